@@ -1,0 +1,75 @@
+"""The command line: from here each verb leads to one file under `deploy/commands/`.
+
+    sensor profile -> simulate -> train -> export -> quantize -> gate -> check -> bench -> restore
+
+Exit codes: 0 done, 1 a gate or check failed, 2 bad input (one sentence on standard error, nothing half-written).
+"""
+
+from pathlib import Path
+from typing import Any
+
+import typer
+from typer.core import TyperGroup
+
+import model
+from deploy import __version__
+from deploy.commands import (
+    train,
+)
+from profiles.errors import BeersError
+
+
+class Group(TyperGroup):
+    """Turns what a user can mend into one sentence and exit code 2."""
+
+    def invoke(self, ctx: typer.Context) -> Any:
+        """Run the chosen command."""
+        try:
+            return super().invoke(ctx)
+        except BeersError as error:
+            message = str(error)
+        except MemoryError:
+            message = "memory: expected enough for this input, got none left; give a smaller image or tile."
+        typer.echo(f"beers-deploy: {message}", err=True)
+        raise typer.Exit(2)
+
+
+app = typer.Typer(
+    cls=Group,
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode="rich",
+    context_settings={"help_option_names": ["-h", "--help"]},
+    help="Satellite image restoration from training to board: simulate, train, quantise, check, predict, restore.",
+)
+
+
+def _version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"beers-deploy {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def main(
+    _: bool = typer.Option(False, "--version", callback=_version, is_eager=True, help="Print the version."),
+) -> None:
+    """Check the installation before any command runs."""
+    here = Path(__file__).resolve().parents[1]
+    there = Path(str(model.__file__)).resolve().parents[1]
+    if here != there:
+        raise BeersError(
+            "installation",
+            expected=f"'model' beside 'deploy' in {here}",
+            got=f"another package of that name in {there}",
+            remedy="install beers-deploy in a virtual environment of its own",
+        )
+
+
+def example(text: str) -> str:
+    """The example that ends a command's help."""
+    return f"Example:  [bold]beers-deploy {text}[/bold]"
+
+
+app.command("train", epilog=example(train.EXAMPLE))(train.train)

@@ -1,0 +1,40 @@
+"""Progress of long work: a rich bar on a terminal, plain lines elsewhere; always on standard error."""
+
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+LINE_EVERY_S = 5.0
+
+
+class Steps:
+    """Counts steps of one piece of work."""
+
+    def __init__(self, label: str, total: int, bar: Progress | None) -> None:
+        self.label, self.total, self.done, self._bar = label, total, 0, bar
+        self._task = bar.add_task(label, total=total) if bar else None
+        self._printed = time.monotonic()
+
+    def advance(self, steps: int = 1, note: str = "") -> None:
+        """Report that so many further steps are done."""
+        self.done += steps
+        if self._bar is not None and self._task is not None:
+            self._bar.update(self._task, completed=self.done, description=f"{self.label} {note}".strip())
+        elif time.monotonic() - self._printed > LINE_EVERY_S or self.done >= self.total:
+            self._printed = time.monotonic()
+            sys.stderr.write(f"{self.label}: {self.done}/{self.total} {note}".rstrip() + "\n")
+
+
+@contextmanager
+def steps(label: str, total: int) -> Iterator[Steps]:
+    """Show the progress of `total` steps while the block runs."""
+    if not sys.stderr.isatty():
+        yield Steps(label, total, None)
+        return
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
+        yield Steps(label, total, bar)

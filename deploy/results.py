@@ -1,0 +1,143 @@
+"""The one kind of document that commands write with --json: figures that say where they come from.
+
+A figure is measured (here), predicted (by a model, with an interval) or published (by a named document); what could
+not be had is unavailable, with the reason, and never a zero.
+"""
+
+import json
+import platform
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+from deploy import __version__
+from model.files import sha256, write_text
+
+SCHEMA_NAME, SCHEMA_VERSION = "beers-deploy/results", 1
+SCHEMA_PATH = Path(__file__).parent / "schema" / "results-1.json"
+
+Mode = Literal["measured", "predicted", "published", "unavailable"]
+
+
+@dataclass(frozen=True)
+class Figure:
+    """A number with its unit, its mode and its source."""
+
+    value: float | None
+    unit: str
+    mode: Mode
+    source: str = ""
+    interval: tuple[float, float] | None = None
+    reason: str = ""
+
+    def to_json(self) -> dict[str, object]:
+        """The figure as the schema wants it."""
+        if self.mode == "unavailable":
+            return {"value": None, "unit": self.unit, "mode": self.mode, "reason": self.reason}
+        interval = list(self.interval) if self.interval else None
+        return {
+            "value": self.value,
+            "unit": self.unit,
+            "mode": self.mode,
+            "interval": interval,
+            "source": self.source,
+        }
+
+    def __str__(self) -> str:
+        if self.value is None:
+            return "unavailable"
+        text = number(self.value)
+        return text if self.interval is None else f"{text} [{number(self.interval[0])}, {number(self.interval[1])}]"
+
+
+def measured(value: float, unit: str, source: str) -> Figure:
+    """A number that this run observed on this machine."""
+    return Figure(float(value), unit, "measured", source)
+
+
+def predicted(value: float, unit: str, interval: tuple[float, float], source: str) -> Figure:
+    """A number that a model computed, and how far off it may be."""
+    return Figure(float(value), unit, "predicted", source, (float(interval[0]), float(interval[1])))
+
+
+def published(value: float, unit: str, source: str) -> Figure:
+    """A number that a document prints."""
+    return Figure(float(value), unit, "published", source)
+
+
+def unavailable(unit: str, reason: str) -> Figure:
+    """A number that could not be had."""
+    return Figure(None, unit, "unavailable", reason=reason)
+
+
+def number(value: float) -> str:
+    """Four significant digits at most, no exponent where a person would not write one."""
+    if value == 0 or 1e-4 <= abs(value) < 1e6:
+        digits = 0 if abs(value) >= 1000 else 4
+        return f"{value:.0f}" if digits == 0 else f"{value:.{digits}g}"
+    return f"{value:.3g}"
+
+
+@dataclass(frozen=True)
+class Row:
+    """One line of a table: a name, its figures, and plain words beside them."""
+
+    table: str
+    name: str
+    figures: Mapping[str, Figure]
+    text: Mapping[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Document:
+    """What one run of a command found."""
+
+    command: str
+    arguments: Mapping[str, object]
+    inputs: tuple[Path, ...]
+    rows: tuple[Row, ...]
+
+    def to_json(self) -> dict[str, object]:
+        """The whole document as the schema wants it."""
+        return {
+            "schema": SCHEMA_NAME,
+            "schema_version": SCHEMA_VERSION,
+            "tool_version": __version__,
+            "command": self.command,
+            "arguments": {key: _plain(value) for key, value in self.arguments.items()},
+            "inputs": [{"name": path.name, "sha256": sha256(path)} for path in self.inputs],
+            "host": host(),
+            "rows": [
+                {
+                    "table": row.table,
+                    "name": row.name,
+                    "figures": {key: figure.to_json() for key, figure in row.figures.items()},
+                    "text": dict(row.text),
+                }
+                for row in self.rows
+            ],
+        }
+
+    def write(self, path: Path | None) -> None:
+        """Write the document where --json asked for it; nowhere when it did not."""
+        if path is not None:
+            write_text(path, json.dumps(self.to_json(), indent=1) + "\n")
+
+
+def host() -> dict[str, object]:
+    """What the measured figures were measured on."""
+    import psutil
+
+    return {
+        "system": platform.system(),
+        "machine": platform.machine(),
+        "python": platform.python_version(),
+        "cpus": psutil.cpu_count() or 1,
+        "memory_gb": round(psutil.virtual_memory().total / 1e9, 1),
+        "load_1_min": round(psutil.getloadavg()[0], 2),
+    }
+
+
+def _plain(value: object) -> object:
+    return value if isinstance(value, str | int | float | bool | type(None)) else str(value)

@@ -1,0 +1,85 @@
+"""ConvBEERS: a residual network without batch normalisation that undoes blur and noise (paper, section 3.1).
+
+    image -> head -> [conv, ReLU, conv, +] x blocks -> body end, + head -> tail -> correction, + image
+
+Every convolution is 3 x 3 with stride 1 and zero padding 1. 16 blocks of 64 features make 1.2 M parameters.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+
+
+@dataclass(frozen=True)
+class Variant:
+    """A named point of the family."""
+
+    blocks: int
+    features: int
+
+    @property
+    def radius_px(self) -> int:
+        """How far an output pixel sees: one pixel per convolution (head, two a block, body end, tail)."""
+        return 2 * self.blocks + 3
+
+
+VARIANTS = {
+    "convbeers": Variant(blocks=16, features=64),  # the paper's
+    "convbeers-m": Variant(blocks=16, features=32),
+    "convbeers-s": Variant(blocks=8, features=32),
+    "convbeers-xs": Variant(blocks=4, features=16),
+}
+
+
+def conv3x3(inputs: int, outputs: int) -> nn.Conv2d:
+    """A size-preserving convolution."""
+    return nn.Conv2d(inputs, outputs, kernel_size=3, padding=1)
+
+
+class ResidualBlock(nn.Module):
+    """x + conv(relu(conv(x))), (N, F, H, W) to the same shape."""
+
+    def __init__(self, features: int) -> None:
+        super().__init__()
+        self.first = conv3x3(features, features)
+        self.second = conv3x3(features, features)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Shape kept."""
+        correction: Tensor = self.second(torch.relu(self.first(x)))
+        return x + correction
+
+
+class ConvBEERS(nn.Module):
+    """The network: (N, 1, H, W) in [0, 1] of full scale to the same, not clipped."""
+
+    def __init__(self, variant: Variant) -> None:
+        super().__init__()
+        self.variant = variant
+        self.head = conv3x3(1, variant.features)
+        self.body = nn.Sequential(*(ResidualBlock(variant.features) for _ in range(variant.blocks)))
+        self.body_end = conv3x3(variant.features, variant.features)
+        self.tail = conv3x3(variant.features, 1)
+
+    def forward(self, image: Tensor) -> Tensor:
+        """Image plus correction, (N, 1, H, W)."""
+        shallow = self.head(image)
+        deep = shallow + self.body_end(self.body(shallow))
+        correction: Tensor = self.tail(deep)
+        return image + correction
+
+
+def initialise(network: ConvBEERS, generator: torch.Generator) -> None:
+    """Start as (nearly) the identity: He-normal weights, residual branches and correction scaled down.
+
+    Without batch normalisation the stream's variance would otherwise double at each block.
+    """
+    for name, module in network.named_modules():
+        if isinstance(module, nn.Conv2d):
+            fan_in = module.in_channels * 9
+            scale = 0.1 if name.endswith(("second", "body_end", "tail")) else 1.0
+            with torch.no_grad():
+                module.weight.normal_(0.0, scale * (2 / fan_in) ** 0.5, generator=generator)
+                if module.bias is not None:
+                    module.bias.zero_()

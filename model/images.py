@@ -1,0 +1,105 @@
+"""Read pixels from TIFF, PNG or JPEG files, and refuse with one sentence what is no image."""
+
+from pathlib import Path
+
+import numpy as np
+import psutil
+import tifffile
+from PIL import Image, UnidentifiedImageError
+
+from profiles.errors import ImageError, MachineError
+
+TIFF_SUFFIXES = {".tif", ".tiff"}
+IMAGE_SUFFIXES = TIFF_SUFFIXES | {".png", ".jpg", ".jpeg"}
+WORKING_COPIES = 12
+"""Float copies of an image that a command may hold at once: reading refuses what would not fit in memory."""
+
+
+def read_pixels(path: Path) -> np.ndarray:
+    """The pixels of an image file as stored: (H, W) or (H, W, bands), any dtype.
+
+    Raises:
+        ImageError: missing, empty, not an image, or holding NaN or infinity.
+        MachineError: too large for the free memory.
+    """
+    if not path.is_file():
+        raise ImageError(str(path), expected="an image file", got="no such file", remedy="check the path")
+    if path.stat().st_size == 0:
+        raise ImageError(str(path), expected="an image", got="an empty file", remedy="write or copy it again")
+    pixels = _read_tiff(path) if path.suffix.lower() in TIFF_SUFFIXES else _read_other(path)
+    if pixels.ndim not in (2, 3) or 0 in pixels.shape:
+        raise ImageError(
+            str(path), expected="a 2-D image", got=f"shape {pixels.shape}", remedy="export one page of it"
+        )
+    if np.issubdtype(pixels.dtype, np.floating) and not np.isfinite(pixels).all():
+        count = int((~np.isfinite(pixels)).sum())
+        raise ImageError(
+            str(path), expected="finite pixels", got=f"{count} NaN or infinite", remedy="fill or mask them first"
+        )
+    return pixels
+
+
+def list_images(folder: Path) -> list[Path]:
+    """The image files of a folder, sorted by name.
+
+    Raises:
+        ImageError: no such folder, or no image in it.
+    """
+    found = sorted(p for p in folder.glob("*") if p.suffix.lower() in IMAGE_SUFFIXES) if folder.is_dir() else []
+    if not found:
+        got = "no image in it" if folder.is_dir() else "no such folder"
+        raise ImageError(str(folder), expected="a folder of images", got=got, remedy="give TIFF, PNG or JPEG files")
+    return found
+
+
+def _read_tiff(path: Path) -> np.ndarray:
+    try:
+        with tifffile.TiffFile(path) as file:
+            series = file.series[0]
+            _check_memory(path, int(np.prod(series.shape)))
+            pixels = np.asarray(series.asarray())
+    except MachineError:
+        raise
+    except ValueError as error:
+        if "imagecodecs" in str(error):
+            remedy = "pip install 'beers-deploy[codecs]'"
+            raise MachineError(
+                str(path), expected="a TIFF compression known here", got=str(error), remedy=remedy
+            ) from error
+        raise _no_image(path, error) from error
+    except Exception as error:  # a damaged file raises whatever its bytes lead to
+        raise _no_image(path, error) from error
+    if pixels.ndim == 3 and pixels.shape[0] in (1, 3, 4) and pixels.shape[2] not in (1, 3, 4):
+        pixels = np.moveaxis(pixels, 0, 2)  # planar storage: bands first
+    return pixels[..., 0] if pixels.ndim == 3 and pixels.shape[2] == 1 else pixels
+
+
+def _read_other(path: Path) -> np.ndarray:
+    limit, Image.MAX_IMAGE_PIXELS = Image.MAX_IMAGE_PIXELS, None  # our own check knows the free memory
+    try:
+        with Image.open(path) as image:
+            bands = 4 if image.mode == "RGBA" else len(image.getbands())
+            _check_memory(path, image.width * image.height * bands)
+            return np.asarray(image if image.mode in ("L", "I;16", "I", "F") else image.convert("RGB"))
+    except (UnidentifiedImageError, OSError, ValueError, SyntaxError) as error:
+        raise _no_image(path, error) from error
+    finally:
+        Image.MAX_IMAGE_PIXELS = limit
+
+
+def _check_memory(path: Path, samples: int) -> None:
+    needed, free = samples * 4 * WORKING_COPIES, psutil.virtual_memory().available
+    if needed > free:
+        raise MachineError(
+            str(path),
+            expected=f"an image that fits in {free / 1e9:.1f} GB of free memory",
+            got=f"{samples / 1e6:.0f} million samples, which need about {needed / 1e9:.1f} GB",
+            remedy="cut it into pieces",
+        )
+
+
+def _no_image(path: Path, error: Exception) -> ImageError:
+    got = " ".join(str(error).split()) or type(error).__name__
+    return ImageError(
+        str(path), expected="a readable TIFF, PNG or JPEG", got=got[:120], remedy="check that it is a whole image"
+    )

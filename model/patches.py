@@ -1,0 +1,124 @@
+"""Training patches, simulated as they are needed from whole scenes.
+
+A scene's spectrum is computed once; each visit blurs, samples and folds it anew with another sensor, scale, phase
+and exposure. Visiting whole scenes yields many patches for one transform.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from model.simulator.acquire import Pair, acquire
+from model.simulator.draws import Draw
+from model.simulator.sampling import crop_divisible, scene_spectrum
+from model.simulator.scene import Scene
+from profiles.errors import ImageError
+from profiles.sensor import SensorProfile
+
+
+@dataclass(frozen=True)
+class PatchRecipe:
+    """How patches are drawn from scenes."""
+
+    degraded: SensorProfile
+    reference: SensorProfile
+    patch_px: int = 96
+    oversamplings: tuple[int, ...] = (2, 3, 4, 5)  # every ratio shows the same ground at another scale
+    exposures: tuple[float, float] = (0.5, 1.25)  # darker and brighter days than the photograph's
+    margin_px: int = 16
+
+
+@dataclass(frozen=True)
+class Visited:
+    """A scene ready to be visited: its half spectrum and its width in pixels."""
+
+    spectrum: Tensor
+    width: int
+
+
+class PatchSource:
+    """Endless batches of (degraded, reference) patches, (N, 1, P, P) in [0, 1]; the same for the same seed."""
+
+    SHARD_BATCHES = 16
+    """Batches mixed together: enough scenes in one batch, little memory."""
+
+    def __init__(self, scenes: list[Scene], recipe: PatchRecipe, batch: int, seed: int) -> None:
+        self.recipe, self.batch, self.seed = recipe, batch, seed
+        common = int(np.lcm.reduce(recipe.oversamplings))
+        self._scenes = [prepare(scene, common) for scene in scenes]
+
+    def batches(self, first: int = 0) -> Iterator[tuple[Tensor, Tensor]]:
+        """Batch number `first` and all that follow: a resumed run goes on where it stopped."""
+        index = first
+        while True:
+            shard, within = divmod(index, self.SHARD_BATCHES)
+            degraded, reference = self._shard(shard)
+            for k in range(within, self.SHARD_BATCHES):
+                part = slice(k * self.batch, (k + 1) * self.batch)
+                yield degraded[part], reference[part]
+            index = (shard + 1) * self.SHARD_BATCHES
+
+    def _shard(self, number: int) -> tuple[Tensor, Tensor]:
+        generator = Draw(self.seed, number).generator("shard")
+        wanted, pieces, count = self.batch * self.SHARD_BATCHES, [], 0
+        for _ in range(50 * wanted):
+            piece = visit(self._scenes[generator.integers(len(self._scenes))], self.recipe, generator)
+            pieces.append(piece)
+            count += len(piece)
+            if count >= wanted:
+                order = torch.from_numpy(generator.permutation(count)[:wanted])
+                patches = torch.cat(pieces)[order]
+                return patches[:, :1].contiguous(), patches[:, 1:].contiguous()
+        raise ImageError(
+            "training images",
+            expected=f"scenes that hold a patch of {self.recipe.patch_px} target pixels",
+            got="none large enough",
+            remedy="give larger images or a smaller patch",
+        )
+
+
+def prepare(scene: Scene, multiple: int) -> Visited:
+    """Crop a scene to multiples of every oversampling, and transform it once."""
+    radiance = crop_divisible(scene.radiance, multiple)
+    return Visited(scene_spectrum(radiance), radiance.shape[-1])
+
+
+def visit(scene: Visited, recipe: PatchRecipe, generator: np.random.Generator) -> Tensor:
+    """All the patches of one simulated pass over a scene, (N, 2, P, P): degraded and reference in [0, 1]."""
+    ratio = int(generator.choice(recipe.oversamplings))
+    room = min(scene.spectrum.shape[-2], scene.width) // ratio - 2 * recipe.margin_px
+    if room < recipe.patch_px:
+        return torch.empty(0, 2, recipe.patch_px, recipe.patch_px)
+    pair = _acquire_pair(scene, recipe, ratio, generator)
+    patches = cut(torch.stack([pair.degraded, pair.reference]), recipe.patch_px, generator)
+    return turn(patches, generator)
+
+
+def _acquire_pair(scene: Visited, recipe: PatchRecipe, ratio: int, generator: np.random.Generator) -> Pair:
+    spectrum = scene.spectrum * float(generator.uniform(*recipe.exposures))
+    phase_y, phase_x = (float(v) for v in generator.uniform(-ratio / 2, ratio / 2, 2))
+    draw = Draw(int(generator.integers(2**31)))
+    images = []
+    for profile, role in ((recipe.degraded, "degraded"), (recipe.reference, "reference")):
+        sensor = profile.draw(generator)
+        dn = acquire(spectrum, scene.width, sensor, ratio, draw, role, (phase_y, phase_x), recipe.margin_px)
+        images.append(dn / sensor.max_dn)
+    return Pair(*images)
+
+
+def cut(images: Tensor, patch_px: int, generator: np.random.Generator) -> Tensor:
+    """Cut (C, H, W) into as many whole patches as fit, from a random corner: (N, C, P, P)."""
+    height, width = images.shape[-2:]
+    top, left = (int(generator.integers(size % patch_px + 1)) for size in (height, width))
+    grid = images[:, top:, left:].unfold(1, patch_px, patch_px).unfold(2, patch_px, patch_px)
+    return grid.permute(1, 2, 0, 3, 4).reshape(-1, images.shape[0], patch_px, patch_px)
+
+
+def turn(patches: Tensor, generator: np.random.Generator) -> Tensor:
+    """One of the eight symmetries of the square, the same for all patches of a pass."""
+    quarter, mirrored = int(generator.integers(4)), bool(generator.integers(2))
+    turned = torch.rot90(patches, quarter, (-2, -1))
+    return turned.flip(-1) if mirrored else turned

@@ -1,0 +1,24 @@
+"""The converter: radiance to whole digital numbers, and back."""
+
+import numpy as np
+from torch import Tensor
+
+from profiles.sensor import Sensor
+
+
+def digitise(radiance: Tensor, sensor: Sensor) -> Tensor:
+    """DN = min(max(round(gain * L), 0), 2^bits - 1), as float32.
+
+    Rounding adds 1/12 DN^2 of variance. Clipping comes before any cast, so that nothing wraps around.
+    """
+    return (radiance * sensor.gain_dn_per_radiance).round().clamp(0, sensor.max_dn)
+
+
+def to_radiance(dn: Tensor, sensor: Sensor) -> Tensor:
+    """Radiance in W/m2/sr/um of digital numbers."""
+    return dn / sensor.gain_dn_per_radiance
+
+
+def to_uint16(dn: Tensor) -> np.ndarray:
+    """Whole digital numbers of at most 16 bits as the array that a TIFF file takes."""
+    return np.asarray(dn.round().clamp(0, 65535).cpu().numpy().astype(np.uint16))

@@ -1,0 +1,65 @@
+"""From the scene's fine grid to the sensor's: every r-th point of the blurred scene, centred, without a shift."""
+
+import torch
+from torch import Tensor
+
+from profiles.errors import OptionError
+
+
+def scene_spectrum(radiance: Tensor) -> Tensor:
+    """Half spectrum (..., H, W // 2 + 1) of a scene (..., H, W), to be sampled through any number of sensors."""
+    spectrum: Tensor = torch.fft.rfft2(radiance)
+    return spectrum
+
+
+def sample(
+    spectrum: Tensor, transfer: Tensor, width: int, oversampling: int, offset_px: tuple[float, float] = (0.0, 0.0)
+) -> Tensor:
+    """Blur by `transfer` and keep every r-th point in both directions.
+
+    Target pixel n covers scene pixels r*n to r*n + r - 1, so it is sampled at their centre, r*n + (r - 1) / 2. For
+    even r that lies between two scene pixels: a phase ramp goes there, where slicing would shift by half a pixel.
+
+    Args:
+        spectrum: (..., H, W // 2 + 1) complex, of a scene whose H and W are multiples of r.
+        transfer: (H, W // 2 + 1) real, see `mtf.transfer_function`.
+        width: W in scene pixels.
+        oversampling: r, scene pixels per target pixel.
+        offset_px: further shift of the sampling grid (down, right), in scene pixels.
+
+    Returns:
+        (..., H / r, W / r) float32. The borders wrap: crop a margin of real scene.
+    """
+    height = spectrum.shape[-2]
+    check_divisible(height, width, oversampling)
+    centre = (oversampling - 1) / 2
+    ramp_y = _ramp(torch.fft.fftfreq(height, device=spectrum.device), centre + offset_px[0])
+    ramp_x = _ramp(torch.fft.rfftfreq(width, device=spectrum.device), centre + offset_px[1])
+    blurred = spectrum * transfer * ramp_y[:, None] * ramp_x
+    # Keeping every r-th row is adding up the r aliases of each frequency: the inverse FFT is r times smaller.
+    rows = height // oversampling
+    folded = blurred.reshape(*blurred.shape[:-2], oversampling, rows, -1).sum(-3) / oversampling
+    lines: Tensor = torch.fft.irfft(torch.fft.ifft(folded, dim=-2), n=width, dim=-1)
+    return lines[..., ::oversampling].contiguous()
+
+
+def crop_divisible(radiance: Tensor, oversampling: int) -> Tensor:
+    """Cut the last rows and columns so that H and W are multiples of the oversampling."""
+    height, width = (size // oversampling * oversampling for size in radiance.shape[-2:])
+    return radiance[..., :height, :width]
+
+
+def check_divisible(height: int, width: int, oversampling: int) -> None:
+    """Refuse a scene that the target grid does not divide."""
+    if oversampling < 1 or height % oversampling or width % oversampling:
+        raise OptionError(
+            "oversampling",
+            expected=f"a whole divisor of the scene's {height} x {width} pixels",
+            got=repr(oversampling),
+            remedy="crop the scene (crop_divisible) or choose another ratio",
+        )
+
+
+def _ramp(frequency: Tensor, shift_px: float) -> Tensor:
+    angle = 2 * torch.pi * frequency.double() * shift_px
+    return torch.polar(torch.ones_like(angle), angle).to(torch.complex64)

@@ -1,0 +1,102 @@
+"""A number and where it comes from: the one kind of value that a profile holds."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+from profiles.errors import ProfileError
+
+Status = Literal["published", "inferred", "assumed", "stated"]
+"""published: in a document; inferred: computed from such; assumed: our choice; stated: the user's own."""
+
+Number = float | tuple[float, float]
+
+
+@dataclass(frozen=True)
+class Constant:
+    """A value, or a range [low, high], with its provenance."""
+
+    value: Number
+    status: Status
+    source: str
+
+    @property
+    def low(self) -> float:
+        """The smallest value it can take."""
+        return self.value[0] if isinstance(self.value, tuple) else self.value
+
+    @property
+    def high(self) -> float:
+        """The largest value it can take."""
+        return self.value[1] if isinstance(self.value, tuple) else self.value
+
+    def __str__(self) -> str:
+        return f"{self.low:g}" if self.low == self.high else f"{self.low:g} to {self.high:g}"
+
+
+def read_constant(where: str, raw: object) -> Constant:
+    """Read `0.07`, `[0.03, 0.07]` or `{ value = ..., status = ..., source = ... }`.
+
+    A bare number is the user's own statement: status "stated".
+    """
+    if not isinstance(raw, Mapping):
+        return Constant(_number(where, raw), "stated", "stated by the profile without a source")
+    check_keys(where, raw, required={"value", "status", "source"})
+    status, source = raw["status"], raw["source"]
+    if status not in get_args(Status):
+        raise ProfileError(
+            f"{where}.status",
+            expected="one of " + ", ".join(get_args(Status)),
+            got=repr(status),
+            remedy="say where the number comes from",
+        )
+    if not isinstance(source, str) or not source.strip():
+        raise ProfileError(
+            f"{where}.source",
+            expected="a text naming a document",
+            got=repr(source),
+            remedy="say where the number comes from",
+        )
+    return Constant(_number(where, raw["value"]), status, source)
+
+
+def check_keys(
+    where: str,
+    raw: Mapping[str, object],
+    required: set[str],
+    optional: set[str] = frozenset(),  # type: ignore[assignment]
+) -> None:
+    """Refuse unknown keys first (a typo is the likelier fault), then missing ones."""
+    allowed = required | optional
+    for key in raw:
+        if key not in allowed:
+            raise ProfileError(
+                where,
+                expected=f"the keys {', '.join(sorted(allowed))}",
+                got=f"{key!r}",
+                remedy=_rename(key, allowed),
+            )
+    for key in sorted(required - set(raw)):
+        raise ProfileError(
+            where, expected=f"the key {key!r}", got="none", remedy="add it; a shipped profile shows how"
+        )
+
+
+def _rename(key: str, allowed: set[str]) -> str:
+    """Point at the key that was meant: most often the same one with its unit."""
+    meant = sorted(name for name in allowed if name.startswith(key) or key.startswith(name))
+    return f"write {meant[0]!r} (the unit belongs to the name)" if meant else "remove it or correct its spelling"
+
+
+def _number(where: str, raw: object) -> Number:
+    if _is_number(raw):
+        return float(raw)  # type: ignore[arg-type]
+    if isinstance(raw, list) and len(raw) == 2 and all(map(_is_number, raw)) and raw[0] <= raw[1]:
+        return (float(raw[0]), float(raw[1]))
+    raise ProfileError(
+        where, expected="a finite number or a range [low, high]", got=repr(raw), remedy="give one of the two"
+    )
+
+
+def _is_number(raw: object) -> bool:
+    return isinstance(raw, int | float) and not isinstance(raw, bool) and abs(raw) < float("inf")

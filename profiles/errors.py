@@ -1,0 +1,46 @@
+"""What can go wrong with what a user hands us.
+
+BeersError              one sentence, no traceback, exit code 2
+  ProfileError          a sensor or target profile
+  ImageError            a scene or an acquisition
+  ModelError            a weights or ONNX file
+  OptionError           a command-line value, or two that do not go together
+  MachineError          the host: memory, disk, a missing optional package
+
+A gate that fails is no error: its command exits with 1.
+"""
+
+
+class BeersError(Exception):
+    """Bad input: what was expected, what was got, and what to do about it.
+
+    Args:
+        where: the file, option or tensor at fault.
+        expected: what a sound input looks like.
+        got: what stood there instead.
+        remedy: what the user can do.
+    """
+
+    def __init__(self, where: str, *, expected: str, got: str, remedy: str) -> None:
+        super().__init__(f"{where}: expected {expected}, got {got}; {remedy}.")
+        self.where, self.expected, self.got, self.remedy = where, expected, got, remedy
+
+
+class ProfileError(BeersError):
+    """A sensor or target profile that does not hold together."""
+
+
+class ImageError(BeersError):
+    """An image that cannot be read, or whose pixels make no sense."""
+
+
+class ModelError(BeersError):
+    """A weights or ONNX file that is not what the command needs."""
+
+
+class OptionError(BeersError):
+    """A command-line value that is out of range, or two that contradict each other."""
+
+
+class MachineError(BeersError):
+    """Something this host lacks: memory, disk space, an optional package."""

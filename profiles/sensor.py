@@ -1,0 +1,212 @@
+"""Sensor profiles: the grid, the MTF, the noise and the digitiser of one instrument.
+
+A profile may state ranges (a family of sensors); `SensorProfile.draw` picks one physical `Sensor` from it.
+"""
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from profiles.constant import Constant, check_keys, read_constant
+from profiles.errors import ProfileError
+from profiles.toml import read_toml, shipped_names
+
+MTF_NYQUIST_MAX = 2 / math.pi
+"""A perfect lens over a square detector: sinc(0.5). Nothing above it is a blur (facts: gamma < 0)."""
+
+MAX_DRAWS = 10_000
+
+
+@dataclass(frozen=True)
+class Sensor:
+    """One instrument, every number settled.
+
+    The noise variance is alpha * L + beta, L in W/m2/sr/um (paper, section 3.3, signal-dependent noise).
+    """
+
+    mtf_nyquist: float
+    alpha: float
+    beta: float
+    gain_dn_per_radiance: float
+    bits: int
+
+    @property
+    def max_dn(self) -> int:
+        """The largest digital number, 4095 for 12 bits."""
+        return int(2**self.bits) - 1
+
+    def noise_sigma(self, radiance: float) -> float:
+        """Standard deviation of the noise at `radiance`, both in W/m2/sr/um."""
+        return math.sqrt(max(self.alpha * radiance + self.beta, 0.0))
+
+
+@dataclass(frozen=True)
+class SensorProfile:
+    """What one TOML file under `profiles/sensors/` states, each constant with its source."""
+
+    name: str
+    description: str
+    gsd_m: Constant
+    oversampling: Constant
+    mtf_nyquist: Constant
+    radiance_0: Constant
+    snr_0: Constant
+    radiance_1: Constant
+    snr_1: Constant
+    bits: Constant
+    gain_dn_per_radiance: Constant
+
+    def draw(self, generator: np.random.Generator) -> Sensor:
+        """Pick one sensor from the ranges: MTF uniform, SNR pair uniform over the physically valid pairs."""
+        return self.draw_counted(generator)[0]
+
+    def draw_counted(self, generator: np.random.Generator) -> tuple[Sensor, int]:
+        """As `draw`, with the number of SNR pairs that were rejected as impossible."""
+        mtf_nyquist = float(generator.uniform(self.mtf_nyquist.low, self.mtf_nyquist.high))
+        for rejected in range(MAX_DRAWS):
+            snr_0 = float(generator.uniform(self.snr_0.low, self.snr_0.high))
+            snr_1 = float(generator.uniform(self.snr_1.low, self.snr_1.high))
+            alpha, beta = noise_from_snr(self.radiance_0.low, snr_0, self.radiance_1.low, snr_1)
+            if alpha >= 0 and beta >= 0:
+                return self._sensor(mtf_nyquist, alpha, beta), rejected
+        raise self._impossible_snr()
+
+    def nominal(self) -> Sensor:
+        """The middle of every range (the SNR at radiance_0 moved to the nearest physical value)."""
+        snr_1 = _middle(self.snr_1)
+        low, high = snr_0_bounds(self.radiance_0.low, self.radiance_1.low, snr_1)
+        snr_0 = min(max(_middle(self.snr_0), low), high)
+        alpha, beta = noise_from_snr(self.radiance_0.low, snr_0, self.radiance_1.low, snr_1)
+        return self._sensor(_middle(self.mtf_nyquist), max(alpha, 0.0), max(beta, 0.0))
+
+    def _sensor(self, mtf_nyquist: float, alpha: float, beta: float) -> Sensor:
+        return Sensor(mtf_nyquist, alpha, beta, self.gain_dn_per_radiance.low, int(self.bits.low))
+
+    def _impossible_snr(self) -> ProfileError:
+        low, high = snr_0_bounds(self.radiance_0.low, self.radiance_1.low, self.snr_1.high)
+        return ProfileError(
+            f"sensor profile {self.name}: noise.snr_0 and noise.snr_1",
+            expected=f"an SNR of {low:g} to {high:g} at {self.radiance_0} W/m2/sr/um for {self.snr_1.high:g} at "
+            f"{self.radiance_1} (variance alpha L + beta with alpha, beta >= 0)",
+            got=f"{self.snr_0}",
+            remedy="correct one of the two; both are linear ratios, not dB",
+        )
+
+
+def _middle(constant: Constant) -> float:
+    return (constant.low + constant.high) / 2
+
+
+def noise_from_snr(radiance_0: float, snr_0: float, radiance_1: float, snr_1: float) -> tuple[float, float]:
+    """Solve sigma_i^2 = (L_i / SNR_i)^2 = alpha L_i + beta for (alpha, beta) (paper, section 3.3).
+
+    Either may come out negative: see `snr_0_bounds`.
+    """
+    variance_0, variance_1 = (radiance_0 / snr_0) ** 2, (radiance_1 / snr_1) ** 2
+    alpha = (variance_1 - variance_0) / (radiance_1 - radiance_0)
+    return alpha, variance_0 - alpha * radiance_0
+
+
+def snr_0_bounds(radiance_0: float, radiance_1: float, snr_1: float) -> tuple[float, float]:
+    """The SNRs at `radiance_0` that leave alpha >= 0 (lower bound) and beta >= 0 (upper bound)."""
+    ratio = radiance_0 / radiance_1
+    return snr_1 * ratio, snr_1 * math.sqrt(ratio)
+
+
+TABLES: dict[str, tuple[str, ...]] = {
+    "grid": ("gsd_m", "oversampling"),
+    "mtf": ("mtf_nyquist",),
+    "noise": ("radiance_0", "snr_0", "radiance_1", "snr_1"),
+    "digitiser": ("bits", "gain_dn_per_radiance"),
+}
+
+
+def sensor_names() -> list[str]:
+    """The names of the shipped sensor profiles."""
+    return shipped_names("sensors")
+
+
+def load_sensor(name: str) -> SensorProfile:
+    """Read a shipped sensor profile by name, or the user's own by the path of its .toml file.
+
+    Raises:
+        ProfileError: unknown name, wrong or missing key, or numbers that no instrument can have.
+    """
+    label, raw = read_toml("sensors", name)
+    check_keys(label, raw, required={"description", *TABLES})
+    constants: dict[str, Constant] = {}
+    for table, keys in TABLES.items():
+        content = raw[table]
+        if not isinstance(content, Mapping):
+            raise ProfileError(label, expected=f"a table [{table}]", got=repr(content), remedy="write it as one")
+        check_keys(f"{label} [{table}]", content, required=set(keys))
+        constants |= {key: read_constant(f"{label} [{table}] {key}", content[key]) for key in keys}
+    profile = SensorProfile(name=label.removesuffix(".toml"), description=str(raw["description"]), **constants)
+    _check_physics(label, profile)
+    return profile
+
+
+def _check_physics(label: str, profile: SensorProfile) -> None:
+    mtf_max = MTF_NYQUIST_MAX
+    checks: list[tuple[str, Constant, Callable[[float], bool], str, str]] = [
+        (
+            "[grid] gsd_m",
+            profile.gsd_m,
+            lambda v: v > 0,
+            "metres above 0",
+            "give the ground sampling distance",
+        ),
+        (
+            "[grid] oversampling",
+            profile.oversampling,
+            lambda v: v >= 1 and v == int(v),
+            "whole numbers from 1 on",
+            "give the number of scene pixels per sensor pixel",
+        ),
+        (
+            "[mtf] mtf_nyquist",
+            profile.mtf_nyquist,
+            lambda v: 0 < v <= mtf_max,
+            f"a contrast above 0 and up to {mtf_max:.4f} (2/pi, the square detector alone)",
+            "give a ratio, 0.07 for 7 %",
+        ),
+        ("[noise] snr_0", profile.snr_0, lambda v: v > 0, "linear ratios above 0", "convert dB first"),
+        ("[noise] snr_1", profile.snr_1, lambda v: v > 0, "linear ratios above 0", "convert dB first"),
+        (
+            "[noise] radiance_0",
+            profile.radiance_0,
+            lambda v: 0 < v < profile.radiance_1.low,
+            "W/m2/sr/um above 0 and below radiance_1",
+            "name the darker of the two points radiance_0",
+        ),
+        (
+            "[digitiser] bits",
+            profile.bits,
+            lambda v: v in range(1, 17),
+            "a whole number from 1 to 16",
+            "give the bits per pixel",
+        ),
+        (
+            "[digitiser] gain_dn_per_radiance",
+            profile.gain_dn_per_radiance,
+            lambda v: v > 0,
+            "DN per W/m2/sr/um above 0",
+            "give full-scale DN divided by full-scale radiance",
+        ),
+    ]
+    for key, constant, valid, expected, remedy in checks:
+        if not (valid(constant.low) and valid(constant.high)):
+            raise ProfileError(f"{label} {key}", expected=expected, got=str(constant), remedy=remedy)
+    _check_snr(profile)
+
+
+def _check_snr(profile: SensorProfile) -> None:
+    """Some pair in the ranges must be physical: the bounds grow with snr_1, so its two ends decide."""
+    ends = [
+        snr_0_bounds(profile.radiance_0.low, profile.radiance_1.low, s)
+        for s in (profile.snr_1.low, profile.snr_1.high)
+    ]
+    if profile.snr_0.high < ends[0][0] or profile.snr_0.low > ends[1][1]:
+        raise profile._impossible_snr()

@@ -1,0 +1,37 @@
+"""Find and read a profile: a shipped name, or the path of the user's own TOML file."""
+
+import tomllib
+from pathlib import Path
+
+from profiles.errors import ProfileError
+
+HERE = Path(__file__).parent
+
+
+def shipped_names(kind: str) -> list[str]:
+    """The names of the profiles shipped in `profiles/KIND/`."""
+    return sorted(path.stem for path in (HERE / kind).glob("*.toml"))
+
+
+def read_toml(kind: str, name: str) -> tuple[str, dict[str, object]]:
+    """Return (label for messages, parsed table) of profile `name`.
+
+    Raises:
+        ProfileError: no such profile, not readable, or not TOML.
+    """
+    path = Path(name) if name.endswith(".toml") else HERE / kind / f"{name}.toml"
+    known = shipped_names(kind)
+    if not name.endswith(".toml") and name not in known:
+        raise ProfileError(
+            f"profile {name!r}",
+            expected=f"one of {', '.join(known)}, or the path of a .toml file",
+            got=repr(name),
+            remedy="run 'beers-deploy profiles' to see them all",
+        )
+    try:
+        return path.name, tomllib.loads(path.read_bytes().decode())
+    except OSError as error:
+        reason = error.strerror or str(error)
+        raise ProfileError(str(path), expected="a readable file", got=reason, remedy="check the path") from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise ProfileError(str(path), expected="TOML text", got=str(error), remedy="correct that line") from error
