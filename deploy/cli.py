@@ -22,7 +22,7 @@ from profiles.errors import BeersError
 class Group(TyperGroup):
     """Turns what a user can mend into one sentence and exit code 2."""
 
-    def invoke(self, ctx: typer.Context) -> Any:
+    def invoke(self, ctx: Any) -> Any:
         """Run the chosen command."""
         try:
             return super().invoke(ctx)

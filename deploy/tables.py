@@ -4,10 +4,11 @@ from collections.abc import Iterable
 
 from rich.console import Console
 from rich.table import Table
+from rich.text import Text
 
 from deploy.results import Figure, Row
 
-MARK = {"measured": "[green]m[/green]", "predicted": "[yellow]p[/yellow]", "published": "[blue]d[/blue]"}
+MARK = {"measured": ("m", "green"), "predicted": ("p", "yellow"), "published": ("d", "blue")}
 LEGEND = "m measured here, p predicted [interval], d published in a document"
 
 
@@ -37,11 +38,11 @@ def unit_of(key: str, rows: list[Row]) -> str:
     return next(row.figures[key].unit for row in rows if key in row.figures)
 
 
-def cell(figure: Figure | None) -> str:
+def cell(figure: Figure | None) -> Text:
     """A figure with its mode, or nothing."""
-    if figure is None:
-        return ""
-    return "-" if figure.value is None else f"{figure} {MARK[figure.mode]}".replace(" [", " \\[", 1)
+    if figure is None or figure.value is None:
+        return Text("" if figure is None else "-")
+    return Text.assemble(str(figure), " ", MARK[figure.mode])
 
 
 def missing(rows: list[Row]) -> list[str]:
