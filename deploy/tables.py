@@ -28,9 +28,9 @@ def print_rows(title: str, rows: Iterable[Row], console: Console | None = None) 
         table.add_row(row.name, *figures, *(row.text.get(key, "") for key in words))
     console = console or Console()
     console.print(table)
-    console.print(LEGEND, style="dim", highlight=False)
+    console.print(LEGEND, style="dim", highlight=False, markup=False)
     for reason in dict.fromkeys(missing(rows)):
-        console.print(reason, style="dim", highlight=False)
+        console.print(reason, style="dim", highlight=False, markup=False)
 
 
 def unit_of(key: str, rows: list[Row]) -> str:

@@ -1,0 +1,1 @@
+"""Image quality: how close to the reference (`fidelity`)."""

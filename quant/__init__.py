@@ -1,0 +1,4 @@
+"""The numbers: calibration, power-of-two positions, INT8 graph writing and the float/INT8 gate.
+
+float ONNX -> graph -> planes -> calibration -> positions -> host file (onnxruntime) and board file (DPU flow)
+"""

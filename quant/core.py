@@ -1,0 +1,116 @@
+"""The integer core: the graph with int8 weights and bias, and a position for every tensor, as the DPU demands."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from quant.graph import Add, Conv, Graph
+from quant.positions import SHIFTS, Shifts, best_position, clamp, coarsest_position, quantise
+
+
+@dataclass(frozen=True)
+class IntConv:
+    """int8 convolution: sum of products, plus bias << shift_bias, ReLU, shifted right by shift_cut, clipped."""
+
+    name: str
+    input: str
+    output: str
+    weight: np.ndarray  # (O, I, kh, kw) int8
+    weight_position: int
+    bias: np.ndarray  # (O,) int8
+    bias_position: int
+    relu: bool
+
+    @property
+    def inputs(self) -> tuple[str, ...]:
+        """The tensors it reads."""
+        return (self.input,)
+
+    @property
+    def pad_px(self) -> int:
+        """Zero padding on each side."""
+        return int(self.weight.shape[2]) // 2
+
+
+@dataclass(frozen=True)
+class IntCore:
+    """Operations in order, and the position of every activation tensor."""
+
+    ops: tuple[IntConv | Add, ...]
+    positions: Mapping[str, int]
+
+    def scale(self, tensor: str) -> float:
+        """The value of one unit of a tensor, 2^-position."""
+        return float(2.0 ** -self.positions[tensor])
+
+
+def build_core(graph: Graph, positions: Mapping[str, int], shifts: Shifts = SHIFTS) -> IntCore:
+    """Quantise the weights of a graph, and move positions that the DPU's shifts cannot reach.
+
+    Args:
+        graph: a plane-reading graph.
+        positions: the least-squares position of every activation.
+        shifts: the windows of the target.
+    """
+    legal = dict(positions)
+    ops: list[IntConv | Add] = []
+    for op in graph:
+        if isinstance(op, Conv):
+            ops.append(_quantise_conv(op, legal, shifts))
+        else:
+            _move_add(op, legal, shifts)
+            ops.append(op)
+    return IntCore(tuple(ops), legal)
+
+
+def _quantise_conv(op: Conv, positions: dict[str, int], shifts: Shifts) -> IntConv:
+    weight_position = best_position(op.weight)
+    product = weight_position + positions[op.input]
+    cut = clamp(product - positions[op.output], shifts.cut)
+    positions[op.output] = product - cut
+    wanted = best_position(op.bias) if op.bias.any() else product
+    coarsest = min(wanted, coarsest_position(float(np.abs(op.bias).max(initial=0.0))) + 1)
+    bias_position = product - clamp(product - max(wanted, coarsest), shifts.bias)
+    return IntConv(
+        op.name,
+        op.input,
+        op.output,
+        quantise(op.weight, weight_position),
+        weight_position,
+        quantise(op.bias, bias_position),
+        bias_position,
+        op.relu,
+    )
+
+
+def _move_add(op: Add, positions: dict[str, int], shifts: Shifts) -> None:
+    coarse = min(positions[i] for i in op.inputs)
+    for name in op.inputs:
+        positions[name] = coarse + clamp(positions[name] - coarse, shifts.read)
+    positions[op.output] = coarse - clamp(coarse - positions[op.output], shifts.write)
+
+
+def shift_faults(core: IntCore, shifts: Shifts = SHIFTS) -> list[str]:
+    """Every shift outside its window, one sentence each; empty for a legal core."""
+    faults = []
+    for op in core.ops:
+        for rule, value, window in op_shifts(op, core.positions, shifts):
+            if not window[0] <= value <= window[1]:
+                faults.append(f"{op.name}: {rule} is {value}, allowed {window[0]} to {window[1]}")
+    return faults
+
+
+def op_shifts(
+    op: IntConv | Add, positions: Mapping[str, int], shifts: Shifts
+) -> list[tuple[str, int, tuple[int, int]]]:
+    """(name, value, window) of the shifts that one operation needs."""
+    inputs, output = [positions[i] for i in op.inputs], positions[op.output]
+    if isinstance(op, Add):
+        read, write = max(inputs) - min(inputs), min(inputs) - output
+        return [("shift_read", read, shifts.read), ("shift_write", write, shifts.write)]
+    product = op.weight_position + inputs[0]
+    return [
+        ("shift_cut", product - output, shifts.cut),
+        ("shift_bias", product - op.bias_position, shifts.bias),
+    ]

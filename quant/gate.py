@@ -1,0 +1,58 @@
+"""The float/INT8 gate: what INT8 changes, and whether that is too much."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+import onnxruntime as ort
+
+from model.metrics.fidelity import psnr_db
+from quant.session import run
+
+
+@dataclass(frozen=True)
+class GateResult:
+    """Differences in [0, 1] of full scale over all pixels; PSNRs over full scale, in dB."""
+
+    mae: float
+    std: float
+    max_abs: float
+    psnr_between_db: float
+    psnr_degraded_db: float
+    psnr_float_db: float
+    psnr_int8_db: float
+    patches: int
+
+    @property
+    def drop_db(self) -> float:
+        """PSNR lost against the reference."""
+        return self.psnr_float_db - self.psnr_int8_db
+
+    def passes(self, max_mae: float) -> bool:
+        """Whether the mean absolute difference is within the limit; never for NaN."""
+        return self.mae <= max_mae
+
+
+def compare(
+    float_session: ort.InferenceSession,
+    int8_session: ort.InferenceSession,
+    pairs: Iterable[tuple[np.ndarray, np.ndarray]],
+) -> GateResult:
+    """Run both networks on (degraded, reference) pairs of (1, 1, H, W) in [0, 1]; outputs clipped as a file would."""
+    differences, errors = [], []
+    for degraded, reference in pairs:
+        in_float, in_int8 = (np.clip(run(s, degraded), 0, 1) for s in (float_session, int8_session))
+        differences.append((in_int8 - in_float).ravel())
+        errors.append([psnr_db(image, reference, 1.0) for image in (degraded, in_float, in_int8)])
+    difference = np.concatenate(differences).astype(np.float64)
+    degraded_db, float_db, int8_db = np.mean(errors, axis=0)
+    return GateResult(
+        mae=float(np.abs(difference).mean()),
+        std=float(difference.std()),
+        max_abs=float(np.abs(difference).max()),
+        psnr_between_db=psnr_db(difference, np.zeros_like(difference), 1.0),
+        psnr_degraded_db=float(degraded_db),
+        psnr_float_db=float(float_db),
+        psnr_int8_db=float(int8_db),
+        patches=len(errors),
+    )

@@ -1,0 +1,37 @@
+"""A 12-bit image for an int8 engine: two planes, coarse and remainder.
+
+    DN = 32 * coarse + remainder,   coarse in 0..127,   remainder in -16..31
+
+Both fit int8, and no bit is lost. Zero stays zero in both, so that the engine's zero padding means what it meant in
+the float network. The first convolution reads both planes: the remainder's weights are the coarse ones / 32.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+
+from quant.graph import IMAGE, Conv, Graph
+
+PLANES = "planes"
+MAX_DN = 4095
+STEP = 32
+COARSE_MAX = 127
+POSITION = 7
+"""The planes' scale is 2^-7: coarse 127 stands for about 1, the full scale."""
+
+
+def split(image: np.ndarray) -> np.ndarray:
+    """(N, 1, H, W) float32 in [0, 1] to the two planes (N, 2, H, W) int8."""
+    dn = np.clip(np.rint(image * np.float32(MAX_DN)), 0, MAX_DN)
+    coarse = np.minimum(np.rint(dn / STEP), COARSE_MAX)
+    return np.concatenate([coarse, dn - STEP * coarse], axis=1).astype(np.int8)
+
+
+def read_planes(graph: Graph) -> Graph:
+    """The same graph with a first convolution that reads the planes (as q * 2^-7) instead of the image."""
+    first = graph[0]
+    assert isinstance(first, Conv)  # noqa: S101 - correction_graph has seen to it
+    assert first.input == IMAGE  # noqa: S101
+    unit = np.float32(2.0**POSITION / MAX_DN)
+    weight = np.concatenate([first.weight * (STEP * unit), first.weight * unit], axis=1)
+    return (replace(first, input=PLANES, weight=weight.astype(np.float32)), *graph[1:])
