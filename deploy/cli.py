@@ -5,6 +5,7 @@
 Exit codes: 0 done, 1 a gate or check failed, 2 bad input (one sentence on standard error, nothing half-written).
 """
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,12 @@ from typer.core import TyperGroup
 import model
 from deploy import __version__
 from deploy.commands import (
+    export,
+    gate,
+    profiles,
+    quantize,
+    restore,
+    simulate,
     train,
 )
 from profiles.errors import BeersError
@@ -72,4 +79,14 @@ def example(text: str) -> str:
     return f"Example:  [bold]beers-deploy {text}[/bold]"
 
 
-app.command("train", epilog=example(train.EXAMPLE))(train.train)
+COMMANDS: dict[str, tuple[Callable[..., None], str]] = {
+    "profiles": (profiles.profiles, profiles.EXAMPLE),
+    "simulate": (simulate.simulate, simulate.EXAMPLE),
+    "train": (train.train, train.EXAMPLE),
+    "export": (export.export, export.EXAMPLE),
+    "quantize": (quantize.quantize, quantize.EXAMPLE),
+    "gate": (gate.gate, gate.EXAMPLE),
+    "restore": (restore.restore, restore.EXAMPLE),
+}
+for name, (function, text) in COMMANDS.items():
+    app.command(name, epilog=example(text))(function)

@@ -78,14 +78,6 @@ def tensors(graph: Graph) -> list[str]:
     return [op.output for op in graph]
 
 
-def radius_px(graph: Graph) -> int:
-    """How far an output pixel sees: the convolutions on the longest path from the image."""
-    reach = {IMAGE: 0}
-    for op in graph:
-        reach[op.output] = max(reach.get(i, 0) for i in op.inputs) + (op.pad_px if isinstance(op, Conv) else 0)
-    return reach[CORRECTION]
-
-
 def relu_count(graph: Graph) -> int:
     """How many convolutions carry a ReLU: quantisers have been seen to drop them without a word."""
     return sum(isinstance(op, Conv) and op.relu for op in graph)

@@ -13,6 +13,9 @@ from quant.host_file import host_model
 from quant.onnx_file import fixed_tile_px, metadata
 from quant.planes import read_planes
 
+PASSES = 2
+"""Times that every calibration patch is looked at."""
+
 
 @dataclass(frozen=True)
 class Quantised:

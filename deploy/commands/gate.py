@@ -1,0 +1,81 @@
+"""`beers-deploy gate`: does INT8 stay close enough to float? Exit code 1 when it does not."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+if TYPE_CHECKING:
+    from deploy.results import Row
+    from quant.gate import GateResult
+
+EXAMPLE = "gate float.onnx int8.onnx --max-mae 0.0012"
+
+HELD_OUT_SEED = 1000
+"""Added to the seed: the gate must not see the calibration's patches."""
+
+
+def gate(
+    float_model: Annotated[
+        Path | None, typer.Argument(metavar="[FLOAT]", help="Float ONNX; the shipped one if none.")
+    ] = None,
+    int8_model: Annotated[
+        Path | None, typer.Argument(metavar="[INT8]", help="INT8 ONNX; the shipped one if none.")
+    ] = None,
+    max_mae: Annotated[float, typer.Option(min=0, help="Largest mean absolute difference, of full scale.")] = 0.0012,
+    sensor: Annotated[str, typer.Option(help="Profile of the test patches.")] = "pleiades-degraded",
+    images: Annotated[Path | None, typer.Option(help="Folder of scenes; drawn ones if none.")] = None,
+    patches: Annotated[int, typer.Option(min=1, help="Test patches of 128 x 128.")] = 32,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the patches.")] = 0,
+    json: Annotated[Path | None, typer.Option(help="Write the figures here.")] = None,
+) -> None:
+    """Compare a float and an INT8 network on simulated pairs neither was calibrated on."""
+    from deploy.defaults import default_float_weights, default_int8, load_scenes
+    from deploy.defaults import float_model as read_float
+    from deploy.results import Document
+    from deploy.tables import print_rows
+    from profiles import load_sensor
+    from quant.calibration import REFERENCE, draw_patches
+    from quant.gate import compare
+    from quant.onnx_file import load_onnx
+    from quant.session import open_session
+
+    float_path, int8_path = float_model or default_float_weights(), int8_model or default_int8()
+    sessions = open_session(read_float(float_path)), open_session(load_onnx(int8_path))
+    degraded, reference = load_sensor(sensor), load_sensor(REFERENCE)
+    held_out = seed + HELD_OUT_SEED
+    scenes = load_scenes(images, reference.nominal(), held_out)
+    result = compare(*sessions, draw_patches(scenes, degraded, reference, patches, held_out).pairs)
+    row = _row(result)
+    print_rows("float against INT8", [row])
+    arguments = {"max_mae": max_mae, "sensor": sensor, "patches": patches, "seed": seed, "images": images}
+    Document("gate", arguments, (float_path, int8_path), (row,)).write(json)
+    passed = result.passes(max_mae)
+    verdict = "passed" if passed else "FAILED"
+    typer.echo(f"gate {verdict}: MAE {result.mae:.3g}, allowed {max_mae:.3g}; PSNR drop {result.drop_db:.2f} dB")
+    if not passed:
+        raise typer.Exit(1)
+
+
+def _row(result: "GateResult") -> "Row":
+    from deploy.results import Row, measured, unavailable
+
+    source = f"{result.patches} simulated patches of 128 x 128"
+    figures = {
+        "MAE": (result.mae, "of full scale"),
+        "std": (result.std, "of full scale"),
+        "max": (result.max_abs, "of full scale"),
+        "PSNR float-INT8": (result.psnr_between_db, "dB"),
+        "PSNR degraded": (result.psnr_degraded_db, "dB"),
+        "PSNR float": (result.psnr_float_db, "dB"),
+        "PSNR INT8": (result.psnr_int8_db, "dB"),
+    }
+    identical = "the two networks give identical images"
+    return Row(
+        "gate",
+        "INT8 - float",
+        {
+            key: measured(value, unit, source) if value < float("inf") else unavailable(unit, identical)
+            for key, (value, unit) in figures.items()
+        },
+    )

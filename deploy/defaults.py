@@ -1,0 +1,58 @@
+"""What commands use when nothing is given: the shipped convbeers-s, and drawn scenes."""
+
+from pathlib import Path
+
+import numpy as np
+import onnx
+
+from deploy.export import to_onnx
+from model.images import list_images
+from model.simulator.procedural import procedural_scene
+from model.simulator.scene import Scene, read_scene
+from model.weights_file import SHIPPED, load_network, shipped_weights
+from profiles.sensor import Sensor
+from quant.onnx_file import load_onnx
+
+VARIANT = "convbeers-s"
+SCENES = 3
+SCENE_SIDE_PX = 2400
+
+
+def default_float_weights() -> Path:
+    """The shipped float weights (safetensors)."""
+    return shipped_weights(VARIANT)
+
+
+def default_int8() -> Path:
+    """The shipped INT8 network (ONNX, host spelling)."""
+    return SHIPPED / f"{VARIANT}-int8.onnx"
+
+
+def float_model(path: Path | None) -> onnx.ModelProto:
+    """A float network as ONNX: from an .onnx or a .safetensors file, or the shipped one.
+
+    Raises:
+        ModelError: neither of these.
+    """
+    path = path or default_float_weights()
+    if path.suffix != ".safetensors":
+        return load_onnx(path)
+    network, recipe = load_network(path)
+    return to_onnx(network, about(path.stem, recipe))
+
+
+def about(variant: str, recipe: dict[str, object]) -> dict[str, str]:
+    """What an exported file says of itself."""
+    return {
+        "variant": variant,
+        "sensor": str(recipe.get("degraded", "")),
+        "reference": str(recipe.get("reference", "")),
+    }
+
+
+def load_scenes(folder: Path | None, sensor: Sensor, seed: int) -> list[Scene]:
+    """The scenes of a folder of images, or drawn ones, other for every seed."""
+    if folder is not None:
+        return [read_scene(path, sensor) for path in list_images(folder)]
+    generators = np.random.default_rng(seed).spawn(SCENES)
+    return [procedural_scene(SCENE_SIDE_PX, SCENE_SIDE_PX, g) for g in generators]

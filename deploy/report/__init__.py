@@ -1,0 +1,1 @@
+"""Reports: one self-contained HTML file, pictures embedded, every number with its mode."""

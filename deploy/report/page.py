@@ -1,0 +1,83 @@
+"""Render a report: tables of rows and pictures, in one HTML file that asks the network for nothing."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import jinja2
+
+from deploy import __version__
+from deploy.results import Figure, Row
+from deploy.tables import missing, unit_of
+from model.files import write_text
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table of the report, with a sentence on how to read it."""
+
+    title: str
+    rows: Sequence[Row]
+    caption: str = ""
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A picture as a data: address, and what it shows."""
+
+    title: str
+    source: str
+    caption: str
+
+
+@dataclass(frozen=True)
+class Report:
+    """What a page holds, in reading order."""
+
+    title: str
+    headline: str
+    tables: Sequence[Table]
+    pictures: Sequence[Picture]
+    notes: Sequence[str]
+
+
+def render(report: Report) -> str:
+    """The page as HTML."""
+    loader = jinja2.FileSystemLoader(Path(__file__).parent)
+    environment = jinja2.Environment(loader=loader, autoescape=True, undefined=jinja2.StrictUndefined)
+    tables = [_grid(table) for table in report.tables]
+    return environment.get_template("report.html").render(report=report, tables=tables, version=__version__)
+
+
+def write_report(report: Report, path: Path) -> None:
+    """Write the page, whole or not at all."""
+    write_text(path, render(report))
+
+
+def _grid(table: Table) -> dict[str, object]:
+    """Header and cells of a table."""
+    rows = list(table.rows)
+    keys = list(dict.fromkeys(key for row in rows for key in row.figures))
+    words = list(dict.fromkeys(key for row in rows for key in row.text))
+    return {
+        "title": table.title,
+        "caption": table.caption,
+        "header": [(key, unit_of(key, rows)) for key in keys] + [(word, "") for word in words],
+        "rows": [
+            {
+                "name": row.name,
+                "cells": [_cell(row.figures.get(key)) for key in keys],
+                "words": [row.text.get(word, "") for word in words],
+            }
+            for row in rows
+        ],
+        "missing": list(dict.fromkeys(missing(rows))),
+    }
+
+
+def _cell(figure: Figure | None) -> dict[str, str]:
+    if figure is None:
+        return {"text": "", "mode": "", "title": ""}
+    if figure.value is None:
+        return {"text": "-", "mode": "unavailable", "title": figure.reason}
+    return {"text": str(figure), "mode": figure.mode, "title": figure.source}

@@ -1,0 +1,213 @@
+"""A drawn scene: fields, forest, streets, houses, cars and a resolution pattern, as radiance in W/m2/sr/um.
+
+It is the built-in input, so that everything runs without a single image file. Radiances are those of a clear day:
+asphalt 30, grass 45, roofs 60 to 160, concrete 120, white paint 260.
+"""
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+import torch
+from PIL import Image, ImageDraw
+
+from model.simulator.scene import Scene
+
+Point = tuple[float, float]
+
+SHADOW, ASPHALT, GRASS, SOIL, CONCRETE, WHITE, WATER = 12.0, 30.0, 45.0, 75.0, 120.0, 260.0, 16.0
+
+
+def procedural_scene(height_px: int, width_px: int, generator: np.random.Generator) -> Scene:
+    """Draw a scene of that many pixels, a 10 cm world: a car is some 40 pixels long.
+
+    Returns:
+        A scene of (H, W) radiance; the same for the same generator state.
+    """
+    canvas = Image.new("F", (width_px, height_px), GRASS)
+    draw = ImageDraw.Draw(canvas)
+    _fields(draw, canvas.size, generator)
+    _forest(draw, canvas.size, generator)
+    _river(draw, canvas.size, generator)
+    _town(draw, canvas.size, generator)
+    radiance = np.asarray(canvas) * _texture(height_px, width_px, generator)
+    canvas = Image.fromarray(radiance.astype(np.float32))
+    _pattern(ImageDraw.Draw(canvas), canvas.size)
+    return Scene("procedural", torch.from_numpy(np.array(canvas, dtype=np.float32)))
+
+
+def _texture(height_px: int, width_px: int, generator: np.random.Generator) -> np.ndarray:
+    """Multiplicative 1/f texture around 1, some 12 % rms: nothing on the ground is flat."""
+    white = generator.standard_normal((height_px, width_px), dtype=np.float32)
+    fy, fx = np.fft.fftfreq(height_px)[:, None], np.fft.rfftfreq(width_px)[None, :]
+    radius = np.hypot(fx, fy)
+    spectrum = np.fft.rfft2(white) / np.maximum(radius, 1 / 400)
+    texture = np.fft.irfft2(spectrum, s=(height_px, width_px))
+    return np.asarray(np.exp(0.12 * texture / texture.std()))
+
+
+def _fields(draw: ImageDraw.ImageDraw, size: tuple[int, int], generator: np.random.Generator) -> None:
+    """A patchwork of parcels, each with crop rows of its own direction."""
+    width, height = size
+    step = 700
+    for top in range(-step, height + step, step):
+        for left in range(-step, width + step, step):
+            corner = (left + generator.uniform(-90, 90), top + generator.uniform(-90, 90))
+            parcel = _box(corner, step - 12, step - 12, generator.uniform(-0.06, 0.06))
+            base = float(generator.choice([38, 55, 70, 88]))
+            draw.polygon(parcel, fill=base)
+            _rows(draw, parcel, base, generator)
+
+
+def _rows(draw: ImageDraw.ImageDraw, parcel: list[Point], base: float, generator: np.random.Generator) -> None:
+    """Crop rows 6 to 14 pixels apart, between two opposite sides of the parcel."""
+    (ax, ay), (bx, by), (cx, cy), (dx, dy) = parcel
+    count = int(700 / generator.uniform(6, 14))
+    contrast = generator.uniform(0.85, 1.2)
+    for k in range(count):
+        t = (k + 0.5) / count
+        start = (ax + t * (bx - ax), ay + t * (by - ay))
+        end = (dx + t * (cx - dx), dy + t * (cy - dy))
+        draw.line([start, end], fill=base * contrast, width=3)
+
+
+def _forest(draw: ImageDraw.ImageDraw, size: tuple[int, int], generator: np.random.Generator) -> None:
+    """Tree crowns: a shadow, a dark disc and a sunlit side, over the left third of the lower half."""
+    width, height = size
+    for _ in range(int(width * height / 2600)):
+        x, y = generator.uniform(0, width * 0.42), generator.uniform(height * 0.55, height)
+        if x > width * 0.36 and generator.random() < 0.6:
+            continue
+        _tree(draw, x, y, generator.uniform(14, 34), generator)
+
+
+def _tree(draw: ImageDraw.ImageDraw, x: float, y: float, radius: float, generator: np.random.Generator) -> None:
+    draw.ellipse(_around(x + 0.6 * radius, y + 0.6 * radius, radius), fill=SHADOW)
+    draw.ellipse(_around(x, y, radius), fill=float(generator.uniform(24, 34)))
+    draw.ellipse(_around(x - 0.25 * radius, y - 0.25 * radius, 0.65 * radius), fill=float(generator.uniform(36, 60)))
+    for _ in range(6):
+        dx, dy = generator.uniform(-0.6, 0.4, 2) * radius
+        draw.ellipse(_around(x + dx, y + dy, 0.14 * radius), fill=float(generator.uniform(20, 80)))
+
+
+def _river(draw: ImageDraw.ImageDraw, size: tuple[int, int], generator: np.random.Generator) -> None:
+    """A winding river along the left edge, with pale banks."""
+    width, height = size
+    phase = generator.uniform(0, math.tau)
+    middle = [(width * (0.1 + 0.04 * math.sin(phase + 5 * y / height)), y) for y in range(-50, height + 51, 5)]
+    for half_width, value in ((width / 36, SOIL * 1.3), (width / 48, WATER)):
+        for x, y in middle:
+            draw.ellipse(_around(x, y, half_width), fill=value)
+
+
+def _town(draw: ImageDraw.ImageDraw, size: tuple[int, int], generator: np.random.Generator) -> None:
+    """Blocks of houses along turned streets, over the right part."""
+    width, height = size
+    angle = float(generator.uniform(-0.25, 0.25))
+    place = _turn(width * 0.72, height * 0.55, angle)
+    reach_x, reach_y = width * 0.3, height * 0.62
+    for v in np.arange(-reach_y, reach_y, 420):
+        _street(draw, place, [(-reach_x, v), (reach_x, v)], generator)
+    for u in np.arange(-reach_x, reach_x + 1, 560):
+        _street(draw, place, [(u, -reach_y), (u, reach_y)], generator)
+    for v in np.arange(-reach_y, reach_y - 420, 420):
+        for u in np.arange(-reach_x, reach_x - 180, 187):
+            if (u + reach_x) % 560 < 400:
+                _house(draw, place, u + 70, v + 70, generator)
+                _house(draw, place, u + 70, v + 240, generator)
+
+
+def _street(
+    draw: ImageDraw.ImageDraw,
+    place: Callable[[float, float], Point],
+    ends: list[Point],
+    generator: np.random.Generator,
+) -> None:
+    (u0, v0), (u1, v1) = ends
+    draw.line([place(u0, v0), place(u1, v1)], fill=CONCRETE * 0.8, width=92)
+    draw.line([place(u0, v0), place(u1, v1)], fill=ASPHALT, width=68)
+    length = math.hypot(u1 - u0, v1 - v0)
+    along = ((u1 - u0) / length, (v1 - v0) / length)
+    for s in np.arange(20, length - 40, 80):
+        dash = [(u0 + along[0] * t, v0 + along[1] * t) for t in (s, s + 34)]
+        draw.line([place(*p) for p in dash], fill=WHITE * 0.7, width=4)
+    for s in generator.uniform(40, length - 60, int(length / 240)):
+        side = 22 * float(generator.choice([-1, 1]))
+        u, v = u0 + along[0] * s - along[1] * side, v0 + along[1] * s + along[0] * side
+        car = [(u - along[0] * a - along[1] * b, v - along[1] * a + along[0] * b) for a, b in _rectangle(20, 9)]
+        draw.polygon([_shift(place(*p), 5) for p in car], fill=SHADOW)
+        draw.polygon([place(*p) for p in car], fill=float(generator.choice([18, 60, 110, 190, 280])))
+
+
+def _house(
+    draw: ImageDraw.ImageDraw,
+    place: Callable[[float, float], Point],
+    u: float,
+    v: float,
+    generator: np.random.Generator,
+) -> None:
+    """A gable roof, one slope in the sun, its shadow, a chimney and a tree in the yard."""
+    long, wide = generator.uniform(90, 130), generator.uniform(64, 92)
+    bright = float(generator.uniform(60, 160))
+    roof = [(u, v), (u + long, v), (u + long, v + wide), (u, v + wide)]
+    draw.polygon([_shift(place(*p), 22) for p in roof], fill=SHADOW)
+    ridge = v + wide / 2
+    draw.polygon([place(*p) for p in [(u, v), (u + long, v), (u + long, ridge), (u, ridge)]], fill=bright)
+    draw.polygon(
+        [place(*p) for p in [(u, ridge), (u + long, ridge), (u + long, v + wide), (u, v + wide)]], fill=bright * 0.55
+    )
+    for k in np.arange(8, long, 11):
+        draw.line([place(u + k, v), place(u + k, v + wide)], fill=bright * 0.8, width=2)
+    x, y = place(u + 0.3 * long, v + 0.3 * wide)
+    draw.rectangle((x, y, x + 9, y + 9), fill=CONCRETE)
+    if generator.random() < 0.6:
+        _tree(draw, *place(u + long + 24, v + wide), generator.uniform(12, 22), generator)
+
+
+def _pattern(draw: ImageDraw.ImageDraw, size: tuple[int, int]) -> None:
+    """A calibration site at the top: a slanted edge, a Siemens star and bar groups on a concrete pad."""
+    side = min(size) * 0.22
+    left, top = size[0] * 0.36, size[1] * 0.08
+    draw.rectangle((left, top, left + 2.6 * side, top + side), fill=CONCRETE)
+    edge = [(left + 0.1 * side, top + 0.1 * side), (left + 0.45 * side, top + 0.1 * side)]
+    slant = 0.8 * side * math.tan(math.radians(5))
+    edge += [(left + 0.45 * side + slant, top + 0.9 * side), (left + 0.1 * side, top + 0.9 * side)]
+    draw.polygon(edge, fill=ASPHALT)
+    _star(draw, left + 1.3 * side, top + 0.5 * side, 0.42 * side)
+    x = left + 1.85 * side
+    for bar in (16.0, 12.0, 8.0, 6.0, 4.0, 3.0):
+        for k in range(3):
+            draw.rectangle(
+                (x + 2 * k * bar, top + 0.15 * side, x + (2 * k + 1) * bar, top + 0.85 * side), fill=ASPHALT
+            )
+        x += 7 * bar
+
+
+def _star(draw: ImageDraw.ImageDraw, x: float, y: float, radius: float, sectors: int = 36) -> None:
+    draw.ellipse(_around(x, y, radius), fill=WHITE)
+    for k in range(sectors):
+        start = 360 * k / sectors
+        draw.pieslice(_around(x, y, radius), start, start + 180 / sectors, fill=ASPHALT)
+
+
+def _box(corner: Point, width: float, height: float, angle: float) -> list[Point]:
+    place = _turn(*corner, angle)
+    return [place(0, 0), place(width, 0), place(width, height), place(0, height)]
+
+
+def _rectangle(half_long: float, half_wide: float) -> list[Point]:
+    return [(-half_long, -half_wide), (half_long, -half_wide), (half_long, half_wide), (-half_long, half_wide)]
+
+
+def _turn(x: float, y: float, angle: float) -> Callable[[float, float], Point]:
+    """From a turned frame centred at (x, y) to the canvas."""
+    cosine, sine = math.cos(angle), math.sin(angle)
+    return lambda u, v: (x + cosine * u - sine * v, y + sine * u + cosine * v)
+
+
+def _shift(point: Point, by: float) -> Point:
+    return (point[0] + by, point[1] + by)
+
+
+def _around(x: float, y: float, radius: float) -> tuple[float, float, float, float]:
+    return (x - radius, y - radius, x + radius, y + radius)

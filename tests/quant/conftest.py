@@ -1,0 +1,40 @@
+"""A small network with real structure, its ONNX graph, and patches from a drawn scene."""
+
+import numpy as np
+import onnx
+import pytest
+import torch
+
+from deploy.export import to_onnx
+from model.convbeers import ConvBEERS, Variant, initialise
+from model.simulator.procedural import procedural_scene
+from profiles import load_sensor
+from quant.calibration import Patches, draw_patches
+from quant.quantise import Quantised, quantise_model
+
+
+@pytest.fixture(scope="session")
+def network() -> ConvBEERS:
+    network = ConvBEERS(Variant(blocks=2, features=8))
+    initialise(network, torch.Generator().manual_seed(3))
+    with torch.no_grad():
+        for name, value in network.named_parameters():
+            if name.endswith("bias"):
+                value.normal_(0, 0.02, generator=torch.Generator().manual_seed(len(name)))
+    return network.eval()
+
+
+@pytest.fixture(scope="session")
+def float_onnx(network: ConvBEERS) -> onnx.ModelProto:
+    return to_onnx(network, {"variant": "test"})
+
+
+@pytest.fixture(scope="session")
+def patches() -> Patches:
+    scene = procedural_scene(900, 960, np.random.default_rng(1))
+    return draw_patches([scene], load_sensor("pleiades-degraded"), load_sensor("pleiades-reference"), count=6, seed=5)
+
+
+@pytest.fixture(scope="session")
+def quantised(float_onnx: onnx.ModelProto, patches: Patches) -> Quantised:
+    return quantise_model(float_onnx, patches, {"seed": "5"}, tick=lambda: None)

@@ -1,0 +1,40 @@
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from quant.positions import best_position, coarsest_position, quantise
+
+
+@given(st.floats(1e-6, 1e6))
+def test_the_coarsest_position_clips_nothing_and_one_finer_does(max_abs: float) -> None:
+    position = coarsest_position(max_abs)
+    assert max_abs * 2.0**position <= 127 < max_abs * 2.0 ** (position + 1)
+
+
+@given(st.integers(0, 2**31), st.floats(1e-4, 1e3))
+def test_the_best_position_has_the_least_squared_error(seed: int, scale: float) -> None:
+    values = (np.random.default_rng(seed).standard_normal(400) * scale).astype(np.float32)
+    best = best_position(values)
+
+    def error(position: int) -> float:
+        restored = np.clip(np.rint(values * 2.0**position), -128, 127) / 2.0**position
+        return float(((values - restored) ** 2).sum())
+
+    assert error(best) <= min(error(best + k) for k in (-2, -1, 1, 2)) * (1 + 1e-5)
+
+
+def test_an_outlier_is_clipped_rather_than_coarsening_the_rest() -> None:
+    values = np.concatenate([np.linspace(-1, 1, 10_001), [4.0]])
+    assert best_position(values) > coarsest_position(4.0)
+
+
+@pytest.mark.parametrize(
+    ("value", "expected"), [(0.5, 1), (-0.5, -1), (1.5, 2), (126.5, 127), (300.0, 127), (-300.0, -128)]
+)
+def test_constants_round_half_away_from_zero_and_saturate(value: float, expected: int) -> None:
+    assert quantise(np.array([value]), 0)[0] == expected
+
+
+def test_zeros_have_a_position() -> None:
+    assert best_position(np.zeros(3)) == 0
