@@ -15,6 +15,10 @@ from typer.core import TyperGroup
 import model
 from deploy import __version__
 from deploy.commands import (
+    bench,
+    check,
+    demo,
+    evaluate,
     export,
     gate,
     profiles,
@@ -80,13 +84,17 @@ def example(text: str) -> str:
 
 
 COMMANDS: dict[str, tuple[Callable[..., None], str]] = {
+    "demo": (demo.demo, demo.EXAMPLE),
     "profiles": (profiles.profiles, profiles.EXAMPLE),
     "simulate": (simulate.simulate, simulate.EXAMPLE),
     "train": (train.train, train.EXAMPLE),
     "export": (export.export, export.EXAMPLE),
     "quantize": (quantize.quantize, quantize.EXAMPLE),
     "gate": (gate.gate, gate.EXAMPLE),
+    "check": (check.check, check.EXAMPLE),
+    "bench": (bench.bench, bench.EXAMPLE),
     "restore": (restore.restore, restore.EXAMPLE),
+    "evaluate": (evaluate.evaluate, evaluate.EXAMPLE),
 }
 for name, (function, text) in COMMANDS.items():
     app.command(name, epilog=example(text))(function)

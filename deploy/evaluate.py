@@ -9,7 +9,7 @@ import torch
 
 from deploy.defaults import default_int8, float_model
 from deploy.restore import MAX_DN, TILE_PX, restore_image
-from deploy.results import Row, measured
+from deploy.results import Row, measured, unavailable
 from model.metrics.fidelity import psnr_db, ssim
 from model.simulator.acquire import MARGIN_PX, Pair, simulate_pair
 from model.simulator.draws import Draw
@@ -91,17 +91,32 @@ def _network(name: str) -> Method:
 
 
 def score(name: str, method: Method, pairs: list[NamedPair], tick: Callable[[], None]) -> list[Row]:
-    """One row an image and one for the mean, PSNR and SSIM over 4095 DN."""
-    rows, figures = [], []
+    """The mean row, and one row an image."""
+    rows = []
     for item in pairs:
         restored = method(item.pair.degraded.numpy())
-        reference = item.pair.reference.numpy()
-        figures.append((psnr_db(restored, reference, MAX_DN), ssim(restored, reference, MAX_DN)))
-        rows.append(_row("images", f"{name}: {item.name}", *figures[-1], "simulated pair"))
+        rows.append(fidelity_row("images", f"{name}: {item.name}", restored, item.pair.reference.numpy()))
         tick()
-    mean = np.mean(figures, axis=0)
-    return [_row("mean", name, float(mean[0]), float(mean[1]), f"mean of {len(pairs)} simulated pairs"), *rows]
+    return [mean_row(name, rows), *rows]
 
 
-def _row(table: str, name: str, psnr: float, similarity: float, source: str) -> Row:
-    return Row(table, name, {"PSNR": measured(psnr, "dB", source), "SSIM": measured(similarity, "ratio", source)})
+def fidelity_row(table: str, name: str, dn: np.ndarray, reference: np.ndarray) -> Row:
+    """PSNR and SSIM of (H, W) digital numbers over 4095 DN."""
+    source = "simulated pair"
+    psnr = psnr_db(dn, reference, MAX_DN)
+    identical = "infinite: identical to the reference"
+    figures = {
+        "PSNR": measured(psnr, "dB", source) if np.isfinite(psnr) else unavailable("dB", identical),
+        "SSIM": measured(ssim(dn, reference, MAX_DN), "ratio", source),
+    }
+    return Row(table, name, figures)
+
+
+def mean_row(name: str, rows: list[Row]) -> Row:
+    """The mean of each figure over the rows that have it."""
+    figures = {}
+    for key, first in rows[0].figures.items():
+        values = [value for row in rows if (value := row.figures[key].value) is not None]
+        source = f"mean of {len(values)} simulated pairs"
+        figures[key] = measured(float(np.mean(values)), first.unit, source) if values else first
+    return Row("mean", name, figures)

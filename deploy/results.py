@@ -48,7 +48,9 @@ class Figure:
         if self.value is None:
             return "unavailable"
         text = number(self.value)
-        return text if self.interval is None else f"{text} [{number(self.interval[0])}, {number(self.interval[1])}]"
+        if self.interval is None or self.interval[0] == self.interval[1]:  # plain arithmetic needs no interval
+            return text
+        return f"{text} [{number(self.interval[0])}, {number(self.interval[1])}]"
 
 
 def measured(value: float, unit: str, source: str) -> Figure:

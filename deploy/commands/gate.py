@@ -1,13 +1,9 @@
 """`beers-deploy gate`: does INT8 stay close enough to float? Exit code 1 when it does not."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
-
-if TYPE_CHECKING:
-    from deploy.results import Row
-    from quant.gate import GateResult
 
 EXAMPLE = "gate float.onnx int8.onnx --max-mae 0.0012"
 
@@ -34,6 +30,7 @@ def gate(
     from deploy.defaults import float_model as read_float
     from deploy.results import Document
     from deploy.tables import print_rows
+    from deploy.verdict import gate_row
     from profiles import load_sensor
     from quant.calibration import REFERENCE, draw_patches
     from quant.gate import compare
@@ -46,7 +43,7 @@ def gate(
     held_out = seed + HELD_OUT_SEED
     scenes = load_scenes(images, reference.nominal(), held_out)
     result = compare(*sessions, draw_patches(scenes, degraded, reference, patches, held_out).pairs)
-    row = _row(result)
+    row = gate_row(result)
     print_rows("float against INT8", [row])
     arguments = {"max_mae": max_mae, "sensor": sensor, "patches": patches, "seed": seed, "images": images}
     Document("gate", arguments, (float_path, int8_path), (row,)).write(json)
@@ -55,27 +52,3 @@ def gate(
     typer.echo(f"gate {verdict}: MAE {result.mae:.3g}, allowed {max_mae:.3g}; PSNR drop {result.drop_db:.2f} dB")
     if not passed:
         raise typer.Exit(1)
-
-
-def _row(result: "GateResult") -> "Row":
-    from deploy.results import Row, measured, unavailable
-
-    source = f"{result.patches} simulated patches of 128 x 128"
-    figures = {
-        "MAE": (result.mae, "of full scale"),
-        "std": (result.std, "of full scale"),
-        "max": (result.max_abs, "of full scale"),
-        "PSNR float-INT8": (result.psnr_between_db, "dB"),
-        "PSNR degraded": (result.psnr_degraded_db, "dB"),
-        "PSNR float": (result.psnr_float_db, "dB"),
-        "PSNR INT8": (result.psnr_int8_db, "dB"),
-    }
-    identical = "the two networks give identical images"
-    return Row(
-        "gate",
-        "INT8 - float",
-        {
-            key: measured(value, unit, source) if value < float("inf") else unavailable(unit, identical)
-            for key, (value, unit) in figures.items()
-        },
-    )

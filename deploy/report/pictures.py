@@ -42,7 +42,7 @@ def busiest_window(dn: np.ndarray, side_px: int) -> tuple[int, int]:
     return max(corners, key=lambda c: float(gradient[c[0] : c[0] + side_px, c[1] : c[1] + side_px].mean()))
 
 
-def png_data_url(grey: np.ndarray) -> str:
+def picture_url(grey: np.ndarray) -> str:
     """An (H, W) or (H, W, 3) uint8 picture as a data: address."""
     buffer = io.BytesIO()
     Image.fromarray(grey).save(buffer, "PNG", optimize=True)

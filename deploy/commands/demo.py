@@ -1,0 +1,30 @@
+"""`beers-deploy demo`: the whole chain on one image, with a report at the end."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+EXAMPLE = "demo --out demo"
+
+
+def demo(
+    image: Annotated[Path | None, typer.Option(help="Raw 12-bit image, or an 8-bit photograph as scene.")] = None,
+    out: Annotated[Path, typer.Option(help="Folder for the report and the files made.")] = Path("demo"),
+    seed: Annotated[int, typer.Option(min=0, help="Seed of every random draw.")] = 0,
+    json: Annotated[Path | None, typer.Option(help="Write the figures here.")] = None,
+) -> None:
+    """Simulate, quantise, gate, check, restore and predict, on a drawn scene or your image; ends with report.html."""
+    from deploy.demo import run_demo
+    from deploy.report.page import write_report
+    from deploy.results import Document
+    from deploy.tables import print_rows
+
+    result = run_demo(image, out, seed, lambda step: typer.echo(step, err=True))
+    write_report(result.report, out / "report.html")
+    for table in result.report.tables:
+        print_rows(table.title, table.rows)
+    typer.echo(result.report.headline)
+    typer.echo(f"report: {out / 'report.html'}")
+    arguments = {"image": image, "out": out, "seed": seed}
+    Document("demo", arguments, tuple([image] if image else []), result.rows).write(json)

@@ -1,0 +1,58 @@
+"""One build of the DPU: a target profile and a configuration of it."""
+
+from dataclasses import dataclass
+
+from profiles import TargetProfile, load_target
+from profiles.constant import Constant
+from profiles.errors import OptionError
+
+
+@dataclass(frozen=True)
+class Dpu:
+    """A DPU configuration: C32B3 has 3 batch handlers, each of 32 AI engines and 32 output channels at a time."""
+
+    target: TargetProfile
+    name: str
+    constants: dict[str, Constant]
+
+    @property
+    def batch(self) -> int:
+        """Images that go through at once, one a batch handler."""
+        return int(self.constants["batch_handlers"].low)
+
+    @property
+    def output_parallel(self) -> int:
+        """Output channels that a batch handler computes at a time."""
+        return int(self.constants["cpb"].low)
+
+    @property
+    def engine_ops_per_s(self) -> float:
+        """Peak int8 operations a second of one batch handler; a multiply-accumulate counts as two."""
+        return self.constants["peak_tops"].low * 1e12 / self.batch
+
+    def limit(self, table: str, key: str) -> Constant:
+        """A constant of the target."""
+        return self.target.constant(table, key)
+
+    def value(self, table: str, key: str) -> float:
+        """The single value of a constant of the target."""
+        return self.target.value(table, key)
+
+    def whole(self, table: str, key: str) -> int:
+        """The value of a constant that counts something."""
+        return int(self.value(table, key))
+
+
+def load_dpu(target: str = "vck190", configuration: str | None = None) -> Dpu:
+    """Read a target profile and one of its configurations.
+
+    Raises:
+        ProfileError: unknown target or configuration.
+        OptionError: a target without a DPU.
+    """
+    profile = load_target(target)
+    if not profile.configurations:
+        raise OptionError(
+            "--target", expected="a target with a DPU, such as vck190", got=repr(target), remedy="choose another"
+        )
+    return Dpu(profile, *profile.configuration(configuration))

@@ -1,0 +1,30 @@
+"""What a broken rule says: the reason, in the node's own numbers, and what to change."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from deploy.dpu.board import Dpu
+from deploy.dpu.graph import Operation
+from profiles.constant import Constant
+
+
+@dataclass(frozen=True)
+class Finding:
+    """Why a node cannot run on the DPU, and what would let it."""
+
+    reason: str
+    remedy: str
+
+
+Rule = Callable[[Operation, Dpu], Finding | None]
+"""One rule of the DPU: None when the node keeps it. Its docstring is the rule's text, {table[key]} its limits."""
+
+
+def outside(values: tuple[int, ...], limit: Constant) -> bool:
+    """Whether any value lies beyond the limit."""
+    return any(not limit.low <= value <= limit.high for value in values)
+
+
+def groups_of(count: int, size: int) -> int:
+    """How many groups of `size` hold `count` things."""
+    return -(-count // size)

@@ -1,0 +1,162 @@
+"""Which nodes of a file compute on integers, with which scales, and which nodes are mere notation for that.
+
+A tensor holds one of four things:
+
+1. "float": what the host computes with.
+2. "int8": written by QuantizeLinear, a cast to int8 or an integer kernel (or the same numbers as uint8 around 128).
+3. "seen": int8 seen as float, behind DequantizeLinear.
+4. "wide": a sum of products of such, on its way to a QuantizeLinear.
+"""
+
+from collections.abc import Mapping
+from typing import Literal
+
+import onnx
+from onnx import TensorProto, numpy_helper
+
+from deploy.dpu.graph import Scale
+
+Content = Literal["float", "int8", "seen", "wide"]
+
+BYTES = (TensorProto.INT8, TensorProto.UINT8)
+ACTIVATIONS = {"Relu", "LeakyRelu", "PRelu", "HardSigmoid", "HardSwish", "Clip"}
+OPERANDS = {
+    "QuantizeLinear": slice(0, 1),
+    "DequantizeLinear": slice(0, 1),
+    "QLinearAdd": slice(0, 4, 3),
+    "QLinearMul": slice(0, 4, 3),
+    "QLinearConcat": slice(2, None, 3),
+}
+"""Which inputs are tensors of the network; the rest are scales and zero points."""
+FORMATS: dict[str, dict[int, tuple[int, int]]] = {
+    "QLinearConv": {0: (1, 2), 3: (4, 5), -1: (6, 7)},
+    "QLinearAdd": {0: (1, 2), 3: (4, 5), -1: (6, 7)},
+    "QLinearMul": {0: (1, 2), 3: (4, 5), -1: (6, 7)},
+    "QLinearAveragePool": {0: (1, 2), -1: (3, 4)},
+    "QLinearGlobalAveragePool": {0: (1, 2), -1: (3, 4)},
+    "QLinearLeakyRelu": {0: (1, 2), -1: (3, 4)},
+    "QuantizeLinear": {-1: (1, 2)},
+    "DequantizeLinear": {0: (1, 2)},
+}
+"""Where an operator names the scale and zero point of input i, or (-1) of its result."""
+
+
+class Integers:
+    """The number formats of one file."""
+
+    def __init__(self, model: onnx.ModelProto, constants: Mapping[str, TensorProto]) -> None:
+        nodes = model.graph.node
+        self.present = any(n.op_type in FORMATS for n in nodes)
+        self._constants = constants
+        self._ends = {o.name for o in model.graph.output}
+        self._readers: dict[str, list[onnx.NodeProto]] = {}
+        for node in nodes:
+            for name in node.input:
+                self._readers.setdefault(name, []).append(node)
+        self._same: dict[str, str] = {}
+        self._seen: dict[str, str] = {}
+        self._formats: dict[str, Scale] = {}
+        self._content: dict[str, Content] = {
+            i.name: "int8" if i.type.tensor_type.elem_type in BYTES else "float" for i in model.graph.input
+        }
+        for node in nodes:
+            self._read_formats(node)
+            self._follow(node)
+
+    def resolve(self, name: str) -> str:
+        """The tensor that a name stands for once notation is dissolved."""
+        while name in self._same:
+            name = self._same[name]
+        return name
+
+    def is_integer(self, node: onnx.NodeProto) -> bool:
+        """Whether the file computes this node on integers."""
+        return self._content.get(node.output[0], "float") in ("int8", "wide")
+
+    def is_notation(self, node: onnx.NodeProto) -> bool:
+        """Whether a node only says how its neighbours' integers are to be read."""
+        result = node.output[0]
+        if node.op_type == "DequantizeLinear" and result not in self._same:
+            readers = self._readers.get(result, [])
+            return result not in self._ends and all(self.is_integer(reader) for reader in readers)
+        return result in self._same
+
+    def activations(self, node: onnx.NodeProto) -> tuple[str, ...]:
+        """The tensors of the network that a node reads."""
+        default = slice(0, 1) if node.op_type.startswith("QLinear") else slice(None)
+        names = [name for name in node.input[OPERANDS.get(node.op_type, default)] if name]
+        if self.is_integer(node) and node.op_type != "QuantizeLinear":
+            names = [self._seen.get(name, name) for name in names]
+        resolved = (self.resolve(name) for name in names)
+        return tuple(name for name in resolved if name not in self._constants)
+
+    def scales(self, node: onnx.NodeProto) -> dict[str, Scale]:
+        """The formats of a node's tensors by role: "input 0", "input 1", ..., "weight", "bias", "output"."""
+        if not self.is_integer(node):
+            return {}
+        roles = {f"input {i}": name for i, name in enumerate(self.activations(node))}
+        if node.op_type == "Conv":
+            roles |= dict(zip(("weight", "bias"), node.input[1:], strict=False))
+        elif node.op_type == "QLinearConv":
+            roles["weight"] = node.input[3]
+        roles["output"] = self._requantised(node.output[0])
+        found = {role: self._formats.get(self.resolve(name)) for role, name in roles.items()}
+        return {role: scale for role, scale in found.items() if scale is not None}
+
+    def _follow(self, node: onnx.NodeProto) -> None:
+        """Work out what a node's results hold, from what its inputs hold."""
+        if not node.output:
+            return
+        content = self._result(node)
+        self._content |= dict.fromkeys(node.output, content)
+        if node.op_type == "DequantizeLinear":
+            aliases = self._same if self.resolve(node.input[0]) in self._constants else self._seen
+            aliases[node.output[0]] = node.input[0]
+        elif node.op_type == "QuantizeLinear" and self._content.get(node.input[0]) == "wide":
+            self._same[node.output[0]] = node.input[0]
+            self._formats[node.input[0]] = self._formats[node.output[0]]
+        elif content == "int8" and node.output[0] not in self._formats and node.input[0] in self._formats:
+            self._formats[node.output[0]] = self._formats[node.input[0]]
+
+    def _result(self, node: onnx.NodeProto) -> Content:
+        if node.op_type == "DequantizeLinear":
+            return "seen"
+        if node.op_type == "QuantizeLinear" or node.op_type in FORMATS or node.op_type == "QLinearConcat":
+            return "int8"
+        if node.op_type == "Cast":
+            return "int8" if any(a.name == "to" and a.i in BYTES for a in node.attribute) else "float"
+        names = [self.resolve(name) for name in node.input if name]
+        holds = {self._content.get(name, "float") for name in names if name not in self._constants}
+        if holds == {"int8"}:
+            return "int8"
+        return "wide" if holds and holds <= {"seen", "wide"} and self._requantised(node.output[0]) else "float"
+
+    def _requantised(self, tensor: str) -> str:
+        """The int8 tensor that a wide one becomes, past an activation; "" where it stays float."""
+        readers = self._readers.get(tensor, [])
+        if self._content.get(tensor) == "int8":
+            return tensor
+        if tensor in self._ends or not readers:
+            return ""
+        if all(reader.op_type == "QuantizeLinear" for reader in readers):
+            return str(readers[0].output[0])
+        if len(readers) == 1 and readers[0].op_type in ACTIVATIONS:
+            return self._requantised(readers[0].output[0])
+        return ""
+
+    def _read_formats(self, node: onnx.NodeProto) -> None:
+        for place, (scale, zero_point) in FORMATS.get(node.op_type, {}).items():
+            tensor = node.output[0] if place == -1 else node.input[place]
+            zero = node.input[zero_point] if len(node.input) > zero_point else ""
+            self._formats[self.resolve(tensor)] = self._scale(node.input[scale], zero)
+        if node.op_type == "QLinearConcat":
+            for tensor, at in [(node.output[0], 0), *((node.input[i], i + 1) for i in range(2, len(node.input), 3))]:
+                self._formats[self.resolve(tensor)] = self._scale(node.input[at], node.input[at + 1])
+
+    def _scale(self, scale: str, zero: str) -> Scale:
+        values, zeros = self._constants.get(scale), self._constants.get(zero)
+        scales = tuple(map(float, numpy_helper.to_array(values).ravel())) if values is not None else ()
+        if zeros is None:
+            return Scale(scales, (0,), "uint8")  # ONNX's default where no zero point is given
+        array = numpy_helper.to_array(zeros)
+        return Scale(scales, tuple(map(int, array.ravel())), str(array.dtype))

@@ -1,0 +1,102 @@
+"""What the DPU demands of the numbers in a quantised file: one rule, one function.
+
+A position p stands for the scale 2^-p; shifts are differences of positions.
+"""
+
+# ruff: noqa: ARG001 - every rule takes the operation and the DPU
+
+from deploy.dpu.board import Dpu
+from deploy.dpu.finding import Finding, outside
+from deploy.dpu.graph import Operation
+
+AGAIN = "quantise with 'beers-deploy quantize --regime legal'"
+
+
+def on_integers(op: Operation, dpu: Dpu) -> Finding | None:
+    """A node on the DPU computes on int8 tensors (UG1414 3.5, quantisation)."""
+    return None if op.integer else Finding("the file computes it in floating point", AGAIN)
+
+
+def symmetric(op: Operation, dpu: Dpu) -> Finding | None:
+    """Tensors are int8 around zero, or the same numbers as uint8 around 128 (Vitis-AI 3.0, vai_q_pytorch)."""
+    faults = [
+        f"{role} {scale.integer_type} around {scale.zero_points[0]}"
+        for role, scale in op.scales.items()
+        if not scale.symmetric
+    ]
+    return Finding("; ".join(faults), AGAIN) if faults else None
+
+
+def per_tensor(op: Operation, dpu: Dpu) -> Finding | None:
+    """A tensor has one scale, not one a channel (Vitis-AI 3.0, vai_q_pytorch)."""
+    faults = [f"{role} has {len(scale.scales)} scales" for role, scale in op.scales.items() if len(scale.scales) != 1]
+    return Finding("; ".join(faults), AGAIN) if faults else None
+
+
+def power_of_two(op: Operation, dpu: Dpu) -> Finding | None:
+    """Scales are powers of two (UG1414 3.5, quantisation)."""
+    single = {role: scale for role, scale in op.scales.items() if len(scale.scales) == 1}
+    faults = [f"{role} scale {scale.scales[0]:.4g}" for role, scale in single.items() if scale.position is None]
+    return Finding("; ".join(faults), AGAIN) if faults else None
+
+
+def shift_cut(op: Operation, dpu: Dpu) -> Finding | None:
+    """Weight + input - output position of a convolution is {numbers[shift_cut]} (Vitis-AI 3.0, vai_q_pytorch)."""
+    cut, limit = _cut(op), dpu.limit("numbers", "shift_cut")
+    return None if cut is None or not outside((cut,), limit) else Finding(f"shift_cut {cut}, allowed {limit}", AGAIN)
+
+
+def shift_bias(op: Operation, dpu: Dpu) -> Finding | None:
+    """Weight + input - bias position is at most {numbers[shift_bias_max]} (Vitis-AI 3.0, vai_q_pytorch).
+
+    And at least min(0, shift_cut + 8 - {numbers[accumulator_bits]}).
+    """
+    product, cut, bias = _product(op), _cut(op), _position(op, "bias")
+    if product is None or cut is None or bias is None:
+        return None
+    low = min(0, cut + 8 - dpu.whole("numbers", "accumulator_bits"))
+    high, shift = dpu.whole("numbers", "shift_bias_max"), product - bias
+    return None if low <= shift <= high else Finding(f"shift_bias {shift}, allowed {low} to {high}", AGAIN)
+
+
+def shift_read(op: Operation, dpu: Dpu) -> Finding | None:
+    """The inputs' positions of an add lie {numbers[shift_read]} apart (Vitis-AI 3.0, vai_q_pytorch)."""
+    inputs, limit = _inputs(op), dpu.limit("numbers", "shift_read")
+    shift = max(inputs) - min(inputs) if inputs else 0
+    return Finding(f"shift_read {shift}, allowed {limit}", AGAIN) if outside((shift,), limit) else None
+
+
+def shift_write(op: Operation, dpu: Dpu) -> Finding | None:
+    """An add's smallest input position less its output's is {numbers[shift_write]} (Vitis-AI 3.0, vai_q_pytorch)."""
+    inputs, output, limit = _inputs(op), _position(op, "output"), dpu.limit("numbers", "shift_write")
+    if not inputs or output is None or not outside((min(inputs) - output,), limit):
+        return None
+    return Finding(f"shift_write {min(inputs) - output}, allowed {limit}", AGAIN)
+
+
+def same_position(op: Operation, dpu: Dpu) -> Finding | None:
+    """Inputs and output of a concat or a pool share one position (Vitis-AI 3.0, vai_q_pytorch)."""
+    positions = {role: p for role in op.scales if (p := _position(op, role)) is not None}
+    if len(set(positions.values())) < 2:
+        return None
+    return Finding(", ".join(f"{role} position {p}" for role, p in positions.items()), AGAIN)
+
+
+def _position(op: Operation, role: str) -> int | None:
+    scale = op.scales.get(role)
+    return scale.position if scale else None
+
+
+def _inputs(op: Operation) -> list[int]:
+    positions = (_position(op, f"input {i}") for i in range(len(op.inputs)))
+    return [p for p in positions if p is not None]
+
+
+def _product(op: Operation) -> int | None:
+    weight, source = _position(op, "weight"), _position(op, "input 0")
+    return None if weight is None or source is None else weight + source
+
+
+def _cut(op: Operation) -> int | None:
+    product, output = _product(op), _position(op, "output")
+    return None if product is None or output is None else product - output

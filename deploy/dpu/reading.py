@@ -1,0 +1,223 @@
+"""From an ONNX file to the DPU's short list of operations, whichever of three spellings it uses.
+
+1. float: Conv, Relu, Add.
+2. integer kernels: QLinearConv, com.microsoft QLinearAdd, Relu (or Max with the zero point), float host nodes around.
+3. QDQ: QuantizeLinear and DequantizeLinear around float operators. The pairs are notation: they are dissolved, and
+   only those at the border, which really convert, stay as operations.
+"""
+
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import onnx
+from onnx import TensorProto, helper, numpy_helper
+
+from deploy.dpu.graph import Kind, Network, Operation, Shape, Window
+from deploy.dpu.integers import Integers
+from deploy.dpu.shapes import out_shape, padding
+from profiles.errors import ModelError
+from quant.onnx_file import load_onnx
+
+KINDS: dict[str, Kind] = {
+    "Conv": "conv",
+    "QLinearConv": "conv",
+    "ConvTranspose": "transposed",
+    "Add": "add",
+    "QLinearAdd": "add",
+    "Mul": "mul",
+    "QLinearMul": "mul",
+    "Concat": "concat",
+    "QLinearConcat": "concat",
+    "Pad": "pad",
+    "Resize": "resize",
+    "Upsample": "resize",
+    "DepthToSpace": "pixel shuffle",
+    "QuantizeLinear": "quantise",
+    "DequantizeLinear": "dequantise",
+}
+KINDS |= dict.fromkeys(("Relu", "LeakyRelu", "QLinearLeakyRelu", "PRelu", "HardSigmoid", "HardSwish"), "activation")
+KINDS |= dict.fromkeys(("MaxPool", "AveragePool", "GlobalAveragePool", "GlobalMaxPool"), "pool")
+KINDS |= dict.fromkeys(("QLinearAveragePool", "QLinearGlobalAveragePool"), "pool")
+
+
+def read_network(path: Path, tile_px: int = 640) -> Network:
+    """Read an ONNX file as a network for one image with sides of `tile_px`.
+
+    Raises:
+        ModelError: not a self-contained ONNX file, or not a network of images.
+    """
+    return network_of(load_onnx(path), tile_px, str(path))
+
+
+def network_of(model: onnx.ModelProto, tile_px: int, where: str = "ONNX model") -> Network:
+    """As `read_network`, of a model in memory."""
+    if not model.graph.node:
+        remedy = "give a file written by 'beers-deploy export' or 'beers-deploy quantize'"
+        raise ModelError(where, expected="a network", got="an ONNX file without nodes", remedy=remedy)
+    try:
+        return _Reader(model, tile_px, where).network()
+    except (ArithmeticError, LookupError, TypeError, ValueError) as error:  # sizes and inputs that cannot be
+        got = f"nodes that contradict it ({' '.join(str(error).split())[:80]})"
+        remedy = "check the file with onnx.checker, and export it again"
+        raise ModelError(where, expected="nodes as ONNX defines them", got=got, remedy=remedy) from error
+
+
+class _Reader:
+    """Walks the nodes once, in their topological order, carrying shapes and number formats along."""
+
+    def __init__(self, model: onnx.ModelProto, tile_px: int, where: str) -> None:
+        graph = model.graph
+        self.nodes = list(graph.node)
+        self.constants: dict[str, TensorProto] = {t.name: t for t in graph.initializer}
+        self.constants |= {n.output[0]: t for n in graph.node for t in _constant(n)}
+        if any(t.data_location == TensorProto.EXTERNAL for t in self.constants.values()):
+            got, remedy = "constants kept in another file", "save it as one file"
+            raise ModelError(where, expected="one self-contained ONNX file", got=got, remedy=remedy)
+        self.inputs = {i.name: _input_shape(i, tile_px, where) for i in graph.input if i.name not in self.constants}
+        self.outputs = tuple(o.name for o in graph.output)
+        self.shapes: dict[str, Shape | None] = dict(self.inputs)
+        self.kinds: dict[str, Kind] = {}
+        self.integers = Integers(model, self.constants)
+
+    def network(self) -> Network:
+        """The operations, the notation of quantisation dissolved."""
+        operations = tuple(op for node in self.nodes for op in self._read(node))
+        outputs = tuple(self.integers.resolve(name) for name in self.outputs)
+        return Network(operations, self.inputs, outputs, self.integers.present)
+
+    def _read(self, node: onnx.NodeProto) -> Iterator[Operation]:
+        if node.op_type == "Constant" or self.integers.is_notation(node):
+            return
+        weight = self._weight(node)
+        kind = "activation" if self._is_activation(node) else _kind(node, weight)
+        activations = self.integers.activations(node)
+        shapes = tuple(self.shapes.get(name) for name in activations)
+        window, channels = _window(node, weight, shapes), _channels(node, weight, shapes)
+        shape = out_shape(node, kind, shapes, window, channels[1], self.constants)
+        outputs = tuple(self.integers.resolve(name) for name in node.output if name)
+        self.shapes |= dict.fromkeys(outputs, shape)
+        self.kinds |= dict.fromkeys(outputs, kind)
+        operation = Operation(
+            name=node.name or node.output[0],
+            op_type=node.op_type,
+            kind=kind,
+            inputs=activations,
+            outputs=outputs,
+            in_shapes=shapes,
+            out_shape=shape,
+            window=window,
+            channels=channels,
+            weight_bytes=_count(weight) if weight is not None else 0,
+            attributes=_attributes(node),
+            follows=self.kinds.get(activations[0]) if activations else None,
+            integer=self.integers.is_integer(node),
+            scales=self.integers.scales(node),
+        )
+        yield replace(operation, constant_shape=self._constant_shape(node, operation))
+
+    def _weight(self, node: onnx.NodeProto) -> TensorProto | None:
+        place = {"Conv": 1, "ConvTranspose": 1, "QLinearConv": 3}.get(node.op_type)
+        name = node.input[place] if place is not None and len(node.input) > place else ""
+        return self.constants.get(self.integers.resolve(name))
+
+    def _is_activation(self, node: onnx.NodeProto) -> bool:
+        """max(q, zero point), the ReLU of integers; and Clip from 0 to 6, which is ReLU6."""
+        constants = [self.constants[name] for name in node.input[1:] if name in self.constants]
+        if node.op_type == "Max":
+            return self.integers.is_integer(node) and len(constants) == len(node.input) - 1 == 1
+        limits = [float(numpy_helper.to_array(t).ravel()[0]) for t in constants if _count(t) == 1]
+        return node.op_type == "Clip" and limits == [0.0, 6.0]
+
+    def _constant_shape(self, node: onnx.NodeProto, op: Operation) -> tuple[int, ...] | None:
+        """Shape of the constant operand of an element-wise operator."""
+        if op.kind not in ("add", "mul") and op.op_type not in ("Sub", "Div"):
+            return None
+        behind = (self.integers.resolve(name) for name in node.input[: 2 if "QLinear" not in op.op_type else 4])
+        found = [self.constants[name] for name in behind if name in self.constants]
+        first = next((t for t in found if len(op.inputs) == 1), None)
+        return tuple(first.dims) if first is not None else None
+
+
+def _kind(node: onnx.NodeProto, weight: TensorProto | None) -> Kind:
+    kind = KINDS.get(node.op_type, "other")
+    if kind != "conv":
+        return kind
+    groups = int(_number(_attributes(node), "group", 1))
+    if groups == 1 or weight is None:
+        return "conv"
+    return "depthwise" if weight.dims[1] == 1 else "grouped conv"
+
+
+def _window(node: onnx.NodeProto, weight: TensorProto | None, shapes: tuple[Shape | None, ...]) -> Window:
+    given = _attributes(node)
+    whole = shapes[0][1:] if "Global" in node.op_type and shapes and shapes[0] else (1, 1)
+    kernel = _pair(given, "kernel_shape", weight.dims[2:4] if weight is not None else whole)
+    pads = given.get("pads", (0, 0, 0, 0)) if node.op_type != "Pad" else (0, 0, 0, 0)
+    top, left, bottom, right = pads if isinstance(pads, list | tuple) and len(pads) == 4 else (0, 0, 0, 0)
+    window = Window(
+        kernel,
+        _pair(given, "strides", (1, 1)),
+        (int(top), int(left), int(bottom), int(right)),
+        _pair(given, "dilations", (1, 1)),
+        _pair(given, "output_padding", (0, 0)),
+    )
+    return padding(given, shapes[0] if shapes else None, window)
+
+
+def _channels(node: onnx.NodeProto, weight: TensorProto | None, shapes: tuple[Shape | None, ...]) -> tuple[int, int]:
+    groups = int(_number(_attributes(node), "group", 1))
+    if weight is None:
+        channels = shapes[0][0] if shapes and shapes[0] else 0
+        return channels, channels
+    if node.op_type == "ConvTranspose":
+        return weight.dims[0], weight.dims[1] * groups
+    return weight.dims[1] * groups, weight.dims[0]
+
+
+def _constant(node: onnx.NodeProto) -> list[TensorProto]:
+    return [a.t for a in node.attribute if a.name == "value"] if node.op_type == "Constant" else []
+
+
+def _attributes(node: onnx.NodeProto) -> dict[str, object]:
+    return {a.name: helper.get_attribute_value(a) for a in node.attribute}
+
+
+def _number(attributes: dict[str, object], key: str, default: int) -> float:
+    value = attributes.get(key, default)
+    return float(value) if isinstance(value, int | float) else default
+
+
+def _pair(attributes: dict[str, object], key: str, default: object) -> tuple[int, int]:
+    given = attributes.get(key, default)
+    values = [int(v) for v in given] if hasattr(given, "__iter__") else []
+    return (values[0], values[1]) if len(values) == 2 else (1, 1)
+
+
+def _count(tensor: TensorProto) -> int:
+    count = 1
+    for size in tensor.dims:
+        count *= size
+    return count
+
+
+def _input_shape(info: onnx.ValueInfoProto, tile_px: int, where: str) -> Shape:
+    """(C, tile, tile) of an input (N, C, H, W).
+
+    Raises:
+        ModelError: not such an input, or one fixed to another tile.
+    """
+    sizes = [d.dim_value for d in info.type.tensor_type.shape.dim]
+    if len(sizes) != 4 or sizes[1] < 1:
+        raise ModelError(
+            where, expected="inputs (N, C, H, W)", got=f"{info.name} {sizes}", remedy="export the network as such"
+        )
+    fixed = {size for size in sizes[2:] if size} - {tile_px}
+    if fixed:
+        raise ModelError(
+            where,
+            expected=f"an input that takes {tile_px} x {tile_px} pixels",
+            got=f"one fixed to {sizes[2]} x {sizes[3]}",
+            remedy=f"pass --tile {min(fixed)}, or export it with free sizes",
+        )
+    return (sizes[1], tile_px, tile_px)

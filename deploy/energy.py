@@ -1,0 +1,46 @@
+"""Energy of this machine's processor from the counters that Linux exposes (RAPL); never a guess from a data sheet."""
+
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import TypeVar
+
+from deploy.results import Figure, measured, unavailable
+
+POWERCAP = Path("/sys/class/powercap")
+
+Result = TypeVar("Result")
+
+
+def timed(work: Callable[[], Result], powercap: Path = POWERCAP) -> tuple[Result, float, Figure]:
+    """Do some work; return its result, its wall time in seconds, and the processor packages' mean power."""
+    before = _read(powercap)
+    start = time.perf_counter()
+    result = work()
+    elapsed_s = time.perf_counter() - start
+    return result, elapsed_s, _power(before, _read(powercap), elapsed_s)
+
+
+def _power(before: dict[Path, int] | str, after: dict[Path, int] | str, elapsed_s: float) -> Figure:
+    if isinstance(before, str) or isinstance(after, str):
+        return unavailable("W", before if isinstance(before, str) else str(after))
+    if elapsed_s <= 0:
+        return unavailable("W", "the work took no time that the clock can tell")
+    energy_uj = sum(_advance(domain, before[domain], after[domain]) for domain in before)
+    return measured(energy_uj / 1e6 / elapsed_s, "W", "RAPL package counters over the same window")
+
+
+def _advance(domain: Path, before: int, after: int) -> int:
+    """Counts between two readings of a counter that starts again at its range; one turn at most (minutes)."""
+    return after - before if after >= before else after - before + int((domain / "max_energy_range_uj").read_text())
+
+
+def _read(powercap: Path) -> dict[Path, int] | str:
+    """Counters of the packages in microjoules, or why there are none."""
+    try:
+        domains = [d for d in sorted(powercap.glob("*rapl*:*")) if (d / "name").read_text().startswith("package")]
+        counters = {domain: int((domain / "energy_uj").read_text()) for domain in domains}
+    except (OSError, ValueError) as error:
+        reason = error.strerror if isinstance(error, OSError) else "no number in it"
+        return f"RAPL energy counters cannot be read here ({reason})"
+    return counters or "this machine shows no RAPL energy counters (usual in virtual machines)"

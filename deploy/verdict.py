@@ -1,0 +1,27 @@
+"""The float/INT8 gate's figures as a row of results."""
+
+import math
+
+from deploy.results import Figure, Row, measured, unavailable
+from quant.gate import GateResult
+
+
+def gate_row(result: GateResult) -> Row:
+    """What INT8 changes, on patches that calibration did not see."""
+    source = f"{result.patches} simulated patches of 128 x 128"
+
+    def figure(value: float, unit: str) -> Figure:
+        if math.isinf(value):
+            return unavailable(unit, "infinite: the two images are identical")
+        return measured(value, unit, source)
+
+    figures = {
+        "MAE": figure(result.mae, "of full scale"),
+        "std": figure(result.std, "of full scale"),
+        "max": figure(result.max_abs, "of full scale"),
+        "PSNR float-INT8": figure(result.psnr_between_db, "dB"),
+        "PSNR degraded": figure(result.psnr_degraded_db, "dB"),
+        "PSNR float": figure(result.psnr_float_db, "dB"),
+        "PSNR INT8": figure(result.psnr_int8_db, "dB"),
+    }
+    return Row("gate", "INT8 against float", figures)

@@ -1,0 +1,110 @@
+"""Small ONNX files made node by node, for the tests of the checker and the cost model."""
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+import onnx
+from onnx import TensorProto, helper, numpy_helper
+
+Value = int | float | str | list[int]
+
+
+class Sketch:
+    """A network under construction; every method returns the name of its result."""
+
+    def __init__(self, channels: int = 8) -> None:
+        self.input = helper.make_tensor_value_info("image", TensorProto.FLOAT, ["N", channels, "H", "W"])
+        self.nodes: list[onnx.NodeProto] = []
+        self.constants: list[onnx.TensorProto] = []
+
+    def constant(self, value: np.ndarray) -> str:
+        name = f"constant{len(self.constants)}"
+        self.constants.append(numpy_helper.from_array(value, name))
+        return name
+
+    def node(self, op_type: str, *inputs: str, domain: Value = "", **attributes: Value) -> str:
+        name = f"{op_type.lower()}{len(self.nodes)}"
+        node = helper.make_node(op_type, list(inputs), [name], name=name, domain=str(domain))
+        node.attribute.extend(helper.make_attribute(key, value) for key, value in attributes.items())
+        self.nodes.append(node)
+        return name
+
+    def weight(self, *shape: int) -> str:
+        return self.constant(np.zeros(shape, np.float32))
+
+    def conv(self, source: str, weight: tuple[int, ...] = (8, 8, 3, 3), **attributes: Value) -> str:
+        given: Mapping[str, Value] = {"pads": [weight[2] // 2, weight[3] // 2] * 2, **attributes}
+        return self.node("Conv", source, self.weight(*weight), **given)
+
+    def save(self, path: Path, *results: str) -> Path:
+        ends = [helper.make_tensor_value_info(r, TensorProto.FLOAT, ["N", "C", "H2", "W2"]) for r in results]
+        graph = helper.make_graph(self.nodes, "sketch", [self.input], ends, self.constants)
+        opsets = [helper.make_opsetid("", 17), helper.make_opsetid("com.microsoft", 1)]
+        onnx.save_model(helper.make_model(graph, opset_imports=opsets, ir_version=8), path)
+        return path
+
+
+def float_convbeers(path: Path, blocks: int, features: int) -> Path:
+    """The float spelling: head, residual blocks, body end, tail, global add."""
+    sketch = Sketch(channels=1)
+    wide = (features, features, 3, 3)
+    stream = head = sketch.conv("image", (features, 1, 3, 3))
+    for _ in range(blocks):
+        inner = sketch.node("Relu", sketch.conv(stream, wide))
+        stream = sketch.node("Add", stream, sketch.conv(inner, wide))
+    deep = sketch.node("Add", head, sketch.conv(stream, wide))
+    return sketch.save(path, sketch.node("Add", "image", sketch.conv(deep, (1, features, 3, 3))))
+
+
+class IntegerSketch(Sketch):
+    """A sketch whose nodes are onnxruntime's integer kernels."""
+
+    def __init__(self, channels: int = 1, scale: float = 2.0**-7, zero: int = 0) -> None:
+        super().__init__(channels)
+        self.numbers = (self.constant(np.array(scale, np.float32)), self.constant(np.array(zero, np.int8)))
+
+    def quantised(self, source: str) -> str:
+        return self.node("QuantizeLinear", source, *self.numbers)
+
+    def qconv(self, source: str, weight: tuple[int, ...], weight_scale: float = 2.0**-7) -> str:
+        pads = [weight[2] // 2, weight[3] // 2] * 2
+        kernel = self.constant(np.ones(weight, np.int8))
+        scale, zero = self.constant(np.array(weight_scale, np.float32)), self.numbers[1]
+        return self.node("QLinearConv", source, *self.numbers, kernel, scale, zero, *self.numbers, pads=pads)
+
+    def qadd(self, one: str, other: str) -> str:
+        feeds = (one, *self.numbers, other, *self.numbers, *self.numbers)
+        return self.node("QLinearAdd", *feeds, domain="com.microsoft")
+
+
+def integer_convbeers(path: Path, blocks: int, features: int, weight_scale: float = 2.0**-7) -> Path:
+    """The host's integer spelling, one int8 plane in, the correction added to the image behind."""
+    s = IntegerSketch()
+    wide = (features, features, 3, 3)
+    stream = head = s.qconv(s.quantised("image"), (features, 1, 3, 3), weight_scale)
+    for _ in range(blocks):
+        inner = s.node("Relu", s.qconv(stream, wide, weight_scale))
+        stream = s.qadd(stream, s.qconv(inner, wide, weight_scale))
+    deep = s.qadd(head, s.qconv(stream, wide, weight_scale))
+    correction = s.node("DequantizeLinear", s.qconv(deep, (1, features, 3, 3), weight_scale), *s.numbers)
+    return s.save(path, s.node("Add", "image", correction))
+
+
+def board_convbeers(path: Path, blocks: int, features: int) -> Path:
+    """The board's QDQ spelling of the core by itself, int8 weights and bias through DequantizeLinear."""
+    s = IntegerSketch()
+
+    def pair(source: str) -> str:
+        return s.node("DequantizeLinear", s.node("QuantizeLinear", source, *s.numbers), *s.numbers)
+
+    def conv(source: str, *weight: int) -> str:
+        feeds = (s.constant(np.ones(shape, np.int8)) for shape in (weight, weight[:1]))
+        return s.node("Conv", source, *(s.node("DequantizeLinear", f, *s.numbers) for f in feeds), pads=[1] * 4)
+
+    stream = head = pair(conv(pair("image"), features, 1, 3, 3))
+    for _ in range(blocks):
+        inner = pair(s.node("Relu", conv(stream, features, features, 3, 3)))
+        stream = pair(s.node("Add", stream, pair(conv(inner, features, features, 3, 3))))
+    deep = pair(s.node("Add", head, pair(conv(stream, features, features, 3, 3))))
+    return s.save(path, pair(conv(deep, 1, features, 3, 3)))

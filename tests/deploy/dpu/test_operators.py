@@ -1,0 +1,235 @@
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from deploy.dpu.board import Dpu, load_dpu
+from deploy.dpu.operators import all_rules, rule_name, rule_text
+from deploy.dpu.placement import place
+from deploy.dpu.reading import read_network
+from profiles.errors import OptionError, ProfileError
+from tests.deploy.dpu.graphs import IntegerSketch, Sketch, Value, integer_convbeers
+
+Draw = Callable[[Sketch, str], str]
+DPU = load_dpu()
+TILE_PX = 288
+
+
+def broken_rules(path: Path, dpu: Dpu = DPU, tile_px: int = TILE_PX) -> list[str]:
+    return [broken.rule for node in place(read_network(path, tile_px), dpu).nodes for broken in node.broken]
+
+
+def between_convs(tmp_path: Path, draw: Draw, channels: int = 8) -> list[str]:
+    """Rules broken by what `draw` puts between two convolutions."""
+    sketch = Sketch(channels)
+    middle = draw(sketch, sketch.conv("image", (channels, channels, 1, 1)))
+    result = sketch.node("AveragePool", middle, kernel_shape=[1, 1])
+    end = sketch.conv(result, (1, sketch_channels(sketch, middle, channels), 1, 1))
+    return broken_rules(sketch.save(tmp_path / "net.onnx", end))
+
+
+def sketch_channels(sketch: Sketch, tensor: str, default: int) -> int:
+    """Output channels of a convolution's result; the stream's own for all else."""
+    weights = {t.name: t.dims for t in sketch.constants}
+    for node in sketch.nodes:
+        if node.output[0] == tensor and node.op_type in ("Conv", "ConvTranspose"):
+            return int(weights[node.input[1]][0 if node.op_type == "Conv" else 1])
+    return default
+
+
+def conv(*weight: int, **attributes: Value) -> Draw:
+    return lambda sketch, source: sketch.conv(source, weight, **attributes)
+
+
+def transposed(*weight: int, **attributes: Value) -> Draw:
+    return lambda sketch, source: sketch.node("ConvTranspose", source, sketch.weight(*weight), **attributes)
+
+
+def node(op_type: str, **attributes: Value) -> Draw:
+    return lambda sketch, source: sketch.node(op_type, source, **attributes)
+
+
+def scaled(*shape: int) -> Draw:
+    return lambda sketch, source: sketch.node("Mul", source, sketch.weight(*shape))
+
+
+def resized(scale: float, **attributes: Value) -> Draw:
+    import numpy as np
+
+    return lambda sketch, source: sketch.node(
+        "Resize", source, "", sketch.constant(np.array([1, 1, scale, scale], np.float32)), **attributes
+    )
+
+
+def padded(mode: str) -> Draw:
+    import numpy as np
+
+    pads = np.array([0, 0, 2, 2, 0, 0, 2, 2], np.int64)
+    return lambda sketch, source: sketch.node("Pad", source, sketch.constant(pads), mode=mode)
+
+
+def behind_conv(op_type: str, **attributes: Value) -> Draw:
+    return lambda sketch, source: sketch.node(op_type, sketch.conv(source, (8, 8, 3, 3)), **attributes)
+
+
+def behind_sum(op_type: str, **attributes: Value) -> Draw:
+    return lambda sketch, source: sketch.node(op_type, sketch.node("Add", source, source), **attributes)
+
+
+# Each rule with a network that breaks it alone, and the same network with the remedy followed.
+CASES: dict[str, tuple[Draw, Draw]] = {
+    "conv kernel": (conv(8, 8, 17, 1), conv(8, 8, 15, 1)),
+    "conv stride": (conv(8, 8, 3, 3, strides=[9, 9]), conv(8, 8, 3, 3, strides=[3, 3])),
+    "conv padding": (conv(8, 8, 3, 3, pads=[3, 1, 1, 1]), conv(8, 8, 3, 3, pads=[2, 1, 1, 1])),
+    "conv window": (conv(8, 8, 9, 8), conv(8, 8, 8, 8)),
+    "conv dilation": (
+        conv(8, 8, 3, 1, dilations=[513, 1], pads=[513, 0, 513, 0]),
+        conv(8, 8, 3, 1, dilations=[512, 1], pads=[513, 0, 513, 0]),
+    ),
+    "conv groups": (conv(8, 4, 3, 3, group=2), conv(8, 8, 3, 3)),
+    "depthwise kernel": (conv(8, 1, 257, 1, group=8, pads=[15, 0, 15, 0]), conv(8, 1, 255, 1, group=8, pads=[0] * 4)),
+    "depthwise stride": (conv(8, 1, 3, 3, group=8, strides=[257, 1]), conv(8, 1, 3, 3, group=8)),
+    "depthwise padding": (
+        conv(8, 1, 3, 3, group=8, pads=[16, 1, 1, 1]),
+        conv(8, 1, 3, 3, group=8, pads=[15, 1, 9, 9]),
+    ),
+    "transposed kernel": (transposed(8, 8, 2, 2, strides=[3, 3]), transposed(8, 8, 4, 4, strides=[2, 2])),
+    "transposed output padding": (
+        transposed(8, 8, 3, 3, strides=[2, 2], output_padding=[1, 1]),
+        transposed(8, 8, 4, 4, strides=[2, 2], pads=[1, 1, 1, 1]),
+    ),
+    "transposed padding": (transposed(8, 8, 2, 2, pads=[3, 0, 0, 0]), transposed(8, 8, 2, 2, pads=[2, 0, 0, 0])),
+    "pool kernel": (node("MaxPool", kernel_shape=[257, 1]), node("MaxPool", kernel_shape=[17, 1])),
+    "pool stride": (node("MaxPool", kernel_shape=[2, 2], strides=[257, 1]), node("MaxPool", kernel_shape=[2, 2])),
+    "pool padding": (
+        node("MaxPool", kernel_shape=[20, 20], pads=[16, 0, 0, 0]),
+        node("MaxPool", kernel_shape=[20, 20], pads=[15, 0, 0, 0]),
+    ),
+    "activation place": (
+        lambda s, x: s.node("Relu", s.node("MaxPool", x, kernel_shape=[2, 2])),
+        lambda s, x: s.node("MaxPool", s.node("Relu", x), kernel_shape=[2, 2]),
+    ),
+    "activation of sums": (behind_sum("HardSigmoid"), behind_sum("Relu")),
+    "leaky relu alpha": (behind_conv("LeakyRelu", alpha=0.1), behind_conv("LeakyRelu", alpha=26 / 256)),
+    "mul constant": (scaled(1, 8, 3, 3), scaled(1, 8, 1, 1)),
+    "pad mode": (padded("reflect"), padded("constant")),
+    "resize mode": (resized(2, mode="cubic"), resized(2, mode="nearest")),
+    "resize scale": (resized(3, mode="linear"), resized(2, mode="linear")),
+    "pixel shuffle": (node("DepthToSpace", blocksize=1), resized(1, mode="nearest")),
+    "known operator": (behind_conv("Sigmoid"), behind_conv("HardSigmoid")),
+}
+WIDE = {"conv channels", "conv weight bank", "depthwise channels", "transposed channels", "resize channels"}
+NUMBERS = {
+    "on integers",
+    "symmetric",
+    "per tensor",
+    "power of two",
+    "shift cut",
+    "shift bias",
+    "shift read",
+    "shift write",
+    "same position",
+}
+
+
+def test_every_rule_has_a_case() -> None:
+    assert {rule_name(rule) for rule in all_rules()} == set(CASES) | WIDE | NUMBERS
+
+
+@pytest.mark.parametrize("rule", CASES)
+def test_each_rule_refuses_its_case_alone(tmp_path: Path, rule: str) -> None:
+    assert between_convs(tmp_path, CASES[rule][0]) == [rule]
+
+
+@pytest.mark.parametrize("rule", CASES)
+def test_following_the_remedy_passes(tmp_path: Path, rule: str) -> None:
+    assert between_convs(tmp_path, CASES[rule][1]) == []
+
+
+@pytest.mark.parametrize(
+    ("rule", "draw", "channels"),
+    [
+        ("conv channels", conv(4097, 8, 1, 1), 8),
+        ("conv weight bank", conv(1, 2048, 8, 8, pads=[3] * 4), 2048),
+        ("transposed channels", transposed(8, 4097, 1, 1), 8),
+    ],
+)
+def test_wide_layers(tmp_path: Path, rule: str, draw: Draw, channels: int) -> None:
+    sketch = Sketch(channels)
+    assert broken_rules(sketch.save(tmp_path / "w.onnx", draw(sketch, "image"))) == [rule]
+
+
+@pytest.mark.parametrize(
+    ("rule", "draw"),
+    [("depthwise channels", conv(4097, 1, 3, 3, group=4097)), ("resize channels", resized(2, mode="nearest"))],
+)
+def test_too_many_channels_for_the_alu_and_resize(tmp_path: Path, rule: str, draw: Draw) -> None:
+    sketch = Sketch(4097)
+    assert broken_rules(sketch.save(tmp_path / "w.onnx", draw(sketch, "image"))) == [rule]
+
+
+def test_all_broken_rules_of_a_node_are_listed(tmp_path: Path) -> None:
+    draw = conv(8, 4, 17, 9, group=2, strides=[9, 1], pads=[0, 0, 20, 0])
+    found = between_convs(tmp_path, draw)
+    assert found == ["conv kernel", "conv stride", "conv padding", "conv window", "conv groups"]
+
+
+def test_a_wider_array_needs_more_of_the_weight_bank(tmp_path: Path) -> None:
+    sketch = Sketch(1024)
+    path = sketch.save(tmp_path / "w.onnx", sketch.conv("image", (4, 1024, 8, 8)))
+    assert broken_rules(path, load_dpu("vck190", "C32B1")) == []
+    assert broken_rules(path, load_dpu("vck190", "C64B1")) == ["conv weight bank"]
+
+
+def test_legal_integers_pass(tmp_path: Path) -> None:
+    assert broken_rules(integer_convbeers(tmp_path / "i.onnx", 1, 8)) == []
+
+
+def test_free_scales_are_refused(tmp_path: Path) -> None:
+    assert set(broken_rules(integer_convbeers(tmp_path / "i.onnx", 1, 8, weight_scale=0.01))) == {"power of two"}
+
+
+@pytest.mark.parametrize(("rule", "weight_scale"), [("shift cut", 2.0), ("shift cut", 2.0**-20)])
+def test_shifts_out_of_reach_are_refused(tmp_path: Path, rule: str, weight_scale: float) -> None:
+    assert set(broken_rules(integer_convbeers(tmp_path / "i.onnx", 1, 8, weight_scale))) == {rule}
+
+
+def test_asymmetric_integers_are_refused(tmp_path: Path) -> None:
+    sketch = IntegerSketch(zero=3)
+    path = sketch.save(
+        tmp_path / "z.onnx",
+        sketch.node("DequantizeLinear", sketch.qconv(sketch.quantised("image"), (4, 1, 3, 3)), *sketch.numbers),
+    )
+    assert broken_rules(path) == ["symmetric"]
+
+
+def test_a_float_convolution_in_a_quantised_file_is_refused(tmp_path: Path) -> None:
+    sketch = IntegerSketch()
+    first = sketch.qconv(sketch.quantised("image"), (4, 1, 3, 3))
+    path = sketch.save(
+        tmp_path / "f.onnx", sketch.conv(sketch.node("DequantizeLinear", first, *sketch.numbers), (1, 4, 3, 3))
+    )
+    assert "on integers" in broken_rules(path)
+
+
+def test_rules_read_with_the_targets_limits() -> None:
+    texts = {rule_name(rule): rule_text(rule, DPU) for rule in all_rules()}
+    assert texts["conv kernel"] == "Kernel height and width are 1 to 16 (UG1414 3.5, conv2d)."
+    assert not [text for text in texts.values() if "{" in text or "(" not in text]
+
+
+def test_findings_name_the_numbers_and_a_remedy(tmp_path: Path) -> None:
+    sketch = Sketch(8)
+    path = sketch.save(tmp_path / "k.onnx", sketch.conv("image", (8, 8, 17, 1)))
+    (broken,) = place(read_network(path, TILE_PX), DPU).nodes[0].broken
+    assert broken.finding.reason == "kernel (17 x 1) is not in the DPU's range 1 to 16"
+    assert "at most 16" in broken.finding.remedy
+
+
+def test_unknown_configuration_and_target() -> None:
+    with pytest.raises(ProfileError, match="C32B3"):
+        load_dpu("vck190", "C99B9")
+    with pytest.raises(ProfileError, match="vck190"):
+        load_dpu("vck9000")
+    with pytest.raises(OptionError, match="with a DPU"):
+        load_dpu("host-cpu")

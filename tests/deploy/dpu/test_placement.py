@@ -1,0 +1,85 @@
+from pathlib import Path
+
+from deploy.dpu.board import load_dpu
+from deploy.dpu.placement import FLOAT_NOTE, place
+from deploy.dpu.reading import read_network
+from tests.deploy.dpu.graphs import (
+    IntegerSketch,
+    Sketch,
+    board_convbeers,
+    float_convbeers,
+    integer_convbeers,
+)
+
+DPU = load_dpu()
+
+
+def test_the_integer_file_has_three_parts_and_one_subgraph(tmp_path: Path) -> None:
+    placement = place(read_network(integer_convbeers(tmp_path / "i.onnx", 2, 8), 53), DPU)
+    parts = [node.part for node in placement.nodes]
+    assert parts[0] == "host-front"
+    assert parts[-2:] == ["host-back", "host-back"]
+    assert set(parts[1:-2]) == {"dpu-core"}
+    assert placement.dpu_subgraphs == 1
+    assert not placement.failed
+    assert [(cut.size_bytes, cut.onto_dpu) for cut in placement.cuts] == [(53 * 53, True), (53 * 53, False)]
+
+
+def test_a_float_file_is_judged_as_if_quantised(tmp_path: Path) -> None:
+    placement = place(read_network(float_convbeers(tmp_path / "f.onnx", 2, 8), 53), DPU)
+    assert placement.note == FLOAT_NOTE
+    assert [node.part for node in placement.nodes].count("host-back") == 1
+    assert placement.nodes[-1].part == "host-back"
+    assert (placement.dpu_subgraphs, placement.failed) == (1, ())
+
+
+def test_the_board_file_is_all_core_but_its_conversions(tmp_path: Path) -> None:
+    placement = place(read_network(board_convbeers(tmp_path / "b.onnx", 2, 8), 53), DPU)
+    assert [node.device for node in placement.nodes if node.part != "dpu-core"] == ["host", "host"]
+    assert (placement.dpu_subgraphs, placement.failed) == (1, ())
+
+
+def test_an_operator_in_the_middle_cuts_the_core_in_two(tmp_path: Path) -> None:
+    sketch = Sketch(8)
+    middle = sketch.node("Sigmoid", sketch.conv("image"))
+    path = sketch.save(tmp_path / "s.onnx", sketch.conv(middle))
+    placement = place(read_network(path, 21), DPU)
+    assert placement.dpu_subgraphs == 2
+    assert [node.device for node in placement.nodes] == ["DPU", "CPU", "DPU"]
+    assert len(placement.cuts) == 4
+    assert {cut.size_bytes for cut in placement.cuts} == {8 * 21 * 21}
+
+
+def test_a_branch_past_the_cpu_does_not_join_what_it_parts(tmp_path: Path) -> None:
+    """The skip ends in the second piece: were the two one, it would wait for itself."""
+    sketch = Sketch(8)
+    first = sketch.conv("image")
+    end = sketch.node("Add", first, sketch.conv(sketch.node("Sigmoid", first)))
+    placement = place(read_network(sketch.save(tmp_path / "b.onnx", end), 21), DPU)
+    assert placement.dpu_subgraphs == 2
+
+
+def test_two_heads_of_one_input_are_two_pieces(tmp_path: Path) -> None:
+    sketch = Sketch(8)
+    path = sketch.save(tmp_path / "t.onnx", sketch.conv("image"), sketch.conv("image"))
+    assert place(read_network(path, 21), DPU).dpu_subgraphs == 2
+
+
+def test_scaling_in_front_is_the_hosts_but_other_operators_are_refused(tmp_path: Path) -> None:
+    sketch = Sketch(8)
+    scaled = sketch.node("Div", "image", sketch.weight(1))
+    placement = place(read_network(sketch.save(tmp_path / "d.onnx", sketch.conv(scaled)), 20), DPU)
+    assert [node.part for node in placement.nodes] == ["host-front", "dpu-core"]
+
+    sketch = Sketch(2)
+    apart = sketch.node("SpaceToDepth", "image", blocksize=2)
+    placement = place(read_network(sketch.save(tmp_path / "a.onnx", sketch.conv(apart)), 20), DPU)
+    assert [node.device for node in placement.nodes] == ["CPU", "DPU"]
+
+
+def test_a_relu_behind_the_last_convolution_stays_on_the_dpu(tmp_path: Path) -> None:
+    sketch = IntegerSketch()
+    last = sketch.node("Relu", sketch.qconv(sketch.quantised("image"), (4, 1, 3, 3)))
+    path = sketch.save(tmp_path / "r.onnx", sketch.node("DequantizeLinear", last, *sketch.numbers))
+    devices = [node.device for node in place(read_network(path, 20), DPU).nodes]
+    assert devices == ["host", "DPU", "DPU", "host"]

@@ -1,0 +1,162 @@
+import contextlib
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import onnx
+import pytest
+from onnx import TensorProto, numpy_helper
+
+from deploy.dpu.board import load_dpu
+from deploy.dpu.graph import Operation
+from deploy.dpu.placement import place
+from deploy.dpu.reading import network_of, read_network
+from profiles.errors import ModelError
+from tests.deploy.dpu.graphs import (
+    Sketch,
+    board_convbeers,
+    float_convbeers,
+    integer_convbeers,
+)
+
+
+def core(path: Path) -> list[tuple[object, ...]]:
+    """What the three spellings have in common."""
+    kinds = ("conv", "add", "activation")
+    names = {name: k for k, op in enumerate(read_network(path, 96).operations) for name in op.outputs}
+
+    def plain(op: Operation) -> tuple[object, ...]:
+        return (op.kind, op.in_shapes, op.out_shape, op.window, op.channels, op.weight_bytes, op.follows)
+
+    assert names
+    return [plain(op) for op in read_network(path, 96).operations if op.kind in kinds]
+
+
+def test_three_spellings_are_one_network(tmp_path: Path) -> None:
+    spelt = [
+        core(make(tmp_path / f"{k}.onnx", 2, 24))
+        for k, make in enumerate((float_convbeers, integer_convbeers, board_convbeers))
+    ]
+    head, tail = spelt[0][0], spelt[0][-2]
+    assert head[4] == (1, 24)
+    assert tail[4] == (24, 1)
+    # The head differs in what stands before it (a quantiser or nothing), the global add in which files hold it.
+    assert [row[:-1] for row in spelt[0]] == [row[:-1] for row in spelt[1]]
+    assert [row[:-1] for row in spelt[0][:-1]] == [row[:-1] for row in spelt[2]]
+
+
+def test_board_file_keeps_only_the_conversions_at_its_border(tmp_path: Path) -> None:
+    kinds = [op.kind for op in read_network(board_convbeers(tmp_path / "b.onnx", 3, 8), 64).operations]
+    assert kinds.count("quantise") == 1
+    assert kinds.count("dequantise") == 1
+    assert (kinds[0], kinds[-1]) == ("quantise", "dequantise")
+
+
+def test_numbers_of_a_board_file_reach_its_operations(tmp_path: Path) -> None:
+    network = read_network(board_convbeers(tmp_path / "b.onnx", 1, 8), 64)
+    conv = next(op for op in network.operations if op.kind == "conv")
+    assert conv.integer
+    assert {role: scale.position for role, scale in conv.scales.items()} == dict.fromkeys(
+        ("input 0", "weight", "bias", "output"), 7
+    )
+
+
+@pytest.mark.parametrize(
+    ("attributes", "expected"),
+    [
+        ({"pads": [0, 0, 0, 0]}, (5, 35, 35)),
+        ({"strides": [2, 2]}, (5, 19, 19)),
+        ({"dilations": [3, 3], "pads": [3, 3, 3, 3]}, (5, 37, 37)),
+        ({"auto_pad": "SAME_UPPER", "strides": [2, 2], "pads": [0, 0, 0, 0]}, (5, 19, 19)),
+    ],
+)
+def test_convolution_shapes(tmp_path: Path, attributes: dict[str, list[int]], expected: tuple[int, int, int]) -> None:
+    sketch = Sketch(3)
+    path = sketch.save(tmp_path / "c.onnx", sketch.conv("image", (5, 3, 3, 3), **attributes))
+    assert read_network(path, 37).operations[0].out_shape == expected
+
+
+def test_shapes_go_on_past_operators_of_onnxruntime_and_odd_ones(tmp_path: Path) -> None:
+    sketch = Sketch(4)
+    apart = sketch.node("SpaceToDepth", sketch.conv("image", (4, 4, 3, 3)), blocksize=2)
+    up = sketch.node("ConvTranspose", apart, sketch.weight(16, 6, 4, 4), strides=[2, 2], pads=[1, 1, 1, 1])
+    joined = sketch.node("Concat", up, up, axis=1)
+    path = sketch.save(tmp_path / "o.onnx", sketch.node("MaxPool", joined, kernel_shape=[2, 2], strides=[2, 2]))
+    shapes = [op.out_shape for op in read_network(path, 30).operations]
+    assert shapes == [(4, 30, 30), (16, 15, 15), (6, 30, 30), (12, 30, 30), (12, 15, 15)]
+
+
+def test_an_unknown_operator_hides_the_shape_but_not_the_network(tmp_path: Path) -> None:
+    sketch = Sketch(4)
+    odd = sketch.node("Mystery", sketch.conv("image", (4, 4, 3, 3)), domain="com.microsoft")
+    sketch.save(tmp_path / "m.onnx", sketch.conv(odd, (4, 4, 3, 3)))
+    after = read_network(tmp_path / "m.onnx", 30).operations[-1]
+    assert after.out_shape is None
+    with pytest.raises(ModelError, match="hides the shape"):
+        _ = after.operations
+
+
+@pytest.mark.parametrize("content", [b"", b"not an onnx file at all", b"\x08\x07"])
+def test_garbage_is_refused_in_one_sentence(tmp_path: Path, content: bytes) -> None:
+    (tmp_path / "bad.onnx").write_bytes(content)
+    with pytest.raises(ModelError, match=r"bad\.onnx: expected .*, got .*; .*\.$"):
+        read_network(tmp_path / "bad.onnx")
+
+
+def test_weights_in_other_files_are_refused(tmp_path: Path) -> None:
+    sketch = Sketch(2)
+    path = sketch.save(tmp_path / "e.onnx", sketch.conv("image", (2, 2, 3, 3)))
+    model = onnx.load_model(path)
+    weight = model.graph.initializer[0]
+    weight.CopyFrom(TensorProto(name=weight.name, dims=weight.dims, data_type=weight.data_type))
+    weight.data_location = TensorProto.EXTERNAL
+    weight.external_data.add(key="location", value="weights.bin")
+    path.write_bytes(model.SerializeToString())
+    with pytest.raises(ModelError):
+        read_network(path)
+
+
+def test_a_model_fixed_to_another_tile_says_which(tmp_path: Path) -> None:
+    sketch = Sketch(2)
+    for dimension in sketch.input.type.tensor_type.shape.dim[2:]:
+        dimension.dim_value = 48
+    path = sketch.save(tmp_path / "f.onnx", sketch.conv("image", (2, 2, 3, 3)))
+    assert read_network(path, 48).operations[0].out_shape == (2, 48, 48)
+    with pytest.raises(ModelError, match="--tile 48"):
+        read_network(path, 640)
+
+
+def test_inputs_that_are_no_images_are_refused(tmp_path: Path) -> None:
+    sketch = Sketch(2)
+    del sketch.input.type.tensor_type.shape.dim[3]
+    sketch.constants.append(numpy_helper.from_array(np.zeros(1, np.float32), "one"))
+    path = sketch.save(tmp_path / "i.onnx", sketch.node("Add", "image", "one"))
+    with pytest.raises(ModelError, match="inputs"):
+        read_network(path)
+
+
+@pytest.mark.parametrize(
+    "draw",
+    [
+        lambda s: s.node("QLinearAdd", "image", domain="com.microsoft"),
+        lambda s: s.conv("image", (2, 2, 3, 3), strides=[0, 0]),
+        lambda s: s.node("Conv", "image", s.constant(np.zeros(2, np.float32))),
+        lambda s: s.node("QuantizeLinear", "image", s.constant(np.zeros(0, np.float32))),
+    ],
+)
+def test_nodes_that_cannot_be_never_end_in_a_traceback(tmp_path: Path, draw: Callable[[Sketch], str]) -> None:
+    sketch = Sketch(2)
+    path = sketch.save(tmp_path / "x.onnx", draw(sketch))
+    with contextlib.suppress(ModelError):
+        place(read_network(path, 32), load_dpu())
+
+
+def test_constant_nodes_in_other_files_are_refused(tmp_path: Path) -> None:
+    sketch = Sketch(2)
+    path = sketch.save(tmp_path / "e.onnx", sketch.conv("image", (2, 2, 3, 3)))
+    model = onnx.load_model(path)
+    tensor = TensorProto(name="far", dims=[1], data_type=TensorProto.FLOAT, data_location=TensorProto.EXTERNAL)
+    tensor.external_data.add(key="location", value="far.bin")
+    model.graph.node.insert(0, onnx.helper.make_node("Constant", [], ["far"], value=tensor))
+    with pytest.raises(ModelError, match="another file"):
+        network_of(model, 32)

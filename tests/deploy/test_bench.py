@@ -1,0 +1,181 @@
+import json
+import math
+from pathlib import Path
+
+import jsonschema
+import numpy as np
+import pytest
+import tifffile
+import typer
+from typer.testing import CliRunner
+
+from deploy.bench import Swath, efficiency, layer_rows, predict_file, predicted_rows, published_rows
+from deploy.commands.bench import bench, parse_size
+from deploy.commands.check import check
+from deploy.dpu.board import load_dpu
+from deploy.measure import CROP_PX, Sensors, drawn_acquisition, traditional_rows
+from deploy.results import SCHEMA_PATH, Row, measured, predicted, unavailable
+from profiles import load_sensor
+from profiles.errors import BeersError, ImageError, OptionError, ProfileError
+from tests.deploy.dpu.graphs import Sketch, float_convbeers, integer_convbeers
+
+DPU = load_dpu()
+SENSORS = Sensors(load_sensor("pleiades-degraded"), load_sensor("pleiades-reference"))
+
+
+def run(command: str, *arguments: str) -> tuple[int, str]:
+    """Run one command as the command line does; errors pass through."""
+    app = typer.Typer()
+    app.command("check")(check)
+    app.command("bench")(bench)
+    result = CliRunner().invoke(app, [command, *arguments])
+    if isinstance(result.exception, BeersError):
+        raise result.exception
+    return result.exit_code, result.output
+
+
+def document(path: Path) -> dict[str, list[dict[str, object]]]:
+    content = json.loads(path.read_text())
+    jsonschema.validate(content, json.loads(SCHEMA_PATH.read_text()))
+    return dict(content)
+
+
+def value(row: Row, key: str) -> float:
+    number = row.figures[key].value
+    assert number is not None
+    return number
+
+
+def test_a_swath_is_predicted_as_the_paper_counts_and_in_whole_tiles(tmp_path: Path) -> None:
+    prediction = predict_file(float_convbeers(tmp_path / "f.onnx", 16, 64), DPU)
+    swath = Swath(13600, 9016, 640, 35)
+    fraction, whole = predicted_rows("ConvBEERS", prediction, swath, DPU)
+    assert value(fraction, "latency") == pytest.approx(swath.frames / prediction.fps)
+    assert value(whole, "tiles") == 384
+    assert value(whole, "latency") == pytest.approx(128 * prediction.batch_time_s)
+    for row in (fraction, whole):
+        assert {figure.mode for figure in row.figures.values()} == {"predicted"}
+        low, high = row.figures["latency"].interval or (0, 0)
+        assert low < value(row, "latency") < high
+    low, high = fraction.figures["latency"].interval or (0, 0)
+    assert low < 42 < high
+    low, high = fraction.figures["efficiency"].interval or (0, 0)
+    assert low < 98965 < high
+
+
+def test_a_last_batch_that_is_not_full_still_takes_its_time(tmp_path: Path) -> None:
+    prediction = predict_file(float_convbeers(tmp_path / "f.onnx", 1, 16), DPU, 64)
+    _, whole = predicted_rows("net", prediction, Swath(64, 64, 64, 5), DPU)
+    assert value(whole, "latency") == pytest.approx(prediction.batch_time_s)
+
+
+def test_rows_of_layers_sum_to_their_last(tmp_path: Path) -> None:
+    rows = layer_rows(predict_file(integer_convbeers(tmp_path / "i.onnx", 2, 24), DPU, 333))
+    *parts, total = (value(row, "time") for row in rows)
+    assert math.fsum(parts) == pytest.approx(total, rel=1e-12)
+
+
+def test_published_rows_are_the_papers_and_agree_with_each_other() -> None:
+    traditional, network = published_rows()
+    assert value(traditional, "latency") / value(network, "latency") == pytest.approx(41, abs=0.5)
+    for row in (traditional, network):
+        rate = 13600 * 9016 / value(row, "latency") / value(row, "power")
+        assert rate == pytest.approx(value(row, "efficiency"), rel=0.01)
+        assert {figure.mode for figure in row.figures.values()} == {"published"}
+
+
+def test_efficiency_is_only_as_good_as_its_parts() -> None:
+    time, power = measured(2.0, "s", "clock"), measured(5.0, "W", "counter")
+    assert efficiency(1000, time, power).mode == "measured"
+    assert efficiency(1000, time, unavailable("W", "no counter")).reason == "no counter"
+    mixed = efficiency(1000, predicted(2.0, "s", (1.0, 4.0), "model"), power)
+    assert (mixed.mode, mixed.value, mixed.interval) == ("predicted", 100.0, (50.0, 200.0))
+
+
+def test_a_small_image_is_measured_whole() -> None:
+    swath = Swath(61, 47)
+    (row,) = traditional_rows(drawn_acquisition(swath, SENSORS), swath, SENSORS)
+    assert row.figures["latency"].mode == "measured"
+    assert row.figures["throughput"].mode == "measured"
+
+
+def test_a_large_swath_is_predicted_from_crops_and_says_so() -> None:
+    swath = Swath(13600, 9016)
+    dn = np.full((70, 90), 1000, np.float32)
+    (row,) = traditional_rows(dn, swath, SENSORS)
+    latency = row.figures["latency"]
+    assert latency.mode == "predicted"
+    assert "3 crops of 90 x 70" in latency.source
+    assert latency.interval is not None
+    assert latency.interval[0] <= value(row, "latency") <= latency.interval[1]
+
+
+def test_no_budget_means_no_whole_run() -> None:
+    swath = Swath(33, 33)
+    (row,) = traditional_rows(drawn_acquisition(swath, SENSORS), swath, SENSORS, budget_s=0)
+    assert row.figures["latency"].mode == "predicted"
+
+
+def test_a_drawn_acquisition_is_no_larger_than_the_crops_need() -> None:
+    assert drawn_acquisition(Swath(61, 47), SENSORS).shape == (47, 61)
+    assert drawn_acquisition(Swath(300, 90), SENSORS).shape == (90, 300)
+    assert max(drawn_acquisition(Swath(9000, 40), SENSORS).shape) == 3 * CROP_PX
+
+
+@pytest.mark.parametrize("text", ["13600", "0x5", "ax5", "13600x", "1x2x3", "-4x4"])
+def test_a_bad_size_is_refused(text: str) -> None:
+    with pytest.raises(OptionError, match="13600x9016"):
+        parse_size(text)
+
+
+def test_bench_writes_a_valid_document(tmp_path: Path) -> None:
+    image, out = tmp_path / "raw.tif", tmp_path / "out.json"
+    tifffile.imwrite(image, np.random.default_rng(0).integers(300, 900, (51, 63), dtype=np.uint16))
+    model = integer_convbeers(tmp_path / "net.onnx", 1, 8)
+    code, _ = run("bench", str(model), "--image", str(image), "--tile", "32", "--json", str(out))
+    assert code == 0
+    written = document(out)
+    assert [entry["name"] for entry in written["inputs"]] == ["net.onnx", "raw.tif"]
+    names = [str(row["name"]) for row in written["rows"]]
+    assert sum("paper:" in name for name in names) == 2
+    assert any("halo 5 px" in name for name in names)
+
+
+def test_bench_on_this_machine(tmp_path: Path) -> None:
+    model, out = integer_convbeers(tmp_path / "net.onnx", 1, 8), tmp_path / "host.json"
+    code, output = run("bench", str(model), "--target", "host", "--tile", "32", "--json", str(out))
+    assert code == 0
+    assert "no proxy" in output
+    (row,) = document(out)["rows"]
+    assert isinstance(row["figures"], dict)
+    assert row["figures"]["p50"]["value"] <= row["figures"]["p90"]["value"]
+
+
+def test_check_passes_and_fails_by_exit_code(tmp_path: Path) -> None:
+    out = tmp_path / "check.json"
+    code, output = run("check", str(integer_convbeers(tmp_path / "net.onnx", 1, 8)), "--json", str(out))
+    assert (code, "DPU subgraphs: 1" in output) == (0, True)
+    document(out)
+
+    sketch = Sketch(8)
+    bad = sketch.save(tmp_path / "bad.onnx", sketch.conv(sketch.node("Sigmoid", sketch.conv("image"))))
+    code, output = run("check", str(bad), "--json", str(out))
+    assert (code, "FAILED" in output) == (1, True)
+    refused = [row for row in document(out)["rows"] if "remedy" in dict(row["text"])]  # type: ignore[call-overload]
+    assert len(refused) == 1
+
+
+def test_bad_options_are_refused(tmp_path: Path) -> None:
+    model = str(integer_convbeers(tmp_path / "net.onnx", 1, 8))
+    with pytest.raises(ProfileError, match="--config"):
+        run("bench", model, "--config", "C1B1")
+    with pytest.raises(OptionError, match="--tile"):
+        run("bench", model, "--tile", "16", "--halo", "8")
+    colour = tmp_path / "rgb.tif"
+    tifffile.imwrite(colour, np.zeros((8, 9, 3), np.uint8), photometric="rgb")
+    with pytest.raises(ImageError, match="one band"):
+        run("bench", model, "--image", str(colour))
+    mono = tmp_path / "mono.tif"
+    tifffile.imwrite(mono, np.zeros((8, 9), np.uint16))
+    with pytest.raises(OptionError, match="--size"):
+        run("bench", model, "--image", str(mono), "--size", "3x4")

@@ -1,0 +1,186 @@
+"""The command line as a user meets it: help, exit codes, one sentence for each fault, nothing half-written."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import jsonschema
+import numpy as np
+import onnx
+import pytest
+import tifffile
+from onnx import numpy_helper
+from PIL import Image
+from typer.testing import CliRunner
+
+from deploy.cli import COMMANDS, app
+from deploy.defaults import default_int8
+from deploy.results import SCHEMA_PATH
+
+runner = CliRunner()
+
+
+def acquisition(path: Path, height: int = 37, width: int = 61) -> Path:
+    dn = np.random.default_rng(0).integers(200, 1800, (height, width))
+    tifffile.imwrite(path, dn.astype(np.uint16))
+    return path
+
+
+def fails(arguments: list[str], *words: str) -> None:
+    """Exit code 2 and one sentence with these words; no traceback."""
+    result = runner.invoke(app, arguments)
+    assert result.exit_code == 2, result.output
+    message = result.stderr.strip()
+    assert message.startswith("beers-deploy: ")
+    assert "\n" not in message
+    assert "Traceback" not in message
+    for word in ("expected", "got", *words):
+        assert word in message
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_every_command_has_help_with_an_example(name: str) -> None:
+    result = runner.invoke(app, [name, "--help"])
+    assert result.exit_code == 0
+    assert f"beers-deploy {name}" in " ".join(result.output.split())
+    assert "Example" in result.output
+
+
+def test_help_imports_nothing_heavy() -> None:
+    code = "import sys; import deploy.cli; print([m for m in ('torch', 'onnxruntime', 'onnx') if m in sys.modules])"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
+
+
+def test_the_command_reference_is_fresh() -> None:
+    root = Path(__file__).parents[2]
+    code = (
+        "import sys; sys.path.insert(0, 'docs'); from make_commands import reference; sys.stdout.write(reference())"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=root)
+    assert done.stdout == (root / "docs" / "commands.md").read_text(), "run python docs/make_commands.py"
+
+
+def test_version() -> None:
+    assert runner.invoke(app, ["--version"]).output.startswith("beers-deploy 0.")
+
+
+def test_restore_writes_a_whole_twelve_bit_image(tmp_path: Path) -> None:
+    image, out = acquisition(tmp_path / "raw.tif"), tmp_path / "made" / "restored.tif"
+    result = runner.invoke(app, ["restore", str(image), str(out)])
+    assert result.exit_code == 0, result.output
+    restored = tifffile.imread(out)
+    assert restored.dtype == np.uint16
+    assert restored.shape == (37, 61)
+    assert restored.max() <= 4095
+    assert [p.name for p in out.parent.iterdir()] == ["restored.tif"]
+
+
+def test_tile_size_changes_no_pixel(tmp_path: Path) -> None:
+    image = acquisition(tmp_path / "raw.tif", 83, 97)
+    for tile in ("640", "48"):
+        arguments = ["restore", str(image), str(tmp_path / f"{tile}.tif"), "--tile", tile]
+        assert runner.invoke(app, arguments).exit_code == 0
+    np.testing.assert_array_equal(tifffile.imread(tmp_path / "48.tif"), tifffile.imread(tmp_path / "640.tif"))
+
+
+def bad_images(folder: Path) -> dict[str, Path]:
+    (folder / "empty.tif").write_bytes(b"")
+    (folder / "text.tif").write_text("no image at all")
+    tifffile.imwrite(folder / "bands.tif", np.zeros((20, 20, 3), np.uint16), photometric="rgb")
+    tifffile.imwrite(folder / "nan.tif", np.full((20, 20), np.nan, np.float32))
+    tifffile.imwrite(folder / "bright.tif", np.full((20, 20), 60000, np.uint16))
+    Image.new("RGB", (20, 20)).save(folder / "colour.png")
+    return {path.stem: path for path in folder.iterdir()} | {"missing": folder / "missing.tif"}
+
+
+@pytest.mark.parametrize(
+    ("name", "word"),
+    [
+        ("empty", "empty file"),
+        ("text", "readable TIFF"),
+        ("bands", "3 bands"),
+        ("nan", "NaN"),
+        ("bright", "60000"),
+        ("colour", "3 bands"),
+        ("missing", "no such file"),
+    ],
+)
+def test_restore_refuses_what_is_no_acquisition(name: str, word: str, tmp_path: Path) -> None:
+    folder = tmp_path / "in"
+    folder.mkdir()
+    fails(["restore", str(bad_images(folder)[name]), str(tmp_path / "out.tif")], word)
+    assert not (tmp_path / "out.tif").exists()
+
+
+def test_unwritable_output_is_one_sentence(tmp_path: Path) -> None:
+    image = acquisition(tmp_path / "raw.tif")
+    fails(["restore", str(image), str(image / "below-a-file.tif")], "raw.tif")
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["profiles", "no-such-sensor"],
+        ["gate", "--sensor", "no-such-sensor"],
+        ["export", "--out", "x.onnx", "--variant", "no-such-variant"],
+        ["export", "--out", "x.onnx", "--checkpoint", "missing.safetensors"],
+        ["quantize", "missing.onnx", "--out", "x.onnx"],
+        ["check", "missing.onnx"],
+        ["check", "--config", "C99"],
+        ["check", "--target", "no-such-target"],
+        ["evaluate", "--images", "no-such-folder"],
+        ["evaluate", "--methods", "magic"],
+        ["bench", "--size", "big"],
+        ["restore", "missing.tif", "x.tif", "--halo", "wide"],
+    ],
+)
+def test_wrong_values_are_one_sentence(arguments: list[str]) -> None:
+    fails(arguments)
+
+
+def test_garbage_models_are_refused(tmp_path: Path) -> None:
+    for name, content in (("empty.onnx", b""), ("text.onnx", b"not a model")):
+        path = tmp_path / name
+        path.write_bytes(content)
+        fails(["check", str(path)], name)
+        fails(["quantize", str(path), "--out", str(tmp_path / "x.onnx")], name)
+
+
+def test_the_gate_passes_the_shipped_network_and_stops_a_broken_one(tmp_path: Path) -> None:
+    figures = tmp_path / "gate.json"
+    sound = runner.invoke(app, ["gate", "--patches", "4", "--json", str(figures)])
+    assert sound.exit_code == 0, sound.output
+    jsonschema.validate(json.loads(figures.read_text()), json.loads(SCHEMA_PATH.read_text()))
+    weights = tmp_path / "float.onnx"
+    assert runner.invoke(app, ["export", "--out", str(weights)]).exit_code == 0
+    broken = runner.invoke(app, ["gate", str(weights), str(broken_copy(tmp_path)), "--patches", "4"])
+    assert broken.exit_code == 1
+    assert "FAILED" in broken.output
+
+
+def broken_copy(folder: Path) -> Path:
+    """The shipped INT8 network with one convolution's weights turned upside down."""
+    model = onnx.load(default_int8())
+    tensor = next(t for t in model.graph.initializer if t.name == "body.3.first.weight")
+    tensor.CopyFrom(numpy_helper.from_array(numpy_helper.to_array(tensor)[:, :, ::-1].copy(), tensor.name))
+    onnx.save(model, folder / "broken.onnx")
+    return folder / "broken.onnx"
+
+
+def test_profiles_show_every_source() -> None:
+    assert "pleiades-degraded" in runner.invoke(app, ["profiles"]).output
+    shown = runner.invoke(app, ["profiles", "pleiades-degraded"]).output
+    assert "gain_dn_per_radiance" in shown
+    assert "assumed" in shown
+
+
+def test_simulated_pairs_are_the_same_bytes_for_the_same_seed(tmp_path: Path) -> None:
+    scene = tmp_path / "scene.png"
+    pixels = np.random.default_rng(0).integers(0, 255, (500, 560, 3))
+    Image.fromarray(pixels.astype(np.uint8)).save(scene)
+    for run in ("a", "b"):
+        assert runner.invoke(app, ["simulate", str(scene), "--out", str(tmp_path / run)]).exit_code == 0
+    for name in ("scene-degraded.tif", "scene-reference.tif"):
+        assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes()

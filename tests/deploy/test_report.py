@@ -1,0 +1,50 @@
+import numpy as np
+
+from deploy.report.page import Picture, Report, Table, render
+from deploy.report.pictures import busiest_window, picture_url, stretch_of, strip
+from deploy.results import Row, measured, predicted, unavailable
+
+
+def report() -> Report:
+    figures = {
+        "latency": predicted(1.25, "s", (1.0, 2.0), "a cost model"),
+        "PSNR": measured(41.5, "dB", "a pair"),
+        "power": unavailable("W", "no counter on this <machine>"),
+    }
+    table = Table("Times", [Row("bench", "network & more", figures)], "a caption")
+    picture = Picture("a crop", picture_url(np.zeros((4, 5), np.uint8)), "what it shows")
+    return Report("A title", "A headline.", [table], [picture], ["a note"])
+
+
+def test_every_number_shows_its_mode_and_source() -> None:
+    page = render(report())
+    for text in ("1.25 [1, 2]", "predicted", "a cost model", "41.5", "measured", "a note"):
+        assert text in page
+
+
+def test_the_page_asks_the_network_for_nothing() -> None:
+    page = render(report())
+    for word in ("http://", "https://", 'src="/', "<script", "@import", "url("):
+        assert word not in page
+
+
+def test_words_are_escaped() -> None:
+    page = render(report())
+    assert "no counter on this &lt;machine&gt;" in page
+    assert "network &amp; more" in page
+
+
+def test_the_busiest_window_lies_on_the_texture() -> None:
+    dn = np.full((90, 130), 500.0)
+    dn[50:80, 90:120] += np.random.default_rng(0).integers(0, 800, (30, 30))
+    top, left = busiest_window(dn, 20)
+    assert 40 <= top <= 70
+    assert 80 <= left <= 110
+
+
+def test_compared_crops_share_one_stretch() -> None:
+    dark, bright = np.full((30, 40), 100.0), np.full((30, 40), 900.0)
+    stretch = stretch_of(np.concatenate([dark, bright]))
+    picture = np.asarray(strip({"dark": dark, "bright": bright}, (0, 0), 20, 2, stretch))
+    assert picture[-1, 0] < 20
+    assert picture[-1, -1] > 235
