@@ -20,10 +20,11 @@ from deploy.evaluate import Method, fidelity_row
 from deploy.export import parity
 from deploy.measure import Sensors, traditional_rows
 from deploy.report.page import Picture, Report, Table
-from deploy.report.pictures import busiest_window, picture_url, stretch_of, strip
+from deploy.report.pictures import busiest_windows, picture_url, stretch_of, strip
 from deploy.restore import TILE_PX, read_acquisition, restore_image, write_tiff
 from deploy.results import Row, measured
 from deploy.verdict import gate_row
+from model.files import whole_file
 from model.images import read_pixels
 from model.simulator.acquire import MARGIN_PX, Pair, simulate_pair
 from model.simulator.draws import Draw
@@ -42,7 +43,7 @@ from quant.session import open_session
 SENSOR = "pleiades-degraded"
 SIDE_PX = 640
 CALIBRATION_PATCHES, GATE_PATCHES = 24, 12
-CROP_PX, ZOOM = 120, 3
+CROP_PX, ZOOM = 110, 3
 PAPER_SWATH = (13600, 9016)
 
 
@@ -89,12 +90,12 @@ def _simulated(scene: Scene, seed: int) -> Input:
 def run_demo(image: Path | None, out: Path, seed: int, say: Callable[[str], None]) -> Demo:
     """Run the chain, write its files into `out`, and return the figures and the report.
 
-    Files: float.onnx, int8.onnx, core.onnx (the board's spelling), restored.tif.
+    Files: float.onnx, int8.onnx, core.onnx (the board's spelling), restored.tif, before-after.png.
     """
     say("reading the image")
     given = read_input(image, seed)
     say("exporting, quantising and gating")
-    gate_row, int8, parity_row = quantise_and_gate(out, seed)
+    gate, int8, exact = quantise_and_gate(out, seed)
     say("checking every operator against the DPU")
     dpu = load_dpu()
     placement = place(read_network(out / "int8.onnx", TILE_PX), dpu)
@@ -102,11 +103,15 @@ def run_demo(image: Path | None, out: Path, seed: int, say: Callable[[str], None
     methods = _methods(int8)
     restored = {name: method(given.degraded) for name, method in methods.items()}
     write_tiff(out / "restored.tif", restored[INT8].astype(np.uint16))
+    images = {"degraded input": given.degraded, **restored}
+    if given.pair is not None:
+        images["reference"] = given.pair.reference.numpy()
+    pictures = _pictures(images, out)
     quality = _quality(given, restored)
     say("measuring the traditional pipeline, predicting the board")
     bench, swath = bench_rows(out / "int8.onnx", given.degraded, dpu, receptive_radius_px(int8))
-    rows = (*bench, *swath, *quality, gate_row, parity_row)
-    return Demo(rows, _report(given, restored, bench, swath, quality, (gate_row, parity_row), placement))
+    rows = (*bench, *swath, *quality, gate, exact)
+    return Demo(rows, _report(given, pictures, bench, swath, quality, (gate, exact), placement))
 
 
 TRADITIONAL, INT8 = "traditional", f"{VARIANT}, INT8"
@@ -169,16 +174,13 @@ def _quality(given: Input, restored: dict[str, np.ndarray]) -> list[Row]:
 
 def _report(
     given: Input,
-    restored: dict[str, np.ndarray],
+    pictures: list[Picture],
     bench: list[Row],
     swath: list[Row],
     quality: list[Row],
     gate: tuple[Row, ...],
     placement: Placement,
 ) -> Report:
-    images = {"degraded input": given.degraded, **restored}
-    if given.pair is not None:
-        images["reference"] = given.pair.reference.numpy()
     tables = [
         Table(f"Time and power for this image, {given.degraded.shape[1]} x {given.degraded.shape[0]}", bench),
         Table(f"A swath of {PAPER_SWATH[0]} x {PAPER_SWATH[1]}, beside the paper's figures", swath, SWATH_CAPTION),
@@ -189,7 +191,7 @@ def _report(
         "From training to board, on one image",
         headline(bench, quality, placement),
         tables,
-        _pictures(images),
+        pictures,
         NOTES,
     )
 
@@ -225,17 +227,21 @@ def headline(bench: list[Row], quality: list[Row], placement: Placement) -> str:
     return text + "."
 
 
-def _pictures(images: dict[str, np.ndarray]) -> list[Picture]:
+def _pictures(images: dict[str, np.ndarray], out: Path) -> list[Picture]:
     first = next(iter(images.values()))
     side = min(CROP_PX, *first.shape)
     stretch = stretch_of(first)
-    window = busiest_window(first, side)
-    crops = strip(images, window, side, ZOOM, stretch)
+    windows = busiest_windows(first, side)
+    crops = strip(images, windows, side, ZOOM, stretch)
+    with whole_file(out / "before-after.png") as temporary:
+        crops.save(temporary, "PNG", optimize=True)
     whole = stretch.to_bytes(images[INT8])[: 2 * SIDE_PX, : 2 * SIDE_PX]
-    where = f"rows {window[0]} to {window[0] + side}, columns {window[1]} to {window[1] + side}"
+    where = " and ".join(f"row {top}, column {left}" for top, left in windows)
     return [
         Picture(
-            "The same crop, before and after", picture_url(np.asarray(crops)), f"Enlarged {ZOOM} times: {where}."
+            "The same crops, before and after",
+            picture_url(np.asarray(crops)),
+            f"{side} pixels a side from {where}, enlarged {ZOOM} times.",
         ),
         Picture(f"Restored by {INT8}", picture_url(whole), "The network's output, same grey scale as above."),
     ]

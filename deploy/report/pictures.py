@@ -5,10 +5,10 @@ import io
 from dataclasses import dataclass
 
 import numpy as np
-from PIL import Image, ImageDraw
+from PIL import Image, ImageDraw, ImageFont
 
 GAMMA = 1 / 1.8
-LABEL_PX = 18
+LABEL_PX, GAP_PX = 22, 4
 
 
 @dataclass(frozen=True)
@@ -30,15 +30,22 @@ def stretch_of(dn: np.ndarray) -> Stretch:
     return Stretch(float(black), float(white))
 
 
-def busiest_window(dn: np.ndarray, side_px: int) -> tuple[int, int]:
-    """Top and left of the window with the strongest gradients, on a coarse grid: where a crop is worth showing."""
+def busiest_windows(dn: np.ndarray, side_px: int) -> list[tuple[int, int]]:
+    """(top, left) of the window with the strongest gradients in the upper and in the lower half of an image.
+
+    Only one where the image is too low for two.
+    """
+    half = dn.shape[0] // 2
+    if half < side_px:
+        return [_busiest(dn, side_px)]
+    top, left = _busiest(dn[half:], side_px)
+    return [_busiest(dn[:half], side_px), (half + top, left)]
+
+
+def _busiest(dn: np.ndarray, side_px: int) -> tuple[int, int]:
     gradient = np.abs(np.diff(dn, axis=0))[:, :-1] + np.abs(np.diff(dn, axis=1))[:-1]
-    height, width = dn.shape
-    corners = [
-        (top, left)
-        for top in range(0, max(height - side_px, 0) + 1, max(side_px // 2, 1))
-        for left in range(0, max(width - side_px, 0) + 1, max(side_px // 2, 1))
-    ]
+    rows, columns = (range(0, max(size - side_px, 0) + 1, max(side_px // 2, 1)) for size in dn.shape)
+    corners = [(top, left) for top in rows for left in columns]
     return max(corners, key=lambda c: float(gradient[c[0] : c[0] + side_px, c[1] : c[1] + side_px].mean()))
 
 
@@ -50,16 +57,18 @@ def picture_url(grey: np.ndarray) -> str:
 
 
 def strip(
-    images: dict[str, np.ndarray], window: tuple[int, int], side_px: int, zoom: int, stretch: Stretch
+    images: dict[str, np.ndarray], windows: list[tuple[int, int]], side_px: int, zoom: int, stretch: Stretch
 ) -> Image.Image:
-    """The same crop of several (H, W) images side by side, enlarged without smoothing, each under its name."""
-    top, left = window
+    """The same crops of several (H, W) images: a column an image under its name, a row a window, no smoothing."""
     size = side_px * zoom
-    canvas = Image.new("L", (len(images) * (size + 4) - 4, size + LABEL_PX), 255)
+    canvas = Image.new("L", (len(images) * (size + GAP_PX) - GAP_PX, len(windows) * (size + GAP_PX) + LABEL_PX), 255)
     draw = ImageDraw.Draw(canvas)
-    for k, (name, dn) in enumerate(images.items()):
-        crop = Image.fromarray(stretch.to_bytes(dn[top : top + side_px, left : left + side_px]))
-        crop = crop.resize((crop.width * zoom, crop.height * zoom), Image.Resampling.NEAREST)
-        canvas.paste(crop, (k * (size + 4), LABEL_PX))
-        draw.text((k * (size + 4) + 2, 2), name, fill=0)
+    font = ImageFont.load_default(size=LABEL_PX - 6)
+    for column, (name, dn) in enumerate(images.items()):
+        left = column * (size + GAP_PX)
+        draw.text((left + 2, 1), name, fill=0, font=font)
+        for row, (y, x) in enumerate(windows):
+            crop = Image.fromarray(stretch.to_bytes(dn[y : y + side_px, x : x + side_px]))
+            crop = crop.resize((crop.width * zoom, crop.height * zoom), Image.Resampling.NEAREST)
+            canvas.paste(crop, (left, LABEL_PX + row * (size + GAP_PX)))
     return canvas
