@@ -3,7 +3,7 @@
 import hashlib
 import os
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from profiles.errors import MachineError
@@ -22,11 +22,34 @@ def whole_file(path: Path) -> Iterator[Path]:
         yield temporary
         temporary.replace(path)
     except OSError as error:
-        raise MachineError(
-            str(path), expected="a place to write to", got=error.strerror or str(error), remedy="choose another path"
-        ) from error
+        raise _unwritable(path, error.strerror or str(error)) from error
     finally:
-        temporary.unlink(missing_ok=True)
+        with suppress(OSError):
+            temporary.unlink()
+
+
+def require_writable(*paths: Path | None) -> None:
+    """Find out before long work, not after it, that an output cannot be written; None asks for no output.
+
+    Raises:
+        MachineError: a path is a folder, or its folder cannot be made or written to.
+    """
+    for path in paths:
+        if path is None:
+            continue
+        if path.is_dir():
+            raise _unwritable(path, "a folder")
+        probe = path.with_name(f".{path.name}.{os.getpid()}.probe")
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            probe.touch()
+            probe.unlink()
+        except OSError as error:
+            raise _unwritable(path, error.strerror or str(error)) from error
+
+
+def _unwritable(path: Path, got: str) -> MachineError:
+    return MachineError(str(path), expected="a place to write to", got=got, remedy="choose another path")
 
 
 def write_text(path: Path, text: str) -> None:

@@ -45,8 +45,10 @@ def bench(
     from deploy.measure import host_rows
     from deploy.results import Document
     from deploy.tables import print_rows
+    from model.files import require_writable
     from profiles import load_target
 
+    require_writable(json)
     path = model or default_int8()
     if target is Target.host:
         rows = host_rows(path, load_target("host-cpu"), tile, threads)

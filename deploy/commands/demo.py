@@ -19,7 +19,9 @@ def demo(
     from deploy.report.page import write_report
     from deploy.results import Document
     from deploy.tables import print_rows
+    from model.files import require_writable
 
+    require_writable(out / "report.html", json)
     result = run_demo(image, out, seed, lambda step: typer.echo(step, err=True))
     write_report(result.report, out / "report.html")
     for table in result.report.tables:

@@ -24,9 +24,11 @@ def evaluate(
     from deploy.progress import steps
     from deploy.results import Document
     from deploy.tables import print_rows
+    from model.files import require_writable
     from profiles import load_sensor
     from profiles.errors import ImageError
 
+    require_writable(json)
     eyes = load_sensor(sensor), load_sensor(reference)
     names = list(dict.fromkeys(["degraded", *(name.strip() for name in methods.split(","))]))
     chosen = [(name, method_named(name, *eyes)) for name in names]

@@ -31,12 +31,14 @@ def gate(
     from deploy.results import Document
     from deploy.tables import print_rows
     from deploy.verdict import gate_row
+    from model.files import require_writable
     from profiles import load_sensor
     from quant.calibration import REFERENCE, draw_patches
     from quant.gate import compare
     from quant.onnx_file import load_onnx
     from quant.session import open_session
 
+    require_writable(json)
     float_path, int8_path = float_model or default_float_weights(), int8_model or default_int8()
     sessions = open_session(read_float(float_path)), open_session(load_onnx(int8_path))
     degraded, reference = load_sensor(sensor), load_sensor(REFERENCE)

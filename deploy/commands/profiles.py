@@ -16,9 +16,9 @@ def profiles(
     ] = None,
 ) -> None:
     """List sensors and targets, or show one: every constant, its status and its source."""
-    from rich.console import Console
     from rich.table import Table
 
+    from deploy.tables import default_console
     from profiles import load_sensor, load_target, sensor_names, target_names
 
     table = Table("name" if name is None else "constant", title_justify="left")
@@ -36,7 +36,7 @@ def profiles(
         table.title = title
         for key, constant in constants:
             table.add_row(key, str(constant), constant.status, constant.source)
-    Console().print(table)
+    default_console().print(table)
 
 
 def _constants(name: str) -> "tuple[str, list[tuple[str, Constant]]]":

@@ -23,11 +23,13 @@ def quantize(
     """Quantise to int8 with power-of-two positions: the correction on the DPU, the 12-bit add on the host."""
     from deploy.defaults import load_scenes
     from deploy.progress import steps
+    from model.files import require_writable
     from profiles import load_sensor, load_target
     from quant.calibration import REFERENCE, draw_patches
     from quant.onnx_file import load_onnx, save_onnx
     from quant.quantise import PASSES, quantise_model
 
+    require_writable(out, board)
     board_target = load_target(target)
     float_model = load_onnx(model)
     degraded, reference = load_sensor(sensor), load_sensor(REFERENCE)

@@ -23,10 +23,12 @@ def restore(
     from deploy.progress import steps
     from deploy.restore import check_fixed_tile, parse_halo, read_acquisition, restore_image, write_tiff
     from deploy.tiling import plan_tiles
+    from model.files import require_writable
     from quant.onnx_file import load_onnx
     from quant.radius import receptive_radius_px
     from quant.session import open_session
 
+    require_writable(out)
     network = load_onnx(model or default_int8())
     halo_px = parse_halo(halo, receptive_radius_px(network))
     dn = read_acquisition(image)

@@ -23,6 +23,7 @@ def train(
 ) -> None:
     """Train a network on pairs simulated on the fly; resumable, the same weights for the same seed."""
     from deploy.progress import steps as progress
+    from model.files import require_writable
     from model.images import list_images
     from model.patches import PatchRecipe, PatchSource
     from model.simulator.scene import read_scene
@@ -34,6 +35,7 @@ def train(
     shape = variant_named(variant)
     recipe = PatchRecipe(load_sensor(sensor), load_sensor(reference), patch_px=patch)
     files = list_images(images)
+    require_writable(out / f"{variant}.safetensors")
     trainer = Trainer(shape, TrainingRecipe(steps=steps, batch=batch, seed=seed), device)
     checkpoint = out / "checkpoint.safetensors"
     if resume:
@@ -48,7 +50,6 @@ def train(
             scenes.append(read_scene(file, recipe.reference.nominal()))
             bar.advance()
     source = PatchSource(scenes, recipe, batch, seed)
-    out.mkdir(parents=True, exist_ok=True)
     with (out / "log.csv").open("a") as log, progress("training", steps) as bar:
         bar.advance(trainer.step)
 
