@@ -16,6 +16,8 @@ from quant.onnx_file import load_onnx
 VARIANT = "convbeers-s"
 SCENES = 3
 SCENE_SIDE_PX = 2400
+HELD_OUT_SEED = 1000
+"""Added to a run's seed where patches must be others than calibration's."""
 
 
 def default_float_weights() -> Path:
@@ -54,5 +56,10 @@ def load_scenes(folder: Path | None, sensor: Sensor, seed: int) -> list[Scene]:
     """The scenes of a folder of images, or drawn ones, other for every seed."""
     if folder is not None:
         return [read_scene(path, sensor) for path in list_images(folder)]
-    generators = np.random.default_rng(seed).spawn(SCENES)
+    return draw_scenes(SCENES, seed)
+
+
+def draw_scenes(count: int, seed: int) -> list[Scene]:
+    """Drawn scenes, each with its own generator."""
+    generators = np.random.default_rng(seed).spawn(count)
     return [procedural_scene(SCENE_SIDE_PX, SCENE_SIDE_PX, g) for g in generators]

@@ -12,7 +12,7 @@ import onnx
 import torch
 
 from deploy.bench import Swath, predict_file, predicted_rows, published_rows
-from deploy.defaults import VARIANT, default_float_weights, float_model, load_scenes
+from deploy.defaults import HELD_OUT_SEED, VARIANT, default_float_weights, float_model, load_scenes
 from deploy.dpu.board import Dpu, load_dpu
 from deploy.dpu.placement import Placement, place
 from deploy.dpu.reading import read_network
@@ -129,7 +129,8 @@ def quantise_and_gate(out: Path, seed: int) -> tuple[Row, onnx.ModelProto, Row]:
     result = quantise_model(model, patches, {"calibration_sensor": SENSOR}, lambda: None)
     save_onnx(result.host, out / "int8.onnx")
     save_onnx(result.board, out / "core.onnx")
-    held_out = draw_patches(scenes, eyes.degraded, eyes.reference, GATE_PATCHES, seed + 1)
+    unseen = load_scenes(None, eyes.reference.nominal(), seed + HELD_OUT_SEED)
+    held_out = draw_patches(unseen, eyes.degraded, eyes.reference, GATE_PATCHES, seed + HELD_OUT_SEED)
     verdict = compare(open_session(model), open_session(result.host), held_out.pairs)
     source = "one random image of 97 x 97"
     exact = Row("gate", "ONNX against torch", {"max": measured(difference, "of full scale", source)})

@@ -20,6 +20,10 @@ SCHEMA_PATH = Path(__file__).parent / "schema" / "results-1.json"
 Mode = Literal["measured", "predicted", "published", "unavailable"]
 
 
+DIGITS = {"measured": 4, "predicted": 3, "published": 12, "unavailable": 4}
+"""Significant digits shown: a prediction deserves fewer, a published figure stays as printed."""
+
+
 @dataclass(frozen=True)
 class Figure:
     """A number with its unit, its mode and its source."""
@@ -47,10 +51,11 @@ class Figure:
     def __str__(self) -> str:
         if self.value is None:
             return "unavailable"
-        text = number(self.value)
+        digits = DIGITS[self.mode]
+        text = number(self.value, digits)
         if self.interval is None or self.interval[0] == self.interval[1]:  # plain arithmetic needs no interval
             return text
-        return f"{text} [{number(self.interval[0])}, {number(self.interval[1])}]"
+        return f"{text} [{number(self.interval[0], digits)}, {number(self.interval[1], digits)}]"
 
 
 def measured(value: float, unit: str, source: str) -> Figure:
@@ -73,12 +78,12 @@ def unavailable(unit: str, reason: str) -> Figure:
     return Figure(None, unit, "unavailable", reason=reason)
 
 
-def number(value: float) -> str:
-    """Four significant digits at most, no exponent where a person would not write one."""
-    if value == 0 or 1e-4 <= abs(value) < 1e6:
-        digits = 0 if abs(value) >= 1000 else 4
-        return f"{value:.0f}" if digits == 0 else f"{value:.{digits}g}"
-    return f"{value:.3g}"
+def number(value: float, digits: int) -> str:
+    """So many significant digits, thousands grouped, no exponent where a person would not write one."""
+    rounded = float(f"{value:.{digits}g}")
+    if abs(rounded) >= 1000:
+        return f"{rounded:,.0f}"
+    return f"{rounded:.{digits}g}"
 
 
 @dataclass(frozen=True)

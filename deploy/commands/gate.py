@@ -7,9 +7,6 @@ import typer
 
 EXAMPLE = "gate float.onnx int8.onnx --max-mae 0.0012"
 
-HELD_OUT_SEED = 1000
-"""Added to the seed: the gate must not see the calibration's patches."""
-
 
 def gate(
     float_model: Annotated[
@@ -26,7 +23,7 @@ def gate(
     json: Annotated[Path | None, typer.Option(help="Write the figures here.")] = None,
 ) -> None:
     """Compare a float and an INT8 network on simulated pairs neither was calibrated on."""
-    from deploy.defaults import default_float_weights, default_int8, load_scenes
+    from deploy.defaults import HELD_OUT_SEED, default_float_weights, default_int8, load_scenes
     from deploy.defaults import float_model as read_float
     from deploy.results import Document
     from deploy.tables import print_rows

@@ -14,6 +14,7 @@ def train(
     variant: Annotated[str, typer.Option(help="Size of the network.")] = "convbeers-s",
     sensor: Annotated[str, typer.Option(help="Profile of the degraded input.")] = "pleiades-variable",
     reference: Annotated[str, typer.Option(help="Profile of the wanted output.")] = "pleiades-reference",
+    drawn: Annotated[int, typer.Option(min=0, help="Drawn scenes to add to the images.")] = 0,
     steps: Annotated[int, typer.Option(min=1, help="Gradient steps.")] = 20_000,
     batch: Annotated[int, typer.Option(min=1, help="Patches a step.")] = 8,
     patch: Annotated[int, typer.Option(min=16, help="Patch side in pixels.")] = 96,
@@ -22,6 +23,7 @@ def train(
     resume: Annotated[bool, typer.Option("--resume", help="Go on from the run's checkpoint.")] = False,
 ) -> None:
     """Train a network on pairs simulated on the fly; resumable, the same weights for the same seed."""
+    from deploy.defaults import draw_scenes
     from deploy.progress import steps as progress
     from model.files import require_writable
     from model.images import list_images
@@ -49,6 +51,7 @@ def train(
         for file in files:
             scenes.append(read_scene(file, recipe.reference.nominal()))
             bar.advance()
+    scenes += draw_scenes(drawn, seed)
     source = PatchSource(scenes, recipe, batch, seed)
     with (out / "log.csv").open("a") as log, progress("training", steps) as bar:
         bar.advance(trainer.step)
@@ -60,7 +63,7 @@ def train(
 
         trainer.run(source, checkpoint, report)
     weights = out / f"{variant}.safetensors"
-    finish(trainer, weights, describe(trainer.recipe, recipe, [f.name for f in files]))
+    finish(trainer, weights, describe(trainer.recipe, recipe, [scene.name for scene in scenes]))
     typer.echo(f"wrote {weights}")
 
 
