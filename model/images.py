@@ -1,5 +1,6 @@
 """Read pixels from TIFF, PNG or JPEG files, and refuse with one sentence what is no image."""
 
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -77,7 +78,7 @@ def _read_tiff(path: Path) -> np.ndarray:
 def _read_other(path: Path) -> np.ndarray:
     limit, Image.MAX_IMAGE_PIXELS = Image.MAX_IMAGE_PIXELS, None  # our own check knows the free memory
     try:
-        with Image.open(path) as image:
+        with warnings.catch_warnings(action="ignore"), Image.open(path) as image:  # odd EXIF is no concern of ours
             bands = 4 if image.mode == "RGBA" else len(image.getbands())
             _check_memory(path, image.width * image.height * bands)
             return np.asarray(image if image.mode in ("L", "I;16", "I", "F") else image.convert("RGB"))

@@ -131,7 +131,7 @@ def _street(
     for s in np.arange(20, length - 40, 80):
         dash = [(u0 + along[0] * t, v0 + along[1] * t) for t in (s, s + 34)]
         draw.line([place(*p) for p in dash], fill=WHITE * 0.7, width=4)
-    for s in generator.uniform(40, length - 60, int(length / 240)):
+    for s in generator.uniform(40, max(length - 60, 41), int(length / 240)):
         side = 22 * float(generator.choice([-1, 1]))
         u, v = u0 + along[0] * s - along[1] * side, v0 + along[1] * s + along[0] * side
         car = [(u - along[0] * a - along[1] * b, v - along[1] * a + along[0] * b) for a, b in _rectangle(20, 9)]

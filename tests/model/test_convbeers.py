@@ -1,0 +1,43 @@
+import pytest
+import torch
+
+from model.convbeers import VARIANTS, ConvBEERS, Variant, initialise
+
+
+def build(variant: Variant, seed: int = 0) -> ConvBEERS:
+    network = ConvBEERS(variant)
+    initialise(network, torch.Generator().manual_seed(seed))
+    return network.eval()
+
+
+@pytest.mark.parametrize(("name", "parameters"), [("convbeers", 1_219_841), ("convbeers-s", 157_825)])
+def test_the_parameters_are_those_of_the_paper(name: str, parameters: int) -> None:
+    assert sum(p.numel() for p in ConvBEERS(VARIANTS[name]).parameters()) == parameters
+
+
+@pytest.mark.parametrize("blocks", [0, 1, 3])
+def test_the_radius_is_how_far_a_gradient_reaches(blocks: int) -> None:
+    variant = Variant(blocks=blocks, features=4)
+    side, middle = 4 * variant.radius_px + 1, 2 * variant.radius_px
+    image = torch.rand(1, 1, side, side, generator=torch.Generator().manual_seed(1)).requires_grad_()
+    network = build(variant)
+    for module in network.modules():
+        if isinstance(module, torch.nn.Conv2d) and module.bias is not None:
+            torch.nn.init.constant_(module.bias, 0.5)  # keep the ReLUs open
+    network(image)[0, 0, middle, middle].backward()
+    assert image.grad is not None
+    rows = image.grad[0, 0].abs().sum(1).nonzero().flatten()
+    assert (middle - int(rows.min()), int(rows.max()) - middle) == (variant.radius_px, variant.radius_px)
+
+
+def test_a_new_network_is_nearly_the_identity() -> None:
+    image = torch.rand(1, 1, 37, 53, generator=torch.Generator().manual_seed(1))
+    difference = (build(VARIANTS["convbeers-s"])(image) - image).detach()
+    assert float(difference.abs().max()) < 0.5
+    assert float(difference.std()) < 0.2
+
+
+def test_any_size_keeps_its_shape() -> None:
+    network = build(Variant(1, 4))
+    for shape in ((1, 1, 1, 1), (2, 1, 13, 21), (1, 1, 1, 40)):
+        assert network(torch.zeros(shape)).shape == shape

@@ -1,0 +1,128 @@
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from profiles import load_sensor, load_target, sensor_names, target_names
+from profiles.errors import ProfileError
+from profiles.sensor import TABLES, noise_from_snr, snr_0_bounds
+from profiles.toml import HERE
+
+SHIPPED = ["dior-high", "dior-medium", "pleiades-degraded", "pleiades-reference", "pleiades-variable"]
+
+
+def edited(folder: Path, old: str, new: str) -> str:
+    """A copy of pleiades-degraded with one line changed."""
+    text = (HERE / "sensors" / "pleiades-degraded.toml").read_text()
+    assert old in text
+    path = folder / "mine.toml"
+    path.write_text(text.replace(old, new))
+    return str(path)
+
+
+def test_the_promised_profiles_are_shipped() -> None:
+    assert sensor_names() == SHIPPED
+    assert target_names() == ["host-cpu", "vck190"]
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+def test_every_sensor_constant_has_a_source(name: str) -> None:
+    profile = load_sensor(name)
+    for key in (key for keys in TABLES.values() for key in keys):
+        constant = getattr(profile, key)
+        assert constant.source.strip()
+        assert constant.status in ("published", "inferred", "assumed")
+
+
+@pytest.mark.parametrize("name", ["host-cpu", "vck190"])
+def test_every_target_constant_has_a_source(name: str) -> None:
+    target = load_target(name)
+    tables = [*target.tables.values(), *target.configurations.values()]
+    assert all(constant.source.strip() for table in tables for constant in table.values())
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ("gsd_m", "gsd", ("'gsd'", "'gsd_m'", "unit")),
+        ("mtf_nyquist =", "sharpness =", ("'sharpness'", "mtf_nyquist")),
+        ("value = 0.07", "value = 0.7", ("mtf_nyquist", "0.6366", "0.7")),
+        ("value = 0.07", "value = 0", ("mtf_nyquist", "above 0")),
+        ("value = 0.07", "value = [0.07, 0.03]", ("range [low, high]",)),
+        ("value = 50,", "value = 90,", ("27.5 to 55", "90", "not dB")),
+        ("value = 50,", "value = 20,", ("27.5 to 55", "20")),
+        ("value = 12,", "value = 0,", ("bits", "1 to 16")),
+        ("value = 5,", "value = 2.5,", ("oversampling", "whole numbers")),
+        ("[mtf]", "[mtf", ("TOML",)),
+        ('status = "assumed"', 'status = "guessed"', ("guessed", "published, inferred")),
+        ('"paper, table 1: L0, in W/m2/sr/um"', '""', ("source",)),
+        ("value = 25,", 'value = "bright",', ("finite number",)),
+    ],
+)
+def test_a_wrong_file_gets_one_sentence(old: str, new: str, words: tuple[str, ...], tmp_path: Path) -> None:
+    with pytest.raises(ProfileError) as caught:
+        load_sensor(edited(tmp_path, old, new))
+    message = str(caught.value)
+    assert "mine" in message
+    assert "\n" not in message
+    for word in ("expected", "got", *words):
+        assert word in message
+
+
+def test_missing_profiles_and_files(tmp_path: Path) -> None:
+    with pytest.raises(ProfileError, match="pleiades-degraded"):
+        load_sensor("hubble")
+    with pytest.raises(ProfileError, match="No such file"):
+        load_sensor(str(tmp_path / "none.toml"))
+    (tmp_path / "empty.toml").touch()
+    with pytest.raises(ProfileError, match="'description'"):
+        load_sensor(str(tmp_path / "empty.toml"))
+
+
+def test_a_bare_number_is_the_users_own_statement(tmp_path: Path) -> None:
+    path = edited(
+        tmp_path, '{ value = 0.07, status = "published", source = "paper, table 1: Sim-Degraded-Fixed" }', "0.08"
+    )
+    constant = load_sensor(path).mtf_nyquist
+    assert (constant.value, constant.status) == (0.08, "stated")
+
+
+@given(st.sampled_from(SHIPPED), st.integers(0, 2**32))
+def test_every_draw_is_physical_and_within_its_ranges(name: str, seed: int) -> None:
+    profile = load_sensor(name)
+    sensor = profile.draw(np.random.default_rng(seed))
+    assert sensor.alpha >= 0
+    assert sensor.beta >= 0
+    assert profile.mtf_nyquist.low <= sensor.mtf_nyquist <= profile.mtf_nyquist.high
+    for radiance, snr in ((profile.radiance_0, profile.snr_0), (profile.radiance_1, profile.snr_1)):
+        drawn = radiance.low / sensor.noise_sigma(radiance.low)
+        assert snr.low * (1 - 1e-9) <= drawn <= snr.high * (1 + 1e-9)
+    assert sensor == profile.draw(np.random.default_rng(seed))
+
+
+def test_impossible_pairs_are_counted() -> None:
+    profile, rng = load_sensor("dior-high"), np.random.default_rng(0)
+    rejected = sum(profile.draw_counted(rng)[1] for _ in range(400))
+    share = rejected / (rejected + 400)
+    assert 0.70 < share < 0.80  # 24.9 % of the pairs are valid
+
+
+@given(st.floats(10, 200), st.floats(0.0, 1.0))
+def test_bounds_are_where_a_coefficient_changes_sign(snr_1: float, share: float) -> None:
+    low, high = snr_0_bounds(25, 100, snr_1)
+    alpha, beta = noise_from_snr(25, low + share * (high - low), 100, snr_1)
+    assert alpha >= -1e-12
+    assert beta >= -1e-9
+    assert noise_from_snr(25, low * 0.99, 100, snr_1)[0] < 0
+    assert noise_from_snr(25, high * 1.01, 100, snr_1)[1] < 0
+
+
+def test_noise_reproduces_both_points() -> None:
+    alpha, beta = noise_from_snr(25, 50, 100, 110)
+    assert alpha == pytest.approx(0.007686, abs=1e-6)
+    assert beta == pytest.approx(0.0579, abs=1e-4)
+    for radiance, snr in ((25, 50), (100, 110)):
+        assert radiance / math.sqrt(alpha * radiance + beta) == pytest.approx(snr)

@@ -1,0 +1,78 @@
+import math
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from model.simulator.mtf import transfer_function
+from model.simulator.sampling import crop_divisible, sample, scene_spectrum
+from profiles.errors import OptionError
+
+RATIOS = list(range(1, 9))
+
+
+def scene(height: int, width: int, seed: int = 0) -> torch.Tensor:
+    return 20 + 100 * torch.rand(height, width, generator=torch.Generator().manual_seed(seed))
+
+
+def blob(side: int, sigma: float) -> torch.Tensor:
+    """A Gaussian centred in an even-sided square, between its four middle pixels."""
+    x = torch.arange(side, dtype=torch.float64) - (side - 1) / 2
+    line = torch.exp(-0.5 * (x / sigma) ** 2)
+    return (line[:, None] * line).float()
+
+
+def centroid(image: torch.Tensor) -> tuple[float, float]:
+    """(row, column) from the middle of the image, in its own pixels."""
+    image = image.double()
+    rows, columns = (torch.arange(n, dtype=torch.float64) - (n - 1) / 2 for n in image.shape)
+    return float((image.sum(1) * rows).sum() / image.sum()), float((image.sum(0) * columns).sum() / image.sum())
+
+
+@pytest.mark.parametrize("ratio", RATIOS)
+def test_folding_equals_blurring_then_picking(ratio: int) -> None:
+    height, width = 13 * ratio, 8 * ratio
+    radiance, transfer = scene(height, width), transfer_function(height, width, ratio, 0.25)
+    shift = (ratio - 1) / 2
+    ramps = [torch.exp(2j * math.pi * f * shift) for f in (torch.fft.fftfreq(height), torch.fft.rfftfreq(width))]
+    blurred = torch.fft.rfft2(radiance.double()) * transfer * ramps[0][:, None] * ramps[1]
+    expected = torch.fft.irfft2(blurred, s=(height, width))[::ratio, ::ratio]
+    result = sample(scene_spectrum(radiance), transfer, width, ratio)
+    torch.testing.assert_close(result.double(), expected, rtol=0, atol=5e-4)
+
+
+@pytest.mark.parametrize("ratio", RATIOS)
+def test_nothing_is_shifted(ratio: int) -> None:
+    side = 32 * ratio
+    result = sample(scene_spectrum(blob(side, 3.0 * ratio)), transfer_function(side, side, ratio, 0.1), side, ratio)
+    assert max(map(abs, centroid(result))) < 1e-3
+
+
+@pytest.mark.parametrize("ratio", [2, 4, 6])
+def test_plain_slicing_would_shift_at_even_ratios(ratio: int) -> None:
+    sliced = blob(32 * ratio, 3.0 * ratio)[ratio // 2 :: ratio, ratio // 2 :: ratio]
+    assert abs(centroid(sliced)[0]) == pytest.approx(0.5 / ratio, rel=0.05)
+
+
+@given(st.integers(1, 8), st.integers(3, 15), st.integers(3, 15), st.integers(0, 1000))
+def test_the_mean_radiance_is_kept(ratio: int, rows: int, columns: int, seed: int) -> None:
+    radiance = scene(rows * ratio, columns * ratio, seed)
+    transfer = transfer_function(*radiance.shape, ratio, 0.07)
+    result = sample(scene_spectrum(radiance), transfer, columns * ratio, ratio)
+    # Frequencies that alias onto the mean are whole cycles per pixel, where the detector's sinc is zero.
+    assert float(result.double().mean()) == pytest.approx(float(radiance.double().mean()), rel=1e-6)
+
+
+@given(st.integers(1, 8), st.floats(0.0, 400.0))
+def test_a_constant_stays_what_it_is(ratio: int, level: float) -> None:
+    radiance = torch.full((5 * ratio, 7 * ratio), level)
+    result = sample(scene_spectrum(radiance), transfer_function(*radiance.shape, ratio, 0.07), 7 * ratio, ratio)
+    torch.testing.assert_close(result, torch.full((5, 7), level), rtol=2e-6, atol=1e-5)
+
+
+def test_a_grid_that_does_not_divide_is_refused() -> None:
+    radiance = scene(30, 31)
+    with pytest.raises(OptionError, match="30 x 31"):
+        sample(scene_spectrum(radiance), transfer_function(30, 31, 4, 0.1), 31, 4)
+    assert crop_divisible(radiance, 4).shape == (28, 28)
