@@ -99,8 +99,8 @@ def efficiency(pixels: int, latency: Figure, power: Figure) -> Figure:
 def published_rows() -> list[Row]:
     """The paper's two runs on the VCK190, as printed; its DPU configuration is not named."""
     runs = {
-        "paper: traditional on the VCK190's CPU": (1724, 0.2, 22.5, 3161),
-        "paper: ConvBEERS, INT8 on the DPU": (42, 7.2, 29.6, 98965),
+        "paper, 13600 x 9016: traditional on the VCK190's CPU": (1724, 0.2, 22.5, 3161),
+        "paper, 13600 x 9016: ConvBEERS, INT8 on the DPU": (42, 7.2, 29.6, 98965),
     }
     units = {"latency": "s", "throughput": "frame/s", "power": "W", "efficiency": "px/s/W"}
     return [

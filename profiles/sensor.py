@@ -5,11 +5,13 @@ A profile may state ranges (a family of sensors); `SensorProfile.draw` picks one
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from profiles.constant import Constant, check_keys, read_constant
+from profiles.effects import TABLES as EFFECT_TABLES
+from profiles.effects import Effect, Table, draw_effect, middle_effect, read_effect
 from profiles.errors import ProfileError
 from profiles.toml import read_toml, shipped_names
 
@@ -31,6 +33,7 @@ class Sensor:
     beta: float
     gain_dn_per_radiance: float
     bits: int
+    effects: Mapping[str, Effect] = field(default_factory=dict)
 
     @property
     def max_dn(self) -> int:
@@ -57,6 +60,7 @@ class SensorProfile:
     snr_1: Constant
     bits: Constant
     gain_dn_per_radiance: Constant
+    effects: Mapping[str, Table] = field(default_factory=dict)
 
     def draw(self, generator: np.random.Generator) -> Sensor:
         """Pick one sensor from the ranges: MTF uniform, SNR pair uniform over the physically valid pairs."""
@@ -70,7 +74,8 @@ class SensorProfile:
             snr_1 = float(generator.uniform(self.snr_1.low, self.snr_1.high))
             alpha, beta = noise_from_snr(self.radiance_0.low, snr_0, self.radiance_1.low, snr_1)
             if alpha >= 0 and beta >= 0:
-                return self._sensor(mtf_nyquist, alpha, beta), rejected
+                effects = {name: draw_effect(name, table, generator) for name, table in self.effects.items()}
+                return self._sensor(mtf_nyquist, alpha, beta, effects), rejected
         raise self._impossible_snr()
 
     def nominal(self) -> Sensor:
@@ -79,10 +84,11 @@ class SensorProfile:
         low, high = snr_0_bounds(self.radiance_0.low, self.radiance_1.low, snr_1)
         snr_0 = min(max(_middle(self.snr_0), low), high)
         alpha, beta = noise_from_snr(self.radiance_0.low, snr_0, self.radiance_1.low, snr_1)
-        return self._sensor(_middle(self.mtf_nyquist), max(alpha, 0.0), max(beta, 0.0))
+        effects = {name: middle_effect(name, table) for name, table in self.effects.items()}
+        return self._sensor(_middle(self.mtf_nyquist), max(alpha, 0.0), max(beta, 0.0), effects)
 
-    def _sensor(self, mtf_nyquist: float, alpha: float, beta: float) -> Sensor:
-        return Sensor(mtf_nyquist, alpha, beta, self.gain_dn_per_radiance.low, int(self.bits.low))
+    def _sensor(self, mtf_nyquist: float, alpha: float, beta: float, effects: Mapping[str, Effect]) -> Sensor:
+        return Sensor(mtf_nyquist, alpha, beta, self.gain_dn_per_radiance.low, int(self.bits.low), effects)
 
     def _impossible_snr(self) -> ProfileError:
         low, high = snr_0_bounds(self.radiance_0.low, self.radiance_1.low, self.snr_1.high)
@@ -135,7 +141,7 @@ def load_sensor(name: str) -> SensorProfile:
         ProfileError: unknown name, wrong or missing key, or numbers that no instrument can have.
     """
     label, raw = read_toml("sensors", name)
-    check_keys(label, raw, required={"description", *TABLES})
+    check_keys(label, raw, required={"description", *TABLES}, optional=set(EFFECT_TABLES))
     constants: dict[str, Constant] = {}
     for table, keys in TABLES.items():
         content = raw[table]
@@ -143,7 +149,10 @@ def load_sensor(name: str) -> SensorProfile:
             raise ProfileError(label, expected=f"a table [{table}]", got=repr(content), remedy="write it as one")
         check_keys(f"{label} [{table}]", content, required=set(keys))
         constants |= {key: read_constant(f"{label} [{table}] {key}", content[key]) for key in keys}
-    profile = SensorProfile(name=label.removesuffix(".toml"), description=str(raw["description"]), **constants)
+    effects = {name: read_effect(f"{label} [{name}]", name, raw[name]) for name in EFFECT_TABLES if name in raw}
+    profile = SensorProfile(
+        name=label.removesuffix(".toml"), description=str(raw["description"]), effects=effects, **constants
+    )
     _check_physics(label, profile)
     return profile
 

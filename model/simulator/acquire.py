@@ -1,13 +1,15 @@
 """One scene, seen by one sensor or by two: the order of the effects stands here and nowhere else."""
 
-from dataclasses import dataclass
+from collections.abc import Collection
+from dataclasses import dataclass, replace
 
+import torch
 from torch import Tensor
 
-from model.simulator.digitise import digitise
+from model.simulator.detect import detect
 from model.simulator.draws import Draw
-from model.simulator.mtf import transfer_function
-from model.simulator.noise import add_noise
+from model.simulator.mtf import sensor_transfer
+from model.simulator.plan import Plan
 from model.simulator.sampling import crop_divisible, sample, scene_spectrum
 from profiles.errors import ImageError
 from profiles.sensor import Sensor
@@ -22,6 +24,37 @@ class Pair:
 
     degraded: Tensor
     reference: Tensor
+
+
+def simulate_planned(
+    radiance: Tensor,
+    sensor: Sensor,
+    oversampling: int,
+    draw: Draw,
+    plan: Plan,
+    role: str = "degraded",
+    margin_px: int = MARGIN_PX,
+) -> Tensor:
+    """Acquire a scene (H, W) in W/m2/sr/um with only the effects that its plan calls for.
+
+    Returns:
+        Digital numbers (H / r - 2 margin, W / r - 2 margin), float32.
+    """
+    radiance = crop_divisible(radiance, oversampling)
+    if "mtf" in plan.skipped:
+        pixels = torch.nn.functional.avg_pool2d(radiance[None, None], oversampling)[0, 0]
+        return detect(crop_margin(pixels, margin_px), sensor, draw, role, plan.skipped)
+    spectrum, width = scene_spectrum(radiance), radiance.shape[-1]
+    transfer = sensor_transfer(
+        spectrum.shape[-2], width, oversampling, without(sensor, plan.skipped), radiance.device
+    )
+    signal = crop_margin(sample(spectrum, transfer, width, oversampling), margin_px)
+    return detect(signal, sensor, draw, role, plan.skipped)
+
+
+def without(sensor: Sensor, skipped: Collection[str]) -> Sensor:
+    """The sensor without some of its effects."""
+    return replace(sensor, effects={k: v for k, v in sensor.effects.items() if k not in skipped})
 
 
 def simulate_pair(
@@ -55,7 +88,7 @@ def acquire(
     offset_px: tuple[float, float] = (0.0, 0.0),
     margin_px: int = MARGIN_PX,
 ) -> Tensor:
-    """Digital numbers of one acquisition: blur, sampling, noise, digitising, in that order.
+    """Digital numbers of one acquisition: blur and sampling, then what `detect` does on the target grid.
 
     Args:
         spectrum: see `sampling.scene_spectrum`.
@@ -67,9 +100,9 @@ def acquire(
         offset_px: sub-pixel phase of the sampling grid, in scene pixels.
         margin_px: target pixels cropped on each side.
     """
-    transfer = transfer_function(spectrum.shape[-2], width, oversampling, sensor.mtf_nyquist, spectrum.device)
+    transfer = sensor_transfer(spectrum.shape[-2], width, oversampling, sensor, spectrum.device)
     signal = crop_margin(sample(spectrum, transfer, width, oversampling, offset_px), margin_px)
-    return digitise(add_noise(signal, sensor, draw.generator(f"noise-{role}")), sensor)
+    return detect(signal, sensor, draw, role)
 
 
 def crop_margin(image: Tensor, margin_px: int) -> Tensor:

@@ -7,11 +7,16 @@ from profiles.sensor import Sensor
 
 
 def digitise(radiance: Tensor, sensor: Sensor) -> Tensor:
-    """DN = min(max(round(gain * L), 0), 2^bits - 1), as float32.
+    """DN = min(max(round(gain * L), 0), 2^bits - 1), as float32, L in W/m2/sr/um."""
+    return digitise_dn(radiance * sensor.gain_dn_per_radiance, sensor)
+
+
+def digitise_dn(dn: Tensor, sensor: Sensor) -> Tensor:
+    """Round to whole digital numbers and clip to the converter's range.
 
     Rounding adds 1/12 DN^2 of variance. Clipping comes before any cast, so that nothing wraps around.
     """
-    return (radiance * sensor.gain_dn_per_radiance).round().clamp(0, sensor.max_dn)
+    return dn.round().clamp(0, sensor.max_dn)
 
 
 def to_radiance(dn: Tensor, sensor: Sensor) -> Tensor:

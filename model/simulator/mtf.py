@@ -6,52 +6,93 @@ from functools import lru_cache
 import torch
 from torch import Tensor
 
+from profiles.effects import AntiAlias, Smear
 from profiles.errors import OptionError
-from profiles.sensor import MTF_NYQUIST_MAX
+from profiles.sensor import MTF_NYQUIST_MAX, Sensor
 
 NYQUIST = 0.5
 """Cycles per target pixel."""
 
 
-def gamma_from_mtf(mtf_nyquist: float) -> float:
-    """Solve MTF(0.5, 0) = mtf_nyquist for gamma: gamma = -2 ln(mtf_nyquist * pi / 2) (paper, section 3.3).
+def gamma_from_mtf(mtf_nyquist: float, antialias_sigma_px: float = 0.0) -> float:
+    """Solve MTF(0.5, 0) = mtf_nyquist for gamma: gamma = -2 ln(mtf_nyquist * pi / (2 G)) (paper, section 3.3).
 
-    Limits: 2/pi gives 0 (the square detector alone); towards 0 it grows without bound.
+    G is the anti-alias filter's own gain at Nyquist: the filter is part of the budget, so that the product has the
+    MTF that its profile states. Limits: 2 G / pi gives 0 (the square detector alone); towards 0 it grows without
+    bound.
 
     Raises:
-        OptionError: outside (0, 2/pi], where the "blur" would amplify or erase everything.
+        OptionError: outside (0, 2 G / pi], where the "blur" would have to amplify, or would erase everything.
     """
-    if not 0 < mtf_nyquist <= MTF_NYQUIST_MAX:
+    limit = mtf_limit(antialias_sigma_px)
+    if not 0 < mtf_nyquist <= limit:
+        filter_gain = limit / MTF_NYQUIST_MAX
+        with_filter = f" behind an anti-alias filter that keeps {filter_gain:.3f}" if antialias_sigma_px else ""
         raise OptionError(
             "MTF at Nyquist",
-            expected=f"a ratio above 0 and up to {MTF_NYQUIST_MAX:.4f}",
+            expected=f"a ratio above 0 and up to {limit:.4f}{with_filter}",
             got=repr(mtf_nyquist),
             remedy="0.07 means 7 %",
         )
-    # max: at 2/pi itself the rounding of the product may fall on either side of 1
-    return max(-2 * math.log(mtf_nyquist * math.pi / 2), 0.0)
+    # max: at the limit itself the rounding of the ratio may fall on either side of 1
+    return max(-2 * math.log(mtf_nyquist / limit), 0.0)
 
 
-def mtf(fx: Tensor, fy: Tensor, mtf_nyquist: float) -> Tensor:
-    """MTF(fx, fy) = exp(-gamma * sqrt(fx^2 + fy^2)) * sinc(fx) * sinc(fy) (paper, section 3.3).
+def mtf_limit(antialias_sigma_px: float = 0.0) -> float:
+    """The highest MTF at Nyquist, that of a perfect lens: 2 / pi for a square detector, times the filter's gain."""
+    at_nyquist = torch.tensor(NYQUIST, dtype=torch.float64)
+    return MTF_NYQUIST_MAX * float(gaussian_response(at_nyquist, antialias_sigma_px))
+
+
+def mtf(fx: Tensor, fy: Tensor, mtf_nyquist: float, antialias_sigma_px: float = 0.0) -> Tensor:
+    """MTF(fx, fy) = exp(-gamma * sqrt(fx^2 + fy^2)) * sinc(fx) * sinc(fy) * G(fx, fy) (paper, section 3.3).
 
     Args:
         fx: horizontal frequencies in cycles per TARGET pixel, float64, broadcast against fy.
         fy: vertical frequencies, likewise. Beyond 1 the sinc is negative, and stays so.
-        mtf_nyquist: contrast kept at fx = 0.5, fy = 0.
+        mtf_nyquist: contrast kept at fx = 0.5, fy = 0, the anti-alias filter G included.
+        antialias_sigma_px: standard deviation of that filter in target pixels; 0 is none (G = 1).
     """
     radius = torch.hypot(fx, fy)
-    return torch.exp(-gamma_from_mtf(mtf_nyquist) * radius) * torch.sinc(fx) * torch.sinc(fy)
+    optics = torch.exp(-gamma_from_mtf(mtf_nyquist, antialias_sigma_px) * radius)
+    detector = torch.sinc(fx) * torch.sinc(fy)
+    return optics * detector * gaussian_response(radius, antialias_sigma_px)
+
+
+def gaussian_response(frequency: Tensor, sigma_px: float) -> Tensor:
+    """exp(-2 pi^2 sigma^2 f^2), the transform of a Gaussian filter; 1 for sigma 0."""
+    return torch.exp(-2 * (math.pi * sigma_px * frequency) ** 2)
+
+
+def smear_response(fy: Tensor, length_px: float) -> Tensor:
+    """sinc(length * fy): uniform motion along the track during an exposure; 1 for length 0."""
+    return torch.sinc(length_px * fy)
+
+
+def sensor_transfer(
+    height: int, width: int, oversampling: int, sensor: Sensor, device: torch.device | None = None
+) -> Tensor:
+    """All the linear, shift-invariant effects of a sensor as one (H, W // 2 + 1) float32 transfer function."""
+    antialias, smear = sensor.effects.get("antialias"), sensor.effects.get("smear")
+    sigma_px = antialias.sigma_px if isinstance(antialias, AntiAlias) else 0.0
+    length_px = smear.length_px if isinstance(smear, Smear) else 0.0
+    return transfer_function(height, width, oversampling, sensor.mtf_nyquist, sigma_px, length_px, device)
 
 
 @lru_cache(maxsize=64)
 def transfer_function(
-    height: int, width: int, oversampling: int, mtf_nyquist: float, device: torch.device | None = None
+    height: int,
+    width: int,
+    oversampling: int,
+    mtf_nyquist: float,
+    antialias_sigma_px: float = 0.0,
+    smear_px: float = 0.0,
+    device: torch.device | None = None,
 ) -> Tensor:
-    """The MTF on the half spectrum of a scene: (H, W // 2 + 1) float32, ready to multiply an rfft2.
+    """MTF and smear on the half spectrum of a scene: (H, W // 2 + 1) float32, ready to multiply an rfft2.
 
     `height` and `width` are in scene pixels, `oversampling` of which make one target pixel.
     """
     fy = torch.fft.fftfreq(height, 1 / oversampling, dtype=torch.float64, device=device)[:, None]
     fx = torch.fft.rfftfreq(width, 1 / oversampling, dtype=torch.float64, device=device)[None, :]
-    return mtf(fx, fy, mtf_nyquist).float()
+    return (mtf(fx, fy, mtf_nyquist, antialias_sigma_px) * smear_response(fy, smear_px)).float()

@@ -6,6 +6,9 @@ from torch import Tensor
 
 from profiles.sensor import Sensor
 
+NOISE_LIMIT = 6.0
+"""Draws are clipped here (two in a billion), so that the effect of noise has a bound."""
+
 
 def noise_sigma(radiance: Tensor, sensor: Sensor) -> Tensor:
     """sigma(L) = sqrt(alpha L + beta), in W/m2/sr/um (paper, section 3.3).
@@ -18,5 +21,6 @@ def noise_sigma(radiance: Tensor, sensor: Sensor) -> Tensor:
 
 def add_noise(radiance: Tensor, sensor: Sensor, generator: np.random.Generator) -> Tensor:
     """L + sigma(L) * n, n standard normal and independent per pixel; shape and device kept."""
-    normal = torch.from_numpy(generator.standard_normal(tuple(radiance.shape), dtype=np.float32))
-    return radiance + noise_sigma(radiance, sensor) * normal.to(radiance.device)
+    normal = generator.standard_normal(tuple(radiance.shape), dtype=np.float32)
+    np.clip(normal, -NOISE_LIMIT, NOISE_LIMIT, out=normal)
+    return radiance + noise_sigma(radiance, sensor) * torch.from_numpy(normal).to(radiance.device)

@@ -137,7 +137,7 @@ def test_bench_writes_a_valid_document(tmp_path: Path) -> None:
     written = document(out)
     assert [entry["name"] for entry in written["inputs"]] == ["net.onnx", "raw.tif"]
     names = [str(row["name"]) for row in written["rows"]]
-    assert sum("paper:" in name for name in names) == 2
+    assert sum(name.startswith("paper, 13600 x 9016:") for name in names) == 2
     assert any("halo 5 px" in name for name in names)
 
 
