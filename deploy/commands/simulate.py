@@ -1,40 +1,131 @@
-"""`beers-deploy simulate`: what two sensors would see of a scene, as 12-bit TIFF pairs."""
+"""`beers-deploy simulate`: what two sensors would see of a scene, as 12-bit TIFF pairs; or why, with --explain."""
 
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
+
+if TYPE_CHECKING:
+    from model.simulator.plan import Plan
 
 EXAMPLE = "simulate aerial.png --sensor pleiades-degraded --out pairs"
 
 
+@dataclass(frozen=True)
+class Preset:
+    """One of the paper's datasets (table 1, and the table of DIOR parameters)."""
+
+    sensor: str
+    patch_px: int
+
+
+PRESETS = {
+    "paper-variable": Preset("pleiades-variable", 128),
+    "paper-fixed": Preset("pleiades-degraded", 128),
+    "paper-test": Preset("pleiades-degraded", 1500),
+    "dior-medium": Preset("dior-medium", 256),
+    "dior-high": Preset("dior-high", 256),
+}
+
+
 def simulate(
-    scenes: Annotated[list[Path], typer.Argument(help="Images: 8-bit RGB or mono, 16-bit DN, float radiance.")],
-    out: Annotated[Path, typer.Option(help="Folder of the pairs.")],
-    sensor: Annotated[str, typer.Option(help="Profile of the degraded image.")] = "pleiades-degraded",
-    reference: Annotated[str, typer.Option(help="Profile of the reference image.")] = "pleiades-reference",
+    scenes: Annotated[
+        list[Path] | None, typer.Argument(help="Images: 8-bit, 16-bit DN, float; drawn if none.")
+    ] = None,
+    out: Annotated[Path | None, typer.Option(help="Folder of the dataset.")] = None,
+    sensor: Annotated[
+        str | None, typer.Option(help="Profile of the degraded images; pleiades-degraded if none.")
+    ] = None,
+    reference: Annotated[str, typer.Option(help="Profile of the reference images.")] = "pleiades-reference",
+    preset: Annotated[str | None, typer.Option(help=f"A dataset of the paper: {', '.join(PRESETS)}.")] = None,
+    patch: Annotated[int | None, typer.Option(min=8, help="Patch side in pixels; whole scenes if none.")] = None,
     oversampling: Annotated[
         int | None, typer.Option(min=1, help="Scene pixels per pixel; the profile's if none.")
     ] = None,
+    scene: Annotated[
+        str | None, typer.Option(help="What the scene calls for: night-port, snow, ..., or a .toml.")
+    ] = None,
+    add: Annotated[list[str] | None, typer.Option("--with", help="Effect to add, at typical values.")] = None,
+    forbid: Annotated[list[str] | None, typer.Option("--without", help="Effect to leave out.")] = None,
+    explain: Annotated[
+        bool, typer.Option("--explain", help="Show for each effect what is decided, and why.")
+    ] = False,
+    tolerance: Annotated[float, typer.Option(min=0, help="DN by which skipping may change a pixel.")] = 0.25,
+    workers: Annotated[int, typer.Option(min=0, help="Processes; 0 takes every core.")] = 0,
     seed: Annotated[int, typer.Option(min=0, help="Seed of every random draw.")] = 0,
+    resume: Annotated[bool, typer.Option("--resume", help="Go on with an unfinished dataset.")] = False,
 ) -> None:
-    """Write NAME-degraded.tif and NAME-reference.tif for each scene; the same bytes for the same seed."""
-    from deploy.progress import steps
-    from deploy.restore import write_tiff
-    from model.simulator.acquire import simulate_pair
-    from model.simulator.digitise import to_uint16
-    from model.simulator.draws import Draw
-    from model.simulator.scene import read_scene
-    from profiles import load_sensor
+    """Write degraded/NAME.tif and reference/NAME.tif for each scene or patch; the same bytes for the same seed."""
+    import os
 
-    degraded_profile, reference_profile = load_sensor(sensor), load_sensor(reference)
-    ratio = oversampling or int(degraded_profile.oversampling.low)
-    with steps("simulating", len(scenes)) as bar:
-        for number, path in enumerate(scenes):
-            draw = Draw(seed, number)
-            eyes = [p.draw(draw.generator("sensor")) for p in (degraded_profile, reference_profile)]
-            pair = simulate_pair(read_scene(path, eyes[1]).radiance, eyes[0], eyes[1], ratio, draw)
-            write_tiff(out / f"{path.stem}-degraded.tif", to_uint16(pair.degraded))
-            write_tiff(out / f"{path.stem}-reference.tif", to_uint16(pair.reference))
-            bar.advance(note=path.name)
-    typer.echo(f"wrote {2 * len(scenes)} images to {out}")
+    from deploy.dataset import DatasetRecipe, plan_windows, write_dataset
+    from deploy.progress import steps
+    from model.files import require_writable
+    from profiles import load_sensor
+    from profiles.errors import OptionError
+    from profiles.scene_call import calling_for, load_scene_call
+
+    chosen = _preset(preset)
+    call = load_scene_call(scene) if scene else None
+    degraded = calling_for(load_sensor(sensor or chosen.sensor), call, add or (), forbid or ())
+    recipe = DatasetRecipe(
+        tuple(scenes) if scenes else (None,),
+        degraded,
+        load_sensor(reference),
+        oversampling or int(degraded.oversampling.low),
+        patch or (chosen.patch_px if preset else None),
+        call.radiance_scale.low if call else 1.0,
+        seed,
+        tolerance,
+    )
+    if out is None and not explain:
+        raise OptionError("--out", expected="a folder", got="none", remedy="give one, or ask for --explain alone")
+    if explain:
+        _explain(recipe)
+    if out is None:
+        return
+    require_writable(out / "manifest.jsonl")
+    with steps("simulating", len(plan_windows(recipe))) as bar:
+        summary = write_dataset(recipe, out, workers or os.cpu_count() or 1, resume, bar.advance)
+    rejected = f"; {summary['rejected_share']:.1%} of the drawn SNR pairs were impossible and drawn again"
+    typer.echo(f"wrote {summary['patches']:.0f} pairs to {out}" + (rejected if summary["rejected_share"] else ""))
+
+
+def _preset(name: str | None) -> Preset:
+    from profiles.errors import OptionError
+
+    if name is None:
+        return PRESETS["paper-fixed"]
+    if name not in PRESETS:
+        raise OptionError("--preset", expected=f"one of {', '.join(PRESETS)}", got=repr(name), remedy="choose one")
+    return PRESETS[name]
+
+
+def _explain(recipe: object) -> None:
+    """The plan of the first draw of the degraded sensor, for every scene."""
+    from deploy.dataset import DatasetRecipe, load
+    from model.simulator.bounds import scene_stats
+    from model.simulator.draws import Draw
+    from model.simulator.plan import make_plan
+    from model.simulator.sampling import crop_divisible
+
+    assert isinstance(recipe, DatasetRecipe)  # noqa: S101 - imported late, for a quick --help
+    for index in range(len(recipe.scenes)):
+        scene = load(recipe, index)
+        stats = scene_stats(crop_divisible(scene.radiance, recipe.oversampling), recipe.oversampling)
+        sensor = recipe.degraded.draw(Draw(recipe.seed, index).generator("sensor-degraded"))
+        title = f"{scene.name}: {stats.low:.1f} to {stats.high:.1f} W/m2/sr/um, {recipe.degraded.name}"
+        _print_plan(title, make_plan(sensor, stats, recipe.tolerance_dn))
+
+
+def _print_plan(title: str, plan: "Plan") -> None:
+    from rich.table import Table
+
+    from deploy.tables import default_console
+
+    table = Table("effect", "decision", "why", "bound DN", "cost", title=title, title_justify="left")
+    for d in plan.decisions:
+        bound = "" if d.bound_dn is None else f"{d.bound_dn:.3g}"
+        table.add_row(d.effect, d.choice, d.why, bound, d.cost)
+    default_console().print(table)

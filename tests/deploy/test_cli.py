@@ -182,5 +182,7 @@ def test_simulated_pairs_are_the_same_bytes_for_the_same_seed(tmp_path: Path) ->
     Image.fromarray(pixels.astype(np.uint8)).save(scene)
     for run in ("a", "b"):
         assert runner.invoke(app, ["simulate", str(scene), "--out", str(tmp_path / run)]).exit_code == 0
-    for name in ("scene-degraded.tif", "scene-reference.tif"):
-        assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes()
+    for role in ("degraded", "reference"):
+        (first,), (again,) = (list((tmp_path / run / role).iterdir()) for run in ("a", "b"))
+        assert first.name == again.name == "0000-scene.tif"
+        assert first.read_bytes() == again.read_bytes()

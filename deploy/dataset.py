@@ -1,0 +1,203 @@
+"""Datasets of simulated pairs: 12-bit TIFF patches and a manifest, in parallel, resumable, the same bytes always.
+
+    OUT/degraded/NAME.tif  OUT/reference/NAME.tif  OUT/manifest.jsonl  OUT/recipe.json
+
+A patch's pixels depend on the recipe and its number alone: not on the workers, not on the patches before it.
+"""
+
+import json
+import multiprocessing
+import shutil
+from collections.abc import Callable, Iterator
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import asdict, dataclass
+from itertools import groupby
+from pathlib import Path
+
+import torch
+
+from deploy.restore import write_tiff
+from model.files import sha256, write_text
+from model.simulator.acquire import MARGIN_PX, simulate_planned
+from model.simulator.bounds import scene_stats
+from model.simulator.digitise import to_uint16
+from model.simulator.draws import Draw
+from model.simulator.plan import TOLERANCE_DN, make_plan
+from model.simulator.procedural import procedural_scene
+from model.simulator.sampling import crop_divisible
+from model.simulator.scene import Scene, read_scene
+from profiles.errors import ImageError, OptionError
+from profiles.sensor import SensorProfile
+
+CHUNK = 32
+"""Patches a worker makes before it reports: short enough to lose little to a kill."""
+
+DRAWN_SIDE_PX = 3000
+
+
+@dataclass(frozen=True)
+class DatasetRecipe:
+    """All that decides a dataset's pixels."""
+
+    scenes: tuple[Path | None, ...]  # None: a drawn scene
+    degraded: SensorProfile
+    reference: SensorProfile
+    oversampling: int
+    patch_px: int | None  # None: each scene whole
+    radiance_scale: float = 1.0
+    seed: int = 0
+    tolerance_dn: float = TOLERANCE_DN
+
+    def to_json(self) -> dict[str, object]:
+        """The recipe as a file keeps it; scenes by name and digest."""
+        scenes = [{"name": p.name, "sha256": sha256(p)} if p else {"name": "drawn"} for p in self.scenes]
+        profiles = {role: asdict(p) for role, p in (("degraded", self.degraded), ("reference", self.reference))}
+        rest = {
+            key: getattr(self, key) for key in ("oversampling", "patch_px", "radiance_scale", "seed", "tolerance_dn")
+        }
+        return {"scenes": scenes, **profiles, **rest}
+
+
+@dataclass(frozen=True)
+class Window:
+    """One patch: its number in the dataset, its scene, and the top left of its margin in scene pixels."""
+
+    number: int
+    scene: int
+    name: str
+    top: int
+    left: int
+    height: int
+    width: int
+
+
+def plan_windows(recipe: DatasetRecipe) -> list[Window]:
+    """Every patch of a dataset, in order.
+
+    Raises:
+        ImageError: a scene that holds none.
+    """
+    windows: list[Window] = []
+    for index, path in enumerate(recipe.scenes):
+        found = list(_scene_windows(recipe, index, len(windows)))
+        if not found:
+            side = ((recipe.patch_px or 1) + 2 * MARGIN_PX) * recipe.oversampling
+            raise ImageError(
+                str(path), expected=f"at least {side} scene pixels a side", got="less", remedy="leave it out"
+            )
+        windows += found
+    return windows
+
+
+def _scene_windows(recipe: DatasetRecipe, index: int, first: int) -> Iterator[Window]:
+    path, ratio = recipe.scenes[index], recipe.oversampling
+    height, width = load(recipe, index).radiance.shape
+    stem = f"{index:04d}-{path.stem if path else 'drawn'}"
+    if recipe.patch_px is None:
+        if min(height, width) // ratio > 2 * MARGIN_PX:
+            yield Window(first, index, stem, 0, 0, height, width)
+        return
+    side, step = (recipe.patch_px + 2 * MARGIN_PX) * ratio, recipe.patch_px * ratio
+    corners = [(y, x) for y in range(0, height - side + 1, step) for x in range(0, width - side + 1, step)]
+    for k, (top, left) in enumerate(corners):
+        yield Window(first + k, index, f"{stem}-{k:05d}", top, left, side, side)
+
+
+def load(recipe: DatasetRecipe, index: int) -> Scene:
+    """A scene of the recipe, its radiance scaled."""
+    path = recipe.scenes[index]
+    if path is None:
+        generator = Draw(recipe.seed, index).generator("drawn scene")
+        scene = procedural_scene(DRAWN_SIDE_PX, DRAWN_SIDE_PX, generator)
+    else:
+        scene = read_scene(path, recipe.reference.nominal())
+    return Scene(scene.name, scene.radiance * recipe.radiance_scale)
+
+
+def make_patches(recipe: DatasetRecipe, windows: list[Window], out: Path) -> list[dict[str, object]]:
+    """Simulate and write some patches of one scene; returns their lines of the manifest."""
+    torch.set_num_threads(1)
+    radiance = load(recipe, windows[0].scene).radiance
+    return [_make_patch(recipe, window, radiance, out) for window in windows]
+
+
+def _make_patch(recipe: DatasetRecipe, window: Window, radiance: torch.Tensor, out: Path) -> dict[str, object]:
+    bottom, right = window.top + window.height, window.left + window.width
+    part = crop_divisible(radiance[window.top : bottom, window.left : right], recipe.oversampling)
+    stats, draw = scene_stats(part, recipe.oversampling), Draw(recipe.seed, window.number)
+    line: dict[str, object] = {"number": window.number, "name": window.name, "seed": recipe.seed}
+    line |= {"source": window.name.split("-", 1)[1], "top_px": window.top, "left_px": window.left}
+    for role, profile in (("degraded", recipe.degraded), ("reference", recipe.reference)):
+        sensor, rejected = profile.draw_counted(draw.generator(f"sensor-{role}"))
+        plan = make_plan(sensor, stats, recipe.tolerance_dn)
+        dn = simulate_planned(part, sensor, recipe.oversampling, draw, plan, role)
+        write_tiff(out / role / f"{window.name}.tif", to_uint16(dn))
+        line[role] = {"sensor": asdict(sensor), "rejected_snr_pairs": rejected, "plan": plan.to_json()}
+    return line
+
+
+def write_dataset(
+    recipe: DatasetRecipe, out: Path, workers: int, resume: bool, tick: Callable[[int], None]
+) -> dict[str, float]:
+    """Write a dataset; `tick` is told how many further patches are done.
+
+    Returns:
+        patches, and the share of drawn SNR pairs that were impossible and drawn again.
+
+    Raises:
+        OptionError: the folder holds another dataset, or this one without `resume`.
+    """
+    _check_folder(recipe, out, resume)
+    if (out / "manifest.jsonl").exists():  # nothing was left to do
+        return _summary((out / "manifest.jsonl").read_text(encoding="utf-8"))
+    windows = plan_windows(recipe)
+    chunks = [c for _, group in groupby(windows, key=lambda w: w.scene) for c in _chunks(list(group))]
+    parts = {out / "parts" / f"{chunk[0].number:08d}.jsonl": chunk for chunk in chunks}
+    tick(sum(len(chunk) for path, chunk in parts.items() if path.exists()))
+    waiting = {path: chunk for path, chunk in parts.items() if not path.exists()}
+    for path, lines in _run(recipe, waiting, out, workers):
+        write_text(path, "".join(json.dumps(line, sort_keys=True) + "\n" for line in lines))
+        tick(len(lines))
+    manifest = "".join(path.read_text(encoding="utf-8") for path in parts)
+    write_text(out / "manifest.jsonl", manifest)
+    shutil.rmtree(out / "parts")
+    return _summary(manifest)
+
+
+def _run(
+    recipe: DatasetRecipe, waiting: dict[Path, list[Window]], out: Path, workers: int
+) -> Iterator[tuple[Path, list[dict[str, object]]]]:
+    if workers == 1 or len(waiting) < 2:
+        for path, chunk in waiting.items():
+            yield path, make_patches(recipe, chunk, out)
+        return
+    # spawn: a forked copy of torch's thread pools can hang
+    with ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context("spawn")) as pool:
+        jobs = {pool.submit(make_patches, recipe, chunk, out): path for path, chunk in waiting.items()}
+        try:
+            for job in as_completed(jobs):
+                yield jobs[job], job.result()
+        finally:
+            pool.shutdown(cancel_futures=True)
+
+
+def _check_folder(recipe: DatasetRecipe, out: Path, resume: bool) -> None:
+    path, wanted = out / "recipe.json", json.dumps(recipe.to_json(), indent=1, sort_keys=True) + "\n"
+    if not path.exists():
+        write_text(path, wanted)
+        return
+    got = "this dataset" if path.read_text(encoding="utf-8") == wanted else "another dataset"
+    if got == "another dataset" or not resume:
+        remedy = "add --resume or choose another folder" if got == "this dataset" else "choose another folder"
+        raise OptionError("--out", expected="a folder without a dataset", got=got, remedy=remedy)
+
+
+def _chunks(windows: list[Window]) -> Iterator[list[Window]]:
+    for first in range(0, len(windows), CHUNK):
+        yield windows[first : first + CHUNK]
+
+
+def _summary(manifest: str) -> dict[str, float]:
+    lines = [json.loads(line) for line in manifest.splitlines()]
+    rejected = sum(line[role]["rejected_snr_pairs"] for line in lines for role in ("degraded", "reference"))
+    return {"patches": len(lines), "rejected_share": rejected / (rejected + 2 * len(lines))}

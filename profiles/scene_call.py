@@ -1,0 +1,76 @@
+"""What a scene calls for: light, and effects that it adds to a sensor or forbids (night port, haze over sea, ...)."""
+
+from collections.abc import Collection
+from dataclasses import dataclass, replace
+
+from profiles.constant import Constant, check_keys, read_constant
+from profiles.effects import TABLES, Table, read_effect
+from profiles.errors import OptionError, ProfileError
+from profiles.sensor import SensorProfile
+from profiles.toml import HERE, read_toml, shipped_names
+
+
+@dataclass(frozen=True)
+class SceneCall:
+    """One TOML file under `profiles/scenes/`.
+
+    `radiance_scale` multiplies the scene's radiance: photographs are of a clear day.
+    """
+
+    name: str
+    description: str
+    radiance_scale: Constant
+    effects: dict[str, Table]
+    without: tuple[str, ...]
+
+
+def scene_names() -> list[str]:
+    """The names of the shipped scenes."""
+    return shipped_names("scenes")
+
+
+def load_scene_call(name: str) -> SceneCall:
+    """Read a shipped scene by name, or the user's own by the path of its .toml file.
+
+    Raises:
+        ProfileError: unknown name, wrong key or value, or an effect both added and forbidden.
+    """
+    label, raw = read_toml("scenes", name)
+    check_keys(label, raw, required={"description", "radiance_scale"}, optional={"without", *TABLES})
+    scale = read_constant(f"{label} radiance_scale", raw["radiance_scale"])
+    if scale.low <= 0:
+        raise ProfileError(f"{label} radiance_scale", expected="above 0", got=str(scale), remedy="1 is a clear day")
+    effects = {key: read_effect(f"{label} [{key}]", key, raw[key]) for key in TABLES if key in raw}
+    without = raw.get("without", [])
+    if not isinstance(without, list) or not all(isinstance(w, str) and w in TABLES for w in without):
+        expected = f"a list out of {', '.join(TABLES)}"
+        raise ProfileError(f"{label} without", expected=expected, got=repr(without), remedy="correct the names")
+    if set(without) & set(effects):
+        both = ", ".join(sorted(set(without) & set(effects)))
+        raise ProfileError(label, expected="an effect added or forbidden", got=f"both for {both}", remedy="drop one")
+    return SceneCall(label.removesuffix(".toml"), str(raw["description"]), scale, effects, tuple(without))
+
+
+def typical_effects() -> dict[str, Table]:
+    """Typical values of every optional effect (`profiles/effects.toml`): what `--with NAME` adds."""
+    label, raw = read_toml("", str(HERE / "effects.toml"))
+    return {name: read_effect(f"{label} [{name}]", name, raw[name]) for name in TABLES}
+
+
+def calling_for(
+    profile: SensorProfile, scene: SceneCall | None, add: Collection[str] = (), forbid: Collection[str] = ()
+) -> SensorProfile:
+    """The profile with a scene's effects and `add`, without `forbid`; stated values win over typical ones.
+
+    Raises:
+        OptionError: a name that is no optional effect.
+    """
+    for name in (*add, *forbid):
+        if name not in TABLES:
+            known = ", ".join(TABLES)
+            raise OptionError("effect", expected=f"one of {known}", got=repr(name), remedy="correct the name")
+    typical = typical_effects()
+    effects = {**profile.effects, **(scene.effects if scene else {})}
+    effects |= {name: typical[name] for name in add if name not in effects}
+    gone = {*forbid, *(scene.without if scene else ())}
+    return replace(profile, effects={name: effects[name] for name in TABLES if name in effects and name not in gone})

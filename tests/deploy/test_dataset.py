@@ -1,0 +1,108 @@
+import json
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tifffile
+from PIL import Image
+
+from deploy.dataset import DatasetRecipe, plan_windows, write_dataset
+from profiles import load_sensor
+from profiles.errors import ImageError, OptionError
+from profiles.scene_call import calling_for, load_scene_call, scene_names, typical_effects
+
+
+@pytest.fixture
+def scene(tmp_path: Path) -> Path:
+    pixels = np.random.default_rng(0).integers(0, 255, (420, 610, 3)).astype(np.uint8)
+    Image.fromarray(pixels).save(tmp_path / "scene.png")
+    return tmp_path / "scene.png"
+
+
+VARIABLE, REFERENCE = load_sensor("pleiades-variable"), load_sensor("pleiades-reference")
+
+
+def small(scene: Path, patch_px: int | None = 24) -> DatasetRecipe:
+    return DatasetRecipe((scene, scene), VARIABLE, REFERENCE, oversampling=2, patch_px=patch_px)
+
+
+def bytes_of(folder: Path) -> dict[str, bytes]:
+    return {str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
+
+
+def test_the_bytes_do_not_depend_on_the_workers(scene: Path, tmp_path: Path) -> None:
+    for workers in (1, 2):
+        write_dataset(small(scene), tmp_path / str(workers), workers, resume=False, tick=lambda _: None)
+    assert bytes_of(tmp_path / "1") == bytes_of(tmp_path / "2")
+
+
+def test_the_manifest_tells_where_each_patch_comes_from(scene: Path, tmp_path: Path) -> None:
+    summary = write_dataset(small(scene), tmp_path / "d", 1, resume=False, tick=lambda _: None)
+    lines = [json.loads(line) for line in (tmp_path / "d" / "manifest.jsonl").read_text().splitlines()]
+    assert len(lines) == summary["patches"] == len(plan_windows(small(scene)))
+    assert [line["number"] for line in lines] == list(range(len(lines)))
+    assert len({line["degraded"]["sensor"]["mtf_nyquist"] for line in lines}) == len(lines)
+    for line in lines:
+        for role in ("degraded", "reference"):
+            dn = tifffile.imread(tmp_path / "d" / role / f"{line['name']}.tif")
+            assert dn.shape == (24, 24)
+            assert dn.dtype == np.uint16
+            assert dn.max() <= 4095
+        assert any(d["effect"] == "mtf" for d in line["degraded"]["plan"]["decisions"])
+
+
+def test_a_killed_dataset_is_resumed_to_the_same_bytes(scene: Path, tmp_path: Path) -> None:
+    options = [str(scene), "--oversampling", "2", "--patch", "8", "--workers", "1"]
+    whole, killed = (tmp_path / name for name in ("whole", "killed"))
+    command = [sys.executable, "-c", "from deploy.cli import app; app()", "simulate", *options, "--out"]
+    subprocess.run([*command, str(whole)], check=True, capture_output=True)
+    with subprocess.Popen([*command, str(killed)], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as run:
+        while not list(killed.glob("parts/*.jsonl")) and run.poll() is None:
+            time.sleep(0.01)
+        run.kill()
+    subprocess.run([*command, str(killed), "--resume"], check=True, capture_output=True)
+    assert bytes_of(killed) == bytes_of(whole)
+
+
+def test_another_dataset_in_the_folder_is_not_overwritten(scene: Path, tmp_path: Path) -> None:
+    write_dataset(small(scene), tmp_path / "d", 1, resume=False, tick=lambda _: None)
+    before = bytes_of(tmp_path / "d")
+    with pytest.raises(OptionError, match="add --resume"):
+        write_dataset(small(scene), tmp_path / "d", 1, resume=False, tick=lambda _: None)
+    with pytest.raises(OptionError, match="another dataset"):
+        write_dataset(small(scene, patch_px=32), tmp_path / "d", 1, resume=True, tick=lambda _: None)
+    write_dataset(small(scene), tmp_path / "d", 1, resume=True, tick=lambda _: None)
+    assert bytes_of(tmp_path / "d") == before
+
+
+def test_a_scene_without_room_for_a_patch_is_refused(scene: Path) -> None:
+    with pytest.raises(ImageError, match="scene pixels a side"):
+        plan_windows(small(scene, patch_px=200))
+
+
+def test_a_drawn_scene_needs_no_file(scene: Path) -> None:
+    windows = plan_windows(replace(small(scene), scenes=(scene, None)))
+    assert {window.scene for window in windows} == {0, 1}
+    assert windows[-1].name.startswith("0001-drawn")
+
+
+def test_every_effect_has_a_typical_value_and_every_scene_loads() -> None:
+    assert len(typical_effects()) == 9
+    assert scene_names() == ["desert-noon", "haze-over-sea", "night-port", "snow"]
+    profile = load_sensor("pleiades-degraded")
+    for name in scene_names():
+        call = load_scene_call(name)
+        assert set(calling_for(profile, call).effects) == set(call.effects)
+
+
+def test_effects_are_added_and_forbidden() -> None:
+    profile, haze = load_sensor("pleiades-degraded"), load_scene_call("haze-over-sea")
+    assert set(calling_for(profile, haze, ["prnu"], ["veil"]).effects) == {"striping", "prnu"}
+    stated = calling_for(profile, haze, ["veil"]).effects["veil"]["transmittance"]
+    assert stated.low == 0.6  # the scene's own value, not the typical one
+    with pytest.raises(OptionError, match="clouds"):
+        calling_for(profile, None, ["clouds"])
