@@ -24,7 +24,7 @@ from model.simulator.digitise import to_uint16
 from model.simulator.draws import Draw
 from model.simulator.plan import TOLERANCE_DN, make_plan
 from model.simulator.procedural import procedural_scene
-from model.simulator.sampling import crop_divisible
+from model.simulator.sampling import crop_divisible, resample
 from model.simulator.scene import Scene, read_scene
 from profiles.errors import ImageError, OptionError
 from profiles.sensor import SensorProfile
@@ -47,14 +47,14 @@ class DatasetRecipe:
     radiance_scale: float = 1.0
     seed: int = 0
     tolerance_dn: float = TOLERANCE_DN
+    scene_scale: float = 1.0  # scenes are resampled by it first, where the wanted ratio is no whole number
 
     def to_json(self) -> dict[str, object]:
         """The recipe as a file keeps it; scenes by name and digest."""
         scenes = [{"name": p.name, "sha256": sha256(p)} if p else {"name": "drawn"} for p in self.scenes]
         profiles = {role: asdict(p) for role, p in (("degraded", self.degraded), ("reference", self.reference))}
-        rest = {
-            key: getattr(self, key) for key in ("oversampling", "patch_px", "radiance_scale", "seed", "tolerance_dn")
-        }
+        keys = ("oversampling", "scene_scale", "patch_px", "radiance_scale", "seed", "tolerance_dn")
+        rest = {key: getattr(self, key) for key in keys}
         return {"scenes": scenes, **profiles, **rest}
 
 
@@ -111,7 +111,11 @@ def load(recipe: DatasetRecipe, index: int) -> Scene:
         scene = procedural_scene(DRAWN_SIDE_PX, DRAWN_SIDE_PX, generator)
     else:
         scene = read_scene(path, recipe.reference.nominal())
-    return Scene(scene.name, scene.radiance * recipe.radiance_scale)
+    radiance = scene.radiance * recipe.radiance_scale
+    if recipe.scene_scale != 1:
+        height, width = (round(side * recipe.scene_scale) for side in radiance.shape)
+        radiance = resample(radiance, height, width)
+    return Scene(scene.name, radiance)
 
 
 def make_patches(recipe: DatasetRecipe, windows: list[Window], out: Path) -> list[dict[str, object]]:

@@ -101,6 +101,14 @@ class SensorProfile:
         )
 
 
+def mtf_limit(antialias_sigma_px: float = 0.0) -> float:
+    """The highest MTF at Nyquist, that of a perfect lens: 2 / pi for a square detector, times the filter's gain.
+
+    A Gaussian filter of sigma target pixels keeps exp(-2 pi^2 sigma^2 f^2) at f = 0.5 cycles per pixel.
+    """
+    return MTF_NYQUIST_MAX * math.exp(-2 * (math.pi * antialias_sigma_px * 0.5) ** 2)
+
+
 def _middle(constant: Constant) -> float:
     return (constant.low + constant.high) / 2
 
@@ -208,7 +216,23 @@ def _check_physics(label: str, profile: SensorProfile) -> None:
     for key, constant, valid, expected, remedy in checks:
         if not (valid(constant.low) and valid(constant.high)):
             raise ProfileError(f"{label} {key}", expected=expected, got=str(constant), remedy=remedy)
+    _check_budget(label, profile)
     _check_snr(profile)
+
+
+def _check_budget(label: str, profile: SensorProfile) -> None:
+    """The anti-alias filter alone must leave the MTF that the profile states."""
+    if "antialias" not in profile.effects:
+        return
+    sigma = profile.effects["antialias"]["sigma_px"]
+    limit = mtf_limit(sigma.high)
+    if profile.mtf_nyquist.high > limit:
+        raise ProfileError(
+            f"{label} [mtf] mtf_nyquist",
+            expected=f"at most {limit:.4f}, what an anti-alias filter of {sigma.high:g} px leaves",
+            got=str(profile.mtf_nyquist),
+            remedy="lower one of the two",
+        )
 
 
 def _check_snr(profile: SensorProfile) -> None:

@@ -41,7 +41,7 @@ def simulate(
     preset: Annotated[str | None, typer.Option(help=f"A dataset of the paper: {', '.join(PRESETS)}.")] = None,
     patch: Annotated[int | None, typer.Option(min=8, help="Patch side in pixels; whole scenes if none.")] = None,
     oversampling: Annotated[
-        int | None, typer.Option(min=1, help="Scene pixels per pixel; the profile's if none.")
+        float | None, typer.Option(min=1, help="Scene pixels per pixel, whole or not; the profile's if none.")
     ] = None,
     scene: Annotated[
         str | None, typer.Option(help="What the scene calls for: night-port, snow, ..., or a .toml.")
@@ -57,6 +57,7 @@ def simulate(
     resume: Annotated[bool, typer.Option("--resume", help="Go on with an unfinished dataset.")] = False,
 ) -> None:
     """Write degraded/NAME.tif and reference/NAME.tif for each scene or patch; the same bytes for the same seed."""
+    import math
     import os
 
     from deploy.dataset import DatasetRecipe, plan_windows, write_dataset
@@ -69,15 +70,18 @@ def simulate(
     chosen = _preset(preset)
     call = load_scene_call(scene) if scene else None
     degraded = calling_for(load_sensor(sensor or chosen.sensor), call, add or (), forbid or ())
+    wanted = oversampling or degraded.oversampling.low
+    ratio = math.ceil(wanted)
     recipe = DatasetRecipe(
         tuple(scenes) if scenes else (None,),
         degraded,
         load_sensor(reference),
-        oversampling or int(degraded.oversampling.low),
+        ratio,
         patch or (chosen.patch_px if preset else None),
         call.radiance_scale.low if call else 1.0,
         seed,
         tolerance,
+        ratio / wanted,
     )
     if out is None and not explain:
         raise OptionError("--out", expected="a folder", got="none", remedy="give one, or ask for --explain alone")

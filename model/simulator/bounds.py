@@ -13,10 +13,10 @@ import torch
 from torch import Tensor
 
 from model.simulator.fixed_pattern import PATTERN_LIMIT
-from model.simulator.mtf import mtf_limit, smear_response, transfer_function
+from model.simulator.mtf import smear_response, transfer_function
 from model.simulator.noise import NOISE_LIMIT
 from profiles.effects import AntiAlias, Defects, Dsnu, Effect, FullWell, Offset, Prnu, Smear, Striping, Veil
-from profiles.sensor import Sensor
+from profiles.sensor import Sensor, mtf_limit
 
 
 @dataclass(frozen=True)

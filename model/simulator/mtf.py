@@ -8,7 +8,7 @@ from torch import Tensor
 
 from profiles.effects import AntiAlias, Smear
 from profiles.errors import OptionError
-from profiles.sensor import MTF_NYQUIST_MAX, Sensor
+from profiles.sensor import MTF_NYQUIST_MAX, Sensor, mtf_limit
 
 NYQUIST = 0.5
 """Cycles per target pixel."""
@@ -36,12 +36,6 @@ def gamma_from_mtf(mtf_nyquist: float, antialias_sigma_px: float = 0.0) -> float
         )
     # max: at the limit itself the rounding of the ratio may fall on either side of 1
     return max(-2 * math.log(mtf_nyquist / limit), 0.0)
-
-
-def mtf_limit(antialias_sigma_px: float = 0.0) -> float:
-    """The highest MTF at Nyquist, that of a perfect lens: 2 / pi for a square detector, times the filter's gain."""
-    at_nyquist = torch.tensor(NYQUIST, dtype=torch.float64)
-    return MTF_NYQUIST_MAX * float(gaussian_response(at_nyquist, antialias_sigma_px))
 
 
 def mtf(fx: Tensor, fy: Tensor, mtf_nyquist: float, antialias_sigma_px: float = 0.0) -> Tensor:

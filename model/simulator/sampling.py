@@ -49,6 +49,29 @@ def crop_divisible(radiance: Tensor, oversampling: int) -> Tensor:
     return radiance[..., :height, :width]
 
 
+def resample(radiance: Tensor, height: int, width: int) -> Tensor:
+    """A scene (H, W) on another grid over the same ground, band-limited: for ratios that are no whole number.
+
+    Frequencies that the new grid cannot hold are cut, others kept as they are; new ones are zero. Pixel n of the new
+    grid lies at (n + 1/2) H / height - 1/2 of the old: the ground does not shift. The borders wrap.
+    """
+    old_height, old_width = radiance.shape[-2:]
+    spectrum = torch.fft.rfft2(radiance)
+    fy, fx = (
+        torch.fft.fftfreq(old_height, device=radiance.device),
+        torch.fft.rfftfreq(old_width, device=radiance.device),
+    )
+    spectrum = spectrum * _ramp(fy, (old_height / height - 1) / 2)[:, None] * _ramp(fx, (old_width / width - 1) / 2)
+    rows, columns = min(old_height, height), min(old_width, width)
+    top, bottom, half = (rows + 1) // 2, rows // 2, columns // 2 + 1
+    cut = torch.zeros(height, width // 2 + 1, dtype=spectrum.dtype, device=spectrum.device)
+    cut[:top, :half] = spectrum[:top, :half]
+    cut[height - bottom :, :half] = spectrum[old_height - bottom :, :half]
+    scale = height * width / (old_height * old_width)
+    resampled: Tensor = torch.fft.irfft2(cut, s=(height, width)) * scale
+    return resampled
+
+
 def check_divisible(height: int, width: int, oversampling: int) -> None:
     """Refuse a scene that the target grid does not divide."""
     if oversampling < 1 or height % oversampling or width % oversampling:

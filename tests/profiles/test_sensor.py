@@ -7,6 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from profiles import load_sensor, load_target, sensor_names, target_names
+from profiles.effects import Smear
 from profiles.errors import ProfileError
 from profiles.sensor import TABLES, noise_from_snr, snr_0_bounds
 from profiles.toml import HERE
@@ -126,3 +127,34 @@ def test_noise_reproduces_both_points() -> None:
     assert beta == pytest.approx(0.0579, abs=1e-4)
     for radiance, snr in ((25, 50), (100, 110)):
         assert radiance / math.sqrt(alpha * radiance + beta) == pytest.approx(snr)
+
+
+def with_table(folder: Path, table: str) -> str:
+    path = folder / "mine.toml"
+    path.write_text((HERE / "sensors" / "pleiades-reference.toml").read_text() + "\n" + table)
+    return str(path)
+
+
+def test_a_table_calls_for_its_effect(tmp_path: Path) -> None:
+    profile = load_sensor(with_table(tmp_path, "[smear]\nlength_px = [0.2, 0.4]\n"))
+    drawn = [profile.draw(np.random.default_rng(s)).effects["smear"] for s in range(5)]
+    lengths = {effect.length_px for effect in drawn if isinstance(effect, Smear)}
+    assert len(lengths) == 5
+    assert all(0.2 <= length <= 0.4 for length in lengths)
+
+
+@pytest.mark.parametrize(
+    ("table", "words"),
+    [
+        ("[antialias]\nsigma_px = 0.5\n", ("0.1854", "anti-alias", "0.25")),
+        ("[smear]\nlength = 0.2\n", ("'length'", "length_px")),
+        ("[prnu]\nrms = 0.5\n", ("0 to 0.2",)),
+        ("[clouds]\ncover = 0.5\n", ("'clouds'",)),
+        ("smear = 3\n", ("smear",)),
+    ],
+)
+def test_a_wrong_effect_gets_one_sentence(table: str, words: tuple[str, ...], tmp_path: Path) -> None:
+    with pytest.raises(ProfileError) as caught:
+        load_sensor(with_table(tmp_path, table))
+    for word in ("expected", "got", *words):
+        assert word in str(caught.value)
