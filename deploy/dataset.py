@@ -18,13 +18,12 @@ import torch
 
 from deploy.restore import write_tiff
 from model.files import sha256, write_text
-from model.simulator.acquire import MARGIN_PX, simulate_planned
-from model.simulator.bounds import scene_stats
+from model.simulator.acquire import MARGIN_PX, prepare_scene, simulate_planned
 from model.simulator.digitise import to_uint16
 from model.simulator.draws import Draw
 from model.simulator.plan import TOLERANCE_DN, make_plan
 from model.simulator.procedural import procedural_scene
-from model.simulator.sampling import crop_divisible, resample
+from model.simulator.sampling import resample
 from model.simulator.scene import Scene, read_scene
 from profiles.errors import ImageError, OptionError
 from profiles.sensor import SensorProfile
@@ -127,14 +126,14 @@ def make_patches(recipe: DatasetRecipe, windows: list[Window], out: Path) -> lis
 
 def _make_patch(recipe: DatasetRecipe, window: Window, radiance: torch.Tensor, out: Path) -> dict[str, object]:
     bottom, right = window.top + window.height, window.left + window.width
-    part = crop_divisible(radiance[window.top : bottom, window.left : right], recipe.oversampling)
-    stats, draw = scene_stats(part, recipe.oversampling), Draw(recipe.seed, window.number)
+    part = prepare_scene(radiance[window.top : bottom, window.left : right], recipe.oversampling)
+    draw = Draw(recipe.seed, window.number)
     line: dict[str, object] = {"number": window.number, "name": window.name, "seed": recipe.seed}
     line |= {"source": window.name.split("-", 1)[1], "top_px": window.top, "left_px": window.left}
     for role, profile in (("degraded", recipe.degraded), ("reference", recipe.reference)):
         sensor, rejected = profile.draw_counted(draw.generator(f"sensor-{role}"))
-        plan = make_plan(sensor, stats, recipe.tolerance_dn)
-        dn = simulate_planned(part, sensor, recipe.oversampling, draw, plan, role)
+        plan = make_plan(sensor, part.stats, recipe.tolerance_dn)
+        dn = simulate_planned(part, sensor, draw, plan, role)
         write_tiff(out / role / f"{window.name}.tif", to_uint16(dn))
         line[role] = {"sensor": asdict(sensor), "rejected_snr_pairs": rejected, "plan": plan.to_json()}
     return line

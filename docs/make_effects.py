@@ -11,7 +11,7 @@ import numpy as np
 from PIL import Image
 
 from deploy.report.pictures import Stretch, strip
-from model.simulator.acquire import MARGIN_PX, simulate_planned
+from model.simulator.acquire import MARGIN_PX, prepare_scene, simulate_planned
 from model.simulator.bounds import scene_stats
 from model.simulator.draws import Draw
 from model.simulator.plan import Plan, make_plan
@@ -79,14 +79,15 @@ def plain() -> Sensor:
 def figure() -> Image.Image:
     """A grid of crops: no optional effect, each alone, all."""
     side = (SIDE_PX + 2 * MARGIN_PX) * RATIO
-    scene = procedural_scene(3520, 3520, np.random.default_rng(0)).radiance[2000 : 2000 + side, 2300 : 2300 + side]
+    radiance = procedural_scene(3520, 3520, np.random.default_rng(0)).radiance
+    scene = prepare_scene(radiance[2000 : 2000 + side, 2300 : 2300 + side], RATIO)
     effects = {name: stronger(name, middle_effect(name, table)) for name, table in typical_effects().items()}
     sensors = {"blur and noise": plain()}
     sensors |= {f"+ {name}": replace(plain(), effects={name: effects[name]}) for name in TABLES}
     sensors["all"] = replace(plain(), effects=effects)
-    stats, images = scene_stats(scene, RATIO), {}
+    images = {}
     for name, sensor in sensors.items():
-        images[name] = simulate_planned(scene, sensor, RATIO, Draw(0), make_plan(sensor, stats)).numpy()
+        images[name] = simulate_planned(scene, sensor, Draw(0), make_plan(sensor, scene.stats)).numpy()
     names = list(images)
     rows = [{name: images[name] for name in names[k : k + COLUMNS]} for k in range(0, len(names), COLUMNS)]
     strips = [strip(row, [(0, 0)], SIDE_PX, 2, Stretch(0.0, 2600.0)) for row in rows]

@@ -109,15 +109,14 @@ def _preset(name: str | None) -> Preset:
 def _explain(recipe: object) -> None:
     """The plan of the first draw of the degraded sensor, for every scene."""
     from deploy.dataset import DatasetRecipe, load
-    from model.simulator.bounds import scene_stats
+    from model.simulator.acquire import prepare_scene
     from model.simulator.draws import Draw
     from model.simulator.plan import make_plan
-    from model.simulator.sampling import crop_divisible
 
     assert isinstance(recipe, DatasetRecipe)  # noqa: S101 - imported late, for a quick --help
     for index in range(len(recipe.scenes)):
         scene = load(recipe, index)
-        stats = scene_stats(crop_divisible(scene.radiance, recipe.oversampling), recipe.oversampling)
+        stats = prepare_scene(scene.radiance, recipe.oversampling).stats
         sensor = recipe.degraded.draw(Draw(recipe.seed, index).generator("sensor-degraded"))
         title = f"{scene.name}: {stats.low:.1f} to {stats.high:.1f} W/m2/sr/um, {recipe.degraded.name}"
         _print_plan(title, make_plan(sensor, stats, recipe.tolerance_dn))

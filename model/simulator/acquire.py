@@ -2,10 +2,12 @@
 
 from collections.abc import Collection
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import torch
 from torch import Tensor
 
+from model.simulator.bounds import SceneStats, scene_stats
 from model.simulator.detect import detect
 from model.simulator.draws import Draw
 from model.simulator.mtf import sensor_transfer
@@ -26,30 +28,50 @@ class Pair:
     reference: Tensor
 
 
+@dataclass(frozen=True)
+class PreparedScene:
+    """A scene (H, W) in W/m2/sr/um on its way to several sensors: what they share is computed once."""
+
+    radiance: Tensor
+    oversampling: int
+
+    @cached_property
+    def stats(self) -> SceneStats:
+        """What the plan needs to know of it."""
+        return scene_stats(self.radiance, self.oversampling)
+
+    @cached_property
+    def spectrum(self) -> Tensor:
+        """Its half spectrum, computed when the first plan asks for a blur."""
+        return scene_spectrum(self.radiance)
+
+
+def prepare_scene(radiance: Tensor, oversampling: int) -> PreparedScene:
+    """Crop a scene to whole target pixels."""
+    return PreparedScene(crop_divisible(radiance, oversampling), oversampling)
+
+
 def simulate_planned(
-    radiance: Tensor,
+    scene: PreparedScene,
     sensor: Sensor,
-    oversampling: int,
     draw: Draw,
     plan: Plan,
     role: str = "degraded",
     margin_px: int = MARGIN_PX,
 ) -> Tensor:
-    """Acquire a scene (H, W) in W/m2/sr/um with only the effects that its plan calls for.
+    """Acquire a scene with only the effects that its plan calls for.
 
     Returns:
         Digital numbers (H / r - 2 margin, W / r - 2 margin), float32.
     """
-    radiance = crop_divisible(radiance, oversampling)
+    height, width = scene.radiance.shape
     if "mtf" in plan.skipped:
-        pixels = torch.nn.functional.avg_pool2d(radiance[None, None], oversampling)[0, 0]
-        return detect(crop_margin(pixels, margin_px), sensor, draw, role, plan.skipped)
-    spectrum, width = scene_spectrum(radiance), radiance.shape[-1]
-    transfer = sensor_transfer(
-        spectrum.shape[-2], width, oversampling, without(sensor, plan.skipped), radiance.device
-    )
-    signal = crop_margin(sample(spectrum, transfer, width, oversampling), margin_px)
-    return detect(signal, sensor, draw, role, plan.skipped)
+        pixels = torch.nn.functional.avg_pool2d(scene.radiance[None, None], scene.oversampling)[0, 0]
+    else:
+        kept = without(sensor, plan.skipped)
+        transfer = sensor_transfer(height, width, scene.oversampling, kept, scene.radiance.device)
+        pixels = sample(scene.spectrum, transfer, width, scene.oversampling)
+    return detect(crop_margin(pixels, margin_px), sensor, draw, role, plan.skipped)
 
 
 def without(sensor: Sensor, skipped: Collection[str]) -> Sensor:

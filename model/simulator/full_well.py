@@ -25,6 +25,8 @@ def _spread(excess: Tensor, length_px: float) -> Tensor:
         return torch.zeros_like(excess)
     distance = torch.arange(-radius, radius + 1, dtype=torch.float64).abs()
     kernel = torch.exp(-distance / length_px) * (distance > 0)
+    if kernel.sum() == 0:  # so short that not even a neighbour is reached
+        return torch.zeros_like(excess)
     kernel = (kernel / kernel.sum()).to(excess)
     columns = excess.reshape(-1, 1, *excess.shape[-2:])
     return torch.nn.functional.conv2d(columns, kernel[None, None, :, None], padding=(radius, 0)).reshape(excess.shape)

@@ -1,0 +1,127 @@
+"""Pairs a second of 128 x 128 patches at r = 5, with a margin of 32: ours against two plain ways, in one run.
+
+    python benchmarks/simulator.py --seconds 6
+
+(a) the same effects, each by itself at full resolution, then sampling; (b) all effects at full resolution, whatever
+the scene calls for. Ratios are what counts: machines differ and are shared.
+"""
+
+import argparse
+import multiprocessing
+import time
+from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from model.simulator.acquire import prepare_scene, simulate_planned
+from model.simulator.detect import DN_EFFECTS, RADIANCE_EFFECTS, apply_effect
+from model.simulator.digitise import digitise_dn
+from model.simulator.draws import Draw
+from model.simulator.mtf import gaussian_response, mtf, smear_response
+from model.simulator.noise import add_noise
+from model.simulator.plan import make_plan
+from model.simulator.procedural import procedural_scene
+from profiles import load_sensor
+from profiles.effects import AntiAlias, Effect, Smear, middle_effect
+from profiles.scene_call import typical_effects
+from profiles.sensor import Sensor
+
+RATIO, PATCH_PX, MARGIN_PX, PROCESSES = 5, 128, 32, 2
+ROLES = ("degraded", "reference")
+ALL: dict[str, Effect] = {name: middle_effect(name, table) for name, table in typical_effects().items()}
+
+
+def sensors(effects: dict[str, Effect]) -> tuple[Sensor, Sensor]:
+    """The degraded and the reference sensor with these effects."""
+    degraded, reference = (load_sensor(f"pleiades-{role}").nominal() for role in ROLES)
+    return replace(degraded, effects=effects), replace(reference, effects=effects)
+
+
+def ours(radiance: Tensor, eyes: tuple[Sensor, Sensor], number: int) -> None:
+    """One transform of the scene, then for each sensor a plan and one fused pass."""
+    scene = prepare_scene(radiance, RATIO)
+    for sensor, role in zip(eyes, ROLES, strict=True):
+        simulate_planned(scene, sensor, Draw(0, number), make_plan(sensor, scene.stats), role, MARGIN_PX)
+
+
+def one_by_one(radiance: Tensor, eyes: tuple[Sensor, Sensor], number: int) -> None:
+    """Every effect of each sensor in turn."""
+    for sensor, role in zip(eyes, ROLES, strict=True):
+        _acquire_plainly(radiance, sensor, number, role)
+
+
+def _acquire_plainly(radiance: Tensor, sensor: Sensor, number: int, role: str) -> Tensor:
+    """Each effect by itself at full resolution, random ones included where they act on the scene's grid."""
+    height, width = radiance.shape
+    fy = torch.fft.fftfreq(height, 1 / RATIO)[:, None]
+    fx = torch.fft.rfftfreq(width, 1 / RATIO)[None]
+    responses = [mtf(fx, fy, sensor.mtf_nyquist)]
+    antialias, smear = sensor.effects.get("antialias"), sensor.effects.get("smear")
+    if isinstance(antialias, AntiAlias):
+        responses.append(gaussian_response(torch.hypot(fx, fy), antialias.sigma_px))
+    if isinstance(smear, Smear):
+        responses.append(smear_response(fy, smear.length_px))
+    for response in responses:
+        radiance = torch.fft.irfft2(torch.fft.rfft2(radiance) * response, s=(height, width))
+    draw = Draw(0, number)
+    for name in RADIANCE_EFFECTS:
+        radiance = _apply(radiance, name, sensor, draw, role)
+    image = add_noise(radiance, sensor, draw.generator(f"noise-{role}")) * sensor.gain_dn_per_radiance
+    for name in DN_EFFECTS:
+        image = _apply(image, name, sensor, draw, role)
+    sampled = image[RATIO // 2 :: RATIO, RATIO // 2 :: RATIO]
+    return digitise_dn(sampled[MARGIN_PX:-MARGIN_PX, MARGIN_PX:-MARGIN_PX], sensor)
+
+
+def _apply(image: Tensor, name: str, sensor: Sensor, draw: Draw, role: str) -> Tensor:
+    if name not in sensor.effects:
+        return image
+    return apply_effect(image, sensor.effects[name], sensor, lambda: draw.generator(f"{name}-{role}"))
+
+
+WAYS: dict[str, tuple[Callable[[Tensor, tuple[Sensor, Sensor], int], None], bool, bool]] = {
+    # name: (way, all effects called for, all effects made)
+    "two effects: ours": (ours, False, False),
+    "two effects: (a) one by one": (one_by_one, False, False),
+    "two effects: (b) fixed chain of all": (one_by_one, False, True),
+    "all effects: ours": (ours, True, True),
+    "all effects: (a) one by one": (one_by_one, True, True),
+}
+
+
+def rate(name: str, seconds: float, seed: int) -> float:
+    """Pairs a second of one process."""
+    torch.set_num_threads(1)
+    way, _, made = WAYS[name]
+    side = (PATCH_PX + 2 * MARGIN_PX) * RATIO
+    radiance = procedural_scene(side, side, np.random.default_rng(seed)).radiance
+    eyes = sensors(ALL if made else {})
+    way(radiance, eyes, 0)  # warm-up: transfer functions are cached, as in a run
+    started, done = time.perf_counter(), 0
+    while time.perf_counter() - started < seconds:
+        done += 1
+        way(radiance, eyes, done)
+    return done / (time.perf_counter() - started)
+
+
+def main() -> None:
+    """Measure every way on two processes and print the ratios."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
+    parser.add_argument("--seconds", type=float, default=6.0, help="time for each way")
+    seconds = parser.parse_args().seconds
+    rates = {}
+    with ProcessPoolExecutor(PROCESSES, mp_context=multiprocessing.get_context("spawn")) as pool:
+        for name in WAYS:
+            jobs = [pool.submit(rate, name, seconds, seed) for seed in range(PROCESSES)]
+            rates[name] = sum(job.result() for job in jobs)
+    for name, value in rates.items():
+        best = rates[name.split(":")[0] + ": ours"]
+        print(f"{name:40s} {value:7.1f} pairs/s on {PROCESSES} processes   ours is {best / value:4.1f} times as fast")
+
+
+if __name__ == "__main__":
+    main()
