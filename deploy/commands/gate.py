@@ -30,14 +30,19 @@ def gate(
     from deploy.verdict import gate_row
     from model.files import require_writable
     from profiles import load_sensor
+    from profiles.errors import ModelError
     from quant.calibration import REFERENCE, draw_patches
     from quant.gate import compare
-    from quant.onnx_file import load_onnx
+    from quant.onnx_file import load_onnx, metadata
     from quant.session import open_session
 
     require_writable(json)
     float_path, int8_path = float_model or default_float_weights(), int8_model or default_int8()
-    sessions = open_session(read_float(float_path)), open_session(load_onnx(int8_path))
+    models = read_float(float_path), load_onnx(int8_path)
+    if metadata(models[0]).get("precision", "").startswith("int8"):
+        remedy = "give the float model first, the INT8 model second"
+        raise ModelError(str(float_path), expected="a float network", got="an INT8 one", remedy=remedy)
+    sessions = open_session(models[0]), open_session(models[1])
     degraded, reference = load_sensor(sensor), load_sensor(REFERENCE)
     held_out = seed + HELD_OUT_SEED
     scenes = load_scenes(images, reference.nominal(), held_out)

@@ -1,11 +1,14 @@
-"""`beers-deploy profiles`: list the sensor and target profiles, or show one with the source of each constant."""
+"""`beers-deploy profiles`: list the sensor, scene and target profiles, or show one with each constant's source."""
 
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from profiles.constant import Constant
+    from profiles.effects import Table
 
 EXAMPLE = "profiles pleiades-degraded"
 
@@ -15,11 +18,12 @@ def profiles(
         str | None, typer.Argument(help="A shipped profile, or a .toml file; none lists them all.")
     ] = None,
 ) -> None:
-    """List sensors and targets, or show one: every constant, its status and its source."""
+    """List sensors, scenes and targets, or show one: every constant, its status and its source."""
     from rich.table import Table
 
     from deploy.tables import default_console
     from profiles import load_sensor, load_target, sensor_names, target_names
+    from profiles.scene_call import load_scene_call, scene_names
 
     table = Table("name" if name is None else "constant", title_justify="left")
     if name is None:
@@ -27,6 +31,8 @@ def profiles(
         table.add_column("what it is")
         for sensor in sensor_names():
             table.add_row(sensor, "sensor", load_sensor(sensor).description)
+        for scene in scene_names():
+            table.add_row(scene, "scene", load_scene_call(scene).description)
         for target in target_names():
             table.add_row(target, "target", load_target(target).description)
     else:
@@ -40,23 +46,35 @@ def profiles(
 
 
 def _constants(name: str) -> "tuple[str, list[tuple[str, Constant]]]":
-    """Title and constants of a sensor, or of a target when no sensor goes by that name."""
+    """Title and constants of a sensor, a scene or a target, tried in that order."""
     from profiles import load_sensor, load_target, sensor_names, target_names
     from profiles.errors import OptionError
+    from profiles.scene_call import load_scene_call, scene_names
     from profiles.sensor import TABLES
     from profiles.toml import read_toml
 
     if name in sensor_names() or (name.endswith(".toml") and "mtf" in read_toml("sensors", name)[1]):
         sensor = load_sensor(name)
         keys = [(table, key) for table, keys in TABLES.items() for key in keys]
-        return f"{sensor.name}: {sensor.description}", [(f"{t}.{k}", getattr(sensor, k)) for t, k in keys]
+        rows = [(f"{t}.{k}", getattr(sensor, k)) for t, k in keys] + _effects(sensor.effects)
+        return f"{sensor.name}: {sensor.description}", rows
+    if name in scene_names() or (name.endswith(".toml") and "radiance_scale" in read_toml("scenes", name)[1]):
+        scene = load_scene_call(name)
+        return f"{scene.name}: {scene.description}", [
+            ("radiance_scale", scene.radiance_scale),
+            *_effects(scene.effects),
+        ]
     if name in target_names() or name.endswith(".toml"):
         target = load_target(name)
         groups = {**target.tables, **{f"configurations.{k}": v for k, v in target.configurations.items()}}
         return f"{target.name}: {target.description}", [
             (f"{group}.{key}", value) for group, table in groups.items() for key, value in table.items()
         ]
-    known = ", ".join([*sensor_names(), *target_names()])
+    known = ", ".join([*sensor_names(), *scene_names(), *target_names()])
     raise OptionError(
         "profile", expected=f"one of {known}", got=repr(name), remedy="choose one, or give a .toml file"
     )
+
+
+def _effects(effects: "Mapping[str, Table]") -> "list[tuple[str, Constant]]":
+    return [(f"{name}.{key}", constant) for name, table in effects.items() for key, constant in table.items()]

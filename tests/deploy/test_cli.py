@@ -169,6 +169,19 @@ def broken_copy(folder: Path) -> Path:
     return folder / "broken.onnx"
 
 
+def test_swapped_models_are_noticed(tmp_path: Path) -> None:
+    weights = tmp_path / "float.onnx"
+    assert runner.invoke(app, ["export", "--out", str(weights)]).exit_code == 0
+    fails(["gate", str(default_int8()), str(weights)], "first")
+
+
+@pytest.mark.parametrize("name", ["snow", "vck190", "pleiades-variable"])
+def test_scenes_targets_and_sensors_can_be_shown(name: str) -> None:
+    result = runner.invoke(app, ["profiles", name])
+    assert result.exit_code == 0
+    assert "source" in result.output
+
+
 def test_profiles_show_every_source() -> None:
     assert "pleiades-degraded" in runner.invoke(app, ["profiles"]).output
     shown = runner.invoke(app, ["profiles", "pleiades-degraded"]).output
