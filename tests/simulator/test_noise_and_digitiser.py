@@ -20,11 +20,17 @@ def test_the_variance_is_alpha_l_plus_beta(radiance: float) -> None:
     assert float(noisy.double().mean()) == pytest.approx(radiance, abs=4 * (expected / image.numel()) ** 0.5)
 
 
-def test_digitising_adds_a_twelfth_of_a_unit_squared() -> None:
-    image = torch.full((700, 701), 25.0)
+@pytest.mark.parametrize("radiance", [2.0, 25.0, 60.0, 100.0, 300.0])
+def test_digitising_adds_a_twelfth_of_a_unit_squared(radiance: float) -> None:
+    image = torch.full((700, 701), radiance)
     dn = digitise(add_noise(image, SENSOR, Draw(2).generator("noise")), SENSOR)
-    expected = (SENSOR.alpha * 25 + SENSOR.beta) * SENSOR.gain_dn_per_radiance**2 + 1 / 12
+    expected = (SENSOR.alpha * radiance + SENSOR.beta) * SENSOR.gain_dn_per_radiance**2 + 1 / 12
     assert float(dn.double().var()) == pytest.approx(expected, rel=0.01)
+
+
+def test_snr_is_a_linear_ratio_not_decibels() -> None:
+    assert SENSOR.noise_sigma(25) == pytest.approx(0.5)
+    assert SENSOR.noise_sigma(100) == pytest.approx(0.909, abs=1e-3)
 
 
 def test_ringing_below_zero_is_harmless() -> None:
