@@ -14,17 +14,16 @@ import torch
 from deploy.bench import Swath, predict_file, predicted_rows, published_rows
 from deploy.defaults import HELD_OUT_SEED, VARIANT, default_float_weights, float_model, load_scenes
 from deploy.dpu.board import Dpu, load_dpu
-from deploy.dpu.placement import Placement, place
+from deploy.dpu.placement import place
 from deploy.dpu.reading import read_network
 from deploy.evaluate import Method, fidelity_row
 from deploy.export import parity
 from deploy.measure import Sensors, traditional_rows
-from deploy.report.page import Picture, Report, Table
-from deploy.report.pictures import busiest_windows, picture_url, stretch_of, strip
+from deploy.report.demo_page import INT8, SWATH_PX, TRADITIONAL, comparison, demo_report
+from deploy.report.page import Report
 from deploy.restore import TILE_PX, read_acquisition, restore_image, write_tiff
 from deploy.results import Row, measured
 from deploy.verdict import gate_row
-from model.files import whole_file
 from model.images import read_pixels
 from model.simulator.acquire import MARGIN_PX, Pair, simulate_pair
 from model.simulator.draws import Draw
@@ -43,8 +42,6 @@ from quant.session import open_session
 SENSOR = "pleiades-degraded"
 SIDE_PX = 640
 CALIBRATION_PATCHES, GATE_PATCHES = 24, 12
-CROP_PX, ZOOM = 110, 3
-PAPER_SWATH = (13600, 9016)
 
 
 @dataclass(frozen=True)
@@ -106,15 +103,12 @@ def run_demo(image: Path | None, out: Path, seed: int, say: Callable[[str], None
     images = {"degraded input": given.degraded, **restored}
     if given.pair is not None:
         images["reference"] = given.pair.reference.numpy()
-    pictures = _pictures(images, out)
+    pictures = comparison(images, out)
     quality = _quality(given, restored)
     say("measuring the traditional pipeline, predicting the board")
     bench, swath = bench_rows(out / "int8.onnx", given.degraded, dpu, receptive_radius_px(int8))
     rows = (*bench, *swath, *quality, gate, exact)
-    return Demo(rows, _report(given, pictures, bench, swath, quality, (gate, exact), placement))
-
-
-TRADITIONAL, INT8 = "traditional", f"{VARIANT}, INT8"
+    return Demo(rows, demo_report(given.degraded.shape, pictures, bench, swath, quality, (gate, exact), placement))
 
 
 def quantise_and_gate(out: Path, seed: int) -> tuple[Row, onnx.ModelProto, Row]:
@@ -141,7 +135,7 @@ def bench_rows(model: Path, dn: np.ndarray, dpu: Dpu, halo_px: int) -> tuple[lis
     """Speed for this image, and for the swath of the paper with its published rows beside."""
     prediction = predict_file(model, dpu)
     tables = []
-    for width, height in ((dn.shape[1], dn.shape[0]), PAPER_SWATH):
+    for width, height in ((dn.shape[1], dn.shape[0]), SWATH_PX):
         swath = Swath(width, height, TILE_PX, halo_px)
         network = predicted_rows(VARIANT, prediction, swath, dpu)
         tables.append([*traditional_rows(dn, swath, sensors()), *network])
@@ -171,78 +165,3 @@ def _quality(given: Input, restored: dict[str, np.ndarray]) -> list[Row]:
     reference = given.pair.reference.numpy()
     images = {"degraded input": given.degraded, **restored}
     return [fidelity_row("quality", name, dn, reference) for name, dn in images.items()]
-
-
-def _report(
-    given: Input,
-    pictures: list[Picture],
-    bench: list[Row],
-    swath: list[Row],
-    quality: list[Row],
-    gate: tuple[Row, ...],
-    placement: Placement,
-) -> Report:
-    tables = [
-        Table(f"Time and power for this image, {given.degraded.shape[1]} x {given.degraded.shape[0]}", bench),
-        Table(f"A swath of {PAPER_SWATH[0]} x {PAPER_SWATH[1]}, beside the paper's figures", swath, SWATH_CAPTION),
-        *([Table("Quality on this image, over 4095 DN", quality)] if quality else []),
-        Table("What quantisation changes", gate, GATE_CAPTION),
-    ]
-    return Report(
-        "From training to board, on one image",
-        headline(bench, quality, placement),
-        tables,
-        pictures,
-        NOTES,
-    )
-
-
-SWATH_CAPTION = (
-    "The traditional pipeline is measured on crops of this image and scaled; the paper's rows are what it printed "
-    "for another network (16 blocks of 64 features) on its own hardware."
-)
-GATE_CAPTION = (
-    "On simulated patches that calibration did not see; the INT8 network obeys the DPU's power-of-two rules."
-)
-NOTES = (
-    "Nothing here has run on a board: the DPU's figures come from a cost model fitted on published networks.",
-    "The power of the DPU run is an assumption anchored at the paper's single figure, with a range.",
-    "INT8 time on this CPU is no proxy for the DPU.",
-)
-
-
-def headline(bench: list[Row], quality: list[Row], placement: Placement) -> str:
-    """One sentence: does it fit, how fast, at what quality."""
-    latency = next(row for row in bench if "whole tiles" in row.name).figures["latency"]
-    cpu = bench[0].figures["latency"]
-    fits = (
-        "fits the DPU whole"
-        if placement.dpu_subgraphs == 1 and not placement.failed
-        else "does not fit the DPU whole"
-    )
-    text = f"{VARIANT} in INT8 {fits}: predicted {latency} s for this image on a VCK190"
-    text += f", against {cpu} s {cpu.mode} for the traditional pipeline on this CPU"
-    if quality:
-        before, after = quality[0].figures["PSNR"], quality[-1].figures["PSNR"]
-        text += f"; PSNR rises from {before} to {after} dB (measured)"
-    return text + "."
-
-
-def _pictures(images: dict[str, np.ndarray], out: Path) -> list[Picture]:
-    first = next(iter(images.values()))
-    side = min(CROP_PX, *first.shape)
-    stretch = stretch_of(first)
-    windows = busiest_windows(first, side)
-    crops = strip(images, windows, side, ZOOM, stretch)
-    with whole_file(out / "before-after.png") as temporary:
-        crops.save(temporary, "PNG", optimize=True)
-    whole = stretch.to_bytes(images[INT8])[: 2 * SIDE_PX, : 2 * SIDE_PX]
-    where = " and ".join(f"row {top}, column {left}" for top, left in windows)
-    return [
-        Picture(
-            "The same crops, before and after",
-            picture_url(np.asarray(crops)),
-            f"{side} pixels a side from {where}, enlarged {ZOOM} times.",
-        ),
-        Picture(f"Restored by {INT8}", picture_url(whole), "The network's output, same grey scale as above."),
-    ]
