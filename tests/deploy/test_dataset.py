@@ -10,7 +10,7 @@ import pytest
 import tifffile
 from PIL import Image
 
-from deploy.dataset import DatasetRecipe, plan_windows, write_dataset
+from deploy.dataset import DatasetRecipe, make_patches, plan_windows, write_dataset
 from profiles import load_sensor
 from profiles.errors import ImageError, OptionError
 from profiles.scene_call import calling_for, load_scene_call, scene_names, typical_effects
@@ -38,6 +38,15 @@ def test_the_bytes_do_not_depend_on_the_workers(scene: Path, tmp_path: Path) -> 
     for workers in (1, 2):
         write_dataset(small(scene), tmp_path / str(workers), workers, resume=False, tick=lambda _: None)
     assert bytes_of(tmp_path / "1") == bytes_of(tmp_path / "2")
+
+
+def test_any_patch_can_be_made_again_alone(scene: Path, tmp_path: Path) -> None:
+    write_dataset(small(scene), tmp_path / "all", 1, resume=False, tick=lambda _: None)
+    window = plan_windows(small(scene))[7]
+    make_patches(small(scene), [window], tmp_path / "one")
+    for role in ("degraded", "reference"):
+        name = f"{role}/{window.name}.tif"
+        assert (tmp_path / "one" / name).read_bytes() == (tmp_path / "all" / name).read_bytes()
 
 
 def test_the_manifest_tells_where_each_patch_comes_from(scene: Path, tmp_path: Path) -> None:
