@@ -153,6 +153,8 @@ def write_dataset(
     _check_folder(recipe, out, resume)
     if (out / "manifest.jsonl").exists():  # nothing was left to do
         return _summary((out / "manifest.jsonl").read_text(encoding="utf-8"))
+    for left_over in out.rglob(".*.part"):  # of a run that was killed
+        left_over.unlink()
     windows = plan_windows(recipe)
     chunks = [c for _, group in groupby(windows, key=lambda w: w.scene) for c in _chunks(list(group))]
     parts = {out / "parts" / f"{chunk[0].number:08d}.jsonl": chunk for chunk in chunks}
