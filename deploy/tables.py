@@ -25,7 +25,8 @@ def print_rows(title: str, rows: Iterable[Row], console: Console | None = None) 
     table = by_figure(rows, keys) if len(keys) > len(rows) else by_row(rows, keys)
     table.title, table.title_justify = title, "left"
     console.print(table)
-    console.print(LEGEND, style="dim", highlight=False, markup=False)
+    if keys:
+        console.print(LEGEND, style="dim", highlight=False, markup=False)
     for reason in dict.fromkeys(missing(rows)):
         console.print(reason, style="dim", highlight=False, markup=False)
 
