@@ -57,7 +57,9 @@ def _conv(w: "_Writer", core: IntCore, op: IntConv) -> None:
     shift = op.weight_position + core.positions[op.input] - op.bias_position
     bias = op.bias.astype(np.int32) << shift
     feeds = [op.input, w.unit(core.positions[op.input]), w.zero_point()]
-    feeds += [w.constant(f"{op.name}.weight", op.weight), w.unit(op.weight_position), w.weight_zero_point()]
+    feeds += [w.constant(f"{op.name}.weight", op.weight), w.unit(op.weight_position)]
+    # One a weight: where onnxruntime rewrites weights (see quant.session), it trips over a shared one.
+    feeds += [w.constant(f"{op.name}.weight_zero_point", np.array(0, np.int8))]
     feeds += [w.unit(core.positions[op.output]), w.zero_point(), w.constant(f"{op.name}.bias", bias)]
     result = f"{op.output}.linear" if op.relu else op.output
     kernel = list(op.weight.shape[2:])
@@ -113,6 +115,3 @@ class _Writer:
 
     def zero_point(self) -> str:
         return self.constant("zero_point", np.array(ZERO, np.uint8))
-
-    def weight_zero_point(self) -> str:
-        return self.constant("weight_zero_point", np.array(0, np.int8))

@@ -1,5 +1,7 @@
 """An onnxruntime session, set up once for the whole project."""
 
+import platform
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -9,8 +11,19 @@ import onnxruntime as ort
 from profiles.errors import ModelError
 
 
-def open_session(model: Path | onnx.ModelProto, threads: int = 0, optimise: bool = True) -> ort.InferenceSession:
-    """Open a model on the CPU; `threads` 0 takes every core, `optimise` False runs the graph as written.
+def open_session(
+    model: Path | onnx.ModelProto, threads: int = 0, optimise: bool = True, exact: bool | None = None
+) -> ort.InferenceSession:
+    """Open a model on the CPU.
+
+    x86 processors without VNNI add pairs of int8 products in saturating int16: other numbers than the DPU's. There
+    onnxruntime is told to take its exact kernels, which cost speed.
+
+    Args:
+        model: a file or a model in memory.
+        threads: 0 takes every core.
+        optimise: False runs the graph as written.
+        exact: take the exact int8 kernels; None decides by the processor.
 
     Raises:
         ModelError: onnxruntime refuses the model.
@@ -18,6 +31,10 @@ def open_session(model: Path | onnx.ModelProto, threads: int = 0, optimise: bool
     options = ort.SessionOptions()
     options.intra_op_num_threads = threads
     options.log_severity_level = 3
+    if exact is None:
+        exact = not has_vnni()
+    if exact:
+        options.add_session_config_entry("session.x64quantprecision", "1")
     if not optimise:
         options.graph_optimization_level = ort.GraphOptimizationLevel.ORT_DISABLE_ALL
     source = model.SerializeToString() if isinstance(model, onnx.ModelProto) else str(model)
@@ -28,6 +45,17 @@ def open_session(model: Path | onnx.ModelProto, threads: int = 0, optimise: bool
         got = " ".join(str(error).split())[:160]
         remedy = "give a file written by 'beers-deploy export' or 'beers-deploy quantize'"
         raise ModelError(name, expected="a model that onnxruntime runs", got=got, remedy=remedy) from error
+
+
+@lru_cache(maxsize=1)
+def has_vnni() -> bool:
+    """Whether int8 products are added exactly by this processor; False where it cannot be told."""
+    if platform.machine().lower() not in ("x86_64", "amd64"):
+        return True  # the saturating instruction is x86's own
+    try:
+        return "vnni" in Path("/proc/cpuinfo").read_text(encoding="utf-8")
+    except OSError:
+        return False
 
 
 def run(session: ort.InferenceSession, image: np.ndarray) -> np.ndarray:

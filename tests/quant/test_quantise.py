@@ -65,6 +65,11 @@ def test_optimised_equals_unoptimised(quantised: Quantised) -> None:
     np.testing.assert_array_equal(run(open_session(quantised.host), image()), run(plain, image()))
 
 
+def test_the_exact_kernels_compute_the_same(quantised: Quantised) -> None:
+    default, exact = (open_session(quantised.host, exact=e) for e in (None, True))
+    np.testing.assert_array_equal(run(default, image()), run(exact, image()))
+
+
 def test_every_convolution_is_an_integer_kernel(quantised: Quantised) -> None:
     kinds = [node.op_type for node in quantised.host.graph.node]
     assert kinds.count("QLinearConv") == 7
