@@ -55,6 +55,8 @@ def train(
     source = PatchSource(scenes, recipe, batch, seed)
     with (out / "log.csv").open("a") as log, progress("training", steps) as bar:
         bar.advance(trainer.step)
+        if log.tell() == 0:
+            log.write("step,l1,patches_per_s\n")
 
         def report(now: Progress) -> None:
             log.write(f"{now.step},{now.loss:.6g},{now.patches_per_s:.1f}\n")
