@@ -119,9 +119,17 @@ def effect_bound_dn(effect: Effect, sensor: Sensor, low: float, high: float) -> 
         case Offset():
             return effect.offset_dn
         case Defects():
-            return float(sensor.max_dn) if effect.dead_per_million + effect.hot_per_million > 0 else 0.0
+            return _defects_bound_dn(effect, sensor, low, high)
         case _:
             return 0.0
+
+
+def _defects_bound_dn(defects: Defects, sensor: Sensor, low: float, high: float) -> float:
+    """A pixel becomes 0 or full scale, whatever it was before: beyond the converter's range too."""
+    if defects.dead_per_million + defects.hot_per_million == 0:
+        return 0.0
+    ends = [sensor.gain_dn_per_radiance * v for v in (low, high)]
+    return max(max(abs(dn), abs(sensor.max_dn - dn)) for dn in ends)
 
 
 def noise_bound_dn(sensor: Sensor, high: float) -> float:

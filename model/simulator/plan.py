@@ -104,9 +104,11 @@ def effect_bounds(sensor: Sensor, stats: SceneStats) -> dict[str, float]:
             bounds[name] = behind(direct, sensor, _after(name))
             low, high = low - direct / gain, high + direct / gain  # whether it is applied or not
     bounds["noise"] = noise_bound_dn(sensor, high)
+    low, high = low - bounds["noise"] / gain, high + bounds["noise"] / gain
     for name in ("dsnu", "striping", "offset", "defects"):
         if name in sensor.effects:
             bounds[name] = effect_bound_dn(sensor.effects[name], sensor, low, high)
+            low, high = low - bounds[name] / gain, high + bounds[name] / gain
     return bounds
 
 

@@ -5,6 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from hypothesis import given
+from hypothesis import strategies as st
 
 from model.simulator.acquire import prepare_scene, simulate_planned
 from model.simulator.bounds import scene_stats
@@ -12,8 +14,8 @@ from model.simulator.defects import add_defects
 from model.simulator.draws import Draw
 from model.simulator.fixed_pattern import apply_dsnu, apply_prnu, apply_striping
 from model.simulator.full_well import saturate
-from model.simulator.mtf import gamma_from_mtf, mtf, transfer_function
-from model.simulator.plan import make_plan
+from model.simulator.mtf import gamma_from_mtf, mtf, smear_response, transfer_function
+from model.simulator.plan import TOLERANCE_DN, Plan, make_plan
 from model.simulator.sampling import sample, scene_spectrum
 from model.simulator.veil import add_veil
 from profiles.effects import (
@@ -159,3 +161,60 @@ def test_the_offset_lifts_every_pixel() -> None:
         for e in ({}, {"offset": Offset(64.0)})
     )
     np.testing.assert_allclose((lifted - dark).numpy(), 64.0, rtol=1e-6)
+
+
+@pytest.mark.parametrize("name", NEUTRAL)
+def test_an_effect_that_is_applied_at_neutral_parameters_leaves_the_product_as_it_is(name: str) -> None:
+    """The plan skips nothing here: the operator itself must change no bit."""
+    prepared, draw, everything = prepare_scene(scene(171, 195), 3), Draw(7), Plan((), TOLERANCE_DN)
+    images = [
+        simulate_planned(prepared, stages.plain_sensor(**effects), draw, everything, margin_px=5)
+        for effects in ({name: NEUTRAL[name]}, {})
+    ]
+    assert torch.equal(*images)
+
+
+@pytest.mark.parametrize("name", ["dsnu", "striping", "offset"])
+def test_the_noise_is_the_same_whether_a_pattern_is_applied_or_not(name: str) -> None:
+    """What is added in DN is then all that differs, and it is the same in every row."""
+    radiance, effects = scene(93, 111), {"dsnu": Dsnu(3.0), "striping": Striping(2.0), "offset": Offset(64.0)}
+    sensor = stages.plain_sensor(**effects)
+    whole = stages.before_digitising(radiance, sensor, 3, Draw(5))
+    added = whole - stages.before_digitising(radiance, sensor, 3, Draw(5), {name})
+    np.testing.assert_allclose(added.numpy(), added[:1].expand_as(added).numpy(), atol=1e-3)
+    assert float(added.abs().min()) > 0
+
+
+@given(st.floats(1, 150), st.floats(0, 0.5), st.floats(0, 9), st.integers(2, 37), st.integers(0, 99))
+def test_a_full_well_gives_back_no_more_than_its_share_of_what_it_cuts_off(
+    well: float, share: float, length_px: float, rows: int, seed: int
+) -> None:
+    image = scene(rows, 9, seed)
+    flooded, clipped = saturate(image, FullWell(well, share, length_px)).double(), image.clamp(max=well).double()
+    cut, gained = (image.double() - clipped).sum(0), (flooded - clipped).sum(0)
+    assert bool((flooded >= clipped).all())
+    assert float(flooded.max()) <= well * (1 + 1e-6)
+    assert bool((gained <= share * cut + 1e-3).all())
+
+
+def test_smear_over_whole_scene_pixels_is_their_mean() -> None:
+    """On a smooth scene, without blur or sampling: 2 target pixels are 8 scene pixels, the outer two by half."""
+    ratio, side = 4, 160
+    y = torch.arange(side, dtype=torch.float64) / side
+    wave = 100 + 30 * torch.cos(2 * math.pi * 3 * y) + 10 * torch.sin(2 * math.pi * 5 * y)
+    frequency = torch.fft.rfftfreq(side, 1 / ratio, dtype=torch.float64)
+    smeared = torch.fft.irfft(torch.fft.rfft(wave) * smear_response(frequency, 2.0), n=side)
+    weights = [0.5, *[1.0] * 7, 0.5]
+    mean = sum((w * torch.roll(wave, k - 4) for k, w in enumerate(weights)), torch.zeros_like(wave)) / 8
+    np.testing.assert_allclose(smeared.numpy(), mean.numpy(), atol=0.1)
+    assert float((smeared - wave).abs().max()) > 0.5
+
+
+def test_defect_rates_of_zero_change_nothing_and_of_a_million_everything() -> None:
+    dn = scene(17, 23)
+    for defects, expected in (
+        (Defects(0, 0), dn),
+        (Defects(1e6, 0), torch.zeros_like(dn)),
+        (Defects(0, 1e6), torch.full_like(dn, 255.0)),
+    ):
+        assert torch.equal(add_defects(dn, defects, 255, Draw(0).generator("x")), expected)

@@ -9,6 +9,8 @@ from hypothesis import strategies as st
 
 from model.simulator.mtf import mtf, smear_response, transfer_function
 from model.simulator.sampling import sample, scene_spectrum
+from model.simulator.veil import add_veil
+from profiles.effects import Veil
 
 GAIN = 10.2375
 
@@ -55,12 +57,16 @@ def slanted_edge(side: int, ratio: int, slope: float) -> tuple[torch.Tensor, tor
     return (40 + 200 * coverage).float(), pixels - slope * pixels[:, None]
 
 
+@pytest.mark.parametrize("sigma", [0.0, 0.25])
 @pytest.mark.parametrize("mtf_nyquist", [0.01, 0.03, 0.05, 0.07, 0.25])
-def test_a_slanted_edge_shows_the_mtf_of_the_profile(mtf_nyquist: float) -> None:
-    """ISO 12233 in short: rows shifted onto one another, finely binned, differentiated, transformed."""
+def test_a_slanted_edge_shows_the_mtf_of_the_profile(mtf_nyquist: float, sigma: float) -> None:
+    """ISO 12233 in short, with and without anti-aliasing: rows shifted onto one another, finely
+    binned, differentiated, transformed.
+    """
     ratio, side, bins = 8, 160, 8
     scene, distance = slanted_edge(side, ratio, slope=1 / 16)
-    image = sample(scene_spectrum(scene), transfer_function(*scene.shape, ratio, mtf_nyquist), side * ratio, ratio)
+    transfer = transfer_function(*scene.shape, ratio, mtf_nyquist, sigma)
+    image = sample(scene_spectrum(scene), transfer, side * ratio, ratio)
     inner = slice(40, 120)  # far from where the borders wrap
     index = ((distance[inner] + 36) * bins).round().long().flatten()
     wanted = (index >= 0) & (index < 72 * bins)
@@ -74,3 +80,26 @@ def test_a_slanted_edge_shows_the_mtf_of_the_profile(mtf_nyquist: float) -> None
     steps = math.sin(math.pi * 0.5 / bins) / (math.pi * 0.5 / bins)  # of the bins' differences
     raster = math.sin(math.pi * 0.5 / ratio) / (math.pi * 0.5 / ratio)  # of the scene's own pixels
     assert measured / (steps * raster) == pytest.approx(mtf_nyquist, abs=0.005)
+
+
+@pytest.mark.parametrize("ratio", [1, 2, 3, 5, 8])
+def test_the_veil_after_sampling_equals_the_veil_before_the_blur(ratio: int) -> None:
+    """An affine change of the light commutes with a blur that keeps the mean: so it may wait for the small grid."""
+    veil, radiance = Veil(0.7, 15.0), 300 * torch.rand(17 * ratio, 23 * ratio, generator=torch.Generator())
+    transfer = transfer_function(*radiance.shape, ratio, 0.07, 0.2, 1.5)
+    fused = add_veil(sample(scene_spectrum(radiance), transfer, radiance.shape[1], ratio), veil)
+    expected = one_after_the_other(add_veil(radiance.double(), veil), ratio, 0.07, 0.2, 1.5)
+    assert float((fused - expected).abs().max()) * GAIN < 0.02
+
+
+@pytest.mark.parametrize("smear", [0.0, 0.7, 2.0])
+@pytest.mark.parametrize("ratio", range(1, 9))
+def test_neither_blur_nor_smear_shifts_a_blob(ratio: int, smear: float) -> None:
+    side = 32 * ratio
+    x = torch.arange(side, dtype=torch.float64) - (side - 1) / 2
+    line = torch.exp(-0.5 * (x / (2.5 * ratio)) ** 2)
+    transfer = transfer_function(side, side, ratio, 0.1, 0.2, smear)
+    image = sample(scene_spectrum((line[:, None] * line).float()), transfer, side, ratio).double()
+    middle = torch.arange(32, dtype=torch.float64) - 15.5
+    for axis in (0, 1):
+        assert abs(float((image.sum(1 - axis) * middle).sum() / image.sum())) < 0.01
