@@ -5,7 +5,6 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 import numpy as np
-import onnx
 
 from model.patches import PatchRecipe, PatchSource
 from model.simulator.scene import Scene
@@ -65,8 +64,3 @@ def choose_positions(graph: Graph, images: Iterable[np.ndarray], tick: Callable[
         errors += [squared_errors(r, f) for r, f in zip(results, first, strict=True)]
     best = {name: f + int(np.argmin(e)) for name, f, e in zip(names, first, errors, strict=True)}
     return {PLANES: POSITION, **best}
-
-
-def digest_of(model: onnx.ModelProto) -> str:
-    """SHA-256 of a model's bytes."""
-    return hashlib.sha256(model.SerializeToString(deterministic=True)).hexdigest()

@@ -1,9 +1,13 @@
 """`beers-deploy train`: make a network's weights from images and two sensor profiles."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
+
+if TYPE_CHECKING:
+    from model.patches import PatchRecipe
+    from model.training import TrainingRecipe
 
 EXAMPLE = "train --variant convbeers-s --images aerial/ --out runs/s --steps 20000"
 
@@ -69,15 +73,10 @@ def train(
     typer.echo(f"wrote {weights}")
 
 
-def describe(training: object, patches: object, images: list[str]) -> dict[str, object]:
+def describe(training: "TrainingRecipe", patches: "PatchRecipe", images: list[str]) -> dict[str, object]:
     """The recipe kept in the weights' header: everything but the machine."""
     from dataclasses import asdict
 
-    from model.patches import PatchRecipe
-    from model.training import TrainingRecipe
-
-    assert isinstance(training, TrainingRecipe)  # noqa: S101 - for the type checker
-    assert isinstance(patches, PatchRecipe)  # noqa: S101
     return {
         "training": asdict(training),
         "loss": "L1",

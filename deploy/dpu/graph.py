@@ -122,10 +122,6 @@ class Network:
     outputs: tuple[str, ...]
     quantised: bool
 
-    def producer(self, tensor: str) -> Operation | None:
-        """The operation that computes a tensor; None for an input."""
-        return next((op for op in self.operations if tensor in op.outputs), None)
-
     def consumers(self, tensor: str) -> Iterator[Operation]:
         """The operations that read a tensor."""
         return (op for op in self.operations if tensor in op.inputs)
