@@ -1,6 +1,7 @@
 # Two stages: wheels are built in the first; the second holds only Python, the installed packages and no build tools.
 #   docker build -t beers-deploy .
-#   docker run --rm --read-only --tmpfs /tmp -v "$PWD:/data" beers-deploy restore /data/raw.tif /data/restored.tif
+#   docker run --rm --read-only --tmpfs /tmp --user "$(id -u):$(id -g)" -v "$PWD:/data" \
+#     beers-deploy restore raw.tif restored.tif
 FROM python:3.11.14-slim-bookworm AS build
 ARG TORCH_INDEX=https://download.pytorch.org/whl/cpu
 WORKDIR /src
@@ -12,7 +13,7 @@ COPY profiles profiles
 COPY model model
 COPY quant quant
 COPY deploy deploy
-RUN pip install . && pip uninstall --yes setuptools wheel pip || true
+RUN pip install . && pip uninstall --yes setuptools wheel pip
 
 FROM python:3.11.14-slim-bookworm
 RUN useradd --create-home --uid 1000 beers

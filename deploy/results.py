@@ -5,6 +5,7 @@ not be had is unavailable, with the reason, and never a zero.
 """
 
 import json
+import math
 import platform
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -81,9 +82,11 @@ def unavailable(unit: str, reason: str) -> Figure:
 def number(value: float, digits: int) -> str:
     """So many significant digits, thousands grouped, no exponent where a person would not write one."""
     rounded = float(f"{value:.{digits}g}")
-    if abs(rounded) >= 1000:
-        return f"{rounded:,.0f}"
-    return f"{rounded:.{digits}g}"
+    if abs(rounded) < 1000:
+        return f"{rounded:.{digits}g}"
+    decimals = max(digits - 1 - int(math.log10(abs(rounded))), 0)
+    text = f"{rounded:,.{decimals}f}"
+    return text.rstrip("0").rstrip(".") if decimals else text
 
 
 @dataclass(frozen=True)

@@ -13,6 +13,8 @@ def gate_row(result: GateResult) -> Row:
     def figure(value: float, unit: str) -> Figure:
         if math.isinf(value):
             return unavailable(unit, "infinite: the two images are identical")
+        if math.isnan(value):
+            return unavailable(unit, "a network gave NaN")
         return measured(value, unit, source)
 
     figures = {

@@ -1,5 +1,6 @@
 """Read pixels from TIFF, PNG or JPEG files, and refuse with one sentence what is no image."""
 
+import math
 import warnings
 from pathlib import Path
 
@@ -57,7 +58,7 @@ def _read_tiff(path: Path) -> np.ndarray:
     try:
         with tifffile.TiffFile(path) as file:
             series = file.series[0]
-            _check_memory(path, int(np.prod(series.shape)))
+            _check_memory(path, math.prod(series.shape))
             pixels = np.asarray(series.asarray())
     except MachineError:
         raise

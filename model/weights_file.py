@@ -84,7 +84,7 @@ def load_network(path: Path) -> tuple[ConvBEERS, dict[str, object]]:
         shape = header["variant"]
         network = ConvBEERS(Variant(int(shape["blocks"]), int(shape["features"])))  # type: ignore[index]
         network.load_state_dict(tensors)
-    except (KeyError, TypeError, RuntimeError) as error:
+    except (KeyError, TypeError, ValueError, OverflowError, RuntimeError) as error:
         got = " ".join(str(error).split())[:120]
         remedy = "give a file written by 'beers-deploy train'"
         raise ModelError(str(path), expected="the weights of a ConvBEERS", got=got, remedy=remedy) from error

@@ -1,5 +1,6 @@
 """A number and where it comes from: the one kind of value that a profile holds."""
 
+import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal, get_args
@@ -99,4 +100,4 @@ def _number(where: str, raw: object) -> Number:
 
 
 def _is_number(raw: object) -> bool:
-    return isinstance(raw, int | float) and not isinstance(raw, bool) and abs(raw) < float("inf")
+    return isinstance(raw, int | float) and not isinstance(raw, bool) and abs(raw) <= sys.float_info.max

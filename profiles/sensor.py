@@ -20,6 +20,9 @@ MTF_NYQUIST_MAX = 2 / math.pi
 
 MAX_DRAWS = 10_000
 
+ROUNDING = 1e-14
+"""What float64 may leave of a variance that ought to be 0, of the larger of the two variances."""
+
 
 @dataclass(frozen=True)
 class Sensor:
@@ -116,11 +119,17 @@ def _middle(constant: Constant) -> float:
 def noise_from_snr(radiance_0: float, snr_0: float, radiance_1: float, snr_1: float) -> tuple[float, float]:
     """Solve sigma_i^2 = (L_i / SNR_i)^2 = alpha L_i + beta for (alpha, beta) (paper, section 3.3).
 
-    Either may come out negative: see `snr_0_bounds`.
+    Either may come out negative: see `snr_0_bounds`. On a bound it is 0, whatever rounding left of it.
     """
     variance_0, variance_1 = (radiance_0 / snr_0) ** 2, (radiance_1 / snr_1) ** 2
-    alpha = (variance_1 - variance_0) / (radiance_1 - radiance_0)
-    return alpha, variance_0 - alpha * radiance_0
+    rounding = ROUNDING * max(variance_0, variance_1)
+    slope = _rounded_off(variance_1 - variance_0, rounding)
+    alpha = slope / (radiance_1 - radiance_0)
+    return alpha, _rounded_off(variance_0 - alpha * radiance_0, rounding)
+
+
+def _rounded_off(difference: float, rounding: float) -> float:
+    return 0.0 if abs(difference) <= rounding else difference
 
 
 def snr_0_bounds(radiance_0: float, radiance_1: float, snr_1: float) -> tuple[float, float]:
@@ -165,7 +174,20 @@ def load_sensor(name: str) -> SensorProfile:
     return profile
 
 
+SINGLE = ("radiance_0", "radiance_1", "bits", "gain_dn_per_radiance")
+"""Constants that define what the others mean: no range to draw from."""
+
+
+def _check_single(label: str, profile: SensorProfile) -> None:
+    for key in SINGLE:
+        constant: Constant = getattr(profile, key)
+        if constant.low != constant.high:
+            remedy = "write a profile for each"
+            raise ProfileError(f"{label} {key}", expected="one number", got=f"a range, {constant}", remedy=remedy)
+
+
 def _check_physics(label: str, profile: SensorProfile) -> None:
+    _check_single(label, profile)
     mtf_max = MTF_NYQUIST_MAX
     checks: list[tuple[str, Constant, Callable[[float], bool], str, str]] = [
         (

@@ -1,12 +1,13 @@
 import json
+import math
 from pathlib import Path
 
 import jsonschema
 import pytest
-from rich.console import Console
 
 from deploy.results import SCHEMA_PATH, Document, Figure, Row, measured, number, predicted, published, unavailable
-from deploy.tables import print_rows
+from deploy.verdict import gate_row
+from quant.gate import GateResult
 
 SCHEMA = json.loads(SCHEMA_PATH.read_text())
 
@@ -57,16 +58,34 @@ def test_numbers_read_well(value: float, digits: int, text: str) -> None:
     assert number(value, digits) == text
 
 
-@pytest.mark.parametrize("width", [40, 80, 200])
-def test_tables_show_values_modes_and_reasons(width: int) -> None:
-    console = Console(width=width, record=True, quiet=True)
-    console.quiet = False
-    with console.capture() as capture:
-        rows = [
-            Row("t", "one", {"latency": predicted(2, "s", (1, 3), "m"), "power": unavailable("W", "no [counter]")}),
-            Row("t", "two", {"latency": published(42, "s", "paper")}, {"remedy": "none"}),
-        ]
-        print_rows("a title", rows, console)
-    shown = capture.get()
-    for word in ("42 d", "a title", "no [counter]"):
-        assert word in shown
+def strictly(text: str) -> object:
+    """Parse as JSON proper, which knows neither NaN nor Infinity."""
+
+    def refuse(name: str) -> None:
+        raise ValueError(name)
+
+    return json.loads(text, parse_constant=refuse)
+
+
+def test_what_is_written_is_the_document(tmp_path: Path) -> None:
+    row = Row("t", "row", {"a": measured(1.5, "s", "here")}, {"remedy": "none"})
+    whole = Document("test", {"seed": 0, "json": None}, (), (row,))
+    whole.write(tmp_path / "made" / "a.json")
+    whole.write(None)
+    read = strictly((tmp_path / "made" / "a.json").read_text())
+    jsonschema.validate(read, SCHEMA)
+    assert [p.name for p in (tmp_path / "made").iterdir()] == ["a.json"]
+
+
+def test_a_document_without_rows_is_invalid() -> None:
+    with pytest.raises(jsonschema.ValidationError):
+        jsonschema.validate(Document("test", {}, (), ()).to_json(), SCHEMA)
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, 0.0])
+def test_a_gate_on_a_network_gone_wrong_still_writes_json(value: float, tmp_path: Path) -> None:
+    """A network that gives NaN has no MAE: unavailable with a reason, in JSON that every reader takes."""
+    result = GateResult(value, value, value, value, value, value, value, patches=1)
+    Document("gate", {}, (), (gate_row(result),)).write(tmp_path / "gate.json")
+    jsonschema.validate(strictly((tmp_path / "gate.json").read_text()), SCHEMA)
+    assert result.passes(1.0) == (value == 0)

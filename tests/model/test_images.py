@@ -1,4 +1,6 @@
 import struct
+import tracemalloc
+import zlib
 from pathlib import Path
 
 import numpy as np
@@ -45,6 +47,22 @@ def test_scenes_become_radiance(tmp_path: Path) -> None:
     assert float(read_scene(tmp_path / "radiance.tif", SENSOR).radiance[0, 0]) == 33.5
 
 
+def test_photographs_of_one_or_three_bands_are_linearised(tmp_path: Path) -> None:
+    grey = np.full((16, 24), 188, np.uint8)
+    for name, pixels in (("grey.png", grey), ("grey.jpg", grey), ("colour.jpg", np.dstack([grey] * 3))):
+        Image.fromarray(pixels).save(tmp_path / name)
+        radiance = read_scene(tmp_path / name, SENSOR).radiance
+        assert radiance.shape == (16, 24)
+        assert float(radiance.mean()) == pytest.approx(200, rel=0.03)
+
+
+@pytest.mark.parametrize("pixels", [np.zeros((5, 7, 3), np.uint16), np.zeros((5, 7), np.int16)])
+def test_pixels_of_an_unclear_meaning_are_refused(pixels: np.ndarray, tmp_path: Path) -> None:
+    tifffile.imwrite(tmp_path / "odd.tif", pixels, photometric="rgb" if pixels.ndim == 3 else "minisblack")
+    with pytest.raises(ImageError, match=rf"odd\.tif.*{pixels.dtype}"):
+        read_scene(tmp_path / "odd.tif", SENSOR)
+
+
 def test_bands_weigh_evenly(tmp_path: Path) -> None:
     for band in range(3):
         pixels = np.zeros((4, 4, 3), np.uint8)
@@ -63,12 +81,24 @@ def test_damaged_files_are_one_sentence(suffix: str, content: bytes, tmp_path: P
     assert "\n" not in str(caught.value)
 
 
-def test_a_truncated_file_is_refused(tmp_path: Path) -> None:
-    tifffile.imwrite(tmp_path / "whole.tif", np.random.default_rng(0).integers(0, 4096, (90, 90)).astype(np.uint16))
-    content = (tmp_path / "whole.tif").read_bytes()
-    (tmp_path / "cut.tif").write_bytes(content[: len(content) // 2])
-    with pytest.raises(ImageError, match=r"cut\.tif"):
-        read_pixels(tmp_path / "cut.tif")
+@pytest.mark.parametrize("name", ["cut.tif", "cut.png", "cut.jpg"])
+def test_a_truncated_file_is_refused(name: str, tmp_path: Path) -> None:
+    pixels = np.random.default_rng(0).integers(0, 256, (90, 90)).astype(np.uint8)
+    Image.fromarray(pixels).save(tmp_path / name)
+    assert read_pixels(tmp_path / name).shape == (90, 90)
+    content = (tmp_path / name).read_bytes()
+    (tmp_path / name).write_bytes(content[: len(content) // 2])
+    with pytest.raises(ImageError, match="cut") as caught:
+        read_pixels(tmp_path / name)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("name", ["none.tif", "none.png", "none/none.tif"])
+def test_a_missing_file_is_refused(name: str, tmp_path: Path) -> None:
+    with pytest.raises(ImageError, match="no such file"):
+        read_pixels(tmp_path / name)
+    with pytest.raises(ImageError, match="no such folder"):
+        list_images(tmp_path / name)
 
 
 def test_nan_is_counted(tmp_path: Path) -> None:
@@ -80,18 +110,42 @@ def test_nan_is_counted(tmp_path: Path) -> None:
         read_pixels(tmp_path / "nan.tif")
 
 
-def test_a_gigantic_header_allocates_nothing(tmp_path: Path) -> None:
-    path = tmp_path / "huge.png"
-    header = struct.pack(">IIBBBBB", 2_000_000, 2_000_000, 8, 0, 0, 0, 0)
+def png_header(path: Path, width: int, height: int) -> None:
+    """A small PNG whose header claims another size."""
+    header = struct.pack(">IIBBBBB", width, height, 8, 0, 0, 0, 0)
     Image.new("L", (2, 2)).save(path)
     content = bytearray(path.read_bytes())
-    content[16:29] = header
-    import zlib
+    content[16:33] = header + struct.pack(">I", zlib.crc32(b"IHDR" + header))
+    path.write_bytes(content)
 
-    content[29:33] = struct.pack(">I", zlib.crc32(b"IHDR" + header))
-    path.write_bytes(bytes(content))
-    with pytest.raises(MachineError, match="free memory"):
-        read_pixels(path)
+
+def tiff_header(path: Path, width: int, height: int) -> None:
+    """A TIFF of one uncompressed strip that is not there: (tag, type, value) of each entry."""
+    entries = [(256, 4, width), (257, 4, height), (258, 3, 16), (259, 3, 1), (262, 3, 1), (273, 4, 8), (277, 3, 1)]
+    entries += [(278, 4, height), (279, 4, 4)]
+    directory = b"".join(struct.pack("<HHII", tag, kind, 1, value) for tag, kind, value in entries)
+    head = b"II*\0" + struct.pack("<IH", 8, len(entries))
+    path.write_bytes(head + directory + bytes(68))
+
+
+@pytest.mark.parametrize(
+    ("name", "side"), [("huge.png", 2_000_000), ("huge.tif", 2_000_000), ("huge.tif", 2**32 - 1), ("huge.tif", 2**31)]
+)
+def test_a_gigantic_header_allocates_nothing(name: str, side: int, tmp_path: Path) -> None:
+    """The last two: the number of pixels does not fit 63 bits, or only just."""
+    (png_header if name.endswith("png") else tiff_header)(tmp_path / name, side, side)
+    tracemalloc.start()
+    try:
+        with pytest.raises(MachineError, match="free memory"):
+            read_pixels(tmp_path / name)
+        assert tracemalloc.get_traced_memory()[1] < 10e6
+    finally:
+        tracemalloc.stop()
+
+
+def test_the_headers_made_here_are_read_when_they_are_honest(tmp_path: Path) -> None:
+    tiff_header(tmp_path / "small.tif", 2, 1)
+    assert read_pixels(tmp_path / "small.tif").shape == (1, 2)
 
 
 def test_nothing_half_written_is_left(tmp_path: Path) -> None:

@@ -1,4 +1,5 @@
 from collections.abc import Iterator
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -10,10 +11,10 @@ from model.convbeers import Variant
 from model.patches import PatchRecipe, PatchSource, cut, turn
 from model.simulator.procedural import procedural_scene
 from model.simulator.scene import Scene
-from model.training import MAX_BAD_STEPS, Trainer, TrainingRecipe, finish
-from model.weights_file import load_network, read_tensors, shipped_weights
+from model.training import MAX_BAD_STEPS, Progress, Trainer, TrainingRecipe, finish
+from model.weights_file import load_network
 from profiles import load_sensor
-from profiles.errors import ImageError, ModelError, OptionError
+from profiles.errors import ImageError, ModelError
 
 VARIANT = Variant(blocks=1, features=4)
 
@@ -61,33 +62,42 @@ def test_cut_takes_whole_patches_and_turn_keeps_pairs_together() -> None:
     assert torch.equal(turned[:, 1] - turned[:, 0], torch.full_like(turned[:, 0], 30 * 41))
 
 
-def train(folder: Path, steps: int, *, resume: bool, stop: int | None = None) -> Trainer:
-    """Run to `stop` (a kill: the checkpoint written there is all that is left) or to the end."""
+def train(folder: Path, steps: int, *, resume: bool = False, kill_at: int | None = None) -> Trainer:
+    """Run to the end, or until a kill that leaves the checkpoint of the step before."""
+
+    def report(progress: Progress) -> None:
+        if progress.step == kill_at:
+            raise KeyboardInterrupt
+
     trainer = Trainer(VARIANT, TrainingRecipe(steps=steps, batch=3, warm_up_steps=2))
     checkpoint = folder / "checkpoint.safetensors"
     if resume:
         trainer.resume(checkpoint)
-    if stop is None:
-        trainer.run(source(), checkpoint, lambda _: None)
-        return trainer
-    batches = source().batches()
-    while trainer.step < stop:
-        trainer._train_step(*next(batches))
-    trainer.save(checkpoint)
+    trainer.run(source(), checkpoint, report, every=1, save_every_s=0.0)
     return trainer
 
 
-def test_killed_and_resumed_equals_unbroken(tmp_path: Path) -> None:
-    unbroken = train(tmp_path / "a", 8, resume=False)
-    train(tmp_path / "b", 8, resume=False, stop=5)
+@pytest.mark.parametrize("kill_at", [2, 5, 8])
+def test_killed_and_resumed_equals_unbroken(kill_at: int, tmp_path: Path) -> None:
+    unbroken = train(tmp_path / "a", 8)
+    with pytest.raises(KeyboardInterrupt):
+        train(tmp_path / "b", 8, kill_at=kill_at)
     resumed = train(tmp_path / "b", 8, resume=True)
     for name, value in unbroken.network.state_dict().items():
         assert torch.equal(value, resumed.network.state_dict()[name])
         assert torch.equal(unbroken.average[name], resumed.average[name])
 
 
+def test_a_resumed_run_goes_on_where_the_killed_one_was_saved(tmp_path: Path) -> None:
+    with pytest.raises(KeyboardInterrupt):
+        train(tmp_path, 8, kill_at=5)
+    later = Trainer(VARIANT, TrainingRecipe(steps=8, batch=3, warm_up_steps=2))
+    later.resume(tmp_path / "checkpoint.safetensors")
+    assert later.step == 4
+
+
 def test_a_checkpoint_of_another_recipe_is_refused(tmp_path: Path) -> None:
-    train(tmp_path, 4, resume=False)
+    train(tmp_path, 4)
     other = Trainer(VARIANT, TrainingRecipe(steps=5))
     with pytest.raises(ModelError, match="another recipe"):
         other.resume(tmp_path / "checkpoint.safetensors")
@@ -101,21 +111,42 @@ def test_training_lowers_the_loss(tmp_path: Path) -> None:
 
 
 class Poisoned(PatchSource):
-    """A source of nothing but NaN."""
+    """A source whose batches are NaN, all or those of some numbers."""
+
+    bad: frozenset[int] | None = None
 
     def batches(self, first: int = 0) -> Iterator[tuple[Tensor, Tensor]]:
-        for degraded, reference in super().batches(first):
-            yield degraded * float("nan"), reference
+        for number, (degraded, reference) in enumerate(super().batches(first), first):
+            yield (degraded * float("nan") if self.bad is None or number in self.bad else degraded), reference
+
+
+def poisoned(bad: frozenset[int] | None = None) -> Poisoned:
+    made = Poisoned([procedural_scene(420, 480, np.random.default_rng(2))], source().recipe, 3, 0)
+    made.bad = bad
+    return made
+
+
+def copies(trainer: Trainer) -> list[Tensor]:
+    return [t.clone() for t in (*trainer.network.state_dict().values(), *trainer.average.values())]
 
 
 def test_nan_batches_stop_the_run_and_touch_no_weight(tmp_path: Path) -> None:
     trainer = Trainer(VARIANT, TrainingRecipe(steps=50, batch=3))
-    before = {name: value.clone() for name, value in trainer.network.state_dict().items()}
-    clean = source()
-    poisoned = Poisoned([procedural_scene(420, 480, np.random.default_rng(2))], clean.recipe, 3, 0)
+    before = copies(trainer)
     with pytest.raises(ModelError, match=str(MAX_BAD_STEPS + 1)):
-        trainer.run(poisoned, tmp_path / "c", lambda _: None)
-    assert all(torch.equal(value, before[name]) for name, value in trainer.network.state_dict().items())
+        trainer.run(poisoned(), tmp_path / "c", lambda _: None)
+    assert all(torch.equal(*both) for both in zip(copies(trainer), before, strict=True))
+
+
+def test_one_nan_batch_is_skipped_and_the_run_goes_on(tmp_path: Path) -> None:
+    trainer, seen = Trainer(VARIANT, TrainingRecipe(steps=6, batch=3)), []
+    trainer.run(poisoned(frozenset({2})), tmp_path / "c", lambda _: seen.append(copies(trainer)), every=1)
+    moved = [not all(map(torch.equal, one, other)) for one, other in pairwise(seen)]
+    assert moved == [True, False, True, True, True]
+    assert trainer.bad_steps == 1
+    again = Trainer(VARIANT, TrainingRecipe(steps=6, batch=3))
+    again.resume(tmp_path / "c")
+    assert again.bad_steps == 1
 
 
 @pytest.mark.parametrize("level", [0.0, 80.0, 4000.0])
@@ -128,33 +159,8 @@ def test_a_constant_scene_trains_without_nan(level: float, tmp_path: Path) -> No
 
 
 def test_finished_weights_carry_their_recipe(tmp_path: Path) -> None:
-    trainer = train(tmp_path, 3, resume=False)
+    trainer = train(tmp_path, 3)
     finish(trainer, tmp_path / "w.safetensors", {"loss": "L1", "steps": 3})
     network, recipe = load_network(tmp_path / "w.safetensors")
     assert recipe == {"loss": "L1", "steps": 3}
     assert network.variant == VARIANT
-
-
-@pytest.mark.parametrize("content", [b"", b"garbage", b"\x08\x00\x00\x00\x00\x00\x00\x00{}      "])
-def test_what_is_no_weights_file_is_refused(content: bytes, tmp_path: Path) -> None:
-    (tmp_path / "w.safetensors").write_bytes(content)
-    with pytest.raises(ModelError, match=r"w\.safetensors"):
-        load_network(tmp_path / "w.safetensors")
-
-
-def test_a_missing_file_and_an_unknown_variant(tmp_path: Path) -> None:
-    with pytest.raises(ModelError, match="no such file"):
-        read_tensors(tmp_path / "none.safetensors")
-    with pytest.raises(OptionError, match="convbeers-s"):
-        shipped_weights("convbeers-huge")
-    with pytest.raises(ModelError, match="train"):
-        shipped_weights("convbeers")
-
-
-def test_the_shipped_weights_load_and_say_how_they_were_made() -> None:
-    network, recipe = load_network(shipped_weights("convbeers-s"))
-    assert (network.variant.blocks, network.variant.features) == (8, 32)
-    assert recipe["degraded"] == "pleiades-variable"
-    images = recipe["images"]
-    assert isinstance(images, list)
-    assert len(images) >= 58

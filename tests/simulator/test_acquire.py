@@ -33,6 +33,26 @@ def test_a_sine_keeps_the_contrast_that_the_mtf_says(cycles_per_px: float, mtf_n
     assert contrast == pytest.approx(expected, abs=1e-3)
 
 
+def steepest_fall(ratio: int, mtf_nyquist: float) -> float:
+    """The largest fall between neighbours, in DN, across a step upwards of 1500 DN."""
+    side = 96 * ratio
+    step = torch.full((side, side), 50.0)
+    step[:, side // 2 :] = 200.0
+    sensor = Sensor(mtf_nyquist, 0.0, 0.0, 10.0, 16)
+    line = acquire(scene_spectrum(step), side, sensor, ratio, Draw(0), "degraded", margin_px=16)[0]
+    return float(-torch.diff(line).min())
+
+
+@pytest.mark.parametrize("mtf_nyquist", [0.03, 0.07, 0.25])
+@pytest.mark.parametrize("ratio", [1, 2, 3, 5])
+def test_a_step_rises_without_ringing(ratio: int, mtf_nyquist: float) -> None:
+    assert steepest_fall(ratio, mtf_nyquist) <= 1  # the digitiser's rounding
+
+
+def test_a_step_would_ring_where_the_scene_is_no_finer_than_the_sensor() -> None:
+    assert steepest_fall(1, 0.6) > 10
+
+
 def test_the_two_noises_of_a_pair_are_independent() -> None:
     pair = simulate_pair(torch.full((900, 960), 80.0), DEGRADED, REFERENCE, 5, Draw(0))
     noise = [image.flatten().numpy() - image.mean().item() for image in (pair.degraded, pair.reference)]

@@ -30,9 +30,10 @@ def centroid(image: torch.Tensor) -> tuple[float, float]:
     return float((image.sum(1) * rows).sum() / image.sum()), float((image.sum(0) * columns).sum() / image.sum())
 
 
+@pytest.mark.parametrize(("rows", "columns"), [(13, 8), (13, 21), (2, 1)])
 @pytest.mark.parametrize("ratio", RATIOS)
-def test_folding_equals_blurring_then_picking(ratio: int) -> None:
-    height, width = 13 * ratio, 8 * ratio
+def test_folding_equals_blurring_then_picking(ratio: int, rows: int, columns: int) -> None:
+    height, width = rows * ratio, columns * ratio
     radiance, transfer = scene(height, width), transfer_function(height, width, ratio, 0.25)
     shift = (ratio - 1) / 2
     ramps = [torch.exp(2j * math.pi * f * shift) for f in (torch.fft.fftfreq(height), torch.fft.rfftfreq(width))]
@@ -76,3 +77,19 @@ def test_a_grid_that_does_not_divide_is_refused() -> None:
     with pytest.raises(OptionError, match="30 x 31"):
         sample(scene_spectrum(radiance), transfer_function(30, 31, 4, 0.1), 31, 4)
     assert crop_divisible(radiance, 4).shape == (28, 28)
+
+
+@pytest.mark.parametrize("ratio", [1, 2, 3, 5])
+def test_an_offset_moves_the_grid_over_the_scene(ratio: int) -> None:
+    radiance, transfer = scene(13 * ratio, 21 * ratio), transfer_function(13 * ratio, 21 * ratio, ratio, 0.07)
+    moved = sample(scene_spectrum(radiance), transfer, 21 * ratio, ratio, offset_px=(2.0, -3.0))
+    rolled = sample(scene_spectrum(radiance.roll((-2, 3), (0, 1))), transfer, 21 * ratio, ratio)
+    torch.testing.assert_close(moved, rolled, rtol=0, atol=1e-3)
+
+
+def test_a_stack_of_scenes_is_sampled_one_by_one() -> None:
+    scenes, transfer = torch.stack([scene(39, 63, seed) for seed in range(3)]), transfer_function(39, 63, 3, 0.07)
+    stack = sample(scene_spectrum(scenes), transfer, 63, 3)
+    assert stack.shape == (3, 13, 21)
+    for one, image in zip(scenes, stack, strict=True):
+        torch.testing.assert_close(sample(scene_spectrum(one), transfer, 63, 3), image, rtol=0, atol=1e-4)

@@ -1,0 +1,83 @@
+import io
+
+import pytest
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+from rich.cells import cell_len
+from rich.console import Console
+
+from deploy.results import DIGITS, Figure, Row, measured, number, predicted, published, unavailable
+from deploy.tables import LEGEND, PIPE_WIDTH, default_console, print_rows
+
+TALL = [
+    Row("t", "one", {"latency": predicted(2, "s", (1, 3), "m"), "power": unavailable("W", "no [counter]")}),
+    Row("t", "two", {"latency": published(42, "s", "paper")}, {"remedy": "none"}),
+    Row("t", "three", {}),
+]
+WIDE = [Row("t", "one", {f"figure {k}": measured(k + 0.5, "px", "here") for k in range(12)}, {"remedy": "pad " * 30})]
+TABLES = {"tall": TALL, "wide": WIDE, "words alone": [Row("t", "one", {}, {"finding": "a [b] c"})], "empty": []}
+
+
+def shown(rows: list[Row], width: int) -> str:
+    stream = io.StringIO()
+    print_rows("a title", rows, Console(file=stream, width=width))
+    return stream.getvalue()
+
+
+@pytest.mark.parametrize("width", [40, 80, 200])
+def test_values_modes_and_reasons_are_shown(width: int) -> None:
+    text = shown(TALL, width)
+    for word in ("a title", "42 d", "p", "no [counter]"):
+        assert word in text
+
+
+@pytest.mark.parametrize("name", TABLES)
+@pytest.mark.parametrize("width", [40, 80, 200])
+def test_no_line_is_wider_than_the_terminal(name: str, width: int) -> None:
+    assert all(cell_len(line) <= width for line in shown(TABLES[name], width).splitlines())
+
+
+def test_every_figure_of_a_wide_row_is_read_at_80_columns() -> None:
+    """More figures than rows: one line a figure, so that no column is squeezed."""
+    lines = shown(WIDE, 80).splitlines()
+    for k in range(12):
+        assert any(f"figure {k} " in line and f"{k + 0.5:g} m" in line for line in lines)
+
+
+def test_a_missing_figure_is_a_dash_with_its_reason_once() -> None:
+    rows = [Row("t", "one", {"power": unavailable("W", "no counter")})] * 2
+    text = shown(rows, 80)
+    assert text.count("no counter") == 1
+    assert "0" not in text.replace(LEGEND, "")
+
+
+def test_a_table_of_words_needs_no_legend() -> None:
+    assert LEGEND not in shown(TABLES["words alone"], 200)
+    assert LEGEND in shown(TALL, 200)
+
+
+def test_a_pipe_is_wide_enough_for_whole_tables(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COLUMNS", "20")
+    assert default_console().width == PIPE_WIDTH
+
+
+FIGURES = st.one_of(
+    st.builds(lambda v: measured(v, "s", "here"), st.floats(-1e9, 1e9)),
+    st.builds(lambda v: predicted(v, "W", (v - 1, v + 1), "model"), st.floats(0, 1e7)),
+    st.builds(lambda v: published(v, "dB", "paper"), st.floats(0, 100)),
+    st.just(unavailable("J", "no [red]counter[/red]")),
+)
+
+
+@settings(max_examples=25)
+@given(st.lists(st.dictionaries(st.text(min_size=1, max_size=9), FIGURES, max_size=4), min_size=1, max_size=4))
+def test_any_rows_print_at_80_columns(figures: list[dict[str, Figure]]) -> None:
+    shown([Row("t", f"row [{k}]", row) for k, row in enumerate(figures)], 80)
+
+
+@given(st.floats(-1e9, 1e9), st.sampled_from(sorted(set(DIGITS.values()))))
+@example(1234.5, 12)
+def test_a_shown_number_is_the_number_to_its_digits(value: float, digits: int) -> None:
+    text = number(value, digits)
+    assert float(text.replace(",", "")) == pytest.approx(value, rel=5.01 * 10.0**-digits, abs=1e-300)
+    assert "e" not in text or abs(value) < 1e-4

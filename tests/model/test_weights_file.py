@@ -1,0 +1,117 @@
+import json
+from pathlib import Path
+
+import pytest
+import torch
+from safetensors.torch import save_file
+
+from model.convbeers import VARIANTS, ConvBEERS, Variant, initialise
+from model.weights_file import (
+    load_network,
+    read_tensors,
+    save_network,
+    shipped_weights,
+    variant_named,
+    write_tensors,
+)
+from profiles.errors import MachineError, ModelError, OptionError
+
+
+def network(blocks: int = 1, features: int = 4) -> ConvBEERS:
+    built = ConvBEERS(Variant(blocks, features))
+    initialise(built, torch.Generator().manual_seed(0))
+    return built
+
+
+@pytest.mark.parametrize(("blocks", "features"), [(0, 1), (1, 4), (3, 5)])
+def test_a_network_comes_back_as_it_was(blocks: int, features: int, tmp_path: Path) -> None:
+    written, path = network(blocks, features), tmp_path / "made" / "w.safetensors"
+    save_network(path, written, {"loss": "L1", "steps": 7})
+    read, recipe = load_network(path)
+    assert read.variant == Variant(blocks, features)
+    assert recipe == {"loss": "L1", "steps": 7}
+    assert not read.training
+    for name, value in written.state_dict().items():
+        assert torch.equal(value, read.state_dict()[name])
+    assert [p.name for p in path.parent.iterdir()] == ["w.safetensors"]
+
+
+def test_tensors_of_any_layout_and_kind_come_back(tmp_path: Path) -> None:
+    tensors = {
+        "turned": torch.arange(6.0).reshape(2, 3).T,
+        "whole": torch.tensor([1, -2]),
+        "one": torch.tensor(3.5),
+    }
+    write_tensors(tmp_path / "t.safetensors", tensors, {"step": 3, "name": "a b"})
+    read, header = read_tensors(tmp_path / "t.safetensors")
+    assert header == {"step": 3, "name": "a b"}
+    assert all(torch.equal(read[name], value) for name, value in tensors.items())
+
+
+@pytest.mark.parametrize("content", [b"", b"garbage", b"\x08\x00\x00\x00\x00\x00\x00\x00{}      ", b"\xff" * 64])
+def test_what_is_no_weights_file_is_refused(content: bytes, tmp_path: Path) -> None:
+    (tmp_path / "w.safetensors").write_bytes(content)
+    with pytest.raises(ModelError, match=r"w\.safetensors") as caught:
+        load_network(tmp_path / "w.safetensors")
+    assert "\n" not in str(caught.value)
+
+
+def test_a_truncated_file_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "w.safetensors"
+    save_network(path, network(), {})
+    path.write_bytes(path.read_bytes()[:-5])
+    with pytest.raises(ModelError, match=r"w\.safetensors"):
+        load_network(path)
+
+
+@pytest.mark.parametrize(
+    "variant",
+    [
+        {"blocks": 1, "features": 5},
+        {"blocks": 2, "features": 4},
+        {"blocks": -3, "features": 4},
+        {"blocks": 1},
+        {"blocks": "many", "features": 4},
+        {"blocks": float("inf"), "features": 4},
+        "convbeers",
+        None,
+    ],
+)
+def test_a_header_that_does_not_fit_the_tensors_is_refused(variant: object, tmp_path: Path) -> None:
+    write_tensors(tmp_path / "w.safetensors", network().state_dict(), {"variant": variant})
+    with pytest.raises(ModelError, match="weights of a ConvBEERS") as caught:
+        load_network(tmp_path / "w.safetensors")
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("metadata", [None, {"format": "pt"}, {"variant": json.dumps({"blocks": 1})}])
+def test_another_programs_weights_are_refused(metadata: dict[str, str] | None, tmp_path: Path) -> None:
+    save_file({"weight": torch.zeros(3)}, tmp_path / "w.safetensors", metadata=metadata)
+    with pytest.raises(ModelError, match=r"w\.safetensors"):
+        load_network(tmp_path / "w.safetensors")
+
+
+def test_a_missing_file_and_an_unknown_variant(tmp_path: Path) -> None:
+    with pytest.raises(ModelError, match="no such file"):
+        read_tensors(tmp_path / "none.safetensors")
+    for name in VARIANTS:
+        assert variant_named(name) == VARIANTS[name]
+    with pytest.raises(OptionError, match="convbeers-s"):
+        shipped_weights("convbeers-huge")
+    with pytest.raises(ModelError, match="train"):
+        shipped_weights("convbeers")
+
+
+def test_a_folder_that_cannot_be_made_is_one_sentence(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(MachineError, match="place to write"):
+        save_network(tmp_path / "file" / "w.safetensors", network(), {})
+
+
+def test_the_shipped_weights_load_and_say_how_they_were_made() -> None:
+    shipped, recipe = load_network(shipped_weights("convbeers-s"))
+    assert (shipped.variant.blocks, shipped.variant.features) == (8, 32)
+    assert recipe["degraded"] == "pleiades-variable"
+    images = recipe["images"]
+    assert isinstance(images, list)
+    assert len(images) >= 58

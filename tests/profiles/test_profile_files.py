@@ -1,0 +1,138 @@
+"""What a user may write into a profile by mistake: each is one sentence that says what to do."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from profiles import load_sensor, load_target
+from profiles.errors import ProfileError
+from profiles.sensor import TABLES, noise_from_snr, snr_0_bounds
+from profiles.toml import HERE
+
+SHIPPED = (HERE / "sensors" / "pleiades-degraded.toml").read_text()
+KEYS = [(table, key) for table, keys in TABLES.items() for key in keys]
+
+
+def sensor_file(folder: Path, text: str) -> str:
+    path = folder / "mine.toml"
+    path.write_text(text)
+    return str(path)
+
+
+def edited(old: str, new: str) -> str:
+    assert old in SHIPPED
+    return SHIPPED.replace(old, new)
+
+
+def refusal(path: str) -> ProfileError:
+    """The error, after checking that it is one whole sentence."""
+    with pytest.raises(ProfileError) as caught:
+        load_sensor(path)
+    error = caught.value
+    assert str(error) == f"{error.where}: expected {error.expected}, got {error.got}; {error.remedy}."
+    assert all(part.strip() for part in (error.where, error.expected, error.got, error.remedy))
+    assert "mine" in error.where
+    assert "\n" not in str(error)
+    return error
+
+
+def test_the_file_that_is_edited_here_is_sound(tmp_path: Path) -> None:
+    assert load_sensor(sensor_file(tmp_path, SHIPPED)).mtf_nyquist.value == 0.07
+
+
+@pytest.mark.parametrize(("table", "key"), KEYS)
+def test_a_missing_key_is_named_with_its_table(table: str, key: str, tmp_path: Path) -> None:
+    kept = [line for line in SHIPPED.splitlines() if not line.startswith(f"{key} =")]
+    error = refusal(sensor_file(tmp_path, "\n".join(kept)))
+    assert f"[{table}]" in error.where
+    assert repr(key) in error.expected
+
+
+@pytest.mark.parametrize("table", TABLES)
+def test_a_missing_table_is_named(table: str, tmp_path: Path) -> None:
+    head, _, rest = SHIPPED.partition(f"[{table}]")
+    following = rest[rest.index("\n[") :] if "\n[" in rest else ""
+    assert repr(table) in refusal(sensor_file(tmp_path, head + following)).expected
+
+
+@pytest.mark.parametrize(
+    "value", ["-1", "-0.07", "nan", "inf", "true", "[]", "[0.01, 0.02, 0.03]", '"7 %"', "1" * 400]
+)
+def test_an_mtf_that_is_no_contrast_is_refused(value: str, tmp_path: Path) -> None:
+    assert "mtf_nyquist" in refusal(sensor_file(tmp_path, edited("value = 0.07", f"value = {value}"))).where
+
+
+def test_text_that_is_not_unicode_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "mine.toml").write_bytes(b"description = '\xff\xfe'")
+    assert refusal(str(tmp_path / "mine.toml")).expected == "TOML text"
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ("value = 10.2375", "value = [5.0, 10.0]"),
+        ("value = 12,", "value = [8, 12],"),
+        ("value = 25,", "value = [25, 30],"),
+        ("value = 100,", "value = [90, 110],"),
+    ],
+)
+def test_a_range_is_drawn_from_or_refused(old: str, new: str, tmp_path: Path) -> None:
+    """Never accepted and then quietly cut to its lower end."""
+    try:
+        profile = load_sensor(sensor_file(tmp_path, edited(old, new)))
+    except ProfileError:
+        return
+    drawn = [profile.draw(np.random.default_rng(seed)) for seed in range(8)]
+    assert any(sensor != drawn[0] for sensor in drawn)
+
+
+@pytest.mark.parametrize(
+    ("snr_0", "snr_1"), [(55.0, 110.0), (27.5, 110.0), (34.3, 68.6), (13.7, 27.4), (83.2, 166.4)]
+)
+def test_what_loads_can_be_drawn_at_the_very_bounds(snr_0: float, snr_1: float, tmp_path: Path) -> None:
+    """There alpha or beta is 0, and rounding may leave it a hair below."""
+    assert snr_0 in snr_0_bounds(25, 100, snr_1)
+    text = edited("value = 50,", f"value = {snr_0},").replace("value = 110,", f"value = {snr_1},")
+    sensor = load_sensor(sensor_file(tmp_path, text)).draw(np.random.default_rng(0))
+    assert sensor.alpha >= 0
+    assert sensor.beta >= 0
+    assert 25 / sensor.noise_sigma(25) == pytest.approx(snr_0)
+
+
+@given(st.floats(1, 90), st.floats(1.1, 9), st.floats(5, 300), st.floats(5, 300))
+def test_noise_reproduces_any_two_points(radiance_0: float, factor: float, snr_0: float, snr_1: float) -> None:
+    """Whatever the signs of alpha and beta: the line passes through both variances."""
+    radiance_1 = factor * radiance_0
+    alpha, beta = noise_from_snr(radiance_0, snr_0, radiance_1, snr_1)
+    scale = max((radiance_0 / snr_0) ** 2, (radiance_1 / snr_1) ** 2)
+    for radiance, snr in ((radiance_0, snr_0), (radiance_1, snr_1)):
+        assert alpha * radiance + beta == pytest.approx((radiance / snr) ** 2, rel=1e-9, abs=1e-12 * scale)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("", ("'description'",)),
+        ("description = 'x'\nclock = 3", ("[clock]", "table of constants")),
+        ("description = 'x'\n[dpu]\nclock_mhz = 'fast'", ("clock_mhz", "finite number")),
+        ("description = 'x'\n[dpu]\nclock_mhz = { value = 333 }", ("clock_mhz", "'source'")),
+        ("description = 'x'\ndefault_configuration = 'Z'\n[configurations.A]\nn = 3", ("configuration out of A",)),
+        ("description = 'x'\nconfigurations = 3", ("table of constants",)),
+    ],
+)
+def test_a_wrong_target_gets_one_sentence(text: str, words: tuple[str, ...], tmp_path: Path) -> None:
+    with pytest.raises(ProfileError) as caught:
+        load_target(sensor_file(tmp_path, text))
+    for word in ("mine", "expected", "got", *words):
+        assert word in str(caught.value)
+
+
+def test_a_target_names_what_it_lacks() -> None:
+    target = load_target("vck190")
+    with pytest.raises(ProfileError, match=r"vck190.*\[magic\] wand"):
+        target.value("magic", "wand")
+    with pytest.raises(ProfileError, match="C99"):
+        target.configuration("C99")
