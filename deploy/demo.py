@@ -29,7 +29,7 @@ from model.simulator.acquire import MARGIN_PX, Pair, simulate_pair
 from model.simulator.draws import Draw
 from model.simulator.procedural import procedural_scene
 from model.simulator.scene import Scene, read_scene
-from model.traditional.pipeline import restore_traditional
+from model.traditional.pipeline import Chain, restore_traditional
 from model.weights_file import load_network
 from profiles import load_sensor
 from quant.calibration import REFERENCE, draw_patches
@@ -154,7 +154,7 @@ def _methods(int8: onnx.ModelProto) -> dict[str, Method]:
     session, halo_px = open_session(int8), receptive_radius_px(int8)
     plain = eyes.degraded.nominal(), eyes.reference.nominal()
     return {
-        TRADITIONAL: lambda dn: restore_traditional(torch.from_numpy(dn), *plain).numpy(),
+        TRADITIONAL: lambda dn: restore_traditional(torch.from_numpy(dn), Chain(*plain)).numpy(),
         INT8: lambda dn: restore_image(dn, session, TILE_PX, halo_px).astype(np.float32),
     }
 

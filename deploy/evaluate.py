@@ -14,7 +14,7 @@ from model.metrics.fidelity import psnr_db, ssim
 from model.simulator.acquire import MARGIN_PX, Pair, simulate_pair
 from model.simulator.draws import Draw
 from model.simulator.scene import Scene
-from model.traditional.pipeline import restore_traditional
+from model.traditional.pipeline import Chain, restore_traditional
 from model.weights_file import shipped_weights
 from profiles.errors import OptionError
 from profiles.sensor import SensorProfile
@@ -68,8 +68,8 @@ def method_named(name: str, degraded: SensorProfile, reference: SensorProfile) -
     if name == "degraded":
         return lambda dn: dn
     if name == "traditional":
-        sensors = degraded.nominal(), reference.nominal()
-        return lambda dn: restore_traditional(torch.from_numpy(dn), *sensors).numpy()
+        chain = Chain(degraded.nominal(), reference.nominal())
+        return lambda dn: restore_traditional(torch.from_numpy(dn), chain).numpy()
     return _network(name)
 
 

@@ -15,7 +15,7 @@ from deploy.results import Row, measured, predicted
 from model.simulator.acquire import MARGIN_PX, simulate_pair
 from model.simulator.draws import Draw
 from model.simulator.procedural import procedural_scene
-from model.traditional.pipeline import restore_traditional
+from model.traditional.pipeline import Chain, restore_traditional
 from profiles import SensorProfile, TargetProfile
 from quant.onnx_file import load_onnx
 from quant.session import open_session
@@ -108,4 +108,4 @@ def _crops(dn: np.ndarray) -> Iterator[np.ndarray]:
 
 def _restore(dn: np.ndarray, sensors: Sensors) -> torch.Tensor:
     image = torch.from_numpy(np.ascontiguousarray(dn, dtype=np.float32))
-    return restore_traditional(image, sensors.degraded.nominal(), sensors.reference.nominal())
+    return restore_traditional(image, Chain(sensors.degraded.nominal(), sensors.reference.nominal()))

@@ -1,11 +1,21 @@
-"""The chain: stabilise, NL-Bayes, inverse, MTF compensation. Every number comes from the two sensors."""
+"""The two traditional chains. Every number comes from the two sensors.
 
-from dataclasses import replace
+- denoise first: stabilise, NL-Bayes, inverse, MTF compensation. NL-Bayes meets the white noise that it supposes;
+  what it leaves is amplified afterwards.
+- deconvolve first: MTF compensation, stabilise, NL-Bayes, inverse. The noise that NL-Bayes meets is amplified and
+  coloured by the filter, and it is told how.
+"""
 
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import torch
 from torch import Tensor
 
-from model.traditional.compensate import EPSILON, compensate, compensation_gain
-from model.traditional.nl_bayes import nl_bayes
+from model.traditional.compensate import EPSILON_PER_SIGMA, compensation_gain, compensation_kernel, filter_strips
+from model.traditional.nl_bayes import nl_bayes_strips
+from model.traditional.noise import Noise, coloured_by
 from model.traditional.settings import QUALITIES, Quality
 from model.traditional.stabilise import bias_radiance, destabilise, stabilise
 from profiles.errors import OptionError
@@ -16,33 +26,80 @@ WORKING_SIGMA = 12.0
 
 Of 6, 12 and 25 the best, by 0.04 dB (measured on a photograph at 7 %)."""
 
+Order = Literal["denoise-first", "deconvolve-first"]
 
-def restore_traditional(
-    dn: Tensor, degraded: Sensor, reference: Sensor, quality: str = "standard", epsilon: float = EPSILON
-) -> Tensor:
-    """Restore what `degraded` acquired to what `reference` would have, without its noise.
 
-    Args:
-        dn: (H, W) float32 digital numbers of the degraded sensor.
-        degraded: the sensor that acquired them.
+@dataclass(frozen=True)
+class Chain:
+    """How to restore what `degraded` acquired to what `reference` would have, without its noise.
+
+    Attributes:
+        degraded: the sensor that acquired the image.
         reference: the sensor to imitate; of its noise nothing is imitated.
         quality: "fast", "standard" or "best" (see `settings.QUALITIES`).
-        epsilon: regularisation of the MTF compensation.
+        order: see above.
+        epsilon: regularisation of the MTF compensation; None lets the noise of `degraded` decide.
+    """
+
+    degraded: Sensor
+    reference: Sensor
+    quality: str = "standard"
+    order: Order = "denoise-first"
+    epsilon: float | None = None
+
+    @property
+    def regularisation(self) -> float:
+        """The epsilon of the MTF compensation."""
+        return EPSILON_PER_SIGMA * self.degraded.noise_sigma(100) if self.epsilon is None else self.epsilon
+
+    def kernel(self) -> Tensor:
+        """The filter of the MTF compensation."""
+        return compensation_kernel(self.degraded.mtf_nyquist, self.reference.mtf_nyquist, self.regularisation)
+
+
+def restore_traditional(dn: Tensor, chain: Chain) -> Tensor:
+    """Restore (H, W) float32 digital numbers of the degraded sensor; NaN marks missing pixels, and stays.
 
     Returns:
         (H, W) float32 digital numbers of the reference sensor, clipped to 0..max_dn, not rounded.
     """
-    sensor = with_rounding_noise(degraded)
-    radiance = denoise_radiance(dn / degraded.gain_dn_per_radiance, sensor, quality_named(quality))
-    sharp = compensate(radiance, degraded.mtf_nyquist, reference.mtf_nyquist, epsilon)
-    return (sharp * reference.gain_dn_per_radiance).clamp(0, reference.max_dn)
+    return torch.cat(list(restore_strips([dn], dn.shape[0], chain)))
 
 
-def denoise_radiance(radiance: Tensor, sensor: Sensor, quality: Quality) -> Tensor:
-    """NL-Bayes on the stabilised scale: (H, W) in W/m2/sr/um, of noise variance alpha L + beta, to the same."""
-    stable = stabilise(radiance, sensor) * WORKING_SIGMA
-    clean = nl_bayes(stable, WORKING_SIGMA, quality) / WORKING_SIGMA
-    return destabilise(clean, sensor) + bias_radiance(sensor)
+def restore_strips(strips: Iterable[Tensor], height: int, chain: Chain) -> Iterator[Tensor]:
+    """As `restore_traditional`, bit for bit, on an image that comes and goes in strips of rows, (any, W) each.
+
+    Holds some 700 rows of it, and the tallest strip.
+    """
+    radiance = (strip / chain.degraded.gain_dn_per_radiance for strip in strips)
+    run = _denoise_first if chain.order == "denoise-first" else _deconvolve_first
+    for strip in run(radiance, height, chain, quality_named(chain.quality)):
+        yield (strip * chain.reference.gain_dn_per_radiance).clamp(0, chain.reference.max_dn)
+
+
+def _denoise_first(radiance: Iterable[Tensor], height: int, chain: Chain, quality: Quality) -> Iterator[Tensor]:
+    sensor, white = with_rounding_noise(chain.degraded), Noise(WORKING_SIGMA)
+    clean = denoise_radiance(radiance, height, sensor, white, quality)
+    return filter_strips(clean, height, chain.kernel())
+
+
+def _deconvolve_first(radiance: Iterable[Tensor], height: int, chain: Chain, quality: Quality) -> Iterator[Tensor]:
+    kernel = chain.kernel()
+    coloured = coloured_by(kernel, 1.0)
+    sensor = with_rounding_noise(chain.degraded)
+    amplified = replace(sensor, alpha=sensor.alpha * coloured.sigma**2, beta=sensor.beta * coloured.sigma**2)
+    sharp = filter_strips(radiance, height, kernel)
+    return denoise_radiance(sharp, height, amplified, replace(coloured, sigma=WORKING_SIGMA), quality)
+
+
+def denoise_radiance(
+    radiance: Iterable[Tensor], height: int, sensor: Sensor, noise: Noise, quality: Quality
+) -> Iterator[Tensor]:
+    """NL-Bayes on the stabilised scale: strips in W/m2/sr/um, of noise variance alpha L + beta, to the same."""
+    scale = noise.sigma
+    stable = (stabilise(strip, sensor) * scale for strip in radiance)
+    for clean in nl_bayes_strips(stable, height, noise, quality):
+        yield destabilise(clean / scale, sensor) + bias_radiance(sensor)
 
 
 def with_rounding_noise(sensor: Sensor) -> Sensor:
@@ -57,15 +114,19 @@ def quality_named(name: str) -> Quality:
     return QUALITIES[name]
 
 
-def describe(degraded: Sensor, reference: Sensor, quality: str = "standard", epsilon: float = EPSILON) -> list[str]:
+def describe(chain: Chain) -> list[str]:
     """The steps that `restore_traditional` would take, one line each, with their numbers."""
-    sensor, chosen = with_rounding_noise(degraded), quality_named(quality)
-    gain = float(compensation_gain(64, 64, degraded.mtf_nyquist, reference.mtf_nyquist, epsilon).max())
-    mtfs = f"{degraded.mtf_nyquist:.3g} to {reference.mtf_nyquist:.3g}"
-    return [
+    sensor, chosen, epsilon = with_rounding_noise(chain.degraded), quality_named(chain.quality), chain.regularisation
+    mtf_from, mtf_to = chain.degraded.mtf_nyquist, chain.reference.mtf_nyquist
+    gain = float(compensation_gain(64, 64, mtf_from, mtf_to, epsilon).max())
+    coloured = ", its covariance that of the filtered noise" if chain.order == "deconvolve-first" else ""
+    denoise = [
         f"stabilise noise of variance {sensor.alpha:.4g} L + {sensor.beta:.4g}, L in W/m2/sr/um, rounding counted",
-        f"NL-Bayes at sigma {WORKING_SIGMA:g}: references {chosen.stride_px} px apart, cap {chosen.group_cap} groups",
+        f"NL-Bayes at sigma {WORKING_SIGMA:g}: references {chosen.stride_px} px apart, cap {chosen.group_cap} groups"
+        + coloured,
         f"back to radiance, {bias_radiance(sensor):.2g} W/m2/sr/um of bias restored",
-        f"compensate the MTF at Nyquist from {mtfs}: epsilon {epsilon:g}, largest gain {gain:.2f}",
-        f"clip to 0..{reference.max_dn} DN",
     ]
+    mtfs = f"{mtf_from:.3g} to {mtf_to:.3g}"
+    sharpen = [f"compensate the MTF at Nyquist from {mtfs}: epsilon {epsilon:.2g}, largest gain {gain:.2f}"]
+    steps = denoise + sharpen if chain.order == "denoise-first" else sharpen + denoise
+    return [*steps, f"clip to 0..{chain.reference.max_dn} DN"]

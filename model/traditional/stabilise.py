@@ -26,7 +26,7 @@ def stabilise(radiance: Tensor, sensor: Sensor) -> Tensor:
     _check(sensor)
     dark = math.sqrt(sensor.beta)
     denominator = (sensor.alpha * radiance.clamp(min=0) + sensor.beta).sqrt() + dark
-    return (2 * radiance / denominator).where(denominator > 0, 0.0)
+    return (2 * radiance / denominator).where(denominator != 0, 0.0)
 
 
 def destabilise(stable: Tensor, sensor: Sensor) -> Tensor:
