@@ -16,7 +16,8 @@ from deploy.defaults import HELD_OUT_SEED, VARIANT, default_float_weights, float
 from deploy.dpu.board import Dpu, load_dpu
 from deploy.dpu.placement import place
 from deploy.dpu.reading import read_network
-from deploy.evaluate import Method, fidelity_row
+from deploy.evaluation.methods import Restore
+from deploy.evaluation.scores import fidelity_row
 from deploy.export import parity
 from deploy.measure import Sensors, traditional_rows
 from deploy.report.demo_page import INT8, SWATH_PX, TRADITIONAL, comparison, demo_report
@@ -149,7 +150,7 @@ def _in_table(row: Row, table: str) -> Row:
     return Row(table, row.name, row.figures, row.text)
 
 
-def _methods(int8: onnx.ModelProto) -> dict[str, Method]:
+def _methods(int8: onnx.ModelProto) -> dict[str, Restore]:
     eyes = sensors()
     session, halo_px = open_session(int8), receptive_radius_px(int8)
     plain = eyes.degraded.nominal(), eyes.reference.nominal()
@@ -164,4 +165,4 @@ def _quality(given: Input, restored: dict[str, np.ndarray]) -> list[Row]:
         return []
     reference = given.pair.reference.numpy()
     images = {"degraded input": given.degraded, **restored}
-    return [fidelity_row("quality", name, dn, reference) for name, dn in images.items()]
+    return [fidelity_row("quality", name, dn, reference, given.degraded) for name, dn in images.items()]

@@ -59,9 +59,9 @@ class Figure:
         return f"{text} [{number(self.interval[0], digits)}, {number(self.interval[1], digits)}]"
 
 
-def measured(value: float, unit: str, source: str) -> Figure:
-    """A number that this run observed on this machine."""
-    return Figure(float(value), unit, "measured", source)
+def measured(value: float, unit: str, source: str, interval: tuple[float, float] | None = None) -> Figure:
+    """A number that this run observed on this machine, and how far a repetition might lie from it where known."""
+    return Figure(float(value), unit, "measured", source, interval)
 
 
 def predicted(value: float, unit: str, interval: tuple[float, float], source: str) -> Figure:

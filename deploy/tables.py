@@ -27,7 +27,7 @@ def print_rows(title: str, rows: Iterable[Row], console: Console | None = None) 
     console.print(table)
     if keys:
         console.print(LEGEND, style="dim", highlight=False, markup=False)
-    for reason in dict.fromkeys(missing(rows)):
+    for reason in missing(rows):
         console.print(reason, style="dim", highlight=False, markup=False)
 
 
@@ -81,10 +81,11 @@ def cell(figure: Figure | None) -> Text:
 
 
 def missing(rows: list[Row]) -> list[str]:
-    """Why figures are unavailable."""
-    return [
-        f"- {key} of {row.name}: {figure.reason}"
-        for row in rows
-        for key, figure in row.figures.items()
-        if figure.value is None
-    ]
+    """Why figures are unavailable: a line a reason."""
+    names: dict[tuple[str, str], list[str]] = {}
+    for row in rows:
+        for key, figure in row.figures.items():
+            if figure.value is None:
+                names.setdefault((key, figure.reason), []).append(row.name)
+    few = {place: ", ".join(found) if len(found) < len(rows) / 2 else "" for place, found in names.items()}
+    return [f"- {key}{f' of {few[key, reason]}' if few[key, reason] else ''}: {reason}" for key, reason in names]

@@ -1,48 +1,68 @@
-"""`beers-deploy evaluate`: PSNR and SSIM of several methods on the same simulated pairs."""
+"""`beers-deploy evaluate`: several restorations on the same pairs, judged by the same instruments."""
 
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-EXAMPLE = "evaluate --images aerial/ --methods degraded,traditional,convbeers-s,convbeers-s-int8"
+EXAMPLE = "evaluate --images aerial/ --methods degraded,traditional,convbeers-s,convbeers-s-int8 --out report/"
 
 
 def evaluate(
-    images: Annotated[Path | None, typer.Option(help="Folder of scenes; drawn ones if none.")] = None,
+    images: Annotated[
+        Path | None, typer.Option(help="Folder of scenes to simulate from; drawn ones if none.")
+    ] = None,
+    pairs: Annotated[
+        Path | None, typer.Option(help="Folder with degraded/ and reference/, as 'simulate' writes.")
+    ] = None,
     sensor: Annotated[str, typer.Option(help="Profile of the degraded images.")] = "pleiades-degraded",
     reference: Annotated[str, typer.Option(help="Profile of the reference images.")] = "pleiades-reference",
     methods: Annotated[
         str, typer.Option(help="Names, separated by commas.")
-    ] = "degraded,convbeers-s,convbeers-s-int8",
+    ] = "degraded,traditional,deconvolve-first,convbeers-s,convbeers-s-int8",
+    lpips: Annotated[
+        Path | None, typer.Option(help="Weights of SqueezeNet 1.1 for LPIPS-squeeze, or a folder of backbones.")
+    ] = None,
+    out: Annotated[Path | None, typer.Option(help="Folder for report.html and picture strips.")] = None,
     seed: Annotated[int, typer.Option(min=0, help="Seed of every random draw.")] = 0,
     json: Annotated[Path | None, typer.Option(help="Write the figures here.")] = None,
 ) -> None:
-    """Compare restorations with the reference image, per image and on average; the degraded input is a row."""
-    from deploy.defaults import load_scenes
-    from deploy.evaluate import method_named, score, simulate_pairs
-    from deploy.progress import steps
+    """Compare restorations with the reference, on average and by site; the degraded input is always a row.
+
+    PSNR leaves out clipped pixels. MTF and SNR are measured on restored slanted edges and flat fields. Traditional
+    methods are told both sensors' nominal figures; networks are told nothing.
+    """
+    from deploy.evaluation.methods import method_named
+    from deploy.evaluation.page import evaluation_report, pictures
+    from deploy.evaluation.perceptual import perceptual_distances
+    from deploy.evaluation.run import evaluate_methods, load_pairs
+    from deploy.evaluation.scores import Instruments
+    from deploy.report.page import write_report
     from deploy.results import Document
     from deploy.tables import print_rows
     from model.files import require_writable
     from profiles import load_sensor
-    from profiles.errors import ImageError
+    from profiles.errors import OptionError
 
+    if images is not None and pairs is not None:
+        raise OptionError("--images and --pairs", expected="one of them", got="both", remedy="leave one out")
     require_writable(json)
+    require_writable(out / "report.html" if out else None)
     eyes = load_sensor(sensor), load_sensor(reference)
     names = list(dict.fromkeys(["degraded", *(name.strip() for name in methods.split(","))]))
-    chosen = [(name, method_named(name, *eyes)) for name in names]
-    pairs, small = simulate_pairs(load_scenes(images, eyes[1].nominal(), seed), *eyes, seed)
-    if not pairs:
-        raise ImageError(
-            str(images), expected="scenes of 224 pixels a side or more", got="none", remedy="give larger"
-        )
-    rows = []
-    for name, method in chosen:
-        with steps(name, len(pairs)) as bar:
-            rows += score(name, method, pairs, bar.advance)
-    print_rows(f"{sensor} -> {reference}, {len(pairs)} images", [row for row in rows if row.table == "mean"])
+    chosen = [method_named(name, eyes[0].nominal(), eyes[1].nominal()) for name in names]
+    instruments = Instruments(perceptual_distances(lpips))
+    found, small = load_pairs(images, pairs, *eyes, seed)
+    result = evaluate_methods(chosen, found, instruments, eyes[0].nominal(), seed)
+    title = f"{sensor} -> {reference}, {len(found)} images"
+    print_rows(title, result.mean)
+    print_rows("PSNR by site", result.sites)
     if small:
         typer.echo(f"left out, too small: {', '.join(small)}")
-    arguments = {"images": images, "sensor": sensor, "reference": reference, "methods": methods, "seed": seed}
-    Document("evaluate", arguments, (), tuple(rows)).write(json)
+    if out is not None:
+        strips = pictures(found, chosen, out)
+        write_report(evaluation_report(title, result.mean, result.sites, strips), out / "report.html")
+        typer.echo(f"wrote {out / 'report.html'}")
+    arguments: dict[str, object] = {"images": images, "pairs": pairs, "sensor": sensor, "reference": reference}
+    arguments |= {"methods": methods, "lpips": lpips, "out": out, "seed": seed}
+    Document("evaluate", arguments, (), result.rows).write(json)

@@ -71,7 +71,7 @@ def _grid(table: Table) -> dict[str, object]:
             }
             for row in rows
         ],
-        "missing": list(dict.fromkeys(missing(rows))),
+        "missing": missing(rows),
     }
 
 

@@ -2,6 +2,7 @@
 
 import base64
 import io
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -60,15 +61,41 @@ def strip(
     images: dict[str, np.ndarray], windows: list[tuple[int, int]], side_px: int, zoom: int, stretch: Stretch
 ) -> Image.Image:
     """The same crops of several (H, W) images: a column an image under its name, a row a window, no smoothing."""
-    size = side_px * zoom
-    canvas = Image.new("L", (len(images) * (size + GAP_PX) - GAP_PX, len(windows) * (size + GAP_PX) + LABEL_PX), 255)
+    rows = [
+        strip_row((dn[top : top + side_px, left : left + side_px] for dn in images.values()), stretch)
+        for top, left in windows
+    ]
+    return grid(list(images), rows, zoom)
+
+
+def strip_row(crops: Iterable[np.ndarray], stretch: Stretch) -> list[np.ndarray]:
+    """Crops of digital numbers as grey."""
+    return [stretch.to_bytes(crop) for crop in crops]
+
+
+def error_row(errors: Iterable[np.ndarray], white_dn: float) -> list[np.ndarray]:
+    """Sizes of errors as grey: black none, white `white_dn` and more, linear."""
+    return [np.rint(255 * np.clip(error / white_dn, 0, 1)).astype(np.uint8) for error in errors]
+
+
+def grid(names: list[str], rows: list[list[np.ndarray]], zoom: int) -> Image.Image:
+    """Rows of equally large (h, w) uint8 cells, each column under its name, every pixel `zoom` pixels wide."""
+    height, width = (side * zoom for side in rows[0][0].shape)
+    canvas = Image.new("L", (len(names) * (width + GAP_PX) - GAP_PX, len(rows) * (height + GAP_PX) + LABEL_PX), 255)
     draw = ImageDraw.Draw(canvas)
-    font = ImageFont.load_default(size=LABEL_PX - 6)
-    for column, (name, dn) in enumerate(images.items()):
-        left = column * (size + GAP_PX)
-        draw.text((left + 2, 1), name, fill=0, font=font)
-        for row, (y, x) in enumerate(windows):
-            crop = Image.fromarray(stretch.to_bytes(dn[y : y + side_px, x : x + side_px]))
-            crop = crop.resize((crop.width * zoom, crop.height * zoom), Image.Resampling.NEAREST)
-            canvas.paste(crop, (left, LABEL_PX + row * (size + GAP_PX)))
+    for column, name in enumerate(names):
+        left = column * (width + GAP_PX)
+        draw.text((left + 2, 1), name, fill=0, font=_font_for(name, width))
+        for number, row in enumerate(rows):
+            cell = Image.fromarray(row[column]).resize((width, height), Image.Resampling.NEAREST)
+            canvas.paste(cell, (left, LABEL_PX + number * (height + GAP_PX)))
     return canvas
+
+
+def _font_for(name: str, width_px: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
+    """The largest font that keeps a name within its column."""
+    for size in range(LABEL_PX - 6, 7, -1):
+        font = ImageFont.load_default(size=size)
+        if font.getlength(name) <= width_px - 2:
+            return font
+    return ImageFont.load_default(size=8)

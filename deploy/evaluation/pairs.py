@@ -1,0 +1,96 @@
+"""Pairs of a degraded and a reference image: simulated from scenes, or read from a folder that `simulate` wrote."""
+
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from deploy.restore import read_acquisition
+from model.images import list_images
+from model.simulator.acquire import MARGIN_PX, simulate_pair
+from model.simulator.draws import Draw
+from model.simulator.scene import Scene
+from profiles.errors import ImageError
+from profiles.sensor import SensorProfile
+
+OVERSAMPLINGS = (4, 2)
+MIN_SIDE_PX = 48
+FRAME_NUMBERS = re.compile(r"(_[0-9a-f]*\d[0-9a-f]*)+$")
+"""What a name ends in that tells frames of one site apart: _0034, _5dded5bc_23."""
+
+
+@dataclass(frozen=True)
+class NamedPair:
+    """Two acquisitions of one scene, (H, W) float32 digital numbers of 0..4095, and the scene's name."""
+
+    name: str
+    degraded: np.ndarray
+    reference: np.ndarray
+
+    @property
+    def site(self) -> str:
+        """The name without what tells frames of one site apart."""
+        return FRAME_NUMBERS.sub("", Path(self.name).stem) or self.name
+
+
+def simulate_pairs(
+    scenes: list[Scene], degraded: SensorProfile, reference: SensorProfile, seed: int
+) -> tuple[list[NamedPair], list[str]]:
+    """Simulate a pair of each scene, at the larger oversampling that leaves enough of it.
+
+    Returns:
+        The pairs, and the names of scenes too small to use.
+
+    Raises:
+        ImageError: all are too small.
+    """
+    pairs, small = [], []
+    for number, scene in enumerate(scenes):
+        ratio = next(
+            (r for r in OVERSAMPLINGS if min(scene.radiance.shape) // r >= 2 * MARGIN_PX + MIN_SIDE_PX), None
+        )
+        if ratio is None:
+            small.append(scene.name)
+            continue
+        draw = Draw(seed, number)
+        eyes = [profile.draw(draw.generator("sensor")) for profile in (degraded, reference)]
+        pair = simulate_pair(scene.radiance, eyes[0], eyes[1], ratio, draw)
+        pairs.append(NamedPair(scene.name, pair.degraded.numpy(), pair.reference.numpy()))
+    if not pairs:
+        least = OVERSAMPLINGS[-1] * (2 * MARGIN_PX + MIN_SIDE_PX)
+        raise ImageError(
+            "images",
+            expected=f"scenes of {least} pixels a side or more",
+            got=f"{len(small)} smaller ones",
+            remedy="give larger images",
+        )
+    return pairs, small
+
+
+def read_pairs(folder: Path) -> list[NamedPair]:
+    """Read FOLDER/degraded/NAME.tif beside FOLDER/reference/NAME.tif, mono images of at most 12 bits.
+
+    Raises:
+        ImageError: a folder is missing, a name has no partner, or two images differ in size.
+    """
+    return list(_read_pairs(folder))
+
+
+def _read_pairs(folder: Path) -> Iterator[NamedPair]:
+    degraded, reference = ({p.stem: p for p in list_images(folder / role)} for role in ("degraded", "reference"))
+    alone = sorted(degraded.keys() ^ reference.keys())
+    if alone:
+        raise ImageError(
+            str(folder),
+            expected="each name in degraded/ and in reference/",
+            got=f"{alone[0]!r} in one of them only",
+            remedy="complete the pairs; 'beers-deploy simulate' writes such folders",
+        )
+    for name, path in degraded.items():
+        pair = NamedPair(name, read_acquisition(path), read_acquisition(reference[name]))
+        if pair.degraded.shape != pair.reference.shape:
+            sizes = " and ".join(f"{a.shape[1]} x {a.shape[0]}" for a in (pair.degraded, pair.reference))
+            raise ImageError(f"pair {name}", expected="two images of one size", got=sizes, remedy="crop them alike")
+        yield pair

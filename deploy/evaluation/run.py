@@ -1,0 +1,53 @@
+"""An evaluation from pairs and methods to rows."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from deploy.defaults import load_scenes
+from deploy.evaluation.methods import Method
+from deploy.evaluation.pairs import NamedPair, read_pairs, simulate_pairs
+from deploy.evaluation.paper import paper_rows
+from deploy.evaluation.scores import Instruments, score, site_rows
+from deploy.evaluation.targets import acquire_targets, target_figures
+from deploy.progress import steps
+from deploy.results import Row
+from profiles.sensor import Sensor, SensorProfile
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """The rows of an evaluation: a mean a method and the paper's, a site each, an image each."""
+
+    mean: tuple[Row, ...]
+    sites: tuple[Row, ...]
+    images: tuple[Row, ...]
+
+    @property
+    def rows(self) -> tuple[Row, ...]:
+        """All of them."""
+        return (*self.mean, *self.sites, *self.images)
+
+
+def load_pairs(
+    images: Path | None, pairs: Path | None, degraded: SensorProfile, reference: SensorProfile, seed: int
+) -> tuple[list[NamedPair], list[str]]:
+    """Pairs from a folder of pairs, from a folder of scenes, or from drawn scenes; and scenes too small to use."""
+    if pairs is not None:
+        return read_pairs(pairs), []
+    return simulate_pairs(load_scenes(images, reference.nominal(), seed), degraded, reference, seed)
+
+
+def evaluate_methods(
+    methods: Sequence[Method], pairs: Sequence[NamedPair], instruments: Instruments, sensor: Sensor, seed: int
+) -> Evaluation:
+    """Score every method on every pair, and on targets acquired by `sensor`."""
+    targets = acquire_targets(sensor, seed)
+    means, images = [], []
+    for method in methods:
+        with steps(method.name, len(pairs)) as bar:
+            mean, *rest = score(method, pairs, instruments, seed, bar.advance)
+        figures = {**mean.figures, **target_figures(method, targets)}
+        means.append(replace(mean, figures=figures))
+        images += rest
+    return Evaluation((*means, *paper_rows()), tuple(site_rows(images)), tuple(images))

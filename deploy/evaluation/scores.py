@@ -1,0 +1,110 @@
+"""Scores of one method on the pairs, as rows: an image each, and the mean with its interval."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from deploy.evaluation.methods import Method
+from deploy.evaluation.pairs import NamedPair
+from deploy.evaluation.perceptual import Perceptual
+from deploy.restore import MAX_DN
+from deploy.results import Figure, Row, measured, unavailable
+from model.metrics.bootstrap import mean_interval
+from model.metrics.fidelity import psnr_db, ssim
+
+DISTANCE = "distance"
+UNITS = {"PSNR": "dB", "PSNR gain": "dB", "SSIM": "ratio"}
+IDENTICAL = "infinite: identical to the reference"
+
+
+@dataclass(frozen=True)
+class Instruments:
+    """What is measured besides PSNR and SSIM: perceptual distances by name, each or the reason why not."""
+
+    perceptual: Mapping[str, Perceptual | str]
+
+    def score(self, dn: np.ndarray, reference: np.ndarray, degraded: np.ndarray) -> dict[str, float | None]:
+        """The figures of one restored image, (H, W) digital numbers each."""
+        psnr, before = (fidelity_db(image, reference, degraded) for image in (dn, degraded))
+        scores: dict[str, float | None] = {"PSNR": psnr, "PSNR gain": psnr - before if psnr != before else 0.0}
+        scores["SSIM"] = ssim(dn, reference, MAX_DN)
+        for name, distance in self.perceptual.items():
+            scores[name] = None if isinstance(distance, str) else distance(dn / MAX_DN, reference / MAX_DN)
+        return scores
+
+    def figure(
+        self, key: str, value: float | None, source: str, interval: tuple[float, float] | None = None
+    ) -> Figure:
+        """A score as a figure; unavailable with the reason where there is none."""
+        unit = UNITS.get(key, DISTANCE)
+        if value is None:
+            return unavailable(unit, str(self.perceptual[key]))
+        return measured(value, unit, source, interval) if np.isfinite(value) else unavailable(unit, IDENTICAL)
+
+
+def fidelity_db(dn: np.ndarray, reference: np.ndarray, degraded: np.ndarray) -> float:
+    """PSNR over 4095 DN without the pixels that clipped in the input or the reference: there the truth is unknown."""
+    sound = (reference < MAX_DN) & (degraded < MAX_DN)
+    return psnr_db(dn[sound], reference[sound], MAX_DN) if sound.any() else psnr_db(dn, reference, MAX_DN)
+
+
+def score(
+    method: Method, pairs: Sequence[NamedPair], instruments: Instruments, seed: int, tick: Callable[[], None]
+) -> list[Row]:
+    """The mean row of a method, then one row an image."""
+    rows, scores = [], []
+    for pair in pairs:
+        values = instruments.score(method.restore(pair.degraded), pair.reference, pair.degraded)
+        figures = {key: instruments.figure(key, value, "one pair") for key, value in values.items()}
+        rows.append(Row("images", f"{method.name}: {pair.name}", figures, {"site": pair.site}))
+        scores.append(values)
+        tick()
+    return [mean_row(method, scores, [pair.site for pair in pairs], instruments, seed), *rows]
+
+
+def mean_row(
+    method: Method,
+    scores: Sequence[dict[str, float | None]],
+    sites: Sequence[str],
+    instruments: Instruments,
+    seed: int,
+) -> Row:
+    """The mean of each score over the images that have it, with the bootstrap interval."""
+    figures = {}
+    for key in scores[0]:
+        usable = [
+            (v, site) for s, site in zip(scores, sites, strict=True) if (v := s[key]) is not None and np.isfinite(v)
+        ]
+        if not usable:
+            figures[key] = instruments.figure(key, scores[0][key], "")
+            continue
+        values, places = zip(*usable, strict=True)
+        interval = mean_interval(values, places, np.random.default_rng(seed))
+        source = f"mean of {len(values)} pairs from {len(set(places))} sites, 95 % bootstrap interval over sites"
+        figures[key] = instruments.figure(key, float(np.mean(values)), source, interval)
+    return Row("mean", method.name, figures, {"told": method.told})
+
+
+def site_rows(rows: Sequence[Row]) -> list[Row]:
+    """PSNR by site: a row a site, a column a method, from the rows of the images."""
+    images = [row for row in rows if row.table == "images"]
+    methods = list(dict.fromkeys(row.name.split(": ")[0] for row in images))
+    found = []
+    for site in dict.fromkeys(row.text["site"] for row in images):
+        figures = {}
+        for method in methods:
+            here = [row for row in images if row.text["site"] == site and row.name.startswith(f"{method}: ")]
+            values = [v for row in here if (v := row.figures["PSNR"].value) is not None]
+            source = f"mean PSNR of {len(values)} pairs"
+            figures[method] = measured(float(np.mean(values)), "dB", source) if values else here[0].figures["PSNR"]
+        found.append(Row("sites", site, figures, {"images": str(len(here))}))
+    return found
+
+
+def fidelity_row(table: str, name: str, dn: np.ndarray, reference: np.ndarray, degraded: np.ndarray) -> Row:
+    """PSNR and SSIM of one restored image, (H, W) digital numbers over 4095 DN."""
+    instruments = Instruments({})
+    values = instruments.score(dn, reference, degraded)
+    figures = {key: instruments.figure(key, values[key], "simulated pair") for key in ("PSNR", "SSIM")}
+    return Row(table, name, figures)

@@ -1,0 +1,112 @@
+"""Restorations of scikit-image, as peers for tables: each made to aim at the reference's MTF, none tuned further.
+
+The three deconvolutions undo the degraded MTF whole; the result is blurred to the reference's. Non-local means stands
+in the place of NL-Bayes in the chain.
+"""
+
+from collections.abc import Callable
+from types import ModuleType
+
+import torch
+from torch import Tensor
+
+from model.simulator.mtf import transfer_function
+from model.traditional.compensate import filter_strips
+from model.traditional.pipeline import Chain, with_rounding_noise
+from model.traditional.rows import mirrored
+from model.traditional.stabilise import bias_radiance, destabilise, stabilise
+from profiles.errors import MachineError
+
+PAD_PX = 64
+WIENER_BALANCE, RICHARDSON_LUCY_STEPS = 0.01, 20
+NLM_PATCH_PX, NLM_DISTANCE_PX, NLM_STRENGTH = 5, 6, 0.6
+
+Peer = Callable[[Tensor, Chain], Tensor]
+"""(H, W) digital numbers of the degraded sensor, and the two sensors, to those of the reference."""
+
+
+def wiener(dn: Tensor, chain: Chain) -> Tensor:
+    """scikit-image's Wiener filter with a Laplacian regulariser, balance 0.01."""
+    restoration = _restoration()
+
+    def deconvolve(image: Tensor, blur: Tensor) -> Tensor:
+        restored = restoration.wiener(image.numpy(), blur.numpy().astype(complex), WIENER_BALANCE, clip=False)
+        return torch.from_numpy(restored)
+
+    return _deconvolved(dn, chain, deconvolve)
+
+
+def unsupervised_wiener(dn: Tensor, chain: Chain) -> Tensor:
+    """scikit-image's Wiener filter that estimates its own regularisation (seed 0)."""
+    restoration = _restoration()
+
+    def deconvolve(image: Tensor, blur: Tensor) -> Tensor:
+        restored, _ = restoration.unsupervised_wiener(image.numpy(), blur.numpy().astype(complex), clip=False, rng=0)
+        return torch.from_numpy(restored)
+
+    return _deconvolved(dn, chain, deconvolve)
+
+
+def richardson_lucy(dn: Tensor, chain: Chain) -> Tensor:
+    """scikit-image's Richardson-Lucy, 20 steps."""
+    restoration = _restoration()
+
+    def deconvolve(image: Tensor, blur: Tensor) -> Tensor:
+        height, width = image.shape
+        side = 2 * PAD_PX + 1
+        spread = torch.fft.irfft2(blur, s=(height, width)).roll((PAD_PX, PAD_PX), (0, 1))[:side, :side]
+        spread = spread.clamp(min=0)
+        point = (spread / spread.sum()).numpy()
+        light = image.clamp(min=1e-6).numpy()
+        return torch.from_numpy(restoration.richardson_lucy(light, point, RICHARDSON_LUCY_STEPS, clip=False))
+
+    return _deconvolved(dn, chain, deconvolve)
+
+
+def nl_means(dn: Tensor, chain: Chain) -> Tensor:
+    """The chain with scikit-image's fast non-local means, patches of 5 x 5 within 6 pixels, h = 0.6 sigma."""
+    sensor = with_rounding_noise(chain.degraded)
+    stable = stabilise(dn / chain.degraded.gain_dn_per_radiance, sensor)
+    clean = _restoration().denoise_nl_means(
+        stable.numpy(), NLM_PATCH_PX, NLM_DISTANCE_PX, h=NLM_STRENGTH, sigma=1.0, fast_mode=True
+    )
+    radiance = destabilise(torch.from_numpy(clean).float(), sensor) + bias_radiance(sensor)
+    sharp = torch.cat(list(filter_strips([radiance], len(radiance), chain.kernel())))
+    return _as_reference(sharp, chain)
+
+
+PEERS: dict[str, Peer] = {
+    "wiener": wiener,
+    "unsupervised-wiener": unsupervised_wiener,
+    "richardson-lucy": richardson_lucy,
+    "nl-means": nl_means,
+}
+
+
+def _deconvolved(dn: Tensor, chain: Chain, deconvolve: Callable[[Tensor, Tensor], Tensor]) -> Tensor:
+    """Undo the degraded MTF on mirrored borders, at a scale of 1 for full scale, and blur to the reference's."""
+    full_scale = chain.degraded.max_dn / chain.degraded.gain_dn_per_radiance
+    rows, columns = (mirrored(-PAD_PX, size + PAD_PX, size) for size in dn.shape)
+    height, width = len(rows), len(columns)
+    wide = (dn.double() / chain.degraded.max_dn)[rows][:, columns]
+    blur, target = (transfer_function(height, width, 1, s.mtf_nyquist) for s in (chain.degraded, chain.reference))
+    sharp = torch.fft.rfft2(deconvolve(wide, blur)) * target
+    inside = torch.fft.irfft2(sharp, s=(height, width))[PAD_PX:-PAD_PX, PAD_PX:-PAD_PX]
+    return _as_reference((inside * full_scale).float(), chain)
+
+
+def _as_reference(radiance: Tensor, chain: Chain) -> Tensor:
+    return (radiance * chain.reference.gain_dn_per_radiance).clamp(0, chain.reference.max_dn)
+
+
+def _restoration() -> ModuleType:
+    try:
+        from skimage import restoration
+    except ImportError as error:
+        raise MachineError(
+            "library peers",
+            expected="scikit-image",
+            got="it is not installed",
+            remedy="pip install 'beers-deploy[peers]'",
+        ) from error
+    return restoration

@@ -1,0 +1,71 @@
+"""The loss: its terms, their balance, and gradients that stay finite where images are equal."""
+
+import pytest
+import torch
+from torch import Tensor, nn
+
+from model.losses import PAPER, LossWeights, RestorationLoss, fft_l1
+from model.metrics.perceptual import Lpips
+
+
+def images(side: int = 33, batch: int = 2, seed: int = 0) -> tuple[Tensor, Tensor]:
+    generator = torch.Generator().manual_seed(seed)
+    reference = torch.rand(batch, 1, side, side + 4, generator=generator)
+    return reference + 0.01 * torch.randn(reference.shape, generator=generator), reference
+
+
+class Distance(nn.Module):
+    """Stands for LPIPS where only the sum is tested."""
+
+    def forward(self, restored: Tensor, reference: Tensor) -> Tensor:
+        return (restored - reference).square().mean((1, 2, 3))
+
+
+def with_distance() -> Lpips:
+    return Distance()  # type: ignore[return-value]
+
+
+@pytest.mark.parametrize("side", [32, 64, 128, 256])
+def test_the_fft_term_does_not_depend_on_the_patch_size(side: int) -> None:
+    """Trap 14: the default norm would make it 36, 71, 142 and 285 times the L1."""
+    restored, reference = images(side)
+    l1 = float((restored - reference).abs().mean())
+    assert float(fft_l1(restored, reference)) / l1 == pytest.approx(1.11, abs=0.03)
+    plain = float(torch.fft.rfft2(restored - reference).abs().mean())
+    assert plain / l1 > side
+
+
+def test_gradients_are_finite_where_images_are_equal() -> None:
+    restored = images()[1].requires_grad_()
+    fft_l1(restored, images()[1]).backward()  # type: ignore[no-untyped-call]
+    assert restored.grad is not None
+    assert bool((restored.grad == 0).all())
+    again = images()[1].requires_grad_()
+    spectrum = torch.fft.rfft2(again - images()[1], norm="ortho")
+    (spectrum.real.square() + spectrum.imag.square()).sqrt().mean().backward()  # the other way to write it
+    assert again.grad is not None
+    assert bool(again.grad.isnan().any())
+
+
+def test_the_terms_add_up() -> None:
+    restored, reference = images()
+    total, terms = RestorationLoss(PAPER, with_distance())(restored, reference)
+    assert set(terms) == {"l1", "fft", "lpips"}
+    expected = terms["l1"] + 0.1 * terms["fft"] + 0.5 * terms["lpips"]
+    torch.testing.assert_close(total, expected)
+
+
+def test_terms_without_weight_are_not_computed() -> None:
+    restored, reference = images()
+    total, terms = RestorationLoss(LossWeights(2.0, 0.0, 0.0), with_distance())(restored, reference)
+    assert set(terms) == {"l1"}
+    torch.testing.assert_close(total, 2 * terms["l1"])
+    assert set(RestorationLoss(PAPER)(restored, reference)[1]) == {"l1", "fft"}
+
+
+def test_autocast_does_not_reach_the_loss() -> None:
+    restored, reference = images(64)
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        inside, _ = RestorationLoss()(restored, reference)
+    assert inside.dtype == torch.float32
+    assert torch.equal(inside, RestorationLoss()(restored, reference)[0])
