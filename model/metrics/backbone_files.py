@@ -99,7 +99,8 @@ def _read_safetensors(path: Path, names: Iterable[str]) -> Mapping[str, Tensor]:
 
 
 def _read_npz(path: Path, names: Iterable[str]) -> Mapping[str, Tensor]:
-    with np.load(path, allow_pickle=False) as file:
+    with path.open("rb") as raw:  # np.load leaves a file open that turns out to be broken
+        file = np.load(raw, allow_pickle=False)
         if not isinstance(file, NpzFile):
             raise TypeError("a single array")
         for name in names:

@@ -34,7 +34,7 @@ def test_every_mode_validates() -> None:
         Figure(None, "s", "measured", "here"),
         Figure(None, "W", "unavailable"),
         Figure(1.0, "s", "measured"),
-        Figure(1.0, "s", "measured", "here", (0.0, 2.0)),
+        Figure(1.0, "s", "published", "a paper", (0.0, 2.0)),
     ],
 )
 def test_a_figure_without_what_its_mode_needs_is_invalid(wrong: Figure) -> None:
