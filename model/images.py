@@ -1,6 +1,7 @@
 """Read pixels from TIFF, PNG or JPEG files, and refuse with one sentence what is no image."""
 
 import math
+import re
 import warnings
 from pathlib import Path
 
@@ -13,6 +14,9 @@ from profiles.errors import ImageError, MachineError
 
 TIFF_SUFFIXES = {".tif", ".tiff"}
 IMAGE_SUFFIXES = TIFF_SUFFIXES | {".png", ".jpg", ".jpeg"}
+FRAME_NUMBERS = re.compile(r"(_[0-9a-f]*\d[0-9a-f]*)+$")
+"""What a name ends in that tells frames of one site apart: _0034, _5dded5bc_23."""
+
 WORKING_COPIES = 12
 """Float copies of an image that a command may hold at once: reading refuses what would not fit in memory."""
 
@@ -52,6 +56,11 @@ def list_images(folder: Path) -> list[Path]:
         got = "no image in it" if folder.is_dir() else "no such folder"
         raise ImageError(str(folder), expected="a folder of images", got=got, remedy="give TIFF, PNG or JPEG files")
     return found
+
+
+def site_of(name: str) -> str:
+    """The name of an image without what tells frames of one site apart."""
+    return FRAME_NUMBERS.sub("", Path(name).stem) or name
 
 
 def _read_tiff(path: Path) -> np.ndarray:

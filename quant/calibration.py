@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from model.patches import PatchRecipe, PatchSource
 from model.simulator.scene import Scene
+from model.training.patches import PatchRecipe, PatchSource
 from profiles.sensor import SensorProfile
 from quant.float_file import float_model
 from quant.graph import Graph, tensors

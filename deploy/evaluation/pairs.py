@@ -1,6 +1,5 @@
 """Pairs of a degraded and a reference image: simulated from scenes, or read from a folder that `simulate` wrote."""
 
-import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -8,17 +7,16 @@ from pathlib import Path
 import numpy as np
 
 from deploy.restore import read_acquisition
-from model.images import list_images
+from model.images import site_of
 from model.simulator.acquire import MARGIN_PX, simulate_pair
 from model.simulator.draws import Draw
 from model.simulator.scene import Scene
+from model.training.stored_pairs import pair_files
 from profiles.errors import ImageError
 from profiles.sensor import SensorProfile
 
 OVERSAMPLINGS = (4, 2)
 MIN_SIDE_PX = 48
-FRAME_NUMBERS = re.compile(r"(_[0-9a-f]*\d[0-9a-f]*)+$")
-"""What a name ends in that tells frames of one site apart: _0034, _5dded5bc_23."""
 
 
 @dataclass(frozen=True)
@@ -32,7 +30,7 @@ class NamedPair:
     @property
     def site(self) -> str:
         """The name without what tells frames of one site apart."""
-        return FRAME_NUMBERS.sub("", Path(self.name).stem) or self.name
+        return site_of(self.name)
 
 
 def simulate_pairs(
@@ -79,18 +77,11 @@ def read_pairs(folder: Path) -> list[NamedPair]:
 
 
 def _read_pairs(folder: Path) -> Iterator[NamedPair]:
-    degraded, reference = ({p.stem: p for p in list_images(folder / role)} for role in ("degraded", "reference"))
-    alone = sorted(degraded.keys() ^ reference.keys())
-    if alone:
-        raise ImageError(
-            str(folder),
-            expected="each name in degraded/ and in reference/",
-            got=f"{alone[0]!r} in one of them only",
-            remedy="complete the pairs; 'beers-deploy simulate' writes such folders",
-        )
-    for name, path in degraded.items():
-        pair = NamedPair(name, read_acquisition(path), read_acquisition(reference[name]))
+    for degraded, reference in pair_files(folder):
+        pair = NamedPair(degraded.stem, read_acquisition(degraded), read_acquisition(reference))
         if pair.degraded.shape != pair.reference.shape:
             sizes = " and ".join(f"{a.shape[1]} x {a.shape[0]}" for a in (pair.degraded, pair.reference))
-            raise ImageError(f"pair {name}", expected="two images of one size", got=sizes, remedy="crop them alike")
+            raise ImageError(
+                f"pair {pair.name}", expected="two images of one size", got=sizes, remedy="crop them alike"
+            )
         yield pair

@@ -5,6 +5,7 @@ and exposure. Visiting whole scenes yields many patches for one transform.
 """
 
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,6 +16,7 @@ from model.simulator.acquire import Pair, acquire
 from model.simulator.draws import Draw
 from model.simulator.sampling import crop_divisible, scene_spectrum
 from model.simulator.scene import Scene
+from model.training.workers import Worker
 from profiles.errors import ImageError
 from profiles.sensor import SensorProfile
 
@@ -45,24 +47,39 @@ class PatchSource:
     SHARD_BATCHES = 16
     """Batches mixed together: enough scenes in one batch, little memory."""
 
-    def __init__(self, scenes: list[Scene], recipe: PatchRecipe, batch: int, seed: int) -> None:
-        self.recipe, self.batch, self.seed = recipe, batch, seed
+    def __init__(
+        self,
+        scenes: list[Scene],
+        recipe: PatchRecipe,
+        batch: int,
+        seed: int,
+        worker: Worker | None = None,
+        device: torch.device | None = None,
+    ) -> None:
+        self.recipe, self.batch, self.seed, self.worker = recipe, batch, seed, worker or Worker()
         common = int(np.lcm.reduce(recipe.oversamplings))
-        self._scenes = [prepare(scene, common) for scene in scenes]
+        self._scenes = [prepare(scene, common, device) for scene in scenes]
 
     def batches(self, first: int = 0) -> Iterator[tuple[Tensor, Tensor]]:
-        """Batch number `first` and all that follow: a resumed run goes on where it stopped."""
-        index = first
-        while True:
-            shard, within = divmod(index, self.SHARD_BATCHES)
-            degraded, reference = self._shard(shard)
-            for k in range(within, self.SHARD_BATCHES):
-                part = slice(k * self.batch, (k + 1) * self.batch)
-                yield degraded[part], reference[part]
-            index = (shard + 1) * self.SHARD_BATCHES
+        """Batch number `first` and all that follow: a resumed run goes on where it stopped.
+
+        The next shard is made while the present one is used.
+        """
+        number, within = divmod(first, self.SHARD_BATCHES)
+        with ThreadPoolExecutor(1) as ahead:
+            waiting = ahead.submit(self._shard, number)
+            while True:
+                degraded, reference = waiting.result()
+                number += 1
+                waiting = ahead.submit(self._shard, number)
+                for k in range(within, self.SHARD_BATCHES):
+                    part = slice(k * self.batch, (k + 1) * self.batch)
+                    yield degraded[part], reference[part]
+                within = 0
 
     def _shard(self, number: int) -> tuple[Tensor, Tensor]:
-        generator = Draw(self.seed, number).generator("shard")
+        own = number * self.worker.count + self.worker.rank
+        generator = Draw(self.seed, own).generator("shard")
         wanted, pieces, count = self.batch * self.SHARD_BATCHES, [], 0
         for _ in range(50 * wanted):
             piece = visit(self._scenes[generator.integers(len(self._scenes))], self.recipe, generator)
@@ -70,7 +87,8 @@ class PatchSource:
             count += len(piece)
             if count >= wanted:
                 order = torch.from_numpy(generator.permutation(count)[:wanted])
-                patches = torch.cat(pieces)[order]
+                patches = torch.cat(pieces)
+                patches = patches[order.to(patches.device)]
                 return patches[:, :1].contiguous(), patches[:, 1:].contiguous()
         raise ImageError(
             "training images",
@@ -80,9 +98,9 @@ class PatchSource:
         )
 
 
-def prepare(scene: Scene, multiple: int) -> Visited:
-    """Crop a scene to multiples of every oversampling, and transform it once."""
-    radiance = crop_divisible(scene.radiance, multiple)
+def prepare(scene: Scene, multiple: int, device: torch.device | None = None) -> Visited:
+    """Crop a scene to multiples of every oversampling, and transform it once, where the patches are wanted."""
+    radiance = crop_divisible(scene.radiance, multiple).to(device or scene.radiance.device)
     return Visited(scene_spectrum(radiance), radiance.shape[-1])
 
 
@@ -91,7 +109,7 @@ def visit(scene: Visited, recipe: PatchRecipe, generator: np.random.Generator) -
     ratio = int(generator.choice(recipe.oversamplings))
     room = min(scene.spectrum.shape[-2], scene.width) // ratio - 2 * recipe.margin_px
     if room < recipe.patch_px:
-        return torch.empty(0, 2, recipe.patch_px, recipe.patch_px)
+        return scene.spectrum.real.new_empty(0, 2, recipe.patch_px, recipe.patch_px)
     pair = _acquire_pair(scene, recipe, ratio, generator)
     patches = cut(torch.stack([pair.degraded, pair.reference]), recipe.patch_px, generator)
     return turn(patches, generator)

@@ -1,0 +1,248 @@
+"""A training run from options to a folder: checkpoint, logs, validation pictures, weights with their recipe.
+
+RUN/checkpoint.safetensors  RUN/log.csv  RUN/validation.csv  RUN/validation.png  RUN/VARIANT.safetensors
+"""
+
+import csv
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Protocol
+
+import numpy as np
+
+from deploy.defaults import draw_scenes
+from deploy.progress import Steps, steps
+from deploy.report.pictures import Stretch, busiest_windows, grid, strip_row
+from model.convbeers import ConvBEERS
+from model.files import whole_file
+from model.images import list_images
+from model.metrics.backbone_files import find_backbone, not_found
+from model.metrics.perceptual import Lpips
+from model.simulator.scene import Scene, read_scene
+from model.training.checkpoint import finish
+from model.training.losses import RestorationLoss
+from model.training.patches import PatchRecipe, PatchSource
+from model.training.recipe import TrainingRecipe
+from model.training.stored_pairs import StoredPairs, pair_files
+from model.training.trainer import Progress, Schedule, Source, Trainer
+from model.training.validation import Validation, split_by_site
+from model.training.workers import Worker
+from model.weights_file import load_network, variant_named
+from profiles.errors import OptionError
+
+if TYPE_CHECKING:
+    from torch.utils.tensorboard import SummaryWriter
+
+VALIDATION_CROP_PX, ZOOM = 96, 2
+
+
+@dataclass(frozen=True)
+class Run:
+    """What the command's options say."""
+
+    variant: str
+    recipe: TrainingRecipe
+    patches: PatchRecipe
+    images: Path | None
+    pairs: Path | None
+    out: Path
+    drawn: int = 0
+    lpips: Path | None = None
+    start: Path | None = None
+    teacher: Path | None = None
+    validate_steps: int = 1000
+    tensorboard: bool = False
+    device: str = "cpu"
+
+    @property
+    def checkpoint(self) -> Path:
+        """Where the run can be resumed from."""
+        return self.out / "checkpoint.safetensors"
+
+    @property
+    def weights(self) -> Path:
+        """Where the averaged weights go in the end."""
+        return self.out / f"{self.variant}.safetensors"
+
+
+def train(run: Run, resume: bool, worker: Worker) -> str:
+    """Run or resume a training to its end; what is to be said about its loss.
+
+    Raises:
+        OptionError: the folder holds a run and `resume` is not asked for, or there is nothing to train on.
+        KeyboardInterrupt: stopped; a checkpoint was written.
+    """
+    loss, said = loss_of(run)
+    trainer = Trainer(
+        variant_named(run.variant),
+        run.recipe,
+        loss,
+        worker,
+        run.device,
+        load_network(run.start)[0].state_dict() if run.start else None,
+        load_network(run.teacher)[0] if run.teacher else None,
+    )
+    if loss.perceptual is not None:
+        loss.perceptual.to(trainer.device)
+    if resume:
+        trainer.resume(run.checkpoint)
+    elif run.checkpoint.exists():
+        remedy = "add --resume or choose another"
+        raise OptionError("--out", expected="a folder without a run", got=str(run.checkpoint), remedy=remedy)
+    source, validation, names = data(run, trainer)
+    _train(run, trainer, source, validation)
+    if worker.first:
+        finish(trainer.averaged(), run.weights, about(run, names, validation.names, loss))
+    return said
+
+
+def loss_of(run: Run) -> tuple[RestorationLoss, str]:
+    """The loss of the recipe, and a sentence on whether LPIPS is part of it."""
+    if not run.recipe.loss.lpips:
+        return RestorationLoss(run.recipe.loss), ""
+    found = find_backbone("squeeze", run.lpips)
+    if found is None:
+        return RestorationLoss(run.recipe.loss), f"trains WITHOUT the LPIPS term: {not_found('squeeze')}"
+    perceptual = Lpips.load("squeeze", found)
+    return RestorationLoss(run.recipe.loss, perceptual), f"LPIPS term over {found.name}"
+
+
+def data(run: Run, trainer: Trainer) -> tuple[Source, Validation, list[str]]:
+    """Where batches come from, the images held out, and the names of those trained on."""
+    recipe, eyes = run.recipe, (run.patches.degraded, run.patches.reference)
+    if run.pairs is not None:
+        files = pair_files(run.pairs)
+        max_dn = run.patches.degraded.nominal().max_dn
+        source = StoredPairs(files, run.patches.patch_px, max_dn, recipe.batch, recipe.seed, trainer.worker)
+        return source, Validation([], *eyes), [degraded.name for degraded, _ in files]
+    scenes = read_scenes(run)
+    kept, held = split_by_site([scene.name for scene in scenes])
+    validation = Validation([scenes[k] for k in held], *eyes)
+    train_on = [scenes[k] for k in kept] + draw_scenes(run.drawn, recipe.seed)
+    if not train_on:
+        remedy = "give --images, --pairs or --drawn"
+        raise OptionError("training data", expected="images, pairs or drawn scenes", got="none", remedy=remedy)
+    patches = PatchSource(train_on, run.patches, recipe.batch, recipe.seed, trainer.worker, trainer.device)
+    return patches, validation, [scene.name for scene in train_on]
+
+
+def read_scenes(run: Run) -> list[Scene]:
+    """The images of the run's folder."""
+    if run.images is None:
+        return []
+    files, scenes = list_images(run.images), []
+    with steps("reading", len(files)) as bar:
+        for file in files:
+            scenes.append(read_scene(file, run.patches.reference.nominal()))
+            bar.advance()
+    return scenes
+
+
+def _train(run: Run, trainer: Trainer, source: Source, validation: Validation) -> None:
+    log = Log(run.out / "log.csv", trainer.step)
+    scores = Log(run.out / "validation.csv", trainer.step)
+    board = tensorboard(run.out) if run.tensorboard and trainer.worker.first else None
+    with steps("training", run.recipe.steps) as bar:
+        bar.advance(trainer.step)
+
+        def report(now: Progress) -> None:
+            log.write(now.step, {**now.terms, "patches_per_s": now.patches_per_s})
+            _scalars(board, now.step, now.terms)
+            _show(bar, now)
+
+        def validate(step: int, network: ConvBEERS) -> None:
+            judged = asdict(validation.judge(network))
+            scores.write(step, judged)
+            _scalars(board, step, judged)
+            write_picture(validation, network, run.out / "validation.png")
+
+        every = run.validate_steps if validation.pairs else 0
+        trainer.run(source, run.checkpoint, Schedule(validate_steps=every, report=report, validate=validate))
+
+
+def _show(bar: Steps, now: Progress) -> None:
+    terms = ", ".join(f"{name} {value:.5f}" for name, value in now.terms.items())
+    bar.advance(now.step - bar.done, f"{terms}, {now.patches_per_s:.0f} patches/s")
+
+
+class Log:
+    """A CSV file that grows by a line a report; lines beyond the step that a run resumes from are dropped."""
+
+    def __init__(self, path: Path, step: int) -> None:
+        self.path = path
+        if path.exists():
+            lines = path.read_text(encoding="utf-8").splitlines()
+            kept = [line for line in lines if not line[:1].isdigit() or int(line.split(",")[0]) <= step]
+            path.write_text("".join(f"{line}\n" for line in kept if step), encoding="utf-8")
+
+    def write(self, step: int, values: Mapping[str, float]) -> None:
+        """Add a line, and the header where there is none."""
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        with self.path.open("a", encoding="utf-8", newline="") as file:
+            lines = csv.writer(file, lineterminator="\n")
+            if file.tell() == 0:
+                lines.writerow(["step", *values])
+            lines.writerow([step, *(f"{value:.6g}" for value in values.values())])
+
+
+class Board(Protocol):
+    """What TensorBoard's writer offers."""
+
+    def add_scalar(self, name: str, value: float, step: int) -> None:
+        """Note one figure."""
+        ...
+
+
+def tensorboard(out: Path) -> "SummaryWriter":
+    """A writer of TensorBoard scalars in the run's folder.
+
+    Raises:
+        OptionError: TensorBoard is not installed.
+    """
+    try:
+        from torch.utils.tensorboard import SummaryWriter
+    except ImportError as error:
+        remedy = "pip install 'beers-deploy[tensorboard]'"
+        raise OptionError("--tensorboard", expected="TensorBoard", got="none installed", remedy=remedy) from error
+    return SummaryWriter(str(out / "tensorboard"))
+
+
+def _scalars(board: Board | None, step: int, values: Mapping[str, float]) -> None:
+    if board is not None:
+        for name, value in values.items():
+            board.add_scalar(name, value, step)
+
+
+def write_picture(validation: Validation, network: ConvBEERS, path: Path) -> None:
+    """The busiest crop of each validation image: degraded, restored, reference."""
+    rows: list[list[np.ndarray]] = []
+    for (degraded, reference), restored in zip(validation.pairs, validation.restore(network), strict=True):
+        images = [degraded[0, 0].numpy(), restored, reference[0, 0].numpy()]
+        side = min(VALIDATION_CROP_PX, *images[0].shape)
+        top, left = busiest_windows(images[2], side)[0]
+        stretch = Stretch(*(float(v) for v in np.percentile(images[2], (0.5, 99.5))))
+        rows.append(strip_row((image[top : top + side, left : left + side] for image in images), stretch))
+    sides = {row[0].shape for row in rows}
+    smallest = min(sides)
+    crops = [[cell[: smallest[0], : smallest[1]] for cell in row] for row in rows]
+    with whole_file(path) as temporary:
+        grid(["degraded", "restored", "reference"], crops, ZOOM).save(temporary, "PNG", optimize=True)
+
+
+def about(run: Run, images: Sequence[str], held_out: Sequence[str], loss: RestorationLoss) -> dict[str, object]:
+    """The recipe kept in the weights' header: everything but the machine."""
+    patches = run.patches
+    return {
+        "training": asdict(run.recipe),
+        "lpips": "squeeze" if loss.perceptual is not None else "left out: no weights",
+        "start": run.start.name if run.start else "drawn weights",
+        "teacher": run.teacher.name if run.teacher else "none",
+        "degraded": patches.degraded.name,
+        "reference": patches.reference.name,
+        "patch_px": patches.patch_px,
+        "oversamplings": patches.oversamplings if run.pairs is None else "as stored",
+        "exposures": patches.exposures if run.pairs is None else "as stored",
+        "images": list(images),
+        "held_out": list(held_out),
+    }

@@ -1,0 +1,78 @@
+"""Training patches from pairs on disk, as `simulate` writes them: read as they are needed, cut and turned anew."""
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from model.images import list_images, read_pixels
+from model.simulator.draws import Draw
+from model.training.patches import turn
+from model.training.workers import Worker
+from profiles.errors import ImageError
+
+Files = tuple[Path, Path]
+"""A degraded and a reference image."""
+
+
+def pair_files(folder: Path) -> list[Files]:
+    """The pairs FOLDER/degraded/NAME and FOLDER/reference/NAME, by name.
+
+    Raises:
+        ImageError: a folder is missing or empty, or a name has no partner.
+    """
+    degraded, reference = ({p.stem: p for p in list_images(folder / role)} for role in ("degraded", "reference"))
+    alone = sorted(degraded.keys() ^ reference.keys())
+    if alone:
+        raise ImageError(
+            str(folder),
+            expected="each name in degraded/ and in reference/",
+            got=f"{alone[0]!r} in one of them only",
+            remedy="complete the pairs; 'beers-deploy simulate' writes such folders",
+        )
+    return [(path, reference[name]) for name, path in degraded.items()]
+
+
+class StoredPairs:
+    """Endless batches of (degraded, reference) patches, (N, 1, P, P) in [0, 1]; the same for the same seed."""
+
+    def __init__(
+        self,
+        files: Sequence[Files],
+        patch_px: int,
+        max_dn: int,
+        batch: int,
+        seed: int,
+        worker: Worker | None = None,
+    ) -> None:
+        self.files, self.patch_px, self.max_dn = files, patch_px, max_dn
+        self.batch, self.seed, self.worker = batch, seed, worker or Worker()
+
+    def batches(self, first: int = 0) -> Iterator[tuple[Tensor, Tensor]]:
+        """Batch number `first` and all that follow."""
+        number = first
+        while True:
+            own = number * self.worker.count + self.worker.rank
+            generator = Draw(self.seed, own).generator("stored")
+            patches = torch.stack([self._patch(generator) for _ in range(self.batch)]) / self.max_dn
+            yield patches[:, :1].contiguous(), patches[:, 1:].contiguous()
+            number += 1
+
+    def _patch(self, generator: np.random.Generator) -> Tensor:
+        """One patch (2, P, P) of a random pair."""
+        files = self.files[int(generator.integers(len(self.files)))]
+        images = [read_pixels(file) for file in files]
+        height, width = images[0].shape[:2]
+        if images[0].shape != images[1].shape or images[0].ndim != 2 or min(height, width) < self.patch_px:
+            raise ImageError(
+                str(files[0]),
+                expected=f"a mono pair of one size, {self.patch_px} pixels a side or more",
+                got=f"shapes {images[0].shape} and {images[1].shape}",
+                remedy="choose a smaller --patch, or simulate larger patches",
+            )
+        top, left = (int(generator.integers(size - self.patch_px + 1)) for size in (height, width))
+        window = slice(top, top + self.patch_px), slice(left, left + self.patch_px)
+        both = torch.stack([torch.from_numpy(image[window].astype(np.float32)) for image in images])
+        return turn(both[None], generator)[0]

@@ -1,0 +1,223 @@
+"""The steps of a run: Adam or AdamW, warm-up and cosine, clipped gradients, averaged weights.
+
+Batches are keyed by (seed, step): a run that was killed and resumed ends with the same weights as one that was not.
+"""
+
+import time
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Protocol
+
+import torch
+from torch import Tensor, nn
+
+from model.convbeers import ConvBEERS, Variant, initialise
+from model.training.checkpoint import read_checkpoint, write_checkpoint
+from model.training.guards import Guards
+from model.training.interrupts import held_back
+from model.training.losses import RestorationLoss
+from model.training.recipe import TrainingRecipe
+from model.training.workers import Worker
+
+
+class Source(Protocol):
+    """Where batches come from."""
+
+    def batches(self, first: int = 0) -> Iterator[tuple[Tensor, Tensor]]:
+        """Batch number `first` and all that follow: (degraded, reference), (N, 1, P, P) in [0, 1] each."""
+        ...
+
+
+@dataclass(frozen=True)
+class Progress:
+    """What a run reports now and then: the means of the loss's terms since the last report."""
+
+    step: int
+    steps: int
+    terms: Mapping[str, float]
+    patches_per_s: float
+
+
+@dataclass(frozen=True)
+class Schedule:
+    """How often a run reports, looks at the validation images, and saves."""
+
+    report_steps: int = 100
+    save_s: float = 120.0
+    validate_steps: int = 0  # 0: never
+    report: Callable[[Progress], None] = field(default=lambda _: None)
+    validate: Callable[[int, ConvBEERS], None] = field(default=lambda *_: None)
+
+
+class MixedPrecision(nn.Module):
+    """The network with its body in bfloat16.
+
+    Head, tail and the global add stay float32: 8 bits of mantissa would round a 12-bit image.
+    """
+
+    def __init__(self, network: ConvBEERS) -> None:
+        super().__init__()
+        self.network = network
+
+    def forward(self, image: Tensor) -> Tensor:
+        """(N, 1, H, W) to the same."""
+        shallow = self.network.head(image)
+        with torch.autocast(image.device.type, dtype=torch.bfloat16):
+            deep = self.network.body_end(self.network.body(shallow))
+        correction: Tensor = self.network.tail(shallow + deep.float())
+        return image + correction
+
+
+class Trainer:
+    """One run: its network, running average, optimiser and step.
+
+    Args:
+        variant: the network's size.
+        recipe: see there.
+        loss: the loss that the recipe weighs.
+        worker: this process among those of the run.
+        device: where the steps are computed.
+        start: weights to go on from, as `state_dict`; None draws new ones.
+        teacher: a network whose outputs the recipe's `distil` weighs.
+    """
+
+    def __init__(
+        self,
+        variant: Variant,
+        recipe: TrainingRecipe,
+        loss: RestorationLoss | None = None,
+        worker: Worker | None = None,
+        device: str = "cpu",
+        start: Mapping[str, Tensor] | None = None,
+        teacher: ConvBEERS | None = None,
+    ) -> None:
+        self.recipe, self.worker = recipe, worker or Worker()
+        self.loss, self.device = loss or RestorationLoss(recipe.loss), self.worker.device(device)
+        self.step, self.guards = 0, Guards()
+        self.network = ConvBEERS(variant)
+        initialise(self.network, torch.Generator().manual_seed(recipe.seed))
+        if start is not None:
+            self.network.load_state_dict(dict(start))
+        self.network.to(self.device).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+        self.forward = self.worker.wrap(MixedPrecision(self.network))
+        self.teacher = MixedPrecision(teacher.to(self.device)) if teacher is not None else None
+        self.average = {k: v.detach().clone() for k, v in self.network.state_dict().items()}
+        self.optimiser = _optimiser(self.network, recipe)
+
+    def run(self, source: Source, checkpoint: Path, schedule: Schedule) -> None:
+        """Train to the last step. Ctrl-C leaves a checkpoint of the last whole step.
+
+        Raises:
+            ModelError: the loss stayed non-finite, or diverged.
+            KeyboardInterrupt: after the checkpoint was written.
+        """
+        meter, saved = Meter(self), time.monotonic()
+        with held_back() as interrupt:
+            batches = source.batches(self.step)
+            while self.step < self.recipe.steps and not self.worker.any(interrupt.asked, self.device):
+                meter.add(self.train_step(*next(batches)))
+                self._look(schedule, meter)
+                if time.monotonic() - saved > schedule.save_s:
+                    self.save(checkpoint)
+                    saved = time.monotonic()
+        self.save(checkpoint)
+        if self.step < self.recipe.steps:
+            raise KeyboardInterrupt
+
+    def _look(self, schedule: Schedule, meter: "Meter") -> None:
+        """Report and validate when it is time, and at the end."""
+        last = self.step == self.recipe.steps
+        if self.step % schedule.report_steps == 0 or last:
+            progress = meter.read()
+            if self.worker.first:
+                schedule.report(progress)
+        if self.worker.first and schedule.validate_steps and (self.step % schedule.validate_steps == 0 or last):
+            schedule.validate(self.step, self.averaged())
+
+    def train_step(self, degraded: Tensor, reference: Tensor) -> Mapping[str, Tensor]:
+        """One step on a batch, (N, 1, P, P) each; the loss's terms, none for a step that was skipped."""
+        for group in self.optimiser.param_groups:
+            group["lr"] = self.recipe.rate_at(self.step)
+        degraded = degraded.to(self.device, memory_format=torch.channels_last)
+        total, terms = self._loss(degraded, reference.to(self.device))
+        self.optimiser.zero_grad(set_to_none=True)
+        total.backward()  # type: ignore[no-untyped-call]
+        norm = torch.nn.utils.clip_grad_norm_(self.network.parameters(), self.recipe.gradient_norm)
+        self.step += 1
+        bad = not bool(torch.isfinite(total) & torch.isfinite(norm))
+        if self.worker.any(bad, self.device):
+            self.guards.skipped(self.step)
+            return {}
+        self.optimiser.step()
+        self._average()
+        self.guards.passed(self.step, float(total.detach()))
+        return terms
+
+    def _loss(self, degraded: Tensor, reference: Tensor) -> tuple[Tensor, Mapping[str, Tensor]]:
+        restored = self.forward(degraded)
+        total, terms = self.loss(restored, reference)
+        if self.teacher is None:
+            return total, terms
+        with torch.no_grad():
+            wanted = self.teacher(degraded)
+        distance = (restored - wanted).abs().mean()
+        return total + self.recipe.distil * distance, {**terms, "teacher": distance.detach()}
+
+    def _average(self) -> None:
+        decay = min(self.recipe.ema_decay, (1 + self.step) / (10 + self.step))
+        for name, value in self.network.state_dict().items():
+            self.average[name].lerp_(value, 1 - decay)
+
+    def averaged(self) -> ConvBEERS:
+        """The network with its running-average weights, on the CPU: the one to ship."""
+        network = ConvBEERS(self.network.variant)
+        network.load_state_dict(self.average)
+        return network.eval()
+
+    def save(self, path: Path) -> None:
+        """Write all that an exact resume needs; of several workers, the first does."""
+        if self.worker.first:
+            parts = self.network, self.average, self.optimiser, self.recipe, self.step, self.guards
+            write_checkpoint(path, *parts)
+
+    def resume(self, path: Path) -> None:
+        """Go on from a checkpoint of the same recipe.
+
+        Raises:
+            ModelError: not a checkpoint, or one of another recipe.
+        """
+        self.step, self.guards = read_checkpoint(path, self.network, self.average, self.optimiser, self.recipe)
+
+
+class Meter:
+    """Means of the terms and the patch rate between two reports."""
+
+    def __init__(self, trainer: Trainer) -> None:
+        self._trainer = trainer
+        self._clear()
+
+    def _clear(self) -> None:
+        self._sums: dict[str, float] = {}
+        self._count, self._step, self._started = 0, self._trainer.step, time.monotonic()
+
+    def add(self, terms: Mapping[str, Tensor]) -> None:
+        """Add a step's terms, none for a step that was skipped."""
+        for name, term in terms.items():
+            self._sums[name] = self._sums.get(name, 0.0) + float(term)
+        self._count += bool(terms)
+
+    def read(self) -> Progress:
+        """The report; the next one begins here."""
+        trainer, elapsed_s = self._trainer, max(time.monotonic() - self._started, 1e-9)
+        patches = (trainer.step - self._step) * trainer.recipe.batch * trainer.worker.count
+        terms = {name: value / max(self._count, 1) for name, value in self._sums.items()}
+        progress = Progress(trainer.step, trainer.recipe.steps, terms, patches / elapsed_s)
+        self._clear()
+        return progress
+
+
+def _optimiser(network: ConvBEERS, recipe: TrainingRecipe) -> torch.optim.Optimizer:
+    if recipe.optimiser == "adamw":
+        return torch.optim.AdamW(network.parameters(), lr=recipe.learning_rate, weight_decay=recipe.weight_decay)
+    return torch.optim.Adam(network.parameters(), lr=recipe.learning_rate)

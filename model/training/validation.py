@@ -1,0 +1,89 @@
+"""Judging a run on sites that it does not train on."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from model.convbeers import ConvBEERS
+from model.images import site_of
+from model.metrics.fidelity import psnr_db, ssim
+from model.simulator.acquire import MARGIN_PX, simulate_pair
+from model.simulator.draws import Draw
+from model.simulator.scene import Scene
+from profiles.sensor import SensorProfile
+
+SHARE = 0.05
+"""Of the images: sites are held out, the ones with the fewest images first, until so many are."""
+
+SIDE_PX = 192
+OVERSAMPLINGS = (4, 3, 2, 1)
+MIN_SIDE_PX = 48
+
+
+def split_by_site(names: Sequence[str]) -> tuple[list[int], list[int]]:
+    """Numbers of the images to train on, and of those held out: whole sites, always the same ones.
+
+    Fewer than three sites are all trained on: nothing is held out.
+    """
+    sites: dict[str, list[int]] = {}
+    for number, name in enumerate(names):
+        sites.setdefault(site_of(name), []).append(number)
+    held: list[int] = []
+    if len(sites) >= 3:
+        for site in sorted(sites, key=lambda s: (len(sites[s]), s)):
+            if len(held) >= SHARE * len(names):
+                break
+            held += sites[site]
+    return [n for n in range(len(names)) if n not in held], sorted(held)
+
+
+@dataclass(frozen=True)
+class Judged:
+    """Means over the validation pairs, PSNR over full scale."""
+
+    psnr_db: float
+    degraded_psnr_db: float
+    ssim: float
+
+
+class Validation:
+    """Pairs (1, 1, H, W) in [0, 1] from scenes that are not trained on, the same in every run.
+
+    Scenes too small to leave anything within the margin are left out.
+    """
+
+    def __init__(self, scenes: Sequence[Scene], degraded: SensorProfile, reference: SensorProfile) -> None:
+        self.names, self.pairs = list[str](), list[tuple[Tensor, Tensor]]()
+        for number, scene in enumerate(scenes):
+            room = (min(scene.radiance.shape) // r - 2 * MARGIN_PX >= MIN_SIDE_PX for r in OVERSAMPLINGS)
+            ratio = next((r for r, fits in zip(OVERSAMPLINGS, room, strict=True) if fits), None)
+            if ratio is None:
+                continue
+            draw = Draw(0, number)
+            eyes = [profile.draw(draw.generator("sensor")) for profile in (degraded, reference)]
+            pair = simulate_pair(scene.radiance, eyes[0], eyes[1], ratio, draw)
+            height, width = (min(side, SIDE_PX) for side in pair.degraded.shape)
+            both = (pair.degraded / eyes[0].max_dn, pair.reference / eyes[1].max_dn)
+            degraded_image, reference_image = (image[None, None, :height, :width] for image in both)
+            self.names.append(scene.name)
+            self.pairs.append((degraded_image, reference_image))
+
+    def restore(self, network: ConvBEERS) -> list[np.ndarray]:
+        """Each degraded image through the network in float32, (H, W), clipped to [0, 1]."""
+        with torch.inference_mode():
+            return [network(degraded)[0, 0].clamp(0, 1).numpy() for degraded, _ in self.pairs]
+
+    def judge(self, network: ConvBEERS) -> Judged:
+        """Mean scores of a network on the CPU."""
+        restored = self.restore(network)
+        references = [reference[0, 0].numpy() for _, reference in self.pairs]
+        inputs = [degraded[0, 0].numpy() for degraded, _ in self.pairs]
+        after, before = (
+            float(np.mean([psnr_db(a, b, 1.0) for a, b in zip(images, references, strict=True)]))
+            for images in (restored, inputs)
+        )
+        similar = float(np.mean([ssim(a, b, 1.0) for a, b in zip(restored, references, strict=True)]))
+        return Judged(after, before, similar)

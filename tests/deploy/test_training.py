@@ -1,0 +1,104 @@
+"""`train` from options to a folder of results."""
+
+import csv
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from typer.testing import CliRunner
+
+from deploy.cli import app
+from deploy.training import Log
+from model.simulator.procedural import procedural_scene
+from model.weights_file import load_network
+
+SIDE = 420
+
+
+@pytest.fixture(scope="module")
+def images(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("images")
+    for number, site in enumerate(("coast_1", "forest_1", "town_1")):
+        radiance = procedural_scene(SIDE, SIDE, np.random.default_rng(number)).radiance.numpy()
+        grey = np.clip(255 * (radiance / 400) ** (1 / 2.2), 0, 255).astype(np.uint8)
+        Image.fromarray(grey).save(folder / f"{site}.png")
+    return folder
+
+
+def run(images: Path, out: Path, *more: str, steps: int = 4) -> str:
+    options = ["--variant", "convbeers-xs", "--steps", str(steps), "--batch", "2", "--patch", "32"]
+    result = CliRunner().invoke(app, ["train", "--images", str(images), "--out", str(out), *options, *more])
+    assert result.exit_code == 0, result.output
+    return result.output
+
+
+def rows(path: Path) -> list[dict[str, str]]:
+    with path.open() as file:
+        return list(csv.DictReader(file))
+
+
+def test_a_run_leaves_logs_pictures_and_weights_that_tell_how_they_were_made(
+    images: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("BEERS_LPIPS_WEIGHTS", raising=False)
+    output = run(images, tmp_path / "r", "--validate-every", "2")
+    assert "WITHOUT the LPIPS term" in output
+    assert [row["step"] for row in rows(tmp_path / "r" / "validation.csv")] == ["2", "4"]
+    assert set(rows(tmp_path / "r" / "log.csv")[0]) == {"step", "l1", "fft", "patches_per_s"}
+    with Image.open(tmp_path / "r" / "validation.png") as picture:
+        assert picture.width > 200
+    _, recipe = load_network(tmp_path / "r" / "convbeers-xs.safetensors")
+    assert recipe["lpips"] == "left out: no weights"
+    assert recipe["held_out"] == ["coast_1.png"]
+    assert recipe["images"] == ["forest_1.png", "town_1.png"]
+
+
+def test_a_finished_run_resumes_to_the_same_weights(images: Path, tmp_path: Path) -> None:
+    run(images, tmp_path / "a")
+    first = load_network(tmp_path / "a" / "convbeers-xs.safetensors")[0].state_dict()
+    run(images, tmp_path / "a", "--resume")
+    again = load_network(tmp_path / "a" / "convbeers-xs.safetensors")[0].state_dict()
+    assert all(torch.equal(first[name], again[name]) for name in first)
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (["--images", "nowhere"], "no such folder"),
+        ([], "images, pairs or drawn scenes"),
+        (["--pairs", "here", "--drawn", "1"], "both"),
+        (["--drawn", "1", "--optimiser", "sgd"], "adam or adamw"),
+        (["--drawn", "1", "--variant", "huge"], "variant"),
+        (["--drawn", "1", "--start", "none.safetensors"], "no such file"),
+        (["--drawn", "1", "--lpips", "none.npz"], "no such file"),
+        (["--drawn", "1", "--device", "cuda"], "CUDA"),
+        (["--resume", "--drawn", "1"], "no such file"),
+    ],
+)
+def test_wrong_options_get_one_sentence(options: list[str], words: str, tmp_path: Path) -> None:
+    if "cuda" in options and torch.cuda.is_available():
+        pytest.skip("a CUDA device is here")
+    result = CliRunner().invoke(app, ["train", "--out", str(tmp_path / "r"), "--steps", "1", *options])
+    assert result.exit_code == 2
+    assert words in " ".join(result.output.split())
+    assert "Traceback" not in result.output
+
+
+def test_a_run_in_the_way_is_not_overwritten(images: Path, tmp_path: Path) -> None:
+    run(images, tmp_path / "a", steps=1)
+    options = ["--out", str(tmp_path / "a"), "--variant", "convbeers-xs", "--steps", "1"]
+    result = CliRunner().invoke(app, ["train", "--images", str(images), *options])
+    assert result.exit_code == 2
+    assert "--resume" in result.output
+
+
+def test_a_log_forgets_what_lies_beyond_the_step_resumed_from(tmp_path: Path) -> None:
+    log = Log(tmp_path / "log.csv", 0)
+    for step in (100, 200, 300):
+        log.write(step, {"l1": step / 1000})
+    Log(tmp_path / "log.csv", 200).write(250, {"l1": 0.25})
+    assert [row["step"] for row in rows(tmp_path / "log.csv")] == ["100", "200", "250"]
+    Log(tmp_path / "log.csv", 0)
+    assert (tmp_path / "log.csv").read_text() == ""

@@ -1,0 +1,99 @@
+"""Patches made on the fly, and from pairs on disk."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from deploy.restore import write_tiff
+from model.simulator.procedural import procedural_scene
+from model.simulator.scene import Scene
+from model.training.patches import PatchRecipe, PatchSource, cut, turn
+from model.training.stored_pairs import StoredPairs, pair_files
+from model.training.workers import Worker
+from profiles import load_sensor
+from profiles.errors import ImageError
+
+
+def source(
+    scene: Scene | None = None, seed: int = 0, patch_px: int = 32, worker: Worker | None = None
+) -> PatchSource:
+    scene = scene or procedural_scene(420, 480, np.random.default_rng(2))
+    profiles = load_sensor("pleiades-variable"), load_sensor("pleiades-reference")
+    return PatchSource([scene], PatchRecipe(*profiles, patch_px=patch_px), batch=3, seed=seed, worker=worker)
+
+
+def test_the_same_seed_gives_the_same_batches_from_anywhere() -> None:
+    straight, later = source().batches(), source().batches(first=18)
+    batches = [next(straight) for _ in range(20)]
+    for degraded, reference in batches[18:]:
+        again = next(later)
+        assert torch.equal(degraded, again[0])
+        assert torch.equal(reference, again[1])
+    assert not torch.equal(batches[0][0], next(source(seed=1).batches())[0])
+
+
+def test_patches_lie_within_full_scale() -> None:
+    degraded, reference = next(source().batches())
+    assert degraded.shape == reference.shape == (3, 1, 32, 32)
+    for image in (degraded, reference):
+        assert 0 <= float(image.min()) <= float(image.max()) <= 1
+
+
+def test_the_pair_shows_the_same_ground() -> None:
+    degraded, reference = next(source().batches())
+    for one, other in zip(degraded, reference, strict=True):
+        assert np.corrcoef(one.flatten().numpy(), other.flatten().numpy())[0, 1] > 0.7
+
+
+def test_scenes_too_small_for_a_patch_are_refused() -> None:
+    with pytest.raises(ImageError, match="64 target pixels"):
+        next(source(procedural_scene(120, 120, np.random.default_rng(0)), patch_px=64).batches())
+
+
+def test_cut_takes_whole_patches_and_turn_keeps_pairs_together() -> None:
+    image = torch.arange(2 * 30 * 41).reshape(2, 30, 41)
+    rng = np.random.default_rng(0)
+    patches = cut(image, 8, rng)
+    assert patches.shape == (3 * 5 if patches.shape[0] == 15 else patches.shape[0], 2, 8, 8)
+    turned = turn(patches, rng)
+    assert torch.equal(turned[:, 1] - turned[:, 0], torch.full_like(turned[:, 0], 30 * 41))
+
+
+def test_two_workers_share_the_batches_of_one() -> None:
+    """Shard by shard in turn: together they see what one alone would see."""
+    alone = source().batches()
+    shards = [[next(alone)[0] for _ in range(PatchSource.SHARD_BATCHES)] for _ in range(2)]
+    for rank in range(2):
+        own = source(worker=Worker(rank, 2)).batches()
+        assert all(torch.equal(next(own)[0], batch) for batch in shards[rank])
+
+
+def stored(folder: Path, count: int = 3) -> StoredPairs:
+    for k in range(count):
+        reference = np.random.default_rng(k).integers(0, 4096, (41, 53)).astype(np.uint16)
+        write_tiff(folder / "reference" / f"p{k}.tif", reference)
+        write_tiff(folder / "degraded" / f"p{k}.tif", reference // 2)
+    return StoredPairs(pair_files(folder), 24, 4095, batch=4, seed=0)
+
+
+def test_stored_pairs_are_cut_alike_and_the_same_from_anywhere(tmp_path: Path) -> None:
+    pairs = stored(tmp_path)
+    straight = pairs.batches()
+    batches = [next(straight) for _ in range(4)]
+    degraded, reference = batches[3]
+    assert degraded.shape == reference.shape == (4, 1, 24, 24)
+    torch.testing.assert_close((reference * 4095).round() // 2, (degraded * 4095).round())
+    assert torch.equal(next(pairs.batches(first=3))[0], degraded)
+    assert not torch.equal(batches[0][0], degraded)
+
+
+def test_stored_pairs_too_small_or_incomplete_are_refused(tmp_path: Path) -> None:
+    pairs = stored(tmp_path)
+    pairs.patch_px = 42
+    with pytest.raises(ImageError, match="42 pixels"):
+        next(pairs.batches())
+    (tmp_path / "degraded" / "p1.tif").unlink()
+    with pytest.raises(ImageError, match="'p1' in one"):
+        pair_files(tmp_path)

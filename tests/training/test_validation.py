@@ -1,0 +1,41 @@
+"""Sites held out, and what is measured on them."""
+
+import numpy as np
+
+from model.convbeers import ConvBEERS, Variant
+from model.simulator.procedural import procedural_scene
+from model.training.validation import Validation, split_by_site
+from profiles import load_sensor
+
+NAMES = [f"village_{k:03d}.jpg" for k in range(30)] + [f"forest_{k:03d}.jpg" for k in range(10)] + ["dunes.jpg"]
+EYES = load_sensor("pleiades-degraded"), load_sensor("pleiades-reference")
+
+
+def test_whole_sites_are_held_out_the_smallest_first() -> None:
+    kept, held = split_by_site(NAMES)
+    assert sorted(kept + held) == list(range(41))
+    assert {NAMES[k].split("_")[0] for k in held} == {"dunes.jpg", "forest"}
+
+
+def test_the_split_does_not_depend_on_the_order() -> None:
+    order = list(reversed(NAMES))
+    assert {order[k] for k in split_by_site(order)[1]} == {NAMES[k] for k in split_by_site(NAMES)[1]}
+
+
+def test_few_sites_are_all_trained_on() -> None:
+    assert split_by_site(["a_1.jpg", "b_1.jpg"]) == ([0, 1], [])
+    assert split_by_site([]) == ([], [])
+
+
+def test_a_new_network_is_judged_like_its_input() -> None:
+    scenes = [procedural_scene(side, side, np.random.default_rng(side)) for side in (300, 460, 90)]
+    validation = Validation(scenes, *EYES)
+    assert len(validation.pairs) == 2  # the third is too small
+    network = ConvBEERS(Variant(1, 4)).eval()
+    for parameter in network.tail.parameters():
+        parameter.data.zero_()
+    judged = validation.judge(network)
+    assert judged.psnr_db == judged.degraded_psnr_db
+    assert 0.5 < judged.ssim < 1
+    again = Validation(scenes, *EYES).judge(network)
+    assert again == judged
