@@ -51,7 +51,7 @@ def main() -> None:
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     pairs = product(images(), map(int, arguments.sigma.split(",")))
-    cells = [cell(*image, sigma, arguments.quality, arguments.repeats) for image, sigma in pairs]
+    cells = [cell(name, clean, sigma, arguments.quality, arguments.repeats) for (name, clean), sigma in pairs]
     gain, ratio = np.mean(cells, axis=0)
     print(f"mean: {gain:+.3f} dB, {ratio:.2f} times the C++ time")
 

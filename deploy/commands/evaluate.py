@@ -24,6 +24,9 @@ def evaluate(
         Path | None, typer.Option(help="Weights of SqueezeNet 1.1 for LPIPS-squeeze, or a folder of backbones.")
     ] = None,
     out: Annotated[Path | None, typer.Option(help="Folder for report.html and picture strips.")] = None,
+    sweep: Annotated[
+        bool, typer.Option("--sweep", help="Also PSNR and MTF under other blurs, noises and gains.")
+    ] = False,
     seed: Annotated[int, typer.Option(min=0, help="Seed of every random draw.")] = 0,
     json: Annotated[Path | None, typer.Option(help="Write the figures here.")] = None,
 ) -> None:
@@ -35,7 +38,7 @@ def evaluate(
     from deploy.evaluation.methods import method_named
     from deploy.evaluation.page import evaluation_report, pictures
     from deploy.evaluation.perceptual import perceptual_distances
-    from deploy.evaluation.run import evaluate_methods, load_pairs
+    from deploy.evaluation.run import evaluate_methods, load_pairs, sweep_tables
     from deploy.evaluation.scores import Instruments
     from deploy.report.page import write_report
     from deploy.results import Document
@@ -44,8 +47,9 @@ def evaluate(
     from profiles import load_sensor
     from profiles.errors import OptionError
 
-    if images is not None and pairs is not None:
-        raise OptionError("--images and --pairs", expected="one of them", got="both", remedy="leave one out")
+    if pairs is not None and (images is not None or sweep):
+        expected = "no --images or --sweep beside it: pairs are as they are"
+        raise OptionError("--pairs", expected=expected, got="both", remedy="leave one out")
     require_writable(json)
     require_writable(out / "report.html" if out else None)
     eyes = load_sensor(sensor), load_sensor(reference)
@@ -57,12 +61,15 @@ def evaluate(
     title = f"{sensor} -> {reference}, {len(found)} images"
     print_rows(title, result.mean)
     print_rows("PSNR by site", result.sites)
+    swept = sweep_tables(chosen, images, *eyes, seed) if sweep else ()
+    for table in dict.fromkeys(row.table for row in swept):
+        print_rows(table, [row for row in swept if row.table == table])
     if small:
         typer.echo(f"left out, too small: {', '.join(small)}")
     if out is not None:
         strips = pictures(found, chosen, out)
-        write_report(evaluation_report(title, result.mean, result.sites, strips), out / "report.html")
+        write_report(evaluation_report(title, result.mean, result.sites, swept, strips), out / "report.html")
         typer.echo(f"wrote {out / 'report.html'}")
     arguments: dict[str, object] = {"images": images, "pairs": pairs, "sensor": sensor, "reference": reference}
-    arguments |= {"methods": methods, "lpips": lpips, "out": out, "seed": seed}
-    Document("evaluate", arguments, (), result.rows).write(json)
+    arguments |= {"methods": methods, "lpips": lpips, "out": out, "sweep": sweep, "seed": seed}
+    Document("evaluate", arguments, (), (*result.rows, *swept)).write(json)

@@ -59,12 +59,16 @@ def pictures(pairs: Sequence[NamedPair], methods: Sequence[Method], out: Path) -
     return made
 
 
-def evaluation_report(title: str, mean: Sequence[Row], sites: Sequence[Row], pictures: Sequence[Picture]) -> Report:
-    """The page: means, pictures, sites."""
+def evaluation_report(
+    title: str, mean: Sequence[Row], sites: Sequence[Row], swept: Sequence[Row], pictures: Sequence[Picture]
+) -> Report:
+    """The page: pictures, means, sites, and the sweep where there was one."""
     tables = [
         Table("Means over all pairs", mean, MEAN_CAPTION),
         Table("PSNR by site, over 4095 DN", sites, "Pixels that clipped in the input or the reference are left out."),
     ]
+    names = dict.fromkeys(row.table for row in swept)
+    tables += [Table(name.capitalize(), [row for row in swept if row.table == name]) for name in names]
     return Report(title, headline(mean), tables, pictures, NOTES)
 
 

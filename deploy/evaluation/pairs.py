@@ -3,6 +3,7 @@
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Protocol
 
 import numpy as np
 
@@ -13,10 +14,18 @@ from model.simulator.draws import Draw
 from model.simulator.scene import Scene
 from model.training.stored_pairs import pair_files
 from profiles.errors import ImageError
-from profiles.sensor import SensorProfile
+from profiles.sensor import Sensor
 
 OVERSAMPLINGS = (4, 2)
 MIN_SIDE_PX = 48
+
+
+class Eye(Protocol):
+    """What gives a sensor for each scene: a profile, or always the same one."""
+
+    def draw(self, generator: np.random.Generator, /) -> Sensor:
+        """One sensor."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -34,7 +43,7 @@ class NamedPair:
 
 
 def simulate_pairs(
-    scenes: list[Scene], degraded: SensorProfile, reference: SensorProfile, seed: int
+    scenes: list[Scene], degraded: Eye, reference: Eye, seed: int
 ) -> tuple[list[NamedPair], list[str]]:
     """Simulate a pair of each scene, at the larger oversampling that leaves enough of it.
 

@@ -9,9 +9,11 @@ from deploy.evaluation.methods import Method
 from deploy.evaluation.pairs import NamedPair, read_pairs, simulate_pairs
 from deploy.evaluation.paper import paper_rows
 from deploy.evaluation.scores import Instruments, score, site_rows
+from deploy.evaluation.sweep import conditions, sweep_rows
 from deploy.evaluation.targets import acquire_targets, target_figures
 from deploy.progress import steps
 from deploy.results import Row
+from model.images import site_of
 from profiles.sensor import Sensor, SensorProfile
 
 
@@ -51,3 +53,18 @@ def evaluate_methods(
         means.append(replace(mean, figures=figures))
         images += rest
     return Evaluation((*means, *paper_rows()), tuple(site_rows(images)), tuple(images))
+
+
+def sweep_tables(
+    methods: Sequence[Method],
+    images: Path | None,
+    degraded: SensorProfile,
+    reference: SensorProfile,
+    seed: int,
+) -> tuple[Row, ...]:
+    """PSNR and MTF of the networks and the chain under conditions other than the nominal ones; a scene a site."""
+    scenes = load_scenes(images, reference.nominal(), seed)
+    first = {site_of(scene.name): scene for scene in reversed(scenes)}
+    networks = [method for method in methods if method.told == "nothing"]
+    with steps("sweep", len(conditions(degraded.nominal(), degraded))) as bar:
+        return tuple(sweep_rows(networks, list(first.values()), degraded, reference, seed, bar.advance))

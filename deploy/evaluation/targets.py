@@ -58,12 +58,15 @@ def _acquire(scene: Tensor, sensor: Sensor, draw: Draw, ratio: int = OVERSAMPLIN
 
 def target_figures(method: Method, targets: Targets) -> dict[str, Figure]:
     """MTF at Nyquist in %, and SNR in flat fields, of what the method makes of the targets."""
-    figures = {
-        "MTF at Nyquist": mtf_figure([edge_mtf(_middle(method.restore(e)), saturated=MAX_DN) for e in targets.edges])
-    }
+    figures = {"MTF at Nyquist": mtf_figure(restored_mtfs(method, targets))}
     for radiance, flat in targets.flats:
         figures[f"SNR at {radiance:g}"] = flat_figure(_middle(method.restore(flat)))
     return figures
+
+
+def restored_mtfs(method: Method, targets: Targets) -> list[EdgeMtf | Refusal]:
+    """What the instrument says of each restored edge."""
+    return [edge_mtf(_middle(method.restore(edge)), saturated=MAX_DN) for edge in targets.edges]
 
 
 def _middle(image: np.ndarray) -> np.ndarray:
