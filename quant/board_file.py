@@ -15,7 +15,10 @@ from quant.planes import PLANES
 
 
 def board_model(core: IntCore, about: dict[str, str], tile_px: int | None = None) -> onnx.ModelProto:
-    """`planes` (N, 2, H, W) float32, as q * 2^-7, to `correction` (N, 1, H, W) float32."""
+    """`planes` (N, 2, H, W) float32, as q * 2^-7, to `correction` (N, 1 or 2, H, W) float32.
+
+    Two channels are two gains of the same correction: `quant.passes.dual_gain.merge` makes one of them.
+    """
     writer = _Writer()
     writer.quantised("planes.dequantised", PLANES, core.positions[PLANES])
     for op in core.ops:
@@ -26,7 +29,7 @@ def board_model(core: IntCore, about: dict[str, str], tile_px: int | None = None
         else:
             _conv(writer, op, inputs[0], output)
         writer.quantised(op.output, output, core.positions[op.output])
-    ends = [image_info(PLANES, 2, tile_px)], [image_info(CORRECTION, 1, tile_px)]
+    ends = [image_info(PLANES, 2, tile_px)], [image_info(CORRECTION, core.output_channels, tile_px)]
     graph = helper.make_graph(writer.nodes, "convbeers-core", *ends, list(writer.weights.values()))
     return make_model(graph, about)
 

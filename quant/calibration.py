@@ -40,11 +40,13 @@ def draw_patches(
     return Patches(pairs, digest.hexdigest())
 
 
-def choose_positions(graph: Graph, images: Iterable[np.ndarray], tick: Callable[[], None]) -> dict[str, int]:
+def choose_positions(
+    graph: Graph, images: Iterable[np.ndarray], tick: Callable[[], None], least_squares: bool = True
+) -> dict[str, int]:
     """Least-squares position of every tensor of a plane-reading graph over images (1, 1, H, W) in [0, 1].
 
     Two passes: the largest values, then the squared errors of the positions around them. `tick` is called once per
-    image and pass.
+    image and pass. Without `least_squares` the positions are those that clip nothing.
     """
     images = list(images)
     names = tensors(graph)
@@ -62,5 +64,6 @@ def choose_positions(graph: Graph, images: Iterable[np.ndarray], tick: Callable[
     errors = np.zeros((len(names), CANDIDATES))
     for results in passes():
         errors += [squared_errors(r, f) for r, f in zip(results, first, strict=True)]
-    best = {name: f + int(np.argmin(e)) for name, f, e in zip(names, first, errors, strict=True)}
+    moves = np.argmin(errors, axis=1) if least_squares else np.zeros(len(names), int)
+    best = {name: f + int(move) for name, f, move in zip(names, first, moves, strict=True)}
     return {PLANES: POSITION, **best}

@@ -40,6 +40,12 @@ class IntCore:
     ops: tuple[IntConv | Add, ...]
     positions: Mapping[str, int]
 
+    @property
+    def output_channels(self) -> int:
+        """Channels of the correction: 1, or 2 where it has two gains."""
+        last = self.ops[-1]
+        return len(last.weight) if isinstance(last, IntConv) else 1
+
     def scale(self, tensor: str) -> float:
         """The value of one unit of a tensor, 2^-position."""
         return float(2.0 ** -self.positions[tensor])

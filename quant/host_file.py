@@ -17,6 +17,7 @@ from onnx import TensorProto, helper, numpy_helper
 from quant.core import IntConv, IntCore
 from quant.graph import CORRECTION, IMAGE, Add
 from quant.onnx_file import image_info, make_model
+from quant.passes.dual_gain import FINE_MAX, GAIN
 from quant.planes import COARSE_MAX, MAX_DN, PLANES, STEP
 
 MICROSOFT = "com.microsoft"
@@ -78,9 +79,26 @@ def _add(w: "_Writer", core: IntCore, op: Add) -> None:
 
 def _merge(w: "_Writer", core: IntCore) -> None:
     scale = w.unit(core.positions[CORRECTION])
-    w.node("DequantizeLinear", "host_back.correction", [CORRECTION, scale, w.zero_point()])
+    if core.output_channels == 1:
+        w.node("DequantizeLinear", "host_back.correction", [CORRECTION, scale, w.zero_point()])
+    else:
+        w.node("DequantizeLinear", "host_back.both", [CORRECTION, scale, w.zero_point()])
+        _merge_gains(w, core.scale(CORRECTION))
     w.node("Add", "host_back.add", [IMAGE, "host_back.correction"])
     w.node("Clip", "restored", ["host_back.add", w.scalar("zero", 0), w.scalar("one", 1)], name="host_back.clip")
+
+
+def _merge_gains(w: "_Writer", scale: float) -> None:
+    """See quant.passes.dual_gain.merge for the arithmetic."""
+    halves = w.constant("one_each", np.array([1, 1]))
+    w.nodes.append(
+        helper.make_node("Split", ["host_back.both", halves], ["host_back.fine", "host_back.coarse"], axis=1)
+    )
+    w.nodes[-1].name = "host_back.split"
+    w.node("Mul", "host_back.wide", ["host_back.coarse", w.scalar("gain", GAIN)])
+    w.node("Abs", "host_back.size", ["host_back.fine"])
+    w.node("LessOrEqual", "host_back.fits", ["host_back.size", w.scalar("fine_max", (FINE_MAX + 0.5) * scale)])
+    w.node("Where", "host_back.correction", ["host_back.fits", "host_back.fine", "host_back.wide"])
 
 
 class _Writer:

@@ -35,3 +35,12 @@ def read_planes(graph: Graph) -> Graph:
     unit = np.float32(2.0**POSITION / MAX_DN)
     weight = np.concatenate([first.weight * (STEP * unit), first.weight * unit], axis=1)
     return (replace(first, input=PLANES, weight=weight.astype(np.float32)), *graph[1:])
+
+
+def coarse_plane_only(graph: Graph) -> Graph:
+    """A plane-reading graph that does not look at the remainder: 7 bits of the image, to show what the others buy."""
+    first = graph[0]
+    assert isinstance(first, Conv)  # noqa: S101
+    weight = first.weight.copy()
+    weight[:, 1] = 0
+    return (replace(first, weight=weight), *graph[1:])

@@ -1,20 +1,39 @@
 """Static INT8 in one call: float ONNX and calibration patches in, the two spellings of the integer core out."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 
+import numpy as np
 import onnx
 
 from quant.board_file import board_model
 from quant.calibration import Patches, choose_positions
 from quant.core import IntCore, build_core, shift_faults
-from quant.graph import correction_graph, relu_count
+from quant.graph import CORRECTION, Conv, Graph, correction_graph, relu_count, tensors
 from quant.host_file import host_model
 from quant.onnx_file import fixed_tile_px, metadata
-from quant.planes import read_planes
+from quant.passes.dual_gain import two_gains
+from quant.passes.equalise import channel_ranges, equalise, search, search_steps
+from quant.passes.steady_stream import STREAM_POSITION, common_position, steady, stream_tensors
+from quant.planes import coarse_plane_only, read_planes
+from quant.session import open_session, run
 
-PASSES = 2
-"""Times that every calibration patch is looked at."""
+SEARCH_PATCHES = 16
+"""Patches that the equalisation is searched on, a quarter of them those with the strongest edges: there int8 clips."""
+
+
+@dataclass(frozen=True)
+class Passes:
+    """What is done beyond rounding each tensor: see `quant.passes`, `quant.planes` and `quant.positions`."""
+
+    two_planes: bool = True
+    least_squares: bool = True
+    steady_stream: bool = True
+    equalise: bool = True
+    dual_gain: bool = True
+
+
+ALL = Passes()
 
 
 @dataclass(frozen=True)
@@ -28,22 +47,82 @@ class Quantised:
 
 
 def quantise_model(
-    model: onnx.ModelProto, patches: Patches, about: dict[str, str], tick: Callable[[], None]
+    model: onnx.ModelProto,
+    patches: Patches,
+    about: dict[str, str],
+    tick: Callable[[], None],
+    passes: Passes = ALL,
 ) -> Quantised:
     """Quantise a float ConvBEERS under the DPU's rules: int8, symmetric, per tensor, power-of-two positions.
 
-    1. The global add stays on the host, in 12 bits: only the correction is computed in int8.
-    2. The image enters as two int8 planes, so that all 12 bits are seen.
-    3. Positions have the least squared error over the calibration patches.
+    The global add stays on the host, in 12 bits: only the correction is computed in int8. The rest is `passes`.
 
     Raises:
         ModelError: not a graph of convolutions, ReLUs and adds that ends with the global add.
     """
-    graph = read_planes(correction_graph(model))
-    positions = choose_positions(graph, (degraded for degraded, _ in patches.pairs), tick)
-    core = build_core(graph, positions)
+    graph = _reads_planes(model, passes)
+    degraded = [image for image, _ in patches.pairs]
+    positions = choose_positions(graph, degraded, tick, passes.least_squares)
+    if passes.equalise and stream_tensors(graph):
+        ranges = channel_ranges(graph, degraded, tick)
+        targets = _targets(model, degraded)
+        factors = search(graph, ranges, lambda tried: _error(_core(tried, positions, passes), targets), tick)
+        graph = equalise(graph, factors)
+    core = _core(graph, positions, passes)
     faults = shift_faults(core)
     assert not faults, faults  # noqa: S101 - build_core has moved every position within reach
     about = {**metadata(model), "precision": "int8 legal", "calibration_sha256": patches.digest, **about}
+    about["passes"] = ", ".join(name for name, on in asdict(passes).items() if on)
     tile_px = fixed_tile_px(model)
     return Quantised(host_model(core, about, tile_px), board_model(core, about, tile_px), core, relu_count(graph))
+
+
+def ticks(model: onnx.ModelProto, patches: int, passes: Passes = ALL) -> int:
+    """How often `quantise_model` will call `tick`."""
+    graph = _reads_planes(model, passes)
+    if not (passes.equalise and stream_tensors(graph)):
+        return 2 * patches
+    first = graph[0]
+    assert isinstance(first, Conv)  # noqa: S101 - correction_graph has seen to it
+    return 3 * patches + search_steps(len(first.weight))
+
+
+def _reads_planes(model: onnx.ModelProto, passes: Passes) -> Graph:
+    graph = read_planes(correction_graph(model))
+    return graph if passes.two_planes else coarse_plane_only(graph)
+
+
+def _core(graph: Graph, positions: dict[str, int], passes: Passes) -> IntCore:
+    """The integer core of a graph whose tensors have these least-squares positions, the passes applied."""
+    chosen = dict(positions)
+    if passes.steady_stream or passes.equalise:
+        position = STREAM_POSITION if passes.equalise else common_position(graph, positions)
+        chosen = steady(graph, positions, position)
+    if passes.dual_gain:
+        graph = two_gains(graph)
+        chosen[CORRECTION] += 1
+    assert set(tensors(graph)) <= set(chosen)  # noqa: S101
+    return build_core(graph, chosen)
+
+
+Targets = list[tuple[np.ndarray, np.ndarray]]
+"""Degraded images (1, 1, H, W) and what the float network makes of them, clipped to [0, 1]."""
+
+
+def _targets(model: onnx.ModelProto, images: list[np.ndarray]) -> Targets:
+    """Of the patches, those with the largest corrections, and others of all sizes."""
+    session = open_session(model)
+    outputs = [np.clip(run(session, image), 0, 1) for image in images]
+    sizes = [float(np.abs(output - image).max()) for output, image in zip(outputs, images, strict=True)]
+    order = [int(k) for k in np.argsort(sizes)[::-1]]
+    hard = SEARCH_PATCHES // 4
+    others = order[hard :: max((len(order) - hard) // (SEARCH_PATCHES - hard), 1)]
+    return [(images[k], outputs[k]) for k in (*order[:hard], *others[: SEARCH_PATCHES - hard])]
+
+
+def _error(core: IntCore, targets: Targets) -> float:
+    """Mean squared difference of the integer network from the float one: clipping, which is rare, counts in full."""
+    session = open_session(host_model(core, {}))
+    return float(
+        np.mean([np.square(run(session, image) - wanted, dtype=np.float64).mean() for image, wanted in targets])
+    )

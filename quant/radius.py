@@ -9,9 +9,11 @@ CONVOLUTIONS = {"Conv": 1, "QLinearConv": 3}
 """Operator and the index of its weights among the inputs."""
 
 POINTWISE = {
-    "Add", "Cast", "Clip", "Concat", "DequantizeLinear", "Div", "Identity", "Max", "Min", "Mul", "QLinearAdd",
-    "QuantizeLinear", "Relu", "Round", "Sub",
+    "Abs", "Add", "Cast", "Clip", "DequantizeLinear", "Div", "Identity", "LessOrEqual", "Max", "Min", "Mul",
+    "QLinearAdd", "QuantizeLinear", "Relu", "Round", "Sub", "Where",
 }  # fmt: skip
+OVER_CHANNELS = {"Concat", "Split"}
+"""Point-wise where they work along the channels."""
 
 
 def receptive_radius_px(model: onnx.ModelProto) -> int:
@@ -26,10 +28,14 @@ def receptive_radius_px(model: onnx.ModelProto) -> int:
         radius = max((reach.get(name, 0) for name in node.input), default=0)
         if node.op_type in CONVOLUTIONS:
             radius += _kernel_radius(node, weights)
-        elif node.op_type not in POINTWISE:
+        elif node.op_type not in POINTWISE and not (node.op_type in OVER_CHANNELS and _axis(node) == 1):
             raise _refuse(node, "operators that keep a pixel's neighbourhood local")
         reach.update(dict.fromkeys(node.output, radius))
     return reach[model.graph.output[0].name]
+
+
+def _axis(node: onnx.NodeProto) -> int:
+    return next((int(a.i) for a in node.attribute if a.name == "axis"), 0)
 
 
 def _kernel_radius(node: onnx.NodeProto, weights: dict[str, onnx.TensorProto]) -> int:

@@ -27,7 +27,7 @@ def quantize(
     from profiles import load_sensor, load_target
     from quant.calibration import REFERENCE, draw_patches
     from quant.onnx_file import load_onnx, save_onnx
-    from quant.quantise import PASSES, quantise_model
+    from quant.quantise import quantise_model, ticks
 
     require_writable(out, board)
     board_target = load_target(target)
@@ -35,7 +35,7 @@ def quantize(
     degraded, reference = load_sensor(sensor), load_sensor(REFERENCE)
     drawn = draw_patches(load_scenes(images, reference.nominal(), seed), degraded, reference, patches, seed)
     about = {"calibration_sensor": degraded.name, "calibration_seed": str(seed), "target": board_target.name}
-    with steps("calibrating", PASSES * patches) as bar:
+    with steps("calibrating", ticks(float_model, patches)) as bar:
         result = quantise_model(float_model, drawn, about, bar.advance)
     save_onnx(result.host, out)
     typer.echo(f"wrote {out}: {len(result.core.ops)} integer operations, {result.relus} ReLUs kept")

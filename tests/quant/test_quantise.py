@@ -9,9 +9,10 @@ from onnx import numpy_helper
 from quant.calibration import Patches
 from quant.core import IntConv, build_core, shift_faults
 from quant.gate import compare
-from quant.graph import correction_graph
+from quant.graph import CORRECTION, correction_graph
 from quant.host_file import host_model
 from quant.onnx_file import metadata, save_onnx
+from quant.passes.dual_gain import merge
 from quant.planes import POSITION, read_planes, split
 from quant.quantise import Quantised, quantise_model
 from quant.radius import receptive_radius_px
@@ -56,7 +57,8 @@ def test_host_and_board_files_compute_the_same(quantised: Quantised) -> None:
     for seed in range(3):
         dn = image(seed=seed)
         planes = split(dn).astype(np.float32) * np.float32(2.0**-POSITION)
-        restored = np.clip(dn + board.run(None, {"planes": planes})[0], 0, 1)
+        correction = merge(board.run(None, {"planes": planes})[0], quantised.core.scale(CORRECTION))
+        restored = np.clip(dn + correction, 0, 1)
         np.testing.assert_array_equal(run(host, dn), restored)
 
 

@@ -1,0 +1,95 @@
+"""Scale the channels of the residual stream so that one position suits them all, at no cost in the network.
+
+Whatever writes the stream has its weights multiplied by k per channel, whatever reads it has them divided: the float
+network stays the same, to rounding. A channel that uses a fraction of int8's range is rounded finer for a larger k,
+one that overflows is clipped less for a smaller. The first guess levels the ranges,
+k ~ range^-gamma; then each channel is tried larger and smaller on calibration patches, because what counts is what a
+channel's rounding does to the output.
+"""
+
+from collections.abc import Callable, Iterable
+from dataclasses import replace
+
+import numpy as np
+
+from quant.float_file import float_model
+from quant.graph import Conv, Graph
+from quant.passes.steady_stream import STREAM_POSITION, stream_tensors
+from quant.planes import PLANES, POSITION, split
+from quant.positions import INT8_MAX
+from quant.session import open_session
+
+QUANTILE = 0.9999
+"""A channel's range: the mean over patches of this quantile of its sizes. The maximum would be ruled by outliers."""
+
+LEVELLING = (0.5, 0.75, 1.0)
+HEADROOM = (0.64, 0.8, 1.0, 1.25)
+"""First guesses tried: gamma, and the largest range as a share of int8's. Above 1 the largest values are clipped."""
+
+STEPS = (1.3, 1.3, 1.12)
+"""Factors by which each channel is tried larger and smaller, a sweep each."""
+
+Error = Callable[[Graph], float]
+"""What a graph costs in INT8, on calibration patches."""
+
+
+def equalise(graph: Graph, factors: np.ndarray) -> Graph:
+    """The same network with stream channel c scaled by factors[c], (C,) above 0."""
+    stream = stream_tensors(graph)
+    return tuple(_scaled(op, factors, stream) if isinstance(op, Conv) else op for op in graph)
+
+
+def _scaled(op: Conv, factors: np.ndarray, stream: set[str]) -> Conv:
+    weight, bias = op.weight.astype(np.float64), op.bias.astype(np.float64)
+    if op.output in stream:
+        weight, bias = weight * factors[:, None, None, None], bias * factors
+    if op.input in stream:
+        weight = weight / factors[None, :, None, None]
+    return replace(op, weight=weight.astype(np.float32), bias=bias.astype(np.float32))
+
+
+def channel_ranges(graph: Graph, images: Iterable[np.ndarray], tick: Callable[[], None]) -> np.ndarray:
+    """(C,) range of each stream channel over images (1, 1, H, W), the widest of all the stream's tensors."""
+    names = sorted(stream_tensors(graph))
+    session, total, count = open_session(float_model(graph, names)), np.zeros(1), 0
+    for image in images:
+        feed = {PLANES: split(image).astype(np.float32) * np.float32(2.0**-POSITION)}
+        sizes = [np.abs(r[0]).reshape(r.shape[1], -1) for r in session.run(names, feed)]
+        total = total + np.stack([np.quantile(size, QUANTILE, axis=1) for size in sizes])
+        count += 1
+        tick()
+    ranges = np.asarray(total / max(count, 1)).max(axis=0)
+    floor = 1e-3 * float(ranges.max()) + 1e-12  # a dead channel must not be blown up
+    return np.asarray(np.maximum(ranges, floor))
+
+
+def first_guess(ranges: np.ndarray, levelling: float, headroom: float) -> np.ndarray:
+    """Factors that level the ranges, and fit the largest into int8 at the stream's position."""
+    factors = (ranges.max() / ranges) ** levelling
+    limit = INT8_MAX * 2.0**-STREAM_POSITION
+    return np.asarray(factors * headroom * limit / (ranges * factors).max())
+
+
+def search(graph: Graph, ranges: np.ndarray, error: Error, tick: Callable[[], None]) -> np.ndarray:
+    """The factors of least error: the best first guess, then channel by channel."""
+    guesses = [first_guess(ranges, levelling, headroom) for levelling in LEVELLING for headroom in HEADROOM]
+    costs = []
+    for guess in guesses:
+        costs.append(error(equalise(graph, guess)))
+        tick()
+    factors, best = guesses[int(np.argmin(costs))], min(costs)
+    for step in STEPS:
+        for channel in range(len(factors)):
+            for factor in (step, 1 / step):
+                tried = factors.copy()
+                tried[channel] *= factor
+                cost = error(equalise(graph, tried))
+                if cost < best:
+                    factors, best = tried, cost
+                tick()
+    return factors
+
+
+def search_steps(channels: int) -> int:
+    """How often `search` ticks."""
+    return len(LEVELLING) * len(HEADROOM) + 2 * len(STEPS) * channels

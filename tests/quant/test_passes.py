@@ -1,0 +1,150 @@
+"""The passes: each leaves the float network as it was, and does to the integer one what it says."""
+
+from dataclasses import fields, replace
+
+import numpy as np
+import onnx
+import pytest
+
+from quant.calibration import Patches
+from quant.core import IntConv, op_shifts
+from quant.float_file import float_model
+from quant.gate import compare
+from quant.graph import CORRECTION, Add, Conv, Graph, correction_graph
+from quant.passes.dual_gain import FINE_MAX, GAIN, merge, two_gains
+from quant.passes.equalise import channel_ranges, equalise, first_guess, search, search_steps
+from quant.passes.steady_stream import STREAM_POSITION, common_position, steady, stream_tensors
+from quant.planes import PLANES, POSITION, coarse_plane_only, read_planes, split
+from quant.positions import SHIFTS
+from quant.quantise import ALL, Passes, Quantised, quantise_model, ticks
+from quant.session import open_session
+
+NONE = Passes(**{field.name: False for field in fields(Passes)})
+
+
+@pytest.fixture(scope="module")
+def graph(float_onnx: onnx.ModelProto) -> Graph:
+    return read_planes(correction_graph(float_onnx))
+
+
+def correction(graph: Graph, seed: int = 0) -> np.ndarray:
+    dn = np.random.default_rng(seed).integers(0, 4096, (1, 1, 23, 31)).astype(np.float32) / np.float32(4095)
+    planes = split(dn).astype(np.float32) * np.float32(2.0**-POSITION)
+    return np.asarray(open_session(float_model(graph, [CORRECTION])).run(None, {PLANES: planes})[0])
+
+
+def test_equalising_leaves_the_float_network_as_it_was(graph: Graph) -> None:
+    factors = np.random.default_rng(1).uniform(0.2, 5, 8)
+    np.testing.assert_allclose(correction(equalise(graph, factors)), correction(graph), atol=2e-6)
+    first = equalise(graph, factors)[0]
+    assert isinstance(first, Conv)
+    assert not np.allclose(first.weight, graph[0].weight)  # type: ignore[union-attr]
+
+
+def test_scaling_the_writers_alone_would_change_it(graph: Graph) -> None:
+    wrong = (equalise(graph, np.full(8, 2.0))[0], *graph[1:])
+    assert np.abs(correction(wrong) - correction(graph)).max() > 1e-3
+
+
+def test_ranges_are_levelled_to_the_stream_s_own(graph: Graph, patches: Patches) -> None:
+    images = [image for image, _ in patches.pairs]
+    ranges = channel_ranges(graph, images, lambda: None)
+    assert ranges.shape == (8,)
+    factors = first_guess(ranges, 1.0, 1.0)
+    np.testing.assert_allclose(ranges * factors, 127 * 2.0**-STREAM_POSITION)
+    again = channel_ranges(equalise(graph, factors), images, lambda: None)
+    np.testing.assert_allclose(again, ranges * factors, rtol=1e-4)
+
+
+def test_a_dead_channel_is_not_blown_up(graph: Graph, patches: Patches) -> None:
+    dead = np.ones(8)
+    dead[3] = 1e-12
+    ranges = channel_ranges(equalise(graph, dead), [patches.pairs[0][0]], lambda: None)
+    assert ranges[3] >= 1e-4 * ranges.max()
+
+
+def test_the_search_never_ends_above_its_best_guess(graph: Graph) -> None:
+    wanted = np.geomspace(0.1, 3, 8)
+    ticked: list[int] = []
+
+    def error(tried: Graph) -> float:
+        first = tried[0]
+        assert isinstance(first, Conv)
+        k = np.abs(first.weight).sum((1, 2, 3)) / np.abs(graph[0].weight).sum((1, 2, 3))  # type: ignore[union-attr]
+        return float(np.square(np.log(k / wanted)).sum())
+
+    ranges = np.geomspace(1, 0.05, 8)
+    factors = search(graph, ranges, error, lambda: ticked.append(1))
+    guesses = [first_guess(ranges, g, h) for g in (0.5, 0.75, 1.0) for h in (0.64, 0.8, 1.0, 1.25)]
+    assert error(equalise(graph, factors)) < min(error(equalise(graph, guess)) for guess in guesses)
+    assert len(ticked) == search_steps(8)
+
+
+def test_a_steady_stream_adds_without_rounding(quantised: Quantised) -> None:
+    adds = [op for op in quantised.core.ops if isinstance(op, Add)]
+    assert len(adds) == 3
+    for op in adds:
+        shifts = {name: value for name, value, _ in op_shifts(op, quantised.core.positions, SHIFTS)}
+        assert shifts == {"shift_read": 0, "shift_write": 0}
+
+
+def test_without_it_adds_round(float_onnx: onnx.ModelProto, patches: Patches) -> None:
+    free = quantise_model(float_onnx, patches, {}, lambda: None, replace(NONE, least_squares=True))
+    adds = [op for op in free.core.ops if isinstance(op, Add)]
+    shifts = [v for op in adds for _, v, _ in op_shifts(op, free.core.positions, SHIFTS)]
+    assert any(shifts)
+
+
+def test_the_common_position_is_the_coarsest_of_the_stream(graph: Graph) -> None:
+    positions = {name: 7 + k for k, name in enumerate(sorted(stream_tensors(graph)))} | {CORRECTION: 3}
+    assert common_position(graph, positions) == 7
+    assert steady(graph, positions, 7) == dict.fromkeys(stream_tensors(graph), 7) | {CORRECTION: 3}
+
+
+def test_the_second_gain_is_the_same_correction_coarser(graph: Graph) -> None:
+    both = correction(two_gains(graph))
+    assert both.shape[1] == 2
+    np.testing.assert_allclose(both[:, 1:] * GAIN, correction(graph), atol=1e-6)
+
+
+def test_the_fine_gain_is_believed_until_its_end() -> None:
+    scale = 2.0**-11
+    fine = np.array([0, 126, -126, 127, -127, -128]) * scale
+    coarse = np.array([50, 51, 52, 53, -54, -55]) * scale
+    merged = merge(np.stack([fine, coarse]).astype(np.float32)[None, :, None], scale)[0, 0, 0]
+    np.testing.assert_array_equal(merged / scale, [0, 126, -126, 53 * GAIN, -54 * GAIN, -55 * GAIN])
+    assert FINE_MAX == 126
+    one = np.full((1, 1, 2, 2), 127 * scale, np.float32)
+    assert merge(one, scale) is one
+
+
+def test_the_coarse_plane_alone_sees_seven_bits(graph: Graph) -> None:
+    alone = coarse_plane_only(graph)
+    first = alone[0]
+    assert isinstance(first, Conv)
+    assert not first.weight[:, 1].any()
+    assert first.weight[:, 0].any()
+
+
+def test_all_passes_lose_far_less_than_none(float_onnx: onnx.ModelProto, patches: Patches) -> None:
+    def mae(passes: Passes) -> float:
+        made = quantise_model(float_onnx, patches, {}, lambda: None, passes)
+        return compare(open_session(float_onnx), open_session(made.host), patches.pairs).mae
+
+    assert mae(ALL) < 0.5 * mae(NONE)
+
+
+def test_progress_counts_to_its_end(float_onnx: onnx.ModelProto, patches: Patches) -> None:
+    for passes in (ALL, NONE):
+        ticked: list[int] = []
+        quantise_model(float_onnx, patches, {}, lambda: ticked.append(1), passes)  # noqa: B023
+        assert len(ticked) == ticks(float_onnx, len(patches.pairs), passes)
+
+
+def test_the_correction_has_one_channel_without_the_second_gain(
+    float_onnx: onnx.ModelProto, patches: Patches
+) -> None:
+    made = quantise_model(float_onnx, patches, {}, lambda: None, replace(ALL, dual_gain=False))
+    last = made.core.ops[-1]
+    assert isinstance(last, IntConv)
+    assert len(last.weight) == 1
