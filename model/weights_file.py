@@ -30,25 +30,29 @@ def variant_named(name: str) -> Variant:
     return VARIANTS[name]
 
 
+def shipped_names() -> list[str]:
+    """The names of the shipped float weights: a variant, or a variant fine-tuned for a sensor."""
+    return sorted(path.stem for path in SHIPPED.glob("*.safetensors"))
+
+
 def shipped_weights(name: str) -> Path:
-    """The weights file shipped for a variant.
+    """The shipped weights of that name.
 
     Raises:
-        ModelError: none is shipped.
+        ModelError: none are shipped.
     """
-    variant_named(name)
-    path = SHIPPED / f"{name}.safetensors"
-    if not path.is_file():
-        shipped = ", ".join(sorted(p.stem for p in SHIPPED.glob("*.safetensors"))) or "none"
-        remedy = "train it with 'beers-deploy train' and pass --checkpoint"
-        raise ModelError(f"variant {name}", expected=f"shipped weights ({shipped})", got="none", remedy=remedy)
-    return path
+    if name not in shipped_names():
+        remedy = "train them with 'beers-deploy train' and pass --checkpoint"
+        expected = f"shipped weights ({', '.join(shipped_names())})"
+        raise ModelError(f"weights {name}", expected=expected, got="none", remedy=remedy)
+    return SHIPPED / f"{name}.safetensors"
 
 
 def write_tensors(path: Path, tensors: Mapping[str, Tensor], header: Mapping[str, object]) -> None:
     """Write named tensors and a JSON header as safetensors, whole or not at all."""
     whole = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
     with whole_file(path) as temporary:
+        temporary.touch()  # safetensors would create it for its owner alone
         save_file(whole, temporary, metadata={key: json.dumps(value) for key, value in header.items()})
 
 

@@ -19,7 +19,7 @@ from quant.planes import coarse_plane_only, read_planes
 from quant.session import open_session, run
 
 SEARCH_PATCHES = 16
-"""Patches that the equalisation is searched on, a quarter of them those with the strongest edges: there int8 clips."""
+"""Patches that the equalisation is searched on, a quarter of them with the strongest edges: there int8 clips."""
 
 
 @dataclass(frozen=True)

@@ -9,12 +9,12 @@ import numpy as np
 import onnxruntime as ort
 import torch
 
-from deploy.defaults import default_int8, float_model
+from deploy.defaults import float_model
 from deploy.restore import TILE_PX, restore_image
 from model.traditional.peers import PEERS
 from model.traditional.pipeline import Chain, restore_traditional
 from model.traditional.settings import QUALITIES
-from model.weights_file import shipped_weights
+from model.weights_file import SHIPPED, shipped_names, shipped_weights
 from profiles.errors import OptionError
 from profiles.sensor import Sensor
 from quant.onnx_file import load_onnx
@@ -27,7 +27,7 @@ Restore = Callable[[np.ndarray], np.ndarray]
 TRADITIONAL, DECONVOLVE_FIRST = "traditional", "deconvolve-first"
 EXPECTED = (
     f"degraded, {TRADITIONAL}, {DECONVOLVE_FIRST} (each also with -fast or -best), {', '.join(PEERS)}, "
-    "a shipped network such as convbeers-s or convbeers-s-int8, or an ONNX or safetensors file"
+    f"a shipped network ({', '.join(shipped_names())}, each also with -int8), or an ONNX or safetensors file"
 )
 
 
@@ -71,10 +71,10 @@ def _network(name: str) -> Restore:
     path = Path(name)
     if path.suffix in (".onnx", ".safetensors"):
         model = float_model(path)
-    elif name == default_int8().stem:
-        model = load_onnx(default_int8())
-    elif name.startswith("convbeers"):
+    elif name in shipped_names():
         model = float_model(shipped_weights(name))
+    elif (SHIPPED / f"{name}.onnx").is_file():
+        model = load_onnx(SHIPPED / f"{name}.onnx")
     else:
         raise OptionError("--methods", expected=EXPECTED, got=repr(name), remedy="correct that name")
     session, halo_px = open_session(model), receptive_radius_px(model)
