@@ -52,7 +52,6 @@ def write_tensors(path: Path, tensors: Mapping[str, Tensor], header: Mapping[str
     """Write named tensors and a JSON header as safetensors, whole or not at all."""
     whole = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
     with whole_file(path) as temporary:
-        temporary.touch()  # safetensors would create it for its owner alone
         save_file(whole, temporary, metadata={key: json.dumps(value) for key, value in header.items()})
 
 

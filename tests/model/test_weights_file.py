@@ -115,3 +115,10 @@ def test_the_shipped_weights_load_and_say_how_they_were_made() -> None:
     images = recipe["images"]
     assert isinstance(images, list)
     assert len(images) >= 58
+
+
+def test_others_can_read_what_is_written(tmp_path: Path) -> None:
+    """As far as the user's umask lets them: like any other new file."""
+    (tmp_path / "plain").touch()
+    save_network(tmp_path / "w.safetensors", network(), {})
+    assert (tmp_path / "w.safetensors").stat().st_mode == (tmp_path / "plain").stat().st_mode
