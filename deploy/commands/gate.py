@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-EXAMPLE = "gate float.onnx int8.onnx --max-mae 0.0012"
+EXAMPLE = "gate float.onnx int8.onnx --max-mae 0.0008"
 
 
 def gate(
@@ -15,7 +15,7 @@ def gate(
     int8_model: Annotated[
         Path | None, typer.Argument(metavar="[INT8]", help="INT8 ONNX; the shipped one if none.")
     ] = None,
-    max_mae: Annotated[float, typer.Option(min=0, help="Largest mean absolute difference, of full scale.")] = 0.0012,
+    max_mae: Annotated[float, typer.Option(min=0, help="Largest mean absolute difference, of full scale.")] = 0.0008,
     sensor: Annotated[str, typer.Option(help="Profile of the test patches.")] = "pleiades-degraded",
     images: Annotated[Path | None, typer.Option(help="Folder of scenes; drawn ones if none.")] = None,
     patches: Annotated[int, typer.Option(min=1, help="Test patches of 128 x 128.")] = 32,
