@@ -18,18 +18,26 @@ def quantize(
     board: Annotated[Path | None, typer.Option(help="Also write the DPU's core in the board's spelling.")] = None,
     images: Annotated[Path | None, typer.Option(help="Folder of scenes for calibration; drawn ones if none.")] = None,
     patches: Annotated[int, typer.Option(min=1, help="Calibration patches of 128 x 128.")] = 64,
+    ablate: Annotated[bool, typer.Option("--ablate", help="Show what each pass buys, on other patches.")] = False,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the patches.")] = 0,
+    json: Annotated[Path | None, typer.Option(help="Write the figures here.")] = None,
 ) -> None:
-    """Quantise to int8 with power-of-two positions: the correction on the DPU, the 12-bit add on the host."""
-    from deploy.defaults import load_scenes
+    """Quantise to int8 with power-of-two positions: the correction on the DPU, the 12-bit add on the host.
+
+    Prints each integer layer: bits of its accumulator, seen and proven, and the share of saturated results.
+    """
+    from deploy.defaults import HELD_OUT_SEED, load_scenes
     from deploy.progress import steps
+    from deploy.quant_report import ablation_rows, ablations, layer_rows, rounding_row
+    from deploy.results import Document
+    from deploy.tables import print_rows
     from model.files import require_writable
     from profiles import load_sensor, load_target
     from quant.calibration import REFERENCE, draw_patches
     from quant.onnx_file import load_onnx, save_onnx
     from quant.quantise import quantise_model, ticks
 
-    require_writable(out, board)
+    require_writable(out, board, json)
     board_target = load_target(target)
     float_model = load_onnx(model)
     degraded, reference = load_sensor(sensor), load_sensor(REFERENCE)
@@ -42,3 +50,17 @@ def quantize(
     if board is not None:
         save_onnx(result.board, board)
         typer.echo(f"wrote {board}: the same numbers in the board's spelling")
+    degraded_images = [image for image, _ in drawn.pairs]
+    layers, rounding = layer_rows(result.core, degraded_images), rounding_row(result.core, degraded_images)
+    print_rows("integer layers", layers)
+    print_rows("the rule for halves", [rounding])
+    rows = [*layers, rounding]
+    if ablate:
+        unseen = seed + HELD_OUT_SEED
+        held_out = draw_patches(load_scenes(images, reference.nominal(), unseen), degraded, reference, 32, unseen)
+        with steps("ablating", len(ablations())) as bar:
+            found = ablation_rows(float_model, drawn, held_out, bar.advance)
+        print_rows("what each pass buys, on patches that calibration did not see", found)
+        rows += found
+    arguments = {"target": target, "sensor": sensor, "images": images, "patches": patches, "seed": seed}
+    Document("quantize", arguments, (model, out), tuple(rows)).write(json)

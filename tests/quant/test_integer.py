@@ -1,0 +1,106 @@
+"""The integer reference: the documented arithmetic, equal to the runtime bit for bit but for halves."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from quant.core import IntConv, IntCore
+from quant.graph import CORRECTION, Add
+from quant.integer import INT32_BITS, LayerReport, correction, run_core
+from quant.planes import PLANES, POSITION, split
+from quant.quantise import Quantised
+from quant.session import open_session
+
+
+def image(height: int = 37, width: int = 53, seed: int = 0) -> np.ndarray:
+    dn = np.random.default_rng(seed).integers(0, 4096, (1, 1, height, width))
+    return dn.astype(np.float32) / np.float32(4095)
+
+
+def by_runtime(quantised: Quantised, planes: np.ndarray) -> np.ndarray:
+    feed = {PLANES: planes.astype(np.float32) * np.float32(2.0**-POSITION)}
+    return np.asarray(open_session(quantised.board).run(None, feed)[0])
+
+
+@pytest.mark.parametrize("shape", [(37, 53), (1, 1), (1, 40), (64, 33)])
+def test_it_equals_the_runtime_bit_for_bit_under_the_runtime_s_rounding(
+    shape: tuple[int, int], quantised: Quantised
+) -> None:
+    for seed in range(3):
+        planes = split(image(*shape, seed))
+        np.testing.assert_array_equal(
+            correction(quantised.core, planes, half_even=True), by_runtime(quantised, planes)
+        )
+
+
+def test_under_the_dpu_s_rounding_it_differs_by_halves_alone(quantised: Quantised) -> None:
+    """The first layer's differences are its ties, one unit up; later layers carry them on."""
+    planes = split(image())
+    up, reports = run_core(quantised.core, planes)
+    even, _ = run_core(quantised.core, planes, half_even=True)
+    first = quantised.core.ops[0].output
+    difference = up[first] - even[first]
+    assert set(np.unique(difference)) <= {0, 1}
+    assert 0 < (difference == 1).mean() <= reports[0].ties
+    assert np.abs(up[CORRECTION] - even[CORRECTION]).max() <= 8
+
+
+def one_conv(weight: int, bias: int, cut: int, relu: bool = False) -> IntCore:
+    op = IntConv(
+        "c", PLANES, CORRECTION, np.full((1, 1, 1, 1), weight, np.int8), 0, np.array([bias], np.int8), 0, relu
+    )
+    return IntCore((op,), {PLANES: 0, CORRECTION: -cut})
+
+
+def values(core: IntCore, inputs: list[int], half_even: bool = False) -> list[int]:
+    planes = np.array(inputs, np.int8)[None, None, None]
+    return [int(v) for v in run_core(core, planes, half_even)[0][CORRECTION].ravel()]
+
+
+def test_halves_go_up_and_in_the_runtime_to_even() -> None:
+    inputs = [-6, -5, -4, -3, -2, -1, 0, 1, 2, 3, 4, 5, 6]
+    assert values(one_conv(1, 0, 2), inputs) == [-1, -1, -1, -1, 0, 0, 0, 0, 1, 1, 1, 1, 2]
+    assert values(one_conv(1, 0, 2), inputs, half_even=True) == [-2, -1, -1, -1, 0, 0, 0, 0, 0, 1, 1, 1, 2]
+
+
+def test_products_saturate_at_int8_s_ends() -> None:
+    assert values(one_conv(127, 0, 0), [-128, -1, 0, 1, 127]) == [-128, -127, 0, 127, 127]
+
+
+def test_bias_is_aligned_and_relu_comes_before_the_shift() -> None:
+    op = one_conv(1, 3, 1, relu=True).ops[0]
+    assert isinstance(op, IntConv)
+    aligned = IntCore((replace(op, bias_position=-2),), {PLANES: 0, CORRECTION: -1})  # 3 << 2 = 12
+    assert values(aligned, [-20, -12, -10, 0, 10]) == [0, 0, 1, 6, 11]
+
+
+def test_an_add_aligns_to_the_finer_position() -> None:
+    add = Add("a", ("x", "y"), CORRECTION)
+    ops = (
+        IntConv("x", PLANES, "x", np.ones((1, 1, 1, 1), np.int8), 0, np.zeros(1, np.int8), 0, False),
+        IntConv("y", PLANES, "y", np.ones((1, 1, 1, 1), np.int8), 1, np.zeros(1, np.int8), 0, False),
+        add,
+    )
+    core = IntCore(ops, {PLANES: 0, "x": 0, "y": 1, CORRECTION: 0})
+    # x = v at position 0, y = v at position 1, which is v / 2: 1.5 v, halves up
+    assert values(core, [-3, -1, 0, 1, 2, 3, 100]) == [-4, -1, 0, 2, 3, 5, 127]
+
+
+def test_accumulators_stay_within_what_is_proven(quantised: Quantised) -> None:
+    _, reports = run_core(quantised.core, split(image()))
+    for report in reports:
+        assert isinstance(report, LayerReport)
+        assert report.peak_bits <= report.proven_bits < INT32_BITS
+        assert 0 <= report.saturated <= 1
+
+
+def test_a_wrong_bias_position_is_seen(quantised: Quantised) -> None:
+    ops = list(quantised.core.ops)
+    place = next(k for k, op in enumerate(ops) if isinstance(op, IntConv) and op.bias.any())
+    op = ops[place]
+    assert isinstance(op, IntConv)
+    ops[place] = replace(op, bias_position=op.bias_position - 1)
+    planes = split(image())
+    wrong = correction(replace(quantised.core, ops=tuple(ops)), planes, half_even=True)
+    assert not np.array_equal(wrong, by_runtime(quantised, planes))
