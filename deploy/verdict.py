@@ -20,6 +20,8 @@ def gate_row(result: GateResult) -> Row:
     figures = {
         "MAE": figure(result.mae, "of full scale"),
         "std": figure(result.std, "of full scale"),
+        "std / MAE": figure(result.std_over_mae, "ratio"),
+        "99.9th percentile": figure(result.p999, "of full scale"),
         "max": figure(result.max_abs, "of full scale"),
         "PSNR float-INT8": figure(result.psnr_between_db, "dB"),
         "PSNR degraded": figure(result.psnr_degraded_db, "dB"),

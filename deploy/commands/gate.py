@@ -15,16 +15,27 @@ def gate(
     int8_model: Annotated[
         Path | None, typer.Argument(metavar="[INT8]", help="INT8 ONNX; the shipped one if none.")
     ] = None,
-    max_mae: Annotated[float, typer.Option(min=0, help="Largest mean absolute difference, of full scale.")] = 0.0008,
+    max_mae: Annotated[
+        float | None, typer.Option(min=0, help="Largest mean absolute difference, of full scale; 0.0008 if none.")
+    ] = None,
+    config: Annotated[Path | None, typer.Option(help="TOML file of limits; see docs/gate.md.")] = None,
+    baseline: Annotated[Path | None, typer.Option(help="What 'gate --json' wrote before: MAE may not grow.")] = None,
+    target: Annotated[str, typer.Option(help="Board whose rules the INT8 file must keep.")] = "vck190",
     sensor: Annotated[str, typer.Option(help="Profile of the test patches.")] = "pleiades-degraded",
     images: Annotated[Path | None, typer.Option(help="Folder of scenes; drawn ones if none.")] = None,
     patches: Annotated[int, typer.Option(min=1, help="Test patches of 128 x 128.")] = 32,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the patches.")] = 0,
+    summary: Annotated[Path | None, typer.Option(help="Write the verdict here as Markdown.")] = None,
+    junit: Annotated[Path | None, typer.Option(help="Write the verdict here as JUnit XML.")] = None,
     json: Annotated[Path | None, typer.Option(help="Write the figures here.")] = None,
 ) -> None:
-    """Compare a float and an INT8 network on simulated pairs neither was calibrated on."""
+    """Compare a float and an INT8 network on simulated pairs neither was calibrated on.
+
+    Also checked: the DPU's rules, that no ReLU was lost, and that onnxruntime's optimisations change no bit.
+    """
     from deploy.defaults import HELD_OUT_SEED, default_float_weights, default_int8, load_scenes
     from deploy.defaults import float_model as read_float
+    from deploy.gate import baseline_mae, structure_checks, write_summaries
     from deploy.results import Document
     from deploy.tables import print_rows
     from deploy.verdict import gate_row
@@ -33,10 +44,12 @@ def gate(
     from profiles.errors import ModelError
     from quant.calibration import REFERENCE, draw_patches
     from quant.gate import compare
+    from quant.limits import judge, read_limits
     from quant.onnx_file import load_onnx, metadata
     from quant.session import open_session
 
-    require_writable(json)
+    require_writable(json, summary, junit)
+    limits, before = read_limits(config, max_mae), baseline_mae(baseline)
     float_path, int8_path = float_model or default_float_weights(), int8_model or default_int8()
     models = read_float(float_path), load_onnx(int8_path)
     if metadata(models[0]).get("precision", "").startswith("int8"):
@@ -47,12 +60,16 @@ def gate(
     held_out = seed + HELD_OUT_SEED
     scenes = load_scenes(images, reference.nominal(), held_out)
     result = compare(*sessions, draw_patches(scenes, degraded, reference, patches, held_out).pairs)
+    checks = [*judge(result, limits, before), *structure_checks(models[0], int8_path, models[1], target)]
     row = gate_row(result)
     print_rows("float against INT8", [row])
-    arguments = {"max_mae": max_mae, "sensor": sensor, "patches": patches, "seed": seed, "images": images}
+    for check in checks:
+        typer.echo(f"{'ok    ' if check.passed else 'FAILED'} {check.name}: {check.found} (allowed: {check.allowed})")
+    arguments = {"max_mae": limits.mae, "config": config, "baseline": baseline, "target": target, "sensor": sensor}
+    arguments |= {"patches": patches, "seed": seed, "images": images}
     Document("gate", arguments, (float_path, int8_path), (row,)).write(json)
-    passed = result.passes(max_mae)
-    verdict = "passed" if passed else "FAILED"
-    typer.echo(f"gate {verdict}: MAE {result.mae:.3g}, allowed {max_mae:.3g}; PSNR drop {result.drop_db:.2f} dB")
+    write_summaries(f"INT8 gate of {int8_path.name}", checks, summary, junit)
+    passed = all(check.passed for check in checks)
+    typer.echo(f"gate {'passed' if passed else 'FAILED'}: MAE {result.mae:.3g}, PSNR drop {result.drop_db:.2f} dB")
     if not passed:
         raise typer.Exit(1)

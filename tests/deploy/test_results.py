@@ -8,6 +8,7 @@ import pytest
 from deploy.results import SCHEMA_PATH, Document, Figure, Row, measured, number, predicted, published, unavailable
 from deploy.verdict import gate_row
 from quant.gate import GateResult
+from quant.limits import Limits, judge
 
 SCHEMA = json.loads(SCHEMA_PATH.read_text())
 
@@ -85,7 +86,7 @@ def test_a_document_without_rows_is_invalid() -> None:
 @pytest.mark.parametrize("value", [math.nan, math.inf, 0.0])
 def test_a_gate_on_a_network_gone_wrong_still_writes_json(value: float, tmp_path: Path) -> None:
     """A network that gives NaN has no MAE: unavailable with a reason, in JSON that every reader takes."""
-    result = GateResult(value, value, value, value, value, value, value, patches=1)
+    result = GateResult(value, value, value, value, value, value, value, value, patches=1)
     Document("gate", {}, (), (gate_row(result),)).write(tmp_path / "gate.json")
     jsonschema.validate(strictly((tmp_path / "gate.json").read_text()), SCHEMA)
-    assert result.passes(1.0) == (value == 0)
+    assert judge(result, Limits(mae=1.0))[0].passed == (value == 0)

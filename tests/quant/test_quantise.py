@@ -11,6 +11,7 @@ from quant.core import IntConv, build_core, shift_faults
 from quant.gate import compare
 from quant.graph import CORRECTION, correction_graph
 from quant.host_file import host_model
+from quant.limits import Limits, judge
 from quant.onnx_file import metadata, save_onnx
 from quant.passes.dual_gain import merge
 from quant.planes import POSITION, read_planes, split
@@ -81,8 +82,8 @@ def test_every_convolution_is_an_integer_kernel(quantised: Quantised) -> None:
 def test_int8_stays_close_to_float(float_onnx: onnx.ModelProto, quantised: Quantised, patches: Patches) -> None:
     result = compare(open_session(float_onnx), open_session(quantised.host), patches.pairs)
     assert result.mae < 0.002
-    assert result.passes(0.002)
-    assert not result.passes(result.mae / 2)
+    assert judge(result, Limits(mae=0.002))[0].passed
+    assert not judge(result, Limits(mae=result.mae / 2))[0].passed
 
 
 def test_the_gate_sees_a_broken_weight(float_onnx: onnx.ModelProto, quantised: Quantised, patches: Patches) -> None:
@@ -96,7 +97,7 @@ def test_the_gate_sees_a_broken_weight(float_onnx: onnx.ModelProto, quantised: Q
 
 def test_a_nan_never_passes_the_gate(float_onnx: onnx.ModelProto, quantised: Quantised, patches: Patches) -> None:
     result = compare(open_session(float_onnx), open_session(quantised.host), patches.pairs)
-    assert not replace(result, mae=float("nan")).passes(1.0)
+    assert not judge(replace(result, mae=float("nan")), Limits(mae=1.0))[0].passed
 
 
 def test_the_same_patches_give_the_same_bytes(

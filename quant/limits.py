@@ -1,0 +1,89 @@
+"""What the gate allows: limits by name, from a TOML file or the defaults."""
+
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+
+from profiles.errors import OptionError
+from quant.gate import GateResult
+
+
+@dataclass(frozen=True)
+class Limits:
+    """The largest values allowed; None for no limit. Differences in [0, 1] of full scale, PSNRs in dB.
+
+    Attributes:
+        mae: mean absolute difference of INT8 from float.
+        p999: 99.9th percentile of its size.
+        std_over_mae: 1.25 is rounding alone; clipping drives it up.
+        psnr_drop_db: PSNR lost against the reference.
+        min_psnr_float_int8_db: smallest PSNR of INT8 against float.
+        mae_growth: how many times a stored baseline's MAE.
+    """
+
+    mae: float | None = 0.0008
+    p999: float | None = None
+    std_over_mae: float | None = None
+    psnr_drop_db: float | None = None
+    min_psnr_float_int8_db: float | None = None
+    mae_growth: float | None = 1.05
+
+
+@dataclass(frozen=True)
+class Check:
+    """One thing that the gate looks at."""
+
+    name: str
+    passed: bool
+    found: str
+    allowed: str
+
+
+def read_limits(path: Path | None, mae: float | None) -> Limits:
+    """The limits of a TOML file such as `mae = 0.0007`, or the defaults; `mae` overrides.
+
+    Raises:
+        OptionError: not such a file.
+    """
+    limits = Limits() if path is None else _parse(path)
+    return limits if mae is None else replace(limits, mae=mae)
+
+
+def _parse(path: Path) -> Limits:
+    names = [field.name for field in fields(Limits)]
+    try:
+        raw = tomllib.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        got = "no such file" if not path.exists() else " ".join(str(error).split())[:120]
+        raise OptionError(
+            str(path), expected="a TOML file of limits", got=got, remedy="write mae = 0.0007"
+        ) from error
+    for name, value in raw.items():
+        if name not in names or isinstance(value, bool) or not isinstance(value, int | float) or not value > 0:
+            expected = f"numbers above 0 named {', '.join(names)}"
+            raise OptionError(str(path), expected=expected, got=f"{name} = {value!r}", remedy="correct that line")
+    return Limits(**{**dict.fromkeys(names), "mae_growth": Limits.mae_growth, **raw})
+
+
+def judge(result: GateResult, limits: Limits, baseline_mae: float | None = None) -> list[Check]:
+    """Every limit that is set, against what was found. NaN passes nothing."""
+    found: Mapping[str, tuple[float, float | None]] = {
+        "MAE": (result.mae, limits.mae),
+        "99.9th percentile": (result.p999, limits.p999),
+        "std / MAE": (result.std_over_mae, limits.std_over_mae),
+        "PSNR drop, dB": (result.drop_db, limits.psnr_drop_db),
+    }
+    checks = [
+        Check(name, value <= allowed, f"{value:.4g}", f"at most {allowed:g}")
+        for name, (value, allowed) in found.items()
+        if allowed is not None
+    ]
+    least, level = limits.min_psnr_float_int8_db, result.psnr_between_db
+    if least is not None:
+        checks.append(Check("PSNR float-INT8, dB", level >= least, f"{level:.4g}", f"at least {least:g}"))
+    if baseline_mae is not None and limits.mae_growth is not None:
+        allowed = limits.mae_growth * baseline_mae
+        text = f"at most {allowed:.4g}, {limits.mae_growth:g} times the baseline"
+        checks.append(Check("MAE against the baseline", result.mae <= allowed, f"{result.mae:.4g}", text))
+    return checks

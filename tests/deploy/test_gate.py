@@ -1,0 +1,173 @@
+"""The gate catches what goes wrong in quantised files, and tells a CI job so."""
+
+from collections.abc import Callable
+from pathlib import Path
+from xml.etree import ElementTree as ET
+
+import numpy as np
+import onnx
+import pytest
+from onnx import numpy_helper
+from typer.testing import CliRunner
+
+from deploy.cli import app
+from deploy.defaults import default_int8, float_model
+from deploy.gate import baseline_mae, junit, markdown, structure_checks
+from model.simulator.procedural import procedural_scene
+from profiles import load_sensor
+from profiles.errors import OptionError
+from quant.calibration import Patches, draw_patches
+from quant.gate import compare
+from quant.limits import Check, Limits, judge, read_limits
+from quant.onnx_file import save_onnx
+from quant.session import open_session
+
+SENSORS = load_sensor("pleiades-degraded"), load_sensor("pleiades-reference")
+
+
+@pytest.fixture(scope="module")
+def reference_model() -> onnx.ModelProto:
+    return float_model(None)
+
+
+@pytest.fixture(scope="module")
+def unseen() -> Patches:
+    return draw_patches([procedural_scene(900, 900, np.random.default_rng(77))], *SENSORS, 4, 7)
+
+
+def failed(
+    reference_model: onnx.ModelProto, unseen: Patches, folder: Path, spoil: Callable[[onnx.ModelProto], None]
+) -> set[str]:
+    """The names of the checks that a spoilt copy of the shipped file fails."""
+    model = onnx.load(default_int8())
+    spoil(model)
+    save_onnx(model, folder / "spoilt.onnx")
+    result = compare(open_session(reference_model), open_session(model), unseen.pairs)
+    checks = judge(result, Limits(mae=0.0008, std_over_mae=2.5))
+    checks += structure_checks(reference_model, folder / "spoilt.onnx", model, "vck190")
+    return {check.name for check in checks if not check.passed}
+
+
+def constant(model: onnx.ModelProto, name: str, change: Callable[[np.ndarray], np.ndarray]) -> None:
+    tensor = next(t for t in model.graph.initializer if t.name == name)
+    value = numpy_helper.to_array(tensor)
+    tensor.CopyFrom(numpy_helper.from_array(change(value).astype(value.dtype), name))
+
+
+def node(model: onnx.ModelProto, name: str) -> onnx.NodeProto:
+    found: onnx.NodeProto = next(n for n in model.graph.node if n.name == name)
+    return found
+
+
+def own_constant(model: onnx.ModelProto, name: str, value: np.ndarray) -> str:
+    model.graph.initializer.append(numpy_helper.from_array(value, name))
+    return name
+
+
+def nothing(_model: onnx.ModelProto) -> None:
+    """Leave the file as it is."""
+
+
+def drop_a_relu(model: onnx.ModelProto) -> None:
+    relu = node(model, "body.2.first.relu")
+    source, target = relu.input[0], relu.output[0]
+    model.graph.node.remove(relu)
+    for reader in model.graph.node:
+        reader.input[:] = [source if name == target else name for name in reader.input]
+
+
+def give_a_float_scale(model: onnx.ModelProto) -> None:
+    node(model, "body.4.first").input[6] = own_constant(model, "odd_scale", np.array(0.0043, np.float32))
+    node(model, "body.4.second").input[1] = "odd_scale"
+
+
+def clip_an_activation(model: onnx.ModelProto) -> None:
+    """A block's inner tensor at a position three too fine: it saturates."""
+    conv, reader = node(model, "body.1.first"), node(model, "body.1.second")
+    scale = next(numpy_helper.to_array(t) for t in model.graph.initializer if t.name == conv.input[6])
+    conv.input[6] = own_constant(model, "scale_too_fine", scale / np.float32(8))
+    reader.input[1] = "scale_too_fine"
+
+
+def shift_a_bias(model: onnx.ModelProto) -> None:
+    constant(model, "body_end.bias", lambda bias: bias * 2)
+
+
+def swap_the_planes(model: onnx.ModelProto) -> None:
+    constant(model, "head.weight", lambda weight: weight[:, ::-1].copy())
+
+
+def test_the_shipped_file_passes(reference_model: onnx.ModelProto, unseen: Patches, tmp_path: Path) -> None:
+    assert failed(reference_model, unseen, tmp_path, nothing) == set()
+
+
+@pytest.mark.parametrize(
+    ("spoil", "check"),
+    [
+        (drop_a_relu, "ReLUs kept"),
+        (give_a_float_scale, "legal on the DPU"),
+        (clip_an_activation, "MAE"),
+        (shift_a_bias, "MAE"),
+        (swap_the_planes, "MAE"),
+    ],
+)
+def test_a_spoilt_file_is_stopped(
+    spoil: Callable[[onnx.ModelProto], None],
+    check: str,
+    reference_model: onnx.ModelProto,
+    unseen: Patches,
+    tmp_path: Path,
+) -> None:
+    assert check in failed(reference_model, unseen, tmp_path, spoil)
+
+
+def test_limits_come_from_a_file(tmp_path: Path) -> None:
+    path = tmp_path / "gate.toml"
+    path.write_text("mae = 0.0007\npsnr_drop_db = 0.25\n")
+    limits = read_limits(path, None)
+    assert (limits.mae, limits.psnr_drop_db, limits.p999) == (0.0007, 0.25, None)
+    assert read_limits(path, 0.001).mae == 0.001
+    assert read_limits(None, None) == Limits()
+
+
+@pytest.mark.parametrize(
+    "text", ["mae = 'small'", "mae = true", "mea = 0.1", "mae = -1", "mae = nan", "= 3", "[mae]"]
+)
+def test_limits_that_are_none_are_refused(text: str, tmp_path: Path) -> None:
+    (tmp_path / "gate.toml").write_text(text)
+    with pytest.raises(OptionError, match=r"gate\.toml"):
+        read_limits(tmp_path / "gate.toml", None)
+    with pytest.raises(OptionError, match="no such file"):
+        read_limits(tmp_path / "none.toml", None)
+
+
+CHECKS = [Check("MAE", True, "0.0006", "at most 0.0008"), Check("legal <all>", False, "tail: x & y", "the rules")]
+
+
+def test_a_job_can_read_the_verdict() -> None:
+    text = markdown("INT8 gate", CHECKS)
+    assert "FAILED" in text
+    assert "| MAE | 0.0006 | at most 0.0008 | ok |" in text
+    suite = ET.fromstring(junit("INT8 gate", CHECKS))  # noqa: S314 - our own text
+    assert (suite.get("tests"), suite.get("failures")) == ("2", "1")
+    assert [case.find("failure") is not None for case in suite] == [False, True]
+
+
+def test_a_baseline_holds_the_mae(tmp_path: Path) -> None:
+    runner, first = CliRunner(), tmp_path / "first.json"
+    done = runner.invoke(app, ["gate", "--patches", "2", "--json", str(first), "--junit", str(tmp_path / "j.xml")])
+    assert done.exit_code == 0, done.output
+    before = baseline_mae(first)
+    assert before is not None
+    assert ET.parse(tmp_path / "j.xml").getroot().get("failures") == "0"  # noqa: S314
+    first.write_text(first.read_text().replace(str(before), str(before / 2)))
+    again = runner.invoke(
+        app, ["gate", "--patches", "2", "--baseline", str(first), "--summary", str(tmp_path / "s.md")]
+    )
+    assert again.exit_code == 1
+    assert "**failed**" in (tmp_path / "s.md").read_text()
+    with pytest.raises(OptionError, match="no such file"):
+        baseline_mae(tmp_path / "none.json")
+    (tmp_path / "other.json").write_text("{}")
+    with pytest.raises(OptionError, match="another document"):
+        baseline_mae(tmp_path / "other.json")
