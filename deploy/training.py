@@ -4,7 +4,7 @@ RUN/checkpoint.safetensors  RUN/log.csv  RUN/validation.csv  RUN/validation.png 
 """
 
 import csv
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
@@ -66,14 +66,16 @@ class Run:
         return self.out / f"{self.variant}.safetensors"
 
 
-def train(run: Run, resume: bool, worker: Worker) -> str:
-    """Run or resume a training to its end; what is to be said about its loss.
+def train(run: Run, resume: bool, worker: Worker, say: Callable[[str], None]) -> None:
+    """Run or resume a training to its end; says first whether LPIPS is part of the loss.
 
     Raises:
         OptionError: the folder holds a run and `resume` is not asked for, or there is nothing to train on.
         KeyboardInterrupt: stopped; a checkpoint was written.
     """
     loss, said = loss_of(run)
+    if said and worker.first:
+        say(said)
     trainer = Trainer(
         variant_named(run.variant),
         run.recipe,
@@ -94,7 +96,6 @@ def train(run: Run, resume: bool, worker: Worker) -> str:
     _train(run, trainer, source, validation)
     if worker.first:
         finish(trainer.averaged(), run.weights, about(run, names, validation.names, loss))
-    return said
 
 
 def loss_of(run: Run) -> tuple[RestorationLoss, str]:

@@ -85,6 +85,6 @@ def train(
     )
     require_writable(run.weights)
     with joined(device) as worker:
-        said = run_training(run, resume, worker)
+        run_training(run, resume, worker, typer.echo)
         if worker.first:
-            typer.echo(f"wrote {run.weights}" + (f"; {said}" if said else ""))
+            typer.echo(f"wrote {run.weights}")
