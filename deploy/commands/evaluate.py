@@ -38,7 +38,7 @@ def evaluate(
     from deploy.evaluation.methods import method_named
     from deploy.evaluation.page import evaluation_report, pictures
     from deploy.evaluation.perceptual import perceptual_distances
-    from deploy.evaluation.run import evaluate_methods, load_pairs, sweep_tables
+    from deploy.evaluation.run import evaluate_methods, input_files, load_pairs, sweep_tables
     from deploy.evaluation.scores import Instruments
     from deploy.report.page import write_report
     from deploy.results import Document
@@ -72,4 +72,4 @@ def evaluate(
         typer.echo(f"wrote {out / 'report.html'}")
     arguments: dict[str, object] = {"images": images, "pairs": pairs, "sensor": sensor, "reference": reference}
     arguments |= {"methods": methods, "lpips": lpips, "out": out, "sweep": sweep, "seed": seed}
-    Document("evaluate", arguments, (), (*result.rows, *swept)).write(json)
+    Document("evaluate", arguments, input_files(names, images, pairs, lpips), (*result.rows, *swept)).write(json)

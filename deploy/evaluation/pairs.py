@@ -9,7 +9,7 @@ import numpy as np
 
 from deploy.restore import read_acquisition
 from model.images import site_of
-from model.simulator.acquire import MARGIN_PX, simulate_pair
+from model.simulator.acquire import MARGIN_PX, fitting_oversampling, simulate_pair
 from model.simulator.draws import Draw
 from model.simulator.scene import Scene
 from model.training.stored_pairs import pair_files
@@ -55,9 +55,7 @@ def simulate_pairs(
     """
     pairs, small = [], []
     for number, scene in enumerate(scenes):
-        ratio = next(
-            (r for r in OVERSAMPLINGS if min(scene.radiance.shape) // r >= 2 * MARGIN_PX + MIN_SIDE_PX), None
-        )
+        ratio = fitting_oversampling(scene.radiance, OVERSAMPLINGS, MIN_SIDE_PX)
         if ratio is None:
             small.append(scene.name)
             continue

@@ -13,7 +13,7 @@ from deploy.evaluation.sweep import conditions, sweep_rows
 from deploy.evaluation.targets import acquire_targets, target_figures
 from deploy.progress import steps
 from deploy.results import Row
-from model.images import site_of
+from model.images import list_images, site_of
 from profiles.sensor import Sensor, SensorProfile
 
 
@@ -68,3 +68,12 @@ def sweep_tables(
     networks = [method for method in methods if method.told == "nothing"]
     with steps("sweep", len(conditions(degraded.nominal(), degraded))) as bar:
         return tuple(sweep_rows(networks, list(first.values()), degraded, reference, seed, bar.advance))
+
+
+def input_files(
+    methods: Sequence[str], images: Path | None, pairs: Path | None, lpips: Path | None
+) -> tuple[Path, ...]:
+    """The files that an evaluation's figures rest on: models, scenes or pairs, weights of LPIPS."""
+    named = [path for path in (*map(Path, methods), *([lpips] if lpips else [])) if path.is_file()]
+    folders = [images] if images else [pairs / role for role in ("degraded", "reference")] if pairs else []
+    return (*named, *(path for folder in folders for path in list_images(folder)))

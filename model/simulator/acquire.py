@@ -1,6 +1,6 @@
 """One scene, seen by one sensor or by two: the order of the effects stands here and nowhere else."""
 
-from collections.abc import Collection
+from collections.abc import Collection, Iterable
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -125,6 +125,12 @@ def acquire(
     transfer = sensor_transfer(spectrum.shape[-2], width, oversampling, sensor, spectrum.device)
     signal = crop_margin(sample(spectrum, transfer, width, oversampling, offset_px), margin_px)
     return detect(signal, sensor, draw, role)
+
+
+def fitting_oversampling(radiance: Tensor, oversamplings: Iterable[int], side_px: int) -> int | None:
+    """The first oversampling that leaves `side_px` target pixels within the margin of a scene (H, W), or None."""
+    target_px = side_px + 2 * MARGIN_PX
+    return next((ratio for ratio in oversamplings if min(radiance.shape) // ratio >= target_px), None)
 
 
 def crop_margin(image: Tensor, margin_px: int) -> Tensor:

@@ -10,7 +10,7 @@ from torch import Tensor
 from model.convbeers import ConvBEERS
 from model.images import site_of
 from model.metrics.fidelity import psnr_db, ssim
-from model.simulator.acquire import MARGIN_PX, simulate_pair
+from model.simulator.acquire import fitting_oversampling, simulate_pair
 from model.simulator.draws import Draw
 from model.simulator.scene import Scene
 from profiles.sensor import SensorProfile
@@ -58,8 +58,7 @@ class Validation:
     def __init__(self, scenes: Sequence[Scene], degraded: SensorProfile, reference: SensorProfile) -> None:
         self.names, self.pairs = list[str](), list[tuple[Tensor, Tensor]]()
         for number, scene in enumerate(scenes):
-            room = (min(scene.radiance.shape) // r - 2 * MARGIN_PX >= MIN_SIDE_PX for r in OVERSAMPLINGS)
-            ratio = next((r for r, fits in zip(OVERSAMPLINGS, room, strict=True) if fits), None)
+            ratio = fitting_oversampling(scene.radiance, OVERSAMPLINGS, MIN_SIDE_PX)
             if ratio is None:
                 continue
             draw = Draw(0, number)

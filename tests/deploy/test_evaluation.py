@@ -209,6 +209,7 @@ def test_the_command_on_a_folder_of_pairs(tmp_path: Path, monkeypatch: pytest.Mo
     assert result.exit_code == 0, result.output
     document = json.loads((tmp_path / "e.json").read_text())
     jsonschema.validate(document, json.loads(SCHEMA_PATH.read_text()))
+    assert [each["name"] for each in document["inputs"]] == ["a_1.tif", "b_1.tif"] * 2
     names = [row["name"] for row in document["rows"] if row["table"] == "mean"]
     assert names == ["degraded", "traditional-fast", "paper: traditional", "paper: ConvBEERS"]
     assert (tmp_path / "out" / "report.html").read_text().count("data:image/png") == 2
