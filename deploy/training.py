@@ -10,6 +10,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
+import torch
+from torch import Tensor
 
 from deploy.defaults import draw_scenes
 from deploy.progress import Steps, steps
@@ -29,6 +31,7 @@ from model.training.trainer import Progress, Schedule, Source, Trainer
 from model.training.validation import Validation, split_by_site
 from model.training.workers import Worker
 from model.weights_file import load_network, variant_named
+from model.widen import widen
 from profiles.errors import OptionError
 
 if TYPE_CHECKING:
@@ -82,7 +85,7 @@ def train(run: Run, resume: bool, worker: Worker, say: Callable[[str], None]) ->
         loss,
         worker,
         run.device,
-        load_network(run.start)[0].state_dict() if run.start else None,
+        start_weights(run),
         load_network(run.teacher)[0] if run.teacher else None,
     )
     if loss.perceptual is not None:
@@ -96,6 +99,19 @@ def train(run: Run, resume: bool, worker: Worker, say: Callable[[str], None]) ->
     _train(run, trainer, source, validation)
     if worker.first:
         finish(trainer.averaged(), run.weights, about(run, names, validation.names, loss))
+
+
+def start_weights(run: Run) -> Mapping[str, Tensor] | None:
+    """The weights to go on from, widened to the run's variant; None draws new ones.
+
+    Raises:
+        ModelError: no such weights, or a network that cannot be widened to the variant.
+    """
+    if run.start is None:
+        return None
+    network, _ = load_network(run.start)
+    generator = torch.Generator().manual_seed(run.recipe.seed)
+    return widen(network, variant_named(run.variant), generator).state_dict()
 
 
 def loss_of(run: Run) -> tuple[RestorationLoss, str]:

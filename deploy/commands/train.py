@@ -26,7 +26,7 @@ def train(
     lpips_weight: Annotated[float, typer.Option(min=0, help="Weight of LPIPS in the loss.")] = 0.5,
     fft_weight: Annotated[float, typer.Option(min=0, help="Weight of the L1 of spectra in the loss.")] = 0.1,
     lpips: Annotated[Path | None, typer.Option(help="Weights of SqueezeNet 1.1 for LPIPS, or their folder.")] = None,
-    start: Annotated[Path | None, typer.Option(help="Weights to go on from (fine-tuning).")] = None,
+    start: Annotated[Path | None, typer.Option(help="Weights to go on from; of a narrower network, they are widened.")] = None,
     teacher: Annotated[Path | None, typer.Option(help="Weights of a network to imitate (distilling).")] = None,
     distil: Annotated[float, typer.Option(min=0, help="Weight of the distance to the teacher.")] = 1.0,
     validate_every: Annotated[int, typer.Option(min=0, help="Steps between validations; 0 for none.")] = 1000,
