@@ -23,10 +23,16 @@ def train(
     patch: Annotated[int, typer.Option(min=17, help="Patch side in pixels.")] = 96,
     learning_rate: Annotated[float, typer.Option(min=0, help="Highest learning rate.")] = 1e-3,
     optimiser: Annotated[str, typer.Option(help="adam or adamw.")] = "adam",
+    l1_weight: Annotated[float, typer.Option(min=0, help="Weight of L1 in the loss.")] = 1.0,
+    l2_weight: Annotated[
+        float, typer.Option(min=0, help="Weight of L2 in the loss; some 100 for the highest PSNR.")
+    ] = 0.0,
     lpips_weight: Annotated[float, typer.Option(min=0, help="Weight of LPIPS in the loss.")] = 0.5,
     fft_weight: Annotated[float, typer.Option(min=0, help="Weight of the L1 of spectra in the loss.")] = 0.1,
     lpips: Annotated[Path | None, typer.Option(help="Weights of SqueezeNet 1.1 for LPIPS, or their folder.")] = None,
-    start: Annotated[Path | None, typer.Option(help="Weights to go on from; of a narrower network, they are widened.")] = None,
+    start: Annotated[
+        Path | None, typer.Option(help="Weights to go on from; of a narrower network, they are widened.")
+    ] = None,
     teacher: Annotated[Path | None, typer.Option(help="Weights of a network to imitate (distilling).")] = None,
     distil: Annotated[float, typer.Option(min=0, help="Weight of the distance to the teacher.")] = 1.0,
     validate_every: Annotated[int, typer.Option(min=0, help="Steps between validations; 0 for none.")] = 1000,
@@ -63,7 +69,7 @@ def train(
         batch=batch,
         learning_rate=learning_rate,
         optimiser=optimiser,  # type: ignore[arg-type]
-        loss=LossWeights(lpips=lpips_weight, fft=fft_weight),
+        loss=LossWeights(l1_weight, l2_weight, lpips_weight, fft_weight),
         distil=distil if teacher else 0.0,
         seed=seed,
     )

@@ -1,5 +1,7 @@
 """The paper's loss: 1.0 L1 + 0.5 LPIPS + 0.1 FFT-L1 (paper, training section), each term reported.
 
+Besides, an L2 term for who wants the highest PSNR, which is a mean of squares: L1 forgives the strongest edges.
+
 LPIPS needs weights that are not shipped; without them the loss is L1 + FFT-L1, and the recipe says so.
 """
 
@@ -17,6 +19,7 @@ class LossWeights:
     """How much each term counts; a term of weight 0 is not computed."""
 
     l1: float = 1.0
+    l2: float = 0.0
     lpips: float = 0.5
     fft: float = 0.1
 
@@ -47,6 +50,9 @@ class RestorationLoss:
             restored, reference = restored.float(), reference.float()
             terms = {"l1": (restored - reference).abs().mean()}
             total = weights.l1 * terms["l1"]
+            if weights.l2:
+                terms["l2"] = (restored - reference).square().mean()
+                total = total + weights.l2 * terms["l2"]
             if weights.fft:
                 terms["fft"] = fft_l1(restored, reference)
                 total = total + weights.fft * terms["fft"]

@@ -55,9 +55,20 @@ def test_the_terms_add_up() -> None:
     torch.testing.assert_close(total, expected)
 
 
+def test_an_l2_term_weighs_large_errors_more() -> None:
+    reference = torch.zeros(1, 1, 20, 20)
+    spread, peaked = torch.full_like(reference, 0.01), torch.zeros_like(reference)
+    peaked[..., 0, 0] = 4.0
+    loss = RestorationLoss(LossWeights(l1=1.0, l2=100.0, lpips=0.0, fft=0.0))
+    (even, even_terms), (peak, peak_terms) = (loss(image, reference) for image in (spread, peaked))
+    torch.testing.assert_close(even_terms["l1"], peak_terms["l1"])
+    assert peak > 100 * even
+    torch.testing.assert_close(even, even_terms["l1"] + 100 * even_terms["l2"])
+
+
 def test_terms_without_weight_are_not_computed() -> None:
     restored, reference = images()
-    total, terms = RestorationLoss(LossWeights(2.0, 0.0, 0.0), with_distance())(restored, reference)
+    total, terms = RestorationLoss(LossWeights(l1=2.0, lpips=0.0, fft=0.0), with_distance())(restored, reference)
     assert set(terms) == {"l1"}
     torch.testing.assert_close(total, 2 * terms["l1"])
     assert set(RestorationLoss(PAPER)(restored, reference)[1]) == {"l1", "fft"}
