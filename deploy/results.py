@@ -7,7 +7,7 @@ not be had is unavailable, with the reason, and never a zero.
 import json
 import math
 import platform
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
@@ -97,6 +97,14 @@ class Row:
     name: str
     figures: Mapping[str, Figure]
     text: Mapping[str, str] = field(default_factory=dict)
+
+
+def by_table(rows: Iterable[Row]) -> dict[str, list[Row]]:
+    """The rows of each table, in the order in which the tables first appear."""
+    tables: dict[str, list[Row]] = {}
+    for row in rows:
+        tables.setdefault(row.table, []).append(row)
+    return tables
 
 
 @dataclass(frozen=True)

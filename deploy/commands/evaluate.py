@@ -41,7 +41,7 @@ def evaluate(
     from deploy.evaluation.run import evaluate_methods, input_files, load_pairs, sweep_tables
     from deploy.evaluation.scores import Instruments
     from deploy.report.page import write_report
-    from deploy.results import Document
+    from deploy.results import Document, by_table
     from deploy.tables import print_rows
     from model.files import require_writable
     from profiles import load_sensor
@@ -60,10 +60,9 @@ def evaluate(
     result = evaluate_methods(chosen, found, instruments, eyes[0].nominal(), seed)
     title = f"{sensor} -> {reference}, {len(found)} images"
     print_rows(title, result.mean)
-    print_rows("PSNR by site", result.sites)
     swept = sweep_tables(chosen, images, *eyes, seed) if sweep else ()
-    for table in dict.fromkeys(row.table for row in swept):
-        print_rows(table, [row for row in swept if row.table == table])
+    for table, rows in by_table((*result.sites, *swept)).items():
+        print_rows(table, rows)
     if small:
         typer.echo(f"left out, too small: {', '.join(small)}")
     if out is not None:

@@ -10,7 +10,7 @@ from deploy.evaluation.methods import Method
 from deploy.evaluation.pairs import NamedPair
 from deploy.report.page import Picture, Report, Table
 from deploy.report.pictures import busiest_windows, error_row, grid, picture_url, stretch_of, strip_row
-from deploy.results import Row
+from deploy.results import Row, by_table
 from model.files import whole_file
 
 SITES, CROP_PX, ZOOM = 4, 96, 2
@@ -63,12 +63,9 @@ def evaluation_report(
     title: str, mean: Sequence[Row], sites: Sequence[Row], swept: Sequence[Row], pictures: Sequence[Picture]
 ) -> Report:
     """The page: pictures, means, sites, and the sweep where there was one."""
-    tables = [
-        Table("Means over all pairs", mean, MEAN_CAPTION),
-        Table("PSNR by site, over 4095 DN", sites, "Pixels that clipped in the input or the reference are left out."),
-    ]
-    names = dict.fromkeys(row.table for row in swept)
-    tables += [Table(name.capitalize(), [row for row in swept if row.table == name]) for name in names]
+    tables = [Table("Means over all pairs", mean, MEAN_CAPTION)]
+    tables += [Table(name, rows, SITES_CAPTION) for name, rows in by_table(sites).items()]
+    tables += [Table(name.capitalize(), rows) for name, rows in by_table(swept).items()]
     return Report(title, headline(mean), tables, pictures, NOTES)
 
 
@@ -76,6 +73,7 @@ MEAN_CAPTION = (
     "Intervals: 95 % bootstrap over sites for image figures, 90 % for the MTF. What a method was told stands beside "
     "it: a method that knows the sensor has an advantage that it may not have in orbit."
 )
+SITES_CAPTION = "Over 4095 DN; from PSNR, pixels that clipped in the input or the reference are left out."
 NOTES = (
     "MTF at Nyquist is measured on restored slanted edges.",
     "SNR is measured in restored flat fields, where nothing is to be seen: a denoiser may reach any SNR there.",

@@ -87,19 +87,23 @@ def mean_row(
 
 
 def site_rows(rows: Sequence[Row]) -> list[Row]:
-    """PSNR by site: a row a site, a column a method, from the rows of the images."""
+    """PSNR, SSIM and what perceptual distances there are, by site: a row a site, a column a method."""
     images = [row for row in rows if row.table == "images"]
-    methods = list(dict.fromkeys(row.name.split(": ")[0] for row in images))
-    found = []
-    for site in dict.fromkeys(row.text["site"] for row in images):
-        figures = {}
-        for method in methods:
-            here = [row for row in images if row.text["site"] == site and row.name.startswith(f"{method}: ")]
-            values = [v for row in here if (v := row.figures["PSNR"].value) is not None]
-            source = f"mean PSNR of {len(values)} pairs"
-            figures[method] = measured(float(np.mean(values)), "dB", source) if values else here[0].figures["PSNR"]
-        found.append(Row("sites", site, figures, {"images": str(len(here))}))
-    return found
+    keys = [key for key in images[0].figures if key != "PSNR gain" and any(row.figures[key].value for row in images)]
+    sites = list(dict.fromkeys(row.text["site"] for row in images))
+    return [
+        _site_row(key, site, [row for row in images if row.text["site"] == site]) for key in keys for site in sites
+    ]
+
+
+def _site_row(key: str, site: str, images: Sequence[Row]) -> Row:
+    figures: dict[str, Figure] = {}
+    for method in dict.fromkeys(row.name.split(": ")[0] for row in images):
+        here = [row.figures[key] for row in images if row.name.startswith(f"{method}: ")]
+        values = [figure.value for figure in here if figure.value is not None]
+        source = f"mean {key} of {len(values)} pairs"
+        figures[method] = measured(float(np.mean(values)), here[0].unit, source) if values else here[0]
+    return Row(f"{key} by site", site, figures, {"images": str(len(here))})
 
 
 def fidelity_row(table: str, name: str, dn: np.ndarray, reference: np.ndarray, degraded: np.ndarray) -> Row:

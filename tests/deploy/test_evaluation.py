@@ -19,7 +19,7 @@ from deploy.evaluation.paper import paper_rows
 from deploy.evaluation.scores import Instruments, fidelity_db, score, site_rows
 from deploy.evaluation.targets import acquire_targets, flat_figure, mtf_figure, target_figures
 from deploy.restore import write_tiff
-from deploy.results import SCHEMA_PATH, Document
+from deploy.results import SCHEMA_PATH, Document, by_table
 from deploy.tables import missing
 from model.metrics.refusal import Refusal
 from model.simulator.procedural import procedural_scene
@@ -145,7 +145,9 @@ def test_identical_images_are_no_number() -> None:
 def test_sites_are_means_of_their_images() -> None:
     pairs = [pair("a_1.tif", 1, 10), pair("a_2.tif", 2, 40), pair("b_1.tif", 3, 20)]
     _, *images = score(IDENTITY, pairs, PLAIN, 0, lambda: None)
-    first, second = site_rows(images)
+    rows = site_rows(images)
+    assert list(by_table(rows)) == ["PSNR by site", "SSIM by site"]
+    first, second = rows[:2]
     levels = [row.figures["PSNR"].value or 0 for row in images]
     assert (first.name, second.name) == ("a", "b")
     assert first.figures["degraded"].value == pytest.approx(sum(levels[:2]) / 2)
