@@ -49,8 +49,8 @@ def mtf(fx: Tensor, fy: Tensor, mtf_nyquist: float, antialias_sigma_px: float = 
     """
     radius = torch.hypot(fx, fy)
     optics = torch.exp(-gamma_from_mtf(mtf_nyquist, antialias_sigma_px) * radius)
-    detector = torch.sinc(fx) * torch.sinc(fy)
-    return optics * detector * gaussian_response(radius, antialias_sigma_px)
+    response = optics * torch.sinc(fx) * torch.sinc(fy)
+    return response * gaussian_response(radius, antialias_sigma_px) if antialias_sigma_px else response
 
 
 def gaussian_response(frequency: Tensor, sigma_px: float) -> Tensor:
@@ -87,6 +87,11 @@ def transfer_function(
 
     `height` and `width` are in scene pixels, `oversampling` of which make one target pixel.
     """
-    fy = torch.fft.fftfreq(height, 1 / oversampling, dtype=torch.float64, device=device)[:, None]
-    fx = torch.fft.rfftfreq(width, 1 / oversampling, dtype=torch.float64, device=device)[None, :]
-    return (mtf(fx, fy, mtf_nyquist, antialias_sigma_px) * smear_response(fy, smear_px)).float()
+    fy, fx = (
+        torch.fft.rfftfreq(side, 1 / oversampling, dtype=torch.float64, device=device) for side in (height, width)
+    )
+    upper = mtf(fx[None, :], fy[:, None], mtf_nyquist, antialias_sigma_px)
+    if smear_px:
+        upper = upper * smear_response(fy[:, None], smear_px)
+    upper = upper.float()
+    return torch.cat([upper, upper[1 : (height + 1) // 2].flip(0)])  # even in fy: the rows below are the same

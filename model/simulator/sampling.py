@@ -35,10 +35,10 @@ def sample(
     centre = (oversampling - 1) / 2
     ramp_y = _ramp(torch.fft.fftfreq(height, device=spectrum.device), centre + offset_px[0])
     ramp_x = _ramp(torch.fft.rfftfreq(width, device=spectrum.device), centre + offset_px[1])
-    blurred = spectrum * transfer * ramp_y[:, None] * ramp_x
-    # Keeping every r-th row is adding up the r aliases of each frequency: the inverse FFT is r times smaller.
+    # Keeping every r-th row is adding up the r aliases of each frequency: what follows is r times smaller.
     rows = height // oversampling
-    folded = blurred.reshape(*blurred.shape[:-2], oversampling, rows, -1).sum(-3) / oversampling
+    blurred = (spectrum * transfer).mul_(ramp_y[:, None])
+    folded = blurred.reshape(*blurred.shape[:-2], oversampling, rows, -1).sum(-3).mul_(ramp_x / oversampling)
     lines: Tensor = torch.fft.irfft(torch.fft.ifft(folded, dim=-2), n=width, dim=-1)
     return lines[..., ::oversampling].contiguous()
 
