@@ -17,6 +17,7 @@ from deploy import __version__
 from deploy.commands import (
     bench,
     check,
+    compare,
     demo,
     evaluate,
     export,
@@ -95,6 +96,7 @@ COMMANDS: dict[str, tuple[Callable[..., None], str]] = {
     "bench": (bench.bench, bench.EXAMPLE),
     "restore": (restore.restore, restore.EXAMPLE),
     "evaluate": (evaluate.evaluate, evaluate.EXAMPLE),
+    "compare": (compare.compare, compare.EXAMPLE),
 }
 for name, (function, text) in COMMANDS.items():
     app.command(name, epilog=example(text))(function)

@@ -1,0 +1,64 @@
+"""`beers-deploy compare`: what changed between two runs, and whether a CI job should fail for it."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+EXAMPLE = "compare before.json after.json --fail-on 'MAE>2%' --fail-on 'PSNR<-0.05'"
+
+
+def compare(
+    before: Annotated[Path, typer.Argument(metavar="A.json", help="What a command wrote with --json.")],
+    after: Annotated[Path, typer.Argument(metavar="B.json", help="What it wrote later.")],
+    fail_on: Annotated[
+        list[str] | None,
+        typer.Option(metavar="CHANGE", help="NAME>CHANGE or NAME<CHANGE, in the figure's unit or in %; repeatable."),
+    ] = None,
+    json: Annotated[Path | None, typer.Option(help="Write the changes here.")] = None,
+) -> None:
+    """Show which figures of two results documents differ; exit code 1 if one changed more than --fail-on allows.
+
+    A figure named by --fail-on that the second document lacks fails too.
+    """
+    from deploy.compare import broken, change_rows, parse_limit, read_document
+    from deploy.compare import compare as compare_documents
+    from deploy.results import Document
+    from deploy.tables import print_rows
+    from model.files import require_writable
+
+    require_writable(json)
+    limits = [parse_limit(text) for text in fail_on or ()]
+    documents = read_document(before), read_document(after)
+    found = compare_documents(*documents)
+    rows = change_rows(found.changed)
+    if rows:
+        print_rows(f"{before.name} -> {after.name}", rows)
+    counts = f"{len(rows)} changed, {len(found.gone)} gone, {len(found.new)} new"
+    typer.echo(f"{len(found.both)} figures in both, {counts}")
+    for note in differing(*documents):
+        typer.echo(note)
+    Document("compare", {"fail_on": ", ".join(fail_on or ())}, (before, after), tuple(rows)).write(json)
+    failed = broken(found, limits)
+    for line in failed:
+        typer.echo(f"FAILED {line}")
+    if failed:
+        raise typer.Exit(1)
+
+
+def differing(before: "Mapping[str, object]", after: "Mapping[str, object]") -> list[str]:
+    """What besides the code differs between two runs, a sentence each."""
+    notes = []
+    if before["command"] != after["command"]:
+        notes.append(f"note: another command: {before['command']}, {after['command']}")
+    if before["arguments"] != after["arguments"]:
+        notes.append("note: other arguments")
+    if before["inputs"] != after["inputs"]:
+        notes.append("note: other input files")
+    hosts: list[Mapping[str, object]] = [before["host"], after["host"]]  # type: ignore[list-item]
+    if any(hosts[0][key] != hosts[1][key] for key in ("machine", "cpus", "memory_gb")):
+        notes.append("note: another machine: measured times do not compare")
+    return notes

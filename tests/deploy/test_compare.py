@@ -1,0 +1,119 @@
+"""`compare`: what changed between two documents, and when that fails a job."""
+
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from deploy.cli import app
+from deploy.compare import compare, parse_limit, read_document
+from deploy.results import Document, Figure, Row, measured, predicted, unavailable
+
+
+def document(path: Path, psnr: float = 46.5, mae: float = 0.0006, more: tuple[Row, ...] = ()) -> Path:
+    figures = {"PSNR": measured(psnr, "dB", "22 pairs"), "MAE": measured(mae, "of full scale", "patches")}
+    rows = (
+        Row("gate", "network", figures),
+        Row("bench", "network", {"latency": predicted(42, "s", (30, 60), "model")}),
+    )
+    Document("gate", {"model": "a.onnx"}, (), (*rows, *more)).write(path)
+    return path
+
+
+def run(*arguments: object) -> tuple[int, str]:
+    result = CliRunner().invoke(app, ["compare", *map(str, arguments)])
+    assert "Traceback" not in result.output
+    return result.exit_code, " ".join(result.output.split())
+
+
+def test_the_same_document_has_not_changed(tmp_path: Path) -> None:
+    one = document(tmp_path / "a.json")
+    code, output = run(one, one, "--fail-on", "PSNR<0", "--fail-on", "MAE>0%")
+    assert code == 0
+    assert "3 figures in both, 0 changed, 0 gone, 0 new" in output
+
+
+@pytest.mark.parametrize(
+    ("limit", "code"),
+    [
+        ("PSNR<-0.05", 1),
+        ("PSNR<-0.2", 0),
+        ("PSNR>0", 0),
+        ("MAE>2%", 1),
+        ("MAE>20%", 0),
+        ("MAE<0", 0),
+        ("latency>0", 0),
+    ],
+)
+def test_a_limit_knows_its_direction_and_its_unit(limit: str, code: int, tmp_path: Path) -> None:
+    before, after = document(tmp_path / "a.json"), document(tmp_path / "b.json", psnr=46.4, mae=0.00066)
+    found, output = run(before, after, "--fail-on", limit)
+    assert found == code
+    assert "2 changed" in output
+    assert ("FAILED gate / network" in output) == bool(code)
+
+
+def test_figures_that_come_and_go_are_counted_and_a_watched_one_that_goes_fails(tmp_path: Path) -> None:
+    extra = Row("gate", "other", {"SSIM": measured(0.99, "ratio", "pairs"), "LPIPS": unavailable("distance", "none")})
+    with_more, without = document(tmp_path / "a.json", more=(extra,)), document(tmp_path / "b.json")
+    assert run(with_more, without) == (0, run(with_more, without)[1])
+    assert "2 gone, 0 new" in run(with_more, without)[1]
+    assert "0 gone, 2 new" in run(without, with_more)[1]
+    assert run(with_more, without, "--fail-on", "SSIM<-1")[0] == 1
+
+
+def test_from_nothing_any_rise_is_endless() -> None:
+    limit = parse_limit("saturated>5%")
+    for value, broken in ((0.0, False), (1e-9, True)):
+        changed = compare(*({"rows": [as_row(v)]} for v in (0.0, value))).both[0]
+        assert limit.broken_by(changed) is broken
+
+
+def as_row(value: float) -> dict[str, object]:
+    figure: Figure = measured(value, "%", "seen")
+    return {"table": "t", "name": "n", "figures": {"saturated": figure.to_json()}, "text": {}}
+
+
+def test_a_written_comparison_is_a_document_again(tmp_path: Path) -> None:
+    before, after = document(tmp_path / "a.json"), document(tmp_path / "b.json", psnr=40)
+    assert run(before, after, "--json", tmp_path / "c.json")[0] == 0
+    assert read_document(tmp_path / "c.json")["command"] == "compare"
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [(None, "no such file"), ("", "Expecting value"), ("[]", "another document"), ("{}", "required")],
+)
+def test_what_is_no_document_gets_one_sentence(content: str | None, words: str, tmp_path: Path) -> None:
+    if content is not None:
+        (tmp_path / "x.json").write_text(content)
+    code, output = run(document(tmp_path / "a.json"), tmp_path / "x.json")
+    assert code == 2
+    assert words in output
+
+
+def test_a_watched_figure_that_can_no_longer_be_had_fails(tmp_path: Path) -> None:
+    rows = [
+        {"LPIPS": figure} for figure in (measured(0.01, "distance", "pairs"), unavailable("distance", "no weights"))
+    ]
+    names = ("a.json", "b.json")
+    for name, figures in zip(names, rows, strict=True):
+        Document("gate", {}, (), (Row("gate", "network", figures),)).write(tmp_path / name)
+    paths = [tmp_path / name for name in names]
+    assert run(*paths, "--fail-on", "LPIPS>1")[0] == 1
+    assert run(*reversed(paths), "--fail-on", "LPIPS>1")[0] == 0
+
+
+def test_a_limit_on_a_figure_that_is_not_there_is_refused(tmp_path: Path) -> None:
+    one = document(tmp_path / "a.json")
+    code, output = run(one, one, "--fail-on", "PSMR<0")
+    assert code == 2
+    assert "MAE, PSNR, latency" in output
+
+
+@pytest.mark.parametrize("text", ["PSNR", "PSNR=3", ">3", "PSNR<lots"])
+def test_what_is_no_limit_gets_one_sentence(text: str, tmp_path: Path) -> None:
+    one = document(tmp_path / "a.json")
+    code, output = run(one, one, "--fail-on", text)
+    assert code == 2
+    assert "NAME>CHANGE" in output
