@@ -8,15 +8,17 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from deploy.dpu.board import Dpu
-from deploy.dpu.cost import Prediction, predict
+from deploy.dpu.cost import LayerCost, Prediction, predict
+from deploy.dpu.energy import counted_power, energy_source, layer_energy_j
 from deploy.dpu.frames import paper_frames, whole_tiles
 from deploy.dpu.placement import place
 from deploy.dpu.power import dpu_power
 from deploy.dpu.reading import read_network
 from deploy.results import Figure, Row, predicted, published
 
-TABLE = "bench"
-COST_SOURCE = "structural cost model fitted on 10 published networks, see deploy/dpu/cost.py"
+TABLE, LAYERS = "bench", "layers"
+COST_SOURCE = "cost model fitted on published networks, docs/cost-model.md"
+ARITHMETIC = "arithmetic of the tile grid"
 PAPER = "ConvBEERS paper, table of the VCK190 benchmark, 13600 x 9016"
 PAPER_TILE_PX = 640
 
@@ -45,6 +47,10 @@ class Swath:
         """Whole tiles of the grid."""
         return whole_tiles(self.width_px, self.height_px, self.tile_px, self.halo_px)
 
+    def work_factor(self, tiles: float) -> float:
+        """Pixels computed over pixels of the image."""
+        return tiles * self.tile_px**2 / self.pixels
+
 
 def predict_file(model: Path, dpu: Dpu, tile_px: int = PAPER_TILE_PX) -> Prediction:
     """What the cost model says of an ONNX file.
@@ -69,18 +75,39 @@ def predicted_rows(name: str, prediction: Prediction, swath: Swath, dpu: Dpu) ->
 
 
 def _predicted_row(name: str, prediction: Prediction, swath: Swath, dpu: Dpu, frames: float, batches: float) -> Row:
-    power = dpu_power(dpu)
-    slow_s, fast_s = (batches * prediction.batch / fps for fps in prediction.fps_interval)
-    latency = predicted(batches * prediction.batch_time_s, "s", (fast_s, slow_s), COST_SOURCE)
-    count = "arithmetic of the tile grid"
+    power, latency = dpu_power(dpu), swath_latency(prediction, batches)
+    host_ms = 1e3 * prediction.host_s
     figures = {
-        "tiles": predicted(frames, "tile", (frames, frames), count),
+        "tiles": exact(frames, "tile", ARITHMETIC),
+        "work factor": exact(swath.work_factor(frames), "px/px", ARITHMETIC),
         "latency": latency,
         "throughput": predicted(prediction.fps, "frame/s", prediction.fps_interval, COST_SOURCE),
+        "host beside the DPU": scaled(host_ms, "ms/tile", prediction, COST_SOURCE),
         "power": power,
+        "power of products and traffic": counted_power(prediction, dpu),
+        "energy": energy(latency, power),
         "efficiency": efficiency(swath.pixels, latency, power),
     }
-    return Row(TABLE, name, figures)
+    return Row(TABLE, name, figures, {"fitted range": fitted_range(prediction)})
+
+
+def swath_latency(prediction: Prediction, batches: float) -> Figure:
+    """Time of so many batches, in seconds."""
+    images = batches * prediction.batch
+    slow_s, fast_s = (images / fps for fps in prediction.fps_interval)
+    return predicted(images / prediction.fps, "s", (fast_s, slow_s), COST_SOURCE)
+
+
+def fitted_range(prediction: Prediction) -> str:
+    """Whether the fitted networks speak for this one."""
+    return f"outside: {'; '.join(prediction.outside)}" if prediction.outside else "inside"
+
+
+def energy(latency: Figure, power: Figure) -> Figure:
+    """Energy of the swath, in J: time and power, and their ends."""
+    (fast_s, slow_s), (low_w, high_w) = (f.interval or (f.value or 0.0, f.value or 0.0) for f in (latency, power))
+    value = (latency.value or 0.0) * (power.value or 0.0)
+    return predicted(value, "J", (fast_s * low_w, slow_s * high_w), f"{latency.source}; {power.source}")
 
 
 def efficiency(pixels: int, latency: Figure, power: Figure) -> Figure:
@@ -109,33 +136,50 @@ def published_rows() -> list[Row]:
     ]
 
 
-def layer_rows(prediction: Prediction) -> list[Row]:
-    """One row a layer and one for the overhead; their times add up to that of a batch, the last row."""
-    rows = [
-        Row(
-            "layers",
-            layer.name,
-            {
-                "work": _exact(layer.operations / 1e9, "GOP"),
-                "time": _scaled(layer.time_s, prediction),
-                "LdFM": _exact(layer.load_map_bytes / 1e6, "MB"),
-                "LdWB": _exact(layer.load_weight_bytes / 1e6, "MB"),
-                "StFM": _exact(layer.store_map_bytes / 1e6, "MB"),
-                "array use": _exact(100 * layer.array_use, "%"),
-            },
-        )
-        for layer in prediction.layers
-    ]
-    rows.append(Row("layers", "start of a batch", {"time": _scaled(prediction.overhead_s, prediction)}))
+def layer_rows(prediction: Prediction, dpu: Dpu) -> list[Row]:
+    """One row a layer and one for the start of a batch; their times add up to that of a batch, the last row.
+
+    The columns are those of AMD's vaitrace, with what bounds the layer; bytes and energy are those of one image.
+    """
+    rows = [_layer_row(layer, prediction, dpu) for layer in prediction.layers]
+    rows.append(
+        Row(LAYERS, "start of a batch", {"time": _time(prediction.overhead_s, prediction)}, {"bound": "overhead"})
+    )
     total = f"sum: one batch of {prediction.batch}"
-    return [*rows, Row("layers", total, {"time": _scaled(prediction.batch_time_s, prediction)})]
+    return [*rows, Row(LAYERS, total, {"time": _time(prediction.batch_time_s, prediction)})]
 
 
-def _exact(value: float, unit: str) -> Figure:
-    return predicted(value, unit, (value, value), "arithmetic of the graph's shapes, one image")
+def _layer_row(layer: LayerCost, prediction: Prediction, dpu: Dpu) -> Row:
+    work, batch, low_high_j = layer.work, prediction.batch, layer_energy_j(layer, dpu)
+    moved = batch * (work.load_map_bytes + work.store_map_bytes) + work.weight_bytes
+    seconds = layer.time_s or math.inf  # a concat takes no time of its own
+    figures = {
+        "work": exact(work.operations / 1e9, "GOP"),
+        "time": _time(layer.time_s, prediction),
+        "rate": scaled(batch * work.operations / seconds / 1e9, "GOP/s", prediction, COST_SOURCE, falls=True),
+        "LdFM": exact(work.load_map_bytes / 1e6, "MB"),
+        "LdWB": exact(work.weight_bytes / 1e6, "MB"),
+        "StFM": exact(work.store_map_bytes / 1e6, "MB"),
+        "bandwidth": scaled(moved / seconds / 1e9, "GB/s", prediction, COST_SOURCE, falls=True),
+        "array use": exact(100 * work.array_use, "%"),
+        "energy": predicted(
+            500 * sum(low_high_j), "mJ", (1e3 * low_high_j[0], 1e3 * low_high_j[1]), energy_source(dpu)
+        ),
+    }
+    return Row(LAYERS, work.name, figures, {"bound": layer.bound})
 
 
-def _scaled(time_s: float, prediction: Prediction) -> Figure:
-    """A share of the batch time, with the relative error of the whole."""
+def _time(time_s: float, prediction: Prediction) -> Figure:
+    return scaled(1e3 * time_s, "ms/batch", prediction, COST_SOURCE)
+
+
+def exact(value: float, unit: str, source: str = "arithmetic of the graph's shapes, one image") -> Figure:
+    """A number that follows from shapes alone."""
+    return predicted(value, unit, (value, value), source)
+
+
+def scaled(value: float, unit: str, prediction: Prediction, source: str, *, falls: bool = False) -> Figure:
+    """A part of the prediction, with the relative error of the whole; `falls` where more time means less of it."""
     slow, fast = (prediction.fps / fps for fps in prediction.fps_interval)
-    return predicted(1e3 * time_s, "ms/batch", (1e3 * time_s * fast, 1e3 * time_s * slow), COST_SOURCE)
+    ends = (value / slow, value / fast) if falls else (value * fast, value * slow)
+    return predicted(value, unit, ends, source)

@@ -1,24 +1,29 @@
 """What this machine takes: the traditional pipeline on an image, and a network's time for a tile."""
 
 import statistics
+import time
 from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 
 import numpy as np
+import psutil
 import torch
 
 from deploy.bench import TABLE, Swath, efficiency
+from deploy.counterpart import counterpart, is_quantised
+from deploy.cpu_side import board_cpu_row
 from deploy.energy import timed
-from deploy.results import Row, measured, predicted
+from deploy.host_state import Watch, watched
+from deploy.profiler import node_rows, profile
+from deploy.results import Figure, Row, measured, predicted
+from deploy.turns import Timed, take_turns, tile_feed, timed_rows
 from model.simulator.acquire import MARGIN_PX, simulate_pair
 from model.simulator.draws import Draw
 from model.simulator.procedural import procedural_scene
 from model.traditional.pipeline import Chain, restore_traditional
-from profiles import SensorProfile, TargetProfile
+from profiles import SensorProfile, TargetProfile, load_target
 from quant.onnx_file import load_onnx
-from quant.session import open_session
 
 CROP_PX = 256
 CROPS = 3
@@ -44,58 +49,86 @@ def drawn_acquisition(swath: Swath, sensors: Sensors, seed: int = 0) -> np.ndarr
 
 
 def traditional_rows(dn: np.ndarray, swath: Swath, sensors: Sensors, budget_s: float = 60.0) -> list[Row]:
-    """The traditional pipeline on (H, W) digital numbers: whole if that fits in the budget, else by proportion.
+    """The traditional pipeline on (H, W) digital numbers, here, and scaled to the board's processor.
 
     Crops are timed first, one small run for warm-up left out. When `dn` is the whole swath and its estimate lies
     within `budget_s`, it is run whole and its time is measured; else the swath's is predicted from the crops', with
     the fastest and the slowest crop as its interval.
     """
-    crops = list(_crops(dn))
-    _restore(crops[0][:32, :32], sensors)
-    timings, _, power = timed(lambda: [timed(partial(_restore, crop, sensors))[1] for crop in crops])
-    times_s = [t * swath.pixels / crop.size for t, crop in zip(timings, crops, strict=True)]
-    estimate_s, place = statistics.median(times_s), f"here, {torch.get_num_threads()} threads"
-    if dn.size == swath.pixels and estimate_s <= budget_s:
-        _, elapsed_s, power = timed(lambda: _restore(dn, sensors))
-        source = f"the whole image, {place}"
-        latency = measured(elapsed_s, "s", source)
-        throughput = measured(swath.frames / elapsed_s, "frame/s", source)
-    else:
-        source = f"by proportion from {len(crops)} crops of {crops[0].shape[1]} x {crops[0].shape[0]}, {place}"
-        fast_s, slow_s = min(times_s), max(times_s)
-        latency = predicted(estimate_s, "s", (fast_s, slow_s), source)
-        rates = (swath.frames / slow_s, swath.frames / fast_s)
-        throughput = predicted(swath.frames / estimate_s, "frame/s", rates, source)
+    threads = torch.get_num_threads()
+    with watched() as watch:
+        latency, cpu_s, power = _chain_latency(dn, swath, sensors, budget_s, f"here, {threads} threads")
     figures = {
         "latency": latency,
-        "throughput": throughput,
+        "throughput": _rate(swath.frames, latency),
         "power": power,
         "efficiency": efficiency(swath.pixels, latency, power),
+        **_conditions(watch, threads),
     }
-    return [Row(TABLE, "traditional pipeline on this CPU", figures)]
+    board = board_cpu_row(cpu_s, swath, load_target("vck190"), load_target("host-cpu"))
+    return [Row(TABLE, "traditional pipeline on this CPU", figures), board]
+
+
+def _chain_latency(
+    dn: np.ndarray, swath: Swath, sensors: Sensors, budget_s: float, place: str
+) -> tuple[Figure, tuple[float, float], Figure]:
+    """Of the chain on the swath: latency, CPU time of all cores in s (lowest, highest), and the processor's power."""
+    crops = list(_crops(dn))
+    _restore(crops[0][:32, :32], sensors)
+    timings, _, power = timed(lambda: [_wall_and_cpu_s(crop, sensors) for crop in crops])
+    wall_s, cpu_s = (
+        [t * swath.pixels / crop.size for t, crop in zip(times, crops, strict=True)]
+        for times in zip(*timings, strict=True)
+    )
+    estimate_s = statistics.median(wall_s)
+    if dn.size == swath.pixels and estimate_s <= budget_s:
+        (elapsed_s, whole_cpu_s), _, power = timed(lambda: _wall_and_cpu_s(dn, sensors))
+        return measured(elapsed_s, "s", f"the whole image, {place}"), (whole_cpu_s, whole_cpu_s), power
+    source = f"by proportion from {len(crops)} crops of {crops[0].shape[1]} x {crops[0].shape[0]}, {place}"
+    return predicted(estimate_s, "s", (min(wall_s), max(wall_s)), source), (min(cpu_s), max(cpu_s)), power
+
+
+def _wall_and_cpu_s(dn: np.ndarray, sensors: Sensors) -> tuple[float, float]:
+    """What the chain takes on the wall's clock, and of all this process's cores together."""
+    wall, cpu = time.perf_counter(), time.process_time()
+    _restore(dn, sensors)
+    return time.perf_counter() - wall, time.process_time() - cpu
 
 
 def host_rows(model: Path, target: TargetProfile, tile_px: int, threads: int = 0) -> list[Row]:
-    """A network's time for one tile through onnxruntime: median and 90th percentile over a minimum time and count."""
-    session = open_session(load_onnx(model), threads)
-    feed = {i.name: np.full((1, i.shape[1], tile_px, tile_px), 0.25, np.float32) for i in session.get_inputs()}
-    session.run(None, feed)  # warm-up, not counted
-    min_time_s, min_runs = target.value("measurement", "min_time_s"), target.value("measurement", "min_runs")
-    samples: list[float] = []
+    """A network's time for one tile through onnxruntime, float32 and INT8 taking turns, and its nodes' times.
 
-    def repeat() -> None:
-        while len(samples) < min_runs or sum(samples) < min_time_s:
-            samples.append(timed(lambda: session.run(None, feed))[1])
+    Each runs for the target's minimum time and count, one run for warm-up left out. Its counterpart in the other
+    precision is the shipped network of the same variant; without one it runs alone.
+    """
+    given = load_onnx(model)
+    other = counterpart(given)
+    runs = [Timed(model.stem, given)]
+    if other is not None:
+        runs.append(Timed(f"{'INT8' if is_quantised(other) else 'float32'} of the same shape", other))
+    min_time_s, min_runs = target.value("measurement", "min_time_s"), int(target.value("measurement", "min_runs"))
+    with watched() as watch:
+        take_turns(runs, tile_px, threads, min_time_s, min_runs)
+    conditions = _conditions(watch, threads or psutil.cpu_count(logical=False) or 1)
+    nodes, total_ms = profile(given, tile_feed(given, tile_px), threads)
+    return [*timed_rows(runs, tile_px, conditions), *node_rows(nodes, total_ms)]
 
-    _, total_s, power = timed(repeat)
-    source = f"{len(samples)} runs in {total_s:.1f} s after one for warm-up, loading left out"
-    figures = {
-        "p50": measured(1e3 * float(np.percentile(samples, 50)), "ms/tile", source),
-        "p90": measured(1e3 * float(np.percentile(samples, 90)), "ms/tile", source),
-        "throughput": measured(len(samples) / total_s, "frame/s", source),
-        "power": power,
+
+def _conditions(watch: Watch, threads: int) -> dict[str, Figure]:
+    return {
+        "threads": measured(threads, "thread", "of the runtime"),
+        "CPU load": watch.load,
+        "clock": watch.clock,
     }
-    return [Row("host", f"{model.stem}, {tile_px} x {tile_px}", figures)]
+
+
+def _rate(frames: float, latency: Figure) -> Figure:
+    """Frames a second, of the latency's own mode."""
+    time_s = latency.value or 0.0
+    if latency.interval is None:
+        return measured(frames / time_s, "frame/s", latency.source)
+    low, high = latency.interval
+    return predicted(frames / time_s, "frame/s", (frames / high, frames / low), latency.source)
 
 
 def _crops(dn: np.ndarray) -> Iterator[np.ndarray]:

@@ -12,7 +12,11 @@ from profiles.errors import ModelError
 
 
 def open_session(
-    model: Path | onnx.ModelProto, threads: int = 0, optimise: bool = True, exact: bool | None = None
+    model: Path | onnx.ModelProto,
+    threads: int = 0,
+    optimise: bool = True,
+    exact: bool | None = None,
+    profile: Path | None = None,
 ) -> ort.InferenceSession:
     """Open a model on the CPU.
 
@@ -24,6 +28,7 @@ def open_session(
         threads: 0 takes every core.
         optimise: False runs the graph as written.
         exact: take the exact int8 kernels; None decides by the processor.
+        profile: write the runtime's own profile to files of this prefix.
 
     Raises:
         ModelError: onnxruntime refuses the model.
@@ -37,6 +42,9 @@ def open_session(
         options.add_session_config_entry("session.x64quantprecision", "1")
     if not optimise:
         options.graph_optimization_level = ort.GraphOptimizationLevel.ORT_DISABLE_ALL
+    if profile is not None:
+        options.enable_profiling = True
+        options.profile_file_prefix = str(profile)
     source = model.SerializeToString() if isinstance(model, onnx.ModelProto) else str(model)
     name = "ONNX model" if isinstance(model, onnx.ModelProto) else str(model)
     try:

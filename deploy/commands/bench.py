@@ -1,5 +1,6 @@
 """`beers-deploy bench`: time, throughput, power and efficiency; predicted, measured and published side by side."""
 
+from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -8,6 +9,7 @@ import typer
 
 if TYPE_CHECKING:
     from deploy.bench import Swath
+    from deploy.dpu.board import Dpu
     from deploy.results import Row
 
 EXAMPLE = "bench --target vck190-model --size 13600x9016 --config C32B3"
@@ -31,9 +33,12 @@ def bench(
     target: Annotated[Target, typer.Option(help="The modelled board, or this machine.")] = Target.vck190_model,
     image: Annotated[Path | None, typer.Option(help="Mono image of at most 12 bits: the swath.")] = None,
     size: Annotated[str | None, typer.Option(help=f"Size of the swath in pixels; {PAPER_SIZE} if none.")] = None,
-    tile: Annotated[int, typer.Option(min=16, help="Tile side in pixels.")] = 640,
+    tile: Annotated[str, typer.Option(help="Tile side in pixels; several with commas are swept.")] = "640",
     halo: Annotated[str, typer.Option(help="Context around a tile: 'exact' (no seams) or pixels.")] = "exact",
-    config: Annotated[str | None, typer.Option(help="DPU configuration, C32B1 to C64B5.")] = None,
+    config: Annotated[str | None, typer.Option(help="DPU configuration, C32B1 to C64B5; 'all' sweeps them.")] = None,
+    measured: Annotated[
+        Path | None, typer.Option(help="JSON list of your board's runs: the cost model is refitted to them first.")
+    ] = None,
     budget: Annotated[
         float, typer.Option(min=0, help="Seconds that the traditional pipeline may take to be run on a whole image.")
     ] = 60.0,
@@ -41,62 +46,127 @@ def bench(
     json: Annotated[Path | None, typer.Option(help="Write the figures here.")] = None,
 ) -> None:
     """Compare a network on the DPU with the traditional pipeline on this CPU and with the paper's figures."""
+    from deploy.bench_sweep import parse_tiles
     from deploy.defaults import default_int8
     from deploy.measure import host_rows
-    from deploy.results import Document
+    from deploy.results import Document, by_table
     from deploy.tables import print_rows
     from model.files import require_writable
     from profiles import load_target
 
     require_writable(json)
-    path = model or default_int8()
+    path, tiles = model or default_int8(), parse_tiles(tile)
     if target is Target.host:
-        rows = host_rows(path, load_target("host-cpu"), tile, threads)
-        print_rows(f"{path.name} on this machine", rows)
+        rows = host_rows(path, load_target("host-cpu"), _single(tiles), threads)
+        for table, part in by_table(rows).items():
+            print_rows(f"{path.name} on this machine: {table}", part)
         typer.echo(NO_PROXY)
     else:
-        rows = _on_the_board(path, image, size, tile, halo, config, budget)
+        rows = _on_the_board(path, _Request(image, size, tiles, halo, config, measured), budget)
         typer.echo(PREDICTED)
-    arguments = {"target": target.value, "size": size, "tile": tile, "halo": halo, "config": config}
-    inputs = (path, image) if image else (path,)
+    arguments = {
+        "target": target.value,
+        "size": size,
+        "tile": tile,
+        "halo": halo,
+        "config": config,
+        "measured": measured.name if measured else None,
+    }
+    inputs = tuple(file for file in (path, image, measured) if file)
     Document("bench", arguments, inputs, tuple(rows)).write(json)
 
 
-def _on_the_board(
-    path: Path, image: Path | None, size: str | None, tile: int, halo: str, config: str | None, budget_s: float
-) -> "list[Row]":
-    from deploy.bench import layer_rows, predict_file, predicted_rows, published_rows
-    from deploy.dpu.board import load_dpu
+@dataclass(frozen=True)
+class _Request:
+    """What the user wants to know of the board."""
+
+    image: Path | None
+    size: str | None
+    tiles_px: list[int]
+    halo: str
+    config: str | None
+    measured: Path | None
+
+
+def _on_the_board(path: Path, request: _Request, budget_s: float) -> "list[Row]":
+    from deploy.bench import published_rows
     from deploy.measure import Sensors, drawn_acquisition, traditional_rows
     from deploy.restore import read_acquisition
     from deploy.tables import print_rows
     from profiles import load_sensor
 
-    dpu, sensors = (
-        load_dpu("vck190", config),
-        Sensors(load_sensor("pleiades-degraded"), load_sensor("pleiades-reference")),
-    )
-    dn = read_acquisition(image) if image else None
-    swath = _swath(path, dn.shape if dn is not None else None, size, tile, halo)
-    prediction = predict_file(path, dpu, tile)
-    layers = layer_rows(prediction)
-    print_rows(f"{path.name}, one batch on {dpu.name}", layers)
-    rows = predicted_rows(path.stem, prediction, swath, dpu)
+    sensors = Sensors(load_sensor("pleiades-degraded"), load_sensor("pleiades-reference"))
+    dn = read_acquisition(request.image) if request.image else None
+    swath = _swath(path, dn.shape if dn is not None else None, request)
+    boards, refitted = _boards(request)
+    single = len(boards) == len(request.tiles_px) == 1
+    rows, layers = _single_rows(path, boards[0], swath) if single else _sweep(path, boards, request.tiles_px, swath)
     rows += traditional_rows(dn if dn is not None else drawn_acquisition(swath, sensors), swath, sensors, budget_s)
     rows += published_rows()
+    print_rows(f"{swath.width_px} x {swath.height_px} pixels in tiles of {swath.tile_px}", rows)
+    return [*rows, *layers, *refitted]
+
+
+def _single_rows(path: Path, dpu: "Dpu", swath: "Swath") -> "tuple[list[Row], list[Row]]":
+    """The rows of the swath and of the layers, these printed."""
+    from deploy.bench import layer_rows, predict_file, predicted_rows
+    from deploy.tables import print_rows
+
+    prediction = predict_file(path, dpu, swath.tile_px)
+    layers = layer_rows(prediction, dpu)
+    print_rows(f"{path.name}, one batch on {dpu.name}", layers)
     if prediction.note:
         typer.echo(prediction.note)
-    print_rows(f"{swath.width_px} x {swath.height_px} pixels in tiles of {tile}", rows)
-    return [*rows, *layers]
+    return predicted_rows(path.stem, prediction, swath, dpu), layers
 
 
-def _swath(path: Path, shape: tuple[int, ...] | None, size: str | None, tile: int, halo: str) -> "Swath":
+def _sweep(path: Path, boards: "list[Dpu]", tiles_px: list[int], swath: "Swath") -> "tuple[list[Row], list[Row]]":
+    """No rows of one swath, but those of the sweep, printed."""
+    from deploy.bench_sweep import sweep_rows
+    from deploy.tables import print_rows
+
+    rows = sweep_rows(path, swath, boards, tiles_px)
+    size = f"{swath.width_px} x {swath.height_px} pixels"
+    print_rows(f"{path.name}, {size} in whole tiles, halo {swath.halo_px} px", rows)
+    return [], rows
+
+
+def _boards(request: _Request) -> "tuple[list[Dpu], list[Row]]":
+    """The configurations asked for; their constants refitted where runs are given, and the rows that say so."""
+    from deploy.dpu.board import load_dpu
+    from deploy.refit import refit
+    from deploy.tables import print_rows
+    from profiles import load_target
+
+    names = list(load_target("vck190").configurations) if request.config == "all" else [request.config]
+    boards = [load_dpu("vck190", name) for name in names]
+    if request.measured is None:
+        return boards, []
+    found = refit(request.measured, boards[0])
+    constants, runs = found.constant_rows(), found.run_rows()
+    print_rows(found.source, constants)
+    print_rows("your runs", runs)
+    return [found.applied(dpu) for dpu in boards], [*constants, *runs]
+
+
+def _single(tiles: list[int]) -> int:
+    from profiles.errors import OptionError
+
+    if len(tiles) > 1:
+        raise OptionError(
+            "--tile", expected="one size with --target host", got=str(tiles), remedy="run it once a size"
+        )
+    return tiles[0]
+
+
+def _swath(path: Path, shape: tuple[int, ...] | None, request: _Request) -> "Swath":
     from deploy.bench import Swath
     from deploy.restore import parse_halo
     from profiles.errors import OptionError
     from quant.onnx_file import load_onnx
     from quant.radius import receptive_radius_px
 
+    size, halo, tile = request.size, request.halo, request.tiles_px[0]
     if shape is not None and size is not None:
         raise OptionError("--size", expected="none with --image", got=size, remedy="give one of the two")
     width_px, height_px = (shape[1], shape[0]) if shape else parse_size(size or PAPER_SIZE)

@@ -6,17 +6,19 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 if TYPE_CHECKING:
-    from deploy.dpu.placement import PlacedNode, Placement
-    from deploy.results import Row
+    from deploy.dpu.board import Dpu
 
 EXAMPLE = "check network.onnx --target vck190 --config C32B3"
+TRADITIONAL = Path("traditional")
 
 
 def check(
     model: Annotated[
         Path | None,
         typer.Argument(
-            metavar="[MODEL]", help="ONNX network, float, INT8 or board core; the shipped INT8 one if none."
+            metavar="[MODEL]",
+            help="ONNX network: float, INT8 or board core, anyone's; 'traditional' for the operators of that chain; "
+            "the shipped INT8 one if none.",
         ),
     ] = None,
     target: Annotated[str, typer.Option(help="Profile of a board with a DPU.")] = "vck190",
@@ -24,79 +26,64 @@ def check(
         str | None, typer.Option(help="DPU configuration, C32B1 to C64B5; the target's own if none.")
     ] = None,
     tile: Annotated[int, typer.Option(min=1, help="Tile side in pixels.")] = 640,
+    picture: Annotated[
+        Path | None, typer.Option(help="Draw the graph here, coloured by device: a .svg or .html file.")
+    ] = None,
     json: Annotated[Path | None, typer.Option(help="Write the findings here.")] = None,
 ) -> None:
     """Place every node of a network on the host, the DPU or the CPU; exit code 1 if the DPU cannot run its part."""
     from deploy.defaults import default_int8
     from deploy.dpu.board import load_dpu
+    from deploy.dpu.picture import require_picture
+    from model.files import require_writable
+
+    require_picture(picture)
+    require_writable(picture, json)
+    dpu = load_dpu(target, config)
+    if model == TRADITIONAL:
+        legal = _traditional(dpu, picture, json)
+    else:
+        legal = _network(model or default_int8(), dpu, tile, picture, json)
+    if not legal:
+        raise typer.Exit(1)
+
+
+def _network(path: Path, dpu: "Dpu", tile_px: int, picture: Path | None, json: Path | None) -> bool:
+    """Judge a file; whether its core runs whole on the DPU."""
+    from deploy.dpu.checking import network_rows, summary
+    from deploy.dpu.picture import write_picture
     from deploy.dpu.placement import place
     from deploy.dpu.reading import read_network
     from deploy.results import Document
     from deploy.tables import print_rows
 
-    path, dpu = model or default_int8(), load_dpu(target, config)
-    placement = place(read_network(path, tile), dpu)
-    rows = [row for node in placement.nodes for row in node_rows(node)]
-    print_rows(f"{path.name} on {dpu.target.name} {dpu.name}, tile {tile}", rows)
-    arguments = {"target": target, "config": dpu.name, "tile": tile}
-    Document("check", arguments, (path,), (*rows, *summary_rows(placement))).write(json)
-    for line in summary(placement):
+    placement = place(read_network(path, tile_px), dpu)
+    title = f"{path.name} on {dpu.target.name} {dpu.name}, tile {tile_px}"
+    rows = network_rows(placement, dpu, tile_px)
+    print_rows(title, [row for row in rows if row.table == "nodes"])
+    if picture is not None:
+        write_picture(placement, title, picture)
+    arguments = {"target": dpu.target.name, "config": dpu.name, "tile": tile_px}
+    Document("check", arguments, (path,), tuple(rows)).write(json)
+    for line in summary(placement, dpu, tile_px):
         typer.echo(line)
-    if placement.failed:
-        raise typer.Exit(1)
+    return not placement.failed
 
 
-def node_rows(node: "PlacedNode") -> "list[Row]":
-    """One row for a node that keeps the rules, one for each rule that another breaks."""
-    from deploy.results import Row
+def _traditional(dpu: "Dpu", picture: Path | None, json: Path | None) -> bool:
+    """Judge the operators of the traditional chain; whether the DPU could run them all."""
+    from deploy.dpu.checking import step_rows
+    from deploy.dpu.traditional import judge_traditional, verdict
+    from deploy.results import Document
+    from deploy.tables import print_rows
+    from profiles.errors import OptionError
 
-    words = {"operator": node.op.op_type, "part": node.part, "device": node.device}
-    if not node.broken:
-        return [Row("nodes", node.op.name, {}, words)]
-    return [
-        Row(
-            "nodes",
-            node.op.name,
-            {},
-            {**words, "rule": broken.text, "reason": broken.finding.reason, "remedy": broken.finding.remedy},
-        )
-        for broken in node.broken
-    ]
-
-
-def summary_rows(placement: "Placement") -> "list[Row]":
-    """The number of DPU subgraphs, and the tensors that cross to and from it."""
-    from deploy.results import Row, predicted
-
-    source = "operator rules of the target profile"
-    count = len(placement.failed)
-    figures = {
-        "DPU subgraphs": predicted(n := placement.dpu_subgraphs, "subgraph", (n, n), source),
-        "nodes refused": predicted(count, "node", (count, count), source),
-    }
-    cuts = [
-        Row(
-            "cuts",
-            cut.tensor,
-            {"size": predicted(cut.size_bytes, "byte/image", (cut.size_bytes, cut.size_bytes), source)},
-            {"direction": "onto the DPU" if cut.onto_dpu else "off the DPU"},
-        )
-        for cut in placement.cuts
-    ]
-    return [Row("summary", "placement", figures), *cuts]
-
-
-def summary(placement: "Placement") -> list[str]:
-    """What a person wants to know, in a few lines."""
-    lines = [f"DPU subgraphs: {placement.dpu_subgraphs}"]
-    lines += [
-        f"{'to' if cut.onto_dpu else 'from'} the DPU: {cut.tensor}, {cut.size_bytes / 1e6:.2f} MB an image as int8"
-        for cut in placement.cuts
-    ]
-    if placement.note:
-        lines.append(placement.note)
-    if placement.failed:
-        lines.append(f"check FAILED: {len(placement.failed)} nodes of the core cannot run on the DPU")
-    else:
-        lines.append("check passed: the core runs whole on the DPU")
-    return lines
+    if picture is not None:
+        remedy = "leave the option out, or give a network"
+        raise OptionError("--picture", expected="none with 'traditional'", got=str(picture), remedy=remedy)
+    steps = judge_traditional(dpu)
+    rows = [row for step in steps for row in step_rows(step)]
+    print_rows(f"the traditional chain on {dpu.target.name} {dpu.name}", rows)
+    Document("check", {"target": dpu.target.name, "config": dpu.name}, (), tuple(rows)).write(json)
+    typer.echo(verdict(steps))
+    return not any(step.broken for step in steps)

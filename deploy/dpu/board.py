@@ -21,6 +21,11 @@ class Dpu:
         return int(self.constants["batch_handlers"].low)
 
     @property
+    def input_parallel(self) -> int:
+        """Input channels that a batch handler takes in at a time."""
+        return self.whole("array", "input_channel_parallel")
+
+    @property
     def output_parallel(self) -> int:
         """Output channels that a batch handler computes at a time."""
         return int(self.constants["cpb"].low)
@@ -29,6 +34,12 @@ class Dpu:
     def engine_ops_per_s(self) -> float:
         """Peak int8 operations a second of one batch handler; a multiply-accumulate counts as two."""
         return self.constants["peak_tops"].low * 1e12 / self.batch
+
+    @property
+    def lane_steps_per_s(self) -> float:
+        """Values a second that an engine in programmable logic takes in: channels x pixels x its clock."""
+        lanes = self.value("elementwise", "channels_per_cycle") * self.value("elementwise", "pixels_per_cycle")
+        return lanes * self.value("array", "pl_clock_hz")
 
     def limit(self, table: str, key: str) -> Constant:
         """A constant of the target."""

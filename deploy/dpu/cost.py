@@ -1,81 +1,107 @@
-"""How long a network takes on the DPU: a first structural model, and how far off it has been.
+"""How long a network takes on the DPU, layer by layer, and how far off that may be.
 
-    T_batch = ops / (P efficiency) + W / BW_w + B S / BW_d + t0        FPS = B / T_batch
+The counts come from `work.py`, the formula from `rates.py`, the constants and errors from the target's [cost], where
+`docs/make_cost_model.py` writes what `fit.py` finds on published networks. None of them is ConvBEERS: the paper's own
+figure is what the model is compared with, never what it is made from.
 
-ops     int8 operations of one image (a multiply-accumulate counts as two), P the peak of one batch handler
-W       bytes of weights, loaded once a batch and shared by its B images
-S       bytes of one image's convolution tensors too large for the feature-map banks: each is written to memory and
-        read back; an add is fused with the convolution before it and reads its other operand
-t0      start of a batch
-
-The terms add up (no overlap), so that a batch is exactly the sum of its layers and t0. Pools, concats, activations
-and resizes cost nothing in this model: it is too fast for networks made of many.
-
-The constants were fitted on ten published networks (`profiles/targets/vck190.toml`), none of them ConvBEERS: the
-paper's own figure is what the model is compared with, never what it is made from. Leaving each of the ten out once,
-frames a second came out off by 29.4 % in the mean and by at most 137 % too fast. The interval is made of those two:
-
-    slow end = FPS of full array groups / (1 + 1.37)        fast end = FPS / (1 - 0.294)
-
-Full array groups: the array computes 16 input by 32 (C64: 64) output channels at a time, used or not. The fit knows
-nothing of it; the slow end does. The interval is no confidence interval: it spans errors seen, for networks unlike
-this one.
+The interval is FPS e^-error to FPS e^+error. `error_inside` is the 90 % quantile of |ln(predicted / published)| of
+networks left out of the fit, each network counting once. Where a network lies outside the range of the fitted ones,
+`error_outside` takes its place (networks with large maps, predicted from those with small ones), and the interval
+starts from FPS with nothing hidden (serial = 1) and with everything hidden (serial = 0).
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
 
 from deploy.dpu.board import Dpu
-from deploy.dpu.finding import groups_of
 from deploy.dpu.graph import Operation
 from deploy.dpu.placement import Placement
+from deploy.dpu.rates import Constants, Layers, host_s
+from deploy.dpu.work import FUSED, Work, count_work
 from profiles.errors import ModelError
 
 
 @dataclass(frozen=True)
 class LayerCost:
-    """What one operation costs for one batch. Bytes are those moved for one image, the columns of AMD's vaitrace."""
+    """What one operation costs for one batch; `work` counts one image."""
 
-    name: str
-    kind: str
-    operations: int
-    array_use: float  # used over computed channels, 0 to 1
-    load_map_bytes: int
-    load_weight_bytes: int
-    store_map_bytes: int
+    work: Work
+    compute_s: float
+    memory_s: float
     time_s: float
+
+    @property
+    def start_s(self) -> float:
+        """What is neither compute nor memory."""
+        return max(self.time_s - self.compute_s - self.memory_s, 0.0)
+
+    @property
+    def bound(self) -> str:
+        """What takes longest: compute, memory or overhead."""
+        parts = {"compute": self.compute_s, "memory": self.memory_s, "overhead": self.start_s}
+        return max(parts, key=lambda name: parts[name])
+
+
+@dataclass(frozen=True)
+class Profile:
+    """What places a network inside or outside the range of the fitted ones."""
+
+    operations: float
+    map_bytes: float  # the largest result
+    intensity: float  # operations per map byte moved
+
+    @classmethod
+    def of(cls, operations: Sequence[Operation], works: Sequence[Work]) -> "Profile":
+        """The profile of a network, one image."""
+        total = sum(work.operations for work in works)
+        moved = sum(work.load_map_bytes + work.store_map_bytes for work in works)
+        return cls(total, max(op.out_bytes for op in operations if op.kind not in FUSED), total / max(moved, 1))
 
 
 @dataclass(frozen=True)
 class Prediction:
-    """What the model says of one network on one configuration; `note` says what was assumed of the file."""
+    """What the model says of one network on one configuration; `note` says what was assumed of the file.
+
+    `outside` names what lies beyond the fitted networks, and is empty where nothing does.
+    """
 
     configuration: str
     batch: int
     layers: tuple[LayerCost, ...]
     overhead_s: float
+    host_s: float
     fps_interval: tuple[float, float]
+    outside: tuple[str, ...] = ()
     note: str = ""
 
-    @property
+    @cached_property
     def batch_time_s(self) -> float:
-        """Time of one batch: the layers and the overhead, nothing else."""
+        """Time of one batch on the DPU: the layers and the overhead, nothing else."""
         return math.fsum([*(layer.time_s for layer in self.layers), self.overhead_s])
 
     @property
     def fps(self) -> float:
-        """Images a second, batches back to back."""
-        return self.batch / self.batch_time_s
+        """Images a second, batches back to back, the host working on others beside them."""
+        return frame_rate(self.batch_time_s, self.batch, self.host_s)
 
     @property
     def operations(self) -> int:
         """int8 operations for one image."""
-        return sum(layer.operations for layer in self.layers)
+        return sum(layer.work.operations for layer in self.layers)
 
     @property
     def streamed_bytes(self) -> int:
-        """S: feature-map bytes that one image moves through memory."""
-        return sum(layer.load_map_bytes + layer.store_map_bytes for layer in self.layers)
+        """Feature-map bytes that one image moves through memory."""
+        return sum(layer.work.load_map_bytes + layer.work.store_map_bytes for layer in self.layers)
+
+
+def frame_rate(batch_time_s: float, batch: int, host_time_s: float) -> float:
+    """Images a second: the slower of the DPU and the host."""
+    return 1 / max(batch_time_s / batch, host_time_s)
 
 
 def predict(placement: Placement, dpu: Dpu) -> Prediction:
@@ -88,57 +114,58 @@ def predict(placement: Placement, dpu: Dpu) -> Prediction:
         names = ", ".join(node.op.name for node in placement.failed[:3])
         remedy = "run 'beers-deploy check' for the reasons and remedies"
         raise ModelError("cost model", expected="a core that runs whole on the DPU", got=names, remedy=remedy)
-    layers = tuple(_layer(op, dpu) for op in placement.core if op.kind != "activation")
-    if not any(layer.operations for layer in layers):
+    works = count_work(placement.core, dpu)
+    if not any(work.operations for work in works):
         remedy = "give a network with convolutions"
         raise ModelError("cost model", expected="work for the DPU", got="no convolution", remedy=remedy)
-    overhead_s = dpu.value("cost", "overhead_s")
-    fps = dpu.batch / math.fsum([*(layer.time_s for layer in layers), overhead_s])
-    interval = _interval(fps, layers, overhead_s, dpu)
-    return Prediction(dpu.name, dpu.batch, layers, overhead_s, interval, placement.note)
+    constants, serial = Constants.of(dpu), dpu.value("cost", "serial")
+    layers = Layers.of(works, dpu)
+    columns = (layers.compute_s(constants), layers.memory_s(constants), layers.time_s(constants, serial))
+    costs = tuple(LayerCost(*row) for row in zip(works, *(c.tolist() for c in columns), strict=True))
+    host_time_s = crossing_s(placement, constants)
+    outside = _outside(Profile.of(placement.core, works), dpu)
+    interval = _interval(layers, constants, host_time_s, dpu, bool(outside))
+    return Prediction(dpu.name, dpu.batch, costs, constants.batch_s, host_time_s, interval, outside, placement.note)
 
 
-def layer_time_s(operations: float, weight_bytes: int, streamed_bytes: int, dpu: Dpu) -> float:
-    """The first three terms of T_batch; `operations` and `streamed_bytes` are those of one image."""
-    compute_s = operations / (dpu.engine_ops_per_s * dpu.value("cost", "efficiency"))
-    weights_s = weight_bytes / dpu.value("cost", "weight_bytes_per_s")
-    return compute_s + weights_s + dpu.batch * streamed_bytes / dpu.value("cost", "data_bytes_per_s")
+def crossing_bytes(placement: Placement) -> tuple[int, int]:
+    """Bytes of one image that the host hands to the DPU, and takes back."""
+    onto = sum(cut.size_bytes or 0 for cut in placement.cuts if cut.onto_dpu)
+    back = sum(cut.size_bytes or 0 for cut in placement.cuts if not cut.onto_dpu)
+    return onto, back
 
 
-def _layer(op: Operation, dpu: Dpu) -> LayerCost:
-    load, store = _traffic(op, dpu.value("cost", "kept_bytes"))
-    time_s = layer_time_s(op.operations, op.weight_bytes, load + store, dpu)
-    return LayerCost(op.name, op.kind, op.operations, _array_use(op, dpu), load, op.weight_bytes, store, time_s)
+def crossing_s(placement: Placement, constants: Constants) -> float:
+    """Time of the host for one image: making planes, reading corrections, adding them."""
+    taken, read = (np.array([size], float) for size in crossing_bytes(placement))
+    return float(host_s(taken, read, constants)[0])
 
 
-def _traffic(op: Operation, kept_bytes: float) -> tuple[int, int]:
-    """Feature-map bytes (read, written) through memory for one image."""
-    if op.kind == "add":
-        other = op.out_bytes if len(op.inputs) > 1 else 0
-        return (other if other > kept_bytes else 0), 0
-    if not op.operations:
-        return 0, 0
-    return (op.in_bytes if op.in_bytes > kept_bytes else 0), (op.out_bytes if op.out_bytes > kept_bytes else 0)
+def _interval(
+    layers: Layers, constants: Constants, host_time_s: float, dpu: Dpu, outside: bool
+) -> tuple[float, float]:
+    serial = dpu.value("cost", "serial")
+    shares = (1.0, 0.0) if outside else (serial, serial)
+    times_s = [math.fsum([*layers.time_s(constants, share).tolist(), constants.batch_s]) for share in shares]
+    slow, fast = (frame_rate(time_s, dpu.batch, host_time_s) for time_s in times_s)
+    spread = math.exp(dpu.value("cost", "error_outside" if outside else "error_inside"))
+    return slow / spread, fast * spread
 
 
-def _array_use(op: Operation, dpu: Dpu) -> float:
-    """Channels used over channels computed; 1 for what does not run on the array."""
-    if op.kind not in ("conv", "transposed"):
-        return 1.0
-    sizes = (dpu.whole("array", "input_channel_parallel"), dpu.output_parallel)
-    computed = [groups_of(count, size) * size for count, size in zip(op.channels, sizes, strict=True)]
-    return op.channels[0] * op.channels[1] / (computed[0] * computed[1])
+RANGES = {
+    "map_bytes": ("largest map", 1e6, " MB"),
+    "operations": ("work", 1e9, " GOP"),
+    "intensity": ("operations per byte moved", 1.0, ""),
+}
 
 
-def _interval(fps: float, layers: tuple[LayerCost, ...], overhead_s: float, dpu: Dpu) -> tuple[float, float]:
-    slow = [
-        layer_time_s(
-            layer.operations / layer.array_use,
-            layer.load_weight_bytes,
-            layer.load_map_bytes + layer.store_map_bytes,
-            dpu,
-        )
-        for layer in layers
-    ]
-    low = dpu.batch / math.fsum([*slow, overhead_s]) / (1 + dpu.value("cost", "error_worst_fast"))
-    return low, fps / (1 - dpu.value("cost", "error_mean"))
+def _outside(profile: Profile, dpu: Dpu) -> tuple[str, ...]:
+    """What of a network lies beyond the fitted ones, each with the end of the range that it passes."""
+    found = []
+    for key, (name, scale, unit) in RANGES.items():
+        value, fitted = getattr(profile, key), dpu.limit("cost", f"fitted_{key}")
+        if value > fitted.high:
+            found.append(f"{name} {value / scale:.3g}{unit} (fitted up to {fitted.high / scale:.3g})")
+        if value < fitted.low:
+            found.append(f"{name} {value / scale:.3g}{unit} (fitted from {fitted.low / scale:.3g})")
+    return tuple(found)

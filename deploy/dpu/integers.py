@@ -95,7 +95,7 @@ class Integers:
         if not self.is_integer(node):
             return {}
         roles = {f"input {i}": name for i, name in enumerate(self.activations(node))}
-        if node.op_type == "Conv":
+        if node.op_type in ("Conv", "ConvTranspose"):
             roles |= dict(zip(("weight", "bias"), node.input[1:], strict=False))
         elif node.op_type == "QLinearConv":
             roles["weight"] = node.input[3]

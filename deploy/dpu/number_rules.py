@@ -9,12 +9,15 @@ from deploy.dpu.board import Dpu
 from deploy.dpu.finding import Finding, outside
 from deploy.dpu.graph import Operation
 
-AGAIN = "quantise with 'beers-deploy quantize --regime legal'"
+AGAIN = "'beers-deploy quantize --regime legal' does"
+MOVE = "move the output's position until it fits: 'beers-deploy quantize --regime legal' does"
 
 
 def on_integers(op: Operation, dpu: Dpu) -> Finding | None:
     """A node on the DPU computes on int8 tensors (UG1414 3.5, quantisation)."""
-    return None if op.integer else Finding("the file computes it in floating point", AGAIN)
+    return (
+        None if op.integer else Finding("the file computes it in floating point", f"quantise this node too; {AGAIN}")
+    )
 
 
 def symmetric(op: Operation, dpu: Dpu) -> Finding | None:
@@ -24,26 +27,41 @@ def symmetric(op: Operation, dpu: Dpu) -> Finding | None:
         for role, scale in op.scales.items()
         if not scale.symmetric
     ]
-    return Finding("; ".join(faults), AGAIN) if faults else None
+    return Finding("; ".join(faults), f"calibrate with a zero point of 0; {AGAIN}") if faults else None
 
 
 def per_tensor(op: Operation, dpu: Dpu) -> Finding | None:
     """A tensor has one scale, not one a channel (Vitis-AI 3.0, vai_q_pytorch)."""
     faults = [f"{role} has {len(scale.scales)} scales" for role, scale in op.scales.items() if len(scale.scales) != 1]
-    return Finding("; ".join(faults), AGAIN) if faults else None
+    return Finding("; ".join(faults), f"quantise with one scale a tensor; {AGAIN}") if faults else None
 
 
 def power_of_two(op: Operation, dpu: Dpu) -> Finding | None:
     """Scales are powers of two (UG1414 3.5, quantisation)."""
     single = {role: scale for role, scale in op.scales.items() if len(scale.scales) == 1}
     faults = [f"{role} scale {scale.scales[0]:.4g}" for role, scale in single.items() if scale.position is None]
-    return Finding("; ".join(faults), AGAIN) if faults else None
+    return (
+        Finding("; ".join(faults), f"round each scale to 2^-position; {AGAIN}, and so does AMD Quark's XINT8")
+        if faults
+        else None
+    )
+
+
+def int8_bias(op: Operation, dpu: Dpu) -> Finding | None:
+    """A bias is int8 with a position of its own, not int32 at the products' scale (Vitis-AI 3.0, vai_q_pytorch).
+
+    Judged where the file gives the bias a format: QLinearConv cannot, its operator demands int32.
+    """
+    bias = op.scales.get("bias")
+    if bias is None or bias.integer_type == "int8":
+        return None
+    return Finding(f"its bias is {bias.integer_type}", f"quantise the bias to int8; {AGAIN}")
 
 
 def shift_cut(op: Operation, dpu: Dpu) -> Finding | None:
     """Weight + input - output position of a convolution is {numbers[shift_cut]} (Vitis-AI 3.0, vai_q_pytorch)."""
     cut, limit = _cut(op), dpu.limit("numbers", "shift_cut")
-    return None if cut is None or not outside((cut,), limit) else Finding(f"shift_cut {cut}, allowed {limit}", AGAIN)
+    return None if cut is None or not outside((cut,), limit) else Finding(f"shift_cut {cut}, allowed {limit}", MOVE)
 
 
 def shift_bias(op: Operation, dpu: Dpu) -> Finding | None:
@@ -56,14 +74,14 @@ def shift_bias(op: Operation, dpu: Dpu) -> Finding | None:
         return None
     low = min(0, cut + 8 - dpu.whole("numbers", "accumulator_bits"))
     high, shift = dpu.whole("numbers", "shift_bias_max"), product - bias
-    return None if low <= shift <= high else Finding(f"shift_bias {shift}, allowed {low} to {high}", AGAIN)
+    return None if low <= shift <= high else Finding(f"shift_bias {shift}, allowed {low} to {high}", MOVE)
 
 
 def shift_read(op: Operation, dpu: Dpu) -> Finding | None:
     """The inputs' positions of an add lie {numbers[shift_read]} apart (Vitis-AI 3.0, vai_q_pytorch)."""
     inputs, limit = _inputs(op), dpu.limit("numbers", "shift_read")
     shift = max(inputs) - min(inputs) if inputs else 0
-    return Finding(f"shift_read {shift}, allowed {limit}", AGAIN) if outside((shift,), limit) else None
+    return Finding(f"shift_read {shift}, allowed {limit}", MOVE) if outside((shift,), limit) else None
 
 
 def shift_write(op: Operation, dpu: Dpu) -> Finding | None:
@@ -71,7 +89,7 @@ def shift_write(op: Operation, dpu: Dpu) -> Finding | None:
     inputs, output, limit = _inputs(op), _position(op, "output"), dpu.limit("numbers", "shift_write")
     if not inputs or output is None or not outside((min(inputs) - output,), limit):
         return None
-    return Finding(f"shift_write {min(inputs) - output}, allowed {limit}", AGAIN)
+    return Finding(f"shift_write {min(inputs) - output}, allowed {limit}", MOVE)
 
 
 def same_position(op: Operation, dpu: Dpu) -> Finding | None:
@@ -79,7 +97,9 @@ def same_position(op: Operation, dpu: Dpu) -> Finding | None:
     positions = {role: p for role in op.scales if (p := _position(op, role)) is not None}
     if len(set(positions.values())) < 2:
         return None
-    return Finding(", ".join(f"{role} position {p}" for role, p in positions.items()), AGAIN)
+    return Finding(
+        ", ".join(f"{role} position {p}" for role, p in positions.items()), f"give them the smallest one; {AGAIN}"
+    )
 
 
 def _position(op: Operation, role: str) -> int | None:

@@ -1,16 +1,17 @@
 """The DPU's rules by kind of operation, their texts, and the judgement of one node: all broken rules, not the first.
 
-A rule is a small function (`conv_rules`, `other_rules`, `number_rules`) whose docstring is its text, filled in with
-the limits of the target profile: text, check and documentation cannot drift apart.
+A rule is a small function (`conv_rules`, `other_rules`, `size_rules`, `number_rules`) whose docstring is its text,
+filled in with the limits of the target profile: text, check and documentation cannot drift apart.
 """
 
 import inspect
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 
 from deploy.dpu import conv_rules as c
 from deploy.dpu import number_rules as n
 from deploy.dpu import other_rules as o
+from deploy.dpu import size_rules as s
 from deploy.dpu.board import Dpu
 from deploy.dpu.finding import Finding, Rule
 from deploy.dpu.graph import Kind, Operation
@@ -49,11 +50,14 @@ RULES: Mapping[Kind, tuple[Rule, ...]] = {
 }
 """What a node of each kind has to keep, float or quantised."""
 
+SIZES: tuple[Rule, ...] = (s.map_exists, s.maps_aligned, s.map_in_memory)
+"""What the tile's size has to allow every node."""
+
 NUMBERS: tuple[Rule, ...] = (n.on_integers, n.symmetric, n.per_tensor, n.power_of_two)
 SHIFTS: Mapping[Kind, tuple[Rule, ...]] = {
-    "conv": (n.shift_cut, n.shift_bias),
-    "depthwise": (n.shift_cut, n.shift_bias),
-    "transposed": (n.shift_cut, n.shift_bias),
+    "conv": (n.int8_bias, n.shift_cut, n.shift_bias),
+    "depthwise": (n.int8_bias, n.shift_cut, n.shift_bias),
+    "transposed": (n.int8_bias, n.shift_cut, n.shift_bias),
     "add": (n.shift_read, n.shift_write),
     "mul": (),
     "concat": (n.same_position,),
@@ -73,7 +77,7 @@ class Broken:
 
 def judge(op: Operation, dpu: Dpu, quantised: bool) -> tuple[Broken, ...]:
     """Every rule that a node breaks; the rules of numbers only where the file holds quantised ones."""
-    rules = RULES[op.kind]
+    rules = RULES[op.kind] + SIZES
     if quantised and op.kind != "other":
         rules += NUMBERS + SHIFTS.get(op.kind, ())
     findings = ((rule, rule(op, dpu)) for rule in rules)
@@ -82,7 +86,7 @@ def judge(op: Operation, dpu: Dpu, quantised: bool) -> tuple[Broken, ...]:
 
 def all_rules() -> Iterator[Rule]:
     """Every rule once, in the order of the tables."""
-    chains = [*RULES.values(), NUMBERS, *SHIFTS.values()]
+    chains = [*RULES.values(), SIZES, NUMBERS, *SHIFTS.values()]
     yield from dict.fromkeys(rule for chain in chains for rule in chain)
 
 
@@ -91,6 +95,6 @@ def rule_name(rule: Rule) -> str:
     return rule.__name__.replace("_", " ")
 
 
-def rule_text(rule: Rule, dpu: Dpu) -> str:
-    """The rule's text with the target's limits filled in."""
+def rule_text(rule: Callable[..., object], dpu: Dpu) -> str:
+    """The text of a rule or a remark, with the target's limits filled in."""
     return " ".join((inspect.getdoc(rule) or "").split()).format(**dpu.target.tables)

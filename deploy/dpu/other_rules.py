@@ -7,21 +7,34 @@ from deploy.dpu.conv_rules import alu_padding
 from deploy.dpu.finding import Finding, outside
 from deploy.dpu.graph import Operation
 
+ALU = {"LeakyRelu", "QLinearLeakyRelu", "PRelu", "HardSigmoid"}
 FUSING = {"conv", "depthwise", "transposed", "add", "mul"}
 INSTEAD = {
     "Sub": "fold the minus sign into the weights before it, and add",
     "Neg": "fold the minus sign into the weights before it",
-    "Div": "multiply by the reciprocal",
+    "Div": "fold the division into the weights of the convolution before it, or multiply by the reciprocal",
     "Exp": "leave it to the host, behind the network",
     "Sigmoid": "use HardSigmoid",
     "Tanh": "use HardSigmoid, scaled by the weights behind it",
+    "Log": "leave it to the host, in front of the network",
+    "Sqrt": "leave it to the host, in front of the network",
+    "Softmax": "leave it to the host, behind the network",
+    "Gelu": "use HardSwish",
     "Clip": "use ReLU, or ReLU6 (Clip from 0 to 6)",
     "ReduceSum": "use a 1 x 1 convolution of ones",
     "ReduceMean": "use GlobalAveragePool",
     "Transpose": "keep the layout (N, C, H, W) throughout",
     "Slice": "use a convolution that picks these channels or pixels",
     "SpaceToDepth": "use a strided convolution, or rearrange on the host before the network",
-    "Gather": "use a 1 x 1 convolution that picks these channels",
+    "Gather": "to pick fixed channels, use a 1 x 1 convolution; what is picked by value stays with the host",
+    "Gemm": "write it as a 1 x 1 convolution",
+    "MatMul": "write it as a 1 x 1 convolution where one factor is constant; else leave it to the host",
+    "DFT": "use a convolution of at most 16 x 16 where the filter is short; else leave it to the host",
+    "TopK": "leave it to the host: the DPU does not compare values across a map",
+    "LayerNormalization": "train without normalisation, or with one that folds into the convolution",
+    "FixNeuron": "write the file with QuantizeLinear and DequantizeLinear (QDQ format)",
+    "VitisQuantizeLinear": "write the file with QuantizeLinear and DequantizeLinear (QDQ format)",
+    "ExtendedQuantizeLinear": "write the file with QuantizeLinear and DequantizeLinear (QDQ format)",
     "InstanceNormalization": "train without normalisation, or with one that folds into the convolution",
     "BatchNormalization": "fold it into the convolution before it",
 }
@@ -62,8 +75,11 @@ def pool_padding(op: Operation, dpu: Dpu) -> Finding | None:
 
 
 def activation_place(op: Operation, dpu: Dpu) -> Finding | None:
-    """An activation is fused: right behind a convolution, an add or a mul (UG1414 3.5, activations)."""
-    if op.follows in FUSING or op.op_type in ("LeakyRelu", "QLinearLeakyRelu", "PRelu", "HardSigmoid"):
+    """ReLU, ReLU6 and hard-swish are fused: right behind a convolution, an add or a mul (UG1414 3.5, activations).
+
+    Leaky ReLU, PReLU and hard-sigmoid stand anywhere: the ALU does them (PG389 1.3, ALU).
+    """
+    if op.follows in FUSING or op.op_type in ALU:
         return None
     before = op.follows or "the input"
     return Finding(f"{op.op_type} stands behind {before}", "move it right behind the convolution or add before")
@@ -71,13 +87,13 @@ def activation_place(op: Operation, dpu: Dpu) -> Finding | None:
 
 def activation_of_sums(op: Operation, dpu: Dpu) -> Finding | None:
     """Behind an add or a mul only ReLU is fused (UG1414 3.5, element-wise)."""
-    if op.follows not in ("add", "mul") or op.op_type in ("Relu", "Max"):
+    if op.follows not in ("add", "mul") or op.op_type in {"Relu", "Max", *ALU}:
         return None
     return Finding(f"{op.op_type} stands behind {op.follows}", "use ReLU there")
 
 
 def leaky_relu_alpha(op: Operation, dpu: Dpu) -> Finding | None:
-    """LeakyReLU has alpha = 26 / 256 = {activation[leaky_relu_alpha]} (UG1414 3.5, leaky_relu)."""
+    """LeakyReLU has alpha = 26 / 256 = {activation[leaky_relu_alpha].low} (UG1414 3.5, leaky_relu)."""
     given, wanted = op.attributes.get("alpha", 0.01), dpu.value("activation", "leaky_relu_alpha")
     is_leaky = op.op_type in ("LeakyRelu", "QLinearLeakyRelu")
     if not is_leaky or (isinstance(given, int | float) and abs(given - wanted) < 1e-6):

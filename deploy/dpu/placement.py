@@ -37,10 +37,10 @@ class PlacedNode:
 
 @dataclass(frozen=True)
 class Cut:
-    """A tensor that crosses between the DPU and a processor, as int8."""
+    """A tensor that crosses between the DPU and a processor, as int8; its size None where its shape is unknown."""
 
     tensor: str
-    size_bytes: int
+    size_bytes: int | None
     onto_dpu: bool
 
 
@@ -177,4 +177,4 @@ def _cuts(network: Network, nodes: Iterable[PlacedNode]) -> Iterable[Cut]:
     for name, sides in readers.items():
         written_on_dpu = on_dpu.get(name, False)
         if (not written_on_dpu) in sides:
-            yield Cut(name, sizes.get(name, 0), onto_dpu=not written_on_dpu)
+            yield Cut(name, sizes.get(name), onto_dpu=not written_on_dpu)

@@ -39,7 +39,7 @@ def out_shape(
         return (first[0], 1, 1) if "Global" in node.op_type else _slide(first, window, first[0], _ceil_mode(node))
     if node.op_type in ("QLinearConcat", "Concat") and len(known) > 1:
         return (sum(shape[0] for shape in known), first[1], first[2])
-    if kind in ("add", "mul"):
+    if kind in ("add", "mul") or node.op_type == "Where":
         return (max(s[0] for s in known), max(s[1] for s in known), max(s[2] for s in known))
     if kind in ("activation", "quantise", "dequantise"):
         return first
@@ -70,7 +70,7 @@ def _slide(shape: Shape, window: Window, channels: int, up: bool = False) -> Sha
     return (channels, sizes[0], sizes[1]) if min(sizes) > 0 else None
 
 
-def _grow(shape: Shape, window: Window, channels: int) -> Shape:
+def _grow(shape: Shape, window: Window, channels: int) -> Shape | None:
     """Size = stride (size - 1) + output padding + dilation (kernel - 1) + 1 - pads."""
     height, width = (
         window.stride[axis] * (shape[1 + axis] - 1)
@@ -81,7 +81,7 @@ def _grow(shape: Shape, window: Window, channels: int) -> Shape:
         - window.pads[axis + 2]
         for axis in (0, 1)
     )
-    return (channels, height, width)
+    return (channels, height, width) if min(height, width) > 0 else None
 
 
 def _ceil_mode(node: onnx.NodeProto) -> bool:

@@ -1,5 +1,6 @@
 import json
 import math
+from dataclasses import fields
 from pathlib import Path
 
 import jsonschema
@@ -10,10 +11,13 @@ import typer
 from typer.testing import CliRunner
 
 from deploy.bench import Swath, efficiency, layer_rows, predict_file, predicted_rows, published_rows
+from deploy.bench_sweep import parse_tiles, sweep_rows
 from deploy.commands.bench import bench, parse_size
 from deploy.commands.check import check
 from deploy.dpu.board import load_dpu
+from deploy.dpu.rates import Constants
 from deploy.measure import CROP_PX, Sensors, drawn_acquisition, traditional_rows
+from deploy.refit import refit
 from deploy.results import SCHEMA_PATH, Row, measured, predicted, unavailable
 from profiles import load_sensor
 from profiles.errors import BeersError, ImageError, OptionError, ProfileError
@@ -70,7 +74,7 @@ def test_a_last_batch_that_is_not_full_still_takes_its_time(tmp_path: Path) -> N
 
 
 def test_rows_of_layers_sum_to_their_last(tmp_path: Path) -> None:
-    rows = layer_rows(predict_file(integer_convbeers(tmp_path / "i.onnx", 2, 24), DPU, 333))
+    rows = layer_rows(predict_file(integer_convbeers(tmp_path / "i.onnx", 2, 24), DPU, 333), DPU)
     *parts, total = (value(row, "time") for row in rows)
     assert math.fsum(parts) == pytest.approx(total, rel=1e-12)
 
@@ -94,7 +98,7 @@ def test_efficiency_is_only_as_good_as_its_parts() -> None:
 
 def test_a_small_image_is_measured_whole() -> None:
     swath = Swath(61, 47)
-    (row,) = traditional_rows(drawn_acquisition(swath, SENSORS), swath, SENSORS)
+    row, *_ = traditional_rows(drawn_acquisition(swath, SENSORS), swath, SENSORS)
     assert row.figures["latency"].mode == "measured"
     assert row.figures["throughput"].mode == "measured"
 
@@ -102,7 +106,7 @@ def test_a_small_image_is_measured_whole() -> None:
 def test_a_large_swath_is_predicted_from_crops_and_says_so() -> None:
     swath = Swath(13600, 9016)
     dn = np.full((70, 90), 1000, np.float32)
-    (row,) = traditional_rows(dn, swath, SENSORS)
+    row, *_ = traditional_rows(dn, swath, SENSORS)
     latency = row.figures["latency"]
     assert latency.mode == "predicted"
     assert "3 crops of 90 x 70" in latency.source
@@ -112,7 +116,7 @@ def test_a_large_swath_is_predicted_from_crops_and_says_so() -> None:
 
 def test_no_budget_means_no_whole_run() -> None:
     swath = Swath(33, 33)
-    (row,) = traditional_rows(drawn_acquisition(swath, SENSORS), swath, SENSORS, budget_s=0)
+    row, *_ = traditional_rows(drawn_acquisition(swath, SENSORS), swath, SENSORS, budget_s=0)
     assert row.figures["latency"].mode == "predicted"
 
 
@@ -141,12 +145,94 @@ def test_bench_writes_a_valid_document(tmp_path: Path) -> None:
     assert any("halo 5 px" in name for name in names)
 
 
+def test_layer_rows_have_the_columns_of_vaitrace(tmp_path: Path) -> None:
+    rows = layer_rows(predict_file(integer_convbeers(tmp_path / "i.onnx", 2, 64), DPU, 333), DPU)
+    columns = {"work", "time", "rate", "LdFM", "LdWB", "StFM", "bandwidth", "array use", "energy"}
+    assert all(set(row.figures) == columns for row in rows[:-2])
+    assert {row.text["bound"] for row in rows[:-1]} <= {"compute", "memory", "overhead"}
+    assert any(row.name.startswith("qlinearadd") and value(row, "time") > 0 for row in rows[:-2])
+
+
+def test_small_tiles_keep_maps_on_chip_and_cost_work(tmp_path: Path) -> None:
+    path = integer_convbeers(tmp_path / "net.onnx", 1, 64)
+    rows = sweep_rows(path, Swath(700, 600, halo_px=5), [DPU], [640, 128, 64])
+    assert [row.name for row in rows] == [f"C32B3, tiles of {tile}" for tile in (640, 128, 64)]
+    kept, factors = ([value(row, key) for row in rows] for key in ("layers on chip", "work factor"))
+    assert kept[0] == 0 < kept[1] <= kept[2]
+    assert 1 < factors[1] < factors[2]
+    for row in rows:
+        assert value(row, "latency") >= value(row, "tiles") / value(row, "throughput") * (1 - 1e-12)
+        assert set(row.text) == {"bound", "fitted range"}
+
+
+def test_all_configurations_are_swept(tmp_path: Path) -> None:
+    model, out = integer_convbeers(tmp_path / "net.onnx", 1, 8), tmp_path / "out.json"
+    options = ("--size", "41x33", "--tile", "64,32", "--config", "all", "--budget", "0", "--json", str(out))
+    assert run("bench", str(model), *options)[0] == 0
+    swept = [str(row["name"]) for row in document(out)["rows"] if row["table"] == "sweep"]
+    assert swept == [f"{name}, tiles of {tile}" for name in DPU.target.configurations for tile in (64, 32)]
+
+
+@pytest.mark.parametrize("text", ["", "640,", "640,8", "640;320", "-64"])
+def test_bad_tiles_are_refused(text: str) -> None:
+    with pytest.raises(OptionError, match="--tile"):
+        parse_tiles(text)
+
+
+def test_the_host_takes_one_tile_size(tmp_path: Path) -> None:
+    with pytest.raises(OptionError, match="--target host"):
+        run("bench", str(integer_convbeers(tmp_path / "net.onnx", 1, 8)), "--target", "host", "--tile", "64,32")
+
+
+def test_constants_are_refitted_to_a_boards_runs(tmp_path: Path) -> None:
+    """A board that takes twice the time: the refitted model lies nearer to it than the shipped one."""
+    model, out = integer_convbeers(tmp_path / "net.onnx", 2, 64), tmp_path / "out.json"
+    fps = predict_file(model, DPU, 320).fps / 2
+    runs = [
+        {"model": "net.onnx", "configuration": "C32B3", "tile_px": 320, "fps": fps, "power_w": 28.5},
+        {"network": "resnet-50", "configuration": "C32B6", "fps": 1500},
+    ]
+    (tmp_path / "board.json").write_text(json.dumps(runs))
+    options = ("--tile", "320", "--size", "41x33", "--measured", str(tmp_path / "board.json"), "--budget", "0")
+    assert run("bench", str(model), *options, "--json", str(out))[0] == 0
+    rows = document(out)["rows"]
+    assert {row["name"] for row in rows if row["table"] == "constants"} == {f.name for f in fields(Constants)}
+    found = [dict(row["figures"]) for row in rows if row["table"] == "runs"]  # type: ignore[call-overload]
+    for figures in found:
+        assert figures["shipped is off by"]["value"] == pytest.approx(100, abs=1 if figures is found[0] else 20)
+        assert abs(figures["refitted is off by"]["value"]) < 50
+    (swath, *_) = (dict(row["figures"]) for row in rows if row["table"] == "bench")  # type: ignore[call-overload]
+    assert swath["throughput"]["value"] == pytest.approx(found[0]["refitted"]["value"], rel=1e-6)
+    assert [entry["name"] for entry in document(out)["inputs"]] == ["net.onnx", "board.json"]
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "{",
+        "[]",
+        "3",
+        '[{"fps": 3}]',
+        '[{"network": "resnet-50", "fps": 0}]',
+        '[{"network": "resnet-50", "fps": true}]',
+        '[{"network": "resnet-51", "fps": 3}]',
+        '[{"network": "resnet-50", "fps": 3, "tile_px": 8}]',
+        '[{"network": "resnet-50", "fps": 3, "speed": 8}]',
+    ],
+)
+def test_bad_runs_are_refused(tmp_path: Path, text: str) -> None:
+    path = tmp_path / "board.json"
+    path.write_text(text)
+    with pytest.raises(OptionError, match=r"board\.json"):
+        refit(path, DPU)
+
+
 def test_bench_on_this_machine(tmp_path: Path) -> None:
     model, out = integer_convbeers(tmp_path / "net.onnx", 1, 8), tmp_path / "host.json"
     code, output = run("bench", str(model), "--target", "host", "--tile", "32", "--json", str(out))
     assert code == 0
     assert "no proxy" in output
-    (row,) = document(out)["rows"]
+    row, *_ = document(out)["rows"]
     assert isinstance(row["figures"], dict)
     assert row["figures"]["p50"]["value"] <= row["figures"]["p90"]["value"]
 

@@ -108,3 +108,30 @@ def board_convbeers(path: Path, blocks: int, features: int) -> Path:
         stream = pair(s.node("Add", stream, pair(conv(inner, features, features, 3, 3))))
     deep = pair(s.node("Add", head, pair(conv(stream, features, features, 3, 3))))
     return s.save(path, pair(conv(deep, 1, features, 3, 3)))
+
+
+class QdqSketch(Sketch):
+    """A sketch in QDQ spelling, every tensor with a position of its own: 2^-position is its scale."""
+
+    def scale(self, position: float | list[float], zero: int = 0, kind: type = np.int8) -> tuple[str, str]:
+        scales = 2.0 ** -np.array(position, np.float64)
+        return self.constant(scales.astype(np.float32)), self.constant(np.full(scales.shape, zero, kind))
+
+    def pair(self, source: str, position: float = 7, zero: int = 0) -> str:
+        numbers = self.scale(position, zero)
+        return self.node("DequantizeLinear", self.node("QuantizeLinear", source, *numbers), *numbers)
+
+    def qdq_conv(
+        self,
+        source: str,
+        channels: int = 4,
+        weight: float | list[float] = 7,
+        bias: float = 7,
+        output: float = 7,
+        bias_kind: type = np.int8,
+    ) -> str:
+        kernel = self.constant(np.ones((4, channels, 3, 3), np.int8))
+        start = self.constant(np.ones(4, bias_kind))
+        numbers = {kernel: self.scale(weight), start: self.scale(bias, 0, bias_kind)}
+        feeds = [self.node("DequantizeLinear", value, *scale, axis=0) for value, scale in numbers.items()]
+        return self.pair(self.node("Conv", source, *feeds, pads=[1] * 4), output)

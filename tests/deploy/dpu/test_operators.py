@@ -109,7 +109,7 @@ CASES: dict[str, tuple[Draw, Draw]] = {
         lambda s, x: s.node("Relu", s.node("MaxPool", x, kernel_shape=[2, 2])),
         lambda s, x: s.node("MaxPool", s.node("Relu", x), kernel_shape=[2, 2]),
     ),
-    "activation of sums": (behind_sum("HardSigmoid"), behind_sum("Relu")),
+    "activation of sums": (behind_sum("HardSwish"), behind_sum("Relu")),
     "leaky relu alpha": (behind_conv("LeakyRelu", alpha=0.1), behind_conv("LeakyRelu", alpha=26 / 256)),
     "mul constant": (scaled(1, 8, 3, 3), scaled(1, 8, 1, 1)),
     "pad mode": (padded("reflect"), padded("constant")),
@@ -119,7 +119,9 @@ CASES: dict[str, tuple[Draw, Draw]] = {
     "known operator": (behind_conv("Sigmoid"), behind_conv("HardSigmoid")),
 }
 WIDE = {"conv channels", "conv weight bank", "depthwise channels", "transposed channels", "resize channels"}
+SIZES = {"map exists", "maps aligned", "map in memory"}
 NUMBERS = {
+    "int8 bias",
     "on integers",
     "symmetric",
     "per tensor",
@@ -133,7 +135,7 @@ NUMBERS = {
 
 
 def test_every_rule_has_a_case() -> None:
-    assert {rule_name(rule) for rule in all_rules()} == set(CASES) | WIDE | NUMBERS
+    assert {rule_name(rule) for rule in all_rules()} == set(CASES) | WIDE | SIZES | NUMBERS
 
 
 @pytest.mark.parametrize("rule", CASES)
@@ -166,6 +168,40 @@ def test_wide_layers(tmp_path: Path, rule: str, draw: Draw, channels: int) -> No
 def test_too_many_channels_for_the_alu_and_resize(tmp_path: Path, rule: str, draw: Draw) -> None:
     sketch = Sketch(4097)
     assert broken_rules(sketch.save(tmp_path / "w.onnx", draw(sketch, "image"))) == [rule]
+
+
+def test_a_tile_too_small_for_a_window(tmp_path: Path) -> None:
+    sketch = Sketch(8)
+    path = sketch.save(tmp_path / "s.onnx", sketch.conv("image", (8, 8, 3, 3), pads=[0] * 4))
+    assert broken_rules(path, tile_px=2) == ["map exists"]
+    assert broken_rules(path, tile_px=3) == []
+
+
+def test_a_tile_that_the_stride_does_not_divide(tmp_path: Path) -> None:
+    sketch = Sketch(8)
+    stream = sketch.conv("image")
+    half = sketch.node("MaxPool", stream, kernel_shape=[2, 2], strides=[2, 2])
+    path = sketch.save(tmp_path / "u.onnx", sketch.conv(sketch.node("Add", stream, resized(2)(sketch, half))))
+    assert broken_rules(path, tile_px=21) == ["maps aligned"]
+    assert broken_rules(path, tile_px=22) == []
+
+
+def test_a_factor_for_a_whole_channel_meets_any_map(tmp_path: Path) -> None:
+    sketch = Sketch(8)
+    stream = sketch.conv("image")
+    factor = sketch.conv(sketch.node("GlobalAveragePool", stream), (8, 8, 1, 1))
+    path = sketch.save(tmp_path / "f.onnx", sketch.conv(sketch.node("Mul", stream, factor)))
+    assert broken_rules(path, tile_px=37) == []
+
+
+def test_a_tile_that_the_memory_cannot_hold(tmp_path: Path) -> None:
+    sketch = Sketch(1)
+    path = sketch.save(tmp_path / "m.onnx", sketch.conv(sketch.conv("image", (64, 1, 3, 3)), (1, 64, 3, 3)))
+    node = place(read_network(path, 7001), DPU).nodes[0]
+    assert [broken.rule for broken in node.broken] == ["map in memory"]
+    allowed_px = int(7001 * float(node.broken[0].finding.remedy.split()[-4]))
+    assert broken_rules(path, tile_px=allowed_px - 70) == []  # the remedy names two digits
+    assert broken_rules(path, load_dpu("vck190", "C32B1"), 7001) == []  # one image at a time
 
 
 def test_all_broken_rules_of_a_node_are_listed(tmp_path: Path) -> None:

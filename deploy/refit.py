@@ -1,0 +1,141 @@
+"""Refit the cost model to an owner's own runs: `bench --measured board.json`.
+
+The file is a JSON list; each entry is one run: {"model": FILE or "network": NAME, "configuration": "C32B3",
+"tile_px": 640, "fps": 9.5}, as `docs/board/measure.py` writes it; a "power_w" beside them is not used yet. A model's
+path is relative to the file; a network is one of `deploy/dpu/zoo/networks.py`, with the input size it has there.
+The shipped constants are the start and are held to within some 30 %, so that a few
+runs move what they speak of and leave the rest.
+"""
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+
+from deploy.dpu.board import Dpu, load_dpu
+from deploy.dpu.cost import Profile, crossing_bytes
+from deploy.dpu.fit import FIRM_PRIOR, Case, Cases, fit
+from deploy.dpu.placement import place
+from deploy.dpu.rates import Constants, Layers
+from deploy.dpu.reading import read_network
+from deploy.dpu.work import count_work
+from deploy.dpu.zoo.cases import network_case
+from deploy.dpu.zoo.networks import NETWORKS
+from deploy.results import Row, predicted, published
+from profiles.constant import Constant
+from profiles.errors import ModelError, OptionError
+
+UNITS = {
+    "efficiency": "1",
+    "map_bytes_per_s": "B/s",
+    "batch_s": "s",
+    "layer_s": "s",
+    "host_in_bytes_per_s": "B/s",
+    "host_out_bytes_per_s": "B/s",
+}
+
+
+@dataclass(frozen=True)
+class Refit:
+    """What the runs changed."""
+
+    source: str
+    cases: Cases
+    old: Constants
+    new: Constants
+
+    def applied(self, dpu: Dpu) -> Dpu:
+        """The board with the new constants; its interval stays that of the published networks."""
+        cost = dict(dpu.target.tables["cost"])
+        for field in fields(Constants):
+            cost[field.name] = Constant(getattr(self.new, field.name), "inferred", self.source)
+        return replace(dpu, target=replace(dpu.target, tables={**dpu.target.tables, "cost": cost}))
+
+    def constant_rows(self) -> list[Row]:
+        """The constants before and after."""
+        return [self._constant_row(field.name) for field in fields(Constants)]
+
+    def run_rows(self) -> list[Row]:
+        """What each run was predicted to be, before and after."""
+        before, after = (self.cases.errors(constants).tolist() for constants in (self.old, self.new))
+        return [self._run_row(*row) for row in zip(self.cases.rows, before, after, strict=True)]
+
+    def _constant_row(self, name: str) -> Row:
+        values = {"shipped": getattr(self.old, name), "refitted": getattr(self.new, name)}
+        figures = {key: predicted(value, UNITS[name], (value, value), self.source) for key, value in values.items()}
+        return Row("constants", name, figures)
+
+    def _run_row(self, case: Case, before: float, after: float) -> Row:
+        ratios = {"shipped": math.exp(before), "refitted": math.exp(after)}
+        figures = {"given": published(case.fps, "frame/s", self.source)}
+        for key, ratio in ratios.items():
+            rate = ratio * case.fps
+            figures[key] = predicted(rate, "frame/s", (rate, rate), f"cost model, {key} constants")
+            figures[f"{key} is off by"] = predicted(100 * (ratio - 1), "%", (100 * (ratio - 1),) * 2, "arithmetic")
+        return Row("runs", f"{case.network}, {case.configuration}", figures)
+
+
+def refit(path: Path, dpu: Dpu) -> Refit:
+    """Refit the constants of `dpu`'s target to the runs in a file.
+
+    Raises:
+        OptionError: not such a file, or a run that cannot be understood.
+        ModelError: a model that does not run whole on the DPU.
+    """
+    runs = _read(path)
+    cases = Cases(tuple(_case(run, path, index) for index, run in enumerate(runs)), dpu.value("cost", "serial"))
+    old = Constants.of(dpu)
+    new = fit(cases, old, FIRM_PRIOR).rounded()
+    return Refit(f"refitted to {len(runs)} runs in {path.name}", cases, old, new)
+
+
+def _read(path: Path) -> Sequence[Mapping[str, object]]:
+    try:
+        runs = json.loads(path.read_bytes())
+    except OSError as error:
+        got = error.strerror or str(error)
+        raise OptionError(str(path), expected="a readable file", got=got, remedy="check the path") from error
+    except ValueError as error:
+        raise OptionError(str(path), expected="JSON", got=str(error), remedy="correct the file") from error
+    if not isinstance(runs, list) or not runs or not all(isinstance(run, dict) for run in runs):
+        raise OptionError(str(path), expected="a list of runs", got=type(runs).__name__, remedy=EXAMPLE)
+    return runs
+
+
+EXAMPLE = 'write [{"model": "core.onnx", "configuration": "C32B3", "tile_px": 640, "fps": 9.5}]'
+KEYS = {"model", "network", "configuration", "tile_px", "fps", "power_w"}
+
+
+def _case(run: Mapping[str, object], path: Path, index: int) -> Case:
+    where = f"{path.name}, run {index + 1}"
+    unknown = set(run) - KEYS
+    fps, tile = run.get("fps"), run.get("tile_px", 640)
+    if unknown or ("model" in run) == ("network" in run):
+        raise OptionError(
+            where, expected="model or network, configuration, tile_px, fps", got=str(sorted(run)), remedy=EXAMPLE
+        )
+    if isinstance(fps, bool) or not isinstance(fps, int | float) or not 0 < fps < 1e9:
+        raise OptionError(where, expected="frames a second above zero", got=repr(fps), remedy=EXAMPLE)
+    if isinstance(tile, bool) or not isinstance(tile, int) or tile < 16:
+        raise OptionError(where, expected="a tile side of at least 16 pixels", got=repr(tile), remedy=EXAMPLE)
+    dpu = load_dpu("vck190", str(run.get("configuration", "")) or None)
+    if "network" in run:
+        name = str(run["network"])
+        if name not in NETWORKS:
+            raise OptionError(
+                where, expected=f"one of {', '.join(NETWORKS)}", got=repr(name), remedy="or give a model"
+            )
+        return network_case(name, dpu, float(fps))
+    return _model_case(path.parent / str(run["model"]), dpu, tile, float(fps))
+
+
+def _model_case(model: Path, dpu: Dpu, tile_px: int, fps: float) -> Case:
+    placement = place(read_network(model, tile_px), dpu)
+    if placement.failed:
+        remedy = "run 'beers-deploy check' for the reasons"
+        raise ModelError(str(model), expected="a core that runs whole on the DPU", got="refused nodes", remedy=remedy)
+    works = count_work(placement.core, dpu)
+    profile = Profile.of(placement.core, works)
+    name, layers = f"{model.stem}, tiles of {tile_px}", Layers.of(works, dpu)
+    return Case(name, model.stem, dpu.name, layers, dpu.batch, crossing_bytes(placement), fps, profile)

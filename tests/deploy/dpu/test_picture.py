@@ -1,0 +1,66 @@
+from pathlib import Path
+from xml.etree import ElementTree as ET
+
+import pytest
+
+from deploy.dpu.board import load_dpu
+from deploy.dpu.picture import FILLS, draw, require_picture, write_picture
+from deploy.dpu.placement import Placement, place
+from deploy.dpu.reading import read_network
+from profiles.errors import OptionError
+from tests.deploy.dpu.graphs import Sketch, float_convbeers
+
+SVG = "{http://www.w3.org/2000/svg}"
+
+
+def placed(path: Path) -> Placement:
+    return place(read_network(path, 40), load_dpu())
+
+
+def test_every_node_is_drawn_in_its_devices_colour_and_says_which(tmp_path: Path) -> None:
+    sketch = Sketch(8)
+    middle = sketch.node("Sigmoid", sketch.conv("image"))
+    placement = placed(sketch.save(tmp_path / "s.onnx", sketch.conv(middle)))
+    root = ET.fromstring(draw(placement, "a < b & c"))  # noqa: S314 - our own output
+    boxes = [r for r in root.iter(f"{SVG}rect") if r.get("class") != "page"][len(FILLS) :]
+    labels = [t.text for t in root.iter(f"{SVG}text") if t.get("class") == "device"][len(FILLS) :]
+    devices = [node.device for node in placement.nodes]
+    assert devices == ["DPU", "CPU", "DPU"]
+    assert labels == devices
+    assert [box.get("fill") for box in boxes] == [FILLS[device] for device in devices]
+    words = [t.text or "" for t in root.iter(f"{SVG}text")]
+    assert any("Sigmoid always runs on the CPU" in word for word in words)
+    assert words[0] == "a < b & c"
+
+
+def test_edges_join_writers_to_readers(tmp_path: Path) -> None:
+    placement = placed(float_convbeers(tmp_path / "f.onnx", 2, 8))
+    root = ET.fromstring(draw(placement, "net"))  # noqa: S314
+    written = {name for node in placement.nodes for name in node.op.outputs}
+    reads = sum(name in written for node in placement.nodes for name in node.op.inputs)
+    assert len(list(root.iter(f"{SVG}path"))) == reads
+    assert sum("C" in (p.get("d") or "") for p in root.iter(f"{SVG}path")) == 3  # two blocks' skips and the long one
+
+
+def test_fills_are_light_enough_for_black_text_and_apart_in_brightness() -> None:
+    def luminance(fill: str) -> float:
+        """WCAG 2.1 relative luminance."""
+        parts = [int(fill[k : k + 2], 16) / 255 for k in (1, 3, 5)]
+        linear = [p / 12.92 if p <= 0.04045 else ((p + 0.055) / 1.055) ** 2.4 for p in parts]
+        return 0.2126 * linear[0] + 0.7152 * linear[1] + 0.0722 * linear[2]
+
+    assert all((luminance(fill) + 0.05) / 0.05 > 7 for fill in FILLS.values())
+
+
+def test_a_page_and_a_drawing(tmp_path: Path) -> None:
+    placement = placed(float_convbeers(tmp_path / "f.onnx", 1, 8))
+    for name, start in (("g.svg", "<svg"), ("g.html", "<!doctype html>")):
+        write_picture(placement, "net", tmp_path / name)
+        assert (tmp_path / name).read_text().startswith(start)
+    assert "prefers-color-scheme:dark" in (tmp_path / "g.svg").read_text()
+
+
+def test_other_endings_are_refused() -> None:
+    require_picture(None)
+    with pytest.raises(OptionError, match=r"\.svg or \.html"):
+        require_picture(Path("graph.png"))

@@ -1,0 +1,117 @@
+"""Files that other quantisers write: read without a crash, refused for what the DPU cannot compute, and no more."""
+
+import itertools
+from pathlib import Path
+
+import numpy as np
+import onnx
+import pytest
+from onnx import numpy_helper
+from onnxruntime.quantization import CalibrationDataReader, QuantFormat, QuantType, quantize_static
+
+from deploy.dpu.board import load_dpu
+from deploy.dpu.placement import Placement, place
+from deploy.dpu.reading import read_network
+from tests.deploy.dpu.graphs import Sketch
+
+DPU = load_dpu()
+TILE_PX = 34
+
+
+class RandomSketch(Sketch):
+    """Weights that calibrate to sensible scales."""
+
+    def weight(self, *shape: int) -> str:
+        return self.constant(np.random.default_rng(len(self.constants)).normal(0, 0.1, shape).astype(np.float32))
+
+    def biased(self, source: str, *shape: int) -> str:
+        return self.node("Conv", source, self.weight(*shape), self.weight(shape[0]), pads=[1] * 4)
+
+
+class Images(CalibrationDataReader):  # type: ignore[misc]
+    def __init__(self) -> None:
+        self._images = iter(np.random.default_rng(k).random((1, 1, TILE_PX, TILE_PX), np.float32) for k in range(2))
+
+    def get_next(self) -> dict[str, np.ndarray] | None:
+        return next(({"image": image} for image in self._images), None)
+
+
+def float_file(path: Path) -> Path:
+    """Convolutions with bias, a residual add, pools, and a transposed convolution."""
+    s = RandomSketch(1)
+    head = s.biased("image", 8, 1, 3, 3)
+    stream = s.node("Add", head, s.biased(s.node("Relu", s.biased(head, 8, 8, 3, 3)), 8, 8, 3, 3))
+    pooled = s.node("MaxPool", stream, kernel_shape=[2, 2], strides=[2, 2])
+    up = s.node("ConvTranspose", pooled, s.weight(8, 8, 4, 4), strides=[2, 2], pads=[1] * 4)
+    return s.save(path, s.biased(s.node("LeakyRelu", up, alpha=26 / 256), 1, 8, 3, 3))
+
+
+def quantised(
+    path: Path, form: QuantFormat, kind: QuantType, per_channel: bool = False, symmetric: bool = False
+) -> Path:
+    options = {"ActivationSymmetric": symmetric}
+    given = {"quant_format": form, "activation_type": kind, "per_channel": per_channel, "extra_options": options}
+    quantize_static(float_file(path.with_name("f.onnx")), path, Images(), weight_type=QuantType.QInt8, **given)
+    return path
+
+
+def rules(placement: Placement) -> set[str]:
+    return {broken.rule for node in placement.nodes for broken in node.broken}
+
+
+@pytest.mark.parametrize(
+    ("form", "kind", "per_channel"),
+    list(itertools.product(QuantFormat, (QuantType.QInt8, QuantType.QUInt8), (False, True))),
+)
+def test_onnxruntimes_files_are_refused_for_their_numbers_alone(
+    tmp_path: Path, form: QuantFormat, kind: QuantType, per_channel: bool
+) -> None:
+    signed = kind == QuantType.QInt8
+    placement = place(read_network(quantised(tmp_path / "q.onnx", form, kind, per_channel, signed), TILE_PX), DPU)
+    expected = {"power of two"} | ({"per tensor"} if per_channel else set()) | (set() if signed else {"symmetric"})
+    if form == QuantFormat.QDQ:
+        expected |= {"int8 bias"}
+    assert rules(placement) == expected
+    core = [node.op for node in placement.nodes if node.part == "dpu-core"]
+    assert {op.kind for op in core} >= {"conv", "add", "pool", "transposed", "activation"}
+    assert all(op.out_shape is not None and op.integer for op in core)
+
+
+@pytest.mark.parametrize("kind", [QuantType.QInt8, QuantType.QUInt8])
+def test_a_vendors_power_of_two_file_passes_whole(tmp_path: Path, kind: QuantType) -> None:
+    """What AMD's quantisers write for the DPU: QDQ, 2^-position, symmetric, int8 bias."""
+    path = quantised(tmp_path / "q.onnx", QuantFormat.QDQ, kind, symmetric=True)
+    onnx.save_model(with_positions(onnx.load_model(path)), path)
+    placement = place(read_network(path, TILE_PX), DPU)
+    assert rules(placement) == set()
+    assert placement.dpu_subgraphs == 1
+    assert [(cut.tensor, cut.size_bytes) for cut in placement.cuts if cut.onto_dpu] == [
+        (placement.nodes[0].op.output, TILE_PX**2)
+    ]
+
+
+def with_positions(model: onnx.ModelProto) -> onnx.ModelProto:
+    """Scales rounded to powers of two, uint8 around 128, and int8 biases of position 7."""
+    arrays = {t.name: numpy_helper.to_array(t) for t in model.graph.initializer}
+    for node in (n for n in model.graph.node if n.op_type in ("QuantizeLinear", "DequantizeLinear")):
+        value, scale, zero = node.input
+        arrays[scale] = np.exp2(np.round(np.log2(arrays[scale]))).astype(np.float32)
+        if arrays[zero].dtype == np.uint8:
+            arrays[zero] = np.full_like(arrays[zero], 128)
+        if value in arrays and arrays[value].dtype == np.int32:
+            arrays[value], arrays[zero] = np.ones(arrays[value].shape, np.int8), np.zeros((), np.int8)
+            arrays[scale] = np.array(2.0**-7, np.float32)
+    del model.graph.initializer[:]
+    model.graph.initializer.extend(numpy_helper.from_array(array, name) for name, array in arrays.items())
+    return model
+
+
+def test_nodes_of_a_quantiser_that_onnx_does_not_know_are_named_with_a_remedy(tmp_path: Path) -> None:
+    s = Sketch(4)
+    fixed = s.node("FixNeuron", s.conv("image", (4, 4, 3, 3)), domain="com.vai.quantize")
+    path = s.save(tmp_path / "v.onnx", s.conv(fixed, (4, 4, 3, 3)))
+    model = onnx.load_model(path)
+    model.opset_import.append(onnx.helper.make_opsetid("com.vai.quantize", 1))
+    onnx.save_model(model, path)
+    (broken,) = place(read_network(path, TILE_PX), DPU).nodes[1].broken
+    assert "QDQ" in broken.finding.remedy

@@ -1,0 +1,87 @@
+"""The command check: its document, its picture, the traditional chain, and the page made from the rules."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import jsonschema
+import pytest
+import typer
+from typer.testing import CliRunner
+
+from deploy.commands.check import check
+from deploy.results import SCHEMA_PATH
+from profiles.errors import BeersError, OptionError
+from tests.deploy.dpu.graphs import Sketch, board_convbeers, float_convbeers, integer_convbeers
+
+
+def run(*arguments: str) -> tuple[int, str]:
+    app = typer.Typer()
+    app.command()(check)
+    result = CliRunner().invoke(app, arguments)
+    if isinstance(result.exception, BeersError):
+        raise result.exception
+    return result.exit_code, result.output
+
+
+def tables(path: Path) -> dict[str, list[dict[str, Any]]]:
+    content = json.loads(path.read_text())
+    jsonschema.validate(content, json.loads(SCHEMA_PATH.read_text()))
+    found: dict[str, list[dict[str, Any]]] = {}
+    for row in content["rows"]:
+        found.setdefault(row["table"], []).append(row)
+    return found
+
+
+def test_convbeers_passes_whole_in_every_spelling(tmp_path: Path) -> None:
+    for make in (float_convbeers, integer_convbeers, board_convbeers):
+        code, output = run(str(make(tmp_path / "n.onnx", 16, 64)))
+        assert (code, "DPU subgraphs: 1" in output, "check passed" in output) == (0, True, True)
+
+
+def test_the_document_holds_subgraphs_cuts_and_remarks(tmp_path: Path) -> None:
+    sketch = Sketch(8)
+    path = sketch.save(tmp_path / "bad.onnx", sketch.conv(sketch.node("Sigmoid", sketch.conv("image"))))
+    code, output = run(str(path), "--tile", "96", "--json", str(tmp_path / "o.json"))
+    found = tables(tmp_path / "o.json")
+    assert code == 1
+    assert [row["text"]["device"] for row in found["subgraphs"]] == ["DPU", "CPU", "DPU"]
+    assert [row["figures"]["size"]["value"] for row in found["cuts"]] == [8 * 96 * 96] * 4
+    assert {row["name"] for row in found["remarks"]} == {"fix2float", "pieces"}
+    assert "device subgraphs: 3, DPU subgraphs: 2" in output
+
+
+def test_a_size_that_is_not_known_is_no_zero(tmp_path: Path) -> None:
+    sketch = Sketch(4)
+    odd = sketch.node("Mystery", sketch.conv("image", (4, 4, 3, 3)), domain="com.microsoft")
+    path = sketch.save(tmp_path / "m.onnx", sketch.conv(odd, (4, 4, 3, 3)))
+    _, output = run(str(path), "--json", str(tmp_path / "o.json"))
+    modes = [row["figures"]["size"]["mode"] for row in tables(tmp_path / "o.json")["cuts"]]
+    assert modes.count("unavailable") == 2
+    assert "a size unknown" in output
+
+
+def test_a_picture_is_drawn(tmp_path: Path) -> None:
+    model = str(integer_convbeers(tmp_path / "n.onnx", 1, 8))
+    assert run(model, "--picture", str(tmp_path / "g.svg"))[0] == 0
+    assert (tmp_path / "g.svg").read_text().startswith("<svg")
+    with pytest.raises(OptionError, match="--picture"):
+        run(model, "--picture", str(tmp_path / "g.jpg"))
+
+
+def test_the_traditional_chain_is_judged_and_stays_on_the_cpu(tmp_path: Path) -> None:
+    code, output = run("traditional", "--json", str(tmp_path / "t.json"))
+    assert (code, "stays on the CPU" in output) == (1, True)
+    operators = {row["text"]["operator"] for row in tables(tmp_path / "t.json")["nodes"]}
+    assert operators >= {"DFT", "TopK", "Gather", "Cholesky"}
+    with pytest.raises(OptionError, match="--picture"):
+        run("traditional", "--picture", "g.svg")
+
+
+def test_the_page_of_operators_is_fresh() -> None:
+    root = Path(__file__).resolve().parents[2]
+    code = "import sys; sys.path.insert(0, 'docs'); from make_operators import document; sys.stdout.write(document())"
+    done = subprocess.run([sys.executable, "-c", code], cwd=root, capture_output=True, text=True, check=True)
+    assert done.stdout == (root / "docs" / "operators.md").read_text(), "run python docs/make_operators.py"

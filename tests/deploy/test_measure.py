@@ -1,0 +1,147 @@
+"""Measured on this machine: networks taking turns, their nodes, load and memory; and scaled to the board's CPU."""
+
+import math
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import onnx
+import pytest
+
+from deploy.bench import Swath
+from deploy.counterpart import counterpart, is_quantised
+from deploy.cpu_side import board_cpu_row, slowdown
+from deploy.defaults import default_int8, float_model
+from deploy.host_state import peak_memory, watched
+from deploy.measure import Sensors, drawn_acquisition, host_rows, traditional_rows
+from deploy.profiler import node_rows, profile
+from deploy.results import Row
+from deploy.turns import Timed, take_turns, timed_rows
+from profiles import load_sensor, load_target
+from profiles.constant import Constant
+from profiles.errors import ModelError
+from quant.onnx_file import load_onnx
+from tests.deploy.dpu.graphs import Sketch, float_convbeers, integer_convbeers
+
+SENSORS = Sensors(load_sensor("pleiades-degraded"), load_sensor("pleiades-reference"))
+BOARD, HOST = load_target("vck190"), load_target("host-cpu")
+SHORT = {"min_time_s": Constant(0.05, "stated", "test"), "min_runs": Constant(3, "stated", "test")}
+QUICK = replace(HOST, tables={**HOST.tables, "measurement": SHORT})
+SWATH = Swath(13600, 9016)
+
+
+def value(row: Row, key: str) -> float:
+    number = row.figures[key].value
+    assert number is not None
+    return number
+
+
+def test_float_and_int8_take_turns_and_nodes_add_up() -> None:
+    rows = host_rows(default_int8(), QUICK, 48, threads=1)
+    host = [row for row in rows if row.table == "host"]
+    assert [row.name for row in host[:2]] == ["convbeers-s-int8, 48 x 48", "float32 of the same shape, 48 x 48"]
+    for row in host[:2]:
+        assert value(row, "p50") <= value(row, "p90")
+        assert 0 <= value(row, "CPU load") <= 100
+        assert value(row, "threads") == 1
+    assert value(host[2], "ratio") == pytest.approx(value(host[1], "p50") / value(host[0], "p50"))
+    *nodes, total = (value(row, "time") for row in rows if row.table == "host nodes")
+    assert math.fsum(nodes) == pytest.approx(total, rel=1e-12)
+    assert {row.figures[key].mode for row in rows for key in row.figures if key != "power"} <= {
+        "measured",
+        "unavailable",
+    }
+
+
+def test_turns_last_for_the_minimum_time_and_count(tmp_path: Path) -> None:
+    model = onnx.load_model(integer_convbeers(tmp_path / "i.onnx", 1, 8))
+    runs = [Timed("one", model), Timed("other", model)]
+    take_turns(runs, 24, 1, min_time_s=0.05, min_runs=7)
+    assert len(runs[0].times_s) == len(runs[1].times_s) >= 7
+    assert min(sum(run.times_s) for run in runs) >= 0.05
+    assert len(timed_rows(runs[:1], 24, {})) == 1
+
+
+def test_the_counterpart_is_the_other_precision() -> None:
+    int8 = load_onnx(default_int8())
+    float32 = counterpart(int8)
+    assert is_quantised(int8)
+    assert float32 is not None
+    assert not is_quantised(float32)
+    back = counterpart(float32)
+    assert back is not None
+    assert is_quantised(back)
+    shapes = ([t.dims for t in m.graph.initializer if len(t.dims) == 4] for m in (float_model(None), float32))
+    assert len({str(s) for s in shapes}) == 1
+
+
+def test_a_network_of_another_make_runs_alone(tmp_path: Path) -> None:
+    path = float_convbeers(tmp_path / "f.onnx", 1, 8)
+    assert counterpart(load_onnx(path)) is None
+    assert [row.name for row in host_rows(path, QUICK, 32, 1) if row.table == "host"] == ["f, 32 x 32"]
+
+
+def test_a_file_fixed_to_another_tile_is_refused_in_one_sentence(tmp_path: Path) -> None:
+    sketch = Sketch(1)
+    for dimension in sketch.input.type.tensor_type.shape.dim[2:]:
+        dimension.dim_value = 48
+    path = sketch.save(tmp_path / "f.onnx", sketch.conv("image", (1, 1, 3, 3)))
+    with pytest.raises(ModelError, match="--tile 48"):
+        host_rows(path, HOST, 32, 1)
+
+
+def test_every_node_of_the_runtime_has_its_time(tmp_path: Path) -> None:
+    model = onnx.load_model(float_convbeers(tmp_path / "f.onnx", 2, 8))
+    nodes, total_ms = profile(model, {"image": np.zeros((1, 1, 40, 40), np.float32)}, 1)
+    assert sum("Conv" in node.operator for node in nodes) == 7  # head, four of two blocks, body end, tail
+    assert 0 < sum(node.time_ms for node in nodes) <= total_ms
+    assert [row.name for row in node_rows(nodes, total_ms)][-2:] == ["between the nodes", "sum: one tile"]
+
+
+def test_memory_that_is_taken_and_given_back_is_seen() -> None:
+    with peak_memory() as memory:
+        block = np.ones(40_000_000, np.uint8)
+        time.sleep(0.1)
+        del block
+    assert 30e6 < memory.rise_bytes < 200e6
+
+
+def test_load_and_clock_are_figures_or_reasons() -> None:
+    with watched() as watch:
+        sum(range(3_000_000))
+    assert watch.load.mode == "measured"
+    assert watch.clock.value is not None or watch.clock.reason
+
+
+def test_the_boards_processor_is_slower_by_an_interval_of_published_ratios() -> None:
+    low, high = slowdown(BOARD, HOST)
+    assert low == pytest.approx(2470 / (1107 * 1.65))
+    assert high == pytest.approx(55.3 / (1.47 * 1.4))
+
+
+def test_the_papers_time_on_the_board_lies_in_the_interval() -> None:
+    """From 285 to 510 s, what NL-Bayes alone takes on one core of a server for this swath; 1724 s is published."""
+    row = board_cpu_row((285, 510), SWATH, BOARD, HOST)
+    latency = row.figures["latency"]
+    assert latency.mode == "predicted"
+    assert latency.interval is not None
+    assert latency.interval[0] < value(row, "latency") < latency.interval[1]
+    assert latency.interval[0] < 1724 < latency.interval[1]
+    assert (value(row, "power"), row.figures["power"].mode) == (22.5, "published")
+    assert value(row, "throughput") * value(row, "latency") == pytest.approx(SWATH.frames)
+
+
+def test_one_core_at_worst_and_both_at_best() -> None:
+    low, high = slowdown(BOARD, HOST)
+    row = board_cpu_row((100, 100), SWATH, BOARD, HOST)
+    assert row.figures["latency"].interval == pytest.approx((100 * low / 2, 100 * high))
+
+
+def test_the_chain_says_under_what_conditions_it_ran() -> None:
+    swath = Swath(61, 47)
+    here, board = traditional_rows(drawn_acquisition(swath, SENSORS), swath, SENSORS)
+    assert {"threads", "CPU load", "clock"} <= set(here.figures)
+    assert here.figures["latency"].mode == "measured"
+    assert board.figures["latency"].mode == "predicted"
+    assert board.table == here.table
