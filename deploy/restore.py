@@ -1,6 +1,7 @@
-"""Restore a whole image tile by tile."""
+"""Restore an image in memory tile by tile; deploy.swath does it for files of any size."""
 
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -8,7 +9,7 @@ import onnx
 import onnxruntime as ort
 import tifffile
 
-from deploy.tiling import Tile, plan_tiles
+from deploy.tiling import plan_tiles
 from model.files import whole_file
 from model.images import read_pixels
 from profiles.errors import ImageError, OptionError
@@ -17,6 +18,9 @@ from quant.session import run
 
 MAX_DN = 4095
 TILE_PX = 640
+
+Infer = Callable[[np.ndarray], np.ndarray]
+"""A network ready to run: (1, 1, h, w) float32 in [0, 1] to the same shape."""
 
 
 def read_acquisition(path: Path) -> np.ndarray:
@@ -48,22 +52,26 @@ def restore_image(
     halo_px: int,
     tick: Callable[[], None] = lambda: None,
 ) -> np.ndarray:
-    """Restore (H, W) digital numbers to (H, W) uint16 in 0..4095; `tick` is called once a tile."""
+    """Restore (H, W) digital numbers to (H, W) uint16 in 0..4095, in memory; `tick` is called once a tile."""
     result = np.empty(dn.shape, np.uint16)
     height, width = dn.shape
     for tile in plan_tiles(height, width, tile_px, halo_px):
-        tile.write(restore_tile(dn, tile, session), result)
+        tile.write(np.rint(restore_window(tile.read(dn), partial(run, session))), result)
         tick()
     return result
 
 
-def restore_tile(dn: np.ndarray, tile: Tile, session: ort.InferenceSession) -> np.ndarray:
-    """One window through the network, (h, w) uint16."""
-    image = np.ascontiguousarray(tile.read(dn), dtype=np.float32)[None, None] / np.float32(MAX_DN)
-    restored = run(session, image)[0, 0] * np.float32(MAX_DN)
+def restore_window(dn: np.ndarray, infer: Infer, full_scale: float = MAX_DN) -> np.ndarray:
+    """One (h, w) window of digital numbers through the network, (h, w) float32 in 0..full_scale, not rounded.
+
+    Raises:
+        ImageError: the network gives NaN or infinity.
+    """
+    image = np.ascontiguousarray(dn, dtype=np.float32)[None, None] / np.float32(full_scale)
+    restored = infer(image)[0, 0] * np.float32(full_scale)
     if not np.isfinite(restored).all():
         raise ImageError("restored tile", expected="finite pixels", got="NaN", remedy="check the model with 'gate'")
-    return np.asarray(np.clip(np.rint(restored), 0, MAX_DN).astype(np.uint16))
+    return np.asarray(np.clip(restored, 0, np.float32(full_scale)))
 
 
 def write_tiff(path: Path, dn: np.ndarray) -> None:

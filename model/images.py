@@ -3,6 +3,8 @@
 import math
 import re
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +12,7 @@ import psutil
 import tifffile
 from PIL import Image, UnidentifiedImageError
 
-from profiles.errors import ImageError, MachineError
+from profiles.errors import BeersError, ImageError, MachineError
 
 TIFF_SUFFIXES = {".tif", ".tiff"}
 IMAGE_SUFFIXES = TIFF_SUFFIXES | {".png", ".jpg", ".jpeg"}
@@ -28,10 +30,7 @@ def read_pixels(path: Path) -> np.ndarray:
         ImageError: missing, empty, not an image, or holding NaN or infinity.
         MachineError: too large for the free memory.
     """
-    if not path.is_file():
-        raise ImageError(str(path), expected="an image file", got="no such file", remedy="check the path")
-    if path.stat().st_size == 0:
-        raise ImageError(str(path), expected="an image", got="an empty file", remedy="write or copy it again")
+    require_image_file(path)
     pixels = _read_tiff(path) if path.suffix.lower() in TIFF_SUFFIXES else _read_other(path)
     if pixels.ndim not in (2, 3) or 0 in pixels.shape:
         raise ImageError(
@@ -43,6 +42,40 @@ def read_pixels(path: Path) -> np.ndarray:
             str(path), expected="finite pixels", got=f"{count} NaN or infinite", remedy="fill or mask them first"
         )
     return pixels
+
+
+def require_image_file(path: Path) -> None:
+    """Refuse what is no file, or an empty one.
+
+    Raises:
+        ImageError: either.
+    """
+    if not path.is_file():
+        raise ImageError(str(path), expected="an image file", got="no such file", remedy="check the path")
+    if path.stat().st_size == 0:
+        raise ImageError(str(path), expected="an image", got="an empty file", remedy="write or copy it again")
+
+
+@contextmanager
+def damage_in_a_sentence(path: Path, where: str = "") -> Iterator[None]:
+    """One sentence for whatever the bytes of a damaged TIFF lead to; `where` names the place in it.
+
+    Raises:
+        ImageError: damaged.
+        MachineError: a compression that needs a package which is not installed.
+    """
+    try:
+        yield
+    except (BeersError, MemoryError):
+        raise
+    except Exception as error:
+        name = f"{path}, {where}" if where else str(path)
+        if isinstance(error, ValueError) and "imagecodecs" in str(error):
+            remedy = "pip install 'beers-deploy[codecs]'"
+            raise MachineError(
+                name, expected="a TIFF compression known here", got=str(error), remedy=remedy
+            ) from error
+        raise _no_image(name, error) from error
 
 
 def list_images(folder: Path) -> list[Path]:
@@ -64,22 +97,10 @@ def site_of(name: str) -> str:
 
 
 def _read_tiff(path: Path) -> np.ndarray:
-    try:
-        with tifffile.TiffFile(path) as file:
-            series = file.series[0]
-            _check_memory(path, math.prod(series.shape))
-            pixels = np.asarray(series.asarray())
-    except MachineError:
-        raise
-    except ValueError as error:
-        if "imagecodecs" in str(error):
-            remedy = "pip install 'beers-deploy[codecs]'"
-            raise MachineError(
-                str(path), expected="a TIFF compression known here", got=str(error), remedy=remedy
-            ) from error
-        raise _no_image(path, error) from error
-    except Exception as error:  # a damaged file raises whatever its bytes lead to
-        raise _no_image(path, error) from error
+    with damage_in_a_sentence(path), tifffile.TiffFile(path) as file:
+        series = file.series[0]
+        _check_memory(path, math.prod(series.shape))
+        pixels = np.asarray(series.asarray())
     if pixels.ndim == 3 and pixels.shape[0] in (1, 3, 4) and pixels.shape[2] not in (1, 3, 4):
         pixels = np.moveaxis(pixels, 0, 2)  # planar storage: bands first
     return pixels[..., 0] if pixels.ndim == 3 and pixels.shape[2] == 1 else pixels
@@ -93,7 +114,7 @@ def _read_other(path: Path) -> np.ndarray:
             _check_memory(path, image.width * image.height * bands)
             return np.asarray(image if image.mode in ("L", "I;16", "I", "F") else image.convert("RGB"))
     except (UnidentifiedImageError, OSError, ValueError, SyntaxError) as error:
-        raise _no_image(path, error) from error
+        raise _no_image(str(path), error) from error
     finally:
         Image.MAX_IMAGE_PIXELS = limit
 
@@ -109,8 +130,8 @@ def _check_memory(path: Path, samples: int) -> None:
         )
 
 
-def _no_image(path: Path, error: Exception) -> ImageError:
+def _no_image(name: str, error: Exception) -> ImageError:
     got = " ".join(str(error).split()) or type(error).__name__
     return ImageError(
-        str(path), expected="a readable TIFF, PNG or JPEG", got=got[:120], remedy="check that it is a whole image"
+        name, expected="a readable TIFF, PNG or JPEG", got=got[:120], remedy="check that it is a whole image"
     )

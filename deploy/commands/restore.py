@@ -1,40 +1,62 @@
-"""`beers-deploy restore`: a raw 12-bit image in, the restored one out."""
+"""`beers-deploy restore`: a raw image in, the restored one out, of any size."""
 
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
+from deploy.swath.options import FULL_SCALE_DN, TILE_PX, Compression, Options, Runtime
+
 EXAMPLE = "restore raw.tif restored.tif"
 
 
 def restore(
-    image: Annotated[Path, typer.Argument(metavar="IN", help="Mono image of at most 12 bits (TIFF or PNG).")],
-    out: Annotated[Path, typer.Argument(metavar="OUT", help="16-bit TIFF to write, values 0 to 4095.")],
+    image: Annotated[Path, typer.Argument(metavar="IN", help="Image of at most 12 bits (TIFF of any size, or PNG).")],
+    out: Annotated[Path, typer.Argument(metavar="OUT", help="TIFF to write: uint16, or float32 where IN is float.")],
     model: Annotated[
         Path | None, typer.Option(help="ONNX network, float or INT8; the shipped INT8 one if none.")
     ] = None,
-    tile: Annotated[int, typer.Option(min=16, help="Tile side in pixels.")] = 640,
+    tile: Annotated[int, typer.Option(min=16, help="Tile side in pixels.")] = TILE_PX,
     halo: Annotated[str, typer.Option(help="Context around a tile: 'exact' (no seams) or pixels.")] = "exact",
+    full_scale: Annotated[float, typer.Option(help="The digital number that is the network's 1.0.")] = FULL_SCALE_DN,
+    runtime: Annotated[Runtime, typer.Option(help="What runs the network.")] = Runtime.onnxruntime,
     threads: Annotated[int, typer.Option(min=0, help="Threads; 0 takes every core.")] = 0,
+    compression: Annotated[Compression, typer.Option(help="Of the output, lossless.")] = Compression.zlib,
+    memory: Annotated[float | None, typer.Option(min=0, help="Budget in GB; what is free if none.")] = None,
+    resume: Annotated[bool, typer.Option("--resume", help="Go on with a run that was stopped or killed.")] = False,
+    json: Annotated[Path | None, typer.Option(help="Write the figures here.")] = None,
 ) -> None:
-    """Restore an image tile by tile; with the exact halo the result is the whole image's, bit for bit."""
-    from deploy.defaults import default_int8
-    from deploy.progress import steps
-    from deploy.restore import check_fixed_tile, parse_halo, read_acquisition, restore_image, write_tiff
-    from deploy.tiling import plan_tiles
-    from model.files import require_writable
-    from quant.onnx_file import load_onnx
-    from quant.radius import receptive_radius_px
-    from quant.session import open_session
+    """Restore an image tile by tile; with the exact halo the result is the whole image's, bit for bit.
 
-    require_writable(out)
-    network = load_onnx(model or default_int8())
-    halo_px = parse_halo(halo, receptive_radius_px(network))
-    dn = read_acquisition(image)
-    check_fixed_tile(network, tile, dn.shape)
-    height, width = dn.shape
-    with steps("restoring", len(plan_tiles(height, width, tile, halo_px))) as bar:
-        restored = restore_image(dn, open_session(network, threads), tile, halo_px, bar.advance)
-    write_tiff(out, restored)
-    typer.echo(f"wrote {out}: {height} x {width} pixels, tile {tile}, halo {halo_px}")
+    The image is read and written by rows, so memory does not grow with its height. Bands are restored one by one.
+    Georeference, RPCs and missing pixels (NaN, or the nodata value) are kept. Until OUT is finished its rows lie in
+    .OUT.part beside it.
+    """
+    from deploy.results import Document
+    from deploy.swath.run import restore_file
+    from deploy.tables import print_rows
+    from model.files import require_writable
+
+    require_writable(json)
+    path = model or _shipped()
+    options = Options(
+        path,
+        tile,
+        halo,
+        full_scale,
+        runtime,
+        threads,
+        compression,
+        int(memory * 1e9) if memory else None,
+        resume,
+    )
+    row = restore_file(image, out, options, typer.echo)
+    print_rows(f"wrote {out}", [row])
+    arguments = {"tile": tile, "halo": halo, "full_scale": full_scale, "runtime": runtime, "threads": threads}
+    Document("restore", arguments, (path, image), (row,)).write(json)
+
+
+def _shipped() -> Path:
+    from deploy.defaults import default_int8  # brings torch along: only where it is needed
+
+    return default_int8()

@@ -1,0 +1,135 @@
+"""The swath engine beside the bare runtime on the same tiles in memory, and the memory of whole swaths.
+
+    python benchmarks/swath.py [--size 3000x2000] [--runtimes onnxruntime,openvino] [--swaths 13600x9016,20000x20000]
+
+Random weights: speed and memory do not depend on them. Engine and bare runtime take turns in one run; the ratios are
+of their fastest times, by the clock and by the processor (with --threads 1 the latter also holds on a busy machine).
+Swaths run in a process of their own, through a network of one block.
+"""
+
+import argparse
+import json
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import onnx
+import tifffile
+import torch
+
+from deploy.commands.bench import parse_size
+from deploy.export import to_onnx
+from deploy.swath.options import Options, Runtime
+from deploy.swath.run import restore_file
+from deploy.swath.runtime import open_runtime
+from deploy.tiling import plan_tiles
+from model.convbeers import VARIANTS, ConvBEERS, Variant, initialise
+from quant.radius import receptive_radius_px
+
+TILE_PX = 640
+ENTRY = "from deploy.cli import app; app()"
+
+
+def main() -> None:
+    """Print a line a network and runtime, then a line a swath."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--size", default="3000x2000")
+    parser.add_argument("--runtimes", default="onnxruntime")
+    parser.add_argument("--variants", default="convbeers-xs,convbeers-s")
+    parser.add_argument("--int8", type=Path, help="an INT8 network to time as well")
+    parser.add_argument("--swaths", default="")
+    parser.add_argument("--known-rows", type=int, help="rows of the swaths that hold pixels; below them is nodata")
+    parser.add_argument("--threads", type=int, default=0)
+    parser.add_argument("--repeats", type=int, default=3)
+    arguments = parser.parse_args()
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        networks = [random_network(folder, v, VARIANTS[v]) for v in arguments.variants.split(",") if v]
+        for path in networks + ([arguments.int8] if arguments.int8 else []):
+            for runtime in arguments.runtimes.split(","):
+                options = Options(path, TILE_PX, runtime=Runtime(runtime), threads=arguments.threads)
+                speed(folder, options, parse_size(arguments.size), arguments.repeats)
+        for size in filter(None, arguments.swaths.split(",")):
+            memory(folder, random_network(folder, "one-block", Variant(1, 8)), parse_size(size), arguments.known_rows)
+
+
+def speed(folder: Path, options: Options, size: tuple[int, int], repeats: int) -> None:
+    """Engine from file to file over the bare runtime on the same windows, already float32 in memory."""
+    image = folder / "image.tif"
+    dn = np.random.default_rng(0).integers(100, 3000, size[::-1]).astype(np.uint16)
+    tifffile.imwrite(image, dn, tile=(256, 256), compression="zlib")
+    network = onnx.load(options.model)
+    tiles = plan_tiles(*dn.shape, TILE_PX, receptive_radius_px(network))
+    windows = [np.ascontiguousarray(tile.read(dn), np.float32)[None, None] / np.float32(4095) for tile in tiles]
+    infer, version = open_runtime(options.runtime, network, options.threads)
+
+    def bare() -> None:
+        for window in windows:
+            infer(window)
+
+    def engine() -> None:
+        restore_file(image, folder / "out.tif", options, lambda _: None)
+
+    (bare_s, bare_cpu_s), (engine_s, engine_cpu_s) = fastest([bare, engine], repeats)
+    print(
+        f"{options.model.stem:18} {version:20} {len(tiles)} tiles: bare {bare_s:.2f} s, engine {engine_s:.2f} s "
+        f"({dn.size / engine_s / 1e6:.3f} Mpx/s); engine over bare {bare_s / engine_s:.3f} by the clock, "
+        f"{bare_cpu_s / engine_cpu_s:.3f} by the processor",
+        flush=True,
+    )
+
+
+def fastest(works: list[Callable[[], None]], repeats: int) -> np.ndarray:
+    """The fastest (clock, processor) times of each in s, taking turns; the first turn is not counted."""
+    times_s = np.zeros((repeats + 1, len(works), 2))
+    for turn in times_s:
+        for k, work in enumerate(works):
+            before = time.perf_counter(), time.process_time()
+            work()
+            turn[k] = time.perf_counter() - before[0], time.process_time() - before[1]
+    return np.asarray(times_s[1:].min(axis=0))
+
+
+def memory(folder: Path, model: Path, size: tuple[int, int], known_rows: int | None) -> None:
+    """Peak memory of the command on a drawn swath, compressed in tiles, never whole in memory."""
+    width, height = size
+    image, figures = folder / "swath.tif", folder / "swath.json"
+    write_swath(image, height, width, known_rows or height)
+    arguments = ["restore", image, folder / "swath-out.tif", "--model", model, "--json", figures]
+    subprocess.run([sys.executable, "-c", ENTRY, *map(str, arguments)], check=True)  # noqa: S603
+    row = json.loads(figures.read_text())["rows"][0]["figures"]
+    time_s, peak_gb = row["time"]["value"], row["peak memory"]["value"]
+    print(f"{width} x {height}: {time_s:.0f} s, peak memory {peak_gb:.3f} GB", flush=True)
+
+
+def write_swath(path: Path, height: int, width: int, known_rows: int) -> None:
+    """A ramp of uint16 over the known rows, tile by tile; tiles below them are left out of the file, as nodata."""
+    ramp = np.arange(1, 257, dtype=np.uint16) * np.ones((256, 1), np.uint16)
+    across = -(-width // 256)
+    known, count = -(-known_rows // 256) * across, -(-height // 256) * across
+    tifffile.imwrite(
+        path,
+        (ramp + np.uint16(k % 3000) if k < known else None for k in range(count)),
+        shape=(height, width),
+        dtype=np.uint16,
+        tile=(256, 256),
+        compression="zlib",
+        bigtiff=True,
+        extratags=[(42113, "s", 0, "0", True)],
+    )
+
+
+def random_network(folder: Path, name: str, variant: Variant) -> Path:
+    """A float network with random weights."""
+    network = ConvBEERS(variant)
+    initialise(network, torch.Generator().manual_seed(0))
+    onnx.save(to_onnx(network, {}), folder / f"{name}.onnx")
+    return folder / f"{name}.onnx"
+
+
+if __name__ == "__main__":
+    main()

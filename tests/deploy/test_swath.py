@@ -1,0 +1,306 @@
+"""Files restored by the swath engine: the whole image's result bit for bit, and what is kept beside the pixels."""
+
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnx
+import psutil
+import pytest
+import tifffile
+import torch
+
+from deploy.defaults import default_int8
+from deploy.export import to_onnx
+from deploy.restore import Infer, restore_window
+from deploy.results import Row
+from deploy.swath import run as swath
+from deploy.swath.missing import fill_missing
+from deploy.swath.options import Compression, Options, Runtime
+from deploy.swath.runtime import open_runtime
+from model.convbeers import ConvBEERS, Variant, initialise
+from profiles.errors import BeersError, ImageError, MachineError, ModelError, OptionError
+from quant.onnx_file import load_onnx, save_onnx
+from quant.radius import receptive_radius_px
+from quant.session import open_session, run
+
+RADIUS_PX = 5
+SHAPES = [(61, 83), (17, 130), (1, 40), (40, 1), (29, 29), (3, 5)]
+
+
+@pytest.fixture(scope="module")
+def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    network = ConvBEERS(Variant(blocks=1, features=8))
+    initialise(network, torch.Generator().manual_seed(0))
+    with torch.no_grad():
+        for value in network.parameters():
+            value.mul_(2.0)
+    path = tmp_path_factory.mktemp("model") / "small.onnx"
+    save_onnx(to_onnx(network, {}), path)
+    return path
+
+
+def noise(*shape: int, seed: int = 1) -> np.ndarray:
+    return np.random.default_rng(seed).integers(1, 4095, shape).astype(np.uint16)
+
+
+def restore(folder: Path, pixels: np.ndarray, options: Options, **written: Any) -> tuple[np.ndarray, Row]:
+    """Write, restore and read again."""
+    tifffile.imwrite(folder / "in.tif", pixels, **written)
+    row = swath.restore_file(folder / "in.tif", folder / "out.tif", options, lambda _: None)
+    assert sorted(p.name for p in folder.iterdir()) == ["in.tif", "out.tif"]
+    return tifffile.imread(folder / "out.tif"), row
+
+
+def whole_image(model: Path, pixels: np.ndarray) -> np.ndarray:
+    """The result without any tiling, float32."""
+    return restore_window(pixels, partial(run, open_session(load_onnx(model))))
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_tiled_equals_whole_bit_for_bit(shape: tuple[int, int], model: Path, tmp_path: Path) -> None:
+    options = Options(model, tile_px=23)
+    pixels = noise(*shape)
+    restored, _ = restore(tmp_path, pixels, options, tile=(16, 16), compression="zlib")
+    assert restored.dtype == np.uint16
+    np.testing.assert_array_equal(restored, np.rint(whole_image(model, pixels)).astype(np.uint16))
+    floats, _ = restore(tmp_path, pixels.astype(np.float32), options)
+    assert floats.dtype == np.float32
+    np.testing.assert_array_equal(floats, whole_image(model, pixels))
+
+
+@pytest.mark.parametrize("shape", [(131, 97), (20, 150)])
+def test_int8_tiled_equals_whole_bit_for_bit(shape: tuple[int, int], tmp_path: Path) -> None:
+    restored, _ = restore(tmp_path, noise(*shape), Options(default_int8(), tile_px=64))
+    expected = np.rint(whole_image(default_int8(), noise(*shape))).astype(np.uint16)
+    np.testing.assert_array_equal(restored, expected)
+
+
+def test_one_pixel_less_than_the_radius_shows_seams_and_says_so(model: Path, tmp_path: Path) -> None:
+    pixels = noise(61, 83).astype(np.float32)
+    restored, row = restore(tmp_path, pixels, Options(model, tile_px=23, halo=str(RADIUS_PX - 1)))
+    assert (restored != whole_image(model, pixels)).any()
+    largest, mean = row.figures["seam error max"], row.figures["seam error mean"]
+    assert largest.value is not None
+    assert mean.value is not None
+    assert largest.value > mean.value > 0
+    assert largest.mode == "measured"
+
+
+def test_int8_shows_seams_at_one_pixel_less_than_the_radius(tmp_path: Path) -> None:
+    radius_px = receptive_radius_px(load_onnx(default_int8()))
+    pixels = noise(180, 200)
+    restored, _ = restore(tmp_path, pixels, Options(default_int8(), tile_px=64, halo=str(radius_px - 1)))
+    assert (restored != np.rint(whole_image(default_int8(), pixels))).any()
+
+
+def test_the_seam_error_is_that_of_the_tile_in_the_middle(model: Path, tmp_path: Path) -> None:
+    pixels = noise(60, 60).astype(np.float32)
+    restored, row = restore(tmp_path, pixels, Options(model, tile_px=24, halo="2"))
+    middle = np.s_[22:42, 22:42]  # tiles keep rows 0-21, 22-41, 42-59
+    error = np.abs(restored.astype(np.float64) - whole_image(model, pixels))[middle]
+    assert row.figures["seam error max"].value == pytest.approx(error.max())
+    assert row.figures["seam error mean"].value == pytest.approx(error.mean())
+
+
+@pytest.mark.parametrize("written", [{"planarconfig": "separate"}, {"planarconfig": "contig"}])
+def test_bands_are_restored_one_by_one(written: dict[str, str], model: Path, tmp_path: Path) -> None:
+    bands = noise(3, 41, 35)
+    stored = bands if written["planarconfig"] == "separate" else np.moveaxis(bands, 0, 2)
+    restored, row = restore(tmp_path, stored, Options(model, tile_px=23), photometric="rgb", **written)
+    for band, result in zip(bands, restored, strict=True):
+        np.testing.assert_array_equal(result, np.rint(whole_image(model, band)))
+    assert row.figures["tiles"].value == 3 * 3 * 2
+
+
+def test_full_scale_is_what_the_network_sees_as_one(model: Path, tmp_path: Path) -> None:
+    pixels = noise(40, 30)
+    twelve, _ = restore(tmp_path, pixels, Options(model, tile_px=23))
+    fourteen, _ = restore(tmp_path, pixels * 4, Options(model, tile_px=23, full_scale=4095 * 4))
+    assert np.abs(fourteen / 4 - twelve.astype(float)).max() <= 0.625
+    unit, _ = restore(tmp_path, (pixels / 4095).astype(np.float32), Options(model, tile_px=23, full_scale=1))
+    assert np.abs(unit * 4095 - twelve.astype(float)).max() <= 0.51
+
+
+def test_georeference_and_rpcs_are_kept(model: Path, tmp_path: Path) -> None:
+    tags = [
+        (33550, "d", 3, (0.5, 0.5, 0.0), True),
+        (33922, "d", 6, (0.0, 0.0, 0.0, 3e5, 4.8e6, 0.0), True),
+        (34735, "H", 8, (1, 1, 0, 1, 1024, 0, 1, 1), True),
+        (34736, "d", 2, (6378137.0, 298.25), True),
+        (34737, "s", 0, "WGS 84|", True),
+        (42112, "s", 0, "<GDALMetadata/>", True),
+        (42113, "s", 0, "0", True),
+        (50844, "d", 92, tuple(np.linspace(-1, 1, 92)), True),
+    ]
+    restore(tmp_path, noise(20, 20), Options(model), extratags=tags)
+    with tifffile.TiffFile(tmp_path / "in.tif") as before, tifffile.TiffFile(tmp_path / "out.tif") as after:
+        for code, *_ in tags:
+            assert after.pages.first.tags[code].value == before.pages.first.tags[code].value
+            assert after.pages.first.tags[code].dtype == before.pages.first.tags[code].dtype
+
+
+@pytest.mark.parametrize("kind", ["nan", "tag"])
+def test_missing_pixels_stay_and_spoil_nothing(kind: str, model: Path, tmp_path: Path) -> None:
+    known, missing = noise(70, 90).astype(np.float32), np.zeros((70, 90), bool)
+    missing[20:60, 30:75] = missing[3, 5] = True
+    spoilt, tags = np.where(missing, np.nan, known).astype(np.float32), []
+    if kind == "tag":
+        spoilt, tags = (
+            np.where(missing, 7, np.where(known == 7, 8, known)).astype(np.uint16),
+            [(42113, "s", 0, "7", True)],
+        )
+    results = [
+        restore(tmp_path, spoilt, Options(model, tile_px=tile_px), extratags=tags)[0] for tile_px in (19, 31, 640)
+    ]
+    np.testing.assert_array_equal(results[0], results[2])
+    np.testing.assert_array_equal(results[1], results[2])
+    np.testing.assert_array_equal(results[0][missing], spoilt[missing])
+    sound, _ = restore(tmp_path, np.where(missing, 999, known).astype(spoilt.dtype), Options(model))
+    differs = (results[0] != sound) & ~missing
+    rows, columns = np.nonzero(missing)
+    for row, column in np.argwhere(differs):
+        assert np.maximum(np.abs(rows - row), np.abs(columns - column)).min() <= RADIUS_PX
+    assert not (results[0][~missing] == 7).any() or kind == "nan"
+
+
+def test_a_filled_pixel_is_the_nearest_known_one() -> None:
+    pixels, missing = np.arange(12.0).reshape(2, 6), np.zeros((2, 6), bool)
+    missing[0, 1:] = missing[1, :2] = True
+    np.testing.assert_array_equal(fill_missing(pixels, missing, 2), [[0, 0, 0, 9, 10, 11], [8, 8, 8, 9, 10, 11]])
+    assert fill_missing(pixels, np.ones((2, 6), bool), 2).max() == 0
+
+
+def refused(folder: Path, pixels: np.ndarray, options: Options, error: type[BeersError], *words: str) -> None:
+    """One sentence, the old output as it was, and nothing beside it."""
+    tifffile.imwrite(folder / "in.tif", pixels, tile=(16, 16))
+    (folder / "out.tif").write_bytes(b"the old one")
+    with pytest.raises(error) as caught:
+        swath.restore_file(folder / "in.tif", folder / "out.tif", options, lambda _: None)
+    for word in words:
+        assert word in str(caught.value)
+    assert (folder / "out.tif").read_bytes() == b"the old one"
+    assert sorted(p.name for p in folder.iterdir()) == ["in.tif", "out.tif"]
+
+
+def test_values_beyond_full_scale_in_the_last_rows_leave_the_old_output(model: Path, tmp_path: Path) -> None:
+    pixels = noise(90, 40)
+    pixels[-1, -1] = 60000
+    refused(tmp_path, pixels, Options(model, tile_px=23), ImageError, "60000", "--full-scale")
+    pixels = -noise(90, 40).astype(np.float32)
+    refused(tmp_path, pixels, Options(model, tile_px=23), ImageError, "-4")
+    refused(tmp_path, np.full((20, 20), np.inf, np.float32), Options(model), ImageError, "inf")
+
+
+def test_an_image_all_missing_is_refused(model: Path, tmp_path: Path) -> None:
+    refused(tmp_path, np.full((60, 40), np.nan, np.float32), Options(model, tile_px=23), ImageError, "NaN")
+
+
+def test_options_that_cannot_be_are_refused(model: Path, tmp_path: Path) -> None:
+    sound = Options(model, tile_px=23)
+    for options, word in (
+        (replace(sound, tile_px=16, halo="8"), "--tile"),
+        (replace(sound, halo="wide"), "--halo"),
+        (replace(sound, full_scale=0.5), "--full-scale"),
+    ):
+        refused(tmp_path, noise(40, 40), options, OptionError, word)
+
+
+def test_a_network_that_gives_nan_is_refused(model: Path, tmp_path: Path) -> None:
+    broken = load_onnx(model)
+    weights = next(t for t in broken.graph.initializer if t.name == "head.bias")
+    weights.CopyFrom(onnx.numpy_helper.from_array(np.full(8, np.nan, np.float32), weights.name))
+    onnx.save(broken, tmp_path.parent / "broken.onnx")
+    refused(tmp_path, noise(40, 40), Options(tmp_path.parent / "broken.onnx"), ImageError, "finite")
+
+
+def test_a_budget_that_does_not_suffice_is_refused_before_the_run(model: Path, tmp_path: Path) -> None:
+    refused(tmp_path, noise(40, 40), Options(model, memory_bytes=1000), MachineError, "--memory", "--tile")
+    tifffile.imwrite(tmp_path / "in.tif", noise(1000, 3000), compression="zlib", rowsperstrip=1000)
+    options = Options(model, tile_px=64, memory_bytes=int(psutil.Process().memory_info().rss + 8e6))
+    with pytest.raises(MachineError, match="TILED=YES"):
+        swath.restore_file(tmp_path / "in.tif", tmp_path / "out.tif", options, lambda _: None)
+
+
+def test_memory_is_stated_before_anything_is_written(model: Path, tmp_path: Path) -> None:
+    tifffile.imwrite(tmp_path / "in.tif", noise(80, 40))
+    said: list[str] = []
+
+    def say(text: str) -> None:
+        said.append(text)
+        assert not (tmp_path / "out.tif").exists()
+
+    swath.restore_file(tmp_path / "in.tif", tmp_path / "out.tif", Options(model, tile_px=23), say)
+    assert "work factor" in said[0]
+    assert "memory" in said[1]
+
+
+@pytest.mark.parametrize("compression", Compression)
+def test_compressions_are_lossless(compression: Compression, model: Path, tmp_path: Path) -> None:
+    if compression in (Compression.lzw, Compression.zstd):
+        pytest.importorskip("imagecodecs")
+    restored, _ = restore(tmp_path, noise(40, 50), Options(model, compression=compression))
+    np.testing.assert_array_equal(restored, np.rint(whole_image(model, noise(40, 50))))
+    with tifffile.TiffFile(tmp_path / "out.tif") as file:
+        assert file.pages.first.is_tiled
+        assert (file.pages.first.compression == 1) == (compression is Compression.none)
+
+
+def test_large_outputs_are_big_tiffs(model: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("deploy.swath.writer.PLAIN_LIMIT_BYTES", 1000)
+    restore(tmp_path, noise(40, 50), Options(model))
+    with tifffile.TiffFile(tmp_path / "out.tif") as file:
+        assert file.is_bigtiff
+
+
+def test_a_tile_without_known_pixels_costs_no_inference(
+    model: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen: list[tuple[int, ...]] = []
+
+    def counting(window: np.ndarray, infer: Infer, full_scale: float) -> np.ndarray:
+        seen.append(window.shape)
+        return restore_window(window, infer, full_scale)
+
+    monkeypatch.setattr("deploy.swath.engine.restore_window", counting)
+    pixels = noise(30, 300).astype(np.float32)
+    pixels[:, 100:] = np.nan
+    _, row = restore(tmp_path, pixels, Options(model, tile_px=30))
+    assert row.figures["tiles"].value == 15
+    assert len(seen) == 5  # a tile keeps 25 columns, then 20
+
+
+def test_openvino_gives_the_same_int8_numbers(tmp_path: Path) -> None:
+    pytest.importorskip("openvino")
+    pixels = np.concatenate([noise(100, 110), np.linspace(0, 4095, 11000).reshape(100, 110).astype(np.uint16)])
+    one, _ = restore(tmp_path, pixels, Options(default_int8(), tile_px=64))
+    other, row = restore(tmp_path, pixels, Options(default_int8(), tile_px=64, runtime=Runtime.openvino))
+    np.testing.assert_array_equal(other, one)
+    assert row.text["runtime"].startswith("openvino")
+
+
+def test_openvino_gives_the_same_float_numbers_within_a_hundredth_of_a_dn(model: Path, tmp_path: Path) -> None:
+    pytest.importorskip("openvino")
+    pixels = noise(61, 83).astype(np.float32)
+    one, _ = restore(tmp_path, pixels, Options(model, tile_px=30))
+    other, _ = restore(tmp_path, pixels, Options(model, tile_px=30, runtime=Runtime.openvino))
+    whole, _ = restore(tmp_path, pixels, Options(model, runtime=Runtime.openvino))
+    np.testing.assert_array_equal(other, whole)
+    assert np.abs(other - one).max() < 0.01
+
+
+def test_a_missing_openvino_is_one_sentence(model: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(__import__("sys").modules, "openvino", None)
+    with pytest.raises(MachineError, match=r"pip install 'beers-deploy\[openvino\]'"):
+        open_runtime(Runtime.openvino, load_onnx(model), 1)
+
+
+def test_models_that_cannot_be_tiled_are_refused(model: Path, tmp_path: Path) -> None:
+    whole = load_onnx(model)
+    whole.graph.node[-1].output[0] = "local"
+    whole.graph.node.append(onnx.helper.make_node("InstanceNormalization", ["local", "one", "one"], ["restored"]))
+    whole.graph.initializer.append(onnx.numpy_helper.from_array(np.ones(1, np.float32), "one"))
+    save_onnx(whole, tmp_path.parent / "norm.onnx")
+    refused(tmp_path, noise(40, 40), Options(tmp_path.parent / "norm.onnx"), ModelError, "InstanceNormalization")

@@ -1,0 +1,185 @@
+"""Whatever stops a run, the output is the old one or the new one, and a resumed run gives the same bytes.
+
+BEERS_KILLS=50 kills as many runs; the suite kills a few.
+"""
+
+import errno
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tifffile
+import torch
+
+from deploy.export import to_onnx
+from deploy.swath.engine import Restorer
+from deploy.swath.options import Compression, Options
+from deploy.swath.run import restore_file
+from model.convbeers import ConvBEERS, Variant, initialise
+from profiles.errors import MachineError, OptionError
+from quant.onnx_file import save_onnx
+
+KILLS = int(os.environ.get("BEERS_KILLS", "2"))
+ENTRY = "from deploy.cli import app; app()"
+TILE_PX = 64
+
+
+@pytest.fixture(scope="module")
+def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    network = ConvBEERS(Variant(blocks=1, features=8))
+    initialise(network, torch.Generator().manual_seed(0))
+    path = tmp_path_factory.mktemp("model") / "small.onnx"
+    save_onnx(to_onnx(network, {}), path)
+    return path
+
+
+@pytest.fixture
+def image(tmp_path: Path) -> Path:
+    pixels = np.random.default_rng(1).integers(0, 4096, (900, 260)).astype(np.uint16)
+    tifffile.imwrite(tmp_path / "in.tif", pixels, tile=(16, 16))
+    return tmp_path / "in.tif"
+
+
+@pytest.fixture
+def expected(image: Path, model: Path, tmp_path: Path) -> bytes:
+    """The bytes of a run that nothing disturbs."""
+    restore_file(image, tmp_path / "expected.tif", Options(model, TILE_PX), lambda _: None)
+    return (tmp_path / "expected.tif").read_bytes()
+
+
+def begin(image: Path, out: Path, model: Path) -> subprocess.Popen[str]:
+    arguments = ["restore", image, out, "--model", model, "--tile", TILE_PX, "--threads", 1, "--resume"]
+    command = [sys.executable, "-c", ENTRY, *map(str, arguments)]
+    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+
+
+def until(running: subprocess.Popen[str], word: str) -> None:
+    """Wait until it says so, or is done."""
+    assert running.stdout is not None
+    any(word in line for line in running.stdout)
+
+
+def test_killed_at_random_moments_it_is_resumed_to_the_same_bytes(
+    image: Path, model: Path, expected: bytes, tmp_path: Path
+) -> None:
+    out, rng = tmp_path / "out.tif", np.random.default_rng()
+    out.write_bytes(b"old")
+    finished = 0
+    for _ in range(KILLS):
+        running = begin(image, out, model)
+        until(running, rng.choice(["plan", "memory", "memory"]))
+        time.sleep(rng.uniform(0, 0.8))
+        running.kill()
+        running.communicate()
+        finished += running.returncode == 0
+        assert out.read_bytes() in (b"old", expected)
+    last = begin(image, out, model)
+    said, _ = last.communicate(timeout=120)
+    assert last.returncode == 0, said
+    assert out.read_bytes() == expected
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["expected.tif", "in.tif", "out.tif"]
+
+
+def test_ctrl_c_says_how_to_go_on(image: Path, model: Path, expected: bytes, tmp_path: Path) -> None:
+    running = begin(image, tmp_path / "out.tif", model)
+    until(running, "memory")
+    time.sleep(0.15)
+    running.send_signal(signal.SIGINT)
+    said, _ = running.communicate(timeout=60)
+    assert running.returncode not in (0, 2)
+    assert "--resume" in said
+    assert "Traceback" not in said
+    assert not (tmp_path / "out.tif").exists()
+    options = Options(model, TILE_PX, threads=1, resume=True)
+    restore_file(image, tmp_path / "out.tif", options, lambda _: None)
+    assert (tmp_path / "out.tif").read_bytes() == expected
+
+
+def stop_after(tiles: int, monkeypatch: pytest.MonkeyPatch, error: BaseException) -> Callable[[], None]:
+    """Raise an error in the network after so many tiles; the result lets it pass again."""
+    count, kept = iter(range(10**6)), Restorer.kept
+
+    def stopping(self: Restorer, *rest: object) -> tuple[np.ndarray, int]:
+        if next(count) == tiles:
+            raise error
+        return kept(self, *rest)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(Restorer, "kept", stopping)
+    return monkeypatch.undo
+
+
+def test_finished_rows_are_not_restored_again(
+    image: Path, model: Path, expected: bytes, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out, options = tmp_path / "out.tif", Options(model, TILE_PX)
+    go_on = stop_after(50, monkeypatch, KeyboardInterrupt())
+    with pytest.raises(KeyboardInterrupt):
+        restore_file(image, out, options, lambda _: None)
+    go_on()
+    with pytest.raises(OptionError, match="--resume"):
+        restore_file(image, out, replace(options, halo="3", resume=True), lambda _: None)
+    seen: list[str] = []
+    stop_after(50, monkeypatch, AssertionError("restored more than what was left"))
+    restore_file(image, out, replace(options, resume=True), seen.append)
+    assert out.read_bytes() == expected
+
+
+def test_another_image_of_the_same_name_is_not_mixed_in(
+    image: Path, model: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    go_on = stop_after(50, monkeypatch, KeyboardInterrupt())
+    with pytest.raises(KeyboardInterrupt):
+        restore_file(image, tmp_path / "out.tif", Options(model, TILE_PX), lambda _: None)
+    go_on()
+    tifffile.imwrite(image, np.zeros((900, 260), np.uint16), tile=(16, 16))
+    with pytest.raises(OptionError, match="the image"):
+        restore_file(image, tmp_path / "out.tif", Options(model, TILE_PX, resume=True), lambda _: None)
+    restore_file(image, tmp_path / "out.tif", Options(model, TILE_PX), lambda _: None)
+    assert tifffile.imread(tmp_path / "out.tif").max() < 4095
+
+
+@pytest.mark.parametrize("calls", [0, 4, 1000])
+def test_a_full_disk_is_one_sentence_and_loses_no_finished_row(
+    calls: int, image: Path, model: Path, expected: bytes, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The disk fills up at the first rows, at later ones, or while the output is written."""
+    out, options, count, sync = tmp_path / "out.tif", Options(model, TILE_PX), iter(range(10**6)), os.fsync
+
+    def full(handle: int) -> None:
+        if next(count) == calls:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        sync(handle)
+
+    monkeypatch.setattr(os, "fsync", full)
+    if calls == 1000:
+        monkeypatch.setattr("deploy.swath.writer._tiles", full_now)
+    out.write_bytes(b"old")
+    with pytest.raises(MachineError, match=r"No space left.*--resume"):
+        restore_file(image, out, replace(options, compression=Compression.none), lambda _: None)
+    monkeypatch.undo()
+    assert out.read_bytes() == b"old"
+    restore_file(image, out, replace(options, resume=True), lambda _: None)
+    assert out.read_bytes() == expected
+
+
+def full_now(*_: object) -> None:
+    raise OSError(errno.ENOSPC, "No space left on device")
+
+
+def test_a_swath_that_the_disk_cannot_hold_is_refused_first(
+    image: Path, model: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Usage:
+        free = 1000
+
+    monkeypatch.setattr("deploy.swath.spool.shutil.disk_usage", lambda _: Usage)
+    with pytest.raises(MachineError, match="free"):
+        restore_file(image, tmp_path / "out.tif", Options(model, TILE_PX), lambda _: None)
+    assert [p.name for p in tmp_path.iterdir()] == ["in.tif"]
