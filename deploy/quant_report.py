@@ -1,7 +1,8 @@
 """What quantisation did: layer by layer in whole numbers, and what each pass buys on patches it has not seen."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import fields, replace
+from itertools import islice
 
 import numpy as np
 import onnx
@@ -13,6 +14,7 @@ from quant.core import IntCore
 from quant.gate import compare
 from quant.graph import CORRECTION
 from quant.integer import LayerReport, run_core
+from quant.pieces import crops
 from quant.planes import split
 from quant.quantise import ALL, Passes, quantise_model
 from quant.session import open_session
@@ -21,9 +23,9 @@ LAYER_PATCHES = 4
 BITS_SOURCE = "128 times the sum of the weights' sizes, plus the bias: no input exceeds it"
 
 
-def layer_rows(core: IntCore, images: list[np.ndarray]) -> list[Row]:
-    """Accumulators, saturation and ties of each integer operation on a few images (1, 1, H, W)."""
-    seen = [run_core(core, split(image))[1] for image in images[:LAYER_PATCHES]]
+def layer_rows(core: IntCore, images: Iterable[np.ndarray]) -> list[Row]:
+    """Accumulators, saturation and ties of each integer operation on a crop of a few images (1, 1, H, W)."""
+    seen = [run_core(core, split(crop))[1] for crop in few_crops(images)]
     source = f"the integer reference on {len(seen)} calibration patches"
     return [_layer_row(list(reports), source) for reports in zip(*seen, strict=True)]
 
@@ -39,12 +41,17 @@ def _layer_row(reports: list[LayerReport], source: str) -> Row:
     return Row("integer layers", reports[0].name, figures)
 
 
-def rounding_row(core: IntCore, images: list[np.ndarray]) -> Row:
+def few_crops(images: Iterable[np.ndarray]) -> list[np.ndarray]:
+    """One crop of each of the first few images: what is looked at layer by layer."""
+    return [crops(image)[0] for image in islice(images, LAYER_PATCHES)]
+
+
+def rounding_row(core: IntCore, images: Iterable[np.ndarray]) -> Row:
     """How far the DPU's rounding of halves, up, leads away from the runtime's, to even."""
     scale = core.scale(CORRECTION)
     differences = []
-    for image in images[:LAYER_PATCHES]:
-        up, even = (run_core(core, split(image), half_even=rule)[0][CORRECTION][:, :1] for rule in (False, True))
+    for crop in few_crops(images):
+        up, even = (run_core(core, split(crop), half_even=rule)[0][CORRECTION][:, :1] for rule in (False, True))
         differences.append(np.abs(up - even) * scale)
     difference = np.concatenate([d.ravel() for d in differences])
     source = f"the integer reference on {len(differences)} calibration patches, both ways"

@@ -7,19 +7,21 @@ import numpy as np
 import onnx
 
 from quant.board_file import board_model
-from quant.calibration import Patches, choose_positions
+from quant.calibration import Patches, Remade, choose_positions
 from quant.core import IntCore, build_core, shift_faults
+from quant.float_file import float_model
 from quant.graph import CORRECTION, Conv, Graph, correction_graph, relu_count, tensors
 from quant.host_file import host_model
 from quant.onnx_file import fixed_tile_px, metadata
 from quant.passes.dual_gain import two_gains
 from quant.passes.equalise import channel_ranges, equalise, search, search_steps
 from quant.passes.steady_stream import STREAM_POSITION, common_position, steady, stream_tensors
+from quant.pieces import crops, tensor_values
 from quant.planes import coarse_plane_only, read_planes
 from quant.session import open_session, run
 
-SEARCH_PATCHES = 16
-"""Patches that the equalisation is searched on, a quarter of them with the strongest edges: there int8 clips."""
+SEARCH_CROPS = 16
+"""What the equalisation is searched on, a quarter of them with the strongest edges: there int8 clips."""
 
 
 @dataclass(frozen=True)
@@ -38,12 +40,13 @@ ALL = Passes()
 
 @dataclass(frozen=True)
 class Quantised:
-    """One network in whole numbers, for the host and for the board."""
+    """One network in whole numbers, for the host and for the board; `graph` is the float one that was rounded."""
 
     host: onnx.ModelProto
     board: onnx.ModelProto
     core: IntCore
     relus: int
+    graph: Graph
 
 
 def quantise_model(
@@ -61,11 +64,10 @@ def quantise_model(
         ModelError: not a graph of convolutions, ReLUs and adds that ends with the global add.
     """
     graph = _reads_planes(model, passes)
-    degraded = [image for image, _ in patches.pairs]
-    positions = choose_positions(graph, degraded, tick, passes.least_squares)
+    positions = choose_positions(graph, patches.degraded, tick, passes.least_squares)
     if passes.equalise and stream_tensors(graph):
-        ranges = channel_ranges(graph, degraded, tick)
-        targets = _targets(model, degraded)
+        ranges = channel_ranges(graph, patches.degraded, tick)
+        targets = search_targets(read_planes(correction_graph(model)), patches.degraded)
         factors = search(graph, ranges, lambda tried: _error(_core(tried, positions, passes), targets), tick)
         graph = equalise(graph, factors)
     core = _core(graph, positions, passes)
@@ -74,7 +76,10 @@ def quantise_model(
     about = {**metadata(model), "precision": "int8 legal", "calibration_sha256": patches.digest, **about}
     about["passes"] = ", ".join(name for name, on in asdict(passes).items() if on)
     tile_px = fixed_tile_px(model)
-    return Quantised(host_model(core, about, tile_px), board_model(core, about, tile_px), core, relu_count(graph))
+    exact = two_gains(graph) if passes.dual_gain else graph
+    return Quantised(
+        host_model(core, about, tile_px), board_model(core, about, tile_px), core, relu_count(graph), exact
+    )
 
 
 def ticks(model: onnx.ModelProto, patches: int, passes: Passes = ALL) -> int:
@@ -106,18 +111,30 @@ def _core(graph: Graph, positions: dict[str, int], passes: Passes) -> IntCore:
 
 
 Targets = list[tuple[np.ndarray, np.ndarray]]
-"""Degraded images (1, 1, H, W) and what the float network makes of them, clipped to [0, 1]."""
+"""Degraded crops (1, 1, h, w) and what the float network makes of them, clipped to [0, 1]."""
 
 
-def _targets(model: onnx.ModelProto, images: list[np.ndarray]) -> Targets:
-    """Of the patches, those with the largest corrections, and others of all sizes."""
-    session = open_session(model)
-    outputs = [np.clip(run(session, image), 0, 1) for image in images]
-    sizes = [float(np.abs(output - image).max()) for output, image in zip(outputs, images, strict=True)]
-    order = [int(k) for k in np.argsort(sizes)[::-1]]
-    hard = SEARCH_PATCHES // 4
-    others = order[hard :: max((len(order) - hard) // (SEARCH_PATCHES - hard), 1)]
-    return [(images[k], outputs[k]) for k in (*order[:hard], *others[: SEARCH_PATCHES - hard])]
+def search_targets(graph: Graph, images: Remade[np.ndarray]) -> Targets:
+    """Of all crops of the images, those with the largest corrections, and others of all sizes.
+
+    Only their sizes are kept; the images of the chosen are made once more.
+    """
+    session = open_session(float_model(graph, [CORRECTION]))
+
+    def restored(crop: np.ndarray) -> np.ndarray:
+        (correction,) = next(tensor_values(session, [CORRECTION], crop, halo_px=0))
+        return np.asarray(np.clip(crop + correction, 0, 1))
+
+    sizes = {
+        (k, n): float(np.abs(restored(crop) - crop).max())
+        for k, image in enumerate(images)
+        for n, crop in enumerate(crops(image))
+    }
+    order = sorted(sizes, key=lambda place: sizes[place], reverse=True)
+    hard = SEARCH_CROPS // 4
+    others = order[hard :: max((len(order) - hard) // (SEARCH_CROPS - hard), 1)]
+    chosen = [crops(images[k])[n].copy() for k, n in (*order[:hard], *others[: SEARCH_CROPS - hard])]
+    return [(crop, restored(crop)) for crop in chosen]
 
 
 def _error(core: IntCore, targets: Targets) -> float:

@@ -15,12 +15,12 @@ import numpy as np
 from quant.float_file import float_model
 from quant.graph import Conv, Graph
 from quant.passes.steady_stream import STREAM_POSITION, stream_tensors
-from quant.planes import PLANES, POSITION, split
+from quant.pieces import halo_of, tensor_values
 from quant.positions import INT8_MAX
 from quant.session import open_session
 
 QUANTILE = 0.9999
-"""A channel's range: the mean over patches of this quantile of its sizes. The maximum would be ruled by outliers."""
+"""A channel's range: the mean over pieces of this quantile of its sizes. The maximum would be ruled by outliers."""
 
 LEVELLING = (0.5, 0.75, 1.0)
 HEADROOM = (0.64, 0.8, 1.0, 1.25)
@@ -50,13 +50,13 @@ def _scaled(op: Conv, factors: np.ndarray, stream: set[str]) -> Conv:
 
 def channel_ranges(graph: Graph, images: Iterable[np.ndarray], tick: Callable[[], None]) -> np.ndarray:
     """(C,) range of each stream channel over images (1, 1, H, W), the widest of all the stream's tensors."""
-    names = sorted(stream_tensors(graph))
+    names, halo_px = sorted(stream_tensors(graph)), halo_of(graph)
     session, total, count = open_session(float_model(graph, names)), np.zeros(1), 0
     for image in images:
-        feed = {PLANES: split(image).astype(np.float32) * np.float32(2.0**-POSITION)}
-        sizes = [np.abs(r[0]).reshape(r.shape[1], -1) for r in session.run(names, feed)]
-        total = total + np.stack([np.quantile(size, QUANTILE, axis=1) for size in sizes])
-        count += 1
+        for results in tensor_values(session, names, image, halo_px):
+            sizes = [np.abs(r[0]).reshape(r.shape[1], -1) for r in results]
+            total = total + np.stack([np.quantile(size, QUANTILE, axis=1) for size in sizes])
+            count += 1
         tick()
     ranges = np.asarray(total / max(count, 1)).max(axis=0)
     floor = 1e-3 * float(ranges.max()) + 1e-12  # a dead channel must not be blown up

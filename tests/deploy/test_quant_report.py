@@ -1,19 +1,29 @@
 """What `quantize` reports: layers in whole numbers, and what each pass buys."""
 
+import base64
 import json
 from pathlib import Path
+from xml.etree import ElementTree as ET
 
 import jsonschema
+import numpy as np
+import pytest
 import torch
 from typer.testing import CliRunner
 
+from deploy.blame import kind_of_error
 from deploy.cli import app
 from deploy.export import to_onnx
 from deploy.quant_report import ablations
+from deploy.report.histogram import MOST_BARS, bins, histogram_url
+from deploy.restore import write_tiff
 from deploy.results import SCHEMA_PATH
 from model.convbeers import ConvBEERS, Variant, initialise
-from quant.onnx_file import save_onnx
+from model.simulator.procedural import procedural_scene
+from quant.onnx_file import load_onnx, metadata, save_onnx
+from quant.planes import MAX_DN
 from quant.quantise import ALL, Passes
+from quant.spread import Spread
 
 
 def test_every_pass_is_left_out_once() -> None:
@@ -24,11 +34,33 @@ def test_every_pass_is_left_out_once() -> None:
     assert not found["without steady stream"].equalise
 
 
-def test_quantize_reports_layers_and_passes(tmp_path: Path) -> None:
+def float_file(path: Path) -> str:
     network = ConvBEERS(Variant(1, 4))
     initialise(network, torch.Generator().manual_seed(0))
-    save_onnx(to_onnx(network.eval(), {}), tmp_path / "f.onnx")
+    save_onnx(to_onnx(network.eval(), {}), path)
+    return str(path)
+
+
+def test_the_free_regime_writes_a_file_of_its_own_kind(tmp_path: Path) -> None:
+    free = ["quantize", float_file(tmp_path / "f.onnx"), "--regime", "free", "--patches", "2", "--patch", "64"]
+    out = tmp_path / "free.onnx"
+    result = CliRunner().invoke(app, [*free, "--out", str(out), "--json", str(tmp_path / "q.json")])
+    assert result.exit_code == 0, result.output
+    assert metadata(load_onnx(out))["precision"] == "int8 free"
+    jsonschema.validate(json.loads((tmp_path / "q.json").read_text()), json.loads(SCHEMA_PATH.read_text()))
+    for option in (["--ablate"], ["--board", str(tmp_path / "b.onnx")], ["--report", str(tmp_path / "r")]):
+        refused = CliRunner().invoke(app, [*free, "--out", str(tmp_path / "no.onnx"), *option])
+        assert refused.exit_code == 2
+        assert "--regime legal" in " ".join(refused.output.split())
+    assert not (tmp_path / "no.onnx").exists()
+
+
+def test_quantize_reports_layers_and_passes(tmp_path: Path) -> None:
+    float_file(tmp_path / "f.onnx")
+    dn = procedural_scene(640, 700, np.random.default_rng(0)).radiance.numpy() * 4095 / 400
+    write_tiff(tmp_path / "scenes" / "drawn.tif", np.rint(dn).astype(np.uint16))
     options = ["--out", str(tmp_path / "i.onnx"), "--patches", "4", "--ablate", "--json", str(tmp_path / "q.json")]
+    options += ["--patch", "96", "--report", str(tmp_path / "r"), "--images", str(tmp_path / "scenes")]
     result = CliRunner().invoke(app, ["quantize", str(tmp_path / "f.onnx"), *options])
     assert result.exit_code == 0, result.output
     document = json.loads((tmp_path / "q.json").read_text())
@@ -40,3 +72,47 @@ def test_quantize_reports_layers_and_passes(tmp_path: Path) -> None:
         if row["table"] == "integer layers":
             figures = row["figures"]
             assert figures["accumulator, seen"]["value"] <= figures["accumulator, proven"]["value"] < 31
+    layers = [row for row in document["rows"] if row["table"] == "layers"]
+    assert [row["name"] for row in layers][-1] == "all layers"
+    shares = [row["figures"]["share of squared error"]["value"] for row in layers[:-1]]
+    assert sum(shares) == pytest.approx(100)
+    assert tables.count("worst patches") == 4
+    assert json.loads((tmp_path / "r" / "report.json").read_text())["rows"] == document["rows"]
+    page = (tmp_path / "r" / "report.html").read_text()
+    assert page.count("data:image/png;base64,") == 4
+    assert page.count("data:image/svg+xml;base64,") == 1
+    assert "std / MAE is" in page
+    for word in ("http://", "https://", 'src="/', "<script", "@import", "url("):
+        assert word not in page
+
+
+def spread(difference_dn: np.ndarray) -> Spread:
+    counts = np.bincount(difference_dn.astype(int) + MAX_DN, minlength=2 * MAX_DN + 1)
+    return Spread(counts, np.array([0.1]), np.array([0.2]))
+
+
+@pytest.mark.parametrize("farthest", [0, 1, 40, 41, 137, 4095])
+def test_the_histogram_holds_every_error_in_few_bars(farthest: int) -> None:
+    dn = np.array([0, 0, 0, 1, -farthest, farthest])
+    centres, shares, wide = bins(spread(dn))
+    assert len(centres) <= MOST_BARS
+    assert shares.sum() == pytest.approx(1)
+    assert centres[-1] + wide // 2 >= farthest
+    middle = len(centres) // 2
+    assert centres[middle] == 0
+    assert shares[middle] == pytest.approx(float((np.abs(dn) <= wide // 2).mean()))
+
+
+def test_the_histogram_is_a_picture_for_light_and_dark() -> None:
+    url = histogram_url(spread(np.rint(np.random.default_rng(0).normal(0, 4, 5000))))
+    picture = base64.b64decode(url.removeprefix("data:image/svg+xml;base64,")).decode()
+    root = ET.fromstring(picture)  # noqa: S314 - our own picture
+    assert root.tag.endswith("svg")
+    assert picture.count("<rect") > 20
+    assert "prefers-color-scheme: dark" in picture
+
+
+def test_the_ratio_is_put_into_words() -> None:
+    assert "mostly those of rounding." in kind_of_error(1.27)
+    assert "unequal" in kind_of_error(1.5)
+    assert "clipping" in kind_of_error(3.0)

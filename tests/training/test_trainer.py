@@ -196,7 +196,9 @@ def test_a_student_is_pulled_towards_its_teacher(tmp_path: Path) -> None:
         parameter.data.mul_(1.5)
 
     def distance(distil: float) -> float:
-        recipe = TrainingRecipe(steps=60, batch=3, loss=LossWeights(lpips=0.0, fft=0.0), distil=distil, warm_up_steps=5)
+        recipe = TrainingRecipe(
+            steps=60, batch=3, loss=LossWeights(lpips=0.0, fft=0.0), distil=distil, warm_up_steps=5
+        )
         student = Trainer(VARIANT, recipe, teacher=teacher if distil else None)
         student.run(source(), tmp_path / f"{distil}", Schedule())
         image = next(source(seed=3).batches())[0]

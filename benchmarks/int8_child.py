@@ -1,0 +1,82 @@
+"""Quantise one network our way or onnxruntime's: `int8_peers.py` runs it in a process of its own, to see its memory.
+
+    python int8_child.py WAY FLOAT PATCHES OUT     WAY: legal, free, minmax or percentile
+
+PATCHES is an .npy file (K, C, H, W) of what the network takes. Writes OUT, and prints seconds and peak resident
+memory as the last line, in JSON.
+"""
+
+import json
+import resource
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnx
+
+from quant.planes import PLANES, POSITION
+
+
+def main() -> None:
+    """Quantise and say what it took."""
+    way, network, stored, out = sys.argv[1], *map(Path, sys.argv[2:])
+    started = time.perf_counter()
+    if way in ("legal", "free"):
+        ours(way, network, np.load(stored), out)
+    else:
+        onnxruntimes(way, network, np.load(stored), out)
+    seconds = time.perf_counter() - started
+    unit = 1 if sys.platform == "darwin" else 1024  # bytes there, KiB elsewhere
+    peak_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 1e6
+    print(json.dumps({"seconds": seconds, "peak_mb": peak_mb}))
+
+
+def ours(way: str, network: Path, images: np.ndarray, out: Path) -> None:
+    """The host file of `quantize`, of these images (K, 1, H, W) in [0, 1]."""
+    from quant.calibration import Patches, Remade
+    from quant.free import quantise_free
+    from quant.quantise import quantise_model
+
+    def image(number: int) -> np.ndarray:
+        return images[number : number + 1]
+
+    count = len(images)
+    patches = Patches([], Remade(lambda k: (image(k), image(k)), count), Remade(image, count))
+    model = onnx.load(network)
+    if way == "free":
+        onnx.save(quantise_free(model, patches, {}, lambda: None), out)
+    else:
+        onnx.save(quantise_model(model, patches, {}, lambda: None).host, out)
+
+
+def onnxruntimes(way: str, network: Path, inputs: np.ndarray, out: Path) -> None:
+    """QDQ by `quantize_static`: per-channel int8 weights, asymmetric uint8 activations, float scales.
+
+    Its memory grows with the patches by percentile, so it needs gigabytes. The planes' scale is given: they are whole
+    numbers of 2^-7 by construction, and no statistics would find that out.
+    """
+    from onnxruntime import quantization as ort
+
+    class Reader(ort.CalibrationDataReader):
+        def __init__(self) -> None:
+            self.rest = iter(inputs)
+
+        def get_next(self) -> dict[str, np.ndarray] | None:
+            patch = next(self.rest, None)
+            return None if patch is None else {name: patch[None]}
+
+    name = onnx.load(network).graph.input[0].name
+    unit = {"scale": np.array(2.0**-POSITION, np.float32), "zero_point": np.array(128, np.uint8)}
+    options: dict[str, Any] = {"CalibPercentile": 99.99}
+    options |= (
+        {"TensorQuantOverrides": {PLANES: [{**unit, "quant_type": ort.QuantType.QUInt8}]}} if name == PLANES else {}
+    )
+    method = {"minmax": ort.CalibrationMethod.MinMax, "percentile": ort.CalibrationMethod.Percentile}[way]
+    kinds = {"activation_type": ort.QuantType.QUInt8, "weight_type": ort.QuantType.QInt8, "per_channel": True}
+    ort.quantize_static(network, out, Reader(), calibrate_method=method, extra_options=options, **kinds)
+
+
+if __name__ == "__main__":
+    main()

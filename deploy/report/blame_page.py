@@ -1,0 +1,89 @@
+"""The page that says where INT8 errs: by size, by patch and by layer."""
+
+from collections.abc import Sequence
+
+import numpy as np
+import onnxruntime as ort
+
+from deploy.report.histogram import histogram_url
+from deploy.report.page import Picture, Report, Table
+from deploy.report.pictures import error_row, grid, picture_url, stretch_of, strip_row
+from deploy.results import Row, by_table
+from quant.calibration import Patches
+from quant.planes import MAX_DN
+from quant.session import run
+from quant.spread import Spread
+
+ZOOM = 2
+WHITE_SHARE = 0.999
+"""The size of error shown white is the one that this share of all pixels stays below."""
+
+
+def blame_page(
+    headline: str,
+    rows: Sequence[Row],
+    spread: Spread,
+    patches: Patches,
+    sessions: tuple[ort.InferenceSession, ort.InferenceSession],
+    worst: Sequence[int],
+) -> Report:
+    """The histogram, the worst patches, and every table.
+
+    Args:
+        headline: what it comes to, in one or two sentences.
+        rows: of all tables, in reading order.
+        spread: of the errors on the patches.
+        patches: that neither network was calibrated on.
+        sessions: the float and the INT8 network.
+        worst: the numbers of the patches to show.
+    """
+    white_dn = error_shown_white(spread)
+    pictures = [Picture("Errors by size", histogram_url(spread), HISTOGRAM_CAPTION)]
+    pictures += [worst_picture(number, patches.degraded[number], sessions, white_dn) for number in worst]
+    tables = [Table(name.capitalize(), found, CAPTIONS.get(name, "")) for name, found in by_table(rows).items()]
+    return Report("Where INT8 errs", headline, tables, pictures, NOTES)
+
+
+def error_shown_white(spread: Spread) -> int:
+    """In DN, one for all patches, so that they compare."""
+    beyond = (dn for dn in range(1, MAX_DN + 1) if spread.share_beyond(dn) <= 1 - WHITE_SHARE)
+    return next(beyond)
+
+
+def worst_picture(
+    number: int,
+    degraded: np.ndarray,
+    sessions: tuple[ort.InferenceSession, ort.InferenceSession],
+    white_dn: float,
+) -> Picture:
+    """A patch as it is given, in float, in INT8, and the size of the difference."""
+    in_float, in_int8 = (np.clip(run(session, degraded), 0, 1)[0, 0] * MAX_DN for session in sessions)
+    images = {"degraded": degraded[0, 0] * MAX_DN, "float": in_float, "INT8": in_int8}
+    difference = np.abs(in_int8 - in_float)
+    cells = [*strip_row(images.values(), stretch_of(in_float)), *error_row([difference], white_dn)]
+    caption = (
+        f"MAE {difference.mean():.2f} DN, at most {difference.max():.0f} DN. The images share one grey scale; "
+        f"differences: black none, white {white_dn:.0f} DN and more."
+    )
+    picture = np.asarray(grid([*images, "|difference|"], [cells], ZOOM))
+    return Picture(f"Patch {number}", picture_url(picture), caption)
+
+
+HISTOGRAM_CAPTION = (
+    "Share of the pixels by the difference of INT8 from float, on a logarithmic scale. The line is a Gaussian of the "
+    "same standard deviation: rounding follows it, clipping leaves bars beside it."
+)
+CAPTIONS = {
+    "layers": "Each layer in int8 by itself, all others in float. Alone: its own result, given float inputs. The "
+    "other columns: what that does to the restored image, SQNR against the network's correction. The adds of a "
+    "stream of one position lose nothing but what saturates.",
+    "worst patches": "The patches of the largest MAE, of those that calibration did not see.",
+    "error sizes": "Share of the pixels that differ by more than so many DN.",
+    "integer layers": "Accumulators as seen and as proven for any input; results at int8's ends; sums whose rounding "
+    "depends on the rule for halves.",
+}
+NOTES = (
+    "SQNR is 10 log10 of the signal's energy over the error's; differences are of full scale, 0.001 is 4 DN.",
+    "Squared errors of layers nearly add up, as independent errors do: the shares say where an effort would pay.",
+    "All figures are of simulated patches; the INT8 network ran on onnxruntime, which rounds halves to even.",
+)

@@ -1,0 +1,141 @@
+"""Which layer costs what: each one in int8 while all others stay in float.
+
+A convolution errs by its int8 weights and bias, and by rounding and clipping its result. An add errs by what it does
+to sums of whole numbers: in a stream of one position nothing, but where it saturates. What a layer's inputs had
+already lost is not held against it.
+"""
+
+import math
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+import onnx
+from onnx import TensorProto, helper
+
+from quant.core import IntConv, IntCore
+from quant.float_file import float_model
+from quant.graph import CORRECTION, Conv, Graph, Op, tensors
+from quant.host_file import host_model
+from quant.passes.dual_gain import merge
+from quant.pieces import planes_of, tensor_values
+from quant.planes import PLANES
+from quant.positions import INT8_MAX, INT8_MIN
+from quant.session import open_session, run
+
+IN_INT8 = ".in_int8"
+"""Behind the name of a tensor: as int8 weights and bias make it of float inputs, not yet rounded."""
+
+
+class Loss:
+    """Adds up how far results lie from what was wanted, array by array."""
+
+    def __init__(self) -> None:
+        self._signal = self._noise = self._size = 0.0
+        self._count = 0
+
+    def add(self, result: np.ndarray, wanted: np.ndarray, offset: np.ndarray | float = 0.0) -> None:
+        """Count further values; the signal is what was wanted less an offset."""
+        difference = np.subtract(result, wanted, dtype=np.float64)
+        self._noise += float(np.square(difference).sum())
+        self._signal += float(np.square(np.subtract(wanted, offset, dtype=np.float64)).sum())
+        self._size += float(np.abs(difference).sum())
+        self._count += difference.size
+
+    @property
+    def sqnr_db(self) -> float:
+        """10 log10 of the signal's energy over that of the difference; infinite where nothing is lost."""
+        return 10 * math.log10(self._signal / self._noise) if self._noise and self._signal else math.inf
+
+    @property
+    def mae(self) -> float:
+        """Mean size of the difference."""
+        return self._size / self._count
+
+    @property
+    def squared(self) -> float:
+        """Mean squared difference."""
+        return self._noise / self._count
+
+
+@dataclass(frozen=True)
+class LayerBlame:
+    """What one layer in int8 loses, all others in float.
+
+    Attributes:
+        name: of the layer.
+        alone: in its own result; SQNR against that result.
+        network: in the restored image, of full scale; SQNR against the network's correction.
+    """
+
+    name: str
+    alone: Loss
+    network: Loss
+
+
+def blame_layers(
+    graph: Graph, core: IntCore, crops: Iterable[np.ndarray], tick: Callable[[], None]
+) -> tuple[list[LayerBlame], Loss]:
+    """What each layer of a network loses, and what all lose together, over crops (1, 1, H, W) in [0, 1].
+
+    Args:
+        graph: plane-reading, in float: what the core was rounded from.
+        core: the same operations in whole numbers.
+        crops: each passes through the network once for every layer.
+        tick: called after each crop.
+    """
+    twins = tuple(_twin(op, whole) for op, whole in zip(graph, core.ops, strict=True) if isinstance(whole, IntConv))
+    names = tensors((*graph, *twins))
+    exact, int8 = open_session(float_model((*graph, *twins), names)), open_session(host_model(core, {}))
+    rests = {name: open_session(_rest(graph, name)) for name in tensors(graph) if name != CORRECTION}
+    layers, together = [LayerBlame(op.name, Loss(), Loss()) for op in graph], Loss()
+    for crop in crops:
+        (values,) = tensor_values(exact, names, crop, halo_px=0)
+        wanted = dict(zip(names, values, strict=True))
+        restored = _restored(crop, wanted[CORRECTION], core)
+        for op, layer in zip(graph, layers, strict=True):
+            result, meant = _in_int8(op, core, wanted), wanted[op.output]
+            if op.output == CORRECTION:  # of two gains one is coarse and the other clipped: together they count
+                correction = result = merge(result, core.scale(CORRECTION))
+                meant = meant[:, :1]
+            else:
+                feed = {PLANES: planes_of(crop), op.output: result}
+                correction = rests[op.output].run(None, feed)[0]
+            layer.alone.add(result, meant)
+            layer.network.add(_restored(crop, correction, core), restored, crop)
+        together.add(run(int8, crop), restored, crop)
+        tick()
+    return layers, together
+
+
+def _twin(op: Op, whole: IntConv) -> Conv:
+    """The same convolution, by its side, with the values that its int8 weights and bias stand for."""
+    assert isinstance(op, Conv)  # noqa: S101 - the core was built from the graph
+    weight, bias = whole.weight * 2.0**-whole.weight_position, whole.bias * 2.0**-whole.bias_position
+    changed = replace(op, weight=weight.astype(np.float32), bias=bias.astype(np.float32))
+    return replace(changed, name=op.name + IN_INT8, output=op.output + IN_INT8)
+
+
+def _rest(graph: Graph, given: str) -> onnx.ModelProto:
+    """The float network from one of its tensors, given beside the planes, to the correction."""
+    model = float_model(tuple(op for op in graph if op.output != given), [CORRECTION])
+    model.graph.input.append(helper.make_tensor_value_info(given, TensorProto.FLOAT, ["N", "C", "H", "W"]))
+    return model
+
+
+def _in_int8(op: Op, core: IntCore, exact: Mapping[str, np.ndarray]) -> np.ndarray:
+    """A layer's result when it alone is in int8."""
+    if isinstance(op, Conv):
+        return _rounded(exact[op.output + IN_INT8], core.positions[op.output])
+    left, right = (_rounded(exact[name], core.positions[name]) for name in op.inputs)
+    return np.asarray(exact[op.output] + (_rounded(left + right, core.positions[op.output]) - (left + right)))
+
+
+def _rounded(values: np.ndarray, position: int) -> np.ndarray:
+    """To whole multiples of 2^-position, halves up, and clipped, as the DPU does."""
+    scale = np.float32(2.0**position)
+    return np.asarray(np.clip(np.floor(values * scale + np.float32(0.5)), INT8_MIN, INT8_MAX) / scale)
+
+
+def _restored(crop: np.ndarray, correction: np.ndarray, core: IntCore) -> np.ndarray:
+    return np.asarray(np.clip(crop + merge(correction, core.scale(CORRECTION)), 0, 1))

@@ -1,0 +1,79 @@
+"""INT8 for boards that are not the DPU: what its rules cost shows against what goes without them.
+
+As in `quant.quantise` only the correction is computed in int8, the image enters as two planes, the residual stream
+has one scale and its channels are equalised, and the correction has two gains. Gone are the DPU's rules: see
+`quant.free_file`. What both still share is a residual stream of 8 bits, and its rounding dominates.
+"""
+
+from collections.abc import Callable
+
+import numpy as np
+import onnx
+
+from quant.calibration import Patches
+from quant.free_file import Scale, free_model
+from quant.free_scales import tensor_scales
+from quant.graph import CORRECTION, Conv, Graph, correction_graph
+from quant.onnx_file import fixed_tile_px, metadata
+from quant.passes.dual_gain import two_gains
+from quant.passes.equalise import channel_ranges, equalise, search, search_steps
+from quant.passes.steady_stream import STREAM_POSITION, stream_tensors
+from quant.planes import PLANES, POSITION, read_planes
+from quant.positions import INT8_MAX
+from quant.quantise import Targets, search_targets
+from quant.session import open_session, run
+
+UINT8_MAX = 255
+FINER = 2
+"""The fine gain's unit is so much finer than what suits all corrections: the coarse one is there for the large."""
+
+
+def quantise_free(
+    model: onnx.ModelProto, patches: Patches, about: dict[str, str], tick: Callable[[], None]
+) -> onnx.ModelProto:
+    """Quantise a float ConvBEERS to uint8 activations and int8 weights, with float scales, of weights per channel.
+
+    Returns:
+        The host file: `image` to `restored`, every convolution an integer kernel of onnxruntime.
+
+    Raises:
+        ModelError: not a graph of convolutions, ReLUs and adds that ends with the global add.
+    """
+    graph = read_planes(correction_graph(model))
+    scales = _scales(graph, patches, tick)
+    if stream_tensors(graph):
+        ranges = channel_ranges(graph, patches.degraded, tick)
+        targets = search_targets(graph, patches.degraded)
+        factors = search(graph, ranges, lambda tried: _error(tried, scales, targets), tick)
+        graph = equalise(graph, factors)
+    about = {**metadata(model), "precision": "int8 free", "calibration_sha256": patches.digest, **about}
+    return free_model(two_gains(graph), scales, about, fixed_tile_px(model))
+
+
+def free_ticks(model: onnx.ModelProto, patches: int) -> int:
+    """How often `quantise_free` will call `tick`."""
+    graph = read_planes(correction_graph(model))
+    if not stream_tensors(graph):
+        return 2 * patches
+    first = graph[0]
+    assert isinstance(first, Conv)  # noqa: S101 - correction_graph has seen to it
+    return 3 * patches + search_steps(len(first.weight))
+
+
+def _scales(graph: Graph, patches: Patches, tick: Callable[[], None]) -> dict[str, Scale]:
+    """Least-squares scales; the stream has any, because `equalise` scales its channels to it."""
+    convs = [op for op in graph if isinstance(op, Conv) and op.output not in stream_tensors(graph)]
+    levels = {op.output: UINT8_MAX if op.relu else INT8_MAX for op in convs}
+    units = tensor_scales(graph, levels, patches.degraded, tick)
+    units[CORRECTION] /= FINER
+    found = {op.output: Scale(units[op.output], 0) if op.relu else Scale(units[op.output]) for op in convs}
+    stream = dict.fromkeys(stream_tensors(graph), Scale(2.0**-STREAM_POSITION))
+    return {PLANES: Scale(2.0**-POSITION), **stream, **found}
+
+
+def _error(graph: Graph, scales: dict[str, Scale], targets: Targets) -> float:
+    """Mean squared difference from the float network."""
+    session = open_session(free_model(two_gains(graph), scales, {}))
+    return float(
+        np.mean([np.square(run(session, image) - wanted, dtype=np.float64).mean() for image, wanted in targets])
+    )

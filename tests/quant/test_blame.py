@@ -1,0 +1,101 @@
+"""Blame: each layer by itself, against the networks that it stands for."""
+
+from dataclasses import replace
+
+import numpy as np
+import onnx
+import pytest
+
+from quant.blame import LayerBlame, Loss, blame_layers
+from quant.calibration import Patches
+from quant.core import IntConv
+from quant.graph import Add
+from quant.planes import MAX_DN
+from quant.quantise import ALL, Quantised, quantise_model
+from quant.session import open_session, run
+from quant.spread import spread_of
+
+
+@pytest.fixture(scope="module")
+def crops(patches: Patches) -> list[np.ndarray]:
+    return [image[..., :61, :53] for image in list(patches.degraded)[:3]]
+
+
+@pytest.fixture(scope="module")
+def blamed(quantised: Quantised, crops: list[np.ndarray]) -> tuple[list[LayerBlame], Loss]:
+    return blame_layers(quantised.graph, quantised.core, crops, lambda: None)
+
+
+def test_together_they_lose_what_the_int8_file_loses(
+    float_onnx: onnx.ModelProto, quantised: Quantised, crops: list[np.ndarray], blamed: tuple[list[LayerBlame], Loss]
+) -> None:
+    sessions = open_session(float_onnx), open_session(quantised.host)
+    differences = [np.subtract(*(np.clip(run(s, crop), 0, 1) for s in sessions)) for crop in crops]
+    assert blamed[1].mae == pytest.approx(float(np.mean(np.abs(differences))), rel=1e-3)
+
+
+def test_squared_errors_of_layers_nearly_add_up(blamed: tuple[list[LayerBlame], Loss]) -> None:
+    layers, together = blamed
+    assert sum(layer.network.squared for layer in layers) == pytest.approx(together.squared, rel=0.4)
+
+
+def test_adds_of_a_steady_stream_lose_nothing_but_what_saturates(
+    quantised: Quantised, blamed: tuple[list[LayerBlame], Loss]
+) -> None:
+    adds = {op.name for op in quantised.core.ops if isinstance(op, Add)}
+    layers = {layer.name: layer for layer in blamed[0]}
+    worst_add = max(layers[name].network.squared for name in adds)
+    assert worst_add < 0.1 * max(layer.network.squared for layer in blamed[0])
+
+
+def test_a_spoilt_layer_is_found(quantised: Quantised, crops: list[np.ndarray]) -> None:
+    """One layer's weights lose their sign: it, and no other, gets the blame."""
+    ops = list(quantised.core.ops)
+    at = next(k for k, op in enumerate(ops) if op.name == "body.1.second")
+    spoilt = ops[at]
+    assert isinstance(spoilt, IntConv)
+    ops[at] = replace(spoilt, weight=-spoilt.weight)
+    layers, _ = blame_layers(quantised.graph, replace(quantised.core, ops=tuple(ops)), crops, lambda: None)
+    assert min(layers, key=lambda layer: layer.alone.sqnr_db).name == "body.1.second"
+    assert layers[at].alone.sqnr_db < 0
+    assert all(layer.alone.sqnr_db > 10 for layer in layers if layer.name != "body.1.second")
+
+
+def test_one_gain_is_blamed_as_two_are(
+    float_onnx: onnx.ModelProto, patches: Patches, crops: list[np.ndarray]
+) -> None:
+    made = quantise_model(float_onnx, patches, {}, lambda: None, replace(ALL, equalise=False, dual_gain=False))
+    layers, _ = blame_layers(made.graph, made.core, crops, lambda: None)
+    tail = layers[-1]
+    assert tail.alone.sqnr_db == pytest.approx(tail.network.sqnr_db, abs=1)
+
+
+def test_loss_is_that_of_its_definition() -> None:
+    wanted = np.array([3.0, -4.0, 0.5])
+    loss = Loss()
+    loss.add(wanted[:2] + 0.1, wanted[:2])
+    loss.add(wanted[2:] - 0.2, wanted[2:])
+    assert loss.mae == pytest.approx(0.4 / 3)
+    assert loss.squared == pytest.approx(0.06 / 3)
+    assert loss.sqnr_db == pytest.approx(10 * np.log10(25.25 / 0.06))
+    same = Loss()
+    same.add(wanted, wanted)
+    assert same.sqnr_db == np.inf
+
+
+def test_spread_counts_every_pixel_by_its_difference(
+    float_onnx: onnx.ModelProto, quantised: Quantised, crops: list[np.ndarray]
+) -> None:
+    sessions = open_session(float_onnx), open_session(quantised.host)
+    spread = spread_of(*sessions, crops)
+    difference = np.concatenate(
+        [np.subtract(*(np.clip(run(s, crop), 0, 1) for s in reversed(sessions))).ravel() for crop in crops]
+    )
+    assert spread.counts.sum() == difference.size
+    dn = np.rint(difference * MAX_DN)
+    assert spread.std_dn == pytest.approx(float(dn.std()), rel=1e-6)
+    for beyond in (0, 1, 5):
+        assert spread.share_beyond(beyond) == pytest.approx(float((np.abs(dn) > beyond).mean()), abs=1e-9)
+    order = spread.worst(3)
+    assert sorted(order) == [0, 1, 2]
+    assert spread.mae[order[0]] == spread.mae.max()

@@ -1,0 +1,153 @@
+"""Calibration patches: spread over light, blur and noise; made anew each time; statistics the same in pieces."""
+
+from collections.abc import Callable
+
+import numpy as np
+import onnx
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from model.simulator.procedural import procedural_scene
+from model.simulator.scene import Scene
+from profiles import load_sensor
+from profiles.errors import ImageError
+from quant.calibration import Patches, choose_positions, draw_patches
+from quant.float_file import float_model
+from quant.graph import Graph, correction_graph, tensors
+from quant.pieces import PIECE_PX, crops, halo_of, planes_of, tensor_values
+from quant.planes import PLANES, read_planes
+from quant.session import open_session
+from quant.strata import stratified
+
+VARIABLE, REFERENCE = load_sensor("pleiades-variable"), load_sensor("pleiades-reference")
+
+
+@pytest.fixture(scope="module")
+def scenes() -> list[Scene]:
+    return [procedural_scene(700, 940, np.random.default_rng(k)) for k in (1, 2)]
+
+
+@pytest.fixture(scope="module")
+def drawn(scenes: list[Scene]) -> Patches:
+    return draw_patches(scenes, VARIABLE, REFERENCE, count=12, seed=3, patch_px=40)
+
+
+@pytest.fixture(scope="module")
+def graph(float_onnx: onnx.ModelProto) -> Graph:
+    return read_planes(correction_graph(float_onnx))
+
+
+def image(height: int, width: int) -> np.ndarray:
+    dn = np.random.default_rng(height).integers(0, 4096, (1, 1, height, width))
+    return dn.astype(np.float32) / np.float32(4095)
+
+
+def test_patches_are_the_same_however_they_are_asked_for(drawn: Patches) -> None:
+    passes = [list(drawn.pairs), list(drawn.pairs)]
+    for number, (once, again) in enumerate(zip(*passes, strict=True)):
+        alone = drawn.degraded[number]
+        assert alone.shape == once[1].shape == (1, 1, 40, 40)
+        assert alone.dtype == once[1].dtype == np.float32
+        np.testing.assert_array_equal(once, again)
+        np.testing.assert_array_equal(alone, once[0])
+    with pytest.raises(IndexError):
+        drawn.pairs[12]
+
+
+def test_the_digest_names_the_bytes(scenes: list[Scene], drawn: Patches) -> None:
+    def digest(seed: int, count: int = 12) -> str:
+        return draw_patches(scenes, VARIABLE, REFERENCE, count, seed, patch_px=40).digest
+
+    assert digest(3) == drawn.digest
+    assert len({digest(3), digest(4), digest(3, 11)}) == 3
+
+
+def test_the_pair_shows_the_same_ground(drawn: Patches) -> None:
+    for degraded, reference in drawn.pairs:
+        assert np.corrcoef(degraded.ravel(), reference.ravel())[0, 1] > 0.7
+        assert 0 <= degraded.min() <= degraded.max() <= 1
+
+
+def test_the_ranges_are_covered_without_gaps(scenes: list[Scene]) -> None:
+    """With 40 strata, each 1/40 of the candidates: no gap in the MTF exceeds a few strata, and both ends are seen."""
+    views = draw_patches(scenes, VARIABLE, REFERENCE, count=40, seed=0, patch_px=40).views
+    low, high = VARIABLE.mtf_nyquist.low, VARIABLE.mtf_nyquist.high
+    found = (np.sort([view.degraded.mtf_nyquist for view in views]) - low) / (high - low)
+    assert found[0] < 2 / 40
+    assert found[-1] > 1 - 2 / 40
+    assert np.diff(found).max() < 3 / 40
+
+
+@settings(max_examples=40, deadline=None)
+@given(count=st.integers(1, 30), size=st.integers(1, 9), seed=st.integers(0, 2**31))
+def test_each_group_gives_one(count: int, size: int, seed: int) -> None:
+    generator = np.random.default_rng(seed)
+    candidates = [float(k) for k in generator.permutation(count * size)]
+    chosen = stratified(candidates, lambda value: value, count, generator)
+    assert sorted(int(value) // size for value in chosen) == list(range(count))
+
+
+def test_light_blur_and_noise_are_matched_at_random(scenes: list[Scene]) -> None:
+    views = draw_patches(scenes, VARIABLE, REFERENCE, count=200, seed=1, patch_px=40).views
+    keys: list[Callable[[int], float]] = [
+        lambda k: views[k].ground.brightness,
+        lambda k: views[k].degraded.mtf_nyquist,
+        lambda k: views[k].degraded.noise_sigma(25),
+    ]
+    ranks = np.array([np.argsort(np.argsort([key(k) for k in range(200)])) for key in keys])
+    assert np.abs(np.corrcoef(ranks) - np.eye(3)).max() < 0.25
+
+
+def test_scenes_too_small_for_a_patch_are_refused(scenes: list[Scene]) -> None:
+    with pytest.raises(ImageError, match="300 target pixels"):
+        draw_patches(scenes, VARIABLE, REFERENCE, count=1, seed=0, patch_px=300)
+
+
+@pytest.mark.parametrize("shape", [(PIECE_PX, 31), (PIECE_PX + 1, 37), (2 * PIECE_PX + 3, PIECE_PX + 70)])
+def test_pieces_hold_what_the_whole_image_gives(graph: Graph, shape: tuple[int, int]) -> None:
+    names, whole = tensors(graph), image(*shape)
+    session = open_session(float_model(graph, names))
+    wanted = session.run(names, {PLANES: planes_of(whole)})
+    pieces = list(tensor_values(session, names, whole, halo_of(graph)))
+    for k, tensor in enumerate(wanted):
+        assert sum(piece[k].size for piece in pieces) == tensor.size
+        assert max(np.abs(piece[k]).max() for piece in pieces) == pytest.approx(np.abs(tensor).max(), rel=1e-5)
+        total = sum(float(np.square(piece[k], dtype=np.float64).sum()) for piece in pieces)
+        assert total == pytest.approx(float(np.square(tensor, dtype=np.float64).sum()), rel=1e-5)
+
+
+def test_without_a_halo_they_would_not(graph: Graph) -> None:
+    names, whole = [tensors(graph)[-1]], image(PIECE_PX + 9, 40)
+    session = open_session(float_model(graph, names))
+    wanted = session.run(names, {PLANES: planes_of(whole)})[0]
+    pieces = list(tensor_values(session, names, whole, halo_px=0))
+    total = sum(float(np.square(piece[0], dtype=np.float64).sum()) for piece in pieces)
+    assert total != pytest.approx(float(np.square(wanted, dtype=np.float64).sum()), rel=1e-5)
+
+
+def test_crops_tile_the_image() -> None:
+    whole = image(2 * PIECE_PX + 5, PIECE_PX)
+    found = crops(whole)
+    assert [max(crop.shape) <= PIECE_PX for crop in found] == [True] * 3
+    np.testing.assert_array_equal(np.concatenate(found, axis=2), whole)
+
+
+def test_no_run_sees_more_than_a_piece_with_its_halo(graph: Graph) -> None:
+    """What bounds memory: the largest array that the session returns does not grow with the image."""
+    names = tensors(graph)
+    session = open_session(float_model(graph, names))
+    side = PIECE_PX + 2 * halo_of(graph)
+    for piece in tensor_values(session, names, image(3 * PIECE_PX + 1, 3 * PIECE_PX + 2), halo_of(graph)):
+        assert max(values.base.shape[2] for values in piece if values.base is not None) <= side
+
+
+def test_positions_of_a_large_image_are_those_of_its_whole(graph: Graph) -> None:
+    """In pieces or at once: found here by hand from whole tensors."""
+    whole = image(PIECE_PX + 21, 50)
+    positions = choose_positions(graph, [whole], lambda: None, least_squares=False)
+    names = tensors(graph)
+    values = open_session(float_model(graph, names)).run(names, {PLANES: planes_of(whole)})
+    for name, tensor in zip(names, values, strict=True):
+        largest = float(np.abs(tensor).max())
+        assert largest * 2.0 ** positions[name] <= 127 < largest * 2.0 ** (positions[name] + 1)

@@ -1,0 +1,197 @@
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+import onnx
+import onnxruntime as ort
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from onnx import numpy_helper
+
+from model.simulator.procedural import procedural_scene
+from profiles import load_sensor
+from quant.calibration import Patches, draw_patches
+from quant.free import free_ticks, quantise_free
+from quant.free_scales import BINS, best_scale, round_weight
+from quant.gate import compare
+from quant.graph import CORRECTION, correction_graph, relu_count
+from quant.integer import _convolve
+from quant.onnx_file import metadata, save_onnx
+from quant.planes import PLANES
+from quant.quantise import Quantised
+from quant.session import open_session, run
+
+SIZES = [(37, 53), (16, 91), (5, 3)]
+
+
+def image(height: int, width: int, seed: int = 0) -> np.ndarray:
+    dn = np.random.default_rng(seed).integers(0, 4096, (1, 1, height, width))
+    return dn.astype(np.float32) / np.float32(4095)
+
+
+@pytest.fixture(scope="module")
+def ticked() -> list[int]:
+    return []
+
+
+@pytest.fixture(scope="module")
+def free(float_onnx: onnx.ModelProto, patches: Patches, ticked: list[int]) -> onnx.ModelProto:
+    return quantise_free(float_onnx, patches, {"seed": "5"}, tick=lambda: ticked.append(1))
+
+
+@pytest.fixture(scope="module")
+def unseen() -> Patches:
+    return drawn(6, 128)
+
+
+def drawn(count: int, patch_px: int) -> Patches:
+    scene = procedural_scene(900, 960, np.random.default_rng(77))
+    degraded, reference = load_sensor("pleiades-degraded"), load_sensor("pleiades-reference")
+    return draw_patches([scene], degraded, reference, count, seed=78, patch_px=patch_px)
+
+
+def whole_numbers(model: onnx.ModelProto, planes: np.ndarray, around: str = "zeros") -> np.ndarray:
+    """The correction as stored, in int64 arithmetic from the stored planes (N, 2, H, W).
+
+    `around` each image are zeros, or the zero bytes that a kernel would take which forgot the zero point.
+    """
+    constant = {t.name: numpy_helper.to_array(t).astype(np.float64) for t in model.graph.initializer}
+    found = {PLANES: planes.astype(np.int64)}
+    for node in model.graph.node:
+        if node.op_type == "QLinearConv":
+            x, unit, zero, weight, scales, _, out_unit, out_zero, bias = node.input
+            taps, offset = constant[weight].astype(np.int64), int(constant[zero])
+            if around == "zeros":
+                sums = _convolve(found[x] - offset, taps)
+            else:
+                sums = _convolve(found[x], taps) - offset * taps.sum((1, 2, 3))[:, None, None]
+            sums = sums + constant[bias][:, None, None]
+            value = sums * (constant[unit] * constant[scales] / constant[out_unit])[:, None, None]
+        elif node.op_type == "QLinearAdd":
+            *terms, out_unit, out_zero = node.input
+            values = [(found[q] - constant[z]) * constant[u] for q, u, z in (terms[:3], terms[3:])]
+            value = (values[0] + values[1]) / constant[out_unit]
+        else:
+            continue
+        found[node.output[0]] = np.clip(np.rint(value) + constant[out_zero], 0, 255).astype(np.int64)
+    return found[CORRECTION]
+
+
+def with_outputs(model: onnx.ModelProto, names: list[str]) -> onnx.ModelProto:
+    opened = onnx.ModelProto()
+    opened.CopyFrom(model)
+    kind = onnx.TensorProto.UINT8
+    opened.graph.output.extend(onnx.helper.make_tensor_value_info(n, kind, ["N", "C", "H", "W"]) for n in names)
+    return opened
+
+
+@pytest.mark.parametrize("size", SIZES)
+def test_it_computes_what_whole_numbers_say_zeros_around_the_image(
+    free: onnx.ModelProto, size: tuple[int, int]
+) -> None:
+    session = open_session(with_outputs(free, [PLANES, CORRECTION]))
+    planes, correction = session.run([PLANES, CORRECTION], {"image": image(*size)})
+    expected = whole_numbers(free, planes)
+    assert (expected == correction).mean() > 0.98  # float32 beside float64: a rare half rounds the other way
+    np.testing.assert_allclose(expected, correction, atol=2)
+
+
+def test_padding_with_anything_but_zero_would_be_noticed(free: onnx.ModelProto) -> None:
+    session = open_session(with_outputs(free, [PLANES, CORRECTION]))
+    planes, correction = session.run([PLANES, CORRECTION], {"image": image(37, 53)})
+    same = whole_numbers(free, planes, around="zero bytes") == correction
+    assert same[..., 7:-7, 7:-7].mean() > 0.98
+    assert same[..., 0, :].mean() < 0.5
+
+
+def test_every_convolution_stays_an_integer_kernel(free: onnx.ModelProto, tmp_path: Path) -> None:
+    options = ort.SessionOptions()
+    options.log_severity_level = 3
+    options.optimized_model_filepath = str(tmp_path / "optimised.onnx")
+    ort.InferenceSession(free.SerializeToString(), options, providers=["CPUExecutionProvider"])
+    kinds = Counter(node.op_type for node in onnx.load(tmp_path / "optimised.onnx").graph.node)
+    assert kinds["QLinearConv"] == 7
+    assert not [kind for kind in kinds if kind.endswith("Conv") and kind != "QLinearConv"]
+
+
+@pytest.mark.parametrize("size", SIZES)
+def test_optimised_equals_unoptimised(free: onnx.ModelProto, size: tuple[int, int]) -> None:
+    plain = open_session(free, optimise=False)
+    np.testing.assert_array_equal(run(open_session(free), image(*size)), run(plain, image(*size)))
+
+
+def test_the_relus_are_kept(float_onnx: onnx.ModelProto, free: onnx.ModelProto) -> None:
+    clipping = [n for n in free.graph.node if n.op_type == "QLinearConv" and n.input[7] == "zero_point_0"]
+    assert len(clipping) == relu_count(correction_graph(float_onnx)) == 2
+
+
+def test_free_scales_lose_less_than_legal_ones_on_patches_not_seen(
+    float_onnx: onnx.ModelProto, quantised: Quantised, free: onnx.ModelProto, unseen: Patches
+) -> None:
+    session = open_session(float_onnx)
+    legal, without = (compare(session, open_session(m), unseen.pairs) for m in (quantised.host, free))
+    assert without.mae < legal.mae
+    assert without.std < legal.std
+
+
+def test_a_wrong_scale_loses_more(float_onnx: onnx.ModelProto, free: onnx.ModelProto, unseen: Patches) -> None:
+    broken = onnx.ModelProto()
+    broken.CopyFrom(free)
+    for tensor in broken.graph.initializer:
+        if tensor.name == "head.weight_scale":
+            tensor.CopyFrom(numpy_helper.from_array(numpy_helper.to_array(tensor) * np.float32(1.1), tensor.name))
+    sound, worse = (compare(open_session(float_onnx), open_session(m), unseen.pairs) for m in (free, broken))
+    assert worse.mae > 1.5 * sound.mae
+
+
+def test_the_file_says_what_it_is(free: onnx.ModelProto, patches: Patches) -> None:
+    about = metadata(free)
+    assert about["precision"] == "int8 free"
+    assert about["calibration_sha256"] == patches.digest
+    assert free.graph.input[0].name == "image"
+    assert [output.name for output in free.graph.output] == ["restored"]
+
+
+def test_it_ticks_as_often_as_it_says(
+    float_onnx: onnx.ModelProto, free: onnx.ModelProto, patches: Patches, ticked: list[int]
+) -> None:
+    assert free.graph.node
+    assert len(ticked) == free_ticks(float_onnx, len(patches.pairs))
+
+
+def test_the_same_patches_give_the_same_bytes(float_onnx: onnx.ModelProto, tmp_path: Path) -> None:
+    for name in ("once", "again"):
+        save_onnx(quantise_free(float_onnx, drawn(2, 32), {"seed": "5"}, tick=lambda: None), tmp_path / name)
+    assert (tmp_path / "once").read_bytes() == (tmp_path / "again").read_bytes()
+
+
+@given(st.integers(0, 2**32 - 1), st.sampled_from([127, 255]), st.floats(1.0, 4.0))
+def test_a_least_squares_scale_loses_no_more_than_one_that_clips_nothing(seed: int, levels: int, tail: float) -> None:
+    values = np.abs(np.random.default_rng(seed).standard_t(tail + 1, 4000))
+    largest = float(values.max())
+    counts = np.bincount(np.rint(values * (BINS / largest)).astype(int), minlength=BINS + 1)
+    sizes = np.linspace(0, largest, BINS + 1)
+
+    def error(scale: float) -> float:
+        return float(counts @ (np.minimum(np.rint(sizes / scale), levels) * scale - sizes) ** 2)
+
+    assert error(best_scale(counts, largest, levels)) <= error(largest / levels) * (1 + 1e-9)
+
+
+@given(st.integers(0, 2**32 - 1), st.integers(1, 5), st.sampled_from([1, 3]))
+def test_each_output_channel_has_the_precision_of_its_own_size(seed: int, channels: int, side: int) -> None:
+    generator = np.random.default_rng(seed)
+    sizes = 10.0 ** generator.integers(-4, 3, (channels, 1, 1, 1))
+    weight = generator.normal(0, 1, (channels, 3, side, side)) * sizes
+    rounded = round_weight(weight.astype(np.float32), np.zeros(channels))
+    found = rounded.values * rounded.scales.astype(np.float64)[:, None, None, None]
+    size = np.abs(weight).max((1, 2, 3), keepdims=True)
+    assert rounded.values.dtype == np.int8
+    assert (np.square(found - weight).mean((1, 2, 3), keepdims=True) <= (size / 127 / 2) ** 2 * 1.01).all()
+
+
+def test_a_channel_of_zeros_stays_zero_and_a_tiny_one_keeps_its_bias_in_reach() -> None:
+    rounded = round_weight(np.array([[[[0.0]]], [[[1e-9]]]]), finest=np.array([0.0, 1e-3]))
+    assert rounded.scales.tolist() == pytest.approx([1.0, 1e-3])
+    assert not rounded.values.any()
