@@ -90,7 +90,6 @@ def test_killed_at_random_moments_it_is_resumed_to_the_same_bytes(
 def test_ctrl_c_says_how_to_go_on(image: Path, model: Path, expected: bytes, tmp_path: Path) -> None:
     running = begin(image, tmp_path / "out.tif", model)
     until(running, "memory")
-    time.sleep(0.15)
     running.send_signal(signal.SIGINT)
     said, _ = running.communicate(timeout=60)
     assert running.returncode not in (0, 2)
