@@ -2,7 +2,8 @@
 
 As in `quant.quantise` only the correction is computed in int8, the image enters as two planes, the residual stream
 has one scale and its channels are equalised, and the correction has two gains. Gone are the DPU's rules: see
-`quant.free_file`. What both still share is a residual stream of 8 bits, and its rounding dominates.
+`quant.free_file`. Float scales by themselves gain little: what rules in both is a residual stream of 8 bits. So the
+last of its tensors is computed in half steps, which int32 bias affords.
 """
 
 from collections.abc import Callable
@@ -13,10 +14,11 @@ import onnx
 from quant.calibration import Patches
 from quant.free_file import Scale, free_model
 from quant.free_scales import tensor_scales
-from quant.graph import CORRECTION, Conv, Graph, correction_graph
+from quant.graph import CORRECTION, Conv, Graph, correction_graph, tensors
 from quant.onnx_file import fixed_tile_px, metadata
 from quant.passes.dual_gain import two_gains
 from quant.passes.equalise import channel_ranges, equalise, search, search_steps
+from quant.passes.half_steps import half_steps
 from quant.passes.steady_stream import STREAM_POSITION, stream_tensors
 from quant.planes import PLANES, POSITION, read_planes
 from quant.positions import INT8_MAX
@@ -24,6 +26,7 @@ from quant.quantise import Targets, search_targets
 from quant.session import open_session, run
 
 UINT8_MAX = 255
+STREAM_STEP = 2.0**-STREAM_POSITION
 FINER = 2
 """The fine gain's unit is so much finer than what suits all corrections: the coarse one is there for the large."""
 
@@ -47,7 +50,7 @@ def quantise_free(
         factors = search(graph, ranges, lambda tried: _error(tried, scales, targets), tick)
         graph = equalise(graph, factors)
     about = {**metadata(model), "precision": "int8 free", "calibration_sha256": patches.digest, **about}
-    return free_model(two_gains(graph), scales, about, fixed_tile_px(model))
+    return _written(graph, scales, about, fixed_tile_px(model))
 
 
 def free_ticks(model: onnx.ModelProto, patches: int) -> int:
@@ -61,19 +64,26 @@ def free_ticks(model: onnx.ModelProto, patches: int) -> int:
 
 
 def _scales(graph: Graph, patches: Patches, tick: Callable[[], None]) -> dict[str, Scale]:
-    """Least-squares scales; the stream has any, because `equalise` scales its channels to it."""
+    """Least-squares scales of what is not the stream; that has any, because `equalise` scales its channels to it."""
     convs = [op for op in graph if isinstance(op, Conv) and op.output not in stream_tensors(graph)]
     levels = {op.output: UINT8_MAX if op.relu else INT8_MAX for op in convs}
     units = tensor_scales(graph, levels, patches.degraded, tick)
     units[CORRECTION] /= FINER
     found = {op.output: Scale(units[op.output], 0) if op.relu else Scale(units[op.output]) for op in convs}
-    stream = dict.fromkeys(stream_tensors(graph), Scale(2.0**-STREAM_POSITION))
-    return {PLANES: Scale(2.0**-POSITION), **stream, **found}
+    return {PLANES: Scale(2.0**-POSITION), **found}
+
+
+def _written(
+    graph: Graph, scales: dict[str, Scale], about: dict[str, str], tile_px: int | None = None
+) -> onnx.ModelProto:
+    stream = Scale(STREAM_STEP)
+    fine = two_gains(half_steps(graph, STREAM_STEP))
+    return free_model(fine, {name: scales.get(name, stream) for name in (PLANES, *tensors(fine))}, about, tile_px)
 
 
 def _error(graph: Graph, scales: dict[str, Scale], targets: Targets) -> float:
     """Mean squared difference from the float network."""
-    session = open_session(free_model(two_gains(graph), scales, {}))
+    session = open_session(_written(graph, scales, {}))
     return float(
         np.mean([np.square(run(session, image) - wanted, dtype=np.float64).mean() for image, wanted in targets])
     )

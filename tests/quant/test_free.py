@@ -12,13 +12,19 @@ from onnx import numpy_helper
 from model.simulator.procedural import procedural_scene
 from profiles import load_sensor
 from quant.calibration import Patches, draw_patches
+from quant.float_file import float_model
 from quant.free import free_ticks, quantise_free
-from quant.free_scales import BINS, best_scale, round_weight
+from quant.free_file import Scale, free_model
+from quant.free_scales import BINS, best_scale, round_weight, tensor_scales
 from quant.gate import compare
-from quant.graph import CORRECTION, correction_graph, relu_count
+from quant.graph import CORRECTION, Conv, Graph, correction_graph, relu_count, tensors
 from quant.integer import _convolve
 from quant.onnx_file import metadata, save_onnx
-from quant.planes import PLANES
+from quant.passes.dual_gain import two_gains
+from quant.passes.equalise import channel_ranges, equalise, first_guess
+from quant.passes.half_steps import OFFSETS, half_steps
+from quant.pieces import planes_of
+from quant.planes import PLANES, POSITION, read_planes
 from quant.quantise import Quantised
 from quant.session import open_session, run
 
@@ -111,7 +117,7 @@ def test_every_convolution_stays_an_integer_kernel(free: onnx.ModelProto, tmp_pa
     options.optimized_model_filepath = str(tmp_path / "optimised.onnx")
     ort.InferenceSession(free.SerializeToString(), options, providers=["CPUExecutionProvider"])
     kinds = Counter(node.op_type for node in onnx.load(tmp_path / "optimised.onnx").graph.node)
-    assert kinds["QLinearConv"] == 7
+    assert kinds["QLinearConv"] == 8  # seven, the head also in half steps
     assert not [kind for kind in kinds if kind.endswith("Conv") and kind != "QLinearConv"]
 
 
@@ -195,3 +201,43 @@ def test_a_channel_of_zeros_stays_zero_and_a_tiny_one_keeps_its_bias_in_reach() 
     rounded = round_weight(np.array([[[[0.0]]], [[[1e-9]]]]), finest=np.array([0.0, 1e-3]))
     assert rounded.scales.tolist() == pytest.approx([1.0, 1e-3])
     assert not rounded.values.any()
+
+
+def in_float(graph: Graph) -> np.ndarray:
+    planes = planes_of(image(23, 31))
+    return np.asarray(open_session(float_model(graph, [CORRECTION])).run(None, {PLANES: planes})[0])
+
+
+def test_half_steps_leave_the_float_network_as_it_was(float_onnx: onnx.ModelProto) -> None:
+    graph = read_planes(correction_graph(float_onnx))
+    twice = half_steps(graph, 2.0**-8)
+    assert len(twice) == len(graph) + 1  # the head is also read by the first block, as it was
+    np.testing.assert_allclose(in_float(twice), in_float(graph), atol=2e-6)
+
+
+def test_half_steps_need_an_add_of_two_convolutions_before_the_tail(float_onnx: onnx.ModelProto) -> None:
+    graph = read_planes(correction_graph(float_onnx))
+    for other in (graph[:-1], graph[-1:], graph[:3]):
+        assert half_steps(other, 2.0**-8) == other
+
+
+@given(st.floats(-100, 100))
+def test_two_copies_hold_half_steps(value: float) -> None:
+    copies = np.rint(value + OFFSETS)
+    assert abs(copies.mean() - value) <= 0.25 + 1e-9
+
+
+def test_half_steps_lose_less(float_onnx: onnx.ModelProto, patches: Patches, unseen: Patches) -> None:
+    step, graph = 2.0**-8, read_planes(correction_graph(float_onnx))
+    graph = equalise(graph, first_guess(channel_ranges(graph, patches.degraded, lambda: None), 0.5, 0.8))
+    levels = {op.output: 255 for op in graph if isinstance(op, Conv) and op.relu} | {CORRECTION: 127}
+    units = tensor_scales(graph, levels, patches.degraded, lambda: None)
+    scales = {name: Scale(unit, 0 if levels[name] == 255 else 128) for name, unit in units.items()}
+    scales[PLANES] = Scale(2.0**-POSITION)
+
+    def mae(offset: float) -> float:
+        fine = two_gains(half_steps(graph, offset))
+        model = free_model(fine, {name: scales.get(name, Scale(step)) for name in (PLANES, *tensors(fine))}, {})
+        return compare(open_session(float_onnx), open_session(model), unseen.pairs).mae
+
+    assert mae(step) < 0.95 * mae(0.0)
