@@ -2,9 +2,9 @@
 
     python benchmarks/int8_peers.py --images aerial-train/ --held-out aerial-test/ --quark-python quark/bin/python
 
-Prints a Markdown table. Each way quantises in a process of its own; its peak memory has the interpreter and libraries
-in it. Peers get the plain graph, and the one that we quantise: two planes in, the correction out, the add left to the
-host.
+On Linux. Prints a Markdown table. Each way quantises in a process of its own; its peak memory has the interpreter and
+libraries in it. Peers get the plain graph, and the one that we quantise: two planes in, the correction out, the add
+left to the host.
 
 Quark wants other versions of its libraries, so it lives in its own environment. Without the CPU build of torch, pip
 would fetch gigabytes of CUDA packages:
@@ -103,7 +103,8 @@ def quantise(way: Way, files: dict[bool, tuple[Path, Path]], out: Path, python: 
     """
     command = [python, str(way.script), *way.before, *map(str, files[way.rewritten]), str(out), *way.after]
     paths = {**os.environ, "PYTHONPATH": str(HERE.parent)} if way.script == OURS else {**os.environ, "PYTHONPATH": ""}
-    done = subprocess.run(command, capture_output=True, text=True, env=paths, check=False)  # noqa: S603 - our own
+    kept = {"capture_output": True, "text": True, "env": paths, "cwd": out.parent}  # Quark drops files where it runs
+    done = subprocess.run(command, check=False, **kept)  # noqa: S603 - our own
     if done.returncode:
         last = (done.stderr.strip() or "no message").splitlines()[-1]
         raise RuntimeError(f"exit {done.returncode}: {last}")
@@ -164,7 +165,7 @@ def main() -> None:
     parser.add_argument("--keep", type=Path, help="folder for the quantised files")
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory() as temporary:
-        folder = arguments.keep or Path(temporary)
+        folder = (arguments.keep or Path(temporary)).resolve()
         folder.mkdir(parents=True, exist_ok=True)
         for line in table(arguments, folder):
             print(line, flush=True)

@@ -7,9 +7,9 @@ out. Writes OUT, and prints seconds and peak resident memory as the last line, i
 """
 
 import json
-import resource
 import sys
 import time
+from pathlib import Path
 
 import numpy as np
 import onnx
@@ -43,9 +43,13 @@ def main() -> None:
     started = time.perf_counter()
     ModelQuantizer(config).quantize_model(network, out, reader)
     seconds = time.perf_counter() - started
-    unit = 1 if sys.platform == "darwin" else 1024  # bytes there, KiB elsewhere
-    peak_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 1e6
-    print(json.dumps({"seconds": seconds, "peak_mb": peak_mb}))
+    print(json.dumps({"seconds": seconds, "peak_mb": peak_mb()}))
+
+
+def peak_mb() -> float:
+    """Largest resident memory of this process; getrusage would count that of its parent before it too."""
+    status = dict(line.split(":", 1) for line in Path("/proc/self/status").read_text(encoding="utf-8").splitlines())
+    return int(status["VmHWM"].split()[0]) * 1024 / 1e6
 
 
 if __name__ == "__main__":

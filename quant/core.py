@@ -75,19 +75,18 @@ def _quantise_conv(op: Conv, positions: dict[str, int], shifts: Shifts) -> IntCo
     product = weight_position + positions[op.input]
     cut = clamp(product - positions[op.output], shifts.cut)
     positions[op.output] = product - cut
-    wanted = best_position(op.bias) if op.bias.any() else product
-    coarsest = min(wanted, coarsest_position(float(np.abs(op.bias).max(initial=0.0))) + 1)
-    bias_position = product - clamp(product - max(wanted, coarsest), shifts.bias)
+    weight = quantise(op.weight, weight_position)
     return IntConv(
-        op.name,
-        op.input,
-        op.output,
-        quantise(op.weight, weight_position),
-        weight_position,
-        quantise(op.bias, bias_position),
-        bias_position,
-        op.relu,
+        op.name, op.input, op.output, weight, weight_position, *quantise_bias(op.bias, product, shifts), op.relu
     )
+
+
+def quantise_bias(bias: np.ndarray, product: int, shifts: Shifts = SHIFTS) -> tuple[np.ndarray, int]:
+    """An int8 bias (O,) and its position, within reach of the accumulator at position `product`."""
+    wanted = best_position(bias) if bias.any() else product
+    coarsest = min(wanted, coarsest_position(float(np.abs(bias).max(initial=0.0))) + 1)
+    position = product - clamp(product - max(wanted, coarsest), shifts.bias)
+    return quantise(bias, position), position
 
 
 def _move_add(op: Add, positions: dict[str, int], shifts: Shifts) -> None:

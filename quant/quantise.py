@@ -12,9 +12,12 @@ from quant.core import IntCore, build_core, shift_faults
 from quant.float_file import float_model
 from quant.graph import CORRECTION, Conv, Graph, correction_graph, relu_count, tensors
 from quant.host_file import host_model
+from quant.moments import input_moments
 from quant.onnx_file import fixed_tile_px, metadata
 from quant.passes.dual_gain import two_gains
 from quant.passes.equalise import channel_ranges, equalise, search, search_steps
+from quant.passes.fit_weights import fit_weights
+from quant.passes.half_steps import half_steps
 from quant.passes.steady_stream import STREAM_POSITION, common_position, steady, stream_tensors
 from quant.pieces import crops, tensor_values
 from quant.planes import coarse_plane_only, read_planes
@@ -32,6 +35,8 @@ class Passes:
     least_squares: bool = True
     steady_stream: bool = True
     equalise: bool = True
+    half_steps: bool = True
+    fit_weights: bool = True
     dual_gain: bool = True
 
 
@@ -70,26 +75,28 @@ def quantise_model(
         targets = search_targets(read_planes(correction_graph(model)), patches.degraded)
         factors = search(graph, ranges, lambda tried: _error(_core(tried, positions, passes), targets), tick)
         graph = equalise(graph, factors)
-    core = _core(graph, positions, passes)
+    final, core = _final(graph, positions, passes), _core(graph, positions, passes)
+    if passes.fit_weights:
+        core = fit_weights(final, core, input_moments(final, patches.degraded, tick))
     faults = shift_faults(core)
     assert not faults, faults  # noqa: S101 - build_core has moved every position within reach
     about = {**metadata(model), "precision": "int8 legal", "calibration_sha256": patches.digest, **about}
     about["passes"] = ", ".join(name for name, on in asdict(passes).items() if on)
     tile_px = fixed_tile_px(model)
-    exact = two_gains(graph) if passes.dual_gain else graph
     return Quantised(
-        host_model(core, about, tile_px), board_model(core, about, tile_px), core, relu_count(graph), exact
+        host_model(core, about, tile_px), board_model(core, about, tile_px), core, relu_count(graph), final
     )
 
 
 def ticks(model: onnx.ModelProto, patches: int, passes: Passes = ALL) -> int:
     """How often `quantise_model` will call `tick`."""
     graph = _reads_planes(model, passes)
+    passings = 2 + passes.fit_weights
     if not (passes.equalise and stream_tensors(graph)):
-        return 2 * patches
+        return passings * patches
     first = graph[0]
     assert isinstance(first, Conv)  # noqa: S101 - correction_graph has seen to it
-    return 3 * patches + search_steps(len(first.weight))
+    return (passings + 1) * patches + search_steps(len(first.weight))
 
 
 def _reads_planes(model: onnx.ModelProto, passes: Passes) -> Graph:
@@ -99,15 +106,24 @@ def _reads_planes(model: onnx.ModelProto, passes: Passes) -> Graph:
 
 def _core(graph: Graph, positions: dict[str, int], passes: Passes) -> IntCore:
     """The integer core of a graph whose tensors have these least-squares positions, the passes applied."""
-    chosen = dict(positions)
+    chosen, final = dict(positions), _final(graph, positions, passes)
     if passes.steady_stream or passes.equalise:
-        position = STREAM_POSITION if passes.equalise else common_position(graph, positions)
-        chosen = steady(graph, positions, position)
+        chosen = steady(final, positions, _stream_position(graph, positions, passes))
     if passes.dual_gain:
-        graph = two_gains(graph)
         chosen[CORRECTION] += 1
-    assert set(tensors(graph)) <= set(chosen)  # noqa: S101
-    return build_core(graph, chosen)
+    assert set(tensors(final)) <= set(chosen)  # noqa: S101
+    return build_core(final, chosen)
+
+
+def _final(graph: Graph, positions: dict[str, int], passes: Passes) -> Graph:
+    """The graph that is rounded: with half steps and two gains where wanted."""
+    if passes.half_steps and (passes.steady_stream or passes.equalise):
+        graph = half_steps(graph, 2.0 ** -_stream_position(graph, positions, passes))
+    return two_gains(graph) if passes.dual_gain else graph
+
+
+def _stream_position(graph: Graph, positions: dict[str, int], passes: Passes) -> int:
+    return STREAM_POSITION if passes.equalise else common_position(graph, positions)
 
 
 Targets = list[tuple[np.ndarray, np.ndarray]]

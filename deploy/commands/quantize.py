@@ -7,7 +7,6 @@ from typing import Annotated
 import typer
 
 EXAMPLE = "quantize float.onnx --target vck190 --sensor pleiades-degraded --out int8.onnx"
-HELD_OUT_PATCHES = 32
 
 
 class Regime(StrEnum):
@@ -36,6 +35,9 @@ def quantize(
         Path | None,
         typer.Option(help="Folder for report.html and report.json: which layers and patches err, and how."),
     ] = None,
+    without: Annotated[
+        list[str] | None, typer.Option(help="Leave out a pass that --ablate lists, as half-steps; may be repeated.")
+    ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the patches.")] = 0,
     json: Annotated[Path | None, typer.Option(help="Write the figures here.")] = None,
 ) -> None:
@@ -43,76 +45,35 @@ def quantize(
 
     Prints each integer layer: bits of its accumulator, seen and proven, and the share of saturated results.
     """
-    from deploy.blame import blame_report
-    from deploy.defaults import HELD_OUT_SEED, load_scenes
-    from deploy.progress import steps
-    from deploy.quant_report import LAYER_PATCHES, ablation_rows, ablations, layer_rows, rounding_row
-    from deploy.report.page import write_report
+    from deploy.quantising import (
+        Calibration,
+        Wanted,
+        passes_without,
+        quantise_free_file,
+        quantise_legal_file,
+    )
     from deploy.results import Document
-    from deploy.tables import print_rows
-    from deploy.verdict import gate_row
     from model.files import require_writable
-    from profiles import load_sensor, load_target
+    from profiles import load_target
     from profiles.errors import OptionError
-    from quant.calibration import REFERENCE, Patches, draw_patches
-    from quant.free import free_ticks, quantise_free
-    from quant.gate import compare
-    from quant.onnx_file import load_onnx, save_onnx
-    from quant.quantise import quantise_model, ticks
-    from quant.session import open_session
+    from quant.onnx_file import load_onnx
 
-    if regime is Regime.free and (board or ablate or report):
+    if regime is Regime.free and (board or ablate or report or without):
         remedy = "leave it out, or take --regime legal"
-        raise OptionError("--regime free", expected="no --board, --ablate or --report", got="one", remedy=remedy)
+        expected = "no --board, --ablate, --report or --without"
+        raise OptionError("--regime free", expected=expected, got="one", remedy=remedy)
+    passes = passes_without(without or [])
     page, figures = (report / "report.html", report / "report.json") if report else (None, None)
     require_writable(out, board, json, page, figures)
-    board_target = load_target(target)
-    float_model = load_onnx(model)
-    degraded, reference = load_sensor(sensor), load_sensor(REFERENCE)
-    scenes = load_scenes(images, reference.nominal(), seed)
-    drawn = draw_patches(scenes, degraded, reference, patches, seed, patch)
-    about = {"calibration_sensor": degraded.name, "calibration_seed": str(seed)}
-    arguments = {"target": target, "sensor": sensor, "images": images, "patches": patches, "patch": patch}
-    arguments |= {"regime": regime.value, "seed": seed}
-
-    def unseen() -> Patches:
-        """Patches of the same scenes, or of other drawn ones, that calibration does not see."""
-        other = seed + HELD_OUT_SEED
-        ground = scenes if images else load_scenes(None, reference.nominal(), other)
-        return draw_patches(ground, degraded, reference, HELD_OUT_PATCHES, other)
-
+    network, board_target = load_onnx(model), load_target(target)
+    calibration = Calibration(sensor, images, patches, patch, seed)
     if regime is Regime.free:
-        with steps("calibrating", free_ticks(float_model, patches)) as bar:
-            made = quantise_free(float_model, drawn, about, bar.advance)
-        save_onnx(made, out)
-        typer.echo(f"wrote {out}: float scales, for boards that are not the DPU")
-        row = gate_row(compare(open_session(float_model), open_session(made), unseen().pairs))
-        print_rows("float against INT8, on patches that calibration did not see", [row])
-        Document("quantize", arguments, (model, out), (row,)).write(json)
-        return
-    about["target"] = board_target.name
-    with steps("calibrating", ticks(float_model, patches)) as bar:
-        result = quantise_model(float_model, drawn, about, bar.advance)
-    save_onnx(result.host, out)
-    typer.echo(f"wrote {out}: {len(result.core.ops)} integer operations, {result.relus} ReLUs kept")
-    if board is not None:
-        save_onnx(result.board, board)
-        typer.echo(f"wrote {board}: the same numbers in the board's spelling")
-    layers, rounding = layer_rows(result.core, drawn.degraded), rounding_row(result.core, drawn.degraded)
-    print_rows("integer layers", layers)
-    print_rows("the rule for halves", [rounding])
-    rows = [*layers, rounding]
-    if ablate:
-        with steps("ablating", len(ablations())) as bar:
-            found = ablation_rows(float_model, drawn, unseen(), bar.advance)
-        print_rows("what each pass buys, on patches that calibration did not see", found)
-        rows += found
-    if page:
-        with steps("blaming", LAYER_PATCHES) as bar:
-            found, written = blame_report(float_model, result, unseen(), rows, bar.advance)
-        rows = [*found, *rows]
-        write_report(written, page)
-        typer.echo(f"wrote {page}: {written.headline}")
+        rows = quantise_free_file(network, calibration, out, typer.echo)
+    else:
+        wanted = Wanted(board, ablate, page)
+        rows = quantise_legal_file(network, calibration, board_target.name, passes, out, wanted, typer.echo)
+    arguments = {"target": target, "sensor": sensor, "images": images, "patches": patches, "patch": patch}
+    arguments |= {"regime": regime.value, "without": ", ".join(without or []), "seed": seed}
     document = Document("quantize", arguments, (model, out), tuple(rows))
     for path in (figures, json):
         document.write(path)

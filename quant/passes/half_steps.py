@@ -4,7 +4,7 @@ The tail reads head + body end, each rounded to eight bits, and these two roundi
 Both are computed twice, with biases a quarter of a step down and a quarter up, and the tail reads both copies at half
 weight. The two rounded values of x add up to x rounded at half the step (Hermite's identity:
 floor(x) + floor(x + 1/2) = floor(2x)), so it is the same network with finer numbers there, for twice the work in one
-of all convolutions.
+of all convolutions. Nothing in it is against the DPU's rules: an int8 bias holds a quarter of a step.
 """
 
 from dataclasses import replace

@@ -29,8 +29,8 @@ from quant.spread import Spread
 def test_every_pass_is_left_out_once() -> None:
     found = ablations()
     assert found["all passes"] == ALL
-    assert found["none"] == Passes(*[False] * 5)
-    assert len(found) == 7
+    assert found["none"] == Passes(*[False] * 7)
+    assert len(found) == 9
     assert not found["without steady stream"].equalise
 
 
@@ -55,6 +55,28 @@ def test_the_free_regime_writes_a_file_of_its_own_kind(tmp_path: Path) -> None:
     assert not (tmp_path / "no.onnx").exists()
 
 
+def test_a_pass_can_be_left_out(tmp_path: Path) -> None:
+    out = tmp_path / "i.onnx"
+    options = [
+        "--out",
+        str(out),
+        "--patches",
+        "2",
+        "--patch",
+        "64",
+        "--without",
+        "half-steps",
+        "--without",
+        "equalise",
+    ]
+    result = CliRunner().invoke(app, ["quantize", float_file(tmp_path / "f.onnx"), *options])
+    assert result.exit_code == 0, result.output
+    assert metadata(load_onnx(out))["passes"] == "two_planes, least_squares, steady_stream, fit_weights, dual_gain"
+    unknown = CliRunner().invoke(app, ["quantize", str(tmp_path / "f.onnx"), "--out", str(out), "--without", "magic"])
+    assert unknown.exit_code == 2
+    assert "half-steps" in unknown.output
+
+
 def test_quantize_reports_layers_and_passes(tmp_path: Path) -> None:
     float_file(tmp_path / "f.onnx")
     dn = procedural_scene(640, 700, np.random.default_rng(0)).radiance.numpy() * 4095 / 400
@@ -66,8 +88,8 @@ def test_quantize_reports_layers_and_passes(tmp_path: Path) -> None:
     document = json.loads((tmp_path / "q.json").read_text())
     jsonschema.validate(document, json.loads(SCHEMA_PATH.read_text()))
     tables = [row["table"] for row in document["rows"]]
-    assert tables.count("integer layers") == 7
-    assert tables.count("ablation") == 7
+    assert tables.count("integer layers") == 8
+    assert tables.count("ablation") == 9
     for row in document["rows"]:
         if row["table"] == "integer layers":
             figures = row["figures"]

@@ -36,5 +36,14 @@ def patches() -> Patches:
 
 
 @pytest.fixture(scope="session")
+def unseen() -> Patches:
+    """Of another scene than calibration's."""
+    scene = procedural_scene(900, 960, np.random.default_rng(77))
+    return draw_patches(
+        [scene], load_sensor("pleiades-degraded"), load_sensor("pleiades-reference"), count=6, seed=78
+    )
+
+
+@pytest.fixture(scope="session")
 def quantised(float_onnx: onnx.ModelProto, patches: Patches) -> Quantised:
     return quantise_model(float_onnx, patches, {"seed": "5"}, tick=lambda: None)

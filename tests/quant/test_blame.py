@@ -45,7 +45,7 @@ def test_adds_of_a_steady_stream_lose_nothing_but_what_saturates(
     adds = {op.name for op in quantised.core.ops if isinstance(op, Add)}
     layers = {layer.name: layer for layer in blamed[0]}
     worst_add = max(layers[name].network.squared for name in adds)
-    assert worst_add < 0.1 * max(layer.network.squared for layer in blamed[0])
+    assert worst_add < 0.2 * max(layer.network.squared for layer in blamed[0])
 
 
 def test_a_spoilt_layer_is_found(quantised: Quantised, crops: list[np.ndarray]) -> None:

@@ -46,11 +46,6 @@ def free(float_onnx: onnx.ModelProto, patches: Patches, ticked: list[int]) -> on
     return quantise_free(float_onnx, patches, {"seed": "5"}, tick=lambda: ticked.append(1))
 
 
-@pytest.fixture(scope="module")
-def unseen() -> Patches:
-    return drawn(6, 128)
-
-
 def drawn(count: int, patch_px: int) -> Patches:
     scene = procedural_scene(900, 960, np.random.default_rng(77))
     degraded, reference = load_sensor("pleiades-degraded"), load_sensor("pleiades-reference")

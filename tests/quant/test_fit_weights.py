@@ -1,0 +1,106 @@
+"""Weights fitted to what a convolution reads: its result errs less, in the spirit of the exact quadratic."""
+
+from dataclasses import replace
+
+import numpy as np
+import onnx
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.testing import assert_allclose
+
+from quant.calibration import Patches
+from quant.core import IntConv, op_shifts
+from quant.gate import compare
+from quant.graph import Conv, Graph, correction_graph
+from quant.moments import Moments, input_moments
+from quant.passes.fit_weights import descend, fit_weights
+from quant.pieces import planes_of
+from quant.planes import read_planes
+from quant.positions import SHIFTS
+from quant.quantise import ALL, quantise_model
+from quant.session import open_session
+
+
+@pytest.fixture(scope="module")
+def graph(float_onnx: onnx.ModelProto) -> Graph:
+    return read_planes(correction_graph(float_onnx))
+
+
+def squared(whole: np.ndarray, wanted: np.ndarray, covariance: np.ndarray) -> np.ndarray:
+    error = whole - wanted
+    return np.asarray(((error @ covariance) * error).sum(axis=1))
+
+
+@given(st.integers(0, 2**32 - 1), st.integers(1, 7), st.integers(1, 12))
+def test_no_channel_errs_more_than_rounded_to_nearest(seed: int, channels: int, size: int) -> None:
+    generator = np.random.default_rng(seed)
+    wanted = generator.uniform(-127, 127, (channels, size))
+    windows = generator.normal(0, 1, (3 * size, size)) + generator.normal(0, 3, (3 * size, 1))
+    covariance = windows.T @ windows / len(windows) + 1e-6 * np.eye(size)
+    nearest = np.rint(wanted)
+    found = descend(wanted, nearest, covariance)
+    assert (squared(found, wanted, covariance) <= squared(nearest, wanted, covariance) + 1e-9).all()
+    assert (found == np.rint(found)).all()
+    assert np.abs(found).max() <= 128
+
+
+def test_weights_that_meet_the_same_pixel_keep_their_sum() -> None:
+    wanted = np.full((1, 9), 0.3)
+    found = descend(wanted, np.zeros((1, 9)), np.ones((9, 9)) + 1e-3 * np.eye(9))
+    assert found.sum() == 3  # nearest to 2.7; each by itself rounds to 0
+
+
+def test_of_weights_that_meet_unrelated_values_the_nearest_stay() -> None:
+    wanted = np.random.default_rng(2).uniform(-120, 120, (4, 18))
+    assert (descend(wanted, np.rint(wanted), np.diag(np.arange(1.0, 19))) == np.rint(wanted)).all()
+
+
+def test_moments_are_those_of_the_windows() -> None:
+    windows = np.random.default_rng(0).normal(2, 1, (50, 4)).astype(np.float32)
+    moments = Moments(np.zeros((4, 4)), np.zeros(4))
+    for part in np.array_split(windows, 3):
+        moments.add(part)
+    assert_allclose(moments.mean, windows.mean(axis=0), rtol=1e-5)
+    assert_allclose(moments.covariance, np.cov(windows.T, bias=True), rtol=1e-3, atol=1e-5)
+
+
+def test_the_first_convolution_s_moments_are_those_of_the_planes(graph: Graph, patches: Patches) -> None:
+    head = graph[0]
+    moments = input_moments(graph, patches.degraded, lambda: None)[head.name]
+    planes = np.concatenate([planes_of(image) for image in patches.degraded])
+    centre = moments.mean.reshape(2, 3, 3)[:, 1, 1]
+    assert_allclose(centre, planes.mean(axis=(0, 2, 3)), rtol=0.05, atol=2e-3)
+
+
+def test_every_layer_errs_less_on_what_it_reads(
+    float_onnx: onnx.ModelProto, patches: Patches, unseen: Patches
+) -> None:
+    nearest = quantise_model(float_onnx, patches, {}, lambda: None, replace(ALL, fit_weights=False))
+    fitted = fit_weights(nearest.graph, nearest.core, input_moments(nearest.graph, patches.degraded, lambda: None))
+    other = input_moments(nearest.graph, unseen.degraded, lambda: None)
+    for op, before, after in zip(nearest.graph, nearest.core.ops, fitted.ops, strict=True):
+        if isinstance(op, Conv) and isinstance(before, IntConv) and isinstance(after, IntConv):
+            moments = other[op.name]
+            wanted = op.weight.reshape(len(op.weight), -1) * 2.0**before.weight_position
+            errors = [
+                squared(whole.weight.reshape(wanted.shape), wanted, moments.covariance) for whole in (before, after)
+            ]
+            assert errors[1].mean() < errors[0].mean(), op.name
+
+
+def test_fitted_numbers_stay_legal(float_onnx: onnx.ModelProto, patches: Patches) -> None:
+    core = quantise_model(float_onnx, patches, {}, lambda: None).core
+    for op in core.ops:
+        for _, value, window in op_shifts(op, core.positions, SHIFTS):
+            assert window[0] <= value <= window[1]
+
+
+def test_it_lowers_the_network_s_error_on_unseen_patches(
+    float_onnx: onnx.ModelProto, patches: Patches, unseen: Patches
+) -> None:
+    session, errors = open_session(float_onnx), []
+    for fit in (False, True):
+        made = quantise_model(float_onnx, patches, {}, lambda: None, replace(ALL, equalise=False, fit_weights=fit))
+        errors.append(compare(session, open_session(made.host), unseen.pairs).mae)
+    assert errors[1] < errors[0]
