@@ -86,10 +86,11 @@ def search(graph: Graph, ranges: np.ndarray, error: Error, tick: Callable[[], No
                 cost = error(equalise(graph, tried))
                 if cost < best:
                     factors, best = tried, cost
-                tick()
+                    break  # the other way leads back
+            tick()
     return factors
 
 
 def search_steps(channels: int) -> int:
     """How often `search` ticks."""
-    return len(LEVELLING) * len(HEADROOM) + 2 * len(STEPS) * channels
+    return len(LEVELLING) * len(HEADROOM) + len(STEPS) * channels
