@@ -3,7 +3,7 @@
     python benchmarks/int8_peers.py --images aerial-train/ --held-out aerial-test/ --quark-python quark/bin/python
 
 On Linux. Prints a Markdown table. Each way quantises in a process of its own; its peak memory has the interpreter and
-libraries in it. Peers get the plain graph, and the one that we quantise: two planes in, the correction out, the add
+libraries in it. Peers get the plain graph, and the one that we quantise: planes in, the correction out, the add
 left to the host.
 
 Quark wants other versions of its libraries, so it lives in its own environment. Without the CPU build of torch, pip

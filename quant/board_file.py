@@ -11,11 +11,11 @@ from onnx import helper, numpy_helper
 from quant.core import IntConv, IntCore
 from quant.graph import CORRECTION, Add
 from quant.onnx_file import image_info, make_model
-from quant.planes import PLANES
+from quant.planes import COUNT, PLANES
 
 
 def board_model(core: IntCore, about: dict[str, str], tile_px: int | None = None) -> onnx.ModelProto:
-    """`planes` (N, 2, H, W) float32, as q * 2^-7, to `correction` (N, 1 or 2, H, W) float32.
+    """`planes` (N, 3, H, W) float32, as q * 2^-7, to `correction` (N, 1 or 2, H, W) float32.
 
     Two channels are two gains of the same correction: `quant.passes.dual_gain.merge` makes one of them.
     """
@@ -29,7 +29,7 @@ def board_model(core: IntCore, about: dict[str, str], tile_px: int | None = None
         else:
             _conv(writer, op, inputs[0], output)
         writer.quantised(op.output, output, core.positions[op.output])
-    ends = [image_info(PLANES, 2, tile_px)], [image_info(CORRECTION, core.output_channels, tile_px)]
+    ends = [image_info(PLANES, COUNT, tile_px)], [image_info(CORRECTION, core.output_channels, tile_px)]
     graph = helper.make_graph(writer.nodes, "convbeers-core", *ends, list(writer.weights.values()))
     return make_model(graph, about)
 

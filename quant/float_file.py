@@ -5,11 +5,11 @@ from onnx import TensorProto, helper, numpy_helper
 
 from quant.graph import Conv, Graph
 from quant.onnx_file import image_info, make_model
-from quant.planes import PLANES
+from quant.planes import COUNT, PLANES
 
 
 def float_model(graph: Graph, outputs: list[str]) -> onnx.ModelProto:
-    """The graph from `planes` (N, 2, H, W) float32 to the named tensors."""
+    """The graph from `planes` (N, 3, H, W) float32 to the named tensors."""
     nodes: list[onnx.NodeProto] = []
     weights: list[onnx.TensorProto] = []
     for op in graph:
@@ -24,4 +24,4 @@ def float_model(graph: Graph, outputs: list[str]) -> onnx.ModelProto:
         else:
             nodes.append(helper.make_node("Add", list(op.inputs), [op.output], name=op.name))
     results = [helper.make_tensor_value_info(n, TensorProto.FLOAT, ["N", "C", "H", "W"]) for n in outputs]
-    return make_model(helper.make_graph(nodes, "core", [image_info(PLANES, 2, None)], results, weights), {})
+    return make_model(helper.make_graph(nodes, "core", [image_info(PLANES, COUNT, None)], results, weights), {})

@@ -1,6 +1,6 @@
 """INT8 for boards that are not the DPU: what its rules cost shows against what goes without them.
 
-As in `quant.quantise` only the correction is computed in int8, the image enters as two planes, the residual stream
+As in `quant.quantise` only the correction is computed in int8, the image enters as planes, the residual stream
 has one scale and its channels are equalised, and the correction has two gains. Gone are the DPU's rules: see
 `quant.free_file`. Float scales by themselves gain little: what rules in both is a residual stream of 8 bits. So the
 last of its tensors is computed in half steps, which int32 bias affords.

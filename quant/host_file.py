@@ -18,7 +18,7 @@ from quant.core import IntConv, IntCore
 from quant.graph import CORRECTION, IMAGE, Add
 from quant.onnx_file import image_info, make_model
 from quant.passes.dual_gain import FINE_MAX, GAIN
-from quant.planes import COARSE_MAX, MAX_DN, PLANES, STEP
+from quant.planes import COARSE_MAX, MAX_DN, PLANES, QUARTER, STEP
 
 MICROSOFT = "com.microsoft"
 ZERO = 128
@@ -49,7 +49,10 @@ def _split_planes(w: "_Writer") -> None:
     w.node("Min", "host_front.coarse", ["host_front.whole_steps", w.scalar("coarse_max", COARSE_MAX)])
     w.node("Mul", "host_front.coarse_dn", ["host_front.coarse", w.scalar("step", STEP)])
     w.node("Sub", "host_front.remainder", ["host_front.dn", "host_front.coarse_dn"])
-    w.node("Concat", "host_front.planes", ["host_front.coarse", "host_front.remainder"], axis=1)
+    w.node("Mul", "host_front.quarters", ["host_front.remainder", w.scalar("one_quarter", 1 / QUARTER)])
+    w.node("Round", "host_front.quarter", ["host_front.quarters"])
+    planes = ["host_front.coarse", "host_front.remainder", "host_front.quarter"]
+    w.node("Concat", "host_front.planes", planes, axis=1)
     w.node("Add", "host_front.offset", ["host_front.planes", w.scalar("offset", ZERO)])
     w.node("Cast", PLANES, ["host_front.offset"], to=TensorProto.UINT8)
 

@@ -42,7 +42,7 @@ class LayerReport:
 def run_core(
     core: IntCore, planes: np.ndarray, half_even: bool = False
 ) -> tuple[dict[str, np.ndarray], list[LayerReport]]:
-    """Every tensor of the core for int8 planes (N, 2, H, W), and a report a layer."""
+    """Every tensor of the core for int8 planes (N, 3, H, W), and a report a layer."""
     tensors, reports = {PLANES: planes.astype(np.int64)}, []
     for op in core.ops:
         sums, shift, bound = _conv(core, op, tensors) if isinstance(op, IntConv) else _add(core, op, tensors)
@@ -55,7 +55,7 @@ def run_core(
 
 
 def correction(core: IntCore, planes: np.ndarray, half_even: bool = False) -> np.ndarray:
-    """The correction (N, 1 or 2, H, W) as float32 multiples of its scale, of int8 planes (N, 2, H, W)."""
+    """The correction (N, 1 or 2, H, W) as float32 multiples of its scale, of int8 planes (N, 3, H, W)."""
     tensors, _ = run_core(core, planes, half_even)
     return np.asarray(tensors[CORRECTION] * np.float32(core.scale(CORRECTION)), np.float32)
 

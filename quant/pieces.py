@@ -34,7 +34,7 @@ def tensor_values(
 
 
 def planes_of(image: np.ndarray) -> np.ndarray:
-    """An image (N, 1, H, W) in [0, 1] as a plane-reading float network takes it: (N, 2, H, W) float32."""
+    """An image (N, 1, H, W) in [0, 1] as a plane-reading float network takes it: (N, 3, H, W) float32."""
     return split(image).astype(np.float32) * np.float32(2.0**-POSITION)
 
 

@@ -31,7 +31,7 @@ SEARCH_CROPS = 16
 class Passes:
     """What is done beyond rounding each tensor: see `quant.passes`, `quant.planes` and `quant.positions`."""
 
-    two_planes: bool = True
+    fine_planes: bool = True
     least_squares: bool = True
     steady_stream: bool = True
     equalise: bool = True
@@ -101,7 +101,7 @@ def ticks(model: onnx.ModelProto, patches: int, passes: Passes = ALL) -> int:
 
 def _reads_planes(model: onnx.ModelProto, passes: Passes) -> Graph:
     graph = read_planes(correction_graph(model))
-    return graph if passes.two_planes else coarse_plane_only(graph)
+    return graph if passes.fine_planes else coarse_plane_only(graph)
 
 
 def _core(graph: Graph, positions: dict[str, int], passes: Passes) -> IntCore:

@@ -71,7 +71,7 @@ def test_a_pass_can_be_left_out(tmp_path: Path) -> None:
     ]
     result = CliRunner().invoke(app, ["quantize", float_file(tmp_path / "f.onnx"), *options])
     assert result.exit_code == 0, result.output
-    assert metadata(load_onnx(out))["passes"] == "two_planes, least_squares, steady_stream, fit_weights, dual_gain"
+    assert metadata(load_onnx(out))["passes"] == "fine_planes, least_squares, steady_stream, fit_weights, dual_gain"
     unknown = CliRunner().invoke(app, ["quantize", str(tmp_path / "f.onnx"), "--out", str(out), "--without", "magic"])
     assert unknown.exit_code == 2
     assert "half-steps" in unknown.output

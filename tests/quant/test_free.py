@@ -53,7 +53,7 @@ def drawn(count: int, patch_px: int) -> Patches:
 
 
 def whole_numbers(model: onnx.ModelProto, planes: np.ndarray, around: str = "zeros") -> np.ndarray:
-    """The correction as stored, in int64 arithmetic from the stored planes (N, 2, H, W).
+    """The correction as stored, in int64 arithmetic from the stored planes (N, 3, H, W).
 
     `around` each image are zeros, or the zero bytes that a kernel would take which forgot the zero point.
     """

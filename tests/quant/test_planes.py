@@ -1,12 +1,13 @@
 import numpy as np
 
-from quant.planes import MAX_DN, STEP, split
+from quant.planes import MAX_DN, QUARTER, STEP, split
 
 
 def test_no_digital_number_is_lost() -> None:
     dn = np.arange(MAX_DN + 1, dtype=np.float32).reshape(1, 1, 64, 64)
     planes = split(dn / np.float32(MAX_DN)).astype(np.int32)
-    np.testing.assert_array_equal(STEP * planes[:, :1] + planes[:, 1:], dn.astype(np.int32))
+    np.testing.assert_array_equal(STEP * planes[:, :1] + planes[:, 1:2], dn.astype(np.int32))
+    assert np.abs(QUARTER * planes[:, 2:] - planes[:, 1:2]).max() <= QUARTER / 2
 
 
 def test_zero_stays_zero_for_the_padding() -> None:
@@ -15,5 +16,5 @@ def test_zero_stays_zero_for_the_padding() -> None:
 
 def test_values_beyond_the_range_are_clipped_not_wrapped() -> None:
     low, high = (split(np.full((1, 1, 1, 1), v, np.float32)).ravel().tolist() for v in (-3.0, 7.0))
-    assert low == [0, 0]
+    assert low == [0, 0, 0]
     assert STEP * high[0] + high[1] == MAX_DN
