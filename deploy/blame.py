@@ -14,7 +14,7 @@ from quant.blame import Loss, blame_layers
 from quant.calibration import Patches
 from quant.gate import GateResult, compare
 from quant.quantise import Quantised
-from quant.session import open_session
+from quant.session import open_any_size
 from quant.spread import Spread, spread_of
 
 WORST = 4
@@ -27,7 +27,7 @@ def blame_report(
     model: onnx.ModelProto, result: Quantised, held_out: Patches, more: list[Row], tick: Callable[[], None]
 ) -> tuple[list[Row], Report]:
     """Blame on patches that calibration did not see: the rows, and the page with the rows of `more` after them."""
-    sessions = open_session(model), open_session(result.host)
+    sessions = open_any_size(model), open_any_size(result.host)
     gate, spread = compare(*sessions, held_out.pairs), spread_of(*sessions, held_out.degraded)
     worst = spread.worst(WORST)
     layers = layer_blame_rows(result, held_out, tick)

@@ -13,7 +13,8 @@ from deploy.dpu.reading import read_network
 from model.files import write_text
 from profiles.errors import OptionError
 from quant.limits import Check
-from quant.session import open_session, run
+from quant.onnx_file import fixed_tile_px
+from quant.session import open_any_size, run
 
 RELUS = ("Relu", "Max")
 TILE_PX = 640
@@ -23,11 +24,11 @@ def structure_checks(
     float_model: onnx.ModelProto, int8_path: Path, int8: onnx.ModelProto, target: str
 ) -> list[Check]:
     """Is the INT8 file legal, does it keep every ReLU, does it compute the same with and without optimisation?"""
-    failed = place(read_network(int8_path, TILE_PX), load_dpu(target, None)).failed
+    failed = place(read_network(int8_path, fixed_tile_px(int8) or TILE_PX), load_dpu(target, None)).failed
     first = f"{failed[0].op.name}: {failed[0].broken[0].finding.reason}" if failed else "every node keeps the rules"
     wanted, kept = (relu_count(model) for model in (float_model, int8))
     image = np.random.default_rng(0).random((1, 1, 97, 101), dtype=np.float32)
-    plain, optimised = (run(open_session(int8, optimise=o), image) for o in (False, True))
+    plain, optimised = (run(open_any_size(int8, optimise=o), image) for o in (False, True))
     difference = float(np.abs(plain - optimised).max())
     return [
         Check("legal on the DPU", not failed, first, f"the rules of {target}"),

@@ -17,7 +17,7 @@ from quant.integer import LayerReport, run_core
 from quant.pieces import crops
 from quant.planes import split
 from quant.quantise import ALL, Passes, quantise_model
-from quant.session import open_session
+from quant.session import open_any_size
 
 LAYER_PATCHES = 4
 BITS_SOURCE = "128 times the sum of the weights' sizes, plus the bias: no input exceeds it"
@@ -66,10 +66,10 @@ def ablation_rows(
     model: onnx.ModelProto, calibration: Patches, held_out: Patches, tick: Callable[[], None]
 ) -> list[Row]:
     """The gate's figures with all passes, with each one left out, and with none."""
-    session, rows = open_session(model), []
+    session, rows = open_any_size(model), []
     for name, passes in ablations().items():
         made = quantise_model(model, calibration, {}, lambda: None, passes)
-        row = gate_row(compare(session, open_session(made.host), held_out.pairs))
+        row = gate_row(compare(session, open_any_size(made.host), held_out.pairs))
         rows.append(Row("ablation", name, row.figures))
         tick()
     return rows

@@ -24,7 +24,7 @@ from quant.free import free_ticks, quantise_free
 from quant.gate import compare
 from quant.onnx_file import save_onnx
 from quant.quantise import ALL, Passes, Quantised, quantise_model, ticks
-from quant.session import open_session
+from quant.session import open_any_size
 
 HELD_OUT_PATCHES = 32
 Say = Callable[[str], None]
@@ -99,7 +99,7 @@ def quantise_free_file(model: onnx.ModelProto, calibration: Calibration, out: Pa
         made = quantise_free(model, calibration.drawn, calibration.about, bar.advance)
     save_onnx(made, out)
     say(f"wrote {out}: float scales, for boards that are not the DPU")
-    row = gate_row(compare(open_session(model), open_session(made), calibration.unseen.pairs))
+    row = gate_row(compare(open_any_size(model), open_any_size(made), calibration.unseen.pairs))
     print_rows("float against INT8, on patches that calibration did not see", [row])
     return [row]
 

@@ -77,3 +77,16 @@ def fixed_tile_px(model: onnx.ModelProto) -> int | None:
             remedy="export it with 'beers-deploy export'",
         )
     return sizes[2] or None
+
+
+def any_size(model: onnx.ModelProto) -> onnx.ModelProto:
+    """A network of convolutions that is fixed to one tile, for images of any size; any other as it is."""
+    if fixed_tile_px(model) is None:
+        return model
+    free = onnx.ModelProto()
+    free.CopyFrom(model)
+    for value in (*free.graph.input, *free.graph.output):
+        for side, name in zip(value.type.tensor_type.shape.dim[2:], ("H", "W"), strict=True):
+            side.dim_param = name
+    del free.graph.value_info[:]
+    return free

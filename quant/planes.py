@@ -4,8 +4,8 @@
     quarter = remainder / 4, rounded
 
 All fit int8, and no bit is lost. Zero stays zero in all, so that the engine's zero padding means what it meant in
-the float network. The first convolution reads them: the remainder's weights are the coarse ones / 32, the quarter's are
-0. In whole numbers that leaves the remainder's weights a size of 4 at most, and rounding them errs as much as all
+the float network. The first convolution reads them: the remainder's weights are the coarse ones / 32, the quarter's
+are 0. In whole numbers that leaves the remainder's weights a size of 4 at most, and rounding them errs as much as all
 behind it; `quant.passes.fit_weights` mends them in quarters by weights of the third plane. An engine that takes 16
 channels at once computes it for nothing.
 """

@@ -9,6 +9,7 @@ import onnx
 import onnxruntime as ort
 
 from profiles.errors import ModelError
+from quant.onnx_file import any_size
 
 
 def open_session(
@@ -64,6 +65,11 @@ def has_vnni() -> bool:
         return "vnni" in Path("/proc/cpuinfo").read_text(encoding="utf-8")
     except OSError:
         return False
+
+
+def open_any_size(model: onnx.ModelProto, optimise: bool = True) -> ort.InferenceSession:
+    """A session that takes patches of any size, also of a network that is fixed to one tile."""
+    return open_session(any_size(model), optimise=optimise)
 
 
 def run(session: ort.InferenceSession, image: np.ndarray) -> np.ndarray:

@@ -46,7 +46,7 @@ def gate(
     from quant.gate import compare
     from quant.limits import judge, read_limits
     from quant.onnx_file import load_onnx, metadata
-    from quant.session import open_session
+    from quant.session import open_any_size
 
     require_writable(json, summary, junit)
     limits, before = read_limits(config, max_mae), baseline_mae(baseline)
@@ -55,7 +55,7 @@ def gate(
     if metadata(models[0]).get("precision", "").startswith("int8"):
         remedy = "give the float model first, the INT8 model second"
         raise ModelError(str(float_path), expected="a float network", got="an INT8 one", remedy=remedy)
-    sessions = open_session(models[0]), open_session(models[1])
+    sessions = open_any_size(models[0]), open_any_size(models[1])
     degraded, reference = load_sensor(sensor), load_sensor(REFERENCE)
     held_out = seed + HELD_OUT_SEED
     scenes = load_scenes(images, reference.nominal(), held_out)

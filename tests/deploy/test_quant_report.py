@@ -20,7 +20,7 @@ from deploy.restore import write_tiff
 from deploy.results import SCHEMA_PATH
 from model.convbeers import ConvBEERS, Variant, initialise
 from model.simulator.procedural import procedural_scene
-from quant.onnx_file import load_onnx, metadata, save_onnx
+from quant.onnx_file import fixed_tile_px, load_onnx, metadata, save_onnx
 from quant.planes import MAX_DN
 from quant.quantise import ALL, Passes
 from quant.spread import Spread
@@ -75,6 +75,21 @@ def test_a_pass_can_be_left_out(tmp_path: Path) -> None:
     unknown = CliRunner().invoke(app, ["quantize", str(tmp_path / "f.onnx"), "--out", str(out), "--without", "magic"])
     assert unknown.exit_code == 2
     assert "half-steps" in unknown.output
+
+
+def test_a_network_fixed_to_one_tile_is_quantised_reported_and_gated(tmp_path: Path) -> None:
+    network = ConvBEERS(Variant(1, 4))
+    initialise(network, torch.Generator().manual_seed(0))
+    paths = tmp_path / "f.onnx", tmp_path / "i.onnx"
+    save_onnx(to_onnx(network.eval(), {}, tile_px=80), paths[0])
+    options = ["--out", str(paths[1]), "--patches", "2", "--patch", "64", "--report", str(tmp_path / "r")]
+    for arguments in (
+        ["quantize", str(paths[0]), *options],
+        ["gate", *map(str, paths), "--patches", "3", "--max-mae", "1"],
+    ):
+        result = CliRunner().invoke(app, arguments)
+        assert result.exit_code == 0, result.output
+    assert fixed_tile_px(load_onnx(paths[1])) == 80
 
 
 def test_quantize_reports_layers_and_passes(tmp_path: Path) -> None:
