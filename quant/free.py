@@ -1,9 +1,9 @@
 """INT8 for boards that are not the DPU: what its rules cost shows against what goes without them.
 
-As in `quant.quantise` only the correction is computed in int8, the image enters as planes, the residual stream
-has one scale and its channels are equalised, and the correction has two gains. Gone are the DPU's rules: see
-`quant.free_file`. Float scales by themselves gain little: what rules in both is a residual stream of 8 bits. So the
-last of its tensors is computed in half steps, which int32 bias affords.
+As in `quant.quantise` only the correction is computed in int8, the image enters as planes, the residual stream has
+one scale, equalised channels and half steps at its end, weights are fitted to what they meet, and the correction has
+two gains. Gone are the DPU's rules: see `quant.free_file`. Float scales by themselves gain little: what rules in both
+is a residual stream of 8 bits.
 """
 
 from collections.abc import Callable
@@ -15,6 +15,7 @@ from quant.calibration import Patches
 from quant.free_file import Scale, free_model
 from quant.free_scales import tensor_scales
 from quant.graph import CORRECTION, Conv, Graph, correction_graph, tensors
+from quant.moments import Moments, input_moments
 from quant.onnx_file import fixed_tile_px, metadata
 from quant.passes.dual_gain import two_gains
 from quant.passes.equalise import channel_ranges, equalise, search, search_steps
@@ -50,17 +51,18 @@ def quantise_free(
         factors = search(graph, ranges, lambda tried: _error(tried, scales, targets), tick)
         graph = equalise(graph, factors)
     about = {**metadata(model), "precision": "int8 free", "calibration_sha256": patches.digest, **about}
-    return _written(graph, scales, about, fixed_tile_px(model))
+    moments = input_moments(_fine(graph), patches.degraded, tick)
+    return _written(graph, scales, about, fixed_tile_px(model), moments)
 
 
 def free_ticks(model: onnx.ModelProto, patches: int) -> int:
     """How often `quantise_free` will call `tick`."""
     graph = read_planes(correction_graph(model))
     if not stream_tensors(graph):
-        return 2 * patches
+        return 3 * patches
     first = graph[0]
     assert isinstance(first, Conv)  # noqa: S101 - correction_graph has seen to it
-    return 3 * patches + search_steps(len(first.weight))
+    return 4 * patches + search_steps(len(first.weight))
 
 
 def _scales(graph: Graph, patches: Patches, tick: Callable[[], None]) -> dict[str, Scale]:
@@ -73,12 +75,20 @@ def _scales(graph: Graph, patches: Patches, tick: Callable[[], None]) -> dict[st
     return {PLANES: Scale(2.0**-POSITION), **found}
 
 
+def _fine(graph: Graph) -> Graph:
+    return two_gains(half_steps(graph, STREAM_STEP))
+
+
 def _written(
-    graph: Graph, scales: dict[str, Scale], about: dict[str, str], tile_px: int | None = None
+    graph: Graph,
+    scales: dict[str, Scale],
+    about: dict[str, str],
+    tile_px: int | None = None,
+    moments: dict[str, Moments] | None = None,
 ) -> onnx.ModelProto:
-    stream = Scale(STREAM_STEP)
-    fine = two_gains(half_steps(graph, STREAM_STEP))
-    return free_model(fine, {name: scales.get(name, stream) for name in (PLANES, *tensors(fine))}, about, tile_px)
+    stream, fine = Scale(STREAM_STEP), _fine(graph)
+    known = {name: scales.get(name, stream) for name in (PLANES, *tensors(fine))}
+    return free_model(fine, known, about, tile_px, moments)
 
 
 def _error(graph: Graph, scales: dict[str, Scale], targets: Targets) -> float:

@@ -17,7 +17,9 @@ from onnx import helper
 from quant.free_scales import round_weight
 from quant.graph import CORRECTION, IMAGE, Add, Conv, Graph
 from quant.host_file import MICROSOFT, ZERO, _merge_gains, _split_planes, _Writer
+from quant.moments import Moments
 from quant.onnx_file import image_info, make_model
+from quant.passes.fit_weights import fit
 
 MAX_BIAS = 2.0**30
 """A channel of tiny weights keeps a scale at which its bias fits int32, beside the products."""
@@ -32,7 +34,11 @@ class Scale:
 
 
 def free_model(
-    graph: Graph, scales: Mapping[str, Scale], about: dict[str, str], tile_px: int | None = None
+    graph: Graph,
+    scales: Mapping[str, Scale],
+    about: dict[str, str],
+    tile_px: int | None = None,
+    moments: Mapping[str, Moments] | None = None,
 ) -> onnx.ModelProto:
     """The network on stock onnxruntime, (N, 1, H, W) float32 in [0, 1] to the same.
 
@@ -41,6 +47,7 @@ def free_model(
         scales: of every tensor, the planes included.
         about: metadata.
         tile_px: side of a fixed tile, or None for any size.
+        moments: of what each convolution reads, for `quant.passes.fit_weights`; None rounds to nearest.
     """
     writer = _Writer()
     _split_planes(writer)
@@ -50,7 +57,7 @@ def free_model(
             feeds += _scale(writer, scales[op.output])
             writer.node("QLinearAdd", op.output, feeds, name=op.name, domain=MICROSOFT)
         else:
-            _conv(writer, op, scales)
+            _conv(writer, op, scales, moments[op.name] if moments else None)
     both = [CORRECTION, *_scale(writer, scales[CORRECTION])]
     writer.node("DequantizeLinear", "host_back.both", both)
     _merge_gains(writer, scales[CORRECTION].unit)
@@ -62,12 +69,13 @@ def free_model(
     return make_model(whole, about, microsoft=True)
 
 
-def _conv(w: _Writer, op: Conv, scales: Mapping[str, Scale]) -> None:
+def _conv(w: _Writer, op: Conv, scales: Mapping[str, Scale], moments: Moments | None) -> None:
     weight = round_weight(op.weight, np.abs(op.bias) / (scales[op.input].unit * MAX_BIAS))
+    values, shifted = fit(op.weight, weight.values, weight.scales, moments) if moments else (weight.values, 0.0)
     products = np.float32(scales[op.input].unit) * weight.scales.astype(np.float64)
-    bias = np.rint(op.bias / products).astype(np.int32)
+    bias = np.rint((op.bias - shifted) / products).astype(np.int32)
     feeds = [op.input, *_scale(w, scales[op.input])]
-    feeds += [w.constant(f"{op.name}.weight", weight.values), w.constant(f"{op.name}.weight_scale", weight.scales)]
+    feeds += [w.constant(f"{op.name}.weight", values), w.constant(f"{op.name}.weight_scale", weight.scales)]
     feeds += [w.constant(f"{op.name}.weight_zero_point", np.zeros(len(op.weight), np.int8))]
     feeds += [*_scale(w, scales[op.output]), w.constant(f"{op.name}.bias", bias)]
     kernel, zero_point = list(op.weight.shape[2:]), scales[op.output].zero_point

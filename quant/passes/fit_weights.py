@@ -40,12 +40,25 @@ def fit_weights(graph: Graph, core: IntCore, moments: Mapping[str, Moments]) -> 
 
 
 def _fit(op: Conv, whole: IntConv, input_position: int, moments: Moments) -> IntConv:
-    wanted = op.weight.reshape(len(op.weight), -1).astype(np.float64) * 2.0**whole.weight_position
-    fitted = descend(wanted, whole.weight.reshape(wanted.shape), moments.covariance)
-    shifted = (fitted - wanted) @ moments.mean * 2.0**-whole.weight_position
+    weight, shifted = fit(op.weight, whole.weight, np.array([2.0**-whole.weight_position]), moments)
     bias, bias_position = quantise_bias(op.bias - shifted, whole.weight_position + input_position)
-    weight = fitted.astype(np.int8).reshape(whole.weight.shape)
     return replace(whole, weight=weight, bias=bias, bias_position=bias_position)
+
+
+def fit(
+    weight: np.ndarray, nearest: np.ndarray, scales: np.ndarray, moments: Moments
+) -> tuple[np.ndarray, np.ndarray]:
+    """Whole weights (O, I, kh, kw) int8, and by how much they raise the mean result of each channel (O,).
+
+    Args:
+        weight: (O, I, kh, kw), what they stand for.
+        nearest: each rounded by itself.
+        scales: (1,) or (O,), the value of 1.
+        moments: of what the convolution reads.
+    """
+    wanted = weight.reshape(len(weight), -1) / scales[:, None].astype(np.float64)
+    fitted = descend(wanted, nearest.reshape(wanted.shape), moments.covariance)
+    return fitted.astype(np.int8).reshape(weight.shape), (fitted - wanted) @ moments.mean * scales
 
 
 def descend(wanted: np.ndarray, nearest: np.ndarray, covariance: np.ndarray) -> np.ndarray:
