@@ -1,19 +1,23 @@
 """The swath engine beside the bare runtime on the same tiles in memory, and the memory of whole swaths.
 
     python benchmarks/swath.py [--size 3000x2000] [--runtimes onnxruntime,openvino] [--swaths 13600x9016,20000x20000]
+    python benchmarks/swath.py --peers [--monai-python monai/bin/python]
 
 Random weights: speed and memory do not depend on them. Engine and bare runtime take turns in one run; the ratios are
 of their fastest times, by the clock and by the processor (with --threads 1 the latter also holds on a busy machine).
-Swaths run in a process of their own, through a network of one block.
+Swaths run in a process of their own, through a network of one block. With --peers the engine runs beside
+dask.array.map_overlap, and beside MONAI where its Python is given, from file to file: times in turns, and how far
+their pixels lie from the engine's, which are the whole image's.
 """
 
 import argparse
 import json
+import os
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -42,6 +46,8 @@ def main() -> None:
     parser.add_argument("--variants", default="convbeers-xs,convbeers-s")
     parser.add_argument("--int8", type=Path, help="an INT8 network to time as well")
     parser.add_argument("--swaths", default="")
+    parser.add_argument("--peers", action="store_true", help="beside dask.array.map_overlap, and MONAI where given")
+    parser.add_argument("--monai-python", help="interpreter of the environment that MONAI is installed in")
     parser.add_argument("--known-rows", type=int, help="rows of the swaths that hold pixels; below them is nodata")
     parser.add_argument("--threads", type=int, default=0)
     parser.add_argument("--repeats", type=int, default=3)
@@ -52,7 +58,11 @@ def main() -> None:
         for path in networks + ([arguments.int8] if arguments.int8 else []):
             for runtime in arguments.runtimes.split(","):
                 options = Options(path, TILE_PX, runtime=Runtime(runtime), threads=arguments.threads)
-                speed(folder, options, parse_size(arguments.size), arguments.repeats)
+                size, repeats = parse_size(arguments.size), arguments.repeats
+                if arguments.peers or arguments.monai_python:
+                    beside_peers(folder, options, size, repeats, arguments.monai_python)
+                else:
+                    speed(folder, options, size, repeats)
         for size in filter(None, arguments.swaths.split(",")):
             memory(folder, random_network(folder, "one-block", Variant(1, 8)), parse_size(size), arguments.known_rows)
 
@@ -60,8 +70,7 @@ def main() -> None:
 def speed(folder: Path, options: Options, size: tuple[int, int], repeats: int) -> None:
     """Engine from file to file over the bare runtime on the same windows, already float32 in memory."""
     image = folder / "image.tif"
-    dn = np.random.default_rng(0).integers(100, 3000, size[::-1]).astype(np.uint16)
-    tifffile.imwrite(image, dn, tile=(256, 256), compression="zlib")
+    dn = write_noise(image, size)
     network = onnx.load(options.model)
     tiles = plan_tiles(*dn.shape, TILE_PX, receptive_radius_px(network))
     windows = [np.ascontiguousarray(tile.read(dn), np.float32)[None, None] / np.float32(4095) for tile in tiles]
@@ -83,14 +92,45 @@ def speed(folder: Path, options: Options, size: tuple[int, int], repeats: int) -
     )
 
 
-def fastest(works: list[Callable[[], None]], repeats: int) -> np.ndarray:
-    """The fastest (clock, processor) times of each in s, taking turns; the first turn is not counted."""
+def beside_peers(
+    folder: Path, options: Options, size: tuple[int, int], repeats: int, monai_python: str | None
+) -> None:
+    """Engine and peers from file to file; peers run on onnxruntime or OpenVINO here, MONAI on onnxruntime."""
+    from swath_peers import Task, difference_dn, ways
+
+    image = folder / "image.tif"
+    dn = write_noise(image, size)
+    task = Task(image, options, options.threads or os.cpu_count() or 1)
+    with ways(task, monai_python) as runs:
+        times_s = fastest(list(runs.values()), repeats)
+    for name, (clock_s, cpu_s) in zip(runs, times_s, strict=True):
+        largest, mean = difference_dn(task.out("engine"), task.out(name))
+        print(
+            f"{options.model.stem:18} {options.runtime:12} {name:24} {clock_s:.2f} s "
+            f"({dn.size / clock_s / 1e6:.3f} Mpx/s); over the engine {clock_s / times_s[0, 0]:.2f} by the clock, "
+            f"{cpu_s / times_s[0, 1]:.2f} by the processor; off by {largest:.0f} DN at most, {mean:.4f} on average",
+            flush=True,
+        )
+
+
+def write_noise(path: Path, size: tuple[int, int]) -> np.ndarray:
+    """A noisy image of width x height, in packed tiles; returns its pixels."""
+    dn = np.random.default_rng(0).integers(100, 3000, size[::-1]).astype(np.uint16)
+    tifffile.imwrite(path, dn, tile=(256, 256), compression="zlib")
+    return dn
+
+
+def fastest(works: Sequence[Callable[[], float | None]], repeats: int) -> np.ndarray:
+    """The fastest (clock, processor) times of each in s, taking turns; the first turn is not counted.
+
+    A work returns what another process took of the processor, if one did.
+    """
     times_s = np.zeros((repeats + 1, len(works), 2))
     for turn in times_s:
         for k, work in enumerate(works):
             before = time.perf_counter(), time.process_time()
-            work()
-            turn[k] = time.perf_counter() - before[0], time.process_time() - before[1]
+            elsewhere_s = work() or 0.0
+            turn[k] = time.perf_counter() - before[0], time.process_time() - before[1] + elsewhere_s
     return np.asarray(times_s[1:].min(axis=0))
 
 

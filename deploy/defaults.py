@@ -6,28 +6,20 @@ import numpy as np
 import onnx
 
 from deploy.export import to_onnx
+from deploy.shipped import VARIANT as VARIANT
+from deploy.shipped import default_float_weights as default_float_weights
+from deploy.shipped import default_int8 as default_int8
 from model.images import list_images
 from model.simulator.procedural import procedural_scene
 from model.simulator.scene import Scene, read_scene
-from model.weights_file import SHIPPED, load_network, shipped_weights
+from model.weights_file import load_network
 from profiles.sensor import Sensor
 from quant.onnx_file import load_onnx
 
-VARIANT = "convbeers-s"
 SCENES = 3
 SCENE_SIDE_PX = 2400
 HELD_OUT_SEED = 1000
 """Added to a run's seed where patches must be others than calibration's."""
-
-
-def default_float_weights() -> Path:
-    """The shipped float weights (safetensors)."""
-    return shipped_weights(VARIANT)
-
-
-def default_int8() -> Path:
-    """The shipped INT8 network (ONNX, host spelling)."""
-    return SHIPPED / f"{VARIANT}-int8.onnx"
 
 
 def float_model(path: Path | None) -> onnx.ModelProto:

@@ -1,6 +1,6 @@
 """Restore an image in memory tile by tile; deploy.swath does it for files of any size."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from functools import partial
 from pathlib import Path
 
@@ -9,7 +9,7 @@ import onnx
 import onnxruntime as ort
 import tifffile
 
-from deploy.tiling import plan_tiles
+from deploy.tiling import Tile, plan_tiles
 from model.files import whole_file
 from model.images import read_pixels
 from profiles.errors import ImageError, OptionError
@@ -53,10 +53,24 @@ def restore_image(
     tick: Callable[[], None] = lambda: None,
 ) -> np.ndarray:
     """Restore (H, W) digital numbers to (H, W) uint16 in 0..4095, in memory; `tick` is called once a tile."""
-    result = np.empty(dn.shape, np.uint16)
+    return restore_with(partial(run, session), dn, tile_px, halo_px, tick)
+
+
+def restore_with(
+    infer: Infer, dn: np.ndarray, tile_px: int, halo_px: int, tick: Callable[[], None] = lambda: None
+) -> np.ndarray:
+    """As `restore_image`, with any network ready to run."""
     height, width = dn.shape
-    for tile in plan_tiles(height, width, tile_px, halo_px):
-        tile.write(np.rint(restore_window(tile.read(dn), partial(run, session))), result)
+    return restore_tiles(dn, infer, plan_tiles(height, width, tile_px, halo_px), tick)
+
+
+def restore_tiles(
+    dn: np.ndarray, infer: Infer, tiles: Iterable[Tile], tick: Callable[[], None] = lambda: None
+) -> np.ndarray:
+    """As `restore_with`, with any tiles that cover the image."""
+    result = np.empty(dn.shape, np.uint16)
+    for tile in tiles:
+        tile.write(np.rint(restore_window(tile.read(dn), infer)), result)
         tick()
     return result
 

@@ -12,9 +12,10 @@ from torch import Tensor
 
 from model.convbeers import VARIANTS, ConvBEERS, Variant
 from model.files import whole_file
+from model.shipped import SHIPPED as SHIPPED
+from model.shipped import shipped_names as shipped_names
+from model.shipped import shipped_weights as shipped_weights
 from profiles.errors import ModelError, OptionError
-
-SHIPPED = Path(__file__).parent / "weights"
 
 
 def variant_named(name: str) -> Variant:
@@ -28,24 +29,6 @@ def variant_named(name: str) -> Variant:
             "variant", expected=f"one of {', '.join(VARIANTS)}", got=repr(name), remedy="choose one of them"
         )
     return VARIANTS[name]
-
-
-def shipped_names() -> list[str]:
-    """The names of the shipped float weights: a variant, or a variant fine-tuned for a sensor."""
-    return sorted(path.stem for path in SHIPPED.glob("*.safetensors"))
-
-
-def shipped_weights(name: str) -> Path:
-    """The shipped weights of that name.
-
-    Raises:
-        ModelError: none are shipped.
-    """
-    if name not in shipped_names():
-        remedy = "train them with 'beers-deploy train' and pass --checkpoint"
-        expected = f"shipped weights ({', '.join(shipped_names())})"
-        raise ModelError(f"weights {name}", expected=expected, got="none", remedy=remedy)
-    return SHIPPED / f"{name}.safetensors"
 
 
 def write_tensors(path: Path, tensors: Mapping[str, Tensor], header: Mapping[str, object]) -> None:

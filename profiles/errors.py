@@ -10,6 +10,8 @@ BeersError              one sentence, no traceback, exit code 2
 A gate that fails is no error: its command exits with 1.
 """
 
+from functools import partial
+
 
 class BeersError(Exception):
     """Bad input: what was expected, what was got, and what to do about it.
@@ -24,6 +26,10 @@ class BeersError(Exception):
     def __init__(self, where: str, *, expected: str, got: str, remedy: str) -> None:
         super().__init__(f"{where}: expected {expected}, got {got}; {remedy}.")
         self.where, self.expected, self.got, self.remedy = where, expected, got, remedy
+
+    def __reduce__(self) -> tuple[object, ...]:
+        """How it comes back from a worker process: an exception's own way knows no keywords."""
+        return partial(type(self), expected=self.expected, got=self.got, remedy=self.remedy), (self.where,)
 
 
 class ProfileError(BeersError):

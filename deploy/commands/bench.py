@@ -47,9 +47,9 @@ def bench(
 ) -> None:
     """Compare a network on the DPU with the traditional pipeline on this CPU and with the paper's figures."""
     from deploy.bench_sweep import parse_tiles
-    from deploy.defaults import default_int8
     from deploy.measure import host_rows
     from deploy.results import Document, by_table
+    from deploy.shipped import default_int8
     from deploy.tables import print_rows
     from model.files import require_writable
     from profiles import load_target

@@ -32,9 +32,9 @@ def check(
     json: Annotated[Path | None, typer.Option(help="Write the findings here.")] = None,
 ) -> None:
     """Place every node of a network on the host, the DPU or the CPU; exit code 1 if the DPU cannot run its part."""
-    from deploy.defaults import default_int8
     from deploy.dpu.board import load_dpu
     from deploy.dpu.picture import require_picture
+    from deploy.shipped import default_int8
     from model.files import require_writable
 
     require_picture(picture)

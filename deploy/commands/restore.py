@@ -20,9 +20,18 @@ def restore(
     halo: Annotated[str, typer.Option(help="Context around a tile: 'exact' (no seams) or pixels.")] = "exact",
     full_scale: Annotated[float, typer.Option(help="The digital number that is the network's 1.0.")] = FULL_SCALE_DN,
     runtime: Annotated[Runtime, typer.Option(help="What runs the network.")] = Runtime.onnxruntime,
-    threads: Annotated[int, typer.Option(min=0, help="Threads; 0 takes every core.")] = 0,
+    threads: Annotated[int, typer.Option(min=0, help="Threads; 0 takes every core, or what falls to a worker.")] = 0,
     compression: Annotated[Compression, typer.Option(help="Of the output, lossless.")] = Compression.zlib,
-    memory: Annotated[float | None, typer.Option(min=0, help="Budget in GB; what is free if none.")] = None,
+    memory: Annotated[
+        float | None,
+        typer.Option(min=0, help="Budget in GB, --workers included; of a scheduler's, each. What is free if none."),
+    ] = None,
+    workers: Annotated[
+        int, typer.Option(min=0, help="Processes of this machine that restore, by Dask; 0: none but this one.")
+    ] = 0,
+    scheduler: Annotated[
+        str | None, typer.Option(help="Dask scheduler whose workers restore, such as tcp://host:8786.")
+    ] = None,
     resume: Annotated[bool, typer.Option("--resume", help="Go on with a run that was stopped or killed.")] = False,
     json: Annotated[Path | None, typer.Option(help="Write the figures here.")] = None,
 ) -> None:
@@ -30,15 +39,17 @@ def restore(
 
     The image is read and written by rows, so memory does not grow with its height. Bands are restored one by one.
     Georeference, RPCs and missing pixels (NaN, or the nodata value) are kept. Until OUT is finished its rows lie in
-    .OUT.part beside it.
+    .OUT.part beside it. Workers change no pixel: where they are of one processor and the same versions, the bytes are
+    those of one process. Those of a scheduler must find IN under its path; only this process writes.
     """
     from deploy.results import Document
+    from deploy.shipped import default_int8
     from deploy.swath.run import restore_file
     from deploy.tables import print_rows
     from model.files import require_writable
 
     require_writable(json)
-    path = model or _shipped()
+    path = model or default_int8()
     options = Options(
         path,
         tile,
@@ -49,14 +60,11 @@ def restore(
         compression,
         int(memory * 1e9) if memory else None,
         resume,
+        workers,
+        scheduler,
     )
     row = restore_file(image, out, options, typer.echo)
     print_rows(f"wrote {out}", [row])
     arguments = {"tile": tile, "halo": halo, "full_scale": full_scale, "runtime": runtime, "threads": threads}
+    arguments |= {"workers": workers, "scheduler": scheduler}
     Document("restore", arguments, (path, image), (row,)).write(json)
-
-
-def _shipped() -> Path:
-    from deploy.defaults import default_int8  # brings torch along: only where it is needed
-
-    return default_int8()

@@ -56,20 +56,29 @@ def simulate(
     ] = False,
     tolerance: Annotated[float, typer.Option(min=0, help="DN by which skipping may change a pixel.")] = 0.25,
     workers: Annotated[int, typer.Option(min=0, help="Processes; 0 takes every core.")] = 0,
+    scheduler: Annotated[
+        str | None, typer.Option(help="Dask scheduler whose workers simulate, such as tcp://host:8786.")
+    ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Seed of every random draw.")] = 0,
     resume: Annotated[bool, typer.Option("--resume", help="Go on with an unfinished dataset.")] = False,
 ) -> None:
-    """Write degraded/NAME.tif and reference/NAME.tif for each scene or patch; the same bytes for the same seed."""
+    """Write degraded/NAME.tif and reference/NAME.tif for each scene or patch; the same bytes for the same seed.
+
+    The workers of a scheduler must find the scenes under their paths; only this process writes.
+    """
     import math
     import os
 
-    from deploy.dataset import DatasetRecipe, plan_windows, write_dataset
+    from deploy.cluster import check_choice
+    from deploy.dataset import write_dataset
+    from deploy.dataset_patches import DatasetRecipe, plan_windows
     from deploy.progress import steps
     from model.files import require_writable
     from profiles import load_sensor
     from profiles.errors import OptionError
     from profiles.scene_call import calling_for, load_scene_call
 
+    check_choice(workers, scheduler)
     chosen = _preset(preset)
     call = load_scene_call(scene) if scene else None
     degraded = calling_for(load_sensor(sensor or chosen.sensor), call, add or (), forbid or ())
@@ -96,7 +105,7 @@ def simulate(
         return
     require_writable(out / "manifest.jsonl")
     with steps("simulating", len(plan_windows(recipe))) as bar:
-        summary = write_dataset(recipe, out, workers or os.cpu_count() or 1, resume, bar.advance)
+        summary = write_dataset(recipe, out, workers or os.cpu_count() or 1, resume, bar.advance, scheduler)
     rejected = f"; {summary['rejected_share']:.1%} of the drawn SNR pairs were impossible and drawn again"
     typer.echo(f"wrote {summary['patches']:.0f} pairs to {out}" + (rejected if summary["rejected_share"] else ""))
 
@@ -113,7 +122,7 @@ def _preset(name: str | None) -> Preset:
 
 def _explain(recipe: object) -> None:
     """The plan of the first draw of the degraded sensor, for every scene."""
-    from deploy.dataset import DatasetRecipe, load
+    from deploy.dataset_patches import DatasetRecipe, load
     from model.simulator.acquire import prepare_scene
     from model.simulator.draws import Draw
     from model.simulator.plan import make_plan

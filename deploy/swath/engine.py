@@ -1,149 +1,36 @@
 """Row of tiles by row of tiles: one is read ahead and one written behind while the network works on a third."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Generator, Iterable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
 
 import numpy as np
 
-from deploy.restore import Infer, restore_window
-from deploy.swath.missing import fill_missing
 from deploy.swath.plan import Plan
-from deploy.swath.raster import Raster
 from deploy.swath.reader import Source
+from deploy.swath.restorer import Band, Restorer
 from deploy.tiling import Span
-from profiles.errors import ImageError
 
+Restored = tuple[Span, np.ndarray, int]
+"""A row of tiles, its kept rows (bands, rows, width), and how many of their pixels are known."""
 Sink = Callable[[Span, np.ndarray, int], None]
-"""Takes the kept rows of a row of tiles, (bands, rows, width), and how many of its pixels are known."""
-
-
-@dataclass(frozen=True)
-class Band:
-    """Rows of an image from `top` on: (bands, rows, width) as stored, and which are missing (None: none is)."""
-
-    top: int
-    pixels: np.ndarray
-    missing: np.ndarray | None
-
-
-@dataclass(frozen=True)
-class Restorer:
-    """What turns a window into restored pixels.
-
-    Attributes:
-        raster: the image's facts.
-        infer: the network.
-        full_scale: the digital number that is 1.0 to the network.
-        radius_px: the network's receptive radius; missing pixels are filled from no farther away, so what lies
-            beyond, filled or not, is nothing that a known pixel sees.
-        name: of the image, for messages.
-    """
-
-    raster: Raster
-    infer: Infer
-    full_scale: float
-    radius_px: int
-    name: str = "image"
-
-    def read(self, source: Source, start: int, stop: int) -> Band:
-        """The rows that a row of tiles needs.
-
-        Raises:
-            ImageError: unreadable rows, or values outside 0 to full scale.
-        """
-        margin = self.radius_px if self.raster.may_miss else 0
-        start, stop = max(start - margin, 0), min(stop + margin, self.raster.height_px)
-        pixels = source.read(start, stop)
-        missing = self.raster.missing(pixels) if self.raster.may_miss else None
-        band = Band(start, pixels, missing if missing is not None and missing.any() else None)
-        self._check(band)
-        return band
-
-    def kept(self, band: Band, plane: int, rows: Span, columns: Span) -> tuple[np.ndarray, int]:
-        """The kept pixels of one tile as they are stored, and how many of them are known."""
-        keep = (
-            plane,
-            slice(rows.keep_start - band.top, rows.keep_stop - band.top),
-            slice(columns.keep_start, columns.keep_stop),
-        )
-        stored = band.pixels[keep].astype(self.raster.out_dtype)
-        missing = None if band.missing is None else band.missing[keep]
-        if missing is not None and missing.all():
-            return stored, 0
-        window = restore_window(self._window(band, plane, rows, columns), self.infer, self.full_scale)
-        inner = window[_within(rows), _within(columns)]
-        result = self._as_stored(inner)
-        if missing is None:
-            return result, result.size
-        return np.where(missing, stored, result), int((~missing).sum())
-
-    def _window(self, band: Band, plane: int, rows: Span, columns: Span) -> np.ndarray:
-        """What the network sees of a tile, missing pixels filled."""
-        if band.missing is None:
-            return band.pixels[plane, rows.start - band.top : rows.stop - band.top, columns.start : columns.stop]
-        left, right = max(columns.start - self.radius_px, 0), columns.stop + self.radius_px
-        top, bottom = max(rows.start - self.radius_px, 0) - band.top, rows.stop + self.radius_px - band.top
-        around = (plane, slice(top, bottom), slice(left, right))
-        filled = fill_missing(band.pixels[around], band.missing[around], self.radius_px)
-        above, aside = rows.start - band.top - top, columns.start - left
-        return filled[above : above + rows.stop - rows.start, aside : aside + columns.stop - columns.start]
-
-    def _as_stored(self, restored: np.ndarray) -> np.ndarray:
-        """Rounded where the output holds integers; never the nodata value, which would read as missing."""
-        result = np.rint(restored) if self.raster.out_dtype.kind == "u" else restored
-        result = result.astype(self.raster.out_dtype)
-        nodata = self.raster.nodata
-        if nodata is not None and 0 <= nodata <= self.full_scale:
-            result[result == result.dtype.type(nodata)] = self._beside(nodata)
-        return result
-
-    def _beside(self, nodata: float) -> float:
-        if self.raster.out_dtype.kind == "u":
-            return nodata + 1 if nodata + 1 <= self.full_scale else nodata - 1
-        towards = self.full_scale if nodata < self.full_scale else 0
-        return float(np.nextafter(np.float32(nodata), np.float32(towards)))
-
-    def _check(self, band: Band) -> None:
-        known = True if band.missing is None else ~band.missing
-        low, high = (float(extreme(band.pixels, where=known, initial=0)) for extreme in (np.min, np.max))
-        if low < 0 or high > self.full_scale:
-            raise ImageError(
-                f"{self.name}, rows {band.top} to {band.top + band.pixels.shape[1] - 1}",
-                expected=f"digital numbers of 0 to {self.full_scale:g}",
-                got=f"values from {low:g} to {high:g}",
-                remedy="give the sensor's highest number as --full-scale, or mark missing pixels as nodata",
-            )
 
 
 def restore_rows(
-    source: Source, plan: Plan, restorer: Restorer, sink: Sink, done_rows: int, tick: Callable[[], None]
-) -> None:
-    """Restore the rows from `done_rows` on into `sink`; `tick` is called once a tile.
-
-    Reading and writing have a thread each; never more than one band waits on either side.
-    """
-    rows = [row for row in plan.rows if row.keep_start >= done_rows]
-    if not rows:
-        return
-    with ThreadPoolExecutor(1) as ahead, ThreadPoolExecutor(1) as behind:
-        reading = ahead.submit(restorer.read, source, rows[0].start, rows[0].stop)
-        writing: Future[None] | None = None
+    source: Source, plan: Plan, restorer: Restorer, rows: Sequence[Span], tick: Callable[[], None]
+) -> Generator[Restored, None, None]:
+    """Restore rows of tiles, each read while the one before is in work; `tick` is called once a tile."""
+    with ThreadPoolExecutor(1) as ahead:
+        coming = [ahead.submit(restorer.read, source, row.start, row.stop) for row in rows[:1]]
         for k, row in enumerate(rows):
-            band = reading.result()
-            if k + 1 < len(rows):
-                reading = ahead.submit(restorer.read, source, rows[k + 1].start, rows[k + 1].stop)
-            restored, known = _restore_row(band, row, plan, restorer, tick)
-            if writing is not None:
-                writing.result()
-            writing = behind.submit(sink, row, restored, known)
-        if writing is not None:
-            writing.result()
+            band = coming.pop().result()
+            coming += [ahead.submit(restorer.read, source, nxt.start, nxt.stop) for nxt in rows[k + 1 : k + 2]]
+            yield row, *restore_row(band, row, plan, restorer, tick)
 
 
-def _restore_row(
+def restore_row(
     band: Band, row: Span, plan: Plan, restorer: Restorer, tick: Callable[[], None]
 ) -> tuple[np.ndarray, int]:
+    """The kept pixels of one row of tiles, (bands, rows, width), and how many of them are known."""
     shape = (plan.bands, row.keep_stop - row.keep_start, plan.width_px)
     result, known = np.empty(shape, restorer.raster.out_dtype), 0
     for plane in range(plan.bands):
@@ -155,5 +42,13 @@ def _restore_row(
     return result, known
 
 
-def _within(span: Span) -> slice:
-    return slice(span.keep_start - span.start, span.keep_stop - span.start)
+def write_behind(restored: Iterable[Restored], sink: Sink) -> None:
+    """Hand rows over to `sink`, each while the next is made; never more than one waits."""
+    with ThreadPoolExecutor(1) as behind:
+        writing: Future[None] | None = None
+        for row in restored:
+            if writing is not None:
+                writing.result()
+            writing = behind.submit(sink, *row)
+        if writing is not None:
+            writing.result()

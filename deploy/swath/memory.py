@@ -1,16 +1,83 @@
-"""The most memory this process ever held."""
+"""What a run takes of memory: what the process held at most, and whether what is to come fits in the budget."""
 
 import sys
+from contextlib import suppress
+from pathlib import Path
+
+import psutil
 
 from deploy.results import Figure, measured, unavailable
+from deploy.swath.plan import Plan
+from deploy.swath.reader import Source
+from profiles.errors import MachineError
 
 
 def peak_memory() -> Figure:
     """Peak resident memory in GB; unavailable where the system keeps no such count."""
     try:
-        import resource
+        peak = _peak_bytes()
     except ImportError:
         return unavailable("GB", "this system counts no peak memory")
-    unit_bytes = 1 if sys.platform == "darwin" else 1024
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit_bytes
     return measured(peak / 1e9, "GB", "resident memory of this process, highest since it began")
+
+
+def _peak_bytes() -> int:
+    """Linux's own count where there is one: getrusage's begins with what the process's parent held."""
+    with suppress(OSError, StopIteration):
+        lines = Path("/proc/self/status").read_text(encoding="utf-8").splitlines()
+        return 1024 * int(next(line for line in lines if line.startswith("VmHWM")).split()[1])
+    import resource
+
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak if sys.platform == "darwin" else 1024 * peak
+
+
+def rows_bytes(source: Source, plan: Plan, begun: bool = False) -> int:
+    """Memory that rows of the image will take beyond what is held now.
+
+    Two bands as read and two as restored: one in work and one on its way, on either side; and what the source holds.
+    Once the run has `begun`, the first band and the source's share are there already. Where pixels may be missing,
+    each has a flag, and one more while flags are made.
+    """
+    raster = source.raster
+    row_px = raster.bands * raster.width_px
+    read = plan.band_rows_px * row_px * (raster.dtype.itemsize + raster.may_miss)
+    flags = plan.band_rows_px * row_px * raster.may_miss
+    held = 0 if begun else read + source.held_bytes(plan.band_rows_px)
+    return read + flags + 2 * restored_bytes(source, plan) + held
+
+
+def restored_bytes(source: Source, plan: Plan) -> int:
+    """Memory of one row of tiles as it is stored."""
+    raster = source.raster
+    return min(plan.tile_px, plan.height_px) * raster.bands * raster.width_px * raster.out_dtype.itemsize
+
+
+def check_memory(rows: int, budget_bytes: int | None, bulky: bool, share: int = 1) -> int:
+    """The process's peak memory in bytes: what it holds now, and the rows to come.
+
+    Args:
+        rows: bytes that rows of the image will take.
+        budget_bytes: None allows what is free.
+        bulky: most of them for the sake of an image in large strips.
+        share: how many processes share the budget.
+
+    Raises:
+        MachineError: it does not fit.
+    """
+    held = psutil.Process().memory_info().rss
+    allowed = budget_bytes // share if budget_bytes else psutil.virtual_memory().available // share + held
+    if held + rows <= allowed:
+        return held + rows
+    remedy = "rewrite the image in tiles (gdal_translate -co TILED=YES)" if bulky else "take a smaller --tile"
+    raise MachineError(
+        "--memory" + (f", one of {share} processes" if share > 1 else ""),
+        expected=f"a run within {allowed / 1e9:.2f} GB",
+        got=f"{held / 1e9:.2f} GB before and {rows / 1e9:.2f} GB for rows of the image",
+        remedy=f"{remedy} or give it more",
+    )
+
+
+def is_bulky(source: Source, plan: Plan) -> bool:
+    """Whether most of the memory is for the image's own strips or tiles."""
+    return source.held_bytes(1) > rows_bytes(source, plan) / 2

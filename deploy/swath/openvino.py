@@ -4,7 +4,8 @@ from collections.abc import Callable
 from functools import lru_cache
 from importlib import import_module
 from importlib.metadata import version
-from typing import Any
+from threading import get_ident
+from typing import Any, Literal
 
 import numpy as np
 import onnx
@@ -15,20 +16,24 @@ from profiles.errors import MachineError, ModelError
 LOWEST = "openvino.lowest_uint8"
 
 
-def open_openvino(model: onnx.ModelProto, threads: int) -> tuple[Callable[[np.ndarray], np.ndarray], str]:
+Precision = Literal["f32", "bf16"]
+
+
+def open_openvino(
+    model: onnx.ModelProto, threads: int, precision: Precision = "f32"
+) -> tuple[Callable[[np.ndarray], np.ndarray], str]:
     """A callable (1, 1, h, w) float32 -> (1, 1, h, w), and the runtime's name and version.
 
     Raises:
-        MachineError: OpenVINO is not installed.
+        MachineError: OpenVINO is not installed, or this processor does not compute in that precision.
         ModelError: OpenVINO refuses the model.
     """
-    try:
-        core: Any = import_module("openvino").Core()
-    except ImportError as error:
-        got, remedy = "no package openvino", "pip install 'beers-deploy[openvino]'"
-        raise MachineError("--runtime", expected="OpenVINO installed", got=got, remedy=remedy) from error
-    # float32: where the processor has bfloat16 units, OpenVINO would round to it.
-    options = {"INFERENCE_PRECISION_HINT": "f32", "PERFORMANCE_HINT": "LATENCY"}
+    core = _core()
+    if precision == "bf16" and "BF16" not in core.get_property("CPU", "OPTIMIZATION_CAPABILITIES"):
+        remedy = "run it on a processor that has them"
+        raise MachineError("bfloat16", expected="a processor with bfloat16 units", got="none", remedy=remedy)
+    # Said aloud: where the processor has bfloat16 units, OpenVINO would round to it unasked.
+    options = {"INFERENCE_PRECISION_HINT": precision, "PERFORMANCE_HINT": "LATENCY"}
     options |= {"INFERENCE_NUM_THREADS": str(threads)} if threads else {}
     content = saturating_adds(model).SerializeToString()
 
@@ -42,10 +47,22 @@ def open_openvino(model: onnx.ModelProto, threads: int) -> tuple[Callable[[np.nd
             got, remedy = " ".join(str(error).split())[:160], "use --runtime onnxruntime"
             raise ModelError("ONNX model", expected="one that OpenVINO runs", got=got, remedy=remedy) from error
 
+    @lru_cache(maxsize=64)
+    def request(shape: tuple[int, ...], _thread: int) -> Any:
+        return compiled(shape).create_infer_request()  # one serves no two threads at once
+
     def infer(image: np.ndarray) -> np.ndarray:
-        return np.asarray(compiled(image.shape)(image)[0])
+        return np.asarray(request(image.shape, get_ident()).infer([image], share_inputs=True)[0])
 
     return infer, f"openvino {version('openvino')}"
+
+
+def _core() -> Any:  # openvino.Core, an optional package
+    try:
+        return import_module("openvino").Core()
+    except ImportError as error:
+        got, remedy = "no package openvino", "pip install 'beers-deploy[openvino]'"
+        raise MachineError("--runtime", expected="OpenVINO installed", got=got, remedy=remedy) from error
 
 
 def saturating_adds(model: onnx.ModelProto) -> onnx.ModelProto:

@@ -84,14 +84,23 @@ def require_numbers(path: str, dtype: np.dtype[Any] | None) -> np.dtype[Any]:
 
 
 def _nodata(path: str, page: tifffile.TiffPage, dtype: np.dtype[Any]) -> float | None:
-    """The nodata value; None without one, or with one that no pixel of this type can have."""
+    """The nodata value of a page; None without one that can be read."""
     if NODATA_TAG not in page.tags:
         return None
     try:
         value = float(str(page.tags[NODATA_TAG].value).strip("\x00 "))
     except ValueError:
         return None
-    if dtype.kind == "f":
+    return usable_nodata(path, value, dtype)
+
+
+def usable_nodata(path: str, value: float | None, dtype: np.dtype[Any]) -> float | None:
+    """A nodata value; None for one that no pixel of this type can have.
+
+    Raises:
+        ImageError: the output could not hold it.
+    """
+    if value is None or dtype.kind == "f":
         return value
     limits = np.iinfo(dtype)
     if not value.is_integer() or not limits.min <= value <= limits.max:

@@ -41,7 +41,7 @@ def open_source(path: Path) -> Iterator[Source]:
     """
     require_image_file(path)
     if path.suffix.lower() not in TIFF_SUFFIXES | BIG_TIFF_SUFFIXES:
-        yield WholeSource(path)
+        yield whole_source(path)
         return
     with damage_in_a_sentence(path):
         file = tifffile.TiffFile(path)
@@ -50,18 +50,23 @@ def open_source(path: Path) -> Iterator[Source]:
             series = file.series[0]
             page = series.keyframe
             one_page = page.shaped[1] == 1 and page.size == series.size
-        yield TiffSource(path, page) if one_page else WholeSource(path)
+        yield TiffSource(path, page) if one_page else whole_source(path)
 
 
-class WholeSource:
+def whole_source(path: Path) -> "ArraySource":
     """An image read whole: PNG, JPEG, and TIFFs of several pages."""
+    pixels = read_pixels(path)
+    dtype = require_numbers(str(path), pixels.dtype)
+    bands = pixels[None] if pixels.ndim == 2 else np.moveaxis(pixels, 2, 0)
+    count, height_px, width_px = bands.shape
+    return ArraySource(bands, Raster(count, height_px, width_px, dtype))
 
-    def __init__(self, path: Path) -> None:
-        pixels = read_pixels(path)
-        require_numbers(str(path), pixels.dtype)
-        self._pixels = pixels[None] if pixels.ndim == 2 else np.moveaxis(pixels, 2, 0)
-        bands, height_px, width_px = self._pixels.shape
-        self.raster = Raster(bands, height_px, width_px, self._pixels.dtype)
+
+class ArraySource:
+    """An image in memory, (bands, height, width)."""
+
+    def __init__(self, pixels: np.ndarray, raster: Raster) -> None:
+        self._pixels, self.raster = pixels, raster
 
     def read(self, start: int, stop: int) -> np.ndarray:
         """See Source."""

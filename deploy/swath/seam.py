@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from deploy.swath.engine import Restorer
 from deploy.swath.plan import Plan
 from deploy.swath.reader import Source
+from deploy.swath.restorer import Restorer
 from deploy.tiling import Span
 
 

@@ -18,6 +18,11 @@ from deploy.tiling import Span
 from profiles.errors import MachineError, OptionError
 
 
+def part_folder(out: Path) -> Path:
+    """Where a run keeps what it needs for `out`."""
+    return out.with_name(f".{out.name}.part")
+
+
 class Spool:
     """The rows of a (bands, height, width) image, finished from the top."""
 
@@ -38,7 +43,7 @@ class Spool:
             OptionError: what was left belongs to another job.
         """
         self.out, self.shape, self.dtype = out, shape, dtype
-        self.folder = out.with_name(f".{out.name}.part")
+        self.folder = part_folder(out)
         self._job = dict(job)
         self.rows, self.known = self._left() if resume else (0, 0)
         with self.disk():
@@ -73,8 +78,8 @@ class Spool:
 
     def remove(self) -> None:
         """Throw the rows away; the journal first, so that nothing is left that counts on them."""
-        (self.folder / "journal.json").unlink(missing_ok=True)
-        shutil.rmtree(self.folder, ignore_errors=True)
+        for name in ("journal.json", "journal.new", "rows.raw", "out.tif"):
+            (self.folder / name).unlink(missing_ok=True)
 
     @contextmanager
     def disk(self) -> Iterator[None]:

@@ -2,6 +2,7 @@ import json
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,8 +10,12 @@ import numpy as np
 import pytest
 import tifffile
 from PIL import Image
+from typer.testing import CliRunner
 
-from deploy.dataset import DatasetRecipe, make_patches, plan_windows, write_dataset
+from deploy.cli import app
+from deploy.cluster import local_cluster
+from deploy.dataset import CHUNK, write_dataset
+from deploy.dataset_patches import DatasetRecipe, make_patches, plan_windows
 from profiles import load_sensor
 from profiles.errors import ImageError, OptionError
 from profiles.scene_call import calling_for, load_scene_call, scene_names, typical_effects
@@ -28,6 +33,10 @@ VARIABLE, REFERENCE = load_sensor("pleiades-variable"), load_sensor("pleiades-re
 
 def small(scene: Path, patch_px: int | None = 24) -> DatasetRecipe:
     return DatasetRecipe((scene, scene), VARIABLE, REFERENCE, oversampling=2, patch_px=patch_px)
+
+
+def silent(_: int) -> None:
+    """Says nothing."""
 
 
 def bytes_of(folder: Path) -> dict[str, bytes]:
@@ -115,3 +124,55 @@ def test_effects_are_added_and_forbidden() -> None:
     assert stated.low == 0.6  # the scene's own value, not the typical one
     with pytest.raises(OptionError, match="clouds"):
         calling_for(profile, None, ["clouds"])
+
+
+@pytest.fixture(scope="module")
+def scheduler() -> Iterator[str]:
+    """The address of a scheduler with two workers."""
+    pytest.importorskip("distributed", reason="the extra 'dask' is not installed")
+    with local_cluster(2) as local:
+        yield local.scheduler_address
+
+
+def test_a_scheduler_s_workers_give_the_same_bytes(scene: Path, scheduler: str, tmp_path: Path) -> None:
+    recipe = DatasetRecipe((scene, scene), VARIABLE, REFERENCE, oversampling=2, patch_px=12)
+    assert len(plan_windows(recipe)) > 2 * CHUNK
+    write_dataset(recipe, tmp_path / "here", 1, resume=False, tick=silent)
+    done: list[int] = []
+    write_dataset(recipe, tmp_path / "there", 1, resume=False, tick=done.append, scheduler=scheduler)
+    assert bytes_of(tmp_path / "there") == bytes_of(tmp_path / "here")
+    assert sum(done) == len(plan_windows(recipe))
+
+
+def test_a_dataset_begun_here_is_finished_by_a_scheduler_s_workers(
+    scene: Path, scheduler: str, tmp_path: Path
+) -> None:
+    def stop(patches: int) -> None:
+        if patches:
+            raise KeyboardInterrupt
+
+    recipe = DatasetRecipe((scene, scene), VARIABLE, REFERENCE, oversampling=2, patch_px=12)
+    with pytest.raises(KeyboardInterrupt):
+        write_dataset(recipe, tmp_path / "d", 1, resume=False, tick=stop)
+    done: list[int] = []
+    write_dataset(recipe, tmp_path / "d", 1, resume=True, tick=done.append, scheduler=scheduler)
+    assert done[0] >= CHUNK
+    write_dataset(recipe, tmp_path / "whole", 1, resume=False, tick=silent)
+    assert bytes_of(tmp_path / "d") == bytes_of(tmp_path / "whole")
+
+
+def test_a_scene_that_a_worker_does_not_find_is_one_sentence(
+    scene: Path, scheduler: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("deploy.dataset_spread.sha256", lambda path: f"digest of another {path.name}")
+    with pytest.raises(ImageError, match=r"another file of that name.*shared folder"):
+        write_dataset(small(scene), tmp_path / "d", 1, resume=False, tick=silent, scheduler=scheduler)
+    assert not list(tmp_path.rglob("*.tif"))
+
+
+def test_workers_and_a_scheduler_do_not_go_together(scene: Path, tmp_path: Path) -> None:
+    options = ["simulate", str(scene), "--out", str(tmp_path / "d"), "--workers", "2", "--scheduler", "host:8786"]
+    result = CliRunner().invoke(app, options)
+    assert result.exit_code == 2
+    assert "leave out --workers" in result.stderr
+    assert not (tmp_path / "d").exists()

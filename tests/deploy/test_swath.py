@@ -12,10 +12,10 @@ import pytest
 import tifffile
 import torch
 
-from deploy.defaults import default_int8
 from deploy.export import to_onnx
 from deploy.restore import Infer, restore_window
 from deploy.results import Row
+from deploy.shipped import default_int8
 from deploy.swath import run as swath
 from deploy.swath.missing import fill_missing
 from deploy.swath.options import Compression, Options, Runtime
@@ -264,7 +264,7 @@ def test_a_tile_without_known_pixels_costs_no_inference(
         seen.append(window.shape)
         return restore_window(window, infer, full_scale)
 
-    monkeypatch.setattr("deploy.swath.engine.restore_window", counting)
+    monkeypatch.setattr("deploy.swath.restorer.restore_window", counting)
     pixels = noise(30, 300).astype(np.float32)
     pixels[:, 100:] = np.nan
     _, row = restore(tmp_path, pixels, Options(model, tile_px=30))

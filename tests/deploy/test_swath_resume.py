@@ -19,8 +19,8 @@ import tifffile
 import torch
 
 from deploy.export import to_onnx
-from deploy.swath.engine import Restorer
 from deploy.swath.options import Compression, Options
+from deploy.swath.restorer import Restorer
 from deploy.swath.run import restore_file
 from model.convbeers import ConvBEERS, Variant, initialise
 from profiles.errors import MachineError, OptionError

@@ -1,0 +1,114 @@
+"""For notebooks: `from deploy.library import restore`, on arrays of numpy, Dask and xarray.
+
+The pixels are those that the command `restore` writes of the same image.
+"""
+
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+
+from deploy.shipped import default_int8
+from deploy.swath.engine import restore_rows
+from deploy.swath.options import FULL_SCALE_DN, TILE_PX, Options, Runtime
+from deploy.swath.raster import Raster, require_numbers, usable_nodata
+from deploy.swath.reader import ArraySource
+from deploy.swath.restorer import Restorer
+from deploy.swath.run import plan_of
+from deploy.swath.runtime import open_runtime
+from profiles.errors import ImageError, OptionError
+from quant.onnx_file import load_onnx
+
+NAME = "image"
+Image = TypeVar("Image")
+"""numpy.ndarray, dask.array.Array or xarray.DataArray."""
+
+
+def restore(
+    image: Image,
+    model: Path | str | None = None,
+    *,
+    tile_px: int = TILE_PX,
+    halo: int | str = "exact",
+    full_scale: float = FULL_SCALE_DN,
+    runtime: str = "onnxruntime",
+    threads: int = 0,
+    nodata: float | None = None,
+) -> Image:
+    """Restore an image of raw digital numbers, (H, W) or (bands, H, W); bands are restored one by one.
+
+    Args:
+        image: of numpy it is restored at once; of Dask the result is lazy, a chunk for each tile and band, and may be
+            computed on a cluster that has this package; an xarray.DataArray keeps coordinates and attributes.
+        model: ONNX file, float or INT8; the shipped INT8 network if None.
+        tile_px: side of a tile.
+        halo: 'exact', or pixels of context around a tile.
+        full_scale: the digital number that is 1.0 to the network.
+        runtime: 'onnxruntime' or 'openvino'.
+        threads: of the runtime; 0 takes every core, or one for each of Dask's own threads.
+        nodata: the value of missing pixels, besides NaN; a DataArray's own `_FillValue` if None.
+
+    Returns:
+        The same kind and shape: uint16 of integers, float32 of floats. Missing pixels stay as they are.
+
+    Raises:
+        ImageError: no such array, or values outside 0 to full scale; of Dask when it is computed.
+        ModelError: a network that cannot be tiled or run.
+        OptionError: options that do not go together.
+        MachineError: a missing package.
+    """
+    options = Options(Path(model or default_int8()), tile_px, str(halo), full_scale, _runtime(runtime), threads)
+    if hasattr(image, "coords") and hasattr(image, "dims"):  # an xarray.DataArray, without importing it
+        labelled: Any = image
+        missing = labelled.attrs.get("_FillValue") if nodata is None else nodata
+        restored: Image = labelled.copy(data=_restore(labelled.data, options, missing))
+        return restored
+    plain: Image = _restore(image, options, nodata)
+    return plain
+
+
+def _restore(image: Any, options: Options, nodata: float | None) -> Any:
+    bands = _bands_first(image)
+    raster = _raster(bands, nodata)
+    if hasattr(image, "__dask_graph__"):
+        from deploy.library_dask import restore_lazily  # needs Dask, which such an image brought along
+
+        restored = restore_lazily(bands, raster, options)
+    else:
+        restored = _restore_now(bands, raster, options)
+    return restored.reshape(image.shape)
+
+
+def _restore_now(bands: np.ndarray, raster: Raster, options: Options) -> np.ndarray:
+    network, source = load_onnx(options.model), ArraySource(bands, raster)
+    plan = plan_of(raster, network, options)
+    infer, _ = open_runtime(options.runtime, network, options.threads)
+    restorer = Restorer(raster, infer, options.full_scale, plan.radius_px, NAME)
+    result = np.empty(raster.shape, raster.out_dtype)
+    for row, pixels, _ in restore_rows(source, plan, restorer, plan.rows, lambda: None):
+        result[:, row.keep_start : row.keep_stop] = pixels
+    return result
+
+
+def _bands_first(image: Any) -> Any:
+    shape = getattr(image, "shape", ())
+    if len(shape) not in (2, 3) or 0 in shape or any(side != side for side in shape) or np.ma.isMaskedArray(image):
+        got = "a masked array" if np.ma.isMaskedArray(image) else f"{type(image).__name__} of shape {shape}"
+        remedy = "give pixels as an array, missing ones as NaN or as nodata, sizes known"
+        raise ImageError(NAME, expected="an array (H, W) or (bands, H, W)", got=got, remedy=remedy)
+    return image if len(shape) == 3 else image[None]
+
+
+def _raster(bands: Any, nodata: float | None) -> Raster:
+    count, height_px, width_px = bands.shape
+    dtype = require_numbers(NAME, bands.dtype)
+    missing = None if nodata is None else float(nodata)
+    return Raster(count, height_px, width_px, dtype, usable_nodata(NAME, missing, dtype))
+
+
+def _runtime(name: str) -> Runtime:
+    try:
+        return Runtime(name)
+    except ValueError as error:
+        expected = " or ".join(Runtime)
+        raise OptionError("runtime", expected=expected, got=repr(name), remedy="choose one") from error

@@ -1,0 +1,17 @@
+"""The shipped networks' files, found without loading anything."""
+
+from pathlib import Path
+
+from model.shipped import SHIPPED, shipped_weights
+
+VARIANT = "convbeers-s"
+
+
+def default_float_weights() -> Path:
+    """The shipped float weights (safetensors)."""
+    return shipped_weights(VARIANT)
+
+
+def default_int8() -> Path:
+    """The shipped INT8 network (ONNX, host spelling)."""
+    return SHIPPED / f"{VARIANT}-int8.onnx"

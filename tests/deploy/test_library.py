@@ -1,0 +1,202 @@
+"""Arrays restored in a notebook: the pixels that the command writes of the same image."""
+
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import tifffile
+import torch
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from deploy.cluster import local_cluster
+from deploy.export import to_onnx
+from deploy.library import restore
+from deploy.shipped import default_int8
+from deploy.swath.options import Options
+from deploy.swath.run import restore_file
+from model.convbeers import ConvBEERS, Variant, initialise
+from profiles.errors import ImageError, ModelError, OptionError
+from quant.onnx_file import save_onnx
+
+SHAPES = [(61, 83), (17, 130), (1, 40), (29, 29), (3, 5), (3, 41, 35), (1, 50, 20)]
+
+
+@pytest.fixture(scope="module")
+def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    network = ConvBEERS(Variant(blocks=1, features=8))
+    initialise(network, torch.Generator().manual_seed(0))
+    path = tmp_path_factory.mktemp("model") / "small.onnx"
+    save_onnx(to_onnx(network, {}), path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def da() -> Any:
+    return pytest.importorskip("dask.array", reason="the extra 'dask' is not installed")
+
+
+def noise(*shape: int) -> np.ndarray:
+    return np.random.default_rng(1).integers(1, 4096, shape).astype(np.uint16)
+
+
+def of_file(folder: Path, pixels: np.ndarray, options: Options, nodata: float | None = None) -> np.ndarray:
+    """What the command makes of the same pixels."""
+    tags = [] if nodata is None else [(42113, "s", 0, f"{nodata:g}", True)]
+    planes: dict[str, Any] = {"photometric": "rgb", "planarconfig": "separate"} if pixels.shape[0] == 3 else {}
+    stored = pixels if pixels.ndim == 2 or planes else pixels[0]
+    tifffile.imwrite(folder / "in.tif", stored, extratags=tags, **(planes if pixels.ndim == 3 else {}))
+    restore_file(folder / "in.tif", folder / "out.tif", options, lambda _: None)
+    return tifffile.imread(folder / "out.tif").reshape(pixels.shape)
+
+
+@pytest.mark.parametrize("halo", ["exact", 2])
+@pytest.mark.parametrize("shape", SHAPES)
+def test_an_array_gives_the_pixels_of_the_file(
+    shape: tuple[int, ...], halo: int | str, model: Path, tmp_path: Path
+) -> None:
+    for pixels in (noise(*shape), noise(*shape).astype(np.float32)):
+        expected = of_file(tmp_path, pixels, Options(model, 23, str(halo)))
+        restored = restore(pixels, model, tile_px=23, halo=halo)
+        assert restored.dtype == expected.dtype
+        np.testing.assert_array_equal(restored, expected)
+
+
+def test_the_shipped_int8_network_is_the_default(da: Any, tmp_path: Path) -> None:
+    expected = of_file(tmp_path, noise(97, 110), Options(default_int8(), 64))
+    np.testing.assert_array_equal(restore(noise(97, 110), tile_px=64), expected)
+    lazy = restore(da.from_array(noise(97, 110), chunks=50), tile_px=64)
+    np.testing.assert_array_equal(lazy.compute(), expected)
+
+
+@pytest.mark.parametrize("kind", ["nan", "value"])
+def test_missing_pixels_stay_as_in_a_file(kind: str, da: Any, model: Path, tmp_path: Path) -> None:
+    pixels, nodata = noise(70, 90), None if kind == "nan" else 7.0
+    pixels[20:60, 30:75] = pixels[3, 5] = 7
+    pixels = np.where(pixels == 7, np.nan, pixels).astype(np.float32) if kind == "nan" else pixels
+    expected = of_file(tmp_path, pixels, Options(model, 23), nodata)
+    np.testing.assert_array_equal(restore(pixels, model, tile_px=23, nodata=nodata), expected)
+    lazy = restore(da.from_array(pixels, chunks=31), model, tile_px=23, nodata=nodata)
+    np.testing.assert_array_equal(lazy.compute(), expected)
+    np.testing.assert_array_equal(restore(pixels * np.nan, model), pixels * np.nan)
+
+
+@settings(max_examples=15, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(st.integers(1, 70), st.integers(1, 70), st.integers(1, 50), st.integers(1, 50), st.booleans())
+def test_a_dask_array_of_any_chunks_gives_the_same(
+    da: Any, model: Path, height: int, width: int, down: int, across: int, planes: bool
+) -> None:
+    pixels = noise(2, height, width) if planes else noise(height, width)
+    chunks = (1, down, across) if planes else (down, across)
+    lazy = restore(da.from_array(pixels, chunks=chunks), model, tile_px=23)
+    assert lazy.shape == pixels.shape
+    assert lazy.dtype == np.uint16
+    np.testing.assert_array_equal(lazy.compute(), restore(pixels, model, tile_px=23))
+
+
+def test_nothing_is_read_before_it_is_asked_for_and_no_more_than_that(da: Any, model: Path) -> None:
+    read: list[tuple[int, ...]] = []
+
+    def counted(block: np.ndarray, block_info: Any = None) -> np.ndarray:
+        read.append(block_info[0]["chunk-location"])
+        return block
+
+    pixels = noise(200, 200)
+    chunks = da.from_array(pixels, chunks=50).map_blocks(counted, dtype=np.uint16, meta=np.empty((0, 0), np.uint16))
+    lazy = restore(chunks, model, tile_px=40)
+    assert read == []
+    corner = lazy[:30, :30].compute(scheduler="synchronous")
+    np.testing.assert_array_equal(corner, restore(pixels, model, tile_px=40)[:30, :30])
+    assert read == [(0, 0)]
+
+
+def test_two_processes_compute_the_same(da: Any, model: Path) -> None:
+    distributed = pytest.importorskip("distributed")
+    pixels = noise(150, 120)
+    lazy = restore(da.from_array(pixels, chunks=64), model, tile_px=40)
+    with local_cluster(2) as local, distributed.Client(local) as client:
+        computed = client.compute(lazy).result()
+    np.testing.assert_array_equal(computed, restore(pixels, model, tile_px=40))
+
+
+def test_openvino_serves_dask_s_threads(da: Any, model: Path) -> None:
+    pytest.importorskip("openvino")
+    pixels = noise(150, 120)
+    lazy = restore(da.from_array(pixels, chunks=64), model, tile_px=40, runtime="openvino")
+    computed = lazy.compute(scheduler="threads", num_workers=8)
+    np.testing.assert_array_equal(computed, restore(pixels, model, tile_px=40, runtime="openvino"))
+
+
+@pytest.mark.parametrize("lazy", [False, True])
+def test_a_data_array_keeps_what_it_says(lazy: bool, da: Any, model: Path) -> None:
+    xarray = pytest.importorskip("xarray")
+    pixels = noise(1, 60, 50)
+    pixels[0, 10:20, 10:20] = 9
+    held = da.from_array(pixels, chunks=(1, 32, 32)) if lazy else pixels
+    places = {"y": np.arange(60.0), "x": np.arange(50.0), "band": [1], "spatial_ref": 0}
+    attributes = {"_FillValue": 9, "units": "DN"}
+    image = xarray.DataArray(held, dims=("band", "y", "x"), coords=places, attrs=attributes, name="scene")
+    restored = restore(image, model, tile_px=23)
+    assert hasattr(restored.data, "__dask_graph__") == lazy
+    np.testing.assert_array_equal(restored.values, restore(pixels, model, tile_px=23, nodata=9))
+    assert (restored.values[0, 10:20, 10:20] == 9).all()
+    xarray.testing.assert_identical(restored.coords.to_dataset(), image.coords.to_dataset())
+    assert (restored.attrs, restored.name, restored.dims) == (image.attrs, image.name, image.dims)
+    other = restore(image, model, tile_px=23, nodata=4000)
+    assert (other.values != restored.values).any()
+
+
+def test_values_beyond_full_scale_are_refused_at_once_or_when_computed(da: Any, model: Path) -> None:
+    pixels = noise(60, 50)
+    pixels[40, 30] = 60000
+    with pytest.raises(ImageError, match=r"60000.*--full-scale"):
+        restore(pixels, model, tile_px=23)
+    lazy = restore(da.from_array(pixels, chunks=20), model, tile_px=23)
+    np.testing.assert_array_equal(lazy[:10].compute(), restore(pixels[:30], model, tile_px=23)[:10])
+    with pytest.raises(ImageError, match=r"rows \d+ to \d+: .*60000"):
+        lazy.compute()
+
+
+@pytest.mark.parametrize(
+    "image",
+    [
+        np.ones(5, np.uint16),
+        np.ones((2, 2, 2, 2), np.uint16),
+        np.ones((0, 5), np.uint16),
+        np.ones((5, 5), bool),
+        np.ones((5, 5), complex),
+        np.ma.masked_equal(np.ones((5, 5), np.uint16), 0),
+        "image.tif",
+    ],
+)
+def test_what_is_no_image_is_refused(image: Any, model: Path) -> None:
+    with pytest.raises(ImageError, match=r"^image: expected"):
+        restore(image, model)
+
+
+def test_a_dask_array_of_unknown_size_is_refused(da: Any, model: Path) -> None:
+    known = da.from_array(noise(20, 20))
+    with pytest.raises(ImageError, match="sizes known"):
+        restore(known[known[:, 0] > 2000], model)
+
+
+def test_options_and_models_are_refused_before_anything_is_computed(da: Any, model: Path, tmp_path: Path) -> None:
+    for image in (noise(40, 40), da.from_array(noise(40, 40), chunks=20)):
+        with pytest.raises(OptionError, match="runtime: expected onnxruntime or openvino"):
+            restore(image, model, runtime="tensorrt")
+        with pytest.raises(OptionError, match="--tile"):
+            restore(image, model, tile_px=10)
+        with pytest.raises(OptionError, match="--halo"):
+            restore(image, model, halo=-1)
+        with pytest.raises(ModelError, match="no such file"):
+            restore(image, tmp_path / "none.onnx")
+
+
+def test_importing_it_brings_no_torch_no_dask_and_no_xarray() -> None:
+    names = ("torch", "dask", "distributed", "xarray", "matplotlib")
+    code = f"import sys; from deploy.library import restore; print([m for m in {names} if m in sys.modules])"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"

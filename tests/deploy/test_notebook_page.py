@@ -1,0 +1,37 @@
+"""The code of docs/notebook.md, as a reader would run it."""
+
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import tifffile
+
+from deploy.shipped import default_int8
+from deploy.swath.options import Options
+from deploy.swath.run import restore_file
+
+PAGE = Path(__file__).parents[2] / "docs" / "notebook.md"
+
+
+@pytest.mark.filterwarnings("ignore::PendingDeprecationWarning")  # between rioxarray and affine
+def test_the_page_gives_what_the_command_gives(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    rasterio = pytest.importorskip("rasterio", reason="no rasterio and no rioxarray")
+    pytest.importorskip("rioxarray", reason="no rioxarray")
+    monkeypatch.chdir(tmp_path)
+    pixels = np.random.default_rng(0).integers(1, 4096, (1, 300, 260)).astype(np.uint16)
+    pixels[:, 40:90, 50:120] = 0
+    about = {"crs": "EPSG:32631", "transform": rasterio.Affine(0.5, 0, 3e5, 0, -0.5, 4.8e6), "nodata": 0}
+    with rasterio.open("raw.tif", "w", "GTiff", 260, 300, 1, dtype="uint16", **about) as file:
+        file.write(pixels)
+    names: dict[str, Any] = {}
+    for code in re.findall(r"```python\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL):
+        exec(code, names)  # noqa: S102 - our own page
+    restore_file(Path("raw.tif"), Path("expected.tif"), Options(default_int8()), lambda _: None)
+    expected = tifffile.imread("expected.tif")
+    with rasterio.open("restored.tif") as ours, rasterio.open("expected.tif") as theirs:
+        np.testing.assert_array_equal(ours.read(1), expected)
+        assert (ours.crs, ours.transform, ours.nodata) == (theirs.crs, theirs.transform, theirs.nodata)
+    np.testing.assert_array_equal(names["corner"].values, expected[:200, :200])
+    np.testing.assert_array_equal(names["whole"][0], expected)
