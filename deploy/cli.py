@@ -26,6 +26,7 @@ from deploy.commands import (
     quantize,
     restore,
     simulate,
+    tradeoff,
     train,
 )
 from profiles.errors import BeersError
@@ -96,6 +97,7 @@ COMMANDS: dict[str, tuple[Callable[..., None], str]] = {
     "bench": (bench.bench, bench.EXAMPLE),
     "restore": (restore.restore, restore.EXAMPLE),
     "evaluate": (evaluate.evaluate, evaluate.EXAMPLE),
+    "tradeoff": (tradeoff.tradeoff, tradeoff.EXAMPLE),
     "compare": (compare.compare, compare.EXAMPLE),
 }
 for name, (function, text) in COMMANDS.items():

@@ -1,0 +1,94 @@
+"""`beers-deploy tradeoff`: what accuracy costs in time, over many operating points."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+if TYPE_CHECKING:
+    from deploy.tradeoff.study import Study
+
+EXAMPLE = "tradeoff --images aerial/ --out study/ --budget 'latency<=20s'"
+PAPER_SIZE = "13600x9016"
+SHOWN = ("PSNR", "LPIPS-squeeze", "host p50", "board latency", "board energy")
+"""Figures on the terminal; the report and the document hold all."""
+
+
+def tradeoff(
+    out: Annotated[Path, typer.Option(help="Folder for the report, tradeoff.json and the cache of measurements.")],
+    images: Annotated[
+        Path | None, typer.Option(help="Folder of held-out scenes to simulate from; drawn ones if none.")
+    ] = None,
+    sensor: Annotated[str, typer.Option(help="Profile of the degraded images.")] = "pleiades-degraded",
+    reference: Annotated[str, typer.Option(help="Profile of the reference images.")] = "pleiades-reference",
+    networks: Annotated[
+        str | None,
+        typer.Option(help="Shipped names and ONNX or safetensors files, with commas; all shipped if none."),
+    ] = None,
+    budget: Annotated[
+        str | None, typer.Option(help="What you can afford: 'latency<=20s', 'energy<=600J,host<=2'. Best PSNR wins.")
+    ] = None,
+    need: Annotated[
+        str | None, typer.Option(help="What you must reach: 'psnr>=44'. Without a budget the least latency wins.")
+    ] = None,
+    lpips: Annotated[
+        Path | None, typer.Option(help="Weights of SqueezeNet 1.1 for LPIPS-squeeze, or a folder of backbones.")
+    ] = None,
+    calibration: Annotated[
+        Path | None, typer.Option(help="Folder of scenes to make missing INT8 files on; drawn ones if none.")
+    ] = None,
+    size: Annotated[str, typer.Option(help="Size of the swath in pixels.")] = PAPER_SIZE,
+    cache: Annotated[Path | None, typer.Option(help="Folder of kept measurements; OUT/cache if none.")] = None,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of every random draw.")] = 0,
+    json: Annotated[Path | None, typer.Option(help="Write the figures here too.")] = None,
+) -> None:
+    """Measure networks, chains and peers on the same pairs, predict their runs on the board, and weigh them.
+
+    Measurements are kept: a second run, or one that was stopped, measures only what is missing. Exit code 1 where no
+    point keeps --budget and --need; the report is written all the same.
+    """
+    from deploy.commands.bench import parse_size
+    from deploy.report.tradeoff_page import write_study
+    from deploy.results import Document
+    from deploy.tradeoff.cache import Cache
+    from deploy.tradeoff.demands import parse_demands
+    from deploy.tradeoff.request import Request
+    from deploy.tradeoff.run import run_study
+    from model.files import require_writable
+    from model.weights_file import shipped_names
+
+    figures = out / "tradeoff.json"
+    require_writable(figures, json)
+    demands = [tuple(parse_demands(name, text)) for name, text in (("--budget", budget), ("--need", need))]
+    names = tuple(networks.split(",")) if networks is not None else tuple(shipped_names())
+    request = Request(
+        names, images, calibration, sensor, reference, lpips, parse_size(size), demands[0], demands[1], seed
+    )
+    result = run_study(request, Cache(cache or out / "cache"))
+    write_study(result.study, out)
+    say(result.study)
+    arguments: dict[str, object] = {"images": images, "sensor": sensor, "reference": reference, "size": size}
+    arguments |= {"networks": networks, "budget": budget, "need": need, "calibration": calibration, "seed": seed}
+    document = Document("tradeoff", arguments, request.files, result.rows)
+    for path in (figures, json):
+        document.write(path)
+    if not result.met:
+        raise typer.Exit(1)
+
+
+def say(study: "Study") -> None:
+    """The most important figures, and what they mean."""
+    from deploy.results import Row
+    from deploy.tables import print_rows
+
+    rows = [
+        Row(r.table, r.name, {key: r.figures[key] for key in SHOWN}, {"told": r.text["told"]}) for r in study.points
+    ]
+    print_rows("operating points", rows)
+    for front in study.fronts:
+        if front.y == "PSNR":
+            typer.echo(f"front of {front.y} against {front.x}: {'; '.join(front.members)}")
+            for price in front.prices:
+                typer.echo(f"  {price}")
+    for sentence in (*study.advice, study.headline):
+        typer.echo(sentence)

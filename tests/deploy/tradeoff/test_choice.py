@@ -1,0 +1,139 @@
+"""Advice: which point, why, and what it would take to do better; what is said of the paper's network."""
+
+import pytest
+
+from deploy.tradeoff.choice import choose
+from deploy.tradeoff.demands import parse_demands
+from deploy.tradeoff.findings import as_good, findings, headline, papers_point
+from deploy.tradeoff.outcome import Arena
+from deploy.tradeoff.prices import fronts
+from tests.deploy.tradeoff.arenas import Made, arena, named
+
+FAMILY = {
+    "tiny": Made(44.0, 4, 16),
+    "small": Made(45.3, 8, 32),
+    "papers": Made(45.0, 16, 64),
+    "tuned": Made(46.9, 8, 32, told="trained for the sensor"),
+}
+
+
+@pytest.fixture(scope="module")
+def family() -> Arena:
+    return arena(FAMILY)
+
+
+def latency_s(found: Arena, start: str) -> float:
+    return found.outcomes[named(found, start)].figures["board latency"].value or 0.0
+
+
+def asked(found: Arena, budget: str | None = None, need: str | None = None) -> tuple[str, str]:
+    """The name of the choice and the advice."""
+    choice = choose(found, parse_demands("--budget", budget), parse_demands("--need", need))
+    return choice.outcome.point.unit.method if choice.outcome else "", " ".join(choice.advice)
+
+
+def test_a_budget_buys_the_best_picture_and_a_need_the_least_time(family: Arena) -> None:
+    between = (latency_s(family, "tiny") + latency_s(family, "small")) / 2
+    assert asked(family, budget=f"latency<={between}s")[0] == "tiny"
+    assert asked(family, budget="latency<=1000s")[0] == "tuned"
+    assert asked(family, need="psnr>=43")[0] == "tiny"
+    assert asked(family, need="psnr>=44.5")[0] == "small"
+    assert asked(family, budget="latency<=1000s", need="psnr>=45")[0] == "tuned"
+
+
+def test_advice_says_what_doing_better_asks_for(family: Arena) -> None:
+    between = (latency_s(family, "tiny") + latency_s(family, "small")) / 2
+    words = asked(family, budget=f"latency<={between}s")[1]
+    assert "highest PSNR of the 1 points" in words
+    assert "give up board latency at most" in words
+    assert "small INT8 legal" in words or "tuned INT8 legal" in words
+    assert "No point of this study has a higher PSNR" in asked(family, budget="latency<=1000s")[1]
+    assert "No point of this study has a lower board latency" in asked(family, need="psnr>=43")[1]
+
+
+def test_an_interval_that_passes_the_limit_is_owned_up_to(family: Arena) -> None:
+    just = latency_s(family, "tiny") * 1.01
+    assert "not the whole interval" in asked(family, budget=f"latency<={just}")[1]
+    assert "not the whole interval" not in asked(family, budget="latency<=1000")[1]
+
+
+def test_where_nothing_will_do_the_nearest_is_named(family: Arena) -> None:
+    name, words = asked(family, need="psnr>=50")
+    assert not name
+    assert "nearest comes tuned" in words
+    assert "6.2 % off" in words
+    name, words = asked(family, need="lpips<=0.1")
+    assert not name
+    assert "none has every figure" in words
+
+
+def test_the_paper_is_matched_by_what_is_told_no_more(family: Arena) -> None:
+    """The network trained for the sensor is better still, and does not compare."""
+    paper = papers_point(family, lambda method: method == "papers", "C32B3")
+    assert paper is not None
+    best = as_good(family, paper)
+    assert best is not None
+    assert best.point.unit.method == "small"
+    equal, tenth = findings(family, paper)
+    assert "matched within 0.1 dB by small" in equal
+    assert "0.3 dB" in equal
+    assert "less than half the time over the whole interval" in equal
+    assert "the best is tiny" in tenth
+    assert "1 dB [" in tenth
+    assert "of PSNR less" in tenth
+    assert "small INT8 legal in tiles of 640" in headline(family, paper)
+
+
+def test_where_nothing_matches_the_paper_it_is_said() -> None:
+    worse = arena({"tiny": Made(44.8, 4, 16), "papers": Made(45.0, 16, 64)})
+    paper = papers_point(worse, lambda method: method == "papers", "C32B3")
+    equal, tenth = findings(worse, paper)
+    assert "no point told as much" in equal
+    assert "the best is tiny" in tenth
+    assert "papers" in headline(worse, paper)
+    slower = arena({"huge": Made(46.0, 32, 64), "papers": Made(45.0, 16, 64)})
+    equal, tenth = findings(slower, papers_point(slower, lambda method: method == "papers", "C32B3"))
+    assert "in less time" in equal
+    assert "there is no point; the least takes huge" in tenth
+
+
+def test_points_on_another_configuration_are_not_held_against_the_paper() -> None:
+    found = arena({"small": Made(45.3, 8, 32, configuration="C32B6"), "papers": Made(45.0, 16, 64)})
+    paper = papers_point(found, lambda method: method == "papers", "C32B3")
+    assert paper is not None
+    assert as_good(found, paper) is None
+
+
+def test_without_the_papers_network_there_is_no_finding(family: Arena) -> None:
+    assert papers_point(family, lambda _: False, "C32B3") is None
+    assert "not among the networks" in findings(family, None)[0]
+    assert "tuned" in headline(family, None)
+
+
+def test_pairs_of_images_tell_apart_what_intervals_of_means_do_not(family: Arena) -> None:
+    """Means scatter by 3 dB from site to site; on the same sites half a decibel is sure."""
+    small, papers = (named(family, name) for name in ("small", "papers"))
+    low, high = family.gain(small, papers, "PSNR")
+    assert 0 < low < 0.3 < high < 0.6
+    assert family.gain(papers, small, "PSNR") == pytest.approx((-high, -low), abs=1e-6)
+    assert family.gain(small, small, "PSNR") == (0.0, 0.0)
+
+
+def test_fronts_are_there_for_every_pair_of_figures_that_points_have(family: Arena) -> None:
+    found = fronts(family)
+    assert {(front.x, front.y) for front in found} == {
+        (x, y) for x in ("board latency", "board energy") for y in ("PSNR", "SSIM")
+    }
+    latency = next(front for front in found if (front.x, front.y) == ("board latency", "PSNR"))
+    assert [name.split()[0] for name in latency.members] == ["tiny", "tuned"]
+    assert latency.beaten[named(family, "papers")] == named(family, "tuned")
+    assert len(latency.prices) == 1
+    assert latency.prices[0].startswith("The last 2.9 dB")
+    assert "times" in latency.prices[0]
+    assert "board energy" in latency.prices[0]
+
+
+def test_a_gain_that_images_cannot_tell_is_owned_up_to() -> None:
+    found = arena({"tiny": Made(45.0, 4, 16), "small": Made(45.01, 8, 32, scatter_db=0.5)})
+    assert "cannot tell that gain from nothing" in fronts(found)[0].prices[0]
+    assert not fronts(found)[0].beaten

@@ -1,0 +1,314 @@
+"""A whole study of two tiny networks: unbroken, stopped and resumed, warm, and with something changed."""
+
+import json
+import shutil
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from typer.testing import CliRunner
+
+from deploy.cli import app
+from deploy.compare import compare, read_document
+from deploy.evaluation import targets as targets_module
+from deploy.evaluation.methods import Restore
+from deploy.results import Row
+from deploy.tradeoff import int8, lab, selection
+from deploy.tradeoff.cache import Cache
+from deploy.tradeoff.host_time import Times
+from deploy.tradeoff.request import Request
+from deploy.tradeoff.run import Result, run_study
+from model.convbeers import ConvBEERS, Variant, initialise
+from model.simulator.procedural import procedural_scene
+from model.weights_file import save_network
+from quant.onnx_file import load_onnx, save_onnx
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two networks, two scenes to judge on and one to calibrate on."""
+    folder = tmp_path_factory.mktemp("tiny")
+    for name, variant in (("narrow", Variant(1, 2)), ("wide", Variant(2, 2))):
+        network = ConvBEERS(variant)
+        initialise(network, torch.Generator().manual_seed(3))
+        save_network(folder / f"{name}.safetensors", network, {"degraded": "pleiades-degraded"})
+    for number in range(3):
+        scene = procedural_scene(300, 340, np.random.default_rng(number)).radiance.numpy()
+        place = folder / ("images" if number < 2 else "calibration") / f"site{'abc'[number]}.png"
+        place.parent.mkdir(exist_ok=True)
+        Image.fromarray(np.clip(scene, 0, 255).astype(np.uint8)).save(place)
+    return folder
+
+
+@pytest.fixture(scope="module", autouse=True)
+def small() -> Iterator[None]:
+    """Less of everything, and a clock that always says the same."""
+    with pytest.MonkeyPatch.context() as patch:
+        for module, name, value in (
+            (targets_module, "ANGLES_DEG", (5.0, 8.0)),
+            (targets_module, "REPEATS", 1),
+            (int8, "PATCHES", 2),
+            (int8, "PATCH_PX", 32),
+            (selection, "QUALITIES", ("fast",)),
+            (selection, "PEERS", ("nl-means",)),
+            (lab, "take_turns", steady),
+        ):
+            patch.setattr(module, name, value)
+        yield
+
+
+def steady(units: Sequence[Restore], tile: np.ndarray, tick: Callable[[], None]) -> list[Times]:
+    tick()
+    return [Times("one", (0.1, 0.2, 0.1), (0.1, 0.1, 0.1), tile.size) for _ in units]
+
+
+def request(folder: Path, *names: str, **more: object) -> Request:
+    files = tuple(str(folder / f"{name}.safetensors") for name in names or ("narrow", "wide"))
+    sensors = ("pleiades-degraded", "pleiades-reference")
+    options = {"lpips": None, "size_px": (1500, 1200)} | more
+    return Request(files, folder / "images", folder / "calibration", *sensors, **options)  # type: ignore[arg-type]
+
+
+@pytest.fixture(scope="module")
+def kept(folder: Path, small: None, tmp_path_factory: pytest.TempPathFactory) -> tuple[Result, Path]:  # noqa: ARG001
+    """An unbroken run, and the cache that it filled."""
+    place = tmp_path_factory.mktemp("cache")
+    return run_study(request(folder), Cache(place)), place
+
+
+def plain(rows: Sequence[Row]) -> list[tuple[object, ...]]:
+    return [(row.table, row.name, dict(row.figures), dict(row.text)) for row in rows]
+
+
+def measured_again(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """Names what is measured from here on."""
+    seen: list[str] = []
+
+    def noted(name: str, work: Callable[..., object]) -> Callable[..., object]:
+        def noting(*arguments: object) -> object:
+            seen.append(name)
+            return work(*arguments)
+
+        return noting
+
+    for name in ("measure", "measure_images", "measure_mae", "take_turns"):
+        monkeypatch.setattr(lab, name, noted(name, getattr(lab, name)))
+    return seen
+
+
+def test_every_figure_of_every_point_is_a_number_or_has_a_reason(kept: tuple[Result, Path]) -> None:
+    points = kept[0].study.points
+    assert len({row.name for row in points}) == len(points) > 20
+    for row in points:
+        assert len(row.figures) == 13
+        for key, figure in row.figures.items():
+            assert figure.unit, key
+            if figure.value is None:
+                assert figure.reason
+            else:
+                assert np.isfinite(figure.value)
+                assert figure.source
+    legal = next(row for row in points if "wide INT8 legal" in row.name)
+    assert all(figure.value is not None for key, figure in legal.figures.items() if key != "LPIPS-squeeze")
+    assert legal.text["told"] == "trained for the sensor"
+
+
+def test_accuracy_knows_no_configuration_and_seams_show(kept: tuple[Result, Path]) -> None:
+    points = [row for row in kept[0].study.points if row.text["method"] == "wide" and "legal" in row.name]
+    exact = [row.figures["PSNR"] for row in points if row.text["halo"] == "exact"]
+    assert len({figure.value for figure in exact}) == 1
+    assert {figure.mode for figure in exact} == {"measured"}
+    cut = [row.figures["PSNR"] for row in points if row.text["halo"] == "0"]
+    assert {figure.mode for figure in cut} == {"predicted"}
+    assert all(figure.value != exact[0].value for figure in cut)
+
+
+def test_a_second_run_measures_nothing_and_says_the_same(
+    folder: Path, kept: tuple[Result, Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen = measured_again(monkeypatch)
+    again = run_study(request(folder), Cache(kept[1]))
+    assert not seen
+    assert plain(again.rows) == plain(kept[0].rows)
+    assert (again.study.fronts, again.study.advice) == (kept[0].study.fronts, kept[0].study.advice)
+    for one, other in zip(again.study.crops, kept[0].study.crops, strict=True):
+        assert np.array_equal(one.dn, other.dn)
+
+
+@pytest.mark.parametrize("jobs", [2, 11])
+def test_stopped_and_resumed_it_says_the_same(
+    jobs: int, folder: Path, kept: tuple[Result, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Stopped while the next measurement was under way; INT8 files were made before, or take as long again."""
+    for made in kept[1].glob("*.onnx"):
+        shutil.copy(made, tmp_path)
+    done: list[str] = []
+    keep = Cache.keep
+
+    def stop(self: Cache, kind: str, key: object, value: object) -> None:
+        if len(done) == jobs:
+            raise KeyboardInterrupt
+        done.append(kind)
+        keep(self, kind, key, value)  # type: ignore[arg-type]
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Cache, "keep", stop)
+        with pytest.raises(KeyboardInterrupt):
+            run_study(request(folder), Cache(tmp_path))
+    seen = measured_again(monkeypatch)
+    resumed = run_study(request(folder), Cache(tmp_path))
+    assert plain(resumed.rows) == plain(kept[0].rows)
+    whole = [path for path in kept[1].glob("*.json") if not path.name.startswith("host")]
+    assert len(seen) == len(whole) + 1 - jobs  # one turn of times; nothing of what was kept is measured again
+
+
+def test_a_damaged_measurement_is_made_again_and_no_other(
+    folder: Path, kept: tuple[Result, Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    next(kept[1].glob("mae-*.json")).write_text("{")
+    seen = measured_again(monkeypatch)
+    assert plain(run_study(request(folder), Cache(kept[1])).rows) == plain(kept[0].rows)
+    assert seen == ["measure_mae"]
+
+
+def test_a_new_network_is_measured_and_the_old_ones_are_not(
+    folder: Path, kept: tuple[Result, Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (folder / "copy.safetensors").write_bytes((folder / "narrow.safetensors").read_bytes())
+    seen = measured_again(monkeypatch)
+    found = run_study(request(folder, "narrow", "copy"), Cache(kept[1]))
+    assert seen.count("measure") == 3 + (1 if has_bf16(found) else 0)
+    assert seen.count("take_turns") == 1
+    by_name = {row.name: row.figures["PSNR"].value for row in found.study.points}
+    for name, value in by_name.items():
+        if name.startswith("copy"):
+            assert value == by_name[name.replace("copy", "narrow")]
+
+
+def has_bf16(result: Result) -> bool:
+    return any(row.text["precision"] == "bf16" and row.figures["PSNR"].value for row in result.study.points)
+
+
+def test_other_images_are_measured_anew_and_times_are_not(
+    folder: Path, kept: tuple[Result, Path], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    other = tmp_path / "images"
+    other.mkdir()
+    (other / "sitea.png").write_bytes((folder / "images" / "sitea.png").read_bytes())
+    seen = measured_again(monkeypatch)
+    run_study(replace(request(folder), images=other), Cache(kept[1]))
+    assert seen.count("measure") >= 8
+    assert "take_turns" not in seen
+
+
+def test_a_units_scores_are_those_of_its_own_restoration(folder: Path, kept: tuple[Result, Path]) -> None:
+    """The legal file made on the way, measured by hand."""
+    from deploy.evaluation.methods import method_named
+    from deploy.evaluation.scores import Instruments, fidelity_db
+    from deploy.tradeoff.run import make_ground
+    from profiles import load_sensor
+
+    ground, _ = make_ground(request(folder))
+    sensors = load_sensor("pleiades-degraded").nominal(), load_sensor("pleiades-reference").nominal()
+    restore = method_named(str(folder / "wide.safetensors"), *sensors).restore
+    values = [fidelity_db(restore(p.degraded), p.reference, p.degraded) for p in ground.pairs]
+    row = next(row for row in kept[0].study.points if row.name == "wide float32")
+    assert row.figures["PSNR"].value == pytest.approx(np.mean(values))
+    assert isinstance(ground.instruments, Instruments)
+
+
+def test_crops_show_one_place_and_end_with_the_reference(kept: tuple[Result, Path]) -> None:
+    crops = kept[0].study.crops
+    assert [crops[0].point, crops[-1].point] == ["degraded", "reference"]
+    assert crops[-1].psnr_db is None
+    assert len({crop.dn.shape for crop in crops}) == 1
+    assert {crop.dn.dtype for crop in crops} == {np.dtype(np.float32)}
+    names = {row.name for row in kept[0].study.points}
+    assert {crop.point for crop in crops[1:-1]} <= names
+    assert len(crops) >= 4
+
+
+def test_an_int8_file_is_taken_as_it_is(folder: Path, kept: tuple[Result, Path], tmp_path: Path) -> None:
+    legal = next(kept[1].glob("int8-legal-*.onnx"))
+    given = tmp_path / "given.onnx"
+    save_onnx(load_onnx(legal), given)
+    found = run_study(replace(request(folder), networks=(str(given),)), Cache(kept[1]))
+    points = [row for row in found.study.points if row.text["method"] == "given"]
+    assert {row.text["precision"] for row in points} == {"INT8 legal"}
+    assert points[0].figures["float-INT8 MAE"].reason == "no float network of it at hand"
+    assert points[0].figures["board latency"].value
+
+
+def test_a_missing_library_leaves_a_point_with_its_reason(
+    folder: Path, kept: tuple[Result, Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "skimage", None)
+    monkeypatch.setitem(sys.modules, "openvino", None)
+    points = {row.name: row for row in run_study(request(folder), Cache(kept[1])).study.points}
+    for name, word in (("nl-means", "scikit-image"), ("wide bf16", "openvino")):
+        assert {figure.mode for figure in points[name].figures.values()} == {"unavailable"}
+        assert word in points[name].figures["PSNR"].reason
+    assert points["wide float32"].figures["PSNR"].value
+
+
+def command(folder: Path, kept: tuple[Result, Path], out: Path, *more: str) -> tuple[int, str]:
+    names = ",".join(str(folder / f"{name}.safetensors") for name in ("narrow", "wide"))
+    options = ["--images", folder / "images", "--calibration", folder / "calibration", "--networks", names]
+    options += ["--size", "1500x1200", "--cache", kept[1], "--out", out, *more]
+    result = CliRunner().invoke(app, ["tradeoff", *map(str, options)])
+    assert "Traceback" not in result.output
+    return result.exit_code, " ".join(result.output.split())
+
+
+def test_the_command_writes_a_report_and_a_document_that_compare_reads(
+    folder: Path, kept: tuple[Result, Path], tmp_path: Path
+) -> None:
+    code, output = command(
+        folder, kept, tmp_path / "a", "--budget", "latency<=100s", "--json", str(tmp_path / "x.json")
+    )
+    assert code == 0
+    assert "For board latency at most 100 s" in output
+    documents = [read_document(path) for path in (tmp_path / "x.json", tmp_path / "a" / "tradeoff.json")]
+    assert documents[0] == documents[1] | {"host": documents[0]["host"]}
+    found = compare(*documents)
+    assert found.both
+    assert not found.changed
+    assert any(place[0] == "points" and place[2] == "board energy" for place in (c.place for c in found.both))
+    assert list((tmp_path / "a").glob("*.html"))
+
+
+def test_a_need_that_nothing_meets_exits_1_and_writes_the_report(
+    folder: Path, kept: tuple[Result, Path], tmp_path: Path
+) -> None:
+    code, output = command(folder, kept, tmp_path / "b", "--need", "psnr>=99")
+    assert code == 1
+    assert "No point keeps PSNR at least 99 dB" in output
+    assert json.loads((tmp_path / "b" / "tradeoff.json").read_text())["command"] == "tradeoff"
+    assert list((tmp_path / "b").glob("*.html"))
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (["--budget", "speed<=3"], "one of psnr"),
+        (["--need", "psnr"], "NAME<=NUMBER"),
+        (["--size", "wide"], "WIDTHxHEIGHT"),
+        (["--networks", "nothing"], "a shipped network"),
+        (["--sensor", "nothing"], "nothing"),
+        (["--lpips", "nothing.npz"], "nothing.npz"),
+        (["--images", "nothing"], "no such folder"),
+        (["--calibration", "nothing"], "no such folder"),
+    ],
+)
+def test_bad_input_gets_one_sentence(
+    options: list[str], words: str, folder: Path, kept: tuple[Result, Path], tmp_path: Path
+) -> None:
+    code, output = command(folder, kept, tmp_path / "c", *options)
+    assert code == 2
+    assert words in output
+    assert not list((tmp_path / "c").glob("*"))
