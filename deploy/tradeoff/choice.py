@@ -1,5 +1,6 @@
 """The best point for a budget or a need, why it is, and what it would take to do better."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -8,6 +9,8 @@ from deploy.tradeoff.demands import Demand, shortfall
 from deploy.tradeoff.outcome import COSTS, Arena, Outcome
 
 QUALITY = "PSNR"
+ALIKE_DB = 0.05
+"""Within it a cheaper point is chosen where the images tell none apart."""
 
 
 @dataclass(frozen=True)
@@ -27,14 +30,29 @@ def choose(arena: Arena, budget: Sequence[Demand], need: Sequence[Demand]) -> Ch
     asked = " and ".join(map(str, demands))
     if not kept:
         return Choice(None, (_nearest(ranked or list(arena.outcomes.values()), demands, asked),))
-    best = min(kept, key=goal.of)
-    why = f"it has the {goal.words} of the {len(kept)} points that keep it"
-    sentences = [
-        f"For {asked}: {best.name} (told: {best.text['told']}), {figures_words(best, demands, goal.key)}; {why}."
-    ]
-    sentences += _doubts(best, demands)
+    best = chosen = min(kept, key=goal.of)
+    if goal.key == QUALITY:
+        paid = next((demand.key for demand in budget if demand.key in COSTS), _cost(arena))
+        chosen = min(_alike(arena, best, kept), key=lambda each: each.value(paid) or math.inf)
+    found = f"{chosen.name} (told: {chosen.text['told']}), {figures_words(chosen, demands, goal.key)}"
+    sentences = [f"For {asked}: {found}; {_why(chosen, best, goal, len(kept))}."]
+    sentences += _doubts(chosen, demands)
     sentences.append(_better(best, ranked, demands, goal))
-    return Choice(best, tuple(sentences))
+    return Choice(chosen, tuple(sentences))
+
+
+def _alike(arena: Arena, best: Outcome, kept: Sequence[Outcome]) -> list[Outcome]:
+    """Points near the best that the images cannot tell from it."""
+    least = (best.value(QUALITY) or 0.0) - ALIKE_DB
+    near = [each for each in kept if (each.value(QUALITY) or 0.0) >= least]
+    return [each for each in near if arena.gain(best.name, each.name, QUALITY)[0] <= 0]
+
+
+def _why(chosen: Outcome, best: Outcome, goal: "Goal", count: int) -> str:
+    if chosen is best:
+        return f"it has the {goal.words} of the {count} points that keep it"
+    higher = f"{best.name}, {figure_words(best.figures[goal.key])}"
+    return f"the {goal.words} of the {count} points that keep it, of {higher}, cannot be told from it, and costs more"
 
 
 def _cost(arena: Arena) -> str:
@@ -81,9 +99,11 @@ def _doubts(best: Outcome, demands: Sequence[Demand]) -> list[str]:
 
 def _better(best: Outcome, ranked: Sequence[Outcome], demands: Sequence[Demand], goal: Goal) -> str:
     """The point beyond the demands that would be better, and asks for the least."""
-    above = [each for each in ranked if goal.of(each) < goal.of(best)]
+    above = [
+        each for each in ranked if goal.of(each) < goal.of(best) and math.isfinite(shortfall(each.figures, demands))
+    ]
     if not above:
-        return f"No point of this study has a {'higher' if goal.sign < 0 else 'lower'} {goal.key}."
+        return f"No point that has the figures asked for has a {'higher' if goal.sign < 0 else 'lower'} {goal.key}."
     nearest = min(above, key=lambda each: shortfall(each.figures, demands))
     missed = [demand for demand in demands if demand.short_by(nearest.figures.get(demand.key))]
     return (
@@ -95,7 +115,7 @@ def _better(best: Outcome, ranked: Sequence[Outcome], demands: Sequence[Demand],
 def _nearest(outcomes: Sequence[Outcome], demands: Sequence[Demand], asked: str) -> str:
     nearest = min(outcomes, key=lambda each: shortfall(each.figures, demands))
     miss = shortfall(nearest.figures, demands)
-    if miss == float("inf"):
+    if math.isinf(miss):
         return f"No point keeps {asked}: none has every figure asked for."
     return (
         f"No point keeps {asked}; nearest comes {nearest.name}, with {figures_words(nearest, demands)}: "

@@ -16,6 +16,7 @@ def notes(ground: Ground, small: Sequence[str], lacks: Mapping[str, str], calibr
     found = [
         "No board was used: figures of the board are predicted, its power is an assumption that no network changes.",
         f"Pictures are judged on {len(ground.pairs)} whole images of {len(set(ground.sites))} sites.",
+        "The paper's shape is judged with the weights of that shape at hand, not with the paper's own.",
         "Points are told apart by the differences on the same images: their own intervals show how images differ.",
         f"Times on the board are told apart by their ratio, with none and all of the memory's hidden, and {spread}.",
         "Points of one network, tile and configuration are told apart on the board by their count of tiles alone.",

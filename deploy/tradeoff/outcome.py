@@ -1,5 +1,6 @@
 """A point with all that is known of it, and points held against one another."""
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
@@ -47,6 +48,11 @@ class Outcome:
         return self.point.name
 
     @property
+    def host_s(self) -> list[float]:
+        """Its times for a megapixel here, round by round."""
+        return self.host.per_megapixel(self.work_factor).tolist() if self.host else []
+
+    @property
     def row(self) -> Row:
         """For tables and documents."""
         return Row("points", self.name, self.figures, self.text)
@@ -84,11 +90,16 @@ class Arena:
         assert second.board is not None  # noqa: S101
         return (latency_ratio if key == "board latency" else energy_ratio)(first.board, second.board)
 
+    def times(self, a: str, b: str, key: str) -> float:
+        """Cost of `a` over cost of `b`, by value; on the host of the same rounds where there are such."""
+        first, second = self.outcomes[a], self.outcomes[b]
+        if key.startswith("host") and _together(first, second):
+            ratios = [w1 / w2 for w1, w2 in zip(first.host_s, second.host_s, strict=True)]
+            return float(np.median(ratios))
+        return (first.value(key) or 0.0) / (second.value(key) or math.inf)
+
     def _host_ratio(self, a: Outcome, b: Outcome) -> Interval:
-        assert a.host is not None  # noqa: S101 - only what has the figure is compared by it
-        assert b.host is not None  # noqa: S101
-        times = a.host.per_megapixel(a.work_factor), b.host.per_megapixel(b.work_factor)
-        return ratio_interval(times[0], times[1], a.host.session == b.host.session, self.seed)
+        return ratio_interval(np.asarray(a.host_s), np.asarray(b.host_s), _together(a, b), self.seed)
 
     def _values(self, name: str, key: str) -> tuple[float, ...]:
         scores = self.outcomes[name].scores
@@ -110,6 +121,11 @@ class Plane:
     def gain(self, a: str, b: str) -> Interval:
         """Quality of `a` less quality of `b`."""
         return self.arena.gain(a, b, self.y)
+
+
+def _together(a: Outcome, b: Outcome) -> bool:
+    """Whether both were timed in the same rounds."""
+    return a.host is not None and b.host is not None and a.host.session == b.host.session
 
 
 @cache

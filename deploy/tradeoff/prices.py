@@ -1,6 +1,6 @@
 """Fronts of an arena, and in words what each step along them costs."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from itertools import pairwise
 
 from deploy.results import number
@@ -32,17 +32,27 @@ def places(arena: Arena, x: str, y: str) -> list[Place]:
 
 
 def prices(arena: Arena, members: tuple[str, ...], x: str, y: str) -> tuple[str, ...]:
-    """A sentence a step from each member to the next."""
-    steps = list(pairwise(members))
-    return tuple(_price(arena, *step, x, y, last=step == steps[-1]) for step in steps)
+    """A sentence a step along a front, from cheap to dear."""
+    found = list(pairwise(apart(arena, members, x, y)))
+    return tuple(_price(arena, *step, x, y, last=step == found[-1]) for step in found)
+
+
+def apart(arena: Arena, members: Sequence[str], x: str, y: str) -> list[str]:
+    """Members that are surely better and surely dearer, each than the one before; of those as dear the best."""
+    kept = list(members[:1])
+    for name in members[1:]:
+        if arena.gain(name, kept[-1], y)[0] <= 0:
+            continue
+        if arena.ratio(name, kept[-1], x)[0] <= 1:
+            kept.pop()
+        kept.append(name)
+    return kept
 
 
 def _price(arena: Arena, cheap: str, dear: str, x: str, y: str, *, last: bool) -> str:
     times = " and ".join(times_words(arena, dear, cheap, key) for key in (x, *BESIDE[x]))
-    step = f"from {cheap} to {dear}"
-    bought = f"{'The last' if last else 'A step of'} {gain_words(arena, dear, cheap, y)}, {step}, costs {times}"
-    doubtful = arena.gain(dear, cheap, y)[0] <= 0
-    return f"{bought}{'; these images cannot tell that gain from nothing' if doubtful else ''}."
+    bought = f"{'The last' if last else 'A step of'} {gain_words(arena, dear, cheap, y)}"
+    return f"{bought}, from {cheap} to {dear}, costs {times}."
 
 
 def gain_words(arena: Arena, better: str, worse: str, key: str) -> str:
@@ -56,6 +66,5 @@ def gain_words(arena: Arena, better: str, worse: str, key: str) -> str:
 
 def times_words(arena: Arena, a: str, b: str, key: str) -> str:
     """How many times as much one point costs: "2.1 times [1.7, 2.6] the board latency"."""
-    values = [arena.outcomes[name].figures[key].value or 0.0 for name in (a, b)]
     low, high = arena.ratio(a, b, key)
-    return f"{number(values[0] / values[1], 2)} times [{number(low, 2)}, {number(high, 2)}] the {key}"
+    return f"{number(arena.times(a, b, key), 2)} times [{number(low, 2)}, {number(high, 2)}] the {key}"
