@@ -17,6 +17,7 @@ would fetch gigabytes of CUDA packages:
 import argparse
 import json
 import os
+import re
 import subprocess
 import sys
 import tempfile
@@ -133,7 +134,7 @@ def table(arguments: argparse.Namespace, folder: Path) -> Iterator[str]:
     yield "| tool | graph | MAE | std | max | std/MAE | PSNR float dB | PSNR INT8 dB | drop dB | SSIM | s | peak MB |"
     yield "|---|---|---|---|---|---|---|---|---|---|---|---|"
     for number, way in enumerate(ways(arguments.adaround_iterations)):
-        if arguments.only not in way.name:
+        if not re.search(arguments.only, way.name):
             continue
         python = sys.executable if way.script == OURS else arguments.quark_python
         graph = "rewritten" if way.rewritten or way.name.startswith("beers") else "plain"
@@ -164,7 +165,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--quark-python", help="interpreter of the environment that AMD Quark is installed in")
     parser.add_argument("--adaround-iterations", type=int, default=60, help="a layer; Quark's own default is 1000")
-    parser.add_argument("--only", default="", help="ways whose name holds this")
+    parser.add_argument("--only", default="", help="ways whose name this regular expression finds")
     parser.add_argument("--keep", type=Path, help="folder for the quantised files")
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory() as temporary:

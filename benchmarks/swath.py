@@ -28,9 +28,11 @@ import torch
 from deploy.commands.bench import parse_size
 from deploy.export import to_onnx
 from deploy.swath.options import Options, Runtime
+from deploy.swath.plan import make_plan
+from deploy.swath.raster import Raster
 from deploy.swath.run import restore_file
 from deploy.swath.runtime import open_runtime
-from deploy.tiling import plan_tiles
+from deploy.tiling import Tile
 from model.convbeers import VARIANTS, ConvBEERS, Variant, initialise
 from quant.radius import receptive_radius_px
 
@@ -68,11 +70,13 @@ def main() -> None:
 
 
 def speed(folder: Path, options: Options, size: tuple[int, int], repeats: int) -> None:
-    """Engine from file to file over the bare runtime on the same windows, already float32 in memory."""
+    """Engine from file to file over the bare runtime on the same windows, already float32 in memory, one by one."""
     image = folder / "image.tif"
     dn = write_noise(image, size)
     network = onnx.load(options.model)
-    tiles = plan_tiles(*dn.shape, TILE_PX, receptive_radius_px(network))
+    radius_px = receptive_radius_px(network)
+    plan = make_plan(Raster(1, *dn.shape, dn.dtype), TILE_PX, radius_px, radius_px)
+    tiles = [Tile(row, column) for row in plan.rows for column in plan.columns]
     windows = [np.ascontiguousarray(tile.read(dn), np.float32)[None, None] / np.float32(4095) for tile in tiles]
     infer, version = open_runtime(options.runtime, network, options.threads)
 

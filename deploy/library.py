@@ -15,7 +15,7 @@ from deploy.swath.raster import Raster, require_numbers, usable_nodata
 from deploy.swath.reader import ArraySource
 from deploy.swath.restorer import Restorer
 from deploy.swath.run import plan_of
-from deploy.swath.runtime import open_runtime
+from deploy.swath.runtime import open_runtime, tiles_at_once
 from profiles.errors import ImageError, OptionError
 from quant.onnx_file import load_onnx
 
@@ -82,10 +82,11 @@ def _restore(image: Any, options: Options, nodata: float | None) -> Any:
 def _restore_now(bands: np.ndarray, raster: Raster, options: Options) -> np.ndarray:
     network, source = load_onnx(options.model), ArraySource(bands, raster)
     plan = plan_of(raster, network, options)
-    infer, _ = open_runtime(options.runtime, network, options.threads)
+    at_once = tiles_at_once(options.threads, plan.tiles)
+    infer, _ = open_runtime(options.runtime, network, options.threads, at_once)
     restorer = Restorer(raster, infer, options.full_scale, plan.radius_px, NAME)
     result = np.empty(raster.shape, raster.out_dtype)
-    for row, pixels, _ in restore_rows(source, plan, restorer, plan.rows, lambda: None):
+    for row, pixels, _ in restore_rows(source, plan, restorer, plan.rows, lambda: None, at_once):
         result[:, row.keep_start : row.keep_stop] = pixels
     return result
 

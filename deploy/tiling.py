@@ -70,6 +70,16 @@ def plan_side(size_px: int, tile_px: int, halo_px: int) -> list[Span]:
     return list(_spans(size_px, min(tile_px, size_px), halo_px))
 
 
+def even_side_px(size_px: int, tile_px: int, halo_px: int) -> int:
+    """The shortest side that needs no more tiles than `tile_px` does: what a last tile overlaps is work done twice.
+
+    Raises:
+        OptionError: as `plan_side`.
+    """
+    count = len(plan_side(size_px, tile_px, halo_px))
+    return max(-(-(size_px + 2 * halo_px * (count - 1)) // count), 2 * halo_px + 1)
+
+
 def _spans(size_px: int, tile_px: int, halo_px: int) -> Iterator[Span]:
     done = 0
     while done < size_px:

@@ -14,8 +14,9 @@ ARITHMETIC = "arithmetic on the plan of tiles"
 def plan_sentence(plan: Plan) -> str:
     """How the image is cut."""
     bands = f", each of {plan.bands} bands by itself" if plan.bands > 1 else ""
+    rows_px, columns_px = plan.tile_shape
     return (
-        f"plan: {plan.height_px} x {plan.width_px} pixels{bands}; {plan.tiles} tiles of {plan.tile_px}, "
+        f"plan: {plan.height_px} x {plan.width_px} pixels{bands}; {plan.tiles} tiles of {rows_px} x {columns_px}, "
         f"halo {_halo(plan)}, work factor {plan.work_factor:.2f}"
     )
 

@@ -18,8 +18,8 @@ from profiles.errors import BeersError, ImageError, MachineError
 Say = Callable[[str], None]
 Tick = Callable[[int], None]
 """Told how many tiles are done since; stops the run where somebody asked to."""
-TILES_UNTIL_STEADY = 2
-"""onnxruntime plans its memory during the first run and takes it for the second; then it takes no more."""
+RUNS_UNTIL_STEADY = 2
+"""Of each tile in work at a time: then a runtime takes no more memory."""
 
 
 def rows_left(spool: Spool, plan: Plan) -> list[Span]:
@@ -28,9 +28,15 @@ def rows_left(spool: Spool, plan: Plan) -> list[Span]:
 
 
 def fill_here(
-    spool: Spool, source: Source, plan: Plan, restorer: Restorer, budget_bytes: int | None, say: Say
+    spool: Spool,
+    source: Source,
+    plan: Plan,
+    restorer: Restorer,
+    at_once: int,
+    budget_bytes: int | None,
+    say: Say,
 ) -> None:
-    """Finish the spool's rows in this process.
+    """Finish the spool's rows in this process, `at_once` tiles at a time.
 
     Raises:
         ImageError: unreadable rows, values out of range, or no known pixel at all; the rows are thrown away.
@@ -38,7 +44,7 @@ def fill_here(
         KeyboardInterrupt: stopped; finished rows stay.
     """
     rows = rows_left(spool, plan)
-    tiles, steady = count(1), min(TILES_UNTIL_STEADY, len(rows) * len(plan.columns) * plan.bands)
+    tiles, steady = count(1), min(RUNS_UNTIL_STEADY * at_once, len(rows) * len(plan.columns) * plan.bands)
     with filling(spool, plan, restorer.name, say) as tick:
 
         def done() -> None:
@@ -48,7 +54,7 @@ def fill_here(
                 say(f"memory: {peak / 1e9:.2f} GB at most (measured on the first tiles, and the rows to come)")
             tick(1)
 
-        with closing(restore_rows(source, plan, restorer, rows, done)) as restored:
+        with closing(restore_rows(source, plan, restorer, rows, done, at_once)) as restored:
             write_behind(restored, spool.append)
 
 

@@ -35,22 +35,22 @@ def _peak_bytes() -> int:
 def rows_bytes(source: Source, plan: Plan, begun: bool = False) -> int:
     """Memory that rows of the image will take beyond what is held now.
 
-    Two bands as read and two as restored: one in work and one on its way, on either side; and what the source holds.
-    Once the run has `begun`, the first band and the source's share are there already. Where pixels may be missing,
-    each has a flag, and one more while flags are made.
+    Three bands as read and three as restored: two in work and one on its way, on either side; and what the source
+    holds. Once the run has `begun`, the first band and the source's share are there already. Where pixels may be
+    missing, each has a flag, and one more while flags are made.
     """
     raster = source.raster
     row_px = raster.bands * raster.width_px
     read = plan.band_rows_px * row_px * (raster.dtype.itemsize + raster.may_miss)
     flags = plan.band_rows_px * row_px * raster.may_miss
     held = 0 if begun else read + source.held_bytes(plan.band_rows_px)
-    return read + flags + 2 * restored_bytes(source, plan) + held
+    return 2 * read + flags + 3 * restored_bytes(source, plan) + held
 
 
 def restored_bytes(source: Source, plan: Plan) -> int:
     """Memory of one row of tiles as it is stored."""
     raster = source.raster
-    return min(plan.tile_px, plan.height_px) * raster.bands * raster.width_px * raster.out_dtype.itemsize
+    return plan.tile_shape[0] * raster.bands * raster.width_px * raster.out_dtype.itemsize
 
 
 def check_memory(rows: int, budget_bytes: int | None, bulky: bool, share: int = 1) -> int:

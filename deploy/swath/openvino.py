@@ -20,9 +20,9 @@ Precision = Literal["f32", "bf16"]
 
 
 def open_openvino(
-    model: onnx.ModelProto, threads: int, precision: Precision = "f32"
+    model: onnx.ModelProto, threads: int, precision: Precision = "f32", at_once: int = 1
 ) -> tuple[Callable[[np.ndarray], np.ndarray], str]:
-    """A callable (1, 1, h, w) float32 -> (1, 1, h, w), and the runtime's name and version.
+    """A callable (1, 1, h, w) float32 -> (1, 1, h, w) for `at_once` callers, and the runtime's name and version.
 
     Raises:
         MachineError: OpenVINO is not installed, or this processor does not compute in that precision.
@@ -33,7 +33,7 @@ def open_openvino(
         remedy = "run it on a processor that has them"
         raise MachineError("bfloat16", expected="a processor with bfloat16 units", got="none", remedy=remedy)
     # Said aloud: where the processor has bfloat16 units, OpenVINO would round to it unasked.
-    options = {"INFERENCE_PRECISION_HINT": precision, "PERFORMANCE_HINT": "LATENCY"}
+    options = {"INFERENCE_PRECISION_HINT": precision, "NUM_STREAMS": str(at_once)}
     options |= {"INFERENCE_NUM_THREADS": str(threads)} if threads else {}
     content = saturating_adds(model).SerializeToString()
 

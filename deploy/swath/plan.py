@@ -3,12 +3,12 @@
 from dataclasses import dataclass
 
 from deploy.swath.raster import Raster
-from deploy.tiling import Span, plan_side
+from deploy.tiling import Span, even_side_px, plan_side
 
 
 @dataclass(frozen=True)
 class Plan:
-    """Rows and columns of tiles over an image of `bands` planes."""
+    """Rows and columns of tiles, none longer than `tile_px`, over an image of `bands` planes."""
 
     bands: int
     height_px: int
@@ -18,6 +18,12 @@ class Plan:
     radius_px: int
     rows: tuple[Span, ...]
     columns: tuple[Span, ...]
+
+    @property
+    def tile_shape(self) -> tuple[int, int]:
+        """Rows and columns of pixels of every tile."""
+        row, column = self.rows[0], self.columns[0]
+        return row.stop - row.start, column.stop - column.start
 
     @property
     def tiles(self) -> int:
@@ -33,14 +39,16 @@ class Plan:
     @property
     def band_rows_px(self) -> int:
         """Most rows that are read at once: a tile's, and those that missing pixels are filled from."""
-        return min(max(r.stop - r.start for r in self.rows) + 2 * self.radius_px, self.height_px)
+        return min(self.tile_shape[0] + 2 * self.radius_px, self.height_px)
 
 
-def make_plan(raster: Raster, tile_px: int, halo_px: int, radius_px: int) -> Plan:
-    """The plan of an image.
+def make_plan(raster: Raster, tile_px: int, halo_px: int, radius_px: int, fixed: bool = False) -> Plan:
+    """The plan of an image: tiles of at most `tile_px` a side, or of just that where the network is `fixed` to it.
 
     Raises:
         OptionError: a tile with no room between its two halos.
     """
-    rows, columns = (plan_side(size, tile_px, halo_px) for size in (raster.height_px, raster.width_px))
-    return Plan(*raster.shape, tile_px, halo_px, radius_px, tuple(rows), tuple(columns))
+    sizes = raster.height_px, raster.width_px
+    sides = [tile_px if fixed else even_side_px(size, tile_px, halo_px) for size in sizes]
+    rows, columns = (tuple(plan_side(size, side, halo_px)) for size, side in zip(sizes, sides, strict=True))
+    return Plan(*raster.shape, tile_px, halo_px, radius_px, rows, columns)

@@ -18,7 +18,7 @@ from deploy.swath.plan import Plan, make_plan
 from deploy.swath.raster import Raster
 from deploy.swath.reader import open_source
 from deploy.swath.restorer import Restorer
-from deploy.swath.runtime import open_runtime
+from deploy.swath.runtime import open_runtime, tiles_at_once
 from deploy.swath.spool import Spool, part_folder
 from deploy.swath.spread import fill_spread, make_work
 from deploy.swath.writer import require_codec, write_output
@@ -53,7 +53,8 @@ def _restore(image: Path, out: Path, options: Options, say: Say) -> Row:
         say(plan_sentence(plan))
         if not options.is_spread:
             check_memory(rows_bytes(source, plan), options.memory_bytes, is_bulky(source, plan))
-        infer, runtime = open_runtime(options.runtime, network, options.threads)
+        at_once = tiles_at_once(options.threads, plan.tiles)
+        infer, runtime = open_runtime(options.runtime, network, options.threads, at_once)
         restorer = Restorer(source.raster, infer, options.full_scale, plan.radius_px, str(image))
         figures = seam_figures(source, plan, restorer, fixed_tile_px(network) is not None)
         job = make_job(image, options, plan, runtime)
@@ -63,7 +64,7 @@ def _restore(image: Path, out: Path, options: Options, say: Say) -> Row:
             work = make_work(image, plan, network, runtime, options)
             figures |= worker_figures(fill_spread(spool, source, work, say))
         else:
-            fill_here(spool, source, plan, restorer, options.memory_bytes, say)
+            fill_here(spool, source, plan, restorer, at_once, options.memory_bytes, say)
     with held_back():  # a stop now would save nothing
         write_output(spool, source.raster, options.compression)
     return run_row(image.name, plan, done, time.perf_counter() - started, runtime, options, figures)
@@ -79,4 +80,5 @@ def plan_of(raster: Raster, network: onnx.ModelProto, options: Options) -> Plan:
     radius_px = receptive_radius_px(network)
     check_scale(options.full_scale, raster.out_dtype.kind)
     check_fixed_tile(network, options.tile_px, raster.shape[1:])
-    return make_plan(raster, options.tile_px, parse_halo(options.halo, radius_px), radius_px)
+    halo_px, fixed = parse_halo(options.halo, radius_px), fixed_tile_px(network) is not None
+    return make_plan(raster, options.tile_px, halo_px, radius_px, fixed)

@@ -1,6 +1,7 @@
 """What runs a network: onnxruntime by default, OpenVINO as an option."""
 
 import hashlib
+import os
 from dataclasses import dataclass
 from functools import partial
 
@@ -11,19 +12,36 @@ from deploy.restore import Infer
 from deploy.swath.openvino import open_openvino
 from deploy.swath.options import Runtime
 from profiles.errors import ModelError
+from quant.onnx_file import parse_onnx
 from quant.session import open_session, run
 
+AT_ONCE = 4
+"""Most tiles in work at a time. Each needs the memory of a network's maps, and some 4 % are gained by it."""
 
-def open_runtime(runtime: Runtime, model: onnx.ModelProto, threads: int) -> tuple[Infer, str]:
-    """A network ready to run, and the runtime's name and version; `threads` 0 takes every core.
+
+def tiles_at_once(threads: int, tiles: int) -> int:
+    """How many tiles are best restored at a time, each by an equal share of the threads; 0 takes every core."""
+    cores = threads or os.cpu_count() or 1
+    return max(count for count in range(1, AT_ONCE + 1) if cores % count == 0 and count <= max(tiles, 1))
+
+
+def open_runtime(runtime: Runtime, model: onnx.ModelProto, threads: int, at_once: int = 1) -> tuple[Infer, str]:
+    """A network ready to run, and the runtime's name and version.
+
+    Args:
+        runtime: which.
+        model: the network.
+        threads: in all; 0 takes every core.
+        at_once: how many callers share the threads.
 
     Raises:
         MachineError: the runtime is not installed.
         ModelError: it refuses the model.
     """
     if runtime is Runtime.openvino:
-        return open_openvino(model, threads)
-    return partial(run, open_session(model, threads)), f"onnxruntime {ort.__version__}"
+        return open_openvino(model, threads, at_once=at_once)
+    share = (threads or os.cpu_count() or 1) // at_once if at_once > 1 else threads
+    return partial(run, open_session(model, share)), f"onnxruntime {ort.__version__}"
 
 
 @dataclass(frozen=True)
@@ -51,4 +69,4 @@ def open_packed(packed: Packed) -> tuple[Infer, str]:
     if hashlib.sha256(packed.content).hexdigest() != packed.digest:
         got, remedy = "others", "check the connection between the machines"
         raise ModelError("network", expected=f"bytes of digest {packed.digest[:12]}", got=got, remedy=remedy)
-    return open_runtime(packed.runtime, onnx.load_model_from_string(packed.content), packed.threads)
+    return open_runtime(packed.runtime, parse_onnx(packed.content, "network"), packed.threads)

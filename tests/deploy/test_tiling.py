@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from deploy.export import to_onnx
 from deploy.restore import restore_image
-from deploy.tiling import plan_tiles
+from deploy.tiling import even_side_px, plan_side, plan_tiles
 from model.convbeers import ConvBEERS, Variant, initialise
 from profiles.errors import OptionError
 from quant.session import open_session
@@ -41,6 +41,15 @@ def test_every_kept_pixel_has_its_halo_or_touches_the_border(size: int, tile_px:
         for span in (tile.rows, tile.columns):
             assert span.start == 0 or span.keep_start - span.start >= halo_px
             assert span.stop == size or span.stop - span.keep_stop >= halo_px
+
+
+@given(st.integers(1, 2000), st.integers(13, 200), st.integers(0, 6))
+def test_an_even_side_needs_as_many_tiles_and_none_shorter_does(size: int, tile_px: int, halo_px: int) -> None:
+    side, count = even_side_px(size, tile_px, halo_px), len(plan_side(size, tile_px, halo_px))
+    assert side <= tile_px
+    assert len(plan_side(size, side, halo_px)) == count
+    if side > 2 * halo_px + 1 and count > 1:
+        assert len(plan_side(size, side - 1, halo_px)) > count
 
 
 def test_a_tile_without_room_between_its_halos_is_refused() -> None:

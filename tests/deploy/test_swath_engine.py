@@ -1,0 +1,92 @@
+"""Tiles restored several at a time give the rows that they give one by one."""
+
+import os
+import threading
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from deploy.restore import Infer
+from deploy.swath.engine import restore_rows
+from deploy.swath.plan import Plan, make_plan
+from deploy.swath.raster import Raster
+from deploy.swath.reader import ArraySource
+from deploy.swath.restorer import Restorer
+from deploy.swath.runtime import AT_ONCE, tiles_at_once
+from profiles.errors import ImageError
+
+SHAPE = (2, 75, 133)
+TILE_PX, RADIUS_PX = 32, 3
+
+
+def running(infer: Infer, at_once: int, tick: Callable[[], None] = lambda: None) -> np.ndarray:
+    """A noisy image of two bands through `infer`."""
+    pixels = np.random.default_rng(0).integers(0, 4096, SHAPE).astype(np.uint16)
+    raster = Raster(*SHAPE, pixels.dtype, None)
+    plan: Plan = make_plan(raster, TILE_PX, RADIUS_PX, RADIUS_PX)
+    restorer = Restorer(raster, infer, 4095.0, RADIUS_PX)
+    result = np.empty(SHAPE, np.uint16)
+    for row, kept, known in restore_rows(ArraySource(pixels, raster), plan, restorer, plan.rows, tick, at_once):
+        assert known == kept.size
+        result[:, row.keep_start : row.keep_stop] = kept
+    return result
+
+
+def brighter(image: np.ndarray) -> np.ndarray:
+    return np.asarray(image * np.float32(0.5) + np.float32(0.25))
+
+
+@pytest.mark.parametrize("at_once", [2, 3, 4])
+def test_rows_are_the_same_however_many_tiles_are_in_work(at_once: int) -> None:
+    assert np.array_equal(running(brighter, at_once), running(brighter, 1))
+
+
+def test_as_many_tiles_are_in_work_as_were_asked_for() -> None:
+    """Each call waits for a second one: one at a time would wait in vain. Two bands make their number even."""
+    together = threading.Barrier(2, timeout=10)
+
+    def patient(image: np.ndarray) -> np.ndarray:
+        together.wait()
+        return brighter(image)
+
+    assert np.array_equal(running(patient, 2), running(brighter, 1))
+
+
+def test_after_an_error_no_further_tile_is_begun() -> None:
+    calls: list[int] = []
+
+    def broken(image: np.ndarray) -> np.ndarray:
+        calls.append(1)
+        return np.full_like(image, np.nan)
+
+    with pytest.raises(ImageError, match="finite pixels"):
+        running(broken, 2)
+    assert len(calls) < 10, "the first two rows of tiles have twenty"
+
+
+def test_after_a_stop_no_further_tile_is_begun() -> None:
+    calls, going = [], threading.Event()
+
+    def slow(image: np.ndarray) -> np.ndarray:
+        calls.append(1)
+        if len(calls) > 2:
+            going.wait(0.2)
+        return brighter(image)
+
+    def stop() -> None:
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        running(slow, 2, stop)
+    assert len(calls) < 10
+
+
+@given(threads=st.integers(0, 256), tiles=st.integers(0, 1000))
+def test_tiles_share_the_threads_evenly(threads: int, tiles: int) -> None:
+    count = tiles_at_once(threads, tiles)
+    cores = threads or os.cpu_count() or 1
+    assert 1 <= count <= min(AT_ONCE, max(tiles, 1))
+    assert cores % count == 0
