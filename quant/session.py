@@ -9,6 +9,7 @@ import onnx
 import onnxruntime as ort
 
 from profiles.errors import ModelError
+from quant.fillers import filled
 from quant.onnx_file import any_size
 
 
@@ -47,10 +48,11 @@ def open_session(
     if profile is not None:
         options.enable_profiling = True
         options.profile_file_prefix = str(profile)
-    source = model.SerializeToString() if isinstance(model, onnx.ModelProto) else str(model)
+    known = model if isinstance(model, onnx.ModelProto) else onnx.load(model)
+    known = filled(known) if optimise else known
     name = "ONNX model" if isinstance(model, onnx.ModelProto) else str(model)
     try:
-        return ort.InferenceSession(source, options, providers=["CPUExecutionProvider"])
+        return ort.InferenceSession(known.SerializeToString(), options, providers=["CPUExecutionProvider"])
     except Exception as error:  # onnxruntime raises a class of its own for each status code
         got = " ".join(str(error).split())[:160]
         remedy = "give a file written by 'beers-deploy export' or 'beers-deploy quantize'"
