@@ -28,15 +28,15 @@ WIDE, NARROW = Canvas(1080, 660, 30, brief=False), Canvas(400, 640, 24, brief=Tr
 
 
 def wishes_of(front: Front, rows: Sequence[Row], dots: Sequence[Dot], canvas: Canvas) -> list[Wish]:
-    """Names of the front's members, best first; then of the best point of each other method, where there is room."""
+    """Names of the front's steps, best first; then of the best point of each other method, where there is room."""
     sign = 1 if front.y in RISING else -1
     by_quality = sorted(
         zip(rows, dots, strict=True), key=lambda each: -sign * (each[0].figures[front.y].value or 0.0)
     )
     named = {method_of(row) for row in rows if row.name in front.members}
     best = {method_of(row): dot for row, dot in reversed(by_quality) if method_of(row) not in named}
-    members = [dot for _, dot in by_quality if dot.name in front.members]
-    wanted = [*members, *sorted(best.values(), key=lambda dot: dot.y)]
+    steps = [dot for _, dot in by_quality if dot.name in front.steps]
+    wanted = [*steps, *sorted(best.values(), key=lambda dot: dot.y)]
     heads = Counter(_head(dot.name) for dot in wanted)
     return [
         Wish(dot.x, dot.y, _lines(dot.name, canvas, heads[_head(dot.name)] == 1), dot.state == "front")

@@ -38,7 +38,7 @@ def write_study(study: Study, out: Path) -> None:
         MachineError: a file cannot be written.
     """
     fronts = ordered(study.fronts)
-    first = plot_of(fronts[0] if fronts else Front(*FIRST, (), {}, ()), points_of(study), WIDE)
+    first = plot_of(fronts[0] if fronts else Front(*FIRST, (), (), {}, ()), points_of(study), WIDE)
     write_text(out / "tradeoff.svg", plot_svg(first, alone=True))
     write_png(first, out / "tradeoff.png")
     write_points(study.points, out / "points.csv")

@@ -46,7 +46,7 @@ class Cache:
             stored = json.loads(self.path(kind, key).read_text(encoding="utf-8"))
             whole = stored["sha256"] == digest_of(stored["value"])
             return what.from_json(stored["value"]) if whole else None
-        except (OSError, ValueError, KeyError, TypeError, AttributeError):
+        except (OSError, ValueError, LookupError, TypeError, AttributeError, ArithmeticError, RecursionError):
             return None
 
     def keep(self, kind: str, key: Key, value: Keepable) -> None:

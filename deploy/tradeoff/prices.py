@@ -23,7 +23,8 @@ def _fronts(arena: Arena) -> Iterator[Front]:
             found = places(arena, x, y)
             if found:
                 members = front(found)
-                yield Front(x, y, members, beaten(found, Plane(arena, x, y)), prices(arena, members, x, y))
+                steps = apart(arena, members, x, y)
+                yield Front(x, y, members, steps, beaten(found, Plane(arena, x, y)), prices(arena, steps, x, y))
 
 
 def places(arena: Arena, x: str, y: str) -> list[Place]:
@@ -31,13 +32,13 @@ def places(arena: Arena, x: str, y: str) -> list[Place]:
     return [place for outcome in arena.outcomes.values() if (place := outcome.place(x, y))]
 
 
-def prices(arena: Arena, members: tuple[str, ...], x: str, y: str) -> tuple[str, ...]:
-    """A sentence a step along a front, from cheap to dear."""
-    found = list(pairwise(apart(arena, members, x, y)))
+def prices(arena: Arena, steps: tuple[str, ...], x: str, y: str) -> tuple[str, ...]:
+    """A sentence for each step, from cheap to dear."""
+    found = list(pairwise(steps))
     return tuple(_price(arena, *step, x, y, last=step == found[-1]) for step in found)
 
 
-def apart(arena: Arena, members: Sequence[str], x: str, y: str) -> list[str]:
+def apart(arena: Arena, members: Sequence[str], x: str, y: str) -> tuple[str, ...]:
     """Members that are surely better and surely dearer, each than the one before; of those as dear the best."""
     kept = list(members[:1])
     for name in members[1:]:
@@ -46,7 +47,7 @@ def apart(arena: Arena, members: Sequence[str], x: str, y: str) -> list[str]:
         if arena.ratio(name, kept[-1], x)[0] <= 1:
             kept.pop()
         kept.append(name)
-    return kept
+    return tuple(kept)
 
 
 def _price(arena: Arena, cheap: str, dear: str, x: str, y: str, *, last: bool) -> str:

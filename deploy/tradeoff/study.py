@@ -16,13 +16,15 @@ class Front:
         x: key of the figure that is paid, "board latency".
         y: key of the figure that is bought, "PSNR".
         members: names of the points on the front by their values, along x from cheap to dear.
+        steps: those of them that are surely better and surely dearer than the one before.
         beaten: name of a point to the name of one that dominates it beyond the intervals.
-        prices: a sentence on what each step from one member to the next costs.
+        prices: a sentence on what each step costs.
     """
 
     x: str
     y: str
     members: tuple[str, ...]
+    steps: tuple[str, ...]
     beaten: Mapping[str, str]
     prices: tuple[str, ...]
 

@@ -168,7 +168,8 @@ def front(points: Sequence[Row], x: str, y: str) -> Front:
     beaten = {b[2]: a[2] for b in places for a in places if a[0] < 0.8 * b[0] and a[1] > b[1] + margin}
     steps = pairwise(members)
     prices = [f"From {a[2]} to {b[2]}: {b[0] / a[0]:.1f} times the {x}." for a, b in steps]
-    return Front(x, y, tuple(each[2] for each in members), beaten, tuple(prices))
+    names = tuple(each[2] for each in members)
+    return Front(x, y, names, names, beaten, tuple(prices))
 
 
 def layer(name: str, ms: float, **text: str) -> Row:

@@ -226,11 +226,18 @@ def test_quality_is_up_and_cost_is_right(found: Study) -> None:
 
 
 @pytest.mark.parametrize("canvas", [WIDE, NARROW])
-def test_every_member_of_a_front_is_named(found: Study, canvas: Canvas) -> None:
+def test_every_step_of_a_front_is_named(found: Study, canvas: Canvas) -> None:
     for each in found.fronts:
         plot = plot_of(each, points_of(found), canvas)
         named = {label.wish.lines[0].partition(",")[0] for label in plot.labels}
-        assert {name.partition(",")[0] for name in each.members} <= named
+        assert {name.partition(",")[0] for name in each.steps} <= named
+
+
+def test_members_that_are_no_steps_need_no_name(found: Study) -> None:
+    front = replace(found.fronts[0], steps=found.fronts[0].members[-1:])
+    named = [label.wish.lines for label in plot_of(front, points_of(found), WIDE).labels]
+    of_members = [lines for lines in named if any(name.startswith(lines[0]) for name in front.members)]
+    assert len(of_members) < len(front.members)
 
 
 def apart(a: Box, b: Box) -> bool:
@@ -301,7 +308,7 @@ def test_the_legend_stays_on_the_canvas_and_clear_of_itself(found: Study, canvas
 
 
 def test_an_empty_front_has_no_line(found: Study) -> None:
-    bare = Front("board latency", "PSNR", (), {}, ())
+    bare = Front("board latency", "PSNR", (), (), {}, ())
     plot = plot_of(bare, points_of(replace(found, points=())), WIDE)
     assert plot.front == ()
     assert plot.dots == ()

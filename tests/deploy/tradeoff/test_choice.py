@@ -168,6 +168,7 @@ def test_of_points_that_cost_as_much_for_all_we_know_the_best_has_the_price() ->
     assert [name.split()[0] for name in front.members] == ["tiny", "tall", "papers"]
     assert len(front.prices) == 1
     assert "from tall" in front.prices[0]
+    assert [name.split()[0] for name in front.steps] == ["tall", "papers"]
 
 
 def test_of_points_that_images_cannot_tell_apart_the_cheaper_is_chosen() -> None:
