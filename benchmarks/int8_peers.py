@@ -31,7 +31,7 @@ import onnx
 from deploy.defaults import HELD_OUT_SEED, load_scenes
 from deploy.defaults import float_model as read_float
 from model.metrics.fidelity import psnr_db, ssim
-from model.weights_file import shipped_weights
+from model.shipped import shipped_weights
 from profiles import load_sensor
 from quant.calibration import REFERENCE, Pair, draw_patches
 from quant.float_file import float_model

@@ -3,7 +3,7 @@
 import onnx
 
 from deploy.defaults import float_model
-from model.weights_file import SHIPPED, shipped_names, shipped_weights
+from model.shipped import SHIPPED, shipped_names, shipped_weights
 from quant.onnx_file import load_onnx, metadata
 
 

@@ -6,9 +6,7 @@ import numpy as np
 import onnx
 
 from deploy.export import to_onnx
-from deploy.shipped import VARIANT as VARIANT
-from deploy.shipped import default_float_weights as default_float_weights
-from deploy.shipped import default_int8 as default_int8
+from deploy.shipped import default_float_weights
 from model.images import list_images
 from model.simulator.procedural import procedural_scene
 from model.simulator.scene import Scene, read_scene

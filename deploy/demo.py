@@ -12,7 +12,7 @@ import onnx
 import torch
 
 from deploy.bench import Swath, predict_file, predicted_rows, published_rows
-from deploy.defaults import HELD_OUT_SEED, VARIANT, default_float_weights, float_model, load_scenes
+from deploy.defaults import HELD_OUT_SEED, float_model, load_scenes
 from deploy.dpu.board import Dpu, load_dpu
 from deploy.dpu.placement import place
 from deploy.dpu.reading import read_network
@@ -24,6 +24,7 @@ from deploy.report.demo_page import INT8, SWATH_PX, TRADITIONAL, comparison, dem
 from deploy.report.page import Report
 from deploy.restore import TILE_PX, read_acquisition, restore_image, write_tiff
 from deploy.results import Row, measured
+from deploy.shipped import VARIANT, default_float_weights
 from deploy.verdict import gate_row
 from model.images import read_pixels
 from model.simulator.acquire import MARGIN_PX, Pair, simulate_pair

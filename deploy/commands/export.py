@@ -22,7 +22,8 @@ def export(
     """Write the network as ONNX, any height and width unless --tile fixes them, and check it against torch."""
     from deploy.defaults import about
     from deploy.export import parity, to_onnx
-    from model.weights_file import load_network, shipped_weights
+    from model.shipped import shipped_weights
+    from model.weights_file import load_network
     from profiles.errors import ModelError
     from quant.onnx_file import save_onnx
 

@@ -33,10 +33,11 @@ def gate(
 
     Also checked: the DPU's rules, that no ReLU was lost, and that onnxruntime's optimisations change no bit.
     """
-    from deploy.defaults import HELD_OUT_SEED, default_float_weights, default_int8, load_scenes
+    from deploy.defaults import HELD_OUT_SEED, load_scenes
     from deploy.defaults import float_model as read_float
     from deploy.gate import baseline_mae, structure_checks, write_summaries
     from deploy.results import Document
+    from deploy.shipped import default_float_weights, default_int8
     from deploy.tables import print_rows
     from deploy.verdict import gate_row
     from model.files import require_writable

@@ -55,7 +55,7 @@ def tradeoff(
     from deploy.tradeoff.request import Request
     from deploy.tradeoff.run import run_study
     from model.files import require_writable
-    from model.weights_file import shipped_names
+    from model.shipped import shipped_names
 
     figures = out / "tradeoff.json"
     require_writable(figures, json)

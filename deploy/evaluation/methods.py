@@ -11,10 +11,10 @@ import torch
 
 from deploy.defaults import float_model
 from deploy.restore import TILE_PX, restore_image
+from model.shipped import SHIPPED, shipped_names, shipped_weights
 from model.traditional.peers import PEERS
 from model.traditional.pipeline import Chain, restore_traditional
 from model.traditional.settings import QUALITIES
-from model.weights_file import SHIPPED, shipped_names, shipped_weights
 from profiles.errors import OptionError
 from profiles.sensor import Sensor
 from quant.onnx_file import load_onnx

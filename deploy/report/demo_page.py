@@ -4,11 +4,11 @@ from pathlib import Path
 
 import numpy as np
 
-from deploy.defaults import VARIANT
 from deploy.dpu.placement import Placement
 from deploy.report.page import Picture, Report, Table
 from deploy.report.pictures import busiest_windows, picture_url, stretch_of, strip
 from deploy.results import Row
+from deploy.shipped import VARIANT
 from model.files import whole_file
 
 CROP_PX, ZOOM = 110, 3

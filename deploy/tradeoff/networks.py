@@ -10,7 +10,7 @@ import onnx
 from deploy.counterpart import is_quantised
 from deploy.defaults import float_model
 from model.convbeers import VARIANTS
-from model.weights_file import SHIPPED, shipped_names, shipped_weights
+from model.shipped import SHIPPED, shipped_names, shipped_weights
 from profiles.errors import OptionError
 from quant.onnx_file import fixed_tile_px, load_onnx, metadata
 

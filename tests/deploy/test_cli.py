@@ -15,8 +15,8 @@ from PIL import Image
 from typer.testing import CliRunner
 
 from deploy.cli import COMMANDS, app
-from deploy.defaults import default_int8
 from deploy.results import SCHEMA_PATH
+from deploy.shipped import default_int8
 
 runner = CliRunner()
 

@@ -11,8 +11,9 @@ from onnx import numpy_helper
 from typer.testing import CliRunner
 
 from deploy.cli import app
-from deploy.defaults import default_int8, float_model
+from deploy.defaults import float_model
 from deploy.gate import baseline_mae, junit, markdown, structure_checks
+from deploy.shipped import default_int8
 from model.simulator.procedural import procedural_scene
 from profiles import load_sensor
 from profiles.errors import OptionError

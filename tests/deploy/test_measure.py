@@ -12,11 +12,12 @@ import pytest
 from deploy.bench import Swath
 from deploy.counterpart import counterpart, is_quantised
 from deploy.cpu_side import board_cpu_row, slowdown
-from deploy.defaults import default_int8, float_model
+from deploy.defaults import float_model
 from deploy.host_state import peak_memory, watched
 from deploy.measure import Sensors, drawn_acquisition, host_rows, traditional_rows
 from deploy.profiler import node_rows, profile
 from deploy.results import Row
+from deploy.shipped import default_int8
 from deploy.turns import Timed, take_turns, timed_rows
 from profiles import load_sensor, load_target
 from profiles.constant import Constant

@@ -8,7 +8,7 @@ import onnxruntime as ort
 import pytest
 
 from deploy.shipped import default_int8
-from model.weights_file import SHIPPED
+from model.shipped import SHIPPED
 from quant.fillers import FEWEST_OUTPUTS, filled
 from quant.onnx_file import load_onnx
 

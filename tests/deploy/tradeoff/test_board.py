@@ -7,8 +7,8 @@ import onnx
 import pytest
 
 from deploy.bench import Swath
-from deploy.defaults import default_int8
 from deploy.dpu.board import load_dpu
+from deploy.shipped import default_int8
 from deploy.tradeoff.board import (
     CpuRun,
     DpuRun,

@@ -10,7 +10,7 @@ from deploy.dpu.board import load_dpu
 from deploy.tradeoff.networks import Network, find_networks, is_papers, operations_per_px, shape_of
 from deploy.tradeoff.points import EXACT, LEGAL, PRECISIONS, Board, Unit, network_points, other_points, tiles_px
 from deploy.tradeoff.selection import board_of, configurations_for, precisions_of
-from model.weights_file import SHIPPED, shipped_names, shipped_weights
+from model.shipped import SHIPPED, shipped_names, shipped_weights
 from profiles.errors import ModelError, OptionError
 
 BOARD = Board(19, 176, 176, ("C32B3", "C32B1", "C32B6"))
