@@ -1,0 +1,35 @@
+"""What a session does beside its results."""
+
+import time
+
+import numpy as np
+import pytest
+
+from deploy.shipped import default_int8
+from quant.session import open_session, run
+
+IMAGE = np.full((1, 1, 96, 96), 0.5, np.float32)
+
+
+def idle_cpu_s(wait_s: float) -> float:
+    """What this process takes of the processor while it does nothing."""
+    begun = time.process_time()
+    time.sleep(wait_s)
+    return time.process_time() - begun
+
+
+def test_a_session_that_has_run_leaves_the_processor_alone() -> None:
+    """Its threads would wait busily for the next run, and take that from a session timed after it."""
+    session = open_session(default_int8(), threads=2)
+    run(session, IMAGE)
+    idle = []
+    for _ in range(5):
+        run(session, IMAGE)
+        idle.append(idle_cpu_s(0.02))
+    assert min(idle) < 0.004
+
+
+@pytest.mark.parametrize("threads", [1, 2, 3])
+def test_the_number_of_threads_changes_no_bit(threads: int) -> None:
+    image = np.random.default_rng(0).random((1, 1, 53, 71), dtype=np.float32)
+    assert np.array_equal(run(open_session(default_int8(), threads), image), run(open_session(default_int8()), image))
