@@ -16,7 +16,7 @@ def restore(
     model: Annotated[
         Path | None, typer.Option(help="ONNX network, float or INT8; the shipped INT8 one if none.")
     ] = None,
-    tile: Annotated[int, typer.Option(min=16, help="Tile side in pixels.")] = TILE_PX,
+    tile: Annotated[int, typer.Option(min=16, help="Longest side of a tile in pixels.")] = TILE_PX,
     halo: Annotated[str, typer.Option(help="Context around a tile: 'exact' (no seams) or pixels.")] = "exact",
     full_scale: Annotated[float, typer.Option(help="The digital number that is the network's 1.0.")] = FULL_SCALE_DN,
     runtime: Annotated[Runtime, typer.Option(help="What runs the network.")] = Runtime.onnxruntime,
