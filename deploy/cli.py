@@ -26,6 +26,7 @@ from deploy.commands import (
     quantize,
     restore,
     simulate,
+    stress,
     tradeoff,
     train,
 )
@@ -97,6 +98,7 @@ COMMANDS: dict[str, tuple[Callable[..., None], str]] = {
     "bench": (bench.bench, bench.EXAMPLE),
     "restore": (restore.restore, restore.EXAMPLE),
     "evaluate": (evaluate.evaluate, evaluate.EXAMPLE),
+    "stress": (stress.stress, stress.EXAMPLE),
     "tradeoff": (tradeoff.tradeoff, tradeoff.EXAMPLE),
     "compare": (compare.compare, compare.EXAMPLE),
 }

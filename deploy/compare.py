@@ -10,6 +10,7 @@ from jsonschema import Draft202012Validator
 
 from deploy.results import SCHEMA_PATH, Figure, Row
 from profiles.errors import OptionError
+from profiles.text import read_json
 
 Place = tuple[str, str, str]
 """Table, row and name of a figure."""
@@ -111,7 +112,7 @@ def read_document(path: Path) -> dict[str, object]:
         OptionError: missing, or not one.
     """
     try:
-        document = json.loads(path.read_text(encoding="utf-8"))
+        document = read_json(path)
         schema = Draft202012Validator(json.loads(SCHEMA_PATH.read_text(encoding="utf-8")))
         error = next(schema.iter_errors(document), None)
         got = "" if error is None else f"another document: {error.message[:100]}"
@@ -122,7 +123,7 @@ def read_document(path: Path) -> dict[str, object]:
     if got:
         remedy = "give what a command wrote with --json"
         raise OptionError(str(path), expected="a results document", got=got, remedy=remedy)
-    return document  # type: ignore[no-any-return]
+    return document  # type: ignore[return-value]
 
 
 def compare(before: Mapping[str, object], after: Mapping[str, object]) -> Comparison:

@@ -12,11 +12,13 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from itertools import groupby
 from pathlib import Path
+from typing import Any
 
 from deploy.dataset_patches import DatasetRecipe, Line, Window, make_patches, plan_windows
 from deploy.dataset_spread import spread_patches
-from model.files import write_text
+from model.files import whole_file, write_text
 from profiles.errors import OptionError
+from profiles.text import parse_json
 
 CHUNK = 32
 """Patches a worker makes before it reports: short enough to lose little to a kill."""
@@ -43,9 +45,10 @@ def write_dataset(
     """
     _check_folder(recipe, out, resume)
     if (out / "manifest.jsonl").exists():  # nothing was left to do
-        return _summary((out / "manifest.jsonl").read_text(encoding="utf-8"))
+        return _read_summary(out / "manifest.jsonl")
     for left_over in out.rglob(".*.part"):  # of a run that was killed
-        left_over.unlink()
+        if not left_over.is_dir():
+            left_over.unlink()
     windows = plan_windows(recipe)
     chunks = [c for _, group in groupby(windows, key=lambda w: w.scene) for c in _chunks(list(group))]
     parts = {out / "parts" / f"{chunk[0].number:08d}.jsonl": chunk for chunk in chunks}
@@ -55,10 +58,11 @@ def write_dataset(
     for path, lines in made:
         write_text(path, "".join(json.dumps(line, sort_keys=True) + "\n" for line in lines))
         tick(len(lines))
-    manifest = "".join(path.read_text(encoding="utf-8") for path in parts)
-    write_text(out / "manifest.jsonl", manifest)
+    with whole_file(out / "manifest.jsonl") as manifest:
+        manifest.write_bytes(b"".join(path.read_bytes() for path in parts))
+        summary = _read_summary(manifest)
     shutil.rmtree(out / "parts")
-    return _summary(manifest)
+    return summary
 
 
 def _run(
@@ -83,7 +87,8 @@ def _check_folder(recipe: DatasetRecipe, out: Path, resume: bool) -> None:
     if not path.exists():
         write_text(path, wanted)
         return
-    got = "this dataset" if path.read_text(encoding="utf-8") == wanted else "another dataset"
+    same = path.is_file() and path.read_bytes() == wanted.encode()
+    got = "this dataset" if same else "another dataset"
     if got == "another dataset" or not resume:
         remedy = "add --resume or choose another folder" if got == "this dataset" else "choose another folder"
         raise OptionError("--out", expected="a folder without a dataset", got=got, remedy=remedy)
@@ -94,7 +99,16 @@ def _chunks(windows: list[Window]) -> Iterator[list[Window]]:
         yield windows[first : first + CHUNK]
 
 
-def _summary(manifest: str) -> dict[str, float]:
-    lines = [json.loads(line) for line in manifest.splitlines()]
-    rejected = sum(line[role]["rejected_snr_pairs"] for line in lines for role in ("degraded", "reference"))
-    return {"patches": len(lines), "rejected_share": rejected / (rejected + 2 * len(lines))}
+def _read_summary(path: Path) -> dict[str, float]:
+    """Patches, and the share of SNR pairs that were drawn again.
+
+    Raises:
+        OptionError: no manifest of ours.
+    """
+    try:
+        lines: list[Any] = [parse_json(line) for line in path.read_text(encoding="utf-8").split("\n") if line]
+        rejected = sum(int(line[role]["rejected_snr_pairs"]) for line in lines for role in ("degraded", "reference"))
+        return {"patches": len(lines), "rejected_share": rejected / (rejected + 2 * len(lines))}
+    except (ArithmeticError, LookupError, OSError, TypeError, ValueError) as error:
+        got, remedy = " ".join(str(error).split())[:120], "choose another --out"
+        raise OptionError(str(path), expected="a dataset's manifest", got=got, remedy=remedy) from error

@@ -1,7 +1,7 @@
 """The gate: figures against limits, the file against the DPU's rules, and what a CI job wants to read."""
 
-import json
 from pathlib import Path
+from typing import Any
 from xml.etree import ElementTree as ET
 
 import numpy as np
@@ -12,6 +12,7 @@ from deploy.dpu.placement import place
 from deploy.dpu.reading import read_network
 from model.files import write_text
 from profiles.errors import OptionError
+from profiles.text import read_json
 from quant.limits import Check
 from quant.onnx_file import fixed_tile_px
 from quant.session import open_any_size, run
@@ -51,7 +52,7 @@ def baseline_mae(path: Path | None) -> float | None:
     if path is None:
         return None
     try:
-        document = json.loads(path.read_text(encoding="utf-8"))
+        document: Any = read_json(path)
         return float(next(row["figures"]["MAE"]["value"] for row in document["rows"] if row["table"] == "gate"))
     except (OSError, ValueError, KeyError, TypeError, StopIteration) as error:
         got = "no such file" if not path.exists() else "another document"

@@ -7,7 +7,6 @@ The shipped constants are the start and are held to within some 30 %, so that a 
 runs move what they speak of and leave the rest.
 """
 
-import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
@@ -25,6 +24,7 @@ from deploy.dpu.zoo.networks import NETWORKS
 from deploy.results import Row, predicted, published
 from profiles.constant import Constant
 from profiles.errors import ModelError, OptionError
+from profiles.text import read_json
 
 UNITS = {
     "efficiency": "1",
@@ -92,18 +92,21 @@ def refit(path: Path, dpu: Dpu) -> Refit:
 
 def _read(path: Path) -> Sequence[Mapping[str, object]]:
     try:
-        runs = json.loads(path.read_bytes())
+        runs = read_json(path)
     except OSError as error:
         got = error.strerror or str(error)
         raise OptionError(str(path), expected="a readable file", got=got, remedy="check the path") from error
     except ValueError as error:
         raise OptionError(str(path), expected="JSON", got=str(error), remedy="correct the file") from error
-    if not isinstance(runs, list) or not runs or not all(isinstance(run, dict) for run in runs):
-        raise OptionError(str(path), expected="a list of runs", got=type(runs).__name__, remedy=EXAMPLE)
+    if not isinstance(runs, list) or not 0 < len(runs) <= RUNS or not all(isinstance(run, dict) for run in runs):
+        expected, got = f"a list of 1 to {RUNS} runs", type(runs).__name__
+        raise OptionError(str(path), expected=expected, got=got, remedy=EXAMPLE)
     return runs
 
 
 EXAMPLE = 'write [{"model": "core.onnx", "configuration": "C32B3", "tile_px": 640, "fps": 9.5}]'
+RUNS, TILE_MAX_PX, FPS = 1000, 1 << 16, (1e-9, 1e9)
+"""A board has seen far fewer runs; beyond these sizes and rates the fit has no digits left."""
 KEYS = {"model", "network", "configuration", "tile_px", "fps", "power_w"}
 
 
@@ -115,10 +118,12 @@ def _case(run: Mapping[str, object], path: Path, index: int) -> Case:
         raise OptionError(
             where, expected="model or network, configuration, tile_px, fps", got=str(sorted(run)), remedy=EXAMPLE
         )
-    if isinstance(fps, bool) or not isinstance(fps, int | float) or not 0 < fps < 1e9:
+    if isinstance(fps, bool) or not isinstance(fps, int | float) or not FPS[0] < fps < FPS[1]:
         raise OptionError(where, expected="frames a second above zero", got=repr(fps), remedy=EXAMPLE)
-    if isinstance(tile, bool) or not isinstance(tile, int) or tile < 16:
-        raise OptionError(where, expected="a tile side of at least 16 pixels", got=repr(tile), remedy=EXAMPLE)
+    if isinstance(tile, bool) or not isinstance(tile, int) or not 16 <= tile <= TILE_MAX_PX:
+        raise OptionError(
+            where, expected=f"a tile side of 16 to {TILE_MAX_PX} pixels", got=repr(tile), remedy=EXAMPLE
+        )
     dpu = load_dpu("vck190", str(run.get("configuration", "")) or None)
     if "network" in run:
         name = str(run["network"])

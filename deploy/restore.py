@@ -82,7 +82,8 @@ def restore_window(dn: np.ndarray, infer: Infer, full_scale: float = MAX_DN) -> 
         ImageError: the network gives NaN or infinity.
     """
     image = np.ascontiguousarray(dn, dtype=np.float32)[None, None] / np.float32(full_scale)
-    restored = infer(image)[0, 0] * np.float32(full_scale)
+    with np.errstate(over="ignore"):  # what overflows is refused
+        restored = infer(image)[0, 0] * np.float32(full_scale)
     if not np.isfinite(restored).all():
         raise ImageError("restored tile", expected="finite pixels", got="NaN", remedy="check the model with 'gate'")
     return np.asarray(np.clip(restored, 0, np.float32(full_scale)))

@@ -4,6 +4,7 @@ RUN/checkpoint.safetensors  RUN/log.csv  RUN/validation.csv  RUN/validation.png 
 """
 
 import csv
+import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -33,6 +34,9 @@ from model.training.workers import Worker
 from model.weights_file import load_network, variant_named
 from model.widen import widen
 from profiles.errors import OptionError
+
+STEP = re.compile(r"[0-9]{1,18}(?=,)")
+"""What a line of a log begins with."""
 
 if TYPE_CHECKING:
     from torch.utils.tensorboard import SummaryWriter
@@ -189,8 +193,8 @@ class Log:
     def __init__(self, path: Path, step: int) -> None:
         self.path = path
         if path.exists():
-            lines = path.read_text(encoding="utf-8").splitlines()
-            kept = [line for line in lines if not line[:1].isdigit() or int(line.split(",")[0]) <= step]
+            lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
+            kept = [line for line in lines if not (number := STEP.match(line)) or int(number[0]) <= step]
             path.write_text("".join(f"{line}\n" for line in kept if step), encoding="utf-8")
 
     def write(self, step: int, values: Mapping[str, float]) -> None:

@@ -1,5 +1,6 @@
 """Read pixels from TIFF, PNG or JPEG files, and refuse with one sentence what is no image."""
 
+import io
 import math
 import re
 import warnings
@@ -9,15 +10,20 @@ from pathlib import Path
 
 import numpy as np
 import psutil
-import tifffile
-from PIL import Image, UnidentifiedImageError
+from PIL import Image
 
+from model.tiff import open_tiff
+from model.tiff_page import check_page
 from profiles.errors import BeersError, ImageError, MachineError
+from profiles.text import read_whole
 
 TIFF_SUFFIXES = {".tif", ".tiff"}
 IMAGE_SUFFIXES = TIFF_SUFFIXES | {".png", ".jpg", ".jpeg"}
 FRAME_NUMBERS = re.compile(r"(_[0-9a-f]*\d[0-9a-f]*)+$")
 """What a name ends in that tells frames of one site apart: _0034, _5dded5bc_23."""
+
+PACKED_BYTES = 1 << 30
+"""Of a PNG or JPEG file."""
 
 WORKING_COPIES = 12
 """Float copies of an image that a command may hold at once: reading refuses what would not fit in memory."""
@@ -58,7 +64,7 @@ def require_image_file(path: Path) -> None:
 
 @contextmanager
 def damage_in_a_sentence(path: Path, where: str = "") -> Iterator[None]:
-    """One sentence for whatever the bytes of a damaged TIFF lead to; `where` names the place in it.
+    """One sentence for whatever the bytes of a damaged image lead to; `where` names the place in it.
 
     Raises:
         ImageError: damaged.
@@ -97,9 +103,11 @@ def site_of(name: str) -> str:
 
 
 def _read_tiff(path: Path) -> np.ndarray:
-    with damage_in_a_sentence(path), tifffile.TiffFile(path) as file:
+    with damage_in_a_sentence(path), open_tiff(path) as file:
         series = file.series[0]
         _check_memory(path, math.prod(series.shape))
+        for page in series.pages:
+            check_page(path, page)  # type: ignore[arg-type]  # frames have what pages have; none is damage
         pixels = np.asarray(series.asarray())
     if pixels.ndim == 3 and pixels.shape[0] in (1, 3, 4) and pixels.shape[2] not in (1, 3, 4):
         pixels = np.moveaxis(pixels, 0, 2)  # planar storage: bands first
@@ -109,14 +117,23 @@ def _read_tiff(path: Path) -> np.ndarray:
 def _read_other(path: Path) -> np.ndarray:
     limit, Image.MAX_IMAGE_PIXELS = Image.MAX_IMAGE_PIXELS, None  # our own check knows the free memory
     try:
-        with warnings.catch_warnings(action="ignore"), Image.open(path) as image:  # odd EXIF is no concern of ours
+        with (
+            damage_in_a_sentence(path),
+            warnings.catch_warnings(action="ignore"),  # odd EXIF is no concern of ours
+            Image.open(
+                _in_memory(path), formats=("PNG", "JPEG")
+            ) as image,  # others would run further programs, as for EPS
+        ):
             bands = 4 if image.mode == "RGBA" else len(image.getbands())
             _check_memory(path, image.width * image.height * bands)
             return np.asarray(image if image.mode in ("L", "I;16", "I", "F") else image.convert("RGB"))
-    except (UnidentifiedImageError, OSError, ValueError, SyntaxError) as error:
-        raise _no_image(str(path), error) from error
     finally:
         Image.MAX_IMAGE_PIXELS = limit
+
+
+def _in_memory(path: Path) -> io.BytesIO:
+    """The packed file: a chunk's stated length then takes no more memory than there is file."""
+    return io.BytesIO(read_whole(path, PACKED_BYTES))
 
 
 def _check_memory(path: Path, samples: int) -> None:

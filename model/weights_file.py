@@ -4,6 +4,7 @@ import json
 from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 import torch
 from safetensors import SafetensorError, safe_open
@@ -12,10 +13,8 @@ from torch import Tensor
 
 from model.convbeers import VARIANTS, ConvBEERS, Variant
 from model.files import whole_file
-from model.shipped import SHIPPED as SHIPPED
-from model.shipped import shipped_names as shipped_names
-from model.shipped import shipped_weights as shipped_weights
 from profiles.errors import ModelError, OptionError
+from profiles.text import parse_json
 
 
 def variant_named(name: str) -> Variant:
@@ -46,10 +45,10 @@ def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, object]]:
     """
     try:
         with safe_open(path, framework="pt") as file:
-            header = {key: json.loads(value) for key, value in (file.metadata() or {}).items()}
+            header = {key: parse_json(value) for key, value in (file.metadata() or {}).items()}
             return {key: file.get_tensor(key) for key in file.keys()}, header  # noqa: SIM118 - no mapping
-    except (SafetensorError, OSError, ValueError) as error:
-        got = "no such file" if not path.exists() else str(error)
+    except (SafetensorError, OSError, ValueError, LookupError, TypeError, RuntimeError) as error:
+        got = "no such file" if not path.exists() else " ".join(str(error).split())[:120]
         remedy = "give a file written by 'beers-deploy train'"
         raise ModelError(str(path), expected="safetensors weights", got=got, remedy=remedy) from error
 
@@ -67,15 +66,30 @@ def load_network(path: Path) -> tuple[ConvBEERS, dict[str, object]]:
     """
     tensors, header = read_tensors(path)
     try:
-        shape = header["variant"]
-        network = ConvBEERS(Variant(int(shape["blocks"]), int(shape["features"])))  # type: ignore[index]
+        shape: Any = header["variant"]
+        variant = Variant(int(shape["blocks"]), int(shape["features"]))
+        _check_variant(variant, tensors)
+        network = ConvBEERS(variant)
         network.load_state_dict(tensors)
-    except (KeyError, TypeError, ValueError, OverflowError, RuntimeError) as error:
+    except (AttributeError, LookupError, TypeError, ValueError, OverflowError, RuntimeError) as error:
         got = " ".join(str(error).split())[:120]
         remedy = "give a file written by 'beers-deploy train'"
         raise ModelError(str(path), expected="the weights of a ConvBEERS", got=got, remedy=remedy) from error
     recipe = header.get("recipe", {})
     return network.eval(), recipe if isinstance(recipe, dict) else {}
+
+
+def _check_variant(variant: Variant, tensors: Mapping[str, Tensor]) -> None:
+    """The tensors decide before a network is made: a header alone must not take memory.
+
+    Raises:
+        ValueError: other tensors than a network of that variant has, of another type, or not finite.
+    """
+    first = tensors["head.weight"]
+    if len(tensors) != 4 * variant.blocks + 6 or len(first) != variant.features:
+        raise ValueError(f"{len(tensors)} tensors, {len(first)} features at the head, for {variant}")
+    if not all(tensor.dtype == torch.float32 for tensor in tensors.values()) or not all_finite(tensors):
+        raise ValueError("weights that are not finite float32")
 
 
 def all_finite(tensors: Mapping[str, Tensor]) -> bool:

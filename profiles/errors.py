@@ -12,6 +12,9 @@ A gate that fails is no error: its command exits with 1.
 
 from functools import partial
 
+LONGEST = 400
+"""Characters of a file that a message shows at most."""
+
 
 class BeersError(Exception):
     """Bad input: what was expected, what was got, and what to do about it.
@@ -24,12 +27,20 @@ class BeersError(Exception):
     """
 
     def __init__(self, where: str, *, expected: str, got: str, remedy: str) -> None:
-        super().__init__(f"{where}: expected {expected}, got {got}; {remedy}.")
+        super().__init__(
+            f"{_printable(where)}: expected {_printable(expected, 4 * LONGEST)}, got {_printable(got)}; {remedy}."
+        )
         self.where, self.expected, self.got, self.remedy = where, expected, got, remedy
 
     def __reduce__(self) -> tuple[object, ...]:
         """How it comes back from a worker process: an exception's own way knows no keywords."""
         return partial(type(self), expected=self.expected, got=self.got, remedy=self.remedy), (self.where,)
+
+
+def _printable(text: str, longest: int = LONGEST) -> str:
+    """One line that a terminal shows as it is, whatever a file held."""
+    shown = "".join(c if c.isprintable() else ascii(c)[1:-1] for c in text[:longest])
+    return shown + ("..." if len(text) > longest else "")
 
 
 class ProfileError(BeersError):

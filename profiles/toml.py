@@ -1,9 +1,9 @@
 """Find and read a profile: a shipped name, or the path of the user's own TOML file."""
 
-import tomllib
 from pathlib import Path
 
 from profiles.errors import ProfileError
+from profiles.text import read_toml_text
 
 HERE = Path(__file__).parent
 
@@ -29,9 +29,9 @@ def read_toml(kind: str, name: str) -> tuple[str, dict[str, object]]:
             remedy="run 'beers-deploy profiles' to see them all",
         )
     try:
-        return path.name, tomllib.loads(path.read_bytes().decode())
+        return path.name, read_toml_text(path)
     except OSError as error:
         reason = error.strerror or str(error)
         raise ProfileError(str(path), expected="a readable file", got=reason, remedy="check the path") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+    except ValueError as error:
         raise ProfileError(str(path), expected="TOML text", got=str(error), remedy="correct that line") from error

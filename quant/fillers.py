@@ -60,11 +60,11 @@ class _Filling:
     def _padded(self, node: onnx.NodeProto, count: int) -> list[onnx.NodeProto]:
         source = node.input[0]
         known = source in self.wide_inputs
-        node.input[0] = self.wide_inputs.setdefault(source, f"{source}.filled")
+        node.input[0] = self.wide_inputs.setdefault(source, f"{source}.padded")
         if known:
             return []
-        pads = self._constant(f"{source}.filled.pads", np.array([0, 0, 0, 0, 0, count, 0, 0]))
-        return [helper.make_node("Pad", [source, pads], [f"{source}.filled"], name=f"{source}.filled")]
+        pads = self._constant(f"{source}.padded.pads", np.array([0, 0, 0, 0, 0, count, 0, 0]))
+        return [helper.make_node("Pad", [source, pads], [f"{source}.padded"], name=f"{source}.padded")]
 
     def _cut(self, node: onnx.NodeProto, count: int) -> list[onnx.NodeProto]:
         name = node.output[0]

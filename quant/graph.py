@@ -11,6 +11,7 @@ import onnx
 from onnx import numpy_helper
 
 from profiles.errors import ModelError
+from quant.untrusted import contradictions
 
 IMAGE, CORRECTION = "image", "correction"
 
@@ -56,6 +57,11 @@ def correction_graph(model: onnx.ModelProto) -> Graph:
     Raises:
         ModelError: an operation of another kind, or no global add at the end.
     """
+    with contradictions("float model"):
+        return _correction_graph(model)
+
+
+def _correction_graph(model: onnx.ModelProto) -> Graph:
     weights = {t.name: numpy_helper.to_array(t) for t in model.graph.initializer}
     image, restored = model.graph.input[0].name, model.graph.output[0].name
     ops: list[Op] = []

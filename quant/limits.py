@@ -1,11 +1,14 @@
 """What the gate allows: limits by name, from a TOML file or the defaults."""
 
-import tomllib
+import math
+import sys
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
+from typing import Any
 
 from profiles.errors import OptionError
+from profiles.text import read_toml_text
 from quant.gate import GateResult
 
 
@@ -53,17 +56,25 @@ def read_limits(path: Path | None, mae: float | None) -> Limits:
 def _parse(path: Path) -> Limits:
     names = [field.name for field in fields(Limits)]
     try:
-        raw = tomllib.loads(path.read_text(encoding="utf-8"))
+        raw = read_toml_text(path)
     except (OSError, ValueError) as error:
         got = "no such file" if not path.exists() else " ".join(str(error).split())[:120]
         raise OptionError(
             str(path), expected="a TOML file of limits", got=got, remedy="write mae = 0.0007"
         ) from error
     for name, value in raw.items():
-        if name not in names or isinstance(value, bool) or not isinstance(value, int | float) or not value > 0:
+        if name not in names or not _is_limit(value):
             expected = f"numbers above 0 named {', '.join(names)}"
             raise OptionError(str(path), expected=expected, got=f"{name} = {value!r}", remedy="correct that line")
-    return Limits(**{**dict.fromkeys(names), "mae_growth": Limits.mae_growth, **raw})
+    given: dict[str, Any] = {**dict.fromkeys(names), "mae_growth": Limits.mae_growth, **raw}
+    return Limits(**given)
+
+
+def _is_limit(value: object) -> bool:
+    """A number above 0 that float64 holds, or infinity."""
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return False
+    return value == math.inf or 0 < value <= sys.float_info.max
 
 
 def judge(result: GateResult, limits: Limits, baseline_mae: float | None = None) -> list[Check]:

@@ -1,4 +1,4 @@
-"""Read and write ONNX files without trusting them: one sentence for whatever is not a self-contained model."""
+"""Read and write ONNX files without trusting them: one sentence for whatever is not a sound model."""
 
 from pathlib import Path
 
@@ -7,29 +7,55 @@ from google.protobuf.message import DecodeError
 
 from model.files import whole_file
 from profiles.errors import ModelError
+from profiles.text import read_whole
+from quant.runnable import check_runnable
+from quant.untrusted import FILE_BYTES, check_content
 
 OPSET = 17
 IR_VERSION = 8
 
 
-def load_onnx(path: Path) -> onnx.ModelProto:
-    """Read an ONNX model that carries all its weights.
+REMEDY = "give a file written by 'beers-deploy export' or 'beers-deploy quantize'"
+
+
+def load_onnx(path: Path, to_run: bool = True) -> onnx.ModelProto:
+    """Read an ONNX model that carries all its weights: the one way by which a file comes in.
+
+    Args:
+        path: the file.
+        to_run: whether a runtime may get it; False where its nodes are only looked at, whosever they are.
 
     Raises:
-        ModelError: missing, empty, not ONNX, or pointing at weights in other files.
+        ModelError: missing, empty, not ONNX, or not to be trusted (see `quant.untrusted` and `quant.runnable`).
     """
-    remedy = "give a file written by 'beers-deploy export' or 'beers-deploy quantize'"
     if not path.is_file():
-        raise ModelError(str(path), expected="an ONNX file", got="no such file", remedy=remedy)
+        raise ModelError(str(path), expected="an ONNX file", got="no such file", remedy=REMEDY)
     try:
-        model = onnx.load_model(path, load_external_data=False)
+        content = read_whole(path, FILE_BYTES)
+    except (OSError, ValueError) as error:
+        got = " ".join(str(error).split())[:120]
+        raise ModelError(str(path), expected="an ONNX file", got=got, remedy=REMEDY) from error
+    return parse_onnx(content, str(path), to_run)
+
+
+def parse_onnx(content: bytes, where: str, to_run: bool = True) -> onnx.ModelProto:
+    """As `load_onnx`, of a file's bytes.
+
+    Raises:
+        ModelError: as there.
+    """
+    if not content:
+        raise ModelError(where, expected="an ONNX file", got="an empty file", remedy=REMEDY)
+    try:
+        model = onnx.ModelProto()
+        model.ParseFromString(content)
+        check_content(model, where)  # before the checker, which looks for files that weights are said to be in
         onnx.checker.check_model(model)
-    except (DecodeError, onnx.checker.ValidationError, ValueError, OSError) as error:
-        got = "an empty file" if path.stat().st_size == 0 else " ".join(str(error).split())[:120]
-        raise ModelError(str(path), expected="an ONNX file", got=got or "other bytes", remedy=remedy) from error
-    if any(t.data_location == onnx.TensorProto.EXTERNAL for t in model.graph.initializer):
-        got = "weights kept in another file"
-        raise ModelError(str(path), expected="one self-contained ONNX file", got=got, remedy="save it as one file")
+    except (DecodeError, onnx.checker.ValidationError, ValueError) as error:
+        got = " ".join(str(error).split())[:120] or "other bytes"
+        raise ModelError(where, expected="an ONNX file", got=got, remedy=REMEDY) from error
+    if to_run:
+        check_runnable(model, where)
     return model
 
 
@@ -80,12 +106,19 @@ def fixed_tile_px(model: onnx.ModelProto) -> int | None:
 
 
 def any_size(model: onnx.ModelProto) -> onnx.ModelProto:
-    """A network of convolutions that is fixed to one tile, for images of any size; any other as it is."""
+    """A network of convolutions that is fixed to one tile, for images of any size; any other as it is.
+
+    Raises:
+        ModelError: other than one image in and out.
+    """
     if fixed_tile_px(model) is None:
         return model
     free = onnx.ModelProto()
     free.CopyFrom(model)
     for value in (*free.graph.input, *free.graph.output):
+        if len(value.type.tensor_type.shape.dim) != 4:
+            got = f"{value.name!r} of {len(value.type.tensor_type.shape.dim)} sizes"
+            raise ModelError("ONNX model", expected="an image in and out", got=got, remedy=REMEDY)
         for side, name in zip(value.type.tensor_type.shape.dim[2:], ("H", "W"), strict=True):
             side.dim_param = name
     del free.graph.value_info[:]

@@ -10,6 +10,7 @@ from typing import Any
 import onnx
 
 from profiles.errors import ModelError
+from quant.untrusted import contradictions
 
 CONVOLUTIONS = {"Conv": 1, "QLinearConv": 3}
 """Operator and the index of its weights among the inputs."""
@@ -32,6 +33,11 @@ def receptive_radius_px(model: onnx.ModelProto) -> int:
     Raises:
         ModelError: an operator that is no same-size convolution or pool of stride 1 and not point-wise.
     """
+    with contradictions("tiled model"):
+        return _radius_px(model)
+
+
+def _radius_px(model: onnx.ModelProto) -> int:
     constants = {t.name: tuple(t.dims) for t in model.graph.initializer}
     reach = {tensor.name: 0 for tensor in model.graph.input if tensor.name not in constants}
     for node in model.graph.node:

@@ -10,7 +10,8 @@ import onnxruntime as ort
 
 from profiles.errors import ModelError
 from quant.fillers import filled
-from quant.onnx_file import any_size
+from quant.onnx_file import any_size, load_onnx
+from quant.untrusted import contradictions, times
 
 
 def open_session(
@@ -33,12 +34,12 @@ def open_session(
         profile: write the runtime's own profile to files of this prefix.
 
     Raises:
-        ModelError: onnxruntime refuses the model.
+        ModelError: a file that is not to be trusted, or onnxruntime refuses the model.
     """
     options = ort.SessionOptions()
     options.intra_op_num_threads = threads
     options.enable_mem_pattern = False  # a plan of the memory takes up to 40 % more of it, and saves no time
-    options.log_severity_level = 3
+    options.log_severity_level = 4  # what fails is raised, and said once
     # Threads that wait for this session's next run take a core from whoever runs meanwhile, for tens of milliseconds.
     options.add_session_config_entry("session.force_spinning_stop", "1")
     if exact is None:
@@ -50,9 +51,10 @@ def open_session(
     if profile is not None:
         options.enable_profiling = True
         options.profile_file_prefix = str(profile)
-    known = model if isinstance(model, onnx.ModelProto) else onnx.load(model)
-    known = filled(known) if optimise else known
+    known = model if isinstance(model, onnx.ModelProto) else load_onnx(model)
     name = "ONNX model" if isinstance(model, onnx.ModelProto) else str(model)
+    with contradictions(name):
+        known = filled(known) if optimise else known
     try:
         return ort.InferenceSession(known.SerializeToString(), options, providers=["CPUExecutionProvider"])
     except Exception as error:  # onnxruntime raises a class of its own for each status code
@@ -78,5 +80,20 @@ def open_any_size(model: onnx.ModelProto, optimise: bool = True) -> ort.Inferenc
 
 
 def run(session: ort.InferenceSession, image: np.ndarray) -> np.ndarray:
-    """Restore (N, 1, H, W) float32 in [0, 1] to the same shape."""
-    return np.asarray(session.run(None, {session.get_inputs()[0].name: image})[0])
+    """Restore (N, 1, H, W) float32 in [0, 1] to the same shape.
+
+    Raises:
+        ModelError: a model that does not run on this image, or that returns another shape.
+    """
+    try:
+        restored = np.asarray(session.run(None, {session.get_inputs()[0].name: image})[0])
+    except Exception as error:  # as above
+        raise _unfit(" ".join(str(error).split())[:160]) from error
+    if restored.shape != image.shape:
+        raise _unfit(f"a result of {times(restored.shape)}")
+    return restored
+
+
+def _unfit(got: str) -> ModelError:
+    remedy = "export it for images of any size, or check its sizes"
+    return ModelError("ONNX model", expected="one that restores an image to its own size", got=got, remedy=remedy)

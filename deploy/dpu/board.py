@@ -4,7 +4,12 @@ from dataclasses import dataclass
 
 from profiles import TargetProfile, load_target
 from profiles.constant import Constant
-from profiles.errors import OptionError
+from profiles.errors import OptionError, ProfileError
+
+CONFIGURATION = ("batch_handlers", "cpb", "peak_tops")
+DIVISORS = ("array", "memory", "elementwise", "cost", "power")
+"""Tables of widths, rates and energies: nothing in them can be nothing."""
+SMALLEST, LARGEST = 1e-30, 1e30
 
 
 @dataclass(frozen=True)
@@ -58,7 +63,7 @@ def load_dpu(target: str = "vck190", configuration: str | None = None) -> Dpu:
     """Read a target profile and one of its configurations.
 
     Raises:
-        ProfileError: unknown target or configuration.
+        ProfileError: unknown target or configuration, or constants that no board has.
         OptionError: a target without a DPU.
     """
     profile = load_target(target)
@@ -66,4 +71,16 @@ def load_dpu(target: str = "vck190", configuration: str | None = None) -> Dpu:
         raise OptionError(
             "--target", expected="a target with a DPU, such as vck190", got=repr(target), remedy="choose another"
         )
-    return Dpu(profile, *profile.configuration(configuration))
+    name, constants = profile.configuration(configuration)
+    for key in CONFIGURATION:
+        _require(f"{profile.name} [configurations.{name}] {key}", constants.get(key))
+    for table in DIVISORS:
+        for key, constant in profile.tables.get(table, {}).items():
+            _require(f"{profile.name} [{table}] {key}", constant)
+    return Dpu(profile, name, constants)
+
+
+def _require(where: str, constant: Constant | None) -> None:
+    if constant is None or not SMALLEST < constant.low <= constant.high < LARGEST:
+        got = "none" if constant is None else str(constant)
+        raise ProfileError(where, expected="a number above 0 that a board can have", got=got, remedy="correct it")

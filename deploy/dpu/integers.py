@@ -20,6 +20,8 @@ Content = Literal["float", "int8", "seen", "wide"]
 
 BYTES = (TensorProto.INT8, TensorProto.UINT8)
 ACTIVATIONS = {"Relu", "LeakyRelu", "PRelu", "HardSigmoid", "HardSwish", "Clip"}
+ACTIVATIONS_MAX = 8
+"""Of one after the other, looked past for the QuantizeLinear behind: a chain of thousands is nobody's network."""
 OPERANDS = {
     "QuantizeLinear": slice(0, 1),
     "DequantizeLinear": slice(0, 1),
@@ -133,15 +135,17 @@ class Integers:
 
     def _requantised(self, tensor: str) -> str:
         """The int8 tensor that a wide one becomes, past an activation; "" where it stays float."""
-        readers = self._readers.get(tensor, [])
-        if self._content.get(tensor) == "int8":
-            return tensor
-        if tensor in self._ends or not readers:
-            return ""
-        if all(reader.op_type == "QuantizeLinear" for reader in readers):
-            return str(readers[0].output[0])
-        if len(readers) == 1 and readers[0].op_type in ACTIVATIONS:
-            return self._requantised(readers[0].output[0])
+        for _ in range(ACTIVATIONS_MAX):
+            readers = self._readers.get(tensor, [])
+            if self._content.get(tensor) == "int8":
+                return tensor
+            if tensor in self._ends or not readers:
+                return ""
+            if all(reader.op_type == "QuantizeLinear" for reader in readers):
+                return str(readers[0].output[0])
+            if len(readers) > 1 or readers[0].op_type not in ACTIVATIONS:
+                return ""
+            tensor = readers[0].output[0]
         return ""
 
     def _read_formats(self, node: onnx.NodeProto) -> None:

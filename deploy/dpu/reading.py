@@ -18,6 +18,7 @@ from deploy.dpu.integers import Integers
 from deploy.dpu.shapes import out_shape, padding
 from profiles.errors import ModelError
 from quant.onnx_file import load_onnx
+from quant.untrusted import contradictions
 
 KINDS: dict[str, Kind] = {
     "Conv": "conv",
@@ -47,7 +48,7 @@ def read_network(path: Path, tile_px: int = 640) -> Network:
     Raises:
         ModelError: not a self-contained ONNX file, or not a network of images.
     """
-    return network_of(load_onnx(path), tile_px, str(path))
+    return network_of(load_onnx(path, to_run=False), tile_px, str(path))
 
 
 def network_of(model: onnx.ModelProto, tile_px: int, where: str = "ONNX model") -> Network:
@@ -55,12 +56,8 @@ def network_of(model: onnx.ModelProto, tile_px: int, where: str = "ONNX model") 
     if not model.graph.node:
         remedy = "give a file written by 'beers-deploy export' or 'beers-deploy quantize'"
         raise ModelError(where, expected="a network", got="an ONNX file without nodes", remedy=remedy)
-    try:
+    with contradictions(where):
         return _Reader(model, tile_px, where).network()
-    except (ArithmeticError, LookupError, TypeError, ValueError) as error:  # sizes and inputs that cannot be
-        got = f"nodes that contradict it ({' '.join(str(error).split())[:80]})"
-        remedy = "check the file with onnx.checker, and export it again"
-        raise ModelError(where, expected="nodes as ONNX defines them", got=got, remedy=remedy) from error
 
 
 class _Reader:

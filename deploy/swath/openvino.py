@@ -33,7 +33,7 @@ def open_openvino(
         remedy = "run it on a processor that has them"
         raise MachineError("bfloat16", expected="a processor with bfloat16 units", got="none", remedy=remedy)
     # Said aloud: where the processor has bfloat16 units, OpenVINO would round to it unasked.
-    options = {"INFERENCE_PRECISION_HINT": precision, "NUM_STREAMS": str(at_once)}
+    options = {"INFERENCE_PRECISION_HINT": precision, "NUM_STREAMS": str(at_once), "ENABLE_CPU_PINNING": False}
     options |= {"INFERENCE_NUM_THREADS": str(threads)} if threads else {}
     content = saturating_adds(model).SerializeToString()
 

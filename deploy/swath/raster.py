@@ -12,6 +12,9 @@ NODATA_TAG = 42113
 CARRIED_TAGS = (33550, 33922, 34264, 34735, 34736, 34737, 42112, NODATA_TAG, 50844)
 """GeoTIFF's scale, tie points, transformation and keys; GDAL's metadata and nodata; rational polynomials."""
 
+SIDE_PX, BANDS = 1 << 22, 1 << 12
+"""An image has a plan of its tiles before any pixel is read: a header alone must not make that large."""
+
 Tag = tuple[int, int, int, Any, bool]
 """Code, type, count, value, once: what tifffile takes as an extra tag."""
 
@@ -54,9 +57,14 @@ def page_raster(path: str, page: tifffile.TiffPage) -> Raster:
     """The raster of a TIFF page.
 
     Raises:
-        ImageError: pixels that are no real numbers, or a nodata value that the output could not hold.
+        ImageError: too large to be planned, pixels that are no real numbers, or a nodata value that the output could
+            not hold.
     """
     planes, _, height_px, width_px, samples = page.shaped
+    if max(height_px, width_px) > SIDE_PX or planes * samples > BANDS:
+        got = f"{planes * samples} bands of {height_px} x {width_px}"
+        expected = f"at most {BANDS} bands of {SIDE_PX} pixels a side"
+        raise ImageError(path, expected=expected, got=got, remedy="cut it into pieces")
     dtype = require_numbers(path, page.dtype)
     tags = [page.tags[code] for code in CARRIED_TAGS if code in page.tags]
     nodata = _nodata(path, page, dtype)

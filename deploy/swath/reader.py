@@ -14,7 +14,8 @@ import tifffile
 
 from deploy.swath.raster import Raster, page_raster, require_numbers
 from model.images import TIFF_SUFFIXES, damage_in_a_sentence, read_pixels, require_image_file
-from profiles.errors import ImageError
+from model.tiff import open_tiff
+from model.tiff_page import check_page
 
 BIG_TIFF_SUFFIXES = {".btf", ".tf8"}
 
@@ -44,13 +45,15 @@ def open_source(path: Path) -> Iterator[Source]:
         yield whole_source(path)
         return
     with damage_in_a_sentence(path):
-        file = tifffile.TiffFile(path)
+        file = open_tiff(path)
     with file:
         with damage_in_a_sentence(path):
             series = file.series[0]
             page = series.keyframe
             one_page = page.shaped[1] == 1 and page.size == series.size
-        yield TiffSource(path, page) if one_page else whole_source(path)
+            check_page(path, page)
+            source = TiffSource(path, page) if one_page else whole_source(path)
+        yield source
 
 
 def whole_source(path: Path) -> "ArraySource":
@@ -89,7 +92,6 @@ class TiffSource:
         self._across = -(-width_px // page.tilewidth) if page.is_tiled else 1
         self._held: dict[int, np.ndarray] = {}
         self._flat = page.compression == 1 and page.is_contiguous and page.bitspersample in (8, 16, 32, 64)
-        self._check_whole()
 
     def read(self, start: int, stop: int) -> np.ndarray:
         """See Source."""
@@ -141,10 +143,3 @@ class TiffSource:
             target = block[plane, :, :rows, left : left + columns]
             target[:] = page.nodata if pixels is None else np.moveaxis(pixels[0, :rows, :columns], 2, 0)
         return block.reshape(raster.bands, self._segment_px, raster.width_px)
-
-    def _check_whole(self) -> None:
-        ends = (a + n for a, n in zip(self._page.dataoffsets, self._page.databytecounts, strict=True))
-        end, size = max(ends, default=0), self._path.stat().st_size
-        if end > size:
-            got, remedy = f"a file cut short at {size} of {end} bytes", "copy it again"
-            raise ImageError(str(self._path), expected="a whole TIFF", got=got, remedy=remedy)

@@ -12,6 +12,7 @@ from deploy.restore import Infer
 from deploy.swath.openvino import open_openvino
 from deploy.swath.options import Runtime
 from profiles.errors import ModelError
+from quant.onnx_file import parse_onnx
 from quant.session import open_session, run
 
 AT_ONCE = 4
@@ -68,4 +69,4 @@ def open_packed(packed: Packed) -> tuple[Infer, str]:
     if hashlib.sha256(packed.content).hexdigest() != packed.digest:
         got, remedy = "others", "check the connection between the machines"
         raise ModelError("network", expected=f"bytes of digest {packed.digest[:12]}", got=got, remedy=remedy)
-    return open_runtime(packed.runtime, onnx.load_model_from_string(packed.content), packed.threads)
+    return open_runtime(packed.runtime, parse_onnx(packed.content, "network"), packed.threads)

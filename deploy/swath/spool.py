@@ -5,6 +5,7 @@ reach the disk before the journal counts them, and the journal is replaced in on
 """
 
 import json
+import math
 import os
 import shutil
 from collections.abc import Iterator, Mapping
@@ -16,6 +17,7 @@ import numpy as np
 
 from deploy.tiling import Span
 from profiles.errors import MachineError, OptionError
+from profiles.text import read_json
 
 
 def part_folder(out: Path) -> Path:
@@ -99,10 +101,11 @@ class Spool:
         path = self.folder / "journal.json"
         if not path.is_file():
             return 0, 0
-        with suppress(ValueError, KeyError, OSError):
-            journal = json.loads(path.read_text(encoding="utf-8"))
-            if journal["job"] == self._job:
-                return int(journal["rows"]), int(journal["known"])
+        with suppress(ValueError, KeyError, TypeError, OSError):
+            journal: Any = read_json(path)
+            rows, known = int(journal["rows"]), int(journal["known"])
+            if journal["job"] == self._job and 0 <= rows <= self.shape[1] and 0 <= known <= math.prod(self.shape):
+                return rows, known
         raise OptionError(
             "--resume",
             expected="the image, the model and the options of the run that was stopped",

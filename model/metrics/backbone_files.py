@@ -1,7 +1,11 @@
 """Find and read the weights of a perceptual metric's backbone. Nothing is unpickled, nothing is fetched."""
 
+import math
 import os
+import struct
+import tokenize
 import zipfile
+import zlib
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
@@ -16,6 +20,12 @@ from profiles.errors import ModelError
 
 WEIGHTS_VARIABLE = "BEERS_LPIPS_WEIGHTS"
 SUFFIXES = (".safetensors", ".npz")
+ARRAY_BYTES = 1 << 30
+DAMAGE = (
+    SafetensorError, OSError, ValueError, TypeError, EOFError, RuntimeError, ArithmeticError, SyntaxError,
+    struct.error, tokenize.TokenError, zipfile.BadZipFile, zlib.error,
+)  # fmt: skip
+"""What a damaged archive has been seen to end in."""
 CONVERT = (
     "convert it where you trust it: safetensors.torch.save_file(torch.load(FILE, weights_only=True), "
     "'NAME.safetensors')"
@@ -78,7 +88,7 @@ def read_tensors(path: Path, names: Iterable[str]) -> dict[str, Tensor]:
         return {name: _as_float32(tensor) for name, tensor in read(path, names).items()}
     except KeyError as error:
         raise _error(path, f"a tensor named {error.args[0]}", "none of that name") from error
-    except (SafetensorError, OSError, ValueError, TypeError, EOFError, zipfile.BadZipFile) as error:
+    except DAMAGE as error:
         got = " ".join(str(error).split())[:120]
         raise _error(path, "arrays of floating-point numbers, none pickled", got, CONVERT) from error
 
@@ -106,7 +116,24 @@ def _read_npz(path: Path, names: Iterable[str]) -> Mapping[str, Tensor]:
         for name in names:
             if name not in file:
                 raise KeyError(name)
+            _require_held(path, name)
         return {name: torch.from_numpy(file[name]) for name in names}
+
+
+def _require_held(path: Path, name: str) -> None:
+    """An array is as large as its header says before any of it is read: the archive must hold as much.
+
+    Raises:
+        ValueError: it does not, or more than belongs to any backbone.
+    """
+    with zipfile.ZipFile(path) as archive, archive.open(f"{name}.npy") as stream:
+        held_bytes = archive.getinfo(f"{name}.npy").file_size
+        read = np.lib.format.read_array_header_1_0
+        if np.lib.format.read_magic(stream) != (1, 0):
+            read = np.lib.format.read_array_header_2_0
+        shape, _, dtype = read(stream)
+    if not math.prod(shape) * dtype.itemsize <= held_bytes <= ARRAY_BYTES:
+        raise ValueError(f"{name} of {shape} in {held_bytes} bytes")
 
 
 def _check(path: Path, name: str, tensor: Tensor, wanted: Tensor) -> None:

@@ -13,7 +13,7 @@ MIN_SIDE_PX = 2 * SSIM_RADIUS_PX + 1
 
 
 def psnr_db(image: np.ndarray, reference: np.ndarray, data_range: float) -> float:
-    """10 log10(range^2 / mean squared error); infinite for identical images.
+    """10 log10(range^2 / mean squared error); infinite for identical images, NaN where pixels are not finite.
 
     Args:
         image: any shape.
@@ -22,6 +22,8 @@ def psnr_db(image: np.ndarray, reference: np.ndarray, data_range: float) -> floa
     """
     difference = np.asarray(image, np.float64) - np.asarray(reference, np.float64)
     error = float(np.mean(difference**2))
+    if not math.isfinite(error):
+        return math.nan
     return math.inf if error == 0 else 10 * math.log10(data_range**2 / error)
 
 

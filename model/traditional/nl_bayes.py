@@ -46,13 +46,18 @@ def nl_bayes_strips(strips: Iterable[Tensor], height: int, noise: Noise, quality
     if noise.sigma == 0:
         yield from (strip.clone() for strip in strips)
         return
-    as_guide, for_first, for_second = tee(_checked(strips), 3)
+    as_guide, for_first, for_second = tee(finite_or_missing(strips), 3)
     basic = denoise_pass(Rows(for_first), Rows(as_guide), height, noise, first_pass(noise.sigma), quality.stride_px)
     settings = second_pass(noise.sigma, quality)
     yield from denoise_pass(Rows(for_second), Rows(basic), height, noise, settings, quality.stride_px)
 
 
-def _checked(strips: Iterable[Tensor]) -> Iterator[Tensor]:
+def finite_or_missing(strips: Iterable[Tensor]) -> Iterator[Tensor]:
+    """The strips as they come.
+
+    Raises:
+        ImageError: one holds infinite values.
+    """
     for strip in strips:
         if bool(torch.isinf(strip).any()):
             remedy = "mark missing pixels as NaN"

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from model.traditional.compensate import EPSILON_PER_SIGMA, compensation_gain, compensation_kernel, filter_strips
-from model.traditional.nl_bayes import nl_bayes_strips
+from model.traditional.nl_bayes import finite_or_missing, nl_bayes_strips
 from model.traditional.noise import Noise, coloured_by
 from model.traditional.settings import QUALITIES, Quality
 from model.traditional.stabilise import bias_radiance, destabilise, stabilise
@@ -70,8 +70,11 @@ def restore_strips(strips: Iterable[Tensor], height: int, chain: Chain) -> Itera
     """As `restore_traditional`, bit for bit, on an image that comes and goes in strips of rows, (any, W) each.
 
     Holds some 700 rows of it, and the tallest strip.
+
+    Raises:
+        ImageError: infinite values; the stabiliser would make NaN of them, which means missing.
     """
-    radiance = (strip / chain.degraded.gain_dn_per_radiance for strip in strips)
+    radiance = (strip / chain.degraded.gain_dn_per_radiance for strip in finite_or_missing(strips))
     run = _denoise_first if chain.order == "denoise-first" else _deconvolve_first
     for strip in run(radiance, height, chain, quality_named(chain.quality)):
         yield (strip * chain.reference.gain_dn_per_radiance).clamp(0, chain.reference.max_dn)

@@ -12,6 +12,9 @@ from model.training.recipe import TrainingRecipe
 from model.weights_file import all_finite, load_network, read_tensors, save_network, write_tensors
 from profiles.errors import ModelError
 
+MOMENTS = ("step", "exp_avg", "exp_avg_sq")
+"""What Adam keeps of each parameter."""
+
 
 def write_checkpoint(
     path: Path,
@@ -48,13 +51,16 @@ def read_checkpoint(
         remedy = "repeat its options, or choose another --out"
         raise ModelError(str(path), expected=f"a checkpoint of {recipe}", got="another recipe", remedy=remedy)
     try:
-        network.load_state_dict(_part(tensors, "network."))
+        _check_parts(tensors, network)
         guards = Guards.from_json(header["guards"])  # type: ignore[arg-type]
         step = int(str(header["step"]))
-    except (KeyError, TypeError, ValueError, RuntimeError) as error:
+        if not 0 <= step <= recipe.steps:
+            raise ValueError(f"step {step} of {recipe.steps}")
+    except (AttributeError, LookupError, TypeError, ValueError, OverflowError) as error:
         got = " ".join(str(error).split())[:120]
         remedy = "choose the variant it was begun with"
         raise ModelError(str(path), expected="a checkpoint of this network", got=got, remedy=remedy) from error
+    network.load_state_dict(_part(tensors, "network."))
     for name, value in _part(tensors, "average.").items():
         average[name].copy_(value)
     for name, parameter in network.named_parameters():
@@ -74,6 +80,33 @@ def finish(network: ConvBEERS, path: Path, recipe: dict[str, object]) -> ConvBEE
         raise ModelError(str(path), expected="finite weights", got="NaN or infinity", remedy=remedy)
     save_network(path, network, recipe)
     return load_network(path)[0]
+
+
+def _check_parts(tensors: dict[str, Tensor], network: ConvBEERS) -> None:
+    """Nothing is filled in before all of it fits.
+
+    Raises:
+        ValueError: a tensor that is missing, misshapen, of another type or not finite.
+    """
+    wanted = network.state_dict()
+    parameters = dict(network.named_parameters())
+    for name, value in wanted.items():
+        _check_like(tensors[f"network.{name}"], value)
+        _check_like(tensors[f"average.{name}"], value)
+    moments = [name for name in tensors if name.startswith("moment.")]
+    for name in moments:
+        parameter, moment = name.removeprefix("moment.").rsplit(".", 1)
+        like = parameters[parameter]
+        _check_like(tensors[name], like.new_zeros(()) if moment == "step" else like)
+    if len(tensors) != 2 * len(wanted) + len(moments) or len(moments) not in (0, len(MOMENTS) * len(parameters)):
+        raise ValueError(f"{len(tensors)} tensors")
+    if {name.rsplit(".", 1)[1] for name in moments} - set(MOMENTS) or not all_finite(tensors):
+        raise ValueError("other moments than Adam's, or values that are not finite")
+
+
+def _check_like(value: Tensor, wanted: Tensor) -> None:
+    if value.shape != wanted.shape or value.dtype != wanted.dtype:
+        raise ValueError(f"a tensor {tuple(value.shape)} of {value.dtype} in place of {tuple(wanted.shape)}")
 
 
 def _part(tensors: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:

@@ -6,14 +6,8 @@ import torch
 from safetensors.torch import save_file
 
 from model.convbeers import VARIANTS, ConvBEERS, Variant, initialise
-from model.weights_file import (
-    load_network,
-    read_tensors,
-    save_network,
-    shipped_weights,
-    variant_named,
-    write_tensors,
-)
+from model.shipped import shipped_weights
+from model.weights_file import load_network, read_tensors, save_network, variant_named, write_tensors
 from profiles.errors import MachineError, ModelError, OptionError
 
 
@@ -79,7 +73,7 @@ def test_a_truncated_file_is_refused(tmp_path: Path) -> None:
 )
 def test_a_header_that_does_not_fit_the_tensors_is_refused(variant: object, tmp_path: Path) -> None:
     write_tensors(tmp_path / "w.safetensors", network().state_dict(), {"variant": variant})
-    with pytest.raises(ModelError, match="weights of a ConvBEERS") as caught:
+    with pytest.raises(ModelError, match=r"weights of a ConvBEERS|number Infinity") as caught:
         load_network(tmp_path / "w.safetensors")
     assert "\n" not in str(caught.value)
 

@@ -1,0 +1,66 @@
+"""`beers-deploy stress`: hard cases against a network and everything around it. Exit code 1 when something fails."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+EXAMPLE = "stress float.onnx int8.onnx --out stability.md"
+
+
+def stress(
+    float_model: Annotated[
+        Path | None, typer.Argument(metavar="[FLOAT]", help="Float ONNX or weights; a shipped one if none.")
+    ] = None,
+    int8_model: Annotated[
+        Path | None, typer.Argument(metavar="[INT8]", help="Its INT8 ONNX; the shipped one with the shipped float.")
+    ] = None,
+    variant: Annotated[str, typer.Option(help="Shipped pair of this name, where no file is given.")] = "convbeers-s",
+    cases: Annotated[str | None, typer.Option(help="Only these cases, with commas: 'night,snow'.")] = None,
+    stages: Annotated[str | None, typer.Option(help="Only these stages, with commas: 'float32,INT8'.")] = None,
+    size: Annotated[int, typer.Option(min=16, help="Side in pixels, where a case has none of its own.")] = 96,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of every random draw.")] = 0,
+    out: Annotated[Path | None, typer.Option(help="Write the tables here as Markdown.")] = None,
+    json: Annotated[Path | None, typer.Option(help="Write the figures here.")] = None,
+) -> None:
+    """Run hard cases through simulator, traditional chain, network, INT8, tiling, metrics and losses.
+
+    Prints what holds, the worst measures, the known limitations met, and what is proven for every image.
+    """
+    from deploy.progress import steps
+    from deploy.results import Document, by_table
+    from deploy.stress.battery import STAGES, chosen, run_battery
+    from deploy.stress.cases import CASES
+    from deploy.stress.page import markdown, title
+    from deploy.stress.proofs import layer_rows, overflow_proven, proof_rows
+    from deploy.stress.rows import battery_rows, bound_rows, finding_rows, limitation_rows
+    from deploy.stress.subject import open_subject
+    from deploy.tables import print_rows
+    from model.files import require_writable, write_text
+
+    require_writable(out, json)
+    names = chosen(cases, [case.name for case in CASES], "--cases")
+    wanted = chosen(stages, STAGES, "--stages")
+    subject = open_subject(float_model, int8_model, variant)
+    selected = [case for case in CASES if case.name in names]
+    with steps("stressing", len(selected) * len(wanted)) as bar:
+        outcomes = run_battery(subject, selected, wanted, seed, bar.advance, size)
+    tables = (battery_rows(outcomes), bound_rows(outcomes), limitation_rows(outcomes))
+    shown = [row for table in (*tables, proof_rows(subject, outcomes), layer_rows(subject)) for row in table]
+    for table, rows in by_table(shown).items():
+        print_rows(title(table), rows)
+    arguments = {"variant": variant, "cases": cases, "stages": stages, "size": size, "seed": seed}
+    Document("stress", arguments, subject.paths, (*shown, *finding_rows(outcomes))).write(json)
+    if out is not None:
+        write_text(out, markdown(shown))
+    for reason in dict.fromkeys(outcome.reason for outcome in outcomes if outcome.reason):
+        typer.echo(f"not looked at: {reason}")
+    failed = [outcome for outcome in outcomes if outcome.failed]
+    for outcome in failed:
+        typer.echo(f"FAILED {outcome.case.name}, {outcome.stage}: {outcome.verdict.removeprefix('FAILED: ')}")
+    safe = overflow_proven(subject)
+    if not safe:
+        typer.echo("FAILED: an int32 accumulator might overflow, see the integer layers")
+    typer.echo(f"stress {'passed' if not failed and safe else 'FAILED'}: {len(outcomes)} looks, {len(failed)} failed")
+    if failed or not safe:
+        raise typer.Exit(1)

@@ -1,0 +1,113 @@
+"""What is measured on a hard case, and when it holds."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from deploy.stress.cases import FULL_DN
+from profiles.errors import BeersError
+
+FLAT_DN = 0.01 * FULL_DN
+"""One per cent of full scale: what the mean may move by, and what does not count as ringing."""
+
+Work = Callable[[np.ndarray], np.ndarray]
+"""An image (H, W) in DN to another."""
+
+
+@dataclass(frozen=True)
+class Measure:
+    """One figure of one image; it holds where it is at most what is allowed. NaN never holds."""
+
+    check: str
+    value: float
+    allowed: float
+    unit: str = "DN"
+
+    @property
+    def holds(self) -> bool:
+        """Whether the value is within what is allowed."""
+        return self.value <= self.allowed
+
+
+def not_finite(*images: np.ndarray) -> Measure:
+    """Pixels that are NaN or infinite."""
+    return Measure("not finite", float(sum((~np.isfinite(image)).sum() for image in images)), 0, "px")
+
+
+def out_of_range(image: np.ndarray) -> Measure:
+    """Known pixels outside 0 to 4095."""
+    return Measure("out of range", float(((image < 0) | (image > FULL_DN)).sum()), 0, "px")
+
+
+def differing(check: str, image: np.ndarray, other: np.ndarray) -> Measure:
+    """Pixels that are not the same, bit for bit; two NaN are."""
+    same = (image == other) | (np.isnan(image) & np.isnan(other))
+    return Measure(check, float((~same).sum()), 0, "px")
+
+
+def mean_shift(image: np.ndarray, source: np.ndarray, allowed: float = FLAT_DN) -> Measure:
+    """By how much the mean moved."""
+    shift = float(np.mean(image, dtype=np.float64) - np.mean(source, dtype=np.float64))
+    return Measure("mean moved", abs(shift), allowed)
+
+
+def ringing(image: np.ndarray, source: np.ndarray, radius_px: int, allowed: float) -> Measure:
+    """How far pixels leave the range of the source's pixels within the radius, over the contrast there.
+
+    One per cent of full scale does not count, and contrast is ten per cent at least: flat ground has none.
+    """
+    low, high = local_range(source, radius_px)
+    beyond = np.maximum(np.maximum(image - high, low - image) - FLAT_DN, 0)
+    share = beyond / np.maximum(high - low, 10 * FLAT_DN)
+    return Measure("ringing", 100 * float(share.max()), allowed, "% of contrast")
+
+
+def local_range(image: np.ndarray, radius_px: int) -> tuple[np.ndarray, np.ndarray]:
+    """The smallest and the largest pixel within the radius along both axes."""
+    low, high = image, image
+    for axis in (0, 1):
+        margins = [(radius_px, radius_px) if a == axis else (0, 0) for a in (0, 1)]
+        low, high = (
+            np.lib.stride_tricks.sliding_window_view(
+                np.pad(values, margins, constant_values=end), 2 * radius_px + 1, axis
+            )
+            for values, end in ((low, np.inf), (high, -np.inf))
+        )
+        low, high = low.min(-1), high.max(-1)
+    return low, high
+
+
+def gain(work: Work, source: np.ndarray, result: np.ndarray, generator: np.random.Generator) -> float:
+    """Largest change of any pixel, in DN, for a change of 1 DN: of one pixel, and of all by random signs."""
+    one = np.zeros(source.shape, np.float32)
+    one[source.shape[0] // 2, source.shape[1] // 2] = 1
+    signs = generator.choice(np.array([-1, 1], np.float32), source.shape)
+    return max(change(work, source, result, nudge) for nudge in (one, signs))
+
+
+def change(work: Work, source: np.ndarray, result: np.ndarray, nudge: np.ndarray) -> float:
+    """Largest change of any pixel, in DN, for one of 1 DN or none at each."""
+    return float(np.abs(work(_nudged(source, nudge)) - result).max())
+
+
+def _nudged(source: np.ndarray, nudge: np.ndarray) -> np.ndarray:
+    """The source and a change of 1 DN, turned round where it would leave the converter's range."""
+    wanted = source + nudge
+    return np.asarray(np.where((wanted < 0) | (wanted > FULL_DN), source - nudge, wanted), np.float32)
+
+
+def refused(work: Callable[[], object]) -> Measure:
+    """Runs that went through where one sentence was due."""
+    try:
+        work()
+    except BeersError:
+        return Measure("not refused", 0, 0, "runs")
+    return Measure("not refused", 1, 0, "runs")
+
+
+def inside(image: np.ndarray, margin_px: int) -> np.ndarray:
+    """Without so many pixels on each side; the whole where nothing would be left."""
+    if min(image.shape) <= 2 * margin_px + 1:
+        return image
+    return image[margin_px : image.shape[0] - margin_px, margin_px : image.shape[1] - margin_px]

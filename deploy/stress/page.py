@@ -1,0 +1,71 @@
+"""The outcomes as Markdown: what `stress --out` writes and docs/stability.md shows."""
+
+from collections.abc import Sequence
+
+from deploy.results import Figure, Row, by_table
+
+TITLES = {
+    "battery": "Cases and stages",
+    "limitations": "Known limitations met",
+    "proofs": "Proven for every image",
+    "integer layers": "Integer layers",
+}
+NOTES = {
+    "battery": "`ok`: every check holds; `limit`: only what a known limitation explains does not; `-`: not looked "
+    "at, for whole numbers know no missing pixels and the others are refused before.",
+    "proofs": "Loose, but true of every image and every size. `inside` is farther from the border than the receptive "
+    "radius.",
+    "integer layers": "Intervals of whole numbers through the file's weights: true of every image.",
+}
+
+
+def title(table: str) -> str:
+    """Of a table's section."""
+    return TITLES.get(table, f"{table[:1].upper()}{table[1:]}")
+
+
+def markdown(rows: Sequence[Row]) -> str:
+    """A section for each table."""
+    parts = []
+    for table, found in by_table(rows).items():
+        parts += [f"## {title(table)}\n", *([NOTES[table], ""] if table in NOTES else []), *_table(found), ""]
+    return "\n".join(parts)
+
+
+def _table(rows: Sequence[Row]) -> list[str]:
+    keys = list(dict.fromkeys(key for row in rows for key in row.figures))
+    words = list(dict.fromkeys(word for row in rows for word in row.text))
+    lines = [_line(["", *(_head(key, rows) for key in keys), *words]), _line(["---"] * (1 + len(keys) + len(words)))]
+    for row in rows:
+        figures = [_cell(row.figures.get(key), alike=len(_kinds(key, rows)) == 1) for key in keys]
+        lines.append(_line([row.name, *figures, *(row.text.get(word, "") for word in words)]))
+    return lines
+
+
+def _kinds(key: str, rows: Sequence[Row]) -> set[str]:
+    """Unit and mode of a column's figures; a bound that is proven says so."""
+    return {_kind(row.figures[key]) for row in rows if key in row.figures}
+
+
+def _kind(figure: Figure) -> str:
+    mode = "proven" if figure.source.startswith("proven") else figure.mode
+    return f"{figure.unit}, {mode}"
+
+
+def _head(key: str, rows: Sequence[Row]) -> str:
+    kinds = _kinds(key, rows)
+    return f"{key} ({kinds.pop()})" if len(kinds) == 1 else key
+
+
+def _cell(figure: Figure | None, alike: bool) -> str:
+    if figure is None:
+        return ""
+    if figure.value is None:
+        return f"unavailable: {figure.reason}"
+    size = abs(figure.value)
+    digits = f"{figure.value:.3g}" if size >= 1e6 or 0 < size < 1e-3 else str(figure)
+    return digits if alike else f"{digits} {_kind(figure)}"
+
+
+def _line(cells: Sequence[str]) -> str:
+    return f"| {' | '.join(cell.replace('|', '/') for cell in cells)} |"

@@ -1,0 +1,128 @@
+"""What is under test: a float network and its INT8 file, opened once."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property, partial
+from pathlib import Path
+from typing import TypeVar
+
+import numpy as np
+import onnx
+import onnxruntime as ort
+
+from deploy.counterpart import is_quantised
+from deploy.defaults import float_model
+from deploy.restore import Infer
+from deploy.stress.cases import FULL_DN
+from deploy.swath.engine import restore_rows
+from deploy.swath.plan import make_plan
+from deploy.swath.raster import Raster
+from deploy.swath.reader import ArraySource
+from deploy.swath.restorer import Restorer
+from model.shipped import SHIPPED, shipped_weights
+from profiles.errors import BeersError, ModelError
+from quant.core import IntCore
+from quant.graph import Graph, correction_graph
+from quant.host_reader import read_core
+from quant.onnx_file import any_size, load_onnx
+from quant.radius import receptive_radius_px
+from quant.session import open_session, run
+
+T = TypeVar("T")
+
+WHOLE_PX = 4096
+"""A tile that no case fills."""
+
+
+@dataclass(frozen=True)
+class Network:
+    """One file: how it runs, and how far it sees."""
+
+    model: onnx.ModelProto
+
+    @cached_property
+    def radius_px(self) -> int:
+        """How far from a pixel its result depends on."""
+        return receptive_radius_px(self.model)
+
+    def infer(self, threads: int = 1) -> Infer:
+        """The network on so many threads."""
+        if threads not in self._opened:
+            self._opened[threads] = open_session(any_size(self.model), threads)
+        return partial(run, self._opened[threads])
+
+    def restore(self, image: np.ndarray, threads: int = 1, tile_px: int = WHOLE_PX) -> np.ndarray:
+        """As the product restores digital numbers (H, W): tiled, missing pixels kept, clipped, not rounded."""
+        return restore(self.infer(threads), image, self.radius_px, tile_px)
+
+    @cached_property
+    def _opened(self) -> dict[int, ort.InferenceSession]:
+        return {}
+
+
+@dataclass(frozen=True)
+class Subject:
+    """A pair of networks.
+
+    Attributes:
+        float32: the float one.
+        int8: the INT8 one, or None.
+        paths: the files they came from.
+    """
+
+    float32: Network
+    int8: Network | None
+    paths: tuple[Path, ...]
+
+    @cached_property
+    def graph(self) -> Graph | BeersError:
+        """The float network's operations, or why they cannot be told."""
+        return _or_reason(lambda: correction_graph(self.float32.model))
+
+    @cached_property
+    def core(self) -> IntCore | BeersError | None:
+        """The INT8 file's whole numbers, or why they cannot be told; None without a file."""
+        int8 = self.int8
+        return None if int8 is None else _or_reason(lambda: read_core(int8.model))
+
+
+def open_subject(float_path: Path | None, int8_path: Path | None, variant: str) -> Subject:
+    """The files given, or the shipped pair of a variant where neither is.
+
+    Raises:
+        ModelError: no such file or variant, the two swapped, or a network that cannot be tiled.
+    """
+    if float_path is None:
+        float_path, int8_path = shipped_weights(variant), SHIPPED / f"{variant}-int8.onnx"
+        int8_path = int8_path if int8_path.is_file() else None
+    float32 = Network(float_model(float_path))
+    int8 = None if int8_path is None else Network(load_onnx(int8_path))
+    for path, network, wanted in ((float_path, float32, False), (int8_path, int8, True)):
+        if network is not None and is_quantised(network.model) != wanted:
+            kinds = ("an INT8 network", "a float one") if wanted else ("a float network", "an INT8 one")
+            remedy = "give the float model first, the INT8 model second"
+            raise ModelError(str(path), expected=kinds[0], got=kinds[1], remedy=remedy)
+        if network is not None:
+            _ = network.radius_px  # refuses what cannot be tiled before anything runs
+    paths = (float_path,) if int8_path is None else (float_path, int8_path)
+    return Subject(float32, int8, paths)
+
+
+def restore(infer: Infer, image: np.ndarray, radius_px: int, tile_px: int = WHOLE_PX) -> np.ndarray:
+    """The product's own way from digital numbers (H, W) to restored ones, float32, not rounded."""
+    pixels = np.asarray(image, np.float32)[None]
+    height_px, width_px = image.shape
+    raster = Raster(1, height_px, width_px, pixels.dtype)
+    plan = make_plan(raster, tile_px, radius_px, radius_px)
+    restorer = Restorer(raster, infer, float(FULL_DN), radius_px, "case")
+    result = np.empty_like(pixels)
+    for row, kept, _ in restore_rows(ArraySource(pixels, raster), plan, restorer, plan.rows, lambda: None):
+        result[:, row.keep_start : row.keep_stop] = kept
+    return np.asarray(result[0])
+
+
+def _or_reason(work: Callable[[], T]) -> T | BeersError:
+    try:
+        return work()
+    except BeersError as error:
+        return error

@@ -1,0 +1,112 @@
+"""What a page of a stranger's TIFF could make a decoder do, looked for before its pixels are decoded.
+
+A tile's size is only a number in the file; a JPEG within has a header of its own; packed bytes may unpack to a
+thousand times as many. None of that is believed here.
+"""
+
+import math
+import zlib
+from collections.abc import Iterator
+from importlib.util import find_spec
+from pathlib import Path
+
+import psutil
+import tifffile
+
+from profiles.errors import ImageError, MachineError
+
+NONE, LZW, JPEG, DEFLATE, PACKBITS, ZSTD = 1, 5, 7, (8, 32946), 32773, 50000
+KNOWN = {NONE, LZW, JPEG, *DEFLATE, PACKBITS, ZSTD}
+"""Compressions, by TIFF's numbers. The others' decoders take their sizes from the packed bytes."""
+PIECE_BYTES = 1 << 20
+MARKER, FRAMES = 0xFF, set(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
+
+
+def check_page(path: Path, page: tifffile.TiffPage) -> None:
+    """Refuse a page that would take more than its pixels do.
+
+    Raises:
+        ImageError: a file cut short, a compression that is not known here, or packed bytes of more pixels than their
+            place has.
+        MachineError: a strip or tile that does not fit in memory.
+    """
+    if page.compression not in KNOWN:
+        got, remedy = str(tifffile.COMPRESSION(page.compression).name), "write it with deflate, LZW or zstd"
+        raise ImageError(str(path), expected="a TIFF compression known here", got=got, remedy=remedy)
+    needed, free = segment_bytes(page), psutil.virtual_memory().available
+    if needed > free:
+        expected, got = f"strips or tiles that fit in {free / 1e9:.1f} GB", f"{needed / 1e9:.1f} GB for one"
+        raise MachineError(str(path), expected=expected, got=got, remedy="rewrite it in smaller tiles")
+    _check_whole(path, page)
+    if page.compression == JPEG:
+        _check_frames(path, page)
+    elif page.compression in DEFLATE and find_spec("imagecodecs") is None:
+        _check_unpacked(path, page)
+
+
+def segment_bytes(page: tifffile.TiffPage) -> int:
+    """Bytes of one decoded strip or tile, as the file sizes it."""
+    samples = page.samplesperpixel if page.planarconfig == 1 else 1
+    return math.prod(_place_px(page)) * max(page.tiledepth, 1) * samples * max(page.bitspersample // 8, 1)
+
+
+def _check_whole(path: Path, page: tifffile.TiffPage) -> None:
+    """Reading beyond the end would take the memory first, and find out then."""
+    ends = (a + n for a, n in zip(page.dataoffsets, page.databytecounts, strict=True))
+    end, size = max(ends, default=0), path.stat().st_size
+    if end > size:
+        got, remedy = f"a file cut short at {size} of {end} bytes", "copy it again"
+        raise ImageError(str(path), expected="a whole TIFF", got=got, remedy=remedy)
+
+
+def _place_px(page: tifffile.TiffPage) -> tuple[int, int]:
+    """Height and width of a strip or tile."""
+    if page.is_tiled:
+        return page.tilelength, page.tilewidth
+    return min(page.rowsperstrip, page.imagelength), page.imagewidth
+
+
+def _segments(page: tifffile.TiffPage) -> Iterator[bytes]:
+    for segment in page.parent.filehandle.read_segments(page.dataoffsets, page.databytecounts):
+        if isinstance(segment, tuple) and segment[0] is not None:
+            yield segment[0]
+
+
+def _check_frames(path: Path, page: tifffile.TiffPage) -> None:
+    place = _place_px(page)
+    for data in _segments(page):
+        size = jpeg_size_px(data)
+        if size is None:
+            got, remedy = "a damaged one", "copy or convert it again"
+            raise ImageError(str(path), expected="JPEGs with a frame header", got=got, remedy=remedy)
+        if size[0] > place[0] or size[1] > place[1]:
+            raise _swollen(path, f"a JPEG of {size[0]} x {size[1]} pixels in a place of {place[0]} x {place[1]}")
+
+
+def jpeg_size_px(data: bytes) -> tuple[int, int] | None:
+    """Height and width in a JPEG's own header; None where no frame (marker C0 to CF but C4, C8, CC) comes first."""
+    at = 2
+    while at + 9 <= len(data) and data[at] == MARKER:
+        kind = data[at + 1]
+        if kind in FRAMES:
+            return int.from_bytes(data[at + 5 : at + 7]), int.from_bytes(data[at + 7 : at + 9])
+        # a fill byte, or a piece with its length
+        at += 1 if kind == MARKER else 2 + int.from_bytes(data[at + 2 : at + 4])
+    return None
+
+
+def _check_unpacked(path: Path, page: tifffile.TiffPage) -> None:
+    """Without imagecodecs, tifffile unpacks however much there is."""
+    limit = segment_bytes(page) + PIECE_BYTES
+    for data in _segments(page):
+        unpacker, total = zlib.decompressobj(), 0
+        while data and not unpacker.eof:
+            total += len(unpacker.decompress(data, PIECE_BYTES))
+            data = unpacker.unconsumed_tail
+            if total > limit:
+                raise _swollen(path, f"{len(data)} bytes that unpack to more than {total}")
+
+
+def _swollen(path: Path, got: str) -> ImageError:
+    remedy = "copy or write it again"
+    return ImageError(str(path), expected="strips and tiles no larger than their place", got=got, remedy=remedy)

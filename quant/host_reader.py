@@ -1,0 +1,78 @@
+"""The integer core of a host file, read back: what `quant.host_file` wrote, as numbers to reason about."""
+
+import numpy as np
+import onnx
+from onnx import numpy_helper
+
+from profiles.errors import ModelError
+from quant.core import IntConv, IntCore
+from quant.graph import CORRECTION, Add
+from quant.host_file import ZERO
+from quant.planes import PLANES
+
+
+def read_core(model: onnx.ModelProto) -> IntCore:
+    """The core of an INT8 file of the legal regime, its int32 bias at the accumulator's own position.
+
+    Raises:
+        ModelError: another spelling, float scales, or asymmetric numbers.
+    """
+    reader = _Reader(model)
+    for node in model.graph.node:
+        if node.op_type == "QLinearConv":
+            reader.conv(node)
+        elif node.op_type == "QLinearAdd":
+            reader.add(node)
+        elif node.op_type == "Max":
+            reader.relu(node)
+    if not reader.ops or PLANES not in reader.positions or CORRECTION not in reader.positions:
+        raise _refuse("no such core")
+    return IntCore(tuple(reader.ops), reader.positions)
+
+
+class _Reader:
+    """Collects operations and positions."""
+
+    def __init__(self, model: onnx.ModelProto) -> None:
+        self._values = {t.name: numpy_helper.to_array(t) for t in model.graph.initializer}
+        self.ops: list[IntConv | Add] = []
+        self.positions: dict[str, int] = {}
+
+    def conv(self, node: onnx.NodeProto) -> None:
+        source, *_, bias = node.input
+        weight, position = self._value(node.input[3]), self._position(node.input[4], node.input[5], 0)
+        self.positions[source] = self._position(node.input[1], node.input[2], ZERO)
+        self.positions[node.output[0]] = self._position(node.input[6], node.input[7], ZERO)
+        whole, product = self._value(bias).astype(np.int64), position + self.positions[source]
+        self.ops.append(IntConv(node.name, source, node.output[0], weight, position, whole, product, False))
+
+    def add(self, node: onnx.NodeProto) -> None:
+        for name, scale, zero in ((node.input[0], 1, 2), (node.input[3], 4, 5), (node.output[0], 6, 7)):
+            self.positions[name] = self._position(node.input[scale], node.input[zero], ZERO)
+        self.ops.append(Add(node.name, (node.input[0], node.input[3]), node.output[0]))
+
+    def relu(self, node: onnx.NodeProto) -> None:
+        """The larger of a value and the zero point; it becomes part of the convolution."""
+        last = self.ops[-1] if self.ops else None
+        if not isinstance(last, IntConv) or last.output != node.input[0]:
+            return
+        self.ops[-1] = IntConv(**{**vars(last), "output": node.output[0], "relu": True})
+        self.positions[node.output[0]] = self.positions.pop(last.output)
+
+    def _value(self, name: str) -> np.ndarray:
+        if name not in self._values:
+            raise _refuse(f"no constant {name}")
+        return self._values[name]
+
+    def _position(self, scale: str, zero: str, symmetric: int) -> int:
+        """Of a power-of-two scale around the middle."""
+        unit, middle = self._value(scale), self._value(zero)
+        mantissa, exponent = np.frexp(unit.ravel()[:1].astype(np.float64))
+        if unit.size != 1 or mantissa[0] != 0.5 or int(middle.ravel()[0]) != symmetric:
+            raise _refuse(f"scale {float(unit.ravel()[0]):g}, zero point {int(middle.ravel()[0])}")
+        return 1 - int(exponent[0])
+
+
+def _refuse(got: str) -> ModelError:
+    remedy = "make it with 'beers-deploy quantize --regime legal'"
+    return ModelError("INT8 core", expected="power-of-two scales, symmetric, from planes", got=got, remedy=remedy)

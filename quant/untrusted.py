@@ -1,0 +1,122 @@
+"""Whether an ONNX file holds what it states: looked at before anything else believes it.
+
+A stranger's file may name other files to be opened, state sizes that no memory holds, or lack the values it counts.
+What it may do once a runtime has it is the matter of `quant.runnable`.
+"""
+
+import math
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+
+import onnx
+from onnx import TensorProto
+
+from profiles.errors import ModelError
+
+FILE_BYTES = 1 << 30
+VALUES = 1 << 28
+"""Of one tensor that a file sizes without holding it: 1 GiB of float32."""
+RANK = 16
+
+FIELDS: dict[int, tuple[int, str]] = {
+    TensorProto.FLOAT: (4, "float_data"),
+    TensorProto.DOUBLE: (8, "double_data"),
+    TensorProto.INT32: (4, "int32_data"),
+    TensorProto.INT64: (8, "int64_data"),
+    TensorProto.UINT32: (4, "uint64_data"),
+    TensorProto.UINT64: (8, "uint64_data"),
+}
+"""Bytes of a value, and where a tensor keeps values that are not raw bytes."""
+FIELDS |= dict.fromkeys((TensorProto.BOOL, TensorProto.INT8, TensorProto.UINT8), (1, "int32_data"))
+SHORT = (TensorProto.FLOAT16, TensorProto.BFLOAT16, TensorProto.INT16, TensorProto.UINT16)
+FIELDS |= dict.fromkeys(SHORT, (2, "int32_data"))
+
+
+def check_content(model: onnx.ModelProto, where: str) -> None:
+    """Refuse a model that does not hold what it states.
+
+    Raises:
+        ModelError: no input or output; sizes that cannot be; values elsewhere, missing or of another type.
+    """
+    graph = model.graph
+    held = {tensor.name for tensor in graph.initializer}
+    if all(value.name in held for value in graph.input) or not graph.output:
+        raise refused(where, "a network with an input and an output", "none", "export the network again")
+    for value in (*graph.input, *graph.output, *graph.value_info):
+        check_size(value.name, [d.dim_value for d in value.type.tensor_type.shape.dim], where)
+    for tensor in _tensors(graph):
+        _check_tensor(tensor, where)
+
+
+@contextmanager
+def contradictions(where: str) -> Iterator[None]:
+    """One sentence for whatever a graph leads to whose nodes lack inputs, or have sizes that cannot be.
+
+    Raises:
+        ModelError: such a graph.
+    """
+    try:
+        yield
+    except (ArithmeticError, AttributeError, LookupError, RecursionError, TypeError, ValueError) as error:
+        got = f"nodes that contradict it ({' '.join(str(error).split())[:80]})"
+        remedy = "check the file with onnx.checker, and export it again"
+        raise refused(where, "nodes as ONNX defines them", got, remedy) from error
+
+
+def check_size(name: str, sizes: Iterable[float], where: str) -> None:
+    """Refuse a tensor that a file sizes beyond reason; 0 and -1 stand for sizes left open.
+
+    Raises:
+        ModelError: such a size.
+    """
+    sizes = list(sizes)
+    rank = len(sizes) <= RANK
+    if not (rank and min(sizes, default=0) >= -1 and math.prod(max(size, 1) for size in sizes) <= VALUES):
+        got = f"{name!r} of {times(sizes)}"
+        raise refused(where, f"tensors of at most {VALUES} values", got, "export the network again")
+
+
+def times(sizes: Iterable[float]) -> str:
+    """Sizes as a person writes them: 64 x 3 x 3."""
+    return " x ".join(f"{size:.12g}" for size in sizes)
+
+
+def refused(where: str, expected: str, got: str, remedy: str) -> ModelError:
+    """What is raised of a file."""
+    return ModelError(where, expected=expected, got=got, remedy=remedy)
+
+
+def _tensors(graph: onnx.GraphProto) -> Iterator[TensorProto]:
+    """Every constant, also of graphs within; protobuf itself ends their nesting at a hundred."""
+    yield from graph.initializer
+    for sparse in graph.sparse_initializer:
+        yield from (sparse.values, sparse.indices)
+    for attribute in (a for node in graph.node for a in node.attribute):
+        yield from (*([attribute.t] if attribute.HasField("t") else []), *attribute.tensors)
+        for inner in (*([attribute.g] if attribute.HasField("g") else []), *attribute.graphs):
+            yield from _tensors(inner)
+
+
+def _check_tensor(tensor: TensorProto, where: str) -> None:
+    _check_place_and_type(tensor, where)
+    value_bytes, field = FIELDS[tensor.data_type]
+    if len(tensor.dims) > RANK or min(tensor.dims, default=0) < 0:
+        got = f"{tensor.name!r} of {times(tensor.dims)}"
+        raise refused(where, f"at most {RANK} sizes from 0 on", got, "export it again")
+    stated = math.prod(tensor.dims)
+    raw = tensor.HasField("raw_data")
+    present = len(tensor.raw_data) / value_bytes if raw else len(getattr(tensor, field))
+    if stated != present:
+        got = f"{tensor.name!r} of {times(tensor.dims)} values that holds {present:g}"
+        raise refused(where, "weights as many as it states", got, "copy or export it again")
+
+
+def _check_place_and_type(tensor: TensorProto, where: str) -> None:
+    if tensor.data_location == TensorProto.EXTERNAL or tensor.external_data:
+        place = next((entry.value for entry in tensor.external_data if entry.key == "location"), "no place")
+        got = f"{tensor.name!r} kept in another file, {place!r}"
+        raise refused(where, "one self-contained ONNX file", got, "save it as one file")
+    if tensor.data_type not in FIELDS:
+        known = TensorProto.DataType.values()
+        kind = TensorProto.DataType.Name(tensor.data_type) if tensor.data_type in known else f"{tensor.data_type}"
+        raise refused(where, "weights of plain numbers", f"{tensor.name!r} of type {kind}", "convert them")

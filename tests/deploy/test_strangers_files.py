@@ -1,0 +1,211 @@
+"""Documents, weights and folders that others wrote, each once the end of a run: now a sentence, or no matter."""
+
+import io
+import json
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from typer.testing import CliRunner
+
+from deploy.cli import app
+from deploy.dataset import _read_summary
+from deploy.dpu.board import load_dpu
+from deploy.gate import baseline_mae
+from deploy.refit import refit
+from deploy.results import Document, Row, measured
+from deploy.swath.spool import Spool, part_folder
+from deploy.tradeoff.cache import Cache, digest_of
+from deploy.tradeoff.host_time import Times
+from deploy.training import Log
+from model.metrics.backbone_files import read_tensors
+from model.weights_file import load_network, write_tensors
+from model.weights_file import read_tensors as read_weights
+from profiles.errors import ModelError, OptionError, ProfileError
+from profiles.toml import HERE
+from quant.limits import read_limits
+from tests.fuzz.parsers import JOB, SHAPE, checkpoint_seeds, go_on, weights_seeds
+
+runner = CliRunner()
+
+
+def document(path: Path, value: object, name: str = "int8") -> Path:
+    """Results with one figure of any value."""
+    made = Document("gate", {}, (), (Row("gate", name, {"MAE": measured(1.0, "", "here")}),)).to_json()
+    path.write_text(json.dumps(made).replace('"value": 1.0', f'"value": {value}'))
+    return path
+
+
+@pytest.mark.parametrize("value", ["NaN", "Infinity", "1e999", "1" + "0" * 400, "9" * 5000, "[" * 100_000])
+def test_figures_that_are_no_numbers_are_refused(value: str, tmp_path: Path) -> None:
+    path = document(tmp_path / "a.json", value)
+    with pytest.raises(OptionError, match=r"a\.json"):
+        baseline_mae(path)
+    result = runner.invoke(app, ["compare", str(document(tmp_path / "b.json", 2.0)), str(path)])
+    assert result.exit_code == 2, result.output
+    assert result.stderr.strip().count("\n") == 0
+
+
+def test_a_name_that_no_terminal_prints_is_refused(tmp_path: Path) -> None:
+    path = document(tmp_path / "a.json", 1.0)
+    path.write_text(path.read_text().replace("int8", "\\ud800"))
+    assert runner.invoke(app, ["compare", str(path), str(path)]).exit_code == 2
+
+
+@pytest.mark.parametrize("value", ["0x" + "f" * 400, "-1", "nan", "true", "[1]", "'a'"])
+def test_limits_that_are_no_numbers_are_refused(value: str, tmp_path: Path) -> None:
+    (tmp_path / "gate.toml").write_text(f"mae = {value}")
+    with pytest.raises(OptionError, match="mae"):
+        read_limits(tmp_path / "gate.toml", None)
+
+
+def test_a_limit_may_be_infinite(tmp_path: Path) -> None:
+    (tmp_path / "gate.toml").write_text("mae_growth = inf")
+    assert read_limits(tmp_path / "gate.toml", None).mae_growth == float("inf")
+
+
+@pytest.mark.parametrize(
+    "run",
+    [{"fps": 1e-300}, {"tile_px": 10**300}, {"tile_px": 1 << 20}, {"fps": float("inf")}, {"network": "\ud800"}],
+)
+def test_runs_of_a_board_beyond_reason_are_refused(run: dict[str, object], tmp_path: Path) -> None:
+    sound = {"network": "resnet-50", "configuration": "C32B3", "tile_px": 640, "fps": 95.0}
+    path = tmp_path / "runs.json"
+    path.write_text(json.dumps([sound]))
+    refit(path, load_dpu())
+    for runs in ([{**sound, **run}], [sound] * 1001):
+        path.write_text(json.dumps(runs))
+        with pytest.raises(OptionError):
+            refit(path, load_dpu())
+
+
+@pytest.mark.parametrize(
+    "variant",
+    [{"blocks": 10**9, "features": 2}, {"blocks": 1, "features": 10**6}, {"blocks": 10**400, "features": 2}],
+)
+def test_a_header_of_weights_takes_no_memory(variant: dict[str, int], tmp_path: Path) -> None:
+    write_tensors(tmp_path / "w.safetensors", {"head.weight": torch.zeros(2, 1, 3, 3)}, {"variant": variant})
+    with pytest.raises(ModelError):
+        load_network(tmp_path / "w.safetensors")
+
+
+def test_a_deep_header_is_refused(tmp_path: Path) -> None:
+    content = json.dumps({"__metadata__": {"variant": "[" * 50_000}}).encode()
+    (tmp_path / "w.safetensors").write_bytes(len(content).to_bytes(8, "little") + content)
+    with pytest.raises(ModelError, match="nesting"):
+        load_network(tmp_path / "w.safetensors")
+
+
+def test_weights_that_are_not_finite_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "w.safetensors"
+    path.write_bytes(weights_seeds(tmp_path)[0])
+    tensors, header = read_weights(path)
+    tensors["tail.bias"][0] = float("nan")
+    write_tensors(path, tensors, header)
+    with pytest.raises(ModelError, match="not finite"):
+        load_network(path)
+
+
+@pytest.mark.parametrize(
+    ("line", "changed"),
+    [
+        ("\ncpb = {", "\ncpbb = {"),
+        ("\nbatch_handlers = { value = 3,", "\nbatch_handlers = { value = 0,"),
+        ("\nweight_bank_width = {", "\nmine = 0\nweight_bank_width = {"),
+    ],
+)
+def test_a_target_with_constants_that_no_board_has_is_refused(line: str, changed: str, tmp_path: Path) -> None:
+    shipped = (HERE / "targets" / "vck190.toml").read_text(encoding="utf-8")
+    assert line in shipped
+    path = tmp_path / "mine.toml"
+    path.write_text(shipped)
+    load_dpu(str(path))
+    path.write_text(shipped.replace(line, changed))
+    with pytest.raises(ProfileError, match="a board can have"):
+        load_dpu(str(path))
+
+
+Spoil = Callable[[dict[str, torch.Tensor]], object]
+
+
+@pytest.mark.parametrize(
+    "spoil",
+    [
+        lambda t: t.pop("average.tail.bias"),
+        lambda t: t.update({"average.other": torch.zeros(1)}),
+        lambda t: t.update({"average.tail.bias": torch.zeros(7)}),
+        lambda t: t.update({"moment.tail.bias.exp_avg": torch.zeros(3, 1)}),
+        lambda t: t.pop("moment.tail.bias.exp_avg"),
+        lambda t: t.update({"moment.tail.bias.mine": torch.zeros(1)}),
+        lambda t: t.update({"moment.nobody.step": torch.zeros(())}),
+        lambda t: t.update({"network.tail.bias": torch.full((1,), float("nan"))}),
+    ],
+)
+def test_a_spoilt_checkpoint_is_refused(spoil: Spoil, tmp_path: Path) -> None:
+    path = tmp_path / "c.safetensors"
+    path.write_bytes(checkpoint_seeds(tmp_path)[1])
+    go_on(path)
+    tensors, header = read_weights(path)
+    spoil(tensors)
+    write_tensors(path, tensors, header)
+    with pytest.raises(ModelError, match="checkpoint of this network"):
+        go_on(path)
+
+
+def archive(path: Path, content: bytes) -> Path:
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as file:
+        file.writestr("a.npy", content)
+    return path
+
+
+def test_an_array_larger_than_its_archive_is_refused(tmp_path: Path) -> None:
+    stream = io.BytesIO()
+    np.save(stream, np.ones((2, 3), np.float32))
+    assert read_tensors(archive(tmp_path / "a.npz", stream.getvalue()), ["a"])["a"].shape == (2, 3)
+    stated: dict[str, object] = {"descr": "<f4", "fortran_order": False, "shape": (1 << 40,)}
+    np.lib.format.write_array_header_1_0(head := io.BytesIO(), stated)
+    with pytest.raises(ModelError, match="arrays"):
+        read_tensors(archive(tmp_path / "b.npz", head.getvalue() + bytes(24)), ["a"])
+
+
+@pytest.mark.parametrize("journal", [[], 3, {"rows": 10**9}, {"rows": -1}, {"known": -5}, {"rows": None}, {"job": 1}])
+def test_a_journal_that_counts_rows_that_are_not_there_is_refused(journal: object, tmp_path: Path) -> None:
+    out = tmp_path / "out.tif"
+    part_folder(out).mkdir()
+    sound = {"job": JOB, "rows": 4, "known": 32}
+    path = part_folder(out) / "journal.json"
+    path.write_text(json.dumps({**sound, **journal} if isinstance(journal, dict) else journal))
+    with pytest.raises(OptionError, match="--resume"):
+        Spool(out, SHAPE, np.dtype(np.uint16), JOB, resume=True)
+    path.write_text(json.dumps(sound))
+    assert Spool(out, SHAPE, np.dtype(np.uint16), JOB, resume=True).rows == 4
+
+
+@pytest.mark.parametrize("line", ["", "{}", "[]", "3", "[" * 5000, '{"degraded": {"rejected_snr_pairs": "x"}}'])
+def test_a_manifest_that_is_none_is_refused(line: str, tmp_path: Path) -> None:
+    (tmp_path / "manifest.jsonl").write_text(line + "\n")
+    with pytest.raises(OptionError, match="manifest"):
+        _read_summary(tmp_path / "manifest.jsonl")
+
+
+@pytest.mark.parametrize("pixels", ["Infinity", "NaN", "9" * 5000, "[" * 100_000])
+def test_a_damaged_measurement_is_measured_again(pixels: str, tmp_path: Path) -> None:
+    cache, value = Cache(tmp_path), {"session": "1", "wall_s": [1.0], "cpu_s": [1.0], "pixels": 7}
+    stored = json.dumps({"value": value, "sha256": digest_of(value)})
+    cache.path("times", {}).write_text(stored)
+    assert cache.find("times", {}, Times) is not None
+    cache.path("times", {}).write_text(stored.replace("7", pixels, 1))
+    assert cache.find("times", {}, Times) is None
+
+
+def test_a_log_with_strange_lines_is_gone_on_with(tmp_path: Path) -> None:
+    path = tmp_path / "log.csv"
+    path.write_bytes("step,loss\n1,0.5\n²,1\n12abc\n30,2\n".encode() + b"\xff\xfe\n" + b"9" * 5000 + b",1\n")
+    Log(path, 20).write(21, {"loss": 0.25})
+    lines = path.read_text().splitlines()
+    assert lines[:2] == ["step,loss", "1,0.5"]
+    assert "30,2" not in lines
+    assert lines[-1] == "21,0.25"

@@ -1,0 +1,239 @@
+"""Damage to the bytes of a file, and to what its format means by them; all of it drawn from one generator."""
+
+import json
+import struct
+import zlib
+from collections.abc import Callable, Sequence
+
+import numpy as np
+import onnx
+from google.protobuf.message import DecodeError, Message
+
+Rng = np.random.Generator
+Mutate = Callable[[bytes, Rng], bytes]
+
+NUMBERS = (
+    0,
+    1,
+    -1,
+    2,
+    7,
+    8,
+    127,
+    128,
+    255,
+    256,
+    1000,
+    32767,
+    65535,
+    65536,
+    10**6,
+    2**31 - 1,
+    2**31,
+    2**32 - 1,
+    2**62,
+)
+TEXTS = (
+    "", "a", "\0", "\n", "../../x", "/etc/passwd", "1e999", "NaN", "\ud800", "é", "a" * 5000, "9" * 5000, "%s%n",
+    "com.microsoft", "If", "Loop", "Conv", "image",
+)  # fmt: skip
+TOKENS = (
+    b"\0", b"\n", b'"', b"[", b"]", b"{", b"}", b"=", b".", b",", b"-", b"inf", b"nan", b"1e999", b"0x" + b"f" * 600,
+    b"9" * 5000, b"[" * 400, b"{\"a\":" * 400, b"a." * 90, b"\xff\xff\xff\xff", b"\\ud800", b"true", b"null", b"'''",
+)  # fmt: skip
+
+
+def damaged(content: bytes, others: Sequence[bytes], meaning: Mutate | None, rng: Rng) -> bytes:
+    """A few faults, one after another: of the bytes, or (where the format is known) of what they mean."""
+    for _ in range(int(rng.geometric(0.6))):
+        if meaning is not None and rng.random() < 0.6:
+            content = meaning(content, rng)
+        else:
+            content = of_bytes(content, others, rng)
+    return content[: 1 << 18]
+
+
+def of_bytes(content: bytes, others: Sequence[bytes], rng: Rng) -> bytes:
+    """Flip, overwrite, insert, cut out, repeat or cut off bytes, or take some from another file."""
+    a, b = sorted(int(rng.integers(0, len(content) + 1)) for _ in range(2))
+    b = min(b, a + int(2 ** rng.uniform(0, 10)))
+    other = others[int(rng.integers(len(others)))]
+    c = int(rng.integers(0, len(other) + 1))
+    number = NUMBERS[int(rng.integers(len(NUMBERS)))]
+    order, width = ("<>"[int(rng.integers(2))], int(rng.integers(4)))
+    packed = struct.pack(f"{order}{'BHIQ'[width]}", number % 2 ** (8 << width))
+    token = TOKENS[int(rng.integers(len(TOKENS)))]
+    flipped = bytes([content[a] ^ (1 << int(rng.integers(8)))]) if a < len(content) else b""
+    choices = (
+        content[:a] + flipped + content[a + 1 :],
+        content[:a] + rng.bytes(1) + content[a + 1 :],
+        content[:a] + packed + content[a + len(packed) :],
+        content[:a] + token + content[a:],
+        content[:a] + rng.bytes(b - a) + content[a:],
+        content[:a] + content[b:],
+        content[:b] + content[a:b] * int(rng.integers(1, 30)) + content[b:],
+        content[:a] + other[c : c + b - a] + content[b:],
+        content[:a],
+    )
+    return choices[int(rng.integers(len(choices)))]
+
+
+def of_json(content: bytes, rng: Rng) -> bytes:
+    """Change one value of a document, or its place; as it was where it is no document any more."""
+    try:
+        return json.dumps(_tree(json.loads(content), rng)).encode("utf-8", "surrogatepass")
+    except (ValueError, RecursionError):
+        return content
+
+
+def of_safetensors(content: bytes, rng: Rng) -> bytes:
+    """Change the header, or the JSON within its metadata, and its length with it."""
+    size = int.from_bytes(content[:8], "little")
+    header = of_json(content[8 : 8 + size], rng)
+    if rng.random() < 0.5:
+        try:
+            tree = json.loads(header)
+            inner = tree["__metadata__"]
+            key = sorted(inner)[int(rng.integers(len(inner)))]
+            inner[key] = of_json(inner[key].encode(), rng).decode()
+            header = json.dumps(tree).encode()
+        except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
+            pass
+    return len(header).to_bytes(8, "little") + header + content[8 + size :]
+
+
+def of_png(content: bytes, rng: Rng) -> bytes:
+    """Change a chunk's kind or bytes, and its checksum with them."""
+    chunks, at = [], 8
+    while at + 12 <= len(content):
+        size = int.from_bytes(content[at : at + 4])
+        chunks.append(content[at + 4 : at + 8 + size])
+        at += 12 + size
+    if not chunks:
+        return content
+    place = int(rng.integers(len(chunks)))
+    chunks[place] = of_bytes(chunks[place], chunks, rng)
+    if rng.random() < 0.1:
+        chunks.insert(place, chunks[int(rng.integers(len(chunks)))])
+    packed = (len(c[4:]).to_bytes(4) + c + zlib.crc32(c).to_bytes(4) for c in chunks if len(c) >= 4)
+    return content[:8] + b"".join(packed)
+
+
+def of_tiff(content: bytes, rng: Rng) -> bytes:
+    """Change tag, type, count or value of an entry of the first directory (classic and little-endian)."""
+    if content[:4] != b"II*\0" or len(content) < 8:
+        return content
+    start = int.from_bytes(content[4:8], "little")
+    count = int.from_bytes(content[start : start + 2], "little")
+    if not 0 < count < 100:
+        return content
+    at = start + 2 + 12 * int(rng.integers(count))
+    field, width = ((0, 2), (2, 2), (4, 4), (8, 4))[int(rng.choice(4, p=(0.1, 0.1, 0.2, 0.6)))]
+    number = NUMBERS[int(rng.integers(len(NUMBERS)))] if rng.random() < 0.7 else int(rng.integers(70_000))
+    value = (number % 2 ** (8 * width)).to_bytes(width, "little")
+    if field == 0 and rng.random() < 0.5:
+        value = int(rng.choice((256, 257, 258, 259, 277, 278, 284, 317, 322, 323, 330, 339, 50838))).to_bytes(
+            2, "little"
+        )
+    return b"".join((content[: at + field], value, content[at + field + width :]))
+
+
+def of_onnx(content: bytes, rng: Rng) -> bytes:
+    """Change one field somewhere in a model; as it was where it is no model any more."""
+    model = onnx.ModelProto()
+    try:
+        model.ParseFromString(content)
+        _field(model, rng)
+        return bytes(model.SerializeToString())
+    except (DecodeError, ValueError, TypeError):
+        return content
+
+
+def _field(message: Message, rng: Rng) -> None:
+    """Walk down at random, and change what is met at the end."""
+    fields = [pair for pair in message.ListFields() if rng.random() < 0.8]
+    if not fields or rng.random() < 0.05:
+        everything = message.DESCRIPTOR.fields
+        _set(message, everything[int(rng.integers(len(everything)))], rng)
+        return
+    descriptor, value = fields[int(rng.integers(len(fields)))]
+    if not descriptor.is_repeated:
+        if isinstance(value, Message):
+            _field(value, rng)
+        else:
+            _set(message, descriptor, rng)
+        return
+    place, kind = int(rng.integers(len(value))), rng.random()
+    if kind < 0.1:
+        del value[place]
+    elif kind < 0.2:
+        value.extend([value[place]])
+    elif isinstance(value[place], Message):
+        _field(value[place], rng)
+    else:
+        value[place] = _like(value[place], rng)
+
+
+def _set(message: Message, descriptor: object, rng: Rng) -> None:
+    """A field that was there or not; groups of fields are left empty but present."""
+    name, kind = descriptor.name, descriptor.cpp_type  # type: ignore[attr-defined]
+    if descriptor.is_repeated or kind == 10:  # type: ignore[attr-defined]  # 10: a message
+        value = getattr(message, name)
+        if kind == 10:
+            value.add() if descriptor.is_repeated else value.SetInParent()  # type: ignore[attr-defined]
+        return
+    old = getattr(message, name)
+    setattr(message, name, int(rng.integers(0, 30)) if kind == 8 else _like(old, rng))  # 8: an enumeration
+
+
+def _like(value: object, rng: Rng) -> object:
+    if isinstance(value, int):
+        return int(NUMBERS[int(rng.integers(len(NUMBERS)))])
+    if isinstance(value, float):
+        return float(rng.choice((0.0, -1.0, 1e38, np.inf, np.nan, 1e-40)))
+    text = TEXTS[int(rng.integers(len(TEXTS)))]
+    if isinstance(value, bytes):
+        return of_bytes(value, [value], rng)
+    return text.encode("utf-8", "ignore").decode()
+
+
+def _tree(value: object, rng: Rng) -> object:
+    """A document with one value changed, dropped, repeated or wrapped up."""
+    if isinstance(value, dict) and value and rng.random() < 0.85:
+        key = list(value)[int(rng.integers(len(value)))]
+        kind = rng.random()
+        if kind < 0.1:
+            return {name: inner for name, inner in value.items() if name != key}
+        if kind < 0.2:
+            return {**value, TEXTS[int(rng.integers(len(TEXTS)))]: value[key]}
+        return {**value, key: _tree(value[key], rng)}
+    if isinstance(value, list) and value and rng.random() < 0.85:
+        place = int(rng.integers(len(value)))
+        kind = rng.random()
+        if kind < 0.2:
+            return value[:place] + value[place + 1 :] if kind < 0.1 else value + value[place:]
+        return [*value[:place], _tree(value[place], rng), *value[place + 1 :]]
+    return _leaf(value, rng)
+
+
+def _leaf(value: object, rng: Rng) -> object:
+    nested: object = value
+    for _ in range(int(rng.choice((1, 40, 400)))):
+        nested = [nested]
+    others: tuple[object, ...] = (
+        None,
+        True,
+        [],
+        {},
+        "",
+        -1,
+        0,
+        1e308,
+        float("nan"),
+        float("inf"),
+        10**400,
+        2**63,
+        nested,
+    )
+    texts = TEXTS[int(rng.integers(len(TEXTS)))]
+    return (*others, texts)[int(rng.integers(len(others) + 1))]

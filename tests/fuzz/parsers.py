@@ -1,0 +1,317 @@
+"""Every parser of files that others wrote, with small valid files to damage."""
+
+import io
+import json
+import shutil
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cache, partial
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+import onnx
+import tifffile
+import torch
+from PIL import Image
+
+from deploy.compare import change_rows, compare, read_document
+from deploy.dataset import _read_summary
+from deploy.dpu.board import load_dpu
+from deploy.dpu.graph import Network
+from deploy.dpu.placement import place
+from deploy.dpu.rates import Layers
+from deploy.dpu.reading import read_network
+from deploy.dpu.work import count_work
+from deploy.gate import baseline_mae
+from deploy.refit import refit
+from deploy.results import Document, Figure, Row, measured, predicted, unavailable
+from deploy.swath.reader import open_source
+from deploy.swath.spool import Spool, part_folder
+from deploy.tables import by_row, cell
+from deploy.tradeoff.accuracy import Scores
+from deploy.tradeoff.cache import Cache, Keepable
+from deploy.tradeoff.host_time import Times
+from deploy.training import Log
+from model.convbeers import ConvBEERS, Variant
+from model.images import read_pixels
+from model.metrics.backbone_files import read_tensors
+from model.training.checkpoint import read_checkpoint, write_checkpoint
+from model.training.guards import Guards
+from model.training.recipe import TrainingRecipe
+from model.weights_file import load_network, save_network
+from profiles import load_sensor, load_target
+from profiles.errors import BeersError
+from profiles.scene_call import load_scene_call
+from quant.graph import correction_graph
+from quant.limits import read_limits
+from quant.onnx_file import fixed_tile_px, load_onnx
+from quant.radius import receptive_radius_px
+from quant.session import open_any_size, open_session, run
+from tests.deploy.dpu.graphs import board_convbeers, float_convbeers, integer_convbeers
+from tests.fuzz.mutation import Mutate, of_json, of_onnx, of_png, of_safetensors, of_tiff
+
+ROOT = Path(__file__).parents[2]
+SIDE_PX = 16
+RECIPE = TrainingRecipe(steps=10)
+SMALL = Variant(1, 2)
+JOB: dict[str, object] = {"image": [1, "a", 2], "model": "b", "tile_px": 64, "halo_px": 4, "full_scale": 4095.0}
+SHAPE = (1, 8, 8)
+
+
+@dataclass(frozen=True)
+class Parser:
+    """A way into the program.
+
+    Attributes:
+        name: in lists.
+        suffix: of its files.
+        seeds: makes small valid files, given a folder to work in.
+        parse: reads a file, and touches what it says.
+        meaning: damage that knows the format; None where bytes are all there is.
+        share: of a campaign's executions; dear parsers have less.
+    """
+
+    name: str
+    suffix: str
+    seeds: Callable[[Path], list[bytes]]
+    parse: Callable[[Path], object]
+    meaning: Mutate | None = None
+    share: float = 1.0
+
+
+def _files(*folders: str) -> list[bytes]:
+    return [path.read_bytes() for folder in folders for path in sorted((ROOT / "profiles" / folder).glob("*.toml"))]
+
+
+def _written(make: Callable[[Path], object], path: Path) -> bytes:
+    make(path)
+    return path.read_bytes()
+
+
+def onnx_seeds(folder: Path) -> list[bytes]:
+    """The three spellings of a small network, one of them fixed to a tile."""
+    spellings = (float_convbeers, integer_convbeers, board_convbeers)
+    made = [_written(partial(spelling, blocks=1, features=2), folder / "a.onnx") for spelling in spellings]
+    fixed = onnx.load_model(float_convbeers(folder / "a.onnx", 1, 2))
+    for value in (*fixed.graph.input, *fixed.graph.output):
+        for dim, size in zip(value.type.tensor_type.shape.dim, (1, 1, SIDE_PX, SIDE_PX), strict=True):
+            dim.dim_value = size
+    return [*made, fixed.SerializeToString()]
+
+
+def look_at_onnx(path: Path) -> None:
+    """What `check` does."""
+    place(read_network(path, SIDE_PX), load_dpu())
+
+
+def understand_onnx(path: Path) -> None:
+    """What `quantize` and `restore` ask of a network before they run it."""
+    model = load_onnx(path)
+    for question in (fixed_tile_px, receptive_radius_px, correction_graph):
+        _asked(question, model)
+
+
+def _asked(question: Callable[[onnx.ModelProto], object], model: onnx.ModelProto) -> None:
+    try:
+        question(model)
+    except BeersError as error:
+        if not str(error).isprintable():
+            raise ValueError("no sentence") from error
+
+
+def run_onnx(path: Path) -> None:
+    """What `gate` does: the runtime gets the file, fixed to a tile or not."""
+    model = load_onnx(path)
+    image = np.full((1, 1, SIDE_PX, SIDE_PX), 0.25, np.float32)
+    run(open_session(model, 1), image)
+    run(open_any_size(model), image[:, :, :9])
+
+
+def tiff_seeds(folder: Path) -> list[bytes]:
+    """Strips and tiles, packed or not, bands in planes or mixed, pages, tags of geography, every byte order."""
+    rng = np.random.default_rng(0)
+    grey = rng.integers(0, 4096, (17, 19)).astype(np.uint16)
+    colour = rng.integers(0, 256, (17, 19, 3)).astype(np.uint8)
+    nodata = [(42113, "s", 0, "7", True), (33550, "d", 3, (1.0, 1.0, 0.0), True)]
+    path = folder / "a.tif"
+    kinds: list[tuple[np.ndarray, dict[str, object]]] = [
+        (grey, {"rowsperstrip": 5}),
+        (grey, {"tile": (16, 16), "compression": "zlib", "predictor": True}),
+        (grey.astype(np.float32), {"extratags": nodata, "metadata": None}),
+        (colour, {"photometric": "rgb", "compression": "zlib"}),
+        (np.moveaxis(colour, 2, 0), {"photometric": "rgb", "planarconfig": "separate"}),
+        (np.stack([grey, grey]), {"photometric": "minisblack"}),
+        (grey, {"bigtiff": True}),
+        (grey, {"byteorder": ">"}),
+        (grey, {"imagej": True}),
+        (grey, {"ome": True}),
+    ]
+    made = [_written(partial(tifffile.imwrite, data=pixels, **given), path) for pixels, given in kinds]  # type: ignore[arg-type]
+    return [*made, *(_image(kind) for kind in ({"format": "TIFF", "compression": c} for c in ("jpeg", "tiff_lzw")))]
+
+
+def _image(given: dict[str, str]) -> bytes:
+    stream, pixels = io.BytesIO(), np.random.default_rng(1).integers(0, 256, (17, 19)).astype(np.uint8)
+    Image.fromarray(pixels).save(stream, **given)
+    return stream.getvalue()
+
+
+def read_rows(path: Path) -> None:
+    """What `restore` reads: bands of rows, a large image only in part."""
+    with open_source(path) as source:
+        raster = source.raster
+        if raster.bands * raster.width_px * min(raster.height_px, 64) < 1 << 24:
+            source.held_bytes(64)
+            for top in range(0, min(raster.height_px, 64), 7):
+                raster.missing(source.read(top, min(top + 9, raster.height_px)))
+
+
+def document_seeds(_: Path) -> list[bytes]:
+    """Results as `--json` writes them, of the gate among them."""
+    figures = {"MAE": measured(7e-4, "of full scale", "here"), "none": unavailable("W", "no counter")}
+    figures["time"] = predicted(3.0, "s", (2.0, 4.0), "cost model")
+    rows = (Row("gate", "int8", figures, {"word": "text"}), Row("gate", "other", figures))
+    return [json.dumps(Document("gate", {"seed": 1}, (), rows).to_json()).encode()]
+
+
+def read_results(path: Path) -> None:
+    """What `compare` shows."""
+    document = read_document(path)
+    changes = compare(document, read_document(path)).both
+    rows = change_rows(changes)
+    by_row(rows, ["before", "after"])
+    for change in changes:
+        cell(change.before)
+
+
+def cache_seeds(folder: Path) -> list[bytes]:
+    """Both kinds of kept measurements."""
+    cache = Cache(folder)
+    scores = Scores(({"PSNR": 30.0, "LPIPS": None},), {"edge": Figure(0.2, "", "measured", "here")})
+    kept: dict[str, Keepable] = {"scores": scores, "times": Times("1", (0.1, 0.2), (0.1, 0.2), 65536)}
+    for kind, value in kept.items():
+        cache.keep(kind, {}, value)
+    return [cache.path(kind, {}).read_bytes() for kind in kept]
+
+
+def find_kept(path: Path) -> None:
+    """A damaged measurement is none; the digest is left out, so that the values themselves are met."""
+    with TemporaryDirectory() as name:
+        cache = Cache(Path(name))
+        for kind, what in (("scores", Scores), ("times", Times)):
+            shutil.copy(path, cache.path(kind, {}))
+            cache.find(kind, {}, what)
+
+
+def journal_seeds(_: Path) -> list[bytes]:
+    """What a stopped run leaves."""
+    return [json.dumps({"job": JOB, "rows": 4, "known": 32}).encode()]
+
+
+def resume(path: Path) -> None:
+    """A run that goes on where a journal says."""
+    with TemporaryDirectory() as name:
+        out = Path(name) / "out.tif"
+        part_folder(out).mkdir()
+        shutil.copy(path, part_folder(out) / "journal.json")
+        assert 0 <= Spool(out, SHAPE, np.dtype(np.uint16), JOB, resume=True).rows <= SHAPE[1]
+
+
+def log_lines(path: Path) -> None:
+    """A training log that a resumed run goes on with."""
+    with TemporaryDirectory() as name:
+        Log(Path(shutil.copy(path, Path(name) / "log.csv")), 20)
+
+
+def checkpoint_seeds(folder: Path) -> list[bytes]:
+    """A checkpoint after a step, and one before any."""
+    return [_written(partial(_checkpoint, steps=steps), folder / "c.safetensors") for steps in (0, 1)]
+
+
+def _checkpoint(path: Path, steps: int) -> None:
+    network, optimiser = _fresh()
+    for _ in range(steps):
+        network(torch.ones(1, 1, 5, 5)).sum().backward()
+        optimiser.step()
+    average = {k: v.detach().clone() for k, v in network.state_dict().items()}
+    write_checkpoint(path, network, average, optimiser, RECIPE, steps, Guards())
+
+
+def _fresh() -> tuple[ConvBEERS, torch.optim.Optimizer]:
+    network = ConvBEERS(SMALL)
+    return network, torch.optim.Adam(network.parameters(), lr=1e-9)
+
+
+def go_on(path: Path) -> None:
+    """Read a checkpoint, and take a step."""
+    network, optimiser = _fresh()
+    average = {k: v.detach().clone() for k, v in network.state_dict().items()}
+    read_checkpoint(path, network, average, optimiser, RECIPE)
+    network(torch.ones(1, 1, 3, 3)).sum().backward()
+    optimiser.step()
+
+
+def backbone_seeds(_: Path, packed: bool) -> list[bytes]:
+    """An archive of arrays."""
+    stream = io.BytesIO()
+    (np.savez_compressed if packed else np.savez)(stream, a=np.ones((2, 3), np.float32), b=np.zeros(4, np.float16))
+    return [stream.getvalue()]
+
+
+def weights_seeds(folder: Path) -> list[bytes]:
+    """A network's weights."""
+    return [_written(partial(save_network, network=_fresh()[0], recipe={"degraded": "x"}), folder / "w.safetensors")]
+
+
+def runs_seeds(_: Path) -> list[bytes]:
+    """A board's own measurements."""
+    run = {"network": "resnet-50", "configuration": "C32B3", "tile_px": 640, "fps": 95.0}
+    model = {"model": "core.onnx", "tile_px": 64, "fps": 9.5, "power_w": 30}
+    return [json.dumps(runs).encode() for runs in ([run], [run, {**run, "fps": 5}], [run, model])]
+
+
+def manifest_seeds(_: Path) -> list[bytes]:
+    """Lines of a dataset's manifest."""
+    line = {role: {"rejected_snr_pairs": 1, "sensor": "x"} for role in ("degraded", "reference")}
+    return [b"".join(json.dumps({"name": "a", **line}).encode() + b"\n" for _ in range(2))]
+
+
+def board_of(path: Path) -> None:
+    """A target of the user's, and a network placed on it and timed."""
+    load_target(str(path))
+    dpu = load_dpu(str(path))
+    Layers.of(count_work(place(_network(), dpu).core, dpu), dpu)
+
+
+@cache
+def _network() -> Network:
+    with TemporaryDirectory() as name:
+        return read_network(integer_convbeers(Path(name) / "a.onnx", 1, 2), SIDE_PX)
+
+
+LIMITS = [b"mae = 0.0007\np999 = 0.01\n", b"psnr_drop_db = 0.05\nmae_growth = 1.1\nmin_psnr_float_int8_db = 60\n"]
+
+PARSERS: tuple[Parser, ...] = (
+    Parser("ONNX, looked at", ".onnx", onnx_seeds, look_at_onnx, of_onnx),
+    Parser("ONNX, understood", ".onnx", onnx_seeds, understand_onnx, of_onnx, 2.0),
+    Parser("ONNX, run", ".onnx", onnx_seeds, run_onnx, of_onnx, 0.3),
+    Parser("TIFF, whole", ".tif", tiff_seeds, read_pixels, of_tiff, 2.0),
+    Parser("TIFF, by rows", ".tif", tiff_seeds, read_rows, of_tiff, 2.0),
+    Parser("PNG", ".png", lambda _: [_image({"format": "PNG"})], read_pixels, of_png),
+    Parser("JPEG", ".jpg", lambda _: [_image({"format": "JPEG"})], read_pixels),
+    Parser("sensor TOML", ".toml", lambda _: _files("sensors"), lambda p: load_sensor(str(p)).nominal()),
+    Parser("scene TOML", ".toml", lambda _: _files("scenes"), lambda p: load_scene_call(str(p))),
+    Parser("target TOML", ".toml", lambda _: _files("targets"), board_of, share=0.3),
+    Parser("gate limits TOML", ".toml", lambda _: LIMITS, lambda p: read_limits(p, None)),
+    Parser("results JSON", ".json", document_seeds, read_results, of_json),
+    Parser("gate baseline JSON", ".json", document_seeds, baseline_mae, of_json),
+    Parser("board's runs JSON", ".json", runs_seeds, lambda p: refit(p, load_dpu()), of_json, 0.3),
+    Parser("kept measurements", ".json", cache_seeds, find_kept, of_json),
+    Parser("journal of a run", ".json", journal_seeds, resume, of_json, 0.5),
+    Parser("dataset manifest", ".jsonl", manifest_seeds, _read_summary, of_json),
+    Parser("training log", ".csv", lambda _: [b"step,loss\n10,0.5\n20,0.25\n"], log_lines, share=0.5),
+    Parser("weights", ".safetensors", weights_seeds, load_network, of_safetensors),
+    Parser("checkpoint", ".safetensors", checkpoint_seeds, go_on, of_safetensors),
+    Parser("backbone npz", ".npz", partial(backbone_seeds, packed=True), lambda p: read_tensors(p, ["a", "b"])),
+)

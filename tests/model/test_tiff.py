@@ -1,0 +1,176 @@
+"""Images whose headers would make a decoder take memory, open other files or run other programs."""
+
+import io
+import struct
+import subprocess
+import tracemalloc
+import zlib
+from contextlib import suppress
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tifffile
+from PIL import Image
+
+from deploy.swath.reader import open_source
+from model.images import read_pixels
+from model.tiff_page import jpeg_size_px
+from profiles.errors import BeersError, ImageError, MachineError
+
+GREY = np.random.default_rng(0).integers(0, 250, (16, 16)).astype(np.uint8)
+
+
+def tiff(path: Path, data: bytes, **changed: int) -> Path:
+    """A TIFF of one strip of 16 x 16 bytes, with entries of the names changed or added."""
+    names = {"bits": 258, "compression": 259, "rows": 278, "size": 279, "samples": 277, "height": 257, "width": 256}
+    names |= {"tile_width": 322, "tile_height": 323}
+    entries = {256: 16, 257: 16, 258: 8, 259: 1, 262: 1, 273: 0, 277: 1, 278: 16, 279: len(data)}
+    entries |= {names[name]: value for name, value in changed.items()}
+    place = 273
+    if 322 in entries:  # tiles have tags of their own
+        place, entries[325] = 324, entries.pop(279)
+        del entries[273], entries[278]
+        entries[place] = 0
+    entries[place] = 8 + 2 + 12 * len(entries) + 4
+    listed = b"".join(struct.pack("<HHII", tag, 4, 1, value) for tag, value in sorted(entries.items()))
+    path.write_bytes(b"II*\0" + struct.pack("<IH", 8, len(entries)) + listed + bytes(4) + data)
+    return path
+
+
+def refused(path: Path, error: type[BeersError], word: str) -> None:
+    """By both readers, in a sentence and without memory."""
+    tracemalloc.start()
+    try:
+        for read in (read_pixels, rows):
+            with pytest.raises(error, match=word):
+                read(path)
+        assert tracemalloc.get_traced_memory()[1] < 16e6
+    finally:
+        tracemalloc.stop()
+
+
+def rows(path: Path) -> np.ndarray:
+    with open_source(path) as source:
+        return source.read(0, source.raster.height_px)
+
+
+def test_the_files_made_here_are_read_when_they_are_honest(tmp_path: Path) -> None:
+    for compression, data in ((1, GREY.tobytes()), (8, zlib.compress(GREY.tobytes()))):
+        path = tiff(tmp_path / "a.tif", data, compression=compression)
+        np.testing.assert_array_equal(read_pixels(path), GREY)
+        np.testing.assert_array_equal(rows(path)[0], GREY)
+
+
+def test_bytes_that_unpack_to_more_than_their_place_are_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Where imagecodecs is missing: with it, the decoder is told the size."""
+    monkeypatch.setattr("model.tiff_page.find_spec", lambda _: None)
+    path = tiff(tmp_path / "bomb.tif", zlib.compress(bytes(50_000_000), 9), compression=8)
+    refused(path, ImageError, "unpack to more")
+
+
+def test_a_jpeg_larger_than_its_place_is_refused(tmp_path: Path) -> None:
+    stream = io.BytesIO()
+    Image.fromarray(GREY).save(stream, "JPEG")
+    data = bytearray(stream.getvalue())
+    assert jpeg_size_px(bytes(data)) == (16, 16)
+    frame = data.find(b"\xff\xc0")
+    data[frame + 5 : frame + 9] = struct.pack(">HH", 30_000, 20_000)
+    refused(tiff(tmp_path / "a.tif", bytes(data), compression=7), ImageError, "30000 x 20000")
+    garbage = bytes(data[:2]) + b"\x00\x01" + bytes(data[2:])  # which a decoder would skip
+    refused(tiff(tmp_path / "b.tif", garbage, compression=7), ImageError, "damaged")
+
+
+@pytest.mark.parametrize("compression", [34712, 50002, 34925, 34887, 50001])
+def test_compressions_that_size_themselves_are_refused(compression: int, tmp_path: Path) -> None:
+    refused(tiff(tmp_path / "a.tif", GREY.tobytes(), compression=compression), ImageError, "compression known")
+
+
+def test_a_tile_that_no_memory_holds_is_refused(tmp_path: Path) -> None:
+    data = zlib.compress(GREY.tobytes())
+    honest = tiff(tmp_path / "a.tif", data, compression=8, tile_width=16, tile_height=16)
+    np.testing.assert_array_equal(read_pixels(honest), GREY)
+    absurd = tiff(tmp_path / "b.tif", data, compression=8, tile_width=1 << 30, tile_height=1 << 30)
+    refused(absurd, MachineError, "strips or tiles")
+
+
+def test_a_strip_beyond_the_end_is_refused_before_it_is_read(tmp_path: Path) -> None:
+    refused(tiff(tmp_path / "a.tif", GREY.tobytes(), size=2**32 - 1), ImageError, "cut short")
+
+
+def test_an_image_too_long_to_be_planned_is_refused(tmp_path: Path) -> None:
+    path = tiff(tmp_path / "a.tif", GREY.tobytes(), height=2**32 - 1, rows=16)
+    with pytest.raises(BeersError):
+        rows(path)
+    path = tiff(tmp_path / "b.tif", GREY.tobytes(), height=2**23, width=1, rows=2**23, size=256)
+    with pytest.raises(ImageError, match="pixels a side"):
+        rows(path)
+
+
+def test_other_files_that_a_microscopes_tiff_names_are_not_opened(tmp_path: Path) -> None:
+    """OME-XML says which file a plane lies in: `../secret.tif` is as good as any."""
+    tifffile.imwrite(tmp_path / "secret.tif", np.full((16, 16), 77, np.uint8), ome=True)
+    folder = tmp_path / "in"
+    folder.mkdir()
+    with tifffile.TiffFile(tmp_path / "secret.tif") as file:
+        identity = file.ome_metadata.split('UUID="')[1].split('"')[0]  # type: ignore[union-attr]
+    xml = (
+        '<?xml version="1.0"?><OME xmlns="http://www.openmicroscopy.org/Schemas/OME/2016-06" UUID="urn:uuid:1">'
+        '<Image><Pixels DimensionOrder="XYZCT" Type="uint8" SizeX="16" SizeY="16" SizeZ="1" SizeC="1" SizeT="1">'
+        f'<TiffData IFD="0" PlaneCount="1"><UUID FileName="../secret.tif">{identity}</UUID></TiffData>'
+        "</Pixels></Image></OME>"
+    )
+    tifffile.imwrite(folder / "a.tif", GREY, description=xml, metadata=None)
+    np.testing.assert_array_equal(read_pixels(folder / "a.tif"), GREY)
+    np.testing.assert_array_equal(rows(folder / "a.tif")[0], GREY)
+
+
+@pytest.mark.parametrize("count", [1, 2, 150])
+def test_pages_in_a_circle_are_refused(count: int, tmp_path: Path) -> None:
+    """Empty directories of 6 bytes that lead on, and the last one back: tifffile sees no circle of 100 or more."""
+    path, first = tmp_path / "a.tif", 8
+    places = [first + 6 * number for number in range(count)] + [first]
+    path.write_bytes(b"II*\0" + struct.pack("<I", first) + b"".join(struct.pack("<HI", 0, p) for p in places[1:]))
+    refused(path, ImageError, "circle")
+    big = b"II+\0" + struct.pack("<HHQQQ", 8, 0, 16, 0, 16)
+    path.write_bytes(big)
+    refused(path, ImageError, "circle")
+
+
+def test_pages_within_pages_are_counted(tmp_path: Path) -> None:
+    path = tmp_path / "a.tif"
+    tifffile.imwrite(path, GREY, extratags=[(65000, "I", 4000, (8,) * 4000, True)])
+    path.write_bytes(path.read_bytes().replace(struct.pack("<HH", 65000, 4), struct.pack("<HH", 330, 4)))
+    refused(path, ImageError, "within pages")
+
+
+def test_what_is_no_png_or_jpeg_starts_no_other_program(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Pillow hands EPS to Ghostscript, whatever the file is called."""
+
+    def started(*_: object, **__: object) -> None:
+        raise AssertionError("a program was started")
+
+    for name in ("Popen", "check_call", "run"):
+        monkeypatch.setattr(subprocess, name, started)
+    path = tmp_path / "a.png"
+    path.write_bytes(b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 9 9\n%%EndComments\nshowpage\n%%EOF\n")
+    with pytest.raises(ImageError, match=r"a\.png"):
+        read_pixels(path)
+
+
+def test_a_chunk_stated_longer_than_the_file_takes_no_memory(tmp_path: Path) -> None:
+    path = tmp_path / "a.png"
+    Image.fromarray(GREY).save(path)
+    content = bytearray(path.read_bytes())
+    at = content.find(b"IDAT")
+    content[at - 4 : at] = struct.pack(">I", 2**31 - 1)
+    path.write_bytes(content)
+    tracemalloc.start()
+    try:
+        with suppress(ImageError):
+            read_pixels(path)
+        assert tracemalloc.get_traced_memory()[1] < 16e6
+    finally:
+        tracemalloc.stop()

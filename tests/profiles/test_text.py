@@ -1,0 +1,98 @@
+"""TOML and JSON that would hang, exhaust memory or end in a traceback."""
+
+import os
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from profiles import load_sensor, load_target
+from profiles.errors import OptionError, ProfileError
+from profiles.text import DEPTH, JSON_BYTES, TOML_BYTES, parse_json, read_json, read_toml_text
+
+BAD_TOML = {
+    "nested arrays": "a = " + "[" * 20_000,
+    "closed ones": "a = " + "[" * 200 + "]" * 200,
+    "inline tables": "a = " + "{b = " * 5_000,
+    "a dotted key": "a." * 8_000 + "a = 1",
+    "with strange spaces": '"\\u2028" .' * 5_000 + "a = 1",
+    "tables in tables": "[" + ".".join("a" * 60) + "]\nb = 1",
+    "decimal digits": "a = " + "9" * 5_000,
+    "hex digits": "a = 0x" + "f" * 50_000,
+    "too long": "#" * (TOML_BYTES + 1),
+    "no text": "a = '\x00'",
+}
+
+
+@pytest.mark.parametrize("name", BAD_TOML)
+def test_hostile_toml_is_a_sentence_in_a_moment(name: str, tmp_path: Path) -> None:
+    path = tmp_path / "mine.toml"
+    path.write_text(BAD_TOML[name])
+    with pytest.raises(ValueError, match=r"."):
+        read_toml_text(path)
+    for load in (load_sensor, load_target):
+        with pytest.raises(ProfileError) as caught:
+            load(str(path))
+        assert str(caught.value).isprintable()
+
+
+BAD_JSON = {
+    "nested arrays": "[" * 100_000,
+    "closed ones": "[" * 100 + "]" * 100,
+    "nested objects": '{"a":' * 100_000,
+    "not a number": '{"a": NaN}',
+    "infinity": "[-Infinity]",
+    "a large number": "1e999",
+    "a large whole number": "1" + "0" * 400,
+    "thousands of digits": "9" * 5_000,
+    "half a pair": '"\\ud800"',
+    "half a pair as a key": '{"\\udc00": 1}',
+    "nothing": "",
+}
+
+
+@pytest.mark.parametrize("name", BAD_JSON)
+def test_hostile_json_is_a_value_error(name: str) -> None:
+    with pytest.raises(ValueError, match=r"."):
+        parse_json(BAD_JSON[name])
+
+
+@given(st.recursive(st.none() | st.booleans() | st.integers(-(10**9), 10**9) | st.text(), st.lists, max_leaves=20))
+def test_what_is_plain_comes_through(value: object) -> None:
+    import json
+
+    assert parse_json(json.dumps(value)) == value
+
+
+@pytest.mark.parametrize(("depth", "sound"), [(DEPTH - 1, True), (DEPTH, False)])
+def test_the_depth_is_exact(depth: int, sound: bool) -> None:
+    text = "[" * depth + "1" + "]" * depth
+    if sound:
+        assert parse_json(text) is not None
+    else:
+        with pytest.raises(ValueError, match="levels"):
+            parse_json(text)
+
+
+def test_pipes_devices_and_huge_files_are_not_read(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe.json")
+    with (tmp_path / "huge.json").open("wb") as stream:
+        stream.truncate(JSON_BYTES + 1)
+    for path, word in (
+        (tmp_path / "pipe.json", "regular"),
+        (Path("/dev/zero"), "regular"),
+        (tmp_path / "huge.json", "more"),
+    ):
+        with pytest.raises(ValueError, match=word):
+            read_json(path)
+    with pytest.raises(FileNotFoundError):
+        read_json(tmp_path / "none.json")
+
+
+def test_a_message_shows_what_a_file_holds_on_one_short_line() -> None:
+    error = OptionError("a\nb", expected="c", got="\x1b[2J\ud800" + "x" * 10_000, remedy="d")
+    assert str(error).isprintable()
+    assert "\\x1b[2J\\ud800xxx" in str(error)
+    assert len(str(error)) < 600
+    str(error).encode()

@@ -1,0 +1,277 @@
+"""ONNX files that would harm: each is refused by a sentence before a runtime has it."""
+
+from collections.abc import Callable
+from pathlib import Path
+from unittest.mock import patch
+
+import numpy as np
+import onnx
+import pytest
+from onnx import TensorProto, helper, numpy_helper
+
+from deploy.dpu.board import load_dpu
+from deploy.dpu.placement import place
+from deploy.dpu.reading import read_network
+from profiles.errors import ModelError
+from quant.onnx_file import any_size, load_onnx, parse_onnx
+from quant.session import open_session, run
+from quant.untrusted import FILE_BYTES
+from tests.deploy.dpu.graphs import Sketch, board_convbeers, float_convbeers, integer_convbeers
+
+Change = Callable[[onnx.ModelProto], object]
+IMAGE = np.full((1, 1, 12, 14), 0.25, np.float32)
+
+
+@pytest.fixture
+def model(tmp_path: Path) -> onnx.ModelProto:
+    return onnx.load_model(float_convbeers(tmp_path / "sound.onnx", 1, 4))
+
+
+def refusal(model: onnx.ModelProto, to_run: bool = True) -> str:
+    """What is said of a model; no runtime sees it."""
+    with patch("onnxruntime.InferenceSession") as session, pytest.raises(ModelError) as caught:
+        open_session(parse_onnx(model.SerializeToString(), "stranger.onnx", to_run), 1)
+    assert not session.called
+    assert str(caught.value).startswith("stranger.onnx: expected ")
+    return str(caught.value)
+
+
+@pytest.mark.parametrize("spelling", [float_convbeers, integer_convbeers, board_convbeers])
+def test_sound_files_of_every_spelling_run(spelling: Callable[..., Path], tmp_path: Path) -> None:
+    path = spelling(tmp_path / "a.onnx", blocks=1, features=4)
+    assert run(open_session(path, 1), IMAGE).shape == IMAGE.shape
+
+
+def outside(place: str) -> Change:
+    def change(model: onnx.ModelProto) -> None:
+        tensor = model.graph.initializer[0]
+        tensor.ClearField("raw_data")
+        tensor.data_location = TensorProto.EXTERNAL
+        tensor.external_data.add(key="location", value=place)
+
+    return change
+
+
+@pytest.mark.parametrize("place", ["/etc/passwd", "../secret.bin", "beside.bin", "a/../../b", "link.bin", ""])
+def test_weights_in_other_files_are_never_looked_for(place: str, model: onnx.ModelProto) -> None:
+    outside(place)(model)
+    with patch("onnx.checker.check_model") as checker:
+        assert "another file" in refusal(model)
+    assert not checker.called
+
+
+def test_a_place_beside_the_weights_themselves_is_refused_too(model: onnx.ModelProto) -> None:
+    model.graph.initializer[0].external_data.add(key="location", value="../secret.bin")
+    assert "../secret.bin" in refusal(model)
+
+
+def stating(*dims: int) -> Change:
+    def change(model: onnx.ModelProto) -> None:
+        del model.graph.initializer[0].dims[:]
+        model.graph.initializer[0].dims.extend(dims)
+
+    return change
+
+
+def sized(*dims: int) -> Change:
+    def change(model: onnx.ModelProto) -> None:
+        for dim, size in zip(model.graph.input[0].type.tensor_type.shape.dim, dims, strict=True):
+            dim.dim_value = size
+
+    return change
+
+
+def typed(kind: int) -> Change:
+    return lambda model: setattr(model.graph.initializer[0], "data_type", kind)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (stating(10**6, 10**6, 10**6), "1000000 x 1000000 x 1000000"),
+        (stating(2**62, 4), "as many as it states"),
+        (stating(-4, 1, 3, 3), "sizes from 0 on"),
+        (stating(4, 1, 3, 4), "holds 36"),
+        (stating(*[1] * 17), "at most 16 sizes"),
+        (stating(0), "holds 36"),
+        (sized(1, 1, 2**40, 2**40), "values"),
+        (sized(1, 1, -5, 640), "-5"),
+        (sized(2**62, 2**62, 2**62, 2**62), "values"),
+        (typed(TensorProto.STRING), "STRING"),
+        (typed(TensorProto.COMPLEX64), "COMPLEX64"),
+        (typed(TensorProto.INT4), "INT4"),
+        (typed(0), "UNDEFINED"),
+        (typed(12345), "12345"),
+        (lambda m: m.graph.ClearField("input"), "an input and an output"),
+        (lambda m: m.graph.ClearField("output"), "an input and an output"),
+        (lambda m: m.ClearField("graph"), "an input and an output"),
+    ],
+)
+def test_what_a_file_states_but_does_not_hold_is_refused(change: Change, words: str, model: onnx.ModelProto) -> None:
+    change(model)
+    for to_run in (True, False):
+        assert words in refusal(model, to_run)
+
+
+def ending_in(*kinds: onnx.NodeProto) -> Change:
+    """Nodes behind the network: each reads `x` and writes `y` unless it says otherwise."""
+
+    def change(model: onnx.ModelProto) -> None:
+        model.graph.node.extend(kinds)
+        model.opset_import.extend(helper.make_opsetid(domain, 1) for domain in {n.domain for n in kinds if n.domain})
+
+    return change
+
+
+def constant(name: str, *values: float, kind: type = np.int64) -> onnx.NodeProto:
+    return helper.make_node("Constant", [], [name], value=numpy_helper.from_array(np.array(values, kind)))
+
+
+LOOP = helper.make_graph(
+    [helper.make_node("Identity", ["cond"], ["again"])],
+    "body",
+    [
+        helper.make_tensor_value_info("i", TensorProto.INT64, []),
+        helper.make_tensor_value_info("cond", TensorProto.BOOL, []),
+    ],
+    [helper.make_tensor_value_info("again", TensorProto.BOOL, [])],
+)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (ending_in(helper.make_node("Evil", ["image"], ["y"], domain="ai.strangers")), "Evil of 'ai.strangers'"),
+        (ending_in(helper.make_node("FusedConv", ["image"], ["y"], domain="com.microsoft")), "FusedConv"),
+        (ending_in(helper.make_node("LinearRegressor", ["image"], ["y"], domain="ai.onnx.ml")), "LinearRegressor"),
+        (ending_in(helper.make_node("Loop", ["", ""], [], body=LOOP)), "Loop with a graph within"),
+        (
+            ending_in(constant("n", 2**20, 2**20), helper.make_node("ConstantOfShape", ["n"], ["y"])),
+            "constants alone",
+        ),
+        (ending_in(constant("n", 9, 9), helper.make_node("Expand", ["n", "n"], ["y"])), "constants alone"),
+        (ending_in(helper.make_node("RandomNormal", [], ["y"], shape=[2**20, 2**20])), "values"),
+        (ending_in(constant("n", 1, 1, 2**20, 2**20), helper.make_node("Expand", ["image", "n"], ["y"])), "Expand"),
+        (ending_in(constant("n", 1, 1, 2000, 1), helper.make_node("Tile", ["image", "n"], ["y"])), "enlargements"),
+        (ending_in(constant("n", *[9**9] * 8), helper.make_node("Pad", ["image", "n"], ["y"])), "enlargements"),
+        (
+            ending_in(
+                constant("s", 1, 1, 1e6, float("nan"), kind=np.float32),
+                helper.make_node("Resize", ["image", "", "s"], ["y"]),
+            ),
+            "enlargements",
+        ),
+        (
+            ending_in(
+                constant("a", 1, 1, 9, 9),
+                helper.make_node("Neg", ["a"], ["b"]),
+                helper.make_node("Expand", ["image", "b"], ["y"]),
+            ),
+            "a computed one",
+        ),
+        (ending_in(helper.make_node("MaxPool", ["image"], ["y"], kernel_shape=[3, 3], pads=[2**30] * 4)), "pads"),
+        (ending_in(helper.make_node("DepthToSpace", ["image"], ["y"], blocksize=2**20)), "blocksize"),
+    ],
+)
+def test_what_a_runtime_would_do_for_a_stranger_is_refused(
+    change: Change, words: str, model: onnx.ModelProto
+) -> None:
+    change(model)
+    with patch("onnx.checker.check_model"):  # some are refused by it too, in other words
+        assert words in refusal(model)
+
+
+def test_functions_and_sparse_weights_are_refused(model: onnx.ModelProto) -> None:
+    values, places = (
+        numpy_helper.from_array(np.array([1], kind), name) for kind, name in ((np.float32, "v"), (int, "i"))
+    )
+    sparse = helper.make_sparse_tensor(values, places, [2**40])
+    model.graph.sparse_initializer.append(sparse)
+    assert "sparse" in refusal(model)
+    del model.graph.sparse_initializer[:]
+    opsets = [helper.make_opsetid("", 17)]
+    body = [helper.make_node("Identity", ["x"], ["y"])]
+    model.functions.append(helper.make_function("mine", "F", ["x"], ["y"], body, opsets))
+    assert "functions" in refusal(model)
+
+
+def test_strangers_operators_may_be_looked_at(tmp_path: Path) -> None:
+    sketch = Sketch(1)
+    path = sketch.save(tmp_path / "a.onnx", sketch.node("Mystery", "image", domain="com.microsoft"))
+    assert read_network(path, 32).operations[0].op_type == "Mystery"
+    with pytest.raises(ModelError, match="Mystery"):
+        load_onnx(path)
+
+
+def test_a_file_of_absurd_size_is_not_read(tmp_path: Path) -> None:
+    path = tmp_path / "huge.onnx"
+    with path.open("wb") as stream:
+        stream.truncate(FILE_BYTES + 1)  # sparse: it takes no disk
+    with patch.object(Path, "read_bytes", side_effect=AssertionError), pytest.raises(ModelError, match="more than"):
+        load_onnx(path)
+
+
+def test_every_truncation_of_a_file_is_refused_or_sound(model: onnx.ModelProto) -> None:
+    content = model.SerializeToString()
+    refused = 0
+    for end in range(0, len(content), 37):
+        try:
+            parse_onnx(content[:end], "cut.onnx")
+        except ModelError as error:
+            refused += str(error).isprintable()
+    assert refused >= len(content) // 37 - 5
+
+
+def test_an_output_of_another_rank_is_no_image(model: onnx.ModelProto) -> None:
+    sized(1, 1, 16, 16)(model)
+    del model.graph.output[0].type.tensor_type.shape.dim[3]
+    with pytest.raises(ModelError, match="image in and out"):
+        any_size(model)
+
+
+def test_a_network_that_fails_on_an_image_is_one_sentence(tmp_path: Path) -> None:
+    sketch = Sketch(1)
+    sketch.node("Add", "image", sketch.constant(np.zeros((1, 1, 5, 5), np.float32)))
+    other = sketch.save(tmp_path / "a.onnx", "add0")
+    sketch = Sketch(1)
+    smaller = sketch.save(tmp_path / "b.onnx", sketch.node("MaxPool", "image", kernel_shape=[2, 2], strides=[2, 2]))
+    for path in (other, smaller):
+        with pytest.raises(ModelError, match="its own size"):
+            run(open_session(path, 1), IMAGE)
+
+
+def test_weights_without_sizes_are_one_sentence(tmp_path: Path) -> None:
+    """They are read before the runtime sees the file: for spare channels."""
+    path = integer_convbeers(tmp_path / "a.onnx", 1, 4)
+    model = onnx.load_model(path)
+    weight = next(node.input[3] for node in model.graph.node if node.op_type == "QLinearConv")
+    tensor = next(t for t in model.graph.initializer if t.name == weight)
+    tensor.CopyFrom(numpy_helper.from_array(np.array(1, np.int8), weight))
+    with pytest.raises(ModelError):
+        open_session(parse_onnx(model.SerializeToString(), "flat.onnx"), 1)
+
+
+def test_a_long_chain_of_activations_is_followed_in_a_moment(tmp_path: Path) -> None:
+    """Once it ended in a RecursionError: each was looked past for the QuantizeLinear behind it."""
+    sketch = Sketch(1)
+    scale, zero = sketch.constant(np.array(0.5, np.float32)), sketch.constant(np.array(0, np.int8))
+    last = sketch.node("DequantizeLinear", sketch.node("QuantizeLinear", "image", scale, zero), scale, zero)
+    for _ in range(1200):
+        last = sketch.node("Relu", last)
+    place(read_network(sketch.save(tmp_path / "long.onnx", last), 32), load_dpu())
+
+
+def test_there_is_one_door() -> None:
+    """What opens an ONNX file, and what hands one to a runtime, each stand in one place."""
+    root = Path(__file__).parents[2]
+    doors = {"onnx.load": set[str](), "ParseFromString(": set[str](), "InferenceSession(": set[str]()}
+    for folder in ("deploy", "model", "profiles", "quant"):
+        for path in (root / folder).rglob("*.py"):
+            for word, places in doors.items():
+                if word in path.read_text(encoding="utf-8"):
+                    places.add(str(path.relative_to(root)))
+    assert doors == {
+        "onnx.load": set(),
+        "ParseFromString(": {"quant/onnx_file.py"},
+        "InferenceSession(": {"quant/session.py"},
+    }

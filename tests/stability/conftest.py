@@ -1,0 +1,66 @@
+"""A small network with real structure, quantised, and the stress subject that it makes."""
+
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import onnx
+import pytest
+import torch
+
+from deploy.export import to_onnx
+from deploy.stress.subject import Subject, open_subject
+from model.convbeers import ConvBEERS, Variant, initialise
+from model.simulator.procedural import procedural_scene
+from profiles import load_sensor
+from quant.calibration import draw_patches
+from quant.onnx_file import save_onnx
+from quant.quantise import ALL, Quantised, quantise_model
+
+
+@pytest.fixture(autouse=True)
+def one_thread() -> Iterator[None]:
+    """On images this small a second thread only waits."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
+@pytest.fixture(scope="session")
+def network() -> ConvBEERS:
+    made = ConvBEERS(Variant(blocks=1, features=6))
+    initialise(made, torch.Generator().manual_seed(3))
+    with torch.no_grad():
+        made.tail.weight.mul_(0.03)  # a trained network keeps flat ground; a new one nearly does
+    return made.eval()
+
+
+@pytest.fixture(scope="session")
+def float_onnx(network: ConvBEERS) -> onnx.ModelProto:
+    return to_onnx(network, {"variant": "test"})
+
+
+@pytest.fixture(scope="session")
+def quantised(float_onnx: onnx.ModelProto) -> Quantised:
+    scene = procedural_scene(700, 700, np.random.default_rng(1))
+    sensors = load_sensor("pleiades-degraded"), load_sensor("pleiades-reference")
+    patches = draw_patches([scene], *sensors, count=2, seed=5)
+    quick = replace(ALL, equalise=False, fit_weights=False)
+    return quantise_model(float_onnx, patches, {}, tick=lambda: None, passes=quick)
+
+
+@pytest.fixture(scope="session")
+def pair(float_onnx: onnx.ModelProto, quantised: Quantised, tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    """The two files."""
+    folder = tmp_path_factory.mktemp("pair")
+    paths = [folder / "float.onnx", folder / "int8.onnx"]
+    for model, path in zip((float_onnx, quantised.host), paths, strict=True):
+        save_onnx(model, path)
+    return paths
+
+
+@pytest.fixture(scope="session")
+def subject(pair: list[Path]) -> Subject:
+    return open_subject(pair[0], pair[1], "")

@@ -1,0 +1,182 @@
+"""The battery passes what is sound, and stops what is broken."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import onnx
+import pytest
+from jsonschema import validate
+from onnx import numpy_helper
+from typer.testing import CliRunner
+
+from deploy.cli import app
+from deploy.results import SCHEMA_PATH
+from deploy.stress.battery import STAGES, Outcome, run_battery, worst
+from deploy.stress.cases import CASES, FULL_DN, Case
+from deploy.stress.checks import Measure, differing, local_range, ringing
+from deploy.stress.limitations import LIMITATIONS
+from deploy.stress.subject import Subject, open_subject, restore
+from quant.onnx_file import save_onnx
+
+BY_NAME = {case.name: case for case in CASES}
+SIDE_PX = 32
+CHEAP = tuple(stage for stage in STAGES if stage != "traditional")
+
+
+def look(subject: Subject, names: list[str], stages: tuple[str, ...]) -> list[Outcome]:
+    return run_battery(subject, [BY_NAME[name] for name in names], stages, side_px=SIDE_PX)
+
+
+@pytest.mark.parametrize("case", [case for case in CASES if not case.large], ids=lambda case: str(case.name))
+def test_a_small_network_passes_every_case(case: Case, subject: Subject) -> None:
+    outcomes = look(subject, [case.name], CHEAP)
+    assert not [(o.stage, o.verdict, o.reason) for o in outcomes if o.failed]
+
+
+@pytest.mark.parametrize("name", ["full scale", "hot pixel", "night", "NaN pixels", "1 x 1"])
+def test_the_traditional_chain_passes(name: str, subject: Subject) -> None:
+    case = BY_NAME[name]
+    (outcome,) = run_battery(subject, [case], ["traditional"], side_px=20)
+    assert not outcome.failed
+
+
+@pytest.mark.parametrize("name", ["steps", "snow", "nodata stripes", "beyond 12 bits", "flat 1 x N"])
+def test_the_shipped_network_passes(name: str, shipped: Subject) -> None:
+    outcomes = run_battery(shipped, [BY_NAME[name]], ["float32", "INT8", "tiling"], side_px=48)
+    assert not [(o.stage, o.verdict) for o in outcomes if o.failed]
+
+
+@pytest.fixture(scope="module")
+def shipped() -> Subject:
+    return open_subject(None, None, "convbeers-xs")
+
+
+def spoilt(model: onnx.ModelProto, name: str, change: Callable[[np.ndarray], np.ndarray]) -> onnx.ModelProto:
+    copy = onnx.ModelProto()
+    copy.CopyFrom(model)
+    tensor = next(t for t in copy.graph.initializer if t.name == name)
+    value = numpy_helper.to_array(tensor)
+    tensor.CopyFrom(numpy_helper.from_array(np.asarray(change(value.copy()), value.dtype), name))
+    return copy
+
+
+def one_nan(weight: np.ndarray) -> np.ndarray:
+    weight.ravel()[4] = np.nan
+    return weight
+
+
+@pytest.mark.parametrize(
+    ("name", "change", "case", "check"),
+    [
+        ("body.0.second.weight", one_nan, "night", "refused"),
+        ("tail.weight", lambda w: 3000 * w, "night", "gain"),
+        ("tail.weight", lambda w: 300 * w, "no noise", "ringing"),
+        ("tail.weight", lambda w: 1e6 * w, "no noise", "error against float64"),
+        ("tail.bias", lambda b: b + 0.05, "deciles", "mean moved"),
+        ("head.weight", lambda w: w * 1e38, "steps", "refused"),
+    ],
+)
+def test_a_broken_float_network_fails(
+    name: str,
+    change: Callable[[np.ndarray], np.ndarray],
+    case: str,
+    check: str,
+    float_onnx: onnx.ModelProto,
+    tmp_path: Path,
+) -> None:
+    save_onnx(spoilt(float_onnx, name, change), tmp_path / "broken.onnx")
+    (outcome,) = look(open_subject(tmp_path / "broken.onnx", None, ""), [case], ("float32",))
+    assert any(measure.check.startswith(check) for measure in outcome.failed), outcome.verdict
+
+
+def test_a_broken_int8_network_fails(pair: list[Path], tmp_path: Path) -> None:
+    broken = spoilt(onnx.load(pair[1]), "tail.bias", lambda bias: bias + 10_000_000)
+    save_onnx(broken, tmp_path / "broken.onnx")
+    outcomes = look(open_subject(pair[0], tmp_path / "broken.onnx", ""), ["deciles"], ("INT8",))
+    assert {"mean moved"} <= {measure.check for measure in outcomes[0].failed}
+
+
+def test_a_halo_one_pixel_short_fails(subject: Subject) -> None:
+    """Of the network's receptive radius: tile plans differ."""
+    image, radius_px = BY_NAME["no noise"].draw(48, np.random.default_rng(0))[0], subject.float32.radius_px
+    infer = subject.float32.infer()
+    whole = restore(infer, image, radius_px)
+    for short, same in ((0, True), (1, False)):
+        tiled = restore(infer, image, radius_px - short, tile_px=2 * radius_px + 9)
+        assert differing("plans differ", tiled, whole).holds == same
+
+
+def test_nan_never_holds_and_is_the_worst() -> None:
+    nan = Measure("c", float("nan"), 1)
+    assert not nan.holds
+    assert worst([Measure("c", 0.5, 1), nan, Measure("c", 7, 1)])[0] is nan
+    assert not Measure("c", float("inf"), 1).holds
+
+
+def test_a_limitation_explains_no_more_than_its_ceiling(subject: Subject) -> None:
+    del subject
+    limit = next(known for known in LIMITATIONS if known.name == "border")
+    for value, failed in ((limit.ceiling, 0), (limit.ceiling + 1, 1), (float("nan"), 1)):
+        outcome = Outcome(BY_NAME["deciles"], "INT8", (Measure("border", value, 10),))
+        assert len(outcome.failed) == failed
+    elsewhere = Outcome(BY_NAME["deciles"], "simulator", (Measure("border", 20, 10),))
+    assert elsewhere.failed
+
+
+def test_ringing_is_what_leaves_the_range_around() -> None:
+    source = np.zeros((9, 9), np.float32)
+    source[:, 5:] = 1000
+    low, high = local_range(source, 1)
+    assert (low[0, 4], high[0, 4], high[0, 3]) == (0, 1000, 0)
+    over = source.copy()
+    over[4, 5] = 1000 + 41 + 500
+    assert ringing(over, source, 1, 75).value == pytest.approx(50, abs=0.1)
+    assert ringing(source, source, 1, 75).value == 0
+
+
+@pytest.mark.parametrize("case", CASES, ids=lambda case: str(case.name))
+def test_cases_are_drawn_from_their_seed_and_say_what_is_wrong_with_them(case: Case) -> None:
+    first, second = (case.draw(24, np.random.default_rng(7)) for _ in range(2))
+    for image, again in zip(first, second, strict=True):
+        np.testing.assert_array_equal(image, again)
+        assert image.dtype == np.float32
+        sound = bool(np.isfinite(image).all()) and image.min() >= 0 and image.max() <= FULL_DN
+        assert sound == (case.pixels == "sound")
+
+
+def test_the_command_writes_its_figures_and_fails_by_exit_code(pair: list[Path], tmp_path: Path) -> None:
+    few = ["--cases", "night,NaN pixels", "--stages", "float32,INT8,metrics", "--size", "24"]
+    files = ["--json", str(tmp_path / "s.json"), "--out", str(tmp_path / "s.md")]
+    done = CliRunner().invoke(app, ["stress", str(pair[0]), str(pair[1]), *few, *files])
+    assert done.exit_code == 0, done.output
+    document = json.loads((tmp_path / "s.json").read_text())
+    validate(document, json.loads(SCHEMA_PATH.read_text()))
+    tables = {row["table"] for row in document["rows"]}
+    assert {"battery", "worst, count", "proofs", "integer layers", "findings"} <= tables
+    assert "## Proven for every image" in (tmp_path / "s.md").read_text()
+    broken = spoilt(onnx.load(pair[0]), "body.0.second.weight", one_nan)
+    save_onnx(broken, tmp_path / "broken.onnx")
+    failed = CliRunner().invoke(app, ["stress", str(tmp_path / "broken.onnx"), *few])
+    assert failed.exit_code == 1
+    assert "FAILED night, float32" in failed.output
+    assert "not looked at: INT8 network" in failed.output
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["--cases", "fog"], "some of black"),
+        (["--stages", "fog"], "some of simulator"),
+        (["--variant", "fog"], "shipped weights"),
+        (["nowhere.onnx"], "no such file"),
+        (["FLOAT", "FLOAT"], "an INT8 network"),
+        (["INT8"], "a float network"),
+    ],
+)
+def test_bad_input_is_one_sentence(arguments: list[str], words: str, pair: list[Path]) -> None:
+    files = dict(zip(("FLOAT", "INT8"), map(str, pair), strict=True))
+    result = CliRunner().invoke(app, ["stress", *(files.get(text, text) for text in arguments)])
+    assert result.exit_code == 2
+    assert words in result.output

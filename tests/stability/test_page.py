@@ -1,0 +1,59 @@
+"""docs/stability.md names every case, stage and limitation that the code knows."""
+
+import importlib.util
+import sys
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+from deploy.results import Row, by_table, measured, predicted, unavailable
+from deploy.stress.battery import STAGES
+from deploy.stress.cases import CASES
+from deploy.stress.limitations import LIMITATIONS
+from deploy.stress.page import markdown
+
+DOCS = Path(__file__).resolve().parents[2] / "docs"
+
+
+@pytest.fixture(scope="module")
+def maker() -> ModuleType:
+    spec = importlib.util.spec_from_file_location("make_stability", DOCS / "make_stability.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules["make_stability"] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+def faults(page: str, maker: ModuleType) -> list[str]:
+    """What the page lacks, and what it has that failed."""
+    wanted = [maker.OPENING.strip(), *maker.stage_lines(), *maker.limitation_lines()]
+    lacking = [text for text in wanted if text.strip() not in page]
+    lacking += [case.name for case in CASES if f"\n| {case.name} | " not in page]
+    lacking += [] if f"|  | {' | '.join(STAGES)} |" in page else ["the stages of the table"]
+    return lacking + (["a failure"] if "FAILED" in page else [])
+
+
+def test_the_page_is_fresh(maker: ModuleType) -> None:
+    assert faults((DOCS / "stability.md").read_text(encoding="utf-8"), maker) == []
+
+
+def test_a_stale_page_is_found(maker: ModuleType) -> None:
+    page = (DOCS / "stability.md").read_text(encoding="utf-8")
+    for text in ("\n| snow | ", LIMITATIONS[0].meaning, "| losses |"):
+        assert text in page
+        assert faults(page.replace(text, ""), maker)
+    assert faults(page.replace("| snow | ok", "| snow | FAILED: gain", 1), maker) == ["a failure"]
+
+
+def test_columns_say_unit_and_mode() -> None:
+    rows = [
+        Row("t", "a|b", {"x": measured(1.5, "DN", "s"), "y": predicted(2e21, "DN", (2e21, 2e21), "proven for all")}),
+        Row("t", "c", {"x": unavailable("DN", "no reason"), "y": predicted(3, "DN", (3, 3), "proven for all")}),
+    ]
+    page = markdown([row for found in by_table(rows).values() for row in found])
+    assert "y (DN, proven)" in page
+    assert "| a/b | 1.5 DN, measured | 2e+21 |" in page
+    assert "unavailable: no reason" in page
