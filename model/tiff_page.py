@@ -7,7 +7,9 @@ thousand times as many. None of that is believed here.
 import math
 import zlib
 from collections.abc import Iterator
+from contextlib import suppress
 from importlib.util import find_spec
+from itertools import accumulate
 from pathlib import Path
 
 import psutil
@@ -30,6 +32,9 @@ def check_page(path: Path, page: tifffile.TiffPage) -> None:
             place has.
         MachineError: a strip or tile that does not fit in memory.
     """
+    if not all(isinstance(size, int) for size in page.shaped):  # a size may be stored as a float
+        got, remedy = f"sizes of {page.shaped}", "write it again"
+        raise ImageError(str(path), expected="whole numbers of pixels", got=got, remedy=remedy)
     if page.compression not in KNOWN:
         got, remedy = str(tifffile.COMPRESSION(page.compression).name), "write it with deflate, LZW or zstd"
         raise ImageError(str(path), expected="a TIFF compression known here", got=got, remedy=remedy)
@@ -96,15 +101,21 @@ def jpeg_size_px(data: bytes) -> tuple[int, int] | None:
 
 
 def _check_unpacked(path: Path, page: tifffile.TiffPage) -> None:
-    """Without imagecodecs, tifffile unpacks however much there is."""
+    """Without imagecodecs, tifffile unpacks however much there is. Damage is told when its rows are read."""
     limit = segment_bytes(page) + PIECE_BYTES
     for data in _segments(page):
-        unpacker, total = zlib.decompressobj(), 0
-        while data and not unpacker.eof:
-            total += len(unpacker.decompress(data, PIECE_BYTES))
-            data = unpacker.unconsumed_tail
-            if total > limit:
-                raise _swollen(path, f"{len(data)} bytes that unpack to more than {total}")
+        with suppress(zlib.error):
+            for total in accumulate(map(len, _unpacked(data))):
+                if total > limit:
+                    raise _swollen(path, f"{len(data)} bytes that unpack to more than {total}")
+
+
+def _unpacked(data: bytes) -> Iterator[bytes]:
+    """Piece by piece."""
+    unpacker = zlib.decompressobj()
+    while data and not unpacker.eof:
+        yield unpacker.decompress(data, PIECE_BYTES)
+        data = unpacker.unconsumed_tail
 
 
 def _swollen(path: Path, got: str) -> ImageError:

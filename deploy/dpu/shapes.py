@@ -96,8 +96,10 @@ def _infer(node: onnx.NodeProto, known: list[Shape], constants: dict[str, Tensor
         if name in constants:
             data[name] = constants[name]
             types[name] = helper.make_tensor_type_proto(data[name].data_type, list(data[name].dims))
-        else:
-            types[name] = helper.make_tensor_type_proto(TensorProto.FLOAT, [1, *next(shapes)])
+        elif (shape := next(shapes, None)) is not None:
+            types[name] = helper.make_tensor_type_proto(TensorProto.FLOAT, [1, *shape])
+        else:  # a scale or a size that is no constant of the file
+            return None
     try:
         schema = onnx.defs.get_schema(node.op_type, 17, node.domain)
         opsets = [helper.make_opsetid("", 17)]

@@ -100,6 +100,14 @@ def test_a_strip_beyond_the_end_is_refused_before_it_is_read(tmp_path: Path) -> 
     refused(tiff(tmp_path / "a.tif", GREY.tobytes(), size=2**32 - 1), ImageError, "cut short")
 
 
+def test_a_size_that_is_no_whole_number_is_refused(tmp_path: Path) -> None:
+    path = tiff(tmp_path / "a.tif", GREY.tobytes())
+    whole, broken = struct.pack("<HHII", 257, 4, 1, 16), struct.pack("<HHIf", 257, 11, 1, 16.0)
+    assert whole in path.read_bytes()
+    path.write_bytes(path.read_bytes().replace(whole, broken))
+    refused(path, ImageError, "whole numbers")
+
+
 def test_an_image_too_long_to_be_planned_is_refused(tmp_path: Path) -> None:
     path = tiff(tmp_path / "a.tif", GREY.tobytes(), height=2**32 - 1, rows=16)
     with pytest.raises(BeersError):

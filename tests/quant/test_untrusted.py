@@ -251,6 +251,13 @@ def test_weights_without_sizes_are_one_sentence(tmp_path: Path) -> None:
         open_session(parse_onnx(model.SerializeToString(), "flat.onnx"), 1)
 
 
+def test_an_unknown_operator_of_two_tensors_hides_the_shape(tmp_path: Path) -> None:
+    sketch = Sketch(1)
+    scale = sketch.constant(np.array(0.5, np.float32))
+    odd = sketch.node("QLinearMystery", "image", scale, "image", domain="com.microsoft")
+    assert read_network(sketch.save(tmp_path / "a.onnx", odd), 32).operations[0].out_shape is None
+
+
 def test_a_long_chain_of_activations_is_followed_in_a_moment(tmp_path: Path) -> None:
     """Once it ended in a RecursionError: each was looked past for the QuantizeLinear behind it."""
     sketch = Sketch(1)
