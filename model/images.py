@@ -56,7 +56,12 @@ def require_image_file(path: Path) -> None:
     Raises:
         ImageError: either.
     """
-    if not path.is_file():
+    try:
+        found = path.is_file()
+    except OSError as error:  # such as a name that is too long
+        got = error.strerror or str(error)
+        raise ImageError(str(path), expected="an image file", got=got, remedy="check the path") from error
+    if not found:
         raise ImageError(str(path), expected="an image file", got="no such file", remedy="check the path")
     if path.stat().st_size == 0:
         raise ImageError(str(path), expected="an image", got="an empty file", remedy="write or copy it again")

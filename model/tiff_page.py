@@ -21,6 +21,10 @@ NONE, LZW, JPEG, DEFLATE, PACKBITS, ZSTD = 1, 5, 7, (8, 32946), 32773, 50000
 KNOWN = {NONE, LZW, JPEG, *DEFLATE, PACKBITS, ZSTD}
 """Compressions, by TIFF's numbers. The others' decoders take their sizes from the packed bytes."""
 PIECE_BYTES = 1 << 20
+SIZES = (
+    "imagelength", "imagewidth", "imagedepth", "tilelength", "tilewidth", "tiledepth", "rowsperstrip",
+    "samplesperpixel", "bitspersample", "planarconfig", "compression",
+)  # fmt: skip
 MARKER, FRAMES = 0xFF, set(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 
 
@@ -32,9 +36,10 @@ def check_page(path: Path, page: tifffile.TiffPage) -> None:
             place has.
         MachineError: a strip or tile that does not fit in memory.
     """
-    if not all(isinstance(size, int) for size in page.shaped):  # a size may be stored as a float
-        got, remedy = f"sizes of {page.shaped}", "write it again"
-        raise ImageError(str(path), expected="whole numbers of pixels", got=got, remedy=remedy)
+    for name in SIZES:
+        if not isinstance(getattr(page, name), int):  # a file may hold a float, or a list
+            got, remedy = f"{name} of {str(getattr(page, name))[:40]}", "write it again"
+            raise ImageError(str(path), expected="whole numbers of pixels", got=got, remedy=remedy)
     if page.compression not in KNOWN:
         got, remedy = str(tifffile.COMPRESSION(page.compression).name), "write it with deflate, LZW or zstd"
         raise ImageError(str(path), expected="a TIFF compression known here", got=got, remedy=remedy)

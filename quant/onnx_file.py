@@ -28,9 +28,9 @@ def load_onnx(path: Path, to_run: bool = True) -> onnx.ModelProto:
     Raises:
         ModelError: missing, empty, not ONNX, or not to be trusted (see `quant.untrusted` and `quant.runnable`).
     """
-    if not path.is_file():
-        raise ModelError(str(path), expected="an ONNX file", got="no such file", remedy=REMEDY)
     try:
+        if not path.is_file():
+            raise ModelError(str(path), expected="an ONNX file", got="no such file", remedy=REMEDY)
         content = read_whole(path, FILE_BYTES)
     except (OSError, ValueError) as error:
         got = " ".join(str(error).split())[:120]

@@ -1,5 +1,6 @@
 """A run on disk: safetensors, with all that an exact resume needs; nothing is unpickled."""
 
+import math
 from dataclasses import asdict
 from pathlib import Path
 
@@ -14,6 +15,7 @@ from profiles.errors import ModelError
 
 MOMENTS = ("step", "exp_avg", "exp_avg_sq")
 """What Adam keeps of each parameter."""
+LEAST = {"step": 1.0, "exp_avg_sq": 0.0}
 
 
 def write_checkpoint(
@@ -51,7 +53,7 @@ def read_checkpoint(
         remedy = "repeat its options, or choose another --out"
         raise ModelError(str(path), expected=f"a checkpoint of {recipe}", got="another recipe", remedy=remedy)
     try:
-        _check_parts(tensors, network)
+        _check_parts(tensors, network, recipe.steps)
         guards = Guards.from_json(header["guards"])  # type: ignore[arg-type]
         step = int(str(header["step"]))
         if not 0 <= step <= recipe.steps:
@@ -82,7 +84,7 @@ def finish(network: ConvBEERS, path: Path, recipe: dict[str, object]) -> ConvBEE
     return load_network(path)[0]
 
 
-def _check_parts(tensors: dict[str, Tensor], network: ConvBEERS) -> None:
+def _check_parts(tensors: dict[str, Tensor], network: ConvBEERS, steps: int) -> None:
     """Nothing is filled in before all of it fits.
 
     Raises:
@@ -98,6 +100,10 @@ def _check_parts(tensors: dict[str, Tensor], network: ConvBEERS) -> None:
         parameter, moment = name.removeprefix("moment.").rsplit(".", 1)
         like = parameters[parameter]
         _check_like(tensors[name], like.new_zeros(()) if moment == "step" else like)
+        if not bool((tensors[name] >= LEAST.get(moment, -math.inf)).all()) or (
+            moment == "step" and tensors[name] > steps
+        ):
+            raise ValueError(f"{name} that Adam cannot have")
     if len(tensors) != 2 * len(wanted) + len(moments) or len(moments) not in (0, len(MOMENTS) * len(parameters)):
         raise ValueError(f"{len(tensors)} tensors")
     if {name.rsplit(".", 1)[1] for name in moments} - set(MOMENTS) or not all_finite(tensors):

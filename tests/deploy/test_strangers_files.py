@@ -21,12 +21,14 @@ from deploy.swath.spool import Spool, part_folder
 from deploy.tradeoff.cache import Cache, digest_of
 from deploy.tradeoff.host_time import Times
 from deploy.training import Log
+from model.images import read_pixels
 from model.metrics.backbone_files import read_tensors
 from model.weights_file import load_network, write_tensors
 from model.weights_file import read_tensors as read_weights
-from profiles.errors import ModelError, OptionError, ProfileError
+from profiles.errors import BeersError, ModelError, OptionError, ProfileError
 from profiles.toml import HERE
 from quant.limits import read_limits
+from quant.onnx_file import load_onnx
 from tests.fuzz.parsers import JOB, SHAPE, checkpoint_seeds, go_on, weights_seeds
 
 runner = CliRunner()
@@ -109,6 +111,12 @@ def test_weights_that_are_not_finite_are_refused(tmp_path: Path) -> None:
         load_network(path)
 
 
+def test_a_name_too_long_for_the_disk_is_a_sentence(tmp_path: Path) -> None:
+    for read, name in ((load_onnx, "a" * 5000 + ".onnx"), (read_pixels, "a" * 5000 + ".tif")):
+        with pytest.raises(BeersError, match="too long"):
+            read(tmp_path / name)
+
+
 @pytest.mark.parametrize(
     ("line", "changed"),
     [
@@ -140,6 +148,10 @@ Spoil = Callable[[dict[str, torch.Tensor]], object]
         lambda t: t.update({"moment.tail.bias.exp_avg": torch.zeros(3, 1)}),
         lambda t: t.pop("moment.tail.bias.exp_avg"),
         lambda t: t.update({"moment.tail.bias.mine": torch.zeros(1)}),
+        lambda t: t.update({"moment.tail.bias.step": torch.tensor(0.0)}),
+        lambda t: t.update({"moment.tail.bias.step": torch.tensor(-1e9)}),
+        lambda t: t.update({"moment.tail.bias.step": torch.tensor(11.0)}),
+        lambda t: t.update({"moment.tail.bias.exp_avg_sq": torch.full((1,), -1.0)}),
         lambda t: t.update({"moment.nobody.step": torch.zeros(())}),
         lambda t: t.update({"network.tail.bias": torch.full((1,), float("nan"))}),
     ],

@@ -106,6 +106,10 @@ def test_a_size_that_is_no_whole_number_is_refused(tmp_path: Path) -> None:
     assert whole in path.read_bytes()
     path.write_bytes(path.read_bytes().replace(whole, broken))
     refused(path, ImageError, "whole numbers")
+    path = tiff(tmp_path / "b.tif", GREY.tobytes())
+    many = struct.pack("<HHII", 257, 4, 20, 8)  # a list, of what stands at the file's begin
+    path.write_bytes(path.read_bytes().replace(whole, many))
+    refused(path, ImageError, "whole numbers|readable")
 
 
 def test_an_image_too_long_to_be_planned_is_refused(tmp_path: Path) -> None:
