@@ -1,25 +1,37 @@
-# Two stages: wheels are built in the first; the second holds only Python, the installed packages and no build tools.
+# Three stages: the first installs by hash, the second lists what was installed, the third holds only Python and that.
 #   docker build -t beers-deploy .
-#   docker run --rm --read-only --tmpfs /tmp --user "$(id -u):$(id -g)" -v "$PWD:/data" \
+#   docker run --rm --read-only --tmpfs /tmp --network none --user "$(id -u):$(id -g)" -v "$PWD:/data" \
 #     beers-deploy restore raw.tif restored.tif
-FROM python:3.11.14-slim-bookworm AS build
+# The tag is for people; what is pulled is the digest (docker buildx imagetools inspect TAG shows a tag's present one).
+FROM python:3.11.14-slim-bookworm@sha256:65a93d69fa75478d554f4ad27c85c1e69fa184956261b4301ebaf6dbb0a3543d AS base
+
+FROM base AS build
 ARG TORCH_INDEX=https://download.pytorch.org/whl/cpu
 WORKDIR /src
 RUN python -m venv /opt/venv
 ENV PATH=/opt/venv/bin:$PATH PIP_NO_CACHE_DIR=1 PIP_DISABLE_PIP_VERSION_CHECK=1
-RUN pip install torch==2.13.0 --index-url "$TORCH_INDEX"
+COPY requirements.lock ./
+RUN pip install --only-binary :all: --no-deps --require-hashes --extra-index-url "$TORCH_INDEX" -r requirements.lock
 COPY pyproject.toml README.md LICENSE ./
 COPY profiles profiles
 COPY model model
 COPY quant quant
 COPY deploy deploy
-RUN pip install . && pip uninstall --yes setuptools wheel pip
+RUN pip install --no-index --no-deps --no-build-isolation . && pip check && pip uninstall --yes setuptools pip
 
-FROM python:3.11.14-slim-bookworm
+# A stage of its own: what makes the list cannot touch what is listed.
+FROM base AS sbom
+RUN python -m venv /opt/tool && /opt/tool/bin/pip install --no-cache-dir cyclonedx-bom==7.5.0
+COPY --from=build /opt/venv /opt/venv
+COPY pyproject.toml ./
+RUN /opt/tool/bin/cyclonedx-py environment --pyproject pyproject.toml --output-reproducible -o /sbom.cdx.json /opt/venv
+
+FROM base
 RUN useradd --create-home --uid 1000 beers
 COPY --from=build /opt/venv /opt/venv
-ENV PATH=/opt/venv/bin:$PATH HOME=/tmp PYTHONDONTWRITEBYTECODE=1
-USER beers
+COPY --from=sbom /sbom.cdx.json /opt/venv/share/sbom.cdx.json
+ENV PATH=/opt/venv/bin:$PATH HOME=/tmp PYTHONDONTWRITEBYTECODE=1 ORT_DISABLE_TELEMETRY=1
+USER 1000:1000
 WORKDIR /data
 ENTRYPOINT ["beers-deploy"]
 CMD ["--help"]
