@@ -15,6 +15,7 @@ from __future__ import annotations
 import argparse
 import itertools
 import json
+import os
 import statistics
 import sys
 import threading
@@ -22,6 +23,8 @@ import time
 from pathlib import Path
 
 import numpy as np
+
+os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")  # before it is loaded: from 1.29 on it reports its use
 import onnxruntime as ort
 
 POWER_SAMPLE_S = 0.05

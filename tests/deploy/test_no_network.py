@@ -1,7 +1,17 @@
-"""The main commands where no socket can be opened: nothing is fetched, asked or told at run time."""
+"""The main commands where no socket can be opened: nothing is fetched, asked or told at run time.
+
+Most run in this process, where Python's sockets are watched; some in a process of their own, where the kernel watches
+native libraries' too (tests/deploy/sealed.py).
+"""
 
 import json
+import os
+import platform
+import signal
 import socket
+import subprocess
+import sys
+from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
@@ -12,8 +22,15 @@ from typer.testing import CliRunner
 from deploy.cli import app
 from model.convbeers import ConvBEERS, Variant, initialise
 from model.weights_file import save_network
+from tests.deploy.sealed import SOCKET_CALL
 
 runner = CliRunner()
+
+ROOT = Path(__file__).resolve().parents[2]
+needs_filters = pytest.mark.skipif(
+    sys.platform != "linux" or platform.machine() not in SOCKET_CALL,
+    reason="only Linux on x86-64 and AArch64 has these system calls",
+)
 
 
 @pytest.fixture
@@ -55,6 +72,12 @@ def test_the_chain_opens_no_socket(tmp_path: Path, no_sockets: list[tuple[object
     done("bench", int8, "--size", "300x200", "--tile", 64)
     done("restore", tmp_path / "raw.tif", tmp_path / "out.tif", "--model", int8)
     done("compare", figures, figures)
+    done("evaluate", "--images", scenes, "--methods", f"degraded,{int8}")
+    done("simulate", "--scene", "haze-over-sea", "--explain")
+    done("simulate", "--patch", 32, "--workers", 1, "--out", tmp_path / "pairs")
+    tiny = ("--steps", 2, "--batch", 1, "--patch", 32, "--validate-every", 0, "--lpips-weight", 0)
+    done("train", "--variant", "convbeers-xs", "--drawn", 1, *tiny, "--out", tmp_path / "run")
+    assert (tmp_path / "run" / "convbeers-xs.safetensors").is_file()
     assert json.loads(figures.read_text())["command"] == "gate"
     assert tifffile.imread(tmp_path / "out.tif").shape == (37, 61)
     assert no_sockets == []
@@ -64,3 +87,50 @@ def test_an_attempt_would_be_seen(no_sockets: list[tuple[object, ...]]) -> None:
     with pytest.raises(OSError, match="no network"):
         socket.create_connection(("localhost", 1))
     assert no_sockets
+
+
+def alone(home: Path, *arguments: object) -> subprocess.CompletedProcess[str]:
+    """Python where a user would start it: no variable is set that makes libraries hold their tongues in CI."""
+    environment = {"PATH": os.environ["PATH"], "HOME": str(home), "TMPDIR": str(home)}
+    command = [sys.executable, *map(str, arguments)]
+    return subprocess.run(
+        command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=300, check=False
+    )
+
+
+def kept(home: Path) -> list[str]:
+    return sorted(str(path.relative_to(home)) for path in home.rglob("*") if path.is_file())
+
+
+@needs_filters
+@pytest.mark.parametrize("runtime", ["onnxruntime", "openvino"])
+def test_no_native_library_opens_one_or_keeps_an_identifier(tmp_path: Path, runtime: str) -> None:
+    if runtime == "openvino":
+        pytest.importorskip("openvino", reason="the extra 'openvino' is not installed")
+    home, raw, out = tmp_path / "home", tmp_path / "raw.tif", tmp_path / "out.tif"
+    home.mkdir()
+    tifffile.imwrite(raw, np.random.default_rng(0).integers(200, 1800, (37, 61)).astype(np.uint16))
+    result = alone(home, "-m", "tests.deploy.sealed", "restore", raw, out, "--runtime", runtime)
+    assert result.returncode == 0, result.stderr
+    assert tifffile.imread(out).shape == (37, 61)
+    assert kept(home) == []
+
+
+@needs_filters
+def test_a_native_attempt_would_end_the_process(tmp_path: Path) -> None:
+    begin = "from tests.deploy.sealed import seal; seal(); import socket; "
+    assert alone(tmp_path, "-c", begin + "socket.socketpair()").returncode == 0
+    for family in ("AF_INET", "AF_INET6"):
+        assert alone(tmp_path, "-c", begin + f"socket.socket(socket.{family})").returncode == -signal.SIGSYS
+
+
+def test_an_identifier_would_be_seen(tmp_path: Path) -> None:
+    if tuple(map(int, version("onnxruntime").split(".")[:2])) < (1, 29):
+        pytest.skip("this onnxruntime keeps none anywhere")
+    alone(tmp_path, "-c", "import onnxruntime")
+    if not kept(tmp_path):
+        pytest.skip("this build of onnxruntime keeps none")
+    silent = tmp_path / "silent"
+    silent.mkdir()
+    alone(silent, "-c", "import quant, onnxruntime")
+    assert kept(silent) == []
