@@ -1,0 +1,108 @@
+"""Arithmetic against its definition, written another way: SSIM's variances, a bias in whole numbers, an inverse."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.lib.stride_tricks import sliding_window_view
+
+from deploy.stress.battery import run_battery
+from deploy.stress.cases import CASES
+from deploy.stress.subject import Subject
+from model.metrics.fidelity import SSIM_RADIUS_PX, SSIM_SIGMA_PX, ssim
+from model.simulator.mtf import NYQUIST, mtf
+from model.traditional.compensate import compensation_gain
+from quant.board_file import board_model
+from quant.core import IntConv, IntCore
+from quant.graph import CORRECTION
+from quant.host_file import host_model
+from quant.integer import correction
+from quant.passes.dual_gain import merge
+from quant.planes import PLANES, POSITION, split
+from quant.quantise import Quantised
+from quant.session import open_session, run
+
+
+def ssim_by_two_passes(image: np.ndarray, reference: np.ndarray, data_range: float) -> float:
+    """Variances as means of squared distances from the mean: nothing large is subtracted."""
+    offset = np.arange(-SSIM_RADIUS_PX, SSIM_RADIUS_PX + 1)
+    side = np.exp(-0.5 * (offset / SSIM_SIGMA_PX) ** 2)
+    weights = np.outer(side, side) / side.sum() ** 2
+    x, y = (sliding_window_view(a.astype(np.float64), weights.shape) for a in (image, reference))
+    mean_x, mean_y = ((a * weights).sum((2, 3)) for a in (x, y))
+    from_x, from_y = x - mean_x[..., None, None], y - mean_y[..., None, None]
+    var_x, var_y, both = (
+        (a * b * weights).sum((2, 3)) for a, b in ((from_x, from_x), (from_y, from_y), (from_x, from_y))
+    )
+    c1, c2 = (0.01 * data_range) ** 2, (0.03 * data_range) ** 2
+    light = (2 * mean_x * mean_y + c1) / (mean_x**2 + mean_y**2 + c1)
+    return float((light * (2 * both + c2) / (var_x + var_y + c2)).mean())
+
+
+@settings(max_examples=20)
+@given(
+    seed=st.integers(0, 999),
+    level=st.floats(0, 4000),
+    sigma=st.floats(0.5, 50),
+    data_range=st.sampled_from([1.0, 4095.0]),
+)
+def test_ssim_is_that_of_its_definition(seed: int, level: float, sigma: float, data_range: float) -> None:
+    noise = np.random.default_rng(seed).standard_normal((2, 23, 31))
+    image, other = (level + sigma * noise).astype(np.float32)
+    assert ssim(image, other, data_range) == pytest.approx(ssim_by_two_passes(image, other, data_range), abs=1e-10)
+
+
+def biased(core: IntCore, generator: np.random.Generator) -> IntCore:
+    """The core with a bias of its own in every convolution, at any position that the DPU can shift."""
+    ops = []
+    for op in core.ops:
+        if isinstance(op, IntConv):
+            bias = generator.integers(-128, 128, len(op.bias)).astype(np.int8)
+            product = op.weight_position + core.positions[op.input]
+            op = replace(op, bias=bias, bias_position=product - int(generator.integers(0, 8)))
+        ops.append(op)
+    return replace(core, ops=tuple(ops))
+
+
+@pytest.mark.parametrize("shape", [(17, 20), (1, 1), (1, 19), (12, 2)])
+@pytest.mark.parametrize("seed", [0, 1])
+def test_both_files_hold_every_bias_at_its_position(seed: int, shape: tuple[int, int], quantised: Quantised) -> None:
+    generator = np.random.default_rng(seed)
+    core = biased(quantised.core, generator)
+    image = generator.uniform(0.3, 0.7, (1, 1, *shape)).astype(np.float32)
+    planes = split(image)
+    whole = correction(core, planes, half_even=True)
+    restored = np.clip(image + merge(whole, core.scale(CORRECTION)), 0, 1)
+    np.testing.assert_array_equal(run(open_session(host_model(core, {})), image), restored)
+    feed = {PLANES: planes.astype(np.float32) * np.float32(2.0**-POSITION)}
+    np.testing.assert_array_equal(open_session(board_model(core, {})).run(None, feed)[0], whole)
+
+
+def test_a_bias_one_position_off_would_show(quantised: Quantised) -> None:
+    core = biased(quantised.core, np.random.default_rng(0))
+    planes = split(np.full((1, 1, 9, 9), 0.5, np.float32))
+    ops = [replace(op, bias_position=op.bias_position - 1) if isinstance(op, IntConv) else op for op in core.ops]
+    assert (correction(core, planes) != correction(replace(core, ops=tuple(ops)), planes)).any()
+
+
+MTFS = st.floats(0.001, 0.63)
+
+
+@given(mtf_from=MTFS, mtf_to=MTFS, epsilon=st.floats(1e-3, 1))
+def test_no_inverse_amplifies_beyond_what_its_regularisation_proves(
+    mtf_from: float, mtf_to: float, epsilon: float
+) -> None:
+    """T H / (H^2 + epsilon r^2) is at most T / (2 sqrt(epsilon) r), whatever the blur H."""
+    gain = compensation_gain(32, 30, mtf_from, mtf_to, epsilon)
+    fy, fx = torch.fft.fftfreq(32, dtype=torch.float64)[:, None], torch.fft.rfftfreq(30, dtype=torch.float64)
+    radius = (fy.square() + fx.square()).sqrt() / NYQUIST
+    assert float((gain * 2 * epsilon**0.5 * radius / mtf(fx, fy, mtf_to)).max()) <= 1 + 1e-9
+
+
+def test_the_traditional_chain_passes_what_hardly_any_contrast_is_left_of(subject: Subject) -> None:
+    case = next(case for case in CASES if case.name == "MTF 0.1 %")
+    (outcome,) = run_battery(subject, [case], ["traditional"], side_px=32)
+    assert not outcome.failed, outcome.verdict
