@@ -29,6 +29,9 @@ def train(
     ] = 0.0,
     lpips_weight: Annotated[float, typer.Option(min=0, help="Weight of LPIPS in the loss.")] = 0.5,
     fft_weight: Annotated[float, typer.Option(min=0, help="Weight of the L1 of spectra in the loss.")] = 0.1,
+    radiance_weight: Annotated[
+        float, typer.Option(min=0, help="Weight of the error of patches' means in the loss.")
+    ] = 0.0,
     lpips: Annotated[Path | None, typer.Option(help="Weights of SqueezeNet 1.1 for LPIPS, or their folder.")] = None,
     start: Annotated[
         Path | None, typer.Option(help="Weights to go on from; of a narrower network, they are widened.")
@@ -69,7 +72,7 @@ def train(
         batch=batch,
         learning_rate=learning_rate,
         optimiser=optimiser,  # type: ignore[arg-type]
-        loss=LossWeights(l1_weight, l2_weight, lpips_weight, fft_weight),
+        loss=LossWeights(l1_weight, l2_weight, lpips_weight, fft_weight, radiance_weight),
         distil=distil if teacher else 0.0,
         seed=seed,
     )

@@ -5,7 +5,7 @@ import torch
 from torch import Tensor, nn
 
 from model.metrics.perceptual import Lpips
-from model.training.losses import PAPER, LossWeights, RestorationLoss, fft_l1
+from model.training.losses import PAPER, LossWeights, RestorationLoss, fft_l1, radiance_l1
 
 
 def images(side: int = 33, batch: int = 2, seed: int = 0) -> tuple[Tensor, Tensor]:
@@ -53,6 +53,19 @@ def test_the_terms_add_up() -> None:
     assert set(terms) == {"l1", "fft", "lpips"}
     expected = terms["l1"] + 0.1 * terms["fft"] + 0.5 * terms["lpips"]
     torch.testing.assert_close(total, expected)
+
+
+def test_a_radiance_term_sees_the_mean_and_nothing_else() -> None:
+    """Noise of any size that keeps each patch's mean costs nothing; errors of two patches do not cancel."""
+    _, reference = images(side=21, batch=2)
+    noise = 0.1 * torch.randn(reference.shape, generator=torch.Generator().manual_seed(1))
+    kept = reference + noise - noise.mean((1, 2, 3), keepdim=True)
+    assert float(radiance_l1(kept, reference)) < 1e-6
+    shift = torch.tensor([0.02, -0.02])[:, None, None, None]
+    assert float(radiance_l1(kept + shift, reference)) == pytest.approx(0.02, rel=1e-4)
+    total, terms = RestorationLoss(LossWeights(1.0, 0.0, 0.0, 0.0, 2.0))(kept + shift, reference)
+    assert set(terms) == {"l1", "radiance"}
+    torch.testing.assert_close(total, terms["l1"] + 2 * terms["radiance"])
 
 
 def test_an_l2_term_weighs_large_errors_more() -> None:
