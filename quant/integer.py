@@ -7,7 +7,8 @@ Activations round half up; a runtime that computes in float rounds half to even.
 one half the two differ by one unit: `half_even` takes the runtime's rule, so that both can be proven and counted.
 """
 
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -18,6 +19,30 @@ from quant.positions import INT8_MAX, INT8_MIN
 
 INT32_BITS = 31
 """Of an accumulator, without the sign."""
+
+EXACT = 2**24
+"""Up to here float32 holds whole numbers exactly, and sums them in any order."""
+
+
+@dataclass(frozen=True)
+class Faults:
+    """What goes wrong while the core runs, or is held in check.
+
+    Attributes:
+        shifts: wrong shifts, by operation and field: `shift_cut`, `shift_bias` of a convolution, `shift_write` of an
+            add.
+        touch: what becomes of a tensor, by name, between the operation that writes it and those that read it.
+    """
+
+    shifts: Mapping[tuple[str, str], int] = field(default_factory=dict)
+    touch: Callable[[str, np.ndarray], np.ndarray] = field(default=lambda _, tensor: tensor)
+
+    def shift(self, op: str, name: str, meant: int) -> int:
+        """The shift that an operation uses."""
+        return self.shifts.get((op, name), meant)
+
+
+SOUND = Faults()
 
 
 @dataclass(frozen=True)
@@ -40,14 +65,17 @@ class LayerReport:
 
 
 def run_core(
-    core: IntCore, planes: np.ndarray, half_even: bool = False
+    core: IntCore, planes: np.ndarray, half_even: bool = False, faults: Faults = SOUND
 ) -> tuple[dict[str, np.ndarray], list[LayerReport]]:
-    """Every tensor of the core for int8 planes (N, 3, H, W), and a report a layer."""
-    tensors, reports = {PLANES: planes.astype(np.int64)}, []
+    """Every tensor of the core for int8 planes (N, 3, H, W), as int16, and a report a layer."""
+    tensors, reports = {PLANES: faults.touch(PLANES, planes.astype(np.int16))}, []
     for op in core.ops:
-        sums, shift, bound = _conv(core, op, tensors) if isinstance(op, IntConv) else _add(core, op, tensors)
-        tensors[op.output], ties = _shifted(sums, shift, half_even)
-        result = tensors[op.output]
+        if isinstance(op, IntConv):
+            sums, shift, bound = _conv(core, op, tensors, faults)
+        else:
+            sums, shift, bound = _add(core, op, tensors, faults)
+        result, ties = _shifted(sums, shift, half_even)
+        tensors[op.output] = faults.touch(op.output, result)
         ends = (result == INT8_MAX) | (result == INT8_MIN)
         peak = float(np.log2(max(int(np.abs(sums).max()), 1)))
         reports.append(LayerReport(op.name, peak, bound, float(ends.mean()), ties))
@@ -60,48 +88,60 @@ def correction(core: IntCore, planes: np.ndarray, half_even: bool = False) -> np
     return np.asarray(tensors[CORRECTION] * np.float32(core.scale(CORRECTION)), np.float32)
 
 
-def _conv(core: IntCore, op: IntConv, tensors: dict[str, np.ndarray]) -> tuple[np.ndarray, int, float]:
+def _conv(
+    core: IntCore, op: IntConv, tensors: dict[str, np.ndarray], faults: Faults
+) -> tuple[np.ndarray, int, float]:
     """The accumulators (N, O, H, W), the shift to int8, and the bits that they cannot exceed."""
     product = op.weight_position + core.positions[op.input]
-    bias = op.bias.astype(np.int64) << (product - op.bias_position)
-    sums = _convolve(tensors[op.input], op.weight.astype(np.int64)) + bias[:, None, None]
+    bias = _moved(op.bias.astype(np.int64), faults.shift(op.name, "shift_bias", product - op.bias_position))
+    sums = _convolve(tensors[op.input], op.weight) + bias[:, None, None]
     bound = 128 * np.abs(op.weight.astype(np.int64)).sum((1, 2, 3)) + np.abs(bias)
     if op.relu:
         sums = np.maximum(sums, 0)
-    return sums, product - core.positions[op.output], float(np.log2(max(int(bound.max()), 1)))
+    cut = faults.shift(op.name, "shift_cut", product - core.positions[op.output])
+    return sums, cut, float(np.log2(max(int(bound.max()), 1)))
 
 
 def _convolve(image: np.ndarray, weight: np.ndarray) -> np.ndarray:
-    """Same-size convolution with zero padding: one product of matrices a tap, exact in int64."""
-    side = weight.shape[2]
-    margin = side // 2
-    wide = np.pad(image, ((0, 0), (0, 0), (margin, margin), (margin, margin)))
+    """Same-size convolution with zero padding: a product of matrices a tap, in floats that hold its sums exactly."""
+    largest = 128 * int(np.abs(weight.astype(np.int64)).sum((1, 2, 3)).max(initial=0))
+    exact = np.float32 if largest <= EXACT else np.float64
+    count, margin = len(image), weight.shape[2] // 2
+    wide = np.pad(image.astype(exact), ((0, 0), (0, 0), (margin, margin), (margin, margin)))
     height, width = image.shape[2:]
-    sums = np.zeros((len(image), len(weight), height, width), np.int64)
-    for dy in range(side):
-        for dx in range(side):
-            # float64 holds whole numbers exactly up to 2^53, and its product of matrices is the fast one
-            part = wide[:, :, dy : dy + height, dx : dx + width].astype(np.float64)
-            tap = weight[:, :, dy, dx].astype(np.float64)
-            sums += np.einsum("oi,nihw->nohw", tap, part, optimize=True).astype(np.int64)
-    return sums
+    sums = np.zeros((count, len(weight), height * width), exact)
+    for (dy, dx), tap in _taps(weight.astype(exact)):
+        sums += tap @ wide[:, :, dy : dy + height, dx : dx + width].reshape(count, -1, height * width)
+    return sums.reshape(count, len(weight), height, width).astype(np.int64)
 
 
-def _add(core: IntCore, op: Add, tensors: dict[str, np.ndarray]) -> tuple[np.ndarray, int, float]:
+def _taps(weight: np.ndarray) -> Iterator[tuple[tuple[int, int], np.ndarray]]:
+    """Each place of a kernel with its matrix (O, I)."""
+    for dy, dx in np.ndindex(weight.shape[2:]):
+        yield (dy, dx), np.ascontiguousarray(weight[:, :, dy, dx])
+
+
+def _add(core: IntCore, op: Add, tensors: dict[str, np.ndarray], faults: Faults) -> tuple[np.ndarray, int, float]:
     """The sum at the finer input's position, exact; the shift that remains; and its bits."""
     finest = max(core.positions[name] for name in op.inputs)
-    aligned = [tensors[name] << (finest - core.positions[name]) for name in op.inputs]
+    aligned = [tensors[name].astype(np.int64) << (finest - core.positions[name]) for name in op.inputs]
     bound = sum(128 << (finest - core.positions[name]) for name in op.inputs)
-    return aligned[0] + aligned[1], finest - core.positions[op.output], float(np.log2(bound))
+    write = faults.shift(op.name, "shift_write", finest - core.positions[op.output])
+    return aligned[0] + aligned[1], write, float(np.log2(bound))
+
+
+def _moved(values: np.ndarray, shift: int) -> np.ndarray:
+    """Shifted left, or right where a fault makes it so."""
+    return values << shift if shift >= 0 else values >> -shift
 
 
 def _shifted(sums: np.ndarray, shift: int, half_even: bool) -> tuple[np.ndarray, float]:
-    """Sums divided by 2^shift, rounded and clipped to int8; and the share that lay half-way."""
+    """Sums divided by 2^shift, rounded and clipped to int8, as int16; and the share that lay half-way."""
     if shift <= 0:
-        return np.clip(sums << -shift, INT8_MIN, INT8_MAX), 0.0
+        return np.clip(sums << -shift, INT8_MIN, INT8_MAX).astype(np.int16), 0.0
     half = 1 << (shift - 1)
     rounded = (sums + half) >> shift
     ties = (sums & ((1 << shift) - 1)) == half
     if half_even:
         rounded = rounded - (ties & (rounded % 2 == 1))
-    return np.clip(rounded, INT8_MIN, INT8_MAX), float(ties.mean())
+    return np.clip(rounded, INT8_MIN, INT8_MAX).astype(np.int16), float(ties.mean())

@@ -1,9 +1,13 @@
 """`beers-deploy stress`: hard cases against a network and everything around it. Exit code 1 when something fails."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
+
+if TYPE_CHECKING:
+    from deploy.stress.flip_study import FlipRequest
+    from deploy.stress.subject import Subject
 
 EXAMPLE = "stress float.onnx int8.onnx --out stability.md"
 
@@ -20,17 +24,34 @@ def stress(
     stages: Annotated[str | None, typer.Option(help="Only these stages, with commas: 'float32,INT8'.")] = None,
     size: Annotated[int, typer.Option(min=16, help="Side in pixels, where a case has none of its own.")] = 96,
     seed: Annotated[int, typer.Option(min=0, help="Seed of every random draw.")] = 0,
-    out: Annotated[Path | None, typer.Option(help="Write the tables here as Markdown.")] = None,
+    bit_flips: Annotated[
+        bool, typer.Option("--bit-flips", help="Turn bits over in the INT8 network instead of running hard cases.")
+    ] = False,
+    draws: Annotated[int, typer.Option(min=1, help="Strikes of each memory and rate, with --bit-flips.")] = 6,
+    sensor: Annotated[
+        str, typer.Option(help="Sensor profile of the patches, with --bit-flips.")
+    ] = "pleiades-degraded",
+    images: Annotated[
+        Path | None,
+        typer.Option(help="Folder of aerial images for the patches, with --bit-flips; else drawn scenes."),
+    ] = None,
+    target: Annotated[str, typer.Option(help="Board that prices the guards, with --bit-flips.")] = "vck190",
+    out: Annotated[
+        Path | None, typer.Option(help="Write the tables here as Markdown; with --bit-flips the curves beside it.")
+    ] = None,
     json: Annotated[Path | None, typer.Option(help="Write the figures here.")] = None,
 ) -> None:
     """Run hard cases through simulator, traditional chain, network, INT8, tiling, metrics and losses.
 
-    Prints what holds, the worst measures, the known limitations met, and what is proven for every image.
+    Prints what holds, the worst measures, the known limitations met, and what is proven for every image. With
+    --bit-flips: what bits turned over in weights, shifts, maps and the image cost, what guards buy back, and what
+    these cost on the board.
     """
     from deploy.progress import steps
     from deploy.results import Document, by_table
     from deploy.stress.battery import STAGES, chosen, run_battery
     from deploy.stress.cases import CASES
+    from deploy.stress.flip_study import FlipRequest
     from deploy.stress.page import markdown, title
     from deploy.stress.proofs import layer_rows, overflow_proven, proof_rows
     from deploy.stress.rows import battery_rows, bound_rows, finding_rows, limitation_rows
@@ -39,6 +60,10 @@ def stress(
     from model.files import require_writable, write_text
 
     require_writable(out, json)
+    if bit_flips:
+        request = FlipRequest(sensor, images, target, draws, size, seed)
+        _flip_bits(open_subject(float_model, int8_model, variant), request, cases or stages, out, json)
+        return
     names = chosen(cases, [case.name for case in CASES], "--cases")
     wanted = chosen(stages, STAGES, "--stages")
     subject = open_subject(float_model, int8_model, variant)
@@ -64,3 +89,31 @@ def stress(
     typer.echo(f"stress {'passed' if not failed and safe else 'FAILED'}: {len(outcomes)} looks, {len(failed)} failed")
     if failed or not safe:
         raise typer.Exit(1)
+
+
+def _flip_bits(
+    subject: "Subject", request: "FlipRequest", beside: str | None, out: Path | None, json: Path | None
+) -> None:
+    """Strike, print, and write what was asked for; hard cases have no place beside it."""
+    from dataclasses import asdict
+
+    from deploy.progress import steps
+    from deploy.results import Document, by_table
+    from deploy.stress.flip_picture import flip_curves_svg
+    from deploy.stress.flip_study import flip_rows, ticks
+    from deploy.stress.page import markdown, title
+    from deploy.tables import print_rows
+    from model.files import write_text
+    from profiles.errors import OptionError
+
+    if beside is not None:
+        expected, remedy = "no --cases or --stages beside it", "leave these out"
+        raise OptionError("--bit-flips", expected=expected, got=repr(beside), remedy=remedy)
+    with steps("turning bits over", ticks(subject, request)) as bar:
+        rows = flip_rows(subject, request, bar.advance)
+    for table, found in by_table(rows).items():
+        print_rows(title(table), found)
+    Document("stress", {"bit_flips": True, **asdict(request)}, subject.paths, tuple(rows)).write(json)
+    if out is not None:
+        write_text(out, markdown(rows))
+        write_text(out.with_suffix(".svg"), flip_curves_svg({subject.paths[-1].stem: rows}))

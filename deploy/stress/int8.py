@@ -33,7 +33,7 @@ def runtime(subject: Subject, case: Case, image: np.ndarray) -> list[Measure]:
 
 def reference(subject: Subject, case: Case, image: np.ndarray) -> list[Measure]:
     """By whole numbers alone, 48 x 48 pixels of larger images."""
-    core, network = _core(subject), _int8(subject)
+    core, network = core_of(subject), _int8(subject)
     if case.pixels != "sound":
         return []
     crop = (np.asarray(image[:CROP_PX, :CROP_PX], np.float32) / np.float32(FULL_DN))[None, None]
@@ -53,6 +53,20 @@ def reference(subject: Subject, case: Case, image: np.ndarray) -> list[Measure]:
         Measure("accumulator beyond its proof", over, 0, "bits"),
         _unproven(core, reports),
     ]
+
+
+def core_of(subject: Subject) -> IntCore:
+    """The whole numbers of the INT8 file.
+
+    Raises:
+        ModelError: no file, or one whose numbers cannot be told.
+    """
+    _int8(subject)
+    core = subject.core
+    if isinstance(core, BeersError):
+        raise core
+    assert core is not None  # noqa: S101 - there is a file
+    return core
 
 
 def planes_of(core: IntCore, image: np.ndarray) -> np.ndarray:
@@ -80,12 +94,3 @@ def _int8(subject: Subject) -> Network:
         remedy = "give it as the second argument"
         raise ModelError("INT8 network", expected="a file", got="none", remedy=remedy)
     return subject.int8
-
-
-def _core(subject: Subject) -> IntCore:
-    _int8(subject)
-    core = subject.core
-    if isinstance(core, BeersError):
-        raise core
-    assert core is not None  # noqa: S101 - there is a file
-    return core

@@ -9,12 +9,24 @@ TITLES = {
     "limitations": "Known limitations met",
     "proofs": "Proven for every image",
     "integer layers": "Integer layers",
+    "bit flips": "Quality against bits turned over",
+    "bit flips by layer": "One flip, by layer",
+    "bit flips by bit": "One flip, by bit",
+    "guards": "What guards cost on the board",
 }
 NOTES = {
     "battery": "`ok`: every check holds; `limit`: only what a known limitation explains does not; `-`: not looked "
     "at, for whole numbers know no missing pixels and the others are refused before.",
     "proofs": "Loose, but true of every image and every size. `inside` is farther from the border than the receptive "
     "radius.",
+    "bit flips": "PSNR, mean and range over patches and strikes; one kind of memory at a time. `clamped`: ReLU6 and "
+    "the limit of the correction. `all guards`: checksums and three copies too, looked at before the image; what "
+    "strikes the weights after that stays for this tile.",
+    "bit flips by layer": "How far one bit moves the restored image, root mean square over a crop, no guard on: mean "
+    "and worst over all bits of a number.",
+    "bit flips by bit": "The same, over all layers. A shift has six bits.",
+    "guards": "ReLU6 only where calibration stays below 96 units. Three rows are the host's time; the DPU is busy "
+    "meanwhile, so nothing is lost while the host has time left.",
     "integer layers": "Intervals of whole numbers through the file's weights: true of every image.",
 }
 

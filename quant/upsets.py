@@ -1,0 +1,113 @@
+"""Bits that a particle turns over: in weights, shifts, feature maps and the image.
+
+Memories are counted as the board holds them: int8 weights and bias, int8 maps, 12 bits a pixel, and the shifts of
+each operation as numbers of six bits (their windows, -15 to 16, need no more; UG1414 3.5 and Vitis-AI 3.0).
+"""
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+
+from quant.core import IntConv, IntCore
+from quant.positions import INT8_MAX, INT8_MIN
+
+MEGABIT = 1e6
+INT8_BITS, PIXEL_BITS, SHIFT_BITS = 8, 12, 6
+Shifts = Mapping[tuple[str, str], int]
+"""By operation and field, as `quant.integer.Faults` takes them."""
+
+
+def upset_count(bits: int, per_megabit: float, generator: np.random.Generator) -> int:
+    """How many of so many bits are turned over, each on its own."""
+    return int(generator.binomial(bits, min(per_megabit / MEGABIT, 1.0)))
+
+
+def turned_over(
+    values: np.ndarray, count: int, generator: np.random.Generator, bits: int = INT8_BITS, bit: int | None = None
+) -> np.ndarray:
+    """A copy of whole numbers, two's complement where their type is signed, with `count` bits turned over.
+
+    Args:
+        values: of any integer type that holds them.
+        count: of different bits.
+        generator: draws which.
+        bits: of one number.
+        bit: turn over only this one, 0 being the least.
+    """
+    choices = values.size if bit is not None else values.size * bits
+    chosen = generator.choice(choices, min(count, choices), replace=False, shuffle=False)
+    places, which = (chosen, np.full_like(chosen, bit)) if bit is not None else divmod(chosen, bits)
+    raw = (values.ravel().astype(np.int64) & ((1 << bits) - 1)).copy()
+    np.bitwise_xor.at(raw, places, np.left_shift(1, which))
+    if np.issubdtype(values.dtype, np.signedinteger):
+        raw = np.where(raw >> (bits - 1) == 1, raw - (1 << bits), raw)
+    return raw.astype(values.dtype).reshape(values.shape)
+
+
+def as_stored(core: IntCore) -> IntCore:
+    """The core with its bias in int8, at the finest position that holds it: what the board keeps in memory."""
+    return replace(core, ops=tuple(_narrow(op) if isinstance(op, IntConv) else op for op in core.ops))
+
+
+def _narrow(op: IntConv) -> IntConv:
+    """Exact where the bias came from int8."""
+    bias, shift = op.bias.astype(np.int64), 0
+    while (np.clip(bias >> shift, INT8_MIN, INT8_MAX) != bias >> shift).any():
+        shift += 1
+    return replace(op, bias=(bias >> shift).astype(np.int8), bias_position=op.bias_position - shift)
+
+
+def weight_bits(core: IntCore) -> int:
+    """Bits of all weights and bias."""
+    return INT8_BITS * sum(op.weight.size + op.bias.size for op in core.ops if isinstance(op, IntConv))
+
+
+def upset_weights(core: IntCore, count: int, generator: np.random.Generator) -> IntCore:
+    """The core with so many bits of its weights and bias turned over, wherever they fall."""
+    convs = [op for op in core.ops if isinstance(op, IntConv)]
+    sizes = np.array([op.weight.size + op.bias.size for op in convs])
+    share = generator.multivariate_hypergeometric(sizes * INT8_BITS, count)
+    hit = {op.name: upset_conv(op, int(n), generator) for op, n in zip(convs, share, strict=True) if n}
+    return with_ops(core, hit)
+
+
+def upset_conv(op: IntConv, count: int, generator: np.random.Generator, bit: int | None = None) -> IntConv:
+    """The convolution with so many bits turned over, all of them the given one where one is given."""
+    stored = np.concatenate([op.weight.ravel(), op.bias])
+    stored = turned_over(stored, count, generator, INT8_BITS, bit)
+    return replace(op, weight=stored[: op.weight.size].reshape(op.weight.shape), bias=stored[op.weight.size :])
+
+
+def with_ops(core: IntCore, others: Mapping[str, IntConv]) -> IntCore:
+    """The core with other convolutions of these names."""
+    return replace(core, ops=tuple(others.get(op.name, op) for op in core.ops))
+
+
+def map_channels(core: IntCore) -> dict[str, int]:
+    """Channels of every tensor that the core reads or writes."""
+    first = core.ops[0]
+    found = {first.input: first.weight.shape[1]} if isinstance(first, IntConv) else {}
+    for op in core.ops:
+        found[op.output] = len(op.weight) if isinstance(op, IntConv) else found[op.inputs[0]]
+    return found
+
+
+def shifts_of(core: IntCore) -> dict[tuple[str, str], int]:
+    """The shift fields of every operation."""
+    fields: dict[tuple[str, str], int] = {}
+    for op in core.ops:
+        if isinstance(op, IntConv):
+            product = op.weight_position + core.positions[op.input]
+            fields[op.name, "shift_cut"] = product - core.positions[op.output]
+            fields[op.name, "shift_bias"] = product - op.bias_position
+        else:
+            finest = max(core.positions[name] for name in op.inputs)
+            fields[op.name, "shift_write"] = finest - core.positions[op.output]
+    return fields
+
+
+def upset_shifts(shifts: Shifts, count: int, generator: np.random.Generator) -> dict[tuple[str, str], int]:
+    """The shifts with so many bits turned over."""
+    raw = turned_over(np.array(list(shifts.values()), np.int16), count, generator, SHIFT_BITS)
+    return dict(zip(shifts, raw.tolist(), strict=True))

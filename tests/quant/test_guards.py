@@ -1,0 +1,108 @@
+"""Guards: nothing changes in a healthy network, and what they promise holds in a struck one."""
+
+import numpy as np
+import pytest
+
+from quant.core import IntConv, IntCore
+from quant.graph import CORRECTION
+from quant.guards import Guards, checksums, corrections, guarded, learn_guards, reloaded, voted
+from quant.integer import SOUND, Faults, run_core
+from quant.planes import MAX_DN, split
+from quant.quantise import Quantised
+from quant.upsets import as_stored, shifts_of, upset_conv, upset_shifts, upset_weights, with_ops
+
+
+def image(seed: int, height: int = 37, width: int = 53) -> np.ndarray:
+    return np.random.default_rng(seed).random((1, 1, height, width), dtype=np.float32)
+
+
+@pytest.fixture(scope="module")
+def core(quantised: Quantised) -> IntCore:
+    return as_stored(quantised.core)
+
+
+@pytest.fixture(scope="module")
+def guards(core: IntCore) -> Guards:
+    return learn_guards(core, [split(image(seed)) for seed in range(3)])
+
+
+def test_calibration_patches_pass_untouched(core: IntCore, guards: Guards) -> None:
+    for seed in range(3):
+        bare, clamped = (run_core(core, split(image(seed)), faults=f)[0] for f in (SOUND, guarded(SOUND, guards)))
+        np.testing.assert_array_equal(bare[CORRECTION], clamped[CORRECTION])
+        correction = corrections(core, bare)
+        np.testing.assert_array_equal(guards.limit(correction), correction)
+
+
+def test_bounds_are_the_next_ones_that_hold_what_was_seen(core: IntCore) -> None:
+    """A dark image leaves room below 96 units; a bright one fills int8, and such a ReLU gets no bound."""
+    dark = [split(0.1 * image(seed)) for seed in range(2)]
+    guards = learn_guards(core, dark)
+    runs = [run_core(core, planes)[0] for planes in dark]
+    assert guards.relu6
+    for name, bound in guards.relu6.items():
+        peak = max(int(run[name].max()) for run in runs)
+        assert bound in (96, 48, 24, 12, 6, 3)
+        assert bound / 2 < max(peak, 2) <= max(bound, 2)
+    largest = max(MAX_DN * float(np.abs(corrections(core, run)).max()) for run in runs)
+    assert guards.limit_dn / 2 < largest <= guards.limit_dn
+
+
+def test_a_clamped_result_keeps_its_bound_whatever_the_weights(core: IntCore) -> None:
+    some = Guards({op.output: 24 for op in core.ops if isinstance(op, IntConv) and op.relu}, 64.0, {})
+    struck = upset_weights(core, 2000, np.random.default_rng(0))
+    bare, clamped = (run_core(struck, split(image(9)), faults=f)[0] for f in (SOUND, guarded(SOUND, some)))
+    assert max(int(bare[name].max()) for name in some.relu6) > 24
+    assert max(int(clamped[name].max()) for name in some.relu6) == 24
+    limited = some.limit(corrections(core, clamped))
+    bound = np.float32(64 / MAX_DN)
+    assert np.abs(limited).max() <= bound < np.abs(corrections(core, bare)).max()
+
+
+def test_memory_is_struck_after_the_clamp(core: IntCore) -> None:
+    name = next(op.output for op in core.ops if isinstance(op, IntConv) and op.relu)
+    faults = Faults({}, lambda found, tensor: np.full_like(tensor, 127) if found == name else tensor)
+    tensors, _ = run_core(core, split(image(0)), faults=guarded(faults, Guards({name: 3}, 1.0, {})))
+    assert (tensors[name] == 127).all()
+
+
+def test_every_single_flip_is_found_and_the_layer_loaded_again(core: IntCore, guards: Guards) -> None:
+    generator = np.random.default_rng(3)
+    for op in [op for op in core.ops if isinstance(op, IntConv)]:
+        for bit in range(8):
+            struck = with_ops(core, {op.name: upset_conv(op, 1, generator, bit)})
+            wrong = {name for name, sum_ in checksums(struck).items() if sum_ != guards.checksums[name]}
+            assert wrong == {op.name}
+            assert checksums(reloaded(struck, core, guards.checksums)) == guards.checksums
+
+
+def test_many_flips_are_found_too(core: IntCore, guards: Guards) -> None:
+    struck = upset_weights(core, 5000, np.random.default_rng(4))
+    healed = reloaded(struck, core, guards.checksums)
+    planes = split(image(1))
+    sound, wrong, right = (run_core(each, planes)[0][CORRECTION] for each in (core, struck, healed))
+    np.testing.assert_array_equal(right, sound)
+    assert not np.array_equal(wrong, sound)
+
+
+def test_two_copies_of_three_decide(core: IntCore) -> None:
+    meant = shifts_of(core)
+    one, other = (upset_shifts(meant, count, np.random.default_rng(count)) for count in (1, 4))
+    assert one != meant
+    assert voted((one, meant, meant)) == meant
+    assert voted((meant, one, meant)) == voted((meant, meant, other)) == meant
+    assert voted((one, one, meant)) == one  # the same bit twice is beyond three copies
+
+
+def test_a_wrong_shift_is_used(core: IntCore) -> None:
+    meant = shifts_of(core)
+    planes = split(image(2))
+    sound = run_core(core, planes)[0][CORRECTION]
+    np.testing.assert_array_equal(run_core(core, planes, faults=Faults(meant))[0][CORRECTION], sound)
+    for key, shift in meant.items():
+        for wrong in (shift ^ 1, -32, 31):
+            tensors, _ = run_core(core, planes, faults=Faults({key: wrong}))
+            assert all(tensor.min() >= -128 and tensor.max() <= 127 for tensor in tensors.values())
+        cut = {key: shift + 2}
+        if key[1] == "shift_cut":
+            assert not np.array_equal(run_core(core, planes, faults=Faults(cut))[0][CORRECTION], sound)

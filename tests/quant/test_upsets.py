@@ -1,0 +1,111 @@
+"""Bits turned over: as many as were asked for, in numbers that the memory can hold, wherever they fall."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from quant.core import IntConv
+from quant.integer import run_core
+from quant.planes import split
+from quant.quantise import Quantised
+from quant.upsets import (
+    INT8_BITS,
+    PIXEL_BITS,
+    SHIFT_BITS,
+    as_stored,
+    map_channels,
+    shifts_of,
+    turned_over,
+    upset_count,
+    upset_shifts,
+    upset_weights,
+    weight_bits,
+)
+
+KINDS = {"int8": (np.int8, 8), "maps": (np.int16, 8), "pixels": (np.uint16, 12), "shifts": (np.int16, 6)}
+
+
+def image(height: int = 21, width: int = 34) -> np.ndarray:
+    return np.random.default_rng(5).random((1, 1, height, width), dtype=np.float32)
+
+
+def bits_apart(a: np.ndarray, b: np.ndarray, bits: int) -> int:
+    apart = (a.astype(np.int64) ^ b.astype(np.int64)) & ((1 << bits) - 1)
+    return sum(int(value).bit_count() for value in apart.ravel())
+
+
+@given(st.sampled_from(sorted(KINDS)), st.integers(0, 2**32 - 1), st.data())
+def test_so_many_bits_are_turned_over_and_no_more(kind: str, seed: int, data: st.DataObject) -> None:
+    dtype, bits = KINDS[kind]
+    low, high = (0, 2**bits) if kind == "pixels" else (-(2 ** (bits - 1)), 2 ** (bits - 1))
+    values = np.random.default_rng(seed).integers(low, high, (3, 7)).astype(dtype)
+    count = data.draw(st.integers(0, values.size * bits))
+    struck = turned_over(values, count, np.random.default_rng(seed), bits)
+    assert bits_apart(values, struck, bits) == count
+    assert struck.dtype == values.dtype
+    assert low <= struck.min() <= struck.max() < high
+    again = turned_over(values, count, np.random.default_rng(seed), bits)
+    np.testing.assert_array_equal(struck, again)
+
+
+@pytest.mark.parametrize("bit", range(INT8_BITS))
+def test_one_bit_moves_a_number_by_its_weight(bit: int) -> None:
+    values = np.array([0, -128, 127, -1, 85], np.int8)
+    struck = turned_over(values, values.size, np.random.default_rng(0), bit=bit)
+    difference = struck.astype(int) - values
+    assert set(np.abs(difference)) == {2**bit}
+
+
+def test_the_rate_is_that_of_a_megabit() -> None:
+    """Poisson's standard deviation is the root of the mean."""
+    counts = [upset_count(2_000_000, 50.0, np.random.default_rng(k)) for k in range(400)]
+    assert np.mean(counts) == pytest.approx(100, abs=4 * 10 / 20)
+    assert np.std(counts) == pytest.approx(10, rel=0.2)
+    assert upset_count(1000, 0.0, np.random.default_rng(0)) == 0
+    assert upset_count(1000, 1e9, np.random.default_rng(0)) == 1000
+
+
+def test_the_stored_bias_is_int8_and_the_network_the_same(quantised: Quantised) -> None:
+    stored = as_stored(quantised.core)
+    convs = [op for op in stored.ops if isinstance(op, IntConv)]
+    assert all(op.bias.dtype == np.int8 for op in convs)
+    assert weight_bits(stored) == 8 * sum(op.weight.size + op.bias.size for op in convs)
+    planes = split(image())
+    before, after = run_core(quantised.core, planes)[0], run_core(stored, planes)[0]
+    for name in before:
+        np.testing.assert_array_equal(before[name], after[name])
+
+
+def test_weights_are_struck_over_all_layers(quantised: Quantised) -> None:
+    core = as_stored(quantised.core)
+    struck = upset_weights(core, 200, np.random.default_rng(1))
+    apart = {
+        a.name: bits_apart(a.weight, b.weight, 8) + bits_apart(a.bias, b.bias, 8)
+        for a, b in zip(core.ops, struck.ops, strict=True)
+        if isinstance(a, IntConv) and isinstance(b, IntConv)
+    }
+    assert sum(apart.values()) == 200
+    assert sum(count > 0 for count in apart.values()) > len(apart) / 2
+
+
+def test_every_shift_is_what_the_core_uses(quantised: Quantised) -> None:
+    core = as_stored(quantised.core)
+    shifts = shifts_of(core)
+    assert len(shifts) == sum(2 if isinstance(op, IntConv) else 1 for op in core.ops)
+    limit = 2 ** (SHIFT_BITS - 1)
+    assert all(-limit <= shift < limit for shift in shifts.values())
+    struck = upset_shifts(shifts, 3, np.random.default_rng(2))
+    assert sum((struck[key] ^ shifts[key]).bit_count() for key in shifts if struck[key] >= 0) <= 3
+    assert struck.keys() == shifts.keys()
+    assert struck != shifts
+
+
+def test_maps_have_the_channels_that_run(quantised: Quantised) -> None:
+    tensors, _ = run_core(quantised.core, split(image()))
+    assert {name: tensor.shape[1] for name, tensor in tensors.items()} == map_channels(quantised.core)
+
+
+def test_pixels_stay_in_twelve_bits() -> None:
+    dn = np.array([0, 4095, 2048], np.uint16)
+    assert turned_over(dn, 36, np.random.default_rng(0), PIXEL_BITS).tolist() == [4095, 0, 2047]

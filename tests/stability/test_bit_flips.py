@@ -1,0 +1,167 @@
+"""Bits turned over: what a strike costs, what guards buy back, and what the board pays for them."""
+
+import importlib.util
+import json
+import sys
+from itertools import pairwise
+from pathlib import Path
+from types import ModuleType
+from xml.etree import ElementTree as ET
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from deploy.bench import predict_file
+from deploy.cli import app
+from deploy.dpu.board import load_dpu
+from deploy.results import Row, by_table
+from deploy.stress.flip_curves import RATES, curve_rows, name_of
+from deploy.stress.flip_picture import flip_curves_svg
+from deploy.stress.flip_places import place_rows
+from deploy.stress.flip_price import TILE_PX, price_rows
+from deploy.stress.flip_study import FlipRequest, make_patient
+from deploy.stress.flips import MEMORIES, Patient, Struck, restored
+from deploy.stress.int8 import core_of
+from deploy.stress.subject import open_subject
+from model.shipped import SHIPPED
+from quant.core import IntConv
+from quant.guards import Guards, checksums
+from quant.integer import SOUND
+from quant.upsets import as_stored
+
+DOCS = Path(__file__).resolve().parents[2] / "docs"
+REQUEST = FlipRequest("pleiades-degraded", None, "vck190", draws=2, size_px=48, seed=3)
+
+
+@pytest.fixture(scope="module")
+def patient() -> Patient:
+    """A trained network: what a new one makes is hardly worse with bits turned over."""
+    return make_patient(open_subject(None, None, "convbeers-xs"), REQUEST)
+
+
+@pytest.fixture(scope="module")
+def rows(patient: Patient) -> dict[str, Row]:
+    return {row.name: row for row in curve_rows(patient, 2, seed=0)}
+
+
+def db(row: Row, guards: str) -> float:
+    value = row.figures[guards].value
+    assert value is not None
+    return value
+
+
+def test_strikes_cost_more_the_more_there_are(rows: dict[str, Row]) -> None:
+    clean = db(rows["none"], "no guard")
+    for memory in ("weights", "maps", "image"):
+        found = [db(rows[name_of(memory, rate)], "no guard") for rate in RATES]
+        assert found[0] == pytest.approx(clean, abs=0.2)
+        assert found[-1] < clean - 0.1
+    assert db(rows[name_of("shifts", 10_000)], "no guard") <= clean
+
+
+def test_checksums_and_copies_bring_the_healthy_network_back(rows: dict[str, Row]) -> None:
+    for rate in RATES:
+        assert db(rows[name_of("weights", rate)], "all guards") == db(rows["none"], "all guards")
+    assert db(rows[name_of("shifts", 1000)], "all guards") == db(rows["none"], "all guards")
+
+
+def test_the_same_seed_strikes_the_same_bits(patient: Patient, rows: dict[str, Row]) -> None:
+    again = {row.name: row for row in curve_rows(patient, 2, seed=0)}
+    other = {row.name: row for row in curve_rows(patient, 2, seed=1)}
+    assert again == rows
+    assert other != rows
+
+
+@pytest.mark.parametrize("memory", list(MEMORIES))
+def test_a_strike_leaves_the_patient_alone(memory: str, patient: Patient) -> None:
+    image = patient.pairs[0][0]
+    before, healthy = image.copy(), restored(patient, Struck(patient.core, SOUND, image, 0))
+    struck = MEMORIES[memory](patient, image, 50_000, np.random.default_rng(0))
+    assert struck.flips > 0
+    assert not np.array_equal(restored(patient, struck), healthy)
+    np.testing.assert_array_equal(restored(patient, struck), restored(patient, struck))
+    np.testing.assert_array_equal(image, before)
+    np.testing.assert_array_equal(restored(patient, patient.healthy(0)), healthy)
+
+
+def test_the_sign_hurts_more_than_the_least_bit(patient: Patient) -> None:
+    tables = by_table(place_rows(patient, seed=0, side_px=24))
+    assert [row.name for row in tables["bit flips by layer"]] == [op.name for op in patient.core.ops]
+    least, *_, sign = tables["bit flips by bit"]
+    for memory in ("weights, mean", "map, mean"):
+        assert db(sign, memory) > 2 * db(least, memory)
+
+
+@pytest.mark.parametrize("variant", ["convbeers-xs", "convbeers-s", "convbeers-m", "convbeers"])
+def test_all_guards_cost_under_two_per_cent_on_the_board(variant: str) -> None:
+    core = as_stored(core_of(open_subject(None, None, variant)))
+    relus = {op.output: 96 for op in core.ops if isinstance(op, IntConv) and op.relu}
+    dpu, patient = load_dpu("vck190", None), Patient(core, Guards(relus, 1024.0, checksums(core)), ())
+    found = price_rows(patient, predict_file(SHIPPED / f"{variant}-int8.onnx", dpu, TILE_PX), dpu)
+    *parts, together = (db(row, "time") for row in found)
+    assert together == pytest.approx(sum(parts))
+    assert 0 < db(found[-1], "of a tile, if nothing hides") < 2
+    assert db(found[-1], "frame rate lost beside the DPU") == 0
+    assert all(figure.mode == "predicted" and figure.interval for row in found for figure in row.figures.values())
+
+
+def test_the_command(pair: list[Path], tmp_path: Path) -> None:
+    files = ["--json", str(tmp_path / "f.json"), "--out", str(tmp_path / "f.md")]
+    few = ["--bit-flips", "--draws", "1", "--size", "32"]
+    done = CliRunner().invoke(app, ["stress", *map(str, pair), *few, *files])
+    assert done.exit_code == 0, done.output
+    document = json.loads((tmp_path / "f.json").read_text(encoding="utf-8"))
+    assert {row["table"] for row in document["rows"]} == {
+        "bit flips", "bit flips by layer", "bit flips by bit", "guards",
+    }  # fmt: skip
+    page = (tmp_path / "f.md").read_text(encoding="utf-8")
+    assert "## What guards cost on the board" in page
+    picture = ET.fromstring((tmp_path / "f.svg").read_text(encoding="utf-8"))  # noqa: S314 - written above
+    assert len(picture.findall("{http://www.w3.org/2000/svg}polyline")) == 2 * len(MEMORIES)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["FLOAT", "--bit-flips"], "INT8 network"),
+        (["FLOAT", "INT8", "--bit-flips", "--cases", "snow"], "--bit-flips"),
+        (["FLOAT", "INT8", "--bit-flips", "--sensor", "nobody"], "nobody"),
+        (["FLOAT", "INT8", "--bit-flips", "--target", "nobody"], "nobody"),
+        (["FLOAT", "INT8", "--bit-flips", "--images", "nowhere"], "nowhere"),
+    ],
+)
+def test_wrong_arguments(arguments: list[str], said: str, pair: list[Path]) -> None:
+    files = {"FLOAT": str(pair[0]), "INT8": str(pair[1])}
+    result = CliRunner().invoke(app, ["stress", *(files.get(text, text) for text in arguments)])
+    assert result.exit_code == 2, result.output
+    assert said in result.output
+
+
+@pytest.fixture(scope="module")
+def maker() -> ModuleType:
+    spec = importlib.util.spec_from_file_location("make_bit_flips", DOCS / "make_bit_flips.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules["make_bit_flips"] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_the_page_is_fresh(maker: ModuleType) -> None:
+    page = (DOCS / "bit-flips.md").read_text(encoding="utf-8")
+    assert page.startswith(maker.OPENING + maker.FINDINGS)
+    for variant in maker.VARIANTS:
+        core = open_subject(None, None, variant).core
+        assert all(f"\n| {op.name} | " in page for op in core.ops)  # type: ignore[union-attr]
+    assert page.count("| all guards | ") == len(maker.VARIANTS)
+    for memory in MEMORIES:
+        assert page.count(f"\n| {memory}, ") >= 4 * len(maker.VARIANTS)
+
+
+def test_curves_go_from_left_to_right(rows: dict[str, Row]) -> None:
+    picture = ET.fromstring(flip_curves_svg({"a": list(rows.values())}))  # noqa: S314 - our own
+    for line in picture.findall("{http://www.w3.org/2000/svg}polyline"):
+        places = [float(point.split(",")[0]) for point in line.attrib["points"].split()]
+        assert all(a < b for a, b in pairwise(places))
