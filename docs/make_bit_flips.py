@@ -43,8 +43,8 @@ Guards:
 
 """
 
-FINDINGS = """- Up to 10 bits in a megabit of weights, or one of feature maps, nobody would see a difference (0.1 dB). At
-  the same rate the network of 16 x 64, which holds eight times the weights of 8 x 32, loses no more.
+FINDINGS = """- Up to 10 bits in a megabit of weights, or one of feature maps, nobody would see a difference (0.1 dB).
+  At the same rate the network of 16 x 64, which holds eight times the weights of 8 x 32, loses no more.
 - Weights: CRC-32 finds every strike here, and after loading again the network is the healthy one.
 - Shifts are few and seldom struck, but one of them wrong costs 3 to 12 dB in the mean and above 20 dB at worst; three
   copies mend all but two strikes on the same bit, which are met at 10 000 in a megabit.
