@@ -11,10 +11,14 @@ from onnx import helper, numpy_helper
 
 FEWEST_OUTPUTS = 16
 INPUTS_OF = 4
+FIRST_OPSET = 11
+"""From here on Pad and Slice take their places as inputs."""
 
 
 def filled(model: onnx.ModelProto) -> onnx.ModelProto:
     """The model with the same results, its integer convolutions no narrower than suits onnxruntime."""
+    if any(each.domain in ("", "ai.onnx") and each.version < FIRST_OPSET for each in model.opset_import):
+        return model
     wider = onnx.ModelProto()
     wider.CopyFrom(model)
     arrays = {each.name: each for each in wider.graph.initializer}
@@ -35,7 +39,7 @@ class _Filling:
     def around(self, node: onnx.NodeProto) -> list[onnx.NodeProto]:
         """The node, and what widens its input and narrows its output."""
         weight = self.arrays.get(node.input[3]) if node.op_type == "QLinearConv" else None
-        if weight is None or any(each.name == "group" and each.i != 1 for each in node.attribute):
+        if weight is None or weight.ndim != 4 or not self._takes_zeros(node):
             return [node]
         outputs, inputs = weight.shape[:2]
         more_inputs = -inputs % INPUTS_OF if inputs < FEWEST_OUTPUTS else 0
@@ -45,6 +49,12 @@ class _Filling:
         self._widen(node, more_outputs, more_inputs)
         before = self._padded(node, more_inputs) if more_inputs else []
         return [*before, node, *(self._cut(node, outputs) if more_outputs else [])]
+
+    def _takes_zeros(self, node: onnx.NodeProto) -> bool:
+        """Whether a stored 0 is a weight of 0, and each output reads every input."""
+        middle = self.arrays.get(node.input[5])
+        grouped = any(each.name == "group" and each.i != 1 for each in node.attribute)
+        return middle is not None and not middle.any() and not grouped
 
     def _widen(self, node: onnx.NodeProto, outputs: int, inputs: int) -> None:
         """Weights of zero; scales and zero points that are a channel's own get more, which matter to nobody."""

@@ -63,13 +63,13 @@ def spoil_inputs(model: onnx.ModelProto) -> None:
     tensor.CopyFrom(onnx.numpy_helper.from_array(weight, tensor.name))
 
 
-def test_one_output_channel_is_filled_too() -> None:
-    """Of a network with one gain: its bias has one number, as a scale for the whole tensor might."""
+def one_convolution(weight: np.ndarray, weight_zero: int, opset: int = 17) -> onnx.ModelProto:
+    """Of weights (O, I, 1, 1), int8 or uint8, that someone else's quantiser might write."""
     tensors = {
         "scale": np.float32(0.5),
         "zero": np.uint8(128),
-        "weight": np.array([[[[1]], [[-2]]]], np.int8),
-        "weight_zero": np.int8(0),
+        "weight": weight,
+        "weight_zero": weight.dtype.type(weight_zero),
         "bias": np.array([7], np.int32),
     }
     feeds = ["image", "scale", "zero", "weight", "scale", "weight_zero", "scale", "zero", "bias"]
@@ -81,7 +81,20 @@ def test_one_output_channel_is_filled_too() -> None:
     graph = onnx.helper.make_graph(
         [onnx.helper.make_node("QLinearConv", feeds, ["y"])], "one", ends[:1], ends[1:], constants
     )
-    model = onnx.helper.make_model(graph, opset_imports=[onnx.helper.make_opsetid("", 17)], ir_version=9)
+    return onnx.helper.make_model(graph, opset_imports=[onnx.helper.make_opsetid("", opset)], ir_version=9)
+
+
+def test_one_output_channel_is_filled_too() -> None:
+    """Of a network with one gain: its bias has one number, as a scale for the whole tensor might."""
+    model = one_convolution(np.array([[[[1]], [[-2]]]], np.int8), 0)
     image = np.random.default_rng(0).integers(0, 256, (1, 2, 3, 5)).astype(np.uint8)
     assert weights(filled(model)) == [(FEWEST_OUTPUTS, 4, 1, 1)]
+    assert np.array_equal(as_written(filled(model), image), as_written(model, image))
+
+
+@pytest.mark.parametrize(("zero", "opset"), [(128, 17), (0, 10)])
+def test_where_a_stored_zero_is_no_weight_of_zero_nothing_is_filled(zero: int, opset: int) -> None:
+    model = one_convolution(np.array([[[[130]], [[120]]]], np.uint8), zero, opset)
+    image = np.random.default_rng(0).integers(0, 256, (1, 2, 3, 5)).astype(np.uint8)
+    assert weights(filled(model)) == [(1, 2, 1, 1)]
     assert np.array_equal(as_written(filled(model), image), as_written(model, image))
