@@ -4,7 +4,7 @@ from collections.abc import Callable
 from functools import lru_cache
 from importlib import import_module
 from importlib.metadata import version
-from threading import get_ident
+from threading import Lock, get_ident
 from typing import Any, Literal
 
 import numpy as np
@@ -47,9 +47,12 @@ def open_openvino(
             got, remedy = " ".join(str(error).split())[:160], "use --runtime onnxruntime"
             raise ModelError("ONNX model", expected="one that OpenVINO runs", got=got, remedy=remedy) from error
 
+    compiling = Lock()
+
     @lru_cache(maxsize=64)
     def request(shape: tuple[int, ...], _thread: int) -> Any:
-        return compiled(shape).create_infer_request()  # one serves no two threads at once
+        with compiling:  # or each thread would compile its own at the first tile
+            return compiled(shape).create_infer_request()  # one serves no two threads at once
 
     def infer(image: np.ndarray) -> np.ndarray:
         return np.asarray(request(image.shape, get_ident()).infer([image], share_inputs=True)[0])

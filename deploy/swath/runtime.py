@@ -20,7 +20,7 @@ AT_ONCE = 4
 
 
 def tiles_at_once(threads: int, tiles: int) -> int:
-    """How many tiles are best restored at a time, each by an equal share of the threads; 0 takes every core."""
+    """How many tiles are best restored at a time; 0 threads takes every core."""
     cores = threads or os.cpu_count() or 1
     return max(count for count in range(1, AT_ONCE + 1) if cores % count == 0 and count <= max(tiles, 1))
 
@@ -40,8 +40,12 @@ def open_runtime(runtime: Runtime, model: onnx.ModelProto, threads: int, at_once
     """
     if runtime is Runtime.openvino:
         return open_openvino(model, threads, at_once=at_once)
-    share = (threads or os.cpu_count() or 1) // at_once if at_once > 1 else threads
-    return partial(run, open_session(model, share)), f"onnxruntime {ort.__version__}"
+    return partial(run, open_session(model, session_threads(threads, at_once))), f"onnxruntime {ort.__version__}"
+
+
+def session_threads(threads: int, at_once: int) -> int:
+    """What to ask onnxruntime for: its n are n - 1 of its own, which all callers share, and each caller."""
+    return (threads or os.cpu_count() or 1) - at_once + 1 if at_once > 1 else threads
 
 
 @dataclass(frozen=True)

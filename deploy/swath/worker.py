@@ -117,7 +117,8 @@ def restore_piece(work: Work, row: Span) -> Piece:
 
 def forget(key: str) -> None:
     """Close what a run left open; a row still in work ends at its next tile."""
-    opened = _opened.pop(key, None)
+    with _opening:
+        opened = _opened.pop(key, None)
     if opened is not None:
         opened.stopped = True
 

@@ -15,7 +15,7 @@ from deploy.swath.plan import Plan, make_plan
 from deploy.swath.raster import Raster
 from deploy.swath.reader import ArraySource
 from deploy.swath.restorer import Restorer
-from deploy.swath.runtime import AT_ONCE, tiles_at_once
+from deploy.swath.runtime import AT_ONCE, session_threads, tiles_at_once
 from profiles.errors import ImageError
 
 SHAPE = (2, 75, 133)
@@ -90,3 +90,5 @@ def test_tiles_share_the_threads_evenly(threads: int, tiles: int) -> None:
     cores = threads or os.cpu_count() or 1
     assert 1 <= count <= min(AT_ONCE, max(tiles, 1))
     assert cores % count == 0
+    if count > 1:
+        assert session_threads(threads, count) - 1 + count == cores  # onnxruntime's own threads, and the callers

@@ -342,8 +342,9 @@ def worker_processes(running: subprocess.Popen[str]) -> list[psutil.Process]:
     return [child for child in children if "spawn_main" in " ".join(child.cmdline())]
 
 
-def until_a_row_is_finished(out: Path) -> None:
+def until_a_row_is_finished(out: Path, running: subprocess.Popen[str]) -> None:
     while not journal(out).is_file():
+        assert running.poll() is None, "it ended before a row was seen"
         time.sleep(0.02)
 
 
@@ -366,7 +367,7 @@ def running(slow: tuple[Path, bytes], tmp_path: Path) -> Iterator[subprocess.Pop
     begun = begin(slow[0], tmp_path / "out.tif", default_int8(), "--workers", "2")
     try:
         until(begun, "memory")
-        until_a_row_is_finished(tmp_path / "out.tif")
+        until_a_row_is_finished(tmp_path / "out.tif", begun)
         yield begun
     finally:
         begun.kill()
