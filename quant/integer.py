@@ -20,7 +20,7 @@ from quant.positions import INT8_MAX, INT8_MIN
 INT32_BITS = 31
 """Of an accumulator, without the sign."""
 
-EXACT = 2**24
+FLOAT32_WHOLE_MAX = 2**24
 """Up to here float32 holds whole numbers exactly, and sums them in any order."""
 
 
@@ -105,7 +105,7 @@ def _conv(
 def _convolve(image: np.ndarray, weight: np.ndarray) -> np.ndarray:
     """Same-size convolution with zero padding: a product of matrices a tap, in floats that hold its sums exactly."""
     largest = 128 * int(np.abs(weight.astype(np.int64)).sum((1, 2, 3)).max(initial=0))
-    exact = np.float32 if largest <= EXACT else np.float64
+    exact = np.float32 if largest <= FLOAT32_WHOLE_MAX else np.float64
     count, margin = len(image), weight.shape[2] // 2
     wide = np.pad(image.astype(exact), ((0, 0), (0, 0), (margin, margin), (margin, margin)))
     height, width = image.shape[2:]
@@ -126,8 +126,9 @@ def _add(core: IntCore, op: Add, tensors: dict[str, np.ndarray], faults: Faults)
     finest = max(core.positions[name] for name in op.inputs)
     aligned = [tensors[name].astype(np.int64) << (finest - core.positions[name]) for name in op.inputs]
     bound = sum(128 << (finest - core.positions[name]) for name in op.inputs)
-    write = faults.shift(op.name, "shift_write", finest - core.positions[op.output])
-    return aligned[0] + aligned[1], write, float(np.log2(bound))
+    coarsest = min(core.positions[name] for name in op.inputs)
+    write = faults.shift(op.name, "shift_write", coarsest - core.positions[op.output])
+    return aligned[0] + aligned[1], finest - coarsest + write, float(np.log2(bound))
 
 
 def _moved(values: np.ndarray, shift: int) -> np.ndarray:
@@ -138,7 +139,8 @@ def _moved(values: np.ndarray, shift: int) -> np.ndarray:
 def _shifted(sums: np.ndarray, shift: int, half_even: bool) -> tuple[np.ndarray, float]:
     """Sums divided by 2^shift, rounded and clipped to int8, as int16; and the share that lay half-way."""
     if shift <= 0:
-        return np.clip(sums << -shift, INT8_MIN, INT8_MAX).astype(np.int16), 0.0
+        moved = np.clip(sums, INT8_MIN, INT8_MAX) << min(-shift, 8)  # by 8 all but 0 has come to an end
+        return np.clip(moved, INT8_MIN, INT8_MAX).astype(np.int16), 0.0
     half = 1 << (shift - 1)
     rounded = (sums + half) >> shift
     ties = (sums & ((1 << shift) - 1)) == half

@@ -1,7 +1,7 @@
 """Bits that a particle turns over: in weights, shifts, feature maps and the image.
 
 Memories are counted as the board holds them: int8 weights and bias, int8 maps, 12 bits a pixel, and the shifts of
-each operation as numbers of six bits (their windows, -15 to 16, need no more; UG1414 3.5 and Vitis-AI 3.0).
+each operation as numbers of six bits (assumed: their windows, -15 to 16, need no more; Vitis-AI 3.0).
 """
 
 from collections.abc import Mapping
@@ -9,8 +9,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from quant.core import IntConv, IntCore
-from quant.positions import INT8_MAX, INT8_MIN
+from profiles.errors import ModelError
+from quant.core import IntConv, IntCore, op_shifts
+from quant.positions import INT8_MAX, INT8_MIN, SHIFTS
 
 MEGABIT = 1e6
 INT8_BITS, PIXEL_BITS, SHIFT_BITS = 8, 12, 6
@@ -46,16 +47,29 @@ def turned_over(
 
 
 def as_stored(core: IntCore) -> IntCore:
-    """The core with its bias in int8, at the finest position that holds it: what the board keeps in memory."""
+    """The core with its bias in int8, at the finest position that holds it: what the board keeps in memory.
+
+    Raises:
+        ModelError: a bias that int8 does not hold, or a shift of more than six bits.
+    """
+    for (op, field), shift in shifts_of(core).items():
+        if not -(1 << (SHIFT_BITS - 1)) <= shift < 1 << (SHIFT_BITS - 1):
+            raise _refuse(f"{field} {shift} at {op}")
     return replace(core, ops=tuple(_narrow(op) if isinstance(op, IntConv) else op for op in core.ops))
 
 
 def _narrow(op: IntConv) -> IntConv:
-    """Exact where the bias came from int8."""
     bias, shift = op.bias.astype(np.int64), 0
     while (np.clip(bias >> shift, INT8_MIN, INT8_MAX) != bias >> shift).any():
         shift += 1
+    if ((bias >> shift) << shift != bias).any():
+        raise _refuse(f"a bias of {int(np.abs(bias).max())} at {op.name}, finer than its size allows")
     return replace(op, bias=(bias >> shift).astype(np.int8), bias_position=op.bias_position - shift)
+
+
+def _refuse(got: str) -> ModelError:
+    remedy = "make it with 'beers-deploy quantize --regime legal'"
+    return ModelError("INT8 core", expected="bias and shifts as the board stores them", got=got, remedy=remedy)
 
 
 def weight_bits(core: IntCore) -> int:
@@ -94,17 +108,14 @@ def map_channels(core: IntCore) -> dict[str, int]:
 
 
 def shifts_of(core: IntCore) -> dict[tuple[str, str], int]:
-    """The shift fields of every operation."""
-    fields: dict[tuple[str, str], int] = {}
-    for op in core.ops:
-        if isinstance(op, IntConv):
-            product = op.weight_position + core.positions[op.input]
-            fields[op.name, "shift_cut"] = product - core.positions[op.output]
-            fields[op.name, "shift_bias"] = product - op.bias_position
-        else:
-            finest = max(core.positions[name] for name in op.inputs)
-            fields[op.name, "shift_write"] = finest - core.positions[op.output]
-    return fields
+    """The shifts of every operation, but for an add's shift_read: 0 where a stream keeps one position."""
+    named = [(op.name, *shift) for op in core.ops for shift in op_shifts(op, core.positions, SHIFTS)]
+    return {(op, field): value for op, field, value, _ in named if field != "shift_read"}
+
+
+def bits_apart(shifts: Shifts, others: Shifts) -> int:
+    """In how many bits they differ."""
+    return sum(((shifts[key] ^ others[key]) & ((1 << SHIFT_BITS) - 1)).bit_count() for key in shifts)
 
 
 def upset_shifts(shifts: Shifts, count: int, generator: np.random.Generator) -> dict[tuple[str, str], int]:

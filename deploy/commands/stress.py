@@ -109,11 +109,27 @@ def _flip_bits(
     if beside is not None:
         expected, remedy = "no --cases or --stages beside it", "leave these out"
         raise OptionError("--bit-flips", expected=expected, got=repr(beside), remedy=remedy)
+    picture = _picture_beside(out, json)
     with steps("turning bits over", ticks(subject, request)) as bar:
         rows = flip_rows(subject, request, bar.advance)
     for table, found in by_table(rows).items():
         print_rows(title(table), found)
     Document("stress", {"bit_flips": True, **asdict(request)}, subject.paths, tuple(rows)).write(json)
-    if out is not None:
+    if out is not None and picture is not None:
         write_text(out, markdown(rows))
-        write_text(out.with_suffix(".svg"), flip_curves_svg({subject.paths[-1].stem: rows}))
+        write_text(picture, flip_curves_svg({subject.paths[-1].stem: rows}))
+
+
+def _picture_beside(out: Path | None, json: Path | None) -> Path | None:
+    """Where the curves go: beside the tables, over nothing else that is written."""
+    from model.files import require_writable
+    from profiles.errors import OptionError
+
+    if out is None:
+        return None
+    picture = out.with_name(f"{out.stem}.svg")
+    if picture in (out, json):
+        expected, remedy = f"a name other than that of the curves, {picture.name}", "give it the suffix .md"
+        raise OptionError("--out", expected=expected, got=out.name, remedy=remedy)
+    require_writable(picture)
+    return picture

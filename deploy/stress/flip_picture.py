@@ -26,4 +26,5 @@ def _curves(networks: Mapping[str, Sequence[Row]], memory: str) -> list[Curve]:
 
 def _points(rows: Sequence[Row], memory: str, guards: str) -> Points:
     by_name = {row.name: row for row in rows if row.table == "bit flips"}
-    return tuple((rate, by_name[name_of(memory, rate)].figures[guards].value or 0.0) for rate in rates_of(memory))
+    values = {rate: by_name[name_of(memory, rate)].figures[guards].value for rate in rates_of(memory)}
+    return tuple((rate, value) for rate, value in values.items() if value is not None)

@@ -17,19 +17,18 @@ from quant.integer import SOUND, Faults
 from quant.planes import MAX_DN
 from quant.upsets import INT8_BITS, SHIFT_BITS, upset_conv, with_ops
 
-SOURCE = "integer reference, one flip at a time"
-BITS = {"weights": INT8_BITS, "map": INT8_BITS, "shifts": SHIFT_BITS}
+SOURCE = "integer reference, one flip at a time: a number drawn for each bit"
+MEMORIES = ("weights", "map", "shifts")
 
 
 @dataclass(frozen=True)
 class Flip:
-    """One flip: where it fell, and what it did to the restored image, in DN."""
+    """One flip: where it fell, and what it did to the restored image, in DN, root mean square."""
 
     layer: str
     memory: str
     bit: int
     rms_dn: float
-    largest_dn: float
 
 
 def place_rows(patient: Patient, seed: int, side_px: int, tick: Callable[[], None] = lambda: None) -> list[Row]:
@@ -50,14 +49,14 @@ def ticks(patient: Patient) -> int:
 def single_flips(
     patient: Patient, seed: int, side_px: int, tick: Callable[[], None] = lambda: None
 ) -> Iterator[Flip]:
-    """One flip of every bit in every layer's weights, shifts and result, on a crop of a patch."""
+    """For every bit a flip of one number in each layer's weights and result, and of each shift; on a crop."""
     for number, op in enumerate(patient.core.ops):
         generator = np.random.default_rng([seed, number])
         image = patient.pairs[number % len(patient.pairs)][0][:, :, :side_px, :side_px]
         healthy = restored(patient, Struck(patient.core, SOUND, image, 0))
         for memory, bit, struck in _strikes(patient, op, image, generator):
             error_dn = MAX_DN * (restored(patient, struck).astype(np.float64) - healthy)
-            yield Flip(op.name, memory, bit, float(np.sqrt(np.mean(error_dn**2))), float(np.abs(error_dn).max()))
+            yield Flip(op.name, memory, bit, float(np.sqrt(np.mean(error_dn**2))))
         tick()
 
 
@@ -85,7 +84,7 @@ def _signed(raw: int) -> int:
 def _row(table: str, name: str, flips: Sequence[Flip]) -> Row:
     """For each memory the mean and the worst flip."""
     figures = {}
-    for memory in BITS:
+    for memory in MEMORIES:
         found = [flip for flip in flips if flip.memory == memory]
         if found:
             figures[f"{memory}, mean"] = measured(float(np.mean([f.rms_dn for f in found])), "DN rms", SOURCE)

@@ -16,6 +16,7 @@ from quant.upsets import (
     INT8_BITS,
     PIXEL_BITS,
     SHIFT_BITS,
+    bits_apart,
     map_channels,
     shifts_of,
     turned_over,
@@ -82,11 +83,9 @@ def quality_db(patient: Patient, struck: Struck, reference: np.ndarray, clamped:
 def mended(patient: Patient, struck: Struck, per_megabit: float, generator: np.random.Generator) -> Struck:
     """What checksums and three copies make of it before the next image: the other copies are struck as well."""
     core = reloaded(struck.core, patient.core, patient.guards.checksums)
-    copies = (
-        {**patient.shifts, **struck.faults.shifts},
-        *(_upset_copy(patient, per_megabit, generator) for _ in range(2)),
-    )
-    shifts = voted(copies) if struck.faults.shifts else {}  # type: ignore[arg-type]
+    first = {**patient.shifts, **struck.faults.shifts}
+    second, third = (_upset_copy(patient, per_megabit, generator) for _ in range(2))
+    shifts = voted((first, second, third)) if struck.faults.shifts else {}
     return replace(struck, core=core, faults=replace(struck.faults, shifts=shifts))
 
 
@@ -103,8 +102,7 @@ def _weights(patient: Patient, image: np.ndarray, per_megabit: float, generator:
 
 def _shifts(patient: Patient, image: np.ndarray, per_megabit: float, generator: np.random.Generator) -> Struck:
     wrong = _upset_copy(patient, per_megabit, generator)
-    flips = sum((wrong[key] ^ patient.shifts[key]).bit_count() for key in wrong)
-    return Struck(patient.core, Faults(wrong), image, flips)
+    return Struck(patient.core, Faults(wrong), image, bits_apart(wrong, patient.shifts))
 
 
 def _maps(patient: Patient, image: np.ndarray, per_megabit: float, generator: np.random.Generator) -> Struck:

@@ -22,8 +22,9 @@ NOTES = {
     "bit flips": "PSNR, mean and range over patches and strikes; one kind of memory at a time. `clamped`: ReLU6 and "
     "the limit of the correction. `all guards`: checksums and three copies too, looked at before the image; what "
     "strikes the weights after that stays for this tile.",
-    "bit flips by layer": "How far one bit moves the restored image, root mean square over a crop, no guard on: mean "
-    "and worst over all bits of a number.",
+    "bit flips by layer": "How far one bit moves the restored image, root mean square over a crop of half the "
+    "patch's side, no guard on: mean and worst over one number drawn for each of its bits, and over all bits of the "
+    "layer's shifts. A flip in a map stays near its place, so a larger crop would make its figure smaller.",
     "bit flips by bit": "The same, over all layers. A shift has six bits.",
     "guards": "ReLU6 only where calibration stays below 96 units. Three rows are the host's time; the DPU is busy "
     "meanwhile, so nothing is lost while the host has time left.",

@@ -7,7 +7,7 @@ from quant.core import IntConv, IntCore
 from quant.graph import CORRECTION
 from quant.guards import Guards, checksums, corrections, guarded, learn_guards, reloaded, voted
 from quant.integer import SOUND, Faults, run_core
-from quant.planes import MAX_DN, split
+from quant.planes import MAX_DN, PLANES, split
 from quant.quantise import Quantised
 from quant.upsets import as_stored, shifts_of, upset_conv, upset_shifts, upset_weights, with_ops
 
@@ -100,9 +100,18 @@ def test_a_wrong_shift_is_used(core: IntCore) -> None:
     sound = run_core(core, planes)[0][CORRECTION]
     np.testing.assert_array_equal(run_core(core, planes, faults=Faults(meant))[0][CORRECTION], sound)
     for key, shift in meant.items():
-        for wrong in (shift ^ 1, -32, 31):
-            tensors, _ = run_core(core, planes, faults=Faults({key: wrong}))
-            assert all(tensor.min() >= -128 and tensor.max() <= 127 for tensor in tensors.values())
+        for wrong in (-32, 31):
+            assert not np.array_equal(run_core(core, planes, faults=Faults({key: wrong}))[0][CORRECTION], sound)
         cut = {key: shift + 2}
         if key[1] == "shift_cut":
             assert not np.array_equal(run_core(core, planes, faults=Faults(cut))[0][CORRECTION], sound)
+
+
+def test_shifts_as_wrong_as_can_be_keep_every_sign() -> None:
+    """Nothing wraps around: bias moved left by 31, sums by 32."""
+    bias = np.array([57, 20, -3, 0], np.int8)
+    op = IntConv("c", PLANES, CORRECTION, np.zeros((4, 1, 1, 1), np.int8), 0, bias, 0, False)
+    core = IntCore((op,), {PLANES: 0, CORRECTION: 0})
+    faults = Faults({("c", "shift_bias"): 31, ("c", "shift_cut"): -32})
+    tensors, _ = run_core(core, np.zeros((1, 1, 1, 1), np.int8), faults=faults)
+    assert tensors[CORRECTION].ravel().tolist() == [127, 127, -128, 0]

@@ -1,10 +1,13 @@
 """Bits turned over: as many as were asked for, in numbers that the memory can hold, wherever they fall."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from profiles.errors import ModelError
 from quant.core import IntConv
 from quant.integer import run_core
 from quant.planes import split
@@ -14,6 +17,7 @@ from quant.upsets import (
     PIXEL_BITS,
     SHIFT_BITS,
     as_stored,
+    bits_apart,
     map_channels,
     shifts_of,
     turned_over,
@@ -30,7 +34,7 @@ def image(height: int = 21, width: int = 34) -> np.ndarray:
     return np.random.default_rng(5).random((1, 1, height, width), dtype=np.float32)
 
 
-def bits_apart(a: np.ndarray, b: np.ndarray, bits: int) -> int:
+def turned(a: np.ndarray, b: np.ndarray, bits: int) -> int:
     apart = (a.astype(np.int64) ^ b.astype(np.int64)) & ((1 << bits) - 1)
     return sum(int(value).bit_count() for value in apart.ravel())
 
@@ -42,7 +46,7 @@ def test_so_many_bits_are_turned_over_and_no_more(kind: str, seed: int, data: st
     values = np.random.default_rng(seed).integers(low, high, (3, 7)).astype(dtype)
     count = data.draw(st.integers(0, values.size * bits))
     struck = turned_over(values, count, np.random.default_rng(seed), bits)
-    assert bits_apart(values, struck, bits) == count
+    assert turned(values, struck, bits) == count
     assert struck.dtype == values.dtype
     assert low <= struck.min() <= struck.max() < high
     again = turned_over(values, count, np.random.default_rng(seed), bits)
@@ -81,7 +85,7 @@ def test_weights_are_struck_over_all_layers(quantised: Quantised) -> None:
     core = as_stored(quantised.core)
     struck = upset_weights(core, 200, np.random.default_rng(1))
     apart = {
-        a.name: bits_apart(a.weight, b.weight, 8) + bits_apart(a.bias, b.bias, 8)
+        a.name: turned(a.weight, b.weight, 8) + turned(a.bias, b.bias, 8)
         for a, b in zip(core.ops, struck.ops, strict=True)
         if isinstance(a, IntConv) and isinstance(b, IntConv)
     }
@@ -96,9 +100,23 @@ def test_every_shift_is_what_the_core_uses(quantised: Quantised) -> None:
     limit = 2 ** (SHIFT_BITS - 1)
     assert all(-limit <= shift < limit for shift in shifts.values())
     struck = upset_shifts(shifts, 3, np.random.default_rng(2))
-    assert sum((struck[key] ^ shifts[key]).bit_count() for key in shifts if struck[key] >= 0) <= 3
     assert struck.keys() == shifts.keys()
-    assert struck != shifts
+    assert bits_apart(struck, shifts) == 3
+
+
+def test_bits_of_shifts_are_counted_whatever_their_sign() -> None:
+    shifts = {(str(k), "shift_cut"): k for k in range(-16, 17)}
+    for count in (1, 2, 50):
+        assert bits_apart(upset_shifts(shifts, count, np.random.default_rng(count)), shifts) == count
+
+
+def test_numbers_that_the_board_could_not_store_are_refused(quantised: Quantised) -> None:
+    op = next(op for op in quantised.core.ops if isinstance(op, IntConv))
+    odd = replace(op, bias=np.full(len(op.bias), 100_001), bias_position=op.bias_position)
+    far = replace(op, weight_position=op.weight_position + 40, bias_position=op.bias_position + 40)
+    for wrong in (odd, far):
+        with pytest.raises(ModelError, match=op.name):
+            as_stored(replace(quantised.core, ops=(wrong, *quantised.core.ops[1:])))
 
 
 def test_maps_have_the_channels_that_run(quantised: Quantised) -> None:

@@ -23,6 +23,7 @@ from deploy.stress.flip_price import TILE_PX, price_rows
 from deploy.stress.flip_study import FlipRequest, make_patient
 from deploy.stress.flips import MEMORIES, Patient, Struck, restored
 from deploy.stress.int8 import core_of
+from deploy.stress.page import markdown
 from deploy.stress.subject import open_subject
 from model.shipped import SHIPPED
 from quant.core import IntConv
@@ -129,9 +130,14 @@ def test_the_command(pair: list[Path], tmp_path: Path) -> None:
         (["FLOAT", "INT8", "--bit-flips", "--sensor", "nobody"], "nobody"),
         (["FLOAT", "INT8", "--bit-flips", "--target", "nobody"], "nobody"),
         (["FLOAT", "INT8", "--bit-flips", "--images", "nowhere"], "nowhere"),
+        (["FLOAT", "INT8", "--bit-flips", "--out", "x.svg"], "x.svg"),
+        (["FLOAT", "INT8", "--bit-flips", "--out", "x.md", "--json", "x.svg"], "x.svg"),
     ],
 )
-def test_wrong_arguments(arguments: list[str], said: str, pair: list[Path]) -> None:
+def test_wrong_arguments(
+    arguments: list[str], said: str, pair: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
     files = {"FLOAT": str(pair[0]), "INT8": str(pair[1])}
     result = CliRunner().invoke(app, ["stress", *(files.get(text, text) for text in arguments)])
     assert result.exit_code == 2, result.output
@@ -156,8 +162,19 @@ def test_the_page_is_fresh(maker: ModuleType) -> None:
         core = open_subject(None, None, variant).core
         assert all(f"\n| {op.name} | " in page for op in core.ops)  # type: ignore[union-attr]
     assert page.count("| all guards | ") == len(maker.VARIANTS)
+    assert all(line in page for line in price_lines(maker))
     for memory in MEMORIES:
         assert page.count(f"\n| {memory}, ") >= 4 * len(maker.VARIANTS)
+
+
+def price_lines(maker: ModuleType) -> list[str]:
+    """What guards cost, as the page must say it: prices need no strikes."""
+    lines = []
+    for variant in maker.VARIANTS:
+        patient, dpu = make_patient(open_subject(None, None, variant), maker.REQUEST), load_dpu("vck190", None)
+        prediction = predict_file(SHIPPED / f"{variant}-int8.onnx", dpu, TILE_PX)
+        lines += markdown(price_rows(patient, prediction, dpu)).splitlines()
+    return [line for line in lines if line.startswith("|")]
 
 
 def test_curves_go_from_left_to_right(rows: dict[str, Row]) -> None:
