@@ -60,8 +60,7 @@ FINDINGS = """- Up to 10 bits in a megabit of weights, or one of feature maps, n
 
 def document(networks: Mapping[str, Sequence[Row]]) -> str:
     """The whole page as Markdown."""
-    parts = [f"# {name}\n\n{markdown(rows)}".replace("\n## ", f"\n## {name}: ") for name, rows in networks.items()]
-    bodies = [part.split("\n", 2)[2] for part in parts]
+    bodies = [markdown(rows).replace("## ", f"## {name}: ") for name, rows in networks.items()]
     return OPENING + FINDINGS + "\n" + "\n".join(bodies)
 
 

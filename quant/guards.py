@@ -16,9 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from quant.core import IntConv, IntCore
-from quant.graph import CORRECTION
-from quant.integer import Faults, run_core
-from quant.passes.dual_gain import merge
+from quant.integer import Faults, merged_correction, run_core
 from quant.planes import MAX_DN
 from quant.upsets import Shifts, with_ops
 
@@ -57,15 +55,9 @@ def learn_guards(core: IntCore, planes: Iterable[np.ndarray]) -> Guards:
     for each in planes:
         tensors, _ = run_core(core, each)
         relus = {name: max(peak, int(tensors[name].max())) for name, peak in relus.items()}
-        largest_dn = max(largest_dn, MAX_DN * float(np.abs(corrections(core, tensors)).max()))
+        largest_dn = max(largest_dn, MAX_DN * float(np.abs(merged_correction(core, tensors)).max()))
     bounds = {name: _next_relu6(peak) for name, peak in relus.items() if peak <= RELU6_UNITS}
     return Guards(bounds, _next_power(largest_dn), checksums(core))
-
-
-def corrections(core: IntCore, tensors: Mapping[str, np.ndarray]) -> np.ndarray:
-    """The correction (N, 1, H, W) of full scale, from the tensors of a run."""
-    scale = core.scale(CORRECTION)
-    return merge((tensors[CORRECTION] * np.float32(scale)).astype(np.float32), scale)
 
 
 def checksums(core: IntCore) -> dict[str, int]:

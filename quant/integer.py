@@ -14,6 +14,7 @@ import numpy as np
 
 from quant.core import IntConv, IntCore
 from quant.graph import CORRECTION, Add
+from quant.passes.dual_gain import merge
 from quant.planes import PLANES
 from quant.positions import INT8_MAX, INT8_MIN
 
@@ -86,6 +87,12 @@ def correction(core: IntCore, planes: np.ndarray, half_even: bool = False) -> np
     """The correction (N, 1 or 2, H, W) as float32 multiples of its scale, of int8 planes (N, 3, H, W)."""
     tensors, _ = run_core(core, planes, half_even)
     return np.asarray(tensors[CORRECTION] * np.float32(core.scale(CORRECTION)), np.float32)
+
+
+def merged_correction(core: IntCore, tensors: Mapping[str, np.ndarray]) -> np.ndarray:
+    """The correction (N, 1, H, W) of full scale as the host reads it, from the tensors of a run."""
+    scale = core.scale(CORRECTION)
+    return merge((tensors[CORRECTION] * np.float32(scale)).astype(np.float32), scale)
 
 
 def _conv(

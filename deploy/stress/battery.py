@@ -2,15 +2,13 @@
 
 import math
 import zlib
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import torch
 
 from deploy.stress.cases import CASES, SIDE_PX, Case
-from deploy.stress.checks import Measure
+from deploy.stress.checks import Measure, torch_threads
 from deploy.stress.int8 import reference, runtime
 from deploy.stress.limitations import Limitation, limitation_of
 from deploy.stress.losses import losses
@@ -77,7 +75,7 @@ def run_battery(
 ) -> list[Outcome]:
     """Look at every case at every stage; `tick` is called once for each such pair."""
     outcomes = []
-    with one_torch_thread():
+    with torch_threads(1):  # on images this small a second thread only waits
         for case in cases:
             images = case.draw(side_px, np.random.default_rng([seed, zlib.crc32(case.name.encode())]))
             for stage in stages:
@@ -132,14 +130,3 @@ def chosen(names: str | None, known: Iterable[str], option: str) -> list[str]:
             expected = f"some of {', '.join(every)}"
             raise OptionError(option, expected=expected, got=repr(name), remedy="separate them by commas")
     return wanted
-
-
-@contextmanager
-def one_torch_thread() -> Iterator[None]:
-    """On images this small a second thread only waits."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)

@@ -1,9 +1,11 @@
 """What is measured on a hard case, and when it holds."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 import numpy as np
+import torch
 
 from deploy.stress.cases import FULL_DN
 from profiles.errors import BeersError
@@ -111,3 +113,14 @@ def inside(image: np.ndarray, margin_px: int) -> np.ndarray:
     if min(image.shape) <= 2 * margin_px + 1:
         return image
     return image[margin_px : image.shape[0] - margin_px, margin_px : image.shape[1] - margin_px]
+
+
+@contextmanager
+def torch_threads(count: int) -> Iterator[None]:
+    """So many of torch's threads for a while."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(count)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)

@@ -2,20 +2,18 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from itertools import islice
 from pathlib import Path
 
 from deploy.bench import predict_file
-from deploy.defaults import HELD_OUT_SEED, load_scenes
+from deploy.defaults import HELD_OUT_SEED
 from deploy.dpu.board import load_dpu
+from deploy.quantising import Calibration
 from deploy.results import Row
 from deploy.stress import flip_curves, flip_places
 from deploy.stress.flip_price import TILE_PX, price_rows
 from deploy.stress.flips import Patient
 from deploy.stress.int8 import core_of, planes_of
 from deploy.stress.subject import Subject
-from profiles import load_sensor
-from quant.calibration import REFERENCE, draw_patches
 from quant.guards import learn_guards
 from quant.upsets import as_stored
 
@@ -67,12 +65,9 @@ def ticks(subject: Subject, request: FlipRequest) -> int:
 def make_patient(subject: Subject, request: FlipRequest) -> Patient:
     """The core as the board stores it, guards that calibration patches teach, and other patches to try it on."""
     core = as_stored(core_of(subject))
-    degraded, reference = load_sensor(request.sensor), load_sensor(REFERENCE)
     taught, tried = (
-        draw_patches(
-            load_scenes(request.images, reference.nominal(), seed), degraded, reference, count, seed, request.size_px
-        )
+        Calibration(request.sensor, request.images, count, request.size_px, seed).drawn
         for seed, count in ((request.seed, CALIBRATION_PATCHES), (request.seed + HELD_OUT_SEED, request.draws))
     )
     guards = learn_guards(core, (planes_of(core, image) for image in taught.degraded))
-    return Patient(core, guards, list(islice(tried.pairs, request.draws)))
+    return Patient(core, guards, list(tried.pairs))

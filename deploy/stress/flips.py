@@ -9,8 +9,8 @@ import numpy as np
 from deploy.stress.int8 import planes_of
 from model.metrics.fidelity import psnr_db
 from quant.core import IntCore
-from quant.guards import Guards, checksums, corrections, guarded, reloaded, voted
-from quant.integer import SOUND, Faults, run_core
+from quant.guards import Guards, checksums, guarded, reloaded, voted
+from quant.integer import SOUND, Faults, merged_correction, run_core
 from quant.planes import MAX_DN
 from quant.upsets import (
     INT8_BITS,
@@ -70,7 +70,7 @@ def restored(patient: Patient, struck: Struck, clamped: bool = False) -> np.ndar
     """The image (1, 1, H, W) that a struck network makes of a struck image."""
     faults = guarded(struck.faults, patient.guards) if clamped else struck.faults
     tensors, _ = run_core(struck.core, planes_of(struck.core, struck.image), faults=faults)
-    correction = corrections(struck.core, tensors)
+    correction = merged_correction(struck.core, tensors)
     correction = patient.guards.limit(correction) if clamped else correction
     return np.asarray(np.clip(struck.image + correction, 0, 1), np.float32)
 

@@ -8,10 +8,8 @@ from deploy.stress.network import restoration
 from deploy.stress.subject import Network, Subject
 from profiles.errors import BeersError, ModelError
 from quant.core import IntConv, IntCore
-from quant.graph import CORRECTION
 from quant.int_bounds import saturable
-from quant.integer import LayerReport, run_core
-from quant.passes.dual_gain import merge
+from quant.integer import LayerReport, merged_correction, run_core
 from quant.planes import split
 
 GAIN_DN = 128.0
@@ -77,9 +75,7 @@ def planes_of(core: IntCore, image: np.ndarray) -> np.ndarray:
 
 
 def _restored(core: IntCore, image: np.ndarray, tensors: dict[str, np.ndarray]) -> np.ndarray:
-    scale = core.scale(CORRECTION)
-    correction = merge((tensors[CORRECTION] * np.float32(scale)).astype(np.float32), scale)
-    return np.asarray(np.clip(image + correction, 0, 1)[0, 0])
+    return np.asarray(np.clip(image + merged_correction(core, tensors), 0, 1)[0, 0])
 
 
 def _unproven(core: IntCore, reports: list[LayerReport]) -> Measure:

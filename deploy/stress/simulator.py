@@ -10,7 +10,16 @@ import torch
 from torch import Tensor
 
 from deploy.stress.cases import FULL_DN, Case
-from deploy.stress.checks import Measure, differing, gain, mean_shift, not_finite, out_of_range, refused
+from deploy.stress.checks import (
+    Measure,
+    differing,
+    gain,
+    mean_shift,
+    not_finite,
+    out_of_range,
+    refused,
+    torch_threads,
+)
 from deploy.stress.subject import Subject
 from model.simulator.acquire import acquire
 from model.simulator.bounds import ringing_of, scene_stats
@@ -94,12 +103,8 @@ def _signal_float64(image: np.ndarray, sensor: Sensor) -> np.ndarray:
 
 
 def _threads(image: np.ndarray, sensor: Sensor, acquired: np.ndarray) -> Measure:
-    before = torch.get_num_threads()
-    torch.set_num_threads(before + 1)
-    try:
+    with torch_threads(torch.get_num_threads() + 1):
         return differing("threads differ", acquired, _acquired(image, sensor))
-    finally:
-        torch.set_num_threads(before)
 
 
 def _read_back(image: np.ndarray, sensor: Sensor) -> object:

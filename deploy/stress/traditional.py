@@ -14,6 +14,7 @@ from deploy.stress.checks import (
     out_of_range,
     refused,
     ringing,
+    torch_threads,
 )
 from deploy.stress.simulator import sensor_of
 from deploy.stress.subject import Subject
@@ -69,9 +70,5 @@ def _strips(image: np.ndarray, chain: Chain, result: np.ndarray) -> Measure:
 
 
 def _threads(image: np.ndarray, chain: Chain, result: np.ndarray) -> Measure:
-    before = torch.get_num_threads()
-    torch.set_num_threads(before + 1)
-    try:
+    with torch_threads(torch.get_num_threads() + 1):
         return differing("threads differ", result, _restored(image, chain))
-    finally:
-        torch.set_num_threads(before)

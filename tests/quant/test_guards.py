@@ -5,8 +5,8 @@ import pytest
 
 from quant.core import IntConv, IntCore
 from quant.graph import CORRECTION
-from quant.guards import Guards, checksums, corrections, guarded, learn_guards, reloaded, voted
-from quant.integer import SOUND, Faults, run_core
+from quant.guards import Guards, checksums, guarded, learn_guards, reloaded, voted
+from quant.integer import SOUND, Faults, merged_correction, run_core
 from quant.planes import MAX_DN, PLANES, split
 from quant.quantise import Quantised
 from quant.upsets import as_stored, shifts_of, upset_conv, upset_shifts, upset_weights, with_ops
@@ -30,7 +30,7 @@ def test_calibration_patches_pass_untouched(core: IntCore, guards: Guards) -> No
     for seed in range(3):
         bare, clamped = (run_core(core, split(image(seed)), faults=f)[0] for f in (SOUND, guarded(SOUND, guards)))
         np.testing.assert_array_equal(bare[CORRECTION], clamped[CORRECTION])
-        correction = corrections(core, bare)
+        correction = merged_correction(core, bare)
         np.testing.assert_array_equal(guards.limit(correction), correction)
 
 
@@ -44,7 +44,7 @@ def test_bounds_are_the_next_ones_that_hold_what_was_seen(core: IntCore) -> None
         peak = max(int(run[name].max()) for run in runs)
         assert bound in (96, 48, 24, 12, 6, 3)
         assert bound / 2 < max(peak, 2) <= max(bound, 2)
-    largest = max(MAX_DN * float(np.abs(corrections(core, run)).max()) for run in runs)
+    largest = max(MAX_DN * float(np.abs(merged_correction(core, run)).max()) for run in runs)
     assert guards.limit_dn / 2 < largest <= guards.limit_dn
 
 
@@ -54,9 +54,9 @@ def test_a_clamped_result_keeps_its_bound_whatever_the_weights(core: IntCore) ->
     bare, clamped = (run_core(struck, split(image(9)), faults=f)[0] for f in (SOUND, guarded(SOUND, some)))
     assert max(int(bare[name].max()) for name in some.relu6) > 24
     assert max(int(clamped[name].max()) for name in some.relu6) == 24
-    limited = some.limit(corrections(core, clamped))
+    limited = some.limit(merged_correction(core, clamped))
     bound = np.float32(64 / MAX_DN)
-    assert np.abs(limited).max() <= bound < np.abs(corrections(core, bare)).max()
+    assert np.abs(limited).max() <= bound < np.abs(merged_correction(core, bare)).max()
 
 
 def test_memory_is_struck_after_the_clamp(core: IntCore) -> None:

@@ -10,6 +10,7 @@ import pytest
 import torch
 
 from deploy.export import to_onnx
+from deploy.stress.checks import torch_threads
 from deploy.stress.subject import Subject, open_subject
 from model.convbeers import ConvBEERS, Variant, initialise
 from model.simulator.procedural import procedural_scene
@@ -22,10 +23,8 @@ from quant.quantise import ALL, Quantised, quantise_model
 @pytest.fixture(autouse=True)
 def one_thread() -> Iterator[None]:
     """On images this small a second thread only waits."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
+    with torch_threads(1):
+        yield
 
 
 @pytest.fixture(scope="session")

@@ -1,8 +1,6 @@
 """Bits turned over: what a strike costs, what guards buy back, and what the board pays for them."""
 
-import importlib.util
 import json
-import sys
 from itertools import pairwise
 from pathlib import Path
 from types import ModuleType
@@ -30,8 +28,8 @@ from quant.core import IntConv
 from quant.guards import Guards, checksums
 from quant.integer import SOUND
 from quant.upsets import as_stored
+from tests.stability.makers import DOCS, load_maker
 
-DOCS = Path(__file__).resolve().parents[2] / "docs"
 REQUEST = FlipRequest("pleiades-degraded", None, "vck190", draws=2, size_px=48, seed=3)
 
 
@@ -146,13 +144,7 @@ def test_wrong_arguments(
 
 @pytest.fixture(scope="module")
 def maker() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("make_bit_flips", DOCS / "make_bit_flips.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules["make_bit_flips"] = module
-    spec.loader.exec_module(module)
-    return module
+    return load_maker("make_bit_flips")
 
 
 def test_the_page_is_fresh(maker: ModuleType) -> None:

@@ -1,14 +1,14 @@
 """docs/mutations.md is true to the code: what would be broken is there, and so are the tests that noticed."""
 
-import importlib.util
 import re
 import shutil
-import sys
 from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
 
 import pytest
+
+from tests.stability.makers import load_maker
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGE = ROOT / "docs" / "mutations.md"
@@ -34,13 +34,7 @@ REPORT = """<testsuites><testsuite>
 
 @pytest.fixture(scope="module")
 def maker() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("make_mutations", ROOT / "docs" / "make_mutations.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules["make_mutations"] = module
-    spec.loader.exec_module(module)
-    return module
+    return load_maker("make_mutations")
 
 
 def faults(page: str, maker: ModuleType) -> list[str]:

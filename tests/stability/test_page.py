@@ -1,8 +1,5 @@
 """docs/stability.md names every case, stage and limitation that the code knows."""
 
-import importlib.util
-import sys
-from pathlib import Path
 from types import ModuleType
 
 import pytest
@@ -12,19 +9,12 @@ from deploy.stress.battery import STAGES
 from deploy.stress.cases import CASES
 from deploy.stress.limitations import LIMITATIONS
 from deploy.stress.page import markdown
-
-DOCS = Path(__file__).resolve().parents[2] / "docs"
+from tests.stability.makers import DOCS, load_maker
 
 
 @pytest.fixture(scope="module")
 def maker() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("make_stability", DOCS / "make_stability.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules["make_stability"] = module
-    spec.loader.exec_module(module)
-    return module
+    return load_maker("make_stability")
 
 
 def faults(page: str, maker: ModuleType) -> list[str]:

@@ -1,0 +1,19 @@
+"""The scripts of docs/ that make pages, opened as modules: their words and rows are compared with the pages."""
+
+import importlib.util
+import sys
+from pathlib import Path
+from types import ModuleType
+
+DOCS = Path(__file__).resolve().parents[2] / "docs"
+
+
+def load_maker(name: str) -> ModuleType:
+    """The script docs/NAME.py."""
+    spec = importlib.util.spec_from_file_location(name, DOCS / f"{name}.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[name] = module
+    spec.loader.exec_module(module)
+    return module
