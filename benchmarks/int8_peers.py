@@ -134,10 +134,10 @@ def table(arguments: argparse.Namespace, folder: Path) -> Iterator[str]:
     yield "| tool | graph | MAE | std | max | std/MAE | PSNR float dB | PSNR INT8 dB | drop dB | SSIM | s | peak MB |"
     yield "|---|---|---|---|---|---|---|---|---|---|---|---|"
     for number, way in enumerate(ways(arguments.adaround_iterations)):
-        if not re.search(arguments.only, way.name):
+        graph = "rewritten" if way.rewritten or way.name.startswith("beers") else "plain"
+        if not re.search(arguments.only, f"{way.name}, {graph}"):
             continue
         python = sys.executable if way.script == OURS else arguments.quark_python
-        graph = "rewritten" if way.rewritten or way.name.startswith("beers") else "plain"
         if python is None:
             yield f"| {way.name} | {graph} | unavailable: no --quark-python |{' |' * 9}"
             continue
@@ -165,7 +165,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--quark-python", help="interpreter of the environment that AMD Quark is installed in")
     parser.add_argument("--adaround-iterations", type=int, default=60, help="a layer; Quark's own default is 1000")
-    parser.add_argument("--only", default="", help="ways whose name this regular expression finds")
+    parser.add_argument("--only", default="", help='rows whose "tool, graph" this regular expression finds')
     parser.add_argument("--keep", type=Path, help="folder for the quantised files")
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory() as temporary:
