@@ -75,17 +75,23 @@ def best_scale(counts: np.ndarray, largest: float, levels: int) -> float:
 def round_weight(weight: np.ndarray, finest: np.ndarray) -> RoundedWeight:
     """Each output channel at its own least-squares scale, but none below `finest` (O,); one of zeros at scale 1."""
     rows = np.asarray(weight, np.float64).reshape(len(weight), -1)
-    scales = np.maximum([_row_scale(row) for row in rows], finest).astype(np.float32)
-    whole = np.clip(np.rint(rows / scales[:, None]), -INT8_MAX, INT8_MAX)
-    return RoundedWeight(whole.astype(np.int8).reshape(weight.shape), scales)
+    scales = np.maximum(_row_scales(rows), finest).astype(np.float32)
+    return RoundedWeight(_whole(rows, scales).astype(np.int8).reshape(weight.shape), scales)
 
 
-def _row_scale(row: np.ndarray) -> float:
-    if not row.any():
-        return 1.0
-    tried = SHARES * np.abs(row).max() / INT8_MAX
-    errors = [np.sum((np.clip(np.rint(row / s), -INT8_MAX, INT8_MAX) * s - row) ** 2) for s in tried]
-    return float(tried[int(np.argmin(errors))])
+def _row_scales(rows: np.ndarray) -> np.ndarray:
+    """(O,) for rows (O, n): a share at a time for all rows, because a search asks for it at every trial."""
+    largest = np.abs(rows).max(axis=1)
+    best, least = np.ones(len(rows)), np.full(len(rows), np.inf)
+    for share in SHARES:
+        tried = np.where(largest > 0, share * largest / INT8_MAX, 1.0)
+        error = np.square(_whole(rows, tried) * tried[:, None] - rows).sum(axis=1)
+        best, least = np.where(error < least, tried, best), np.minimum(error, least)
+    return best
+
+
+def _whole(rows: np.ndarray, scales: np.ndarray) -> np.ndarray:
+    return np.asarray(np.clip(np.rint(rows / scales[:, None]), -INT8_MAX, INT8_MAX))
 
 
 def _counts(sizes: np.ndarray, largest: float) -> np.ndarray:
