@@ -10,6 +10,7 @@ import onnx
 from deploy.dpu.board import load_dpu
 from deploy.dpu.placement import place
 from deploy.dpu.reading import read_network
+from deploy.shipped import shipped_pair
 from model.files import write_text
 from profiles.errors import OptionError
 from profiles.text import read_json
@@ -19,6 +20,21 @@ from quant.session import open_any_size, run
 
 RELUS = ("Relu", "Max")
 TILE_PX = 640
+
+
+def files_or_shipped(float_path: Path | None, int8_path: Path | None, variant: str) -> tuple[Path, Path]:
+    """The two files given, or the shipped pair where neither is.
+
+    Raises:
+        OptionError: one file without the other: two networks that have nothing to do with each other.
+        ModelError: no pair of that name is shipped.
+    """
+    if float_path is None:
+        return shipped_pair(variant)
+    if int8_path is None:
+        remedy = "give its INT8 file too, or none of both for a shipped pair"
+        raise OptionError("INT8", expected=f"the INT8 network of {float_path.name}", got="none", remedy=remedy)
+    return float_path, int8_path
 
 
 def structure_checks(

@@ -14,4 +14,13 @@ def default_float_weights() -> Path:
 
 def default_int8() -> Path:
     """The shipped INT8 network (ONNX, host spelling)."""
-    return SHIPPED / f"{VARIANT}-int8.onnx"
+    return shipped_pair(VARIANT)[1]
+
+
+def shipped_pair(variant: str) -> tuple[Path, Path]:
+    """The float weights of that name and their INT8 network (ONNX, host spelling).
+
+    Raises:
+        ModelError: none are shipped.
+    """
+    return shipped_weights(variant), SHIPPED / f"{variant}-int8.onnx"

@@ -1,6 +1,7 @@
 """The float/INT8 gate's figures as a row of results."""
 
 import math
+from collections.abc import Mapping
 
 from deploy.results import Figure, Row, measured, unavailable
 from quant.gate import GateResult
@@ -29,3 +30,11 @@ def gate_row(result: GateResult) -> Row:
         "PSNR INT8": figure(result.psnr_int8_db, "dB"),
     }
     return Row("gate", "INT8 against float", figures)
+
+
+def saturation_figure(shares: Mapping[str, float], patches: int) -> Figure:
+    """What share of its results comes to the ends of 8 bits, in the layer where most do."""
+    if not shares:
+        return unavailable("%", "no result in the file is rounded to 8 bits")
+    layer = max(shares, key=lambda name: shares[name])
+    return measured(100 * shares[layer], "%", f"{layer}, the worst of {len(shares)}; {patches} patches of 128 x 128")

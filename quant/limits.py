@@ -14,7 +14,7 @@ from quant.gate import GateResult
 
 @dataclass(frozen=True)
 class Limits:
-    """The largest values allowed; None for no limit. Differences in [0, 1] of full scale, PSNRs in dB.
+    """The largest values allowed; None for no limit. Differences and shares in [0, 1], PSNRs in dB.
 
     Attributes:
         mae: mean absolute difference of INT8 from float.
@@ -22,14 +22,16 @@ class Limits:
         std_over_mae: 1.25 is rounding alone; clipping drives it up.
         psnr_drop_db: PSNR lost against the reference.
         min_psnr_float_int8_db: smallest PSNR of INT8 against float.
+        saturated: share of a layer's results at the ends of 8 bits, of the layer with most.
         mae_growth: how many times a stored baseline's MAE.
     """
 
-    mae: float | None = 0.0008
+    mae: float | None = 0.0007
     p999: float | None = None
     std_over_mae: float | None = None
     psnr_drop_db: float | None = None
     min_psnr_float_int8_db: float | None = None
+    saturated: float | None = None
     mae_growth: float | None = 1.05
 
 
@@ -98,3 +100,12 @@ def judge(result: GateResult, limits: Limits, baseline_mae: float | None = None)
         text = f"at most {allowed:.4g}, {limits.mae_growth:g} times the baseline"
         checks.append(Check("MAE against the baseline", result.mae <= allowed, f"{result.mae:.4g}", text))
     return checks
+
+
+def judge_saturation(shares: Mapping[str, float], limits: Limits) -> list[Check]:
+    """The layer that saturates most, against the limit if there is one; where nothing is 8-bit none is kept."""
+    if limits.saturated is None:
+        return []
+    layer, share = max(shares.items(), key=lambda item: item[1], default=("any layer: none is 8-bit", math.nan))
+    allowed = f"at most {limits.saturated:g} of a layer's"
+    return [Check("saturated results", share <= limits.saturated, f"{share:.2g} in {layer}", allowed)]

@@ -1,22 +1,22 @@
 """`beers-deploy gate`: does INT8 stay close enough to float? Exit code 1 when it does not."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-EXAMPLE = "gate float.onnx int8.onnx --max-mae 0.0008"
+EXAMPLE = "gate float.onnx int8.onnx --max-mae 0.0007"
 
 
 def gate(
     float_model: Annotated[
-        Path | None, typer.Argument(metavar="[FLOAT]", help="Float ONNX; the shipped one if none.")
+        Path | None, typer.Argument(metavar="[FLOAT]", help="Float ONNX or weights; a shipped pair if none.")
     ] = None,
-    int8_model: Annotated[
-        Path | None, typer.Argument(metavar="[INT8]", help="INT8 ONNX; the shipped one if none.")
-    ] = None,
+    int8_model: Annotated[Path | None, typer.Argument(metavar="[INT8]", help="Its INT8 ONNX.")] = None,
+    variant: Annotated[str, typer.Option(help="Shipped pair of this name, where no file is given.")] = "convbeers-s",
     max_mae: Annotated[
-        float | None, typer.Option(min=0, help="Largest mean absolute difference, of full scale; 0.0008 if none.")
+        float | None, typer.Option(min=0, help="Largest mean absolute difference, of full scale; 0.0007 if none.")
     ] = None,
     config: Annotated[Path | None, typer.Option(help="TOML file of limits; see docs/gate.md.")] = None,
     baseline: Annotated[Path | None, typer.Option(help="What 'gate --json' wrote before: MAE may not grow.")] = None,
@@ -31,27 +31,28 @@ def gate(
 ) -> None:
     """Compare a float and an INT8 network on simulated pairs neither was calibrated on.
 
-    Also checked: the DPU's rules, that no ReLU was lost, and that onnxruntime's optimisations change no bit.
+    Also checked: what saturates inside, the DPU's rules, that no ReLU was lost, and that onnxruntime's optimisations
+    change no bit.
     """
     from deploy.defaults import HELD_OUT_SEED, load_scenes
     from deploy.defaults import float_model as read_float
-    from deploy.gate import baseline_mae, structure_checks, write_summaries
+    from deploy.gate import baseline_mae, files_or_shipped, structure_checks, write_summaries
     from deploy.results import Document
-    from deploy.shipped import default_float_weights, default_int8
     from deploy.tables import print_rows
-    from deploy.verdict import gate_row
+    from deploy.verdict import gate_row, saturation_figure
     from model.files import require_writable
     from profiles import load_sensor
     from profiles.errors import ModelError
     from quant.calibration import REFERENCE, draw_patches
     from quant.gate import compare
-    from quant.limits import judge, read_limits
+    from quant.limits import judge, judge_saturation, read_limits
     from quant.onnx_file import load_onnx, metadata
+    from quant.saturation import saturated_shares
     from quant.session import open_any_size
 
     require_writable(json, summary, junit)
     limits, before = read_limits(config, max_mae), baseline_mae(baseline)
-    float_path, int8_path = float_model or default_float_weights(), int8_model or default_int8()
+    float_path, int8_path = files_or_shipped(float_model, int8_model, variant)
     models = read_float(float_path), load_onnx(int8_path)
     if metadata(models[0]).get("precision", "").startswith("int8"):
         remedy = "give the float model first, the INT8 model second"
@@ -60,9 +61,12 @@ def gate(
     degraded, reference = load_sensor(sensor), load_sensor(REFERENCE)
     held_out = seed + HELD_OUT_SEED
     scenes = load_scenes(images, reference.nominal(), held_out)
-    result = compare(*sessions, draw_patches(scenes, degraded, reference, patches, held_out).pairs)
-    checks = [*judge(result, limits, before), *structure_checks(models[0], int8_path, models[1], target)]
+    drawn = draw_patches(scenes, degraded, reference, patches, held_out)
+    result, shares = compare(*sessions, drawn.pairs), saturated_shares(models[1], drawn.degraded)
+    checks = [*judge(result, limits, before), *judge_saturation(shares, limits)]
+    checks += structure_checks(models[0], int8_path, models[1], target)
     row = gate_row(result)
+    row = replace(row, figures={**row.figures, "saturated results": saturation_figure(shares, patches)})
     print_rows("float against INT8", [row])
     for check in checks:
         typer.echo(f"{'ok    ' if check.passed else 'FAILED'} {check.name}: {check.found} (allowed: {check.allowed})")

@@ -13,13 +13,13 @@ import onnxruntime as ort
 from deploy.counterpart import is_quantised
 from deploy.defaults import float_model
 from deploy.restore import Infer
+from deploy.shipped import shipped_pair
 from deploy.stress.cases import FULL_DN
 from deploy.swath.engine import restore_rows
 from deploy.swath.plan import make_plan
 from deploy.swath.raster import Raster
 from deploy.swath.reader import ArraySource
 from deploy.swath.restorer import Restorer
-from model.shipped import SHIPPED, shipped_weights
 from profiles.errors import BeersError, ModelError
 from quant.core import IntCore
 from quant.graph import Graph, correction_graph
@@ -93,8 +93,7 @@ def open_subject(float_path: Path | None, int8_path: Path | None, variant: str) 
         ModelError: no such file or variant, the two swapped, or a network that cannot be tiled.
     """
     if float_path is None:
-        float_path, int8_path = shipped_weights(variant), SHIPPED / f"{variant}-int8.onnx"
-        int8_path = int8_path if int8_path.is_file() else None
+        float_path, int8_path = shipped_pair(variant)
     float32 = Network(float_model(float_path))
     int8 = None if int8_path is None else Network(load_onnx(int8_path))
     for path, network, wanted in ((float_path, float32, False), (int8_path, int8, True)):

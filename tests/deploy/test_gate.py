@@ -13,14 +13,16 @@ from typer.testing import CliRunner
 from deploy.cli import app
 from deploy.defaults import float_model
 from deploy.gate import baseline_mae, junit, markdown, structure_checks
-from deploy.shipped import default_int8
+from deploy.shipped import default_int8, shipped_pair
+from model.shipped import SHIPPED
 from model.simulator.procedural import procedural_scene
 from profiles import load_sensor
 from profiles.errors import OptionError
 from quant.calibration import Patches, draw_patches
 from quant.gate import compare
-from quant.limits import Check, Limits, judge, read_limits
+from quant.limits import Check, Limits, judge, judge_saturation, read_limits
 from quant.onnx_file import save_onnx
+from quant.saturation import saturated_shares
 from quant.session import open_session
 
 SENSORS = load_sensor("pleiades-degraded"), load_sensor("pleiades-reference")
@@ -44,7 +46,8 @@ def failed(
     spoil(model)
     save_onnx(model, folder / "spoilt.onnx")
     result = compare(open_session(reference_model), open_session(model), unseen.pairs)
-    checks = judge(result, Limits(mae=0.0008, std_over_mae=2.5))
+    limits = Limits(std_over_mae=2.5, saturated=0.001)
+    checks = judge(result, limits) + judge_saturation(saturated_shares(model, unseen.degraded), limits)
     checks += structure_checks(reference_model, folder / "spoilt.onnx", model, "vck190")
     return {check.name for check in checks if not check.passed}
 
@@ -108,6 +111,7 @@ def test_the_shipped_file_passes(reference_model: onnx.ModelProto, unseen: Patch
         (drop_a_relu, "ReLUs kept"),
         (give_a_float_scale, "legal on the DPU"),
         (clip_an_activation, "MAE"),
+        (clip_an_activation, "saturated results"),
         (shift_a_bias, "MAE"),
         (swap_the_planes, "MAE"),
     ],
@@ -142,6 +146,13 @@ def test_limits_that_are_none_are_refused(text: str, tmp_path: Path) -> None:
         read_limits(tmp_path / "none.toml", None)
 
 
+def test_without_8_bit_results_no_limit_on_them_is_kept() -> None:
+    assert judge_saturation({}, Limits()) == []
+    (check,) = judge_saturation({}, Limits(saturated=0.5))
+    assert not check.passed
+    assert "none is 8-bit" in check.found
+
+
 CHECKS = [Check("MAE", True, "0.0006", "at most 0.0008"), Check("legal <all>", False, "tail: x & y", "the rules")]
 
 
@@ -152,6 +163,14 @@ def test_a_job_can_read_the_verdict() -> None:
     suite = ET.fromstring(junit("INT8 gate", CHECKS))  # noqa: S314 - our own text
     assert (suite.get("tests"), suite.get("failures")) == ("2", "1")
     assert [case.find("failure") is not None for case in suite] == [False, True]
+
+
+def test_one_file_alone_is_no_pair(tmp_path: Path) -> None:
+    (tmp_path / "float.onnx").touch()
+    done = CliRunner().invoke(app, ["gate", str(tmp_path / "float.onnx")])
+    assert done.exit_code == 2
+    assert "expected the INT8 network of float.onnx" in " ".join(done.output.split())
+    assert shipped_pair("convbeers-xs") == (SHIPPED / "convbeers-xs.safetensors", SHIPPED / "convbeers-xs-int8.onnx")
 
 
 def test_a_baseline_holds_the_mae(tmp_path: Path) -> None:

@@ -1,0 +1,93 @@
+"""How often the results inside an INT8 network come to the ends of 8 bits: what lies beyond is clipped, and lost.
+
+Looked at is whatever a node rounds to 8 bits, in any spelling (integer kernels or QDQ), as the graph is written. Two
+ends are no loss: the lower one where it stands for zero or where a ReLU reads it, for that is the ReLU, and those of
+the fine gain, which the coarse one is there for (`quant.passes.dual_gain`).
+"""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+import onnx
+from onnx import numpy_helper
+
+from quant.graph import CORRECTION
+from quant.onnx_file import any_size
+from quant.session import open_session
+
+ZERO_POINTS = {"QuantizeLinear": 2, "QLinearConv": 7, "QLinearAdd": 7, "QLinearMatMul": 7}
+"""The operators that round to 8 bits, and which input holds the zero point of their result."""
+
+RELUS = ("Relu", "Max")
+
+
+@dataclass(frozen=True)
+class Rounded:
+    """A tensor of 8 bits.
+
+    Attributes:
+        name: in the graph.
+        zero_point: its value for 0, which says its type too.
+        low_is_relu: whether what is clipped at the lower end would have become zero anyway.
+    """
+
+    name: str
+    zero_point: np.ndarray
+    low_is_relu: bool
+
+    def at_ends(self, values: np.ndarray) -> np.ndarray:
+        """Which of its values (N, C, H, W) lie at an end."""
+        range_ = np.iinfo(self.zero_point.dtype)
+        kept = values[:, 1:] if self.name == CORRECTION and values.shape[1] == 2 else values
+        low = (kept == range_.min) & (not self.low_is_relu and bool(self.zero_point.min() > range_.min))
+        return np.asarray((kept == range_.max) | low)
+
+
+def saturated_shares(model: onnx.ModelProto, images: Iterable[np.ndarray]) -> dict[str, float]:
+    """The share, in [0, 1], of each 8-bit tensor's values that lie at an end, over images (N, 1, H, W) in [0, 1].
+
+    Empty where no node rounds to 8 bits.
+
+    Raises:
+        ModelError: onnxruntime refuses the model.
+    """
+    looked_at = rounded_tensors(model)
+    if not looked_at:
+        return {}
+    session = open_session(_telling(any_size(model), looked_at), optimise=False)
+    ends, counts = np.zeros(len(looked_at)), np.zeros(len(looked_at))
+    for image in images:
+        results = session.run([tensor.name for tensor in looked_at], {session.get_inputs()[0].name: image})
+        flags = [tensor.at_ends(values) for tensor, values in zip(looked_at, results, strict=True)]
+        ends += [flag.sum() for flag in flags]
+        counts += [flag.size for flag in flags]
+    shares = ends / np.maximum(counts, 1)
+    return {tensor.name: float(share) for tensor, share in zip(looked_at, shares, strict=True)}
+
+
+def rounded_tensors(model: onnx.ModelProto) -> list[Rounded]:
+    """What the graph's nodes round to 8 bits, in the graph's order."""
+    constants = {tensor.name: tensor for tensor in model.graph.initializer}
+    relus = {name for node in model.graph.node if node.op_type in RELUS for name in node.input}
+    found = []
+    for node in model.graph.node:
+        place = ZERO_POINTS.get(node.op_type)
+        if place is None or node.input[0] in constants:
+            continue
+        stored = constants.get(node.input[place]) if len(node.input) > place else None
+        zero_point = np.array(0, np.uint8) if stored is None else numpy_helper.to_array(stored)
+        found.append(Rounded(node.output[0], zero_point, node.output[0] in relus))
+    return [tensor for tensor in found if tensor.zero_point.dtype in (np.int8, np.uint8)]
+
+
+def _telling(model: onnx.ModelProto, tensors: list[Rounded]) -> onnx.ModelProto:
+    """The model with these tensors as outputs beside its own."""
+    told = onnx.ModelProto()
+    told.CopyFrom(model)
+    outputs = {value.name for value in told.graph.output}
+    for tensor in tensors:
+        kind = onnx.helper.np_dtype_to_tensor_dtype(tensor.zero_point.dtype)
+        if tensor.name not in outputs:
+            told.graph.output.append(onnx.helper.make_tensor_value_info(tensor.name, kind, None))
+    return told
