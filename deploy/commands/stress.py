@@ -12,7 +12,12 @@ if TYPE_CHECKING:
 EXAMPLE = "stress float.onnx int8.onnx --out stability.md"
 
 
+HARD_CASES_ONLY = ("cases", "stages")
+BIT_FLIPS_ONLY = ("draws", "sensor", "images", "target")
+
+
 def stress(
+    context: typer.Context,
     float_model: Annotated[
         Path | None, typer.Argument(metavar="[FLOAT]", help="Float ONNX or weights; a shipped one if none.")
     ] = None,
@@ -59,10 +64,11 @@ def stress(
     from deploy.tables import print_rows
     from model.files import require_writable, write_text
 
+    _refuse(context, HARD_CASES_ONLY if bit_flips else BIT_FLIPS_ONLY, bit_flips)
     require_writable(out, json)
     if bit_flips:
         request = FlipRequest(sensor, images, target, draws, size, seed)
-        _flip_bits(open_subject(float_model, int8_model, variant), request, cases or stages, out, json)
+        _flip_bits(open_subject(float_model, int8_model, variant), request, out, json)
         return
     names = chosen(cases, [case.name for case in CASES], "--cases")
     wanted = chosen(stages, STAGES, "--stages")
@@ -91,10 +97,22 @@ def stress(
         raise typer.Exit(1)
 
 
-def _flip_bits(
-    subject: "Subject", request: "FlipRequest", beside: str | None, out: Path | None, json: Path | None
-) -> None:
-    """Strike, print, and write what was asked for; hard cases have no place beside it."""
+def _refuse(context: typer.Context, names: tuple[str, ...], bit_flips: bool) -> None:
+    """Options of the other work of this command: better said than ignored."""
+    from profiles.errors import OptionError
+
+    for name in names:
+        source = context.get_parameter_source(name)
+        if source is not None and source.name == "COMMANDLINE":
+            if bit_flips:
+                expected, got, remedy = "hard cases", "--bit-flips", "leave one of the two out"
+            else:
+                expected, got, remedy = "--bit-flips beside it", "hard cases", "add --bit-flips, or leave it out"
+            raise OptionError(f"--{name}", expected=expected, got=got, remedy=remedy)
+
+
+def _flip_bits(subject: "Subject", request: "FlipRequest", out: Path | None, json: Path | None) -> None:
+    """Strike, print, and write what was asked for."""
     from dataclasses import asdict
 
     from deploy.progress import steps
@@ -104,11 +122,7 @@ def _flip_bits(
     from deploy.stress.page import markdown, title
     from deploy.tables import print_rows
     from model.files import write_text
-    from profiles.errors import OptionError
 
-    if beside is not None:
-        expected, remedy = "no --cases or --stages beside it", "leave these out"
-        raise OptionError("--bit-flips", expected=expected, got=repr(beside), remedy=remedy)
     picture = _picture_beside(out, json)
     with steps("turning bits over", ticks(subject, request)) as bar:
         rows = flip_rows(subject, request, bar.advance)
