@@ -11,6 +11,9 @@ from deploy.results import Figure, Row
 from deploy.tables import missing, unit_of
 from model.files import write_text
 
+WIDE = 8
+"""Columns that fit on a page beside the names of the rows."""
+
 
 @dataclass(frozen=True)
 class Table:
@@ -55,24 +58,33 @@ def write_report(report: Report, path: Path) -> None:
 
 
 def _grid(table: Table) -> dict[str, object]:
-    """Header and cells of a table."""
+    """Header and lines of a table; figures stand below each other where beside each other they would not fit."""
     rows = list(table.rows)
-    keys = list(dict.fromkeys(key for row in rows for key in row.figures))
+    figures = list(dict.fromkeys(key for row in rows for key in row.figures))
     words = list(dict.fromkeys(key for row in rows for key in row.text))
+    columns = [_head(key, unit_of(key, rows)) for key in figures] + [_head(word, word=True) for word in words]
+    cells = [
+        [_cell(row.figures.get(key)) for key in figures] + [_word(row.text.get(word, "")) for word in words]
+        for row in rows
+    ]
+    heads = [_head(row.name) for row in rows]
+    if len(columns) > max(WIDE, len(rows)):
+        columns, heads, cells = heads, columns, [list(line) for line in zip(*cells, strict=True)]
     return {
         "title": table.title,
         "caption": table.caption,
-        "header": [(key, unit_of(key, rows)) for key in keys] + [(word, "") for word in words],
-        "rows": [
-            {
-                "name": row.name,
-                "cells": [_cell(row.figures.get(key)) for key in keys],
-                "words": [row.text.get(word, "") for word in words],
-            }
-            for row in rows
-        ],
+        "header": columns,
+        "lines": list(zip(heads, cells, strict=True)),
         "missing": missing(rows),
     }
+
+
+def _head(name: str, unit: str = "", word: bool = False) -> dict[str, str]:
+    return {"text": name, "unit": unit, "mode": "word" if word else ""}
+
+
+def _word(text: str) -> dict[str, str]:
+    return {"text": text, "mode": "word", "title": ""}
 
 
 def _cell(figure: Figure | None) -> dict[str, str]:

@@ -1,0 +1,68 @@
+"""A report's tables lose nothing, and turn when their figures would not fit beside each other."""
+
+from html.parser import HTMLParser
+
+import pytest
+
+from deploy.report.page import WIDE, Report, Table, render
+from deploy.results import Row, measured, unavailable
+
+
+class Cells(HTMLParser):
+    """The texts of a page's tables, line by line, cell by cell."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.lines: list[list[str]] = []
+        self.inside = False
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:  # noqa: ARG002 - HTMLParser's
+        if tag == "tr":
+            self.lines.append([])
+        self.inside = tag in ("td", "th") or (self.inside and tag == "small")
+        if tag in ("td", "th"):
+            self.lines[-1].append("")
+
+    def handle_endtag(self, tag: str) -> None:
+        self.inside = self.inside and tag not in ("td", "th")
+
+    def handle_data(self, data: str) -> None:
+        if self.inside:
+            self.lines[-1][-1] += f"{data} "
+
+
+def lines(rows: list[Row]) -> list[list[str]]:
+    reader = Cells()
+    reader.feed(render(Report("A page", "Its headline", [Table("A table", rows)], [], [])))
+    return [[cell.strip() for cell in line] for line in reader.lines]
+
+
+def rows_of(figures: int, count: int) -> list[Row]:
+    return [
+        Row("t", f"row <{k}>", {f"figure {n}": measured(100 * k + n, "s", "a watch") for n in range(figures)})
+        for k in range(count)
+    ]
+
+
+@pytest.mark.parametrize(("figures", "count"), [(1, 1), (WIDE, 2), (WIDE + 1, 2), (WIDE + 1, WIDE + 3)])
+def test_every_figure_stands_where_its_row_and_name_meet(figures: int, count: int) -> None:
+    rows = rows_of(figures, count)
+    (_, *columns), *body = lines(rows)
+    turned = columns == [row.name for row in rows]
+    assert turned == (figures > WIDE and figures > count)
+    for head, *cells in body:
+        for column, cell in zip(columns, cells, strict=True):
+            name, figure = (column, head) if turned else (head, column)
+            row = next(row for row in rows if row.name == name)
+            assert cell == f"{row.figures[figure.removesuffix(' s')]} measured"
+
+
+@pytest.mark.parametrize("figures", [2, WIDE + 2])
+def test_words_and_what_is_missing_are_told(figures: int) -> None:
+    row = Row(
+        "t", "one", {**rows_of(figures, 1)[0].figures, "power": unavailable("W", "no meter")}, {"note": "so & so"}
+    )
+    text = render(Report("A page", "Its headline", [Table("A table", [row], "How to read it")], [], []))
+    assert "so &amp; so" in text
+    assert "no meter" in text
+    assert "How to read it" in text
