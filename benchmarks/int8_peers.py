@@ -59,14 +59,16 @@ class Way:
 
 def ways(adaround_iterations: int) -> list[Way]:
     """All that are compared, the slowest last."""
-    peers = [
+    peers: list[tuple[str, Path, tuple[str, ...], tuple[str, ...]]] = [
         ("onnxruntime min-max", OURS, ("minmax",), ()),
         ("onnxruntime percentile 99.99", OURS, ("percentile",), ()),
         ("Quark XINT8", QUARK, (), ("0",)),
         ("Quark XINT8 + AdaRound", QUARK, (), (str(adaround_iterations),)),
     ]
     ours = [Way(f"beers-deploy {regime}", False, OURS, (regime,)) for regime in ("legal", "free")]
-    return ours + [Way(name, graph, *command) for name, *command in peers for graph in (False, True)]
+    return ours + [
+        Way(name, graph, script, before, after) for name, script, before, after in peers for graph in (False, True)
+    ]
 
 
 def restorer(path: Path) -> Restore:
@@ -77,7 +79,7 @@ def restorer(path: Path) -> Restore:
     def restore(image: np.ndarray) -> np.ndarray:
         fed = planes_of(image) if name == PLANES else image
         result = np.asarray(session.run(None, {name: fed})[0])
-        return np.clip(image + result if name == PLANES else result, 0, 1)
+        return np.asarray(np.clip(image + result if name == PLANES else result, 0, 1))
 
     return restore
 
@@ -104,8 +106,8 @@ def quantise(way: Way, files: dict[bool, tuple[Path, Path]], out: Path, python: 
     """
     command = [python, str(way.script), *way.before, *map(str, files[way.rewritten]), str(out), *way.after]
     paths = {**os.environ, "PYTHONPATH": str(HERE.parent)} if way.script == OURS else {**os.environ, "PYTHONPATH": ""}
-    kept = {"capture_output": True, "text": True, "env": paths, "cwd": out.parent}  # Quark drops files where it runs
-    done = subprocess.run(command, check=False, **kept)  # noqa: S603 - our own
+    at = out.parent  # Quark drops files where it runs
+    done = subprocess.run(command, check=False, capture_output=True, text=True, env=paths, cwd=at)  # noqa: S603 - our own
     if done.returncode:
         last = (done.stderr.strip() or "no message").splitlines()[-1]
         raise RuntimeError(f"exit {done.returncode}: {last}")

@@ -75,7 +75,8 @@ def speed(folder: Path, options: Options, size: tuple[int, int], repeats: int) -
     dn = write_noise(image, size)
     network = onnx.load(options.model)
     radius_px = receptive_radius_px(network)
-    plan = make_plan(Raster(1, *dn.shape, dn.dtype), TILE_PX, radius_px, radius_px)
+    height_px, width_px = dn.shape
+    plan = make_plan(Raster(1, height_px, width_px, dn.dtype), TILE_PX, radius_px, radius_px)
     tiles = [Tile(row, column) for row in plan.rows for column in plan.columns]
     windows = [np.ascontiguousarray(tile.read(dn), np.float32)[None, None] / np.float32(4095) for tile in tiles]
     infer, version = open_runtime(options.runtime, network, options.threads)

@@ -74,9 +74,9 @@ def overlapped(task: Task, way: str, chunks_at_once: int) -> Run:
         infer, _ = open_runtime(task.options.runtime, onnx.load(task.options.model), threads)
 
         def restored(block: np.ndarray) -> np.ndarray:
-            return np.rint(restore_window(block, infer)).astype(np.uint16)
+            return np.asarray(np.rint(restore_window(block, infer)), np.uint16)
 
-        image = da.from_array(tifffile.imread(task.image), chunks=core_px)
+        image = da.from_array(tifffile.imread(task.image), chunks=core_px)  # type: ignore[no-untyped-call]
         lazy = image.map_overlap(restored, depth=halo_px, boundary="none", meta=np.empty((0, 0), np.uint16))
         pixels = lazy.compute(scheduler="threads", num_workers=chunks_at_once)
         write(out, pixels)
