@@ -35,7 +35,8 @@ from model.shipped import shipped_weights
 from profiles import load_sensor
 from quant.calibration import REFERENCE, Pair, draw_patches
 from quant.float_file import float_model
-from quant.graph import CORRECTION, correction_graph
+from quant.float_reader import correction_graph
+from quant.graph import CORRECTION
 from quant.pieces import planes_of
 from quant.planes import PLANES, read_planes
 from quant.session import open_session

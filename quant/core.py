@@ -5,8 +5,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from profiles.errors import ModelError
 from quant.graph import Add, Conv, Graph
 from quant.positions import SHIFTS, Shifts, best_position, clamp, coarsest_position, quantise
+
+ROUNDS = 8
+"""An add may move a tensor that was written long before, whose writer must then follow; two rounds do, if any."""
 
 
 @dataclass(frozen=True)
@@ -58,20 +62,35 @@ def build_core(graph: Graph, positions: Mapping[str, int], shifts: Shifts = SHIF
         graph: a plane-reading graph.
         positions: the least-squares position of every activation.
         shifts: the windows of the target.
+
+    Raises:
+        ModelError: no positions are within reach: sizes of values that have nothing to do with each other.
     """
     legal = dict(positions)
+    for _ in range(ROUNDS):
+        core = _in_one_round(graph, legal, shifts)
+        faults = shift_faults(core, shifts)
+        if not faults:
+            return core
+    remedy = "look for weights that are far too large or small"
+    raise ModelError("float model", expected="values that the DPU's shifts reach", got=faults[0], remedy=remedy)
+
+
+def _in_one_round(graph: Graph, positions: dict[str, int], shifts: Shifts) -> IntCore:
+    """Every operation within reach of the positions before it, which it may move."""
     ops: list[IntConv | Add] = []
     for op in graph:
         if isinstance(op, Conv):
-            ops.append(_quantise_conv(op, legal, shifts))
+            ops.append(_quantise_conv(op, positions, shifts))
         else:
-            _move_add(op, legal, shifts)
+            _move_add(op, positions, shifts)
             ops.append(op)
-    return IntCore(tuple(ops), legal)
+    return IntCore(tuple(ops), dict(positions))
 
 
 def _quantise_conv(op: Conv, positions: dict[str, int], shifts: Shifts) -> IntConv:
-    weight_position = best_position(op.weight)
+    finest = shifts.cut[1] + positions[op.output] - positions[op.input]  # finer weights would make the result clip
+    weight_position = min(best_position(op.weight), finest)
     product = weight_position + positions[op.input]
     cut = clamp(product - positions[op.output], shifts.cut)
     positions[op.output] = product - cut

@@ -12,9 +12,10 @@ import numpy as np
 import onnx
 
 from quant.calibration import Patches
+from quant.float_reader import correction_graph
 from quant.free_file import Scale, free_model
 from quant.free_scales import tensor_scales
-from quant.graph import CORRECTION, Conv, Graph, correction_graph, tensors
+from quant.graph import CORRECTION, Conv, Graph, tensors
 from quant.moments import Moments, input_moments
 from quant.onnx_file import fixed_tile_px, metadata
 from quant.passes.dual_gain import two_gains

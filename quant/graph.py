@@ -1,17 +1,8 @@
-"""The float network as a short list of operations: what quantisation works on.
+"""The network as a short list of operations, convolutions and adds: what quantisation works on."""
 
-Only what ConvBEERS is made of is accepted (convolution, ReLU, add), and the graph must end with the global add. That
-add is left out here: the network keeps only the correction, and the host adds it to the 12-bit image.
-"""
-
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
-import onnx
-from onnx import numpy_helper
-
-from profiles.errors import ModelError
-from quant.untrusted import contradictions
 
 IMAGE, CORRECTION = "image", "correction"
 
@@ -51,34 +42,6 @@ Op = Conv | Add
 Graph = tuple[Op, ...]
 
 
-def correction_graph(model: onnx.ModelProto) -> Graph:
-    """The operations from `image` to `correction`, in order, the global add taken off.
-
-    Raises:
-        ModelError: an operation of another kind, or no global add at the end.
-    """
-    with contradictions("float model"):
-        return _correction_graph(model)
-
-
-def _correction_graph(model: onnx.ModelProto) -> Graph:
-    weights = {t.name: numpy_helper.to_array(t) for t in model.graph.initializer}
-    image, restored = model.graph.input[0].name, model.graph.output[0].name
-    ops: list[Op] = []
-    for node in model.graph.node:
-        if node.op_type == "Relu":
-            _fuse_relu(ops, node)
-        else:
-            ops.append(_read(node, weights))
-    last = ops.pop() if ops else None
-    if not (isinstance(last, Add) and last.output == restored and image in last.inputs):
-        raise _refuse("a global add of the image at the end", last.name if last else "no node")
-    correction = last.inputs[1 - last.inputs.index(image)]
-    if any(image in op.inputs for op in ops[1:]):
-        raise _refuse("an image that only the first convolution and the global add read", "another reader")
-    return tuple(_rename(op, {image: IMAGE, correction: CORRECTION}) for op in ops)
-
-
 def tensors(graph: Graph) -> list[str]:
     """The names of all results, in order."""
     return [op.output for op in graph]
@@ -87,43 +50,3 @@ def tensors(graph: Graph) -> list[str]:
 def relu_count(graph: Graph) -> int:
     """How many convolutions carry a ReLU: quantisers have been seen to drop them without a word."""
     return sum(isinstance(op, Conv) and op.relu for op in graph)
-
-
-def _read(node: onnx.NodeProto, weights: dict[str, np.ndarray]) -> Op:
-    name = node.name or node.output[0]
-    if node.op_type == "Add" and not any(i in weights for i in node.input):
-        return Add(name, (node.input[0], node.input[1]), node.output[0])
-    if node.op_type == "Conv" and node.input[1] in weights and _is_plain(node, weights[node.input[1]]):
-        weight = weights[node.input[1]].astype(np.float32)
-        bias = weights[node.input[2]] if len(node.input) > 2 else np.zeros(len(weight))
-        return Conv(name, node.input[0], node.output[0], weight, bias.astype(np.float32))
-    raise _refuse("only same-size convolutions of stride 1, ReLU and adds", f"{node.op_type} {name}")
-
-
-def _is_plain(node: onnx.NodeProto, weight: np.ndarray) -> bool:
-    given = {a.name: onnx.helper.get_attribute_value(a) for a in node.attribute}
-    kernel = weight.shape[2]
-    unit = all(set(given.get(key, [1])) == {1} for key in ("strides", "dilations")) and given.get("group", 1) == 1
-    same = list(given.get("pads", [0] * 4)) == [kernel // 2] * 4 and kernel % 2 == 1 and kernel == weight.shape[3]
-    return unit and same and given.get("auto_pad", b"NOTSET") == b"NOTSET"
-
-
-def _fuse_relu(ops: list[Op], node: onnx.NodeProto) -> None:
-    before = ops[-1] if ops else None
-    if not isinstance(before, Conv) or before.output != node.input[0]:
-        raise _refuse("each ReLU right behind a convolution", f"ReLU {node.name}")
-    ops[-1] = replace(before, output=node.output[0], relu=True)
-
-
-def _rename(op: Op, names: dict[str, str]) -> Op:
-    output = names.get(op.output, op.output)
-    if isinstance(op, Conv):
-        return replace(op, input=names.get(op.input, op.input), output=output)
-    left, right = (names.get(i, i) for i in op.inputs)
-    return replace(op, inputs=(left, right), output=output)
-
-
-def _refuse(expected: str, got: str) -> ModelError:
-    return ModelError(
-        "float model", expected=expected, got=got, remedy="export the network with 'beers-deploy export'"
-    )

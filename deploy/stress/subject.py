@@ -22,7 +22,8 @@ from deploy.swath.reader import ArraySource
 from deploy.swath.restorer import Restorer
 from profiles.errors import BeersError, ModelError
 from quant.core import IntCore
-from quant.graph import Graph, correction_graph
+from quant.float_reader import correction_graph
+from quant.graph import Graph
 from quant.host_reader import read_core
 from quant.onnx_file import any_size, load_onnx
 from quant.radius import receptive_radius_px

@@ -64,14 +64,15 @@ def fit(
 def descend(wanted: np.ndarray, nearest: np.ndarray, covariance: np.ndarray) -> np.ndarray:
     """Whole numbers (O, n) in [-128, 127] near the wanted ones, of less e^T C e than the nearest.
 
-    Coordinate descent: along one weight the least error lies at q_i - (C e)_i / C_ii, rounded.
+    Coordinate descent: along one weight the least error lies at q_i - (C e)_i / C_ii, rounded. A weight that meets
+    nothing but one value stays: the bias makes up for it.
     """
     whole = nearest.astype(np.float64)
     gradient = (whole - wanted) @ covariance
     variance = np.diag(covariance)
     for _ in range(SWEEPS):
         moved = False
-        for i in np.argsort(-variance):
+        for i in np.argsort(-variance)[: np.count_nonzero(variance)]:
             target = whole[:, i] - gradient[:, i] / variance[i]
             step = np.clip(np.rint(target), INT8_MIN, INT8_MAX) - whole[:, i]
             if step.any():

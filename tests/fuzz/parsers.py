@@ -43,7 +43,7 @@ from model.weights_file import load_network, save_network
 from profiles import load_sensor, load_target
 from profiles.errors import BeersError
 from profiles.scene_call import load_scene_call
-from quant.graph import correction_graph
+from quant.float_reader import correction_graph
 from quant.limits import read_limits
 from quant.onnx_file import fixed_tile_px, load_onnx
 from quant.radius import receptive_radius_px

@@ -14,7 +14,8 @@ from profiles import load_sensor
 from profiles.errors import ImageError
 from quant.calibration import Patches, choose_positions, draw_patches
 from quant.float_file import float_model
-from quant.graph import Graph, correction_graph, tensors
+from quant.float_reader import correction_graph
+from quant.graph import Graph, tensors
 from quant.pieces import PIECE_PX, crops, halo_of, planes_of, tensor_values
 from quant.planes import PLANES, read_planes
 from quant.session import open_session

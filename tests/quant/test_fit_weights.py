@@ -11,8 +11,9 @@ from numpy.testing import assert_allclose
 
 from quant.calibration import Patches
 from quant.core import IntConv, op_shifts
+from quant.float_reader import correction_graph
 from quant.gate import compare
-from quant.graph import Conv, Graph, correction_graph
+from quant.graph import Conv, Graph
 from quant.moments import Moments, input_moments
 from quant.passes.fit_weights import descend, fit_weights
 from quant.pieces import planes_of

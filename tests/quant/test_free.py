@@ -13,11 +13,12 @@ from model.simulator.procedural import procedural_scene
 from profiles import load_sensor
 from quant.calibration import Patches, draw_patches
 from quant.float_file import float_model
+from quant.float_reader import correction_graph
 from quant.free import free_ticks, quantise_free
 from quant.free_file import Scale, free_model
 from quant.free_scales import BINS, best_scale, round_weight, tensor_scales
 from quant.gate import compare
-from quant.graph import CORRECTION, Conv, Graph, correction_graph, relu_count, tensors
+from quant.graph import CORRECTION, Conv, Graph, relu_count, tensors
 from quant.integer import _convolve
 from quant.onnx_file import metadata, save_onnx
 from quant.passes.dual_gain import two_gains

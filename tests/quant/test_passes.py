@@ -9,8 +9,9 @@ import pytest
 from quant.calibration import Patches
 from quant.core import IntConv, op_shifts
 from quant.float_file import float_model
+from quant.float_reader import correction_graph
 from quant.gate import compare
-from quant.graph import CORRECTION, Add, Conv, Graph, correction_graph
+from quant.graph import CORRECTION, Add, Conv, Graph
 from quant.passes.dual_gain import FINE_MAX, GAIN, merge, two_gains
 from quant.passes.equalise import channel_ranges, equalise, first_guess, search, search_steps
 from quant.passes.steady_stream import STREAM_POSITION, common_position, steady, stream_tensors

@@ -8,8 +8,9 @@ from onnx import numpy_helper
 
 from quant.calibration import Patches
 from quant.core import IntConv, build_core, shift_faults
+from quant.float_reader import correction_graph
 from quant.gate import compare
-from quant.graph import CORRECTION, correction_graph
+from quant.graph import CORRECTION
 from quant.host_file import host_model
 from quant.limits import Limits, judge
 from quant.onnx_file import metadata, save_onnx

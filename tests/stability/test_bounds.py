@@ -16,7 +16,8 @@ from model.shipped import SHIPPED
 from profiles.errors import ModelError
 from quant.bounds import bound_anywhere, bound_inside, compose
 from quant.core import IntConv
-from quant.graph import CORRECTION, Graph, correction_graph
+from quant.float_reader import correction_graph
+from quant.graph import CORRECTION, Graph
 from quant.host_reader import read_core
 from quant.int_bounds import layer_bounds
 from quant.integer import INT32_BITS, correction, run_core

@@ -1,0 +1,135 @@
+"""Networks that cannot be quantised are refused in a sentence; odd ones that can be lose no more than others."""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import onnx
+import pytest
+from onnx import numpy_helper
+
+from profiles.errors import ModelError
+from quant.accepted import check_graph
+from quant.calibration import Patches
+from quant.core import build_core, shift_faults
+from quant.float_reader import correction_graph
+from quant.free import quantise_free
+from quant.gate import compare
+from quant.graph import IMAGE, Add, Conv, Graph
+from quant.planes import PLANES, read_planes
+from quant.quantise import quantise_model
+from quant.session import open_session
+
+
+@pytest.fixture
+def graph(float_onnx: onnx.ModelProto) -> Graph:
+    return correction_graph(float_onnx)
+
+
+def conv(graph: Graph, name: str) -> Conv:
+    found = next(op for op in graph if op.name == name)
+    assert isinstance(found, Conv)
+    return found
+
+
+def with_op(graph: Graph, changed: Conv | Add) -> Graph:
+    return tuple(changed if op.name == changed.name else op for op in graph)
+
+
+def three_channels(graph: Graph) -> Graph:
+    head = conv(graph, "head")
+    return with_op(graph, replace(head, weight=np.repeat(head.weight, 3, axis=1)))
+
+
+def no_tail(graph: Graph) -> Graph:
+    return (*graph[:-2], replace(graph[-2], output="correction"))
+
+
+def add_first(graph: Graph) -> Graph:
+    return (Add("twice", (IMAGE, IMAGE), "x"), replace(conv(graph, "head"), input="x"), *graph[1:])
+
+
+def nan_weight(graph: Graph) -> Graph:
+    head = conv(graph, "head")
+    return with_op(graph, replace(head, bias=np.full_like(head.bias, np.nan)))
+
+
+def a_wide_branch(graph: Graph) -> Graph:
+    branch = conv(graph, "body.0.second")
+    weight, bias = np.concatenate([branch.weight] * 2), np.concatenate([branch.bias] * 2)
+    return with_op(graph, replace(branch, weight=weight, bias=bias))
+
+
+def nobody_wrote(graph: Graph) -> Graph:
+    return with_op(graph, replace(conv(graph, "body.0.second"), input="before the relu"))
+
+
+def two_streams(graph: Graph) -> Graph:
+    """Another pair of adds, of one channel, behind the tail."""
+    tail = replace(conv(graph, "tail"), output="narrow")
+    last = Conv("last", "sum", "correction", np.ones((1, 1, 1, 1), np.float32), np.zeros(1, np.float32))
+    return (*graph[:-1], tail, Add("narrow.add", ("narrow", "narrow"), "sum"), last)
+
+
+@pytest.mark.parametrize(
+    ("spoil", "said"),
+    [
+        (lambda _: (), "no operation"),
+        (three_channels, r"head, a convolution of \(\d+, 3\)"),
+        (add_first, "twice, an add"),
+        (no_tail, "last convolution"),
+        (nan_weight, "NaN or infinity in head"),
+        (a_wide_branch, "two tensors of one width"),
+        (nobody_wrote, "before the relu"),
+        (two_streams, r"widths \[1, "),
+    ],
+)
+def test_what_cannot_be_quantised_is_refused(spoil: Callable[[Graph], Graph], said: str, graph: Graph) -> None:
+    check_graph(graph)
+    with pytest.raises(ModelError, match=said):
+        check_graph(spoil(graph))
+
+
+def spoilt(model: onnx.ModelProto, name: str, change: Callable[[np.ndarray], np.ndarray]) -> onnx.ModelProto:
+    """A copy with one weight or bias changed."""
+    copy = onnx.ModelProto()
+    copy.CopyFrom(model)
+    tensor = next(t for t in copy.graph.initializer if t.name == name)
+    tensor.CopyFrom(numpy_helper.from_array(change(numpy_helper.to_array(tensor).copy()).astype(np.float32), name))
+    return copy
+
+
+@pytest.mark.parametrize("regime", ["legal", "free"])
+def test_a_layer_that_never_fires_costs_nothing(
+    regime: str, float_onnx: onnx.ModelProto, patches: Patches, unseen: Patches
+) -> None:
+    """Weights that meet only zeros cannot be fitted to them; the bias behind them still counts."""
+    dead = spoilt(float_onnx, "body.0.first.bias", lambda bias: bias - 50)
+    dead = spoilt(dead, "body.0.second.bias", lambda bias: bias + 0.05)
+
+    def mae(model: onnx.ModelProto) -> float:
+        made = (
+            quantise_free(model, patches, {}, lambda: None)
+            if regime == "free"
+            else quantise_model(model, patches, {}, lambda: None).host
+        )
+        return compare(open_session(model), open_session(made), unseen.pairs).mae
+
+    assert mae(dead) < 1.5 * mae(float_onnx)
+
+
+@pytest.mark.parametrize("share", [1e-5, 1e-9, 0.0])
+def test_a_branch_of_tiny_values_stays_legal(share: float, float_onnx: onnx.ModelProto, patches: Patches) -> None:
+    """An add moves the branch to the stream's position long after its weights were given one of their own."""
+    tiny = spoilt(float_onnx, "body.0.second.weight", lambda weight: weight * share)
+    tiny = spoilt(tiny, "body.0.second.bias", lambda bias: bias * share)
+    assert shift_faults(quantise_model(tiny, patches, {}, lambda: None).core) == []
+
+
+def test_sizes_beyond_all_shifts_are_refused(graph: Graph) -> None:
+    planes = read_planes(graph)
+    branch = conv(planes, "body.0.second")
+    huge = with_op(planes, replace(branch, weight=branch.weight * np.float32(1e30)))
+    positions = {PLANES: 7, **{op.output: 8 for op in huge}}
+    with pytest.raises(ModelError, match="shifts reach"):
+        build_core(huge, positions)
