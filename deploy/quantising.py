@@ -10,7 +10,7 @@ import onnx
 from deploy.blame import blame_report
 from deploy.defaults import HELD_OUT_SEED, load_scenes
 from deploy.progress import steps
-from deploy.quant_report import LAYER_PATCHES, ablation_rows, ablations, layer_rows, rounding_row
+from deploy.quant_report import LAYER_PATCHES, ablation_rows, ablations, integer_rows
 from deploy.report.page import write_report
 from deploy.results import Row
 from deploy.tables import print_rows
@@ -117,7 +117,7 @@ def quantise_legal_file(
         save_onnx(result.board, wanted.board)
         say(f"wrote {wanted.board}: the same numbers in the board's spelling")
     images = calibration.drawn.degraded
-    layers, rounding = layer_rows(result.core, images), rounding_row(result.core, images)
+    layers, rounding = integer_rows(result.core, result.host, images)
     print_rows("integer layers", layers)
     print_rows("the rule for halves", [rounding])
     rows = [*layers, rounding, *(_ablated(model, calibration) if wanted.ablate else [])]

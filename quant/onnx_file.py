@@ -1,5 +1,6 @@
 """Read and write ONNX files without trusting them: one sentence for whatever is not a sound model."""
 
+from collections.abc import Mapping
 from pathlib import Path
 
 import onnx
@@ -86,6 +87,17 @@ def image_info(
     """An (N, channels, H, W) tensor: a fixed tile of one image, or any number and size."""
     shape: list[str | int | None] = [1, channels, tile_px, tile_px] if tile_px else ["N", channels, "H", "W"]
     return onnx.helper.make_tensor_value_info(name, kind, shape)
+
+
+def with_outputs(model: onnx.ModelProto, kinds: Mapping[str, int]) -> onnx.ModelProto:
+    """The model with these tensors, of these ONNX types, as outputs behind its own."""
+    told = onnx.ModelProto()
+    told.CopyFrom(model)
+    own = {value.name for value in told.graph.output}
+    told.graph.output.extend(
+        onnx.helper.make_tensor_value_info(name, kind, None) for name, kind in kinds.items() if name not in own
+    )
+    return told
 
 
 def fixed_tile_px(model: onnx.ModelProto) -> int | None:

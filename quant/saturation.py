@@ -13,7 +13,7 @@ import onnx
 from onnx import numpy_helper
 
 from quant.graph import CORRECTION
-from quant.onnx_file import any_size
+from quant.onnx_file import any_size, with_outputs
 from quant.session import open_session
 
 ZERO_POINTS = {"QuantizeLinear": 2, "QLinearConv": 7, "QLinearAdd": 7, "QLinearMatMul": 7}
@@ -55,7 +55,8 @@ def saturated_shares(model: onnx.ModelProto, images: Iterable[np.ndarray]) -> di
     looked_at = rounded_tensors(model)
     if not looked_at:
         return {}
-    session = open_session(_telling(any_size(model), looked_at), optimise=False)
+    kinds = {t.name: onnx.helper.np_dtype_to_tensor_dtype(t.zero_point.dtype) for t in looked_at}
+    session = open_session(with_outputs(any_size(model), kinds), optimise=False)
     ends, counts = np.zeros(len(looked_at)), np.zeros(len(looked_at))
     for image in images:
         results = session.run([tensor.name for tensor in looked_at], {session.get_inputs()[0].name: image})
@@ -79,15 +80,3 @@ def rounded_tensors(model: onnx.ModelProto) -> list[Rounded]:
         zero_point = np.array(0, np.uint8) if stored is None else numpy_helper.to_array(stored)
         found.append(Rounded(node.output[0], zero_point, node.output[0] in relus))
     return [tensor for tensor in found if tensor.zero_point.dtype in (np.int8, np.uint8)]
-
-
-def _telling(model: onnx.ModelProto, tensors: list[Rounded]) -> onnx.ModelProto:
-    """The model with these tensors as outputs beside its own."""
-    told = onnx.ModelProto()
-    told.CopyFrom(model)
-    outputs = {value.name for value in told.graph.output}
-    for tensor in tensors:
-        kind = onnx.helper.np_dtype_to_tensor_dtype(tensor.zero_point.dtype)
-        if tensor.name not in outputs:
-            told.graph.output.append(onnx.helper.make_tensor_value_info(tensor.name, kind, None))
-    return told

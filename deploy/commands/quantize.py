@@ -17,7 +17,7 @@ class Regime(StrEnum):
 
 
 def quantize(
-    model: Annotated[Path, typer.Argument(help="Float ONNX written by 'export'.")],
+    model: Annotated[Path, typer.Argument(help="Float ONNX or weights.")],
     out: Annotated[Path, typer.Option(help="INT8 ONNX for the host, runs on stock onnxruntime.")],
     target: Annotated[str, typer.Option(help="Whose rules to obey.")] = "vck190",
     sensor: Annotated[
@@ -45,6 +45,7 @@ def quantize(
 
     Prints each integer layer: bits of its accumulator, seen and proven, and the share of saturated results.
     """
+    from deploy.defaults import float_model
     from deploy.quantising import (
         Calibration,
         Wanted,
@@ -56,7 +57,6 @@ def quantize(
     from model.files import require_writable
     from profiles import load_target
     from profiles.errors import OptionError
-    from quant.onnx_file import load_onnx
 
     if regime is Regime.free and (board or ablate or report or without):
         remedy = "leave it out, or take --regime legal"
@@ -65,7 +65,7 @@ def quantize(
     passes = passes_without(without or [])
     page, figures = (report / "report.html", report / "report.json") if report else (None, None)
     require_writable(out, board, json, page, figures)
-    network, board_target = load_onnx(model), load_target(target)
+    network, board_target = float_model(model), load_target(target)
     calibration = Calibration(sensor, images, patches, patch, seed)
     if regime is Regime.free:
         rows = quantise_free_file(network, calibration, out, typer.echo)

@@ -79,8 +79,9 @@ CAPTIONS = {
     "stream of one position lose nothing but what saturates.",
     "worst patches": "The patches of the largest MAE, of those that calibration did not see.",
     "error sizes": "Share of the pixels that differ by more than so many DN.",
-    "integer layers": "Accumulators as seen and as proven for any input; results at int8's ends; sums whose rounding "
-    "depends on the rule for halves.",
+    "integer layers": "Accumulators as seen and as proven for any input, and what is left of 24 bits; results at "
+    "int8's ends; sums whose rounding depends on the rule for halves; the integer reference beside onnxruntime, with "
+    "onnxruntime's rule and with the DPU's.",
 }
 NOTES = (
     "SQNR is 10 log10 of the signal's energy over the error's; differences are of full scale, 0.001 is 4 DN.",
