@@ -1,9 +1,12 @@
 """The other precision of a network: float32 for an INT8 file of ours, INT8 for a float one."""
 
+from pathlib import Path
+
 import onnx
 
 from deploy.defaults import float_model
 from model.shipped import SHIPPED, shipped_names, shipped_weights
+from profiles.errors import ModelError
 from quant.onnx_file import load_onnx, metadata
 
 
@@ -22,3 +25,15 @@ def counterpart(model: onnx.ModelProto) -> onnx.ModelProto | None:
 def is_quantised(model: onnx.ModelProto) -> bool:
     """Whether any node computes on, makes or reads quantised numbers."""
     return any("QLinear" in n.op_type or n.op_type.endswith("quantizeLinear") for n in model.graph.node)
+
+
+def require_quantised(model: onnx.ModelProto, path: Path, wanted: bool) -> None:
+    """Refuse the float network in the place of the INT8 one, and the other way round.
+
+    Raises:
+        ModelError: it is the other kind.
+    """
+    if is_quantised(model) != wanted:
+        expected, got = ("an INT8 network", "a float one") if wanted else ("a float network", "an INT8 one")
+        remedy = "give the float model first, the INT8 model second"
+        raise ModelError(str(path), expected=expected, got=got, remedy=remedy)

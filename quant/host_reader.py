@@ -7,7 +7,8 @@ from onnx import numpy_helper
 from profiles.errors import ModelError
 from quant.core import IntConv, IntCore
 from quant.graph import CORRECTION, Add
-from quant.host_file import ZERO
+from quant.host_file import ZERO, host_model
+from quant.onnx_file import fixed_tile_px, metadata
 from quant.planes import PLANES
 
 
@@ -28,6 +29,27 @@ def read_core(model: onnx.ModelProto) -> IntCore:
     if not reader.ops or PLANES not in reader.positions or CORRECTION not in reader.positions:
         raise _refuse("no such core")
     return IntCore(tuple(reader.ops), reader.positions)
+
+
+def spelling_fault(model: onnx.ModelProto) -> str | None:
+    """Where a file of the legal regime is not what its whole numbers spell: the host's ends, ReLUs, a reader's scale.
+
+    None where nothing differs, and for files of others.
+    """
+    ours = metadata(model).get("precision") == "int8 legal"
+    try:
+        core = read_core(model)
+    except ModelError as error:
+        return error.got if ours else None
+    meant = host_model(core, {}, fixed_tile_px(model)).graph
+    for kind, found, wanted in (
+        ("constant", model.graph.initializer, meant.initializer),
+        ("node", model.graph.node, meant.node),
+    ):
+        differing = [a.name for a, b in zip(found, wanted, strict=False) if a != b]
+        if differing or len(found) != len(wanted):
+            return f"{kind} {differing[0]}" if differing else f"{len(found)} {kind}s instead of {len(wanted)}"
+    return None
 
 
 class _Reader:

@@ -36,12 +36,16 @@ class Rounded:
     zero_point: np.ndarray
     low_is_relu: bool
 
+    @property
+    def lowest(self) -> int:
+        """The smallest number that its 8 bits hold."""
+        return int(np.iinfo(self.zero_point.dtype).min)
+
     def at_ends(self, values: np.ndarray) -> np.ndarray:
         """Which of its values (N, C, H, W) lie at an end."""
-        range_ = np.iinfo(self.zero_point.dtype)
         kept = values[:, 1:] if self.name == CORRECTION and values.shape[1] == 2 else values
-        low = (kept == range_.min) & (not self.low_is_relu and bool(self.zero_point.min() > range_.min))
-        return np.asarray((kept == range_.max) | low)
+        low = (kept == self.lowest) & (not self.low_is_relu and bool(self.zero_point.min() > self.lowest))
+        return np.asarray((kept == self.lowest + 255) | low)
 
 
 def saturated_shares(model: onnx.ModelProto, images: Iterable[np.ndarray]) -> dict[str, float]:

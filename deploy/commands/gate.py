@@ -34,29 +34,33 @@ def gate(
     Also checked: what saturates inside, the DPU's rules, that no ReLU was lost, and that onnxruntime's optimisations
     change no bit.
     """
+    from deploy.counterpart import require_quantised
     from deploy.defaults import HELD_OUT_SEED, load_scenes
     from deploy.defaults import float_model as read_float
-    from deploy.gate import baseline_mae, files_or_shipped, structure_checks, write_summaries
+    from deploy.gate import files_or_shipped, structure_checks
+    from deploy.gate_baseline import baseline_mae
+    from deploy.gate_report import write_summaries
     from deploy.results import Document
     from deploy.tables import print_rows
     from deploy.verdict import gate_row, saturation_figure
     from model.files import require_writable
     from profiles import load_sensor
-    from profiles.errors import ModelError
     from quant.calibration import REFERENCE, draw_patches
     from quant.gate import compare
     from quant.limits import judge, judge_saturation, read_limits
-    from quant.onnx_file import load_onnx, metadata
+    from quant.onnx_file import load_onnx
     from quant.saturation import saturated_shares
     from quant.session import open_any_size
 
     require_writable(json, summary, junit)
-    limits, before = read_limits(config, max_mae), baseline_mae(baseline)
+    limits = read_limits(config, max_mae)
+    arguments = {"max_mae": limits.mae, "config": config, "baseline": baseline, "target": target, "sensor": sensor}
+    arguments |= {"patches": patches, "seed": seed, "images": images}
+    before = None if baseline is None else baseline_mae(baseline, arguments)
     float_path, int8_path = files_or_shipped(float_model, int8_model, variant)
     models = read_float(float_path), load_onnx(int8_path)
-    if metadata(models[0]).get("precision", "").startswith("int8"):
-        remedy = "give the float model first, the INT8 model second"
-        raise ModelError(str(float_path), expected="a float network", got="an INT8 one", remedy=remedy)
+    require_quantised(models[0], float_path, wanted=False)
+    require_quantised(models[1], int8_path, wanted=True)
     sessions = open_any_size(models[0]), open_any_size(models[1])
     degraded, reference = load_sensor(sensor), load_sensor(REFERENCE)
     held_out = seed + HELD_OUT_SEED
@@ -70,8 +74,6 @@ def gate(
     print_rows("float against INT8", [row])
     for check in checks:
         typer.echo(f"{'ok    ' if check.passed else 'FAILED'} {check.name}: {check.found} (allowed: {check.allowed})")
-    arguments = {"max_mae": limits.mae, "config": config, "baseline": baseline, "target": target, "sensor": sensor}
-    arguments |= {"patches": patches, "seed": seed, "images": images}
     Document("gate", arguments, (float_path, int8_path), (row,)).write(json)
     write_summaries(f"INT8 gate of {int8_path.name}", checks, summary, junit)
     passed = all(check.passed for check in checks)

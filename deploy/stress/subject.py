@@ -10,7 +10,7 @@ import numpy as np
 import onnx
 import onnxruntime as ort
 
-from deploy.counterpart import is_quantised
+from deploy.counterpart import require_quantised
 from deploy.defaults import float_model
 from deploy.restore import Infer
 from deploy.shipped import shipped_pair
@@ -20,7 +20,7 @@ from deploy.swath.plan import make_plan
 from deploy.swath.raster import Raster
 from deploy.swath.reader import ArraySource
 from deploy.swath.restorer import Restorer
-from profiles.errors import BeersError, ModelError
+from profiles.errors import BeersError
 from quant.core import IntCore
 from quant.float_reader import correction_graph
 from quant.graph import Graph
@@ -98,11 +98,8 @@ def open_subject(float_path: Path | None, int8_path: Path | None, variant: str) 
     float32 = Network(float_model(float_path))
     int8 = None if int8_path is None else Network(load_onnx(int8_path))
     for path, network, wanted in ((float_path, float32, False), (int8_path, int8, True)):
-        if network is not None and is_quantised(network.model) != wanted:
-            kinds = ("an INT8 network", "a float one") if wanted else ("a float network", "an INT8 one")
-            remedy = "give the float model first, the INT8 model second"
-            raise ModelError(str(path), expected=kinds[0], got=kinds[1], remedy=remedy)
-        if network is not None:
+        if path is not None and network is not None:
+            require_quantised(network.model, path, wanted)
             _ = network.radius_px  # refuses what cannot be tiled before anything runs
     paths = (float_path,) if int8_path is None else (float_path, int8_path)
     return Subject(float32, int8, paths)

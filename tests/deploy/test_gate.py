@@ -12,13 +12,17 @@ from typer.testing import CliRunner
 
 from deploy.cli import app
 from deploy.defaults import float_model
-from deploy.gate import baseline_mae, junit, markdown, structure_checks
+from deploy.gate import structure_checks
+from deploy.gate_baseline import baseline_mae
+from deploy.gate_report import junit, markdown
+from deploy.results import Document, Row, measured
 from deploy.shipped import default_int8, shipped_pair
 from model.shipped import SHIPPED
 from model.simulator.procedural import procedural_scene
 from profiles import load_sensor
 from profiles.errors import OptionError
 from quant.calibration import Patches, draw_patches
+from quant.free import quantise_free
 from quant.gate import compare
 from quant.limits import Check, Limits, judge, judge_saturation, read_limits
 from quant.onnx_file import save_onnx
@@ -173,12 +177,14 @@ def test_one_file_alone_is_no_pair(tmp_path: Path) -> None:
     assert shipped_pair("convbeers-xs") == (SHIPPED / "convbeers-xs.safetensors", SHIPPED / "convbeers-xs-int8.onnx")
 
 
+ASKED = {"sensor": "pleiades-degraded", "images": None, "patches": 2, "seed": 0}
+
+
 def test_a_baseline_holds_the_mae(tmp_path: Path) -> None:
     runner, first = CliRunner(), tmp_path / "first.json"
     done = runner.invoke(app, ["gate", "--patches", "2", "--json", str(first), "--junit", str(tmp_path / "j.xml")])
     assert done.exit_code == 0, done.output
-    before = baseline_mae(first)
-    assert before is not None
+    before = baseline_mae(first, ASKED)
     assert ET.parse(tmp_path / "j.xml").getroot().get("failures") == "0"  # noqa: S314
     first.write_text(first.read_text().replace(str(before), str(before / 2)))
     again = runner.invoke(
@@ -187,7 +193,102 @@ def test_a_baseline_holds_the_mae(tmp_path: Path) -> None:
     assert again.exit_code == 1
     assert "**failed**" in (tmp_path / "s.md").read_text()
     with pytest.raises(OptionError, match="no such file"):
-        baseline_mae(tmp_path / "none.json")
+        baseline_mae(tmp_path / "none.json", ASKED)
     (tmp_path / "other.json").write_text("{}")
     with pytest.raises(OptionError, match="another document"):
-        baseline_mae(tmp_path / "other.json")
+        baseline_mae(tmp_path / "other.json", ASKED)
+
+
+@pytest.mark.parametrize(
+    "other", [{"seed": 1}, {"patches": 3}, {"sensor": "pleiades-variable"}, {"images": Path("aerial")}]
+)
+def test_a_baseline_of_other_patches_is_refused(other: dict[str, object], tmp_path: Path) -> None:
+    row = Row("gate", "INT8 against float", {"MAE": measured(5e-4, "of full scale", "here")})
+    Document("gate", ASKED, (), (row,)).write(tmp_path / "before.json")
+    assert baseline_mae(tmp_path / "before.json", ASKED) == 5e-4
+    (name,) = other
+    with pytest.raises(OptionError, match=f"same patches \\({name}"):
+        baseline_mae(tmp_path / "before.json", {**ASKED, **other})
+
+
+def test_a_folder_of_images_may_lie_elsewhere(tmp_path: Path) -> None:
+    row = Row("gate", "INT8 against float", {"MAE": measured(5e-4, "of full scale", "here")})
+    Document("gate", {**ASKED, "images": "/here/aerial"}, (), (row,)).write(tmp_path / "before.json")
+    assert baseline_mae(tmp_path / "before.json", {**ASKED, "images": Path("there/aerial")}) == 5e-4
+
+
+SMALL = "convbeers-xs"
+
+
+@pytest.mark.parametrize("fault", ["twice the bias", "no bias"])
+def test_a_baseline_shows_a_wrong_bias_in_any_layer(fault: str, unseen: Patches) -> None:
+    """A bias off by one position, or lost, may hide below a limit on the MAE, not in a twentieth of what it was."""
+    weights, path = shipped_pair(SMALL)
+    session, sound = open_session(float_model(weights)), onnx.load(path)
+    before = compare(session, open_session(sound), unseen.pairs).mae
+    names = [node.input[8] for node in sound.graph.node if node.op_type == "QLinearConv"]
+    assert len(names) == 12
+    for name in names:
+        model = onnx.ModelProto()
+        model.CopyFrom(sound)
+        constant(model, name, lambda bias: bias * (2 if fault == "twice the bias" else 0))
+        checks = judge(compare(session, open_session(model), unseen.pairs), Limits(), before)
+        assert not all(check.passed for check in checks), name
+
+
+def raise_a_floor(model: onnx.ModelProto) -> None:
+    node(model, "body.1.first.relu").input[1] = own_constant(model, "floor", np.array(130, np.uint8))
+
+
+def change_the_host(name: str, value: float) -> Callable[[onnx.ModelProto], None]:
+    return lambda model: constant(model, name, lambda _: np.array(value))
+
+
+def read_at_another_scale(model: onnx.ModelProto) -> None:
+    reader = node(model, "body.1.second")
+    reader.input[1] = own_constant(model, "other_scale", np.array(2.0**-6, np.float32))
+
+
+@pytest.mark.parametrize(
+    ("spoil", "check"),
+    [
+        (raise_a_floor, "ReLUs kept"),
+        (raise_a_floor, "spelling"),
+        (read_at_another_scale, "spelling"),
+        (change_the_host("gain", 4), "spelling"),
+        (change_the_host("max_dn", 4096), "spelling"),
+        (change_the_host("fine_max", 0.25), "spelling"),
+    ],
+)
+def test_what_hardly_shows_in_pixels_is_seen_in_the_file(
+    spoil: Callable[[onnx.ModelProto], None],
+    check: str,
+    reference_model: onnx.ModelProto,
+    unseen: Patches,
+    tmp_path: Path,
+) -> None:
+    assert check in failed(reference_model, unseen, tmp_path, spoil)
+
+
+def test_a_free_file_is_judged_without_the_rules_of_a_dpu(
+    reference_model: onnx.ModelProto, unseen: Patches, tmp_path: Path
+) -> None:
+    path = tmp_path / "free.onnx"
+    save_onnx(quantise_free(reference_model, unseen, {}, lambda: None), path)
+    checks = structure_checks(reference_model, path, onnx.load(path), "host-cpu")
+    assert {check.name for check in checks if check.passed} == {
+        "ReLUs kept",
+        "spelling",
+        "optimised equals unoptimised",
+    }
+    (rules,) = {c.name for c in structure_checks(reference_model, path, onnx.load(path), "vck190") if not c.passed}
+    assert rules == "legal on the DPU"
+
+
+def test_two_networks_of_one_kind_are_refused(reference_model: onnx.ModelProto, tmp_path: Path) -> None:
+    path = tmp_path / "float.onnx"
+    save_onnx(reference_model, path)
+    for pair, expected in (([path, path], "an INT8"), ([default_int8()] * 2, "a float")):
+        done = CliRunner().invoke(app, ["gate", *map(str, pair)])
+        assert done.exit_code == 2
+        assert f"expected {expected} network" in " ".join(done.output.split())

@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 from deploy.cli import app
 from deploy.dataset import _read_summary
 from deploy.dpu.board import load_dpu
-from deploy.gate import baseline_mae
+from deploy.gate_baseline import PATCHES, baseline_mae
 from deploy.refit import refit
 from deploy.results import Document, Row, measured
 from deploy.swath.spool import Spool, part_folder
@@ -36,7 +36,8 @@ runner = CliRunner()
 
 def document(path: Path, value: object, name: str = "int8") -> Path:
     """Results with one figure of any value."""
-    made = Document("gate", {}, (), (Row("gate", name, {"MAE": measured(1.0, "", "here")}),)).to_json()
+    asked = dict.fromkeys(PATCHES)
+    made = Document("gate", asked, (), (Row("gate", name, {"MAE": measured(1.0, "", "here")}),)).to_json()
     path.write_text(json.dumps(made).replace('"value": 1.0', f'"value": {value}'))
     return path
 
@@ -45,7 +46,7 @@ def document(path: Path, value: object, name: str = "int8") -> Path:
 def test_figures_that_are_no_numbers_are_refused(value: str, tmp_path: Path) -> None:
     path = document(tmp_path / "a.json", value)
     with pytest.raises(OptionError, match=r"a\.json"):
-        baseline_mae(path)
+        baseline_mae(path, dict.fromkeys(PATCHES))
     result = runner.invoke(app, ["compare", str(document(tmp_path / "b.json", 2.0)), str(path)])
     assert result.exit_code == 2, result.output
     assert result.stderr.strip().count("\n") == 0

@@ -23,7 +23,7 @@ from deploy.dpu.placement import place
 from deploy.dpu.rates import Layers
 from deploy.dpu.reading import read_network
 from deploy.dpu.work import count_work
-from deploy.gate import baseline_mae
+from deploy.gate_baseline import PATCHES, baseline_mae
 from deploy.refit import refit
 from deploy.results import Document, Figure, Row, measured, predicted, unavailable
 from deploy.swath.reader import open_source
@@ -167,12 +167,15 @@ def read_rows(path: Path) -> None:
                 raster.missing(source.read(top, min(top + 9, raster.height_px)))
 
 
+GATED = dict.fromkeys(PATCHES, 1)
+
+
 def document_seeds(_: Path) -> list[bytes]:
     """Results as `--json` writes them, of the gate among them."""
     figures = {"MAE": measured(7e-4, "of full scale", "here"), "none": unavailable("W", "no counter")}
     figures["time"] = predicted(3.0, "s", (2.0, 4.0), "cost model")
     rows = (Row("gate", "int8", figures, {"word": "text"}), Row("gate", "other", figures))
-    return [json.dumps(Document("gate", {"seed": 1}, (), rows).to_json()).encode()]
+    return [json.dumps(Document("gate", GATED, (), rows).to_json()).encode()]
 
 
 def read_results(path: Path) -> None:
@@ -305,7 +308,7 @@ PARSERS: tuple[Parser, ...] = (
     Parser("target TOML", ".toml", lambda _: _files("targets"), board_of, share=0.3),
     Parser("gate limits TOML", ".toml", lambda _: LIMITS, lambda p: read_limits(p, None)),
     Parser("results JSON", ".json", document_seeds, read_results, of_json),
-    Parser("gate baseline JSON", ".json", document_seeds, baseline_mae, of_json),
+    Parser("gate baseline JSON", ".json", document_seeds, lambda p: baseline_mae(p, GATED), of_json),
     Parser("board's runs JSON", ".json", runs_seeds, lambda p: refit(p, load_dpu()), of_json, 0.3),
     Parser("kept measurements", ".json", cache_seeds, find_kept, of_json),
     Parser("journal of a run", ".json", journal_seeds, resume, of_json, 0.5),
