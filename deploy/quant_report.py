@@ -14,6 +14,7 @@ from quant.calibration import Patches
 from quant.core import IntCore
 from quant.gate import compare
 from quant.pieces import crops
+from quant.positions import SHIFTS, Shifts
 from quant.quantise import ALL, Passes, quantise_model
 from quant.session import open_any_size
 
@@ -66,12 +67,12 @@ def few_crops(images: Iterable[np.ndarray]) -> list[np.ndarray]:
 
 
 def ablation_rows(
-    model: onnx.ModelProto, calibration: Patches, held_out: Patches, tick: Callable[[], None]
+    model: onnx.ModelProto, calibration: Patches, held_out: Patches, tick: Callable[[], None], shifts: Shifts = SHIFTS
 ) -> list[Row]:
     """The gate's figures with all passes, with each one left out, and with none."""
     session, rows = open_any_size(model), []
     for name, passes in ablations().items():
-        made = quantise_model(model, calibration, {}, lambda: None, passes)
+        made = quantise_model(model, calibration, {}, lambda: None, passes, shifts)
         row = gate_row(compare(session, open_any_size(made.host), held_out.pairs))
         rows.append(Row("ablation", name, row.figures))
         tick()

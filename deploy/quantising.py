@@ -19,10 +19,12 @@ from model.simulator.scene import Scene
 from profiles import load_sensor
 from profiles.errors import OptionError
 from profiles.sensor import SensorProfile
+from profiles.target import TargetProfile
 from quant.calibration import REFERENCE, Patches, draw_patches
 from quant.free import free_ticks, quantise_free
 from quant.gate import compare
 from quant.onnx_file import save_onnx
+from quant.positions import Shifts, target_shifts
 from quant.quantise import ALL, Passes, Quantised, quantise_model, ticks
 from quant.session import open_any_size
 
@@ -105,12 +107,23 @@ def quantise_free_file(model: onnx.ModelProto, calibration: Calibration, out: Pa
 
 
 def quantise_legal_file(
-    model: onnx.ModelProto, calibration: Calibration, target: str, passes: Passes, out: Path, wanted: Wanted, say: Say
+    model: onnx.ModelProto,
+    calibration: Calibration,
+    target: TargetProfile,
+    passes: Passes,
+    out: Path,
+    wanted: Wanted,
+    say: Say,
 ) -> list[Row]:
-    """Write the INT8 file under the target's rules and whatever else is wanted; print each integer layer."""
+    """Write the INT8 file under the target's rules and whatever else is wanted; print each integer layer.
+
+    Raises:
+        OptionError: a target without a DPU.
+    """
+    shifts = _shifts_of(target)
     with steps("calibrating", ticks(model, calibration.patches, passes)) as bar:
-        about = {**calibration.about, "target": target}
-        result = quantise_model(model, calibration.drawn, about, bar.advance, passes)
+        about = {**calibration.about, "target": target.name}
+        result = quantise_model(model, calibration.drawn, about, bar.advance, passes, shifts)
     save_onnx(result.host, out)
     say(f"wrote {out}: {len(result.core.ops)} integer operations, {result.relus} ReLUs kept")
     if wanted.board is not None:
@@ -120,13 +133,20 @@ def quantise_legal_file(
     layers, rounding = integer_rows(result.core, result.host, images)
     print_rows("integer layers", layers)
     print_rows("the rule for halves", [rounding])
-    rows = [*layers, rounding, *(_ablated(model, calibration) if wanted.ablate else [])]
+    rows = [*layers, rounding, *(_ablated(model, calibration, shifts) if wanted.ablate else [])]
     return _blamed(model, result, calibration, rows, wanted.page, say) if wanted.page else rows
 
 
-def _ablated(model: onnx.ModelProto, calibration: Calibration) -> list[Row]:
+def _shifts_of(target: TargetProfile) -> Shifts:
+    if not target.configurations:
+        expected, remedy = "a target with a DPU, such as vck190", "choose another, or take --regime free"
+        raise OptionError("--target", expected=expected, got=repr(target.name), remedy=remedy)
+    return target_shifts(target)
+
+
+def _ablated(model: onnx.ModelProto, calibration: Calibration, shifts: Shifts) -> list[Row]:
     with steps("ablating", len(ablations())) as bar:
-        rows = ablation_rows(model, calibration.drawn, calibration.unseen, bar.advance)
+        rows = ablation_rows(model, calibration.drawn, calibration.unseen, bar.advance, shifts)
     print_rows("what each pass buys, on patches that calibration did not see", rows)
     return rows
 

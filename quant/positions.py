@@ -8,6 +8,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from profiles.target import TargetProfile
+
 INT8_MIN, INT8_MAX = -128, 127
 CANDIDATES = 6
 """Positions tried: the one that clips nothing, and the finer ones after it."""
@@ -53,6 +55,21 @@ class Shifts:
 
 
 SHIFTS = Shifts()
+
+
+def target_shifts(target: TargetProfile) -> Shifts:
+    """The windows that a target's profile states.
+
+    Raises:
+        ProfileError: it states none: it has no DPU.
+    """
+
+    def window(key: str) -> tuple[int, int]:
+        constant = target.constant("numbers", key)
+        return int(constant.low), int(constant.high)
+
+    bias = 0, int(target.value("numbers", "shift_bias_max"))
+    return Shifts(window("shift_cut"), bias, window("shift_read"), window("shift_write"))
 
 
 def clamp(value: int, window: tuple[int, int]) -> int:

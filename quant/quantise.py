@@ -22,6 +22,7 @@ from quant.passes.half_steps import half_steps
 from quant.passes.steady_stream import STREAM_POSITION, common_position, steady, stream_tensors
 from quant.pieces import crops, tensor_values
 from quant.planes import coarse_plane_only, read_planes
+from quant.positions import SHIFTS, Shifts
 from quant.session import open_session, run
 
 SEARCH_CROPS = 16
@@ -61,10 +62,12 @@ def quantise_model(
     about: dict[str, str],
     tick: Callable[[], None],
     passes: Passes = ALL,
+    shifts: Shifts = SHIFTS,
 ) -> Quantised:
     """Quantise a float ConvBEERS under the DPU's rules: int8, symmetric, per tensor, power-of-two positions.
 
     The global add stays on the host, in 12 bits: only the correction is computed in int8. The rest is `passes`.
+    `shifts` are the windows of the target.
 
     Raises:
         ModelError: not a graph of convolutions, ReLUs and adds that ends with the global add, or with weights of no
@@ -75,11 +78,11 @@ def quantise_model(
     if passes.equalise and stream_tensors(graph):
         ranges = channel_ranges(graph, patches.degraded, tick)
         targets = search_targets(read_planes(correction_graph(model)), patches.degraded)
-        factors = search(graph, ranges, lambda tried: _error(_core(tried, positions, passes), targets), tick)
+        factors = search(graph, ranges, lambda tried: _error(_core(tried, positions, passes, shifts), targets), tick)
         graph = equalise(graph, factors)
-    final, core = _final(graph, positions, passes), _core(graph, positions, passes)
+    final, core = _final(graph, positions, passes), _core(graph, positions, passes, shifts)
     if passes.fit_weights:
-        core = fit_weights(final, core, input_moments(final, patches.degraded, tick))
+        core = fit_weights(final, core, input_moments(final, patches.degraded, tick), shifts)
     about = {**metadata(model), "precision": "int8 legal", "calibration_sha256": patches.digest, **about}
     about["passes"] = ", ".join(name for name, on in asdict(passes).items() if on)
     tile_px = fixed_tile_px(model)
@@ -104,7 +107,7 @@ def _reads_planes(model: onnx.ModelProto, passes: Passes) -> Graph:
     return graph if passes.fine_planes else coarse_plane_only(graph)
 
 
-def _core(graph: Graph, positions: dict[str, int], passes: Passes) -> IntCore:
+def _core(graph: Graph, positions: dict[str, int], passes: Passes, shifts: Shifts) -> IntCore:
     """The integer core of a graph whose tensors have these least-squares positions, the passes applied."""
     chosen, final = dict(positions), _final(graph, positions, passes)
     if passes.steady_stream or passes.equalise:
@@ -112,7 +115,7 @@ def _core(graph: Graph, positions: dict[str, int], passes: Passes) -> IntCore:
     if passes.dual_gain:
         chosen[CORRECTION] += 1
     assert set(tensors(final)) <= set(chosen)  # noqa: S101
-    return build_core(final, chosen)
+    return build_core(final, chosen, shifts)
 
 
 def _final(graph: Graph, positions: dict[str, int], passes: Passes) -> Graph:

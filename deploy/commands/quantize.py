@@ -71,7 +71,7 @@ def quantize(
         rows = quantise_free_file(network, calibration, out, typer.echo)
     else:
         wanted = Wanted(board, ablate, page)
-        rows = quantise_legal_file(network, calibration, board_target.name, passes, out, wanted, typer.echo)
+        rows = quantise_legal_file(network, calibration, board_target, passes, out, wanted, typer.echo)
     arguments = {"target": target, "sensor": sensor, "images": images, "patches": patches, "patch": patch}
     arguments |= {"regime": regime.value, "without": ", ".join(without or []), "seed": seed}
     document = Document("quantize", arguments, (model, out), tuple(rows))

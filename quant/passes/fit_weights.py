@@ -15,23 +15,24 @@ import numpy as np
 from quant.core import IntConv, IntCore, quantise_bias
 from quant.graph import Conv, Graph
 from quant.moments import Moments
-from quant.positions import INT8_MAX, INT8_MIN
+from quant.positions import INT8_MAX, INT8_MIN, SHIFTS, Shifts
 
 SWEEPS = 20
 """At most; a sweep that changes nothing ends it, after some five."""
 
 
-def fit_weights(graph: Graph, core: IntCore, moments: Mapping[str, Moments]) -> IntCore:
+def fit_weights(graph: Graph, core: IntCore, moments: Mapping[str, Moments], shifts: Shifts = SHIFTS) -> IntCore:
     """The core with weights and biases rounded for what each convolution reads; positions stay.
 
     Args:
         graph: the float operations that the core was built from.
         core: with weights rounded to nearest.
         moments: of each convolution's input, by its name.
+        shifts: the windows of the target.
     """
     pairs = zip(graph, core.ops, strict=True)
     ops = [
-        _fit(op, whole, core.positions[whole.input], moments[op.name])
+        _fit(op, whole, core.positions[whole.input], moments[op.name], shifts)
         if isinstance(op, Conv) and isinstance(whole, IntConv)
         else whole
         for op, whole in pairs
@@ -39,9 +40,9 @@ def fit_weights(graph: Graph, core: IntCore, moments: Mapping[str, Moments]) -> 
     return replace(core, ops=tuple(ops))
 
 
-def _fit(op: Conv, whole: IntConv, input_position: int, moments: Moments) -> IntConv:
+def _fit(op: Conv, whole: IntConv, input_position: int, moments: Moments, shifts: Shifts) -> IntConv:
     weight, shifted = fit(op.weight, whole.weight, np.array([2.0**-whole.weight_position]), moments)
-    bias, bias_position = quantise_bias(op.bias - shifted, whole.weight_position + input_position)
+    bias, bias_position = quantise_bias(op.bias - shifted, whole.weight_position + input_position, shifts)
     return replace(whole, weight=weight, bias=bias, bias_position=bias_position)
 
 

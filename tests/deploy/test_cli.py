@@ -144,6 +144,13 @@ def test_garbage_models_are_refused(tmp_path: Path) -> None:
         fails(["quantize", str(path), "--out", str(tmp_path / "x.onnx")], name)
 
 
+def test_rules_need_a_board_that_has_them(tmp_path: Path) -> None:
+    paths = [str(tmp_path / name) for name in ("float.onnx", "int8.onnx")]
+    assert runner.invoke(app, ["export", "--variant", "convbeers-xs", "--out", paths[0]]).exit_code == 0
+    fails(["quantize", paths[0], "--target", "host-cpu", "--out", paths[1]], "--target", "--regime free")
+    assert not Path(paths[1]).exists()
+
+
 def test_the_gate_passes_the_shipped_network_and_stops_a_broken_one(tmp_path: Path) -> None:
     figures = tmp_path / "gate.json"
     sound = runner.invoke(app, ["gate", "--patches", "4", "--json", str(figures)])

@@ -3,7 +3,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from quant.positions import best_position, coarsest_position, quantise
+from profiles import load_target
+from profiles.errors import ProfileError
+from quant.positions import SHIFTS, best_position, coarsest_position, quantise, target_shifts
 
 
 @given(st.floats(1e-6, 1e6))
@@ -38,3 +40,10 @@ def test_constants_round_half_away_from_zero_and_saturate(value: float, expected
 
 def test_zeros_have_a_position() -> None:
     assert best_position(np.zeros(3)) == 0
+
+
+def test_the_windows_are_those_of_the_target() -> None:
+    """What is built in, for tests and callers without a board, is what the shipped profile states."""
+    assert target_shifts(load_target("vck190")) == SHIFTS
+    with pytest.raises(ProfileError, match="shift_"):
+        target_shifts(load_target("host-cpu"))
