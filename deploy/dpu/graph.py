@@ -5,6 +5,8 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Literal
 
+import numpy as np
+
 from profiles.errors import ModelError
 
 Kind = Literal[
@@ -86,6 +88,8 @@ class Operation:
     follows: Kind | None = None  # what computes the first input
     integer: bool = False
     scales: Mapping[str, Scale] = field(default_factory=dict)  # of "input 0", ..., "weight", "bias", "output"
+    disputed: Mapping[str, tuple[Scale, ...]] = field(default_factory=dict)  # where the file gives several
+    constants: Mapping[str, np.ndarray | None] = field(default_factory=dict, compare=False)  # None: computed
 
     @property
     def output(self) -> str:

@@ -11,9 +11,11 @@ A tensor holds one of four things:
 from collections.abc import Mapping
 from typing import Literal
 
+import numpy as np
 import onnx
 from onnx import TensorProto, numpy_helper
 
+from deploy.dpu.formats import FORMATS, stated
 from deploy.dpu.graph import Scale
 
 Content = Literal["float", "int8", "seen", "wide"]
@@ -30,17 +32,8 @@ OPERANDS = {
     "QLinearConcat": slice(2, None, 3),
 }
 """Which inputs are tensors of the network; the rest are scales and zero points."""
-FORMATS: dict[str, dict[int, tuple[int, int]]] = {
-    "QLinearConv": {0: (1, 2), 3: (4, 5), -1: (6, 7)},
-    "QLinearAdd": {0: (1, 2), 3: (4, 5), -1: (6, 7)},
-    "QLinearMul": {0: (1, 2), 3: (4, 5), -1: (6, 7)},
-    "QLinearAveragePool": {0: (1, 2), -1: (3, 4)},
-    "QLinearGlobalAveragePool": {0: (1, 2), -1: (3, 4)},
-    "QLinearLeakyRelu": {0: (1, 2), -1: (3, 4)},
-    "QuantizeLinear": {-1: (1, 2)},
-    "DequantizeLinear": {0: (1, 2)},
-}
-"""Where an operator names the scale and zero point of input i, or (-1) of its result."""
+ELEMENTWISE = {"Add", "Mul", "Concat", "QLinearAdd", "QLinearMul", "QLinearConcat"}
+"""Operators whose constant operands are numbers of the network."""
 
 
 class Integers:
@@ -57,7 +50,7 @@ class Integers:
                 self._readers.setdefault(name, []).append(node)
         self._same: dict[str, str] = {}
         self._seen: dict[str, str] = {}
-        self._formats: dict[str, Scale] = {}
+        self._formats: dict[str, tuple[Scale, ...]] = {}  # the writer's first, then whatever contradicts it
         self._content: dict[str, Content] = {
             i.name: "int8" if i.type.tensor_type.elem_type in BYTES else "float" for i in model.graph.input
         }
@@ -93,17 +86,46 @@ class Integers:
         return tuple(name for name in resolved if name not in self._constants)
 
     def scales(self, node: onnx.NodeProto) -> dict[str, Scale]:
-        """The formats of a node's tensors by role: "input 0", "input 1", ..., "weight", "bias", "output"."""
+        """The formats of a node's tensors by role: "input 0", ..., "weight", "bias", "constant 1", "output"."""
+        own = dict(stated(node, self._constants))
+        numbers = self._numbers(node)
+        found = {role: formats[0] for role, name in self._tensors(node).items() if (formats := self._named(name))}
+        found |= {role: own[name] for role, name in numbers.items() if name in own}
+        return found | {role: self._formats[name][0] for role, name in numbers.items() if name in self._formats}
+
+    def disputed(self, node: onnx.NodeProto) -> dict[str, tuple[Scale, ...]]:
+        """The formats of a node's activations to which the file gives more than one, by role as in `scales`."""
+        found = {role: self._named(name) for role, name in self._tensors(node).items()}
+        return {role: formats for role, formats in found.items() if len(formats) > 1}
+
+    def constants(self, node: onnx.NodeProto) -> dict[str, np.ndarray | None]:
+        """The constants of a node as stored, by role as in `scales`; None for one that other nodes compute."""
+        found = {role: self._constants.get(self.resolve(name)) for role, name in self._numbers(node).items()}
+        return {role: None if t is None else numpy_helper.to_array(t) for role, t in found.items()}
+
+    def _tensors(self, node: onnx.NodeProto) -> dict[str, str]:
+        """The activations that an integer node reads and writes, by role."""
         if not self.is_integer(node):
             return {}
-        roles = {f"input {i}": name for i, name in enumerate(self.activations(node))}
+        inputs = {f"input {i}": name for i, name in enumerate(self.activations(node))}
+        return inputs | {"output": self._requantised(node.output[0])}
+
+    def _numbers(self, node: onnx.NodeProto) -> dict[str, str]:
+        """What an integer node computes with besides activations, by role."""
+        names: dict[str, str] = {}
+        if not self.is_integer(node):
+            return names
         if node.op_type in ("Conv", "ConvTranspose"):
-            roles |= dict(zip(("weight", "bias"), node.input[1:], strict=False))
+            names = dict(zip(("weight", "bias"), node.input[1:], strict=False))
         elif node.op_type == "QLinearConv":
-            roles["weight"] = node.input[3]
-        roles["output"] = self._requantised(node.output[0])
-        found = {role: self._formats.get(self.resolve(name)) for role, name in roles.items()}
-        return {role: scale for role, scale in found.items() if scale is not None}
+            names = dict(zip(("weight", "bias"), (node.input[3], *node.input[8:]), strict=False))
+        elif node.op_type in ELEMENTWISE:
+            operands = enumerate(node.input[OPERANDS.get(node.op_type, slice(None))])
+            names = {f"constant {i}": name for i, name in operands if self.resolve(name) in self._constants}
+        return {role: name for role, name in names.items() if name}
+
+    def _named(self, tensor: str) -> tuple[Scale, ...]:
+        return self._formats.get(self.resolve(tensor), ())
 
     def _follow(self, node: onnx.NodeProto) -> None:
         """Work out what a node's results hold, from what its inputs hold."""
@@ -116,9 +138,9 @@ class Integers:
             aliases[node.output[0]] = node.input[0]
         elif node.op_type == "QuantizeLinear" and self._content.get(node.input[0]) == "wide":
             self._same[node.output[0]] = node.input[0]
-            self._formats[node.input[0]] = self._formats[node.output[0]]
+            self._give(node.input[0], self._formats[node.output[0]][0])
         elif content == "int8" and node.output[0] not in self._formats and node.input[0] in self._formats:
-            self._formats[node.output[0]] = self._formats[node.input[0]]
+            self._give(node.output[0], self._formats[node.input[0]][0])
 
     def _result(self, node: onnx.NodeProto) -> Content:
         if node.op_type == "DequantizeLinear":
@@ -149,18 +171,14 @@ class Integers:
         return ""
 
     def _read_formats(self, node: onnx.NodeProto) -> None:
-        for place, (scale, zero_point) in FORMATS.get(node.op_type, {}).items():
-            tensor = node.output[0] if place == -1 else node.input[place]
-            zero = node.input[zero_point] if len(node.input) > zero_point else ""
-            self._formats[self.resolve(tensor)] = self._scale(node.input[scale], zero)
-        if node.op_type == "QLinearConcat":
-            for tensor, at in [(node.output[0], 0), *((node.input[i], i + 1) for i in range(2, len(node.input), 3))]:
-                self._formats[self.resolve(tensor)] = self._scale(node.input[at], node.input[at + 1])
+        """A constant's format is its reader's own: two nodes may read the same bytes at two scales."""
+        for name, scale in stated(node, self._constants):
+            if name not in self._constants:
+                self._give(self.resolve(name), scale)
+            elif node.op_type == "DequantizeLinear":
+                self._give(node.output[0], scale)
 
-    def _scale(self, scale: str, zero: str) -> Scale:
-        values, zeros = self._constants.get(scale), self._constants.get(zero)
-        scales = tuple(map(float, numpy_helper.to_array(values).ravel())) if values is not None else ()
-        if zeros is None:
-            return Scale(scales, (0,), "uint8")  # ONNX's default where no zero point is given
-        array = numpy_helper.to_array(zeros)
-        return Scale(scales, tuple(map(int, array.ravel())), str(array.dtype))
+    def _give(self, tensor: str, scale: Scale) -> None:
+        known = self._formats.get(tensor, ())
+        if scale not in known:
+            self._formats[tensor] = (*known, scale)

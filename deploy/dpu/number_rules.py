@@ -7,7 +7,7 @@ A position p stands for the scale 2^-p; shifts are differences of positions.
 
 from deploy.dpu.board import Dpu
 from deploy.dpu.finding import Finding, outside
-from deploy.dpu.graph import Operation
+from deploy.dpu.graph import Operation, Scale
 
 AGAIN = "'beers-deploy quantize --regime legal' does"
 MOVE = "move the output's position until it fits: 'beers-deploy quantize --regime legal' does"
@@ -25,7 +25,7 @@ def symmetric(op: Operation, dpu: Dpu) -> Finding | None:
     faults = [
         f"{role} {scale.integer_type} around {scale.zero_points[0]}"
         for role, scale in op.scales.items()
-        if not scale.symmetric
+        if not scale.symmetric or (scale.integer_type == "int32" and role.startswith(("input", "output")))
     ]
     return Finding("; ".join(faults), f"calibrate with a zero point of 0; {AGAIN}") if faults else None
 
@@ -47,15 +47,10 @@ def power_of_two(op: Operation, dpu: Dpu) -> Finding | None:
     )
 
 
-def int8_bias(op: Operation, dpu: Dpu) -> Finding | None:
-    """A bias is int8 with a position of its own, not int32 at the products' scale (Vitis-AI 3.0, vai_q_pytorch).
-
-    Judged where the file gives the bias a format: QLinearConv cannot, its operator demands int32.
-    """
-    bias = op.scales.get("bias")
-    if bias is None or bias.integer_type == "int8":
-        return None
-    return Finding(f"its bias is {bias.integer_type}", f"quantise the bias to int8; {AGAIN}")
+def one_format(op: Operation, dpu: Dpu) -> Finding | None:
+    """Who writes a tensor and who reads it give it the same scale and zero point (Vitis-AI 3.0, vai_q_pytorch)."""
+    faults = [f"{role} is {' and '.join(map(_words, formats))}" for role, formats in op.disputed.items()]
+    return Finding("; ".join(faults), f"give each tensor one scale and zero point; {AGAIN}") if faults else None
 
 
 def shift_cut(op: Operation, dpu: Dpu) -> Finding | None:
@@ -69,7 +64,7 @@ def shift_bias(op: Operation, dpu: Dpu) -> Finding | None:
 
     And at least min(0, shift_cut + 8 - {numbers[accumulator_bits]}).
     """
-    product, cut, bias = _product(op), _cut(op), _position(op, "bias")
+    product, cut, bias = product_position(op), _cut(op), _position(op, "bias")
     if product is None or cut is None or bias is None:
         return None
     low = min(0, cut + 8 - dpu.whole("numbers", "accumulator_bits"))
@@ -102,21 +97,28 @@ def same_position(op: Operation, dpu: Dpu) -> Finding | None:
     )
 
 
+def product_position(op: Operation) -> int | None:
+    """The position of a convolution's sums of products, None without one."""
+    weight, source = _position(op, "weight"), _position(op, "input 0")
+    return None if weight is None or source is None else weight + source
+
+
 def _position(op: Operation, role: str) -> int | None:
     scale = op.scales.get(role)
     return scale.position if scale else None
 
 
 def _inputs(op: Operation) -> list[int]:
-    positions = (_position(op, f"input {i}") for i in range(len(op.inputs)))
+    """Of the tensors and constants that an element-wise operator reads."""
+    positions = (_position(op, role) for role in op.scales if role.startswith(("input", "constant")))
     return [p for p in positions if p is not None]
 
 
-def _product(op: Operation) -> int | None:
-    weight, source = _position(op, "weight"), _position(op, "input 0")
-    return None if weight is None or source is None else weight + source
-
-
 def _cut(op: Operation) -> int | None:
-    product, output = _product(op), _position(op, "output")
+    product, output = product_position(op), _position(op, "output")
     return None if product is None or output is None else product - output
+
+
+def _words(scale: Scale) -> str:
+    scales, zeros = ", ".join(f"{s:.9g}" for s in scale.scales[:1]), scale.zero_points[:1]
+    return f"{scale.integer_type} at scale {scales or 'unknown'} around {zeros[0] if zeros else 'nothing'}"

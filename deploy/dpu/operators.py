@@ -1,13 +1,15 @@
 """The DPU's rules by kind of operation, their texts, and the judgement of one node: all broken rules, not the first.
 
-A rule is a small function (`conv_rules`, `other_rules`, `size_rules`, `number_rules`) whose docstring is its text,
-filled in with the limits of the target profile: text, check and documentation cannot drift apart.
+A rule is a small function (`conv_rules`, `other_rules`, `size_rules`, `number_rules`, `constant_rules`) whose
+docstring is its text, filled in with the limits of the target profile: text, check and documentation cannot drift
+apart.
 """
 
 import inspect
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 
+from deploy.dpu import constant_rules as k
 from deploy.dpu import conv_rules as c
 from deploy.dpu import number_rules as n
 from deploy.dpu import other_rules as o
@@ -53,11 +55,11 @@ RULES: Mapping[Kind, tuple[Rule, ...]] = {
 SIZES: tuple[Rule, ...] = (s.map_exists, s.maps_aligned, s.map_in_memory)
 """What the tile's size has to allow every node."""
 
-NUMBERS: tuple[Rule, ...] = (n.on_integers, n.symmetric, n.per_tensor, n.power_of_two)
+NUMBERS: tuple[Rule, ...] = (n.on_integers, n.symmetric, n.per_tensor, n.power_of_two, n.one_format, k.int8_constants)
 SHIFTS: Mapping[Kind, tuple[Rule, ...]] = {
-    "conv": (n.int8_bias, n.shift_cut, n.shift_bias),
-    "depthwise": (n.int8_bias, n.shift_cut, n.shift_bias),
-    "transposed": (n.int8_bias, n.shift_cut, n.shift_bias),
+    "conv": (k.int8_bias, k.int32_bias, n.shift_cut, n.shift_bias),
+    "depthwise": (k.int8_bias, k.int32_bias, n.shift_cut, n.shift_bias),
+    "transposed": (k.int8_bias, k.int32_bias, n.shift_cut, n.shift_bias),
     "add": (n.shift_read, n.shift_write),
     "mul": (),
     "concat": (n.same_position,),

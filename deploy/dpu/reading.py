@@ -110,6 +110,8 @@ class _Reader:
             follows=self.kinds.get(activations[0]) if activations else None,
             integer=self.integers.is_integer(node),
             scales=self.integers.scales(node),
+            disputed=self.integers.disputed(node),
+            constants=self.integers.constants(node),
         )
         yield replace(operation, constant_shape=self._constant_shape(node, operation))
 

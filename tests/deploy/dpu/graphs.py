@@ -67,11 +67,15 @@ class IntegerSketch(Sketch):
     def quantised(self, source: str) -> str:
         return self.node("QuantizeLinear", source, *self.numbers)
 
-    def qconv(self, source: str, weight: tuple[int, ...], weight_scale: float = 2.0**-7) -> str:
+    def qconv(
+        self, source: str, weight: tuple[int, ...], weight_scale: float = 2.0**-7, bias: np.ndarray | None = None
+    ) -> str:
         pads = [weight[2] // 2, weight[3] // 2] * 2
         kernel = self.constant(np.ones(weight, np.int8))
         scale, zero = self.constant(np.array(weight_scale, np.float32)), self.numbers[1]
-        return self.node("QLinearConv", source, *self.numbers, kernel, scale, zero, *self.numbers, pads=pads)
+        start = [] if bias is None else [self.constant(bias)]
+        feeds = (source, *self.numbers, kernel, scale, zero, *self.numbers, *start)
+        return self.node("QLinearConv", *feeds, pads=pads)
 
     def qadd(self, one: str, other: str) -> str:
         feeds = (one, *self.numbers, other, *self.numbers, *self.numbers)
@@ -117,9 +121,18 @@ class QdqSketch(Sketch):
         scales = 2.0 ** -np.array(position, np.float64)
         return self.constant(scales.astype(np.float32)), self.constant(np.full(scales.shape, zero, kind))
 
-    def pair(self, source: str, position: float = 7, zero: int = 0) -> str:
+    def pair(self, source: str, position: float = 7, zero: int = 0, read: tuple[float, int] | None = None) -> str:
+        """A tensor quantised and dequantised; `read` is the position and the zero point of who reads another."""
         numbers = self.scale(position, zero)
-        return self.node("DequantizeLinear", self.node("QuantizeLinear", source, *numbers), *numbers)
+        read_numbers = numbers if read is None else self.scale(*read)
+        return self.node("DequantizeLinear", self.node("QuantizeLinear", source, *numbers), *read_numbers)
+
+    def stored(self, value: np.ndarray, position: float | list[float] = 7) -> str:
+        """A constant seen as float; one of float32 as it is."""
+        name = self.constant(value)
+        if value.dtype == np.float32:
+            return name
+        return self.node("DequantizeLinear", name, *self.scale(position, 0, value.dtype.type), axis=0)
 
     def qdq_conv(
         self,
@@ -129,9 +142,8 @@ class QdqSketch(Sketch):
         bias: float = 7,
         output: float = 7,
         bias_kind: type = np.int8,
+        weight_kind: type = np.int8,
     ) -> str:
-        kernel = self.constant(np.ones((4, channels, 3, 3), np.int8))
-        start = self.constant(np.ones(4, bias_kind))
-        numbers = {kernel: self.scale(weight), start: self.scale(bias, 0, bias_kind)}
-        feeds = [self.node("DequantizeLinear", value, *scale, axis=0) for value, scale in numbers.items()]
-        return self.pair(self.node("Conv", source, *feeds, pads=[1] * 4), output)
+        kernel = self.stored(np.ones((4, channels, 3, 3), weight_kind), weight)
+        start = self.stored(np.ones(4, bias_kind), bias)
+        return self.pair(self.node("Conv", source, kernel, start, pads=[1] * 4), output)

@@ -33,6 +33,25 @@ def joined(output: float) -> Draw:
     return lambda s, x: s.pair(s.node("Add", x, x), output)
 
 
+def combined(op_type: str, kind: type, position: float = 7) -> Draw:
+    """The tensor added to or multiplied by a constant for each channel."""
+    return lambda s, x: s.pair(s.node(op_type, x, s.stored(np.ones((1, 4, 1, 1), kind), position)))
+
+
+def read(position: float, zero: int = 0) -> Draw:
+    return lambda s, x: s.qdq_conv(s.pair(s.node("Relu", x), 6, read=(position, zero)))
+
+
+def twice(one: float, other: float) -> Draw:
+    """A sum that is quantised once for each of its two readers."""
+
+    def draw(s: QdqSketch, x: str) -> str:
+        total = s.node("Add", x, x)
+        return s.pair(s.node("Add", s.pair(total, one), s.pair(total, other)))
+
+    return draw
+
+
 CASES: dict[str, tuple[Draw, Draw]] = {
     "symmetric": (lambda s, x: s.pair(s.node("Add", x, x), 7, zero=3), joined(7)),
     "per tensor": (conv(weight=[7, 7, 6, 7]), conv(weight=7)),
@@ -43,6 +62,17 @@ CASES: dict[str, tuple[Draw, Draw]] = {
     "shift read": (added(-2, 14, -2), added(-2, 13, -2)),
     "shift write": (added(7, 7, 23), added(7, 7, 22)),
     "same position": (pooled(6), pooled(7)),
+    "power of two: of an addend": (combined("Add", np.int8, -math.log2(0.01)), combined("Add", np.int8)),
+    "shift read: of an addend": (combined("Add", np.int8, 23), combined("Add", np.int8, 22)),
+    "int8 constants: weights in float": (conv(weight_kind=np.float32), conv()),
+    "int8 constants: weights of int32": (conv(weight_kind=np.int32), conv()),
+    "int8 constants: an addend in float": (combined("Add", np.float32), combined("Add", np.int8)),
+    "int8 constants: a factor in float": (combined("Mul", np.float32), combined("Mul", np.int8)),
+    "int8 constants: an addend of int32": (combined("Add", np.int32), combined("Add", np.int8)),
+    "int8 bias: in float": (conv(bias_kind=np.float32), conv()),
+    "one format: read at another scale": (read(4), read(6)),
+    "one format: read around another zero": (read(6, zero=3), read(6)),
+    "one format: quantised twice": (twice(7, 5), twice(7, 7)),
 }
 
 
@@ -54,13 +84,33 @@ def remedies(path: Path, draw: Draw) -> dict[str, str]:
     return {b.rule: b.finding.remedy for node in nodes for b in node.broken}
 
 
-@pytest.mark.parametrize("rule", CASES)
-def test_each_rule_refuses_its_file_alone_and_names_a_remedy(tmp_path: Path, rule: str) -> None:
-    found = remedies(tmp_path / "n.onnx", CASES[rule][0])
+@pytest.mark.parametrize("case", CASES)
+def test_each_rule_refuses_its_file_alone_and_names_a_remedy(tmp_path: Path, case: str) -> None:
+    found, rule = remedies(tmp_path / "n.onnx", CASES[case][0]), case.split(":")[0]
     assert list(found) == [rule]
     assert (MOVE if rule.startswith("shift") else AGAIN) in found[rule]
 
 
-@pytest.mark.parametrize("rule", CASES)
-def test_following_the_remedy_passes(tmp_path: Path, rule: str) -> None:
-    assert remedies(tmp_path / "n.onnx", CASES[rule][1]) == {}
+@pytest.mark.parametrize("case", CASES)
+def test_following_the_remedy_passes(tmp_path: Path, case: str) -> None:
+    assert remedies(tmp_path / "n.onnx", CASES[case][1]) == {}
+
+
+def test_two_nodes_may_read_the_same_constant_at_two_scales(tmp_path: Path) -> None:
+    """As an optimiser leaves them that stores equal bytes once: each has its own copy on the board."""
+
+    def draw(s: QdqSketch, x: str) -> str:
+        weight, bias = s.constant(np.ones((4, 4, 3, 3), np.int8)), s.stored(np.zeros(4, np.int8))
+        for position in (7, 5):
+            seen = s.node("DequantizeLinear", weight, *s.scale(position))
+            x = s.pair(s.node("Conv", x, seen, bias, pads=[1] * 4))
+        return x
+
+    assert remedies(tmp_path / "n.onnx", draw) == {}
+
+
+def test_weights_that_other_nodes_compute_are_refused(tmp_path: Path) -> None:
+    def draw(s: QdqSketch, x: str) -> str:
+        return s.pair(s.node("Conv", x, s.pair(s.weight(4, 4, 3, 3)), kernel_shape=[3, 3], pads=[1] * 4))
+
+    assert AGAIN in remedies(tmp_path / "n.onnx", draw)["int8 constants"]

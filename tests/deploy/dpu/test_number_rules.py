@@ -50,6 +50,14 @@ def test_windows_hold_at_their_ends(rule: Rule, inside: dict[str, int], outside:
     assert rule(operation("add", **outside), DPU) is not None
 
 
+def test_only_a_bias_may_be_int32() -> None:
+    for role, kept in (("bias", True), ("input 0", False), ("output", False)):
+        op = Operation(
+            "op", "Conv", "conv", ("in",), ("out",), integer=True, scales={role: Scale((0.5,), (0,), "int32")}
+        )
+        assert (number_rules.symmetric(op, DPU) is None) == kept
+
+
 @pytest.mark.parametrize(
     ("rule", "scale", "kept"),
     [

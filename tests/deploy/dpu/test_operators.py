@@ -122,6 +122,9 @@ WIDE = {"conv channels", "conv weight bank", "depthwise channels", "transposed c
 SIZES = {"map exists", "maps aligned", "map in memory"}
 NUMBERS = {
     "int8 bias",
+    "int32 bias",
+    "int8 constants",
+    "one format",
     "on integers",
     "symmetric",
     "per tensor",

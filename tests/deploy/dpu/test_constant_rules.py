@@ -1,0 +1,136 @@
+"""The constants of integer kernels: whose int32 bias the DPU can hold, and who reads a tensor as it was written."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import onnx
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from onnx import numpy_helper
+
+from deploy.dpu import constant_rules
+from deploy.dpu.board import load_dpu
+from deploy.dpu.graph import Operation, Scale
+from deploy.dpu.placement import place
+from deploy.dpu.reading import network_of, read_network
+from deploy.export import to_onnx
+from deploy.shipped import shipped_pair
+from model.convbeers import ConvBEERS, Variant, initialise
+from model.shipped import shipped_names
+from model.simulator.procedural import procedural_scene
+from profiles import load_sensor
+from quant.calibration import draw_patches
+from quant.quantise import quantise_model
+from tests.deploy.dpu.graphs import IntegerSketch
+
+DPU = load_dpu()
+HALF = Scale((0.5,), (0,), "int8")
+SMALLEST = "convbeers-xs"
+
+
+def rules(model: onnx.ModelProto) -> set[str]:
+    return {broken.rule for node in place(network_of(model, 64), DPU).nodes for broken in node.broken}
+
+
+def shipped() -> onnx.ModelProto:
+    return onnx.load_model(shipped_pair(SMALLEST)[1])
+
+
+def kept(values: list[int]) -> bool:
+    bias = {"bias": np.array(values, np.int32)}
+    scales = dict.fromkeys(("input 0", "weight", "output"), HALF)
+    op = Operation("op", "QLinearConv", "conv", ("in",), ("out",), integer=True, scales=scales, constants=bias)
+    return constant_rules.int32_bias(op, DPU) is None
+
+
+@given(st.lists(st.integers(-128, 127)), st.integers(0, 16))
+def test_a_shifted_int8_bias_passes(values: list[int], shift: int) -> None:
+    assert kept([value << shift for value in values])
+
+
+@given(st.lists(st.integers(-300, 300), min_size=1), st.integers(0, 18))
+def test_a_bias_passes_where_some_shift_makes_it_int8(values: list[int], shift: int) -> None:
+    values = [value << shift for value in values]
+    shifts = [k for k in range(17) if all(v % 2**k == 0 and -128 <= v >> k <= 127 for v in values)]
+    assert kept(values) == bool(shifts)
+
+
+@pytest.mark.parametrize(
+    ("bias", "broken"),
+    [
+        ([127 << 16, -128 << 16, 0, 0], set()),
+        ([64 << 17, 0, 0, 0], {"int32 bias"}),  # a shift of 17 makes 128 of shift 16
+        ([129, 1, 0, 0], {"int32 bias"}),
+        ([127, 1, 0, 0], set()),
+        (np.random.default_rng(0).integers(-(2**30), 2**30, 4).tolist(), {"int32 bias"}),
+    ],
+)
+def test_the_bias_of_an_integer_kernel_is_looked_at(tmp_path: Path, bias: list[int], broken: set[str]) -> None:
+    s = IntegerSketch()
+    inner = s.qconv(s.quantised("image"), (4, 1, 3, 3), bias=np.array(bias, np.int32))
+    path = s.save(tmp_path / "b.onnx", s.node("DequantizeLinear", inner, *s.numbers))
+    failed = place(read_network(path, 20), DPU).failed
+    assert {b.rule for node in failed for b in node.broken} == broken
+    assert all("quantize --regime legal" in node.broken[0].finding.remedy for node in failed)
+
+
+@pytest.mark.parametrize("name", shipped_names())
+def test_the_shipped_files_keep_every_rule(name: str) -> None:
+    assert rules(onnx.load_model(shipped_pair(name)[1])) == set()
+
+
+@pytest.mark.parametrize("spread", [0.001, 0.1, 3.0])
+def test_what_quantize_writes_of_random_networks_keeps_every_rule(spread: float) -> None:
+    """In both spellings, biases small and large beside the products."""
+    network, generator = ConvBEERS(Variant(blocks=1, features=4)), torch.Generator().manual_seed(7)
+    initialise(network, generator)
+    with torch.no_grad():
+        for name, value in network.named_parameters():
+            if name.endswith("bias"):
+                value.normal_(0, spread, generator=generator)
+    scene = procedural_scene(400, 400, np.random.default_rng(1))
+    sensors = load_sensor("pleiades-degraded"), load_sensor("pleiades-reference")
+    patches = draw_patches([scene], *sensors, count=2, seed=5)
+    made = quantise_model(to_onnx(network.eval(), {}), patches, {}, tick=lambda: None)
+    assert rules(made.host) == rules(made.board) == set()
+
+
+def biases(model: onnx.ModelProto) -> list[str]:
+    return [node.input[8] for node in model.graph.node if node.op_type == "QLinearConv"]
+
+
+@pytest.mark.parametrize("name", biases(shipped()))
+def test_a_shipped_bias_with_one_more_on_a_value_is_refused(name: str) -> None:
+    """Each has a shift above 0, and a largest value that needs it."""
+    model = shipped()
+    tensor = next(t for t in model.graph.initializer if t.name == name)
+    values = numpy_helper.to_array(tensor).copy()
+    values[0] += 1
+    tensor.CopyFrom(numpy_helper.from_array(values, name))
+    assert rules(model) == {"int32 bias"}
+
+
+def reader(op_type: str, place: int) -> Callable[[onnx.ModelProto], None]:
+    """The last node of a kind, with 4 times the scale at a place, or a zero point one less."""
+
+    def spoil(model: onnx.ModelProto) -> None:
+        node = [n for n in model.graph.node if n.op_type == op_type][-1]
+        value = numpy_helper.to_array(next(t for t in model.graph.initializer if t.name == node.input[place]))
+        changed = value * 4 if value.dtype == np.float32 else value - 1
+        model.graph.initializer.append(numpy_helper.from_array(changed.astype(value.dtype), "spoilt"))
+        node.input[place] = "spoilt"
+
+    return spoil
+
+
+@pytest.mark.parametrize(
+    ("op_type", "place"),
+    [("QLinearConv", 1), ("QLinearConv", 2), ("QLinearAdd", 1), ("QLinearAdd", 4), ("DequantizeLinear", 1)],
+)
+def test_who_reads_a_tensor_otherwise_than_it_was_written_is_refused(op_type: str, place: int) -> None:
+    model = shipped()
+    reader(op_type, place)(model)
+    assert "one format" in rules(model)
