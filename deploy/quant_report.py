@@ -16,7 +16,7 @@ from quant.gate import compare
 from quant.pieces import crops
 from quant.positions import SHIFTS, Shifts
 from quant.quantise import ALL, Passes, quantise_model
-from quant.session import open_any_size
+from quant.session import open_any_size, run
 
 LAYER_PATCHES = 4
 NARROW_BITS = 23
@@ -24,12 +24,20 @@ NARROW_BITS = 23
 BITS_SOURCE = "128 times the sum of the weights' sizes, plus the bias: no input exceeds it"
 
 
-def integer_rows(core: IntCore, host: onnx.ModelProto, images: Iterable[np.ndarray]) -> tuple[list[Row], Row]:
+def integer_rows(
+    model: onnx.ModelProto, core: IntCore, host: onnx.ModelProto, images: Iterable[np.ndarray]
+) -> tuple[list[Row], Row]:
     """Each integer operation on a crop of a few images (1, 1, H, W), and what the DPU's rule for halves changes."""
-    found = [agreement(core, host, crop) for crop in few_crops(images)]
+    seen = few_crops(images)
+    found = [agreement(core, host, crop) for crop in seen]
     source = f"the integer reference on {len(found)} calibration patches"
-    layers = [_layer_row(list(same), source) for same in zip(*(layers for layers, _ in found), strict=True)]
-    return layers, _rounding_row(np.concatenate([sizes.ravel() for _, sizes in found]), source)
+    layers = [_layer_row(list(same), source) for same in zip(*(one.layers for one in found), strict=True)]
+    session = open_any_size(model)
+    both = [
+        [np.clip(crop + result, 0, 1) for result in (one.up, one.even)] for crop, one in zip(seen, found, strict=True)
+    ]
+    in_float = [np.clip(run(session, crop), 0, 1) for crop in seen]
+    return layers, _rounding_row(in_float, both, source)
 
 
 def _layer_row(layers: list[LayerAgreement], source: str) -> Row:
@@ -52,11 +60,19 @@ def _layer_row(layers: list[LayerAgreement], source: str) -> Row:
     return Row("integer layers", layers[0].report.name, figures)
 
 
-def _rounding_row(sizes: np.ndarray, source: str) -> Row:
-    """How far the DPU's rounding of halves, up, leads the restored image away from the runtime's, to even."""
+def _rounding_row(in_float: list[np.ndarray], both: list[list[np.ndarray]], source: str) -> Row:
+    """How far the DPU's rounding of halves, up, leads away from the runtime's, to even; which is nearer to float."""
+    up, even = (np.concatenate([results[k].ravel() for results in both]) for k in (0, 1))
+    whole = np.concatenate([result.ravel() for result in in_float])
+
+    def mae(one: np.ndarray, other: np.ndarray) -> Figure:
+        return measured(float(np.abs(one - other).mean(dtype=np.float64)), "of full scale", source)
+
     figures = {
-        "pixels that differ": measured(100 * float((sizes > 0).mean()), "%", f"{source}, both ways"),
-        "MAE": measured(float(sizes.mean()), "of full scale", f"{source}, both ways"),
+        "pixels that differ": measured(100 * float((up != even).mean()), "%", source),
+        "MAE between them": mae(up, even),
+        "MAE of halves up": mae(up, whole),
+        "MAE of halves to even": mae(even, whole),
     }
     return Row("rounding", "halves up (DPU) against halves to even (onnxruntime)", figures)
 

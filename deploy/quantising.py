@@ -130,7 +130,7 @@ def quantise_legal_file(
         save_onnx(result.board, wanted.board)
         say(f"wrote {wanted.board}: the same numbers in the board's spelling")
     images = calibration.drawn.degraded
-    layers, rounding = integer_rows(result.core, result.host, images)
+    layers, rounding = integer_rows(model, result.core, result.host, images)
     print_rows("integer layers", layers)
     print_rows("the rule for halves", [rounding])
     rows = [*layers, rounding, *(_ablated(model, calibration, shifts) if wanted.ablate else [])]

@@ -34,16 +34,22 @@ class LayerAgreement:
     moved_by: int
 
 
-def agreement(core: IntCore, host: onnx.ModelProto, image: np.ndarray) -> tuple[list[LayerAgreement], np.ndarray]:
-    """Every operation, and the size of the difference that the rule makes in the correction.
+@dataclass(frozen=True)
+class Agreement:
+    """All operations in order, and the correction (N, 1, H, W) of full scale with halves up, and to even."""
+
+    layers: list[LayerAgreement]
+    up: np.ndarray
+    even: np.ndarray
+
+
+def agreement(core: IntCore, host: onnx.ModelProto, image: np.ndarray) -> Agreement:
+    """Run the core by both rules and in onnxruntime.
 
     Args:
         core: whole numbers.
         host: the same in the host's spelling.
         image: (N, 1, H, W) in [0, 1].
-
-    Returns:
-        The layers in order; (N, 1, H, W) float32 of full scale.
     """
     names = [op.output for op in core.ops]
     session = open_session(with_outputs(any_size(host), dict.fromkeys(names, onnx.TensorProto.UINT8)))
@@ -55,4 +61,4 @@ def agreement(core: IntCore, host: onnx.ModelProto, image: np.ndarray) -> tuple[
         difference = np.abs(up[name] - even[name])
         unequal = float((runtime.astype(np.int16) - ZERO != even[name]).mean())
         layers.append(LayerAgreement(report, unequal, float((difference > 0).mean()), int(difference.max())))
-    return layers, np.abs(merged_correction(core, up) - merged_correction(core, even))
+    return Agreement(layers, merged_correction(core, up), merged_correction(core, even))

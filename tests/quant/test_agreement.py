@@ -19,7 +19,7 @@ IMAGE = np.random.default_rng(4).random((2, 1, 35, 41), dtype=np.float32)
 
 
 def test_every_layer_of_a_new_file_is_equal(quantised: Quantised) -> None:
-    layers, _ = agreement(quantised.core, quantised.host, IMAGE)
+    layers = agreement(quantised.core, quantised.host, IMAGE).layers
     assert [layer.report.name for layer in layers] == [op.name for op in quantised.core.ops]
     assert {layer.unequal for layer in layers} == {0.0}
 
@@ -27,9 +27,9 @@ def test_every_layer_of_a_new_file_is_equal(quantised: Quantised) -> None:
 @pytest.mark.parametrize("path", sorted(SHIPPED.glob("*-int8.onnx")), ids=lambda path: path.stem)
 def test_every_layer_of_a_shipped_file_is_equal(path: Path) -> None:
     model = load_onnx(path)
-    layers, moved = agreement(read_core(model), model, IMAGE[:1])
-    assert {layer.unequal for layer in layers} == {0.0}
-    assert moved.any()
+    found = agreement(read_core(model), model, IMAGE[:1])
+    assert {layer.unequal for layer in found.layers} == {0.0}
+    assert (found.up != found.even).any()
 
 
 def test_a_layer_that_computes_something_else_is_found(quantised: Quantised) -> None:
@@ -37,7 +37,7 @@ def test_a_layer_that_computes_something_else_is_found(quantised: Quantised) -> 
     spoilt.CopyFrom(quantised.host)
     bias = next(t for t in spoilt.graph.initializer if t.name == "body.0.second.bias")
     bias.CopyFrom(numpy_helper.from_array(numpy_helper.to_array(bias) * 2 + 900, bias.name))
-    layers, _ = agreement(quantised.core, spoilt, IMAGE)
+    layers = agreement(quantised.core, spoilt, IMAGE).layers
     unequal = {layer.report.name: layer.unequal > 0 for layer in layers}
     assert not unequal["body.0.first"]
     assert unequal["body.0.second"]
@@ -45,12 +45,12 @@ def test_a_layer_that_computes_something_else_is_found(quantised: Quantised) -> 
 
 
 def test_what_the_rule_moves_is_counted(quantised: Quantised) -> None:
-    layers, moved = agreement(quantised.core, quantised.host, IMAGE)
+    found = agreement(quantised.core, quantised.host, IMAGE)
     up, even = (run_core(quantised.core, split(IMAGE), half_even=rule)[0] for rule in (False, True))
-    for layer, op in zip(layers, quantised.core.ops, strict=True):
+    for layer, op in zip(found.layers, quantised.core.ops, strict=True):
         difference = up[op.output] - even[op.output]
         assert layer.moved == pytest.approx(np.count_nonzero(difference) / difference.size)
         assert layer.moved_by == np.abs(difference).max()
-    wanted = merged_correction(quantised.core, up) - merged_correction(quantised.core, even)
-    np.testing.assert_array_equal(moved, np.abs(wanted))
-    assert max(layer.moved for layer in layers) > 0
+    np.testing.assert_array_equal(found.up, merged_correction(quantised.core, up))
+    np.testing.assert_array_equal(found.even, merged_correction(quantised.core, even))
+    assert max(layer.moved for layer in found.layers) > 0
