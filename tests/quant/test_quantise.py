@@ -54,10 +54,11 @@ def test_unreachable_positions_are_moved_to_legal_ones(float_onnx: onnx.ModelPro
     assert shift_faults(build_core(graph, wild)) == []
 
 
-def test_host_and_board_files_compute_the_same(quantised: Quantised) -> None:
+@pytest.mark.parametrize("size", [(37, 53), (1, 7), (419, 643)])
+def test_host_and_board_files_compute_the_same(size: tuple[int, int], quantised: Quantised) -> None:
     host, board = open_session(quantised.host), open_session(quantised.board)
     for seed in range(3):
-        dn = image(seed=seed)
+        dn = image(*size, seed=seed)
         planes = split(dn).astype(np.float32) * np.float32(2.0**-POSITION)
         correction = merge(board.run(None, {"planes": planes})[0], quantised.core.scale(CORRECTION))
         restored = np.clip(dn + correction, 0, 1)
