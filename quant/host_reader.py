@@ -10,6 +10,7 @@ from quant.graph import CORRECTION, Add
 from quant.host_file import ZERO, host_model
 from quant.onnx_file import fixed_tile_px, metadata
 from quant.planes import PLANES
+from quant.untrusted import contradictions
 
 
 def read_core(model: onnx.ModelProto) -> IntCore:
@@ -35,7 +36,15 @@ def spelling_fault(model: onnx.ModelProto) -> str | None:
     """Where a file of the legal regime is not what its whole numbers spell: the host's ends, ReLUs, a reader's scale.
 
     None where nothing differs, and for files of others.
+
+    Raises:
+        ModelError: nodes that contradict it.
     """
+    with contradictions("INT8 model"):
+        return _spelling_fault(model)
+
+
+def _spelling_fault(model: onnx.ModelProto) -> str | None:
     ours = metadata(model).get("precision") == "int8 legal"
     try:
         core = read_core(model)

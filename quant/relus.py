@@ -4,10 +4,20 @@ import onnx
 from onnx import numpy_helper
 
 from quant.saturation import Rounded, rounded_tensors
+from quant.untrusted import contradictions
 
 
 def relu_count(model: onnx.ModelProto) -> int:
-    """ReLUs in any spelling: Relu, the larger of a value and zero, a convolution whose 8 bits begin at zero."""
+    """ReLUs in any spelling: Relu, the larger of a value and zero, a convolution whose 8 bits begin at zero.
+
+    Raises:
+        ModelError: nodes that contradict it.
+    """
+    with contradictions("model"):
+        return _count(model)
+
+
+def _count(model: onnx.ModelProto) -> int:
     constants = {tensor.name: tensor for tensor in model.graph.initializer}
     rounded = {tensor.name: tensor for tensor in rounded_tensors(model)}
     convolved = {name for node in model.graph.node if "Conv" in node.op_type for name in node.output}

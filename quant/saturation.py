@@ -14,7 +14,8 @@ from onnx import numpy_helper
 
 from quant.graph import CORRECTION
 from quant.onnx_file import any_size, with_outputs
-from quant.session import open_session
+from quant.session import open_session, tensors_of
+from quant.untrusted import contradictions
 
 ZERO_POINTS = {"QuantizeLinear": 2, "QLinearConv": 7, "QLinearAdd": 7, "QLinearMatMul": 7}
 """The operators that round to 8 bits, and which input holds the zero point of their result."""
@@ -43,7 +44,7 @@ class Rounded:
 
     def at_ends(self, values: np.ndarray) -> np.ndarray:
         """Which of its values (N, C, H, W) lie at an end."""
-        kept = values[:, 1:] if self.name == CORRECTION and values.shape[1] == 2 else values
+        kept = values[:, 1:] if self.name == CORRECTION and values.shape[1:2] == (2,) else values
         low = (kept == self.lowest) & (not self.low_is_relu and bool(self.zero_point.min() > self.lowest))
         return np.asarray((kept == self.lowest + 255) | low)
 
@@ -54,7 +55,7 @@ def saturated_shares(model: onnx.ModelProto, images: Iterable[np.ndarray]) -> di
     Empty where no node rounds to 8 bits.
 
     Raises:
-        ModelError: onnxruntime refuses the model.
+        ModelError: onnxruntime refuses the model, or cannot run it.
     """
     looked_at = rounded_tensors(model)
     if not looked_at:
@@ -63,7 +64,7 @@ def saturated_shares(model: onnx.ModelProto, images: Iterable[np.ndarray]) -> di
     session = open_session(with_outputs(any_size(model), kinds), optimise=False)
     ends, counts = np.zeros(len(looked_at)), np.zeros(len(looked_at))
     for image in images:
-        results = session.run([tensor.name for tensor in looked_at], {session.get_inputs()[0].name: image})
+        results = tensors_of(session, [tensor.name for tensor in looked_at], image)
         flags = [tensor.at_ends(values) for tensor, values in zip(looked_at, results, strict=True)]
         ends += [flag.sum() for flag in flags]
         counts += [flag.size for flag in flags]
@@ -72,7 +73,16 @@ def saturated_shares(model: onnx.ModelProto, images: Iterable[np.ndarray]) -> di
 
 
 def rounded_tensors(model: onnx.ModelProto) -> list[Rounded]:
-    """What the graph's nodes round to 8 bits, in the graph's order."""
+    """What the graph's nodes round to 8 bits, in the graph's order.
+
+    Raises:
+        ModelError: nodes that contradict it.
+    """
+    with contradictions("INT8 model"):
+        return [tensor for tensor in _rounded(model) if tensor.zero_point.dtype in (np.int8, np.uint8)]
+
+
+def _rounded(model: onnx.ModelProto) -> list[Rounded]:
     constants = {tensor.name: tensor for tensor in model.graph.initializer}
     relus = {name for node in model.graph.node if node.op_type in RELUS for name in node.input}
     found = []
@@ -83,4 +93,4 @@ def rounded_tensors(model: onnx.ModelProto) -> list[Rounded]:
         stored = constants.get(node.input[place]) if len(node.input) > place else None
         zero_point = np.array(0, np.uint8) if stored is None else numpy_helper.to_array(stored)
         found.append(Rounded(node.output[0], zero_point, node.output[0] in relus))
-    return [tensor for tensor in found if tensor.zero_point.dtype in (np.int8, np.uint8)]
+    return found

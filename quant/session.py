@@ -85,13 +85,22 @@ def run(session: ort.InferenceSession, image: np.ndarray) -> np.ndarray:
     Raises:
         ModelError: a model that does not run on this image, or that returns another shape.
     """
-    try:
-        restored = np.asarray(session.run(None, {session.get_inputs()[0].name: image})[0])
-    except Exception as error:  # as above
-        raise _unfit(" ".join(str(error).split())[:160]) from error
+    restored = tensors_of(session, None, image)[0]
     if restored.shape != image.shape:
         raise _unfit(f"a result of {times(restored.shape)}")
     return restored
+
+
+def tensors_of(session: ort.InferenceSession, names: list[str] | None, image: np.ndarray) -> list[np.ndarray]:
+    """The named outputs, or all, for an image (N, 1, H, W) float32 in [0, 1].
+
+    Raises:
+        ModelError: a model that does not run on this image.
+    """
+    try:
+        return [np.asarray(value) for value in session.run(names, {session.get_inputs()[0].name: image})]
+    except Exception as error:  # as above
+        raise _unfit(" ".join(str(error).split())[:160]) from error
 
 
 def _unfit(got: str) -> ModelError:

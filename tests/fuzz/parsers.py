@@ -44,9 +44,12 @@ from profiles import load_sensor, load_target
 from profiles.errors import BeersError
 from profiles.scene_call import load_scene_call
 from quant.float_reader import correction_graph
+from quant.host_reader import spelling_fault
 from quant.limits import read_limits
 from quant.onnx_file import fixed_tile_px, load_onnx
 from quant.radius import receptive_radius_px
+from quant.relus import relu_count
+from quant.saturation import rounded_tensors, saturated_shares
 from quant.session import open_any_size, open_session, run
 from tests.deploy.dpu.graphs import board_convbeers, float_convbeers, integer_convbeers
 from tests.fuzz.mutation import Mutate, of_json, of_onnx, of_png, of_safetensors, of_tiff
@@ -106,9 +109,16 @@ def look_at_onnx(path: Path) -> None:
 
 
 def understand_onnx(path: Path) -> None:
-    """What `quantize` and `restore` ask of a network before they run it."""
+    """What `quantize`, `restore` and `gate` ask of a network before they run it."""
     model = load_onnx(path)
-    for question in (fixed_tile_px, receptive_radius_px, correction_graph):
+    for question in (
+        fixed_tile_px,
+        receptive_radius_px,
+        correction_graph,
+        relu_count,
+        spelling_fault,
+        rounded_tensors,
+    ):
         _asked(question, model)
 
 
@@ -126,6 +136,7 @@ def run_onnx(path: Path) -> None:
     image = np.full((1, 1, SIDE_PX, SIDE_PX), 0.25, np.float32)
     run(open_session(model, 1), image)
     run(open_any_size(model), image[:, :, :9])
+    saturated_shares(model, [image])
 
 
 def tiff_seeds(folder: Path) -> list[bytes]:
