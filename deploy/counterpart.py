@@ -24,7 +24,8 @@ def counterpart(model: onnx.ModelProto) -> onnx.ModelProto | None:
 
 def is_quantised(model: onnx.ModelProto) -> bool:
     """Whether any node computes on, makes or reads quantised numbers."""
-    return any("QLinear" in n.op_type or n.op_type.endswith("quantizeLinear") for n in model.graph.node)
+    kinds = {node.op_type.lower() for node in model.graph.node}
+    return any(mark in kind for kind in kinds for mark in ("qlinear", "quantizelinear", "integer"))
 
 
 def require_quantised(model: onnx.ModelProto, path: Path, wanted: bool) -> None:

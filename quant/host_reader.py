@@ -2,13 +2,12 @@
 
 import numpy as np
 import onnx
-from onnx import numpy_helper
 
 from profiles.errors import ModelError
 from quant.core import IntConv, IntCore
 from quant.graph import CORRECTION, Add
 from quant.host_file import ZERO, host_model
-from quant.onnx_file import fixed_tile_px, metadata
+from quant.onnx_file import constants, fixed_tile_px, metadata
 from quant.planes import PLANES
 from quant.untrusted import contradictions
 
@@ -32,40 +31,39 @@ def read_core(model: onnx.ModelProto) -> IntCore:
     return IntCore(tuple(reader.ops), reader.positions)
 
 
-def spelling_fault(model: onnx.ModelProto) -> str | None:
+def spelling_faults(model: onnx.ModelProto) -> list[str] | None:
     """Where a file of the legal regime is not what its whole numbers spell: the host's ends, ReLUs, a reader's scale.
 
-    None where nothing differs, and for files of others.
+    None for files of others.
 
     Raises:
         ModelError: nodes that contradict it.
     """
     with contradictions("INT8 model"):
-        return _spelling_fault(model)
+        return _spelling_faults(model)
 
 
-def _spelling_fault(model: onnx.ModelProto) -> str | None:
+def _spelling_faults(model: onnx.ModelProto) -> list[str] | None:
     ours = metadata(model).get("precision") == "int8 legal"
     try:
         core = read_core(model)
     except ModelError as error:
-        return error.got if ours else None
-    meant = host_model(core, {}, fixed_tile_px(model)).graph
+        return [error.got] if ours else None
+    meant, faults = host_model(core, {}, fixed_tile_px(model)).graph, []
     for kind, found, wanted in (
         ("constant", model.graph.initializer, meant.initializer),
         ("node", model.graph.node, meant.node),
     ):
-        differing = [a.name for a, b in zip(found, wanted, strict=False) if a != b]
-        if differing or len(found) != len(wanted):
-            return f"{kind} {differing[0]}" if differing else f"{len(found)} {kind}s instead of {len(wanted)}"
-    return None
+        faults += [f"{kind} {a.name}" for a, b in zip(found, wanted, strict=False) if a != b]
+        faults += [f"{len(found)} {kind}s instead of {len(wanted)}"] if len(found) != len(wanted) else []
+    return faults
 
 
 class _Reader:
     """Collects operations and positions."""
 
     def __init__(self, model: onnx.ModelProto) -> None:
-        self._values = {t.name: numpy_helper.to_array(t) for t in model.graph.initializer}
+        self._values = constants(model)
         self.ops: list[IntConv | Add] = []
         self.positions: dict[str, int] = {}
 

@@ -3,8 +3,10 @@
 from collections.abc import Mapping
 from pathlib import Path
 
+import numpy as np
 import onnx
 from google.protobuf.message import DecodeError
+from onnx import numpy_helper
 
 from model.files import whole_file
 from profiles.errors import ModelError
@@ -98,6 +100,16 @@ def with_outputs(model: onnx.ModelProto, kinds: Mapping[str, int]) -> onnx.Model
         onnx.helper.make_tensor_value_info(name, kind, None) for name, kind in kinds.items() if name not in own
     )
     return told
+
+
+def constants(model: onnx.ModelProto) -> dict[str, np.ndarray]:
+    """The constants of a model by name: initializers, and what nodes of the kind Constant hold."""
+    found = {tensor.name: numpy_helper.to_array(tensor) for tensor in model.graph.initializer}
+    for node in model.graph.node:
+        values = [a.t for a in node.attribute if a.name == "value"]
+        if node.op_type == "Constant" and values:
+            found[node.output[0]] = numpy_helper.to_array(values[0])
+    return found
 
 
 def fixed_tile_px(model: onnx.ModelProto) -> int | None:

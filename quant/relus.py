@@ -1,47 +1,60 @@
 """ReLUs of an ONNX file in any spelling: quantisers have been seen to drop them without a word."""
 
-import onnx
-from onnx import numpy_helper
+from dataclasses import dataclass
 
+import numpy as np
+import onnx
+
+from quant.onnx_file import constants
 from quant.saturation import Rounded, rounded_tensors
 from quant.untrusted import contradictions
 
 
-def relu_count(model: onnx.ModelProto) -> int:
-    """ReLUs in any spelling: Relu, the larger of a value and zero, a convolution whose 8 bits begin at zero.
+@dataclass(frozen=True)
+class Relus:
+    """How many a file has.
+
+    Attributes:
+        spelt: nodes that are one: Relu, or the larger of a value and zero.
+        folded: convolutions whose 8 bits begin at zero, which is a ReLU, unless their results were never below zero.
+    """
+
+    spelt: int
+    folded: int
+
+    def may_be(self, wanted: int) -> bool:
+        """Whether so many ReLUs can be told apart in it, no less and no more."""
+        return self.spelt <= wanted <= self.spelt + self.folded
+
+    def __str__(self) -> str:
+        return f"{self.spelt}, and up to {self.folded} as 8 bits from zero" if self.folded else str(self.spelt)
+
+
+def count_relus(model: onnx.ModelProto) -> Relus:
+    """The ReLUs of a file.
 
     Raises:
         ModelError: nodes that contradict it.
     """
     with contradictions("model"):
-        return _count(model)
+        known, rounded = constants(model), {tensor.name: tensor for tensor in rounded_tensors(model)}
+        convolved = {name for node in model.graph.node if "Conv" in node.op_type for name in node.output}
+        spelt = [n.op_type == "Relu" or _cuts_at_zero(n, known, rounded) for n in model.graph.node]
+        return Relus(sum(spelt), sum(_begins_at_zero(node, rounded, convolved) for node in model.graph.node))
 
 
-def _count(model: onnx.ModelProto) -> int:
-    constants = {tensor.name: tensor for tensor in model.graph.initializer}
-    rounded = {tensor.name: tensor for tensor in rounded_tensors(model)}
-    convolved = {name for node in model.graph.node if "Conv" in node.op_type for name in node.output}
-    count = 0
-    for node in model.graph.node:
-        if node.op_type == "Max":
-            count += _zero_is_the_floor(node, constants, rounded)
-        else:
-            count += node.op_type == "Relu" or _begins_at_zero(node, rounded, convolved)
-    return count
-
-
-def _zero_is_the_floor(
-    node: onnx.NodeProto, constants: dict[str, onnx.TensorProto], rounded: dict[str, Rounded]
-) -> bool:
-    """Whether a Max cuts off what is below zero, which in 8 bits is the zero point."""
-    value, floor = rounded.get(node.input[0]), constants.get(node.input[-1])
-    zero = 0 if value is None else value.zero_point
-    return floor is not None and bool((numpy_helper.to_array(floor) == zero).all())
+def _cuts_at_zero(node: onnx.NodeProto, known: dict[str, np.ndarray], rounded: dict[str, Rounded]) -> bool:
+    """Whether it is a Max with zero, which in 8 bits is the zero point of what it is compared with."""
+    floors = [known[name] for name in node.input if name in known]
+    if node.op_type != "Max" or not floors:
+        return False
+    zeros = [rounded[name].zero_point for name in node.input if name in rounded] or [np.zeros(())]
+    return bool((floors[0] == zeros[0]).all())
 
 
 def _begins_at_zero(node: onnx.NodeProto, rounded: dict[str, Rounded], convolved: set[str]) -> bool:
     """Whether a convolution's result is rounded to numbers of which none is below zero."""
-    value = rounded.get(node.output[0])
+    value = rounded.get(node.output[0]) if node.output else None
     if value is None or not (node.op_type == "QLinearConv" or node.input[0] in convolved):
         return False
     return bool((value.zero_point == value.lowest).all())

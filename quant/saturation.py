@@ -10,15 +10,15 @@ from dataclasses import dataclass
 
 import numpy as np
 import onnx
-from onnx import numpy_helper
 
 from quant.graph import CORRECTION
-from quant.onnx_file import any_size, with_outputs
+from quant.onnx_file import any_size, constants, with_outputs
 from quant.session import open_session, tensors_of
 from quant.untrusted import contradictions
 
 ZERO_POINTS = {"QuantizeLinear": 2, "QLinearConv": 7, "QLinearAdd": 7, "QLinearMatMul": 7}
-"""The operators that round to 8 bits, and which input holds the zero point of their result."""
+"""ONNX's and onnxruntime's operators that round to 8 bits, of those that may run (`quant.runnable`), and which input
+holds the zero point of their result."""
 
 RELUS = ("Relu", "Max")
 
@@ -83,14 +83,22 @@ def rounded_tensors(model: onnx.ModelProto) -> list[Rounded]:
 
 
 def _rounded(model: onnx.ModelProto) -> list[Rounded]:
-    constants = {tensor.name: tensor for tensor in model.graph.initializer}
+    known = constants(model)
+    read_as = {node.output[0]: node.input[0] for node in model.graph.node if node.op_type == "DequantizeLinear"}
     relus = {name for node in model.graph.node if node.op_type in RELUS for name in node.input}
+    relus |= {read_as[name] for name in relus & set(read_as)}
     found = []
     for node in model.graph.node:
         place = ZERO_POINTS.get(node.op_type)
-        if place is None or node.input[0] in constants:
-            continue
-        stored = constants.get(node.input[place]) if len(node.input) > place else None
-        zero_point = np.array(0, np.uint8) if stored is None else numpy_helper.to_array(stored)
-        found.append(Rounded(node.output[0], zero_point, node.output[0] in relus))
+        if place is not None and node.input[0] not in known:
+            stored = known.get(node.input[place]) if len(node.input) > place else None
+            zero_point = _default_zero_point(node) if stored is None else stored
+            found.append(Rounded(node.output[0], zero_point, node.output[0] in relus))
     return found
+
+
+def _default_zero_point(node: onnx.NodeProto) -> np.ndarray:
+    """Of a node that names none: 0, of the type that it asks for, or uint8."""
+    kinds = [a.i for a in node.attribute if a.name == "output_dtype" and a.i]
+    kind = onnx.helper.tensor_dtype_to_np_dtype(kinds[0]) if kinds else np.uint8
+    return np.zeros((), kind)

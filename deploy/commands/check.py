@@ -10,6 +10,7 @@ if TYPE_CHECKING:
 
 EXAMPLE = "check network.onnx --target vck190 --config C32B3"
 TRADITIONAL = Path("traditional")
+TILE_PX = 640
 
 
 def check(
@@ -25,7 +26,9 @@ def check(
     config: Annotated[
         str | None, typer.Option(help="DPU configuration, C32B1 to C64B5; the target's own if none.")
     ] = None,
-    tile: Annotated[int, typer.Option(min=1, help="Tile side in pixels.")] = 640,
+    tile: Annotated[
+        int | None, typer.Option(min=1, help="Tile side in pixels; the network's own if it has one, else 640.")
+    ] = None,
     picture: Annotated[
         Path | None, typer.Option(help="Draw the graph here, coloured by device: a .svg or .html file.")
     ] = None,
@@ -48,15 +51,16 @@ def check(
         raise typer.Exit(1)
 
 
-def _network(path: Path, dpu: "Dpu", tile_px: int, picture: Path | None, json: Path | None) -> bool:
+def _network(path: Path, dpu: "Dpu", tile: int | None, picture: Path | None, json: Path | None) -> bool:
     """Judge a file; whether its core runs whole on the DPU."""
     from deploy.dpu.checking import network_rows, summary
     from deploy.dpu.picture import write_picture
     from deploy.dpu.placement import place
-    from deploy.dpu.reading import read_network
+    from deploy.dpu.reading import own_tile_px, read_network
     from deploy.results import Document
     from deploy.tables import print_rows
 
+    tile_px = tile or own_tile_px(path) or TILE_PX
     placement = place(read_network(path, tile_px), dpu)
     title = f"{path.name} on {dpu.target.name} {dpu.name}, tile {tile_px}"
     rows = network_rows(placement, dpu, tile_px)

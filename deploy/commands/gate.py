@@ -14,7 +14,9 @@ def gate(
         Path | None, typer.Argument(metavar="[FLOAT]", help="Float ONNX or weights; a shipped pair if none.")
     ] = None,
     int8_model: Annotated[Path | None, typer.Argument(metavar="[INT8]", help="Its INT8 ONNX.")] = None,
-    variant: Annotated[str, typer.Option(help="Shipped pair of this name, where no file is given.")] = "convbeers-s",
+    variant: Annotated[
+        str | None, typer.Option(help="Shipped pair of this name, without files; convbeers-s if none.")
+    ] = None,
     max_mae: Annotated[
         float | None, typer.Option(min=0, help="Largest mean absolute difference, of full scale; 0.0007 if none.")
     ] = None,

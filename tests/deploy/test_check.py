@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import jsonschema
+import onnx
 import pytest
 import typer
 from typer.testing import CliRunner
@@ -39,6 +40,18 @@ def test_convbeers_passes_whole_in_every_spelling(tmp_path: Path) -> None:
     for make in (float_convbeers, integer_convbeers, board_convbeers):
         code, output = run(str(make(tmp_path / "n.onnx", 16, 64)))
         assert (code, "DPU subgraphs: 1" in output, "check passed" in output) == (0, True, True)
+
+
+def test_a_network_of_one_tile_is_checked_at_that(tmp_path: Path) -> None:
+    model = onnx.load(float_convbeers(tmp_path / "n.onnx", 2, 8))
+    for value in (*model.graph.input, *model.graph.output):
+        for side in value.type.tensor_type.shape.dim[2:]:
+            side.dim_value = 96
+    onnx.save(model, tmp_path / "fixed.onnx")
+    code, output = run(str(tmp_path / "fixed.onnx"))
+    assert (code, "tile 96" in output) == (0, True)
+    with pytest.raises(BeersError, match="--tile 96"):
+        run(str(tmp_path / "fixed.onnx"), "--tile", "640")
 
 
 def test_the_document_holds_subgraphs_cuts_and_remarks(tmp_path: Path) -> None:

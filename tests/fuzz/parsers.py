@@ -44,11 +44,11 @@ from profiles import load_sensor, load_target
 from profiles.errors import BeersError
 from profiles.scene_call import load_scene_call
 from quant.float_reader import correction_graph
-from quant.host_reader import spelling_fault
+from quant.host_reader import spelling_faults
 from quant.limits import read_limits
 from quant.onnx_file import fixed_tile_px, load_onnx
 from quant.radius import receptive_radius_px
-from quant.relus import relu_count
+from quant.relus import count_relus
 from quant.saturation import rounded_tensors, saturated_shares
 from quant.session import open_any_size, open_session, run
 from tests.deploy.dpu.graphs import board_convbeers, float_convbeers, integer_convbeers
@@ -115,8 +115,8 @@ def understand_onnx(path: Path) -> None:
         fixed_tile_px,
         receptive_radius_px,
         correction_graph,
-        relu_count,
-        spelling_fault,
+        count_relus,
+        spelling_faults,
         rounded_tensors,
     ):
         _asked(question, model)

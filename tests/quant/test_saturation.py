@@ -51,6 +51,23 @@ def test_shares_are_those_of_the_values(zero_point: np.ndarray | None, relu: boo
     assert shares["whole"] > 0.1
 
 
+def test_a_relu_between_two_roundings_reads_the_first() -> None:
+    """QuantizeLinear, DequantizeLinear, Relu, QuantizeLinear: what is below zero was to be cut off."""
+    model = qdq(1 / 400, np.array(0, np.int8))
+    model.graph.node[1].output[0] = "float"
+    model.graph.node.extend(
+        [
+            helper.make_node("Relu", ["float"], ["positive"]),
+            helper.make_node("QuantizeLinear", ["positive", "scale", "zero"], ["again"]),
+            helper.make_node("DequantizeLinear", ["again", "scale", "zero"], ["restored"]),
+        ]
+    )
+    signed = (IMAGE - 0.5) * 2
+    shares = saturated_shares(model, [signed])
+    lost = float((signed * 400 >= 126.5).mean())
+    assert shares == {"whole": pytest.approx(lost, abs=1e-3), "again": pytest.approx(lost, abs=1e-3)}
+
+
 def test_a_scale_that_fits_saturates_nothing() -> None:
     assert saturated_shares(qdq(1 / 120, np.array(0, np.int8)), [IMAGE]) == {"whole": 0.0}
 
