@@ -10,8 +10,7 @@ import numpy as np
 import onnx
 from onnx import numpy_helper
 
-from profiles.errors import ModelError
-from quant.accepted import check_graph
+from quant.accepted import check_graph, refused_graph
 from quant.graph import CORRECTION, IMAGE, Add, Conv, Graph, Op
 from quant.untrusted import contradictions
 
@@ -39,10 +38,10 @@ def _correction_graph(model: onnx.ModelProto) -> Graph:
             ops.append(_read(node, weights))
     last = ops.pop() if ops else None
     if not (isinstance(last, Add) and last.output == restored and image in last.inputs):
-        raise _refuse("a global add of the image at the end", last.name if last else "no node")
+        raise refused_graph("a global add of the image at the end", last.name if last else "no node")
     correction = last.inputs[1 - last.inputs.index(image)]
     if any(image in op.inputs for op in ops[1:]):
-        raise _refuse("an image that only the first convolution and the global add read", "another reader")
+        raise refused_graph("an image that only the first convolution and the global add read", "another reader")
     return tuple(_rename(op, {image: IMAGE, correction: CORRECTION}) for op in ops)
 
 
@@ -54,7 +53,7 @@ def _read(node: onnx.NodeProto, weights: dict[str, np.ndarray]) -> Op:
         weight = weights[node.input[1]].astype(np.float32)
         bias = weights[node.input[2]] if len(node.input) > 2 else np.zeros(len(weight))
         return Conv(name, node.input[0], node.output[0], weight, bias.astype(np.float32))
-    raise _refuse("only same-size convolutions of stride 1, ReLU and adds", f"{node.op_type} {name}")
+    raise refused_graph("only same-size convolutions of stride 1, ReLU and adds", f"{node.op_type} {name}")
 
 
 def _is_plain(node: onnx.NodeProto, weight: np.ndarray) -> bool:
@@ -68,7 +67,7 @@ def _is_plain(node: onnx.NodeProto, weight: np.ndarray) -> bool:
 def _fuse_relu(ops: list[Op], node: onnx.NodeProto) -> None:
     before = ops[-1] if ops else None
     if not isinstance(before, Conv) or before.output != node.input[0]:
-        raise _refuse("each ReLU right behind a convolution", f"ReLU {node.name}")
+        raise refused_graph("each ReLU right behind a convolution", f"ReLU {node.name}")
     ops[-1] = replace(before, output=node.output[0], relu=True)
 
 
@@ -78,9 +77,3 @@ def _rename(op: Op, names: dict[str, str]) -> Op:
         return replace(op, input=names.get(op.input, op.input), output=output)
     left, right = (names.get(i, i) for i in op.inputs)
     return replace(op, inputs=(left, right), output=output)
-
-
-def _refuse(expected: str, got: str) -> ModelError:
-    return ModelError(
-        "float model", expected=expected, got=got, remedy="export the network with 'beers-deploy export'"
-    )

@@ -56,12 +56,14 @@ def _network(path: Path, dpu: "Dpu", tile: int | None, picture: Path | None, jso
     from deploy.dpu.checking import network_rows, summary
     from deploy.dpu.picture import write_picture
     from deploy.dpu.placement import place
-    from deploy.dpu.reading import own_tile_px, read_network
+    from deploy.dpu.reading import network_of, own_tile_px
     from deploy.results import Document
     from deploy.tables import print_rows
+    from quant.onnx_file import load_onnx
 
-    tile_px = tile or own_tile_px(path) or TILE_PX
-    placement = place(read_network(path, tile_px), dpu)
+    model = load_onnx(path, to_run=False)
+    tile_px = tile or own_tile_px(model) or TILE_PX
+    placement = place(network_of(model, tile_px, str(path)), dpu)
     title = f"{path.name} on {dpu.target.name} {dpu.name}, tile {tile_px}"
     rows = network_rows(placement, dpu, tile_px)
     print_rows(title, [row for row in rows if row.table == "nodes"])

@@ -51,13 +51,9 @@ def read_network(path: Path, tile_px: int = 640) -> Network:
     return network_of(load_onnx(path, to_run=False), tile_px, str(path))
 
 
-def own_tile_px(path: Path) -> int | None:
-    """The side of the tile that a file is fixed to, None where it takes any.
-
-    Raises:
-        ModelError: not an ONNX file.
-    """
-    dims = load_onnx(path, to_run=False).graph.input[0].type.tensor_type.shape.dim
+def own_tile_px(model: onnx.ModelProto) -> int | None:
+    """The side of the tile that a network is fixed to, None where it takes any."""
+    dims = model.graph.input[0].type.tensor_type.shape.dim
     return max((d.dim_value for d in dims[2:]), default=0) or None
 
 
