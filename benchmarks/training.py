@@ -2,28 +2,33 @@
 
     python benchmarks/training.py --variant convbeers-s
 
-What the ratio lacks of 1 is what simulating, guarding, averaging and logging cost. The two take turns, so that what
-else the machine does falls on both.
+Both are timed in float32 and in bfloat16, and the one that `train` would choose here is named. What the ratio lacks
+of 1 is what simulating, guarding, averaging and logging cost. All take turns, so that what else the machine does
+falls on each of them.
 """
 
 import argparse
 import tempfile
 import time
 from collections.abc import Callable, Iterator
-from itertools import islice
+from functools import partial
+from itertools import islice, product
 from pathlib import Path
 from statistics import median
+from typing import get_args
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from model.convbeers import VARIANTS, ConvBEERS
+from deploy.tradeoff.lab import machine
+from model.convbeers import VARIANTS
 from model.simulator.procedural import procedural_scene
 from model.training.losses import LossWeights, RestorationLoss
 from model.training.patches import PatchRecipe, PatchSource
+from model.training.precision import MixedPrecision, Precision
 from model.training.recipe import TrainingRecipe
-from model.training.trainer import MixedPrecision, Trainer
+from model.training.trainer import Trainer
 from profiles import load_sensor
 
 BATCH, PATCH_PX, TURNS = 8, 96, 5
@@ -40,16 +45,21 @@ def main() -> None:
     scenes = [procedural_scene(1200, 1600, np.random.default_rng(seed)) for seed in range(4)]
     source = PatchSource(scenes, PatchRecipe(*profiles, patch_px=PATCH_PX), BATCH, 0)
     recipe = TrainingRecipe(steps=(TURNS + 1) * arguments.steps, batch=BATCH, loss=LOSS)
-    trainer, bare_network = (Trainer(VARIANTS[arguments.variant], recipe) for _ in range(2))
-    made, batches = list(islice(source.batches(), arguments.steps)), source.batches()
-    bare, whole = [], []
+    variant, steps = VARIANTS[arguments.variant], arguments.steps
+    trainers = {name: Trainer(variant, recipe, precision=name) for name in get_args(Precision)}
+    made, batches = list(islice(source.batches(), steps)), source.batches()
+    bare: dict[str, list[float]] = {name: [] for name in trainers}
+    whole: dict[str, list[float]] = {name: [] for name in trainers}
     with tempfile.TemporaryDirectory() as folder:
-        for _ in range(TURNS + 1):
-            bare.append(rate(arguments.steps, lambda: bare_loop(bare_network.network, made)))
-            whole.append(rate(arguments.steps, lambda: run(trainer, batches, arguments.steps, Path(folder) / "c")))
-    ratios = [ours / theirs for ours, theirs in zip(whole[1:], bare[1:], strict=True)]  # the first warms up
-    rates = f"bare loop {median(bare[1:]):.1f} patches/s, training run {median(whole[1:]):.1f}"
-    print(f"{arguments.variant}: {rates}, ratio {median(ratios):.2f}")
+        for _, (name, trainer) in product(range(TURNS + 1), trainers.items()):
+            bare[name].append(rate(steps, partial(bare_loop, Trainer(variant, recipe, precision=name), made)))
+            whole[name].append(rate(steps, partial(run, trainer, batches, steps, Path(folder) / "c")))
+    print(f"{arguments.variant} on {machine()}, {torch.get_num_threads()} threads")
+    for name in trainers:
+        ratio = median(ours / theirs for ours, theirs in zip(whole[name][1:], bare[name][1:], strict=True))
+        rates = f"bare loop {median(bare[name][1:]):.1f} patches/s, training run {median(whole[name][1:]):.1f}"
+        print(f"{name}: {rates}, ratio {ratio:.2f}")  # the first turn warms up
+    print(f"train computes in {Trainer(variant, recipe).precision} here")
 
 
 def rate(steps: int, work: Callable[[], None]) -> float:
@@ -59,10 +69,10 @@ def rate(steps: int, work: Callable[[], None]) -> float:
     return steps * BATCH / (time.perf_counter() - started)
 
 
-def bare_loop(network: ConvBEERS, batches: list[tuple[Tensor, Tensor]]) -> None:
+def bare_loop(trainer: Trainer, batches: list[tuple[Tensor, Tensor]]) -> None:
     """What anybody would write: forward, loss, backward, step."""
-    forward, loss = MixedPrecision(network), RestorationLoss(LOSS)
-    optimiser = torch.optim.Adam(network.parameters(), lr=1e-4)
+    forward, loss = MixedPrecision(trainer.network, trainer.precision), RestorationLoss(LOSS)
+    optimiser = torch.optim.Adam(trainer.network.parameters(), lr=1e-4)
     for degraded, reference in batches:
         degraded = degraded.to(memory_format=torch.channels_last)
         total, _ = loss(forward(degraded), reference)

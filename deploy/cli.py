@@ -5,7 +5,7 @@
 Exit codes: 0 done, 1 a gate or check failed, 2 bad input (one sentence on standard error, nothing half-written).
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -59,15 +59,13 @@ app = typer.Typer(
 )
 
 
-def _version(wanted: bool) -> None:
-    if wanted:
-        typer.echo(f"beers-deploy {__version__}")
-        raise typer.Exit
-
-
-@app.callback()
+@app.callback(invoke_without_command=True)
 def main(
-    _: bool = typer.Option(False, "--version", callback=_version, is_eager=True, help="Print the version."),
+    context: typer.Context,
+    version: bool = typer.Option(False, "--version", help="Print the version."),
+    verbose: bool = typer.Option(
+        False, "--verbose", help="With --version: what it runs on, and what was asked of it."
+    ),
 ) -> None:
     """Check the installation before any command runs."""
     here = Path(__file__).resolve().parents[1]
@@ -79,6 +77,31 @@ def main(
             got=f"another package of that name in {there}",
             remedy="install beers-deploy in a virtual environment of its own",
         )
+    if version or context.invoked_subcommand is None:
+        typer.echo(f"beers-deploy {__version__}" if version else context.get_help())
+        for line in _installation() if version and verbose else ():
+            typer.echo(line)
+        raise typer.Exit
+
+
+def _installation() -> Iterator[str]:
+    """What this installation runs on: its system, its runtimes, and what its kernels were asked, a line each."""
+    from importlib.metadata import PackageNotFoundError
+    from importlib.metadata import version as version_of
+
+    from deploy.results import host
+    from model.processor import bfloat16_speed, int8_adds_exactly
+
+    int8_adds_exactly()
+    bfloat16_speed()
+    for key, value in host().items():
+        shown = value if isinstance(value, dict) else {key: value}
+        yield from (f"{name.replace('_', ' ')}: {each}" for name, each in shown.items())
+    for package in ("onnxruntime", "onnx", "torch", "numpy", "openvino"):
+        try:
+            yield f"{package}: {version_of(package)}"
+        except PackageNotFoundError:
+            yield f"{package}: not installed"
 
 
 def example(text: str) -> str:

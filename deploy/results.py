@@ -14,6 +14,7 @@ from typing import Literal
 
 from deploy import __version__
 from model.files import sha256, write_text
+from model.processor import decided
 
 SCHEMA_NAME, SCHEMA_VERSION = "beers-deploy/results", 1
 SCHEMA_PATH = Path(__file__).parent / "schema" / "results-1.json"
@@ -144,7 +145,7 @@ class Document:
 
 
 def host() -> dict[str, object]:
-    """What the measured figures were measured on."""
+    """What the measured figures were measured on, and what of its kernels had to be asked for them."""
     import psutil
 
     return {
@@ -154,6 +155,7 @@ def host() -> dict[str, object]:
         "cpus": psutil.cpu_count() or 1,
         "memory_gb": round(psutil.virtual_memory().total / 1e9, 1),
         "load_1_min": round(psutil.getloadavg()[0], 2),
+        "kernels": decided(),
     }
 
 

@@ -26,6 +26,7 @@ from model.simulator.scene import Scene, read_scene
 from model.training.checkpoint import finish
 from model.training.losses import RestorationLoss
 from model.training.patches import PatchRecipe, PatchSource
+from model.training.precision import Precision
 from model.training.recipe import TrainingRecipe
 from model.training.stored_pairs import StoredPairs, pair_files
 from model.training.trainer import Progress, Schedule, Source, Trainer
@@ -61,6 +62,7 @@ class Run:
     validate_steps: int = 1000
     tensorboard: bool = False
     device: str = "cpu"
+    precision: Precision | None = None
 
     @property
     def checkpoint(self) -> Path:
@@ -91,6 +93,7 @@ def train(run: Run, resume: bool, worker: Worker, say: Callable[[str], None]) ->
         run.device,
         start_weights(run),
         load_network(run.teacher)[0] if run.teacher else None,
+        run.precision,
     )
     if loss.perceptual is not None:
         loss.perceptual.to(trainer.device)
@@ -102,7 +105,8 @@ def train(run: Run, resume: bool, worker: Worker, say: Callable[[str], None]) ->
     source, validation, names = data(run, trainer)
     _train(run, trainer, source, validation)
     if worker.first:
-        finish(trainer.averaged(), run.weights, about(run, names, validation.names, loss))
+        told = about(run, names, validation.names, loss) | {"precision": trainer.precision}
+        finish(trainer.averaged(), run.weights, told)
 
 
 def start_weights(run: Run) -> Mapping[str, Tensor] | None:
@@ -184,7 +188,7 @@ def _train(run: Run, trainer: Trainer, source: Source, validation: Validation) -
 
 def _show(bar: Steps, now: Progress) -> None:
     terms = ", ".join(f"{name} {value:.5f}" for name, value in now.terms.items())
-    bar.advance(now.step - bar.done, f"{terms}, {now.patches_per_s:.0f} patches/s")
+    bar.advance(now.step - bar.done, f"{terms}, {now.patches_per_s:.0f} patches/s in {now.precision}")
 
 
 class Log:

@@ -7,10 +7,12 @@ Activations round half up; a runtime that computes in float rounds half to even.
 one half the two differ by one unit: `half_even` takes the runtime's rule, so that both can be proven and counted.
 """
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from itertools import product
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 
 from quant.core import IntConv, IntCore
 from quant.graph import CORRECTION, Add
@@ -23,6 +25,9 @@ INT32_BITS = 31
 
 FLOAT32_WHOLE_MAX = 2**24
 """Up to here float32 holds whole numbers exactly, and sums them in any order."""
+
+STRIP_VALUES = 1 << 22
+"""Values of the windows that are laid out at a time: 16 MB of float32."""
 
 
 @dataclass(frozen=True)
@@ -110,22 +115,23 @@ def _conv(
 
 
 def _convolve(image: np.ndarray, weight: np.ndarray) -> np.ndarray:
-    """Same-size convolution with zero padding: a product of matrices a tap, in floats that hold its sums exactly."""
+    """Same-size convolution with zero padding, (N, I, H, W) by (O, I, k, k): a product of matrices a strip of rows.
+
+    In floats that hold its sums exactly; the windows of a whole image would take kh kw times its memory.
+    """
     largest = 128 * int(np.abs(weight.astype(np.int64)).sum((1, 2, 3)).max(initial=0))
     exact = np.float32 if largest <= FLOAT32_WHOLE_MAX else np.float64
-    count, margin = len(image), weight.shape[2] // 2
-    wide = np.pad(image.astype(exact), ((0, 0), (0, 0), (margin, margin), (margin, margin)))
-    height, width = image.shape[2:]
-    sums = np.zeros((count, len(weight), height * width), exact)
-    for (dy, dx), tap in _taps(weight.astype(exact)):
-        sums += tap @ wide[:, :, dy : dy + height, dx : dx + width].reshape(count, -1, height * width)
-    return sums.reshape(count, len(weight), height, width).astype(np.int64)
-
-
-def _taps(weight: np.ndarray) -> Iterator[tuple[tuple[int, int], np.ndarray]]:
-    """Each place of a kernel with its matrix (O, I)."""
-    for dy, dx in np.ndindex(weight.shape[2:]):
-        yield (dy, dx), np.ascontiguousarray(weight[:, :, dy, dx])
+    kernel, matrix = weight.shape[2], weight.reshape(len(weight), -1).astype(exact)
+    ends = (kernel // 2, kernel // 2)
+    wide = np.pad(image.astype(exact), ((0, 0), (0, 0), ends, ends))
+    windows = sliding_window_view(wide, (kernel, kernel), (2, 3))
+    count, _, height, width = image.shape
+    sums = np.empty((count, len(weight), height, width), np.int64)
+    rows = max(STRIP_VALUES // (matrix.shape[1] * width), 1)
+    for number, top in product(range(count), range(0, height, rows)):
+        strip = windows[number, :, top : top + rows].transpose(0, 3, 4, 1, 2).reshape(matrix.shape[1], -1)
+        sums[number, :, top : top + rows] = (matrix @ strip).reshape(len(weight), -1, width)
+    return sums
 
 
 def _add(core: IntCore, op: Add, tensors: dict[str, np.ndarray], faults: Faults) -> tuple[np.ndarray, int, float]:

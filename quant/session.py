@@ -1,15 +1,15 @@
 """An onnxruntime session, set up once for the whole project."""
 
-import platform
-from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
 import onnx
 import onnxruntime as ort
 
+from model.processor import int8_adds_exactly
 from profiles.errors import ModelError
 from quant.fillers import filled
+from quant.kernels import is_integer, made_exact
 from quant.onnx_file import any_size, load_onnx
 from quant.untrusted import contradictions, times
 
@@ -21,16 +21,13 @@ def open_session(
     exact: bool | None = None,
     profile: Path | None = None,
 ) -> ort.InferenceSession:
-    """Open a model on the CPU.
-
-    x86 processors without VNNI add pairs of int8 products in saturating int16: other numbers than the DPU's. There
-    onnxruntime is told to take its exact kernels, which cost speed.
+    """Open a model on the CPU, such that its integers are added exactly whatever the processor (`quant.kernels`).
 
     Args:
         model: a file or a model in memory.
         threads: 0 takes every core.
         optimise: False runs the graph as written.
-        exact: take the exact int8 kernels; None decides by the processor.
+        exact: take the ways of a processor whose int8 kernels saturate; None asks the processor.
         profile: write the runtime's own profile to files of this prefix.
 
     Raises:
@@ -42,10 +39,6 @@ def open_session(
     options.log_severity_level = 4  # what fails is raised, and said once
     # Threads that wait for this session's next run take a core from whoever runs meanwhile, for tens of milliseconds.
     options.add_session_config_entry("session.force_spinning_stop", "1")
-    if exact is None:
-        exact = not has_vnni()
-    if exact:
-        options.add_session_config_entry("session.x64quantprecision", "1")
     if not optimise:
         options.graph_optimization_level = ort.GraphOptimizationLevel.ORT_DISABLE_ALL
     if profile is not None:
@@ -55,23 +48,16 @@ def open_session(
     name = "ONNX model" if isinstance(model, onnx.ModelProto) else str(model)
     with contradictions(name):
         known = filled(known) if optimise else known
+        if is_integer(known) and (not int8_adds_exactly() if exact is None else exact):
+            known, _ = made_exact(known)
+            # Left to itself, onnxruntime makes integer convolutions of float ones between 8-bit tensors.
+            options.add_session_config_entry("session.disable_quant_qdq", "1")
     try:
         return ort.InferenceSession(known.SerializeToString(), options, providers=["CPUExecutionProvider"])
     except Exception as error:  # onnxruntime raises a class of its own for each status code
         got = " ".join(str(error).split())[:160]
         remedy = "give a file written by 'beers-deploy export' or 'beers-deploy quantize'"
         raise ModelError(name, expected="a model that onnxruntime runs", got=got, remedy=remedy) from error
-
-
-@lru_cache(maxsize=1)
-def has_vnni() -> bool:
-    """Whether int8 products are added exactly by this processor; False where it cannot be told."""
-    if platform.machine().lower() not in ("x86_64", "amd64"):
-        return True  # the saturating instruction is x86's own
-    try:
-        return "vnni" in Path("/proc/cpuinfo").read_text(encoding="utf-8")
-    except OSError:
-        return False
 
 
 def open_any_size(model: onnx.ModelProto, optimise: bool = True) -> ort.InferenceSession:

@@ -42,6 +42,9 @@ def train(
     tensorboard: Annotated[bool, typer.Option("--tensorboard", help="Write TensorBoard scalars too.")] = False,
     seed: Annotated[int, typer.Option(min=0, help="Seed of weights and patches.")] = 0,
     device: Annotated[str, typer.Option(help="cpu, or cuda.")] = "cpu",
+    precision: Annotated[
+        str | None, typer.Option(help="float32 or bfloat16; by default what is faster on this processor.")
+    ] = None,
     resume: Annotated[bool, typer.Option("--resume", help="Go on from the run's checkpoint.")] = False,
 ) -> None:
     """Train a network on pairs simulated on the fly, or stored; resumable, the same weights for the same seed.
@@ -57,6 +60,7 @@ def train(
     from model.files import require_writable
     from model.training.losses import LossWeights
     from model.training.patches import PatchRecipe
+    from model.training.precision import Precision
     from model.training.recipe import Optimiser, TrainingRecipe
     from model.training.workers import joined
     from profiles import load_sensor
@@ -64,6 +68,8 @@ def train(
 
     if optimiser not in get_args(Optimiser):
         raise OptionError("--optimiser", expected="adam or adamw", got=repr(optimiser), remedy="pick one")
+    if precision not in (None, *get_args(Precision)):
+        raise OptionError("--precision", expected="float32 or bfloat16", got=repr(precision), remedy="pick one")
     if pairs is not None and (images is not None or drawn):
         remedy = "leave one out"
         raise OptionError("--pairs", expected="no --images or --drawn beside it", got="both", remedy=remedy)
@@ -91,6 +97,7 @@ def train(
         validate_every,
         tensorboard,
         device,
+        precision,  # type: ignore[arg-type]
     )
     require_writable(run.weights)
     with joined(device) as worker:

@@ -3,12 +3,14 @@
 import math
 from dataclasses import asdict
 from pathlib import Path
+from typing import cast, get_args
 
 import torch
 from torch import Tensor
 
 from model.convbeers import ConvBEERS
 from model.training.guards import Guards
+from model.training.precision import Precision
 from model.training.recipe import TrainingRecipe
 from model.weights_file import all_finite, load_network, read_tensors, save_network, write_tensors
 from profiles.errors import ModelError
@@ -26,14 +28,16 @@ def write_checkpoint(
     recipe: TrainingRecipe,
     step: int,
     guards: Guards,
+    precision: Precision,
 ) -> None:
-    """Write weights, their running average, the optimiser's moments, the step and the guards."""
+    """Write weights, their running average, the optimiser's moments, the step, the guards and the precision."""
     tensors = {f"network.{k}": v for k, v in network.state_dict().items()}
     tensors |= {f"average.{k}": v for k, v in average.items()}
     for name, parameter in network.named_parameters():
         for moment, value in optimiser.state.get(parameter, {}).items():
             tensors[f"moment.{name}.{moment}"] = value
-    write_tensors(path, tensors, {"step": step, "guards": guards.to_json(), "recipe": asdict(recipe)})
+    header = {"step": step, "guards": guards.to_json(), "recipe": asdict(recipe), "precision": precision}
+    write_tensors(path, tensors, header)
 
 
 def read_checkpoint(
@@ -42,8 +46,8 @@ def read_checkpoint(
     average: dict[str, Tensor],
     optimiser: torch.optim.Optimizer,
     recipe: TrainingRecipe,
-) -> tuple[int, Guards]:
-    """Fill network, average and optimiser from a checkpoint; the step it stands at, and its guards.
+) -> tuple[int, Guards, Precision]:
+    """Fill network, average and optimiser from a checkpoint; its step, its guards and what it was computed in.
 
     Raises:
         ModelError: not a checkpoint, or one of another recipe or network.
@@ -58,6 +62,9 @@ def read_checkpoint(
         step = int(str(header["step"]))
         if not 0 <= step <= recipe.steps:
             raise ValueError(f"step {step} of {recipe.steps}")
+        precision = header["precision"]
+        if precision not in get_args(Precision):
+            raise ValueError(f"precision {precision!r}")
     except (AttributeError, LookupError, TypeError, ValueError, OverflowError) as error:
         got = " ".join(str(error).split())[:120]
         remedy = "choose the variant it was begun with"
@@ -68,7 +75,7 @@ def read_checkpoint(
     for name, parameter in network.named_parameters():
         moments = _part(tensors, f"moment.{name}.")
         optimiser.state[parameter] = {k: _placed(k, v, parameter) for k, v in moments.items()}
-    return step, guards
+    return step, guards, cast(Precision, precision)
 
 
 def finish(network: ConvBEERS, path: Path, recipe: dict[str, object]) -> ConvBEERS:

@@ -10,13 +10,14 @@ from pathlib import Path
 from typing import Protocol
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from model.convbeers import ConvBEERS, Variant, initialise
 from model.training.checkpoint import read_checkpoint, write_checkpoint
 from model.training.guards import Guards
 from model.training.interrupts import held_back
 from model.training.losses import RestorationLoss
+from model.training.precision import MixedPrecision, Precision, choose_precision
 from model.training.recipe import TrainingRecipe
 from model.training.workers import Worker
 
@@ -31,12 +32,13 @@ class Source(Protocol):
 
 @dataclass(frozen=True)
 class Progress:
-    """What a run reports now and then: the means of the loss's terms since the last report."""
+    """What a run reports now and then, the means of the loss's terms since the last report among it."""
 
     step: int
     steps: int
     terms: Mapping[str, float]
     patches_per_s: float
+    precision: Precision
 
 
 @dataclass(frozen=True)
@@ -50,25 +52,6 @@ class Schedule:
     validate: Callable[[int, ConvBEERS], None] = field(default=lambda *_: None)
 
 
-class MixedPrecision(nn.Module):
-    """The network with its body in bfloat16.
-
-    Head, tail and the global add stay float32: 8 bits of mantissa would round a 12-bit image.
-    """
-
-    def __init__(self, network: ConvBEERS) -> None:
-        super().__init__()
-        self.network = network
-
-    def forward(self, image: Tensor) -> Tensor:
-        """(N, 1, H, W) to the same."""
-        shallow = self.network.head(image)
-        with torch.autocast(image.device.type, dtype=torch.bfloat16):
-            deep = self.network.body_end(self.network.body(shallow))
-        correction: Tensor = self.network.tail(shallow + deep.float())
-        return image + correction
-
-
 class Trainer:
     """One run: its network, running average, optimiser and step.
 
@@ -80,6 +63,7 @@ class Trainer:
         device: where the steps are computed.
         start: weights to go on from, as `state_dict`; None draws new ones.
         teacher: a network whose outputs the recipe's `distil` weighs.
+        precision: what the body is computed in; None measures what is faster here.
     """
 
     def __init__(
@@ -91,6 +75,7 @@ class Trainer:
         device: str = "cpu",
         start: Mapping[str, Tensor] | None = None,
         teacher: ConvBEERS | None = None,
+        precision: Precision | None = None,
     ) -> None:
         self.recipe, self.worker = recipe, worker or Worker()
         self.loss, self.device = loss or RestorationLoss(recipe.loss), self.worker.device(device)
@@ -100,10 +85,15 @@ class Trainer:
         if start is not None:
             self.network.load_state_dict(dict(start))
         self.network.to(self.device).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-        self.forward = self.worker.wrap(MixedPrecision(self.network))
-        self.teacher = MixedPrecision(teacher.to(self.device)) if teacher is not None else None
+        self._wanted, self._teacher = precision, teacher.to(self.device) if teacher is not None else None
+        self._compute_in(choose_precision(precision, None, self.worker, self.device))
         self.average = {k: v.detach().clone() for k, v in self.network.state_dict().items()}
         self.optimiser = _optimiser(self.network, recipe)
+
+    def _compute_in(self, precision: Precision) -> None:
+        self.precision: Precision = precision
+        self.forward = self.worker.wrap(MixedPrecision(self.network, precision))
+        self.teacher = MixedPrecision(self._teacher, precision) if self._teacher is not None else None
 
     def run(self, source: Source, checkpoint: Path, schedule: Schedule) -> None:
         """Train to the last step. Ctrl-C leaves a checkpoint of the last whole step.
@@ -179,15 +169,17 @@ class Trainer:
         """Write all that an exact resume needs; of several workers, the first does."""
         if self.worker.first:
             parts = self.network, self.average, self.optimiser, self.recipe, self.step, self.guards
-            write_checkpoint(path, *parts)
+            write_checkpoint(path, *parts, self.precision)
 
     def resume(self, path: Path) -> None:
-        """Go on from a checkpoint of the same recipe.
+        """Go on from a checkpoint of the same recipe, begun on this processor or another.
 
         Raises:
             ModelError: not a checkpoint, or one of another recipe.
         """
-        self.step, self.guards = read_checkpoint(path, self.network, self.average, self.optimiser, self.recipe)
+        parts = self.network, self.average, self.optimiser, self.recipe
+        self.step, self.guards, begun = read_checkpoint(path, *parts)
+        self._compute_in(choose_precision(self._wanted, begun, self.worker, self.device))
 
 
 class Meter:
@@ -212,7 +204,7 @@ class Meter:
         trainer, elapsed_s = self._trainer, max(time.monotonic() - self._started, 1e-9)
         patches = (trainer.step - self._step) * trainer.recipe.batch * trainer.worker.count
         terms = {name: value / max(self._count, 1) for name, value in self._sums.items()}
-        progress = Progress(trainer.step, trainer.recipe.steps, terms, patches / elapsed_s)
+        progress = Progress(trainer.step, trainer.recipe.steps, terms, patches / elapsed_s, trainer.precision)
         self._clear()
         return progress
 

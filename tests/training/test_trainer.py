@@ -233,7 +233,7 @@ from test_trainer import VARIANT, Schedule, Trainer, TrainingRecipe, worker_sour
 from model.training.workers import joined
 torch.set_num_threads(1)
 with joined("cpu") as worker:
-    trainer = Trainer(VARIANT, TrainingRecipe(steps=3, batch=3, warm_up_steps=1), worker=worker)
+    trainer = Trainer(VARIANT, TrainingRecipe(steps=3, batch=3, warm_up_steps=1), worker=worker, precision="float32")
     trainer.run(worker_source(worker), Path(sys.argv[1]), Schedule())
 """
 
@@ -268,7 +268,7 @@ def test_two_workers_do_the_steps_of_one_with_a_batch_twice_as_large(tmp_path: P
     )
     assert result.returncode == 0, result.stderr[-2000:]
     recipe = TrainingRecipe(steps=3, batch=3, warm_up_steps=1)
-    alone, two = Trainer(VARIANT, recipe), Trainer(VARIANT, recipe)
+    alone, two = (Trainer(VARIANT, recipe, precision="float32") for _ in range(2))
     alone.run(Together(), tmp_path / "one", Schedule())
     two.resume(tmp_path / "two")
     start = Trainer(VARIANT, recipe)

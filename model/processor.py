@@ -1,0 +1,85 @@
+"""What this processor's kernels do, asked of the runtimes that run them.
+
+Names of processors and lists of their features say little: an emulator shows its host's, other systems show none,
+and a runtime may not use what is there. So each question is a tiny computation whose right answer is known, put once
+a process, when somebody needs it.
+"""
+
+import time
+from functools import lru_cache
+
+import numpy as np
+
+TERMS, CHANNELS = 16, 16
+ACTIVATION, WEIGHT = 255, 127
+"""Two neighbouring products of these make 64 770: twice what int16 holds."""
+
+FEWEST_TURNS, ASKING_S = 3, 0.1
+"""Of a timed question: its first turn sets up, and others may meet a busy machine."""
+
+_decided: dict[str, str] = {}
+
+
+def decided() -> dict[str, str]:
+    """What was asked in this process so far, and the answer in words."""
+    return dict(_decided)
+
+
+@lru_cache(maxsize=1)
+def int8_adds_exactly() -> bool:
+    """Whether onnxruntime's products of uint8 activations and int8 weights are added without saturation.
+
+    On x86 processors without VNNI pairs of products are added in saturating int16.
+    """
+    stated = _product_sum()
+    exact = stated == TERMS * ACTIVATION * WEIGHT
+    _decided["int8"] = "adds exactly" if exact else "saturates; networks are computed in ways that do not"
+    return exact
+
+
+def _product_sum() -> int:
+    """The sum of TERMS products of the largest numbers, as onnxruntime's integer kernels have it."""
+    import onnxruntime as ort
+    from onnx import TensorProto, helper, numpy_helper
+
+    weights = numpy_helper.from_array(np.full((TERMS, CHANNELS), WEIGHT, np.int8), "weights")
+    product = helper.make_node("MatMulInteger", ["activations", "weights"], ["sums"])
+    given = helper.make_tensor_value_info("activations", TensorProto.UINT8, [CHANNELS, TERMS])
+    wanted = helper.make_tensor_value_info("sums", TensorProto.INT32, [CHANNELS, CHANNELS])
+    graph = helper.make_graph([product], "probe", [given], [wanted], [weights])
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
+    options = ort.SessionOptions()
+    options.intra_op_num_threads = 1
+    session = ort.InferenceSession(model.SerializeToString(), options, providers=["CPUExecutionProvider"])
+    activations = np.full((CHANNELS, TERMS), ACTIVATION, np.uint8)
+    return int(session.run(None, {"activations": activations})[0].min())
+
+
+@lru_cache(maxsize=1)
+def bfloat16_speed() -> float:
+    """How many times as fast as float32 torch's convolutions are in bfloat16 here, forward and backward.
+
+    Above 1 where the processor has units for bfloat16; where they are emulated, about 0.1.
+    """
+    import torch
+
+    convolution = torch.nn.Conv2d(32, 32, 3, padding=1).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+    images = torch.ones(4, 32, 48, 48).to(memory_format=torch.channels_last).requires_grad_()
+
+    def time_s(in_bfloat16: bool) -> float:
+        begun = time.perf_counter()
+        with torch.autocast("cpu", dtype=torch.bfloat16, enabled=in_bfloat16):
+            result = convolution(images)
+        result.float().sum().backward()
+        return time.perf_counter() - begun
+
+    threads, begun, turns = torch.get_num_threads(), time.perf_counter(), list[tuple[float, float]]()
+    torch.set_num_threads(1)  # threads that wait for a core which others use would be timed instead
+    try:  # in turns, so that what else the machine does falls on both
+        while len(turns) < FEWEST_TURNS or time.perf_counter() - begun < ASKING_S:
+            turns.append((time_s(in_bfloat16=False), time_s(in_bfloat16=True)))
+    finally:
+        torch.set_num_threads(threads)
+    ratio = min(float32_s for float32_s, _ in turns) / min(bfloat16_s for _, bfloat16_s in turns)
+    _decided["bfloat16"] = f"convolutions at {ratio:.2g} times the speed of float32"
+    return ratio

@@ -1,0 +1,214 @@
+"""INT8 operators that add exactly, also on processors whose fast kernels do not.
+
+x86 processors without VNNI multiply unsigned activations by signed weights and add neighbouring products in
+saturating int16 (`vpmaddubsw`). What lies beyond is clipped without a word, which gives other numbers than the
+DPU's. There a session computes each operator in the fastest way that is proven exact, chosen as the file is opened:
+
+1. SIGNED: weights stay as they are, for no two neighbouring products can leave int16, whatever the activations.
+   a. A tensor behind a ReLU is stored as 128..255 around 128. Moved down to 0..127 around 0, no weights saturate.
+   b. Otherwise all pairs of weights that a kernel may form are looked at.
+2. UNSIGNED: weights stored as uint8, 128 higher and around 128. These kernels add in int32, at half the speed.
+3. CONVERTED: the same for signed activations, which are moved to uint8 before the operator, and back behind it.
+
+Each is the same sum of the same whole numbers, so the results are those of an exact processor, bit for bit.
+"""
+
+import hashlib
+from collections import defaultdict
+from dataclasses import dataclass
+from enum import StrEnum
+
+import numpy as np
+import onnx
+from onnx import TensorProto, helper, numpy_helper
+
+from quant.onnx_file import constants
+from quant.untrusted import refused
+
+INT16_MAX, INT16_MIN = 32767, -32768
+MIDDLE, UINT8_MAX = 128, 255
+
+
+class Way(StrEnum):
+    """How an operator is computed where the fast kernels saturate."""
+
+    signed = "int8 weights, proven not to saturate"
+    unsigned = "uint8 weights"
+    converted = "uint8 weights and activations"
+
+
+@dataclass(frozen=True)
+class Places:
+    """Where an operator holds its activations' zero point, its weights, their zero point and its result's."""
+
+    zero: int
+    weight: int
+    weight_zero: int
+    result_zero: int | None
+
+
+OPERATORS = {
+    "QLinearConv": Places(2, 3, 5, 7),
+    "QLinearMatMul": Places(2, 3, 5, 7),
+    "ConvInteger": Places(2, 1, 3, None),
+    "MatMulInteger": Places(2, 1, 3, None),
+}
+"""ONNX's operators whose kernels multiply 8-bit numbers. Activations are the first input; a None result is int32."""
+
+REQUANTISING = {"QLinearConv": 7, "QLinearAdd": 7}
+"""What may write a tensor behind which a ReLU is moved down, and where it holds its result's zero point."""
+
+
+def is_integer(model: onnx.ModelProto) -> bool:
+    """Whether a model holds 8-bit tensors: operators of integers, or float ones between such tensors (QDQ)."""
+    return any(node.op_type in (*OPERATORS, "DequantizeLinear") for node in model.graph.node)
+
+
+def made_exact(model: onnx.ModelProto) -> tuple[onnx.ModelProto, dict[str, Way]]:
+    """The model with the same results on kernels that add exactly, and the way of each operator by its name.
+
+    Raises:
+        ModelError: an operator of which nothing can be proven, for its signed weights are no constants of the file.
+    """
+    work = _Rewriting(model)
+    for node in [each for each in work.model.graph.node if each.op_type == "Max"]:
+        work.move_relu_down(node)
+    nodes = [each for node in work.model.graph.node for each in work.around(node)]
+    del work.model.graph.node[:]
+    work.model.graph.node.extend(nodes)
+    return work.model, work.ways
+
+
+def cannot_saturate(kind: str, weight: np.ndarray, largest: int) -> bool:
+    """Whether no pair of neighbouring products can leave int16, for any activations from 0 to `largest`.
+
+    Args:
+        kind: the ONNX operator.
+        weight: int8, (O, I, kh, kw) of a convolution, (..., I, O) of a product of matrices.
+        largest: the largest activation as it is stored.
+    """
+    rows = _rows(kind, weight)
+    # Pairs begin at even places. Where an odd number of channels lets them straddle taps, all neighbours count.
+    step = 2 if kind == "QLinearConv" and weight.shape[1] % 2 == 0 else 1
+    first, second = rows[:, :-1:step], rows[:, 1::step]
+    highest = np.maximum(first, 0) + np.maximum(second, 0)
+    lowest = np.minimum(first, 0) + np.minimum(second, 0)
+    return bool((largest * highest <= INT16_MAX).all() and (largest * lowest >= INT16_MIN).all())
+
+
+def _rows(kind: str, weight: np.ndarray) -> np.ndarray:
+    """The weights of each result in the order of the sum, (O, terms) int64."""
+    if kind == "QLinearConv":  # over the channels of a tap, then tap by tap
+        ordered = np.moveaxis(weight.reshape(*weight.shape[:2], -1), 1, 2)
+    else:
+        ordered = weight if kind == "ConvInteger" else np.moveaxis(weight, -1, 0)
+    return ordered.reshape(len(ordered), -1).astype(np.int64)
+
+
+class _Rewriting:
+    """A copy of the model, what is known of it, and the ways chosen so far."""
+
+    def __init__(self, model: onnx.ModelProto) -> None:
+        self.model = onnx.ModelProto()
+        self.model.CopyFrom(model)
+        self.arrays, self.ways = constants(model), dict[str, Way]()
+        self.writers = {name: node for node in self.model.graph.node for name in node.output}
+        self.readers: dict[str, list[onnx.NodeProto]] = defaultdict(list)
+        for node in self.model.graph.node:
+            for name in node.input:
+                self.readers[name].append(node)
+        self.kept = {value.name for value in self.model.graph.output}
+        self.largest: dict[str, int] = {}
+
+    def move_relu_down(self, relu: onnx.NodeProto) -> None:
+        """Store what is behind max(result, its zero point) around 0: min(result moved down, what is left of 255).
+
+        Left as it is where anything but the operators above would notice.
+        """
+        source, result = relu.input[0], relu.output[0]
+        middle = self.arrays.get(relu.input[1]) if len(relu.input) == 2 else None
+        writer = self.writers.get(source)
+        if middle is None or middle.dtype != np.uint8 or middle.size != 1 or writer is None:
+            return
+        own = len(self.readers[source]) == 1 and not self.kept & {source, result}
+        written = writer.op_type in REQUANTISING and self._holds(writer, REQUANTISING[writer.op_type], middle)
+        if not own or not written or not all(self._reads(node, result, middle) for node in self.readers[result]):
+            return
+        zero, self.largest[result] = self._constant(np.uint8(0)), UINT8_MAX - int(middle.ravel()[0])
+        writer.input[REQUANTISING[writer.op_type]] = zero
+        relu.op_type, relu.input[1] = "Min", self._constant(np.uint8(self.largest[result]))
+        for reader in self.readers[result]:
+            reader.input[OPERATORS[reader.op_type].zero] = zero
+
+    def _reads(self, node: onnx.NodeProto, name: str, zero: np.ndarray) -> bool:
+        """Whether a node is an operator that reads the tensor as its activations, around this zero point."""
+        places = OPERATORS.get(node.op_type)
+        return places is not None and list(node.input).count(name) == 1 and self._holds(node, places.zero, zero)
+
+    def _holds(self, node: onnx.NodeProto, place: int, value: np.ndarray) -> bool:
+        held = self.arrays.get(node.input[place]) if place < len(node.input) else None
+        return held is not None and held.dtype == value.dtype and held.ravel().tolist() == value.ravel().tolist()
+
+    def around(self, node: onnx.NodeProto) -> list[onnx.NodeProto]:
+        """The node computed in an exact way, with what converts before and behind it."""
+        places = OPERATORS.get(node.op_type)
+        if places is None:
+            return [node]
+        weight = self.arrays.get(node.input[places.weight])
+        if weight is None:
+            got = f"{node.op_type} {node.name or node.output[0]!r} with computed weights"
+            remedy = "store its weights as constants, or run it on a processor with VNNI"
+            raise refused("INT8 model", "weights that are constants, which this processor needs", got, remedy)
+        if weight.dtype != np.int8:
+            return [node]
+        name = node.name or node.output[0]
+        if cannot_saturate(node.op_type, weight, self.largest.get(node.input[0], UINT8_MAX)):
+            self.ways[name] = Way.signed
+            return [node]
+        self._lift(node, places.weight, places.weight_zero)
+        zero = self.arrays.get(node.input[places.zero])
+        signed = zero is not None and zero.dtype == np.int8
+        self.ways[name] = Way.converted if signed else Way.unsigned
+        return self._converted(node, places) if signed else [node]
+
+    def _lift(self, node: onnx.NodeProto, *places: int) -> None:
+        """Constants of int8 as uint8, 128 higher; a zero point that the operator leaves out is 0."""
+        for place in places:
+            node.input.extend([""] * (place + 1 - len(node.input)))
+            value = self.arrays.get(node.input[place], np.zeros((), np.int8))
+            node.input[place] = self._constant((value.astype(np.int16) + MIDDLE).astype(np.uint8))
+
+    def _converted(self, node: onnx.NodeProto, places: Places) -> list[onnx.NodeProto]:
+        """The node on uint8 activations, between what moves them up and, where it is of 8 bits, its result down."""
+        self._lift(node, places.zero)
+        before, node.input[0] = self._moved(node.input[0], MIDDLE, TensorProto.UINT8)
+        if places.result_zero is None:
+            return [*before, node]
+        self._lift(node, places.result_zero)
+        result, node.output[0] = node.output[0], f"{node.output[0]}.unsigned"
+        behind, _ = self._moved(node.output[0], -MIDDLE, TensorProto.INT8, result)
+        return [*before, node, *behind]
+
+    def _moved(self, source: str, by: int, kind: int, result: str = "") -> tuple[list[onnx.NodeProto], str]:
+        """An 8-bit tensor as another type of 8 bits, its numbers that much higher; made once for all its readers."""
+        result = result or f"{source}.unsigned"
+        if result in self.writers and self.writers[result].op_type == "Cast":
+            return [], result
+        wide, moved = f"{result}.wide", f"{result}.moved"
+        nodes = [
+            helper.make_node("Cast", [source], [wide], name=wide, to=TensorProto.INT32),
+            helper.make_node("Add", [wide, self._constant(np.int32(by))], [moved], name=moved),
+            helper.make_node("Cast", [moved], [result], name=f"{result}.cast", to=kind),
+        ]
+        self.writers[result] = nodes[-1]
+        return nodes, result
+
+    def _constant(self, value: np.ndarray | np.generic) -> str:
+        """A constant of the model that holds this value."""
+        array = np.asarray(value)
+        digest = hashlib.sha256(array.tobytes()).hexdigest()[:16]
+        name = f"exact.{array.dtype}.{'x'.join(map(str, array.shape))}.{digest}"
+        if name not in self.arrays:
+            self.arrays[name] = array
+            self.model.graph.initializer.append(numpy_helper.from_array(array, name))
+        return name

@@ -1,0 +1,216 @@
+"""Integer operators are added exactly, in the ways that a processor takes whose fast kernels saturate.
+
+The ways are forced, so that they are proven on every processor; where the kernels do saturate, leaving them out
+fails (`test_left_alone_they_saturate_where_the_processor_does`).
+"""
+
+from pathlib import Path
+
+import numpy as np
+import onnx
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from onnx import TensorProto, helper, numpy_helper
+
+from model.processor import int8_adds_exactly
+from model.shipped import SHIPPED
+from profiles.errors import ModelError
+from quant.host_reader import read_core
+from quant.integer import merged_correction, run_core
+from quant.kernels import INT16_MAX, INT16_MIN, Way, cannot_saturate, made_exact
+from quant.onnx_file import load_onnx
+from quant.planes import split
+from quant.session import open_session, run
+
+SHAPES = [(1, 1, 1), (3, 5, 3), (4, 6, 1), (16, 16, 3), (5, 33, 3), (32, 8, 2), (17, 32, 3)]
+"""(outputs, inputs, kernel) of convolutions: odd ones straddle what a kernel takes at a time."""
+
+
+def convolution(
+    weight: np.ndarray, kind: type[np.uint8 | np.int8], groups: int = 1, per_channel: bool = False
+) -> onnx.ModelProto:
+    """QLinearConv of images (N, C, H, W) of 8 bits by int8 weights (O, C / groups, k, k), asymmetric, with a bias."""
+    outputs, terms = len(weight), weight[0].size
+    unit = 2.0 ** -np.ceil(np.log2(terms * 127))
+    constants = {
+        "unit": np.float32(1),
+        "middle": np.asarray(100 if kind is np.uint8 else -7, kind),
+        "weight": weight,
+        "weight_unit": 2.0 ** (np.arange(outputs) % 3).astype(np.float32) if per_channel else np.float32(1),
+        "weight_middle": np.zeros(outputs, np.int8) if per_channel else np.int8(3),
+        "result_unit": np.float32(1 / unit / 4),
+        "bias": np.arange(outputs, dtype=np.int32) * 1001 - 7,
+    }
+    feeds = ["image", "unit", "middle", "weight", "weight_unit", "weight_middle", "result_unit", "middle", "bias"]
+    element = helper.np_dtype_to_tensor_dtype(np.dtype(kind))
+    ends = [helper.make_tensor_value_info(name, element, ["N", None, "H", "W"]) for name in ("image", "result")]
+    held = [numpy_helper.from_array(np.asarray(value), name) for name, value in constants.items()]
+    node = helper.make_node("QLinearConv", feeds, ["result"], name="convolution", group=groups)
+    graph = helper.make_graph([node], "one", ends[:1], ends[1:], held)
+    return helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
+
+
+def by_definition(model: onnx.ModelProto, image: np.ndarray) -> np.ndarray:
+    """What such a convolution is, tap by tap in int64: no padding, halves to even."""
+    held = {tensor.name: numpy_helper.to_array(tensor) for tensor in model.graph.initializer}
+    groups = model.graph.node[0].attribute[0].i
+    shifted = image.astype(np.int64) - int(held["middle"])
+    weight = held["weight"].astype(np.int64) - held["weight_middle"].astype(np.int64).reshape(-1, *([1] * 3))[:1]
+    per_group, kernel = weight.shape[1], weight.shape[2]
+    height, width = (side - kernel + 1 for side in image.shape[2:])
+    sums = np.zeros((len(image), len(weight), height, width), np.int64)
+    for o in range(len(weight)):
+        first = o // (len(weight) // groups) * per_group
+        for dy, dx in np.ndindex(kernel, kernel):
+            seen = shifted[:, first : first + per_group, dy : dy + height, dx : dx + width]
+            sums[:, o] += np.einsum("nchw,c->nhw", seen, weight[o, :, dy, dx])
+    scale = held["weight_unit"].astype(np.float64).reshape(-1, 1, 1) / float(held["result_unit"])
+    result = np.rint((sums + held["bias"][:, None, None]) * scale) + int(held["middle"])
+    limits = np.iinfo(image.dtype)
+    return np.asarray(np.clip(result, limits.min, limits.max), image.dtype)
+
+
+@given(
+    shape=st.sampled_from(SHAPES),
+    kind=st.sampled_from([np.uint8, np.int8]),
+    per_channel=st.booleans(),
+    large=st.booleans(),
+    seed=st.integers(0, 2**32 - 1),
+)
+@settings(max_examples=40, deadline=None)
+def test_any_convolution_is_added_exactly(
+    shape: tuple[int, int, int], kind: type[np.uint8 | np.int8], per_channel: bool, large: bool, seed: int
+) -> None:
+    generator = np.random.default_rng(seed)
+    outputs, inputs, kernel = shape
+    weight = generator.integers(-128, 128, (outputs, inputs, kernel, kernel)).astype(np.int8)
+    if large:  # as many as can be at the ends of what they hold
+        weight = np.where(weight > 0, np.int8(127), np.int8(-128))
+    limits = np.iinfo(kind)
+    image = generator.choice([limits.min, limits.max, 0], (2, inputs, 7, 9)).astype(kind)
+    model = convolution(weight, kind, per_channel=per_channel)
+    for optimise in (False, True):
+        session = open_session(model, 1, optimise, exact=True)
+        assert np.array_equal(session.run(None, {"image": image})[0], by_definition(model, image))
+
+
+@pytest.mark.parametrize("groups", [2, 6])
+@pytest.mark.parametrize("kind", [np.uint8, np.int8])
+def test_grouped_and_depthwise_convolutions_are_added_exactly(groups: int, kind: type[np.uint8 | np.int8]) -> None:
+    generator = np.random.default_rng(groups)
+    weight = generator.choice([-128, 127], (12, 6 // groups, 3, 3)).astype(np.int8)
+    limits = np.iinfo(kind)
+    image = generator.choice([limits.min, limits.max], (1, 6, 9, 7)).astype(kind)
+    model = convolution(weight, kind, groups)
+    session = open_session(model, 1, exact=True)
+    assert np.array_equal(session.run(None, {"image": image})[0], by_definition(model, image))
+
+
+def test_left_alone_they_saturate_where_the_processor_does() -> None:
+    """The control: without the ways the numbers are wrong on such a processor, and right on any other."""
+    image, weight = np.full((1, 32, 5, 5), 255, np.uint8), np.full((16, 32, 3, 3), 127, np.int8)
+    model = convolution(weight, np.uint8)
+    result = open_session(model, 1, exact=False).run(None, {"image": image})[0]
+    assert np.array_equal(result, by_definition(model, image)) == int8_adds_exactly()
+
+
+@given(
+    inputs=st.integers(1, 6),
+    kernel=st.integers(1, 2),
+    largest=st.sampled_from([127, 255]),
+    seed=st.integers(0, 2**32 - 1),
+    size=st.sampled_from([63, 70, 128]),
+)
+@settings(max_examples=200, deadline=None)
+def test_what_is_proven_holds_for_the_worst_activations(
+    inputs: int, kernel: int, largest: int, seed: int, size: int
+) -> None:
+    """Of the pairs that a kernel forms from channel to channel of a tap, and across taps where they are odd."""
+    generator = np.random.default_rng(seed)
+    weight = np.clip(generator.integers(-size, size + 1, (3, inputs, kernel, kernel)), -128, 127).astype(np.int8)
+    line = np.moveaxis(weight.reshape(3, inputs, -1), 1, 2).reshape(3, -1).astype(np.int64)
+    line = np.pad(line, ((0, 0), (0, line.shape[1] % 2)))
+    pairs = line.reshape(3, -1, 2)
+    worst = [largest * np.where(sign * pairs > 0, pairs, 0).sum(-1) for sign in (1, -1)]
+    if cannot_saturate("QLinearConv", weight, largest):
+        assert worst[0].max() <= INT16_MAX
+        assert worst[1].min() >= INT16_MIN
+    elif inputs % 2 == 0:
+        assert worst[0].max() > INT16_MAX or worst[1].min() < INT16_MIN
+
+
+@pytest.mark.parametrize(
+    ("pair", "largest", "proven"),
+    [
+        ((64, 64), 255, True),  # 32 640
+        ((64, 65), 255, False),  # 32 895
+        ((127, -128), 255, True),  # each by itself
+        ((-64, -65), 255, False),
+        ((127, 127), 127, True),  # behind a ReLU, 32 258
+        ((-128, -128), 127, True),
+    ],
+)
+def test_the_limit_is_that_of_int16(pair: tuple[int, int], largest: int, proven: bool) -> None:
+    weight = np.array(pair, np.int8).reshape(1, 2, 1, 1)
+    assert cannot_saturate("QLinearConv", weight, largest) == proven
+
+
+SMALL = [SHIPPED / f"{name}-int8.onnx" for name in ("convbeers-xs", "convbeers-s", "convbeers-s-nominal")]
+
+
+@pytest.mark.parametrize("path", SMALL, ids=lambda path: path.stem)
+@pytest.mark.parametrize("optimise", [False, True])
+def test_shipped_networks_are_those_of_the_integer_reference(path: Path, optimise: bool) -> None:
+    model, generator = load_onnx(path), np.random.default_rng(5)
+    core = read_core(model)
+    drawn = generator.random((1, 1, 37, 53)), generator.integers(0, 2, (1, 1, 24, 41))
+    for image in (each.astype(np.float32) for each in drawn):
+        tensors, _ = run_core(core, split(image), half_even=True)
+        wanted = np.clip(image + merged_correction(core, tensors), 0, 1)
+        assert np.array_equal(run(open_session(model, 1, optimise, exact=True), image), wanted)
+
+
+@pytest.mark.parametrize("path", SMALL, ids=lambda path: path.stem)
+def test_behind_a_relu_no_weights_saturate_and_most_others_do_not(path: Path) -> None:
+    """What keeps INT8 faster than float32: most convolutions keep the fast kernels."""
+    ways = made_exact(load_onnx(path))[1]
+    behind = {way for name, way in ways.items() if name.endswith(".second")}
+    assert behind == {Way.signed}
+    assert sum(way == Way.signed for way in ways.values()) > len(ways) / 2
+
+
+def test_a_relu_that_somebody_else_looks_at_is_left_alone() -> None:
+    """A tensor that is wanted as an output is stored as the file says."""
+    model = load_onnx(SMALL[0])
+    relu = next(node.output[0] for node in model.graph.node if node.op_type == "Max")
+    model.graph.output.append(helper.make_tensor_value_info(relu, TensorProto.UINT8, None))
+    image = np.random.default_rng(0).random((1, 1, 13, 21), dtype=np.float32)
+    as_written, ways = open_session(model, 1, exact=False), open_session(model, 1, exact=True)
+    lowest = ways.run([relu], {"image": image})[0].min()
+    assert lowest == as_written.run([relu], {"image": image})[0].min() == 128
+
+
+def test_products_of_matrices_are_added_exactly_too() -> None:
+    generator = np.random.default_rng(1)
+    weight = generator.choice([-128, 127], (33, 17)).astype(np.int8)
+    image = generator.choice([0, 255], (5, 33)).astype(np.uint8)
+    given_, wanted = (
+        helper.make_tensor_value_info(name, kind, None)
+        for name, kind in (("image", TensorProto.UINT8), ("sums", TensorProto.INT32))
+    )
+    node = helper.make_node("MatMulInteger", ["image", "weight"], ["sums"])
+    held = [numpy_helper.from_array(weight, "weight")]
+    graph = helper.make_graph([node], "one", [given_], [wanted], held)
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
+    sums = open_session(model, 1, exact=True).run(None, {"image": image})[0]
+    assert np.array_equal(sums, image.astype(np.int64) @ weight.astype(np.int64))
+
+
+def test_weights_that_are_computed_are_refused_in_a_sentence() -> None:
+    model = convolution(np.full((4, 4, 1, 1), 3, np.int8), np.uint8)
+    stored = next(tensor for tensor in model.graph.initializer if tensor.name == "weight")
+    model.graph.initializer.remove(stored)
+    model.graph.input.append(helper.make_tensor_value_info("weight", TensorProto.INT8, [4, 4, 1, 1]))
+    with pytest.raises(ModelError, match="QLinearConv 'convolution' with computed weights"):
+        open_session(model, exact=True)
