@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Literal
 
 from deploy import __version__
+from deploy.processor import processor_name
 from model.files import sha256, write_text
 
 SCHEMA_NAME, SCHEMA_VERSION = "beers-deploy/results", 1
@@ -144,16 +145,18 @@ class Document:
 
 
 def host() -> dict[str, object]:
-    """What the measured figures were measured on."""
+    """What the measured figures were measured on; None for what this system does not tell."""
     import psutil
 
     return {
         "system": platform.system(),
         "machine": platform.machine(),
+        "processor": processor_name(),
         "python": platform.python_version(),
         "cpus": psutil.cpu_count() or 1,
         "memory_gb": round(psutil.virtual_memory().total / 1e9, 1),
-        "load_1_min": round(psutil.getloadavg()[0], 2),
+        # Windows has no such count: psutil begins one when asked, and says 0 for the first seconds.
+        "load_1_min": None if platform.system() == "Windows" else round(psutil.getloadavg()[0], 2),
     }
 
 

@@ -7,11 +7,11 @@ import platform
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from pathlib import Path
 
 import numpy as np
 import psutil
 
+from deploy.processor import processor_name
 from deploy.tradeoff.accuracy import Ground, Scores, measure, measure_images, measure_mae
 from deploy.tradeoff.cache import Cache, Key, code_digest, pixels_digest
 from deploy.tradeoff.host_time import CODE, ROUNDS, Times, take_turns
@@ -132,12 +132,4 @@ class Lab:
 
 def machine() -> str:
     """What host times hold for: the processor and its cores."""
-    return f"{platform.machine()} {platform.processor()} {_model_name()} x {psutil.cpu_count()}"
-
-
-def _model_name() -> str:
-    try:
-        with Path("/proc/cpuinfo").open(encoding="utf-8") as lines:
-            return next((line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")), "")
-    except OSError:
-        return ""
+    return f"{platform.machine()} {processor_name() or platform.processor()} x {psutil.cpu_count()}"
