@@ -5,6 +5,8 @@
 Exit codes: 0 done, 1 a gate or check failed, 2 bad input (one sentence on standard error, nothing half-written).
 """
 
+import io
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -65,11 +67,19 @@ def _version(wanted: bool) -> None:
         raise typer.Exit
 
 
+def _print_any_name() -> None:
+    """Print what the terminal's encoding lacks as an escape: not every one is UTF-8, and a name must end no run."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
+
+
 @app.callback()
 def main(
     _: bool = typer.Option(False, "--version", callback=_version, is_eager=True, help="Print the version."),
 ) -> None:
     """Check the installation before any command runs."""
+    _print_any_name()
     here = Path(__file__).resolve().parents[1]
     there = Path(str(model.__file__)).resolve().parents[1]
     if here != there:
