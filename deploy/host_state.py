@@ -46,11 +46,11 @@ def peak_memory() -> Figure:
 
 
 def _peak_bytes() -> int | None:
+    if sys.platform == "win32":
+        return int(psutil.Process().memory_info().peak_wset)
     with suppress(OSError, StopIteration):  # getrusage's count on Linux begins with what the process's parent held
         lines = STATUS.read_text(encoding="utf-8").splitlines()
         return 1024 * int(next(line for line in lines if line.startswith("VmHWM")).split()[1])
-    if (windows := getattr(psutil.Process().memory_info(), "peak_wset", None)) is not None:
-        return int(windows)
     try:
         import resource
     except ImportError:

@@ -63,21 +63,20 @@ def test_macos_counts_bytes_and_the_others_kibibytes(
 ) -> None:
     usage = SimpleNamespace(RUSAGE_SELF=0, getrusage=lambda _: SimpleNamespace(ru_maxrss=2_000_000))
     monkeypatch.setitem(sys.modules, "resource", usage)
-    monkeypatch.setattr(psutil.Process, "memory_info", lambda _: SimpleNamespace(rss=1))
     monkeypatch.setattr(host_state, "STATUS", NOWHERE)
     monkeypatch.setattr(sys, "platform", system)
     assert gigabytes(peak_memory()) == pytest.approx(2e6 * unit_bytes / 1e9)
 
 
 def test_windows_counts_a_peak_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(host_state, "STATUS", NOWHERE)
+    monkeypatch.setattr(sys, "platform", "win32")
     monkeypatch.setattr(psutil.Process, "memory_info", lambda _: SimpleNamespace(rss=1, peak_wset=700 * MEGABYTE))
     assert gigabytes(peak_memory()) == pytest.approx(0.7)
 
 
 def test_where_nothing_counts_it_there_is_a_reason_and_no_zero(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(host_state, "STATUS", NOWHERE)
-    monkeypatch.setattr(psutil.Process, "memory_info", lambda _: SimpleNamespace(rss=1))
+    monkeypatch.setattr(sys, "platform", "unheard-of")
     monkeypatch.setitem(sys.modules, "resource", None)
     figure = peak_memory()
     assert (figure.value, figure.mode) == (None, "unavailable")
