@@ -146,7 +146,7 @@ def memory(folder: Path, model: Path, size: tuple[int, int], known_rows: int | N
     write_swath(image, height, width, known_rows or height)
     arguments = ["restore", image, folder / "swath-out.tif", "--model", model, "--json", figures]
     subprocess.run([sys.executable, "-c", ENTRY, *map(str, arguments)], check=True)  # noqa: S603
-    row = json.loads(figures.read_text())["rows"][0]["figures"]
+    row = json.loads(figures.read_text(encoding="utf-8"))["rows"][0]["figures"]
     time_s, peak_gb = row["time"]["value"], row["peak memory"]["value"]
     print(f"{width} x {height}: {time_s:.0f} s, peak memory {peak_gb:.3f} GB", flush=True)
 

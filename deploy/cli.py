@@ -5,6 +5,8 @@
 Exit codes: 0 done, 1 a gate or check failed, 2 bad input (one sentence on standard error, nothing half-written).
 """
 
+import io
+import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -59,6 +61,13 @@ app = typer.Typer(
 )
 
 
+def _print_any_name() -> None:
+    """Print what the terminal's encoding lacks as an escape: not every one is UTF-8, and a name must end no run."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
+
+
 @app.callback(invoke_without_command=True)
 def main(
     context: typer.Context,
@@ -68,6 +77,7 @@ def main(
     ),
 ) -> None:
     """Check the installation before any command runs."""
+    _print_any_name()
     here = Path(__file__).resolve().parents[1]
     there = Path(str(model.__file__)).resolve().parents[1]
     if here != there:

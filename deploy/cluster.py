@@ -3,6 +3,7 @@
 import logging
 import re
 import signal
+import sys
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from importlib import import_module
@@ -68,7 +69,7 @@ def _no_interrupts_in_children() -> Iterator[None]:
 
     Threads inherit the mask, and so do the processes that they start, later ones in place of dead ones included.
     """
-    if not hasattr(signal, "pthread_sigmask"):
+    if sys.platform == "win32":  # which has no masks: every process of the console gets it
         yield
         return
     resource_tracker.ensure_running()  # begun later, it would lift the mask

@@ -8,6 +8,7 @@ Processes here make the patches, or the workers of a Dask scheduler.
 import json
 import multiprocessing
 import shutil
+import sys
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from itertools import groupby
@@ -22,6 +23,8 @@ from profiles.text import parse_json
 
 CHUNK = 32
 """Patches a worker makes before it reports: short enough to lose little to a kill."""
+MOST_PROCESSES = 61 if sys.platform == "win32" else 1 << 16
+"""Windows waits for no more at once, and Python refuses a larger pool."""
 
 
 def write_dataset(
@@ -73,7 +76,8 @@ def _run(
             yield path, make_patches(recipe, chunk, out)
         return
     # spawn: a forked copy of torch's thread pools can hang
-    with ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context("spawn")) as pool:
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(min(workers, MOST_PROCESSES), mp_context=context) as pool:
         jobs = {pool.submit(make_patches, recipe, chunk, out): path for path, chunk in waiting.items()}
         try:
             for job in as_completed(jobs):

@@ -62,7 +62,7 @@ def make_files(order: Order, windows: list[Window]) -> Made:
     with TemporaryDirectory() as name:
         folder = Path(name)
         lines = make_patches(order.recipe, windows, folder)
-        files = {str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.rglob("*.tif"))}
+        files = {path.relative_to(folder).as_posix(): path.read_bytes() for path in sorted(folder.rglob("*.tif"))}
     return Made(files, lines)
 
 

@@ -32,14 +32,22 @@ def _power(before: dict[Path, int] | str, after: dict[Path, int] | str, elapsed_
 
 def _advance(domain: Path, before: int, after: int) -> int:
     """Counts between two readings of a counter that starts again at its range; one turn at most (minutes)."""
-    return after - before if after >= before else after - before + int((domain / "max_energy_range_uj").read_text())
+    return (
+        after - before
+        if after >= before
+        else after - before + int((domain / "max_energy_range_uj").read_text(encoding="utf-8"))
+    )
 
 
 def _read(powercap: Path) -> dict[Path, int] | str:
     """Counters of the packages in microjoules, or why there are none."""
     try:
-        domains = [d for d in sorted(powercap.glob("*rapl*:*")) if (d / "name").read_text().startswith("package")]
-        counters = {domain: int((domain / "energy_uj").read_text()) for domain in domains}
+        domains = [
+            d
+            for d in sorted(powercap.glob("*rapl*:*"))
+            if (d / "name").read_text(encoding="utf-8").startswith("package")
+        ]
+        counters = {domain: int((domain / "energy_uj").read_text(encoding="utf-8")) for domain in domains}
     except (OSError, ValueError) as error:
         reason = error.strerror if isinstance(error, OSError) else "no number in it"
         return f"RAPL energy counters cannot be read here ({reason})"

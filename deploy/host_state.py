@@ -1,15 +1,19 @@
 """What this machine did while something was measured: load and clock of its CPUs, and the memory that it took."""
 
+import sys
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import psutil
 
 from deploy.results import Figure, measured, unavailable
 
 SAMPLE_S = 0.002
+STATUS = Path("/proc/self/status")
+"""Linux's own counts of this process."""
 
 
 @dataclass
@@ -30,7 +34,29 @@ def watched() -> Iterator[Watch]:
     if clocks:
         watch.clock = measured(sum(clocks) / len(clocks), "GHz", "mean of all CPUs at start and end")
     else:
-        watch.clock = unavailable("GHz", "this system does not tell its clock")
+        watch.clock = unavailable("GHz", "this system does not tell the clock of the moment")
+
+
+def peak_memory() -> Figure:
+    """Most resident memory of this process since it began, in GB; unavailable where the system does not count it."""
+    peak = _peak_bytes()
+    if peak is None:
+        return unavailable("GB", "this system counts no peak memory")
+    return measured(peak / 1e9, "GB", "resident memory of this process, highest since it began")
+
+
+def _peak_bytes() -> int | None:
+    if sys.platform == "win32":
+        return int(psutil.Process().memory_info().peak_wset)
+    with suppress(OSError, StopIteration):  # getrusage's count on Linux begins with what the process's parent held
+        lines = STATUS.read_text(encoding="utf-8").splitlines()
+        return 1024 * int(next(line for line in lines if line.startswith("VmHWM")).split()[1])
+    try:
+        import resource
+    except ImportError:
+        return None
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak if sys.platform == "darwin" else 1024 * peak  # macOS counts bytes, the others KiB
 
 
 @dataclass
@@ -41,8 +67,12 @@ class Memory:
 
 
 @contextmanager
-def peak_memory() -> Iterator[Memory]:
-    """Resident memory of this process, sampled every 2 ms over a block of work: its highest rise."""
+def memory_rise() -> Iterator[Memory]:
+    """The highest rise of this process's resident memory over a block of work, sampled every 2 ms.
+
+    No count of the system's says it: theirs begin with the process, and a block after a larger one would seem to
+    take nothing.
+    """
     memory, process, done = Memory(), psutil.Process(), threading.Event()
     start = process.memory_info().rss
 
@@ -74,5 +104,7 @@ def _load(before: tuple[float, ...], after: tuple[float, ...]) -> Figure:
 
 
 def _clock_ghz() -> float | None:
+    if sys.platform != "linux":  # elsewhere psutil knows the nominal clock alone
+        return None
     frequency = psutil.cpu_freq()
     return frequency.current / 1e3 if frequency and frequency.current else None

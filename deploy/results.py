@@ -14,7 +14,7 @@ from typing import Literal
 
 from deploy import __version__
 from model.files import sha256, write_text
-from model.processor import decided
+from model.processor import decided, processor_name
 
 SCHEMA_NAME, SCHEMA_VERSION = "beers-deploy/results", 1
 SCHEMA_PATH = Path(__file__).parent / "schema" / "results-1.json"
@@ -145,16 +145,18 @@ class Document:
 
 
 def host() -> dict[str, object]:
-    """What the measured figures were measured on, and what of its kernels had to be asked for them."""
+    """What the measured figures were measured on, and what was asked of its kernels; None for what is not told."""
     import psutil
 
     return {
         "system": platform.system(),
         "machine": platform.machine(),
+        "processor": processor_name(),
         "python": platform.python_version(),
         "cpus": psutil.cpu_count() or 1,
         "memory_gb": round(psutil.virtual_memory().total / 1e9, 1),
-        "load_1_min": round(psutil.getloadavg()[0], 2),
+        # Windows has no such count: psutil begins one when asked, and says 0 for the first seconds.
+        "load_1_min": None if platform.system() == "Windows" else round(psutil.getloadavg()[0], 2),
         "kernels": decided(),
     }
 

@@ -199,7 +199,7 @@ class Log:
         if path.exists():
             lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
             kept = [line for line in lines if not (number := STEP.match(line)) or int(number[0]) <= step]
-            path.write_text("".join(f"{line}\n" for line in kept if step), encoding="utf-8")
+            path.write_text("".join(f"{line}\n" for line in kept if step), encoding="utf-8", newline="")
 
     def write(self, step: int, values: Mapping[str, float]) -> None:
         """Add a line, and the header where there is none."""

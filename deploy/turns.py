@@ -11,7 +11,7 @@ import onnx
 from deploy.counterpart import is_quantised
 from deploy.dpu.reading import network_of
 from deploy.energy import timed
-from deploy.host_state import peak_memory
+from deploy.host_state import memory_rise
 from deploy.results import Figure, Row, measured, unavailable
 from quant.session import open_session
 
@@ -32,7 +32,7 @@ def take_turns(runs: Sequence[Timed], tile_px: int, threads: int, min_time_s: fl
     calls = []
     for run in runs:
         feed = tile_feed(run.model, tile_px, run.name)
-        with peak_memory() as memory:
+        with memory_rise() as memory:
             session = open_session(run.model, threads)
             session.run(None, feed)  # warm-up, not counted
         run.rise_bytes = memory.rise_bytes

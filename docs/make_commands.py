@@ -36,5 +36,5 @@ def _line(parameter: object) -> str:
 
 
 if __name__ == "__main__":
-    TARGET.write_text(reference(), encoding="utf-8")
+    TARGET.write_text(reference(), encoding="utf-8", newline="\n")
     sys.stdout.write(f"wrote {TARGET}\n")

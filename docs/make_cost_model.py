@@ -62,8 +62,8 @@ WHY = {
 def main() -> None:
     """Write both files."""
     cases = published_cases()
-    PROFILE.write_text(with_cost(PROFILE.read_text(encoding="utf-8"), cases), encoding="utf-8")
-    PAGE.write_text(page(cases), encoding="utf-8")
+    PROFILE.write_text(with_cost(PROFILE.read_text(encoding="utf-8"), cases), encoding="utf-8", newline="\n")
+    PAGE.write_text(page(cases), encoding="utf-8", newline="\n")
     sys.stdout.write(f"wrote {PROFILE} and {PAGE}\n")
 
 

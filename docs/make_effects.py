@@ -67,7 +67,7 @@ def main() -> None:
     scene = procedural_scene(1500, 1500, np.random.default_rng(0)).radiance
     plans = [plan_section(name, load_scene_call(name), scene) for name in scene_names()]
     text = HEAD.format(shown=shown, tolerance=make_plan(plain(), scene_stats(scene, RATIO)).tolerance_dn)
-    (HERE / "effects.md").write_text(text + "\n" + "\n".join(plans), encoding="utf-8")
+    (HERE / "effects.md").write_text(text + "\n" + "\n".join(plans), encoding="utf-8", newline="\n")
     sys.stdout.write("wrote docs/effects.png and docs/effects.md\n")
 
 

@@ -169,7 +169,7 @@ def main() -> int:
         for mutation in MUTATIONS:
             found[mutation.name] = failures_of(copy, mutation)
             bar.advance(note=mutation.name)
-    TARGET.write_text(document(found), encoding="utf-8")
+    TARGET.write_text(document(found), encoding="utf-8", newline="\n")
     sys.stdout.write(f"wrote {TARGET}\n")
     for name in survivors(found):
         sys.stdout.write(f"SURVIVED: {name}\n")

@@ -73,5 +73,5 @@ def _traditional() -> list[str]:
 
 
 if __name__ == "__main__":
-    TARGET.write_text(document(), encoding="utf-8")
+    TARGET.write_text(document(), encoding="utf-8", newline="\n")
     sys.stdout.write(f"wrote {TARGET}\n")

@@ -68,5 +68,5 @@ def measured_rows() -> list[Row]:
 
 
 if __name__ == "__main__":
-    TARGET.write_text(document(measured_rows()), encoding="utf-8")
+    TARGET.write_text(document(measured_rows()), encoding="utf-8", newline="\n")
     sys.stdout.write(f"wrote {TARGET}\n")

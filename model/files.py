@@ -56,9 +56,9 @@ def _unwritable(path: Path, got: str) -> MachineError:
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write `text` as UTF-8, whole or not at all."""
+    """Write `text` as UTF-8, whole or not at all, and the same bytes on every system: lines end as they do in it."""
     with whole_file(path) as temporary:
-        temporary.write_text(text, encoding="utf-8")
+        temporary.write_text(text, encoding="utf-8", newline="")
 
 
 def sha256(path: Path) -> str:

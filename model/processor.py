@@ -1,14 +1,16 @@
-"""What this processor's kernels do, asked of the runtimes that run them.
+"""This machine's processor: its name, and what its kernels do, asked of the runtimes that run them.
 
-Names of processors and lists of their features say little: an emulator shows its host's, other systems show none,
-and a runtime may not use what is there. So each question is a tiny computation whose right answer is known, put once
-a process, when somebody needs it.
+The name decides nothing. Lists of features would not serve either: an emulator shows its host's, other systems show
+none, and a runtime may not use what is there. So each question is a tiny computation whose right answer is known,
+put once a process, when somebody needs it.
 """
 
+import platform
+import subprocess
+import sys
 import time
 from functools import lru_cache
-
-import numpy as np
+from pathlib import Path
 
 TERMS, CHANNELS = 16, 16
 ACTIVATION, WEIGHT = 255, 127
@@ -39,6 +41,7 @@ def int8_adds_exactly() -> bool:
 
 def _product_sum() -> int:
     """The sum of TERMS products of the largest numbers, as onnxruntime's integer kernels have it."""
+    import numpy as np
     import onnxruntime as ort
     from onnx import TensorProto, helper, numpy_helper
 
@@ -83,3 +86,58 @@ def bfloat16_speed() -> float:
     ratio = min(float32_s for float32_s, _ in turns) / min(bfloat16_s for _, bfloat16_s in turns)
     _decided["bfloat16"] = f"convolutions at {ratio:.2g} times the speed of float32"
     return ratio
+
+
+COMM, CPUINFO = Path("/proc/self/comm"), Path("/proc/cpuinfo")
+"""Linux: what runs this process, and one block of lines for each core."""
+WINDOWS_KEY = r"HARDWARE\DESCRIPTION\System\CentralProcessor\0"
+
+
+@lru_cache(maxsize=1)
+def processor_name() -> str | None:
+    """Such as "AMD EPYC 7763 64-Core Processor" or "Apple M2".
+
+    None where the system tells no name, and under user-mode emulation, where the one it tells is of the processor
+    beneath the emulated one.
+    """
+    ways = {"Linux": _linux_name, "Darwin": _macos_name, "Windows": _windows_name}
+    try:
+        name = ways.get(platform.system(), str)()
+    except (OSError, subprocess.SubprocessError):
+        return None
+    return " ".join(name.split()) or None
+
+
+def _linux_name() -> str:
+    if COMM.read_text(encoding="utf-8", errors="replace").startswith("qemu-"):
+        return ""
+    cores = _fields(CPUINFO.read_text(encoding="utf-8", errors="replace"))
+    if names := cores.get("model name"):
+        return ", ".join(names)
+    if parts := cores.get("CPU part"):  # ARM's kernel knows numbers alone
+        return f"ARM part {', '.join(parts)} of implementer {', '.join(cores.get('CPU implementer', ['unknown']))}"
+    return ""
+
+
+def _fields(cpuinfo: str) -> dict[str, list[str]]:
+    """The different values of each field, in order: large and small cores have names of their own."""
+    found: dict[str, list[str]] = {}
+    for line in cpuinfo.splitlines():
+        key, _, value = (part.strip() for part in line.partition(":"))
+        if value and value not in found.setdefault(key, []):
+            found[key].append(value)
+    return found
+
+
+def _macos_name() -> str:
+    command = ["/usr/sbin/sysctl", "-n", "machdep.cpu.brand_string"]
+    return subprocess.run(command, capture_output=True, encoding="utf-8", timeout=5, check=True).stdout  # noqa: S603
+
+
+def _windows_name() -> str:
+    if sys.platform == "win32":
+        import winreg
+
+        with winreg.OpenKey(winreg.HKEY_LOCAL_MACHINE, WINDOWS_KEY) as key:
+            return str(winreg.QueryValueEx(key, "ProcessorNameString")[0])
+    return ""

@@ -46,7 +46,8 @@ def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, object]]:
     try:
         with safe_open(path, framework="pt") as file:
             header = {key: parse_json(value) for key, value in (file.metadata() or {}).items()}
-            return {key: file.get_tensor(key) for key in file.keys()}, header  # noqa: SIM118 - no mapping
+            # Copies: the library's own lie in the file, which Windows then does not replace, and others may change.
+            return {key: file.get_tensor(key).clone() for key in file.keys()}, header  # noqa: SIM118 - no mapping
     except (SafetensorError, OSError, ValueError, LookupError, TypeError, RuntimeError) as error:
         got = "no such file" if not path.exists() else " ".join(str(error).split())[:120]
         remedy = "give a file written by 'beers-deploy train'"

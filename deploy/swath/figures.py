@@ -1,7 +1,7 @@
 """What a run says of itself: its plan in a sentence, and its figures."""
 
+from deploy.host_state import peak_memory
 from deploy.results import Figure, Row, measured, predicted, unavailable
-from deploy.swath.memory import peak_memory
 from deploy.swath.options import Options
 from deploy.swath.plan import Plan
 from deploy.swath.reader import Source

@@ -1,75 +1,60 @@
 """One run at a time on one output. The system holds the lock, so that one left by a killed process blocks nobody."""
 
-import os
-import sys
+import errno
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
+from filelock import BaseFileLock, FileLock, Timeout
+
 from profiles.errors import MachineError
 
 NAME = "lock"
+GRACE_S = 0.2
+"""How long to wait for a run that ends just now: it takes the lock's file along, and who waits makes a new one."""
+ENOTSUPP = 524
+"""Linux's own number beside ENOTSUP, which some network file systems let out."""
+NO_LOCKS = (errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOLCK, ENOTSUPP)
 
 
 @contextmanager
 def only_run(out: Path, folder: Path) -> Iterator[None]:
     """Hold `folder`, where a run keeps what it needs for `out`; in the end it is gone, unless rows were left in it.
 
-    It locks nothing on Windows, nor on a disk that has no locks, as some of networks.
+    It locks nothing on a disk that has no locks, as some of networks.
 
     Raises:
         MachineError: another run holds it, or it cannot be made.
     """
-    handle = _take(out, folder)
+    lock = _take(out, folder)
     try:
         yield
     finally:
+        with suppress(OSError):  # Windows removes no open file: there it goes with the release
+            (folder / NAME).unlink()  # while it is ours: whoever has opened it finds out and begins again
+        with suppress(OSError):
+            lock.release()
         with suppress(OSError):  # rows for --resume lie there
-            if handle is not None and _leads_to(folder / NAME, handle):
-                (folder / NAME).unlink()  # while it is ours: whoever opens it now finds out and begins again
             folder.rmdir()
-        if handle is not None:
-            os.close(handle)
 
 
-def _take(out: Path, folder: Path) -> int | None:
-    """The lock, as an open file; None where there are no locks."""
-    if sys.platform == "win32":
-        return None
+def _take(out: Path, folder: Path) -> BaseFileLock:
+    """The lock, held; where there are no locks it holds nothing."""
+    # A file that only stands for a lock would outlive a killed run: rather none where the system has none.
+    lock = FileLock(folder / NAME, timeout=GRACE_S, thread_local=False, fallback_to_soft=False)
+    until_s = time.monotonic() + GRACE_S
     while True:
         try:
             folder.mkdir(parents=True, exist_ok=True)
-            handle = os.open(folder / NAME, os.O_RDWR | os.O_CREAT, 0o666)
-        except FileNotFoundError:  # the folder went with a run that ended just now
-            continue
-        except OSError as error:
-            got, remedy = error.strerror or str(error), "choose another path"
-            raise MachineError(str(folder), expected="a folder to write to", got=got, remedy=remedy) from error
-        if not _lock(handle):
-            os.close(handle)
+            lock.acquire()
+        except Timeout as error:
             got, remedy = "another one at work", "wait for its end or choose another output"
-            raise MachineError(str(out), expected="no other run on this output", got=got, remedy=remedy)
-        if _leads_to(folder / NAME, handle):
-            return handle
-        os.close(handle)  # of a run that ended just now
-
-
-def _lock(handle: int) -> bool:
-    """Whether no other process holds the lock."""
-    import fcntl
-
-    try:
-        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return False
-    except OSError:  # a disk without locks
-        return True
-    return True
-
-
-def _leads_to(path: Path, handle: int) -> bool:
-    """Whether the path is still that of the open file."""
-    try:
-        return os.path.samestat(path.stat(), os.fstat(handle))
-    except FileNotFoundError:
-        return False
+            raise MachineError(str(out), expected="no other run on this output", got=got, remedy=remedy) from error
+        except OSError as error:
+            if isinstance(error, FileNotFoundError) and time.monotonic() < until_s:
+                continue  # the folder went with a run that ended just now
+            if error.errno not in NO_LOCKS:
+                got, remedy = error.strerror or str(error), "choose another path"
+                raise MachineError(str(folder), expected="a folder to write to", got=got, remedy=remedy) from error
+        return lock

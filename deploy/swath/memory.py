@@ -1,35 +1,10 @@
-"""What a run takes of memory: what the process held at most, and whether what is to come fits in the budget."""
-
-import sys
-from contextlib import suppress
-from pathlib import Path
+"""What a run takes of memory, and whether it fits in the budget."""
 
 import psutil
 
-from deploy.results import Figure, measured, unavailable
 from deploy.swath.plan import Plan
 from deploy.swath.reader import Source
 from profiles.errors import MachineError
-
-
-def peak_memory() -> Figure:
-    """Peak resident memory in GB; unavailable where the system keeps no such count."""
-    try:
-        peak = _peak_bytes()
-    except ImportError:
-        return unavailable("GB", "this system counts no peak memory")
-    return measured(peak / 1e9, "GB", "resident memory of this process, highest since it began")
-
-
-def _peak_bytes() -> int:
-    """Linux's own count where there is one: getrusage's begins with what the process's parent held."""
-    with suppress(OSError, StopIteration):
-        lines = Path("/proc/self/status").read_text(encoding="utf-8").splitlines()
-        return 1024 * int(next(line for line in lines if line.startswith("VmHWM")).split()[1])
-    import resource
-
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return peak if sys.platform == "darwin" else 1024 * peak
 
 
 def rows_bytes(source: Source, plan: Plan, begun: bool = False) -> int:

@@ -9,9 +9,10 @@ from threading import Lock
 
 import numpy as np
 
+from deploy.host_state import peak_memory
 from deploy.swath.engine import restore_row
 from deploy.swath.job import fingerprint
-from deploy.swath.memory import check_memory, is_bulky, peak_memory, rows_bytes
+from deploy.swath.memory import check_memory, is_bulky, rows_bytes
 from deploy.swath.options import Options
 from deploy.swath.plan import Plan
 from deploy.swath.reader import Source, open_source

@@ -7,7 +7,6 @@ import platform
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from pathlib import Path
 
 import numpy as np
 import psutil
@@ -21,6 +20,7 @@ from deploy.tradeoff.networks import operations_per_px
 from deploy.tradeoff.points import EXACT, Point, Unit
 from deploy.tradeoff.seams import cut_in_four
 from deploy.tradeoff.shelf import Shelf
+from model.processor import processor_name
 
 S_PER_OPERATION = {"INT8": 1e-11, "float": 3e-11}
 S_PER_PX = {"network": 5e-7, "chain": 5e-6, "peer": 3e-6}
@@ -132,12 +132,4 @@ class Lab:
 
 def machine() -> str:
     """What host times hold for: the processor and its cores."""
-    return f"{platform.machine()} {platform.processor()} {_model_name()} x {psutil.cpu_count()}"
-
-
-def _model_name() -> str:
-    try:
-        with Path("/proc/cpuinfo").open(encoding="utf-8") as lines:
-            return next((line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")), "")
-    except OSError:
-        return ""
+    return f"{platform.machine()} {processor_name() or platform.processor()} x {psutil.cpu_count()}"

@@ -202,15 +202,15 @@ class PowerMeter:
             self.samples_w.append(self._read_w())
 
     def _read_w(self) -> float:
-        return sum(int(file.read_text()) for file in self._files) / 1e6
+        return sum(int(file.read_text(encoding="utf-8")) for file in self._files) / 1e6
 
 
 def write_entry(entry: dict[str, object], path: Path) -> None:
     """Add a run to the list in a file."""
-    runs = json.loads(path.read_text()) if path.is_file() else []
+    runs = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else []
     if not isinstance(runs, list):
         raise ValueError(f"{path}: expected a JSON list of runs, got {type(runs).__name__}: give another --out")
-    path.write_text(json.dumps([*runs, entry], indent=1) + "\n")
+    path.write_text(json.dumps([*runs, entry], indent=1) + "\n", encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -105,7 +105,7 @@ def _read_safetensors(path: Path, names: Iterable[str]) -> Mapping[str, Tensor]:
         for name in names:
             if name not in held:
                 raise KeyError(name)
-        return {name: file.get_tensor(name) for name in names}
+        return {name: file.get_tensor(name).clone() for name in names}  # the library's own lie in the file
 
 
 def _read_npz(path: Path, names: Iterable[str]) -> Mapping[str, Tensor]:

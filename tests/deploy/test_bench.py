@@ -39,7 +39,7 @@ def run(command: str, *arguments: str) -> tuple[int, str]:
 
 
 def document(path: Path) -> dict[str, list[dict[str, object]]]:
-    content = json.loads(path.read_text())
+    content = json.loads(path.read_text(encoding="utf-8"))
     jsonschema.validate(content, json.loads(SCHEMA_PATH.read_text()))
     return dict(content)
 

@@ -28,7 +28,7 @@ def run(*arguments: str) -> tuple[int, str]:
 
 
 def tables(path: Path) -> dict[str, list[dict[str, Any]]]:
-    content = json.loads(path.read_text())
+    content = json.loads(path.read_text(encoding="utf-8"))
     jsonschema.validate(content, json.loads(SCHEMA_PATH.read_text()))
     found: dict[str, list[dict[str, Any]]] = {}
     for row in content["rows"]:

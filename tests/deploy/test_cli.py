@@ -1,6 +1,7 @@
 """The command line as a user meets it: help, exit codes, one sentence for each fault, nothing half-written."""
 
 import json
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -92,6 +93,18 @@ def test_tile_size_changes_no_pixel(tmp_path: Path) -> None:
         arguments = ["restore", str(image), str(tmp_path / f"{tile}.tif"), "--tile", tile]
         assert runner.invoke(app, arguments).exit_code == 0
     np.testing.assert_array_equal(tifffile.imread(tmp_path / "48.tif"), tifffile.imread(tmp_path / "640.tif"))
+
+
+def test_a_name_that_the_terminal_cannot_show_ends_no_run(tmp_path: Path) -> None:
+    image = acquisition(tmp_path / "\u6771\u4eac.tif", 40, 50)
+    command = [sys.executable, "-c", "from deploy.cli import app; app()", "restore", image, tmp_path / "out.tif"]
+    environment = {**os.environ, "PYTHONIOENCODING": "cp1252"}  # as pipes have it on Windows
+    done = subprocess.run(
+        list(map(str, command)), env=environment, capture_output=True, encoding="cp1252", check=False
+    )
+    assert done.returncode == 0, done.stderr
+    assert "\\u6771\\u4eac" in done.stdout
+    assert tifffile.imread(tmp_path / "out.tif").shape == (40, 50)
 
 
 def bad_images(folder: Path) -> dict[str, Path]:

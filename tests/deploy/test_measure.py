@@ -13,7 +13,7 @@ from deploy.bench import Swath
 from deploy.counterpart import counterpart, is_quantised
 from deploy.cpu_side import board_cpu_row, slowdown
 from deploy.defaults import float_model
-from deploy.host_state import peak_memory, watched
+from deploy.host_state import memory_rise, watched
 from deploy.measure import Sensors, drawn_acquisition, host_rows, traditional_rows
 from deploy.profiler import node_rows, profile
 from deploy.results import Row
@@ -101,7 +101,7 @@ def test_every_node_of_the_runtime_has_its_time(tmp_path: Path) -> None:
 
 
 def test_memory_that_is_taken_and_given_back_is_seen() -> None:
-    with peak_memory() as memory:
+    with memory_rise() as memory:
         block = np.ones(40_000_000, np.uint8)
         time.sleep(0.1)
         del block

@@ -91,7 +91,8 @@ def test_an_attempt_would_be_seen(no_sockets: list[tuple[object, ...]]) -> None:
 
 def alone(home: Path, *arguments: object) -> subprocess.CompletedProcess[str]:
     """Python where a user would start it: no variable is set that makes libraries hold their tongues in CI."""
-    environment = {"PATH": os.environ["PATH"], "HOME": str(home), "TMPDIR": str(home)}
+    inherited = {name: os.environ[name] for name in ("PATH", "SYSTEMROOT") if name in os.environ}
+    environment = {**inherited, "HOME": str(home), "TMPDIR": str(home)}
     command = [sys.executable, *map(str, arguments)]
     return subprocess.run(
         command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=300, check=False

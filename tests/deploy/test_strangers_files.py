@@ -38,7 +38,7 @@ def document(path: Path, value: object, name: str = "int8") -> Path:
     """Results with one figure of any value."""
     asked = dict.fromkeys(PATCHES)
     made = Document("gate", asked, (), (Row("gate", name, {"MAE": measured(1.0, "", "here")}),)).to_json()
-    path.write_text(json.dumps(made).replace('"value": 1.0', f'"value": {value}'))
+    path.write_text(json.dumps(made).replace('"value": 1.0', f'"value": {value}'), encoding="utf-8")
     return path
 
 

@@ -1,12 +1,14 @@
 """Two runs never write one output at once, and no dead one stands in the way."""
 
-import os
+import errno
 import subprocess
 import sys
 import threading
+import time
 from pathlib import Path
 
 import numpy as np
+import psutil
 import pytest
 import tifffile
 
@@ -16,8 +18,6 @@ from deploy.swath.lock import only_run
 from deploy.swath.options import Options
 from deploy.swath.run import restore_file
 from profiles.errors import MachineError
-
-pytest.importorskip("fcntl", reason="this system has no locks of files")
 
 ENTRY = "from deploy.cli import app; app()"
 TILE_PX = 64
@@ -67,6 +67,58 @@ def test_a_killed_run_stands_in_nobody_s_way(image: Path, tmp_path: Path) -> Non
     assert sorted(p.name for p in tmp_path.iterdir()) == ["in.tif", "out.tif"]
 
 
+def test_a_killed_process_loses_its_lock_and_a_stopped_one_does_not(tmp_path: Path) -> None:
+    out, folder = tmp_path / "out", tmp_path / ".out.part"
+    hold = f"""
+import time
+from pathlib import Path
+from deploy.swath.lock import only_run
+with only_run(Path({str(out)!r}), Path({str(folder)!r})):
+    print("held", flush=True)
+    time.sleep(600)
+"""
+    with subprocess.Popen([sys.executable, "-c", hold], stdout=subprocess.PIPE, text=True) as holder:
+        try:
+            assert holder.stdout is not None
+            assert holder.stdout.readline() == "held\n"
+            psutil.Process(holder.pid).suspend()
+            with pytest.raises(MachineError, match="no other run"), only_run(out, folder):
+                pass
+        finally:
+            holder.kill()
+    with only_run(out, folder):
+        assert (folder / lock.NAME).is_file()
+    assert not folder.exists()
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="flock is what POSIX systems lock by")
+@pytest.mark.parametrize("number", lock.NO_LOCKS)
+def test_a_disk_without_locks_locks_nothing_and_is_left_clean(
+    number: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import fcntl
+
+    def refuse(*_: int) -> None:
+        raise OSError(number, "no locks here")
+
+    monkeypatch.setattr(fcntl, "flock", refuse)
+    folder = tmp_path / ".out.part"
+    with only_run(tmp_path / "out", folder), only_run(tmp_path / "out", folder):
+        pass
+    assert not folder.exists()
+
+
+def test_a_folder_that_never_comes_is_one_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Such as a drive that is not there: no run that just ended took it along."""
+
+    def missing(self: Path, *_: object, **__: object) -> None:
+        raise FileNotFoundError(errno.ENOENT, "no such drive", str(self))
+
+    monkeypatch.setattr(Path, "mkdir", missing)
+    with pytest.raises(MachineError, match="no such drive"), only_run(tmp_path / "out", tmp_path / ".out.part"):
+        pass
+
+
 def test_rows_outlive_the_lock(tmp_path: Path) -> None:
     folder = tmp_path / ".out.part"
     with only_run(tmp_path / "out", folder):
@@ -84,18 +136,20 @@ def test_it_is_given_back_after_an_error(tmp_path: Path) -> None:
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows removes no file that is open: nothing can come between")
 def test_a_run_that_ends_just_then_takes_no_lock_along(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Between opening the file and locking it, the run that held it ends: the lock must be on the new file."""
-    folder, taken = tmp_path / ".out.part", lock._lock
-    ends = iter([True, True, False])
+    import fcntl
 
-    def ending(handle: int) -> bool:
-        if next(ends):
+    folder, taken, ends = tmp_path / ".out.part", fcntl.flock, iter([True, True, False])
+
+    def ending(handle: int, operation: int) -> None:
+        if operation & fcntl.LOCK_EX and next(ends):
             (folder / lock.NAME).unlink()
             folder.rmdir()
-        return taken(handle)
+        taken(handle, operation)
 
-    monkeypatch.setattr(lock, "_lock", ending)
+    monkeypatch.setattr(fcntl, "flock", ending)
     with only_run(tmp_path / "out", folder):
         monkeypatch.undo()
         assert (folder / lock.NAME).is_file()
@@ -112,7 +166,7 @@ def test_many_that_try_are_never_two_at_once(tmp_path: Path) -> None:
                 with only_run(tmp_path / "out", tmp_path / ".out.part"):
                     inside[0] += 1
                     most[0] = max(most[0], inside[0])
-                    os.sched_yield()
+                    time.sleep(0)
                     inside[0] -= 1
             except MachineError:
                 refused[0] += 1

@@ -35,7 +35,7 @@ def run(images: Path, out: Path, *more: str, steps: int = 4) -> str:
 
 
 def rows(path: Path) -> list[dict[str, str]]:
-    with path.open() as file:
+    with path.open(encoding="utf-8") as file:
         return list(csv.DictReader(file))
 
 

@@ -1,10 +1,18 @@
-"""The processor is asked by computing: its answers hold for larger computations of the same kind."""
+"""The processor is asked by computing, and its answers hold for larger computations; its system tells its name."""
+
+import platform
+import shutil
+import subprocess
+import sys
+from pathlib import Path
 
 import numpy as np
 import onnxruntime as ort
+import pytest
 from onnx import TensorProto, helper, numpy_helper
 
-from model.processor import bfloat16_speed, decided, int8_adds_exactly
+from model import processor
+from model.processor import bfloat16_speed, decided, int8_adds_exactly, processor_name
 
 
 def convolved(image: np.ndarray, weight: np.ndarray, scale: float) -> np.ndarray:
@@ -43,3 +51,59 @@ def test_what_was_asked_is_told_in_words() -> None:
 def test_the_speed_of_bfloat16_is_measured_once_a_process() -> None:
     """Two answers could differ on a busy machine, and one run must not mix them."""
     assert bfloat16_speed() == bfloat16_speed() > 0
+
+
+NOWHERE = Path("no such file")
+
+
+def named(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, cpuinfo: str, comm: str = "python3\n") -> str | None:
+    (tmp_path / "comm").write_text(comm, encoding="utf-8")
+    (tmp_path / "cpuinfo").write_text(cpuinfo, encoding="utf-8")
+    monkeypatch.setattr(processor, "COMM", tmp_path / "comm")
+    monkeypatch.setattr(processor, "CPUINFO", tmp_path / "cpuinfo")
+    monkeypatch.setattr(platform, "system", lambda: "Linux")
+    return processor_name.__wrapped__()
+
+
+X86 = "".join(f"processor\t: {core}\nmodel name\t: Some  CPU @ 2.0GHz\nflags\t\t: a b\n\n" for core in range(3))
+CORE = "processor\t: {}\nCPU implementer\t: 0x41\nCPU architecture: 8\nCPU part\t: {}\n\n"
+ARM = "".join(CORE.format(core, part) for core, part in enumerate(["0xd03", "0xd03", "0xd09"]))
+
+
+@pytest.mark.parametrize(
+    ("cpuinfo", "name"),
+    [
+        (X86, "Some CPU @ 2.0GHz"),
+        (ARM, "ARM part 0xd03, 0xd09 of implementer 0x41"),
+        ("processor : 0\nisa : rv64imafdc\n", None),
+        ("", None),
+        ("\x00: \n:::\n", None),
+    ],
+)
+def test_linux_names_it_or_nothing_does(
+    cpuinfo: str, name: str | None, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    assert named(monkeypatch, tmp_path, cpuinfo) == name
+
+
+def test_the_processor_beneath_an_emulated_one_lends_it_no_name(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    assert named(monkeypatch, tmp_path, X86, comm="qemu-x86_64\n") is None
+
+
+@pytest.mark.skipif(
+    shutil.which("qemu-x86_64") is None or platform.machine() != "x86_64",
+    reason="no qemu-x86_64 (Debian's package qemu-user) on an x86-64 machine",
+)
+def test_under_a_real_emulator_there_is_no_name() -> None:
+    ask = "from model.processor import processor_name; print(processor_name())"
+    command = ["qemu-x86_64", "-cpu", "Nehalem", sys.executable, "-c", ask]
+    assert subprocess.run(command, capture_output=True, text=True, check=True).stdout == "None\n"
+
+
+def test_a_system_that_cannot_be_asked_gives_none(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(processor, "COMM", NOWHERE)
+    for system in ("Linux", "Darwin", "Windows", "Java", ""):
+        monkeypatch.setattr(platform, "system", lambda system=system: system)
+        assert processor_name.__wrapped__() is None or system == platform.uname().system

@@ -1,6 +1,7 @@
 """TOML and JSON that would hang, exhaust memory or end in a traceback."""
 
 import os
+import sys
 from pathlib import Path
 
 import pytest
@@ -75,17 +76,19 @@ def test_the_depth_is_exact(depth: int, sound: bool) -> None:
             parse_json(text)
 
 
-def test_pipes_devices_and_huge_files_are_not_read(tmp_path: Path) -> None:
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no pipes and devices among its files")
+def test_pipes_and_devices_are_not_read(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe.json")
+    for path in (tmp_path / "pipe.json", Path("/dev/zero")):
+        with pytest.raises(ValueError, match="regular"):
+            read_json(path)
+
+
+def test_huge_files_are_not_read(tmp_path: Path) -> None:
     with (tmp_path / "huge.json").open("wb") as stream:
         stream.truncate(JSON_BYTES + 1)
-    for path, word in (
-        (tmp_path / "pipe.json", "regular"),
-        (Path("/dev/zero"), "regular"),
-        (tmp_path / "huge.json", "more"),
-    ):
-        with pytest.raises(ValueError, match=word):
-            read_json(path)
+    with pytest.raises(ValueError, match="more"):
+        read_json(tmp_path / "huge.json")
     with pytest.raises(FileNotFoundError):
         read_json(tmp_path / "none.json")
 

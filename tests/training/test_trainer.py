@@ -146,7 +146,7 @@ def test_finished_weights_carry_their_recipe(tmp_path: Path) -> None:
 def test_ctrl_c_finishes_the_step_and_leaves_a_checkpoint_of_it(number: int, tmp_path: Path) -> None:
     def report(progress: Progress) -> None:
         if progress.step == 4:
-            os.kill(os.getpid(), number)
+            signal.raise_signal(number)
 
     trainer = Trainer(VARIANT, TrainingRecipe(steps=8, batch=3, warm_up_steps=2))
     with pytest.raises(KeyboardInterrupt):
@@ -160,7 +160,7 @@ def test_a_second_ctrl_c_stops_at_once() -> None:
     def ask(times: int) -> bool:
         with held_back() as interrupt:
             for _ in range(times):
-                os.kill(os.getpid(), signal.SIGINT)
+                signal.raise_signal(signal.SIGINT)
             return interrupt.asked
 
     assert ask(1)
@@ -252,6 +252,7 @@ class Together:
             yield torch.cat([one[0], other[0]]), torch.cat([one[1], other[1]])
 
 
+@pytest.mark.skipif(sys.platform == "win32", reason="torch for Windows lacks the libuv that torchrun asks for")
 def test_two_workers_do_the_steps_of_one_with_a_batch_twice_as_large(tmp_path: Path) -> None:
     script = tmp_path / "worker.py"
     script.write_text(WORKER)

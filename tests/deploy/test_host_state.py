@@ -1,0 +1,88 @@
+"""What the machine's system says of a process's memory, on systems of every kind."""
+
+import platform
+import subprocess
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+
+import psutil
+import pytest
+
+from deploy import host_state
+from deploy.host_state import peak_memory
+from deploy.results import Figure, host
+from model.processor import processor_name
+
+MEGABYTE = 1_000_000
+NOWHERE = Path("no such file")
+
+
+def gigabytes(figure: Figure) -> float:
+    assert figure.value is not None, figure.reason
+    return figure.value
+
+
+TAKE = """
+import sys
+from deploy.host_state import peak_memory
+before = peak_memory().value
+block = b"x" * int(sys.argv[1])
+del block
+print(before, peak_memory().value)
+"""
+
+
+@pytest.mark.parametrize("taken_mb", [0, 300])
+def test_memory_that_was_given_back_is_still_in_the_peak(taken_mb: int) -> None:
+    command = [sys.executable, "-c", TAKE, str(taken_mb * MEGABYTE)]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    before, after = map(float, done.stdout.split())
+    assert 0.005 < before < 0.3
+    assert after - before == pytest.approx(taken_mb / 1e3, abs=0.01)
+
+
+def test_the_peak_is_this_process_s_own_not_its_parent_s() -> None:
+    block = b"x" * (400 * MEGABYTE)
+    done = subprocess.run([sys.executable, "-c", TAKE, "0"], capture_output=True, text=True, check=True)
+    assert gigabytes(peak_memory()) > len(block) / 1e9
+    assert float(done.stdout.split()[1]) < 0.3
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="another way is the only one here")
+def test_every_posix_system_s_way_agrees_with_linux_s_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    own = gigabytes(peak_memory())
+    monkeypatch.setattr(host_state, "STATUS", NOWHERE)
+    assert own * 0.95 < gigabytes(peak_memory()) < psutil.virtual_memory().total / 1e9  # a parent may have held more
+
+
+@pytest.mark.parametrize(("system", "unit_bytes"), [("darwin", 1), ("freebsd14", 1024)])
+def test_macos_counts_bytes_and_the_others_kibibytes(
+    system: str, unit_bytes: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    usage = SimpleNamespace(RUSAGE_SELF=0, getrusage=lambda _: SimpleNamespace(ru_maxrss=2_000_000))
+    monkeypatch.setitem(sys.modules, "resource", usage)
+    monkeypatch.setattr(host_state, "STATUS", NOWHERE)
+    monkeypatch.setattr(sys, "platform", system)
+    assert gigabytes(peak_memory()) == pytest.approx(2e6 * unit_bytes / 1e9)
+
+
+def test_windows_counts_a_peak_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "platform", "win32")
+    monkeypatch.setattr(psutil.Process, "memory_info", lambda _: SimpleNamespace(rss=1, peak_wset=700 * MEGABYTE))
+    assert gigabytes(peak_memory()) == pytest.approx(0.7)
+
+
+def test_where_nothing_counts_it_there_is_a_reason_and_no_zero(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(host_state, "STATUS", NOWHERE)
+    monkeypatch.setattr(sys, "platform", "unheard-of")
+    monkeypatch.setitem(sys.modules, "resource", None)
+    figure = peak_memory()
+    assert (figure.value, figure.mode) == (None, "unavailable")
+    assert figure.reason
+
+
+def test_results_say_what_they_were_measured_on(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert host()["processor"] == processor_name()
+    monkeypatch.setattr(platform, "system", lambda: "Windows")
+    assert host()["load_1_min"] is None  # psutil's first answer there is a zero that means unknown

@@ -1,0 +1,45 @@
+"""What is read of a file of weights is a copy: Windows replaces no file that is held, such as a checkpoint."""
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+import pytest
+import torch
+from safetensors import safe_open
+from torch import Tensor
+
+from model.metrics import backbone_files
+from model.weights_file import read_tensors, write_tensors
+
+TENSORS = {"small": torch.arange(3.0), "large": torch.arange(20_000.0).reshape(100, 200)}
+
+Read = Callable[[Path], Mapping[str, Tensor]]
+
+
+def as_the_library_does(path: Path) -> Mapping[str, Tensor]:
+    with safe_open(path, framework="pt") as file:
+        return {name: file.get_tensor(name) for name in TENSORS}
+
+
+def is_copy(read: Read, path: Path) -> bool:
+    """Whether tensors keep their values when somebody writes into their file, which is then replaced."""
+    write_tensors(path, TENSORS, {})
+    size = path.stat().st_size
+    found = read(path)
+    with path.open("r+b") as file:
+        file.write(bytes(size))
+    kept = all(torch.equal(found[name], value) for name, value in TENSORS.items())
+    write_tensors(path, TENSORS, {})
+    return kept
+
+
+@pytest.mark.parametrize(
+    "read", [lambda path: read_tensors(path)[0], lambda path: backbone_files.read_tensors(path, TENSORS)]
+)
+def test_what_was_read_does_not_change_with_its_file(read: Read, tmp_path: Path) -> None:
+    assert is_copy(read, tmp_path / "w.safetensors")
+
+
+@pytest.mark.skipif("sys.platform == 'win32'", reason="Windows lets nobody write what the library holds")
+def test_the_library_alone_would_hold_the_file(tmp_path: Path) -> None:
+    assert not is_copy(as_the_library_does, tmp_path / "w.safetensors")

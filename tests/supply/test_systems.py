@@ -1,0 +1,120 @@
+"""What is said of systems, in pyproject.toml, workflows and pages, is one thing; and no module needs one of them."""
+
+import ast
+import re
+import tomllib
+from pathlib import Path
+
+import pytest
+from packaging.requirements import Requirement
+from packaging.specifiers import SpecifierSet
+from packaging.version import Version
+
+ROOT = Path(__file__).resolve().parents[2]
+PACKAGES = ("deploy", "model", "quant", "profiles")
+OF_ONE_SYSTEM = {
+    "fcntl",
+    "grp",
+    "msvcrt",
+    "nt",
+    "posix",
+    "pty",
+    "pwd",
+    "resource",
+    "syslog",
+    "termios",
+    "tty",
+    "winreg",
+}
+TORCH = re.compile(r"pip install[^\n]*?[ '\"]torch((?:[<>=!~]=?[\d.]+,?)+)")
+VERSIONS = [Version(text) for text in ("2.4.1", "2.5.0", "2.9.1", "2.13.0", "2.13.1", "2.14.0", "2.15.0", "3.0.0")]
+
+
+def asked_for(name: str) -> SpecifierSet:
+    dependencies = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["dependencies"]
+    return next(found.specifier for found in map(Requirement, dependencies) if found.name == name)
+
+
+def pages() -> list[Path]:
+    return [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *ROOT.glob(".github/workflows/*.yml")]
+
+
+def beyond(text: str, asked: SpecifierSet) -> list[str]:
+    """The installations of torch in `text` that might bring one which the project then replaces."""
+    newest = max(version for version in VERSIONS if version in asked)
+    return [
+        found
+        for found in TORCH.findall(text)
+        if any(version in SpecifierSet(found) for version in VERSIONS if version > newest)
+        or not any(version in SpecifierSet(found) for version in VERSIONS if version in asked)
+    ]
+
+
+def test_torch_is_asked_for_by_a_range_with_both_ends() -> None:
+    asked = asked_for("torch")
+    assert {specifier.operator for specifier in asked} == {">=", "<"}
+    assert [str(version) for version in VERSIONS if version in asked] == ["2.5.0", "2.9.1", "2.13.0", "2.13.1"]
+    assert Version("2.13.0+cpu") in asked
+
+
+def test_every_page_installs_a_torch_that_the_project_keeps() -> None:
+    found = {page.name: TORCH.findall(page.read_text(encoding="utf-8")) for page in pages()}
+    assert found["README.md"] == found["CONTRIBUTING.md"] == ["<2.14"]
+    assert [fault for page in pages() for fault in beyond(page.read_text(encoding="utf-8"), asked_for("torch"))] == []
+
+
+@pytest.mark.parametrize("spec", ["==2.14.0", "<2.15", ">=2.5", "==2.4.1"])
+def test_a_torch_that_the_project_would_replace_is_seen(spec: str) -> None:
+    assert beyond(f"    pip install 'torch{spec}' --index-url x", asked_for("torch")) == [spec]
+
+
+def test_the_workflow_and_its_page_name_the_same_systems() -> None:
+    yaml = pytest.importorskip("yaml", reason="no package yaml to read the workflow with")
+    jobs = yaml.safe_load((ROOT / ".github/workflows/ci.yml").read_text(encoding="utf-8"))["jobs"]
+    pythons = [job["strategy"]["matrix"]["python"] for job in jobs.values()]
+    assert pythons == [["3.11", "3.12", "3.13", "3.14"]] * 2
+    assert jobs["elsewhere"]["strategy"]["matrix"]["system"] == ["macos-latest", "windows-latest"]
+    page = (ROOT / "docs" / "systems.md").read_text(encoding="utf-8")
+    rows = [line.split("|") for line in page.splitlines() if "job `elsewhere`)" in line]
+    assert [row[1].split(",")[0].strip() for row in rows] == ["macOS", "Windows"]
+    assert {row[2].strip() for row in rows} == {f"{pythons[1][0]} to {pythons[1][-1]}"}
+    assert {row[4].strip() for row in rows} == {"never"}
+
+
+def bound_to_a_system(source: str) -> list[str]:
+    """What a module imports on opening that only some systems have, and text files that it opens in whatever code."""
+    tree = ast.parse(source)
+    imported = [alias.name for node in tree.body if isinstance(node, ast.Import) for alias in node.names]
+    imported += [str(node.module) for node in tree.body if isinstance(node, ast.ImportFrom)]
+    calls = [node for node in ast.walk(tree) if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute)]
+    unsaid = [
+        ast.unparse(call)
+        for call in calls
+        if isinstance(call.func, ast.Attribute) and call.func.attr in ("read_text", "write_text")
+        if not any(keyword.arg == "encoding" for keyword in call.keywords)
+    ]
+    return [name for name in imported if name.partition(".")[0] in OF_ONE_SYSTEM] + unsaid
+
+
+def test_every_module_opens_on_every_system_and_says_its_encodings() -> None:
+    modules = [path for package in PACKAGES for path in (ROOT / package).rglob("*.py")]
+    found = {path: bound_to_a_system(path.read_text(encoding="utf-8")) for path in modules}
+    assert len(modules) > 100
+    assert {path: faults for path, faults in found.items() if faults} == {}
+
+
+@pytest.mark.parametrize(
+    ("source", "fault"),
+    [
+        ("import fcntl\n", "fcntl"),
+        ("from resource import getrusage\n", "resource"),
+        ("def f(path):\n    return path.read_text()\n", "path.read_text()"),
+        ("path.write_text('a', errors='replace')\n", "path.write_text('a', errors='replace')"),
+    ],
+)
+def test_a_module_of_one_system_is_seen(source: str, fault: str) -> None:
+    assert bound_to_a_system(source) == [fault]
+
+
+def test_what_is_asked_for_within_a_function_is_no_fault() -> None:
+    assert bound_to_a_system("def f():\n    import resource\n    return resource\n") == []
