@@ -1,0 +1,88 @@
+"""INT8 beside float32 on onnxruntime, as this processor computes them and as one without VNNI would have to.
+
+    python benchmarks/int8_kernels.py --variant convbeers-s --tile 640 --threads 1 2
+
+`int8` is what every command runs here. `ways` takes, whatever the processor, the ways of one whose int8 kernels
+saturate (`quant.kernels`): where they do, the two are the same. `plain` is the file as it stands, which is right only
+where int8 products add exactly; int8 / plain is what exactness costs. The sessions take turns, so that what else the
+machine does falls on each of them; ratios are of the fastest turns. On another processor: benchmarks/without_vnni.py.
+"""
+
+import argparse
+import time
+from collections import Counter
+from statistics import median
+
+import numpy as np
+import onnx
+import onnxruntime as ort
+
+from deploy.export import to_onnx
+from model.processor import decided, int8_adds_exactly, processor_name
+from model.shipped import SHIPPED
+from model.weights_file import load_network
+from quant.fillers import filled
+from quant.kernels import made_exact
+from quant.onnx_file import load_onnx
+from quant.session import open_session, run
+
+VARIANTS = ("convbeers-xs", "convbeers-s", "convbeers-m", "convbeers")
+
+
+def main() -> None:
+    """Print the ways by layer, then the times and their ratios."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--variant", choices=VARIANTS, nargs="+", default=["convbeers-s"])
+    parser.add_argument("--tile", type=int, default=640)
+    parser.add_argument("--threads", type=int, nargs="+", default=[1, 2])
+    parser.add_argument("--turns", type=int, default=5)
+    arguments = parser.parse_args()
+    int8_adds_exactly()
+    print(f"{processor_name()}, onnxruntime {ort.__version__}; int8 {decided()['int8']}")
+    image = np.random.default_rng(0).random((1, 1, arguments.tile, arguments.tile), dtype=np.float32)
+    for variant in arguments.variant:
+        integer = load_onnx(SHIPPED / f"{variant}-int8.onnx")
+        print_ways(variant, integer)
+        network, _ = load_network(SHIPPED / f"{variant}.safetensors")
+        for threads in arguments.threads:
+            print_times(variant, to_onnx(network, {}), integer, image, threads, arguments.turns)
+
+
+def print_ways(variant: str, integer: onnx.ModelProto) -> None:
+    """How each layer is computed where the fast kernels saturate."""
+    ways = made_exact(filled(integer))[1]
+    counts = ", ".join(f"{count} {way}" for way, count in Counter(ways.values()).items())
+    others = ", ".join(name for name, way in ways.items() if way.name != "signed")
+    print(f"{variant}: {counts} ({others})")
+
+
+def print_times(
+    variant: str, floating: onnx.ModelProto, integer: onnx.ModelProto, image: np.ndarray, threads: int, turns: int
+) -> None:
+    """The fastest run of each session, and the ratios."""
+    sessions = {
+        "float32": open_session(floating, threads),
+        "int8": open_session(integer, threads),
+        "ways": open_session(integer, threads, exact=True),
+        "plain": open_session(integer, threads, exact=False),
+    }
+    times_s: dict[str, list[float]] = {name: [] for name in sessions}
+    for _ in range(turns + 1):
+        for name, session in sessions.items():
+            begun = time.perf_counter()
+            run(session, image)
+            times_s[name].append(time.perf_counter() - begun)
+    fastest_s = {name: min(times[1:]) for name, times in times_s.items()}  # the first turn sets up
+    spread = max(median(times[1:]) / fastest_s[name] for name, times in times_s.items())
+    shown = ", ".join(f"{name} {time_s:.3f} s" for name, time_s in fastest_s.items())
+    ratios = {name: fastest_s["float32"] / fastest_s[name] for name in ("int8", "ways")}
+    cost = fastest_s["int8"] / fastest_s["plain"]
+    print(
+        f"{variant}, {image.shape[-1]} x {image.shape[-1]}, {threads} threads: {shown}; "
+        f"float32 / int8 {ratios['int8']:.2f}, float32 / ways {ratios['ways']:.2f}, int8 / plain {cost:.2f}; "
+        f"median up to {spread:.2f} times the fastest"
+    )
+
+
+if __name__ == "__main__":
+    main()
