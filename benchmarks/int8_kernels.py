@@ -38,7 +38,7 @@ def main() -> None:
     parser.add_argument("--turns", type=int, default=5)
     arguments = parser.parse_args()
     int8_adds_exactly()
-    print(f"{processor_name()}, onnxruntime {ort.__version__}; int8 {decided()['int8']}")
+    print(f"{processor_name()}, onnxruntime {ort.__version__}; int8: {decided()['int8 on onnxruntime']}")
     image = np.random.default_rng(0).random((1, 1, arguments.tile, arguments.tile), dtype=np.float32)
     for variant in arguments.variant:
         integer = load_onnx(SHIPPED / f"{variant}-int8.onnx")

@@ -9,12 +9,19 @@ import platform
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from functools import lru_cache
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-TERMS, CHANNELS = 16, 16
+if TYPE_CHECKING:
+    import numpy as np
+
+CHANNELS, SIDE_PX = 32, 3
 ACTIVATION, WEIGHT = 255, 127
 """Two neighbouring products of these make 64 770: twice what int16 holds."""
+RESULT = 200
+"""What the sum of a whole window becomes in 8 bits."""
 
 FEWEST_TURNS, ASKING_S = 3, 0.1
 """Of a timed question: its first turn sets up, and others may meet a busy machine."""
@@ -27,35 +34,58 @@ def decided() -> dict[str, str]:
     return dict(_decided)
 
 
+Convolve = Callable[[bytes, "np.ndarray"], "np.ndarray"]
+"""Runs an ONNX model, given as a file's bytes, on an image (1, C, H, W) uint8."""
+
+
 @lru_cache(maxsize=1)
 def int8_adds_exactly() -> bool:
-    """Whether onnxruntime's products of uint8 activations and int8 weights are added without saturation.
+    """Whether onnxruntime adds products of uint8 activations and int8 weights without saturation: see `asked`."""
+    return asked("onnxruntime", _on_onnxruntime)
 
-    On x86 processors without VNNI pairs of products are added in saturating int16.
+
+def asked(runtime: str, convolve: Convolve) -> bool:
+    """Whether a runtime's integer convolutions add exactly, told by one of the largest numbers.
+
+    x86 kernels without VNNI add pairs of products of uint8 and int8 in saturating int16, and give half of this sum.
     """
-    stated = _product_sum()
-    exact = stated == TERMS * ACTIVATION * WEIGHT
-    _decided["int8"] = "adds exactly" if exact else "saturates; networks are computed in ways that do not"
+    import numpy as np
+
+    image = np.full((1, CHANNELS, SIDE_PX, SIDE_PX), ACTIVATION, np.uint8)
+    exact = bool((convolve(_largest_convolution(), image) == RESULT).all())
+    words = "add exactly" if exact else "saturate; layers are computed in ways that do not"
+    _decided[f"int8 on {runtime}"] = f"its kernels {words}"
     return exact
 
 
-def _product_sum() -> int:
-    """The sum of TERMS products of the largest numbers, as onnxruntime's integer kernels have it."""
+def _on_onnxruntime(model: bytes, image: "np.ndarray") -> "np.ndarray":
     import numpy as np
     import onnxruntime as ort
-    from onnx import TensorProto, helper, numpy_helper
 
-    weights = numpy_helper.from_array(np.full((TERMS, CHANNELS), WEIGHT, np.int8), "weights")
-    product = helper.make_node("MatMulInteger", ["activations", "weights"], ["sums"])
-    given = helper.make_tensor_value_info("activations", TensorProto.UINT8, [CHANNELS, TERMS])
-    wanted = helper.make_tensor_value_info("sums", TensorProto.INT32, [CHANNELS, CHANNELS])
-    graph = helper.make_graph([product], "probe", [given], [wanted], [weights])
-    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
     options = ort.SessionOptions()
     options.intra_op_num_threads = 1
-    session = ort.InferenceSession(model.SerializeToString(), options, providers=["CPUExecutionProvider"])
-    activations = np.full((CHANNELS, TERMS), ACTIVATION, np.uint8)
-    return int(session.run(None, {"activations": activations})[0].min())
+    session = ort.InferenceSession(model, options, providers=["CPUExecutionProvider"])
+    return np.asarray(session.run(None, {"image": image})[0])
+
+
+def _largest_convolution() -> bytes:
+    """An ONNX file: one window over the whole image, all weights the largest, the sum scaled to RESULT."""
+    import numpy as np
+    from onnx import TensorProto, helper, numpy_helper
+
+    weight = np.full((CHANNELS, CHANNELS, SIDE_PX, SIDE_PX), WEIGHT, np.int8)
+    scale = np.float32(ACTIVATION * WEIGHT * weight[0].size / RESULT)
+    values = {"one": np.float32(1), "zero": np.uint8(0), "weight": weight, "signed_zero": np.int8(0), "scale": scale}
+    feeds = ["image", "one", "zero", "weight", "one", "signed_zero", "scale", "zero"]
+    sizes = {"image": SIDE_PX, "result": 1}
+    ends = [
+        helper.make_tensor_value_info(name, TensorProto.UINT8, [1, CHANNELS, px, px]) for name, px in sizes.items()
+    ]
+    constants = [numpy_helper.from_array(np.asarray(value), name) for name, value in values.items()]
+    node = helper.make_node("QLinearConv", feeds, ["result"])
+    graph = helper.make_graph([node], "largest", ends[:1], ends[1:], constants)
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
+    return bytes(model.SerializeToString())
 
 
 @lru_cache(maxsize=1)

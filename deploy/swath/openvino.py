@@ -11,7 +11,9 @@ import numpy as np
 import onnx
 from onnx import helper, numpy_helper
 
+from model.processor import asked
 from profiles.errors import MachineError, ModelError
+from quant.kernels import is_integer, made_exact
 
 LOWEST = "openvino.lowest_uint8"
 
@@ -35,7 +37,7 @@ def open_openvino(
     # Said aloud: where the processor has bfloat16 units, OpenVINO would round to it unasked.
     options = {"INFERENCE_PRECISION_HINT": precision, "NUM_STREAMS": str(at_once), "ENABLE_CPU_PINNING": False}
     options |= {"INFERENCE_NUM_THREADS": str(threads)} if threads else {}
-    content = saturating_adds(model).SerializeToString()
+    content = saturating_adds(_exact(model, core)).SerializeToString()
 
     @lru_cache(maxsize=2)
     def compiled(shape: tuple[int, ...]) -> Any:
@@ -58,6 +60,19 @@ def open_openvino(
         return np.asarray(request(image.shape, get_ident()).infer([image], share_inputs=True)[0])
 
     return infer, f"openvino {version('openvino')}"
+
+
+def _exact(model: onnx.ModelProto, core: Any) -> onnx.ModelProto:
+    """The model as this processor's kernels add it exactly."""
+    return model if not is_integer(model) or _adds_exactly(core) else made_exact(model)[0]
+
+
+@lru_cache(maxsize=1)
+def _adds_exactly(core: Any) -> bool:
+    def convolve(model: bytes, image: np.ndarray) -> np.ndarray:
+        return np.asarray(core.compile_model(core.read_model(model), "CPU").create_infer_request().infer([image])[0])
+
+    return asked("openvino", convolve)
 
 
 def _core() -> Any:  # openvino.Core, an optional package

@@ -73,7 +73,9 @@ def test_the_version_in_full_says_what_the_kernels_were_asked() -> None:
         result = runner.invoke(app, order)
         assert result.exit_code == 0
         lines = dict(line.split(": ", 1) for line in result.output.splitlines()[1:])
-        assert {"system", "machine", "int8", "bfloat16", "onnxruntime", "torch", "openvino"} <= set(lines)
+        assert {"system", "machine", "int8 on onnxruntime", "bfloat16", "onnxruntime", "torch", "openvino"} <= set(
+            lines
+        )
 
 
 def test_restore_writes_a_whole_twelve_bit_image(tmp_path: Path) -> None:

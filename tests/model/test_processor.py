@@ -44,7 +44,7 @@ def test_the_answer_holds_for_convolutions() -> None:
 def test_what_was_asked_is_told_in_words() -> None:
     int8_adds_exactly()
     bfloat16_speed()
-    assert set(decided()) == {"int8", "bfloat16"}
+    assert {"int8 on onnxruntime", "bfloat16"} <= set(decided())
     assert "times the speed of float32" in decided()["bfloat16"]
 
 
