@@ -24,7 +24,7 @@ def sentence(checks: Sequence[Check], passed: str) -> str:
     """
     failed = [str(check) for check in checks if not check.passed]
     if not failed:
-        return f"passed: all of {len(checks)} checks kept; {passed}"
+        return f"passed, all {len(checks)} checks: {passed}"
     return f"FAILED, {len(failed)} of {len(checks)} checks: {'; '.join(failed)}"
 
 

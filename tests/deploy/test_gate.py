@@ -188,7 +188,7 @@ def test_a_strangers_name_stays_on_its_line() -> None:
 
 
 def test_the_last_line_names_what_failed_and_nothing_else() -> None:
-    assert sentence(CHECKS[:1], "MAE 0.0006") == "passed: all of 1 checks kept; MAE 0.0006"
+    assert sentence(CHECKS[:1], "MAE 0.0006") == "passed, all 1 checks: MAE 0.0006"
     text = sentence(CHECKS, "MAE 0.0006")
     assert text.startswith("FAILED, 2 of 4 checks: PSNR drop 0.31 dB, allowed at most 0.25; nodes <all> 1 (tail")
     assert "MAE" not in text
