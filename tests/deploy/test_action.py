@@ -128,8 +128,16 @@ def test_a_network_that_cannot_be_quantised_is_red(runner: Runner, networks: Pat
     take(runner, networks, "int8.onnx")
     outputs = runner.run_action({"float": "models/int8.onnx"})
     assert runner.red
-    assert outputs["verdict"] == ""
+    assert outputs["verdict"] == "error"
     assert runner.stderr.startswith("beers-deploy: ")
+
+
+def test_a_limit_that_is_no_number_is_red(runner: Runner, networks: Path) -> None:
+    take(runner, networks, "float.onnx", "int8.onnx")
+    outputs = runner.run_action({"float": "models/float.onnx", "int8": "models/int8.onnx", "max-mae": "0,0007"})
+    assert runner.red
+    assert outputs["verdict"] == "error"
+    assert "--max-mae" in runner.stderr
 
 
 def test_names_are_never_run(runner: Runner) -> None:

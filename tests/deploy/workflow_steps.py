@@ -147,7 +147,9 @@ def value_of(text: str, known: dict[str, str]) -> str:
 
 
 def lookup(name: str, known: dict[str, str]) -> str:
-    """A name's value; of an output that no step wrote, nothing, as GitHub has it."""
+    """A name's value, or a text in quotes; of an output that no step wrote, nothing, as GitHub has it."""
+    if name.startswith("'"):
+        return name.strip("'")
     return known.get(name, "") if re.fullmatch(r"steps\.\w+\.outputs\.[\w-]+", name) else known[name]
 
 
