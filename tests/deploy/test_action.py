@@ -3,6 +3,7 @@
 import json
 import shutil
 import subprocess
+import sys
 from pathlib import Path
 from xml.etree import ElementTree as ET
 
@@ -17,6 +18,10 @@ from tests.deploy.workflow_steps import ACTION, BASH, KEPT, ROOT, Runner, read_y
 
 WORKFLOW = ROOT / ".github" / "workflows" / "int8-gate.yml"
 OURS = "Export a shipped network"
+
+pytestmark = pytest.mark.skipif(
+    sys.platform == "win32", reason="the steps run in bash, which Windows has not of itself"
+)
 
 
 @pytest.fixture(scope="module")
