@@ -72,7 +72,7 @@ def test_a_sound_pair_is_green(runner: Runner, networks: Path) -> None:
 
 
 def test_a_broken_pair_is_red(runner: Runner, networks: Path) -> None:
-    """One bias doubled hides below the limit on the MAE, and not below the baseline of a good version."""
+    """The first convolution's bias doubled, beside the baseline of the sound pair."""
     take(runner, networks, "float.onnx", "int8.onnx", "broken.onnx")
     pair = {"float": "models/float.onnx", "int8": "models/int8.onnx"}
     sound = runner.run_action({**pair, "json": "models/gate.json"})
