@@ -124,7 +124,7 @@ def _append(path: Path | None, text: str) -> None:
     if path is None:
         return
     try:
-        with path.open("a", encoding="utf-8") as stream:
+        with path.open("a", encoding="utf-8", newline="\n") as stream:
             stream.write(text)
     except OSError as error:
         got, remedy = error.strerror or str(error), "choose another path"

@@ -152,7 +152,7 @@ def test_names_are_never_run(runner: Runner) -> None:
 
 
 def test_the_action_says_what_it_takes() -> None:
-    action, page = read_yaml(ACTION), (ROOT / "docs" / "gate.md").read_text()
+    action, page = read_yaml(ACTION), (ROOT / "docs" / "gate.md").read_text(encoding="utf-8")
     assert action["inputs"]["sensor"]["default"] == SENSOR
     for kind in ("inputs", "outputs"):
         for name, about in action[kind].items():

@@ -29,7 +29,7 @@ SHORT = {"quantize": "--patches 2 --patch 32", "gate": "--patches 2"}
 
 def read_yaml(path: Path) -> dict[str, Any]:
     """A workflow or an action."""
-    content: dict[str, Any] = yaml.safe_load(path.read_text())
+    content: dict[str, Any] = yaml.safe_load(path.read_text(encoding="utf-8"))
     return content
 
 
@@ -113,7 +113,7 @@ class Runner:
         given = {name: value_of(str(text), known) for name, text in step.get("env", {}).items()}
         assert "${{" not in step["run"], "values reach the shell by its environment"
         done = subprocess.run([*BASH, step["run"]], cwd=self.folder, env=self.environment | given, **KEPT)
-        lines = [line.partition("=") for line in written.read_text().splitlines()]
+        lines = [line.partition("=") for line in written.read_text(encoding="utf-8").splitlines()]
         self.outputs |= {f"steps.{step['id']}.outputs.{name}": text for name, _, text in lines}
         if done.returncode:
             self.red, self.stderr = True, done.stderr
