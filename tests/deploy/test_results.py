@@ -131,6 +131,7 @@ def test_a_command_that_judges_has_a_verdict(command: str) -> None:
         {"checks": [{**CHECKS[1].to_json(), "passed": False}]},
         {"checks": [{**CHECKS[0].to_json(), "value": None, "limit": "0.0007"}]},
         {"schema_version": 1},
+        {"host": {"system": "Linux"}},
     ],
 )
 def test_a_verdict_that_its_checks_do_not_bear_out_is_invalid(wrong: dict[str, object]) -> None:
@@ -138,6 +139,13 @@ def test_a_verdict_that_its_checks_do_not_bear_out_is_invalid(wrong: dict[str, o
     jsonschema.validate(sound, SCHEMA)
     with pytest.raises(jsonschema.ValidationError):
         jsonschema.validate({**sound, **wrong}, SCHEMA)
+
+
+def test_a_host_of_version_2_says_which_kernels_it_took() -> None:
+    sound = judged(CHECKS[0])
+    del sound["host"]["kernels"]
+    with pytest.raises(jsonschema.ValidationError, match="'kernels' is a required"):
+        jsonschema.validate(sound, SCHEMA)
 
 
 def test_documents_of_version_1_are_still_read() -> None:
