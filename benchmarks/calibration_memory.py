@@ -44,8 +44,8 @@ def main() -> None:
         network, int8 = (str(Path(folder) / name) for name in ("float.onnx", "int8.onnx"))
         subprocess.run([*COMMAND, "export", "--variant", arguments.variant, "--out", network], check=True)  # noqa: S603
         for patches, side in CASES:
-            sizes = ["--patches", str(patches), "--patch", str(side)]
-            peak, seconds, computing = measure([*COMMAND, "quantize", network, "--out", int8, *sizes, *scenes])
+            drawn = ["--sensor", "pleiades-variable", "--patches", str(patches), "--patch", str(side), *scenes]
+            peak, seconds, computing = measure([*COMMAND, "quantize", network, "--out", int8, *drawn])
             work = f"{patches:5d} of {f'{side} x {side}':16s}"
             print(f"{work} {peak:7.0f} MB {seconds:6.0f} s, computing {computing:.0f} s", flush=True)
 

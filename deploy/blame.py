@@ -5,11 +5,11 @@ from collections.abc import Callable
 
 import onnx
 
+from deploy.gate import gate_row
 from deploy.quant_report import few_crops
 from deploy.report.blame_page import blame_page
 from deploy.report.page import Report
 from deploy.results import Figure, Row, measured, unavailable
-from deploy.verdict import gate_row
 from quant.blame import Loss, blame_layers
 from quant.calibration import Patches
 from quant.gate import GateResult, compare

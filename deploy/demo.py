@@ -19,13 +19,13 @@ from deploy.dpu.reading import read_network
 from deploy.evaluation.methods import Restore
 from deploy.evaluation.scores import fidelity_row
 from deploy.export import parity
+from deploy.gate import gate_row
 from deploy.measure import Sensors, traditional_rows
 from deploy.report.demo_page import INT8, SWATH_PX, TRADITIONAL, comparison, demo_report
 from deploy.report.page import Report
 from deploy.restore import TILE_PX, read_acquisition, restore_image, write_tiff
 from deploy.results import Row, measured
 from deploy.shipped import VARIANT, default_float_weights
-from deploy.verdict import gate_row
 from model.images import read_pixels
 from model.simulator.acquire import MARGIN_PX, Pair, simulate_pair
 from model.simulator.draws import Draw

@@ -1,23 +1,127 @@
-"""What the gate looks at in the files themselves: which they are, the DPU's rules, ReLUs, spelling."""
+"""The gate: what INT8 changes, what the file itself shows, and which limits that keeps.
 
+Looked at, in this order:
+
+1. Patches that calibration did not see, through both networks: MAE, percentile, PSNRs (`quant.gate`), and the results
+   inside the INT8 network that saturate (`quant.saturation`).
+2. The MAE that an earlier gate found on the same patches, where a baseline is given.
+3. The INT8 file: the DPU's rules, its ReLUs, its encoding, the same bits with onnxruntime's optimisations as without.
+"""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import onnx
 
+from deploy.counterpart import require_quantised
+from deploy.defaults import HELD_OUT_SEED, float_model, load_scenes
 from deploy.dpu.board import load_dpu
+from deploy.dpu.checking import legality
 from deploy.dpu.placement import place
 from deploy.dpu.reading import read_network
+from deploy.results import Document, Figure, Row, measured, unavailable
 from deploy.shipped import VARIANT, shipped_pair
-from profiles import load_target
+from profiles import load_sensor, load_target
 from profiles.errors import OptionError
+from profiles.text import read_json
+from quant.calibration import REFERENCE, Patches, draw_patches
+from quant.checks import Check
+from quant.gate import GateResult, compare
 from quant.host_reader import spelling_faults
-from quant.limits import Check
-from quant.onnx_file import fixed_tile_px
+from quant.limits import Limits, judge, judge_saturation
+from quant.onnx_file import fixed_tile_px, load_onnx
 from quant.relus import count_relus
+from quant.saturation import saturated_shares
 from quant.session import open_any_size, run
 
 TILE_PX = 640
+
+PATCHES = ("sensor", "images", "patches", "seed")
+"""The arguments that say what INT8 and float are compared on."""
+
+
+@dataclass(frozen=True)
+class Request:
+    """What to judge, by which limits, on which patches.
+
+    Attributes:
+        float_path: float ONNX or weights.
+        int8_path: its INT8 ONNX.
+        limits: what is allowed.
+        baseline: what an earlier gate wrote as JSON, or None.
+        target: name of the board whose rules the INT8 file must keep.
+        sensor: name or file of the profile of the test patches.
+        images: folder of scenes; None for drawn ones.
+        patches: number of test patches of 128 x 128.
+        seed: of the patches.
+    """
+
+    float_path: Path
+    int8_path: Path
+    limits: Limits
+    baseline: Path | None
+    target: str
+    sensor: str
+    images: Path | None
+    patches: int
+    seed: int
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What the gate found: the comparison, the share of saturated results of each layer, and every check."""
+
+    result: GateResult
+    shares: Mapping[str, float]
+    checks: tuple[Check, ...]
+
+    @property
+    def passed(self) -> bool:
+        """Whether every check did."""
+        return all(check.passed for check in self.checks)
+
+    @property
+    def row(self) -> Row:
+        """The figures of the comparison, what it costs against the reference, and the worst layer's saturation."""
+        row, patches = gate_row(self.result), self.result.patches
+        drop = _figure(self.result.drop_db, "dB", patches)
+        worst = saturation_figure(self.shares, patches)
+        return replace(row, figures={**row.figures, "PSNR drop": drop, "saturated results": worst})
+
+    def document(self, request: Request, config: Path | None) -> Document:
+        """What `gate --json` writes; `config` is the file from which the limits came."""
+        arguments = {"max_mae": request.limits.mae, "config": config, "baseline": request.baseline}
+        arguments |= {name: getattr(request, name) for name in ("target", *PATCHES)}
+        return Document("gate", arguments, (request.float_path, request.int8_path), (self.row,), self.checks)
+
+
+def run_gate(request: Request) -> Outcome:
+    """Judge an INT8 network beside its float one.
+
+    Raises:
+        BeersError: a file, a profile or a folder is missing or not what it should be.
+    """
+    before = None if request.baseline is None else baseline_mae(request.baseline, vars(request))
+    floating, int8 = float_model(request.float_path), load_onnx(request.int8_path)
+    require_quantised(floating, request.float_path, wanted=False)
+    require_quantised(int8, request.int8_path, wanted=True)
+    sessions, unseen = (open_any_size(floating), open_any_size(int8)), _unseen(request)
+    result, shares = compare(*sessions, unseen.pairs), saturated_shares(int8, unseen.degraded)
+    checks = judge(result, request.limits, before) + judge_saturation(shares, request.limits)
+    checks += structure_checks(floating, request.int8_path, int8, request.target)
+    return Outcome(result, shares, tuple(checks))
+
+
+def _unseen(request: Request) -> Patches:
+    """Patches that calibration with the same seed does not draw."""
+    degraded, reference = load_sensor(request.sensor), load_sensor(REFERENCE)
+    held_out = request.seed + HELD_OUT_SEED
+    scenes = load_scenes(request.images, reference.nominal(), held_out)
+    return draw_patches(scenes, degraded, reference, request.patches, held_out)
 
 
 def files_or_shipped(float_path: Path | None, int8_path: Path | None, variant: str | None) -> tuple[Path, Path]:
@@ -38,35 +142,100 @@ def files_or_shipped(float_path: Path | None, int8_path: Path | None, variant: s
     return float_path, int8_path
 
 
+def baseline_mae(path: Path, arguments: Mapping[str, Any]) -> float:
+    """The MAE in a document that an earlier `gate --json` wrote, of the same patches.
+
+    Args:
+        path: the document.
+        arguments: of this run of the gate.
+
+    Raises:
+        OptionError: no such document, or one of other patches.
+    """
+    try:
+        document: Any = read_json(path)
+        before = {name: _plain(name, document["arguments"][name]) for name in PATCHES}
+        mae = float(next(row["figures"]["MAE"]["value"] for row in document["rows"] if row["table"] == "gate"))
+    except (OSError, ValueError, KeyError, TypeError, StopIteration) as error:
+        got = "no such file" if not path.exists() else "another document"
+        remedy = "give what 'gate --json' wrote"
+        raise OptionError(str(path), expected="a gate's results", got=got, remedy=remedy) from error
+    for name in PATCHES:
+        now = _plain(name, arguments[name])
+        if before[name] != now:
+            expected, got = f"a baseline of the same patches ({name} {now})", f"{name} {before[name]}"
+            raise OptionError(str(path), expected=expected, got=got, remedy="make it anew with these")
+    return mae
+
+
+def _plain(name: str, value: object) -> str:
+    """As text; of a folder of images its name, for it may lie elsewhere."""
+    return Path(str(value)).name if name == "images" else str(value)
+
+
 def structure_checks(
     float_model: onnx.ModelProto, int8_path: Path, int8: onnx.ModelProto, target: str
 ) -> list[Check]:
-    """Does the INT8 file keep rules and ReLUs, is it spelt as meant, and the same with and without optimisation?"""
-    wanted, kept = count_relus(float_model).spelt, count_relus(int8)
+    """Does the INT8 file keep rules and ReLUs, is it encoded as meant, and the same with and without optimisation?"""
     image = np.random.default_rng(0).random((1, 1, 97, 101), dtype=np.float32)
     plain, optimised = (run(open_any_size(int8, optimise=o), image) for o in (False, True))
     difference = float(np.abs(plain - optimised).max())
     return [
         *_legality(int8_path, int8, target),
-        Check("ReLUs kept", kept.may_be(wanted), str(kept), str(wanted)),
-        *_spelling(int8),
-        Check("optimised equals unoptimised", difference == 0, f"{difference:.3g} apart", "the same bits"),
+        _relus(float_model, int8),
+        *_encoding(int8),
+        Check("optimised against unoptimised", difference, 0, "of full scale"),
     ]
-
-
-def _spelling(model: onnx.ModelProto) -> list[Check]:
-    """Of files that `quantize` wrote under the rules of a DPU."""
-    faults = spelling_faults(model)
-    if faults is None:
-        return []
-    found = faults[0] if faults else "as its whole numbers say"
-    return [Check("spelling", not faults, found, "what 'quantize' would write of them")]
 
 
 def _legality(path: Path, model: onnx.ModelProto, target: str) -> list[Check]:
     """The DPU's rules; a target without a DPU has none."""
     if not load_target(target).configurations:
         return []
-    failed = place(read_network(path, fixed_tile_px(model) or TILE_PX), load_dpu(target, None)).failed
-    first = f"{failed[0].op.name}: {failed[0].broken[0].finding.reason}" if failed else "every node keeps the rules"
-    return [Check("legal on the DPU", not failed, first, f"the rules of {target}")]
+    return [legality(place(read_network(path, fixed_tile_px(model) or TILE_PX), load_dpu(target, None)))]
+
+
+def _relus(float_model: onnx.ModelProto, int8: onnx.ModelProto) -> Check:
+    wanted, kept = count_relus(float_model).spelt, count_relus(int8)
+    return Check("ReLUs lost or added", kept.off_by(wanted), 0, "ReLU", detail=f"{wanted} in float, {kept} in INT8")
+
+
+def _encoding(model: onnx.ModelProto) -> list[Check]:
+    """Of files that `quantize` wrote under the rules of a DPU: does each part say what the whole numbers ask for?"""
+    faults = spelling_faults(model)
+    if faults is None:
+        return []
+    return [Check("faults of the encoding", len(faults), 0, "fault", detail=faults[0] if faults else "")]
+
+
+def gate_row(result: GateResult) -> Row:
+    """What INT8 changes, on patches that calibration did not see."""
+    found = {
+        "MAE": (result.mae, "of full scale"),
+        "std": (result.std, "of full scale"),
+        "std / MAE": (result.std_over_mae, "ratio"),
+        "99.9th percentile": (result.p999, "of full scale"),
+        "max": (result.max_abs, "of full scale"),
+        "PSNR float-INT8": (result.psnr_between_db, "dB"),
+        "PSNR degraded": (result.psnr_degraded_db, "dB"),
+        "PSNR float": (result.psnr_float_db, "dB"),
+        "PSNR INT8": (result.psnr_int8_db, "dB"),
+    }
+    figures = {name: _figure(value, unit, result.patches) for name, (value, unit) in found.items()}
+    return Row("gate", "INT8 against float", figures)
+
+
+def _figure(value: float, unit: str, patches: int) -> Figure:
+    if math.isinf(value):
+        return unavailable(unit, "infinite: the two images are identical")
+    if math.isnan(value):
+        return unavailable(unit, "a network gave NaN")
+    return measured(value, unit, f"{patches} simulated patches of 128 x 128")
+
+
+def saturation_figure(shares: Mapping[str, float], patches: int) -> Figure:
+    """What share of its results comes to the ends of 8 bits, in the layer where most do."""
+    if not shares:
+        return unavailable("%", "no result in the file is rounded to 8 bits")
+    layer = max(shares, key=lambda name: shares[name])
+    return measured(100 * shares[layer], "%", f"{layer}, the worst of {len(shares)}; {patches} patches of 128 x 128")

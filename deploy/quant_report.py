@@ -7,8 +7,8 @@ from itertools import islice
 import numpy as np
 import onnx
 
+from deploy.gate import gate_row
 from deploy.results import Figure, Row, measured, predicted
-from deploy.verdict import gate_row
 from quant.agreement import LayerAgreement, agreement
 from quant.calibration import Patches
 from quant.core import IntCore

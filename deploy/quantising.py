@@ -9,12 +9,12 @@ import onnx
 
 from deploy.blame import blame_report
 from deploy.defaults import HELD_OUT_SEED, load_scenes
+from deploy.gate import gate_row
 from deploy.progress import steps
 from deploy.quant_report import LAYER_PATCHES, ablation_rows, ablations, integer_rows
 from deploy.report.page import write_report
 from deploy.results import Row
 from deploy.tables import print_rows
-from deploy.verdict import gate_row
 from model.simulator.scene import Scene
 from profiles import load_sensor
 from profiles.errors import OptionError

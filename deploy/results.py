@@ -15,9 +15,10 @@ from typing import Literal
 from deploy import __version__
 from model.files import sha256, write_text
 from model.processor import decided, processor_name
+from quant.checks import Check
 
-SCHEMA_NAME, SCHEMA_VERSION = "beers-deploy/results", 1
-SCHEMA_PATH = Path(__file__).parent / "schema" / "results-1.json"
+SCHEMA_NAME, SCHEMA_VERSION = "beers-deploy/results", 2
+SCHEMA_PATH = Path(__file__).parent / "schema" / "results-2.json"
 
 Mode = Literal["measured", "predicted", "published", "unavailable"]
 
@@ -110,12 +111,13 @@ def by_table(rows: Iterable[Row]) -> dict[str, list[Row]]:
 
 @dataclass(frozen=True)
 class Document:
-    """What one run of a command found."""
+    """What one run of a command found; of a command that judges, also its checks, which are its verdict."""
 
     command: str
     arguments: Mapping[str, object]
     inputs: tuple[Path, ...]
     rows: tuple[Row, ...]
+    checks: tuple[Check, ...] = ()
 
     def to_json(self) -> dict[str, object]:
         """The whole document as the schema wants it."""
@@ -127,6 +129,7 @@ class Document:
             "arguments": {key: _plain(value) for key, value in self.arguments.items()},
             "inputs": [{"name": path.name, "sha256": sha256(path)} for path in self.inputs],
             "host": host(),
+            **_verdict(self.checks),
             "rows": [
                 {
                     "table": row.table,
@@ -159,6 +162,14 @@ def host() -> dict[str, object]:
         "load_1_min": None if platform.system() == "Windows" else round(psutil.getloadavg()[0], 2),
         "kernels": decided(),
     }
+
+
+def _verdict(checks: tuple[Check, ...]) -> dict[str, object]:
+    """Nothing of a command that judges nothing."""
+    if not checks:
+        return {}
+    passed = all(check.passed for check in checks)
+    return {"verdict": "passed" if passed else "failed", "checks": [check.to_json() for check in checks]}
 
 
 def _plain(value: object) -> object:

@@ -6,6 +6,10 @@ from model.shipped import SHIPPED, shipped_weights
 
 VARIANT = "convbeers-s"
 
+SENSOR = "pleiades-degraded"
+"""The sensor profile of a command that is told none: the same for all, so that a network is judged where it was
+calibrated. (`train` alone defaults to a range of sensors.)"""
+
 
 def default_float_weights() -> Path:
     """The shipped float weights (safetensors)."""

@@ -28,7 +28,7 @@ class BeersError(Exception):
 
     def __init__(self, where: str, *, expected: str, got: str, remedy: str) -> None:
         super().__init__(
-            f"{_printable(where)}: expected {_printable(expected, 4 * LONGEST)}, got {_printable(got)}; {remedy}."
+            f"{printable(where)}: expected {printable(expected, 4 * LONGEST)}, got {printable(got)}; {remedy}."
         )
         self.where, self.expected, self.got, self.remedy = where, expected, got, remedy
 
@@ -37,7 +37,7 @@ class BeersError(Exception):
         return partial(type(self), expected=self.expected, got=self.got, remedy=self.remedy), (self.where,)
 
 
-def _printable(text: str, longest: int = LONGEST) -> str:
+def printable(text: str, longest: int = LONGEST) -> str:
     """One line that a terminal shows as it is, whatever a file held."""
     shown = "".join(c if c.isprintable() else ascii(c)[1:-1] for c in text[:longest])
     return shown + ("..." if len(text) > longest else "")

@@ -9,6 +9,7 @@ from typing import Any
 
 from profiles.errors import OptionError
 from profiles.text import read_toml_text
+from quant.checks import Check
 from quant.gate import GateResult
 
 
@@ -33,16 +34,6 @@ class Limits:
     min_psnr_float_int8_db: float | None = None
     saturated: float | None = None
     mae_growth: float | None = 1.05
-
-
-@dataclass(frozen=True)
-class Check:
-    """One thing that the gate looks at."""
-
-    name: str
-    passed: bool
-    found: str
-    allowed: str
 
 
 def read_limits(path: Path | None, mae: float | None) -> Limits:
@@ -80,32 +71,28 @@ def _is_limit(value: object) -> bool:
 
 
 def judge(result: GateResult, limits: Limits, baseline_mae: float | None = None) -> list[Check]:
-    """Every limit that is set, against what was found. NaN passes nothing."""
-    found: Mapping[str, tuple[float, float | None]] = {
-        "MAE": (result.mae, limits.mae),
-        "99.9th percentile": (result.p999, limits.p999),
-        "std / MAE": (result.std_over_mae, limits.std_over_mae),
-        "PSNR drop, dB": (result.drop_db, limits.psnr_drop_db),
-    }
+    """Every limit that is set, against what was found."""
+    scale = "of full scale"
     checks = [
-        Check(name, value <= allowed, f"{value:.4g}", f"at most {allowed:g}")
-        for name, (value, allowed) in found.items()
-        if allowed is not None
+        _at_most("MAE", result.mae, limits.mae, scale),
+        _at_most("99.9th percentile", result.p999, limits.p999, scale),
+        _at_most("std / MAE", result.std_over_mae, limits.std_over_mae, "ratio"),
+        _at_most("PSNR drop", result.drop_db, limits.psnr_drop_db, "dB"),
     ]
-    least, level = limits.min_psnr_float_int8_db, result.psnr_between_db
-    if least is not None:
-        checks.append(Check("PSNR float-INT8, dB", level >= least, f"{level:.4g}", f"at least {least:g}"))
+    if limits.min_psnr_float_int8_db is not None:
+        least = limits.min_psnr_float_int8_db
+        checks.append([Check("PSNR float-INT8", result.psnr_between_db, least, "dB", "at least")])
     if baseline_mae is not None and limits.mae_growth is not None:
-        allowed = limits.mae_growth * baseline_mae
-        text = f"at most {allowed:.4g}, {limits.mae_growth:g} times the baseline"
-        checks.append(Check("MAE against the baseline", result.mae <= allowed, f"{result.mae:.4g}", text))
-    return checks
+        allowed, detail = limits.mae_growth * baseline_mae, f"the baseline has {baseline_mae:.4g}"
+        checks.append(_at_most("MAE against the baseline", result.mae, allowed, scale, detail))
+    return [check for found in checks for check in found]
 
 
 def judge_saturation(shares: Mapping[str, float], limits: Limits) -> list[Check]:
     """The layer that saturates most, against the limit if there is one; where nothing is 8-bit none is kept."""
-    if limits.saturated is None:
-        return []
     layer, share = max(shares.items(), key=lambda item: item[1], default=("any layer: none is 8-bit", math.nan))
-    allowed = f"at most {limits.saturated:g} of a layer's"
-    return [Check("saturated results", share <= limits.saturated, f"{share:.2g} in {layer}", allowed)]
+    return _at_most("saturated results", share, limits.saturated, "of a layer's", f"in {layer}")
+
+
+def _at_most(name: str, value: float, limit: float | None, unit: str, detail: str = "") -> list[Check]:
+    return [] if limit is None else [Check(name, value, limit, unit, detail=detail)]

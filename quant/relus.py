@@ -22,9 +22,9 @@ class Relus:
     spelt: int
     folded: int
 
-    def may_be(self, wanted: int) -> bool:
-        """Whether so many ReLUs can be told apart in it, no less and no more."""
-        return self.spelt <= wanted <= self.spelt + self.folded
+    def off_by(self, wanted: int) -> int:
+        """How many of `wanted` ReLUs are surely lost, or how many surely added."""
+        return max(wanted - self.spelt - self.folded, self.spelt - wanted, 0)
 
     def __str__(self) -> str:
         return f"{self.spelt}, and up to {self.folded} as 8 bits from zero" if self.folded else str(self.spelt)

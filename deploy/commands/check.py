@@ -53,7 +53,7 @@ def check(
 
 def _network(path: Path, dpu: "Dpu", tile: int | None, picture: Path | None, json: Path | None) -> bool:
     """Judge a file; whether its core runs whole on the DPU."""
-    from deploy.dpu.checking import network_rows, summary
+    from deploy.dpu.checking import legality, network_rows, summary
     from deploy.dpu.picture import write_picture
     from deploy.dpu.placement import place
     from deploy.dpu.reading import network_of, own_tile_px
@@ -70,7 +70,7 @@ def _network(path: Path, dpu: "Dpu", tile: int | None, picture: Path | None, jso
     if picture is not None:
         write_picture(placement, title, picture)
     arguments = {"target": dpu.target.name, "config": dpu.name, "tile": tile_px}
-    Document("check", arguments, (path,), tuple(rows)).write(json)
+    Document("check", arguments, (path,), tuple(rows), (legality(placement),)).write(json)
     for line in summary(placement, dpu, tile_px):
         typer.echo(line)
     return not placement.failed
@@ -78,7 +78,7 @@ def _network(path: Path, dpu: "Dpu", tile: int | None, picture: Path | None, jso
 
 def _traditional(dpu: "Dpu", picture: Path | None, json: Path | None) -> bool:
     """Judge the operators of the traditional chain; whether the DPU could run them all."""
-    from deploy.dpu.checking import step_rows
+    from deploy.dpu.checking import step_legality, step_rows
     from deploy.dpu.traditional import judge_traditional, verdict
     from deploy.results import Document
     from deploy.tables import print_rows
@@ -90,6 +90,7 @@ def _traditional(dpu: "Dpu", picture: Path | None, json: Path | None) -> bool:
     steps = judge_traditional(dpu)
     rows = [row for step in steps for row in step_rows(step)]
     print_rows(f"the traditional chain on {dpu.target.name} {dpu.name}", rows)
-    Document("check", {"target": dpu.target.name, "config": dpu.name}, (), tuple(rows)).write(json)
+    arguments, checks = {"target": dpu.target.name, "config": dpu.name}, (step_legality(steps),)
+    Document("check", arguments, (), tuple(rows), checks).write(json)
     typer.echo(verdict(steps))
     return not any(step.broken for step in steps)

@@ -6,6 +6,8 @@ from typing import Annotated
 
 import typer
 
+from deploy.shipped import SENSOR
+
 EXAMPLE = "quantize float.onnx --target vck190 --sensor pleiades-degraded --out int8.onnx"
 
 
@@ -20,9 +22,7 @@ def quantize(
     model: Annotated[Path, typer.Argument(help="Float ONNX or weights.")],
     out: Annotated[Path, typer.Option(help="INT8 ONNX for the host, runs on stock onnxruntime.")],
     target: Annotated[str, typer.Option(help="Whose rules to obey.")] = "vck190",
-    sensor: Annotated[
-        str, typer.Option(help="Profile that calibration patches are drawn from.")
-    ] = "pleiades-variable",
+    sensor: Annotated[str, typer.Option(help="Profile that calibration patches are drawn from.")] = SENSOR,
     regime: Annotated[
         Regime, typer.Option(help="legal: the DPU's rules; free: float scales, a channel's own for weights.")
     ] = Regime.legal,

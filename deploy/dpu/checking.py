@@ -1,6 +1,6 @@
 """The checker's findings as rows of results and as a few lines."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 from deploy.dpu.board import Dpu
 from deploy.dpu.operators import Broken
@@ -8,6 +8,7 @@ from deploy.dpu.placement import Cut, PlacedNode, Placement
 from deploy.dpu.remarks import remarks_on
 from deploy.dpu.traditional import Step
 from deploy.results import Figure, Row, predicted, unavailable
+from quant.checks import Check
 
 SOURCE = "operator rules of the target profile"
 
@@ -26,6 +27,13 @@ def network_rows(placement: Placement, dpu: Dpu, tile_px: int) -> list[Row]:
     return [*nodes, *_subgraph_rows(placement), *map(_cut_row, placement.cuts), *remarks, summary]
 
 
+def legality(placement: Placement) -> Check:
+    """The verdict on a network: no node of its core may break a rule."""
+    failed = placement.failed
+    first = f"{failed[0].op.name}: {failed[0].broken[0].finding.reason}" if failed else ""
+    return Check("nodes the DPU refuses", len(failed), 0, "node", detail=first)
+
+
 def summary(placement: Placement, dpu: Dpu, tile_px: int) -> list[str]:
     """What a person wants to know, in a few lines."""
     lines = [f"device subgraphs: {len(_pieces(placement))}, DPU subgraphs: {placement.dpu_subgraphs}"]
@@ -37,10 +45,17 @@ def summary(placement: Placement, dpu: Dpu, tile_px: int) -> list[str]:
     if placement.note:
         lines.append(placement.note)
     if placement.failed:
-        lines.append(f"check FAILED: {len(placement.failed)} nodes of the core cannot run on the DPU")
+        lines.append(f"check FAILED: {legality(placement)}")
     else:
         lines.append("check passed: the core runs whole on the DPU")
     return lines
+
+
+def step_legality(steps: Sequence[Step]) -> Check:
+    """The verdict on the traditional chain: how many of its steps the DPU refuses."""
+    broken = [step for step in steps if step.broken]
+    first = f"{broken[0].purpose}: {broken[0].broken[0].finding.reason}" if broken else ""
+    return Check("steps the DPU refuses", len(broken), 0, "step", detail=first)
 
 
 def step_rows(step: Step) -> list[Row]:

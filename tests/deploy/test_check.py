@@ -64,6 +64,30 @@ def test_the_document_holds_subgraphs_cuts_and_remarks(tmp_path: Path) -> None:
     assert [row["figures"]["size"]["value"] for row in found["cuts"]] == [8 * 96 * 96] * 4
     assert {row["name"] for row in found["remarks"]} == {"fix2float", "pieces"}
     assert "device subgraphs: 3, DPU subgraphs: 2" in output
+    assert "check FAILED: nodes the DPU refuses 1 (" in output.splitlines()[-1]
+
+
+def test_the_document_holds_the_verdict(tmp_path: Path) -> None:
+    sketch = Sketch(8)
+    path = sketch.save(tmp_path / "bad.onnx", sketch.conv(sketch.node("Sigmoid", sketch.conv("image"))))
+    bad = verdict(tmp_path / "bad.json", str(path))
+    sound = verdict(tmp_path / "sound.json", str(float_convbeers(tmp_path / "n.onnx", 2, 8)))
+    chain = verdict(tmp_path / "chain.json", "traditional")
+    assert [found[0] for found in (bad, sound, chain)] == ["failed", "passed", "failed"]
+    limit = {"limit": 0, "bound": "at most"}
+    nodes = {"name": "nodes the DPU refuses", "unit": "node", **limit}
+    assert nodes.items() | {"value": 1, "passed": False}.items() <= bad[1].items()
+    assert nodes.items() | {"value": 0, "passed": True, "detail": ""}.items() <= sound[1].items()
+    assert (chain[1]["unit"], chain[1]["value"] > 10) == ("step", True)
+
+
+def verdict(path: Path, model: str) -> tuple[str, dict[str, Any]]:
+    """The verdict in the document, and its one check."""
+    run(model, "--json", str(path))
+    content = json.loads(path.read_text())
+    jsonschema.validate(content, json.loads(SCHEMA_PATH.read_text()))
+    (check,) = content["checks"]
+    return content["verdict"], check
 
 
 def test_a_size_that_is_not_known_is_no_zero(tmp_path: Path) -> None:

@@ -13,11 +13,13 @@ import pytest
 import tifffile
 from onnx import numpy_helper
 from PIL import Image
+from typer.core import TyperGroup
+from typer.main import get_command
 from typer.testing import CliRunner
 
 from deploy.cli import COMMANDS, app
 from deploy.results import SCHEMA_PATH
-from deploy.shipped import default_int8
+from deploy.shipped import SENSOR, default_int8
 
 runner = CliRunner()
 
@@ -46,6 +48,15 @@ def test_every_command_has_help_with_an_example(name: str) -> None:
     assert result.exit_code == 0
     assert f"beers-deploy {name}" in " ".join(result.output.split())
     assert "Example" in result.output
+
+
+def test_what_is_told_no_sensor_takes_the_same_one() -> None:
+    """A network calibrated on one and judged on another is no fair trial; `train` alone is for a range of sensors."""
+    group = get_command(app)
+    assert isinstance(group, TyperGroup)
+    defaults = {name: p.default for name, c in group.commands.items() for p in c.params if p.name == "sensor"}
+    assert {"quantize", "gate", "evaluate"} <= set(defaults)
+    assert {name for name, default in defaults.items() if default not in (SENSOR, None)} == {"train"}
 
 
 def test_help_imports_nothing_heavy() -> None:

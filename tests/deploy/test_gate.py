@@ -1,7 +1,9 @@
 """The gate catches what goes wrong in quantised files, and tells a CI job so."""
 
+import json
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 from xml.etree import ElementTree as ET
 
 import numpy as np
@@ -12,20 +14,20 @@ from typer.testing import CliRunner
 
 from deploy.cli import app
 from deploy.defaults import float_model
-from deploy.gate import structure_checks
-from deploy.gate_baseline import baseline_mae
-from deploy.gate_report import junit, markdown
+from deploy.gate import baseline_mae, structure_checks
 from deploy.results import Document, Row, measured
 from deploy.shipped import default_int8, shipped_pair
+from deploy.verdict import junit, markdown, sentence
 from model.shipped import SHIPPED
 from model.simulator.procedural import procedural_scene
 from profiles import load_sensor
 from profiles.errors import OptionError
 from quant.calibration import Patches, draw_patches
+from quant.checks import Bound, Check
 from quant.free import quantise_free
 from quant.gate import compare
 from quant.host_reader import read_core
-from quant.limits import Check, Limits, judge, judge_saturation, read_limits
+from quant.limits import Limits, judge, judge_saturation, read_limits
 from quant.onnx_file import image_info, save_onnx
 from quant.relus import Relus, count_relus
 from quant.saturation import rounded_tensors, saturated_shares
@@ -114,8 +116,8 @@ def test_the_shipped_file_passes(reference_model: onnx.ModelProto, unseen: Patch
 @pytest.mark.parametrize(
     ("spoil", "check"),
     [
-        (drop_a_relu, "ReLUs kept"),
-        (give_a_float_scale, "legal on the DPU"),
+        (drop_a_relu, "ReLUs lost or added"),
+        (give_a_float_scale, "nodes the DPU refuses"),
         (clip_an_activation, "MAE"),
         (clip_an_activation, "saturated results"),
         (shift_a_bias, "MAE"),
@@ -159,16 +161,54 @@ def test_without_8_bit_results_no_limit_on_them_is_kept() -> None:
     assert "none is 8-bit" in check.found
 
 
-CHECKS = [Check("MAE", True, "0.0006", "at most 0.0008"), Check("legal <all>", False, "tail: x & y", "the rules")]
+CHECKS = [
+    Check("MAE", 6e-4, 8e-4, "of full scale"),
+    Check("PSNR drop", 0.31, 0.25, "dB"),
+    Check("nodes <all>", 1, 0, "node", detail="tail: x & y | z\n::error::\x1b[31m"),
+    Check("PSNR float-INT8", 61.15, 60, "dB", "at least"),
+]
 
 
 def test_a_job_can_read_the_verdict() -> None:
     text = markdown("INT8 gate", CHECKS)
-    assert "FAILED" in text
-    assert "| MAE | 0.0006 | at most 0.0008 | ok |" in text
+    assert text.startswith("## INT8 gate: FAILED")
+    assert "| MAE | 0.0006 of full scale | at most 0.0008 | ok |" in text
+    assert "<" not in text
     suite = ET.fromstring(junit("INT8 gate", CHECKS))  # noqa: S314 - our own text
-    assert (suite.get("tests"), suite.get("failures")) == ("2", "1")
-    assert [case.find("failure") is not None for case in suite] == [False, True]
+    assert [suite.get(name) for name in ("tests", "failures", "errors")] == ["4", "2", "0"]
+    assert [case.find("failure") is not None for case in suite] == [False, True, True, False]
+
+
+def test_a_strangers_name_stays_on_its_line() -> None:
+    """A node's name may hold what a terminal or a CI's log would obey, or what ends a cell of a table."""
+    for text in (str(CHECKS[2]), sentence(CHECKS, ""), CHECKS[2].found):
+        assert text.isprintable()
+    (line,) = (line for line in markdown("t", CHECKS).splitlines() if "tail" in line)
+    assert line.replace("\\|", "").count("|") == 5
+
+
+def test_the_last_line_names_what_failed_and_nothing_else() -> None:
+    assert sentence(CHECKS[:1], "MAE 0.0006") == "passed, all 1 checks: MAE 0.0006"
+    text = sentence(CHECKS, "MAE 0.0006")
+    assert text.startswith("FAILED, 2 of 4 checks: PSNR drop 0.31 dB, allowed at most 0.25; nodes <all> 1 (tail")
+    assert "MAE" not in text
+    assert "float-INT8" not in text
+
+
+@pytest.mark.parametrize(
+    ("value", "limit", "bound", "passed"),
+    [
+        (1.0, 1.0, "at most", True),
+        (1.0, 1.0, "at least", True),
+        (1.1, 1.0, "at most", False),
+        (1.1, 1.0, "at least", True),
+        (np.nan, np.inf, "at most", False),
+        (np.nan, 0.0, "at least", False),
+        (np.inf, 60.0, "at least", True),
+    ],
+)
+def test_the_number_decides(value: float, limit: float, bound: Bound, passed: bool) -> None:
+    assert Check("x", value, limit, "dB", bound).passed == passed
 
 
 def test_one_file_alone_is_no_pair(tmp_path: Path) -> None:
@@ -189,19 +229,72 @@ def test_a_baseline_holds_the_mae(tmp_path: Path) -> None:
     runner, first = CliRunner(), tmp_path / "first.json"
     done = runner.invoke(app, ["gate", "--patches", "2", "--json", str(first), "--junit", str(tmp_path / "j.xml")])
     assert done.exit_code == 0, done.output
+    assert json.loads(first.read_text())["verdict"] == "passed"
     before = baseline_mae(first, ASKED)
     assert ET.parse(tmp_path / "j.xml").getroot().get("failures") == "0"  # noqa: S314
     first.write_text(first.read_text().replace(str(before), str(before / 2)))
-    again = runner.invoke(
-        app, ["gate", "--patches", "2", "--baseline", str(first), "--summary", str(tmp_path / "s.md")]
-    )
+    paths = {name: tmp_path / name for name in ("json", "summary", "outputs")}
+    for name in ("summary", "outputs"):
+        paths[name].write_text(f"{name} of a step before\n")
+    wanted = [text for name, path in paths.items() for text in (f"--{name}", str(path))]
+    again = runner.invoke(app, ["gate", "--patches", "2", "--baseline", str(first), *wanted])
     assert again.exit_code == 1
-    assert "**failed**" in (tmp_path / "s.md").read_text()
+    assert paths["summary"].read_text().startswith("summary of a step before\n\n## INT8 gate")
+    assert "**failed**" in paths["summary"].read_text()
+    last = again.output.splitlines()[-1]
+    assert last.startswith(f"gate FAILED, 1 of 6 checks: MAE against the baseline {before:.4g} of full scale")
+    only_baseline_is_blamed(json.loads(paths["json"].read_text()), before)
+    lines = dict(line.split("=") for line in paths["outputs"].read_text().splitlines()[1:])
+    assert float(lines.pop("mae")) == pytest.approx(before, rel=1e-5)
+    assert 0 < float(lines.pop("drop")) < 1
+    assert lines == {"verdict": "failed"}
+
+
+def only_baseline_is_blamed(document: Any, mae: float) -> None:
+    assert document["verdict"] == "failed"
+    assert [check["name"] for check in document["checks"] if not check["passed"]] == ["MAE against the baseline"]
+    limits = {check["name"]: (check["value"], check["limit"]) for check in document["checks"]}
+    assert limits["MAE"] == (mae, 0.0007)
+    assert limits["MAE against the baseline"] == (mae, pytest.approx(1.05 * mae / 2))
+
+
+def test_a_document_that_is_no_baseline_is_refused(tmp_path: Path) -> None:
     with pytest.raises(OptionError, match="no such file"):
         baseline_mae(tmp_path / "none.json", ASKED)
     (tmp_path / "other.json").write_text("{}")
     with pytest.raises(OptionError, match="another document"):
         baseline_mae(tmp_path / "other.json", ASKED)
+
+
+def test_bad_input_is_told_where_a_job_looks(tmp_path: Path) -> None:
+    paths = {name: tmp_path / name for name in ("junit", "summary", "outputs")}
+    paths["summary"].write_text("before\n")
+    wanted = [text for name, path in paths.items() for text in (f"--{name}", str(path))]
+    pair = [str(tmp_path / "<none>.onnx"), str(default_int8())]
+    done = CliRunner().invoke(app, ["gate", *pair, *wanted])
+    assert done.exit_code == 2
+    told = done.stderr.removeprefix("beers-deploy: ").strip()
+    assert "<none>.onnx: expected an ONNX file, got no such file" in told
+    suite = ET.parse(paths["junit"]).getroot()  # noqa: S314
+    assert [suite.get(name) for name in ("tests", "failures", "errors")] == ["1", "0", "1"]
+    (error,) = suite.iter("error")
+    assert error.text == error.get("message") == told
+    summary = f"before\n\n## INT8 gate: not judged\n\n{told}\n"
+    assert paths["summary"].read_text() == summary.replace("<", "&lt;")
+    assert paths["outputs"].read_text() == "verdict=error\n"
+
+
+def test_a_report_that_cannot_be_written_hides_no_fault(tmp_path: Path) -> None:
+    """What is wrong with the first output is told, and the others still get it."""
+    wanted = ["--json", str(tmp_path), "--junit", str(tmp_path / "j.xml"), "--summary", str(tmp_path / "s.md")]
+    done = CliRunner().invoke(app, ["gate", *wanted])
+    assert done.exit_code == 2
+    assert "got a folder" in done.stderr
+    assert "got a folder" in (tmp_path / "j.xml").read_text()
+    nowhere = CliRunner().invoke(app, ["gate", "--summary", str(tmp_path), "--junit", str(tmp_path / "k.xml")])
+    assert nowhere.exit_code == 2
+    assert nowhere.stderr.count("\n") == 1
+    assert "got a folder" in (tmp_path / "k.xml").read_text()
 
 
 @pytest.mark.parametrize(
@@ -277,7 +370,7 @@ def test_a_relu_is_the_larger_of_zero_whatever_comes_first(spelt: list[str]) -> 
 def test_results_that_are_never_below_zero_need_no_relu() -> None:
     """An 8-bit range from zero may be a ReLU folded in, or none: both are told apart by what was there in float."""
     found = Relus(spelt=1, folded=2)
-    assert [found.may_be(wanted) for wanted in range(5)] == [False, True, True, True, False]
+    assert [found.off_by(wanted) for wanted in range(6)] == [1, 0, 0, 0, 1, 2]
 
 
 def change_the_host(name: str, value: float) -> Callable[[onnx.ModelProto], None]:
@@ -292,12 +385,12 @@ def read_at_another_scale(model: onnx.ModelProto) -> None:
 @pytest.mark.parametrize(
     ("spoil", "check"),
     [
-        (raise_a_floor, "ReLUs kept"),
-        (raise_a_floor, "spelling"),
-        (read_at_another_scale, "spelling"),
-        (change_the_host("gain", 4), "spelling"),
-        (change_the_host("max_dn", 4096), "spelling"),
-        (change_the_host("fine_max", 0.25), "spelling"),
+        (raise_a_floor, "ReLUs lost or added"),
+        (raise_a_floor, "faults of the encoding"),
+        (read_at_another_scale, "faults of the encoding"),
+        (change_the_host("gain", 4), "faults of the encoding"),
+        (change_the_host("max_dn", 4096), "faults of the encoding"),
+        (change_the_host("fine_max", 0.25), "faults of the encoding"),
     ],
 )
 def test_what_hardly_shows_in_pixels_is_seen_in_the_file(
@@ -316,9 +409,12 @@ def test_a_free_file_is_judged_without_the_rules_of_a_dpu(
     path = tmp_path / "free.onnx"
     save_onnx(quantise_free(reference_model, unseen, {}, lambda: None), path)
     checks = structure_checks(reference_model, path, onnx.load(path), "host-cpu")
-    assert [(c.name, c.passed) for c in checks] == [("ReLUs kept", True), ("optimised equals unoptimised", True)]
+    assert [(c.name, c.passed) for c in checks] == [
+        ("ReLUs lost or added", True),
+        ("optimised against unoptimised", True),
+    ]
     (rules,) = {c.name for c in structure_checks(reference_model, path, onnx.load(path), "vck190") if not c.passed}
-    assert rules == "legal on the DPU"
+    assert rules == "nodes the DPU refuses"
 
 
 def test_two_networks_of_one_kind_are_refused(reference_model: onnx.ModelProto, tmp_path: Path) -> None:

@@ -1,12 +1,15 @@
 import json
 import math
 from pathlib import Path
+from typing import Any
 
 import jsonschema
 import pytest
 
+from deploy.compare import read_document
+from deploy.gate import gate_row
 from deploy.results import SCHEMA_PATH, Document, Figure, Row, measured, number, predicted, published, unavailable
-from deploy.verdict import gate_row
+from quant.checks import Check
 from quant.gate import GateResult
 from quant.limits import Limits, judge
 
@@ -87,6 +90,66 @@ def test_a_document_without_rows_is_invalid() -> None:
 def test_a_gate_on_a_network_gone_wrong_still_writes_json(value: float, tmp_path: Path) -> None:
     """A network that gives NaN has no MAE: unavailable with a reason, in JSON that every reader takes."""
     result = GateResult(value, value, value, value, value, value, value, value, patches=1)
-    Document("gate", {}, (), (gate_row(result),)).write(tmp_path / "gate.json")
+    checks = tuple(judge(result, Limits(mae=1.0)))
+    Document("gate", {}, (), (gate_row(result),), checks).write(tmp_path / "gate.json")
     jsonschema.validate(strictly((tmp_path / "gate.json").read_text()), SCHEMA)
-    assert judge(result, Limits(mae=1.0))[0].passed == (value == 0)
+    assert checks[0].passed == (value == 0)
+
+
+CHECKS = Check("MAE", 6e-4, 7e-4, "of full scale"), Check("PSNR drop", math.nan, 0.25, "dB", detail="of a layer")
+
+
+def judged(*checks: Check, command: str = "gate") -> dict[str, Any]:
+    row = Row("t", "row", {"a": measured(1, "s", "here")})
+    return Document(command, {}, (), (row,), checks).to_json()
+
+
+@pytest.mark.parametrize(("checks", "verdict"), [(CHECKS[:1], "passed"), (CHECKS, "failed")])
+def test_a_verdict_stands_beside_its_checks(checks: tuple[Check, ...], verdict: str) -> None:
+    whole = judged(*checks)
+    jsonschema.validate(strictly(json.dumps(whole, allow_nan=False)), SCHEMA)
+    assert whole["verdict"] == verdict
+    assert [check["passed"] for check in whole["checks"]] == [True, False][: len(checks)]
+    first = {"name": "MAE", "value": 6e-4, "limit": 7e-4, "unit": "of full scale", "bound": "at most"}
+    assert whole["checks"][0] == {**first, "passed": True, "detail": ""}
+    assert whole["checks"][-1]["value"] == (6e-4 if verdict == "passed" else None)
+
+
+@pytest.mark.parametrize("command", ["gate", "check"])
+def test_a_command_that_judges_has_a_verdict(command: str) -> None:
+    with pytest.raises(jsonschema.ValidationError, match="'verdict' is a required"):
+        jsonschema.validate(judged(command=command), SCHEMA)
+    jsonschema.validate(judged(command="bench"), SCHEMA)
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"verdict": "failed"},
+        {"verdict": "perhaps"},
+        {"checks": []},
+        {"checks": [{**CHECKS[1].to_json(), "passed": False}]},
+        {"checks": [{**CHECKS[0].to_json(), "value": None, "limit": "0.0007"}]},
+        {"schema_version": 1},
+        {"host": {"system": "Linux"}},
+    ],
+)
+def test_a_verdict_that_its_checks_do_not_bear_out_is_invalid(wrong: dict[str, object]) -> None:
+    sound = judged(CHECKS[0])
+    jsonschema.validate(sound, SCHEMA)
+    with pytest.raises(jsonschema.ValidationError):
+        jsonschema.validate({**sound, **wrong}, SCHEMA)
+
+
+def test_a_host_of_version_2_says_which_kernels_it_took() -> None:
+    sound = judged(CHECKS[0])
+    del sound["host"]["kernels"]
+    with pytest.raises(jsonschema.ValidationError, match="'kernels' is a required"):
+        jsonschema.validate(sound, SCHEMA)
+
+
+def test_documents_of_version_1_are_still_read() -> None:
+    baselines = list((Path(__file__).parents[2] / ".ci" / "baselines").iterdir())
+    assert len(baselines) == 6
+    for path in baselines:
+        assert read_document(path)["schema_version"] == 1

@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 from deploy.cli import app
 from deploy.dataset import _read_summary
 from deploy.dpu.board import load_dpu
-from deploy.gate_baseline import PATCHES, baseline_mae
+from deploy.gate import PATCHES, baseline_mae
 from deploy.refit import refit
 from deploy.results import Document, Row, measured
 from deploy.swath.spool import Spool, part_folder
@@ -27,6 +27,7 @@ from model.weights_file import load_network, write_tensors
 from model.weights_file import read_tensors as read_weights
 from profiles.errors import BeersError, ModelError, OptionError, ProfileError
 from profiles.toml import HERE
+from quant.checks import Check
 from quant.limits import read_limits
 from quant.onnx_file import load_onnx
 from tests.fuzz.parsers import JOB, SHAPE, checkpoint_seeds, go_on, weights_seeds
@@ -37,7 +38,8 @@ runner = CliRunner()
 def document(path: Path, value: object, name: str = "int8") -> Path:
     """Results with one figure of any value."""
     asked = dict.fromkeys(PATCHES)
-    made = Document("gate", asked, (), (Row("gate", name, {"MAE": measured(1.0, "", "here")}),)).to_json()
+    row, check = Row("gate", name, {"MAE": measured(1.0, "", "here")}), Check("MAE", 0.5, 2.0, "of full scale")
+    made = Document("gate", asked, (), (row,), (check,)).to_json()
     path.write_text(json.dumps(made).replace('"value": 1.0', f'"value": {value}'), encoding="utf-8")
     return path
 

@@ -23,7 +23,7 @@ from deploy.dpu.placement import place
 from deploy.dpu.rates import Layers
 from deploy.dpu.reading import read_network
 from deploy.dpu.work import count_work
-from deploy.gate_baseline import PATCHES, baseline_mae
+from deploy.gate import PATCHES, baseline_mae
 from deploy.refit import refit
 from deploy.results import Document, Figure, Row, measured, predicted, unavailable
 from deploy.swath.reader import open_source
@@ -43,6 +43,7 @@ from model.weights_file import load_network, save_network
 from profiles import load_sensor, load_target
 from profiles.errors import BeersError
 from profiles.scene_call import load_scene_call
+from quant.checks import Check
 from quant.float_reader import correction_graph
 from quant.host_reader import spelling_faults
 from quant.limits import read_limits
@@ -186,7 +187,8 @@ def document_seeds(_: Path) -> list[bytes]:
     figures = {"MAE": measured(7e-4, "of full scale", "here"), "none": unavailable("W", "no counter")}
     figures["time"] = predicted(3.0, "s", (2.0, 4.0), "cost model")
     rows = (Row("gate", "int8", figures, {"word": "text"}), Row("gate", "other", figures))
-    return [json.dumps(Document("gate", GATED, (), rows).to_json()).encode()]
+    check = Check("MAE", 0.5, 2.0, "of full scale", detail="text")
+    return [json.dumps(Document("gate", GATED, (), rows, (check,)).to_json()).encode()]
 
 
 def read_results(path: Path) -> None:

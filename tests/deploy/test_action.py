@@ -1,0 +1,218 @@
+"""The action and the workflow to copy, run as shell: green on a sound pair, red on a broken or a missing one."""
+
+import json
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from xml.etree import ElementTree as ET
+
+import onnx
+import pytest
+from onnx import numpy_helper
+from typer.testing import CliRunner
+
+from deploy.cli import app
+from deploy.shipped import SENSOR, shipped_pair
+from tests.deploy.workflow_steps import ACTION, BASH, KEPT, ROOT, Runner, read_yaml
+
+WORKFLOW = ROOT / ".github" / "workflows" / "int8-gate.yml"
+OURS = "Export a shipped network"
+
+pytestmark = pytest.mark.skipif(
+    sys.platform == "win32", reason="the steps run in bash, which Windows has not of itself"
+)
+
+
+@pytest.fixture(scope="module")
+def networks(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a sound pair, the same with one bias doubled, and a baseline of the sound one."""
+    folder = tmp_path_factory.mktemp("networks")
+    done = CliRunner().invoke(app, ["export", "--variant", "convbeers-xs", "--out", str(folder / "float.onnx")])
+    assert done.exit_code == 0, done.output
+    shutil.copy(shipped_pair("convbeers-xs")[1], folder / "int8.onnx")
+    model = onnx.load(folder / "int8.onnx")
+    name = next(node.input[8] for node in model.graph.node if node.op_type == "QLinearConv")
+    bias = next(tensor for tensor in model.graph.initializer if tensor.name == name)
+    bias.CopyFrom(numpy_helper.from_array(2 * numpy_helper.to_array(bias), name))
+    onnx.save(model, folder / "broken.onnx")
+    return folder
+
+
+@pytest.fixture
+def runner(tmp_path: Path) -> Runner:
+    (tmp_path / "workspace").mkdir()
+    made = Runner(tmp_path / "workspace")
+    made.prepare()
+    return made
+
+
+def take(runner: Runner, networks: Path, *names: str) -> None:
+    """Lay networks into models/, as a user's repository has them."""
+    (runner.folder / "models").mkdir(exist_ok=True)
+    for name in names:
+        shutil.copy(networks / name, runner.folder / "models" / name)
+
+
+def suite(path: Path) -> ET.Element:
+    return ET.parse(path).getroot()  # noqa: S314 - our own text
+
+
+def test_a_sound_pair_is_green(runner: Runner, networks: Path) -> None:
+    take(runner, networks, "float.onnx", "int8.onnx")
+    outputs = runner.run_action({"float": "models/float.onnx", "int8": "models/int8.onnx", "junit": "made/j.xml"})
+    assert not runner.red, runner.stderr
+    assert outputs["verdict"] == "passed"
+    assert 0 < float(outputs["mae"]) < 0.0007
+    assert 0 < float(outputs["drop"]) < 1
+    assert (outputs["int8"], outputs["board"]) == ("models/int8.onnx", "")
+    assert runner.summary.read_text().startswith("what a step before wrote\n\n## INT8 gate of int8.onnx: passed")
+    assert suite(runner.folder / "made" / "j.xml").get("failures") == "0"
+    assert json.loads((runner.folder / "gate.json").read_text())["verdict"] == "passed"
+
+
+def test_a_broken_pair_is_red(runner: Runner, networks: Path) -> None:
+    """The first convolution's bias doubled, beside the baseline of the sound pair."""
+    take(runner, networks, "float.onnx", "int8.onnx", "broken.onnx")
+    pair = {"float": "models/float.onnx", "int8": "models/int8.onnx"}
+    sound = runner.run_action({**pair, "json": "models/gate.json"})
+    assert sound["verdict"] == "passed"
+    outputs = runner.run_action({**pair, "int8": "models/broken.onnx", "baseline": "models/gate.json"})
+    assert runner.red
+    assert outputs["verdict"] == "failed"
+    assert float(outputs["mae"]) > 0
+    failed = {case.get("name") for case in suite(runner.folder / "gate.xml") if case.find("failure") is not None}
+    assert "MAE against the baseline" in failed
+
+
+@pytest.mark.parametrize("given", [{}, {"int8": "models/int8.onnx"}])
+def test_a_missing_float_network_is_red_in_one_sentence(
+    given: dict[str, str], runner: Runner, networks: Path
+) -> None:
+    take(runner, networks, "int8.onnx")
+    outputs = runner.run_action({"float": "models/float.onnx", **given})
+    assert runner.red
+    assert runner.stderr.count("\n") == 1
+    assert "models/float.onnx: expected an ONNX file, got no such file" in runner.stderr
+    assert outputs["verdict"] == "error"
+    assert (outputs["mae"], outputs["drop"]) == ("", "")
+    (error,) = suite(runner.folder / "gate.xml").iter("error")
+    assert str(error.text) in runner.stderr
+    assert str(error.text) in runner.summary.read_text()
+    assert not (runner.folder / "gate.json").exists()
+
+
+@pytest.mark.parametrize("name", ["config", "baseline", "sensor", "int8"])
+def test_whatever_else_is_missing_is_red(name: str, runner: Runner, networks: Path) -> None:
+    take(runner, networks, "float.onnx", "int8.onnx")
+    given = {"float": "models/float.onnx", "int8": "models/int8.onnx", name: "models/none.toml"}
+    assert runner.run_action(given)["verdict"] == "error"
+    assert runner.red
+    assert runner.stderr.count("\n") == 1
+    assert "none.toml" in runner.stderr
+
+
+def test_without_an_int8_network_it_quantises_for_the_same_sensor(runner: Runner, networks: Path) -> None:
+    take(runner, networks, "float.onnx")
+    sensor = runner.folder / "mine.toml"
+    shutil.copy(ROOT / "profiles" / "sensors" / f"{SENSOR}.toml", sensor)
+    outputs = runner.run_action({"float": "models/float.onnx", "sensor": "mine.toml", "max-mae": "0.001"})
+    assert not runner.red, runner.stderr
+    assert outputs["verdict"] == "passed"
+    for name in ("int8", "board"):
+        assert Path(outputs[name]).is_relative_to(runner.temporary)
+        assert onnx.load(outputs[name]).graph.node
+    calls = runner.calls.read_text().splitlines()
+    assert [call.split()[0] for call in calls] == ["quantize", "gate"]
+    assert all("--target vck190 --sensor mine.toml" in call for call in calls)
+    arguments = json.loads((runner.folder / "gate.json").read_text())["arguments"]
+    assert (arguments["sensor"], arguments["max_mae"]) == ("mine.toml", 0.001)
+
+
+def test_a_network_that_cannot_be_quantised_is_red(runner: Runner, networks: Path) -> None:
+    take(runner, networks, "int8.onnx")
+    outputs = runner.run_action({"float": "models/int8.onnx"})
+    assert runner.red
+    assert outputs["verdict"] == "error"
+    assert runner.stderr.startswith("beers-deploy: ")
+
+
+def test_a_limit_that_is_no_number_is_red(runner: Runner, networks: Path) -> None:
+    take(runner, networks, "float.onnx", "int8.onnx")
+    outputs = runner.run_action({"float": "models/float.onnx", "int8": "models/int8.onnx", "max-mae": "0,0007"})
+    assert runner.red
+    assert outputs["verdict"] == "error"
+    assert "--max-mae" in runner.stderr
+
+
+def test_names_are_never_run(runner: Runner) -> None:
+    given = dict.fromkeys(("float", "int8", "sensor", "config"), "$(touch ran) `touch ran` ; touch ran")
+    assert runner.run_action(given)["verdict"] == "error"
+    assert not (runner.folder / "ran").exists()
+
+
+def test_the_action_says_what_it_takes() -> None:
+    action, page = read_yaml(ACTION), (ROOT / "docs" / "gate.md").read_text(encoding="utf-8")
+    assert action["inputs"]["sensor"]["default"] == SENSOR
+    for kind in ("inputs", "outputs"):
+        for name, about in action[kind].items():
+            assert about["description"].endswith(".")
+            assert f"| `{name}` |" in page, f"docs/gate.md lacks the {kind[:-1]} {name}"
+
+
+def test_installing_puts_the_command_alone_on_the_path(tmp_path: Path) -> None:
+    """With a Python that writes down what it is asked for, for want of a package index in a test."""
+    (step,) = (step for step in read_yaml(ACTION)["runs"]["steps"] if "pip install" in step.get("run", ""))
+    python = tmp_path / "python"
+    python.write_text(
+        '#!/usr/bin/env bash\necho "$*" >> "$LOG"\n'
+        'if [ "$2" = venv ]; then mkdir -p "$3/bin"; cp "$0" "$3/bin/python"; fi\n'
+        'if [ "$3" = install ]; then echo ok > "$(dirname "$0")/beers-deploy"; fi\n'
+    )
+    python.chmod(0o755)
+    given = {"PYTHON": str(python), "SOURCE": "the action", "RUNNER_TEMP": str(tmp_path), "RUNNER_OS": "Linux"}
+    files = {"LOG": str(tmp_path / "log"), "GITHUB_PATH": str(tmp_path / "path"), "PATH": "/usr/bin:/bin"}
+    done = subprocess.run([*BASH, step["run"]], cwd=tmp_path, env=given | files, **KEPT)
+    assert done.returncode == 0, done.stderr
+    venv = tmp_path / "beers-deploy"
+    assert (tmp_path / "log").read_text() == f"-m venv {venv}\n-m pip install --quiet the action\n"
+    (added,) = (tmp_path / "path").read_text().splitlines()
+    assert [path.name for path in Path(added).iterdir()] == ["beers-deploy"]
+    assert step["env"]["PIP_EXTRA_INDEX_URL"] == "https://download.pytorch.org/whl/cpu"
+
+
+def steps_of_workflow() -> list[dict[str, object]]:
+    (job,) = read_yaml(WORKFLOW)["jobs"].values()
+    steps: list[dict[str, object]] = job["steps"]
+    return steps
+
+
+def test_the_workflow_is_red_without_a_network(runner: Runner) -> None:
+    """As a user has it, who leaves our own step out: no shipped network stands in for one that is missing."""
+    runner.run_steps([step for step in steps_of_workflow() if step.get("name") != OURS], {})
+    assert runner.red
+    assert runner.stderr.count("\n") == 1
+    assert "models/float.onnx: expected an ONNX file, got no such file" in runner.stderr
+
+
+def test_the_workflow_is_green_with_one(runner: Runner, networks: Path) -> None:
+    take(runner, networks, "float.onnx")
+    runner.run_steps([step for step in steps_of_workflow() if step.get("name") != OURS], {})
+    assert not runner.red, runner.stderr
+    assert runner.outputs["steps.gate.outputs.verdict"] == "passed"
+    assert (runner.folder / "gate.xml").is_file()
+
+
+def test_our_own_step_makes_the_network_that_the_gate_reads(runner: Runner) -> None:
+    (ours,) = (step for step in steps_of_workflow() if step.get("name") == OURS)
+    (gate,) = (step for step in steps_of_workflow() if step.get("id") == "gate")
+    runner.run_shell(ours, {})
+    assert not runner.red, runner.stderr
+    assert isinstance(gate["with"], dict)
+    assert onnx.load(runner.folder / gate["with"]["float"]).graph.node
+
+
+def test_the_workflow_asks_for_no_cache_of_packages() -> None:
+    """`cache: pip` stops in a repository that has no requirements.txt or pyproject.toml."""
+    for path in (WORKFLOW, ACTION):
+        assert "cache:" not in path.read_text()

@@ -1,0 +1,162 @@
+"""Runs what a GitHub workflow or a composite action would: its steps as shell, one after the other, in a folder.
+
+Of the expressions and the conditions only those are understood that our own files use; any other is an error, and so
+is a name that nothing defines. Steps of other actions (checkout, setup-python, uploads) are left out, as are those
+that install.
+"""
+
+import os
+import re
+import subprocess
+import sysconfig
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import yaml  # type: ignore[import-untyped]  # its stubs are one more package, for one function
+
+ROOT = Path(__file__).resolve().parents[2]
+ACTION = ROOT / "action.yml"
+
+EXPRESSION = re.compile(r"\$\{\{ (.+?) \}\}")
+IS_EMPTY = re.compile(r"([\w.-]+) == ''")
+BASH = ("bash", "--noprofile", "--norc", "-eo", "pipefail", "-c")
+"""As GitHub runs `shell: bash`."""
+
+SHORT = {"quantize": "--patches 2 --patch 32", "gate": "--patches 2"}
+"""What the tests add to commands, so that they take seconds."""
+
+
+def read_yaml(path: Path) -> dict[str, Any]:
+    """A workflow or an action."""
+    content: dict[str, Any] = yaml.safe_load(path.read_text(encoding="utf-8"))
+    return content
+
+
+@dataclass
+class Runner:
+    """One job in a folder.
+
+    Attributes:
+        folder: the workspace.
+        red: whether a step has failed; those after it are left out, unless they always run.
+        stderr: what the failed step wrote there.
+        outputs: of the steps, by "steps.ID.outputs.NAME".
+    """
+
+    folder: Path
+    red: bool = False
+    stderr: str = ""
+    outputs: dict[str, str] = field(default_factory=dict)
+
+    def prepare(self) -> None:
+        """What is there before the first step: the commands, and a summary that another job's step began."""
+        (self.temporary / "command").mkdir(parents=True)
+        self.summary.write_text("what a step before wrote\n")
+        lines = [f'{name}) set -- "$@" {more};;' for name, more in SHORT.items()]
+        self.command("beers-deploy", f'echo "$*" >> "{self.calls}"; case "$1" in {" ".join(lines)} esac', '"$@"')
+        self.command("pipx", "shift 3", '"${@:2}"')  # pipx run --spec . beers-deploy ...
+
+    @property
+    def temporary(self) -> Path:
+        """What RUNNER_TEMP names."""
+        return self.folder.parent / "temporary"
+
+    @property
+    def summary(self) -> Path:
+        """What GITHUB_STEP_SUMMARY names."""
+        return self.temporary / "summary.md"
+
+    @property
+    def calls(self) -> Path:
+        """The arguments of every call of beers-deploy, a line each."""
+        return self.temporary / "calls"
+
+    def command(self, name: str, before: str, arguments: str) -> None:
+        """Put a command on the path that does something and then runs ours."""
+        real = Path(sysconfig.get_path("scripts")) / "beers-deploy"
+        path = self.temporary / "command" / name
+        path.write_text(f'#!/usr/bin/env bash\n{before}\nexec "{real}" {arguments}\n')
+        path.chmod(0o755)
+
+    def run_action(self, given: dict[str, str]) -> dict[str, str]:
+        """The action with these inputs; its outputs."""
+        action = read_yaml(ACTION)
+        inputs = {name: str(about.get("default", "")) for name, about in action["inputs"].items()}
+        assert given.keys() <= inputs.keys()
+        inputs.update(given)
+        context = {f"inputs.{name}": text for name, text in inputs.items()} | {"github.action_path": str(ROOT)}
+        own = Runner(self.folder)  # its steps have ids of their own
+        own.run_steps(action["runs"]["steps"], context)
+        self.red, self.stderr = own.red, own.stderr
+        known = context | own.outputs
+        return {name: value_of(about["value"], known) for name, about in action["outputs"].items()}
+
+    def run_steps(self, steps: list[dict[str, Any]], context: dict[str, str]) -> None:
+        """Every step that its condition lets run."""
+        for step in steps:
+            condition = step.get("if", "")
+            if condition != "always()" and (self.red or not holds(condition, context)):
+                continue
+            if step.get("uses") == "./":
+                given = {name: value_of(str(text), context | self.outputs) for name, text in step["with"].items()}
+                outputs = self.run_action(given)
+                self.outputs |= {f"steps.{step['id']}.outputs.{name}": text for name, text in outputs.items()}
+            elif "run" in step and "pip install" not in step["run"]:
+                self.run_shell(step, context)
+
+    def run_shell(self, step: dict[str, Any], context: dict[str, str]) -> None:
+        """One step's script; what it writes to its outputs is kept even when it fails."""
+        written = self.temporary / "outputs"
+        written.write_text("")
+        known = context | self.outputs
+        given = {name: value_of(str(text), known) for name, text in step.get("env", {}).items()}
+        assert "${{" not in step["run"], "values reach the shell by its environment"
+        done = subprocess.run([*BASH, step["run"]], cwd=self.folder, env=self.environment | given, **KEPT)
+        lines = [line.partition("=") for line in written.read_text(encoding="utf-8").splitlines()]
+        self.outputs |= {f"steps.{step['id']}.outputs.{name}": text for name, _, text in lines}
+        if done.returncode:
+            self.red, self.stderr = True, done.stderr
+
+    @property
+    def environment(self) -> dict[str, str]:
+        """What the runner gives to each step."""
+        return {
+            "PATH": f"{self.temporary / 'command'}:{os.environ['PATH']}",
+            "HOME": str(self.temporary),
+            "PYTHONPATH": str(ROOT),
+            "RUNNER_TEMP": str(self.temporary),
+            "RUNNER_OS": "Linux",
+            "GITHUB_OUTPUT": str(self.temporary / "outputs"),
+            "GITHUB_PATH": str(self.temporary / "path"),
+            "GITHUB_STEP_SUMMARY": str(self.summary),
+        }
+
+
+KEPT: dict[str, Any] = {"capture_output": True, "text": True, "check": False}
+
+
+def value_of(text: str, known: dict[str, str]) -> str:
+    """A text with its expressions replaced: names, or the first of several that is not empty."""
+
+    def replaced(found: re.Match[str]) -> str:
+        names = found[1].split(" || ")
+        return next((value for value in (lookup(name, known) for name in names) if value), "")
+
+    return EXPRESSION.sub(replaced, text)
+
+
+def lookup(name: str, known: dict[str, str]) -> str:
+    """A name's value, or a text in quotes; of an output that no step wrote, nothing, as GitHub has it."""
+    if name.startswith("'"):
+        return name.strip("'")
+    return known.get(name, "") if re.fullmatch(r"steps\.\w+\.outputs\.[\w-]+", name) else known[name]
+
+
+def holds(condition: str, known: dict[str, str]) -> bool:
+    """Whether a step runs: without a condition, or where an input is empty."""
+    if not condition:
+        return True
+    found = IS_EMPTY.fullmatch(condition)
+    assert found, condition
+    return lookup(found[1], known) == ""
