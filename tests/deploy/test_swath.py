@@ -16,6 +16,7 @@ from deploy.export import to_onnx
 from deploy.restore import Infer, restore_window
 from deploy.results import Row
 from deploy.shipped import default_int8
+from deploy.swath import openvino
 from deploy.swath import run as swath
 from deploy.swath.missing import fill_missing
 from deploy.swath.options import Compression, Options, Runtime
@@ -279,6 +280,16 @@ def test_openvino_gives_the_same_int8_numbers(tmp_path: Path) -> None:
     other, row = restore(tmp_path, pixels, Options(default_int8(), tile_px=64, runtime=Runtime.openvino))
     np.testing.assert_array_equal(other, one)
     assert row.text["runtime"].startswith("openvino")
+
+
+def test_openvino_gives_them_on_processors_whose_kernels_saturate_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    """In the ways that are taken there; the image is of the extremes, at which sums are largest."""
+    pytest.importorskip("openvino")
+    image = np.random.default_rng(3).integers(0, 2, (1, 1, 41, 67)).astype(np.float32)
+    model = load_onnx(default_int8())
+    monkeypatch.setattr(openvino, "_adds_exactly", lambda _: False)
+    restored = openvino.open_openvino(model, 1)[0](image)
+    np.testing.assert_array_equal(restored, run(open_session(model), image))
 
 
 def test_openvino_gives_the_same_float_numbers_within_a_hundredth_of_a_dn(model: Path, tmp_path: Path) -> None:
