@@ -10,7 +10,8 @@ DPU's. There a session computes each operator in the fastest way that is proven 
 2. UNSIGNED: weights stored as uint8, 128 higher and around 128. These kernels add in int32, at half the speed.
 3. CONVERTED: the same for signed activations, which are moved to uint8 before the operator, and back behind it.
 
-Each is the same sum of the same whole numbers, so the results are those of an exact processor, bit for bit.
+Each is the same sum of the same whole numbers, so the results are those of an exact processor, bit for bit. Float
+operators between 8-bit tensors (QDQ), of which onnxruntime makes integer ones, are looked at as what they become.
 """
 
 import hashlib
@@ -54,6 +55,9 @@ OPERATORS = {
     "MatMulInteger": Places(2, 1, 3, None),
 }
 """ONNX's operators whose kernels multiply 8-bit numbers. Activations are the first input; a None result is int32."""
+
+FLOAT_OPERATORS = {"Conv": "QLinearConv", "MatMul": "QLinearMatMul", "Gemm": "QLinearMatMul"}
+"""Operators on dequantised tensors (QDQ), and which integer operator onnxruntime makes of each."""
 
 REQUANTISING = {"QLinearConv": 7, "QLinearAdd": 7}
 """What may write a tensor behind which a ReLU is moved down, and where it holds its result's zero point."""
@@ -119,6 +123,7 @@ class _Rewriting:
                 self.readers[name].append(node)
         self.kept = {value.name for value in self.model.graph.output}
         self.largest: dict[str, int] = {}
+        self.moved: set[str] = set()
 
     def move_relu_down(self, relu: onnx.NodeProto) -> None:
         """Store what is behind max(result, its zero point) around 0: min(result moved down, what is left of 255).
@@ -151,6 +156,8 @@ class _Rewriting:
 
     def around(self, node: onnx.NodeProto) -> list[onnx.NodeProto]:
         """The node computed in an exact way, with what converts before and behind it."""
+        if node.op_type in FLOAT_OPERATORS:
+            return self._between(node)
         places = OPERATORS.get(node.op_type)
         if places is None:
             return [node]
@@ -171,11 +178,28 @@ class _Rewriting:
         self.ways[name] = Way.converted if signed else Way.unsigned
         return self._converted(node, places) if signed else [node]
 
+    def _between(self, node: onnx.NodeProto) -> list[onnx.NodeProto]:
+        """A float operator whose weights are dequantised int8, and what dequantises them from uint8 if need be."""
+        source = self.writers.get(node.input[1])
+        weight = self.arrays.get(source.input[0]) if source and source.op_type == "DequantizeLinear" else None
+        if source is None or weight is None or weight.dtype != np.int8:
+            return [node]
+        turned = any(each.name == "transB" and each.i for each in node.attribute)
+        if cannot_saturate(FLOAT_OPERATORS[node.op_type], weight.T if turned else weight, UINT8_MAX):
+            self.ways[node.name or node.output[0]] = Way.signed
+            return [node]
+        self.ways[node.name or node.output[0]] = Way.unsigned
+        lifted = onnx.NodeProto()
+        lifted.CopyFrom(source)
+        self._lift(lifted, 0, 2)
+        node.input[1] = lifted.name = lifted.output[0] = f"{node.output[0]}.weight_from_uint8"
+        return [lifted, node]
+
     def _lift(self, node: onnx.NodeProto, *places: int) -> None:
-        """Constants of int8 as uint8, 128 higher; a zero point that the operator leaves out is 0."""
+        """Store int8 constants as uint8, 128 higher."""
         for place in places:
             node.input.extend([""] * (place + 1 - len(node.input)))
-            value = self.arrays.get(node.input[place], np.zeros((), np.int8))
+            value = self.arrays.get(node.input[place], np.zeros((), np.int8))  # a zero point that is left out
             node.input[place] = self._constant((value.astype(np.int16) + MIDDLE).astype(np.uint8))
 
     def _converted(self, node: onnx.NodeProto, places: Places) -> list[onnx.NodeProto]:
@@ -186,13 +210,14 @@ class _Rewriting:
             return [*before, node]
         self._lift(node, places.result_zero)
         result, node.output[0] = node.output[0], f"{node.output[0]}.unsigned"
+        self.moved.add(node.output[0])
         behind, _ = self._moved(node.output[0], -MIDDLE, TensorProto.INT8, result)
         return [*before, node, *behind]
 
     def _moved(self, source: str, by: int, kind: int, result: str = "") -> tuple[list[onnx.NodeProto], str]:
         """An 8-bit tensor as another type of 8 bits, its numbers that much higher; made once for all its readers."""
         result = result or f"{source}.unsigned"
-        if result in self.writers and self.writers[result].op_type == "Cast":
+        if result in self.moved:
             return [], result
         wide, moved = f"{result}.wide", f"{result}.moved"
         nodes = [
@@ -200,7 +225,7 @@ class _Rewriting:
             helper.make_node("Add", [wide, self._constant(np.int32(by))], [moved], name=moved),
             helper.make_node("Cast", [moved], [result], name=f"{result}.cast", to=kind),
         ]
-        self.writers[result] = nodes[-1]
+        self.moved.add(result)
         return nodes, result
 
     def _constant(self, value: np.ndarray | np.generic) -> str:

@@ -50,8 +50,6 @@ def open_session(
         known = filled(known) if optimise else known
         if is_integer(known) and (not int8_adds_exactly() if exact is None else exact):
             known, _ = made_exact(known)
-            # Left to itself, onnxruntime makes integer convolutions of float ones between 8-bit tensors.
-            options.add_session_config_entry("session.disable_quant_qdq", "1")
     try:
         return ort.InferenceSession(known.SerializeToString(), options, providers=["CPUExecutionProvider"])
     except Exception as error:  # onnxruntime raises a class of its own for each status code

@@ -12,6 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from onnx import TensorProto, helper, numpy_helper
+from onnxruntime.quantization import CalibrationDataReader, QuantFormat, QuantType, quantize_static
 
 from model.processor import int8_adds_exactly
 from model.shipped import SHIPPED
@@ -214,3 +215,35 @@ def test_weights_that_are_computed_are_refused_in_a_sentence() -> None:
     model.graph.input.append(helper.make_tensor_value_info("weight", TensorProto.INT8, [4, 4, 1, 1]))
     with pytest.raises(ModelError, match="QLinearConv 'convolution' with computed weights"):
         open_session(model, exact=True)
+
+
+class Calibration(CalibrationDataReader):  # type: ignore[misc]  # onnxruntime has no types
+    """A few images of noise for somebody else's quantiser."""
+
+    def __init__(self) -> None:
+        generator = np.random.default_rng(4)
+        self._images = iter([generator.random((1, 1, 24, 24), dtype=np.float32) for _ in range(4)])
+
+    def get_next(self) -> dict[str, np.ndarray] | None:
+        image = next(self._images, None)
+        return None if image is None else {"image": image}
+
+
+@pytest.mark.parametrize("activations", [QuantType.QUInt8, QuantType.QInt8])
+@pytest.mark.parametrize("per_channel", [False, True])
+@pytest.mark.parametrize("form", [QuantFormat.QOperator, QuantFormat.QDQ])
+def test_files_of_other_makers_give_the_same_numbers_in_these_ways(
+    form: QuantFormat, per_channel: bool, activations: QuantType, float_onnx: onnx.ModelProto, tmp_path: Path
+) -> None:
+    """Asymmetric activations, float scales; QDQ as the integer operators that the runtime makes of it."""
+    options = {"quant_format": form, "per_channel": per_channel, "activation_type": activations}
+    onnx.save_model(float_onnx, tmp_path / "float.onnx")
+    quantize_static(tmp_path / "float.onnx", tmp_path / "theirs.onnx", Calibration(), weight_type=QuantType.QInt8, **options)
+    theirs = load_onnx(tmp_path / "theirs.onnx")
+    assert set(made_exact(theirs)[1].values()) & {Way.unsigned, Way.converted}
+    image = np.random.default_rng(1).integers(0, 2, (1, 1, 31, 45)).astype(np.float32)
+    ways = run(open_session(theirs, 1, exact=True), image)
+    if form is QuantFormat.QOperator:
+        assert np.array_equal(ways, run(open_session(theirs, 1, optimise=False, exact=True), image))
+    if int8_adds_exactly():
+        assert np.array_equal(ways, run(open_session(theirs, 1), image))
