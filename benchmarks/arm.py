@@ -23,7 +23,7 @@ PROCESSORS = ("cortex-a72", "neoverse-n1", "max")
 """Of `qemu-aarch64 -cpu help`: NEON alone; dot products of int8 too; matrix products of int8 too."""
 NETWORKS = ("convbeers-xs", "convbeers-s")
 PINNED = ("numpy", "onnx", "onnxruntime", "pillow", "psutil", "tifffile")
-OTHERS = ("hypothesis", "jinja2", "jsonschema", "pytest", "rich", "typer")
+OTHERS = ("filelock", "hypothesis", "jinja2", "jsonschema", "pytest", "rich", "typer")
 PLATFORMS = [f"{name}_aarch64" for name in ("manylinux_2_28", "manylinux_2_27", "manylinux_2_26", "manylinux2014")]
 TESTS = ("test_integers.py", "test_restore.py")
 """Of tests/processors: what needs no torch, whose ARM wheel alone has 0.5 GB."""
