@@ -1,0 +1,47 @@
+"""What every processor must compute alike: run natively by the whole suite, and emulated by `.ci/emulate`.
+
+Nothing here starts another process, which would not be emulated, or needs more than the command `gate` does.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import onnx
+import pytest
+
+from deploy.shipped import shipped_pair
+from quant.board_file import board_model
+from quant.core import IntConv, IntCore
+from quant.host_reader import read_core
+from quant.onnx_file import load_onnx
+from quant.positions import INT8_MAX, INT8_MIN
+
+
+@dataclass(frozen=True)
+class Encodings:
+    """One shipped network in whole numbers: its core, the host's file, and the same core in the board's encoding."""
+
+    core: IntCore
+    host: onnx.ModelProto
+    board: onnx.ModelProto
+
+
+@pytest.fixture(scope="session", params=["convbeers-xs", "convbeers-s"])
+def shipped(request: pytest.FixtureRequest) -> Encodings:
+    host = load_onnx(shipped_pair(request.param)[1])
+    core = with_int8_bias(read_core(host))
+    return Encodings(core, host, board_model(core, {}))
+
+
+def with_int8_bias(core: IntCore) -> IntCore:
+    """The core of a host file, which aligns every bias to its accumulator, with the board's int8 bias."""
+    return replace(core, ops=tuple(_unaligned(op) if isinstance(op, IntConv) else op for op in core.ops))
+
+
+def _unaligned(op: IntConv) -> IntConv:
+    """Bits that no bias of the layer uses are what it was shifted by."""
+    used = int(np.bitwise_or.reduce(op.bias)) or 1
+    shift = (used & -used).bit_length() - 1
+    bias = op.bias >> shift
+    assert INT8_MIN <= bias.min() <= bias.max() <= INT8_MAX
+    return replace(op, bias=bias.astype(np.int8), bias_position=op.bias_position - shift)

@@ -1,0 +1,53 @@
+"""`restore`: the integer reference's pixels, whatever the tiles, threads and ways in."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tifffile
+from typer.testing import CliRunner
+
+from deploy.cli import app
+from deploy.library import restore
+from deploy.shipped import shipped_pair
+from quant.host_reader import read_core
+from quant.integer import merged_correction, run_core
+from quant.onnx_file import load_onnx
+from quant.planes import split
+
+MAX_DN = np.float32(4095)
+
+
+def raw(height: int, width: int) -> np.ndarray:
+    """Digital numbers (H, W) of every size, smooth here and rough there."""
+    y, x = np.mgrid[:height, :width]
+    smooth = 2048 + 1500 * np.sin(y / 9) * np.cos(x / 7)
+    rough = np.random.default_rng(4).normal(0, 600, (height, width)) * (x > width // 2)
+    return np.asarray(np.clip(np.rint(smooth + rough), 0, 4095), np.uint16)
+
+
+def by_reference(dn: np.ndarray, name: str) -> np.ndarray:
+    """What whole numbers alone make of digital numbers (H, W)."""
+    core = read_core(load_onnx(shipped_pair(name)[1]))
+    image = (dn.astype(np.float32) / MAX_DN)[None, None]
+    tensors, _ = run_core(core, split(image), half_even=True)
+    restored = np.clip(image + merged_correction(core, tensors), 0, 1)[0, 0] * MAX_DN
+    return np.asarray(np.rint(restored), np.uint16)
+
+
+@pytest.mark.parametrize("name", ["convbeers-xs", "convbeers-s"])
+def test_an_array_becomes_what_the_integer_reference_says(name: str) -> None:
+    dn, model = raw(61, 97), shipped_pair(name)[1]
+    expected = by_reference(dn, name)
+    assert (expected != dn).mean() > 0.5
+    for tile_px, threads in ((640, 1), (48, 2)):
+        np.testing.assert_array_equal(restore(dn, model, tile_px=tile_px, threads=threads), expected)
+
+
+def test_the_command_writes_the_same_pixels(tmp_path: Path) -> None:
+    dn = raw(70, 41)
+    tifffile.imwrite(tmp_path / "raw.tif", dn)
+    asked = ["restore", str(tmp_path / "raw.tif"), str(tmp_path / "restored.tif"), "--tile", "64"]
+    done = CliRunner().invoke(app, asked)
+    assert done.exit_code == 0, done.output
+    np.testing.assert_array_equal(tifffile.imread(tmp_path / "restored.tif"), by_reference(dn, "convbeers-s"))
