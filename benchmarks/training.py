@@ -26,7 +26,7 @@ from model.convbeers import VARIANTS
 from model.simulator.procedural import procedural_scene
 from model.training.losses import LossWeights, RestorationLoss
 from model.training.patches import PatchRecipe, PatchSource
-from model.training.precision import MixedPrecision, Precision
+from model.training.precision import Precision, in_precision
 from model.training.recipe import TrainingRecipe
 from model.training.trainer import Trainer
 from profiles import load_sensor
@@ -69,9 +69,9 @@ def rate(steps: int, work: Callable[[], None]) -> float:
     return steps * BATCH / (time.perf_counter() - started)
 
 
-def bare_loop(trainer: Trainer, batches: list[tuple[Tensor, Tensor]]) -> None:
+def bare_loop(trainer: Trainer, batches: list[tuple[Tensor, ...]]) -> None:
     """What anybody would write: forward, loss, backward, step."""
-    forward, loss = MixedPrecision(trainer.network, trainer.precision), RestorationLoss(LOSS)
+    forward, loss = in_precision(trainer.network, trainer.precision), RestorationLoss(LOSS)
     optimiser = torch.optim.Adam(trainer.network.parameters(), lr=1e-4)
     for degraded, reference in batches:
         degraded = degraded.to(memory_format=torch.channels_last)
@@ -81,7 +81,7 @@ def bare_loop(trainer: Trainer, batches: list[tuple[Tensor, Tensor]]) -> None:
         optimiser.step()
 
 
-def run(trainer: Trainer, batches: Iterator[tuple[Tensor, Tensor]], steps: int, checkpoint: Path) -> None:
+def run(trainer: Trainer, batches: Iterator[tuple[Tensor, ...]], steps: int, checkpoint: Path) -> None:
     """So many further steps of a run, simulation included, and a checkpoint."""
     for degraded, reference in islice(batches, steps):
         trainer.train_step(degraded, reference)

@@ -10,6 +10,7 @@ from deploy.quant_report import few_crops
 from deploy.report.blame_page import blame_page
 from deploy.report.page import Report
 from deploy.results import Figure, Row, measured, unavailable
+from profiles.sensor import Sensor
 from quant.blame import Loss, blame_layers
 from quant.calibration import Patches
 from quant.gate import GateResult, compare
@@ -65,11 +66,18 @@ def worst_row(number: int, patches: Patches, spread: Spread) -> Row:
     figures = {
         "MAE": measured(float(spread.mae[number]), "of full scale", source),
         "max": measured(float(spread.largest[number]), "of full scale", source),
-        "MTF at Nyquist": measured(100 * view.degraded.mtf_nyquist, "%", "drawn from the sensor profile"),
+        **_mtf_figures(view.degraded),
         "mean radiance": measured(view.ground.brightness, "W/m2/sr/um", "of the simulated ground"),
         "oversampling": measured(view.ground.oversampling, "scene pixels a pixel", "drawn"),
     }
     return Row("worst patches", f"patch {number}", figures, {"scene": view.ground.scene.name})
+
+
+def _mtf_figures(sensor: Sensor) -> dict[str, Figure]:
+    """One figure, or two where the sensor's axes differ."""
+    across, along = sensor.mtf_axes
+    values = {"MTF at Nyquist": across} if across == along else {"MTF across": across, "MTF along": along}
+    return {name: measured(100 * value, "%", "drawn from the sensor profile") for name, value in values.items()}
 
 
 def sizes_row(spread: Spread) -> Row:

@@ -8,9 +8,39 @@ import torch
 from onnx import helper, numpy_helper
 
 from deploy import __version__
+from model.conditioning import fold, tell
 from model.convbeers import ConvBEERS
+from model.weights_file import is_told, load_network, load_told
+from profiles.errors import ModelError
+from profiles.sensor import load_sensor
 from quant.onnx_file import image_info, make_model
 from quant.session import open_session, run
+
+
+def network_for(path: Path, sensor: str | None) -> tuple[ConvBEERS, dict[str, object], tuple[str, ...]]:
+    """A plain network from a weights file; weights that can be told their sensor are folded for the one named.
+
+    Args:
+        path: weights that `train` wrote.
+        sensor: a profile's name or .toml file, of which the middle of every range is told; None for plain weights.
+
+    Returns:
+        The network, its recipe, and a sentence for each value of the sensor outside the range it was trained for.
+
+    Raises:
+        ModelError: told weights without a sensor, or a sensor for plain ones.
+        ProfileError: no such sensor.
+    """
+    if sensor is None:
+        return (*load_network(path), ())
+    if not is_told(path):
+        remedy = "leave --sensor out, or give weights of 'train --told'"
+        expected = "weights that can be told their sensor"
+        raise ModelError(str(path), expected=expected, got="those of a plain network", remedy=remedy)
+    told, recipe = load_told(path)
+    profile = load_sensor(sensor)
+    found = tell(profile.nominal())
+    return fold(told, found.vector), {**recipe, "degraded": profile.name}, found.outside
 
 
 def to_onnx(network: ConvBEERS, about: dict[str, str], tile_px: int | None = None) -> onnx.ModelProto:

@@ -17,11 +17,12 @@ from torch import Tensor
 from deploy.defaults import draw_scenes
 from deploy.progress import Steps, steps
 from deploy.report.pictures import Stretch, busiest_windows, grid, strip_row
-from model.convbeers import ConvBEERS
+from model.conditioning import Network
 from model.files import whole_file
 from model.images import list_images
 from model.metrics.backbone_files import find_backbone, not_found
 from model.metrics.perceptual import Lpips
+from model.shipped import TOLD_SUFFIX
 from model.simulator.scene import Scene, read_scene
 from model.training.checkpoint import finish
 from model.training.losses import RestorationLoss
@@ -29,11 +30,11 @@ from model.training.patches import PatchRecipe, PatchSource
 from model.training.precision import Precision
 from model.training.recipe import TrainingRecipe
 from model.training.stored_pairs import StoredPairs, pair_files
-from model.training.trainer import Progress, Schedule, Source, Trainer
+from model.training.trainer import Progress, Schedule, Source, Trainer, new_network
 from model.training.validation import Validation, split_by_site
 from model.training.workers import Worker
-from model.weights_file import load_network, variant_named
-from model.widen import widen
+from model.weights_file import is_told, load_network, load_told, variant_named
+from model.widen import widen, widen_told
 from profiles.errors import OptionError
 
 STEP = re.compile(r"[0-9]{1,18}(?=,)")
@@ -43,6 +44,9 @@ if TYPE_CHECKING:
     from torch.utils.tensorboard import SummaryWriter
 
 VALIDATION_CROP_PX, ZOOM = 96, 2
+
+TOLD_VIEWS = 4
+"""Sensors that each validation image is seen by where the network is told them: they differ by far more."""
 
 
 @dataclass(frozen=True)
@@ -72,7 +76,7 @@ class Run:
     @property
     def weights(self) -> Path:
         """Where the averaged weights go in the end."""
-        return self.out / f"{self.variant}.safetensors"
+        return self.out / f"{self.variant}{TOLD_SUFFIX if self.patches.told else ''}.safetensors"
 
 
 def train(run: Run, resume: bool, worker: Worker, say: Callable[[str], None]) -> None:
@@ -94,6 +98,7 @@ def train(run: Run, resume: bool, worker: Worker, say: Callable[[str], None]) ->
         start_weights(run),
         load_network(run.teacher)[0] if run.teacher else None,
         run.precision,
+        run.patches.told is not None,
     )
     if loss.perceptual is not None:
         loss.perceptual.to(trainer.device)
@@ -117,9 +122,14 @@ def start_weights(run: Run) -> Mapping[str, Tensor] | None:
     """
     if run.start is None:
         return None
-    network, _ = load_network(run.start)
-    generator = torch.Generator().manual_seed(run.recipe.seed)
-    return widen(network, variant_named(run.variant), generator).state_dict()
+    variant, generator = variant_named(run.variant), torch.Generator().manual_seed(run.recipe.seed)
+    if run.patches.told is None:
+        return widen(load_network(run.start)[0], variant, generator).state_dict()
+    if is_told(run.start):
+        return widen_told(load_told(run.start)[0], variant, generator).state_dict()
+    network = new_network(variant, generator, told=True)
+    base = widen(load_network(run.start)[0], variant, generator).state_dict()
+    return network.state_dict() | {f"base.{name}": weight for name, weight in base.items()}
 
 
 def loss_of(run: Run) -> tuple[RestorationLoss, str]:
@@ -135,7 +145,7 @@ def loss_of(run: Run) -> tuple[RestorationLoss, str]:
 
 def data(run: Run, trainer: Trainer) -> tuple[Source, Validation, list[str]]:
     """Where batches come from, the images held out, and the names of those trained on."""
-    recipe, eyes = run.recipe, (run.patches.degraded, run.patches.reference)
+    recipe, eyes = run.recipe, (run.patches.told or run.patches.degraded, run.patches.reference)
     if run.pairs is not None:
         files = pair_files(run.pairs)
         max_dn = run.patches.degraded.nominal().max_dn
@@ -143,7 +153,8 @@ def data(run: Run, trainer: Trainer) -> tuple[Source, Validation, list[str]]:
         return source, Validation([], *eyes), [degraded.name for degraded, _ in files]
     scenes = read_scenes(run)
     kept, held = split_by_site([scene.name for scene in scenes])
-    validation = Validation([scenes[k] for k in held], *eyes)
+    views = TOLD_VIEWS if run.patches.told else 1
+    validation = Validation([scenes[k] for k in held for _ in range(views)], *eyes)
     train_on = [scenes[k] for k in kept] + draw_scenes(run.drawn, recipe.seed)
     if not train_on:
         remedy = "give --images, --pairs or --drawn"
@@ -176,7 +187,7 @@ def _train(run: Run, trainer: Trainer, source: Source, validation: Validation) -
             _scalars(board, now.step, now.terms)
             _show(bar, now)
 
-        def validate(step: int, network: ConvBEERS) -> None:
+        def validate(step: int, network: Network) -> None:
             judged = asdict(validation.judge(network))
             scores.write(step, judged)
             _scalars(board, step, judged)
@@ -239,7 +250,7 @@ def _scalars(board: Board | None, step: int, values: Mapping[str, float]) -> Non
             board.add_scalar(name, value, step)
 
 
-def write_picture(validation: Validation, network: ConvBEERS, path: Path) -> None:
+def write_picture(validation: Validation, network: Network, path: Path) -> None:
     """The busiest crop of each validation image: degraded, restored, reference."""
     rows: list[list[np.ndarray]] = []
     for (degraded, reference), restored in zip(validation.pairs, validation.restore(network), strict=True):
@@ -263,11 +274,11 @@ def about(run: Run, images: Sequence[str], held_out: Sequence[str], loss: Restor
         "lpips": "squeeze" if loss.perceptual is not None else "left out: no weights",
         "start": run.start.name if run.start else "drawn weights",
         "teacher": run.teacher.name if run.teacher else "none",
-        "degraded": patches.degraded.name,
+        "degraded": patches.degraded.name if patches.told is None else "told, drawn over the ranges",
         "reference": patches.reference.name,
         "patch_px": patches.patch_px,
         "oversamplings": patches.oversamplings if run.pairs is None else "as stored",
         "exposures": patches.exposures if run.pairs is None else "as stored",
         "images": list(images),
-        "held_out": list(held_out),
+        "held_out": list(dict.fromkeys(held_out)),
     }

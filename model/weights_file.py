@@ -4,17 +4,26 @@ import json
 from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
+from model.conditioning import DIRECTIONS, RANGES, Network, ToldConvBEERS
 from model.convbeers import VARIANTS, ConvBEERS, Variant
 from model.files import whole_file
 from profiles.errors import ModelError, OptionError
 from profiles.text import parse_json
+
+TOLD = "told its sensor"
+"""The kind of weights, in the header, that need a sensor before they are a network; plain ones state no kind."""
+
+FAULTS = (AttributeError, LookupError, TypeError, ValueError, OverflowError, RuntimeError)
+"""What reading a header or filling a network may raise on a file that is not ours."""
+
+N = TypeVar("N", ConvBEERS, ToldConvBEERS)
 
 
 def variant_named(name: str) -> Variant:
@@ -54,9 +63,12 @@ def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, object]]:
         raise ModelError(str(path), expected="safetensors weights", got=got, remedy=remedy) from error
 
 
-def save_network(path: Path, network: ConvBEERS, recipe: Mapping[str, object]) -> None:
-    """Write a network's weights, its variant and the recipe that made them."""
-    write_tensors(path, network.state_dict(), {"variant": asdict(network.variant), "recipe": dict(recipe)})
+def save_network(path: Path, network: Network, recipe: Mapping[str, object]) -> None:
+    """Write a network's weights, its variant and the recipe that made them; the ranges of what it can be told."""
+    header: dict[str, object] = {"variant": asdict(network.variant), "recipe": dict(recipe)}
+    if isinstance(network, ToldConvBEERS):
+        header |= {"kind": TOLD, "ranges": dict(RANGES)}
+    write_tensors(path, network.state_dict(), header)
 
 
 def load_network(path: Path) -> tuple[ConvBEERS, dict[str, object]]:
@@ -66,28 +78,74 @@ def load_network(path: Path) -> tuple[ConvBEERS, dict[str, object]]:
         ModelError: not our weights, or weights of another shape.
     """
     tensors, header = read_tensors(path)
+    if header.get("kind") == TOLD:
+        remedy = "name the sensor: beers-deploy export --checkpoint FILE --sensor NAME"
+        raise ModelError(
+            str(path), expected="the weights of a plain network", got="one that is told its sensor", remedy=remedy
+        )
     try:
-        shape: Any = header["variant"]
-        variant = Variant(int(shape["blocks"]), int(shape["features"]))
-        _check_variant(variant, tensors)
-        network = ConvBEERS(variant)
-        network.load_state_dict(tensors)
-    except (AttributeError, LookupError, TypeError, ValueError, OverflowError, RuntimeError) as error:
-        got = " ".join(str(error).split())[:120]
-        remedy = "give a file written by 'beers-deploy train'"
-        raise ModelError(str(path), expected="the weights of a ConvBEERS", got=got, remedy=remedy) from error
+        network = _filled(ConvBEERS, "", 1, tensors, header)
+    except FAULTS as error:
+        raise _not_weights(path, "the weights of a ConvBEERS", error) from error
+    return network, _recipe(header)
+
+
+def load_told(path: Path) -> tuple[ToldConvBEERS, dict[str, object]]:
+    """Read a network that is told its sensor, in evaluation mode, and its recipe.
+
+    Raises:
+        ModelError: not such weights, or of other ranges than this version tells in.
+    """
+    tensors, header = read_tensors(path)
+    try:
+        if header.get("kind") != TOLD:
+            raise ValueError("a network that cannot be told its sensor")
+        if header.get("ranges") != {name: list(ends) for name, ends in RANGES.items()}:
+            raise ValueError("other ranges of sensors than this version's")
+        network = _filled(ToldConvBEERS, "base.", 1 + DIRECTIONS, tensors, header)
+    except FAULTS as error:
+        raise _not_weights(path, "weights that 'train --told' wrote", error) from error
+    return network, _recipe(header)
+
+
+def is_told(path: Path) -> bool:
+    """Whether a weights file holds a network that is told its sensor.
+
+    Raises:
+        ModelError: missing or not safetensors.
+    """
+    return read_tensors(path)[1].get("kind") == TOLD
+
+
+def _not_weights(path: Path, expected: str, error: Exception) -> ModelError:
+    got = " ".join(str(error).split())[:120]
+    return ModelError(str(path), expected=expected, got=got, remedy="give a file written by 'beers-deploy train'")
+
+
+def _recipe(header: Mapping[str, object]) -> dict[str, object]:
     recipe = header.get("recipe", {})
-    return network.eval(), recipe if isinstance(recipe, dict) else {}
+    return recipe if isinstance(recipe, dict) else {}
 
 
-def _check_variant(variant: Variant, tensors: Mapping[str, Tensor]) -> None:
+def _filled(kind: type[N], prefix: str, copies: int, tensors: Mapping[str, Tensor], header: Mapping[str, Any]) -> N:
+    """A network of that kind, which holds `copies` sets of a ConvBEERS's weights, in evaluation mode."""
+    shape = header["variant"]
+    variant = Variant(int(shape["blocks"]), int(shape["features"]))
+    _check_variant(variant, tensors, prefix, copies)
+    network = kind(variant)
+    network.load_state_dict(dict(tensors))
+    return network.eval()
+
+
+def _check_variant(variant: Variant, tensors: Mapping[str, Tensor], prefix: str, copies: int) -> None:
     """The tensors decide before a network is made: a header alone must not take memory.
 
     Raises:
         ValueError: other tensors than a network of that variant has, of another type, or not finite.
     """
-    first = tensors["head.weight"]
-    if len(tensors) != 4 * variant.blocks + 6 or len(first) != variant.features:
+    first = tensors[f"{prefix}head.weight"]
+    others = sum(name.startswith("coefficients.") for name in tensors)
+    if len(tensors) - others != copies * (4 * variant.blocks + 6) or len(first) != variant.features:
         raise ValueError(f"{len(tensors)} tensors, {len(first)} features at the head, for {variant}")
     if not all(tensor.dtype == torch.float32 for tensor in tensors.values()) or not all_finite(tensors):
         raise ValueError("weights that are not finite float32")

@@ -7,6 +7,7 @@ Goodfellow and Shlens, ICLR 2016, section 2.3). The shares differ for every read
 import torch
 from torch import Tensor, nn
 
+from model.conditioning import ToldConvBEERS
 from model.convbeers import ConvBEERS, Variant
 from profiles.errors import ModelError
 
@@ -30,6 +31,21 @@ def widen(network: ConvBEERS, variant: Variant, generator: torch.Generator) -> C
             assert old.bias is not None  # noqa: S101 - conv3x3 gives one
             assert new.bias is not None  # noqa: S101
             new.bias.copy_(old.bias.repeat(new.out_channels // old.out_channels))
+    return wide
+
+
+def widen_told(network: ToldConvBEERS, variant: Variant, generator: torch.Generator) -> ToldConvBEERS:
+    """As `widen`: base and directions are widened, and the convolutions' coefficients stay.
+
+    Raises:
+        ModelError: see `widen`.
+    """
+    wide = ToldConvBEERS(variant)
+    wide.base.load_state_dict(widen(network.base, variant, generator).state_dict())
+    for old, new in zip(network.directions, wide.directions, strict=True):
+        assert isinstance(old, ConvBEERS)  # noqa: S101 - ModuleList forgets it
+        new.load_state_dict(widen(old, variant, generator).state_dict())
+    wide.coefficients.load_state_dict(network.coefficients.state_dict())
     return wide
 
 

@@ -29,6 +29,17 @@ class Sensor:
     """One instrument, every number settled.
 
     The noise variance is alpha * L + beta, L in W/m2/sr/um (paper, section 3.3, signal-dependent noise).
+
+    Attributes:
+        mtf_nyquist: contrast kept at 0.5 cycles per pixel; across the track where the two axes differ.
+        alpha: signal-dependent variance per radiance, in W/m2/sr/um.
+        beta: variance in the dark, in (W/m2/sr/um)^2.
+        gain_dn_per_radiance: digital numbers per W/m2/sr/um.
+        bits: of a digital number.
+        effects: beside blur, noise and digitising, by name.
+        mtf_nyquist_along: contrast kept along the track; None where it is that across. A pushbroom's line of
+            detectors lies across the track: image rows are lines in time, so "across" is the horizontal axis (along
+            a row, fx) and "along" the vertical one (down a column, fy).
     """
 
     mtf_nyquist: float
@@ -37,6 +48,12 @@ class Sensor:
     gain_dn_per_radiance: float
     bits: int
     effects: Mapping[str, Effect] = field(default_factory=dict)
+    mtf_nyquist_along: float | None = None
+
+    @property
+    def mtf_axes(self) -> tuple[float, float]:
+        """Contrast kept at 0.5 cycles per pixel, (across the track, along it): horizontally and vertically."""
+        return self.mtf_nyquist, self.mtf_nyquist if self.mtf_nyquist_along is None else self.mtf_nyquist_along
 
     @property
     def max_dn(self) -> int:
@@ -64,6 +81,7 @@ class SensorProfile:
     bits: Constant
     gain_dn_per_radiance: Constant
     effects: Mapping[str, Table] = field(default_factory=dict)
+    mtf_nyquist_along: Constant | None = None
 
     def draw(self, generator: np.random.Generator) -> Sensor:
         """Pick one sensor from the ranges: MTF uniform, SNR pair uniform over the physically valid pairs."""
@@ -78,7 +96,9 @@ class SensorProfile:
             alpha, beta = noise_from_snr(self.radiance_0.low, snr_0, self.radiance_1.low, snr_1)
             if alpha >= 0 and beta >= 0:
                 effects = {name: draw_effect(name, table, generator) for name, table in self.effects.items()}
-                return self._sensor(mtf_nyquist, alpha, beta, effects), rejected
+                along = self.mtf_nyquist_along  # drawn last: a profile without it draws what it always drew
+                mtf_along = None if along is None else float(generator.uniform(along.low, along.high))
+                return self._sensor(mtf_nyquist, alpha, beta, effects, mtf_along), rejected
         raise self._impossible_snr()
 
     def nominal(self) -> Sensor:
@@ -88,10 +108,13 @@ class SensorProfile:
         snr_0 = min(max(_middle(self.snr_0), low), high)
         alpha, beta = noise_from_snr(self.radiance_0.low, snr_0, self.radiance_1.low, snr_1)
         effects = {name: middle_effect(name, table) for name, table in self.effects.items()}
-        return self._sensor(_middle(self.mtf_nyquist), max(alpha, 0.0), max(beta, 0.0), effects)
+        mtf_along = None if self.mtf_nyquist_along is None else _middle(self.mtf_nyquist_along)
+        return self._sensor(_middle(self.mtf_nyquist), max(alpha, 0.0), max(beta, 0.0), effects, mtf_along)
 
-    def _sensor(self, mtf_nyquist: float, alpha: float, beta: float, effects: Mapping[str, Effect]) -> Sensor:
-        return Sensor(mtf_nyquist, alpha, beta, self.gain_dn_per_radiance.low, int(self.bits.low), effects)
+    def _sensor(
+        self, mtf: float, alpha: float, beta: float, effects: Mapping[str, Effect], mtf_along: float | None
+    ) -> Sensor:
+        return Sensor(mtf, alpha, beta, self.gain_dn_per_radiance.low, int(self.bits.low), effects, mtf_along)
 
     def _impossible_snr(self) -> ProfileError:
         low, high = snr_0_bounds(self.radiance_0.low, self.radiance_1.low, self.snr_1.high)
@@ -146,6 +169,10 @@ TABLES: dict[str, tuple[str, ...]] = {
 }
 
 
+OPTIONAL: dict[str, tuple[str, ...]] = {"mtf": ("mtf_nyquist_along",)}
+"""Keys that a table may leave out: without its own, the MTF along the track is that across."""
+
+
 def sensor_names() -> list[str]:
     """The names of the shipped sensor profiles."""
     return shipped_names("sensors")
@@ -164,8 +191,10 @@ def load_sensor(name: str) -> SensorProfile:
         content = raw[table]
         if not isinstance(content, Mapping):
             raise ProfileError(label, expected=f"a table [{table}]", got=repr(content), remedy="write it as one")
-        check_keys(f"{label} [{table}]", content, required=set(keys))
-        constants |= {key: read_constant(f"{label} [{table}] {key}", content[key]) for key in keys}
+        optional = OPTIONAL.get(table, ())
+        check_keys(f"{label} [{table}]", content, required=set(keys), optional=set(optional))
+        given = [*keys, *(key for key in optional if key in content)]
+        constants |= {key: read_constant(f"{label} [{table}] {key}", content[key]) for key in given}
     effects = {name: read_effect(f"{label} [{name}]", name, raw[name]) for name in EFFECT_TABLES if name in raw}
     profile = SensorProfile(
         name=label.removesuffix(".toml"), description=str(raw["description"]), effects=effects, **constants
@@ -235,6 +264,9 @@ def _check_physics(label: str, profile: SensorProfile) -> None:
             "give full-scale DN divided by full-scale radiance",
         ),
     ]
+    if profile.mtf_nyquist_along is not None:
+        _, _, valid, expected, remedy = checks[2]
+        checks.append(("[mtf] mtf_nyquist_along", profile.mtf_nyquist_along, valid, expected, remedy))
     for key, constant, valid, expected, remedy in checks:
         if not (valid(constant.low) and valid(constant.high)):
             raise ProfileError(f"{label} {key}", expected=expected, got=str(constant), remedy=remedy)
@@ -248,13 +280,15 @@ def _check_budget(label: str, profile: SensorProfile) -> None:
         return
     sigma = profile.effects["antialias"]["sigma_px"]
     limit = mtf_limit(sigma.high)
-    if profile.mtf_nyquist.high > limit:
-        raise ProfileError(
-            f"{label} [mtf] mtf_nyquist",
-            expected=f"at most {limit:.4f}, what an anti-alias filter of {sigma.high:g} px leaves",
-            got=str(profile.mtf_nyquist),
-            remedy="lower one of the two",
-        )
+    for key in ("mtf_nyquist", "mtf_nyquist_along"):
+        mtf: Constant | None = getattr(profile, key)
+        if mtf is not None and mtf.high > limit:
+            raise ProfileError(
+                f"{label} [mtf] {key}",
+                expected=f"at most {limit:.4f}, what an anti-alias filter of {sigma.high:g} px leaves",
+                got=str(mtf),
+                remedy="lower one of the two",
+            )
 
 
 def _check_snr(profile: SensorProfile) -> None:

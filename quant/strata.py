@@ -93,9 +93,13 @@ def draw_views(
         strict=True,
     )
     return [
-        View(ground, replace(noisy, mtf_nyquist=blurred.mtf_nyquist), recipe.reference.draw(generator))
+        View(ground, _blurred_as(noisy, blurred), recipe.reference.draw(generator))
         for ground, blurred, noisy in spread
     ]
+
+
+def _blurred_as(sensor: Sensor, other: Sensor) -> Sensor:
+    return replace(sensor, mtf_nyquist=other.mtf_nyquist, mtf_nyquist_along=other.mtf_nyquist_along)
 
 
 def stratified(

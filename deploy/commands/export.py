@@ -15,20 +15,30 @@ def export(
     out: Annotated[Path, typer.Option(help="ONNX file to write.")],
     variant: Annotated[str, typer.Option(help="Shipped weights of this name.")] = "convbeers-s",
     checkpoint: Annotated[Path | None, typer.Option(help="Your own weights instead (.safetensors).")] = None,
+    sensor: Annotated[
+        str | None,
+        typer.Option(help="Specialise weights that can be told their sensor: a profile's name, or your .toml file."),
+    ] = None,
     tile: Annotated[
         int | None, typer.Option(min=16, help="Fix the input to one tile of this side, 640 for a board.")
     ] = None,
 ) -> None:
-    """Write the network as ONNX, any height and width unless --tile fixes them, and check it against torch."""
+    """Write the network as ONNX, any height and width unless --tile fixes them, and check it against torch.
+
+    Weights of 'train --told' become the network for one --sensor, at no cost when it runs; of a profile with ranges,
+    for the middle of each. What lies outside the range that they were trained for is told as the nearest end of it,
+    with a warning.
+    """
     from deploy.defaults import about
-    from deploy.export import parity, to_onnx
+    from deploy.export import network_for, parity, to_onnx
     from model.shipped import shipped_weights
-    from model.weights_file import load_network
     from profiles.errors import ModelError
     from quant.onnx_file import save_onnx
 
     path = checkpoint or shipped_weights(variant)
-    network, recipe = load_network(path)
+    network, recipe, warnings = network_for(path, sensor)
+    for warning in warnings:
+        typer.echo(f"warning: {warning}", err=True)
     save_onnx(to_onnx(network, about(path.stem, recipe), tile), out)
     difference = parity(network, out, tile or 97)
     typer.echo(f"wrote {out}: largest difference from torch {difference:.2g} of full scale (measured)")

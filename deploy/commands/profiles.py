@@ -50,13 +50,14 @@ def _constants(name: str) -> "tuple[str, list[tuple[str, Constant]]]":
     from profiles import load_sensor, load_target, sensor_names, target_names
     from profiles.errors import OptionError
     from profiles.scene_call import load_scene_call, scene_names
-    from profiles.sensor import TABLES
+    from profiles.sensor import OPTIONAL, TABLES
     from profiles.toml import read_toml
 
     if name in sensor_names() or (name.endswith(".toml") and "mtf" in read_toml("sensors", name)[1]):
         sensor = load_sensor(name)
-        keys = [(table, key) for table, keys in TABLES.items() for key in keys]
-        rows = [(f"{t}.{k}", getattr(sensor, k)) for t, k in keys] + _effects(sensor.effects)
+        keys = [(table, key) for table, keys in TABLES.items() for key in (*keys, *OPTIONAL.get(table, ()))]
+        given = [(f"{table}.{key}", getattr(sensor, key)) for table, key in keys]
+        rows = [(key, constant) for key, constant in given if constant is not None] + _effects(sensor.effects)
         return f"{sensor.name}: {sensor.description}", rows
     if name in scene_names() or (name.endswith(".toml") and "radiance_scale" in read_toml("scenes", name)[1]):
         scene = load_scene_call(name)

@@ -16,6 +16,9 @@ def train(
     pairs: Annotated[Path | None, typer.Option(help="Folder of pairs that 'simulate' wrote, instead.")] = None,
     variant: Annotated[str, typer.Option(help="Size of the network.")] = "convbeers-s",
     sensor: Annotated[str, typer.Option(help="Profile of the degraded input.")] = "pleiades-variable",
+    told: Annotated[
+        bool, typer.Option("--told", help="Draw sensors of a wide range with that gain, and tell the network each.")
+    ] = False,
     reference: Annotated[str, typer.Option(help="Profile of the wanted output.")] = "pleiades-reference",
     drawn: Annotated[int, typer.Option(min=0, help="Drawn scenes to add to the images.")] = 0,
     steps: Annotated[int, typer.Option(min=1, help="Gradient steps.")] = 20_000,
@@ -57,6 +60,7 @@ def train(
 
     from deploy.training import Run
     from deploy.training import train as run_training
+    from model.conditioning import SensorFamily
     from model.files import require_writable
     from model.training.losses import LossWeights
     from model.training.patches import PatchRecipe
@@ -73,6 +77,9 @@ def train(
     if pairs is not None and (images is not None or drawn):
         remedy = "leave one out"
         raise OptionError("--pairs", expected="no --images or --drawn beside it", got="both", remedy=remedy)
+    if told and (pairs is not None or teacher is not None):
+        remedy = "leave one out: stored pairs do not say what sensor each had, and a teacher is not told"
+        raise OptionError("--told", expected="no --pairs or --teacher beside it", got="both", remedy=remedy)
     recipe = TrainingRecipe(
         steps=steps,
         batch=batch,
@@ -82,7 +89,9 @@ def train(
         distil=distil if teacher else 0.0,
         seed=seed,
     )
-    patches = PatchRecipe(load_sensor(sensor), load_sensor(reference), patch_px=patch)
+    degraded = load_sensor(sensor)
+    family = SensorFamily(degraded.nominal()) if told else None
+    patches = PatchRecipe(degraded, load_sensor(reference), patch_px=patch, told=family)
     run = Run(
         variant,
         recipe,

@@ -37,13 +37,18 @@ class Condition:
 def conditions(nominal: Sensor, profile: SensorProfile) -> list[Condition]:
     """The nominal sensor; other MTFs; other SNRs; both at once; and one with another gain."""
     found = [Condition("nominal", nominal)]
-    found += [Condition(f"MTF {mtf:.0%}", replace(nominal, mtf_nyquist=mtf)) for mtf in SHARPNESS]
+    found += [Condition(f"MTF {mtf:.0%}", _sharp(nominal, mtf)) for mtf in SHARPNESS]
     found += [Condition(f"SNR {a:g} / {b:g}", _noisy(nominal, profile, a, b)) for a, b in NOISE]
     low = _noisy(nominal, profile, 25, 55)
-    found += [Condition(f"MTF {mtf:.0%}, SNR 25 / 55", replace(low, mtf_nyquist=mtf)) for mtf in (0.05, 0.03)]
-    worst = replace(_noisy(nominal, profile, 15, 50), mtf_nyquist=0.03)
-    gain = replace(nominal, mtf_nyquist=0.10, gain_dn_per_radiance=0.7 * nominal.gain_dn_per_radiance)
+    found += [Condition(f"MTF {mtf:.0%}, SNR 25 / 55", _sharp(low, mtf)) for mtf in (0.05, 0.03)]
+    worst = _sharp(_noisy(nominal, profile, 15, 50), 0.03)
+    gain = replace(_sharp(nominal, 0.10), gain_dn_per_radiance=0.7 * nominal.gain_dn_per_radiance)
     return [*found, Condition("MTF 3%, SNR 15 / 50", worst), Condition("MTF 10%, gain x 0.7", gain)]
+
+
+def _sharp(sensor: Sensor, mtf: float) -> Sensor:
+    """The sensor with that MTF at Nyquist on both axes."""
+    return replace(sensor, mtf_nyquist=mtf, mtf_nyquist_along=None)
 
 
 def _noisy(sensor: Sensor, profile: SensorProfile, snr_0: float, snr_1: float) -> Sensor:

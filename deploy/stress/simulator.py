@@ -52,7 +52,9 @@ def simulator(_: Subject, case: Case, image: np.ndarray) -> list[Measure]:
 def sensor_of(case: Case) -> Sensor:
     """The profile's sensor, with the case's own MTF."""
     sensor = load_sensor(SENSOR).nominal()
-    return sensor if case.mtf_nyquist is None else replace(sensor, mtf_nyquist=case.mtf_nyquist)
+    if case.mtf_nyquist is None:
+        return sensor
+    return replace(sensor, mtf_nyquist=case.mtf_nyquist, mtf_nyquist_along=None)
 
 
 def _linear(image: np.ndarray, sensor: Sensor) -> list[Measure]:
@@ -96,7 +98,7 @@ def _signal_float64(image: np.ndarray, sensor: Sensor) -> np.ndarray:
     radiance = _radiance(image, sensor).double()
     height, width = radiance.shape
     fy, fx = (torch.fft.fftfreq(side, dtype=torch.float64) for side in (height, width))
-    response = mtf(RATIO * fx[None, :], RATIO * fy[:, None], sensor.mtf_nyquist)
+    response = mtf(RATIO * fx[None, :], RATIO * fy[:, None], sensor.mtf_axes)
     shift = torch.exp(1j * torch.pi * (RATIO - 1) * fy)[:, None] * torch.exp(1j * torch.pi * (RATIO - 1) * fx)
     blurred = torch.fft.ifft2(torch.fft.fft2(radiance) * response * shift).real
     return np.asarray(blurred[::RATIO, ::RATIO].numpy() * sensor.gain_dn_per_radiance)

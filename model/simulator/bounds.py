@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from model.simulator.fixed_pattern import PATTERN_LIMIT
-from model.simulator.mtf import smear_response, transfer_function
+from model.simulator.mtf import Axes, smear_response, transfer_function
 from model.simulator.noise import NOISE_LIMIT
 from profiles.effects import AntiAlias, Defects, Dsnu, Effect, FullWell, Offset, Prnu, Smear, Striping, Veil
 from profiles.sensor import Sensor, mtf_limit
@@ -48,17 +48,21 @@ def ringing_of(sensor: Sensor, stats: SceneStats) -> float:
     """Sum of the absolute values of the blur's kernel on the scene's grid: 1 without ringing.
 
     A blurrier sensor is a sharper one followed by a positive kernel of sum 1, which cannot enlarge the sum: so the
-    MTF is rounded up to the next whole percent, and sensors share what was computed once.
+    MTF is rounded up to the next whole percent, and sensors share what was computed once. Of two axes rounded each by
+    itself that would not hold: they are taken as they are.
     """
     antialias = sensor.effects.get("antialias")
     sigma_px = antialias.sigma_px if isinstance(antialias, AntiAlias) else 0.0
-    limit = mtf_limit(sigma_px)
-    rounded = min(math.ceil(sensor.mtf_nyquist * 100) / 100, limit)
-    return _kernel_sum(stats.height, stats.width, stats.oversampling, max(rounded, sensor.mtf_nyquist), sigma_px)
+    size = stats.height, stats.width, stats.oversampling
+    across, along = sensor.mtf_axes
+    if across != along:
+        return _kernel_sum(*size, (across, along), sigma_px)
+    rounded = min(math.ceil(across * 100) / 100, mtf_limit(sigma_px))
+    return _kernel_sum(*size, max(rounded, across), sigma_px)
 
 
 @lru_cache(maxsize=256)
-def _kernel_sum(height: int, width: int, oversampling: int, mtf_nyquist: float, sigma_px: float) -> float:
+def _kernel_sum(height: int, width: int, oversampling: int, mtf_nyquist: Axes, sigma_px: float) -> float:
     transfer = transfer_function(height, width, oversampling, mtf_nyquist, sigma_px)
     return float(torch.fft.irfft2(transfer.double(), s=(height, width)).abs().sum())
 

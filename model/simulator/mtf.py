@@ -38,17 +38,27 @@ def gamma_from_mtf(mtf_nyquist: float, antialias_sigma_px: float = 0.0) -> float
     return max(-2 * math.log(mtf_nyquist / limit), 0.0)
 
 
-def mtf(fx: Tensor, fy: Tensor, mtf_nyquist: float, antialias_sigma_px: float = 0.0) -> Tensor:
+Axes = float | tuple[float, float]
+"""An MTF at Nyquist: one for both axes, or (across the track, along it), that is horizontal and vertical."""
+
+
+def mtf(fx: Tensor, fy: Tensor, mtf_nyquist: Axes, antialias_sigma_px: float = 0.0) -> Tensor:
     """MTF(fx, fy) = exp(-gamma * sqrt(fx^2 + fy^2)) * sinc(fx) * sinc(fy) * G(fx, fy) (paper, section 3.3).
+
+    With a second MTF, along the track, gamma * sqrt(fx^2 + fy^2) becomes sqrt((gamma_x fx)^2 + (gamma_y fy)^2): each
+    axis keeps the contrast stated for it, and equal ones give the paper's formula to the last bit.
 
     Args:
         fx: horizontal frequencies in cycles per TARGET pixel, float64, broadcast against fy.
         fy: vertical frequencies, likewise. Beyond 1 the sinc is negative, and stays so.
-        mtf_nyquist: contrast kept at fx = 0.5, fy = 0, the anti-alias filter G included.
+        mtf_nyquist: contrast kept at 0.5 cycles per pixel, the anti-alias filter G included.
         antialias_sigma_px: standard deviation of that filter in target pixels; 0 is none (G = 1).
     """
+    across, along = mtf_nyquist if isinstance(mtf_nyquist, tuple) else (mtf_nyquist, mtf_nyquist)
+    gamma_x, gamma_y = (gamma_from_mtf(value, antialias_sigma_px) for value in (across, along))
     radius = torch.hypot(fx, fy)
-    optics = torch.exp(-gamma_from_mtf(mtf_nyquist, antialias_sigma_px) * radius)
+    # gamma * radius where it can be: hypot(gamma fx, gamma fy) rounds otherwise, and one gamma is the usual case
+    optics = torch.exp(-gamma_x * radius if gamma_x == gamma_y else -torch.hypot(gamma_x * fx, gamma_y * fy))
     response = optics * torch.sinc(fx) * torch.sinc(fy)
     return response * gaussian_response(radius, antialias_sigma_px) if antialias_sigma_px else response
 
@@ -70,7 +80,7 @@ def sensor_transfer(
     antialias, smear = sensor.effects.get("antialias"), sensor.effects.get("smear")
     sigma_px = antialias.sigma_px if isinstance(antialias, AntiAlias) else 0.0
     length_px = smear.length_px if isinstance(smear, Smear) else 0.0
-    return transfer_function(height, width, oversampling, sensor.mtf_nyquist, sigma_px, length_px, device)
+    return transfer_function(height, width, oversampling, sensor.mtf_axes, sigma_px, length_px, device)
 
 
 @lru_cache(maxsize=64)
@@ -78,7 +88,7 @@ def transfer_function(
     height: int,
     width: int,
     oversampling: int,
-    mtf_nyquist: float,
+    mtf_nyquist: Axes,
     antialias_sigma_px: float = 0.0,
     smear_px: float = 0.0,
     device: torch.device | None = None,

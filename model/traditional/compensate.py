@@ -10,7 +10,7 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from model.simulator.mtf import NYQUIST, mtf
+from model.simulator.mtf import NYQUIST, Axes, mtf
 from model.traditional.fill import fill_missing
 from model.traditional.rows import Rows, mirrored
 from model.traditional.threads import map_tiles
@@ -30,7 +30,7 @@ BLOCK_PX = 384
 """Side of the blocks that are filtered at once: with the radius around it, an FFT of 512."""
 
 
-def compensate(image: Tensor, mtf_from: float, mtf_to: float, epsilon: float) -> Tensor:
+def compensate(image: Tensor, mtf_from: Axes, mtf_to: Axes, epsilon: float) -> Tensor:
     """Filter (H, W) by `compensation_kernel`, on mirrored borders; unit and mean are kept, NaN stays NaN.
 
     Limits: a constant image is unchanged, up to rounding. With equal MTFs only the regularisation acts.
@@ -72,7 +72,7 @@ def _block(rows: Tensor, kernel: Tensor, left: int) -> Tensor:
     return (filtered[inside] + mean).where(known[core], torch.nan)
 
 
-def compensation_kernel(mtf_from: float, mtf_to: float, epsilon: float, radius_px: int = RADIUS_PX) -> Tensor:
+def compensation_kernel(mtf_from: Axes, mtf_to: Axes, epsilon: float, radius_px: int = RADIUS_PX) -> Tensor:
     """The filter whose gain is `compensation_gain`, cut at `radius_px`: (2 R + 1, 2 R + 1) float64, of sum 1.
 
     The weight that is cut off comes back as a smooth hill over the whole filter. So the gain is exact at DC, and
@@ -88,7 +88,7 @@ def compensation_kernel(mtf_from: float, mtf_to: float, epsilon: float, radius_p
     return kernel
 
 
-def compensation_gain(height: int, width: int, mtf_from: float, mtf_to: float, epsilon: float) -> Tensor:
+def compensation_gain(height: int, width: int, mtf_from: Axes, mtf_to: Axes, epsilon: float) -> Tensor:
     """G = T H / (H^2 + epsilon r^2) on the half spectrum, (height, width // 2 + 1) float64.
 
     H is the MTF to undo, T the one to reach, r = |f| / f_Nyquist. Weighted by r^2, epsilon leaves G(0) at exactly 1;
@@ -98,7 +98,7 @@ def compensation_gain(height: int, width: int, mtf_from: float, mtf_to: float, e
     Args:
         height: rows of the image.
         width: columns of the image.
-        mtf_from: MTF at Nyquist of the image, in (0, 2 / pi].
+        mtf_from: MTF at Nyquist of the image, in (0, 2 / pi]; one, or across and along the track.
         mtf_to: MTF at Nyquist to reach, likewise.
         epsilon: regularisation, 0 or more.
     """

@@ -54,7 +54,7 @@ class Chain:
 
     def kernel(self) -> Tensor:
         """The filter of the MTF compensation."""
-        return compensation_kernel(self.degraded.mtf_nyquist, self.reference.mtf_nyquist, self.regularisation)
+        return compensation_kernel(self.degraded.mtf_axes, self.reference.mtf_axes, self.regularisation)
 
 
 def restore_traditional(dn: Tensor, chain: Chain) -> Tensor:
@@ -117,10 +117,14 @@ def quality_named(name: str) -> Quality:
     return QUALITIES[name]
 
 
+def _axes_text(across: float, along: float) -> str:
+    return f"{across:.3g}" if across == along else f"{across:.3g} across and {along:.3g} along the track"
+
+
 def describe(chain: Chain) -> list[str]:
     """The steps that `restore_traditional` would take, one line each, with their numbers."""
     sensor, chosen, epsilon = with_rounding_noise(chain.degraded), quality_named(chain.quality), chain.regularisation
-    mtf_from, mtf_to = chain.degraded.mtf_nyquist, chain.reference.mtf_nyquist
+    mtf_from, mtf_to = chain.degraded.mtf_axes, chain.reference.mtf_axes
     gain = float(compensation_gain(64, 64, mtf_from, mtf_to, epsilon).max())
     coloured = ", its covariance that of the filtered noise" if chain.order == "deconvolve-first" else ""
     denoise = [
@@ -129,7 +133,7 @@ def describe(chain: Chain) -> list[str]:
         + coloured,
         f"back to radiance, {bias_radiance(sensor):.2g} W/m2/sr/um of bias restored",
     ]
-    mtfs = f"{mtf_from:.3g} to {mtf_to:.3g}"
+    mtfs = " to ".join(_axes_text(*axes) for axes in (mtf_from, mtf_to))
     sharpen = [f"compensate the MTF at Nyquist from {mtfs}: epsilon {epsilon:.2g}, largest gain {gain:.2f}"]
     steps = denoise + sharpen if chain.order == "denoise-first" else sharpen + denoise
     return [*steps, f"clip to 0..{chain.reference.max_dn} DN"]

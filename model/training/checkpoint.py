@@ -8,11 +8,11 @@ from typing import cast, get_args
 import torch
 from torch import Tensor
 
-from model.convbeers import ConvBEERS
+from model.conditioning import Network, ToldConvBEERS
 from model.training.guards import Guards
 from model.training.precision import Precision
 from model.training.recipe import TrainingRecipe
-from model.weights_file import all_finite, load_network, read_tensors, save_network, write_tensors
+from model.weights_file import all_finite, load_network, load_told, read_tensors, save_network, write_tensors
 from profiles.errors import ModelError
 
 MOMENTS = ("step", "exp_avg", "exp_avg_sq")
@@ -22,7 +22,7 @@ LEAST = {"step": 1.0, "exp_avg_sq": 0.0}
 
 def write_checkpoint(
     path: Path,
-    network: ConvBEERS,
+    network: Network,
     average: dict[str, Tensor],
     optimiser: torch.optim.Optimizer,
     recipe: TrainingRecipe,
@@ -42,7 +42,7 @@ def write_checkpoint(
 
 def read_checkpoint(
     path: Path,
-    network: ConvBEERS,
+    network: Network,
     average: dict[str, Tensor],
     optimiser: torch.optim.Optimizer,
     recipe: TrainingRecipe,
@@ -78,7 +78,7 @@ def read_checkpoint(
     return step, guards, cast(Precision, precision)
 
 
-def finish(network: ConvBEERS, path: Path, recipe: dict[str, object]) -> ConvBEERS:
+def finish(network: Network, path: Path, recipe: dict[str, object]) -> Network:
     """Write a network with the recipe that made it, and read it back.
 
     Raises:
@@ -88,10 +88,10 @@ def finish(network: ConvBEERS, path: Path, recipe: dict[str, object]) -> ConvBEE
         remedy = "lower the learning rate"
         raise ModelError(str(path), expected="finite weights", got="NaN or infinity", remedy=remedy)
     save_network(path, network, recipe)
-    return load_network(path)[0]
+    return load_told(path)[0] if isinstance(network, ToldConvBEERS) else load_network(path)[0]
 
 
-def _check_parts(tensors: dict[str, Tensor], network: ConvBEERS, steps: int) -> None:
+def _check_parts(tensors: dict[str, Tensor], network: Network, steps: int) -> None:
     """Nothing is filled in before all of it fits.
 
     Raises:

@@ -12,25 +12,37 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from model.simulator.acquire import Pair, acquire
+from model.conditioning import SensorFamily, tell, transposed
+from model.simulator.acquire import acquire
 from model.simulator.draws import Draw
 from model.simulator.sampling import crop_divisible, scene_spectrum
 from model.simulator.scene import Scene
 from model.training.workers import Worker
 from profiles.errors import ImageError
-from profiles.sensor import SensorProfile
+from profiles.sensor import Sensor, SensorProfile
 
 
 @dataclass(frozen=True)
 class PatchRecipe:
-    """How patches are drawn from scenes."""
+    """How patches are drawn from scenes.
+
+    Attributes:
+        degraded: draws the sensor of each pass over a scene.
+        reference: draws the sensor of the wanted image.
+        patch_px: side of a patch.
+        oversamplings: ratios to draw from; every ratio shows the same ground at another scale.
+        exposures: darker and brighter days than the photograph's.
+        margin_px: target pixels cropped on each side.
+        told: draws the sensors instead of `degraded`; each patch then comes with the vector of its sensor.
+    """
 
     degraded: SensorProfile
     reference: SensorProfile
     patch_px: int = 96
-    oversamplings: tuple[int, ...] = (2, 3, 4, 5)  # every ratio shows the same ground at another scale
-    exposures: tuple[float, float] = (0.5, 1.25)  # darker and brighter days than the photograph's
+    oversamplings: tuple[int, ...] = (2, 3, 4, 5)
+    exposures: tuple[float, float] = (0.5, 1.25)
     margin_px: int = 16
+    told: SensorFamily | None = None
 
 
 @dataclass(frozen=True)
@@ -42,7 +54,10 @@ class Visited:
 
 
 class PatchSource:
-    """Endless batches of (degraded, reference) patches, (N, 1, P, P) in [0, 1]; the same for the same seed."""
+    """Endless batches of (degraded, reference) patches, (N, 1, P, P) in [0, 1]; the same for the same seed.
+
+    With sensors told, of (degraded, reference, sensor vectors (N, 4)).
+    """
 
     SHARD_BATCHES = 16
     """Batches mixed together: enough scenes in one batch, little memory."""
@@ -60,7 +75,7 @@ class PatchSource:
         common = int(np.lcm.reduce(recipe.oversamplings))
         self._scenes = [prepare(scene, common, device) for scene in scenes]
 
-    def batches(self, first: int = 0) -> Iterator[tuple[Tensor, Tensor]]:
+    def batches(self, first: int = 0) -> Iterator[tuple[Tensor, ...]]:
         """Batch number `first` and all that follow: a resumed run goes on where it stopped.
 
         The next shard is made while the present one is used.
@@ -69,27 +84,29 @@ class PatchSource:
         with ThreadPoolExecutor(1) as ahead:
             waiting = ahead.submit(self._shard, number)
             while True:
-                degraded, reference = waiting.result()
+                shard = waiting.result()
                 number += 1
                 waiting = ahead.submit(self._shard, number)
                 for k in range(within, self.SHARD_BATCHES):
                     part = slice(k * self.batch, (k + 1) * self.batch)
-                    yield degraded[part], reference[part]
+                    yield tuple(tensor[part] for tensor in shard)
                 within = 0
 
-    def _shard(self, number: int) -> tuple[Tensor, Tensor]:
+    def _shard(self, number: int) -> tuple[Tensor, ...]:
         own = number * self.worker.count + self.worker.rank
         generator = Draw(self.seed, own).generator("shard")
-        wanted, pieces, count = self.batch * self.SHARD_BATCHES, [], 0
+        wanted, pieces, vectors, count = self.batch * self.SHARD_BATCHES, list[Tensor](), list[Tensor](), 0
         for _ in range(50 * wanted):
-            piece = visit(self._scenes[generator.integers(len(self._scenes))], self.recipe, generator)
+            piece, vector = visit(self._scenes[generator.integers(len(self._scenes))], self.recipe, generator)
             pieces.append(piece)
+            vectors.append(vector.expand(len(piece), -1))
             count += len(piece)
             if count >= wanted:
                 order = torch.from_numpy(generator.permutation(count)[:wanted])
                 patches = torch.cat(pieces)
                 patches = patches[order.to(patches.device)]
-                return patches[:, :1].contiguous(), patches[:, 1:].contiguous()
+                pair = patches[:, :1].contiguous(), patches[:, 1:].contiguous()
+                return (*pair, torch.cat(vectors)[order]) if self.recipe.told else pair
         raise ImageError(
             "training images",
             expected=f"scenes that hold a patch of {self.recipe.patch_px} target pixels",
@@ -104,27 +121,38 @@ def prepare(scene: Scene, multiple: int, device: torch.device | None = None) -> 
     return Visited(scene_spectrum(radiance), radiance.shape[-1])
 
 
-def visit(scene: Visited, recipe: PatchRecipe, generator: np.random.Generator) -> Tensor:
-    """All the patches of one simulated pass over a scene, (N, 2, P, P): degraded and reference in [0, 1]."""
+def visit(scene: Visited, recipe: PatchRecipe, generator: np.random.Generator) -> tuple[Tensor, Tensor]:
+    """All the patches of one simulated pass over a scene, (N, 2, P, P), and the vector (4,) of its sensor.
+
+    The patches are degraded and reference in [0, 1].
+    """
     ratio = int(generator.choice(recipe.oversamplings))
     room = min(scene.spectrum.shape[-2], scene.width) // ratio - 2 * recipe.margin_px
     if room < recipe.patch_px:
-        return scene.spectrum.real.new_empty(0, 2, recipe.patch_px, recipe.patch_px)
-    pair = _acquire_pair(scene, recipe, ratio, generator)
-    patches = cut(torch.stack([pair.degraded, pair.reference]), recipe.patch_px, generator)
-    return turn(patches, generator)
+        return scene.spectrum.real.new_empty(0, 2, recipe.patch_px, recipe.patch_px), torch.empty(4)
+    images, sensor = _acquire_pair(scene, recipe, ratio, generator)
+    patches = cut(images, recipe.patch_px, generator)
+    quarter, mirrored = draw_turn(generator)
+    vector = tell(sensor).vector
+    if recipe.told is None and sensor.mtf_axes[0] != sensor.mtf_axes[1]:
+        quarter -= quarter % 2  # a blind network learns one sensor: its two axes must not change places
+    return turned(patches, quarter, mirrored), transposed(vector) if quarter % 2 else vector
 
 
-def _acquire_pair(scene: Visited, recipe: PatchRecipe, ratio: int, generator: np.random.Generator) -> Pair:
+def _acquire_pair(
+    scene: Visited, recipe: PatchRecipe, ratio: int, generator: np.random.Generator
+) -> tuple[Tensor, Sensor]:
+    """Degraded and reference, (2, H, W), and the sensor of the degraded one."""
     spectrum = scene.spectrum * float(generator.uniform(*recipe.exposures))
     phase_y, phase_x = (float(v) for v in generator.uniform(-ratio / 2, ratio / 2, 2))
     draw = Draw(int(generator.integers(2**31)))
-    images = []
-    for profile, role in ((recipe.degraded, "degraded"), (recipe.reference, "reference")):
+    images, sensors = list[Tensor](), list[Sensor]()
+    for profile, role in ((recipe.told or recipe.degraded, "degraded"), (recipe.reference, "reference")):
         sensor = profile.draw(generator)
         dn = acquire(spectrum, scene.width, sensor, ratio, draw, role, (phase_y, phase_x), recipe.margin_px)
         images.append(dn / sensor.max_dn)
-    return Pair(*images)
+        sensors.append(sensor)
+    return torch.stack(images), sensors[0]
 
 
 def cut(images: Tensor, patch_px: int, generator: np.random.Generator) -> Tensor:
@@ -137,6 +165,15 @@ def cut(images: Tensor, patch_px: int, generator: np.random.Generator) -> Tensor
 
 def turn(patches: Tensor, generator: np.random.Generator) -> Tensor:
     """One of the eight symmetries of the square, the same for all patches of a pass."""
-    quarter, mirrored = int(generator.integers(4)), bool(generator.integers(2))
-    turned = torch.rot90(patches, quarter, (-2, -1))
-    return turned.flip(-1) if mirrored else turned
+    return turned(patches, *draw_turn(generator))
+
+
+def draw_turn(generator: np.random.Generator) -> tuple[int, bool]:
+    """Quarter turns, and whether to mirror afterwards; an odd number of quarters makes columns of rows."""
+    return int(generator.integers(4)), bool(generator.integers(2))
+
+
+def turned(patches: Tensor, quarter: int, mirrored: bool) -> Tensor:
+    """Patches (..., P, P) turned by quarters, then mirrored."""
+    rotated = torch.rot90(patches, quarter, (-2, -1))
+    return rotated.flip(-1) if mirrored else rotated

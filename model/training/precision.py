@@ -8,6 +8,7 @@ from typing import Literal
 import torch
 from torch import Tensor, nn
 
+from model.conditioning import Network, ToldConvBEERS, each_through
 from model.convbeers import ConvBEERS
 from model.processor import bfloat16_speed
 from model.training.workers import Worker
@@ -58,3 +59,22 @@ class MixedPrecision(nn.Module):
             deep = self.network.body_end(self.network.body(shallow))
         correction: Tensor = self.network.tail(shallow + deep.float())
         return image + correction
+
+
+class ToldMixedPrecision(nn.Module):
+    """As `MixedPrecision`, each image with the weights for its own sensor; these are mixed in float32."""
+
+    def __init__(self, network: ToldConvBEERS, precision: Precision) -> None:
+        super().__init__()
+        self.network, self.plain = network, MixedPrecision(network.base, precision)
+
+    def forward(self, image: Tensor, vectors: Tensor) -> Tensor:
+        """(N, 1, H, W) and sensor vectors (N, 4) to (N, 1, H, W)."""
+        return each_through(self.plain, "network.", self.network.weights(vectors), image)
+
+
+def in_precision(network: Network, precision: Precision) -> nn.Module:
+    """The network as it is trained."""
+    if isinstance(network, ToldConvBEERS):
+        return ToldMixedPrecision(network, precision)
+    return MixedPrecision(network, precision)

@@ -12,12 +12,13 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
+from model.conditioning import Network, ToldConvBEERS, initialise_coefficients
 from model.convbeers import ConvBEERS, Variant, initialise
 from model.training.checkpoint import read_checkpoint, write_checkpoint
 from model.training.guards import Guards
 from model.training.interrupts import held_back
 from model.training.losses import RestorationLoss
-from model.training.precision import MixedPrecision, Precision, choose_precision
+from model.training.precision import MixedPrecision, Precision, choose_precision, in_precision
 from model.training.recipe import TrainingRecipe
 from model.training.workers import Worker
 
@@ -25,8 +26,11 @@ from model.training.workers import Worker
 class Source(Protocol):
     """Where batches come from."""
 
-    def batches(self, first: int = 0) -> Iterator[tuple[Tensor, Tensor]]:
-        """Batch number `first` and all that follow: (degraded, reference), (N, 1, P, P) in [0, 1] each."""
+    def batches(self, first: int = 0) -> Iterator[tuple[Tensor, ...]]:
+        """Batch number `first` and all that follow: (degraded, reference), (N, 1, P, P) in [0, 1] each.
+
+        For a network that is told its sensor, (degraded, reference, sensor vectors (N, 4)).
+        """
         ...
 
 
@@ -49,7 +53,7 @@ class Schedule:
     save_s: float = 120.0
     validate_steps: int = 0  # 0: never
     report: Callable[[Progress], None] = field(default=lambda _: None)
-    validate: Callable[[int, ConvBEERS], None] = field(default=lambda *_: None)
+    validate: Callable[[int, Network], None] = field(default=lambda *_: None)
 
 
 class Trainer:
@@ -64,6 +68,7 @@ class Trainer:
         start: weights to go on from, as `state_dict`; None draws new ones.
         teacher: a network whose outputs the recipe's `distil` weighs.
         precision: what the body is computed in; None measures what is faster here.
+        told: whether the network is told the sensor of each patch.
     """
 
     def __init__(
@@ -76,12 +81,12 @@ class Trainer:
         start: Mapping[str, Tensor] | None = None,
         teacher: ConvBEERS | None = None,
         precision: Precision | None = None,
+        told: bool = False,
     ) -> None:
         self.recipe, self.worker = recipe, worker or Worker()
         self.loss, self.device = loss or RestorationLoss(recipe.loss), self.worker.device(device)
         self.step, self.guards = 0, Guards()
-        self.network = ConvBEERS(variant)
-        initialise(self.network, torch.Generator().manual_seed(recipe.seed))
+        self.network = new_network(variant, torch.Generator().manual_seed(recipe.seed), told)
         if start is not None:
             self.network.load_state_dict(dict(start))
         self.network.to(self.device).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
@@ -92,7 +97,7 @@ class Trainer:
 
     def _compute_in(self, precision: Precision) -> None:
         self.precision: Precision = precision
-        self.forward = self.worker.wrap(MixedPrecision(self.network, precision))
+        self.forward = self.worker.wrap(in_precision(self.network, precision))
         self.teacher = MixedPrecision(self._teacher, precision) if self._teacher is not None else None
 
     def run(self, source: Source, checkpoint: Path, schedule: Schedule) -> None:
@@ -125,12 +130,16 @@ class Trainer:
         if self.worker.first and schedule.validate_steps and (self.step % schedule.validate_steps == 0 or last):
             schedule.validate(self.step, self.averaged())
 
-    def train_step(self, degraded: Tensor, reference: Tensor) -> Mapping[str, Tensor]:
-        """One step on a batch, (N, 1, P, P) each; the loss's terms, none for a step that was skipped."""
+    def train_step(self, degraded: Tensor, reference: Tensor, *vectors: Tensor) -> Mapping[str, Tensor]:
+        """One step on a batch, (N, 1, P, P) each; the loss's terms, none for a step that was skipped.
+
+        A network that is told its sensor takes the sensor vectors (N, 4) too.
+        """
         for group in self.optimiser.param_groups:
             group["lr"] = self.recipe.rate_at(self.step)
         degraded = degraded.to(self.device, memory_format=torch.channels_last)
-        total, terms = self._loss(degraded, reference.to(self.device))
+        told = (vector.to(self.device) for vector in vectors)
+        total, terms = self._loss(degraded, reference.to(self.device), *told)
         self.optimiser.zero_grad(set_to_none=True)
         total.backward()  # type: ignore[no-untyped-call]
         norm = torch.nn.utils.clip_grad_norm_(self.network.parameters(), self.recipe.gradient_norm)
@@ -144,8 +153,8 @@ class Trainer:
         self.guards.passed(self.step, float(total.detach()))
         return terms
 
-    def _loss(self, degraded: Tensor, reference: Tensor) -> tuple[Tensor, Mapping[str, Tensor]]:
-        restored = self.forward(degraded)
+    def _loss(self, degraded: Tensor, reference: Tensor, *vectors: Tensor) -> tuple[Tensor, Mapping[str, Tensor]]:
+        restored = self.forward(degraded, *vectors)
         total, terms = self.loss(restored, reference)
         if self.teacher is None:
             return total, terms
@@ -159,9 +168,9 @@ class Trainer:
         for name, value in self.network.state_dict().items():
             self.average[name].lerp_(value, 1 - decay)
 
-    def averaged(self) -> ConvBEERS:
+    def averaged(self) -> Network:
         """The network with its running-average weights, on the CPU: the one to ship."""
-        network = ConvBEERS(self.network.variant)
+        network = type(self.network)(self.network.variant)
         network.load_state_dict(self.average)
         return network.eval()
 
@@ -209,7 +218,19 @@ class Meter:
         return progress
 
 
-def _optimiser(network: ConvBEERS, recipe: TrainingRecipe) -> torch.optim.Optimizer:
+def new_network(variant: Variant, generator: torch.Generator, told: bool) -> Network:
+    """A network that nothing was trained into yet."""
+    if not told:
+        network = ConvBEERS(variant)
+        initialise(network, generator)
+        return network
+    conditioned = ToldConvBEERS(variant)
+    initialise(conditioned.base, generator)
+    initialise_coefficients(conditioned, generator)
+    return conditioned
+
+
+def _optimiser(network: Network, recipe: TrainingRecipe) -> torch.optim.Optimizer:
     if recipe.optimiser == "adamw":
         return torch.optim.AdamW(network.parameters(), lr=recipe.learning_rate, weight_decay=recipe.weight_decay)
     return torch.optim.Adam(network.parameters(), lr=recipe.learning_rate)

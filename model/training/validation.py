@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from model.convbeers import ConvBEERS
+from model.conditioning import Network, SensorFamily, ToldConvBEERS, fold, tell
 from model.images import site_of
 from model.metrics.fidelity import psnr_db, ssim
 from model.simulator.acquire import fitting_oversampling, simulate_pair
@@ -55,8 +55,10 @@ class Validation:
     Scenes too small to leave anything within the margin are left out.
     """
 
-    def __init__(self, scenes: Sequence[Scene], degraded: SensorProfile, reference: SensorProfile) -> None:
-        self.names, self.pairs = list[str](), list[tuple[Tensor, Tensor]]()
+    def __init__(
+        self, scenes: Sequence[Scene], degraded: SensorProfile | SensorFamily, reference: SensorProfile
+    ) -> None:
+        self.names, self.pairs, self.vectors = list[str](), list[tuple[Tensor, Tensor]](), list[Tensor]()
         for number, scene in enumerate(scenes):
             ratio = fitting_oversampling(scene.radiance, OVERSAMPLINGS, MIN_SIDE_PX)
             if ratio is None:
@@ -69,13 +71,21 @@ class Validation:
             degraded_image, reference_image = (image[None, None, :height, :width] for image in both)
             self.names.append(scene.name)
             self.pairs.append((degraded_image, reference_image))
+            self.vectors.append(tell(eyes[0]).vector)
 
-    def restore(self, network: ConvBEERS) -> list[np.ndarray]:
-        """Each degraded image through the network in float32, (H, W), clipped to [0, 1]."""
-        with torch.inference_mode():
-            return [network(degraded)[0, 0].clamp(0, 1).numpy() for degraded, _ in self.pairs]
+    def restore(self, network: Network) -> list[np.ndarray]:
+        """Each degraded image through the network in float32, (H, W), clipped to [0, 1].
 
-    def judge(self, network: ConvBEERS) -> Judged:
+        A network that can be told its sensor is told the one that acquired the image.
+        """
+        restored = []
+        for (degraded, _), vector in zip(self.pairs, self.vectors, strict=True):
+            plain = fold(network, vector) if isinstance(network, ToldConvBEERS) else network
+            with torch.inference_mode():
+                restored.append(plain(degraded)[0, 0].clamp(0, 1).numpy())
+        return restored
+
+    def judge(self, network: Network) -> Judged:
         """Mean scores of a network on the CPU."""
         restored = self.restore(network)
         references = [reference[0, 0].numpy() for _, reference in self.pairs]

@@ -1,12 +1,20 @@
 from pathlib import Path
 
+import numpy as np
 import onnx
 import pytest
 import torch
+from typer.testing import CliRunner, Result
 
+from deploy.cli import app
 from deploy.export import parity, to_onnx
+from model.conditioning import ToldConvBEERS, initialise_coefficients, tell
 from model.convbeers import ConvBEERS, Variant, initialise
+from model.weights_file import load_told, save_network
+from profiles import load_sensor
+from profiles.toml import HERE
 from quant.onnx_file import fixed_tile_px, metadata, save_onnx
+from quant.session import open_session, run
 
 
 @pytest.fixture(scope="module")
@@ -40,3 +48,63 @@ def test_a_relu_stands_behind_every_first_convolution(network: ConvBEERS) -> Non
     kinds = [node.op_type for node in to_onnx(network, {}).graph.node]
     assert kinds.count("Relu") == network.variant.blocks
     assert kinds.count("Add") == network.variant.blocks + 2
+
+
+@pytest.fixture
+def told(tmp_path: Path) -> Path:
+    """Weights as `train --told` leaves them."""
+    network, generator = ToldConvBEERS(Variant(blocks=2, features=8)), torch.Generator().manual_seed(0)
+    initialise(network.base, generator)
+    initialise_coefficients(network, generator)
+    for parameter in network.directions.parameters():
+        torch.nn.init.normal_(parameter, 0.0, 0.05, generator)
+    save_network(tmp_path / "told.safetensors", network, {"degraded": "many"})
+    return tmp_path / "told.safetensors"
+
+
+def export(*options: str) -> Result:
+    return CliRunner().invoke(app, ["export", *options])
+
+
+@pytest.mark.parametrize("sensor", ["pleiades-degraded", "pleiades-variable"])
+def test_told_weights_are_exported_for_the_sensor_named(told: Path, sensor: str, tmp_path: Path) -> None:
+    path = tmp_path / "x.onnx"
+    result = export("--checkpoint", str(told), "--sensor", sensor, "--out", str(path))
+    assert result.exit_code == 0, result.output
+    assert "warning" not in result.output
+    unfolded, vector = load_told(told)[0], tell(load_sensor(sensor).nominal()).vector
+    image = np.random.default_rng(1).random((1, 1, 27, 35), dtype=np.float32)
+    with torch.inference_mode():
+        expected = unfolded(torch.from_numpy(image), vector[None]).numpy()
+    assert float(np.abs(run(open_session(path), image) - expected).max()) < 1e-6
+    assert metadata(onnx.load(path))["sensor"] == sensor
+
+
+def test_another_sensor_makes_another_file_and_the_same_one_the_same_bytes(told: Path, tmp_path: Path) -> None:
+    files = [tmp_path / f"{number}.onnx" for number in range(3)]
+    for file, sensor in zip(files, ("pleiades-degraded", "pleiades-degraded", "pleiades-variable"), strict=True):
+        assert export("--checkpoint", str(told), "--sensor", sensor, "--out", str(file)).exit_code == 0
+    same, again, other = (file.read_bytes() for file in files)
+    assert same == again
+    assert same != other
+
+
+def test_a_users_own_sensor_and_what_lies_outside_the_ranges_is_said(told: Path, tmp_path: Path) -> None:
+    text = (HERE / "sensors" / "pleiades-degraded.toml").read_text()
+    mine = tmp_path / "mine.toml"
+    mine.write_text(text.replace("[noise]", "mtf_nyquist_along = 0.004\n[noise]"))
+    result = export("--checkpoint", str(told), "--sensor", str(mine), "--out", str(tmp_path / "x.onnx"))
+    assert result.exit_code == 0, result.output
+    assert "warning: mtf_along 0.004 is outside 0.015 to 0.15, told as 0.015" in " ".join(result.stderr.split())
+
+
+def test_told_weights_need_a_sensor_and_plain_ones_take_none(told: Path, tmp_path: Path) -> None:
+    out = tmp_path / "x.onnx"
+    missing = export("--checkpoint", str(told), "--out", str(out))
+    useless = export("--variant", "convbeers-xs", "--sensor", "pleiades-degraded", "--out", str(out))
+    unknown = export("--checkpoint", str(told), "--sensor", "hubble", "--out", str(out))
+    for result, words in ((missing, "--sensor NAME"), (useless, "can be told"), (unknown, "hubble")):
+        assert result.exit_code == 2
+        assert words in " ".join(result.output.split())
+        assert "Traceback" not in result.output
+    assert not out.exists()

@@ -11,8 +11,10 @@ from typer.testing import CliRunner
 
 from deploy.cli import app
 from deploy.training import Log
+from model.conditioning import fold
+from model.shipped import shipped_weights
 from model.simulator.procedural import procedural_scene
-from model.weights_file import load_network
+from model.weights_file import load_network, load_told, read_tensors
 
 SIDE = 420
 
@@ -63,6 +65,34 @@ def test_a_finished_run_resumes_to_the_same_weights(images: Path, tmp_path: Path
     assert all(torch.equal(first[name], again[name]) for name in first)
 
 
+def test_a_told_run_starts_from_blind_weights_and_resumes_to_the_same(images: Path, tmp_path: Path) -> None:
+    blind = shipped_weights("convbeers-xs")
+    run(images, tmp_path / "a", "--told", "--start", str(blind), "--validate-every", "2")
+    path = tmp_path / "a" / "convbeers-xs-told.safetensors"
+    tensors, header = read_tensors(path)
+    run(images, tmp_path / "a", "--told", "--start", str(blind), "--validate-every", "2", "--resume")
+    again, again_header = read_tensors(path)
+    assert header == again_header
+    assert all(torch.equal(tensor, again[name]) for name, tensor in tensors.items())
+    assert [row["step"] for row in rows(tmp_path / "a" / "validation.csv")] == ["2", "4"]
+    recipe = load_told(path)[1]
+    assert recipe["degraded"] == "told, drawn over the ranges"
+    assert recipe["held_out"] == ["coast_1.png"]
+
+
+def test_a_told_run_that_learns_nothing_is_what_it_started_from(images: Path, tmp_path: Path) -> None:
+    options = ["--told", "--learning-rate", "0", "--validate-every", "0", "--start"]
+    run(images, tmp_path / "a", *options, str(shipped_weights("convbeers-xs")), steps=1)
+    path, blind = tmp_path / "a" / "convbeers-xs-told.safetensors", load_network(shipped_weights("convbeers-xs"))[0]
+    image, told = torch.rand(1, 1, 27, 33, generator=torch.Generator().manual_seed(0)), load_told(path)[0]
+    vector = torch.tensor([-1.0, 0.3, 0.5, 1.0])
+    with torch.inference_mode():
+        torch.testing.assert_close(fold(told, vector)(image), blind(image), rtol=0, atol=1e-6)
+    run(images, tmp_path / "b", *options, str(path), steps=1)
+    again = load_told(tmp_path / "b" / path.name)[0].state_dict()
+    assert all(torch.allclose(value, again[name]) for name, value in told.state_dict().items())
+
+
 @pytest.mark.parametrize(
     ("options", "words"),
     [
@@ -75,6 +105,8 @@ def test_a_finished_run_resumes_to_the_same_weights(images: Path, tmp_path: Path
         (["--drawn", "1", "--lpips", "none.npz"], "no such file"),
         (["--drawn", "1", "--device", "cuda"], "CUDA"),
         (["--resume", "--drawn", "1"], "no such file"),
+        (["--told", "--pairs", "here"], "do not say what sensor"),
+        (["--told", "--drawn", "1", "--teacher", "here"], "teacher is not told"),
     ],
 )
 def test_wrong_options_get_one_sentence(options: list[str], words: str, tmp_path: Path) -> None:

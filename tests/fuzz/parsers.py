@@ -33,13 +33,14 @@ from deploy.tradeoff.accuracy import Scores
 from deploy.tradeoff.cache import Cache, Keepable
 from deploy.tradeoff.host_time import Times
 from deploy.training import Log
+from model.conditioning import ToldConvBEERS
 from model.convbeers import ConvBEERS, Variant
 from model.images import read_pixels
 from model.metrics.backbone_files import read_tensors
 from model.training.checkpoint import read_checkpoint, write_checkpoint
 from model.training.guards import Guards
 from model.training.recipe import TrainingRecipe
-from model.weights_file import load_network, save_network
+from model.weights_file import load_network, load_told, save_network
 from profiles import load_sensor, load_target
 from profiles.errors import BeersError
 from profiles.scene_call import load_scene_call
@@ -280,6 +281,12 @@ def weights_seeds(folder: Path) -> list[bytes]:
     return [_written(partial(save_network, network=_fresh()[0], recipe={"degraded": "x"}), folder / "w.safetensors")]
 
 
+def told_seeds(folder: Path) -> list[bytes]:
+    """The weights of a network that is told its sensor."""
+    network = ToldConvBEERS(SMALL)
+    return [_written(partial(save_network, network=network, recipe={"degraded": "x"}), folder / "w.safetensors")]
+
+
 def runs_seeds(_: Path) -> list[bytes]:
     """A board's own measurements."""
     run = {"network": "resnet-50", "configuration": "C32B3", "tile_px": 640, "fps": 95.0}
@@ -328,6 +335,7 @@ PARSERS: tuple[Parser, ...] = (
     Parser("dataset manifest", ".jsonl", manifest_seeds, _read_summary, of_json),
     Parser("training log", ".csv", lambda _: [b"step,loss\n10,0.5\n20,0.25\n"], log_lines, share=0.5),
     Parser("weights", ".safetensors", weights_seeds, load_network, of_safetensors),
+    Parser("told weights", ".safetensors", told_seeds, load_told, of_safetensors),
     Parser("checkpoint", ".safetensors", checkpoint_seeds, go_on, of_safetensors),
     Parser("backbone npz", ".npz", partial(backbone_seeds, packed=True), lambda p: read_tensors(p, ["a", "b"])),
 )

@@ -10,7 +10,7 @@ from model.metrics.refusal import Refusal
 from model.metrics.sharpness import EdgeMtf, edge_mtf
 from model.simulator.detect import detect
 from model.simulator.draws import Draw
-from model.simulator.mtf import mtf, transfer_function
+from model.simulator.mtf import mtf, sensor_transfer, transfer_function
 from model.simulator.sampling import sample, scene_spectrum
 from profiles.errors import ImageError
 from profiles.sensor import Sensor, noise_from_snr
@@ -41,6 +41,19 @@ def measured(image: np.ndarray) -> EdgeMtf:
     result = edge_mtf(image, saturated=4095)
     assert isinstance(result, EdgeMtf), result
     return result
+
+
+@pytest.mark.parametrize("angle_deg", [5.0, 11.0])
+def test_a_sensor_of_two_axes_is_measured_at_both(angle_deg: float) -> None:
+    """Edges upright and lying, acquired by one sensor: 12 % across the track, 5 % along it."""
+    sensor, side = Sensor(0.12, 0.0, 0.0, GAIN, 12, {}, 0.05), SCENE_PX * RATIO
+    transfer, upright = sensor_transfer(side, side, RATIO, sensor), slanted_edge(SCENE_PX, RATIO, angle_deg)
+    middle = slice((SCENE_PX - SIDE_PX) // 2, (SCENE_PX + SIDE_PX) // 2)
+    found = []
+    for scene in (upright, upright.T.contiguous()):
+        image = sample(scene_spectrum(scene), transfer, side, RATIO)[middle, middle]
+        found.append(measured(image.numpy() * GAIN).mtf_nyquist)
+    assert found == pytest.approx([0.12, 0.05], abs=0.005)
 
 
 def refused(image: np.ndarray, noise_sigma: float | None = None, saturated: float | None = None) -> str:

@@ -5,9 +5,18 @@ import pytest
 import torch
 from safetensors.torch import save_file
 
+from model.conditioning import RANGES, ToldConvBEERS
 from model.convbeers import VARIANTS, ConvBEERS, Variant, initialise
 from model.shipped import shipped_weights
-from model.weights_file import load_network, read_tensors, save_network, variant_named, write_tensors
+from model.weights_file import (
+    is_told,
+    load_network,
+    load_told,
+    read_tensors,
+    save_network,
+    variant_named,
+    write_tensors,
+)
 from profiles.errors import MachineError, ModelError, OptionError
 
 
@@ -116,3 +125,61 @@ def test_others_can_read_what_is_written(tmp_path: Path) -> None:
     (tmp_path / "plain").touch()
     save_network(tmp_path / "w.safetensors", network(), {})
     assert (tmp_path / "w.safetensors").stat().st_mode == (tmp_path / "plain").stat().st_mode
+
+
+def told() -> ToldConvBEERS:
+    built = ToldConvBEERS(Variant(1, 4))
+    for parameter in built.parameters():
+        torch.nn.init.normal_(parameter, 0.0, 0.1, torch.Generator().manual_seed(0))
+    return built
+
+
+def test_a_told_network_comes_back_as_it_was(tmp_path: Path) -> None:
+    written, path = told(), tmp_path / "w.safetensors"
+    save_network(path, written, {"steps": 7})
+    read, recipe = load_told(path)
+    assert recipe == {"steps": 7}
+    assert not read.training
+    assert is_told(path)
+    assert all(torch.equal(value, read.state_dict()[name]) for name, value in written.state_dict().items())
+    assert read_tensors(path)[1]["ranges"] == {name: list(ends) for name, ends in RANGES.items()}
+
+
+def test_told_and_plain_weights_are_not_taken_for_one_another(tmp_path: Path) -> None:
+    save_network(tmp_path / "told.safetensors", told(), {})
+    save_network(tmp_path / "plain.safetensors", network(), {})
+    assert not is_told(tmp_path / "plain.safetensors")
+    with pytest.raises(ModelError, match="--sensor"):
+        load_network(tmp_path / "told.safetensors")
+    with pytest.raises(ModelError, match="cannot be told"):
+        load_told(tmp_path / "plain.safetensors")
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"ranges": {"mtf_across": [0.01, 0.2]}}, "ranges"),
+        ({"ranges": None}, "ranges"),
+        ({"variant": {"blocks": 1, "features": 5}}, "features"),
+        ({"variant": {"blocks": 10**9, "features": 4}}, "tensors"),
+        ({"variant": None}, "weights"),
+    ],
+)
+def test_told_weights_with_a_wrong_header_are_refused(change: dict[str, object], words: str, tmp_path: Path) -> None:
+    path = tmp_path / "w.safetensors"
+    save_network(path, told(), {})
+    tensors, header = read_tensors(path)
+    write_tensors(path, tensors, header | change)
+    with pytest.raises(ModelError, match=words) as caught:
+        load_told(path)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("missing", ["base.tail.bias", "directions.1.body.0.first.weight", "coefficients.2.weight"])
+def test_told_weights_that_lack_a_tensor_are_refused(missing: str, tmp_path: Path) -> None:
+    path = tmp_path / "w.safetensors"
+    save_network(path, told(), {})
+    tensors, header = read_tensors(path)
+    write_tensors(path, {name: value for name, value in tensors.items() if name != missing}, header)
+    with pytest.raises(ModelError, match=r"w\.safetensors"):
+        load_told(path)

@@ -1,4 +1,5 @@
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -58,6 +59,13 @@ def test_every_target_constant_has_a_source(name: str) -> None:
         ("value = 12,", "value = 0,", ("bits", "1 to 16")),
         ("value = 5,", "value = 2.5,", ("oversampling", "whole numbers")),
         ("[mtf]", "[mtf", ("TOML",)),
+        ("[noise]", "mtf_nyquist_along = 0.7\n[noise]", ("mtf_nyquist_along", "0.6366", "0.7")),
+        ("[noise]", "mtf_nyquist_vertical = 0.05\n[noise]", ("mtf_nyquist_vertical", "mtf_nyquist_along")),
+        (
+            "[noise]",
+            "mtf_nyquist_along = 0.5\n[antialias]\nsigma_px = 0.4\n[noise]",
+            ("mtf_nyquist_along", "at most"),
+        ),
         ('status = "assumed"', 'status = "guessed"', ("guessed", "published, inferred")),
         ('"paper, table 1: L0, in W/m2/sr/um"', '""', ("source",)),
         ("value = 25,", 'value = "bright",', ("finite number",)),
@@ -71,6 +79,17 @@ def test_a_wrong_file_gets_one_sentence(old: str, new: str, words: tuple[str, ..
     assert "\n" not in message
     for word in ("expected", "got", *words):
         assert word in message
+
+
+def test_the_track_may_have_a_contrast_of_its_own(tmp_path: Path) -> None:
+    both = load_sensor(edited(tmp_path, "[noise]", "mtf_nyquist_along = [0.03, 0.05]\n[noise]"))
+    one = load_sensor("pleiades-degraded")
+    assert both.nominal().mtf_axes == pytest.approx((0.07, 0.04))
+    assert one.nominal().mtf_axes == (0.07, 0.07)
+    assert one.nominal() == replace(both.nominal(), mtf_nyquist_along=None)
+    draws = [both.draw(np.random.default_rng(seed)) for seed in range(40)]
+    assert all(0.03 <= sensor.mtf_axes[1] <= 0.05 for sensor in draws)
+    assert len({sensor.mtf_axes[1] for sensor in draws}) == 40
 
 
 def test_missing_profiles_and_files(tmp_path: Path) -> None:

@@ -236,9 +236,14 @@ def test_files_of_other_makers_give_the_same_numbers_in_these_ways(
     form: QuantFormat, per_channel: bool, activations: QuantType, float_onnx: onnx.ModelProto, tmp_path: Path
 ) -> None:
     """Asymmetric activations, float scales; QDQ as the integer operators that the runtime makes of it."""
-    options = {"quant_format": form, "per_channel": per_channel, "activation_type": activations}
+    options = {
+        "quant_format": form,
+        "per_channel": per_channel,
+        "activation_type": activations,
+        "weight_type": QuantType.QInt8,
+    }
     onnx.save_model(float_onnx, tmp_path / "float.onnx")
-    quantize_static(tmp_path / "float.onnx", tmp_path / "theirs.onnx", Calibration(), weight_type=QuantType.QInt8, **options)
+    quantize_static(tmp_path / "float.onnx", tmp_path / "theirs.onnx", Calibration(), **options)
     theirs = load_onnx(tmp_path / "theirs.onnx")
     assert set(made_exact(theirs)[1].values()) & {Way.unsigned, Way.converted}
     image = np.random.default_rng(1).integers(0, 2, (1, 1, 31, 45)).astype(np.float32)

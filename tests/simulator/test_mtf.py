@@ -46,3 +46,42 @@ def test_the_sinc_keeps_its_sign_beyond_the_first_zero() -> None:
 
 def test_the_mean_passes_unchanged() -> None:
     assert float(transfer_function(30, 42, 3, 0.07)[0, 0]) == 1.0
+
+
+def grid(height: int, width: int) -> tuple[torch.Tensor, torch.Tensor]:
+    fy, fx = (torch.fft.fftfreq(side, 1 / 3, dtype=torch.float64) for side in (height, width))
+    return fx[None, :], fy[:, None]
+
+
+@given(st.floats(1e-3, 0.5), st.floats(1e-3, 0.5), st.sampled_from([0.0, 0.2]))
+def test_each_axis_keeps_the_contrast_stated_for_it(across: float, along: float, sigma_px: float) -> None:
+    half, zero = torch.tensor(0.5, dtype=torch.float64), torch.tensor(0.0, dtype=torch.float64)
+    assert float(mtf(half, zero, (across, along), sigma_px)) == pytest.approx(across, rel=1e-9)
+    assert float(mtf(zero, half, (across, along), sigma_px)) == pytest.approx(along, rel=1e-9)
+
+
+@given(st.floats(1e-4, 0.5), st.integers(2, 31), st.integers(2, 31))
+def test_two_equal_axes_are_one_to_the_last_bit(mtf_nyquist: float, height: int, width: int) -> None:
+    fx, fy = grid(height, width)
+    assert torch.equal(mtf(fx, fy, (mtf_nyquist, mtf_nyquist)), mtf(fx, fy, mtf_nyquist))
+
+
+@given(st.floats(0.01, 0.5), st.integers(2, 31), st.integers(2, 31))
+def test_the_formula_of_two_axes_meets_that_of_one(mtf_nyquist: float, height: int, width: int) -> None:
+    """Axes that differ in the last digits take the other branch: no step lies between the two."""
+    fx, fy = grid(height, width)
+    near = mtf(fx, fy, (mtf_nyquist, mtf_nyquist * (1 + 1e-12)))
+    torch.testing.assert_close(near, mtf(fx, fy, mtf_nyquist), rtol=1e-10, atol=1e-14)
+
+
+def test_turning_the_axes_turns_the_response() -> None:
+    fx, fy = grid(13, 21)
+    turned = mtf(fy.T, fx.T, (0.05, 0.12))
+    torch.testing.assert_close(turned.T, mtf(fx, fy, (0.12, 0.05)), rtol=1e-12, atol=0)
+    assert not torch.allclose(mtf(fx, fy, (0.12, 0.05)), mtf(fx, fy, (0.05, 0.12)), rtol=1e-3, atol=1e-3)
+
+
+@pytest.mark.parametrize("axes", [(0.07, 0.0), (0.7, 0.07), (0.07, math.nan)])
+def test_an_impossible_axis_is_refused(axes: tuple[float, float]) -> None:
+    with pytest.raises(OptionError, match=r"0\.6366"):
+        mtf(*grid(5, 7), axes)

@@ -73,11 +73,12 @@ OPTIONAL: dict[str, st.SearchStrategy[Effect]] = {
 }
 effects = st.fixed_dictionaries({}, optional=OPTIONAL)
 sensors = st.builds(
-    lambda m, a, b, e: Sensor(m, a, b, 10.2375, 12, e),
+    lambda m, a, b, e, along: Sensor(m, a, b, 10.2375, 12, e, along),
     st.floats(0.005, 0.3),
     st.sampled_from([0.0, 0.0077]),
     st.sampled_from([0.0, 1e-6, 0.058]),
     effects,
+    st.one_of(st.none(), st.floats(0.005, 0.3)),
 )
 
 

@@ -163,6 +163,30 @@ def test_it_says_what_it_does() -> None:
     assert "0.07 to 0.25" in steps[3]
 
 
+def test_the_chain_undoes_each_axis_by_its_own_blur(camera: Tensor) -> None:
+    sensor = replace(DEGRADED, mtf_nyquist=0.12, mtf_nyquist_along=0.04)
+    turned, one = replace(sensor, mtf_nyquist=0.04, mtf_nyquist_along=0.12), replace(sensor, mtf_nyquist_along=None)
+    seen = simulate_pair(camera[64:267, 128:337] * (200 / 255), sensor, NOISE_FREE, 1, Draw(seed=1))
+    right, *wrong = (
+        psnr_db(restore_traditional(seen.degraded, Chain(told, REFERENCE)), seen.reference)
+        for told in (sensor, turned, one)
+    )
+    assert right > max(wrong) + 1
+
+
+def test_a_turned_sensor_gives_the_turned_filter() -> None:
+    upright, lying = (replace(DEGRADED, mtf_nyquist=a, mtf_nyquist_along=b) for a, b in ((0.1, 0.05), (0.05, 0.1)))
+    kernels = [Chain(sensor, REFERENCE, epsilon=3e-3).kernel() for sensor in (upright, lying)]
+    torch.testing.assert_close(kernels[0].T, kernels[1], rtol=0, atol=1e-12)
+    same = Chain(replace(DEGRADED, mtf_nyquist_along=0.07), REFERENCE, epsilon=3e-3)
+    assert torch.equal(same.kernel(), Chain(DEGRADED, REFERENCE, epsilon=3e-3).kernel())
+
+
+def test_it_names_both_axes() -> None:
+    said = describe(Chain(replace(DEGRADED, mtf_nyquist_along=0.05), REFERENCE))
+    assert any("0.07 across and 0.05 along the track to 0.25" in line for line in said)
+
+
 def test_an_unknown_quality_is_refused() -> None:
     with pytest.raises(OptionError, match="fast, standard, best"):
         restore_traditional(torch.ones(3, 3), Chain(DEGRADED, REFERENCE, "superb"))

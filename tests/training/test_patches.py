@@ -1,5 +1,7 @@
 """Patches made on the fly, and from pairs on disk."""
 
+from dataclasses import replace
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -7,6 +9,7 @@ import pytest
 import torch
 
 from deploy.restore import write_tiff
+from model.conditioning import SensorFamily
 from model.simulator.procedural import procedural_scene
 from model.simulator.scene import Scene
 from model.training.patches import PatchRecipe, PatchSource, cut, turn
@@ -14,6 +17,7 @@ from model.training.stored_pairs import StoredPairs, pair_files
 from model.training.workers import Worker
 from profiles import load_sensor
 from profiles.errors import ImageError
+from profiles.sensor import Sensor
 
 
 def source(
@@ -32,6 +36,55 @@ def test_the_same_seed_gives_the_same_batches_from_anywhere() -> None:
         assert torch.equal(degraded, again[0])
         assert torch.equal(reference, again[1])
     assert not torch.equal(batches[0][0], next(source(seed=1).batches())[0])
+
+
+class OneSensor(SensorFamily):
+    """A family of one, sharp across the track and blurred along it."""
+
+    def draw(self, _generator: np.random.Generator) -> Sensor:
+        return replace(self.like, mtf_nyquist=0.15, mtf_nyquist_along=0.03, alpha=0.0, beta=0.0)
+
+
+def steps(image: torch.Tensor) -> tuple[float, float]:
+    """Mean difference of neighbours, along a row and down a column."""
+    return float(image.diff(dim=-1).abs().mean()), float(image.diff(dim=-2).abs().mean())
+
+
+def test_a_turned_patch_comes_with_the_sensor_as_it_lies() -> None:
+    """Against its reference, a patch has lost more along the axis that its vector calls the more blurred one."""
+    scene = Scene("noise", 100 + 60 * torch.rand(420, 480, generator=torch.Generator().manual_seed(0)))
+    recipe = replace(source().recipe, told=OneSensor(load_sensor("pleiades-degraded").nominal()), oversamplings=(2,))
+    ways = set()
+    for degraded, reference, vectors in islice(PatchSource([scene], recipe, 3, 0).batches(), 30):
+        for one, other, vector in zip(degraded, reference, vectors, strict=True):
+            across, along = (a / b for a, b in zip(steps(one), steps(other), strict=True))
+            assert (across > along) == bool(vector[0] > vector[1])
+            ways.add(across > along)
+    assert ways == {True, False}
+
+
+def test_told_patches_come_with_vectors_of_many_sensors_and_the_same_again() -> None:
+    recipe = replace(source().recipe, told=SensorFamily(load_sensor("pleiades-degraded").nominal()))
+    scene = procedural_scene(420, 480, np.random.default_rng(2))
+    first, again = ([*islice(PatchSource([scene], recipe, 3, 0).batches(k), 20 - k)] for k in (0, 17))
+    vectors = torch.cat([batch[2] for batch in first])
+    assert vectors.shape == (60, 4)
+    assert float(vectors.std(0).min()) > 0.3
+    assert all(
+        torch.equal(a, b) for one, two in zip(first[17:], again, strict=True) for a, b in zip(one, two, strict=True)
+    )
+
+
+def test_a_blind_network_sees_the_axes_of_one_sensor_as_they_are() -> None:
+    """Half turns and mirrors only: what is sharper across the track stays so."""
+    scene = Scene("noise", 100 + 60 * torch.rand(420, 480, generator=torch.Generator().manual_seed(0)))
+    profile = load_sensor("pleiades-degraded")
+    across, along = (replace(profile.mtf_nyquist, value=value) for value in (0.3, 0.03))
+    anisotropic = replace(profile, mtf_nyquist=across, mtf_nyquist_along=along)
+    recipe = replace(source().recipe, degraded=anisotropic, oversamplings=(2,))
+    for degraded, reference in islice(PatchSource([scene], recipe, 3, 0).batches(), 30):
+        kept = [a / b for a, b in zip(steps(degraded), steps(reference), strict=True)]
+        assert kept[0] > kept[1]
 
 
 def test_patches_lie_within_full_scale() -> None:

@@ -3,6 +3,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Iterator
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from typing import get_args
@@ -12,7 +13,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from model.convbeers import Variant
+from model.conditioning import SensorFamily
+from model.convbeers import ConvBEERS, Variant
 from model.simulator.procedural import procedural_scene
 from model.simulator.scene import Scene
 from model.training.checkpoint import finish
@@ -23,7 +25,7 @@ from model.training.patches import PatchRecipe, PatchSource
 from model.training.recipe import Optimiser, TrainingRecipe
 from model.training.trainer import Progress, Schedule, Trainer
 from model.training.workers import Worker
-from model.weights_file import load_network
+from model.weights_file import load_network, read_tensors
 from profiles import load_sensor
 from profiles.errors import ModelError
 
@@ -49,6 +51,56 @@ def train(folder: Path, steps: int, *, resume: bool = False, kill_at: int | None
         trainer.resume(checkpoint)
     trainer.run(source(), checkpoint, Schedule(1, 0.0, report=report))
     return trainer
+
+
+def train_told(folder: Path, *, resume: bool = False, kill_at: int | None = None) -> Trainer:
+    def report(progress: Progress) -> None:
+        if progress.step == kill_at:
+            raise KeyboardInterrupt
+
+    trainer = Trainer(VARIANT, TrainingRecipe(steps=8, batch=3, warm_up_steps=2), told=True)
+    checkpoint = folder / "checkpoint.safetensors"
+    if resume:
+        trainer.resume(checkpoint)
+    trainer.run(told_source(), checkpoint, Schedule(1, 0.0, report=report))
+    return trainer
+
+
+def told_source() -> PatchSource:
+    recipe = replace(source().recipe, told=SensorFamily(load_sensor("pleiades-degraded").nominal()))
+    return PatchSource([procedural_scene(420, 480, np.random.default_rng(2))], recipe, batch=3, seed=0)
+
+
+def test_a_told_network_killed_and_resumed_equals_the_unbroken_one_in_every_bit(tmp_path: Path) -> None:
+    unbroken = train_told(tmp_path / "a")
+    with pytest.raises(KeyboardInterrupt):
+        train_told(tmp_path / "b", kill_at=5)
+    resumed = train_told(tmp_path / "b", resume=True)
+    for trainer, folder in ((unbroken, "a"), (resumed, "b")):
+        finish(trainer.averaged(), tmp_path / folder / "weights.safetensors", {"steps": 8})
+    for name in ("weights.safetensors", "checkpoint.safetensors"):
+        (tensors, header), (others, other_header) = (read_tensors(tmp_path / folder / name) for folder in "ab")
+        assert header == other_header
+        assert tensors.keys() == others.keys()
+        assert all(torch.equal(tensor, others[name]) for name, tensor in tensors.items())
+
+
+def test_a_told_run_moves_base_directions_and_coefficients(tmp_path: Path) -> None:
+    before, after = Trainer(VARIANT, TrainingRecipe(steps=8), told=True), train_told(tmp_path)
+    moved = {
+        name.split(".")[0]: not torch.equal(value, after.network.state_dict()[name])
+        for name, value in before.network.state_dict().items()
+    }
+    assert moved == {"base": True, "directions": True, "coefficients": True}
+
+
+def test_plain_and_told_checkpoints_are_not_taken_for_one_another(tmp_path: Path) -> None:
+    recipe = TrainingRecipe(steps=8, batch=3, warm_up_steps=2)
+    train(tmp_path / "plain", 8)
+    train_told(tmp_path / "told")
+    for written, told in (("plain", True), ("told", False)):
+        with pytest.raises(ModelError, match="checkpoint of this network"):
+            Trainer(VARIANT, recipe, told=told).resume(tmp_path / written / "checkpoint.safetensors")
 
 
 @pytest.mark.parametrize("kill_at", [2, 5, 8])
@@ -192,6 +244,7 @@ def test_guards_survive_a_resume() -> None:
 
 def test_a_student_is_pulled_towards_its_teacher(tmp_path: Path) -> None:
     teacher = train(tmp_path, 4).averaged()
+    assert isinstance(teacher, ConvBEERS)
     for parameter in teacher.parameters():
         parameter.data.mul_(1.5)
 
@@ -220,6 +273,7 @@ def test_adamw_pulls_weights_towards_zero(tmp_path: Path) -> None:
         recipe = TrainingRecipe(steps=12, batch=3, optimiser=name, weight_decay=20.0, warm_up_steps=1)
         trainer = Trainer(VARIANT, recipe)
         trainer.run(source(), tmp_path / name, Schedule())
+        assert isinstance(trainer.network, ConvBEERS)
         norms[name] = float(trainer.network.head.weight.detach().norm())
     assert norms["adamw"] < 0.95 * norms["adam"]
 

@@ -1,0 +1,200 @@
+"""What a network is told, and that folding changes nothing."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from model.conditioning import (
+    DIRECTIONS,
+    RANGES,
+    SensorFamily,
+    ToldConvBEERS,
+    fold,
+    initialise_coefficients,
+    sensor_values,
+    tell,
+    transposed,
+)
+from model.convbeers import Variant, initialise
+from profiles import load_sensor
+from profiles.effects import Smear
+from profiles.sensor import Sensor, noise_from_snr
+
+NOMINAL = load_sensor("pleiades-degraded").nominal()
+FAMILY = SensorFamily(NOMINAL)
+
+
+def trained(seed: int = 0) -> ToldConvBEERS:
+    """A network whose directions do something, as training leaves it."""
+    generator = torch.Generator().manual_seed(seed)
+    network = ToldConvBEERS(Variant(blocks=2, features=5))
+    initialise(network.base, generator)
+    initialise_coefficients(network, generator)
+    with torch.no_grad():
+        for parameter in network.directions.parameters():
+            parameter.normal_(0.0, 0.05, generator=generator)
+    return network.eval()
+
+
+def drawn(seed: int) -> Sensor:
+    return FAMILY.draw(np.random.default_rng(seed))
+
+
+@settings(max_examples=60)
+@given(st.integers(0, 2**20), st.integers(1, 41), st.integers(1, 37))
+def test_the_folded_network_computes_what_the_unfolded_one_does(seed: int, height: int, width: int) -> None:
+    network, vector = trained(seed % 3), tell(drawn(seed)).vector
+    image = torch.rand(1, 1, height, width, generator=torch.Generator().manual_seed(seed))
+    with torch.inference_mode():
+        unfolded, folded = network(image, vector[None]), fold(network, vector)(image)
+    assert float((unfolded - folded).abs().max()) <= 1e-6
+
+
+def test_each_image_of_a_batch_meets_its_own_sensor() -> None:
+    network, vectors = trained(), torch.stack([tell(drawn(seed)).vector for seed in range(3)])
+    images = torch.rand(3, 1, 13, 17, generator=torch.Generator().manual_seed(0))
+    with torch.inference_mode():
+        together = network(images, vectors)
+        for number in range(3):
+            alone = fold(network, vectors[number])(images[number : number + 1])
+            assert float((together[number] - alone).abs().max()) <= 1e-6
+            other = fold(network, vectors[number - 1])(images[number : number + 1])
+            assert float((together[number] - other).abs().max()) > 1e-4
+
+
+def test_folding_takes_no_part_of_the_network_along() -> None:
+    network, vector = trained(), tell(NOMINAL).vector
+    image, folded = torch.rand(1, 1, 9, 14), fold(network, vector)
+    with torch.no_grad():
+        before = folded(image)
+        for parameter in network.parameters():
+            parameter.zero_()
+        assert torch.equal(folded(image), before)
+
+
+def test_before_training_the_network_is_its_base_whatever_it_is_told() -> None:
+    network = trained()
+    for parameter in network.directions.parameters():
+        torch.nn.init.zeros_(parameter)
+    image = torch.rand(2, 1, 11, 15)
+    vectors = torch.stack([tell(drawn(seed)).vector for seed in (1, 2)])
+    with torch.inference_mode():
+        torch.testing.assert_close(network(image, vectors), network.base(image), rtol=0, atol=1e-6)
+
+
+def test_training_can_leave_the_base_at_once() -> None:
+    """The coefficients differ from sensor to sensor before the first step: a direction has a gradient to follow."""
+    network = ToldConvBEERS(Variant(1, 4))
+    initialise(network.base, torch.Generator().manual_seed(0))
+    initialise_coefficients(network, torch.Generator().manual_seed(1))
+    vectors = torch.stack([tell(drawn(seed)).vector for seed in range(6)])
+    assert float(network.coefficients(vectors).detach().std(0).mean()) > 0.1
+    network(torch.rand(6, 1, 9, 9), vectors).abs().sum().backward()
+    gradients = [p.grad for direction in network.directions for p in direction.parameters()]
+    assert len(gradients) == DIRECTIONS * 2 * network.layers
+    assert all(gradient is not None and float(gradient.abs().max()) > 0 for gradient in gradients)
+
+
+def test_what_is_told_of_a_sensor_known_by_hand() -> None:
+    values = sensor_values(NOMINAL)  # SNR 50 at 25 and 110 at 100 W/m2/sr/um, 400 of them full scale
+    assert values["mtf_across"] == values["mtf_along"] == 0.07
+    assert values["sigma_dark"] == pytest.approx(25 / 50 / 400, rel=2e-3)
+    assert values["sigma_bright"] == pytest.approx(100 / 110 / 400, rel=1e-3)
+    alpha, beta = noise_from_snr(25, 50, 100, 110)
+    assert values == sensor_values(Sensor(0.07, alpha, beta, NOMINAL.gain_dn_per_radiance, 12, {}, 0.07))
+
+
+def test_the_ends_of_the_ranges_are_minus_one_and_one() -> None:
+    ends = [tell(replace(NOMINAL, mtf_nyquist=mtf)).vector for mtf in RANGES["mtf_across"]]
+    assert [vector[:2].tolist() for vector in ends] == [[-1.0, -1.0], [1.0, 1.0]]
+    middle = (RANGES["mtf_across"][0] * RANGES["mtf_across"][1]) ** 0.5
+    assert float(tell(replace(NOMINAL, mtf_nyquist=middle)).vector[0]) == pytest.approx(0, abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("sensor", "name"),
+    [
+        (replace(NOMINAL, mtf_nyquist=0.25), "mtf_across"),
+        (replace(NOMINAL, mtf_nyquist_along=0.005), "mtf_along"),
+        (replace(NOMINAL, alpha=0.0, beta=0.0), "sigma_dark"),
+        (replace(NOMINAL, alpha=1.0), "sigma_bright"),
+    ],
+)
+def test_what_lies_outside_is_moved_to_the_end_and_said(sensor: Sensor, name: str) -> None:
+    told = tell(sensor)
+    assert float(told.vector.abs().max()) == 1
+    said = [sentence for sentence in told.outside if sentence.startswith(name)]
+    assert len(said) == 1
+    assert "outside" in said[0]
+
+
+@pytest.mark.parametrize(("along", "said"), [(0.027, True), (0.029, False), (0.15, False), (0.07, False)])
+def test_axes_further_apart_than_any_in_training_are_said(along: float, said: bool) -> None:
+    for sensor in (
+        replace(NOMINAL, mtf_nyquist_along=along),
+        replace(NOMINAL, mtf_nyquist=along, mtf_nyquist_along=0.07),
+    ):
+        told = tell(sensor)
+        assert [sentence.startswith("the lower MTF") for sentence in told.outside] == [True] * said
+
+
+@given(st.integers(0, 2**20))
+def test_no_sensor_that_is_trained_on_is_clamped_or_impossible(seed: int) -> None:
+    sensor = drawn(seed)
+    assert tell(sensor).outside == ()
+    assert sensor.alpha >= 0
+    assert sensor.beta >= 0
+    across, along = sensor.mtf_axes
+    assert along <= across
+    assert along >= 0.399 * across
+
+
+def test_no_corner_of_the_ranges_is_starved() -> None:
+    """Blurred and noisy together, and each mixture: more than one sensor in a hundred for each of eight corners."""
+    generator = np.random.default_rng(0)
+    vectors = torch.stack([tell(FAMILY.draw(generator)).vector for _ in range(3000)])
+    low, high = vectors[:, [0, 1, 3]] < -1 / 3, vectors[:, [0, 1, 3]] > 1 / 3
+    for sharp in (False, True):
+        for noisy in (False, True):
+            blur = (high if sharp else low)[:, :2].all(1)
+            noise = high[:, 2] if noisy else low[:, 2]
+            assert float((blur & noise).float().mean()) > 0.04
+    shares = [sensor_values(FAMILY.draw(generator)) for _ in range(500)]
+    ratios = np.array([share["mtf_along"] / share["mtf_across"] for share in shares])
+    assert np.median(ratios) > 0.75
+    assert (ratios < 0.5).mean() > 0.05
+
+
+@pytest.mark.parametrize("gain", [0.4, 0.7, 2.0])
+def test_the_vector_speaks_of_full_scale_whatever_the_gain(gain: float) -> None:
+    """The same digital numbers, though each stands for another radiance."""
+    other = replace(
+        NOMINAL,
+        gain_dn_per_radiance=gain * NOMINAL.gain_dn_per_radiance,
+        alpha=NOMINAL.alpha / gain,
+        beta=NOMINAL.beta / gain**2,
+    )
+    torch.testing.assert_close(tell(other).vector, tell(NOMINAL).vector)
+
+
+def test_few_bits_are_noise() -> None:
+    coarse = replace(NOMINAL, bits=7, gain_dn_per_radiance=NOMINAL.gain_dn_per_radiance * 127 / 4095)
+    assert sensor_values(coarse)["sigma_dark"] > 1.5 * sensor_values(NOMINAL)["sigma_dark"]
+
+
+def test_smear_is_told_as_contrast_lost_along_the_track() -> None:
+    smeared = replace(NOMINAL, effects={"smear": Smear(1.0)})
+    across, along = (sensor_values(smeared)[name] for name in ("mtf_across", "mtf_along"))
+    assert across == 0.07
+    assert along == pytest.approx(0.07 * 2 / np.pi)
+
+
+def test_a_turned_image_has_the_turned_vector() -> None:
+    sensor = replace(NOMINAL, mtf_nyquist=0.12, mtf_nyquist_along=0.05)
+    turned = replace(NOMINAL, mtf_nyquist=0.05, mtf_nyquist_along=0.12)
+    assert torch.equal(transposed(tell(sensor).vector), tell(turned).vector)
+    assert not torch.equal(tell(sensor).vector, tell(turned).vector)
