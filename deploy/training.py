@@ -110,8 +110,8 @@ def train(run: Run, resume: bool, worker: Worker, say: Callable[[str], None]) ->
     source, validation, names = data(run, trainer)
     _train(run, trainer, source, validation)
     if worker.first:
-        told = about(run, names, validation.names, loss) | {"precision": trainer.precision}
-        finish(trainer.averaged(), run.weights, told)
+        recipe = about(run, names, validation.names, loss) | {"precision": trainer.precision}
+        finish(trainer.averaged(), run.weights, recipe)
 
 
 def start_weights(run: Run) -> Mapping[str, Tensor] | None:
