@@ -8,6 +8,7 @@ from typer.testing import CliRunner
 from deploy.cli import app
 from deploy.compare import compare, parse_limit, read_document
 from deploy.results import Document, Figure, Row, measured, predicted, unavailable
+from quant.checks import Check
 
 
 def document(path: Path, psnr: float = 46.5, mae: float = 0.0006, more: tuple[Row, ...] = ()) -> Path:
@@ -16,7 +17,8 @@ def document(path: Path, psnr: float = 46.5, mae: float = 0.0006, more: tuple[Ro
         Row("gate", "network", figures),
         Row("bench", "network", {"latency": predicted(42, "s", (30, 60), "model")}),
     )
-    Document("gate", {"model": "a.onnx"}, (), (*rows, *more)).write(path)
+    checks = (Check("MAE", mae, 0.0007, "of full scale"),)
+    Document("gate", {"model": "a.onnx"}, (), (*rows, *more), checks).write(path)
     return path
 
 
@@ -98,7 +100,9 @@ def test_a_watched_figure_that_can_no_longer_be_had_fails(tmp_path: Path) -> Non
     ]
     names = ("a.json", "b.json")
     for name, figures in zip(names, rows, strict=True):
-        Document("gate", {}, (), (Row("gate", "network", figures),)).write(tmp_path / name)
+        Document(
+            "gate", {}, (), (Row("gate", "network", figures),), (Check("MAE", 0.0006, 0.0007, "of full scale"),)
+        ).write(tmp_path / name)
     paths = [tmp_path / name for name in names]
     assert run(*paths, "--fail-on", "LPIPS>1")[0] == 1
     assert run(*reversed(paths), "--fail-on", "LPIPS>1")[0] == 0
