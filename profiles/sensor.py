@@ -218,6 +218,11 @@ def _check_single(label: str, profile: SensorProfile) -> None:
 def _check_physics(label: str, profile: SensorProfile) -> None:
     _check_single(label, profile)
     mtf_max = MTF_NYQUIST_MAX
+    contrast: tuple[Callable[[float], bool], str, str] = (
+        lambda v: 0 < v <= mtf_max,
+        f"a contrast above 0 and up to {mtf_max:.4f} (2/pi, the square detector alone)",
+        "give a ratio, 0.07 for 7 %",
+    )
     checks: list[tuple[str, Constant, Callable[[float], bool], str, str]] = [
         (
             "[grid] gsd_m",
@@ -233,13 +238,7 @@ def _check_physics(label: str, profile: SensorProfile) -> None:
             "whole numbers from 1 on",
             "give the number of scene pixels per sensor pixel",
         ),
-        (
-            "[mtf] mtf_nyquist",
-            profile.mtf_nyquist,
-            lambda v: 0 < v <= mtf_max,
-            f"a contrast above 0 and up to {mtf_max:.4f} (2/pi, the square detector alone)",
-            "give a ratio, 0.07 for 7 %",
-        ),
+        ("[mtf] mtf_nyquist", profile.mtf_nyquist, *contrast),
         ("[noise] snr_0", profile.snr_0, lambda v: v > 0, "linear ratios above 0", "convert dB first"),
         ("[noise] snr_1", profile.snr_1, lambda v: v > 0, "linear ratios above 0", "convert dB first"),
         (
@@ -265,8 +264,7 @@ def _check_physics(label: str, profile: SensorProfile) -> None:
         ),
     ]
     if profile.mtf_nyquist_along is not None:
-        _, _, valid, expected, remedy = checks[2]
-        checks.append(("[mtf] mtf_nyquist_along", profile.mtf_nyquist_along, valid, expected, remedy))
+        checks.append(("[mtf] mtf_nyquist_along", profile.mtf_nyquist_along, *contrast))
     for key, constant, valid, expected, remedy in checks:
         if not (valid(constant.low) and valid(constant.high)):
             raise ProfileError(f"{label} {key}", expected=expected, got=str(constant), remedy=remedy)
