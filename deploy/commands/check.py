@@ -41,7 +41,7 @@ def check(
     from model.files import require_writable
 
     require_picture(picture)
-    require_writable(picture, json)
+    require_writable(picture, json, inputs=(model or default_int8(), Path(target)))
     dpu = load_dpu(target, config)
     if model == TRADITIONAL:
         legal = _traditional(dpu, picture, json)

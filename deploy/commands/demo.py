@@ -15,13 +15,13 @@ def demo(
     json: Annotated[Path | None, typer.Option(help="Write the figures here.")] = None,
 ) -> None:
     """Simulate, quantise, gate, check, restore and predict, on a drawn scene or your image; ends with report.html."""
-    from deploy.demo import run_demo
+    from deploy.demo import FILES, run_demo
     from deploy.report.page import write_report
     from deploy.results import Document
     from deploy.tables import print_rows
     from model.files import require_writable
 
-    require_writable(out / "report.html", json)
+    require_writable(*(out / name for name in FILES), json, inputs=(image,))
     result = run_demo(image, out, seed, lambda step: typer.echo(step, err=True))
     write_report(result.report, out / "report.html")
     for table in result.report.tables:

@@ -31,11 +31,13 @@ def export(
     """
     from deploy.defaults import about
     from deploy.export import network_for, parity, to_onnx
+    from model.files import require_writable
     from model.shipped import shipped_weights
     from profiles.errors import ModelError
     from quant.onnx_file import save_onnx
 
     path = checkpoint or shipped_weights(variant)
+    require_writable(out, inputs=(path, Path(sensor) if sensor else None))
     network, recipe, warnings = network_for(path, sensor)
     for warning in warnings:
         typer.echo(f"warning: {warning}", err=True)

@@ -43,9 +43,11 @@ def gate(
     from deploy.gate import Request, files_or_shipped, run_gate
     from deploy.tables import print_rows
     from deploy.verdict import Reports, sentence
-    from model.files import require_writable
+    from model.files import claim_outputs, require_writable
     from quant.limits import read_limits
 
+    read = (float_model, int8_model, config, baseline, images, *map(Path, (target, sensor)))
+    claim_outputs(json, junit, summary, outputs, inputs=read)  # before bad input is told there
     reports = Reports(summary, junit, outputs)
     with reports.of_bad_input("INT8 gate"):
         require_writable(json)

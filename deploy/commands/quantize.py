@@ -64,7 +64,8 @@ def quantize(
         raise OptionError("--regime free", expected=expected, got="one", remedy=remedy)
     passes = passes_without(without or [])
     page, figures = (report / "report.html", report / "report.json") if report else (None, None)
-    require_writable(out, board, json, page, figures)
+    read = (model, images, *map(Path, (target, sensor)))
+    require_writable(out, board, json, page, figures, inputs=read)
     network, board_target = float_model(model), load_target(target)
     calibration = Calibration(sensor, images, patches, patch, seed)
     if regime is Regime.free:

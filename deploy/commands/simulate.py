@@ -79,6 +79,10 @@ def simulate(
     from profiles.scene_call import calling_for, load_scene_call
 
     check_choice(workers, scheduler)
+    if out is not None:
+        read = (*(scenes or ()), *(Path(name) for name in (sensor, reference, scene) if name))
+        folders = [out / name for name in ("degraded", "reference", "parts")]
+        require_writable(out / "manifest.jsonl", out / "recipe.json", inputs=read, folders=folders)
     chosen = _preset(preset)
     call = load_scene_call(scene) if scene else None
     degraded = calling_for(load_sensor(sensor or chosen.sensor), call, add or (), forbid or ())
@@ -103,7 +107,6 @@ def simulate(
         _explain(recipe)
     if out is None:
         return
-    require_writable(out / "manifest.jsonl")
     with steps("simulating", len(plan_windows(recipe))) as bar:
         summary = write_dataset(recipe, out, workers or os.cpu_count() or 1, resume, bar.advance, scheduler)
     rejected = f"; {summary['rejected_share']:.1%} of the drawn SNR pairs were impossible and drawn again"

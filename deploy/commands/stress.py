@@ -65,10 +65,12 @@ def stress(
     from model.files import require_writable, write_text
 
     _refuse(context, HARD_CASES_ONLY if bit_flips else BIT_FLIPS_ONLY, bit_flips)
-    require_writable(out, json)
+    picture = _picture_beside(out, json) if bit_flips else None
+    read = (float_model, int8_model, images, *map(Path, (sensor, target)))
+    require_writable(out, json, picture, inputs=read)
     if bit_flips:
         request = FlipRequest(sensor, images, target, draws, size, seed)
-        _flip_bits(open_subject(float_model, int8_model, variant), request, out, json)
+        _flip_bits(open_subject(float_model, int8_model, variant), request, (out, picture, json))
         return
     names = chosen(cases, [case.name for case in CASES], "--cases")
     wanted = chosen(stages, STAGES, "--stages")
@@ -111,8 +113,10 @@ def _refuse(context: typer.Context, names: tuple[str, ...], bit_flips: bool) -> 
             raise OptionError(f"--{name}", expected=expected, got=got, remedy=remedy)
 
 
-def _flip_bits(subject: "Subject", request: "FlipRequest", out: Path | None, json: Path | None) -> None:
-    """Strike, print, and write what was asked for."""
+def _flip_bits(
+    subject: "Subject", request: "FlipRequest", wanted: tuple[Path | None, Path | None, Path | None]
+) -> None:
+    """Strike, print, and write what was asked for: tables, curves, figures."""
     from dataclasses import asdict
 
     from deploy.progress import steps
@@ -123,7 +127,7 @@ def _flip_bits(subject: "Subject", request: "FlipRequest", out: Path | None, jso
     from deploy.tables import print_rows
     from model.files import write_text
 
-    picture = _picture_beside(out, json)
+    out, picture, json = wanted
     with steps("turning bits over", ticks(subject, request)) as bar:
         rows = flip_rows(subject, request, bar.advance)
     for table, found in by_table(rows).items():
@@ -136,7 +140,6 @@ def _flip_bits(subject: "Subject", request: "FlipRequest", out: Path | None, jso
 
 def _picture_beside(out: Path | None, json: Path | None) -> Path | None:
     """Where the curves go: beside the tables, over nothing else that is written."""
-    from model.files import require_writable
     from profiles.errors import OptionError
 
     if out is None:
@@ -145,5 +148,4 @@ def _picture_beside(out: Path | None, json: Path | None) -> Path | None:
     if picture in (out, json):
         expected, remedy = f"a name other than that of the curves, {picture.name}", "give it the suffix .md"
         raise OptionError("--out", expected=expected, got=out.name, remedy=remedy)
-    require_writable(picture)
     return picture

@@ -48,7 +48,7 @@ def tradeoff(
     point keeps --budget and --need; the report is written all the same.
     """
     from deploy.commands.bench import parse_size
-    from deploy.report.tradeoff_page import write_study
+    from deploy.report.tradeoff_page import FILES, write_study
     from deploy.results import Document
     from deploy.tradeoff.cache import Cache
     from deploy.tradeoff.demands import parse_demands
@@ -57,14 +57,15 @@ def tradeoff(
     from model.files import require_writable
     from model.shipped import shipped_names
 
-    figures = out / "tradeoff.json"
-    require_writable(figures, json)
+    figures, kept = out / "tradeoff.json", cache or out / "cache"
     demands = [tuple(parse_demands(name, text)) for name, text in (("--budget", budget), ("--need", need))]
     names = tuple(networks.split(",")) if networks is not None else tuple(shipped_names())
+    read = (images, calibration, lpips, *map(Path, (sensor, reference, *names)))
+    require_writable(figures, *(out / name for name in FILES), json, inputs=read, folders=(kept,))
     request = Request(
         names, images, calibration, sensor, reference, lpips, parse_size(size), demands[0], demands[1], seed
     )
-    result = run_study(request, Cache(cache or out / "cache"))
+    result = run_study(request, Cache(kept))
     write_study(result.study, out)
     say(result.study)
     arguments: dict[str, object] = {"images": images, "sensor": sensor, "reference": reference, "size": size}

@@ -58,7 +58,7 @@ def train(
     """
     from typing import get_args
 
-    from deploy.training import Run
+    from deploy.training import FILES, Run, weights_name
     from deploy.training import train as run_training
     from model.conditioning import SensorFamily
     from model.files import require_writable
@@ -80,6 +80,9 @@ def train(
     if told and (pairs is not None or teacher is not None):
         remedy = "leave one out: stored pairs do not say what sensor each had, and a teacher is not told"
         raise OptionError("--told", expected="no --pairs or --teacher beside it", got="both", remedy=remedy)
+    stored = [pairs, *(pairs / role for role in ("degraded", "reference"))] if pairs else [images]
+    read = (*stored, lpips, start, teacher, *map(Path, (sensor, reference)))
+    require_writable(*(out / name for name in (*FILES, weights_name(variant, told))), inputs=read)
     recipe = TrainingRecipe(
         steps=steps,
         batch=batch,
@@ -108,7 +111,6 @@ def train(
         device,
         precision,  # type: ignore[arg-type]
     )
-    require_writable(run.weights)
     with joined(device) as worker:
         run_training(run, resume, worker, typer.echo)
         if worker.first:

@@ -39,7 +39,7 @@ def restore_file(image: Path, out: Path, options: Options, say: Say) -> Row:
         KeyboardInterrupt: stopped; rows already finished stay for `resume`.
     """
     check_choice(options.workers, options.scheduler)
-    require_writable(out)
+    require_writable(out, inputs=(image, options.model))
     require_codec(options.compression)
     with only_run(out, part_folder(out)):
         return _restore(image, out, options, say)
