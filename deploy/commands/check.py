@@ -27,7 +27,8 @@ def check(
         str | None, typer.Option(help="DPU configuration, C32B1 to C64B5; the target's own if none.")
     ] = None,
     tile: Annotated[
-        int | None, typer.Option(min=1, help="Tile side in pixels; the network's own if it has one, else 640.")
+        int | None,
+        typer.Option(min=1, max=8192, help="Tile side in pixels; the network's own if it has one, else 640."),
     ] = None,
     picture: Annotated[
         Path | None, typer.Option(help="Draw the graph here, coloured by device: a .svg or .html file.")

@@ -5,13 +5,15 @@ from typing import Annotated
 
 import typer
 
+from deploy.cores import SEEDS
+
 EXAMPLE = "demo --out demo"
 
 
 def demo(
     image: Annotated[Path | None, typer.Option(help="Raw 12-bit image, or an 8-bit photograph as scene.")] = None,
     out: Annotated[Path, typer.Option(help="Folder for the report and the files made.")] = Path("demo"),
-    seed: Annotated[int, typer.Option(min=0, help="Seed of every random draw.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, max=SEEDS, help="Seed of every random draw.")] = 0,
     json: Annotated[Path | None, typer.Option(help="Write the figures here.")] = None,
 ) -> None:
     """Simulate, quantise, gate, check, restore and predict, on a drawn scene or your image; ends with report.html."""

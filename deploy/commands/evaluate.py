@@ -5,6 +5,8 @@ from typing import Annotated
 
 import typer
 
+from deploy.cores import SEEDS
+
 EXAMPLE = "evaluate --images aerial/ --methods degraded,traditional,convbeers-s,convbeers-s-int8 --out report/"
 
 
@@ -27,7 +29,7 @@ def evaluate(
     sweep: Annotated[
         bool, typer.Option("--sweep", help="Also PSNR and MTF under other blurs, noises and gains.")
     ] = False,
-    seed: Annotated[int, typer.Option(min=0, help="Seed of every random draw.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, max=SEEDS, help="Seed of every random draw.")] = 0,
     json: Annotated[Path | None, typer.Option(help="Write the figures here.")] = None,
 ) -> None:
     """Compare restorations with the reference, on average and by site; the degraded input is always a row.

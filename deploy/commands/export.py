@@ -20,7 +20,7 @@ def export(
         typer.Option(help="Specialise weights that can be told their sensor: a profile's name, or your .toml file."),
     ] = None,
     tile: Annotated[
-        int | None, typer.Option(min=16, help="Fix the input to one tile of this side, 640 for a board.")
+        int | None, typer.Option(min=16, max=8192, help="Fix the input to one tile of this side, 640 for a board.")
     ] = None,
 ) -> None:
     """Write the network as ONNX, any height and width unless --tile fixes them, and check it against torch.

@@ -5,6 +5,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from deploy.cores import SEEDS
+
 if TYPE_CHECKING:
     from deploy.stress.flip_study import FlipRequest
     from deploy.stress.subject import Subject
@@ -27,12 +29,16 @@ def stress(
     variant: Annotated[str, typer.Option(help="Shipped pair of this name, where no file is given.")] = "convbeers-s",
     cases: Annotated[str | None, typer.Option(help="Only these cases, with commas: 'night,snow'.")] = None,
     stages: Annotated[str | None, typer.Option(help="Only these stages, with commas: 'float32,INT8'.")] = None,
-    size: Annotated[int, typer.Option(min=16, help="Side in pixels, where a case has none of its own.")] = 96,
-    seed: Annotated[int, typer.Option(min=0, help="Seed of every random draw.")] = 0,
+    size: Annotated[
+        int, typer.Option(min=16, max=4096, help="Side in pixels, where a case has none of its own.")
+    ] = 96,
+    seed: Annotated[int, typer.Option(min=0, max=SEEDS, help="Seed of every random draw.")] = 0,
     bit_flips: Annotated[
         bool, typer.Option("--bit-flips", help="Turn bits over in the INT8 network instead of running hard cases.")
     ] = False,
-    draws: Annotated[int, typer.Option(min=1, help="Strikes of each memory and rate, with --bit-flips.")] = 6,
+    draws: Annotated[
+        int, typer.Option(min=1, max=10_000, help="Strikes of each memory and rate, with --bit-flips.")
+    ] = 6,
     sensor: Annotated[
         str, typer.Option(help="Sensor profile of the patches, with --bit-flips.")
     ] = "pleiades-degraded",

@@ -5,6 +5,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from deploy.cores import SEEDS
+
 if TYPE_CHECKING:
     from deploy.tradeoff.study import Study
 
@@ -39,7 +41,7 @@ def tradeoff(
     ] = None,
     size: Annotated[str, typer.Option(help="Size of the swath in pixels.")] = PAPER_SIZE,
     cache: Annotated[Path | None, typer.Option(help="Folder of kept measurements; OUT/cache if none.")] = None,
-    seed: Annotated[int, typer.Option(min=0, help="Seed of every random draw.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, max=SEEDS, help="Seed of every random draw.")] = 0,
     json: Annotated[Path | None, typer.Option(help="Write the figures here too.")] = None,
 ) -> None:
     """Measure networks, chains and peers on the same pairs, predict their runs on the board, and weigh them.

@@ -5,6 +5,8 @@ from typing import Annotated
 
 import typer
 
+from deploy.cores import SEEDS
+
 EXAMPLE = "train --variant convbeers-s --images aerial/ --out runs/s --steps 20000"
 
 
@@ -20,10 +22,10 @@ def train(
         bool, typer.Option("--told", help="Draw sensors of a wide range with that gain, and tell the network each.")
     ] = False,
     reference: Annotated[str, typer.Option(help="Profile of the wanted output.")] = "pleiades-reference",
-    drawn: Annotated[int, typer.Option(min=0, help="Drawn scenes to add to the images.")] = 0,
+    drawn: Annotated[int, typer.Option(min=0, max=1000, help="Drawn scenes to add to the images.")] = 0,
     steps: Annotated[int, typer.Option(min=1, help="Gradient steps.")] = 20_000,
-    batch: Annotated[int, typer.Option(min=1, help="Patches a step and worker.")] = 8,
-    patch: Annotated[int, typer.Option(min=17, help="Patch side in pixels.")] = 96,
+    batch: Annotated[int, typer.Option(min=1, max=4096, help="Patches a step and worker.")] = 8,
+    patch: Annotated[int, typer.Option(min=17, max=2048, help="Patch side in pixels.")] = 96,
     learning_rate: Annotated[float, typer.Option(min=0, help="Highest learning rate.")] = 1e-3,
     optimiser: Annotated[str, typer.Option(help="adam or adamw.")] = "adam",
     l1_weight: Annotated[float, typer.Option(min=0, help="Weight of L1 in the loss.")] = 1.0,
@@ -43,7 +45,7 @@ def train(
     distil: Annotated[float, typer.Option(min=0, help="Weight of the distance to the teacher.")] = 1.0,
     validate_every: Annotated[int, typer.Option(min=0, help="Steps between validations; 0 for none.")] = 1000,
     tensorboard: Annotated[bool, typer.Option("--tensorboard", help="Write TensorBoard scalars too.")] = False,
-    seed: Annotated[int, typer.Option(min=0, help="Seed of weights and patches.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, max=SEEDS, help="Seed of weights and patches.")] = 0,
     device: Annotated[str, typer.Option(help="cpu, or cuda.")] = "cpu",
     precision: Annotated[
         str | None, typer.Option(help="float32 or bfloat16; by default what is faster on this processor.")
