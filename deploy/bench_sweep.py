@@ -12,6 +12,9 @@ from deploy.dpu.cost import Prediction
 from deploy.results import Row, predicted
 from profiles.errors import OptionError
 
+MOST_TILE_PX = 8192
+"""One layer's result of 64 channels has 17 GB there; no board has a tenth of it."""
+
 
 def sweep_rows(model: Path, swath: Swath, boards: Sequence[Dpu], tiles_px: Sequence[int]) -> list[Row]:
     """A row a configuration and tile size, for whole tiles with the swath's halo."""
@@ -48,10 +51,12 @@ def parse_tiles(text: str) -> list[int]:
     """Tile sides in pixels, with commas between them.
 
     Raises:
-        OptionError: another text, or a side below 16.
+        OptionError: another text, or a side below 16 or above MOST_TILE_PX.
     """
     parts = [part.strip() for part in text.split(",")]
-    if not all(part.isdecimal() and int(part) >= 16 for part in parts):
+    if not all(part.isdecimal() and len(part) < 6 and 16 <= int(part) <= MOST_TILE_PX for part in parts):
         remedy = "write one size, or several as 640,256,128"
-        raise OptionError("--tile", expected="tile sides of at least 16 pixels", got=repr(text), remedy=remedy)
+        raise OptionError(
+            "--tile", expected=f"tile sides of 16 to {MOST_TILE_PX} pixels", got=repr(text), remedy=remedy
+        )
     return [int(part) for part in parts]

@@ -12,6 +12,7 @@ from pkgutil import resolve_name
 from typing import Any
 
 from deploy import __version__
+from deploy.cores import require_cores
 from deploy.workers import Workers, lost_workers
 from profiles.errors import MachineError, OptionError
 
@@ -21,10 +22,10 @@ ADDRESS = re.compile(r"((tcp|tls|ucx|wss?)://)?(\[\S+\]|[^/:\s]+):\d+|inproc://\
 
 
 def check_choice(workers: int, scheduler: str | None) -> None:
-    """Workers here or workers elsewhere, not both.
+    """Workers here or workers elsewhere, not both, and here no more than there are cores.
 
     Raises:
-        OptionError: both are asked for, or no address of a scheduler is one.
+        OptionError: both or too many are asked for, or no address of a scheduler is one.
     """
     if scheduler and not ADDRESS.fullmatch(scheduler):
         remedy = "the scheduler prints it when it starts"
@@ -32,6 +33,7 @@ def check_choice(workers: int, scheduler: str | None) -> None:
     if workers and scheduler:
         remedy = "a scheduler has workers of its own: leave out --workers"
         raise OptionError("--workers", expected="none beside --scheduler", got=str(workers), remedy=remedy)
+    require_cores("--workers", workers)
 
 
 @contextmanager

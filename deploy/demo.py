@@ -44,6 +44,8 @@ from quant.session import open_session
 SENSOR = "pleiades-degraded"
 SIDE_PX = 640
 CALIBRATION_PATCHES, GATE_PATCHES = 24, 12
+FILES = ("report.html", "float.onnx", "int8.onnx", "core.onnx", "restored.tif", "before-after.png")
+"""What a run leaves in its folder."""
 
 
 @dataclass(frozen=True)

@@ -27,7 +27,7 @@ from deploy.results import Document, Figure, Row, measured, unavailable
 from deploy.shipped import VARIANT, shipped_pair
 from profiles import load_sensor, load_target
 from profiles.errors import OptionError
-from profiles.text import read_json
+from profiles.text import read_json, unreadable
 from quant.calibration import REFERENCE, Patches, draw_patches
 from quant.checks import Check
 from quant.gate import GateResult, compare
@@ -157,7 +157,7 @@ def baseline_mae(path: Path, arguments: Mapping[str, Any]) -> float:
         before = {name: _plain(name, document["arguments"][name]) for name in PATCHES}
         mae = float(next(row["figures"]["MAE"]["value"] for row in document["rows"] if row["table"] == "gate"))
     except (OSError, ValueError, KeyError, TypeError, StopIteration) as error:
-        got = "no such file" if not path.exists() else "another document"
+        got = unreadable(path) or "another document"
         remedy = "give what 'gate --json' wrote"
         raise OptionError(str(path), expected="a gate's results", got=got, remedy=remedy) from error
     for name in PATCHES:

@@ -11,6 +11,7 @@ import psutil
 import torch
 
 from deploy.bench import TABLE, Swath, efficiency
+from deploy.cores import require_cores
 from deploy.counterpart import counterpart, is_quantised
 from deploy.cpu_side import board_cpu_row
 from deploy.energy import timed
@@ -100,7 +101,11 @@ def host_rows(model: Path, target: TargetProfile, tile_px: int, threads: int = 0
 
     Each runs for the target's minimum time and count, one run for warm-up left out. Its counterpart in the other
     precision is the shipped network of the same variant; without one it runs alone.
+
+    Raises:
+        OptionError: more threads than cores.
     """
+    require_cores("--threads", threads)
     given = load_onnx(model)
     other = counterpart(given)
     runs = [Timed(model.stem, given)]

@@ -76,7 +76,16 @@ class Run:
     @property
     def weights(self) -> Path:
         """Where the averaged weights go in the end."""
-        return self.out / f"{self.variant}{TOLD_SUFFIX if self.patches.told else ''}.safetensors"
+        return self.out / weights_name(self.variant, self.patches.told is not None)
+
+
+FILES = ("checkpoint.safetensors", "log.csv", "validation.csv", "validation.png")
+"""What a run leaves in its folder besides the weights."""
+
+
+def weights_name(variant: str, told: bool) -> str:
+    """The file of the averaged weights; of a network that is told its sensor under a name of its own."""
+    return f"{variant}{TOLD_SUFFIX if told else ''}.safetensors"
 
 
 def train(run: Run, resume: bool, worker: Worker, say: Callable[[str], None]) -> None:

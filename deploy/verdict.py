@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from xml.etree import ElementTree as ET
 
-from model.files import require_writable, write_text
+from model.files import require_regular, require_writable, write_text
 from profiles.errors import BeersError, MachineError
 from quant.checks import Check
 
@@ -123,6 +123,7 @@ def _append(path: Path | None, text: str) -> None:
     """Add to what other steps of a job wrote."""
     if path is None:
         return
+    require_regular(path)
     try:
         with path.open("a", encoding="utf-8", newline="\n") as stream:
             stream.write(text)

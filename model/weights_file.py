@@ -15,7 +15,7 @@ from model.conditioning import DIRECTIONS, RANGES, Network, ToldConvBEERS
 from model.convbeers import VARIANTS, ConvBEERS, Variant
 from model.files import whole_file
 from profiles.errors import ModelError, OptionError
-from profiles.text import parse_json
+from profiles.text import parse_json, unreadable
 
 TOLD = "told its sensor"
 """The kind of weights, in the header, that need a sensor before they are a network; plain ones state no kind."""
@@ -58,7 +58,7 @@ def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, object]]:
             # Copies: the library's own lie in the file, which Windows then does not replace, and others may change.
             return {key: file.get_tensor(key).clone() for key in file.keys()}, header  # noqa: SIM118 - no mapping
     except (SafetensorError, OSError, ValueError, LookupError, TypeError, RuntimeError) as error:
-        got = "no such file" if not path.exists() else " ".join(str(error).split())[:120]
+        got = unreadable(path) or " ".join(str(error).split())[:120]
         remedy = "give a file written by 'beers-deploy train'"
         raise ModelError(str(path), expected="safetensors weights", got=got, remedy=remedy) from error
 

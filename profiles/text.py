@@ -10,6 +10,7 @@ import stat
 import sys
 import tomllib
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 
 TOML_BYTES = 1 << 16
@@ -17,6 +18,7 @@ TOML_BYTES = 1 << 16
 JSON_BYTES = 1 << 26
 DEPTH = 32
 TOO_DEEP = f"more than {DEPTH} levels of nesting"
+LFS_POINTER = b"version https://git-lfs"
 LINE_DOTS = 100
 """A line's dots may all be of one key: tomllib takes 4 s of processor time for one of 16 384 parts (measured)."""
 
@@ -28,7 +30,7 @@ def read_toml_text(path: Path) -> dict[str, object]:
         OSError: not readable.
         ValueError: too large, no UTF-8, no TOML, nested too deeply, or with a longer number.
     """
-    text = read_whole(path, TOML_BYTES).decode("utf-8")
+    text = read_whole(path, TOML_BYTES).decode("utf-8-sig")  # some editors on Windows begin with a mark
     if any(line.count(".") > LINE_DOTS for line in text.split("\n")):
         raise ValueError(f"a line with more than {LINE_DOTS} dots")
     try:
@@ -46,7 +48,7 @@ def read_json(path: Path) -> object:
         OSError: not readable.
         ValueError: as of `parse_json`, or too large.
     """
-    return parse_json(read_whole(path, JSON_BYTES).decode("utf-8"))
+    return parse_json(read_whole(path, JSON_BYTES).decode("utf-8-sig"))
 
 
 def parse_json(text: str) -> object:
@@ -69,14 +71,33 @@ def read_whole(path: Path, limit_bytes: int) -> bytes:
 
     Raises:
         OSError: not readable.
-        ValueError: too large, or a pipe or a device, which may have no end.
+        ValueError: too large, a pointer of Git LFS, or no file: a folder, a pipe or a device, which may have no end.
     """
     found = path.stat()
-    if not stat.S_ISREG(found.st_mode):
-        raise ValueError("no regular file")
+    if reason := unreadable(path):
+        raise ValueError(reason)
     if found.st_size > limit_bytes:
         raise ValueError(f"more than {limit_bytes} bytes")
     return path.read_bytes()
+
+
+def unreadable(path: Path) -> str | None:
+    """Why there is no file to be read at a path, in words for its user; None where there is one.
+
+    Git LFS leaves a pointer in place of each large file that was not fetched: 130 bytes of text under its name.
+    """
+    try:
+        mode = path.stat().st_mode
+    except FileNotFoundError:
+        return "no such file"
+    except OSError as error:  # such as a name that is too long
+        return error.strerror or str(error)
+    if not stat.S_ISREG(mode):
+        return "a folder" if stat.S_ISDIR(mode) else "no regular file"
+    with suppress(OSError), path.open("rb") as stream:
+        if stream.read(len(LFS_POINTER)) == LFS_POINTER:
+            return "a pointer of Git LFS in place of the file, which 'git lfs pull' fetches"
+    return None
 
 
 def _check(found: object, largest: float) -> None:

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from profiles.errors import OptionError
-from profiles.text import read_toml_text
+from profiles.text import read_toml_text, unreadable
 from quant.checks import Check
 from quant.gate import GateResult
 
@@ -51,7 +51,7 @@ def _parse(path: Path) -> Limits:
     try:
         raw = read_toml_text(path)
     except (OSError, ValueError) as error:
-        got = "no such file" if not path.exists() else " ".join(str(error).split())[:120]
+        got = unreadable(path) or " ".join(str(error).split())[:120]
         raise OptionError(
             str(path), expected="a TOML file of limits", got=got, remedy="write mae = 0.0007"
         ) from error

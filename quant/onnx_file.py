@@ -10,7 +10,7 @@ from onnx import numpy_helper
 
 from model.files import whole_file
 from profiles.errors import ModelError
-from profiles.text import read_whole
+from profiles.text import read_whole, unreadable
 from quant.runnable import check_runnable
 from quant.untrusted import FILE_BYTES, check_content
 
@@ -32,11 +32,9 @@ def load_onnx(path: Path, to_run: bool = True) -> onnx.ModelProto:
         ModelError: missing, empty, not ONNX, or not to be trusted (see `quant.untrusted` and `quant.runnable`).
     """
     try:
-        if not path.is_file():
-            raise ModelError(str(path), expected="an ONNX file", got="no such file", remedy=REMEDY)
         content = read_whole(path, FILE_BYTES)
     except (OSError, ValueError) as error:
-        got = " ".join(str(error).split())[:120]
+        got = unreadable(path) or " ".join(str(error).split())[:120]
         raise ModelError(str(path), expected="an ONNX file", got=got, remedy=REMEDY) from error
     return parse_onnx(content, str(path), to_run)
 

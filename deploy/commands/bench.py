@@ -54,8 +54,8 @@ def bench(
     from model.files import require_writable
     from profiles import load_target
 
-    require_writable(json)
     path, tiles = model or default_int8(), parse_tiles(tile)
+    require_writable(json, inputs=(path, image, measured))
     if target is Target.host:
         rows = host_rows(path, load_target("host-cpu"), _single(tiles), threads)
         for table, part in by_table(rows).items():

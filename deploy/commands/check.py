@@ -27,7 +27,8 @@ def check(
         str | None, typer.Option(help="DPU configuration, C32B1 to C64B5; the target's own if none.")
     ] = None,
     tile: Annotated[
-        int | None, typer.Option(min=1, help="Tile side in pixels; the network's own if it has one, else 640.")
+        int | None,
+        typer.Option(min=1, max=8192, help="Tile side in pixels; the network's own if it has one, else 640."),
     ] = None,
     picture: Annotated[
         Path | None, typer.Option(help="Draw the graph here, coloured by device: a .svg or .html file.")
@@ -41,7 +42,7 @@ def check(
     from model.files import require_writable
 
     require_picture(picture)
-    require_writable(picture, json)
+    require_writable(picture, json, inputs=(model or default_int8(), Path(target)))
     dpu = load_dpu(target, config)
     if model == TRADITIONAL:
         legal = _traditional(dpu, picture, json)

@@ -30,7 +30,7 @@ def compare(
     from deploy.tables import print_rows
     from model.files import require_writable
 
-    require_writable(json)
+    require_writable(json, inputs=(before, after))
     limits = [parse_limit(text) for text in fail_on or ()]
     documents = read_document(before), read_document(after)
     found = compare_documents(*documents)

@@ -5,23 +5,25 @@ from typing import Annotated
 
 import typer
 
+from deploy.cores import SEEDS
+
 EXAMPLE = "demo --out demo"
 
 
 def demo(
     image: Annotated[Path | None, typer.Option(help="Raw 12-bit image, or an 8-bit photograph as scene.")] = None,
     out: Annotated[Path, typer.Option(help="Folder for the report and the files made.")] = Path("demo"),
-    seed: Annotated[int, typer.Option(min=0, help="Seed of every random draw.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, max=SEEDS, help="Seed of every random draw.")] = 0,
     json: Annotated[Path | None, typer.Option(help="Write the figures here.")] = None,
 ) -> None:
     """Simulate, quantise, gate, check, restore and predict, on a drawn scene or your image; ends with report.html."""
-    from deploy.demo import run_demo
+    from deploy.demo import FILES, run_demo
     from deploy.report.page import write_report
     from deploy.results import Document
     from deploy.tables import print_rows
     from model.files import require_writable
 
-    require_writable(out / "report.html", json)
+    require_writable(*(out / name for name in FILES), json, inputs=(image,))
     result = run_demo(image, out, seed, lambda step: typer.echo(step, err=True))
     write_report(result.report, out / "report.html")
     for table in result.report.tables:

@@ -5,6 +5,8 @@ from typing import Annotated
 
 import typer
 
+from deploy.cores import SEEDS
+
 EXAMPLE = "evaluate --images aerial/ --methods degraded,traditional,convbeers-s,convbeers-s-int8 --out report/"
 
 
@@ -27,7 +29,7 @@ def evaluate(
     sweep: Annotated[
         bool, typer.Option("--sweep", help="Also PSNR and MTF under other blurs, noises and gains.")
     ] = False,
-    seed: Annotated[int, typer.Option(min=0, help="Seed of every random draw.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, max=SEEDS, help="Seed of every random draw.")] = 0,
     json: Annotated[Path | None, typer.Option(help="Write the figures here.")] = None,
 ) -> None:
     """Compare restorations with the reference, on average and by site; the degraded input is always a row.
@@ -50,10 +52,11 @@ def evaluate(
     if pairs is not None and (images is not None or sweep):
         expected = "no --images or --sweep beside it: pairs are as they are"
         raise OptionError("--pairs", expected=expected, got="both", remedy="leave one out")
-    require_writable(json)
-    require_writable(out / "report.html" if out else None)
-    eyes = load_sensor(sensor), load_sensor(reference)
     names = list(dict.fromkeys(["degraded", *(name.strip() for name in methods.split(","))]))
+    folders = [pairs, *(pairs / role for role in ("degraded", "reference"))] if pairs else [images]
+    read = (*folders, lpips, *map(Path, (sensor, reference, *names)))
+    require_writable(out / "report.html" if out else None, json, inputs=read, folders=(out,))
+    eyes = load_sensor(sensor), load_sensor(reference)
     chosen = [method_named(name, eyes[0].nominal(), eyes[1].nominal()) for name in names]
     instruments = Instruments(perceptual_distances(lpips))
     found, small = load_pairs(images, pairs, *eyes, seed)

@@ -20,7 +20,7 @@ def export(
         typer.Option(help="Specialise weights that can be told their sensor: a profile's name, or your .toml file."),
     ] = None,
     tile: Annotated[
-        int | None, typer.Option(min=16, help="Fix the input to one tile of this side, 640 for a board.")
+        int | None, typer.Option(min=16, max=8192, help="Fix the input to one tile of this side, 640 for a board.")
     ] = None,
 ) -> None:
     """Write the network as ONNX, any height and width unless --tile fixes them, and check it against torch.
@@ -31,11 +31,13 @@ def export(
     """
     from deploy.defaults import about
     from deploy.export import network_for, parity, to_onnx
+    from model.files import require_writable
     from model.shipped import shipped_weights
     from profiles.errors import ModelError
     from quant.onnx_file import save_onnx
 
     path = checkpoint or shipped_weights(variant)
+    require_writable(out, inputs=(path, Path(sensor) if sensor else None))
     network, recipe, warnings = network_for(path, sensor)
     for warning in warnings:
         typer.echo(f"warning: {warning}", err=True)

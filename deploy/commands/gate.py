@@ -5,6 +5,7 @@ from typing import Annotated
 
 import typer
 
+from deploy.cores import SEEDS
 from deploy.shipped import SENSOR
 
 EXAMPLE = "gate float.onnx int8.onnx --max-mae 0.0007"
@@ -26,8 +27,8 @@ def gate(
     target: Annotated[str, typer.Option(help="Board whose rules the INT8 file must keep.")] = "vck190",
     sensor: Annotated[str, typer.Option(help="Profile of the test patches.")] = SENSOR,
     images: Annotated[Path | None, typer.Option(help="Folder of scenes; drawn ones if none.")] = None,
-    patches: Annotated[int, typer.Option(min=1, help="Test patches of 128 x 128.")] = 32,
-    seed: Annotated[int, typer.Option(min=0, help="Seed of the patches.")] = 0,
+    patches: Annotated[int, typer.Option(min=1, max=100_000, help="Test patches of 128 x 128.")] = 32,
+    seed: Annotated[int, typer.Option(min=0, max=SEEDS, help="Seed of the patches.")] = 0,
     summary: Annotated[Path | None, typer.Option(help="Add the verdict to this file as Markdown.")] = None,
     junit: Annotated[Path | None, typer.Option(help="Write the verdict here as JUnit XML.")] = None,
     outputs: Annotated[
@@ -43,9 +44,11 @@ def gate(
     from deploy.gate import Request, files_or_shipped, run_gate
     from deploy.tables import print_rows
     from deploy.verdict import Reports, sentence
-    from model.files import require_writable
+    from model.files import claim_outputs, require_writable
     from quant.limits import read_limits
 
+    read = (float_model, int8_model, config, baseline, images, *map(Path, (target, sensor)))
+    claim_outputs(json, junit, summary, outputs, inputs=read)  # before bad input is told there
     reports = Reports(summary, junit, outputs)
     with reports.of_bad_input("INT8 gate"):
         require_writable(json)

@@ -6,6 +6,7 @@ from typing import Annotated
 
 import typer
 
+from deploy.cores import SEEDS
 from deploy.shipped import SENSOR
 
 EXAMPLE = "quantize float.onnx --target vck190 --sensor pleiades-degraded --out int8.onnx"
@@ -28,8 +29,8 @@ def quantize(
     ] = Regime.legal,
     board: Annotated[Path | None, typer.Option(help="Also write the DPU's core in the board's spelling.")] = None,
     images: Annotated[Path | None, typer.Option(help="Folder of scenes for calibration; drawn ones if none.")] = None,
-    patches: Annotated[int, typer.Option(min=1, help="Calibration patches.")] = 64,
-    patch: Annotated[int, typer.Option(min=32, help="Side of a calibration patch in pixels.")] = 128,
+    patches: Annotated[int, typer.Option(min=1, max=100_000, help="Calibration patches.")] = 64,
+    patch: Annotated[int, typer.Option(min=32, max=2048, help="Side of a calibration patch in pixels.")] = 128,
     ablate: Annotated[bool, typer.Option("--ablate", help="Show what each pass buys, on other patches.")] = False,
     report: Annotated[
         Path | None,
@@ -38,7 +39,7 @@ def quantize(
     without: Annotated[
         list[str] | None, typer.Option(help="Leave out a pass that --ablate lists, as half-steps; may be repeated.")
     ] = None,
-    seed: Annotated[int, typer.Option(min=0, help="Seed of the patches.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, max=SEEDS, help="Seed of the patches.")] = 0,
     json: Annotated[Path | None, typer.Option(help="Write the figures here.")] = None,
 ) -> None:
     """Quantise to int8 with power-of-two positions: the correction on the DPU, the 12-bit add on the host.
@@ -64,7 +65,8 @@ def quantize(
         raise OptionError("--regime free", expected=expected, got="one", remedy=remedy)
     passes = passes_without(without or [])
     page, figures = (report / "report.html", report / "report.json") if report else (None, None)
-    require_writable(out, board, json, page, figures)
+    read = (model, images, *map(Path, (target, sensor)))
+    require_writable(out, board, json, page, figures, inputs=read)
     network, board_target = float_model(model), load_target(target)
     calibration = Calibration(sensor, images, patches, patch, seed)
     if regime is Regime.free:

@@ -48,8 +48,8 @@ def restore(
     from deploy.tables import print_rows
     from model.files import require_writable
 
-    require_writable(json)
     path = model or default_int8()
+    require_writable(out, json, inputs=(image, path))
     options = Options(
         path,
         tile,

@@ -6,6 +6,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from deploy.cores import SEEDS
+
 if TYPE_CHECKING:
     from model.simulator.plan import Plan
 
@@ -42,9 +44,11 @@ def simulate(
     ] = None,
     reference: Annotated[str, typer.Option(help="Profile of the reference images.")] = "pleiades-reference",
     preset: Annotated[str | None, typer.Option(help=f"A dataset of the paper: {', '.join(PRESETS)}.")] = None,
-    patch: Annotated[int | None, typer.Option(min=8, help="Patch side in pixels; whole scenes if none.")] = None,
+    patch: Annotated[
+        int | None, typer.Option(min=8, max=8192, help="Patch side in pixels; whole scenes if none.")
+    ] = None,
     oversampling: Annotated[
-        float | None, typer.Option(min=1, help="Scene pixels per pixel, whole or not; the profile's if none.")
+        float | None, typer.Option(min=1, max=64, help="Scene pixels per pixel, whole or not; the profile's if none.")
     ] = None,
     scene: Annotated[
         str | None, typer.Option(help="What the scene calls for: night-port, snow, ..., or a .toml.")
@@ -59,7 +63,7 @@ def simulate(
     scheduler: Annotated[
         str | None, typer.Option(help="Dask scheduler whose workers simulate, such as tcp://host:8786.")
     ] = None,
-    seed: Annotated[int, typer.Option(min=0, help="Seed of every random draw.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, max=SEEDS, help="Seed of every random draw.")] = 0,
     resume: Annotated[bool, typer.Option("--resume", help="Go on with an unfinished dataset.")] = False,
 ) -> None:
     """Write degraded/NAME.tif and reference/NAME.tif for each scene or patch; the same bytes for the same seed.
@@ -79,6 +83,10 @@ def simulate(
     from profiles.scene_call import calling_for, load_scene_call
 
     check_choice(workers, scheduler)
+    if out is not None:
+        read = (*(scenes or ()), *(Path(name) for name in (sensor, reference, scene) if name))
+        folders = [out / name for name in ("degraded", "reference", "parts")]
+        require_writable(out / "manifest.jsonl", out / "recipe.json", inputs=read, folders=folders)
     chosen = _preset(preset)
     call = load_scene_call(scene) if scene else None
     degraded = calling_for(load_sensor(sensor or chosen.sensor), call, add or (), forbid or ())
@@ -103,7 +111,6 @@ def simulate(
         _explain(recipe)
     if out is None:
         return
-    require_writable(out / "manifest.jsonl")
     with steps("simulating", len(plan_windows(recipe))) as bar:
         summary = write_dataset(recipe, out, workers or os.cpu_count() or 1, resume, bar.advance, scheduler)
     rejected = f"; {summary['rejected_share']:.1%} of the drawn SNR pairs were impossible and drawn again"

@@ -5,6 +5,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from deploy.cores import SEEDS
+
 if TYPE_CHECKING:
     from deploy.stress.flip_study import FlipRequest
     from deploy.stress.subject import Subject
@@ -27,12 +29,16 @@ def stress(
     variant: Annotated[str, typer.Option(help="Shipped pair of this name, where no file is given.")] = "convbeers-s",
     cases: Annotated[str | None, typer.Option(help="Only these cases, with commas: 'night,snow'.")] = None,
     stages: Annotated[str | None, typer.Option(help="Only these stages, with commas: 'float32,INT8'.")] = None,
-    size: Annotated[int, typer.Option(min=16, help="Side in pixels, where a case has none of its own.")] = 96,
-    seed: Annotated[int, typer.Option(min=0, help="Seed of every random draw.")] = 0,
+    size: Annotated[
+        int, typer.Option(min=16, max=4096, help="Side in pixels, where a case has none of its own.")
+    ] = 96,
+    seed: Annotated[int, typer.Option(min=0, max=SEEDS, help="Seed of every random draw.")] = 0,
     bit_flips: Annotated[
         bool, typer.Option("--bit-flips", help="Turn bits over in the INT8 network instead of running hard cases.")
     ] = False,
-    draws: Annotated[int, typer.Option(min=1, help="Strikes of each memory and rate, with --bit-flips.")] = 6,
+    draws: Annotated[
+        int, typer.Option(min=1, max=10_000, help="Strikes of each memory and rate, with --bit-flips.")
+    ] = 6,
     sensor: Annotated[
         str, typer.Option(help="Sensor profile of the patches, with --bit-flips.")
     ] = "pleiades-degraded",
@@ -65,10 +71,12 @@ def stress(
     from model.files import require_writable, write_text
 
     _refuse(context, HARD_CASES_ONLY if bit_flips else BIT_FLIPS_ONLY, bit_flips)
-    require_writable(out, json)
+    picture = _picture_beside(out, json) if bit_flips else None
+    read = (float_model, int8_model, images, *map(Path, (sensor, target)))
+    require_writable(out, json, picture, inputs=read)
     if bit_flips:
         request = FlipRequest(sensor, images, target, draws, size, seed)
-        _flip_bits(open_subject(float_model, int8_model, variant), request, out, json)
+        _flip_bits(open_subject(float_model, int8_model, variant), request, (out, picture, json))
         return
     names = chosen(cases, [case.name for case in CASES], "--cases")
     wanted = chosen(stages, STAGES, "--stages")
@@ -111,8 +119,10 @@ def _refuse(context: typer.Context, names: tuple[str, ...], bit_flips: bool) -> 
             raise OptionError(f"--{name}", expected=expected, got=got, remedy=remedy)
 
 
-def _flip_bits(subject: "Subject", request: "FlipRequest", out: Path | None, json: Path | None) -> None:
-    """Strike, print, and write what was asked for."""
+def _flip_bits(
+    subject: "Subject", request: "FlipRequest", wanted: tuple[Path | None, Path | None, Path | None]
+) -> None:
+    """Strike, print, and write what was asked for: tables, curves, figures."""
     from dataclasses import asdict
 
     from deploy.progress import steps
@@ -123,7 +133,7 @@ def _flip_bits(subject: "Subject", request: "FlipRequest", out: Path | None, jso
     from deploy.tables import print_rows
     from model.files import write_text
 
-    picture = _picture_beside(out, json)
+    out, picture, json = wanted
     with steps("turning bits over", ticks(subject, request)) as bar:
         rows = flip_rows(subject, request, bar.advance)
     for table, found in by_table(rows).items():
@@ -136,7 +146,6 @@ def _flip_bits(subject: "Subject", request: "FlipRequest", out: Path | None, jso
 
 def _picture_beside(out: Path | None, json: Path | None) -> Path | None:
     """Where the curves go: beside the tables, over nothing else that is written."""
-    from model.files import require_writable
     from profiles.errors import OptionError
 
     if out is None:
@@ -145,5 +154,4 @@ def _picture_beside(out: Path | None, json: Path | None) -> Path | None:
     if picture in (out, json):
         expected, remedy = f"a name other than that of the curves, {picture.name}", "give it the suffix .md"
         raise OptionError("--out", expected=expected, got=out.name, remedy=remedy)
-    require_writable(picture)
     return picture

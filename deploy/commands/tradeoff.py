@@ -5,6 +5,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from deploy.cores import SEEDS
+
 if TYPE_CHECKING:
     from deploy.tradeoff.study import Study
 
@@ -39,7 +41,7 @@ def tradeoff(
     ] = None,
     size: Annotated[str, typer.Option(help="Size of the swath in pixels.")] = PAPER_SIZE,
     cache: Annotated[Path | None, typer.Option(help="Folder of kept measurements; OUT/cache if none.")] = None,
-    seed: Annotated[int, typer.Option(min=0, help="Seed of every random draw.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, max=SEEDS, help="Seed of every random draw.")] = 0,
     json: Annotated[Path | None, typer.Option(help="Write the figures here too.")] = None,
 ) -> None:
     """Measure networks, chains and peers on the same pairs, predict their runs on the board, and weigh them.
@@ -48,7 +50,7 @@ def tradeoff(
     point keeps --budget and --need; the report is written all the same.
     """
     from deploy.commands.bench import parse_size
-    from deploy.report.tradeoff_page import write_study
+    from deploy.report.tradeoff_page import FILES, write_study
     from deploy.results import Document
     from deploy.tradeoff.cache import Cache
     from deploy.tradeoff.demands import parse_demands
@@ -57,14 +59,15 @@ def tradeoff(
     from model.files import require_writable
     from model.shipped import shipped_names
 
-    figures = out / "tradeoff.json"
-    require_writable(figures, json)
+    figures, kept = out / "tradeoff.json", cache or out / "cache"
     demands = [tuple(parse_demands(name, text)) for name, text in (("--budget", budget), ("--need", need))]
     names = tuple(networks.split(",")) if networks is not None else tuple(shipped_names())
+    read = (images, calibration, lpips, *map(Path, (sensor, reference, *names)))
+    require_writable(figures, *(out / name for name in FILES), json, inputs=read, folders=(kept,))
     request = Request(
         names, images, calibration, sensor, reference, lpips, parse_size(size), demands[0], demands[1], seed
     )
-    result = run_study(request, Cache(cache or out / "cache"))
+    result = run_study(request, Cache(kept))
     write_study(result.study, out)
     say(result.study)
     arguments: dict[str, object] = {"images": images, "sensor": sensor, "reference": reference, "size": size}

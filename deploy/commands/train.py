@@ -5,6 +5,8 @@ from typing import Annotated
 
 import typer
 
+from deploy.cores import SEEDS
+
 EXAMPLE = "train --variant convbeers-s --images aerial/ --out runs/s --steps 20000"
 
 
@@ -20,10 +22,10 @@ def train(
         bool, typer.Option("--told", help="Draw sensors of a wide range with that gain, and tell the network each.")
     ] = False,
     reference: Annotated[str, typer.Option(help="Profile of the wanted output.")] = "pleiades-reference",
-    drawn: Annotated[int, typer.Option(min=0, help="Drawn scenes to add to the images.")] = 0,
+    drawn: Annotated[int, typer.Option(min=0, max=1000, help="Drawn scenes to add to the images.")] = 0,
     steps: Annotated[int, typer.Option(min=1, help="Gradient steps.")] = 20_000,
-    batch: Annotated[int, typer.Option(min=1, help="Patches a step and worker.")] = 8,
-    patch: Annotated[int, typer.Option(min=17, help="Patch side in pixels.")] = 96,
+    batch: Annotated[int, typer.Option(min=1, max=4096, help="Patches a step and worker.")] = 8,
+    patch: Annotated[int, typer.Option(min=17, max=2048, help="Patch side in pixels.")] = 96,
     learning_rate: Annotated[float, typer.Option(min=0, help="Highest learning rate.")] = 1e-3,
     optimiser: Annotated[str, typer.Option(help="adam or adamw.")] = "adam",
     l1_weight: Annotated[float, typer.Option(min=0, help="Weight of L1 in the loss.")] = 1.0,
@@ -43,7 +45,7 @@ def train(
     distil: Annotated[float, typer.Option(min=0, help="Weight of the distance to the teacher.")] = 1.0,
     validate_every: Annotated[int, typer.Option(min=0, help="Steps between validations; 0 for none.")] = 1000,
     tensorboard: Annotated[bool, typer.Option("--tensorboard", help="Write TensorBoard scalars too.")] = False,
-    seed: Annotated[int, typer.Option(min=0, help="Seed of weights and patches.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, max=SEEDS, help="Seed of weights and patches.")] = 0,
     device: Annotated[str, typer.Option(help="cpu, or cuda.")] = "cpu",
     precision: Annotated[
         str | None, typer.Option(help="float32 or bfloat16; by default what is faster on this processor.")
@@ -58,7 +60,7 @@ def train(
     """
     from typing import get_args
 
-    from deploy.training import Run
+    from deploy.training import FILES, Run, weights_name
     from deploy.training import train as run_training
     from model.conditioning import SensorFamily
     from model.files import require_writable
@@ -80,6 +82,9 @@ def train(
     if told and (pairs is not None or teacher is not None):
         remedy = "leave one out: stored pairs do not say what sensor each had, and a teacher is not told"
         raise OptionError("--told", expected="no --pairs or --teacher beside it", got="both", remedy=remedy)
+    stored = [pairs, *(pairs / role for role in ("degraded", "reference"))] if pairs else [images]
+    read = (*stored, lpips, start, teacher, *map(Path, (sensor, reference)))
+    require_writable(*(out / name for name in (*FILES, weights_name(variant, told))), inputs=read)
     recipe = TrainingRecipe(
         steps=steps,
         batch=batch,
@@ -108,7 +113,6 @@ def train(
         device,
         precision,  # type: ignore[arg-type]
     )
-    require_writable(run.weights)
     with joined(device) as worker:
         run_training(run, resume, worker, typer.echo)
         if worker.first:

@@ -31,8 +31,11 @@ FIRST = ("board latency", "PSNR")
 STATES = {"front": "on the front", "even": "not told apart from the front", "beaten": "beaten by {}"}
 
 
+FILES = ("tradeoff.html", "tradeoff.svg", "tradeoff.png", "points.csv")
+
+
 def write_study(study: Study, out: Path) -> None:
-    """Write OUT/tradeoff.html, tradeoff.svg, tradeoff.png and points.csv, each whole or not at all.
+    """Write each of FILES into a folder, whole or not at all.
 
     Raises:
         MachineError: a file cannot be written.

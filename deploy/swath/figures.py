@@ -15,8 +15,9 @@ def plan_sentence(plan: Plan) -> str:
     """How the image is cut."""
     bands = f", each of {plan.bands} bands by itself" if plan.bands > 1 else ""
     rows_px, columns_px = plan.tile_shape
+    tiles = "1 tile" if plan.tiles == 1 else f"{plan.tiles} tiles"
     return (
-        f"plan: {plan.height_px} x {plan.width_px} pixels{bands}; {plan.tiles} tiles of {rows_px} x {columns_px}, "
+        f"plan: {plan.height_px} x {plan.width_px} pixels{bands}; {tiles} of {rows_px} x {columns_px}, "
         f"halo {_halo(plan)}, work factor {plan.work_factor:.2f}"
     )
 

@@ -6,6 +6,7 @@ from pathlib import Path
 import onnx
 
 from deploy.cluster import check_choice
+from deploy.cores import require_cores
 from deploy.restore import check_fixed_tile, parse_halo
 from deploy.results import Row
 from deploy.swath.figures import plan_sentence, run_row, seam_figures, worker_figures
@@ -21,7 +22,7 @@ from deploy.swath.restorer import Restorer
 from deploy.swath.runtime import open_runtime, tiles_at_once
 from deploy.swath.spool import Spool, part_folder
 from deploy.swath.spread import fill_spread, make_work
-from deploy.swath.writer import require_codec, write_output
+from deploy.swath.writer import require_codec, require_tiff_name, write_output
 from model.files import require_writable
 from model.training.interrupts import held_back
 from quant.onnx_file import fixed_tile_px, load_onnx
@@ -39,7 +40,10 @@ def restore_file(image: Path, out: Path, options: Options, say: Say) -> Row:
         KeyboardInterrupt: stopped; rows already finished stay for `resume`.
     """
     check_choice(options.workers, options.scheduler)
-    require_writable(out)
+    require_writable(out, inputs=(image, options.model))
+    if options.scheduler is None:
+        require_cores("--threads", options.threads)
+    require_tiff_name(out)
     require_codec(options.compression)
     with only_run(out, part_folder(out)):
         return _restore(image, out, options, say)

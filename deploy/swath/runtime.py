@@ -8,6 +8,7 @@ from functools import partial
 import onnx
 import onnxruntime as ort
 
+from deploy.cores import require_cores
 from deploy.restore import Infer
 from deploy.swath.openvino import open_openvino
 from deploy.swath.options import Runtime
@@ -37,7 +38,9 @@ def open_runtime(runtime: Runtime, model: onnx.ModelProto, threads: int, at_once
     Raises:
         MachineError: the runtime is not installed.
         ModelError: it refuses the model.
+        OptionError: more threads than cores.
     """
+    require_cores("--threads", threads)
     if runtime is Runtime.openvino:
         return open_openvino(model, threads, at_once=at_once)
     return partial(run, open_session(model, session_threads(threads, at_once))), f"onnxruntime {ort.__version__}"

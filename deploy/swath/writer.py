@@ -3,14 +3,17 @@
 import io
 import os
 from collections.abc import Iterator
+from pathlib import Path
 
 import numpy as np
 import tifffile
 
 from deploy.swath.options import Compression
 from deploy.swath.raster import Raster
+from deploy.swath.reader import BIG_TIFF_SUFFIXES
 from deploy.swath.spool import Spool, sync_folder
-from profiles.errors import MachineError
+from model.images import TIFF_SUFFIXES
+from profiles.errors import MachineError, OptionError
 
 TILE_PX = 256
 PLAIN_LIMIT_BYTES = 4_000_000_000
@@ -18,6 +21,17 @@ PLAIN_LIMIT_BYTES = 4_000_000_000
 BUFFER_BYTES = 1 << 25
 FAST_LEVEL = 1
 """Of zlib: on a noisy 12-bit image 1 % larger than its default, in less than half the time (measured)."""
+
+
+def require_tiff_name(path: Path) -> None:
+    """Refuse a name under which no program would look for a TIFF.
+
+    Raises:
+        OptionError: it does not end as a TIFF's does.
+    """
+    if path.suffix.lower() not in TIFF_SUFFIXES | BIG_TIFF_SUFFIXES:
+        remedy = "name it so; other programs turn a TIFF into what you need"
+        raise OptionError("OUT", expected="a TIFF's name, such as restored.tif", got=path.name, remedy=remedy)
 
 
 def require_codec(compression: Compression) -> None:

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import tifffile
 import torch
 from typer.testing import CliRunner
 
@@ -26,6 +27,7 @@ from model.metrics.backbone_files import read_tensors
 from model.weights_file import load_network, write_tensors
 from model.weights_file import read_tensors as read_weights
 from profiles.errors import BeersError, ModelError, OptionError, ProfileError
+from profiles.text import read_json, read_toml_text
 from profiles.toml import HERE
 from quant.checks import Check
 from quant.limits import read_limits
@@ -224,3 +226,47 @@ def test_a_log_with_strange_lines_is_gone_on_with(tmp_path: Path) -> None:
     assert lines[:2] == ["step,loss", "1,0.5"]
     assert "30,2" not in lines
     assert lines[-1] == "21,0.25"
+
+
+POINTER = "version https://git-lfs.github.com/spec/v1\noid sha256:4d7a2146\nsize 12345\n"
+
+
+@pytest.mark.parametrize(
+    ("command", "name"),
+    [
+        (["check", "{}"], "network.onnx"),
+        (["gate", "{}", "{}"], "network.onnx"),
+        (["export", "--out", "out.onnx", "--checkpoint", "{}"], "weights.safetensors"),
+        (["gate", "--config", "{}"], "limits.toml"),
+        (["gate", "--baseline", "{}"], "gate.json"),
+        (["compare", "{}", "{}"], "gate.json"),
+        (["profiles", "{}"], "sensor.toml"),
+    ],
+)
+@pytest.mark.parametrize("what", ["pointer", "folder"])
+def test_what_stands_in_place_of_a_file_is_named(
+    command: list[str], name: str, what: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    path = tmp_path / name
+    path.mkdir() if what == "folder" else path.write_text(POINTER)
+    done = runner.invoke(app, [word.format(path) for word in command])
+    assert done.exit_code == 2
+    assert name in done.stderr
+    assert ("got a folder" if what == "folder" else "'git lfs pull'") in done.stderr
+
+
+def test_a_mark_at_the_beginning_of_a_text_is_no_part_of_it(tmp_path: Path) -> None:
+    (tmp_path / "limits.toml").write_bytes(b"\xef\xbb\xbfmae = 0.5\n")
+    (tmp_path / "one.json").write_bytes(b"\xef\xbb\xbf[1]")
+    assert read_toml_text(tmp_path / "limits.toml") == {"mae": 0.5}
+    assert read_json(tmp_path / "one.json") == [1]
+
+
+@pytest.mark.parametrize("name", ["out.png", "out.jpg", "out", "out.tif.gz"])
+def test_no_tiff_is_written_under_another_name(name: str, tmp_path: Path) -> None:
+    tifffile.imwrite(tmp_path / "raw.tif", np.full((20, 20), 500, np.uint16))
+    done = runner.invoke(app, ["restore", str(tmp_path / "raw.tif"), str(tmp_path / name)])
+    assert done.exit_code == 2
+    assert f"expected a TIFF's name, such as restored.tif, got {name}" in done.stderr
+    assert not (tmp_path / name).exists()

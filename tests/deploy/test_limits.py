@@ -1,0 +1,75 @@
+"""What is asked of a machine has an end: said before any work, not after minutes of silence or at the last byte."""
+
+import os
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from deploy.bench_sweep import MOST_TILE_PX, parse_tiles
+from deploy.cli import app
+from deploy.cores import require_cores
+from profiles.errors import OptionError
+
+HUGE = str(10**23)
+
+
+@pytest.mark.parametrize("cores", [1, 2, 16])
+def test_threads_and_processes_are_at_most_the_cores(cores: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(os, "cpu_count", lambda: cores)
+    for asked in (0, 1, cores):
+        require_cores("--threads", asked)
+    for asked in (-1, cores + 1, 100_000):
+        with pytest.raises(OptionError, match=f"--threads: expected 0 to {cores}, the cores"):
+            require_cores("--threads", asked)
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        ["bench", "--target", "host", "--threads", "100000"],
+        ["restore", "raw.tif", "out.tif", "--threads", "100000"],
+        ["restore", "raw.tif", "out.tif", "--workers", "100000"],
+        ["simulate", "--out", "pairs", "--workers", "100000"],
+    ],
+)
+def test_a_command_says_how_many(command: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "raw.tif").write_bytes(b"not read yet")
+    done = CliRunner().invoke(app, command)
+    assert done.exit_code == 2
+    assert f"expected 0 to {os.cpu_count()}, the cores of this machine, got 100000" in done.stderr
+    assert [path.name for path in tmp_path.iterdir()] == ["raw.tif"]
+
+
+@pytest.mark.parametrize(
+    ("command", "option"),
+    [
+        ("check", "--tile"),
+        ("export", "--tile"),
+        ("gate", "--patches"),
+        ("gate", "--seed"),
+        ("quantize", "--patch"),
+        ("quantize", "--patches"),
+        ("simulate", "--oversampling"),
+        ("simulate", "--patch"),
+        ("stress", "--draws"),
+        ("stress", "--size"),
+        ("train", "--batch"),
+        ("train", "--drawn"),
+        ("train", "--patch"),
+        ("train", "--seed"),
+    ],
+)
+def test_a_huge_number_is_refused_at_once(command: str, option: str) -> None:
+    done = CliRunner().invoke(app, [command, option, HUGE])
+    assert done.exit_code == 2
+    assert "less than or equal to" in " ".join(done.stderr.split())
+    assert option in done.stderr
+
+
+def test_tiles_of_a_sweep_have_an_end() -> None:
+    assert parse_tiles(f"16, {MOST_TILE_PX}") == [16, MOST_TILE_PX]
+    for text in (str(MOST_TILE_PX + 1), "9" * 5000, "15"):
+        with pytest.raises(OptionError, match="--tile"):
+            parse_tiles(text)
