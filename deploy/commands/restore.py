@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from deploy.swath.options import FULL_SCALE_DN, TILE_PX, Compression, Options, Runtime
+from deploy.swath.options import TILE_PX, Compression, Options, Runtime
 
 EXAMPLE = "restore raw.tif restored.tif"
 
@@ -18,7 +18,10 @@ def restore(
     ] = None,
     tile: Annotated[int, typer.Option(min=16, help="Longest side of a tile in pixels.")] = TILE_PX,
     halo: Annotated[str, typer.Option(help="Context around a tile: 'exact' (no seams) or pixels.")] = "exact",
-    full_scale: Annotated[float, typer.Option(help="The digital number that is the network's 1.0.")] = FULL_SCALE_DN,
+    full_scale: Annotated[
+        float | None,
+        typer.Option(help="Pixel value that is full scale; 4095 if none, but 8-bit and 0..1 pixels need it."),
+    ] = None,
     runtime: Annotated[Runtime, typer.Option(help="What runs the network.")] = Runtime.onnxruntime,
     threads: Annotated[int, typer.Option(min=0, help="Threads; 0 takes every core, or what falls to a worker.")] = 0,
     compression: Annotated[Compression, typer.Option(help="Of the output, lossless.")] = Compression.zlib,
@@ -38,6 +41,7 @@ def restore(
     """Restore an image tile by tile; with the exact halo the result is the whole image's, bit for bit.
 
     The image is read and written by rows, so memory does not grow with its height. Bands are restored one by one.
+    OUT has the scale of IN: 8-bit pixels with --full-scale 255 come out as 0..255, floats with 1 as 0..1.
     Georeference, RPCs and missing pixels (NaN, or the nodata value) are kept. Until OUT is finished its rows lie in
     .OUT.part beside it. Workers change no pixel: where they are of one processor and the same versions, the bytes are
     those of one process. Those of a scheduler must find IN under its path; only this process writes.

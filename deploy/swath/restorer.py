@@ -11,6 +11,9 @@ from deploy.swath.reader import Source
 from deploy.tiling import Span
 from profiles.errors import ImageError
 
+NAME = "image"
+"""Of one that came without a file."""
+
 
 @dataclass(frozen=True)
 class Band:
@@ -38,7 +41,7 @@ class Restorer:
     infer: Infer
     full_scale: float
     radius_px: int
-    name: str = "image"
+    name: str = NAME
 
     def read(self, source: Source, start: int, stop: int) -> Band:
         """The rows that a row of tiles needs.
