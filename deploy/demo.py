@@ -18,7 +18,7 @@ from deploy.dpu.placement import place
 from deploy.dpu.reading import read_network
 from deploy.evaluation.methods import Restore
 from deploy.evaluation.scores import fidelity_row
-from deploy.export import parity
+from deploy.export import require_parity
 from deploy.gate import gate_row
 from deploy.measure import Sensors, traditional_rows
 from deploy.report.demo_page import INT8, SWATH_PX, TRADITIONAL, comparison, demo_report
@@ -70,15 +70,18 @@ def sensors() -> Sensors:
     return Sensors(load_sensor(SENSOR), load_sensor(REFERENCE))
 
 
-def read_input(image: Path | None, seed: int) -> Input:
-    """A drawn scene, a photograph as a scene (8 bits), or a raw acquisition (mono, up to 12 bits)."""
+def read_input(image: Path | None, seed: int, full_scale: float | None = None) -> Input:
+    """A drawn scene, a photograph as a scene (8 bits), or a raw acquisition (mono, up to 12 bits).
+
+    With the pixel value that is its `full_scale`, any image is a raw acquisition.
+    """
     if image is None:
         eyes = sensors()
         side = (SIDE_PX + 2 * MARGIN_PX) * int(eyes.degraded.oversampling.low)
         return _simulated(procedural_scene(side, side, np.random.default_rng(seed)), seed)
-    if read_pixels(image).dtype == np.uint8:
+    if full_scale is None and read_pixels(image).dtype == np.uint8:
         return _simulated(read_scene(image, sensors().reference.nominal()), seed)
-    return Input(image.name, read_acquisition(image), None)
+    return Input(image.name, read_acquisition(image, full_scale, None), None)
 
 
 def _simulated(scene: Scene, seed: int) -> Input:
@@ -88,13 +91,15 @@ def _simulated(scene: Scene, seed: int) -> Input:
     return Input(scene.name, pair.degraded.numpy(), pair)
 
 
-def run_demo(image: Path | None, out: Path, seed: int, say: Callable[[str], None]) -> Demo:
+def run_demo(
+    image: Path | None, out: Path, seed: int, say: Callable[[str], None], full_scale: float | None = None
+) -> Demo:
     """Run the chain, write its files into `out`, and return the figures and the report.
 
     Files: float.onnx, int8.onnx, core.onnx (the board's spelling), restored.tif, before-after.png.
     """
     say("reading the image")
-    given = read_input(image, seed)
+    given = read_input(image, seed, full_scale)
     say("exporting, quantising and gating")
     gate, int8, exact = quantise_and_gate(out, seed)
     say("checking every operator against the DPU")
@@ -121,7 +126,7 @@ def quantise_and_gate(out: Path, seed: int) -> tuple[Row, onnx.ModelProto, Row]:
     model = float_model(None)
     save_onnx(model, out / "float.onnx")
     network, _ = load_network(default_float_weights())
-    difference = parity(network, out / "float.onnx", 97)
+    difference = require_parity(network, out / "float.onnx", 97)
     scenes = load_scenes(None, eyes.reference.nominal(), seed)
     patches = draw_patches(scenes, eyes.degraded, eyes.reference, CALIBRATION_PATCHES, seed)
     result = quantise_model(model, patches, {"calibration_sensor": SENSOR}, lambda: None)

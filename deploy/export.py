@@ -16,6 +16,9 @@ from profiles.sensor import load_sensor
 from quant.onnx_file import image_info, make_model
 from quant.session import open_session, run
 
+MAX_DIFFERENCE = 1e-5
+"""Of full scale: a twentieth of a digital number, above what float32 summation order explains."""
+
 
 def network_for(path: Path, sensor: str | None) -> tuple[ConvBEERS, dict[str, object], tuple[str, ...]]:
     """A plain network from a weights file; weights that can be told their sensor are folded for the one named.
@@ -57,12 +60,35 @@ def to_onnx(network: ConvBEERS, about: dict[str, str], tile_px: int | None = Non
     return make_model(graph, {"beers_deploy_version": __version__, "precision": "float32", **about})
 
 
-def parity(network: ConvBEERS, path: Path, side_px: int) -> float:
-    """Largest absolute difference between torch and onnxruntime on one random image, in [0, 1] of full scale."""
+def parity(network: ConvBEERS, model: Path | onnx.ModelProto, side_px: int) -> float:
+    """Largest absolute difference between torch and onnxruntime on one random image, in [0, 1] of full scale.
+
+    Raises:
+        ModelError: the network gives NaN or infinity; then nothing can be compared.
+    """
     image = np.random.default_rng(0).random((1, 1, side_px, side_px), dtype=np.float32)
     with torch.inference_mode():
         expected = network(torch.from_numpy(image)).numpy()
-    return float(np.abs(run(open_session(path), image) - expected).max())
+    with np.errstate(invalid="ignore", over="ignore"):  # what is not finite is refused
+        difference = float(np.abs(run(open_session(model), image) - expected).max())
+    if not np.isfinite(difference):
+        expected_text, remedy = "finite pixels on a random image", "train it again with a lower learning rate"
+        raise ModelError("network", expected=expected_text, got="NaN or infinity", remedy=remedy)
+    return difference
+
+
+def require_parity(network: ConvBEERS, model: Path | onnx.ModelProto, side_px: int) -> float:
+    """As `parity`, and small.
+
+    Raises:
+        ModelError: the network gives NaN or infinity, or both do not compute the same.
+    """
+    difference = parity(network, model, side_px)
+    if difference > MAX_DIFFERENCE:
+        expected = f"at most {MAX_DIFFERENCE:g} of full scale from torch"
+        remedy = "report it: the export is wrong"
+        raise ModelError("exported network", expected=expected, got=f"{difference:g}", remedy=remedy)
+    return difference
 
 
 class _Writer:

@@ -10,16 +10,15 @@ import numpy as np
 
 from deploy.shipped import default_int8
 from deploy.swath.engine import restore_rows
-from deploy.swath.options import FULL_SCALE_DN, TILE_PX, Options, Runtime
+from deploy.swath.options import TILE_PX, Options, Runtime
 from deploy.swath.raster import Raster, require_numbers, usable_nodata
 from deploy.swath.reader import ArraySource
-from deploy.swath.restorer import Restorer
-from deploy.swath.run import plan_of
+from deploy.swath.restorer import NAME, Restorer
+from deploy.swath.run import plan_of, scale_of
 from deploy.swath.runtime import open_runtime, tiles_at_once
 from profiles.errors import ImageError, OptionError
 from quant.onnx_file import load_onnx
 
-NAME = "image"
 Image = TypeVar("Image")
 """numpy.ndarray, dask.array.Array or xarray.DataArray."""
 
@@ -30,7 +29,7 @@ def restore(
     *,
     tile_px: int = TILE_PX,
     halo: int | str = "exact",
-    full_scale: float = FULL_SCALE_DN,
+    full_scale: float | None = None,
     runtime: str = "onnxruntime",
     threads: int = 0,
     nodata: float | None = None,
@@ -43,16 +42,19 @@ def restore(
         model: ONNX file, float or INT8; the shipped INT8 network if None.
         tile_px: side of a tile.
         halo: 'exact', or pixels of context around a tile.
-        full_scale: the digital number that is 1.0 to the network.
+        full_scale: the pixel value that is 1.0 to the network. None is 4095 (12 bits) for integers of more than 8
+            bits and for floats of digital numbers; 8-bit pixels, and floats that all lie in about 0..1, are refused
+            without it. Floats of Dask are judged tile by tile when they are computed.
         runtime: 'onnxruntime' or 'openvino'.
         threads: of the runtime; 0 takes every core, or one for each of Dask's own threads.
         nodata: the value of missing pixels, besides NaN; a DataArray's own `_FillValue` if None.
 
     Returns:
-        The same kind and shape: uint16 of integers, float32 of floats. Missing pixels stay as they are.
+        The same kind, shape and scale: uint16 of integers, float32 of floats. Missing pixels stay as they are.
 
     Raises:
-        ImageError: no such array, or values outside 0 to full scale; of Dask when it is computed.
+        ImageError: no such array, pixels that leave the full scale open, or values outside 0 to full scale; of
+            Dask when it is computed.
         ModelError: a network that cannot be tiled or run.
         OptionError: options that do not go together.
         MachineError: a missing package.
@@ -84,7 +86,8 @@ def _restore_now(bands: np.ndarray, raster: Raster, options: Options) -> np.ndar
     plan = plan_of(raster, network, options)
     at_once = tiles_at_once(options.threads, plan.tiles)
     infer, _ = open_runtime(options.runtime, network, options.threads, at_once)
-    restorer = Restorer(raster, infer, options.full_scale, plan.radius_px, NAME)
+    full_scale = scale_of(source, plan, options.full_scale, NAME)
+    restorer = Restorer(raster, infer, full_scale, plan.radius_px, NAME)
     result = np.empty(raster.shape, raster.out_dtype)
     for row, pixels, _ in restore_rows(source, plan, restorer, plan.rows, lambda: None, at_once):
         result[:, row.keep_start : row.keep_stop] = pixels

@@ -15,10 +15,11 @@ from deploy.restore import Infer
 from deploy.swath.options import Options
 from deploy.swath.plan import Plan
 from deploy.swath.raster import Raster
-from deploy.swath.restorer import Restorer
+from deploy.swath.restorer import NAME, Restorer
 from deploy.swath.run import plan_of
 from deploy.swath.runtime import Packed, open_packed, pack
 from deploy.tiling import Span
+from model.scale import settled_scale
 from quant.onnx_file import load_onnx
 
 NETWORKS_KEPT = 2
@@ -31,14 +32,20 @@ class Task:
 
     raster: Raster
     network: Packed
-    full_scale: float
+    full_scale: float | None
     radius_px: int
 
-    def restorer(self) -> Restorer:
-        """For this process."""
+    def restorer(self, window: np.ndarray) -> Restorer:
+        """For this process, at the full scale that was asked for or that the window's pixels tell.
+
+        Raises:
+            ImageError: they leave it open.
+        """
+        largest = (self.raster.largest(part) for part in (window,))
+        full_scale = settled_scale(NAME, self.raster.dtype, largest, self.full_scale)
         with _opening:
             infer = _kept(self.network)
-        return Restorer(self.raster, infer, self.full_scale, self.radius_px)
+        return Restorer(self.raster, infer, full_scale, self.radius_px, NAME)
 
 
 def restore_lazily(bands: Any, raster: Raster, options: Options) -> Any:
@@ -47,6 +54,7 @@ def restore_lazily(bands: Any, raster: Raster, options: Options) -> Any:
     delayed: Any = import_module("dask").delayed
     network = load_onnx(options.model)
     plan = plan_of(raster, network, options)
+    settled_scale(NAME, raster.dtype, (), options.full_scale)  # what the type alone decides comes at once
     packed = pack(network, options.runtime, options.threads or 1)
     task = delayed(Task(raster, packed, options.full_scale, plan.radius_px))
     tile = delayed(restore_tile)
@@ -66,9 +74,9 @@ def restore_tile(task: Task, window: np.ndarray, top: int, left: int, row: Span,
     """The kept pixels (1, h, w) of one tile, from a window (1, ., .) whose first pixel is at (top, left).
 
     Raises:
-        ImageError: values outside 0 to full scale.
+        ImageError: values outside 0 to full scale, or a full scale left open.
     """
-    restorer = task.restorer()
+    restorer = task.restorer(window)
     here = Span(*(side - left for side in (column.start, column.stop, column.keep_start, column.keep_stop)))
     pixels, _ = restorer.kept(restorer.band(top, window), 0, row, here)
     return pixels[None]

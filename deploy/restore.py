@@ -12,22 +12,30 @@ import tifffile
 from deploy.tiling import Tile, plan_tiles
 from model.files import whole_file
 from model.images import read_pixels
+from model.scale import settled_scale
 from profiles.errors import ImageError, OptionError
 from quant.onnx_file import fixed_tile_px
 from quant.session import run
 
 MAX_DN = 4095
 TILE_PX = 640
+RESCALE = "rescale it to the sensor's digital numbers"
 
 Infer = Callable[[np.ndarray], np.ndarray]
 """A network ready to run: (1, 1, h, w) float32 in [0, 1] to the same shape."""
 
 
-def read_acquisition(path: Path) -> np.ndarray:
-    """Digital numbers (H, W) float32 of a mono image of at most 12 bits.
+def read_acquisition(path: Path, full_scale: float | None = None, remedy: str | None = RESCALE) -> np.ndarray:
+    """Digital numbers (H, W) float32 in 0..4095 of a mono image of at most 12 bits.
+
+    Args:
+        path: a TIFF, PNG or JPEG file.
+        full_scale: the pixel value that is full scale; None lets the pixels' type and values decide (model.scale).
+        remedy: what to do about pixels that leave it open; None names --full-scale.
 
     Raises:
-        ImageError: several bands, or values that no 12-bit sensor gives.
+        ImageError: several bands, pixels that leave the full scale open, or values that no 12-bit sensor gives.
+        OptionError: a full scale that such pixels cannot have.
     """
     pixels = read_pixels(path)
     if pixels.ndim != 2:
@@ -35,14 +43,13 @@ def read_acquisition(path: Path) -> np.ndarray:
             str(path), expected="one band", got=f"{pixels.shape[2]} bands", remedy="extract the panchromatic band"
         )
     low, high = float(pixels.min()), float(pixels.max())
-    if low < 0 or high > MAX_DN:
-        raise ImageError(
-            str(path),
-            expected=f"12-bit digital numbers, 0 to {MAX_DN}",
-            got=f"values from {low:g} to {high:g}",
-            remedy="rescale it to the sensor's digital numbers",
-        )
-    return np.asarray(pixels, dtype=np.float32)
+    settled = settled_scale(str(path), pixels.dtype, [max(-low, high)], full_scale, MAX_DN, remedy)
+    if low < 0 or high > settled:
+        expected = f"12-bit digital numbers, 0 to {MAX_DN}" if settled == MAX_DN else f"values of 0 to {settled:g}"
+        got = f"values from {low:g} to {high:g}"
+        raise ImageError(str(path), expected=expected, got=got, remedy=RESCALE)
+    dn = np.asarray(pixels, dtype=np.float32)
+    return dn if settled == MAX_DN else np.minimum(dn * np.float32(MAX_DN / settled), np.float32(MAX_DN))
 
 
 def restore_image(

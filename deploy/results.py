@@ -26,10 +26,16 @@ Mode = Literal["measured", "predicted", "published", "unavailable"]
 DIGITS = {"measured": 4, "predicted": 3, "published": 12, "unavailable": 4}
 """Significant digits shown: a prediction deserves fewer, a published figure stays as printed."""
 
+NOT_FINITE = "the result is not a finite number"
+
 
 @dataclass(frozen=True)
 class Figure:
-    """A number with its unit, its mode and its source."""
+    """A finite number with its unit, its mode and its source, or none and the reason why.
+
+    Raises:
+        ValueError: NaN or infinity, which no reader could tell from a result.
+    """
 
     value: float | None
     unit: str
@@ -37,6 +43,10 @@ class Figure:
     source: str = ""
     interval: tuple[float, float] | None = None
     reason: str = ""
+
+    def __post_init__(self) -> None:
+        if not all(math.isfinite(number) for number in (self.value or 0.0, *(self.interval or ()))):
+            raise ValueError(f"a figure that is not finite: {self.value} {self.interval or ''}")
 
     def to_json(self) -> dict[str, object]:
         """The figure as the schema wants it."""
@@ -62,12 +72,20 @@ class Figure:
 
 
 def measured(value: float, unit: str, source: str, interval: tuple[float, float] | None = None) -> Figure:
-    """A number that this run observed on this machine, and how far a repetition might lie from it where known."""
-    return Figure(float(value), unit, "measured", source, interval)
+    """A number that this run observed on this machine, and how far a repetition might lie from it where known.
+
+    Unavailable where it is NaN or infinite; without an interval where that is.
+    """
+    if not math.isfinite(value):
+        return unavailable(unit, f"{NOT_FINITE} ({float(value)}): {source}")
+    known = interval if interval is not None and all(math.isfinite(end) for end in interval) else None
+    return Figure(float(value), unit, "measured", source, known)
 
 
 def predicted(value: float, unit: str, interval: tuple[float, float], source: str) -> Figure:
-    """A number that a model computed, and how far off it may be."""
+    """A number that a model computed, and how far off it may be; unavailable where any of them is not finite."""
+    if not all(math.isfinite(number) for number in (value, *interval)):
+        return unavailable(unit, f"{NOT_FINITE} ({float(value)}): {source}")
     return Figure(float(value), unit, "predicted", source, (float(interval[0]), float(interval[1])))
 
 

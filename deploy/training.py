@@ -25,6 +25,7 @@ from model.metrics.perceptual import Lpips
 from model.shipped import TOLD_SUFFIX
 from model.simulator.scene import Scene, read_scene
 from model.training.checkpoint import finish
+from model.training.guards import require_finite_output
 from model.training.losses import RestorationLoss
 from model.training.patches import PatchRecipe, PatchSource
 from model.training.precision import Precision
@@ -197,6 +198,7 @@ def _train(run: Run, trainer: Trainer, source: Source, validation: Validation) -
             _show(bar, now)
 
         def validate(step: int, network: Network) -> None:
+            require_finite_output(network, f"training step {step}")
             judged = asdict(validation.judge(network))
             scores.write(step, judged)
             _scalars(board, step, judged)

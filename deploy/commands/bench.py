@@ -32,6 +32,9 @@ def bench(
     ] = None,
     target: Annotated[Target, typer.Option(help="The modelled board, or this machine.")] = Target.vck190_model,
     image: Annotated[Path | None, typer.Option(help="Mono image of at most 12 bits: the swath.")] = None,
+    full_scale: Annotated[
+        float | None, typer.Option(help="Pixel value of --image that is full scale; 4095 if none.")
+    ] = None,
     size: Annotated[str | None, typer.Option(help=f"Size of the swath in pixels; {PAPER_SIZE} if none.")] = None,
     tile: Annotated[str, typer.Option(help="Tile side in pixels; several with commas are swept.")] = "640",
     halo: Annotated[str, typer.Option(help="Context around a tile: 'exact' (no seams) or pixels.")] = "exact",
@@ -62,10 +65,11 @@ def bench(
             print_rows(f"{path.name} on this machine: {table}", part)
         typer.echo(NO_PROXY)
     else:
-        rows = _on_the_board(path, _Request(image, size, tiles, halo, config, measured), budget)
+        rows = _on_the_board(path, _Request(image, full_scale, size, tiles, halo, config, measured), budget)
         typer.echo(PREDICTED)
     arguments = {
         "target": target.value,
+        "full_scale": full_scale,
         "size": size,
         "tile": tile,
         "halo": halo,
@@ -81,6 +85,7 @@ class _Request:
     """What the user wants to know of the board."""
 
     image: Path | None
+    full_scale: float | None
     size: str | None
     tiles_px: list[int]
     halo: str
@@ -96,7 +101,7 @@ def _on_the_board(path: Path, request: _Request, budget_s: float) -> "list[Row]"
     from profiles import load_sensor
 
     sensors = Sensors(load_sensor("pleiades-degraded"), load_sensor("pleiades-reference"))
-    dn = read_acquisition(request.image) if request.image else None
+    dn = read_acquisition(request.image, request.full_scale, None) if request.image else None
     swath = _swath(path, dn.shape if dn is not None else None, request)
     boards, refitted = _boards(request)
     single = len(boards) == len(request.tiles_px) == 1
@@ -166,6 +171,8 @@ def _swath(path: Path, shape: tuple[int, ...] | None, request: _Request) -> "Swa
     from quant.onnx_file import load_onnx
     from quant.radius import receptive_radius_px
 
+    if request.full_scale is not None and shape is None:
+        raise OptionError("--full-scale", expected="--image beside it", got="none", remedy="leave it out")
     size, halo, tile = request.size, request.halo, request.tiles_px[0]
     if shape is not None and size is not None:
         raise OptionError("--size", expected="none with --image", got=size, remedy="give one of the two")

@@ -12,6 +12,10 @@ EXAMPLE = "demo --out demo"
 
 def demo(
     image: Annotated[Path | None, typer.Option(help="Raw 12-bit image, or an 8-bit photograph as scene.")] = None,
+    full_scale: Annotated[
+        float | None,
+        typer.Option(help="Pixel value of a raw image that is full scale; 4095 if none, needed for 0..1."),
+    ] = None,
     out: Annotated[Path, typer.Option(help="Folder for the report and the files made.")] = Path("demo"),
     seed: Annotated[int, typer.Option(min=0, max=SEEDS, help="Seed of every random draw.")] = 0,
     json: Annotated[Path | None, typer.Option(help="Write the figures here.")] = None,
@@ -22,13 +26,16 @@ def demo(
     from deploy.results import Document
     from deploy.tables import print_rows
     from model.files import require_writable
+    from profiles.errors import OptionError
 
+    if full_scale is not None and image is None:
+        raise OptionError("--full-scale", expected="--image beside it", got="none", remedy="leave it out")
     require_writable(*(out / name for name in FILES), json, inputs=(image,))
-    result = run_demo(image, out, seed, lambda step: typer.echo(step, err=True))
+    result = run_demo(image, out, seed, lambda step: typer.echo(step, err=True), full_scale)
     write_report(result.report, out / "report.html")
     for table in result.report.tables:
         print_rows(table.title, table.rows)
     typer.echo(result.report.headline)
     typer.echo(f"report: {out / 'report.html'}")
-    arguments = {"image": image, "out": out, "seed": seed}
+    arguments = {"image": image, "full_scale": full_scale, "out": out, "seed": seed}
     Document("demo", arguments, tuple([image] if image else []), result.rows).write(json)

@@ -1,13 +1,21 @@
 """`beers-deploy restore`: a raw image in, the restored one out, of any size."""
 
+from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from deploy.swath.options import FULL_SCALE_DN, TILE_PX, Compression, Options, Runtime
+from deploy.swath.options import TILE_PX, Compression, Options, Runtime
 
 EXAMPLE = "restore raw.tif restored.tif"
+
+
+class Method(StrEnum):
+    """What restores."""
+
+    network = "network"
+    traditional = "traditional"
 
 
 def restore(
@@ -16,9 +24,17 @@ def restore(
     model: Annotated[
         Path | None, typer.Option(help="ONNX network, float or INT8; the shipped INT8 one if none.")
     ] = None,
+    method: Annotated[Method, typer.Option(help="A network, or the traditional chain of --sensor.")] = Method.network,
+    sensor: Annotated[
+        str | None,
+        typer.Option(help="With --method traditional: the sensor of IN, a profile's name or your .toml file."),
+    ] = None,
     tile: Annotated[int, typer.Option(min=16, help="Longest side of a tile in pixels.")] = TILE_PX,
     halo: Annotated[str, typer.Option(help="Context around a tile: 'exact' (no seams) or pixels.")] = "exact",
-    full_scale: Annotated[float, typer.Option(help="The digital number that is the network's 1.0.")] = FULL_SCALE_DN,
+    full_scale: Annotated[
+        float | None,
+        typer.Option(help="Pixel value that is full scale; 4095 if none, but 8-bit and 0..1 pixels need it."),
+    ] = None,
     runtime: Annotated[Runtime, typer.Option(help="What runs the network.")] = Runtime.onnxruntime,
     threads: Annotated[int, typer.Option(min=0, help="Threads; 0 takes every core, or what falls to a worker.")] = 0,
     compression: Annotated[Compression, typer.Option(help="Of the output, lossless.")] = Compression.zlib,
@@ -38,6 +54,9 @@ def restore(
     """Restore an image tile by tile; with the exact halo the result is the whole image's, bit for bit.
 
     The image is read and written by rows, so memory does not grow with its height. Bands are restored one by one.
+    OUT has the scale of IN: 8-bit pixels with --full-scale 255 come out as 0..255, floats with 1 as 0..1.
+    With --method traditional the image is stabilised, denoised and sharpened as its --sensor asks, in strips of rows:
+    one band, minutes a megapixel, not resumable.
     Georeference, RPCs and missing pixels (NaN, or the nodata value) are kept. Until OUT is finished its rows lie in
     .OUT.part beside it. Workers change no pixel: where they are of one processor and the same versions, the bytes are
     those of one process. Those of a scheduler must find IN under its path; only this process writes.
@@ -47,7 +66,25 @@ def restore(
     from deploy.swath.run import restore_file
     from deploy.tables import print_rows
     from model.files import require_writable
+    from profiles.errors import OptionError
 
+    budget_bytes = int(memory * 1e9) if memory else None
+    if method is Method.traditional:
+        require_writable(out, json, inputs=(image, Path(sensor) if sensor else None))
+        given: dict[str, object] = {
+            "--model": model,
+            "--tile": tile != TILE_PX,
+            "--halo": halo != "exact",
+            "--resume": resume,
+        }
+        given |= {"--runtime": runtime is not Runtime.onnxruntime, "--threads": threads}
+        given |= {"--workers": workers, "--scheduler": scheduler}
+        _require_nothing_else(given)
+        _by_the_chain(image, out, sensor, full_scale, compression, budget_bytes, json)
+        return
+    if sensor is not None:
+        remedy = "add --method traditional, or fold a network for the sensor with 'beers-deploy export --sensor'"
+        raise OptionError("--sensor", expected="--method traditional beside it", got="a network", remedy=remedy)
     path = model or default_int8()
     require_writable(out, json, inputs=(image, path))
     options = Options(
@@ -58,7 +95,7 @@ def restore(
         runtime,
         threads,
         compression,
-        int(memory * 1e9) if memory else None,
+        budget_bytes,
         resume,
         workers,
         scheduler,
@@ -68,3 +105,42 @@ def restore(
     arguments = {"tile": tile, "halo": halo, "full_scale": full_scale, "runtime": runtime, "threads": threads}
     arguments |= {"workers": workers, "scheduler": scheduler}
     Document("restore", arguments, (path, image), (row,)).write(json)
+
+
+def _require_nothing_else(given: dict[str, object]) -> None:
+    """The traditional chain takes no option of a network's.
+
+    Raises:
+        OptionError: one was given.
+    """
+    from profiles.errors import OptionError
+
+    for name, value in given.items():
+        if value:
+            raise OptionError(name, expected="none with --method traditional", got="one", remedy="leave it out")
+
+
+def _by_the_chain(
+    image: Path,
+    out: Path,
+    sensor: str | None,
+    full_scale: float | None,
+    compression: Compression,
+    memory_bytes: int | None,
+    json: Path | None,
+) -> None:
+    from deploy.results import Document
+    from deploy.swath.traditional import Request, restore_file_traditionally
+    from deploy.tables import print_rows
+    from profiles import load_sensor
+    from profiles.errors import OptionError
+    from quant.calibration import REFERENCE
+
+    if sensor is None:
+        remedy = "name a profile ('beers-deploy profiles' lists them) or give your .toml file"
+        raise OptionError("--sensor", expected="the sensor that acquired IN", got="none", remedy=remedy)
+    request = Request(load_sensor(sensor), load_sensor(REFERENCE), full_scale, compression, memory_bytes)
+    row = restore_file_traditionally(image, out, request)
+    print_rows(f"wrote {out}", [row])
+    arguments = {"method": "traditional", "sensor": sensor, "full_scale": full_scale}
+    Document("restore", arguments, (image,), (row,)).write(json)

@@ -43,7 +43,14 @@ def worker_figures(peak_gb: float | None) -> dict[str, Figure]:
 
 
 def run_row(
-    name: str, plan: Plan, done_rows: int, time_s: float, runtime: str, options: Options, more: dict[str, Figure]
+    name: str,
+    plan: Plan,
+    done_rows: int,
+    time_s: float,
+    runtime: str,
+    options: Options,
+    more: dict[str, Figure],
+    full_scale: float,
 ) -> Row:
     """The figures of one run, of which `done_rows` were finished before."""
     useful_px = plan.bands * (plan.height_px - done_rows) * plan.width_px
@@ -57,7 +64,12 @@ def run_row(
         **more,
     }
     workers = {"workers": options.scheduler or str(options.workers)} if options.is_spread else {}
-    return Row("restore", name, figures, {"halo": _halo(plan), "runtime": runtime, **workers})
+    return Row(
+        "restore",
+        name,
+        figures,
+        {"halo": _halo(plan), "full scale": f"{full_scale:g}", "runtime": runtime, **workers},
+    )
 
 
 def _halo(plan: Plan) -> str:

@@ -10,14 +10,14 @@ from model.files import sha256
 DIGEST_BYTES = 1 << 16
 
 
-def make_job(image: Path, options: Options, plan: Plan, runtime: str) -> dict[str, object]:
+def make_job(image: Path, options: Options, plan: Plan, runtime: str, full_scale: float) -> dict[str, object]:
     """As the journal keeps it; who computes, and on how many machines, is no part of it."""
     return {
         "image": [*fingerprint(image), image.stat().st_mtime_ns],
         "model": sha256(options.model),
         "tile_px": plan.tile_px,
         "halo_px": plan.halo_px,
-        "full_scale": options.full_scale,
+        "full_scale": full_scale,
         "runtime": runtime,
     }
 

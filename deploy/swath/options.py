@@ -4,10 +4,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
 
-from profiles.errors import OptionError
-
 TILE_PX = 640
-FULL_SCALE_DN = 4095.0
 
 
 class Runtime(StrEnum):
@@ -39,7 +36,7 @@ class Options:
         model: the network's file.
         tile_px: side of a tile.
         halo: 'exact', or pixels of context around a tile.
-        full_scale: the digital number that is 1.0 to the network.
+        full_scale: the pixel value that is 1.0 to the network; None lets type and values decide (model.scale).
         runtime: what runs the network.
         threads: of the runtime; 0 takes every core, or a worker's share of them.
         compression: of the output.
@@ -52,7 +49,7 @@ class Options:
     model: Path
     tile_px: int = TILE_PX
     halo: str = "exact"
-    full_scale: float = FULL_SCALE_DN
+    full_scale: float | None = None
     runtime: Runtime = Runtime.onnxruntime
     threads: int = 0
     compression: Compression = Compression.zlib
@@ -65,15 +62,3 @@ class Options:
     def is_spread(self) -> bool:
         """Whether other processes restore."""
         return bool(self.workers or self.scheduler)
-
-
-def check_scale(full_scale: float, kind: str) -> None:
-    """A full scale that pixels of this kind (numpy's letter, of the output) can have.
-
-    Raises:
-        OptionError: another.
-    """
-    if full_scale > 0 and (kind == "f" or (full_scale <= 65535 and full_scale % 1 == 0)):
-        return
-    expected = "a number above 0" if kind == "f" else "a whole number of 1 to 65535 for integer pixels"
-    raise OptionError("--full-scale", expected=expected, got=f"{full_scale:g}", remedy="4095 is 12 bits")

@@ -47,6 +47,12 @@ class Raster:
             flags |= pixels == pixels.dtype.type(self.nodata)
         return flags
 
+    def largest(self, pixels: np.ndarray) -> float:
+        """The largest size of a known pixel among these, 0 where none is known."""
+        known = ~self.missing(pixels)
+        low, high = (float(extreme(pixels, where=known, initial=0)) for extreme in (np.min, np.max))
+        return max(-low, high)
+
     @property
     def may_miss(self) -> bool:
         """Whether any pixel could be missing at all."""

@@ -11,6 +11,9 @@ from deploy.swath.reader import Source
 from deploy.tiling import Span
 from profiles.errors import ImageError
 
+NAME = "image"
+"""Of one that came without a file."""
+
 
 @dataclass(frozen=True)
 class Band:
@@ -38,7 +41,7 @@ class Restorer:
     infer: Infer
     full_scale: float
     radius_px: int
-    name: str = "image"
+    name: str = NAME
 
     def read(self, source: Source, start: int, stop: int) -> Band:
         """The rows that a row of tiles needs.
@@ -61,10 +64,7 @@ class Restorer:
         Raises:
             ImageError: values outside 0 to full scale.
         """
-        missing = self.raster.missing(pixels) if self.raster.may_miss else None
-        band = Band(top, pixels, missing if missing is not None and missing.any() else None)
-        self._check(band)
-        return band
+        return checked_band(self.raster, top, pixels, self.full_scale, self.name)
 
     def kept(self, band: Band, plane: int, rows: Span, columns: Span) -> tuple[np.ndarray, int]:
         """The kept pixels of one tile as they are stored, and how many of them are known."""
@@ -79,7 +79,7 @@ class Restorer:
             return stored, 0
         window = restore_window(self._window(band, plane, rows, columns), self.infer, self.full_scale)
         inner = window[_within(rows), _within(columns)]
-        result = self._as_stored(inner)
+        result = as_stored(self.raster, inner, self.full_scale)
         if missing is None:
             return result, result.size
         return np.where(missing, stored, result), int((~missing).sum())
@@ -95,31 +95,42 @@ class Restorer:
         above, aside = rows.start - band.top - top, columns.start - left
         return filled[above : above + rows.stop - rows.start, aside : aside + columns.stop - columns.start]
 
-    def _as_stored(self, restored: np.ndarray) -> np.ndarray:
-        """Rounded where the output holds integers; never the nodata value, which would read as missing."""
-        result = np.rint(restored) if self.raster.out_dtype.kind == "u" else restored
-        result = result.astype(self.raster.out_dtype)
-        nodata = self.raster.nodata
-        if nodata is not None and 0 <= nodata <= self.full_scale:
-            result[result == result.dtype.type(nodata)] = self._beside(nodata)
-        return result
 
-    def _beside(self, nodata: float) -> float:
-        if self.raster.out_dtype.kind == "u":
-            return nodata + 1 if nodata + 1 <= self.full_scale else nodata - 1
-        towards = self.full_scale if nodata < self.full_scale else 0
-        return float(np.nextafter(np.float32(nodata), np.float32(towards)))
+def checked_band(raster: Raster, top: int, pixels: np.ndarray, full_scale: float, name: str) -> Band:
+    """Rows from `top` on, (bands, rows, width) as stored, with what they miss.
 
-    def _check(self, band: Band) -> None:
-        known = True if band.missing is None else ~band.missing
-        low, high = (float(extreme(band.pixels, where=known, initial=0)) for extreme in (np.min, np.max))
-        if low < 0 or high > self.full_scale:
-            raise ImageError(
-                f"{self.name}, rows {band.top} to {band.top + band.pixels.shape[1] - 1}",
-                expected=f"digital numbers of 0 to {self.full_scale:g}",
-                got=f"values from {low:g} to {high:g}",
-                remedy="give the sensor's highest number as --full-scale, or mark missing pixels as nodata",
-            )
+    Raises:
+        ImageError: values outside 0 to full scale.
+    """
+    missing = raster.missing(pixels) if raster.may_miss else None
+    band = Band(top, pixels, missing if missing is not None and missing.any() else None)
+    known = True if band.missing is None else ~band.missing
+    low, high = (float(extreme(band.pixels, where=known, initial=0)) for extreme in (np.min, np.max))
+    if low < 0 or high > full_scale:
+        raise ImageError(
+            f"{name}, rows {band.top} to {band.top + band.pixels.shape[1] - 1}",
+            expected=f"digital numbers of 0 to {full_scale:g}",
+            got=f"values from {low:g} to {high:g}",
+            remedy="give the sensor's highest number as --full-scale, or mark missing pixels as nodata",
+        )
+    return band
+
+
+def as_stored(raster: Raster, restored: np.ndarray, full_scale: float) -> np.ndarray:
+    """Rounded where the output holds integers; never the nodata value, which would read as missing."""
+    result = np.rint(restored) if raster.out_dtype.kind == "u" else restored
+    result = result.astype(raster.out_dtype)
+    nodata = raster.nodata
+    if nodata is not None and 0 <= nodata <= full_scale:
+        result[result == result.dtype.type(nodata)] = _beside(raster, nodata, full_scale)
+    return result
+
+
+def _beside(raster: Raster, nodata: float, full_scale: float) -> float:
+    if raster.out_dtype.kind == "u":
+        return nodata + 1 if nodata + 1 <= full_scale else nodata - 1
+    towards = full_scale if nodata < full_scale else 0
+    return float(np.nextafter(np.float32(nodata), np.float32(towards)))
 
 
 def _within(span: Span) -> slice:

@@ -26,14 +26,16 @@ ROWS_HERE = 2
 """One being written, one on its way to be."""
 
 
-def make_work(image: Path, plan: Plan, network: onnx.ModelProto, runtime: str, options: Options) -> Work:
+def make_work(
+    image: Path, plan: Plan, network: onnx.ModelProto, runtime: str, options: Options, full_scale: float
+) -> Work:
     """What the workers of one run are to do.
 
     Those of this machine share its cores; elsewhere a slot is taken to be worth one.
     """
     share = (os.cpu_count() or 1) // options.workers if options.workers else 1
     packed = pack(network, options.runtime, options.threads or max(share, 1))
-    return Work(uuid.uuid4().hex, image.absolute(), fingerprint(image), plan, options, packed, runtime)
+    return Work(uuid.uuid4().hex, image.absolute(), fingerprint(image), plan, options, packed, runtime, full_scale)
 
 
 def fill_spread(spool: Spool, source: Source, work: Work, say: Say) -> float | None:

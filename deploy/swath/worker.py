@@ -36,6 +36,7 @@ class Work:
         seen: the image's fingerprint, to know another file of that name.
         network: to be opened.
         runtime: name and version of what runs it where the run began; another might give other bytes.
+        full_scale: the pixel value that is 1.0 to the network, settled where the run began.
     """
 
     key: str
@@ -45,6 +46,7 @@ class Work:
     options: Options
     network: Packed
     runtime: str
+    full_scale: float
 
 
 @dataclass(frozen=True)
@@ -73,7 +75,7 @@ class Opened:
         infer, runtime = open_packed(work.network)
         if runtime != work.runtime:
             raise MachineError(here(), expected=work.runtime, got=runtime, remedy="install the same everywhere")
-        scale, radius_px = work.options.full_scale, work.plan.radius_px
+        scale, radius_px = work.full_scale, work.plan.radius_px
         self.restorer = Restorer(self.source.raster, infer, scale, radius_px, str(work.image))
 
     def restore(self, row: Span) -> Piece:

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from model.conditioning import Network, ToldConvBEERS
-from model.training.guards import Guards
+from model.training.guards import Guards, require_finite_output
 from model.training.precision import Precision
 from model.training.recipe import TrainingRecipe
 from model.weights_file import all_finite, load_network, load_told, read_tensors, save_network, write_tensors
@@ -82,11 +82,12 @@ def finish(network: Network, path: Path, recipe: dict[str, object]) -> Network:
     """Write a network with the recipe that made it, and read it back.
 
     Raises:
-        ModelError: a weight is not finite.
+        ModelError: a weight is not finite, or what the network makes of an image.
     """
     if not all_finite(network.state_dict()):
         remedy = "lower the learning rate"
         raise ModelError(str(path), expected="finite weights", got="NaN or infinity", remedy=remedy)
+    require_finite_output(network, str(path))
     save_network(path, network, recipe)
     return load_told(path)[0] if isinstance(network, ToldConvBEERS) else load_network(path)[0]
 

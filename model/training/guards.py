@@ -2,10 +2,14 @@
 
 import math
 
+import torch
+
+from model.conditioning import RANGES, Network, ToldConvBEERS, fold
 from profiles.errors import ModelError
 
 MAX_BAD_STEPS = 10
 WINDOW_STEPS = 200
+TEST_SIDE_PX = 65
 DIVERGED = 5.0
 """A mean loss this many times the best one so far is no fluctuation: batches vary by a factor of two."""
 
@@ -58,6 +62,25 @@ class Guards:
         guards = cls(int(str(kept["bad_steps"])), math.inf if best is None else float(str(best)))
         guards._sum, guards._count = float(str(kept["sum"])), int(str(kept["count"]))
         return guards
+
+
+def require_finite_output(network: Network, where: str) -> None:
+    """Refuse a network that makes NaN or infinity of an image in [0, 1]: its weights may be finite all the same.
+
+    Args:
+        network: on the CPU; one that is told its sensor is told the middle of every range.
+        where: what to name in the message.
+
+    Raises:
+        ModelError: it does.
+    """
+    image = torch.rand((1, 1, TEST_SIDE_PX, TEST_SIDE_PX), generator=torch.Generator().manual_seed(0))
+    plain = fold(network, torch.zeros(len(RANGES))) if isinstance(network, ToldConvBEERS) else network
+    with torch.inference_mode():
+        restored = plain(torch.cat([torch.zeros_like(image), image, torch.ones_like(image)]))
+    if not bool(torch.isfinite(restored).all()):
+        remedy = "lower the learning rate"
+        raise ModelError(where, expected="finite pixels of a test image", got="NaN or infinity", remedy=remedy)
 
 
 def _error(step: int, expected: str, got: str) -> ModelError:

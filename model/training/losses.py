@@ -26,6 +26,10 @@ class LossWeights:
     fft: float = 0.1
     radiance: float = 0.0
 
+    def total(self, perceptual: bool = True) -> float:
+        """The sum of the weights, that of LPIPS only where it is computed."""
+        return self.l1 + self.l2 + self.fft + self.radiance + (self.lpips if perceptual else 0.0)
+
 
 PAPER = LossWeights()
 

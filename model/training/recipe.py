@@ -1,10 +1,11 @@
 """What decides the weights, besides the pairs."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Literal
 
 from model.training.losses import PAPER, LossWeights
+from profiles.errors import OptionError
 
 Optimiser = Literal["adam", "adamw"]
 
@@ -25,6 +26,9 @@ class TrainingRecipe:
         loss: weights of the loss's terms.
         distil: weight of the L1 distance to a teacher's output; 0 without a teacher.
         seed: of the first weights and of the patches.
+
+    Raises:
+        OptionError: a number that is negative or not finite.
     """
 
     steps: int
@@ -38,6 +42,14 @@ class TrainingRecipe:
     loss: LossWeights = PAPER
     distil: float = 0.0
     seed: int = 0
+
+    def __post_init__(self) -> None:
+        numbers = {"learning rate": self.learning_rate, "weight of the teacher": self.distil}
+        numbers |= {f"weight of {term} in the loss": weight for term, weight in asdict(self.loss).items()}
+        for name, value in numbers.items():
+            if not (math.isfinite(value) and value >= 0):
+                expected, remedy = "a finite number, 0 or above", "correct it"
+                raise OptionError(name, expected=expected, got=f"{value:g}", remedy=remedy)
 
     def rate_at(self, step: int) -> float:
         """Learning rate of a step: linear warm-up, then a cosine down to zero."""

@@ -21,6 +21,7 @@ from model.training.losses import RestorationLoss
 from model.training.precision import MixedPrecision, Precision, choose_precision, in_precision
 from model.training.recipe import TrainingRecipe
 from model.training.workers import Worker
+from profiles.errors import OptionError
 
 
 class Source(Protocol):
@@ -69,6 +70,9 @@ class Trainer:
         teacher: a network whose outputs the recipe's `distil` weighs.
         precision: what the body is computed in; None measures what is faster here.
         told: whether the network is told the sensor of each patch.
+
+    Raises:
+        OptionError: a loss of which nothing is weighed.
     """
 
     def __init__(
@@ -85,6 +89,7 @@ class Trainer:
     ) -> None:
         self.recipe, self.worker = recipe, worker or Worker()
         self.loss, self.device = loss or RestorationLoss(recipe.loss), self.worker.device(device)
+        require_loss(self.loss, recipe.distil if teacher is not None else 0.0)
         self.step, self.guards = 0, Guards()
         self.network = new_network(variant, torch.Generator().manual_seed(recipe.seed), told)
         if start is not None:
@@ -216,6 +221,19 @@ class Meter:
         progress = Progress(trainer.step, trainer.recipe.steps, terms, patches / elapsed_s, trainer.precision)
         self._clear()
         return progress
+
+
+def require_loss(loss: RestorationLoss, distil: float) -> None:
+    """Refuse a loss that is 0 whatever the network gives: such a run learns nothing.
+
+    Raises:
+        OptionError: no term that is computed has a weight above 0.
+    """
+    if loss.weights.total(loss.perceptual is not None) + distil > 0:
+        return
+    left_out = ", and none but LPIPS, which lacks its weights" if loss.weights.lpips else ""
+    got, remedy = f"weights of 0{left_out}", "raise one of --l1-weight, --l2-weight, --fft-weight, --radiance-weight"
+    raise OptionError("loss", expected="a term of weight above 0", got=got, remedy=remedy)
 
 
 def new_network(variant: Variant, generator: torch.Generator, told: bool) -> Network:

@@ -265,3 +265,8 @@ def test_bad_options_are_refused(tmp_path: Path) -> None:
     tifffile.imwrite(mono, np.zeros((8, 9), np.uint16))
     with pytest.raises(OptionError, match="--size"):
         run("bench", model, "--image", str(mono), "--size", "3x4")
+    with pytest.raises(OptionError, match="--full-scale"):
+        run("bench", model, "--full-scale", "255")
+    tifffile.imwrite(mono, np.full((8, 9), 0.5, np.float32))
+    with pytest.raises(ImageError, match=r"0\.5; .*--full-scale"):
+        run("bench", model, "--image", str(mono))

@@ -18,8 +18,11 @@ from typer.main import get_command
 from typer.testing import CliRunner
 
 from deploy.cli import COMMANDS, app
+from deploy.demo import read_input
+from deploy.restore import read_acquisition
 from deploy.results import SCHEMA_PATH
 from deploy.shipped import SENSOR, default_int8
+from profiles.errors import ImageError
 
 runner = CliRunner()
 
@@ -143,6 +146,42 @@ def test_restore_refuses_what_is_no_acquisition(name: str, word: str, tmp_path: 
     folder.mkdir()
     fails(["restore", str(bad_images(folder)[name]), str(tmp_path / "out.tif")], word)
     assert not (tmp_path / "out.tif").exists()
+
+
+def test_a_photograph_is_no_raw_image_until_its_scale_is_named(tmp_path: Path) -> None:
+    picture, out = tmp_path / "photo.jpg", tmp_path / "out.tif"
+    Image.fromarray(np.random.default_rng(0).integers(0, 256, (40, 50, 3), np.uint8)).save(picture)
+    fails(["restore", str(picture), str(out)], "--full-scale")
+    assert not out.exists()
+    result = runner.invoke(app, ["restore", str(picture), str(out), "--full-scale", "255"])
+    assert result.exit_code == 0, result.output
+    restored = tifffile.imread(out)
+    assert restored.dtype == np.uint16
+    assert restored.shape == (3, 40, 50)
+    assert restored.max() <= 255
+
+
+def test_an_acquisition_of_another_scale_is_read_as_digital_numbers(tmp_path: Path) -> None:
+    dn = np.arange(4096, dtype=np.uint16).reshape(64, 64)
+    tifffile.imwrite(tmp_path / "dn.tif", dn)
+    tifffile.imwrite(tmp_path / "share.tif", (dn / 4095).astype(np.float32))
+    tifffile.imwrite(tmp_path / "eight.tif", (dn // 16).astype(np.uint8))
+    np.testing.assert_array_equal(read_acquisition(tmp_path / "dn.tif"), dn)
+    np.testing.assert_allclose(read_acquisition(tmp_path / "share.tif", 1), dn, atol=1e-3)
+    np.testing.assert_allclose(read_acquisition(tmp_path / "eight.tif", 255), dn, atol=17)
+    for name in ("share.tif", "eight.tif"):
+        with pytest.raises(ImageError, match="rescale it"):  # where no option settles it, as for pairs
+            read_acquisition(tmp_path / name)
+        with pytest.raises(ImageError, match="--full-scale"):
+            read_input(tmp_path / name, 0) if name == "share.tif" else read_acquisition(tmp_path / name, None, None)
+        with pytest.raises(ImageError, match="values from 0"):
+            read_acquisition(tmp_path / name, 0.5 if name == "share.tif" else 100)
+    assert read_input(tmp_path / "share.tif", 0, 1).degraded.max() == 4095
+    assert read_input(tmp_path / "eight.tif", 0, 255).pair is None  # a raw image, no scene
+
+
+def test_a_full_scale_without_an_image_is_refused() -> None:
+    fails(["demo", "--full-scale", "255"], "--image")
 
 
 def test_unwritable_output_is_one_sentence(tmp_path: Path) -> None:

@@ -7,11 +7,12 @@ import torch
 from typer.testing import CliRunner, Result
 
 from deploy.cli import app
-from deploy.export import parity, to_onnx
+from deploy.export import parity, require_parity, to_onnx
 from model.conditioning import ToldConvBEERS, initialise_coefficients, tell
 from model.convbeers import ConvBEERS, Variant, initialise
 from model.weights_file import load_told, save_network
 from profiles import load_sensor
+from profiles.errors import ModelError
 from profiles.toml import HERE
 from quant.onnx_file import fixed_tile_px, metadata, save_onnx
 from quant.session import open_session, run
@@ -38,6 +39,34 @@ def test_parity_notices_other_weights(network: ConvBEERS, tmp_path: Path) -> Non
     other = ConvBEERS(network.variant)
     initialise(other, torch.Generator().manual_seed(1))
     assert parity(other.eval(), path, 33) > 1e-4
+
+
+def overflowing(network: ConvBEERS) -> ConvBEERS:
+    """Finite weights all the same, as a far too high learning rate leaves them."""
+    broken = ConvBEERS(network.variant)
+    broken.load_state_dict({name: value * 1e25 for name, value in network.state_dict().items()})
+    return broken.eval()
+
+
+def test_a_network_that_gives_nan_is_not_exported(network: ConvBEERS, tmp_path: Path) -> None:
+    weights, out = tmp_path / "run.safetensors", tmp_path / "float.onnx"
+    save_network(weights, overflowing(network), {})
+    result = export("--checkpoint", str(weights), "--out", str(out))
+    assert result.exit_code == 2
+    assert "expected finite pixels" in " ".join(result.output.split())
+    assert "largest difference" not in result.output
+    assert not out.exists()
+    with pytest.raises(ModelError, match="finite pixels"):
+        parity(overflowing(network), to_onnx(overflowing(network), {}), 33)
+    save_network(weights, network, {})
+    assert export("--checkpoint", str(weights), "--out", str(out)).exit_code == 0
+
+
+def test_an_export_that_computes_something_else_is_refused(network: ConvBEERS) -> None:
+    other = ConvBEERS(network.variant)
+    initialise(other, torch.Generator().manual_seed(1))
+    with pytest.raises(ModelError, match="report it"):
+        require_parity(other.eval(), to_onnx(network, {}), 33)
 
 
 def test_the_file_names_its_variant(network: ConvBEERS) -> None:

@@ -160,6 +160,21 @@ def test_values_beyond_full_scale_are_refused_at_once_or_when_computed(da: Any, 
         lazy.compute()
 
 
+def test_a_full_scale_left_open_is_asked_for(da: Any, model: Path) -> None:
+    shares, eight = (noise(60, 50) / 4095).astype(np.float32), (noise(60, 50) // 16).astype(np.uint8)
+    for image in (shares, eight, da.from_array(eight, chunks=20)):
+        with pytest.raises(ImageError, match=r"^image: .*--full-scale"):
+            restore(image, model, tile_px=23)
+    lazy = restore(da.from_array(shares, chunks=20), model, tile_px=23)
+    with pytest.raises(ImageError, match=r"^image: .*--full-scale"):
+        lazy.compute()
+    for image, full_scale in ((shares, 1), (eight, 255)):
+        whole = restore(image, model, tile_px=23, full_scale=full_scale)
+        assert whole.max() <= full_scale
+        lazy = restore(da.from_array(image, chunks=20), model, tile_px=23, full_scale=full_scale)
+        np.testing.assert_array_equal(lazy.compute(), whole)
+
+
 @pytest.mark.parametrize(
     "image",
     [

@@ -96,6 +96,23 @@ def test_a_gate_on_a_network_gone_wrong_still_writes_json(value: float, tmp_path
     assert checks[0].passed == (value == 0)
 
 
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
+def test_no_figure_is_other_than_finite(value: float) -> None:
+    """It cannot be made, and what measured it says so: unavailable, with the reason."""
+    for mode in ("measured", "predicted", "published"):
+        with pytest.raises(ValueError, match="not finite"):
+            Figure(value, "s", mode, "here", (0, 1))
+    with pytest.raises(ValueError, match="not finite"):
+        Figure(1.0, "s", "predicted", "here", (0, value))
+    for figure in (measured(value, "dB", "one pair"), predicted(value, "dB", (1, 2), "one pair")):
+        assert (figure.value, figure.mode) == (None, "unavailable")
+        assert "not a finite number" in figure.reason
+        assert "one pair" in figure.reason
+    assert predicted(1, "s", (0, value), "a model").mode == "unavailable"
+    assert measured(1, "s", "here", (0, value)).interval is None
+    assert measured(1, "s", "here", (0, 2)).interval == (0, 2)
+
+
 CHECKS = Check("MAE", 6e-4, 7e-4, "of full scale"), Check("PSNR drop", math.nan, 0.25, "dB", detail="of a layer")
 
 

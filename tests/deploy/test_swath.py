@@ -125,6 +125,51 @@ def test_full_scale_is_what_the_network_sees_as_one(model: Path, tmp_path: Path)
     assert np.abs(unit * 4095 - twelve.astype(float)).max() <= 0.51
 
 
+def test_8_bit_pixels_come_back_in_their_scale(model: Path, tmp_path: Path) -> None:
+    eight = np.random.default_rng(3).integers(0, 256, (40, 31)).astype(np.uint8)
+    refused(tmp_path, eight, Options(model, tile_px=23), ImageError, "8-bit pixels", "--full-scale")
+    (tmp_path / "out.tif").unlink()
+    restored, row = restore(tmp_path, eight, Options(model, tile_px=23, full_scale=255))
+    assert restored.max() <= 255
+    assert row.text["full scale"] == "255"
+    infer = partial(run, open_session(load_onnx(model)))
+    np.testing.assert_array_equal(restored, np.rint(restore_window(eight, infer, 255)).astype(np.uint16))
+
+
+@pytest.mark.parametrize("workers", [0, 1])
+def test_floats_of_about_0_to_1_are_refused_until_their_scale_is_named(
+    workers: int, model: Path, tmp_path: Path
+) -> None:
+    if workers:
+        pytest.importorskip("distributed")
+    shares = (noise(61, 37) / 4095).astype(np.float32)
+    shares[5:9] = np.nan
+    refused(
+        tmp_path, shares, Options(model, tile_px=23, workers=workers), ImageError, "floats of at most 1", "--full"
+    )
+    refused(tmp_path, shares * 1.9, Options(model, tile_px=23, workers=workers), ImageError, "--full-scale")
+    (tmp_path / "out.tif").unlink()
+    restored, _ = restore(tmp_path, shares, Options(model, tile_px=23, full_scale=1, workers=workers))
+    assert 0 < np.nanmean(restored) < np.nanmax(restored) <= 1
+
+
+def test_one_bright_row_at_the_end_makes_floats_digital_numbers(model: Path, tmp_path: Path) -> None:
+    dark = np.full((70, 37), 0.5, np.float32)
+    dark[-1, 3] = 900
+    one, row = restore(tmp_path, dark, Options(model, tile_px=23))
+    asked, _ = restore(tmp_path, dark, Options(model, tile_px=23, full_scale=4095))
+    np.testing.assert_array_equal(one, asked)
+    assert row.text["full scale"] == "4095"
+
+
+def test_nodata_settles_no_scale(model: Path, tmp_path: Path) -> None:
+    shares = (noise(40, 37) / 4095).astype(np.float32)
+    shares[3:7] = -9999
+    tifffile.imwrite(tmp_path / "in.tif", shares, extratags=[(42113, "s", 0, "-9999", True)])
+    with pytest.raises(ImageError, match="--full-scale"):
+        swath.restore_file(tmp_path / "in.tif", tmp_path / "out.tif", Options(model, tile_px=23), lambda _: None)
+
+
 def test_georeference_and_rpcs_are_kept(model: Path, tmp_path: Path) -> None:
     tags = [
         (33550, "d", 3, (0.5, 0.5, 0.0), True),

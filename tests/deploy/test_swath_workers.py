@@ -172,7 +172,7 @@ def work(image: Path, model: Path) -> Work:
     with open_source(image) as source:
         plan = plan_of(source.raster, network, options)
     _, runtime = open_runtime(Runtime.onnxruntime, network, 1)
-    return make_work(image, plan, network, runtime, options)
+    return make_work(image, plan, network, runtime, options, 4095)
 
 
 def in_workers(scheduler: str, work: Work) -> None:

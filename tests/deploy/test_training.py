@@ -107,6 +107,12 @@ def test_a_told_run_that_learns_nothing_is_what_it_started_from(images: Path, tm
         (["--resume", "--drawn", "1"], "no such file"),
         (["--told", "--pairs", "here"], "do not say what sensor"),
         (["--told", "--drawn", "1", "--teacher", "here"], "teacher is not told"),
+        (["--drawn", "1", "--learning-rate", "inf"], "learning rate: expected a finite number"),
+        (["--drawn", "1", "--fft-weight", "inf"], "weight of fft in the loss: expected a finite number"),
+        (
+            ["--drawn", "1", "--l1-weight", "0", "--lpips-weight", "0", "--fft-weight", "0"],
+            "a term of weight above 0",
+        ),
     ],
 )
 def test_wrong_options_get_one_sentence(options: list[str], words: str, tmp_path: Path) -> None:
@@ -116,6 +122,28 @@ def test_wrong_options_get_one_sentence(options: list[str], words: str, tmp_path
     assert result.exit_code == 2
     assert words in " ".join(result.output.split())
     assert "Traceback" not in result.output
+
+
+def test_a_loss_of_nothing_but_lpips_needs_its_weights(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("BEERS_LPIPS_WEIGHTS", raising=False)
+    options = ["--drawn", "1", "--l1-weight", "0", "--fft-weight", "0", "--steps", "1"]
+    result = CliRunner().invoke(app, ["train", "--out", str(tmp_path / "r"), *options])
+    assert result.exit_code == 2
+    assert "lacks its weights" in " ".join(result.output.split())
+
+
+@pytest.mark.parametrize("validate_every", ["0", "2"])
+@pytest.mark.parametrize("told", [False, True])
+def test_a_run_that_ends_in_nan_leaves_no_weights(
+    told: bool, validate_every: str, images: Path, tmp_path: Path
+) -> None:
+    more = ["--learning-rate", "1e30", "--validate-every", validate_every, *(["--told"] if told else [])]
+    options = ["--variant", "convbeers-xs", "--steps", "2", "--batch", "2", "--patch", "32", *more]
+    result = CliRunner().invoke(app, ["train", "--images", str(images), "--out", str(tmp_path / "r"), *options])
+    assert result.exit_code == 2, result.output
+    assert "lower the learning rate" in " ".join(result.output.split())
+    assert "wrote" not in result.output
+    assert not list((tmp_path / "r").glob("convbeers*"))
 
 
 def test_a_run_in_the_way_is_not_overwritten(images: Path, tmp_path: Path) -> None:

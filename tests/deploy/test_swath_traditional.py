@@ -1,0 +1,135 @@
+"""The traditional chain on files: the pixels of the chain on the whole array, whatever the sensor."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tifffile
+import torch
+from typer.testing import CliRunner
+
+from deploy.cli import app
+from deploy.swath.traditional import Request, restore_file_traditionally
+from model.traditional.pipeline import restore_traditional
+from profiles import load_sensor
+from profiles.errors import ImageError, MachineError
+from profiles.toml import HERE
+
+SHAPE = (151, 67)
+
+
+def request() -> Request:
+    return Request(load_sensor("pleiades-degraded"), load_sensor("pleiades-reference"))
+
+
+def noise(seed: int = 0) -> np.ndarray:
+    return np.random.default_rng(seed).integers(300, 1500, SHAPE).astype(np.uint16)
+
+
+def of_array(pixels: np.ndarray, asked: Request) -> np.ndarray:
+    return restore_traditional(torch.from_numpy(pixels.astype(np.float32)), asked.chain()).numpy()
+
+
+def of_file(folder: Path, pixels: np.ndarray, asked: Request, **written: object) -> np.ndarray:
+    tifffile.imwrite(folder / "in.tif", pixels, **written)  # type: ignore[arg-type]
+    row = restore_file_traditionally(folder / "in.tif", folder / "out.tif", asked)
+    assert row.text["method"] == "traditional"
+    assert sorted(path.name for path in folder.iterdir()) == ["in.tif", "out.tif"]
+    return tifffile.imread(folder / "out.tif")
+
+
+def own_sensor(folder: Path) -> Path:
+    """A sensor of another gain, 14 bits and a blur of its own."""
+    text = (HERE / "sensors" / "pleiades-degraded.toml").read_text()
+    lines = []
+    for line in text.splitlines():
+        if line.startswith("bits"):
+            line = line.replace("12", "14")
+        if line.startswith("gain_dn_per_radiance"):
+            line = line.replace("10.2375", "40.0")
+        lines.append(line)
+    path = folder / "mine.toml"
+    path.write_text("\n".join(lines))
+    return path
+
+
+def test_a_file_gives_the_pixels_of_the_array(tmp_path: Path) -> None:
+    whole = of_array(noise(), request())
+    tags = [(33550, "d", 3, (0.5, 0.5, 0.0), True)]
+    restored = of_file(tmp_path, noise(), request(), rowsperstrip=16, compression="zlib", extratags=tags)
+    np.testing.assert_array_equal(restored, np.rint(whole).astype(np.uint16))
+    with tifffile.TiffFile(tmp_path / "out.tif") as file:
+        assert file.pages.first.tags[33550].value == (0.5, 0.5, 0.0)
+    floats = of_file(tmp_path, noise().astype(np.float32), request())
+    np.testing.assert_array_equal(floats, whole)
+    assert np.abs(whole - noise()).mean() > 10  # it does something
+
+
+def test_missing_pixels_stay(tmp_path: Path) -> None:
+    pixels = noise()
+    pixels[20:40, 5:9] = 7
+    restored = of_file(tmp_path, pixels, request(), extratags=[(42113, "s", 0, "7", True)])
+    np.testing.assert_array_equal(restored == 7, pixels == 7)
+    spoilt = np.where(pixels == 7, np.nan, pixels).astype(np.float32)
+    np.testing.assert_array_equal(of_file(tmp_path, spoilt, request()), of_array(spoilt, request()))
+
+
+def test_the_output_has_the_scale_of_the_input_whatever_the_gain(tmp_path: Path) -> None:
+    mine = replace(request(), sensor=load_sensor(str(own_sensor(tmp_path))))
+    (tmp_path / "files").mkdir()
+    flat = np.full(SHAPE, 8000, np.uint16)
+    restored = of_file(tmp_path / "files", flat, mine)
+    assert abs(float(restored.mean()) / 8000 - 1) < 0.01
+    share = of_file(tmp_path / "files", (noise() / 4095).astype(np.float32), replace(request(), full_scale=1.0))
+    np.testing.assert_allclose(share * 4095, of_array(noise(), request()), atol=0.5)
+
+
+@pytest.mark.parametrize(
+    ("pixels", "words"),
+    [
+        (np.full(SHAPE, 5000, np.uint16), "5000"),
+        (np.full(SHAPE, 200, np.uint8), "--full-scale"),
+        (np.full(SHAPE, 0.5, np.float32), "--full-scale"),
+        (np.full(SHAPE, np.nan, np.float32), "NaN or nodata everywhere"),
+        (np.full((*SHAPE, 3), 500, np.uint16), "one band"),
+    ],
+)
+def test_what_it_cannot_restore_leaves_the_old_output(pixels: np.ndarray, words: str, tmp_path: Path) -> None:
+    tifffile.imwrite(tmp_path / "in.tif", pixels, photometric="rgb" if pixels.ndim == 3 else "minisblack")
+    (tmp_path / "out.tif").write_bytes(b"the old one")
+    with pytest.raises(ImageError, match=words):
+        restore_file_traditionally(tmp_path / "in.tif", tmp_path / "out.tif", request())
+    assert (tmp_path / "out.tif").read_bytes() == b"the old one"
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["in.tif", "out.tif"]
+
+
+def test_a_budget_that_does_not_suffice_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(MachineError, match="--memory"):
+        of_file(tmp_path, noise(), replace(request(), memory_bytes=1000))
+
+
+def test_the_command_needs_a_sensor_and_no_option_of_a_network(tmp_path: Path) -> None:
+    image, out = tmp_path / "in.tif", tmp_path / "out.tif"
+    tifffile.imwrite(image, noise())
+    start = ["restore", str(image), str(out)]
+    chain = [*start, "--method", "traditional"]
+    named = [*chain, "--sensor", "pleiades-degraded"]
+    for arguments, words in (
+        (chain, "--sensor: expected the sensor that acquired IN"),
+        ([*start, "--sensor", "pleiades-degraded"], "expected --method traditional beside it"),
+        ([*chain, "--sensor", "hubble"], "hubble"),
+        ([*named, "--tile", "64"], "--tile: expected none with --method traditional"),
+        ([*named, "--resume"], "--resume: expected none"),
+        ([*named, "--workers", "2"], "--workers: expected none"),
+    ):
+        result = CliRunner().invoke(app, arguments)
+        assert result.exit_code == 2
+        assert words in " ".join(result.output.split())
+        assert not out.exists()
+    result = CliRunner().invoke(
+        app, [*chain, "--sensor", str(own_sensor(tmp_path)), "--json", str(tmp_path / "a.json")]
+    )
+    assert result.exit_code == 0, result.output
+    assert tifffile.imread(out).shape == SHAPE
+    assert '"sensor": "mine"' in (tmp_path / "a.json").read_text()

@@ -1,0 +1,75 @@
+"""Whose pixels are 12-bit digital numbers, and whose nobody can know."""
+
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+
+from model.scale import FULL_SCALE_DN, UNIT_MAX, settled_scale
+from profiles.errors import BeersError, ImageError, OptionError
+
+
+def settled(kind: str, *largest: float, asked: float | None = None) -> float:
+    return settled_scale("x.tif", np.dtype(kind), largest, asked)
+
+
+@pytest.mark.parametrize("kind", ["uint16", "int16", "uint32", "int32"])
+def test_integers_of_more_than_8_bits_are_12_bit_digital_numbers(kind: str) -> None:
+    for brightest in (0, 1, 255, 4095, 60000):  # what lies beyond is refused where pixels are read
+        assert settled(kind, brightest) == FULL_SCALE_DN
+
+
+@pytest.mark.parametrize("kind", ["float16", "float32", "float64"])
+def test_floats_beyond_any_share_are_digital_numbers(kind: str) -> None:
+    assert settled(kind, 0.0, 1.0, 2.5) == FULL_SCALE_DN
+    assert settled(kind, 4095) == FULL_SCALE_DN
+    for brightest in (1e-6, 0.5, 1.0, UNIT_MAX):
+        with pytest.raises(ImageError, match=r"x\.tif: .*more than 8 bits, got floats of at most .*--full-scale"):
+            settled(kind, 0.0, brightest)
+
+
+@pytest.mark.parametrize("kind", ["uint8", "int8"])
+def test_8_bit_pixels_leave_it_open(kind: str) -> None:
+    with pytest.raises(ImageError, match=r"got 8-bit pixels; .*--full-scale \(255 for"):
+        settled(kind, 200)
+
+
+def test_black_says_nothing() -> None:
+    assert settled("float32") == settled("float32", 0.0, 0.0) == FULL_SCALE_DN
+
+
+@pytest.mark.parametrize(("kind", "asked"), [("uint8", 255), ("float32", 1.0), ("float32", 4095), ("uint16", 1023)])
+def test_what_was_asked_for_settles_it(kind: str, asked: float) -> None:
+    assert settled(kind, 0.7, asked=asked) == asked
+
+
+@pytest.mark.parametrize("asked", [0, -1, float("nan"), float("inf")])
+@pytest.mark.parametrize("kind", ["uint16", "float32"])
+def test_no_image_has_such_a_full_scale(kind: str, asked: float) -> None:
+    with pytest.raises(OptionError, match="--full-scale"):
+        settled(kind, 1000, asked=asked)
+
+
+def test_integers_have_a_whole_full_scale() -> None:
+    with pytest.raises(OptionError, match="whole number"):
+        settled("uint8", 200, asked=0.5)
+    assert settled("float32", 0.2, asked=0.5) == 0.5
+
+
+def test_no_more_is_looked_at_than_decides() -> None:
+    looked: list[float] = []
+
+    def parts() -> Iterator[float]:
+        for value in (0.0, 0.9, 3000.0, 4000.0):
+            looked.append(value)
+            yield value
+
+    assert settled_scale("x", np.dtype("float32"), parts()) == FULL_SCALE_DN
+    assert looked == [0.0, 0.9, 3000.0]
+    assert settled_scale("x", np.dtype("uint16"), parts()) == FULL_SCALE_DN
+    assert looked == [0.0, 0.9, 3000.0]
+
+
+def test_who_has_no_such_option_says_what_else_to_do() -> None:
+    with pytest.raises(BeersError, match=r"; rescale it\.$"):
+        settled_scale("x", np.dtype("uint8"), (), remedy="rescale it")
