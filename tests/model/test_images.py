@@ -164,8 +164,8 @@ def test_nothing_half_written_is_left(tmp_path: Path) -> None:
 
 def test_outputs_that_cannot_be_written_are_found_early(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
-    for path in (tmp_path, tmp_path / "file" / "below"):
-        with pytest.raises(MachineError, match="place to write"):
+    for path, got in ((tmp_path, "a folder"), (tmp_path / "file" / "below", "place to write")):
+        with pytest.raises(MachineError, match=got):
             require_writable(path)
     require_writable(None, tmp_path / "new" / "out.tif")
     assert not list((tmp_path / "new").iterdir())
