@@ -7,7 +7,7 @@ from safetensors.torch import save_file
 
 from model.conditioning import RANGES, ToldConvBEERS
 from model.convbeers import VARIANTS, ConvBEERS, Variant, initialise
-from model.shipped import shipped_weights
+from model.shipped import SHIPPED, shipped_names, shipped_weights, told_names
 from model.weights_file import (
     is_told,
     load_network,
@@ -183,3 +183,13 @@ def test_told_weights_that_lack_a_tensor_are_refused(missing: str, tmp_path: Pat
     write_tensors(path, {name: value for name, value in tensors.items() if name != missing}, header)
     with pytest.raises(ModelError, match=r"w\.safetensors"):
         load_told(path)
+
+
+def test_the_shipped_told_weights_load_have_a_card_and_are_no_network_by_themselves() -> None:
+    assert "convbeers-s-told" in told_names()
+    for name in told_names():
+        read, recipe = load_told(shipped_weights(name))
+        assert read.variant == VARIANTS[name.removesuffix("-told")]
+        assert recipe["reference"] == "pleiades-reference"
+        assert name in (SHIPPED / f"{name}.md").read_text(encoding="utf-8")
+        assert name not in shipped_names()
