@@ -148,10 +148,14 @@ def _files_of(path: Path) -> list[Path]:
 
 
 def _overlap(one: Path, other: Path) -> bool:
-    """Whether two outputs are one file, or one would have to be the other's folder; some disks know no capitals."""
+    """Whether two outputs are one file, or one would have to be the other's folder; some disks know no capitals.
+
+    What is a folder already is refused as such, whatever is to be written into it.
+    """
     a, b = (Path(os.path.realpath(path).casefold()) for path in (one, other))
     linked = _exists(one) and _exists(other) and _identity(one) == _identity(other)
-    return linked or a == b or a in b.parents or b in a.parents
+    inside = (a in b.parents and not one.is_dir()) or (b in a.parents and not other.is_dir())
+    return linked or a == b or inside
 
 
 def _taken(path: Path, got: str) -> OptionError:

@@ -11,6 +11,7 @@ EXAMPLE = "train --variant convbeers-s --images aerial/ --out runs/s --steps 200
 
 
 def train(
+    context: typer.Context,
     out: Annotated[Path, typer.Option(help="Folder of the run: checkpoint, logs, pictures and weights.")],
     images: Annotated[
         Path | None, typer.Option(help="Folder of sharp aerial images (8-bit RGB, or 16-bit mono) to simulate from.")
@@ -82,6 +83,11 @@ def train(
     if told and (pairs is not None or teacher is not None):
         remedy = "leave one out: stored pairs do not say what sensor each had, and a teacher is not told"
         raise OptionError("--told", expected="no --pairs or --teacher beside it", got="both", remedy=remedy)
+    if images is None:
+        expected = "--images, of which whole sites are held out, beside it"
+        _require_unasked(context, "validate_every", expected, "no images: nothing to validate on")
+    if teacher is None:
+        _require_unasked(context, "distil", "--teacher beside it", "no network to imitate")
     stored = [pairs, *(pairs / role for role in ("degraded", "reference"))] if pairs else [images]
     read = (*stored, lpips, start, teacher, *map(Path, (sensor, reference)))
     require_writable(*(out / name for name in (*FILES, weights_name(variant, told))), inputs=read)
@@ -117,3 +123,13 @@ def train(
         run_training(run, resume, worker, typer.echo)
         if worker.first:
             typer.echo(f"wrote {run.weights}")
+
+
+def _require_unasked(context: typer.Context, name: str, expected: str, got: str) -> None:
+    """An option that would do nothing: better said than ignored."""
+    from profiles.errors import OptionError
+
+    source = context.get_parameter_source(name)
+    if source is not None and source.name == "COMMANDLINE" and context.params[name]:
+        option = f"--{name.replace('_', '-')}"
+        raise OptionError(option, expected=expected, got=got, remedy="leave it out, or give what it needs")

@@ -25,7 +25,7 @@ from deploy.swath.raster import Raster
 from deploy.swath.reader import Source, open_source
 from deploy.swath.restorer import as_stored, checked_band
 from deploy.swath.spool import Spool, part_folder
-from deploy.swath.writer import require_codec, write_output
+from deploy.swath.writer import require_codec, require_tiff_name, write_output
 from deploy.tiling import Span
 from model.files import require_writable
 from model.scale import settled_scale
@@ -74,7 +74,8 @@ def restore_file_traditionally(image: Path, out: Path, request: Request) -> Row:
         MachineError: another run on `out`; memory or disk.
         KeyboardInterrupt: stopped; nothing is left behind.
     """
-    require_writable(out)
+    require_writable(out, inputs=(image,))
+    require_tiff_name(out)
     require_codec(request.compression)
     with only_run(out, part_folder(out)):
         return _restore(image, out, request)

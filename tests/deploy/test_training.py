@@ -113,6 +113,9 @@ def test_a_told_run_that_learns_nothing_is_what_it_started_from(images: Path, tm
             ["--drawn", "1", "--l1-weight", "0", "--lpips-weight", "0", "--fft-weight", "0"],
             "a term of weight above 0",
         ),
+        (["--pairs", "here", "--validate-every", "5"], "nothing to validate on"),
+        (["--drawn", "1", "--validate-every", "5"], "--validate-every: expected --images"),
+        (["--drawn", "1", "--distil", "2"], "--distil: expected --teacher"),
     ],
 )
 def test_wrong_options_get_one_sentence(options: list[str], words: str, tmp_path: Path) -> None:
