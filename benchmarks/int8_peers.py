@@ -125,10 +125,10 @@ def table(arguments: argparse.Namespace, folder: Path) -> Iterator[str]:
         (arguments.images, arguments.sensor, arguments.patches, arguments.seed),
         (arguments.held_out, arguments.held_out_sensor, arguments.held_out_patches, arguments.seed + HELD_OUT_SEED),
     ):
-        degraded = load_sensor(sensor)
-        aim = reference_for(degraded)
+        profile = load_sensor(sensor)
+        aim = reference_for(profile)
         scenes = load_scenes(images, aim.nominal(), seed)
-        drawn.append(list(draw_patches(scenes, degraded, aim, count, seed).pairs))
+        drawn.append(list(draw_patches(scenes, profile, aim, count, seed).pairs))
     degraded = np.concatenate([image for image, _ in drawn[0]])
     files = {False: (folder / "plain.onnx", folder / "plain.npy"), True: (folder / "core.onnx", folder / "core.npy")}
     onnx.save(network, files[False][0])
