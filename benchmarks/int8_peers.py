@@ -33,7 +33,8 @@ from deploy.defaults import float_model as read_float
 from model.metrics.fidelity import psnr_db, ssim
 from model.shipped import shipped_weights
 from profiles import load_sensor
-from quant.calibration import REFERENCE, Pair, draw_patches
+from profiles.sensor import reference_for
+from quant.calibration import Pair, draw_patches
 from quant.float_file import float_model
 from quant.float_reader import correction_graph
 from quant.graph import CORRECTION
@@ -119,14 +120,15 @@ def quantise(way: Way, files: dict[bool, tuple[Path, Path]], out: Path, python: 
 def table(arguments: argparse.Namespace, folder: Path) -> Iterator[str]:
     """Line by line, as each way ends."""
     network = read_float(arguments.float or shipped_weights(arguments.variant))
-    reference = load_sensor(REFERENCE)
     drawn = []
     for images, sensor, count, seed in (
         (arguments.images, arguments.sensor, arguments.patches, arguments.seed),
         (arguments.held_out, arguments.held_out_sensor, arguments.held_out_patches, arguments.seed + HELD_OUT_SEED),
     ):
-        scenes = load_scenes(images, reference.nominal(), seed)
-        drawn.append(list(draw_patches(scenes, load_sensor(sensor), reference, count, seed).pairs))
+        profile = load_sensor(sensor)
+        aim = reference_for(profile)
+        scenes = load_scenes(images, aim.nominal(), seed)
+        drawn.append(list(draw_patches(scenes, profile, aim, count, seed).pairs))
     degraded = np.concatenate([image for image, _ in drawn[0]])
     files = {False: (folder / "plain.onnx", folder / "plain.npy"), True: (folder / "core.onnx", folder / "core.npy")}
     onnx.save(network, files[False][0])

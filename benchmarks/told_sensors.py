@@ -99,7 +99,7 @@ def measure(case: Case, methods: Sequence[Restore], scenes: Sequence[Scene]) -> 
 
 def simulated(scenes: Sequence[Scene], sensor: Sensor) -> list[NamedPair]:
     """The pairs of a sensor; scenes too small for one are left out."""
-    return simulate_pairs(list(scenes), Fixed(sensor), Fixed(REFERENCE), 0)[0]
+    return simulate_pairs(list(scenes), Fixed(sensor), Fixed(REFERENCE.in_units_of(sensor)), 0)[0]
 
 
 def psnr(restore: Restore, pair: NamedPair, told: Sensor) -> float:

@@ -16,7 +16,7 @@ from model.simulator.procedural import procedural_scene
 from model.simulator.sampling import resample
 from model.simulator.scene import Scene, read_scene
 from profiles.errors import ImageError
-from profiles.sensor import SensorProfile
+from profiles.sensor import SensorProfile, require_same_units
 
 DRAWN_SIDE_PX = 3000
 Line = dict[str, object]
@@ -36,6 +36,9 @@ class DatasetRecipe:
     seed: int = 0
     tolerance_dn: float = TOLERANCE_DN
     scene_scale: float = 1.0  # scenes are resampled by it first, where the wanted ratio is no whole number
+
+    def __post_init__(self) -> None:
+        require_same_units(self.degraded, self.reference)
 
     def to_json(self) -> dict[str, object]:
         """The recipe as a file keeps it; scenes by name and digest."""

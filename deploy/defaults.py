@@ -1,5 +1,6 @@
 """What commands use when nothing is given: the shipped convbeers-s, and drawn scenes."""
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,7 @@ from model.images import list_images
 from model.simulator.procedural import procedural_scene
 from model.simulator.scene import Scene, read_scene
 from model.weights_file import load_network
-from profiles.sensor import Sensor
+from profiles.sensor import REFERENCE, Sensor, SensorProfile, describe_units, load_sensor
 from quant.onnx_file import load_onnx
 
 SCENES = 3
@@ -40,6 +41,22 @@ def about(variant: str, recipe: dict[str, object]) -> dict[str, str]:
         "sensor": str(recipe.get("degraded", "")),
         "reference": str(recipe.get("reference", "")),
     }
+
+
+def reference_beside(degraded: SensorProfile, name: str | None, say: Callable[[str], None]) -> SensorProfile:
+    """The reference profile that a user named, or the default one, in the digital numbers of `degraded`.
+
+    One that was named, and states other ones, is converted in sight: `say` is told.
+
+    Raises:
+        ProfileError: no such profile, or a faulty one.
+    """
+    stated = load_sensor(name or REFERENCE)
+    reference = stated.in_units_of(degraded)
+    if name is not None and reference is not stated:
+        units = f"{describe_units(degraded)}, as {degraded.name} has them"
+        say(f"note: the reference {stated.name} ({describe_units(stated)}) is taken at {units}")
+    return reference
 
 
 def load_scenes(folder: Path | None, sensor: Sensor, seed: int) -> list[Scene]:

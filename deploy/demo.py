@@ -34,7 +34,8 @@ from model.simulator.scene import Scene, read_scene
 from model.traditional.pipeline import Chain, restore_traditional
 from model.weights_file import load_network
 from profiles import load_sensor
-from quant.calibration import REFERENCE, draw_patches
+from profiles.sensor import reference_for
+from quant.calibration import draw_patches
 from quant.gate import compare
 from quant.onnx_file import save_onnx
 from quant.quantise import quantise_model
@@ -67,7 +68,8 @@ class Demo:
 
 def sensors() -> Sensors:
     """The sensor that the demo simulates, and the one it imitates."""
-    return Sensors(load_sensor(SENSOR), load_sensor(REFERENCE))
+    degraded = load_sensor(SENSOR)
+    return Sensors(degraded, reference_for(degraded))
 
 
 def read_input(image: Path | None, seed: int, full_scale: float | None = None) -> Input:

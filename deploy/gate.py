@@ -27,8 +27,9 @@ from deploy.results import Document, Figure, Row, measured, unavailable
 from deploy.shipped import VARIANT, shipped_pair
 from profiles import load_sensor, load_target
 from profiles.errors import OptionError
+from profiles.sensor import reference_for
 from profiles.text import read_json, unreadable
-from quant.calibration import REFERENCE, Patches, draw_patches
+from quant.calibration import Patches, draw_patches
 from quant.checks import Check
 from quant.gate import GateResult, compare
 from quant.host_reader import spelling_faults
@@ -118,7 +119,8 @@ def run_gate(request: Request) -> Outcome:
 
 def _unseen(request: Request) -> Patches:
     """Patches that calibration with the same seed does not draw."""
-    degraded, reference = load_sensor(request.sensor), load_sensor(REFERENCE)
+    degraded = load_sensor(request.sensor)
+    reference = reference_for(degraded)
     held_out = request.seed + HELD_OUT_SEED
     scenes = load_scenes(request.images, reference.nominal(), held_out)
     return draw_patches(scenes, degraded, reference, request.patches, held_out)

@@ -18,9 +18,9 @@ from deploy.tables import print_rows
 from model.simulator.scene import Scene
 from profiles import load_sensor
 from profiles.errors import OptionError
-from profiles.sensor import SensorProfile
+from profiles.sensor import SensorProfile, reference_for
 from profiles.target import TargetProfile
-from quant.calibration import REFERENCE, Patches, draw_patches
+from quant.calibration import Patches, draw_patches
 from quant.free import free_ticks, quantise_free
 from quant.gate import compare
 from quant.onnx_file import save_onnx
@@ -69,7 +69,7 @@ class Calibration:
 
     @cached_property
     def _reference(self) -> SensorProfile:
-        return load_sensor(REFERENCE)
+        return reference_for(self._degraded)
 
 
 @dataclass(frozen=True)

@@ -25,16 +25,19 @@ Infer = Callable[[np.ndarray], np.ndarray]
 """A network ready to run: (1, 1, h, w) float32 in [0, 1] to the same shape."""
 
 
-def read_acquisition(path: Path, full_scale: float | None = None, remedy: str | None = RESCALE) -> np.ndarray:
-    """Digital numbers (H, W) float32 in 0..4095 of a mono image of at most 12 bits.
+def read_acquisition(
+    path: Path, full_scale: float | None = None, remedy: str | None = RESCALE, max_dn: int = MAX_DN
+) -> np.ndarray:
+    """Digital numbers (H, W) float32 in 0..max_dn of a mono image: of at most 12 bits unless a sensor says otherwise.
 
     Args:
         path: a TIFF, PNG or JPEG file.
         full_scale: the pixel value that is full scale; None lets the pixels' type and values decide (model.scale).
         remedy: what to do about pixels that leave it open; None names --full-scale.
+        max_dn: the sensor's largest digital number.
 
     Raises:
-        ImageError: several bands, pixels that leave the full scale open, or values that no 12-bit sensor gives.
+        ImageError: several bands, pixels that leave the full scale open, or values that no such sensor gives.
         OptionError: a full scale that such pixels cannot have.
     """
     pixels = read_pixels(path)
@@ -43,13 +46,17 @@ def read_acquisition(path: Path, full_scale: float | None = None, remedy: str | 
             str(path), expected="one band", got=f"{pixels.shape[2]} bands", remedy="extract the panchromatic band"
         )
     low, high = float(pixels.min()), float(pixels.max())
-    settled = settled_scale(str(path), pixels.dtype, [max(-low, high)], full_scale, MAX_DN, remedy)
+    settled = settled_scale(str(path), pixels.dtype, [max(-low, high)], full_scale, max_dn, remedy)
     if low < 0 or high > settled:
-        expected = f"12-bit digital numbers, 0 to {MAX_DN}" if settled == MAX_DN else f"values of 0 to {settled:g}"
+        expected = (
+            f"{max_dn.bit_length()}-bit digital numbers, 0 to {max_dn}"
+            if settled == max_dn
+            else f"values of 0 to {settled:g}"
+        )
         got = f"values from {low:g} to {high:g}"
         raise ImageError(str(path), expected=expected, got=got, remedy=RESCALE)
     dn = np.asarray(pixels, dtype=np.float32)
-    return dn if settled == MAX_DN else np.minimum(dn * np.float32(MAX_DN / settled), np.float32(MAX_DN))
+    return dn if settled == max_dn else np.minimum(dn * np.float32(max_dn / settled), np.float32(max_dn))
 
 
 def restore_image(
@@ -58,26 +65,36 @@ def restore_image(
     tile_px: int,
     halo_px: int,
     tick: Callable[[], None] = lambda: None,
+    max_dn: int = MAX_DN,
 ) -> np.ndarray:
-    """Restore (H, W) digital numbers to (H, W) uint16 in 0..4095, in memory; `tick` is called once a tile."""
-    return restore_with(partial(run, session), dn, tile_px, halo_px, tick)
+    """Restore (H, W) digital numbers to (H, W) uint16 in 0..max_dn, in memory; `tick` is called once a tile."""
+    return restore_with(partial(run, session), dn, tile_px, halo_px, tick, max_dn)
 
 
 def restore_with(
-    infer: Infer, dn: np.ndarray, tile_px: int, halo_px: int, tick: Callable[[], None] = lambda: None
+    infer: Infer,
+    dn: np.ndarray,
+    tile_px: int,
+    halo_px: int,
+    tick: Callable[[], None] = lambda: None,
+    max_dn: int = MAX_DN,
 ) -> np.ndarray:
     """As `restore_image`, with any network ready to run."""
     height, width = dn.shape
-    return restore_tiles(dn, infer, plan_tiles(height, width, tile_px, halo_px), tick)
+    return restore_tiles(dn, infer, plan_tiles(height, width, tile_px, halo_px), tick, max_dn)
 
 
 def restore_tiles(
-    dn: np.ndarray, infer: Infer, tiles: Iterable[Tile], tick: Callable[[], None] = lambda: None
+    dn: np.ndarray,
+    infer: Infer,
+    tiles: Iterable[Tile],
+    tick: Callable[[], None] = lambda: None,
+    max_dn: int = MAX_DN,
 ) -> np.ndarray:
     """As `restore_with`, with any tiles that cover the image."""
     result = np.empty(dn.shape, np.uint16)
     for tile in tiles:
-        tile.write(np.rint(restore_window(tile.read(dn), infer)), result)
+        tile.write(np.rint(restore_window(tile.read(dn), infer, max_dn)), result)
         tick()
     return result
 

@@ -7,8 +7,9 @@ from typing import Literal, get_args
 
 from profiles.errors import ProfileError
 
-Status = Literal["published", "inferred", "assumed", "stated"]
-"""published: in a document; inferred: computed from such; assumed: our choice; stated: the user's own."""
+Status = Literal["published", "inferred", "measured", "assumed", "stated"]
+"""published: in a document; measured: on the instrument; inferred: computed from such; assumed: our choice; stated:
+the user's own."""
 
 Number = float | tuple[float, float]
 

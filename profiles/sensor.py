@@ -5,13 +5,14 @@ A profile may state ranges (a family of sensors); `SensorProfile.draw` picks one
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
 from profiles.constant import Constant, check_keys, read_constant
 from profiles.effects import TABLES as EFFECT_TABLES
-from profiles.effects import Effect, Table, draw_effect, middle_effect, read_effect
+from profiles.effects import Effect, Offset, Table, draw_effect, middle_effect, read_effect
 from profiles.errors import ProfileError
 from profiles.toml import read_toml, shipped_names
 
@@ -19,6 +20,11 @@ MTF_NYQUIST_MAX = 2 / math.pi
 """A perfect lens over a square detector: sinc(0.5). Nothing above it is a blur (facts: gamma < 0)."""
 
 MAX_DRAWS = 10_000
+
+REFERENCE = "pleiades-reference"
+"""The shipped profile of the image that restoration aims at, unless another is named."""
+
+OFFSET = "offset"
 
 ROUNDING = 1e-14
 """What float64 may leave of a variance that ought to be 0, of the larger of the two variances."""
@@ -60,6 +66,18 @@ class Sensor:
         """The largest digital number, 4095 for 12 bits."""
         return int(2**self.bits) - 1
 
+    @property
+    def offset_dn(self) -> float:
+        """The digital number of the dark; 0 without an offset."""
+        offset = self.effects.get(OFFSET)
+        return offset.offset_dn if isinstance(offset, Offset) else 0.0
+
+    def in_units_of(self, other: "Sensor") -> "Sensor":
+        """This sensor's blur and noise in the digital numbers of `other`: its gain, bits and offset."""
+        effects = {name: effect for name, effect in self.effects.items() if name != OFFSET}
+        effects |= {name: effect for name, effect in other.effects.items() if name == OFFSET}
+        return replace(self, gain_dn_per_radiance=other.gain_dn_per_radiance, bits=other.bits, effects=effects)
+
     def noise_sigma(self, radiance: float) -> float:
         """Standard deviation of the noise at `radiance`, both in W/m2/sr/um."""
         return math.sqrt(max(self.alpha * radiance + self.beta, 0.0))
@@ -82,6 +100,23 @@ class SensorProfile:
     gain_dn_per_radiance: Constant
     effects: Mapping[str, Table] = field(default_factory=dict)
     mtf_nyquist_along: Constant | None = None
+
+    @property
+    def units(self) -> tuple[float, float, float]:
+        """What a digital number means: DN per W/m2/sr/um, bits, and the DN of the dark."""
+        offset = self.effects[OFFSET]["offset_dn"].low if OFFSET in self.effects else 0.0
+        return self.gain_dn_per_radiance.low, self.bits.low, offset
+
+    def in_units_of(self, other: "SensorProfile") -> "SensorProfile":
+        """This profile with the gain, bits and offset of `other`; itself where they are the same.
+
+        Two acquisitions of one scene compare, pixel by pixel, only where a digital number means the same in both.
+        """
+        if self.units == other.units:
+            return self
+        both = {**self.effects, **other.effects}
+        effects = {n: both[n] for n in EFFECT_TABLES if n in (other.effects if n == OFFSET else self.effects)}
+        return replace(self, gain_dn_per_radiance=other.gain_dn_per_radiance, bits=other.bits, effects=effects)
 
     def draw(self, generator: np.random.Generator) -> Sensor:
         """Pick one sensor from the ranges: MTF uniform, SNR pair uniform over the physically valid pairs."""
@@ -125,6 +160,36 @@ class SensorProfile:
             got=f"{self.snr_0}",
             remedy="correct one of the two; both are linear ratios, not dB",
         )
+
+
+def reference_for(degraded: SensorProfile, name: str = REFERENCE) -> SensorProfile:
+    """The profile called `name` in the digital numbers of `degraded`: what a restoration of its images is held to.
+
+    Raises:
+        ProfileError: no such profile, or a faulty one.
+    """
+    return load_sensor(name).in_units_of(degraded)
+
+
+def require_same_units(degraded: SensorProfile, reference: SensorProfile) -> None:
+    """Refuse a reference that another digitiser made: its images differ from the degraded ones by a factor.
+
+    Raises:
+        ProfileError: another gain, other bits or another offset.
+    """
+    if degraded.units != reference.units:
+        raise ProfileError(
+            f"sensor profile {reference.name}, the reference of {degraded.name}",
+            expected=describe_units(degraded),
+            got=describe_units(reference),
+            remedy="take the reference in the degraded sensor's units",
+        )
+
+
+def describe_units(profile: SensorProfile) -> str:
+    """What a digital number of the profile means, in words."""
+    gain, bits, offset_dn = profile.units
+    return f"{gain:g} DN per W/m2/sr/um, {bits:g} bits" + (f", {offset_dn:g} DN of offset" if offset_dn else "")
 
 
 def mtf_limit(antialias_sigma_px: float = 0.0) -> float:
@@ -184,7 +249,47 @@ def load_sensor(name: str) -> SensorProfile:
     Raises:
         ProfileError: unknown name, wrong or missing key, or numbers that no instrument can have.
     """
-    label, raw = read_toml("sensors", name)
+    return read_sensor(*read_toml("sensors", name))
+
+
+def sensor_from_json(label: str, raw: Mapping[str, Any]) -> SensorProfile:
+    """A profile from the plain values of its fields, as `dataclasses.asdict` and JSON leave them.
+
+    Raises:
+        ProfileError: keys or numbers that no profile has.
+    """
+    known = {key for table, keys in TABLES.items() for key in (*keys, *OPTIONAL.get(table, ()))}
+    check_keys(label, raw, required={"name", "description"}, optional={*known, "effects"})
+    tables: dict[str, Any] = {
+        table: {key: raw[key] for key in (*keys, *OPTIONAL.get(table, ())) if raw.get(key) is not None}
+        for table, keys in TABLES.items()
+    }
+    effects = raw.get("effects", {})
+    if not isinstance(effects, Mapping):
+        raise ProfileError(label, expected="a table of effects", got=repr(effects), remedy="make it anew")
+    return replace(
+        read_sensor(label, {"description": raw["description"], **tables, **effects}), name=str(raw["name"])
+    )
+
+
+def same_instrument(one: SensorProfile, other: SensorProfile) -> bool:
+    """Whether two profiles state the same numbers, whatever they are called and wherever the numbers come from."""
+    return _numbers(one) == _numbers(other)
+
+
+def _numbers(profile: SensorProfile) -> dict[str, object]:
+    keys = [key for table, keys in TABLES.items() for key in (*keys, *OPTIONAL.get(table, ()))]
+    constants: dict[str, Constant | None] = {key: getattr(profile, key) for key in keys}
+    constants |= {f"{n}.{key}": value for n, table in profile.effects.items() for key, value in table.items()}
+    return {key: constant and (constant.low, constant.high) for key, constant in constants.items()}
+
+
+def read_sensor(label: str, raw: Mapping[str, Any]) -> SensorProfile:
+    """A profile from the tables of its file; `label` names the file in errors.
+
+    Raises:
+        ProfileError: wrong or missing key, or numbers that no instrument can have.
+    """
     check_keys(label, raw, required={"description", *TABLES}, optional=set(EFFECT_TABLES))
     constants: dict[str, Constant] = {}
     for table, keys in TABLES.items():
@@ -208,8 +313,9 @@ SINGLE = ("radiance_0", "radiance_1", "bits", "gain_dn_per_radiance")
 
 
 def _check_single(label: str, profile: SensorProfile) -> None:
-    for key in SINGLE:
-        constant: Constant = getattr(profile, key)
+    single: dict[str, Constant] = {key: getattr(profile, key) for key in SINGLE}
+    single |= {f"[{OFFSET}] {key}": constant for key, constant in profile.effects.get(OFFSET, {}).items()}
+    for key, constant in single.items():
         if constant.low != constant.high:
             remedy = "write a profile for each"
             raise ProfileError(f"{label} {key}", expected="one number", got=f"a range, {constant}", remedy=remedy)

@@ -13,13 +13,18 @@ def shipped_names(kind: str) -> list[str]:
     return sorted(path.stem for path in (HERE / kind).glob("*.toml"))
 
 
+def profile_path(kind: str, name: str) -> Path:
+    """Where the profile `name` lies: in `profiles/KIND/`, or where the user's own path says."""
+    return Path(name) if name.endswith(".toml") else HERE / kind / f"{name}.toml"
+
+
 def read_toml(kind: str, name: str) -> tuple[str, dict[str, object]]:
     """Return (label for messages, parsed table) of profile `name`.
 
     Raises:
         ProfileError: no such profile, not readable, or not TOML.
     """
-    path = Path(name) if name.endswith(".toml") else HERE / kind / f"{name}.toml"
+    path = profile_path(kind, name)
     known = shipped_names(kind)
     if not name.endswith(".toml") and name not in known:
         raise ProfileError(

@@ -29,7 +29,6 @@ from quant.session import open_session
 from quant.strata import Ground, View, draw_views
 
 PATCH_PX = 128
-REFERENCE = "pleiades-reference"
 DEGRADED = "degraded"
 """The role whose noise a patch carries: the same in a pair and alone."""
 
@@ -92,6 +91,7 @@ def draw_patches(
 
     Raises:
         ImageError: no scene holds a patch.
+        ProfileError: the two profiles differ in gain, bits or offset.
     """
     recipe = PatchRecipe(degraded, reference, patch_px=patch_px)
     views = draw_views(scenes, recipe, count, Draw(seed).generator("views"))

@@ -17,8 +17,14 @@ def evaluate(
     pairs: Annotated[
         Path | None, typer.Option(help="Folder with degraded/ and reference/, as 'simulate' writes.")
     ] = None,
-    sensor: Annotated[str, typer.Option(help="Profile of the degraded images.")] = "pleiades-degraded",
-    reference: Annotated[str, typer.Option(help="Profile of the reference images.")] = "pleiades-reference",
+    sensor: Annotated[
+        str | None,
+        typer.Option(help="Profile of the degraded images; of pairs the recipe's, else pleiades-degraded if none."),
+    ] = None,
+    reference: Annotated[
+        str | None,
+        typer.Option(help="Profile of the reference images, in the sensor's DN; pleiades-reference if none."),
+    ] = None,
     methods: Annotated[
         str, typer.Option(help="Names, separated by commas.")
     ] = "degraded,traditional,deconvolve-first,convbeers-s,convbeers-s-int8",
@@ -40,13 +46,14 @@ def evaluate(
     from deploy.evaluation.methods import method_named
     from deploy.evaluation.page import evaluation_report, pictures
     from deploy.evaluation.perceptual import perceptual_distances
+    from deploy.evaluation.recipe import profiles_for, read_pairs_recipe
     from deploy.evaluation.run import evaluate_methods, input_files, load_pairs, sweep_tables
     from deploy.evaluation.scores import Instruments
     from deploy.report.page import write_report
     from deploy.results import Document, by_table
     from deploy.tables import print_rows
     from model.files import require_writable
-    from profiles import load_sensor
+    from model.metrics.bootstrap import LEAST_SITES
     from profiles.errors import OptionError
 
     if pairs is not None and (images is not None or sweep):
@@ -54,24 +61,33 @@ def evaluate(
         raise OptionError("--pairs", expected=expected, got="both", remedy="leave one out")
     names = list(dict.fromkeys(["degraded", *(name.strip() for name in methods.split(","))]))
     folders = [pairs, *(pairs / role for role in ("degraded", "reference"))] if pairs else [images]
-    read = (*folders, lpips, *map(Path, (sensor, reference, *names)))
+    read = (*folders, lpips, *(Path(name) for name in (sensor, reference, *names) if name))
     require_writable(out / "report.html" if out else None, json, inputs=read, folders=(out,))
-    eyes = load_sensor(sensor), load_sensor(reference)
+    recipe = read_pairs_recipe(pairs) if pairs is not None else None
+    eyes = profiles_for(sensor, reference, recipe, typer.echo)
     chosen = [method_named(name, eyes[0].nominal(), eyes[1].nominal()) for name in names]
-    instruments = Instruments(perceptual_distances(lpips))
-    found, small = load_pairs(images, pairs, *eyes, seed)
+    instruments = Instruments(perceptual_distances(lpips), eyes[0].nominal().max_dn)
+    found, small = load_pairs(images, pairs, *eyes, seed, recipe)
     result = evaluate_methods(chosen, found, instruments, eyes[0].nominal(), seed)
-    title = f"{sensor} -> {reference}, {len(found)} images"
+    title = f"{eyes[0].name} -> {eyes[1].name}, {len(found)} images"
     print_rows(title, result.mean)
     swept = sweep_tables(chosen, images, *eyes, seed) if sweep else ()
     for table, rows in by_table((*result.sites, *swept)).items():
         print_rows(table, rows)
+    sites = len({pair.site for pair in found})
+    if sites < LEAST_SITES:
+        typer.echo(f"no interval over sites is shown: of {sites}, fewer than {LEAST_SITES}, none could be trusted")
     if small:
         typer.echo(f"left out, too small: {', '.join(small)}")
     if out is not None:
         strips = pictures(found, chosen, out)
         write_report(evaluation_report(title, result.mean, result.sites, swept, strips), out / "report.html")
         typer.echo(f"wrote {out / 'report.html'}")
-    arguments: dict[str, object] = {"images": images, "pairs": pairs, "sensor": sensor, "reference": reference}
+    arguments: dict[str, object] = {
+        "images": images,
+        "pairs": pairs,
+        "sensor": sensor or eyes[0].name,
+        "reference": eyes[1].name,
+    }
     arguments |= {"methods": methods, "lpips": lpips, "out": out, "sweep": sweep, "seed": seed}
     Document("evaluate", arguments, input_files(names, images, pairs, lpips), (*result.rows, *swept)).write(json)

@@ -17,8 +17,15 @@ def profiles(
     name: Annotated[
         str | None, typer.Argument(help="A shipped profile, or a .toml file; none lists them all.")
     ] = None,
+    toml: Annotated[bool, typer.Option("--toml", help="Print the file itself, to start one's own from.")] = False,
 ) -> None:
-    """List sensors, scenes and targets, or show one: every constant, its status and its source."""
+    """List sensors, scenes and targets, or show one: every constant, its status and its source.
+
+    The keys of a sensor's file, with units and ranges: docs/sensor-profile.md.
+    """
+    if toml:
+        typer.echo(_file_text(name), nl=False)
+        return
     from rich.table import Table
 
     from deploy.tables import default_console
@@ -43,6 +50,21 @@ def profiles(
         for key, constant in constants:
             table.add_row(key, str(constant), constant.status, constant.source)
     default_console().print(table)
+
+
+def _file_text(name: str | None) -> str:
+    """The TOML of a profile that can be read as one."""
+    from profiles import sensor_names
+    from profiles.errors import OptionError
+    from profiles.scene_call import scene_names
+    from profiles.toml import profile_path
+
+    if name is None:
+        remedy = "name one, such as pleiades-degraded"
+        raise OptionError("--toml", expected="the name of a profile beside it", got="none", remedy=remedy)
+    _constants(name)
+    kind = "sensors" if name in sensor_names() else "scenes" if name in scene_names() else "targets"
+    return profile_path(kind, name).read_text(encoding="utf-8")
 
 
 def _constants(name: str) -> "tuple[str, list[tuple[str, Constant]]]":

@@ -134,12 +134,13 @@ def _by_the_chain(
     from deploy.tables import print_rows
     from profiles import load_sensor
     from profiles.errors import OptionError
-    from quant.calibration import REFERENCE
+    from profiles.sensor import reference_for
 
     if sensor is None:
         remedy = "name a profile ('beers-deploy profiles' lists them) or give your .toml file"
         raise OptionError("--sensor", expected="the sensor that acquired IN", got="none", remedy=remedy)
-    request = Request(load_sensor(sensor), load_sensor(REFERENCE), full_scale, compression, memory_bytes)
+    degraded = load_sensor(sensor)
+    request = Request(degraded, reference_for(degraded), full_scale, compression, memory_bytes)
     row = restore_file_traditionally(image, out, request)
     print_rows(f"wrote {out}", [row])
     arguments = {"method": "traditional", "sensor": sensor, "full_scale": full_scale}

@@ -42,7 +42,10 @@ def simulate(
     sensor: Annotated[
         str | None, typer.Option(help="Profile of the degraded images; pleiades-degraded if none.")
     ] = None,
-    reference: Annotated[str, typer.Option(help="Profile of the reference images.")] = "pleiades-reference",
+    reference: Annotated[
+        str | None,
+        typer.Option(help="Profile of the reference images, in the sensor's DN; pleiades-reference if none."),
+    ] = None,
     preset: Annotated[str | None, typer.Option(help=f"A dataset of the paper: {', '.join(PRESETS)}.")] = None,
     patch: Annotated[
         int | None, typer.Option(min=8, max=8192, help="Patch side in pixels; whole scenes if none.")
@@ -76,6 +79,7 @@ def simulate(
     from deploy.cluster import check_choice
     from deploy.dataset import write_dataset
     from deploy.dataset_patches import DatasetRecipe, plan_windows
+    from deploy.defaults import reference_beside
     from deploy.progress import steps
     from model.files import require_writable
     from profiles import load_sensor
@@ -95,7 +99,7 @@ def simulate(
     recipe = DatasetRecipe(
         tuple(scenes) if scenes else (None,),
         degraded,
-        load_sensor(reference),
+        reference_beside(degraded, reference, typer.echo),
         ratio,
         patch or (chosen.patch_px if preset else None),
         call.radiance_scale.low if call else 1.0,

@@ -22,7 +22,10 @@ def tradeoff(
         Path | None, typer.Option(help="Folder of held-out scenes to simulate from; drawn ones if none.")
     ] = None,
     sensor: Annotated[str, typer.Option(help="Profile of the degraded images.")] = "pleiades-degraded",
-    reference: Annotated[str, typer.Option(help="Profile of the reference images.")] = "pleiades-reference",
+    reference: Annotated[
+        str | None,
+        typer.Option(help="Profile of the reference images, in the sensor's DN; pleiades-reference if none."),
+    ] = None,
     networks: Annotated[
         str | None,
         typer.Option(help="Shipped names and ONNX or safetensors files, with commas; all shipped if none."),
@@ -50,6 +53,7 @@ def tradeoff(
     point keeps --budget and --need; the report is written all the same.
     """
     from deploy.commands.bench import parse_size
+    from deploy.defaults import reference_beside
     from deploy.report.tradeoff_page import FILES, write_study
     from deploy.results import Document
     from deploy.tradeoff.cache import Cache
@@ -58,19 +62,31 @@ def tradeoff(
     from deploy.tradeoff.run import run_study
     from model.files import require_writable
     from model.shipped import shipped_names
+    from profiles.sensor import REFERENCE, load_sensor
 
     figures, kept = out / "tradeoff.json", cache or out / "cache"
     demands = [tuple(parse_demands(name, text)) for name, text in (("--budget", budget), ("--need", need))]
     names = tuple(networks.split(",")) if networks is not None else tuple(shipped_names())
-    read = (images, calibration, lpips, *map(Path, (sensor, reference, *names)))
+    aim = reference or REFERENCE
+    read = (images, calibration, lpips, *map(Path, (sensor, aim, *names)))
     require_writable(figures, *(out / name for name in FILES), json, inputs=read, folders=(kept,))
+    reference_beside(load_sensor(sensor), reference, typer.echo)
     request = Request(
-        names, images, calibration, sensor, reference, lpips, parse_size(size), demands[0], demands[1], seed
+        names,
+        images,
+        calibration,
+        sensor,
+        aim,
+        lpips,
+        parse_size(size),
+        demands[0],
+        demands[1],
+        seed,
     )
     result = run_study(request, Cache(kept))
     write_study(result.study, out)
     say(result.study)
-    arguments: dict[str, object] = {"images": images, "sensor": sensor, "reference": reference, "size": size}
+    arguments: dict[str, object] = {"images": images, "sensor": sensor, "reference": aim, "size": size}
     arguments |= {"networks": networks, "budget": budget, "need": need, "calibration": calibration, "seed": seed}
     document = Document("tradeoff", arguments, request.files, result.rows)
     for path in (figures, json):

@@ -22,7 +22,9 @@ def train(
     told: Annotated[
         bool, typer.Option("--told", help="Draw sensors of a wide range with that gain, and tell the network each.")
     ] = False,
-    reference: Annotated[str, typer.Option(help="Profile of the wanted output.")] = "pleiades-reference",
+    reference: Annotated[
+        str | None, typer.Option(help="Profile of the wanted output, in the sensor's DN; pleiades-reference if none.")
+    ] = None,
     drawn: Annotated[int, typer.Option(min=0, max=1000, help="Drawn scenes to add to the images.")] = 0,
     steps: Annotated[int, typer.Option(min=1, help="Gradient steps.")] = 20_000,
     batch: Annotated[int, typer.Option(min=1, max=4096, help="Patches a step and worker.")] = 8,
@@ -61,6 +63,7 @@ def train(
     """
     from typing import get_args
 
+    from deploy.defaults import reference_beside
     from deploy.training import FILES, Run, weights_name
     from deploy.training import train as run_training
     from model.conditioning import SensorFamily
@@ -89,7 +92,7 @@ def train(
     if teacher is None:
         _require_unasked(context, "distil", "--teacher beside it", "no network to imitate")
     stored = [pairs, *(pairs / role for role in ("degraded", "reference"))] if pairs else [images]
-    read = (*stored, lpips, start, teacher, *map(Path, (sensor, reference)))
+    read = (*stored, lpips, start, teacher, *(Path(name) for name in (sensor, reference) if name))
     require_writable(*(out / name for name in (*FILES, weights_name(variant, told))), inputs=read)
     recipe = TrainingRecipe(
         steps=steps,
@@ -102,7 +105,7 @@ def train(
     )
     degraded = load_sensor(sensor)
     family = SensorFamily(degraded.nominal()) if told else None
-    patches = PatchRecipe(degraded, load_sensor(reference), patch_px=patch, told=family)
+    patches = PatchRecipe(degraded, reference_beside(degraded, reference, typer.echo), patch_px=patch, told=family)
     run = Run(
         variant,
         recipe,

@@ -41,7 +41,7 @@ class Method:
 
 
 def method_named(name: str, degraded: Sensor, reference: Sensor) -> Method:
-    """The method of that name; the traditional ones are told both sensors.
+    """The method of that name; the traditional ones are told both sensors, a network full scale alone.
 
     Raises:
         OptionError: no such method.
@@ -56,7 +56,7 @@ def method_named(name: str, degraded: Sensor, reference: Sensor) -> Method:
     if name in PEERS:
         plain = Chain(degraded, reference)
         return Method(name, lambda dn: PEERS[name](torch.from_numpy(dn), plain).numpy(), "both sensors")
-    return Method(name, _network(name), "nothing")
+    return Method(name, _network(name, degraded.max_dn), "nothing")
 
 
 def _chain(name: str, degraded: Sensor, reference: Sensor) -> Chain | None:
@@ -67,7 +67,7 @@ def _chain(name: str, degraded: Sensor, reference: Sensor) -> Chain | None:
     return None
 
 
-def _network(name: str) -> Restore:
+def _network(name: str, max_dn: int) -> Restore:
     path = Path(name)
     if path.suffix in (".onnx", ".safetensors"):
         model = float_model(path)
@@ -78,8 +78,8 @@ def _network(name: str) -> Restore:
     else:
         raise OptionError("--methods", expected=EXPECTED, got=repr(name), remedy="correct that name")
     session, halo_px = open_session(model), receptive_radius_px(model)
-    return partial(_run_network, session=session, halo_px=halo_px)
+    return partial(_run_network, session=session, halo_px=halo_px, max_dn=max_dn)
 
 
-def _run_network(dn: np.ndarray, session: ort.InferenceSession, halo_px: int) -> np.ndarray:
-    return restore_image(dn, session, TILE_PX, halo_px).astype(np.float32)
+def _run_network(dn: np.ndarray, session: ort.InferenceSession, halo_px: int, max_dn: int) -> np.ndarray:
+    return restore_image(dn, session, TILE_PX, halo_px, max_dn=max_dn).astype(np.float32)

@@ -70,10 +70,11 @@ def evaluation_report(
 
 
 MEAN_CAPTION = (
-    "Intervals: 95 % bootstrap over sites for image figures, 90 % for the MTF. What a method was told stands beside "
+    "Intervals: 95 % bootstrap over sites for image figures, none below five sites; 90 % for the MTF. "
+    "What a method was told stands beside "
     "it: a method that knows the sensor has an advantage that it may not have in orbit."
 )
-SITES_CAPTION = "Over 4095 DN; from PSNR, pixels that clipped in the input or the reference are left out."
+SITES_CAPTION = "Over full scale; from PSNR, pixels that clipped in the input or the reference are left out."
 NOTES = (
     "MTF at Nyquist is measured on restored slanted edges.",
     "SNR is measured in restored flat fields, where nothing is to be seen: a denoiser may reach any SNR there.",

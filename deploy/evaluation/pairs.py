@@ -1,20 +1,21 @@
 """Pairs of a degraded and a reference image: simulated from scenes, or read from a folder that `simulate` wrote."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
 import numpy as np
 
-from deploy.restore import read_acquisition
+from deploy.evaluation.recipe import PairsRecipe
+from deploy.restore import MAX_DN, read_acquisition
 from model.images import site_of
 from model.simulator.acquire import MARGIN_PX, fitting_oversampling, simulate_pair
 from model.simulator.draws import Draw
 from model.simulator.scene import Scene
 from model.training.stored_pairs import pair_files
 from profiles.errors import ImageError
-from profiles.sensor import Sensor
+from profiles.sensor import Sensor, SensorProfile
 
 OVERSAMPLINGS = (4, 2)
 MIN_SIDE_PX = 48
@@ -30,22 +31,23 @@ class Eye(Protocol):
 
 @dataclass(frozen=True)
 class NamedPair:
-    """Two acquisitions of one scene, (H, W) float32 digital numbers of 0..4095, and the scene's name."""
+    """Two acquisitions of one scene, (H, W) float32 digital numbers of the same units, and the scene's name."""
 
     name: str
     degraded: np.ndarray
     reference: np.ndarray
+    place: str | None = None
 
     @property
     def site(self) -> str:
-        """The name without what tells frames of one site apart."""
-        return site_of(self.name)
+        """The place that is known; else the name without what tells frames of one site apart."""
+        return self.place or site_of(self.name)
 
 
 def simulate_pairs(
-    scenes: list[Scene], degraded: Eye, reference: Eye, seed: int
+    scenes: list[Scene], degraded: Eye, reference: Eye, seed: int, oversamplings: Sequence[int] = OVERSAMPLINGS
 ) -> tuple[list[NamedPair], list[str]]:
-    """Simulate a pair of each scene, at the larger oversampling that leaves enough of it.
+    """Simulate a pair of each scene, at the first of the oversamplings that leaves enough of it.
 
     Returns:
         The pairs, and the names of scenes too small to use.
@@ -55,7 +57,7 @@ def simulate_pairs(
     """
     pairs, small = [], []
     for number, scene in enumerate(scenes):
-        ratio = fitting_oversampling(scene.radiance, OVERSAMPLINGS, MIN_SIDE_PX)
+        ratio = fitting_oversampling(scene.radiance, oversamplings, MIN_SIDE_PX)
         if ratio is None:
             small.append(scene.name)
             continue
@@ -64,7 +66,7 @@ def simulate_pairs(
         pair = simulate_pair(scene.radiance, eyes[0], eyes[1], ratio, draw)
         pairs.append(NamedPair(scene.name, pair.degraded.numpy(), pair.reference.numpy()))
     if not pairs:
-        least = OVERSAMPLINGS[-1] * (2 * MARGIN_PX + MIN_SIDE_PX)
+        least = oversamplings[-1] * (2 * MARGIN_PX + MIN_SIDE_PX)
         raise ImageError(
             "images",
             expected=f"scenes of {least} pixels a side or more",
@@ -74,18 +76,30 @@ def simulate_pairs(
     return pairs, small
 
 
-def read_pairs(folder: Path) -> list[NamedPair]:
-    """Read FOLDER/degraded/NAME.tif beside FOLDER/reference/NAME.tif, mono images of at most 12 bits.
+def oversamplings_of(profile: SensorProfile) -> tuple[int, ...]:
+    """The profile's oversampling, though no more than 4, and 2 for scenes too small for it.
+
+    At more than 4 little would be left of a photograph, and the blur is sampled finely enough at 4.
+    """
+    own = int(profile.oversampling.low)
+    return tuple(dict.fromkeys(min(own, ratio) for ratio in OVERSAMPLINGS))
+
+
+def read_pairs(folder: Path, max_dn: int = MAX_DN, recipe: PairsRecipe | None = None) -> list[NamedPair]:
+    """Read FOLDER/degraded/NAME.tif beside FOLDER/reference/NAME.tif, mono images of 0 to max_dn.
+
+    With the recipe beside them, the sites are those of the scenes that it names.
 
     Raises:
         ImageError: a folder is missing, a name has no partner, or two images differ in size.
     """
-    return list(_read_pairs(folder))
+    return list(_read_pairs(folder, max_dn, recipe))
 
 
-def _read_pairs(folder: Path) -> Iterator[NamedPair]:
+def _read_pairs(folder: Path, max_dn: int, recipe: PairsRecipe | None) -> Iterator[NamedPair]:
     for degraded, reference in pair_files(folder):
-        pair = NamedPair(degraded.stem, read_acquisition(degraded), read_acquisition(reference))
+        seen, meant = (read_acquisition(path, max_dn=max_dn) for path in (degraded, reference))
+        pair = NamedPair(degraded.stem, seen, meant, recipe.site(degraded.stem) if recipe else None)
         if pair.degraded.shape != pair.reference.shape:
             sizes = " and ".join(f"{a.shape[1]} x {a.shape[0]}" for a in (pair.degraded, pair.reference))
             raise ImageError(

@@ -6,8 +6,9 @@ from pathlib import Path
 
 from deploy.defaults import load_scenes
 from deploy.evaluation.methods import Method
-from deploy.evaluation.pairs import NamedPair, read_pairs, simulate_pairs
+from deploy.evaluation.pairs import NamedPair, oversamplings_of, read_pairs, simulate_pairs
 from deploy.evaluation.paper import paper_rows
+from deploy.evaluation.recipe import PairsRecipe
 from deploy.evaluation.scores import Instruments, score, site_rows
 from deploy.evaluation.sweep import conditions, sweep_rows
 from deploy.evaluation.targets import acquire_targets, target_figures
@@ -32,12 +33,18 @@ class Evaluation:
 
 
 def load_pairs(
-    images: Path | None, pairs: Path | None, degraded: SensorProfile, reference: SensorProfile, seed: int
+    images: Path | None,
+    pairs: Path | None,
+    degraded: SensorProfile,
+    reference: SensorProfile,
+    seed: int,
+    recipe: PairsRecipe | None = None,
 ) -> tuple[list[NamedPair], list[str]]:
     """Pairs from a folder of pairs, from a folder of scenes, or from drawn scenes; and scenes too small to use."""
     if pairs is not None:
-        return read_pairs(pairs), []
-    return simulate_pairs(load_scenes(images, reference.nominal(), seed), degraded, reference, seed)
+        return read_pairs(pairs, degraded.nominal().max_dn, recipe), []
+    scenes = load_scenes(images, reference.nominal(), seed)
+    return simulate_pairs(scenes, degraded, reference, seed, oversamplings_of(degraded))
 
 
 def evaluate_methods(

@@ -10,7 +10,7 @@ from deploy.evaluation.pairs import NamedPair
 from deploy.evaluation.perceptual import Perceptual
 from deploy.restore import MAX_DN
 from deploy.results import Figure, Row, measured, unavailable
-from model.metrics.bootstrap import mean_interval
+from model.metrics.bootstrap import site_interval
 from model.metrics.fidelity import psnr_db, ssim
 
 DISTANCE = "distance"
@@ -20,17 +20,24 @@ IDENTICAL = "infinite: identical to the reference"
 
 @dataclass(frozen=True)
 class Instruments:
-    """What is measured besides PSNR and SSIM: perceptual distances by name, each or the reason why not."""
+    """What images are measured with.
+
+    Attributes:
+        perceptual: distances by name besides PSNR and SSIM, each or the reason why not.
+        max_dn: the digital number that is full scale.
+    """
 
     perceptual: Mapping[str, Perceptual | str]
+    max_dn: int = MAX_DN
 
     def score(self, dn: np.ndarray, reference: np.ndarray, degraded: np.ndarray) -> dict[str, float | None]:
         """The figures of one restored image, (H, W) digital numbers each."""
-        psnr, before = (fidelity_db(image, reference, degraded) for image in (dn, degraded))
+        psnr, before = (fidelity_db(image, reference, degraded, self.max_dn) for image in (dn, degraded))
         scores: dict[str, float | None] = {"PSNR": psnr, "PSNR gain": psnr - before if psnr != before else 0.0}
-        scores["SSIM"] = ssim(dn, reference, MAX_DN)
+        scores["SSIM"] = ssim(dn, reference, self.max_dn)
         for name, distance in self.perceptual.items():
-            scores[name] = None if isinstance(distance, str) else distance(dn / MAX_DN, reference / MAX_DN)
+            both = dn / self.max_dn, reference / self.max_dn
+            scores[name] = None if isinstance(distance, str) else distance(*both)
         return scores
 
     def figure(
@@ -43,10 +50,10 @@ class Instruments:
         return measured(value, unit, source, interval) if np.isfinite(value) else unavailable(unit, IDENTICAL)
 
 
-def fidelity_db(dn: np.ndarray, reference: np.ndarray, degraded: np.ndarray) -> float:
-    """PSNR over 4095 DN without the pixels that clipped in the input or the reference: there the truth is unknown."""
-    sound = (reference < MAX_DN) & (degraded < MAX_DN)
-    return psnr_db(dn[sound], reference[sound], MAX_DN) if sound.any() else psnr_db(dn, reference, MAX_DN)
+def fidelity_db(dn: np.ndarray, reference: np.ndarray, degraded: np.ndarray, max_dn: int = MAX_DN) -> float:
+    """PSNR over full scale without the pixels that clipped in the input or the reference: their truth is unknown."""
+    sound = (reference < max_dn) & (degraded < max_dn)
+    return psnr_db(dn[sound], reference[sound], max_dn) if sound.any() else psnr_db(dn, reference, max_dn)
 
 
 def score(
@@ -80,8 +87,8 @@ def mean_row(
             figures[key] = instruments.figure(key, scores[0][key], "")
             continue
         values, places = zip(*usable, strict=True)
-        interval = mean_interval(values, places, np.random.default_rng(seed))
-        source = f"mean of {len(values)} pairs from {len(set(places))} sites, 95 % bootstrap interval over sites"
+        interval, words = site_interval(values, places, np.random.default_rng(seed))
+        source = f"mean of {len(values)} pairs from {len(set(places))} sites, {words}"
         figures[key] = instruments.figure(key, float(np.mean(values)), source, interval)
     return Row("mean", method.name, figures, {"told": method.told})
 

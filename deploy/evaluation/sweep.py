@@ -10,11 +10,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from deploy.evaluation.methods import Method, method_named
-from deploy.evaluation.pairs import NamedPair, simulate_pairs
+from deploy.evaluation.pairs import NamedPair, oversamplings_of, simulate_pairs
 from deploy.evaluation.scores import fidelity_db
 from deploy.evaluation.targets import acquire_targets, mtf_figure, restored_mtfs
 from deploy.results import Row, measured
-from model.metrics.bootstrap import mean_interval
+from model.metrics.bootstrap import site_interval
 from model.simulator.scene import Scene
 from profiles.sensor import Sensor, SensorProfile, noise_from_snr
 
@@ -78,8 +78,10 @@ def sweep_rows(
     """A row a condition for PSNR, and one for the MTF at Nyquist: the input, both chains, each network."""
     nominal, rows = profile.nominal(), []
     for condition in conditions(nominal, profile):
-        target = replace(reference.nominal(), gain_dn_per_radiance=condition.sensor.gain_dn_per_radiance)
-        pairs, _ = simulate_pairs(list(scenes), Fixed(condition.sensor), Fixed(target), seed)
+        target = reference.nominal().in_units_of(condition.sensor)
+        pairs, _ = simulate_pairs(
+            list(scenes), Fixed(condition.sensor), Fixed(target), seed, oversamplings_of(profile)
+        )
         methods = [method_named("degraded", nominal, target), *_chains(condition.sensor, nominal, target), *networks]
         rows += _rows(condition, methods, pairs, seed)
         tick()
@@ -98,9 +100,10 @@ def _rows(condition: Condition, methods: Sequence[Method], pairs: Sequence[Named
     targets = acquire_targets(condition.sensor, seed)
     psnr, mtf = {}, {}
     for method in methods:
-        values = [fidelity_db(method.restore(p.degraded), p.reference, p.degraded) for p in pairs]
-        interval = mean_interval(values, [p.site for p in pairs], np.random.default_rng(seed))
-        source = f"mean of {len(values)} pairs, 95 % bootstrap interval over sites"
+        restored = ((method.restore(pair.degraded), pair) for pair in pairs)
+        values = [fidelity_db(dn, p.reference, p.degraded, condition.sensor.max_dn) for dn, p in restored]
+        interval, words = site_interval(values, [p.site for p in pairs], np.random.default_rng(seed))
+        source = f"mean of {len(values)} pairs, {words}"
         psnr[method.name] = measured(float(np.mean(values)), "dB", source, interval)
         mtf[method.name] = mtf_figure(restored_mtfs(method, targets))
     return [Row("sweep, MTF at Nyquist", condition.name, mtf), Row("sweep, PSNR", condition.name, psnr)]

@@ -32,10 +32,19 @@ STUDENT_90 = {2: 6.31, 3: 2.92, 4: 2.35, 5: 2.13, 6: 2.02, 8: 1.89, 12: 1.80}
 
 @dataclass(frozen=True)
 class Targets:
-    """Acquired targets: edges (H, W) digital numbers, and flat fields with their radiance."""
+    """Acquired targets: edges (H, W) digital numbers, flat fields with their radiance, and what the sensor adds.
+
+    Attributes:
+        edges: each with independent noise.
+        flats: radiance in W/m2/sr/um, and the field.
+        max_dn: the digital number at which an edge is saturated.
+        offset_dn: the digital number of the dark, no part of a signal.
+    """
 
     edges: Sequence[np.ndarray]
     flats: Sequence[tuple[float, np.ndarray]]
+    max_dn: int = MAX_DN
+    offset_dn: float = 0.0
 
 
 def acquire_targets(sensor: Sensor, seed: int) -> Targets:
@@ -48,7 +57,7 @@ def acquire_targets(sensor: Sensor, seed: int) -> Targets:
     for number, radiance in enumerate(RADIANCES):
         scene = torch.full((FLAT_PX, FLAT_PX), radiance)
         flats.append((radiance, _acquire(scene, sensor, Draw(seed, len(edges) + number), ratio=1)))
-    return Targets(edges, flats)
+    return Targets(edges, flats, sensor.max_dn, sensor.offset_dn)
 
 
 def _acquire(scene: Tensor, sensor: Sensor, draw: Draw, ratio: int = OVERSAMPLING) -> np.ndarray:
@@ -60,13 +69,13 @@ def target_figures(method: Method, targets: Targets) -> dict[str, Figure]:
     """MTF at Nyquist in %, and SNR in flat fields, of what the method makes of the targets."""
     figures = {"MTF at Nyquist": mtf_figure(restored_mtfs(method, targets))}
     for radiance, flat in targets.flats:
-        figures[f"SNR at {radiance:g}"] = flat_figure(_middle(method.restore(flat)))
+        figures[f"SNR at {radiance:g}"] = flat_figure(_middle(method.restore(flat)) - targets.offset_dn)
     return figures
 
 
 def restored_mtfs(method: Method, targets: Targets) -> list[EdgeMtf | Refusal]:
     """What the instrument says of each restored edge."""
-    return [edge_mtf(_middle(method.restore(edge)), saturated=MAX_DN) for edge in targets.edges]
+    return [edge_mtf(_middle(method.restore(edge)), saturated=targets.max_dn) for edge in targets.edges]
 
 
 def _middle(image: np.ndarray) -> np.ndarray:

@@ -15,7 +15,6 @@ from deploy.evaluation.methods import Method, Restore
 from deploy.evaluation.pairs import NamedPair
 from deploy.evaluation.scores import Instruments
 from deploy.evaluation.targets import Targets, target_figures
-from deploy.restore import MAX_DN
 from deploy.results import Figure
 from deploy.tradeoff.cache import code_digest, pixels_digest
 
@@ -80,7 +79,7 @@ class Ground:
         names = [pair.name for pair in self.pairs]
         targets = pixels_digest([*self.targets.edges, *(flat for _, flat in self.targets.flats)])
         given = {"pairs": pairs, "names": names, "targets": targets, "weights": self.weights}
-        return {**given, "code": code_digest(*CODE)}
+        return {**given, "max_dn": self.instruments.max_dn, "code": code_digest(*CODE)}
 
     @property
     def sites(self) -> list[str]:
@@ -112,6 +111,6 @@ def measure_mae(restore: Restore, float_restore: Restore, ground: Ground, tick: 
     images = []
     for pair in ground.pairs:
         in_int8, in_float = (np.asarray(each(pair.degraded), np.float64) for each in (restore, float_restore))
-        images.append({MAE: float(np.abs(in_int8 - in_float).mean()) / MAX_DN})
+        images.append({MAE: float(np.abs(in_int8 - in_float).mean()) / ground.instruments.max_dn})
         tick()
     return Scores(tuple(images))

@@ -7,7 +7,7 @@ import numpy as np
 from deploy.evaluation.pairs import NamedPair
 from deploy.evaluation.scores import fidelity_db
 from deploy.report.pictures import busiest_windows
-from deploy.restore import restore_with
+from deploy.restore import MAX_DN, restore_with
 from deploy.tradeoff.lab import Lab
 from deploy.tradeoff.outcome import Outcome
 from deploy.tradeoff.points import Unit
@@ -34,7 +34,8 @@ def crop_points(
 
 def make_crops(points: Sequence[Outcome], lab: Lab) -> tuple[Crop, ...]:
     """Degraded, each point as it would restore it, reference; of the pair that is hardest to restore."""
-    pair = hardest(lab.ground.pairs)
+    max_dn = lab.ground.instruments.max_dn
+    pair = hardest(lab.ground.pairs, max_dn)
     side = min(CROP_PX, *pair.reference.shape)
     top, left = busiest_windows(pair.reference, side)[0]
 
@@ -43,16 +44,16 @@ def make_crops(points: Sequence[Outcome], lab: Lab) -> tuple[Crop, ...]:
             np.asarray(image[top : top + side, left : left + side], np.float32)
             for image in (dn, pair.reference, pair.degraded)
         )
-        return Crop(name, title, here, None if dn is pair.reference else fidelity_db(here, truth, seen))
+        return Crop(name, title, here, None if dn is pair.reference else fidelity_db(here, truth, seen, max_dn))
 
     made = [crop(each.name, each.name, _restored(each, pair, lab)) for each in points]
     return (crop("degraded", "degraded", pair.degraded), *made, crop("reference", "reference", pair.reference))
 
 
-def hardest(pairs: Sequence[NamedPair]) -> NamedPair:
+def hardest(pairs: Sequence[NamedPair], max_dn: int = MAX_DN) -> NamedPair:
     """The pair whose degraded image is farthest from its reference, among those that hold a crop where any does."""
     large = [pair for pair in pairs if min(pair.reference.shape) >= CROP_PX] or pairs
-    return min(large, key=lambda pair: fidelity_db(pair.degraded, pair.reference, pair.degraded))
+    return min(large, key=lambda pair: fidelity_db(pair.degraded, pair.reference, pair.degraded, max_dn))
 
 
 def _restored(outcome: Outcome, pair: NamedPair, lab: Lab) -> np.ndarray:
@@ -60,4 +61,4 @@ def _restored(outcome: Outcome, pair: NamedPair, lab: Lab) -> np.ndarray:
     if opened.infer is None:
         return opened.restore(pair.degraded)
     halo_px = point.halo_px(lab.shelf.radius_px(point.unit.method))
-    return restore_with(opened.infer, pair.degraded, point.tile_px, halo_px)
+    return restore_with(opened.infer, pair.degraded, point.tile_px, halo_px, max_dn=lab.shelf.max_dn)

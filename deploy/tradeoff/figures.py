@@ -20,7 +20,7 @@ from deploy.tradeoff.outcome import QUALITIES, Outcome
 from deploy.tradeoff.points import EXACT, Point, on_dpu
 from deploy.tradeoff.seams import seam_density, with_seams
 from deploy.tradeoff.shelf import runtime_of
-from model.metrics.bootstrap import mean_interval
+from model.metrics.bootstrap import site_interval
 from profiles.errors import ModelError
 from quant.onnx_file import load_onnx
 
@@ -83,8 +83,8 @@ class Assembly:
             return unavailable("ratio", NOT_PAIRED if point.unit.precision.startswith("INT8") else NO_INT8)
         values = [values[MAE] or 0.0 for values in found.images]
         ground = self.lab.ground
-        interval = mean_interval(values, ground.sites, np.random.default_rng(ground.seed))
-        source = f"mean of {len(values)} pairs, exact seams, of full scale, 95 % bootstrap interval over sites"
+        interval, words = site_interval(values, ground.sites, np.random.default_rng(ground.seed))
+        source = f"mean of {len(values)} pairs, exact seams, of full scale, {words}"
         return measured(float(np.mean(values)), "ratio", source, interval)
 
     def _host(self, times: Times | None, work_factor: float, point: Point) -> dict[str, Figure]:

@@ -14,7 +14,8 @@ from deploy.tradeoff.points import LEGAL
 from model.files import sha256
 from model.images import list_images
 from profiles import load_sensor, sensor_names
-from quant.calibration import REFERENCE, Patches, draw_patches
+from profiles.sensor import reference_for
+from quant.calibration import Patches, draw_patches
 from quant.free import free_ticks, quantise_free
 from quant.onnx_file import metadata
 from quant.passes.equalise import search_steps
@@ -52,9 +53,10 @@ class Calibration:
 
     def patches(self, model: onnx.ModelProto) -> Patches:
         """For one network."""
-        reference = load_sensor(REFERENCE)
+        degraded = load_sensor(self.sensor_of(model))
+        reference = reference_for(degraded)
         scenes = load_scenes(self.scenes, reference.nominal(), self.seed)
-        return draw_patches(scenes, load_sensor(self.sensor_of(model)), reference, PATCHES, self.seed, PATCH_PX)
+        return draw_patches(scenes, degraded, reference, PATCHES, self.seed, PATCH_PX)
 
 
 def make_int8(

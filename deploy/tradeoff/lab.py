@@ -97,7 +97,7 @@ class Lab:
         def run(tick: Tick) -> None:
             infer = self.shelf.open(unit).infer
             assert infer is not None  # noqa: S101 - only networks have tiles
-            found = Scores(measure_images(cut_in_four(infer, halo_px), self.ground, tick))
+            found = Scores(measure_images(cut_in_four(infer, halo_px, self.shelf.max_dn), self.ground, tick))
             self.cache.keep("seams", self._key(unit, halo_px=halo_px), found)
 
         return self._job(f"seams of {unit}, halo {halo_px}", unit, run)

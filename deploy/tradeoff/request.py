@@ -6,6 +6,7 @@ from pathlib import Path
 from deploy.tradeoff.demands import Demand
 from model.images import list_images
 from model.metrics.backbone_files import find_backbone
+from profiles.sensor import SensorProfile, load_sensor, reference_for
 
 
 @dataclass(frozen=True)
@@ -35,6 +36,12 @@ class Request:
     budget: tuple[Demand, ...] = ()
     need: tuple[Demand, ...] = ()
     seed: int = 0
+
+    @property
+    def profiles(self) -> tuple[SensorProfile, SensorProfile]:
+        """Of the degraded images and of the reference, this one in the digital numbers of the first."""
+        degraded = load_sensor(self.sensor)
+        return degraded, reference_for(degraded, self.reference)
 
     @property
     def backbone(self) -> Path | None:

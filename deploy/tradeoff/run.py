@@ -41,7 +41,6 @@ from deploy.tradeoff.selection import select_points
 from deploy.tradeoff.shelf import Shelf
 from deploy.tradeoff.study import Study
 from model.files import sha256
-from profiles import load_sensor
 from quant.onnx_file import load_onnx
 
 LPIPS = "LPIPS-squeeze"
@@ -112,18 +111,17 @@ def _put_together(request: Request, lab: Lab, arena: Arena, remarks: tuple[str, 
 def make_shelf(request: Request, cache: Cache) -> Shelf:
     """The methods of a study."""
     networks = {network.name: network for network in find_networks(request.networks)}
-    sensors = load_sensor(request.sensor), load_sensor(request.reference)
-    return Shelf(networks, *sensors, Calibration(request.calibration, request.sensor, request.seed), cache)
+    return Shelf(networks, *request.profiles, Calibration(request.calibration, request.sensor, request.seed), cache)
 
 
 def make_ground(request: Request) -> tuple[Ground, list[str]]:
     """What all are judged on, and the names of images too small for it."""
-    sensors = load_sensor(request.sensor), load_sensor(request.reference)
+    sensors = request.profiles
     pairs, small = load_pairs(request.images, None, *sensors, request.seed)
     perceptual = {LPIPS: perceptual_distances(request.lpips)[LPIPS]}
     weights = sha256(request.backbone) if request.backbone else ""
     targets = acquire_targets(sensors[0].nominal(), request.seed)
-    return Ground(pairs, targets, Instruments(perceptual), weights, request.seed), small
+    return Ground(pairs, targets, Instruments(perceptual, sensors[0].nominal().max_dn), weights, request.seed), small
 
 
 def host_tile(shelf: Shelf, seed: int) -> np.ndarray:

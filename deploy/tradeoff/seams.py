@@ -21,15 +21,15 @@ from deploy.tradeoff.accuracy import Scores, Values
 LEAST_SQUARED_ERROR = 1e-12
 
 
-def cut_in_four(infer: Infer, halo_px: int) -> Restore:
+def cut_in_four(infer: Infer, halo_px: int, max_dn: int = MAX_DN) -> Restore:
     """Restores (H, W) digital numbers in four windows, each with so much of the others around it."""
-    return partial(_restore, infer=infer, halo_px=halo_px)
+    return partial(_restore, infer=infer, halo_px=halo_px, max_dn=max_dn)
 
 
-def _restore(dn: np.ndarray, infer: Infer, halo_px: int) -> np.ndarray:
+def _restore(dn: np.ndarray, infer: Infer, halo_px: int, max_dn: int) -> np.ndarray:
     rows, columns = (halves(size_px, halo_px) for size_px in dn.shape)
     tiles = [Tile(row, column) for row in rows for column in columns]
-    return restore_tiles(dn, infer, tiles).astype(np.float32)
+    return restore_tiles(dn, infer, tiles, max_dn=max_dn).astype(np.float32)
 
 
 def halves(size_px: int, halo_px: int) -> list[Span]:

@@ -53,6 +53,11 @@ class Shelf:
     calibration: Calibration
     cache: Cache
 
+    @property
+    def max_dn(self) -> int:
+        """The largest digital number of the images."""
+        return self.degraded.nominal().max_dn
+
     def lack(self, unit: Unit) -> str:
         """Why a unit cannot be had here; empty where it can."""
         try:
@@ -127,7 +132,7 @@ class Shelf:
         model = load_onnx(path) if path else self.model(unit.method)
         half = unit.precision == "bf16"
         infer, _ = open_openvino(model, 0, "bf16") if half else open_runtime(Runtime.onnxruntime, model, 0)
-        return Opened(partial(_whole, infer=infer, radius_px=self.radius_px(unit.method)), infer)
+        return Opened(partial(_whole, infer=infer, radius_px=self.radius_px(unit.method), max_dn=self.max_dn), infer)
 
 
 def runtime_of(unit: Unit) -> str:
@@ -137,8 +142,8 @@ def runtime_of(unit: Unit) -> str:
     return "scikit-image" if unit.kind == "peer" else "PyTorch"
 
 
-def _whole(dn: np.ndarray, infer: Infer, radius_px: int) -> np.ndarray:
-    return restore_with(infer, dn, TILE_PX, radius_px).astype(np.float32)
+def _whole(dn: np.ndarray, infer: Infer, radius_px: int, max_dn: int) -> np.ndarray:
+    return restore_with(infer, dn, TILE_PX, radius_px, max_dn=max_dn).astype(np.float32)
 
 
 @cache

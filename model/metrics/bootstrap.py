@@ -6,6 +6,19 @@ import numpy as np
 
 DRAWS, LEVEL = 4000, 0.95
 
+LEAST_SITES = 5
+"""Of fewer sites no interval is shown: drawn with replacement, they vary far less than others of their kind would."""
+
+
+def site_interval(
+    values: Sequence[float], sites: Sequence[str], generator: np.random.Generator
+) -> tuple[tuple[float, float] | None, str]:
+    """The interval of `mean_interval` and what it is in words; None, and the reason, below five sites."""
+    count = len(set(sites))
+    if count < LEAST_SITES:
+        return None, f"no interval: {count} site{'s' if count > 1 else ''}, fewer than {LEAST_SITES}"
+    return mean_interval(values, sites, generator), "95 % bootstrap interval over sites"
+
 
 def mean_interval(
     values: Sequence[float], sites: Sequence[str], generator: np.random.Generator

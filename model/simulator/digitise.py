@@ -20,8 +20,13 @@ def digitise_dn(dn: Tensor, sensor: Sensor) -> Tensor:
 
 
 def to_radiance(dn: Tensor, sensor: Sensor) -> Tensor:
-    """Radiance in W/m2/sr/um of digital numbers."""
-    return dn / sensor.gain_dn_per_radiance
+    """Radiance in W/m2/sr/um of digital numbers, the offset taken off."""
+    return (dn - sensor.offset_dn) / sensor.gain_dn_per_radiance
+
+
+def to_dn(radiance: Tensor, sensor: Sensor) -> Tensor:
+    """The inverse of `to_radiance`, clipped to the converter's range and not rounded."""
+    return (radiance * sensor.gain_dn_per_radiance + sensor.offset_dn).clamp(0, sensor.max_dn)
 
 
 def to_uint16(dn: Tensor) -> np.ndarray:

@@ -10,6 +10,7 @@ from types import ModuleType
 import torch
 from torch import Tensor
 
+from model.simulator.digitise import to_dn, to_radiance
 from model.simulator.mtf import transfer_function
 from model.traditional.compensate import filter_strips
 from model.traditional.pipeline import Chain, with_rounding_noise
@@ -66,13 +67,13 @@ def richardson_lucy(dn: Tensor, chain: Chain) -> Tensor:
 def nl_means(dn: Tensor, chain: Chain) -> Tensor:
     """The chain with scikit-image's fast non-local means, patches of 5 x 5 within 6 pixels, h = 0.6 sigma."""
     sensor = with_rounding_noise(chain.degraded)
-    stable = stabilise(dn / chain.degraded.gain_dn_per_radiance, sensor)
+    stable = stabilise(to_radiance(dn, chain.degraded), sensor)
     clean = _restoration().denoise_nl_means(
         stable.numpy(), NLM_PATCH_PX, NLM_DISTANCE_PX, h=NLM_STRENGTH, sigma=1.0, fast_mode=True
     )
     radiance = destabilise(torch.from_numpy(clean).float(), sensor) + bias_radiance(sensor)
     sharp = torch.cat(list(filter_strips([radiance], len(radiance), chain.kernel())))
-    return _as_reference(sharp, chain)
+    return to_dn(sharp, chain.reference)
 
 
 PEERS: dict[str, Peer] = {
@@ -88,15 +89,11 @@ def _deconvolved(dn: Tensor, chain: Chain, deconvolve: Callable[[Tensor, Tensor]
     full_scale = chain.degraded.max_dn / chain.degraded.gain_dn_per_radiance
     rows, columns = (mirrored(-PAD_PX, size + PAD_PX, size) for size in dn.shape)
     height, width = len(rows), len(columns)
-    wide = (dn.double() / chain.degraded.max_dn)[rows][:, columns]
+    wide = ((dn.double() - chain.degraded.offset_dn) / chain.degraded.max_dn)[rows][:, columns]
     blur, target = (transfer_function(height, width, 1, s.mtf_axes) for s in (chain.degraded, chain.reference))
     sharp = torch.fft.rfft2(deconvolve(wide, blur)) * target
     inside = torch.fft.irfft2(sharp, s=(height, width))[PAD_PX:-PAD_PX, PAD_PX:-PAD_PX]
-    return _as_reference((inside * full_scale).float(), chain)
-
-
-def _as_reference(radiance: Tensor, chain: Chain) -> Tensor:
-    return (radiance * chain.reference.gain_dn_per_radiance).clamp(0, chain.reference.max_dn)
+    return to_dn((inside * full_scale).float(), chain.reference)
 
 
 def _restoration() -> ModuleType:

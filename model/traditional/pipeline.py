@@ -13,6 +13,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
+from model.simulator.digitise import to_dn, to_radiance
 from model.traditional.compensate import EPSILON_PER_SIGMA, compensation_gain, compensation_kernel, filter_strips
 from model.traditional.nl_bayes import finite_or_missing, nl_bayes_strips
 from model.traditional.noise import Noise, coloured_by
@@ -74,10 +75,10 @@ def restore_strips(strips: Iterable[Tensor], height: int, chain: Chain) -> Itera
     Raises:
         ImageError: infinite values; the stabiliser would make NaN of them, which means missing.
     """
-    radiance = (strip / chain.degraded.gain_dn_per_radiance for strip in finite_or_missing(strips))
+    radiance = (to_radiance(strip, chain.degraded) for strip in finite_or_missing(strips))
     run = _denoise_first if chain.order == "denoise-first" else _deconvolve_first
     for strip in run(radiance, height, chain, quality_named(chain.quality)):
-        yield (strip * chain.reference.gain_dn_per_radiance).clamp(0, chain.reference.max_dn)
+        yield to_dn(strip, chain.reference)
 
 
 def _denoise_first(radiance: Iterable[Tensor], height: int, chain: Chain, quality: Quality) -> Iterator[Tensor]:

@@ -19,7 +19,7 @@ from model.simulator.sampling import crop_divisible, scene_spectrum
 from model.simulator.scene import Scene
 from model.training.workers import Worker
 from profiles.errors import ImageError
-from profiles.sensor import Sensor, SensorProfile
+from profiles.sensor import Sensor, SensorProfile, require_same_units
 
 
 @dataclass(frozen=True)
@@ -28,7 +28,7 @@ class PatchRecipe:
 
     Attributes:
         degraded: draws the sensor of each pass over a scene.
-        reference: draws the sensor of the wanted image.
+        reference: draws the sensor of the wanted image, in the units of `degraded`.
         patch_px: side of a patch.
         oversamplings: ratios to draw from; every ratio shows the same ground at another scale.
         exposures: darker and brighter days than the photograph's.
@@ -43,6 +43,9 @@ class PatchRecipe:
     exposures: tuple[float, float] = (0.5, 1.25)
     margin_px: int = 16
     told: SensorFamily | None = None
+
+    def __post_init__(self) -> None:
+        require_same_units(self.degraded, self.reference)
 
 
 @dataclass(frozen=True)

@@ -125,14 +125,20 @@ def test_an_image_that_is_all_clipped_still_has_a_figure() -> None:
 
 
 def test_the_degraded_input_gains_nothing_and_missing_figures_have_a_reason() -> None:
-    mean, *images = score(IDENTITY, [pair(seed=s) for s in range(3)], PLAIN, 0, lambda: None)
+    mean, *images = score(IDENTITY, [pair(f"{'abcde'[s]}.tif", seed=s) for s in range(5)], PLAIN, 0, lambda: None)
     assert mean.figures["PSNR gain"].value == 0
-    assert len(images) == 3
+    assert len(images) == 5
     assert mean.figures["LPIPS-squeeze"].reason == "no weights"
     assert missing([mean, *images]) == ["- LPIPS-squeeze: no weights"]
     interval = mean.figures["PSNR"].interval
     assert interval is not None
     assert interval[0] <= (mean.figures["PSNR"].value or 0) <= interval[1]
+
+
+def test_below_five_sites_a_mean_has_no_interval_and_says_so() -> None:
+    mean, *_ = score(IDENTITY, [pair(f"{'abcd'[s]}.tif", seed=s) for s in range(4)], PLAIN, 0, lambda: None)
+    assert mean.figures["PSNR"].interval is None
+    assert "no interval: 4 sites, fewer than 5" in mean.figures["PSNR"].source
 
 
 def test_identical_images_are_no_number() -> None:

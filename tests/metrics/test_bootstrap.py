@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from model.metrics.bootstrap import mean_interval
+from model.metrics.bootstrap import LEAST_SITES, mean_interval, site_interval
 
 
 def interval(values: list[float], sites: list[str]) -> tuple[float, float]:
@@ -35,3 +35,16 @@ def test_a_single_site_draws_its_images_and_a_single_image_has_no_width() -> Non
 def test_the_same_seed_gives_the_same_interval() -> None:
     assert interval([1.0, 2.0, 4.0], list("abc")) == interval([1.0, 2.0, 4.0], list("abc"))
     assert interval([1.0, 2.0, 4.0], list("abc")) == pytest.approx((1, 4), abs=0.7)
+
+
+@pytest.mark.parametrize("count", [1, 2, LEAST_SITES - 1, LEAST_SITES, 9])
+def test_below_five_sites_there_is_no_interval_and_it_is_said(count: int) -> None:
+    values, sites = list(np.linspace(40, 44, 3 * count)), [f"s{k % count}" for k in range(3 * count)]
+    found, words = site_interval(values, sites, np.random.default_rng(0))
+    if count < LEAST_SITES:
+        assert found is None
+        assert "no interval" in words
+        assert f"{count} site" in words
+    else:
+        assert found == interval(values, sites)
+        assert "no interval" not in words

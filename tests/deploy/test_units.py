@@ -1,0 +1,89 @@
+"""A digital number means the same in a degraded image and in its reference, whatever the sensor's digitiser."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from deploy.dataset_patches import DatasetRecipe
+from deploy.defaults import reference_beside
+from deploy.evaluation.methods import method_named
+from deploy.evaluation.pairs import simulate_pairs
+from deploy.evaluation.scores import fidelity_db
+from model.simulator.procedural import procedural_scene
+from model.training.patches import PatchRecipe
+from profiles import SensorProfile, load_sensor
+from profiles.constant import Constant
+from profiles.errors import ProfileError
+from profiles.sensor import reference_for
+
+DEGRADED = load_sensor("pleiades-degraded")
+METHODS = ("degraded", "traditional-fast", "convbeers-xs")
+SCENE = procedural_scene(330, 346, np.random.default_rng(3))
+
+
+def with_units(profile: SensorProfile, gain: float, bits: int, offset_dn: float = 0.0) -> SensorProfile:
+    def stated(value: float) -> Constant:
+        return Constant(value, "stated", "a test")
+
+    effects = {"offset": {"offset_dn": stated(offset_dn)}} if offset_dn else {}
+    return replace(profile, gain_dn_per_radiance=stated(gain), bits=stated(bits), effects=effects)
+
+
+def psnr_db(degraded: SensorProfile, reference: SensorProfile) -> list[float]:
+    """Of each method, on one pair."""
+    sensors = degraded.nominal(), reference.nominal()
+    (pair,), _ = simulate_pairs([SCENE], degraded, reference, 0)
+    methods = [method_named(name, *sensors) for name in METHODS]
+    return [fidelity_db(m.restore(pair.degraded), pair.reference, pair.degraded, sensors[0].max_dn) for m in methods]
+
+
+@pytest.fixture(scope="module")
+def shipped() -> list[float]:
+    return psnr_db(DEGRADED, reference_for(DEGRADED))
+
+
+@pytest.mark.parametrize(("gain", "bits"), [(10.0, 12), (4 * 10.2375, 14), (16 * 10.2375, 16)])
+def test_scaling_the_gain_and_the_bits_changes_no_psnr_and_no_ranking(
+    shipped: list[float], gain: float, bits: int
+) -> None:
+    degraded = with_units(DEGRADED, gain, bits)
+    found = psnr_db(degraded, reference_for(degraded))
+    full_scale_db = 20 * np.log10(4095 / 10.2375 / ((2**bits - 1) / gain))  # what PSNR is taken over
+    assert found == pytest.approx([value - full_scale_db for value in shipped], abs=0.15)
+    assert np.argsort(found).tolist() == np.argsort(shipped).tolist()
+
+
+def test_an_offset_changes_no_psnr(shipped: list[float]) -> None:
+    degraded = with_units(DEGRADED, 10.2375, 12, offset_dn=100)
+    assert psnr_db(degraded, reference_for(degraded)) == pytest.approx(shipped, abs=0.4)
+
+
+def test_a_reference_of_another_gain_reverses_the_verdict(shipped: list[float]) -> None:
+    found = psnr_db(with_units(DEGRADED, 10.0, 12), load_sensor("pleiades-reference"))
+    assert found[2] < shipped[2] - 1
+
+
+def test_a_shipped_reference_stays_as_it_is() -> None:
+    assert reference_for(DEGRADED) == load_sensor("pleiades-reference")
+
+
+def test_a_named_reference_of_other_units_is_converted_in_sight() -> None:
+    said = list[str]()
+    degraded = with_units(DEGRADED, 40, 14, offset_dn=5)
+    assert reference_beside(degraded, None, said.append).units == (40, 14, 5)
+    assert said == []
+    assert reference_beside(degraded, "pleiades-reference", said.append).units == (40, 14, 5)
+    (sentence,) = said
+    assert "pleiades-reference (10.2375 DN per W/m2/sr/um, 12 bits)" in sentence
+    assert "40 DN per W/m2/sr/um, 14 bits, 5 DN of offset" in sentence
+    reference_beside(DEGRADED, "pleiades-reference", said.append)
+    assert len(said) == 1
+
+
+def test_recipes_refuse_a_reference_of_other_units() -> None:
+    degraded, reference = with_units(DEGRADED, 10, 12), load_sensor("pleiades-reference")
+    with pytest.raises(ProfileError, match=r"10 DN per W/m2/sr/um, 12 bits.*10\.2375"):
+        PatchRecipe(degraded, reference)
+    with pytest.raises(ProfileError, match="reference of pleiades-degraded"):
+        DatasetRecipe((None,), degraded, reference, 2, None)

@@ -1,0 +1,72 @@
+"""docs/sensor-profile.md names every key of a profile, with its range, and no other."""
+
+import re
+import tomllib
+from dataclasses import fields
+from pathlib import Path
+from typing import get_args
+
+import pytest
+from typer.testing import CliRunner
+
+from deploy.cli import app
+from profiles.constant import Status, read_constant
+from profiles.effects import LIMITS
+from profiles.effects import TABLES as EFFECTS
+from profiles.sensor import (
+    MTF_NYQUIST_MAX,
+    OPTIONAL,
+    SINGLE,
+    TABLES,
+    load_sensor,
+    read_sensor,
+    same_instrument,
+    sensor_names,
+)
+
+PAGE = (Path(__file__).parents[2] / "docs" / "sensor-profile.md").read_text(encoding="utf-8")
+ROWS = dict(re.findall(r"^\| `(\[\w+\] \w+)` \|(.*)\|$", PAGE, re.MULTILINE))
+
+
+def test_the_page_has_every_key_and_no_other() -> None:
+    wanted = {f"[{table}] {key}" for tables in (TABLES, OPTIONAL) for table, keys in tables.items() for key in keys}
+    wanted |= {f"[{name}] {field.name}" for name, effect in EFFECTS.items() for field in fields(effect)}
+    assert set(ROWS) == wanted
+    assert all(len(cells.split("|")) == 3 and all(map(str.strip, cells.split("|"))) for cells in ROWS.values())
+
+
+@pytest.mark.parametrize(
+    ("name", "key"), [(name, field.name) for name, effect in EFFECTS.items() for field in fields(effect)]
+)
+def test_the_page_gives_the_ranges_of_effects(name: str, key: str) -> None:
+    low, high = LIMITS[key]
+    assert ROWS[f"[{name}] {key}"].split("|")[1].strip().startswith(f"{low:g} to {high:g}")
+
+
+def test_the_page_says_where_a_range_is_refused_and_what_bounds_the_mtf() -> None:
+    single = {f"[{table}] {key}" for table, keys in TABLES.items() for key in keys if key in SINGLE}
+    assert {key for key, cells in ROWS.items() if "no range" in cells} == {*single, "[offset] offset_dn"}
+    assert f"{MTF_NYQUIST_MAX:.4f}" in ROWS["[mtf] mtf_nyquist"]
+
+
+@pytest.mark.parametrize("status", get_args(Status))
+def test_the_page_names_every_status_and_each_is_read(status: str) -> None:
+    assert f"`{status}`" in PAGE
+    assert read_constant("a test", {"value": 1, "status": status, "source": "a test"}).status == status
+
+
+def test_the_example_of_the_page_is_a_profile(tmp_path: Path) -> None:
+    (example,) = re.findall(r"```toml\n(.*?)```", PAGE, re.DOTALL)
+    (tmp_path / "my-sensor.toml").write_text(example, encoding="utf-8")
+    assert load_sensor(str(tmp_path / "my-sensor.toml")).units == (10, 12, 0)
+    assert read_sensor("a test", tomllib.loads(example)).mtf_nyquist.low == 0.05
+
+
+def test_profiles_print_the_file_to_start_from(tmp_path: Path) -> None:
+    for name in (*sensor_names(), "snow", "vck190"):
+        printed = CliRunner().invoke(app, ["profiles", name, "--toml"])
+        (tmp_path / "mine.toml").write_text(printed.output, encoding="utf-8")
+        assert CliRunner().invoke(app, ["profiles", str(tmp_path / "mine.toml"), "--toml"]).output == printed.output
+    for name in sensor_names():
+        (tmp_path / "mine.toml").write_text(CliRunner().invoke(app, ["profiles", name, "--toml"]).output)
+        assert same_instrument(load_sensor(str(tmp_path / "mine.toml")), load_sensor(name))
