@@ -1,5 +1,6 @@
 """`beers-deploy restore`: a raw image in, the restored one out, of any size."""
 
+from collections.abc import Mapping
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
@@ -107,7 +108,7 @@ def restore(
     Document("restore", arguments, (path, image), (row,)).write(json)
 
 
-def _require_nothing_else(given: dict[str, object]) -> None:
+def _require_nothing_else(given: Mapping[str, object]) -> None:
     """The traditional chain takes no option of a network's.
 
     Raises:
