@@ -76,10 +76,7 @@ def sensors(name: str = SENSOR) -> Sensors:
     """
     degraded, reference = load_sensor(name), load_sensor(REFERENCE)
     if degraded.nominal().bits != BITS:
-        got, remedy = (
-            f"{degraded.nominal().bits} bits",
-            "use 'restore --method traditional' or 'restore --full-scale'",
-        )
+        got, remedy = f"{degraded.nominal().bits} bits", "use 'restore', with --full-scale or --method traditional"
         raise OptionError("--sensor", expected=f"a sensor of {BITS} bits", got=got, remedy=remedy)
     return Sensors(degraded, replace(reference, gain_dn_per_radiance=degraded.gain_dn_per_radiance))
 
