@@ -57,7 +57,7 @@ def restore(
     The image is read and written by rows, so memory does not grow with its height. Bands are restored one by one.
     OUT has the scale of IN: 8-bit pixels with --full-scale 255 come out as 0..255, floats with 1 as 0..1.
     With --method traditional the image is stabilised, denoised and sharpened as its --sensor asks, in strips of rows:
-    one band, minutes a megapixel, not resumable.
+    one band, about a minute a megapixel on two cores, not resumable.
     Georeference, RPCs and missing pixels (NaN, or the nodata value) are kept. Until OUT is finished its rows lie in
     .OUT.part beside it. Workers change no pixel: where they are of one processor and the same versions, the bytes are
     those of one process. Those of a scheduler must find IN under its path; only this process writes.
