@@ -86,11 +86,8 @@ def _restore(image: Path, out: Path, request: Request) -> Row:
     with open_source(image) as source:
         raster = source.raster
         _require_one_band(raster, image)
-        check_memory(
-            FIXED_BYTES + BYTES_PER_COLUMN * raster.width_px + source.held_bytes(STRIP_PX),
-            request.memory_bytes,
-            bulky=False,
-        )
+        needed = FIXED_BYTES + BYTES_PER_COLUMN * raster.width_px + source.held_bytes(STRIP_PX)
+        check_memory(needed, request.memory_bytes, bulky=False)
         largest = (raster.largest(source.read(*rows)) for rows in _strips(raster.height_px))
         max_dn = chain.degraded.max_dn
         full_scale = settled_scale(str(image), raster.dtype, largest, request.full_scale, max_dn)
