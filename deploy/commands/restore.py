@@ -23,7 +23,7 @@ def restore(
     image: Annotated[Path, typer.Argument(metavar="IN", help="Image of at most 12 bits (TIFF of any size, or PNG).")],
     out: Annotated[Path, typer.Argument(metavar="OUT", help="TIFF to write: uint16, or float32 where IN is float.")],
     model: Annotated[
-        Path | None, typer.Option(help="ONNX network, float or INT8; the shipped INT8 one if none.")
+        Path | None, typer.Option(help="ONNX network, or a shipped one's name; the INT8 convbeers-s if none.")
     ] = None,
     method: Annotated[Method, typer.Option(help="A network, or the traditional chain of --sensor.")] = Method.network,
     sensor: Annotated[
@@ -63,7 +63,7 @@ def restore(
     those of one process. Those of a scheduler must find IN under its path; only this process writes.
     """
     from deploy.results import Document
-    from deploy.shipped import default_int8
+    from deploy.shipped import int8_file
     from deploy.swath.run import restore_file
     from deploy.tables import print_rows
     from model.files import require_writable
@@ -86,7 +86,7 @@ def restore(
     if sensor is not None:
         remedy = "add --method traditional, or fold a network for the sensor with 'beers-deploy export --sensor'"
         raise OptionError("--sensor", expected="--method traditional beside it", got="a network", remedy=remedy)
-    path = model or default_int8()
+    path = int8_file(model)
     require_writable(out, json, inputs=(image, path))
     options = Options(
         path,

@@ -60,6 +60,7 @@ def train(
     """
     from typing import get_args
 
+    from deploy.shipped import float_file
     from deploy.training import FILES, Run, weights_name
     from deploy.training import train as run_training
     from model.conditioning import SensorFamily
@@ -83,6 +84,7 @@ def train(
         remedy = "leave one out: stored pairs do not say what sensor each had, and a teacher is not told"
         raise OptionError("--told", expected="no --pairs or --teacher beside it", got="both", remedy=remedy)
     stored = [pairs, *(pairs / role for role in ("degraded", "reference"))] if pairs else [images]
+    start, teacher = (float_file(path) if path else None for path in (start, teacher))
     read = (*stored, lpips, start, teacher, *map(Path, (sensor, reference)))
     require_writable(*(out / name for name in (*FILES, weights_name(variant, told))), inputs=read)
     recipe = TrainingRecipe(

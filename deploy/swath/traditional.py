@@ -37,8 +37,8 @@ STRIP_PX = 128
 """Rows read at a time."""
 
 FIXED_BYTES, BYTES_PER_COLUMN = 100_000_000, 40_000
-"""Of memory that the chain takes, and more for each pixel of a row: some 700 rows, in several float32 copies. Measured
-at 400 and 1200 columns: 75 MB and 30 kB."""
+"""Of memory that the chain takes, and more for each pixel of a row: some 700 rows, in several float32 copies.
+Measured at 400 and 1200 columns: 75 MB and 30 kB."""
 
 
 @dataclass(frozen=True)
