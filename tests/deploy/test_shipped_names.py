@@ -2,8 +2,12 @@
 
 from pathlib import Path
 
+import numpy as np
 import pytest
+import tifffile
+from typer.testing import CliRunner
 
+from deploy.cli import app
 from deploy.shipped import VARIANT, default_int8, float_file, int8_file, shipped_pair
 
 
@@ -26,3 +30,19 @@ def test_anything_else_stays_a_path(given: str) -> None:
 
 def test_nothing_given_is_the_default() -> None:
     assert int8_file(None) == default_int8() == int8_file(Path(VARIANT))
+
+
+def test_commands_take_the_name(tmp_path: Path) -> None:
+    tifffile.imwrite(tmp_path / "in.tif", np.random.default_rng(0).integers(200, 1800, (37, 41)).astype(np.uint16))
+    for model in ("convbeers-xs", str(shipped_pair("convbeers-xs")[1])):
+        out = tmp_path / f"{len(model)}.tif"
+        result = CliRunner().invoke(app, ["restore", str(tmp_path / "in.tif"), str(out), "--model", model])
+        assert result.exit_code == 0, result.output
+    first, second = (tifffile.imread(path) for path in tmp_path.glob("*.tif") if path.name != "in.tif")
+    np.testing.assert_array_equal(first, second)
+    result = CliRunner().invoke(app, ["check", "convbeers-xs", "--tile", "64"])
+    assert result.exit_code == 0, result.output
+    result = CliRunner().invoke(
+        app, ["restore", str(tmp_path / "in.tif"), str(tmp_path / "x.tif"), "--model", "huge"]
+    )
+    assert result.exit_code == 2
