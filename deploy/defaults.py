@@ -7,7 +7,7 @@ import numpy as np
 import onnx
 
 from deploy.export import to_onnx
-from deploy.shipped import default_float_weights
+from deploy.shipped import default_float_weights, float_file
 from model.images import list_images
 from model.simulator.procedural import procedural_scene
 from model.simulator.scene import Scene, read_scene
@@ -27,7 +27,7 @@ def float_model(path: Path | None) -> onnx.ModelProto:
     Raises:
         ModelError: neither of these.
     """
-    path = path or default_float_weights()
+    path = float_file(path) if path else default_float_weights()
     if path.suffix != ".safetensors":
         return load_onnx(path)
     network, recipe = load_network(path)

@@ -25,7 +25,7 @@ from deploy.report.demo_page import INT8, SWATH_PX, TRADITIONAL, comparison, dem
 from deploy.report.page import Report
 from deploy.restore import TILE_PX, read_acquisition, restore_image, write_tiff
 from deploy.results import Row, measured
-from deploy.shipped import VARIANT, default_float_weights
+from deploy.shipped import SENSOR, VARIANT, default_float_weights
 from model.images import read_pixels
 from model.simulator.acquire import MARGIN_PX, Pair, simulate_pair
 from model.simulator.draws import Draw
@@ -34,6 +34,7 @@ from model.simulator.scene import Scene, read_scene
 from model.traditional.pipeline import Chain, restore_traditional
 from model.weights_file import load_network
 from profiles import load_sensor
+from profiles.errors import OptionError
 from profiles.sensor import reference_for
 from quant.calibration import draw_patches
 from quant.gate import compare
@@ -42,7 +43,8 @@ from quant.quantise import quantise_model
 from quant.radius import receptive_radius_px
 from quant.session import open_session
 
-SENSOR = "pleiades-degraded"
+BITS = 12
+"""Of a digital number, to the networks' files."""
 SIDE_PX = 640
 CALIBRATION_PATCHES, GATE_PATCHES = 24, 12
 FILES = ("report.html", "float.onnx", "int8.onnx", "core.onnx", "restored.tif", "before-after.png")
@@ -66,49 +68,61 @@ class Demo:
     report: Report
 
 
-def sensors() -> Sensors:
-    """The sensor that the demo simulates, and the one it imitates."""
-    degraded = load_sensor(SENSOR)
+def sensors(name: str = SENSOR) -> Sensors:
+    """The sensor that the demo simulates, and the one it imitates.
+
+    Raises:
+        OptionError: a sensor of other than 12 bits.
+        ProfileError: no such sensor.
+    """
+    degraded = load_sensor(name)
+    if degraded.nominal().bits != BITS:
+        got, remedy = f"{degraded.nominal().bits} bits", "use 'restore', with --full-scale or --method traditional"
+        raise OptionError("--sensor", expected=f"a sensor of {BITS} bits", got=got, remedy=remedy)
     return Sensors(degraded, reference_for(degraded))
 
 
-def read_input(image: Path | None, seed: int, full_scale: float | None = None) -> Input:
+def read_input(image: Path | None, seed: int, eyes: Sensors, full_scale: float | None = None) -> Input:
     """A drawn scene, a photograph as a scene (8 bits), or a raw acquisition (mono, up to 12 bits).
 
     With the pixel value that is its `full_scale`, any image is a raw acquisition.
     """
     if image is None:
-        eyes = sensors()
         side = (SIDE_PX + 2 * MARGIN_PX) * int(eyes.degraded.oversampling.low)
-        return _simulated(procedural_scene(side, side, np.random.default_rng(seed)), seed)
+        return _simulated(procedural_scene(side, side, np.random.default_rng(seed)), seed, eyes)
     if full_scale is None and read_pixels(image).dtype == np.uint8:
-        return _simulated(read_scene(image, sensors().reference.nominal()), seed)
+        return _simulated(read_scene(image, eyes.reference.nominal()), seed, eyes)
     return Input(image.name, read_acquisition(image, full_scale, None), None)
 
 
-def _simulated(scene: Scene, seed: int) -> Input:
-    eyes = sensors()
+def _simulated(scene: Scene, seed: int, eyes: Sensors) -> Input:
     ratio = int(eyes.degraded.oversampling.low)
     pair = simulate_pair(scene.radiance, eyes.degraded.nominal(), eyes.reference.nominal(), ratio, Draw(seed))
     return Input(scene.name, pair.degraded.numpy(), pair)
 
 
 def run_demo(
-    image: Path | None, out: Path, seed: int, say: Callable[[str], None], full_scale: float | None = None
+    image: Path | None,
+    out: Path,
+    seed: int,
+    say: Callable[[str], None],
+    full_scale: float | None = None,
+    sensor: str = SENSOR,
 ) -> Demo:
     """Run the chain, write its files into `out`, and return the figures and the report.
 
     Files: float.onnx, int8.onnx, core.onnx (the board's spelling), restored.tif, before-after.png.
     """
     say("reading the image")
-    given = read_input(image, seed, full_scale)
+    eyes = sensors(sensor)
+    given = read_input(image, seed, eyes, full_scale)
     say("exporting, quantising and gating")
-    gate, int8, exact = quantise_and_gate(out, seed)
+    gate, int8, exact = quantise_and_gate(out, seed, eyes)
     say("checking every operator against the DPU")
     dpu = load_dpu()
     placement = place(read_network(out / "int8.onnx", TILE_PX), dpu)
     say("restoring: traditional pipeline and INT8 network")
-    methods = _methods(int8)
+    methods = _methods(int8, eyes)
     restored = {name: method(given.degraded) for name, method in methods.items()}
     write_tiff(out / "restored.tif", restored[INT8].astype(np.uint16))
     images = {"degraded input": given.degraded, **restored}
@@ -117,21 +131,20 @@ def run_demo(
     pictures = comparison(images, out)
     quality = _quality(given, restored)
     say("measuring the traditional pipeline, predicting the board")
-    bench, swath = bench_rows(out / "int8.onnx", given.degraded, dpu, receptive_radius_px(int8))
+    bench, swath = bench_rows(out / "int8.onnx", given.degraded, dpu, receptive_radius_px(int8), eyes)
     rows = (*bench, *swath, *quality, gate, exact)
     return Demo(rows, demo_report(given.degraded.shape, pictures, bench, swath, quality, (gate, exact), placement))
 
 
-def quantise_and_gate(out: Path, seed: int) -> tuple[Row, onnx.ModelProto, Row]:
+def quantise_and_gate(out: Path, seed: int, eyes: Sensors) -> tuple[Row, onnx.ModelProto, Row]:
     """Export the shipped weights, quantise on drawn scenes, compare; returns the gate's row and the INT8 model."""
-    eyes = sensors()
     model = float_model(None)
     save_onnx(model, out / "float.onnx")
     network, _ = load_network(default_float_weights())
     difference = require_parity(network, out / "float.onnx", 97)
     scenes = load_scenes(None, eyes.reference.nominal(), seed)
     patches = draw_patches(scenes, eyes.degraded, eyes.reference, CALIBRATION_PATCHES, seed)
-    result = quantise_model(model, patches, {"calibration_sensor": SENSOR}, lambda: None)
+    result = quantise_model(model, patches, {"calibration_sensor": eyes.degraded.name}, lambda: None)
     save_onnx(result.host, out / "int8.onnx")
     save_onnx(result.board, out / "core.onnx")
     unseen = load_scenes(None, eyes.reference.nominal(), seed + HELD_OUT_SEED)
@@ -142,14 +155,14 @@ def quantise_and_gate(out: Path, seed: int) -> tuple[Row, onnx.ModelProto, Row]:
     return gate_row(verdict), result.host, exact
 
 
-def bench_rows(model: Path, dn: np.ndarray, dpu: Dpu, halo_px: int) -> tuple[list[Row], list[Row]]:
+def bench_rows(model: Path, dn: np.ndarray, dpu: Dpu, halo_px: int, eyes: Sensors) -> tuple[list[Row], list[Row]]:
     """Speed for this image, and for the swath of the paper with its published rows beside."""
     prediction = predict_file(model, dpu)
     tables = []
     for width, height in ((dn.shape[1], dn.shape[0]), SWATH_PX):
         swath = Swath(width, height, TILE_PX, halo_px)
         network = predicted_rows(VARIANT, prediction, swath, dpu)
-        tables.append([*traditional_rows(dn, swath, sensors()), *network])
+        tables.append([*traditional_rows(dn, swath, eyes), *network])
     return tables[0], [
         *(_in_table(row, "swath") for row in tables[1]),
         *(_in_table(r, "swath") for r in published_rows()),
@@ -160,8 +173,7 @@ def _in_table(row: Row, table: str) -> Row:
     return Row(table, row.name, row.figures, row.text)
 
 
-def _methods(int8: onnx.ModelProto) -> dict[str, Restore]:
-    eyes = sensors()
+def _methods(int8: onnx.ModelProto, eyes: Sensors) -> dict[str, Restore]:
     session, halo_px = open_session(int8), receptive_radius_px(int8)
     plain = eyes.degraded.nominal(), eyes.reference.nominal()
     return {

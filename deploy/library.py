@@ -8,7 +8,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from deploy.shipped import default_int8
+from deploy.shipped import int8_file
 from deploy.swath.engine import restore_rows
 from deploy.swath.options import TILE_PX, Options, Runtime
 from deploy.swath.raster import Raster, require_numbers, usable_nodata
@@ -39,7 +39,7 @@ def restore(
     Args:
         image: of numpy it is restored at once; of Dask the result is lazy, a chunk for each tile and band, and may be
             computed on a cluster that has this package; an xarray.DataArray keeps coordinates and attributes.
-        model: ONNX file, float or INT8; the shipped INT8 network if None.
+        model: ONNX file, float or INT8, or the name of a shipped network; the shipped INT8 network if None.
         tile_px: side of a tile.
         halo: 'exact', or pixels of context around a tile.
         full_scale: the pixel value that is 1.0 to the network. None is 4095 (12 bits) for integers of more than 8
@@ -59,7 +59,9 @@ def restore(
         OptionError: options that do not go together.
         MachineError: a missing package.
     """
-    options = Options(Path(model or default_int8()), tile_px, str(halo), full_scale, _runtime(runtime), threads)
+    options = Options(
+        int8_file(Path(model) if model else None), tile_px, str(halo), full_scale, _runtime(runtime), threads
+    )
     if hasattr(image, "coords") and hasattr(image, "dims"):  # an xarray.DataArray, without importing it
         labelled: Any = image
         missing = labelled.attrs.get("_FillValue") if nodata is None else nodata

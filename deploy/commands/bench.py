@@ -52,12 +52,12 @@ def bench(
     from deploy.bench_sweep import parse_tiles
     from deploy.measure import host_rows
     from deploy.results import Document, by_table
-    from deploy.shipped import default_int8
+    from deploy.shipped import int8_file
     from deploy.tables import print_rows
     from model.files import require_writable
     from profiles import load_target
 
-    path, tiles = model or default_int8(), parse_tiles(tile)
+    path, tiles = int8_file(model), parse_tiles(tile)
     require_writable(json, inputs=(path, image, measured))
     if target is Target.host:
         rows = host_rows(path, load_target("host-cpu"), _single(tiles), threads)

@@ -38,16 +38,16 @@ def check(
     """Place every node of a network on the host, the DPU or the CPU; exit code 1 if the DPU cannot run its part."""
     from deploy.dpu.board import load_dpu
     from deploy.dpu.picture import require_picture
-    from deploy.shipped import default_int8
+    from deploy.shipped import int8_file
     from model.files import require_writable
 
     require_picture(picture)
-    require_writable(picture, json, inputs=(model or default_int8(), Path(target)))
+    require_writable(picture, json, inputs=(int8_file(model), Path(target)))
     dpu = load_dpu(target, config)
     if model == TRADITIONAL:
         legal = _traditional(dpu, picture, json)
     else:
-        legal = _network(model or default_int8(), dpu, tile, picture, json)
+        legal = _network(int8_file(model), dpu, tile, picture, json)
     if not legal:
         raise typer.Exit(1)
 

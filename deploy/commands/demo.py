@@ -6,6 +6,7 @@ from typing import Annotated
 import typer
 
 from deploy.cores import SEEDS
+from deploy.shipped import SENSOR
 
 EXAMPLE = "demo --out demo"
 
@@ -16,6 +17,9 @@ def demo(
         float | None,
         typer.Option(help="Pixel value of a raw image that is full scale; 4095 if none, needed for 0..1."),
     ] = None,
+    sensor: Annotated[
+        str, typer.Option(help="Of the raw image, or to simulate: a profile's name or your .toml file, 12 bits.")
+    ] = SENSOR,
     out: Annotated[Path, typer.Option(help="Folder for the report and the files made.")] = Path("demo"),
     seed: Annotated[int, typer.Option(min=0, max=SEEDS, help="Seed of every random draw.")] = 0,
     json: Annotated[Path | None, typer.Option(help="Write the figures here.")] = None,
@@ -30,12 +34,13 @@ def demo(
 
     if full_scale is not None and image is None:
         raise OptionError("--full-scale", expected="--image beside it", got="none", remedy="leave it out")
-    require_writable(*(out / name for name in FILES), json, inputs=(image,))
-    result = run_demo(image, out, seed, lambda step: typer.echo(step, err=True), full_scale)
+    own = Path(sensor) if sensor.endswith(".toml") else None
+    require_writable(*(out / name for name in FILES), json, inputs=(image, own))
+    result = run_demo(image, out, seed, lambda step: typer.echo(step, err=True), full_scale, sensor)
     write_report(result.report, out / "report.html")
     for table in result.report.tables:
         print_rows(table.title, table.rows)
     typer.echo(result.report.headline)
     typer.echo(f"report: {out / 'report.html'}")
-    arguments = {"image": image, "full_scale": full_scale, "out": out, "seed": seed}
+    arguments = {"image": image, "full_scale": full_scale, "sensor": sensor, "out": out, "seed": seed}
     Document("demo", arguments, tuple([image] if image else []), result.rows).write(json)

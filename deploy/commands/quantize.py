@@ -20,7 +20,7 @@ class Regime(StrEnum):
 
 
 def quantize(
-    model: Annotated[Path, typer.Argument(help="Float ONNX or weights.")],
+    model: Annotated[Path, typer.Argument(help="Float ONNX or weights, or a shipped network's name.")],
     out: Annotated[Path, typer.Option(help="INT8 ONNX for the host, runs on stock onnxruntime.")],
     target: Annotated[str, typer.Option(help="Whose rules to obey.")] = "vck190",
     sensor: Annotated[str, typer.Option(help="Profile that calibration patches are drawn from.")] = SENSOR,
@@ -55,6 +55,7 @@ def quantize(
         quantise_legal_file,
     )
     from deploy.results import Document
+    from deploy.shipped import float_file
     from model.files import require_writable
     from profiles import load_target
     from profiles.errors import OptionError
@@ -63,6 +64,7 @@ def quantize(
         remedy = "leave it out, or take --regime legal"
         expected = "no --board, --ablate, --report or --without"
         raise OptionError("--regime free", expected=expected, got="one", remedy=remedy)
+    model = float_file(model)
     passes = passes_without(without or [])
     page, figures = (report / "report.html", report / "report.json") if report else (None, None)
     read = (model, images, *map(Path, (target, sensor)))

@@ -1,5 +1,6 @@
 """`beers-deploy restore`: a raw image in, the restored one out, of any size."""
 
+from collections.abc import Mapping
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
@@ -22,7 +23,7 @@ def restore(
     image: Annotated[Path, typer.Argument(metavar="IN", help="Image of at most 12 bits (TIFF of any size, or PNG).")],
     out: Annotated[Path, typer.Argument(metavar="OUT", help="TIFF to write: uint16, or float32 where IN is float.")],
     model: Annotated[
-        Path | None, typer.Option(help="ONNX network, float or INT8; the shipped INT8 one if none.")
+        Path | None, typer.Option(help="ONNX network, or a shipped one's name; the INT8 convbeers-s if none.")
     ] = None,
     method: Annotated[Method, typer.Option(help="A network, or the traditional chain of --sensor.")] = Method.network,
     sensor: Annotated[
@@ -56,13 +57,13 @@ def restore(
     The image is read and written by rows, so memory does not grow with its height. Bands are restored one by one.
     OUT has the scale of IN: 8-bit pixels with --full-scale 255 come out as 0..255, floats with 1 as 0..1.
     With --method traditional the image is stabilised, denoised and sharpened as its --sensor asks, in strips of rows:
-    one band, minutes a megapixel, not resumable.
+    one band, about a minute a megapixel on two cores, not resumable.
     Georeference, RPCs and missing pixels (NaN, or the nodata value) are kept. Until OUT is finished its rows lie in
     .OUT.part beside it. Workers change no pixel: where they are of one processor and the same versions, the bytes are
     those of one process. Those of a scheduler must find IN under its path; only this process writes.
     """
     from deploy.results import Document
-    from deploy.shipped import default_int8
+    from deploy.shipped import int8_file
     from deploy.swath.run import restore_file
     from deploy.tables import print_rows
     from model.files import require_writable
@@ -85,7 +86,7 @@ def restore(
     if sensor is not None:
         remedy = "add --method traditional, or fold a network for the sensor with 'beers-deploy export --sensor'"
         raise OptionError("--sensor", expected="--method traditional beside it", got="a network", remedy=remedy)
-    path = model or default_int8()
+    path = int8_file(model)
     require_writable(out, json, inputs=(image, path))
     options = Options(
         path,
@@ -107,7 +108,7 @@ def restore(
     Document("restore", arguments, (path, image), (row,)).write(json)
 
 
-def _require_nothing_else(given: dict[str, object]) -> None:
+def _require_nothing_else(given: Mapping[str, object]) -> None:
     """The traditional chain takes no option of a network's.
 
     Raises:

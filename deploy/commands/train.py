@@ -64,6 +64,7 @@ def train(
     from typing import get_args
 
     from deploy.defaults import reference_beside
+    from deploy.shipped import float_file
     from deploy.training import FILES, Run, weights_name
     from deploy.training import train as run_training
     from model.conditioning import SensorFamily
@@ -92,6 +93,7 @@ def train(
     if teacher is None:
         _require_unasked(context, "distil", "--teacher beside it", "no network to imitate")
     stored = [pairs, *(pairs / role for role in ("degraded", "reference"))] if pairs else [images]
+    start, teacher = (float_file(path) if path else None for path in (start, teacher))
     read = (*stored, lpips, start, teacher, *(Path(name) for name in (sensor, reference) if name))
     require_writable(*(out / name for name in (*FILES, weights_name(variant, told))), inputs=read)
     recipe = TrainingRecipe(

@@ -3,24 +3,48 @@ from pathlib import Path
 
 import jsonschema
 import numpy as np
+import onnx
+import pytest
 import tifffile
 from typer.testing import CliRunner
 
 from deploy.cli import app
+from deploy.demo import read_input, sensors
 from deploy.results import SCHEMA_PATH
+from profiles.errors import OptionError
+from profiles.toml import HERE
+from quant.onnx_file import metadata
 
 
 def test_the_demo_takes_a_raw_image_through_the_whole_chain(tmp_path: Path) -> None:
     raw = tmp_path / "raw.tif"
     tifffile.imwrite(raw, np.random.default_rng(0).integers(300, 1500, (120, 150)).astype(np.uint16))
+    text = (HERE / "sensors" / "pleiades-degraded.toml").read_text()
+    mine = tmp_path / "mine.toml"
+    mine.write_text(text.replace("10.2375", "10.0"))
     out, figures = tmp_path / "out", tmp_path / "figures.json"
-    result = CliRunner().invoke(app, ["demo", "--image", str(raw), "--out", str(out), "--json", str(figures)])
+    options = ["--image", str(raw), "--out", str(out), "--json", str(figures), "--sensor", str(mine)]
+    result = CliRunner().invoke(app, ["demo", *options])
     assert result.exit_code == 0, result.output
     made = {path.name for path in out.iterdir()}
     assert made == {"report.html", "float.onnx", "int8.onnx", "core.onnx", "restored.tif", "before-after.png"}
     assert tifffile.imread(out / "restored.tif").shape == (120, 150)
     document = json.loads(figures.read_text())
     jsonschema.validate(document, json.loads(SCHEMA_PATH.read_text()))
+    assert document["arguments"]["sensor"] == str(mine)
+    assert metadata(onnx.load(out / "int8.onnx"))["calibration_sensor"] == "mine"
     modes = {figure["mode"] for row in document["rows"] for figure in row["figures"].values()}
     assert {"measured", "predicted", "published"} <= modes
     assert "fits the DPU whole" in (out / "report.html").read_text()
+
+
+def test_the_reference_has_the_gain_of_the_sensor_named(tmp_path: Path) -> None:
+    """Else every pixel of the scene would be off by the ratio of the gains, and the PSNR would say so."""
+    text = (HERE / "sensors" / "pleiades-degraded.toml").read_text()
+    (tmp_path / "mine.toml").write_text(text.replace("10.2375", "5.0"))
+    pair = read_input(None, 0, sensors(str(tmp_path / "mine.toml"))).pair
+    assert pair is not None
+    assert abs(float(pair.degraded.mean() / pair.reference.mean()) - 1) < 0.01
+    (tmp_path / "wide.toml").write_text(text.replace("bits = { value = 12", "bits = { value = 14"))
+    with pytest.raises(OptionError, match="--sensor: expected a sensor of 12 bits, got 14 bits"):
+        sensors(str(tmp_path / "wide.toml"))

@@ -1,0 +1,48 @@
+"""Shipped networks by name wherever a network is taken."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tifffile
+from typer.testing import CliRunner
+
+from deploy.cli import app
+from deploy.shipped import VARIANT, default_int8, float_file, int8_file, shipped_pair
+
+
+@pytest.mark.parametrize("name", ["convbeers-xs", "convbeers-s", "convbeers-s-nominal"])
+def test_a_name_is_the_shipped_network(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    weights, int8 = shipped_pair(name)
+    assert int8_file(Path(name)) == int8_file(Path(f"{name}-int8")) == int8
+    assert float_file(Path(name)) == weights
+    assert weights.is_file()
+    assert int8.is_file()
+    monkeypatch.chdir(tmp_path)
+    Path(name).write_bytes(b"mine")  # a file of that name is what was meant
+    assert int8_file(Path(name)) == float_file(Path(name)) == Path(name)
+
+
+@pytest.mark.parametrize("given", ["none", "none.onnx", "folder/convbeers-s"])
+def test_anything_else_stays_a_path(given: str) -> None:
+    assert int8_file(Path(given)) == float_file(Path(given)) == Path(given)
+
+
+def test_nothing_given_is_the_default() -> None:
+    assert int8_file(None) == default_int8() == int8_file(Path(VARIANT))
+
+
+def test_commands_take_the_name(tmp_path: Path) -> None:
+    tifffile.imwrite(tmp_path / "in.tif", np.random.default_rng(0).integers(200, 1800, (37, 41)).astype(np.uint16))
+    for model in ("convbeers-xs", str(shipped_pair("convbeers-xs")[1])):
+        out = tmp_path / f"{len(model)}.tif"
+        result = CliRunner().invoke(app, ["restore", str(tmp_path / "in.tif"), str(out), "--model", model])
+        assert result.exit_code == 0, result.output
+    first, second = (tifffile.imread(path) for path in tmp_path.glob("*.tif") if path.name != "in.tif")
+    np.testing.assert_array_equal(first, second)
+    result = CliRunner().invoke(app, ["check", "convbeers-xs", "--tile", "64"])
+    assert result.exit_code == 0, result.output
+    result = CliRunner().invoke(
+        app, ["restore", str(tmp_path / "in.tif"), str(tmp_path / "x.tif"), "--model", "huge"]
+    )
+    assert result.exit_code == 2
