@@ -230,7 +230,7 @@ def test_images_and_pairs_together_are_refused(tmp_path: Path) -> None:
 
 
 def test_a_measured_interval_is_valid_json(tmp_path: Path) -> None:
-    mean, *_ = score(IDENTITY, [pair(seed=s) for s in range(3)], PLAIN, 0, lambda: None)
+    mean, *_ = score(IDENTITY, [pair(f"{'abcde'[s]}.tif", seed=s) for s in range(5)], PLAIN, 0, lambda: None)
     Document("evaluate", {}, (), (mean,)).write(tmp_path / "d.json")
     document = json.loads((tmp_path / "d.json").read_text())
     jsonschema.validate(document, json.loads(SCHEMA_PATH.read_text()))
