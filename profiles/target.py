@@ -7,6 +7,9 @@ from profiles.constant import Constant, check_keys, read_constant
 from profiles.errors import ProfileError
 from profiles.toml import read_toml, shipped_names
 
+MODEL_SUFFIX = "-model"
+"""What `bench` adds to a board's name: its figures are of a model of the board."""
+
 
 @dataclass(frozen=True)
 class TargetProfile:
@@ -71,10 +74,12 @@ def target_names() -> list[str]:
 def load_target(name: str) -> TargetProfile:
     """Read a shipped target profile by name, or the user's own by the path of its .toml file.
 
+    A board's cost model has the name of the board: `vck190-model`, as `bench` calls it, is `vck190`.
+
     Raises:
         ProfileError: unknown name, or a table that is not made of constants.
     """
-    label, raw = read_toml("targets", name)
+    label, raw = read_toml("targets", name.removesuffix(MODEL_SUFFIX))
     special = {"description", "default_configuration", "configurations"}
     check_keys(label, {k: v for k, v in raw.items() if k in special}, {"description"}, special)
     tables = {k: _table(f"{label} [{k}]", v) for k, v in raw.items() if k not in special}

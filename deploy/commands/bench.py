@@ -1,7 +1,6 @@
 """`beers-deploy bench`: time, throughput, power and efficiency; predicted, measured and published side by side."""
 
 from dataclasses import dataclass
-from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -15,22 +14,18 @@ if TYPE_CHECKING:
 EXAMPLE = "bench --target vck190-model --size 13600x9016 --config C32B3"
 
 PAPER_SIZE = "13600x9016"
+BOARD, HOSTS = "vck190-model", ("host", "host-cpu")
 PREDICTED = "No board was used: the DPU's figures come from a cost model, its power from an assumption."
 NO_PROXY = "Time on this CPU is no proxy for the DPU: here INT8 may even run slower than float."
-
-
-class Target(StrEnum):
-    """What the figures are about."""
-
-    vck190_model = "vck190-model"
-    host = "host"
 
 
 def bench(
     model: Annotated[
         Path | None, typer.Argument(metavar="[MODEL]", help="ONNX network; the shipped INT8 one if none.")
     ] = None,
-    target: Annotated[Target, typer.Option(help="The modelled board, or this machine.")] = Target.vck190_model,
+    target: Annotated[
+        str, typer.Option(help="The modelled board, with or without -model behind its name; or host, this machine.")
+    ] = BOARD,
     image: Annotated[Path | None, typer.Option(help="Mono image of at most 12 bits: the swath.")] = None,
     full_scale: Annotated[
         float | None, typer.Option(help="Pixel value of --image that is full scale; 4095 if none.")
@@ -59,7 +54,7 @@ def bench(
 
     path, tiles = int8_file(model), parse_tiles(tile)
     require_writable(json, inputs=(path, image, measured))
-    if target is Target.host:
+    if _is_host(target):
         rows = host_rows(path, load_target("host-cpu"), _single(tiles), threads)
         for table, part in by_table(rows).items():
             print_rows(f"{path.name} on this machine: {table}", part)
@@ -68,7 +63,7 @@ def bench(
         rows = _on_the_board(path, _Request(image, full_scale, size, tiles, halo, config, measured), budget)
         typer.echo(PREDICTED)
     arguments = {
-        "target": target.value,
+        "target": target,
         "full_scale": full_scale,
         "size": size,
         "tile": tile,
@@ -179,6 +174,20 @@ def _swath(path: Path, shape: tuple[int, ...] | None, request: _Request) -> "Swa
     width_px, height_px = (shape[1], shape[0]) if shape else parse_size(size or PAPER_SIZE)
     halo_px = parse_halo(halo, receptive_radius_px(load_onnx(path))) if halo == "exact" else parse_halo(halo, 0)
     return Swath(width_px, height_px, tile, halo_px)
+
+
+def _is_host(target: str) -> bool:
+    """Whether this machine is meant, by the name of its profile or as `host`; else the one board that is modelled.
+
+    Raises:
+        OptionError: another target.
+    """
+    from profiles.errors import OptionError
+    from profiles.target import MODEL_SUFFIX
+
+    if target.removesuffix(MODEL_SUFFIX) not in (*HOSTS, BOARD.removesuffix(MODEL_SUFFIX)):
+        raise OptionError("--target", expected=f"{BOARD} or host", got=repr(target), remedy="pick one")
+    return target in HOSTS
 
 
 def parse_size(text: str) -> tuple[int, int]:

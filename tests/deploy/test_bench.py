@@ -270,3 +270,20 @@ def test_bad_options_are_refused(tmp_path: Path) -> None:
     tifffile.imwrite(mono, np.full((8, 9), 0.5, np.float32))
     with pytest.raises(ImageError, match=r"0\.5; .*--full-scale"):
         run("bench", model, "--image", str(mono))
+
+
+def test_a_board_is_named_with_or_without_its_model(tmp_path: Path) -> None:
+    """As `check` and `profiles` name it, and as a model of it."""
+    model = str(integer_convbeers(tmp_path / "net.onnx", 1, 8))
+    tables = []
+    for name in ("vck190-model", "vck190"):
+        code, output = run("bench", model, "--target", name, "--size", "600x400", "--tile", "64", "--budget", "0")
+        assert code == 0
+        tables.append([line for line in output.splitlines() if "C32B3" in line])
+    assert tables[0] == tables[1] != []
+    assert run("check", model, "--target", "vck190-model") == run("check", model, "--target", "vck190")
+
+
+def test_a_target_that_nobody_modelled_is_one_sentence(tmp_path: Path) -> None:
+    with pytest.raises(OptionError, match="expected vck190-model or host, got 'kv260'"):
+        run("bench", str(integer_convbeers(tmp_path / "net.onnx", 1, 8)), "--target", "kv260")
