@@ -57,5 +57,5 @@ def _kind(ops: Graph) -> str:
 
 def refused_graph(expected: str, got: str) -> ModelError:
     """The sentence for a network that cannot be quantised."""
-    remedy = "export the network with 'beers-deploy export'"
+    remedy = "see docs/commands.md for what 'quantize' takes; other INT8 files can be checked and gated all the same"
     return ModelError("float model", expected=expected, got=got, remedy=remedy)

@@ -10,6 +10,7 @@ import numpy as np
 import onnx
 from onnx import numpy_helper
 
+from profiles.errors import ModelError
 from quant.accepted import check_graph, refused_graph
 from quant.graph import CORRECTION, IMAGE, Add, Conv, Graph, Op
 from quant.untrusted import contradictions
@@ -25,6 +26,15 @@ def correction_graph(model: onnx.ModelProto) -> Graph:
         graph = _correction_graph(model)
     check_graph(graph)
     return graph
+
+
+def refusal(model: onnx.ModelProto) -> str:
+    """Why a float network cannot be quantised, as a sentence; empty where it can."""
+    try:
+        correction_graph(model)
+    except ModelError as error:
+        return f"expected {error.expected}, got {error.got}"
+    return ""
 
 
 def _correction_graph(model: onnx.ModelProto) -> Graph:

@@ -60,6 +60,7 @@ def _network(path: Path, dpu: "Dpu", tile: int | None, picture: Path | None, jso
     from deploy.dpu.reading import network_of, own_tile_px
     from deploy.results import Document
     from deploy.tables import print_rows
+    from quant.float_reader import refusal
     from quant.onnx_file import load_onnx
 
     model = load_onnx(path, to_run=False)
@@ -72,7 +73,7 @@ def _network(path: Path, dpu: "Dpu", tile: int | None, picture: Path | None, jso
         write_picture(placement, title, picture)
     arguments = {"target": dpu.target.name, "config": dpu.name, "tile": tile_px}
     Document("check", arguments, (path,), tuple(rows), (legality(placement),)).write(json)
-    for line in summary(placement, dpu, tile_px):
+    for line in summary(placement, dpu, tile_px, refusal(model) if placement.note else ""):
         typer.echo(line)
     return not placement.failed
 

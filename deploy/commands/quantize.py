@@ -44,6 +44,9 @@ def quantize(
 ) -> None:
     """Quantise to int8 with power-of-two positions: the correction on the DPU, the 12-bit add on the host.
 
+    Taken are residual networks of one channel: same-size convolutions of stride 1, each ReLU right behind one, adds,
+    and at the end the add of the image. 'check' says of a float file whether it is one of these.
+
     Prints each integer layer: bits of its accumulator, seen and proven, and the share of saturated results.
     """
     from deploy.defaults import float_model

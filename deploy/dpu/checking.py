@@ -34,8 +34,15 @@ def legality(placement: Placement) -> Check:
     return Check("nodes the DPU refuses", len(failed), 0, "node", detail=first)
 
 
-def summary(placement: Placement, dpu: Dpu, tile_px: int) -> list[str]:
-    """What a person wants to know, in a few lines."""
+def summary(placement: Placement, dpu: Dpu, tile_px: int, refusal: str = "") -> list[str]:
+    """What a person wants to know, in a few lines.
+
+    Args:
+        placement: every node on its device.
+        dpu: the DPU that was asked.
+        tile_px: side of a tile.
+        refusal: why `quantize` does not take a float file; empty where it does.
+    """
     lines = [f"device subgraphs: {len(_pieces(placement))}, DPU subgraphs: {placement.dpu_subgraphs}"]
     lines += [
         f"{'to' if cut.onto_dpu else 'from'} the DPU: {cut.tensor}, {_megabytes(cut)} an image as int8"
@@ -44,6 +51,7 @@ def summary(placement: Placement, dpu: Dpu, tile_px: int) -> list[str]:
     lines += [f"{name}: {text}" for name, text in remarks_on(placement, dpu, tile_px).items()]
     if placement.note:
         lines.append(placement.note)
+        lines.append(f"'quantize' does not take it: {refusal}" if refusal else "'quantize' takes it")
     if placement.failed:
         lines.append(f"check FAILED: {legality(placement)}")
     else:

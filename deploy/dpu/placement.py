@@ -21,7 +21,7 @@ Device = Literal["host", "DPU", "CPU"]
 SCALING = {"Mul", "Div", "Add", "Sub", "Clip", "Cast", "Round", "Floor", "Identity", "Min", "Max"}
 """What a float file may do to the image before the network and to the result behind it."""
 
-FLOAT_NOTE = "a float file: judged as the network it is once quantised, its final add left to the host"
+FLOAT_NOTE = "a float file: judged as if its tensors had 8 bits, its final add left to the host"
 
 
 @dataclass(frozen=True)

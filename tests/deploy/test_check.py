@@ -14,7 +14,8 @@ from typer.testing import CliRunner
 
 from deploy.commands.check import check
 from deploy.results import SCHEMA_PATH
-from profiles.errors import BeersError, OptionError
+from profiles.errors import BeersError, ModelError, OptionError
+from quant.float_reader import correction_graph
 from tests.deploy.dpu.graphs import Sketch, board_convbeers, float_convbeers, integer_convbeers
 
 
@@ -122,3 +123,21 @@ def test_the_page_of_operators_is_fresh() -> None:
     code = "import sys; sys.path.insert(0, 'docs'); from make_operators import document; sys.stdout.write(document())"
     done = subprocess.run([sys.executable, "-c", code], cwd=root, capture_output=True, text=True, check=True)
     assert done.stdout == (root / "docs" / "operators.md").read_text(), "run python docs/make_operators.py"
+
+
+def test_of_a_float_file_check_says_what_quantize_would(tmp_path: Path) -> None:
+    """Both give the same reason, so that nobody passes one to be refused by the other."""
+    taken, refused = float_convbeers(tmp_path / "taken.onnx", 1, 8), tmp_path / "refused.onnx"
+    model = onnx.load(taken)
+    model.graph.node.remove(model.graph.node[-1])  # the global add
+    model.graph.output[0].name = model.graph.node[-1].output[0]
+    onnx.save(model, refused)
+    assert "'quantize' takes it" in run(str(taken))[1]
+    with pytest.raises(ModelError) as error:
+        correction_graph(model)
+    said = " ".join(run(str(refused))[1].split())
+    assert f"'quantize' does not take it: expected {error.value.expected}, got {error.value.got}" in said
+
+
+def test_of_an_int8_file_nothing_is_said_of_quantising(tmp_path: Path) -> None:
+    assert "'quantize'" not in run(str(integer_convbeers(tmp_path / "int8.onnx", 1, 8)))[1]
