@@ -7,7 +7,7 @@ scale of the input.
 
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -61,8 +61,7 @@ class Request:
 
     def chain(self) -> Chain:
         """The chain from the sensor to the reference, both in the sensor's digital numbers."""
-        sensor, reference = self.sensor.nominal(), self.reference.nominal()
-        return Chain(sensor, replace(reference, gain_dn_per_radiance=sensor.gain_dn_per_radiance, bits=sensor.bits))
+        return Chain(self.sensor.nominal(), self.reference.in_units_of(self.sensor).nominal())
 
 
 def restore_file_traditionally(image: Path, out: Path, request: Request) -> Row:
