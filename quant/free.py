@@ -8,7 +8,6 @@ is a residual stream of 8 bits.
 
 from collections.abc import Callable
 
-import numpy as np
 import onnx
 
 from quant.calibration import Patches
@@ -24,8 +23,7 @@ from quant.passes.half_steps import half_steps
 from quant.passes.steady_stream import STREAM_POSITION, stream_tensors
 from quant.planes import PLANES, POSITION, read_planes
 from quant.positions import INT8_MAX
-from quant.quantise import Targets, search_targets
-from quant.session import open_session, run
+from quant.quantise import crop_costs, search_targets
 
 UINT8_MAX = 255
 STREAM_STEP = 2.0**-STREAM_POSITION
@@ -49,7 +47,7 @@ def quantise_free(
     if stream_tensors(graph):
         ranges = channel_ranges(graph, patches.degraded, tick)
         targets = search_targets(graph, patches.degraded)
-        factors = search(graph, ranges, lambda tried: _error(tried, scales, targets), tick)
+        factors = search(graph, ranges, lambda tried: crop_costs(_written(tried, scales, {}), targets), tick)
         graph = equalise(graph, factors)
     about = {**metadata(model), "precision": "int8 free", "calibration_sha256": patches.digest, **about}
     moments = input_moments(_fine(graph), patches.degraded, tick)
@@ -90,11 +88,3 @@ def _written(
     stream, fine = Scale(STREAM_STEP), _fine(graph)
     known = {name: scales.get(name, stream) for name in (PLANES, *tensors(fine))}
     return free_model(fine, known, about, tile_px, moments)
-
-
-def _error(graph: Graph, scales: dict[str, Scale], targets: Targets) -> float:
-    """Mean squared difference from the float network."""
-    session = open_session(_written(graph, scales, {}))
-    return float(
-        np.mean([np.square(run(session, image) - wanted, dtype=np.float64).mean() for image, wanted in targets])
-    )

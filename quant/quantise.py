@@ -18,7 +18,7 @@ from quant.host_file import host_model
 from quant.moments import input_moments
 from quant.onnx_file import fixed_tile_px, metadata
 from quant.passes.dual_gain import two_gains
-from quant.passes.equalise import channel_ranges, equalise, search, search_steps
+from quant.passes.equalise import Costs, channel_ranges, equalise, search, search_steps
 from quant.passes.fit_weights import fit_weights
 from quant.passes.half_steps import half_steps
 from quant.passes.steady_stream import STREAM_POSITION, common_position, steady, stream_tensors
@@ -80,7 +80,11 @@ def quantise_model(
     if passes.equalise and stream_tensors(graph):
         ranges = channel_ranges(graph, patches.degraded, tick)
         targets = search_targets(read_planes(correction_graph(model)), patches.degraded)
-        factors = search(graph, ranges, lambda tried: _error(_core(tried, positions, passes, shifts), targets), tick)
+
+        def trial(tried: Graph) -> Costs:
+            return crop_costs(host_model(_core(tried, positions, passes, shifts), {}), targets)
+
+        factors = search(graph, ranges, trial, tick)
         graph = equalise(graph, factors)
     final, core = _final(graph, positions, passes), _core(graph, positions, passes, shifts)
     if passes.fit_weights:
@@ -158,14 +162,20 @@ def search_targets(graph: Graph, images: Remade[np.ndarray]) -> Targets:
     return [(crop, restored(crop)) for crop in chosen]
 
 
-def _error(core: IntCore, targets: Targets) -> float:
-    """Mean squared difference of the integer network from the float one: clipping, which is rare, counts in full."""
-    session = open_session(host_model(core, {}), threads=1)
+def crop_costs(model: onnx.ModelProto, targets: Targets) -> Costs:
+    """Root mean squared difference of an integer network from the float one, by crop.
 
-    def squared(target: tuple[np.ndarray, np.ndarray]) -> float:
-        image, wanted = target
-        return float(np.square(run(session, image) - wanted, dtype=np.float64).mean())
+    Squared, because clipping is rare and must count; its root, so that no single crop that clips decides alone.
+    """
+    session = open_session(model, threads=1)
 
-    # Small crops keep cores busier one to each than all on one: threads that share a crop wait for each other.
-    with ThreadPoolExecutor(os.cpu_count()) as cores:
-        return float(np.mean(list(cores.map(squared, targets))))
+    def cost(number: int) -> float:
+        image, wanted = targets[number]
+        return float(np.sqrt(np.square(run(session, image) - wanted, dtype=np.float64).mean()))
+
+    def of(crops: np.ndarray | None) -> np.ndarray:
+        # Small crops keep cores busier one to each than all on one: threads that share a crop wait for each other.
+        with ThreadPoolExecutor(os.cpu_count()) as cores:
+            return np.array(list(cores.map(cost, range(len(targets)) if crops is None else crops)))
+
+    return of

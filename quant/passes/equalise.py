@@ -8,7 +8,8 @@ channel's rounding does to the output.
 """
 
 from collections.abc import Callable, Iterable
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from itertools import product
 
 import numpy as np
 
@@ -26,11 +27,20 @@ LEVELLING = (0.5, 0.75, 1.0)
 HEADROOM = (0.64, 0.8, 1.0, 1.25)
 """First guesses tried: gamma, and the largest range as a share of int8's. Above 1 the largest values are clipped."""
 
-STEPS = (1.3, 1.3, 1.12)
+STEPS = (1.5, 1.2)
 """Factors by which each channel is tried larger and smaller, a sweep each."""
 
-Error = Callable[[Graph], float]
-"""What a graph costs in INT8, on calibration patches."""
+FIRST_CROPS = 2
+MARGIN = 0.003
+"""A trial is given up once the crops that it was tried on cost that share more than with the best factors so far.
+
+Each look doubles the crops. Some 30 % of the runs remain.
+"""
+
+Costs = Callable[[np.ndarray | None], np.ndarray]
+"""What one graph costs in INT8 on the crops of given numbers, or on all of them: an error each."""
+
+Trial = Callable[[Graph], Costs]
 
 
 def equalise(graph: Graph, factors: np.ndarray) -> Graph:
@@ -70,25 +80,49 @@ def first_guess(ranges: np.ndarray, levelling: float, headroom: float) -> np.nda
     return np.asarray(factors * headroom * limit / (ranges * factors).max())
 
 
-def search(graph: Graph, ranges: np.ndarray, error: Error, tick: Callable[[], None]) -> np.ndarray:
+def search(graph: Graph, ranges: np.ndarray, trial: Trial, tick: Callable[[], None]) -> np.ndarray:
     """The factors of least error: the best first guess, then channel by channel."""
-    guesses = [first_guess(ranges, levelling, headroom) for levelling in LEVELLING for headroom in HEADROOM]
-    costs = []
-    for guess in guesses:
-        costs.append(error(equalise(graph, guess)))
+    best = None
+    for levelling, headroom in product(LEVELLING, HEADROOM):
+        best = _race(graph, first_guess(ranges, levelling, headroom), trial, best)
         tick()
-    factors, best = guesses[int(np.argmin(costs))], min(costs)
+    assert best is not None  # noqa: S101
     for step in STEPS:
-        for channel in range(len(factors)):
+        for channel in range(len(ranges)):
             for factor in (step, 1 / step):
-                tried = factors.copy()
+                tried = best.factors.copy()
                 tried[channel] *= factor
-                cost = error(equalise(graph, tried))
-                if cost < best:
-                    factors, best = tried, cost
+                winner = _race(graph, tried, trial, best)
+                if winner is not best:
+                    best = winner
                     break  # the other way leads back
             tick()
-    return factors
+    return best.factors
+
+
+@dataclass(frozen=True)
+class _Best:
+    """The best factors so far, (C,), and what they cost on each crop, (N,)."""
+
+    factors: np.ndarray
+    costs: np.ndarray
+
+
+def _race(graph: Graph, factors: np.ndarray, trial: Trial, best: _Best | None) -> _Best:
+    """The better of two, the costliest crops first: six of seven trials fail, and most of them show it on two."""
+    costs_of = trial(equalise(graph, factors))
+    if best is None:
+        return _Best(factors, costs_of(None))
+    order = np.argsort(-best.costs, kind="stable")
+    costs, seen = np.zeros(len(order)), 0
+    while seen < len(order):
+        crops = order[seen : max(2 * seen, FIRST_CROPS)]
+        costs[crops] = costs_of(crops)
+        seen += len(crops)
+        margin = MARGIN if seen < len(order) else 0.0
+        if costs.sum() >= best.costs[order[:seen]].sum() * (1 + margin):
+            return best
+    return _Best(factors, costs)
 
 
 def search_steps(channels: int) -> int:

@@ -13,7 +13,15 @@ from quant.float_reader import correction_graph
 from quant.gate import compare
 from quant.graph import CORRECTION, Add, Conv, Graph
 from quant.passes.dual_gain import FINE_MAX, GAIN, merge, two_gains
-from quant.passes.equalise import channel_ranges, equalise, first_guess, search, search_steps
+from quant.passes.equalise import (
+    FIRST_CROPS,
+    Costs,
+    channel_ranges,
+    equalise,
+    first_guess,
+    search,
+    search_steps,
+)
 from quant.passes.steady_stream import STREAM_POSITION, common_position, steady, stream_tensors
 from quant.planes import PLANES, POSITION, coarse_plane_only, read_planes, split
 from quant.positions import SHIFTS
@@ -64,21 +72,56 @@ def test_a_dead_channel_is_not_blown_up(graph: Graph, patches: Patches) -> None:
     assert ranges[3] >= 1e-4 * ranges.max()
 
 
-def test_the_search_never_ends_above_its_best_guess(graph: Graph) -> None:
-    wanted = np.geomspace(0.1, 3, 8)
+CROPS = 5
+RANGES = np.geomspace(1, 0.05, 8)
+
+
+def searched(graph: Graph, weights: np.ndarray) -> tuple[list[float], float, list[int]]:
+    """What each first guess costs, what the search ends at, and how many crops each trial ran on.
+
+    The cost on each crop is known: how far the channels are from factors of their own, times the crop's weight.
+    """
+    sizes = np.abs(graph[0].weight).sum((1, 2, 3))  # type: ignore[union-attr]
+    runs: list[int] = []
+
+    def costs(tried: Graph) -> np.ndarray:
+        factors = np.abs(tried[0].weight).sum((1, 2, 3)) / sizes  # type: ignore[union-attr]
+        return np.asarray(np.square(np.log(factors / np.geomspace(0.1, 3, 8))).sum() * weights)
+
+    def trial(tried: Graph) -> Costs:
+        runs.append(0)
+
+        def of(crops: np.ndarray | None) -> np.ndarray:
+            chosen = costs(tried) if crops is None else costs(tried)[crops]
+            runs[-1] += len(chosen)
+            return chosen
+
+        return of
+
     ticked: list[int] = []
-
-    def error(tried: Graph) -> float:
-        first = tried[0]
-        assert isinstance(first, Conv)
-        k = np.abs(first.weight).sum((1, 2, 3)) / np.abs(graph[0].weight).sum((1, 2, 3))  # type: ignore[union-attr]
-        return float(np.square(np.log(k / wanted)).sum())
-
-    ranges = np.geomspace(1, 0.05, 8)
-    factors = search(graph, ranges, error, lambda: ticked.append(1))
-    guesses = [first_guess(ranges, g, h) for g in (0.5, 0.75, 1.0) for h in (0.64, 0.8, 1.0, 1.25)]
-    assert error(equalise(graph, factors)) < min(error(equalise(graph, guess)) for guess in guesses)
+    factors = search(graph, RANGES, trial, lambda: ticked.append(1))
     assert len(ticked) == search_steps(8)
+    guesses = [first_guess(RANGES, g, h) for g in (0.5, 0.75, 1.0) for h in (0.64, 0.8, 1.0, 1.25)]
+    ends = [float(costs(equalise(graph, each)).sum()) for each in (*guesses, factors)]
+    return ends[:-1], ends[-1], runs
+
+
+def test_the_search_never_ends_above_its_best_guess(graph: Graph) -> None:
+    guesses, found, _ = searched(graph, np.arange(1.0, CROPS + 1))
+    assert found < min(guesses)
+
+
+def test_a_trial_that_fails_on_its_first_crops_is_run_on_no_others(graph: Graph) -> None:
+    _, _, runs = searched(graph, np.arange(1.0, CROPS + 1))
+    assert set(runs) == {FIRST_CROPS, CROPS}  # every crop says the same here: it fails at once or not at all
+    assert runs[0] == CROPS
+    assert runs.count(FIRST_CROPS) > len(runs) / 3
+
+
+def test_a_trial_that_the_costliest_crops_favour_still_has_to_win_on_all(graph: Graph) -> None:
+    """What the first crops call better and the others worse is not taken: the last look knows no margin."""
+    guesses, found, _ = searched(graph, np.array([3.0, 2.0, -1.0, -2.0, -3.0]))
+    assert found <= guesses[0]
 
 
 def test_a_steady_stream_adds_without_rounding(quantised: Quantised) -> None:
