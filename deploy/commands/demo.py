@@ -34,8 +34,7 @@ def demo(
 
     if full_scale is not None and image is None:
         raise OptionError("--full-scale", expected="--image beside it", got="none", remedy="leave it out")
-    own = Path(sensor) if sensor.endswith(".toml") else None
-    require_writable(*(out / name for name in FILES), json, inputs=(image, own))
+    require_writable(*(out / name for name in FILES), json, inputs=(image, Path(sensor)))
     result = run_demo(image, out, seed, lambda step: typer.echo(step, err=True), full_scale, sensor)
     write_report(result.report, out / "report.html")
     for table in result.report.tables:

@@ -6,6 +6,7 @@ from typing import Annotated
 import typer
 
 from deploy.cores import SEEDS
+from deploy.shipped import SENSOR
 
 EXAMPLE = "evaluate --images aerial/ --methods degraded,traditional,convbeers-s,convbeers-s-int8 --out report/"
 
@@ -19,7 +20,7 @@ def evaluate(
     ] = None,
     sensor: Annotated[
         str | None,
-        typer.Option(help="Profile of the degraded images; of pairs the recipe's, else pleiades-degraded if none."),
+        typer.Option(help=f"Profile of the degraded images; of pairs the recipe's, else {SENSOR} if none."),
     ] = None,
     reference: Annotated[
         str | None,

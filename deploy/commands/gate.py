@@ -13,9 +13,12 @@ EXAMPLE = "gate float.onnx int8.onnx --max-mae 0.0007"
 
 def gate(
     float_model: Annotated[
-        Path | None, typer.Argument(metavar="[FLOAT]", help="Float ONNX or weights; a shipped pair if none.")
+        Path | None,
+        typer.Argument(metavar="[FLOAT]", help="Float ONNX or weights, or a shipped name; a shipped pair if none."),
     ] = None,
-    int8_model: Annotated[Path | None, typer.Argument(metavar="[INT8]", help="Its INT8 ONNX.")] = None,
+    int8_model: Annotated[
+        Path | None, typer.Argument(metavar="[INT8]", help="Its INT8 ONNX, or a shipped name.")
+    ] = None,
     variant: Annotated[
         str | None, typer.Option(help="Shipped pair of this name, without files; convbeers-s if none.")
     ] = None,

@@ -54,13 +54,14 @@ def profiles(
 
 def _file_text(name: str | None) -> str:
     """The TOML of a profile that can be read as one."""
+    from deploy.shipped import SENSOR
     from profiles import sensor_names
     from profiles.errors import OptionError
     from profiles.scene_call import scene_names
     from profiles.toml import profile_path
 
     if name is None:
-        remedy = "name one, such as pleiades-degraded"
+        remedy = f"name one, such as {SENSOR}"
         raise OptionError("--toml", expected="the name of a profile beside it", got="none", remedy=remedy)
     _constants(name)
     kind = "sensors" if name in sensor_names() else "scenes" if name in scene_names() else "targets"

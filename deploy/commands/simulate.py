@@ -6,7 +6,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from deploy.commands.unasked import refuse
 from deploy.cores import SEEDS
+from deploy.shipped import SENSOR
 
 if TYPE_CHECKING:
     from model.simulator.plan import Plan
@@ -27,21 +29,20 @@ MIN_RATIO = 2
 
 PRESETS = {
     "paper-variable": Preset("pleiades-variable", 128),
-    "paper-fixed": Preset("pleiades-degraded", 128),
-    "paper-test": Preset("pleiades-degraded", 1500),
+    "paper-fixed": Preset(SENSOR, 128),
+    "paper-test": Preset(SENSOR, 1500),
     "dior-medium": Preset("dior-medium", 256),
     "dior-high": Preset("dior-high", 256),
 }
 
 
 def simulate(
+    context: typer.Context,
     scenes: Annotated[
         list[Path] | None, typer.Argument(help="Images: 8-bit, 16-bit DN, float; drawn if none.")
     ] = None,
     out: Annotated[Path | None, typer.Option(help="Folder of the dataset.")] = None,
-    sensor: Annotated[
-        str | None, typer.Option(help="Profile of the degraded images; pleiades-degraded if none.")
-    ] = None,
+    sensor: Annotated[str | None, typer.Option(help=f"Profile of the degraded images; {SENSOR} if none.")] = None,
     reference: Annotated[
         str | None,
         typer.Option(help="Profile of the reference images, in the sensor's DN; pleiades-reference if none."),
@@ -86,6 +87,9 @@ def simulate(
     from profiles.errors import OptionError
     from profiles.scene_call import calling_for, load_scene_call
 
+    if out is None:
+        expected, remedy = "--out beside it", "leave it out, or give a folder"
+        refuse(context, ["workers", "scheduler", "resume"], expected=expected, got="none", remedy=remedy)
     check_choice(workers, scheduler)
     if out is not None:
         read = (*(scenes or ()), *(Path(name) for name in (sensor, reference, scene) if name))

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from deploy.cores import SEEDS
+from deploy.shipped import SENSOR
 
 if TYPE_CHECKING:
     from deploy.tradeoff.study import Study
@@ -21,7 +22,7 @@ def tradeoff(
     images: Annotated[
         Path | None, typer.Option(help="Folder of held-out scenes to simulate from; drawn ones if none.")
     ] = None,
-    sensor: Annotated[str, typer.Option(help="Profile of the degraded images.")] = "pleiades-degraded",
+    sensor: Annotated[str, typer.Option(help="Profile of the degraded images.")] = SENSOR,
     reference: Annotated[
         str | None,
         typer.Option(help="Profile of the reference images, in the sensor's DN; pleiades-reference if none."),

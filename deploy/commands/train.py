@@ -5,6 +5,7 @@ from typing import Annotated
 
 import typer
 
+from deploy.commands.unasked import refuse
 from deploy.cores import SEEDS
 
 EXAMPLE = "train --variant convbeers-s --images aerial/ --out runs/s --steps 20000"
@@ -87,11 +88,7 @@ def train(
     if told and (pairs is not None or teacher is not None):
         remedy = "leave one out: stored pairs do not say what sensor each had, and a teacher is not told"
         raise OptionError("--told", expected="no --pairs or --teacher beside it", got="both", remedy=remedy)
-    if images is None:
-        expected = "--images, of which whole sites are held out, beside it"
-        _require_unasked(context, "validate_every", expected, "no images: nothing to validate on")
-    if teacher is None:
-        _require_unasked(context, "distil", "--teacher beside it", "no network to imitate")
+    _refuse_unused(context)
     stored = [pairs, *(pairs / role for role in ("degraded", "reference"))] if pairs else [images]
     start, teacher = (float_file(path) if path else None for path in (start, teacher))
     read = (*stored, lpips, start, teacher, *(Path(name) for name in (sensor, reference) if name))
@@ -130,11 +127,15 @@ def train(
             typer.echo(f"wrote {run.weights}")
 
 
-def _require_unasked(context: typer.Context, name: str, expected: str, got: str) -> None:
-    """An option that would do nothing: better said than ignored."""
-    from profiles.errors import OptionError
-
-    source = context.get_parameter_source(name)
-    if source is not None and source.name == "COMMANDLINE" and context.params[name]:
-        option = f"--{name.replace('_', '-')}"
-        raise OptionError(option, expected=expected, got=got, remedy="leave it out, or give what it needs")
+def _refuse_unused(context: typer.Context) -> None:
+    """Refuse options that would do nothing beside the others."""
+    remedy = "leave it out, or give what it needs"
+    if context.params["images"] is None:
+        expected = "--images, of which whole sites are held out, beside it"
+        refuse(context, ["validate_every"], expected=expected, got="no images: nothing to validate on", remedy=remedy)
+    if context.params["teacher"] is None:
+        expected, got = "--teacher beside it", "no network to imitate"
+        refuse(context, ["distil"], expected=expected, got=got, remedy=remedy)
+    if not context.params["lpips_weight"]:
+        expected, got = "a weight of LPIPS in the loss", "--lpips-weight 0"
+        refuse(context, ["lpips"], expected=expected, got=got, remedy="leave one of the two out")
