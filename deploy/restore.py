@@ -144,6 +144,6 @@ def check_fixed_tile(model: onnx.ModelProto, tile_px: int, shape: tuple[int, ...
         raise OptionError(
             "--tile",
             expected=f"{fixed}, the size the model is fixed to, and an image at least as large",
-            got=f"tile {tile_px}, image {shape[0]} x {shape[1]}",
+            got=f"tile {tile_px}, image {shape[1]} x {shape[0]}",
             remedy="use a model exported without --tile",
         )

@@ -90,7 +90,7 @@ def _check_frames(path: Path, page: tifffile.TiffPage) -> None:
             got, remedy = "a damaged one", "copy or convert it again"
             raise ImageError(str(path), expected="JPEGs with a frame header", got=got, remedy=remedy)
         if size[0] > place[0] or size[1] > place[1]:
-            raise _swollen(path, f"a JPEG of {size[0]} x {size[1]} pixels in a place of {place[0]} x {place[1]}")
+            raise _swollen(path, f"a JPEG of {size[1]} x {size[0]} pixels in a place of {place[1]} x {place[0]}")
 
 
 def jpeg_size_px(data: bytes) -> tuple[int, int] | None:

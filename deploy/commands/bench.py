@@ -35,7 +35,9 @@ def bench(
     full_scale: Annotated[
         float | None, typer.Option(help="Pixel value of --image that is full scale; 4095 if none.")
     ] = None,
-    size: Annotated[str | None, typer.Option(help=f"Size of the swath in pixels; {PAPER_SIZE} if none.")] = None,
+    size: Annotated[
+        str | None, typer.Option(help=f"Width x height of the swath in pixels; {PAPER_SIZE} if none.")
+    ] = None,
     tile: Annotated[str, typer.Option(help="Tile side in pixels; several with commas are swept.")] = "640",
     halo: Annotated[str, typer.Option(help="Context around a tile: 'exact' (no seams) or pixels.")] = "exact",
     config: Annotated[str | None, typer.Option(help="DPU configuration, C32B1 to C64B5; 'all' sweeps them.")] = None,

@@ -43,7 +43,7 @@ def tradeoff(
     calibration: Annotated[
         Path | None, typer.Option(help="Folder of scenes to make missing INT8 files on; drawn ones if none.")
     ] = None,
-    size: Annotated[str, typer.Option(help="Size of the swath in pixels.")] = PAPER_SIZE,
+    size: Annotated[str, typer.Option(help="Width x height of the swath in pixels.")] = PAPER_SIZE,
     cache: Annotated[Path | None, typer.Option(help="Folder of kept measurements; OUT/cache if none.")] = None,
     seed: Annotated[int, typer.Option(min=0, max=SEEDS, help="Seed of every random draw.")] = 0,
     json: Annotated[Path | None, typer.Option(help="Write the figures here too.")] = None,

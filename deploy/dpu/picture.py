@@ -53,13 +53,17 @@ def draw(placement: Placement, title: str) -> str:
 
 def _box(y: int, node: PlacedNode) -> str:
     """A node's device, operator and name; beside them the result's shape, or what is wrong."""
-    shape = " x ".join(map(str, node.op.out_shape)) if node.op.out_shape else "shape unknown"
+    shape = _maps(*node.op.out_shape) if node.op.out_shape else "shape unknown"
     faults = "; ".join(f"{b.rule}: {b.finding.reason}" for b in node.broken)
     name = _short(f"{node.op.op_type}  {node.op.name}", NAME_LETTERS)
     text = f'<text x="{LEFT_PX + 60}" y="{y + 19}">{name}</text>'
     words = _short(faults or shape, FAULT_LETTERS)
     beside = f'<text class="beside" x="{LEFT_PX + NAME_PX + 10}" y="{y + 19}">{words}</text>'
     return "".join((_label(LEFT_PX, y, NAME_PX, node.device), text, beside))
+
+
+def _maps(channels: int, height_px: int, width_px: int) -> str:
+    return f"{channels} map{'s' if channels > 1 else ''} of {width_px} x {height_px}"
 
 
 def _label(x: int, y: int, width: int, device: str) -> str:

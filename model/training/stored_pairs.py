@@ -69,10 +69,16 @@ class StoredPairs:
             raise ImageError(
                 str(files[0]),
                 expected=f"a mono pair of one size, {self.patch_px} pixels a side or more",
-                got=f"shapes {images[0].shape} and {images[1].shape}",
+                got=" and ".join(map(_size, images)),
                 remedy="choose a smaller --patch, or simulate larger patches",
             )
         top, left = (int(generator.integers(size - self.patch_px + 1)) for size in (height, width))
         window = slice(top, top + self.patch_px), slice(left, left + self.patch_px)
         both = torch.stack([torch.from_numpy(image[window].astype(np.float32)) for image in images])
         return turn(both[None], generator)[0]
+
+
+def _size(image: np.ndarray) -> str:
+    """Width x height, and the bands where it is not mono."""
+    height, width, *bands = image.shape
+    return f"{width} x {height} pixels" + (f" of {bands[0]} bands" if bands else "")

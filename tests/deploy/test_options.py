@@ -84,5 +84,5 @@ def _value(parameter: Parameter) -> str:
     if parameter.hint in (int, float):
         return str(max(parameter.info.min or 0, 1))
     if issubclass(parameter.hint, StrEnum):
-        return list(parameter.hint)[-1]
+        return str(list(parameter.hint)[-1])
     return GIVEN.get(parameter.name, "a")

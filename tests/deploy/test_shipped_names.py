@@ -9,6 +9,7 @@ from typer.testing import CliRunner
 
 from deploy.cli import app
 from deploy.shipped import VARIANT, default_int8, float_file, int8_file, shipped_pair
+from quant.onnx_file import load_onnx, metadata
 
 
 @pytest.mark.parametrize("name", ["convbeers-xs", "convbeers-s", "convbeers-s-nominal"])
@@ -42,6 +43,15 @@ def test_commands_take_the_name(tmp_path: Path) -> None:
     np.testing.assert_array_equal(first, second)
     result = CliRunner().invoke(app, ["check", "convbeers-xs", "--tile", "64"])
     assert result.exit_code == 0, result.output
+    result = CliRunner().invoke(app, ["stress", "convbeers-xs", "convbeers-xs-int8", "--cases", "1 x 1"])
+    assert result.exit_code == 0, result.output
+    result = CliRunner().invoke(app, ["gate", "convbeers-xs", "convbeers-xs", "--patches", "2", "--max-mae", "1"])
+    assert result.exit_code == 0, result.output
+    assert result.output.splitlines()[-1].startswith("gate passed")
+    exported = ["export", "--checkpoint", "convbeers-xs", "--out", str(tmp_path / "net.onnx")]
+    result = CliRunner().invoke(app, exported)
+    assert result.exit_code == 0, result.output
+    assert metadata(load_onnx(tmp_path / "net.onnx"))["variant"] == "convbeers-xs"
     result = CliRunner().invoke(
         app, ["restore", str(tmp_path / "in.tif"), str(tmp_path / "x.tif"), "--model", "huge"]
     )
