@@ -15,7 +15,7 @@ from pathlib import Path
 import psutil
 import tifffile
 
-from profiles.errors import ImageError, MachineError
+from profiles.errors import ImageError, MachineError, sizes
 
 NONE, LZW, JPEG, DEFLATE, PACKBITS, ZSTD = 1, 5, 7, (8, 32946), 32773, 50000
 KNOWN = {NONE, LZW, JPEG, *DEFLATE, PACKBITS, ZSTD}
@@ -45,7 +45,8 @@ def check_page(path: Path, page: tifffile.TiffPage) -> None:
         raise ImageError(str(path), expected="a TIFF compression known here", got=got, remedy=remedy)
     needed, free = segment_bytes(page), psutil.virtual_memory().available
     if needed > free:
-        expected, got = f"strips or tiles that fit in {free / 1e9:.1f} GB", f"{needed / 1e9:.1f} GB for one"
+        room, size = sizes(free, needed)
+        expected, got = f"strips or tiles that fit in {room}", f"{size} for one"
         raise MachineError(str(path), expected=expected, got=got, remedy="rewrite it in smaller tiles")
     _check_whole(path, page)
     if page.compression == JPEG:

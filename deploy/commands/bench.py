@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from deploy.commands.saying import say
 from deploy.commands.unasked import refuse
 
 if TYPE_CHECKING:
@@ -20,6 +21,7 @@ BOARD_ONLY = ("image", "full_scale", "size", "halo", "config", "measured", "budg
 HOST_ONLY = ("threads",)
 BOARD, HOSTS = "vck190-model", ("host", "host-cpu")
 PREDICTED = "No board was used: the DPU's figures come from a cost model, its power from an assumption."
+TRAFFIC = "LdFM, StFM: feature maps loaded and stored, an image; LdWB: weights and biases loaded, a batch."
 NO_PROXY = "Time on this CPU is no proxy for the DPU: here INT8 may even run slower than float."
 
 
@@ -66,10 +68,10 @@ def bench(
         rows = host_rows(path, load_target("host-cpu"), _single(tiles), threads)
         for table, part in by_table(rows).items():
             print_rows(f"{path.name} on this machine: {table}", part)
-        typer.echo(NO_PROXY)
+        say(NO_PROXY)
     else:
         rows = _on_the_board(path, _Request(image, full_scale, size, tiles, halo, config, measured), budget)
-        typer.echo(PREDICTED)
+        say(PREDICTED)
     arguments = {
         "target": target,
         "full_scale": full_scale,
@@ -135,8 +137,9 @@ def _single_rows(path: Path, dpu: "Dpu", swath: "Swath") -> "tuple[list[Row], li
     prediction = predict_file(path, dpu, swath.tile_px)
     layers = layer_rows(prediction, dpu)
     print_rows(f"{path.name}, one batch on {dpu.name}", layers)
+    say(TRAFFIC)
     if prediction.note:
-        typer.echo(prediction.note)
+        say(prediction.note)
     return predicted_rows(path.stem, prediction, swath, dpu), layers
 
 

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from deploy.commands.saying import say
 from deploy.commands.unasked import refuse
 
 if TYPE_CHECKING:
@@ -77,7 +78,7 @@ def _network(path: Path, dpu: "Dpu", tile: int | None, picture: Path | None, jso
     arguments = {"target": dpu.target.name, "config": dpu.name, "tile": tile_px}
     Document("check", arguments, (path,), tuple(rows), (legality(placement),)).write(json)
     for line in summary(placement, dpu, tile_px, refusal(model) if placement.note else ""):
-        typer.echo(line)
+        say(line)
     return not placement.failed
 
 
@@ -93,5 +94,5 @@ def _traditional(dpu: "Dpu", json: Path | None) -> bool:
     print_rows(f"the traditional chain on {dpu.target.name} {dpu.name}", rows)
     arguments, checks = {"target": dpu.target.name, "config": dpu.name}, (step_legality(steps),)
     Document("check", arguments, (), tuple(rows), checks).write(json)
-    typer.echo(verdict(steps))
+    say(verdict(steps))
     return not any(step.broken for step in steps)

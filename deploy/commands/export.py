@@ -5,6 +5,7 @@ from typing import Annotated
 
 import typer
 
+from deploy.commands.saying import say
 from deploy.commands.unasked import refuse
 from deploy.shipped import VARIANT
 
@@ -45,8 +46,8 @@ def export(
     require_writable(out, inputs=(path, Path(sensor) if sensor else None))
     network, recipe, warnings = network_for(path, sensor)
     for warning in warnings:
-        typer.echo(f"warning: {warning}", err=True)
+        say(f"warning: {warning}", err=True)
     model = to_onnx(network, about(path.stem, recipe), tile)
     difference = require_parity(network, model, tile or 97)
     save_onnx(model, out)
-    typer.echo(f"wrote {out}: largest difference from torch {difference:.2g} of full scale (measured)")
+    say(f"wrote {out}: largest difference from torch {difference:.2g} of full scale (measured)")

@@ -5,6 +5,7 @@ from typing import Annotated
 
 import typer
 
+from deploy.commands.saying import say
 from deploy.cores import SEEDS
 from deploy.shipped import SENSOR
 
@@ -61,11 +62,11 @@ def gate(
         outcome = run_gate(request)
     print_rows("float against INT8", [outcome.row])
     for check in outcome.checks:
-        typer.echo(f"{'ok    ' if check.passed else 'FAILED'} {check}")
+        say(f"{'ok    ' if check.passed else 'FAILED'} {check}")
     figures = {"mae": outcome.result.mae, "drop": outcome.result.drop_db}
     outcome.document(request, config).write(json)
     reports.write(f"INT8 gate of {files[1].name}", outcome.checks, figures)
     shown = f"MAE {figures['mae']:.3g} of full scale, PSNR drop {figures['drop']:.2f} dB"
-    typer.echo(f"gate {sentence(outcome.checks, shown)}")
+    say(f"gate {sentence(outcome.checks, shown)}")
     if not outcome.passed:
         raise typer.Exit(1)

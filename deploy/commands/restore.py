@@ -6,6 +6,7 @@ from typing import Annotated
 
 import typer
 
+from deploy.commands.saying import say
 from deploy.commands.unasked import refuse
 from deploy.swath.options import TILE_PX, Compression, Options, Runtime
 
@@ -72,7 +73,7 @@ def restore(
     from model.files import require_writable
     from profiles.errors import OptionError
 
-    budget_bytes = int(memory * 1e9) if memory else None
+    budget_bytes = max(int(memory * 1e9), 1) if memory else None
     if method is Method.traditional:
         require_writable(out, json, inputs=(image, Path(sensor) if sensor else None))
         expected, remedy = "none with --method traditional", "leave it out"
@@ -97,7 +98,7 @@ def restore(
         workers,
         scheduler,
     )
-    row = restore_file(image, out, options, typer.echo)
+    row = restore_file(image, out, options, say)
     print_rows(f"wrote {out}", [row])
     arguments = {"tile": tile, "halo": halo, "full_scale": full_scale, "runtime": runtime, "threads": threads}
     arguments |= {"workers": workers, "scheduler": scheduler}

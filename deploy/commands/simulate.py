@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from deploy.commands.saying import say
 from deploy.commands.unasked import refuse
 from deploy.cores import SEEDS
 from deploy.shipped import SENSOR
@@ -103,7 +104,7 @@ def simulate(
     recipe = DatasetRecipe(
         tuple(scenes) if scenes else (None,),
         degraded,
-        reference_beside(degraded, reference, typer.echo),
+        reference_beside(degraded, reference, say),
         ratio,
         patch or (chosen.patch_px if preset else None),
         call.radiance_scale.low if call else 1.0,
@@ -112,7 +113,7 @@ def simulate(
         ratio / wanted,
     )
     if ratio < MIN_RATIO:
-        typer.echo(f"note: at {ratio} scene pixel a pixel the blur itself rings near sharp edges", err=True)
+        say(f"note: at {ratio} scene pixel a pixel the blur itself rings near sharp edges", err=True)
     if out is None and not explain:
         raise OptionError("--out", expected="a folder", got="none", remedy="give one, or ask for --explain alone")
     if explain:
@@ -122,7 +123,7 @@ def simulate(
     with steps("simulating", len(plan_windows(recipe))) as bar:
         summary = write_dataset(recipe, out, workers or os.cpu_count() or 1, resume, bar.advance, scheduler)
     rejected = f"; {summary['rejected_share']:.1%} of the drawn SNR pairs were impossible and drawn again"
-    typer.echo(f"wrote {summary['patches']:.0f} pairs to {out}" + (rejected if summary["rejected_share"] else ""))
+    say(f"wrote {summary['patches']:.0f} pairs to {out}" + (rejected if summary["rejected_share"] else ""))
 
 
 def _preset(name: str | None) -> Preset:
@@ -154,10 +155,10 @@ def _explain(recipe: object) -> None:
 def _print_plan(title: str, plan: "Plan") -> None:
     from rich.table import Table
 
-    from deploy.tables import default_console
+    from deploy.tables import default_console, plain
 
-    table = Table("effect", "decision", "why", "bound DN", "cost", title=title, title_justify="left")
+    table = Table("effect", "decision", "why", "bound DN", "cost", title=plain(title), title_justify="left")
     for d in plan.decisions:
         bound = "" if d.bound_dn is None else f"{d.bound_dn:.3g}"
-        table.add_row(d.effect, d.choice, d.why, bound, d.cost)
+        table.add_row(*map(plain, (d.effect, d.choice, d.why, bound, d.cost)))
     default_console().print(table)

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from deploy.commands.saying import say
 from deploy.commands.unasked import refuse
 from deploy.cores import SEEDS
 from deploy.shipped import SENSOR, VARIANT
@@ -94,14 +95,14 @@ def stress(
     if out is not None:
         write_text(out, markdown(shown))
     for reason in dict.fromkeys(outcome.reason for outcome in outcomes if outcome.reason):
-        typer.echo(f"not looked at: {reason}")
+        say(f"not looked at: {reason}")
     failed = [outcome for outcome in outcomes if outcome.failed]
     for outcome in failed:
-        typer.echo(f"FAILED {outcome.case.name}, {outcome.stage}: {outcome.verdict.removeprefix('FAILED: ')}")
+        say(f"FAILED {outcome.case.name}, {outcome.stage}: {outcome.verdict.removeprefix('FAILED: ')}")
     safe = overflow_proven(subject)
     if not safe:
-        typer.echo("FAILED: an int32 accumulator might overflow, see the integer layers")
-    typer.echo(f"stress {'passed' if not failed and safe else 'FAILED'}: {len(outcomes)} looks, {len(failed)} failed")
+        say("FAILED: an int32 accumulator might overflow, see the integer layers")
+    say(f"stress {'passed' if not failed and safe else 'FAILED'}: {len(outcomes)} looks, {len(failed)} failed")
     if failed or not safe:
         raise typer.Exit(1)
 

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from deploy.commands.saying import say
 from deploy.cores import SEEDS
 from deploy.shipped import SENSOR
 
@@ -71,7 +72,7 @@ def tradeoff(
     aim = reference or REFERENCE
     read = (images, calibration, lpips, *map(Path, (sensor, aim, *names)))
     require_writable(figures, *(out / name for name in FILES), json, inputs=read, folders=(kept,))
-    reference_beside(load_sensor(sensor), reference, typer.echo)
+    reference_beside(load_sensor(sensor), reference, say)
     request = Request(
         names,
         images,
@@ -86,7 +87,7 @@ def tradeoff(
     )
     result = run_study(request, Cache(kept))
     write_study(result.study, out)
-    say(result.study)
+    show(result.study)
     arguments: dict[str, object] = {"images": images, "sensor": sensor, "reference": aim, "size": size}
     arguments |= {"networks": networks, "budget": budget, "need": need, "calibration": calibration, "seed": seed}
     document = Document("tradeoff", arguments, request.files, result.rows)
@@ -96,7 +97,7 @@ def tradeoff(
         raise typer.Exit(1)
 
 
-def say(study: "Study") -> None:
+def show(study: "Study") -> None:
     """The most important figures, and what they mean."""
     from deploy.results import Row
     from deploy.tables import print_rows
@@ -107,8 +108,8 @@ def say(study: "Study") -> None:
     print_rows("operating points", rows)
     for front in study.fronts:
         if front.y == "PSNR":
-            typer.echo(f"front of {front.y} against {front.x}: {'; '.join(front.members)}")
+            say(f"front of {front.y} against {front.x}: {'; '.join(front.members)}")
             for price in front.prices:
-                typer.echo(f"  {price}")
+                say(f"  {price}")
     for sentence in (*study.advice, study.headline):
-        typer.echo(sentence)
+        say(sentence)

@@ -5,6 +5,7 @@ from typing import Annotated
 
 import typer
 
+from deploy.commands.saying import say
 from deploy.commands.unasked import refuse
 from deploy.cores import SEEDS
 
@@ -104,7 +105,7 @@ def train(
     )
     degraded = load_sensor(sensor)
     family = SensorFamily(degraded.nominal()) if told else None
-    patches = PatchRecipe(degraded, reference_beside(degraded, reference, typer.echo), patch_px=patch, told=family)
+    patches = PatchRecipe(degraded, reference_beside(degraded, reference, say), patch_px=patch, told=family)
     run = Run(
         variant,
         recipe,
@@ -122,9 +123,9 @@ def train(
         precision,  # type: ignore[arg-type]
     )
     with joined(device) as worker:
-        run_training(run, resume, worker, typer.echo)
+        run_training(run, resume, worker, say)
         if worker.first:
-            typer.echo(f"wrote {run.weights}")
+            say(f"wrote {run.weights}")
 
 
 def _refuse_unused(context: typer.Context) -> None:

@@ -8,6 +8,7 @@ import math
 from deploy.dpu.board import Dpu
 from deploy.dpu.finding import Finding, shown
 from deploy.dpu.graph import Operation
+from profiles.errors import sizes
 
 WINDOWED = {"conv", "grouped conv", "depthwise", "transposed", "pool"}
 
@@ -39,5 +40,6 @@ def map_in_memory(op: Operation, dpu: Dpu) -> Finding | None:
     size = math.prod(op.out_shape) * dpu.batch if op.out_shape else 0
     if size <= most:
         return None
-    reason = f"{size / 1e9:.1f} GB for {dpu.batch} images, of {most / 1e9:.1f} GB"
+    taken, room = sizes(size, most)
+    reason = f"{taken} for {dpu.batch} images, of {room}"
     return Finding(reason, f"use a tile of at most {math.sqrt(most / size):.2f} times this side")

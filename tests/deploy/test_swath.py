@@ -236,8 +236,8 @@ def test_values_beyond_full_scale_in_the_last_rows_leave_the_old_output(model: P
     pixels[-1, -1] = 60000
     refused(tmp_path, pixels, Options(model, tile_px=23), ImageError, "60000", "--full-scale")
     pixels = -noise(90, 40).astype(np.float32)
-    refused(tmp_path, pixels, Options(model, tile_px=23), ImageError, "-4")
-    refused(tmp_path, np.full((20, 20), np.inf, np.float32), Options(model), ImageError, "inf")
+    refused(tmp_path, pixels, Options(model, tile_px=23), ImageError, "-4", "add the offset")
+    refused(tmp_path, np.full((20, 20), np.inf, np.float32), Options(model), ImageError, "inf", "write NaN")
 
 
 def test_an_image_all_missing_is_refused(model: Path, tmp_path: Path) -> None:
