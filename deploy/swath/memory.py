@@ -50,7 +50,7 @@ def check_memory(rows: int, budget_bytes: int | None, bulky: bool, share: int = 
         "--memory" + (f", one of {share} processes" if share > 1 else ""),
         expected=f"a run within {limit}",
         got=f"{before} before and {rows_size} for rows of the image",
-        remedy=f"{remedy} or give it more",
+        remedy=f"{remedy} or give it more" if held < allowed else f"give it more than {before}",
     )
 
 

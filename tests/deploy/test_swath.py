@@ -263,7 +263,15 @@ def test_a_network_that_gives_nan_is_refused(model: Path, tmp_path: Path) -> Non
 
 
 def test_a_budget_that_does_not_suffice_is_refused_before_the_run(model: Path, tmp_path: Path) -> None:
-    refused(tmp_path, noise(40, 40), Options(model, memory_bytes=1000), MachineError, "--memory", "--tile")
+    refused(
+        tmp_path,
+        noise(40, 40),
+        Options(model, memory_bytes=1000),
+        MachineError,
+        "--memory",
+        "1.00 kB",
+        "give it more than",
+    )
     tifffile.imwrite(tmp_path / "in.tif", noise(1000, 3000), compression="zlib", rowsperstrip=1000)
     options = Options(model, tile_px=64, memory_bytes=int(psutil.Process().memory_info().rss + 8e6))
     with pytest.raises(MachineError, match="TILED=YES"):
