@@ -157,9 +157,9 @@ def _layer_row(layer: LayerCost, prediction: Prediction, dpu: Dpu) -> Row:
         "work": exact(work.operations / 1e9, "GOP"),
         "time": _time(layer.time_s, prediction),
         "rate": scaled(batch * work.operations / seconds / 1e9, "GOP/s", prediction, COST_SOURCE, falls=True),
-        "LdFM": exact(work.load_map_bytes / 1e6, "MB"),
-        "LdWB": exact(work.weight_bytes / 1e6, "MB"),
-        "StFM": exact(work.store_map_bytes / 1e6, "MB"),
+        "LdFM": exact(work.load_map_bytes / 1e6, "MB", "feature maps that an image loads, by the graph's shapes"),
+        "LdWB": exact(work.weight_bytes / 1e6, "MB", "weights and biases that a batch loads, by the graph's shapes"),
+        "StFM": exact(work.store_map_bytes / 1e6, "MB", "feature maps that an image stores, by the graph's shapes"),
         "bandwidth": scaled(moved / seconds / 1e9, "GB/s", prediction, COST_SOURCE, falls=True),
         "array use": exact(100 * work.array_use, "%"),
         "energy": predicted(

@@ -66,18 +66,20 @@ def worst_row(number: int, patches: Patches, spread: Spread) -> Row:
     figures = {
         "MAE": measured(float(spread.mae[number]), "of full scale", source),
         "max": measured(float(spread.largest[number]), "of full scale", source),
-        **_mtf_figures(view.degraded),
         "mean radiance": measured(view.ground.brightness, "W/m2/sr/um", "of the simulated ground"),
-        "oversampling": measured(view.ground.oversampling, "scene pixels a pixel", "drawn"),
     }
-    return Row("worst patches", f"patch {number}", figures, {"scene": view.ground.scene.name})
+    words = {
+        "scene": view.ground.scene.name,
+        "MTF at Nyquist, drawn from the profile": _mtf(view.degraded),
+        "scene pixels a pixel, drawn": str(view.ground.oversampling),
+    }
+    return Row("worst patches", f"patch {number}", figures, words)
 
 
-def _mtf_figures(sensor: Sensor) -> dict[str, Figure]:
-    """One figure, or two where the sensor's axes differ."""
-    across, along = sensor.mtf_axes
-    values = {"MTF at Nyquist": across} if across == along else {"MTF across": across, "MTF along": along}
-    return {name: measured(100 * value, "%", "drawn from the sensor profile") for name, value in values.items()}
+def _mtf(sensor: Sensor) -> str:
+    """One value, or two where the sensor's axes differ: what the profile gave to this patch, measured nowhere."""
+    across, along = (f"{100 * value:.3g} %" for value in sensor.mtf_axes)
+    return across if across == along else f"{across} across the track, {along} along it"
 
 
 def sizes_row(spread: Spread) -> Row:

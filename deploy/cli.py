@@ -135,5 +135,6 @@ COMMANDS: dict[str, tuple[Callable[..., None], str]] = {
     "tradeoff": (tradeoff.tradeoff, tradeoff.EXAMPLE),
     "compare": (compare.compare, compare.EXAMPLE),
 }
+CLASSES = {"gate": gate.GateCommand}
 for name, (function, text) in COMMANDS.items():
-    app.command(name, epilog=example(text))(function)
+    app.command(name, cls=CLASSES.get(name), epilog=example(text))(function)

@@ -24,7 +24,7 @@ from deploy.dpu.checking import legality
 from deploy.dpu.placement import place
 from deploy.dpu.reading import read_network
 from deploy.results import Document, Figure, Row, measured, unavailable
-from deploy.shipped import VARIANT, shipped_pair
+from deploy.shipped import VARIANT, float_file, int8_file, shipped_pair
 from profiles import load_sensor, load_target
 from profiles.errors import OptionError
 from profiles.sensor import reference_for
@@ -127,7 +127,7 @@ def _unseen(request: Request) -> Patches:
 
 
 def files_or_shipped(float_path: Path | None, int8_path: Path | None, variant: str | None) -> tuple[Path, Path]:
-    """The two files given, or the shipped pair where neither is.
+    """The two files given, or shipped ones of that name; the shipped pair where neither is given.
 
     Raises:
         OptionError: one file without the other, which have nothing to do with each other; files and a variant.
@@ -141,7 +141,7 @@ def files_or_shipped(float_path: Path | None, int8_path: Path | None, variant: s
     if variant is not None:
         expected, remedy = "it without files", "leave it out, or the files"
         raise OptionError("--variant", expected=expected, got=float_path.name, remedy=remedy)
-    return float_path, int8_path
+    return float_file(float_path), int8_file(int8_path)
 
 
 def baseline_mae(path: Path, arguments: Mapping[str, Any]) -> float:

@@ -12,7 +12,7 @@ import tifffile
 from deploy.tiling import Tile, plan_tiles
 from model.files import whole_file
 from model.images import read_pixels
-from model.scale import settled_scale
+from model.scale import remedy_outside, settled_scale
 from profiles.errors import ImageError, OptionError
 from quant.onnx_file import fixed_tile_px
 from quant.session import run
@@ -54,7 +54,7 @@ def read_acquisition(
             else f"values of 0 to {settled:g}"
         )
         got = f"values from {low:g} to {high:g}"
-        raise ImageError(str(path), expected=expected, got=got, remedy=RESCALE)
+        raise ImageError(str(path), expected=expected, got=got, remedy=remedy_outside(low, high, RESCALE))
     dn = np.asarray(pixels, dtype=np.float32)
     return dn if settled == max_dn else np.minimum(dn * np.float32(max_dn / settled), np.float32(max_dn))
 
@@ -144,6 +144,6 @@ def check_fixed_tile(model: onnx.ModelProto, tile_px: int, shape: tuple[int, ...
         raise OptionError(
             "--tile",
             expected=f"{fixed}, the size the model is fixed to, and an image at least as large",
-            got=f"tile {tile_px}, image {shape[0]} x {shape[1]}",
+            got=f"tile {tile_px}, image {shape[1]} x {shape[0]}",
             remedy="use a model exported without --tile",
         )

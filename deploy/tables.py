@@ -7,9 +7,10 @@ from rich.table import Table
 from rich.text import Text
 
 from deploy.results import Figure, Row
+from profiles.errors import visible
 
-MARK = {"measured": ("m", "green"), "predicted": ("p", "yellow"), "published": ("d", "blue")}
-LEGEND = "m measured here, p predicted [interval], d published in a document"
+COLOURS = {"measured": "green", "predicted": "yellow", "published": "blue"}
+LEGEND = "measured: here; predicted: by a model, with its [interval]; published: in a document"
 PIPE_WIDTH = 200
 """Columns when the output is no terminal: nothing is cut."""
 
@@ -23,12 +24,12 @@ def print_rows(title: str, rows: Iterable[Row], console: Console | None = None) 
     console = console or default_console()
     keys = list(dict.fromkeys(key for row in rows for key in row.figures))
     table = by_figure(rows, keys) if len(keys) > len(rows) else by_row(rows, keys)
-    table.title, table.title_justify = title, "left"
+    table.title, table.title_justify = plain(title), "left"
     console.print(table)
     if keys:
         console.print(LEGEND, style="dim", highlight=False, markup=False)
     for reason in missing(rows):
-        console.print(reason, style="dim", highlight=False, markup=False)
+        console.print(plain(reason), style="dim")
 
 
 def default_console() -> Console:
@@ -37,29 +38,38 @@ def default_console() -> Console:
     return console if console.is_terminal else Console(width=PIPE_WIDTH)
 
 
+def plain(text: str) -> Text:
+    """Words as they are: no markup, and nothing that a terminal would obey, whatever a file held."""
+    return Text(visible(text))
+
+
 def by_row(rows: list[Row], keys: list[str]) -> Table:
-    """One line a row, the units in the header."""
+    """One line a row; the units in the header, and the mode where it is that of the whole column."""
     table = Table("")
     words = words_of(rows)
     for key in keys:
-        table.add_column(f"{key}\n({unit_of(key, rows)})", justify="right")
+        mode = common_mode(key, rows)
+        unit = f"{unit_of(key, rows)}, {mode}" if mode else unit_of(key, rows)
+        table.add_column(plain(f"{key}\n({unit})"), justify="right")
     for word in words:
-        table.add_column(word, overflow="fold")
+        table.add_column(plain(word), overflow="fold")
     for row in rows:
-        figures = [cell(row.figures.get(key)) for key in keys]
-        table.add_row(row.name, *figures, *(row.text.get(word, "") for word in words))
+        figures = [cell(row.figures.get(key), common_mode(key, rows)) for key in keys]
+        table.add_row(plain(row.name), *figures, *(plain(row.text.get(word, "")) for word in words))
     return table
 
 
 def by_figure(rows: list[Row], keys: list[str]) -> Table:
-    """One line a figure, the rows side by side."""
-    table = Table("", "unit")
+    """One line a figure, the rows side by side; its mode in a column where it is that of them all."""
+    table = Table("", "unit", "mode")
     for row in rows:
-        table.add_column(row.name, justify="right", overflow="fold")
+        table.add_column(plain(row.name), justify="right", overflow="fold")
     for key in keys:
-        table.add_row(key, unit_of(key, rows), *(cell(row.figures.get(key)) for row in rows))
+        mode = common_mode(key, rows)
+        figures = [cell(row.figures.get(key), mode) for row in rows]
+        table.add_row(plain(key), plain(unit_of(key, rows)), mode, *figures)
     for word in words_of(rows):
-        table.add_row(word, "", *(row.text.get(word, "") for row in rows))
+        table.add_row(plain(word), "", "", *(plain(row.text.get(word, "")) for row in rows))
     return table
 
 
@@ -73,11 +83,18 @@ def unit_of(key: str, rows: list[Row]) -> str:
     return next(row.figures[key].unit for row in rows if key in row.figures)
 
 
-def cell(figure: Figure | None) -> Text:
-    """A figure with its mode, or nothing."""
+def common_mode(key: str, rows: list[Row]) -> str:
+    """The mode of all figures of a column that there are; empty where they differ or none is there."""
+    modes = {row.figures[key].mode for row in rows if key in row.figures and row.figures[key].value is not None}
+    return modes.pop() if len(modes) == 1 else ""
+
+
+def cell(figure: Figure | None, said: str) -> Text:
+    """A figure, its mode behind it unless the table says it elsewhere; or nothing."""
     if figure is None or figure.value is None:
         return Text("" if figure is None else "-")
-    return Text.assemble(str(figure), " ", MARK[figure.mode])
+    text = Text(str(figure), COLOURS[figure.mode])
+    return text if said else text.append(f" {figure.mode}")
 
 
 def missing(rows: list[Row]) -> list[str]:

@@ -158,8 +158,9 @@ def data(run: Run, trainer: Trainer) -> tuple[Source, Validation, list[str]]:
     recipe, eyes = run.recipe, (run.patches.told or run.patches.degraded, run.patches.reference)
     if run.pairs is not None:
         files = pair_files(run.pairs)
-        max_dn = run.patches.degraded.nominal().max_dn
-        source = StoredPairs(files, run.patches.patch_px, max_dn, recipe.batch, recipe.seed, trainer.worker)
+        degraded = run.patches.degraded
+        given = (run.patches.patch_px, degraded.nominal().max_dn, recipe.batch, recipe.seed, trainer.worker)
+        source = StoredPairs(files, *given, quarters=degraded.mtf_nyquist_along is None)
         return source, Validation([], *eyes), [degraded.name for degraded, _ in files]
     scenes = read_scenes(run)
     kept, held = split_by_site([scene.name for scene in scenes])

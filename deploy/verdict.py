@@ -11,7 +11,7 @@ from pathlib import Path
 from xml.etree import ElementTree as ET
 
 from model.files import require_regular, require_writable, write_text
-from profiles.errors import BeersError, MachineError
+from profiles.errors import BeersError, MachineError, printable
 from quant.checks import Check
 
 
@@ -42,7 +42,7 @@ def junit(title: str, checks: Sequence[Check]) -> str:
     """The verdict as JUnit XML: a test case a check."""
     suite = _suite(title, tests=len(checks), failures=sum(not check.passed for check in checks))
     for check in checks:
-        case = ET.SubElement(suite, "testcase", classname=title, name=check.name)
+        case = ET.SubElement(suite, "testcase", classname=printable(title), name=check.name)
         if not check.passed:
             text = f"found {check.found}, allowed {check.allowed}"
             ET.SubElement(case, "failure", message=text).text = text
@@ -52,7 +52,7 @@ def junit(title: str, checks: Sequence[Check]) -> str:
 def junit_error(title: str, error: BeersError) -> str:
     """JUnit XML of what could not be judged: one test case, an error with the sentence that says why."""
     suite = _suite(title, tests=1, errors=1)
-    case = ET.SubElement(suite, "testcase", classname=title, name="input")
+    case = ET.SubElement(suite, "testcase", classname=printable(title), name="input")
     ET.SubElement(case, "error", message=str(error), type=type(error).__name__).text = str(error)
     return ET.tostring(suite, encoding="unicode") + "\n"
 
@@ -111,7 +111,9 @@ class Reports:
 
 def _suite(title: str, **counts: int) -> ET.Element:
     numbers = {"tests": 0, "failures": 0, "errors": 0, **counts}
-    return ET.Element("testsuite", name=title, attrib={name: str(count) for name, count in numbers.items()})
+    return ET.Element(
+        "testsuite", name=printable(title), attrib={name: str(count) for name, count in numbers.items()}
+    )
 
 
 def _escaped(text: str) -> str:

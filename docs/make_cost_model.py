@@ -49,7 +49,7 @@ WHY = {
     "yolo v5 n": "so light that the model lets its host bound it; how much of 25 200 boxes that host reads is not "
     "published",
     "mobilenet v1 0.25": "27 MOP: times of an image that no count of bytes or operations holds bound it",
-    "yolo v3 288 x 512": "published no faster than 416 x 416, for 15 % fewer operations",
+    "yolo v3 512 x 288": "published no faster than 416 x 416, for 15 % fewer operations",
     "efficientnet lite0": "its widened maps lie just above 1 MiB and count as passing through memory; the board "
     "seems to keep them",
     "inception-resnet v2": "its residual sums feed three branches and an add each, and count as passing through "

@@ -1,6 +1,7 @@
 """Whole files or none, and never over what a run reads or writes elsewhere.
 
-One rule for every output of every command: it is a regular file or a new name, no input, and no other output.
+One rule for every output of every command: it is a regular file or a new name, no input, no other output, and nothing
+that is shipped.
 Symbolic links, pipes and devices are refused: what is renamed over them would stand in their place.
 """
 
@@ -13,7 +14,9 @@ from itertools import combinations
 from pathlib import Path
 
 from model.images import IMAGE_SUFFIXES
+from model.shipped import SHIPPED
 from profiles.errors import MachineError, OptionError
+from profiles.toml import HERE as PROFILES
 
 READ_SUFFIXES = IMAGE_SUFFIXES | {".onnx", ".safetensors", ".pth"}
 """What a command takes from a folder that it reads; an earlier run's figures may lie there and be renewed."""
@@ -53,7 +56,9 @@ def whole_file(path: Path) -> Iterator[Path]:
 def claim_outputs(
     *outputs: Path | None, inputs: Iterable[Path | None] = (), folders: Iterable[Path | None] = ()
 ) -> None:
-    """Refuse, before any work, an output that would destroy an input or another output; None asks for no output.
+    """Refuse, before any work, an output that would destroy an input, another output or what is shipped.
+
+    None asks for no output.
 
     Args:
         outputs: files that are to be written.
@@ -69,6 +74,8 @@ def claim_outputs(
     for path in wanted:
         if _exists(path) and _identity(path) in known:
             raise _taken(path, "an input of this run")
+        if _is_shipped(path):
+            raise _taken(path, "a file of this installation, which every later run reads")
     homes = {_identity(file.parent) for file in read if file.suffix.lower() in IMAGE_SUFFIXES}
     for folder in folders:
         if folder is not None and _exists(folder) and _identity(folder) in homes:
@@ -138,6 +145,12 @@ def _exists(path: Path) -> bool:
 def _identity(path: Path) -> tuple[int, int]:
     found = path.stat()
     return found.st_dev, found.st_ino
+
+
+def _is_shipped(path: Path) -> bool:
+    """Whether a shipped network or profile stands there, through links."""
+    shipped = [*SHIPPED.glob("*"), *PROFILES.rglob("*.toml")]
+    return _exists(path) and _identity(path) in {_identity(file) for file in shipped}
 
 
 def _files_of(path: Path) -> list[Path]:

@@ -14,7 +14,7 @@ from PIL import Image
 
 from model.tiff import open_tiff
 from model.tiff_page import check_page
-from profiles.errors import BeersError, ImageError, MachineError
+from profiles.errors import BeersError, ImageError, MachineError, sizes
 from profiles.text import read_whole
 
 TIFF_SUFFIXES = {".tif", ".tiff"}
@@ -44,9 +44,8 @@ def read_pixels(path: Path) -> np.ndarray:
         )
     if np.issubdtype(pixels.dtype, np.floating) and not np.isfinite(pixels).all():
         count = int((~np.isfinite(pixels)).sum())
-        raise ImageError(
-            str(path), expected="finite pixels", got=f"{count} NaN or infinite", remedy="fill or mask them first"
-        )
+        remedy = "replace them or crop them off; 'restore' alone takes missing pixels, as NaN or nodata"
+        raise ImageError(str(path), expected="finite pixels", got=f"{count} NaN or infinite", remedy=remedy)
     return pixels
 
 
@@ -144,12 +143,12 @@ def _in_memory(path: Path) -> io.BytesIO:
 def _check_memory(path: Path, samples: int) -> None:
     needed, free = samples * 4 * WORKING_COPIES, psutil.virtual_memory().available
     if needed > free:
-        raise MachineError(
-            str(path),
-            expected=f"an image that fits in {free / 1e9:.1f} GB of free memory",
-            got=f"{samples / 1e6:.0f} million samples, which need about {needed / 1e9:.1f} GB",
-            remedy="cut it into pieces",
+        room, size = sizes(free, needed)
+        expected, got = (
+            f"an image that fits in {room} of free memory",
+            f"{samples:,} samples, which need about {size}",
         )
+        raise MachineError(str(path), expected=expected, got=got, remedy="cut it into pieces")
 
 
 def _no_image(name: str, error: Exception) -> ImageError:

@@ -78,5 +78,14 @@ def check_scale(full_scale: float, kind: str) -> None:
     raise OptionError("--full-scale", expected=expected, got=f"{full_scale:g}", remedy="4095 is 12 bits")
 
 
+def remedy_outside(low: float, high: float, remedy: str) -> str:
+    """What to do about values from `low` to `high` that no sensor gives; `remedy` where they are only too large."""
+    if not np.isfinite([low, high]).all():
+        return "write NaN or the nodata value in place of infinite pixels: 'restore' takes both for missing"
+    if low < 0:
+        return "add the offset that was taken off the image, clip it at 0, or mark such pixels as nodata"
+    return remedy
+
+
 def _open(name: str, got: str, remedy: str) -> ImageError:
     return ImageError(name, expected="digital numbers of more than 8 bits", got=got, remedy=remedy)

@@ -15,7 +15,7 @@ from pathlib import Path
 import psutil
 import tifffile
 
-from profiles.errors import ImageError, MachineError
+from profiles.errors import ImageError, MachineError, sizes
 
 NONE, LZW, JPEG, DEFLATE, PACKBITS, ZSTD = 1, 5, 7, (8, 32946), 32773, 50000
 KNOWN = {NONE, LZW, JPEG, *DEFLATE, PACKBITS, ZSTD}
@@ -45,7 +45,8 @@ def check_page(path: Path, page: tifffile.TiffPage) -> None:
         raise ImageError(str(path), expected="a TIFF compression known here", got=got, remedy=remedy)
     needed, free = segment_bytes(page), psutil.virtual_memory().available
     if needed > free:
-        expected, got = f"strips or tiles that fit in {free / 1e9:.1f} GB", f"{needed / 1e9:.1f} GB for one"
+        room, size = sizes(free, needed)
+        expected, got = f"strips or tiles that fit in {room}", f"{size} for one"
         raise MachineError(str(path), expected=expected, got=got, remedy="rewrite it in smaller tiles")
     _check_whole(path, page)
     if page.compression == JPEG:
@@ -90,7 +91,7 @@ def _check_frames(path: Path, page: tifffile.TiffPage) -> None:
             got, remedy = "a damaged one", "copy or convert it again"
             raise ImageError(str(path), expected="JPEGs with a frame header", got=got, remedy=remedy)
         if size[0] > place[0] or size[1] > place[1]:
-            raise _swollen(path, f"a JPEG of {size[0]} x {size[1]} pixels in a place of {place[0]} x {place[1]}")
+            raise _swollen(path, f"a JPEG of {size[1]} x {size[0]} pixels in a place of {place[1]} x {place[0]}")
 
 
 def jpeg_size_px(data: bytes) -> tuple[int, int] | None:

@@ -43,6 +43,28 @@ def printable(text: str, longest: int = LONGEST) -> str:
     return shown + ("..." if len(text) > longest else "")
 
 
+def visible(text: str) -> str:
+    """The text, lines and tabs kept, with each other character that a terminal would obey or hide as its escape."""
+    return "".join(c if c.isprintable() or c in "\n\t" else ascii(c)[1:-1] for c in text)
+
+
+def sizes(*counts_bytes: float) -> list[str]:
+    """Numbers of bytes, each in its own unit, with as many digits (three or more) as tell different ones apart."""
+    for digits in range(3, 17):
+        texts = [_size(count, digits) for count in counts_bytes]
+        if len(set(texts)) == len(set(counts_bytes)):
+            break
+    return texts
+
+
+def _size(count_bytes: float, digits: int) -> str:
+    for unit, scale in (("GB", 1e9), ("MB", 1e6), ("kB", 1e3)):
+        if count_bytes >= scale:
+            value = count_bytes / scale
+            return f"{value:.{max(digits - len(str(int(value))), 0)}f} {unit}"
+    return f"{count_bytes:.0f} bytes"
+
+
 class ProfileError(BeersError):
     """A sensor or target profile that does not hold together."""
 

@@ -6,6 +6,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from deploy.commands.saying import say
+from deploy.commands.unasked import refuse
+
 if TYPE_CHECKING:
     from deploy.bench import Swath
     from deploy.dpu.board import Dpu
@@ -14,12 +17,16 @@ if TYPE_CHECKING:
 EXAMPLE = "bench --target vck190-model --size 13600x9016 --config C32B3"
 
 PAPER_SIZE = "13600x9016"
+BOARD_ONLY = ("image", "full_scale", "size", "halo", "config", "measured", "budget")
+HOST_ONLY = ("threads",)
 BOARD, HOSTS = "vck190-model", ("host", "host-cpu")
 PREDICTED = "No board was used: the DPU's figures come from a cost model, its power from an assumption."
+TRAFFIC = "LdFM, StFM: feature maps loaded and stored, an image; LdWB: weights and biases loaded, a batch."
 NO_PROXY = "Time on this CPU is no proxy for the DPU: here INT8 may even run slower than float."
 
 
 def bench(
+    context: typer.Context,
     model: Annotated[
         Path | None, typer.Argument(metavar="[MODEL]", help="ONNX network; the shipped INT8 one if none.")
     ] = None,
@@ -30,7 +37,9 @@ def bench(
     full_scale: Annotated[
         float | None, typer.Option(help="Pixel value of --image that is full scale; 4095 if none.")
     ] = None,
-    size: Annotated[str | None, typer.Option(help=f"Size of the swath in pixels; {PAPER_SIZE} if none.")] = None,
+    size: Annotated[
+        str | None, typer.Option(help=f"Width x height of the swath in pixels; {PAPER_SIZE} if none.")
+    ] = None,
     tile: Annotated[str, typer.Option(help="Tile side in pixels; several with commas are swept.")] = "640",
     halo: Annotated[str, typer.Option(help="Context around a tile: 'exact' (no seams) or pixels.")] = "exact",
     config: Annotated[str | None, typer.Option(help="DPU configuration, C32B1 to C64B5; 'all' sweeps them.")] = None,
@@ -52,16 +61,17 @@ def bench(
     from model.files import require_writable
     from profiles import load_target
 
-    path, tiles = int8_file(model), parse_tiles(tile)
+    path, tiles, here = int8_file(model), parse_tiles(tile), _is_host(target)
+    _refuse_unused(context, here)
     require_writable(json, inputs=(path, image, measured))
-    if _is_host(target):
+    if here:
         rows = host_rows(path, load_target("host-cpu"), _single(tiles), threads)
         for table, part in by_table(rows).items():
             print_rows(f"{path.name} on this machine: {table}", part)
-        typer.echo(NO_PROXY)
+        say(NO_PROXY)
     else:
         rows = _on_the_board(path, _Request(image, full_scale, size, tiles, halo, config, measured), budget)
-        typer.echo(PREDICTED)
+        say(PREDICTED)
     arguments = {
         "target": target,
         "full_scale": full_scale,
@@ -73,6 +83,17 @@ def bench(
     }
     inputs = tuple(file for file in (path, image, measured) if file)
     Document("bench", arguments, inputs, tuple(rows)).write(json)
+
+
+def _refuse_unused(context: typer.Context, here: bool) -> None:
+    """Refuse the options of the other target, and a size or a scale that no image asks for."""
+    wanted = "the modelled board" if here else "--target host"
+    expected, remedy = f"{wanted} beside it", f"leave it out, or take {wanted}"
+    refuse(context, BOARD_ONLY if here else HOST_ONLY, expected=expected, got="the other target", remedy=remedy)
+    if context.params["image"] is None:
+        refuse(context, ["full_scale"], expected="--image beside it", got="none", remedy="leave it out")
+    else:
+        refuse(context, ["size"], expected="none with --image", got="both", remedy="give one of the two")
 
 
 @dataclass(frozen=True)
@@ -92,10 +113,11 @@ def _on_the_board(path: Path, request: _Request, budget_s: float) -> "list[Row]"
     from deploy.bench import published_rows
     from deploy.measure import Sensors, drawn_acquisition, traditional_rows
     from deploy.restore import read_acquisition
+    from deploy.shipped import SENSOR
     from deploy.tables import print_rows
-    from profiles import load_sensor
+    from profiles.sensor import REFERENCE, load_sensor
 
-    sensors = Sensors(load_sensor("pleiades-degraded"), load_sensor("pleiades-reference"))
+    sensors = Sensors(load_sensor(SENSOR), load_sensor(REFERENCE))
     dn = read_acquisition(request.image, request.full_scale, None) if request.image else None
     swath = _swath(path, dn.shape if dn is not None else None, request)
     boards, refitted = _boards(request)
@@ -115,8 +137,9 @@ def _single_rows(path: Path, dpu: "Dpu", swath: "Swath") -> "tuple[list[Row], li
     prediction = predict_file(path, dpu, swath.tile_px)
     layers = layer_rows(prediction, dpu)
     print_rows(f"{path.name}, one batch on {dpu.name}", layers)
+    say(TRAFFIC)
     if prediction.note:
-        typer.echo(prediction.note)
+        say(prediction.note)
     return predicted_rows(path.stem, prediction, swath, dpu), layers
 
 
@@ -162,16 +185,11 @@ def _single(tiles: list[int]) -> int:
 def _swath(path: Path, shape: tuple[int, ...] | None, request: _Request) -> "Swath":
     from deploy.bench import Swath
     from deploy.restore import parse_halo
-    from profiles.errors import OptionError
     from quant.onnx_file import load_onnx
     from quant.radius import receptive_radius_px
 
-    if request.full_scale is not None and shape is None:
-        raise OptionError("--full-scale", expected="--image beside it", got="none", remedy="leave it out")
-    size, halo, tile = request.size, request.halo, request.tiles_px[0]
-    if shape is not None and size is not None:
-        raise OptionError("--size", expected="none with --image", got=size, remedy="give one of the two")
-    width_px, height_px = (shape[1], shape[0]) if shape else parse_size(size or PAPER_SIZE)
+    halo, tile = request.halo, request.tiles_px[0]
+    width_px, height_px = (shape[1], shape[0]) if shape else parse_size(request.size or PAPER_SIZE)
     halo_px = parse_halo(halo, receptive_radius_px(load_onnx(path))) if halo == "exact" else parse_halo(halo, 0)
     return Swath(width_px, height_px, tile, halo_px)
 

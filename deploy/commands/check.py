@@ -5,6 +5,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from deploy.commands.saying import say
+from deploy.commands.unasked import refuse
+
 if TYPE_CHECKING:
     from deploy.dpu.board import Dpu
 
@@ -14,6 +17,7 @@ TILE_PX = 640
 
 
 def check(
+    context: typer.Context,
     model: Annotated[
         Path | None,
         typer.Argument(
@@ -41,14 +45,14 @@ def check(
     from deploy.shipped import int8_file
     from model.files import require_writable
 
+    if model == TRADITIONAL:
+        remedy = "leave the option out, or give a network"
+        refuse(context, ["picture", "tile"], expected="none with 'traditional'", got="one", remedy=remedy)
     require_picture(picture)
     require_writable(picture, json, inputs=(int8_file(model), Path(target)))
     dpu = load_dpu(target, config)
-    if model == TRADITIONAL:
-        legal = _traditional(dpu, picture, json)
-    else:
-        legal = _network(int8_file(model), dpu, tile, picture, json)
-    if not legal:
+    chain = model == TRADITIONAL
+    if not (_traditional(dpu, json) if chain else _network(int8_file(model), dpu, tile, picture, json)):
         raise typer.Exit(1)
 
 
@@ -74,25 +78,21 @@ def _network(path: Path, dpu: "Dpu", tile: int | None, picture: Path | None, jso
     arguments = {"target": dpu.target.name, "config": dpu.name, "tile": tile_px}
     Document("check", arguments, (path,), tuple(rows), (legality(placement),)).write(json)
     for line in summary(placement, dpu, tile_px, refusal(model) if placement.note else ""):
-        typer.echo(line)
+        say(line)
     return not placement.failed
 
 
-def _traditional(dpu: "Dpu", picture: Path | None, json: Path | None) -> bool:
+def _traditional(dpu: "Dpu", json: Path | None) -> bool:
     """Judge the operators of the traditional chain; whether the DPU could run them all."""
     from deploy.dpu.checking import step_legality, step_rows
     from deploy.dpu.traditional import judge_traditional, verdict
     from deploy.results import Document
     from deploy.tables import print_rows
-    from profiles.errors import OptionError
 
-    if picture is not None:
-        remedy = "leave the option out, or give a network"
-        raise OptionError("--picture", expected="none with 'traditional'", got=str(picture), remedy=remedy)
     steps = judge_traditional(dpu)
     rows = [row for step in steps for row in step_rows(step)]
     print_rows(f"the traditional chain on {dpu.target.name} {dpu.name}", rows)
     arguments, checks = {"target": dpu.target.name, "config": dpu.name}, (step_legality(steps),)
     Document("check", arguments, (), tuple(rows), checks).write(json)
-    typer.echo(verdict(steps))
+    say(verdict(steps))
     return not any(step.broken for step in steps)

@@ -5,6 +5,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from deploy.commands.saying import say
+
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
@@ -38,13 +40,13 @@ def compare(
     if rows:
         print_rows(f"{before.name} -> {after.name}", rows)
     counts = f"{len(rows)} changed, {len(found.gone)} gone, {len(found.new)} new"
-    typer.echo(f"{len(found.both)} figures in both, {counts}")
+    say(f"{len(found.both)} figures in both, {counts}")
     for note in differing(*documents):
-        typer.echo(note)
+        say(note)
     Document("compare", {"fail_on": ", ".join(fail_on or ())}, (before, after), tuple(rows)).write(json)
     failed = broken(found, limits)
     for line in failed:
-        typer.echo(f"FAILED {line}")
+        say(f"FAILED {line}")
     if failed:
         raise typer.Exit(1)
 

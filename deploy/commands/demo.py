@@ -5,6 +5,7 @@ from typing import Annotated
 
 import typer
 
+from deploy.commands.saying import say
 from deploy.cores import SEEDS
 from deploy.shipped import SENSOR
 
@@ -34,13 +35,12 @@ def demo(
 
     if full_scale is not None and image is None:
         raise OptionError("--full-scale", expected="--image beside it", got="none", remedy="leave it out")
-    own = Path(sensor) if sensor.endswith(".toml") else None
-    require_writable(*(out / name for name in FILES), json, inputs=(image, own))
-    result = run_demo(image, out, seed, lambda step: typer.echo(step, err=True), full_scale, sensor)
+    require_writable(*(out / name for name in FILES), json, inputs=(image, Path(sensor)))
+    result = run_demo(image, out, seed, lambda step: say(step, err=True), full_scale, sensor)
     write_report(result.report, out / "report.html")
     for table in result.report.tables:
         print_rows(table.title, table.rows)
-    typer.echo(result.report.headline)
-    typer.echo(f"report: {out / 'report.html'}")
+    say(result.report.headline)
+    say(f"report: {out / 'report.html'}")
     arguments = {"image": image, "full_scale": full_scale, "sensor": sensor, "out": out, "seed": seed}
     Document("demo", arguments, tuple([image] if image else []), result.rows).write(json)

@@ -5,7 +5,9 @@ from typing import Annotated
 
 import typer
 
+from deploy.commands.saying import say
 from deploy.cores import SEEDS
+from deploy.shipped import SENSOR
 
 EXAMPLE = "evaluate --images aerial/ --methods degraded,traditional,convbeers-s,convbeers-s-int8 --out report/"
 
@@ -19,7 +21,7 @@ def evaluate(
     ] = None,
     sensor: Annotated[
         str | None,
-        typer.Option(help="Profile of the degraded images; of pairs the recipe's, else pleiades-degraded if none."),
+        typer.Option(help=f"Profile of the degraded images; of pairs the recipe's, else {SENSOR} if none."),
     ] = None,
     reference: Annotated[
         str | None,
@@ -64,7 +66,7 @@ def evaluate(
     read = (*folders, lpips, *(Path(name) for name in (sensor, reference, *names) if name))
     require_writable(out / "report.html" if out else None, json, inputs=read, folders=(out,))
     recipe = read_pairs_recipe(pairs) if pairs is not None else None
-    eyes = profiles_for(sensor, reference, recipe, typer.echo)
+    eyes = profiles_for(sensor, reference, recipe, say)
     chosen = [method_named(name, eyes[0].nominal(), eyes[1].nominal()) for name in names]
     instruments = Instruments(perceptual_distances(lpips), eyes[0].nominal().max_dn)
     found, small = load_pairs(images, pairs, *eyes, seed, recipe)
@@ -76,13 +78,13 @@ def evaluate(
         print_rows(table, rows)
     sites = len({pair.site for pair in found})
     if sites < LEAST_SITES:
-        typer.echo(f"no interval over sites is shown: of {sites}, fewer than {LEAST_SITES}, none could be trusted")
+        say(f"no interval over sites is shown: of {sites}, fewer than {LEAST_SITES}, none could be trusted")
     if small:
-        typer.echo(f"left out, too small: {', '.join(small)}")
+        say(f"left out, too small: {', '.join(small)}")
     if out is not None:
         strips = pictures(found, chosen, out)
         write_report(evaluation_report(title, result.mean, result.sites, swept, strips), out / "report.html")
-        typer.echo(f"wrote {out / 'report.html'}")
+        say(f"wrote {out / 'report.html'}")
     arguments: dict[str, object] = {
         "images": images,
         "pairs": pairs,

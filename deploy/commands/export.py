@@ -5,13 +5,20 @@ from typing import Annotated
 
 import typer
 
+from deploy.commands.saying import say
+from deploy.commands.unasked import refuse
+from deploy.shipped import VARIANT
+
 EXAMPLE = "export --variant convbeers-s --out float.onnx"
 
 
 def export(
+    context: typer.Context,
     out: Annotated[Path, typer.Option(help="ONNX file to write.")],
-    variant: Annotated[str, typer.Option(help="Shipped weights of this name.")] = "convbeers-s",
-    checkpoint: Annotated[Path | None, typer.Option(help="Your own weights instead (.safetensors).")] = None,
+    variant: Annotated[str, typer.Option(help="Shipped weights of this name.")] = VARIANT,
+    checkpoint: Annotated[
+        Path | None, typer.Option(help="Your own weights instead (.safetensors), or a shipped network's name.")
+    ] = None,
     sensor: Annotated[
         str | None,
         typer.Option(help="Specialise weights that can be told their sensor: a profile's name, or your .toml file."),
@@ -28,16 +35,19 @@ def export(
     """
     from deploy.defaults import about
     from deploy.export import network_for, require_parity, to_onnx
+    from deploy.shipped import float_file
     from model.files import require_writable
     from model.shipped import shipped_weights
     from quant.onnx_file import save_onnx
 
-    path = checkpoint or shipped_weights(variant)
+    if checkpoint is not None:
+        refuse(context, ["variant"], expected="no --checkpoint beside it", got="both", remedy="leave one out")
+    path = float_file(checkpoint) if checkpoint else shipped_weights(variant)
     require_writable(out, inputs=(path, Path(sensor) if sensor else None))
     network, recipe, warnings = network_for(path, sensor)
     for warning in warnings:
-        typer.echo(f"warning: {warning}", err=True)
+        say(f"warning: {warning}", err=True)
     model = to_onnx(network, about(path.stem, recipe), tile)
     difference = require_parity(network, model, tile or 97)
     save_onnx(model, out)
-    typer.echo(f"wrote {out}: largest difference from torch {difference:.2g} of full scale (measured)")
+    say(f"wrote {out}: largest difference from torch {difference:.2g} of full scale (measured)")

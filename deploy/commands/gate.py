@@ -1,21 +1,60 @@
 """`beers-deploy gate`: does INT8 stay close enough to float? Exit code 1 when it does not."""
 
+from contextlib import suppress
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
+from typer.core import TyperCommand
 
+from deploy.commands.saying import say
 from deploy.cores import SEEDS
 from deploy.shipped import SENSOR
 
 EXAMPLE = "gate float.onnx int8.onnx --max-mae 0.0007"
+UsageError: type[Exception] = typer.BadParameter.__bases__[0]
+"""An unknown option, a missing value: what the parser finds before the command runs."""
+
+
+class GateCommand(TyperCommand):
+    """Tells a usage error where a CI job looks for the verdict, as other bad input is."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Parse the words of the command line."""
+        words = list(args)
+        try:
+            return super().parse_args(ctx, args)
+        except UsageError as error:
+            _tell_usage(words, str(error))
+            raise
+
+
+def _tell_usage(words: list[str], message: str) -> None:
+    """Write the reports that the words ask for, but over nothing that another word may mean."""
+    from deploy.verdict import Reports
+    from model.files import claim_outputs
+    from profiles.errors import BeersError, OptionError
+
+    plain = [part for word in words for part in (word.split("=", 1) if word.startswith("--") else [word])]
+    places = [plain.index(option) + 1 for option in ("--summary", "--junit", "--outputs") if option in plain[:-1]]
+    named = {plain[place - 1].removeprefix("--"): Path(plain[place]) for place in places}
+    others = [Path(part) for place, part in enumerate(plain) if place not in places]
+    reports = Reports(named.get("summary"), named.get("junit"), named.get("outputs"))
+    with suppress(BeersError):
+        claim_outputs(*named.values(), inputs=others)
+        with reports.of_bad_input("INT8 gate"):
+            remedy = "see 'beers-deploy gate --help'"
+            raise OptionError("command line", expected="what gate takes", got=message, remedy=remedy)
 
 
 def gate(
     float_model: Annotated[
-        Path | None, typer.Argument(metavar="[FLOAT]", help="Float ONNX or weights; a shipped pair if none.")
+        Path | None,
+        typer.Argument(metavar="[FLOAT]", help="Float ONNX or weights, or a shipped name; a shipped pair if none."),
     ] = None,
-    int8_model: Annotated[Path | None, typer.Argument(metavar="[INT8]", help="Its INT8 ONNX.")] = None,
+    int8_model: Annotated[
+        Path | None, typer.Argument(metavar="[INT8]", help="Its INT8 ONNX, or a shipped name.")
+    ] = None,
     variant: Annotated[
         str | None, typer.Option(help="Shipped pair of this name, without files; convbeers-s if none.")
     ] = None,
@@ -58,11 +97,11 @@ def gate(
         outcome = run_gate(request)
     print_rows("float against INT8", [outcome.row])
     for check in outcome.checks:
-        typer.echo(f"{'ok    ' if check.passed else 'FAILED'} {check}")
+        say(f"{'ok    ' if check.passed else 'FAILED'} {check}")
     figures = {"mae": outcome.result.mae, "drop": outcome.result.drop_db}
     outcome.document(request, config).write(json)
     reports.write(f"INT8 gate of {files[1].name}", outcome.checks, figures)
     shown = f"MAE {figures['mae']:.3g} of full scale, PSNR drop {figures['drop']:.2f} dB"
-    typer.echo(f"gate {sentence(outcome.checks, shown)}")
+    say(f"gate {sentence(outcome.checks, shown)}")
     if not outcome.passed:
         raise typer.Exit(1)

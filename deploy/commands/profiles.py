@@ -4,6 +4,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from deploy.commands.saying import say
+
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
@@ -24,11 +26,11 @@ def profiles(
     The keys of a sensor's file, with units and ranges: docs/sensor-profile.md.
     """
     if toml:
-        typer.echo(_file_text(name), nl=False)
+        say(_file_text(name).removesuffix("\n"))
         return
     from rich.table import Table
 
-    from deploy.tables import default_console
+    from deploy.tables import default_console, plain
     from profiles import load_sensor, load_target, sensor_names, target_names
     from profiles.scene_call import load_scene_call, scene_names
 
@@ -37,30 +39,31 @@ def profiles(
         table.add_column("kind")
         table.add_column("what it is")
         for sensor in sensor_names():
-            table.add_row(sensor, "sensor", load_sensor(sensor).description)
+            table.add_row(sensor, "sensor", plain(load_sensor(sensor).description))
         for scene in scene_names():
-            table.add_row(scene, "scene", load_scene_call(scene).description)
+            table.add_row(scene, "scene", plain(load_scene_call(scene).description))
         for target in target_names():
-            table.add_row(target, "target", load_target(target).description)
+            table.add_row(target, "target", plain(load_target(target).description))
     else:
         for column in ("value", "status", "source"):
             table.add_column(column)
         title, constants = _constants(name)
-        table.title = title
+        table.title = plain(title)
         for key, constant in constants:
-            table.add_row(key, str(constant), constant.status, constant.source)
+            table.add_row(*map(plain, (key, str(constant), constant.status, constant.source)))
     default_console().print(table)
 
 
 def _file_text(name: str | None) -> str:
     """The TOML of a profile that can be read as one."""
+    from deploy.shipped import SENSOR
     from profiles import sensor_names
     from profiles.errors import OptionError
     from profiles.scene_call import scene_names
     from profiles.toml import profile_path
 
     if name is None:
-        remedy = "name one, such as pleiades-degraded"
+        remedy = f"name one, such as {SENSOR}"
         raise OptionError("--toml", expected="the name of a profile beside it", got="none", remedy=remedy)
     _constants(name)
     kind = "sensors" if name in sensor_names() else "scenes" if name in scene_names() else "targets"

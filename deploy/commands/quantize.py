@@ -6,6 +6,7 @@ from typing import Annotated
 
 import typer
 
+from deploy.commands.saying import say
 from deploy.cores import SEEDS
 from deploy.shipped import SENSOR
 
@@ -75,10 +76,10 @@ def quantize(
     network, board_target = float_model(model), load_target(target)
     calibration = Calibration(sensor, images, patches, patch, seed)
     if regime is Regime.free:
-        rows = quantise_free_file(network, calibration, out, typer.echo)
+        rows = quantise_free_file(network, calibration, out, say)
     else:
         wanted = Wanted(board, ablate, page)
-        rows = quantise_legal_file(network, calibration, board_target, passes, out, wanted, typer.echo)
+        rows = quantise_legal_file(network, calibration, board_target, passes, out, wanted, say)
     arguments = {"target": target, "sensor": sensor, "images": images, "patches": patches, "patch": patch}
     arguments |= {"regime": regime.value, "without": ", ".join(without or []), "seed": seed}
     document = Document("quantize", arguments, (model, out), tuple(rows))

@@ -1,15 +1,18 @@
 """`beers-deploy restore`: a raw image in, the restored one out, of any size."""
 
-from collections.abc import Mapping
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
+from deploy.commands.saying import say
+from deploy.commands.unasked import refuse
 from deploy.swath.options import TILE_PX, Compression, Options, Runtime
 
 EXAMPLE = "restore raw.tif restored.tif"
+NETWORK_ONLY = ("model", "tile", "halo", "resume", "runtime", "threads", "workers", "scheduler")
+"""Options of which the traditional chain takes none."""
 
 
 class Method(StrEnum):
@@ -20,6 +23,7 @@ class Method(StrEnum):
 
 
 def restore(
+    context: typer.Context,
     image: Annotated[Path, typer.Argument(metavar="IN", help="Image of at most 12 bits (TIFF of any size, or PNG).")],
     out: Annotated[Path, typer.Argument(metavar="OUT", help="TIFF to write: uint16, or float32 where IN is float.")],
     model: Annotated[
@@ -69,18 +73,11 @@ def restore(
     from model.files import require_writable
     from profiles.errors import OptionError
 
-    budget_bytes = int(memory * 1e9) if memory else None
+    budget_bytes = max(int(memory * 1e9), 1) if memory else None
     if method is Method.traditional:
         require_writable(out, json, inputs=(image, Path(sensor) if sensor else None))
-        given: dict[str, object] = {
-            "--model": model,
-            "--tile": tile != TILE_PX,
-            "--halo": halo != "exact",
-            "--resume": resume,
-        }
-        given |= {"--runtime": runtime is not Runtime.onnxruntime, "--threads": threads}
-        given |= {"--workers": workers, "--scheduler": scheduler}
-        _require_nothing_else(given)
+        expected, remedy = "none with --method traditional", "leave it out"
+        refuse(context, NETWORK_ONLY, expected=expected, got="one", remedy=remedy)
         _by_the_chain(image, out, sensor, full_scale, compression, budget_bytes, json)
         return
     if sensor is not None:
@@ -101,24 +98,11 @@ def restore(
         workers,
         scheduler,
     )
-    row = restore_file(image, out, options, typer.echo)
+    row = restore_file(image, out, options, say)
     print_rows(f"wrote {out}", [row])
     arguments = {"tile": tile, "halo": halo, "full_scale": full_scale, "runtime": runtime, "threads": threads}
     arguments |= {"workers": workers, "scheduler": scheduler}
     Document("restore", arguments, (path, image), (row,)).write(json)
-
-
-def _require_nothing_else(given: Mapping[str, object]) -> None:
-    """The traditional chain takes no option of a network's.
-
-    Raises:
-        OptionError: one was given.
-    """
-    from profiles.errors import OptionError
-
-    for name, value in given.items():
-        if value:
-            raise OptionError(name, expected="none with --method traditional", got="one", remedy="leave it out")
 
 
 def _by_the_chain(

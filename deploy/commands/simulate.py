@@ -6,7 +6,10 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from deploy.commands.saying import say
+from deploy.commands.unasked import refuse
 from deploy.cores import SEEDS
+from deploy.shipped import SENSOR
 
 if TYPE_CHECKING:
     from model.simulator.plan import Plan
@@ -27,21 +30,20 @@ MIN_RATIO = 2
 
 PRESETS = {
     "paper-variable": Preset("pleiades-variable", 128),
-    "paper-fixed": Preset("pleiades-degraded", 128),
-    "paper-test": Preset("pleiades-degraded", 1500),
+    "paper-fixed": Preset(SENSOR, 128),
+    "paper-test": Preset(SENSOR, 1500),
     "dior-medium": Preset("dior-medium", 256),
     "dior-high": Preset("dior-high", 256),
 }
 
 
 def simulate(
+    context: typer.Context,
     scenes: Annotated[
         list[Path] | None, typer.Argument(help="Images: 8-bit, 16-bit DN, float; drawn if none.")
     ] = None,
     out: Annotated[Path | None, typer.Option(help="Folder of the dataset.")] = None,
-    sensor: Annotated[
-        str | None, typer.Option(help="Profile of the degraded images; pleiades-degraded if none.")
-    ] = None,
+    sensor: Annotated[str | None, typer.Option(help=f"Profile of the degraded images; {SENSOR} if none.")] = None,
     reference: Annotated[
         str | None,
         typer.Option(help="Profile of the reference images, in the sensor's DN; pleiades-reference if none."),
@@ -86,6 +88,9 @@ def simulate(
     from profiles.errors import OptionError
     from profiles.scene_call import calling_for, load_scene_call
 
+    if out is None:
+        expected, remedy = "--out beside it", "leave it out, or give a folder"
+        refuse(context, ["workers", "scheduler", "resume"], expected=expected, got="none", remedy=remedy)
     check_choice(workers, scheduler)
     if out is not None:
         read = (*(scenes or ()), *(Path(name) for name in (sensor, reference, scene) if name))
@@ -99,7 +104,7 @@ def simulate(
     recipe = DatasetRecipe(
         tuple(scenes) if scenes else (None,),
         degraded,
-        reference_beside(degraded, reference, typer.echo),
+        reference_beside(degraded, reference, say),
         ratio,
         patch or (chosen.patch_px if preset else None),
         call.radiance_scale.low if call else 1.0,
@@ -108,7 +113,7 @@ def simulate(
         ratio / wanted,
     )
     if ratio < MIN_RATIO:
-        typer.echo(f"note: at {ratio} scene pixel a pixel the blur itself rings near sharp edges", err=True)
+        say(f"note: at {ratio} scene pixel a pixel the blur itself rings near sharp edges", err=True)
     if out is None and not explain:
         raise OptionError("--out", expected="a folder", got="none", remedy="give one, or ask for --explain alone")
     if explain:
@@ -118,7 +123,7 @@ def simulate(
     with steps("simulating", len(plan_windows(recipe))) as bar:
         summary = write_dataset(recipe, out, workers or os.cpu_count() or 1, resume, bar.advance, scheduler)
     rejected = f"; {summary['rejected_share']:.1%} of the drawn SNR pairs were impossible and drawn again"
-    typer.echo(f"wrote {summary['patches']:.0f} pairs to {out}" + (rejected if summary["rejected_share"] else ""))
+    say(f"wrote {summary['patches']:.0f} pairs to {out}" + (rejected if summary["rejected_share"] else ""))
 
 
 def _preset(name: str | None) -> Preset:
@@ -150,10 +155,10 @@ def _explain(recipe: object) -> None:
 def _print_plan(title: str, plan: "Plan") -> None:
     from rich.table import Table
 
-    from deploy.tables import default_console
+    from deploy.tables import default_console, plain
 
-    table = Table("effect", "decision", "why", "bound DN", "cost", title=title, title_justify="left")
+    table = Table("effect", "decision", "why", "bound DN", "cost", title=plain(title), title_justify="left")
     for d in plan.decisions:
         bound = "" if d.bound_dn is None else f"{d.bound_dn:.3g}"
-        table.add_row(d.effect, d.choice, d.why, bound, d.cost)
+        table.add_row(*map(plain, (d.effect, d.choice, d.why, bound, d.cost)))
     default_console().print(table)

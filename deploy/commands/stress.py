@@ -5,7 +5,10 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from deploy.commands.saying import say
+from deploy.commands.unasked import refuse
 from deploy.cores import SEEDS
+from deploy.shipped import SENSOR, VARIANT
 
 if TYPE_CHECKING:
     from deploy.stress.flip_study import FlipRequest
@@ -21,12 +24,13 @@ BIT_FLIPS_ONLY = ("draws", "sensor", "images", "target")
 def stress(
     context: typer.Context,
     float_model: Annotated[
-        Path | None, typer.Argument(metavar="[FLOAT]", help="Float ONNX or weights; a shipped one if none.")
+        Path | None,
+        typer.Argument(metavar="[FLOAT]", help="Float ONNX or weights, or a shipped name; a shipped pair if none."),
     ] = None,
     int8_model: Annotated[
-        Path | None, typer.Argument(metavar="[INT8]", help="Its INT8 ONNX; the shipped one with the shipped float.")
+        Path | None, typer.Argument(metavar="[INT8]", help="Its INT8 ONNX, or a shipped name.")
     ] = None,
-    variant: Annotated[str, typer.Option(help="Shipped pair of this name, where no file is given.")] = "convbeers-s",
+    variant: Annotated[str, typer.Option(help="Shipped pair of this name, where no file is given.")] = VARIANT,
     cases: Annotated[str | None, typer.Option(help="Only these cases, with commas: 'night,snow'.")] = None,
     stages: Annotated[str | None, typer.Option(help="Only these stages, with commas: 'float32,INT8'.")] = None,
     size: Annotated[
@@ -39,9 +43,7 @@ def stress(
     draws: Annotated[
         int, typer.Option(min=1, max=10_000, help="Strikes of each memory and rate, with --bit-flips.")
     ] = 6,
-    sensor: Annotated[
-        str, typer.Option(help="Sensor profile of the patches, with --bit-flips.")
-    ] = "pleiades-degraded",
+    sensor: Annotated[str, typer.Option(help="Sensor profile of the patches, with --bit-flips.")] = SENSOR,
     images: Annotated[
         Path | None,
         typer.Option(help="Folder of aerial images for the patches, with --bit-flips; else drawn scenes."),
@@ -70,7 +72,7 @@ def stress(
     from deploy.tables import print_rows
     from model.files import require_writable, write_text
 
-    _refuse(context, HARD_CASES_ONLY if bit_flips else BIT_FLIPS_ONLY, bit_flips)
+    _refuse_unused(context, float_model, bit_flips)
     picture = _picture_beside(out, json) if bit_flips else None
     read = (float_model, int8_model, images, *map(Path, (sensor, target)))
     require_writable(out, json, picture, inputs=read)
@@ -93,30 +95,29 @@ def stress(
     if out is not None:
         write_text(out, markdown(shown))
     for reason in dict.fromkeys(outcome.reason for outcome in outcomes if outcome.reason):
-        typer.echo(f"not looked at: {reason}")
+        say(f"not looked at: {reason}")
     failed = [outcome for outcome in outcomes if outcome.failed]
     for outcome in failed:
-        typer.echo(f"FAILED {outcome.case.name}, {outcome.stage}: {outcome.verdict.removeprefix('FAILED: ')}")
+        say(f"FAILED {outcome.case.name}, {outcome.stage}: {outcome.verdict.removeprefix('FAILED: ')}")
     safe = overflow_proven(subject)
     if not safe:
-        typer.echo("FAILED: an int32 accumulator might overflow, see the integer layers")
-    typer.echo(f"stress {'passed' if not failed and safe else 'FAILED'}: {len(outcomes)} looks, {len(failed)} failed")
+        say("FAILED: an int32 accumulator might overflow, see the integer layers")
+    say(f"stress {'passed' if not failed and safe else 'FAILED'}: {len(outcomes)} looks, {len(failed)} failed")
     if failed or not safe:
         raise typer.Exit(1)
 
 
-def _refuse(context: typer.Context, names: tuple[str, ...], bit_flips: bool) -> None:
-    """Options of the other work of this command: better said than ignored."""
-    from profiles.errors import OptionError
-
-    for name in names:
-        source = context.get_parameter_source(name)
-        if source is not None and source.name == "COMMANDLINE":
-            if bit_flips:
-                expected, got, remedy = "hard cases", "--bit-flips", "leave one of the two out"
-            else:
-                expected, got, remedy = "--bit-flips beside it", "hard cases", "add --bit-flips, or leave it out"
-            raise OptionError(f"--{name}", expected=expected, got=got, remedy=remedy)
+def _refuse_unused(context: typer.Context, float_model: Path | None, bit_flips: bool) -> None:
+    """Refuse a shipped variant beside a file, and the options of the other work of this command."""
+    if float_model is not None:
+        expected, remedy = "it without files", "leave it out, or the files"
+        refuse(context, ["variant"], expected=expected, got=float_model.name, remedy=remedy)
+    if bit_flips:
+        remedy = "leave one of the two out"
+        refuse(context, HARD_CASES_ONLY, expected="hard cases", got="--bit-flips", remedy=remedy)
+    else:
+        expected, remedy = "--bit-flips beside it", "add --bit-flips, or leave it out"
+        refuse(context, BIT_FLIPS_ONLY, expected=expected, got="hard cases", remedy=remedy)
 
 
 def _flip_bits(

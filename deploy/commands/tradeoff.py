@@ -5,7 +5,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from deploy.commands.saying import say
 from deploy.cores import SEEDS
+from deploy.shipped import SENSOR
 
 if TYPE_CHECKING:
     from deploy.tradeoff.study import Study
@@ -21,7 +23,7 @@ def tradeoff(
     images: Annotated[
         Path | None, typer.Option(help="Folder of held-out scenes to simulate from; drawn ones if none.")
     ] = None,
-    sensor: Annotated[str, typer.Option(help="Profile of the degraded images.")] = "pleiades-degraded",
+    sensor: Annotated[str, typer.Option(help="Profile of the degraded images.")] = SENSOR,
     reference: Annotated[
         str | None,
         typer.Option(help="Profile of the reference images, in the sensor's DN; pleiades-reference if none."),
@@ -42,7 +44,7 @@ def tradeoff(
     calibration: Annotated[
         Path | None, typer.Option(help="Folder of scenes to make missing INT8 files on; drawn ones if none.")
     ] = None,
-    size: Annotated[str, typer.Option(help="Size of the swath in pixels.")] = PAPER_SIZE,
+    size: Annotated[str, typer.Option(help="Width x height of the swath in pixels.")] = PAPER_SIZE,
     cache: Annotated[Path | None, typer.Option(help="Folder of kept measurements; OUT/cache if none.")] = None,
     seed: Annotated[int, typer.Option(min=0, max=SEEDS, help="Seed of every random draw.")] = 0,
     json: Annotated[Path | None, typer.Option(help="Write the figures here too.")] = None,
@@ -70,7 +72,7 @@ def tradeoff(
     aim = reference or REFERENCE
     read = (images, calibration, lpips, *map(Path, (sensor, aim, *names)))
     require_writable(figures, *(out / name for name in FILES), json, inputs=read, folders=(kept,))
-    reference_beside(load_sensor(sensor), reference, typer.echo)
+    reference_beside(load_sensor(sensor), reference, say)
     request = Request(
         names,
         images,
@@ -85,7 +87,7 @@ def tradeoff(
     )
     result = run_study(request, Cache(kept))
     write_study(result.study, out)
-    say(result.study)
+    show(result.study)
     arguments: dict[str, object] = {"images": images, "sensor": sensor, "reference": aim, "size": size}
     arguments |= {"networks": networks, "budget": budget, "need": need, "calibration": calibration, "seed": seed}
     document = Document("tradeoff", arguments, request.files, result.rows)
@@ -95,7 +97,7 @@ def tradeoff(
         raise typer.Exit(1)
 
 
-def say(study: "Study") -> None:
+def show(study: "Study") -> None:
     """The most important figures, and what they mean."""
     from deploy.results import Row
     from deploy.tables import print_rows
@@ -106,8 +108,8 @@ def say(study: "Study") -> None:
     print_rows("operating points", rows)
     for front in study.fronts:
         if front.y == "PSNR":
-            typer.echo(f"front of {front.y} against {front.x}: {'; '.join(front.members)}")
+            say(f"front of {front.y} against {front.x}: {'; '.join(front.members)}")
             for price in front.prices:
-                typer.echo(f"  {price}")
+                say(f"  {price}")
     for sentence in (*study.advice, study.headline):
-        typer.echo(sentence)
+        say(sentence)

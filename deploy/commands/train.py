@@ -5,9 +5,13 @@ from typing import Annotated
 
 import typer
 
+from deploy.commands.saying import say
+from deploy.commands.unasked import refuse
 from deploy.cores import SEEDS
 
 EXAMPLE = "train --variant convbeers-s --images aerial/ --out runs/s --steps 20000"
+RANGE = "pleiades-variable"
+"""The sensors of a network that is for no single one."""
 
 
 def train(
@@ -18,12 +22,16 @@ def train(
     ] = None,
     pairs: Annotated[Path | None, typer.Option(help="Folder of pairs that 'simulate' wrote, instead.")] = None,
     variant: Annotated[str, typer.Option(help="Size of the network.")] = "convbeers-s",
-    sensor: Annotated[str, typer.Option(help="Profile of the degraded input.")] = "pleiades-variable",
+    sensor: Annotated[
+        str | None,
+        typer.Option(help=f"Profile of the degraded input; of pairs their recipe's, else {RANGE} if none."),
+    ] = None,
     told: Annotated[
         bool, typer.Option("--told", help="Draw sensors of a wide range with that gain, and tell the network each.")
     ] = False,
     reference: Annotated[
-        str | None, typer.Option(help="Profile of the wanted output, in the sensor's DN; pleiades-reference if none.")
+        str | None,
+        typer.Option(help="Profile of the wanted output, in the sensor's DN; pleiades-reference if none."),
     ] = None,
     drawn: Annotated[int, typer.Option(min=0, max=1000, help="Drawn scenes to add to the images.")] = 0,
     steps: Annotated[int, typer.Option(min=1, help="Gradient steps.")] = 20_000,
@@ -58,12 +66,12 @@ def train(
     """Train a network on pairs simulated on the fly, or stored; resumable, the same weights for the same seed.
 
     The loss is the paper's: 1.0 L1 + 0.5 LPIPS + 0.1 L1 of spectra; without weights for LPIPS that term is left out,
-    which is said and kept in the recipe. A twentieth of the images, whole sites, is held out for validation. Several
-    GPUs: start it with torchrun.
+    which is said and kept in the recipe. Pairs bring sensor, reference and full scale in a recipe.json: others are
+    refused. A twentieth of the images, whole sites, is held out for validation. Several GPUs: start it with torchrun.
     """
     from typing import get_args
 
-    from deploy.defaults import reference_beside
+    from deploy.evaluation.recipe import profiles_for, read_pairs_recipe
     from deploy.shipped import float_file
     from deploy.training import FILES, Run, weights_name
     from deploy.training import train as run_training
@@ -74,7 +82,6 @@ def train(
     from model.training.precision import Precision
     from model.training.recipe import Optimiser, TrainingRecipe
     from model.training.workers import joined
-    from profiles import load_sensor
     from profiles.errors import OptionError
 
     if optimiser not in get_args(Optimiser):
@@ -87,11 +94,7 @@ def train(
     if told and (pairs is not None or teacher is not None):
         remedy = "leave one out: stored pairs do not say what sensor each had, and a teacher is not told"
         raise OptionError("--told", expected="no --pairs or --teacher beside it", got="both", remedy=remedy)
-    if images is None:
-        expected = "--images, of which whole sites are held out, beside it"
-        _require_unasked(context, "validate_every", expected, "no images: nothing to validate on")
-    if teacher is None:
-        _require_unasked(context, "distil", "--teacher beside it", "no network to imitate")
+    _refuse_unused(context)
     stored = [pairs, *(pairs / role for role in ("degraded", "reference"))] if pairs else [images]
     start, teacher = (float_file(path) if path else None for path in (start, teacher))
     read = (*stored, lpips, start, teacher, *(Path(name) for name in (sensor, reference) if name))
@@ -105,9 +108,10 @@ def train(
         distil=distil if teacher else 0.0,
         seed=seed,
     )
-    degraded = load_sensor(sensor)
+    made = read_pairs_recipe(pairs) if pairs else None
+    degraded, wanted = profiles_for(sensor or (None if made else RANGE), reference, made, say)
     family = SensorFamily(degraded.nominal()) if told else None
-    patches = PatchRecipe(degraded, reference_beside(degraded, reference, typer.echo), patch_px=patch, told=family)
+    patches = PatchRecipe(degraded, wanted, patch_px=patch, told=family)
     run = Run(
         variant,
         recipe,
@@ -125,16 +129,20 @@ def train(
         precision,  # type: ignore[arg-type]
     )
     with joined(device) as worker:
-        run_training(run, resume, worker, typer.echo)
+        run_training(run, resume, worker, say)
         if worker.first:
-            typer.echo(f"wrote {run.weights}")
+            say(f"wrote {run.weights}")
 
 
-def _require_unasked(context: typer.Context, name: str, expected: str, got: str) -> None:
-    """An option that would do nothing: better said than ignored."""
-    from profiles.errors import OptionError
-
-    source = context.get_parameter_source(name)
-    if source is not None and source.name == "COMMANDLINE" and context.params[name]:
-        option = f"--{name.replace('_', '-')}"
-        raise OptionError(option, expected=expected, got=got, remedy="leave it out, or give what it needs")
+def _refuse_unused(context: typer.Context) -> None:
+    """Refuse options that would do nothing beside the others."""
+    remedy = "leave it out, or give what it needs"
+    if context.params["images"] is None:
+        expected = "--images, of which whole sites are held out, beside it"
+        refuse(context, ["validate_every"], expected=expected, got="no images: nothing to validate on", remedy=remedy)
+    if context.params["teacher"] is None:
+        expected, got = "--teacher beside it", "no network to imitate"
+        refuse(context, ["distil"], expected=expected, got=got, remedy=remedy)
+    if not context.params["lpips_weight"]:
+        expected, got = "a weight of LPIPS in the loss", "--lpips-weight 0"
+        refuse(context, ["lpips"], expected=expected, got=got, remedy="leave one of the two out")

@@ -3,7 +3,7 @@
 # ruff: noqa: ARG001 - every rule takes the operation and the DPU
 
 from deploy.dpu.board import Dpu
-from deploy.dpu.finding import Finding, groups_of, outside
+from deploy.dpu.finding import Finding, groups_of, outside, shown
 from deploy.dpu.graph import Operation
 
 
@@ -13,7 +13,7 @@ def conv_kernel(op: Operation, dpu: Dpu) -> Finding | None:
     if not outside(kernel, limit):
         return None
     remedy = f"use a kernel of at most {limit.high:g}, or stack small ones: two 3 x 3 see as far as one 5 x 5"
-    return Finding(f"kernel ({kernel[0]} x {kernel[1]}) is not in the DPU's range {limit}", remedy)
+    return Finding(f"kernel ({shown(kernel)}) is not in the DPU's range {limit}", remedy)
 
 
 def conv_stride(op: Operation, dpu: Dpu) -> Finding | None:
@@ -22,7 +22,7 @@ def conv_stride(op: Operation, dpu: Dpu) -> Finding | None:
     if not outside(stride, limit):
         return None
     remedy = f"use a stride of at most {limit.high:g}, or two convolutions whose strides multiply to it"
-    return Finding(f"stride ({stride[0]}, {stride[1]}) is not in the DPU's range {limit}", remedy)
+    return Finding(f"stride ({shown(stride)}) is not in the DPU's range {limit}", remedy)
 
 
 def conv_channels(op: Operation, dpu: Dpu) -> Finding | None:
@@ -92,7 +92,7 @@ def depthwise_kernel(op: Operation, dpu: Dpu) -> Finding | None:
     kernel, limit, most = op.window.kernel, dpu.limit("depthwise", "kernel"), dpu.whole("depthwise", "window_max")
     if not outside(kernel, limit) and kernel[0] * kernel[1] <= most:
         return None
-    reason = f"kernel ({kernel[0]} x {kernel[1]}) is not in the DPU's range {limit}, area at most {most}"
+    reason = f"kernel ({shown(kernel)}) is not in the DPU's range {limit}, area at most {most}"
     return Finding(reason, "use a smaller kernel, or a k x 1 and a 1 x k depthwise convolution")
 
 
@@ -101,7 +101,7 @@ def depthwise_stride(op: Operation, dpu: Dpu) -> Finding | None:
     limit, stride = dpu.limit("depthwise", "stride"), op.window.stride
     if not outside(stride, limit):
         return None
-    reason = f"stride ({stride[0]}, {stride[1]}) is not in the DPU's range {limit}"
+    reason = f"stride ({shown(stride)}) is not in the DPU's range {limit}"
     return Finding(reason, f"use a stride of at most {limit.high:g}")
 
 
@@ -121,7 +121,9 @@ def transposed_kernel(op: Operation, dpu: Dpu) -> Finding | None:
     pairs = list(zip(op.window.kernel, op.window.stride, strict=True))
     if not outside(tuple(n for k, s in pairs for n in (k // s, groups_of(k, s))), limit):
         return None
-    reason = f"kernel {op.window.kernel} / stride {op.window.stride} is not in the DPU's range {limit}"
+    reason = (
+        f"kernel ({shown(op.window.kernel)}) / stride ({shown(op.window.stride)}) is not in the DPU's range {limit}"
+    )
     return Finding(reason, "use a kernel at least as large as the stride, such as 4 x 4 with stride 2")
 
 
@@ -138,7 +140,8 @@ def transposed_padding(op: Operation, dpu: Dpu) -> Finding | None:
     room = op.window.kernel * 2
     if all(0 <= pad <= most for pad, most in zip(op.window.pads, room, strict=True)):
         return None
-    return Finding(f"pads {op.window.pads} exceed the kernel {op.window.kernel}", "pad less, and crop on the host")
+    reason = f"pads {op.window.pads} exceed the kernel ({shown(op.window.kernel)})"
+    return Finding(reason, "pad less, and crop on the host")
 
 
 def transposed_channels(op: Operation, dpu: Dpu) -> Finding | None:

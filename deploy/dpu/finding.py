@@ -25,6 +25,11 @@ def outside(values: tuple[int, ...], limit: Constant) -> bool:
     return any(not limit.low <= value <= limit.high for value in values)
 
 
+def shown(sides: tuple[int, int]) -> str:
+    """Height and width, in the order of ONNX, as sizes are shown everywhere: width x height."""
+    return f"{sides[1]} x {sides[0]}"
+
+
 def groups_of(count: int, size: int) -> int:
     """How many groups of `size` hold `count` things."""
     return -(-count // size)

@@ -4,7 +4,7 @@
 
 from deploy.dpu.board import Dpu
 from deploy.dpu.conv_rules import alu_padding
-from deploy.dpu.finding import Finding, outside
+from deploy.dpu.finding import Finding, outside, shown
 from deploy.dpu.graph import Operation
 
 ALU = {"LeakyRelu", "QLinearLeakyRelu", "PRelu", "HardSigmoid"}
@@ -56,7 +56,7 @@ def pool_kernel(op: Operation, dpu: Dpu) -> Finding | None:
     kernel, limit = op.window.kernel, dpu.limit("pool", "kernel")
     if not outside(kernel, limit):
         return None
-    reason = f"kernel ({kernel[0]} x {kernel[1]}) is not in the DPU's range {limit}"
+    reason = f"kernel ({shown(kernel)}) is not in the DPU's range {limit}"
     return Finding(reason, "pool in two steps, or a smaller tile where the pool is global")
 
 
@@ -65,7 +65,7 @@ def pool_stride(op: Operation, dpu: Dpu) -> Finding | None:
     stride, limit = op.window.stride, dpu.limit("pool", "stride")
     if not outside(stride, limit):
         return None
-    reason = f"stride ({stride[0]}, {stride[1]}) is not in the DPU's range {limit}"
+    reason = f"stride ({shown(stride)}) is not in the DPU's range {limit}"
     return Finding(reason, "pool in two steps")
 
 

@@ -222,7 +222,7 @@ def _input_shape(info: onnx.ValueInfoProto, tile_px: int, where: str) -> Shape:
         raise ModelError(
             where,
             expected=f"an input that takes {tile_px} x {tile_px} pixels",
-            got=f"one fixed to {sizes[2]} x {sizes[3]}",
+            got=f"one fixed to {sizes[3] or 'any'} x {sizes[2] or 'any'}",
             remedy=f"pass --tile {min(fixed)}, or export it with free sizes",
         )
     return (sizes[1], tile_px, tile_px)

@@ -6,8 +6,9 @@ No document states a largest height or width of the DPU's maps; they stream thro
 import math
 
 from deploy.dpu.board import Dpu
-from deploy.dpu.finding import Finding
+from deploy.dpu.finding import Finding, shown
 from deploy.dpu.graph import Operation
+from profiles.errors import sizes
 
 WINDOWED = {"conv", "grouped conv", "depthwise", "transposed", "pool"}
 
@@ -17,9 +18,8 @@ def map_exists(op: Operation, dpu: Dpu) -> Finding | None:  # noqa: ARG001 - eve
     before = op.in_shapes[0] if op.in_shapes else None
     if op.kind not in WINDOWED or before is None or op.out_shape is not None:
         return None
-    reason = (
-        f"nothing is left of a map of {before[1]} x {before[2]} under {op.window.kernel}, stride {op.window.stride}"
-    )
+    window = f"a kernel of {shown(op.window.kernel)}, stride {shown(op.window.stride)}"
+    reason = f"nothing is left of a map of {shown(before[1:])} under {window}"
     return Finding(reason, "use a larger tile, or fewer strides before it")
 
 
@@ -28,7 +28,7 @@ def maps_aligned(op: Operation, dpu: Dpu) -> Finding | None:  # noqa: ARG001
     sizes = {(shape[1], shape[2]) for shape in op.in_shapes if shape is not None}
     if op.kind not in ("add", "mul", "concat") or len(sizes - {(1, 1)}) < 2:
         return None
-    reason = " and ".join(f"{height} x {width}" for height, width in sorted(sizes)) + " meet"
+    reason = " and ".join(shown(size) for size in sorted(sizes)) + " meet"
     return Finding(
         reason, "use a tile whose side is a multiple of the network's total stride, or pad the smaller map"
     )
@@ -40,5 +40,6 @@ def map_in_memory(op: Operation, dpu: Dpu) -> Finding | None:
     size = math.prod(op.out_shape) * dpu.batch if op.out_shape else 0
     if size <= most:
         return None
-    reason = f"{size / 1e9:.1f} GB for {dpu.batch} images, of {most / 1e9:.1f} GB"
+    taken, room = sizes(size, most)
+    reason = f"{taken} for {dpu.batch} images, of {room}"
     return Finding(reason, f"use a tile of at most {math.sqrt(most / size):.2f} times this side")

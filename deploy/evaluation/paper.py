@@ -1,6 +1,8 @@
 """What the paper printed, for rows beside our own; its test set, and which LPIPS it used, are not known."""
 
+from deploy.evaluation.targets import snr_name
 from deploy.results import Row, published, unavailable
+from model.metrics.noise_level import RADIANCES
 
 SOURCE = "ConvBEERS paper, table on its simulated test set"
 NOTE = "another test set: does not compare"
@@ -29,7 +31,6 @@ def _row(
         "LPIPS, network not stated": published(distances[0], "distance", SOURCE),
         "DISTS": published(distances[1], "distance", SOURCE),
         "MTF at Nyquist": sharpness,
-        "SNR at 25": published(snr[0], "ratio", SOURCE),
-        "SNR at 100": published(snr[1], "ratio", SOURCE),
+        **{snr_name(r): published(value, "ratio", SOURCE) for r, value in zip(RADIANCES, snr, strict=True)},
     }
     return Row("mean", name, figures, {"told": NOTE})

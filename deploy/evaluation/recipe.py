@@ -6,13 +6,11 @@ from pathlib import Path
 from typing import Any
 
 from deploy.defaults import reference_beside
+from deploy.shipped import SENSOR
 from model.images import site_of
 from profiles.errors import OptionError
 from profiles.sensor import SensorProfile, load_sensor, same_instrument, sensor_from_json
 from profiles.text import read_json
-
-SENSOR = "pleiades-degraded"
-"""Of images of which nothing is known."""
 
 
 @dataclass(frozen=True)

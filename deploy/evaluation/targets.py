@@ -65,11 +65,16 @@ def _acquire(scene: Tensor, sensor: Sensor, draw: Draw, ratio: int = OVERSAMPLIN
     return dn.numpy()
 
 
+def snr_name(radiance: float) -> str:
+    """The name of the SNR in a flat field of a radiance in W/m2/sr/um."""
+    return f"SNR at {radiance:g} W/m2/sr/um"
+
+
 def target_figures(method: Method, targets: Targets) -> dict[str, Figure]:
     """MTF at Nyquist in %, and SNR in flat fields, of what the method makes of the targets."""
     figures = {"MTF at Nyquist": mtf_figure(restored_mtfs(method, targets))}
     for radiance, flat in targets.flats:
-        figures[f"SNR at {radiance:g}"] = flat_figure(_middle(method.restore(flat)) - targets.offset_dn)
+        figures[snr_name(radiance)] = flat_figure(_middle(method.restore(flat)) - targets.offset_dn)
     return figures
 
 

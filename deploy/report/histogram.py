@@ -2,23 +2,22 @@
 
 import base64
 import math
-from pathlib import Path
 
-import jinja2
 import numpy as np
 
+from deploy.report.templates import templates
 from quant.planes import MAX_DN
 from quant.spread import Spread
 
-WIDTH, HEIGHT, LEFT, BOTTOM = 900, 300, 62, 40
+WIDTH, HEIGHT, LEFT, BOTTOM, FONT_PX = 338, 240, 80, 46, 13
+"""In pixels of the page, on the narrowest one too: a wider picture would be scaled down there, its labels with it."""
+LABELS = 6
 MOST_BARS = 81
 
 
 def histogram_url(spread: Spread) -> str:
     """Shares of pixels by error, on a logarithmic scale, and a Gaussian of the same deviation, as a data: address."""
-    loader = jinja2.FileSystemLoader(Path(__file__).parent)
-    environment = jinja2.Environment(loader=loader, autoescape=True, undefined=jinja2.StrictUndefined)
-    svg = environment.get_template("histogram.svg").render(_layout(spread))
+    svg = templates().get_template("histogram.svg").render(_layout(spread))
     return "data:image/svg+xml;base64," + base64.b64encode(svg.encode()).decode()
 
 
@@ -53,13 +52,14 @@ def _layout(spread: Spread) -> dict[str, object]:
         return round(high * min(-math.log10(max(share, 10.0**-decades)) / decades, 1), 1)
 
     xs = [round(LEFT + slot * (k + 0.5), 1) for k in range(len(centres))]
-    every = max(len(centres) // 10, 1)
+    every = max(len(centres) // LABELS, 1)
     ticks = [k for k in range(len(centres)) if (k - len(centres) // 2) % every == 0]
     return {
         "width": WIDTH,
         "height": HEIGHT,
+        "font": FONT_PX,
         "left": LEFT,
-        "rows": [(f"{100 * 10.0**-d:g} %", y_of(10.0**-d)) for d in range(1, decades)],
+        "rows": [(f"{100 * 10.0**-d:.{max(d - 2, 0)}f} %", y_of(10.0**-d)) for d in range(1, decades)],
         "bars": [
             (round(x - 0.4 * slot, 1), y_of(share), round(0.8 * slot, 1), round(high - y_of(share), 1))
             for x, share in zip(xs, shares, strict=True)

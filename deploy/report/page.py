@@ -4,9 +4,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import jinja2
-
 from deploy import __version__
+from deploy.report.templates import templates
 from deploy.results import Figure, Row
 from deploy.tables import missing, unit_of
 from model.files import write_text
@@ -46,10 +45,8 @@ class Report:
 
 def render(report: Report) -> str:
     """The page as HTML."""
-    loader = jinja2.FileSystemLoader(Path(__file__).parent)
-    environment = jinja2.Environment(loader=loader, autoescape=True, undefined=jinja2.StrictUndefined)
     tables = [_grid(table) for table in report.tables]
-    return environment.get_template("report.html").render(report=report, tables=tables, version=__version__)
+    return templates().get_template("report.html").render(report=report, tables=tables, version=__version__)
 
 
 def write_report(report: Report, path: Path) -> None:

@@ -9,6 +9,7 @@ import tifffile
 import torch
 from torch import Tensor
 
+from deploy.shipped import SENSOR
 from deploy.stress.cases import FULL_DN, Case
 from deploy.stress.checks import (
     Measure,
@@ -30,7 +31,6 @@ from model.simulator.scene import read_scene
 from profiles import load_sensor
 from profiles.sensor import Sensor
 
-SENSOR = "pleiades-degraded"
 RATIO = 2
 FLOAT32_DN = 0.05
 """Of a transform in float32, at full scale."""

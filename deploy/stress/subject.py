@@ -13,7 +13,7 @@ import onnxruntime as ort
 from deploy.counterpart import require_quantised
 from deploy.defaults import float_model
 from deploy.restore import Infer
-from deploy.shipped import shipped_pair
+from deploy.shipped import float_file, int8_file, shipped_pair
 from deploy.stress.cases import FULL_DN
 from deploy.swath.engine import restore_rows
 from deploy.swath.plan import make_plan
@@ -88,13 +88,14 @@ class Subject:
 
 
 def open_subject(float_path: Path | None, int8_path: Path | None, variant: str) -> Subject:
-    """The files given, or the shipped pair of a variant where neither is.
+    """The files given, or shipped ones of that name; the shipped pair of a variant where neither is given.
 
     Raises:
         ModelError: no such file or variant, the two swapped, or a network that cannot be tiled.
     """
     if float_path is None:
         float_path, int8_path = shipped_pair(variant)
+    float_path, int8_path = float_file(float_path), int8_file(int8_path) if int8_path else None
     float32 = Network(float_model(float_path))
     int8 = None if int8_path is None else Network(load_onnx(int8_path))
     for path, network, wanted in ((float_path, float32, False), (int8_path, int8, True)):

@@ -17,7 +17,7 @@ def plan_sentence(plan: Plan) -> str:
     rows_px, columns_px = plan.tile_shape
     tiles = "1 tile" if plan.tiles == 1 else f"{plan.tiles} tiles"
     return (
-        f"plan: {plan.height_px} x {plan.width_px} pixels{bands}; {tiles} of {rows_px} x {columns_px}, "
+        f"plan: {plan.width_px} x {plan.height_px} pixels{bands}; {tiles} of {columns_px} x {rows_px}, "
         f"halo {_halo(plan)}, work factor {plan.work_factor:.2f}"
     )
 

@@ -4,7 +4,7 @@ import psutil
 
 from deploy.swath.plan import Plan
 from deploy.swath.reader import Source
-from profiles.errors import MachineError
+from profiles.errors import MachineError, sizes
 
 
 def rows_bytes(source: Source, plan: Plan, begun: bool = False) -> int:
@@ -44,12 +44,13 @@ def check_memory(rows: int, budget_bytes: int | None, bulky: bool, share: int = 
     allowed = budget_bytes // share if budget_bytes else psutil.virtual_memory().available // share + held
     if held + rows <= allowed:
         return held + rows
+    limit, before, rows_size = sizes(allowed, held, rows)
     remedy = "rewrite the image in tiles (gdal_translate -co TILED=YES)" if bulky else "take a smaller --tile"
     raise MachineError(
         "--memory" + (f", one of {share} processes" if share > 1 else ""),
-        expected=f"a run within {allowed / 1e9:.2f} GB",
-        got=f"{held / 1e9:.2f} GB before and {rows / 1e9:.2f} GB for rows of the image",
-        remedy=f"{remedy} or give it more",
+        expected=f"a run within {limit}",
+        got=f"{before} before and {rows_size} for rows of the image",
+        remedy=f"{remedy} or give it more" if held < allowed else f"give it more than {before}",
     )
 
 

@@ -68,7 +68,7 @@ def page_raster(path: str, page: tifffile.TiffPage) -> Raster:
     """
     planes, _, height_px, width_px, samples = page.shaped
     if max(height_px, width_px) > SIDE_PX or planes * samples > BANDS:
-        got = f"{planes * samples} bands of {height_px} x {width_px}"
+        got = f"{planes * samples} bands of {width_px} x {height_px} pixels"
         expected = f"at most {BANDS} bands of {SIDE_PX} pixels a side"
         raise ImageError(path, expected=expected, got=got, remedy="cut it into pieces")
     dtype = require_numbers(path, page.dtype)

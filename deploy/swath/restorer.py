@@ -9,6 +9,7 @@ from deploy.swath.missing import fill_missing
 from deploy.swath.raster import Raster
 from deploy.swath.reader import Source
 from deploy.tiling import Span
+from model.scale import remedy_outside
 from profiles.errors import ImageError
 
 NAME = "image"
@@ -107,11 +108,12 @@ def checked_band(raster: Raster, top: int, pixels: np.ndarray, full_scale: float
     known = True if band.missing is None else ~band.missing
     low, high = (float(extreme(band.pixels, where=known, initial=0)) for extreme in (np.min, np.max))
     if low < 0 or high > full_scale:
+        remedy = "give the sensor's highest number as --full-scale, or mark missing pixels as nodata"
         raise ImageError(
             f"{name}, rows {band.top} to {band.top + band.pixels.shape[1] - 1}",
             expected=f"digital numbers of 0 to {full_scale:g}",
             got=f"values from {low:g} to {high:g}",
-            remedy="give the sensor's highest number as --full-scale, or mark missing pixels as nodata",
+            remedy=remedy_outside(low, high, remedy),
         )
     return band
 

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from deploy.tiling import Span
-from profiles.errors import MachineError, OptionError
+from profiles.errors import MachineError, OptionError, sizes
 from profiles.text import read_json
 
 
@@ -130,8 +130,8 @@ class Spool:
         needed = bands * (height - self.rows) * width * self.dtype.itemsize
         free = shutil.disk_usage(self.out.parent).free
         if needed > free:
-            got, remedy = f"{free / 1e9:.2f} GB free", "free some space or write elsewhere"
-            raise MachineError(str(self.out), expected=f"{needed / 1e9:.2f} GB", got=got, remedy=remedy)
+            (wanted, left), remedy = sizes(needed, free), "free some space or write elsewhere"
+            raise MachineError(str(self.out), expected=f"{wanted} of disk", got=f"{left} free", remedy=remedy)
 
 
 def sync_folder(folder: Path) -> None:

@@ -14,7 +14,7 @@ import numpy as np
 from deploy.evaluation.methods import Method, Restore
 from deploy.evaluation.pairs import NamedPair
 from deploy.evaluation.scores import Instruments
-from deploy.evaluation.targets import Targets, target_figures
+from deploy.evaluation.targets import Targets, snr_name, target_figures
 from deploy.results import Figure
 from deploy.tradeoff.cache import code_digest, pixels_digest
 
@@ -92,7 +92,7 @@ def measure(restore: Restore, ground: Ground, tick: Callable[[], None]) -> Score
     images = measure_images(restore, ground, tick)
     found = target_figures(Method("", restore, ""), ground.targets)
     tick()
-    dark = f"SNR at {ground.targets.flats[0][0]:g}"
+    dark = snr_name(ground.targets.flats[0][0])
     return Scores(images, {"MTF at Nyquist": found["MTF at Nyquist"], FLAT: found[dark]})
 
 

@@ -59,7 +59,7 @@ def find_edge(image: np.ndarray) -> Edge | Refusal:
     """
     image = upright(image)
     if image.shape[0] < MIN_ROWS or image.shape[1] <= 2 * (WINDOW_PX + PLATEAU_PX):
-        return Refusal("few-rows", f"{image.shape[0]} x {image.shape[1]} pixels, 20 x 31 are needed")
+        return Refusal("few-rows", f"{image.shape[1]} x {image.shape[0]} pixels, 31 x 20 are needed")
     rows = np.arange(image.shape[0])
     slope, offset = _median_line(rows, _steepest(image))
     for _ in range(PASSES):

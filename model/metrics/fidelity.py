@@ -38,7 +38,7 @@ def ssim(image: np.ndarray, reference: np.ndarray, data_range: float) -> float:
     The images' common mean is taken off first: in E[x^2] - E[x]^2 it would cost digits.
     """
     if min(image.shape) < MIN_SIDE_PX:
-        expected, got = f"at least {MIN_SIDE_PX} pixels a side", f"{image.shape}"
+        expected, got = f"at least {MIN_SIDE_PX} pixels a side", " x ".join(map(str, image.shape[::-1]))
         raise ImageError("SSIM", expected=expected, got=got, remedy="give larger images")
     offset = float(np.mean(reference, dtype=np.float64))
     x, y = (torch.from_numpy(np.asarray(a, np.float64) - offset) for a in (image, reference))

@@ -89,7 +89,7 @@ def edge_mtf(
 def _unusable(image: np.ndarray, saturated: float | None) -> Refusal | None:
     """What can be said before the edge is found."""
     if min(image.shape) < MIN_ROWS:
-        return Refusal("few-rows", f"{image.shape[0]} x {image.shape[1]} pixels, {MIN_ROWS} rows are needed")
+        return Refusal("few-rows", f"{image.shape[1]} x {image.shape[0]} pixels, {MIN_ROWS} rows are needed")
     lost = ~np.isfinite(image)
     if lost.any():
         return Refusal("not-finite", f"{int(lost.sum())} pixels are not finite")

@@ -140,7 +140,7 @@ def crop_margin(image: Tensor, margin_px: int) -> Tensor:
         raise ImageError(
             "scene",
             expected=f"more than {2 * margin_px} target pixels a side, the margin that the blur needs",
-            got=f"{height} x {width} target pixels",
+            got=f"{width} x {height} target pixels",
             remedy="give a larger scene or a smaller oversampling",
         )
     return image[..., margin_px : height - margin_px, margin_px : width - margin_px]

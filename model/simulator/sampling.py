@@ -77,7 +77,7 @@ def check_divisible(height: int, width: int, oversampling: int) -> None:
     if oversampling < 1 or height % oversampling or width % oversampling:
         raise OptionError(
             "oversampling",
-            expected=f"a whole divisor of the scene's {height} x {width} pixels",
+            expected=f"a whole divisor of the scene's {width} x {height} pixels",
             got=repr(oversampling),
             remedy="crop the scene (crop_divisible) or choose another ratio",
         )

@@ -135,10 +135,9 @@ def visit(scene: Visited, recipe: PatchRecipe, generator: np.random.Generator) -
         return scene.spectrum.real.new_empty(0, 2, recipe.patch_px, recipe.patch_px), torch.empty(4)
     images, sensor = _acquire_pair(scene, recipe, ratio, generator)
     patches = cut(images, recipe.patch_px, generator)
-    quarter, mirrored = draw_turn(generator)
+    alike = sensor.mtf_axes[0] == sensor.mtf_axes[1]
+    quarter, mirrored = draw_turn(generator, quarters=alike or recipe.told is not None)
     vector = tell(sensor).vector
-    if recipe.told is None and sensor.mtf_axes[0] != sensor.mtf_axes[1]:
-        quarter -= quarter % 2  # a blind network learns one sensor: its two axes must not change places
     return turned(patches, quarter, mirrored), transposed(vector) if quarter % 2 else vector
 
 
@@ -166,14 +165,18 @@ def cut(images: Tensor, patch_px: int, generator: np.random.Generator) -> Tensor
     return grid.permute(1, 2, 0, 3, 4).reshape(-1, images.shape[0], patch_px, patch_px)
 
 
-def turn(patches: Tensor, generator: np.random.Generator) -> Tensor:
-    """One of the eight symmetries of the square, the same for all patches of a pass."""
-    return turned(patches, *draw_turn(generator))
+def turn(patches: Tensor, generator: np.random.Generator, quarters: bool = True) -> Tensor:
+    """One of the eight symmetries of the square, the same for all patches of a pass; of four without `quarters`."""
+    return turned(patches, *draw_turn(generator, quarters))
 
 
-def draw_turn(generator: np.random.Generator) -> tuple[int, bool]:
-    """Quarter turns, and whether to mirror afterwards; an odd number of quarters makes columns of rows."""
-    return int(generator.integers(4)), bool(generator.integers(2))
+def draw_turn(generator: np.random.Generator, quarters: bool) -> tuple[int, bool]:
+    """Quarter turns, and whether to mirror afterwards; an odd number of quarters makes columns of rows.
+
+    A blind network learns one sensor: where its two axes differ they must not change places, and `quarters` is False.
+    """
+    quarter = int(generator.integers(4))
+    return quarter if quarters else quarter - quarter % 2, bool(generator.integers(2))
 
 
 def turned(patches: Tensor, quarter: int, mirrored: bool) -> Tensor:

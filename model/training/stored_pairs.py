@@ -8,10 +8,13 @@ import torch
 from torch import Tensor
 
 from model.images import list_images, read_pixels
+from model.scale import remedy_outside, settled_scale
 from model.simulator.draws import Draw
 from model.training.patches import turn
 from model.training.workers import Worker
 from profiles.errors import ImageError
+
+RESCALE = "rescale it to the digital numbers of the sensor that made the pairs"
 
 Files = tuple[Path, Path]
 """A degraded and a reference image."""
@@ -36,7 +39,17 @@ def pair_files(folder: Path) -> list[Files]:
 
 
 class StoredPairs:
-    """Endless batches of (degraded, reference) patches, (N, 1, P, P) in [0, 1]; the same for the same seed."""
+    """Endless batches of (degraded, reference) patches, (N, 1, P, P) in [0, 1]; the same for the same seed.
+
+    Args:
+        files: the pairs.
+        patch_px: side of a patch.
+        max_dn: the largest digital number of the sensor that made the pairs.
+        batch: patches of a batch.
+        seed: of what is drawn.
+        worker: which of several this is.
+        quarters: whether patches may be turned by quarters: not those of a sensor whose two axes differ.
+    """
 
     def __init__(
         self,
@@ -46,7 +59,9 @@ class StoredPairs:
         batch: int,
         seed: int,
         worker: Worker | None = None,
+        quarters: bool = True,
     ) -> None:
+        self.quarters = quarters
         self.files, self.patch_px, self.max_dn = files, patch_px, max_dn
         self.batch, self.seed, self.worker = batch, seed, worker or Worker()
 
@@ -63,16 +78,32 @@ class StoredPairs:
     def _patch(self, generator: np.random.Generator) -> Tensor:
         """One patch (2, P, P) of a random pair."""
         files = self.files[int(generator.integers(len(self.files)))]
-        images = [read_pixels(file) for file in files]
+        images = [self._digital_numbers(file) for file in files]
         height, width = images[0].shape[:2]
         if images[0].shape != images[1].shape or images[0].ndim != 2 or min(height, width) < self.patch_px:
             raise ImageError(
                 str(files[0]),
                 expected=f"a mono pair of one size, {self.patch_px} pixels a side or more",
-                got=f"shapes {images[0].shape} and {images[1].shape}",
+                got=" and ".join(map(_size, images)),
                 remedy="choose a smaller --patch, or simulate larger patches",
             )
         top, left = (int(generator.integers(size - self.patch_px + 1)) for size in (height, width))
         window = slice(top, top + self.patch_px), slice(left, left + self.patch_px)
         both = torch.stack([torch.from_numpy(image[window].astype(np.float32)) for image in images])
-        return turn(both[None], generator)[0]
+        return turn(both[None], generator, self.quarters)[0]
+
+    def _digital_numbers(self, file: Path) -> np.ndarray:
+        """The pixels of an image, refused where they are not those of the sensor."""
+        pixels = read_pixels(file)
+        low, high = float(pixels.min()), float(pixels.max())
+        settled_scale(str(file), pixels.dtype, [max(-low, high)], usual=self.max_dn, remedy=RESCALE)
+        if low < 0 or high > self.max_dn:
+            expected, got = f"digital numbers of 0 to {self.max_dn}", f"values from {low:g} to {high:g}"
+            raise ImageError(str(file), expected=expected, got=got, remedy=remedy_outside(low, high, RESCALE))
+        return pixels
+
+
+def _size(image: np.ndarray) -> str:
+    """Width x height, and the bands where it is not mono."""
+    height, width, *bands = image.shape
+    return f"{width} x {height} pixels" + (f" of {bands[0]} bands" if bands else "")

@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 
 from deploy.bench import Swath, efficiency, layer_rows, predict_file, predicted_rows, published_rows
 from deploy.bench_sweep import parse_tiles, sweep_rows
-from deploy.commands.bench import bench, parse_size
+from deploy.commands.bench import TRAFFIC, bench, parse_size
 from deploy.commands.check import check
 from deploy.dpu.board import load_dpu
 from deploy.dpu.rates import Constants
@@ -149,6 +149,7 @@ def test_layer_rows_have_the_columns_of_vaitrace(tmp_path: Path) -> None:
     rows = layer_rows(predict_file(integer_convbeers(tmp_path / "i.onnx", 2, 64), DPU, 333), DPU)
     columns = {"work", "time", "rate", "LdFM", "LdWB", "StFM", "bandwidth", "array use", "energy"}
     assert all(set(row.figures) == columns for row in rows[:-2])
+    assert all(word in TRAFFIC for word in columns if word[:2] in ("Ld", "St"))
     assert {row.text["bound"] for row in rows[:-1]} <= {"compute", "memory", "overhead"}
     assert any(row.name.startswith("qlinearadd") and value(row, "time") > 0 for row in rows[:-2])
 

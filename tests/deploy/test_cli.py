@@ -23,6 +23,7 @@ from deploy.restore import read_acquisition
 from deploy.results import SCHEMA_PATH
 from deploy.shipped import SENSOR, default_int8
 from profiles.errors import ImageError
+from profiles.toml import profile_path
 
 runner = CliRunner()
 
@@ -54,12 +55,12 @@ def test_every_command_has_help_with_an_example(name: str) -> None:
 
 
 def test_what_is_told_no_sensor_takes_the_same_one() -> None:
-    """A network calibrated on one and judged on another is no fair trial; `train` alone is for a range of sensors."""
+    """A network calibrated on one and judged on another is no fair trial."""
     group = get_command(app)
     assert isinstance(group, TyperGroup)
     defaults = {name: p.default for name, c in group.commands.items() for p in c.params if p.name == "sensor"}
     assert {"quantize", "gate", "evaluate"} <= set(defaults)
-    assert {name for name, default in defaults.items() if default not in (SENSOR, None)} == {"train"}
+    assert set(defaults.values()) == {SENSOR, None}
 
 
 def test_help_imports_nothing_heavy() -> None:
@@ -266,6 +267,22 @@ def test_profiles_show_every_source() -> None:
     shown = runner.invoke(app, ["profiles", "pleiades-degraded"]).output
     assert "gain_dn_per_radiance" in shown
     assert "assumed" in shown
+
+
+def test_a_description_is_shown_and_not_obeyed(tmp_path: Path) -> None:
+    text = (profile_path("sensors", "pleiades-degraded")).read_text()
+    first = next(line for line in text.splitlines() if line.startswith("description"))
+    own = tmp_path / "own.toml"
+    own.write_text(text.replace(first, 'description = "a \\u001b]0;title\\u0007 \\u001b[31mred"') + "# \x9b31m\n")
+    for more in ([], ["--toml"]):
+        output = runner.invoke(app, ["profiles", str(own), *more]).output
+        assert set("\x1b\x07\x9b").isdisjoint(output)
+        assert "31m" in output
+    refused = runner.invoke(app, ["restore", "raw.tif", "\x1b[31m.png"])
+    assert "\x1b" not in refused.output
+    simulated = runner.invoke(app, ["simulate", "--explain", "--sensor", str(own)])
+    assert simulated.exit_code == 0, simulated.output
+    assert "\x1b" not in simulated.output
 
 
 def test_simulated_pairs_are_the_same_bytes_for_the_same_seed(tmp_path: Path) -> None:

@@ -17,7 +17,7 @@ from deploy.evaluation.page import chosen_pairs, strip_of
 from deploy.evaluation.pairs import NamedPair, read_pairs, simulate_pairs
 from deploy.evaluation.paper import paper_rows
 from deploy.evaluation.scores import Instruments, fidelity_db, score, site_rows
-from deploy.evaluation.targets import acquire_targets, flat_figure, mtf_figure, target_figures
+from deploy.evaluation.targets import acquire_targets, flat_figure, mtf_figure, snr_name, target_figures
 from deploy.restore import write_tiff
 from deploy.results import SCHEMA_PATH, Document, by_table
 from deploy.tables import missing
@@ -167,11 +167,12 @@ def test_targets_measure_the_sensor_and_what_a_chain_makes_of_it(monkeypatch: py
     assert len(targets.edges) == 4
     before = target_figures(IDENTITY, targets)
     assert before["MTF at Nyquist"].value == pytest.approx(7, abs=0.7)
-    assert before["SNR at 25"].value == pytest.approx(50, rel=0.05)
-    assert before["SNR at 100"].value == pytest.approx(110, rel=0.05)
+    assert snr_name(25) == "SNR at 25 W/m2/sr/um"
+    assert before[snr_name(25)].value == pytest.approx(50, rel=0.05)
+    assert before[snr_name(100)].value == pytest.approx(110, rel=0.05)
     after = target_figures(method_named("traditional-fast", *SENSORS), targets)
     assert (after["MTF at Nyquist"].value or 0) > 12
-    assert (after["SNR at 25"].value or 0) > 200
+    assert (after[snr_name(25)].value or 0) > 200
 
 
 def test_refused_edges_and_silent_fields_are_unavailable() -> None:

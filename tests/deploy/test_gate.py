@@ -424,3 +424,29 @@ def test_two_networks_of_one_kind_are_refused(reference_model: onnx.ModelProto, 
         done = CliRunner().invoke(app, ["gate", *map(str, pair)])
         assert done.exit_code == 2
         assert f"expected {expected} network" in " ".join(done.output.split())
+
+
+@pytest.mark.parametrize("wrong", [["--typo"], ["--patches", "many"], ["--max-mae"], ["a", "b", "c"]])
+def test_a_usage_error_is_told_where_the_verdict_would_be(
+    wrong: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("summary.md").write_text("what stood here\n", encoding="utf-8")
+    done = CliRunner().invoke(app, ["gate", "--junit", "j.xml", "--summary=summary.md", "--outputs", "o.txt", *wrong])
+    assert done.exit_code == 2
+    assert "Error" in done.output
+    suite = ET.parse("j.xml").getroot()  # noqa: S314 - our own file
+    assert (suite.get("errors"), suite.get("failures")) == ("1", "0")
+    assert "command line: expected what gate takes" in str(suite[0][0].get("message"))
+    assert Path("summary.md").read_text(encoding="utf-8").startswith("what stood here\n\n## INT8 gate: not judged")
+    assert Path("o.txt").read_text(encoding="utf-8") == "verdict=error\n"
+
+
+@pytest.mark.parametrize("how", [["{0}", "{0}"], ["--config={0}"], ["--summary", "{0}"]])
+def test_a_usage_error_is_told_over_nothing_else_that_is_named(how: list[str], tmp_path: Path) -> None:
+    mine = tmp_path / "mine.onnx"
+    mine.write_bytes(b"mine")
+    words = [word.format(mine) for word in how]
+    done = CliRunner().invoke(app, ["gate", "--junit", str(mine), *words, "--typo"])
+    assert done.exit_code == 2
+    assert mine.read_bytes() == b"mine"

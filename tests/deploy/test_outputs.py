@@ -1,6 +1,6 @@
 """One rule for every output of every command: no input, no other output, nothing but a regular file or a new name.
 
-The table below says of every path that a command takes whether it is read or written; a new one must be added to it.
+docs/make_options.py says of every path that a command takes whether it is read or written.
 """
 
 import os
@@ -18,75 +18,54 @@ from typer.main import get_command
 from typer.testing import CliRunner
 
 from deploy.cli import COMMANDS, app
-
-FILE, FOLDER, READ = "file", "folder", "read"
+from docs.make_options import FILE, FOLDER, PATHS, Paths
+from model import files
 
 
 @dataclass(frozen=True)
 class Case:
-    """How a command's paths are used.
+    """How a command's paths are tried.
 
     Attributes:
-        written: parameters that are outputs: FILE or FOLDER.
+        paths: which are read, and which written.
         inside: a file that the command writes into its output folders.
-        read: parameters that are inputs.
         suffix: of every name, where the command asks for one.
         more: arguments without which the command does not write.
-        also_read: options that take a file where others take a name.
     """
 
-    written: dict[str, str]
-    read: tuple[str, ...] = ()
+    paths: Paths
     inside: str = ""
     suffix: str = ".tif"
     more: tuple[str, ...] = ()
-    also_read: tuple[str, ...] = ()
+
+    @property
+    def written(self) -> dict[str, str]:
+        return self.paths.written
+
+    @property
+    def read(self) -> tuple[str, ...]:
+        return self.paths.read
+
+    @property
+    def also_read(self) -> tuple[str, ...]:
+        return self.paths.also_read
 
 
+INSIDE = {
+    "demo": "int8.onnx",
+    "simulate": "recipe.json",
+    "train": "checkpoint.safetensors",
+    "quantize": "report.html",
+    "evaluate": "report.html",
+    "tradeoff": "tradeoff.html",
+}
+SUFFIXES = {"check": ".svg", "compare": ".json"}
+MORE = {"stress": ("--bit-flips",)}
+BESIDE = {("restore", "sensor"): ("--method", "traditional")}
+"""What an option is refused without."""
 CASES = {
-    "demo": Case({"out": FOLDER, "json": FILE}, ("image",), "int8.onnx"),
-    "profiles": Case({}),
-    "simulate": Case({"out": FOLDER}, ("scenes",), "recipe.json", also_read=("sensor", "reference", "scene")),
-    "train": Case(
-        {"out": FOLDER},
-        ("images", "pairs", "lpips", "start", "teacher"),
-        "checkpoint.safetensors",
-        also_read=("sensor", "reference"),
-    ),
-    "export": Case({"out": FILE}, ("checkpoint",), also_read=("sensor",)),
-    "quantize": Case(
-        {"out": FILE, "board": FILE, "report": FOLDER, "json": FILE},
-        ("model", "images"),
-        "report.html",
-        also_read=("sensor", "target"),
-    ),
-    "gate": Case(
-        {"summary": FILE, "junit": FILE, "outputs": FILE, "json": FILE},
-        ("float_model", "int8_model", "config", "baseline", "images"),
-        also_read=("sensor", "target"),
-    ),
-    "check": Case({"picture": FILE, "json": FILE}, ("model",), suffix=".svg", also_read=("target",)),
-    "bench": Case({"json": FILE}, ("model", "image", "measured")),
-    "restore": Case({"out": FILE, "json": FILE}, ("image", "model")),
-    "evaluate": Case(
-        {"out": FOLDER, "json": FILE},
-        ("images", "pairs", "lpips"),
-        "report.html",
-        also_read=("sensor", "reference", "methods"),
-    ),
-    "stress": Case(
-        {"out": FILE, "json": FILE},
-        ("float_model", "int8_model", "images"),
-        more=("--bit-flips",),
-        also_read=("sensor", "target"),
-    ),
-    "tradeoff": Case(
-        {"out": FOLDER, "cache": FOLDER, "json": FILE},
-        ("images", "lpips", "calibration"),
-        "tradeoff.html",
-        also_read=("sensor", "reference", "networks"),
-    ),
-    "compare": Case({"json": FILE}, ("before", "after"), suffix=".json"),
+    name: Case(paths, INSIDE.get(name, ""), SUFFIXES.get(name, ".tif"), MORE.get(name, ()))
+    for name, paths in PATHS.items()
 }
 WRITERS = [(name, option) for name, case in CASES.items() for option in case.written]
 NEVER_WRITTEN_INTO = {("tradeoff", "cache")}
@@ -116,7 +95,8 @@ def arguments(name: str, values: dict[str, Path]) -> list[str]:
             positional += [str(value)] if value else []
         elif value is not None:
             options += [parameter.opts[0], str(value)]
-    return [name, *positional, *options, *case.more]
+    more = [word for option in values for word in BESIDE.get((name, option), ())]
+    return [name, *positional, *options, *case.more, *more]
 
 
 def given(name: str, folder: Path, **values: Path) -> list[str]:
@@ -300,6 +280,22 @@ def test_no_two_outputs_are_one(name: str, one: str, other: str, tmp_path: Path)
     around = tmp_path / "detour" / ".." / file.relative_to(tmp_path)
     refused(given(name, tmp_path, **{one: value, other: around}), tmp_path, *words)
     refused(given(name, tmp_path, **{one: value, other: file / f"below{CASES[name].suffix}"}), tmp_path, *words)
+
+
+@pytest.mark.parametrize(
+    ("name", "option"), [pair for pair in WRITERS if CASES[pair[0]].written[pair[1]] == FILE], ids=str
+)
+def test_no_output_is_shipped(name: str, option: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A network that a run reads by its name, or where it is given none."""
+    monkeypatch.setattr(files, "SHIPPED", tmp_path / "weights")
+    value = kept(tmp_path / "weights" / f"kept{CASES[name].suffix}")
+    refused(given(name, tmp_path, **{option: value}), tmp_path, str(value), "a file of this installation")
+
+
+def test_no_output_is_a_shipped_profile(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(files, "PROFILES", tmp_path)
+    profile = kept(tmp_path / "sensors" / "mine.toml")
+    refused(["gate", "--json", str(profile)], tmp_path, str(profile), "a file of this installation")
 
 
 def test_the_curves_of_bit_flips_are_an_output_too(tmp_path: Path) -> None:

@@ -2,6 +2,8 @@
 
 import base64
 import json
+from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 from xml.etree import ElementTree as ET
 
@@ -11,19 +13,26 @@ import pytest
 import torch
 from typer.testing import CliRunner
 
-from deploy.blame import kind_of_error
+from deploy.blame import kind_of_error, worst_row
 from deploy.cli import app
 from deploy.export import to_onnx
 from deploy.quant_report import ablations
-from deploy.report.histogram import MOST_BARS, bins, histogram_url
+from deploy.report.histogram import FONT_PX, MOST_BARS, bins, histogram_url
+from deploy.report.labels import text_width
 from deploy.restore import write_tiff
 from deploy.results import SCHEMA_PATH
 from model.convbeers import ConvBEERS, Variant, initialise
 from model.simulator.procedural import procedural_scene
+from profiles import load_sensor
+from profiles.sensor import reference_for
+from quant.calibration import draw_patches
 from quant.onnx_file import fixed_tile_px, load_onnx, metadata, save_onnx
 from quant.planes import MAX_DN
 from quant.quantise import ALL, Passes
 from quant.spread import Spread
+
+PHONE_PX = 358
+"""A window of 390 pixels less the page's margins."""
 
 
 def test_every_pass_is_left_out_once() -> None:
@@ -147,6 +156,40 @@ def test_the_histogram_is_a_picture_for_light_and_dark() -> None:
     assert root.tag.endswith("svg")
     assert picture.count("<rect") > 20
     assert "prefers-color-scheme: dark" in picture
+
+
+@pytest.mark.parametrize("farthest", [1, 40, 137, 4095])
+def test_labels_of_the_histogram_can_be_read_on_the_narrowest_page(farthest: int) -> None:
+    """At the size at which they are written: nothing is scaled down to fit, none is cut, none hides another."""
+    dn = np.array([0] * 3_000_000 + [-farthest, farthest])
+    url = histogram_url(spread(dn))
+    root = ET.fromstring(base64.b64decode(url.removeprefix("data:image/svg+xml;base64,")))  # noqa: S314
+    width = float(root.get("width") or 0)
+    assert width <= PHONE_PX
+    assert FONT_PX >= 12
+    across = list[tuple[float, float]]()
+    for text in (each for each in root.iter() if each.tag.endswith("text")):
+        wide, x, anchor = text_width(text.text or "", FONT_PX), float(text.get("x") or 0), text.get("text-anchor")
+        left = x - wide if anchor == "end" else x - wide / 2
+        assert left >= 0
+        assert left + wide <= width
+        if (text.text or "").lstrip("-").isdigit():
+            across.append((left, left + wide))
+    assert len(across) >= 3
+    assert all(one[1] < other[0] for one, other in pairwise(across))
+
+
+def test_what_the_profile_gave_is_no_measurement() -> None:
+    profile = load_sensor("pleiades-degraded")
+    sensor = replace(profile.nominal(), mtf_nyquist=0.05)
+    scene = procedural_scene(700, 700, np.random.default_rng(0))
+    patches = draw_patches([scene], profile, reference_for(profile), 1, 0)
+    row = worst_row(0, replace(patches, views=[replace(patches.views[0], degraded=sensor)]), spread(np.zeros(9)))
+    assert row.text["MTF at Nyquist, drawn from the profile"] == "5 %"
+    assert not any("MTF" in key for key in row.figures)
+    along = replace(sensor, mtf_nyquist_along=0.03)
+    row = worst_row(0, replace(patches, views=[replace(patches.views[0], degraded=along)]), spread(np.zeros(9)))
+    assert row.text["MTF at Nyquist, drawn from the profile"] == "5 % across the track, 3 % along it"
 
 
 def test_the_ratio_is_put_into_words() -> None:

@@ -1,3 +1,6 @@
+import re
+from dataclasses import replace
+
 import numpy as np
 
 from deploy.report.page import Picture, Report, Table, render
@@ -20,6 +23,13 @@ def test_every_number_shows_its_mode_and_source() -> None:
     page = render(report())
     for text in ("1.25 [1, 2]", "predicted", "a cost model", "41.5", "measured", "a note"):
         assert text in page
+
+
+def test_no_interval_breaks_within_its_brackets() -> None:
+    page = render(replace(report(), headline="It takes 7 [4, 11] s."))
+    assert "It takes 7 [4,\N{NO-BREAK SPACE}11] s." in page
+    assert re.search(r"td\.predicted.*white-space: nowrap", page)
+    assert 'class="predicted"' in page
 
 
 def test_the_page_asks_the_network_for_nothing() -> None:

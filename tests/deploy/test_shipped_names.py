@@ -8,7 +8,9 @@ import tifffile
 from typer.testing import CliRunner
 
 from deploy.cli import app
+from deploy.gate import files_or_shipped
 from deploy.shipped import VARIANT, default_int8, float_file, int8_file, shipped_pair
+from quant.onnx_file import load_onnx, metadata
 
 
 @pytest.mark.parametrize("name", ["convbeers-xs", "convbeers-s", "convbeers-s-nominal"])
@@ -40,9 +42,31 @@ def test_commands_take_the_name(tmp_path: Path) -> None:
         assert result.exit_code == 0, result.output
     first, second = (tifffile.imread(path) for path in tmp_path.glob("*.tif") if path.name != "in.tif")
     np.testing.assert_array_equal(first, second)
-    result = CliRunner().invoke(app, ["check", "convbeers-xs", "--tile", "64"])
-    assert result.exit_code == 0, result.output
     result = CliRunner().invoke(
         app, ["restore", str(tmp_path / "in.tif"), str(tmp_path / "x.tif"), "--model", "huge"]
     )
     assert result.exit_code == 2
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        ["check", "convbeers-xs", "--tile", "64"],
+        ["stress", "convbeers-xs", "convbeers-xs-int8", "--cases", "1 x 1", "--stages", "INT8"],
+    ],
+)
+def test_judges_take_the_name(command: list[str]) -> None:
+    result = CliRunner().invoke(app, command)
+    assert result.exit_code == 0, result.output
+    assert f"{command[0]} passed" in result.output
+
+
+def test_the_gate_takes_the_names() -> None:
+    for int8 in ("convbeers-xs", "convbeers-xs-int8"):
+        assert files_or_shipped(Path("convbeers-xs"), Path(int8), None) == shipped_pair("convbeers-xs")
+
+
+def test_export_takes_the_name(tmp_path: Path) -> None:
+    result = CliRunner().invoke(app, ["export", "--checkpoint", "convbeers-xs", "--out", str(tmp_path / "net.onnx")])
+    assert result.exit_code == 0, result.output
+    assert metadata(load_onnx(tmp_path / "net.onnx"))["variant"] == "convbeers-xs"

@@ -236,8 +236,8 @@ def test_values_beyond_full_scale_in_the_last_rows_leave_the_old_output(model: P
     pixels[-1, -1] = 60000
     refused(tmp_path, pixels, Options(model, tile_px=23), ImageError, "60000", "--full-scale")
     pixels = -noise(90, 40).astype(np.float32)
-    refused(tmp_path, pixels, Options(model, tile_px=23), ImageError, "-4")
-    refused(tmp_path, np.full((20, 20), np.inf, np.float32), Options(model), ImageError, "inf")
+    refused(tmp_path, pixels, Options(model, tile_px=23), ImageError, "-4", "add the offset")
+    refused(tmp_path, np.full((20, 20), np.inf, np.float32), Options(model), ImageError, "inf", "write NaN")
 
 
 def test_an_image_all_missing_is_refused(model: Path, tmp_path: Path) -> None:
@@ -263,7 +263,15 @@ def test_a_network_that_gives_nan_is_refused(model: Path, tmp_path: Path) -> Non
 
 
 def test_a_budget_that_does_not_suffice_is_refused_before_the_run(model: Path, tmp_path: Path) -> None:
-    refused(tmp_path, noise(40, 40), Options(model, memory_bytes=1000), MachineError, "--memory", "--tile")
+    refused(
+        tmp_path,
+        noise(40, 40),
+        Options(model, memory_bytes=1000),
+        MachineError,
+        "--memory",
+        "1.00 kB",
+        "give it more than",
+    )
     tifffile.imwrite(tmp_path / "in.tif", noise(1000, 3000), compression="zlib", rowsperstrip=1000)
     options = Options(model, tile_px=64, memory_bytes=int(psutil.Process().memory_info().rss + 8e6))
     with pytest.raises(MachineError, match="TILED=YES"):

@@ -1,4 +1,5 @@
 import io
+import re
 
 import pytest
 from hypothesis import example, given, settings
@@ -8,6 +9,7 @@ from rich.console import Console
 
 from deploy.results import DIGITS, Figure, Row, measured, number, predicted, published, unavailable
 from deploy.tables import LEGEND, PIPE_WIDTH, default_console, print_rows
+from profiles.errors import visible
 
 TALL = [
     Row("t", "one", {"latency": predicted(2, "s", (1, 3), "m"), "power": unavailable("W", "no [counter]")}),
@@ -27,7 +29,7 @@ def shown(rows: list[Row], width: int) -> str:
 @pytest.mark.parametrize("width", [40, 80, 200])
 def test_values_modes_and_reasons_are_shown(width: int) -> None:
     text = shown(TALL, width)
-    for word in ("a title", "42 d", "p", "no [counter]"):
+    for word in ("a title", "42", "published", "predicted", "no [counter]"):
         assert word in text
 
 
@@ -41,7 +43,7 @@ def test_every_figure_of_a_wide_row_is_read_at_80_columns() -> None:
     """More figures than rows: one line a figure, so that no column is squeezed."""
     lines = shown(WIDE, 80).splitlines()
     for k in range(12):
-        assert any(f"figure {k} " in line and f"{k + 0.5:g} m" in line for line in lines)
+        assert any(f"figure {k} " in line and "measured" in line and f" {k + 0.5:g} " in line for line in lines)
 
 
 def test_a_missing_figure_is_a_dash_with_its_reason_once() -> None:
@@ -49,6 +51,38 @@ def test_a_missing_figure_is_a_dash_with_its_reason_once() -> None:
     text = shown(rows, 80)
     assert text.count("no counter") == 1
     assert "0" not in text.replace(LEGEND, "")
+
+
+@pytest.mark.parametrize("word", ["\x1b[31mred", "\x9b31m", "\u202egnp.exe", "[red]red[/red]", "a[/b]", "\r"])
+def test_what_a_file_says_is_shown_and_not_obeyed(word: str) -> None:
+    """By a terminal of colours, which prints escapes of its own."""
+    figure = measured(1.5, "px", "here")
+    stream = io.StringIO()
+    rows = [Row("t", word, {"size": figure, word: unavailable(word, word)}, {word: word})] * 2
+    for shape in (rows, rows[:1]):
+        print_rows(word, shape, Console(file=stream, width=PIPE_WIDTH, force_terminal=True, color_system="standard"))
+    text = re.sub(r"\x1b\[(0|1|2|3|3[0-9]|1;3[0-9]|2;3[0-9])?m", "", stream.getvalue())
+    assert set("\x1b\x9b\u202e\r").isdisjoint(text)
+    assert text.count(visible(word)) >= 10
+
+
+def test_a_tag_is_a_word_and_no_unit() -> None:
+    """An m beside a number of metres or seconds was read as their unit."""
+    mixed = [
+        Row("t", "ours", {"time": measured(1.586, "s", "here")}),
+        Row("t", "board", {"time": predicted(2, "s", (1, 3), "model")}),
+    ]
+    for width in (40, 80):
+        text = shown(mixed, width)
+        assert all(word in text for word in ("1.586", "measured", "predicted", "(s)"))
+        assert " m " not in text
+        alike = shown([mixed[0]] * 2, width)
+        assert alike.count("measured") == 2, "in the heading, and in the legend"
+        one = next(line for line in shown(mixed[:1], width).splitlines() if "1.586" in line)
+        assert [cell.strip() for cell in one.split("│")[1:-1]] in (
+            ["time", "s", "measured", "1.586"],
+            ["ours", "1.586"],
+        )
 
 
 def test_a_table_of_words_needs_no_legend() -> None:

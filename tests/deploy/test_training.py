@@ -2,6 +2,7 @@
 
 import csv
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -9,12 +10,15 @@ import torch
 from PIL import Image
 from typer.testing import CliRunner
 
+from deploy import training
 from deploy.cli import app
 from deploy.training import Log
 from model.conditioning import fold
 from model.shipped import shipped_weights
 from model.simulator.procedural import procedural_scene
+from model.training.stored_pairs import StoredPairs
 from model.weights_file import load_network, load_told, read_tensors
+from profiles.toml import profile_path
 
 SIDE = 420
 
@@ -125,6 +129,40 @@ def test_wrong_options_get_one_sentence(options: list[str], words: str, tmp_path
     assert result.exit_code == 2
     assert words in " ".join(result.output.split())
     assert "Traceback" not in result.output
+
+
+def test_pairs_bring_their_sensor_and_its_full_scale(
+    images: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of 14 bits, and of another MTF along the track than across it."""
+    text = profile_path("sensors", "pleiades-degraded").read_text(encoding="utf-8")
+    own = tmp_path / "own.toml"
+    along = 'mtf_nyquist_along = { value = 0.05, status = "measured", source = "a test" }'
+    text = text.replace("bits = { value = 12", "bits = { value = 14").replace("[mtf]", f"[mtf]\n{along}")
+    own.write_text(text, encoding="utf-8")
+    scene = next(images.glob("*.png"))
+    simulated = CliRunner().invoke(
+        app, ["simulate", str(scene), "--sensor", str(own), "--out", str(tmp_path / "pairs"), "--workers", "1"]
+    )
+    assert simulated.exit_code == 0, simulated.output
+    options = ["--pairs", str(tmp_path / "pairs"), "--variant", "convbeers-xs", "--steps", "1", "--batch", "1"]
+    options += ["--patch", "17", "--out", str(tmp_path / "r")]
+    for contradiction in (["--sensor", "pleiades-degraded"], ["--reference", "dior-medium"]):
+        result = CliRunner().invoke(app, ["train", *options, *contradiction])
+        assert result.exit_code == 2
+        assert f"{contradiction[0]}: expected the sensor that made the pairs" in result.output
+        assert not list(tmp_path.glob("r/*"))
+    made = list[StoredPairs]()
+
+    def kept(*values: Any, **named: Any) -> StoredPairs:
+        made.append(StoredPairs(*values, **named))
+        return made[0]
+
+    monkeypatch.setattr(training, "StoredPairs", kept)
+    result = CliRunner().invoke(app, ["train", *options])
+    assert result.exit_code == 0, result.output
+    assert load_network(tmp_path / "r" / "convbeers-xs.safetensors")[1]["degraded"] == "own"
+    assert (made[0].max_dn, made[0].quarters) == (16383, False)
 
 
 def test_a_loss_of_nothing_but_lpips_needs_its_weights(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

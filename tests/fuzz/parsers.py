@@ -199,7 +199,7 @@ def read_results(path: Path) -> None:
     rows = change_rows(changes)
     by_row(rows, ["before", "after"])
     for change in changes:
-        cell(change.before)
+        cell(change.before, "")
 
 
 def cache_seeds(folder: Path) -> list[bytes]:

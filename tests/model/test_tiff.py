@@ -78,7 +78,7 @@ def test_a_jpeg_larger_than_its_place_is_refused(tmp_path: Path) -> None:
     assert jpeg_size_px(bytes(data)) == (16, 16)
     frame = data.find(b"\xff\xc0")
     data[frame + 5 : frame + 9] = struct.pack(">HH", 30_000, 20_000)
-    refused(tiff(tmp_path / "a.tif", bytes(data), compression=7), ImageError, "30000 x 20000")
+    refused(tiff(tmp_path / "a.tif", bytes(data), compression=7), ImageError, "20000 x 30000")
     garbage = bytes(data[:2]) + b"\x00\x01" + bytes(data[2:])  # which a decoder would skip
     refused(tiff(tmp_path / "b.tif", garbage, compression=7), ImageError, "damaged")
 

@@ -1,10 +1,21 @@
-"""Errors come back whole from worker processes, which hand them over pickled."""
+"""Errors come back whole from worker processes, which hand them over pickled; what they say can be read."""
 
 from multiprocessing.reduction import ForkingPickler
 
 import pytest
+from hypothesis import example, given
+from hypothesis import strategies as st
 
-from profiles.errors import BeersError, ImageError, MachineError, ModelError, OptionError, ProfileError
+from profiles.errors import (
+    BeersError,
+    ImageError,
+    MachineError,
+    ModelError,
+    OptionError,
+    ProfileError,
+    sizes,
+    visible,
+)
 
 
 @pytest.mark.parametrize("kind", [BeersError, ImageError, MachineError, ModelError, OptionError, ProfileError])
@@ -14,3 +25,25 @@ def test_an_error_survives_the_way_between_processes(kind: type[BeersError]) -> 
     assert type(come) is kind
     assert str(come) == str(sent) == "a.tif: expected rows, got none; give some."
     assert (come.where, come.expected, come.got, come.remedy) == ("a.tif", "rows", "none", "give some")
+
+
+@given(st.lists(st.integers(0, 10**13), min_size=1, max_size=3))
+@example([1, 2])
+@example([310_000_000, 310_000_001])
+@example([999_999, 1_000_000])
+def test_sizes_that_differ_look_different(counts_bytes: list[int]) -> None:
+    """No "expected 0.00 GB, got 0.00 GB"."""
+    texts = sizes(*counts_bytes)
+    scales = {"GB": 1e9, "MB": 1e6, "kB": 1e3, "bytes": 1}
+    assert len(set(texts)) == len(set(counts_bytes))
+    for text, count in zip(texts, counts_bytes, strict=True):
+        number, unit = text.split()
+        assert float(number) * scales[unit] == pytest.approx(count, rel=0.005)
+
+
+@given(st.text(max_size=40))
+def test_visible_text_keeps_its_lines_and_nothing_that_is_obeyed(text: str) -> None:
+    found = visible(text)
+    assert all(c.isprintable() or c in "\n\t" for c in found)
+    assert found.count("\n") == text.count("\n")
+    assert visible(found) == found

@@ -74,7 +74,7 @@ def test_a_constant_stays_what_it_is(ratio: int, level: float) -> None:
 
 def test_a_grid_that_does_not_divide_is_refused() -> None:
     radiance = scene(30, 31)
-    with pytest.raises(OptionError, match="30 x 31"):
+    with pytest.raises(OptionError, match="31 x 30"):
         sample(scene_spectrum(radiance), transfer_function(30, 31, 4, 0.1), 31, 4)
     assert crop_divisible(radiance, 4).shape == (28, 28)
 

@@ -142,6 +142,35 @@ def test_stored_pairs_are_cut_alike_and_the_same_from_anywhere(tmp_path: Path) -
     assert not torch.equal(batches[0][0], degraded)
 
 
+@pytest.mark.parametrize("quarters", [True, False])
+def test_stored_pairs_of_two_different_axes_keep_them(quarters: bool, tmp_path: Path) -> None:
+    """Rows of one brightness each stay rows, unless a patch may be turned by a quarter."""
+    rows = np.broadcast_to(np.arange(41, dtype=np.uint16)[:, None] * 90, (41, 53))
+    for role in ("degraded", "reference"):
+        write_tiff(tmp_path / role / "p.tif", np.ascontiguousarray(rows))
+    pairs = StoredPairs(pair_files(tmp_path), 24, 4095, batch=32, seed=0, quarters=quarters)
+    patches, _ = next(pairs.batches())
+    kept = [bool((patch == patch[..., :1]).all()) for patch in patches]
+    assert any(kept)
+    assert all(kept) is not quarters
+
+
+@pytest.mark.parametrize(
+    ("pixels", "words"),
+    [
+        (np.full((41, 53), 5000, np.uint16), "0 to 4095, got values from 5000"),
+        (np.full((41, 53), 200, np.uint8), "8-bit pixels"),
+        (np.full((41, 53), 0.4, np.float32), "floats of at most 0.4"),
+        (np.full((41, 53), -9, np.float32), "add the offset"),
+    ],
+)
+def test_stored_pairs_of_another_scale_are_refused(pixels: np.ndarray, words: str, tmp_path: Path) -> None:
+    for role in ("degraded", "reference"):
+        write_tiff(tmp_path / role / "p.tif", pixels)
+    with pytest.raises(ImageError, match=words):
+        next(StoredPairs(pair_files(tmp_path), 24, 4095, batch=1, seed=0).batches())
+
+
 def test_stored_pairs_too_small_or_incomplete_are_refused(tmp_path: Path) -> None:
     pairs = stored(tmp_path)
     pairs.patch_px = 42

@@ -71,7 +71,7 @@ NETWORKS = {
     "yolo v2": Entry("darknet", yolo_v2, "scores"),
     "yolo v3": Entry("darknet", yolo_v3, "scores"),
     "yolo v3 coco": Entry("darknet", lambda: yolo_v3(classes=80), "scores"),
-    "yolo v3 288 x 512": Entry("darknet", lambda: yolo_v3(288, 512, 10), "scores"),
+    "yolo v3 512 x 288": Entry("darknet", lambda: yolo_v3(288, 512, 10), "scores"),
     "tiny yolo v3": Entry("darknet", tiny_yolo_v3, "scores"),
     "yolo v5 n": Entry("csp", lambda: yolo_v5(0.25, 0.33), "scores"),
     "yolo v5 l": Entry("csp", lambda: yolo_v5(1.0, 1.0), "scores"),

@@ -261,7 +261,7 @@ def test_findings_name_the_numbers_and_a_remedy(tmp_path: Path) -> None:
     sketch = Sketch(8)
     path = sketch.save(tmp_path / "k.onnx", sketch.conv("image", (8, 8, 17, 1)))
     (broken,) = place(read_network(path, TILE_PX), DPU).nodes[0].broken
-    assert broken.finding.reason == "kernel (17 x 1) is not in the DPU's range 1 to 16"
+    assert broken.finding.reason == "kernel (1 x 17) is not in the DPU's range 1 to 16"
     assert "at most 16" in broken.finding.remedy
 
 

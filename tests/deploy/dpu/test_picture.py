@@ -1,3 +1,5 @@
+import re
+from itertools import pairwise
 from pathlib import Path
 from xml.etree import ElementTree as ET
 
@@ -7,6 +9,7 @@ from deploy.dpu.board import load_dpu
 from deploy.dpu.picture import FILLS, draw, require_picture, write_picture
 from deploy.dpu.placement import Placement, place
 from deploy.dpu.reading import read_network
+from deploy.report.labels import text_width
 from profiles.errors import OptionError
 from tests.deploy.dpu.graphs import Sketch, float_convbeers
 
@@ -29,8 +32,31 @@ def test_every_node_is_drawn_in_its_devices_colour_and_says_which(tmp_path: Path
     assert labels == devices
     assert [box.get("fill") for box in boxes] == [FILLS[device] for device in devices]
     words = [t.text or "" for t in root.iter(f"{SVG}text")]
-    assert any("Sigmoid always runs on the CPU" in word for word in words)
+    assert "Sigmoid always runs on the CPU" in " ".join(words)
     assert words[0] == "a < b & c"
+
+
+@pytest.mark.parametrize("blocks", [1, 9])
+def test_every_word_is_seen_on_a_phone(blocks: int, tmp_path: Path) -> None:
+    """At its own size: a wider picture is cut off at 390 pixels, or its words scaled down."""
+    sketch = Sketch(8)
+    conv = sketch.node("Sigmoid", sketch.conv("image", (8, 8, 17, 33)))
+    broken = placed(sketch.save(tmp_path / "s.onnx", sketch.conv(conv)))
+    deep = placed(float_convbeers(tmp_path / "f.onnx", blocks, 8))
+    for placement in (broken, deep):
+        title = "a-network-with-quite-a-long-name.onnx on vck190 C32B3, tile 640"
+        root = ET.fromstring(draw(placement, title))  # noqa: S314
+        assert float(root.get("width") or 0) <= 390
+        texts = list(root.iter(f"{SVG}text"))
+        for text in texts:
+            assert float(text.get("x") or 0) + text_width(text.text or "", 13) <= 390
+        rows = [float(text.get("y") or 0) for text in texts if text.get("class") == "beside"]
+        assert all(other - one >= 13 for one, other in pairwise(rows)), "lines below each other"
+        assert float(root.get("height") or 0) > max(rows)
+        for path in root.iter(f"{SVG}path"):
+            assert all(float(number) >= 0 for number in re.findall(r"-?[0-9.]+", path.get("d") or ""))
+    for node in broken.nodes:
+        assert node.op.name in ET.tostring(ET.fromstring(draw(broken, "net")), encoding="unicode")  # noqa: S314
 
 
 def test_edges_join_writers_to_readers(tmp_path: Path) -> None:

@@ -1,0 +1,27 @@
+"""Options that were given where they would do nothing: better said than ignored."""
+
+from collections.abc import Iterable
+
+import typer
+
+
+def refuse(context: typer.Context, names: Iterable[str], *, expected: str, got: str, remedy: str) -> None:
+    """Refuse the first of these parameters to which the command line gives a value; 0 asks for nothing.
+
+    Args:
+        context: of the command that runs.
+        names: of its parameters, as Python spells them.
+        expected: what must stand beside the option, or must not.
+        got: what stands there.
+        remedy: what the user can do.
+
+    Raises:
+        OptionError: one was given.
+    """
+    from profiles.errors import OptionError
+
+    options = {parameter.name: parameter.opts[0] for parameter in context.command.params}
+    for name in names:
+        source = context.get_parameter_source(name)
+        if source is not None and source.name == "COMMANDLINE" and context.params[name]:
+            raise OptionError(options[name], expected=expected, got=got, remedy=remedy)

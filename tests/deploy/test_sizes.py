@@ -1,0 +1,78 @@
+"""Sizes are width x height wherever one is printed: here of 61 columns and 37 rows."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tifffile
+import torch
+from PIL import Image
+from typer.testing import CliRunner
+
+from deploy.cli import app
+from deploy.export import to_onnx
+from deploy.restore import check_fixed_tile
+from deploy.shipped import default_float_weights
+from model.metrics.edges import find_edge
+from model.metrics.refusal import Refusal
+from model.metrics.sharpness import edge_mtf
+from model.simulator.acquire import crop_margin
+from model.simulator.sampling import check_divisible
+from model.training.stored_pairs import StoredPairs, pair_files
+from model.weights_file import load_network
+from profiles.errors import BeersError
+
+ROWS, COLUMNS = 37, 61
+IMAGE = np.random.default_rng(0).integers(200, 1800, (ROWS, COLUMNS)).astype(np.uint16)
+
+
+def plan_of_restore(folder: Path) -> str:
+    tifffile.imwrite(folder / "raw.tif", IMAGE)
+    command = ["restore", str(folder / "raw.tif"), str(folder / "out.tif"), "--model", "convbeers-xs"]
+    return CliRunner().invoke(app, command).output
+
+
+def fixed_tile(_: Path) -> str:
+    model = to_onnx(load_network(default_float_weights())[0], {}, 64)
+    return said(lambda: check_fixed_tile(model, 64, IMAGE.shape))
+
+
+def stored_pairs(folder: Path) -> str:
+    for role in ("degraded", "reference"):
+        (folder / role).mkdir()
+        Image.fromarray(IMAGE).save(folder / role / "a.png")
+    return said(lambda: next(StoredPairs(pair_files(folder), 40, 4095, 1, 0).batches()))
+
+
+def said(work: Callable[[], object]) -> str:
+    with pytest.raises(BeersError) as caught:
+        work()
+    return str(caught.value)
+
+
+def refusal(found: object) -> str:
+    assert isinstance(found, Refusal)
+    return found.reason
+
+
+SENTENCES: list[Callable[[Path], str]] = [
+    plan_of_restore,
+    fixed_tile,
+    stored_pairs,
+    lambda _: said(lambda: crop_margin(torch.zeros(ROWS, COLUMNS), 30)),
+    lambda _: said(lambda: check_divisible(ROWS, COLUMNS, 2)),
+]
+
+
+@pytest.mark.parametrize("sentence", SENTENCES)
+def test_a_sentence_names_the_width_first(sentence: Callable[[Path], str], tmp_path: Path) -> None:
+    text = sentence(tmp_path)
+    assert f"{COLUMNS} x {ROWS}" in text
+    assert f"{ROWS} x {COLUMNS}" not in text
+
+
+def test_a_refused_edge_names_the_width_first() -> None:
+    small = np.zeros((10, 12), np.float32)
+    for found in (find_edge(small), edge_mtf(small, None)):
+        assert "12 x 10 pixels" in refusal(found)
