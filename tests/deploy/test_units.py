@@ -62,11 +62,12 @@ def test_scaling_the_gain_and_the_bits_changes_no_psnr_and_no_ranking(
 def rescaled(profile: SensorProfile, bits: int, dimmer: float, offset_dn: float) -> SensorProfile:
     """Full scale, gain and offset grow alike with the bits; scenes are so many times dimmer, and the gain higher."""
     times = (2**bits - 1) / 4095
-    points = {
-        key: Constant(getattr(profile, key).low / dimmer, "stated", "a test") for key in ("radiance_0", "radiance_1")
-    }
+    darker, brighter = (
+        Constant(point.low / dimmer, "stated", "a test") for point in (profile.radiance_0, profile.radiance_1)
+    )
     gain = profile.gain_dn_per_radiance.low * times * dimmer
-    return replace(with_units(profile, gain, bits, offset_dn * times), **points)
+    dimmed = replace(profile, radiance_0=darker, radiance_1=brighter)
+    return with_units(dimmed, gain, bits, offset_dn * times)
 
 
 @cache
