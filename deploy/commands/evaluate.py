@@ -45,6 +45,7 @@ def evaluate(
     """
     from deploy.evaluation.methods import method_named
     from deploy.evaluation.page import evaluation_report, pictures
+    from deploy.evaluation.pairs import oversampling_note
     from deploy.evaluation.perceptual import perceptual_distances
     from deploy.evaluation.recipe import profiles_for, read_pairs_recipe
     from deploy.evaluation.run import evaluate_methods, input_files, load_pairs, sweep_tables
@@ -77,11 +78,14 @@ def evaluate(
     sites = len({pair.site for pair in found})
     if sites < LEAST_SITES:
         typer.echo(f"no interval over sites is shown: of {sites}, fewer than {LEAST_SITES}, none could be trusted")
+    sampled = oversampling_note(found, eyes[0])
+    if sampled:
+        typer.echo(sampled)
     if small:
         typer.echo(f"left out, too small: {', '.join(small)}")
     if out is not None:
         strips = pictures(found, chosen, out)
-        write_report(evaluation_report(title, result.mean, result.sites, swept, strips), out / "report.html")
+        write_report(evaluation_report(title, result.mean, result.sites, swept, strips, sampled), out / "report.html")
         typer.echo(f"wrote {out / 'report.html'}")
     arguments: dict[str, object] = {
         "images": images,
