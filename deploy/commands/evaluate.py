@@ -70,7 +70,7 @@ def evaluate(
     instruments = Instruments(perceptual_distances(lpips), eyes[0].nominal().max_dn)
     found, small = load_pairs(images, pairs, *eyes, seed, recipe)
     result = evaluate_methods(chosen, found, instruments, eyes[0].nominal(), seed)
-    title = f"{eyes[0].name} -> {eyes[1].name}, {len(found)} images"
+    title = f"{eyes[0].name} -> {eyes[1].name}, {len(found)} image{'' if len(found) == 1 else 's'}"
     print_rows(title, result.mean)
     swept = sweep_tables(chosen, images, *eyes, seed) if sweep else ()
     for table, rows in by_table((*result.sites, *swept)).items():
