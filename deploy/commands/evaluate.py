@@ -41,7 +41,7 @@ def evaluate(
     """Compare restorations with the reference, on average and by site; the degraded input is always a row.
 
     PSNR leaves out clipped pixels. MTF and SNR are measured on restored slanted edges and flat fields. Traditional
-    methods are told both sensors' nominal figures; networks are told nothing.
+    methods are told both sensors' nominal figures; networks are told nothing, but may have been made for the sensor.
     """
     from deploy.evaluation.methods import method_named
     from deploy.evaluation.page import evaluation_report, pictures
@@ -66,7 +66,7 @@ def evaluate(
     require_writable(out / "report.html" if out else None, json, inputs=read, folders=(out,))
     recipe = read_pairs_recipe(pairs) if pairs is not None else None
     eyes = profiles_for(sensor, reference, recipe, typer.echo)
-    chosen = [method_named(name, eyes[0].nominal(), eyes[1].nominal()) for name in names]
+    chosen = [method_named(name, eyes[0].nominal(), eyes[1].nominal(), eyes[0].name) for name in names]
     instruments = Instruments(perceptual_distances(lpips), eyes[0].nominal().max_dn)
     found, small = load_pairs(images, pairs, *eyes, seed, recipe)
     result = evaluate_methods(chosen, found, instruments, eyes[0].nominal(), seed)

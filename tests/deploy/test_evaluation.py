@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 
 from deploy.cli import app
 from deploy.evaluation import targets as targets_module
-from deploy.evaluation.methods import Method, method_named
+from deploy.evaluation.methods import TRAINED, Method, method_named
 from deploy.evaluation.page import chosen_pairs, strip_of
 from deploy.evaluation.pairs import NamedPair, oversampling_note, oversamplings_of, read_pairs, simulate_pairs
 from deploy.evaluation.paper import paper_rows
@@ -121,6 +121,20 @@ def test_of_pairs_from_a_folder_no_oversampling_is_known() -> None:
 def test_an_unknown_method_is_refused(name: str) -> None:
     with pytest.raises(OptionError, match=r"--methods|variant"):
         method_named(name, *SENSORS)
+
+
+def test_what_a_network_was_made_for_is_no_secret() -> None:
+    """By the sensor that its file names; a name that is not asked about says nothing."""
+    told = {
+        (name, sensor): method_named(name, *SENSORS, sensor).told
+        for name in ("convbeers-s-nominal", "convbeers-s-nominal-int8", "convbeers-xs", "traditional", "degraded")
+        for sensor in ("pleiades-degraded", "dior-high", "")
+    }
+    made = {name for (name, sensor), words in told.items() if words == TRAINED and sensor == "pleiades-degraded"}
+    assert made == {"convbeers-s-nominal", "convbeers-s-nominal-int8"}
+    assert TRAINED not in [words for (_, sensor), words in told.items() if sensor != "pleiades-degraded"]
+    assert told["convbeers-xs", "pleiades-degraded"] == "nothing"
+    assert told["traditional", "dior-high"] == "both sensors"
 
 
 def test_a_peer_without_its_library_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
