@@ -119,7 +119,7 @@ def _check_finite(tensor: TensorProto, where: str) -> None:
     """Of a plain number infinity may be meant, as a bound of Clip; of weights nothing that is not finite."""
     if tensor.data_type not in FLOATS:
         return
-    values = numpy_helper.to_array(tensor).astype(np.float64, copy=False)
+    values = numpy_helper.to_array(tensor)
     lost = np.isnan(values) if not tensor.dims else ~np.isfinite(values)
     if lost.any():
         got = f"{np.count_nonzero(lost)} NaN or infinite in {tensor.name or 'a constant'}"
