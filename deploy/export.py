@@ -10,6 +10,7 @@ from onnx import helper, numpy_helper
 from deploy import __version__
 from model.conditioning import fold, tell
 from model.convbeers import ConvBEERS
+from model.shipped import told_names
 from model.weights_file import is_told, load_network, load_told
 from profiles.errors import ModelError
 from profiles.sensor import load_sensor
@@ -37,7 +38,7 @@ def network_for(path: Path, sensor: str | None) -> tuple[ConvBEERS, dict[str, ob
     if sensor is None:
         return (*load_network(path), ())
     if not is_told(path):
-        remedy = "leave --sensor out, or give weights of 'train --told'"
+        remedy = f"leave --sensor out, or give weights of 'train --told' or one of {', '.join(told_names())}"
         expected = "weights that can be told their sensor"
         raise ModelError(str(path), expected=expected, got="those of a plain network", remedy=remedy)
     told, recipe = load_told(path)

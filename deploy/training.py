@@ -34,7 +34,7 @@ from model.training.stored_pairs import StoredPairs, pair_files
 from model.training.trainer import Progress, Schedule, Source, Trainer, new_network
 from model.training.validation import Validation, split_by_site
 from model.training.workers import Worker
-from model.weights_file import is_told, load_network, load_told, variant_named
+from model.weights_file import N, is_told, load_network, load_told, variant_named
 from model.widen import widen, widen_told
 from profiles.errors import OptionError
 
@@ -106,7 +106,7 @@ def train(run: Run, resume: bool, worker: Worker, say: Callable[[str], None]) ->
         worker,
         run.device,
         start_weights(run),
-        load_network(run.teacher)[0] if run.teacher else None,
+        _sound(load_network, run.teacher) if run.teacher else None,
         run.precision,
         run.patches.told is not None,
     )
@@ -134,12 +134,19 @@ def start_weights(run: Run) -> Mapping[str, Tensor] | None:
         return None
     variant, generator = variant_named(run.variant), torch.Generator().manual_seed(run.recipe.seed)
     if run.patches.told is None:
-        return widen(load_network(run.start)[0], variant, generator).state_dict()
+        return widen(_sound(load_network, run.start), variant, generator).state_dict()
     if is_told(run.start):
-        return widen_told(load_told(run.start)[0], variant, generator).state_dict()
+        return widen_told(_sound(load_told, run.start), variant, generator).state_dict()
     network = new_network(variant, generator, told=True)
-    base = widen(load_network(run.start)[0], variant, generator).state_dict()
+    base = widen(_sound(load_network, run.start), variant, generator).state_dict()
     return network.state_dict() | {f"base.{name}": weight for name, weight in base.items()}
+
+
+def _sound(load: Callable[[Path], tuple[N, object]], path: Path) -> N:
+    """A network from its file, refused where it gives NaN: a run would skip every step that it has a part in."""
+    network = load(path)[0]
+    require_finite_output(network, str(path), "give another network")
+    return network
 
 
 def loss_of(run: Run) -> tuple[RestorationLoss, str]:

@@ -13,7 +13,7 @@ from deploy.dpu.reading import network_of
 from deploy.energy import timed
 from deploy.host_state import memory_rise
 from deploy.results import Figure, Row, measured, unavailable
-from quant.session import open_session
+from quant.session import open_session, require_finite
 
 
 @dataclass
@@ -28,13 +28,17 @@ class Timed:
 
 
 def take_turns(runs: Sequence[Timed], tile_px: int, threads: int, min_time_s: float, min_runs: int) -> None:
-    """Run each for one tile in turn until all have run for `min_time_s` and `min_runs` times; fills in `runs`."""
+    """Run each for one tile in turn until all have run for `min_time_s` and `min_runs` times; fills in `runs`.
+
+    Raises:
+        ModelError: a network that gives NaN or infinity.
+    """
     calls = []
     for run in runs:
         feed = tile_feed(run.model, tile_px, run.name)
         with memory_rise() as memory:
             session = open_session(run.model, threads)
-            session.run(None, feed)  # warm-up, not counted
+            require_finite(session.run(None, feed), run.name)  # warm-up, not counted
         run.rise_bytes = memory.rise_bytes
         calls.append(partial(session.run, None, feed))
     while min(sum(run.times_s) for run in runs) < min_time_s or len(runs[0].times_s) < min_runs:

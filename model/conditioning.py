@@ -114,7 +114,7 @@ class SensorFamily:
         dark = sigma * _log_uniform(generator, 0.5, 1.0)
         alpha = max(sigma**2 - dark**2, 0.0) / (full_scale * 3 / 16)
         beta = max(dark**2 - alpha * full_scale / 16, 0.0)
-        return Sensor(mtf, alpha, beta, self.like.gain_dn_per_radiance, self.like.bits, {}, along)
+        return Sensor(mtf, alpha, beta, self.like.gain_dn_per_radiance, self.like.bits, {}, along, full_scale / 4)
 
 
 def _log_uniform(generator: np.random.Generator, low: float, high: float) -> float:

@@ -46,6 +46,7 @@ class Sensor:
         mtf_nyquist_along: contrast kept along the track; None where it is that across. A pushbroom's line of
             detectors lies across the track: image rows are lines in time, so "across" is the horizontal axis (along
             a row, fx) and "along" the vertical one (down a column, fy).
+        radiance_1: of what is bright in its scenes, in W/m2/sr/um: the brighter point at which its SNR is stated.
     """
 
     mtf_nyquist: float
@@ -55,6 +56,7 @@ class Sensor:
     bits: int
     effects: Mapping[str, Effect] = field(default_factory=dict)
     mtf_nyquist_along: float | None = None
+    radiance_1: float = 100.0
 
     @property
     def mtf_axes(self) -> tuple[float, float]:
@@ -149,7 +151,8 @@ class SensorProfile:
     def _sensor(
         self, mtf: float, alpha: float, beta: float, effects: Mapping[str, Effect], mtf_along: float | None
     ) -> Sensor:
-        return Sensor(mtf, alpha, beta, self.gain_dn_per_radiance.low, int(self.bits.low), effects, mtf_along)
+        gain, bits = self.gain_dn_per_radiance.low, int(self.bits.low)
+        return Sensor(mtf, alpha, beta, gain, bits, effects, mtf_along, self.radiance_1.low)
 
     def _impossible_snr(self) -> ProfileError:
         low, high = snr_0_bounds(self.radiance_0.low, self.radiance_1.low, self.snr_1.high)

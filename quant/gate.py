@@ -43,7 +43,7 @@ def compare(
     """Run both networks on (degraded, reference) pairs of (1, 1, H, W) in [0, 1]; outputs clipped as a file would."""
     differences, errors = [], []
     for degraded, reference in pairs:
-        in_float, in_int8 = (np.clip(run(s, degraded), 0, 1) for s in (float_session, int8_session))
+        in_float, in_int8 = (_as_in_a_file(run(s, degraded)) for s in (float_session, int8_session))
         differences.append((in_int8 - in_float).ravel())
         errors.append([psnr_db(image, reference, 1.0) for image in (degraded, in_float, in_int8)])
     difference = np.concatenate(differences).astype(np.float64)
@@ -59,3 +59,8 @@ def compare(
         psnr_int8_db=float(int8_db),
         patches=len(errors),
     )
+
+
+def _as_in_a_file(restored: np.ndarray) -> np.ndarray:
+    """Clipped to [0, 1]; NaN where infinite, which no clipping makes a pixel."""
+    return np.where(np.isinf(restored), np.nan, np.clip(restored, 0, 1))

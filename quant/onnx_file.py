@@ -29,8 +29,12 @@ def load_onnx(path: Path, to_run: bool = True) -> onnx.ModelProto:
         to_run: whether a runtime may get it; False where its nodes are only looked at, whosever they are.
 
     Raises:
-        ModelError: missing, empty, not ONNX, or not to be trusted (see `quant.untrusted` and `quant.runnable`).
+        ModelError: missing, empty, not ONNX, of weights that are not finite, or not to be trusted (see
+            `quant.untrusted` and `quant.runnable`).
     """
+    if path.suffix == ".safetensors":
+        remedy = "export it first: beers-deploy export --checkpoint FILE --out FILE.onnx"
+        raise ModelError(str(path), expected="an ONNX file", got="safetensors weights", remedy=remedy)
     try:
         content = read_whole(path, FILE_BYTES)
     except (OSError, ValueError) as error:

@@ -8,6 +8,7 @@ import onnxruntime as ort
 
 from quant.graph import Conv, Graph
 from quant.planes import PLANES, POSITION, split
+from quant.session import require_finite
 
 PIECE_PX = 128
 """Side of the largest piece, halo not counted."""
@@ -25,12 +26,17 @@ def tensor_values(
 
     Each piece is computed with a halo of the pixels that its values depend on, which is then cut off: together the
     pieces hold what the whole image would have given, its zero-padded borders included.
+
+    Raises:
+        ModelError: NaN or infinity inside the network.
     """
     for (top, bottom), (left, right) in _places(image):
         above, before = min(top, halo_px), min(left, halo_px)
         with_halo = image[..., top - above : bottom + halo_px, left - before : right + halo_px]
         inner = ..., slice(above, above + bottom - top), slice(before, before + right - left)
-        yield [result[inner] for result in session.run(names, {PLANES: planes_of(with_halo)})]
+        values = [result[inner] for result in session.run(names, {PLANES: planes_of(with_halo)})]
+        require_finite(values, "float network")
+        yield values
 
 
 def planes_of(image: np.ndarray) -> np.ndarray:

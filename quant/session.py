@@ -1,5 +1,6 @@
 """An onnxruntime session, set up once for the whole project."""
 
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
@@ -85,6 +86,17 @@ def tensors_of(session: ort.InferenceSession, names: list[str] | None, image: np
         return [np.asarray(value) for value in session.run(names, {session.get_inputs()[0].name: image})]
     except Exception as error:  # as above
         raise _unfit(" ".join(str(error).split())[:160]) from error
+
+
+def require_finite(values: Iterable[np.ndarray], where: str) -> None:
+    """Refuse what a network computed of an image in [0, 1], where its weights are finite and that is not.
+
+    Raises:
+        ModelError: NaN or infinity among the values.
+    """
+    if not all(np.isfinite((value.min(), value.max())).all() for value in values):
+        remedy = "its sums overflow: train it again with a lower learning rate, or scale its weights"
+        raise ModelError(where, expected="finite values for an image", got="NaN or infinity", remedy=remedy)
 
 
 def _unfit(got: str) -> ModelError:

@@ -8,8 +8,9 @@ import math
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 
+import numpy as np
 import onnx
-from onnx import TensorProto
+from onnx import TensorProto, numpy_helper
 
 from profiles.errors import ModelError
 
@@ -27,6 +28,7 @@ FIELDS: dict[int, tuple[int, str]] = {
     TensorProto.UINT64: (8, "uint64_data"),
 }
 """Bytes of a value, and where a tensor keeps values that are not raw bytes."""
+FLOATS = (TensorProto.FLOAT, TensorProto.DOUBLE, TensorProto.FLOAT16, TensorProto.BFLOAT16)
 FIELDS |= dict.fromkeys((TensorProto.BOOL, TensorProto.INT8, TensorProto.UINT8), (1, "int32_data"))
 SHORT = (TensorProto.FLOAT16, TensorProto.BFLOAT16, TensorProto.INT16, TensorProto.UINT16)
 FIELDS |= dict.fromkeys(SHORT, (2, "int32_data"))
@@ -36,7 +38,8 @@ def check_content(model: onnx.ModelProto, where: str) -> None:
     """Refuse a model that does not hold what it states.
 
     Raises:
-        ModelError: no input or output; sizes that cannot be; values elsewhere, missing or of another type.
+        ModelError: no input or output; sizes that cannot be; values elsewhere, missing, of another type or not
+            finite.
     """
     graph = model.graph
     held = {tensor.name for tensor in graph.initializer}
@@ -109,6 +112,18 @@ def _check_tensor(tensor: TensorProto, where: str) -> None:
     if stated != present:
         got = f"{tensor.name!r} of {times(tensor.dims)} values that holds {present:g}"
         raise refused(where, "weights as many as it states", got, "copy or export it again")
+    _check_finite(tensor, where)
+
+
+def _check_finite(tensor: TensorProto, where: str) -> None:
+    """Of a plain number infinity may be meant, as a bound of Clip; of weights nothing that is not finite."""
+    if tensor.data_type not in FLOATS:
+        return
+    values = numpy_helper.to_array(tensor)
+    lost = np.isnan(values) if not tensor.dims else ~np.isfinite(values)
+    if lost.any():
+        got = f"{np.count_nonzero(lost)} NaN or infinite in {tensor.name or 'a constant'}"
+        raise refused(where, "finite weights", got, "train or export it again")
 
 
 def _check_place_and_type(tensor: TensorProto, where: str) -> None:

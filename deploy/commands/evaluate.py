@@ -43,10 +43,11 @@ def evaluate(
     """Compare restorations with the reference, on average and by site; the degraded input is always a row.
 
     PSNR leaves out clipped pixels. MTF and SNR are measured on restored slanted edges and flat fields. Traditional
-    methods are told both sensors' nominal figures; networks are told nothing.
+    methods are told both sensors' nominal figures; networks are told nothing, but may have been made for the sensor.
     """
     from deploy.evaluation.methods import method_named
     from deploy.evaluation.page import evaluation_report, pictures
+    from deploy.evaluation.pairs import oversampling_note
     from deploy.evaluation.perceptual import perceptual_distances
     from deploy.evaluation.recipe import profiles_for, read_pairs_recipe
     from deploy.evaluation.run import evaluate_methods, input_files, load_pairs, sweep_tables
@@ -67,11 +68,11 @@ def evaluate(
     require_writable(out / "report.html" if out else None, json, inputs=read, folders=(out,))
     recipe = read_pairs_recipe(pairs) if pairs is not None else None
     eyes = profiles_for(sensor, reference, recipe, say)
-    chosen = [method_named(name, eyes[0].nominal(), eyes[1].nominal()) for name in names]
+    chosen = [method_named(name, eyes[0].nominal(), eyes[1].nominal(), eyes[0].name) for name in names]
     instruments = Instruments(perceptual_distances(lpips), eyes[0].nominal().max_dn)
     found, small = load_pairs(images, pairs, *eyes, seed, recipe)
     result = evaluate_methods(chosen, found, instruments, eyes[0].nominal(), seed)
-    title = f"{eyes[0].name} -> {eyes[1].name}, {len(found)} images"
+    title = f"{eyes[0].name} -> {eyes[1].name}, {len(found)} image{'' if len(found) == 1 else 's'}"
     print_rows(title, result.mean)
     swept = sweep_tables(chosen, images, *eyes, seed) if sweep else ()
     for table, rows in by_table((*result.sites, *swept)).items():
@@ -79,11 +80,14 @@ def evaluate(
     sites = len({pair.site for pair in found})
     if sites < LEAST_SITES:
         say(f"no interval over sites is shown: of {sites}, fewer than {LEAST_SITES}, none could be trusted")
+    sampled = oversampling_note(found, eyes[0])
+    if sampled:
+        say(sampled)
     if small:
         say(f"left out, too small: {', '.join(small)}")
     if out is not None:
         strips = pictures(found, chosen, out)
-        write_report(evaluation_report(title, result.mean, result.sites, swept, strips), out / "report.html")
+        write_report(evaluation_report(title, result.mean, result.sites, swept, strips, sampled), out / "report.html")
         say(f"wrote {out / 'report.html'}")
     arguments: dict[str, object] = {
         "images": images,

@@ -81,7 +81,8 @@ def restore(
         _by_the_chain(image, out, sensor, full_scale, compression, budget_bytes, json)
         return
     if sensor is not None:
-        remedy = "add --method traditional, or fold a network for the sensor with 'beers-deploy export --sensor'"
+        made = "'beers-deploy export --variant convbeers-s-told --sensor ... --out mine.onnx'"
+        remedy = f"add --method traditional, or make a network for it with {made} and give that as --model"
         raise OptionError("--sensor", expected="--method traditional beside it", got="a network", remedy=remedy)
     path = int8_file(model)
     require_writable(out, json, inputs=(image, path))

@@ -123,7 +123,8 @@ def simulate(
     with steps("simulating", len(plan_windows(recipe))) as bar:
         summary = write_dataset(recipe, out, workers or os.cpu_count() or 1, resume, bar.advance, scheduler)
     rejected = f"; {summary['rejected_share']:.1%} of the drawn SNR pairs were impossible and drawn again"
-    say(f"wrote {summary['patches']:.0f} pairs to {out}" + (rejected if summary["rejected_share"] else ""))
+    pairs = f"{summary['patches']:.0f} pair{'' if summary['patches'] == 1 else 's'}"
+    say(f"wrote {pairs} to {out}" + (rejected if summary["rejected_share"] else ""))
 
 
 def _preset(name: str | None) -> Preset:

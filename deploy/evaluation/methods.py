@@ -6,6 +6,7 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
+import onnx
 import onnxruntime as ort
 import torch
 
@@ -17,7 +18,7 @@ from model.traditional.pipeline import Chain, restore_traditional
 from model.traditional.settings import QUALITIES
 from profiles.errors import OptionError
 from profiles.sensor import Sensor
-from quant.onnx_file import load_onnx
+from quant.onnx_file import load_onnx, metadata
 from quant.radius import receptive_radius_px
 from quant.session import open_session
 
@@ -31,6 +32,10 @@ EXPECTED = (
 )
 
 
+KNOWS, BLIND, TRAINED = "both sensors", "nothing", "trained for the sensor"
+"""What a method is told: the last of a network whose file names the sensor."""
+
+
 @dataclass(frozen=True)
 class Method:
     """A restoration with the name it is listed under, and what it was told."""
@@ -40,8 +45,14 @@ class Method:
     told: str
 
 
-def method_named(name: str, degraded: Sensor, reference: Sensor) -> Method:
+def method_named(name: str, degraded: Sensor, reference: Sensor, sensor_name: str = "") -> Method:
     """The method of that name; the traditional ones are told both sensors, a network full scale alone.
+
+    Args:
+        name: as in EXPECTED.
+        degraded: the sensor of the images.
+        reference: the one that is aimed at.
+        sensor_name: of the degraded sensor's profile, by which a network's file says that it was made for it.
 
     Raises:
         OptionError: no such method.
@@ -52,11 +63,17 @@ def method_named(name: str, degraded: Sensor, reference: Sensor) -> Method:
         return Method(name, lambda dn: dn, "nothing: the input itself")
     chain = _chain(name, degraded, reference)
     if chain is not None:
-        return Method(name, lambda dn: restore_traditional(torch.from_numpy(dn), chain).numpy(), "both sensors")
+        return Method(name, lambda dn: restore_traditional(torch.from_numpy(dn), chain).numpy(), KNOWS)
     if name in PEERS:
         plain = Chain(degraded, reference)
-        return Method(name, lambda dn: PEERS[name](torch.from_numpy(dn), plain).numpy(), "both sensors")
-    return Method(name, _network(name, degraded.max_dn), "nothing")
+        return Method(name, lambda dn: PEERS[name](torch.from_numpy(dn), plain).numpy(), KNOWS)
+    model = _network(name)
+    return Method(name, _restoring(model, degraded.max_dn), knowledge_of(model, sensor_name))
+
+
+def knowledge_of(model: onnx.ModelProto, sensor_name: str) -> str:
+    """What a network knows of the sensor of that name: nothing, or that it was trained or folded for it."""
+    return TRAINED if sensor_name and metadata(model).get("sensor") == sensor_name else BLIND
 
 
 def _chain(name: str, degraded: Sensor, reference: Sensor) -> Chain | None:
@@ -67,16 +84,18 @@ def _chain(name: str, degraded: Sensor, reference: Sensor) -> Chain | None:
     return None
 
 
-def _network(name: str, max_dn: int) -> Restore:
+def _network(name: str) -> onnx.ModelProto:
     path = Path(name)
     if path.suffix in (".onnx", ".safetensors"):
-        model = float_model(path)
-    elif name in shipped_names():
-        model = float_model(shipped_weights(name))
-    elif (SHIPPED / f"{name}.onnx").is_file():
-        model = load_onnx(SHIPPED / f"{name}.onnx")
-    else:
-        raise OptionError("--methods", expected=EXPECTED, got=repr(name), remedy="correct that name")
+        return float_model(path)
+    if name in shipped_names():
+        return float_model(shipped_weights(name))
+    if (SHIPPED / f"{name}.onnx").is_file():
+        return load_onnx(SHIPPED / f"{name}.onnx")
+    raise OptionError("--methods", expected=EXPECTED, got=repr(name), remedy="correct that name")
+
+
+def _restoring(model: onnx.ModelProto, max_dn: int) -> Restore:
     session, halo_px = open_session(model), receptive_radius_px(model)
     return partial(_run_network, session=session, halo_px=halo_px, max_dn=max_dn)
 

@@ -60,13 +60,19 @@ def pictures(pairs: Sequence[NamedPair], methods: Sequence[Method], out: Path) -
 
 
 def evaluation_report(
-    title: str, mean: Sequence[Row], sites: Sequence[Row], swept: Sequence[Row], pictures: Sequence[Picture]
+    title: str,
+    mean: Sequence[Row],
+    sites: Sequence[Row],
+    swept: Sequence[Row],
+    pictures: Sequence[Picture],
+    sampled: str = "",
 ) -> Report:
-    """The page: pictures, means, sites, and the sweep where there was one."""
+    """The page: pictures, means, sites, and the sweep where there was one; `sampled` is one more note."""
     tables = [Table("Means over all pairs", mean, MEAN_CAPTION)]
     tables += [Table(name, rows, SITES_CAPTION) for name, rows in by_table(sites).items()]
     tables += [Table(name.capitalize(), rows) for name, rows in by_table(swept).items()]
-    return Report(title, headline(mean), tables, pictures, NOTES)
+    notes = (*NOTES, f"{sampled[0].upper()}{sampled[1:]}.") if sampled else NOTES
+    return Report(title, headline(mean), tables, pictures, notes)
 
 
 MEAN_CAPTION = (

@@ -1,5 +1,6 @@
 """Pairs of a degraded and a reference image: simulated from scenes, or read from a folder that `simulate` wrote."""
 
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -31,12 +32,18 @@ class Eye(Protocol):
 
 @dataclass(frozen=True)
 class NamedPair:
-    """Two acquisitions of one scene, (H, W) float32 digital numbers of the same units, and the scene's name."""
+    """Two acquisitions of one scene, (H, W) float32 digital numbers of the same units, and the scene's name.
+
+    Attributes:
+        place: its site, where one is known by more than the name.
+        oversampling: scene pixels per pixel, where the pair was simulated here.
+    """
 
     name: str
     degraded: np.ndarray
     reference: np.ndarray
     place: str | None = None
+    oversampling: int | None = None
 
     @property
     def site(self) -> str:
@@ -64,7 +71,7 @@ def simulate_pairs(
         draw = Draw(seed, number)
         eyes = [profile.draw(draw.generator("sensor")) for profile in (degraded, reference)]
         pair = simulate_pair(scene.radiance, eyes[0], eyes[1], ratio, draw)
-        pairs.append(NamedPair(scene.name, pair.degraded.numpy(), pair.reference.numpy()))
+        pairs.append(NamedPair(scene.name, pair.degraded.numpy(), pair.reference.numpy(), oversampling=ratio))
     if not pairs:
         least = oversamplings[-1] * (2 * MARGIN_PX + MIN_SIDE_PX)
         raise ImageError(
@@ -83,6 +90,19 @@ def oversamplings_of(profile: SensorProfile) -> tuple[int, ...]:
     """
     own = int(profile.oversampling.low)
     return tuple(dict.fromkeys(min(own, ratio) for ratio in OVERSAMPLINGS))
+
+
+def oversampling_note(pairs: Sequence[NamedPair], profile: SensorProfile) -> str:
+    """A sentence where pairs were simulated at another oversampling than the profile's; else nothing."""
+    own = int(profile.oversampling.low)
+    counts = Counter(pair.oversampling for pair in pairs if pair.oversampling is not None)
+    if not set(counts) - {own}:
+        return ""
+    used = " and ".join(f"{ratio} ({count} of {len(pairs)} images)" for ratio, count in sorted(counts.items())[::-1])
+    return (
+        f"scene pixels per pixel: {used}, where {profile.name} states {own}; at most {OVERSAMPLINGS[0]} are taken, "
+        f"and {OVERSAMPLINGS[1]} of small images ('simulate' keeps the profile's)"
+    )
 
 
 def read_pairs(folder: Path, max_dn: int = MAX_DN, recipe: PairsRecipe | None = None) -> list[NamedPair]:

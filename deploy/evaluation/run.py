@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from deploy.defaults import load_scenes
-from deploy.evaluation.methods import Method
+from deploy.evaluation.methods import BLIND, TRAINED, Method
 from deploy.evaluation.pairs import NamedPair, oversamplings_of, read_pairs, simulate_pairs
 from deploy.evaluation.paper import paper_rows
 from deploy.evaluation.recipe import PairsRecipe
@@ -72,7 +72,7 @@ def sweep_tables(
     """PSNR and MTF of the networks and the chain under conditions other than the nominal ones; a scene a site."""
     scenes = load_scenes(images, reference.nominal(), seed)
     first = {site_of(scene.name): scene for scene in reversed(scenes)}
-    networks = [method for method in methods if method.told == "nothing"]
+    networks = [method for method in methods if method.told in (BLIND, TRAINED)]
     with steps("sweep", len(conditions(degraded.nominal(), degraded))) as bar:
         return tuple(sweep_rows(networks, list(first.values()), degraded, reference, seed, bar.advance))
 

@@ -8,10 +8,13 @@ from deploy.tradeoff.board import PAIR_QUANTILE, pair_error
 from deploy.tradeoff.host_time import ROUNDS
 from deploy.tradeoff.host_time import TILE_PX as HOST_TILE_PX
 from deploy.tradeoff.int8 import PATCH_PX, PATCHES
+from model.metrics.bootstrap import LEAST_SITES
 
 
-def notes(ground: Ground, small: Sequence[str], lacks: Mapping[str, str], calibrated_on: str) -> tuple[str, ...]:
-    """Sentences, the most important first."""
+def notes(
+    ground: Ground, sampled: str, small: Sequence[str], lacks: Mapping[str, str], calibrated_on: str
+) -> tuple[str, ...]:
+    """Sentences, the most important first; `sampled` says at what oversampling, where that is not the profile's."""
     spread = f"{math.exp(pair_error()):.2f} times either way ({PAIR_QUANTILE:.0%} of published pairs)"
     found = [
         "No board was used: figures of the board are predicted, its power is an assumption that no network changes.",
@@ -28,5 +31,12 @@ def notes(ground: Ground, small: Sequence[str], lacks: Mapping[str, str], calibr
         "Chains and peers are told both sensors; what a network was told stands beside it.",
         "A chain on the board's CPU is scaled from CPU time here by benchmarks of other programs: a wide interval.",
     ]
+    sites = len(set(ground.sites))
+    if sites < LEAST_SITES:
+        found.append(
+            f"No interval over sites is shown, and pictures tell no two points apart: of {sites}, fewer than "
+            f"{LEAST_SITES}, none could be trusted."
+        )
+    found += [f"{sampled[0].upper()}{sampled[1:]}."] if sampled else []
     found += [f"Left out, too small: {', '.join(small)}."] if small else []
     return (*found, *(f"{unit} is not there: {reason}." for unit, reason in lacks.items()))

@@ -13,7 +13,7 @@ from deploy.tradeoff.board import BoardRun, energy_ratio, latency_ratio
 from deploy.tradeoff.host_time import Times, ratio_interval
 from deploy.tradeoff.pareto import Interval, Place
 from deploy.tradeoff.points import Point
-from model.metrics.bootstrap import mean_interval
+from model.metrics.bootstrap import site_interval
 
 COSTS = ("board latency", "board energy", "host p50")
 QUALITIES = {"PSNR": 1, "SSIM": 1, "LPIPS-squeeze": -1}
@@ -77,7 +77,10 @@ class Arena:
     seed: int
 
     def gain(self, a: str, b: str, key: str) -> Interval:
-        """How much better `a` is than `b`: bootstrap over sites of the differences on the same images, 95 %."""
+        """How much better `a` is than `b`: bootstrap over sites of the differences on the same images, 95 %.
+
+        Endless either way where the sites are too few to tell anything apart.
+        """
         first, second = (self._values(name, key) for name in (a, b))
         return _difference(first, second, tuple(self.sites), QUALITIES[key], self.seed)
 
@@ -134,7 +137,8 @@ def _difference(
 ) -> Interval:
     differences = sign * (np.asarray(first) - np.asarray(second))
     known = np.isfinite(differences)
-    if not known.any():
-        return -np.inf, np.inf
+    if known.any() and not differences[known].any():  # the same pictures, on however many sites
+        return 0.0, 0.0
     places = np.asarray(sites)[known].tolist()
-    return mean_interval(differences[known].tolist(), places, np.random.default_rng(seed))
+    interval, _ = site_interval(differences[known].tolist(), places, np.random.default_rng(seed))
+    return interval or (-np.inf, np.inf)

@@ -1,5 +1,6 @@
 """Fronts of an arena, and in words what each step along them costs."""
 
+import math
 from collections.abc import Iterator, Sequence
 from itertools import pairwise
 
@@ -57,12 +58,13 @@ def _price(arena: Arena, cheap: str, dear: str, x: str, y: str, *, last: bool) -
 
 
 def gain_words(arena: Arena, better: str, worse: str, key: str) -> str:
-    """By how much one point is better, with its interval: "0.32 dB [0.2, 0.5] of PSNR"."""
+    """By how much one point is better, with its interval where there is one: "0.32 dB [0.2, 0.5] of PSNR"."""
     values = [arena.outcomes[name].figures[key] for name in (better, worse)]
     gain = QUALITIES[key] * ((values[0].value or 0.0) - (values[1].value or 0.0))
     low, high = arena.gain(better, worse, key)
     unit = values[0].unit if values[0].unit == "dB" else ""
-    return " ".join(f"{number(gain, 2)} {unit} [{number(low, 2)}, {number(high, 2)}] of {key}".split())
+    interval = f"[{number(low, 2)}, {number(high, 2)}]" if math.isfinite(high - low) else ""
+    return " ".join(f"{number(gain, 2)} {unit} {interval} of {key}".split())
 
 
 def times_words(arena: Arena, a: str, b: str, key: str) -> str:

@@ -13,6 +13,7 @@ from deploy.dpu.board import load_dpu
 from deploy.dpu.checking import network_rows
 from deploy.dpu.placement import place
 from deploy.dpu.reading import network_of
+from deploy.evaluation.pairs import oversampling_note
 from deploy.evaluation.perceptual import perceptual_distances
 from deploy.evaluation.run import load_pairs
 from deploy.evaluation.scores import Instruments
@@ -85,7 +86,8 @@ def run_study(request: Request, cache: Cache) -> Result:
     assembly = Assembly(lab, swath, lacks)
     outcomes = [*(assembly.outcome(point) for point in points), *paper_outcomes(swath)]
     arena = Arena({each.name: each for each in outcomes}, ground.sites, request.seed)
-    return _put_together(request, lab, arena, notes(ground, small, lacks, calibrated_on(request)))
+    sampled = oversampling_note(ground.pairs, request.profiles[0])
+    return _put_together(request, lab, arena, notes(ground, sampled, small, lacks, calibrated_on(request)))
 
 
 def _put_together(request: Request, lab: Lab, arena: Arena, remarks: tuple[str, ...]) -> Result:

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import onnx
 
-from deploy.evaluation.methods import Restore, method_named
+from deploy.evaluation.methods import KNOWS, Restore, knowledge_of, method_named
 from deploy.restore import TILE_PX, Infer, restore_with
 from deploy.swath.openvino import open_openvino
 from deploy.swath.options import Runtime
@@ -21,7 +21,7 @@ from deploy.tradeoff.points import LEGAL, Unit
 from model.files import sha256
 from profiles.errors import BeersError, ModelError
 from profiles.sensor import SensorProfile
-from quant.onnx_file import load_onnx, metadata, save_onnx
+from quant.onnx_file import load_onnx, save_onnx
 from quant.radius import receptive_radius_px
 
 MAKING = ("quant", "quant.passes", "model.simulator", "deploy.tradeoff.int8")
@@ -32,7 +32,6 @@ PACKAGES = {
     "scikit-image": "scikit-image",
     "PyTorch": "torch",
 }
-KNOWS, BLIND, TRAINED = "both sensors", "nothing", "trained for the sensor"
 
 
 @dataclass(frozen=True)
@@ -70,7 +69,7 @@ class Shelf:
         """What a unit knows of the sensor."""
         if unit.kind != "network":
             return KNOWS
-        return TRAINED if metadata(self.model(unit.method)).get("sensor") == self.degraded.name else BLIND
+        return knowledge_of(self.model(unit.method), self.degraded.name)
 
     def model(self, method: str) -> onnx.ModelProto:
         """A network as its user gave it."""

@@ -16,10 +16,12 @@ from model.traditional.rows import Rows, mirrored
 from model.traditional.threads import map_tiles
 from profiles.errors import OptionError
 
-EPSILON_PER_SIGMA = 3.3e-3
-"""Regularisation at Nyquist per W/m2/sr/um of noise at 100 W/m2/sr/um: what denoising leaves grows about as sigma.
+EPSILON_PER_PERCENT = 3.3e-3
+"""Regularisation at Nyquist per per cent of noise at the brighter radiance that a profile states (100 W/m2/sr/um in
+the shipped ones): what denoising leaves grows about as sigma.
 
-On a photograph 3e-3 was best of 1e-3, 3e-3 and 1e-2 at MTF 7 %, SNR 50 / 110, and 1e-2 at 3 %, 15 / 50; with this
+A share of the light, not a radiance: scenes half as bright, seen with twice the gain, are restored alike. On a
+photograph 3e-3 was best of 1e-3, 3e-3 and 1e-2 at MTF 7 %, SNR 50 / 110, and 1e-2 at 3 %, 15 / 50; with this
 rule both lose less than 0.05 dB (measured).
 """
 

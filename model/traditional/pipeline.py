@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from model.simulator.digitise import to_dn, to_radiance
-from model.traditional.compensate import EPSILON_PER_SIGMA, compensation_gain, compensation_kernel, filter_strips
+from model.traditional.compensate import EPSILON_PER_PERCENT, compensation_gain, compensation_kernel, filter_strips
 from model.traditional.nl_bayes import finite_or_missing, nl_bayes_strips
 from model.traditional.noise import Noise, coloured_by
 from model.traditional.settings import QUALITIES, Quality
@@ -51,7 +51,10 @@ class Chain:
     @property
     def regularisation(self) -> float:
         """The epsilon of the MTF compensation."""
-        return EPSILON_PER_SIGMA * self.degraded.noise_sigma(100) if self.epsilon is None else self.epsilon
+        if self.epsilon is not None:
+            return self.epsilon
+        bright = self.degraded.radiance_1
+        return EPSILON_PER_PERCENT * self.degraded.noise_sigma(bright) * (100 / bright)
 
     def kernel(self) -> Tensor:
         """The filter of the MTF compensation."""

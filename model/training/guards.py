@@ -64,12 +64,13 @@ class Guards:
         return guards
 
 
-def require_finite_output(network: Network, where: str) -> None:
+def require_finite_output(network: Network, where: str, remedy: str = "lower the learning rate") -> None:
     """Refuse a network that makes NaN or infinity of an image in [0, 1]: its weights may be finite all the same.
 
     Args:
         network: on the CPU; one that is told its sensor is told the middle of every range.
         where: what to name in the message.
+        remedy: what to do about it.
 
     Raises:
         ModelError: it does.
@@ -79,7 +80,6 @@ def require_finite_output(network: Network, where: str) -> None:
     with torch.inference_mode():
         restored = plain(torch.cat([torch.zeros_like(image), image, torch.ones_like(image)]))
     if not bool(torch.isfinite(restored).all()):
-        remedy = "lower the learning rate"
         raise ModelError(where, expected="finite pixels of a test image", got="NaN or infinity", remedy=remedy)
 
 

@@ -12,9 +12,9 @@ from typer.testing import CliRunner
 
 from deploy.cli import app
 from deploy.evaluation import targets as targets_module
-from deploy.evaluation.methods import Method, method_named
+from deploy.evaluation.methods import TRAINED, Method, method_named
 from deploy.evaluation.page import chosen_pairs, strip_of
-from deploy.evaluation.pairs import NamedPair, read_pairs, simulate_pairs
+from deploy.evaluation.pairs import NamedPair, oversampling_note, oversamplings_of, read_pairs, simulate_pairs
 from deploy.evaluation.paper import paper_rows
 from deploy.evaluation.scores import Instruments, fidelity_db, score, site_rows
 from deploy.evaluation.targets import acquire_targets, flat_figure, mtf_figure, snr_name, target_figures
@@ -24,6 +24,7 @@ from deploy.tables import missing
 from model.metrics.refusal import Refusal
 from model.simulator.procedural import procedural_scene
 from profiles import load_sensor
+from profiles.constant import Constant
 from profiles.errors import ImageError, MachineError, OptionError
 
 DEGRADED, REFERENCE = load_sensor("pleiades-degraded"), load_sensor("pleiades-reference")
@@ -94,10 +95,46 @@ def test_scenes_too_small_are_named_and_all_too_small_is_refused() -> None:
         simulate_pairs([small], DEGRADED, REFERENCE, 0)
 
 
+@pytest.mark.parametrize(
+    ("own", "sides", "words"),
+    [
+        (2, (300, 700), ""),
+        (4, (700, 700), ""),
+        (4, (300, 700), "4 (1 of 2 images) and 2 (1 of 2 images), where pleiades-degraded states 4"),
+        (5, (700, 700), "4 (2 of 2 images), where pleiades-degraded states 5; at most 4 are taken"),
+    ],
+)
+def test_another_oversampling_than_the_profiles_is_said(own: int, sides: tuple[int, int], words: str) -> None:
+    profile = replace(DEGRADED, oversampling=Constant(own, "stated", "a test"))
+    scenes = [procedural_scene(side, side, np.random.default_rng(0)) for side in sides]
+    pairs, _ = simulate_pairs(scenes, profile, REFERENCE, 0, oversamplings_of(profile))
+    said = oversampling_note(pairs, profile)
+    assert words in said
+    assert bool(words) == bool(said)
+
+
+def test_of_pairs_from_a_folder_no_oversampling_is_known() -> None:
+    assert oversampling_note([pair()], DEGRADED) == ""
+
+
 @pytest.mark.parametrize("name", ["magic", "traditional-superb", "convbeers-huge", ""])
 def test_an_unknown_method_is_refused(name: str) -> None:
     with pytest.raises(OptionError, match=r"--methods|variant"):
         method_named(name, *SENSORS)
+
+
+def test_what_a_network_was_made_for_is_no_secret() -> None:
+    """By the sensor that its file names; a name that is not asked about says nothing."""
+    told = {
+        (name, sensor): method_named(name, *SENSORS, sensor).told
+        for name in ("convbeers-s-nominal", "convbeers-s-nominal-int8", "convbeers-xs", "traditional", "degraded")
+        for sensor in ("pleiades-degraded", "dior-high", "")
+    }
+    made = {name for (name, sensor), words in told.items() if words == TRAINED and sensor == "pleiades-degraded"}
+    assert made == {"convbeers-s-nominal", "convbeers-s-nominal-int8"}
+    assert TRAINED not in [words for (_, sensor), words in told.items() if sensor != "pleiades-degraded"]
+    assert told["convbeers-xs", "pleiades-degraded"] == "nothing"
+    assert told["traditional", "dior-high"] == "both sensors"
 
 
 def test_a_peer_without_its_library_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,15 +1,20 @@
 """A digital number means the same in a degraded image and in its reference, whatever the sensor's digitiser."""
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from deploy.dataset_patches import DatasetRecipe
 from deploy.defaults import reference_beside
 from deploy.evaluation.methods import method_named
 from deploy.evaluation.pairs import simulate_pairs
-from deploy.evaluation.scores import fidelity_db
+from deploy.evaluation.scores import Instruments, fidelity_db
+from model.simulator.mtf import mtf
 from model.simulator.procedural import procedural_scene
 from model.training.patches import PatchRecipe
 from profiles import SensorProfile, load_sensor
@@ -52,6 +57,58 @@ def test_scaling_the_gain_and_the_bits_changes_no_psnr_and_no_ranking(
     full_scale_db = 20 * np.log10(4095 / 10.2375 / ((2**bits - 1) / gain))  # what PSNR is taken over
     assert found == pytest.approx([value - full_scale_db for value in shipped], abs=0.15)
     assert np.argsort(found).tolist() == np.argsort(shipped).tolist()
+
+
+def rescaled(profile: SensorProfile, bits: int, dimmer: float, offset_dn: float) -> SensorProfile:
+    """Full scale, gain and offset grow alike with the bits; scenes are so many times dimmer, and the gain higher."""
+    times = (2**bits - 1) / 4095
+    darker, brighter = (
+        Constant(point.low / dimmer, "stated", "a test") for point in (profile.radiance_0, profile.radiance_1)
+    )
+    gain = profile.gain_dn_per_radiance.low * times * dimmer
+    dimmed = replace(profile, radiance_0=darker, radiance_1=brighter)
+    return with_units(dimmed, gain, bits, offset_dn * times)
+
+
+@cache
+def evaluated(bits: int, dimmer: float, offset_dn: float) -> tuple[np.ndarray, int]:
+    """PSNR in dB over full scale of each method, (3,), and the pixels it is a mean of."""
+    degraded, reference = (
+        rescaled(profile, bits, dimmer, offset_dn) for profile in (DEGRADED, load_sensor("pleiades-reference"))
+    )
+    scene = replace(SCENE, radiance=SCENE.radiance / dimmer)
+    (pair,), _ = simulate_pairs([scene], degraded, reference, 0, (2,))
+    methods = [method_named(name, degraded.nominal(), reference.nominal()) for name in METHODS]
+    instruments = Instruments({}, degraded.nominal().max_dn)
+    scores = [instruments.score(m.restore(pair.degraded), pair.reference, pair.degraded) for m in methods]
+    return np.array([each["PSNR"] for each in scores]), pair.degraded.size
+
+
+def rounding_db(psnr_db: np.ndarray, bits: int, pixels: int) -> np.ndarray:
+    """How far rounding to whole DN, of 12 bits here and of `bits` there, may move these PSNRs.
+
+    A step q leaves an error of q / sqrt(12): in the reference, in what is restored, and in the input, where the
+    restoration amplifies it as white noise, by the ratio of the MTFs over all frequencies (rms). The noise dithers
+    it, so it is independent of the error that a method leaves: the squares add, and the mean product of the two
+    stays within four standard deviations; errors are alike within a patch of 5 x 5 pixels.
+    """
+    steps = np.hypot(1 / 4095, 1 / (2**bits - 1)) / np.sqrt(12)
+    fx, fy = torch.fft.fftfreq(64)[None], torch.fft.fftfreq(64)[:, None]
+    ratio = mtf(fx, fy, (0.25, 0.25)) / mtf(fx, fy, (0.07, 0.07))
+    share = steps * np.sqrt(float(ratio.square().mean()) + 2) / 10 ** (-psnr_db / 20)
+    return np.asarray(10 * np.log10(1 + share**2 + 2 * 4 * share / np.sqrt(pixels / 25)))
+
+
+@settings(max_examples=4, deadline=None, derandomize=True)
+@given(bits=st.integers(12, 16), dimmer=st.floats(0.1, 10), offset_dn=st.sampled_from([0.0, 60.0]))
+def test_radiance_gain_and_bits_scaled_together_change_nothing_but_rounding(
+    bits: int, dimmer: float, offset_dn: float
+) -> None:
+    (usual, pixels), (found, _) = evaluated(12, 1, offset_dn), evaluated(bits, dimmer, offset_dn)
+    allowed = rounding_db(usual, bits, pixels)
+    assert np.all(np.abs(found - usual) <= allowed), (found - usual, allowed)
+    assert allowed.max() < 0.25 < np.diff(np.sort(usual)).min() / 2  # so the ranking is settled
+    assert np.argsort(found).tolist() == np.argsort(usual).tolist()
 
 
 def test_an_offset_changes_no_psnr(shipped: list[float]) -> None:

@@ -7,6 +7,8 @@ from pathlib import Path
 from typing import get_args
 
 import pytest
+from typer.core import TyperGroup
+from typer.main import get_command
 from typer.testing import CliRunner
 
 from deploy.cli import app
@@ -70,3 +72,18 @@ def test_profiles_print_the_file_to_start_from(tmp_path: Path) -> None:
     for name in sensor_names():
         (tmp_path / "mine.toml").write_text(CliRunner().invoke(app, ["profiles", name, "--toml"]).output)
         assert same_instrument(load_sensor(str(tmp_path / "mine.toml")), load_sensor(name))
+
+
+def test_the_pages_commands_are_understood_and_use_what_was_written_before() -> None:
+    """Read by the command line itself, not run; each input is the page's own, the user's, or an earlier output."""
+    (block,) = re.findall(r"```sh\n(.*?)```", PAGE, re.DOTALL)
+    group, known = get_command(app), {"scene.png", "raw.tif", "my-sensor.toml"}
+    assert isinstance(group, TyperGroup)
+    lines = [line.split()[1:] for line in block.splitlines()]
+    for name, *words in lines:
+        context = group.commands[name].make_context(name, [*words])
+        paths = {word for part in words for word in part.split(",") if re.search(r"\.(png|tif|toml|onnx)$", word)}
+        outputs = {str(context.params.get(key)) for key in ("out", "output", "board")} & {*words}
+        assert paths - outputs <= known, (name, paths - outputs - known)
+        known |= outputs
+    assert [name for name, *_ in lines].count("restore") == 2

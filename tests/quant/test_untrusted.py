@@ -156,7 +156,7 @@ LOOP = helper.make_graph(
         (ending_in(constant("n", *[9**9] * 8), helper.make_node("Pad", ["image", "n"], ["y"])), "enlargements"),
         (
             ending_in(
-                constant("s", 1, 1, 1e6, float("nan"), kind=np.float32),
+                constant("s", 1, 1, 1e6, 1e6, kind=np.float32),
                 helper.make_node("Resize", ["image", "", "s"], ["y"]),
             ),
             "enlargements",

@@ -1,12 +1,15 @@
 """Advice: which point, why, and what it would take to do better; what is said of the paper's network."""
 
+import math
+from dataclasses import replace
+
 import pytest
 
 from deploy.tradeoff.choice import choose
 from deploy.tradeoff.demands import parse_demands
 from deploy.tradeoff.findings import as_good, findings, headline, papers_point
 from deploy.tradeoff.outcome import Arena
-from deploy.tradeoff.prices import fronts
+from deploy.tradeoff.prices import fronts, gain_words
 from tests.deploy.tradeoff.arenas import Made, arena, named
 
 FAMILY = {
@@ -118,6 +121,23 @@ def test_pairs_of_images_tell_apart_what_intervals_of_means_do_not(family: Arena
     assert 0 < low < 0.3 < high < 0.6
     assert family.gain(papers, small, "PSNR") == pytest.approx((-high, -low), abs=1e-6)
     assert family.gain(small, small, "PSNR") == (0.0, 0.0)
+
+
+def test_below_five_sites_pictures_tell_no_two_points_apart(family: Arena) -> None:
+    """But for points that give the same pictures, of which the cheaper one is better on however many sites."""
+    few = replace(family, sites=("a", "a", "b", "c", "d", "d"))
+    small, papers = (named(few, name) for name in ("small", "papers"))
+    assert few.gain(small, papers, "PSNR") == (-math.inf, math.inf)
+    assert few.gain(small, small, "PSNR") == (0.0, 0.0)
+    assert gain_words(few, small, papers, "PSNR") == "0.3 dB of PSNR"
+    assert "[" in gain_words(family, small, papers, "PSNR")
+    for front in fronts(few):
+        assert not front.beaten
+        assert not front.prices
+    assert as_good(few, few.outcomes[papers], surely=True) is None
+    sentences = " ".join(findings(few, few.outcomes[papers]))
+    assert "inf" not in sentences
+    assert "over the whole interval: " not in sentences
 
 
 def test_fronts_are_there_for_every_pair_of_figures_that_points_have(family: Arena) -> None:

@@ -118,6 +118,19 @@ def test_every_figure_of_every_point_is_a_number_or_has_a_reason(kept: tuple[Res
     assert legal.text["told"] == "trained for the sensor"
 
 
+def test_two_sites_give_no_interval_and_images_smaller_than_the_profile_asks_for_are_owned_up_to(
+    kept: tuple[Result, Path],
+) -> None:
+    study = kept[0].study
+    for row in study.points:
+        psnr = row.figures["PSNR"]
+        assert psnr.mode != "measured" or psnr.interval is None
+    assert not any("dB [" in sentence for front in study.fronts for sentence in front.prices)
+    notes = " ".join(study.notes)
+    assert "No interval over sites is shown, and pictures tell no two points apart: of 2, fewer than 5" in notes
+    assert "Scene pixels per pixel: 2 (2 of 2 images), where pleiades-degraded states 5" in notes
+
+
 def test_accuracy_knows_no_configuration_and_seams_show(kept: tuple[Result, Path]) -> None:
     points = [row for row in kept[0].study.points if row.text["method"] == "wide" and "legal" in row.name]
     exact = [row.figures["PSNR"] for row in points if row.text["halo"] == "exact"]

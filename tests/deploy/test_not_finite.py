@@ -1,0 +1,149 @@
+"""A network with weights that are not finite, or that makes NaN of an image, gives one sentence and no figure."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import onnx
+import pytest
+import tifffile
+import torch
+from onnx import helper, numpy_helper
+from typer.testing import CliRunner
+
+from deploy.cli import app
+from deploy.export import to_onnx
+from deploy.shipped import shipped_pair
+from model.convbeers import VARIANTS, ConvBEERS
+from model.weights_file import save_network
+from profiles.errors import ModelError
+from quant.gate import compare
+from quant.onnx_file import load_onnx, parse_onnx, save_onnx
+from quant.session import open_session
+
+VARIANT = "convbeers-xs"
+INT8 = str(shipped_pair(VARIANT)[1])
+READERS = [
+    "quantize {0} --out {1}/int8.onnx --board {1}/board.onnx --json {1}/q.json",
+    f"gate {{0}} {INT8} --json {{1}}/g.json",
+    "check {0} --json {1}/c.json --picture {1}/c.svg",
+    "evaluate --methods {0} --json {1}/e.json --out {1}",
+    f"stress {{0}} {INT8} --json {{1}}/s.json",
+    "stress --bit-flips {0} --json {1}/s.json",
+    "tradeoff --networks {0} --out {1}",
+    "bench {0} --json {1}/b.json",
+    "bench {0} --target host --json {1}/b.json",
+    "restore {1}/raw.tif {1}/out.tif --model {0}",
+]
+TRAINING = f"--variant {VARIANT} --drawn 1 --steps 2 --batch 1 --patch 24 --validate-every 0 --out {{1}}"
+OF_WEIGHTS = [
+    "export --checkpoint {0} --out {1}/float.onnx",
+    f"train --start {{0}} {TRAINING}",
+    f"train --teacher {{0}} {TRAINING}",
+    "quantize {0} --out {1}/int8.onnx",
+    f"gate {{0}} {INT8} --json {{1}}/g.json",
+]
+Spoil = Callable[[ConvBEERS], None]
+
+
+def one(value: float) -> Spoil:
+    """One weight of the body becomes this."""
+
+    def spoil(network: ConvBEERS) -> None:
+        dict(network.named_parameters())["body.1.first.weight"].view(-1)[5] = value
+
+    return spoil
+
+
+def overflowing(network: ConvBEERS) -> None:
+    """Every weight is finite, no sum is."""
+    for name, weight in network.named_parameters():
+        if name.endswith("weight"):
+            weight.fill_(1e30)
+
+
+def written(folder: Path, spoil: Spoil, suffix: str) -> Path:
+    path, network = folder / f"net{suffix}", ConvBEERS(VARIANTS[VARIANT]).eval()
+    with torch.no_grad():
+        spoil(network)
+    if suffix == ".onnx":
+        save_onnx(to_onnx(network, {}), path)
+    else:
+        save_network(path, network, {})
+    tifffile.imwrite(folder / "raw.tif", np.full((40, 44), 700, np.uint16))
+    return path
+
+
+def spoken(command: str, path: Path, exit_code: int = 2) -> str:
+    """What the command says; it leaves no file behind."""
+    before = {p for p in path.parent.rglob("*") if p.is_file()}
+    result = CliRunner().invoke(app, command.format(path, path.parent).split())
+    assert result.exit_code == exit_code, result.output
+    assert result.exception is None or isinstance(result.exception, SystemExit)
+    assert {p for p in path.parent.rglob("*") if p.is_file()} == before
+    return " ".join(result.output.split())
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_a_file_with_such_a_weight_is_not_read(tmp_path: Path, value: float) -> None:
+    with pytest.raises(ModelError, match=r"finite weights, got 1 NaN or infinite in body\.1\.first\.weight"):
+        load_onnx(written(tmp_path, one(value), ".onnx"), to_run=False)
+
+
+@pytest.mark.parametrize("command", READERS)
+def test_no_command_takes_such_a_network(tmp_path: Path, command: str) -> None:
+    path = written(tmp_path, one(np.nan), ".onnx")
+    assert "expected finite weights, got 1 NaN" in spoken(command, path)
+
+
+@pytest.mark.parametrize("command", OF_WEIGHTS)
+def test_no_command_takes_such_weights(tmp_path: Path, command: str) -> None:
+    path = written(tmp_path, one(np.inf), ".safetensors")
+    assert "weights that are not finite" in spoken(command, path)
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        "quantize {0} --out {1}/int8.onnx --patches 1",
+        "quantize {0} --out {1}/int8.onnx --patches 1 --regime free",
+        "bench {0} --target host --tile 64 --json {1}/b.json",
+        "restore {1}/raw.tif {1}/out.tif --model {0}",
+    ],
+)
+def test_a_network_whose_sums_overflow_is_refused_where_it_runs(tmp_path: Path, command: str) -> None:
+    said = spoken(command, written(tmp_path, overflowing, ".onnx"))
+    assert "NaN" in said
+    assert "finite" in said
+
+
+@pytest.mark.parametrize("command", OF_WEIGHTS[:3])
+def test_weights_whose_sums_overflow_are_neither_exported_nor_trained_from(tmp_path: Path, command: str) -> None:
+    assert "finite" in spoken(command, written(tmp_path, overflowing, ".safetensors"))
+
+
+def test_the_gate_fails_a_network_whose_sums_overflow(tmp_path: Path) -> None:
+    said = spoken(f"gate {{0}} {INT8} --patches 1", written(tmp_path, overflowing, ".onnx"), exit_code=1)
+    assert "gate FAILED" in said
+    assert "MAE nan" in said
+
+
+def test_an_infinite_pixel_is_no_full_scale_to_the_gate() -> None:
+    """Clipped to 1, infinity on both sides would agree."""
+    ends = [helper.make_tensor_value_info(name, 1, ["N", 1, "H", "W"]) for name in ("image", "restored")]
+    scale = numpy_helper.from_array(np.full((1, 1, 1, 1), 3e38, np.float32), "s")
+    nodes = [helper.make_node("Mul", ["image", "s"], ["a"]), helper.make_node("Mul", ["a", "s"], ["restored"])]
+    graph = helper.make_graph(nodes, "g", ends[:1], ends[1:], [scale])
+    session = open_session(helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8))
+    image = np.full((1, 1, 8, 8), 0.5, np.float32)
+    assert np.isnan(compare(session, session, [(image, image)]).mae)
+
+
+def test_infinity_may_be_a_bound() -> None:
+    """Of Clip, as exporters write one that is left open."""
+    model = to_onnx(ConvBEERS(VARIANTS[VARIANT]).eval(), {})
+    bounds = [numpy_helper.from_array(np.array(v, np.float32), n) for n, v in (("low", 0), ("high", np.inf))]
+    model.graph.initializer.extend(bounds)
+    model.graph.node[-1].output[0] = "open"
+    model.graph.node.append(helper.make_node("Clip", ["open", "low", "high"], ["restored"]))
+    assert isinstance(parse_onnx(model.SerializeToString(), "m"), onnx.ModelProto)
