@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import onnx
 
-from quant.planes import PLANES, POSITION
+from quant.graph import PLANES, POSITION
 
 STRIDE = 16
 """Patches that onnxruntime's calibration looks at together; with 64 at once the network of 16 x 64 takes 20 GB."""

@@ -18,11 +18,10 @@ import onnx
 import onnxruntime as ort
 
 from deploy.export import to_onnx
+from model.io.weights import load_network
 from model.processor import decided, int8_adds_exactly, processor_name
 from model.shipped import SHIPPED
-from model.weights_file import load_network
-from quant.fillers import filled
-from quant.kernels import made_exact
+from quant.kernels import filled, made_exact
 from quant.onnx_file import load_onnx
 from quant.session import open_session, run
 

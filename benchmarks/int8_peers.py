@@ -35,12 +35,8 @@ from model.shipped import shipped_weights
 from profiles import load_sensor
 from profiles.sensor import reference_for
 from quant.calibration import Pair, draw_patches
-from quant.float_file import float_model
-from quant.float_reader import correction_graph
-from quant.graph import CORRECTION
-from quant.pieces import planes_of
-from quant.planes import PLANES, read_planes
-from quant.session import open_session
+from quant.graph import CORRECTION, PLANES, correction_graph, float_model, read_planes
+from quant.session import open_session, planes_of
 
 HERE = Path(__file__).parent
 QUARK = HERE / "quark_child.py"

@@ -23,11 +23,8 @@ import torch
 from torch import Tensor
 
 from model.simulator.acquire import prepare_scene, simulate_planned
-from model.simulator.detect import DN_EFFECTS, RADIANCE_EFFECTS, apply_effect
-from model.simulator.digitise import digitise_dn
-from model.simulator.draws import Draw
+from model.simulator.detector import DN_EFFECTS, RADIANCE_EFFECTS, Draw, add_noise, apply_effect, digitise_dn
 from model.simulator.mtf import gaussian_response, mtf, smear_response
-from model.simulator.noise import add_noise
 from model.simulator.plan import make_plan
 from model.simulator.procedural import procedural_scene
 from profiles import load_sensor

@@ -27,12 +27,11 @@ import torch
 
 from deploy.commands.bench import parse_size
 from deploy.export import to_onnx
-from deploy.swath.options import Options, Runtime
-from deploy.swath.plan import make_plan
-from deploy.swath.raster import Raster
-from deploy.swath.run import restore_file
-from deploy.swath.runtime import open_runtime
-from deploy.tiling import Tile
+from deploy.restoration.options import Options, Runtime
+from deploy.restoration.plan import Tile, make_plan
+from deploy.restoration.run import restore_file
+from deploy.restoration.runtime import open_runtime
+from deploy.restoration.source import Raster
 from model.convbeers import VARIANTS, ConvBEERS, Variant, initialise
 from quant.radius import receptive_radius_px
 

@@ -16,10 +16,10 @@ import numpy as np
 import onnx
 import tifffile
 
-from deploy.restore import restore_window
-from deploy.swath.options import Options
-from deploy.swath.run import restore_file
-from deploy.swath.runtime import open_runtime
+from deploy.restoration.arrays import restore_window
+from deploy.restoration.options import Options
+from deploy.restoration.run import restore_file
+from deploy.restoration.runtime import open_runtime
 from quant.radius import receptive_radius_px
 
 HERE = Path(__file__).parent

@@ -16,15 +16,15 @@ import torch
 from torch import Tensor
 
 from deploy.evaluation.pairs import NamedPair, simulate_pairs
+from deploy.evaluation.run import Fixed, conditions
 from deploy.evaluation.scores import fidelity_db
-from deploy.evaluation.sweep import Fixed, conditions
 from deploy.export import network_for
 from model.conditioning import fold, tell
 from model.convbeers import ConvBEERS
-from model.images import list_images, site_of
-from model.simulator.scene import Scene, read_scene
+from model.io.images import list_images, site_of
+from model.io.weights import is_told, load_told
+from model.simulator.sampling import Scene, read_scene
 from model.traditional.pipeline import Chain, restore_traditional
-from model.weights_file import is_told, load_told
 from profiles import load_sensor
 from profiles.sensor import Sensor, noise_from_snr
 

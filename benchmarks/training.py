@@ -21,13 +21,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from deploy.tradeoff.lab import machine
+from deploy.tradeoff.measurements import machine
 from model.convbeers import VARIANTS
 from model.simulator.procedural import procedural_scene
+from model.training.checkpoint import TrainingRecipe
 from model.training.losses import LossWeights, RestorationLoss
 from model.training.patches import PatchRecipe, PatchSource
 from model.training.precision import Precision, in_precision
-from model.training.recipe import TrainingRecipe
 from model.training.trainer import Trainer
 from profiles import load_sensor
 

@@ -8,9 +8,10 @@ from pathlib import Path
 
 from jsonschema import Draft202012Validator
 
-from deploy.results import SCHEMA_PATH, Figure, Row
+from deploy.results import SCHEMA_PATH
 from profiles.errors import OptionError
-from profiles.text import read_json
+from profiles.figures import Figure, Row
+from profiles.toml import read_json
 
 Place = tuple[str, str, str]
 """Table, row and name of a figure."""

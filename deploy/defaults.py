@@ -7,13 +7,14 @@ import numpy as np
 import onnx
 
 from deploy.export import to_onnx
-from deploy.shipped import default_float_weights, float_file
-from model.images import list_images
+from model.io.images import list_images
+from model.io.weights import load_network
+from model.shipped import SHIPPED, default_float_weights, float_file, shipped_names, shipped_weights
 from model.simulator.procedural import procedural_scene
-from model.simulator.scene import Scene, read_scene
-from model.weights_file import load_network
+from model.simulator.sampling import Scene, read_scene
+from profiles.errors import ModelError
 from profiles.sensor import REFERENCE, Sensor, SensorProfile, describe_units, load_sensor
-from quant.onnx_file import load_onnx
+from quant.onnx_file import load_onnx, metadata
 
 SCENES = 3
 SCENE_SIDE_PX = 2400
@@ -70,3 +71,33 @@ def draw_scenes(count: int, seed: int) -> list[Scene]:
     """Drawn scenes, each with its own generator."""
     generators = np.random.default_rng(seed).spawn(count)
     return [procedural_scene(SCENE_SIDE_PX, SCENE_SIDE_PX, g) for g in generators]
+
+
+def counterpart(model: onnx.ModelProto) -> onnx.ModelProto | None:
+    """A shipped network of the same variant in the other precision, or None; its weights may be others.
+
+    Time depends on the shapes, not on the weights: for a comparison of time any weights will do.
+    """
+    variant = metadata(model).get("variant", "")
+    if is_quantised(model):
+        return float_model(shipped_weights(variant)) if variant in shipped_names() else None
+    int8 = SHIPPED / f"{variant}-int8.onnx"
+    return load_onnx(int8) if variant and int8.is_file() else None
+
+
+def is_quantised(model: onnx.ModelProto) -> bool:
+    """Whether any node computes on, makes or reads quantised numbers."""
+    kinds = {node.op_type.lower() for node in model.graph.node}
+    return any(mark in kind for kind in kinds for mark in ("qlinear", "quantizelinear", "integer"))
+
+
+def require_quantised(model: onnx.ModelProto, path: Path, wanted: bool) -> None:
+    """Refuse the float network in the place of the INT8 one, and the other way round.
+
+    Raises:
+        ModelError: it is the other kind.
+    """
+    if is_quantised(model) != wanted:
+        expected, got = ("an INT8 network", "a float one") if wanted else ("a float network", "an INT8 one")
+        remedy = "give the float model first, the INT8 model second"
+        raise ModelError(str(path), expected=expected, got=got, remedy=remedy)

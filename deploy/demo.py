@@ -11,30 +11,30 @@ import numpy as np
 import onnx
 import torch
 
-from deploy.bench import Swath, predict_file, predicted_rows, published_rows
+from deploy.bench.host import Sensors, traditional_rows
+from deploy.bench.tables import Swath, predict_file, predicted_rows, published_rows
 from deploy.defaults import HELD_OUT_SEED, float_model, load_scenes
 from deploy.dpu.board import Dpu, load_dpu
-from deploy.dpu.placement import place
+from deploy.dpu.checker.placement import place
 from deploy.dpu.reading import read_network
 from deploy.evaluation.methods import Restore
 from deploy.evaluation.scores import fidelity_row
 from deploy.export import require_parity
 from deploy.gate import gate_row
-from deploy.measure import Sensors, traditional_rows
 from deploy.report.demo_page import INT8, SWATH_PX, TRADITIONAL, comparison, demo_report
 from deploy.report.page import Report
-from deploy.restore import TILE_PX, read_acquisition, restore_image, write_tiff
-from deploy.results import Row, measured
-from deploy.shipped import SENSOR, VARIANT, default_float_weights
-from model.images import read_pixels
+from deploy.restoration.arrays import TILE_PX, read_acquisition, restore_image, write_tiff
+from model.io.images import read_pixels
+from model.io.weights import load_network
+from model.shipped import SENSOR, VARIANT, default_float_weights
 from model.simulator.acquire import MARGIN_PX, Pair, simulate_pair
-from model.simulator.draws import Draw
+from model.simulator.detector import Draw
 from model.simulator.procedural import procedural_scene
-from model.simulator.scene import Scene, read_scene
+from model.simulator.sampling import Scene, read_scene
 from model.traditional.pipeline import Chain, restore_traditional
-from model.weights_file import load_network
 from profiles import load_sensor
 from profiles.errors import OptionError
+from profiles.figures import Row, measured
 from profiles.sensor import reference_for
 from quant.calibration import draw_patches
 from quant.gate import compare

@@ -10,8 +10,8 @@ from onnx import helper, numpy_helper
 from deploy import __version__
 from model.conditioning import fold, tell
 from model.convbeers import ConvBEERS
+from model.io.weights import is_told, load_network, load_told
 from model.shipped import told_names
-from model.weights_file import is_told, load_network, load_told
 from profiles.errors import ModelError
 from profiles.sensor import load_sensor
 from quant.onnx_file import image_info, make_model

@@ -9,31 +9,32 @@ Looked at, in this order:
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree as ET
 
 import numpy as np
 import onnx
 
-from deploy.counterpart import require_quantised
-from deploy.defaults import HELD_OUT_SEED, float_model, load_scenes
+from deploy.defaults import HELD_OUT_SEED, float_model, load_scenes, require_quantised
 from deploy.dpu.board import load_dpu
-from deploy.dpu.checking import legality
-from deploy.dpu.placement import place
+from deploy.dpu.checker.placement import place
+from deploy.dpu.checker.table import legality
 from deploy.dpu.reading import read_network
-from deploy.results import Document, Figure, Row, measured, unavailable
-from deploy.shipped import VARIANT, float_file, int8_file, shipped_pair
+from deploy.results import Document
+from model.io.files import require_regular, require_writable, write_text
+from model.shipped import VARIANT, float_file, int8_file, shipped_pair
 from profiles import load_sensor, load_target
-from profiles.errors import OptionError
+from profiles.errors import BeersError, MachineError, OptionError, printable
+from profiles.figures import Figure, Row, measured, unavailable
 from profiles.sensor import reference_for
-from profiles.text import read_json, unreadable
+from profiles.toml import read_json, unreadable
 from quant.calibration import Patches, draw_patches
-from quant.checks import Check
-from quant.gate import GateResult, compare
-from quant.host_reader import spelling_faults
-from quant.limits import Limits, judge, judge_saturation
+from quant.encodings import spelling_faults
+from quant.gate import Check, GateResult, Limits, compare, judge, judge_saturation
 from quant.onnx_file import fixed_tile_px, load_onnx
 from quant.relus import count_relus
 from quant.saturation import saturated_shares
@@ -241,3 +242,122 @@ def saturation_figure(shares: Mapping[str, float], patches: int) -> Figure:
         return unavailable("%", "no result in the file is rounded to 8 bits")
     layer = max(shares, key=lambda name: shares[name])
     return measured(100 * shares[layer], "%", f"{layer}, the worst of {len(shares)}; {patches} patches of 128 x 128")
+
+
+def sentence(checks: Sequence[Check], passed: str) -> str:
+    """The line that ends a command: every check that failed, with its value and its limit, and no other.
+
+    Args:
+        checks: all that were made.
+        passed: what to say beside their number where none failed.
+    """
+    failed = [str(check) for check in checks if not check.passed]
+    if not failed:
+        return f"passed, all {len(checks)} checks: {passed}"
+    return f"FAILED, {len(failed)} of {len(checks)} checks: {'; '.join(failed)}"
+
+
+def markdown(title: str, checks: Sequence[Check]) -> str:
+    """The verdict as a table for a job's summary page."""
+    verdict = "passed" if all(check.passed for check in checks) else "FAILED"
+    lines = [f"## {title}: {verdict}", "", "| check | found | allowed | |", "|---|---|---|---|"]
+    for check in checks:
+        cells = check.name, check.found.replace("|", "\\|"), check.allowed, "ok" if check.passed else "**failed**"
+        lines.append(f"| {' | '.join(cells)} |")
+    return _escaped("\n".join(lines))
+
+
+def junit(title: str, checks: Sequence[Check]) -> str:
+    """The verdict as JUnit XML: a test case a check."""
+    suite = _suite(title, tests=len(checks), failures=sum(not check.passed for check in checks))
+    for check in checks:
+        case = ET.SubElement(suite, "testcase", classname=printable(title), name=check.name)
+        if not check.passed:
+            text = f"found {check.found}, allowed {check.allowed}"
+            ET.SubElement(case, "failure", message=text).text = text
+    return ET.tostring(suite, encoding="unicode") + "\n"
+
+
+def junit_error(title: str, error: BeersError) -> str:
+    """JUnit XML of what could not be judged: one test case, an error with the sentence that says why."""
+    suite = _suite(title, tests=1, errors=1)
+    case = ET.SubElement(suite, "testcase", classname=printable(title), name="input")
+    ET.SubElement(case, "error", message=str(error), type=type(error).__name__).text = str(error)
+    return ET.tostring(suite, encoding="unicode") + "\n"
+
+
+@dataclass(frozen=True)
+class Reports:
+    """The files in which a CI job wants a verdict; None for those that it does not want.
+
+    Attributes:
+        summary: Markdown, added to what other steps wrote there, as to $GITHUB_STEP_SUMMARY.
+        junit: JUnit XML, written anew.
+        outputs: lines NAME=VALUE, added to what stands there, as to $GITHUB_OUTPUT.
+    """
+
+    summary: Path | None
+    junit: Path | None
+    outputs: Path | None
+
+    def write(self, title: str, checks: Sequence[Check], figures: Mapping[str, float]) -> None:
+        """Write what is wanted; `figures` are the outputs beside the verdict.
+
+        Raises:
+            MachineError: a file cannot be written.
+        """
+        verdict = "passed" if all(check.passed for check in checks) else "failed"
+        _append(self.summary, f"\n{markdown(title, checks)}")
+        _append(self.outputs, "".join(f"{name}={value:.6g}\n" for name, value in figures.items()))
+        _append(self.outputs, f"verdict={verdict}\n")
+        if self.junit is not None:
+            write_text(self.junit, junit(title, checks))
+
+    @contextmanager
+    def of_bad_input(self, title: str) -> Iterator[None]:
+        """Tell bad input in these files too, then let it end the command.
+
+        Raises:
+            MachineError: a file cannot be written.
+        """
+        try:
+            require_writable(self.summary, self.junit, self.outputs)
+            yield
+        except BeersError as error:
+            self._tell(title, error)
+            raise
+
+    def _tell(self, title: str, error: BeersError) -> None:
+        """Each file by itself: one that cannot be written must hide neither what was wrong nor the others."""
+        with suppress(MachineError):
+            _append(self.summary, f"\n## {title}: not judged\n\n{_escaped(str(error))}")
+        with suppress(MachineError):
+            _append(self.outputs, "verdict=error\n")
+        if self.junit is not None:
+            with suppress(MachineError):
+                write_text(self.junit, junit_error(title, error))
+
+
+def _suite(title: str, **counts: int) -> ET.Element:
+    numbers = {"tests": 0, "failures": 0, "errors": 0, **counts}
+    return ET.Element(
+        "testsuite", name=printable(title), attrib={name: str(count) for name, count in numbers.items()}
+    )
+
+
+def _escaped(text: str) -> str:
+    """Markdown in which a name of a stranger's file opens no tag."""
+    return text.replace("<", "&lt;") + "\n"
+
+
+def _append(path: Path | None, text: str) -> None:
+    """Add to what other steps of a job wrote."""
+    if path is None:
+        return
+    require_regular(path)
+    try:
+        with path.open("a", encoding="utf-8", newline="\n") as stream:
+            stream.write(text)
+    except OSError as error:
+        got, remedy = error.strerror or str(error), "choose another path"
+        raise MachineError(str(path), expected="a file to add to", got=got, remedy=remedy) from error

@@ -1,130 +1,24 @@
-"""The one kind of document that commands write with --json: figures that say where they come from.
-
-A figure is measured (here), predicted (by a model, with an interval) or published (by a named document); what could
-not be had is unavailable, with the reason, and never a zero.
-"""
+"""The one kind of document that commands write with --json: rows of figures that say where they come from."""
 
 import json
-import math
 import platform
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
 
 from deploy import __version__
-from model.files import sha256, write_text
+from model.io.files import sha256, write_text
 from model.processor import decided, processor_name
-from quant.checks import Check
+from profiles.errors import visible
+from profiles.figures import Figure, Row
+from quant.gate import Check
 
 SCHEMA_NAME, SCHEMA_VERSION = "beers-deploy/results", 2
 SCHEMA_PATH = Path(__file__).parent / "schema" / "results-2.json"
-
-Mode = Literal["measured", "predicted", "published", "unavailable"]
-
-
-DIGITS = {"measured": 4, "predicted": 3, "published": 12, "unavailable": 4}
-"""Significant digits shown: a prediction deserves fewer, a published figure stays as printed."""
-
-NOT_FINITE = "the result is not a finite number"
-
-
-@dataclass(frozen=True)
-class Figure:
-    """A finite number with its unit, its mode and its source, or none and the reason why.
-
-    Raises:
-        ValueError: NaN or infinity, which no reader could tell from a result.
-    """
-
-    value: float | None
-    unit: str
-    mode: Mode
-    source: str = ""
-    interval: tuple[float, float] | None = None
-    reason: str = ""
-
-    def __post_init__(self) -> None:
-        if not all(math.isfinite(number) for number in (self.value or 0.0, *(self.interval or ()))):
-            raise ValueError(f"a figure that is not finite: {self.value} {self.interval or ''}")
-
-    def to_json(self) -> dict[str, object]:
-        """The figure as the schema wants it."""
-        if self.mode == "unavailable":
-            return {"value": None, "unit": self.unit, "mode": self.mode, "reason": self.reason}
-        interval = list(self.interval) if self.interval else None
-        return {
-            "value": self.value,
-            "unit": self.unit,
-            "mode": self.mode,
-            "interval": interval,
-            "source": self.source,
-        }
-
-    def __str__(self) -> str:
-        if self.value is None:
-            return "unavailable"
-        digits = DIGITS[self.mode]
-        text = number(self.value, digits)
-        if self.interval is None or self.interval[0] == self.interval[1]:  # plain arithmetic needs no interval
-            return text
-        return f"{text} [{number(self.interval[0], digits)}, {number(self.interval[1], digits)}]"
-
-
-def measured(value: float, unit: str, source: str, interval: tuple[float, float] | None = None) -> Figure:
-    """A number that this run observed on this machine, and how far a repetition might lie from it where known.
-
-    Unavailable where it is NaN or infinite; without an interval where that is.
-    """
-    if not math.isfinite(value):
-        return unavailable(unit, f"{NOT_FINITE} ({float(value)}): {source}")
-    known = interval if interval is not None and all(math.isfinite(end) for end in interval) else None
-    return Figure(float(value), unit, "measured", source, known)
-
-
-def predicted(value: float, unit: str, interval: tuple[float, float], source: str) -> Figure:
-    """A number that a model computed, and how far off it may be; unavailable where any of them is not finite."""
-    if not all(math.isfinite(number) for number in (value, *interval)):
-        return unavailable(unit, f"{NOT_FINITE} ({float(value)}): {source}")
-    return Figure(float(value), unit, "predicted", source, (float(interval[0]), float(interval[1])))
-
-
-def published(value: float, unit: str, source: str) -> Figure:
-    """A number that a document prints."""
-    return Figure(float(value), unit, "published", source)
-
-
-def unavailable(unit: str, reason: str) -> Figure:
-    """A number that could not be had."""
-    return Figure(None, unit, "unavailable", reason=reason)
-
-
-def number(value: float, digits: int) -> str:
-    """So many significant digits, thousands grouped, no exponent where a person would not write one."""
-    rounded = float(f"{value:.{digits}g}")
-    if abs(rounded) < 1000:
-        return f"{rounded:.{digits}g}"
-    decimals = max(digits - 1 - int(math.log10(abs(rounded))), 0)
-    text = f"{rounded:,.{decimals}f}"
-    return text.rstrip("0").rstrip(".") if decimals else text
-
-
-@dataclass(frozen=True)
-class Row:
-    """One line of a table: a name, its figures, and plain words beside them."""
-
-    table: str
-    name: str
-    figures: Mapping[str, Figure]
-    text: Mapping[str, str] = field(default_factory=dict)
-
-
-def by_table(rows: Iterable[Row]) -> dict[str, list[Row]]:
-    """The rows of each table, in the order in which the tables first appear."""
-    tables: dict[str, list[Row]] = {}
-    for row in rows:
-        tables.setdefault(row.table, []).append(row)
-    return tables
 
 
 @dataclass(frozen=True)
@@ -192,3 +86,102 @@ def _verdict(checks: tuple[Check, ...]) -> dict[str, object]:
 
 def _plain(value: object) -> object:
     return value if isinstance(value, str | int | float | bool | type(None)) else str(value)
+
+
+COLOURS = {"measured": "green", "predicted": "yellow", "published": "blue"}
+LEGEND = "measured: here; predicted: by a model, with its [interval]; published: in a document"
+PIPE_WIDTH = 200
+"""Columns when the output is no terminal: nothing is cut."""
+
+
+def print_rows(title: str, rows: Iterable[Row], console: Console | None = None) -> None:
+    """Print the rows of one table, reasons for missing figures below it.
+
+    One line a row; or, where there are more figures than rows, one line a figure.
+    """
+    rows = list(rows)
+    console = console or default_console()
+    keys = list(dict.fromkeys(key for row in rows for key in row.figures))
+    table = by_figure(rows, keys) if len(keys) > len(rows) else by_row(rows, keys)
+    table.title, table.title_justify = plain(title), "left"
+    console.print(table)
+    if keys:
+        console.print(LEGEND, style="dim", highlight=False, markup=False)
+    for reason in missing(rows):
+        console.print(plain(reason), style="dim")
+
+
+def default_console() -> Console:
+    """Standard output, wide enough for whole tables when it is a file or a pipe."""
+    console = Console()
+    return console if console.is_terminal else Console(width=PIPE_WIDTH)
+
+
+def plain(text: str) -> Text:
+    """Words as they are: no markup, and nothing that a terminal would obey, whatever a file held."""
+    return Text(visible(text))
+
+
+def by_row(rows: list[Row], keys: list[str]) -> Table:
+    """One line a row; the units in the header, and the mode where it is that of the whole column."""
+    table = Table("")
+    words = words_of(rows)
+    for key in keys:
+        mode = common_mode(key, rows)
+        unit = f"{unit_of(key, rows)}, {mode}" if mode else unit_of(key, rows)
+        table.add_column(plain(f"{key}\n({unit})"), justify="right")
+    for word in words:
+        table.add_column(plain(word), overflow="fold")
+    for row in rows:
+        figures = [cell(row.figures.get(key), common_mode(key, rows)) for key in keys]
+        table.add_row(plain(row.name), *figures, *(plain(row.text.get(word, "")) for word in words))
+    return table
+
+
+def by_figure(rows: list[Row], keys: list[str]) -> Table:
+    """One line a figure, the rows side by side; its mode in a column where it is that of them all."""
+    table = Table("", "unit", "mode")
+    for row in rows:
+        table.add_column(plain(row.name), justify="right", overflow="fold")
+    for key in keys:
+        mode = common_mode(key, rows)
+        figures = [cell(row.figures.get(key), mode) for row in rows]
+        table.add_row(plain(key), plain(unit_of(key, rows)), mode, *figures)
+    for word in words_of(rows):
+        table.add_row(plain(word), "", "", *(plain(row.text.get(word, "")) for row in rows))
+    return table
+
+
+def words_of(rows: list[Row]) -> list[str]:
+    """The names of the plain words beside figures."""
+    return list(dict.fromkeys(word for row in rows for word in row.text))
+
+
+def unit_of(key: str, rows: list[Row]) -> str:
+    """The unit of a column: that of its first figure."""
+    return next(row.figures[key].unit for row in rows if key in row.figures)
+
+
+def common_mode(key: str, rows: list[Row]) -> str:
+    """The mode of all figures of a column that there are; empty where they differ or none is there."""
+    modes = {row.figures[key].mode for row in rows if key in row.figures and row.figures[key].value is not None}
+    return modes.pop() if len(modes) == 1 else ""
+
+
+def cell(figure: Figure | None, said: str) -> Text:
+    """A figure, its mode behind it unless the table says it elsewhere; or nothing."""
+    if figure is None or figure.value is None:
+        return Text("" if figure is None else "-")
+    text = Text(str(figure), COLOURS[figure.mode])
+    return text if said else text.append(f" {figure.mode}")
+
+
+def missing(rows: list[Row]) -> list[str]:
+    """Why figures are unavailable: a line a reason."""
+    names: dict[tuple[str, str], list[str]] = {}
+    for row in rows:
+        for key, figure in row.figures.items():
+            if figure.value is None:
+                names.setdefault((key, figure.reason), []).append(row.name)
+    few = {place: ", ".join(found) if len(found) < len(rows) / 2 else "" for place, found in names.items()}
+    return [f"- {key}{f' of {few[key, reason]}' if few[key, reason] else ''}: {reason}" for key, reason in names]

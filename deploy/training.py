@@ -18,24 +18,21 @@ from deploy.defaults import draw_scenes
 from deploy.progress import Steps, steps
 from deploy.report.pictures import Stretch, busiest_windows, grid, strip_row
 from model.conditioning import Network
-from model.files import whole_file
-from model.images import list_images
-from model.metrics.backbone_files import find_backbone, not_found
+from model.io.files import whole_file
+from model.io.images import list_images
+from model.io.weights import N, is_told, load_network, load_told, variant_named, widen, widen_told
+from model.metrics.backbones import find_backbone, not_found
 from model.metrics.perceptual import Lpips
 from model.shipped import TOLD_SUFFIX
-from model.simulator.scene import Scene, read_scene
-from model.training.checkpoint import finish
+from model.simulator.sampling import Scene, read_scene
+from model.training.checkpoint import TrainingRecipe, finish
 from model.training.guards import require_finite_output
 from model.training.losses import RestorationLoss
-from model.training.patches import PatchRecipe, PatchSource
+from model.training.patches import PatchRecipe, PatchSource, StoredPairs, pair_files
 from model.training.precision import Precision
-from model.training.recipe import TrainingRecipe
-from model.training.stored_pairs import StoredPairs, pair_files
 from model.training.trainer import Progress, Schedule, Source, Trainer, new_network
 from model.training.validation import Validation, split_by_site
 from model.training.workers import Worker
-from model.weights_file import N, is_told, load_network, load_told, variant_named
-from model.widen import widen, widen_told
 from profiles.errors import OptionError
 
 STEP = re.compile(r"[0-9]{1,18}(?=,)")

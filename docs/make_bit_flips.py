@@ -8,12 +8,11 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from deploy.progress import steps
-from deploy.results import Row
-from deploy.stress.flip_picture import flip_curves_svg
-from deploy.stress.flip_study import FlipRequest, flip_rows, ticks
-from deploy.stress.page import markdown
+from deploy.stress.flip_study import FlipRequest, flip_curves_svg, flip_rows, ticks
+from deploy.stress.rows import markdown
 from deploy.stress.subject import open_subject
-from model.files import write_text
+from model.io.files import write_text
+from profiles.figures import Row
 
 HERE = Path(__file__).parent
 VARIANTS = ("convbeers-s", "convbeers")

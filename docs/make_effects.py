@@ -12,9 +12,8 @@ from PIL import Image
 
 from deploy.report.pictures import Stretch, strip
 from model.simulator.acquire import MARGIN_PX, prepare_scene, simulate_planned
-from model.simulator.bounds import scene_stats
-from model.simulator.draws import Draw
-from model.simulator.plan import Plan, make_plan
+from model.simulator.detector import Draw
+from model.simulator.plan import Plan, make_plan, scene_stats
 from model.simulator.procedural import procedural_scene
 from profiles import load_sensor
 from profiles.effects import TABLES, Effect, middle_effect
@@ -46,7 +45,7 @@ scene has their table (`profiles/effects.py` holds their parameters, `profiles/e
 picture they are stronger than typical, so that the eye can see them: {shown}.
 
 Order of the light: one transfer function for MTF, anti-alias filter and smear; sampling; then on the small grid veil,
-full well, PRNU, noise, gain, DSNU, striping, offset, defects, digitising (`model/simulator/detect.py`).
+full well, PRNU, noise, gain, DSNU, striping, offset, defects, digitising (`model/simulator/detector.py`).
 
 The anti-alias filter is part of the MTF's budget: the product has the MTF that the profile states, or the profile is
 refused. Motion smear comes on top, along the track only.
@@ -55,7 +54,7 @@ refused. Motion smear comes on top, along the track only.
 
 `simulate --explain` prints for each effect what is decided and why, before a pixel is made. A bound is the largest
 change that any pixel could see, in DN before digitising, proven from the scene's darkest and brightest radiance, its
-steepest step along the track and the kernels' sizes (`model/simulator/bounds.py`). What a scene cannot show is left
+steepest step along the track and the kernels' sizes (`model/simulator/plan.py`). What a scene cannot show is left
 out, {tolerance:g} DN for all such effects together.
 """
 

@@ -5,13 +5,13 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 from deploy.dpu.board import load_dpu
-from deploy.dpu.finding import Rule
+from deploy.dpu.checker.finding import Rule
+from deploy.dpu.checker.operators import NUMBERS, RULES, SHIFTS, SIZES, rule_name, rule_text
+from deploy.dpu.checker.other_rules import INSTEAD
+from deploy.dpu.checker.table import REMARKS
+from deploy.dpu.checker.traditional import judge_traditional, verdict
 from deploy.dpu.graph import Kind
-from deploy.dpu.operators import NUMBERS, RULES, SHIFTS, SIZES, rule_name, rule_text
-from deploy.dpu.other_rules import INSTEAD
 from deploy.dpu.reading import KINDS
-from deploy.dpu.remarks import REMARKS
-from deploy.dpu.traditional import judge_traditional, verdict
 
 TARGET = Path(__file__).parent / "operators.md"
 DPU = load_dpu()

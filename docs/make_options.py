@@ -16,7 +16,7 @@ from typing import Any, get_args, get_origin, get_type_hints
 from typer.main import get_command
 
 from deploy.cli import COMMANDS, app
-from deploy.cores import SEEDS
+from model.processor import SEEDS
 
 TARGET = Path(__file__).parent / "options.md"
 FILE, FOLDER = "file", "folder"

@@ -8,15 +8,13 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from deploy.progress import steps
-from deploy.results import Row
-from deploy.shipped import VARIANT
 from deploy.stress.battery import STAGES, run_battery
 from deploy.stress.cases import CASES
-from deploy.stress.limitations import LIMITATIONS
-from deploy.stress.page import markdown
-from deploy.stress.proofs import layer_rows, proof_rows
-from deploy.stress.rows import battery_rows, bound_rows, limitation_rows
+from deploy.stress.checks import LIMITATIONS
+from deploy.stress.rows import battery_rows, bound_rows, layer_rows, limitation_rows, markdown, proof_rows
 from deploy.stress.subject import open_subject
+from model.shipped import VARIANT
+from profiles.figures import Row
 
 TARGET = Path(__file__).parent / "stability.md"
 

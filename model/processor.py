@@ -5,6 +5,7 @@ none, and a runtime may not use what is there. So each question is a tiny comput
 put once a process, when somebody needs it.
 """
 
+import os
 import platform
 import subprocess
 import sys
@@ -13,6 +14,8 @@ from collections.abc import Callable
 from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING
+
+from profiles.errors import OptionError
 
 if TYPE_CHECKING:
     import numpy as np
@@ -171,3 +174,19 @@ def _windows_name() -> str:
         with winreg.OpenKey(winreg.HKEY_LOCAL_MACHINE, WINDOWS_KEY) as key:
             return str(winreg.QueryValueEx(key, "ProcessorNameString")[0])
     return ""
+
+
+SEEDS = 2**62
+"""The largest seed: torch takes one of 64 bits, and other draws of a run add to it."""
+
+
+def require_cores(option: str, asked: int) -> None:
+    """Refuse more threads or processes than this machine has logical cores; 0 is the option's own default.
+
+    Raises:
+        OptionError: more, or a number below 0.
+    """
+    cores = os.cpu_count() or 1
+    if not 0 <= asked <= cores:
+        expected = f"0 to {cores}, the cores of this machine"
+        raise OptionError(option, expected=expected, got=str(asked), remedy="leave it out for the default")

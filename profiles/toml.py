@@ -1,9 +1,131 @@
 """Find and read a profile: a shipped name, or the path of the user's own TOML file."""
 
+import json
+import math
+import stat
+import sys
+import tomllib
+from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 
 from profiles.errors import ProfileError
-from profiles.text import read_toml_text
+
+TOML_BYTES = 1 << 16
+"""The largest shipped profile takes a fifth of it."""
+JSON_BYTES = 1 << 26
+DEPTH = 32
+TOO_DEEP = f"more than {DEPTH} levels of nesting"
+LFS_POINTER = b"version https://git-lfs"
+LINE_DOTS = 100
+"""A line's dots may all be of one key: tomllib takes 4 s of processor time for one of 16 384 parts (measured)."""
+
+
+def read_toml_text(path: Path) -> dict[str, object]:
+    """A TOML file as plain values; it may say inf, nan, or a whole number of up to 2 000 digits.
+
+    Raises:
+        OSError: not readable.
+        ValueError: too large, no UTF-8, no TOML, nested too deeply, or with a longer number.
+    """
+    text = read_whole(path, TOML_BYTES).decode("utf-8-sig")  # some editors on Windows begin with a mark
+    if any(line.count(".") > LINE_DOTS for line in text.split("\n")):
+        raise ValueError(f"a line with more than {LINE_DOTS} dots")
+    try:
+        found = tomllib.loads(text)
+    except RecursionError:
+        raise ValueError(TOO_DEEP) from None
+    _check(found, 10**2000)
+    return found
+
+
+def read_json(path: Path) -> object:
+    """A JSON file as plain values.
+
+    Raises:
+        OSError: not readable.
+        ValueError: as of `parse_json`, or too large.
+    """
+    return parse_json(read_whole(path, JSON_BYTES).decode("utf-8-sig"))
+
+
+def parse_json(text: str) -> object:
+    """JSON as plain values.
+
+    Raises:
+        ValueError: no JSON, nested too deeply, or holding what cannot be computed with or printed: NaN, infinity,
+            numbers that float64 cannot hold, half a surrogate pair.
+    """
+    try:
+        found: object = json.loads(text, parse_constant=_number, parse_float=_number)
+    except RecursionError:
+        raise ValueError(TOO_DEEP) from None
+    _check(found, sys.float_info.max)
+    return found
+
+
+def read_whole(path: Path, limit_bytes: int) -> bytes:
+    """A file's bytes.
+
+    Raises:
+        OSError: not readable.
+        ValueError: too large, a pointer of Git LFS, or no file: a folder, a pipe or a device, which may have no end.
+    """
+    found = path.stat()
+    if reason := unreadable(path):
+        raise ValueError(reason)
+    if found.st_size > limit_bytes:
+        raise ValueError(f"more than {limit_bytes} bytes")
+    return path.read_bytes()
+
+
+def unreadable(path: Path) -> str | None:
+    """Why there is no file to be read at a path, in words for its user; None where there is one.
+
+    Git LFS leaves a pointer in place of each large file that was not fetched: 130 bytes of text under its name.
+    """
+    try:
+        mode = path.stat().st_mode
+    except FileNotFoundError:
+        return "no such file"
+    except OSError as error:  # such as a name that is too long
+        return error.strerror or str(error)
+    if not stat.S_ISREG(mode):
+        return "a folder" if stat.S_ISDIR(mode) else "no regular file"
+    with suppress(OSError), path.open("rb") as stream:
+        if stream.read(len(LFS_POINTER)) == LFS_POINTER:
+            return "a pointer of Git LFS in place of the file, which 'git lfs pull' fetches"
+    return None
+
+
+def _check(found: object, largest: float) -> None:
+    """Level by level, so that no depth is too deep to be measured."""
+    level = [found]
+    for _ in range(DEPTH):
+        level = [inner for value in level for inner in _inside(value, largest)]
+        if not level:
+            return
+    raise ValueError(TOO_DEEP)
+
+
+def _inside(value: object, largest: float) -> Iterator[object]:
+    if isinstance(value, dict):
+        yield from value
+        yield from value.values()
+    elif isinstance(value, list):
+        yield from value
+    elif isinstance(value, str):
+        value.encode()  # half a surrogate pair cannot be printed
+    elif isinstance(value, int) and abs(value) > largest:
+        raise ValueError("a whole number of hundreds of digits")
+
+
+def _number(text: str) -> float:
+    value = float(text)
+    if not math.isfinite(value):
+        raise ValueError(f"the number {text[:20]}")
+    return value
+
 
 HERE = Path(__file__).parent
 

@@ -5,28 +5,142 @@ grows neither with their number nor with their size.
 """
 
 import hashlib
-from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Generic, TypeVar
 
 import numpy as np
 import torch
+from torch import Tensor
 
-from model.simulator.acquire import acquire
-from model.simulator.draws import Draw
+from model.simulator.acquire import MARGIN_PX, acquire
+from model.simulator.detector import Draw
 from model.simulator.mtf import transfer_function
-from model.simulator.sampling import scene_spectrum
-from model.simulator.scene import Scene
+from model.simulator.sampling import Scene, scene_spectrum
 from model.training.patches import PatchRecipe, turn
+from profiles.errors import ImageError
 from profiles.sensor import Sensor, SensorProfile
-from quant.float_file import float_model
-from quant.graph import Graph, tensors
-from quant.pieces import halo_of, tensor_values
-from quant.planes import PLANES, POSITION
-from quant.positions import CANDIDATES, coarsest_position, squared_errors
-from quant.session import open_session
-from quant.strata import Ground, View, draw_views
+from quant.core import CANDIDATES, coarsest_position, squared_errors
+from quant.graph import PLANES, POSITION, Graph, float_model, tensors
+from quant.session import halo_of, open_session, tensor_values
+
+VIEW_CANDIDATES = 8
+"""Drawn for each that is wanted."""
+
+Candidate = TypeVar("Candidate")
+
+
+@dataclass(frozen=True)
+class Ground:
+    """A square of a scene, margin included, seen at one scale and in one light.
+
+    Attributes:
+        scene: it lies in.
+        top: its first row in scene pixels.
+        left: its first column.
+        side_px: its rows and columns, in target pixels.
+        oversampling: scene pixels per target pixel.
+        exposure: factor on the scene's radiance.
+    """
+
+    scene: Scene
+    top: int
+    left: int
+    side_px: int
+    oversampling: int
+    exposure: float
+
+    @property
+    def radiance(self) -> Tensor:
+        """In W/m2/sr/um, on the scene's grid: a square of side_px * oversampling."""
+        return self.exposure * self._part(1)
+
+    @cached_property
+    def brightness(self) -> float:
+        """Its mean radiance, to within what one scene pixel in each target pixel tells."""
+        return self.exposure * float(self._part(self.oversampling).mean())
+
+    def _part(self, step: int) -> Tensor:
+        side = self.side_px * self.oversampling
+        return self.scene.radiance[self.top : self.top + side : step, self.left : self.left + side : step]
+
+
+@dataclass(frozen=True)
+class View:
+    """One patch: the ground, and the two sensors that see it."""
+
+    ground: Ground
+    degraded: Sensor
+    reference: Sensor
+
+
+def draw_views(
+    scenes: Sequence[Scene], recipe: PatchRecipe, count: int, generator: np.random.Generator
+) -> list[View]:
+    """So many views, spread over brightness, MTF and noise.
+
+    A scene at a scale is drawn as often as it holds patches, as training sees it.
+
+    Raises:
+        ImageError: no scene holds a patch with its margin.
+    """
+    places = _places(scenes, recipe)
+    room = np.array([_room_px(*place) for place in places])
+    drawn = generator.choice(len(places), VIEW_CANDIDATES * count, p=room / room.sum())
+    grounds = [_ground(places[k], recipe, generator) for k in drawn]
+    sensors = [recipe.degraded.draw(generator) for _ in range(VIEW_CANDIDATES * count)]
+    dark = recipe.degraded.radiance_0.low
+    spread = zip(
+        stratified(grounds, lambda ground: ground.brightness, count, generator),
+        stratified(sensors, lambda sensor: sensor.mtf_nyquist, count, generator),
+        stratified(sensors, lambda sensor: sensor.noise_sigma(dark), count, generator),
+        strict=True,
+    )
+    return [
+        View(ground, _blurred_as(noisy, blurred), recipe.reference.draw(generator))
+        for ground, blurred, noisy in spread
+    ]
+
+
+def _blurred_as(sensor: Sensor, other: Sensor) -> Sensor:
+    return replace(sensor, mtf_nyquist=other.mtf_nyquist, mtf_nyquist_along=other.mtf_nyquist_along)
+
+
+def stratified(
+    candidates: Sequence[Candidate], key: Callable[[Candidate], float], count: int, generator: np.random.Generator
+) -> list[Candidate]:
+    """One of each of `count` equal groups of the candidates ordered by `key`, in random order."""
+    ranked, size = sorted(candidates, key=key), len(candidates) // count
+    chosen = [ranked[group * size + int(generator.integers(size))] for group in range(count)]
+    return [chosen[k] for k in generator.permutation(count)]
+
+
+def _places(scenes: Sequence[Scene], recipe: PatchRecipe) -> list[tuple[Scene, int]]:
+    """Scenes, each with every oversampling at which it holds a patch."""
+    side_px = recipe.patch_px + 2 * MARGIN_PX
+    fitting = [
+        (s, ratio) for s in scenes for ratio in recipe.oversamplings if min(s.radiance.shape) >= side_px * ratio
+    ]
+    if not fitting:
+        expected = f"scenes that hold a patch of {recipe.patch_px} target pixels and {MARGIN_PX} around it"
+        remedy = "give larger images or a smaller patch"
+        raise ImageError("calibration images", expected=expected, got="none large enough", remedy=remedy)
+    return fitting
+
+
+def _room_px(scene: Scene, oversampling: int) -> int:
+    """Target pixels of a scene within the margin."""
+    height, width = (size // oversampling - 2 * MARGIN_PX for size in scene.radiance.shape)
+    return height * width
+
+
+def _ground(place: tuple[Scene, int], recipe: PatchRecipe, generator: np.random.Generator) -> Ground:
+    scene, oversampling = place
+    side_px = recipe.patch_px + 2 * MARGIN_PX
+    top, left = (int(generator.integers(size - side_px * oversampling + 1)) for size in scene.radiance.shape)
+    return Ground(scene, top, left, side_px, oversampling, float(generator.uniform(*recipe.exposures)))
+
 
 PATCH_PX = 128
 DEGRADED = "degraded"
@@ -87,7 +201,7 @@ def draw_patches(
     seed: int,
     patch_px: int = PATCH_PX,
 ) -> Patches:
-    """Patches by sensor profile and seed, spread over the profile's ranges and over brightness: see `quant.strata`.
+    """Patches by sensor profile and seed, spread over the profile's ranges and over brightness.
 
     Raises:
         ImageError: no scene holds a patch.

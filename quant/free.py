@@ -1,29 +1,191 @@
 """INT8 for boards that are not the DPU: what its rules cost shows against what goes without them.
 
-As in `quant.quantise` only the correction is computed in int8, the image enters as planes, the residual stream has
-one scale, equalised channels and half steps at its end, weights are fitted to what they meet, and the correction has
-two gains. Gone are the DPU's rules: see `quant.free_file`. Float scales by themselves gain little: what rules in both
-is a residual stream of 8 bits.
+Activations uint8 with float scales, weights int8 with a scale of each output channel, both by least squares;
+written with the host file's integer kernels. What stays is the residual stream of 8 bits.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass
 
+import numpy as np
 import onnx
+from onnx import helper
 
 from quant.calibration import Patches
-from quant.float_reader import correction_graph
-from quant.free_file import Scale, free_model
-from quant.free_scales import tensor_scales
-from quant.graph import CORRECTION, Conv, Graph, tensors
-from quant.moments import Moments, input_moments
-from quant.onnx_file import fixed_tile_px, metadata
-from quant.passes.dual_gain import two_gains
+from quant.core import INT8_MAX
+from quant.encodings import MICROSOFT, ZERO, _HostWriter, _merge_gains, _split_planes
+from quant.graph import (
+    CORRECTION,
+    IMAGE,
+    PLANES,
+    POSITION,
+    Add,
+    Conv,
+    Graph,
+    correction_graph,
+    float_model,
+    read_planes,
+    tensors,
+)
+from quant.onnx_file import fixed_tile_px, image_info, make_model, metadata
 from quant.passes.equalise import channel_ranges, equalise, search, search_steps
-from quant.passes.half_steps import half_steps
-from quant.passes.steady_stream import STREAM_POSITION, stream_tensors
-from quant.planes import PLANES, POSITION, read_planes
-from quant.positions import INT8_MAX
+from quant.passes.fit_weights import Moments, fit, input_moments
+from quant.passes.stream import STREAM_POSITION, half_steps, stream_tensors, two_gains
 from quant.quantise import crop_costs, search_targets
+from quant.session import halo_of, open_session, tensor_values
+
+BINS = 4096
+"""Sixteen and more a step of an 8-bit number."""
+
+SHARES = np.linspace(0.3, 1.0, 71)
+"""Scales tried, as shares of the one that clips nothing."""
+
+
+@dataclass(frozen=True)
+class RoundedWeight:
+    """An int8 weight with one scale an output channel: (O, I, kh, kw) int8 in [-127, 127] and (O,) float32."""
+
+    values: np.ndarray
+    scales: np.ndarray
+
+
+def tensor_scales(
+    graph: Graph, levels: Mapping[str, int], images: Iterable[np.ndarray], tick: Callable[[], None]
+) -> dict[str, float]:
+    """The least-squares scale of each named tensor of a plane-reading graph.
+
+    Args:
+        graph: that reads the planes.
+        levels: names, and the largest whole number that the size of a value may take: 255, or 127 beside a sign.
+        images: (1, 1, H, W) float32 in [0, 1], passed over twice; one is in memory at a time.
+        tick: called once per image and pass.
+    """
+    names, halo_px = list(levels), halo_of(graph)
+    session = open_session(float_model(graph, names))
+
+    def sizes() -> Iterator[list[np.ndarray]]:
+        for image in images:
+            for results in tensor_values(session, names, image, halo_px):
+                yield [np.abs(r) for r in results]
+            tick()
+
+    largest = np.zeros(len(names))
+    for results in sizes():
+        largest = np.maximum(largest, [float(r.max()) for r in results])
+    largest[largest == 0] = 1  # a tensor that is always zero: any scale will do
+    counts = np.zeros((len(names), BINS + 1))
+    for results in sizes():
+        counts += [_counts(r, float(high)) for r, high in zip(results, largest, strict=True)]
+    return {
+        name: best_scale(count, float(high), levels[name])
+        for name, count, high in zip(names, counts, largest, strict=True)
+    }
+
+
+def best_scale(counts: np.ndarray, largest: float, levels: int) -> float:
+    """The scale of least squared error, of sizes counted at 0, largest / BINS, ... largest."""
+    sizes = np.linspace(0, largest, BINS + 1)
+    tried = SHARES * largest / levels
+    errors = [np.dot(counts, (np.minimum(np.rint(sizes / s), levels) * s - sizes) ** 2) for s in tried]
+    return float(tried[int(np.argmin(errors))])
+
+
+def round_weight(weight: np.ndarray, finest: np.ndarray) -> RoundedWeight:
+    """Each output channel at its own least-squares scale, but none below `finest` (O,); one of zeros at scale 1."""
+    rows = np.asarray(weight, np.float64).reshape(len(weight), -1)
+    scales = np.maximum(_row_scales(rows), finest).astype(np.float32)
+    return RoundedWeight(_whole(rows, scales).astype(np.int8).reshape(weight.shape), scales)
+
+
+def _row_scales(rows: np.ndarray) -> np.ndarray:
+    """(O,) for rows (O, n): a share at a time for all rows, because a search asks for it at every trial."""
+    largest = np.abs(rows).max(axis=1)
+    best, least = np.ones(len(rows)), np.full(len(rows), np.inf)
+    for share in SHARES:
+        tried = np.where(largest > 0, share * largest / INT8_MAX, 1.0)
+        error = np.square(_whole(rows, tried) * tried[:, None] - rows).sum(axis=1)
+        best, least = np.where(error < least, tried, best), np.minimum(error, least)
+    return best
+
+
+def _whole(rows: np.ndarray, scales: np.ndarray) -> np.ndarray:
+    return np.asarray(np.clip(np.rint(rows / scales[:, None]), -INT8_MAX, INT8_MAX))
+
+
+def _counts(sizes: np.ndarray, largest: float) -> np.ndarray:
+    places = np.rint(sizes.ravel() * np.float32(BINS / largest)).astype(np.int32)
+    return np.bincount(np.minimum(places, BINS), minlength=BINS + 1)
+
+
+MAX_BIAS = 2.0**30
+"""A channel of tiny weights keeps a scale at which its bias fits int32, beside the products."""
+
+
+@dataclass(frozen=True)
+class Scale:
+    """A uint8 tensor holds (value - zero_point) * unit."""
+
+    unit: float
+    zero_point: int = ZERO
+
+
+def free_model(
+    graph: Graph,
+    scales: Mapping[str, Scale],
+    about: dict[str, str],
+    tile_px: int | None = None,
+    moments: Mapping[str, Moments] | None = None,
+) -> onnx.ModelProto:
+    """The network on stock onnxruntime, (N, 1, H, W) float32 in [0, 1] to the same.
+
+    Args:
+        graph: that reads the planes, its correction with two gains.
+        scales: of every tensor, the planes included.
+        about: metadata.
+        tile_px: side of a fixed tile, or None for any size.
+        moments: of what each convolution reads, for `quant.passes.fit_weights`; None rounds to nearest.
+    """
+    writer = _HostWriter()
+    _split_planes(writer)
+    for op in graph:
+        if isinstance(op, Add):
+            feeds = [feed for name in op.inputs for feed in (name, *_scale(writer, scales[name]))]
+            feeds += _scale(writer, scales[op.output])
+            writer.node("QLinearAdd", op.output, feeds, name=op.name, domain=MICROSOFT)
+        else:
+            _conv(writer, op, scales, moments[op.name] if moments else None)
+    both = [CORRECTION, *_scale(writer, scales[CORRECTION])]
+    writer.node("DequantizeLinear", "host_back.both", both)
+    _merge_gains(writer, scales[CORRECTION].unit)
+    writer.node("Add", "host_back.add", [IMAGE, "host_back.correction"])
+    limits = [writer.scalar("zero", 0), writer.scalar("one", 1)]
+    writer.node("Clip", "restored", ["host_back.add", *limits], name="host_back.clip")
+    ends = [image_info(IMAGE, 1, tile_px)], [image_info("restored", 1, tile_px)]
+    whole = helper.make_graph(writer.nodes, "convbeers-int8-free", *ends, list(writer.weights.values()))
+    return make_model(whole, about, microsoft=True)
+
+
+def _conv(w: _HostWriter, op: Conv, scales: Mapping[str, Scale], moments: Moments | None) -> None:
+    weight = round_weight(op.weight, np.abs(op.bias) / (scales[op.input].unit * MAX_BIAS))
+    values, shifted = fit(op.weight, weight.values, weight.scales, moments) if moments else (weight.values, 0.0)
+    products = np.float32(scales[op.input].unit) * weight.scales.astype(np.float64)
+    bias = np.rint((op.bias - shifted) / products).astype(np.int32)
+    feeds = [op.input, *_scale(w, scales[op.input])]
+    feeds += [w.constant(f"{op.name}.weight", values), w.constant(f"{op.name}.weight_scale", weight.scales)]
+    feeds += [w.constant(f"{op.name}.weight_zero_point", np.zeros(len(op.weight), np.int8))]
+    feeds += [*_scale(w, scales[op.output]), w.constant(f"{op.name}.bias", bias)]
+    kernel, zero_point = list(op.weight.shape[2:]), scales[op.output].zero_point
+    clipped = op.relu and zero_point != 0
+    result = f"{op.output}.linear" if clipped else op.output
+    w.node("QLinearConv", result, feeds, name=op.name, pads=[op.pad_px] * 4, kernel_shape=kernel)
+    if clipped:
+        w.node("Max", op.output, [result, _scale(w, scales[op.output])[1]], name=f"{op.name}.relu")
+
+
+def _scale(w: _HostWriter, scale: Scale) -> list[str]:
+    unit = w.scalar(f"scale_{np.float32(scale.unit)!s}", scale.unit)
+    return [unit, w.constant(f"zero_point_{scale.zero_point}", np.array(scale.zero_point, np.uint8))]
+
 
 UINT8_MAX = 255
 STREAM_STEP = 2.0**-STREAM_POSITION

@@ -12,13 +12,15 @@ from dataclasses import dataclass, field
 from itertools import product
 
 import numpy as np
+import onnx
 from numpy.lib.stride_tricks import sliding_window_view
 
-from quant.core import IntConv, IntCore
-from quant.graph import CORRECTION, Add
-from quant.passes.dual_gain import merge
-from quant.planes import PLANES
-from quant.positions import INT8_MAX, INT8_MIN
+from quant.core import INT8_MAX, INT8_MIN, IntConv, IntCore
+from quant.encodings import ZERO
+from quant.graph import CORRECTION, PLANES, Add, split
+from quant.onnx_file import any_size, with_outputs
+from quant.passes.stream import merge
+from quant.session import open_session
 
 INT32_BITS = 31
 """Of an accumulator, without the sign."""
@@ -160,3 +162,50 @@ def _shifted(sums: np.ndarray, shift: int, half_even: bool) -> tuple[np.ndarray,
     if half_even:
         rounded = rounded - (ties & (rounded % 2 == 1))
     return np.clip(rounded, INT8_MIN, INT8_MAX).astype(np.int16), float(ties.mean())
+
+
+@dataclass(frozen=True)
+class LayerAgreement:
+    """One operation's results, computed three times.
+
+    Attributes:
+        report: of the integer reference, which rounds halves up, as the DPU does.
+        unequal: share of onnxruntime's results that are not the reference's when that rounds halves to even.
+        moved: share of the results that the DPU's rule changes, here or in a layer before.
+        moved_by: the largest of these changes, in units of 2^-position.
+    """
+
+    report: LayerReport
+    unequal: float
+    moved: float
+    moved_by: int
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """All operations in order, and the correction (N, 1, H, W) of full scale with halves up, and to even."""
+
+    layers: list[LayerAgreement]
+    up: np.ndarray
+    even: np.ndarray
+
+
+def agreement(core: IntCore, host: onnx.ModelProto, image: np.ndarray) -> Agreement:
+    """Run the core by both rules and in onnxruntime.
+
+    Args:
+        core: whole numbers.
+        host: the same in the host's spelling.
+        image: (N, 1, H, W) in [0, 1].
+    """
+    names = [op.output for op in core.ops]
+    session = open_session(with_outputs(any_size(host), dict.fromkeys(names, onnx.TensorProto.UINT8)))
+    stored = session.run(names, {session.get_inputs()[0].name: image})
+    up, reports = run_core(core, split(image))
+    even, _ = run_core(core, split(image), half_even=True)
+    layers = []
+    for name, report, runtime in zip(names, reports, stored, strict=True):
+        difference = np.abs(up[name] - even[name])
+        unequal = float((runtime.astype(np.int16) - ZERO != even[name]).mean())
+        layers.append(LayerAgreement(report, unequal, float((difference > 0).mean()), int(difference.max())))
+    return Agreement(layers, merged_correction(core, up), merged_correction(core, even))

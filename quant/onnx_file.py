@@ -8,11 +8,10 @@ import onnx
 from google.protobuf.message import DecodeError
 from onnx import numpy_helper
 
-from model.files import whole_file
+from model.io.files import whole_file
 from profiles.errors import ModelError
-from profiles.text import read_whole, unreadable
-from quant.runnable import check_runnable
-from quant.untrusted import FILE_BYTES, check_content
+from profiles.toml import read_whole, unreadable
+from quant.untrusted import FILE_BYTES, check_content, check_runnable
 
 OPSET = 17
 IR_VERSION = 8
@@ -30,7 +29,7 @@ def load_onnx(path: Path, to_run: bool = True) -> onnx.ModelProto:
 
     Raises:
         ModelError: missing, empty, not ONNX, of weights that are not finite, or not to be trusted (see
-            `quant.untrusted` and `quant.runnable`).
+            `quant.untrusted` and `quant.untrusted`).
     """
     if path.suffix == ".safetensors":
         remedy = "export it first: beers-deploy export --checkpoint FILE --out FILE.onnx"

@@ -8,24 +8,25 @@ from dataclasses import asdict, dataclass
 import numpy as np
 import onnx
 
-from quant.board_file import board_model
 from quant.calibration import Patches, Remade, choose_positions
-from quant.core import IntCore, build_core
-from quant.float_file import float_model
-from quant.float_reader import correction_graph
-from quant.graph import CORRECTION, Conv, Graph, relu_count, tensors
-from quant.host_file import host_model
-from quant.moments import input_moments
+from quant.core import SHIFTS, IntCore, Shifts, build_core
+from quant.encodings import board_model, host_model
+from quant.graph import (
+    CORRECTION,
+    Conv,
+    Graph,
+    coarse_plane_only,
+    correction_graph,
+    float_model,
+    read_planes,
+    relu_count,
+    tensors,
+)
 from quant.onnx_file import fixed_tile_px, metadata
-from quant.passes.dual_gain import two_gains
 from quant.passes.equalise import Costs, channel_ranges, equalise, search, search_steps
-from quant.passes.fit_weights import fit_weights
-from quant.passes.half_steps import half_steps
-from quant.passes.steady_stream import STREAM_POSITION, common_position, steady, stream_tensors
-from quant.pieces import crops, tensor_values
-from quant.planes import coarse_plane_only, read_planes
-from quant.positions import SHIFTS, Shifts
-from quant.session import open_session, run
+from quant.passes.fit_weights import fit_weights, input_moments
+from quant.passes.stream import STREAM_POSITION, common_position, half_steps, steady, stream_tensors, two_gains
+from quant.session import crops, open_session, run, tensor_values
 
 SEARCH_CROPS = 16
 """What the equalisation is searched on, a quarter of them with the strongest edges: there int8 clips."""
@@ -33,7 +34,7 @@ SEARCH_CROPS = 16
 
 @dataclass(frozen=True)
 class Passes:
-    """What is done beyond rounding each tensor: see `quant.passes`, `quant.planes` and `quant.positions`."""
+    """What is done beyond rounding each tensor: see `quant.passes`, `quant.graph` and `quant.core`."""
 
     fine_planes: bool = True
     least_squares: bool = True

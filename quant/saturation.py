@@ -2,7 +2,7 @@
 
 Looked at is whatever a node rounds to 8 bits, in any spelling (integer kernels or QDQ), as the graph is written. Two
 ends are no loss: the lower one where it stands for zero or where a ReLU reads it, for that is the ReLU, and those of
-the fine gain, which the coarse one is there for (`quant.passes.dual_gain`).
+the fine gain, which the coarse one is there for (`quant.passes.stream`).
 """
 
 from collections.abc import Iterable
@@ -17,7 +17,7 @@ from quant.session import open_session, tensors_of
 from quant.untrusted import contradictions
 
 ZERO_POINTS = {"QuantizeLinear": 2, "QLinearConv": 7, "QLinearAdd": 7, "QLinearMatMul": 7}
-"""ONNX's and onnxruntime's operators that round to 8 bits, of those that may run (`quant.runnable`), and which input
+"""ONNX's and onnxruntime's operators that round to 8 bits, of those that may run (`quant.untrusted`), and which input
 holds the zero point of their result."""
 
 RELUS = ("Relu", "Max")

@@ -10,9 +10,9 @@ from deploy.commands.saying import say
 from deploy.commands.unasked import refuse
 
 if TYPE_CHECKING:
-    from deploy.bench import Swath
+    from deploy.bench.tables import Swath
     from deploy.dpu.board import Dpu
-    from deploy.results import Row
+    from profiles.figures import Row
 
 EXAMPLE = "bench --target vck190-model --size 13600x9016 --config C32B3"
 
@@ -53,13 +53,13 @@ def bench(
     json: Annotated[Path | None, typer.Option(help="Write the figures here.")] = None,
 ) -> None:
     """Compare a network on the DPU with the traditional pipeline on this CPU and with the paper's figures."""
-    from deploy.bench_sweep import parse_tiles
-    from deploy.measure import host_rows
-    from deploy.results import Document, by_table
-    from deploy.shipped import int8_file
-    from deploy.tables import print_rows
-    from model.files import require_writable
+    from deploy.bench.host import host_rows
+    from deploy.bench.tables import parse_tiles
+    from deploy.results import Document, print_rows
+    from model.io.files import require_writable
+    from model.shipped import int8_file
     from profiles import load_target
+    from profiles.figures import by_table
 
     path, tiles, here = int8_file(model), parse_tiles(tile), _is_host(target)
     _refuse_unused(context, here)
@@ -110,11 +110,11 @@ class _Request:
 
 
 def _on_the_board(path: Path, request: _Request, budget_s: float) -> "list[Row]":
-    from deploy.bench import published_rows
-    from deploy.measure import Sensors, drawn_acquisition, traditional_rows
-    from deploy.restore import read_acquisition
-    from deploy.shipped import SENSOR
-    from deploy.tables import print_rows
+    from deploy.bench.host import Sensors, drawn_acquisition, traditional_rows
+    from deploy.bench.tables import published_rows
+    from deploy.restoration.arrays import read_acquisition
+    from deploy.results import print_rows
+    from model.shipped import SENSOR
     from profiles.sensor import REFERENCE, load_sensor
 
     sensors = Sensors(load_sensor(SENSOR), load_sensor(REFERENCE))
@@ -131,8 +131,8 @@ def _on_the_board(path: Path, request: _Request, budget_s: float) -> "list[Row]"
 
 def _single_rows(path: Path, dpu: "Dpu", swath: "Swath") -> "tuple[list[Row], list[Row]]":
     """The rows of the swath and of the layers, these printed."""
-    from deploy.bench import layer_rows, predict_file, predicted_rows
-    from deploy.tables import print_rows
+    from deploy.bench.tables import layer_rows, predict_file, predicted_rows
+    from deploy.results import print_rows
 
     prediction = predict_file(path, dpu, swath.tile_px)
     layers = layer_rows(prediction, dpu)
@@ -145,8 +145,8 @@ def _single_rows(path: Path, dpu: "Dpu", swath: "Swath") -> "tuple[list[Row], li
 
 def _sweep(path: Path, boards: "list[Dpu]", tiles_px: list[int], swath: "Swath") -> "tuple[list[Row], list[Row]]":
     """No rows of one swath, but those of the sweep, printed."""
-    from deploy.bench_sweep import sweep_rows
-    from deploy.tables import print_rows
+    from deploy.bench.tables import sweep_rows
+    from deploy.results import print_rows
 
     rows = sweep_rows(path, swath, boards, tiles_px)
     size = f"{swath.width_px} x {swath.height_px} pixels"
@@ -157,8 +157,8 @@ def _sweep(path: Path, boards: "list[Dpu]", tiles_px: list[int], swath: "Swath")
 def _boards(request: _Request) -> "tuple[list[Dpu], list[Row]]":
     """The configurations asked for; their constants refitted where runs are given, and the rows that say so."""
     from deploy.dpu.board import load_dpu
-    from deploy.refit import refit
-    from deploy.tables import print_rows
+    from deploy.dpu.cost.validation import refit
+    from deploy.results import print_rows
     from profiles import load_target
 
     names = list(load_target("vck190").configurations) if request.config == "all" else [request.config]
@@ -183,8 +183,8 @@ def _single(tiles: list[int]) -> int:
 
 
 def _swath(path: Path, shape: tuple[int, ...] | None, request: _Request) -> "Swath":
-    from deploy.bench import Swath
-    from deploy.restore import parse_halo
+    from deploy.bench.tables import Swath
+    from deploy.restoration.arrays import parse_halo
     from quant.onnx_file import load_onnx
     from quant.radius import receptive_radius_px
 

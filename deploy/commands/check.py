@@ -41,9 +41,9 @@ def check(
 ) -> None:
     """Place every node of a network on the host, the DPU or the CPU; exit code 1 if the DPU cannot run its part."""
     from deploy.dpu.board import load_dpu
-    from deploy.dpu.picture import require_picture
-    from deploy.shipped import int8_file
-    from model.files import require_writable
+    from deploy.dpu.checker.table import require_picture
+    from model.io.files import require_writable
+    from model.shipped import int8_file
 
     if model == TRADITIONAL:
         remedy = "leave the option out, or give a network"
@@ -58,13 +58,11 @@ def check(
 
 def _network(path: Path, dpu: "Dpu", tile: int | None, picture: Path | None, json: Path | None) -> bool:
     """Judge a file; whether its core runs whole on the DPU."""
-    from deploy.dpu.checking import legality, network_rows, summary
-    from deploy.dpu.picture import write_picture
-    from deploy.dpu.placement import place
+    from deploy.dpu.checker.placement import place
+    from deploy.dpu.checker.table import legality, network_rows, summary, write_picture
     from deploy.dpu.reading import network_of, own_tile_px
-    from deploy.results import Document
-    from deploy.tables import print_rows
-    from quant.float_reader import refusal
+    from deploy.results import Document, print_rows
+    from quant.graph import refusal
     from quant.onnx_file import load_onnx
 
     model = load_onnx(path, to_run=False)
@@ -84,10 +82,9 @@ def _network(path: Path, dpu: "Dpu", tile: int | None, picture: Path | None, jso
 
 def _traditional(dpu: "Dpu", json: Path | None) -> bool:
     """Judge the operators of the traditional chain; whether the DPU could run them all."""
-    from deploy.dpu.checking import step_legality, step_rows
-    from deploy.dpu.traditional import judge_traditional, verdict
-    from deploy.results import Document
-    from deploy.tables import print_rows
+    from deploy.dpu.checker.table import step_legality, step_rows
+    from deploy.dpu.checker.traditional import judge_traditional, verdict
+    from deploy.results import Document, print_rows
 
     steps = judge_traditional(dpu)
     rows = [row for step in steps for row in step_rows(step)]

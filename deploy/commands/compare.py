@@ -28,9 +28,8 @@ def compare(
     """
     from deploy.compare import broken, change_rows, parse_limit, read_document
     from deploy.compare import compare as compare_documents
-    from deploy.results import Document
-    from deploy.tables import print_rows
-    from model.files import require_writable
+    from deploy.results import Document, print_rows
+    from model.io.files import require_writable
 
     require_writable(json, inputs=(before, after))
     limits = [parse_limit(text) for text in fail_on or ()]

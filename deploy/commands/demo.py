@@ -6,8 +6,8 @@ from typing import Annotated
 import typer
 
 from deploy.commands.saying import say
-from deploy.cores import SEEDS
-from deploy.shipped import SENSOR
+from model.processor import SEEDS
+from model.shipped import SENSOR
 
 EXAMPLE = "demo --out demo"
 
@@ -28,9 +28,8 @@ def demo(
     """Simulate, quantise, gate, check, restore and predict, on a drawn scene or your image; ends with report.html."""
     from deploy.demo import FILES, run_demo
     from deploy.report.page import write_report
-    from deploy.results import Document
-    from deploy.tables import print_rows
-    from model.files import require_writable
+    from deploy.results import Document, print_rows
+    from model.io.files import require_writable
     from profiles.errors import OptionError
 
     if full_scale is not None and image is None:

@@ -6,8 +6,8 @@ from typing import Annotated
 import typer
 
 from deploy.commands.saying import say
-from deploy.cores import SEEDS
-from deploy.shipped import SENSOR
+from model.processor import SEEDS
+from model.shipped import SENSOR
 
 EXAMPLE = "evaluate --images aerial/ --methods degraded,traditional,convbeers-s,convbeers-s-int8 --out report/"
 
@@ -47,17 +47,15 @@ def evaluate(
     """
     from deploy.evaluation.methods import method_named
     from deploy.evaluation.page import evaluation_report, pictures
-    from deploy.evaluation.pairs import oversampling_note
-    from deploy.evaluation.perceptual import perceptual_distances
-    from deploy.evaluation.recipe import profiles_for, read_pairs_recipe
+    from deploy.evaluation.pairs import oversampling_note, profiles_for, read_pairs_recipe
     from deploy.evaluation.run import evaluate_methods, input_files, load_pairs, sweep_tables
-    from deploy.evaluation.scores import Instruments
+    from deploy.evaluation.scores import Instruments, perceptual_distances
     from deploy.report.page import write_report
-    from deploy.results import Document, by_table
-    from deploy.tables import print_rows
-    from model.files import require_writable
+    from deploy.results import Document, print_rows
+    from model.io.files import require_writable
     from model.metrics.bootstrap import LEAST_SITES
     from profiles.errors import OptionError
+    from profiles.figures import by_table
 
     if pairs is not None and (images is not None or sweep):
         expected = "no --images or --sweep beside it: pairs are as they are"

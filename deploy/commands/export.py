@@ -7,7 +7,7 @@ import typer
 
 from deploy.commands.saying import say
 from deploy.commands.unasked import refuse
-from deploy.shipped import VARIANT
+from model.shipped import VARIANT
 
 EXAMPLE = "export --variant convbeers-s --out float.onnx"
 
@@ -35,9 +35,8 @@ def export(
     """
     from deploy.defaults import about
     from deploy.export import network_for, require_parity, to_onnx
-    from deploy.shipped import float_file
-    from model.files import require_writable
-    from model.shipped import shipped_weights
+    from model.io.files import require_writable
+    from model.shipped import float_file, shipped_weights
     from quant.onnx_file import save_onnx
 
     if checkpoint is not None:

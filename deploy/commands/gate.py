@@ -8,8 +8,8 @@ import typer
 from typer.core import TyperCommand
 
 from deploy.commands.saying import say
-from deploy.cores import SEEDS
-from deploy.shipped import SENSOR
+from model.processor import SEEDS
+from model.shipped import SENSOR
 
 EXAMPLE = "gate float.onnx int8.onnx --max-mae 0.0007"
 UsageError: type[Exception] = typer.BadParameter.__bases__[0]
@@ -31,8 +31,8 @@ class GateCommand(TyperCommand):
 
 def _tell_usage(words: list[str], message: str) -> None:
     """Write the reports that the words ask for, but over nothing that another word may mean."""
-    from deploy.verdict import Reports
-    from model.files import claim_outputs
+    from deploy.gate import Reports
+    from model.io.files import claim_outputs
     from profiles.errors import BeersError, OptionError
 
     plain = [part for word in words for part in (word.split("=", 1) if word.startswith("--") else [word])]
@@ -80,11 +80,10 @@ def gate(
     Also checked: what saturates inside, the DPU's rules, that no ReLU was lost, and that onnxruntime's optimisations
     change no bit.
     """
-    from deploy.gate import Request, files_or_shipped, run_gate
-    from deploy.tables import print_rows
-    from deploy.verdict import Reports, sentence
-    from model.files import claim_outputs, require_writable
-    from quant.limits import read_limits
+    from deploy.gate import Reports, Request, files_or_shipped, run_gate, sentence
+    from deploy.results import print_rows
+    from model.io.files import claim_outputs, require_writable
+    from quant.gate import read_limits
 
     read = (float_model, int8_model, config, baseline, images, *map(Path, (target, sensor)))
     claim_outputs(json, junit, summary, outputs, inputs=read)  # before bad input is told there

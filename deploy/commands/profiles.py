@@ -30,7 +30,7 @@ def profiles(
         return
     from rich.table import Table
 
-    from deploy.tables import default_console, plain
+    from deploy.results import default_console, plain
     from profiles import load_sensor, load_target, sensor_names, target_names
     from profiles.scene_call import load_scene_call, scene_names
 
@@ -56,7 +56,7 @@ def profiles(
 
 def _file_text(name: str | None) -> str:
     """The TOML of a profile that can be read as one."""
-    from deploy.shipped import SENSOR
+    from model.shipped import SENSOR
     from profiles import sensor_names
     from profiles.errors import OptionError
     from profiles.scene_call import scene_names

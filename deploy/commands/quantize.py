@@ -7,8 +7,8 @@ from typing import Annotated
 import typer
 
 from deploy.commands.saying import say
-from deploy.cores import SEEDS
-from deploy.shipped import SENSOR
+from model.processor import SEEDS
+from model.shipped import SENSOR
 
 EXAMPLE = "quantize float.onnx --target vck190 --sensor pleiades-degraded --out int8.onnx"
 
@@ -51,7 +51,7 @@ def quantize(
     Prints each integer layer: bits of its accumulator, seen and proven, and the share of saturated results.
     """
     from deploy.defaults import float_model
-    from deploy.quantising import (
+    from deploy.quantise import (
         Calibration,
         Wanted,
         passes_without,
@@ -59,8 +59,8 @@ def quantize(
         quantise_legal_file,
     )
     from deploy.results import Document
-    from deploy.shipped import float_file
-    from model.files import require_writable
+    from model.io.files import require_writable
+    from model.shipped import float_file
     from profiles import load_target
     from profiles.errors import OptionError
 

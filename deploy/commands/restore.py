@@ -8,7 +8,7 @@ import typer
 
 from deploy.commands.saying import say
 from deploy.commands.unasked import refuse
-from deploy.swath.options import TILE_PX, Compression, Options, Runtime
+from deploy.restoration.options import TILE_PX, Compression, Options, Runtime
 
 EXAMPLE = "restore raw.tif restored.tif"
 NETWORK_ONLY = ("model", "tile", "halo", "resume", "runtime", "threads", "workers", "scheduler")
@@ -66,11 +66,10 @@ def restore(
     .OUT.part beside it. Workers change no pixel: where they are of one processor and the same versions, the bytes are
     those of one process. Those of a scheduler must find IN under its path; only this process writes.
     """
-    from deploy.results import Document
-    from deploy.shipped import int8_file
-    from deploy.swath.run import restore_file
-    from deploy.tables import print_rows
-    from model.files import require_writable
+    from deploy.restoration.run import restore_file
+    from deploy.results import Document, print_rows
+    from model.io.files import require_writable
+    from model.shipped import int8_file
     from profiles.errors import OptionError
 
     budget_bytes = max(int(memory * 1e9), 1) if memory else None
@@ -115,9 +114,8 @@ def _by_the_chain(
     memory_bytes: int | None,
     json: Path | None,
 ) -> None:
-    from deploy.results import Document
-    from deploy.swath.traditional import Request, restore_file_traditionally
-    from deploy.tables import print_rows
+    from deploy.restoration.traditional import Request, restore_file_traditionally
+    from deploy.results import Document, print_rows
     from profiles import load_sensor
     from profiles.errors import OptionError
     from profiles.sensor import reference_for

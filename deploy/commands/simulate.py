@@ -8,8 +8,8 @@ import typer
 
 from deploy.commands.saying import say
 from deploy.commands.unasked import refuse
-from deploy.cores import SEEDS
-from deploy.shipped import SENSOR
+from model.processor import SEEDS
+from model.shipped import SENSOR
 
 if TYPE_CHECKING:
     from model.simulator.plan import Plan
@@ -79,11 +79,10 @@ def simulate(
     import os
 
     from deploy.cluster import check_choice
-    from deploy.dataset import write_dataset
-    from deploy.dataset_patches import DatasetRecipe, plan_windows
+    from deploy.dataset import DatasetRecipe, plan_windows, write_dataset
     from deploy.defaults import reference_beside
     from deploy.progress import steps
-    from model.files import require_writable
+    from model.io.files import require_writable
     from profiles import load_sensor
     from profiles.errors import OptionError
     from profiles.scene_call import calling_for, load_scene_call
@@ -139,9 +138,9 @@ def _preset(name: str | None) -> Preset:
 
 def _explain(recipe: object) -> None:
     """The plan of the first draw of the degraded sensor, for every scene."""
-    from deploy.dataset_patches import DatasetRecipe, load
+    from deploy.dataset import DatasetRecipe, load
     from model.simulator.acquire import prepare_scene
-    from model.simulator.draws import Draw
+    from model.simulator.detector import Draw
     from model.simulator.plan import make_plan
 
     assert isinstance(recipe, DatasetRecipe)  # noqa: S101 - imported late, for a quick --help
@@ -156,7 +155,7 @@ def _explain(recipe: object) -> None:
 def _print_plan(title: str, plan: "Plan") -> None:
     from rich.table import Table
 
-    from deploy.tables import default_console, plain
+    from deploy.results import default_console, plain
 
     table = Table("effect", "decision", "why", "bound DN", "cost", title=plain(title), title_justify="left")
     for d in plan.decisions:

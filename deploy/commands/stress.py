@@ -7,8 +7,8 @@ import typer
 
 from deploy.commands.saying import say
 from deploy.commands.unasked import refuse
-from deploy.cores import SEEDS
-from deploy.shipped import SENSOR, VARIANT
+from model.processor import SEEDS
+from model.shipped import SENSOR, VARIANT
 
 if TYPE_CHECKING:
     from deploy.stress.flip_study import FlipRequest
@@ -61,16 +61,24 @@ def stress(
     these cost on the board.
     """
     from deploy.progress import steps
-    from deploy.results import Document, by_table
+    from deploy.results import Document, print_rows
     from deploy.stress.battery import STAGES, chosen, run_battery
     from deploy.stress.cases import CASES
     from deploy.stress.flip_study import FlipRequest
-    from deploy.stress.page import markdown, title
-    from deploy.stress.proofs import layer_rows, overflow_proven, proof_rows
-    from deploy.stress.rows import battery_rows, bound_rows, finding_rows, limitation_rows
+    from deploy.stress.rows import (
+        battery_rows,
+        bound_rows,
+        finding_rows,
+        layer_rows,
+        limitation_rows,
+        markdown,
+        overflow_proven,
+        proof_rows,
+        title,
+    )
     from deploy.stress.subject import open_subject
-    from deploy.tables import print_rows
-    from model.files import require_writable, write_text
+    from model.io.files import require_writable, write_text
+    from profiles.figures import by_table
 
     _refuse_unused(context, float_model, bit_flips)
     picture = _picture_beside(out, json) if bit_flips else None
@@ -127,12 +135,11 @@ def _flip_bits(
     from dataclasses import asdict
 
     from deploy.progress import steps
-    from deploy.results import Document, by_table
-    from deploy.stress.flip_picture import flip_curves_svg
-    from deploy.stress.flip_study import flip_rows, ticks
-    from deploy.stress.page import markdown, title
-    from deploy.tables import print_rows
-    from model.files import write_text
+    from deploy.results import Document, print_rows
+    from deploy.stress.flip_study import flip_curves_svg, flip_rows, ticks
+    from deploy.stress.rows import markdown, title
+    from model.io.files import write_text
+    from profiles.figures import by_table
 
     out, picture, json = wanted
     with steps("turning bits over", ticks(subject, request)) as bar:

@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from deploy.commands.saying import say
-from deploy.cores import SEEDS
-from deploy.shipped import SENSOR
+from model.processor import SEEDS
+from model.shipped import SENSOR
 
 if TYPE_CHECKING:
     from deploy.tradeoff.study import Study
@@ -56,13 +56,13 @@ def tradeoff(
     """
     from deploy.commands.bench import parse_size
     from deploy.defaults import reference_beside
-    from deploy.report.tradeoff_page import FILES, write_study
     from deploy.results import Document
     from deploy.tradeoff.cache import Cache
-    from deploy.tradeoff.demands import parse_demands
-    from deploy.tradeoff.request import Request
+    from deploy.tradeoff.page import FILES, write_study
+    from deploy.tradeoff.points import parse_demands
     from deploy.tradeoff.run import run_study
-    from model.files import require_writable
+    from deploy.tradeoff.selection import Request
+    from model.io.files import require_writable
     from model.shipped import shipped_names
     from profiles.sensor import REFERENCE, load_sensor
 
@@ -99,8 +99,8 @@ def tradeoff(
 
 def show(study: "Study") -> None:
     """The most important figures, and what they mean."""
-    from deploy.results import Row
-    from deploy.tables import print_rows
+    from deploy.results import print_rows
+    from profiles.figures import Row
 
     rows = [
         Row(r.table, r.name, {key: r.figures[key] for key in SHOWN}, {"told": r.text["told"]}) for r in study.points

@@ -7,7 +7,7 @@ import typer
 
 from deploy.commands.saying import say
 from deploy.commands.unasked import refuse
-from deploy.cores import SEEDS
+from model.processor import SEEDS
 
 EXAMPLE = "train --variant convbeers-s --images aerial/ --out runs/s --steps 20000"
 RANGE = "pleiades-variable"
@@ -71,16 +71,16 @@ def train(
     """
     from typing import get_args
 
-    from deploy.evaluation.recipe import profiles_for, read_pairs_recipe
-    from deploy.shipped import float_file
+    from deploy.evaluation.pairs import profiles_for, read_pairs_recipe
     from deploy.training import FILES, Run, weights_name
     from deploy.training import train as run_training
     from model.conditioning import SensorFamily
-    from model.files import require_writable
+    from model.io.files import require_writable
+    from model.shipped import float_file
+    from model.training.checkpoint import Optimiser, TrainingRecipe
     from model.training.losses import LossWeights
     from model.training.patches import PatchRecipe
     from model.training.precision import Precision
-    from model.training.recipe import Optimiser, TrainingRecipe
     from model.training.workers import joined
     from profiles.errors import OptionError
 

@@ -13,9 +13,8 @@ from pathlib import Path
 import onnx
 from onnx import TensorProto, helper, numpy_helper
 
-from deploy.dpu.graph import Kind, Network, Operation, Shape, Window
+from deploy.dpu.graph import Kind, Network, Operation, Shape, Window, out_shape, padding
 from deploy.dpu.integers import Integers
-from deploy.dpu.shapes import out_shape, padding
 from profiles.errors import ModelError
 from quant.onnx_file import load_onnx
 from quant.untrusted import contradictions

@@ -11,7 +11,7 @@ import onnxruntime as ort
 import torch
 
 from deploy.defaults import float_model
-from deploy.restore import TILE_PX, restore_image
+from deploy.restoration.arrays import TILE_PX, restore_image
 from model.shipped import SHIPPED, shipped_names, shipped_weights
 from model.traditional.peers import PEERS
 from model.traditional.pipeline import Chain, restore_traditional

@@ -10,8 +10,8 @@ from deploy.evaluation.methods import Method
 from deploy.evaluation.pairs import NamedPair
 from deploy.report.page import Picture, Report, Table
 from deploy.report.pictures import busiest_windows, error_row, grid, picture_url, stretch_of, strip_row
-from deploy.results import Row, by_table
-from model.files import whole_file
+from model.io.files import whole_file
+from profiles.figures import Row, by_table
 
 SITES, CROP_PX, ZOOM = 4, 96, 2
 

@@ -1,22 +1,95 @@
 """Pairs of a degraded and a reference image: simulated from scenes, or read from a folder that `simulate` wrote."""
 
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
-from deploy.evaluation.recipe import PairsRecipe
-from deploy.restore import MAX_DN, read_acquisition
-from model.images import site_of
+from deploy.defaults import reference_beside
+from deploy.restoration.arrays import MAX_DN, read_acquisition
+from model.io.images import site_of
+from model.shipped import SENSOR
 from model.simulator.acquire import MARGIN_PX, fitting_oversampling, simulate_pair
-from model.simulator.draws import Draw
-from model.simulator.scene import Scene
-from model.training.stored_pairs import pair_files
-from profiles.errors import ImageError
-from profiles.sensor import Sensor, SensorProfile
+from model.simulator.detector import Draw
+from model.simulator.sampling import Scene
+from model.training.patches import pair_files
+from profiles.errors import ImageError, OptionError
+from profiles.sensor import Sensor, SensorProfile, load_sensor, same_instrument, sensor_from_json
+from profiles.toml import read_json
+
+
+@dataclass(frozen=True)
+class PairsRecipe:
+    """The sensors that made a folder of pairs, and the scenes that they saw.
+
+    Attributes:
+        degraded: profile of the degraded images.
+        reference: profile of the reference images.
+        scenes: file names in their order; None for a drawn scene.
+    """
+
+    degraded: SensorProfile
+    reference: SensorProfile
+    scenes: tuple[str | None, ...]
+
+    def site(self, stem: str) -> str:
+        """The site of the pair NUMBER-SCENE or NUMBER-SCENE-PATCH: two frames of a site, or two patches, are one.
+
+        A drawn scene is a site of its own.
+        """
+        number = stem.split("-", 1)[0]
+        known = number.isdecimal() and int(number) < len(self.scenes)
+        scene = self.scenes[int(number)] if known else stem
+        return f"{number}-drawn" if scene is None else site_of(scene)
+
+
+def read_pairs_recipe(folder: Path) -> PairsRecipe | None:
+    """The recipe beside a folder's pairs; None where there is none.
+
+    Raises:
+        OptionError: a recipe that is none of ours.
+        ProfileError: a sensor in it that cannot be.
+    """
+    path = folder / "recipe.json"
+    if not path.exists():
+        return None
+    try:
+        raw: Any = read_json(path)
+        scenes = tuple(str(s["name"]) if "sha256" in s else None for s in raw["scenes"])
+        sensors = {role: dict(raw[role]) for role in ("degraded", "reference")}
+    except (LookupError, OSError, TypeError, ValueError) as error:
+        remedy = "make the pairs anew, or remove it and say --sensor"
+        raise OptionError(str(path), expected="a dataset's recipe", got="another file", remedy=remedy) from error
+    profiles = {role: sensor_from_json(f"{path} {role}", raw) for role, raw in sensors.items()}
+    return PairsRecipe(profiles["degraded"], profiles["reference"], scenes)
+
+
+def profiles_for(
+    sensor: str | None, reference: str | None, recipe: PairsRecipe | None, say: Callable[[str], None]
+) -> tuple[SensorProfile, SensorProfile]:
+    """The profiles of degraded and reference images: the recipe's where there is one, else those named.
+
+    Raises:
+        OptionError: a name that contradicts the recipe.
+        ProfileError: no such profile, or a faulty one.
+    """
+    if recipe is None:
+        degraded = load_sensor(sensor or SENSOR)
+        return degraded, reference_beside(degraded, reference, say)
+    named = sensor and load_sensor(sensor), reference and load_sensor(reference).in_units_of(recipe.degraded)
+    _require_made_by("--sensor", named[0] or None, recipe.degraded)
+    _require_made_by("--reference", named[1] or None, recipe.reference)
+    return recipe.degraded, recipe.reference
+
+
+def _require_made_by(option: str, named: SensorProfile | None, made: SensorProfile) -> None:
+    if named is not None and not same_instrument(named, made):
+        expected = f"the sensor that made the pairs, {made.name} with the numbers in recipe.json"
+        raise OptionError(option, expected=expected, got=f"{named.name} with other numbers", remedy="leave it out")
+
 
 OVERSAMPLINGS = (4, 2)
 MIN_SIDE_PX = 48

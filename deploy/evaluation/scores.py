@@ -2,16 +2,56 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
+import torch
 
 from deploy.evaluation.methods import Method
 from deploy.evaluation.pairs import NamedPair
-from deploy.evaluation.perceptual import Perceptual
-from deploy.restore import MAX_DN
-from deploy.results import Figure, Row, measured, unavailable
+from deploy.evaluation.targets import snr_name
+from deploy.restoration.arrays import MAX_DN
+from model.metrics.backbones import find_backbone, not_found
 from model.metrics.bootstrap import site_interval
 from model.metrics.fidelity import psnr_db, ssim
+from model.metrics.noise_level import RADIANCES
+from model.metrics.perceptual import Dists, Lpips
+from profiles.figures import Figure, Row, measured, published, unavailable
+
+Perceptual = Callable[[np.ndarray, np.ndarray], float]
+"""Distance of two images (H, W) in [0, 1] of full scale."""
+
+
+def perceptual_distances(place: Path | None) -> dict[str, Perceptual | str]:
+    """LPIPS-squeeze or the reason why not, and LPIPS-alex, LPIPS-vgg and DISTS where their backbones are found.
+
+    Args:
+        place: a file with SqueezeNet 1.1, or a folder with any of the backbones; None asks the environment.
+
+    Raises:
+        ModelError: a file that is missing or holds something else.
+    """
+    found: dict[str, Perceptual | str] = {"LPIPS-squeeze": not_found("squeeze")}
+    for network in ("squeeze", "alex", "vgg"):
+        if network != "squeeze" and place is not None and not place.is_dir():
+            break
+        file = find_backbone(network, place)
+        if file is None:
+            continue
+        found[f"LPIPS-{network}"] = _distance(Lpips.load(network, file))
+        if network == "vgg":
+            found["DISTS"] = _distance(Dists.load(file))
+    return found
+
+
+def _distance(metric: Lpips | Dists) -> Perceptual:
+    def distance(image: np.ndarray, reference: np.ndarray) -> float:
+        both = [torch.from_numpy(np.asarray(a, np.float32))[None, None] for a in (image, reference)]
+        with torch.inference_mode():
+            return float(metric(*both))
+
+    return distance
+
 
 DISTANCE = "distance"
 UNITS = {"PSNR": "dB", "PSNR gain": "dB", "SSIM": "ratio"}
@@ -119,3 +159,35 @@ def fidelity_row(table: str, name: str, dn: np.ndarray, reference: np.ndarray, d
     values = instruments.score(dn, reference, degraded)
     figures = {key: instruments.figure(key, values[key], "simulated pair") for key in ("PSNR", "SSIM")}
     return Row(table, name, figures)
+
+
+SOURCE = "ConvBEERS paper, table on its simulated test set"
+NOTE = "another test set: does not compare"
+
+
+def paper_rows() -> list[Row]:
+    """The paper's traditional pipeline and its network."""
+    return [
+        _row("paper: traditional", 20.6, 0.843, (0.216, 0.220), None, (65.33, 138.51)),
+        _row("paper: ConvBEERS", 27.5, 0.932, (0.068, 0.077), 20.0, (66.27, 156.07)),
+    ]
+
+
+def _row(
+    name: str,
+    psnr: float,
+    ssim: float,
+    distances: tuple[float, float],
+    mtf: float | None,
+    snr: tuple[float, float],
+) -> Row:
+    sharpness = unavailable("%", "the paper: did not converge") if mtf is None else published(mtf, "%", SOURCE)
+    figures = {
+        "PSNR": published(psnr, "dB", SOURCE),
+        "SSIM": published(ssim, "ratio", SOURCE),
+        "LPIPS, network not stated": published(distances[0], "distance", SOURCE),
+        "DISTS": published(distances[1], "distance", SOURCE),
+        "MTF at Nyquist": sharpness,
+        **{snr_name(r): published(value, "ratio", SOURCE) for r, value in zip(RADIANCES, snr, strict=True)},
+    }
+    return Row("mean", name, figures, {"told": NOTE})

@@ -13,15 +13,15 @@ import torch
 from torch import Tensor
 
 from deploy.evaluation.methods import Method
-from deploy.restore import MAX_DN
-from deploy.results import Figure, measured, unavailable
-from model.metrics.edge_target import slanted_edge
+from deploy.restoration.arrays import MAX_DN
+from model.metrics.edges import slanted_edge
 from model.metrics.noise_level import RADIANCES
 from model.metrics.refusal import Refusal
 from model.metrics.sharpness import EdgeMtf, edge_mtf
 from model.simulator.acquire import acquire
-from model.simulator.draws import Draw
+from model.simulator.detector import Draw
 from model.simulator.sampling import scene_spectrum
+from profiles.figures import Figure, measured, unavailable
 from profiles.sensor import Sensor
 
 ANGLES_DEG = (3.0, 5.0, 8.0, 11.0)

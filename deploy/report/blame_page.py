@@ -8,11 +8,11 @@ import onnxruntime as ort
 from deploy.report.histogram import histogram_url
 from deploy.report.page import Picture, Report, Table
 from deploy.report.pictures import error_row, grid, picture_url, stretch_of, strip_row
-from deploy.results import Row, by_table
+from profiles.figures import Row, by_table
 from quant.calibration import Patches
-from quant.planes import MAX_DN
+from quant.graph import MAX_DN
+from quant.sensitivity import Spread
 from quant.session import run
-from quant.spread import Spread
 
 ZOOM = 2
 WHITE_SHARE = 0.999

@@ -5,10 +5,10 @@ from dataclasses import dataclass, replace
 
 from deploy.report.axes import Axis, padded
 from deploy.report.labels import text_width
+from deploy.report.page import templates
 from deploy.report.plot import FONT_PX
 from deploy.report.plot_svg import plot_style
-from deploy.report.templates import templates
-from deploy.results import number
+from profiles.figures import number
 
 Points = tuple[tuple[float, float], ...]
 

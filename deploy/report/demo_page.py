@@ -4,12 +4,12 @@ from pathlib import Path
 
 import numpy as np
 
-from deploy.dpu.placement import Placement
+from deploy.dpu.checker.placement import Placement
 from deploy.report.page import Picture, Report, Table
 from deploy.report.pictures import busiest_windows, picture_url, stretch_of, strip
-from deploy.results import Row
-from deploy.shipped import VARIANT
-from model.files import whole_file
+from model.io.files import whole_file
+from model.shipped import VARIANT
+from profiles.figures import Row
 
 CROP_PX, ZOOM = 110, 3
 LARGEST_PX = 1280

@@ -5,9 +5,9 @@ import math
 
 import numpy as np
 
-from deploy.report.templates import templates
-from quant.planes import MAX_DN
-from quant.spread import Spread
+from deploy.report.page import templates
+from quant.graph import MAX_DN
+from quant.sensitivity import Spread
 
 WIDTH, HEIGHT, LEFT, BOTTOM, FONT_PX = 338, 240, 80, 46, 13
 """In pixels of the page, on the narrowest one too: a wider picture would be scaled down there, its labels with it."""

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from deploy.results import Row, number
+from profiles.figures import Row, number
 
 WIDTH, HEIGHT = 1000, 100
 FILLED = 0.82

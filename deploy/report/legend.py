@@ -6,7 +6,7 @@ from dataclasses import replace
 from deploy.report.labels import text_width
 from deploy.report.marks import FILLINGS, Filling, Mark, filling_of
 from deploy.report.plot import FONT_PX, Entry, State
-from deploy.results import Row
+from profiles.figures import Row
 
 ROW_PX, MARK_PX, GAP_PX, EDGE_PX = 22, 14, 18, 16
 LETTERS = 40

@@ -8,7 +8,7 @@ from PIL import Image, ImageColor, ImageDraw
 from deploy.report.labels import Place, font_of
 from deploy.report.marks import LIGHT, Mark, scaled
 from deploy.report.plot import FONT_PX, LABEL_PX, TITLE_PX, Dot, Plot, State
-from model.files import whole_file
+from model.io.files import whole_file
 
 SCALE, FINER = 2, 2
 """Pixels of the picture for one of the plot; how much finer it is drawn than kept."""

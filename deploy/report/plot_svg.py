@@ -3,8 +3,8 @@
 from markupsafe import Markup
 
 from deploy.report.marks import DARK, LIGHT
+from deploy.report.page import templates
 from deploy.report.plot import Plot
-from deploy.report.templates import templates
 
 
 def plot_style() -> Markup:

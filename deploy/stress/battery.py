@@ -8,16 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from deploy.stress.cases import CASES, SIDE_PX, Case
-from deploy.stress.checks import Measure, torch_threads
-from deploy.stress.int8 import reference, runtime
-from deploy.stress.limitations import Limitation, limitation_of
-from deploy.stress.losses import losses
-from deploy.stress.metrics import metrics
-from deploy.stress.network import bfloat16, float32
-from deploy.stress.simulator import simulator
+from deploy.stress.checks import Limitation, Measure, limitation_of, torch_threads
+from deploy.stress.networks import bfloat16, float32, plans, reference, runtime
+from deploy.stress.science import losses, metrics, simulator, traditional
 from deploy.stress.subject import Subject
-from deploy.stress.tiling import plans
-from deploy.stress.traditional import traditional
 from profiles.errors import BeersError, OptionError
 
 Look = Callable[[Subject, Case, np.ndarray], list[Measure]]

@@ -1,21 +1,65 @@
 """`stress --bit-flips`: the patient, and the tables of what flips do to it and what guards cost."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from math import exp
 from pathlib import Path
 
-from deploy.bench import predict_file
+from deploy.bench.tables import predict_file
 from deploy.defaults import HELD_OUT_SEED
-from deploy.dpu.board import load_dpu
-from deploy.quantising import Calibration
-from deploy.results import Row
-from deploy.stress import flip_curves, flip_places
-from deploy.stress.flip_price import TILE_PX, price_rows
-from deploy.stress.flips import Patient
-from deploy.stress.int8 import core_of, planes_of
+from deploy.dpu.board import Dpu, load_dpu
+from deploy.dpu.cost.latency import Prediction, frame_rate
+from deploy.dpu.cost.layers import Constants
+from deploy.quantise import Calibration
+from deploy.report.curves import Curve, Panel, Points, curves_svg
+from deploy.stress import flips
+from deploy.stress.flips import MEMORIES, SETS, Patient, name_of, rates_of
+from deploy.stress.networks import core_of, planes_of
 from deploy.stress.subject import Subject
-from quant.guards import learn_guards
-from quant.upsets import as_stored
+from profiles.figures import Row, predicted
+from quant.core import IntConv
+from quant.faults import INT8_BITS, as_stored, learn_guards, weight_bits
+
+FUSED = "fused into the convolution (UG1414 3.5)"
+INSTRUCTED = "two instructions of 16 values, one a cycle of the host's slowest clock (assumed)"
+READ = (
+    "bytes over the rate at which the host hands them to the DPU (fitted, docs/cost-model.md; assumed to hold here)"
+)
+TILE_PX = 640
+AT_ONCE, INSTRUCTIONS = 16, 2
+
+
+def price_rows(patient: Patient, prediction: Prediction, dpu: Dpu) -> list[Row]:
+    """A row a guard and one for all of them, at work for every tile of 640 x 640."""
+    relus = sum(op.relu for op in patient.core.ops if isinstance(op, IntConv))
+    rate, values = Constants.of(dpu).host_in_bytes_per_s, patient.core.output_channels * TILE_PX**2
+    clock_hz = 1e9 * dpu.limit("cpu", "clock_ghz").low
+    limit_s = INSTRUCTIONS * values / AT_ONCE / clock_hz
+    checksums_s = weight_bits(patient.core) / INT8_BITS / rate
+    copies_s = 3 * len(patient.shifts) / rate
+    spread = exp(dpu.value("cost", "error_outside"))
+    guards = {
+        f"ReLU6 at {len(patient.guards.relu6)} of {relus} ReLUs": (0.0, FUSED),
+        f"limit of the correction, {patient.guards.limit_dn:g} DN": (limit_s, INSTRUCTED),
+        "checksums of all weights": (checksums_s, READ),
+        "three copies of the shifts": (copies_s, READ),
+        "all guards": (limit_s + checksums_s + copies_s, f"{INSTRUCTED}; {READ}"),
+    }
+    return [_row(name, time_s, source, prediction, spread) for name, (time_s, source) in guards.items()]
+
+
+def _row(name: str, time_s: float, source: str, prediction: Prediction, spread: float) -> Row:
+    tile_s = prediction.batch_time_s / prediction.batch
+    slow, fast = prediction.fps_interval
+    beside = frame_rate(prediction.batch_time_s, prediction.batch, prediction.host_s + time_s)
+    times_s, most = (time_s / spread, time_s * spread), 100 * time_s * spread * fast
+    figures = {
+        "time": predicted(1e3 * time_s, "ms/tile", (1e3 * times_s[0], 1e3 * times_s[1]), source),
+        "of a tile, if nothing hides": predicted(100 * time_s / tile_s, "%", (100 * times_s[0] * slow, most), source),
+        "frame rate lost beside the DPU": predicted(100 * (1 - beside / prediction.fps), "%", (0.0, most), source),
+    }
+    return Row("guards", name, figures)
+
 
 CALIBRATION_PATCHES = 16
 
@@ -52,14 +96,14 @@ def flip_rows(subject: Subject, request: FlipRequest, tick: Callable[[], None] =
     dpu = load_dpu(request.target, None)
     prediction = predict_file(subject.paths[-1], dpu, TILE_PX)
     patient = make_patient(subject, request)
-    curves = flip_curves.curve_rows(patient, request.draws, request.seed, tick)
-    places = flip_places.place_rows(patient, request.seed, request.size_px // 2, tick)
+    curves = flips.curve_rows(patient, request.draws, request.seed, tick)
+    places = flips.place_rows(patient, request.seed, request.size_px // 2, tick)
     return [*curves, *places, *price_rows(patient, prediction, dpu)]
 
 
 def ticks(subject: Subject, request: FlipRequest) -> int:
     """How often `flip_rows` reports progress."""
-    return flip_curves.ticks(request.draws) + len(core_of(subject).ops)
+    return flips.curve_ticks(request.draws) + len(core_of(subject).ops)
 
 
 def make_patient(subject: Subject, request: FlipRequest) -> Patient:
@@ -71,3 +115,26 @@ def make_patient(subject: Subject, request: FlipRequest) -> Patient:
     )
     guards = learn_guards(core, (planes_of(core, image) for image in taught.degraded))
     return Patient(core, guards, list(tried.pairs))
+
+
+SHOWN = (SETS[-1], SETS[0])
+
+
+def flip_curves_svg(networks: Mapping[str, Sequence[Row]]) -> str:
+    """PSNR against bits turned over, with all guards and with none; rows by the network's name."""
+    panels = [Panel(memory, _curves(networks, memory)) for memory in MEMORIES]
+    return curves_svg(panels, "bits turned over in a megabit", "PSNR, dB (measured)")
+
+
+def _curves(networks: Mapping[str, Sequence[Row]], memory: str) -> list[Curve]:
+    return [
+        Curve(f"{name}, {guards}", colour, guards == SETS[0], _points(rows, memory, guards))
+        for colour, (name, rows) in enumerate(networks.items())
+        for guards in SHOWN
+    ]
+
+
+def _points(rows: Sequence[Row], memory: str, guards: str) -> Points:
+    by_name = {row.name: row for row in rows if row.table == "bit flips"}
+    values = {rate: by_name[name_of(memory, rate)].figures[guards].value for rate in rates_of(memory)}
+    return tuple((rate, value) for rate, value in values.items() if value is not None)

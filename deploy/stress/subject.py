@@ -9,22 +9,21 @@ from typing import TypeVar
 import numpy as np
 import onnx
 import onnxruntime as ort
+import torch
+from torch import Tensor
+from torch.nn.functional import conv2d
 
-from deploy.counterpart import require_quantised
-from deploy.defaults import float_model
-from deploy.restore import Infer
-from deploy.shipped import float_file, int8_file, shipped_pair
+from deploy.defaults import float_model, require_quantised
+from deploy.restoration.arrays import Infer
+from deploy.restoration.engine import Restorer, restore_rows
+from deploy.restoration.plan import make_plan
+from deploy.restoration.source import ArraySource, Raster
 from deploy.stress.cases import FULL_DN
-from deploy.swath.engine import restore_rows
-from deploy.swath.plan import make_plan
-from deploy.swath.raster import Raster
-from deploy.swath.reader import ArraySource
-from deploy.swath.restorer import Restorer
+from model.shipped import float_file, int8_file, shipped_pair
 from profiles.errors import BeersError
 from quant.core import IntCore
-from quant.float_reader import correction_graph
-from quant.graph import Graph
-from quant.host_reader import read_core
+from quant.encodings import read_core
+from quant.graph import CORRECTION, IMAGE, Add, Graph, correction_graph
 from quant.onnx_file import any_size, load_onnx
 from quant.radius import receptive_radius_px
 from quant.session import open_session, run
@@ -124,3 +123,41 @@ def _or_reason(work: Callable[[], T]) -> T | BeersError:
         return work()
     except BeersError as error:
         return error
+
+
+def infer_in(graph: Graph, dtype: torch.dtype, sum_dtype: torch.dtype = torch.float64) -> Infer:
+    """The image plus the graph's correction, the correction computed in `dtype`, the sum in `sum_dtype`.
+
+    bfloat16 is what training computes in where autocast is on; the global add stays in float32 there.
+    """
+
+    def infer(image: np.ndarray) -> np.ndarray:
+        with torch.inference_mode():
+            restored = _as(image, sum_dtype) + _correction(graph, _as(image, dtype)).to(sum_dtype)
+        return np.asarray(restored.numpy())
+
+    return infer
+
+
+def steepest_signs(graph: Graph, image: np.ndarray) -> np.ndarray:
+    """The change (H, W) of -1, 0 or 1 that moves the middle pixel most, to first order: its gradient's signs."""
+    pixels = _as(image, torch.float32)[None, None].requires_grad_()
+    restored = pixels + _correction(graph, pixels)
+    (gradient,) = torch.autograd.grad(restored[0, 0, image.shape[0] // 2, image.shape[1] // 2], pixels)
+    return np.asarray(gradient[0, 0].sign().numpy())
+
+
+def _correction(graph: Graph, image: Tensor) -> Tensor:
+    tensors = {IMAGE: image}
+    for op in graph:
+        if isinstance(op, Add):
+            tensors[op.output] = tensors[op.inputs[0]] + tensors[op.inputs[1]]
+            continue
+        weight, bias = (_as(values, image.dtype) for values in (op.weight, op.bias))
+        result = conv2d(tensors[op.input], weight, bias, padding=op.pad_px)
+        tensors[op.output] = torch.relu(result) if op.relu else result
+    return tensors[CORRECTION]
+
+
+def _as(values: np.ndarray, dtype: torch.dtype) -> Tensor:
+    return torch.from_numpy(np.ascontiguousarray(values)).to(dtype)

@@ -1,31 +1,25 @@
-"""How good the pictures of a unit are: every unit on the same held-out pairs and targets, image by image.
+"""How good the pictures of a method are: all on the same held-out pairs and targets, image by image.
 
-Kept image by image, because two points are told apart by the differences on the same images, which scatter far less
-than the images do.
+What a halo below the exact one costs is measured on images cut in four, weighed by the seams of a swath.
 """
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any, Self
 
 import numpy as np
 
+from deploy.bench.tables import Swath
 from deploy.evaluation.methods import Method, Restore
 from deploy.evaluation.pairs import NamedPair
 from deploy.evaluation.scores import Instruments
 from deploy.evaluation.targets import Targets, snr_name, target_figures
-from deploy.results import Figure
+from deploy.restoration.arrays import MAX_DN, Infer, restore_tiles
+from deploy.restoration.plan import Span, Tile, plan_side
 from deploy.tradeoff.cache import code_digest, pixels_digest
+from profiles.figures import Figure
 
-CODE = (
-    "deploy.tradeoff.accuracy",
-    "deploy.tradeoff.seams",
-    "deploy.evaluation",
-    "model.metrics",
-    "deploy.restore",
-    "deploy.tiling",
-)
 MAE = "float-INT8 MAE"
 FLAT = "flat SNR"
 
@@ -79,7 +73,7 @@ class Ground:
         names = [pair.name for pair in self.pairs]
         targets = pixels_digest([*self.targets.edges, *(flat for _, flat in self.targets.flats)])
         given = {"pairs": pairs, "names": names, "targets": targets, "weights": self.weights}
-        return {**given, "max_dn": self.instruments.max_dn, "code": code_digest(*CODE)}
+        return {**given, "max_dn": self.instruments.max_dn, "code": code_digest(__name__)}
 
     @property
     def sites(self) -> list[str]:
@@ -114,3 +108,50 @@ def measure_mae(restore: Restore, float_restore: Restore, ground: Ground, tick: 
         images.append({MAE: float(np.abs(in_int8 - in_float).mean()) / ground.instruments.max_dn})
         tick()
     return Scores(tuple(images))
+
+
+LEAST_SQUARED_ERROR = 1e-12
+
+
+def cut_in_four(infer: Infer, halo_px: int, max_dn: int = MAX_DN) -> Restore:
+    """Restores (H, W) digital numbers in four windows, each with so much of the others around it."""
+    return partial(_restore, infer=infer, halo_px=halo_px, max_dn=max_dn)
+
+
+def _restore(dn: np.ndarray, infer: Infer, halo_px: int, max_dn: int) -> np.ndarray:
+    rows, columns = (halves(size_px, halo_px) for size_px in dn.shape)
+    tiles = [Tile(row, column) for row in rows for column in columns]
+    return restore_tiles(dn, infer, tiles, max_dn=max_dn).astype(np.float32)
+
+
+def halves(size_px: int, halo_px: int) -> list[Span]:
+    """Both halves of a side, each reading `halo_px` of the other."""
+    cut = size_px // 2
+    return [Span(0, min(cut + halo_px, size_px), 0, cut), Span(max(cut - halo_px, 0), size_px, cut, size_px)]
+
+
+def seam_density(swath: Swath) -> float:
+    """Pixels of seam for each pixel of a swath in tiles."""
+    sides = (swath.width_px, swath.height_px)
+    return sum((len(plan_side(side, swath.tile_px, swath.halo_px)) - 1) / side for side in sides)
+
+
+def with_seams(exact: Scores, cut: Scores, shapes: Sequence[tuple[int, ...]], density: float) -> Scores:
+    """Scores of each image as if it had so many seam pixels for each of its own; targets show none."""
+    shares = [density / sum(1 / side for side in shape) for shape in shapes]
+    images = [_weighed(*each) for each in zip(exact.images, cut.images, shares, strict=True)]
+    return Scores(tuple(images), exact.targets)
+
+
+def _weighed(exact: Values, cut: Values, share: float) -> Values:
+    return {key: _between(key, exact[key], cut[key], share) for key in exact}
+
+
+def _between(key: str, exact: float | None, cut: float | None, share: float) -> float | None:
+    if exact is None or cut is None:
+        return None
+    if key != "PSNR":
+        return exact + share * (cut - exact)
+    errors = [MAX_DN**2 * 10 ** (-psnr / 10) for psnr in (exact, cut)]
+    error = max(errors[0] + share * (errors[1] - errors[0]), LEAST_SQUARED_ERROR)
+    return float(10 * np.log10(MAX_DN**2 / error))

@@ -21,18 +21,15 @@ from itertools import combinations, pairwise
 import numpy as np
 import onnx
 
-from deploy.bench import Swath, efficiency, energy, swath_latency
-from deploy.cpu_side import board_cpu_row
-from deploy.dpu.accuracy import bound_by_dpu, leave_out
+from deploy.bench.tables import Swath, board_cpu_row, efficiency, energy, swath_latency
 from deploy.dpu.board import Dpu, load_dpu
-from deploy.dpu.cost import Prediction, frame_rate, predict
-from deploy.dpu.placement import place
-from deploy.dpu.power import dpu_power
-from deploy.dpu.rates import Constants
+from deploy.dpu.checker.placement import place
+from deploy.dpu.cost.latency import Prediction, dpu_power, frame_rate, predict
+from deploy.dpu.cost.layers import Constants
+from deploy.dpu.cost.validation import bound_by_dpu, leave_out, published_cases
 from deploy.dpu.reading import network_of
-from deploy.dpu.zoo.cases import published_cases
-from deploy.results import Figure, predicted
 from profiles import load_target
+from profiles.figures import Figure, predicted
 
 FRAME_PX = 640
 FIGURES = ("latency", "throughput", "power", "energy", "efficiency")

@@ -1,8 +1,9 @@
 """Measurements kept by what they depend on: a small file each, written whole; a damaged one is measured again."""
 
+import ast
 import hashlib
 import json
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -10,7 +11,7 @@ from typing import Any, Protocol, Self, TypeVar
 
 import numpy as np
 
-from model.files import write_text
+from model.io.files import write_text
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -84,10 +85,34 @@ def pixels_digest(images: Iterable[np.ndarray]) -> str:
 
 @cache
 def code_digest(*names: str) -> str:
-    """SHA-256 of the sources of modules, or of all modules of packages: other code measures something else."""
+    """SHA-256 of the sources of modules and of all of ours that they import: other code measures something else."""
     digest = hashlib.sha256()
-    for name in names:
-        place = ROOT / name.replace(".", "/")
-        for path in sorted(place.glob("*.py")) if place.is_dir() else [place.with_suffix(".py")]:
-            digest.update(path.read_bytes())
+    for path in sorted(_sources(names)):
+        digest.update(path.read_bytes())
     return digest.hexdigest()
+
+
+def _sources(names: Iterable[str]) -> set[Path]:
+    """The files of modules by name, and of what they import from this installation, wherever in them that stands."""
+    found: set[Path] = set()
+    waiting = list(names)
+    while waiting:
+        path = _source(waiting.pop())
+        if path is not None and path not in found:
+            found.add(path)
+            waiting += _imported(path)
+    return found
+
+
+def _source(name: str) -> Path | None:
+    place = ROOT / name.replace(".", "/")
+    return next((path for path in (place.with_suffix(".py"), place / "__init__.py") if path.is_file()), None)
+
+
+def _imported(path: Path) -> Iterator[str]:
+    for node in ast.walk(ast.parse(path.read_bytes())):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            yield node.module
+            yield from (f"{node.module}.{alias.name}" for alias in node.names)

@@ -8,12 +8,11 @@ from typing import Any, Self
 import numpy as np
 
 from deploy.evaluation.methods import Restore
-from deploy.results import Figure, measured
+from profiles.figures import Figure, measured
 
 TILE_PX = 256
 ROUNDS = 9
 DRAWS, LEVEL = 1000, 0.95
-CODE = ("deploy.tradeoff.host_time",)
 
 
 @dataclass(frozen=True)

@@ -1,19 +1,85 @@
-"""A point with all that is known of it, and points held against one another."""
+"""A point with all that is known of it, points held against one another, and fronts of points that nothing beats.
+
+Figures come from what was measured of a point's parts and from the cost model; fronts hold by value and beyond
+intervals.
+"""
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
+from typing import Protocol
 
 import numpy as np
 
-from deploy.results import Figure, Row
-from deploy.tradeoff.accuracy import Scores
-from deploy.tradeoff.board import BoardRun, energy_ratio, latency_ratio
-from deploy.tradeoff.host_time import Times, ratio_interval
-from deploy.tradeoff.pareto import Interval, Place
-from deploy.tradeoff.points import Point
+from deploy.bench.tables import Swath
+from deploy.dpu.board import load_dpu
+from deploy.evaluation.methods import Method
+from deploy.evaluation.scores import mean_row
+from deploy.tradeoff.accuracy import FLAT, MAE, Scores, seam_density, with_seams
+from deploy.tradeoff.board import FIGURES as BOARD
+from deploy.tradeoff.board import BoardRun, CpuRun, DpuRun, energy_ratio, latency_ratio, predict_model
+from deploy.tradeoff.host_time import Times, host_figures, ratio_interval
+from deploy.tradeoff.measurements import Lab
+from deploy.tradeoff.methods import runtime_of
+from deploy.tradeoff.points import EXACT, NAMES, Point, on_dpu
 from model.metrics.bootstrap import site_interval
+from profiles.errors import ModelError
+from profiles.figures import Figure, Row, measured, predicted, unavailable
+from quant.onnx_file import load_onnx
+
+Interval = tuple[float, float]
+
+
+@dataclass(frozen=True)
+class Place:
+    """A point in one plane: what it costs, and how good it is (higher is better)."""
+
+    name: str
+    cost: float
+    quality: float
+
+
+class Judge(Protocol):
+    """Tells points apart, each with the interval of the difference."""
+
+    def ratio(self, a: str, b: str) -> Interval:
+        """Cost of `a` over cost of `b`."""
+        ...
+
+    def gain(self, a: str, b: str) -> Interval:
+        """Quality of `a` less quality of `b`."""
+        ...
+
+
+def front(places: Sequence[Place]) -> tuple[str, ...]:
+    """Names on the front by values, from cheap to dear; of points that are alike the first."""
+    members, best = [], float("-inf")
+    for place in sorted(places, key=lambda p: (p.cost, -p.quality)):
+        if place.quality > best:
+            members.append(place.name)
+            best = place.quality
+    return tuple(members)
+
+
+def dominates(a: Place, b: Place, judge: Judge) -> bool:
+    """Whether `a` is surely no worse than `b` in both, and surely better in one."""
+    worse = a.cost > b.cost or a.quality < b.quality
+    if worse or (a.cost, a.quality) == (b.cost, b.quality):
+        return False
+    most, least = judge.ratio(a.name, b.name)[1], judge.gain(a.name, b.name)[0]
+    return most <= 1 and least >= 0 and (most < 1 or least > 0)
+
+
+def beaten(places: Sequence[Place], judge: Judge) -> Mapping[str, str]:
+    """Every point that another dominates, with the best of those that do."""
+    found = {}
+    for b in places:
+        above = [a for a in places if a.name != b.name and dominates(a, b, judge)]
+        if above:
+            found[b.name] = max(above, key=lambda a: (a.quality, -a.cost)).name
+    return found
+
 
 COSTS = ("board latency", "board energy", "host p50")
 QUALITIES = {"PSNR": 1, "SSIM": 1, "LPIPS-squeeze": -1}
@@ -142,3 +208,106 @@ def _difference(
     places = np.asarray(sites)[known].tolist()
     interval, _ = site_interval(differences[known].tolist(), places, np.random.default_rng(seed))
     return interval or (-np.inf, np.inf)
+
+
+UNITS = dict(NAMES.values())
+"""Every figure of a point, in the order in which they are shown, with its unit."""
+
+DPU_ONLY = "the DPU takes INT8 alone, with scales that are powers of two"
+NOT_PAIRED = "no float network of it at hand"
+NO_INT8 = "not an INT8 network"
+
+
+@dataclass(frozen=True)
+class Assembly:
+    """Makes outcomes; `lacks` says of units that cannot be had why not."""
+
+    lab: Lab
+    swath: Swath
+    lacks: Mapping[str, str]
+
+    def outcome(self, point: Point) -> Outcome:
+        """All that is known of a point."""
+        reason = self.lacks.get(str(point.unit), "")
+        if reason:
+            return Outcome(point, {key: unavailable(unit, reason) for key, unit in UNITS.items()}, self._text(point))
+        swath = self._swath(point)
+        times, work_factor = self.lab.times(point.unit), swath.work_factor(swath.tiles)
+        work_factor = work_factor if point.unit.kind == "network" else 1.0
+        scores, run = self._scores(point, swath), self._board(point, swath, times)
+        figures = self._quality(point, scores) | self._host(times, work_factor, point)
+        figures |= run.figures() if not isinstance(run, str) else {f"board {k}": unavailable("", run) for k in BOARD}
+        ordered = {key: replace(figures[key], unit=unit) for key, unit in UNITS.items()}
+        board = None if isinstance(run, str) else run
+        return Outcome(point, ordered, self._text(point), scores, board, times, work_factor)
+
+    def _swath(self, point: Point) -> Swath:
+        halo_px = point.halo_px(self.lab.shelf.radius_px(point.unit.method)) if point.unit.kind == "network" else 0
+        return replace(self.swath, tile_px=point.tile_px, halo_px=halo_px)
+
+    def _scores(self, point: Point, swath: Swath) -> Scores:
+        exact = self.lab.scores(point.unit)
+        assert exact is not None  # noqa: S101 - its job has run
+        if point.halo == EXACT:
+            return exact
+        cut = self.lab.cut_scores(point.unit, int(point.halo))
+        assert cut is not None  # noqa: S101 - its job has run
+        shapes = [pair.degraded.shape for pair in self.lab.ground.pairs]
+        return with_seams(exact, cut, shapes, seam_density(swath))
+
+    def _quality(self, point: Point, scores: Scores) -> dict[str, Figure]:
+        ground = self.lab.ground
+        means = mean_row(Method("", lambda dn: dn, ""), scores.images, ground.sites, ground.instruments, ground.seed)  # type: ignore[arg-type] # read, never written
+        figures = {key: means.figures[key] for key in QUALITIES}
+        if point.halo != EXACT:
+            figures = {key: _with_seams(figure) for key, figure in figures.items()}
+        return figures | {key: scores.targets[key] for key in ("MTF at Nyquist", FLAT)} | {MAE: self._mae(point)}
+
+    def _mae(self, point: Point) -> Figure:
+        found = self.lab.mae(point.unit)
+        if found is None:
+            return unavailable("ratio", NOT_PAIRED if point.unit.precision.startswith("INT8") else NO_INT8)
+        values = [values[MAE] or 0.0 for values in found.images]
+        ground = self.lab.ground
+        interval, words = site_interval(values, ground.sites, np.random.default_rng(ground.seed))
+        source = f"mean of {len(values)} pairs, exact seams, of full scale, {words}"
+        return measured(float(np.mean(values)), "ratio", source, interval)
+
+    def _host(self, times: Times | None, work_factor: float, point: Point) -> dict[str, Figure]:
+        assert times is not None  # noqa: S101 - its job has run
+        return host_figures(times, work_factor, runtime_of(point.unit), self.lab.ground.seed)
+
+    def _board(self, point: Point, swath: Swath, times: Times | None) -> BoardRun | str:
+        """Its run on the board, or why there is none."""
+        if point.unit.kind != "network":
+            assert times is not None  # noqa: S101 - its job has run
+            low, high = times.cpu_per_px()
+            return CpuRun((low * swath.pixels, high * swath.pixels), swath)
+        file = self.lab.shelf.int8_file(point.unit)
+        if not on_dpu(point.unit) or file is None:
+            return DPU_ONLY
+        try:
+            dpu = load_dpu("vck190", point.configuration)
+            return DpuRun(point.unit.method, dpu, predict_model(load_onnx(file), dpu, point.tile_px), swath)
+        except ModelError as error:
+            return str(error).rstrip(".")
+
+    def _text(self, point: Point) -> dict[str, str]:
+        network = point.unit.kind == "network"
+        return {
+            "method": point.unit.method,
+            "kind": point.unit.kind,
+            "precision": point.unit.precision,
+            "halo": point.halo if network else "none",
+            "tile": str(point.tile_px) if network else "none",
+            "configuration": point.configuration or "none",
+            "told": self.lab.shelf.told(point.unit),
+            "runtime": runtime_of(point.unit),
+        }
+
+
+def _with_seams(figure: Figure) -> Figure:
+    if figure.value is None:
+        return figure
+    source = f"{figure.source}; seams measured on the images cut in four, weighed by the swath's seams"
+    return predicted(figure.value, figure.unit, figure.interval or (figure.value,) * 2, source)

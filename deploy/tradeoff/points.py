@@ -1,24 +1,14 @@
-"""Operating points: which of the many ways to restore a swath are looked at, and why these.
+"""Operating points, and what a user can afford and needs of them: `latency<=20s`, `psnr>=44`, several with commas."""
 
-Not the whole product of all choices: each is varied where it can matter.
-
-- *Precision* (float32, bf16, INT8 free, INT8 legal): every network, in large tiles with exact seams. It sets the
-  picture, and on the host the time.
-- *Tile size*: INT8 legal of every network at 640, at the fastest of the tiles that are just small enough for maps to
-  stay in the DPU's banks (found from the cost model), and halfway between, by ratio. It sets the board's time; with
-  exact seams the picture is the same.
-- *Halo* (0, 8, 16, exact): at the smallest of these tiles, where it costs most of the time, and 0 at 640, which is
-  how the paper counts.
-- *Configuration*: the smallest and the largest of the target beside its default, C64 only where most layers are wider
-  than a C32 engine; at the tile that is fastest on the default one. It sets the board's time alone.
-- *Chains and library peers*: each once; they have no tiles.
-"""
-
-from collections.abc import Iterable, Sequence
+import math
+import re
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
-from deploy.bench import PAPER_TILE_PX
+from deploy.bench.tables import PAPER_TILE_PX
+from profiles.errors import OptionError
+from profiles.figures import Figure
 
 Kind = Literal["network", "chain", "peer", "paper"]
 PRECISIONS = ("float32", "bf16", "INT8 free", "INT8 legal")
@@ -113,3 +103,80 @@ def other_points(chains: Iterable[str], peers: Iterable[str]) -> list[Point]:
     """The points that are no networks, in float32."""
     named = [(name, "chain") for name in chains] + [(name, "peer") for name in peers]
     return [Point(Unit(name, kind, "float32")) for name, kind in named]  # type: ignore[arg-type] # of a literal
+
+
+NAMES = {
+    "psnr": ("PSNR", "dB"),
+    "ssim": ("SSIM", "ratio"),
+    "lpips": ("LPIPS-squeeze", "distance"),
+    "mtf": ("MTF at Nyquist", "%"),
+    "snr": ("flat SNR", "ratio"),
+    "mae": ("float-INT8 MAE", "ratio"),
+    "host": ("host p50", "s/Mpx"),
+    "host-p90": ("host p90", "s/Mpx"),
+    "latency": ("board latency", "s"),
+    "throughput": ("board throughput", "frame/s"),
+    "power": ("board power", "W"),
+    "energy": ("board energy", "J"),
+    "efficiency": ("board efficiency", "px/s/W"),
+}
+"""What a user writes: the figure that it stands for, and its unit."""
+
+DEMAND = re.compile(
+    r"(?P<name>[a-z0-9-]+)\s*(?P<side><=|>=)\s*(?P<limit>[+-]?\d+(\.\d+)?([eE][+-]?\d+)?)\s*(?P<unit>\S*)"
+)
+
+
+@dataclass(frozen=True)
+class Demand:
+    """One limit: the figure at most, or at least, so much."""
+
+    key: str
+    at_most: bool
+    limit: float
+    unit: str
+
+    def __str__(self) -> str:
+        unit = "" if self.unit in ("ratio", "distance") else f" {self.unit}"
+        return f"{self.key} {'at most' if self.at_most else 'at least'} {self.limit:g}{unit}"
+
+    def short_by(self, figure: Figure | None) -> float:
+        """By what share of the limit a figure misses it; 0 where it keeps it, endless where it is unavailable."""
+        if figure is None or figure.value is None:
+            return math.inf
+        miss = figure.value - self.limit if self.at_most else self.limit - figure.value
+        return max(miss, 0.0) / (abs(self.limit) or 1.0)
+
+    def surely_kept(self, figure: Figure) -> bool:
+        """Whether the whole interval keeps it."""
+        low, high = figure.interval or (figure.value or 0.0,) * 2
+        return high <= self.limit if self.at_most else low >= self.limit
+
+
+def parse_demands(option: str, text: str | None) -> list[Demand]:
+    """Demands with commas between them.
+
+    Raises:
+        OptionError: another text, an unknown name, or a unit that is not the figure's.
+    """
+    return [_parse(option, part.strip()) for part in text.split(",")] if text is not None else []
+
+
+def _parse(option: str, text: str) -> Demand:
+    found = DEMAND.fullmatch(text.lower())
+    if found is None:
+        expected, remedy = "NAME<=NUMBER or NAME>=NUMBER", "write 'latency<=20s' or 'psnr>=44'"
+        raise OptionError(option, expected=expected, got=repr(text), remedy=remedy)
+    if found["name"] not in NAMES:
+        expected = f"one of {', '.join(NAMES)}"
+        raise OptionError(option, expected=expected, got=repr(found["name"]), remedy="correct the name")
+    key, unit = NAMES[found["name"]]
+    if found["unit"] not in ("", unit.lower()):
+        remedy = f"write {found['name']}{found['side']}{found['limit']}{unit}"
+        raise OptionError(option, expected=f"{key} in {unit}", got=repr(found["unit"]), remedy=remedy)
+    return Demand(key, found["side"] == "<=", float(found["limit"]), unit)
+
+
+def shortfall(figures: Mapping[str, Figure], demands: Sequence[Demand]) -> float:
+    """By what share of its limit a point misses the demand that it misses most; 0 where it keeps all."""
+    return max((demand.short_by(figures.get(demand.key)) for demand in demands), default=0.0)

@@ -8,41 +8,83 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from deploy.bench import Swath, layer_rows
+from deploy.bench.host import Sensors, drawn_acquisition
+from deploy.bench.tables import Swath, layer_rows
 from deploy.dpu.board import load_dpu
-from deploy.dpu.checking import network_rows
-from deploy.dpu.placement import place
+from deploy.dpu.checker.placement import place
+from deploy.dpu.checker.table import network_rows
 from deploy.dpu.reading import network_of
-from deploy.evaluation.pairs import oversampling_note
-from deploy.evaluation.perceptual import perceptual_distances
+from deploy.evaluation.pairs import NamedPair, oversampling_note
 from deploy.evaluation.run import load_pairs
-from deploy.evaluation.scores import Instruments
+from deploy.evaluation.scores import Instruments, fidelity_db, perceptual_distances
 from deploy.evaluation.targets import acquire_targets
-from deploy.measure import Sensors, drawn_acquisition
-from deploy.results import Row
+from deploy.report.pictures import busiest_windows
+from deploy.restoration.arrays import MAX_DN, restore_with
 from deploy.tradeoff.accuracy import Ground
+from deploy.tradeoff.advice import Choice, choose, findings, fronts, headline, notes, paper_outcomes, papers_point
 from deploy.tradeoff.board import DpuRun
 from deploy.tradeoff.cache import Cache
-from deploy.tradeoff.choice import Choice, choose
-from deploy.tradeoff.crops import crop_points, make_crops
-from deploy.tradeoff.figures import Assembly
-from deploy.tradeoff.findings import findings, headline, papers_point
 from deploy.tradeoff.host_time import TILE_PX
-from deploy.tradeoff.int8 import Calibration
-from deploy.tradeoff.jobs import run_jobs
-from deploy.tradeoff.lab import Lab
-from deploy.tradeoff.networks import find_networks, is_papers
-from deploy.tradeoff.notes import notes
-from deploy.tradeoff.outcome import Arena, Outcome
-from deploy.tradeoff.paper import paper_outcomes
-from deploy.tradeoff.points import Point
-from deploy.tradeoff.prices import fronts
-from deploy.tradeoff.request import Request
-from deploy.tradeoff.selection import select_points
-from deploy.tradeoff.shelf import Shelf
-from deploy.tradeoff.study import Study
-from model.files import sha256
+from deploy.tradeoff.measurements import Lab, run_jobs
+from deploy.tradeoff.methods import Calibration, Shelf, find_networks, is_papers
+from deploy.tradeoff.outcome import Arena, Assembly, Outcome
+from deploy.tradeoff.points import Point, Unit
+from deploy.tradeoff.selection import Request, select_points
+from deploy.tradeoff.study import Crop, Front, Study
+from model.io.files import sha256
+from profiles.figures import Row
 from quant.onnx_file import load_onnx
+
+CROP_PX, MOST = 128, 8
+FRONT = ("board latency", "PSNR")
+
+
+def crop_points(
+    outcomes: Sequence[Outcome], fronts: Sequence[Front], chosen: Sequence[Outcome | None]
+) -> list[Outcome]:
+    """Chosen points, the best of each kind, and those on the front of PSNR against latency: one a unit and halo."""
+    by_name = {each.name: each for each in outcomes}
+    members = [by_name[name] for front in fronts if (front.x, front.y) == FRONT for name in front.members]
+    known = sorted((o for o in outcomes if o.value("PSNR") is not None), key=lambda o: -(o.value("PSNR") or 0.0))
+    best = {each.point.unit.kind: each for each in reversed(known)}.values()
+    wanted = [each for each in (*chosen, *best, *reversed(members)) if each is not None]
+    alike: dict[tuple[Unit, str], Outcome] = {}
+    for each in wanted:
+        alike.setdefault((each.point.unit, each.point.halo), each)
+    return list(alike.values())[:MOST]
+
+
+def make_crops(points: Sequence[Outcome], lab: Lab) -> tuple[Crop, ...]:
+    """Degraded, each point as it would restore it, reference; of the pair that is hardest to restore."""
+    max_dn = lab.ground.instruments.max_dn
+    pair = hardest(lab.ground.pairs, max_dn)
+    side = min(CROP_PX, *pair.reference.shape)
+    top, left = busiest_windows(pair.reference, side)[0]
+
+    def crop(name: str, title: str, dn: np.ndarray) -> Crop:
+        here, truth, seen = (
+            np.asarray(image[top : top + side, left : left + side], np.float32)
+            for image in (dn, pair.reference, pair.degraded)
+        )
+        return Crop(name, title, here, None if dn is pair.reference else fidelity_db(here, truth, seen, max_dn))
+
+    made = [crop(each.name, each.name, _restored(each, pair, lab)) for each in points]
+    return (crop("degraded", "degraded", pair.degraded), *made, crop("reference", "reference", pair.reference))
+
+
+def hardest(pairs: Sequence[NamedPair], max_dn: int = MAX_DN) -> NamedPair:
+    """The pair whose degraded image is farthest from its reference, among those that hold a crop where any does."""
+    large = [pair for pair in pairs if min(pair.reference.shape) >= CROP_PX] or pairs
+    return min(large, key=lambda pair: fidelity_db(pair.degraded, pair.reference, pair.degraded, max_dn))
+
+
+def _restored(outcome: Outcome, pair: NamedPair, lab: Lab) -> np.ndarray:
+    opened, point = lab.shelf.open(outcome.point.unit), outcome.point
+    if opened.infer is None:
+        return opened.restore(pair.degraded)
+    halo_px = point.halo_px(lab.shelf.radius_px(point.unit.method))
+    return restore_with(opened.infer, pair.degraded, point.tile_px, halo_px, max_dn=lab.shelf.max_dn)
+
 
 LPIPS = "LPIPS-squeeze"
 

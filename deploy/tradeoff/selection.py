@@ -3,19 +3,32 @@
 import math
 import statistics
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from pathlib import Path
 
 import onnx
 
-from deploy.bench import PAPER_TILE_PX, Swath, swath_latency
+from deploy.bench.tables import PAPER_TILE_PX, Swath, swath_latency
 from deploy.dpu.board import Dpu, load_dpu
 from deploy.tradeoff.board import kept_tiles_px, predict_model
-from deploy.tradeoff.networks import Network, conv_weights
-from deploy.tradeoff.points import LEGAL, PRECISIONS, STEP_PX, Board, Point, network_points, other_points, tiles_px
-from deploy.tradeoff.shelf import Shelf
+from deploy.tradeoff.methods import Network, Shelf, conv_weights
+from deploy.tradeoff.points import (
+    LEGAL,
+    PRECISIONS,
+    STEP_PX,
+    Board,
+    Demand,
+    Point,
+    network_points,
+    other_points,
+    tiles_px,
+)
+from model.io.images import list_images
+from model.metrics.backbones import find_backbone
 from model.traditional.peers import PEERS
 from model.traditional.settings import QUALITIES
 from profiles.errors import ModelError
+from profiles.sensor import SensorProfile, load_sensor, reference_for
 from quant.onnx_file import load_onnx
 from quant.radius import receptive_radius_px
 
@@ -69,3 +82,51 @@ def configurations_for(model: onnx.ModelProto, default: Dpu) -> list[str]:
         alike = sorted((dpu for dpu in fitting if dpu.output_parallel == width), key=lambda dpu: dpu.batch)
         ends += [alike[0].name, alike[-1].name]
     return list(dict.fromkeys([default.name, *ends]))
+
+
+@dataclass(frozen=True)
+class Request:
+    """The options of `tradeoff`.
+
+    Attributes:
+        networks: shipped names and files.
+        images: folder of held-out scenes; drawn ones if None.
+        calibration: folder of scenes that INT8 files are made on; drawn ones if None.
+        sensor: profile of the degraded images.
+        reference: profile of the reference images.
+        lpips: weights of SqueezeNet 1.1, or a folder of backbones.
+        size_px: width and height of the swath.
+        budget: limits within which the best picture is wanted.
+        need: limits that are to be kept at the least cost.
+        seed: of every random draw.
+    """
+
+    networks: tuple[str, ...]
+    images: Path | None
+    calibration: Path | None
+    sensor: str
+    reference: str
+    lpips: Path | None
+    size_px: tuple[int, int]
+    budget: tuple[Demand, ...] = ()
+    need: tuple[Demand, ...] = ()
+    seed: int = 0
+
+    @property
+    def profiles(self) -> tuple[SensorProfile, SensorProfile]:
+        """Of the degraded images and of the reference, this one in the digital numbers of the first."""
+        degraded = load_sensor(self.sensor)
+        return degraded, reference_for(degraded, self.reference)
+
+    @property
+    def backbone(self) -> Path | None:
+        """The file of SqueezeNet's weights, where there is one."""
+        return find_backbone("squeeze", self.lpips)
+
+    @property
+    def files(self) -> tuple[Path, ...]:
+        """The files that the figures rest on, besides shipped ones."""
+        named = [path for path in map(Path, self.networks) if path.is_file()]
+        folders = [folder for folder in (self.images, self.calibration) if folder]
+        weights = [self.backbone] if self.backbone else []
+        return (*named, *(path for folder in folders for path in list_images(folder)), *weights)

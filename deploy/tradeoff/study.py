@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from deploy.results import Row
+from profiles.figures import Row
 
 
 @dataclass(frozen=True)

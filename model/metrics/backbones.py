@@ -4,14 +4,24 @@ Written here because torchvision does not import beside the CPU build of torch. 
 (`backbone_files`): ImageNet weights are never shipped or fetched.
 """
 
-from collections.abc import Mapping
+import math
+import os
+import struct
+import tokenize
+import zipfile
+import zlib
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from pathlib import Path
 
+import numpy as np
 import torch
+from numpy.lib.npyio import NpzFile
+from safetensors import SafetensorError, safe_open
 from torch import Tensor, nn
 from torch.nn import functional
 
-from profiles.errors import OptionError
+from profiles.errors import ModelError, OptionError
 
 
 @dataclass(frozen=True)
@@ -129,3 +139,133 @@ def _vgg16() -> list[nn.Module]:
             layers += [nn.Conv2d(channels, width, 3, padding=1), nn.ReLU()]
             channels = width
     return layers
+
+
+WEIGHTS_VARIABLE = "BEERS_LPIPS_WEIGHTS"
+SUFFIXES = (".safetensors", ".npz")
+ARRAY_BYTES = 1 << 30
+DAMAGE = (
+    SafetensorError, OSError, ValueError, TypeError, EOFError, RuntimeError, ArithmeticError, SyntaxError,
+    struct.error, tokenize.TokenError, zipfile.BadZipFile, zlib.error,
+)  # fmt: skip
+"""What a damaged archive has been seen to end in."""
+CONVERT = (
+    "convert it where you trust it: safetensors.torch.save_file(torch.load(FILE, weights_only=True), "
+    "'NAME.safetensors')"
+)
+
+
+def find_backbone(network: str, place: Path | None = None) -> Path | None:
+    """The weights file of a backbone, or None: then `not_found(network)` is the reason to show.
+
+    Args:
+        network: "squeeze", "alex" or "vgg" (DISTS uses "vgg").
+        place: a file, which is taken at its word, or a folder. Without it the environment variable
+            BEERS_LPIPS_WEIGHTS is asked; it may name a file or a folder, and a file counts only for the network
+            its name begins with.
+
+    Raises:
+        OptionError: no such network.
+    """
+    stem = backbone_spec(network).file_stem
+    if place is not None and not place.is_dir():
+        return place
+    named = place or os.environ.get(WEIGHTS_VARIABLE)
+    if not named:
+        return None
+    files = [Path(named)] if Path(named).is_file() else sorted(Path(named).glob("*"))
+    return next((file for file in files if file.name.startswith(stem) and file.suffix in SUFFIXES), None)
+
+
+def not_found(network: str) -> str:
+    """Why a metric is unavailable when `find_backbone` found nothing."""
+    names = " or ".join(f"{backbone_spec(network).file_stem}*{suffix}" for suffix in SUFFIXES)
+    return f"weights not found: no {names}; set {WEIGHTS_VARIABLE} to the file or its folder"
+
+
+def load_weights(module: nn.Module, path: Path) -> None:
+    """Fill a module from a file that holds its parameters by name; whatever else the file holds is left aside.
+
+    Raises:
+        ModelError: missing, of a kind that is not read, or with a parameter missing, misshapen or not finite.
+    """
+    wanted = module.state_dict()
+    tensors = read_tensors(path, wanted)
+    for name, tensor in tensors.items():
+        _check(path, name, tensor, wanted[name])
+    module.load_state_dict(tensors)
+
+
+def read_tensors(path: Path, names: Iterable[str]) -> dict[str, Tensor]:
+    """The named tensors of a .safetensors or .npz file, as float32.
+
+    Raises:
+        ModelError: missing file, missing name, or of a kind that is not read.
+    """
+    if path.suffix not in SUFFIXES:
+        raise _error(path, "a .safetensors or .npz file", f"'{path.suffix}', which is not read", CONVERT)
+    if not path.is_file():
+        raise _error(path, "a weights file", "no such file", "check the path")
+    read = _read_npz if path.suffix == ".npz" else _read_safetensors
+    try:
+        return {name: _as_float32(tensor) for name, tensor in read(path, names).items()}
+    except KeyError as error:
+        raise _error(path, f"a tensor named {error.args[0]}", "none of that name") from error
+    except DAMAGE as error:
+        got = " ".join(str(error).split())[:120]
+        raise _error(path, "arrays of floating-point numbers, none pickled", got, CONVERT) from error
+
+
+def _as_float32(tensor: Tensor) -> Tensor:
+    if not tensor.is_floating_point():
+        raise TypeError(f"an array of {tensor.dtype}")
+    return tensor.float()
+
+
+def _read_safetensors(path: Path, names: Iterable[str]) -> Mapping[str, Tensor]:
+    with safe_open(path, framework="pt") as file:
+        held = set(file.keys())
+        for name in names:
+            if name not in held:
+                raise KeyError(name)
+        return {name: file.get_tensor(name).clone() for name in names}  # the library's own lie in the file
+
+
+def _read_npz(path: Path, names: Iterable[str]) -> Mapping[str, Tensor]:
+    with path.open("rb") as raw:  # np.load leaves a file open that turns out to be broken
+        file = np.load(raw, allow_pickle=False)
+        if not isinstance(file, NpzFile):
+            raise TypeError("a single array")
+        for name in names:
+            if name not in file:
+                raise KeyError(name)
+            _require_held(path, name)
+        return {name: torch.from_numpy(file[name]) for name in names}
+
+
+def _require_held(path: Path, name: str) -> None:
+    """An array is as large as its header says before any of it is read: the archive must hold as much.
+
+    Raises:
+        ValueError: it does not, or more than belongs to any backbone.
+    """
+    with zipfile.ZipFile(path) as archive, archive.open(f"{name}.npy") as stream:
+        held_bytes = archive.getinfo(f"{name}.npy").file_size
+        read = np.lib.format.read_array_header_1_0
+        if np.lib.format.read_magic(stream) != (1, 0):
+            read = np.lib.format.read_array_header_2_0
+        shape, _, dtype = read(stream)
+    if not math.prod(shape) * dtype.itemsize <= held_bytes <= ARRAY_BYTES:
+        raise ValueError(f"{name} of {shape} in {held_bytes} bytes")
+
+
+def _check(path: Path, name: str, tensor: Tensor, wanted: Tensor) -> None:
+    if tensor.shape != wanted.shape:
+        raise _error(path, f"{name} of shape {tuple(wanted.shape)}", f"{tuple(tensor.shape)}")
+    if not bool(torch.isfinite(tensor).all()):
+        raise _error(path, f"finite values in {name}", "NaN or infinity")
+
+
+def _error(path: Path, expected: str, got: str, remedy: str = "") -> ModelError:
+    remedy = remedy or "give the feature layers named as in torchvision (features.0.weight ...)"
+    return ModelError(str(path), expected=expected, got=got, remedy=remedy)

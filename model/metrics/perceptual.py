@@ -12,8 +12,7 @@ from typing import Self
 import torch
 from torch import Tensor, nn
 
-from model.metrics.backbone_files import load_weights, read_tensors
-from model.metrics.backbones import Backbone
+from model.metrics.backbones import Backbone, load_weights, read_tensors
 from profiles.errors import ImageError
 
 PUBLISHED = Path(__file__).parent / "weights"

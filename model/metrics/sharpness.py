@@ -15,9 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from model.metrics.edge_spread import ROW_LAG, spread
-from model.metrics.edges import MIN_ROWS, Edge, find_edge
-from model.metrics.plateaus import Plateaus, fit_plateaus
+from model.metrics.edges import MIN_ROWS, ROW_LAG, Edge, Plateaus, find_edge, fit_plateaus, spread
 from model.metrics.refusal import Refusal
 from profiles.errors import ImageError
 

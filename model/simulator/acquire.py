@@ -7,11 +7,9 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from model.simulator.bounds import SceneStats, scene_stats
-from model.simulator.detect import detect
-from model.simulator.draws import Draw
+from model.simulator.detector import Draw, detect
 from model.simulator.mtf import sensor_transfer
-from model.simulator.plan import Plan
+from model.simulator.plan import Plan, SceneStats, scene_stats
 from model.simulator.sampling import crop_divisible, sample, scene_spectrum
 from profiles.errors import ImageError
 from profiles.sensor import Sensor

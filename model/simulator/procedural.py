@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from PIL import Image, ImageDraw
 
-from model.simulator.scene import Scene
+from model.simulator.sampling import Scene
 
 Point = tuple[float, float]
 

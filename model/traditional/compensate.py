@@ -11,9 +11,7 @@ import torch
 from torch import Tensor
 
 from model.simulator.mtf import NYQUIST, Axes, mtf
-from model.traditional.fill import fill_missing
-from model.traditional.rows import Rows, mirrored
-from model.traditional.threads import map_tiles
+from model.traditional.rows import Rows, fill_missing, map_tiles, mirrored
 from profiles.errors import OptionError
 
 EPSILON_PER_PERCENT = 3.3e-3

@@ -8,14 +8,277 @@ searches, and takes its model, in the result of the first.
 from collections.abc import Iterable, Iterator
 from itertools import tee
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from model.traditional.noise import Noise
-from model.traditional.passes import denoise_pass
-from model.traditional.rows import Rows
-from model.traditional.settings import QUALITIES, Quality, first_pass, second_pass
+from model.traditional.rows import Rows, map_tiles, mirrored
+from model.traditional.settings import QUALITIES, PassSettings, Quality, first_pass, second_pass
 from profiles.errors import ImageError
+
+JITTER = 1e-3
+"""Added to the diagonal of a noisy covariance, in units of sigma^2. Up to 1e-2 costs less than 0.01 dB (measured)."""
+
+
+def estimate_groups(
+    noisy: Tensor, guide: Tensor, taken: Tensor | None, noise: Noise, settings: PassSettings
+) -> Tensor:
+    """Posterior mean of every patch: P - beta Sigma S^-1 (P - mean of P), Sigma the covariance of the noise.
+
+    1. Pass 1: S is the covariance of the noisy patches, signal and noise together.
+    2. Pass 2: S is the covariance of the guide's patches plus beta Sigma.
+    3. A flat group of pass 1 (variance of all its pixels below gamma sigma^2): every pixel becomes their mean.
+    4. No Cholesky factor of S: the noisy patches stay.
+
+    Both S give P_mean + C S^-1 (P - P_mean) with C the signal's covariance, so only S needs an inverse (IPOL 2013,
+    estimates of the first and the second step; there Sigma = sigma^2 I).
+
+    Args:
+        noisy: (B, N, k * k) groups of patches.
+        guide: the same patches of the guide image; in pass 1 `noisy` itself.
+        taken: (B, N) of 0 and 1: which patches the group counts, None for all; the others' estimates mean nothing.
+        noise: that of `noisy`.
+        settings: those of the pass.
+    """
+    mean, centred, covariance = _moments(noisy, taken)
+    if guide is not noisy:
+        covariance = _moments(guide, taken)[2]
+    flat = _is_flat(mean, covariance, settings.flat_gamma * noise.sigma**2)
+    shrinkage = torch.zeros_like(covariance)
+    shrinkage[~flat] = _shrinkage(covariance[~flat], noise, settings)
+    estimates = torch.baddbmm(noisy, centred, shrinkage, alpha=-1)
+    estimates[flat] = mean[flat].mean(2, keepdim=True)
+    return estimates
+
+
+def _moments(patches: Tensor, taken: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
+    """Mean patch (B, 1, k * k), the patches without it, and their covariance, of the taken patches.
+
+    Divided by their number and not by one less, as published.
+    """
+    if taken is None:
+        mean = patches.mean(1, keepdim=True)
+        centred = patches - mean
+        return mean, centred, centred.mT @ centred / patches.shape[1]
+    share = taken / taken.sum(1, keepdim=True)
+    mean = share[:, None] @ patches
+    centred = patches - mean
+    return mean, centred, centred.mT @ (centred * share[..., None])
+
+
+def _is_flat(mean: Tensor, covariance: Tensor, bound: float) -> Tensor:
+    """(B,) whether the variance of all the pixels of a group stays below `bound`.
+
+    It is the variance within the k * k positions, the trace, plus that between them: two small sums, where the sum
+    of the squared pixels would drown sigma^2 in float32.
+    """
+    within = covariance.diagonal(dim1=1, dim2=2).mean(1)
+    return within + mean[:, 0].var(1, correction=0) < bound
+
+
+def _shrinkage(covariance: Tensor, noise: Noise, settings: PassSettings) -> Tensor:
+    """The matrix beta S^-1 Sigma, for patches as rows, or 0 where S has no Cholesky factor."""
+    sigma_matrix = noise.covariance(settings.side_px).to(covariance) * settings.excess
+    diagonal = covariance.diagonal(dim1=1, dim2=2)
+    # A drawn or saturated area has rank 0 or 1: the covariance is then no better known than its own rounding.
+    diagonal.add_(torch.finfo(covariance.dtype).eps * diagonal.sum(1, keepdim=True))
+    if settings.clean_guide:
+        covariance = covariance + sigma_matrix
+    else:
+        diagonal.add_(JITTER * noise.sigma**2)
+    factor, failed = torch.linalg.cholesky_ex(covariance)
+    lost = failed != 0
+    factor[lost] = torch.eye(factor.shape[1], dtype=factor.dtype, device=factor.device)
+    shrinkage = torch.cholesky_inverse(factor) @ sigma_matrix
+    shrinkage[lost] = 0
+    return shrinkage
+
+
+def patch_matrix(image: Tensor, side_px: int) -> Tensor:
+    """Every patch of (H, W): ((H - k + 1) * (W - k + 1), k * k)."""
+    return image.unfold(0, side_px, 1).unfold(1, side_px, 1).reshape(-1, side_px * side_px)
+
+
+def overlap_add(patches: Tensor, shape: torch.Size, side_px: int) -> Tensor:
+    """Add every patch of the matrix onto its place in an image of `shape` (H, W): the adjoint of `patch_matrix`."""
+    height, width = shape
+    stack = patches.reshape(height - side_px + 1, width - side_px + 1, side_px, side_px)
+    image = patches.new_zeros(height, width)
+    for dy in range(side_px):
+        for dx in range(side_px):
+            image[dy : dy + stack.shape[0], dx : dx + stack.shape[1]] += stack[:, :, dy, dx]
+    return image
+
+
+def window_distances(guide: Tensor, rows: Tensor, columns: Tensor, side_px: int, window_px: int) -> Tensor:
+    """Squared L2 distance of each reference patch to the window_px^2 patches around it.
+
+    d(p, q) = sum over k * k pixels of (P - Q)^2, as box sums of shifted differences: exact where the expansion
+    |P|^2 - 2 P.Q + |Q|^2 would cancel in float32.
+
+    Args:
+        guide: (H, W), wide enough to hold every window.
+        rows: (R,) top row of each reference's window, ascending from 0.
+        columns: (C,) leftmost column of it, ascending from 0.
+        side_px: k, the side of a patch.
+        window_px: number of candidates along each axis, odd; the reference is the middle one.
+
+    Returns:
+        (R * C, window_px^2). The reference's distance to itself is -1: it wins every tie.
+    """
+    half = window_px // 2
+    box_rows, box_columns = _boxes(rows, side_px, guide.dtype), _boxes(columns, side_px, guide.dtype)
+    height, width = box_rows.shape[1], box_columns.shape[1]
+    centre = guide[half : half + height, None, half : half + width]
+    distances = guide.new_empty(len(rows), len(columns), window_px, window_px)
+    for dy in range(window_px):
+        shifted = guide[dy : dy + height].unfold(1, width, 1)[:, :window_px]  # (height, window, width)
+        squares = (shifted - centre).square_().reshape(height, -1)
+        sums = (box_rows @ squares).reshape(-1, width) @ box_columns.T
+        distances[:, :, dy] = sums.reshape(len(rows), window_px, -1).mT
+    distances[:, :, half, half] = -1
+    return distances.reshape(len(rows) * len(columns), -1)
+
+
+def window_numbers(rows: Tensor, columns: Tensor, grid_columns: int, window_px: int) -> tuple[Tensor, Tensor]:
+    """Patch number of each window's first candidate (R * C, 1), and what to add for the others (window_px^2,)."""
+    first = (rows[:, None] * grid_columns + columns).reshape(-1, 1)
+    steps = torch.arange(window_px, device=rows.device)
+    return first, (steps[:, None] * grid_columns + steps).reshape(-1)
+
+
+def _boxes(starts: Tensor, side_px: int, dtype: torch.dtype) -> Tensor:
+    """(R, E) of ones where pixel e lies in the patch of reference r: a box sum at chosen places is a product."""
+    offset = torch.arange(int(starts[-1]) + side_px, device=starts.device) - starts[:, None]
+    return ((offset >= 0) & (offset < side_px)).to(dtype)
+
+
+TILE_REFERENCES = 24
+"""References along each side of a tile: bounds the memory whatever the image, and keeps a tile near the cache."""
+
+Sums = tuple[Tensor, Tensor]
+"""Sum and number of the estimates of each pixel, both (h, w)."""
+
+Places = tuple[Tensor, Tensor]
+"""Rows and columns of references, as the top left corners of their search windows."""
+
+
+def denoise_pass(
+    noisy: Rows, guide: Rows, height: int, noise: Noise, settings: PassSettings, stride_px: int
+) -> Iterator[Tensor]:
+    """Each pixel's mean over all the estimates of it, in strips of rows; a pixel without any keeps its value."""
+    margin = settings.margin_px
+    runs = reference_runs(height, stride_px)
+    carried: Sums | None = None
+    for run, following in zip(runs, [*runs[1:], None], strict=True):
+        top, bottom = int(run[0]) - margin, int(run[-1]) + stride_px + margin
+        rows = mirrored(top, bottom, height)
+        noisy_rows, guide_rows = noisy.window(rows), guide.window(rows)
+        sums = _row_of_tiles(noisy_rows, guide_rows, run - run[0], noise, settings, stride_px)
+        if carried is not None:
+            for sum_, before in zip(sums, carried, strict=True):
+                sum_[: len(before)] += before
+        done = (height if following is None else int(following[0]) - margin) - top
+        total, count = (sum_[max(-top, 0) : done] for sum_ in sums)
+        yield (total / count).where(count > 0, noisy_rows[max(-top, 0) : done])
+        carried = sums[0][done:], sums[1][done:]
+
+
+def reference_runs(size_px: int, stride_px: int) -> tuple[Tensor, ...]:
+    """Pixels on which references are centred along one axis, tile by tile; the last pixel always has one."""
+    centres = torch.arange(0, size_px + stride_px - 1, stride_px).clamp(max=size_px - 1)
+    return torch.split(centres, TILE_REFERENCES)
+
+
+def _row_of_tiles(
+    noisy: Tensor, guide: Tensor, centres: Tensor, noise: Noise, settings: PassSettings, stride_px: int
+) -> Sums:
+    """The sums of one row of tiles over (h, W); `centres` count from the first reference's own."""
+    margin, width = settings.margin_px, noisy.shape[1]
+    wide = mirrored(-margin, width + stride_px - 1 + margin, width)
+    noisy_wide, guide_wide = noisy[:, wide], guide[:, wide]
+    runs = reference_runs(width, stride_px)
+
+    def estimate(run: Tensor) -> Sums:
+        area = slice(int(run[0]), int(run[-1]) + stride_px + 2 * margin)
+        rows, columns = centres, run - run[0]
+        if not bool(torch.isfinite(noisy_wide[:, area]).all()):  # what is left between missing pixels is narrow
+            rows, columns = (torch.arange(int(place[-1]) + stride_px) for place in (rows, columns))
+        return _tile(noisy_wide[:, area], guide_wide[:, area], (rows, columns), noise, settings)
+
+    total, count = torch.zeros_like(noisy_wide), torch.zeros_like(noisy_wide)
+    for run, (tile_total, tile_count) in zip(runs, map_tiles(estimate, runs), strict=True):
+        left = int(run[0])
+        total[:, left : left + tile_total.shape[1]] += tile_total
+        count[:, left : left + tile_count.shape[1]] += tile_count
+    return total[:, margin : margin + width], count[:, margin : margin + width]
+
+
+def _tile(noisy: Tensor, guide: Tensor, places: Places, noise: Noise, settings: PassSettings) -> Sums:
+    """The sums over a tile (h, w)."""
+    known = torch.isfinite(noisy)
+    if not bool(known.any()):
+        return torch.zeros_like(noisy), torch.zeros_like(noisy)
+    side = settings.side_px
+    patches, guides = patch_matrix(noisy.nan_to_num(0), side), patch_matrix(guide.nan_to_num(0), side)
+    total, count = torch.zeros_like(patches), patches.new_zeros(len(patches), 1)
+    for numbers, taken in similar_groups(guide, known, places, settings):
+        members = _rows_of(patches, numbers)
+        model = _rows_of(guides, numbers) if settings.clean_guide else members
+        estimates = estimate_groups(members, model, taken, noise, settings)
+        weights = torch.ones_like(numbers, dtype=noisy.dtype) if taken is None else taken
+        if taken is not None:
+            estimates *= taken[..., None]
+        total.index_add_(0, numbers.reshape(-1), estimates.reshape(-1, side**2))
+        count.index_add_(0, numbers.reshape(-1), weights.reshape(-1, 1))
+    return overlap_add(total, noisy.shape, side), overlap_add(count.expand_as(total), noisy.shape, side)
+
+
+def _rows_of(matrix: Tensor, numbers: Tensor) -> Tensor:
+    """matrix[numbers], four times faster (measured)."""
+    return matrix.index_select(0, numbers.reshape(-1)).reshape(*numbers.shape, -1)
+
+
+def similar_groups(
+    guide: Tensor, known: Tensor, places: Places, settings: PassSettings
+) -> Iterator[tuple[Tensor, Tensor | None]]:
+    """Groups of like patches: their numbers (B, N), and which of them count (None: all).
+
+    The many groups of no more than the usual number come first, without the room that the others need.
+    """
+    distances = window_distances(guide.nan_to_num(0), *places, settings.side_px, settings.window_px)
+    first, steps = window_numbers(*places, guide.shape[1] - settings.side_px + 1, settings.window_px)
+    if not bool(known.all()):
+        _rule_out(distances, first + steps, patch_matrix(known, settings.side_px).all(1))
+    usual, most = settings.similar, min(settings.most_similar, distances.shape[1])
+    candidate, nearest = nearest_first(distances, usual, most)
+    enough = nearest[:, :usual].amax(1, keepdim=True).clamp(min=settings.alike_rms**2 * settings.side_px**2)
+    taken = (nearest <= enough) & nearest.isfinite()
+    sizes = taken.sum(1)
+    for chosen, size in (((sizes > 0) & (sizes <= usual), usual), (sizes > usual, most)):
+        if bool(chosen.any()):
+            counts = taken[chosen, :size]
+            numbers = first[chosen] + steps[candidate[chosen, :size]]
+            yield numbers, None if bool(counts.all()) else counts.to(guide.dtype)
+
+
+def _rule_out(distances: Tensor, numbers: Tensor, whole: Tensor) -> None:
+    """Put the patches (B, M) that hold a missing pixel, and groups around such a one, out of reach."""
+    distances[~whole[numbers]] = torch.inf
+    distances[~whole[numbers[:, numbers.shape[1] // 2]]] = torch.inf
+
+
+def nearest_first(distances: Tensor, usual: int, most: int) -> tuple[Tensor, Tensor]:
+    """Columns (B, most) of the smallest of each row, the `usual` smallest among them first, and their values.
+
+    numpy's partition is over three times faster than torch's topk (measured).
+    """
+    ends = [k for k in (usual - 1, most - 1) if k < distances.shape[1] - 1]
+    columns = torch.from_numpy(np.argpartition(distances.numpy(), ends, axis=1)[:, :most]) if ends else None
+    if columns is None:
+        columns = torch.arange(most).expand(len(distances), most)
+    return columns, distances.gather(1, columns)
 
 
 def nl_bayes(image: Tensor, noise: Noise, quality: Quality = QUALITIES["standard"]) -> Tensor:

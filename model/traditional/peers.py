@@ -10,12 +10,12 @@ from types import ModuleType
 import torch
 from torch import Tensor
 
-from model.simulator.digitise import to_dn, to_radiance
+from model.simulator.detector import to_dn, to_radiance
 from model.simulator.mtf import transfer_function
 from model.traditional.compensate import filter_strips
+from model.traditional.noise import bias_radiance, destabilise, stabilise
 from model.traditional.pipeline import Chain, with_rounding_noise
 from model.traditional.rows import mirrored
-from model.traditional.stabilise import bias_radiance, destabilise, stabilise
 from profiles.errors import MachineError
 
 PAD_PX = 64

@@ -13,12 +13,11 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from model.simulator.digitise import to_dn, to_radiance
+from model.simulator.detector import to_dn, to_radiance
 from model.traditional.compensate import EPSILON_PER_PERCENT, compensation_gain, compensation_kernel, filter_strips
 from model.traditional.nl_bayes import finite_or_missing, nl_bayes_strips
-from model.traditional.noise import Noise, coloured_by
+from model.traditional.noise import Noise, bias_radiance, coloured_by, destabilise, stabilise
 from model.traditional.settings import QUALITIES, Quality
-from model.traditional.stabilise import bias_radiance, destabilise, stabilise
 from profiles.errors import OptionError
 from profiles.sensor import Sensor
 

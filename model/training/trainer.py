@@ -14,12 +14,11 @@ from torch import Tensor
 
 from model.conditioning import Network, ToldConvBEERS, initialise_coefficients
 from model.convbeers import ConvBEERS, Variant, initialise
-from model.training.checkpoint import read_checkpoint, write_checkpoint
+from model.training.checkpoint import TrainingRecipe, read_checkpoint, write_checkpoint
 from model.training.guards import Guards
 from model.training.interrupts import held_back
 from model.training.losses import RestorationLoss
 from model.training.precision import MixedPrecision, Precision, choose_precision, in_precision
-from model.training.recipe import TrainingRecipe
 from model.training.workers import Worker
 from profiles.errors import OptionError
 

@@ -8,11 +8,11 @@ import torch
 from torch import Tensor
 
 from model.conditioning import Network, SensorFamily, ToldConvBEERS, fold, tell
-from model.images import site_of
+from model.io.images import site_of
 from model.metrics.fidelity import psnr_db, ssim
 from model.simulator.acquire import fitting_oversampling, simulate_pair
-from model.simulator.draws import Draw
-from model.simulator.scene import Scene
+from model.simulator.detector import Draw
+from model.simulator.sampling import Scene
 from profiles.sensor import SensorProfile
 
 SHARE = 0.05

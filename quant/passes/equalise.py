@@ -13,12 +13,10 @@ from itertools import product
 
 import numpy as np
 
-from quant.float_file import float_model
-from quant.graph import Conv, Graph
-from quant.passes.steady_stream import STREAM_POSITION, stream_tensors
-from quant.pieces import halo_of, tensor_values
-from quant.positions import INT8_MAX
-from quant.session import open_session
+from quant.core import INT8_MAX
+from quant.graph import Conv, Graph, float_model
+from quant.passes.stream import STREAM_POSITION, stream_tensors
+from quant.session import halo_of, open_session, tensor_values
 
 QUANTILE = 0.9999
 """A channel's range: the mean over pieces of this quantile of its sizes. The maximum would be ruled by outliers."""

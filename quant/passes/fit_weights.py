@@ -7,15 +7,76 @@ Frantar et al. 2023). From the nearest numbers on, weight after weight takes the
 until none does. What the mean is off by then goes into the bias.
 """
 
-from collections.abc import Mapping
-from dataclasses import replace
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 
-from quant.core import IntConv, IntCore, quantise_bias
-from quant.graph import Conv, Graph
-from quant.moments import Moments
-from quant.positions import INT8_MAX, INT8_MIN, SHIFTS, Shifts
+from quant.core import INT8_MAX, INT8_MIN, SHIFTS, IntConv, IntCore, Shifts, quantise_bias
+from quant.graph import PLANES, Conv, Graph, float_model, tensors
+from quant.session import crops, halo_of, open_session, planes_of, tensor_values
+
+EVERY_PX = 4
+"""Windows are taken so far apart in both directions: neighbours say nearly the same."""
+
+
+@dataclass
+class Moments:
+    """Sums over windows x, (I kh kw,) each, that a convolution multiplies its weights with."""
+
+    products: np.ndarray  # (n, n) float64, sum of x x^T
+    total: np.ndarray  # (n,) float64, sum of x
+    count: int = 0
+
+    def add(self, windows: np.ndarray) -> None:
+        """Count further windows (K, n) float32."""
+        self.products += windows.T @ windows
+        self.total += windows.sum(axis=0, dtype=np.float64)
+        self.count += len(windows)
+
+    @property
+    def mean(self) -> np.ndarray:
+        """(n,) mean window."""
+        return np.asarray(self.total / self.count)
+
+    @property
+    def covariance(self) -> np.ndarray:
+        """(n, n) covariance, a little of its mean variance added to the diagonal so that no direction is free."""
+        covariance = self.products / self.count - np.outer(self.mean, self.mean)
+        floor = 1e-6 * np.trace(covariance) / len(covariance)
+        return np.asarray(covariance + floor * np.eye(len(covariance)))
+
+
+def input_moments(graph: Graph, images: Iterable[np.ndarray], tick: Callable[[], None]) -> dict[str, Moments]:
+    """The moments of every convolution of a plane-reading graph, by its name, over images (1, 1, H, W) in [0, 1].
+
+    The values are those of the float network. `tick` is called once an image.
+    """
+    convs = [op for op in graph if isinstance(op, Conv)]
+    found = {op.name: _nothing(op) for op in convs}
+    names, halo_px = tensors(graph), halo_of(graph)
+    session = open_session(float_model(graph, names))
+    for image in images:
+        for crop, values in zip(crops(image), tensor_values(session, names, image, halo_px), strict=True):
+            read = {PLANES: planes_of(crop), **dict(zip(names, values, strict=True))}
+            for op in convs:
+                found[op.name].add(_windows(read[op.input], op))
+        tick()
+    return found
+
+
+def _nothing(op: Conv) -> Moments:
+    size = int(np.prod(op.weight.shape[1:]))
+    return Moments(np.zeros((size, size)), np.zeros(size))
+
+
+def _windows(values: np.ndarray, op: Conv) -> np.ndarray:
+    """(K, I kh kw) of the windows within (1, I, H, W), some pixels apart."""
+    kernel = op.weight.shape[2:]
+    windows = sliding_window_view(values[0], kernel, axis=(1, 2))[:, ::EVERY_PX, ::EVERY_PX]
+    return np.ascontiguousarray(windows.transpose(1, 2, 0, 3, 4)).reshape(-1, int(np.prod(op.weight.shape[1:])))
+
 
 SWEEPS = 20
 """At most; a sweep that changes nothing ends it, after some five."""

@@ -13,7 +13,7 @@ from onnx import numpy_helper
 from typer.testing import CliRunner
 
 from deploy.cli import app
-from deploy.shipped import SENSOR, shipped_pair
+from model.shipped import SENSOR, shipped_pair
 from tests.deploy.workflow_steps import ACTION, BASH, KEPT, ROOT, Runner, read_yaml
 
 WORKFLOW = ROOT / ".github" / "workflows" / "int8-gate.yml"

@@ -10,17 +10,26 @@ import tifffile
 import typer
 from typer.testing import CliRunner
 
-from deploy.bench import Swath, efficiency, layer_rows, predict_file, predicted_rows, published_rows
-from deploy.bench_sweep import parse_tiles, sweep_rows
+from deploy.bench.host import CROP_PX, Sensors, drawn_acquisition, traditional_rows
+from deploy.bench.tables import (
+    Swath,
+    efficiency,
+    layer_rows,
+    parse_tiles,
+    predict_file,
+    predicted_rows,
+    published_rows,
+    sweep_rows,
+)
 from deploy.commands.bench import TRAFFIC, bench, parse_size
 from deploy.commands.check import check
 from deploy.dpu.board import load_dpu
-from deploy.dpu.rates import Constants
-from deploy.measure import CROP_PX, Sensors, drawn_acquisition, traditional_rows
-from deploy.refit import refit
-from deploy.results import SCHEMA_PATH, Row, measured, predicted, unavailable
+from deploy.dpu.cost.layers import Constants
+from deploy.dpu.cost.validation import refit
+from deploy.results import SCHEMA_PATH
 from profiles import load_sensor
 from profiles.errors import BeersError, ImageError, OptionError, ProfileError
+from profiles.figures import Row, measured, predicted, unavailable
 from tests.deploy.dpu.graphs import Sketch, float_convbeers, integer_convbeers
 
 DPU = load_dpu()

@@ -15,7 +15,7 @@ from typer.testing import CliRunner
 from deploy.commands.check import check
 from deploy.results import SCHEMA_PATH
 from profiles.errors import BeersError, ModelError, OptionError
-from quant.float_reader import correction_graph
+from quant.graph import correction_graph
 from tests.deploy.dpu.graphs import Sketch, board_convbeers, float_convbeers, integer_convbeers
 
 

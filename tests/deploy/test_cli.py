@@ -19,9 +19,9 @@ from typer.testing import CliRunner
 
 from deploy.cli import COMMANDS, app
 from deploy.demo import read_input, sensors
-from deploy.restore import read_acquisition
+from deploy.restoration.arrays import read_acquisition
 from deploy.results import SCHEMA_PATH
-from deploy.shipped import SENSOR, default_int8
+from model.shipped import SENSOR, default_int8
 from profiles.errors import ImageError
 from profiles.toml import profile_path
 

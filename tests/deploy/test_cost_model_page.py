@@ -3,7 +3,7 @@ from pathlib import Path
 
 import pytest
 
-from deploy.dpu.zoo.cases import published_cases
+from deploy.dpu.cost.validation import published_cases
 
 DOCS = Path(__file__).parents[2] / "docs"
 

@@ -14,8 +14,7 @@ from typer.testing import CliRunner
 
 from deploy.cli import app
 from deploy.cluster import local_cluster
-from deploy.dataset import CHUNK, write_dataset
-from deploy.dataset_patches import DatasetRecipe, make_patches, plan_windows
+from deploy.dataset import CHUNK, DatasetRecipe, make_patches, plan_windows, write_dataset
 from profiles import load_sensor
 from profiles.errors import ImageError, OptionError
 from profiles.scene_call import calling_for, load_scene_call, scene_names, typical_effects
@@ -164,7 +163,7 @@ def test_a_dataset_begun_here_is_finished_by_a_scheduler_s_workers(
 def test_a_scene_that_a_worker_does_not_find_is_one_sentence(
     scene: Path, scheduler: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("deploy.dataset_spread.sha256", lambda path: f"digest of another {path.name}")
+    monkeypatch.setattr("deploy.dataset.sha256", lambda path: f"digest of another {path.name}")
     with pytest.raises(ImageError, match=r"another file of that name.*shared folder"):
         write_dataset(small(scene), tmp_path / "d", 1, resume=False, tick=silent, scheduler=scheduler)
     assert not list(tmp_path.rglob("*.tif"))

@@ -3,7 +3,7 @@ from pathlib import Path
 
 import pytest
 
-from deploy.energy import timed
+from deploy.bench.profile import timed
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="Linux's counters have names that Windows refuses")
 

@@ -15,17 +15,16 @@ from deploy.evaluation import targets as targets_module
 from deploy.evaluation.methods import TRAINED, Method, method_named
 from deploy.evaluation.page import chosen_pairs, strip_of
 from deploy.evaluation.pairs import NamedPair, oversampling_note, oversamplings_of, read_pairs, simulate_pairs
-from deploy.evaluation.paper import paper_rows
-from deploy.evaluation.scores import Instruments, fidelity_db, score, site_rows
+from deploy.evaluation.scores import Instruments, fidelity_db, paper_rows, score, site_rows
 from deploy.evaluation.targets import acquire_targets, flat_figure, mtf_figure, snr_name, target_figures
-from deploy.restore import write_tiff
-from deploy.results import SCHEMA_PATH, Document, by_table
-from deploy.tables import missing
+from deploy.restoration.arrays import write_tiff
+from deploy.results import SCHEMA_PATH, Document, missing
 from model.metrics.refusal import Refusal
 from model.simulator.procedural import procedural_scene
 from profiles import load_sensor
 from profiles.constant import Constant
 from profiles.errors import ImageError, MachineError, OptionError
+from profiles.figures import by_table
 
 DEGRADED, REFERENCE = load_sensor("pleiades-degraded"), load_sensor("pleiades-reference")
 SENSORS = DEGRADED.nominal(), REFERENCE.nominal()

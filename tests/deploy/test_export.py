@@ -10,7 +10,7 @@ from deploy.cli import app
 from deploy.export import parity, require_parity, to_onnx
 from model.conditioning import ToldConvBEERS, initialise_coefficients, tell
 from model.convbeers import ConvBEERS, Variant, initialise
-from model.weights_file import load_told, save_network
+from model.io.weights import load_told, save_network
 from profiles import load_sensor
 from profiles.errors import ModelError
 from profiles.toml import HERE

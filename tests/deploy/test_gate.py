@@ -14,20 +14,17 @@ from typer.testing import CliRunner
 
 from deploy.cli import app
 from deploy.defaults import float_model
-from deploy.gate import baseline_mae, structure_checks
-from deploy.results import Document, Row, measured
-from deploy.shipped import default_int8, shipped_pair
-from deploy.verdict import junit, markdown, sentence
-from model.shipped import SHIPPED
+from deploy.gate import baseline_mae, junit, markdown, sentence, structure_checks
+from deploy.results import Document
+from model.shipped import SHIPPED, default_int8, shipped_pair
 from model.simulator.procedural import procedural_scene
 from profiles import load_sensor
 from profiles.errors import OptionError
+from profiles.figures import Row, measured
 from quant.calibration import Patches, draw_patches
-from quant.checks import Bound, Check
+from quant.encodings import read_core
 from quant.free import quantise_free
-from quant.gate import compare
-from quant.host_reader import read_core
-from quant.limits import Limits, judge, judge_saturation, read_limits
+from quant.gate import Bound, Check, Limits, compare, judge, judge_saturation, read_limits
 from quant.onnx_file import image_info, save_onnx
 from quant.relus import Relus, count_relus
 from quant.saturation import rounded_tensors, saturated_shares

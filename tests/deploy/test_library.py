@@ -15,10 +15,10 @@ from hypothesis import strategies as st
 from deploy.cluster import local_cluster
 from deploy.export import to_onnx
 from deploy.library import restore
-from deploy.shipped import default_int8
-from deploy.swath.options import Options
-from deploy.swath.run import restore_file
+from deploy.restoration.options import Options
+from deploy.restoration.run import restore_file
 from model.convbeers import ConvBEERS, Variant, initialise
+from model.shipped import default_int8
 from profiles.errors import ImageError, ModelError, OptionError
 from quant.onnx_file import save_onnx
 

@@ -6,9 +6,9 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from deploy.bench_sweep import MOST_TILE_PX, parse_tiles
+from deploy.bench.tables import MOST_TILE_PX, parse_tiles
 from deploy.cli import app
-from deploy.cores import require_cores
+from model.processor import require_cores
 from profiles.errors import OptionError
 
 HUGE = str(10**23)

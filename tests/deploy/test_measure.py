@@ -9,19 +9,25 @@ import numpy as np
 import onnx
 import pytest
 
-from deploy.bench import Swath
-from deploy.counterpart import counterpart, is_quantised
-from deploy.cpu_side import board_cpu_row, slowdown
-from deploy.defaults import float_model
-from deploy.host_state import memory_rise, watched
-from deploy.measure import Sensors, drawn_acquisition, host_rows, traditional_rows
-from deploy.profiler import node_rows, profile
-from deploy.results import Row
-from deploy.shipped import default_int8
-from deploy.turns import Timed, take_turns, timed_rows
+from deploy.bench.host import (
+    Sensors,
+    Timed,
+    drawn_acquisition,
+    host_rows,
+    memory_rise,
+    take_turns,
+    timed_rows,
+    traditional_rows,
+    watched,
+)
+from deploy.bench.profile import node_rows, profile
+from deploy.bench.tables import Swath, board_cpu_row, slowdown
+from deploy.defaults import counterpart, float_model, is_quantised
+from model.shipped import default_int8
 from profiles import load_sensor, load_target
 from profiles.constant import Constant
 from profiles.errors import ModelError
+from profiles.figures import Row
 from quant.onnx_file import load_onnx
 from tests.deploy.dpu.graphs import Sketch, float_convbeers, integer_convbeers
 

@@ -21,7 +21,7 @@ from typer.testing import CliRunner
 
 from deploy.cli import app
 from model.convbeers import ConvBEERS, Variant, initialise
-from model.weights_file import save_network
+from model.io.weights import save_network
 from tests.deploy.sealed import SOCKET_CALL
 
 runner = CliRunner()

@@ -13,9 +13,9 @@ from typer.testing import CliRunner
 
 from deploy.cli import app
 from deploy.export import to_onnx
-from deploy.shipped import shipped_pair
 from model.convbeers import VARIANTS, ConvBEERS
-from model.weights_file import save_network
+from model.io.weights import save_network
+from model.shipped import shipped_pair
 from profiles.errors import ModelError
 from quant.gate import compare
 from quant.onnx_file import load_onnx, parse_onnx, save_onnx

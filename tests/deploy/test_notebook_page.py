@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 import tifffile
 
-from deploy.shipped import default_int8
-from deploy.swath.options import Options
-from deploy.swath.run import restore_file
+from deploy.restoration.options import Options
+from deploy.restoration.run import restore_file
+from model.shipped import default_int8
 
 PAGE = Path(__file__).parents[2] / "docs" / "notebook.md"
 

@@ -19,7 +19,7 @@ from typer.testing import CliRunner
 
 from deploy.cli import COMMANDS, app
 from docs.make_options import FILE, FOLDER, PATHS, Paths
-from model import files
+from model.io import files
 
 
 @dataclass(frozen=True)

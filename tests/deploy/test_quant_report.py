@@ -13,23 +13,22 @@ import pytest
 import torch
 from typer.testing import CliRunner
 
-from deploy.blame import kind_of_error, worst_row
 from deploy.cli import app
 from deploy.export import to_onnx
-from deploy.quant_report import ablations
+from deploy.quantise import ablations, kind_of_error, worst_row
 from deploy.report.histogram import FONT_PX, MOST_BARS, bins, histogram_url
 from deploy.report.labels import text_width
-from deploy.restore import write_tiff
+from deploy.restoration.arrays import write_tiff
 from deploy.results import SCHEMA_PATH
 from model.convbeers import ConvBEERS, Variant, initialise
 from model.simulator.procedural import procedural_scene
 from profiles import load_sensor
 from profiles.sensor import reference_for
 from quant.calibration import draw_patches
+from quant.graph import MAX_DN
 from quant.onnx_file import fixed_tile_px, load_onnx, metadata, save_onnx
-from quant.planes import MAX_DN
 from quant.quantise import ALL, Passes
-from quant.spread import Spread
+from quant.sensitivity import Spread
 
 PHONE_PX = 358
 """A window of 390 pixels less the page's margins."""

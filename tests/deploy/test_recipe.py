@@ -9,10 +9,8 @@ import pytest
 import tifffile
 from PIL import Image
 
-from deploy.dataset import write_dataset
-from deploy.dataset_patches import DatasetRecipe
-from deploy.evaluation.pairs import oversamplings_of, read_pairs
-from deploy.evaluation.recipe import profiles_for, read_pairs_recipe
+from deploy.dataset import DatasetRecipe, write_dataset
+from deploy.evaluation.pairs import oversamplings_of, profiles_for, read_pairs, read_pairs_recipe
 from profiles import load_sensor
 from profiles.errors import OptionError, ProfileError
 from profiles.sensor import reference_for, same_instrument, sensor_from_json, sensor_names

@@ -5,7 +5,7 @@ import numpy as np
 
 from deploy.report.page import Picture, Report, Table, render
 from deploy.report.pictures import busiest_windows, picture_url, stretch_of, strip
-from deploy.results import Row, measured, predicted, unavailable
+from profiles.figures import Row, measured, predicted, unavailable
 
 
 def report() -> Report:

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import tifffile
 
-from deploy.shipped import default_float_weights, default_int8
+from model.shipped import default_float_weights, default_int8
 
 
 def test_the_shipped_files_are_there() -> None:

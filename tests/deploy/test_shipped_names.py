@@ -9,7 +9,7 @@ from typer.testing import CliRunner
 
 from deploy.cli import app
 from deploy.gate import files_or_shipped
-from deploy.shipped import VARIANT, default_int8, float_file, int8_file, shipped_pair
+from model.shipped import VARIANT, default_int8, float_file, int8_file, shipped_pair
 from quant.onnx_file import load_onnx, metadata
 
 

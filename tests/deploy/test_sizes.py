@@ -12,15 +12,15 @@ from typer.testing import CliRunner
 
 from deploy.cli import app
 from deploy.export import to_onnx
-from deploy.restore import check_fixed_tile
-from deploy.shipped import default_float_weights
+from deploy.restoration.arrays import check_fixed_tile
+from model.io.weights import load_network
 from model.metrics.edges import find_edge
 from model.metrics.refusal import Refusal
 from model.metrics.sharpness import edge_mtf
+from model.shipped import default_float_weights
 from model.simulator.acquire import crop_margin
 from model.simulator.sampling import check_divisible
-from model.training.stored_pairs import StoredPairs, pair_files
-from model.weights_file import load_network
+from model.training.patches import StoredPairs, pair_files
 from profiles.errors import BeersError
 
 ROWS, COLUMNS = 37, 61

@@ -15,22 +15,21 @@ from typer.testing import CliRunner
 from deploy.cli import app
 from deploy.dataset import _read_summary
 from deploy.dpu.board import load_dpu
+from deploy.dpu.cost.validation import refit
 from deploy.gate import PATCHES, baseline_mae
-from deploy.refit import refit
-from deploy.results import Document, Row, measured
-from deploy.swath.spool import Spool, part_folder
+from deploy.restoration.output import Spool, part_folder
+from deploy.results import Document
 from deploy.tradeoff.cache import Cache, digest_of
 from deploy.tradeoff.host_time import Times
 from deploy.training import Log
-from model.images import read_pixels
-from model.metrics.backbone_files import read_tensors
-from model.weights_file import load_network, write_tensors
-from model.weights_file import read_tensors as read_weights
+from model.io.images import read_pixels
+from model.io.weights import load_network, write_tensors
+from model.io.weights import read_tensors as read_weights
+from model.metrics.backbones import read_tensors
 from profiles.errors import BeersError, ModelError, OptionError, ProfileError
-from profiles.text import read_json, read_toml_text
-from profiles.toml import HERE
-from quant.checks import Check
-from quant.limits import read_limits
+from profiles.figures import Row, measured
+from profiles.toml import HERE, read_json, read_toml_text
+from quant.gate import Check, read_limits
 from quant.onnx_file import load_onnx
 from tests.fuzz.parsers import JOB, SHAPE, checkpoint_seeds, go_on, weights_seeds
 

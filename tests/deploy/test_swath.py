@@ -13,16 +13,16 @@ import tifffile
 import torch
 
 from deploy.export import to_onnx
-from deploy.restore import Infer, restore_window
-from deploy.results import Row
-from deploy.shipped import default_int8
-from deploy.swath import openvino
-from deploy.swath import run as swath
-from deploy.swath.missing import fill_missing
-from deploy.swath.options import Compression, Options, Runtime
-from deploy.swath.runtime import open_runtime
+from deploy.restoration import run as swath
+from deploy.restoration import runtime
+from deploy.restoration.arrays import Infer, restore_window
+from deploy.restoration.options import Compression, Options, Runtime
+from deploy.restoration.runtime import open_runtime
+from deploy.restoration.source import fill_missing
 from model.convbeers import ConvBEERS, Variant, initialise
+from model.shipped import default_int8
 from profiles.errors import BeersError, ImageError, MachineError, ModelError, OptionError
+from profiles.figures import Row
 from quant.onnx_file import load_onnx, save_onnx
 from quant.radius import receptive_radius_px
 from quant.session import open_session, run
@@ -254,10 +254,11 @@ def test_options_that_cannot_be_are_refused(model: Path, tmp_path: Path) -> None
         refused(tmp_path, noise(40, 40), options, OptionError, word)
 
 
-def test_a_network_that_gives_nan_is_refused(model: Path, tmp_path: Path) -> None:
+def test_a_network_whose_sums_overflow_is_refused(model: Path, tmp_path: Path) -> None:
     broken = load_onnx(model)
-    weights = next(t for t in broken.graph.initializer if t.name == "head.bias")
-    weights.CopyFrom(onnx.numpy_helper.from_array(np.full(8, np.nan, np.float32), weights.name))
+    weights = next(t for t in broken.graph.initializer if t.name == "head.weight")
+    value = onnx.numpy_helper.to_array(weights) * np.float32(1e38)
+    weights.CopyFrom(onnx.numpy_helper.from_array(value, weights.name))
     onnx.save(broken, tmp_path.parent / "broken.onnx")
     refused(tmp_path, noise(40, 40), Options(tmp_path.parent / "broken.onnx"), ImageError, "finite")
 
@@ -303,7 +304,7 @@ def test_compressions_are_lossless(compression: Compression, model: Path, tmp_pa
 
 
 def test_large_outputs_are_big_tiffs(model: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("deploy.swath.writer.PLAIN_LIMIT_BYTES", 1000)
+    monkeypatch.setattr("deploy.restoration.output.PLAIN_LIMIT_BYTES", 1000)
     restore(tmp_path, noise(40, 50), Options(model))
     with tifffile.TiffFile(tmp_path / "out.tif") as file:
         assert file.is_bigtiff
@@ -318,7 +319,7 @@ def test_a_tile_without_known_pixels_costs_no_inference(
         seen.append(window.shape)
         return restore_window(window, infer, full_scale)
 
-    monkeypatch.setattr("deploy.swath.restorer.restore_window", counting)
+    monkeypatch.setattr("deploy.restoration.engine.restore_window", counting)
     pixels = noise(30, 300).astype(np.float32)
     pixels[:, 100:] = np.nan
     _, row = restore(tmp_path, pixels, Options(model, tile_px=30))
@@ -340,8 +341,8 @@ def test_openvino_gives_them_on_processors_whose_kernels_saturate_too(monkeypatc
     pytest.importorskip("openvino")
     image = np.random.default_rng(3).integers(0, 2, (1, 1, 41, 67)).astype(np.float32)
     model = load_onnx(default_int8())
-    monkeypatch.setattr(openvino, "_adds_exactly", lambda _: False)
-    restored = openvino.open_openvino(model, 1)[0](image)
+    monkeypatch.setattr(runtime, "_adds_exactly", lambda _: False)
+    restored = runtime.open_openvino(model, 1)[0](image)
     np.testing.assert_array_equal(restored, run(open_session(model), image))
 
 

@@ -9,13 +9,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from deploy.restore import Infer
-from deploy.swath.engine import restore_rows
-from deploy.swath.plan import Plan, make_plan
-from deploy.swath.raster import Raster
-from deploy.swath.reader import ArraySource
-from deploy.swath.restorer import Restorer
-from deploy.swath.runtime import AT_ONCE, session_threads, tiles_at_once
+from deploy.restoration.arrays import Infer
+from deploy.restoration.engine import Restorer, restore_rows
+from deploy.restoration.plan import Plan, make_plan
+from deploy.restoration.runtime import AT_ONCE, session_threads, tiles_at_once
+from deploy.restoration.source import ArraySource, Raster
 from profiles.errors import ImageError
 
 SHAPE = (2, 75, 133)

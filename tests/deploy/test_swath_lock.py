@@ -12,11 +12,11 @@ import psutil
 import pytest
 import tifffile
 
-from deploy.shipped import default_int8
-from deploy.swath import lock
-from deploy.swath.lock import only_run
-from deploy.swath.options import Options
-from deploy.swath.run import restore_file
+from deploy.restoration import output
+from deploy.restoration.options import Options
+from deploy.restoration.output import only_run
+from deploy.restoration.run import restore_file
+from model.shipped import default_int8
 from profiles.errors import MachineError
 
 ENTRY = "from deploy.cli import app; app()"
@@ -62,7 +62,7 @@ def test_a_killed_run_stands_in_nobody_s_way(image: Path, tmp_path: Path) -> Non
     out = tmp_path / "out.tif"
     with begin(image, out) as running:
         running.kill()
-    assert (tmp_path / ".out.tif.part" / lock.NAME).is_file()
+    assert (tmp_path / ".out.tif.part" / output.NAME).is_file()
     restore(image, out, resume=True)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["in.tif", "out.tif"]
 
@@ -72,7 +72,7 @@ def test_a_killed_process_loses_its_lock_and_a_stopped_one_does_not(tmp_path: Pa
     hold = f"""
 import time
 from pathlib import Path
-from deploy.swath.lock import only_run
+from deploy.restoration.output import only_run
 with only_run(Path({str(out)!r}), Path({str(folder)!r})):
     print("held", flush=True)
     time.sleep(600)
@@ -87,12 +87,12 @@ with only_run(Path({str(out)!r}), Path({str(folder)!r})):
         finally:
             holder.kill()
     with only_run(out, folder):
-        assert (folder / lock.NAME).is_file()
+        assert (folder / output.NAME).is_file()
     assert not folder.exists()
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="flock is what POSIX systems lock by")
-@pytest.mark.parametrize("number", lock.NO_LOCKS)
+@pytest.mark.parametrize("number", output.NO_LOCKS)
 def test_a_disk_without_locks_locks_nothing_and_is_left_clean(
     number: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -145,14 +145,14 @@ def test_a_run_that_ends_just_then_takes_no_lock_along(tmp_path: Path, monkeypat
 
     def ending(handle: int, operation: int) -> None:
         if operation & fcntl.LOCK_EX and next(ends):
-            (folder / lock.NAME).unlink()
+            (folder / output.NAME).unlink()
             folder.rmdir()
         taken(handle, operation)
 
     monkeypatch.setattr(fcntl, "flock", ending)
     with only_run(tmp_path / "out", folder):
         monkeypatch.undo()
-        assert (folder / lock.NAME).is_file()
+        assert (folder / output.NAME).is_file()
         with pytest.raises(MachineError, match="no other run"), only_run(tmp_path / "out", folder):
             pass
 

@@ -19,9 +19,9 @@ import tifffile
 import torch
 
 from deploy.export import to_onnx
-from deploy.swath.options import Compression, Options
-from deploy.swath.restorer import Restorer
-from deploy.swath.run import restore_file
+from deploy.restoration.engine import Restorer
+from deploy.restoration.options import Compression, Options
+from deploy.restoration.run import restore_file
 from model.convbeers import ConvBEERS, Variant, initialise
 from profiles.errors import MachineError, OptionError
 from quant.onnx_file import save_onnx
@@ -159,7 +159,7 @@ def test_a_full_disk_is_one_sentence_and_loses_no_finished_row(
 
     monkeypatch.setattr(os, "fsync", full)
     if calls == 1000:
-        monkeypatch.setattr("deploy.swath.writer._tiles", full_now)
+        monkeypatch.setattr("deploy.restoration.output._tiles", full_now)
     out.write_bytes(b"old")
     with pytest.raises(MachineError, match=r"No space left.*--resume"):
         restore_file(image, out, replace(options, compression=Compression.none), lambda _: None)
@@ -179,7 +179,7 @@ def test_a_swath_that_the_disk_cannot_hold_is_refused_first(
     class Usage:
         free = 1000
 
-    monkeypatch.setattr("deploy.swath.spool.shutil.disk_usage", lambda _: Usage)
+    monkeypatch.setattr("deploy.restoration.output.shutil.disk_usage", lambda _: Usage)
     with pytest.raises(MachineError, match="free"):
         restore_file(image, tmp_path / "out.tif", Options(model, TILE_PX), lambda _: None)
     assert [p.name for p in tmp_path.iterdir()] == ["in.tif"]

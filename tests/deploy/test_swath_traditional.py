@@ -10,7 +10,7 @@ import torch
 from typer.testing import CliRunner
 
 from deploy.cli import app
-from deploy.swath.traditional import Request, restore_file_traditionally
+from deploy.restoration.traditional import Request, restore_file_traditionally
 from model.traditional.pipeline import restore_traditional
 from profiles import load_sensor
 from profiles.errors import ImageError, MachineError

@@ -18,19 +18,18 @@ import pytest
 import tifffile
 import torch
 
-from deploy import cluster, workers
+from deploy import cluster
 from deploy.cluster import check_choice, local_cluster, open_cluster
 from deploy.export import to_onnx
-from deploy.shipped import default_int8
-from deploy.swath.options import Options, Runtime
-from deploy.swath.reader import open_source
-from deploy.swath.restorer import Restorer
-from deploy.swath.run import plan_of, restore_file
-from deploy.swath.runtime import open_runtime
-from deploy.swath.spread import make_work
-from deploy.swath.worker import Piece, Work, restore_piece
-from deploy.tiling import Span
+from deploy.restoration.engine import Restorer
+from deploy.restoration.options import Options, Runtime
+from deploy.restoration.plan import Span
+from deploy.restoration.run import plan_of, restore_file
+from deploy.restoration.runtime import open_runtime
+from deploy.restoration.source import open_source
+from deploy.restoration.workers import Piece, Work, make_work, restore_piece
 from model.convbeers import ConvBEERS, Variant, initialise
+from model.shipped import default_int8
 from profiles.errors import ImageError, MachineError, ModelError, OptionError
 from quant.onnx_file import load_onnx, save_onnx
 from quant.session import open_session, run
@@ -193,7 +192,7 @@ def test_a_worker_of_another_kind_is_refused(work: Work, scheduler: str, monkeyp
         in_workers(scheduler, replace(work, runtime="onnxruntime 0.1"))
     with pytest.raises(ModelError, match="digest"):
         in_workers(scheduler, replace(work, network=replace(work.network, content=work.network.content[:-1])))
-    monkeypatch.setattr(workers, "versions", lambda: {**workers_here(), "torch": "9.9"})
+    monkeypatch.setattr(cluster, "versions", lambda: {**workers_here(), "torch": "9.9"})
     with pytest.raises(MachineError, match=r"expected torch 9.9, got torch \d"):
         in_workers(scheduler, work)
     monkeypatch.setattr(cluster, "__version__", "77.0")
@@ -201,7 +200,7 @@ def test_a_worker_of_another_kind_is_refused(work: Work, scheduler: str, monkeyp
         in_workers(scheduler, work)
 
 
-workers_here = workers.versions
+workers_here = cluster.versions
 
 
 def by_value() -> None:
@@ -216,7 +215,7 @@ def slow_touch(folder: Path, number: int) -> int:
 
 
 def test_only_so_many_pieces_are_under_way(scheduler: str, tmp_path: Path) -> None:
-    most = 2 * workers.PIECES_PER_SLOT  # two workers of one slot
+    most = 2 * cluster.PIECES_PER_SLOT  # two workers of one slot
     with open_cluster(0, scheduler) as there, closing(touching(there, tmp_path, 40)) as pieces:
         assert next(pieces) == 0
         while len(list(tmp_path.iterdir())) < most:
@@ -227,7 +226,7 @@ def test_only_so_many_pieces_are_under_way(scheduler: str, tmp_path: Path) -> No
     assert len(list(tmp_path.iterdir())) == 40
 
 
-def touching(there: workers.Workers, folder: Path, count: int) -> Any:
+def touching(there: cluster.Workers, folder: Path, count: int) -> Any:
     by_value()
     return there.in_order(slow_touch, folder, range(count), lambda: None)
 
@@ -249,7 +248,7 @@ def test_a_worker_that_dies_once_changes_nothing(
     options, once = Options(model, TILE_PX), tmp_path / "once"
     restore_file(image, tmp_path / "expected.tif", options, silent)
     once.touch()
-    monkeypatch.setattr("deploy.swath.spread.restore_piece", deadly)
+    monkeypatch.setattr("deploy.restoration.workers.restore_piece", deadly)
     restore_file(image, tmp_path / "out.tif", replace(options, scheduler=scheduler), silent)
     assert once.read_text() == "it has happened"
     assert (tmp_path / "out.tif").read_bytes() == (tmp_path / "expected.tif").read_bytes()
@@ -260,7 +259,7 @@ def test_workers_that_die_again_and_again_are_one_sentence(
 ) -> None:
     by_value()
     options, out = Options(model, TILE_PX), tmp_path / "out.tif"
-    monkeypatch.setattr("deploy.swath.spread.restore_piece", deadly)
+    monkeypatch.setattr("deploy.restoration.workers.restore_piece", deadly)
     with pytest.raises(MachineError, match=r"4 that died over one piece.*--resume"):
         restore_file(image, out, replace(options, scheduler=scheduler), silent)
     assert journal(out).is_file()

@@ -6,13 +6,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from deploy.evaluation import sweep as module
+from deploy.evaluation import run as module
 from deploy.evaluation import targets as targets_module
 from deploy.evaluation.methods import Method
-from deploy.evaluation.sweep import TOLD_NOMINAL, TOLD_TRUTH, Condition, Fixed, conditions, sweep_rows
-from deploy.results import Row
+from deploy.evaluation.run import TOLD_NOMINAL, TOLD_TRUTH, Condition, Fixed, conditions, sweep_rows
 from model.simulator.procedural import procedural_scene
 from profiles import SensorProfile, load_sensor
+from profiles.figures import Row
 from profiles.sensor import Sensor
 
 PROFILE, REFERENCE = load_sensor("pleiades-degraded"), load_sensor("pleiades-reference")

@@ -7,9 +7,9 @@ from hypothesis import strategies as st
 from rich.cells import cell_len
 from rich.console import Console
 
-from deploy.results import DIGITS, Figure, Row, measured, number, predicted, published, unavailable
-from deploy.tables import LEGEND, PIPE_WIDTH, default_console, print_rows
+from deploy.results import LEGEND, PIPE_WIDTH, default_console, print_rows
 from profiles.errors import visible
+from profiles.figures import DIGITS, Figure, Row, measured, number, predicted, published, unavailable
 
 TALL = [
     Row("t", "one", {"latency": predicted(2, "s", (1, 3), "m"), "power": unavailable("W", "no [counter]")}),

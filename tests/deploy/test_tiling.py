@@ -6,8 +6,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from deploy.export import to_onnx
-from deploy.restore import restore_image
-from deploy.tiling import even_side_px, plan_side, plan_tiles
+from deploy.restoration.arrays import restore_image
+from deploy.restoration.plan import even_side_px, plan_side, plan_tiles
 from model.convbeers import ConvBEERS, Variant, initialise
 from profiles.errors import OptionError
 from quant.session import open_session

@@ -9,7 +9,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from deploy.dataset_patches import DatasetRecipe
+from deploy.dataset import DatasetRecipe
 from deploy.defaults import reference_beside
 from deploy.evaluation.methods import method_named
 from deploy.evaluation.pairs import simulate_pairs

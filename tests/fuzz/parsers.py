@@ -18,36 +18,33 @@ from PIL import Image
 from deploy.compare import change_rows, compare, read_document
 from deploy.dataset import _read_summary
 from deploy.dpu.board import load_dpu
+from deploy.dpu.checker.placement import place
+from deploy.dpu.cost.layers import Layers, count_work
+from deploy.dpu.cost.validation import refit
 from deploy.dpu.graph import Network
-from deploy.dpu.placement import place
-from deploy.dpu.rates import Layers
 from deploy.dpu.reading import read_network
-from deploy.dpu.work import count_work
 from deploy.gate import PATCHES, baseline_mae
-from deploy.refit import refit
-from deploy.results import Document, Figure, Row, measured, predicted, unavailable
-from deploy.swath.reader import open_source
-from deploy.swath.spool import Spool, part_folder
-from deploy.tables import by_row, cell
+from deploy.restoration.output import Spool, part_folder
+from deploy.restoration.source import open_source
+from deploy.results import Document, by_row, cell
 from deploy.tradeoff.accuracy import Scores
 from deploy.tradeoff.cache import Cache, Keepable
 from deploy.tradeoff.host_time import Times
 from deploy.training import Log
 from model.conditioning import ToldConvBEERS
 from model.convbeers import ConvBEERS, Variant
-from model.images import read_pixels
-from model.metrics.backbone_files import read_tensors
-from model.training.checkpoint import read_checkpoint, write_checkpoint
+from model.io.images import read_pixels
+from model.io.weights import load_network, load_told, save_network
+from model.metrics.backbones import read_tensors
+from model.training.checkpoint import TrainingRecipe, read_checkpoint, write_checkpoint
 from model.training.guards import Guards
-from model.training.recipe import TrainingRecipe
-from model.weights_file import load_network, load_told, save_network
 from profiles import load_sensor, load_target
 from profiles.errors import BeersError
+from profiles.figures import Figure, Row, measured, predicted, unavailable
 from profiles.scene_call import load_scene_call
-from quant.checks import Check
-from quant.float_reader import correction_graph
-from quant.host_reader import spelling_faults
-from quant.limits import read_limits
+from quant.encodings import spelling_faults
+from quant.gate import Check, read_limits
+from quant.graph import correction_graph
 from quant.onnx_file import fixed_tile_px, load_onnx
 from quant.radius import receptive_radius_px
 from quant.relus import count_relus

@@ -2,7 +2,7 @@ from pathlib import Path
 
 import pytest
 
-from model.files import write_text
+from model.io.files import write_text
 
 
 @pytest.mark.parametrize("text", ["one\ntwo\n", "one\r\ntwo\r\n", "\u00b5m, \u6771\u4eac\n", ""])

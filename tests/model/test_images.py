@@ -9,9 +9,9 @@ import tifffile
 import torch
 from PIL import Image
 
-from model.files import require_writable, whole_file
-from model.images import list_images, read_pixels
-from model.simulator.scene import read_scene
+from model.io.files import require_writable, whole_file
+from model.io.images import list_images, read_pixels
+from model.simulator.sampling import read_scene
 from profiles import load_sensor
 from profiles.errors import ImageError, MachineError
 

@@ -8,8 +8,8 @@ import torch
 from safetensors import safe_open
 from torch import Tensor
 
-from model.metrics import backbone_files
-from model.weights_file import read_tensors, write_tensors
+from model.io.weights import read_tensors, write_tensors
+from model.metrics import backbones
 
 TENSORS = {"small": torch.arange(3.0), "large": torch.arange(20_000.0).reshape(100, 200)}
 
@@ -34,7 +34,7 @@ def is_copy(read: Read, path: Path) -> bool:
 
 
 @pytest.mark.parametrize(
-    "read", [lambda path: read_tensors(path)[0], lambda path: backbone_files.read_tensors(path, TENSORS)]
+    "read", [lambda path: read_tensors(path)[0], lambda path: backbones.read_tensors(path, TENSORS)]
 )
 def test_what_was_read_does_not_change_with_its_file(read: Read, tmp_path: Path) -> None:
     assert is_copy(read, tmp_path / "w.safetensors")

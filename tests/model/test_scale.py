@@ -5,7 +5,7 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
-from model.scale import FULL_SCALE_DN, UNIT_MAX, settled_scale
+from model.io.images import FULL_SCALE_DN, UNIT_MAX, settled_scale
 from profiles.errors import BeersError, ImageError, OptionError
 
 

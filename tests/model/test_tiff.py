@@ -13,9 +13,9 @@ import pytest
 import tifffile
 from PIL import Image
 
-from deploy.swath.reader import open_source
-from model.images import read_pixels
-from model.tiff_page import jpeg_size_px
+from deploy.restoration.source import open_source
+from model.io.images import read_pixels
+from model.io.tiff import jpeg_size_px
 from profiles.errors import BeersError, ImageError, MachineError
 
 GREY = np.random.default_rng(0).integers(0, 250, (16, 16)).astype(np.uint8)
@@ -66,7 +66,7 @@ def test_bytes_that_unpack_to_more_than_their_place_are_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Where imagecodecs is missing: with it, the decoder is told the size."""
-    monkeypatch.setattr("model.tiff_page.find_spec", lambda _: None)
+    monkeypatch.setattr("model.io.tiff.find_spec", lambda _: None)
     path = tiff(tmp_path / "bomb.tif", zlib.compress(bytes(50_000_000), 9), compression=8)
     refused(path, ImageError, "unpack to more")
 

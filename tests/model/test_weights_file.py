@@ -7,8 +7,7 @@ from safetensors.torch import save_file
 
 from model.conditioning import RANGES, ToldConvBEERS
 from model.convbeers import VARIANTS, ConvBEERS, Variant, initialise
-from model.shipped import SHIPPED, shipped_names, shipped_weights, told_names
-from model.weights_file import (
+from model.io.weights import (
     is_told,
     load_network,
     load_told,
@@ -17,6 +16,7 @@ from model.weights_file import (
     variant_named,
     write_tensors,
 )
+from model.shipped import SHIPPED, shipped_names, shipped_weights, told_names
 from profiles.errors import MachineError, ModelError, OptionError
 
 

@@ -5,7 +5,7 @@ import torch
 
 from model.conditioning import ToldConvBEERS, fold, initialise_coefficients
 from model.convbeers import ConvBEERS, Variant, initialise
-from model.widen import widen, widen_told
+from model.io.weights import widen, widen_told
 from profiles.errors import ModelError
 
 

@@ -9,12 +9,10 @@ import numpy as np
 import onnx
 import pytest
 
-from deploy.shipped import shipped_pair
-from quant.board_file import board_model
-from quant.core import IntConv, IntCore
-from quant.host_reader import read_core
+from model.shipped import shipped_pair
+from quant.core import INT8_MAX, INT8_MIN, IntConv, IntCore
+from quant.encodings import board_model, read_core
 from quant.onnx_file import load_onnx
-from quant.positions import INT8_MAX, INT8_MIN
 
 
 @dataclass(frozen=True)

@@ -5,14 +5,10 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from quant.agreement import agreement
-from quant.board_file import board_model
-from quant.core import IntConv, IntCore
-from quant.graph import CORRECTION
-from quant.host_file import host_model
-from quant.integer import correction, merged_correction, run_core
-from quant.planes import PLANES, POSITION, split
-from quant.positions import INT8_MAX, INT8_MIN
+from quant.core import INT8_MAX, INT8_MIN, IntConv, IntCore
+from quant.encodings import board_model, host_model
+from quant.graph import CORRECTION, PLANES, POSITION, split
+from quant.integer import agreement, correction, merged_correction, run_core
 from quant.session import open_session, run
 from tests.processors.conftest import Encodings
 

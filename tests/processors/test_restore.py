@@ -9,11 +9,11 @@ from typer.testing import CliRunner
 
 from deploy.cli import app
 from deploy.library import restore
-from deploy.shipped import shipped_pair
-from quant.host_reader import read_core
+from model.shipped import shipped_pair
+from quant.encodings import read_core
+from quant.graph import split
 from quant.integer import merged_correction, run_core
 from quant.onnx_file import load_onnx
-from quant.planes import split
 
 MAX_DN = np.float32(4095)
 

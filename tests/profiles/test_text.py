@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from profiles import load_sensor, load_target
 from profiles.errors import OptionError, ProfileError
-from profiles.text import DEPTH, JSON_BYTES, TOML_BYTES, parse_json, read_json, read_toml_text
+from profiles.toml import DEPTH, JSON_BYTES, TOML_BYTES, parse_json, read_json, read_toml_text
 
 BAD_TOML = {
     "nested arrays": "a = " + "[" * 20_000,

@@ -9,14 +9,11 @@ import pytest
 from onnx import numpy_helper
 
 from profiles.errors import ModelError
-from quant.accepted import check_graph
 from quant.calibration import Patches
 from quant.core import build_core, shift_faults
-from quant.float_reader import correction_graph
 from quant.free import quantise_free
 from quant.gate import compare
-from quant.graph import IMAGE, Add, Conv, Graph
-from quant.planes import PLANES, read_planes
+from quant.graph import IMAGE, PLANES, Add, Conv, Graph, check_graph, correction_graph, read_planes
 from quant.quantise import quantise_model
 from quant.session import open_session
 

@@ -8,11 +8,10 @@ import pytest
 from onnx import numpy_helper
 
 from model.shipped import SHIPPED
-from quant.agreement import agreement
-from quant.host_reader import read_core
-from quant.integer import merged_correction, run_core
+from quant.encodings import read_core
+from quant.graph import split
+from quant.integer import agreement, merged_correction, run_core
 from quant.onnx_file import load_onnx
-from quant.planes import split
 from quant.quantise import Quantised
 
 IMAGE = np.random.default_rng(4).random((2, 1, 35, 41), dtype=np.float32)

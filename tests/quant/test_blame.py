@@ -6,14 +6,12 @@ import numpy as np
 import onnx
 import pytest
 
-from quant.blame import LayerBlame, Loss, blame_layers
 from quant.calibration import Patches
 from quant.core import IntConv
-from quant.graph import Add
-from quant.planes import MAX_DN
+from quant.graph import MAX_DN, Add
 from quant.quantise import ALL, Quantised, quantise_model
+from quant.sensitivity import LayerBlame, Loss, blame_layers, spread_of
 from quant.session import open_session, run
-from quant.spread import spread_of
 
 
 @pytest.fixture(scope="module")

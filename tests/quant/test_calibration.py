@@ -9,17 +9,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from model.simulator.procedural import procedural_scene
-from model.simulator.scene import Scene
+from model.simulator.sampling import Scene
 from profiles import load_sensor
 from profiles.errors import ImageError
-from quant.calibration import Patches, choose_positions, draw_patches
-from quant.float_file import float_model
-from quant.float_reader import correction_graph
-from quant.graph import Graph, tensors
-from quant.pieces import PIECE_PX, crops, halo_of, planes_of, tensor_values
-from quant.planes import PLANES, read_planes
-from quant.session import open_session
-from quant.strata import stratified
+from quant.calibration import Patches, choose_positions, draw_patches, stratified
+from quant.graph import PLANES, Graph, correction_graph, float_model, read_planes, tensors
+from quant.session import PIECE_PX, crops, halo_of, open_session, planes_of, tensor_values
 
 VARIABLE, REFERENCE = load_sensor("pleiades-variable"), load_sensor("pleiades-reference")
 

@@ -7,9 +7,8 @@ import onnx
 import onnxruntime as ort
 import pytest
 
-from deploy.shipped import default_int8
-from model.shipped import SHIPPED
-from quant.fillers import FEWEST_OUTPUTS, filled
+from model.shipped import SHIPPED, default_int8
+from quant.kernels import FEWEST_OUTPUTS, filled
 from quant.onnx_file import load_onnx
 
 NETWORKS = [default_int8(), SHIPPED / "convbeers-xs-int8.onnx"]

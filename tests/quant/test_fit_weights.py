@@ -10,17 +10,12 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
 from quant.calibration import Patches
-from quant.core import IntConv, op_shifts
-from quant.float_reader import correction_graph
+from quant.core import SHIFTS, IntConv, op_shifts
 from quant.gate import compare
-from quant.graph import Conv, Graph
-from quant.moments import Moments, input_moments
-from quant.passes.fit_weights import descend, fit_weights
-from quant.pieces import planes_of
-from quant.planes import read_planes
-from quant.positions import SHIFTS
+from quant.graph import Conv, Graph, correction_graph, read_planes
+from quant.passes.fit_weights import Moments, descend, fit_weights, input_moments
 from quant.quantise import ALL, quantise_model
-from quant.session import open_session
+from quant.session import open_session, planes_of
 
 
 @pytest.fixture(scope="module")

@@ -12,22 +12,26 @@ from onnx import numpy_helper
 from model.simulator.procedural import procedural_scene
 from profiles import load_sensor
 from quant.calibration import Patches, draw_patches
-from quant.float_file import float_model
-from quant.float_reader import correction_graph
-from quant.free import free_ticks, quantise_free
-from quant.free_file import Scale, free_model
-from quant.free_scales import BINS, best_scale, round_weight, tensor_scales
+from quant.free import BINS, Scale, best_scale, free_model, free_ticks, quantise_free, round_weight, tensor_scales
 from quant.gate import compare
-from quant.graph import CORRECTION, Conv, Graph, relu_count, tensors
+from quant.graph import (
+    CORRECTION,
+    PLANES,
+    POSITION,
+    Conv,
+    Graph,
+    correction_graph,
+    float_model,
+    read_planes,
+    relu_count,
+    tensors,
+)
 from quant.integer import _convolve
 from quant.onnx_file import metadata, save_onnx
-from quant.passes.dual_gain import two_gains
 from quant.passes.equalise import channel_ranges, equalise, first_guess
-from quant.passes.half_steps import OFFSETS, half_steps
-from quant.pieces import planes_of
-from quant.planes import PLANES, POSITION, read_planes
+from quant.passes.stream import OFFSETS, half_steps, two_gains
 from quant.quantise import Quantised
-from quant.session import open_session, run
+from quant.session import open_session, planes_of, run
 
 SIZES = [(37, 53), (16, 91), (5, 3)]
 

@@ -4,8 +4,7 @@ import pytest
 from onnx import helper
 
 from profiles.errors import ModelError
-from quant.float_reader import correction_graph
-from quant.graph import CORRECTION, IMAGE, Add, Conv, relu_count
+from quant.graph import CORRECTION, IMAGE, Add, Conv, correction_graph, relu_count
 from quant.onnx_file import image_info, make_model
 
 

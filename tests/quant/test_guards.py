@@ -4,12 +4,23 @@ import numpy as np
 import pytest
 
 from quant.core import IntConv, IntCore
-from quant.graph import CORRECTION
-from quant.guards import Guards, checksums, guarded, learn_guards, reloaded, voted
+from quant.faults import (
+    Guards,
+    as_stored,
+    checksums,
+    guarded,
+    learn_guards,
+    reloaded,
+    shifts_of,
+    upset_conv,
+    upset_shifts,
+    upset_weights,
+    voted,
+    with_ops,
+)
+from quant.graph import CORRECTION, MAX_DN, PLANES, split
 from quant.integer import SOUND, Faults, merged_correction, run_core
-from quant.planes import MAX_DN, PLANES, split
 from quant.quantise import Quantised
-from quant.upsets import as_stored, shifts_of, upset_conv, upset_shifts, upset_weights, with_ops
 
 
 def image(seed: int, height: int = 37, width: int = 53) -> np.ndarray:

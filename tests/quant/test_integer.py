@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from quant.core import IntConv, IntCore
-from quant.graph import CORRECTION, Add
+from quant.graph import CORRECTION, PLANES, POSITION, Add, split
 from quant.integer import INT32_BITS, LayerReport, correction, run_core
-from quant.planes import PLANES, POSITION, split
 from quant.quantise import Quantised
 from quant.session import open_session
 

@@ -7,12 +7,21 @@ import onnx
 import pytest
 
 from quant.calibration import Patches
-from quant.core import IntConv, op_shifts
-from quant.float_file import float_model
-from quant.float_reader import correction_graph
+from quant.core import SHIFTS, IntConv, op_shifts
 from quant.gate import compare
-from quant.graph import CORRECTION, Add, Conv, Graph
-from quant.passes.dual_gain import FINE_MAX, GAIN, merge, two_gains
+from quant.graph import (
+    CORRECTION,
+    PLANES,
+    POSITION,
+    Add,
+    Conv,
+    Graph,
+    coarse_plane_only,
+    correction_graph,
+    float_model,
+    read_planes,
+    split,
+)
 from quant.passes.equalise import (
     FIRST_CROPS,
     Costs,
@@ -22,9 +31,16 @@ from quant.passes.equalise import (
     search,
     search_steps,
 )
-from quant.passes.steady_stream import STREAM_POSITION, common_position, steady, stream_tensors
-from quant.planes import PLANES, POSITION, coarse_plane_only, read_planes, split
-from quant.positions import SHIFTS
+from quant.passes.stream import (
+    FINE_MAX,
+    GAIN,
+    STREAM_POSITION,
+    common_position,
+    merge,
+    steady,
+    stream_tensors,
+    two_gains,
+)
 from quant.quantise import ALL, Passes, Quantised, quantise_model, ticks
 from quant.session import open_session
 

@@ -1,6 +1,6 @@
 import numpy as np
 
-from quant.planes import MAX_DN, QUARTER, STEP, split
+from quant.graph import MAX_DN, QUARTER, STEP, split
 
 
 def test_no_digital_number_is_lost() -> None:

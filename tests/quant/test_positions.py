@@ -5,7 +5,7 @@ from hypothesis import strategies as st
 
 from profiles import load_target
 from profiles.errors import ProfileError
-from quant.positions import SHIFTS, best_position, coarsest_position, quantise, target_shifts
+from quant.core import SHIFTS, best_position, coarsest_position, quantise, target_shifts
 
 
 @given(st.floats(1e-6, 1e6))

@@ -8,14 +8,11 @@ from onnx import numpy_helper
 
 from quant.calibration import Patches
 from quant.core import IntConv, build_core, shift_faults
-from quant.float_reader import correction_graph
-from quant.gate import compare
-from quant.graph import CORRECTION
-from quant.host_file import host_model
-from quant.limits import Limits, judge
+from quant.encodings import host_model
+from quant.gate import Limits, compare, judge
+from quant.graph import CORRECTION, POSITION, correction_graph, read_planes, split
 from quant.onnx_file import metadata, save_onnx
-from quant.passes.dual_gain import merge
-from quant.planes import POSITION, read_planes, split
+from quant.passes.stream import merge
 from quant.quantise import Quantised, quantise_model
 from quant.radius import receptive_radius_px
 from quant.session import open_session, run

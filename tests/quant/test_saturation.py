@@ -8,11 +8,10 @@ import pytest
 from onnx import helper, numpy_helper
 
 from model.shipped import SHIPPED
-from quant.graph import CORRECTION
-from quant.host_reader import read_core
+from quant.encodings import read_core
+from quant.graph import CORRECTION, split
 from quant.integer import run_core
 from quant.onnx_file import image_info, load_onnx, make_model
-from quant.planes import split
 from quant.saturation import rounded_tensors, saturated_shares
 
 IMAGE = np.random.default_rng(3).random((2, 1, 37, 43), dtype=np.float32)

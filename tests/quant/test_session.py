@@ -5,7 +5,7 @@ import time
 import numpy as np
 import pytest
 
-from deploy.shipped import default_int8
+from model.shipped import default_int8
 from quant.session import open_session, run
 
 IMAGE = np.full((1, 1, 96, 96), 0.5, np.float32)

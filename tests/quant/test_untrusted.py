@@ -10,7 +10,7 @@ import pytest
 from onnx import TensorProto, helper, numpy_helper
 
 from deploy.dpu.board import load_dpu
-from deploy.dpu.placement import place
+from deploy.dpu.checker.placement import place
 from deploy.dpu.reading import read_network
 from profiles.errors import ModelError
 from quant.onnx_file import any_size, load_onnx, parse_onnx

@@ -9,10 +9,7 @@ from hypothesis import strategies as st
 
 from profiles.errors import ModelError
 from quant.core import IntConv
-from quant.integer import run_core
-from quant.planes import split
-from quant.quantise import Quantised
-from quant.upsets import (
+from quant.faults import (
     INT8_BITS,
     PIXEL_BITS,
     SHIFT_BITS,
@@ -26,6 +23,9 @@ from quant.upsets import (
     upset_weights,
     weight_bits,
 )
+from quant.graph import split
+from quant.integer import run_core
+from quant.quantise import Quantised
 
 KINDS = {"int8": (np.int8, 8), "maps": (np.int16, 8), "pixels": (np.uint16, 12), "shifts": (np.int16, 6)}
 

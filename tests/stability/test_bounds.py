@@ -10,20 +10,16 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from deploy.stress.exact import infer_in
-from deploy.stress.subject import open_subject
+from deploy.stress.subject import infer_in, open_subject
 from model.shipped import SHIPPED
 from profiles.errors import ModelError
-from quant.bounds import bound_anywhere, bound_inside, compose
+from quant.bounds import bound_anywhere, bound_inside, compose, layer_bounds
 from quant.core import IntConv
-from quant.float_reader import correction_graph
-from quant.graph import CORRECTION, Graph
-from quant.host_reader import read_core
-from quant.int_bounds import layer_bounds
+from quant.encodings import read_core
+from quant.graph import CORRECTION, Graph, correction_graph, split
 from quant.integer import INT32_BITS, correction, run_core
 from quant.onnx_file import load_onnx
-from quant.passes.dual_gain import merge
-from quant.planes import split
+from quant.passes.stream import merge
 from quant.quantise import Quantised
 from quant.session import open_session, run
 

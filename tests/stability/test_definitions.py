@@ -15,13 +15,11 @@ from deploy.stress.subject import Subject
 from model.metrics.fidelity import SSIM_RADIUS_PX, SSIM_SIGMA_PX, ssim
 from model.simulator.mtf import NYQUIST, mtf
 from model.traditional.compensate import compensation_gain
-from quant.board_file import board_model
 from quant.core import IntConv, IntCore
-from quant.graph import CORRECTION
-from quant.host_file import host_model
+from quant.encodings import board_model, host_model
+from quant.graph import CORRECTION, PLANES, POSITION, split
 from quant.integer import correction
-from quant.passes.dual_gain import merge
-from quant.planes import PLANES, POSITION, split
+from quant.passes.stream import merge
 from quant.quantise import Quantised
 from quant.session import open_session, run
 

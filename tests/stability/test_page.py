@@ -4,11 +4,11 @@ from types import ModuleType
 
 import pytest
 
-from deploy.results import Row, by_table, measured, predicted, unavailable
 from deploy.stress.battery import STAGES
 from deploy.stress.cases import CASES
-from deploy.stress.limitations import LIMITATIONS
-from deploy.stress.page import markdown
+from deploy.stress.checks import LIMITATIONS
+from deploy.stress.rows import markdown
+from profiles.figures import Row, by_table, measured, predicted, unavailable
 from tests.stability.makers import DOCS, load_maker
 
 

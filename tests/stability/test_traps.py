@@ -10,11 +10,10 @@ import torch
 from torch import Tensor
 
 from model.metrics.fidelity import psnr_db, ssim
-from model.simulator.digitise import to_uint16
-from model.simulator.draws import Draw
+from model.simulator.detector import Draw, to_uint16
 from model.simulator.mtf import gamma_from_mtf, mtf
 from model.traditional.compensate import compensate
-from model.traditional.estimate import estimate_groups
+from model.traditional.nl_bayes import estimate_groups
 from model.traditional.noise import Noise
 from model.traditional.pipeline import Chain, Order, restore_traditional
 from model.traditional.settings import QUALITIES, first_pass, second_pass

@@ -9,6 +9,10 @@ from typing import Literal
 
 from deploy.dpu.graph import Network
 from deploy.dpu.zoo.classification import (
+    efficientnet_edgetpu,
+    efficientnet_lite0,
+    mobilenet_v1,
+    mobilenet_v2,
     reid,
     resnet18,
     resnet_bottleneck,
@@ -17,11 +21,18 @@ from deploy.dpu.zoo.classification import (
     squeezenet,
     vgg,
 )
-from deploy.dpu.zoo.csp import yolo_v5, yolox
-from deploy.dpu.zoo.detection import ssd_resnet34, tiny_yolo_v3, yolo_v2, yolo_v3
+from deploy.dpu.zoo.dense import (
+    enet,
+    erfnet,
+    ssd_resnet34,
+    superpoint,
+    tiny_yolo_v3,
+    yolo_v2,
+    yolo_v3,
+    yolo_v5,
+    yolox,
+)
 from deploy.dpu.zoo.inception import inception_resnet_v2, inception_v1, inception_v2, inception_v3
-from deploy.dpu.zoo.mobile import efficientnet_edgetpu, efficientnet_lite0, mobilenet_v1, mobilenet_v2
-from deploy.dpu.zoo.segmentation import enet, erfnet, superpoint
 
 HostReads = Literal["all", "scores", "sorts"]
 """What the host does with the results: read every value (classes, pixels), read one score a box and skip the rest, or

@@ -11,15 +11,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 from onnx import numpy_helper
 
-from deploy.dpu import constant_rules
 from deploy.dpu.board import load_dpu
+from deploy.dpu.checker import number_rules
+from deploy.dpu.checker.placement import place
 from deploy.dpu.graph import Operation, Scale
-from deploy.dpu.placement import place
 from deploy.dpu.reading import network_of, read_network
 from deploy.export import to_onnx
-from deploy.shipped import shipped_pair
 from model.convbeers import ConvBEERS, Variant, initialise
-from model.shipped import shipped_names
+from model.shipped import shipped_names, shipped_pair
 from model.simulator.procedural import procedural_scene
 from profiles import load_sensor
 from quant.calibration import draw_patches
@@ -43,7 +42,7 @@ def kept(values: list[int]) -> bool:
     bias = {"bias": np.array(values, np.int32)}
     scales = dict.fromkeys(("input 0", "weight", "output"), HALF)
     op = Operation("op", "QLinearConv", "conv", ("in",), ("out",), integer=True, scales=scales, constants=bias)
-    return constant_rules.int32_bias(op, DPU) is None
+    return number_rules.int32_bias(op, DPU) is None
 
 
 @given(st.lists(st.integers(-128, 127)), st.integers(0, 16))

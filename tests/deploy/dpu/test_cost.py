@@ -3,11 +3,11 @@ from pathlib import Path
 
 import pytest
 
-from deploy.bench import PAPER_TILE_PX, predict_file
+from deploy.bench.tables import PAPER_TILE_PX, predict_file
 from deploy.dpu.board import load_dpu
-from deploy.dpu.cost import Prediction, predict
-from deploy.dpu.placement import place
-from deploy.dpu.zoo.convbeers import convbeers
+from deploy.dpu.checker.placement import place
+from deploy.dpu.cost.latency import Prediction, predict
+from deploy.dpu.zoo.dense import convbeers
 from profiles.errors import ModelError
 from tests.deploy.dpu.graphs import (
     Sketch,

@@ -2,12 +2,11 @@ from pathlib import Path
 
 import pytest
 
-from deploy.bench import predict_file
+from deploy.bench.tables import predict_file
 from deploy.dpu.board import load_dpu
-from deploy.dpu.cost import predict
-from deploy.dpu.energy import counted_power, image_energy_j, layer_energy_j
-from deploy.dpu.placement import place
-from deploy.dpu.zoo.convbeers import convbeers
+from deploy.dpu.checker.placement import place
+from deploy.dpu.cost.latency import counted_power, image_energy_j, layer_energy_j, predict
+from deploy.dpu.zoo.dense import convbeers
 from tests.deploy.dpu.graphs import float_convbeers
 
 DPU = load_dpu()

@@ -6,19 +6,19 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 
-from deploy.dpu.accuracy import (
+from deploy.dpu.board import load_dpu
+from deploy.dpu.cost.fit import FIRM_PRIOR, START, Cases, fit
+from deploy.dpu.cost.layers import Array, Constants
+from deploy.dpu.cost.validation import (
     beyond,
     coverage,
     fitted_ranges,
     leave_out,
+    published_cases,
     quantile,
     rank_correlation,
     relative,
 )
-from deploy.dpu.board import load_dpu
-from deploy.dpu.fit import FIRM_PRIOR, START, Cases, fit
-from deploy.dpu.rates import Array, Constants
-from deploy.dpu.zoo.cases import published_cases
 
 DPU = load_dpu()
 

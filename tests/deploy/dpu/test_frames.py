@@ -1,6 +1,6 @@
 import pytest
 
-from deploy.dpu.frames import paper_frames, tile_count, whole_tiles
+from deploy.dpu.cost.latency import paper_frames, tile_count, whole_tiles
 from profiles.errors import OptionError
 
 

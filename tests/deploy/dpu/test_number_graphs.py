@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from deploy.dpu.board import load_dpu
-from deploy.dpu.number_rules import AGAIN, MOVE
-from deploy.dpu.placement import place
+from deploy.dpu.checker.number_rules import AGAIN, MOVE
+from deploy.dpu.checker.placement import place
 from deploy.dpu.reading import read_network
 from tests.deploy.dpu.graphs import QdqSketch
 

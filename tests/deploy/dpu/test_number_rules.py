@@ -2,9 +2,9 @@ from collections.abc import Mapping
 
 import pytest
 
-from deploy.dpu import number_rules
 from deploy.dpu.board import load_dpu
-from deploy.dpu.finding import Rule
+from deploy.dpu.checker import number_rules
+from deploy.dpu.checker.finding import Rule
 from deploy.dpu.graph import Kind, Operation, Scale
 
 DPU = load_dpu()

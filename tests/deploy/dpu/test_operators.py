@@ -4,8 +4,8 @@ from pathlib import Path
 import pytest
 
 from deploy.dpu.board import Dpu, load_dpu
-from deploy.dpu.operators import all_rules, rule_name, rule_text
-from deploy.dpu.placement import place
+from deploy.dpu.checker.operators import all_rules, rule_name, rule_text
+from deploy.dpu.checker.placement import place
 from deploy.dpu.reading import read_network
 from profiles.errors import OptionError, ProfileError
 from tests.deploy.dpu.graphs import IntegerSketch, Sketch, Value, integer_convbeers

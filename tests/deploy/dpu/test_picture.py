@@ -6,8 +6,8 @@ from xml.etree import ElementTree as ET
 import pytest
 
 from deploy.dpu.board import load_dpu
-from deploy.dpu.picture import FILLS, draw, require_picture, write_picture
-from deploy.dpu.placement import Placement, place
+from deploy.dpu.checker.placement import Placement, place
+from deploy.dpu.checker.table import FILLS, draw, require_picture, write_picture
 from deploy.dpu.reading import read_network
 from deploy.report.labels import text_width
 from profiles.errors import OptionError

@@ -1,7 +1,7 @@
 from pathlib import Path
 
 from deploy.dpu.board import load_dpu
-from deploy.dpu.placement import FLOAT_NOTE, place
+from deploy.dpu.checker.placement import FLOAT_NOTE, place
 from deploy.dpu.reading import read_network
 from tests.deploy.dpu.graphs import (
     IntegerSketch,

@@ -8,8 +8,8 @@ import pytest
 from onnx import TensorProto, numpy_helper
 
 from deploy.dpu.board import load_dpu
+from deploy.dpu.checker.placement import place
 from deploy.dpu.graph import Operation
-from deploy.dpu.placement import place
 from deploy.dpu.reading import network_of, read_network
 from profiles.errors import ModelError
 from tests.deploy.dpu.graphs import (

@@ -1,10 +1,10 @@
 from pathlib import Path
 
 from deploy.dpu.board import load_dpu
-from deploy.dpu.operators import rule_text
-from deploy.dpu.placement import Placement, place
+from deploy.dpu.checker.operators import rule_text
+from deploy.dpu.checker.placement import Placement, place
+from deploy.dpu.checker.table import REMARKS, remarks_on
 from deploy.dpu.reading import read_network
-from deploy.dpu.remarks import REMARKS, remarks_on
 from tests.deploy.dpu.graphs import Sketch, integer_convbeers
 
 DPU = load_dpu()

@@ -1,6 +1,6 @@
 from deploy.dpu.board import load_dpu
-from deploy.dpu.operators import judge
-from deploy.dpu.traditional import judge_traditional, verdict
+from deploy.dpu.checker.operators import judge
+from deploy.dpu.checker.traditional import judge_traditional, verdict
 from model.traditional.compensate import RADIUS_PX
 
 DPU = load_dpu()

@@ -10,7 +10,7 @@ from onnx import numpy_helper
 from onnxruntime.quantization import CalibrationDataReader, QuantFormat, QuantType, quantize_static
 
 from deploy.dpu.board import load_dpu
-from deploy.dpu.placement import Placement, place
+from deploy.dpu.checker.placement import Placement, place
 from deploy.dpu.reading import read_network
 from tests.deploy.dpu.graphs import Sketch
 

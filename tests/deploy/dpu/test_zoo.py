@@ -3,7 +3,7 @@ from itertools import pairwise
 import pytest
 
 from deploy.dpu.board import load_dpu
-from deploy.dpu.placement import place
+from deploy.dpu.checker.placement import place
 from deploy.dpu.zoo.builder import Builder
 from deploy.dpu.zoo.networks import NETWORKS, network, published_rates
 

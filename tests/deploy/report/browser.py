@@ -15,7 +15,7 @@ from typing import Any
 
 import pytest
 
-from deploy.report.templates import digest
+from deploy.report.page import digest
 
 Report = dict[str, Any]
 """What a script wrote, as JSON has it; "asked": the addresses that the browser asked the server for."""

@@ -5,8 +5,8 @@ from itertools import pairwise
 
 import numpy as np
 
-from deploy.results import Figure, Row, measured, predicted, published, unavailable
 from deploy.tradeoff.study import Crop, Front, Study
+from profiles.figures import Figure, Row, measured, predicted, published, unavailable
 
 NETWORKS = {
     "convbeers-xs": (44.3, 2.1),

@@ -1,7 +1,7 @@
 from itertools import pairwise
 
 from deploy.report.layer_bars import HEIGHT, WIDTH, layer_bars
-from deploy.results import Row, unavailable
+from profiles.figures import Row, unavailable
 from tests.deploy.report.studies import layer, layers
 
 

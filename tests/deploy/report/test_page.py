@@ -5,7 +5,7 @@ from html.parser import HTMLParser
 import pytest
 
 from deploy.report.page import WIDE, Report, Table, render
-from deploy.results import Row, measured, unavailable
+from profiles.figures import Row, measured, unavailable
 
 
 class Cells(HTMLParser):

@@ -1,5 +1,5 @@
-from deploy.report.provenance import Provenance, grid_of
-from deploy.results import Row, measured, predicted, unavailable
+from deploy.report.page import Provenance, grid_of
+from profiles.figures import Row, measured, predicted, unavailable
 
 
 def rows() -> list[Row]:

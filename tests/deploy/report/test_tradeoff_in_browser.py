@@ -7,9 +7,8 @@ import pytest
 from PIL import Image
 
 from deploy.report.marks import DARK, LIGHT
-from deploy.report.tradeoff_names import NARROW, WIDE
-from deploy.report.tradeoff_page import render_study
-from deploy.results import Row
+from deploy.tradeoff.page import NARROW, WIDE, render_study
+from profiles.figures import Row
 from tests.deploy.report.browser import Report, browser, drive, framed
 from tests.deploy.report.studies import study
 from tests.deploy.report.test_tradeoff_page import apart, within

@@ -17,13 +17,20 @@ from PIL import Image
 from deploy.report.labels import Box
 from deploy.report.marks import marks_of
 from deploy.report.plot import Plot
-from deploy.report.tradeoff_names import NARROW, WIDE, Canvas
-from deploy.report.tradeoff_page import points_of, render_study, write_study
-from deploy.report.tradeoff_plot import plot_of
-from deploy.report.tradeoff_points import Points, method_of
-from deploy.results import Row, unavailable
+from deploy.tradeoff.page import (
+    NARROW,
+    WIDE,
+    Canvas,
+    Points,
+    method_of,
+    plot_of,
+    points_of,
+    render_study,
+    write_study,
+)
 from deploy.tradeoff.study import Front, Study
 from profiles.errors import MachineError
+from profiles.figures import Row, unavailable
 from tests.deploy.report.studies import PEERS, UNITS, crops, front, point, study, words
 
 FILES = ("tradeoff.html", "tradeoff.svg", "tradeoff.png", "points.csv")

@@ -5,18 +5,17 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from deploy.bench import Swath
+from deploy.bench.tables import Swath
 from deploy.dpu.board import load_dpu
-from deploy.dpu.cost import predict
-from deploy.dpu.placement import place
-from deploy.dpu.zoo.convbeers import convbeers
-from deploy.results import Figure, measured, unavailable
+from deploy.dpu.checker.placement import place
+from deploy.dpu.cost.latency import predict
+from deploy.dpu.zoo.dense import convbeers
 from deploy.tradeoff.accuracy import Scores
 from deploy.tradeoff.board import DpuRun
-from deploy.tradeoff.figures import UNITS
 from deploy.tradeoff.host_time import Times
-from deploy.tradeoff.outcome import Arena, Outcome
+from deploy.tradeoff.outcome import UNITS, Arena, Outcome
 from deploy.tradeoff.points import EXACT, LEGAL, Point, Unit
+from profiles.figures import Figure, measured, unavailable
 
 SITES = ("a", "a", "b", "c", "d", "e")
 DIFFICULTY_DB = np.array([0.0, 1.0, -6.0, 5.0, -2.0, 2.0])

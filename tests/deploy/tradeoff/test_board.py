@@ -6,9 +6,8 @@ from dataclasses import replace
 import onnx
 import pytest
 
-from deploy.bench import Swath
+from deploy.bench.tables import Swath
 from deploy.dpu.board import load_dpu
-from deploy.shipped import default_int8
 from deploy.tradeoff.board import (
     CpuRun,
     DpuRun,
@@ -18,6 +17,7 @@ from deploy.tradeoff.board import (
     pair_error,
     predict_model,
 )
+from model.shipped import default_int8
 from profiles.errors import ModelError
 from quant.onnx_file import load_onnx
 

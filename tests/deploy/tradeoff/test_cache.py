@@ -96,23 +96,28 @@ def test_digests_of_plain_values_know_no_order_of_keys() -> None:
     assert digest_of({"a": 1}) != digest_of({"a": 2})
 
 
-def test_other_code_is_another_measurement(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (tmp_path / "tool").mkdir()
-    (tmp_path / "tool" / "one.py").write_text("x = 1\n")
+def test_other_code_is_another_measurement_however_far_it_is_imported(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tool = tmp_path / "tool"
+    tool.mkdir()
+    (tool / "__init__.py").write_text("")
+    (tool / "one.py").write_text("def late():\n    from tool import two\n")
+    (tool / "two.py").write_text("import json\nimport tool.three as three\n")
+    (tool / "other.py").write_text("x = 1\n")
     monkeypatch.setattr(cache_module, "ROOT", tmp_path)
     digests = []
-    for text in ("x = 1\n", "x = 2\n"):
-        (tmp_path / "tool" / "one.py").write_text(text)
+    for changed, text in (("three", "x = 1\n"), ("three", "x = 2\n"), ("other", "x = 2\n")):
+        (tool / f"{changed}.py").write_text(text)
         code_digest.cache_clear()
-        digests.append((code_digest("tool"), code_digest("tool.one")))
+        digests.append(code_digest("tool.one"))
     code_digest.cache_clear()
-    assert digests[0][0] != digests[1][0]
-    assert digests[0][1] != digests[1][1]
+    assert digests[0] != digests[1]
+    assert digests[1] == digests[2]
 
 
-def test_measuring_code_is_where_its_digest_looks() -> None:
-    from deploy.tradeoff import accuracy, host_time, shelf
+def test_what_is_measured_depends_on_the_metrics_and_the_network_runner() -> None:
+    from deploy.tradeoff.accuracy import measure
 
-    for name in (*accuracy.CODE, *host_time.CODE, *shelf.MAKING, *shelf.CHAINS):
-        place = cache_module.ROOT / name.replace(".", "/")
-        assert list(place.glob("*.py")) if place.is_dir() else place.with_suffix(".py").is_file(), name
+    found = {path.relative_to(cache_module.ROOT).as_posix() for path in cache_module._sources([measure.__module__])}
+    assert {"model/metrics/fidelity.py", "deploy/restoration/arrays.py", "deploy/tradeoff/accuracy.py"} <= found

@@ -5,11 +5,9 @@ from dataclasses import replace
 
 import pytest
 
-from deploy.tradeoff.choice import choose
-from deploy.tradeoff.demands import parse_demands
-from deploy.tradeoff.findings import as_good, findings, headline, papers_point
+from deploy.tradeoff.advice import as_good, choose, findings, fronts, gain_words, headline, papers_point
 from deploy.tradeoff.outcome import Arena
-from deploy.tradeoff.prices import fronts, gain_words
+from deploy.tradeoff.points import parse_demands
 from tests.deploy.tradeoff.arenas import Made, arena, named
 
 FAMILY = {

@@ -4,9 +4,9 @@ import math
 
 import pytest
 
-from deploy.results import measured, predicted, unavailable
-from deploy.tradeoff.demands import NAMES, Demand, parse_demands, shortfall
+from deploy.tradeoff.points import NAMES, Demand, parse_demands, shortfall
 from profiles.errors import OptionError
+from profiles.figures import measured, predicted, unavailable
 
 
 @pytest.mark.parametrize(

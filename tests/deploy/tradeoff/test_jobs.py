@@ -2,7 +2,7 @@
 
 import pytest
 
-from deploy.tradeoff.jobs import Job, Tick, run_jobs, time_left
+from deploy.tradeoff.measurements import Job, Tick, run_jobs, time_left
 
 
 def test_jobs_run_in_order_and_the_last_line_says_that_all_is_done(capsys: pytest.CaptureFixture[str]) -> None:

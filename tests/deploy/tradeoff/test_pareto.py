@@ -6,7 +6,7 @@ from itertools import combinations
 from hypothesis import given
 from hypothesis import strategies as st
 
-from deploy.tradeoff.pareto import Interval, Place, beaten, dominates, front
+from deploy.tradeoff.outcome import Interval, Place, beaten, dominates, front
 
 NUMBERS = st.integers(-3, 3).map(float)  # few values: many ties
 PLACES = st.lists(st.tuples(NUMBERS, NUMBERS), max_size=12).map(

@@ -5,10 +5,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from deploy.bench import Swath
+from deploy.bench.tables import Swath
 from deploy.evaluation.scores import fidelity_db
-from deploy.tradeoff.accuracy import Scores
-from deploy.tradeoff.seams import cut_in_four, halves, seam_density, with_seams
+from deploy.tradeoff.accuracy import Scores, cut_in_four, halves, seam_density, with_seams
 
 RADIUS_PX = 2
 
@@ -86,6 +85,6 @@ def test_predicted_from_a_cut_is_what_a_swath_of_tiles_really_shows() -> None:
 
 
 def in_tiles(dn: np.ndarray, tile_px: int) -> np.ndarray:
-    from deploy.restore import restore_with
+    from deploy.restoration.arrays import restore_with
 
     return restore_with(blur, dn, tile_px, 0).astype(np.float32)

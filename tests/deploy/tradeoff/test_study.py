@@ -17,15 +17,15 @@ from deploy.cli import app
 from deploy.compare import compare, read_document
 from deploy.evaluation import targets as targets_module
 from deploy.evaluation.methods import Restore
-from deploy.results import Row
-from deploy.tradeoff import int8, lab, selection
+from deploy.tradeoff import measurements, methods, selection
 from deploy.tradeoff.cache import Cache
 from deploy.tradeoff.host_time import Times
-from deploy.tradeoff.request import Request
 from deploy.tradeoff.run import Result, run_study
+from deploy.tradeoff.selection import Request
 from model.convbeers import ConvBEERS, Variant, initialise
+from model.io.weights import save_network
 from model.simulator.procedural import procedural_scene
-from model.weights_file import save_network
+from profiles.figures import Row
 from quant.onnx_file import load_onnx, save_onnx
 
 
@@ -52,11 +52,11 @@ def small() -> Iterator[None]:
         for module, name, value in (
             (targets_module, "ANGLES_DEG", (5.0, 8.0)),
             (targets_module, "REPEATS", 1),
-            (int8, "PATCHES", 2),
-            (int8, "PATCH_PX", 32),
+            (methods, "PATCHES", 2),
+            (methods, "PATCH_PX", 32),
             (selection, "QUALITIES", ("fast",)),
             (selection, "PEERS", ("nl-means",)),
-            (lab, "take_turns", steady),
+            (measurements, "take_turns", steady),
         ):
             patch.setattr(module, name, value)
         yield
@@ -97,7 +97,7 @@ def measured_again(monkeypatch: pytest.MonkeyPatch) -> list[str]:
         return noting
 
     for name in ("measure", "measure_images", "measure_mae", "take_turns"):
-        monkeypatch.setattr(lab, name, noted(name, getattr(lab, name)))
+        monkeypatch.setattr(measurements, name, noted(name, getattr(measurements, name)))
     return seen
 
 

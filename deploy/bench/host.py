@@ -1,0 +1,333 @@
+"""What this machine takes: the traditional pipeline on an image, and networks' times for a tile.
+
+Networks take turns, so that whatever else runs here meets them alike and their times can be compared; load, clock
+and memory stand beside what was measured.
+"""
+
+import statistics
+import sys
+import threading
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import onnx
+import psutil
+import torch
+
+from deploy.bench.profile import node_rows, profile, timed
+from deploy.bench.tables import TABLE, Swath, board_cpu_row, efficiency
+from deploy.defaults import counterpart, is_quantised
+from deploy.dpu.reading import network_of
+from model.processor import require_cores
+from model.simulator.acquire import MARGIN_PX, simulate_pair
+from model.simulator.detector import Draw
+from model.simulator.procedural import procedural_scene
+from model.traditional.pipeline import Chain, restore_traditional
+from profiles import SensorProfile, TargetProfile, load_target
+from profiles.figures import Figure, Row, measured, predicted, unavailable
+from quant.onnx_file import load_onnx
+from quant.session import open_session, require_finite
+
+SAMPLE_S = 0.002
+STATUS = Path("/proc/self/status")
+"""Linux's own counts of this process."""
+
+
+@dataclass
+class Watch:
+    """Filled in when the watched block ends."""
+
+    load: Figure = field(default_factory=lambda: unavailable("%", "not measured"))
+    clock: Figure = field(default_factory=lambda: unavailable("GHz", "not measured"))
+
+
+@contextmanager
+def watched() -> Iterator[Watch]:
+    """Load of all CPUs, other processes included, and their clock, over a block of work."""
+    watch, before, first_ghz = Watch(), psutil.cpu_times(), _clock_ghz()
+    yield watch
+    watch.load = _load(before, psutil.cpu_times())
+    clocks = [ghz for ghz in (first_ghz, _clock_ghz()) if ghz]
+    if clocks:
+        watch.clock = measured(sum(clocks) / len(clocks), "GHz", "mean of all CPUs at start and end")
+    else:
+        watch.clock = unavailable("GHz", "this system does not tell the clock of the moment")
+
+
+def peak_memory() -> Figure:
+    """Most resident memory of this process since it began, in GB; unavailable where the system does not count it."""
+    peak = _peak_bytes()
+    if peak is None:
+        return unavailable("GB", "this system counts no peak memory")
+    return measured(peak / 1e9, "GB", "resident memory of this process, highest since it began")
+
+
+def _peak_bytes() -> int | None:
+    if sys.platform == "win32":
+        return int(psutil.Process().memory_info().peak_wset)
+    with suppress(OSError, StopIteration):  # getrusage's count on Linux begins with what the process's parent held
+        lines = STATUS.read_text(encoding="utf-8").splitlines()
+        return 1024 * int(next(line for line in lines if line.startswith("VmHWM")).split()[1])
+    try:
+        import resource
+    except ImportError:
+        return None
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak if sys.platform == "darwin" else 1024 * peak  # macOS counts bytes, the others KiB
+
+
+@dataclass
+class Memory:
+    """By how many bytes resident memory rose at most."""
+
+    rise_bytes: int = 0
+
+
+@contextmanager
+def memory_rise() -> Iterator[Memory]:
+    """The highest rise of this process's resident memory over a block of work, sampled every 2 ms.
+
+    No count of the system's says it: theirs begin with the process, and a block after a larger one would seem to
+    take nothing.
+    """
+    memory, process, done = Memory(), psutil.Process(), threading.Event()
+    start = process.memory_info().rss
+
+    def sample() -> None:
+        memory.rise_bytes = max(memory.rise_bytes, process.memory_info().rss - start)
+
+    def keep_sampling() -> None:
+        while not done.wait(SAMPLE_S):
+            sample()
+
+    sampler = threading.Thread(target=keep_sampling, daemon=True)
+    sampler.start()
+    try:
+        yield memory
+    finally:
+        sample()
+        done.set()
+        sampler.join()
+
+
+def _load(before: tuple[float, ...], after: tuple[float, ...]) -> Figure:
+    """Share of CPU time that was not idle, from two readings of psutil.cpu_times()."""
+    spent = {name: b - a for name, a, b in zip(type(before)._fields, before, after, strict=True)}  # type: ignore[attr-defined]
+    total = sum(value for name, value in spent.items() if not name.startswith("guest"))  # guests are counted in user
+    if total <= 0:
+        return unavailable("%", "too short for the system's clock of CPU time")
+    idle = spent["idle"] + spent.get("iowait", 0.0)
+    return measured(100 * (1 - idle / total), "%", "all CPUs over the same window, other processes included")
+
+
+def _clock_ghz() -> float | None:
+    if sys.platform != "linux":  # elsewhere psutil knows the nominal clock alone
+        return None
+    frequency = psutil.cpu_freq()
+    return frequency.current / 1e3 if frequency and frequency.current else None
+
+
+@dataclass
+class Timed:
+    """A network, and what its runs took."""
+
+    name: str
+    model: onnx.ModelProto
+    times_s: list[float] = field(default_factory=list)
+    powers: list[Figure] = field(default_factory=list)
+    rise_bytes: int = 0
+
+
+def take_turns(runs: Sequence[Timed], tile_px: int, threads: int, min_time_s: float, min_runs: int) -> None:
+    """Run each for one tile in turn until all have run for `min_time_s` and `min_runs` times; fills in `runs`.
+
+    Raises:
+        ModelError: a network that gives NaN or infinity.
+    """
+    calls = []
+    for run in runs:
+        feed = tile_feed(run.model, tile_px, run.name)
+        with memory_rise() as memory:
+            session = open_session(run.model, threads)
+            require_finite(session.run(None, feed), run.name)  # warm-up, not counted
+        run.rise_bytes = memory.rise_bytes
+        calls.append(partial(session.run, None, feed))
+    while min(sum(run.times_s) for run in runs) < min_time_s or len(runs[0].times_s) < min_runs:
+        for run, call in zip(runs, calls, strict=True):
+            _, time_s, power = timed(call)
+            run.times_s.append(time_s)
+            run.powers.append(power)
+
+
+def tile_feed(model: onnx.ModelProto, tile_px: int, where: str = "ONNX model") -> dict[str, np.ndarray]:
+    """A grey tile (1, C, tile, tile) for every input.
+
+    Raises:
+        ModelError: inputs that are no images, or fixed to another tile.
+    """
+    inputs = network_of(model, tile_px, where).inputs
+    return {name: np.full((1, *shape), 0.25, np.float32) for name, shape in inputs.items()}
+
+
+def timed_rows(runs: Sequence[Timed], tile_px: int, conditions: Mapping[str, Figure]) -> list[Row]:
+    """One row a network, and for two of them how much faster INT8 is here."""
+    rows = [_row(run, tile_px, conditions) for run in runs]
+    return [*rows, _ratio_row(runs)] if len(runs) == 2 else rows
+
+
+def _row(run: Timed, tile_px: int, conditions: Mapping[str, Figure]) -> Row:
+    times_ms, total_s = 1e3 * np.array(run.times_s), sum(run.times_s)
+    source = f"{len(run.times_s)} runs in {total_s:.1f} s after one for warm-up, loading left out"
+    memory = "highest rise of resident memory while the file was opened and run once, sampled every 2 ms"
+    figures = {
+        "p50": measured(float(np.percentile(times_ms, 50)), "ms/tile", source),
+        "p90": measured(float(np.percentile(times_ms, 90)), "ms/tile", source),
+        "throughput": measured(len(run.times_s) / total_s, "frame/s", source),
+        "power": _mean_power(run),
+        "peak memory": measured(run.rise_bytes / 1e6, "MB", memory),
+    }
+    return Row("host", f"{run.name}, {tile_px} x {tile_px}", {**figures, **conditions})
+
+
+def _ratio_row(runs: Sequence[Timed]) -> Row:
+    int8, float32 = sorted(runs, key=lambda run: not is_quantised(run.model))
+    ratio = statistics.median(float32.times_s) / statistics.median(int8.times_s)
+    source = f"medians of {len(int8.times_s)} runs each, taking turns"
+    return Row("host", "float32 time / INT8 time, here", {"ratio": measured(ratio, "x", source)})
+
+
+def _mean_power(run: Timed) -> Figure:
+    """Mean over the network's own runs, or why there is none."""
+    missing = next((power for power in run.powers if power.value is None), None)
+    if missing is not None:
+        return unavailable("W", missing.reason)
+    energy_j = sum((power.value or 0.0) * time_s for power, time_s in zip(run.powers, run.times_s, strict=True))
+    return measured(energy_j / sum(run.times_s), "W", run.powers[0].source)
+
+
+CROP_PX = 256
+CROPS = 3
+
+
+@dataclass(frozen=True)
+class Sensors:
+    """The sensor that acquired an image and the one to imitate."""
+
+    degraded: SensorProfile
+    reference: SensorProfile
+
+
+def drawn_acquisition(swath: Swath, sensors: Sensors, seed: int = 0) -> np.ndarray:
+    """Digital numbers of a drawn scene, as large as the swath but no larger than the crops need."""
+    height = min(swath.height_px, CROP_PX)
+    width = min(swath.width_px, CROPS * CROP_PX)
+    ratio = int(sensors.degraded.oversampling.low)
+    height, width = ((side + 2 * MARGIN_PX) * ratio for side in (height, width))
+    scene = procedural_scene(height, width, np.random.default_rng(seed))
+    pair = simulate_pair(scene.radiance, sensors.degraded.nominal(), sensors.reference.nominal(), ratio, Draw(seed))
+    return pair.degraded.numpy()
+
+
+def traditional_rows(dn: np.ndarray, swath: Swath, sensors: Sensors, budget_s: float = 60.0) -> list[Row]:
+    """The traditional pipeline on (H, W) digital numbers, here, and scaled to the board's processor.
+
+    Crops are timed first, one small run for warm-up left out. When `dn` is the whole swath and its estimate lies
+    within `budget_s`, it is run whole and its time is measured; else the swath's is predicted from the crops', with
+    the fastest and the slowest crop as its interval.
+    """
+    threads = torch.get_num_threads()
+    with watched() as watch:
+        latency, cpu_s, power = _chain_latency(dn, swath, sensors, budget_s, f"here, {threads} threads")
+    figures = {
+        "latency": latency,
+        "throughput": _rate(swath.frames, latency),
+        "power": power,
+        "efficiency": efficiency(swath.pixels, latency, power),
+        **_conditions(watch, threads),
+    }
+    board = board_cpu_row(cpu_s, swath, load_target("vck190"), load_target("host-cpu"))
+    return [Row(TABLE, "traditional pipeline on this CPU", figures), board]
+
+
+def _chain_latency(
+    dn: np.ndarray, swath: Swath, sensors: Sensors, budget_s: float, place: str
+) -> tuple[Figure, tuple[float, float], Figure]:
+    """Of the chain on the swath: latency, CPU time of all cores in s (lowest, highest), and the processor's power."""
+    crops = list(_crops(dn))
+    _restore(crops[0][:32, :32], sensors)
+    timings, _, power = timed(lambda: [_wall_and_cpu_s(crop, sensors) for crop in crops])
+    wall_s, cpu_s = (
+        [t * swath.pixels / crop.size for t, crop in zip(times, crops, strict=True)]
+        for times in zip(*timings, strict=True)
+    )
+    estimate_s = statistics.median(wall_s)
+    if dn.size == swath.pixels and estimate_s <= budget_s:
+        (elapsed_s, whole_cpu_s), _, power = timed(lambda: _wall_and_cpu_s(dn, sensors))
+        return measured(elapsed_s, "s", f"the whole image, {place}"), (whole_cpu_s, whole_cpu_s), power
+    source = f"by proportion from {len(crops)} crops of {crops[0].shape[1]} x {crops[0].shape[0]}, {place}"
+    return predicted(estimate_s, "s", (min(wall_s), max(wall_s)), source), (min(cpu_s), max(cpu_s)), power
+
+
+def _wall_and_cpu_s(dn: np.ndarray, sensors: Sensors) -> tuple[float, float]:
+    """What the chain takes on the wall's clock, and of all this process's cores together."""
+    wall, cpu = time.perf_counter(), time.process_time()
+    _restore(dn, sensors)
+    return time.perf_counter() - wall, time.process_time() - cpu
+
+
+def host_rows(model: Path, target: TargetProfile, tile_px: int, threads: int = 0) -> list[Row]:
+    """A network's time for one tile through onnxruntime, float32 and INT8 taking turns, and its nodes' times.
+
+    Each runs for the target's minimum time and count, one run for warm-up left out. Its counterpart in the other
+    precision is the shipped network of the same variant; without one it runs alone.
+
+    Raises:
+        OptionError: more threads than cores.
+    """
+    require_cores("--threads", threads)
+    given = load_onnx(model)
+    other = counterpart(given)
+    runs = [Timed(model.stem, given)]
+    if other is not None:
+        runs.append(Timed(f"{'INT8' if is_quantised(other) else 'float32'} of the same shape", other))
+    min_time_s, min_runs = target.value("measurement", "min_time_s"), int(target.value("measurement", "min_runs"))
+    with watched() as watch:
+        take_turns(runs, tile_px, threads, min_time_s, min_runs)
+    conditions = _conditions(watch, threads or psutil.cpu_count(logical=False) or 1)
+    nodes, total_ms = profile(given, tile_feed(given, tile_px), threads)
+    return [*timed_rows(runs, tile_px, conditions), *node_rows(nodes, total_ms)]
+
+
+def _conditions(watch: Watch, threads: int) -> dict[str, Figure]:
+    return {
+        "threads": measured(threads, "thread", "of the runtime"),
+        "CPU load": watch.load,
+        "clock": watch.clock,
+    }
+
+
+def _rate(frames: float, latency: Figure) -> Figure:
+    """Frames a second, of the latency's own mode."""
+    time_s = latency.value or 0.0
+    if latency.interval is None:
+        return measured(frames / time_s, "frame/s", latency.source)
+    low, high = latency.interval
+    return predicted(frames / time_s, "frame/s", (frames / high, frames / low), latency.source)
+
+
+def _crops(dn: np.ndarray) -> Iterator[np.ndarray]:
+    """Square crops along the image's diagonal, or the image where it is no larger."""
+    height, width = (min(CROP_PX, side) for side in dn.shape)
+    for k in range(CROPS):
+        top, left = ((side - crop) * k // (CROPS - 1) for side, crop in zip(dn.shape, (height, width), strict=True))
+        yield dn[top : top + height, left : left + width]
+
+
+def _restore(dn: np.ndarray, sensors: Sensors) -> torch.Tensor:
+    image = torch.from_numpy(np.ascontiguousarray(dn, dtype=np.float32))
+    return restore_traditional(image, Chain(sensors.degraded.nominal(), sensors.reference.nominal()))

@@ -1,0 +1,284 @@
+"""The rows of the bench: a network on the DPU (predicted), the traditional pipeline (measured here), the paper's.
+
+One network on several configurations of the DPU, in tiles of several sizes; the traditional pipeline on the board's
+own processor is CPU time spent here, scaled by published benchmarks.
+"""
+
+import math
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from deploy.dpu.board import Dpu
+from deploy.dpu.checker.placement import place
+from deploy.dpu.cost.latency import (
+    LayerCost,
+    Prediction,
+    counted_power,
+    dpu_power,
+    energy_source,
+    layer_energy_j,
+    paper_frames,
+    predict,
+    whole_tiles,
+)
+from deploy.dpu.reading import read_network
+from profiles import TargetProfile
+from profiles.errors import OptionError
+from profiles.figures import Figure, Row, predicted, published
+
+TABLE, LAYERS = "bench", "layers"
+COST_SOURCE = "cost model fitted on published networks, docs/cost-model.md"
+ARITHMETIC = "arithmetic of the tile grid"
+PAPER = "ConvBEERS paper, table of the VCK190 benchmark, 13600 x 9016"
+PAPER_TILE_PX = 640
+
+
+@dataclass(frozen=True)
+class Swath:
+    """The image that all rows are about, and the tiles it is cut into."""
+
+    width_px: int
+    height_px: int
+    tile_px: int = PAPER_TILE_PX
+    halo_px: int = 0
+
+    @property
+    def pixels(self) -> int:
+        """Pixels of the image."""
+        return self.width_px * self.height_px
+
+    @property
+    def frames(self) -> float:
+        """Tiles as the paper counts: a fraction, without halo."""
+        return paper_frames(self.width_px, self.height_px, self.tile_px)
+
+    @property
+    def tiles(self) -> int:
+        """Whole tiles of the grid."""
+        return whole_tiles(self.width_px, self.height_px, self.tile_px, self.halo_px)
+
+    def work_factor(self, tiles: float) -> float:
+        """Pixels computed over pixels of the image."""
+        return tiles * self.tile_px**2 / self.pixels
+
+
+def predict_file(model: Path, dpu: Dpu, tile_px: int = PAPER_TILE_PX) -> Prediction:
+    """What the cost model says of an ONNX file.
+
+    Raises:
+        ModelError: not a network, or one that does not run whole on the DPU.
+    """
+    return predict(place(read_network(model, tile_px), dpu), dpu)
+
+
+def predicted_rows(name: str, prediction: Prediction, swath: Swath, dpu: Dpu) -> list[Row]:
+    """A network on the DPU, twice: as the paper counts, and with whole tiles."""
+    batches = math.ceil(swath.tiles / prediction.batch)
+    counts = {
+        "as the paper counts": (swath.frames, swath.frames / prediction.batch),
+        f"whole tiles, halo {swath.halo_px} px": (float(swath.tiles), float(batches)),
+    }
+    return [
+        _predicted_row(f"{name}, INT8 on the DPU ({prediction.configuration}), {how}", prediction, swath, dpu, *count)
+        for how, count in counts.items()
+    ]
+
+
+def _predicted_row(name: str, prediction: Prediction, swath: Swath, dpu: Dpu, frames: float, batches: float) -> Row:
+    power, latency = dpu_power(dpu), swath_latency(prediction, batches)
+    host_ms = 1e3 * prediction.host_s
+    figures = {
+        "tiles": exact(frames, "tile", ARITHMETIC),
+        "work factor": exact(swath.work_factor(frames), "px/px", ARITHMETIC),
+        "latency": latency,
+        "throughput": predicted(prediction.fps, "frame/s", prediction.fps_interval, COST_SOURCE),
+        "host beside the DPU": scaled(host_ms, "ms/tile", prediction, COST_SOURCE),
+        "power": power,
+        "power of products and traffic": counted_power(prediction, dpu),
+        "energy": energy(latency, power),
+        "efficiency": efficiency(swath.pixels, latency, power),
+    }
+    return Row(TABLE, name, figures, {"fitted range": fitted_range(prediction)})
+
+
+def swath_latency(prediction: Prediction, batches: float) -> Figure:
+    """Time of so many batches, in seconds."""
+    images = batches * prediction.batch
+    slow_s, fast_s = (images / fps for fps in prediction.fps_interval)
+    return predicted(images / prediction.fps, "s", (fast_s, slow_s), COST_SOURCE)
+
+
+def fitted_range(prediction: Prediction) -> str:
+    """Whether the fitted networks speak for this one."""
+    return f"outside: {'; '.join(prediction.outside)}" if prediction.outside else "inside"
+
+
+def energy(latency: Figure, power: Figure) -> Figure:
+    """Energy of the swath, in J: time and power, and their ends."""
+    (fast_s, slow_s), (low_w, high_w) = (f.interval or (f.value or 0.0, f.value or 0.0) for f in (latency, power))
+    value = (latency.value or 0.0) * (power.value or 0.0)
+    return predicted(value, "J", (fast_s * low_w, slow_s * high_w), f"{latency.source}; {power.source}")
+
+
+def efficiency(pixels: int, latency: Figure, power: Figure) -> Figure:
+    """Pixels a second and watt; its interval pairs the slowest run with the highest power and the reverse."""
+    unit = "px/s/W"
+    if power.value is None or latency.value is None:
+        return Figure(None, unit, "unavailable", reason=power.reason or latency.reason)
+    value = pixels / latency.value / power.value
+    if "predicted" not in (latency.mode, power.mode):
+        return Figure(value, unit, latency.mode, f"{latency.source}; {power.source}")
+    times, watts = (f.interval or (f.value or 0.0, f.value or 0.0) for f in (latency, power))
+    interval = (pixels / times[1] / watts[1], pixels / times[0] / watts[0])
+    return predicted(value, unit, interval, f"{latency.source}; {power.source}")
+
+
+def published_rows() -> list[Row]:
+    """The paper's two runs on the VCK190, as printed; its DPU configuration is not named."""
+    runs = {
+        "paper, 13600 x 9016: traditional on the VCK190's CPU": (1724, 0.2, 22.5, 3161),
+        "paper, 13600 x 9016: ConvBEERS, INT8 on the DPU": (42, 7.2, 29.6, 98965),
+    }
+    units = {"latency": "s", "throughput": "frame/s", "power": "W", "efficiency": "px/s/W"}
+    return [
+        Row(TABLE, name, {k: published(v, units[k], PAPER) for k, v in zip(units, values, strict=True)})
+        for name, values in runs.items()
+    ]
+
+
+def layer_rows(prediction: Prediction, dpu: Dpu) -> list[Row]:
+    """One row a layer and one for the start of a batch; their times add up to that of a batch, the last row.
+
+    The columns are those of AMD's vaitrace, with what bounds the layer; bytes and energy are those of one image.
+    """
+    rows = [_layer_row(layer, prediction, dpu) for layer in prediction.layers]
+    rows.append(
+        Row(LAYERS, "start of a batch", {"time": _time(prediction.overhead_s, prediction)}, {"bound": "overhead"})
+    )
+    total = f"sum: one batch of {prediction.batch}"
+    return [*rows, Row(LAYERS, total, {"time": _time(prediction.batch_time_s, prediction)})]
+
+
+def _layer_row(layer: LayerCost, prediction: Prediction, dpu: Dpu) -> Row:
+    work, batch, low_high_j = layer.work, prediction.batch, layer_energy_j(layer, dpu)
+    moved = batch * (work.load_map_bytes + work.store_map_bytes) + work.weight_bytes
+    seconds = layer.time_s or math.inf  # a concat takes no time of its own
+    figures = {
+        "work": exact(work.operations / 1e9, "GOP"),
+        "time": _time(layer.time_s, prediction),
+        "rate": scaled(batch * work.operations / seconds / 1e9, "GOP/s", prediction, COST_SOURCE, falls=True),
+        "LdFM": exact(work.load_map_bytes / 1e6, "MB", "feature maps that an image loads, by the graph's shapes"),
+        "LdWB": exact(work.weight_bytes / 1e6, "MB", "weights and biases that a batch loads, by the graph's shapes"),
+        "StFM": exact(work.store_map_bytes / 1e6, "MB", "feature maps that an image stores, by the graph's shapes"),
+        "bandwidth": scaled(moved / seconds / 1e9, "GB/s", prediction, COST_SOURCE, falls=True),
+        "array use": exact(100 * work.array_use, "%"),
+        "energy": predicted(
+            500 * sum(low_high_j), "mJ", (1e3 * low_high_j[0], 1e3 * low_high_j[1]), energy_source(dpu)
+        ),
+    }
+    return Row(LAYERS, work.name, figures, {"bound": layer.bound})
+
+
+def _time(time_s: float, prediction: Prediction) -> Figure:
+    return scaled(1e3 * time_s, "ms/batch", prediction, COST_SOURCE)
+
+
+def exact(value: float, unit: str, source: str = "arithmetic of the graph's shapes, one image") -> Figure:
+    """A number that follows from shapes alone."""
+    return predicted(value, unit, (value, value), source)
+
+
+def scaled(value: float, unit: str, prediction: Prediction, source: str, *, falls: bool = False) -> Figure:
+    """A part of the prediction, with the relative error of the whole; `falls` where more time means less of it."""
+    slow, fast = (prediction.fps / fps for fps in prediction.fps_interval)
+    ends = (value / slow, value / fast) if falls else (value * fast, value * slow)
+    return predicted(value, unit, ends, source)
+
+
+MOST_TILE_PX = 8192
+"""One layer's result of 64 channels has 17 GB there; no board has a tenth of it."""
+
+
+def sweep_rows(model: Path, swath: Swath, boards: Sequence[Dpu], tiles_px: Sequence[int]) -> list[Row]:
+    """A row a configuration and tile size, for whole tiles with the swath's halo."""
+    return [
+        _row(predict_file(model, dpu, tile_px), replace(swath, tile_px=tile_px))
+        for dpu in boards
+        for tile_px in tiles_px
+    ]
+
+
+def _row(prediction: Prediction, swath: Swath) -> Row:
+    figures = {
+        "tiles": exact(swath.tiles, "tile", ARITHMETIC),
+        "work factor": exact(swath.work_factor(swath.tiles), "px/px", ARITHMETIC),
+        "latency": swath_latency(prediction, math.ceil(swath.tiles / prediction.batch)),
+        "throughput": predicted(prediction.fps, "frame/s", prediction.fps_interval, COST_SOURCE),
+        "maps through memory": exact(prediction.streamed_bytes / 1e6, "MB/tile"),
+        "layers on chip": exact(on_chip(prediction), "%"),
+    }
+    bound = Counter[str]()
+    for layer in prediction.layers:
+        bound[layer.bound] += round(1e12 * layer.time_s)
+    words = {"bound": bound.most_common(1)[0][0], "fitted range": fitted_range(prediction)}
+    return Row("sweep", f"{prediction.configuration}, tiles of {swath.tile_px}", figures, words)
+
+
+def on_chip(prediction: Prediction) -> float:
+    """Share of layers that neither read nor write maps in memory, in percent."""
+    kept = [not (layer.work.load_map_bytes or layer.work.store_map_bytes) for layer in prediction.layers]
+    return 100 * sum(kept) / len(kept)
+
+
+def parse_tiles(text: str) -> list[int]:
+    """Tile sides in pixels, with commas between them.
+
+    Raises:
+        OptionError: another text, or a side below 16 or above MOST_TILE_PX.
+    """
+    parts = [part.strip() for part in text.split(",")]
+    if not all(part.isdecimal() and len(part) < 6 and 16 <= int(part) <= MOST_TILE_PX for part in parts):
+        remedy = "write one size, or several as 640,256,128"
+        raise OptionError(
+            "--tile", expected=f"tile sides of 16 to {MOST_TILE_PX} pixels", got=repr(text), remedy=remedy
+        )
+    return [int(part) for part in parts]
+
+
+NAME = "traditional pipeline on the board's CPU, 2 x Cortex-A72"
+
+
+def slowdown(board: TargetProfile, host: TargetProfile) -> tuple[float, float]:
+    """How many times longer a core of the board's processor takes than one of a common server: lowest, highest."""
+    clock, integers, floats = (
+        board.constant("cpu", key) for key in ("clock_ghz", "zip_mips_per_ghz", "linpack_gflops_per_ghz")
+    )
+    low = host.value("cpu", "zip_mips") / (integers.high * clock.high)
+    return low, host.value("cpu", "linpack_gflops") / (floats.low * clock.low)
+
+
+def board_cpu_row(cpu_s: tuple[float, float], swath: Swath, board: TargetProfile, host: TargetProfile) -> Row:
+    """CPU time scaled to the board's processor: shared by its cores at best, on one core at worst.
+
+    Args:
+        cpu_s: time of this host's cores together that the swath takes, lowest and highest, in s.
+        swath: the image it is about.
+        board: profile with a table [cpu], and the power of its CPU run.
+        host: profile of a common server core.
+    """
+    fast, slow = slowdown(board, host)
+    low, high = cpu_s[0] * fast / board.value("cpu", "cores"), cpu_s[1] * slow
+    source = (
+        f"CPU time here x {fast:.2g} to {slow:.2g} (7-zip and HPL of A72 and common server cores), on 1 or 2 cores"
+    )
+    latency = predicted(math.sqrt(low * high), "s", (low, high), source)  # the ends are ratios: their geometric mean
+    rates = swath.frames / high, swath.frames / low
+    power = board.constant("power", "cpu_run_w")
+    figures = {
+        "latency": latency,
+        "throughput": predicted(math.sqrt(rates[0] * rates[1]), "frame/s", rates, source),
+        "power": published(power.low, "W", power.source),
+    }
+    return Row(TABLE, NAME, {**figures, "efficiency": efficiency(swath.pixels, latency, figures["power"])})

@@ -1,0 +1,1 @@
+"""What the DPU can run: its rules, one small function each, and where each node of a network goes."""

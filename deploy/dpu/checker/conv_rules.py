@@ -1,0 +1,165 @@
+"""What the DPU demands of convolutions, plain, depthwise and transposed: one rule, one function."""
+
+from deploy.dpu.board import Dpu
+from deploy.dpu.checker.finding import Finding, groups_of, outside, shown
+from deploy.dpu.graph import Operation
+
+# ruff: noqa: ARG001 - every rule takes the operation and the DPU
+
+
+def conv_kernel(op: Operation, dpu: Dpu) -> Finding | None:
+    """Kernel height and width are {conv[kernel]} (UG1414 3.5, conv2d)."""
+    limit, kernel = dpu.limit("conv", "kernel"), op.window.kernel
+    if not outside(kernel, limit):
+        return None
+    remedy = f"use a kernel of at most {limit.high:g}, or stack small ones: two 3 x 3 see as far as one 5 x 5"
+    return Finding(f"kernel ({shown(kernel)}) is not in the DPU's range {limit}", remedy)
+
+
+def conv_stride(op: Operation, dpu: Dpu) -> Finding | None:
+    """Strides are {conv[stride]} (UG1414 3.5, conv2d)."""
+    limit, stride = dpu.limit("conv", "stride"), op.window.stride
+    if not outside(stride, limit):
+        return None
+    remedy = f"use a stride of at most {limit.high:g}, or two convolutions whose strides multiply to it"
+    return Finding(f"stride ({shown(stride)}) is not in the DPU's range {limit}", remedy)
+
+
+def conv_channels(op: Operation, dpu: Dpu) -> Finding | None:
+    """Input and output channels are at most {conv[channels_max]} (UG1414 3.5, conv2d)."""
+    return _channels(op, dpu.whole("conv", "channels_max"))
+
+
+def conv_padding(op: Operation, dpu: Dpu) -> Finding | None:
+    """Padding on each side is 0 to (kernel - 1) * dilation (UG1414 3.5, conv2d)."""
+    window = op.window
+    room = [(k - 1) * d for k, d in zip(window.kernel, window.dilation, strict=True)] * 2
+    if all(0 <= pad <= most for pad, most in zip(window.pads, room, strict=True)):
+        return None
+    remedy = "pad at most (kernel - 1) * dilation here and the rest with a Pad node of constant mode"
+    return Finding(f"pads {window.pads} exceed {tuple(room)}, (kernel - 1) * dilation", remedy)
+
+
+def conv_weight_bank(op: Operation, dpu: Dpu) -> Finding | None:
+    """Weights fit the parameter buffer's depth of {memory[weight_bank_depth]} (Vitis-AI master, dpu_op_filter.py).
+
+    The depth is kernel height * width * ceil(input channels / {memory[weight_bank_width]}) * ceil(output channels at
+    a time / {memory[weight_banks]}).
+    """
+    area = op.window.kernel[0] * op.window.kernel[1]
+    inputs = groups_of(op.channels[0], dpu.whole("memory", "weight_bank_width"))
+    depth = area * inputs * groups_of(dpu.output_parallel, dpu.whole("memory", "weight_banks"))
+    most = dpu.whole("memory", "weight_bank_depth")
+    if depth <= most:
+        return None
+    remedy = "use a smaller kernel or fewer input channels (a 1 x 1 convolution before it can reduce them)"
+    return Finding(f"weights are too large for the parameter buffer: depth {depth} of {most}", remedy)
+
+
+def conv_window(op: Operation, dpu: Dpu) -> Finding | None:
+    """The kernel's area * ceil(ic / {conv[window_channels]}) is at most {conv[window_max]} (UG1414 3.5, conv2d)."""
+    area = op.window.kernel[0] * op.window.kernel[1]
+    size = area * groups_of(op.channels[0], dpu.whole("conv", "window_channels"))
+    most = dpu.whole("conv", "window_max")
+    if size <= most:
+        return None
+    return Finding(f"window of {size} exceeds {most}", f"keep kernel height * width within {most}, such as 8 x 8")
+
+
+def conv_dilation(op: Operation, dpu: Dpu) -> Finding | None:
+    """Dilation * input channels is at most {conv[dilated_channels_max]} (UG1414 3.5, conv2d)."""
+    size, most = max(op.window.dilation) * op.channels[0], dpu.whole("conv", "dilated_channels_max")
+    if max(op.window.dilation) == 1 or size <= most:
+        return None
+    remedy = f"use a dilation of at most {most // op.channels[0]}, or fewer input channels"
+    return Finding(f"dilation {max(op.window.dilation)} * {op.channels[0]} input channels exceeds {most}", remedy)
+
+
+def conv_groups(op: Operation, dpu: Dpu) -> Finding | None:
+    """A convolution has one group, or as many as input channels: depthwise (UG1414 3.5, conv2d)."""
+    if op.kind != "grouped conv":
+        return None
+    groups = op.attributes.get("group")
+    remedy = "use group = 1 with zeros where groups do not meet, or one convolution a group and a concat"
+    return Finding(f"{groups} groups for {op.channels[0]} input channels", remedy)
+
+
+def depthwise_kernel(op: Operation, dpu: Dpu) -> Finding | None:
+    """Kernel sides are {depthwise[kernel]} (PG389 1.3, ALU).
+
+    Their product is at most {depthwise[window_max]} (UG1414 3.5, depthwise-conv2d).
+    """
+    kernel, limit, most = op.window.kernel, dpu.limit("depthwise", "kernel"), dpu.whole("depthwise", "window_max")
+    if not outside(kernel, limit) and kernel[0] * kernel[1] <= most:
+        return None
+    reason = f"kernel ({shown(kernel)}) is not in the DPU's range {limit}, area at most {most}"
+    return Finding(reason, "use a smaller kernel, or a k x 1 and a 1 x k depthwise convolution")
+
+
+def depthwise_stride(op: Operation, dpu: Dpu) -> Finding | None:
+    """Strides are {depthwise[stride]} (PG389 1.3, ALU)."""
+    limit, stride = dpu.limit("depthwise", "stride"), op.window.stride
+    if not outside(stride, limit):
+        return None
+    reason = f"stride ({shown(stride)}) is not in the DPU's range {limit}"
+    return Finding(reason, f"use a stride of at most {limit.high:g}")
+
+
+def depthwise_padding(op: Operation, dpu: Dpu) -> Finding | None:
+    """Padding is {depthwise[pad_begin]} top and left, {depthwise[pad_end]} bottom and right (PG389 1.3, ALU)."""
+    return alu_padding(op, dpu, "depthwise")
+
+
+def depthwise_channels(op: Operation, dpu: Dpu) -> Finding | None:
+    """Channels are at most {depthwise[channels_max]} (UG1414 3.5, depthwise-conv2d)."""
+    return _channels(op, dpu.whole("depthwise", "channels_max"))
+
+
+def transposed_kernel(op: Operation, dpu: Dpu) -> Finding | None:
+    """Kernel / stride, rounded down and up, is {transposed[kernel_per_stride]} (UG1414 3.5, transposed-conv2d)."""
+    limit = dpu.limit("transposed", "kernel_per_stride")
+    pairs = list(zip(op.window.kernel, op.window.stride, strict=True))
+    if not outside(tuple(n for k, s in pairs for n in (k // s, groups_of(k, s))), limit):
+        return None
+    reason = (
+        f"kernel ({shown(op.window.kernel)}) / stride ({shown(op.window.stride)}) is not in the DPU's range {limit}"
+    )
+    return Finding(reason, "use a kernel at least as large as the stride, such as 4 x 4 with stride 2")
+
+
+def transposed_output_padding(op: Operation, dpu: Dpu) -> Finding | None:
+    """output_padding is {transposed[output_padding]} (UG1414 3.5, transposed-conv2d)."""
+    if max(op.window.output_padding) == dpu.whole("transposed", "output_padding"):
+        return None
+    reason = f"the DPU does not support output_padding {op.window.output_padding}"
+    return Finding(reason, "use an even kernel, such as 4 x 4 with stride 2 and padding 1: it needs none")
+
+
+def transposed_padding(op: Operation, dpu: Dpu) -> Finding | None:
+    """Padding on each side is 0 to the kernel's side (UG1414 3.5, transposed-conv2d)."""
+    room = op.window.kernel * 2
+    if all(0 <= pad <= most for pad, most in zip(op.window.pads, room, strict=True)):
+        return None
+    reason = f"pads {op.window.pads} exceed the kernel ({shown(op.window.kernel)})"
+    return Finding(reason, "pad less, and crop on the host")
+
+
+def transposed_channels(op: Operation, dpu: Dpu) -> Finding | None:
+    """Input and output channels are at most {transposed[channels_max]} (UG1414 3.5, transposed-conv2d)."""
+    return _channels(op, dpu.whole("transposed", "channels_max"))
+
+
+def alu_padding(op: Operation, dpu: Dpu, table: str) -> Finding | None:
+    """The padding that the ALU engine can do, for depthwise convolutions and pools."""
+    begin, end = dpu.limit(table, "pad_begin"), dpu.limit(table, "pad_end")
+    if not outside(op.window.pads[:2], begin) and not outside(op.window.pads[2:], end):
+        return None
+    reason = f"pads {op.window.pads} are not in the DPU's range: top, left {begin}; bottom, right {end}"
+    return Finding(reason, f"pad at most {begin.high:g} at top and left, the rest with a Pad node of constant mode")
+
+
+def _channels(op: Operation, most: int) -> Finding | None:
+    if max(op.channels) <= most:
+        return None
+    reason = f"{op.channels[0]} input and {op.channels[1]} output channels: at most {most}"
+    return Finding(reason, f"use at most {most} channels, in several convolutions if need be")

@@ -1,0 +1,182 @@
+"""What the DPU demands of the numbers in a quantised file: one rule, one function.
+
+A position p stands for the scale 2^-p; shifts are differences of positions.
+"""
+
+import numpy as np
+
+from deploy.dpu.board import Dpu
+from deploy.dpu.checker.finding import Finding, outside
+from deploy.dpu.graph import Operation, Scale
+
+# ruff: noqa: ARG001 - every rule takes the operation and the DPU
+
+
+AGAIN = "'beers-deploy quantize --regime legal' does"
+MOVE = "move the output's position until it fits: 'beers-deploy quantize --regime legal' does"
+
+
+def on_integers(op: Operation, dpu: Dpu) -> Finding | None:
+    """A node on the DPU computes on int8 tensors (UG1414 3.5, quantisation)."""
+    return (
+        None if op.integer else Finding("the file computes it in floating point", f"quantise this node too; {AGAIN}")
+    )
+
+
+def symmetric(op: Operation, dpu: Dpu) -> Finding | None:
+    """Tensors are int8 around zero, or the same numbers as uint8 around 128 (Vitis-AI 3.0, vai_q_pytorch)."""
+    faults = [
+        f"{role} {scale.integer_type} around {scale.zero_points[0]}"
+        for role, scale in op.scales.items()
+        if not scale.symmetric or (scale.integer_type == "int32" and role.startswith(("input", "output")))
+    ]
+    return Finding("; ".join(faults), f"calibrate with a zero point of 0; {AGAIN}") if faults else None
+
+
+def per_tensor(op: Operation, dpu: Dpu) -> Finding | None:
+    """A tensor has one scale, not one a channel (Vitis-AI 3.0, vai_q_pytorch)."""
+    faults = [f"{role} has {len(scale.scales)} scales" for role, scale in op.scales.items() if len(scale.scales) != 1]
+    return Finding("; ".join(faults), f"quantise with one scale a tensor; {AGAIN}") if faults else None
+
+
+def power_of_two(op: Operation, dpu: Dpu) -> Finding | None:
+    """Scales are powers of two (UG1414 3.5, quantisation)."""
+    single = {role: scale for role, scale in op.scales.items() if len(scale.scales) == 1}
+    faults = [f"{role} scale {scale.scales[0]:.4g}" for role, scale in single.items() if scale.position is None]
+    return (
+        Finding("; ".join(faults), f"round each scale to 2^-position; {AGAIN}, and so does AMD Quark's XINT8")
+        if faults
+        else None
+    )
+
+
+def one_format(op: Operation, dpu: Dpu) -> Finding | None:
+    """Who writes a tensor and who reads it give it the same scale and zero point (Vitis-AI 3.0, vai_q_pytorch)."""
+    faults = [f"{role} is {' and '.join(map(_words, formats))}" for role, formats in op.disputed.items()]
+    return Finding("; ".join(faults), f"give each tensor one scale and zero point; {AGAIN}") if faults else None
+
+
+def shift_cut(op: Operation, dpu: Dpu) -> Finding | None:
+    """Weight + input - output position of a convolution is {numbers[shift_cut]} (Vitis-AI 3.0, vai_q_pytorch)."""
+    cut, limit = _cut(op), dpu.limit("numbers", "shift_cut")
+    return None if cut is None or not outside((cut,), limit) else Finding(f"shift_cut {cut}, allowed {limit}", MOVE)
+
+
+def shift_bias(op: Operation, dpu: Dpu) -> Finding | None:
+    """Weight + input - bias position is at most {numbers[shift_bias_max]} (Vitis-AI 3.0, vai_q_pytorch).
+
+    And at least min(0, shift_cut + 8 - {numbers[accumulator_bits]}).
+    """
+    product, cut, bias = product_position(op), _cut(op), _position(op, "bias")
+    if product is None or cut is None or bias is None:
+        return None
+    low = min(0, cut + 8 - dpu.whole("numbers", "accumulator_bits"))
+    high, shift = dpu.whole("numbers", "shift_bias_max"), product - bias
+    return None if low <= shift <= high else Finding(f"shift_bias {shift}, allowed {low} to {high}", MOVE)
+
+
+def shift_read(op: Operation, dpu: Dpu) -> Finding | None:
+    """The inputs' positions of an add lie {numbers[shift_read]} apart (Vitis-AI 3.0, vai_q_pytorch)."""
+    inputs, limit = _inputs(op), dpu.limit("numbers", "shift_read")
+    shift = max(inputs) - min(inputs) if inputs else 0
+    return Finding(f"shift_read {shift}, allowed {limit}", MOVE) if outside((shift,), limit) else None
+
+
+def shift_write(op: Operation, dpu: Dpu) -> Finding | None:
+    """An add's smallest input position less its output's is {numbers[shift_write]} (Vitis-AI 3.0, vai_q_pytorch)."""
+    inputs, output, limit = _inputs(op), _position(op, "output"), dpu.limit("numbers", "shift_write")
+    if not inputs or output is None or not outside((min(inputs) - output,), limit):
+        return None
+    return Finding(f"shift_write {min(inputs) - output}, allowed {limit}", MOVE)
+
+
+def same_position(op: Operation, dpu: Dpu) -> Finding | None:
+    """Inputs and output of a concat or a pool share one position (Vitis-AI 3.0, vai_q_pytorch)."""
+    positions = {role: p for role in op.scales if (p := _position(op, role)) is not None}
+    if len(set(positions.values())) < 2:
+        return None
+    return Finding(
+        ", ".join(f"{role} position {p}" for role, p in positions.items()), f"give them the smallest one; {AGAIN}"
+    )
+
+
+def product_position(op: Operation) -> int | None:
+    """The position of a convolution's sums of products, None without one."""
+    weight, source = _position(op, "weight"), _position(op, "input 0")
+    return None if weight is None or source is None else weight + source
+
+
+def _position(op: Operation, role: str) -> int | None:
+    scale = op.scales.get(role)
+    return scale.position if scale else None
+
+
+def _inputs(op: Operation) -> list[int]:
+    """Of the tensors and constants that an element-wise operator reads."""
+    positions = (_position(op, role) for role in op.scales if role.startswith(("input", "constant")))
+    return [p for p in positions if p is not None]
+
+
+def _cut(op: Operation) -> int | None:
+    product, output = product_position(op), _position(op, "output")
+    return None if product is None or output is None else product - output
+
+
+def _words(scale: Scale) -> str:
+    scales, zeros = ", ".join(f"{s:.9g}" for s in scale.scales[:1]), scale.zero_points[:1]
+    return f"{scale.integer_type} at scale {scales or 'unknown'} around {zeros[0] if zeros else 'nothing'}"
+
+
+# ruff: noqa: ARG001 - every rule takes the operation and the DPU
+
+
+BYTES = ("int8", "uint8")
+"""Whether uint8 lies around 128 is the rule "symmetric"."""
+
+
+def int8_constants(op: Operation, dpu: Dpu) -> Finding | None:
+    """Weights, and constants that are added, multiplied or joined, are stored as int8 (UG1414 3.5, quantisation)."""
+    kinds = {role: _kind(values) for role, values in op.constants.items() if role != "bias"}
+    faults = [f"{role} is {kind}" for role, kind in kinds.items() if kind not in BYTES]
+    faults += [f"{role} has no scale" for role, kind in kinds.items() if kind in BYTES and role not in op.scales]
+    return Finding("; ".join(faults), f"store it as int8 with a scale 2^-position; {AGAIN}") if faults else None
+
+
+def int8_bias(op: Operation, dpu: Dpu) -> Finding | None:
+    """A bias is int8 with a position of its own, not int32 at the products' scale (Vitis-AI 3.0, vai_q_pytorch).
+
+    The operator QLinearConv demands int32: its bias has a rule of its own.
+    """
+    if "bias" not in op.constants or op.op_type == "QLinearConv":
+        return None
+    kind = _kind(op.constants["bias"])
+    return None if kind == "int8" else Finding(f"its bias is {kind}", f"quantise the bias to int8; {AGAIN}")
+
+
+def int32_bias(op: Operation, dpu: Dpu) -> Finding | None:
+    """A QLinearConv's int32 bias is int8 << k, k at most {numbers[shift_bias_max]} (Vitis-AI 3.0, vai_q_pytorch).
+
+    One k for all values: the weight + input - bias position. A change that keeps this form no rule can see: one more
+    where k is 0 is another bias, and as legal. Judged where the products have a position.
+    """
+    if "bias" not in op.constants or op.op_type != "QLinearConv" or product_position(op) is None:
+        return None
+    values, high = op.constants["bias"], dpu.whole("numbers", "shift_bias_max")
+    remedy = f"round the bias to int8 at a position of its own; {AGAIN}"
+    if values is None or _kind(values) != "int32":
+        return Finding(f"its bias is {_kind(values)}", remedy)
+    shift = min(high, _spare_bits(values))
+    low, top = (int(end) for end in ((values >> shift).min(initial=0), (values >> shift).max(initial=0)))
+    if low >= -128 and top <= 127:
+        return None
+    return Finding(f"its bias is {low} to {top} shifted left by {shift}, allowed -128 to 127 by 0 to {high}", remedy)
+
+
+def _kind(values: np.ndarray | None) -> str:
+    return "computed by other nodes" if values is None else str(values.dtype)
+
+
+def _spare_bits(values: np.ndarray) -> int:
+    """How many low bits are 0 in every value; 0 where all values are."""
+    bits = int(np.bitwise_or.reduce(values, axis=None))
+    return (bits & -bits).bit_length() - 1 if bits else 0

@@ -1,0 +1,197 @@
+"""What the DPU demands of pools, activations, element-wise operators and moves of pixels: one rule, one function."""
+
+import math
+
+from deploy.dpu.board import Dpu
+from deploy.dpu.checker.conv_rules import alu_padding
+from deploy.dpu.checker.finding import Finding, outside, shown
+from deploy.dpu.graph import Operation
+from profiles.errors import sizes
+
+# ruff: noqa: ARG001 - every rule takes the operation and the DPU
+
+
+ALU = {"LeakyRelu", "QLinearLeakyRelu", "PRelu", "HardSigmoid"}
+FUSING = {"conv", "depthwise", "transposed", "add", "mul"}
+INSTEAD = {
+    "Sub": "fold the minus sign into the weights before it, and add",
+    "Neg": "fold the minus sign into the weights before it",
+    "Div": "fold the division into the weights of the convolution before it, or multiply by the reciprocal",
+    "Exp": "leave it to the host, behind the network",
+    "Sigmoid": "use HardSigmoid",
+    "Tanh": "use HardSigmoid, scaled by the weights behind it",
+    "Log": "leave it to the host, in front of the network",
+    "Sqrt": "leave it to the host, in front of the network",
+    "Softmax": "leave it to the host, behind the network",
+    "Gelu": "use HardSwish",
+    "Clip": "use ReLU, or ReLU6 (Clip from 0 to 6)",
+    "ReduceSum": "use a 1 x 1 convolution of ones",
+    "ReduceMean": "use GlobalAveragePool",
+    "Transpose": "keep the layout (N, C, H, W) throughout",
+    "Slice": "use a convolution that picks these channels or pixels",
+    "SpaceToDepth": "use a strided convolution, or rearrange on the host before the network",
+    "Gather": "to pick fixed channels, use a 1 x 1 convolution; what is picked by value stays with the host",
+    "Gemm": "write it as a 1 x 1 convolution",
+    "MatMul": "write it as a 1 x 1 convolution where one factor is constant; else leave it to the host",
+    "DFT": "use a convolution of at most 16 x 16 where the filter is short; else leave it to the host",
+    "TopK": "leave it to the host: the DPU does not compare values across a map",
+    "LayerNormalization": "train without normalisation, or with one that folds into the convolution",
+    "FixNeuron": "write the file with QuantizeLinear and DequantizeLinear (QDQ format)",
+    "VitisQuantizeLinear": "write the file with QuantizeLinear and DequantizeLinear (QDQ format)",
+    "ExtendedQuantizeLinear": "write the file with QuantizeLinear and DequantizeLinear (QDQ format)",
+    "InstanceNormalization": "train without normalisation, or with one that folds into the convolution",
+    "BatchNormalization": "fold it into the convolution before it",
+}
+
+
+def known_operator(op: Operation, dpu: Dpu) -> Finding | None:
+    """Only operators of the supported list run on the DPU (UG1414 3.5, supported operators)."""
+    remedy = INSTEAD.get(op.op_type, "leave it to the host before or behind the network, or do without it")
+    return Finding(f"{op.op_type} always runs on the CPU", remedy)
+
+
+def pixel_shuffle(op: Operation, dpu: Dpu) -> Finding | None:
+    """PixelShuffle is avoided: it compiles but has given wrong numbers (Vitis-AI issue 1486)."""
+    return Finding(f"{op.op_type} compiles but has given wrong numbers", "use a nearest Resize and a convolution")
+
+
+def pool_kernel(op: Operation, dpu: Dpu) -> Finding | None:
+    """Pool kernel sides are {pool[kernel]} (PG389 1.3, ALU)."""
+    kernel, limit = op.window.kernel, dpu.limit("pool", "kernel")
+    if not outside(kernel, limit):
+        return None
+    reason = f"kernel ({shown(kernel)}) is not in the DPU's range {limit}"
+    return Finding(reason, "pool in two steps, or a smaller tile where the pool is global")
+
+
+def pool_stride(op: Operation, dpu: Dpu) -> Finding | None:
+    """Pool strides are {pool[stride]} (PG389 1.3, ALU)."""
+    stride, limit = op.window.stride, dpu.limit("pool", "stride")
+    if not outside(stride, limit):
+        return None
+    reason = f"stride ({shown(stride)}) is not in the DPU's range {limit}"
+    return Finding(reason, "pool in two steps")
+
+
+def pool_padding(op: Operation, dpu: Dpu) -> Finding | None:
+    """Pool padding is {pool[pad_begin]} at top and left, {pool[pad_end]} at bottom and right (PG389 1.3, ALU)."""
+    return alu_padding(op, dpu, "pool")
+
+
+def activation_place(op: Operation, dpu: Dpu) -> Finding | None:
+    """ReLU, ReLU6 and hard-swish are fused: right behind a convolution, an add or a mul (UG1414 3.5, activations).
+
+    Leaky ReLU, PReLU and hard-sigmoid stand anywhere: the ALU does them (PG389 1.3, ALU).
+    """
+    if op.follows in FUSING or op.op_type in ALU:
+        return None
+    before = op.follows or "the input"
+    return Finding(f"{op.op_type} stands behind {before}", "move it right behind the convolution or add before")
+
+
+def activation_of_sums(op: Operation, dpu: Dpu) -> Finding | None:
+    """Behind an add or a mul only ReLU is fused (UG1414 3.5, element-wise)."""
+    if op.follows not in ("add", "mul") or op.op_type in {"Relu", "Max", *ALU}:
+        return None
+    return Finding(f"{op.op_type} stands behind {op.follows}", "use ReLU there")
+
+
+def leaky_relu_alpha(op: Operation, dpu: Dpu) -> Finding | None:
+    """LeakyReLU has alpha = 26 / 256 = {activation[leaky_relu_alpha].low} (UG1414 3.5, leaky_relu)."""
+    given, wanted = op.attributes.get("alpha", 0.01), dpu.value("activation", "leaky_relu_alpha")
+    is_leaky = op.op_type in ("LeakyRelu", "QLinearLeakyRelu")
+    if not is_leaky or (isinstance(given, int | float) and abs(given - wanted) < 1e-6):
+        return None
+    return Finding(
+        f"its alpha is {given}, but the DPU supports only {wanted}", f"train with alpha = {wanted}, or ReLU"
+    )
+
+
+def mul_constant(op: Operation, dpu: Dpu) -> Finding | None:
+    """A constant factor is one number a channel: it becomes a 1 x 1 depthwise convolution (UG1414 3.5, mul)."""
+    shape = op.constant_shape or ()
+    if sum(size > 1 for size in shape) <= 1 and (len(shape) < 2 or max(shape[-2:]) == 1):
+        return None
+    return Finding(f"a constant factor of shape {shape}", "use one factor a channel, shape (1, C, 1, 1)")
+
+
+def pad_mode(op: Operation, dpu: Dpu) -> Finding | None:
+    """Padding is constant or symmetric; reflect runs on the CPU (UG1414 3.5, pad)."""
+    mode = op.attributes.get("mode", b"constant")
+    if mode == b"constant":
+        return None
+    name = mode.decode() if isinstance(mode, bytes) else mode
+    return Finding(f"pad mode {name}", "use zero padding inside the convolution, or pad the image on the host")
+
+
+def resize_mode(op: Operation, dpu: Dpu) -> Finding | None:
+    """Resize is nearest without align_corners, or bilinear (UG1414 3.5, resize)."""
+    mode, corners = _text(op, "mode", "nearest"), _text(op, "coordinate_transformation_mode", "half_pixel")
+    if mode == "linear" or (mode == "nearest" and corners != "align_corners"):
+        return None
+    return Finding(f"resize mode {mode} with {corners}", "use nearest with coordinate mode asymmetric")
+
+
+def resize_scale(op: Operation, dpu: Dpu) -> Finding | None:
+    """Bilinear scales are one power of two, {resize[bilinear_scale]} (UG1414 3.5, resize).
+
+    With half-pixel centres {resize[half_pixel_scale]}.
+    """
+    before, after = op.in_shapes[0] if op.in_shapes else None, op.out_shape
+    if _text(op, "mode", "nearest") != "linear" or before is None or after is None:
+        return None
+    half = _text(op, "coordinate_transformation_mode", "half_pixel") == "half_pixel"
+    limit = dpu.limit("resize", "half_pixel_scale" if half else "bilinear_scale")
+    scales = {after[1] / before[1], after[2] / before[2]}
+    if scales <= {2.0, 4.0, 8.0} and len(scales) == 1 and limit.low <= min(scales) <= limit.high:
+        return None
+    reason = f"bilinear scale {' x '.join(f'{s:g}' for s in sorted(scales))}, the DPU's are powers of two, {limit}"
+    return Finding(reason, "scale by 2 several times, or use nearest")
+
+
+def resize_channels(op: Operation, dpu: Dpu) -> Finding | None:
+    """Resize takes at most {resize[channels_max]} channels (UG1414 3.5, resize)."""
+    most = dpu.whole("resize", "channels_max")
+    if op.channels[0] <= most:
+        return None
+    return Finding(f"{op.channels[0]} channels: at most {most}", "reduce them with a 1 x 1 convolution before")
+
+
+def _text(op: Operation, key: str, default: str) -> str:
+    value = op.attributes.get(key, default)
+    return value.decode() if isinstance(value, bytes) else str(value)
+
+
+WINDOWED = {"conv", "grouped conv", "depthwise", "transposed", "pool"}
+
+
+def map_exists(op: Operation, dpu: Dpu) -> Finding | None:
+    """The tile is large enough for every window: each map keeps at least one pixel (ONNX 1.17, Conv and MaxPool)."""
+    before = op.in_shapes[0] if op.in_shapes else None
+    if op.kind not in WINDOWED or before is None or op.out_shape is not None:
+        return None
+    window = f"a kernel of {shown(op.window.kernel)}, stride {shown(op.window.stride)}"
+    reason = f"nothing is left of a map of {shown(before[1:])} under {window}"
+    return Finding(reason, "use a larger tile, or fewer strides before it")
+
+
+def maps_aligned(op: Operation, dpu: Dpu) -> Finding | None:
+    """Maps that meet in an add, mul or concat have one height and width, or 1 x 1 (ONNX 1.17, Add and Concat)."""
+    sizes = {(shape[1], shape[2]) for shape in op.in_shapes if shape is not None}
+    if op.kind not in ("add", "mul", "concat") or len(sizes - {(1, 1)}) < 2:
+        return None
+    reason = " and ".join(shown(size) for size in sorted(sizes)) + " meet"
+    return Finding(
+        reason, "use a tile whose side is a multiple of the network's total stride, or pad the smaller map"
+    )
+
+
+def map_in_memory(op: Operation, dpu: Dpu) -> Finding | None:
+    """A map, for all images of a batch, fits {tile[memory_bytes].low:.0f} bytes (assumed: the board's LPDDR4)."""
+    most = dpu.value("tile", "memory_bytes")
+    size = math.prod(op.out_shape) * dpu.batch if op.out_shape else 0
+    if size <= most:
+        return None
+    taken, room = sizes(size, most)
+    reason = f"{taken} for {dpu.batch} images, of {room}"
+    return Finding(reason, f"use a tile of at most {math.sqrt(most / size):.2f} times this side")

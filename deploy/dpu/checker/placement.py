@@ -1,0 +1,180 @@
+"""Where each node goes: to the host by design, to the DPU, or to the CPU for want of a rule kept.
+
+A network on this board has three parts:
+
+1. host-front: scaling and splitting the image, before the first convolution.
+2. dpu-core: everything from the first convolution to the last, and int8 nodes right behind it.
+3. host-back: making numbers of integers, adding the correction to the 12-bit image, clipping.
+"""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Literal
+
+from deploy.dpu.board import Dpu
+from deploy.dpu.checker.operators import Broken, judge
+from deploy.dpu.graph import CONVOLUTIONS, Network, Operation
+
+Part = Literal["host-front", "dpu-core", "host-back"]
+Device = Literal["host", "DPU", "CPU"]
+
+SCALING = {"Mul", "Div", "Add", "Sub", "Clip", "Cast", "Round", "Floor", "Identity", "Min", "Max"}
+"""What a float file may do to the image before the network and to the result behind it."""
+
+FLOAT_NOTE = "a float file: judged as if its tensors had 8 bits, its final add left to the host"
+
+
+@dataclass(frozen=True)
+class PlacedNode:
+    """A node with its part, its device and, where it should run on the DPU and cannot, the rules it breaks."""
+
+    op: Operation
+    part: Part
+    device: Device
+    broken: tuple[Broken, ...]
+    subgraph: int
+
+
+@dataclass(frozen=True)
+class Cut:
+    """A tensor that crosses between the DPU and a processor, as int8; its size None where its shape is unknown."""
+
+    tensor: str
+    size_bytes: int | None
+    onto_dpu: bool
+
+
+@dataclass(frozen=True)
+class Placement:
+    """The nodes in order; note says what was assumed."""
+
+    nodes: tuple[PlacedNode, ...]
+    cuts: tuple[Cut, ...]
+    note: str
+
+    @property
+    def dpu_subgraphs(self) -> int:
+        """How many pieces the DPU runs, each with its own transfers."""
+        return len({node.subgraph for node in self.nodes if node.device == "DPU"})
+
+    @property
+    def failed(self) -> tuple[PlacedNode, ...]:
+        """The nodes that should run on the DPU and cannot."""
+        return tuple(node for node in self.nodes if node.broken)
+
+    @property
+    def core(self) -> tuple[Operation, ...]:
+        """The operations of the DPU's part."""
+        return tuple(node.op for node in self.nodes if node.part == "dpu-core")
+
+
+def place(network: Network, dpu: Dpu) -> Placement:
+    """Judge every node of a network against the rules of a DPU."""
+    parts = _parts(network)
+    broken = [
+        judge(op, dpu, network.quantised) if part == "dpu-core" else ()
+        for op, part in zip(network.operations, parts, strict=True)
+    ]
+    devices: list[Device] = [
+        "host" if part != "dpu-core" else "CPU" if found else "DPU" for part, found in zip(parts, broken, strict=True)
+    ]
+    subgraphs = _subgraphs(network.operations, devices)
+    rows = zip(network.operations, parts, devices, broken, subgraphs, strict=True)
+    nodes = tuple(PlacedNode(*row) for row in rows)
+    return Placement(nodes, tuple(_cuts(network, nodes)), "" if network.quantised else FLOAT_NOTE)
+
+
+def _parts(network: Network) -> list[Part]:
+    """A node before the first or behind the last convolution is the host's if it is one of the host's kinds."""
+    operations = network.operations
+    behind = _reached(operations, network, forwards=True)
+    before = _reached(operations, network, forwards=False)
+    parts: list[Part] = []
+    finished: set[str] = set()
+    for op in operations:
+        leads, trails = op.output not in behind, op.output not in before
+        if leads and _is_host_front(op, network):
+            parts.append("host-front")
+        elif trails and (_is_host_back(op, network) or finished & set(op.inputs)):
+            parts.append("host-back")
+            finished |= set(op.outputs)
+        else:
+            parts.append("dpu-core")
+    return parts
+
+
+def _reached(operations: tuple[Operation, ...], network: Network, *, forwards: bool) -> set[str]:
+    """The results computed from a convolution's, its own included (forwards), or that one is computed from."""
+    found: set[str] = set()
+    for op in operations if forwards else reversed(operations):
+        ends = op.inputs if forwards else [r.output for name in op.outputs for r in network.consumers(name)]
+        if op.kind in CONVOLUTIONS or found & set(ends):
+            found |= set(op.outputs)
+    return found
+
+
+def _is_host_front(op: Operation, network: Network) -> bool:
+    """In a quantised file whatever leads to the core; in a float file only scaling."""
+    return network.quantised or op.op_type in SCALING
+
+
+def _is_host_back(op: Operation, network: Network) -> bool:
+    """In a quantised file what is float again; in a float file the add of the image, or scaling by constants."""
+    if op.kind in CONVOLUTIONS:
+        return False
+    if network.quantised:
+        return not op.integer and (op.kind == "dequantise" or op.op_type in SCALING)
+    return op.op_type in SCALING and (bool(set(op.inputs) & set(network.inputs)) or len(op.inputs) == 1)
+
+
+def _subgraphs(operations: tuple[Operation, ...], devices: list[Device]) -> list[int]:
+    """Pieces that run in one go: neighbours on one device that no other device's node stands between."""
+    depth: dict[str, tuple[bool, int]] = {}
+    joined = _Groups()
+    result = []
+    for op, device in zip(operations, devices, strict=True):
+        on_dpu = device == "DPU"
+        steps = [d + (was != on_dpu) for was, d in (depth[i] for i in op.inputs if i in depth)]
+        level = (on_dpu, max(steps, default=0))
+        depth |= dict.fromkeys(op.outputs, level)
+        for name in op.inputs:
+            if depth.get(name) == level:
+                joined.join(name, op.output)
+        for name in op.outputs:
+            joined.join(name, op.output)
+        result.append(op.output)
+    numbers: dict[str, int] = {}
+    return [numbers.setdefault(joined.root(name), len(numbers)) for name in result]
+
+
+class _Groups:
+    """Sets that merge: which tensors belong to one piece."""
+
+    def __init__(self) -> None:
+        self._parent: dict[str, str] = {}
+
+    def root(self, name: str) -> str:
+        while self._parent.get(name, name) != name:
+            name = self._parent[name]
+        return name
+
+    def join(self, one: str, other: str) -> None:
+        self._parent[self.root(one)] = self.root(other)
+
+
+def _cuts(network: Network, nodes: Iterable[PlacedNode]) -> Iterable[Cut]:
+    """Tensors written on one side and read on the other, the network's own ends included."""
+    on_dpu = {name: node.device == "DPU" for node in nodes for name in node.op.outputs}
+    readers: dict[str, set[bool]] = {}
+    sizes = {name: shape[0] * shape[1] * shape[2] for name, shape in network.inputs.items()}
+    for node in nodes:
+        for name in node.op.inputs:
+            readers.setdefault(name, set()).add(node.device == "DPU")
+        if node.op.out_shape is not None:
+            sizes |= dict.fromkeys(node.op.outputs, node.op.out_bytes)
+    for name in network.outputs:
+        readers.setdefault(name, set()).add(False)
+    for name, sides in readers.items():
+        written_on_dpu = on_dpu.get(name, False)
+        if (not written_on_dpu) in sides:
+            yield Cut(name, sizes.get(name), onto_dpu=not written_on_dpu)

@@ -1,0 +1,191 @@
+"""How an image is cut into tiles with exact seams, and what that costs: known before the run.
+
+A tile is read with a halo of `halo_px` pixels around what is kept of it; whether a run fits into memory is looked
+at before it begins.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import psutil
+
+from deploy.restoration.source import Raster, Source
+from profiles.errors import MachineError, OptionError, sizes
+
+
+@dataclass(frozen=True)
+class Span:
+    """One side of a tile: what it reads, and the part of it that is kept, in image pixels (end excluded)."""
+
+    start: int
+    stop: int
+    keep_start: int
+    keep_stop: int
+
+
+@dataclass(frozen=True)
+class Tile:
+    """A window of the image and the part that is kept."""
+
+    rows: Span
+    columns: Span
+
+    def read(self, image: np.ndarray) -> np.ndarray:
+        """The window of an (H, W) image."""
+        return image[self.rows.start : self.rows.stop, self.columns.start : self.columns.stop]
+
+    def write(self, result: np.ndarray, image: np.ndarray) -> None:
+        """Put the kept part of a tile's result into an (H, W) image."""
+        rows = slice(self.rows.keep_start - self.rows.start, self.rows.keep_stop - self.rows.start)
+        columns = slice(self.columns.keep_start - self.columns.start, self.columns.keep_stop - self.columns.start)
+        target = (
+            slice(self.rows.keep_start, self.rows.keep_stop),
+            slice(self.columns.keep_start, self.columns.keep_stop),
+        )
+        image[target] = result[rows, columns]
+
+
+def plan_tiles(height_px: int, width_px: int, tile_px: int, halo_px: int) -> list[Tile]:
+    """Tiles in reading order whose kept parts cover the image exactly once.
+
+    An image smaller than a tile is one window of its own size along that side.
+    """
+    rows, columns = plan_side(height_px, tile_px, halo_px), plan_side(width_px, tile_px, halo_px)
+    return [Tile(row, column) for row in rows for column in columns]
+
+
+def plan_side(size_px: int, tile_px: int, halo_px: int) -> list[Span]:
+    """The spans along one side.
+
+    Raises:
+        OptionError: a tile with no room between its two halos.
+    """
+    if tile_px <= 2 * halo_px or halo_px < 0:
+        raise OptionError(
+            "--tile",
+            expected=f"more than twice the halo of {halo_px} px",
+            got=f"{tile_px} px",
+            remedy="take larger tiles or a smaller halo",
+        )
+    return list(_spans(size_px, min(tile_px, size_px), halo_px))
+
+
+def even_side_px(size_px: int, tile_px: int, halo_px: int) -> int:
+    """The shortest side that needs no more tiles than `tile_px` does: what a last tile overlaps is work done twice.
+
+    Raises:
+        OptionError: as `plan_side`.
+    """
+    count = len(plan_side(size_px, tile_px, halo_px))
+    return max(-(-(size_px + 2 * halo_px * (count - 1)) // count), 2 * halo_px + 1)
+
+
+def _spans(size_px: int, tile_px: int, halo_px: int) -> Iterator[Span]:
+    done = 0
+    while done < size_px:
+        start = min(max(done - halo_px, 0), size_px - tile_px)
+        stop = start + tile_px
+        kept = size_px if stop == size_px else stop - halo_px
+        yield Span(start, stop, done, kept)
+        done = kept
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Rows and columns of tiles, none longer than `tile_px`, over an image of `bands` planes."""
+
+    bands: int
+    height_px: int
+    width_px: int
+    tile_px: int
+    halo_px: int
+    radius_px: int
+    rows: tuple[Span, ...]
+    columns: tuple[Span, ...]
+
+    @property
+    def tile_shape(self) -> tuple[int, int]:
+        """Rows and columns of pixels of every tile."""
+        row, column = self.rows[0], self.columns[0]
+        return row.stop - row.start, column.stop - column.start
+
+    @property
+    def tiles(self) -> int:
+        """Windows that the network sees."""
+        return len(self.rows) * len(self.columns) * self.bands
+
+    @property
+    def work_factor(self) -> float:
+        """Pixels that the network sees over pixels of the image."""
+        seen = sum(r.stop - r.start for r in self.rows) * sum(c.stop - c.start for c in self.columns)
+        return seen / (self.height_px * self.width_px)
+
+    @property
+    def band_rows_px(self) -> int:
+        """Most rows that are read at once: a tile's, and those that missing pixels are filled from."""
+        return min(self.tile_shape[0] + 2 * self.radius_px, self.height_px)
+
+
+def make_plan(raster: Raster, tile_px: int, halo_px: int, radius_px: int, fixed: bool = False) -> Plan:
+    """The plan of an image: tiles of at most `tile_px` a side, or of just that where the network is `fixed` to it.
+
+    Raises:
+        OptionError: a tile with no room between its two halos.
+    """
+    sizes = raster.height_px, raster.width_px
+    sides = [tile_px if fixed else even_side_px(size, tile_px, halo_px) for size in sizes]
+    rows, columns = (tuple(plan_side(size, side, halo_px)) for size, side in zip(sizes, sides, strict=True))
+    return Plan(*raster.shape, tile_px, halo_px, radius_px, rows, columns)
+
+
+def rows_bytes(source: Source, plan: Plan, begun: bool = False) -> int:
+    """Memory that rows of the image will take beyond what is held now.
+
+    Three bands as read and three as restored: two in work and one on its way, on either side; and what the source
+    holds. Once the run has `begun`, the first band and the source's share are there already. Where pixels may be
+    missing, each has a flag, and one more while flags are made.
+    """
+    raster = source.raster
+    row_px = raster.bands * raster.width_px
+    read = plan.band_rows_px * row_px * (raster.dtype.itemsize + raster.may_miss)
+    flags = plan.band_rows_px * row_px * raster.may_miss
+    held = 0 if begun else read + source.held_bytes(plan.band_rows_px)
+    return 2 * read + flags + 3 * restored_bytes(source, plan) + held
+
+
+def restored_bytes(source: Source, plan: Plan) -> int:
+    """Memory of one row of tiles as it is stored."""
+    raster = source.raster
+    return plan.tile_shape[0] * raster.bands * raster.width_px * raster.out_dtype.itemsize
+
+
+def check_memory(rows: int, budget_bytes: int | None, bulky: bool, share: int = 1) -> int:
+    """The process's peak memory in bytes: what it holds now, and the rows to come.
+
+    Args:
+        rows: bytes that rows of the image will take.
+        budget_bytes: None allows what is free.
+        bulky: most of them for the sake of an image in large strips.
+        share: how many processes share the budget.
+
+    Raises:
+        MachineError: it does not fit.
+    """
+    held = psutil.Process().memory_info().rss
+    allowed = budget_bytes // share if budget_bytes else psutil.virtual_memory().available // share + held
+    if held + rows <= allowed:
+        return held + rows
+    limit, before, rows_size = sizes(allowed, held, rows)
+    remedy = "rewrite the image in tiles (gdal_translate -co TILED=YES)" if bulky else "take a smaller --tile"
+    raise MachineError(
+        "--memory" + (f", one of {share} processes" if share > 1 else ""),
+        expected=f"a run within {limit}",
+        got=f"{before} before and {rows_size} for rows of the image",
+        remedy=f"{remedy} or give it more" if held < allowed else f"give it more than {before}",
+    )
+
+
+def is_bulky(source: Source, plan: Plan) -> bool:
+    """Whether most of the memory is for the image's own strips or tiles."""
+    return source.held_bytes(1) > rows_bytes(source, plan) / 2

@@ -1,0 +1,183 @@
+"""What runs a network: onnxruntime by default, OpenVINO as an option, with the same int8 numbers."""
+
+import hashlib
+import os
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import lru_cache, partial
+from importlib import import_module
+from importlib.metadata import version
+from threading import Lock, get_ident
+from typing import Any, Literal
+
+import numpy as np
+import onnx
+import onnxruntime as ort
+from onnx import helper, numpy_helper
+
+from deploy.restoration.arrays import Infer
+from deploy.restoration.options import Runtime
+from model.processor import asked, require_cores
+from profiles.errors import MachineError, ModelError
+from quant.kernels import is_integer, made_exact
+from quant.onnx_file import parse_onnx
+from quant.session import open_session, run
+
+LOWEST = "openvino.lowest_uint8"
+
+
+Precision = Literal["f32", "bf16"]
+
+
+def open_openvino(
+    model: onnx.ModelProto, threads: int, precision: Precision = "f32", at_once: int = 1
+) -> tuple[Callable[[np.ndarray], np.ndarray], str]:
+    """A callable (1, 1, h, w) float32 -> (1, 1, h, w) for `at_once` callers, and the runtime's name and version.
+
+    Raises:
+        MachineError: OpenVINO is not installed, or this processor does not compute in that precision.
+        ModelError: OpenVINO refuses the model.
+    """
+    core = _core()
+    if precision == "bf16" and "BF16" not in core.get_property("CPU", "OPTIMIZATION_CAPABILITIES"):
+        remedy = "run it on a processor that has them"
+        raise MachineError("bfloat16", expected="a processor with bfloat16 units", got="none", remedy=remedy)
+    # Said aloud: where the processor has bfloat16 units, OpenVINO would round to it unasked.
+    options = {"INFERENCE_PRECISION_HINT": precision, "NUM_STREAMS": str(at_once), "ENABLE_CPU_PINNING": False}
+    options |= {"INFERENCE_NUM_THREADS": str(threads)} if threads else {}
+    content = saturating_adds(_exact(model, core)).SerializeToString()
+
+    @lru_cache(maxsize=2)
+    def compiled(shape: tuple[int, ...]) -> Any:
+        try:
+            network = core.read_model(content)
+            network.reshape(list(shape))
+            return core.compile_model(network, "CPU", options)
+        except RuntimeError as error:
+            got, remedy = " ".join(str(error).split())[:160], "use --runtime onnxruntime"
+            raise ModelError("ONNX model", expected="one that OpenVINO runs", got=got, remedy=remedy) from error
+
+    compiling = Lock()
+
+    @lru_cache(maxsize=64)
+    def request(shape: tuple[int, ...], _thread: int) -> Any:
+        with compiling:  # or each thread would compile its own at the first tile
+            return compiled(shape).create_infer_request()  # one serves no two threads at once
+
+    def infer(image: np.ndarray) -> np.ndarray:
+        return np.asarray(request(image.shape, get_ident()).infer([image], share_inputs=True)[0])
+
+    return infer, f"openvino {version('openvino')}"
+
+
+def _exact(model: onnx.ModelProto, core: Any) -> onnx.ModelProto:
+    """The model as this processor's kernels add it exactly."""
+    return model if not is_integer(model) or _adds_exactly(core) else made_exact(model)[0]
+
+
+@lru_cache(maxsize=1)
+def _adds_exactly(core: Any) -> bool:
+    def convolve(model: bytes, image: np.ndarray) -> np.ndarray:
+        return np.asarray(core.compile_model(core.read_model(model), "CPU").create_infer_request().infer([image])[0])
+
+    return asked("openvino", convolve)
+
+
+def _core() -> Any:  # openvino.Core, an optional package
+    try:
+        return import_module("openvino").Core()
+    except ImportError as error:
+        got, remedy = "no package openvino", "pip install 'beers-deploy[openvino]'"
+        raise MachineError("--runtime", expected="OpenVINO installed", got=got, remedy=remedy) from error
+
+
+def saturating_adds(model: onnx.ModelProto) -> onnx.ModelProto:
+    """The model with every QLinearAdd spelt as dequantise, add, quantise.
+
+    OpenVINO's own QLinearAdd wraps around where it should saturate (256 becomes 0). Spelt out it saturates, but a
+    convolution before it is fused with it, and the rounding between the two is lost; taking the larger of the value
+    and 0, which changes no uint8, keeps them apart. Measured: equal to onnxruntime bit for bit.
+    """
+    spelt = onnx.ModelProto()
+    spelt.CopyFrom(model)
+    spelt.graph.initializer.append(numpy_helper.from_array(np.array(0, np.uint8), LOWEST))
+    del spelt.graph.node[:]
+    for node in model.graph.node:
+        spelt.graph.node.extend(_spelt_out(node) if node.op_type == "QLinearAdd" else [node])
+    return spelt
+
+
+def _spelt_out(add: onnx.NodeProto) -> list[onnx.NodeProto]:
+    (a, *a_scale), (b, *b_scale), scale = add.input[0:3], add.input[3:6], add.input[6:8]
+    name = add.output[0]
+    return [
+        helper.make_node("Max", [a, LOWEST], [f"{name}.a"]),
+        helper.make_node("Max", [b, LOWEST], [f"{name}.b"]),
+        helper.make_node("DequantizeLinear", [f"{name}.a", *a_scale], [f"{name}.a_real"]),
+        helper.make_node("DequantizeLinear", [f"{name}.b", *b_scale], [f"{name}.b_real"]),
+        helper.make_node("Add", [f"{name}.a_real", f"{name}.b_real"], [f"{name}.sum"]),
+        helper.make_node("QuantizeLinear", [f"{name}.sum", *scale], [name]),
+    ]
+
+
+AT_ONCE = 4
+"""Most tiles in work at a time. Each needs the memory of a network's maps, and some 4 % are gained by it."""
+
+
+def tiles_at_once(threads: int, tiles: int) -> int:
+    """How many tiles are best restored at a time; 0 threads takes every core."""
+    cores = threads or os.cpu_count() or 1
+    return max(count for count in range(1, AT_ONCE + 1) if cores % count == 0 and count <= max(tiles, 1))
+
+
+def open_runtime(runtime: Runtime, model: onnx.ModelProto, threads: int, at_once: int = 1) -> tuple[Infer, str]:
+    """A network ready to run, and the runtime's name and version.
+
+    Args:
+        runtime: which.
+        model: the network.
+        threads: in all; 0 takes every core.
+        at_once: how many callers share the threads.
+
+    Raises:
+        MachineError: the runtime is not installed.
+        ModelError: it refuses the model.
+        OptionError: more threads than cores.
+    """
+    require_cores("--threads", threads)
+    if runtime is Runtime.openvino:
+        return open_openvino(model, threads, at_once=at_once)
+    return partial(run, open_session(model, session_threads(threads, at_once))), f"onnxruntime {ort.__version__}"
+
+
+def session_threads(threads: int, at_once: int) -> int:
+    """What to ask onnxruntime for: its n are n - 1 of its own, which all callers share, and each caller."""
+    return (threads or os.cpu_count() or 1) - at_once + 1 if at_once > 1 else threads
+
+
+@dataclass(frozen=True)
+class Packed:
+    """A network on its way to another process: an ONNX file's bytes, their digest, and how it is to be run."""
+
+    content: bytes
+    digest: str
+    runtime: Runtime
+    threads: int
+
+
+def pack(model: onnx.ModelProto, runtime: Runtime, threads: int) -> Packed:
+    """A network made ready to be sent."""
+    content = model.SerializeToString()
+    return Packed(content, hashlib.sha256(content).hexdigest(), runtime, threads)
+
+
+def open_packed(packed: Packed) -> tuple[Infer, str]:
+    """As `open_runtime`, where it arrived.
+
+    Raises:
+        ModelError: not as it was sent.
+    """
+    if hashlib.sha256(packed.content).hexdigest() != packed.digest:
+        got, remedy = "others", "check the connection between the machines"
+        raise ModelError("network", expected=f"bytes of digest {packed.digest[:12]}", got=got, remedy=remedy)
+    return open_runtime(packed.runtime, parse_onnx(packed.content, "network"), packed.threads)

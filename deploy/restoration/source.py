@@ -1,0 +1,285 @@
+"""An image file as bands of rows: what is known before its pixels are read, and only what is touched is decoded.
+
+Size, type, nodata value and the tags that place it on Earth come first. Missing pixels are filled from what lies
+near before a network sees them, without any arithmetic.
+"""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+import tifffile
+
+from model.io.images import TIFF_SUFFIXES, damage_in_a_sentence, read_pixels, require_image_file
+from model.io.tiff import check_page, open_tiff
+from profiles.errors import ImageError
+
+NODATA_TAG = 42113
+CARRIED_TAGS = (33550, 33922, 34264, 34735, 34736, 34737, 42112, NODATA_TAG, 50844)
+"""GeoTIFF's scale, tie points, transformation and keys; GDAL's metadata and nodata; rational polynomials."""
+
+SIDE_PX, BANDS = 1 << 22, 1 << 12
+"""An image has a plan of its tiles before any pixel is read: a header alone must not make that large."""
+
+Tag = tuple[int, int, int, Any, bool]
+"""Code, type, count, value, once: what tifffile takes as an extra tag."""
+
+
+@dataclass(frozen=True)
+class Raster:
+    """An image as stored: `bands` planes of (height_px, width_px)."""
+
+    bands: int
+    height_px: int
+    width_px: int
+    dtype: np.dtype[Any]
+    nodata: float | None = None
+    tags: tuple[Tag, ...] = ()
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """(bands, height, width)."""
+        return self.bands, self.height_px, self.width_px
+
+    @property
+    def out_dtype(self) -> np.dtype[Any]:
+        """Of the restored image: uint16 of integers, float32 of floats."""
+        return np.dtype(np.float32 if self.dtype.kind == "f" else np.uint16)
+
+    def missing(self, pixels: np.ndarray) -> np.ndarray:
+        """Where stored pixels hold no measurement: NaN or the nodata value; bool of the same shape."""
+        flags = np.isnan(pixels) if self.dtype.kind == "f" else np.zeros(pixels.shape, bool)
+        if self.nodata is not None:
+            flags |= pixels == pixels.dtype.type(self.nodata)
+        return flags
+
+    def largest(self, pixels: np.ndarray) -> float:
+        """The largest size of a known pixel among these, 0 where none is known."""
+        known = ~self.missing(pixels)
+        low, high = (float(extreme(pixels, where=known, initial=0)) for extreme in (np.min, np.max))
+        return max(-low, high)
+
+    @property
+    def may_miss(self) -> bool:
+        """Whether any pixel could be missing at all."""
+        return self.dtype.kind == "f" or self.nodata is not None
+
+
+def page_raster(path: str, page: tifffile.TiffPage) -> Raster:
+    """The raster of a TIFF page.
+
+    Raises:
+        ImageError: too large to be planned, pixels that are no real numbers, or a nodata value that the output could
+            not hold.
+    """
+    planes, _, height_px, width_px, samples = page.shaped
+    if max(height_px, width_px) > SIDE_PX or planes * samples > BANDS:
+        got = f"{planes * samples} bands of {width_px} x {height_px} pixels"
+        expected = f"at most {BANDS} bands of {SIDE_PX} pixels a side"
+        raise ImageError(path, expected=expected, got=got, remedy="cut it into pieces")
+    dtype = require_numbers(path, page.dtype)
+    tags = [page.tags[code] for code in CARRIED_TAGS if code in page.tags]
+    nodata = _nodata(path, page, dtype)
+    carried = [t for t in tags if t.code != NODATA_TAG or nodata is not None]
+    return Raster(
+        planes * samples,
+        height_px,
+        width_px,
+        dtype,
+        nodata,
+        tuple((t.code, int(t.dtype), t.count, t.value, True) for t in carried),
+    )
+
+
+def require_numbers(path: str, dtype: np.dtype[Any] | None) -> np.dtype[Any]:
+    """The type of the pixels, unless they are complex or packed bits.
+
+    Raises:
+        ImageError: pixels that are neither integers nor floats.
+    """
+    if dtype is None or dtype.kind not in "uif":
+        got = str(dtype or "packed bits")
+        raise ImageError(path, expected="integer or float pixels", got=got, remedy="convert it to uint16")
+    return dtype
+
+
+def _nodata(path: str, page: tifffile.TiffPage, dtype: np.dtype[Any]) -> float | None:
+    """The nodata value of a page; None without one that can be read."""
+    if NODATA_TAG not in page.tags:
+        return None
+    try:
+        value = float(str(page.tags[NODATA_TAG].value).strip("\x00 "))
+    except ValueError:
+        return None
+    return usable_nodata(path, value, dtype)
+
+
+def usable_nodata(path: str, value: float | None, dtype: np.dtype[Any]) -> float | None:
+    """A nodata value; None for one that no pixel of this type can have.
+
+    Raises:
+        ImageError: the output could not hold it.
+    """
+    if value is None or dtype.kind == "f":
+        return value
+    limits = np.iinfo(dtype)
+    if not value.is_integer() or not limits.min <= value <= limits.max:
+        return None
+    if not 0 <= value <= np.iinfo(np.uint16).max:
+        remedy = "give its missing pixels a value of 0 to 65535"
+        raise ImageError(path, expected="a nodata value that uint16 holds", got=f"{value:g}", remedy=remedy)
+    return value
+
+
+BIG_TIFF_SUFFIXES = {".btf", ".tf8"}
+
+
+class Source(Protocol):
+    """An image that gives rows."""
+
+    raster: Raster
+
+    def read(self, start: int, stop: int) -> np.ndarray:
+        """Rows `start` to `stop` (excluded) of every band, (bands, rows, width), as stored."""
+
+    def held_bytes(self, rows_px: int) -> int:
+        """Memory that reading so many rows at a time takes, besides the rows themselves."""
+
+
+@contextmanager
+def open_source(path: Path) -> Iterator[Source]:
+    """Open an image for reading by rows: a TIFF page as a stream, anything else whole.
+
+    Raises:
+        ImageError: no such file, or no image of numbers.
+        MachineError: an unknown compression, or an image read whole that does not fit in memory.
+    """
+    require_image_file(path)
+    if path.suffix.lower() not in TIFF_SUFFIXES | BIG_TIFF_SUFFIXES:
+        yield whole_source(path)
+        return
+    with damage_in_a_sentence(path):
+        file = open_tiff(path)
+    with file:
+        with damage_in_a_sentence(path):
+            series = file.series[0]
+            page = series.keyframe
+            one_page = page.shaped[1] == 1 and page.size == series.size
+            check_page(path, page)
+            source = TiffSource(path, page) if one_page else whole_source(path)
+        yield source
+
+
+def whole_source(path: Path) -> "ArraySource":
+    """An image read whole: PNG, JPEG, and TIFFs of several pages."""
+    pixels = read_pixels(path)
+    dtype = require_numbers(str(path), pixels.dtype)
+    bands = pixels[None] if pixels.ndim == 2 else np.moveaxis(pixels, 2, 0)
+    count, height_px, width_px = bands.shape
+    return ArraySource(bands, Raster(count, height_px, width_px, dtype))
+
+
+class ArraySource:
+    """An image in memory, (bands, height, width)."""
+
+    def __init__(self, pixels: np.ndarray, raster: Raster) -> None:
+        self._pixels, self.raster = pixels, raster
+
+    def read(self, start: int, stop: int) -> np.ndarray:
+        """See Source."""
+        return self._pixels[:, start:stop]
+
+    def held_bytes(self, rows_px: int) -> int:  # noqa: ARG002
+        """Nothing more than it holds from the start."""
+        return 0
+
+
+class TiffSource:
+    """One page of a TIFF, plain or BigTIFF, in strips or tiles, samples interleaved or in planes."""
+
+    def __init__(self, path: Path, page: tifffile.TiffPage) -> None:
+        self._path, self._page = path, page
+        self.raster = page_raster(str(path), page)
+        self._planes, _, height_px, width_px, self._samples = page.shaped
+        self._segment_px = min(page.tilelength if page.is_tiled else page.rowsperstrip, height_px)
+        self._down = -(-height_px // self._segment_px)
+        self._across = -(-width_px // page.tilewidth) if page.is_tiled else 1
+        self._held: dict[int, np.ndarray] = {}
+        self._flat = page.compression == 1 and page.is_contiguous and page.bitspersample in (8, 16, 32, 64)
+
+    def read(self, start: int, stop: int) -> np.ndarray:
+        """See Source."""
+        with damage_in_a_sentence(self._path, f"rows {start} to {stop - 1}"):
+            return self._read_flat(start, stop) if self._flat else self._read_segments(start, stop)
+
+    def held_bytes(self, rows_px: int) -> int:
+        """Whole segments around the rows, and one row of segments, packed and decoded, while it is read."""
+        if self._flat:
+            return 0
+        covered = min(rows_px + 2 * self._segment_px, self._down * self._segment_px)
+        row_bytes = self.raster.bands * self.raster.width_px * self.raster.dtype.itemsize
+        return (covered + 2 * self._segment_px) * row_bytes
+
+    def _read_flat(self, start: int, stop: int) -> np.ndarray:
+        width, samples, rows = self.raster.width_px, self._samples, stop - start
+        kind = self.raster.dtype.newbyteorder(self._page.parent.byteorder)
+        out = np.empty((self._planes, samples, rows, width), self.raster.dtype)
+        for plane in range(self._planes):
+            first = (plane * self.raster.height_px + start) * width * samples
+            offset = self._page.dataoffsets[0] + first * kind.itemsize
+            pixels = np.fromfile(self._path, kind, rows * width * samples, offset=offset)
+            out[plane] = np.moveaxis(pixels.reshape(rows, width, samples), 2, 0)
+        return out.reshape(self.raster.bands, rows, width)
+
+    def _read_segments(self, start: int, stop: int) -> np.ndarray:
+        size = self._segment_px
+        first, last = start // size, -(-stop // size)
+        self._held = {row: pixels for row, pixels in self._held.items() if first <= row < last}
+        out = np.empty((self.raster.bands, stop - start, self.raster.width_px), self.raster.dtype)
+        for row in range(first, last):
+            pixels = self._held[row] if row in self._held else self._decode(row)
+            self._held[row] = pixels
+            top = row * size
+            low, high = max(start, top), min(stop, top + size)
+            out[:, low - start : high - start] = pixels[:, low - top : high - top]
+        return out
+
+    def _decode(self, row: int) -> np.ndarray:
+        """The strips or tiles at one height, (bands, segment rows, width)."""
+        page, raster = self._page, self.raster
+        block = np.empty((self._planes, self._samples, self._segment_px, raster.width_px), raster.dtype)
+        wanted = [(p * self._down + row) * self._across + c for p in range(self._planes) for c in range(self._across)]
+        offsets, counts = [page.dataoffsets[i] for i in wanted], [page.databytecounts[i] for i in wanted]
+        jpeg = {"jpegtables": page.jpegtables, "jpegheader": page.jpegheader}
+        for data, index in page.parent.filehandle.read_segments(offsets, counts, wanted):
+            pixels, (plane, _, _, left, _), (_, rows, columns, _) = page.decode(data, index, **jpeg)
+            rows, columns = min(rows, self._segment_px), min(columns, raster.width_px - left)
+            target = block[plane, :, :rows, left : left + columns]
+            target[:] = page.nodata if pixels is None else np.moveaxis(pixels[0, :rows, :columns], 2, 0)
+        return block.reshape(raster.bands, self._segment_px, raster.width_px)
+
+
+def fill_missing(pixels: np.ndarray, missing: np.ndarray, reach_px: int) -> np.ndarray:
+    """(h, w) pixels where each `missing` one is a copy of a known one at most `reach_px` rows and columns away.
+
+    The nearest known pixel of the row, then the nearest filled one of the column; 0 where there is none in reach. So
+    a filled pixel depends on nothing farther away, and a window gives just what the whole image gives.
+    """
+    filled, missing = _along_rows(pixels, missing, reach_px)
+    filled, missing = _along_rows(filled.T, missing.T, reach_px)
+    return np.asarray(np.where(missing, 0, filled).T)
+
+
+def _along_rows(pixels: np.ndarray, missing: np.ndarray, reach_px: int) -> tuple[np.ndarray, np.ndarray]:
+    """Filled pixels, and where none was in reach; of two at the same distance the left one is taken."""
+    width = pixels.shape[1]
+    far = width + reach_px + 1
+    here = np.arange(width)
+    left = np.maximum.accumulate(np.where(missing, -far, here), axis=1)
+    right = np.minimum.accumulate(np.where(missing, 2 * far, here)[:, ::-1], axis=1)[:, ::-1]
+    nearest = np.where(here - left <= right - here, left, right)
+    out_of_reach = np.abs(nearest - here) > reach_px
+    return np.take_along_axis(pixels, np.where(out_of_reach, here, nearest), axis=1), out_of_reach

@@ -1,0 +1,153 @@
+"""The traditional chain on an image file of any size: what `restore --method traditional` does.
+
+Rows come and go in strips, so that memory grows with the width alone. What the chain does is known of the sensor: its
+MTF, noise and gain. The reference it imitates is seen with the sensor's own gain and bits, so that the output has the
+scale of the input.
+"""
+
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from deploy.bench.host import peak_memory
+from deploy.progress import steps
+from deploy.restoration.engine import as_stored, checked_band
+from deploy.restoration.options import Compression, fingerprint
+from deploy.restoration.output import Spool, only_run, part_folder, require_codec, require_tiff_name, write_output
+from deploy.restoration.plan import Span, check_memory
+from deploy.restoration.source import Raster, Source, open_source
+from model.io.files import require_writable
+from model.io.images import settled_scale
+from model.traditional.pipeline import Chain, restore_strips
+from profiles.errors import ImageError
+from profiles.figures import Row, measured
+from profiles.sensor import SensorProfile
+
+STRIP_PX = 128
+"""Rows read at a time."""
+
+FIXED_BYTES, BYTES_PER_COLUMN = 100_000_000, 40_000
+"""Of memory that the chain takes, and more for each pixel of a row: some 700 rows, in several float32 copies.
+Measured at 400 and 1200 columns: 75 MB and 30 kB."""
+
+
+@dataclass(frozen=True)
+class Request:
+    """What a user can choose.
+
+    Attributes:
+        sensor: the one that acquired the image, of which the middle of every range is taken.
+        reference: the one to imitate.
+        full_scale: the pixel value that is the sensor's highest digital number; None lets type and values decide.
+        compression: of the output.
+        memory_bytes: budget of the process; None is what is free.
+    """
+
+    sensor: SensorProfile
+    reference: SensorProfile
+    full_scale: float | None = None
+    compression: Compression = Compression.zlib
+    memory_bytes: int | None = None
+
+    def chain(self) -> Chain:
+        """The chain from the sensor to the reference, both in the sensor's digital numbers."""
+        return Chain(self.sensor.nominal(), self.reference.in_units_of(self.sensor).nominal())
+
+
+def restore_file_traditionally(image: Path, out: Path, request: Request) -> Row:
+    """Restore the mono image `image` into the TIFF `out`, and return the run's figures.
+
+    Raises:
+        ImageError: no such image, damaged, of several bands, all missing, of a scale left open, or values outside 0
+            to full scale; nothing is left behind.
+        OptionError: a full scale that such pixels cannot have.
+        MachineError: another run on `out`; memory or disk.
+        KeyboardInterrupt: stopped; nothing is left behind.
+    """
+    require_writable(out, inputs=(image,))
+    require_tiff_name(out)
+    require_codec(request.compression)
+    with only_run(out, part_folder(out)):
+        return _restore(image, out, request)
+
+
+def _restore(image: Path, out: Path, request: Request) -> Row:
+    started, chain = time.perf_counter(), request.chain()
+    with open_source(image) as source:
+        raster = source.raster
+        _require_one_band(raster, image)
+        needed = FIXED_BYTES + BYTES_PER_COLUMN * raster.width_px + source.held_bytes(STRIP_PX)
+        check_memory(needed, request.memory_bytes, bulky=False)
+        largest = (raster.largest(source.read(*rows)) for rows in _strips(raster.height_px))
+        max_dn = chain.degraded.max_dn
+        full_scale = settled_scale(str(image), raster.dtype, largest, request.full_scale, max_dn)
+        job = {"image": list(fingerprint(image)), "method": "traditional"}
+        spool = Spool(out, raster.shape, raster.out_dtype, job, resume=False)
+        try:
+            _fill(spool, source, chain, full_scale, str(image))
+            write_output(spool, raster, request.compression)
+        except BaseException:  # a strip is no place to go on from: the chain looks hundreds of rows back
+            spool.remove()
+            raise
+    return _row(image.name, raster, time.perf_counter() - started, request, full_scale)
+
+
+def _fill(spool: Spool, source: Source, chain: Chain, full_scale: float, name: str) -> None:
+    """Restore every row.
+
+    Raises:
+        ImageError: no pixel of the image is known, or one is outside 0 to full scale.
+    """
+    raster, to_dn, top = source.raster, chain.degraded.max_dn / full_scale, 0
+    with steps("restoring rows", raster.height_px) as bar:
+        for strip in restore_strips(_read(source, to_dn, full_scale, name), raster.height_px, chain):
+            stop = top + strip.shape[0]
+            missing = torch.isnan(strip).numpy()[None]
+            kept = as_stored(raster, np.nan_to_num(strip.numpy()[None] / np.float32(to_dn)), full_scale)
+            if missing.any():
+                kept = np.where(missing, source.read(top, stop).astype(raster.out_dtype), kept)
+            spool.append(Span(top, stop, top, stop), kept, int((~missing).sum()))
+            bar.advance(stop - top)
+            top = stop
+    if not spool.known:
+        got, remedy = "NaN or nodata everywhere", "check that it is the right file"
+        raise ImageError(name, expected="some pixels with values", got=got, remedy=remedy)
+
+
+def _read(source: Source, to_dn: float, full_scale: float, name: str) -> Iterator[Tensor]:
+    """Strips (rows, width) float32 of digital numbers, NaN where they are missing."""
+    for start, stop in _strips(source.raster.height_px):
+        band = checked_band(source.raster, start, source.read(start, stop), full_scale, name)
+        dn = band.pixels[0].astype(np.float32) * np.float32(to_dn)
+        if band.missing is not None:
+            dn[band.missing[0]] = np.nan
+        yield torch.from_numpy(dn)
+
+
+def _strips(height_px: int) -> Iterator[tuple[int, int]]:
+    """First row and the one behind the last of each strip."""
+    for start in range(0, height_px, STRIP_PX):
+        yield start, min(start + STRIP_PX, height_px)
+
+
+def _require_one_band(raster: Raster, image: Path) -> None:
+    if raster.bands > 1:
+        remedy = "extract the band that the profile describes"
+        raise ImageError(str(image), expected="one band", got=f"{raster.bands} bands", remedy=remedy)
+
+
+def _row(name: str, raster: Raster, time_s: float, request: Request, full_scale: float) -> Row:
+    source = f"from opening the image to the finished file, {torch.get_num_threads()} threads"
+    pixels = raster.height_px * raster.width_px
+    figures = {
+        "time": measured(time_s, "s", source),
+        "throughput": measured(pixels / time_s / 1e6, "Mpx/s", source),
+        "peak memory": peak_memory(),
+    }
+    text = {"method": "traditional", "sensor": request.sensor.name, "full scale": f"{full_scale:g}"}
+    return Row("restore", name, figures, text)

@@ -1,0 +1,200 @@
+"""Rows of tiles restored by the workers of a cluster: the same plan, the same bytes as here.
+
+Image and network stay open between rows, in each process.
+"""
+
+import os
+import uuid
+import weakref
+from collections.abc import Callable, Generator, Iterator, Sequence
+from contextlib import ExitStack, closing, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from threading import Lock
+
+import numpy as np
+import onnx
+
+from deploy.bench.host import peak_memory
+from deploy.cluster import PIECES_PER_SLOT, here, open_cluster, slots_here, unreachable
+from deploy.restoration.engine import Restored, Restorer, Say, Tick, filling, restore_row, rows_left, write_behind
+from deploy.restoration.options import Options, fingerprint
+from deploy.restoration.output import Spool
+from deploy.restoration.plan import Plan, Span, check_memory, is_bulky, restored_bytes, rows_bytes
+from deploy.restoration.runtime import Packed, open_packed, pack
+from deploy.restoration.source import Source, open_source
+from profiles.errors import MachineError
+
+JOBS_KEPT = 2
+"""That a process keeps open: runs may share a cluster, and one that was killed closes nothing."""
+
+
+@dataclass(frozen=True)
+class Work:
+    """What workers are to do in one run.
+
+    Attributes:
+        key: tells this run from others on the same cluster.
+        image: its path, the same for all workers.
+        seen: the image's fingerprint, to know another file of that name.
+        network: to be opened.
+        runtime: name and version of what runs it where the run began; another might give other bytes.
+        full_scale: the pixel value that is 1.0 to the network, settled where the run began.
+    """
+
+    key: str
+    image: Path
+    seen: tuple[int, str]
+    plan: Plan
+    options: Options
+    network: Packed
+    runtime: str
+    full_scale: float
+
+
+@dataclass(frozen=True)
+class Piece:
+    """A restored row of tiles, (bands, rows, width), and the most memory that its worker will take and took."""
+
+    pixels: np.ndarray
+    known: int
+    most_bytes: int
+    peak_gb: float | None
+
+
+class StoppedError(Exception):
+    """The run is over: nobody waits for this row."""
+
+
+class Opened:
+    """An image and a network ready for rows."""
+
+    def __init__(self, work: Work) -> None:
+        self.work, self.reading, self.stopped, self.most_bytes = work, Lock(), False, 0
+        stack = ExitStack()
+        weakref.finalize(self, stack.close)  # when the last row that needs it is done
+        self.source = stack.enter_context(_reachable(work))
+        self._check_memory(begun=False)
+        infer, runtime = open_packed(work.network)
+        if runtime != work.runtime:
+            raise MachineError(here(), expected=work.runtime, got=runtime, remedy="install the same everywhere")
+        scale, radius_px = work.full_scale, work.plan.radius_px
+        self.restorer = Restorer(self.source.raster, infer, scale, radius_px, str(work.image))
+
+    def restore(self, row: Span) -> Piece:
+        """Restore one row of tiles."""
+        with self.reading:
+            band = self.restorer.read(self.source, row.start, row.stop)
+        pixels, known = restore_row(band, row, self.work.plan, self.restorer, self._tick)
+        if not self.most_bytes:
+            self.most_bytes = self._check_memory(begun=True)
+        return Piece(pixels, known, self.most_bytes, peak_memory().value)
+
+    def _tick(self) -> None:
+        if self.stopped:
+            raise StoppedError
+
+    def _check_memory(self, begun: bool) -> int:
+        source, plan, options = self.source, self.work.plan, self.work.options
+        rows = slots_here() * rows_bytes(source, plan, begun)
+        return check_memory(rows, options.memory_bytes, is_bulky(source, plan), options.workers + 1)
+
+
+_opened: dict[str, Opened] = {}
+_opening = Lock()
+
+
+def restore_piece(work: Work, row: Span) -> Piece:
+    """One row of tiles.
+
+    Raises:
+        ImageError: the image cannot be read here, is another one, or has values outside 0 to full scale.
+        MachineError: memory, or another runtime than where the run began.
+        ModelError: the network did not arrive as it was sent.
+    """
+    with _opening:
+        if work.key not in _opened:
+            while len(_opened) >= JOBS_KEPT:
+                del _opened[next(iter(_opened))]
+            _opened[work.key] = Opened(work)
+        opened = _opened[work.key]
+    return opened.restore(row)
+
+
+def forget(key: str) -> None:
+    """Close what a run left open; a row still in work ends at its next tile."""
+    with _opening:
+        opened = _opened.pop(key, None)
+    if opened is not None:
+        opened.stopped = True
+
+
+@contextmanager
+def _reachable(work: Work) -> Iterator[Source]:
+    """The image, if it is the one that the run began with."""
+    try:
+        seen = fingerprint(work.image)
+    except OSError as error:
+        raise unreachable(work.image, error.strerror or str(error)) from error
+    if seen != work.seen:
+        raise unreachable(work.image, "another file of that name")
+    with open_source(work.image) as source:
+        yield source
+
+
+ROWS_HERE = 2
+"""One being written, one on its way to be."""
+
+
+def make_work(
+    image: Path, plan: Plan, network: onnx.ModelProto, runtime: str, options: Options, full_scale: float
+) -> Work:
+    """What the workers of one run are to do.
+
+    Those of this machine share its cores; elsewhere a slot is taken to be worth one.
+    """
+    share = (os.cpu_count() or 1) // options.workers if options.workers else 1
+    packed = pack(network, options.runtime, options.threads or max(share, 1))
+    return Work(uuid.uuid4().hex, image.absolute(), fingerprint(image), plan, options, packed, runtime, full_scale)
+
+
+def fill_spread(spool: Spool, source: Source, work: Work, say: Say) -> float | None:
+    """Finish the spool's rows by workers; returns the peak memory of the largest one in GB.
+
+    Raises:
+        ImageError: as here, or an image that a worker cannot read; the rows are thrown away.
+        MachineError: memory, disk, Dask or its workers; finished rows stay.
+        KeyboardInterrupt: stopped; finished rows stay.
+    """
+    peaks_gb: list[float] = []
+
+    def told(piece: Piece) -> None:
+        if not peaks_gb:
+            most = f"{piece.most_bytes / 1e9:.2f} GB at most in each worker"
+            say(f"memory: {most} (measured on a first row, and the rows to come)")
+        peaks_gb.append(piece.peak_gb or 0)
+
+    with filling(spool, work.plan, str(work.image), say) as tick:
+        if rows := rows_left(spool, work.plan):
+            with closing(spread_rows(work, source, rows, tick, told)) as restored:
+                write_behind(restored, spool.append)
+    return max(peaks_gb, default=0) or None
+
+
+def spread_rows(
+    work: Work, source: Source, rows: Sequence[Span], tick: Tick, told: Callable[[Piece], None]
+) -> Generator[Restored, None, None]:
+    """Restore rows of tiles in order, several under way at a time; `told` is handed each before it is yielded."""
+    options, plan = work.options, work.plan
+    with open_cluster(options.workers, options.scheduler) as workers:
+        waiting = (PIECES_PER_SLOT * workers.slots + ROWS_HERE) * restored_bytes(source, plan)
+        check_memory(waiting, options.memory_bytes, bulky=False, share=options.workers + 1)
+        pieces = workers.in_order(restore_piece, workers.share(work), rows, lambda: tick(0))
+        try:
+            with closing(pieces):
+                for row, piece in zip(rows, pieces, strict=True):
+                    told(piece)
+                    yield row, piece.pixels, piece.known
+                    tick(len(plan.columns) * plan.bands)
+        finally:
+            workers.everywhere(forget, work.key)

@@ -1,0 +1,331 @@
+"""Every method of a study, ready to run: shipped networks, the user's, INT8 files made here, chains, peers.
+
+INT8 files that a study lacks are made on patches of the sensor that the float network was trained for.
+"""
+
+import math
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from functools import cache, cached_property, partial
+from importlib.metadata import version
+from pathlib import Path
+
+import numpy as np
+import onnx
+
+from deploy.defaults import float_model, is_quantised, load_scenes
+from deploy.evaluation.methods import KNOWS, Restore, knowledge_of, method_named
+from deploy.restoration.arrays import TILE_PX, Infer, restore_with
+from deploy.restoration.options import Runtime
+from deploy.restoration.runtime import open_openvino, open_runtime
+from deploy.tradeoff.cache import Cache, code_digest, digest_of
+from deploy.tradeoff.points import LEGAL, Unit
+from model.convbeers import VARIANTS
+from model.io.files import sha256
+from model.io.images import list_images
+from model.shipped import SHIPPED, shipped_names, shipped_weights
+from profiles import load_sensor, sensor_names
+from profiles.errors import BeersError, ModelError, OptionError
+from profiles.sensor import SensorProfile, reference_for
+from quant.calibration import Patches, draw_patches
+from quant.free import free_ticks, quantise_free
+from quant.onnx_file import fixed_tile_px, load_onnx, metadata, save_onnx
+from quant.passes.equalise import search_steps
+from quant.quantise import SEARCH_CROPS, quantise_model, ticks
+from quant.radius import receptive_radius_px
+
+PAPER = VARIANTS["convbeers"]
+"""The paper's network: 16 blocks of 64 features."""
+
+
+@dataclass(frozen=True)
+class Network:
+    """A network in the precisions in which it is at hand.
+
+    Attributes:
+        name: what it is listed under.
+        float_file: weights or ONNX in float32; None where only INT8 is given.
+        int8_file: INT8 ONNX; None where it is yet to be made.
+        given: precision of the INT8 file, "INT8 legal" unless the file says otherwise.
+    """
+
+    name: str
+    float_file: Path | None
+    int8_file: Path | None
+    given: str = "INT8 legal"
+
+    def model(self) -> onnx.ModelProto:
+        """The float network as ONNX, or the INT8 one where that is all there is."""
+        return float_model(self.float_file) if self.float_file else load_onnx(self.int8_file or Path())
+
+
+def find_networks(names: Iterable[str]) -> list[Network]:
+    """Networks by shipped name or file, each once.
+
+    Raises:
+        OptionError: neither a shipped name nor a file of weights, two files of one name, or a model of one tile size.
+        ModelError: a file that is no network.
+    """
+    found: dict[str, Network] = {}
+    for name in dict.fromkeys(each.strip() for each in names):
+        network = _network(name)
+        if network.name in found:
+            raise OptionError("--networks", expected="names that differ", got=repr(name), remedy="rename one file")
+        found[network.name] = network
+    return list(found.values())
+
+
+def _network(name: str) -> Network:
+    path = Path(name)
+    if name in shipped_names():
+        int8 = SHIPPED / f"{name}-int8.onnx"
+        return Network(name, shipped_weights(name), int8 if int8.is_file() else None)
+    if path.suffix not in (".onnx", ".safetensors"):
+        expected = f"a shipped network ({', '.join(shipped_names())}) or an ONNX or safetensors file"
+        raise OptionError("--networks", expected=expected, got=repr(name), remedy="correct that name")
+    model = float_model(path)
+    if fixed_tile_px(model):
+        got, remedy = f"{name} for one tile size", "export it without --tile"
+        raise OptionError("--networks", expected="networks for images of any size", got=got, remedy=remedy)
+    if is_quantised(model):
+        precision = metadata(model).get("precision", "int8 legal").replace("int8", "INT8")
+        return Network(path.stem, None, path, precision)
+    return Network(path.stem, path, None)
+
+
+def shape_of(model: onnx.ModelProto) -> tuple[int, int]:
+    """Residual blocks and features of a ConvBEERS, from its convolutions: head, two a block, body's end, tail."""
+    weights = conv_weights(model)
+    return (len(weights) - 3) // 2, weights[0][0] if weights else 0
+
+
+def is_papers(model: onnx.ModelProto) -> bool:
+    """Whether a network has the paper's shape."""
+    return shape_of(model) == (PAPER.blocks, PAPER.features)
+
+
+def operations_per_px(model: onnx.ModelProto) -> int:
+    """Operations of the convolutions for each pixel, a product and its sum counting as two."""
+    return 2 * sum(math.prod(shape) for shape in conv_weights(model))
+
+
+def conv_weights(model: onnx.ModelProto) -> list[tuple[int, ...]]:
+    """Shapes of the convolutions' weights, in order."""
+    sizes = {tensor.name: tuple(tensor.dims) for tensor in model.graph.initializer}
+    place = {"Conv": 1, "QLinearConv": 3}
+    named = [node.input[place[node.op_type]] for node in model.graph.node if node.op_type in place]
+    return [sizes[name] for name in named if name in sizes]
+
+
+PATCHES, PATCH_PX = 32, 96
+"""Fewer and smaller than `quantize` takes: several networks are made in one sitting."""
+
+SEARCH_MAX = 3e13
+"""Operations that the search for INT8 free may take: the paper's network would take five times as many."""
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """Where calibration patches come from: a folder of scenes, or drawn ones; never the images of the study."""
+
+    scenes: Path | None
+    sensor: str
+    seed: int
+
+    @cached_property
+    def scenes_digest(self) -> str:
+        """Of the folder's images; drawn scenes follow from the seed."""
+        return digest_of([sha256(path) for path in list_images(self.scenes)] if self.scenes else [])
+
+    def key(self, model: onnx.ModelProto) -> dict[str, object]:
+        """What the patches for a network depend on."""
+        profile, size = load_sensor(self.sensor_of(model)), [PATCHES, PATCH_PX]
+        return {"scenes": self.scenes_digest, "sensor": repr(profile), "seed": self.seed, "size": size}
+
+    def sensor_of(self, model: onnx.ModelProto) -> str:
+        """The profile that a network says it was trained for; the study's where it says nothing known."""
+        named = metadata(model).get("sensor", "")
+        return named if named in sensor_names() else self.sensor
+
+    def patches(self, model: onnx.ModelProto) -> Patches:
+        """For one network."""
+        degraded = load_sensor(self.sensor_of(model))
+        reference = reference_for(degraded)
+        scenes = load_scenes(self.scenes, reference.nominal(), self.seed)
+        return draw_patches(scenes, degraded, reference, PATCHES, self.seed, PATCH_PX)
+
+
+def make_int8(
+    model: onnx.ModelProto, precision: str, calibration: Calibration, tick: Callable[[], None]
+) -> onnx.ModelProto:
+    """The network in INT8, host spelling.
+
+    Raises:
+        ModelError: not a graph of convolutions, ReLUs and adds that ends with the global add.
+        ImageError: no scene holds a patch.
+    """
+    patches = calibration.patches(model)
+    about = {"calibration_sensor": calibration.sensor_of(model), "calibration_seed": str(calibration.seed)}
+    if precision == LEGAL:
+        return quantise_model(model, patches, about, tick).host
+    return quantise_free(model, patches, about, tick)
+
+
+def int8_ticks(model: onnx.ModelProto, precision: str) -> int:
+    """How often `make_int8` will call `tick`."""
+    return ticks(model, PATCHES) if precision == LEGAL else free_ticks(model, PATCHES)
+
+
+def search_operations(model: onnx.ModelProto) -> float:
+    """What the search for equal channels computes: most of the work of making an INT8 file."""
+    pixels = SEARCH_CROPS * PATCH_PX**2
+    return float(search_steps(shape_of(model)[1])) * pixels * operations_per_px(model)
+
+
+MAKING = ("quant.quantise", "quant.free", "quant.calibration")
+CHAINS = ("model.traditional.pipeline", "model.traditional.peers")
+PACKAGES = {
+    "OpenVINO": "openvino",
+    "onnxruntime": "onnxruntime",
+    "scikit-image": "scikit-image",
+    "PyTorch": "torch",
+}
+
+
+@dataclass(frozen=True)
+class Opened:
+    """A method ready to run; `infer` is its bare network, where it is one."""
+
+    restore: Restore
+    infer: Infer | None = None
+
+
+@dataclass(frozen=True)
+class Shelf:
+    """Opens units; `degraded` and `reference` are what chains are told."""
+
+    networks: dict[str, Network]
+    degraded: SensorProfile
+    reference: SensorProfile
+    calibration: Calibration
+    cache: Cache
+
+    @property
+    def max_dn(self) -> int:
+        """The largest digital number of the images."""
+        return self.degraded.nominal().max_dn
+
+    def lack(self, unit: Unit) -> str:
+        """Why a unit cannot be had here; empty where it can."""
+        try:
+            _require(self, unit)
+        except BeersError as error:
+            return str(error).rstrip(".")
+        return ""
+
+    def told(self, unit: Unit) -> str:
+        """What a unit knows of the sensor."""
+        if unit.kind != "network":
+            return KNOWS
+        return knowledge_of(self.model(unit.method), self.degraded.name)
+
+    def model(self, method: str) -> onnx.ModelProto:
+        """A network as its user gave it."""
+        return _model(self.networks[method])
+
+    def radius_px(self, method: str) -> int:
+        """How far a network sees."""
+        return receptive_radius_px(self.model(method))
+
+    def digest(self, unit: Unit) -> str:
+        """What the unit's pictures depend on; known before a missing INT8 file is made."""
+        return digest_of([self._content(unit), runtime_of(unit), version(PACKAGES[runtime_of(unit)])])
+
+    def _content(self, unit: Unit) -> str:
+        if unit.kind != "network":
+            return f"{unit.method} {self.degraded!r} {self.reference!r} {code_digest(*CHAINS)}"
+        path = self.int8_file(unit)
+        if path is None:
+            return sha256(self.networks[unit.method].float_file or Path())
+        return path.name if self.makes(unit) else sha256(path)
+
+    def makes(self, unit: Unit) -> bool:
+        """Whether its INT8 file is made here."""
+        network = self.networks.get(unit.method)
+        if network is None or not unit.precision.startswith("INT8"):
+            return False
+        return network.int8_file is None or unit.precision != network.given
+
+    def int8_file(self, unit: Unit) -> Path | None:
+        """Its INT8 file, there or yet to be made; None of a float unit."""
+        network = self.networks.get(unit.method)
+        if network is None or not unit.precision.startswith("INT8"):
+            return None
+        if not self.makes(unit):
+            return network.int8_file
+        key = {"float": sha256(network.float_file or Path()), **self.calibration.key(self.model(unit.method))}
+        key |= {"precision": unit.precision, "code": code_digest(*MAKING)}
+        return self.cache.path(unit.precision.replace(" ", "-").lower(), key, "onnx")
+
+    def missing(self, units: Sequence[Unit]) -> list[Unit]:
+        """Of some units, those whose INT8 file is yet to be made, or is damaged."""
+        return [unit for unit in units if self.makes(unit) and not _sound(self.int8_file(unit))]
+
+    def make(self, unit: Unit, tick: Callable[[], None]) -> None:
+        """Make its INT8 file and keep it."""
+        made = make_int8(self.model(unit.method), unit.precision, self.calibration, tick)
+        save_onnx(made, self.int8_file(unit) or Path())
+
+    def open(self, unit: Unit) -> Opened:
+        """Ready to run.
+
+        Raises:
+            MachineError: a package or a processor's unit is not there.
+            ModelError: the runtime refuses the model.
+        """
+        if unit.kind != "network":
+            return Opened(method_named(unit.method, self.degraded.nominal(), self.reference.nominal()).restore)
+        path = self.int8_file(unit)
+        model = load_onnx(path) if path else self.model(unit.method)
+        half = unit.precision == "bf16"
+        infer, _ = open_openvino(model, 0, "bf16") if half else open_runtime(Runtime.onnxruntime, model, 0)
+        return Opened(partial(_whole, infer=infer, radius_px=self.radius_px(unit.method), max_dn=self.max_dn), infer)
+
+
+def runtime_of(unit: Unit) -> str:
+    """What runs a unit on this machine."""
+    if unit.kind == "network":
+        return "OpenVINO" if unit.precision == "bf16" else "onnxruntime"
+    return "scikit-image" if unit.kind == "peer" else "PyTorch"
+
+
+def _whole(dn: np.ndarray, infer: Infer, radius_px: int, max_dn: int) -> np.ndarray:
+    return restore_with(infer, dn, TILE_PX, radius_px, max_dn=max_dn).astype(np.float32)
+
+
+@cache
+def _model(network: Network) -> onnx.ModelProto:
+    return network.model()
+
+
+def _sound(path: Path | None) -> bool:
+    try:
+        return path is not None and bool(load_onnx(path).graph.node)
+    except ModelError:
+        return False
+
+
+def _require(shelf: Shelf, unit: Unit) -> None:
+    """Refuse what cannot be had, before any long work; what is yet to be made is not opened."""
+    if not shelf.makes(unit):
+        opened = shelf.open(unit)
+        if unit.kind == "peer":  # its library is asked for when it runs
+            opened.restore(np.random.default_rng(0).uniform(500, 600, (64, 64)).astype(np.float32))
+        return
+    model = shelf.model(unit.method)
+    int8_ticks(model, unit.precision)
+    work = search_operations(model)
+    if unit.precision != LEGAL and work > SEARCH_MAX:
+        got, remedy = f"{work:.2g}", "make it with 'quantize --regime free' and give the file"
+        expected = f"at most {SEARCH_MAX:.2g} operations of search for an INT8 file made on the way"
+        raise ModelError(str(unit), expected=expected, got=got, remedy=remedy)

@@ -1,0 +1,234 @@
+"""Read pixels from TIFF, PNG or JPEG files, settle what value is full scale, and refuse what is no image."""
+
+import io
+import math
+import re
+import warnings
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import psutil
+from PIL import Image
+
+from model.io.tiff import check_page, open_tiff
+from profiles.errors import BeersError, ImageError, MachineError, OptionError, sizes
+from profiles.toml import read_whole
+
+TIFF_SUFFIXES = {".tif", ".tiff"}
+IMAGE_SUFFIXES = TIFF_SUFFIXES | {".png", ".jpg", ".jpeg"}
+FRAME_NUMBERS = re.compile(r"(_[0-9a-f]*\d[0-9a-f]*)+$")
+"""What a name ends in that tells frames of one site apart: _0034, _5dded5bc_23."""
+
+PACKED_BYTES = 1 << 30
+"""Of a PNG or JPEG file."""
+
+WORKING_COPIES = 12
+"""Float copies of an image that a command may hold at once: reading refuses what would not fit in memory."""
+
+
+def read_pixels(path: Path) -> np.ndarray:
+    """The pixels of an image file as stored: (H, W) or (H, W, bands), any dtype.
+
+    Raises:
+        ImageError: missing, empty, not an image, or holding NaN or infinity.
+        MachineError: too large for the free memory.
+    """
+    require_image_file(path)
+    pixels = _read_tiff(path) if path.suffix.lower() in TIFF_SUFFIXES else _read_other(path)
+    if pixels.ndim not in (2, 3) or 0 in pixels.shape:
+        raise ImageError(
+            str(path), expected="a 2-D image", got=f"shape {pixels.shape}", remedy="export one page of it"
+        )
+    if np.issubdtype(pixels.dtype, np.floating) and not np.isfinite(pixels).all():
+        count = int((~np.isfinite(pixels)).sum())
+        remedy = "replace them or crop them off; 'restore' alone takes missing pixels, as NaN or nodata"
+        raise ImageError(str(path), expected="finite pixels", got=f"{count} NaN or infinite", remedy=remedy)
+    return pixels
+
+
+def require_image_file(path: Path) -> None:
+    """Refuse what is no file, or an empty one.
+
+    Raises:
+        ImageError: either.
+    """
+    try:
+        found = path.is_file()
+    except OSError as error:  # such as a name that is too long
+        got = error.strerror or str(error)
+        raise ImageError(str(path), expected="an image file", got=got, remedy="check the path") from error
+    if not found:
+        raise ImageError(str(path), expected="an image file", got="no such file", remedy="check the path")
+    if path.stat().st_size == 0:
+        raise ImageError(str(path), expected="an image", got="an empty file", remedy="write or copy it again")
+
+
+@contextmanager
+def damage_in_a_sentence(path: Path, where: str = "") -> Iterator[None]:
+    """One sentence for whatever the bytes of a damaged image lead to; `where` names the place in it.
+
+    Raises:
+        ImageError: damaged.
+        MachineError: a compression that needs a package which is not installed.
+    """
+    try:
+        yield
+    except (BeersError, MemoryError):
+        raise
+    except Exception as error:
+        name = f"{path}, {where}" if where else str(path)
+        if isinstance(error, ValueError) and "imagecodecs" in str(error):
+            remedy = "pip install 'beers-deploy[codecs]'"
+            raise MachineError(
+                name, expected="a TIFF compression known here", got=str(error), remedy=remedy
+            ) from error
+        raise _no_image(name, error) from error
+
+
+def list_images(folder: Path) -> list[Path]:
+    """The image files of a folder, sorted by name.
+
+    Raises:
+        ImageError: no such folder, or no image in it.
+    """
+    found = sorted(p for p in folder.glob("*") if p.suffix.lower() in IMAGE_SUFFIXES) if folder.is_dir() else []
+    if not found:
+        got = "no image in it" if folder.is_dir() else "no such folder"
+        raise ImageError(str(folder), expected="a folder of images", got=got, remedy="give TIFF, PNG or JPEG files")
+    return found
+
+
+def site_of(name: str) -> str:
+    """The name of an image without what tells frames of one site apart."""
+    return FRAME_NUMBERS.sub("", Path(name).stem) or name
+
+
+def _read_tiff(path: Path) -> np.ndarray:
+    with damage_in_a_sentence(path), open_tiff(path) as file:
+        series = file.series[0]
+        _check_memory(path, math.prod(series.shape))
+        for page in series.pages:
+            check_page(path, page)  # type: ignore[arg-type]  # frames have what pages have; none is damage
+        pixels = np.asarray(series.asarray())
+    if pixels.ndim == 3 and pixels.shape[0] in (1, 3, 4) and pixels.shape[2] not in (1, 3, 4):
+        pixels = np.moveaxis(pixels, 0, 2)  # planar storage: bands first
+    return pixels[..., 0] if pixels.ndim == 3 and pixels.shape[2] == 1 else pixels
+
+
+def _read_other(path: Path) -> np.ndarray:
+    limit, Image.MAX_IMAGE_PIXELS = Image.MAX_IMAGE_PIXELS, None  # our own check knows the free memory
+    try:
+        with (
+            damage_in_a_sentence(path),
+            warnings.catch_warnings(action="ignore"),  # odd EXIF is no concern of ours
+            Image.open(
+                _in_memory(path), formats=("PNG", "JPEG")
+            ) as image,  # others would run further programs, as for EPS
+        ):
+            bands = 4 if image.mode == "RGBA" else len(image.getbands())
+            _check_memory(path, image.width * image.height * bands)
+            return np.asarray(image if image.mode in ("L", "I;16", "I", "F") else image.convert("RGB"))
+    finally:
+        Image.MAX_IMAGE_PIXELS = limit
+
+
+def _in_memory(path: Path) -> io.BytesIO:
+    """The packed file: a chunk's stated length then takes no more memory than there is file."""
+    return io.BytesIO(read_whole(path, PACKED_BYTES))
+
+
+def _check_memory(path: Path, samples: int) -> None:
+    needed, free = samples * 4 * WORKING_COPIES, psutil.virtual_memory().available
+    if needed > free:
+        room, size = sizes(free, needed)
+        expected, got = (
+            f"an image that fits in {room} of free memory",
+            f"{samples:,} samples, which need about {size}",
+        )
+        raise MachineError(str(path), expected=expected, got=got, remedy="cut it into pieces")
+
+
+def _no_image(name: str, error: Exception) -> ImageError:
+    got = " ".join(str(error).split()) or type(error).__name__
+    return ImageError(
+        name, expected="a readable TIFF, PNG or JPEG", got=got[:120], remedy="check that it is a whole image"
+    )
+
+
+FULL_SCALE_DN = 4095.0
+"""Of 12 bits."""
+
+UNIT_MAX = 2.0
+"""Floats no larger may be shares of full scale, or reflectances, which pass 1 on snow and glint. A raw image has a
+pixel above 2 DN wherever it sees anything at all."""
+
+REMEDY = "give the pixel value that is full scale as --full-scale"
+
+
+def settled_scale(
+    name: str,
+    dtype: np.dtype[np.generic],
+    largest: Iterable[float],
+    asked: float | None = None,
+    usual: float = FULL_SCALE_DN,
+    remedy: str | None = None,
+) -> float:
+    """The pixel value that is full scale.
+
+    Args:
+        name: of the image, for the message.
+        dtype: of the pixels.
+        largest: the largest size of a known pixel in each part of the image, drawn for floats only and no further
+            than to the first that decides; 0 says nothing.
+        asked: as the user gave it; None lets type and values decide.
+        usual: the full scale of digital numbers.
+        remedy: what to do about pixels that leave it open, where the caller has no --full-scale.
+
+    Raises:
+        ImageError: pixels that leave it open.
+        OptionError: a full scale that such pixels cannot have.
+    """
+    if asked is not None:
+        check_scale(asked, dtype.kind)
+        return asked
+    if dtype.itemsize == 1:
+        raise _open(name, "8-bit pixels", remedy or f"{REMEDY} (255 for all of 8 bits), or the raw image")
+    if dtype.kind != "f":
+        return usual
+    brightest = 0.0
+    for value in largest:
+        brightest = max(brightest, value)
+        if brightest > UNIT_MAX:
+            return usual
+    if brightest == 0:  # black, or missing everywhere
+        return usual
+    got = f"floats of at most {brightest:.3g}"
+    raise _open(name, got, remedy or f"{REMEDY} (1 for 0..1, {usual:g} for digital numbers)")
+
+
+def check_scale(full_scale: float, kind: str) -> None:
+    """A full scale that pixels of this kind (numpy's letter) can have.
+
+    Raises:
+        OptionError: another.
+    """
+    whole = full_scale <= 65535 and full_scale % 1 == 0
+    if 0 < full_scale < np.inf and (kind == "f" or whole):
+        return
+    expected = "a number above 0" if kind == "f" else "a whole number of 1 to 65535 for integer pixels"
+    raise OptionError("--full-scale", expected=expected, got=f"{full_scale:g}", remedy="4095 is 12 bits")
+
+
+def remedy_outside(low: float, high: float, remedy: str) -> str:
+    """What to do about values from `low` to `high` that no sensor gives; `remedy` where they are only too large."""
+    if not np.isfinite([low, high]).all():
+        return "write NaN or the nodata value in place of infinite pixels: 'restore' takes both for missing"
+    if low < 0:
+        return "add the offset that was taken off the image, clip it at 0, or mark such pixels as nodata"
+    return remedy
+
+
+def _open(name: str, got: str, remedy: str) -> ImageError:
+    return ImageError(name, expected="digital numbers of more than 8 bits", got=got, remedy=remedy)

@@ -1,0 +1,197 @@
+"""Open a stranger's TIFF: as plain pages, none of which leads back to an earlier one.
+
+Formats for microscopes name further files to be opened, and tifffile follows directories that lead in a circle for
+hours. What a page's pixels could do is the matter of `model.io.tiff`.
+"""
+
+import logging
+import math
+import os
+import struct
+import zlib
+from collections.abc import Iterator
+from contextlib import suppress
+from importlib.util import find_spec
+from itertools import accumulate
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import psutil
+import tifffile
+
+from profiles.errors import ImageError, MachineError, sizes
+
+PLAIN: dict[str, Any] = dict.fromkeys(
+    (
+        "is_avs", "is_bif", "is_eer", "is_fluoview", "is_lsm", "is_mdgel", "is_mmstack", "is_ndpi", "is_ndtiff",
+        "is_nih", "is_ome", "is_philips", "is_qpi", "is_scanimage", "is_scn", "is_sis", "is_stk", "is_svs",
+    ),
+    False,
+)  # fmt: skip
+"""Laboratories' own kinds of TIFF are read as plain pages: some name other files to be opened."""
+TAGS, PAGES_WITHIN = 100_000, 64
+"""Of all pages together: a thousand pages have some twenty thousand tags."""
+
+logging.getLogger("tifffile").addHandler(logging.NullHandler())  # who asks for its remarks still has them
+
+
+def open_tiff(path: Path) -> tifffile.TiffFile:
+    """A TIFF as plain pages; raises what tifffile raises.
+
+    Raises:
+        ImageError: pages in a circle, or more of them, or of their tags, than any image here has.
+    """
+    _check_directories(path)
+    file = tifffile.TiffFile(path, **PLAIN)
+    try:
+        within = sum(len(page.subifds or ()) for page in file.pages if isinstance(page, tifffile.TiffPage))
+        if within > PAGES_WITHIN:
+            raise _endless(path, f"{within} pages within pages")
+    except Exception:
+        file.close()
+        raise
+    return file
+
+
+def _check_directories(path: Path) -> None:
+    """Before tifffile follows them: it does not see every circle, and goes round for hours."""
+    seen, tags = set[int](), 0
+    with path.open("rb") as stream, suppress(struct.error, OSError, OverflowError):  # a broken end: tifffile says so
+        for place, count in _directories(stream):
+            tags += count + 1
+            if place in seen or tags > TAGS:
+                raise _endless(path, "pages in a circle" if place in seen else f"more than {TAGS} tags")
+            seen.add(place)
+
+
+def _directories(stream: BinaryIO) -> Iterator[tuple[int, int]]:
+    """Place and number of tags of one directory after another, plain or BigTIFF."""
+    head = stream.read(4)
+    order, big = ">" if head[:2] == b"MM" else "<", head[2:] in (b"+\0", b"\0+")
+    (count, tag_bytes, offset), start = (("Q", 20, "Q"), 8) if big else (("H", 12, "I"), 4)
+
+    def number(kind: str) -> int:
+        return int(struct.unpack(order + kind, stream.read(struct.calcsize(kind)))[0])
+
+    stream.seek(start)
+    while place := number(offset):
+        stream.seek(place)
+        tags = number(count)
+        yield place, tags
+        stream.seek(tag_bytes * tags, os.SEEK_CUR)
+
+
+def _endless(path: Path, got: str) -> ImageError:
+    return ImageError(str(path), expected="a TIFF of a few pages", got=got, remedy="write it again")
+
+
+NONE, LZW, JPEG, DEFLATE, PACKBITS, ZSTD = 1, 5, 7, (8, 32946), 32773, 50000
+KNOWN = {NONE, LZW, JPEG, *DEFLATE, PACKBITS, ZSTD}
+"""Compressions, by TIFF's numbers. The others' decoders take their sizes from the packed bytes."""
+PIECE_BYTES = 1 << 20
+SIZES = (
+    "imagelength", "imagewidth", "imagedepth", "tilelength", "tilewidth", "tiledepth", "rowsperstrip",
+    "samplesperpixel", "bitspersample", "planarconfig", "compression",
+)  # fmt: skip
+MARKER, FRAMES = 0xFF, set(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
+
+
+def check_page(path: Path, page: tifffile.TiffPage) -> None:
+    """Refuse a page that would take more than its pixels do.
+
+    Raises:
+        ImageError: a file cut short, a compression that is not known here, or packed bytes of more pixels than their
+            place has.
+        MachineError: a strip or tile that does not fit in memory.
+    """
+    for name in SIZES:
+        if not isinstance(getattr(page, name), int):  # a file may hold a float, or a list
+            got, remedy = f"{name} of {str(getattr(page, name))[:40]}", "write it again"
+            raise ImageError(str(path), expected="whole numbers of pixels", got=got, remedy=remedy)
+    if page.compression not in KNOWN:
+        got, remedy = str(tifffile.COMPRESSION(page.compression).name), "write it with deflate, LZW or zstd"
+        raise ImageError(str(path), expected="a TIFF compression known here", got=got, remedy=remedy)
+    needed, free = segment_bytes(page), psutil.virtual_memory().available
+    if needed > free:
+        room, size = sizes(free, needed)
+        expected, got = f"strips or tiles that fit in {room}", f"{size} for one"
+        raise MachineError(str(path), expected=expected, got=got, remedy="rewrite it in smaller tiles")
+    _check_whole(path, page)
+    if page.compression == JPEG:
+        _check_frames(path, page)
+    elif page.compression in DEFLATE and find_spec("imagecodecs") is None:
+        _check_unpacked(path, page)
+
+
+def segment_bytes(page: tifffile.TiffPage) -> int:
+    """Bytes of one decoded strip or tile, as the file sizes it."""
+    samples = page.samplesperpixel if page.planarconfig == 1 else 1
+    return math.prod(_place_px(page)) * max(page.tiledepth, 1) * samples * max(page.bitspersample // 8, 1)
+
+
+def _check_whole(path: Path, page: tifffile.TiffPage) -> None:
+    """Reading beyond the end would take the memory first, and find out then."""
+    ends = (a + n for a, n in zip(page.dataoffsets, page.databytecounts, strict=True))
+    end, size = max(ends, default=0), path.stat().st_size
+    if end > size:
+        got, remedy = f"a file cut short at {size} of {end} bytes", "copy it again"
+        raise ImageError(str(path), expected="a whole TIFF", got=got, remedy=remedy)
+
+
+def _place_px(page: tifffile.TiffPage) -> tuple[int, int]:
+    """Height and width of a strip or tile."""
+    if page.is_tiled:
+        return page.tilelength, page.tilewidth
+    return min(page.rowsperstrip, page.imagelength), page.imagewidth
+
+
+def _segments(page: tifffile.TiffPage) -> Iterator[bytes]:
+    for segment in page.parent.filehandle.read_segments(page.dataoffsets, page.databytecounts):
+        if isinstance(segment, tuple) and segment[0] is not None:
+            yield segment[0]
+
+
+def _check_frames(path: Path, page: tifffile.TiffPage) -> None:
+    place = _place_px(page)
+    for data in _segments(page):
+        size = jpeg_size_px(data)
+        if size is None:
+            got, remedy = "a damaged one", "copy or convert it again"
+            raise ImageError(str(path), expected="JPEGs with a frame header", got=got, remedy=remedy)
+        if size[0] > place[0] or size[1] > place[1]:
+            raise _swollen(path, f"a JPEG of {size[1]} x {size[0]} pixels in a place of {place[1]} x {place[0]}")
+
+
+def jpeg_size_px(data: bytes) -> tuple[int, int] | None:
+    """Height and width in a JPEG's own header; None where no frame (marker C0 to CF but C4, C8, CC) comes first."""
+    at = 2
+    while at + 9 <= len(data) and data[at] == MARKER:
+        kind = data[at + 1]
+        if kind in FRAMES:
+            return int.from_bytes(data[at + 5 : at + 7]), int.from_bytes(data[at + 7 : at + 9])
+        # a fill byte, or a piece with its length
+        at += 1 if kind == MARKER else 2 + int.from_bytes(data[at + 2 : at + 4])
+    return None
+
+
+def _check_unpacked(path: Path, page: tifffile.TiffPage) -> None:
+    """Without imagecodecs, tifffile unpacks however much there is. Damage is told when its rows are read."""
+    limit = segment_bytes(page) + PIECE_BYTES
+    for data in _segments(page):
+        with suppress(zlib.error):
+            for total in accumulate(map(len, _unpacked(data))):
+                if total > limit:
+                    raise _swollen(path, f"{len(data)} bytes that unpack to more than {total}")
+
+
+def _unpacked(data: bytes) -> Iterator[bytes]:
+    """Piece by piece."""
+    unpacker = zlib.decompressobj()
+    while data and not unpacker.eof:
+        yield unpacker.decompress(data, PIECE_BYTES)
+        data = unpacker.unconsumed_tail
+
+
+def _swollen(path: Path, got: str) -> ImageError:
+    remedy = "copy or write it again"
+    return ImageError(str(path), expected="strips and tiles no larger than their place", got=got, remedy=remedy)

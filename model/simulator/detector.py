@@ -1,0 +1,198 @@
+"""What the detectors and the electronics do to the sampled signal, on the target grid: the order stands here.
+
+Haze before the instrument, saturation and what spills over, fixed-pattern noise of a push-broom sensor, noise that
+grows with the light, dead and hot pixels, and the converter. Each random effect has a generator of its own, keyed
+by (seed, patch, effect).
+"""
+
+import zlib
+from collections.abc import Callable, Collection
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from profiles.effects import Defects, Dsnu, Effect, FullWell, Offset, Prnu, Striping, Veil
+from profiles.sensor import Sensor
+
+NOISE_LIMIT = 6.0
+"""Draws are clipped here (two in a billion), so that the effect of noise has a bound."""
+
+
+def noise_sigma(radiance: Tensor, sensor: Sensor) -> Tensor:
+    """sigma(L) = sqrt(alpha L + beta), in W/m2/sr/um (paper, section 3.3).
+
+    Ringing can push L below zero, where there is no light to be noisy about: L counts as 0 there. A negative
+    variance (possible only for a sensor built by hand) counts as 0 too.
+    """
+    return (sensor.alpha * radiance.clamp(min=0) + sensor.beta).clamp(min=0).sqrt()
+
+
+def add_noise(radiance: Tensor, sensor: Sensor, generator: np.random.Generator) -> Tensor:
+    """L + sigma(L) * n, n standard normal and independent per pixel; shape and device kept."""
+    normal = generator.standard_normal(tuple(radiance.shape), dtype=np.float32)
+    np.clip(normal, -NOISE_LIMIT, NOISE_LIMIT, out=normal)
+    return radiance + noise_sigma(radiance, sensor) * torch.from_numpy(normal).to(radiance.device)
+
+
+PATTERN_LIMIT = 4.0
+"""Detectors further out are rejected at the factory: draws are clipped here, so that bounds can be proven."""
+
+
+def apply_prnu(radiance: Tensor, prnu: Prnu, generator: np.random.Generator) -> Tensor:
+    """L' = (1 + rms * n) * L, n standard normal per column, clipped at 4; rms 0 changes nothing."""
+    return radiance * (1 + prnu.rms * _columns(radiance, generator))
+
+
+def apply_dsnu(dn: Tensor, dsnu: Dsnu, generator: np.random.Generator) -> Tensor:
+    """DN' = DN + rms_dn * n, n standard normal per column, clipped at 4; rms_dn 0 changes nothing."""
+    return dn + dsnu.rms_dn * _columns(dn, generator)
+
+
+def apply_striping(dn: Tensor, striping: Striping) -> Tensor:
+    """Half of odd_even_dn is added to even columns and taken from odd ones; 0 changes nothing."""
+    columns = torch.arange(dn.shape[-1], device=dn.device)
+    return dn + striping.odd_even_dn * (0.5 - (columns % 2).to(dn.dtype))
+
+
+def _columns(image: Tensor, generator: np.random.Generator) -> Tensor:
+    """One clipped standard normal number a column, (W,) float32."""
+    draw = generator.standard_normal(image.shape[-1], dtype=np.float32)
+    return torch.from_numpy(np.clip(draw, -PATTERN_LIMIT, PATTERN_LIMIT)).to(image.device)
+
+
+def saturate(radiance: Tensor, well: FullWell) -> Tensor:
+    """L' = min(L + share * (k * max(L - well, 0)), well), in W/m2/sr/um.
+
+    k spreads the excess up and down the column, falling by e every `blooming_px` pixels, and sums to 1 at most
+    (what leaves the image is lost). Limits: below the well nothing changes; share 0 is a plain clip.
+    """
+    excess = (radiance - well.radiance).clamp(min=0)
+    if well.blooming_share > 0 and well.blooming_px > 0 and bool((excess > 0).any()):
+        radiance = radiance + well.blooming_share * _spread(excess, well.blooming_px)
+    return radiance.clamp(max=well.radiance)
+
+
+def _spread(excess: Tensor, length_px: float) -> Tensor:
+    """Convolve each column of (..., H, W) with the two-sided exponential without its centre, normalised."""
+    radius = min(int(6 * length_px) + 1, excess.shape[-2] - 1)
+    if radius < 1:
+        return torch.zeros_like(excess)
+    distance = torch.arange(-radius, radius + 1, dtype=torch.float64).abs()
+    kernel = torch.exp(-distance / length_px) * (distance > 0)
+    if kernel.sum() == 0:  # so short that not even a neighbour is reached
+        return torch.zeros_like(excess)
+    kernel = (kernel / kernel.sum()).to(excess)
+    columns = excess.reshape(-1, 1, *excess.shape[-2:])
+    return torch.nn.functional.conv2d(columns, kernel[None, None, :, None], padding=(radius, 0)).reshape(excess.shape)
+
+
+def add_defects(dn: Tensor, defects: Defects, max_dn: int, generator: np.random.Generator) -> Tensor:
+    """A pixel is dead (0 DN) or hot (max_dn) with its rate per million, independently; rates 0 change nothing."""
+    draw = torch.from_numpy(generator.random(tuple(dn.shape), dtype=np.float32)).to(dn.device)
+    dead, hot = defects.dead_per_million / 1e6, defects.hot_per_million / 1e6
+    dn = torch.where(draw < dead, torch.zeros_like(dn), dn)
+    return torch.where(draw >= 1 - hot, torch.full_like(dn, float(max_dn)), dn) if hot > 0 else dn
+
+
+def add_veil(radiance: Tensor, veil: Veil) -> Tensor:
+    """L' = transmittance * L + path radiance, in W/m2/sr/um.
+
+    Limits: (1, 0) changes nothing; transmittance 0 leaves the path radiance alone. It is the same before and after
+    the blur, whose gain at zero frequency is 1: so it is applied on the small target grid.
+    """
+    return radiance * veil.transmittance + veil.path_radiance
+
+
+def digitise(radiance: Tensor, sensor: Sensor) -> Tensor:
+    """DN = min(max(round(gain * L), 0), 2^bits - 1), as float32, L in W/m2/sr/um."""
+    return digitise_dn(radiance * sensor.gain_dn_per_radiance, sensor)
+
+
+def digitise_dn(dn: Tensor, sensor: Sensor) -> Tensor:
+    """Round to whole digital numbers and clip to the converter's range.
+
+    Rounding adds 1/12 DN^2 of variance. Clipping comes before any cast, so that nothing wraps around.
+    """
+    return dn.round().clamp(0, sensor.max_dn)
+
+
+def to_radiance(dn: Tensor, sensor: Sensor) -> Tensor:
+    """Radiance in W/m2/sr/um of digital numbers, the offset taken off."""
+    return (dn - sensor.offset_dn) / sensor.gain_dn_per_radiance
+
+
+def to_dn(radiance: Tensor, sensor: Sensor) -> Tensor:
+    """The inverse of `to_radiance`, clipped to the converter's range and not rounded."""
+    return (radiance * sensor.gain_dn_per_radiance + sensor.offset_dn).clamp(0, sensor.max_dn)
+
+
+def to_uint16(dn: Tensor) -> np.ndarray:
+    """Whole digital numbers of at most 16 bits as the array that a TIFF file takes."""
+    return np.asarray(dn.round().clamp(0, 65535).cpu().numpy().astype(np.uint16))
+
+
+@dataclass(frozen=True)
+class Draw:
+    """What names a patch's randomness: the run's seed and the patch's number."""
+
+    seed: int
+    patch: int = 0
+
+    def generator(self, effect: str) -> np.random.Generator:
+        """The generator of one effect of this patch; counter-based (Philox), the same on every machine."""
+        entropy = (self.seed, self.patch, zlib.crc32(effect.encode()))
+        return np.random.Generator(np.random.Philox(np.random.SeedSequence(entropy)))
+
+
+RADIANCE_EFFECTS = ("veil", "full_well", "prnu")
+DN_EFFECTS = ("dsnu", "striping", "offset", "defects")
+
+
+def detect(signal: Tensor, sensor: Sensor, draw: Draw, role: str, skip: Collection[str] = ()) -> Tensor:
+    """Whole digital numbers of a blurred, sampled signal (..., H, W) in W/m2/sr/um.
+
+    Args:
+        signal: radiance on the target grid.
+        sensor: the instrument; it has an effect by having its table.
+        draw: seed and patch number; each effect takes its own generator from it.
+        role: "degraded" or "reference", so that the two draws of a pair differ.
+        skip: effects to leave out, see `plan.Plan.skipped`.
+    """
+    wanted = {name: effect for name, effect in sensor.effects.items() if name not in skip}
+
+    def apply(image: Tensor, names: tuple[str, ...]) -> Tensor:
+        for name in names:
+            if name in wanted:
+                image = apply_effect(image, wanted[name], sensor, partial(draw.generator, f"{name}-{role}"))
+        return image
+
+    signal = apply(signal, RADIANCE_EFFECTS)
+    if "noise" not in skip:
+        signal = add_noise(signal, sensor, draw.generator(f"noise-{role}"))
+    return digitise_dn(apply(signal * sensor.gain_dn_per_radiance, DN_EFFECTS), sensor)
+
+
+def apply_effect(
+    image: Tensor, effect: Effect, sensor: Sensor, generator: Callable[[], np.random.Generator]
+) -> Tensor:
+    """Apply one effect of the target grid; the generator is made only for those that draw."""
+    match effect:
+        case Veil():
+            return add_veil(image, effect)
+        case FullWell():
+            return saturate(image, effect)
+        case Prnu():
+            return apply_prnu(image, effect, generator())
+        case Dsnu():
+            return apply_dsnu(image, effect, generator())
+        case Striping():
+            return apply_striping(image, effect)
+        case Offset():
+            return image + effect.offset_dn
+        case Defects():
+            return add_defects(image, effect, sensor.max_dn, generator())
+        case _:
+            return image  # part of the transfer function

@@ -1,0 +1,116 @@
+"""What a reported figure is: a number with its unit, its mode and its source, and rows of them.
+
+A figure is measured (here), predicted (by a model, with an interval) or published (by a named document); what could
+not be had is unavailable, with the reason, and never a zero.
+"""
+
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from typing import Literal
+
+Mode = Literal["measured", "predicted", "published", "unavailable"]
+
+
+DIGITS = {"measured": 4, "predicted": 3, "published": 12, "unavailable": 4}
+"""Significant digits shown: a prediction deserves fewer, a published figure stays as printed."""
+
+NOT_FINITE = "the result is not a finite number"
+
+
+@dataclass(frozen=True)
+class Figure:
+    """A finite number with its unit, its mode and its source, or none and the reason why.
+
+    Raises:
+        ValueError: NaN or infinity, which no reader could tell from a result.
+    """
+
+    value: float | None
+    unit: str
+    mode: Mode
+    source: str = ""
+    interval: tuple[float, float] | None = None
+    reason: str = ""
+
+    def __post_init__(self) -> None:
+        if not all(math.isfinite(number) for number in (self.value or 0.0, *(self.interval or ()))):
+            raise ValueError(f"a figure that is not finite: {self.value} {self.interval or ''}")
+
+    def to_json(self) -> dict[str, object]:
+        """The figure as the schema wants it."""
+        if self.mode == "unavailable":
+            return {"value": None, "unit": self.unit, "mode": self.mode, "reason": self.reason}
+        interval = list(self.interval) if self.interval else None
+        return {
+            "value": self.value,
+            "unit": self.unit,
+            "mode": self.mode,
+            "interval": interval,
+            "source": self.source,
+        }
+
+    def __str__(self) -> str:
+        if self.value is None:
+            return "unavailable"
+        digits = DIGITS[self.mode]
+        text = number(self.value, digits)
+        if self.interval is None or self.interval[0] == self.interval[1]:  # plain arithmetic needs no interval
+            return text
+        return f"{text} [{number(self.interval[0], digits)}, {number(self.interval[1], digits)}]"
+
+
+def measured(value: float, unit: str, source: str, interval: tuple[float, float] | None = None) -> Figure:
+    """A number that this run observed on this machine, and how far a repetition might lie from it where known.
+
+    Unavailable where it is NaN or infinite; without an interval where that is.
+    """
+    if not math.isfinite(value):
+        return unavailable(unit, f"{NOT_FINITE} ({float(value)}): {source}")
+    known = interval if interval is not None and all(math.isfinite(end) for end in interval) else None
+    return Figure(float(value), unit, "measured", source, known)
+
+
+def predicted(value: float, unit: str, interval: tuple[float, float], source: str) -> Figure:
+    """A number that a model computed, and how far off it may be; unavailable where any of them is not finite."""
+    if not all(math.isfinite(number) for number in (value, *interval)):
+        return unavailable(unit, f"{NOT_FINITE} ({float(value)}): {source}")
+    return Figure(float(value), unit, "predicted", source, (float(interval[0]), float(interval[1])))
+
+
+def published(value: float, unit: str, source: str) -> Figure:
+    """A number that a document prints."""
+    return Figure(float(value), unit, "published", source)
+
+
+def unavailable(unit: str, reason: str) -> Figure:
+    """A number that could not be had."""
+    return Figure(None, unit, "unavailable", reason=reason)
+
+
+def number(value: float, digits: int) -> str:
+    """So many significant digits, thousands grouped, no exponent where a person would not write one."""
+    rounded = float(f"{value:.{digits}g}")
+    if abs(rounded) < 1000:
+        return f"{rounded:.{digits}g}"
+    decimals = max(digits - 1 - int(math.log10(abs(rounded))), 0)
+    text = f"{rounded:,.{decimals}f}"
+    return text.rstrip("0").rstrip(".") if decimals else text
+
+
+@dataclass(frozen=True)
+class Row:
+    """One line of a table: a name, its figures, and plain words beside them."""
+
+    table: str
+    name: str
+    figures: Mapping[str, Figure]
+    text: Mapping[str, str] = field(default_factory=dict)
+
+
+def by_table(rows: Iterable[Row]) -> dict[str, list[Row]]:
+    """The rows of each table, in the order in which the tables first appear."""
+    tables: dict[str, list[Row]] = {}
+    for row in rows:
+        tables.setdefault(row.table, []).append(row)
+    return tables

@@ -1,0 +1,290 @@
+"""The integer core as ONNX, in two encodings of the same numbers, and read back.
+
+The host file runs on stock onnxruntime by integer kernels, from image to restored image. The board file is the core
+by itself as QDQ ONNX, with int8 bias and power-of-two scales. Reading a host file back gives numbers to reason
+about.
+"""
+
+import numpy as np
+import onnx
+from onnx import TensorProto, helper, numpy_helper
+
+from profiles.errors import ModelError
+from quant.core import IntConv, IntCore
+from quant.graph import COARSE_MAX, CORRECTION, COUNT, IMAGE, MAX_DN, PLANES, QUARTER, STEP, Add
+from quant.onnx_file import constants, fixed_tile_px, image_info, make_model, metadata
+from quant.passes.stream import FINE_MAX, GAIN
+from quant.untrusted import contradictions
+
+MICROSOFT = "com.microsoft"
+ZERO = 128
+
+
+def host_model(core: IntCore, about: dict[str, str], tile_px: int | None = None) -> onnx.ModelProto:
+    """The whole INT8 network on stock onnxruntime, (N, 1, H, W) float32 in [0, 1] to the same."""
+    writer = _HostWriter()
+    _split_planes(writer)
+    for op in core.ops:
+        if isinstance(op, Add):
+            _add(writer, core, op)
+        else:
+            _host_conv(writer, core, op)
+    _merge(writer, core)
+    ends = [image_info(IMAGE, 1, tile_px)], [image_info("restored", 1, tile_px)]
+    graph = helper.make_graph(writer.nodes, "convbeers-int8", *ends, list(writer.weights.values()))
+    return make_model(graph, about, microsoft=True)
+
+
+def _split_planes(w: "_HostWriter") -> None:
+    """See quant.graph for the arithmetic."""
+    w.node("Mul", "host_front.scale", [IMAGE, w.scalar("max_dn", MAX_DN)])
+    w.node("Round", "host_front.round", ["host_front.scale"])
+    w.node("Clip", "host_front.dn", ["host_front.round", w.scalar("zero", 0), w.scalar("max_dn", MAX_DN)])
+    w.node("Mul", "host_front.steps", ["host_front.dn", w.scalar("one_step", 1 / STEP)])
+    w.node("Round", "host_front.whole_steps", ["host_front.steps"])
+    w.node("Min", "host_front.coarse", ["host_front.whole_steps", w.scalar("coarse_max", COARSE_MAX)])
+    w.node("Mul", "host_front.coarse_dn", ["host_front.coarse", w.scalar("step", STEP)])
+    w.node("Sub", "host_front.remainder", ["host_front.dn", "host_front.coarse_dn"])
+    w.node("Mul", "host_front.quarters", ["host_front.remainder", w.scalar("one_quarter", 1 / QUARTER)])
+    w.node("Round", "host_front.quarter", ["host_front.quarters"])
+    planes = ["host_front.coarse", "host_front.remainder", "host_front.quarter"]
+    w.node("Concat", "host_front.planes", planes, axis=1)
+    w.node("Add", "host_front.offset", ["host_front.planes", w.scalar("offset", ZERO)])
+    w.node("Cast", PLANES, ["host_front.offset"], to=TensorProto.UINT8)
+
+
+def _host_conv(w: "_HostWriter", core: IntCore, op: IntConv) -> None:
+    shift = op.weight_position + core.positions[op.input] - op.bias_position
+    bias = op.bias.astype(np.int32) << shift
+    feeds = [op.input, w.unit(core.positions[op.input]), w.zero_point()]
+    feeds += [w.constant(f"{op.name}.weight", op.weight), w.unit(op.weight_position)]
+    # One a weight: where onnxruntime rewrites weights (see quant.session), it trips over a shared one.
+    feeds += [w.constant(f"{op.name}.weight_zero_point", np.array(0, np.int8))]
+    feeds += [w.unit(core.positions[op.output]), w.zero_point(), w.constant(f"{op.name}.bias", bias)]
+    result = f"{op.output}.linear" if op.relu else op.output
+    kernel = list(op.weight.shape[2:])
+    w.node("QLinearConv", result, feeds, name=op.name, pads=[op.pad_px] * 4, kernel_shape=kernel)
+    if op.relu:
+        w.node("Max", op.output, [result, w.zero_point()], name=f"{op.name}.relu")
+
+
+def _add(w: "_HostWriter", core: IntCore, op: Add) -> None:
+    feeds = []
+    for name in (*op.inputs, op.output):
+        quantity = [] if name == op.output else [name]
+        feeds += [*quantity, w.unit(core.positions[name]), w.zero_point()]
+    w.node("QLinearAdd", op.output, feeds, name=op.name, domain=MICROSOFT)
+
+
+def _merge(w: "_HostWriter", core: IntCore) -> None:
+    scale = w.unit(core.positions[CORRECTION])
+    if core.output_channels == 1:
+        w.node("DequantizeLinear", "host_back.correction", [CORRECTION, scale, w.zero_point()])
+    else:
+        w.node("DequantizeLinear", "host_back.both", [CORRECTION, scale, w.zero_point()])
+        _merge_gains(w, core.scale(CORRECTION))
+    w.node("Add", "host_back.add", [IMAGE, "host_back.correction"])
+    w.node("Clip", "restored", ["host_back.add", w.scalar("zero", 0), w.scalar("one", 1)], name="host_back.clip")
+
+
+def _merge_gains(w: "_HostWriter", scale: float) -> None:
+    """See quant.passes.stream.merge for the arithmetic."""
+    halves = w.constant("one_each", np.array([1, 1]))
+    w.nodes.append(
+        helper.make_node("Split", ["host_back.both", halves], ["host_back.fine", "host_back.coarse"], axis=1)
+    )
+    w.nodes[-1].name = "host_back.split"
+    w.node("Mul", "host_back.wide", ["host_back.coarse", w.scalar("gain", GAIN)])
+    w.node("Abs", "host_back.size", ["host_back.fine"])
+    w.node("LessOrEqual", "host_back.fits", ["host_back.size", w.scalar("fine_max", (FINE_MAX + 0.5) * scale)])
+    w.node("Where", "host_back.correction", ["host_back.fits", "host_back.fine", "host_back.wide"])
+
+
+class _HostWriter:
+    """Collects nodes and constants; a constant of one name is written once."""
+
+    def __init__(self) -> None:
+        self.nodes: list[onnx.NodeProto] = []
+        self.weights: dict[str, onnx.TensorProto] = {}
+
+    def node(
+        self,
+        kind: str,
+        output: str,
+        inputs: list[str],
+        name: str = "",
+        domain: str = "",
+        **attributes: int | list[int],
+    ) -> None:
+        node = helper.make_node(kind, inputs, [output], name=name or output, domain=domain)
+        node.attribute.extend(helper.make_attribute(key, value) for key, value in attributes.items())
+        self.nodes.append(node)
+
+    def constant(self, name: str, value: np.ndarray) -> str:
+        self.weights.setdefault(name, numpy_helper.from_array(value, name))
+        return name
+
+    def scalar(self, name: str, value: float) -> str:
+        return self.constant(name, np.array(value, np.float32))
+
+    def unit(self, position: int) -> str:
+        return self.constant(f"scale_2^{-position}", np.array(2.0**-position, np.float32))
+
+    def zero_point(self) -> str:
+        return self.constant("zero_point", np.array(ZERO, np.uint8))
+
+
+def board_model(core: IntCore, about: dict[str, str], tile_px: int | None = None) -> onnx.ModelProto:
+    """`planes` (N, 3, H, W) float32, as q * 2^-7, to `correction` (N, 1 or 2, H, W) float32.
+
+    Two channels are two gains of the same correction: `quant.passes.stream.merge` makes one of them.
+    """
+    writer = _BoardWriter()
+    writer.quantised("planes.dequantised", PLANES, core.positions[PLANES])
+    for op in core.ops:
+        inputs = ["planes.dequantised" if i == PLANES else i for i in op.inputs]
+        output = f"{op.output}.float"
+        if isinstance(op, Add):
+            writer.nodes.append(helper.make_node("Add", inputs, [output], name=op.name))
+        else:
+            _board_conv(writer, op, inputs[0], output)
+        writer.quantised(op.output, output, core.positions[op.output])
+    ends = [image_info(PLANES, COUNT, tile_px)], [image_info(CORRECTION, core.output_channels, tile_px)]
+    graph = helper.make_graph(writer.nodes, "convbeers-core", *ends, list(writer.weights.values()))
+    return make_model(graph, about)
+
+
+def _board_conv(w: "_BoardWriter", op: IntConv, source: str, output: str) -> None:
+    weight = w.dequantised(f"{op.name}.weight", op.weight, op.weight_position)
+    bias = w.dequantised(f"{op.name}.bias", op.bias, op.bias_position)
+    result = f"{op.output}.linear" if op.relu else output
+    kernel = list(op.weight.shape[2:])
+    feeds = [source, weight, bias]
+    w.nodes.append(helper.make_node("Conv", feeds, [result], name=op.name, pads=[op.pad_px] * 4, kernel_shape=kernel))
+    if op.relu:
+        w.nodes.append(helper.make_node("Relu", [result], [output], name=f"{op.name}.relu"))
+
+
+class _BoardWriter:
+    """Collects nodes and constants."""
+
+    def __init__(self) -> None:
+        self.nodes: list[onnx.NodeProto] = []
+        self.weights: dict[str, onnx.TensorProto] = {}
+
+    def scale(self, position: int) -> list[str]:
+        name = f"scale_2^{-position}"
+        self.weights.setdefault(name, numpy_helper.from_array(np.array(2.0**-position, np.float32), name))
+        self.weights.setdefault("zero_point", numpy_helper.from_array(np.array(0, np.int8), "zero_point"))
+        return [name, "zero_point"]
+
+    def quantised(self, output: str, source: str, position: int) -> None:
+        """Quantise and dequantise an activation."""
+        middle = f"{source}.int8"
+        self.nodes.append(helper.make_node("QuantizeLinear", [source, *self.scale(position)], [middle], name=middle))
+        self.nodes.append(
+            helper.make_node("DequantizeLinear", [middle, *self.scale(position)], [output], name=f"{middle}.float")
+        )
+
+    def dequantised(self, name: str, value: np.ndarray, position: int) -> str:
+        """An int8 constant seen as float."""
+        self.weights[name] = numpy_helper.from_array(value, name)
+        result = f"{name}.float"
+        feeds = [name, *self.scale(position)]
+        self.nodes.append(helper.make_node("DequantizeLinear", feeds, [result], name=result))
+        return result
+
+
+def read_core(model: onnx.ModelProto) -> IntCore:
+    """The core of an INT8 file of the legal regime, its int32 bias at the accumulator's own position.
+
+    Raises:
+        ModelError: another spelling, float scales, or asymmetric numbers.
+    """
+    reader = _Reader(model)
+    for node in model.graph.node:
+        if node.op_type == "QLinearConv":
+            reader.conv(node)
+        elif node.op_type == "QLinearAdd":
+            reader.add(node)
+        elif node.op_type == "Max":
+            reader.relu(node)
+    if not reader.ops or PLANES not in reader.positions or CORRECTION not in reader.positions:
+        raise _refuse("no such core")
+    return IntCore(tuple(reader.ops), reader.positions)
+
+
+def spelling_faults(model: onnx.ModelProto) -> list[str] | None:
+    """Where a file of the legal regime is not what its whole numbers spell: the host's ends, ReLUs, a reader's scale.
+
+    None for files of others.
+
+    Raises:
+        ModelError: nodes that contradict it.
+    """
+    with contradictions("INT8 model"):
+        return _spelling_faults(model)
+
+
+def _spelling_faults(model: onnx.ModelProto) -> list[str] | None:
+    ours = metadata(model).get("precision") == "int8 legal"
+    try:
+        core = read_core(model)
+    except ModelError as error:
+        return [error.got] if ours else None
+    meant, faults = host_model(core, {}, fixed_tile_px(model)).graph, []
+    for kind, found, wanted in (
+        ("constant", model.graph.initializer, meant.initializer),
+        ("node", model.graph.node, meant.node),
+    ):
+        faults += [f"{kind} {a.name}" for a, b in zip(found, wanted, strict=False) if a != b]
+        faults += [f"{len(found)} {kind}s instead of {len(wanted)}"] if len(found) != len(wanted) else []
+    return faults
+
+
+class _Reader:
+    """Collects operations and positions."""
+
+    def __init__(self, model: onnx.ModelProto) -> None:
+        self._values = constants(model)
+        self.ops: list[IntConv | Add] = []
+        self.positions: dict[str, int] = {}
+
+    def conv(self, node: onnx.NodeProto) -> None:
+        source, *_, bias = node.input
+        weight, position = self._value(node.input[3]), self._position(node.input[4], node.input[5], 0)
+        self.positions[source] = self._position(node.input[1], node.input[2], ZERO)
+        self.positions[node.output[0]] = self._position(node.input[6], node.input[7], ZERO)
+        whole, product = self._value(bias).astype(np.int64), position + self.positions[source]
+        self.ops.append(IntConv(node.name, source, node.output[0], weight, position, whole, product, False))
+
+    def add(self, node: onnx.NodeProto) -> None:
+        for name, scale, zero in ((node.input[0], 1, 2), (node.input[3], 4, 5), (node.output[0], 6, 7)):
+            self.positions[name] = self._position(node.input[scale], node.input[zero], ZERO)
+        self.ops.append(Add(node.name, (node.input[0], node.input[3]), node.output[0]))
+
+    def relu(self, node: onnx.NodeProto) -> None:
+        """The larger of a value and the zero point; it becomes part of the convolution."""
+        last = self.ops[-1] if self.ops else None
+        if not isinstance(last, IntConv) or last.output != node.input[0]:
+            return
+        self.ops[-1] = IntConv(**{**vars(last), "output": node.output[0], "relu": True})
+        self.positions[node.output[0]] = self.positions.pop(last.output)
+
+    def _value(self, name: str) -> np.ndarray:
+        if name not in self._values:
+            raise _refuse(f"no constant {name}")
+        return self._values[name]
+
+    def _position(self, scale: str, zero: str, symmetric: int) -> int:
+        """Of a power-of-two scale around the middle."""
+        unit, middle = self._value(scale), self._value(zero)
+        mantissa, exponent = np.frexp(unit.ravel()[:1].astype(np.float64))
+        if unit.size != 1 or mantissa[0] != 0.5 or int(middle.ravel()[0]) != symmetric:
+            raise _refuse(f"scale {float(unit.ravel()[0]):g}, zero point {int(middle.ravel()[0])}")
+        return 1 - int(exponent[0])
+
+
+def _refuse(got: str) -> ModelError:
+    remedy = "make it with 'beers-deploy quantize --regime legal'"
+    return ModelError("INT8 core", expected="power-of-two scales, symmetric, from planes", got=got, remedy=remedy)

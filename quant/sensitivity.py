@@ -1,0 +1,182 @@
+"""Which layer costs what: each one in int8 while all others stay in float.
+
+A convolution errs by its int8 weights and bias, and by rounding and clipping its result. An add errs by what it does
+to sums of whole numbers: in a stream of one position nothing, but where it saturates. What a layer's inputs had
+already lost is not held against it.
+"""
+
+import math
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+import onnx
+import onnxruntime as ort
+from onnx import TensorProto, helper
+
+from quant.core import INT8_MAX, INT8_MIN, IntConv, IntCore
+from quant.encodings import host_model
+from quant.graph import CORRECTION, MAX_DN, PLANES, Conv, Graph, Op, float_model, tensors
+from quant.passes.stream import merge
+from quant.session import open_session, planes_of, run, tensor_values
+
+IN_INT8 = ".in_int8"
+"""Behind the name of a tensor: as int8 weights and bias make it of float inputs, not yet rounded."""
+
+
+class Loss:
+    """Adds up how far results lie from what was wanted, array by array."""
+
+    def __init__(self) -> None:
+        self._signal = self._noise = self._size = 0.0
+        self._count = 0
+
+    def add(self, result: np.ndarray, wanted: np.ndarray, offset: np.ndarray | float = 0.0) -> None:
+        """Count further values; the signal is what was wanted less an offset."""
+        difference = np.subtract(result, wanted, dtype=np.float64)
+        self._noise += float(np.square(difference).sum())
+        self._signal += float(np.square(np.subtract(wanted, offset, dtype=np.float64)).sum())
+        self._size += float(np.abs(difference).sum())
+        self._count += difference.size
+
+    @property
+    def sqnr_db(self) -> float:
+        """10 log10 of the signal's energy over that of the difference; infinite where nothing is lost."""
+        return 10 * math.log10(self._signal / self._noise) if self._noise and self._signal else math.inf
+
+    @property
+    def mae(self) -> float:
+        """Mean size of the difference."""
+        return self._size / self._count
+
+    @property
+    def squared(self) -> float:
+        """Mean squared difference."""
+        return self._noise / self._count
+
+
+@dataclass(frozen=True)
+class LayerBlame:
+    """What one layer in int8 loses, all others in float.
+
+    Attributes:
+        name: of the layer.
+        alone: in its own result; SQNR against that result.
+        network: in the restored image, of full scale; SQNR against the network's correction.
+    """
+
+    name: str
+    alone: Loss
+    network: Loss
+
+
+def blame_layers(
+    graph: Graph, core: IntCore, crops: Iterable[np.ndarray], tick: Callable[[], None]
+) -> tuple[list[LayerBlame], Loss]:
+    """What each layer of a network loses, and what all lose together, over crops (1, 1, H, W) in [0, 1].
+
+    Args:
+        graph: plane-reading, in float: what the core was rounded from.
+        core: the same operations in whole numbers.
+        crops: each passes through the network once for every layer.
+        tick: called after each crop.
+    """
+    twins = tuple(_twin(op, whole) for op, whole in zip(graph, core.ops, strict=True) if isinstance(whole, IntConv))
+    names = tensors((*graph, *twins))
+    exact, int8 = open_session(float_model((*graph, *twins), names)), open_session(host_model(core, {}))
+    rests = {name: open_session(_rest(graph, name)) for name in tensors(graph) if name != CORRECTION}
+    layers, together = [LayerBlame(op.name, Loss(), Loss()) for op in graph], Loss()
+    for crop in crops:
+        (values,) = tensor_values(exact, names, crop, halo_px=0)
+        wanted = dict(zip(names, values, strict=True))
+        restored = _restored(crop, wanted[CORRECTION], core)
+        for op, layer in zip(graph, layers, strict=True):
+            result, meant = _in_int8(op, core, wanted), wanted[op.output]
+            if op.output == CORRECTION:  # of two gains one is coarse and the other clipped: together they count
+                correction = result = merge(result, core.scale(CORRECTION))
+                meant = meant[:, :1]
+            else:
+                feed = {PLANES: planes_of(crop), op.output: result}
+                correction = rests[op.output].run(None, feed)[0]
+            layer.alone.add(result, meant)
+            layer.network.add(_restored(crop, correction, core), restored, crop)
+        together.add(run(int8, crop), restored, crop)
+        tick()
+    return layers, together
+
+
+def _twin(op: Op, whole: IntConv) -> Conv:
+    """The same convolution, by its side, with the values that its int8 weights and bias stand for."""
+    assert isinstance(op, Conv)  # noqa: S101 - the core was built from the graph
+    weight, bias = whole.weight * 2.0**-whole.weight_position, whole.bias * 2.0**-whole.bias_position
+    changed = replace(op, weight=weight.astype(np.float32), bias=bias.astype(np.float32))
+    return replace(changed, name=op.name + IN_INT8, output=op.output + IN_INT8)
+
+
+def _rest(graph: Graph, given: str) -> onnx.ModelProto:
+    """The float network from one of its tensors, given beside the planes, to the correction."""
+    model = float_model(tuple(op for op in graph if op.output != given), [CORRECTION])
+    model.graph.input.append(helper.make_tensor_value_info(given, TensorProto.FLOAT, ["N", "C", "H", "W"]))
+    return model
+
+
+def _in_int8(op: Op, core: IntCore, exact: Mapping[str, np.ndarray]) -> np.ndarray:
+    """A layer's result when it alone is in int8."""
+    if isinstance(op, Conv):
+        return _rounded(exact[op.output + IN_INT8], core.positions[op.output])
+    left, right = (_rounded(exact[name], core.positions[name]) for name in op.inputs)
+    return np.asarray(exact[op.output] + (_rounded(left + right, core.positions[op.output]) - (left + right)))
+
+
+def _rounded(values: np.ndarray, position: int) -> np.ndarray:
+    """To whole multiples of 2^-position, halves up, and clipped, as the DPU does."""
+    scale = np.float32(2.0**position)
+    return np.asarray(np.clip(np.floor(values * scale + np.float32(0.5)), INT8_MIN, INT8_MAX) / scale)
+
+
+def _restored(crop: np.ndarray, correction: np.ndarray, core: IntCore) -> np.ndarray:
+    return np.asarray(np.clip(crop + merge(correction, core.scale(CORRECTION)), 0, 1))
+
+
+@dataclass(frozen=True)
+class Spread:
+    """Differences of INT8 from float, both clipped to [0, 1].
+
+    Attributes:
+        counts: (2 * 4095 + 1,) pixels by their signed difference in whole DN, from -4095 on.
+        mae: (K,) mean absolute difference of each patch, of full scale.
+        largest: (K,) largest difference of each patch, of full scale.
+    """
+
+    counts: np.ndarray
+    mae: np.ndarray
+    largest: np.ndarray
+
+    @property
+    def std_dn(self) -> float:
+        """Standard deviation in DN, of the differences in whole DN."""
+        dn = np.arange(-MAX_DN, MAX_DN + 1)
+        mean = np.average(dn, weights=self.counts)
+        return float(np.sqrt(np.average((dn - mean) ** 2, weights=self.counts)))
+
+    def share_beyond(self, dn: int) -> float:
+        """Share of the pixels that differ by more than so many whole DN."""
+        return 1 - float(self.counts[MAX_DN - dn : MAX_DN + dn + 1].sum() / self.counts.sum())
+
+    def worst(self, count: int) -> list[int]:
+        """The patches of the largest MAE, the worst first."""
+        return [int(k) for k in np.argsort(-self.mae, kind="stable")[:count]]
+
+
+def spread_of(
+    float_session: ort.InferenceSession, int8_session: ort.InferenceSession, images: Iterable[np.ndarray]
+) -> Spread:
+    """Run both networks on images (1, 1, H, W) in [0, 1], one at a time."""
+    counts, mae, largest = np.zeros(2 * MAX_DN + 1, np.int64), [], []
+    for image in images:
+        in_float, in_int8 = (np.clip(run(session, image), 0, 1) for session in (float_session, int8_session))
+        difference = (in_int8 - in_float).ravel()
+        counts += np.bincount(np.rint(difference * MAX_DN).astype(np.int64) + MAX_DN, minlength=len(counts))
+        mae.append(float(np.abs(difference).mean()))
+        largest.append(float(np.abs(difference).max()))
+    return Spread(counts, np.array(mae), np.array(largest))

@@ -1,0 +1,422 @@
+import os
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+import skimage.data
+import torch
+from safetensors.numpy import load_file, save_file
+from skimage.filters import gaussian
+from torch import Tensor
+
+from model.metrics.backbones import BACKBONES, WEIGHTS_VARIABLE, Backbone, find_backbone, not_found
+from model.metrics.perceptual import MIN_NORM, PUBLISHED, Dists, Lpips, _unit
+from profiles.errors import ImageError, ModelError, OptionError
+
+Weights = dict[str, np.ndarray]
+Maps = list[np.ndarray]
+STEMS = {"squeeze": "squeezenet1_1", "alex": "alexnet", "vgg": "vgg16"}
+
+
+def made_up(network: str) -> Weights:
+    """Random weights that keep the features' size from layer to layer."""
+    rng = np.random.default_rng(len(network))
+    weights = {}
+    for name, tensor in Backbone(network).state_dict().items():
+        fan_in = tensor[0].numel() if name.endswith("weight") else 200
+        weights[name] = (rng.standard_normal(tuple(tensor.shape)) * np.sqrt(2 / fan_in)).astype(np.float32)
+    return weights
+
+
+@pytest.fixture(scope="module", autouse=True)
+def one_thread() -> Iterator[None]:
+    """Maps this small are slower on several threads, far slower on a busy machine."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("weights")
+    for network, stem in STEMS.items():
+        save_file(made_up(network), folder / f"{stem}-made-up.safetensors")
+    return folder
+
+
+@pytest.fixture(params=[*STEMS, "dists"])
+def metric(request: pytest.FixtureRequest, folder: Path) -> Lpips | Dists:
+    return load(request.param, folder)
+
+
+def load(name: str, folder: Path) -> Lpips | Dists:
+    path = find_backbone("vgg" if name == "dists" else name, folder)
+    assert path is not None
+    return Dists.load(path) if name == "dists" else Lpips.load(name, path)
+
+
+def pair(height: int, width: int, sigma: float = 0.1, seed: int = 0) -> tuple[Tensor, Tensor]:
+    reference = skimage.data.camera()[60 : 60 + height, 200 : 200 + width] / 255
+    noise = np.random.default_rng(seed).standard_normal(reference.shape) * sigma
+    return as_batch(reference + noise), as_batch(reference)
+
+
+def as_batch(plane: np.ndarray) -> Tensor:
+    return torch.from_numpy(plane).float()[None, None]
+
+
+# The same metrics once more, plainly, in numpy and float64; an image is (C, H, W).
+
+
+def convolve(x: np.ndarray, weights: Weights, name: str, stride: int = 1, padding: int = 0) -> np.ndarray:
+    kernel, bias = (weights[f"{name}.{part}"].astype(np.float64) for part in ("weight", "bias"))
+    x = np.pad(x, ((0, 0), (padding, padding), (padding, padding)))
+    windows = np.lib.stride_tricks.sliding_window_view(x, kernel.shape[2:], axis=(1, 2))[:, ::stride, ::stride]
+    return np.asarray(np.tensordot(kernel, windows, axes=([1, 2, 3], [0, 3, 4])) + bias[:, None, None])
+
+
+def relu(x: np.ndarray) -> np.ndarray:
+    return np.asarray(np.maximum(x, 0))
+
+
+def pooled(x: np.ndarray, size: int, ceil: bool = False) -> np.ndarray:
+    """Maximum over windows with stride 2; with `ceil` the last window may hang over the edge."""
+    rows, columns = (
+        range(0, length - size + 1 + (ceil and (length - size) % 2), 2) if length >= size else range(1)
+        for length in x.shape[1:]
+    )
+    return np.stack(
+        [np.stack([x[:, i : i + size, j : j + size].max(axis=(1, 2)) for j in columns], -1) for i in rows], 1
+    )
+
+
+def fire(x: np.ndarray, weights: Weights, name: str) -> np.ndarray:
+    squeezed = relu(convolve(x, weights, f"{name}.squeeze"))
+    parts = (convolve(squeezed, weights, f"{name}.expand{n}x{n}", padding=n // 2) for n in (1, 3))
+    return relu(np.concatenate(list(parts)))
+
+
+def squeeze_maps(x: np.ndarray, weights: Weights) -> Maps:
+    maps = [relu(convolve(x, weights, "features.0", stride=2))]
+    for names in ("3 4", "6 7", "9", "10", "11", "12"):
+        x = pooled(maps[-1], 3, ceil=True) if names in ("3 4", "6 7", "9") else maps[-1]
+        for index in names.split():
+            x = fire(x, weights, f"features.{index}")
+        maps.append(x)
+    return maps
+
+
+def alex_maps(x: np.ndarray, weights: Weights) -> Maps:
+    first = relu(convolve(x, weights, "features.0", stride=4, padding=2))
+    second = relu(convolve(pooled(first, 3), weights, "features.3", padding=2))
+    third = relu(convolve(pooled(second, 3), weights, "features.6", padding=1))
+    fourth = relu(convolve(third, weights, "features.8", padding=1))
+    return [first, second, third, fourth, relu(convolve(fourth, weights, "features.10", padding=1))]
+
+
+def max_pooled_by_two(x: np.ndarray) -> np.ndarray:
+    return pooled(x, 2)
+
+
+def hanning_pooled(x: np.ndarray) -> np.ndarray:
+    window = np.hanning(5)[1:-1, None] * np.hanning(5)[None, 1:-1]
+    padded = np.pad(x**2, ((0, 0), (1, 1), (1, 1)))
+    rows, columns = (range(0, length, 2) for length in x.shape[1:])
+    cells = [[(padded[:, i : i + 3, j : j + 3] * window).sum((1, 2)) for j in columns] for i in rows]
+    return np.asarray(np.sqrt(np.moveaxis(np.array(cells), 2, 0) / window.sum() + 1e-12))
+
+
+def vgg_maps(x: np.ndarray, weights: Weights, pool: Callable[[np.ndarray], np.ndarray] = max_pooled_by_two) -> Maps:
+    maps: Maps = []
+    for names in ("0 2", "5 7", "10 12 14", "17 19 21", "24 26 28"):
+        x = pool(maps[-1]) if maps else x
+        for index in names.split():
+            x = relu(convolve(x, weights, f"features.{index}", padding=1))
+        maps.append(x)
+    return maps
+
+
+def plain_lpips(network: str, image: np.ndarray, reference: np.ndarray) -> float:
+    shift, scale = np.array([-0.030, -0.088, -0.188]), np.array([0.458, 0.448, 0.450])
+    weights, heads = made_up(network), load_file(PUBLISHED / f"lpips-{network}.safetensors")
+    maps = {"squeeze": squeeze_maps, "alex": alex_maps, "vgg": vgg_maps}[network]
+    colours = [(2 * np.stack([a] * 3) - 1 - shift[:, None, None]) / scale[:, None, None] for a in (image, reference)]
+    total = 0.0
+    for layer, maps_ab in enumerate(zip(*(maps(colour, weights) for colour in colours), strict=True)):
+        a, b = (m / (np.sqrt((m**2).sum(0)) + 1e-10) for m in maps_ab)
+        total += float(np.mean(np.tensordot(heads[f"lin{layer}"].astype(np.float64), (a - b) ** 2, axes=1)))
+    return total
+
+
+def plain_dists(image: np.ndarray, reference: np.ndarray) -> float:
+    weights, published = made_up("vgg"), load_file(PUBLISHED / "dists.safetensors")
+    alpha, beta = (published[name].astype(np.float64) for name in ("alpha", "beta"))
+    mean, std = np.array([0.485, 0.456, 0.406])[:, None, None], np.array([0.229, 0.224, 0.225])[:, None, None]
+    colours = [np.stack([a] * 3) for a in (image, reference)]
+    stages = [[c, *vgg_maps((c - mean) / std, weights, hanning_pooled)] for c in colours]
+    similar = 0.0
+    channels = ((a, b) for stage in zip(*stages, strict=True) for a, b in zip(*stage, strict=True))
+    for channel, (a, b) in enumerate(channels):
+        means = (2 * a.mean() * b.mean() + 1e-6) / (a.mean() ** 2 + b.mean() ** 2 + 1e-6)
+        covariance = np.mean((a - a.mean()) * (b - b.mean()))
+        similar += alpha[channel] * means + beta[channel] * (2 * covariance + 1e-6) / (a.var() + b.var() + 1e-6)
+    return float(1 - similar / (alpha.sum() + beta.sum()))
+
+
+@pytest.mark.parametrize(
+    ("name", "sides"),
+    [("squeeze", (64, 64)), ("squeeze", (67, 53)), ("alex", (64, 64)), ("alex", (67, 53)), ("vgg", (37, 32)),
+     ("dists", (37, 32))],
+)  # fmt: skip
+def test_agrees_with_a_plain_computation(name: str, sides: tuple[int, int], folder: Path) -> None:
+    image, reference = pair(*sides)
+    metric, planes = load(name, folder), [a[0, 0].double().numpy() for a in (image, reference)]
+    plain = plain_dists(*planes) if name == "dists" else plain_lpips(name, *planes)
+    assert float(metric(image, reference)) == pytest.approx(plain, rel=1e-5)
+    assert float(metric.double()(image.double(), reference.double())) == pytest.approx(plain, rel=1e-7)
+
+
+def test_identical_images_are_0_with_no_gradient(metric: Lpips | Dists) -> None:
+    _, reference = pair(64, 48)
+    image = reference.clone().requires_grad_()
+    value = metric(image, reference)
+    value.sum().backward()
+    assert value.tolist() == [0.0]
+    assert image.grad is not None
+    assert not image.grad.any()
+
+
+def test_each_pair_of_a_batch_has_its_own_value(metric: Lpips | Dists) -> None:
+    pairs = [pair(40, 36, sigma) for sigma in (0.02, 0.3)]
+    images, references = (torch.cat(parts) for parts in zip(*pairs, strict=True))
+    singly = [float(metric(*one)) for one in pairs]
+    assert metric(images, references).tolist() == pytest.approx(singly, rel=1e-4)
+    assert metric(references, images).tolist() == pytest.approx(singly, rel=1e-4)
+    assert 0 < singly[0] < singly[1]
+
+
+def test_the_gradient_is_that_of_the_value(folder: Path) -> None:
+    image, reference = (a.double() for a in pair(33, 33))
+    step = torch.from_numpy(np.random.default_rng(1).standard_normal(image.shape)) * 1e-6
+    for name in ("alex", "dists"):
+        metric, at = load(name, folder).double(), image.clone().requires_grad_()
+        metric(at, reference).sum().backward()
+        assert at.grad is not None
+        with torch.no_grad():
+            change = float(metric(image + step, reference) - metric(image - step, reference)) / 2
+        assert float((at.grad * step).sum()) == pytest.approx(change, rel=1e-3)
+
+
+def naive_unit(features: Tensor) -> Tensor:
+    return features / (features.square().sum(1, keepdim=True).sqrt() + 1e-10)
+
+
+def gradient_at(features: Tensor, unit: Callable[[Tensor], Tensor]) -> Tensor:
+    at = features.clone().requires_grad_()
+    (unit(at) - 0.5).square().sum().backward()  # type: ignore[no-untyped-call]
+    assert at.grad is not None
+    return at.grad
+
+
+@pytest.mark.parametrize("size", [0.0, 1e-30, 1e-12, 1e-6, 1e-3, 1.0])
+def test_features_of_any_size_have_a_bounded_gradient(size: float) -> None:
+    gradient = gradient_at(torch.full((1, 4, 2, 2), size), _unit)
+    assert float(gradient.abs().max()) <= 2 / MIN_NORM
+
+
+def test_the_packages_own_arithmetic_fails_on_features_that_are_all_zero() -> None:
+    assert gradient_at(torch.zeros(1, 4, 2, 2), naive_unit).isnan().all()
+    features = torch.from_numpy(np.random.default_rng(0).standard_normal((2, 8, 5, 5)))
+    assert torch.allclose(_unit(features), naive_unit(features), rtol=1e-8)
+    assert torch.allclose(gradient_at(features, _unit), gradient_at(features, naive_unit), rtol=1e-8)
+
+
+def test_dead_features_keep_the_gradient_finite(metric: Lpips | Dists) -> None:
+    for parameter in metric.backbone.parameters():
+        parameter.data.zero_()
+    image, reference = pair(40, 40)
+    image.requires_grad_()
+    value = metric(image, reference)
+    value.sum().backward()
+    assert image.grad is not None
+    assert image.grad.isfinite().all()
+    assert value.isfinite().all()
+
+
+def test_autocast_does_not_reach_inside(folder: Path) -> None:
+    metric, (image, reference) = load("squeeze", folder), pair(32, 32)
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        inside = metric(image, reference)
+    assert torch.equal(inside, metric(image, reference))
+    assert metric(image.bfloat16(), reference.bfloat16()).dtype == torch.float32
+
+
+def test_parameters_are_frozen(metric: Lpips | Dists) -> None:
+    assert not metric.training
+    assert not any(parameter.requires_grad for parameter in metric.parameters())
+
+
+@pytest.mark.parametrize(("network", "smallest"), [("squeeze", 17), ("alex", 31), ("vgg", 16), ("dists", 16)])
+def test_the_smallest_image(network: str, smallest: int, folder: Path) -> None:
+    metric = load(network, folder)
+    assert metric(*pair(smallest, smallest)).isfinite().all()
+    with pytest.raises(ImageError, match=f"at least {smallest} pixels a side"):
+        metric(*pair(smallest - 1, smallest))
+
+
+def test_images_of_different_shapes_are_refused(metric: Lpips | Dists) -> None:
+    image, reference = pair(40, 40)
+    for wrong in (image[0], image[..., 1:], image.expand(-1, 3, -1, -1)):
+        with pytest.raises(ImageError, match="of one shape"):
+            metric(wrong, wrong if wrong.shape == image[0].shape or wrong.shape[1] == 3 else reference)
+
+
+def test_labels_name_the_network(folder: Path) -> None:
+    assert [load(name, folder).label for name in (*STEMS, "dists")] == [
+        *("LPIPS-squeeze", "LPIPS-alex", "LPIPS-vgg", "DISTS")
+    ]
+
+
+@pytest.mark.parametrize(
+    ("file", "total"),
+    [("lpips-squeeze", 173.4387), ("lpips-alex", 105.2754), ("lpips-vgg", 131.8555), ("dists", 1.0)],
+)
+def test_published_weights_are_whole(file: str, total: float) -> None:
+    tensors = load_file(PUBLISHED / f"{file}.safetensors").values()
+    assert all(tensor.min() >= 0 for tensor in tensors)
+    assert sum(float(tensor.sum()) for tensor in tensors) == pytest.approx(total, rel=1e-5)
+    assert f"`{file}.safetensors`" in (PUBLISHED / "README.md").read_text()
+
+
+# The files a user brings.
+
+
+class Bomb:
+    """Leaves a trace if somebody unpickles it."""
+
+    def __init__(self, trace: Path) -> None:
+        self.trace = trace
+
+    def __reduce__(self) -> tuple[Callable[..., None], tuple[str]]:
+        return os.mkdir, (str(self.trace),)
+
+
+def test_npz_loads_like_safetensors_at_half_precision_and_with_other_entries(tmp_path: Path, folder: Path) -> None:
+    halves = {name: array.astype(np.float16) for name, array in made_up("squeeze").items()}
+    np.savez(tmp_path / "mine.npz", **halves, **{"classifier.1.weight": np.zeros(3)})  # type: ignore[arg-type]
+    images = pair(40, 40)
+    mine = Lpips.load("squeeze", tmp_path / "mine.npz")
+    assert mine.heads.dtype == torch.float32
+    assert float(mine(*images)) == pytest.approx(float(load("squeeze", folder)(*images)), rel=3e-3)
+
+
+@pytest.mark.parametrize("suffix", [".npz", ".safetensors"])
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"features.3.squeeze.bias": None}, "expected a tensor named features.3.squeeze.bias, got none"),
+        (
+            {"features.0.weight": np.zeros((64, 3, 7, 7))},
+            r"features.0.weight of shape \(64, 3, 3, 3\), got \(64, 3, 7",
+        ),
+        ({"features.0.bias": np.full(64, np.nan)}, "finite values in features.0.bias, got NaN"),
+        ({"features.0.bias": np.full(64, 1e300)}, "finite values in features.0.bias"),
+        ({"features.0.bias": np.zeros(64, np.int8)}, "floating-point numbers"),
+    ],
+)
+def test_a_file_that_is_not_that_network_is_refused(
+    tmp_path: Path, suffix: str, change: dict[str, np.ndarray | None], message: str
+) -> None:
+    arrays = {name: a for name, a in (made_up("squeeze") | change).items() if a is not None}
+    path = tmp_path / f"weights{suffix}"
+    if suffix == ".npz":
+        np.savez(path, **arrays)  # type: ignore[arg-type]
+    else:
+        save_file(arrays, path)
+    with pytest.raises(ModelError, match=message):
+        Lpips.load("squeeze", path)
+
+
+def test_a_pickle_inside_npz_is_refused_and_never_run(tmp_path: Path) -> None:
+    arrays: dict[str, np.ndarray] = dict(made_up("squeeze"))
+    arrays["features.0.bias"] = np.array([Bomb(tmp_path / "trace")], dtype=object)
+    np.savez(tmp_path / "weights.npz", **arrays)  # type: ignore[arg-type]
+    with (tmp_path / "bare.npz").open("wb") as file:
+        np.save(file, arrays["features.0.bias"])
+    for name in ("weights.npz", "bare.npz"):
+        with pytest.raises(ModelError, match="none pickled"):
+            Lpips.load("squeeze", tmp_path / name)
+    assert not (tmp_path / "trace").exists()
+
+
+@pytest.mark.parametrize("name", ["vgg16-397923af.pth", "alexnet.pt"])
+def test_a_pickled_file_is_refused_with_the_way_out(tmp_path: Path, name: str) -> None:
+    (tmp_path / name).write_bytes(b"PK")
+    with pytest.raises(ModelError, match=r"convert it where you trust it: .*save_file") as error:
+        Dists.load(tmp_path / name)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("content", [b"", b"nothing of the sort", b"PK\x03\x04 broken"])
+@pytest.mark.parametrize("suffix", [".npz", ".safetensors"])
+def test_a_broken_file_is_refused(tmp_path: Path, suffix: str, content: bytes) -> None:
+    path = tmp_path / f"broken{suffix}"
+    path.write_bytes(content)
+    with pytest.raises(ModelError, match="broken"):
+        Lpips.load("squeeze", path)
+
+
+def test_a_missing_file_and_an_unknown_network_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(ModelError, match="no such file"):
+        Lpips.load("squeeze", tmp_path / "none.npz")
+    with pytest.raises(OptionError, match="squeeze, alex, vgg"):
+        Lpips.load("resnet", tmp_path / "none.npz")
+
+
+def test_where_a_backbone_is_looked_for(tmp_path: Path, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv(WEIGHTS_VARIABLE, raising=False)
+    assert find_backbone("squeeze") is None
+    assert find_backbone("squeeze", tmp_path) is None
+    assert find_backbone("squeeze", tmp_path / "mine.npz") == tmp_path / "mine.npz"
+    file = folder / "vgg16-made-up.safetensors"
+    for place in (folder, file):
+        monkeypatch.setenv(WEIGHTS_VARIABLE, str(place))
+        assert find_backbone("vgg") == file
+        assert find_backbone("vgg", tmp_path) is None
+    assert find_backbone("alex") is None  # the variable names VGG16's file
+    monkeypatch.setenv(WEIGHTS_VARIABLE, str(tmp_path / "nowhere"))
+    assert [find_backbone(network) for network in BACKBONES] == [None] * 3
+    for network, stem in STEMS.items():
+        assert not_found(network).startswith(f"weights not found: no {stem}*.safetensors or {stem}*.npz")
+
+
+# The real SqueezeNet, where it lies beside the repository.
+
+
+@pytest.fixture(scope="module")
+def squeeze(shared_data: Path) -> Lpips:
+    path = find_backbone("squeeze", shared_data / "lpips")
+    if path is None:
+        pytest.skip(not_found("squeeze"))
+    return Lpips.load("squeeze", path)
+
+
+def test_known_values_on_a_photograph(squeeze: Lpips) -> None:
+    """Computed with the `lpips` package; its noise was another draw."""
+    reference = skimage.data.camera()[:256, :256] / 255
+    noise = np.random.default_rng(0).standard_normal(reference.shape)
+    for sigma, published in ((0.01, 0.094), (0.05, 0.369), (0.2, 0.649)):
+        noisy = np.clip(reference + sigma * noise, 0, 1)
+        assert float(squeeze(as_batch(noisy), as_batch(reference))) == pytest.approx(published, rel=0.01)
+    for sigma_px, published in ((0.5, 0.020), (1, 0.132), (2, 0.293), (4, 0.425)):
+        blurred = gaussian(reference, sigma_px, mode="reflect")
+        assert float(squeeze(as_batch(blurred), as_batch(reference))) == pytest.approx(published, abs=5.1e-4)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_more_noise_is_further_away(squeeze: Lpips, seed: int) -> None:
+    values = [float(squeeze(*pair(96, 96, sigma, seed))) for sigma in (0, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2)]
+    assert values[0] == 0
+    assert values == sorted(values)

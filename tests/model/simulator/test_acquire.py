@@ -1,0 +1,96 @@
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from model.simulator.acquire import acquire, simulate_pair
+from model.simulator.detector import Draw
+from model.simulator.procedural import procedural_scene
+from model.simulator.sampling import scene_spectrum
+from profiles import load_sensor
+from profiles.errors import ImageError
+from profiles.sensor import Sensor
+
+DEGRADED, REFERENCE = (load_sensor(name).nominal() for name in ("pleiades-degraded", "pleiades-reference"))
+QUIET = Sensor(0.07, alpha=0.0, beta=0.0, gain_dn_per_radiance=10.0, bits=16)
+
+
+@pytest.mark.parametrize("cycles_per_px", [0.1, 0.25, 0.4])
+@pytest.mark.parametrize("mtf_nyquist", [0.03, 0.07, 0.25])
+def test_a_sine_keeps_the_contrast_that_the_mtf_says(cycles_per_px: float, mtf_nyquist: float) -> None:
+    ratio, pixels = 4, 40
+    x = (torch.arange(pixels * ratio) + 0.5) / ratio
+    wave = 1000 + 500 * torch.cos(2 * math.pi * cycles_per_px * x)
+    radiance = wave.expand(pixels * ratio, -1).contiguous()
+    sensor = Sensor(mtf_nyquist, 0.0, 0.0, 10.0, 16)
+    dn = acquire(scene_spectrum(radiance), radiance.shape[1], sensor, ratio, Draw(0), "degraded", margin_px=0)
+    line = dn.double().mean(0) / 10
+    bin_ = round(cycles_per_px * pixels)
+    contrast = 2 * float(torch.fft.rfft(line)[bin_].abs()) / pixels / 500
+    gamma = -2 * math.log(mtf_nyquist * math.pi / 2)
+    expected = math.exp(-gamma * cycles_per_px) * math.sin(math.pi * cycles_per_px) / (math.pi * cycles_per_px)
+    assert contrast == pytest.approx(expected, abs=1e-3)
+
+
+def steepest_fall(ratio: int, mtf_nyquist: float) -> float:
+    """The largest fall between neighbours, in DN, across a step upwards of 1500 DN."""
+    side = 96 * ratio
+    step = torch.full((side, side), 50.0)
+    step[:, side // 2 :] = 200.0
+    sensor = Sensor(mtf_nyquist, 0.0, 0.0, 10.0, 16)
+    line = acquire(scene_spectrum(step), side, sensor, ratio, Draw(0), "degraded", margin_px=16)[0]
+    return float(-torch.diff(line).min())
+
+
+@pytest.mark.parametrize("mtf_nyquist", [0.03, 0.07, 0.25])
+@pytest.mark.parametrize("ratio", [1, 2, 3, 5])
+def test_a_step_rises_without_ringing(ratio: int, mtf_nyquist: float) -> None:
+    assert steepest_fall(ratio, mtf_nyquist) <= 1  # the digitiser's rounding
+
+
+def test_a_step_would_ring_where_the_scene_is_no_finer_than_the_sensor() -> None:
+    assert steepest_fall(1, 0.6) > 10
+
+
+def test_the_two_noises_of_a_pair_are_independent() -> None:
+    pair = simulate_pair(torch.full((900, 960), 80.0), DEGRADED, REFERENCE, 5, Draw(0))
+    noise = [image.flatten().numpy() - image.mean().item() for image in (pair.degraded, pair.reference)]
+    assert abs(np.corrcoef(noise[0], noise[1])[0, 1]) < 0.03
+
+
+def test_the_same_draw_gives_the_same_pixels_and_another_does_not() -> None:
+    scene = torch.full((500, 470), 80.0)
+    first, again, other = (simulate_pair(scene, DEGRADED, REFERENCE, 5, Draw(s)).degraded for s in (1, 1, 2))
+    assert torch.equal(first, again)
+    assert not torch.equal(first, other)
+
+
+def test_margin_and_ratio_give_the_size() -> None:
+    pair = simulate_pair(torch.full((503, 471), 80.0), DEGRADED, REFERENCE, 5, Draw(0), margin_px=16)
+    assert pair.degraded.shape == pair.reference.shape == (100 - 32, 94 - 32)
+
+
+def test_the_margin_keeps_the_wrapped_border_out() -> None:
+    """A bright strip at the left edge wraps into the right one; within the margin it must have faded."""
+    dark, strip = torch.full((600, 600), 50.0), torch.full((600, 600), 50.0)
+    strip[:, :5] = 400.0
+    inside = [simulate_pair(s, QUIET, QUIET, 5, Draw(0)).degraded[:, -1].mean() for s in (dark, strip)]
+    edge = [simulate_pair(s, QUIET, QUIET, 5, Draw(0), margin_px=0).degraded[:, -1].mean() for s in (dark, strip)]
+    assert abs(inside[1] - inside[0]) < 5
+    assert abs(edge[1] - edge[0]) > 100
+
+
+def test_a_scene_within_its_margin_is_refused() -> None:
+    with pytest.raises(ImageError, match="64 target pixels"):
+        simulate_pair(torch.zeros(300, 900), DEGRADED, REFERENCE, 5, Draw(0))
+
+
+def test_drawn_scenes_are_physical_and_repeatable() -> None:
+    scene = procedural_scene(700, 913, np.random.default_rng(5))
+    assert scene.radiance.shape == (700, 913)
+    assert scene.radiance.dtype == torch.float32
+    assert 0 < scene.radiance.min() < 20
+    assert 200 < scene.radiance.max() < 1000
+    assert torch.equal(scene.radiance, procedural_scene(700, 913, np.random.default_rng(5)).radiance)
+    assert not torch.equal(scene.radiance, procedural_scene(700, 913, np.random.default_rng(6)).radiance)

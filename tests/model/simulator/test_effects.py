@@ -1,0 +1,215 @@
+import importlib.util
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from model.simulator.acquire import prepare_scene, simulate_planned
+from model.simulator.detector import Draw, add_defects, add_veil, apply_dsnu, apply_prnu, apply_striping, saturate
+from model.simulator.mtf import gamma_from_mtf, mtf, smear_response, transfer_function
+from model.simulator.plan import TOLERANCE_DN, Plan, make_plan, scene_stats
+from model.simulator.sampling import sample, scene_spectrum
+from profiles.effects import (
+    AntiAlias,
+    Defects,
+    Dsnu,
+    Effect,
+    FullWell,
+    Offset,
+    Prnu,
+    Smear,
+    Striping,
+    Veil,
+)
+from profiles.errors import OptionError
+
+spec = importlib.util.spec_from_file_location("stages", Path(__file__).parent / "stages.py")
+assert spec is not None
+assert spec.loader is not None
+stages = importlib.util.module_from_spec(spec)
+spec.loader.exec_module(stages)
+
+NEUTRAL: dict[str, Effect] = {
+    "antialias": AntiAlias(0.0),
+    "smear": Smear(0.0),
+    "veil": Veil(1.0, 0.0),
+    "full_well": FullWell(1e6, 0.3, 4.0),
+    "prnu": Prnu(0.0),
+    "dsnu": Dsnu(0.0),
+    "striping": Striping(0.0),
+    "offset": Offset(0.0),
+    "defects": Defects(0.0, 0.0),
+}
+
+
+def scene(height: int = 340, width: int = 390, seed: int = 0) -> torch.Tensor:
+    return 20 + 150 * torch.rand(height, width, generator=torch.Generator().manual_seed(seed))
+
+
+@pytest.mark.parametrize("name", NEUTRAL)
+def test_skipping_equals_applying_at_neutral_parameters_bit_for_bit(name: str) -> None:
+    radiance, draw = scene(), Draw(3)
+    with_it, without_it = stages.plain_sensor(**{name: NEUTRAL[name]}), stages.plain_sensor()
+    images = [stages.before_digitising(radiance, s, 2, draw) for s in (with_it, without_it)]
+    assert torch.equal(*images)
+    plan = make_plan(with_it, scene_stats(radiance, 2))
+    planned = simulate_planned(prepare_scene(radiance, 2), with_it, draw, plan, margin_px=8)
+    everything = make_plan(without_it, scene_stats(radiance, 2))
+    assert torch.equal(
+        planned, simulate_planned(prepare_scene(radiance, 2), without_it, draw, everything, margin_px=8)
+    )
+
+
+@pytest.mark.parametrize("name", ["prnu", "dsnu", "defects", "veil"])
+def test_leaving_one_effect_out_changes_no_other_draw(name: str) -> None:
+    radiance, draw = torch.full((120, 140), 80.0), Draw(5)
+    sensor = stages.plain_sensor(dsnu=Dsnu(3.0), prnu=Prnu(0.01), defects=Defects(500, 500), veil=Veil(0.8, 10.0))
+    whole = stages.before_digitising(radiance, sensor, 2, draw, skip={name, "noise"})
+    other = stages.plain_sensor(**{k: v for k, v in sensor.effects.items() if k != name})
+    assert torch.equal(whole, stages.before_digitising(radiance, other, 2, draw, skip={"noise"}))
+
+
+def test_the_pattern_of_a_column_is_the_same_in_every_row() -> None:
+    flat = torch.full((31, 47), 50.0)
+    for image in (
+        apply_prnu(flat, Prnu(0.02), Draw(1).generator("p")),
+        apply_dsnu(flat, Dsnu(4.0), Draw(1).generator("d")),
+    ):
+        assert torch.equal(image, image[:1].expand_as(image))
+        assert float(image[0].std()) > 0.3
+
+
+def test_prnu_has_its_spread_and_its_limit() -> None:
+    flat = torch.full((1, 40_000), 100.0)
+    gain = apply_prnu(flat, Prnu(0.01), Draw(0).generator("p")) / 100 - 1
+    assert float(gain.std()) == pytest.approx(0.01, rel=0.02)
+    assert float(gain.abs().max()) <= 0.04 + 1e-6
+
+
+def test_stripes_alternate_and_keep_the_mean() -> None:
+    striped = apply_striping(torch.full((5, 8), 100.0), Striping(6.0))
+    assert striped[0].tolist() == [103.0, 97.0] * 4
+
+
+def test_the_veil_is_affine() -> None:
+    assert add_veil(torch.tensor([0.0, 100.0]), Veil(0.6, 25.0)).tolist() == [25.0, 85.0]
+
+
+def test_below_the_well_nothing_changes_and_share_zero_is_a_clip() -> None:
+    image = scene(40, 33)
+    assert torch.equal(saturate(image, FullWell(171.0, 0.4, 5.0)), image)
+    assert torch.equal(saturate(image, FullWell(90.0, 0.0, 5.0)), image.clamp(max=90.0))
+
+
+def test_what_spills_stays_in_its_column_and_never_exceeds_the_excess() -> None:
+    image = torch.full((61, 21), 20.0)
+    image[30, 10] = 520.0
+    flooded = saturate(image, FullWell(120.0, 0.4, 3.0))
+    clipped = image.clamp(max=120.0)
+    gained = (flooded - clipped).sum(0)
+    assert float(flooded.max()) <= 120.0
+    assert float(gained[10]) == pytest.approx(0.4 * 400.0, rel=1e-5)
+    assert float(gained.sum() - gained[10]) == 0.0
+    assert flooded[29, 10] > flooded[25, 10] > 20.0
+
+
+def test_defects_come_at_their_rate_and_at_the_ends_of_the_range() -> None:
+    dn = add_defects(torch.full((1000, 1001), 700.0), Defects(2000, 3000), 4095, Draw(2).generator("x"))
+    dead, hot = int((dn == 0).sum()), int((dn == 4095).sum())
+    for count, expected in ((dead, 2002), (hot, 3003)):
+        assert abs(count - expected) < 5 * math.sqrt(expected)
+    assert int((dn == 700).sum()) == dn.numel() - dead - hot
+
+
+def test_smear_averages_along_the_track_and_nothing_across() -> None:
+    ratio, side = 4, 160
+    y = (torch.arange(side) + 0.5) / ratio
+    along = (100 + 30 * torch.cos(2 * math.pi * 0.1 * y))[:, None].expand(side, side).contiguous()
+    for image, factor in ((along, float(torch.sinc(torch.tensor(3.0 * 0.1)))), (along.T.contiguous(), 1.0)):
+        contrasts = []
+        for smear_px in (0.0, 3.0):
+            transfer = transfer_function(side, side, ratio, 0.2, 0.0, smear_px)
+            contrasts.append(float(sample(scene_spectrum(image), transfer, side, ratio).std()))
+        assert contrasts[1] / contrasts[0] == pytest.approx(factor, rel=1e-4)
+
+
+@pytest.mark.parametrize("sigma_px", [0.1, 0.3, 0.4])
+def test_the_anti_alias_filter_is_part_of_the_budget(sigma_px: float) -> None:
+    half, zero = torch.tensor(0.5, dtype=torch.float64), torch.tensor(0.0, dtype=torch.float64)
+    assert float(mtf(half, zero, 0.07, sigma_px)) == pytest.approx(0.07, rel=1e-9)
+    assert gamma_from_mtf(0.07, sigma_px) < gamma_from_mtf(0.07)
+
+
+def test_an_infeasible_budget_is_refused_with_its_numbers() -> None:
+    with pytest.raises(OptionError, match=r"up to 0\.1854 behind an anti-alias filter that keeps 0\.291"):
+        gamma_from_mtf(0.25, 0.5)
+
+
+def test_the_offset_lifts_every_pixel() -> None:
+    flat = torch.full((20, 24), 10.0)
+    dark, lifted = (
+        stages.before_digitising(flat, stages.plain_sensor(**e), 2, Draw(0), {"noise"})
+        for e in ({}, {"offset": Offset(64.0)})
+    )
+    np.testing.assert_allclose((lifted - dark).numpy(), 64.0, rtol=1e-6)
+
+
+@pytest.mark.parametrize("name", NEUTRAL)
+def test_an_effect_that_is_applied_at_neutral_parameters_leaves_the_product_as_it_is(name: str) -> None:
+    """The plan skips nothing here: the operator itself must change no bit."""
+    prepared, draw, everything = prepare_scene(scene(171, 195), 3), Draw(7), Plan((), TOLERANCE_DN)
+    images = [
+        simulate_planned(prepared, stages.plain_sensor(**effects), draw, everything, margin_px=5)
+        for effects in ({name: NEUTRAL[name]}, {})
+    ]
+    assert torch.equal(*images)
+
+
+@pytest.mark.parametrize("name", ["dsnu", "striping", "offset"])
+def test_the_noise_is_the_same_whether_a_pattern_is_applied_or_not(name: str) -> None:
+    """What is added in DN is then all that differs, and it is the same in every row."""
+    radiance, effects = scene(93, 111), {"dsnu": Dsnu(3.0), "striping": Striping(2.0), "offset": Offset(64.0)}
+    sensor = stages.plain_sensor(**effects)
+    whole = stages.before_digitising(radiance, sensor, 3, Draw(5))
+    added = whole - stages.before_digitising(radiance, sensor, 3, Draw(5), {name})
+    np.testing.assert_allclose(added.numpy(), added[:1].expand_as(added).numpy(), atol=1e-3)
+    assert float(added.abs().min()) > 0
+
+
+@given(st.floats(1, 150), st.floats(0, 0.5), st.floats(0, 9), st.integers(2, 37), st.integers(0, 99))
+def test_a_full_well_gives_back_no_more_than_its_share_of_what_it_cuts_off(
+    well: float, share: float, length_px: float, rows: int, seed: int
+) -> None:
+    image = scene(rows, 9, seed)
+    flooded, clipped = saturate(image, FullWell(well, share, length_px)).double(), image.clamp(max=well).double()
+    cut, gained = (image.double() - clipped).sum(0), (flooded - clipped).sum(0)
+    assert bool((flooded >= clipped).all())
+    assert float(flooded.max()) <= well * (1 + 1e-6)
+    assert bool((gained <= share * cut + 1e-3).all())
+
+
+def test_smear_over_whole_scene_pixels_is_their_mean() -> None:
+    """On a smooth scene, without blur or sampling: 2 target pixels are 8 scene pixels, the outer two by half."""
+    ratio, side = 4, 160
+    y = torch.arange(side, dtype=torch.float64) / side
+    wave = 100 + 30 * torch.cos(2 * math.pi * 3 * y) + 10 * torch.sin(2 * math.pi * 5 * y)
+    frequency = torch.fft.rfftfreq(side, 1 / ratio, dtype=torch.float64)
+    smeared = torch.fft.irfft(torch.fft.rfft(wave) * smear_response(frequency, 2.0), n=side)
+    weights = [0.5, *[1.0] * 7, 0.5]
+    mean = sum((w * torch.roll(wave, k - 4) for k, w in enumerate(weights)), torch.zeros_like(wave)) / 8
+    np.testing.assert_allclose(smeared.numpy(), mean.numpy(), atol=0.1)
+    assert float((smeared - wave).abs().max()) > 0.5
+
+
+def test_defect_rates_of_zero_change_nothing_and_of_a_million_everything() -> None:
+    dn = scene(17, 23)
+    for defects, expected in (
+        (Defects(0, 0), dn),
+        (Defects(1e6, 0), torch.zeros_like(dn)),
+        (Defects(0, 1e6), torch.full_like(dn, 255.0)),
+    ):
+        assert torch.equal(add_defects(dn, defects, 255, Draw(0).generator("x")), expected)

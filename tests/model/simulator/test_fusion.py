@@ -1,0 +1,105 @@
+"""One fused pass computes what the effects would, one after the other, at full resolution."""
+
+import math
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from model.simulator.detector import add_veil
+from model.simulator.mtf import mtf, smear_response, transfer_function
+from model.simulator.sampling import sample, scene_spectrum
+from profiles.effects import Veil
+
+GAIN = 10.2375
+
+
+def one_after_the_other(
+    radiance: torch.Tensor, ratio: int, mtf_nyquist: float, sigma: float, smear: float
+) -> torch.Tensor:
+    """Blur, then smear, then shift, each with a transform of its own in float64; then pick every r-th pixel."""
+    height, width = radiance.shape
+    fy = torch.fft.fftfreq(height, 1 / ratio, dtype=torch.float64)[:, None]
+    fx = torch.fft.rfftfreq(width, 1 / ratio, dtype=torch.float64)[None]
+    shift = 2j * math.pi * (ratio - 1) / 2 / ratio
+    image = radiance.double()
+    for response in (
+        mtf(fx, fy, mtf_nyquist, sigma),
+        smear_response(fy, smear),
+        torch.exp(shift * fy) * torch.exp(shift * fx),
+    ):
+        image = torch.fft.irfft2(torch.fft.rfft2(image) * response, s=(height, width))
+    return image[::ratio, ::ratio]
+
+
+@settings(max_examples=40)
+@given(
+    st.integers(1, 6), st.floats(0.01, 0.3), st.floats(0, 0.3), st.floats(0, 3),
+    st.integers(10, 23), st.integers(10, 21), st.integers(0, 99),
+)  # fmt: skip
+def test_fused_equals_sequential(
+    ratio: int, mtf_nyquist: float, sigma: float, smear: float, rows: int, columns: int, seed: int
+) -> None:
+    radiance = 300 * torch.rand(rows * ratio, columns * ratio, generator=torch.Generator().manual_seed(seed))
+    transfer = transfer_function(*radiance.shape, ratio, mtf_nyquist, sigma, smear)
+    fused = sample(scene_spectrum(radiance), transfer, radiance.shape[1], ratio)
+    expected = one_after_the_other(radiance, ratio, mtf_nyquist, sigma, smear)
+    assert float((fused - expected).abs().max()) * GAIN < 0.02
+
+
+def slanted_edge(side: int, ratio: int, slope: float) -> tuple[torch.Tensor, torch.Tensor]:
+    """A scene with an edge that moves `slope` target pixels a row, and each target pixel's distance from it."""
+    y, x = (torch.arange(side * ratio, dtype=torch.float64) + 0.5 for _ in range(2))
+    middle = side * ratio / 2
+    coverage = (0.5 + x - (middle + slope * (y[:, None] - middle))).clamp(0, 1)  # of each scene pixel
+    pixels = (torch.arange(side, dtype=torch.float64) + 0.5) - side / 2
+    return (40 + 200 * coverage).float(), pixels - slope * pixels[:, None]
+
+
+@pytest.mark.parametrize("sigma", [0.0, 0.25])
+@pytest.mark.parametrize("mtf_nyquist", [0.01, 0.03, 0.05, 0.07, 0.25])
+def test_a_slanted_edge_shows_the_mtf_of_the_profile(mtf_nyquist: float, sigma: float) -> None:
+    """ISO 12233 in short, with and without anti-aliasing: rows shifted onto one another, finely
+    binned, differentiated, transformed.
+    """
+    ratio, side, bins = 8, 160, 8
+    scene, distance = slanted_edge(side, ratio, slope=1 / 16)
+    transfer = transfer_function(*scene.shape, ratio, mtf_nyquist, sigma)
+    image = sample(scene_spectrum(scene), transfer, side * ratio, ratio)
+    inner = slice(40, 120)  # far from where the borders wrap
+    index = ((distance[inner] + 36) * bins).round().long().flatten()
+    wanted = (index >= 0) & (index < 72 * bins)
+    value = image[inner].double().flatten()[wanted]
+    total = torch.zeros(72 * bins, dtype=torch.float64).index_add_(0, index[wanted], value)
+    edge = total / torch.bincount(index[wanted], minlength=72 * bins)
+    spread = torch.diff(edge)
+    cycles = torch.arange(len(spread), dtype=torch.float64) / bins
+    wave = torch.exp(-2j * math.pi * 0.5 * cycles)
+    measured = float((spread * wave).sum().abs() / spread.sum())
+    steps = math.sin(math.pi * 0.5 / bins) / (math.pi * 0.5 / bins)  # of the bins' differences
+    raster = math.sin(math.pi * 0.5 / ratio) / (math.pi * 0.5 / ratio)  # of the scene's own pixels
+    assert measured / (steps * raster) == pytest.approx(mtf_nyquist, abs=0.005)
+
+
+@pytest.mark.parametrize("ratio", [1, 2, 3, 5, 8])
+def test_the_veil_after_sampling_equals_the_veil_before_the_blur(ratio: int) -> None:
+    """An affine change of the light commutes with a blur that keeps the mean: so it may wait for the small grid."""
+    veil, radiance = Veil(0.7, 15.0), 300 * torch.rand(17 * ratio, 23 * ratio, generator=torch.Generator())
+    transfer = transfer_function(*radiance.shape, ratio, 0.07, 0.2, 1.5)
+    fused = add_veil(sample(scene_spectrum(radiance), transfer, radiance.shape[1], ratio), veil)
+    expected = one_after_the_other(add_veil(radiance.double(), veil), ratio, 0.07, 0.2, 1.5)
+    assert float((fused - expected).abs().max()) * GAIN < 0.02
+
+
+@pytest.mark.parametrize("smear", [0.0, 0.7, 2.0])
+@pytest.mark.parametrize("ratio", range(1, 9))
+def test_neither_blur_nor_smear_shifts_a_blob(ratio: int, smear: float) -> None:
+    side = 32 * ratio
+    x = torch.arange(side, dtype=torch.float64) - (side - 1) / 2
+    line = torch.exp(-0.5 * (x / (2.5 * ratio)) ** 2)
+    transfer = transfer_function(side, side, ratio, 0.1, 0.2, smear)
+    image = sample(scene_spectrum((line[:, None] * line).float()), transfer, side, ratio).double()
+    middle = torch.arange(32, dtype=torch.float64) - 15.5
+    for axis in (0, 1):
+        assert abs(float((image.sum(1 - axis) * middle).sum() / image.sum())) < 0.01

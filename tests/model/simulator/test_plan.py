@@ -1,0 +1,204 @@
+"""The plan's promise: no skipped effect would have changed a pixel by more than its bound."""
+
+import importlib.util
+import json
+import os
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from model.simulator import plan as plan_module
+from model.simulator.acquire import prepare_scene, simulate_planned
+from model.simulator.detector import Draw
+from model.simulator.plan import TOLERANCE_DN, Plan, effect_bounds, make_plan, scene_stats
+from model.simulator.sampling import crop_divisible
+from profiles.effects import AntiAlias, Defects, Dsnu, Effect, FullWell, Offset, Prnu, Smear, Striping, Veil
+from profiles.sensor import Sensor
+
+spec = importlib.util.spec_from_file_location("stages", Path(__file__).parent / "stages.py")
+assert spec is not None
+assert spec.loader is not None
+stages = importlib.util.module_from_spec(spec)
+spec.loader.exec_module(stages)
+
+EXAMPLES = int(os.environ.get("BEERS_PLAN_EXAMPLES", "60"))
+"""Thousands by hand: BEERS_PLAN_EXAMPLES=5000 pytest tests/model/simulator/test_plan.py."""
+
+ROUNDING_DN = 0.02
+"""float32 arithmetic at a few thousand DN."""
+
+ALL_APPLIED = Plan((), TOLERANCE_DN)
+"""A plan that skips nothing."""
+
+
+def draw_scene(kind: str, height: int, width: int, level: float, contrast: float, seed: int) -> torch.Tensor:
+    generator = torch.Generator().manual_seed(seed)
+    noise = torch.rand(height, width, generator=generator)
+    if kind == "ramp":
+        noise = (torch.arange(height)[:, None] + torch.arange(width)) / (height + width)
+    if kind == "points":
+        noise = (noise > 0.995).float()
+    if kind == "checkers":
+        noise = ((torch.arange(height)[:, None] // 3 + torch.arange(width) // 2) % 2).float()
+    if kind == "columns":
+        noise = noise[:1].expand(height, width).contiguous()
+    return level * (1 + contrast * (noise - 0.5)).clamp(min=0)
+
+
+scenes = st.builds(
+    draw_scene,
+    st.sampled_from(["noise", "ramp", "points", "columns", "checkers"]),
+    st.sampled_from([60, 90, 150]),
+    st.sampled_from([60, 75, 105]),
+    st.floats(0.1, 380),
+    st.sampled_from([0.0, 1e-5, 1e-4, 1e-2, 0.5, 2.0]),
+    st.integers(0, 99),
+)
+
+OPTIONAL: dict[str, st.SearchStrategy[Effect]] = {
+    "antialias": st.builds(AntiAlias, st.floats(0, 0.3)),
+    "smear": st.builds(Smear, st.floats(0, 3)),
+    "veil": st.builds(Veil, st.floats(0.3, 1), st.sampled_from([0.0, 0.01, 5.0])),
+    "full_well": st.builds(FullWell, st.floats(1, 500), st.floats(0, 0.5), st.floats(0, 8)),
+    "prnu": st.builds(Prnu, st.sampled_from([0.0, 1e-5, 1e-3, 0.05])),
+    "dsnu": st.builds(Dsnu, st.sampled_from([0.0, 0.01, 2.0])),
+    "striping": st.builds(Striping, st.sampled_from([0.0, 0.1, 5.0])),
+    "offset": st.builds(Offset, st.sampled_from([0.0, 0.05, 64.0])),
+    "defects": st.builds(Defects, st.sampled_from([0.0, 1000.0]), st.sampled_from([0.0, 2000.0])),
+}
+effects = st.fixed_dictionaries({}, optional=OPTIONAL)
+sensors = st.builds(
+    lambda m, a, b, e, along: Sensor(m, a, b, 10.2375, 12, e, along),
+    st.floats(0.005, 0.3),
+    st.sampled_from([0.0, 0.0077]),
+    st.sampled_from([0.0, 1e-6, 0.058]),
+    effects,
+    st.one_of(st.none(), st.floats(0.005, 0.3)),
+)
+
+
+def change(radiance: torch.Tensor, sensor: Sensor, ratio: int, name: str, seed: int) -> float:
+    """Largest change of any pixel before digitising when one effect is left out."""
+    skip = {name, "smear", "antialias"} if name == "mtf" else {name}
+    radiance = crop_divisible(radiance, ratio)
+    whole = stages.before_digitising(radiance, sensor, ratio, Draw(seed))
+    return float((whole - stages.before_digitising(radiance, sensor, ratio, Draw(seed), skip)).abs().max())
+
+
+@settings(max_examples=EXAMPLES)
+@given(scenes, sensors, st.sampled_from([1, 2, 3, 5]), st.integers(0, 99))
+def test_no_bound_is_ever_exceeded(radiance: torch.Tensor, sensor: Sensor, ratio: int, seed: int) -> None:
+    stats = scene_stats(crop_divisible(radiance, ratio), ratio)
+    for name, bound in effect_bounds(sensor, stats).items():
+        assert change(radiance, sensor, ratio, name, seed) <= bound * (1 + 1e-4) + ROUNDING_DN, name
+
+
+@settings(max_examples=EXAMPLES)
+@given(scenes, sensors, st.sampled_from([1, 2, 3, 5]), st.integers(0, 99))
+def test_the_plan_keeps_within_its_tolerance(radiance: torch.Tensor, sensor: Sensor, ratio: int, seed: int) -> None:
+    scene = prepare_scene(radiance, ratio)
+    radiance, plan = scene.radiance, make_plan(sensor, scene.stats)
+    whole = stages.before_digitising(radiance, sensor, ratio, Draw(seed))
+    planned = stages.before_digitising(radiance, sensor, ratio, Draw(seed), plan.skipped)
+    assert float((whole - planned).abs().max()) <= TOLERANCE_DN + ROUNDING_DN
+    products = [simulate_planned(scene, sensor, Draw(seed), p, margin_px=2) for p in (plan, ALL_APPLIED)]
+    assert float((products[0] - products[1]).abs().max()) <= 1  # two roundings of almost the same number
+
+
+@pytest.mark.parametrize("wrong", ["smear_bound_dn", "blur_bound_dn", "effect_bound_dn", "noise_bound_dn"])
+def test_a_bound_that_is_too_small_would_be_caught(wrong: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The same check on a scene of full contrast, with one bound function giving a hundredth of the truth."""
+    radiance = torch.zeros(60, 60)
+    radiance[20:44, 10:50] = 200.0
+    tight: dict[str, Effect] = {"smear": Smear(2.0), "veil": Veil(0.5, 20.0), "offset": Offset(50.0)}
+    sensor = stages.plain_sensor(**tight)
+    sound = getattr(plan_module, wrong)
+    monkeypatch.setattr(f"model.simulator.plan.{wrong}", lambda *a: sound(*a) / 100)
+    found = effect_bounds(sensor, scene_stats(radiance, 2))
+    broken = [name for name, bound in found.items() if change(radiance, sensor, 2, name, 0) > bound + ROUNDING_DN]
+    assert broken
+
+
+STRONG: dict[str, Effect] = {
+    "smear": Smear(2.0),
+    "veil": Veil(0.5, 20.0),
+    "full_well": FullWell(150.0, 0.0, 0.0),
+    "prnu": Prnu(0.05),
+    "dsnu": Dsnu(5.0),
+    "striping": Striping(5.0),
+    "offset": Offset(50.0),
+    "defects": Defects(50_000, 0.0),
+}
+
+
+@pytest.mark.parametrize("name", ["mtf", "noise", *STRONG])
+def test_a_quarter_of_any_bound_would_be_caught(name: str) -> None:
+    """The same check again, for each effect by itself: the bounds are not kept only because they are loose."""
+    radiance = torch.zeros(90, 75)
+    radiance[10, :] = radiance[20:70, 10:50] = 200.0
+    sensor = stages.plain_sensor(**{name: STRONG[name]} if name in STRONG else {})
+    if name == "smear":  # its bound leaves out how much a blur hides of it: so a sharp sensor
+        sensor = replace(sensor, mtf_nyquist=0.6)
+    bound = effect_bounds(sensor, scene_stats(radiance, 1))[name]
+    found = change(radiance, sensor, 1, name, 0)
+    assert bound / 4 + ROUNDING_DN < found <= bound + ROUNDING_DN
+
+
+def test_the_bound_of_defects_holds_where_the_signal_is_above_full_scale() -> None:
+    """A dead pixel loses all of the signal, also what the converter would have cut off."""
+    radiance, sensor = torch.full((60, 75), 760.0), stages.plain_sensor(defects=Defects(50_000, 50_000))
+    bound = effect_bounds(sensor, scene_stats(radiance, 3))["defects"]
+    assert change(radiance, sensor, 3, "defects", 0) <= bound + ROUNDING_DN
+
+
+def choices(radiance: torch.Tensor, sensor: Sensor) -> dict[str, str]:
+    return {d.effect: d.choice for d in make_plan(sensor, scene_stats(radiance, 2)).decisions}
+
+
+def test_a_constant_scene_skips_every_blur() -> None:
+    found = choices(torch.full((60, 80), 50.0), stages.plain_sensor(smear=Smear(2.0), antialias=AntiAlias(0.1)))
+    assert {found[n] for n in ("mtf", "smear", "antialias")} == {"cannot show"}
+    assert found["noise"] == found["sampling"] == found["digitising"] == "applied"
+
+
+def test_a_dark_scene_skips_the_full_well_and_a_bright_one_does_not() -> None:
+    sensor, scene = stages.plain_sensor(full_well=FullWell(300.0, 0.3, 4.0)), draw_scene("noise", 60, 80, 100, 0.5, 0)
+    assert choices(scene, sensor)["full_well"] == "cannot show"
+    assert choices(scene * 3, sensor)["full_well"] == "applied"
+
+
+def test_faint_stripes_are_skipped_neutral_ones_named_so_and_others_not_called_for() -> None:
+    scene = draw_scene("noise", 60, 80, 100, 0.5, 0)
+    assert choices(scene, stages.plain_sensor(striping=Striping(0.2)))["striping"] == "cannot show"
+    assert choices(scene, stages.plain_sensor(striping=Striping(0.0)))["striping"] == "neutral"
+    assert choices(scene, stages.plain_sensor())["striping"] == "not called for"
+    assert choices(scene, replace(stages.plain_sensor(), alpha=0.0, beta=0.0))["noise"] == "neutral"
+
+
+def test_what_is_skipped_fits_the_tolerance_together() -> None:
+    faint: dict[str, Effect] = {"striping": Striping(0.3), "dsnu": Dsnu(0.03), "offset": Offset(0.14)}
+    plan = make_plan(stages.plain_sensor(**faint), scene_stats(draw_scene("noise", 60, 80, 100, 0.5, 0), 2))
+    hidden = [d for d in plan.decisions if d.choice == "cannot show"]
+    assert 1 <= len(hidden) < 3
+    assert sum(d.bound_dn or 0 for d in hidden) <= TOLERANCE_DN
+
+
+def test_a_plan_is_data() -> None:
+    plan = make_plan(stages.plain_sensor(**stages.TYPICAL), scene_stats(draw_scene("noise", 60, 80, 100, 0.5, 0), 2))
+    assert json.loads(json.dumps(plan.to_json()))["tolerance_dn"] == TOLERANCE_DN
+    assert len(plan.decisions) == 13
+
+
+def test_a_flat_scene_is_simulated_without_a_transform() -> None:
+    flat, sensor = torch.full((200, 220), 60.0), stages.plain_sensor()
+    scene = prepare_scene(flat, 2)
+    plan = make_plan(sensor, scene.stats)
+    assert "mtf" in plan.skipped
+    dn = simulate_planned(scene, sensor, Draw(0), plan)
+    assert "spectrum" not in vars(scene)
+    assert dn.shape == (36, 46)
+    assert float(dn.mean()) == pytest.approx(614, abs=2)

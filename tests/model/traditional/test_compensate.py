@@ -1,0 +1,134 @@
+"""MTF compensation: gain 1 at DC, the target MTF without regularisation, finite whatever the blur."""
+
+import numpy as np
+import pytest
+import torch
+
+from model.simulator.mtf import transfer_function
+from model.simulator.sampling import sample, scene_spectrum
+from model.traditional import compensate as module
+from model.traditional.compensate import compensate, compensation_gain, compensation_kernel, filter_strips
+from model.traditional.rows import fill_missing, mirrored
+from profiles.errors import OptionError
+
+EPSILON = 3e-3
+
+
+def texture(height: int, width: int) -> torch.Tensor:
+    return torch.from_numpy(np.random.default_rng(0).uniform(0, 4095, (height, width)).astype(np.float32))
+
+
+@pytest.mark.parametrize("mtf_from", [1.001e-4, 1e-3, 0.03, 0.07, 0.25, 0.63])
+@pytest.mark.parametrize("mtf_to", [1.001e-4, 0.25, 0.63])
+@pytest.mark.parametrize("epsilon", [0.0, 3e-3])
+def test_gain_is_one_at_dc_and_finite_everywhere(mtf_from: float, mtf_to: float, epsilon: float) -> None:
+    gain = compensation_gain(26, 35, mtf_from, mtf_to, epsilon)
+    assert float(gain[0, 0]) == 1
+    assert bool(torch.isfinite(gain).all())
+    assert bool((gain >= 0).all())
+
+
+def test_without_regularisation_it_is_the_ratio_of_the_mtfs() -> None:
+    gain = compensation_gain(26, 34, 0.07, 0.25, epsilon=0)
+    assert float(gain[0, 17]) == pytest.approx(0.25 / 0.07)
+
+
+def test_regularisation_holds_the_noise_of_a_weak_mtf_down() -> None:
+    assert float(compensation_gain(26, 34, 0.03, 0.25, epsilon=0).max()) > 15
+    assert float(compensation_gain(26, 34, 0.03, 0.25, EPSILON).max()) < 5
+
+
+@pytest.mark.parametrize("value", [0.0, 1.0, 4095.0])
+def test_a_constant_image_is_unchanged(value: float) -> None:
+    image = torch.full((13, 21), value)
+    torch.testing.assert_close(compensate(image, 0.07, 0.25, EPSILON), image, rtol=1e-6, atol=1e-6)
+
+
+@pytest.mark.parametrize("shape", [(128, 128), (61, 75), (400, 31), (1, 3)])
+def test_the_mean_is_preserved(shape: tuple[int, int]) -> None:
+    """A symmetric filter on a mirrored image: the mean of the crop is that of a period, whatever the size."""
+    image = texture(*shape)
+    restored = compensate(image, 0.07, 0.25, EPSILON)
+    assert float(restored.double().mean() / image.double().mean()) == pytest.approx(1, abs=1e-6)
+
+
+def test_a_regulariser_that_reaches_dc_would_not_preserve_it() -> None:
+    """T H / (H^2 + epsilon), the usual form: 1 % of the light is gone, and PSNR with it."""
+    blur, target = (transfer_function(128, 128, 1, m) for m in (0.07, 0.25))
+    plain = float((target * blur / (blur.square() + 1e-2))[0, 0])
+    assert plain == pytest.approx(1 / 1.01)
+    assert float(compensation_kernel(0.07, 0.25, 1e-2).sum()) == pytest.approx(1, abs=1e-12)
+
+
+@pytest.mark.parametrize("mtf_from", [0.03, 0.07])
+def test_the_kernel_keeps_the_gain_off_dc(mtf_from: float) -> None:
+    kernel = compensation_kernel(mtf_from, 0.25, EPSILON)
+    padded = torch.zeros(512, 512, dtype=torch.float64)
+    padded[:129, :129] = kernel
+    gain = torch.fft.rfft2(padded.roll((-64, -64), (0, 1)))
+    wanted = compensation_gain(512, 512, mtf_from, 0.25, EPSILON)
+    assert float(gain.imag.abs().max()) < 1e-9
+    error = (gain.real / wanted - 1).abs()
+    assert float(error[8:240, 8:240].max()) < 2e-3
+    assert float(error.max()) < 0.04  # at the kink that the gain has where it is continued beyond Nyquist
+
+
+def test_strips_and_blocks_change_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    image, kernel = texture(203, 187), compensation_kernel(0.07, 0.25, EPSILON)
+    whole = compensate(image, 0.07, 0.25, EPSILON)
+    strips = torch.cat(list(filter_strips(torch.split(image, 7), 203, kernel)))
+    assert torch.equal(strips, whole)
+    monkeypatch.setattr(module, "BLOCK_PX", 60)
+    torch.testing.assert_close(compensate(image, 0.07, 0.25, EPSILON), whole, rtol=0, atol=0.01)
+
+
+def test_missing_pixels_reach_no_further_than_the_filter() -> None:
+    image = texture(203, 187)
+    holed = image.clone()
+    holed[:40, :30] = torch.nan
+    whole, restored = (compensate(each, 0.07, 0.25, EPSILON) for each in (image, holed))
+    assert torch.equal(restored.isnan(), holed.isnan())
+    torch.testing.assert_close(restored[104:], whole[104:], rtol=0, atol=0.01)
+    torch.testing.assert_close(restored[:, 94:], whole[:, 94:], rtol=0, atol=0.01)
+    beside = (restored - whole)[40:44, :30].abs().mean()
+    zeros = compensate(holed.nan_to_num(0), 0.07, 0.25, EPSILON)
+    assert float(beside) < 0.7 * float((zeros - whole)[40:44, :30].abs().mean())
+
+
+def test_holes_are_filled_from_around() -> None:
+    image = torch.arange(63.0)[None].expand(37, -1)
+    known = torch.ones_like(image, dtype=torch.bool)
+    known[5:20, 30:40] = False
+    filled = fill_missing(image, known)
+    assert torch.equal(filled[known], image[known])
+    torch.testing.assert_close(filled, image, rtol=0, atol=10)
+    assert torch.equal(fill_missing(image, ~known & False), torch.zeros_like(image))
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (3, 200), (61, 75)])
+def test_any_shape_comes_back_finite(shape: tuple[int, int]) -> None:
+    restored = compensate(texture(*shape), 1.001e-4, 0.63, EPSILON)
+    assert restored.shape == shape
+    assert bool(torch.isfinite(restored).all())
+
+
+def test_it_carries_one_blur_into_the_other() -> None:
+    yy, xx = np.mgrid[:261, :275]
+    scene = torch.from_numpy(2000 + 1000 * np.sin(0.9 * xx + 0.4 * yy) * np.cos(0.07 * xx)).float()
+    blurred, target = (sample(scene_spectrum(scene), transfer_function(261, 275, 1, m), 275, 1) for m in (0.07, 0.25))
+    inside = slice(80, -80), slice(80, -80)
+    before = (blurred - target)[inside].square().mean()
+    after = (compensate(blurred, 0.07, 0.25, epsilon=0) - target)[inside].square().mean()
+    wrong = (compensate(blurred, 0.07, 0.20, epsilon=0) - target)[inside].square().mean()
+    assert float(after) < 1e-3 * float(before)
+    assert float(wrong) > 10 * float(after)
+
+
+@pytest.mark.parametrize("epsilon", [-1e-3, float("nan"), float("inf")])
+def test_a_senseless_epsilon_is_refused(epsilon: float) -> None:
+    with pytest.raises(OptionError, match="epsilon"):
+        compensation_gain(8, 8, 0.07, 0.25, epsilon)
+
+
+def test_mirror_repeats_the_edge_and_may_exceed_the_image() -> None:
+    assert mirrored(-4, 8, 3).tolist() == [2, 2, 1, 0, 0, 1, 2, 2, 1, 0, 0, 1]

@@ -1,0 +1,74 @@
+"""Variance stabilisation: unit variance, an exact inverse, and the limits where formulas usually break."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from model.traditional.noise import bias_radiance, destabilise, stabilise
+from profiles.errors import OptionError
+from profiles.sensor import Sensor, noise_from_snr
+
+NOMINAL = Sensor(0.07, *noise_from_snr(25, 50, 100, 110), gain_dn_per_radiance=10.2375, bits=12)
+LIMITS = [
+    NOMINAL,
+    replace(NOMINAL, beta=0.0),
+    replace(NOMINAL, alpha=0.0),
+    replace(NOMINAL, alpha=1e-7),
+    replace(NOMINAL, alpha=1e-12),
+]
+
+
+def noisy(radiance: float, sensor: Sensor, seed: int) -> torch.Tensor:
+    normal = np.random.default_rng(seed).standard_normal(200_003)
+    return torch.from_numpy(radiance + sensor.noise_sigma(radiance) * normal)
+
+
+@pytest.mark.parametrize("radiance", [5.0, 25.0, 100.0, 390.0])
+def test_noise_has_variance_one_at_every_radiance(radiance: float) -> None:
+    assert float(stabilise(noisy(radiance, NOMINAL, 1), NOMINAL).var()) == pytest.approx(1, abs=0.03)
+
+
+def test_without_it_the_variance_follows_the_light() -> None:
+    assert float(noisy(390, NOMINAL, 1).var() / noisy(5, NOMINAL, 1).var()) > 20
+
+
+@pytest.mark.parametrize("sensor", LIMITS)
+def test_round_trip_in_float32(sensor: Sensor) -> None:
+    radiance = torch.linspace(0, 400, 4097)
+    there_and_back = destabilise(stabilise(radiance, sensor), sensor)
+    torch.testing.assert_close(there_and_back, radiance, rtol=1e-5, atol=1e-6)
+
+
+def test_below_zero_it_goes_on_and_comes_back() -> None:
+    radiance = torch.linspace(-5, 5, 101)
+    stable = stabilise(radiance, NOMINAL)
+    assert bool((stable.diff() > 0).all())
+    torch.testing.assert_close(destabilise(stable, NOMINAL), radiance, rtol=1e-5, atol=1e-6)
+
+
+def test_alpha_to_zero_is_a_division_where_the_difference_of_roots_vanishes() -> None:
+    sensor = replace(NOMINAL, alpha=1e-7, beta=0.25)
+    radiance = torch.tensor([50.0, 50.5])
+    roots = (sensor.alpha * radiance + sensor.beta).sqrt() - sensor.beta**0.5
+    assert float(roots.diff() * 2 / sensor.alpha) == 0
+    assert float(stabilise(radiance, sensor).diff()) == pytest.approx(1, rel=1e-3)
+
+
+def test_no_noise_in_the_dark_is_finite() -> None:
+    sensor = replace(NOMINAL, beta=0.0)
+    stable = stabilise(torch.tensor([-1.0, 0.0, 1.0]), sensor)
+    assert stable.tolist() == pytest.approx([0, 0, 2 / sensor.alpha**0.5])
+
+
+def test_the_bias_of_averaging_is_restored() -> None:
+    sensor = replace(NOMINAL, alpha=0.2)
+    mean = destabilise(stabilise(noisy(25, sensor, 3), sensor).mean(), sensor)
+    assert float(mean) - 25 == pytest.approx(-bias_radiance(sensor), rel=0.2)
+
+
+@pytest.mark.parametrize(("alpha", "beta"), [(-0.01, 0.1), (0.01, -0.01), (0.0, 0.0)])
+def test_an_impossible_noise_is_refused(alpha: float, beta: float) -> None:
+    with pytest.raises(OptionError, match="alpha and beta"):
+        stabilise(torch.ones(3), replace(NOMINAL, alpha=alpha, beta=beta))

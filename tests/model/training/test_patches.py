@@ -1,0 +1,180 @@
+"""Patches made on the fly, and from pairs on disk."""
+
+from dataclasses import replace
+from itertools import islice
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from deploy.restoration.arrays import write_tiff
+from model.conditioning import SensorFamily
+from model.simulator.procedural import procedural_scene
+from model.simulator.sampling import Scene
+from model.training.patches import PatchRecipe, PatchSource, StoredPairs, cut, pair_files, turn
+from model.training.workers import Worker
+from profiles import load_sensor
+from profiles.errors import ImageError
+from profiles.sensor import Sensor
+
+
+def source(
+    scene: Scene | None = None, seed: int = 0, patch_px: int = 32, worker: Worker | None = None
+) -> PatchSource:
+    scene = scene or procedural_scene(420, 480, np.random.default_rng(2))
+    profiles = load_sensor("pleiades-variable"), load_sensor("pleiades-reference")
+    return PatchSource([scene], PatchRecipe(*profiles, patch_px=patch_px), batch=3, seed=seed, worker=worker)
+
+
+def test_the_same_seed_gives_the_same_batches_from_anywhere() -> None:
+    straight, later = source().batches(), source().batches(first=18)
+    batches = [next(straight) for _ in range(20)]
+    for degraded, reference in batches[18:]:
+        again = next(later)
+        assert torch.equal(degraded, again[0])
+        assert torch.equal(reference, again[1])
+    assert not torch.equal(batches[0][0], next(source(seed=1).batches())[0])
+
+
+class OneSensor(SensorFamily):
+    """A family of one, sharp across the track and blurred along it."""
+
+    def draw(self, _generator: np.random.Generator) -> Sensor:
+        return replace(self.like, mtf_nyquist=0.15, mtf_nyquist_along=0.03, alpha=0.0, beta=0.0)
+
+
+def steps(image: torch.Tensor) -> tuple[float, float]:
+    """Mean difference of neighbours, along a row and down a column."""
+    return float(image.diff(dim=-1).abs().mean()), float(image.diff(dim=-2).abs().mean())
+
+
+def test_a_turned_patch_comes_with_the_sensor_as_it_lies() -> None:
+    """Against its reference, a patch has lost more along the axis that its vector calls the more blurred one."""
+    scene = Scene("noise", 100 + 60 * torch.rand(420, 480, generator=torch.Generator().manual_seed(0)))
+    recipe = replace(source().recipe, told=OneSensor(load_sensor("pleiades-degraded").nominal()), oversamplings=(2,))
+    ways = set()
+    for degraded, reference, vectors in islice(PatchSource([scene], recipe, 3, 0).batches(), 30):
+        for one, other, vector in zip(degraded, reference, vectors, strict=True):
+            across, along = (a / b for a, b in zip(steps(one), steps(other), strict=True))
+            assert (across > along) == bool(vector[0] > vector[1])
+            ways.add(across > along)
+    assert ways == {True, False}
+
+
+def test_told_patches_come_with_vectors_of_many_sensors_and_the_same_again() -> None:
+    recipe = replace(source().recipe, told=SensorFamily(load_sensor("pleiades-degraded").nominal()))
+    scene = procedural_scene(420, 480, np.random.default_rng(2))
+    first, again = ([*islice(PatchSource([scene], recipe, 3, 0).batches(k), 20 - k)] for k in (0, 17))
+    vectors = torch.cat([batch[2] for batch in first])
+    assert vectors.shape == (60, 4)
+    assert float(vectors.std(0).min()) > 0.3
+    assert all(
+        torch.equal(a, b) for one, two in zip(first[17:], again, strict=True) for a, b in zip(one, two, strict=True)
+    )
+
+
+def test_a_blind_network_sees_the_axes_of_one_sensor_as_they_are() -> None:
+    """Half turns and mirrors only: what is sharper across the track stays so."""
+    scene = Scene("noise", 100 + 60 * torch.rand(420, 480, generator=torch.Generator().manual_seed(0)))
+    profile = load_sensor("pleiades-degraded")
+    across, along = (replace(profile.mtf_nyquist, value=value) for value in (0.3, 0.03))
+    anisotropic = replace(profile, mtf_nyquist=across, mtf_nyquist_along=along)
+    recipe = replace(source().recipe, degraded=anisotropic, oversamplings=(2,))
+    for degraded, reference in islice(PatchSource([scene], recipe, 3, 0).batches(), 30):
+        kept = [a / b for a, b in zip(steps(degraded), steps(reference), strict=True)]
+        assert kept[0] > kept[1]
+
+
+def test_patches_lie_within_full_scale() -> None:
+    degraded, reference = next(source().batches())
+    assert degraded.shape == reference.shape == (3, 1, 32, 32)
+    for image in (degraded, reference):
+        assert 0 <= float(image.min()) <= float(image.max()) <= 1
+
+
+def test_the_pair_shows_the_same_ground() -> None:
+    degraded, reference = next(source().batches())
+    for one, other in zip(degraded, reference, strict=True):
+        assert np.corrcoef(one.flatten().numpy(), other.flatten().numpy())[0, 1] > 0.7
+
+
+def test_scenes_too_small_for_a_patch_are_refused() -> None:
+    with pytest.raises(ImageError, match="64 target pixels"):
+        next(source(procedural_scene(120, 120, np.random.default_rng(0)), patch_px=64).batches())
+
+
+def test_cut_takes_whole_patches_and_turn_keeps_pairs_together() -> None:
+    image = torch.arange(2 * 30 * 41).reshape(2, 30, 41)
+    rng = np.random.default_rng(0)
+    patches = cut(image, 8, rng)
+    assert patches.shape == (3 * 5 if patches.shape[0] == 15 else patches.shape[0], 2, 8, 8)
+    turned = turn(patches, rng)
+    assert torch.equal(turned[:, 1] - turned[:, 0], torch.full_like(turned[:, 0], 30 * 41))
+
+
+def test_two_workers_share_the_batches_of_one() -> None:
+    """Shard by shard in turn: together they see what one alone would see."""
+    alone = source().batches()
+    shards = [[next(alone)[0] for _ in range(PatchSource.SHARD_BATCHES)] for _ in range(2)]
+    for rank in range(2):
+        own = source(worker=Worker(rank, 2)).batches()
+        assert all(torch.equal(next(own)[0], batch) for batch in shards[rank])
+
+
+def stored(folder: Path, count: int = 3) -> StoredPairs:
+    for k in range(count):
+        reference = np.random.default_rng(k).integers(0, 4096, (41, 53)).astype(np.uint16)
+        write_tiff(folder / "reference" / f"p{k}.tif", reference)
+        write_tiff(folder / "degraded" / f"p{k}.tif", reference // 2)
+    return StoredPairs(pair_files(folder), 24, 4095, batch=4, seed=0)
+
+
+def test_stored_pairs_are_cut_alike_and_the_same_from_anywhere(tmp_path: Path) -> None:
+    pairs = stored(tmp_path)
+    straight = pairs.batches()
+    batches = [next(straight) for _ in range(4)]
+    degraded, reference = batches[3]
+    assert degraded.shape == reference.shape == (4, 1, 24, 24)
+    torch.testing.assert_close((reference * 4095).round() // 2, (degraded * 4095).round())
+    assert torch.equal(next(pairs.batches(first=3))[0], degraded)
+    assert not torch.equal(batches[0][0], degraded)
+
+
+@pytest.mark.parametrize("quarters", [True, False])
+def test_stored_pairs_of_two_different_axes_keep_them(quarters: bool, tmp_path: Path) -> None:
+    """Rows of one brightness each stay rows, unless a patch may be turned by a quarter."""
+    rows = np.broadcast_to(np.arange(41, dtype=np.uint16)[:, None] * 90, (41, 53))
+    for role in ("degraded", "reference"):
+        write_tiff(tmp_path / role / "p.tif", np.ascontiguousarray(rows))
+    pairs = StoredPairs(pair_files(tmp_path), 24, 4095, batch=32, seed=0, quarters=quarters)
+    patches, _ = next(pairs.batches())
+    kept = [bool((patch == patch[..., :1]).all()) for patch in patches]
+    assert any(kept)
+    assert all(kept) is not quarters
+
+
+@pytest.mark.parametrize(
+    ("pixels", "words"),
+    [
+        (np.full((41, 53), 5000, np.uint16), "0 to 4095, got values from 5000"),
+        (np.full((41, 53), 200, np.uint8), "8-bit pixels"),
+        (np.full((41, 53), 0.4, np.float32), "floats of at most 0.4"),
+        (np.full((41, 53), -9, np.float32), "add the offset"),
+    ],
+)
+def test_stored_pairs_of_another_scale_are_refused(pixels: np.ndarray, words: str, tmp_path: Path) -> None:
+    for role in ("degraded", "reference"):
+        write_tiff(tmp_path / role / "p.tif", pixels)
+    with pytest.raises(ImageError, match=words):
+        next(StoredPairs(pair_files(tmp_path), 24, 4095, batch=1, seed=0).batches())
+
+
+def test_stored_pairs_too_small_or_incomplete_are_refused(tmp_path: Path) -> None:
+    pairs = stored(tmp_path)
+    pairs.patch_px = 42
+    with pytest.raises(ImageError, match="42 pixels"):
+        next(pairs.batches())
+    (tmp_path / "degraded" / "p1.tif").unlink()
+    with pytest.raises(ImageError, match="'p1' in one"):
+        pair_files(tmp_path)

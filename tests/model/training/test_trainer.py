@@ -1,0 +1,332 @@
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+from typing import get_args
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from model.conditioning import SensorFamily
+from model.convbeers import ConvBEERS, Variant
+from model.io.weights import load_network, read_tensors
+from model.simulator.procedural import procedural_scene
+from model.simulator.sampling import Scene
+from model.training.checkpoint import Optimiser, TrainingRecipe, finish
+from model.training.guards import MAX_BAD_STEPS, WINDOW_STEPS, Guards
+from model.training.interrupts import held_back
+from model.training.losses import LossWeights
+from model.training.patches import PatchRecipe, PatchSource
+from model.training.trainer import Progress, Schedule, Trainer
+from model.training.workers import Worker
+from profiles import load_sensor
+from profiles.errors import ModelError
+
+VARIANT = Variant(blocks=1, features=4)
+
+
+def source(scene: Scene | None = None, seed: int = 0, patch_px: int = 32) -> PatchSource:
+    scene = scene or procedural_scene(420, 480, np.random.default_rng(2))
+    profiles = load_sensor("pleiades-variable"), load_sensor("pleiades-reference")
+    return PatchSource([scene], PatchRecipe(*profiles, patch_px=patch_px), batch=3, seed=seed)
+
+
+def train(folder: Path, steps: int, *, resume: bool = False, kill_at: int | None = None) -> Trainer:
+    """Run to the end, or until a kill that leaves the checkpoint of the step before."""
+
+    def report(progress: Progress) -> None:
+        if progress.step == kill_at:
+            raise KeyboardInterrupt
+
+    trainer = Trainer(VARIANT, TrainingRecipe(steps=steps, batch=3, warm_up_steps=2))
+    checkpoint = folder / "checkpoint.safetensors"
+    if resume:
+        trainer.resume(checkpoint)
+    trainer.run(source(), checkpoint, Schedule(1, 0.0, report=report))
+    return trainer
+
+
+def train_told(folder: Path, *, resume: bool = False, kill_at: int | None = None) -> Trainer:
+    def report(progress: Progress) -> None:
+        if progress.step == kill_at:
+            raise KeyboardInterrupt
+
+    trainer = Trainer(VARIANT, TrainingRecipe(steps=8, batch=3, warm_up_steps=2), told=True)
+    checkpoint = folder / "checkpoint.safetensors"
+    if resume:
+        trainer.resume(checkpoint)
+    trainer.run(told_source(), checkpoint, Schedule(1, 0.0, report=report))
+    return trainer
+
+
+def told_source() -> PatchSource:
+    recipe = replace(source().recipe, told=SensorFamily(load_sensor("pleiades-degraded").nominal()))
+    return PatchSource([procedural_scene(420, 480, np.random.default_rng(2))], recipe, batch=3, seed=0)
+
+
+def test_a_told_network_killed_and_resumed_equals_the_unbroken_one_in_every_bit(tmp_path: Path) -> None:
+    unbroken = train_told(tmp_path / "a")
+    with pytest.raises(KeyboardInterrupt):
+        train_told(tmp_path / "b", kill_at=5)
+    resumed = train_told(tmp_path / "b", resume=True)
+    for trainer, folder in ((unbroken, "a"), (resumed, "b")):
+        finish(trainer.averaged(), tmp_path / folder / "weights.safetensors", {"steps": 8})
+    for name in ("weights.safetensors", "checkpoint.safetensors"):
+        (tensors, header), (others, other_header) = (read_tensors(tmp_path / folder / name) for folder in "ab")
+        assert header == other_header
+        assert tensors.keys() == others.keys()
+        assert all(torch.equal(tensor, others[name]) for name, tensor in tensors.items())
+
+
+def test_a_told_run_moves_base_directions_and_coefficients(tmp_path: Path) -> None:
+    before, after = Trainer(VARIANT, TrainingRecipe(steps=8), told=True), train_told(tmp_path)
+    moved = {
+        name.split(".")[0]: not torch.equal(value, after.network.state_dict()[name])
+        for name, value in before.network.state_dict().items()
+    }
+    assert moved == {"base": True, "directions": True, "coefficients": True}
+
+
+def test_plain_and_told_checkpoints_are_not_taken_for_one_another(tmp_path: Path) -> None:
+    recipe = TrainingRecipe(steps=8, batch=3, warm_up_steps=2)
+    train(tmp_path / "plain", 8)
+    train_told(tmp_path / "told")
+    for written, told in (("plain", True), ("told", False)):
+        with pytest.raises(ModelError, match="checkpoint of this network"):
+            Trainer(VARIANT, recipe, told=told).resume(tmp_path / written / "checkpoint.safetensors")
+
+
+@pytest.mark.parametrize("kill_at", [2, 5, 8])
+def test_killed_and_resumed_equals_unbroken(kill_at: int, tmp_path: Path) -> None:
+    unbroken = train(tmp_path / "a", 8)
+    with pytest.raises(KeyboardInterrupt):
+        train(tmp_path / "b", 8, kill_at=kill_at)
+    resumed = train(tmp_path / "b", 8, resume=True)
+    for name, value in unbroken.network.state_dict().items():
+        assert torch.equal(value, resumed.network.state_dict()[name])
+        assert torch.equal(unbroken.average[name], resumed.average[name])
+
+
+def test_a_resumed_run_goes_on_where_the_killed_one_was_saved(tmp_path: Path) -> None:
+    with pytest.raises(KeyboardInterrupt):
+        train(tmp_path, 8, kill_at=5)
+    later = Trainer(VARIANT, TrainingRecipe(steps=8, batch=3, warm_up_steps=2))
+    later.resume(tmp_path / "checkpoint.safetensors")
+    assert later.step == 4
+
+
+def test_a_checkpoint_of_another_recipe_is_refused(tmp_path: Path) -> None:
+    train(tmp_path, 4)
+    other = Trainer(VARIANT, TrainingRecipe(steps=5))
+    with pytest.raises(ModelError, match="another recipe"):
+        other.resume(tmp_path / "checkpoint.safetensors")
+
+
+def test_training_lowers_the_loss(tmp_path: Path) -> None:
+    losses: list[float] = []
+    recipe = TrainingRecipe(steps=60, batch=3, warm_up_steps=5)
+    Trainer(VARIANT, recipe).run(
+        source(), tmp_path / "c", Schedule(20, report=lambda p: losses.append(p.terms["l1"]))
+    )
+    assert losses[-1] < 0.8 * losses[0]
+
+
+class Poisoned(PatchSource):
+    """A source whose batches are NaN, all or those of some numbers."""
+
+    bad: frozenset[int] | None = None
+
+    def batches(self, first: int = 0) -> Iterator[tuple[Tensor, Tensor]]:
+        for number, (degraded, reference) in enumerate(super().batches(first), first):
+            yield (degraded * float("nan") if self.bad is None or number in self.bad else degraded), reference
+
+
+def poisoned(bad: frozenset[int] | None = None) -> Poisoned:
+    made = Poisoned([procedural_scene(420, 480, np.random.default_rng(2))], source().recipe, 3, 0)
+    made.bad = bad
+    return made
+
+
+def copies(trainer: Trainer) -> list[Tensor]:
+    return [t.clone() for t in (*trainer.network.state_dict().values(), *trainer.average.values())]
+
+
+def test_nan_batches_stop_the_run_and_touch_no_weight(tmp_path: Path) -> None:
+    trainer = Trainer(VARIANT, TrainingRecipe(steps=50, batch=3))
+    before = copies(trainer)
+    with pytest.raises(ModelError, match=str(MAX_BAD_STEPS + 1)):
+        trainer.run(poisoned(), tmp_path / "c", Schedule())
+    assert all(torch.equal(*both) for both in zip(copies(trainer), before, strict=True))
+
+
+def test_one_nan_batch_is_skipped_and_the_run_goes_on(tmp_path: Path) -> None:
+    trainer, seen = Trainer(VARIANT, TrainingRecipe(steps=6, batch=3)), []
+    trainer.run(poisoned(frozenset({2})), tmp_path / "c", Schedule(1, report=lambda _: seen.append(copies(trainer))))
+    moved = [not all(map(torch.equal, one, other)) for one, other in pairwise(seen)]
+    assert moved == [True, False, True, True, True]
+    assert trainer.guards.bad_steps == 1
+    again = Trainer(VARIANT, TrainingRecipe(steps=6, batch=3))
+    again.resume(tmp_path / "c")
+    assert again.guards.bad_steps == 1
+
+
+@pytest.mark.parametrize("level", [0.0, 80.0, 4000.0])
+def test_a_constant_scene_trains_without_nan(level: float, tmp_path: Path) -> None:
+    scene = Scene("flat", torch.full((420, 480), level))
+    trainer = Trainer(VARIANT, TrainingRecipe(steps=4, batch=3))
+    trainer.run(source(scene), tmp_path / "c", Schedule())
+    assert trainer.guards.bad_steps == 0
+    assert all(torch.isfinite(value).all() for value in trainer.network.state_dict().values())
+
+
+def test_finished_weights_carry_their_recipe(tmp_path: Path) -> None:
+    trainer = train(tmp_path, 3)
+    finish(trainer.averaged(), tmp_path / "w.safetensors", {"loss": "L1", "steps": 3})
+    network, recipe = load_network(tmp_path / "w.safetensors")
+    assert recipe == {"loss": "L1", "steps": 3}
+    assert network.variant == VARIANT
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_ctrl_c_finishes_the_step_and_leaves_a_checkpoint_of_it(number: int, tmp_path: Path) -> None:
+    def report(progress: Progress) -> None:
+        if progress.step == 4:
+            signal.raise_signal(number)
+
+    trainer = Trainer(VARIANT, TrainingRecipe(steps=8, batch=3, warm_up_steps=2))
+    with pytest.raises(KeyboardInterrupt):
+        trainer.run(source(), tmp_path / "checkpoint.safetensors", Schedule(1, report=report))
+    assert trainer.step == 4
+    resumed, unbroken = train(tmp_path, 8, resume=True), train(tmp_path / "b", 8)
+    assert all(map(torch.equal, copies(resumed), copies(unbroken)))
+
+
+def test_a_second_ctrl_c_stops_at_once() -> None:
+    def ask(times: int) -> bool:
+        with held_back() as interrupt:
+            for _ in range(times):
+                signal.raise_signal(signal.SIGINT)
+            return interrupt.asked
+
+    before = signal.getsignal(signal.SIGINT)  # ignored where the tests were started in the background
+    assert ask(1)
+    with pytest.raises(KeyboardInterrupt):
+        ask(2)
+    assert signal.getsignal(signal.SIGINT) is before
+
+
+def test_a_loss_that_runs_away_stops_the_run() -> None:
+    guards = Guards()
+    for step in range(WINDOW_STEPS):
+        guards.passed(step, 0.01)
+    for step in range(WINDOW_STEPS):
+        guards.passed(step, 0.04)  # four times the best: a hard batch of scenes
+    for step in range(WINDOW_STEPS - 1):
+        guards.passed(step, 0.06)
+    with pytest.raises(ModelError, match="diverged"):
+        guards.passed(WINDOW_STEPS, 0.06)
+
+
+def test_guards_survive_a_resume() -> None:
+    guards = Guards()
+    for step in range(WINDOW_STEPS + 7):
+        guards.passed(step, 0.01 + step * 1e-6)
+    again = Guards.from_json(guards.to_json())
+    assert again.to_json() == guards.to_json()
+    assert Guards.from_json(Guards().to_json()).best == float("inf")
+
+
+def test_a_student_is_pulled_towards_its_teacher(tmp_path: Path) -> None:
+    teacher = train(tmp_path, 4).averaged()
+    assert isinstance(teacher, ConvBEERS)
+    for parameter in teacher.parameters():
+        parameter.data.mul_(1.5)
+
+    def distance(distil: float) -> float:
+        recipe = TrainingRecipe(
+            steps=60, batch=3, loss=LossWeights(lpips=0.0, fft=0.0), distil=distil, warm_up_steps=5
+        )
+        student = Trainer(VARIANT, recipe, teacher=teacher if distil else None)
+        student.run(source(), tmp_path / f"{distil}", Schedule())
+        image = next(source(seed=3).batches())[0]
+        return float((student.averaged()(image) - teacher(image)).detach().abs().mean())
+
+    assert distance(20.0) < 0.7 * distance(0.0)
+
+
+def test_fine_tuning_starts_from_the_weights_given(tmp_path: Path) -> None:
+    first = train(tmp_path, 4).averaged()
+    again = Trainer(VARIANT, TrainingRecipe(steps=4), start=first.state_dict())
+    assert all(torch.equal(a, b) for a, b in zip(first.parameters(), again.network.parameters(), strict=True))
+
+
+def test_adamw_pulls_weights_towards_zero(tmp_path: Path) -> None:
+    norms = {}
+    optimisers: tuple[Optimiser, ...] = get_args(Optimiser)
+    for name in optimisers:
+        recipe = TrainingRecipe(steps=12, batch=3, optimiser=name, weight_decay=20.0, warm_up_steps=1)
+        trainer = Trainer(VARIANT, recipe)
+        trainer.run(source(), tmp_path / name, Schedule())
+        assert isinstance(trainer.network, ConvBEERS)
+        norms[name] = float(trainer.network.head.weight.detach().norm())
+    assert norms["adamw"] < 0.95 * norms["adam"]
+
+
+WORKER = """
+import sys
+from pathlib import Path
+import torch
+sys.path.insert(0, sys.argv[2])
+from test_trainer import VARIANT, Schedule, Trainer, TrainingRecipe, worker_source
+from model.training.workers import joined
+torch.set_num_threads(1)
+with joined("cpu") as worker:
+    trainer = Trainer(VARIANT, TrainingRecipe(steps=3, batch=3, warm_up_steps=1), worker=worker, precision="float32")
+    trainer.run(worker_source(worker), Path(sys.argv[1]), Schedule())
+"""
+
+
+def worker_source(worker: Worker) -> PatchSource:
+    scene = procedural_scene(420, 480, np.random.default_rng(2))
+    return PatchSource([scene], source().recipe, batch=3, seed=0, worker=worker)
+
+
+class Together:
+    """The batches of two workers as one."""
+
+    def batches(self, first: int = 0) -> Iterator[tuple[Tensor, Tensor]]:
+        each = [worker_source(Worker(rank, 2)).batches(first) for rank in range(2)]
+        for one, other in zip(*each, strict=True):
+            yield torch.cat([one[0], other[0]]), torch.cat([one[1], other[1]])
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="torch for Windows lacks the libuv that torchrun asks for")
+def test_two_workers_do_the_steps_of_one_with_a_batch_twice_as_large(tmp_path: Path) -> None:
+    script = tmp_path / "worker.py"
+    script.write_text(WORKER)
+    command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node=2"]
+    here = Path(__file__).parent
+    environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(here.parents[2])}
+    result = subprocess.run(
+        [*command, str(script), str(tmp_path / "two"), str(here)],
+        env=environment,
+        capture_output=True,
+        text=True,
+        timeout=240,
+        check=False,
+    )
+    assert result.returncode == 0, result.stderr[-2000:]
+    recipe = TrainingRecipe(steps=3, batch=3, warm_up_steps=1)
+    alone, two = (Trainer(VARIANT, recipe, precision="float32") for _ in range(2))
+    alone.run(Together(), tmp_path / "one", Schedule())
+    two.resume(tmp_path / "two")
+    start = Trainer(VARIANT, recipe)
+    for name, value in alone.network.state_dict().items():
+        moved = float((value - start.network.state_dict()[name]).abs().max())
+        torch.testing.assert_close(two.network.state_dict()[name], value, rtol=0, atol=0.1 * moved)

@@ -1,0 +1,55 @@
+"""What docs/architecture.md says of the packages, held against the code."""
+
+import ast
+from graphlib import TopologicalSorter
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+PACKAGES = ("profiles", "model", "quant", "deploy")
+MOST_MODULES = 16
+
+
+def modules() -> dict[str, Path]:
+    """Every module of ours by its name; a package goes by its own."""
+    files = [path for package in PACKAGES for path in (ROOT / package).rglob("*.py")]
+    names = [".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__") for path in files]
+    return dict(zip(names, files, strict=True))
+
+
+def imported(path: Path, known: dict[str, Path]) -> set[str]:
+    """What a module imports of ours as it is loaded; not what its functions import when they run."""
+    found: set[str] = set()
+    for node in ast.parse(path.read_text(encoding="utf-8")).body:
+        if isinstance(node, ast.ImportFrom) and node.module:
+            found |= {f"{node.module}.{alias.name}" for alias in node.names} | {node.module}
+        elif isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+    return {name for name in found if name in known and known[name].name != "__init__.py"}
+
+
+def test_no_module_imports_itself_by_a_detour() -> None:
+    known = modules()
+    order = TopologicalSorter({name: imported(path, known) for name, path in known.items()})
+    assert len(list(order.static_order())) == len(known)  # a circle raises, and names its modules
+
+
+def test_a_file_imports_only_from_packages_before_its_own() -> None:
+    known = modules()
+    for name, path in known.items():
+        own = PACKAGES.index(name.split(".")[0])
+        assert {PACKAGES.index(each.split(".")[0]) for each in imported(path, known)} <= set(range(own + 1)), name
+
+
+def test_packages_stay_small_enough_to_look_through_and_say_what_is_inside() -> None:
+    for path in modules().values():
+        if path.name == "__init__.py":
+            beside = [each for each in path.parent.glob("*.py") if each != path]
+            assert len(beside) <= MOST_MODULES, path.parent
+            assert ast.get_docstring(ast.parse(path.read_text(encoding="utf-8"))), path
+
+
+def test_the_page_names_files_that_are_there() -> None:
+    page = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
+    named = {word for word in page.split("`") if word.startswith(tuple(f"{each}/" for each in PACKAGES))}
+    assert len(named) > 40
+    assert not [word for word in named if not (ROOT / word).exists()]
