@@ -5,7 +5,7 @@ from pathlib import Path
 
 import onnx
 
-from deploy.bench.host import peak_memory
+from deploy.bench.host_state import peak_memory
 from deploy.cluster import check_choice
 from deploy.restoration.arrays import check_fixed_tile, parse_halo
 from deploy.restoration.engine import Restorer, Say, fill_here, seam_error_dn

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from deploy.bench.host import peak_memory
+from deploy.bench.host_state import peak_memory
 from deploy.progress import steps
 from deploy.restoration.engine import as_stored, checked_band
 from deploy.restoration.options import Compression, fingerprint

@@ -15,7 +15,7 @@ from threading import Lock
 import numpy as np
 import onnx
 
-from deploy.bench.host import peak_memory
+from deploy.bench.host_state import peak_memory
 from deploy.cluster import PIECES_PER_SLOT, here, open_cluster, slots_here, unreachable
 from deploy.restoration.engine import Restored, Restorer, Say, Tick, filling, restore_row, rows_left, write_behind
 from deploy.restoration.options import Options, fingerprint

@@ -9,17 +9,8 @@ import numpy as np
 import onnx
 import pytest
 
-from deploy.bench.host import (
-    Sensors,
-    Timed,
-    drawn_acquisition,
-    host_rows,
-    memory_rise,
-    take_turns,
-    timed_rows,
-    traditional_rows,
-    watched,
-)
+from deploy.bench.host import Sensors, Timed, drawn_acquisition, host_rows, take_turns, timed_rows, traditional_rows
+from deploy.bench.host_state import memory_rise, watched
 from deploy.bench.profile import node_rows, profile
 from deploy.bench.tables import Swath, board_cpu_row, slowdown
 from deploy.defaults import counterpart, float_model, is_quantised
