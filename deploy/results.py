@@ -15,7 +15,7 @@ from model.io.files import sha256, write_text
 from model.processor import decided, processor_name
 from profiles.errors import visible
 from profiles.figures import Figure, Row
-from quant.gate import Check
+from quant.checks import Check
 
 SCHEMA_NAME, SCHEMA_VERSION = "beers-deploy/results", 2
 SCHEMA_PATH = Path(__file__).parent / "schema" / "results-2.json"

@@ -9,7 +9,7 @@ from deploy.cli import app
 from deploy.compare import compare, parse_limit, read_document
 from deploy.results import Document
 from profiles.figures import Figure, Row, measured, predicted, unavailable
-from quant.gate import Check
+from quant.checks import Check
 
 
 def document(path: Path, psnr: float = 46.5, mae: float = 0.0006, more: tuple[Row, ...] = ()) -> Path:

@@ -10,7 +10,9 @@ from deploy.compare import read_document
 from deploy.gate import gate_row
 from deploy.results import SCHEMA_PATH, Document
 from profiles.figures import Figure, Row, measured, number, predicted, published, unavailable
-from quant.gate import Check, GateResult, Limits, judge
+from quant.checks import Check
+from quant.gate import GateResult
+from quant.limits import Limits, judge
 
 SCHEMA = json.loads(SCHEMA_PATH.read_text())
 

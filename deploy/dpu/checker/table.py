@@ -14,7 +14,7 @@ from deploy.dpu.checker.traditional import Step
 from model.io.files import write_text
 from profiles.errors import OptionError
 from profiles.figures import Figure, Row, predicted, unavailable
-from quant.gate import Check
+from quant.checks import Check
 
 Remark = Callable[[Placement, Dpu, int], str | None]
 """Looks at a placed network, the DPU and the tile's side; None where there is nothing to say."""
