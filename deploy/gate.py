@@ -35,8 +35,7 @@ from profiles.toml import read_json, unreadable
 from quant.calibration import Patches, draw_patches
 from quant.checks import Check
 from quant.encodings import spelling_faults
-from quant.gate import GateResult, compare
-from quant.limits import Limits, judge, judge_saturation
+from quant.gate import GateResult, Limits, compare, judge, judge_saturation
 from quant.onnx_file import fixed_tile_px, load_onnx
 from quant.relus import count_relus
 from quant.saturation import saturated_shares

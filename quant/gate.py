@@ -1,12 +1,19 @@
-"""The float/INT8 gate: what INT8 changes, and whether that is too much."""
+"""The float/INT8 gate: what INT8 changes, and the limits, by name, that say whether that is too much."""
 
-from collections.abc import Iterable
-from dataclasses import dataclass
+import math
+import sys
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import onnxruntime as ort
 
 from model.metrics.fidelity import psnr_db
+from profiles.errors import OptionError
+from profiles.toml import read_toml_text, unreadable
+from quant.checks import Check
 from quant.session import run
 
 
@@ -64,3 +71,88 @@ def compare(
 def _as_in_a_file(restored: np.ndarray) -> np.ndarray:
     """Clipped to [0, 1]; NaN where infinite, which no clipping makes a pixel."""
     return np.where(np.isinf(restored), np.nan, np.clip(restored, 0, 1))
+
+
+@dataclass(frozen=True)
+class Limits:
+    """The largest values allowed; None for no limit. Differences and shares in [0, 1], PSNRs in dB.
+
+    Attributes:
+        mae: mean absolute difference of INT8 from float.
+        p999: 99.9th percentile of its size.
+        std_over_mae: 1.25 is rounding alone; clipping drives it up.
+        psnr_drop_db: PSNR lost against the reference.
+        min_psnr_float_int8_db: smallest PSNR of INT8 against float.
+        saturated: share of a layer's results at the ends of 8 bits, of the layer with most.
+        mae_growth: how many times a stored baseline's MAE.
+    """
+
+    mae: float | None = 0.0007
+    p999: float | None = None
+    std_over_mae: float | None = None
+    psnr_drop_db: float | None = None
+    min_psnr_float_int8_db: float | None = None
+    saturated: float | None = None
+    mae_growth: float | None = 1.05
+
+
+def read_limits(path: Path | None, mae: float | None) -> Limits:
+    """The limits of a TOML file such as `mae = 0.0007`, or the defaults; `mae` overrides.
+
+    Raises:
+        OptionError: not such a file.
+    """
+    limits = Limits() if path is None else _parse(path)
+    return limits if mae is None else replace(limits, mae=mae)
+
+
+def _parse(path: Path) -> Limits:
+    names = [field.name for field in fields(Limits)]
+    try:
+        raw = read_toml_text(path)
+    except (OSError, ValueError) as error:
+        got = unreadable(path) or " ".join(str(error).split())[:120]
+        raise OptionError(
+            str(path), expected="a TOML file of limits", got=got, remedy="write mae = 0.0007"
+        ) from error
+    for name, value in raw.items():
+        if name not in names or not _is_limit(value):
+            expected = f"numbers above 0 named {', '.join(names)}"
+            raise OptionError(str(path), expected=expected, got=f"{name} = {value!r}", remedy="correct that line")
+    given: dict[str, Any] = {**dict.fromkeys(names), "mae_growth": Limits.mae_growth, **raw}
+    return Limits(**given)
+
+
+def _is_limit(value: object) -> bool:
+    """A number above 0 that float64 holds, or infinity."""
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return False
+    return value == math.inf or 0 < value <= sys.float_info.max
+
+
+def judge(result: GateResult, limits: Limits, baseline_mae: float | None = None) -> list[Check]:
+    """Every limit that is set, against what was found."""
+    scale = "of full scale"
+    checks = [
+        _at_most("MAE", result.mae, limits.mae, scale),
+        _at_most("99.9th percentile", result.p999, limits.p999, scale),
+        _at_most("std / MAE", result.std_over_mae, limits.std_over_mae, "ratio"),
+        _at_most("PSNR drop", result.drop_db, limits.psnr_drop_db, "dB"),
+    ]
+    if limits.min_psnr_float_int8_db is not None:
+        least = limits.min_psnr_float_int8_db
+        checks.append([Check("PSNR float-INT8", result.psnr_between_db, least, "dB", "at least")])
+    if baseline_mae is not None and limits.mae_growth is not None:
+        allowed, detail = limits.mae_growth * baseline_mae, f"the baseline has {baseline_mae:.4g}"
+        checks.append(_at_most("MAE against the baseline", result.mae, allowed, scale, detail))
+    return [check for found in checks for check in found]
+
+
+def judge_saturation(shares: Mapping[str, float], limits: Limits) -> list[Check]:
+    """The layer that saturates most, against the limit if there is one; where nothing is 8-bit none is kept."""
+    layer, share = max(shares.items(), key=lambda item: item[1], default=("any layer: none is 8-bit", math.nan))
+    return _at_most("saturated results", share, limits.saturated, "of a layer's", f"in {layer}")
+
+
+def _at_most(name: str, value: float, limit: float | None, unit: str, detail: str = "") -> list[Check]:
+    return [] if limit is None else [Check(name, value, limit, unit, detail=detail)]

@@ -83,7 +83,7 @@ def gate(
     from deploy.gate import Reports, Request, files_or_shipped, run_gate, sentence
     from deploy.results import print_rows
     from model.io.files import claim_outputs, require_writable
-    from quant.limits import read_limits
+    from quant.gate import read_limits
 
     read = (float_model, int8_model, config, baseline, images, *map(Path, (target, sensor)))
     claim_outputs(json, junit, summary, outputs, inputs=read)  # before bad input is told there

@@ -25,8 +25,7 @@ from quant.calibration import Patches, draw_patches
 from quant.checks import Bound, Check
 from quant.encodings import read_core
 from quant.free import quantise_free
-from quant.gate import compare
-from quant.limits import Limits, judge, judge_saturation, read_limits
+from quant.gate import Limits, compare, judge, judge_saturation, read_limits
 from quant.onnx_file import image_info, save_onnx
 from quant.relus import Relus, count_relus
 from quant.saturation import rounded_tensors, saturated_shares

@@ -11,8 +11,7 @@ from deploy.gate import gate_row
 from deploy.results import SCHEMA_PATH, Document
 from profiles.figures import Figure, Row, measured, number, predicted, published, unavailable
 from quant.checks import Check
-from quant.gate import GateResult
-from quant.limits import Limits, judge
+from quant.gate import GateResult, Limits, judge
 
 SCHEMA = json.loads(SCHEMA_PATH.read_text())
 

@@ -30,7 +30,7 @@ from profiles.errors import BeersError, ModelError, OptionError, ProfileError
 from profiles.figures import Row, measured
 from profiles.toml import HERE, read_json, read_toml_text
 from quant.checks import Check
-from quant.limits import read_limits
+from quant.gate import read_limits
 from quant.onnx_file import load_onnx
 from tests.fuzz.parsers import JOB, SHAPE, checkpoint_seeds, go_on, weights_seeds
 

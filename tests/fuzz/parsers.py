@@ -44,8 +44,8 @@ from profiles.figures import Figure, Row, measured, predicted, unavailable
 from profiles.scene_call import load_scene_call
 from quant.checks import Check
 from quant.encodings import spelling_faults
+from quant.gate import read_limits
 from quant.graph import correction_graph
-from quant.limits import read_limits
 from quant.onnx_file import fixed_tile_px, load_onnx
 from quant.radius import receptive_radius_px
 from quant.relus import count_relus

@@ -9,9 +9,8 @@ from onnx import numpy_helper
 from quant.calibration import Patches
 from quant.core import IntConv, build_core, shift_faults
 from quant.encodings import host_model
-from quant.gate import compare
+from quant.gate import Limits, compare, judge
 from quant.graph import CORRECTION, POSITION, correction_graph, read_planes, split
-from quant.limits import Limits, judge
 from quant.onnx_file import metadata, save_onnx
 from quant.passes.stream import merge
 from quant.quantise import Quantised, quantise_model
