@@ -85,10 +85,12 @@ def _adds_exactly(core: Any) -> bool:
 
 def _core() -> Any:  # openvino.Core, an optional package
     try:
-        return import_module("openvino").Core()
+        openvino = import_module("openvino")
     except ImportError as error:
         got, remedy = "no package openvino", "pip install 'beers-deploy[openvino]'"
         raise MachineError("--runtime", expected="OpenVINO installed", got=got, remedy=remedy) from error
+    openvino.Type.f32.to_dtype()  # fills a table: two threads that are its first callers lock each other up (2026.4)
+    return openvino.Core()
 
 
 def saturating_adds(model: onnx.ModelProto) -> onnx.ModelProto:
