@@ -14,7 +14,7 @@ from PIL import Image
 
 from model.io.tiff import check_page, open_tiff
 from profiles.errors import BeersError, ImageError, MachineError, OptionError, sizes
-from profiles.toml import read_whole
+from profiles.toml import read_whole, unreadable
 
 TIFF_SUFFIXES = {".tif", ".tiff"}
 IMAGE_SUFFIXES = TIFF_SUFFIXES | {".png", ".jpg", ".jpeg"}
@@ -54,13 +54,9 @@ def require_image_file(path: Path) -> None:
     Raises:
         ImageError: either.
     """
-    try:
-        found = path.is_file()
-    except OSError as error:  # such as a name that is too long
-        got = error.strerror or str(error)
-        raise ImageError(str(path), expected="an image file", got=got, remedy="check the path") from error
-    if not found:
-        raise ImageError(str(path), expected="an image file", got="no such file", remedy="check the path")
+    got = unreadable(path)
+    if got is not None:
+        raise ImageError(str(path), expected="an image file", got=got, remedy="check the path")
     if path.stat().st_size == 0:
         raise ImageError(str(path), expected="an image", got="an empty file", remedy="write or copy it again")
 

@@ -22,6 +22,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from profiles.errors import ModelError, OptionError
+from profiles.toml import unreadable
 
 
 @dataclass(frozen=True)
@@ -204,8 +205,9 @@ def read_tensors(path: Path, names: Iterable[str]) -> dict[str, Tensor]:
     """
     if path.suffix not in SUFFIXES:
         raise _error(path, "a .safetensors or .npz file", f"'{path.suffix}', which is not read", CONVERT)
-    if not path.is_file():
-        raise _error(path, "a weights file", "no such file", "check the path")
+    got = unreadable(path)
+    if got is not None:
+        raise _error(path, "a weights file", got, "check the path")
     read = _read_npz if path.suffix == ".npz" else _read_safetensors
     try:
         return {name: _as_float32(tensor) for name, tensor in read(path, names).items()}

@@ -101,6 +101,11 @@ def test_a_missing_file_is_refused(name: str, tmp_path: Path) -> None:
         list_images(tmp_path / name)
 
 
+def test_a_folder_is_named_as_one(tmp_path: Path) -> None:
+    with pytest.raises(ImageError, match="got a folder"):
+        read_pixels(tmp_path)
+
+
 def test_nan_is_counted(tmp_path: Path) -> None:
     pixels = np.ones((6, 7), np.float32)
     pixels[2, 3] = np.nan
