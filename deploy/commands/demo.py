@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from deploy.commands.saying import say
+from deploy.commands.shared import say
 from model.processor import SEEDS
 from model.shipped import SENSOR
 

@@ -5,8 +5,7 @@ from typing import Annotated
 
 import typer
 
-from deploy.commands.saying import say
-from deploy.commands.unasked import refuse
+from deploy.commands.shared import refuse, say
 from model.shipped import VARIANT
 
 EXAMPLE = "export --variant convbeers-s --out float.onnx"

@@ -7,7 +7,7 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperCommand
 
-from deploy.commands.saying import say
+from deploy.commands.shared import say
 from model.processor import SEEDS
 from model.shipped import SENSOR
 

@@ -4,7 +4,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from deploy.commands.saying import say
+from deploy.commands.shared import say
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

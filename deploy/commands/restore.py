@@ -6,8 +6,7 @@ from typing import Annotated
 
 import typer
 
-from deploy.commands.saying import say
-from deploy.commands.unasked import refuse
+from deploy.commands.shared import refuse, say
 from deploy.restoration.options import TILE_PX, Compression, Options, Runtime
 
 EXAMPLE = "restore raw.tif restored.tif"

@@ -5,8 +5,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from deploy.commands.saying import say
-from deploy.commands.unasked import refuse
+from deploy.commands.shared import refuse, say
 from model.processor import SEEDS
 from model.shipped import SENSOR, VARIANT
 

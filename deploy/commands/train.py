@@ -5,8 +5,7 @@ from typing import Annotated
 
 import typer
 
-from deploy.commands.saying import say
-from deploy.commands.unasked import refuse
+from deploy.commands.shared import refuse, say
 from model.processor import SEEDS
 
 EXAMPLE = "train --variant convbeers-s --images aerial/ --out runs/s --steps 20000"

@@ -1,8 +1,10 @@
-"""Options that were given where they would do nothing: better said than ignored."""
+"""What all commands share: how they print besides tables, and how they refuse options that would do nothing."""
 
 from collections.abc import Iterable
 
 import typer
+
+from profiles.errors import OptionError, visible
 
 
 def refuse(context: typer.Context, names: Iterable[str], *, expected: str, got: str, remedy: str) -> None:
@@ -18,10 +20,13 @@ def refuse(context: typer.Context, names: Iterable[str], *, expected: str, got: 
     Raises:
         OptionError: one was given.
     """
-    from profiles.errors import OptionError
-
     options = {parameter.name: parameter.opts[0] for parameter in context.command.params}
     for name in names:
         source = context.get_parameter_source(name)
         if source is not None and source.name == "COMMANDLINE" and context.params[name]:
             raise OptionError(options[name], expected=expected, got=got, remedy=remedy)
+
+
+def say(text: str, err: bool = False) -> None:
+    """Print lines on standard output, or on standard error, in characters that a terminal shows and does not obey."""
+    typer.echo(visible(text), err=err)
