@@ -15,12 +15,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from deploy.evaluation.pairs import NamedPair, simulate_pairs
-from deploy.evaluation.run import Fixed, conditions
-from deploy.evaluation.scores import fidelity_db
 from deploy.export import network_for
 from model.conditioning import fold, tell
 from model.convbeers import ConvBEERS
+from model.evaluation.pairs import NamedPair, simulate_pairs
+from model.evaluation.run import Fixed, conditions
+from model.evaluation.scores import fidelity_db
 from model.io.images import list_images, site_of
 from model.io.weights import is_told, load_told
 from model.simulator.sampling import Scene, read_scene

@@ -13,23 +13,24 @@ import torch
 
 from deploy.bench.host import Sensors, traditional_rows
 from deploy.bench.tables import Swath, predict_file, predicted_rows, published_rows
-from deploy.defaults import HELD_OUT_SEED, float_model, load_scenes
+from deploy.defaults import HELD_OUT_SEED, float_model
 from deploy.dpu.board import Dpu, load_dpu
 from deploy.dpu.checker.placement import place
 from deploy.dpu.reading import read_network
-from deploy.evaluation.methods import Restore
-from deploy.evaluation.scores import fidelity_row
 from deploy.export import require_parity
 from deploy.gate import gate_row
 from deploy.report.demo_page import INT8, SWATH_PX, TRADITIONAL, comparison, demo_report
 from deploy.report.page import Report
-from deploy.restoration.arrays import TILE_PX, read_acquisition, restore_image, write_tiff
-from model.io.images import read_pixels
+from deploy.restoration.arrays import TILE_PX, restore_image
+from model.evaluation.methods import Restore
+from model.evaluation.scores import fidelity_row
+from model.io.images import read_acquisition, read_pixels
+from model.io.tiff import write_tiff
 from model.io.weights import load_network
 from model.shipped import SENSOR, VARIANT, default_float_weights
 from model.simulator.acquire import MARGIN_PX, Pair, simulate_pair
 from model.simulator.detector import Draw
-from model.simulator.procedural import procedural_scene
+from model.simulator.procedural import load_scenes, procedural_scene
 from model.simulator.sampling import Scene, read_scene
 from model.traditional.pipeline import Chain, restore_traditional
 from profiles import load_sensor

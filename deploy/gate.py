@@ -19,7 +19,7 @@ from xml.etree import ElementTree as ET
 import numpy as np
 import onnx
 
-from deploy.defaults import HELD_OUT_SEED, float_model, load_scenes, require_quantised
+from deploy.defaults import HELD_OUT_SEED, float_model, require_quantised
 from deploy.dpu.board import load_dpu
 from deploy.dpu.checker.placement import place
 from deploy.dpu.checker.table import legality
@@ -27,6 +27,7 @@ from deploy.dpu.reading import read_network
 from deploy.results import Document
 from model.io.files import require_regular, require_writable, write_text
 from model.shipped import VARIANT, float_file, int8_file, shipped_pair
+from model.simulator.procedural import load_scenes
 from profiles import load_sensor, load_target
 from profiles.errors import BeersError, MachineError, OptionError, printable
 from profiles.figures import Figure, Row, measured, unavailable

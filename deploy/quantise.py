@@ -14,12 +14,13 @@ from pathlib import Path
 import numpy as np
 import onnx
 
-from deploy.defaults import HELD_OUT_SEED, load_scenes
+from deploy.defaults import HELD_OUT_SEED
 from deploy.gate import gate_row
-from deploy.progress import steps
 from deploy.report.blame_page import blame_page
 from deploy.report.page import Report, write_report
 from deploy.results import print_rows
+from model.progress import steps
+from model.simulator.procedural import load_scenes
 from model.simulator.sampling import Scene
 from profiles import load_sensor
 from profiles.errors import OptionError

@@ -7,11 +7,11 @@ import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from deploy.progress import steps
 from deploy.stress.flip_study import FlipRequest, flip_curves_svg, flip_rows, ticks
 from deploy.stress.rows import markdown
 from deploy.stress.subject import open_subject
 from model.io.files import write_text
+from model.progress import steps
 from profiles.figures import Row
 
 HERE = Path(__file__).parent

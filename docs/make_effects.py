@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from deploy.report.pictures import Stretch, strip
+from model.io.pictures import Stretch, strip
 from model.simulator.acquire import MARGIN_PX, prepare_scene, simulate_planned
 from model.simulator.detector import Draw
 from model.simulator.plan import Plan, make_plan, scene_stats

@@ -18,7 +18,7 @@ from pathlib import Path
 from shutil import copyfile
 from xml.etree import ElementTree as ET
 
-from deploy.progress import steps
+from model.progress import steps
 
 ROOT = Path(__file__).resolve().parents[1]
 LIST = ROOT / "docs" / "mutations.toml"

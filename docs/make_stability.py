@@ -7,12 +7,12 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
-from deploy.progress import steps
 from deploy.stress.battery import STAGES, run_battery
 from deploy.stress.cases import CASES
 from deploy.stress.checks import LIMITATIONS
 from deploy.stress.rows import battery_rows, bound_rows, layer_rows, limitation_rows, markdown, proof_rows
 from deploy.stress.subject import open_subject
+from model.progress import steps
 from model.shipped import VARIANT
 from profiles.figures import Row
 

@@ -406,3 +406,19 @@ def _check_snr(profile: SensorProfile) -> None:
     ]
     if profile.snr_0.high < ends[0][0] or profile.snr_0.low > ends[1][1]:
         raise profile._impossible_snr()
+
+
+def reference_beside(degraded: SensorProfile, name: str | None, say: Callable[[str], None]) -> SensorProfile:
+    """The reference profile that a user named, or the default one, in the digital numbers of `degraded`.
+
+    One that was named, and states other ones, is converted in sight: `say` is told.
+
+    Raises:
+        ProfileError: no such profile, or a faulty one.
+    """
+    stated = load_sensor(name or REFERENCE)
+    reference = stated.in_units_of(degraded)
+    if name is not None and reference is not stated:
+        units = f"{describe_units(degraded)}, as {degraded.name} has them"
+        say(f"note: the reference {stated.name} ({describe_units(stated)}) is taken at {units}")
+    return reference

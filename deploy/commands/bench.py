@@ -111,8 +111,8 @@ class _Request:
 def _on_the_board(path: Path, request: _Request, budget_s: float) -> "list[Row]":
     from deploy.bench.host import Sensors, drawn_acquisition, traditional_rows
     from deploy.bench.tables import published_rows
-    from deploy.restoration.arrays import read_acquisition
     from deploy.results import print_rows
+    from model.io.images import read_acquisition
     from model.shipped import SENSOR
     from profiles.sensor import REFERENCE, load_sensor
 

@@ -45,13 +45,13 @@ def evaluate(
     PSNR leaves out clipped pixels. MTF and SNR are measured on restored slanted edges and flat fields. Traditional
     methods are told both sensors' nominal figures; networks are told nothing, but may have been made for the sensor.
     """
-    from deploy.evaluation.methods import method_named
-    from deploy.evaluation.page import evaluation_report, pictures
-    from deploy.evaluation.pairs import oversampling_note, profiles_for, read_pairs_recipe
-    from deploy.evaluation.run import evaluate_methods, input_files, load_pairs, sweep_tables
-    from deploy.evaluation.scores import Instruments, perceptual_distances
+    from deploy.methods import method_named
+    from deploy.report.evaluation_page import evaluation_report, pictures
     from deploy.report.page import write_report
     from deploy.results import Document, print_rows
+    from model.evaluation.pairs import oversampling_note, profiles_for, read_pairs_recipe
+    from model.evaluation.run import evaluate_methods, input_files, load_pairs, sweep_tables
+    from model.evaluation.scores import Instruments, perceptual_distances
     from model.io.files import require_writable
     from model.metrics.bootstrap import LEAST_SITES
     from profiles.errors import OptionError

@@ -76,15 +76,17 @@ def simulate(
     """
     import math
     import os
+    from functools import partial
 
     from deploy.cluster import check_choice
-    from deploy.dataset import DatasetRecipe, plan_windows, write_dataset
-    from deploy.defaults import reference_beside
-    from deploy.progress import steps
+    from deploy.dataset_workers import spread_patches
+    from model.dataset import DatasetRecipe, plan_windows, write_dataset
     from model.io.files import require_writable
+    from model.progress import steps
     from profiles import load_sensor
     from profiles.errors import OptionError
     from profiles.scene_call import calling_for, load_scene_call
+    from profiles.sensor import reference_beside
 
     if out is None:
         expected, remedy = "--out beside it", "leave it out, or give a folder"
@@ -119,7 +121,8 @@ def simulate(
     if out is None:
         return
     with steps("simulating", len(plan_windows(recipe))) as bar:
-        summary = write_dataset(recipe, out, workers or os.cpu_count() or 1, resume, bar.advance, scheduler)
+        make = partial(spread_patches, scheduler=scheduler) if scheduler else None
+        summary = write_dataset(recipe, out, workers or os.cpu_count() or 1, resume, bar.advance, make)
     rejected = f"; {summary['rejected_share']:.1%} of the drawn SNR pairs were impossible and drawn again"
     pairs = f"{summary['patches']:.0f} pair{'' if summary['patches'] == 1 else 's'}"
     say(f"wrote {pairs} to {out}" + (rejected if summary["rejected_share"] else ""))
@@ -137,7 +140,7 @@ def _preset(name: str | None) -> Preset:
 
 def _explain(recipe: object) -> None:
     """The plan of the first draw of the degraded sensor, for every scene."""
-    from deploy.dataset import DatasetRecipe, load
+    from model.dataset import DatasetRecipe, load
     from model.simulator.acquire import prepare_scene
     from model.simulator.detector import Draw
     from model.simulator.plan import make_plan

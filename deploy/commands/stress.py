@@ -59,7 +59,6 @@ def stress(
     --bit-flips: what bits turned over in weights, shifts, maps and the image cost, what guards buy back, and what
     these cost on the board.
     """
-    from deploy.progress import steps
     from deploy.results import Document, print_rows
     from deploy.stress.battery import STAGES, chosen, run_battery
     from deploy.stress.cases import CASES
@@ -77,6 +76,7 @@ def stress(
     )
     from deploy.stress.subject import open_subject
     from model.io.files import require_writable, write_text
+    from model.progress import steps
     from profiles.figures import by_table
 
     _refuse_unused(context, float_model, bit_flips)
@@ -133,11 +133,11 @@ def _flip_bits(
     """Strike, print, and write what was asked for: tables, curves, figures."""
     from dataclasses import asdict
 
-    from deploy.progress import steps
     from deploy.results import Document, print_rows
     from deploy.stress.flip_study import flip_curves_svg, flip_rows, ticks
     from deploy.stress.rows import markdown, title
     from model.io.files import write_text
+    from model.progress import steps
     from profiles.figures import by_table
 
     out, picture, json = wanted

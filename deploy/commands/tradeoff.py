@@ -55,7 +55,6 @@ def tradeoff(
     point keeps --budget and --need; the report is written all the same.
     """
     from deploy.commands.bench import parse_size
-    from deploy.defaults import reference_beside
     from deploy.results import Document
     from deploy.tradeoff.cache import Cache
     from deploy.tradeoff.page import FILES, write_study
@@ -64,7 +63,7 @@ def tradeoff(
     from deploy.tradeoff.selection import Request
     from model.io.files import require_writable
     from model.shipped import shipped_names
-    from profiles.sensor import REFERENCE, load_sensor
+    from profiles.sensor import REFERENCE, load_sensor, reference_beside
 
     figures, kept = out / "tradeoff.json", cache or out / "cache"
     demands = [tuple(parse_demands(name, text)) for name, text in (("--budget", budget), ("--need", need))]

@@ -70,16 +70,16 @@ def train(
     """
     from typing import get_args
 
-    from deploy.evaluation.pairs import profiles_for, read_pairs_recipe
-    from deploy.training import FILES, Run, weights_name
-    from deploy.training import train as run_training
     from model.conditioning import SensorFamily
+    from model.evaluation.pairs import profiles_for, read_pairs_recipe
     from model.io.files import require_writable
     from model.shipped import float_file
     from model.training.checkpoint import Optimiser, TrainingRecipe
     from model.training.losses import LossWeights
     from model.training.patches import PatchRecipe
     from model.training.precision import Precision
+    from model.training.run import FILES, Run, weights_name
+    from model.training.run import train as run_training
     from model.training.workers import joined
     from profiles.errors import OptionError
 

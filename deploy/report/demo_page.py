@@ -6,8 +6,8 @@ import numpy as np
 
 from deploy.dpu.checker.placement import Placement
 from deploy.report.page import Picture, Report, Table
-from deploy.report.pictures import busiest_windows, picture_url, stretch_of, strip
 from model.io.files import whole_file
+from model.io.pictures import busiest_windows, picture_url, stretch_of, strip
 from model.shipped import VARIANT
 from profiles.figures import Row
 

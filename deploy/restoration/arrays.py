@@ -2,60 +2,21 @@
 
 from collections.abc import Callable, Iterable
 from functools import partial
-from pathlib import Path
 
 import numpy as np
 import onnx
 import onnxruntime as ort
-import tifffile
 
 from deploy.restoration.plan import Tile, plan_tiles
-from model.io.files import whole_file
-from model.io.images import read_pixels, remedy_outside, settled_scale
+from model.io.images import MAX_DN
 from profiles.errors import ImageError, OptionError
 from quant.onnx_file import fixed_tile_px
 from quant.session import run
 
-MAX_DN = 4095
 TILE_PX = 640
-RESCALE = "rescale it to the sensor's digital numbers"
 
 Infer = Callable[[np.ndarray], np.ndarray]
 """A network ready to run: (1, 1, h, w) float32 in [0, 1] to the same shape."""
-
-
-def read_acquisition(
-    path: Path, full_scale: float | None = None, remedy: str | None = RESCALE, max_dn: int = MAX_DN
-) -> np.ndarray:
-    """Digital numbers (H, W) float32 in 0..max_dn of a mono image: of at most 12 bits unless a sensor says otherwise.
-
-    Args:
-        path: a TIFF, PNG or JPEG file.
-        full_scale: the pixel value that is full scale; None lets the pixels' type and values decide.
-        remedy: what to do about pixels that leave it open; None names --full-scale.
-        max_dn: the sensor's largest digital number.
-
-    Raises:
-        ImageError: several bands, pixels that leave the full scale open, or values that no such sensor gives.
-        OptionError: a full scale that such pixels cannot have.
-    """
-    pixels = read_pixels(path)
-    if pixels.ndim != 2:
-        raise ImageError(
-            str(path), expected="one band", got=f"{pixels.shape[2]} bands", remedy="extract the panchromatic band"
-        )
-    low, high = float(pixels.min()), float(pixels.max())
-    settled = settled_scale(str(path), pixels.dtype, [max(-low, high)], full_scale, max_dn, remedy)
-    if low < 0 or high > settled:
-        expected = (
-            f"{max_dn.bit_length()}-bit digital numbers, 0 to {max_dn}"
-            if settled == max_dn
-            else f"values of 0 to {settled:g}"
-        )
-        got = f"values from {low:g} to {high:g}"
-        raise ImageError(str(path), expected=expected, got=got, remedy=remedy_outside(low, high, RESCALE))
-    dn = np.asarray(pixels, dtype=np.float32)
-    return dn if settled == max_dn else np.minimum(dn * np.float32(max_dn / settled), np.float32(max_dn))
 
 
 def restore_image(
@@ -110,12 +71,6 @@ def restore_window(dn: np.ndarray, infer: Infer, full_scale: float = MAX_DN) -> 
     if not np.isfinite(restored).all():
         raise ImageError("restored tile", expected="finite pixels", got="NaN", remedy="check the model with 'gate'")
     return np.asarray(np.clip(restored, 0, np.float32(full_scale)))
-
-
-def write_tiff(path: Path, dn: np.ndarray) -> None:
-    """Write (H, W) uint16 as a tiled, losslessly compressed TIFF, whole or not at all."""
-    with whole_file(path) as temporary:
-        tifffile.imwrite(temporary, dn, tile=(256, 256), compression="zlib", software="beers-deploy")
 
 
 def parse_halo(text: str, radius_px: int) -> int:

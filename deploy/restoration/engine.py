@@ -13,13 +13,12 @@ from itertools import count
 
 import numpy as np
 
-from deploy.progress import steps
 from deploy.restoration.arrays import Infer, restore_window
 from deploy.restoration.output import Spool
 from deploy.restoration.plan import Plan, Span, check_memory, is_bulky, rows_bytes
 from deploy.restoration.source import Raster, Source, fill_missing
 from model.io.images import remedy_outside
-from model.training.interrupts import held_back
+from model.progress import held_back, steps
 from profiles.errors import BeersError, ImageError, MachineError
 
 NAME = "image"

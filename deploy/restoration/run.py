@@ -18,7 +18,7 @@ from deploy.restoration.workers import fill_spread, make_work
 from model.io.files import require_writable
 from model.io.images import settled_scale
 from model.processor import require_cores
-from model.training.interrupts import held_back
+from model.progress import held_back
 from profiles.figures import Figure, Row, measured, predicted, unavailable
 from quant.onnx_file import fixed_tile_px, load_onnx
 from quant.radius import receptive_radius_px

@@ -15,7 +15,6 @@ import torch
 from torch import Tensor
 
 from deploy.bench.host_state import peak_memory
-from deploy.progress import steps
 from deploy.restoration.engine import as_stored, checked_band
 from deploy.restoration.options import Compression, fingerprint
 from deploy.restoration.output import Spool, only_run, part_folder, require_codec, require_tiff_name, write_output
@@ -23,6 +22,7 @@ from deploy.restoration.plan import Span, check_memory
 from deploy.restoration.source import Raster, Source, open_source
 from model.io.files import require_writable
 from model.io.images import settled_scale
+from model.progress import steps
 from model.traditional.pipeline import Chain, restore_strips
 from profiles.errors import ImageError
 from profiles.figures import Row, measured

@@ -11,13 +11,14 @@ from typing import Any, Self
 import numpy as np
 
 from deploy.bench.tables import Swath
-from deploy.evaluation.methods import Method, Restore
-from deploy.evaluation.pairs import NamedPair
-from deploy.evaluation.scores import Instruments
-from deploy.evaluation.targets import Targets, snr_name, target_figures
-from deploy.restoration.arrays import MAX_DN, Infer, restore_tiles
+from deploy.restoration.arrays import Infer, restore_tiles
 from deploy.restoration.plan import Span, Tile, plan_side
 from deploy.tradeoff.cache import code_digest, pixels_digest
+from model.evaluation.methods import Method, Restore
+from model.evaluation.pairs import NamedPair
+from model.evaluation.scores import Instruments
+from model.evaluation.targets import Targets, snr_name, target_figures
+from model.io.images import MAX_DN
 from profiles.figures import Figure
 
 MAE = "float-INT8 MAE"

@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 from deploy.bench.tables import PAPER, PAPER_TILE_PX, Swath
-from deploy.evaluation.scores import NOTE
 from deploy.tradeoff.accuracy import Ground
 from deploy.tradeoff.board import PAIR_QUANTILE, DpuRun, pair_error
 from deploy.tradeoff.host_time import ROUNDS
@@ -18,6 +17,7 @@ from deploy.tradeoff.methods import PATCH_PX, PATCHES
 from deploy.tradeoff.outcome import COSTS, QUALITIES, UNITS, Arena, Outcome, Place, Plane, beaten, front
 from deploy.tradeoff.points import EXACT, Demand, Point, Unit, on_dpu, shortfall
 from deploy.tradeoff.study import Front
+from model.evaluation.scores import NOTE
 from model.metrics.bootstrap import LEAST_SITES
 from profiles.figures import Figure, number, published, unavailable
 

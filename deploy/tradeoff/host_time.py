@@ -7,7 +7,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from deploy.evaluation.methods import Restore
+from model.evaluation.methods import Restore
 from profiles.figures import Figure, measured
 
 TILE_PX = 256

@@ -9,13 +9,13 @@ from functools import partial
 import numpy as np
 import psutil
 
-from deploy.progress import Steps, steps
 from deploy.tradeoff.accuracy import Ground, Scores, cut_in_four, measure, measure_images, measure_mae
 from deploy.tradeoff.cache import Cache, Key, code_digest, pixels_digest
 from deploy.tradeoff.host_time import ROUNDS, Times, take_turns
 from deploy.tradeoff.methods import Shelf, int8_ticks, operations_per_px, search_operations
 from deploy.tradeoff.points import EXACT, Point, Unit
 from model.processor import processor_name
+from model.progress import Steps, steps
 
 PARTS = 100
 MIN_S = 20.0

@@ -13,17 +13,19 @@ from pathlib import Path
 import numpy as np
 import onnx
 
-from deploy.defaults import float_model, is_quantised, load_scenes
-from deploy.evaluation.methods import KNOWS, Restore, knowledge_of, method_named
+from deploy.defaults import float_model, is_quantised
+from deploy.methods import knowledge_of, method_named
 from deploy.restoration.arrays import TILE_PX, Infer, restore_with
 from deploy.restoration.options import Runtime
 from deploy.restoration.runtime import open_openvino, open_runtime
 from deploy.tradeoff.cache import Cache, code_digest, digest_of
 from deploy.tradeoff.points import LEGAL, Unit
 from model.convbeers import VARIANTS
+from model.evaluation.methods import KNOWS, Restore
 from model.io.files import sha256
 from model.io.images import list_images
 from model.shipped import SHIPPED, shipped_names, shipped_weights
+from model.simulator.procedural import load_scenes
 from profiles import load_sensor, sensor_names
 from profiles.errors import BeersError, ModelError, OptionError
 from profiles.sensor import SensorProfile, reference_for

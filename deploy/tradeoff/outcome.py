@@ -14,8 +14,6 @@ import numpy as np
 
 from deploy.bench.tables import Swath
 from deploy.dpu.board import load_dpu
-from deploy.evaluation.methods import Method
-from deploy.evaluation.scores import mean_row
 from deploy.tradeoff.accuracy import FLAT, MAE, Scores, seam_density, with_seams
 from deploy.tradeoff.board import FIGURES as BOARD
 from deploy.tradeoff.board import BoardRun, CpuRun, DpuRun, energy_ratio, latency_ratio, predict_model
@@ -23,6 +21,8 @@ from deploy.tradeoff.host_time import Times, host_figures, ratio_interval
 from deploy.tradeoff.measurements import Lab
 from deploy.tradeoff.methods import runtime_of
 from deploy.tradeoff.points import EXACT, NAMES, Point, on_dpu
+from model.evaluation.methods import Method
+from model.evaluation.scores import mean_row
 from model.metrics.bootstrap import site_interval
 from profiles.errors import ModelError
 from profiles.figures import Figure, Row, measured, predicted, unavailable

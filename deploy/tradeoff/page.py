@@ -21,13 +21,13 @@ from deploy.report.layer_bars import layer_bars
 from deploy.report.legend import legend_of
 from deploy.report.marks import Mark, filling_of, marks_of
 from deploy.report.page import TEMPLATES, Grid, Provenance, figure_keys, grid_of, templates
-from deploy.report.pictures import picture_url, stretch_of
 from deploy.report.plot import FONT_PX, LABEL_PX, Dot, Plot, State
 from deploy.report.plot_png import write_png
 from deploy.report.plot_svg import plot_style, plot_svg
 from deploy.results import unit_of, words_of
 from deploy.tradeoff.study import Crop, Front, Study
 from model.io.files import write_text
+from model.io.pictures import picture_url, stretch_of
 from profiles.figures import Figure, Row, by_table, number
 
 RISING = {"PSNR", "SSIM", "flat SNR", "board throughput", "board efficiency"}

@@ -14,12 +14,7 @@ from deploy.dpu.board import load_dpu
 from deploy.dpu.checker.placement import place
 from deploy.dpu.checker.table import network_rows
 from deploy.dpu.reading import network_of
-from deploy.evaluation.pairs import NamedPair, oversampling_note
-from deploy.evaluation.run import load_pairs
-from deploy.evaluation.scores import Instruments, fidelity_db, perceptual_distances
-from deploy.evaluation.targets import acquire_targets
-from deploy.report.pictures import busiest_windows
-from deploy.restoration.arrays import MAX_DN, restore_with
+from deploy.restoration.arrays import restore_with
 from deploy.tradeoff.accuracy import Ground
 from deploy.tradeoff.advice import Choice, choose, findings, fronts, headline, notes, paper_outcomes, papers_point
 from deploy.tradeoff.board import DpuRun
@@ -31,7 +26,13 @@ from deploy.tradeoff.outcome import Arena, Assembly, Outcome
 from deploy.tradeoff.points import Point, Unit
 from deploy.tradeoff.selection import Request, select_points
 from deploy.tradeoff.study import Crop, Front, Study
+from model.evaluation.pairs import NamedPair, oversampling_note
+from model.evaluation.run import load_pairs
+from model.evaluation.scores import Instruments, fidelity_db, perceptual_distances
+from model.evaluation.targets import acquire_targets
 from model.io.files import sha256
+from model.io.images import MAX_DN
+from model.io.pictures import busiest_windows
 from profiles.figures import Row
 from quant.onnx_file import load_onnx
 

@@ -18,6 +18,8 @@ from profiles.toml import read_whole, unreadable
 
 TIFF_SUFFIXES = {".tif", ".tiff"}
 IMAGE_SUFFIXES = TIFF_SUFFIXES | {".png", ".jpg", ".jpeg"}
+MAX_DN = 4095
+"""The largest digital number of 12 bits: full scale, unless a sensor says otherwise."""
 FRAME_NUMBERS = re.compile(r"(_[0-9a-f]*\d[0-9a-f]*)+$")
 """What a name ends in that tells frames of one site apart: _0034, _5dded5bc_23."""
 
@@ -26,6 +28,8 @@ PACKED_BYTES = 1 << 30
 
 WORKING_COPIES = 12
 """Float copies of an image that a command may hold at once: reading refuses what would not fit in memory."""
+
+RESCALE = "rescale it to the sensor's digital numbers"
 
 
 def read_pixels(path: Path) -> np.ndarray:
@@ -228,3 +232,37 @@ def remedy_outside(low: float, high: float, remedy: str) -> str:
 
 def _open(name: str, got: str, remedy: str) -> ImageError:
     return ImageError(name, expected="digital numbers of more than 8 bits", got=got, remedy=remedy)
+
+
+def read_acquisition(
+    path: Path, full_scale: float | None = None, remedy: str | None = RESCALE, max_dn: int = MAX_DN
+) -> np.ndarray:
+    """Digital numbers (H, W) float32 in 0..max_dn of a mono image: of at most 12 bits unless a sensor says otherwise.
+
+    Args:
+        path: a TIFF, PNG or JPEG file.
+        full_scale: the pixel value that is full scale; None lets the pixels' type and values decide.
+        remedy: what to do about pixels that leave it open; None names --full-scale.
+        max_dn: the sensor's largest digital number.
+
+    Raises:
+        ImageError: several bands, pixels that leave the full scale open, or values that no such sensor gives.
+        OptionError: a full scale that such pixels cannot have.
+    """
+    pixels = read_pixels(path)
+    if pixels.ndim != 2:
+        raise ImageError(
+            str(path), expected="one band", got=f"{pixels.shape[2]} bands", remedy="extract the panchromatic band"
+        )
+    low, high = float(pixels.min()), float(pixels.max())
+    settled = settled_scale(str(path), pixels.dtype, [max(-low, high)], full_scale, max_dn, remedy)
+    if low < 0 or high > settled:
+        expected = (
+            f"{max_dn.bit_length()}-bit digital numbers, 0 to {max_dn}"
+            if settled == max_dn
+            else f"values of 0 to {settled:g}"
+        )
+        got = f"values from {low:g} to {high:g}"
+        raise ImageError(str(path), expected=expected, got=got, remedy=remedy_outside(low, high, RESCALE))
+    dn = np.asarray(pixels, dtype=np.float32)
+    return dn if settled == max_dn else np.minimum(dn * np.float32(max_dn / settled), np.float32(max_dn))

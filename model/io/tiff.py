@@ -16,9 +16,11 @@ from itertools import accumulate
 from pathlib import Path
 from typing import Any, BinaryIO
 
+import numpy as np
 import psutil
 import tifffile
 
+from model.io.files import whole_file
 from profiles.errors import ImageError, MachineError, sizes
 
 PLAIN: dict[str, Any] = dict.fromkeys(
@@ -195,3 +197,9 @@ def _unpacked(data: bytes) -> Iterator[bytes]:
 def _swollen(path: Path, got: str) -> ImageError:
     remedy = "copy or write it again"
     return ImageError(str(path), expected="strips and tiles no larger than their place", got=got, remedy=remedy)
+
+
+def write_tiff(path: Path, dn: np.ndarray) -> None:
+    """Write (H, W) uint16 as a tiled, losslessly compressed TIFF, whole or not at all."""
+    with whole_file(path) as temporary:
+        tifffile.imwrite(temporary, dn, tile=(256, 256), compression="zlib", software="beers-deploy")

@@ -6,12 +6,15 @@ asphalt 30, grass 45, roofs 60 to 160, concrete 120, white paint 260.
 
 import math
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 import torch
 from PIL import Image, ImageDraw
 
-from model.simulator.sampling import Scene
+from model.io.images import list_images
+from model.simulator.sampling import Scene, read_scene
+from profiles.sensor import Sensor
 
 Point = tuple[float, float]
 
@@ -211,3 +214,22 @@ def _shift(point: Point, by: float) -> Point:
 
 def _around(x: float, y: float, radius: float) -> tuple[float, float, float, float]:
     return (x - radius, y - radius, x + radius, y + radius)
+
+
+SCENES = 3
+
+
+SCENE_SIDE_PX = 2400
+
+
+def load_scenes(folder: Path | None, sensor: Sensor, seed: int) -> list[Scene]:
+    """The scenes of a folder of images, or drawn ones, other for every seed."""
+    if folder is not None:
+        return [read_scene(path, sensor) for path in list_images(folder)]
+    return draw_scenes(SCENES, seed)
+
+
+def draw_scenes(count: int, seed: int) -> list[Scene]:
+    """Drawn scenes, each with its own generator."""
+    generators = np.random.default_rng(seed).spawn(count)
+    return [procedural_scene(SCENE_SIDE_PX, SCENE_SIDE_PX, g) for g in generators]

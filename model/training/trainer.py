@@ -14,9 +14,9 @@ from torch import Tensor
 
 from model.conditioning import Network, ToldConvBEERS, initialise_coefficients
 from model.convbeers import ConvBEERS, Variant, initialise
+from model.progress import held_back
 from model.training.checkpoint import TrainingRecipe, read_checkpoint, write_checkpoint
 from model.training.guards import Guards
-from model.training.interrupts import held_back
 from model.training.losses import RestorationLoss
 from model.training.precision import MixedPrecision, Precision, choose_precision, in_precision
 from model.training.workers import Worker

@@ -19,8 +19,8 @@ from typer.testing import CliRunner
 
 from deploy.cli import COMMANDS, app
 from deploy.demo import read_input, sensors
-from deploy.restoration.arrays import read_acquisition
 from deploy.results import SCHEMA_PATH
+from model.io.images import read_acquisition
 from model.shipped import SENSOR, default_int8
 from profiles.errors import ImageError
 from profiles.toml import profile_path

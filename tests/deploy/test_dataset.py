@@ -4,6 +4,7 @@ import sys
 import time
 from collections.abc import Iterator
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +15,8 @@ from typer.testing import CliRunner
 
 from deploy.cli import app
 from deploy.cluster import local_cluster
-from deploy.dataset import CHUNK, DatasetRecipe, make_patches, plan_windows, write_dataset
+from deploy.dataset_workers import spread_patches
+from model.dataset import CHUNK, DatasetRecipe, make_patches, plan_windows, write_dataset
 from profiles import load_sensor
 from profiles.errors import ImageError, OptionError
 from profiles.scene_call import calling_for, load_scene_call, scene_names, typical_effects
@@ -138,7 +140,14 @@ def test_a_scheduler_s_workers_give_the_same_bytes(scene: Path, scheduler: str, 
     assert len(plan_windows(recipe)) > 2 * CHUNK
     write_dataset(recipe, tmp_path / "here", 1, resume=False, tick=silent)
     done: list[int] = []
-    write_dataset(recipe, tmp_path / "there", 1, resume=False, tick=done.append, scheduler=scheduler)
+    write_dataset(
+        recipe,
+        tmp_path / "there",
+        1,
+        resume=False,
+        tick=done.append,
+        make=partial(spread_patches, scheduler=scheduler),
+    )
     assert bytes_of(tmp_path / "there") == bytes_of(tmp_path / "here")
     assert sum(done) == len(plan_windows(recipe))
 
@@ -154,7 +163,9 @@ def test_a_dataset_begun_here_is_finished_by_a_scheduler_s_workers(
     with pytest.raises(KeyboardInterrupt):
         write_dataset(recipe, tmp_path / "d", 1, resume=False, tick=stop)
     done: list[int] = []
-    write_dataset(recipe, tmp_path / "d", 1, resume=True, tick=done.append, scheduler=scheduler)
+    write_dataset(
+        recipe, tmp_path / "d", 1, resume=True, tick=done.append, make=partial(spread_patches, scheduler=scheduler)
+    )
     assert done[0] >= CHUNK
     write_dataset(recipe, tmp_path / "whole", 1, resume=False, tick=silent)
     assert bytes_of(tmp_path / "d") == bytes_of(tmp_path / "whole")
@@ -163,9 +174,16 @@ def test_a_dataset_begun_here_is_finished_by_a_scheduler_s_workers(
 def test_a_scene_that_a_worker_does_not_find_is_one_sentence(
     scene: Path, scheduler: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("deploy.dataset.sha256", lambda path: f"digest of another {path.name}")
+    monkeypatch.setattr("model.dataset.sha256", lambda path: f"digest of another {path.name}")
     with pytest.raises(ImageError, match=r"another file of that name.*shared folder"):
-        write_dataset(small(scene), tmp_path / "d", 1, resume=False, tick=silent, scheduler=scheduler)
+        write_dataset(
+            small(scene),
+            tmp_path / "d",
+            1,
+            resume=False,
+            tick=silent,
+            make=partial(spread_patches, scheduler=scheduler),
+        )
     assert not list(tmp_path.rglob("*.tif"))
 
 

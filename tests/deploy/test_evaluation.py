@@ -11,14 +11,15 @@ import pytest
 from typer.testing import CliRunner
 
 from deploy.cli import app
-from deploy.evaluation import targets as targets_module
-from deploy.evaluation.methods import TRAINED, Method, method_named
-from deploy.evaluation.page import chosen_pairs, strip_of
-from deploy.evaluation.pairs import NamedPair, oversampling_note, oversamplings_of, read_pairs, simulate_pairs
-from deploy.evaluation.scores import Instruments, fidelity_db, paper_rows, score, site_rows
-from deploy.evaluation.targets import acquire_targets, flat_figure, mtf_figure, snr_name, target_figures
-from deploy.restoration.arrays import write_tiff
+from deploy.methods import method_named
+from deploy.report.evaluation_page import chosen_pairs, strip_of
 from deploy.results import SCHEMA_PATH, Document, missing
+from model.evaluation import targets as targets_module
+from model.evaluation.methods import TRAINED, Method
+from model.evaluation.pairs import NamedPair, oversampling_note, oversamplings_of, read_pairs, simulate_pairs
+from model.evaluation.scores import Instruments, fidelity_db, paper_rows, score, site_rows
+from model.evaluation.targets import acquire_targets, flat_figure, mtf_figure, snr_name, target_figures
+from model.io.tiff import write_tiff
 from model.metrics.refusal import Refusal
 from model.simulator.procedural import procedural_scene
 from profiles import load_sensor

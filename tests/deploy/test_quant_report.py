@@ -18,9 +18,9 @@ from deploy.export import to_onnx
 from deploy.quantise import ablations, kind_of_error, worst_row
 from deploy.report.histogram import FONT_PX, MOST_BARS, bins, histogram_url
 from deploy.report.labels import text_width
-from deploy.restoration.arrays import write_tiff
 from deploy.results import SCHEMA_PATH
 from model.convbeers import ConvBEERS, Variant, initialise
+from model.io.tiff import write_tiff
 from model.simulator.procedural import procedural_scene
 from profiles import load_sensor
 from profiles.sensor import reference_for

@@ -9,8 +9,8 @@ import pytest
 import tifffile
 from PIL import Image
 
-from deploy.dataset import DatasetRecipe, write_dataset
-from deploy.evaluation.pairs import oversamplings_of, profiles_for, read_pairs, read_pairs_recipe
+from model.dataset import DatasetRecipe, write_dataset
+from model.evaluation.pairs import oversamplings_of, profiles_for, read_pairs, read_pairs_recipe
 from profiles import load_sensor
 from profiles.errors import OptionError, ProfileError
 from profiles.sensor import reference_for, same_instrument, sensor_from_json, sensor_names

@@ -4,7 +4,7 @@ from dataclasses import replace
 import numpy as np
 
 from deploy.report.page import Picture, Report, Table, render
-from deploy.report.pictures import busiest_windows, picture_url, stretch_of, strip
+from model.io.pictures import busiest_windows, picture_url, stretch_of, strip
 from profiles.figures import Row, measured, predicted, unavailable
 
 

@@ -13,7 +13,6 @@ import torch
 from typer.testing import CliRunner
 
 from deploy.cli import app
-from deploy.dataset import _read_summary
 from deploy.dpu.board import load_dpu
 from deploy.dpu.cost.validation import refit
 from deploy.gate import PATCHES, baseline_mae
@@ -21,11 +20,12 @@ from deploy.restoration.output import Spool, part_folder
 from deploy.results import Document
 from deploy.tradeoff.cache import Cache, digest_of
 from deploy.tradeoff.host_time import Times
-from deploy.training import Log
+from model.dataset import _read_summary
 from model.io.images import read_pixels
 from model.io.weights import load_network, write_tensors
 from model.io.weights import read_tensors as read_weights
 from model.metrics.backbones import read_tensors
+from model.training.run import Log
 from profiles.errors import BeersError, ModelError, OptionError, ProfileError
 from profiles.figures import Row, measured
 from profiles.toml import HERE, read_json, read_toml_text

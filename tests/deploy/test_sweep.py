@@ -6,10 +6,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from deploy.evaluation import run as module
-from deploy.evaluation import targets as targets_module
-from deploy.evaluation.methods import Method
-from deploy.evaluation.run import TOLD_NOMINAL, TOLD_TRUTH, Condition, Fixed, conditions, sweep_rows
+from model.evaluation import run as module
+from model.evaluation import targets as targets_module
+from model.evaluation.methods import Method
+from model.evaluation.run import TOLD_NOMINAL, TOLD_TRUTH, Condition, Fixed, conditions, sweep_rows
 from model.simulator.procedural import procedural_scene
 from profiles import SensorProfile, load_sensor
 from profiles.figures import Row

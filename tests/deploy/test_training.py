@@ -10,14 +10,14 @@ import torch
 from PIL import Image
 from typer.testing import CliRunner
 
-from deploy import training
 from deploy.cli import app
-from deploy.training import Log
 from model.conditioning import fold
 from model.io.weights import load_network, load_told, read_tensors
 from model.shipped import shipped_weights
 from model.simulator.procedural import procedural_scene
+from model.training import run as training
 from model.training.patches import StoredPairs
+from model.training.run import Log
 from profiles.toml import profile_path
 
 SIDE = 420

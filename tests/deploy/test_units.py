@@ -9,18 +9,17 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from deploy.dataset import DatasetRecipe
-from deploy.defaults import reference_beside
-from deploy.evaluation.methods import method_named
-from deploy.evaluation.pairs import simulate_pairs
-from deploy.evaluation.scores import Instruments, fidelity_db
+from deploy.methods import method_named
+from model.dataset import DatasetRecipe
+from model.evaluation.pairs import simulate_pairs
+from model.evaluation.scores import Instruments, fidelity_db
 from model.simulator.mtf import mtf
 from model.simulator.procedural import procedural_scene
 from model.training.patches import PatchRecipe
 from profiles import SensorProfile, load_sensor
 from profiles.constant import Constant
 from profiles.errors import ProfileError
-from profiles.sensor import reference_for
+from profiles.sensor import reference_beside, reference_for
 
 DEGRADED = load_sensor("pleiades-degraded")
 METHODS = ("degraded", "traditional-fast", "convbeers-xs")

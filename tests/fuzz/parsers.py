@@ -16,7 +16,6 @@ import torch
 from PIL import Image
 
 from deploy.compare import change_rows, compare, read_document
-from deploy.dataset import _read_summary
 from deploy.dpu.board import load_dpu
 from deploy.dpu.checker.placement import place
 from deploy.dpu.cost.layers import Layers, count_work
@@ -30,14 +29,15 @@ from deploy.results import Document, by_row, cell
 from deploy.tradeoff.accuracy import Scores
 from deploy.tradeoff.cache import Cache, Keepable
 from deploy.tradeoff.host_time import Times
-from deploy.training import Log
 from model.conditioning import ToldConvBEERS
 from model.convbeers import ConvBEERS, Variant
+from model.dataset import _read_summary
 from model.io.images import read_pixels
 from model.io.weights import load_network, load_told, save_network
 from model.metrics.backbones import read_tensors
 from model.training.checkpoint import TrainingRecipe, read_checkpoint, write_checkpoint
 from model.training.guards import Guards
+from model.training.run import Log
 from profiles import load_sensor, load_target
 from profiles.errors import BeersError
 from profiles.figures import Figure, Row, measured, predicted, unavailable

@@ -5,8 +5,8 @@ import time
 import numpy as np
 import pytest
 
-from deploy.evaluation.methods import Restore
 from deploy.tradeoff.host_time import ROUNDS, Times, host_figures, ratio_interval, take_turns
+from model.evaluation.methods import Restore
 
 
 def times(scale: float = 1.0, session: str = "one") -> Times:

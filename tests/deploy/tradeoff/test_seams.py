@@ -6,8 +6,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from deploy.bench.tables import Swath
-from deploy.evaluation.scores import fidelity_db
 from deploy.tradeoff.accuracy import Scores, cut_in_four, halves, seam_density, with_seams
+from model.evaluation.scores import fidelity_db
 
 RADIUS_PX = 2
 

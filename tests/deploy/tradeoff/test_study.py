@@ -15,14 +15,14 @@ from typer.testing import CliRunner
 
 from deploy.cli import app
 from deploy.compare import compare, read_document
-from deploy.evaluation import targets as targets_module
-from deploy.evaluation.methods import Restore
 from deploy.tradeoff import measurements, methods, selection
 from deploy.tradeoff.cache import Cache
 from deploy.tradeoff.host_time import Times
 from deploy.tradeoff.run import Result, run_study
 from deploy.tradeoff.selection import Request
 from model.convbeers import ConvBEERS, Variant, initialise
+from model.evaluation import targets as targets_module
+from model.evaluation.methods import Restore
 from model.io.weights import save_network
 from model.simulator.procedural import procedural_scene
 from profiles.figures import Row
@@ -221,9 +221,9 @@ def test_other_images_are_measured_anew_and_times_are_not(
 
 def test_a_units_scores_are_those_of_its_own_restoration(folder: Path, kept: tuple[Result, Path]) -> None:
     """The legal file made on the way, measured by hand."""
-    from deploy.evaluation.methods import method_named
-    from deploy.evaluation.scores import Instruments, fidelity_db
+    from deploy.methods import method_named
     from deploy.tradeoff.run import make_ground
+    from model.evaluation.scores import Instruments, fidelity_db
     from profiles import load_sensor
 
     ground, _ = make_ground(request(folder))

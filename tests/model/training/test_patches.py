@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import torch
 
-from deploy.restoration.arrays import write_tiff
 from model.conditioning import SensorFamily
+from model.io.tiff import write_tiff
 from model.simulator.procedural import procedural_scene
 from model.simulator.sampling import Scene
 from model.training.patches import PatchRecipe, PatchSource, StoredPairs, cut, pair_files, turn

@@ -16,11 +16,11 @@ from torch import Tensor
 from model.conditioning import SensorFamily
 from model.convbeers import ConvBEERS, Variant
 from model.io.weights import load_network, read_tensors
+from model.progress import held_back
 from model.simulator.procedural import procedural_scene
 from model.simulator.sampling import Scene
 from model.training.checkpoint import Optimiser, TrainingRecipe, finish
 from model.training.guards import MAX_BAD_STEPS, WINDOW_STEPS, Guards
-from model.training.interrupts import held_back
 from model.training.losses import LossWeights
 from model.training.patches import PatchRecipe, PatchSource
 from model.training.trainer import Progress, Schedule, Trainer

@@ -12,8 +12,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from deploy.evaluation.methods import Method
-from deploy.restoration.arrays import MAX_DN
+from model.evaluation.methods import Method
+from model.io.images import MAX_DN
 from model.metrics.edges import slanted_edge
 from model.metrics.noise_level import RADIANCES
 from model.metrics.refusal import Refusal

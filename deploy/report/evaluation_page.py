@@ -6,11 +6,11 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from deploy.evaluation.methods import Method
-from deploy.evaluation.pairs import NamedPair
 from deploy.report.page import Picture, Report, Table
-from deploy.report.pictures import busiest_windows, error_row, grid, picture_url, stretch_of, strip_row
+from model.evaluation.methods import Method
+from model.evaluation.pairs import NamedPair
 from model.io.files import whole_file
+from model.io.pictures import busiest_windows, error_row, grid, picture_url, stretch_of, strip_row
 from profiles.figures import Row, by_table
 
 SITES, CROP_PX, ZOOM = 4, 96, 2

@@ -8,16 +8,14 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from deploy.defaults import reference_beside
-from deploy.restoration.arrays import MAX_DN, read_acquisition
-from model.io.images import site_of
+from model.io.images import MAX_DN, read_acquisition, site_of
 from model.shipped import SENSOR
 from model.simulator.acquire import MARGIN_PX, fitting_oversampling, simulate_pair
 from model.simulator.detector import Draw
 from model.simulator.sampling import Scene
 from model.training.patches import pair_files
 from profiles.errors import ImageError, OptionError
-from profiles.sensor import Sensor, SensorProfile, load_sensor, same_instrument, sensor_from_json
+from profiles.sensor import Sensor, SensorProfile, load_sensor, reference_beside, same_instrument, sensor_from_json
 from profiles.toml import read_json
 
 

@@ -1,9 +1,16 @@
-"""Progress of long work: a rich bar on a terminal, plain lines elsewhere; always on standard error."""
+"""Long work: its progress is shown, and Ctrl-C waits for a good moment.
 
+Progress is a rich bar on a terminal, plain lines elsewhere, always on standard error. An interrupt arrives between
+two steps, never within one: a half-made update cannot be resumed.
+"""
+
+import signal
 import sys
+import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from types import FrameType
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
@@ -38,3 +45,33 @@ def steps(label: str, total: int) -> Iterator[Steps]:
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
         yield Steps(label, total, bar)
+
+
+class Interrupt:
+    """Whether somebody asked to stop."""
+
+    asked = False
+
+
+@contextmanager
+def held_back() -> Iterator[Interrupt]:
+    """Note the first Ctrl-C (or SIGTERM) instead of raising it; a second one raises at once.
+
+    Does nothing outside the main thread, where signals do not arrive.
+    """
+    interrupt = Interrupt()
+    if threading.current_thread() is not threading.main_thread():
+        yield interrupt
+        return
+
+    def note(_number: int, _frame: FrameType | None) -> None:
+        if interrupt.asked:
+            raise KeyboardInterrupt
+        interrupt.asked = True
+
+    before = {number: signal.signal(number, note) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield interrupt
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)

@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from deploy.evaluation.methods import Method
-from deploy.evaluation.pairs import NamedPair
-from deploy.evaluation.targets import snr_name
-from deploy.restoration.arrays import MAX_DN
+from model.evaluation.methods import Method
+from model.evaluation.pairs import NamedPair
+from model.evaluation.targets import snr_name
+from model.io.images import MAX_DN
 from model.metrics.backbones import find_backbone, not_found
 from model.metrics.bootstrap import site_interval
 from model.metrics.fidelity import psnr_db, ssim

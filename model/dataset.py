@@ -1,7 +1,6 @@
 """Datasets of simulated pairs: 12-bit TIFF patches and a manifest, in parallel, resumable, the same bytes always.
 
-A patch's pixels depend on the recipe and its number alone, not on who makes it. The workers of a cluster need to
-read the scenes; only this process writes.
+A patch's pixels depend on the recipe and its number alone, not on who makes it: processes here, or a cluster's.
 """
 
 import json
@@ -10,19 +9,15 @@ import shutil
 import sys
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
-from contextlib import closing
-from dataclasses import asdict, dataclass, replace
-from functools import lru_cache
+from dataclasses import asdict, dataclass
 from itertools import groupby
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import torch
 
-from deploy.cluster import open_cluster, unreachable
-from deploy.restoration.arrays import write_tiff
 from model.io.files import sha256, whole_file, write_text
+from model.io.tiff import write_tiff
 from model.simulator.acquire import MARGIN_PX, prepare_scene, simulate_planned
 from model.simulator.detector import Draw, to_uint16
 from model.simulator.plan import TOLERANCE_DN, make_plan
@@ -145,71 +140,8 @@ def _make_patch(recipe: DatasetRecipe, window: Window, radiance: torch.Tensor, o
     return line
 
 
-@dataclass(frozen=True)
-class Order:
-    """What is to be made, and the digests of its scenes; None for a drawn one."""
-
-    recipe: DatasetRecipe
-    digests: tuple[str | None, ...]
-
-
-@dataclass(frozen=True)
-class Made:
-    """Patches as files, by their path in the dataset, and their lines of the manifest."""
-
-    files: dict[str, bytes]
-    lines: list[Line]
-
-
-def spread_patches(
-    recipe: DatasetRecipe, waiting: dict[Path, list[Window]], out: Path, scheduler: str
-) -> Iterator[tuple[Path, list[Line]]]:
-    """Make and write the patches of each part; yields its path and its lines.
-
-    Raises:
-        ImageError: a scene that a worker cannot read.
-        MachineError: Dask, its workers, or a disk.
-    """
-    scenes = tuple(path.absolute() if path else None for path in recipe.scenes)
-    order = Order(replace(recipe, scenes=scenes), tuple(sha256(path) if path else None for path in scenes))
-    with (
-        open_cluster(0, scheduler) as workers,
-        closing(workers.in_order(make_files, workers.share(order), waiting.values(), lambda: None)) as pieces,
-    ):
-        for path, made in zip(waiting, pieces, strict=True):
-            for name, content in made.files.items():
-                with whole_file(out / name) as temporary:
-                    temporary.write_bytes(content)
-            yield path, made.lines
-
-
-def make_files(order: Order, windows: list[Window]) -> Made:
-    """In a worker: some patches of one scene.
-
-    Raises:
-        ImageError: no such scene here, or another file of that name.
-    """
-    scene = windows[0].scene
-    _check_scene(order.recipe.scenes[scene], order.digests[scene])
-    with TemporaryDirectory() as name:
-        folder = Path(name)
-        lines = make_patches(order.recipe, windows, folder)
-        files = {path.relative_to(folder).as_posix(): path.read_bytes() for path in sorted(folder.rglob("*.tif"))}
-    return Made(files, lines)
-
-
-@lru_cache(maxsize=64)
-def _check_scene(path: Path | None, digest: str | None) -> None:
-    """Once for each scene and process."""
-    if path is None:
-        return
-    try:
-        found = sha256(path)
-    except OSError as error:
-        raise unreachable(path, error.strerror or str(error)) from error
-    if found != digest:
-        raise unreachable(path, "another file of that name")
-
+Make = Callable[[DatasetRecipe, dict[Path, list[Window]], Path], Iterator[tuple[Path, list[Line]]]]
+"""Makes and writes the patches of each part into a folder; yields the part's path and its lines."""
 
 CHUNK = 32
 """Patches a worker makes before it reports: short enough to lose little to a kill."""
@@ -223,11 +155,17 @@ def write_dataset(
     workers: int,
     resume: bool,
     tick: Callable[[int], None],
-    scheduler: str | None = None,
+    make: Make | None = None,
 ) -> dict[str, float]:
-    """Write a dataset by processes here, or by the workers of a Dask scheduler.
+    """Write a dataset of 12-bit TIFF patches and its manifest.
 
-    `tick` is told how many further patches are done.
+    Args:
+        recipe: what decides the pixels.
+        out: the dataset's folder.
+        workers: processes that make patches here.
+        resume: whether to go on with a dataset that the folder holds in part.
+        tick: is told how many further patches are done.
+        make: makes them elsewhere instead, as the workers of a cluster do.
 
     Returns:
         patches, and the share of drawn SNR pairs that were impossible and drawn again.
@@ -247,7 +185,7 @@ def write_dataset(
     parts = {out / "parts" / f"{chunk[0].number:08d}.jsonl": chunk for chunk in chunks}
     tick(sum(len(chunk) for path, chunk in parts.items() if path.exists()))
     waiting = {path: chunk for path, chunk in parts.items() if not path.exists()}
-    made = spread_patches(recipe, waiting, out, scheduler) if scheduler else _run(recipe, waiting, out, workers)
+    made = make(recipe, waiting, out) if make else _run(recipe, waiting, out, workers)
     for path, lines in made:
         write_text(path, "".join(json.dumps(line, sort_keys=True) + "\n" for line in lines))
         tick(len(lines))

@@ -6,14 +6,14 @@ from pathlib import Path
 
 import numpy as np
 
-from deploy.defaults import load_scenes
-from deploy.evaluation.methods import BLIND, TRAINED, Method, method_named
-from deploy.evaluation.pairs import NamedPair, PairsRecipe, oversamplings_of, read_pairs, simulate_pairs
-from deploy.evaluation.scores import Instruments, fidelity_db, paper_rows, score, site_rows
-from deploy.evaluation.targets import acquire_targets, mtf_figure, restored_mtfs, target_figures
-from deploy.progress import steps
+from model.evaluation.methods import BLIND, TRAINED, Method, method_without_network
+from model.evaluation.pairs import NamedPair, PairsRecipe, oversamplings_of, read_pairs, simulate_pairs
+from model.evaluation.scores import Instruments, fidelity_db, paper_rows, score, site_rows
+from model.evaluation.targets import acquire_targets, mtf_figure, restored_mtfs, target_figures
 from model.io.images import list_images, site_of
 from model.metrics.bootstrap import site_interval
+from model.progress import steps
+from model.simulator.procedural import load_scenes
 from model.simulator.sampling import Scene
 from profiles.figures import Row, measured
 from profiles.sensor import Sensor, SensorProfile, noise_from_snr
@@ -82,18 +82,22 @@ def sweep_rows(
         pairs, _ = simulate_pairs(
             list(scenes), Fixed(condition.sensor), Fixed(target), seed, oversamplings_of(profile)
         )
-        methods = [method_named("degraded", nominal, target), *_chains(condition.sensor, nominal, target), *networks]
+        methods = [*_known_methods(condition.sensor, nominal, target), *networks]
         rows += _rows(condition, methods, pairs, seed)
         tick()
     return sorted(rows, key=lambda row: row.table)
 
 
-def _chains(truth: Sensor, nominal: Sensor, target: Sensor) -> list[Method]:
-    told = replace(nominal, gain_dn_per_radiance=truth.gain_dn_per_radiance)
-    return [
-        replace(method_named("traditional", sensor, target), name=name)
-        for name, sensor in ((TOLD_TRUTH, truth), (TOLD_NOMINAL, told))
-    ]
+def _known_methods(truth: Sensor, nominal: Sensor, target: Sensor) -> list[Method]:
+    """The input itself, and the chain that knows the true sensor, or the nominal one in its place."""
+    supposed = replace(nominal, gain_dn_per_radiance=truth.gain_dn_per_radiance)
+    wanted = {
+        "degraded": ("degraded", nominal),
+        TOLD_TRUTH: ("traditional", truth),
+        TOLD_NOMINAL: ("traditional", supposed),
+    }
+    found = {shown: method_without_network(name, sensor, target) for shown, (name, sensor) in wanted.items()}
+    return [replace(method, name=shown) for shown, method in found.items() if method is not None]
 
 
 def _rows(condition: Condition, methods: Sequence[Method], pairs: Sequence[NamedPair], seed: int) -> list[Row]:

@@ -14,16 +14,16 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from deploy.defaults import draw_scenes
-from deploy.progress import Steps, steps
-from deploy.report.pictures import Stretch, busiest_windows, grid, strip_row
 from model.conditioning import Network
 from model.io.files import whole_file
 from model.io.images import list_images
+from model.io.pictures import Stretch, busiest_windows, grid, strip_row
 from model.io.weights import N, is_told, load_network, load_told, variant_named, widen, widen_told
 from model.metrics.backbones import find_backbone, not_found
 from model.metrics.perceptual import Lpips
+from model.progress import Steps, steps
 from model.shipped import TOLD_SUFFIX
+from model.simulator.procedural import draw_scenes
 from model.simulator.sampling import Scene, read_scene
 from model.training.checkpoint import TrainingRecipe, finish
 from model.training.guards import require_finite_output

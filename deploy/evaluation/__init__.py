@@ -1,1 +1,0 @@
-"""Restorations judged on pairs: every method sees the same degraded images, the degraded input is a method too."""
