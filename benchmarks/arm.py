@@ -81,7 +81,7 @@ def restored(networks: list[Path], out: Path) -> None:
 
 def networks(folder: Path) -> list[Path]:
     """The shipped pairs as ONNX files: the INT8 ones, and the float ones written into the folder."""
-    from deploy.defaults import float_model
+    from deploy.export import float_model
     from model.shipped import shipped_pair
     from quant.onnx_file import save_onnx
 

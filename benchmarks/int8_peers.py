@@ -28,14 +28,13 @@ from pathlib import Path
 import numpy as np
 import onnx
 
-from deploy.defaults import HELD_OUT_SEED
-from deploy.defaults import float_model as read_float
+from deploy.export import float_model as read_float
 from model.metrics.fidelity import psnr_db, ssim
 from model.shipped import shipped_weights
 from model.simulator.procedural import load_scenes
 from profiles import load_sensor
 from profiles.sensor import reference_for
-from quant.calibration import Pair, draw_patches
+from quant.calibration import HELD_OUT_SEED, Pair, draw_patches
 from quant.graph import CORRECTION, PLANES, correction_graph, float_model, read_planes
 from quant.session import open_session, planes_of
 

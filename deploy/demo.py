@@ -13,12 +13,10 @@ import torch
 
 from deploy.bench.host import Sensors, traditional_rows
 from deploy.bench.tables import Swath, predict_file, predicted_rows, published_rows
-from deploy.defaults import HELD_OUT_SEED, float_model
 from deploy.dpu.board import Dpu, load_dpu
 from deploy.dpu.checker.placement import place
 from deploy.dpu.reading import read_network
-from deploy.export import require_parity
-from deploy.gate import gate_row
+from deploy.export import float_model, require_parity
 from deploy.report.demo_page import INT8, SWATH_PX, TRADITIONAL, comparison, demo_report
 from deploy.report.page import Report
 from deploy.restoration.arrays import TILE_PX, restore_image
@@ -37,8 +35,8 @@ from profiles import load_sensor
 from profiles.errors import OptionError
 from profiles.figures import Row, measured
 from profiles.sensor import reference_for
-from quant.calibration import draw_patches
-from quant.gate import compare
+from quant.calibration import HELD_OUT_SEED, draw_patches
+from quant.gate import compare, gate_row
 from quant.onnx_file import save_onnx
 from quant.quantise import quantise_model
 from quant.radius import receptive_radius_px

@@ -1,4 +1,7 @@
-"""ConvBEERS as ONNX: `image` (N, 1, H, W) in [0, 1] to `restored`, written node by node under readable names."""
+"""ConvBEERS as ONNX: `image` (N, 1, H, W) in [0, 1] to `restored`, written node by node under readable names.
+
+Also how any float network is had as ONNX: from an ONNX file, from weights, or the shipped one.
+"""
 
 from pathlib import Path
 
@@ -11,10 +14,10 @@ from deploy import __version__
 from model.conditioning import fold, tell
 from model.convbeers import ConvBEERS
 from model.io.weights import is_told, load_network, load_told
-from model.shipped import told_names
+from model.shipped import SHIPPED, default_float_weights, float_file, shipped_names, shipped_weights, told_names
 from profiles.errors import ModelError
 from profiles.sensor import load_sensor
-from quant.onnx_file import image_info, make_model
+from quant.onnx_file import image_info, is_quantised, load_onnx, make_model, metadata
 from quant.session import open_session, run
 
 MAX_DIFFERENCE = 1e-5
@@ -108,3 +111,37 @@ class _Writer:
     def conv(self, name: str, source: str) -> str:
         feeds = [source, f"{name}.weight", f"{name}.bias"]
         return self.node("Conv", name, feeds, pads=[1] * 4, kernel_shape=[3, 3])
+
+
+def float_model(path: Path | None) -> onnx.ModelProto:
+    """A float network as ONNX: from an .onnx or a .safetensors file, or the shipped one.
+
+    Raises:
+        ModelError: neither of these.
+    """
+    path = float_file(path) if path else default_float_weights()
+    if path.suffix != ".safetensors":
+        return load_onnx(path)
+    network, recipe = load_network(path)
+    return to_onnx(network, about(path.stem, recipe))
+
+
+def about(variant: str, recipe: dict[str, object]) -> dict[str, str]:
+    """What an exported file says of itself."""
+    return {
+        "variant": variant,
+        "sensor": str(recipe.get("degraded", "")),
+        "reference": str(recipe.get("reference", "")),
+    }
+
+
+def counterpart(model: onnx.ModelProto) -> onnx.ModelProto | None:
+    """A shipped network of the same variant in the other precision, or None; its weights may be others.
+
+    Time depends on the shapes, not on the weights: for a comparison of time any weights will do.
+    """
+    variant = metadata(model).get("variant", "")
+    if is_quantised(model):
+        return float_model(shipped_weights(variant)) if variant in shipped_names() else None
+    int8 = SHIPPED / f"{variant}-int8.onnx"
+    return load_onnx(int8) if variant and int8.is_file() else None

@@ -8,7 +8,6 @@ Looked at, in this order:
 3. The INT8 file: the DPU's rules, its ReLUs, its encoding, the same bits with onnxruntime's optimisations as without.
 """
 
-import math
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
@@ -19,25 +18,25 @@ from xml.etree import ElementTree as ET
 import numpy as np
 import onnx
 
-from deploy.defaults import HELD_OUT_SEED, float_model, require_quantised
 from deploy.dpu.board import load_dpu
 from deploy.dpu.checker.placement import place
 from deploy.dpu.checker.table import legality
 from deploy.dpu.reading import read_network
+from deploy.export import float_model
 from deploy.results import Document
 from model.io.files import require_regular, require_writable, write_text
 from model.shipped import VARIANT, float_file, int8_file, shipped_pair
 from model.simulator.procedural import load_scenes
 from profiles import load_sensor, load_target
 from profiles.errors import BeersError, MachineError, OptionError, printable
-from profiles.figures import Figure, Row, measured, unavailable
+from profiles.figures import Row
 from profiles.sensor import reference_for
 from profiles.toml import read_json, unreadable
-from quant.calibration import Patches, draw_patches
+from quant.calibration import HELD_OUT_SEED, Patches, draw_patches
 from quant.checks import Check
 from quant.encodings import spelling_faults
-from quant.gate import GateResult, Limits, compare, judge, judge_saturation
-from quant.onnx_file import fixed_tile_px, load_onnx
+from quant.gate import GateResult, Limits, _figure, compare, gate_row, judge, judge_saturation, saturation_figure
+from quant.onnx_file import fixed_tile_px, load_onnx, require_quantised
 from quant.relus import count_relus
 from quant.saturation import saturated_shares
 from quant.session import open_any_size, run
@@ -211,39 +210,6 @@ def _encoding(model: onnx.ModelProto) -> list[Check]:
     if faults is None:
         return []
     return [Check("faults of the encoding", len(faults), 0, "fault", detail=faults[0] if faults else "")]
-
-
-def gate_row(result: GateResult) -> Row:
-    """What INT8 changes, on patches that calibration did not see."""
-    found = {
-        "MAE": (result.mae, "of full scale"),
-        "std": (result.std, "of full scale"),
-        "std / MAE": (result.std_over_mae, "ratio"),
-        "99.9th percentile": (result.p999, "of full scale"),
-        "max": (result.max_abs, "of full scale"),
-        "PSNR float-INT8": (result.psnr_between_db, "dB"),
-        "PSNR degraded": (result.psnr_degraded_db, "dB"),
-        "PSNR float": (result.psnr_float_db, "dB"),
-        "PSNR INT8": (result.psnr_int8_db, "dB"),
-    }
-    figures = {name: _figure(value, unit, result.patches) for name, (value, unit) in found.items()}
-    return Row("gate", "INT8 against float", figures)
-
-
-def _figure(value: float, unit: str, patches: int) -> Figure:
-    if math.isinf(value):
-        return unavailable(unit, "infinite: the two images are identical")
-    if math.isnan(value):
-        return unavailable(unit, "a network gave NaN")
-    return measured(value, unit, f"{patches} simulated patches of 128 x 128")
-
-
-def saturation_figure(shares: Mapping[str, float], patches: int) -> Figure:
-    """What share of its results comes to the ends of 8 bits, in the layer where most do."""
-    if not shares:
-        return unavailable("%", "no result in the file is rounded to 8 bits")
-    layer = max(shares, key=lambda name: shares[name])
-    return measured(100 * shares[layer], "%", f"{layer}, the worst of {len(shares)}; {patches} patches of 128 x 128")
 
 
 def sentence(checks: Sequence[Check], passed: str) -> str:

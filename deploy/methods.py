@@ -7,7 +7,7 @@ import numpy as np
 import onnx
 import onnxruntime as ort
 
-from deploy.defaults import float_model
+from deploy.export import float_model
 from deploy.restoration.arrays import TILE_PX, restore_image
 from model.evaluation.methods import (
     BLIND,

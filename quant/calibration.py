@@ -8,6 +8,7 @@ import hashlib
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from pathlib import Path
 from typing import Generic, TypeVar
 
 import numpy as np
@@ -17,10 +18,12 @@ from torch import Tensor
 from model.simulator.acquire import MARGIN_PX, acquire
 from model.simulator.detector import Draw
 from model.simulator.mtf import transfer_function
+from model.simulator.procedural import load_scenes
 from model.simulator.sampling import Scene, scene_spectrum
 from model.training.patches import PatchRecipe, turn
+from profiles import load_sensor
 from profiles.errors import ImageError
-from profiles.sensor import Sensor, SensorProfile
+from profiles.sensor import Sensor, SensorProfile, reference_for
 from quant.core import CANDIDATES, coarsest_position, squared_errors
 from quant.graph import PLANES, POSITION, Graph, float_model, tensors
 from quant.session import halo_of, open_session, tensor_values
@@ -29,6 +32,10 @@ VIEW_CANDIDATES = 8
 """Drawn for each that is wanted."""
 
 Candidate = TypeVar("Candidate")
+
+HELD_OUT_SEED = 1000
+"""Added to a run's seed where patches must be others than calibration's."""
+HELD_OUT_PATCHES = 32
 
 
 @dataclass(frozen=True)
@@ -269,3 +276,43 @@ def _errors(tensor: np.ndarray, first: int) -> np.ndarray:
     """The squared errors of (C, H, W), a few channels at a time: within the cache it is three times faster."""
     parts = np.array_split(tensor, -(-len(tensor) // 4))
     return np.asarray(np.sum([squared_errors(part, first) for part in parts], axis=0))
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """Where a run's patches come from."""
+
+    sensor: str
+    images: Path | None
+    patches: int
+    patch_px: int
+    seed: int
+
+    @cached_property
+    def drawn(self) -> Patches:
+        """What the network is calibrated on."""
+        return draw_patches(self._scenes, self._degraded, self._reference, self.patches, self.seed, self.patch_px)
+
+    @property
+    def unseen(self) -> Patches:
+        """Patches of the same scenes, or of other drawn ones, that calibration does not see."""
+        other = self.seed + HELD_OUT_SEED
+        scenes = self._scenes if self.images else load_scenes(None, self._reference.nominal(), other)
+        return draw_patches(scenes, self._degraded, self._reference, HELD_OUT_PATCHES, other)
+
+    @property
+    def about(self) -> dict[str, str]:
+        """What the file says of it."""
+        return {"calibration_sensor": self._degraded.name, "calibration_seed": str(self.seed)}
+
+    @cached_property
+    def _scenes(self) -> list[Scene]:
+        return load_scenes(self.images, self._reference.nominal(), self.seed)
+
+    @cached_property
+    def _degraded(self) -> SensorProfile:
+        return load_sensor(self.sensor)
+
+    @cached_property
+    def _reference(self) -> SensorProfile:
+        return reference_for(self._degraded)

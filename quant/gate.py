@@ -12,6 +12,7 @@ import onnxruntime as ort
 
 from model.metrics.fidelity import psnr_db
 from profiles.errors import OptionError
+from profiles.figures import Figure, Row, measured, unavailable
 from profiles.toml import read_toml_text, unreadable
 from quant.checks import Check
 from quant.session import run
@@ -156,3 +157,36 @@ def judge_saturation(shares: Mapping[str, float], limits: Limits) -> list[Check]
 
 def _at_most(name: str, value: float, limit: float | None, unit: str, detail: str = "") -> list[Check]:
     return [] if limit is None else [Check(name, value, limit, unit, detail=detail)]
+
+
+def gate_row(result: GateResult) -> Row:
+    """What INT8 changes, on patches that calibration did not see."""
+    found = {
+        "MAE": (result.mae, "of full scale"),
+        "std": (result.std, "of full scale"),
+        "std / MAE": (result.std_over_mae, "ratio"),
+        "99.9th percentile": (result.p999, "of full scale"),
+        "max": (result.max_abs, "of full scale"),
+        "PSNR float-INT8": (result.psnr_between_db, "dB"),
+        "PSNR degraded": (result.psnr_degraded_db, "dB"),
+        "PSNR float": (result.psnr_float_db, "dB"),
+        "PSNR INT8": (result.psnr_int8_db, "dB"),
+    }
+    figures = {name: _figure(value, unit, result.patches) for name, (value, unit) in found.items()}
+    return Row("gate", "INT8 against float", figures)
+
+
+def _figure(value: float, unit: str, patches: int) -> Figure:
+    if math.isinf(value):
+        return unavailable(unit, "infinite: the two images are identical")
+    if math.isnan(value):
+        return unavailable(unit, "a network gave NaN")
+    return measured(value, unit, f"{patches} simulated patches of 128 x 128")
+
+
+def saturation_figure(shares: Mapping[str, float], patches: int) -> Figure:
+    """What share of its results comes to the ends of 8 bits, in the layer where most do."""
+    if not shares:
+        return unavailable("%", "no result in the file is rounded to 8 bits")
+    layer = max(shares, key=lambda name: shares[name])
+    return measured(100 * shares[layer], "%", f"{layer}, the worst of {len(shares)}; {patches} patches of 128 x 128")

@@ -7,7 +7,7 @@ Activations round half up; a runtime that computes in float rounds half to even.
 one half the two differ by one unit: `half_even` takes the runtime's rule, so that both can be proven and counted.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from itertools import product
 
@@ -15,12 +15,13 @@ import numpy as np
 import onnx
 from numpy.lib.stride_tricks import sliding_window_view
 
+from profiles.figures import Figure, Row, measured, predicted
 from quant.core import INT8_MAX, INT8_MIN, IntConv, IntCore
 from quant.encodings import ZERO
 from quant.graph import CORRECTION, PLANES, Add, split
 from quant.onnx_file import any_size, with_outputs
 from quant.passes.stream import merge
-from quant.session import open_session
+from quant.session import few_crops, open_any_size, open_session, run
 
 INT32_BITS = 31
 """Of an accumulator, without the sign."""
@@ -209,3 +210,63 @@ def agreement(core: IntCore, host: onnx.ModelProto, image: np.ndarray) -> Agreem
         unequal = float((runtime.astype(np.int16) - ZERO != even[name]).mean())
         layers.append(LayerAgreement(report, unequal, float((difference > 0).mean()), int(difference.max())))
     return Agreement(layers, merged_correction(core, up), merged_correction(core, even))
+
+
+NARROW_BITS = 23
+"""Of a 24-bit accumulator, without the sign: the documents hint at one (facts on the DPU's rules), int32 has 31."""
+
+
+BITS_SOURCE = "128 times the sum of the weights' sizes, plus the bias: no input exceeds it"
+
+
+def integer_rows(
+    model: onnx.ModelProto, core: IntCore, host: onnx.ModelProto, images: Iterable[np.ndarray]
+) -> tuple[list[Row], Row]:
+    """Each integer operation on a crop of a few images (1, 1, H, W), and what the DPU's rule for halves changes."""
+    seen = few_crops(images)
+    found = [agreement(core, host, crop) for crop in seen]
+    source = f"the integer reference on {len(found)} calibration patches"
+    layers = [_layer_row(list(same), source) for same in zip(*(one.layers for one in found), strict=True)]
+    session = open_any_size(model)
+    both = [
+        [np.clip(crop + result, 0, 1) for result in (one.up, one.even)] for crop, one in zip(seen, found, strict=True)
+    ]
+    in_float = [np.clip(run(session, crop), 0, 1) for crop in seen]
+    return layers, _rounding_row(in_float, both, source)
+
+
+def _layer_row(layers: list[LayerAgreement], source: str) -> Row:
+    proven = layers[0].report.proven_bits
+    left = NARROW_BITS - proven
+
+    def percent(shares: Iterable[float], of: str = source) -> Figure:
+        return measured(100 * float(np.mean(list(shares))), "%", of)
+
+    figures = {
+        "accumulator, seen": measured(max(a.report.peak_bits for a in layers), "bits", source),
+        "accumulator, proven": predicted(proven, "bits", (proven, proven), BITS_SOURCE),
+        "left of 24 bits": predicted(left, "bits", (left, left), f"23 bits and a sign, less {BITS_SOURCE}"),
+        "saturated": percent(a.report.saturated for a in layers),
+        "halves": percent(a.report.ties for a in layers),
+        "as onnxruntime": percent((1 - a.unequal for a in layers), f"{source}, halves to even as there"),
+        "moved by halves up": percent((a.moved for a in layers), f"{source}, halves up"),
+        "at most by": measured(max(a.moved_by for a in layers), "units", f"{source}, halves up"),
+    }
+    return Row("integer layers", layers[0].report.name, figures)
+
+
+def _rounding_row(in_float: list[np.ndarray], both: list[list[np.ndarray]], source: str) -> Row:
+    """How far the DPU's rounding of halves, up, leads away from the runtime's, to even; which is nearer to float."""
+    up, even = (np.concatenate([results[k].ravel() for results in both]) for k in (0, 1))
+    whole = np.concatenate([result.ravel() for result in in_float])
+
+    def mae(one: np.ndarray, other: np.ndarray) -> Figure:
+        return measured(float(np.abs(one - other).mean(dtype=np.float64)), "of full scale", source)
+
+    figures = {
+        "pixels that differ": measured(100 * float((up != even).mean()), "%", source),
+        "MAE between them": mae(up, even),
+        "MAE of halves up": mae(up, whole),
+        "MAE of halves to even": mae(even, whole),
+    }
+    return Row("rounding", "halves up (DPU) against halves to even (onnxruntime)", figures)

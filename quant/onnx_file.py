@@ -148,3 +148,21 @@ def any_size(model: onnx.ModelProto) -> onnx.ModelProto:
             side.dim_param = name
     del free.graph.value_info[:]
     return free
+
+
+def is_quantised(model: onnx.ModelProto) -> bool:
+    """Whether any node computes on, makes or reads quantised numbers."""
+    kinds = {node.op_type.lower() for node in model.graph.node}
+    return any(mark in kind for kind in kinds for mark in ("qlinear", "quantizelinear", "integer"))
+
+
+def require_quantised(model: onnx.ModelProto, path: Path, wanted: bool) -> None:
+    """Refuse the float network in the place of the INT8 one, and the other way round.
+
+    Raises:
+        ModelError: it is the other kind.
+    """
+    if is_quantised(model) != wanted:
+        expected, got = ("an INT8 network", "a float one") if wanted else ("a float network", "an INT8 one")
+        remedy = "give the float model first, the INT8 model second"
+        raise ModelError(str(path), expected=expected, got=got, remedy=remedy)

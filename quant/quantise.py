@@ -3,14 +3,17 @@
 import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields, replace
 
 import numpy as np
 import onnx
 
+from profiles.errors import OptionError
+from profiles.figures import Row
 from quant.calibration import Patches, Remade, choose_positions
 from quant.core import SHIFTS, IntCore, Shifts, build_core
 from quant.encodings import board_model, host_model
+from quant.gate import compare, gate_row
 from quant.graph import (
     CORRECTION,
     Conv,
@@ -26,7 +29,7 @@ from quant.onnx_file import fixed_tile_px, metadata
 from quant.passes.equalise import Costs, channel_ranges, equalise, search, search_steps
 from quant.passes.fit_weights import fit_weights, input_moments
 from quant.passes.stream import STREAM_POSITION, common_position, half_steps, steady, stream_tensors, two_gains
-from quant.session import crops, open_session, run, tensor_values
+from quant.session import crops, open_any_size, open_session, run, tensor_values
 
 SEARCH_CROPS = 16
 """What the equalisation is searched on, a quarter of them with the strongest edges: there int8 clips."""
@@ -180,3 +183,40 @@ def crop_costs(model: onnx.ModelProto, targets: Targets) -> Costs:
             return np.array(list(cores.map(cost, range(len(targets)) if crops is None else crops)))
 
     return of
+
+
+def ablation_rows(
+    model: onnx.ModelProto, calibration: Patches, held_out: Patches, tick: Callable[[], None], shifts: Shifts = SHIFTS
+) -> list[Row]:
+    """The gate's figures with all passes, with each one left out, and with none."""
+    session, rows = open_any_size(model), []
+    for name, passes in ablations().items():
+        made = quantise_model(model, calibration, {}, lambda: None, passes, shifts)
+        row = gate_row(compare(session, open_any_size(made.host), held_out.pairs))
+        rows.append(Row("ablation", name, row.figures))
+        tick()
+    return rows
+
+
+def ablations() -> dict[str, Passes]:
+    """All passes, all but one, none; without a steady stream there is nothing to equalise."""
+    names = [field.name for field in fields(Passes)]
+    found = {"all passes": ALL}
+    for name in names:
+        left_out = {name: False, "equalise": False} if name == "steady_stream" else {name: False}
+        found[f"without {name.replace('_', ' ')}"] = replace(ALL, **left_out)
+    return {**found, "none": Passes(**dict.fromkeys(names, False))}
+
+
+def passes_without(names: list[str]) -> Passes:
+    """All passes but these.
+
+    Raises:
+        OptionError: no pass of that name.
+    """
+    known = [field.name for field in fields(Passes)]
+    for name in names:
+        if name.replace("-", "_") not in known:
+            expected = ", ".join(known).replace("_", "-")
+            raise OptionError("--without", expected=expected, got=repr(name), remedy="name one of these")
+    return replace(ALL, **{name.replace("-", "_"): False for name in names})

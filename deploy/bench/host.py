@@ -19,8 +19,8 @@ import torch
 from deploy.bench.host_state import Watch, memory_rise, watched
 from deploy.bench.profile import node_rows, profile, timed
 from deploy.bench.tables import TABLE, Swath, board_cpu_row, efficiency
-from deploy.defaults import counterpart, is_quantised
 from deploy.dpu.reading import network_of
+from deploy.export import counterpart
 from model.processor import require_cores
 from model.simulator.acquire import MARGIN_PX, simulate_pair
 from model.simulator.detector import Draw
@@ -28,7 +28,7 @@ from model.simulator.procedural import procedural_scene
 from model.traditional.pipeline import Chain, restore_traditional
 from profiles import SensorProfile, TargetProfile, load_target
 from profiles.figures import Figure, Row, measured, predicted, unavailable
-from quant.onnx_file import load_onnx
+from quant.onnx_file import is_quantised, load_onnx
 from quant.session import open_session, require_finite
 
 

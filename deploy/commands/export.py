@@ -32,8 +32,7 @@ def export(
     for the middle of each. What lies outside the range that they were trained for is told as the nearest end of it,
     with a warning.
     """
-    from deploy.defaults import about
-    from deploy.export import network_for, require_parity, to_onnx
+    from deploy.export import about, network_for, require_parity, to_onnx
     from model.io.files import require_writable
     from model.shipped import float_file, shipped_weights
     from quant.onnx_file import save_onnx

@@ -50,19 +50,15 @@ def quantize(
 
     Prints each integer layer: bits of its accumulator, seen and proven, and the share of saturated results.
     """
-    from deploy.defaults import float_model
-    from deploy.quantise import (
-        Calibration,
-        Wanted,
-        passes_without,
-        quantise_free_file,
-        quantise_legal_file,
-    )
+    from deploy.export import float_model
+    from deploy.quantise import Wanted, quantise_free_file, quantise_legal_file
     from deploy.results import Document
     from model.io.files import require_writable
     from model.shipped import float_file
     from profiles import load_target
     from profiles.errors import OptionError
+    from quant.calibration import Calibration
+    from quant.quantise import passes_without
 
     if regime is Regime.free and (board or ablate or report or without):
         remedy = "leave it out, or take --regime legal"

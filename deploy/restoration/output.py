@@ -22,7 +22,7 @@ from filelock import BaseFileLock, FileLock, Timeout
 from deploy.restoration.options import Compression
 from deploy.restoration.plan import Span
 from deploy.restoration.source import BIG_TIFF_SUFFIXES, Raster
-from model.io.images import TIFF_SUFFIXES
+from model.io.files import TIFF_SUFFIXES
 from profiles.errors import MachineError, OptionError, sizes
 from profiles.toml import read_json
 

@@ -13,7 +13,8 @@ from typing import Any, Protocol
 import numpy as np
 import tifffile
 
-from model.io.images import TIFF_SUFFIXES, damage_in_a_sentence, read_pixels, require_image_file
+from model.io.files import TIFF_SUFFIXES
+from model.io.images import damage_in_a_sentence, read_pixels, require_image_file
 from model.io.tiff import check_page, open_tiff
 from profiles.errors import ImageError
 

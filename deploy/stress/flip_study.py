@@ -6,17 +6,16 @@ from math import exp
 from pathlib import Path
 
 from deploy.bench.tables import predict_file
-from deploy.defaults import HELD_OUT_SEED
 from deploy.dpu.board import Dpu, load_dpu
 from deploy.dpu.cost.latency import Prediction, frame_rate
 from deploy.dpu.cost.layers import Constants
-from deploy.quantise import Calibration
 from deploy.report.curves import Curve, Panel, Points, curves_svg
 from deploy.stress import flips
 from deploy.stress.flips import MEMORIES, SETS, Patient, name_of, rates_of
 from deploy.stress.networks import core_of, planes_of
 from deploy.stress.subject import Subject
 from profiles.figures import Row, predicted
+from quant.calibration import HELD_OUT_SEED, Calibration
 from quant.core import IntConv
 from quant.faults import INT8_BITS, as_stored, learn_guards, weight_bits
 

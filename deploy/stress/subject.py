@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import conv2d
 
-from deploy.defaults import float_model, require_quantised
+from deploy.export import float_model
 from deploy.restoration.arrays import Infer
 from deploy.restoration.engine import Restorer, restore_rows
 from deploy.restoration.plan import make_plan
@@ -24,7 +24,7 @@ from profiles.errors import BeersError
 from quant.core import IntCore
 from quant.encodings import read_core
 from quant.graph import CORRECTION, IMAGE, Add, Graph, correction_graph
-from quant.onnx_file import any_size, load_onnx
+from quant.onnx_file import any_size, load_onnx, require_quantised
 from quant.radius import receptive_radius_px
 from quant.session import open_session, run
 

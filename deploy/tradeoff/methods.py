@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import onnx
 
-from deploy.defaults import float_model, is_quantised
+from deploy.export import float_model
 from deploy.methods import knowledge_of, method_named
 from deploy.restoration.arrays import TILE_PX, Infer, restore_with
 from deploy.restoration.options import Runtime
@@ -31,7 +31,7 @@ from profiles.errors import BeersError, ModelError, OptionError
 from profiles.sensor import SensorProfile, reference_for
 from quant.calibration import Patches, draw_patches
 from quant.free import free_ticks, quantise_free
-from quant.onnx_file import fixed_tile_px, load_onnx, metadata, save_onnx
+from quant.onnx_file import fixed_tile_px, is_quantised, load_onnx, metadata, save_onnx
 from quant.passes.equalise import search_steps
 from quant.quantise import SEARCH_CROPS, quantise_model, ticks
 from quant.radius import receptive_radius_px

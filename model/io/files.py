@@ -13,11 +13,12 @@ from contextlib import contextmanager, suppress
 from itertools import combinations
 from pathlib import Path
 
-from model.io.images import IMAGE_SUFFIXES
 from model.shipped import SHIPPED
 from profiles.errors import MachineError, OptionError
 from profiles.toml import HERE as PROFILES
 
+TIFF_SUFFIXES = {".tif", ".tiff"}
+IMAGE_SUFFIXES = TIFF_SUFFIXES | {".png", ".jpg", ".jpeg"}
 READ_SUFFIXES = IMAGE_SUFFIXES | {".onnx", ".safetensors", ".pth"}
 """What a command takes from a folder that it reads; an earlier run's figures may lie there and be renewed."""
 KINDS = {

@@ -12,12 +12,11 @@ import numpy as np
 import psutil
 from PIL import Image
 
+from model.io.files import IMAGE_SUFFIXES, TIFF_SUFFIXES
 from model.io.tiff import check_page, open_tiff
 from profiles.errors import BeersError, ImageError, MachineError, OptionError, sizes
 from profiles.toml import read_whole, unreadable
 
-TIFF_SUFFIXES = {".tif", ".tiff"}
-IMAGE_SUFFIXES = TIFF_SUFFIXES | {".png", ".jpg", ".jpeg"}
 MAX_DN = 4095
 """The largest digital number of 12 bits: full scale, unless a sensor says otherwise."""
 FRAME_NUMBERS = re.compile(r"(_[0-9a-f]*\d[0-9a-f]*)+$")

@@ -13,7 +13,7 @@ from onnx import numpy_helper
 from typer.testing import CliRunner
 
 from deploy.cli import app
-from deploy.defaults import float_model
+from deploy.export import float_model
 from deploy.gate import baseline_mae, junit, markdown, sentence, structure_checks
 from deploy.results import Document
 from model.shipped import SHIPPED, default_int8, shipped_pair

@@ -15,7 +15,6 @@ from typer.testing import CliRunner
 
 from deploy.cli import app
 from deploy.export import to_onnx
-from deploy.quantise import ablations, kind_of_error, worst_row
 from deploy.report.histogram import FONT_PX, MOST_BARS, bins, histogram_url
 from deploy.report.labels import text_width
 from deploy.results import SCHEMA_PATH
@@ -27,8 +26,8 @@ from profiles.sensor import reference_for
 from quant.calibration import draw_patches
 from quant.graph import MAX_DN
 from quant.onnx_file import fixed_tile_px, load_onnx, metadata, save_onnx
-from quant.quantise import ALL, Passes
-from quant.sensitivity import Spread
+from quant.quantise import ALL, Passes, ablations
+from quant.sensitivity import Spread, kind_of_error, worst_row
 
 PHONE_PX = 358
 """A window of 390 pixels less the page's margins."""

@@ -7,11 +7,10 @@ import jsonschema
 import pytest
 
 from deploy.compare import read_document
-from deploy.gate import gate_row
 from deploy.results import SCHEMA_PATH, Document
 from profiles.figures import Figure, Row, measured, number, predicted, published, unavailable
 from quant.checks import Check
-from quant.gate import GateResult, Limits, judge
+from quant.gate import GateResult, Limits, gate_row, judge
 
 SCHEMA = json.loads(SCHEMA_PATH.read_text())
 

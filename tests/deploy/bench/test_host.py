@@ -13,13 +13,13 @@ from deploy.bench.host import Sensors, Timed, drawn_acquisition, host_rows, take
 from deploy.bench.host_state import memory_rise, watched
 from deploy.bench.profile import node_rows, profile
 from deploy.bench.tables import Swath, board_cpu_row, slowdown
-from deploy.defaults import counterpart, float_model, is_quantised
+from deploy.export import counterpart, float_model
 from model.shipped import default_int8
 from profiles import load_sensor, load_target
 from profiles.constant import Constant
 from profiles.errors import ModelError
 from profiles.figures import Row
-from quant.onnx_file import load_onnx
+from quant.onnx_file import is_quantised, load_onnx
 from tests.deploy.dpu.graphs import Sketch, float_convbeers, integer_convbeers
 
 SENSORS = Sensors(load_sensor("pleiades-degraded"), load_sensor("pleiades-reference"))

@@ -5,8 +5,8 @@ from pathlib import Path
 import pytest
 
 from deploy.bench.tables import Swath
-from deploy.defaults import float_model
 from deploy.dpu.board import load_dpu
+from deploy.export import float_model
 from deploy.tradeoff.methods import Network, find_networks, is_papers, operations_per_px, shape_of
 from deploy.tradeoff.points import EXACT, LEGAL, PRECISIONS, Board, Unit, network_points, other_points, tiles_px
 from deploy.tradeoff.selection import board_of, configurations_for, precisions_of

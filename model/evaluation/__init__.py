@@ -1,0 +1,1 @@
+"""Methods compared on the same pairs and targets: scores with intervals, by image and by site, sweeps."""
