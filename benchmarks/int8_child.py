@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import onnx
 
-from quant.graph import PLANES, POSITION
+from quant.graph import PLANES, PLANES_FRAC_BITS
 
 STRIDE = 16
 """Patches that onnxruntime's calibration looks at together; with 64 at once the network of 16 x 64 takes 20 GB."""
@@ -75,7 +75,7 @@ def onnxruntimes(way: str, network: Path, inputs: np.ndarray, out: Path) -> None
             return None if patch is None else {name: patch[None]}
 
     name = onnx.load(network).graph.input[0].name
-    unit = {"scale": np.array(2.0**-POSITION, np.float32), "zero_point": np.array(128, np.uint8)}
+    unit = {"scale": np.array(2.0**-PLANES_FRAC_BITS, np.float32), "zero_point": np.array(128, np.uint8)}
     options: dict[str, Any] = {"CalibPercentile": 99.99, "CalibStridedMinMax": STRIDE}
     options |= (
         {"TensorQuantOverrides": {PLANES: [{**unit, "quant_type": ort.QuantType.QUInt8}]}} if name == PLANES else {}

@@ -110,7 +110,7 @@ def run_demo(
 ) -> Demo:
     """Run the chain, write its files into `out`, and return the figures and the report.
 
-    Files: float.onnx, int8.onnx, core.onnx (the board's spelling), restored.tif, before-after.png.
+    Files: float.onnx, int8.onnx, core.onnx (the board's encoding), restored.tif, before-after.png.
     """
     say("reading the image")
     eyes = sensors(sensor)

@@ -135,7 +135,7 @@ def about(variant: str, recipe: dict[str, object]) -> dict[str, str]:
     }
 
 
-def counterpart(model: onnx.ModelProto) -> onnx.ModelProto | None:
+def other_precision(model: onnx.ModelProto) -> onnx.ModelProto | None:
     """A shipped network of the same variant in the other precision, or None; its weights may be others.
 
     Time depends on the shapes, not on the weights: for a comparison of time any weights will do.

@@ -26,15 +26,13 @@ from deploy.export import float_model
 from deploy.results import Document
 from model.io.files import require_regular, require_writable, write_text
 from model.shipped import VARIANT, float_file, int8_file, shipped_pair
-from model.simulator.procedural import load_scenes
 from profiles import load_sensor, load_target
 from profiles.errors import BeersError, MachineError, OptionError, printable
 from profiles.figures import Row
-from profiles.sensor import reference_for
 from profiles.toml import read_json, unreadable
-from quant.calibration import HELD_OUT_SEED, Patches, draw_patches
+from quant.calibration import unseen_patches
 from quant.checks import Check
-from quant.encodings import spelling_faults
+from quant.encodings import encoding_faults
 from quant.gate import GateResult, Limits, _figure, compare, gate_row, judge, judge_saturation, saturation_figure
 from quant.onnx_file import fixed_tile_px, load_onnx, require_quantised
 from quant.relus import count_relus
@@ -112,20 +110,12 @@ def run_gate(request: Request) -> Outcome:
     floating, int8 = float_model(request.float_path), load_onnx(request.int8_path)
     require_quantised(floating, request.float_path, wanted=False)
     require_quantised(int8, request.int8_path, wanted=True)
-    sessions, unseen = (open_any_size(floating), open_any_size(int8)), _unseen(request)
+    sessions = open_any_size(floating), open_any_size(int8)
+    unseen = unseen_patches(load_sensor(request.sensor), request.images, request.patches, request.seed)
     result, shares = compare(*sessions, unseen.pairs), saturated_shares(int8, unseen.degraded)
     checks = judge(result, request.limits, before) + judge_saturation(shares, request.limits)
     checks += structure_checks(floating, request.int8_path, int8, request.target)
     return Outcome(result, shares, tuple(checks))
-
-
-def _unseen(request: Request) -> Patches:
-    """Patches that calibration with the same seed does not draw."""
-    degraded = load_sensor(request.sensor)
-    reference = reference_for(degraded)
-    held_out = request.seed + HELD_OUT_SEED
-    scenes = load_scenes(request.images, reference.nominal(), held_out)
-    return draw_patches(scenes, degraded, reference, request.patches, held_out)
 
 
 def files_or_shipped(float_path: Path | None, int8_path: Path | None, variant: str | None) -> tuple[Path, Path]:
@@ -200,13 +190,13 @@ def _legality(path: Path, model: onnx.ModelProto, target: str) -> list[Check]:
 
 
 def _relus(float_model: onnx.ModelProto, int8: onnx.ModelProto) -> Check:
-    wanted, kept = count_relus(float_model).spelt, count_relus(int8)
+    wanted, kept = count_relus(float_model).explicit, count_relus(int8)
     return Check("ReLUs lost or added", kept.off_by(wanted), 0, "ReLU", detail=f"{wanted} in float, {kept} in INT8")
 
 
 def _encoding(model: onnx.ModelProto) -> list[Check]:
     """Of files that `quantize` wrote under the rules of a DPU: does each part say what the whole numbers ask for?"""
-    faults = spelling_faults(model)
+    faults = encoding_faults(model)
     if faults is None:
         return []
     return [Check("faults of the encoding", len(faults), 0, "fault", detail=faults[0] if faults else "")]
@@ -314,7 +304,7 @@ def _suite(title: str, **counts: int) -> ET.Element:
 
 
 def _escaped(text: str) -> str:
-    """Markdown in which a name of a stranger's file opens no tag."""
+    """Markdown in which a name of another's file opens no tag."""
     return text.replace("<", "&lt;") + "\n"
 
 

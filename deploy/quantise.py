@@ -10,8 +10,8 @@ from pathlib import Path
 
 import onnx
 
-from deploy.report.blame_page import blame_page
 from deploy.report.page import Report, write_report
+from deploy.report.sensitivity_page import sensitivity_page
 from deploy.results import print_rows
 from model.progress import steps
 from profiles.errors import OptionError
@@ -27,7 +27,7 @@ from quant.quantise import Passes, Quantised, ablation_rows, ablations, quantise
 from quant.sensitivity import (
     WORST,
     headline,
-    layer_blame_rows,
+    layer_error_rows,
     sizes_row,
     spread_of,
     worst_row,
@@ -35,16 +35,16 @@ from quant.sensitivity import (
 from quant.session import LAYER_PATCHES, open_any_size
 
 
-def blame_report(
+def sensitivity_report(
     model: onnx.ModelProto, result: Quantised, held_out: Patches, more: list[Row], tick: Callable[[], None]
 ) -> tuple[list[Row], Report]:
-    """Blame on patches that calibration did not see: the rows, and the page with the rows of `more` after them."""
+    """Where INT8 errs on patches that calibration did not see: the rows, and the page with those of `more` after."""
     sessions = open_any_size(model), open_any_size(result.host)
     gate, spread = compare(*sessions, held_out.pairs), spread_of(*sessions, held_out.degraded)
     worst = spread.worst(WORST)
-    layers = layer_blame_rows(result, held_out, tick)
+    layers = layer_error_rows(result, held_out, tick)
     rows = [gate_row(gate), *layers, *(worst_row(k, held_out, spread) for k in worst), sizes_row(spread)]
-    return rows, blame_page(headline(gate, layers), [*rows, *more], spread, held_out, sessions, worst)
+    return rows, sensitivity_page(headline(gate, layers), [*rows, *more], spread, held_out, sessions, worst)
 
 
 Say = Callable[[str], None]
@@ -92,13 +92,13 @@ def quantise_legal_file(
     say(f"wrote {out}: {len(result.core.ops)} integer operations, {result.relus} ReLUs kept")
     if wanted.board is not None:
         save_onnx(result.board, wanted.board)
-        say(f"wrote {wanted.board}: the same numbers in the board's spelling")
+        say(f"wrote {wanted.board}: the same numbers in the board's encoding")
     images = calibration.drawn.degraded
     layers, rounding = integer_rows(model, result.core, result.host, images)
     print_rows("integer layers", layers)
-    print_rows("the rule for halves", [rounding])
+    print_rows("tie rounding", [rounding])
     rows = [*layers, rounding, *(_ablated(model, calibration, shifts) if wanted.ablate else [])]
-    return _blamed(model, result, calibration, rows, wanted.page, say) if wanted.page else rows
+    return _with_sensitivity(model, result, calibration, rows, wanted.page, say) if wanted.page else rows
 
 
 def _shifts_of(target: TargetProfile) -> Shifts:
@@ -115,11 +115,11 @@ def _ablated(model: onnx.ModelProto, calibration: Calibration, shifts: Shifts) -
     return rows
 
 
-def _blamed(
+def _with_sensitivity(
     model: onnx.ModelProto, result: Quantised, calibration: Calibration, rows: list[Row], page: Path, say: Say
 ) -> list[Row]:
     with steps("blaming", LAYER_PATCHES) as bar:
-        found, written = blame_report(model, result, calibration.unseen, rows, bar.advance)
+        found, written = sensitivity_report(model, result, calibration.unseen, rows, bar.advance)
     write_report(written, page)
     say(f"wrote {page}: {written.headline}")
     return [*found, *rows]

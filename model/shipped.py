@@ -69,12 +69,12 @@ def _named(given: Path) -> list[str]:
 
 
 def default_int8() -> Path:
-    """The shipped INT8 network (ONNX, host spelling)."""
+    """The shipped INT8 network (ONNX, host encoding)."""
     return shipped_pair(VARIANT)[1]
 
 
 def shipped_pair(variant: str) -> tuple[Path, Path]:
-    """The float weights of that name and their INT8 network (ONNX, host spelling).
+    """The float weights of that name and their INT8 network (ONNX, host encoding).
 
     Raises:
         ModelError: none are shipped.

@@ -1,8 +1,8 @@
-"""The numbers: calibration, power-of-two positions, INT8 graph writing and the float/INT8 gate.
+"""The numbers: calibration, power-of-two scales, INT8 graph writing and the float/INT8 gate.
 
-float ONNX -> graph -> planes -> calibration -> positions -> host file (onnxruntime) and board file (DPU flow)
+float ONNX -> graph -> planes -> calibration -> scales -> host file (onnxruntime) and board file (DPU flow)
 """
 
-from quant.silence import silence_runtimes
+from quant.telemetry import switch_off_telemetry
 
-silence_runtimes()  # here, because a runtime's first import anywhere in this package is too late
+switch_off_telemetry()  # here, because a runtime's first import anywhere in this package is too late

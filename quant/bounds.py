@@ -195,21 +195,21 @@ def _conv(core: IntCore, op: IntConv, ranges: dict[str, Range]) -> tuple[np.ndar
     low, high = np.minimum(ranges[op.input][0], 0), np.maximum(ranges[op.input][1], 0)
     weight = op.weight.astype(np.int64)
     up, down = np.maximum(weight, 0).sum((2, 3)), np.minimum(weight, 0).sum((2, 3))
-    product = op.weight_position + core.positions[op.input]
-    bias = op.bias.astype(np.int64) << (product - op.bias_position)
+    product = op.weight_frac_bits + core.frac_bits[op.input]
+    bias = op.bias.astype(np.int64) << (product - op.bias_frac_bits)
     least, most = up @ low + down @ high + bias, up @ high + down @ low + bias
     if op.relu:
         least, most = np.maximum(least, 0), np.maximum(most, 0)
-    return least, most, product - core.positions[op.output]
+    return least, most, product - core.frac_bits[op.output]
 
 
 def _whole_add(core: IntCore, op: Add, ranges: dict[str, Range]) -> tuple[np.ndarray, np.ndarray, int]:
-    finest = max(core.positions[name] for name in op.inputs)
+    finest = max(core.frac_bits[name] for name in op.inputs)
     low, high = (
-        sum(ranges[name][end].astype(np.int64) << (finest - core.positions[name]) for name in op.inputs)
+        sum(ranges[name][end].astype(np.int64) << (finest - core.frac_bits[name]) for name in op.inputs)
         for end in (0, 1)
     )
-    return np.asarray(low), np.asarray(high), finest - core.positions[op.output]
+    return np.asarray(low), np.asarray(high), finest - core.frac_bits[op.output]
 
 
 def _shifted(sums: np.ndarray, shift: int) -> np.ndarray:

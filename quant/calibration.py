@@ -1,4 +1,4 @@
-"""Calibration: what values each tensor takes, seen one piece of a patch at a time.
+"""Calibration: what values each tensor takes, seen one tile of a patch at a time.
 
 Patches are simulated anew for each pass over them, which costs a tenth of what the network does with them. So memory
 grows neither with their number nor with their size.
@@ -24,8 +24,8 @@ from model.training.patches import PatchRecipe, turn
 from profiles import load_sensor
 from profiles.errors import ImageError
 from profiles.sensor import Sensor, SensorProfile, reference_for
-from quant.core import CANDIDATES, coarsest_position, squared_errors
-from quant.graph import PLANES, POSITION, Graph, float_model, tensors
+from quant.core import CANDIDATES, squared_errors, unclipped_frac_bits
+from quant.graph import PLANES, PLANES_FRAC_BITS, Graph, float_model, tensors
 from quant.session import halo_of, open_session, tensor_values
 
 VIEW_CANDIDATES = 8
@@ -243,14 +243,14 @@ def _simulate(ground: Ground, sensors: dict[str, Sensor], draw: Draw) -> list[np
     return [np.ascontiguousarray(image[None]) for image in turned.numpy()]
 
 
-def choose_positions(
+def choose_frac_bits(
     graph: Graph, images: Iterable[np.ndarray], tick: Callable[[], None], least_squares: bool = True
 ) -> dict[str, int]:
-    """Least-squares position of every tensor of a plane-reading graph over images (1, 1, H, W) in [0, 1].
+    """Least-squares scale of every tensor of a plane-reading graph over images (1, 1, H, W) in [0, 1].
 
-    Two passes, so images that can be passed over twice: the largest values, then the squared errors of the positions
+    Two passes, so images that can be passed over twice: the largest values, then the squared errors of the scales
     around them. `tick` is called once per
-    image and pass. Without `least_squares` the positions are those that clip nothing.
+    image and pass. Without `least_squares` the scales are those that clip nothing.
     """
     names, halo_px = tensors(graph), halo_of(graph)
     session = open_session(float_model(graph, names))
@@ -263,13 +263,13 @@ def choose_positions(
     largest = np.zeros(len(names))
     for results in values():
         largest = np.maximum(largest, [float(np.abs(r).max()) for r in results])
-    first = [coarsest_position(m) for m in largest]
+    first = [unclipped_frac_bits(m) for m in largest]
     errors = np.zeros((len(names), CANDIDATES))
     for results in values():
         errors += [_errors(r[0], f) for r, f in zip(results, first, strict=True)]
     moves = np.argmin(errors, axis=1) if least_squares else np.zeros(len(names), int)
     best = {name: f + int(move) for name, f, move in zip(names, first, moves, strict=True)}
-    return {PLANES: POSITION, **best}
+    return {PLANES: PLANES_FRAC_BITS, **best}
 
 
 def _errors(tensor: np.ndarray, first: int) -> np.ndarray:
@@ -296,9 +296,7 @@ class Calibration:
     @property
     def unseen(self) -> Patches:
         """Patches of the same scenes, or of other drawn ones, that calibration does not see."""
-        other = self.seed + HELD_OUT_SEED
-        scenes = self._scenes if self.images else load_scenes(None, self._reference.nominal(), other)
-        return draw_patches(scenes, self._degraded, self._reference, HELD_OUT_PATCHES, other)
+        return unseen_patches(self._degraded, self.images, HELD_OUT_PATCHES, self.seed)
 
     @property
     def about(self) -> dict[str, str]:
@@ -316,3 +314,16 @@ class Calibration:
     @cached_property
     def _reference(self) -> SensorProfile:
         return reference_for(self._degraded)
+
+
+def unseen_patches(degraded: SensorProfile, images: Path | None, patches: int, seed: int) -> Patches:
+    """Patches of 128 x 128 that calibration with the same seed does not draw.
+
+    Args:
+        degraded: the sensor's profile; the reference is the one that belongs to it.
+        images: folder of scenes; None for drawn ones, which are others than calibration's.
+        patches: how many.
+        seed: of the calibration.
+    """
+    reference, other = reference_for(degraded), seed + HELD_OUT_SEED
+    return draw_patches(load_scenes(images, reference.nominal(), other), degraded, reference, patches, other)

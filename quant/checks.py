@@ -44,7 +44,7 @@ class Check:
     def found(self) -> str:
         """The value with its unit and its detail, for a person."""
         unit = "" if self.unit in IN_THE_NAME else f" {self.unit}"
-        # A detail may hold the name of a node of a stranger's file: it must stay on its line of a log.
+        # A detail may hold the name of a node of another's file: it must stay on its line of a log.
         return f"{self.value:.4g}{unit}" + (f" ({printable(self.detail)})" if self.detail else "")
 
     @property

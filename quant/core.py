@@ -1,6 +1,7 @@
 """The integer core: int8 weights and bias, and a power-of-two scale for every tensor, as the DPU demands.
 
-A tensor at position p holds whole multiples of 2^-p in [-128, 127] (UG1414 3.5, vai_q).
+A tensor with n fractional bits holds whole multiples of 2^-n, its scale, in [-128, 127] times that (UG1414 3.5,
+vai_q). `frac_bits` is n everywhere; a finer scale has more of them.
 """
 
 from collections.abc import Mapping
@@ -14,23 +15,23 @@ from quant.graph import Add, Conv, Graph
 
 INT8_MIN, INT8_MAX = -128, 127
 CANDIDATES = 6
-"""Positions tried: the one that clips nothing, and the finer ones after it."""
+"""Scales tried: the one that clips nothing, and the finer ones after it."""
 
 
-def quantise(values: np.ndarray, position: int) -> np.ndarray:
+def quantise(values: np.ndarray, frac_bits: int) -> np.ndarray:
     """Whole numbers in [-128, 127], rounded half away from zero as the DPU does for weights and bias."""
-    scaled = np.asarray(values, dtype=np.float64) * 2.0**position
+    scaled = np.asarray(values, dtype=np.float64) * 2.0**frac_bits
     rounded = np.sign(scaled) * np.floor(np.abs(scaled) + 0.5)
     return np.asarray(np.clip(rounded, INT8_MIN, INT8_MAX).astype(np.int8))
 
 
-def coarsest_position(max_abs: float) -> int:
-    """The finest position that clips nothing (0 for a tensor of zeros)."""
+def unclipped_frac_bits(max_abs: float) -> int:
+    """The finest scale that clips nothing (0 for a tensor of zeros)."""
     return int(np.floor(np.log2(INT8_MAX / max_abs))) if max_abs > 0 else 0
 
 
 def squared_errors(values: np.ndarray, first: int) -> np.ndarray:
-    """Sum of squared rounding and clipping errors at positions first .. first + CANDIDATES - 1, float64."""
+    """Sum of squared rounding and clipping errors with first .. first + CANDIDATES - 1 fractional bits, float64."""
     errors = np.empty(CANDIDATES)
     for k in range(CANDIDATES):
         scale = np.float32(2.0 ** (first + k))
@@ -40,9 +41,9 @@ def squared_errors(values: np.ndarray, first: int) -> np.ndarray:
     return errors
 
 
-def best_position(values: np.ndarray) -> int:
-    """The least-squares position of one array."""
-    first = coarsest_position(float(np.abs(values).max(initial=0.0)))
+def best_frac_bits(values: np.ndarray) -> int:
+    """The least-squares scale of one array."""
+    first = unclipped_frac_bits(float(np.abs(values).max(initial=0.0)))
     return first + int(np.argmin(squared_errors(np.asarray(values, dtype=np.float32), first)))
 
 
@@ -91,9 +92,9 @@ class IntConv:
     input: str
     output: str
     weight: np.ndarray  # (O, I, kh, kw) int8
-    weight_position: int
+    weight_frac_bits: int
     bias: np.ndarray  # (O,) int8
-    bias_position: int
+    bias_frac_bits: int
     relu: bool
 
     @property
@@ -109,10 +110,10 @@ class IntConv:
 
 @dataclass(frozen=True)
 class IntCore:
-    """Operations in order, and the position of every activation tensor."""
+    """Operations in order, and the scale of every activation tensor."""
 
     ops: tuple[IntConv | Add, ...]
-    positions: Mapping[str, int]
+    frac_bits: Mapping[str, int]
 
     @property
     def output_channels(self) -> int:
@@ -121,22 +122,22 @@ class IntCore:
         return len(last.weight) if isinstance(last, IntConv) else 1
 
     def scale(self, tensor: str) -> float:
-        """The value of one unit of a tensor, 2^-position."""
-        return float(2.0 ** -self.positions[tensor])
+        """The value of one unit of a tensor, 2^-n."""
+        return float(2.0 ** -self.frac_bits[tensor])
 
 
-def build_core(graph: Graph, positions: Mapping[str, int], shifts: Shifts = SHIFTS) -> IntCore:
-    """Quantise the weights of a graph, and move positions that the DPU's shifts cannot reach.
+def build_core(graph: Graph, frac_bits: Mapping[str, int], shifts: Shifts = SHIFTS) -> IntCore:
+    """Quantise the weights of a graph, and move scales that the DPU's shifts cannot reach.
 
     Args:
         graph: a plane-reading graph.
-        positions: the least-squares position of every activation.
+        frac_bits: the least-squares number of fractional bits of every activation.
         shifts: the windows of the target.
 
     Raises:
-        ModelError: no positions are within reach: sizes of values that have nothing to do with each other.
+        ModelError: no scales are within reach: sizes of values that have nothing to do with each other.
     """
-    legal = dict(positions)
+    legal = dict(frac_bits)
     for _ in range(ROUNDS):
         core = _in_one_round(graph, legal, shifts)
         faults = shift_faults(core, shifts)
@@ -146,65 +147,65 @@ def build_core(graph: Graph, positions: Mapping[str, int], shifts: Shifts = SHIF
     raise ModelError("float model", expected="values that the DPU's shifts reach", got=faults[0], remedy=remedy)
 
 
-def _in_one_round(graph: Graph, positions: dict[str, int], shifts: Shifts) -> IntCore:
-    """Every operation within reach of the positions before it, which it may move."""
+def _in_one_round(graph: Graph, frac_bits: dict[str, int], shifts: Shifts) -> IntCore:
+    """Every operation within reach of the scales before it, which it may move."""
     ops: list[IntConv | Add] = []
     for op in graph:
         if isinstance(op, Conv):
-            ops.append(_quantise_conv(op, positions, shifts))
+            ops.append(_quantise_conv(op, frac_bits, shifts))
         else:
-            _move_add(op, positions, shifts)
+            _move_add(op, frac_bits, shifts)
             ops.append(op)
-    return IntCore(tuple(ops), dict(positions))
+    return IntCore(tuple(ops), dict(frac_bits))
 
 
-def _quantise_conv(op: Conv, positions: dict[str, int], shifts: Shifts) -> IntConv:
-    finest = shifts.cut[1] + positions[op.output] - positions[op.input]  # finer weights would make the result clip
-    weight_position = min(best_position(op.weight), finest)
-    product = weight_position + positions[op.input]
-    cut = clamp(product - positions[op.output], shifts.cut)
-    positions[op.output] = product - cut
-    weight = quantise(op.weight, weight_position)
+def _quantise_conv(op: Conv, frac_bits: dict[str, int], shifts: Shifts) -> IntConv:
+    finest = shifts.cut[1] + frac_bits[op.output] - frac_bits[op.input]  # finer weights would make the result clip
+    weight_frac_bits = min(best_frac_bits(op.weight), finest)
+    product = weight_frac_bits + frac_bits[op.input]
+    cut = clamp(product - frac_bits[op.output], shifts.cut)
+    frac_bits[op.output] = product - cut
+    weight = quantise(op.weight, weight_frac_bits)
     return IntConv(
-        op.name, op.input, op.output, weight, weight_position, *quantise_bias(op.bias, product, shifts), op.relu
+        op.name, op.input, op.output, weight, weight_frac_bits, *quantise_bias(op.bias, product, shifts), op.relu
     )
 
 
 def quantise_bias(bias: np.ndarray, product: int, shifts: Shifts = SHIFTS) -> tuple[np.ndarray, int]:
-    """An int8 bias (O,) and its position, within reach of the accumulator at position `product`."""
-    wanted = best_position(bias) if bias.any() else product
-    coarsest = min(wanted, coarsest_position(float(np.abs(bias).max(initial=0.0))) + 1)
-    position = product - clamp(product - max(wanted, coarsest), shifts.bias)
-    return quantise(bias, position), position
+    """An int8 bias (O,) and its scale, within reach of the accumulator's `product` fractional bits."""
+    wanted = best_frac_bits(bias) if bias.any() else product
+    coarsest = min(wanted, unclipped_frac_bits(float(np.abs(bias).max(initial=0.0))) + 1)
+    frac_bits = product - clamp(product - max(wanted, coarsest), shifts.bias)
+    return quantise(bias, frac_bits), frac_bits
 
 
-def _move_add(op: Add, positions: dict[str, int], shifts: Shifts) -> None:
-    coarse = min(positions[i] for i in op.inputs)
+def _move_add(op: Add, frac_bits: dict[str, int], shifts: Shifts) -> None:
+    coarse = min(frac_bits[i] for i in op.inputs)
     for name in op.inputs:
-        positions[name] = coarse + clamp(positions[name] - coarse, shifts.read)
-    positions[op.output] = coarse - clamp(coarse - positions[op.output], shifts.write)
+        frac_bits[name] = coarse + clamp(frac_bits[name] - coarse, shifts.read)
+    frac_bits[op.output] = coarse - clamp(coarse - frac_bits[op.output], shifts.write)
 
 
 def shift_faults(core: IntCore, shifts: Shifts = SHIFTS) -> list[str]:
     """Every shift outside its window, one sentence each; empty for a legal core."""
     faults = []
     for op in core.ops:
-        for rule, value, window in op_shifts(op, core.positions, shifts):
+        for rule, value, window in op_shifts(op, core.frac_bits, shifts):
             if not window[0] <= value <= window[1]:
                 faults.append(f"{op.name}: {rule} is {value}, allowed {window[0]} to {window[1]}")
     return faults
 
 
 def op_shifts(
-    op: IntConv | Add, positions: Mapping[str, int], shifts: Shifts
+    op: IntConv | Add, frac_bits: Mapping[str, int], shifts: Shifts
 ) -> list[tuple[str, int, tuple[int, int]]]:
     """(name, value, window) of the shifts that one operation needs."""
-    inputs, output = [positions[i] for i in op.inputs], positions[op.output]
+    inputs, output = [frac_bits[i] for i in op.inputs], frac_bits[op.output]
     if isinstance(op, Add):
         read, write = max(inputs) - min(inputs), min(inputs) - output
         return [("shift_read", read, shifts.read), ("shift_write", write, shifts.write)]
-    product = op.weight_position + inputs[0]
+    product = op.weight_frac_bits + inputs[0]
     return [
         ("shift_cut", product - output, shifts.cut),
-        ("shift_bias", product - op.bias_position, shifts.bias),
+        ("shift_bias", product - op.bias_frac_bits, shifts.bias),
     ]

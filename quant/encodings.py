@@ -54,13 +54,13 @@ def _split_planes(w: "_HostWriter") -> None:
 
 
 def _host_conv(w: "_HostWriter", core: IntCore, op: IntConv) -> None:
-    shift = op.weight_position + core.positions[op.input] - op.bias_position
+    shift = op.weight_frac_bits + core.frac_bits[op.input] - op.bias_frac_bits
     bias = op.bias.astype(np.int32) << shift
-    feeds = [op.input, w.unit(core.positions[op.input]), w.zero_point()]
-    feeds += [w.constant(f"{op.name}.weight", op.weight), w.unit(op.weight_position)]
+    feeds = [op.input, w.unit(core.frac_bits[op.input]), w.zero_point()]
+    feeds += [w.constant(f"{op.name}.weight", op.weight), w.unit(op.weight_frac_bits)]
     # One a weight: where onnxruntime rewrites weights (see quant.session), it trips over a shared one.
     feeds += [w.constant(f"{op.name}.weight_zero_point", np.array(0, np.int8))]
-    feeds += [w.unit(core.positions[op.output]), w.zero_point(), w.constant(f"{op.name}.bias", bias)]
+    feeds += [w.unit(core.frac_bits[op.output]), w.zero_point(), w.constant(f"{op.name}.bias", bias)]
     result = f"{op.output}.linear" if op.relu else op.output
     kernel = list(op.weight.shape[2:])
     w.node("QLinearConv", result, feeds, name=op.name, pads=[op.pad_px] * 4, kernel_shape=kernel)
@@ -72,12 +72,12 @@ def _add(w: "_HostWriter", core: IntCore, op: Add) -> None:
     feeds = []
     for name in (*op.inputs, op.output):
         quantity = [] if name == op.output else [name]
-        feeds += [*quantity, w.unit(core.positions[name]), w.zero_point()]
+        feeds += [*quantity, w.unit(core.frac_bits[name]), w.zero_point()]
     w.node("QLinearAdd", op.output, feeds, name=op.name, domain=MICROSOFT)
 
 
 def _merge(w: "_HostWriter", core: IntCore) -> None:
-    scale = w.unit(core.positions[CORRECTION])
+    scale = w.unit(core.frac_bits[CORRECTION])
     if core.output_channels == 1:
         w.node("DequantizeLinear", "host_back.correction", [CORRECTION, scale, w.zero_point()])
     else:
@@ -127,8 +127,8 @@ class _HostWriter:
     def scalar(self, name: str, value: float) -> str:
         return self.constant(name, np.array(value, np.float32))
 
-    def unit(self, position: int) -> str:
-        return self.constant(f"scale_2^{-position}", np.array(2.0**-position, np.float32))
+    def unit(self, frac_bits: int) -> str:
+        return self.constant(f"scale_2^{-frac_bits}", np.array(2.0**-frac_bits, np.float32))
 
     def zero_point(self) -> str:
         return self.constant("zero_point", np.array(ZERO, np.uint8))
@@ -140,7 +140,7 @@ def board_model(core: IntCore, about: dict[str, str], tile_px: int | None = None
     Two channels are two gains of the same correction: `quant.passes.stream.merge` makes one of them.
     """
     writer = _BoardWriter()
-    writer.quantised("planes.dequantised", PLANES, core.positions[PLANES])
+    writer.quantised("planes.dequantised", PLANES, core.frac_bits[PLANES])
     for op in core.ops:
         inputs = ["planes.dequantised" if i == PLANES else i for i in op.inputs]
         output = f"{op.output}.float"
@@ -148,15 +148,15 @@ def board_model(core: IntCore, about: dict[str, str], tile_px: int | None = None
             writer.nodes.append(helper.make_node("Add", inputs, [output], name=op.name))
         else:
             _board_conv(writer, op, inputs[0], output)
-        writer.quantised(op.output, output, core.positions[op.output])
+        writer.quantised(op.output, output, core.frac_bits[op.output])
     ends = [image_info(PLANES, COUNT, tile_px)], [image_info(CORRECTION, core.output_channels, tile_px)]
     graph = helper.make_graph(writer.nodes, "convbeers-core", *ends, list(writer.weights.values()))
     return make_model(graph, about)
 
 
 def _board_conv(w: "_BoardWriter", op: IntConv, source: str, output: str) -> None:
-    weight = w.dequantised(f"{op.name}.weight", op.weight, op.weight_position)
-    bias = w.dequantised(f"{op.name}.bias", op.bias, op.bias_position)
+    weight = w.dequantised(f"{op.name}.weight", op.weight, op.weight_frac_bits)
+    bias = w.dequantised(f"{op.name}.bias", op.bias, op.bias_frac_bits)
     result = f"{op.output}.linear" if op.relu else output
     kernel = list(op.weight.shape[2:])
     feeds = [source, weight, bias]
@@ -172,34 +172,34 @@ class _BoardWriter:
         self.nodes: list[onnx.NodeProto] = []
         self.weights: dict[str, onnx.TensorProto] = {}
 
-    def scale(self, position: int) -> list[str]:
-        name = f"scale_2^{-position}"
-        self.weights.setdefault(name, numpy_helper.from_array(np.array(2.0**-position, np.float32), name))
+    def scale(self, frac_bits: int) -> list[str]:
+        name = f"scale_2^{-frac_bits}"
+        self.weights.setdefault(name, numpy_helper.from_array(np.array(2.0**-frac_bits, np.float32), name))
         self.weights.setdefault("zero_point", numpy_helper.from_array(np.array(0, np.int8), "zero_point"))
         return [name, "zero_point"]
 
-    def quantised(self, output: str, source: str, position: int) -> None:
+    def quantised(self, output: str, source: str, frac_bits: int) -> None:
         """Quantise and dequantise an activation."""
         middle = f"{source}.int8"
-        self.nodes.append(helper.make_node("QuantizeLinear", [source, *self.scale(position)], [middle], name=middle))
+        self.nodes.append(helper.make_node("QuantizeLinear", [source, *self.scale(frac_bits)], [middle], name=middle))
         self.nodes.append(
-            helper.make_node("DequantizeLinear", [middle, *self.scale(position)], [output], name=f"{middle}.float")
+            helper.make_node("DequantizeLinear", [middle, *self.scale(frac_bits)], [output], name=f"{middle}.float")
         )
 
-    def dequantised(self, name: str, value: np.ndarray, position: int) -> str:
+    def dequantised(self, name: str, value: np.ndarray, frac_bits: int) -> str:
         """An int8 constant seen as float."""
         self.weights[name] = numpy_helper.from_array(value, name)
         result = f"{name}.float"
-        feeds = [name, *self.scale(position)]
+        feeds = [name, *self.scale(frac_bits)]
         self.nodes.append(helper.make_node("DequantizeLinear", feeds, [result], name=result))
         return result
 
 
 def read_core(model: onnx.ModelProto) -> IntCore:
-    """The core of an INT8 file of the legal regime, its int32 bias at the accumulator's own position.
+    """The core of an INT8 file of the legal regime, its int32 bias at the accumulator's own scale.
 
     Raises:
-        ModelError: another spelling, float scales, or asymmetric numbers.
+        ModelError: another encoding, float scales, or asymmetric numbers.
     """
     reader = _Reader(model)
     for node in model.graph.node:
@@ -209,13 +209,13 @@ def read_core(model: onnx.ModelProto) -> IntCore:
             reader.add(node)
         elif node.op_type == "Max":
             reader.relu(node)
-    if not reader.ops or PLANES not in reader.positions or CORRECTION not in reader.positions:
+    if not reader.ops or PLANES not in reader.frac_bits or CORRECTION not in reader.frac_bits:
         raise _refuse("no such core")
-    return IntCore(tuple(reader.ops), reader.positions)
+    return IntCore(tuple(reader.ops), reader.frac_bits)
 
 
-def spelling_faults(model: onnx.ModelProto) -> list[str] | None:
-    """Where a file of the legal regime is not what its whole numbers spell: the host's ends, ReLUs, a reader's scale.
+def encoding_faults(model: onnx.ModelProto) -> list[str] | None:
+    """Where a file of the legal regime is not what its integers ask for: the host's ends, ReLUs, a reader's scale.
 
     None for files of others.
 
@@ -223,10 +223,10 @@ def spelling_faults(model: onnx.ModelProto) -> list[str] | None:
         ModelError: nodes that contradict it.
     """
     with contradictions("INT8 model"):
-        return _spelling_faults(model)
+        return _encoding_faults(model)
 
 
-def _spelling_faults(model: onnx.ModelProto) -> list[str] | None:
+def _encoding_faults(model: onnx.ModelProto) -> list[str] | None:
     ours = metadata(model).get("precision") == "int8 legal"
     try:
         core = read_core(model)
@@ -243,24 +243,24 @@ def _spelling_faults(model: onnx.ModelProto) -> list[str] | None:
 
 
 class _Reader:
-    """Collects operations and positions."""
+    """Collects operations and scales."""
 
     def __init__(self, model: onnx.ModelProto) -> None:
         self._values = constants(model)
         self.ops: list[IntConv | Add] = []
-        self.positions: dict[str, int] = {}
+        self.frac_bits: dict[str, int] = {}
 
     def conv(self, node: onnx.NodeProto) -> None:
         source, *_, bias = node.input
-        weight, position = self._value(node.input[3]), self._position(node.input[4], node.input[5], 0)
-        self.positions[source] = self._position(node.input[1], node.input[2], ZERO)
-        self.positions[node.output[0]] = self._position(node.input[6], node.input[7], ZERO)
-        whole, product = self._value(bias).astype(np.int64), position + self.positions[source]
-        self.ops.append(IntConv(node.name, source, node.output[0], weight, position, whole, product, False))
+        weight, frac_bits = self._value(node.input[3]), self._frac_bits(node.input[4], node.input[5], 0)
+        self.frac_bits[source] = self._frac_bits(node.input[1], node.input[2], ZERO)
+        self.frac_bits[node.output[0]] = self._frac_bits(node.input[6], node.input[7], ZERO)
+        whole, product = self._value(bias).astype(np.int64), frac_bits + self.frac_bits[source]
+        self.ops.append(IntConv(node.name, source, node.output[0], weight, frac_bits, whole, product, False))
 
     def add(self, node: onnx.NodeProto) -> None:
         for name, scale, zero in ((node.input[0], 1, 2), (node.input[3], 4, 5), (node.output[0], 6, 7)):
-            self.positions[name] = self._position(node.input[scale], node.input[zero], ZERO)
+            self.frac_bits[name] = self._frac_bits(node.input[scale], node.input[zero], ZERO)
         self.ops.append(Add(node.name, (node.input[0], node.input[3]), node.output[0]))
 
     def relu(self, node: onnx.NodeProto) -> None:
@@ -269,14 +269,14 @@ class _Reader:
         if not isinstance(last, IntConv) or last.output != node.input[0]:
             return
         self.ops[-1] = IntConv(**{**vars(last), "output": node.output[0], "relu": True})
-        self.positions[node.output[0]] = self.positions.pop(last.output)
+        self.frac_bits[node.output[0]] = self.frac_bits.pop(last.output)
 
     def _value(self, name: str) -> np.ndarray:
         if name not in self._values:
             raise _refuse(f"no constant {name}")
         return self._values[name]
 
-    def _position(self, scale: str, zero: str, symmetric: int) -> int:
+    def _frac_bits(self, scale: str, zero: str, symmetric: int) -> int:
         """Of a power-of-two scale around the middle."""
         unit, middle = self._value(scale), self._value(zero)
         mantissa, exponent = np.frexp(unit.ravel()[:1].astype(np.float64))

@@ -65,7 +65,7 @@ def _narrow(op: IntConv) -> IntConv:
         shift += 1
     if ((bias >> shift) << shift != bias).any():
         raise _refuse(f"a bias of {int(np.abs(bias).max())} at {op.name}, finer than its size allows")
-    return replace(op, bias=(bias >> shift).astype(np.int8), bias_position=op.bias_position - shift)
+    return replace(op, bias=(bias >> shift).astype(np.int8), bias_frac_bits=op.bias_frac_bits - shift)
 
 
 def _refuse(got: str) -> ModelError:
@@ -110,7 +110,7 @@ def map_channels(core: IntCore) -> dict[str, int]:
 
 def shifts_of(core: IntCore) -> dict[tuple[str, str], int]:
     """The shifts of every operation, but for an add's shift_read: 0 where a stream keeps one position."""
-    named = [(op.name, *shift) for op in core.ops for shift in op_shifts(op, core.positions, SHIFTS)]
+    named = [(op.name, *shift) for op in core.ops for shift in op_shifts(op, core.frac_bits, SHIFTS)]
     return {(op, field): value for op, field, value, _ in named if field != "shift_read"}
 
 

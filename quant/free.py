@@ -18,7 +18,7 @@ from quant.graph import (
     CORRECTION,
     IMAGE,
     PLANES,
-    POSITION,
+    PLANES_FRAC_BITS,
     Add,
     Conv,
     Graph,
@@ -30,7 +30,7 @@ from quant.graph import (
 from quant.onnx_file import fixed_tile_px, image_info, make_model, metadata
 from quant.passes.equalise import channel_ranges, equalise, search, search_steps
 from quant.passes.fit_weights import Moments, fit, input_moments
-from quant.passes.stream import STREAM_POSITION, half_steps, stream_tensors, two_gains
+from quant.passes.stream import STREAM_FRAC_BITS, half_lsb_pair, stream_tensors, two_gains
 from quant.quantise import crop_costs, search_targets
 from quant.session import halo_of, open_session, tensor_values
 
@@ -188,7 +188,7 @@ def _scale(w: _HostWriter, scale: Scale) -> list[str]:
 
 
 UINT8_MAX = 255
-STREAM_STEP = 2.0**-STREAM_POSITION
+STREAM_STEP = 2.0**-STREAM_FRAC_BITS
 FINER = 2
 """The fine gain's unit is so much finer than what suits all corrections: the coarse one is there for the large."""
 
@@ -233,11 +233,11 @@ def _scales(graph: Graph, patches: Patches, tick: Callable[[], None]) -> dict[st
     units = tensor_scales(graph, levels, patches.degraded, tick)
     units[CORRECTION] /= FINER
     found = {op.output: Scale(units[op.output], 0) if op.relu else Scale(units[op.output]) for op in convs}
-    return {PLANES: Scale(2.0**-POSITION), **found}
+    return {PLANES: Scale(2.0**-PLANES_FRAC_BITS), **found}
 
 
 def _fine(graph: Graph) -> Graph:
-    return two_gains(half_steps(graph, STREAM_STEP))
+    return two_gains(half_lsb_pair(graph, STREAM_STEP))
 
 
 def _written(

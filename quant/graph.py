@@ -69,7 +69,7 @@ STEP = 32
 COARSE_MAX = 127
 QUARTER = 4
 COUNT = 3
-POSITION = 7
+PLANES_FRAC_BITS = 7
 """The planes' scale is 2^-7: coarse 127 stands for about 1, the full scale."""
 
 
@@ -86,7 +86,7 @@ def read_planes(graph: Graph) -> Graph:
     first = graph[0]
     assert isinstance(first, Conv)  # noqa: S101 - correction_graph has seen to it
     assert first.input == IMAGE  # noqa: S101
-    unit = np.float32(2.0**POSITION / MAX_DN)
+    unit = np.float32(2.0**PLANES_FRAC_BITS / MAX_DN)
     planes = [first.weight * (STEP * unit), first.weight * unit, np.zeros_like(first.weight)]
     weight = np.concatenate(planes, axis=1)
     return (replace(first, input=PLANES, weight=weight.astype(np.float32)), *graph[1:])

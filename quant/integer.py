@@ -29,6 +29,9 @@ INT32_BITS = 31
 FLOAT32_WHOLE_MAX = 2**24
 """Up to here float32 holds whole numbers exactly, and sums them in any order."""
 
+NARROW_BITS = 23
+"""Of a 24-bit accumulator, without the sign: the documents hint at one (facts on the DPU's rules), int32 has 31."""
+BITS_SOURCE = "128 times the sum of the weights' sizes, plus the bias: no input exceeds it"
 STRIP_VALUES = 1 << 22
 """Values of the windows that are laid out at a time: 16 MB of float32."""
 
@@ -63,7 +66,7 @@ class LayerReport:
         peak_bits: bits that the largest accumulator needed, without the sign.
         proven_bits: bits that no input can exceed: 128 times the sum of the weights' sizes, plus the bias.
         saturated: share of the results that came to int8's ends.
-        ties: share of the results whose rounding was decided by the rule for halves.
+        ties: share of the results whose rounding was decided by tie rounding.
     """
 
     name: str
@@ -107,13 +110,13 @@ def _conv(
     core: IntCore, op: IntConv, tensors: dict[str, np.ndarray], faults: Faults
 ) -> tuple[np.ndarray, int, float]:
     """The accumulators (N, O, H, W), the shift to int8, and the bits that they cannot exceed."""
-    product = op.weight_position + core.positions[op.input]
-    bias = _moved(op.bias.astype(np.int64), faults.shift(op.name, "shift_bias", product - op.bias_position))
+    product = op.weight_frac_bits + core.frac_bits[op.input]
+    bias = _moved(op.bias.astype(np.int64), faults.shift(op.name, "shift_bias", product - op.bias_frac_bits))
     sums = _convolve(tensors[op.input], op.weight) + bias[:, None, None]
     bound = 128 * np.abs(op.weight.astype(np.int64)).sum((1, 2, 3)) + np.abs(bias)
     if op.relu:
         sums = np.maximum(sums, 0)
-    cut = faults.shift(op.name, "shift_cut", product - core.positions[op.output])
+    cut = faults.shift(op.name, "shift_cut", product - core.frac_bits[op.output])
     return sums, cut, float(np.log2(max(int(bound.max()), 1)))
 
 
@@ -138,12 +141,12 @@ def _convolve(image: np.ndarray, weight: np.ndarray) -> np.ndarray:
 
 
 def _add(core: IntCore, op: Add, tensors: dict[str, np.ndarray], faults: Faults) -> tuple[np.ndarray, int, float]:
-    """The sum at the finer input's position, exact; the shift that remains; and its bits."""
-    finest = max(core.positions[name] for name in op.inputs)
-    aligned = [tensors[name].astype(np.int64) << (finest - core.positions[name]) for name in op.inputs]
-    bound = sum(128 << (finest - core.positions[name]) for name in op.inputs)
-    coarsest = min(core.positions[name] for name in op.inputs)
-    write = faults.shift(op.name, "shift_write", coarsest - core.positions[op.output])
+    """The sum at the finer input's scale, exact; the shift that remains; and its bits."""
+    finest = max(core.frac_bits[name] for name in op.inputs)
+    aligned = [tensors[name].astype(np.int64) << (finest - core.frac_bits[name]) for name in op.inputs]
+    bound = sum(128 << (finest - core.frac_bits[name]) for name in op.inputs)
+    coarsest = min(core.frac_bits[name] for name in op.inputs)
+    write = faults.shift(op.name, "shift_write", coarsest - core.frac_bits[op.output])
     return aligned[0] + aligned[1], finest - coarsest + write, float(np.log2(bound))
 
 
@@ -170,10 +173,10 @@ class LayerAgreement:
     """One operation's results, computed three times.
 
     Attributes:
-        report: of the integer reference, which rounds halves up, as the DPU does.
-        unequal: share of onnxruntime's results that are not the reference's when that rounds halves to even.
+        report: of the integer reference, which rounds ties up, as the DPU does.
+        unequal: share of onnxruntime's results that are not the reference's when that rounds ties to even.
         moved: share of the results that the DPU's rule changes, here or in a layer before.
-        moved_by: the largest of these changes, in units of 2^-position.
+        moved_by: the largest of these changes, in units of 2^-n.
     """
 
     report: LayerReport
@@ -184,7 +187,7 @@ class LayerAgreement:
 
 @dataclass(frozen=True)
 class Agreement:
-    """All operations in order, and the correction (N, 1, H, W) of full scale with halves up, and to even."""
+    """All operations in order, and the correction (N, 1, H, W) of full scale with half up, and to even."""
 
     layers: list[LayerAgreement]
     up: np.ndarray
@@ -196,7 +199,7 @@ def agreement(core: IntCore, host: onnx.ModelProto, image: np.ndarray) -> Agreem
 
     Args:
         core: whole numbers.
-        host: the same in the host's spelling.
+        host: the same in the host's encoding.
         image: (N, 1, H, W) in [0, 1].
     """
     names = [op.output for op in core.ops]
@@ -212,17 +215,10 @@ def agreement(core: IntCore, host: onnx.ModelProto, image: np.ndarray) -> Agreem
     return Agreement(layers, merged_correction(core, up), merged_correction(core, even))
 
 
-NARROW_BITS = 23
-"""Of a 24-bit accumulator, without the sign: the documents hint at one (facts on the DPU's rules), int32 has 31."""
-
-
-BITS_SOURCE = "128 times the sum of the weights' sizes, plus the bias: no input exceeds it"
-
-
 def integer_rows(
     model: onnx.ModelProto, core: IntCore, host: onnx.ModelProto, images: Iterable[np.ndarray]
 ) -> tuple[list[Row], Row]:
-    """Each integer operation on a crop of a few images (1, 1, H, W), and what the DPU's rule for halves changes."""
+    """Each integer operation on a crop of a few images (1, 1, H, W), and what the DPU's tie rounding changes."""
     seen = few_crops(images)
     found = [agreement(core, host, crop) for crop in seen]
     source = f"the integer reference on {len(found)} calibration patches"
@@ -247,16 +243,16 @@ def _layer_row(layers: list[LayerAgreement], source: str) -> Row:
         "accumulator, proven": predicted(proven, "bits", (proven, proven), BITS_SOURCE),
         "left of 24 bits": predicted(left, "bits", (left, left), f"23 bits and a sign, less {BITS_SOURCE}"),
         "saturated": percent(a.report.saturated for a in layers),
-        "halves": percent(a.report.ties for a in layers),
-        "as onnxruntime": percent((1 - a.unequal for a in layers), f"{source}, halves to even as there"),
-        "moved by halves up": percent((a.moved for a in layers), f"{source}, halves up"),
-        "at most by": measured(max(a.moved_by for a in layers), "units", f"{source}, halves up"),
+        "ties": percent(a.report.ties for a in layers),
+        "as onnxruntime": percent((1 - a.unequal for a in layers), f"{source}, half to even as there"),
+        "moved by half up": percent((a.moved for a in layers), f"{source}, half up"),
+        "at most by": measured(max(a.moved_by for a in layers), "units", f"{source}, half up"),
     }
     return Row("integer layers", layers[0].report.name, figures)
 
 
 def _rounding_row(in_float: list[np.ndarray], both: list[list[np.ndarray]], source: str) -> Row:
-    """How far the DPU's rounding of halves, up, leads away from the runtime's, to even; which is nearer to float."""
+    """How far the DPU's rounding of ties, up, leads away from the runtime's, to even; which is nearer to float."""
     up, even = (np.concatenate([results[k].ravel() for results in both]) for k in (0, 1))
     whole = np.concatenate([result.ravel() for result in in_float])
 
@@ -266,7 +262,7 @@ def _rounding_row(in_float: list[np.ndarray], both: list[list[np.ndarray]], sour
     figures = {
         "pixels that differ": measured(100 * float((up != even).mean()), "%", source),
         "MAE between them": mae(up, even),
-        "MAE of halves up": mae(up, whole),
-        "MAE of halves to even": mae(even, whole),
+        "MAE of half up": mae(up, whole),
+        "MAE of half to even": mae(even, whole),
     }
-    return Row("rounding", "halves up (DPU) against halves to even (onnxruntime)", figures)
+    return Row("rounding", "half up (DPU) against half to even (onnxruntime)", figures)

@@ -252,14 +252,14 @@ def filled(model: onnx.ModelProto) -> onnx.ModelProto:
     wider = onnx.ModelProto()
     wider.CopyFrom(model)
     arrays = {each.name: each for each in wider.graph.initializer}
-    work = _Filling(wider.graph, {name: numpy_helper.to_array(each) for name, each in arrays.items()})
+    work = _ChannelPadding(wider.graph, {name: numpy_helper.to_array(each) for name, each in arrays.items()})
     nodes = [each for node in wider.graph.node for each in work.around(node)]
     del wider.graph.node[:]
     wider.graph.node.extend(nodes)
     return wider
 
 
-class _Filling:
+class _ChannelPadding:
     """What is filled already: convolutions may share an input."""
 
     def __init__(self, graph: onnx.GraphProto, arrays: dict[str, np.ndarray]) -> None:

@@ -1,4 +1,4 @@
-"""Static INT8 in one call: float ONNX and calibration patches in, the two spellings of the integer core out."""
+"""Static INT8 in one call: float ONNX and calibration patches in, the two encodings of the integer core out."""
 
 import os
 from collections.abc import Callable
@@ -10,7 +10,7 @@ import onnx
 
 from profiles.errors import OptionError
 from profiles.figures import Row
-from quant.calibration import Patches, Remade, choose_positions
+from quant.calibration import Patches, Remade, choose_frac_bits
 from quant.core import SHIFTS, IntCore, Shifts, build_core
 from quant.encodings import board_model, host_model
 from quant.gate import compare, gate_row
@@ -28,7 +28,14 @@ from quant.graph import (
 from quant.onnx_file import fixed_tile_px, metadata
 from quant.passes.equalise import Costs, channel_ranges, equalise, search, search_steps
 from quant.passes.fit_weights import fit_weights, input_moments
-from quant.passes.stream import STREAM_POSITION, common_position, half_steps, steady, stream_tensors, two_gains
+from quant.passes.stream import (
+    STREAM_FRAC_BITS,
+    common_frac_bits,
+    half_lsb_pair,
+    share_stream_scale,
+    stream_tensors,
+    two_gains,
+)
 from quant.session import crops, open_any_size, open_session, run, tensor_values
 
 SEARCH_CROPS = 16
@@ -41,9 +48,9 @@ class Passes:
 
     fine_planes: bool = True
     least_squares: bool = True
-    steady_stream: bool = True
+    shared_residual_scale: bool = True
     equalise: bool = True
-    half_steps: bool = True
+    half_lsb_pair: bool = True
     fit_weights: bool = True
     dual_gain: bool = True
 
@@ -70,7 +77,7 @@ def quantise_model(
     passes: Passes = ALL,
     shifts: Shifts = SHIFTS,
 ) -> Quantised:
-    """Quantise a float ConvBEERS under the DPU's rules: int8, symmetric, per tensor, power-of-two positions.
+    """Quantise a float ConvBEERS under the DPU's rules: int8, symmetric, per tensor, power-of-two scales.
 
     The global add stays on the host, in 12 bits: only the correction is computed in int8. The rest is `passes`.
     `shifts` are the windows of the target.
@@ -80,17 +87,17 @@ def quantise_model(
             sensible size.
     """
     graph = _reads_planes(model, passes)
-    positions = choose_positions(graph, patches.degraded, tick, passes.least_squares)
+    frac_bits = choose_frac_bits(graph, patches.degraded, tick, passes.least_squares)
     if passes.equalise and stream_tensors(graph):
         ranges = channel_ranges(graph, patches.degraded, tick)
         targets = search_targets(read_planes(correction_graph(model)), patches.degraded)
 
         def trial(tried: Graph) -> Costs:
-            return crop_costs(host_model(_core(tried, positions, passes, shifts), {}), targets)
+            return crop_costs(host_model(_core(tried, frac_bits, passes, shifts), {}), targets)
 
         factors = search(graph, ranges, trial, tick)
         graph = equalise(graph, factors)
-    final, core = _final(graph, positions, passes), _core(graph, positions, passes, shifts)
+    final, core = _final(graph, frac_bits, passes), _core(graph, frac_bits, passes, shifts)
     if passes.fit_weights:
         core = fit_weights(final, core, input_moments(final, patches.degraded, tick), shifts)
     about = {**metadata(model), "precision": "int8 legal", "calibration_sha256": patches.digest, **about}
@@ -117,26 +124,26 @@ def _reads_planes(model: onnx.ModelProto, passes: Passes) -> Graph:
     return graph if passes.fine_planes else coarse_plane_only(graph)
 
 
-def _core(graph: Graph, positions: dict[str, int], passes: Passes, shifts: Shifts) -> IntCore:
-    """The integer core of a graph whose tensors have these least-squares positions, the passes applied."""
-    chosen, final = dict(positions), _final(graph, positions, passes)
-    if passes.steady_stream or passes.equalise:
-        chosen = steady(final, positions, _stream_position(graph, positions, passes))
+def _core(graph: Graph, frac_bits: dict[str, int], passes: Passes, shifts: Shifts) -> IntCore:
+    """The integer core of a graph whose tensors have these least-squares scales, the passes applied."""
+    chosen, final = dict(frac_bits), _final(graph, frac_bits, passes)
+    if passes.shared_residual_scale or passes.equalise:
+        chosen = share_stream_scale(final, frac_bits, _stream_frac_bits(graph, frac_bits, passes))
     if passes.dual_gain:
         chosen[CORRECTION] += 1
     assert set(tensors(final)) <= set(chosen)  # noqa: S101
     return build_core(final, chosen, shifts)
 
 
-def _final(graph: Graph, positions: dict[str, int], passes: Passes) -> Graph:
-    """The graph that is rounded: with half steps and two gains where wanted."""
-    if passes.half_steps and (passes.steady_stream or passes.equalise):
-        graph = half_steps(graph, 2.0 ** -_stream_position(graph, positions, passes))
+def _final(graph: Graph, frac_bits: dict[str, int], passes: Passes) -> Graph:
+    """The graph that is rounded: with the half-LSB pair and two gains where wanted."""
+    if passes.half_lsb_pair and (passes.shared_residual_scale or passes.equalise):
+        graph = half_lsb_pair(graph, 2.0 ** -_stream_frac_bits(graph, frac_bits, passes))
     return two_gains(graph) if passes.dual_gain else graph
 
 
-def _stream_position(graph: Graph, positions: dict[str, int], passes: Passes) -> int:
-    return STREAM_POSITION if passes.equalise else common_position(graph, positions)
+def _stream_frac_bits(graph: Graph, frac_bits: dict[str, int], passes: Passes) -> int:
+    return STREAM_FRAC_BITS if passes.equalise else common_frac_bits(graph, frac_bits)
 
 
 Targets = list[tuple[np.ndarray, np.ndarray]]
@@ -199,11 +206,11 @@ def ablation_rows(
 
 
 def ablations() -> dict[str, Passes]:
-    """All passes, all but one, none; without a steady stream there is nothing to equalise."""
+    """All passes, all but one, none; without a shared residual scale there is nothing to equalise."""
     names = [field.name for field in fields(Passes)]
     found = {"all passes": ALL}
     for name in names:
-        left_out = {name: False, "equalise": False} if name == "steady_stream" else {name: False}
+        left_out = {name: False, "equalise": False} if name == "shared_residual_scale" else {name: False}
         found[f"without {name.replace('_', ' ')}"] = replace(ALL, **left_out)
     return {**found, "none": Passes(**dict.fromkeys(names, False))}
 

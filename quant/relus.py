@@ -1,4 +1,4 @@
-"""ReLUs of an ONNX file in any spelling: quantisers have been seen to drop them without a word."""
+"""ReLUs of an ONNX file in any encoding: quantisers have been seen to drop them without a word."""
 
 from dataclasses import dataclass
 
@@ -19,15 +19,15 @@ class Relus:
         folded: convolutions whose 8 bits begin at zero, which is a ReLU, unless their results were never below zero.
     """
 
-    spelt: int
+    explicit: int
     folded: int
 
     def off_by(self, wanted: int) -> int:
         """How many of `wanted` ReLUs are surely lost, or how many surely added."""
-        return max(wanted - self.spelt - self.folded, self.spelt - wanted, 0)
+        return max(wanted - self.explicit - self.folded, self.explicit - wanted, 0)
 
     def __str__(self) -> str:
-        return f"{self.spelt}, and up to {self.folded} as 8 bits from zero" if self.folded else str(self.spelt)
+        return f"{self.explicit}, and up to {self.folded} as 8 bits from zero" if self.folded else str(self.explicit)
 
 
 def count_relus(model: onnx.ModelProto) -> Relus:
@@ -39,8 +39,8 @@ def count_relus(model: onnx.ModelProto) -> Relus:
     with contradictions("model"):
         known, rounded = constants(model), {tensor.name: tensor for tensor in rounded_tensors(model)}
         convolved = {name for node in model.graph.node if "Conv" in node.op_type for name in node.output}
-        spelt = [n.op_type == "Relu" or _cuts_at_zero(n, known, rounded) for n in model.graph.node]
-        return Relus(sum(spelt), sum(_begins_at_zero(node, rounded, convolved) for node in model.graph.node))
+        explicit = [n.op_type == "Relu" or _cuts_at_zero(n, known, rounded) for n in model.graph.node]
+        return Relus(sum(explicit), sum(_begins_at_zero(node, rounded, convolved) for node in model.graph.node))
 
 
 def _cuts_at_zero(node: onnx.NodeProto, known: dict[str, np.ndarray], rounded: dict[str, Rounded]) -> bool:

@@ -1,6 +1,6 @@
 """How often the results inside an INT8 network come to the ends of 8 bits: what lies beyond is clipped, and lost.
 
-Looked at is whatever a node rounds to 8 bits, in any spelling (integer kernels or QDQ), as the graph is written. Two
+Looked at is whatever a node rounds to 8 bits, in any encoding (integer kernels or QDQ), as the graph is written. Two
 ends are no loss: the lower one where it stands for zero or where a ReLU reads it, for that is the ReLU, and those of
 the fine gain, which the coarse one is there for (`quant.passes.stream`).
 """

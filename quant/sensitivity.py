@@ -1,7 +1,7 @@
 """Which layer costs what: each one in int8 while all others stay in float.
 
 A convolution errs by its int8 weights and bias, and by rounding and clipping its result. An add errs by what it does
-to sums of whole numbers: in a stream of one position nothing, but where it saturates. What a layer's inputs had
+to sums of whole numbers: in a stream of one scale nothing, but where it saturates. What a layer's inputs had
 already lost is not held against it.
 """
 
@@ -27,6 +27,12 @@ from quant.session import few_crops, open_session, planes_of, run, tensor_values
 
 IN_INT8 = ".in_int8"
 """Behind the name of a tensor: as int8 weights and bias make it of float inputs, not yet rounded."""
+
+
+WORST = 4
+BEYOND_DN = (1, 2, 4, 8, 16, 32, 64)
+ROUNDING, CLIPPING = 1.4, 1.6
+"""std / MAE, 1.25 for a Gaussian: up to the first it is rounding, beyond the second clipping."""
 
 
 class Loss:
@@ -61,7 +67,7 @@ class Loss:
 
 
 @dataclass(frozen=True)
-class LayerBlame:
+class LayerError:
     """What one layer in int8 loses, all others in float.
 
     Attributes:
@@ -75,9 +81,9 @@ class LayerBlame:
     network: Loss
 
 
-def blame_layers(
+def layer_errors(
     graph: Graph, core: IntCore, crops: Iterable[np.ndarray], tick: Callable[[], None]
-) -> tuple[list[LayerBlame], Loss]:
+) -> tuple[list[LayerError], Loss]:
     """What each layer of a network loses, and what all lose together, over crops (1, 1, H, W) in [0, 1].
 
     Args:
@@ -90,7 +96,7 @@ def blame_layers(
     names = tensors((*graph, *twins))
     exact, int8 = open_session(float_model((*graph, *twins), names)), open_session(host_model(core, {}))
     rests = {name: open_session(_rest(graph, name)) for name in tensors(graph) if name != CORRECTION}
-    layers, together = [LayerBlame(op.name, Loss(), Loss()) for op in graph], Loss()
+    layers, together = [LayerError(op.name, Loss(), Loss()) for op in graph], Loss()
     for crop in crops:
         (values,) = tensor_values(exact, names, crop, halo_px=0)
         wanted = dict(zip(names, values, strict=True))
@@ -113,7 +119,7 @@ def blame_layers(
 def _twin(op: Op, whole: IntConv) -> Conv:
     """The same convolution, by its side, with the values that its int8 weights and bias stand for."""
     assert isinstance(op, Conv)  # noqa: S101 - the core was built from the graph
-    weight, bias = whole.weight * 2.0**-whole.weight_position, whole.bias * 2.0**-whole.bias_position
+    weight, bias = whole.weight * 2.0**-whole.weight_frac_bits, whole.bias * 2.0**-whole.bias_frac_bits
     changed = replace(op, weight=weight.astype(np.float32), bias=bias.astype(np.float32))
     return replace(changed, name=op.name + IN_INT8, output=op.output + IN_INT8)
 
@@ -128,14 +134,14 @@ def _rest(graph: Graph, given: str) -> onnx.ModelProto:
 def _in_int8(op: Op, core: IntCore, exact: Mapping[str, np.ndarray]) -> np.ndarray:
     """A layer's result when it alone is in int8."""
     if isinstance(op, Conv):
-        return _rounded(exact[op.output + IN_INT8], core.positions[op.output])
-    left, right = (_rounded(exact[name], core.positions[name]) for name in op.inputs)
-    return np.asarray(exact[op.output] + (_rounded(left + right, core.positions[op.output]) - (left + right)))
+        return _rounded(exact[op.output + IN_INT8], core.frac_bits[op.output])
+    left, right = (_rounded(exact[name], core.frac_bits[name]) for name in op.inputs)
+    return np.asarray(exact[op.output] + (_rounded(left + right, core.frac_bits[op.output]) - (left + right)))
 
 
-def _rounded(values: np.ndarray, position: int) -> np.ndarray:
-    """To whole multiples of 2^-position, halves up, and clipped, as the DPU does."""
-    scale = np.float32(2.0**position)
+def _rounded(values: np.ndarray, frac_bits: int) -> np.ndarray:
+    """To whole multiples of 2^-n, half up, and clipped, as the DPU does."""
+    scale = np.float32(2.0**frac_bits)
     return np.asarray(np.clip(np.floor(values * scale + np.float32(0.5)), INT8_MIN, INT8_MAX) / scale)
 
 
@@ -187,20 +193,10 @@ def spread_of(
     return Spread(counts, np.array(mae), np.array(largest))
 
 
-WORST = 4
-
-
-BEYOND_DN = (1, 2, 4, 8, 16, 32, 64)
-
-
-ROUNDING, CLIPPING = 1.4, 1.6
-"""std / MAE, 1.25 for a Gaussian: up to the first it is rounding, beyond the second clipping."""
-
-
-def layer_blame_rows(result: Quantised, patches: Patches, tick: Callable[[], None]) -> list[Row]:
+def layer_error_rows(result: Quantised, patches: Patches, tick: Callable[[], None]) -> list[Row]:
     """Every layer in int8 by itself, and all of them."""
     seen = few_crops(patches.degraded)
-    layers, together = blame_layers(result.graph, result.core, seen, tick)
+    layers, together = layer_errors(result.graph, result.core, seen, tick)
     source = f"{len(seen)} simulated patches, all other layers in float"
     whole = sum(layer.network.squared for layer in layers)
     rows = []

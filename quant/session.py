@@ -1,6 +1,6 @@
-"""Networks run on onnxruntime: a session, set up once for the whole project, and large images in pieces.
+"""Networks run on onnxruntime: a session, set up once for the whole project, and large images in tiles.
 
-Looking at every tensor of a network at once costs memory that grows with the image; pieces do not.
+Looking at every tensor of a network at once costs memory that grows with the image; tiles do not.
 """
 
 from collections.abc import Iterable, Iterator
@@ -13,7 +13,7 @@ import onnxruntime as ort
 
 from model.processor import int8_adds_exactly
 from profiles.errors import ModelError
-from quant.graph import PLANES, POSITION, Conv, Graph, split
+from quant.graph import PLANES, PLANES_FRAC_BITS, Conv, Graph, split
 from quant.kernels import filled, is_integer, made_exact
 from quant.onnx_file import any_size, load_onnx
 from quant.untrusted import contradictions, times
@@ -108,8 +108,8 @@ def _unfit(got: str) -> ModelError:
     return ModelError("ONNX model", expected="one that restores an image to its own size", got=got, remedy=remedy)
 
 
-PIECE_PX = 128
-"""Side of the largest piece, halo not counted."""
+TILE_PX = 128
+"""Side of the largest tile, halo not counted."""
 
 
 def crops(image: np.ndarray) -> list[np.ndarray]:
@@ -120,10 +120,10 @@ def crops(image: np.ndarray) -> list[np.ndarray]:
 def tensor_values(
     session: ort.InferenceSession, names: list[str], image: np.ndarray, halo_px: int
 ) -> Iterator[list[np.ndarray]]:
-    """The named tensors (1, C, h, w) of a plane-reading float network, piece by piece of an image (1, 1, H, W).
+    """The named tensors (1, C, h, w) of a plane-reading float network, tile by tile of an image (1, 1, H, W).
 
-    Each piece is computed with a halo of the pixels that its values depend on, which is then cut off: together the
-    pieces hold what the whole image would have given, its zero-padded borders included.
+    Each tile is computed with a halo of the pixels that its values depend on, which is then cut off: together the
+    tiles hold what the whole image would have given, its zero-padded borders included.
 
     Raises:
         ModelError: NaN or infinity inside the network.
@@ -139,7 +139,7 @@ def tensor_values(
 
 def planes_of(image: np.ndarray) -> np.ndarray:
     """An image (N, 1, H, W) in [0, 1] as a plane-reading float network takes it: (N, 3, H, W) float32."""
-    return split(image).astype(np.float32) * np.float32(2.0**-POSITION)
+    return split(image).astype(np.float32) * np.float32(2.0**-PLANES_FRAC_BITS)
 
 
 def halo_of(graph: Graph) -> int:
@@ -148,13 +148,13 @@ def halo_of(graph: Graph) -> int:
 
 
 def _places(image: np.ndarray) -> Iterator[tuple[tuple[int, int], tuple[int, int]]]:
-    """(top, bottom) and (left, right) of every piece, all about equally large."""
+    """(top, bottom) and (left, right) of every tile, all about equally large."""
     height, width = image.shape[-2:]
     return product(pairwise(_edges(height)), pairwise(_edges(width)))
 
 
 def _edges(size: int) -> list[int]:
-    count = -(-size // PIECE_PX)
+    count = -(-size // TILE_PX)
     return [size * k // count for k in range(count + 1)]
 
 

@@ -20,7 +20,7 @@ from deploy.bench.host_state import Watch, memory_rise, watched
 from deploy.bench.profile import node_rows, profile, timed
 from deploy.bench.tables import TABLE, Swath, board_cpu_row, efficiency
 from deploy.dpu.reading import network_of
-from deploy.export import counterpart
+from deploy.export import other_precision
 from model.processor import require_cores
 from model.simulator.acquire import MARGIN_PX, simulate_pair
 from model.simulator.detector import Draw
@@ -183,7 +183,7 @@ def _wall_and_cpu_s(dn: np.ndarray, sensors: Sensors) -> tuple[float, float]:
 def host_rows(model: Path, target: TargetProfile, tile_px: int, threads: int = 0) -> list[Row]:
     """A network's time for one tile through onnxruntime, float32 and INT8 taking turns, and its nodes' times.
 
-    Each runs for the target's minimum time and count, one run for warm-up left out. Its counterpart in the other
+    Each runs for the target's minimum time and count, one run for warm-up left out. Its pair in the other
     precision is the shipped network of the same variant; without one it runs alone.
 
     Raises:
@@ -191,7 +191,7 @@ def host_rows(model: Path, target: TargetProfile, tile_px: int, threads: int = 0
     """
     require_cores("--threads", threads)
     given = load_onnx(model)
-    other = counterpart(given)
+    other = other_precision(given)
     runs = [Timed(model.stem, given)]
     if other is not None:
         runs.append(Timed(f"{'INT8' if is_quantised(other) else 'float32'} of the same shape", other))

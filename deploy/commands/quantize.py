@@ -28,7 +28,7 @@ def quantize(
     regime: Annotated[
         Regime, typer.Option(help="legal: the DPU's rules; free: float scales, a channel's own for weights.")
     ] = Regime.legal,
-    board: Annotated[Path | None, typer.Option(help="Also write the DPU's core in the board's spelling.")] = None,
+    board: Annotated[Path | None, typer.Option(help="Also write the DPU's core in the board's encoding.")] = None,
     images: Annotated[Path | None, typer.Option(help="Folder of scenes for calibration; drawn ones if none.")] = None,
     patches: Annotated[int, typer.Option(min=1, max=100_000, help="Calibration patches.")] = 64,
     patch: Annotated[int, typer.Option(min=32, max=2048, help="Side of a calibration patch in pixels.")] = 128,
@@ -38,12 +38,13 @@ def quantize(
         typer.Option(help="Folder for report.html and report.json: which layers and patches err, and how."),
     ] = None,
     without: Annotated[
-        list[str] | None, typer.Option(help="Leave out a pass that --ablate lists, as half-steps; may be repeated.")
+        list[str] | None,
+        typer.Option(help="Leave out a pass that --ablate lists, as half-lsb-pair; may be repeated."),
     ] = None,
     seed: Annotated[int, typer.Option(min=0, max=SEEDS, help="Seed of the patches.")] = 0,
     json: Annotated[Path | None, typer.Option(help="Write the figures here.")] = None,
 ) -> None:
-    """Quantise to int8 with power-of-two positions: the correction on the DPU, the 12-bit add on the host.
+    """Quantise to int8 with power-of-two scales: the correction on the DPU, the 12-bit add on the host.
 
     Taken are residual networks of one channel: same-size convolutions of stride 1, each ReLU right behind one, adds,
     and at the end the add of the image. 'check' says of a float file whether it is one of these.

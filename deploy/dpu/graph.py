@@ -1,4 +1,4 @@
-"""A network as the DPU sees it: a short list of operations, whatever spelling its ONNX file is written in."""
+"""A network as the DPU sees it: a short list of operations, whatever encoding its ONNX file is written in."""
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
@@ -49,7 +49,7 @@ class Scale:
         return self.integer_type in ("int8", "uint8", "int32") and set(self.zero_points) == {middle}
 
     @property
-    def position(self) -> int | None:
+    def frac_bits(self) -> int | None:
         """The p of a scale 2^-p, None for any other scale."""
         if len(self.scales) != 1:
             return None

@@ -1,4 +1,4 @@
-"""From an ONNX file to the DPU's short list of operations, whichever of three spellings it uses.
+"""From an ONNX file to the DPU's short list of operations, whichever of three encodings it uses.
 
 1. float: Conv, Relu, Add.
 2. integer kernels: QLinearConv, com.microsoft QLinearAdd, Relu (or Max with the zero point), float host nodes around.

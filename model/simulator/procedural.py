@@ -18,6 +18,9 @@ from profiles.sensor import Sensor
 
 Point = tuple[float, float]
 
+SCENES, SCENE_SIDE_PX = 3, 2400
+"""Drawn where no folder of images is given."""
+
 SHADOW, ASPHALT, GRASS, SOIL, CONCRETE, WHITE, WATER = 12.0, 30.0, 45.0, 75.0, 120.0, 260.0, 16.0
 
 
@@ -214,12 +217,6 @@ def _shift(point: Point, by: float) -> Point:
 
 def _around(x: float, y: float, radius: float) -> tuple[float, float, float, float]:
     return (x - radius, y - radius, x + radius, y + radius)
-
-
-SCENES = 3
-
-
-SCENE_SIDE_PX = 2400
 
 
 def load_scenes(folder: Path | None, sensor: Sensor, seed: int) -> list[Scene]:

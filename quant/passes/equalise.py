@@ -1,4 +1,4 @@
-"""Scale the channels of the residual stream so that one position suits them all, at no cost in the network.
+"""Scale the channels of the residual stream so that one scale suits them all, at no cost in the network.
 
 Whatever writes the stream has its weights multiplied by k per channel, whatever reads it has them divided: the float
 network stays the same, to rounding. A channel that uses a fraction of int8's range is rounded finer for a larger k,
@@ -15,11 +15,11 @@ import numpy as np
 
 from quant.core import INT8_MAX
 from quant.graph import Conv, Graph, float_model
-from quant.passes.stream import STREAM_POSITION, stream_tensors
+from quant.passes.stream import STREAM_FRAC_BITS, stream_tensors
 from quant.session import halo_of, open_session, tensor_values
 
 QUANTILE = 0.9999
-"""A channel's range: the mean over pieces of this quantile of its sizes. The maximum would be ruled by outliers."""
+"""A channel's range: the mean over tiles of this quantile of its sizes. The maximum would be ruled by outliers."""
 
 LEVELLING = (0.5, 0.75, 1.0)
 HEADROOM = (0.64, 0.8, 1.0, 1.25)
@@ -72,9 +72,9 @@ def channel_ranges(graph: Graph, images: Iterable[np.ndarray], tick: Callable[[]
 
 
 def first_guess(ranges: np.ndarray, levelling: float, headroom: float) -> np.ndarray:
-    """Factors that level the ranges, and fit the largest into int8 at the stream's position."""
+    """Factors that level the ranges, and fit the largest into int8 at the stream's scale."""
     factors = (ranges.max() / ranges) ** levelling
-    limit = INT8_MAX * 2.0**-STREAM_POSITION
+    limit = INT8_MAX * 2.0**-STREAM_FRAC_BITS
     return np.asarray(factors * headroom * limit / (ranges * factors).max())
 
 

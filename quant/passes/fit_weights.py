@@ -83,7 +83,7 @@ SWEEPS = 20
 
 
 def fit_weights(graph: Graph, core: IntCore, moments: Mapping[str, Moments], shifts: Shifts = SHIFTS) -> IntCore:
-    """The core with weights and biases rounded for what each convolution reads; positions stay.
+    """The core with weights and biases rounded for what each convolution reads; scales stay.
 
     Args:
         graph: the float operations that the core was built from.
@@ -93,7 +93,7 @@ def fit_weights(graph: Graph, core: IntCore, moments: Mapping[str, Moments], shi
     """
     pairs = zip(graph, core.ops, strict=True)
     ops = [
-        _fit(op, whole, core.positions[whole.input], moments[op.name], shifts)
+        _fit(op, whole, core.frac_bits[whole.input], moments[op.name], shifts)
         if isinstance(op, Conv) and isinstance(whole, IntConv)
         else whole
         for op, whole in pairs
@@ -101,10 +101,10 @@ def fit_weights(graph: Graph, core: IntCore, moments: Mapping[str, Moments], shi
     return replace(core, ops=tuple(ops))
 
 
-def _fit(op: Conv, whole: IntConv, input_position: int, moments: Moments, shifts: Shifts) -> IntConv:
-    weight, shifted = fit(op.weight, whole.weight, np.array([2.0**-whole.weight_position]), moments)
-    bias, bias_position = quantise_bias(op.bias - shifted, whole.weight_position + input_position, shifts)
-    return replace(whole, weight=weight, bias=bias, bias_position=bias_position)
+def _fit(op: Conv, whole: IntConv, input_frac_bits: int, moments: Moments, shifts: Shifts) -> IntConv:
+    weight, shifted = fit(op.weight, whole.weight, np.array([2.0**-whole.weight_frac_bits]), moments)
+    bias, bias_frac_bits = quantise_bias(op.bias - shifted, whole.weight_frac_bits + input_frac_bits, shifts)
+    return replace(whole, weight=weight, bias=bias, bias_frac_bits=bias_frac_bits)
 
 
 def fit(

@@ -1,6 +1,6 @@
 """What is done to the residual stream and to its last tensor, so that rounding them costs little.
 
-One position for the whole stream makes its adds exact. Two copies of the last stream tensor, rounded half a step
+One scale for the whole stream makes its adds exact. Two copies of the last stream tensor, rounded half a step
 apart, together hold nine bits. Two gains for the correction: a fine one for nearly all pixels, a coarse one for the
 strongest edges.
 """
@@ -12,7 +12,7 @@ import numpy as np
 
 from quant.graph import Add, Conv, Graph
 
-STREAM_POSITION = 8
+STREAM_FRAC_BITS = 8
 """Any would do: `equalise` scales the stream to it."""
 
 
@@ -21,21 +21,21 @@ def stream_tensors(graph: Graph) -> set[str]:
     return {name for op in graph if isinstance(op, Add) for name in (*op.inputs, op.output)}
 
 
-def steady(graph: Graph, positions: Mapping[str, int], position: int) -> dict[str, int]:
-    """The positions with one for the stream."""
-    return {**positions, **dict.fromkeys(stream_tensors(graph), position)}
+def share_stream_scale(graph: Graph, frac_bits: Mapping[str, int], shared: int) -> dict[str, int]:
+    """The scales with one for the stream."""
+    return {**frac_bits, **dict.fromkeys(stream_tensors(graph), shared)}
 
 
-def common_position(graph: Graph, positions: Mapping[str, int]) -> int:
-    """The coarsest least-squares position on the stream: what a stream that is not equalised takes."""
-    return min((positions[name] for name in stream_tensors(graph)), default=STREAM_POSITION)
+def common_frac_bits(graph: Graph, frac_bits: Mapping[str, int]) -> int:
+    """The coarsest least-squares scale on the stream: what a stream that is not equalised takes."""
+    return min((frac_bits[name] for name in stream_tensors(graph)), default=STREAM_FRAC_BITS)
 
 
 OFFSETS = np.array([-0.25, 0.25])
 """Of a step; their mean is 0."""
 
 
-def half_steps(graph: Graph, step: float) -> Graph:
+def half_lsb_pair(graph: Graph, step: float) -> Graph:
     """The graph with two copies of what its last convolution reads, where that is the sum of two convolutions.
 
     Args:

@@ -37,7 +37,7 @@ def tables(path: Path) -> dict[str, list[dict[str, Any]]]:
     return found
 
 
-def test_convbeers_passes_whole_in_every_spelling(tmp_path: Path) -> None:
+def test_convbeers_passes_whole_in_every_encoding(tmp_path: Path) -> None:
     for make in (float_convbeers, integer_convbeers, board_convbeers):
         code, output = run(str(make(tmp_path / "n.onnx", 16, 64)))
         assert (code, "DPU subgraphs: 1" in output, "check passed" in output) == (0, True, True)

@@ -92,7 +92,7 @@ def give_a_float_scale(model: onnx.ModelProto) -> None:
 
 
 def clip_an_activation(model: onnx.ModelProto) -> None:
-    """A block's inner tensor at a position three too fine: it saturates."""
+    """A block's inner tensor at a scale three too fine: it saturates."""
     conv, reader = node(model, "body.1.first"), node(model, "body.1.second")
     scale = next(numpy_helper.to_array(t) for t in model.graph.initializer if t.name == conv.input[6])
     conv.input[6] = own_constant(model, "scale_too_fine", scale / np.float32(8))
@@ -241,14 +241,14 @@ def test_a_baseline_holds_the_mae(tmp_path: Path) -> None:
     assert "**failed**" in paths["summary"].read_text()
     last = again.output.splitlines()[-1]
     assert last.startswith(f"gate FAILED, 1 of 6 checks: MAE against the baseline {before:.4g} of full scale")
-    only_baseline_is_blamed(json.loads(paths["json"].read_text()), before)
+    only_the_baseline_fails(json.loads(paths["json"].read_text()), before)
     lines = dict(line.split("=") for line in paths["outputs"].read_text().splitlines()[1:])
     assert float(lines.pop("mae")) == pytest.approx(before, rel=1e-5)
     assert 0 < float(lines.pop("drop")) < 1
     assert lines == {"verdict": "failed"}
 
 
-def only_baseline_is_blamed(document: Any, mae: float) -> None:
+def only_the_baseline_fails(document: Any, mae: float) -> None:
     assert document["verdict"] == "failed"
     assert [check["name"] for check in document["checks"] if not check["passed"]] == ["MAE against the baseline"]
     limits = {check["name"]: (check["value"], check["limit"]) for check in document["checks"]}
@@ -318,7 +318,7 @@ SMALL = "convbeers-xs"
 
 @pytest.mark.parametrize("fault", ["twice the bias", "no bias"])
 def test_a_baseline_shows_a_wrong_bias_in_any_layer(fault: str, unseen: Patches) -> None:
-    """A bias off by one position, or lost, may hide below a limit on the MAE, not in a twentieth of what it was."""
+    """A bias off by one scale, or lost, may hide below a limit on the MAE, not in a twentieth of what it was."""
     weights, path = shipped_pair(SMALL)
     session, sound = open_session(float_model(weights)), onnx.load(path)
     before = compare(session, open_session(sound), unseen.pairs).mae
@@ -351,13 +351,13 @@ def test_constants_may_be_nodes() -> None:
     sound, other = onnx.load(default_int8()), as_nodes(onnx.load(default_int8()))
     assert count_relus(other) == count_relus(sound) == Relus(8, 0)
     assert [t.name for t in rounded_tensors(other)] == [t.name for t in rounded_tensors(sound)]
-    assert read_core(other).positions == read_core(sound).positions
+    assert read_core(other).frac_bits == read_core(sound).frac_bits
 
 
 @pytest.mark.parametrize("spelt", [["x", "zero"], ["zero", "x"]])
-def test_a_relu_is_the_larger_of_zero_whatever_comes_first(spelt: list[str]) -> None:
+def test_a_relu_is_the_larger_of_zero_whatever_comes_first(explicit: list[str]) -> None:
     node_, zero = (
-        onnx.helper.make_node("Max", spelt, ["y"]),
+        onnx.helper.make_node("Max", explicit, ["y"]),
         numpy_helper.from_array(np.zeros((), np.float32), "zero"),
     )
     ends = image_info("x", 1, None), image_info("y", 1, None)
@@ -367,7 +367,7 @@ def test_a_relu_is_the_larger_of_zero_whatever_comes_first(spelt: list[str]) -> 
 
 def test_results_that_are_never_below_zero_need_no_relu() -> None:
     """An 8-bit range from zero may be a ReLU folded in, or none: both are told apart by what was there in float."""
-    found = Relus(spelt=1, folded=2)
+    found = Relus(explicit=1, folded=2)
     assert [found.off_by(wanted) for wanted in range(6)] == [1, 0, 0, 0, 1, 2]
 
 

@@ -38,7 +38,7 @@ def test_every_pass_is_left_out_once() -> None:
     assert found["all passes"] == ALL
     assert found["none"] == Passes(*[False] * 7)
     assert len(found) == 9
-    assert not found["without steady stream"].equalise
+    assert not found["without shared residual scale"].equalise
 
 
 def float_file(path: Path) -> str:
@@ -72,16 +72,19 @@ def test_a_pass_can_be_left_out(tmp_path: Path) -> None:
         "--patch",
         "64",
         "--without",
-        "half-steps",
+        "half-lsb-pair",
         "--without",
         "equalise",
     ]
     result = CliRunner().invoke(app, ["quantize", float_file(tmp_path / "f.onnx"), *options])
     assert result.exit_code == 0, result.output
-    assert metadata(load_onnx(out))["passes"] == "fine_planes, least_squares, steady_stream, fit_weights, dual_gain"
+    assert (
+        metadata(load_onnx(out))["passes"]
+        == "fine_planes, least_squares, shared_residual_scale, fit_weights, dual_gain"
+    )
     unknown = CliRunner().invoke(app, ["quantize", str(tmp_path / "f.onnx"), "--out", str(out), "--without", "magic"])
     assert unknown.exit_code == 2
-    assert "half-steps" in unknown.output
+    assert "half-lsb-pair" in unknown.output
 
 
 def test_a_network_fixed_to_one_tile_is_quantised_reported_and_gated(tmp_path: Path) -> None:

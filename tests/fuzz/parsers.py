@@ -43,7 +43,7 @@ from profiles.errors import BeersError
 from profiles.figures import Figure, Row, measured, predicted, unavailable
 from profiles.scene_call import load_scene_call
 from quant.checks import Check
-from quant.encodings import spelling_faults
+from quant.encodings import encoding_faults
 from quant.gate import read_limits
 from quant.graph import correction_graph
 from quant.onnx_file import fixed_tile_px, load_onnx
@@ -93,9 +93,9 @@ def _written(make: Callable[[Path], object], path: Path) -> bytes:
 
 
 def onnx_seeds(folder: Path) -> list[bytes]:
-    """The three spellings of a small network, one of them fixed to a tile."""
-    spellings = (float_convbeers, integer_convbeers, board_convbeers)
-    made = [_written(partial(spelling, blocks=1, features=2), folder / "a.onnx") for spelling in spellings]
+    """The three encodings of a small network, one of them fixed to a tile."""
+    encodings = (float_convbeers, integer_convbeers, board_convbeers)
+    made = [_written(partial(encoding, blocks=1, features=2), folder / "a.onnx") for encoding in encodings]
     fixed = onnx.load_model(float_convbeers(folder / "a.onnx", 1, 2))
     for value in (*fixed.graph.input, *fixed.graph.output):
         for dim, size in zip(value.type.tensor_type.shape.dim, (1, 1, SIDE_PX, SIDE_PX), strict=True):
@@ -116,7 +116,7 @@ def understand_onnx(path: Path) -> None:
         receptive_radius_px,
         correction_graph,
         count_relus,
-        spelling_faults,
+        encoding_faults,
         rounded_tensors,
     ):
         _asked(question, model)

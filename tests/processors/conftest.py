@@ -42,4 +42,4 @@ def _unaligned(op: IntConv) -> IntConv:
     shift = (used & -used).bit_length() - 1
     bias = op.bias >> shift
     assert INT8_MIN <= bias.min() <= bias.max() <= INT8_MAX
-    return replace(op, bias=bias.astype(np.int8), bias_position=op.bias_position - shift)
+    return replace(op, bias=bias.astype(np.int8), bias_frac_bits=op.bias_frac_bits - shift)

@@ -7,7 +7,7 @@ import pytest
 
 from quant.core import INT8_MAX, INT8_MIN, IntConv, IntCore
 from quant.encodings import board_model, host_model
-from quant.graph import CORRECTION, PLANES, POSITION, split
+from quant.graph import CORRECTION, PLANES, PLANES_FRAC_BITS, split
 from quant.integer import agreement, correction, merged_correction, run_core
 from quant.session import open_session, run
 from tests.processors.conftest import Encodings
@@ -42,7 +42,7 @@ def test_both_encodings_are_the_integer_reference(
     tensors, _ = run_core(shipped.core, planes, half_even=True)
     restored = np.clip(seen + merged_correction(shipped.core, tensors), 0, 1)
     np.testing.assert_array_equal(run(open_session(shipped.host, optimise=optimise), seen), restored)
-    feed = {PLANES: planes.astype(np.float32) * np.float32(2.0**-POSITION)}
+    feed = {PLANES: planes.astype(np.float32) * np.float32(2.0**-PLANES_FRAC_BITS)}
     by_board = open_session(shipped.board, optimise=optimise).run(None, feed)[0]
     np.testing.assert_array_equal(by_board, correction(shipped.core, planes, half_even=True))
 
@@ -68,8 +68,8 @@ def harsh_core(seed: int, channels: int) -> IntCore:
 
     first = conv("first", PLANES, "inner", (channels, 3, 3, 3), relu=bool(seed % 2))
     last = conv("last", "inner", CORRECTION, (1, channels, 3, 3), relu=False)
-    inner = POSITION + 10 - 9  # product - cut
-    return IntCore((first, last), {PLANES: POSITION, "inner": inner, CORRECTION: inner + 10 - 10})
+    inner = PLANES_FRAC_BITS + 10 - 9  # product - cut
+    return IntCore((first, last), {PLANES: PLANES_FRAC_BITS, "inner": inner, CORRECTION: inner + 10 - 10})
 
 
 @pytest.mark.parametrize("channels", [5, 16, 32])
@@ -79,7 +79,7 @@ def test_the_largest_products_are_added_exactly(seed: int, channels: int) -> Non
     whole = correction(core, split(seen), half_even=True)
     assert len(np.unique(whole)) > 40
     restored = np.clip(seen + whole, 0, 1)
-    feed = {PLANES: split(seen).astype(np.float32) * np.float32(2.0**-POSITION)}
+    feed = {PLANES: split(seen).astype(np.float32) * np.float32(2.0**-PLANES_FRAC_BITS)}
     for optimise in (True, False):
         np.testing.assert_array_equal(run(open_session(host_model(core, {}), optimise=optimise), seen), restored)
         by_board = open_session(board_model(core, {}), optimise=optimise).run(None, feed)[0]

@@ -117,7 +117,7 @@ def test_a_layer_that_never_fires_costs_nothing(
 
 @pytest.mark.parametrize("share", [1e-5, 1e-9, 0.0])
 def test_a_branch_of_tiny_values_stays_legal(share: float, float_onnx: onnx.ModelProto, patches: Patches) -> None:
-    """An add moves the branch to the stream's position long after its weights were given one of their own."""
+    """An add moves the branch to the stream's scale long after its weights were given one of their own."""
     tiny = spoilt(float_onnx, "body.0.second.weight", lambda weight: weight * share)
     tiny = spoilt(tiny, "body.0.second.bias", lambda bias: bias * share)
     assert shift_faults(quantise_model(tiny, patches, {}, lambda: None).core) == []
@@ -127,6 +127,6 @@ def test_sizes_beyond_all_shifts_are_refused(graph: Graph) -> None:
     planes = read_planes(graph)
     branch = conv(planes, "body.0.second")
     huge = with_op(planes, replace(branch, weight=branch.weight * np.float32(1e30)))
-    positions = {PLANES: 7, **{op.output: 8 for op in huge}}
+    frac_bits = {PLANES: 7, **{op.output: 8 for op in huge}}
     with pytest.raises(ModelError, match="shifts reach"):
-        build_core(huge, positions)
+        build_core(huge, frac_bits)

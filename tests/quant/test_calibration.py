@@ -12,9 +12,9 @@ from model.simulator.procedural import procedural_scene
 from model.simulator.sampling import Scene
 from profiles import load_sensor
 from profiles.errors import ImageError
-from quant.calibration import Patches, choose_positions, draw_patches, stratified
+from quant.calibration import Patches, choose_frac_bits, draw_patches, stratified
 from quant.graph import PLANES, Graph, correction_graph, float_model, read_planes, tensors
-from quant.session import PIECE_PX, crops, halo_of, open_session, planes_of, tensor_values
+from quant.session import TILE_PX, crops, halo_of, open_session, planes_of, tensor_values
 
 VARIABLE, REFERENCE = load_sensor("pleiades-variable"), load_sensor("pleiades-reference")
 
@@ -100,7 +100,7 @@ def test_scenes_too_small_for_a_patch_are_refused(scenes: list[Scene]) -> None:
         draw_patches(scenes, VARIABLE, REFERENCE, count=1, seed=0, patch_px=300)
 
 
-@pytest.mark.parametrize("shape", [(PIECE_PX, 31), (PIECE_PX + 1, 37), (2 * PIECE_PX + 3, PIECE_PX + 70)])
+@pytest.mark.parametrize("shape", [(TILE_PX, 31), (TILE_PX + 1, 37), (2 * TILE_PX + 3, TILE_PX + 70)])
 def test_pieces_hold_what_the_whole_image_gives(graph: Graph, shape: tuple[int, int]) -> None:
     names, whole = tensors(graph), image(*shape)
     session = open_session(float_model(graph, names))
@@ -114,7 +114,7 @@ def test_pieces_hold_what_the_whole_image_gives(graph: Graph, shape: tuple[int, 
 
 
 def test_without_a_halo_they_would_not(graph: Graph) -> None:
-    names, whole = [tensors(graph)[-1]], image(PIECE_PX + 9, 40)
+    names, whole = [tensors(graph)[-1]], image(TILE_PX + 9, 40)
     session = open_session(float_model(graph, names))
     wanted = session.run(names, {PLANES: planes_of(whole)})[0]
     pieces = list(tensor_values(session, names, whole, halo_px=0))
@@ -123,9 +123,9 @@ def test_without_a_halo_they_would_not(graph: Graph) -> None:
 
 
 def test_crops_tile_the_image() -> None:
-    whole = image(2 * PIECE_PX + 5, PIECE_PX)
+    whole = image(2 * TILE_PX + 5, TILE_PX)
     found = crops(whole)
-    assert [max(crop.shape) <= PIECE_PX for crop in found] == [True] * 3
+    assert [max(crop.shape) <= TILE_PX for crop in found] == [True] * 3
     np.testing.assert_array_equal(np.concatenate(found, axis=2), whole)
 
 
@@ -133,17 +133,17 @@ def test_no_run_sees_more_than_a_piece_with_its_halo(graph: Graph) -> None:
     """What bounds memory: the largest array that the session returns does not grow with the image."""
     names = tensors(graph)
     session = open_session(float_model(graph, names))
-    side = PIECE_PX + 2 * halo_of(graph)
-    for piece in tensor_values(session, names, image(3 * PIECE_PX + 1, 3 * PIECE_PX + 2), halo_of(graph)):
+    side = TILE_PX + 2 * halo_of(graph)
+    for piece in tensor_values(session, names, image(3 * TILE_PX + 1, 3 * TILE_PX + 2), halo_of(graph)):
         assert max(values.base.shape[2] for values in piece if values.base is not None) <= side
 
 
 def test_positions_of_a_large_image_are_those_of_its_whole(graph: Graph) -> None:
     """In pieces or at once: found here by hand from whole tensors."""
-    whole = image(PIECE_PX + 21, 50)
-    positions = choose_positions(graph, [whole], lambda: None, least_squares=False)
+    whole = image(TILE_PX + 21, 50)
+    frac_bits = choose_frac_bits(graph, [whole], lambda: None, least_squares=False)
     names = tensors(graph)
     values = open_session(float_model(graph, names)).run(names, {PLANES: planes_of(whole)})
     for name, tensor in zip(names, values, strict=True):
         largest = float(np.abs(tensor).max())
-        assert largest * 2.0 ** positions[name] <= 127 < largest * 2.0 ** (positions[name] + 1)
+        assert largest * 2.0 ** frac_bits[name] <= 127 < largest * 2.0 ** (frac_bits[name] + 1)

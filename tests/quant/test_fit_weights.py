@@ -78,7 +78,7 @@ def test_every_layer_errs_less_on_what_it_reads(
     for op, before, after in zip(nearest.graph, nearest.core.ops, fitted.ops, strict=True):
         if isinstance(op, Conv) and isinstance(before, IntConv) and isinstance(after, IntConv):
             moments = other[op.name]
-            wanted = op.weight.reshape(len(op.weight), -1) * 2.0**before.weight_position
+            wanted = op.weight.reshape(len(op.weight), -1) * 2.0**before.weight_frac_bits
             errors = [
                 squared(whole.weight.reshape(wanted.shape), wanted, moments.covariance) for whole in (before, after)
             ]
@@ -88,7 +88,7 @@ def test_every_layer_errs_less_on_what_it_reads(
 def test_fitted_numbers_stay_legal(float_onnx: onnx.ModelProto, patches: Patches) -> None:
     core = quantise_model(float_onnx, patches, {}, lambda: None).core
     for op in core.ops:
-        for _, value, window in op_shifts(op, core.positions, SHIFTS):
+        for _, value, window in op_shifts(op, core.frac_bits, SHIFTS):
             assert window[0] <= value <= window[1]
 
 

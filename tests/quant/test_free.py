@@ -17,7 +17,7 @@ from quant.gate import compare
 from quant.graph import (
     CORRECTION,
     PLANES,
-    POSITION,
+    PLANES_FRAC_BITS,
     Conv,
     Graph,
     correction_graph,
@@ -29,7 +29,7 @@ from quant.graph import (
 from quant.integer import _convolve
 from quant.onnx_file import metadata, save_onnx
 from quant.passes.equalise import channel_ranges, equalise, first_guess
-from quant.passes.stream import OFFSETS, half_steps, two_gains
+from quant.passes.stream import OFFSETS, half_lsb_pair, two_gains
 from quant.quantise import Quantised
 from quant.session import open_session, planes_of, run
 
@@ -117,7 +117,7 @@ def test_every_convolution_stays_an_integer_kernel(free: onnx.ModelProto, tmp_pa
     options.optimized_model_filepath = str(tmp_path / "optimised.onnx")
     ort.InferenceSession(free.SerializeToString(), options, providers=["CPUExecutionProvider"])
     kinds = Counter(node.op_type for node in onnx.load(tmp_path / "optimised.onnx").graph.node)
-    assert kinds["QLinearConv"] == 8  # seven, the head also in half steps
+    assert kinds["QLinearConv"] == 8  # seven, the head also as a half-LSB pair
     assert not [kind for kind in kinds if kind.endswith("Conv") and kind != "QLinearConv"]
 
 
@@ -208,35 +208,35 @@ def in_float(graph: Graph) -> np.ndarray:
     return np.asarray(open_session(float_model(graph, [CORRECTION])).run(None, {PLANES: planes})[0])
 
 
-def test_half_steps_leave_the_float_network_as_it_was(float_onnx: onnx.ModelProto) -> None:
+def test_the_half_lsb_pair_leave_the_float_network_as_it_was(float_onnx: onnx.ModelProto) -> None:
     graph = read_planes(correction_graph(float_onnx))
-    twice = half_steps(graph, 2.0**-8)
+    twice = half_lsb_pair(graph, 2.0**-8)
     assert len(twice) == len(graph) + 1  # the head is also read by the first block, as it was
     np.testing.assert_allclose(in_float(twice), in_float(graph), atol=2e-6)
 
 
-def test_half_steps_need_an_add_of_two_convolutions_before_the_tail(float_onnx: onnx.ModelProto) -> None:
+def test_the_half_lsb_pair_need_an_add_of_two_convolutions_before_the_tail(float_onnx: onnx.ModelProto) -> None:
     graph = read_planes(correction_graph(float_onnx))
     for other in (graph[:-1], graph[-1:], graph[:3]):
-        assert half_steps(other, 2.0**-8) == other
+        assert half_lsb_pair(other, 2.0**-8) == other
 
 
 @given(st.floats(-100, 100))
-def test_two_copies_hold_half_steps(value: float) -> None:
+def test_two_copies_hold_half_an_lsb(value: float) -> None:
     copies = np.rint(value + OFFSETS)
     assert abs(copies.mean() - value) <= 0.25 + 1e-9
 
 
-def test_half_steps_lose_less(float_onnx: onnx.ModelProto, patches: Patches, unseen: Patches) -> None:
+def test_the_half_lsb_pair_lose_less(float_onnx: onnx.ModelProto, patches: Patches, unseen: Patches) -> None:
     step, graph = 2.0**-8, read_planes(correction_graph(float_onnx))
     graph = equalise(graph, first_guess(channel_ranges(graph, patches.degraded, lambda: None), 0.5, 0.8))
     levels = {op.output: 255 for op in graph if isinstance(op, Conv) and op.relu} | {CORRECTION: 127}
     units = tensor_scales(graph, levels, patches.degraded, lambda: None)
     scales = {name: Scale(unit, 0 if levels[name] == 255 else 128) for name, unit in units.items()}
-    scales[PLANES] = Scale(2.0**-POSITION)
+    scales[PLANES] = Scale(2.0**-PLANES_FRAC_BITS)
 
     def mae(offset: float) -> float:
-        fine = two_gains(half_steps(graph, offset))
+        fine = two_gains(half_lsb_pair(graph, offset))
         model = free_model(fine, {name: scales.get(name, Scale(step)) for name in (PLANES, *tensors(fine))}, {})
         return compare(open_session(float_onnx), open_session(model), unseen.pairs).mae
 

@@ -1,4 +1,4 @@
-"""The integer reference: the documented arithmetic, equal to the runtime bit for bit but for halves."""
+"""The integer reference: the documented arithmetic, equal to the runtime bit for bit but for tie rounding."""
 
 from dataclasses import replace
 
@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from quant.core import IntConv, IntCore
-from quant.graph import CORRECTION, PLANES, POSITION, Add, split
+from quant.graph import CORRECTION, PLANES, PLANES_FRAC_BITS, Add, split
 from quant.integer import INT32_BITS, LayerReport, correction, run_core
 from quant.quantise import Quantised
 from quant.session import open_session
@@ -18,7 +18,7 @@ def image(height: int = 37, width: int = 53, seed: int = 0) -> np.ndarray:
 
 
 def by_runtime(quantised: Quantised, planes: np.ndarray) -> np.ndarray:
-    feed = {PLANES: planes.astype(np.float32) * np.float32(2.0**-POSITION)}
+    feed = {PLANES: planes.astype(np.float32) * np.float32(2.0**-PLANES_FRAC_BITS)}
     return np.asarray(open_session(quantised.board).run(None, feed)[0])
 
 
@@ -70,11 +70,11 @@ def test_products_saturate_at_int8_s_ends() -> None:
 def test_bias_is_aligned_and_relu_comes_before_the_shift() -> None:
     op = one_conv(1, 3, 1, relu=True).ops[0]
     assert isinstance(op, IntConv)
-    aligned = IntCore((replace(op, bias_position=-2),), {PLANES: 0, CORRECTION: -1})  # 3 << 2 = 12
+    aligned = IntCore((replace(op, bias_frac_bits=-2),), {PLANES: 0, CORRECTION: -1})  # 3 << 2 = 12
     assert values(aligned, [-20, -12, -10, 0, 10]) == [0, 0, 1, 6, 11]
 
 
-def test_an_add_aligns_to_the_finer_position() -> None:
+def test_an_add_aligns_to_the_finer_scale() -> None:
     add = Add("a", ("x", "y"), CORRECTION)
     ops = (
         IntConv("x", PLANES, "x", np.ones((1, 1, 1, 1), np.int8), 0, np.zeros(1, np.int8), 0, False),
@@ -82,7 +82,7 @@ def test_an_add_aligns_to_the_finer_position() -> None:
         add,
     )
     core = IntCore(ops, {PLANES: 0, "x": 0, "y": 1, CORRECTION: 0})
-    # x = v at position 0, y = v at position 1, which is v / 2: 1.5 v, halves up
+    # x = v with no fractional bit, y = v with one, which is v / 2: 1.5 v, half up
     assert values(core, [-3, -1, 0, 1, 2, 3, 100]) == [-4, -1, 0, 2, 3, 5, 127]
 
 
@@ -94,12 +94,12 @@ def test_accumulators_stay_within_what_is_proven(quantised: Quantised) -> None:
         assert 0 <= report.saturated <= 1
 
 
-def test_a_wrong_bias_position_is_seen(quantised: Quantised) -> None:
+def test_a_wrong_bias_scale_is_seen(quantised: Quantised) -> None:
     ops = list(quantised.core.ops)
     place = next(k for k, op in enumerate(ops) if isinstance(op, IntConv) and op.bias.any())
     op = ops[place]
     assert isinstance(op, IntConv)
-    ops[place] = replace(op, bias_position=op.bias_position - 1)
+    ops[place] = replace(op, bias_frac_bits=op.bias_frac_bits - 1)
     planes = split(image())
     wrong = correction(replace(quantised.core, ops=tuple(ops)), planes, half_even=True)
     assert not np.array_equal(wrong, by_runtime(quantised, planes))

@@ -53,7 +53,7 @@ def convolution(
 
 
 def by_definition(model: onnx.ModelProto, image: np.ndarray) -> np.ndarray:
-    """What such a convolution is, tap by tap in int64: no padding, halves to even."""
+    """What such a convolution is, tap by tap in int64: no padding, half to even."""
     held = {tensor.name: numpy_helper.to_array(tensor) for tensor in model.graph.initializer}
     groups = model.graph.node[0].attribute[0].i
     shifted = image.astype(np.int64) - int(held["middle"])

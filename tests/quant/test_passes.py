@@ -12,7 +12,7 @@ from quant.gate import compare
 from quant.graph import (
     CORRECTION,
     PLANES,
-    POSITION,
+    PLANES_FRAC_BITS,
     Add,
     Conv,
     Graph,
@@ -34,10 +34,10 @@ from quant.passes.equalise import (
 from quant.passes.stream import (
     FINE_MAX,
     GAIN,
-    STREAM_POSITION,
-    common_position,
+    STREAM_FRAC_BITS,
+    common_frac_bits,
     merge,
-    steady,
+    share_stream_scale,
     stream_tensors,
     two_gains,
 )
@@ -54,7 +54,7 @@ def graph(float_onnx: onnx.ModelProto) -> Graph:
 
 def correction(graph: Graph, seed: int = 0) -> np.ndarray:
     dn = np.random.default_rng(seed).integers(0, 4096, (1, 1, 23, 31)).astype(np.float32) / np.float32(4095)
-    planes = split(dn).astype(np.float32) * np.float32(2.0**-POSITION)
+    planes = split(dn).astype(np.float32) * np.float32(2.0**-PLANES_FRAC_BITS)
     return np.asarray(open_session(float_model(graph, [CORRECTION])).run(None, {PLANES: planes})[0])
 
 
@@ -76,7 +76,7 @@ def test_ranges_are_levelled_to_the_stream_s_own(graph: Graph, patches: Patches)
     ranges = channel_ranges(graph, images, lambda: None)
     assert ranges.shape == (8,)
     factors = first_guess(ranges, 1.0, 1.0)
-    np.testing.assert_allclose(ranges * factors, 127 * 2.0**-STREAM_POSITION)
+    np.testing.assert_allclose(ranges * factors, 127 * 2.0**-STREAM_FRAC_BITS)
     again = channel_ranges(equalise(graph, factors), images, lambda: None)
     np.testing.assert_allclose(again, ranges * factors, rtol=1e-4)
 
@@ -140,25 +140,25 @@ def test_a_trial_that_the_costliest_crops_favour_still_has_to_win_on_all(graph: 
     assert found <= guesses[0]
 
 
-def test_a_steady_stream_adds_without_rounding(quantised: Quantised) -> None:
+def test_a_shared_residual_scale_adds_without_rounding(quantised: Quantised) -> None:
     adds = [op for op in quantised.core.ops if isinstance(op, Add)]
     assert len(adds) == 3
     for op in adds:
-        shifts = {name: value for name, value, _ in op_shifts(op, quantised.core.positions, SHIFTS)}
+        shifts = {name: value for name, value, _ in op_shifts(op, quantised.core.frac_bits, SHIFTS)}
         assert shifts == {"shift_read": 0, "shift_write": 0}
 
 
 def test_without_it_adds_round(float_onnx: onnx.ModelProto, patches: Patches) -> None:
     free = quantise_model(float_onnx, patches, {}, lambda: None, replace(NONE, least_squares=True))
     adds = [op for op in free.core.ops if isinstance(op, Add)]
-    shifts = [v for op in adds for _, v, _ in op_shifts(op, free.core.positions, SHIFTS)]
+    shifts = [v for op in adds for _, v, _ in op_shifts(op, free.core.frac_bits, SHIFTS)]
     assert any(shifts)
 
 
-def test_the_common_position_is_the_coarsest_of_the_stream(graph: Graph) -> None:
-    positions = {name: 7 + k for k, name in enumerate(sorted(stream_tensors(graph)))} | {CORRECTION: 3}
-    assert common_position(graph, positions) == 7
-    assert steady(graph, positions, 7) == dict.fromkeys(stream_tensors(graph), 7) | {CORRECTION: 3}
+def test_the_common_scale_is_the_coarsest_of_the_stream(graph: Graph) -> None:
+    frac_bits = {name: 7 + k for k, name in enumerate(sorted(stream_tensors(graph)))} | {CORRECTION: 3}
+    assert common_frac_bits(graph, frac_bits) == 7
+    assert share_stream_scale(graph, frac_bits, 7) == dict.fromkeys(stream_tensors(graph), 7) | {CORRECTION: 3}
 
 
 def test_the_second_gain_is_the_same_correction_coarser(graph: Graph) -> None:

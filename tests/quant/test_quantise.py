@@ -10,7 +10,7 @@ from quant.calibration import Patches
 from quant.core import IntConv, build_core, shift_faults
 from quant.encodings import host_model
 from quant.gate import Limits, compare, judge
-from quant.graph import CORRECTION, POSITION, correction_graph, read_planes, split
+from quant.graph import CORRECTION, PLANES_FRAC_BITS, correction_graph, read_planes, split
 from quant.onnx_file import metadata, save_onnx
 from quant.passes.stream import merge
 from quant.quantise import Quantised, quantise_model
@@ -39,15 +39,15 @@ def test_every_shift_is_within_its_window(quantised: Quantised) -> None:
 
 
 def test_a_shift_outside_its_window_is_named(quantised: Quantised) -> None:
-    positions = dict(quantised.core.positions)
-    positions["head"] = 40
-    faults = shift_faults(replace(quantised.core, positions=positions))
+    frac_bits = dict(quantised.core.frac_bits)
+    frac_bits["head"] = 40
+    faults = shift_faults(replace(quantised.core, frac_bits=frac_bits))
     assert any(fault.startswith("head: shift_cut") for fault in faults)
 
 
 def test_unreachable_positions_are_moved_to_legal_ones(float_onnx: onnx.ModelProto, quantised: Quantised) -> None:
     graph = read_planes(correction_graph(float_onnx))
-    wild = {name: (p if name == "planes" else p + 20) for name, p in quantised.core.positions.items()}
+    wild = {name: (p if name == "planes" else p + 20) for name, p in quantised.core.frac_bits.items()}
     assert shift_faults(build_core(graph, wild)) == []
 
 
@@ -56,7 +56,7 @@ def test_host_and_board_files_compute_the_same(size: tuple[int, int], quantised:
     host, board = open_session(quantised.host), open_session(quantised.board)
     for seed in range(3):
         dn = image(*size, seed=seed)
-        planes = split(dn).astype(np.float32) * np.float32(2.0**-POSITION)
+        planes = split(dn).astype(np.float32) * np.float32(2.0**-PLANES_FRAC_BITS)
         correction = merge(board.run(None, {"planes": planes})[0], quantised.core.scale(CORRECTION))
         restored = np.clip(dn + correction, 0, 1)
         np.testing.assert_array_equal(run(host, dn), restored)
@@ -74,7 +74,9 @@ def test_the_exact_kernels_compute_the_same(quantised: Quantised) -> None:
 
 def test_every_convolution_is_an_integer_kernel(quantised: Quantised) -> None:
     kinds = [node.op_type for node in quantised.host.graph.node]
-    assert kinds.count("QLinearConv") == 8  # head, two of each of two blocks, head and end for half steps, tail
+    assert (
+        kinds.count("QLinearConv") == 8
+    )  # head, two of each of two blocks, head and end for the half-LSB pair, tail
     assert "Conv" not in kinds
 
 
@@ -114,7 +116,7 @@ def test_the_file_says_what_it_was_calibrated_on(quantised: Quantised, patches: 
     assert about["precision"] == "int8 legal"
 
 
-@pytest.mark.parametrize("spelling", ["float", "host", "board"])
-def test_the_radius_is_read_from_the_graph(spelling: str, float_onnx: onnx.ModelProto, quantised: Quantised) -> None:
-    model = {"float": float_onnx, "host": quantised.host, "board": quantised.board}[spelling]
+@pytest.mark.parametrize("encoding", ["float", "host", "board"])
+def test_the_radius_is_read_from_the_graph(encoding: str, float_onnx: onnx.ModelProto, quantised: Quantised) -> None:
+    model = {"float": float_onnx, "host": quantised.host, "board": quantised.board}[encoding]
     assert receptive_radius_px(model) == 7

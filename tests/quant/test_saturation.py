@@ -1,4 +1,4 @@
-"""What comes to the ends of 8 bits is counted, in any spelling, and what is no loss is not."""
+"""What comes to the ends of 8 bits is counted, in any encoding, and what is no loss is not."""
 
 from collections.abc import Callable
 

@@ -36,9 +36,9 @@ def refusal(model: onnx.ModelProto, to_run: bool = True) -> str:
     return str(caught.value)
 
 
-@pytest.mark.parametrize("spelling", [float_convbeers, integer_convbeers, board_convbeers])
-def test_sound_files_of_every_spelling_run(spelling: Callable[..., Path], tmp_path: Path) -> None:
-    path = spelling(tmp_path / "a.onnx", blocks=1, features=4)
+@pytest.mark.parametrize("encoding", [float_convbeers, integer_convbeers, board_convbeers])
+def test_sound_files_of_every_encoding_run(encoding: Callable[..., Path], tmp_path: Path) -> None:
+    path = encoding(tmp_path / "a.onnx", blocks=1, features=4)
     assert run(open_session(path, 1), IMAGE).shape == IMAGE.shape
 
 

@@ -112,8 +112,8 @@ def test_bits_of_shifts_are_counted_whatever_their_sign() -> None:
 
 def test_numbers_that_the_board_could_not_store_are_refused(quantised: Quantised) -> None:
     op = next(op for op in quantised.core.ops if isinstance(op, IntConv))
-    odd = replace(op, bias=np.full(len(op.bias), 100_001), bias_position=op.bias_position)
-    far = replace(op, weight_position=op.weight_position + 40, bias_position=op.bias_position + 40)
+    odd = replace(op, bias=np.full(len(op.bias), 100_001), bias_frac_bits=op.bias_frac_bits)
+    far = replace(op, weight_frac_bits=op.weight_frac_bits + 40, bias_frac_bits=op.bias_frac_bits + 40)
     for wrong in (odd, far):
         with pytest.raises(ModelError, match=op.name):
             as_stored(replace(quantised.core, ops=(wrong, *quantised.core.ops[1:])))

@@ -100,7 +100,7 @@ def test_no_image_leaves_the_integer_bounds(quantised: Quantised) -> None:
 
 def test_an_accumulator_that_overflows_is_found(quantised: Quantised) -> None:
     op = next(op for op in quantised.core.ops if isinstance(op, IntConv))
-    huge = replace(op, bias=np.full(len(op.bias), 2**31, np.int64), bias_position=op.weight_position + 7)
+    huge = replace(op, bias=np.full(len(op.bias), 2**31, np.int64), bias_frac_bits=op.weight_frac_bits + 7)
     core = replace(quantised.core, ops=(huge, *quantised.core.ops[1:]))
     assert layer_bounds(core)[0].bits >= INT32_BITS
 

@@ -17,7 +17,7 @@ from model.simulator.mtf import NYQUIST, mtf
 from model.traditional.compensate import compensation_gain
 from quant.core import IntConv, IntCore
 from quant.encodings import board_model, host_model
-from quant.graph import CORRECTION, PLANES, POSITION, split
+from quant.graph import CORRECTION, PLANES, PLANES_FRAC_BITS, split
 from quant.integer import correction
 from quant.passes.stream import merge
 from quant.quantise import Quantised
@@ -54,20 +54,20 @@ def test_ssim_is_that_of_its_definition(seed: int, level: float, sigma: float, d
 
 
 def biased(core: IntCore, generator: np.random.Generator) -> IntCore:
-    """The core with a bias of its own in every convolution, at any position that the DPU can shift."""
+    """The core with a bias of its own in every convolution, at any scale that the DPU can shift."""
     ops = []
     for op in core.ops:
         if isinstance(op, IntConv):
             bias = generator.integers(-128, 128, len(op.bias)).astype(np.int8)
-            product = op.weight_position + core.positions[op.input]
-            op = replace(op, bias=bias, bias_position=product - int(generator.integers(0, 8)))
+            product = op.weight_frac_bits + core.frac_bits[op.input]
+            op = replace(op, bias=bias, bias_frac_bits=product - int(generator.integers(0, 8)))
         ops.append(op)
     return replace(core, ops=tuple(ops))
 
 
 @pytest.mark.parametrize("shape", [(17, 20), (1, 1), (1, 19), (12, 2)])
 @pytest.mark.parametrize("seed", [0, 1])
-def test_both_files_hold_every_bias_at_its_position(seed: int, shape: tuple[int, int], quantised: Quantised) -> None:
+def test_both_files_hold_every_bias_at_its_scale(seed: int, shape: tuple[int, int], quantised: Quantised) -> None:
     generator = np.random.default_rng(seed)
     core = biased(quantised.core, generator)
     image = generator.uniform(0.3, 0.7, (1, 1, *shape)).astype(np.float32)
@@ -75,14 +75,14 @@ def test_both_files_hold_every_bias_at_its_position(seed: int, shape: tuple[int,
     whole = correction(core, planes, half_even=True)
     restored = np.clip(image + merge(whole, core.scale(CORRECTION)), 0, 1)
     np.testing.assert_array_equal(run(open_session(host_model(core, {})), image), restored)
-    feed = {PLANES: planes.astype(np.float32) * np.float32(2.0**-POSITION)}
+    feed = {PLANES: planes.astype(np.float32) * np.float32(2.0**-PLANES_FRAC_BITS)}
     np.testing.assert_array_equal(open_session(board_model(core, {})).run(None, feed)[0], whole)
 
 
-def test_a_bias_one_position_off_would_show(quantised: Quantised) -> None:
+def test_a_bias_one_scale_off_would_show(quantised: Quantised) -> None:
     core = biased(quantised.core, np.random.default_rng(0))
     planes = split(np.full((1, 1, 9, 9), 0.5, np.float32))
-    ops = [replace(op, bias_position=op.bias_position - 1) if isinstance(op, IntConv) else op for op in core.ops]
+    ops = [replace(op, bias_frac_bits=op.bias_frac_bits - 1) if isinstance(op, IntConv) else op for op in core.ops]
     assert (correction(core, planes) != correction(replace(core, ops=tuple(ops)), planes)).any()
 
 

@@ -18,7 +18,7 @@ NAMES = (
     "missing halo",
     "off by half a pixel",
     "wrong rounding mode",
-    "bias position off by one",
+    "bias off by one fractional bit",
     "reflect instead of zero padding",
     "global seed",
     "non-orthonormal FFT",

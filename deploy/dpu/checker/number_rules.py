@@ -1,6 +1,6 @@
 """What the DPU demands of the numbers in a quantised file: one rule, one function.
 
-A position p stands for the scale 2^-p; shifts are differences of positions.
+n fractional bits stand for the scale 2^-n; shifts are differences of them.
 """
 
 import numpy as np
@@ -13,7 +13,7 @@ from deploy.dpu.graph import Operation, Scale
 
 
 AGAIN = "'beers-deploy quantize --regime legal' does"
-MOVE = "move the output's position until it fits: 'beers-deploy quantize --regime legal' does"
+MOVE = "move the output's scale until it fits: 'beers-deploy quantize --regime legal' does"
 
 
 def on_integers(op: Operation, dpu: Dpu) -> Finding | None:
@@ -42,9 +42,9 @@ def per_tensor(op: Operation, dpu: Dpu) -> Finding | None:
 def power_of_two(op: Operation, dpu: Dpu) -> Finding | None:
     """Scales are powers of two (UG1414 3.5, quantisation)."""
     single = {role: scale for role, scale in op.scales.items() if len(scale.scales) == 1}
-    faults = [f"{role} scale {scale.scales[0]:.4g}" for role, scale in single.items() if scale.position is None]
+    faults = [f"{role} scale {scale.scales[0]:.4g}" for role, scale in single.items() if scale.frac_bits is None]
     return (
-        Finding("; ".join(faults), f"round each scale to 2^-position; {AGAIN}, and so does AMD Quark's XINT8")
+        Finding("; ".join(faults), f"round each scale to 2^-n; {AGAIN}, and so does AMD Quark's XINT8")
         if faults
         else None
     )
@@ -57,17 +57,17 @@ def one_format(op: Operation, dpu: Dpu) -> Finding | None:
 
 
 def shift_cut(op: Operation, dpu: Dpu) -> Finding | None:
-    """Weight + input - output position of a convolution is {numbers[shift_cut]} (Vitis-AI 3.0, vai_q_pytorch)."""
+    """A convolution's weight + input - output fractional bits: {numbers[shift_cut]} (Vitis-AI 3.0, vai_q_pytorch)."""
     cut, limit = _cut(op), dpu.limit("numbers", "shift_cut")
     return None if cut is None or not outside((cut,), limit) else Finding(f"shift_cut {cut}, allowed {limit}", MOVE)
 
 
 def shift_bias(op: Operation, dpu: Dpu) -> Finding | None:
-    """Weight + input - bias position is at most {numbers[shift_bias_max]} (Vitis-AI 3.0, vai_q_pytorch).
+    """A convolution's weight + input - bias fractional bits: at most {numbers[shift_bias_max]} (Vitis-AI 3.0, vai_q_pytorch).
 
     And at least min(0, shift_cut + 8 - {numbers[accumulator_bits]}).
     """
-    product, cut, bias = product_position(op), _cut(op), _position(op, "bias")
+    product, cut, bias = product_frac_bits(op), _cut(op), _frac_bits(op, "bias")
     if product is None or cut is None or bias is None:
         return None
     low = min(0, cut + 8 - dpu.whole("numbers", "accumulator_bits"))
@@ -76,49 +76,50 @@ def shift_bias(op: Operation, dpu: Dpu) -> Finding | None:
 
 
 def shift_read(op: Operation, dpu: Dpu) -> Finding | None:
-    """The inputs' positions of an add lie {numbers[shift_read]} apart (Vitis-AI 3.0, vai_q_pytorch)."""
+    """The fractional bits of an add's inputs lie {numbers[shift_read]} apart (Vitis-AI 3.0, vai_q_pytorch)."""
     inputs, limit = _inputs(op), dpu.limit("numbers", "shift_read")
     shift = max(inputs) - min(inputs) if inputs else 0
     return Finding(f"shift_read {shift}, allowed {limit}", MOVE) if outside((shift,), limit) else None
 
 
 def shift_write(op: Operation, dpu: Dpu) -> Finding | None:
-    """An add's smallest input position less its output's is {numbers[shift_write]} (Vitis-AI 3.0, vai_q_pytorch)."""
-    inputs, output, limit = _inputs(op), _position(op, "output"), dpu.limit("numbers", "shift_write")
+    """An add's coarsest input - output fractional bits: {numbers[shift_write]} (Vitis-AI 3.0, vai_q_pytorch)."""
+    inputs, output, limit = _inputs(op), _frac_bits(op, "output"), dpu.limit("numbers", "shift_write")
     if not inputs or output is None or not outside((min(inputs) - output,), limit):
         return None
     return Finding(f"shift_write {min(inputs) - output}, allowed {limit}", MOVE)
 
 
-def same_position(op: Operation, dpu: Dpu) -> Finding | None:
-    """Inputs and output of a concat or a pool share one position (Vitis-AI 3.0, vai_q_pytorch)."""
-    positions = {role: p for role in op.scales if (p := _position(op, role)) is not None}
-    if len(set(positions.values())) < 2:
+def same_scale(op: Operation, dpu: Dpu) -> Finding | None:
+    """Inputs and output of a concat or a pool share one scale (Vitis-AI 3.0, vai_q_pytorch)."""
+    frac_bits = {role: p for role in op.scales if (p := _frac_bits(op, role)) is not None}
+    if len(set(frac_bits.values())) < 2:
         return None
     return Finding(
-        ", ".join(f"{role} position {p}" for role, p in positions.items()), f"give them the smallest one; {AGAIN}"
+        ", ".join(f"{role} {p} fractional bits" for role, p in frac_bits.items()),
+        f"give them the smallest one; {AGAIN}",
     )
 
 
-def product_position(op: Operation) -> int | None:
-    """The position of a convolution's sums of products, None without one."""
-    weight, source = _position(op, "weight"), _position(op, "input 0")
+def product_frac_bits(op: Operation) -> int | None:
+    """The scale of a convolution's sums of products, None without one."""
+    weight, source = _frac_bits(op, "weight"), _frac_bits(op, "input 0")
     return None if weight is None or source is None else weight + source
 
 
-def _position(op: Operation, role: str) -> int | None:
+def _frac_bits(op: Operation, role: str) -> int | None:
     scale = op.scales.get(role)
-    return scale.position if scale else None
+    return scale.frac_bits if scale else None
 
 
 def _inputs(op: Operation) -> list[int]:
     """Of the tensors and constants that an element-wise operator reads."""
-    positions = (_position(op, role) for role in op.scales if role.startswith(("input", "constant")))
-    return [p for p in positions if p is not None]
+    frac_bits = (_frac_bits(op, role) for role in op.scales if role.startswith(("input", "constant")))
+    return [p for p in frac_bits if p is not None]
 
 
 def _cut(op: Operation) -> int | None:
-    product, output = product_position(op), _position(op, "output")
+    product, output = product_frac_bits(op), _frac_bits(op, "output")
     return None if product is None or output is None else product - output
 
 
@@ -139,11 +140,11 @@ def int8_constants(op: Operation, dpu: Dpu) -> Finding | None:
     kinds = {role: _kind(values) for role, values in op.constants.items() if role != "bias"}
     faults = [f"{role} is {kind}" for role, kind in kinds.items() if kind not in BYTES]
     faults += [f"{role} has no scale" for role, kind in kinds.items() if kind in BYTES and role not in op.scales]
-    return Finding("; ".join(faults), f"store it as int8 with a scale 2^-position; {AGAIN}") if faults else None
+    return Finding("; ".join(faults), f"store it as int8 with a scale 2^-n; {AGAIN}") if faults else None
 
 
 def int8_bias(op: Operation, dpu: Dpu) -> Finding | None:
-    """A bias is int8 with a position of its own, not int32 at the products' scale (Vitis-AI 3.0, vai_q_pytorch).
+    """A bias is int8 with a scale of its own, not int32 at the products' scale (Vitis-AI 3.0, vai_q_pytorch).
 
     The operator QLinearConv demands int32: its bias has a rule of its own.
     """
@@ -156,13 +157,13 @@ def int8_bias(op: Operation, dpu: Dpu) -> Finding | None:
 def int32_bias(op: Operation, dpu: Dpu) -> Finding | None:
     """A QLinearConv's int32 bias is int8 << k, k at most {numbers[shift_bias_max]} (Vitis-AI 3.0, vai_q_pytorch).
 
-    One k for all values: the weight + input - bias position. A change that keeps this form no rule can see: one more
-    where k is 0 is another bias, and as legal. Judged where the products have a position.
+    One k for all values: weight + input - bias fractional bits. A change that keeps this form no rule can see: one
+    more where k is 0 is another bias, and as legal. Judged where the products have a scale.
     """
-    if "bias" not in op.constants or op.op_type != "QLinearConv" or product_position(op) is None:
+    if "bias" not in op.constants or op.op_type != "QLinearConv" or product_frac_bits(op) is None:
         return None
     values, high = op.constants["bias"], dpu.whole("numbers", "shift_bias_max")
-    remedy = f"round the bias to int8 at a position of its own; {AGAIN}"
+    remedy = f"round the bias to int8 at a scale of its own; {AGAIN}"
     if values is None or _kind(values) != "int32":
         return Finding(f"its bias is {_kind(values)}", remedy)
     shift = min(high, _spare_bits(values))

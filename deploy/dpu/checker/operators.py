@@ -62,8 +62,8 @@ SHIFTS: Mapping[Kind, tuple[Rule, ...]] = {
     "transposed": (k.int8_bias, k.int32_bias, n.shift_cut, n.shift_bias),
     "add": (n.shift_read, n.shift_write),
     "mul": (),
-    "concat": (n.same_position,),
-    "pool": (n.same_position,),
+    "concat": (n.same_scale,),
+    "pool": (n.same_scale,),
 }
 """What a quantised node has to keep besides."""
 

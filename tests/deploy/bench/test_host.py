@@ -13,7 +13,7 @@ from deploy.bench.host import Sensors, Timed, drawn_acquisition, host_rows, take
 from deploy.bench.host_state import memory_rise, watched
 from deploy.bench.profile import node_rows, profile
 from deploy.bench.tables import Swath, board_cpu_row, slowdown
-from deploy.export import counterpart, float_model
+from deploy.export import float_model, other_precision
 from model.shipped import default_int8
 from profiles import load_sensor, load_target
 from profiles.constant import Constant
@@ -61,13 +61,13 @@ def test_turns_last_for_the_minimum_time_and_count(tmp_path: Path) -> None:
     assert len(timed_rows(runs[:1], 24, {})) == 1
 
 
-def test_the_counterpart_is_the_other_precision() -> None:
+def test_the_other_precision_is_a_shipped_network_of_the_same_variant() -> None:
     int8 = load_onnx(default_int8())
-    float32 = counterpart(int8)
+    float32 = other_precision(int8)
     assert is_quantised(int8)
     assert float32 is not None
     assert not is_quantised(float32)
-    back = counterpart(float32)
+    back = other_precision(float32)
     assert back is not None
     assert is_quantised(back)
     shapes = ([t.dims for t in m.graph.initializer if len(t.dims) == 4] for m in (float_model(None), float32))
@@ -76,7 +76,7 @@ def test_the_counterpart_is_the_other_precision() -> None:
 
 def test_a_network_of_another_make_runs_alone(tmp_path: Path) -> None:
     path = float_convbeers(tmp_path / "f.onnx", 1, 8)
-    assert counterpart(load_onnx(path)) is None
+    assert other_precision(load_onnx(path)) is None
     assert [row.name for row in host_rows(path, QUICK, 32, 1) if row.table == "host"] == ["f, 32 x 32"]
 
 

@@ -46,7 +46,7 @@ class Sketch:
 
 
 def float_convbeers(path: Path, blocks: int, features: int) -> Path:
-    """The float spelling: head, residual blocks, body end, tail, global add."""
+    """The float encoding: head, residual blocks, body end, tail, global add."""
     sketch = Sketch(channels=1)
     wide = (features, features, 3, 3)
     stream = head = sketch.conv("image", (features, 1, 3, 3))
@@ -83,7 +83,7 @@ class IntegerSketch(Sketch):
 
 
 def integer_convbeers(path: Path, blocks: int, features: int, weight_scale: float = 2.0**-7) -> Path:
-    """The host's integer spelling, one int8 plane in, the correction added to the image behind."""
+    """The host's integer encoding, one int8 plane in, the correction added to the image behind."""
     s = IntegerSketch()
     wide = (features, features, 3, 3)
     stream = head = s.qconv(s.quantised("image"), (features, 1, 3, 3), weight_scale)
@@ -96,7 +96,7 @@ def integer_convbeers(path: Path, blocks: int, features: int, weight_scale: floa
 
 
 def board_convbeers(path: Path, blocks: int, features: int) -> Path:
-    """The board's QDQ spelling of the core by itself, int8 weights and bias through DequantizeLinear."""
+    """The board's QDQ encoding of the core by itself, int8 weights and bias through DequantizeLinear."""
     s = IntegerSketch()
 
     def pair(source: str) -> str:
@@ -115,24 +115,24 @@ def board_convbeers(path: Path, blocks: int, features: int) -> Path:
 
 
 class QdqSketch(Sketch):
-    """A sketch in QDQ spelling, every tensor with a position of its own: 2^-position is its scale."""
+    """A sketch in QDQ encoding, every tensor with a scale of its own: 2^-n is its scale."""
 
-    def scale(self, position: float | list[float], zero: int = 0, kind: type = np.int8) -> tuple[str, str]:
-        scales = 2.0 ** -np.array(position, np.float64)
+    def scale(self, frac_bits: float | list[float], zero: int = 0, kind: type = np.int8) -> tuple[str, str]:
+        scales = 2.0 ** -np.array(frac_bits, np.float64)
         return self.constant(scales.astype(np.float32)), self.constant(np.full(scales.shape, zero, kind))
 
-    def pair(self, source: str, position: float = 7, zero: int = 0, read: tuple[float, int] | None = None) -> str:
-        """A tensor quantised and dequantised; `read` is the position and the zero point of who reads another."""
-        numbers = self.scale(position, zero)
+    def pair(self, source: str, frac_bits: float = 7, zero: int = 0, read: tuple[float, int] | None = None) -> str:
+        """A tensor quantised and dequantised; `read` is the scale and the zero point of who reads another."""
+        numbers = self.scale(frac_bits, zero)
         read_numbers = numbers if read is None else self.scale(*read)
         return self.node("DequantizeLinear", self.node("QuantizeLinear", source, *numbers), *read_numbers)
 
-    def stored(self, value: np.ndarray, position: float | list[float] = 7) -> str:
+    def stored(self, value: np.ndarray, frac_bits: float | list[float] = 7) -> str:
         """A constant seen as float; one of float32 as it is."""
         name = self.constant(value)
         if value.dtype == np.float32:
             return name
-        return self.node("DequantizeLinear", name, *self.scale(position, 0, value.dtype.type), axis=0)
+        return self.node("DequantizeLinear", name, *self.scale(frac_bits, 0, value.dtype.type), axis=0)
 
     def qdq_conv(
         self,

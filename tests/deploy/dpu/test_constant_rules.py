@@ -83,7 +83,7 @@ def test_the_shipped_files_keep_every_rule(name: str) -> None:
 
 @pytest.mark.parametrize("spread", [0.001, 0.1, 3.0])
 def test_what_quantize_writes_of_random_networks_keeps_every_rule(spread: float) -> None:
-    """In both spellings, biases small and large beside the products."""
+    """In both encodings, biases small and large beside the products."""
     network, generator = ConvBEERS(Variant(blocks=1, features=4)), torch.Generator().manual_seed(7)
     initialise(network, generator)
     with torch.no_grad():

@@ -67,7 +67,7 @@ def test_layers_and_overhead_sum_to_the_batch(tmp_path: Path, configuration: str
     assert prediction.fps * prediction.batch_time_s == pytest.approx(dpu.batch, rel=1e-12)
 
 
-def test_the_three_spellings_cost_the_same(tmp_path: Path) -> None:
+def test_the_three_encodings_cost_the_same(tmp_path: Path) -> None:
     makers = (float_convbeers, integer_convbeers, board_convbeers)
     costs = [predict_file(make(tmp_path / f"{k}.onnx", 2, 32), DPU, 192) for k, make in enumerate(makers)]
     assert len({(c.batch_time_s, c.operations, c.streamed_bytes) for c in costs}) == 1

@@ -33,13 +33,13 @@ def joined(output: float) -> Draw:
     return lambda s, x: s.pair(s.node("Add", x, x), output)
 
 
-def combined(op_type: str, kind: type, position: float = 7) -> Draw:
+def combined(op_type: str, kind: type, frac_bits: float = 7) -> Draw:
     """The tensor added to or multiplied by a constant for each channel."""
-    return lambda s, x: s.pair(s.node(op_type, x, s.stored(np.ones((1, 4, 1, 1), kind), position)))
+    return lambda s, x: s.pair(s.node(op_type, x, s.stored(np.ones((1, 4, 1, 1), kind), frac_bits)))
 
 
-def read(position: float, zero: int = 0) -> Draw:
-    return lambda s, x: s.qdq_conv(s.pair(s.node("Relu", x), 6, read=(position, zero)))
+def read(frac_bits: float, zero: int = 0) -> Draw:
+    return lambda s, x: s.qdq_conv(s.pair(s.node("Relu", x), 6, read=(frac_bits, zero)))
 
 
 def twice(one: float, other: float) -> Draw:
@@ -61,7 +61,7 @@ CASES: dict[str, tuple[Draw, Draw]] = {
     "shift bias": (conv(bias=-3), conv(bias=-2)),
     "shift read": (added(-2, 14, -2), added(-2, 13, -2)),
     "shift write": (added(7, 7, 23), added(7, 7, 22)),
-    "same position": (pooled(6), pooled(7)),
+    "same scale": (pooled(6), pooled(7)),
     "power of two: of an addend": (combined("Add", np.int8, -math.log2(0.01)), combined("Add", np.int8)),
     "shift read: of an addend": (combined("Add", np.int8, 23), combined("Add", np.int8, 22)),
     "int8 constants: weights in float": (conv(weight_kind=np.float32), conv()),
@@ -101,8 +101,8 @@ def test_two_nodes_may_read_the_same_constant_at_two_scales(tmp_path: Path) -> N
 
     def draw(s: QdqSketch, x: str) -> str:
         weight, bias = s.constant(np.ones((4, 4, 3, 3), np.int8)), s.stored(np.zeros(4, np.int8))
-        for position in (7, 5):
-            seen = s.node("DequantizeLinear", weight, *s.scale(position))
+        for frac_bits in (7, 5):
+            seen = s.node("DequantizeLinear", weight, *s.scale(frac_bits))
             x = s.pair(s.node("Conv", x, seen, bias, pads=[1] * 4))
         return x
 

@@ -10,12 +10,12 @@ from deploy.dpu.graph import Kind, Operation, Scale
 DPU = load_dpu()
 
 
-def at(position: int) -> Scale:
-    return Scale((2.0**-position,), (0,), "int8")
+def at(frac_bits: int) -> Scale:
+    return Scale((2.0**-frac_bits,), (0,), "int8")
 
 
-def operation(kind: Kind, **positions: int) -> Operation:
-    scales: Mapping[str, Scale] = {role.replace("_", " "): at(p) for role, p in positions.items()}
+def operation(kind: Kind, **frac_bits: int) -> Operation:
+    scales: Mapping[str, Scale] = {role.replace("_", " "): at(p) for role, p in frac_bits.items()}
     inputs = tuple(role for role in scales if role.startswith("input"))
     return Operation("op", kind, kind, inputs, ("out",), integer=True, scales=scales)
 
@@ -42,7 +42,7 @@ def operation(kind: Kind, **positions: int) -> Operation:
         (number_rules.shift_read, {"input_0": 15, "input_1": 0}, {"input_0": 16, "input_1": 0}),
         (number_rules.shift_write, {"input_0": 7, "output": -8}, {"input_0": 7, "output": -9}),
         (number_rules.shift_write, {"input_0": 7, "output": 22}, {"input_0": 7, "output": 23}),
-        (number_rules.same_position, {"input_0": 5, "output": 5}, {"input_0": 5, "output": 6}),
+        (number_rules.same_scale, {"input_0": 5, "output": 5}, {"input_0": 5, "output": 6}),
     ],
 )
 def test_windows_hold_at_their_ends(rule: Rule, inside: dict[str, int], outside: dict[str, int]) -> None:

@@ -133,7 +133,7 @@ NUMBERS = {
     "shift bias",
     "shift read",
     "shift write",
-    "same position",
+    "same scale",
 }
 
 

@@ -21,7 +21,7 @@ from tests.deploy.dpu.graphs import (
 
 
 def core(path: Path) -> list[tuple[object, ...]]:
-    """What the three spellings have in common."""
+    """What the three encodings have in common."""
     kinds = ("conv", "add", "activation")
     names = {name: k for k, op in enumerate(read_network(path, 96).operations) for name in op.outputs}
 
@@ -32,7 +32,7 @@ def core(path: Path) -> list[tuple[object, ...]]:
     return [plain(op) for op in read_network(path, 96).operations if op.kind in kinds]
 
 
-def test_three_spellings_are_one_network(tmp_path: Path) -> None:
+def test_three_encodings_are_one_network(tmp_path: Path) -> None:
     spelt = [
         core(make(tmp_path / f"{k}.onnx", 2, 24))
         for k, make in enumerate((float_convbeers, integer_convbeers, board_convbeers))
@@ -56,7 +56,7 @@ def test_numbers_of_a_board_file_reach_its_operations(tmp_path: Path) -> None:
     network = read_network(board_convbeers(tmp_path / "b.onnx", 1, 8), 64)
     conv = next(op for op in network.operations if op.kind == "conv")
     assert conv.integer
-    assert {role: scale.position for role, scale in conv.scales.items()} == dict.fromkeys(
+    assert {role: scale.frac_bits for role, scale in conv.scales.items()} == dict.fromkeys(
         ("input 0", "weight", "bias", "output"), 7
     )
 

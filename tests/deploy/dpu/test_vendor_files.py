@@ -79,9 +79,9 @@ def test_onnxruntimes_files_are_refused_for_their_numbers_alone(
 
 @pytest.mark.parametrize("kind", [QuantType.QInt8, QuantType.QUInt8])
 def test_a_vendors_power_of_two_file_passes_whole(tmp_path: Path, kind: QuantType) -> None:
-    """What AMD's quantisers write for the DPU: QDQ, 2^-position, symmetric, int8 bias."""
+    """What AMD's quantisers write for the DPU: QDQ, 2^-n, symmetric, int8 bias."""
     path = quantised(tmp_path / "q.onnx", QuantFormat.QDQ, kind, symmetric=True)
-    onnx.save_model(with_positions(onnx.load_model(path)), path)
+    onnx.save_model(with_scales(onnx.load_model(path)), path)
     placement = place(read_network(path, TILE_PX), DPU)
     assert rules(placement) == set()
     assert placement.dpu_subgraphs == 1
@@ -90,8 +90,8 @@ def test_a_vendors_power_of_two_file_passes_whole(tmp_path: Path, kind: QuantTyp
     ]
 
 
-def with_positions(model: onnx.ModelProto) -> onnx.ModelProto:
-    """Scales rounded to powers of two, uint8 around 128, and int8 biases of position 7."""
+def with_scales(model: onnx.ModelProto) -> onnx.ModelProto:
+    """Scales rounded to powers of two, uint8 around 128, and int8 biases of 7 fractional bits."""
     arrays = {t.name: numpy_helper.to_array(t) for t in model.graph.initializer}
     for node in (n for n in model.graph.node if n.op_type in ("QuantizeLinear", "DequantizeLinear")):
         value, scale, zero = node.input

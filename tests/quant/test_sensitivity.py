@@ -1,4 +1,4 @@
-"""Blame: each layer by itself, against the networks that it stands for."""
+"""Error attribution: each layer by itself, against the networks that it stands for."""
 
 from dataclasses import replace
 
@@ -10,7 +10,7 @@ from quant.calibration import Patches
 from quant.core import IntConv
 from quant.graph import MAX_DN, Add
 from quant.quantise import ALL, Quantised, quantise_model
-from quant.sensitivity import LayerBlame, Loss, blame_layers, spread_of
+from quant.sensitivity import LayerError, Loss, layer_errors, spread_of
 from quant.session import open_session, run
 
 
@@ -20,50 +20,53 @@ def crops(patches: Patches) -> list[np.ndarray]:
 
 
 @pytest.fixture(scope="module")
-def blamed(quantised: Quantised, crops: list[np.ndarray]) -> tuple[list[LayerBlame], Loss]:
-    return blame_layers(quantised.graph, quantised.core, crops, lambda: None)
+def attributed(quantised: Quantised, crops: list[np.ndarray]) -> tuple[list[LayerError], Loss]:
+    return layer_errors(quantised.graph, quantised.core, crops, lambda: None)
 
 
 def test_together_they_lose_what_the_int8_file_loses(
-    float_onnx: onnx.ModelProto, quantised: Quantised, crops: list[np.ndarray], blamed: tuple[list[LayerBlame], Loss]
+    float_onnx: onnx.ModelProto,
+    quantised: Quantised,
+    crops: list[np.ndarray],
+    attributed: tuple[list[LayerError], Loss],
 ) -> None:
     sessions = open_session(float_onnx), open_session(quantised.host)
     differences = [np.subtract(*(np.clip(run(s, crop), 0, 1) for s in sessions)) for crop in crops]
-    assert blamed[1].mae == pytest.approx(float(np.mean(np.abs(differences))), rel=1e-3)
+    assert attributed[1].mae == pytest.approx(float(np.mean(np.abs(differences))), rel=1e-3)
 
 
-def test_squared_errors_of_layers_nearly_add_up(blamed: tuple[list[LayerBlame], Loss]) -> None:
-    layers, together = blamed
+def test_squared_errors_of_layers_nearly_add_up(attributed: tuple[list[LayerError], Loss]) -> None:
+    layers, together = attributed
     assert sum(layer.network.squared for layer in layers) == pytest.approx(together.squared, rel=0.4)
 
 
-def test_adds_of_a_steady_stream_lose_nothing_but_what_saturates(
-    quantised: Quantised, blamed: tuple[list[LayerBlame], Loss]
+def test_adds_of_a_shared_residual_scale_lose_nothing_but_what_saturates(
+    quantised: Quantised, attributed: tuple[list[LayerError], Loss]
 ) -> None:
     adds = {op.name for op in quantised.core.ops if isinstance(op, Add)}
-    layers = {layer.name: layer for layer in blamed[0]}
-    rounded = sum(layer.network.squared for layer in blamed[0] if layer.name not in adds)
+    layers = {layer.name: layer for layer in attributed[0]}
+    rounded = sum(layer.network.squared for layer in attributed[0] if layer.name not in adds)
     assert sum(layers[name].network.squared for name in adds) < 0.1 * rounded
 
 
 def test_a_spoilt_layer_is_found(quantised: Quantised, crops: list[np.ndarray]) -> None:
-    """One layer's weights lose their sign: it, and no other, gets the blame."""
+    """One layer's weights lose their sign: it, and no other, gets the error."""
     ops = list(quantised.core.ops)
     at = next(k for k, op in enumerate(ops) if op.name == "body.1.second")
     spoilt = ops[at]
     assert isinstance(spoilt, IntConv)
     ops[at] = replace(spoilt, weight=-spoilt.weight)
-    layers, _ = blame_layers(quantised.graph, replace(quantised.core, ops=tuple(ops)), crops, lambda: None)
+    layers, _ = layer_errors(quantised.graph, replace(quantised.core, ops=tuple(ops)), crops, lambda: None)
     assert min(layers, key=lambda layer: layer.alone.sqnr_db).name == "body.1.second"
     assert layers[at].alone.sqnr_db < 0
     assert all(layer.alone.sqnr_db > 10 for layer in layers if layer.name != "body.1.second")
 
 
-def test_one_gain_is_blamed_as_two_are(
+def test_one_gain_is_attributed_as_two_are(
     float_onnx: onnx.ModelProto, patches: Patches, crops: list[np.ndarray]
 ) -> None:
     made = quantise_model(float_onnx, patches, {}, lambda: None, replace(ALL, equalise=False, dual_gain=False))
-    layers, _ = blame_layers(made.graph, made.core, crops, lambda: None)
+    layers, _ = layer_errors(made.graph, made.core, crops, lambda: None)
     tail = layers[-1]
     assert tail.alone.sqnr_db == pytest.approx(tail.network.sqnr_db, abs=1)
 

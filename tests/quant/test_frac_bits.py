@@ -5,22 +5,22 @@ from hypothesis import strategies as st
 
 from profiles import load_target
 from profiles.errors import ProfileError
-from quant.core import SHIFTS, best_position, coarsest_position, quantise, target_shifts
+from quant.core import SHIFTS, best_frac_bits, quantise, target_shifts, unclipped_frac_bits
 
 
 @given(st.floats(1e-6, 1e6))
-def test_the_coarsest_position_clips_nothing_and_one_finer_does(max_abs: float) -> None:
-    position = coarsest_position(max_abs)
-    assert max_abs * 2.0**position <= 127 < max_abs * 2.0 ** (position + 1)
+def test_the_coarsest_scale_clips_nothing_and_one_finer_does(max_abs: float) -> None:
+    frac_bits = unclipped_frac_bits(max_abs)
+    assert max_abs * 2.0**frac_bits <= 127 < max_abs * 2.0 ** (frac_bits + 1)
 
 
 @given(st.integers(0, 2**31), st.floats(1e-4, 1e3))
-def test_the_best_position_has_the_least_squared_error(seed: int, scale: float) -> None:
+def test_the_best_scale_has_the_least_squared_error(seed: int, scale: float) -> None:
     values = (np.random.default_rng(seed).standard_normal(400) * scale).astype(np.float32)
-    best = best_position(values)
+    best = best_frac_bits(values)
 
-    def error(position: int) -> float:
-        restored = np.clip(np.rint(values * 2.0**position), -128, 127) / 2.0**position
+    def error(frac_bits: int) -> float:
+        restored = np.clip(np.rint(values * 2.0**frac_bits), -128, 127) / 2.0**frac_bits
         return float(((values - restored) ** 2).sum())
 
     assert error(best) <= min(error(best + k) for k in (-2, -1, 1, 2)) * (1 + 1e-5)
@@ -28,7 +28,7 @@ def test_the_best_position_has_the_least_squared_error(seed: int, scale: float) 
 
 def test_an_outlier_is_clipped_rather_than_coarsening_the_rest() -> None:
     values = np.concatenate([np.linspace(-1, 1, 10_001), [4.0]])
-    assert best_position(values) > coarsest_position(4.0)
+    assert best_frac_bits(values) > unclipped_frac_bits(4.0)
 
 
 @pytest.mark.parametrize(
@@ -38,8 +38,8 @@ def test_constants_round_half_away_from_zero_and_saturate(value: float, expected
     assert quantise(np.array([value]), 0)[0] == expected
 
 
-def test_zeros_have_a_position() -> None:
-    assert best_position(np.zeros(3)) == 0
+def test_zeros_have_a_scale() -> None:
+    assert best_frac_bits(np.zeros(3)) == 0
 
 
 def test_the_windows_are_those_of_the_target() -> None:

@@ -19,7 +19,7 @@ WHITE_SHARE = 0.999
 """The size of error shown white is the one that this share of all pixels stays below."""
 
 
-def blame_page(
+def sensitivity_page(
     headline: str,
     rows: Sequence[Row],
     spread: Spread,

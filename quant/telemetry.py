@@ -4,7 +4,7 @@ import os
 import sys
 
 
-def silence_runtimes() -> None:
+def switch_off_telemetry() -> None:
     """Keep onnxruntime and OpenVINO from reporting their use.
 
     onnxruntime's wheels (1.29 and later) keep an identifier in the home folder and send events from native code.
