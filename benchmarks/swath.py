@@ -33,7 +33,7 @@ from deploy.restoration.run import restore_file
 from deploy.restoration.runtime import open_runtime
 from deploy.restoration.source import Raster
 from model.convbeers import VARIANTS, ConvBEERS, Variant, initialise
-from quant.radius import receptive_radius_px
+from quant.onnx_file import receptive_radius_px
 
 TILE_PX = 640
 ENTRY = "from deploy.cli import app; app()"

@@ -37,9 +37,8 @@ from profiles.figures import Row, measured
 from profiles.sensor import reference_for
 from quant.calibration import HELD_OUT_SEED, draw_patches
 from quant.gate import compare, gate_row
-from quant.onnx_file import save_onnx
+from quant.onnx_file import receptive_radius_px, save_onnx
 from quant.quantise import quantise_model
-from quant.radius import receptive_radius_px
 from quant.session import open_session
 
 BITS = 12

@@ -3,19 +3,18 @@
 Looked at, in this order:
 
 1. Patches that calibration did not see, through both networks: MAE, percentile, PSNRs (`quant.gate`), and the results
-   inside the INT8 network that saturate (`quant.saturation`).
+   inside the INT8 network that saturate (`quant.structure`).
 2. The MAE that an earlier gate found on the same patches, where a baseline is given.
 3. The INT8 file: the DPU's rules, its ReLUs, its encoding, the same bits with onnxruntime's optimisations as without.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree as ET
 
-import numpy as np
 import onnx
 
 from deploy.dpu.board import load_dpu
@@ -32,12 +31,10 @@ from profiles.figures import Row
 from profiles.toml import read_json, unreadable
 from quant.calibration import unseen_patches
 from quant.checks import Check
-from quant.encodings import encoding_faults
-from quant.gate import GateResult, Limits, _figure, compare, gate_row, judge, judge_saturation, saturation_figure
+from quant.gate import GateResult, Limits, compare, judge, judge_saturation, verdict_row
 from quant.onnx_file import fixed_tile_px, load_onnx, require_quantised
-from quant.relus import count_relus
-from quant.saturation import saturated_shares
-from quant.session import open_any_size, run
+from quant.session import open_any_size
+from quant.structure import saturated_shares, structure_checks
 
 TILE_PX = 640
 
@@ -88,10 +85,7 @@ class Outcome:
     @property
     def row(self) -> Row:
         """The figures of the comparison, what it costs against the reference, and the worst layer's saturation."""
-        row, patches = gate_row(self.result), self.result.patches
-        drop = _figure(self.result.drop_db, "dB", patches)
-        worst = saturation_figure(self.shares, patches)
-        return replace(row, figures={**row.figures, "PSNR drop": drop, "saturated results": worst})
+        return verdict_row(self.result, self.shares)
 
     def document(self, request: Request, config: Path | None) -> Document:
         """What `gate --json` writes; `config` is the file from which the limits came."""
@@ -114,7 +108,7 @@ def run_gate(request: Request) -> Outcome:
     unseen = unseen_patches(load_sensor(request.sensor), request.images, request.patches, request.seed)
     result, shares = compare(*sessions, unseen.pairs), saturated_shares(int8, unseen.degraded)
     checks = judge(result, request.limits, before) + judge_saturation(shares, request.limits)
-    checks += structure_checks(floating, request.int8_path, int8, request.target)
+    checks += file_checks(floating, request.int8_path, int8, request.target)
     return Outcome(result, shares, tuple(checks))
 
 
@@ -167,19 +161,9 @@ def _plain(name: str, value: object) -> str:
     return Path(str(value)).name if name == "images" else str(value)
 
 
-def structure_checks(
-    float_model: onnx.ModelProto, int8_path: Path, int8: onnx.ModelProto, target: str
-) -> list[Check]:
-    """Does the INT8 file keep rules and ReLUs, is it encoded as meant, and the same with and without optimisation?"""
-    image = np.random.default_rng(0).random((1, 1, 97, 101), dtype=np.float32)
-    plain, optimised = (run(open_any_size(int8, optimise=o), image) for o in (False, True))
-    difference = float(np.abs(plain - optimised).max())
-    return [
-        *_legality(int8_path, int8, target),
-        _relus(float_model, int8),
-        *_encoding(int8),
-        Check("optimised against unoptimised", difference, 0, "of full scale"),
-    ]
+def file_checks(float_model: onnx.ModelProto, int8_path: Path, int8: onnx.ModelProto, target: str) -> list[Check]:
+    """What the INT8 file itself shows: the target's rules, then what `quant.structure` looks at."""
+    return [*_legality(int8_path, int8, target), *structure_checks(float_model, int8)]
 
 
 def _legality(path: Path, model: onnx.ModelProto, target: str) -> list[Check]:
@@ -187,19 +171,6 @@ def _legality(path: Path, model: onnx.ModelProto, target: str) -> list[Check]:
     if not load_target(target).configurations:
         return []
     return [legality(place(read_network(path, fixed_tile_px(model) or TILE_PX), load_dpu(target, None)))]
-
-
-def _relus(float_model: onnx.ModelProto, int8: onnx.ModelProto) -> Check:
-    wanted, kept = count_relus(float_model).explicit, count_relus(int8)
-    return Check("ReLUs lost or added", kept.off_by(wanted), 0, "ReLU", detail=f"{wanted} in float, {kept} in INT8")
-
-
-def _encoding(model: onnx.ModelProto) -> list[Check]:
-    """Of files that `quantize` wrote under the rules of a DPU: does each part say what the whole numbers ask for?"""
-    faults = encoding_faults(model)
-    if faults is None:
-        return []
-    return [Check("faults of the encoding", len(faults), 0, "fault", detail=faults[0] if faults else "")]
 
 
 def sentence(checks: Sequence[Check], passed: str) -> str:

@@ -22,8 +22,7 @@ from model.shipped import SHIPPED, shipped_names, shipped_weights
 from model.traditional.peers import PEERS
 from profiles.errors import OptionError
 from profiles.sensor import Sensor
-from quant.onnx_file import load_onnx, metadata
-from quant.radius import receptive_radius_px
+from quant.onnx_file import load_onnx, metadata, receptive_radius_px
 from quant.session import open_session
 
 EXPECTED = (

@@ -176,6 +176,13 @@ def gate_row(result: GateResult) -> Row:
     return Row("gate", "INT8 against float", figures)
 
 
+def verdict_row(result: GateResult, shares: Mapping[str, float]) -> Row:
+    """The figures of a gate: those of `gate_row`, the PSNR lost against the reference, the worst layer's saturation."""
+    row, drop = gate_row(result), _figure(result.drop_db, "dB", result.patches)
+    worst = saturation_figure(shares, result.patches)
+    return replace(row, figures={**row.figures, "PSNR drop": drop, "saturated results": worst})
+
+
 def _figure(value: float, unit: str, patches: int) -> Figure:
     if math.isinf(value):
         return unavailable(unit, "infinite: the two images are identical")

@@ -184,8 +184,7 @@ def _single(tiles: list[int]) -> int:
 def _swath(path: Path, shape: tuple[int, ...] | None, request: _Request) -> "Swath":
     from deploy.bench.tables import Swath
     from deploy.restoration.arrays import parse_halo
-    from quant.onnx_file import load_onnx
-    from quant.radius import receptive_radius_px
+    from quant.onnx_file import load_onnx, receptive_radius_px
 
     halo, tile = request.halo, request.tiles_px[0]
     width_px, height_px = (shape[1], shape[0]) if shape else parse_size(request.size or PAPER_SIZE)

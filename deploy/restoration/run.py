@@ -20,8 +20,7 @@ from model.io.images import settled_scale
 from model.processor import require_cores
 from model.progress import held_back
 from profiles.figures import Figure, Row, measured, predicted, unavailable
-from quant.onnx_file import fixed_tile_px, load_onnx
-from quant.radius import receptive_radius_px
+from quant.onnx_file import fixed_tile_px, load_onnx, receptive_radius_px
 
 ARITHMETIC = "arithmetic on the plan of tiles"
 

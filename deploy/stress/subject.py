@@ -24,8 +24,7 @@ from profiles.errors import BeersError
 from quant.core import IntCore
 from quant.encodings import read_core
 from quant.graph import CORRECTION, IMAGE, Add, Graph, correction_graph
-from quant.onnx_file import any_size, load_onnx, require_quantised
-from quant.radius import receptive_radius_px
+from quant.onnx_file import any_size, load_onnx, receptive_radius_px, require_quantised
 from quant.session import open_session, run
 
 T = TypeVar("T")

@@ -29,8 +29,7 @@ from model.traditional.peers import PEERS
 from model.traditional.settings import QUALITIES
 from profiles.errors import ModelError
 from profiles.sensor import SensorProfile, load_sensor, reference_for
-from quant.onnx_file import load_onnx
-from quant.radius import receptive_radius_px
+from quant.onnx_file import load_onnx, receptive_radius_px
 
 
 def select_points(shelf: Shelf, swath: Swath) -> list[Point]:

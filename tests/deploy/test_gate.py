@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 
 from deploy.cli import app
 from deploy.export import float_model
-from deploy.gate import baseline_mae, junit, markdown, sentence, structure_checks
+from deploy.gate import baseline_mae, file_checks, junit, markdown, sentence
 from deploy.results import Document
 from model.shipped import SHIPPED, default_int8, shipped_pair
 from model.simulator.procedural import procedural_scene
@@ -27,9 +27,8 @@ from quant.encodings import read_core
 from quant.free import quantise_free
 from quant.gate import Limits, compare, judge, judge_saturation, read_limits
 from quant.onnx_file import image_info, save_onnx
-from quant.relus import Relus, count_relus
-from quant.saturation import rounded_tensors, saturated_shares
 from quant.session import open_session
+from quant.structure import Relus, count_relus, rounded_tensors, saturated_shares
 
 SENSORS = load_sensor("pleiades-degraded"), load_sensor("pleiades-reference")
 
@@ -54,7 +53,7 @@ def failed(
     result = compare(open_session(reference_model), open_session(model), unseen.pairs)
     limits = Limits(std_over_mae=2.5, saturated=0.001)
     checks = judge(result, limits) + judge_saturation(saturated_shares(model, unseen.degraded), limits)
-    checks += structure_checks(reference_model, folder / "spoilt.onnx", model, "vck190")
+    checks += file_checks(reference_model, folder / "spoilt.onnx", model, "vck190")
     return {check.name for check in checks if not check.passed}
 
 
@@ -406,12 +405,12 @@ def test_a_free_file_is_judged_without_the_rules_of_a_dpu(
 ) -> None:
     path = tmp_path / "free.onnx"
     save_onnx(quantise_free(reference_model, unseen, {}, lambda: None), path)
-    checks = structure_checks(reference_model, path, onnx.load(path), "host-cpu")
+    checks = file_checks(reference_model, path, onnx.load(path), "host-cpu")
     assert [(c.name, c.passed) for c in checks] == [
         ("ReLUs lost or added", True),
         ("optimised against unoptimised", True),
     ]
-    (rules,) = {c.name for c in structure_checks(reference_model, path, onnx.load(path), "vck190") if not c.passed}
+    (rules,) = {c.name for c in file_checks(reference_model, path, onnx.load(path), "vck190") if not c.passed}
     assert rules == "nodes the DPU refuses"
 
 

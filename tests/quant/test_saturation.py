@@ -12,7 +12,7 @@ from quant.encodings import read_core
 from quant.graph import CORRECTION, split
 from quant.integer import run_core
 from quant.onnx_file import image_info, load_onnx, make_model
-from quant.saturation import rounded_tensors, saturated_shares
+from quant.structure import rounded_tensors, saturated_shares
 
 IMAGE = np.random.default_rng(3).random((2, 1, 37, 43), dtype=np.float32)
 Lost = Callable[[np.ndarray], np.ndarray]

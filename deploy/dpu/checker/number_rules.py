@@ -57,13 +57,13 @@ def one_format(op: Operation, dpu: Dpu) -> Finding | None:
 
 
 def shift_cut(op: Operation, dpu: Dpu) -> Finding | None:
-    """A convolution's weight + input - output fractional bits: {numbers[shift_cut]} (Vitis-AI 3.0, vai_q_pytorch)."""
+    """Weight + input - output fractional bits: {numbers[shift_cut]} (Vitis-AI 3.0, vai_q_pytorch)."""
     cut, limit = _cut(op), dpu.limit("numbers", "shift_cut")
     return None if cut is None or not outside((cut,), limit) else Finding(f"shift_cut {cut}, allowed {limit}", MOVE)
 
 
 def shift_bias(op: Operation, dpu: Dpu) -> Finding | None:
-    """A convolution's weight + input - bias fractional bits: at most {numbers[shift_bias_max]} (Vitis-AI 3.0, vai_q_pytorch).
+    """Weight + input - bias fractional bits: at most {numbers[shift_bias_max]} (Vitis-AI 3.0, vai_q_pytorch).
 
     And at least min(0, shift_cut + 8 - {numbers[accumulator_bits]}).
     """

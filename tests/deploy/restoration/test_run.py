@@ -23,8 +23,7 @@ from model.convbeers import ConvBEERS, Variant, initialise
 from model.shipped import default_int8
 from profiles.errors import BeersError, ImageError, MachineError, ModelError, OptionError
 from profiles.figures import Row
-from quant.onnx_file import load_onnx, save_onnx
-from quant.radius import receptive_radius_px
+from quant.onnx_file import load_onnx, receptive_radius_px, save_onnx
 from quant.session import open_session, run
 
 RADIUS_PX = 5

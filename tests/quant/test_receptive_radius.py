@@ -9,8 +9,7 @@ import pytest
 from onnx import TensorProto, helper, numpy_helper
 
 from profiles.errors import ModelError
-from quant.onnx_file import image_info, make_model
-from quant.radius import receptive_radius_px
+from quant.onnx_file import image_info, make_model, receptive_radius_px
 
 
 def constant(name: str, *shape: int) -> onnx.TensorProto:

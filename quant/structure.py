@@ -1,0 +1,179 @@
+"""What an INT8 file itself shows: results that come to the ends of 8 bits, lost ReLUs, faults of its encoding.
+
+Saturation: whatever a node rounds to 8 bits is looked at, in any encoding (integer kernels or QDQ), as the graph is
+written; what lies beyond the ends is clipped, and lost. Two ends are no loss: the lower one where it stands for zero
+or where a ReLU reads it, for that is the ReLU, and those of the fine gain, which the coarse one is there for
+(`quant.passes.stream`). ReLUs are counted because quantisers have been seen to drop them without a word.
+"""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+import onnx
+
+from quant.checks import Check
+from quant.encodings import encoding_faults
+from quant.graph import CORRECTION
+from quant.onnx_file import any_size, constants, with_outputs
+from quant.session import open_any_size, open_session, run, tensors_of
+from quant.untrusted import contradictions
+
+ZERO_POINTS = {"QuantizeLinear": 2, "QLinearConv": 7, "QLinearAdd": 7, "QLinearMatMul": 7}
+"""ONNX's and onnxruntime's operators that round to 8 bits, of those that may run (`quant.untrusted`), and which input
+holds the zero point of their result."""
+
+RELUS = ("Relu", "Max")
+
+
+@dataclass(frozen=True)
+class Rounded:
+    """A tensor of 8 bits.
+
+    Attributes:
+        name: in the graph.
+        zero_point: its value for 0, which says its type too.
+        low_is_relu: whether what is clipped at the lower end would have become zero anyway.
+    """
+
+    name: str
+    zero_point: np.ndarray
+    low_is_relu: bool
+
+    @property
+    def lowest(self) -> int:
+        """The smallest number that its 8 bits hold."""
+        return int(np.iinfo(self.zero_point.dtype).min)
+
+    def at_ends(self, values: np.ndarray) -> np.ndarray:
+        """Which of its values (N, C, H, W) lie at an end."""
+        kept = values[:, 1:] if self.name == CORRECTION and values.shape[1:2] == (2,) else values
+        low = (kept == self.lowest) & (not self.low_is_relu and bool(self.zero_point.min() > self.lowest))
+        return np.asarray((kept == self.lowest + 255) | low)
+
+
+def saturated_shares(model: onnx.ModelProto, images: Iterable[np.ndarray]) -> dict[str, float]:
+    """The share, in [0, 1], of each 8-bit tensor's values that lie at an end, over images (N, 1, H, W) in [0, 1].
+
+    Empty where no node rounds to 8 bits.
+
+    Raises:
+        ModelError: onnxruntime refuses the model, or cannot run it.
+    """
+    looked_at = rounded_tensors(model)
+    if not looked_at:
+        return {}
+    kinds = {t.name: onnx.helper.np_dtype_to_tensor_dtype(t.zero_point.dtype) for t in looked_at}
+    session = open_session(with_outputs(any_size(model), kinds), optimise=False)
+    ends, counts = np.zeros(len(looked_at)), np.zeros(len(looked_at))
+    for image in images:
+        results = tensors_of(session, [tensor.name for tensor in looked_at], image)
+        flags = [tensor.at_ends(values) for tensor, values in zip(looked_at, results, strict=True)]
+        ends += [flag.sum() for flag in flags]
+        counts += [flag.size for flag in flags]
+    shares = ends / np.maximum(counts, 1)
+    return {tensor.name: float(share) for tensor, share in zip(looked_at, shares, strict=True)}
+
+
+def rounded_tensors(model: onnx.ModelProto) -> list[Rounded]:
+    """What the graph's nodes round to 8 bits, in the graph's order.
+
+    Raises:
+        ModelError: nodes that contradict it.
+    """
+    with contradictions("INT8 model"):
+        return [tensor for tensor in _rounded(model) if tensor.zero_point.dtype in (np.int8, np.uint8)]
+
+
+def _rounded(model: onnx.ModelProto) -> list[Rounded]:
+    known = constants(model)
+    read_as = {node.output[0]: node.input[0] for node in model.graph.node if node.op_type == "DequantizeLinear"}
+    relus = {name for node in model.graph.node if node.op_type in RELUS for name in node.input}
+    relus |= {read_as[name] for name in relus & set(read_as)}
+    found = []
+    for node in model.graph.node:
+        place = ZERO_POINTS.get(node.op_type)
+        if place is not None and node.input[0] not in known:
+            stored = known.get(node.input[place]) if len(node.input) > place else None
+            zero_point = _default_zero_point(node) if stored is None else stored
+            found.append(Rounded(node.output[0], zero_point, node.output[0] in relus))
+    return found
+
+
+def _default_zero_point(node: onnx.NodeProto) -> np.ndarray:
+    """Of a node that names none: 0, of the type that it asks for, or uint8."""
+    kinds = [a.i for a in node.attribute if a.name == "output_dtype" and a.i]
+    kind = onnx.helper.tensor_dtype_to_np_dtype(kinds[0]) if kinds else np.uint8
+    return np.zeros((), kind)
+
+
+@dataclass(frozen=True)
+class Relus:
+    """How many a file has.
+
+    Attributes:
+        spelt: nodes that are one: Relu, or the larger of a value and zero.
+        folded: convolutions whose 8 bits begin at zero, which is a ReLU, unless their results were never below zero.
+    """
+
+    explicit: int
+    folded: int
+
+    def off_by(self, wanted: int) -> int:
+        """How many of `wanted` ReLUs are surely lost, or how many surely added."""
+        return max(wanted - self.explicit - self.folded, self.explicit - wanted, 0)
+
+    def __str__(self) -> str:
+        return f"{self.explicit}, and up to {self.folded} as 8 bits from zero" if self.folded else str(self.explicit)
+
+
+def count_relus(model: onnx.ModelProto) -> Relus:
+    """The ReLUs of a file.
+
+    Raises:
+        ModelError: nodes that contradict it.
+    """
+    with contradictions("model"):
+        known, rounded = constants(model), {tensor.name: tensor for tensor in rounded_tensors(model)}
+        convolved = {name for node in model.graph.node if "Conv" in node.op_type for name in node.output}
+        explicit = [n.op_type == "Relu" or _cuts_at_zero(n, known, rounded) for n in model.graph.node]
+        return Relus(sum(explicit), sum(_begins_at_zero(node, rounded, convolved) for node in model.graph.node))
+
+
+def _cuts_at_zero(node: onnx.NodeProto, known: dict[str, np.ndarray], rounded: dict[str, Rounded]) -> bool:
+    """Whether it is a Max with zero, which in 8 bits is the zero point of what it is compared with."""
+    floors = [known[name] for name in node.input if name in known]
+    if node.op_type != "Max" or not floors:
+        return False
+    zeros = [rounded[name].zero_point for name in node.input if name in rounded] or [np.zeros(())]
+    return bool((floors[0] == zeros[0]).all())
+
+
+def _begins_at_zero(node: onnx.NodeProto, rounded: dict[str, Rounded], convolved: set[str]) -> bool:
+    """Whether a convolution's result is rounded to numbers of which none is below zero."""
+    value = rounded.get(node.output[0]) if node.output else None
+    if value is None or not (node.op_type == "QLinearConv" or node.input[0] in convolved):
+        return False
+    return bool((value.zero_point == value.lowest).all())
+
+
+def structure_checks(float_model: onnx.ModelProto, int8: onnx.ModelProto) -> list[Check]:
+    """Does the INT8 file keep its ReLUs, is it encoded as meant, and the same with onnxruntime's optimisations?"""
+    image = np.random.default_rng(0).random((1, 1, 97, 101), dtype=np.float32)
+    plain, optimised = (run(open_any_size(int8, optimise=o), image) for o in (False, True))
+    difference = float(np.abs(plain - optimised).max())
+    optimisation = Check("optimised against unoptimised", difference, 0, "of full scale")
+    return [_relus(float_model, int8), *_encoding(int8), optimisation]
+
+
+def _relus(float_model: onnx.ModelProto, int8: onnx.ModelProto) -> Check:
+    wanted, kept = count_relus(float_model).explicit, count_relus(int8)
+    return Check("ReLUs lost or added", kept.off_by(wanted), 0, "ReLU", detail=f"{wanted} in float, {kept} in INT8")
+
+
+def _encoding(model: onnx.ModelProto) -> list[Check]:
+    """Of files that `quantize` wrote under the rules of a DPU: does each part say what the whole numbers ask for?"""
+    faults = encoding_faults(model)
+    if faults is None:
+        return []
+    return [Check("faults of the encoding", len(faults), 0, "fault", detail=faults[0] if faults else "")]
