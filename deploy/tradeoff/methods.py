@@ -21,7 +21,7 @@ from deploy.restoration.runtime import open_openvino, open_runtime
 from deploy.tradeoff.cache import Cache, code_digest, digest_of
 from deploy.tradeoff.points import LEGAL, Unit
 from model.convbeers import VARIANTS
-from model.evaluation.methods import KNOWS, Restore
+from model.evaluation.methods import KNOWN, Restore
 from model.io.files import sha256
 from model.io.images import list_images
 from model.shipped import SHIPPED, shipped_names, shipped_weights
@@ -227,7 +227,7 @@ class Shelf:
     def told(self, unit: Unit) -> str:
         """What a unit knows of the sensor."""
         if unit.kind != "network":
-            return KNOWS
+            return KNOWN
         return knowledge_of(self.model(unit.method), self.degraded.name)
 
     def model(self, method: str) -> onnx.ModelProto:

@@ -126,7 +126,7 @@ def test_an_unknown_method_is_refused(name: str) -> None:
 def test_what_a_network_was_made_for_is_no_secret() -> None:
     """By the sensor that its file names; a name that is not asked about says nothing."""
     told = {
-        (name, sensor): method_named(name, *SENSORS, sensor).told
+        (name, sensor): method_named(name, *SENSORS, sensor).sensor_known
         for name in ("convbeers-s-nominal", "convbeers-s-nominal-int8", "convbeers-xs", "traditional", "degraded")
         for sensor in ("pleiades-degraded", "dior-high", "")
     }
