@@ -28,10 +28,9 @@ import torch
 from deploy.commands.bench import parse_size
 from deploy.export import to_onnx
 from deploy.restoration.options import Options, Runtime
-from deploy.restoration.plan import Tile, make_plan
+from deploy.restoration.plan import make_plan
 from deploy.restoration.run import restore_file
 from deploy.restoration.runtime import open_runtime
-from deploy.restoration.source import Raster
 from model.convbeers import VARIANTS, ConvBEERS, Variant, initialise
 from quant.onnx_file import receptive_radius_px
 
@@ -74,10 +73,9 @@ def speed(folder: Path, options: Options, size: tuple[int, int], repeats: int) -
     dn = write_noise(image, size)
     network = onnx.load(options.model)
     radius_px = receptive_radius_px(network)
-    height_px, width_px = dn.shape
-    plan = make_plan(Raster(1, height_px, width_px, dn.dtype), TILE_PX, radius_px, radius_px)
-    tiles = [Tile(row, column) for row in plan.rows for column in plan.columns]
-    windows = [np.ascontiguousarray(tile.read(dn), np.float32)[None, None] / np.float32(4095) for tile in tiles]
+    plan = make_plan((1, *dn.shape), TILE_PX, radius_px, radius_px)
+    seen = [dn[r.start : r.stop, c.start : c.stop] for r in plan.rows for c in plan.columns]
+    windows = [np.ascontiguousarray(pixels, np.float32)[None, None] / np.float32(4095) for pixels in seen]
     infer, version = open_runtime(options.runtime, network, options.threads)
 
     def bare() -> None:
@@ -89,7 +87,7 @@ def speed(folder: Path, options: Options, size: tuple[int, int], repeats: int) -
 
     (bare_s, bare_cpu_s), (engine_s, engine_cpu_s) = fastest([bare, engine], repeats)
     print(
-        f"{options.model.stem:18} {version:20} {len(tiles)} tiles: bare {bare_s:.2f} s, engine {engine_s:.2f} s "
+        f"{options.model.stem:18} {version:20} {plan.tiles} tiles: bare {bare_s:.2f} s, engine {engine_s:.2f} s "
         f"({dn.size / engine_s / 1e6:.3f} Mpx/s); engine over bare {bare_s / engine_s:.3f} by the clock, "
         f"{bare_cpu_s / engine_cpu_s:.3f} by the processor",
         flush=True,

@@ -17,9 +17,10 @@ from deploy.dpu.board import Dpu, load_dpu
 from deploy.dpu.checker.placement import place
 from deploy.dpu.reading import read_network
 from deploy.export import float_model, require_parity
+from deploy.methods import network_method
 from deploy.report.demo_page import INT8, SWATH_PX, TRADITIONAL, comparison, demo_report
 from deploy.report.page import Report
-from deploy.restoration.arrays import TILE_PX, restore_image
+from deploy.restoration.options import TILE_PX
 from model.evaluation.methods import Restore
 from model.evaluation.scores import fidelity_row
 from model.io.images import read_acquisition, read_pixels
@@ -172,11 +173,10 @@ def _in_table(row: Row, table: str) -> Row:
 
 
 def _methods(int8: onnx.ModelProto, eyes: Sensors) -> dict[str, Restore]:
-    session, halo_px = open_session(int8), receptive_radius_px(int8)
     plain = eyes.degraded.nominal(), eyes.reference.nominal()
     return {
         TRADITIONAL: lambda dn: restore_traditional(torch.from_numpy(dn), Chain(*plain)).numpy(),
-        INT8: lambda dn: restore_image(dn, session, TILE_PX, halo_px).astype(np.float32),
+        INT8: network_method(int8, eyes.degraded.nominal().max_dn),
     }
 
 

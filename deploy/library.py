@@ -13,7 +13,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from deploy.restoration.arrays import Infer
-from deploy.restoration.engine import NAME, Restorer, restore_rows
+from deploy.restoration.engine import NAME, Restorer, restore_array
 from deploy.restoration.options import TILE_PX, Options, Runtime
 from deploy.restoration.plan import Plan, Span
 from deploy.restoration.run import plan_of, scale_of
@@ -95,10 +95,7 @@ def _restore_now(bands: np.ndarray, raster: Raster, options: Options) -> np.ndar
     infer, _ = open_runtime(options.runtime, network, options.threads, at_once)
     full_scale = scale_of(source, plan, options.full_scale, NAME)
     restorer = Restorer(raster, infer, full_scale, plan.radius_px, NAME)
-    result = np.empty(raster.shape, raster.out_dtype)
-    for row, pixels, _ in restore_rows(source, plan, restorer, plan.rows, lambda: None, at_once):
-        result[:, row.keep_start : row.keep_stop] = pixels
-    return result
+    return restore_array(source, plan, restorer, at_once)
 
 
 def _bands_first(image: Any) -> Any:

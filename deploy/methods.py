@@ -1,14 +1,15 @@
 """The methods that can be compared, by name."""
 
-from functools import partial
 from pathlib import Path
 
 import numpy as np
 import onnx
-import onnxruntime as ort
 
 from deploy.export import float_model
-from deploy.restoration.arrays import TILE_PX, restore_image
+from deploy.restoration.engine import restore_dn
+from deploy.restoration.options import TILE_PX, Runtime
+from deploy.restoration.plan import make_plan
+from deploy.restoration.runtime import open_runtime
 from model.evaluation.methods import (
     BLIND,
     DECONVOLVE_FIRST,
@@ -22,8 +23,7 @@ from model.shipped import SHIPPED, shipped_names, shipped_weights
 from model.traditional.peers import PEERS
 from profiles.errors import OptionError
 from profiles.sensor import Sensor
-from quant.onnx_file import load_onnx, metadata, receptive_radius_px
-from quant.session import open_session
+from quant.onnx_file import fixed_tile_px, load_onnx, metadata, receptive_radius_px
 
 EXPECTED = (
     f"degraded, {TRADITIONAL}, {DECONVOLVE_FIRST} (each also with -fast or -best), {', '.join(PEERS)}, "
@@ -49,7 +49,7 @@ def method_named(name: str, degraded: Sensor, reference: Sensor, sensor_name: st
     if plain is not None:
         return plain
     model = _network(name)
-    return Method(name, _restoring(model, degraded.max_dn), knowledge_of(model, sensor_name))
+    return Method(name, network_method(model, degraded.max_dn), knowledge_of(model, sensor_name))
 
 
 def knowledge_of(model: onnx.ModelProto, sensor_name: str) -> str:
@@ -68,10 +68,13 @@ def _network(name: str) -> onnx.ModelProto:
     raise OptionError("--methods", expected=EXPECTED, got=repr(name), remedy="correct that name")
 
 
-def _restoring(model: onnx.ModelProto, max_dn: int) -> Restore:
-    session, halo_px = open_session(model), receptive_radius_px(model)
-    return partial(_run_network, session=session, halo_px=halo_px, max_dn=max_dn)
+def network_method(model: onnx.ModelProto, max_dn: int) -> Restore:
+    """A network as a method: digital numbers of 0 to `max_dn` become whole ones, as `restore` writes them."""
+    infer, _ = open_runtime(Runtime.onnxruntime, model, threads=0)
+    radius_px, fixed_px = receptive_radius_px(model), fixed_tile_px(model)
 
+    def restore(dn: np.ndarray) -> np.ndarray:
+        plan = make_plan((1, *dn.shape), fixed_px or TILE_PX, radius_px, radius_px, fixed_px is not None)
+        return restore_dn(dn, infer, plan, max_dn)
 
-def _run_network(dn: np.ndarray, session: ort.InferenceSession, halo_px: int, max_dn: int) -> np.ndarray:
-    return restore_image(dn, session, TILE_PX, halo_px, max_dn=max_dn).astype(np.float32)
+    return restore

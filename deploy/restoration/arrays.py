@@ -1,62 +1,18 @@
-"""Restore an image in memory tile by tile; `deploy.restoration.run` does it for files of any size."""
+"""One window through a network, and the sizes that a network takes."""
 
-from collections.abc import Callable, Iterable
-from functools import partial
+from collections.abc import Callable
 
 import numpy as np
 import onnx
-import onnxruntime as ort
 
-from deploy.restoration.plan import Tile, plan_tiles
 from model.io.images import MAX_DN
 from profiles.errors import ImageError, OptionError
 from quant.onnx_file import fixed_tile_px
-from quant.session import run
 
 TILE_PX = 640
 
 Infer = Callable[[np.ndarray], np.ndarray]
 """A network ready to run: (1, 1, h, w) float32 in [0, 1] to the same shape."""
-
-
-def restore_image(
-    dn: np.ndarray,
-    session: ort.InferenceSession,
-    tile_px: int,
-    halo_px: int,
-    tick: Callable[[], None] = lambda: None,
-    max_dn: int = MAX_DN,
-) -> np.ndarray:
-    """Restore (H, W) digital numbers to (H, W) uint16 in 0..max_dn, in memory; `tick` is called once a tile."""
-    return restore_with(partial(run, session), dn, tile_px, halo_px, tick, max_dn)
-
-
-def restore_with(
-    infer: Infer,
-    dn: np.ndarray,
-    tile_px: int,
-    halo_px: int,
-    tick: Callable[[], None] = lambda: None,
-    max_dn: int = MAX_DN,
-) -> np.ndarray:
-    """As `restore_image`, with any network ready to run."""
-    height, width = dn.shape
-    return restore_tiles(dn, infer, plan_tiles(height, width, tile_px, halo_px), tick, max_dn)
-
-
-def restore_tiles(
-    dn: np.ndarray,
-    infer: Infer,
-    tiles: Iterable[Tile],
-    tick: Callable[[], None] = lambda: None,
-    max_dn: int = MAX_DN,
-) -> np.ndarray:
-    """As `restore_with`, with any tiles that cover the image."""
-    result = np.empty(dn.shape, np.uint16)
-    for tile in tiles:
-        tile.write(np.rint(restore_window(tile.read(dn), infer, max_dn)), result)
-        tick()
-    return result
 
 
 def restore_window(dn: np.ndarray, infer: Infer, full_scale: float = MAX_DN) -> np.ndarray:

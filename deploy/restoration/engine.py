@@ -16,8 +16,8 @@ import numpy as np
 from deploy.restoration.arrays import Infer, restore_window
 from deploy.restoration.output import Spool
 from deploy.restoration.plan import Plan, Span, check_memory, is_bulky, rows_bytes
-from deploy.restoration.source import Raster, Source, fill_missing
-from model.io.images import remedy_outside
+from deploy.restoration.source import ArraySource, Raster, Source, fill_missing
+from model.io.images import MAX_DN, remedy_outside
 from model.progress import held_back, steps
 from profiles.errors import BeersError, ImageError, MachineError
 
@@ -206,6 +206,42 @@ def joined(row: Span, tiles: Iterable[Kept], plan: Plan, restorer: Restorer, tic
 
 def _places(plan: Plan) -> list[tuple[int, Span]]:
     return [(plane, column) for plane in range(plan.bands) for column in plan.columns]
+
+
+def restore_array(source: Source, plan: Plan, restorer: Restorer, at_once: int = 1) -> np.ndarray:
+    """All rows of an image, (bands, height, width) of `raster.out_dtype`, `at_once` tiles at a time.
+
+    Raises:
+        ImageError: values outside 0 to full scale, or a network that gives NaN.
+    """
+    result = np.empty(restorer.raster.shape, restorer.raster.out_dtype)
+    for row, pixels, _ in restore_rows(source, plan, restorer, plan.rows, lambda: None, at_once):
+        result[:, row.keep_start : row.keep_stop] = pixels
+    return result
+
+
+def restore_dn(dn: np.ndarray, infer: Infer, plan: Plan, max_dn: float = MAX_DN) -> np.ndarray:
+    """Restore (H, W) digital numbers of 0 to `max_dn` to whole ones, float32: what `restore` writes of integers.
+
+    Raises:
+        ImageError: values outside 0 to `max_dn`, or a network that gives NaN.
+    """
+    return np.asarray(np.rint(restore_floats(dn, infer, plan, max_dn)))
+
+
+def restore_floats(dn: np.ndarray, infer: Infer, plan: Plan, max_dn: float = MAX_DN) -> np.ndarray:
+    """Restore (H, W) digital numbers of 0 to `max_dn` to float32, not rounded: what `restore` writes of floats.
+
+    NaN is a missing pixel, and stays.
+
+    Raises:
+        ImageError: values outside 0 to `max_dn`, or a network that gives NaN.
+    """
+    pixels = np.asarray(dn, np.float32)[None]
+    _, height_px, width_px = pixels.shape
+    raster = Raster(1, height_px, width_px, pixels.dtype)
+    restorer = Restorer(raster, infer, float(max_dn), plan.radius_px)
+    return np.asarray(restore_array(ArraySource(pixels, raster), plan, restorer)[0])
 
 
 def write_behind(restored: Iterable[Restored], sink: Sink) -> None:

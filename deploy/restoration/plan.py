@@ -7,10 +7,9 @@ at before it begins.
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-import numpy as np
 import psutil
 
-from deploy.restoration.source import Raster, Source
+from deploy.restoration.source import Source
 from profiles.errors import MachineError, OptionError, sizes
 
 
@@ -22,37 +21,6 @@ class Span:
     stop: int
     keep_start: int
     keep_stop: int
-
-
-@dataclass(frozen=True)
-class Tile:
-    """A window of the image and the part that is kept."""
-
-    rows: Span
-    columns: Span
-
-    def read(self, image: np.ndarray) -> np.ndarray:
-        """The window of an (H, W) image."""
-        return image[self.rows.start : self.rows.stop, self.columns.start : self.columns.stop]
-
-    def write(self, result: np.ndarray, image: np.ndarray) -> None:
-        """Put the kept part of a tile's result into an (H, W) image."""
-        rows = slice(self.rows.keep_start - self.rows.start, self.rows.keep_stop - self.rows.start)
-        columns = slice(self.columns.keep_start - self.columns.start, self.columns.keep_stop - self.columns.start)
-        target = (
-            slice(self.rows.keep_start, self.rows.keep_stop),
-            slice(self.columns.keep_start, self.columns.keep_stop),
-        )
-        image[target] = result[rows, columns]
-
-
-def plan_tiles(height_px: int, width_px: int, tile_px: int, halo_px: int) -> list[Tile]:
-    """Tiles in reading order whose kept parts cover the image exactly once.
-
-    An image smaller than a tile is one window of its own size along that side.
-    """
-    rows, columns = plan_side(height_px, tile_px, halo_px), plan_side(width_px, tile_px, halo_px)
-    return [Tile(row, column) for row in rows for column in columns]
 
 
 def plan_side(size_px: int, tile_px: int, halo_px: int) -> list[Span]:
@@ -127,16 +95,20 @@ class Plan:
         return min(self.tile_shape[0] + 2 * self.radius_px, self.height_px)
 
 
-def make_plan(raster: Raster, tile_px: int, halo_px: int, radius_px: int, fixed: bool = False) -> Plan:
-    """The plan of an image: tiles of at most `tile_px` a side, or of just that where the network is `fixed` to it.
+def make_plan(shape: tuple[int, ...], tile_px: int, halo_px: int, radius_px: int, fixed: bool = False) -> Plan:
+    """The plan of an image (bands, H, W): tiles of at most `tile_px` a side, or just that if the network is `fixed`.
 
     Raises:
         OptionError: a tile with no room between its two halos.
     """
-    sizes = raster.height_px, raster.width_px
-    sides = [tile_px if fixed else even_side_px(size, tile_px, halo_px) for size in sizes]
-    rows, columns = (tuple(plan_side(size, side, halo_px)) for size, side in zip(sizes, sides, strict=True))
-    return Plan(*raster.shape, tile_px, halo_px, radius_px, rows, columns)
+    bands, height_px, width_px = shape
+
+    def side(size_px: int) -> tuple[Span, ...]:
+        longest_px = tile_px if fixed else even_side_px(size_px, tile_px, halo_px)
+        return tuple(plan_side(size_px, longest_px, halo_px))
+
+    rows, columns = side(height_px), side(width_px)
+    return Plan(bands, height_px, width_px, tile_px, halo_px, radius_px, rows, columns)
 
 
 def rows_bytes(source: Source, plan: Plan, begun: bool = False) -> int:

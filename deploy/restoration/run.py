@@ -148,7 +148,7 @@ def plan_of(raster: Raster, network: onnx.ModelProto, options: Options) -> Plan:
     radius_px = receptive_radius_px(network)
     check_fixed_tile(network, options.tile_px, raster.shape[1:])
     halo_px, fixed = parse_halo(options.halo, radius_px), fixed_tile_px(network) is not None
-    return make_plan(raster, options.tile_px, halo_px, radius_px, fixed)
+    return make_plan(raster.shape, options.tile_px, halo_px, radius_px, fixed)
 
 
 def scale_of(source: Source, plan: Plan, asked: float | None, name: str) -> float:

@@ -15,9 +15,8 @@ from torch.nn.functional import conv2d
 
 from deploy.export import float_model
 from deploy.restoration.arrays import Infer
-from deploy.restoration.engine import Restorer, restore_rows
+from deploy.restoration.engine import restore_floats
 from deploy.restoration.plan import make_plan
-from deploy.restoration.source import ArraySource, Raster
 from deploy.stress.cases import FULL_DN
 from model.shipped import float_file, int8_file, shipped_pair
 from profiles.errors import BeersError
@@ -106,15 +105,7 @@ def open_subject(float_path: Path | None, int8_path: Path | None, variant: str) 
 
 def restore(infer: Infer, image: np.ndarray, radius_px: int, tile_px: int = WHOLE_PX) -> np.ndarray:
     """The product's own way from digital numbers (H, W) to restored ones, float32, not rounded."""
-    pixels = np.asarray(image, np.float32)[None]
-    height_px, width_px = image.shape
-    raster = Raster(1, height_px, width_px, pixels.dtype)
-    plan = make_plan(raster, tile_px, radius_px, radius_px)
-    restorer = Restorer(raster, infer, float(FULL_DN), radius_px, "case")
-    result = np.empty_like(pixels)
-    for row, kept, _ in restore_rows(ArraySource(pixels, raster), plan, restorer, plan.rows, lambda: None):
-        result[:, row.keep_start : row.keep_stop] = kept
-    return np.asarray(result[0])
+    return restore_floats(image, infer, make_plan((1, *image.shape), tile_px, radius_px, radius_px), FULL_DN)
 
 
 def _or_reason(work: Callable[[], T]) -> T | BeersError:

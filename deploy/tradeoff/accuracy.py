@@ -11,8 +11,9 @@ from typing import Any, Self
 import numpy as np
 
 from deploy.bench.tables import Swath
-from deploy.restoration.arrays import Infer, restore_tiles
-from deploy.restoration.plan import Span, Tile, plan_side
+from deploy.restoration.arrays import Infer
+from deploy.restoration.engine import restore_dn
+from deploy.restoration.plan import Plan, Span, plan_side
 from deploy.tradeoff.cache import code_digest, pixels_digest
 from model.evaluation.methods import Method, Restore
 from model.evaluation.pairs import NamedPair
@@ -120,9 +121,10 @@ def cut_in_four(infer: Infer, halo_px: int, max_dn: int = MAX_DN) -> Restore:
 
 
 def _restore(dn: np.ndarray, infer: Infer, halo_px: int, max_dn: int) -> np.ndarray:
-    rows, columns = (halves(size_px, halo_px) for size_px in dn.shape)
-    tiles = [Tile(row, column) for row in rows for column in columns]
-    return restore_tiles(dn, infer, tiles, max_dn=max_dn).astype(np.float32)
+    height_px, width_px = dn.shape
+    rows, columns = (tuple(halves(size_px, halo_px)) for size_px in dn.shape)
+    plan = Plan(1, height_px, width_px, max(dn.shape), halo_px, halo_px, rows, columns)
+    return restore_dn(dn, infer, plan, max_dn)
 
 
 def halves(size_px: int, halo_px: int) -> list[Span]:

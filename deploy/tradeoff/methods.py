@@ -15,8 +15,10 @@ import onnx
 
 from deploy.export import float_model
 from deploy.methods import knowledge_of, method_named
-from deploy.restoration.arrays import TILE_PX, Infer, restore_with
-from deploy.restoration.options import Runtime
+from deploy.restoration.arrays import Infer
+from deploy.restoration.engine import restore_dn
+from deploy.restoration.options import TILE_PX, Runtime
+from deploy.restoration.plan import make_plan
 from deploy.restoration.runtime import open_openvino, open_runtime
 from deploy.tradeoff.cache import Cache, code_digest, digest_of
 from deploy.tradeoff.points import LEGAL, Unit
@@ -301,7 +303,7 @@ def runtime_of(unit: Unit) -> str:
 
 
 def _whole(dn: np.ndarray, infer: Infer, radius_px: int, max_dn: int) -> np.ndarray:
-    return restore_with(infer, dn, TILE_PX, radius_px, max_dn=max_dn).astype(np.float32)
+    return restore_dn(dn, infer, make_plan((1, *dn.shape), TILE_PX, radius_px, radius_px), max_dn)
 
 
 @cache

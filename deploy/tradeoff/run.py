@@ -14,7 +14,8 @@ from deploy.dpu.board import load_dpu
 from deploy.dpu.checker.placement import place
 from deploy.dpu.checker.table import network_rows
 from deploy.dpu.reading import network_of
-from deploy.restoration.arrays import restore_with
+from deploy.restoration.engine import restore_dn
+from deploy.restoration.plan import make_plan
 from deploy.tradeoff.accuracy import Ground
 from deploy.tradeoff.advice import Choice, choose, findings, fronts, headline, notes, paper_outcomes, papers_point
 from deploy.tradeoff.board import DpuRun
@@ -83,8 +84,9 @@ def _restored(outcome: Outcome, pair: NamedPair, lab: Lab) -> np.ndarray:
     opened, point = lab.shelf.open(outcome.point.unit), outcome.point
     if opened.infer is None:
         return opened.restore(pair.degraded)
-    halo_px = point.halo_px(lab.shelf.radius_px(point.unit.method))
-    return restore_with(opened.infer, pair.degraded, point.tile_px, halo_px, max_dn=lab.shelf.max_dn)
+    radius_px = lab.shelf.radius_px(point.unit.method)
+    plan = make_plan((1, *pair.degraded.shape), point.tile_px, point.halo_px(radius_px), radius_px)
+    return restore_dn(pair.degraded, opened.infer, plan, lab.shelf.max_dn)
 
 
 LPIPS = "LPIPS-squeeze"

@@ -24,7 +24,7 @@ def running(infer: Infer, at_once: int, tick: Callable[[], None] = lambda: None)
     """A noisy image of two bands through `infer`."""
     pixels = np.random.default_rng(0).integers(0, 4096, SHAPE).astype(np.uint16)
     raster = Raster(*SHAPE, pixels.dtype, None)
-    plan: Plan = make_plan(raster, TILE_PX, RADIUS_PX, RADIUS_PX)
+    plan: Plan = make_plan(raster.shape, TILE_PX, RADIUS_PX, RADIUS_PX)
     restorer = Restorer(raster, infer, 4095.0, RADIUS_PX)
     result = np.empty(SHAPE, np.uint16)
     for row, kept, known in restore_rows(ArraySource(pixels, raster), plan, restorer, plan.rows, tick, at_once):

@@ -1,3 +1,5 @@
+from functools import partial
+
 import numpy as np
 import onnx
 import pytest
@@ -6,11 +8,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from deploy.export import to_onnx
-from deploy.restoration.arrays import restore_image
-from deploy.restoration.plan import even_side_px, plan_side, plan_tiles
+from deploy.restoration.engine import restore_dn
+from deploy.restoration.plan import even_side_px, make_plan, plan_side
 from model.convbeers import ConvBEERS, Variant, initialise
 from profiles.errors import OptionError
-from quant.session import open_session
+from quant.session import open_session, run
 
 RADIUS_PX = 5
 
@@ -27,18 +29,17 @@ def model() -> onnx.ModelProto:
 
 @given(st.integers(1, 90), st.integers(1, 90), st.integers(13, 40), st.integers(0, 6))
 def test_kept_parts_cover_every_pixel_once(height: int, width: int, tile_px: int, halo_px: int) -> None:
-    seen = np.zeros((height, width), int)
-    for tile in plan_tiles(height, width, tile_px, halo_px):
-        window = tile.read(seen)
-        assert window.shape == (min(tile_px, height), min(tile_px, width))
-        tile.write(window + 1, seen)
-    assert (seen == 1).all()
+    plan = make_plan((1, height, width), tile_px, halo_px, halo_px)
+    for size, spans in ((height, plan.rows), (width, plan.columns)):
+        assert [p for span in spans for p in range(span.keep_start, span.keep_stop)] == list(range(size))
+        assert {span.stop - span.start for span in spans} == {spans[0].stop}, "all of one size"
+        assert spans[0].stop <= min(tile_px, size)
 
 
 @given(st.integers(1, 200), st.integers(13, 60), st.integers(0, 6))
 def test_every_kept_pixel_has_its_halo_or_touches_the_border(size: int, tile_px: int, halo_px: int) -> None:
-    for tile in plan_tiles(size, size, tile_px, halo_px):
-        for span in (tile.rows, tile.columns):
+    for side_px in (tile_px, even_side_px(size, tile_px, halo_px)):
+        for span in plan_side(size, side_px, halo_px):
             assert span.start == 0 or span.keep_start - span.start >= halo_px
             assert span.stop == size or span.stop - span.keep_stop >= halo_px
 
@@ -54,19 +55,19 @@ def test_an_even_side_needs_as_many_tiles_and_none_shorter_does(size: int, tile_
 
 def test_a_tile_without_room_between_its_halos_is_refused() -> None:
     with pytest.raises(OptionError, match="halo of 20"):
-        plan_tiles(100, 100, 40, 20)
+        plan_side(100, 40, 20)
 
 
 @pytest.mark.parametrize(("height", "width"), [(61, 83), (17, 130), (1, 40), (40, 1), (29, 29)])
 def test_tiled_equals_whole_bit_for_bit(model: onnx.ModelProto, height: int, width: int) -> None:
-    session = open_session(model)
+    infer = partial(run, open_session(model))
     dn = np.random.default_rng(1).integers(0, 4096, (height, width)).astype(np.float32)
-    whole = restore_image(dn, session, tile_px=256, halo_px=RADIUS_PX)
-    np.testing.assert_array_equal(restore_image(dn, session, tile_px=23, halo_px=RADIUS_PX), whole)
+    tiled, whole = (make_plan((1, height, width), tile_px, RADIUS_PX, RADIUS_PX) for tile_px in (23, 256))
+    np.testing.assert_array_equal(restore_dn(dn, infer, tiled), restore_dn(dn, infer, whole))
 
 
 def test_a_smaller_halo_shows_seams(model: onnx.ModelProto) -> None:
-    session = open_session(model)
+    infer = partial(run, open_session(model))
     dn = np.random.default_rng(1).integers(0, 4096, (61, 83)).astype(np.float32)
-    whole = restore_image(dn, session, tile_px=256, halo_px=RADIUS_PX)
-    assert (restore_image(dn, session, tile_px=23, halo_px=RADIUS_PX - 3) != whole).any()
+    tiled, whole = make_plan((1, 61, 83), 23, RADIUS_PX - 3, RADIUS_PX), make_plan((1, 61, 83), 256, 0, RADIUS_PX)
+    assert (restore_dn(dn, infer, tiled) != restore_dn(dn, infer, whole)).any()

@@ -120,4 +120,4 @@ def test_what_is_measured_depends_on_the_metrics_and_the_network_runner() -> Non
     from deploy.tradeoff.accuracy import measure
 
     found = {path.relative_to(cache_module.ROOT).as_posix() for path in cache_module._sources([measure.__module__])}
-    assert {"model/metrics/fidelity.py", "deploy/restoration/arrays.py", "deploy/tradeoff/accuracy.py"} <= found
+    assert {"model/metrics/fidelity.py", "deploy/restoration/engine.py", "deploy/tradeoff/accuracy.py"} <= found

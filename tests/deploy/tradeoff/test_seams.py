@@ -6,6 +6,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from deploy.bench.tables import Swath
+from deploy.restoration.engine import restore_dn
+from deploy.restoration.plan import make_plan
 from deploy.tradeoff.accuracy import Scores, cut_in_four, halves, seam_density, with_seams
 from model.evaluation.scores import fidelity_db
 
@@ -85,6 +87,4 @@ def test_predicted_from_a_cut_is_what_a_swath_of_tiles_really_shows() -> None:
 
 
 def in_tiles(dn: np.ndarray, tile_px: int) -> np.ndarray:
-    from deploy.restoration.arrays import restore_with
-
-    return restore_with(blur, dn, tile_px, 0).astype(np.float32)
+    return restore_dn(dn, blur, make_plan((1, *dn.shape), tile_px, 0, 0))
