@@ -1,7 +1,6 @@
 """Pairs, methods, scores and targets of an evaluation."""
 
 import json
-import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -24,7 +23,7 @@ from model.metrics.refusal import Refusal
 from model.simulator.procedural import procedural_scene
 from profiles import load_sensor
 from profiles.constant import Constant
-from profiles.errors import ImageError, MachineError, OptionError
+from profiles.errors import ImageError, OptionError
 from profiles.figures import by_table
 
 DEGRADED, REFERENCE = load_sensor("pleiades-degraded"), load_sensor("pleiades-reference")
@@ -135,12 +134,6 @@ def test_what_a_network_was_made_for_is_no_secret() -> None:
     assert TRAINED not in [words for (_, sensor), words in told.items() if sensor != "pleiades-degraded"]
     assert told["convbeers-xs", "pleiades-degraded"] == "nothing"
     assert told["traditional", "dior-high"] == "both sensors"
-
-
-def test_a_peer_without_its_library_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "skimage", None)
-    with pytest.raises(MachineError, match=r"beers-deploy\[peers\]"):
-        method_named("wiener", *SENSORS).restore(pair().degraded)
 
 
 def test_clipped_pixels_do_not_count() -> None:
