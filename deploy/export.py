@@ -15,7 +15,7 @@ from model.convbeers import ConvBEERS
 from model.io.weights import is_told, load_network, load_told
 from model.shipped import SHIPPED, default_float_weights, float_file, shipped_names, shipped_weights, told_names
 from profiles.errors import ModelError
-from profiles.sensor import load_sensor
+from profiles.sensor_file import load_sensor
 from quant.onnx_file import GraphWriter, image_info, is_quantised, load_onnx, make_model, metadata
 from quant.session import open_session, run
 

@@ -114,7 +114,7 @@ def _on_the_board(path: Path, request: _Request, budget_s: float) -> "list[Row]"
     from deploy.results import print_rows
     from model.io.images import read_acquisition
     from model.shipped import SENSOR
-    from profiles.sensor import REFERENCE, load_sensor
+    from profiles.sensor_file import REFERENCE, load_sensor
 
     sensors = Sensors(load_sensor(SENSOR), load_sensor(REFERENCE))
     dn = read_acquisition(request.image, request.full_scale, None) if request.image else None

@@ -63,7 +63,7 @@ def tradeoff(
     from deploy.tradeoff.selection import Request
     from model.io.files import require_writable
     from model.shipped import shipped_names
-    from profiles.sensor import REFERENCE, load_sensor, reference_beside
+    from profiles.sensor_file import REFERENCE, load_sensor, reference_beside
 
     figures, kept = out / "tradeoff.json", cache or out / "cache"
     demands = [tuple(parse_demands(name, text)) for name, text in (("--budget", budget), ("--need", need))]

@@ -30,7 +30,8 @@ from model.shipped import SHIPPED, shipped_names, shipped_weights
 from model.simulator.procedural import load_scenes
 from profiles import load_sensor, sensor_names
 from profiles.errors import BeersError, ModelError, OptionError
-from profiles.sensor import SensorProfile, reference_for
+from profiles.sensor import SensorProfile
+from profiles.sensor_file import reference_for
 from quant.calibration import Patches, draw_patches
 from quant.free import free_ticks, quantise_free
 from quant.onnx_file import fixed_tile_px, is_quantised, load_onnx, metadata, receptive_radius_px, save_onnx
