@@ -54,7 +54,7 @@ def tradeoff(
     Measurements are kept: a second run, or one that was stopped, measures only what is missing. Exit code 1 where no
     point keeps --budget and --need; the report is written all the same.
     """
-    from deploy.commands.bench import parse_size
+    from deploy.bench.tables import parse_size
     from deploy.results import Document
     from deploy.tradeoff.cache import Cache
     from deploy.tradeoff.page import FILES, write_study
