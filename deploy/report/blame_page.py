@@ -5,9 +5,9 @@ from collections.abc import Sequence
 import numpy as np
 import onnxruntime as ort
 
-from deploy.report.histogram import histogram_url
 from deploy.report.page import Picture, Report, Table
 from deploy.report.pictures import error_row, grid, picture_url, stretch_of, strip_row
+from deploy.report.plots import histogram_url
 from profiles.figures import Row, by_table
 from quant.calibration import Patches
 from quant.graph import MAX_DN

@@ -11,7 +11,7 @@ from deploy.dpu.board import Dpu, load_dpu
 from deploy.dpu.cost.latency import Prediction, frame_rate
 from deploy.dpu.cost.layers import Constants
 from deploy.quantise import Calibration
-from deploy.report.curves import Curve, Panel, Points, curves_svg
+from deploy.report.plots import Curve, Panel, Points, curves_svg
 from deploy.stress import flips
 from deploy.stress.flips import MEMORIES, SETS, Patient, name_of, rates_of
 from deploy.stress.networks import core_of, planes_of
