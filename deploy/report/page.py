@@ -11,7 +11,6 @@ from pathlib import Path
 import jinja2
 
 from deploy import __version__
-from deploy.report.marks import Polygon
 from deploy.results import missing, unit_of, words_of
 from model.io.files import write_text
 from profiles.figures import Figure, Row
@@ -19,7 +18,8 @@ from profiles.figures import Figure, Row
 INTERVAL = re.compile(r"\[[^\[\]]*\]")
 
 
-TEMPLATES = Path(__file__).parent
+TEMPLATES = Path(__file__).parents[1]
+"""The folder whose packages hold the pages' templates."""
 
 
 @cache
@@ -33,7 +33,7 @@ def templates() -> jinja2.Environment:
     return made
 
 
-def corners(polygon: Polygon) -> str:
+def corners(polygon: Iterable[tuple[float, float]]) -> str:
     """A polygon as SVG writes it."""
     return " ".join(f"{x:.2f},{y:.2f}" for x, y in polygon)
 
@@ -84,7 +84,7 @@ class Report:
 def render(report: Report) -> str:
     """The page as HTML."""
     tables = [_grid(table) for table in report.tables]
-    return templates().get_template("report.html").render(report=report, tables=tables, version=__version__)
+    return templates().get_template("report/report.html").render(report=report, tables=tables, version=__version__)
 
 
 def write_report(report: Report, path: Path) -> None:

@@ -5,8 +5,8 @@ from collections.abc import Sequence
 import numpy as np
 import onnxruntime as ort
 
-from deploy.report.histogram import histogram_url
 from deploy.report.page import Picture, Report, Table
+from deploy.report.plots import histogram_url
 from model.io.pictures import error_row, grid, picture_url, stretch_of, strip_row
 from profiles.figures import Row, by_table
 from quant.calibration import Patches

@@ -9,7 +9,7 @@ from deploy.bench.tables import predict_file
 from deploy.dpu.board import Dpu, load_dpu
 from deploy.dpu.cost.latency import Prediction, frame_rate
 from deploy.dpu.cost.layers import Constants
-from deploy.report.curves import Curve, Panel, Points, curves_svg
+from deploy.report.plots import Curve, Panel, Points, curves_svg
 from deploy.stress import flips
 from deploy.stress.flips import MEMORIES, SETS, FaultTarget, name_of, rates_of
 from deploy.stress.networks import core_of, planes_of

@@ -14,7 +14,7 @@ from deploy.tradeoff.board import PAIR_QUANTILE, DpuRun, pair_error
 from deploy.tradeoff.host_time import ROUNDS
 from deploy.tradeoff.host_time import TILE_PX as HOST_TILE_PX
 from deploy.tradeoff.methods import PATCH_PX, PATCHES
-from deploy.tradeoff.outcome import COSTS, QUALITIES, UNITS, Arena, Outcome, Place, Plane, beaten, front
+from deploy.tradeoff.outcome import COSTS, QUALITIES, UNITS, Arena, Outcome, Place, Plane, dominated, front
 from deploy.tradeoff.points import EXACT, Demand, Point, Unit, on_dpu, shortfall
 from deploy.tradeoff.study import Front
 from model.evaluation.scores import NOTE
@@ -152,7 +152,7 @@ def _fronts(arena: Arena) -> Iterator[Front]:
             if found:
                 members = front(found)
                 steps = apart(arena, members, x, y)
-                yield Front(x, y, members, steps, beaten(found, Plane(arena, x, y)), prices(arena, steps, x, y))
+                yield Front(x, y, members, steps, dominated(found, Plane(arena, x, y)), prices(arena, steps, x, y))
 
 
 def places(arena: Arena, x: str, y: str) -> list[Place]:

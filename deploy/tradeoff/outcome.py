@@ -71,7 +71,7 @@ def dominates(a: Place, b: Place, judge: Judge) -> bool:
     return most <= 1 and least >= 0 and (most < 1 or least > 0)
 
 
-def beaten(places: Sequence[Place], judge: Judge) -> Mapping[str, str]:
+def dominated(places: Sequence[Place], judge: Judge) -> Mapping[str, str]:
     """Every point that another dominates, with the best of those that do."""
     found = {}
     for b in places:

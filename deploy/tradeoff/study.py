@@ -17,7 +17,7 @@ class Front:
         y: key of the figure that is bought, "PSNR".
         members: names of the points on the front by their values, along x from cheap to dear.
         steps: those of them that are surely better and surely dearer than the one before.
-        beaten: name of a point to the name of one that dominates it beyond the intervals.
+        dominated: name of a point to the name of one that dominates it beyond the intervals.
         prices: a sentence on what each step costs.
     """
 
@@ -25,7 +25,7 @@ class Front:
     y: str
     members: tuple[str, ...]
     steps: tuple[str, ...]
-    beaten: Mapping[str, str]
+    dominated: Mapping[str, str]
     prices: tuple[str, ...]
 
 

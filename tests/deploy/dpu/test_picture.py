@@ -9,7 +9,7 @@ from deploy.dpu.board import load_dpu
 from deploy.dpu.checker.placement import Placement, place
 from deploy.dpu.checker.table import FILLS, draw, require_picture, write_picture
 from deploy.dpu.reading import read_network
-from deploy.report.labels import text_width
+from deploy.report.plots import text_width
 from profiles.errors import OptionError
 from tests.deploy.dpu.graphs import Sketch, float_convbeers
 

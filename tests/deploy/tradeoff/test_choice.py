@@ -130,7 +130,7 @@ def test_below_five_sites_pictures_tell_no_two_points_apart(family: Arena) -> No
     assert gain_words(few, small, papers, "PSNR") == "0.3 dB of PSNR"
     assert "[" in gain_words(family, small, papers, "PSNR")
     for front in fronts(few):
-        assert not front.beaten
+        assert not front.dominated
         assert not front.prices
     assert as_good(few, few.outcomes[papers], surely=True) is None
     sentences = " ".join(findings(few, few.outcomes[papers]))
@@ -145,7 +145,7 @@ def test_fronts_are_there_for_every_pair_of_figures_that_points_have(family: Are
     }
     latency = next(front for front in found if (front.x, front.y) == ("board latency", "PSNR"))
     assert [name.split()[0] for name in latency.members] == ["tiny", "tuned"]
-    assert latency.beaten[named(family, "papers")] == named(family, "tuned")
+    assert latency.dominated[named(family, "papers")] == named(family, "tuned")
     assert len(latency.prices) == 1
     assert latency.prices[0].startswith("The last 2.9 dB")
     assert "times" in latency.prices[0]
@@ -171,7 +171,7 @@ def test_a_step_that_images_cannot_tell_has_no_price() -> None:
     )
     front = fronts(found)[0]
     assert len(front.members) == 3
-    assert not front.beaten
+    assert not front.dominated
     assert len(front.prices) == 1
     assert "from tiny" in front.prices[0]
     assert "to papers" in front.prices[0]

@@ -6,7 +6,7 @@ from itertools import combinations
 from hypothesis import given
 from hypothesis import strategies as st
 
-from deploy.tradeoff.outcome import Interval, Place, beaten, dominates, front
+from deploy.tradeoff.outcome import Interval, Place, dominated, dominates, front
 
 NUMBERS = st.integers(-3, 3).map(float)  # few values: many ties
 PLACES = st.lists(st.tuples(NUMBERS, NUMBERS), max_size=12).map(
@@ -52,15 +52,15 @@ def test_a_front_holds_just_what_nothing_beats(places: list[Place]) -> None:
 def test_without_intervals_beaten_is_all_that_is_not_as_good_as_the_front(places: list[Place]) -> None:
     judge = Spread(places)
     on_front = {(p.cost, p.quality) for p in places if p.name in front(places)}
-    found = beaten(places, judge)
+    found = dominated(places, judge)
     assert set(found) == {p.name for p in places if (p.cost, p.quality) not in on_front}
 
 
 @given(PLACES, st.floats(1, 4), st.floats(0, 3))
 def test_intervals_only_ever_spare_points(places: list[Place], cost: float, quality: float) -> None:
     judge = Spread(places, cost, quality)
-    found = beaten(places, judge)
-    assert set(found) <= set(beaten(places, Spread(places)))
+    found = dominated(places, judge)
+    assert set(found) <= set(dominated(places, Spread(places)))
     assert not set(found) & set(front(places))
     for name, by in found.items():
         a, b = (next(p for p in places if p.name == each) for each in (by, name))
@@ -79,16 +79,16 @@ def test_no_two_points_dominate_each_other(places: list[Place], cost: float, qua
 
 def test_a_point_cheaper_for_sure_and_alike_dominates_and_one_that_may_be_dearer_does_not() -> None:
     places = [Place("cheap", 1.0, 45.0), Place("dear", 1.2, 45.0)]
-    assert beaten(places, Spread(places, cost=1.1)) == {"dear": "cheap"}
-    assert not beaten(places, Spread(places, cost=1.3))
-    assert not beaten(places, Spread(places, cost=1.1, quality=0.01))
+    assert dominated(places, Spread(places, cost=1.1)) == {"dear": "cheap"}
+    assert not dominated(places, Spread(places, cost=1.3))
+    assert not dominated(places, Spread(places, cost=1.1, quality=0.01))
 
 
 def test_the_best_of_those_that_dominate_is_named() -> None:
     places = [Place("fast", 1.0, 2.0), Place("good", 2.0, 3.0), Place("poor", 4.0, 1.0)]
-    assert beaten(places, Spread(places))["poor"] == "good"
+    assert dominated(places, Spread(places))["poor"] == "good"
 
 
 def test_no_points_have_no_front() -> None:
     assert front([]) == ()
-    assert not beaten([], Spread([]))
+    assert not dominated([], Spread([]))

@@ -6,12 +6,13 @@ from pathlib import Path
 import pytest
 from PIL import Image
 
-from deploy.report.marks import DARK, LIGHT
-from deploy.tradeoff.page import NARROW, WIDE, render_study
+from deploy.report.plots import DARK, LIGHT
+from deploy.tradeoff.page import render_study
+from deploy.tradeoff.plot import NARROW, WIDE
 from profiles.figures import Row
-from tests.deploy.report.browser import Report, browser, drive, framed
-from tests.deploy.report.studies import study
-from tests.deploy.report.test_tradeoff_page import apart, within
+from tests.deploy.tradeoff.browser import Report, browser, drive, framed
+from tests.deploy.tradeoff.studies import study
+from tests.deploy.tradeoff.test_page import apart, within
 
 SORT = """
 const table = document.querySelector("table.sorts");
@@ -88,7 +89,7 @@ const drive = (report) => {
   report.wide = [page.documentElement.scrollWidth, page.defaultView.innerWidth];
   report.broken = all("img").filter((each) => !each.naturalWidth).length;
   report.colours = [getComputedStyle(page.body).backgroundColor,
-    getComputedStyle(page.querySelector(".plot .mark0 .edge")).stroke];
+    getComputedStyle(page.querySelector(".front-of .dot path")).stroke];
 };
 """
 
@@ -169,7 +170,7 @@ def test_it_looks_right(page: str, tmp_path: Path, width: int, dark: bool) -> No
     assert report["asked"] == ["/page.html"]
     assert report["broken"] == 0
     assert report["wide"][0] <= report["wide"][1] <= width
-    assert report["colours"] == [rgb("#14171b" if dark else "#ffffff"), rgb((DARK if dark else LIGHT)[0])]
+    assert report["colours"] == [rgb("#14171b" if dark else "#ffffff"), rgb((DARK if dark else LIGHT)["mark0"])]
     assert len(report["texts"]) == len(study().fronts)
     for boxes, (right, bottom) in zip(report["texts"], report["sizes"], strict=True):
         assert right == (WIDE if width > 500 else NARROW).width

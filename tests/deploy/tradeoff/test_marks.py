@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 from PIL import Image, ImageDraw
 
-from deploy.report.marks import DARK, LIGHT, SHAPES, Mark, filling_of, left_half, marks_of
-
-PRECISIONS = ("INT8 legal", "INT8 free", "bf16", "float32")
+from deploy.report.plots import DARK, LIGHT, SERIES
+from deploy.tradeoff.plot import FILLINGS, MARKERS, Mark, marks_of
 
 
 def luminance(colour: str) -> float:
@@ -25,33 +24,28 @@ def painted(mark: Mark) -> np.ndarray:
     """(80, 80) the mark in black and white: nothing of it is left to colour."""
     image = Image.new("L", (80, 80), 255)
     draw = ImageDraw.Draw(image)
-    outer, inner = ([(40 + 28 * x, 40 + 28 * y) for x, y in part] for part in (mark.outer, mark.inner))
+    outer, inner = ([(40 + 60 * x, 40 + 60 * y) for x, y in part] for part in (mark.outer, mark.inner))
     draw.polygon(outer, fill=255, outline=0, width=5)
     if inner:
         draw.polygon(inner, fill=0)
     return np.asarray(image) < 128
 
 
-@pytest.mark.parametrize(("colours", "page"), [(LIGHT, "#ffffff"), (DARK, "#14171b")])
-def test_every_colour_stands_out_from_its_page(colours: tuple[str, ...], page: str) -> None:
-    assert all(contrast(colour, page) >= 3 for colour in colours)
+@pytest.mark.parametrize("colours", [LIGHT, DARK])
+def test_every_colour_stands_out_from_its_page(colours: dict[str, str]) -> None:
+    assert all(contrast(colours[name], colours["page"]) >= 3 for name in SERIES)
+    assert LIGHT.keys() == DARK.keys()
 
 
 def test_marks_differ_without_colour() -> None:
-    marks = [Mark(shape, 0, filling_of(precision)) for shape in range(len(SHAPES)) for precision in PRECISIONS]
+    marks = [Mark(marker, "ink", filling) for marker in MARKERS for filling in FILLINGS.values()]
     pictures = [painted(mark) for mark in marks]
     for a, b in combinations(pictures, 2):
         assert (a ^ b).sum() > 0.05 * (a | b).sum()
 
 
 def test_each_method_has_its_own_look() -> None:
-    names = [f"method {k}" for k in range(len(SHAPES) * len(LIGHT))]
+    names = [f"method {k}" for k in range(len(MARKERS) * len(SERIES))]
     marks = marks_of(names)
-    assert len({mark.shape for mark in list(marks.values())[: len(SHAPES)]}) == len(SHAPES)
-    assert len({(mark.shape, mark.colour) for mark in marks.values()}) == len(names)
-
-
-def test_half_of_a_shape_lies_left() -> None:
-    for shape in SHAPES:
-        assert all(x <= 1e-12 for x, _ in left_half(shape))
-        assert min(x for x, _ in left_half(shape)) == min(x for x, _ in shape)
+    assert len({mark.marker for mark in list(marks.values())[: len(MARKERS)]}) == len(MARKERS)
+    assert len({(mark.marker, mark.colour) for mark in marks.values()}) == len(names)

@@ -1,19 +1,21 @@
-"""Where labels of marks stand so that none hides another or a mark: greedy, the most important first."""
+"""Where labels of marks stand so that none hides another or a mark: greedy, the most important first.
+
+matplotlib places no labels; a search by forces (adjustText) leaves some on each other where marks are dense. Places
+are pixels from the canvas' upper left corner.
+"""
 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cache
+from typing import Literal
 
 import numpy as np
-from PIL import ImageFont
+
+from deploy.report.plots import text_width
 
 LINE_PX, PAD_PX = 15, 3
-SLACK = 1.12
-"""A reader's browser may have a wider font than this one."""
-
 NEAR_PX, FAR_PX = (11, 16, 24), (11, 16, 24, 38, 56, 80, 110, 150, 200)
-TURNS = 24
+DIRECTIONS = 24
 LEADER_PX = 20
 """From here on a line leads from the label to its mark."""
 
@@ -27,7 +29,14 @@ Box = tuple[float, float, float, float]
 
 @dataclass(frozen=True)
 class Wish:
-    """Lines of text beside a mark at (x, y); `far` if they may stand away from it, with a line that leads there."""
+    """A label that is wanted.
+
+    Attributes:
+        x: of its mark, in pixels.
+        y: of its mark, in pixels.
+        lines: of its text.
+        far: whether it may stand away from its mark, with a line that leads there.
+    """
 
     x: float
     y: float
@@ -44,33 +53,21 @@ class Label:
     leader: Place | None
 
     @property
-    def anchor(self) -> str:
-        """Which end of the text stands towards the mark: start, middle or end."""
+    def alignment(self) -> Literal["left", "center", "right"]:
+        """Which end of the text stands towards the mark."""
         left, _, right, _ = self.box
-        return "start" if left > self.wish.x else "end" if right < self.wish.x else "middle"
+        return "left" if left > self.wish.x else "right" if right < self.wish.x else "center"
 
     @property
     def text_x(self) -> float:
-        """Where the text's anchor stands."""
+        """Where that end stands, in pixels."""
         left, _, right, _ = self.box
-        return {"start": left + PAD_PX, "end": right - PAD_PX, "middle": (left + right) / 2}[self.anchor]
+        return {"left": left + PAD_PX, "right": right - PAD_PX, "center": (left + right) / 2}[self.alignment]
 
     @property
     def baselines(self) -> list[float]:
-        """Of each line."""
+        """Of each line, in pixels."""
         return [self.box[1] + PAD_PX + LINE_PX * (k + 0.75) for k in range(len(self.wish.lines))]
-
-
-@cache
-def font_of(size_px: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
-    """The one that comes with Pillow: the same on every machine."""
-    return ImageFont.load_default(size=size_px)
-
-
-def text_width(text: str, size_px: int) -> float:
-    """Of a line in pixels, with some slack."""
-    wide = sum(ord(letter) > 0x2E7F for letter in text)  # letters that our font lacks and that fill a square
-    return SLACK * (font_of(size_px).getlength(text) + 0.5 * wide * size_px)
 
 
 def place(
@@ -120,7 +117,7 @@ def _candidates(wish: Wish, size_px: int) -> tuple[np.ndarray, np.ndarray]:
     """Boxes (n, 4) around a mark, and how many steps away each is; upwards and to the left a little cheaper."""
     width = max(text_width(line, size_px) for line in wish.lines) + 2 * PAD_PX
     height = LINE_PX * len(wish.lines) + 2 * PAD_PX
-    angles = 2 * math.pi * np.arange(TURNS) / TURNS
+    angles = 2 * math.pi * np.arange(DIRECTIONS) / DIRECTIONS
     dx, dy = np.cos(angles), -np.sin(angles)
     boxes, costs = [], []
     for step, distance in enumerate(FAR_PX if wish.far else NEAR_PX):

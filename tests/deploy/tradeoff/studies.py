@@ -153,7 +153,7 @@ def rows() -> list[Row]:
 
 
 def front(points: Sequence[Row], x: str, y: str) -> Front:
-    """The points that no other beats in value; a point is beaten where another is cheaper and half a unit better."""
+    """The points that no other beats in value; dominated where another is cheaper and half a unit better."""
     sign = -1 if y == "LPIPS-squeeze" else 1
     places = [
         (row.figures[x].value or 0.0, sign * (row.figures[y].value or 0.0), row.name)
@@ -165,11 +165,11 @@ def front(points: Sequence[Row], x: str, y: str) -> Front:
         if not members or place[1] > members[-1][1]:
             members.append(place)
     margin = 0.1 * (max(p[1] for p in places) - min(p[1] for p in places))
-    beaten = {b[2]: a[2] for b in places for a in places if a[0] < 0.8 * b[0] and a[1] > b[1] + margin}
+    dominated = {b[2]: a[2] for b in places for a in places if a[0] < 0.8 * b[0] and a[1] > b[1] + margin}
     steps = pairwise(members)
     prices = [f"From {a[2]} to {b[2]}: {b[0] / a[0]:.1f} times the {x}." for a, b in steps]
     names = tuple(each[2] for each in members)
-    return Front(x, y, names, names, beaten, tuple(prices))
+    return Front(x, y, names, names, dominated, tuple(prices))
 
 
 def layer(name: str, ms: float, **text: str) -> Row:

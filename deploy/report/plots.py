@@ -1,0 +1,336 @@
+"""Plots by matplotlib, in one look: as SVG, light or dark as the reader's screen is, and as PNG.
+
+Figures are drawn in the colours LIGHT and measured in pixels, 72 of them an inch, so that matplotlib's points are
+pixels too. In an SVG each colour becomes a variable that a style sheet sets for light and for dark screens; its
+attributes replace matplotlib's inline styles, which a page's content security policy forbids.
+"""
+
+import base64
+import io
+import math
+import re
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import cache
+from typing import TYPE_CHECKING
+from xml.etree import ElementTree as ET
+
+import numpy as np
+from markupsafe import Markup
+
+from profiles.figures import number
+from quant.graph import MAX_DN
+from quant.sensitivity import Spread
+
+if TYPE_CHECKING:
+    from matplotlib.axis import Axis
+    from matplotlib.figure import Figure
+
+PX_PER_INCH = 72
+FONT_PX, TITLE_PX = 13, 15
+
+LIGHT = {
+    "ink": "#1b1f24", "soft": "#5b6470", "line": "#d5dae0", "page": "#ffffff", "reached": "#eef4f8",
+    "mark0": "#0072b2", "mark1": "#d55e00", "mark2": "#008a64", "mark3": "#b4558d", "mark4": "#a87000",
+}  # fmt: skip
+"""Colours by what they are for; the marks' are Okabe and Ito's, darkened where white would swallow them."""
+
+DARK = {
+    "ink": "#e7eaee", "soft": "#9aa4b0", "line": "#39414b", "page": "#14171b", "reached": "#1a2129",
+    "mark0": "#56b4e9", "mark1": "#e8711a", "mark2": "#1fb88a", "mark3": "#cc79a7", "mark4": "#e69f00",
+}  # fmt: skip
+SERIES = ("mark0", "mark1", "mark2", "mark3", "mark4", "ink")
+"""The colours that series of points take in turn."""
+
+LOOK = {
+    "svg.fonttype": "none",
+    "svg.hashsalt": "beers-deploy",  # ids follow from what they name: the same figure, the same bytes
+    "text.parse_math": False,  # a dollar in a file's name is a dollar
+    "font.size": FONT_PX,
+    "text.color": LIGHT["ink"],
+    "figure.facecolor": LIGHT["page"],
+    "axes.facecolor": "none",
+    "axes.labelcolor": LIGHT["soft"],
+    "axes.titlelocation": "left",
+    "axes.titlesize": TITLE_PX,
+    "axes.titleweight": "bold",
+    "axes.axisbelow": True,
+    "axes.grid": True,
+    "grid.color": LIGHT["line"],
+    "grid.linewidth": 1,
+    **{f"axes.spines.{side}": False for side in ("left", "right", "top", "bottom")},
+    **{f"{axis}.labelcolor": LIGHT["soft"] for axis in ("xtick", "ytick")},
+    **{f"xtick.{side}": False for side in ("bottom", "top")},
+    **{f"ytick.{side}": False for side in ("left", "right")},
+    "legend.frameon": False,
+    "legend.borderpad": 0,
+    "legend.borderaxespad": 0,
+    "legend.handletextpad": 0.4,
+    "legend.columnspacing": 1.4,
+}
+
+
+@contextmanager
+def look() -> Iterator[None]:
+    """What is drawn and saved within has the look of our plots, whatever the user set for matplotlib's own."""
+    from matplotlib import style
+
+    with warnings.catch_warnings(), style.context(["default", LOOK]):
+        # A letter that the font lacks is a box in a PNG; of an SVG the browser has its own.
+        warnings.filterwarnings("ignore", "(?s)Glyph .* missing", UserWarning)
+        yield
+
+
+def new_figure(width_px: float, height_px: float) -> "Figure":
+    """An empty figure of that size, for use within `look`."""
+    from matplotlib.figure import Figure
+
+    return Figure(figsize=(width_px / PX_PER_INCH, height_px / PX_PER_INCH), dpi=PX_PER_INCH)
+
+
+@cache
+def text_width(text: str, size_px: float = FONT_PX) -> float:
+    """Width of a line in pixels, in matplotlib's own font: wider than those that a browser takes in its place."""
+    from matplotlib.font_manager import FontProperties
+    from matplotlib.textpath import text_to_path
+
+    with look():
+        width, _, _ = text_to_path.get_text_width_height_descent(text, FontProperties(size=size_px), ismath=False)
+    wide = sum(ord(letter) > 0x2E7F for letter in text)  # letters that the font lacks and that fill a square
+    return float(width) + 0.5 * wide * size_px
+
+
+SUBDIVISIONS = ((1.0, 1.5, 2.0, 3.0, 5.0, 7.0), (1.0, 2.0, 5.0), (1.0, 3.0), (1.0,))
+LEAST_TICKS = 3
+
+
+def set_ticks(axis: "Axis", most: int) -> None:
+    """Put at most so many ticks at round values within an axis' limits, and write the values beside them."""
+    low, high = sorted(axis.get_view_interval())
+    values = round_values(low, high, most, logarithmic=axis.get_scale() == "log")
+    axis.set_ticks(values, labels=[number(value, 12) for value in values])
+    axis.set_ticks([], minor=True)
+
+
+def round_values(low: float, high: float, most: int, *, logarithmic: bool) -> list[float]:
+    """Round values from `low` to `high`, at most `most`; evenly spaced where a logarithmic axis holds too few."""
+    from matplotlib.ticker import LogLocator, MaxNLocator
+
+    logs = [LogLocator(subs=subs, numticks=most + 2) for subs in SUBDIVISIONS] if logarithmic else []
+    evens = [MaxNLocator(count, steps=[1, 2, 5, 10], min_n_ticks=1) for count in range(most + 1, 0, -1)]
+    for locator in (*logs, *evens):
+        values = [float(f"{value:.12g}") for value in locator.tick_values(low, high) if low <= value <= high]
+        if (LEAST_TICKS if locator in logs else 1) <= len(values) <= most:
+            break
+    return values
+
+
+def svg_of(
+    figure: "Figure",
+    name: str,
+    titles: Mapping[str, str] | None = None,
+    *,
+    linked: bool = False,
+    alone: bool = False,
+    stretched: bool = False,
+) -> Markup:
+    """A figure as an SVG element.
+
+    Args:
+        figure: drawn within `look`.
+        name: what a screen reader calls it.
+        titles: what appears when the pointer rests on the artists of a group id (`set_gid`).
+        linked: whether each of those artists leads to the element of the page that has its group id.
+        alone: as a file with its own style sheet; else for a page that has it.
+        stretched: whether it fills whatever room the page gives it, out of proportion.
+    """
+    root = ET.fromstring(_saved(figure))  # noqa: S314 - our own
+    _inline(root)
+    width, height = root.get("viewBox", "").split()[2:]
+    root.attrib = {"class": "plot", "viewBox": f"0 0 {width} {height}", "role": "group", "aria-label": name}
+    if alone:
+        root.attrib |= {"xmlns": "http://www.w3.org/2000/svg", "width": width, "height": height}
+        style = ET.Element("style")
+        style.text = plot_style()
+        root.insert(0, style)
+    if stretched:
+        root.set("preserveAspectRatio", "none")
+    for group in root.iter("g"):
+        title = (titles or {}).get(group.get("class", ""))
+        if title is not None:
+            _explain(group, title, linked=linked)
+    return Markup(ET.tostring(root, encoding="unicode"))  # noqa: S704 - ElementTree escapes
+
+
+def _saved(figure: "Figure") -> str:
+    """What matplotlib writes, without name spaces."""
+    stream = io.BytesIO()
+    with look():
+        figure.savefig(stream, format="svg", metadata=dict.fromkeys(("Date", "Creator", "Format", "Type")))
+    text = re.sub(r' xmlns(:\w+)?="[^"]*"', "", stream.getvalue().decode().replace("xlink:href", "href"))
+    return printable(text)
+
+
+def printable(text: str) -> str:
+    """A text with a mark in the place of each letter that XML forbids: names are a user's."""
+    return re.sub("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]", "\ufffd", text)
+
+
+def _inline(root: ET.Element) -> None:
+    """Give each use of a marker its path, and leave out definitions: nothing refers to another element by its id."""
+    shapes = {f"#{path.get('id')}": path for path in root.iterfind(".//defs/path")}
+    for parent in list(root.iter()):
+        for child in list(parent):
+            if child.tag == "defs":
+                parent.remove(child)
+            elif child.tag == "use":
+                x, y = (child.attrib.pop(key) for key in "xy")
+                child.tag = "path"
+                child.attrib |= {
+                    "d": shapes[child.attrib.pop("href")].get("d", ""),
+                    "transform": f"translate({x} {y})",
+                }
+    for element in root.iter():
+        _plain(element)
+
+
+def _plain(element: ET.Element) -> None:
+    """Attributes for styles, a class for a group id of ours, variables for colours, and two decimals."""
+    names = {colour: name for name, colour in LIGHT.items()}
+    given = element.attrib
+    styles = (part.split(":") for part in given.pop("style", "").split(";") if part)
+    given |= {key.strip(): value.strip() for key, value in styles if key.strip() != "font-family"}
+    given.pop("clip-path", None)
+    group = given.pop("id", "_")
+    if "_" not in group:  # matplotlib's own ids have it
+        given["class"] = group
+    if given.get("transform", "").startswith("rotate(-0 "):
+        del given["transform"]
+    for key in given.keys() & {"fill", "stroke"}:
+        given[key] = f"var(--{names[given[key]]})" if given[key] in names else given[key]
+    for key in given.keys() & {"d", "x", "y", "transform"}:
+        given[key] = re.sub(r"-?\d+\.\d+", lambda found: f"{float(found[0]):.2f}", " ".join(given[key].split()))
+
+
+def _explain(group: ET.Element, title: str, *, linked: bool) -> None:
+    """Make a group one that shows a title, and where wanted a link to what has its id."""
+    if linked:
+        group.tag = "a"
+        group.attrib |= {"href": f"#{group.get('class')}", "tabindex": "-1"}
+    group.set("class", "dot")
+    words = ET.Element("title")
+    words.text = printable(title)
+    group.insert(0, words)
+
+
+def plot_style() -> Markup:
+    """The style sheet of plots: their colours, light and dark, and their letters."""
+    light, dark = (" ".join(f"--{name}: {colour};" for name, colour in colours.items()) for colours in (LIGHT, DARK))
+    return Markup(  # noqa: S704 - no foreign words
+        f":root {{ {light} }}\n@media screen and (prefers-color-scheme: dark) {{ :root {{ {dark} }} }}\n"
+        '.plot text { font-family: Arial, Helvetica, "Liberation Sans", sans-serif; fill: var(--ink); }\n'
+        '.plot text[fill="var(--soft)"] { fill: var(--soft); }\n'
+        ".plot .label text { paint-order: stroke; stroke: var(--page); stroke-width: 3px; stroke-linejoin: round; }\n"
+        ".plot a.dot:hover path { stroke: var(--ink); }\n"
+    )
+
+
+Points = tuple[tuple[float, float], ...]
+
+
+@dataclass(frozen=True)
+class Curve:
+    """Points (x, y) with x above 0; curves of one name look alike in all panels."""
+
+    name: str
+    colour: int
+    dashed: bool
+    points: Points
+
+
+@dataclass(frozen=True)
+class Panel:
+    """Some curves under a title."""
+
+    title: str
+    curves: Sequence[Curve]
+
+
+CURVES_PX = (960, 370)
+CURVES_FRAME = {"left": 0.065, "right": 0.985, "top": 0.89, "bottom": 0.22, "wspace": 0.12}
+
+
+def curves_svg(panels: Sequence[Panel], x_title: str, y_title: str) -> str:
+    """Panels side by side that share the axis upwards, each with a logarithmic axis of its own to the right.
+
+    Returns:
+        An SVG file, light or dark as its reader's screen is.
+    """
+    with look():
+        figure = new_figure(*CURVES_PX)
+        all_axes = figure.subplots(1, len(panels), sharey=True, squeeze=False, gridspec_kw=CURVES_FRAME)[0]
+        named = {}
+        for axes, panel in zip(all_axes, panels, strict=True):
+            axes.set(xscale="log", title=panel.title)
+            axes.margins(0.06)
+            for curve in panel.curves:
+                style = {"color": LIGHT[SERIES[curve.colour]], "ls": "--" if curve.dashed else "-", "marker": "o"}
+                named[curve.name] = axes.plot(*zip(*curve.points, strict=True), **style, ms=5, lw=2, gid="curve")[0]
+            set_ticks(axes.xaxis, 5)
+        set_ticks(all_axes[0].yaxis, 8)
+        figure.supxlabel(x_title, size=FONT_PX, color=LIGHT["soft"], y=0.1)
+        figure.supylabel(y_title, size=FONT_PX, color=LIGHT["soft"])
+        figure.legend(named.values(), named, ncols=len(named), loc="lower center", bbox_to_anchor=(0.5, 0.015))
+        return svg_of(figure, f"{y_title} against {x_title}", alone=True)
+
+
+HISTOGRAM_PX = (358, 240)
+"""No wider than a telephone shows: a wider picture would be scaled down there, its labels with it."""
+HISTOGRAM_FRAME = (0.225, 0.2, 0.72, 0.77)
+LABELS = 5
+MOST_BARS = 81
+
+
+def histogram_url(spread: Spread) -> str:
+    """Shares of pixels by error, on a logarithmic scale, and a Gaussian of the same deviation, as a data: address."""
+    centres, shares, wide = bins(spread)
+    decades = math.ceil(math.log10(spread.counts.sum()))
+    std_dn = max(spread.std_dn, 1e-9)
+    gauss = wide * np.exp(-((centres / std_dn) ** 2) / 2) / (std_dn * math.sqrt(2 * math.pi))
+    least = 10.0**-decades
+    with look():
+        figure = new_figure(*HISTOGRAM_PX)
+        axes = figure.add_axes(HISTOGRAM_FRAME)
+        axes.set(yscale="log", ylim=(least, 1), xlabel="INT8 - float, DN")
+        heights = np.maximum(shares - least, 0)
+        axes.bar(centres, heights, 0.8 * wide, least, color=LIGHT["mark2"])
+        inside = gauss > least
+        axes.plot(centres[inside], np.minimum(gauss[inside], 1), color=LIGHT["mark1"], lw=2)
+        set_ticks(axes.xaxis, LABELS)
+        rows = range(1, decades)
+        axes.yaxis.set_ticks([10.0**-d for d in rows], labels=[f"{100 * 10.0**-d:.{max(d - 2, 0)}f} %" for d in rows])
+        axes.yaxis.set_ticks([], minor=True)
+        axes.grid(visible=False, axis="x")
+        svg = svg_of(figure, "Share of the pixels by the difference of INT8 from float", alone=True)
+    return "data:image/svg+xml;base64," + base64.b64encode(svg.encode()).decode()
+
+
+def bins(spread: Spread) -> tuple[np.ndarray, np.ndarray, int]:
+    """Centres in DN, shares of the pixels, and the width in DN of at most MOST_BARS bins that hold every error."""
+    farthest = int(np.abs(np.flatnonzero(spread.counts) - MAX_DN).max())
+    wide = 1
+    while 2 * _reach(farthest, wide) + 1 > MOST_BARS:
+        wide += 2  # odd, so that zero lies in the middle of a bin
+    reach = _reach(farthest, wide)
+    half = reach * wide + wide // 2
+    padded = np.pad(spread.counts, wide)
+    middle = MAX_DN + wide
+    shares = padded[middle - half : middle + half + 1].reshape(-1, wide).sum(1) / spread.counts.sum()
+    return np.arange(-reach, reach + 1) * wide, shares, wide
+
+
+def _reach(farthest: int, wide: int) -> int:
+    """Bins on each side of the middle one."""
+    return -(-max(farthest - wide // 2, 0) // wide)

@@ -1,0 +1,477 @@
+"""The plot of one front: a mark for each point with its intervals, the front's line, labels and a legend.
+
+Quality is up and cost to the right. Every plot is laid out twice, for a wide screen and for a phone; the page's style
+sheet shows one of them.
+"""
+
+import math
+import textwrap
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from markupsafe import Markup
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
+from matplotlib.colors import to_rgba
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.markers import MarkerStyle
+from matplotlib.patheffects import withStroke
+
+from deploy.report.plots import (
+    LIGHT,
+    PX_PER_INCH,
+    SERIES,
+    TITLE_PX,
+    look,
+    new_figure,
+    set_ticks,
+    svg_of,
+    text_width,
+)
+from deploy.tradeoff.labels import Box, Label, Wish, place
+from deploy.tradeoff.outcome import QUALITIES
+from deploy.tradeoff.study import Front
+from model.io.files import whole_file
+from profiles.figures import Row
+
+Filling = Literal["full", "left", "bottom", "none"]
+FILLINGS: dict[str, Filling] = {"INT8 legal": "full", "INT8 free": "left", "bf16": "bottom", "float32": "none"}
+"""How matplotlib fills a marker, by precision."""
+
+MARKERS = ("o", "s", "^", "D", "*", "P", "v", "p", "X", "<", "d", ">", "h")
+"""matplotlib's markers that can be filled and told apart without colour."""
+
+SIDES = {"s": 0.85, "D": 0.8, "*": 1.25}
+"""How much smaller or larger than others some of them have to be to look as large."""
+
+Polygon = list[tuple[float, float]]
+
+
+@dataclass(frozen=True)
+class Mark:
+    """How a point looks: matplotlib's marker, the name of a colour, and a filling."""
+
+    marker: str
+    colour: str
+    filling: Filling = "full"
+
+    @property
+    def outer(self) -> Polygon:
+        """Its outline in a square of side 1 about (0, 0), y downwards."""
+        return _polygon(self.marker, "full")
+
+    @property
+    def inner(self) -> Polygon:
+        """What is painted inside the outline; nothing of a hollow mark."""
+        return _polygon(self.marker, self.filling) if self.filling != "none" else []
+
+    def line(self, state: "State", x: float = 0, y: float = 0) -> Line2D:
+        """For matplotlib to draw at (x, y), as large as its state asks for."""
+        colour = LIGHT[self.colour]
+        return Line2D(
+            [x],
+            [y],
+            linestyle="",
+            marker=self.marker,
+            markersize=2 * RADIUS_PX[state] * SIDES.get(self.marker, 1),
+            fillstyle="full"
+            if self.filling == "none"
+            else self.filling,  # matplotlib's own "none" can be seen through
+            markerfacecolor=LIGHT["page"] if self.filling == "none" else colour,
+            markerfacecoloralt=LIGHT["page"],
+            markeredgecolor=colour,
+            markeredgewidth=EDGE * RADIUS_PX[state],
+            alpha=FADED if state == "dominated" else None,
+        )
+
+
+def _polygon(marker: str, filling: Filling) -> Polygon:
+    style = MarkerStyle(marker, filling)
+    corners = np.asarray(style.get_path().transformed(style.get_transform()).to_polygons()[0])
+    return [(x, -y) for x, y in corners.tolist()]
+
+
+def marks_of(methods: Iterable[str]) -> dict[str, Mark]:
+    """A mark for each method: no marker twice before all are used, no pair with a colour twice long after."""
+    count, colours = len(MARKERS), len(SERIES)
+    names = dict.fromkeys(methods)
+    return {
+        name: Mark(MARKERS[k % count], SERIES[(k % count + k // count) % colours]) for k, name in enumerate(names)
+    }
+
+
+State = Literal["front", "open", "dominated"]
+RADIUS_PX: dict[State, float] = {"front": 7.0, "open": 5.5, "dominated": 4.5}
+STATES: dict[State, str] = {
+    "front": "on the front",
+    "open": "not distinguished from it",
+    "dominated": "dominated beyond the intervals",
+}
+EDGE = 0.26
+"""Width of an outline, for a mark of radius 1."""
+
+FADED, BAR, PALE_BAR = 0.6, 0.75, 0.16
+"""Opacity of a dominated mark, of an interval, and of an interval of a point off the front."""
+
+
+@dataclass(frozen=True)
+class Points:
+    """The rows of a study, and how their methods look; a row's number is its place in the table."""
+
+    rows: Sequence[Row]
+    marks: Mapping[str, Mark]
+
+    @classmethod
+    def of(cls, rows: Sequence[Row]) -> "Points":
+        """Rows with a look for each of their methods."""
+        return cls(rows, marks_of(map(method_of, rows)))
+
+    def mark(self, row: Row) -> Mark:
+        """The marker and colour of its method, filled as its precision; an unknown precision is left hollow."""
+        return replace(self.marks[method_of(row)], filling=FILLINGS.get(row.text.get("precision", ""), "none"))
+
+    def on(self, front: Front) -> list[tuple[str, Row]]:
+        """The points that can be drawn, each with the id of its row in the page's table."""
+        return [(f"point-{k}", row) for k, row in enumerate(self.rows, 1) if drawn(row, front)]
+
+
+def method_of(row: Row) -> str:
+    """What the row's point runs."""
+    return row.text.get("method", row.name)
+
+
+def drawn(row: Row, front: Front) -> bool:
+    """Whether it has both figures, a cost above zero, and neither published: those were found on other images."""
+    found = [row.figures.get(key) for key in (front.x, front.y)]
+    if any(figure is None or figure.value is None or figure.mode == "published" for figure in found):
+        return False
+    return _value(row, front.x) > 0
+
+
+def state_of(front: Front, name: str) -> State:
+    """Where a point lies beside the front."""
+    return "front" if name in front.members else "dominated" if name in front.dominated else "open"
+
+
+@dataclass(frozen=True)
+class Canvas:
+    """A size in pixels; how many letters a line of a label has; whether labels end at the first comma."""
+
+    width: int
+    height: int
+    letters: int
+    brief: bool
+
+
+WIDE, NARROW = Canvas(1080, 660, 30, brief=False), Canvas(400, 640, 24, brief=True)
+LEFT_PX, RIGHT_PX, TOP_PX, BELOW_PX, EDGE_PX = 66, 14, 34, 54, 18
+LEAST_PX = 260
+"""The frame's least height: below a long legend the canvas grows."""
+
+ROW_PX, WORDS_PX, GAP_PX = 20, 13, 22
+"""In the legend: between lines, from a mark to its words, and from them to the next mark."""
+
+TICK_PX = (64, 44)
+LABEL_PX = 12
+BETTER = "better: up and to the left"
+
+
+@dataclass(frozen=True)
+class Plot:
+    """A figure drawn within `look`, and what lies where on it, in pixels from its upper left corner.
+
+    Attributes:
+        front: what it shows.
+        figure: matplotlib's.
+        frame: where values stand.
+        places: of each point by the id of its row, (x, y).
+        boxes: that marks cover.
+        labels: of some points.
+        titles: what appears when the pointer rests on a point.
+        legend: what each of its parts covers.
+    """
+
+    front: Front
+    figure: Figure
+    frame: Box
+    places: Mapping[str, tuple[float, float]]
+    boxes: Sequence[Box]
+    labels: Sequence[Label]
+    titles: Mapping[str, str]
+    legend: Sequence[Box]
+
+    def svg(self, *, alone: bool = False) -> Markup:
+        """For the page, with links to its table; `alone` as a file of its own."""
+        name = f"{self.front.y} against {self.front.x}"
+        return svg_of(self.figure, name, self.titles, linked=not alone, alone=alone)
+
+    def write_png(self, path: Path) -> None:
+        """Write it with two pixels for each of its own, light, whole or not at all."""
+        with whole_file(path) as temporary, look():
+            for text in self.figure.texts:
+                if text.get_gid() == "label":
+                    text.set_path_effects([withStroke(linewidth=3, foreground=LIGHT["page"])])
+            self.figure.savefig(temporary, format="png", dpi=2 * PX_PER_INCH, metadata={"Software": None})
+
+
+def plot_of(front: Front, points: Points, canvas: Canvas) -> Plot:
+    """The plot of one front."""
+    shown = points.on(front)
+    rows = [row for _, row in shown]
+    legend = legend_of(points, rows, canvas.width)
+    legend_px = max((entry.y for entry in legend), default=0.0) + ROW_PX / 2
+    height = max(canvas.height, TOP_PX + LEAST_PX + BELOW_PX + math.ceil(legend_px))
+    canvas = replace(canvas, height=height)
+    frame = (LEFT_PX, TOP_PX, canvas.width - RIGHT_PX, height - BELOW_PX - legend_px)
+    with look():
+        figure = new_figure(canvas.width, height)
+        parts = _draw_legend(figure, legend, height - legend_px, canvas)
+        axes = _make_axes(figure, front, rows, frame, canvas)
+        stairs = _draw_front(axes, front, rows)
+        _draw_intervals(axes, front, points, rows)
+        for anchor, row in shown:
+            line = points.mark(row).line(state := state_of(front, row.name), *_values(front, row))
+            line.set(gid=anchor, clip_on=False, zorder=4 + RADIUS_PX[state])
+            axes.add_line(line)
+        places = {anchor: _pixels(axes, [_values(front, row)], canvas)[0] for anchor, row in shown}
+        boxes = [_covered(places[anchor], state_of(front, row.name)) for anchor, row in shown]
+        better = (frame[0], frame[1], frame[0] + text_width(BETTER) + 12, frame[1] + 26)
+        lines = [*_thin(_pixels(axes, stairs, canvas)), *_bars(axes, front, rows, canvas)]
+        wishes = wishes_of(front, [(row, places[anchor]) for anchor, row in shown], canvas)
+        labels = place(wishes, [better, *boxes], lines, frame, LABEL_PX)
+        _write(figure, 12, 21, f"{front.y} against {front.x}", canvas, size=TITLE_PX, weight="bold")
+        _write(figure, frame[0] + 8, frame[1] + 18, BETTER, canvas, color=LIGHT["soft"])
+        for label in labels:
+            _draw_label(figure, label, canvas)
+    return Plot(front, figure, frame, places, boxes, labels, {a: _title(front, r) for a, r in shown}, parts)
+
+
+def _value(row: Row, key: str) -> float:
+    return row.figures[key].value or 0.0
+
+
+def _values(front: Front, row: Row) -> tuple[float, float]:
+    return _value(row, front.x), _value(row, front.y)
+
+
+def _title(front: Front, row: Row) -> str:
+    said = [
+        f"{key} {row.figures[key]} {row.figures[key].unit}, {row.figures[key].mode}" for key in (front.y, front.x)
+    ]
+    dominated = f"dominated by {front.dominated[row.name]}" if row.name in front.dominated else ""
+    return "\n".join(line for line in (row.name, *said, dominated) if line)
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A part of the legend: a mark at (x, y) in pixels from the legend's upper left corner, and its words."""
+
+    mark: Mark
+    text: str
+    state: State = "front"
+    x: float = 0.0
+    y: float = 0.0
+
+
+def legend_of(points: Points, rows: Sequence[Row], width_px: float) -> list[Entry]:
+    """Which marker is which method, which filling which precision, which size which state, in lines so wide."""
+    methods = dict.fromkeys(map(method_of, rows))
+    precisions = filter(None, dict.fromkeys(row.text.get("precision", "") for row in rows))
+    groups = [
+        [Entry(points.marks[method], _short(method)) for method in methods],
+        [Entry(Mark("o", "ink", FILLINGS.get(name, "none")), name) for name in precisions],
+        [Entry(Mark("o", "ink"), text, state) for state, text in STATES.items()],
+    ]
+    return list(_flow(groups, width_px))
+
+
+def _flow(groups: Iterable[Sequence[Entry]], width_px: float) -> Iterator[Entry]:
+    """From left to right, each group from a new line on."""
+    y = ROW_PX / 2
+    for group in groups:
+        x = float(EDGE_PX)
+        for entry in group:
+            reach = x + WORDS_PX + text_width(entry.text, LABEL_PX)
+            if reach > width_px and x > EDGE_PX:
+                x, y, reach = float(EDGE_PX), y + ROW_PX, reach - x + EDGE_PX
+            yield replace(entry, x=x, y=y)
+            x = reach + GAP_PX
+        y += ROW_PX if group else 0
+
+
+def _draw_legend(figure: Figure, legend: Sequence[Entry], top_px: float, canvas: Canvas) -> list[Box]:
+    """Returns what its parts cover."""
+    for entry in legend:
+        line = entry.mark.line(entry.state, entry.x / canvas.width, 1 - (top_px + entry.y) / canvas.height)
+        line.set_transform(figure.transFigure)
+        figure.add_artist(line)
+        _write(figure, entry.x + WORDS_PX, top_px + entry.y + 4.5, entry.text, canvas, size=LABEL_PX, gid="legend")
+    reach = ROW_PX / 2
+    return [
+        (e.x - reach, top_px + e.y - reach, e.x + WORDS_PX + text_width(e.text, LABEL_PX), top_px + e.y + reach)
+        for e in legend
+    ]
+
+
+LETTERS = 40
+
+
+def _short(text: str) -> str:
+    line = " ".join(text.split())
+    return line if len(line) <= LETTERS else f"{line[: LETTERS - 1]}\u2026"
+
+
+MARGIN, REACH = 0.07, 0.5
+"""Shares of the values' range: left free around them; at most shown beyond them of intervals."""
+
+
+def _make_axes(figure: Figure, front: Front, rows: Sequence[Row], frame: Box, canvas: Canvas) -> Axes:
+    left, top, right, bottom = frame
+    width, height = canvas.width, canvas.height
+    axes = figure.add_axes((left / width, 1 - bottom / height, (right - left) / width, (bottom - top) / height))
+    y_limits = _limits(rows, front, front.y, logarithmic=False)
+    axes.set(xscale="log", xlim=_limits(rows, front, front.x, logarithmic=True))
+    axes.set(ylim=y_limits if QUALITIES[front.y] > 0 else y_limits[::-1])  # good is up, whichever way it runs
+    axes.set(xlabel=_axis_title(front.x, rows), ylabel=_axis_title(front.y, rows))
+    axes.yaxis.set_label_coords(-(left - 22) / (right - left), 0.5)
+    set_ticks(axes.xaxis, int((right - left) / TICK_PX[0]))
+    set_ticks(axes.yaxis, int((bottom - top) / TICK_PX[1]))
+    return axes
+
+
+def _limits(rows: Sequence[Row], front: Front, key: str, *, logarithmic: bool) -> tuple[float, float]:
+    """They hold all values, and the intervals of the front's members as far as they do not squeeze the values."""
+    forth, back = (math.log, math.exp) if logarithmic else (float, float)
+    values = [forth(_value(row, key)) for row in rows] or [0.0, 1.0]
+    members = [row.figures[key].interval for row in rows if row.name in front.members]
+    ends = [forth(end) for interval in members if interval for end in interval if end > 0 or not logarithmic]
+    low, high = min(values), max(values)
+    span = high - low or max(abs(high), 1.0)
+    inner, outer = ((low - share * span, high + share * span) for share in (MARGIN, REACH))
+    return back(max(outer[0], min([*ends, inner[0]]))), back(min(outer[1], max([*ends, inner[1]])))
+
+
+def _axis_title(key: str, rows: Sequence[Row]) -> str:
+    modes = " and ".join(dict.fromkeys(row.figures[key].mode for row in rows))
+    unit = next((row.figures[key].unit for row in rows), "")
+    return f"{key}, {unit} ({modes})" if rows else key
+
+
+def _draw_front(axes: Axes, front: Front, rows: Sequence[Row]) -> list[tuple[float, float]]:
+    """The best quality for each cost, from the bottom at the cheapest member to the right edge; its corners."""
+    members = sorted(_values(front, row) for row in rows if row.name in front.members)
+    if not members:
+        return []
+    right, bottom = axes.get_xlim()[1], axes.get_ylim()[0]
+    stairs = [(members[0][0], bottom), members[0]]
+    for (_, before), (x, y) in pairwise(members):
+        stairs += [(x, before), (x, y)]
+    stairs.append((right, members[-1][1]))
+    axes.fill(*zip(*stairs, (right, bottom), strict=True), color=LIGHT["reached"], linewidth=0, zorder=0)
+    axes.plot(*zip(*stairs, strict=True), color=LIGHT["ink"], linewidth=1.6, zorder=3, gid="front", clip_on=False)
+    return stairs
+
+
+def _draw_intervals(axes: Axes, front: Front, points: Points, rows: Sequence[Row]) -> None:
+    segments, colours = [], []
+    for row in rows:
+        for ends in _intervals(axes, front, row):
+            segments.append(ends)
+            colours.append(to_rgba(LIGHT[points.mark(row).colour], BAR if row.name in front.members else PALE_BAR))
+    axes.add_collection(LineCollection(segments, colors=colours, linewidths=1.4, zorder=2), autolim=False)
+
+
+def _intervals(axes: Axes, front: Front, row: Row) -> Iterator[tuple[tuple[float, float], tuple[float, float]]]:
+    """Both ends of the interval of each figure; one that goes on beyond the axes ends at their edge."""
+    (x, y), (across, up) = _values(front, row), (row.figures[key].interval for key in (front.x, front.y))
+    if across:
+        low, high = _within(across, axes.get_xlim())
+        yield (low, y), (high, y)
+    if up:
+        low, high = _within(up, axes.get_ylim())
+        yield (x, low), (x, high)
+
+
+def _within(ends: tuple[float, float], limits: tuple[float, float]) -> list[float]:
+    low, high = sorted(limits)
+    return [min(max(end, low), high) for end in ends]
+
+
+def _pixels(axes: Axes, places: Sequence[tuple[float, float]], canvas: Canvas) -> list[tuple[float, float]]:
+    """Places on the canvas of values."""
+    return [(float(x), float(canvas.height - y)) for x, y in axes.transData.transform(places)] if places else []
+
+
+def _covered(at: tuple[float, float], state: State) -> Box:
+    """What a mark covers."""
+    reach = 1.45 * RADIUS_PX[state] + 1
+    return at[0] - reach, at[1] - reach, at[0] + reach, at[1] + reach
+
+
+def _bars(axes: Axes, front: Front, rows: Sequence[Row], canvas: Canvas) -> Iterator[Box]:
+    """What the intervals of the front's members cover."""
+    for row in rows:
+        for ends in _intervals(axes, front, row) if row.name in front.members else ():
+            yield from _thin(_pixels(axes, ends, canvas))
+
+
+def _thin(line: Sequence[tuple[float, float]]) -> list[Box]:
+    """The steps of a line as boxes."""
+    return [(min(a, c), min(b, d), max(a, c) + 1, max(b, d) + 1) for (a, b), (c, d) in pairwise(line)]
+
+
+LABEL_LINES = 3
+
+
+def wishes_of(front: Front, shown: Sequence[tuple[Row, tuple[float, float]]], canvas: Canvas) -> list[Wish]:
+    """Names of the front's steps, best first; then of the best point of each other method, where there is room.
+
+    Args:
+        front: what is plotted.
+        shown: its points, each with its place in pixels.
+        canvas: what it is plotted on.
+    """
+    by_quality = sorted(shown, key=lambda each: -QUALITIES[front.y] * _value(each[0], front.y))
+    named = {method_of(row) for row, _ in shown if row.name in front.members}
+    best = {method_of(row): (row, at) for row, at in reversed(by_quality) if method_of(row) not in named}
+    steps = [each for each in by_quality if each[0].name in front.steps]
+    wanted = [*steps, *sorted(best.values(), key=lambda each: each[1][1])]
+    heads = Counter(_head(row.name) for row, _ in wanted)
+    return [
+        Wish(*at, _lines(row.name, canvas, heads[_head(row.name)] == 1), row.name in front.members)
+        for row, at in wanted
+    ]
+
+
+def _head(name: str) -> str:
+    return name.partition(", ")[0]
+
+
+def _lines(name: str, canvas: Canvas, alone: bool) -> tuple[str, ...]:
+    """A name in a few lines, a new one after its first comma; brief where that is enough to tell it by."""
+    parts = [_head(name)] if canvas.brief and alone else name.split(", ", 1)
+    lines = [line for part in parts for line in textwrap.wrap(part, canvas.letters)] or [""]
+    if len(lines) > LABEL_LINES:
+        lines[LABEL_LINES - 1] = lines[LABEL_LINES - 1][: canvas.letters - 1] + "\u2026"
+    return tuple(lines[:LABEL_LINES])
+
+
+def _draw_label(figure: Figure, label: Label, canvas: Canvas) -> None:
+    if label.leader:
+        ends = [(x / canvas.width, 1 - y / canvas.height) for x, y in (label.leader, (label.wish.x, label.wish.y))]
+        leader = Line2D(*zip(*ends, strict=True), color=LIGHT["soft"], linewidth=1, transform=figure.transFigure)
+        figure.axes[0].add_line(leader)
+        leader.set_clip_on(False)
+    for y, text in zip(label.baselines, label.wish.lines, strict=True):
+        _write(figure, label.text_x, y, text, canvas, ha=label.alignment, size=LABEL_PX, gid="label")
+
+
+def _write(figure: Figure, x: float, y: float, text: str, canvas: Canvas, **style: object) -> None:
+    """A line of text; (x, y) is its baseline's start, or what `ha` says, in pixels."""
+    figure.text(x / canvas.width, 1 - y / canvas.height, text, **style)  # type: ignore[arg-type] # matplotlib's own

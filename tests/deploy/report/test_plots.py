@@ -1,0 +1,61 @@
+import re
+from xml.etree import ElementTree as ET
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from matplotlib import rc_context
+
+from deploy.report.plots import LIGHT, look, new_figure, round_values, set_ticks, svg_of
+
+
+@given(st.floats(-6, 6), st.floats(0.01, 12), st.integers(3, 16), st.booleans())
+def test_ticks_are_few_rising_and_on_the_axis(start: float, decades: float, most: int, logarithmic: bool) -> None:
+    low, high = 10**start, 10 ** (start + decades)
+    values = round_values(low, high, most, logarithmic=logarithmic)
+    assert 1 <= len(values) <= most
+    assert values == sorted(set(values))
+    assert all(low * (1 - 1e-9) <= value <= high * (1 + 1e-9) for value in values)
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "logarithmic", "values"),
+    [(1, 10_000, True, [1, 10, 100, 1000, 10_000]), (41.5, 46.5, False, [42, 43, 44, 45, 46])],
+)
+def test_ticks_are_round(low: float, high: float, logarithmic: bool, values: list[float]) -> None:
+    assert round_values(low, high, 6, logarithmic=logarithmic) == values
+
+
+def drawn(**options: bool) -> str:
+    """A line with every kind of text, two of its letters dangerous."""
+    with look():
+        figure = new_figure(300, 200)
+        axes = figure.add_subplot(xlabel="$cost$ <a> & \x01", ylabel="quality \u4e2d")
+        axes.plot([1, 2], [3, 4], marker="D", fillstyle="left", color=LIGHT["mark0"], gid="point-1")
+        set_ticks(axes.xaxis, 4)
+        return svg_of(figure, "a plot", {"point-1": "<b> \x02"}, **options)
+
+
+@pytest.mark.parametrize("options", [{}, {"linked": True}, {"alone": True}])
+def test_an_svg_needs_no_other_element_and_no_inline_style(options: dict[str, bool]) -> None:
+    text = drawn(**options)
+    root = ET.fromstring(text)  # noqa: S314 - our own
+    assert "url(" not in text
+    assert not re.search(r"\s(style|id|clip-path)=|<use|<defs|xlink", text)
+    words = " ".join(root.itertext())
+    assert "$cost$ <a> & \ufffd" in words
+    assert "<b> \ufffd" in words
+    assert ("href" in text) == bool(options.get("linked"))
+    assert ("prefers-color-scheme: dark" in text) == bool(options.get("alone"))
+
+
+def test_every_colour_of_an_svg_follows_the_screen() -> None:
+    text = drawn()
+    assert "var(--mark0)" in text
+    assert not re.search(r'(fill|stroke)="#', text)
+
+
+def test_the_users_settings_for_matplotlib_change_nothing() -> None:
+    plain = drawn()
+    with rc_context({"lines.linewidth": 9, "font.size": 30, "axes.grid": False, "svg.fonttype": "path"}):
+        assert drawn() == plain
