@@ -32,8 +32,8 @@ EXPECTED = (
 )
 
 
-KNOWS, BLIND, TRAINED = "both sensors", "nothing", "trained for the sensor"
-"""What a method is told: the last of a network whose file names the sensor."""
+KNOWS, BLIND, TRAINED = "known", "blind", "trained for it"
+"""What a method knows of the sensor: the last of a network whose file names the sensor."""
 
 
 @dataclass(frozen=True)

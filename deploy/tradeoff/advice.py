@@ -47,9 +47,9 @@ def choose(results: Results, budget: Sequence[Demand], need: Sequence[Demand]) -
     if goal.key == QUALITY:
         paid = next((demand.key for demand in budget if demand.key in COSTS), _cost(results))
         chosen = min(_alike(results, best, kept), key=lambda each: each.value(paid) or math.inf)
-    found = f"{chosen.name} (told: {chosen.text['told']}), {figures_words(chosen, demands, goal.key)}"
+    found = f"{chosen.name} (sensor: {chosen.text['sensor']}), {figures_words(chosen, demands, goal.key)}"
     sentences = [f"For {asked}: {found}; {_why(chosen, best, goal, len(kept))}."]
-    sentences += _doubts(chosen, demands)
+    sentences += _unsure(chosen, demands)
     sentences.append(_better(best, ranked, demands, goal))
     return Choice(chosen, tuple(sentences))
 
@@ -65,7 +65,8 @@ def _why(chosen: Outcome, best: Outcome, goal: "Goal", count: int) -> str:
     if chosen is best:
         return f"it has the {goal.words} of the {count} points that keep it"
     higher = f"{best.name}, {figure_words(best.figures[goal.key])}"
-    return f"the {goal.words} of the {count} points that keep it, of {higher}, cannot be told from it, and costs more"
+    beside = "is not distinguishable from it, and costs more"
+    return f"the {goal.words} of the {count} points that keep it, of {higher}, {beside}"
 
 
 def _cost(results: Results) -> str:
@@ -102,9 +103,9 @@ def figure_words(figure: Figure) -> str:
     return f"{figure}{unit if figure.value is not None else ''}"
 
 
-def _doubts(best: Outcome, demands: Sequence[Demand]) -> list[str]:
+def _unsure(best: Outcome, demands: Sequence[Demand]) -> list[str]:
     """Demands that the value keeps, and its interval does not."""
-    unsure = [demand for demand in demands if not demand.surely_kept(best.figures[demand.key])]
+    unsure = [demand for demand in demands if not demand.kept_throughout(best.figures[demand.key])]
     if not unsure:
         return []
     return [f"Its value keeps {' and '.join(map(str, unsure))}, but not the whole interval."]
@@ -169,7 +170,7 @@ def prices(results: Results, steps: tuple[str, ...], x: str, y: str) -> tuple[st
 
 
 def apart(results: Results, members: Sequence[str], x: str, y: str) -> tuple[str, ...]:
-    """Members that are surely better and surely dearer, each than the one before; of those as dear the best."""
+    """Members that are better and dearer than the one before beyond the intervals; of those as dear the best."""
     kept = list(members[:1])
     for name in members[1:]:
         if results.gain(name, kept[-1], y)[0] <= 0:
@@ -223,19 +224,19 @@ def findings(results: Results, paper: Outcome | None) -> tuple[str, ...]:
         return (
             "The paper's network (16 blocks of 64 features) is not among the networks: nothing is held against it.",
         )
-    best, sure = (as_good(results, paper, surely=surely) for surely in (False, True))
+    best, throughout = (as_good(results, paper, whole_interval=whole) for whole in (False, True))
     sentences = [equal_quality(results, paper, best, f"within {EQUAL_DB} dB")]
-    if sure is not best:
-        sentences.append(equal_quality(results, paper, sure, f"within {EQUAL_DB} dB over the whole interval"))
+    if throughout is not best:
+        sentences.append(equal_quality(results, paper, throughout, f"within {EQUAL_DB} dB over the whole interval"))
     return (*sentences, tenth_energy(results, paper))
 
 
-def as_good(results: Results, paper: Outcome, *, surely: bool) -> Outcome | None:
+def as_good(results: Results, paper: Outcome, *, whole_interval: bool) -> Outcome | None:
     """The fastest of the points that reach its PSNR within EQUAL_DB: by value, or over the whole interval."""
 
     def lead_db(each: Outcome) -> float:
         by_value = (each.value("PSNR") or 0.0) - (paper.value("PSNR") or 0.0)
-        return min(results.gain(each.name, paper.name, "PSNR")[0], by_value) if surely else by_value
+        return min(results.gain(each.name, paper.name, "PSNR")[0], by_value) if whole_interval else by_value
 
     found = [each for each in _rivals(results, paper) if lead_db(each) >= -EQUAL_DB]
     return min(found, key=lambda each: each.value(LATENCY) or 0.0, default=None)
@@ -245,11 +246,11 @@ def equal_quality(results: Results, paper: Outcome, best: Outcome | None, how: s
     """That the fastest of the points that are as good is faster, or that none is."""
     start = f"The paper's shape with the weights of {paper.point.variant.method}, {_of(paper, 'PSNR', LATENCY)}"
     if best is None or (best.value(LATENCY) or 0.0) >= (paper.value(LATENCY) or 0.0):
-        return f"{start}: no point told as much reaches its PSNR {how} in less time."
+        return f"{start}: no point that knows as much of the sensor reaches its PSNR {how} in less time."
     half = results.ratio(best.name, paper.name, LATENCY)[1] <= 0.5
-    surely = "; less than half the time over the whole interval" if half else ""
+    halved = "; less than half the time over the whole interval" if half else ""
     beside = _beside(results, best, paper, LATENCY, ENERGY)
-    return f"{start}, is matched {how} by {best.name} ({_of(best, 'PSNR', LATENCY)}): {beside}{surely}."
+    return f"{start}, is matched {how} by {best.name} ({_of(best, 'PSNR', LATENCY)}): {beside}{halved}."
 
 
 def tenth_energy(results: Results, paper: Outcome) -> str:
@@ -266,7 +267,7 @@ def tenth_energy(results: Results, paper: Outcome) -> str:
 
 def headline(results: Results, paper: Outcome | None) -> str:
     """One sentence for a project manager."""
-    best = as_good(results, paper, surely=False) if paper else None
+    best = as_good(results, paper, whole_interval=False) if paper else None
     if paper is None or best is None or (best.value(LATENCY) or 0.0) >= (paper.value(LATENCY) or 0.0):
         return _plain_headline(list(results.outcomes.values()))
     seconds = "in {} instead of {} s on the board (predicted)"
@@ -300,7 +301,7 @@ def _rivals(results: Results, paper: Outcome) -> list[Outcome]:
         if each is not paper
         and isinstance(each.board, DpuRun)
         and each.point.configuration == paper.point.configuration
-        and each.text["told"] == paper.text["told"]
+        and each.text["sensor"] == paper.text["sensor"]
     ]
 
 
@@ -324,21 +325,21 @@ def notes(
         "No board was used: figures of the board are predicted, its power is an assumption that no network changes.",
         f"Pictures are judged on {len(benchmark.pairs)} whole images of {len(set(benchmark.sites))} sites.",
         "The paper's shape is judged with the weights of that shape at hand, not with the paper's own.",
-        "Points are told apart by the differences on the same images: their own intervals show how images differ.",
-        f"Times on the board are told apart by their ratio, with none and all of the memory's hidden, and {spread}.",
-        "Points of one network, tile and configuration are told apart on the board by their count of tiles alone.",
+        "Points are distinguished by the differences on the same images: their own intervals show how images differ.",
+        f"Times on the board are distinguished by their ratio, none and all of the memory's hidden, and {spread}.",
+        "Points of one network, tile and configuration are distinguished on the board by their count of tiles alone.",
         "Energies of two networks or configurations may also differ by the whole range assumed for the power.",
         "With the exact halo the picture does not depend on the tile.",
         "With less, seams were measured on images cut in four and weighed by the swath's seams: predicted.",
         f"Host times, {ROUNDS} rounds of a tile of {HOST_TILE_PX} px, interleaved, are no proxy for the board.",
         f"INT8 files made here: {PATCHES} patches of {PATCH_PX} x {PATCH_PX} from {calibrated_on}.",
-        "Chains and peers are told both sensors; what a network was told stands beside it.",
+        "Chains and peers know both sensors; what a network knows of them stands beside it.",
         "A chain on the board's CPU is scaled from CPU time here by benchmarks of other programs: a wide interval.",
     ]
     sites = len(set(benchmark.sites))
     if sites < LEAST_SITES:
         found.append(
-            f"No interval over sites is shown, and pictures tell no two points apart: of {sites}, fewer than "
+            f"No interval over sites is shown, and pictures distinguish no two points: of {sites}, fewer than "
             f"{LEAST_SITES}, none could be trusted."
         )
     found += [f"{sampled[0].upper()}{sampled[1:]}."] if sampled else []
@@ -368,5 +369,5 @@ def _outcome(name: str, precision: str, values: tuple[float, float, float, float
     found["board energy"] = published(latency_s * power_w, "J", f"{PAPER}: latency x power")
     figures: dict[str, Figure] = {key: found.get(key) or unavailable(unit, NOTE) for key, unit in UNITS.items()}
     text = dict.fromkeys(("halo", "tile", "configuration", "runtime"), "not stated")
-    text |= {"method": name, "kind": "paper", "precision": precision, "told": "not stated"}
+    text |= {"method": name, "kind": "paper", "precision": precision, "sensor": "not stated"}
     return Outcome(Point(Variant(name, "paper", precision)), figures, text)

@@ -125,8 +125,14 @@ SEARCH_MAX = 3e13
 
 
 @dataclass(frozen=True)
-class Calibration:
-    """Where calibration patches come from: a folder of scenes, or drawn ones; never the images of the study."""
+class CalibrationScenes:
+    """What the INT8 files of a study are calibrated on: a folder of scenes, or drawn ones; never the study's images.
+
+    Attributes:
+        scenes: the folder; drawn scenes if None.
+        sensor: profile of the study, for networks that name none.
+        seed: of every random draw.
+    """
 
     scenes: Path | None
     sensor: str
@@ -156,7 +162,7 @@ class Calibration:
 
 
 def make_int8(
-    model: onnx.ModelProto, precision: str, calibration: Calibration, tick: Callable[[], None]
+    model: onnx.ModelProto, precision: str, calibration: CalibrationScenes, tick: Callable[[], None]
 ) -> onnx.ModelProto:
     """The network in INT8, host spelling.
 
@@ -202,12 +208,12 @@ class Opened:
 
 @dataclass(frozen=True)
 class MethodStore:
-    """Opens variants; `degraded` and `reference` are what chains are told."""
+    """Opens variants; `degraded` and `reference` are what chains know."""
 
     networks: dict[str, Network]
     degraded: SensorProfile
     reference: SensorProfile
-    calibration: Calibration
+    calibration: CalibrationScenes
     cache: Cache
 
     @property
@@ -223,7 +229,7 @@ class MethodStore:
             return str(error).rstrip(".")
         return ""
 
-    def told(self, variant: Variant) -> str:
+    def sensor_known(self, variant: Variant) -> str:
         """What a variant knows of the sensor."""
         if variant.kind != "network":
             return KNOWS

@@ -1,4 +1,4 @@
-"""A point with all that is known of it, points held against one another, and fronts of points that nothing beats.
+"""What was found of each point, points compared with one another, and fronts of points that none dominates.
 
 Figures come from what was measured of a point's parts and from the cost model; fronts hold by value and beyond
 intervals.
@@ -63,7 +63,11 @@ def front(places: Sequence[Place]) -> tuple[str, ...]:
 
 
 def dominates(a: Place, b: Place, judge: Judge) -> bool:
-    """Whether `a` is surely no worse than `b` in both, and surely better in one."""
+    """Whether `a` is no worse than `b` in both and better in one, by value and over the whole intervals.
+
+    Intervals of pictures and of times on this machine are 95 % bootstrap intervals of the difference or the ratio;
+    those of the board follow the rule in `board`.
+    """
     worse = a.cost > b.cost or a.quality < b.quality
     if worse or (a.cost, a.quality) == (b.cost, b.quality):
         return False
@@ -306,7 +310,7 @@ class Assembly:
             "halo": point.halo if network else "none",
             "tile": str(point.tile_px) if network else "none",
             "configuration": point.configuration or "none",
-            "told": self.measurements.store.told(point.variant),
+            "sensor": self.measurements.store.sensor_known(point.variant),
             "runtime": runtime_of(point.variant),
         }
 

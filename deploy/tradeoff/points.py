@@ -151,7 +151,7 @@ class Demand:
         miss = figure.value - self.limit if self.at_most else self.limit - figure.value
         return max(miss, 0.0) / (abs(self.limit) or 1.0)
 
-    def surely_kept(self, figure: Figure) -> bool:
+    def kept_throughout(self, figure: Figure) -> bool:
         """Whether the whole interval keeps it."""
         low, high = figure.interval or (figure.value or 0.0,) * 2
         return high <= self.limit if self.at_most else low >= self.limit

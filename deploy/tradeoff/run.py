@@ -26,7 +26,7 @@ from deploy.tradeoff.board import DpuRun
 from deploy.tradeoff.cache import Cache
 from deploy.tradeoff.host_time import TILE_PX
 from deploy.tradeoff.measurements import Measurements, run_jobs
-from deploy.tradeoff.methods import Calibration, MethodStore, find_networks, is_papers
+from deploy.tradeoff.methods import CalibrationScenes, MethodStore, find_networks, is_papers
 from deploy.tradeoff.outcome import Assembly, Outcome, Results
 from deploy.tradeoff.points import Point, Variant
 from deploy.tradeoff.selection import Request, select_points
@@ -160,7 +160,7 @@ def make_store(request: Request, cache: Cache) -> MethodStore:
     """The methods of a study."""
     networks = {network.name: network for network in find_networks(request.networks)}
     return MethodStore(
-        networks, *request.profiles, Calibration(request.calibration, request.sensor, request.seed), cache
+        networks, *request.profiles, CalibrationScenes(request.calibration, request.sensor, request.seed), cache
     )
 
 

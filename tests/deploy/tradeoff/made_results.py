@@ -31,7 +31,7 @@ class Made:
     features: int = 16
     tile_px: int = 640
     configuration: str = "C32B3"
-    told: str = "nothing"
+    sensor: str = "blind"
     scatter_db: float = 0.01
     halo: str = EXACT
 
@@ -52,7 +52,7 @@ def outcome(name: str, made: Made, number: int = 0) -> Outcome:
     }
     point = Point(Variant(name, "network", LEGAL), made.tile_px, made.halo, made.configuration)
     times = Times("one", (0.1 * made.blocks,) * 3, (0.1,) * 3, 1000)
-    return Outcome(point, figures, {"told": made.told}, scores, run, times)
+    return Outcome(point, figures, {"sensor": made.sensor}, scores, run, times)
 
 
 def results(points: Mapping[str, Made]) -> Results:

@@ -14,7 +14,7 @@ FAMILY = {
     "tiny": Made(44.0, 4, 16),
     "small": Made(45.3, 8, 32),
     "papers": Made(45.0, 16, 64),
-    "tuned": Made(46.9, 8, 32, told="trained for the sensor"),
+    "tuned": Made(46.9, 8, 32, sensor="trained for it"),
 }
 
 
@@ -68,12 +68,12 @@ def test_where_nothing_will_do_the_nearest_is_named(family: Results) -> None:
     assert "none has every figure" in words
 
 
-def test_the_paper_is_matched_by_what_is_told_no_more(family: Results) -> None:
+def test_the_paper_is_matched_by_what_knows_no_more(family: Results) -> None:
     """The network trained for the sensor is better still, and does not compare."""
     paper = papers_point(family, lambda method: method == "papers", "C32B3")
     assert paper is not None
-    for surely in (False, True):
-        best = as_good(family, paper, surely=surely)
+    for whole in (False, True):
+        best = as_good(family, paper, whole_interval=whole)
         assert best is not None
         assert best.point.variant.method == "small"
     equal, tenth = findings(family, paper)
@@ -90,7 +90,7 @@ def test_where_nothing_matches_the_paper_it_is_said() -> None:
     worse = results({"tiny": Made(44.8, 4, 16), "papers": Made(45.0, 16, 64)})
     paper = papers_point(worse, lambda method: method == "papers", "C32B3")
     equal, tenth = findings(worse, paper)
-    assert "no point told as much" in equal
+    assert "no point that knows as much" in equal
     assert "the best is tiny" in tenth
     assert "papers" in headline(worse, paper)
     slower = results({"huge": Made(46.0, 32, 64), "papers": Made(45.0, 16, 64)})
@@ -103,7 +103,7 @@ def test_points_on_another_configuration_are_not_held_against_the_paper() -> Non
     found = results({"small": Made(45.3, 8, 32, configuration="C32B6"), "papers": Made(45.0, 16, 64)})
     paper = papers_point(found, lambda method: method == "papers", "C32B3")
     assert paper is not None
-    assert as_good(found, paper, surely=False) is None
+    assert as_good(found, paper, whole_interval=False) is None
 
 
 def test_without_the_papers_network_there_is_no_finding(family: Results) -> None:
@@ -132,7 +132,7 @@ def test_below_five_sites_pictures_tell_no_two_points_apart(family: Results) -> 
     for front in fronts(few):
         assert not front.dominated
         assert not front.prices
-    assert as_good(few, few.outcomes[papers], surely=True) is None
+    assert as_good(few, few.outcomes[papers], whole_interval=True) is None
     sentences = " ".join(findings(few, few.outcomes[papers]))
     assert "inf" not in sentences
     assert "over the whole interval: " not in sentences
@@ -160,9 +160,9 @@ def test_a_match_by_value_alone_is_followed_by_one_over_the_whole_interval() -> 
             "papers": Made(45.0, 16, 64),
         }
     )
-    by_value, surely, _ = findings(found, papers_point(found, lambda method: method == "papers", "C32B3"))
+    by_value, throughout, _ = findings(found, papers_point(found, lambda method: method == "papers", "C32B3"))
     assert "matched within 0.1 dB by tiny" in by_value
-    assert "matched within 0.1 dB over the whole interval by small" in surely
+    assert "matched within 0.1 dB over the whole interval by small" in throughout
 
 
 def test_a_step_that_images_cannot_tell_has_no_price() -> None:
@@ -194,6 +194,6 @@ def test_of_points_that_images_cannot_tell_apart_the_cheaper_is_chosen() -> None
     name, words = asked(found, budget="latency<=1000s")
     assert name == "small"
     assert "of papers INT8 legal" in words
-    assert "cannot be told from it" in words
+    assert "is not distinguishable from it" in words
     far = results({"small": Made(45.0, 8, 32), "papers": Made(45.1, 16, 64, scatter_db=2.0)})
     assert asked(far, budget="latency<=1000s")[0] == "papers"

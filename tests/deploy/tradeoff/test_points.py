@@ -73,7 +73,7 @@ def test_wide_engines_are_looked_at_for_wide_layers_alone() -> None:
         assert len(set(found)) == len(found)
 
 
-def test_the_papers_network_is_told_by_its_shape() -> None:
+def test_the_papers_network_is_known_by_its_shape() -> None:
     for name in shipped_names():
         for model in (float_model(shipped_weights(name)), Network(name, None, SHIPPED / f"{name}-int8.onnx").model()):
             assert is_papers(model) == (name == "convbeers")

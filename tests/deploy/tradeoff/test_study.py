@@ -115,7 +115,7 @@ def test_every_figure_of_every_point_is_a_number_or_has_a_reason(kept: tuple[Stu
                 assert figure.source
     legal = next(row for row in points if "wide INT8 legal" in row.name)
     assert all(figure.value is not None for key, figure in legal.figures.items() if key != "LPIPS-squeeze")
-    assert legal.text["told"] == "trained for the sensor"
+    assert legal.text["sensor"] == "trained for it"
 
 
 def test_two_sites_give_no_interval_and_images_smaller_than_the_profile_asks_for_are_owned_up_to(
@@ -127,7 +127,7 @@ def test_two_sites_give_no_interval_and_images_smaller_than_the_profile_asks_for
         assert psnr.mode != "measured" or psnr.interval is None
     assert not any("dB [" in sentence for front in study.fronts for sentence in front.prices)
     notes = " ".join(study.notes)
-    assert "No interval over sites is shown, and pictures tell no two points apart: of 2, fewer than 5" in notes
+    assert "No interval over sites is shown, and pictures distinguish no two points: of 2, fewer than 5" in notes
     assert "Scene pixels per pixel: 2 (2 of 2 images), where pleiades-degraded states 5" in notes
 
 
