@@ -1,6 +1,6 @@
 """What this machine takes: the traditional pipeline on an image, and networks' times for a tile.
 
-Networks take turns, so that whatever else runs here meets them alike and their times can be compared; load, clock
+Networks are timed interleaved, so that whatever else runs here meets them alike; load, clock
 and memory stand beside what was measured.
 """
 
@@ -17,6 +17,7 @@ import psutil
 import torch
 
 from deploy.bench.host_state import Watch, memory_rise, watched
+from deploy.bench.interleaved import interleaved
 from deploy.bench.profile import node_rows, profile, timed
 from deploy.bench.tables import TABLE, Swath, board_cpu_row, efficiency
 from deploy.dpu.reading import network_of
@@ -43,8 +44,8 @@ class Timed:
     rise_bytes: int = 0
 
 
-def take_turns(runs: Sequence[Timed], tile_px: int, threads: int, min_time_s: float, min_runs: int) -> None:
-    """Run each for one tile in turn until all have run for `min_time_s` and `min_runs` times; fills in `runs`.
+def time_networks(runs: Sequence[Timed], tile_px: int, threads: int, min_time_s: float, min_runs: int) -> None:
+    """Time each for one tile, interleaved, until all have run for `min_time_s` and `min_runs` times; fills in `runs`.
 
     Raises:
         ModelError: a network that gives NaN or infinity.
@@ -57,11 +58,14 @@ def take_turns(runs: Sequence[Timed], tile_px: int, threads: int, min_time_s: fl
             require_finite(session.run(None, feed), run.name)  # warm-up, not counted
         run.rise_bytes = memory.rise_bytes
         calls.append(partial(session.run, None, feed))
-    while min(sum(run.times_s) for run in runs) < min_time_s or len(runs[0].times_s) < min_runs:
-        for run, call in zip(runs, calls, strict=True):
-            _, time_s, power = timed(call)
-            run.times_s.append(time_s)
-            run.powers.append(power)
+
+    def enough(found: Sequence[Sequence[tuple[float, Figure]]]) -> bool:
+        shortest_s = min(sum(time_s for time_s, _ in taken) for taken in found)
+        return shortest_s >= min_time_s and len(found[0]) >= min_runs
+
+    for run, taken in zip(runs, interleaved(calls, lambda call: timed(call)[1:], enough), strict=True):
+        run.times_s += [time_s for time_s, _ in taken]
+        run.powers += [power for _, power in taken]
 
 
 def tile_feed(model: onnx.ModelProto, tile_px: int, where: str = "ONNX model") -> dict[str, np.ndarray]:
@@ -97,7 +101,7 @@ def _row(run: Timed, tile_px: int, conditions: Mapping[str, Figure]) -> Row:
 def _ratio_row(runs: Sequence[Timed]) -> Row:
     int8, float32 = sorted(runs, key=lambda run: not is_quantised(run.model))
     ratio = statistics.median(float32.times_s) / statistics.median(int8.times_s)
-    source = f"medians of {len(int8.times_s)} runs each, taking turns"
+    source = f"medians of {len(int8.times_s)} runs each, interleaved"
     return Row("host", "float32 time / INT8 time, here", {"ratio": measured(ratio, "x", source)})
 
 
@@ -181,7 +185,7 @@ def _wall_and_cpu_s(dn: np.ndarray, sensors: Sensors) -> tuple[float, float]:
 
 
 def host_rows(model: Path, target: TargetProfile, tile_px: int, threads: int = 0) -> list[Row]:
-    """A network's time for one tile through onnxruntime, float32 and INT8 taking turns, and its nodes' times.
+    """A network's time for one tile through onnxruntime, float32 and INT8 interleaved, and its nodes' times.
 
     Each runs for the target's minimum time and count, one run for warm-up left out. Its pair in the other
     precision is the shipped network of the same variant; without one it runs alone.
@@ -197,7 +201,7 @@ def host_rows(model: Path, target: TargetProfile, tile_px: int, threads: int = 0
         runs.append(Timed(f"{'INT8' if is_quantised(other) else 'float32'} of the same shape", other))
     min_time_s, min_runs = target.value("measurement", "min_time_s"), int(target.value("measurement", "min_runs"))
     with watched() as watch:
-        take_turns(runs, tile_px, threads, min_time_s, min_runs)
+        time_networks(runs, tile_px, threads, min_time_s, min_runs)
     conditions = _conditions(watch, threads or psutil.cpu_count(logical=False) or 1)
     nodes, total_ms = profile(given, tile_feed(given, tile_px), threads)
     return [*timed_rows(runs, tile_px, conditions), *node_rows(nodes, total_ms)]

@@ -102,7 +102,8 @@ def show(study: "Study") -> None:
     from profiles.figures import Row
 
     rows = [
-        Row(r.table, r.name, {key: r.figures[key] for key in SHOWN}, {"told": r.text["told"]}) for r in study.points
+        Row(r.table, r.name, {key: r.figures[key] for key in SHOWN}, {"sensor": r.text["sensor"]})
+        for r in study.points
     ]
     print_rows("operating points", rows)
     for front in study.fronts:

@@ -31,7 +31,7 @@ Values = Mapping[str, float | None]
 
 @dataclass(frozen=True)
 class Scores:
-    """Scores of a unit: of each pair, in their order, and on targets."""
+    """Scores of a variant: of each pair, in their order, and on targets."""
 
     images: tuple[Values, ...]
     targets: Mapping[str, Figure] = field(default_factory=dict)
@@ -51,8 +51,8 @@ class Scores:
 
 
 @dataclass(frozen=True)
-class Ground:
-    """What all units are judged on.
+class BenchmarkSet:
+    """What all variants are judged on.
 
     Attributes:
         pairs: held-out pairs.
@@ -70,7 +70,7 @@ class Ground:
 
     @cached_property
     def key(self) -> dict[str, object]:
-        """Everything that scores depend on besides the unit."""
+        """Everything that scores depend on besides the variant."""
         pairs = pixels_digest(image for pair in self.pairs for image in (pair.degraded, pair.reference))
         names = [pair.name for pair in self.pairs]
         targets = pixels_digest([*self.targets.edges, *(flat for _, flat in self.targets.flats)])
@@ -83,31 +83,33 @@ class Ground:
         return [pair.site for pair in self.pairs]
 
 
-def measure(restore: Restore, ground: Ground, tick: Callable[[], None]) -> Scores:
+def measure(restore: Restore, benchmark: BenchmarkSet, tick: Callable[[], None]) -> Scores:
     """Scores on every pair and on the targets; `tick` is called once a pair and once for the targets."""
-    images = measure_images(restore, ground, tick)
-    found = target_figures(Method("", restore, ""), ground.targets)
+    images = measure_images(restore, benchmark, tick)
+    found = target_figures(Method("", restore, ""), benchmark.targets)
     tick()
-    dark = snr_name(ground.targets.flats[0][0])
+    dark = snr_name(benchmark.targets.flats[0][0])
     return Scores(images, {"MTF at Nyquist": found["MTF at Nyquist"], FLAT: found[dark]})
 
 
-def measure_images(restore: Restore, ground: Ground, tick: Callable[[], None]) -> tuple[Values, ...]:
+def measure_images(restore: Restore, benchmark: BenchmarkSet, tick: Callable[[], None]) -> tuple[Values, ...]:
     """Scores on every pair."""
     images = []
-    for pair in ground.pairs:
-        values = ground.instruments.score(restore(pair.degraded), pair.reference, pair.degraded)
+    for pair in benchmark.pairs:
+        values = benchmark.instruments.score(restore(pair.degraded), pair.reference, pair.degraded)
         images.append({key: value for key, value in values.items() if key != "PSNR gain"})
         tick()
     return tuple(images)
 
 
-def measure_mae(restore: Restore, float_restore: Restore, ground: Ground, tick: Callable[[], None]) -> Scores:
+def measure_mae(
+    restore: Restore, float_restore: Restore, benchmark: BenchmarkSet, tick: Callable[[], None]
+) -> Scores:
     """Mean difference of INT8 from float on every pair, of full scale; both in whole digital numbers, as in files."""
     images = []
-    for pair in ground.pairs:
+    for pair in benchmark.pairs:
         in_int8, in_float = (np.asarray(each(pair.degraded), np.float64) for each in (restore, float_restore))
-        images.append({MAE: float(np.abs(in_int8 - in_float).mean()) / ground.instruments.max_dn})
+        images.append({MAE: float(np.abs(in_int8 - in_float).mean()) / benchmark.instruments.max_dn})
         tick()
     return Scores(tuple(images))
 

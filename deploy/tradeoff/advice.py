@@ -9,13 +9,13 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 from deploy.bench.tables import PAPER, PAPER_TILE_PX, Swath
-from deploy.tradeoff.accuracy import Ground
+from deploy.tradeoff.accuracy import BenchmarkSet
 from deploy.tradeoff.board import PAIR_QUANTILE, DpuRun, pair_error
 from deploy.tradeoff.host_time import ROUNDS
 from deploy.tradeoff.host_time import TILE_PX as HOST_TILE_PX
 from deploy.tradeoff.methods import PATCH_PX, PATCHES
-from deploy.tradeoff.outcome import COSTS, QUALITIES, UNITS, Arena, Outcome, Place, Plane, dominated, front
-from deploy.tradeoff.points import EXACT, Demand, Point, Unit, on_dpu, shortfall
+from deploy.tradeoff.outcome import COSTS, QUALITIES, UNITS, Outcome, Place, Plane, Results, dominated, front
+from deploy.tradeoff.points import EXACT, Demand, Point, Variant, on_dpu, shortfall
 from deploy.tradeoff.study import Front
 from model.evaluation.scores import NOTE
 from model.metrics.bootstrap import LEAST_SITES
@@ -34,42 +34,43 @@ class Choice:
     advice: tuple[str, ...]
 
 
-def choose(arena: Arena, budget: Sequence[Demand], need: Sequence[Demand]) -> Choice:
+def choose(results: Results, budget: Sequence[Demand], need: Sequence[Demand]) -> Choice:
     """Within a budget the best PSNR; for a need alone the least board latency, or host time where none has one."""
     demands = [*budget, *need]
-    goal = Goal(QUALITY, -1) if budget else Goal(_cost(arena), 1)
-    ranked = [each for each in arena.outcomes.values() if each.value(goal.key) is not None]
+    goal = Goal(QUALITY, -1) if budget else Goal(_cost(results), 1)
+    ranked = [each for each in results.outcomes.values() if each.value(goal.key) is not None]
     kept = [each for each in ranked if not shortfall(each.figures, demands)]
     asked = " and ".join(map(str, demands))
     if not kept:
-        return Choice(None, (_nearest(ranked or list(arena.outcomes.values()), demands, asked),))
+        return Choice(None, (_nearest(ranked or list(results.outcomes.values()), demands, asked),))
     best = chosen = min(kept, key=goal.of)
     if goal.key == QUALITY:
-        paid = next((demand.key for demand in budget if demand.key in COSTS), _cost(arena))
-        chosen = min(_alike(arena, best, kept), key=lambda each: each.value(paid) or math.inf)
-    found = f"{chosen.name} (told: {chosen.text['told']}), {figures_words(chosen, demands, goal.key)}"
+        paid = next((demand.key for demand in budget if demand.key in COSTS), _cost(results))
+        chosen = min(_alike(results, best, kept), key=lambda each: each.value(paid) or math.inf)
+    found = f"{chosen.name} (sensor: {chosen.text['sensor']}), {figures_words(chosen, demands, goal.key)}"
     sentences = [f"For {asked}: {found}; {_why(chosen, best, goal, len(kept))}."]
-    sentences += _doubts(chosen, demands)
+    sentences += _unsure(chosen, demands)
     sentences.append(_better(best, ranked, demands, goal))
     return Choice(chosen, tuple(sentences))
 
 
-def _alike(arena: Arena, best: Outcome, kept: Sequence[Outcome]) -> list[Outcome]:
+def _alike(results: Results, best: Outcome, kept: Sequence[Outcome]) -> list[Outcome]:
     """Points near the best that the images cannot tell from it."""
     least = (best.value(QUALITY) or 0.0) - ALIKE_DB
     near = [each for each in kept if (each.value(QUALITY) or 0.0) >= least]
-    return [each for each in near if arena.gain(best.name, each.name, QUALITY)[0] <= 0]
+    return [each for each in near if results.gain(best.name, each.name, QUALITY)[0] <= 0]
 
 
 def _why(chosen: Outcome, best: Outcome, goal: "Goal", count: int) -> str:
     if chosen is best:
         return f"it has the {goal.words} of the {count} points that keep it"
     higher = f"{best.name}, {figure_words(best.figures[goal.key])}"
-    return f"the {goal.words} of the {count} points that keep it, of {higher}, cannot be told from it, and costs more"
+    beside = "is not distinguishable from it, and costs more"
+    return f"the {goal.words} of the {count} points that keep it, of {higher}, {beside}"
 
 
-def _cost(arena: Arena) -> str:
-    had = (key for key in COSTS if any(each.value(key) is not None for each in arena.outcomes.values()))
+def _cost(results: Results) -> str:
+    had = (key for key in COSTS if any(each.value(key) is not None for each in results.outcomes.values()))
     return next(had, COSTS[0])
 
 
@@ -102,9 +103,9 @@ def figure_words(figure: Figure) -> str:
     return f"{figure}{unit if figure.value is not None else ''}"
 
 
-def _doubts(best: Outcome, demands: Sequence[Demand]) -> list[str]:
+def _unsure(best: Outcome, demands: Sequence[Demand]) -> list[str]:
     """Demands that the value keeps, and its interval does not."""
-    unsure = [demand for demand in demands if not demand.surely_kept(best.figures[demand.key])]
+    unsure = [demand for demand in demands if not demand.kept_throughout(best.figures[demand.key])]
     if not unsure:
         return []
     return [f"Its value keeps {' and '.join(map(str, unsure))}, but not the whole interval."]
@@ -140,64 +141,66 @@ BESIDE = {"board latency": ("board energy",), "board energy": ("board latency",)
 """What else a step costs."""
 
 
-def fronts(arena: Arena) -> tuple[Front, ...]:
+def fronts(results: Results) -> tuple[Front, ...]:
     """A front for each pair of a cost and a quality that some points have."""
-    return tuple(_fronts(arena))
+    return tuple(_fronts(results))
 
 
-def _fronts(arena: Arena) -> Iterator[Front]:
+def _fronts(results: Results) -> Iterator[Front]:
     for y in QUALITIES:
         for x in COSTS:
-            found = places(arena, x, y)
+            found = places(results, x, y)
             if found:
                 members = front(found)
-                steps = apart(arena, members, x, y)
-                yield Front(x, y, members, steps, dominated(found, Plane(arena, x, y)), prices(arena, steps, x, y))
+                steps = apart(results, members, x, y)
+                yield Front(
+                    x, y, members, steps, dominated(found, Plane(results, x, y)), prices(results, steps, x, y)
+                )
 
 
-def places(arena: Arena, x: str, y: str) -> list[Place]:
+def places(results: Results, x: str, y: str) -> list[Place]:
     """The points that have both figures."""
-    return [place for outcome in arena.outcomes.values() if (place := outcome.place(x, y))]
+    return [place for outcome in results.outcomes.values() if (place := outcome.place(x, y))]
 
 
-def prices(arena: Arena, steps: tuple[str, ...], x: str, y: str) -> tuple[str, ...]:
+def prices(results: Results, steps: tuple[str, ...], x: str, y: str) -> tuple[str, ...]:
     """A sentence for each step, from cheap to dear."""
     found = list(pairwise(steps))
-    return tuple(_price(arena, *step, x, y, last=step == found[-1]) for step in found)
+    return tuple(_price(results, *step, x, y, last=step == found[-1]) for step in found)
 
 
-def apart(arena: Arena, members: Sequence[str], x: str, y: str) -> tuple[str, ...]:
-    """Members that are surely better and surely dearer, each than the one before; of those as dear the best."""
+def apart(results: Results, members: Sequence[str], x: str, y: str) -> tuple[str, ...]:
+    """Members that are better and dearer than the one before beyond the intervals; of those as dear the best."""
     kept = list(members[:1])
     for name in members[1:]:
-        if arena.gain(name, kept[-1], y)[0] <= 0:
+        if results.gain(name, kept[-1], y)[0] <= 0:
             continue
-        if arena.ratio(name, kept[-1], x)[0] <= 1:
+        if results.ratio(name, kept[-1], x)[0] <= 1:
             kept.pop()
         kept.append(name)
     return tuple(kept)
 
 
-def _price(arena: Arena, cheap: str, dear: str, x: str, y: str, *, last: bool) -> str:
-    times = " and ".join(times_words(arena, dear, cheap, key) for key in (x, *BESIDE[x]))
-    bought = f"{'The last' if last else 'A step of'} {gain_words(arena, dear, cheap, y)}"
+def _price(results: Results, cheap: str, dear: str, x: str, y: str, *, last: bool) -> str:
+    times = " and ".join(times_words(results, dear, cheap, key) for key in (x, *BESIDE[x]))
+    bought = f"{'The last' if last else 'A step of'} {gain_words(results, dear, cheap, y)}"
     return f"{bought}, from {cheap} to {dear}, costs {times}."
 
 
-def gain_words(arena: Arena, better: str, worse: str, key: str) -> str:
+def gain_words(results: Results, better: str, worse: str, key: str) -> str:
     """By how much one point is better, with its interval where there is one: "0.32 dB [0.2, 0.5] of PSNR"."""
-    values = [arena.outcomes[name].figures[key] for name in (better, worse)]
+    values = [results.outcomes[name].figures[key] for name in (better, worse)]
     gain = QUALITIES[key] * ((values[0].value or 0.0) - (values[1].value or 0.0))
-    low, high = arena.gain(better, worse, key)
+    low, high = results.gain(better, worse, key)
     unit = values[0].unit if values[0].unit == "dB" else ""
     interval = f"[{number(low, 2)}, {number(high, 2)}]" if math.isfinite(high - low) else ""
     return " ".join(f"{number(gain, 2)} {unit} {interval} of {key}".split())
 
 
-def times_words(arena: Arena, a: str, b: str, key: str) -> str:
+def times_words(results: Results, a: str, b: str, key: str) -> str:
     """How many times as much one point costs: "2.1 times [1.7, 2.6] the board latency"."""
-    low, high = arena.ratio(a, b, key)
-    return f"{number(arena.times(a, b, key), 2)} times [{number(low, 2)}, {number(high, 2)}] the {key}"
+    low, high = results.ratio(a, b, key)
+    return f"{number(results.times(a, b, key), 2)} times [{number(low, 2)}, {number(high, 2)}] the {key}"
 
 
 EQUAL_DB = 0.1
@@ -205,74 +208,74 @@ ENERGY_SHARE = 0.1
 LATENCY, ENERGY = "board latency", "board energy"
 
 
-def papers_point(arena: Arena, is_papers: Callable[[str], bool], configuration: str) -> Outcome | None:
+def papers_point(results: Results, is_papers: Callable[[str], bool], configuration: str) -> Outcome | None:
     """The paper's network among the outcomes; `is_papers` tells it by a method's name."""
-    for outcome in arena.outcomes.values():
+    for outcome in results.outcomes.values():
         point = outcome.point
         usual = (point.tile_px, point.halo, point.configuration) == (PAPER_TILE_PX, EXACT, configuration)
-        if usual and on_dpu(point.unit) and is_papers(point.unit.method) and outcome.board:
+        if usual and on_dpu(point.variant) and is_papers(point.variant.method) and outcome.board:
             return outcome
     return None
 
 
-def findings(arena: Arena, paper: Outcome | None) -> tuple[str, ...]:
+def findings(results: Results, paper: Outcome | None) -> tuple[str, ...]:
     """As sentences; without the paper's network the reason why there are none."""
     if paper is None:
         return (
             "The paper's network (16 blocks of 64 features) is not among the networks: nothing is held against it.",
         )
-    best, sure = (as_good(arena, paper, surely=surely) for surely in (False, True))
-    sentences = [equal_quality(arena, paper, best, f"within {EQUAL_DB} dB")]
-    if sure is not best:
-        sentences.append(equal_quality(arena, paper, sure, f"within {EQUAL_DB} dB over the whole interval"))
-    return (*sentences, tenth_energy(arena, paper))
+    best, throughout = (as_good(results, paper, whole_interval=whole) for whole in (False, True))
+    sentences = [equal_quality(results, paper, best, f"within {EQUAL_DB} dB")]
+    if throughout is not best:
+        sentences.append(equal_quality(results, paper, throughout, f"within {EQUAL_DB} dB over the whole interval"))
+    return (*sentences, tenth_energy(results, paper))
 
 
-def as_good(arena: Arena, paper: Outcome, *, surely: bool) -> Outcome | None:
+def as_good(results: Results, paper: Outcome, *, whole_interval: bool) -> Outcome | None:
     """The fastest of the points that reach its PSNR within EQUAL_DB: by value, or over the whole interval."""
 
     def lead_db(each: Outcome) -> float:
         by_value = (each.value("PSNR") or 0.0) - (paper.value("PSNR") or 0.0)
-        return min(arena.gain(each.name, paper.name, "PSNR")[0], by_value) if surely else by_value
+        return min(results.gain(each.name, paper.name, "PSNR")[0], by_value) if whole_interval else by_value
 
-    found = [each for each in _rivals(arena, paper) if lead_db(each) >= -EQUAL_DB]
+    found = [each for each in _rivals(results, paper) if lead_db(each) >= -EQUAL_DB]
     return min(found, key=lambda each: each.value(LATENCY) or 0.0, default=None)
 
 
-def equal_quality(arena: Arena, paper: Outcome, best: Outcome | None, how: str) -> str:
+def equal_quality(results: Results, paper: Outcome, best: Outcome | None, how: str) -> str:
     """That the fastest of the points that are as good is faster, or that none is."""
-    start = f"The paper's shape with the weights of {paper.point.unit.method}, {_of(paper, 'PSNR', LATENCY)}"
+    start = f"The paper's shape with the weights of {paper.point.variant.method}, {_of(paper, 'PSNR', LATENCY)}"
     if best is None or (best.value(LATENCY) or 0.0) >= (paper.value(LATENCY) or 0.0):
-        return f"{start}: no point told as much reaches its PSNR {how} in less time."
-    half = arena.ratio(best.name, paper.name, LATENCY)[1] <= 0.5
-    surely = "; less than half the time over the whole interval" if half else ""
-    beside = _beside(arena, best, paper, LATENCY, ENERGY)
-    return f"{start}, is matched {how} by {best.name} ({_of(best, 'PSNR', LATENCY)}): {beside}{surely}."
+        return f"{start}: no point that knows as much of the sensor reaches its PSNR {how} in less time."
+    half = results.ratio(best.name, paper.name, LATENCY)[1] <= 0.5
+    halved = "; less than half the time over the whole interval" if half else ""
+    beside = _beside(results, best, paper, LATENCY, ENERGY)
+    return f"{start}, is matched {how} by {best.name} ({_of(best, 'PSNR', LATENCY)}): {beside}{halved}."
 
 
-def tenth_energy(arena: Arena, paper: Outcome) -> str:
+def tenth_energy(results: Results, paper: Outcome) -> str:
     """The best of the points that take a tenth of its energy, or that there is none."""
     most = ENERGY_SHARE * (paper.value(ENERGY) or 0.0)
-    found = [each for each in _rivals(arena, paper) if (each.value(ENERGY) or 0.0) <= most]
+    found = [each for each in _rivals(results, paper) if (each.value(ENERGY) or 0.0) <= most]
     start = f"At a tenth of its energy ({number(most, 3)} of {number(paper.value(ENERGY) or 0.0, 3)} J)"
     if not found:
-        cheapest = min(_rivals(arena, paper), key=lambda each: each.value(ENERGY) or 0.0, default=paper)
+        cheapest = min(_rivals(results, paper), key=lambda each: each.value(ENERGY) or 0.0, default=paper)
         return f"{start} there is no point; the least takes {cheapest.name}, {_of(cheapest, ENERGY, 'PSNR')}."
     best = max(found, key=lambda each: each.value("PSNR") or 0.0)
-    return f"{start} the best is {best.name} ({_of(best, 'PSNR', ENERGY)}): {_beside(arena, best, paper, ENERGY)}."
+    return f"{start} the best is {best.name} ({_of(best, 'PSNR', ENERGY)}): {_beside(results, best, paper, ENERGY)}."
 
 
-def headline(arena: Arena, paper: Outcome | None) -> str:
+def headline(results: Results, paper: Outcome | None) -> str:
     """One sentence for a project manager."""
-    best = as_good(arena, paper, surely=False) if paper else None
+    best = as_good(results, paper, whole_interval=False) if paper else None
     if paper is None or best is None or (best.value(LATENCY) or 0.0) >= (paper.value(LATENCY) or 0.0):
-        return _plain_headline(list(arena.outcomes.values()))
+        return _plain_headline(list(results.outcomes.values()))
     seconds = "in {} instead of {} s on the board (predicted)"
     swift = seconds.format(*(number(each.value(LATENCY) or 0.0, 2) for each in (best, paper)))
     decibels = " beside ".join(f"{each.value('PSNR') or 0.0:.2f}" for each in (best, paper))
     where = f"tiles of {best.point.tile_px} on {best.point.configuration}"
     return (
-        f"{best.point.unit} in {where} restores the swath {swift}, within {EQUAL_DB} dB of the paper's shape: "
+        f"{best.point.variant} in {where} restores the swath {swift}, within {EQUAL_DB} dB of the paper's shape: "
         f"PSNR {decibels} dB on the same pairs."
     )
 
@@ -290,23 +293,23 @@ def _plain_headline(outcomes: Sequence[Outcome]) -> str:
     return f"{sentence}; the fastest on the board is {fastest.name}, {_of(fastest, LATENCY, 'PSNR')}."
 
 
-def _rivals(arena: Arena, paper: Outcome) -> list[Outcome]:
+def _rivals(results: Results, paper: Outcome) -> list[Outcome]:
     """The points that compare with the paper's network: see the module."""
     return [
         each
-        for each in arena.outcomes.values()
+        for each in results.outcomes.values()
         if each is not paper
         and isinstance(each.board, DpuRun)
         and each.point.configuration == paper.point.configuration
-        and each.text["told"] == paper.text["told"]
+        and each.text["sensor"] == paper.text["sensor"]
     ]
 
 
-def _beside(arena: Arena, a: Outcome, b: Outcome, *costs: str) -> str:
-    times = " and ".join(times_words(arena, a.name, b.name, key) for key in costs)
+def _beside(results: Results, a: Outcome, b: Outcome, *costs: str) -> str:
+    times = " and ".join(times_words(results, a.name, b.name, key) for key in costs)
     more = (a.value("PSNR") or 0.0) >= (b.value("PSNR") or 0.0)
     better, worse = (a, b) if more else (b, a)
-    return f"{gain_words(arena, better.name, worse.name, 'PSNR')} {'more' if more else 'less'}, for {times}"
+    return f"{gain_words(results, better.name, worse.name, 'PSNR')} {'more' if more else 'less'}, for {times}"
 
 
 def _of(outcome: Outcome, *keys: str) -> str:
@@ -314,34 +317,34 @@ def _of(outcome: Outcome, *keys: str) -> str:
 
 
 def notes(
-    ground: Ground, sampled: str, small: Sequence[str], lacks: Mapping[str, str], calibrated_on: str
+    benchmark: BenchmarkSet, sampled: str, small: Sequence[str], lacks: Mapping[str, str], calibrated_on: str
 ) -> tuple[str, ...]:
     """Sentences, the most important first; `sampled` says at what oversampling, where that is not the profile's."""
     spread = f"{math.exp(pair_error()):.2f} times either way ({PAIR_QUANTILE:.0%} of published pairs)"
     found = [
         "No board was used: figures of the board are predicted, its power is an assumption that no network changes.",
-        f"Pictures are judged on {len(ground.pairs)} whole images of {len(set(ground.sites))} sites.",
+        f"Pictures are judged on {len(benchmark.pairs)} whole images of {len(set(benchmark.sites))} sites.",
         "The paper's shape is judged with the weights of that shape at hand, not with the paper's own.",
-        "Points are told apart by the differences on the same images: their own intervals show how images differ.",
-        f"Times on the board are told apart by their ratio, with none and all of the memory's hidden, and {spread}.",
-        "Points of one network, tile and configuration are told apart on the board by their count of tiles alone.",
+        "Points are distinguished by the differences on the same images: their own intervals show how images differ.",
+        f"Times on the board are distinguished by their ratio, none and all of the memory's hidden, and {spread}.",
+        "Points of one network, tile and configuration are distinguished on the board by their count of tiles alone.",
         "Energies of two networks or configurations may also differ by the whole range assumed for the power.",
         "With the exact halo the picture does not depend on the tile.",
         "With less, seams were measured on images cut in four and weighed by the swath's seams: predicted.",
-        f"Host times, {ROUNDS} rounds of a tile of {HOST_TILE_PX} px in turns, are no proxy for the board.",
+        f"Host times, {ROUNDS} rounds of a tile of {HOST_TILE_PX} px, interleaved, are no proxy for the board.",
         f"INT8 files made here: {PATCHES} patches of {PATCH_PX} x {PATCH_PX} from {calibrated_on}.",
-        "Chains and peers are told both sensors; what a network was told stands beside it.",
+        "Chains and peers know both sensors; what a network knows of them stands beside it.",
         "A chain on the board's CPU is scaled from CPU time here by benchmarks of other programs: a wide interval.",
     ]
-    sites = len(set(ground.sites))
+    sites = len(set(benchmark.sites))
     if sites < LEAST_SITES:
         found.append(
-            f"No interval over sites is shown, and pictures tell no two points apart: of {sites}, fewer than "
+            f"No interval over sites is shown, and pictures distinguish no two points: of {sites}, fewer than "
             f"{LEAST_SITES}, none could be trusted."
         )
     found += [f"{sampled[0].upper()}{sampled[1:]}."] if sampled else []
     found += [f"Left out, too small: {', '.join(small)}."] if small else []
-    return (*found, *(f"{unit} is not there: {reason}." for unit, reason in lacks.items()))
+    return (*found, *(f"{variant} is not there: {reason}." for variant, reason in lacks.items()))
 
 
 SIZE_PX = (13600, 9016)
@@ -366,5 +369,5 @@ def _outcome(name: str, precision: str, values: tuple[float, float, float, float
     found["board energy"] = published(latency_s * power_w, "J", f"{PAPER}: latency x power")
     figures: dict[str, Figure] = {key: found.get(key) or unavailable(unit, NOTE) for key, unit in UNITS.items()}
     text = dict.fromkeys(("halo", "tile", "configuration", "runtime"), "not stated")
-    text |= {"method": name, "kind": "paper", "precision": precision, "told": "not stated"}
-    return Outcome(Point(Unit(name, "paper", precision)), figures, text)
+    text |= {"method": name, "kind": "paper", "precision": precision, "sensor": "not stated"}
+    return Outcome(Point(Variant(name, "paper", precision)), figures, text)

@@ -1,4 +1,4 @@
-"""What a point costs on the board, and how sure it is that one costs less than another.
+"""What a point costs on the board, and by how much that of one point differs from another's.
 
 Two predictions of the DPU lean on one model and share most of its error. So points are compared by the ratio of their
 times, and its interval is made by this rule:

@@ -1,12 +1,14 @@
-"""What a unit takes on this machine: one fixed tile, all units in turns, so that what else runs meets them alike."""
+"""What a variant takes on this machine for one fixed tile, interleaved with all others."""
 
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Self
 
 import numpy as np
 
+from deploy.bench.interleaved import Call, interleaved
 from model.evaluation.methods import Restore
 from profiles.figures import Figure, measured
 
@@ -17,10 +19,10 @@ DRAWS, LEVEL = 1000, 0.95
 
 @dataclass(frozen=True)
 class Times:
-    """What a unit took for one tile, round by round.
+    """What a variant took for one tile, round by round.
 
     Attributes:
-        session: names the run whose rounds they were: units of one session met the same machine.
+        session: names the run whose rounds they were: variants of one session met the same machine.
         wall_s: on the clock.
         cpu_s: of all cores together.
         pixels: of the tile.
@@ -52,31 +54,38 @@ class Times:
         return min(self.cpu_s) / self.pixels, max(self.cpu_s) / self.pixels
 
 
-def take_turns(units: Sequence[Restore], tile: np.ndarray, tick: Callable[[], None]) -> list[Times]:
-    """Run each on the tile in turn, ROUNDS times after one for warm-up; `tick` is called once a round."""
-    for restore in units:
+def time_variants(variants: Sequence[Restore], tile: np.ndarray, tick: Callable[[], None]) -> list[Times]:
+    """Times of each variant on the same tile, ROUNDS of them interleaved after one run for warm-up.
+
+    Args:
+        variants: restore digital numbers (H, W) float32.
+        tile: what they restore.
+        tick: called once a round, and once after the warm-up.
+    """
+    for restore in variants:
         restore(tile)
     tick()
-    wall_s, cpu_s = np.zeros((2, ROUNDS, len(units)))
-    for number in range(ROUNDS):
-        for k, restore in enumerate(units):
-            cpu, wall = time.process_time(), time.perf_counter()
-            restore(tile)
-            wall_s[number, k] = time.perf_counter() - wall
-            cpu_s[number, k] = time.process_time() - cpu
+
+    def enough(found: Sequence[Sequence[tuple[float, float]]]) -> bool:
         tick()
+        return len(found[0]) >= ROUNDS
+
+    found = interleaved([partial(restore, tile) for restore in variants], _wall_and_cpu_s, enough)
     session = str(time.time_ns())
-    return [
-        Times(session, tuple(w), tuple(c), tile.size)
-        for w, c in zip(wall_s.T.tolist(), cpu_s.T.tolist(), strict=True)
-    ]
+    return [Times(session, tuple(w for w, _ in taken), tuple(c for _, c in taken), tile.size) for taken in found]
+
+
+def _wall_and_cpu_s(call: Call) -> tuple[float, float]:
+    cpu, wall = time.process_time(), time.perf_counter()
+    call()
+    return time.perf_counter() - wall, time.process_time() - cpu
 
 
 def host_figures(times: Times, work_factor: float, runtime: str, seed: int) -> dict[str, Figure]:
     """Median and 90th percentile for a megapixel of the image, in s."""
     values = times.per_megapixel(work_factor)
     source = (
-        f"{len(values)} runs of a tile of {TILE_PX} x {TILE_PX} on {runtime}, in turns with the other points, "
+        f"{len(values)} runs of a tile of {TILE_PX} x {TILE_PX} on {runtime}, interleaved with the other points, "
         f"x {work_factor:.3g} pixels computed for each of the image's; 95 % bootstrap interval over rounds"
     )
     return {

@@ -9,11 +9,11 @@ from functools import partial
 import numpy as np
 import psutil
 
-from deploy.tradeoff.accuracy import Ground, Scores, cut_in_four, measure, measure_images, measure_mae
+from deploy.tradeoff.accuracy import BenchmarkSet, Scores, cut_in_four, measure, measure_images, measure_mae
 from deploy.tradeoff.cache import Cache, Key, code_digest, pixels_digest
-from deploy.tradeoff.host_time import ROUNDS, Times, take_turns
-from deploy.tradeoff.methods import Shelf, int8_ticks, operations_per_px, search_operations
-from deploy.tradeoff.points import EXACT, Point, Unit
+from deploy.tradeoff.host_time import ROUNDS, Times, time_variants
+from deploy.tradeoff.methods import MethodStore, int8_ticks, operations_per_px, search_operations
+from deploy.tradeoff.points import EXACT, Point, Variant
 from model.processor import processor_name
 from model.progress import Steps, steps
 
@@ -91,105 +91,105 @@ S_PER_PX = {"network": 5e-7, "chain": 5e-6, "peer": 3e-6}
 
 
 @dataclass(frozen=True)
-class Lab:
-    """Where units are measured: on which ground, on which tile, and where results are kept."""
+class Measurements:
+    """Where variants are measured: on which benchmark, on which tile, and where results are kept."""
 
-    shelf: Shelf
-    ground: Ground
+    store: MethodStore
+    benchmark: BenchmarkSet
     tile: np.ndarray
     cache: Cache
 
-    def jobs(self, points: Sequence[Point], units: Sequence[Unit]) -> list[Job]:
-        """What the cache lacks of these points, whose units can all be had, in the order in which to do it."""
-        seams = dict.fromkeys((p.unit, int(p.halo)) for p in points if p.halo != EXACT)
-        compared = [unit for unit in units if self.float_of(unit)]
-        jobs = [self._making(unit) for unit in self.shelf.missing(units)]
-        jobs += [self._scoring(unit) for unit in units if self.scores(unit) is None]
+    def jobs(self, points: Sequence[Point], variants: Sequence[Variant]) -> list[Job]:
+        """What the cache lacks of these points, whose variants can all be had, in the order in which to do it."""
+        seams = dict.fromkeys((p.variant, int(p.halo)) for p in points if p.halo != EXACT)
+        compared = [variant for variant in variants if self.float_of(variant)]
+        jobs = [self._making(variant) for variant in self.store.missing(variants)]
+        jobs += [self._scoring(variant) for variant in variants if self.scores(variant) is None]
         jobs += [self._cutting(*seam) for seam in seams if self.cut_scores(*seam) is None]
-        jobs += [self._comparing(unit) for unit in compared if self.mae(unit) is None]
-        untimed = [unit for unit in units if self.times(unit) is None]
+        jobs += [self._comparing(variant) for variant in compared if self.mae(variant) is None]
+        untimed = [variant for variant in variants if self.times(variant) is None]
         return [*jobs, self._timing(untimed)] if untimed else jobs
 
-    def scores(self, unit: Unit) -> Scores | None:
+    def scores(self, variant: Variant) -> Scores | None:
         """With exact seams."""
-        return self.cache.find("scores", self._key(unit), Scores)
+        return self.cache.find("scores", self._key(variant), Scores)
 
-    def cut_scores(self, unit: Unit, halo_px: int) -> Scores | None:
+    def cut_scores(self, variant: Variant, halo_px: int) -> Scores | None:
         """Of images cut in four."""
-        return self.cache.find("seams", self._key(unit, halo_px=halo_px), Scores)
+        return self.cache.find("seams", self._key(variant, halo_px=halo_px), Scores)
 
-    def mae(self, unit: Unit) -> Scores | None:
+    def mae(self, variant: Variant) -> Scores | None:
         """Of INT8 against the float network."""
-        return self.cache.find("mae", self._mae_key(unit), Scores) if self.float_of(unit) else None
+        return self.cache.find("mae", self._mae_key(variant), Scores) if self.float_of(variant) else None
 
-    def times(self, unit: Unit) -> Times | None:
+    def times(self, variant: Variant) -> Times | None:
         """On this machine."""
-        return self.cache.find("host", self._host_key(unit), Times)
+        return self.cache.find("host", self._host_key(variant), Times)
 
-    def float_of(self, unit: Unit) -> Unit | None:
+    def float_of(self, variant: Variant) -> Variant | None:
         """The float network that an INT8 one was made from."""
-        network = self.shelf.networks.get(unit.method)
-        known = network is not None and network.float_file is not None and unit.precision.startswith("INT8")
-        return replace(unit, precision="float32") if known else None
+        network = self.store.networks.get(variant.method)
+        known = network is not None and network.float_file is not None and variant.precision.startswith("INT8")
+        return replace(variant, precision="float32") if known else None
 
-    def _key(self, unit: Unit, **more: object) -> Key:
-        return {"unit": str(unit), "model": self.shelf.digest(unit), **self.ground.key, **more}
+    def _key(self, variant: Variant, **more: object) -> Key:
+        return {"variant": str(variant), "model": self.store.digest(variant), **self.benchmark.key, **more}
 
-    def _mae_key(self, unit: Unit) -> Key:
-        other = self.float_of(unit)
-        return self._key(unit, float=self.shelf.digest(other) if other else "")
+    def _mae_key(self, variant: Variant) -> Key:
+        other = self.float_of(variant)
+        return self._key(variant, float=self.store.digest(other) if other else "")
 
-    def _host_key(self, unit: Unit) -> Key:
+    def _host_key(self, variant: Variant) -> Key:
         tile = pixels_digest([self.tile])
         here = {"tile": tile, "machine": machine(), "code": code_digest(Times.__module__)}
-        return {"unit": str(unit), "model": self.shelf.digest(unit), **here}
+        return {"variant": str(variant), "model": self.store.digest(variant), **here}
 
-    def _making(self, unit: Unit) -> Job:
-        model = self.shelf.model(unit.method)
+    def _making(self, variant: Variant) -> Job:
+        model = self.store.model(variant.method)
         work = 40 + search_operations(model) * S_PER_OPERATION["INT8"]
-        return Job(f"making {unit}", work, int8_ticks(model, unit.precision), partial(self.shelf.make, unit))
+        return Job(f"making {variant}", work, int8_ticks(model, variant.precision), partial(self.store.make, variant))
 
-    def _scoring(self, unit: Unit) -> Job:
+    def _scoring(self, variant: Variant) -> Job:
         def run(tick: Tick) -> None:
-            found = measure(self.shelf.open(unit).restore, self.ground, tick)
-            self.cache.keep("scores", self._key(unit), found)
+            found = measure(self.store.open(variant).restore, self.benchmark, tick)
+            self.cache.keep("scores", self._key(variant), found)
 
-        return self._job(f"scoring {unit}", unit, run)
+        return self._job(f"scoring {variant}", variant, run)
 
-    def _cutting(self, unit: Unit, halo_px: int) -> Job:
+    def _cutting(self, variant: Variant, halo_px: int) -> Job:
         def run(tick: Tick) -> None:
-            infer = self.shelf.open(unit).infer
+            infer = self.store.open(variant).infer
             assert infer is not None  # noqa: S101 - only networks have tiles
-            found = Scores(measure_images(cut_in_four(infer, halo_px, self.shelf.max_dn), self.ground, tick))
-            self.cache.keep("seams", self._key(unit, halo_px=halo_px), found)
+            found = Scores(measure_images(cut_in_four(infer, halo_px, self.store.max_dn), self.benchmark, tick))
+            self.cache.keep("seams", self._key(variant, halo_px=halo_px), found)
 
-        return self._job(f"seams of {unit}, halo {halo_px}", unit, run)
+        return self._job(f"seams of {variant}, halo {halo_px}", variant, run)
 
-    def _comparing(self, unit: Unit) -> Job:
+    def _comparing(self, variant: Variant) -> Job:
         def run(tick: Tick) -> None:
-            both = [self.shelf.open(each).restore for each in (unit, self.float_of(unit)) if each]
-            self.cache.keep("mae", self._mae_key(unit), measure_mae(both[0], both[1], self.ground, tick))
+            both = [self.store.open(each).restore for each in (variant, self.float_of(variant)) if each]
+            self.cache.keep("mae", self._mae_key(variant), measure_mae(both[0], both[1], self.benchmark, tick))
 
-        return self._job(f"{unit} against float32", unit, run, 3)
+        return self._job(f"{variant} against float32", variant, run, 3)
 
-    def _timing(self, units: Sequence[Unit]) -> Job:
+    def _timing(self, variants: Sequence[Variant]) -> Job:
         def run(tick: Tick) -> None:
-            found = take_turns([self.shelf.open(unit).restore for unit in units], self.tile, tick)
-            for unit, times in zip(units, found, strict=True):
-                self.cache.keep("host", self._host_key(unit), times)
+            found = time_variants([self.store.open(variant).restore for variant in variants], self.tile, tick)
+            for variant, times in zip(variants, found, strict=True):
+                self.cache.keep("host", self._host_key(variant), times)
 
-        work = sum(self._seconds(unit, self.tile.size) for unit in units) * (ROUNDS + 1)
-        return Job(f"times of {len(units)} methods on this machine", work, ROUNDS + 1, run)
+        work = sum(self._seconds(variant, self.tile.size) for variant in variants) * (ROUNDS + 1)
+        return Job(f"times of {len(variants)} methods on this machine", work, ROUNDS + 1, run)
 
-    def _job(self, name: str, unit: Unit, run: Callable[[Tick], None], times: float = 1) -> Job:
-        pixels = sum(pair.degraded.size for pair in self.ground.pairs)
-        return Job(name, 1 + times * self._seconds(unit, pixels), len(self.ground.pairs) + 1, run)
+    def _job(self, name: str, variant: Variant, run: Callable[[Tick], None], times: float = 1) -> Job:
+        pixels = sum(pair.degraded.size for pair in self.benchmark.pairs)
+        return Job(name, 1 + times * self._seconds(variant, pixels), len(self.benchmark.pairs) + 1, run)
 
-    def _seconds(self, unit: Unit, pixels: int) -> float:
-        a_px = S_PER_PX[unit.kind]
-        if unit.kind == "network":
-            kind = "INT8" if unit.precision.startswith("INT8") else "float"
-            a_px += S_PER_OPERATION[kind] * operations_per_px(self.shelf.model(unit.method))
+    def _seconds(self, variant: Variant, pixels: int) -> float:
+        a_px = S_PER_PX[variant.kind]
+        if variant.kind == "network":
+            kind = "INT8" if variant.precision.startswith("INT8") else "float"
+            a_px += S_PER_OPERATION[kind] * operations_per_px(self.store.model(variant.method))
         return pixels * a_px
 
 

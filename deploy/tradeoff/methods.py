@@ -21,7 +21,7 @@ from deploy.restoration.options import TILE_PX, Runtime
 from deploy.restoration.plan import make_plan
 from deploy.restoration.runtime import open_openvino, open_runtime
 from deploy.tradeoff.cache import Cache, code_digest, digest_of
-from deploy.tradeoff.points import LEGAL, Unit
+from deploy.tradeoff.points import LEGAL, Variant
 from model.convbeers import VARIANTS
 from model.evaluation.methods import KNOWN, Restore
 from model.io.files import sha256
@@ -129,8 +129,14 @@ SEARCH_MAX = 3e13
 
 
 @dataclass(frozen=True)
-class Calibration:
-    """Where calibration patches come from: a folder of scenes, or drawn ones; never the images of the study."""
+class CalibrationScenes:
+    """What the INT8 files of a study are calibrated on: a folder of scenes, or drawn ones; never the study's images.
+
+    Attributes:
+        scenes: the folder; drawn scenes if None.
+        sensor: profile of the study, for networks that name none.
+        seed: of every random draw.
+    """
 
     scenes: Path | None
     sensor: str
@@ -160,7 +166,7 @@ class Calibration:
 
 
 def make_int8(
-    model: onnx.ModelProto, precision: str, calibration: Calibration, tick: Callable[[], None]
+    model: onnx.ModelProto, precision: str, calibration: CalibrationScenes, tick: Callable[[], None]
 ) -> onnx.ModelProto:
     """The network in INT8, host spelling.
 
@@ -205,13 +211,13 @@ class Opened:
 
 
 @dataclass(frozen=True)
-class Shelf:
-    """Opens units; `degraded` and `reference` are what chains are told."""
+class MethodStore:
+    """Opens variants; `degraded` and `reference` are what chains know."""
 
     networks: dict[str, Network]
     degraded: SensorProfile
     reference: SensorProfile
-    calibration: Calibration
+    calibration: CalibrationScenes
     cache: Cache
 
     @property
@@ -219,19 +225,19 @@ class Shelf:
         """The largest digital number of the images."""
         return self.degraded.nominal().max_dn
 
-    def lack(self, unit: Unit) -> str:
-        """Why a unit cannot be had here; empty where it can."""
+    def lack(self, variant: Variant) -> str:
+        """Why a variant cannot be had here; empty where it can."""
         try:
-            _require(self, unit)
+            _require(self, variant)
         except BeersError as error:
             return str(error).rstrip(".")
         return ""
 
-    def told(self, unit: Unit) -> str:
-        """What a unit knows of the sensor."""
-        if unit.kind != "network":
+    def sensor_known(self, variant: Variant) -> str:
+        """What a variant knows of the sensor."""
+        if variant.kind != "network":
             return KNOWN
-        return knowledge_of(self.model(unit.method), self.degraded.name)
+        return knowledge_of(self.model(variant.method), self.degraded.name)
 
     def model(self, method: str) -> onnx.ModelProto:
         """A network as its user gave it."""
@@ -241,66 +247,68 @@ class Shelf:
         """How far a network sees."""
         return receptive_radius_px(self.model(method))
 
-    def digest(self, unit: Unit) -> str:
-        """What the unit's pictures depend on; known before a missing INT8 file is made."""
-        return digest_of([self._content(unit), runtime_of(unit), version(PACKAGES[runtime_of(unit)])])
+    def digest(self, variant: Variant) -> str:
+        """What the variant's pictures depend on; known before a missing INT8 file is made."""
+        return digest_of([self._content(variant), runtime_of(variant), version(PACKAGES[runtime_of(variant)])])
 
-    def _content(self, unit: Unit) -> str:
-        if unit.kind != "network":
-            return f"{unit.method} {self.degraded!r} {self.reference!r} {code_digest(*CHAINS)}"
-        path = self.int8_file(unit)
+    def _content(self, variant: Variant) -> str:
+        if variant.kind != "network":
+            return f"{variant.method} {self.degraded!r} {self.reference!r} {code_digest(*CHAINS)}"
+        path = self.int8_file(variant)
         if path is None:
-            return sha256(self.networks[unit.method].float_file or Path())
-        return path.name if self.makes(unit) else sha256(path)
+            return sha256(self.networks[variant.method].float_file or Path())
+        return path.name if self.makes(variant) else sha256(path)
 
-    def makes(self, unit: Unit) -> bool:
+    def makes(self, variant: Variant) -> bool:
         """Whether its INT8 file is made here."""
-        network = self.networks.get(unit.method)
-        if network is None or not unit.precision.startswith("INT8"):
+        network = self.networks.get(variant.method)
+        if network is None or not variant.precision.startswith("INT8"):
             return False
-        return network.int8_file is None or unit.precision != network.given
+        return network.int8_file is None or variant.precision != network.given
 
-    def int8_file(self, unit: Unit) -> Path | None:
-        """Its INT8 file, there or yet to be made; None of a float unit."""
-        network = self.networks.get(unit.method)
-        if network is None or not unit.precision.startswith("INT8"):
+    def int8_file(self, variant: Variant) -> Path | None:
+        """Its INT8 file, there or yet to be made; None of a float variant."""
+        network = self.networks.get(variant.method)
+        if network is None or not variant.precision.startswith("INT8"):
             return None
-        if not self.makes(unit):
+        if not self.makes(variant):
             return network.int8_file
-        key = {"float": sha256(network.float_file or Path()), **self.calibration.key(self.model(unit.method))}
-        key |= {"precision": unit.precision, "code": code_digest(*MAKING)}
-        return self.cache.path(unit.precision.replace(" ", "-").lower(), key, "onnx")
+        key = {"float": sha256(network.float_file or Path()), **self.calibration.key(self.model(variant.method))}
+        key |= {"precision": variant.precision, "code": code_digest(*MAKING)}
+        return self.cache.path(variant.precision.replace(" ", "-").lower(), key, "onnx")
 
-    def missing(self, units: Sequence[Unit]) -> list[Unit]:
-        """Of some units, those whose INT8 file is yet to be made, or is damaged."""
-        return [unit for unit in units if self.makes(unit) and not _sound(self.int8_file(unit))]
+    def missing(self, variants: Sequence[Variant]) -> list[Variant]:
+        """Of some variants, those whose INT8 file is yet to be made, or is damaged."""
+        return [variant for variant in variants if self.makes(variant) and not _sound(self.int8_file(variant))]
 
-    def make(self, unit: Unit, tick: Callable[[], None]) -> None:
+    def make(self, variant: Variant, tick: Callable[[], None]) -> None:
         """Make its INT8 file and keep it."""
-        made = make_int8(self.model(unit.method), unit.precision, self.calibration, tick)
-        save_onnx(made, self.int8_file(unit) or Path())
+        made = make_int8(self.model(variant.method), variant.precision, self.calibration, tick)
+        save_onnx(made, self.int8_file(variant) or Path())
 
-    def open(self, unit: Unit) -> Opened:
+    def open(self, variant: Variant) -> Opened:
         """Ready to run.
 
         Raises:
             MachineError: a package or a processor's unit is not there.
             ModelError: the runtime refuses the model.
         """
-        if unit.kind != "network":
-            return Opened(method_named(unit.method, self.degraded.nominal(), self.reference.nominal()).restore)
-        path = self.int8_file(unit)
-        model = load_onnx(path) if path else self.model(unit.method)
-        half = unit.precision == "bf16"
+        if variant.kind != "network":
+            return Opened(method_named(variant.method, self.degraded.nominal(), self.reference.nominal()).restore)
+        path = self.int8_file(variant)
+        model = load_onnx(path) if path else self.model(variant.method)
+        half = variant.precision == "bf16"
         infer, _ = open_openvino(model, 0, "bf16") if half else open_runtime(Runtime.onnxruntime, model, 0)
-        return Opened(partial(_whole, infer=infer, radius_px=self.radius_px(unit.method), max_dn=self.max_dn), infer)
+        return Opened(
+            partial(_whole, infer=infer, radius_px=self.radius_px(variant.method), max_dn=self.max_dn), infer
+        )
 
 
-def runtime_of(unit: Unit) -> str:
-    """What runs a unit on this machine."""
-    if unit.kind == "network":
-        return "OpenVINO" if unit.precision == "bf16" else "onnxruntime"
-    return "scikit-image" if unit.kind == "peer" else "PyTorch"
+def runtime_of(variant: Variant) -> str:
+    """What runs a variant on this machine."""
+    if variant.kind == "network":
+        return "OpenVINO" if variant.precision == "bf16" else "onnxruntime"
+    return "scikit-image" if variant.kind == "peer" else "PyTorch"
 
 
 def _whole(dn: np.ndarray, infer: Infer, radius_px: int, max_dn: int) -> np.ndarray:
@@ -319,17 +327,17 @@ def _sound(path: Path | None) -> bool:
         return False
 
 
-def _require(shelf: Shelf, unit: Unit) -> None:
+def _require(store: MethodStore, variant: Variant) -> None:
     """Refuse what cannot be had, before any long work; what is yet to be made is not opened."""
-    if not shelf.makes(unit):
-        opened = shelf.open(unit)
-        if unit.kind == "peer":  # its library is asked for when it runs
+    if not store.makes(variant):
+        opened = store.open(variant)
+        if variant.kind == "peer":  # its library is asked for when it runs
             opened.restore(np.random.default_rng(0).uniform(500, 600, (64, 64)).astype(np.float32))
         return
-    model = shelf.model(unit.method)
-    int8_ticks(model, unit.precision)
+    model = store.model(variant.method)
+    int8_ticks(model, variant.precision)
     work = search_operations(model)
-    if unit.precision != LEGAL and work > SEARCH_MAX:
+    if variant.precision != LEGAL and work > SEARCH_MAX:
         got, remedy = f"{work:.2g}", "make it with 'quantize --regime free' and give the file"
         expected = f"at most {SEARCH_MAX:.2g} operations of search for an INT8 file made on the way"
-        raise ModelError(str(unit), expected=expected, got=got, remedy=remedy)
+        raise ModelError(str(variant), expected=expected, got=got, remedy=remedy)

@@ -1,4 +1,4 @@
-"""A point with all that is known of it, points held against one another, and fronts of points that nothing beats.
+"""What was found of each point, points compared with one another, and fronts of points that none dominates.
 
 Figures come from what was measured of a point's parts and from the cost model; fronts hold by value and beyond
 intervals.
@@ -18,7 +18,7 @@ from deploy.tradeoff.accuracy import FLAT, MAE, Scores, seam_density, with_seams
 from deploy.tradeoff.board import FIGURES as BOARD
 from deploy.tradeoff.board import BoardRun, CpuRun, DpuRun, energy_ratio, latency_ratio, predict_model
 from deploy.tradeoff.host_time import Times, host_figures, ratio_interval
-from deploy.tradeoff.measurements import Lab
+from deploy.tradeoff.measurements import Measurements
 from deploy.tradeoff.methods import runtime_of
 from deploy.tradeoff.points import EXACT, NAMES, Point, on_dpu
 from model.evaluation.methods import Method
@@ -63,7 +63,11 @@ def front(places: Sequence[Place]) -> tuple[str, ...]:
 
 
 def dominates(a: Place, b: Place, judge: Judge) -> bool:
-    """Whether `a` is surely no worse than `b` in both, and surely better in one."""
+    """Whether `a` is no worse than `b` in both and better in one, by value and over the whole intervals.
+
+    Intervals of pictures and of times on this machine are 95 % bootstrap intervals of the difference or the ratio;
+    those of the board follow the rule in `board`.
+    """
     worse = a.cost > b.cost or a.quality < b.quality
     if worse or (a.cost, a.quality) == (b.cost, b.quality):
         return False
@@ -135,7 +139,7 @@ class Outcome:
 
 
 @dataclass(frozen=True)
-class Arena:
+class Results:
     """All outcomes, and the sites of the pairs that they share."""
 
     outcomes: Mapping[str, Outcome]
@@ -177,19 +181,19 @@ class Arena:
 
 @dataclass(frozen=True)
 class Plane:
-    """Two figures of an arena: what `pareto` asks."""
+    """Two figures of all results, as a judge of which points differ in them."""
 
-    arena: Arena
+    results: Results
     x: str
     y: str
 
     def ratio(self, a: str, b: str) -> Interval:
         """Cost of `a` over cost of `b`."""
-        return self.arena.ratio(a, b, self.x)
+        return self.results.ratio(a, b, self.x)
 
     def gain(self, a: str, b: str) -> Interval:
         """Quality of `a` less quality of `b`."""
-        return self.arena.gain(a, b, self.y)
+        return self.results.gain(a, b, self.y)
 
 
 def _together(a: Outcome, b: Outcome) -> bool:
@@ -220,20 +224,20 @@ NO_INT8 = "not an INT8 network"
 
 @dataclass(frozen=True)
 class Assembly:
-    """Makes outcomes; `lacks` says of units that cannot be had why not."""
+    """Makes outcomes; `lacks` says of variants that cannot be had why not."""
 
-    lab: Lab
+    measurements: Measurements
     swath: Swath
     lacks: Mapping[str, str]
 
     def outcome(self, point: Point) -> Outcome:
         """All that is known of a point."""
-        reason = self.lacks.get(str(point.unit), "")
+        reason = self.lacks.get(str(point.variant), "")
         if reason:
             return Outcome(point, {key: unavailable(unit, reason) for key, unit in UNITS.items()}, self._text(point))
         swath = self._swath(point)
-        times, work_factor = self.lab.times(point.unit), swath.work_factor(swath.tiles)
-        work_factor = work_factor if point.unit.kind == "network" else 1.0
+        times, work_factor = self.measurements.times(point.variant), swath.work_factor(swath.tiles)
+        work_factor = work_factor if point.variant.kind == "network" else 1.0
         scores, run = self._scores(point, swath), self._board(point, swath, times)
         figures = self._quality(point, scores) | self._host(times, work_factor, point)
         figures |= run.figures() if not isinstance(run, str) else {f"board {k}": unavailable("", run) for k in BOARD}
@@ -242,67 +246,72 @@ class Assembly:
         return Outcome(point, ordered, self._text(point), scores, board, times, work_factor)
 
     def _swath(self, point: Point) -> Swath:
-        halo_px = point.halo_px(self.lab.shelf.radius_px(point.unit.method)) if point.unit.kind == "network" else 0
+        halo_px = (
+            point.halo_px(self.measurements.store.radius_px(point.variant.method))
+            if point.variant.kind == "network"
+            else 0
+        )
         return replace(self.swath, tile_px=point.tile_px, halo_px=halo_px)
 
     def _scores(self, point: Point, swath: Swath) -> Scores:
-        exact = self.lab.scores(point.unit)
+        exact = self.measurements.scores(point.variant)
         assert exact is not None  # noqa: S101 - its job has run
         if point.halo == EXACT:
             return exact
-        cut = self.lab.cut_scores(point.unit, int(point.halo))
+        cut = self.measurements.cut_scores(point.variant, int(point.halo))
         assert cut is not None  # noqa: S101 - its job has run
-        shapes = [pair.degraded.shape for pair in self.lab.ground.pairs]
+        shapes = [pair.degraded.shape for pair in self.measurements.benchmark.pairs]
         return with_seams(exact, cut, shapes, seam_density(swath))
 
     def _quality(self, point: Point, scores: Scores) -> dict[str, Figure]:
-        ground = self.lab.ground
-        means = mean_row(Method("", lambda dn: dn, ""), scores.images, ground.sites, ground.instruments, ground.seed)  # type: ignore[arg-type] # read, never written
+        benchmark = self.measurements.benchmark
+        method, images = Method("", lambda dn: dn, ""), [dict(values) for values in scores.images]
+        means = mean_row(method, images, benchmark.sites, benchmark.instruments, benchmark.seed)
         figures = {key: means.figures[key] for key in QUALITIES}
         if point.halo != EXACT:
             figures = {key: _with_seams(figure) for key, figure in figures.items()}
         return figures | {key: scores.targets[key] for key in ("MTF at Nyquist", FLAT)} | {MAE: self._mae(point)}
 
     def _mae(self, point: Point) -> Figure:
-        found = self.lab.mae(point.unit)
+        found = self.measurements.mae(point.variant)
         if found is None:
-            return unavailable("ratio", NOT_PAIRED if point.unit.precision.startswith("INT8") else NO_INT8)
+            return unavailable("ratio", NOT_PAIRED if point.variant.precision.startswith("INT8") else NO_INT8)
         values = [values[MAE] or 0.0 for values in found.images]
-        ground = self.lab.ground
-        interval, words = site_interval(values, ground.sites, np.random.default_rng(ground.seed))
+        benchmark = self.measurements.benchmark
+        interval, words = site_interval(values, benchmark.sites, np.random.default_rng(benchmark.seed))
         source = f"mean of {len(values)} pairs, exact seams, of full scale, {words}"
         return measured(float(np.mean(values)), "ratio", source, interval)
 
     def _host(self, times: Times | None, work_factor: float, point: Point) -> dict[str, Figure]:
         assert times is not None  # noqa: S101 - its job has run
-        return host_figures(times, work_factor, runtime_of(point.unit), self.lab.ground.seed)
+        return host_figures(times, work_factor, runtime_of(point.variant), self.measurements.benchmark.seed)
 
     def _board(self, point: Point, swath: Swath, times: Times | None) -> BoardRun | str:
         """Its run on the board, or why there is none."""
-        if point.unit.kind != "network":
+        if point.variant.kind != "network":
             assert times is not None  # noqa: S101 - its job has run
             low, high = times.cpu_per_px()
             return CpuRun((low * swath.pixels, high * swath.pixels), swath)
-        file = self.lab.shelf.int8_file(point.unit)
-        if not on_dpu(point.unit) or file is None:
+        file = self.measurements.store.int8_file(point.variant)
+        if not on_dpu(point.variant) or file is None:
             return DPU_ONLY
         try:
             dpu = load_dpu("vck190", point.configuration)
-            return DpuRun(point.unit.method, dpu, predict_model(load_onnx(file), dpu, point.tile_px), swath)
+            return DpuRun(point.variant.method, dpu, predict_model(load_onnx(file), dpu, point.tile_px), swath)
         except ModelError as error:
             return str(error).rstrip(".")
 
     def _text(self, point: Point) -> dict[str, str]:
-        network = point.unit.kind == "network"
+        network = point.variant.kind == "network"
         return {
-            "method": point.unit.method,
-            "kind": point.unit.kind,
-            "precision": point.unit.precision,
+            "method": point.variant.method,
+            "kind": point.variant.kind,
+            "precision": point.variant.precision,
             "halo": point.halo if network else "none",
             "tile": str(point.tile_px) if network else "none",
             "configuration": point.configuration or "none",
-            "told": self.lab.shelf.told(point.unit),
-            "runtime": runtime_of(point.unit),
+            "sensor": self.measurements.store.sensor_known(point.variant),
+            "runtime": runtime_of(point.variant),
         }
 
 

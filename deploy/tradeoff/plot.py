@@ -45,7 +45,7 @@ FILLINGS: dict[str, Filling] = {"INT8 legal": "full", "INT8 free": "left", "bf16
 """How matplotlib fills a marker, by precision."""
 
 MARKERS = ("o", "s", "^", "D", "*", "P", "v", "p", "X", "<", "d", ">", "h")
-"""matplotlib's markers that can be filled and told apart without colour."""
+"""matplotlib's markers that can be filled and distinguished without colour."""
 
 SIDES = {"s": 0.85, "D": 0.8, "*": 1.25}
 """How much smaller or larger than others some of them have to be to look as large."""

@@ -19,7 +19,7 @@ STEP_PX = 16
 
 
 @dataclass(frozen=True)
-class Unit:
+class Variant:
     """What is measured once and shared by several points: a method in one precision."""
 
     method: str
@@ -34,7 +34,7 @@ class Unit:
 class Point:
     """One way to restore a swath; `halo` is 'exact' or pixels, `configuration` empty off the DPU."""
 
-    unit: Unit
+    variant: Variant
     tile_px: int = PAPER_TILE_PX
     halo: str = EXACT
     configuration: str = ""
@@ -43,8 +43,8 @@ class Point:
     def name(self) -> str:
         """What it is listed under."""
         if not self.configuration:
-            return str(self.unit)
-        return f"{self.unit}, {self.configuration}, tile {self.tile_px}, halo {self.halo}"
+            return str(self.variant)
+        return f"{self.variant}, {self.configuration}, tile {self.tile_px}, halo {self.halo}"
 
     def halo_px(self, radius_px: int) -> int:
         """In pixels, for a network that sees so far."""
@@ -70,14 +70,18 @@ class Board:
 
 def network_points(method: str, precisions: Iterable[str], board: Board) -> list[Point]:
     """The points of one network."""
-    units = [Unit(method, "network", precision) for precision in precisions]
-    points = [point for unit in units for point in (_on_the_dpu(unit, board) if on_dpu(unit) else [Point(unit)])]
+    variants = [Variant(method, "network", precision) for precision in precisions]
+    points = [
+        point
+        for variant in variants
+        for point in (_on_the_dpu(variant, board) if on_dpu(variant) else [Point(variant)])
+    ]
     return list(dict.fromkeys(points))
 
 
-def on_dpu(unit: Unit) -> bool:
+def on_dpu(variant: Variant) -> bool:
     """Whether its numbers are the DPU's."""
-    return unit.kind == "network" and unit.precision == LEGAL
+    return variant.kind == "network" and variant.precision == LEGAL
 
 
 def tiles_px(kept_px: int | None, radius_px: int) -> list[int]:
@@ -88,21 +92,21 @@ def tiles_px(kept_px: int | None, radius_px: int) -> list[int]:
     return sorted({PAPER_TILE_PX, between, kept_px}, reverse=True)
 
 
-def _on_the_dpu(unit: Unit, board: Board) -> list[Point]:
+def _on_the_dpu(variant: Variant, board: Board) -> list[Point]:
     default, *others = board.configurations
     tiles = tiles_px(board.kept_px, board.radius_px)
-    points = [Point(unit, tile, EXACT, default) for tile in tiles]
+    points = [Point(variant, tile, EXACT, default) for tile in tiles]
     if board.radius_px > 0:
-        points.append(Point(unit, PAPER_TILE_PX, "0", default))
+        points.append(Point(variant, PAPER_TILE_PX, "0", default))
     halos = [str(halo) for halo in HALOS_PX if halo < board.radius_px]
-    points += [Point(unit, tiles[-1], halo, default) for halo in halos]
-    return points + [Point(unit, board.fastest_px, EXACT, other) for other in others]
+    points += [Point(variant, tiles[-1], halo, default) for halo in halos]
+    return points + [Point(variant, board.fastest_px, EXACT, other) for other in others]
 
 
 def other_points(chains: Iterable[str], peers: Iterable[str]) -> list[Point]:
     """The points that are no networks, in float32."""
     named = [(name, "chain") for name in chains] + [(name, "peer") for name in peers]
-    return [Point(Unit(name, kind, "float32")) for name, kind in named]  # type: ignore[arg-type] # of a literal
+    return [Point(Variant(name, kind, "float32")) for name, kind in named]  # type: ignore[arg-type] # of a literal
 
 
 NAMES = {
@@ -147,7 +151,7 @@ class Demand:
         miss = figure.value - self.limit if self.at_most else self.limit - figure.value
         return max(miss, 0.0) / (abs(self.limit) or 1.0)
 
-    def surely_kept(self, figure: Figure) -> bool:
+    def kept_throughout(self, figure: Figure) -> bool:
         """Whether the whole interval keeps it."""
         low, high = figure.interval or (figure.value or 0.0,) * 2
         return high <= self.limit if self.at_most else low >= self.limit

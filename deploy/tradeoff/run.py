@@ -16,15 +16,15 @@ from deploy.dpu.checker.table import network_rows
 from deploy.dpu.reading import network_of
 from deploy.restoration.engine import restore_dn
 from deploy.restoration.plan import make_plan
-from deploy.tradeoff.accuracy import Ground
+from deploy.tradeoff.accuracy import BenchmarkSet
 from deploy.tradeoff.advice import Choice, choose, findings, fronts, headline, notes, paper_outcomes, papers_point
 from deploy.tradeoff.board import DpuRun
 from deploy.tradeoff.cache import Cache
 from deploy.tradeoff.host_time import TILE_PX
-from deploy.tradeoff.measurements import Lab, run_jobs
-from deploy.tradeoff.methods import Calibration, Shelf, find_networks, is_papers
-from deploy.tradeoff.outcome import Arena, Assembly, Outcome
-from deploy.tradeoff.points import Point, Unit
+from deploy.tradeoff.measurements import Measurements, run_jobs
+from deploy.tradeoff.methods import CalibrationScenes, MethodStore, find_networks, is_papers
+from deploy.tradeoff.outcome import Assembly, Outcome, Results
+from deploy.tradeoff.points import Point, Variant
 from deploy.tradeoff.selection import Request, select_points
 from deploy.tradeoff.study import Crop, Front, Study
 from model.evaluation.pairs import NamedPair, oversampling_note
@@ -44,22 +44,22 @@ FRONT = ("board latency", "PSNR")
 def crop_points(
     outcomes: Sequence[Outcome], fronts: Sequence[Front], chosen: Sequence[Outcome | None]
 ) -> list[Outcome]:
-    """Chosen points, the best of each kind, and those on the front of PSNR against latency: one a unit and halo."""
+    """Chosen points, the best of each kind, and the front of PSNR against latency: one of each variant and halo."""
     by_name = {each.name: each for each in outcomes}
     members = [by_name[name] for front in fronts if (front.x, front.y) == FRONT for name in front.members]
     known = sorted((o for o in outcomes if o.value("PSNR") is not None), key=lambda o: -(o.value("PSNR") or 0.0))
-    best = {each.point.unit.kind: each for each in reversed(known)}.values()
+    best = {each.point.variant.kind: each for each in reversed(known)}.values()
     wanted = [each for each in (*chosen, *best, *reversed(members)) if each is not None]
-    alike: dict[tuple[Unit, str], Outcome] = {}
+    alike: dict[tuple[Variant, str], Outcome] = {}
     for each in wanted:
-        alike.setdefault((each.point.unit, each.point.halo), each)
+        alike.setdefault((each.point.variant, each.point.halo), each)
     return list(alike.values())[:MOST]
 
 
-def make_crops(points: Sequence[Outcome], lab: Lab) -> tuple[Crop, ...]:
+def make_crops(points: Sequence[Outcome], measurements: Measurements) -> tuple[Crop, ...]:
     """Degraded, each point as it would restore it, reference; of the pair that is hardest to restore."""
-    max_dn = lab.ground.instruments.max_dn
-    pair = hardest(lab.ground.pairs, max_dn)
+    max_dn = measurements.benchmark.instruments.max_dn
+    pair = hardest(measurements.benchmark.pairs, max_dn)
     side = min(CROP_PX, *pair.reference.shape)
     top, left = busiest_windows(pair.reference, side)[0]
 
@@ -70,7 +70,7 @@ def make_crops(points: Sequence[Outcome], lab: Lab) -> tuple[Crop, ...]:
         )
         return Crop(name, title, here, None if dn is pair.reference else fidelity_db(here, truth, seen, max_dn))
 
-    made = [crop(each.name, each.name, _restored(each, pair, lab)) for each in points]
+    made = [crop(each.name, each.name, _restored(each, pair, measurements)) for each in points]
     return (crop("degraded", "degraded", pair.degraded), *made, crop("reference", "reference", pair.reference))
 
 
@@ -80,20 +80,20 @@ def hardest(pairs: Sequence[NamedPair], max_dn: int = MAX_DN) -> NamedPair:
     return min(large, key=lambda pair: fidelity_db(pair.degraded, pair.reference, pair.degraded, max_dn))
 
 
-def _restored(outcome: Outcome, pair: NamedPair, lab: Lab) -> np.ndarray:
-    opened, point = lab.shelf.open(outcome.point.unit), outcome.point
+def _restored(outcome: Outcome, pair: NamedPair, measurements: Measurements) -> np.ndarray:
+    opened, point = measurements.store.open(outcome.point.variant), outcome.point
     if opened.infer is None:
         return opened.restore(pair.degraded)
-    radius_px = lab.shelf.radius_px(point.unit.method)
+    radius_px = measurements.store.radius_px(point.variant.method)
     plan = make_plan((1, *pair.degraded.shape), point.tile_px, point.halo_px(radius_px), radius_px)
-    return restore_dn(pair.degraded, opened.infer, plan, lab.shelf.max_dn)
+    return restore_dn(pair.degraded, opened.infer, plan, measurements.store.max_dn)
 
 
 LPIPS = "LPIPS-squeeze"
 
 
 @dataclass(frozen=True)
-class Result:
+class StudyRun:
     """A study; `met` is false where no point keeps what was asked for."""
 
     study: Study
@@ -114,73 +114,81 @@ class Result:
         return [("layers", self.study.layers), ("placement", self.study.placement)]
 
 
-def run_study(request: Request, cache: Cache) -> Result:
+def run_study(request: Request, cache: Cache) -> StudyRun:
     """Measure what the cache lacks, and put it together.
 
     Raises:
         BeersError: a network, an image, a profile or weights that cannot be used.
     """
     swath = Swath(*request.size_px)
-    shelf = make_shelf(request, cache)
-    ground, small = make_ground(request)
-    lab = Lab(shelf, ground, host_tile(shelf, request.seed), cache)
-    points = select_points(shelf, swath)
-    lacks = lacking(shelf, points)
-    there = [point for point in points if str(point.unit) not in lacks]
-    run_jobs(lab.jobs(there, list(dict.fromkeys(point.unit for point in there))))
-    assembly = Assembly(lab, swath, lacks)
+    store = make_store(request, cache)
+    benchmark, small = make_benchmark(request)
+    measurements = Measurements(store, benchmark, host_tile(store, request.seed), cache)
+    points = select_points(store, swath)
+    lacks = lacking(store, points)
+    there = [point for point in points if str(point.variant) not in lacks]
+    run_jobs(measurements.jobs(there, list(dict.fromkeys(point.variant for point in there))))
+    assembly = Assembly(measurements, swath, lacks)
     outcomes = [*(assembly.outcome(point) for point in points), *paper_outcomes(swath)]
-    arena = Arena({each.name: each for each in outcomes}, ground.sites, request.seed)
-    sampled = oversampling_note(ground.pairs, request.profiles[0])
-    return _put_together(request, lab, arena, notes(ground, sampled, small, lacks, calibrated_on(request)))
+    results = Results({each.name: each for each in outcomes}, benchmark.sites, request.seed)
+    sampled = oversampling_note(benchmark.pairs, request.profiles[0])
+    return _put_together(
+        request, measurements, results, notes(benchmark, sampled, small, lacks, calibrated_on(request))
+    )
 
 
-def _put_together(request: Request, lab: Lab, arena: Arena, remarks: tuple[str, ...]) -> Result:
-    outcomes, found = list(arena.outcomes.values()), fronts(arena)
-    paper = papers_point(arena, lambda method: is_papers(lab.shelf.model(method)), load_dpu().name)
+def _put_together(
+    request: Request, measurements: Measurements, results: Results, remarks: tuple[str, ...]
+) -> StudyRun:
+    outcomes, found = list(results.outcomes.values()), fronts(results)
+    paper = papers_point(results, lambda method: is_papers(measurements.store.model(method)), load_dpu().name)
     asked = [*request.budget, *request.need]
-    choice = choose(arena, request.budget, request.need) if asked else Choice(None, ())
+    choice = choose(results, request.budget, request.need) if asked else Choice(None, ())
     shown = crop_points(outcomes, found, [choice.outcome, paper])
     runs = {each.board.network: each for each in reversed(outcomes) if isinstance(each.board, DpuRun)}
     study = Study(
-        headline(arena, paper),
+        headline(results, paper),
         tuple(each.row for each in outcomes),
         found,
-        (*choice.advice, *findings(arena, paper)),
-        make_crops(shown, lab),
+        (*choice.advice, *findings(results, paper)),
+        make_crops(shown, measurements),
         {name: tuple(layers_of(run)) for name, run in sorted(runs.items())},
-        {name: tuple(placement_of(lab, run)) for name, run in sorted(runs.items())},
+        {name: tuple(placement_of(measurements, run)) for name, run in sorted(runs.items())},
         remarks,
     )
-    return Result(study, not asked or choice.outcome is not None)
+    return StudyRun(study, not asked or choice.outcome is not None)
 
 
-def make_shelf(request: Request, cache: Cache) -> Shelf:
+def make_store(request: Request, cache: Cache) -> MethodStore:
     """The methods of a study."""
     networks = {network.name: network for network in find_networks(request.networks)}
-    return Shelf(networks, *request.profiles, Calibration(request.calibration, request.sensor, request.seed), cache)
+    return MethodStore(
+        networks, *request.profiles, CalibrationScenes(request.calibration, request.sensor, request.seed), cache
+    )
 
 
-def make_ground(request: Request) -> tuple[Ground, list[str]]:
+def make_benchmark(request: Request) -> tuple[BenchmarkSet, list[str]]:
     """What all are judged on, and the names of images too small for it."""
     sensors = request.profiles
     pairs, small = load_pairs(request.images, None, *sensors, request.seed)
     perceptual = {LPIPS: perceptual_distances(request.lpips)[LPIPS]}
     weights = sha256(request.backbone) if request.backbone else ""
     targets = acquire_targets(sensors[0].nominal(), request.seed)
-    return Ground(pairs, targets, Instruments(perceptual, sensors[0].nominal().max_dn), weights, request.seed), small
+    return BenchmarkSet(
+        pairs, targets, Instruments(perceptual, sensors[0].nominal().max_dn), weights, request.seed
+    ), small
 
 
-def host_tile(shelf: Shelf, seed: int) -> np.ndarray:
+def host_tile(store: MethodStore, seed: int) -> np.ndarray:
     """What host times are taken on: a drawn scene as the sensor sees it."""
-    sensors = Sensors(shelf.degraded, shelf.reference)
+    sensors = Sensors(store.degraded, store.reference)
     return drawn_acquisition(Swath(TILE_PX, TILE_PX), sensors, seed)
 
 
-def lacking(shelf: Shelf, points: Sequence[Point]) -> dict[str, str]:
+def lacking(store: MethodStore, points: Sequence[Point]) -> dict[str, str]:
     """Units that cannot be had here, each with the reason."""
-    reasons = {str(unit): shelf.lack(unit) for unit in dict.fromkeys(point.unit for point in points)}
-    return {unit: reason for unit, reason in reasons.items() if reason}
+    reasons = {str(variant): store.lack(variant) for variant in dict.fromkeys(point.variant for point in points)}
+    return {variant: reason for variant, reason in reasons.items() if reason}
 
 
 def calibrated_on(request: Request) -> str:
@@ -194,10 +202,10 @@ def layers_of(outcome: Outcome) -> list[Row]:
     return layer_rows(outcome.board.prediction, outcome.board.dpu)
 
 
-def placement_of(lab: Lab, outcome: Outcome) -> list[Row]:
+def placement_of(measurements: Measurements, outcome: Outcome) -> list[Row]:
     """What runs where."""
     assert isinstance(outcome.board, DpuRun)  # noqa: S101 - chosen so
-    file = lab.shelf.int8_file(outcome.point.unit)
+    file = measurements.store.int8_file(outcome.point.variant)
     assert file is not None  # noqa: S101 - it ran on the board
     tile_px, dpu = outcome.point.tile_px, outcome.board.dpu
     return network_rows(place(network_of(load_onnx(file), tile_px), dpu), dpu, tile_px)

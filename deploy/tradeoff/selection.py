@@ -11,7 +11,7 @@ import onnx
 from deploy.bench.tables import PAPER_TILE_PX, Swath, swath_latency
 from deploy.dpu.board import Dpu, load_dpu
 from deploy.tradeoff.board import kept_tiles_px, predict_model
-from deploy.tradeoff.methods import Network, Shelf, conv_weights
+from deploy.tradeoff.methods import MethodStore, Network, conv_weights
 from deploy.tradeoff.points import (
     LEGAL,
     PRECISIONS,
@@ -33,11 +33,11 @@ from profiles.sensor_file import load_sensor, reference_for
 from quant.onnx_file import load_onnx, receptive_radius_px
 
 
-def select_points(shelf: Shelf, swath: Swath) -> list[Point]:
+def select_points(store: MethodStore, swath: Swath) -> list[Point]:
     """Networks in the order given, then chains, then library peers."""
     points = [
         point
-        for network in shelf.networks.values()
+        for network in store.networks.values()
         for point in network_points(network.name, precisions_of(network), board_of(network, swath))
     ]
     return points + other_points([f"traditional-{quality}" for quality in QUALITIES], PEERS)

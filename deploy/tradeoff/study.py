@@ -10,13 +10,13 @@ from profiles.figures import Row
 
 @dataclass(frozen=True)
 class Front:
-    """The points that nothing beats in both of two figures.
+    """The points that none dominates in two figures.
 
     Attributes:
         x: key of the figure that is paid, "board latency".
         y: key of the figure that is bought, "PSNR".
         members: names of the points on the front by their values, along x from cheap to dear.
-        steps: those of them that are surely better and surely dearer than the one before.
+        steps: those of them that are better and dearer than the one before beyond the intervals.
         dominated: name of a point to the name of one that dominates it beyond the intervals.
         prices: a sentence on what each step costs.
     """

@@ -19,7 +19,7 @@ Restore = Callable[[np.ndarray], np.ndarray]
 
 TRADITIONAL, DECONVOLVE_FIRST = "traditional", "deconvolve-first"
 
-KNOWN, BLIND, TRAINED = "both sensors", "no: blind", "trained for it"
+KNOWN, BLIND, TRAINED = "known", "blind", "trained for it"
 """What a method knows of the sensor: the last of a network whose file names it."""
 
 
@@ -39,7 +39,7 @@ def method_without_network(name: str, degraded: Sensor, reference: Sensor) -> Me
         MachineError: a peer whose library is not installed.
     """
     if name == "degraded":
-        return Method(name, lambda dn: dn, "no: the input itself")
+        return Method(name, lambda dn: dn, "the input itself")
     chain = _chain(name, degraded, reference)
     if chain is not None:
         return Method(name, lambda dn: restore_traditional(torch.from_numpy(dn), chain).numpy(), KNOWN)

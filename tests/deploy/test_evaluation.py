@@ -45,7 +45,7 @@ def write_pairs(folder: Path, pairs: list[NamedPair]) -> Path:
     return folder
 
 
-IDENTITY = Method("degraded", lambda dn: dn, "nothing")
+IDENTITY = Method("degraded", lambda dn: dn, "blind")
 
 
 @pytest.mark.parametrize(
@@ -132,8 +132,8 @@ def test_what_a_network_was_made_for_is_no_secret() -> None:
     made = {name for (name, sensor), words in told.items() if words == TRAINED and sensor == "pleiades-degraded"}
     assert made == {"convbeers-s-nominal", "convbeers-s-nominal-int8"}
     assert TRAINED not in [words for (_, sensor), words in told.items() if sensor != "pleiades-degraded"]
-    assert told["convbeers-xs", "pleiades-degraded"] == "nothing"
-    assert told["traditional", "dior-high"] == "both sensors"
+    assert told["convbeers-xs", "pleiades-degraded"] == "blind"
+    assert told["traditional", "dior-high"] == "known"
 
 
 def test_clipped_pixels_do_not_count() -> None:
@@ -214,7 +214,7 @@ def test_refused_edges_and_silent_fields_are_unavailable() -> None:
 
 def test_strips_hold_every_method_and_black_below_the_reference() -> None:
     one = pair()
-    strip, white = strip_of(one, [IDENTITY, Method("zero", np.zeros_like, "nothing")])
+    strip, white = strip_of(one, [IDENTITY, Method("zero", np.zeros_like, "blind")])
     side = 37 * 2
     assert strip.shape == (22 + 2 * (side + 4), 3 * (side + 4) - 4)
     assert white > 1

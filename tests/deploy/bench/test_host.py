@@ -1,4 +1,4 @@
-"""Measured on this machine: networks taking turns, their nodes, load and memory; and scaled to the board's CPU."""
+"""Measured on this machine: networks interleaved, their nodes, load and memory; and scaled to the board's CPU."""
 
 import math
 import time
@@ -9,7 +9,15 @@ import numpy as np
 import onnx
 import pytest
 
-from deploy.bench.host import Sensors, Timed, drawn_acquisition, host_rows, take_turns, timed_rows, traditional_rows
+from deploy.bench.host import (
+    Sensors,
+    Timed,
+    drawn_acquisition,
+    host_rows,
+    time_networks,
+    timed_rows,
+    traditional_rows,
+)
 from deploy.bench.host_state import memory_rise, watched
 from deploy.bench.profile import node_rows, profile
 from deploy.bench.tables import Swath, board_cpu_row, slowdown
@@ -35,7 +43,7 @@ def value(row: Row, key: str) -> float:
     return number
 
 
-def test_float_and_int8_take_turns_and_nodes_add_up() -> None:
+def test_float_and_int8_are_interleaved_and_nodes_add_up() -> None:
     rows = host_rows(default_int8(), QUICK, 48, threads=1)
     host = [row for row in rows if row.table == "host"]
     assert [row.name for row in host[:2]] == ["convbeers-s-int8, 48 x 48", "float32 of the same shape, 48 x 48"]
@@ -55,7 +63,7 @@ def test_float_and_int8_take_turns_and_nodes_add_up() -> None:
 def test_turns_last_for_the_minimum_time_and_count(tmp_path: Path) -> None:
     model = onnx.load_model(integer_convbeers(tmp_path / "i.onnx", 1, 8))
     runs = [Timed("one", model), Timed("other", model)]
-    take_turns(runs, 24, 1, min_time_s=0.05, min_runs=7)
+    time_networks(runs, 24, 1, min_time_s=0.05, min_runs=7)
     assert len(runs[0].times_s) == len(runs[1].times_s) >= 7
     assert min(sum(run.times_s) for run in runs) >= 0.05
     assert len(timed_rows(runs[:1], 24, {})) == 1

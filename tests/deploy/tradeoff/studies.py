@@ -79,7 +79,7 @@ def point(name: str, psnr_db: float, host_s: float, latency_s: float | None, tex
     """A row of the table of points."""
     mae = 0.0006 if "INT8" in text["precision"] else None
     ours = text["kind"] == "network"
-    host = "9 rounds in turns on a tile of 256 px, " + text["runtime"]
+    host = "9 interleaved rounds on a tile of 256 px, " + text["runtime"]
     figures = {
         **quality(psnr_db, mae),
         "host p50": measured(host_s, "s/Mpx", host, (0.97 * host_s, 1.04 * host_s)),
@@ -96,7 +96,7 @@ def point(name: str, psnr_db: float, host_s: float, latency_s: float | None, tex
 
 def words(method: str, kind: str, precision: str, tile: str, halo: str, configuration: str) -> dict[str, str]:
     """What stands beside the figures of a point."""
-    told = "nothing" if kind == "network" else "both sensors"
+    sensor = "blind" if kind == "network" else "known"
     runtime = {"network": "onnxruntime", "chain": "torch", "peer": "scikit-image", "paper": "not stated"}[kind]
     return {
         "method": method,
@@ -105,7 +105,7 @@ def words(method: str, kind: str, precision: str, tile: str, halo: str, configur
         "halo": halo,
         "tile": tile,
         "configuration": configuration,
-        "told": told,
+        "sensor": sensor,
         "runtime": runtime,
     }
 

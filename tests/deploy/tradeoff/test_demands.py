@@ -63,8 +63,8 @@ def test_a_miss_is_a_share_of_the_limit_and_what_is_unknown_keeps_nothing() -> N
     assert math.isinf(shortfall({}, [least]))
 
 
-def test_a_limit_is_surely_kept_only_by_the_whole_interval() -> None:
+def test_a_limit_is_kept_throughout_only_by_the_whole_interval() -> None:
     most = Demand("board latency", True, 20, "s")
-    assert most.surely_kept(predicted(10, "s", (5, 20), "model"))
-    assert not most.surely_kept(predicted(10, "s", (5, 21), "model"))
-    assert Demand("PSNR", False, 44, "dB").surely_kept(measured(44, "dB", "pairs"))
+    assert most.kept_throughout(predicted(10, "s", (5, 20), "model"))
+    assert not most.kept_throughout(predicted(10, "s", (5, 21), "model"))
+    assert Demand("PSNR", False, 44, "dB").kept_throughout(measured(44, "dB", "pairs"))

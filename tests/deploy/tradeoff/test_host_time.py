@@ -1,11 +1,11 @@
-"""Times in turns, and ratios of them."""
+"""Interleaved times, and ratios of them."""
 
 import time
 
 import numpy as np
 import pytest
 
-from deploy.tradeoff.host_time import ROUNDS, Times, host_figures, ratio_interval, take_turns
+from deploy.tradeoff.host_time import ROUNDS, Times, host_figures, ratio_interval, time_variants
 from model.evaluation.methods import Restore
 
 
@@ -14,10 +14,10 @@ def times(scale: float = 1.0, session: str = "one") -> Times:
     return Times(session, tuple(wall_s.tolist()), tuple(wall_s.tolist()), 10_000)
 
 
-def test_units_take_turns_after_one_run_for_warm_up() -> None:
+def test_variants_are_interleaved_after_one_run_for_warm_up() -> None:
     ran = []
 
-    def unit(name: str, pause_s: float) -> Restore:
+    def method(name: str, pause_s: float) -> Restore:
         def restore(dn: np.ndarray) -> np.ndarray:
             ran.append(name)
             time.sleep(pause_s)
@@ -26,7 +26,7 @@ def test_units_take_turns_after_one_run_for_warm_up() -> None:
         return restore
 
     ticks = []
-    found = take_turns([unit("a", 0), unit("b", 0.005)], np.zeros((4, 5), np.float32), lambda: ticks.append(1))
+    found = time_variants([method("a", 0), method("b", 0.005)], np.zeros((4, 5), np.float32), lambda: ticks.append(1))
     assert ran == ["a", "b"] * (ROUNDS + 1)
     assert len(ticks) == ROUNDS + 1
     assert found[0].session == found[1].session

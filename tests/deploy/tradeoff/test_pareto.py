@@ -39,17 +39,17 @@ def better(a: Place, b: Place) -> bool:
 
 
 @given(PLACES)
-def test_a_front_holds_just_what_nothing_beats(places: list[Place]) -> None:
-    unbeaten = {(b.cost, b.quality) for b in places if not any(better(a, b) for a in places)}
+def test_a_front_holds_just_what_no_other_dominates(places: list[Place]) -> None:
+    undominated = {(b.cost, b.quality) for b in places if not any(better(a, b) for a in places)}
     members = [next(p for p in places if p.name == name) for name in front(places)]
-    assert {(m.cost, m.quality) for m in members} == unbeaten
-    assert len(members) == len(unbeaten)
+    assert {(m.cost, m.quality) for m in members} == undominated
+    assert len(members) == len(undominated)
     assert [m.cost for m in members] == sorted(m.cost for m in members)
     assert [m.quality for m in members] == sorted(m.quality for m in members)
 
 
 @given(PLACES)
-def test_without_intervals_beaten_is_all_that_is_not_as_good_as_the_front(places: list[Place]) -> None:
+def test_without_intervals_dominated_is_all_that_is_not_as_good_as_the_front(places: list[Place]) -> None:
     judge = Spread(places)
     on_front = {(p.cost, p.quality) for p in places if p.name in front(places)}
     found = dominated(places, judge)

@@ -8,7 +8,7 @@ from deploy.bench.tables import Swath
 from deploy.dpu.board import load_dpu
 from deploy.export import float_model
 from deploy.tradeoff.methods import Network, find_networks, is_papers, operations_per_px, shape_of
-from deploy.tradeoff.points import EXACT, LEGAL, PRECISIONS, Board, Unit, network_points, other_points, tiles_px
+from deploy.tradeoff.points import EXACT, LEGAL, PRECISIONS, Board, Variant, network_points, other_points, tiles_px
 from deploy.tradeoff.selection import board_of, configurations_for, precisions_of
 from model.shipped import SHIPPED, shipped_names, shipped_weights
 from profiles.errors import ModelError, OptionError
@@ -20,8 +20,8 @@ def test_names_tell_points_apart_and_only_legal_networks_have_configurations() -
     points = network_points("net", PRECISIONS, BOARD)
     assert len({point.name for point in points}) == len(points)
     for point in points:
-        assert bool(point.configuration) == (point.unit.precision == LEGAL)
-    assert {point.unit.precision for point in points} == set(PRECISIONS)
+        assert bool(point.configuration) == (point.variant.precision == LEGAL)
+    assert {point.variant.precision for point in points} == set(PRECISIONS)
 
 
 def test_halos_stay_below_the_exact_one_and_tiles_hold_them() -> None:
@@ -49,7 +49,7 @@ def test_tiles_lie_between_the_papers_and_what_stays_on_chip(
 
 def test_chains_and_peers_are_float_and_off_the_dpu() -> None:
     points = other_points(["traditional-fast"], ["nl-means"])
-    assert [str(point.unit) for point in points] == ["traditional-fast", "nl-means"]
+    assert [str(point.variant) for point in points] == ["traditional-fast", "nl-means"]
     assert not any(point.configuration for point in points)
 
 
@@ -73,7 +73,7 @@ def test_wide_engines_are_looked_at_for_wide_layers_alone() -> None:
         assert len(set(found)) == len(found)
 
 
-def test_the_papers_network_is_told_by_its_shape() -> None:
+def test_the_papers_network_is_known_by_its_shape() -> None:
     for name in shipped_names():
         for model in (float_model(shipped_weights(name)), Network(name, None, SHIPPED / f"{name}-int8.onnx").model()):
             assert is_papers(model) == (name == "convbeers")
@@ -117,5 +117,5 @@ def test_a_file_that_is_no_network_or_not_there_gets_one_sentence(tmp_path: Path
 
 
 def test_a_unit_is_named_by_method_and_precision() -> None:
-    assert str(Unit("net", "network", "bf16")) == "net bf16"
-    assert str(Unit("wiener", "peer", "float32")) == "wiener"
+    assert str(Variant("net", "network", "bf16")) == "net bf16"
+    assert str(Variant("wiener", "peer", "float32")) == "wiener"

@@ -18,7 +18,7 @@ from deploy.compare import compare, read_document
 from deploy.tradeoff import measurements, methods, selection
 from deploy.tradeoff.cache import Cache
 from deploy.tradeoff.host_time import Times
-from deploy.tradeoff.run import Result, run_study
+from deploy.tradeoff.run import StudyRun, run_study
 from deploy.tradeoff.selection import Request
 from model.convbeers import ConvBEERS, Variant, initialise
 from model.evaluation import targets as targets_module
@@ -56,15 +56,15 @@ def small() -> Iterator[None]:
             (methods, "PATCH_PX", 32),
             (selection, "QUALITIES", ("fast",)),
             (selection, "PEERS", ("nl-means",)),
-            (measurements, "take_turns", steady),
+            (measurements, "time_variants", steady),
         ):
             patch.setattr(module, name, value)
         yield
 
 
-def steady(units: Sequence[Restore], tile: np.ndarray, tick: Callable[[], None]) -> list[Times]:
+def steady(methods: Sequence[Restore], tile: np.ndarray, tick: Callable[[], None]) -> list[Times]:
     tick()
-    return [Times("one", (0.1, 0.2, 0.1), (0.1, 0.1, 0.1), tile.size) for _ in units]
+    return [Times("one", (0.1, 0.2, 0.1), (0.1, 0.1, 0.1), tile.size) for _ in methods]
 
 
 def request(folder: Path, *names: str, **more: object) -> Request:
@@ -75,7 +75,7 @@ def request(folder: Path, *names: str, **more: object) -> Request:
 
 
 @pytest.fixture(scope="module")
-def kept(folder: Path, small: None, tmp_path_factory: pytest.TempPathFactory) -> tuple[Result, Path]:  # noqa: ARG001
+def kept(folder: Path, small: None, tmp_path_factory: pytest.TempPathFactory) -> tuple[StudyRun, Path]:  # noqa: ARG001
     """An unbroken run, and the cache that it filled."""
     place = tmp_path_factory.mktemp("cache")
     return run_study(request(folder), Cache(place)), place
@@ -96,12 +96,12 @@ def measured_again(monkeypatch: pytest.MonkeyPatch) -> list[str]:
 
         return noting
 
-    for name in ("measure", "measure_images", "measure_mae", "take_turns"):
+    for name in ("measure", "measure_images", "measure_mae", "time_variants"):
         monkeypatch.setattr(measurements, name, noted(name, getattr(measurements, name)))
     return seen
 
 
-def test_every_figure_of_every_point_is_a_number_or_has_a_reason(kept: tuple[Result, Path]) -> None:
+def test_every_figure_of_every_point_is_a_number_or_has_a_reason(kept: tuple[StudyRun, Path]) -> None:
     points = kept[0].study.points
     assert len({row.name for row in points}) == len(points) > 20
     for row in points:
@@ -115,11 +115,11 @@ def test_every_figure_of_every_point_is_a_number_or_has_a_reason(kept: tuple[Res
                 assert figure.source
     legal = next(row for row in points if "wide INT8 legal" in row.name)
     assert all(figure.value is not None for key, figure in legal.figures.items() if key != "LPIPS-squeeze")
-    assert legal.text["told"] == "trained for the sensor"
+    assert legal.text["sensor"] == "trained for it"
 
 
 def test_two_sites_give_no_interval_and_images_smaller_than_the_profile_asks_for_are_owned_up_to(
-    kept: tuple[Result, Path],
+    kept: tuple[StudyRun, Path],
 ) -> None:
     study = kept[0].study
     for row in study.points:
@@ -127,11 +127,11 @@ def test_two_sites_give_no_interval_and_images_smaller_than_the_profile_asks_for
         assert psnr.mode != "measured" or psnr.interval is None
     assert not any("dB [" in sentence for front in study.fronts for sentence in front.prices)
     notes = " ".join(study.notes)
-    assert "No interval over sites is shown, and pictures tell no two points apart: of 2, fewer than 5" in notes
+    assert "No interval over sites is shown, and pictures distinguish no two points: of 2, fewer than 5" in notes
     assert "Scene pixels per pixel: 2 (2 of 2 images), where pleiades-degraded states 5" in notes
 
 
-def test_accuracy_knows_no_configuration_and_seams_show(kept: tuple[Result, Path]) -> None:
+def test_accuracy_knows_no_configuration_and_seams_show(kept: tuple[StudyRun, Path]) -> None:
     points = [row for row in kept[0].study.points if row.text["method"] == "wide" and "legal" in row.name]
     exact = [row.figures["PSNR"] for row in points if row.text["halo"] == "exact"]
     assert len({figure.value for figure in exact}) == 1
@@ -142,7 +142,7 @@ def test_accuracy_knows_no_configuration_and_seams_show(kept: tuple[Result, Path
 
 
 def test_a_second_run_measures_nothing_and_says_the_same(
-    folder: Path, kept: tuple[Result, Path], monkeypatch: pytest.MonkeyPatch
+    folder: Path, kept: tuple[StudyRun, Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     seen = measured_again(monkeypatch)
     again = run_study(request(folder), Cache(kept[1]))
@@ -155,7 +155,7 @@ def test_a_second_run_measures_nothing_and_says_the_same(
 
 @pytest.mark.parametrize("jobs", [2, 11])
 def test_stopped_and_resumed_it_says_the_same(
-    jobs: int, folder: Path, kept: tuple[Result, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    jobs: int, folder: Path, kept: tuple[StudyRun, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Stopped while the next measurement was under way; INT8 files were made before, or take as long again."""
     for made in kept[1].glob("*.onnx"):
@@ -181,7 +181,7 @@ def test_stopped_and_resumed_it_says_the_same(
 
 
 def test_a_damaged_measurement_is_made_again_and_no_other(
-    folder: Path, kept: tuple[Result, Path], monkeypatch: pytest.MonkeyPatch
+    folder: Path, kept: tuple[StudyRun, Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     next(kept[1].glob("mae-*.json")).write_text("{")
     seen = measured_again(monkeypatch)
@@ -190,25 +190,25 @@ def test_a_damaged_measurement_is_made_again_and_no_other(
 
 
 def test_a_new_network_is_measured_and_the_old_ones_are_not(
-    folder: Path, kept: tuple[Result, Path], monkeypatch: pytest.MonkeyPatch
+    folder: Path, kept: tuple[StudyRun, Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (folder / "copy.safetensors").write_bytes((folder / "narrow.safetensors").read_bytes())
     seen = measured_again(monkeypatch)
     found = run_study(request(folder, "narrow", "copy"), Cache(kept[1]))
     assert seen.count("measure") == 3 + (1 if has_bf16(found) else 0)
-    assert seen.count("take_turns") == 1
+    assert seen.count("time_variants") == 1
     by_name = {row.name: row.figures["PSNR"].value for row in found.study.points}
     for name, value in by_name.items():
         if name.startswith("copy"):
             assert value == by_name[name.replace("copy", "narrow")]
 
 
-def has_bf16(result: Result) -> bool:
+def has_bf16(result: StudyRun) -> bool:
     return any(row.text["precision"] == "bf16" and row.figures["PSNR"].value for row in result.study.points)
 
 
 def test_other_images_are_measured_anew_and_times_are_not(
-    folder: Path, kept: tuple[Result, Path], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    folder: Path, kept: tuple[StudyRun, Path], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     other = tmp_path / "images"
     other.mkdir()
@@ -216,26 +216,26 @@ def test_other_images_are_measured_anew_and_times_are_not(
     seen = measured_again(monkeypatch)
     run_study(replace(request(folder), images=other), Cache(kept[1]))
     assert seen.count("measure") >= 8
-    assert "take_turns" not in seen
+    assert "time_variants" not in seen
 
 
-def test_a_units_scores_are_those_of_its_own_restoration(folder: Path, kept: tuple[Result, Path]) -> None:
+def test_a_variants_scores_are_those_of_its_own_restoration(folder: Path, kept: tuple[StudyRun, Path]) -> None:
     """The legal file made on the way, measured by hand."""
     from deploy.methods import method_named
-    from deploy.tradeoff.run import make_ground
+    from deploy.tradeoff.run import make_benchmark
     from model.evaluation.scores import Instruments, fidelity_db
     from profiles import load_sensor
 
-    ground, _ = make_ground(request(folder))
+    benchmark, _ = make_benchmark(request(folder))
     sensors = load_sensor("pleiades-degraded").nominal(), load_sensor("pleiades-reference").nominal()
     restore = method_named(str(folder / "wide.safetensors"), *sensors).restore
-    values = [fidelity_db(restore(p.degraded), p.reference, p.degraded) for p in ground.pairs]
+    values = [fidelity_db(restore(p.degraded), p.reference, p.degraded) for p in benchmark.pairs]
     row = next(row for row in kept[0].study.points if row.name == "wide float32")
     assert row.figures["PSNR"].value == pytest.approx(np.mean(values))
-    assert isinstance(ground.instruments, Instruments)
+    assert isinstance(benchmark.instruments, Instruments)
 
 
-def test_crops_show_one_place_and_end_with_the_reference(kept: tuple[Result, Path]) -> None:
+def test_crops_show_one_place_and_end_with_the_reference(kept: tuple[StudyRun, Path]) -> None:
     crops = kept[0].study.crops
     assert [crops[0].point, crops[-1].point] == ["degraded", "reference"]
     assert crops[-1].psnr_db is None
@@ -246,7 +246,7 @@ def test_crops_show_one_place_and_end_with_the_reference(kept: tuple[Result, Pat
     assert len(crops) >= 4
 
 
-def test_an_int8_file_is_taken_as_it_is(folder: Path, kept: tuple[Result, Path], tmp_path: Path) -> None:
+def test_an_int8_file_is_taken_as_it_is(folder: Path, kept: tuple[StudyRun, Path], tmp_path: Path) -> None:
     legal = next(kept[1].glob("int8-legal-*.onnx"))
     given = tmp_path / "given.onnx"
     save_onnx(load_onnx(legal), given)
@@ -258,7 +258,7 @@ def test_an_int8_file_is_taken_as_it_is(folder: Path, kept: tuple[Result, Path],
 
 
 def test_a_missing_library_leaves_a_point_with_its_reason(
-    folder: Path, kept: tuple[Result, Path], monkeypatch: pytest.MonkeyPatch
+    folder: Path, kept: tuple[StudyRun, Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "openvino", None)
     points = {row.name: row for row in run_study(request(folder), Cache(kept[1])).study.points}
@@ -268,7 +268,7 @@ def test_a_missing_library_leaves_a_point_with_its_reason(
     assert points["wide float32"].figures["PSNR"].value
 
 
-def command(folder: Path, kept: tuple[Result, Path], out: Path, *more: str) -> tuple[int, str]:
+def command(folder: Path, kept: tuple[StudyRun, Path], out: Path, *more: str) -> tuple[int, str]:
     names = ",".join(str(folder / f"{name}.safetensors") for name in ("narrow", "wide"))
     options = ["--images", folder / "images", "--calibration", folder / "calibration", "--networks", names]
     options += ["--size", "1500x1200", "--cache", kept[1], "--out", out, *more]
@@ -278,7 +278,7 @@ def command(folder: Path, kept: tuple[Result, Path], out: Path, *more: str) -> t
 
 
 def test_the_command_writes_a_report_and_a_document_that_compare_reads(
-    folder: Path, kept: tuple[Result, Path], tmp_path: Path
+    folder: Path, kept: tuple[StudyRun, Path], tmp_path: Path
 ) -> None:
     code, output = command(
         folder, kept, tmp_path / "a", "--budget", "latency<=100s", "--json", str(tmp_path / "x.json")
@@ -295,7 +295,7 @@ def test_the_command_writes_a_report_and_a_document_that_compare_reads(
 
 
 def test_a_need_that_nothing_meets_exits_1_and_writes_the_report(
-    folder: Path, kept: tuple[Result, Path], tmp_path: Path
+    folder: Path, kept: tuple[StudyRun, Path], tmp_path: Path
 ) -> None:
     code, output = command(folder, kept, tmp_path / "b", "--need", "psnr>=99")
     assert code == 1
@@ -318,7 +318,7 @@ def test_a_need_that_nothing_meets_exits_1_and_writes_the_report(
     ],
 )
 def test_bad_input_gets_one_sentence(
-    options: list[str], words: str, folder: Path, kept: tuple[Result, Path], tmp_path: Path
+    options: list[str], words: str, folder: Path, kept: tuple[StudyRun, Path], tmp_path: Path
 ) -> None:
     code, output = command(folder, kept, tmp_path / "c", *options)
     assert code == 2

@@ -41,7 +41,7 @@ def rows(monkeypatch: pytest.MonkeyPatch, chosen: Sequence[Condition]) -> dict[s
 
     monkeypatch.setattr(module, "conditions", few)
     scene = procedural_scene(700, 760, np.random.default_rng(5))
-    half = Method("half", lambda dn: dn / 2, "nothing")
+    half = Method("half", lambda dn: dn / 2, "blind")
     ticks: list[int] = []
     found = sweep_rows([half], [scene], PROFILE, REFERENCE, 0, lambda: ticks.append(1))
     assert len(ticks) == len(chosen)

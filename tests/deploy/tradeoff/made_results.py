@@ -13,8 +13,8 @@ from deploy.dpu.zoo.dense import convbeers
 from deploy.tradeoff.accuracy import Scores
 from deploy.tradeoff.board import DpuRun
 from deploy.tradeoff.host_time import Times
-from deploy.tradeoff.outcome import UNITS, Arena, Outcome
-from deploy.tradeoff.points import EXACT, LEGAL, Point, Unit
+from deploy.tradeoff.outcome import UNITS, Outcome, Results
+from deploy.tradeoff.points import EXACT, LEGAL, Point, Variant
 from profiles.figures import Figure, measured, unavailable
 
 SITES = ("a", "a", "b", "c", "d", "e")
@@ -31,7 +31,7 @@ class Made:
     features: int = 16
     tile_px: int = 640
     configuration: str = "C32B3"
-    told: str = "nothing"
+    sensor: str = "blind"
     scatter_db: float = 0.01
     halo: str = EXACT
 
@@ -50,17 +50,17 @@ def outcome(name: str, made: Made, number: int = 0) -> Outcome:
         "SSIM": measured(made.psnr_db / 50, "ratio", "made up"),
         **run.figures(),
     }
-    point = Point(Unit(name, "network", LEGAL), made.tile_px, made.halo, made.configuration)
+    point = Point(Variant(name, "network", LEGAL), made.tile_px, made.halo, made.configuration)
     times = Times("one", (0.1 * made.blocks,) * 3, (0.1,) * 3, 1000)
-    return Outcome(point, figures, {"told": made.told}, scores, run, times)
+    return Outcome(point, figures, {"sensor": made.sensor}, scores, run, times)
 
 
-def arena(points: Mapping[str, Made]) -> Arena:
-    """An arena of such points."""
+def results(points: Mapping[str, Made]) -> Results:
+    """An results of such points."""
     made = [outcome(name, point, number) for number, (name, point) in enumerate(points.items())]
-    return Arena({each.name: each for each in made}, SITES, 0)
+    return Results({each.name: each for each in made}, SITES, 0)
 
 
-def named(found: Arena, start: str) -> str:
+def named(found: Results, start: str) -> str:
     """The full name of a point."""
     return next(name for name in found.outcomes if name.startswith(start))
