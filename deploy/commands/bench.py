@@ -183,7 +183,7 @@ def _single(tiles: list[int]) -> int:
 
 def _swath(path: Path, shape: tuple[int, ...] | None, request: _Request) -> "Swath":
     from deploy.bench.tables import Swath
-    from deploy.restoration.arrays import parse_halo
+    from deploy.restoration.options import parse_halo
     from quant.onnx_file import load_onnx, receptive_radius_px
 
     halo, tile = request.halo, request.tiles_px[0]

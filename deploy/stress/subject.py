@@ -14,9 +14,9 @@ from torch import Tensor
 from torch.nn.functional import conv2d
 
 from deploy.export import float_model
-from deploy.restoration.arrays import Infer
 from deploy.restoration.engine import restore_floats
 from deploy.restoration.plan import make_plan
+from deploy.restoration.runtime import Infer
 from deploy.stress.cases import FULL_DN
 from model.shipped import float_file, int8_file, shipped_pair
 from profiles.errors import BeersError

@@ -9,10 +9,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from deploy.restoration.arrays import Infer
 from deploy.restoration.engine import Restorer, restore_rows
 from deploy.restoration.plan import Plan, make_plan
-from deploy.restoration.runtime import AT_ONCE, session_threads, tiles_at_once
+from deploy.restoration.runtime import AT_ONCE, Infer, session_threads, tiles_at_once
 from deploy.restoration.source import ArraySource, Raster
 from profiles.errors import ImageError
 

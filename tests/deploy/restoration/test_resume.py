@@ -104,14 +104,14 @@ def test_ctrl_c_says_how_to_go_on(image: Path, model: Path, expected: bytes, tmp
 
 def stop_after(tiles: int, monkeypatch: pytest.MonkeyPatch, error: BaseException) -> Callable[[], None]:
     """Raise an error in the network after so many tiles; the result lets it pass again."""
-    count, kept = iter(range(10**6)), Restorer.kept
+    count, tile = iter(range(10**6)), Restorer.tile
 
     def stopping(self: Restorer, *rest: object) -> tuple[np.ndarray, int]:
         if next(count) == tiles:
             raise error
-        return kept(self, *rest)  # type: ignore[arg-type]
+        return tile(self, *rest)  # type: ignore[arg-type]
 
-    monkeypatch.setattr(Restorer, "kept", stopping)
+    monkeypatch.setattr(Restorer, "tile", stopping)
     return monkeypatch.undo
 
 

@@ -15,10 +15,9 @@ import torch
 from deploy.export import to_onnx
 from deploy.restoration import run as swath
 from deploy.restoration import runtime
-from deploy.restoration.arrays import Infer, restore_window
+from deploy.restoration.engine import fill_from_nearest, restore_window
 from deploy.restoration.options import Compression, Options, Runtime
-from deploy.restoration.runtime import open_runtime
-from deploy.restoration.source import fill_missing
+from deploy.restoration.runtime import Infer, open_runtime
 from model.convbeers import ConvBEERS, Variant, initialise
 from model.shipped import default_int8
 from profiles.errors import BeersError, ImageError, MachineError, ModelError, OptionError
@@ -214,8 +213,8 @@ def test_missing_pixels_stay_and_spoil_nothing(kind: str, model: Path, tmp_path:
 def test_a_filled_pixel_is_the_nearest_known_one() -> None:
     pixels, missing = np.arange(12.0).reshape(2, 6), np.zeros((2, 6), bool)
     missing[0, 1:] = missing[1, :2] = True
-    np.testing.assert_array_equal(fill_missing(pixels, missing, 2), [[0, 0, 0, 9, 10, 11], [8, 8, 8, 9, 10, 11]])
-    assert fill_missing(pixels, np.ones((2, 6), bool), 2).max() == 0
+    np.testing.assert_array_equal(fill_from_nearest(pixels, missing, 2), [[0, 0, 0, 9, 10, 11], [8, 8, 8, 9, 10, 11]])
+    assert fill_from_nearest(pixels, np.ones((2, 6), bool), 2).max() == 0
 
 
 def refused(folder: Path, pixels: np.ndarray, options: Options, error: type[BeersError], *words: str) -> None:

@@ -23,8 +23,8 @@ from deploy.cluster import check_choice, local_cluster, open_cluster
 from deploy.export import to_onnx
 from deploy.restoration.engine import Restorer
 from deploy.restoration.options import Options, Runtime
-from deploy.restoration.plan import Span
-from deploy.restoration.run import plan_of, restore_file
+from deploy.restoration.plan import Span, plan_for
+from deploy.restoration.run import restore_file
 from deploy.restoration.runtime import open_runtime
 from deploy.restoration.source import open_source
 from deploy.restoration.workers import Piece, Work, make_work, restore_piece
@@ -132,14 +132,14 @@ def test_a_run_begun_here_is_finished_by_workers(
 ) -> None:
     options, out = Options(model, TILE_PX), tmp_path / "out.tif"
     restore_file(image, tmp_path / "expected.tif", options, silent)
-    count, kept = iter(range(10**6)), Restorer.kept
+    count, tile = iter(range(10**6)), Restorer.tile
 
     def stopping(self: Restorer, *rest: object) -> tuple[np.ndarray, int]:
         if next(count) == 40:
             raise KeyboardInterrupt
-        return kept(self, *rest)  # type: ignore[arg-type]
+        return tile(self, *rest)  # type: ignore[arg-type]
 
-    monkeypatch.setattr(Restorer, "kept", stopping)
+    monkeypatch.setattr(Restorer, "tile", stopping)
     with pytest.raises(KeyboardInterrupt):
         restore_file(image, out, options, silent)
     row = restore_file(image, out, replace(options, resume=True, scheduler=scheduler), silent)
@@ -169,7 +169,7 @@ def work(image: Path, model: Path) -> Work:
     network = load_onnx(model)
     options = Options(model, TILE_PX)
     with open_source(image) as source:
-        plan = plan_of(source.raster, network, options)
+        plan = plan_for(network, source.raster.shape, options)
     _, runtime = open_runtime(Runtime.onnxruntime, network, 1)
     return make_work(image, plan, network, runtime, options, 4095)
 
