@@ -16,28 +16,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 import tifffile
-import torch
 
-from deploy.export import to_onnx
 from deploy.restoration.engine import Restorer
 from deploy.restoration.options import Compression, Options
 from deploy.restoration.run import restore_file
-from model.convbeers import ConvBEERS, Variant, initialise
 from profiles.errors import MachineError, OptionError
-from quant.onnx_file import save_onnx
 
 KILLS = int(os.environ.get("BEERS_KILLS", "2"))
 ENTRY = "from deploy.cli import app; app()"
 TILE_PX = 64
-
-
-@pytest.fixture(scope="module")
-def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    network = ConvBEERS(Variant(blocks=1, features=8))
-    initialise(network, torch.Generator().manual_seed(0))
-    path = tmp_path_factory.mktemp("model") / "small.onnx"
-    save_onnx(to_onnx(network, {}), path)
-    return path
 
 
 @pytest.fixture

@@ -10,15 +10,12 @@ import onnx
 import psutil
 import pytest
 import tifffile
-import torch
 
-from deploy.export import to_onnx
 from deploy.restoration import run as swath
 from deploy.restoration import runtime
 from deploy.restoration.engine import fill_from_nearest, restore_window
 from deploy.restoration.options import Compression, Options, Runtime
 from deploy.restoration.runtime import Infer, open_runtime
-from model.convbeers import ConvBEERS, Variant, initialise
 from model.shipped import default_int8
 from profiles.errors import BeersError, ImageError, MachineError, ModelError, OptionError
 from profiles.figures import Row
@@ -27,18 +24,6 @@ from quant.session import open_session, run
 
 RADIUS_PX = 5
 SHAPES = [(61, 83), (17, 130), (1, 40), (40, 1), (29, 29), (3, 5)]
-
-
-@pytest.fixture(scope="module")
-def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    network = ConvBEERS(Variant(blocks=1, features=8))
-    initialise(network, torch.Generator().manual_seed(0))
-    with torch.no_grad():
-        for value in network.parameters():
-            value.mul_(2.0)
-    path = tmp_path_factory.mktemp("model") / "small.onnx"
-    save_onnx(to_onnx(network, {}), path)
-    return path
 
 
 def noise(*shape: int, seed: int = 1) -> np.ndarray:

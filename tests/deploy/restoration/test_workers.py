@@ -16,11 +16,9 @@ import numpy as np
 import psutil
 import pytest
 import tifffile
-import torch
 
 from deploy import cluster
 from deploy.cluster import check_choice, local_cluster, open_cluster
-from deploy.export import to_onnx
 from deploy.restoration.engine import Restorer
 from deploy.restoration.options import Options, Runtime
 from deploy.restoration.plan import Span, plan_for
@@ -28,25 +26,15 @@ from deploy.restoration.run import restore_file
 from deploy.restoration.runtime import open_runtime
 from deploy.restoration.source import open_source
 from deploy.restoration.workers import Piece, Work, make_work, restore_piece
-from model.convbeers import ConvBEERS, Variant, initialise
 from model.shipped import default_int8
 from profiles.errors import ImageError, MachineError, ModelError, OptionError
-from quant.onnx_file import load_onnx, save_onnx
+from quant.onnx_file import load_onnx
 from quant.session import open_session, run
 
 pytest.importorskip("distributed", reason="the extra 'dask' is not installed")
 
 ENTRY = "from deploy.cli import app; app()"
 TILE_PX = 64
-
-
-@pytest.fixture(scope="module")
-def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    network = ConvBEERS(Variant(blocks=1, features=8))
-    initialise(network, torch.Generator().manual_seed(0))
-    path = tmp_path_factory.mktemp("model") / "small.onnx"
-    save_onnx(to_onnx(network, {}), path)
-    return path
 
 
 @pytest.fixture(scope="module")
