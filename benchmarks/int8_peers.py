@@ -33,7 +33,7 @@ from model.metrics.fidelity import psnr_db, ssim
 from model.shipped import shipped_weights
 from model.simulator.procedural import load_scenes
 from profiles import load_sensor
-from profiles.sensor import reference_for
+from profiles.sensor_file import reference_for
 from quant.calibration import HELD_OUT_SEED, Pair, draw_patches
 from quant.graph import CORRECTION, PLANES, correction_graph, float_model, read_planes
 from quant.session import open_session, planes_of

@@ -25,7 +25,7 @@ import onnx
 import tifffile
 import torch
 
-from deploy.commands.bench import parse_size
+from deploy.bench.tables import parse_size
 from deploy.export import to_onnx
 from deploy.restoration.options import Options, Runtime
 from deploy.restoration.plan import make_plan

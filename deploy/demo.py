@@ -35,7 +35,7 @@ from model.traditional.pipeline import Chain, restore_traditional
 from profiles import load_sensor
 from profiles.errors import OptionError
 from profiles.figures import Row, measured
-from profiles.sensor import reference_for
+from profiles.sensor_file import reference_for
 from quant.calibration import HELD_OUT_SEED, draw_patches
 from quant.gate import compare, gate_row
 from quant.onnx_file import receptive_radius_px, save_onnx

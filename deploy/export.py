@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import onnx
 import torch
-from onnx import helper, numpy_helper
 
 from deploy import __version__
 from model.conditioning import fold, tell
@@ -16,8 +15,8 @@ from model.convbeers import ConvBEERS
 from model.io.weights import is_told, load_network, load_told
 from model.shipped import SHIPPED, default_float_weights, float_file, shipped_names, shipped_weights, told_names
 from profiles.errors import ModelError
-from profiles.sensor import load_sensor
-from quant.onnx_file import image_info, is_quantised, load_onnx, make_model, metadata
+from profiles.sensor_file import load_sensor
+from quant.onnx_file import GraphWriter, image_info, is_quantised, load_onnx, make_model, metadata
 from quant.session import open_session, run
 
 MAX_DIFFERENCE = 1e-5
@@ -52,15 +51,16 @@ def network_for(path: Path, sensor: str | None) -> tuple[ConvBEERS, dict[str, ob
 
 def to_onnx(network: ConvBEERS, about: dict[str, str], tile_px: int | None = None) -> onnx.ModelProto:
     """The network as an ONNX model; `tile_px` fixes one square image, None leaves number and size free."""
-    writer = _Writer({name: value.numpy() for name, value in network.state_dict().items()})
-    stream = head = writer.conv("head", "image")
+    writer = GraphWriter()
+    for name, value in network.state_dict().items():
+        writer.constant(name, value.numpy())
+    stream = head = _conv(writer, "head", "image")
     for k in range(network.variant.blocks):
-        inner = writer.node("Relu", f"body.{k}.relu", [writer.conv(f"body.{k}.first", stream)])
-        stream = writer.node("Add", f"body.{k}.add", [stream, writer.conv(f"body.{k}.second", inner)])
-    deep = writer.node("Add", "body_end.add", [head, writer.conv("body_end", stream)])
-    writer.node("Add", "restored", ["image", writer.conv("tail", deep)])
-    ends = [image_info("image", 1, tile_px)], [image_info("restored", 1, tile_px)]
-    graph = helper.make_graph(writer.nodes, "convbeers", *ends, writer.weights)
+        inner = writer.node("Relu", f"body.{k}.relu", [_conv(writer, f"body.{k}.first", stream)])
+        stream = writer.node("Add", f"body.{k}.add", [stream, _conv(writer, f"body.{k}.second", inner)])
+    deep = writer.node("Add", "body_end.add", [head, _conv(writer, "body_end", stream)])
+    writer.node("Add", "restored", ["image", _conv(writer, "tail", deep)])
+    graph = writer.graph("convbeers", [image_info("image", 1, tile_px)], [image_info("restored", 1, tile_px)])
     return make_model(graph, {"beers_deploy_version": __version__, "precision": "float32", **about})
 
 
@@ -95,22 +95,9 @@ def require_parity(network: ConvBEERS, model: Path | onnx.ModelProto, side_px: i
     return difference
 
 
-class _Writer:
-    """Collects nodes and weights; a node's result goes by the node's name."""
-
-    def __init__(self, state: dict[str, np.ndarray]) -> None:
-        self.nodes: list[onnx.NodeProto] = []
-        self.weights = [numpy_helper.from_array(value, name) for name, value in state.items()]
-
-    def node(self, kind: str, name: str, inputs: list[str], **attributes: list[int]) -> str:
-        node = helper.make_node(kind, inputs, [name], name=name)
-        node.attribute.extend(helper.make_attribute(key, value) for key, value in attributes.items())
-        self.nodes.append(node)
-        return name
-
-    def conv(self, name: str, source: str) -> str:
-        feeds = [source, f"{name}.weight", f"{name}.bias"]
-        return self.node("Conv", name, feeds, pads=[1] * 4, kernel_shape=[3, 3])
+def _conv(writer: GraphWriter, name: str, source: str) -> str:
+    feeds = [source, f"{name}.weight", f"{name}.bias"]
+    return writer.node("Conv", name, feeds, pads=[1] * 4, kernel_shape=[3, 3])
 
 
 def float_model(path: Path | None) -> onnx.ModelProto:

@@ -32,7 +32,7 @@ EXPECTED = (
 
 
 def method_named(name: str, degraded: Sensor, reference: Sensor, sensor_name: str = "") -> Method:
-    """The method of that name; the traditional ones are told both sensors, a network full scale alone.
+    """The method of that name; the traditional ones know both sensors, a network full scale alone.
 
     Args:
         name: as in EXPECTED.

@@ -1,8 +1,21 @@
-"""The numbers: calibration, power-of-two scales, INT8 graph writing and the float/INT8 gate.
+"""The numbers: from a float network to INT8 under a DPU's rules, and what that costs.
 
-float ONNX -> graph -> planes -> calibration -> scales -> host file (onnxruntime) and board file (DPU flow)
+float ONNX (`onnx_file`) -> `graph` -> `calibration` -> `passes` -> integer `core` -> two `encodings`: the host's file
+for onnxruntime, the board's for its own flow
+
+- `quantise` does it in one call; `free` goes without the DPU's rules;
+- `session` runs networks on onnxruntime, `kernels` in ways that add exactly on this processor;
+- `integer` is the core's arithmetic in whole numbers, `bounds` proves what holds for any input;
+- `gate`, `structure` and `checks` judge an INT8 file, `sensitivity` says which layers err, `faults` flips bits;
+- `untrusted` looks at files before anything believes them.
+
+What is offered here is loaded when it is asked for.
 """
+
+import lazy_loader
 
 from quant.telemetry import switch_off_telemetry
 
 switch_off_telemetry()  # here, because a runtime's first import anywhere in this package is too late
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -23,7 +23,8 @@ from model.simulator.sampling import Scene, scene_spectrum
 from model.training.patches import PatchRecipe, turn
 from profiles import load_sensor
 from profiles.errors import ImageError
-from profiles.sensor import Sensor, SensorProfile, reference_for
+from profiles.sensor import Sensor, SensorProfile
+from profiles.sensor_file import reference_for
 from quant.core import CANDIDATES, squared_errors, unclipped_frac_bits
 from quant.graph import PLANES, PLANES_FRAC_BITS, Graph, float_model, tensors
 from quant.session import halo_of, open_session, tensor_values

@@ -5,14 +5,16 @@ by itself as QDQ ONNX, with int8 bias and power-of-two scales. Reading a host fi
 about.
 """
 
+from collections.abc import Sequence
+
 import numpy as np
 import onnx
-from onnx import TensorProto, helper, numpy_helper
+from onnx import TensorProto, helper
 
 from profiles.errors import ModelError
 from quant.core import IntConv, IntCore
 from quant.graph import COARSE_MAX, CORRECTION, COUNT, IMAGE, MAX_DN, PLANES, QUARTER, STEP, Add
-from quant.onnx_file import constants, fixed_tile_px, image_info, make_model, metadata
+from quant.onnx_file import GraphWriter, constants, fixed_tile_px, image_info, make_model, metadata
 from quant.passes.stream import FINE_MAX, GAIN
 from quant.untrusted import contradictions
 
@@ -31,8 +33,7 @@ def host_model(core: IntCore, about: dict[str, str], tile_px: int | None = None)
             _host_conv(writer, core, op)
     _merge(writer, core)
     ends = [image_info(IMAGE, 1, tile_px)], [image_info("restored", 1, tile_px)]
-    graph = helper.make_graph(writer.nodes, "convbeers-int8", *ends, list(writer.weights.values()))
-    return make_model(graph, about, microsoft=True)
+    return make_model(writer.graph("convbeers-int8", *ends), about, microsoft=True)
 
 
 def _split_planes(w: "_HostWriter") -> None:
@@ -100,29 +101,19 @@ def _merge_gains(w: "_HostWriter", scale: float) -> None:
     w.node("Where", "host_back.correction", ["host_back.fits", "host_back.fine", "host_back.wide"])
 
 
-class _HostWriter:
-    """Collects nodes and constants; a constant of one name is written once."""
-
-    def __init__(self) -> None:
-        self.nodes: list[onnx.NodeProto] = []
-        self.weights: dict[str, onnx.TensorProto] = {}
+class _HostWriter(GraphWriter):
+    """Writes the host's operators, each with its domain, and uint8 around 128."""
 
     def node(
         self,
         kind: str,
         output: str,
-        inputs: list[str],
+        inputs: Sequence[str],
         name: str = "",
-        domain: str = "",
+        domain: str | None = "",
         **attributes: int | list[int],
-    ) -> None:
-        node = helper.make_node(kind, inputs, [output], name=name or output, domain=domain)
-        node.attribute.extend(helper.make_attribute(key, value) for key, value in attributes.items())
-        self.nodes.append(node)
-
-    def constant(self, name: str, value: np.ndarray) -> str:
-        self.weights.setdefault(name, numpy_helper.from_array(value, name))
-        return name
+    ) -> str:
+        return super().node(kind, output, inputs, name, domain, **attributes)
 
     def scalar(self, name: str, value: float) -> str:
         return self.constant(name, np.array(value, np.float32))
@@ -145,13 +136,12 @@ def board_model(core: IntCore, about: dict[str, str], tile_px: int | None = None
         inputs = ["planes.dequantised" if i == PLANES else i for i in op.inputs]
         output = f"{op.output}.float"
         if isinstance(op, Add):
-            writer.nodes.append(helper.make_node("Add", inputs, [output], name=op.name))
+            writer.node("Add", output, inputs, op.name)
         else:
             _board_conv(writer, op, inputs[0], output)
         writer.quantised(op.output, output, core.frac_bits[op.output])
     ends = [image_info(PLANES, COUNT, tile_px)], [image_info(CORRECTION, core.output_channels, tile_px)]
-    graph = helper.make_graph(writer.nodes, "convbeers-core", *ends, list(writer.weights.values()))
-    return make_model(graph, about)
+    return make_model(writer.graph("convbeers-core", *ends), about)
 
 
 def _board_conv(w: "_BoardWriter", op: IntConv, source: str, output: str) -> None:
@@ -160,39 +150,27 @@ def _board_conv(w: "_BoardWriter", op: IntConv, source: str, output: str) -> Non
     result = f"{op.output}.linear" if op.relu else output
     kernel = list(op.weight.shape[2:])
     feeds = [source, weight, bias]
-    w.nodes.append(helper.make_node("Conv", feeds, [result], name=op.name, pads=[op.pad_px] * 4, kernel_shape=kernel))
+    w.node("Conv", result, feeds, op.name, kernel_shape=kernel, pads=[op.pad_px] * 4)
     if op.relu:
-        w.nodes.append(helper.make_node("Relu", [result], [output], name=f"{op.name}.relu"))
+        w.node("Relu", output, [result], f"{op.name}.relu")
 
 
-class _BoardWriter:
-    """Collects nodes and constants."""
-
-    def __init__(self) -> None:
-        self.nodes: list[onnx.NodeProto] = []
-        self.weights: dict[str, onnx.TensorProto] = {}
+class _BoardWriter(GraphWriter):
+    """Writes tensors as the board's flow reads them: quantised to int8, and seen as float again."""
 
     def scale(self, frac_bits: int) -> list[str]:
-        name = f"scale_2^{-frac_bits}"
-        self.weights.setdefault(name, numpy_helper.from_array(np.array(2.0**-frac_bits, np.float32), name))
-        self.weights.setdefault("zero_point", numpy_helper.from_array(np.array(0, np.int8), "zero_point"))
-        return [name, "zero_point"]
+        name = self.constant(f"scale_2^{-frac_bits}", np.array(2.0**-frac_bits, np.float32))
+        return [name, self.constant("zero_point", np.array(0, np.int8))]
 
     def quantised(self, output: str, source: str, frac_bits: int) -> None:
         """Quantise and dequantise an activation."""
-        middle = f"{source}.int8"
-        self.nodes.append(helper.make_node("QuantizeLinear", [source, *self.scale(frac_bits)], [middle], name=middle))
-        self.nodes.append(
-            helper.make_node("DequantizeLinear", [middle, *self.scale(frac_bits)], [output], name=f"{middle}.float")
-        )
+        middle = self.node("QuantizeLinear", f"{source}.int8", [source, *self.scale(frac_bits)])
+        self.node("DequantizeLinear", output, [middle, *self.scale(frac_bits)], f"{middle}.float")
 
     def dequantised(self, name: str, value: np.ndarray, frac_bits: int) -> str:
         """An int8 constant seen as float."""
-        self.weights[name] = numpy_helper.from_array(value, name)
-        result = f"{name}.float"
-        feeds = [name, *self.scale(frac_bits)]
-        self.nodes.append(helper.make_node("DequantizeLinear", feeds, [result], name=result))
-        return result
+        feeds = [self.constant(name, value), *self.scale(frac_bits)]
+        return self.node("DequantizeLinear", f"{name}.float", feeds)
 
 
 def read_core(model: onnx.ModelProto) -> IntCore:

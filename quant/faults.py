@@ -1,6 +1,7 @@
-"""Bit flips in weights, shifts, feature maps and the image, and cheap guards against them.
+"""Bit flips (single-event upsets) in weights, shifts, feature maps and the image, and cheap guards against them.
 
-The guards: ReLU6, a limit of the correction, checksums with a reload, three copies.
+The guards: ReLU6 in place of ReLU, a limit of the correction, scrubbing of the weights by their checksums, triple
+modular redundancy of the shifts.
 """
 
 import zlib
@@ -20,22 +21,22 @@ Shifts = Mapping[tuple[str, str], int]
 """By operation and field, as `quant.integer.Faults` takes them."""
 
 
-def upset_count(bits: int, per_megabit: float, generator: np.random.Generator) -> int:
-    """How many of so many bits are turned over, each on its own."""
+def flip_count(bits: int, per_megabit: float, generator: np.random.Generator) -> int:
+    """How many of `bits` bits flip, each on its own with probability `per_megabit` / 10^6."""
     return int(generator.binomial(bits, min(per_megabit / MEGABIT, 1.0)))
 
 
-def turned_over(
+def flip_bits(
     values: np.ndarray, count: int, generator: np.random.Generator, bits: int = INT8_BITS, bit: int | None = None
 ) -> np.ndarray:
-    """A copy of whole numbers, two's complement where their type is signed, with `count` bits turned over.
+    """A copy of whole numbers, two's complement where their type is signed, with `count` bits flipped.
 
     Args:
-        values: of any integer type that holds them.
-        count: of different bits.
+        values: of any shape and integer type that holds them.
+        count: how many different bits.
         generator: draws which.
-        bits: of one number.
-        bit: turn over only this one, 0 being the least.
+        bits: how many one number has in memory.
+        bit: flip only this one, 0 being the least.
     """
     choices = values.size if bit is not None else values.size * bits
     chosen = generator.choice(choices, min(count, choices), replace=False, shuffle=False)
@@ -74,23 +75,23 @@ def _refuse(got: str) -> ModelError:
 
 
 def weight_bits(core: IntCore) -> int:
-    """Bits of all weights and bias."""
+    """How many bits all weights and bias take in memory."""
     return INT8_BITS * sum(op.weight.size + op.bias.size for op in core.ops if isinstance(op, IntConv))
 
 
-def upset_weights(core: IntCore, count: int, generator: np.random.Generator) -> IntCore:
-    """The core with so many bits of its weights and bias turned over, wherever they fall."""
+def flip_weights(core: IntCore, count: int, generator: np.random.Generator) -> IntCore:
+    """The core with `count` bits of its weights and bias flipped, wherever they fall."""
     convs = [op for op in core.ops if isinstance(op, IntConv)]
     sizes = np.array([op.weight.size + op.bias.size for op in convs])
     share = generator.multivariate_hypergeometric(sizes * INT8_BITS, count)
-    hit = {op.name: upset_conv(op, int(n), generator) for op, n in zip(convs, share, strict=True) if n}
+    hit = {op.name: flip_conv(op, int(n), generator) for op, n in zip(convs, share, strict=True) if n}
     return with_ops(core, hit)
 
 
-def upset_conv(op: IntConv, count: int, generator: np.random.Generator, bit: int | None = None) -> IntConv:
-    """The convolution with so many bits turned over, all of them the given one where one is given."""
+def flip_conv(op: IntConv, count: int, generator: np.random.Generator, bit: int | None = None) -> IntConv:
+    """The convolution with `count` bits of weights and bias flipped, each of them bit `bit` where one is given."""
     stored = np.concatenate([op.weight.ravel(), op.bias])
-    stored = turned_over(stored, count, generator, INT8_BITS, bit)
+    stored = flip_bits(stored, count, generator, INT8_BITS, bit)
     return replace(op, weight=stored[: op.weight.size].reshape(op.weight.shape), bias=stored[op.weight.size :])
 
 
@@ -115,13 +116,13 @@ def shifts_of(core: IntCore) -> dict[tuple[str, str], int]:
 
 
 def bits_apart(shifts: Shifts, others: Shifts) -> int:
-    """In how many bits they differ."""
+    """In how many bits two sets of shifts differ, six bits a shift."""
     return sum(((shifts[key] ^ others[key]) & ((1 << SHIFT_BITS) - 1)).bit_count() for key in shifts)
 
 
-def upset_shifts(shifts: Shifts, count: int, generator: np.random.Generator) -> dict[tuple[str, str], int]:
-    """The shifts with so many bits turned over."""
-    raw = turned_over(np.array(list(shifts.values()), np.int16), count, generator, SHIFT_BITS)
+def flip_shifts(shifts: Shifts, count: int, generator: np.random.Generator) -> dict[tuple[str, str], int]:
+    """The shifts with `count` of their bits flipped."""
+    raw = flip_bits(np.array(list(shifts.values()), np.int16), count, generator, SHIFT_BITS)
     return dict(zip(shifts, raw.tolist(), strict=True))
 
 
@@ -131,7 +132,7 @@ RELU6_UNITS = 96
 
 @dataclass(frozen=True)
 class Guards:
-    """What a healthy network never exceeds, and what its weights sum to.
+    """What a fault-free network never exceeds, and what its weights sum to.
 
     Attributes:
         relu6: bound in units of each ReLU that has one, by its tensor.
@@ -154,7 +155,7 @@ class Guards:
 
 
 def learn_guards(core: IntCore, planes: Iterable[np.ndarray]) -> Guards:
-    """Guards from what a healthy core reaches on calibration patches, planes (N, 3, H, W) each."""
+    """Guards from what a fault-free core reaches on calibration patches, planes (N, 3, H, W) each."""
     relus = {op.output: 0 for op in core.ops if isinstance(op, IntConv) and op.relu}
     largest_dn = 0.0
     for each in planes:
@@ -170,15 +171,15 @@ def checksums(core: IntCore) -> dict[str, int]:
     return {op.name: _checksum(op) for op in core.ops if isinstance(op, IntConv)}
 
 
-def reloaded(core: IntCore, sound: IntCore, known: Mapping[str, int]) -> IntCore:
-    """The core with every convolution whose checksum is not the known one taken from a sound copy."""
+def scrubbed(core: IntCore, sound: IntCore, known: Mapping[str, int]) -> IntCore:
+    """The core after scrubbing: every convolution whose checksum is not the known one comes from a sound copy."""
     safe = {op.name: op for op in sound.ops if isinstance(op, IntConv)}
     broken = {name: safe[name] for name, found in checksums(core).items() if found != known[name]}
     return with_ops(core, broken)
 
 
 def voted(copies: tuple[Shifts, Shifts, Shifts]) -> dict[tuple[str, str], int]:
-    """Each shift as two of its three copies have it, bit by bit."""
+    """The shifts by majority of three copies, bit by bit: triple modular redundancy."""
     a, b, c = copies
     return {key: (a[key] & b[key]) | (a[key] & c[key]) | (b[key] & c[key]) for key in a}
 

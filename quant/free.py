@@ -9,7 +9,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import onnx
-from onnx import helper
 
 from quant.calibration import Patches
 from quant.core import INT8_MAX
@@ -161,8 +160,7 @@ def free_model(
     limits = [writer.scalar("zero", 0), writer.scalar("one", 1)]
     writer.node("Clip", "restored", ["host_back.add", *limits], name="host_back.clip")
     ends = [image_info(IMAGE, 1, tile_px)], [image_info("restored", 1, tile_px)]
-    whole = helper.make_graph(writer.nodes, "convbeers-int8-free", *ends, list(writer.weights.values()))
-    return make_model(whole, about, microsoft=True)
+    return make_model(writer.graph("convbeers-int8-free", *ends), about, microsoft=True)
 
 
 def _conv(w: _HostWriter, op: Conv, scales: Mapping[str, Scale], moments: Moments | None) -> None:

@@ -177,7 +177,7 @@ def gate_row(result: GateResult) -> Row:
 
 
 def verdict_row(result: GateResult, shares: Mapping[str, float]) -> Row:
-    """The figures of a gate: those of `gate_row`, the PSNR lost against the reference, the worst layer's saturation."""
+    """The figures of a gate: those of `gate_row`, the PSNR lost to the reference, the worst layer's saturation."""
     row, drop = gate_row(result), _figure(result.drop_db, "dB", result.patches)
     worst = saturation_figure(shares, result.patches)
     return replace(row, figures={**row.figures, "PSNR drop": drop, "saturated results": worst})

@@ -12,7 +12,7 @@ import onnx
 from onnx import TensorProto, helper, numpy_helper
 
 from profiles.errors import ModelError
-from quant.onnx_file import image_info, make_model
+from quant.onnx_file import GraphWriter, image_info, make_model
 from quant.untrusted import contradictions
 
 IMAGE, CORRECTION = "image", "correction"
@@ -231,18 +231,19 @@ def _rename(op: Op, names: dict[str, str]) -> Op:
 
 def float_model(graph: Graph, outputs: list[str]) -> onnx.ModelProto:
     """The graph from `planes` (N, 3, H, W) float32 to the named tensors."""
-    nodes: list[onnx.NodeProto] = []
-    weights: list[onnx.TensorProto] = []
+    writer = GraphWriter()
     for op in graph:
-        if isinstance(op, Conv):
-            weights += [numpy_helper.from_array(op.weight, f"{op.name}.weight")]
-            weights += [numpy_helper.from_array(op.bias, f"{op.name}.bias")]
-            result = f"{op.output}.linear" if op.relu else op.output
-            feeds = [op.input, f"{op.name}.weight", f"{op.name}.bias"]
-            nodes.append(helper.make_node("Conv", feeds, [result], name=op.name, pads=[op.pad_px] * 4))
-            if op.relu:
-                nodes.append(helper.make_node("Relu", [result], [op.output], name=f"{op.name}.relu"))
-        else:
-            nodes.append(helper.make_node("Add", list(op.inputs), [op.output], name=op.name))
+        if isinstance(op, Add):
+            writer.node("Add", op.output, op.inputs, op.name)
+            continue
+        feeds = [
+            op.input,
+            writer.constant(f"{op.name}.weight", op.weight),
+            writer.constant(f"{op.name}.bias", op.bias),
+        ]
+        result = f"{op.output}.linear" if op.relu else op.output
+        writer.node("Conv", result, feeds, op.name, pads=[op.pad_px] * 4)
+        if op.relu:
+            writer.node("Relu", op.output, [result], f"{op.name}.relu")
     results = [helper.make_tensor_value_info(n, TensorProto.FLOAT, ["N", "C", "H", "W"]) for n in outputs]
-    return make_model(helper.make_graph(nodes, "core", [image_info(PLANES, COUNT, None)], results, weights), {})
+    return make_model(writer.graph("core", [image_info(PLANES, COUNT, None)], results), {})

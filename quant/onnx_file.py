@@ -6,7 +6,7 @@ graphs that compute the same thing at every pixel have one. Refused is what does
 not the same at every pixel.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -89,6 +89,40 @@ def make_model(graph: onnx.GraphProto, about: dict[str, str], microsoft: bool = 
     model = onnx.helper.make_model(graph, opset_imports=opsets, ir_version=IR_VERSION, producer_name="beers-deploy")
     onnx.helper.set_model_props(model, about)
     return model
+
+
+class GraphWriter:
+    """Collects the nodes and the constants of a graph; a constant of one name is written once."""
+
+    def __init__(self) -> None:
+        self.nodes: list[onnx.NodeProto] = []
+        self.weights: dict[str, onnx.TensorProto] = {}
+
+    def node(
+        self,
+        kind: str,
+        output: str,
+        inputs: Sequence[str],
+        name: str = "",
+        domain: str | None = None,
+        **attributes: int | list[int],
+    ) -> str:
+        """Append an operator of one result, named as its result unless it has a name; returns the result's."""
+        node = onnx.helper.make_node(kind, inputs, [output], name=name or output, domain=domain)
+        node.attribute.extend(onnx.helper.make_attribute(key, value) for key, value in attributes.items())
+        self.nodes.append(node)
+        return output
+
+    def constant(self, name: str, value: np.ndarray) -> str:
+        """Note a constant, and return its name."""
+        self.weights.setdefault(name, numpy_helper.from_array(value, name))
+        return name
+
+    def graph(
+        self, name: str, inputs: list[onnx.ValueInfoProto], outputs: list[onnx.ValueInfoProto]
+    ) -> onnx.GraphProto:
+        """What was collected."""
+        return onnx.helper.make_graph(self.nodes, name, inputs, outputs, list(self.weights.values()))
 
 
 def image_info(

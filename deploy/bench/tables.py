@@ -32,7 +32,7 @@ TABLE, LAYERS = "bench", "layers"
 COST_SOURCE = "cost model fitted on published networks, docs/cost-model.md"
 ARITHMETIC = "arithmetic of the tile grid"
 PAPER = "ConvBEERS paper, table of the VCK190 benchmark, 13600 x 9016"
-PAPER_TILE_PX = 640
+PAPER_TILE_PX, PAPER_SIZE = 640, "13600x9016"
 
 
 @dataclass(frozen=True)
@@ -248,6 +248,19 @@ def parse_tiles(text: str) -> list[int]:
 
 
 NAME = "traditional pipeline on the board's CPU, 2 x Cortex-A72"
+
+
+def parse_size(text: str) -> tuple[int, int]:
+    """WIDTHxHEIGHT in pixels as (width, height).
+
+    Raises:
+        OptionError: another text.
+    """
+    parts = text.lower().split("x")
+    if len(parts) != 2 or not all(part.isdecimal() and int(part) > 0 for part in parts):
+        remedy = f"write it as {PAPER_SIZE}"
+        raise OptionError("--size", expected="WIDTHxHEIGHT in pixels", got=repr(text), remedy=remedy)
+    return int(parts[0]), int(parts[1])
 
 
 def slowdown(board: TargetProfile, host: TargetProfile) -> tuple[float, float]:

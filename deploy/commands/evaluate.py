@@ -43,7 +43,7 @@ def evaluate(
     """Compare restorations with the reference, on average and by site; the degraded input is always a row.
 
     PSNR leaves out clipped pixels. MTF and SNR are measured on restored slanted edges and flat fields. Traditional
-    methods are told both sensors' nominal figures; networks are told nothing, but may have been made for the sensor.
+    methods know both sensors' nominal figures; networks are blind, but may have been made for the sensor.
     """
     from deploy.methods import method_named
     from deploy.report.evaluation_page import evaluation_report, pictures

@@ -117,7 +117,7 @@ def _by_the_chain(
     from deploy.results import Document, print_rows
     from profiles import load_sensor
     from profiles.errors import OptionError
-    from profiles.sensor import reference_for
+    from profiles.sensor_file import reference_for
 
     if sensor is None:
         remedy = "name a profile ('beers-deploy profiles' lists them) or give your .toml file"

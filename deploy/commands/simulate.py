@@ -86,7 +86,7 @@ def simulate(
     from profiles import load_sensor
     from profiles.errors import OptionError
     from profiles.scene_call import calling_for, load_scene_call
-    from profiles.sensor import reference_beside
+    from profiles.sensor_file import reference_beside
 
     if out is None:
         expected, remedy = "--out beside it", "leave it out, or give a folder"

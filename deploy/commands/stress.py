@@ -37,10 +37,11 @@ def stress(
     ] = 96,
     seed: Annotated[int, typer.Option(min=0, max=SEEDS, help="Seed of every random draw.")] = 0,
     bit_flips: Annotated[
-        bool, typer.Option("--bit-flips", help="Turn bits over in the INT8 network instead of running hard cases.")
+        bool,
+        typer.Option("--bit-flips", help="Inject bit flips into the INT8 network instead of running hard cases."),
     ] = False,
     draws: Annotated[
-        int, typer.Option(min=1, max=10_000, help="Strikes of each memory and rate, with --bit-flips.")
+        int, typer.Option(min=1, max=10_000, help="Injections into each memory at each rate, with --bit-flips.")
     ] = 6,
     sensor: Annotated[str, typer.Option(help="Sensor profile of the patches, with --bit-flips.")] = SENSOR,
     images: Annotated[
@@ -56,7 +57,7 @@ def stress(
     """Run hard cases through simulator, traditional chain, network, INT8, tiling, metrics and losses.
 
     Prints what holds, the worst measures, the known limitations met, and what is proven for every image. With
-    --bit-flips: what bits turned over in weights, shifts, maps and the image cost, what guards buy back, and what
+    --bit-flips: what bit flips in weights, shifts, maps and the image cost, what guards buy back, and what
     these cost on the board.
     """
     from deploy.results import Document, print_rows
@@ -130,7 +131,7 @@ def _refuse_unused(context: typer.Context, float_model: Path | None, bit_flips: 
 def _flip_bits(
     subject: "Subject", request: "FlipRequest", wanted: tuple[Path | None, Path | None, Path | None]
 ) -> None:
-    """Strike, print, and write what was asked for: tables, curves, figures."""
+    """Inject, print, and write what was asked for: tables, curves, figures."""
     from dataclasses import asdict
 
     from deploy.results import Document, print_rows

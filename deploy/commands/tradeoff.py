@@ -54,7 +54,7 @@ def tradeoff(
     Measurements are kept: a second run, or one that was stopped, measures only what is missing. Exit code 1 where no
     point keeps --budget and --need; the report is written all the same.
     """
-    from deploy.commands.bench import parse_size
+    from deploy.bench.tables import parse_size
     from deploy.results import Document
     from deploy.tradeoff.cache import Cache
     from deploy.tradeoff.page import FILES, write_study
@@ -63,7 +63,7 @@ def tradeoff(
     from deploy.tradeoff.selection import Request
     from model.io.files import require_writable
     from model.shipped import shipped_names
-    from profiles.sensor import REFERENCE, load_sensor, reference_beside
+    from profiles.sensor_file import REFERENCE, load_sensor, reference_beside
 
     figures, kept = out / "tradeoff.json", cache or out / "cache"
     demands = [tuple(parse_demands(name, text)) for name, text in (("--budget", budget), ("--need", need))]

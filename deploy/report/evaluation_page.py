@@ -77,8 +77,8 @@ def evaluation_report(
 
 MEAN_CAPTION = (
     "Intervals: 95 % bootstrap over sites for image figures, none below five sites; 90 % for the MTF. "
-    "What a method was told stands beside "
-    "it: a method that knows the sensor has an advantage that it may not have in orbit."
+    "What a method knows of the sensor "
+    "stands beside it: one that knows it has an advantage that it may not have in orbit."
 )
 SITES_CAPTION = "Over full scale; from PSNR, pixels that clipped in the input or the reference are left out."
 NOTES = (

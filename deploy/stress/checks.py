@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+from skimage.morphology import dilation, erosion
 
 from deploy.stress.cases import FULL_DN
 from profiles.errors import BeersError
@@ -66,18 +67,9 @@ def ringing(image: np.ndarray, source: np.ndarray, radius_px: int, allowed: floa
 
 
 def local_range(image: np.ndarray, radius_px: int) -> tuple[np.ndarray, np.ndarray]:
-    """The smallest and the largest pixel within the radius along both axes."""
-    low, high = image, image
-    for axis in (0, 1):
-        margins = [(radius_px, radius_px) if a == axis else (0, 0) for a in (0, 1)]
-        low, high = (
-            np.lib.stride_tricks.sliding_window_view(
-                np.pad(values, margins, constant_values=end), 2 * radius_px + 1, axis
-            )
-            for values, end in ((low, np.inf), (high, -np.inf))
-        )
-        low, high = low.min(-1), high.max(-1)
-    return low, high
+    """The smallest and the largest pixel (H, W) within the radius along both axes, the image (H, W) ending there."""
+    square = np.ones((2 * radius_px + 1, 2 * radius_px + 1))
+    return erosion(image, square), dilation(image, square)
 
 
 def gain(work: Work, source: np.ndarray, result: np.ndarray, generator: np.random.Generator) -> float:

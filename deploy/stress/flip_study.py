@@ -1,4 +1,4 @@
-"""`stress --bit-flips`: the patient, and the tables of what flips do to it and what guards cost."""
+"""`stress --bit-flips`: the fault target, and the tables of what flips do to it and what guards cost."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -11,7 +11,7 @@ from deploy.dpu.cost.latency import Prediction, frame_rate
 from deploy.dpu.cost.layers import Constants
 from deploy.report.curves import Curve, Panel, Points, curves_svg
 from deploy.stress import flips
-from deploy.stress.flips import MEMORIES, SETS, Patient, name_of, rates_of
+from deploy.stress.flips import MEMORIES, SETS, FaultTarget, name_of, rates_of
 from deploy.stress.networks import core_of, planes_of
 from deploy.stress.subject import Subject
 from profiles.figures import Row, predicted
@@ -28,21 +28,21 @@ TILE_PX = 640
 AT_ONCE, INSTRUCTIONS = 16, 2
 
 
-def price_rows(patient: Patient, prediction: Prediction, dpu: Dpu) -> list[Row]:
+def price_rows(target: FaultTarget, prediction: Prediction, dpu: Dpu) -> list[Row]:
     """A row a guard and one for all of them, at work for every tile of 640 x 640."""
-    relus = sum(op.relu for op in patient.core.ops if isinstance(op, IntConv))
-    rate, values = Constants.of(dpu).host_in_bytes_per_s, patient.core.output_channels * TILE_PX**2
+    relus = sum(op.relu for op in target.core.ops if isinstance(op, IntConv))
+    rate, values = Constants.of(dpu).host_in_bytes_per_s, target.core.output_channels * TILE_PX**2
     clock_hz = 1e9 * dpu.limit("cpu", "clock_ghz").low
     limit_s = INSTRUCTIONS * values / AT_ONCE / clock_hz
-    checksums_s = weight_bits(patient.core) / INT8_BITS / rate
-    copies_s = 3 * len(patient.shifts) / rate
+    scrubbing_s = weight_bits(target.core) / INT8_BITS / rate
+    copies_s = 3 * len(target.shifts) / rate
     spread = exp(dpu.value("cost", "error_outside"))
     guards = {
-        f"ReLU6 at {len(patient.guards.relu6)} of {relus} ReLUs": (0.0, FUSED),
-        f"limit of the correction, {patient.guards.limit_dn:g} DN": (limit_s, INSTRUCTED),
-        "checksums of all weights": (checksums_s, READ),
-        "three copies of the shifts": (copies_s, READ),
-        "all guards": (limit_s + checksums_s + copies_s, f"{INSTRUCTED}; {READ}"),
+        f"ReLU6 at {len(target.guards.relu6)} of {relus} ReLUs": (0.0, FUSED),
+        f"limit of the correction, {target.guards.limit_dn:g} DN": (limit_s, INSTRUCTED),
+        "scrubbing of all weights": (scrubbing_s, READ),
+        "triple modular redundancy of the shifts": (copies_s, READ),
+        "all guards": (limit_s + scrubbing_s + copies_s, f"{INSTRUCTED}; {READ}"),
     }
     return [_row(name, time_s, source, prediction, spread) for name, (time_s, source) in guards.items()]
 
@@ -65,15 +65,15 @@ CALIBRATION_PATCHES = 16
 
 @dataclass(frozen=True)
 class FlipRequest:
-    """What to strike, and how often.
+    """What to inject faults into, and how often.
 
     Attributes:
         sensor: profile of the degraded patches.
         images: folder of scenes; drawn ones where there is none.
         target: board whose cost model prices the guards.
-        draws: strikes of each kind of memory and rate.
+        draws: injections into each kind of memory at each rate.
         size_px: side of a patch.
-        seed: of patches and strikes.
+        seed: of patches and injections.
     """
 
     sensor: str
@@ -94,10 +94,10 @@ def flip_rows(subject: Subject, request: FlipRequest, tick: Callable[[], None] =
     core_of(subject)  # refused before anything is drawn
     dpu = load_dpu(request.target, None)
     prediction = predict_file(subject.paths[-1], dpu, TILE_PX)
-    patient = make_patient(subject, request)
-    curves = flips.curve_rows(patient, request.draws, request.seed, tick)
-    places = flips.place_rows(patient, request.seed, request.size_px // 2, tick)
-    return [*curves, *places, *price_rows(patient, prediction, dpu)]
+    target = make_target(subject, request)
+    curves = flips.curve_rows(target, request.draws, request.seed, tick)
+    places = flips.place_rows(target, request.seed, request.size_px // 2, tick)
+    return [*curves, *places, *price_rows(target, prediction, dpu)]
 
 
 def ticks(subject: Subject, request: FlipRequest) -> int:
@@ -105,7 +105,7 @@ def ticks(subject: Subject, request: FlipRequest) -> int:
     return flips.curve_ticks(request.draws) + len(core_of(subject).ops)
 
 
-def make_patient(subject: Subject, request: FlipRequest) -> Patient:
+def make_target(subject: Subject, request: FlipRequest) -> FaultTarget:
     """The core as the board stores it, guards that calibration patches teach, and other patches to try it on."""
     core = as_stored(core_of(subject))
     taught, tried = (
@@ -113,16 +113,16 @@ def make_patient(subject: Subject, request: FlipRequest) -> Patient:
         for seed, count in ((request.seed, CALIBRATION_PATCHES), (request.seed + HELD_OUT_SEED, request.draws))
     )
     guards = learn_guards(core, (planes_of(core, image) for image in taught.degraded))
-    return Patient(core, guards, list(tried.pairs))
+    return FaultTarget(core, guards, list(tried.pairs))
 
 
 SHOWN = (SETS[-1], SETS[0])
 
 
 def flip_curves_svg(networks: Mapping[str, Sequence[Row]]) -> str:
-    """PSNR against bits turned over, with all guards and with none; rows by the network's name."""
+    """PSNR against bit flips, with all guards and with none; rows by the network's name."""
     panels = [Panel(memory, _curves(networks, memory)) for memory in MEMORIES]
-    return curves_svg(panels, "bits turned over in a megabit", "PSNR, dB (measured)")
+    return curves_svg(panels, "bit flips in a megabit", "PSNR, dB (measured)")
 
 
 def _curves(networks: Mapping[str, Sequence[Row]], memory: str) -> list[Curve]:

@@ -21,15 +21,15 @@ from quant.faults import (
     Guards,
     bits_apart,
     checksums,
+    flip_bits,
+    flip_conv,
+    flip_count,
+    flip_shifts,
+    flip_weights,
     guarded,
     map_channels,
-    reloaded,
+    scrubbed,
     shifts_of,
-    turned_over,
-    upset_conv,
-    upset_count,
-    upset_shifts,
-    upset_weights,
     voted,
     weight_bits,
     with_ops,
@@ -43,8 +43,14 @@ Shifts = dict[tuple[str, str], int]
 
 
 @dataclass(frozen=True)
-class Patient:
-    """A network under fire: its core as the board stores it, its guards, and what it is tried on."""
+class FaultTarget:
+    """What faults are injected into.
+
+    Attributes:
+        core: the network as the board stores it.
+        guards: learnt from calibration patches.
+        pairs: the patches that it restores, degraded and reference.
+    """
 
     core: IntCore
     guards: Guards
@@ -52,23 +58,23 @@ class Patient:
 
     @cached_property
     def shifts(self) -> Shifts:
-        """As they are meant."""
+        """The shifts of every operation, free of faults."""
         return shifts_of(self.core)
 
-    def healthy(self, number: int) -> "Struck":
-        """A pair with nothing turned over."""
-        return Struck(self.core, SOUND, self.pairs[number][0], 0)
+    def fault_free(self, number: int) -> "Injected":
+        """Pair `number` and the network without any fault."""
+        return Injected(self.core, SOUND, self.pairs[number][0], 0)
 
 
 @dataclass(frozen=True)
-class Struck:
-    """A network and an image as they are after a strike.
+class Injected:
+    """A network and an image after an injection.
 
     Attributes:
         core: with the weights as they are now.
         faults: what else is wrong.
         image: (1, 1, H, W), as it is now.
-        flips: how many bits were turned over.
+        flips: how many bits were flipped.
     """
 
     core: IntCore
@@ -77,79 +83,92 @@ class Struck:
     flips: int
 
 
-def restored(patient: Patient, struck: Struck, clamped: bool = False) -> np.ndarray:
-    """The image (1, 1, H, W) that a struck network makes of a struck image."""
-    faults = guarded(struck.faults, patient.guards) if clamped else struck.faults
-    tensors, _ = run_core(struck.core, planes_of(struck.core, struck.image), faults=faults)
-    correction = merged_correction(struck.core, tensors)
-    correction = patient.guards.limit(correction) if clamped else correction
-    return np.asarray(np.clip(struck.image + correction, 0, 1), np.float32)
+def restored(target: FaultTarget, injected: Injected, clamped: bool = False) -> np.ndarray:
+    """The restored image (1, 1, H, W) in [0, 1]; `clamped` turns the ReLU6 and the limit of the correction on."""
+    faults = guarded(injected.faults, target.guards) if clamped else injected.faults
+    tensors, _ = run_core(injected.core, planes_of(injected.core, injected.image), faults=faults)
+    correction = merged_correction(injected.core, tensors)
+    correction = target.guards.limit(correction) if clamped else correction
+    return np.asarray(np.clip(injected.image + correction, 0, 1), np.float32)
 
 
-def quality_db(patient: Patient, struck: Struck, reference: np.ndarray, clamped: bool = False) -> float:
-    """PSNR of what it makes, on [0, 1]."""
-    return psnr_db(restored(patient, struck, clamped), reference, 1.0)
+def quality_db(target: FaultTarget, injected: Injected, reference: np.ndarray, clamped: bool = False) -> float:
+    """PSNR in dB of the restored image against the reference (1, 1, H, W), on [0, 1]."""
+    return psnr_db(restored(target, injected, clamped), reference, 1.0)
 
 
-def mended(patient: Patient, struck: Struck, per_megabit: float, generator: np.random.Generator) -> Struck:
-    """What checksums and three copies make of it before the next image: the other copies are struck as well."""
-    core = reloaded(struck.core, patient.core, patient.guards.checksums)
-    first = {**patient.shifts, **struck.faults.shifts}
-    second, third = (_upset_copy(patient, per_megabit, generator) for _ in range(2))
-    shifts = voted((first, second, third)) if struck.faults.shifts else {}
-    return replace(struck, core=core, faults=replace(struck.faults, shifts=shifts))
+def correct_faults(
+    target: FaultTarget, injected: Injected, per_megabit: float, generator: np.random.Generator
+) -> Injected:
+    """The network as scrubbing and triple modular redundancy leave it before the next image.
+
+    The other two copies of the shifts suffer flips at the same rate, each on its own.
+    """
+    core = scrubbed(injected.core, target.core, target.guards.checksums)
+    first = {**target.shifts, **injected.faults.shifts}
+    second, third = (_flip_copy(target, per_megabit, generator) for _ in range(2))
+    shifts = voted((first, second, third)) if injected.faults.shifts else {}
+    return replace(injected, core=core, faults=replace(injected.faults, shifts=shifts))
 
 
-def is_mended(patient: Patient, struck: Struck) -> bool:
-    """Whether weights and shifts are all as they are meant."""
-    meant = {**patient.shifts, **struck.faults.shifts} == patient.shifts
-    return meant and checksums(struck.core) == patient.guards.checksums
+def is_corrected(target: FaultTarget, injected: Injected) -> bool:
+    """Whether no fault is left in weights and shifts."""
+    meant = {**target.shifts, **injected.faults.shifts} == target.shifts
+    return meant and checksums(injected.core) == target.guards.checksums
 
 
-def _weights(patient: Patient, image: np.ndarray, per_megabit: float, generator: np.random.Generator) -> Struck:
-    flips = upset_count(weight_bits(patient.core), per_megabit, generator)
-    return Struck(upset_weights(patient.core, flips, generator), SOUND, image, flips)
+def _weights(target: FaultTarget, image: np.ndarray, per_megabit: float, generator: np.random.Generator) -> Injected:
+    flips = flip_count(weight_bits(target.core), per_megabit, generator)
+    return Injected(flip_weights(target.core, flips, generator), SOUND, image, flips)
 
 
-def _shifts(patient: Patient, image: np.ndarray, per_megabit: float, generator: np.random.Generator) -> Struck:
-    wrong = _upset_copy(patient, per_megabit, generator)
-    return Struck(patient.core, Faults(wrong), image, bits_apart(wrong, patient.shifts))
+def _shifts(target: FaultTarget, image: np.ndarray, per_megabit: float, generator: np.random.Generator) -> Injected:
+    wrong = _flip_copy(target, per_megabit, generator)
+    return Injected(target.core, Faults(wrong), image, bits_apart(wrong, target.shifts))
 
 
-def _maps(patient: Patient, image: np.ndarray, per_megabit: float, generator: np.random.Generator) -> Struck:
-    """Every tensor is struck once, between the operation that writes it and those that read it."""
-    pixels, channels = image[0, 0].size, map_channels(patient.core)
-    counts = {name: upset_count(INT8_BITS * pixels * n, per_megabit, generator) for name, n in channels.items()}
-    return struck_maps(patient, image, counts, int(generator.integers(2**63)))
+def _maps(target: FaultTarget, image: np.ndarray, per_megabit: float, generator: np.random.Generator) -> Injected:
+    """Faults enter every tensor once, between the operation that writes it and those that read it."""
+    pixels, channels = image[0, 0].size, map_channels(target.core)
+    counts = {name: flip_count(INT8_BITS * pixels * n, per_megabit, generator) for name, n in channels.items()}
+    return inject_maps(target, image, counts, int(generator.integers(2**63)))
 
 
-def struck_maps(
-    patient: Patient, image: np.ndarray, counts: dict[str, int], seed: int, bit: int | None = None
-) -> Struck:
-    """So many bits of each tensor turned over, the same ones whenever it runs."""
+def inject_maps(
+    target: FaultTarget, image: np.ndarray, counts: dict[str, int], seed: int, bit: int | None = None
+) -> Injected:
+    """The network with `counts` bits flipped in each tensor, by name; the same ones whenever it runs.
+
+    Args:
+        target: the network.
+        image: (1, 1, H, W) in [0, 1], left as it is.
+        counts: bits to flip in each tensor.
+        seed: of the draw.
+        bit: flip only this one of each number, 0 being the least.
+    """
     seeds = {name: [seed, number] for number, name in enumerate(counts)}
 
     def touch(name: str, tensor: np.ndarray) -> np.ndarray:
         if not counts.get(name):
             return tensor
-        return turned_over(tensor, counts[name], np.random.default_rng(seeds[name]), INT8_BITS, bit)
+        return flip_bits(tensor, counts[name], np.random.default_rng(seeds[name]), INT8_BITS, bit)
 
-    return Struck(patient.core, Faults({}, touch), image, sum(counts.values()))
-
-
-def _image(patient: Patient, image: np.ndarray, per_megabit: float, generator: np.random.Generator) -> Struck:
-    flips = upset_count(PIXEL_BITS * image.size, per_megabit, generator)
-    dn = turned_over(np.rint(image * MAX_DN).astype(np.uint16), flips, generator, PIXEL_BITS)
-    return Struck(patient.core, SOUND, (dn / np.float32(MAX_DN)).astype(np.float32), flips)
+    return Injected(target.core, Faults({}, touch), image, sum(counts.values()))
 
 
-def _upset_copy(patient: Patient, per_megabit: float, generator: np.random.Generator) -> Shifts:
-    flips = upset_count(SHIFT_BITS * len(patient.shifts), per_megabit, generator)
-    return upset_shifts(patient.shifts, flips, generator)
+def _image(target: FaultTarget, image: np.ndarray, per_megabit: float, generator: np.random.Generator) -> Injected:
+    flips = flip_count(PIXEL_BITS * image.size, per_megabit, generator)
+    dn = flip_bits(np.rint(image * MAX_DN).astype(np.uint16), flips, generator, PIXEL_BITS)
+    return Injected(target.core, SOUND, (dn / np.float32(MAX_DN)).astype(np.float32), flips)
 
 
-Strike = Callable[[Patient, np.ndarray, float, np.random.Generator], Struck]
-MEMORIES: dict[str, Strike] = {"weights": _weights, "shifts": _shifts, "maps": _maps, "image": _image}
+def _flip_copy(target: FaultTarget, per_megabit: float, generator: np.random.Generator) -> Shifts:
+    flips = flip_count(SHIFT_BITS * len(target.shifts), per_megabit, generator)
+    return flip_shifts(target.shifts, flips, generator)
+
+
+Inject = Callable[[FaultTarget, np.ndarray, float, np.random.Generator], Injected]
+MEMORIES: dict[str, Inject] = {"weights": _weights, "shifts": _shifts, "maps": _maps, "image": _image}
 
 
 SOURCE = "integer reference, one flip at a time: a number drawn for each bit"
@@ -166,48 +185,48 @@ class Flip:
     rms_dn: float
 
 
-def place_rows(patient: Patient, seed: int, side_px: int, tick: Callable[[], None] = lambda: None) -> list[Row]:
+def place_rows(target: FaultTarget, seed: int, side_px: int, tick: Callable[[], None] = lambda: None) -> list[Row]:
     """A row a layer and a row a bit."""
-    flips = list(single_flips(patient, seed, side_px, tick))
+    flips = list(single_flips(target, seed, side_px, tick))
     layers = [
-        _place_row("bit flips by layer", op.name, [f for f in flips if f.layer == op.name]) for op in patient.core.ops
+        _place_row("bit flips by layer", op.name, [f for f in flips if f.layer == op.name]) for op in target.core.ops
     ]
     bits = [_place_row("bit flips by bit", _bit_name(k), [f for f in flips if f.bit == k]) for k in range(INT8_BITS)]
     return [*layers, *bits]
 
 
-def place_ticks(patient: Patient) -> int:
+def place_ticks(target: FaultTarget) -> int:
     """How often `place_rows` reports progress."""
-    return len(patient.core.ops)
+    return len(target.core.ops)
 
 
 def single_flips(
-    patient: Patient, seed: int, side_px: int, tick: Callable[[], None] = lambda: None
+    target: FaultTarget, seed: int, side_px: int, tick: Callable[[], None] = lambda: None
 ) -> Iterator[Flip]:
     """For every bit a flip of one number in each layer's weights and result, and of each shift; on a crop."""
-    for number, op in enumerate(patient.core.ops):
+    for number, op in enumerate(target.core.ops):
         generator = np.random.default_rng([seed, number])
-        image = patient.pairs[number % len(patient.pairs)][0][:, :, :side_px, :side_px]
-        healthy = restored(patient, Struck(patient.core, SOUND, image, 0))
-        for memory, bit, struck in _strikes(patient, op, image, generator):
-            error_dn = MAX_DN * (restored(patient, struck).astype(np.float64) - healthy)
+        image = target.pairs[number % len(target.pairs)][0][:, :, :side_px, :side_px]
+        fault_free = restored(target, Injected(target.core, SOUND, image, 0))
+        for memory, bit, injected in _injections(target, op, image, generator):
+            error_dn = MAX_DN * (restored(target, injected).astype(np.float64) - fault_free)
             yield Flip(op.name, memory, bit, float(np.sqrt(np.mean(error_dn**2))))
         tick()
 
 
-def _strikes(
-    patient: Patient, op: IntConv | Add, image: np.ndarray, generator: np.random.Generator
-) -> Iterator[tuple[str, int, Struck]]:
-    healthy = Struck(patient.core, SOUND, image, 1)
+def _injections(
+    target: FaultTarget, op: IntConv | Add, image: np.ndarray, generator: np.random.Generator
+) -> Iterator[tuple[str, int, Injected]]:
+    fault_free = Injected(target.core, SOUND, image, 1)
     for bit in range(INT8_BITS):
         if isinstance(op, IntConv):
-            struck = upset_conv(op, 1, generator, bit)
-            yield "weights", bit, replace(healthy, core=with_ops(patient.core, {op.name: struck}))
-        yield "map", bit, struck_maps(patient, image, {op.output: 1}, int(generator.integers(2**63)), bit)
-    for key in [key for key in patient.shifts if key[0] == op.name]:
+            flipped = flip_conv(op, 1, generator, bit)
+            yield "weights", bit, replace(fault_free, core=with_ops(target.core, {op.name: flipped}))
+        yield "map", bit, inject_maps(target, image, {op.output: 1}, int(generator.integers(2**63)), bit)
+    for key in [key for key in target.shifts if key[0] == op.name]:
         for bit in range(SHIFT_BITS):
-            wrong = _signed(patient.shifts[key] ^ (1 << bit))
-            yield "shifts", bit, replace(healthy, faults=Faults({key: wrong}))
+            wrong = _signed(target.shifts[key] ^ (1 << bit))
+            yield "shifts", bit, replace(fault_free, faults=Faults({key: wrong}))
 
 
 def _signed(raw: int) -> int:
@@ -233,32 +252,32 @@ def _bit_name(bit: int) -> str:
 
 
 RATES = (0.1, 1.0, 10.0, 100.0, 1000.0)
-"""Bits turned over in a megabit, of 10^6."""
+"""Bit flips in a megabit, of 10^6."""
 RATES_OF = {"shifts": (10.0, 100.0, 1000.0, 10_000.0)}
 """There are too few shifts to be hit at rates that matter elsewhere."""
 DRAWS_OF = {"shifts": 10, "image": 5}
-"""So many times the draws, where few of them strike; those that do not cost nothing."""
-MENDABLE = ("weights", "shifts")
+"""So many times the draws, where few of them flip a bit; those that do not cost nothing."""
+CORRECTABLE = ("weights", "shifts")
 SETS = ("no guard", "clamped", "all guards")
 
 
 @dataclass(frozen=True)
 class Draw:
-    """What one strike came to: bits turned over, and PSNR in dB with each set of guards."""
+    """What one injection came to: the bits that it flipped, and PSNR in dB with each set of guards."""
 
     flips: int
     quality_db: tuple[float, float, float]
 
 
-def curve_rows(patient: Patient, draws: int, seed: int, tick: Callable[[], None] = lambda: None) -> list[Row]:
+def curve_rows(target: FaultTarget, draws: int, seed: int, tick: Callable[[], None] = lambda: None) -> list[Row]:
     """A row for every kind of memory and rate."""
-    clean = [clean_db(patient, number) for number in range(len(patient.pairs))]
+    clean = [clean_db(target, number) for number in range(len(target.pairs))]
     rows = [_clean_row(clean)]
     for memory in MEMORIES:
         for rate in rates_of(memory):
             found = []
             for draw in range(draws_of(memory, draws)):
-                found.append(_draw(patient, memory, rate, draw, seed, clean[draw % len(clean)]))
+                found.append(_draw(target, memory, rate, draw, seed, clean[draw % len(clean)]))
                 tick()
             rows.append(_curve_row(memory, rate, found))
     return rows
@@ -270,39 +289,39 @@ def curve_ticks(draws: int) -> int:
 
 
 def draws_of(memory: str, draws: int) -> int:
-    """How often a kind of memory is struck at each rate."""
+    """How many injections into a kind of memory there are at each rate, `draws` being those asked for."""
     return draws * DRAWS_OF.get(memory, 1)
 
 
 def rates_of(memory: str) -> tuple[float, ...]:
-    """The rates at which a kind of memory is struck."""
+    """The rates of injection for a kind of memory, bit flips in a megabit."""
     return RATES_OF.get(memory, RATES)
 
 
 def name_of(memory: str, rate: float) -> str:
-    """Of a row."""
+    """The name of the row for a kind of memory and a rate."""
     return f"{memory}, {rate:g} in a megabit"
 
 
-def clean_db(patient: Patient, number: int) -> tuple[float, float]:
+def clean_db(target: FaultTarget, number: int) -> tuple[float, float]:
     """PSNR of a pair without flips: as it is, and clamped."""
-    struck, reference = patient.healthy(number), patient.pairs[number][1]
-    bare, clamped = (quality_db(patient, struck, reference, clamped) for clamped in (False, True))
+    injected, reference = target.fault_free(number), target.pairs[number][1]
+    bare, clamped = (quality_db(target, injected, reference, clamped) for clamped in (False, True))
     return bare, clamped
 
 
-def _draw(patient: Patient, memory: str, rate: float, draw: int, seed: int, clean: tuple[float, float]) -> Draw:
-    image, reference = patient.pairs[draw % len(patient.pairs)]
+def _draw(target: FaultTarget, memory: str, rate: float, draw: int, seed: int, clean: tuple[float, float]) -> Draw:
+    image, reference = target.pairs[draw % len(target.pairs)]
     generator = np.random.default_rng([seed, draw, list(MEMORIES).index(memory), rates_of(memory).index(rate)])
-    struck = MEMORIES[memory](patient, image, rate, generator)
-    if struck.flips == 0:
+    injected = MEMORIES[memory](target, image, rate, generator)
+    if injected.flips == 0:
         return Draw(0, (*clean, clean[1]))
-    bare, clamped = (quality_db(patient, struck, reference, c) for c in (False, True))
-    if memory not in MENDABLE:
-        return Draw(struck.flips, (bare, clamped, clamped))
-    healed = mended(patient, struck, rate, generator)
-    whole = clean[1] if is_mended(patient, healed) else quality_db(patient, healed, reference, clamped=True)
-    return Draw(struck.flips, (bare, clamped, whole))
+    bare, clamped = (quality_db(target, injected, reference, c) for c in (False, True))
+    if memory not in CORRECTABLE:
+        return Draw(injected.flips, (bare, clamped, clamped))
+    corrected = correct_faults(target, injected, rate, generator)
+    whole = clean[1] if is_corrected(target, corrected) else quality_db(target, corrected, reference, clamped=True)
+    return Draw(injected.flips, (bare, clamped, whole))
 
 
 def _clean_row(clean: Sequence[tuple[float, float]]) -> Row:

@@ -164,7 +164,7 @@ TITLES = {
     "limitations": "Known limitations met",
     "proofs": "Proven for every image",
     "integer layers": "Integer layers",
-    "bit flips": "Quality against bits turned over",
+    "bit flips": "Quality against bit flips",
     "bit flips by layer": "One flip, by layer",
     "bit flips by bit": "One flip, by bit",
     "guards": "What guards cost on the board",
@@ -174,9 +174,9 @@ NOTES = {
     "at, for whole numbers know no missing pixels and the others are refused before.",
     "proofs": "Loose, but true of every image and every size. `inside` is farther from the border than the receptive "
     "radius.",
-    "bit flips": "PSNR, mean and range over patches and strikes; one kind of memory at a time. `clamped`: ReLU6 and "
-    "the limit of the correction. `all guards`: checksums and three copies too, looked at before the image; what "
-    "strikes the weights after that stays for this tile.",
+    "bit flips": "PSNR, mean and range over patches and injections; one kind of memory at a time. `clamped`: ReLU6 "
+    "and the limit of the correction. `all guards`: scrubbing and triple modular redundancy too, before the image; "
+    "what flips in the weights after that stays for this tile.",
     "bit flips by layer": "How far one bit moves the restored image, root mean square over a crop of half the "
     "patch's side, no guard on: mean and worst over one number drawn for each of its bits, and over all bits of the "
     "layer's shifts. A flip in a map stays near its place, so a larger crop would make its figure smaller.",

@@ -22,14 +22,15 @@ from deploy.restoration.runtime import Infer, open_openvino, open_runtime
 from deploy.tradeoff.cache import Cache, code_digest, digest_of
 from deploy.tradeoff.points import LEGAL, Unit
 from model.convbeers import VARIANTS
-from model.evaluation.methods import KNOWS, Restore
+from model.evaluation.methods import KNOWN, Restore
 from model.io.files import sha256
 from model.io.images import list_images
 from model.shipped import SHIPPED, shipped_names, shipped_weights
 from model.simulator.procedural import load_scenes
 from profiles import load_sensor, sensor_names
 from profiles.errors import BeersError, ModelError, OptionError
-from profiles.sensor import SensorProfile, reference_for
+from profiles.sensor import SensorProfile
+from profiles.sensor_file import reference_for
 from quant.calibration import Patches, draw_patches
 from quant.free import free_ticks, quantise_free
 from quant.onnx_file import fixed_tile_px, is_quantised, load_onnx, metadata, receptive_radius_px, save_onnx
@@ -228,7 +229,7 @@ class Shelf:
     def told(self, unit: Unit) -> str:
         """What a unit knows of the sensor."""
         if unit.kind != "network":
-            return KNOWS
+            return KNOWN
         return knowledge_of(self.model(unit.method), self.degraded.name)
 
     def model(self, method: str) -> onnx.ModelProto:

@@ -28,7 +28,8 @@ from model.metrics.backbones import find_backbone
 from model.traditional.peers import PEERS
 from model.traditional.settings import QUALITIES
 from profiles.errors import ModelError
-from profiles.sensor import SensorProfile, load_sensor, reference_for
+from profiles.sensor import SensorProfile
+from profiles.sensor_file import load_sensor, reference_for
 from quant.onnx_file import load_onnx, receptive_radius_px
 
 

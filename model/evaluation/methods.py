@@ -19,33 +19,33 @@ Restore = Callable[[np.ndarray], np.ndarray]
 
 TRADITIONAL, DECONVOLVE_FIRST = "traditional", "deconvolve-first"
 
-KNOWS, BLIND, TRAINED = "both sensors", "nothing", "trained for the sensor"
-"""What a method is told: the last of a network whose file names the sensor."""
+KNOWN, BLIND, TRAINED = "both sensors", "no: blind", "trained for it"
+"""What a method knows of the sensor: the last of a network whose file names it."""
 
 
 @dataclass(frozen=True)
 class Method:
-    """A restoration with the name it is listed under, and what it was told."""
+    """A restoration with the name it is listed under, and what it knows of the sensor."""
 
     name: str
     restore: Restore
-    told: str
+    sensor_known: str
 
 
 def method_without_network(name: str, degraded: Sensor, reference: Sensor) -> Method | None:
-    """The input itself, a traditional chain or a peer of it, told both sensors; None if the name is none of theirs.
+    """The input itself, or a traditional chain or a peer of it, which know both sensors; None for any other name.
 
     Raises:
         MachineError: a peer whose library is not installed.
     """
     if name == "degraded":
-        return Method(name, lambda dn: dn, "nothing: the input itself")
+        return Method(name, lambda dn: dn, "no: the input itself")
     chain = _chain(name, degraded, reference)
     if chain is not None:
-        return Method(name, lambda dn: restore_traditional(torch.from_numpy(dn), chain).numpy(), KNOWS)
+        return Method(name, lambda dn: restore_traditional(torch.from_numpy(dn), chain).numpy(), KNOWN)
     if name in PEERS:
         plain = Chain(degraded, reference)
-        return Method(name, lambda dn: PEERS[name](torch.from_numpy(dn), plain).numpy(), KNOWS)
+        return Method(name, lambda dn: PEERS[name](torch.from_numpy(dn), plain).numpy(), KNOWN)
     return None
 
 

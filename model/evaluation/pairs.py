@@ -15,7 +15,8 @@ from model.simulator.detector import Draw
 from model.simulator.sampling import Scene
 from model.training.patches import pair_files
 from profiles.errors import ImageError, OptionError
-from profiles.sensor import Sensor, SensorProfile, load_sensor, reference_beside, same_instrument, sensor_from_json
+from profiles.sensor import Sensor, SensorProfile, same_instrument
+from profiles.sensor_file import load_sensor, reference_beside, sensor_from_json
 from profiles.toml import read_json
 
 

@@ -22,8 +22,8 @@ SHARPNESS = (0.10, 0.07, 0.05, 0.03, 0.02)
 NOISE = ((15.0, 50.0), (25.0, 55.0), (30.0, 80.0), (70.0, 150.0), (90.0, 190.0))
 """SNR at 25 and 100 W/m2/sr/um; the nominal 50 / 110 is in every sweep."""
 
-TOLD_NOMINAL = "traditional, told nominal"
-TOLD_TRUTH = "traditional, told the truth"
+NOMINAL_KNOWN = "traditional, nominal sensor known"
+TRUTH_KNOWN = "traditional, true sensor known"
 
 
 @dataclass(frozen=True)
@@ -93,8 +93,8 @@ def _known_methods(truth: Sensor, nominal: Sensor, target: Sensor) -> list[Metho
     supposed = replace(nominal, gain_dn_per_radiance=truth.gain_dn_per_radiance)
     wanted = {
         "degraded": ("degraded", nominal),
-        TOLD_TRUTH: ("traditional", truth),
-        TOLD_NOMINAL: ("traditional", supposed),
+        TRUTH_KNOWN: ("traditional", truth),
+        NOMINAL_KNOWN: ("traditional", supposed),
     }
     found = {shown: method_without_network(name, sensor, target) for shown, (name, sensor) in wanted.items()}
     return [replace(method, name=shown) for shown, method in found.items() if method is not None]
@@ -167,7 +167,7 @@ def sweep_tables(
     """PSNR and MTF of the networks and the chain under conditions other than the nominal ones; a scene a site."""
     scenes = load_scenes(images, reference.nominal(), seed)
     first = {site_of(scene.name): scene for scene in reversed(scenes)}
-    networks = [method for method in methods if method.told in (BLIND, TRAINED)]
+    networks = [method for method in methods if method.sensor_known in (BLIND, TRAINED)]
     with steps("sweep", len(conditions(degraded.nominal(), degraded))) as bar:
         return tuple(sweep_rows(networks, list(first.values()), degraded, reference, seed, bar.advance))
 

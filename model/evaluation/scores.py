@@ -130,7 +130,7 @@ def mean_row(
         interval, words = site_interval(values, places, np.random.default_rng(seed))
         source = f"mean of {len(values)} pairs from {len(set(places))} sites, {words}"
         figures[key] = instruments.figure(key, float(np.mean(values)), source, interval)
-    return Row("mean", method.name, figures, {"told": method.told})
+    return Row("mean", method.name, figures, {"sensor known": method.sensor_known})
 
 
 def site_rows(rows: Sequence[Row]) -> list[Row]:
@@ -190,4 +190,4 @@ def _row(
         "MTF at Nyquist": sharpness,
         **{snr_name(r): published(value, "ratio", SOURCE) for r, value in zip(RADIANCES, snr, strict=True)},
     }
-    return Row("mean", name, figures, {"told": NOTE})
+    return Row("mean", name, figures, {"sensor known": NOTE})

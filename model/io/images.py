@@ -34,6 +34,9 @@ RESCALE = "rescale it to the sensor's digital numbers"
 def read_pixels(path: Path) -> np.ndarray:
     """The pixels of an image file as stored: (H, W) or (H, W, bands), any dtype.
 
+    scikit-image reads the same pixels through the same two libraries, but knows neither the free memory nor which
+    formats start other programs, and answers damage with whatever error these libraries raise.
+
     Raises:
         ImageError: missing, empty, not an image, or holding NaN or infinity.
         MachineError: too large for the free memory.

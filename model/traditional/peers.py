@@ -5,9 +5,9 @@ in the place of NL-Bayes in the chain.
 """
 
 from collections.abc import Callable
-from types import ModuleType
 
 import torch
+from skimage import restoration
 from torch import Tensor
 
 from model.simulator.detector import to_dn, to_radiance
@@ -16,7 +16,6 @@ from model.traditional.compensate import filter_strips
 from model.traditional.noise import bias_radiance, destabilise, stabilise
 from model.traditional.pipeline import Chain, with_rounding_noise
 from model.traditional.rows import mirrored
-from profiles.errors import MachineError
 
 PAD_PX = 64
 WIENER_BALANCE, RICHARDSON_LUCY_STEPS = 0.01, 20
@@ -28,7 +27,6 @@ Peer = Callable[[Tensor, Chain], Tensor]
 
 def wiener(dn: Tensor, chain: Chain) -> Tensor:
     """scikit-image's Wiener filter with a Laplacian regulariser, balance 0.01."""
-    restoration = _restoration()
 
     def deconvolve(image: Tensor, blur: Tensor) -> Tensor:
         restored = restoration.wiener(image.numpy(), blur.numpy().astype(complex), WIENER_BALANCE, clip=False)
@@ -39,7 +37,6 @@ def wiener(dn: Tensor, chain: Chain) -> Tensor:
 
 def unsupervised_wiener(dn: Tensor, chain: Chain) -> Tensor:
     """scikit-image's Wiener filter that estimates its own regularisation (seed 0)."""
-    restoration = _restoration()
 
     def deconvolve(image: Tensor, blur: Tensor) -> Tensor:
         restored, _ = restoration.unsupervised_wiener(image.numpy(), blur.numpy().astype(complex), clip=False, rng=0)
@@ -50,7 +47,6 @@ def unsupervised_wiener(dn: Tensor, chain: Chain) -> Tensor:
 
 def richardson_lucy(dn: Tensor, chain: Chain) -> Tensor:
     """scikit-image's Richardson-Lucy, 20 steps."""
-    restoration = _restoration()
 
     def deconvolve(image: Tensor, blur: Tensor) -> Tensor:
         height, width = image.shape
@@ -68,7 +64,7 @@ def nl_means(dn: Tensor, chain: Chain) -> Tensor:
     """The chain with scikit-image's fast non-local means, patches of 5 x 5 within 6 pixels, h = 0.6 sigma."""
     sensor = with_rounding_noise(chain.degraded)
     stable = stabilise(to_radiance(dn, chain.degraded), sensor)
-    clean = _restoration().denoise_nl_means(
+    clean = restoration.denoise_nl_means(
         stable.numpy(), NLM_PATCH_PX, NLM_DISTANCE_PX, h=NLM_STRENGTH, sigma=1.0, fast_mode=True
     )
     radiance = destabilise(torch.from_numpy(clean).float(), sensor) + bias_radiance(sensor)
@@ -94,16 +90,3 @@ def _deconvolved(dn: Tensor, chain: Chain, deconvolve: Callable[[Tensor, Tensor]
     sharp = torch.fft.rfft2(deconvolve(wide, blur)) * target
     inside = torch.fft.irfft2(sharp, s=(height, width))[PAD_PX:-PAD_PX, PAD_PX:-PAD_PX]
     return to_dn((inside * full_scale).float(), chain.reference)
-
-
-def _restoration() -> ModuleType:
-    try:
-        from skimage import restoration
-    except ImportError as error:
-        raise MachineError(
-            "library peers",
-            expected="scikit-image",
-            got="it is not installed",
-            remedy="pip install 'beers-deploy[peers]'",
-        ) from error
-    return restoration

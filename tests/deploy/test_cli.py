@@ -64,7 +64,8 @@ def test_what_is_told_no_sensor_takes_the_same_one() -> None:
 
 
 def test_help_imports_nothing_heavy() -> None:
-    code = "import sys; import deploy.cli; print([m for m in ('torch', 'onnxruntime', 'onnx') if m in sys.modules])"
+    heavy = ("torch", "onnxruntime", "onnx", "skimage", "scipy")
+    code = f"import sys; import deploy.cli; print([m for m in {heavy} if m in sys.modules])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
 

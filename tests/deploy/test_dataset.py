@@ -174,7 +174,7 @@ def test_a_dataset_begun_here_is_finished_by_a_scheduler_s_workers(
 def test_a_scene_that_a_worker_does_not_find_is_one_sentence(
     scene: Path, scheduler: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("model.dataset.sha256", lambda path: f"digest of another {path.name}")
+    monkeypatch.setattr("deploy.dataset_workers.sha256", lambda path: f"digest of another {path.name}")
     with pytest.raises(ImageError, match=r"another file of that name.*shared folder"):
         write_dataset(
             small(scene),

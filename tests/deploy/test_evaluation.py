@@ -1,7 +1,6 @@
 """Pairs, methods, scores and targets of an evaluation."""
 
 import json
-import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -24,7 +23,7 @@ from model.metrics.refusal import Refusal
 from model.simulator.procedural import procedural_scene
 from profiles import load_sensor
 from profiles.constant import Constant
-from profiles.errors import ImageError, MachineError, OptionError
+from profiles.errors import ImageError, OptionError
 from profiles.figures import by_table
 
 DEGRADED, REFERENCE = load_sensor("pleiades-degraded"), load_sensor("pleiades-reference")
@@ -126,7 +125,7 @@ def test_an_unknown_method_is_refused(name: str) -> None:
 def test_what_a_network_was_made_for_is_no_secret() -> None:
     """By the sensor that its file names; a name that is not asked about says nothing."""
     told = {
-        (name, sensor): method_named(name, *SENSORS, sensor).told
+        (name, sensor): method_named(name, *SENSORS, sensor).sensor_known
         for name in ("convbeers-s-nominal", "convbeers-s-nominal-int8", "convbeers-xs", "traditional", "degraded")
         for sensor in ("pleiades-degraded", "dior-high", "")
     }
@@ -135,12 +134,6 @@ def test_what_a_network_was_made_for_is_no_secret() -> None:
     assert TRAINED not in [words for (_, sensor), words in told.items() if sensor != "pleiades-degraded"]
     assert told["convbeers-xs", "pleiades-degraded"] == "nothing"
     assert told["traditional", "dior-high"] == "both sensors"
-
-
-def test_a_peer_without_its_library_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "skimage", None)
-    with pytest.raises(MachineError, match=r"beers-deploy\[peers\]"):
-        method_named("wiener", *SENSORS).restore(pair().degraded)
 
 
 def test_clipped_pixels_do_not_count() -> None:

@@ -353,7 +353,7 @@ def test_constants_may_be_nodes() -> None:
     assert read_core(other).frac_bits == read_core(sound).frac_bits
 
 
-@pytest.mark.parametrize("spelt", [["x", "zero"], ["zero", "x"]])
+@pytest.mark.parametrize("explicit", [["x", "zero"], ["zero", "x"]])
 def test_a_relu_is_the_larger_of_zero_whatever_comes_first(explicit: list[str]) -> None:
     node_, zero = (
         onnx.helper.make_node("Max", explicit, ["y"]),

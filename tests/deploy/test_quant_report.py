@@ -22,7 +22,7 @@ from model.convbeers import ConvBEERS, Variant, initialise
 from model.io.tiff import write_tiff
 from model.simulator.procedural import procedural_scene
 from profiles import load_sensor
-from profiles.sensor import reference_for
+from profiles.sensor_file import reference_for
 from quant.calibration import draw_patches
 from quant.graph import MAX_DN
 from quant.onnx_file import fixed_tile_px, load_onnx, metadata, save_onnx

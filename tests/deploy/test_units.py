@@ -19,7 +19,7 @@ from model.training.patches import PatchRecipe
 from profiles import SensorProfile, load_sensor
 from profiles.constant import Constant
 from profiles.errors import ProfileError
-from profiles.sensor import reference_beside, reference_for
+from profiles.sensor_file import reference_beside, reference_for
 
 DEGRADED = load_sensor("pleiades-degraded")
 METHODS = ("degraded", "traditional-fast", "convbeers-xs")

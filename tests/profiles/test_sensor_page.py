@@ -15,16 +15,8 @@ from deploy.cli import app
 from profiles.constant import Status, read_constant
 from profiles.effects import LIMITS
 from profiles.effects import TABLES as EFFECTS
-from profiles.sensor import (
-    MTF_NYQUIST_MAX,
-    OPTIONAL,
-    SINGLE,
-    TABLES,
-    load_sensor,
-    read_sensor,
-    same_instrument,
-    sensor_names,
-)
+from profiles.sensor import MTF_NYQUIST_MAX, OPTIONAL, TABLES, same_instrument
+from profiles.sensor_file import SINGLE, load_sensor, read_sensor, sensor_names
 
 PAGE = (Path(__file__).parents[2] / "docs" / "sensor-profile.md").read_text(encoding="utf-8")
 ROWS = dict(re.findall(r"^\| `(\[\w+\] \w+)` \|(.*)\|$", PAGE, re.MULTILINE))

@@ -1,4 +1,4 @@
-"""Guards: nothing changes in a healthy network, and what they promise holds in a struck one."""
+"""Guards: nothing changes in a fault-free network, and what they promise holds after an injection."""
 
 import numpy as np
 import pytest
@@ -8,13 +8,13 @@ from quant.faults import (
     Guards,
     as_stored,
     checksums,
+    flip_conv,
+    flip_shifts,
+    flip_weights,
     guarded,
     learn_guards,
-    reloaded,
+    scrubbed,
     shifts_of,
-    upset_conv,
-    upset_shifts,
-    upset_weights,
     voted,
     with_ops,
 )
@@ -61,8 +61,8 @@ def test_bounds_are_the_next_ones_that_hold_what_was_seen(core: IntCore) -> None
 
 def test_a_clamped_result_keeps_its_bound_whatever_the_weights(core: IntCore) -> None:
     some = Guards({op.output: 24 for op in core.ops if isinstance(op, IntConv) and op.relu}, 64.0, {})
-    struck = upset_weights(core, 2000, np.random.default_rng(0))
-    bare, clamped = (run_core(struck, split(image(9)), faults=f)[0] for f in (SOUND, guarded(SOUND, some)))
+    injected = flip_weights(core, 2000, np.random.default_rng(0))
+    bare, clamped = (run_core(injected, split(image(9)), faults=f)[0] for f in (SOUND, guarded(SOUND, some)))
     assert max(int(bare[name].max()) for name in some.relu6) > 24
     assert max(int(clamped[name].max()) for name in some.relu6) == 24
     limited = some.limit(merged_correction(core, clamped))
@@ -70,39 +70,39 @@ def test_a_clamped_result_keeps_its_bound_whatever_the_weights(core: IntCore) ->
     assert np.abs(limited).max() <= bound < np.abs(merged_correction(core, bare)).max()
 
 
-def test_memory_is_struck_after_the_clamp(core: IntCore) -> None:
+def test_faults_enter_memory_after_the_clamp(core: IntCore) -> None:
     name = next(op.output for op in core.ops if isinstance(op, IntConv) and op.relu)
     faults = Faults({}, lambda found, tensor: np.full_like(tensor, 127) if found == name else tensor)
     tensors, _ = run_core(core, split(image(0)), faults=guarded(faults, Guards({name: 3}, 1.0, {})))
     assert (tensors[name] == 127).all()
 
 
-def test_every_single_flip_is_found_and_the_layer_loaded_again(core: IntCore, guards: Guards) -> None:
+def test_every_single_flip_is_found_and_the_layer_scrubbed(core: IntCore, guards: Guards) -> None:
     generator = np.random.default_rng(3)
     for op in [op for op in core.ops if isinstance(op, IntConv)]:
         for bit in range(8):
-            struck = with_ops(core, {op.name: upset_conv(op, 1, generator, bit)})
-            wrong = {name for name, sum_ in checksums(struck).items() if sum_ != guards.checksums[name]}
+            injected = with_ops(core, {op.name: flip_conv(op, 1, generator, bit)})
+            wrong = {name for name, sum_ in checksums(injected).items() if sum_ != guards.checksums[name]}
             assert wrong == {op.name}
-            assert checksums(reloaded(struck, core, guards.checksums)) == guards.checksums
+            assert checksums(scrubbed(injected, core, guards.checksums)) == guards.checksums
 
 
 def test_many_flips_are_found_too(core: IntCore, guards: Guards) -> None:
-    struck = upset_weights(core, 5000, np.random.default_rng(4))
-    healed = reloaded(struck, core, guards.checksums)
+    injected = flip_weights(core, 5000, np.random.default_rng(4))
+    corrected = scrubbed(injected, core, guards.checksums)
     planes = split(image(1))
-    sound, wrong, right = (run_core(each, planes)[0][CORRECTION] for each in (core, struck, healed))
+    sound, wrong, right = (run_core(each, planes)[0][CORRECTION] for each in (core, injected, corrected))
     np.testing.assert_array_equal(right, sound)
     assert not np.array_equal(wrong, sound)
 
 
 def test_two_copies_of_three_decide(core: IntCore) -> None:
     meant = shifts_of(core)
-    one, other = (upset_shifts(meant, count, np.random.default_rng(count)) for count in (1, 4))
+    one, other = (flip_shifts(meant, count, np.random.default_rng(count)) for count in (1, 4))
     assert one != meant
     assert voted((one, meant, meant)) == meant
     assert voted((meant, one, meant)) == voted((meant, meant, other)) == meant
-    assert voted((one, one, meant)) == one  # the same bit twice is beyond three copies
+    assert voted((one, one, meant)) == one  # the same bit twice is beyond triple modular redundancy
 
 
 def test_a_wrong_shift_is_used(core: IntCore) -> None:

@@ -1,4 +1,4 @@
-"""Bits turned over: what a strike costs, what guards buy back, and what the board pays for them."""
+"""Bit flips: what an injection costs, what guards buy back, and what the board pays for them."""
 
 import json
 from itertools import pairwise
@@ -13,8 +13,8 @@ from typer.testing import CliRunner
 from deploy.bench.tables import predict_file
 from deploy.cli import app
 from deploy.dpu.board import load_dpu
-from deploy.stress.flip_study import TILE_PX, FlipRequest, flip_curves_svg, make_patient, price_rows
-from deploy.stress.flips import MEMORIES, RATES, Patient, Struck, curve_rows, name_of, place_rows, restored
+from deploy.stress.flip_study import TILE_PX, FlipRequest, flip_curves_svg, make_target, price_rows
+from deploy.stress.flips import MEMORIES, RATES, FaultTarget, Injected, curve_rows, name_of, place_rows, restored
 from deploy.stress.networks import core_of
 from deploy.stress.rows import markdown
 from deploy.stress.subject import open_subject
@@ -29,14 +29,14 @@ REQUEST = FlipRequest("pleiades-degraded", None, "vck190", draws=2, size_px=48, 
 
 
 @pytest.fixture(scope="module")
-def patient() -> Patient:
-    """A trained network: what a new one makes is hardly worse with bits turned over."""
-    return make_patient(open_subject(None, None, "convbeers-xs"), REQUEST)
+def target() -> FaultTarget:
+    """A trained network: what a new one makes is hardly worse with bits flipped."""
+    return make_target(open_subject(None, None, "convbeers-xs"), REQUEST)
 
 
 @pytest.fixture(scope="module")
-def rows(patient: Patient) -> dict[str, Row]:
-    return {row.name: row for row in curve_rows(patient, 2, seed=0)}
+def rows(target: FaultTarget) -> dict[str, Row]:
+    return {row.name: row for row in curve_rows(target, 2, seed=0)}
 
 
 def db(row: Row, guards: str) -> float:
@@ -45,7 +45,7 @@ def db(row: Row, guards: str) -> float:
     return value
 
 
-def test_strikes_cost_more_the_more_there_are(rows: dict[str, Row]) -> None:
+def test_flips_cost_more_the_more_there_are(rows: dict[str, Row]) -> None:
     clean = db(rows["none"], "no guard")
     for memory in ("weights", "maps", "image"):
         found = [db(rows[name_of(memory, rate)], "no guard") for rate in RATES]
@@ -54,34 +54,34 @@ def test_strikes_cost_more_the_more_there_are(rows: dict[str, Row]) -> None:
     assert db(rows[name_of("shifts", 10_000)], "no guard") <= clean
 
 
-def test_checksums_and_copies_bring_the_healthy_network_back(rows: dict[str, Row]) -> None:
+def test_scrubbing_and_majority_bring_the_fault_free_network_back(rows: dict[str, Row]) -> None:
     for rate in RATES:
         assert db(rows[name_of("weights", rate)], "all guards") == db(rows["none"], "all guards")
     assert db(rows[name_of("shifts", 1000)], "all guards") == db(rows["none"], "all guards")
 
 
-def test_the_same_seed_strikes_the_same_bits(patient: Patient, rows: dict[str, Row]) -> None:
-    again = {row.name: row for row in curve_rows(patient, 2, seed=0)}
-    other = {row.name: row for row in curve_rows(patient, 2, seed=1)}
+def test_the_same_seed_flips_the_same_bits(target: FaultTarget, rows: dict[str, Row]) -> None:
+    again = {row.name: row for row in curve_rows(target, 2, seed=0)}
+    other = {row.name: row for row in curve_rows(target, 2, seed=1)}
     assert again == rows
     assert other != rows
 
 
 @pytest.mark.parametrize("memory", list(MEMORIES))
-def test_a_strike_leaves_the_patient_alone(memory: str, patient: Patient) -> None:
-    image = patient.pairs[0][0]
-    before, healthy = image.copy(), restored(patient, Struck(patient.core, SOUND, image, 0))
-    struck = MEMORIES[memory](patient, image, 50_000, np.random.default_rng(0))
-    assert struck.flips > 0
-    assert not np.array_equal(restored(patient, struck), healthy)
-    np.testing.assert_array_equal(restored(patient, struck), restored(patient, struck))
+def test_an_injection_leaves_the_target_alone(memory: str, target: FaultTarget) -> None:
+    image = target.pairs[0][0]
+    before, fault_free = image.copy(), restored(target, Injected(target.core, SOUND, image, 0))
+    injected = MEMORIES[memory](target, image, 50_000, np.random.default_rng(0))
+    assert injected.flips > 0
+    assert not np.array_equal(restored(target, injected), fault_free)
+    np.testing.assert_array_equal(restored(target, injected), restored(target, injected))
     np.testing.assert_array_equal(image, before)
-    np.testing.assert_array_equal(restored(patient, patient.healthy(0)), healthy)
+    np.testing.assert_array_equal(restored(target, target.fault_free(0)), fault_free)
 
 
-def test_the_sign_hurts_more_than_the_least_bit(patient: Patient) -> None:
-    tables = by_table(place_rows(patient, seed=0, side_px=24))
-    assert [row.name for row in tables["bit flips by layer"]] == [op.name for op in patient.core.ops]
+def test_the_sign_hurts_more_than_the_least_bit(target: FaultTarget) -> None:
+    tables = by_table(place_rows(target, seed=0, side_px=24))
+    assert [row.name for row in tables["bit flips by layer"]] == [op.name for op in target.core.ops]
     least, *_, sign = tables["bit flips by bit"]
     for memory in ("weights, mean", "map, mean"):
         assert db(sign, memory) > 2 * db(least, memory)
@@ -91,8 +91,8 @@ def test_the_sign_hurts_more_than_the_least_bit(patient: Patient) -> None:
 def test_all_guards_cost_under_two_per_cent_on_the_board(variant: str) -> None:
     core = as_stored(core_of(open_subject(None, None, variant)))
     relus = {op.output: 96 for op in core.ops if isinstance(op, IntConv) and op.relu}
-    dpu, patient = load_dpu("vck190", None), Patient(core, Guards(relus, 1024.0, checksums(core)), ())
-    found = price_rows(patient, predict_file(SHIPPED / f"{variant}-int8.onnx", dpu, TILE_PX), dpu)
+    dpu, target = load_dpu("vck190", None), FaultTarget(core, Guards(relus, 1024.0, checksums(core)), ())
+    found = price_rows(target, predict_file(SHIPPED / f"{variant}-int8.onnx", dpu, TILE_PX), dpu)
     *parts, together = (db(row, "time") for row in found)
     assert together == pytest.approx(sum(parts))
     assert 0 < db(found[-1], "of a tile, if nothing hides") < 2
@@ -157,12 +157,12 @@ def test_the_page_is_fresh(maker: ModuleType) -> None:
 
 
 def price_lines(maker: ModuleType) -> list[str]:
-    """What guards cost, as the page must say it: prices need no strikes."""
+    """What guards cost, as the page must say it: prices need no injections."""
     lines = []
     for variant in maker.VARIANTS:
-        patient, dpu = make_patient(open_subject(None, None, variant), maker.REQUEST), load_dpu("vck190", None)
+        target, dpu = make_target(open_subject(None, None, variant), maker.REQUEST), load_dpu("vck190", None)
         prediction = predict_file(SHIPPED / f"{variant}-int8.onnx", dpu, TILE_PX)
-        lines += markdown(price_rows(patient, prediction, dpu)).splitlines()
+        lines += markdown(price_rows(target, prediction, dpu)).splitlines()
     return [line for line in lines if line.startswith("|")]
 
 

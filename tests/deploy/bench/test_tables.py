@@ -10,18 +10,20 @@ import tifffile
 import typer
 from typer.testing import CliRunner
 
+from deploy.bench.board import TRAFFIC
 from deploy.bench.host import CROP_PX, Sensors, drawn_acquisition, traditional_rows
 from deploy.bench.tables import (
     Swath,
     efficiency,
     layer_rows,
+    parse_size,
     parse_tiles,
     predict_file,
     predicted_rows,
     published_rows,
     sweep_rows,
 )
-from deploy.commands.bench import TRAFFIC, bench, parse_size
+from deploy.commands.bench import bench
 from deploy.commands.check import check
 from deploy.dpu.board import load_dpu
 from deploy.dpu.cost.layers import Constants

@@ -9,7 +9,7 @@ import pytest
 from model.evaluation import run as module
 from model.evaluation import targets as targets_module
 from model.evaluation.methods import Method
-from model.evaluation.run import TOLD_NOMINAL, TOLD_TRUTH, Condition, Fixed, conditions, sweep_rows
+from model.evaluation.run import NOMINAL_KNOWN, TRUTH_KNOWN, Condition, Fixed, conditions, sweep_rows
 from model.simulator.procedural import procedural_scene
 from profiles import SensorProfile, load_sensor
 from profiles.figures import Row
@@ -56,8 +56,8 @@ def level(row: Row, method: str) -> float:
 def test_the_truth_pays_where_the_sensor_has_drifted(monkeypatch: pytest.MonkeyPatch) -> None:
     drifted = Condition("MTF 3%", replace(NOMINAL, mtf_nyquist=0.03))
     found = rows(monkeypatch, [Condition("nominal", NOMINAL), drifted])
-    assert level(found["nominal"], TOLD_TRUTH) == level(found["nominal"], TOLD_NOMINAL)
-    assert level(found["MTF 3%"], TOLD_TRUTH) > level(found["MTF 3%"], TOLD_NOMINAL) + 1
+    assert level(found["nominal"], TRUTH_KNOWN) == level(found["nominal"], NOMINAL_KNOWN)
+    assert level(found["MTF 3%"], TRUTH_KNOWN) > level(found["MTF 3%"], NOMINAL_KNOWN) + 1
     assert level(found["nominal"], "half") < level(found["nominal"], "degraded") - 5
 
 
@@ -65,5 +65,5 @@ def test_another_gain_is_told_to_the_chains_and_kept(monkeypatch: pytest.MonkeyP
     """The reference has the gain of the input, so brightness is no error of a method that knows no gains."""
     dimmer = replace(NOMINAL, gain_dn_per_radiance=0.7 * NOMINAL.gain_dn_per_radiance)
     found = rows(monkeypatch, [Condition("nominal", NOMINAL), Condition("dim", dimmer)])
-    assert level(found["dim"], TOLD_NOMINAL) == level(found["dim"], TOLD_TRUTH)
+    assert level(found["dim"], NOMINAL_KNOWN) == level(found["dim"], TRUTH_KNOWN)
     assert level(found["dim"], "degraded") == pytest.approx(level(found["nominal"], "degraded") + 3.1, abs=0.5)

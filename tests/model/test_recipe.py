@@ -13,7 +13,8 @@ from model.dataset import DatasetRecipe, write_dataset
 from model.evaluation.pairs import oversamplings_of, profiles_for, read_pairs, read_pairs_recipe
 from profiles import load_sensor
 from profiles.errors import OptionError, ProfileError
-from profiles.sensor import reference_for, same_instrument, sensor_from_json, sensor_names
+from profiles.sensor import same_instrument
+from profiles.sensor_file import reference_for, sensor_from_json, sensor_names
 
 SEVERE = load_sensor("dior-high")
 

@@ -1,4 +1,4 @@
-"""Bits turned over: as many as were asked for, in numbers that the memory can hold, wherever they fall."""
+"""Bit flips: as many as were asked for, in numbers that the memory can hold, wherever they fall."""
 
 from dataclasses import replace
 
@@ -15,12 +15,12 @@ from quant.faults import (
     SHIFT_BITS,
     as_stored,
     bits_apart,
+    flip_bits,
+    flip_count,
+    flip_shifts,
+    flip_weights,
     map_channels,
     shifts_of,
-    turned_over,
-    upset_count,
-    upset_shifts,
-    upset_weights,
     weight_bits,
 )
 from quant.graph import split
@@ -34,40 +34,40 @@ def image(height: int = 21, width: int = 34) -> np.ndarray:
     return np.random.default_rng(5).random((1, 1, height, width), dtype=np.float32)
 
 
-def turned(a: np.ndarray, b: np.ndarray, bits: int) -> int:
+def flipped(a: np.ndarray, b: np.ndarray, bits: int) -> int:
     apart = (a.astype(np.int64) ^ b.astype(np.int64)) & ((1 << bits) - 1)
     return sum(int(value).bit_count() for value in apart.ravel())
 
 
 @given(st.sampled_from(sorted(KINDS)), st.integers(0, 2**32 - 1), st.data())
-def test_so_many_bits_are_turned_over_and_no_more(kind: str, seed: int, data: st.DataObject) -> None:
+def test_so_many_bits_are_flipped_and_no_more(kind: str, seed: int, data: st.DataObject) -> None:
     dtype, bits = KINDS[kind]
     low, high = (0, 2**bits) if kind == "pixels" else (-(2 ** (bits - 1)), 2 ** (bits - 1))
     values = np.random.default_rng(seed).integers(low, high, (3, 7)).astype(dtype)
     count = data.draw(st.integers(0, values.size * bits))
-    struck = turned_over(values, count, np.random.default_rng(seed), bits)
-    assert turned(values, struck, bits) == count
-    assert struck.dtype == values.dtype
-    assert low <= struck.min() <= struck.max() < high
-    again = turned_over(values, count, np.random.default_rng(seed), bits)
-    np.testing.assert_array_equal(struck, again)
+    injected = flip_bits(values, count, np.random.default_rng(seed), bits)
+    assert flipped(values, injected, bits) == count
+    assert injected.dtype == values.dtype
+    assert low <= injected.min() <= injected.max() < high
+    again = flip_bits(values, count, np.random.default_rng(seed), bits)
+    np.testing.assert_array_equal(injected, again)
 
 
 @pytest.mark.parametrize("bit", range(INT8_BITS))
 def test_one_bit_moves_a_number_by_its_weight(bit: int) -> None:
     values = np.array([0, -128, 127, -1, 85], np.int8)
-    struck = turned_over(values, values.size, np.random.default_rng(0), bit=bit)
-    difference = struck.astype(int) - values
+    injected = flip_bits(values, values.size, np.random.default_rng(0), bit=bit)
+    difference = injected.astype(int) - values
     assert set(np.abs(difference)) == {2**bit}
 
 
 def test_the_rate_is_that_of_a_megabit() -> None:
     """Poisson's standard deviation is the root of the mean."""
-    counts = [upset_count(2_000_000, 50.0, np.random.default_rng(k)) for k in range(400)]
+    counts = [flip_count(2_000_000, 50.0, np.random.default_rng(k)) for k in range(400)]
     assert np.mean(counts) == pytest.approx(100, abs=4 * 10 / 20)
     assert np.std(counts) == pytest.approx(10, rel=0.2)
-    assert upset_count(1000, 0.0, np.random.default_rng(0)) == 0
-    assert upset_count(1000, 1e9, np.random.default_rng(0)) == 1000
+    assert flip_count(1000, 0.0, np.random.default_rng(0)) == 0
+    assert flip_count(1000, 1e9, np.random.default_rng(0)) == 1000
 
 
 def test_the_stored_bias_is_int8_and_the_network_the_same(quantised: Quantised) -> None:
@@ -81,12 +81,12 @@ def test_the_stored_bias_is_int8_and_the_network_the_same(quantised: Quantised) 
         np.testing.assert_array_equal(before[name], after[name])
 
 
-def test_weights_are_struck_over_all_layers(quantised: Quantised) -> None:
+def test_flips_fall_into_the_weights_of_all_layers(quantised: Quantised) -> None:
     core = as_stored(quantised.core)
-    struck = upset_weights(core, 200, np.random.default_rng(1))
+    injected = flip_weights(core, 200, np.random.default_rng(1))
     apart = {
-        a.name: turned(a.weight, b.weight, 8) + turned(a.bias, b.bias, 8)
-        for a, b in zip(core.ops, struck.ops, strict=True)
+        a.name: flipped(a.weight, b.weight, 8) + flipped(a.bias, b.bias, 8)
+        for a, b in zip(core.ops, injected.ops, strict=True)
         if isinstance(a, IntConv) and isinstance(b, IntConv)
     }
     assert sum(apart.values()) == 200
@@ -99,15 +99,15 @@ def test_every_shift_is_what_the_core_uses(quantised: Quantised) -> None:
     assert len(shifts) == sum(2 if isinstance(op, IntConv) else 1 for op in core.ops)
     limit = 2 ** (SHIFT_BITS - 1)
     assert all(-limit <= shift < limit for shift in shifts.values())
-    struck = upset_shifts(shifts, 3, np.random.default_rng(2))
-    assert struck.keys() == shifts.keys()
-    assert bits_apart(struck, shifts) == 3
+    injected = flip_shifts(shifts, 3, np.random.default_rng(2))
+    assert injected.keys() == shifts.keys()
+    assert bits_apart(injected, shifts) == 3
 
 
 def test_bits_of_shifts_are_counted_whatever_their_sign() -> None:
     shifts = {(str(k), "shift_cut"): k for k in range(-16, 17)}
     for count in (1, 2, 50):
-        assert bits_apart(upset_shifts(shifts, count, np.random.default_rng(count)), shifts) == count
+        assert bits_apart(flip_shifts(shifts, count, np.random.default_rng(count)), shifts) == count
 
 
 def test_numbers_that_the_board_could_not_store_are_refused(quantised: Quantised) -> None:
@@ -126,4 +126,4 @@ def test_maps_have_the_channels_that_run(quantised: Quantised) -> None:
 
 def test_pixels_stay_in_twelve_bits() -> None:
     dn = np.array([0, 4095, 2048], np.uint16)
-    assert turned_over(dn, 36, np.random.default_rng(0), PIXEL_BITS).tolist() == [4095, 0, 2047]
+    assert flip_bits(dn, 36, np.random.default_rng(0), PIXEL_BITS).tolist() == [4095, 0, 2047]

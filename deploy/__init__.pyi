@@ -1,0 +1,13 @@
+from .dpu.board import load_dpu as load_dpu
+from .dpu.checker.placement import place as place
+from .dpu.cost.latency import predict as predict
+from .dpu.reading import read_network as read_network
+from .export import float_model as float_model
+from .export import network_for as network_for
+from .export import to_onnx as to_onnx
+from .gate import run_gate as run_gate
+from .library import restore as restore
+from .methods import method_named as method_named
+from .results import Document as Document
+
+__version__: str
