@@ -79,8 +79,6 @@ def _restore(image: Any, options: Options, nodata: float | None) -> Any:
     bands = _bands_first(image)
     raster = _raster(bands, nodata)
     if hasattr(image, "__dask_graph__"):
-        from deploy.library import restore_lazily  # needs Dask, which such an image brought along
-
         restored = restore_lazily(bands, raster, options)
     else:
         restored = _restore_now(bands, raster, options)
@@ -127,7 +125,7 @@ _opening = Lock()
 
 @dataclass(frozen=True)
 class Task:
-    """What all tiles of an array share."""
+    """What all tiles of a lazy array share: facts of the image and a network, as they are sent to Dask's workers."""
 
     raster: Raster
     network: Packed

@@ -53,7 +53,7 @@ class RestoredRow(NamedTuple):
 
 @dataclass(frozen=True)
 class Restorer:
-    """What turns stored pixels into restored ones.
+    """A network and an image's facts: what turns stored pixels into restored ones.
 
     Attributes:
         raster: the image's facts.
@@ -91,7 +91,7 @@ class Restorer:
             slice(rows.keep_start - strip.top, rows.keep_stop - strip.top),
             slice(columns.keep_start, columns.keep_stop),
         )
-        stored = strip.pixels[keep].astype(self.raster.out_dtype)
+        stored = strip.pixels[keep].astype(self.raster.out_dtype)  # what missing pixels stay
         missing = None if strip.missing is None else strip.missing[keep]
         if missing is not None and missing.all():
             return stored, 0
@@ -105,6 +105,7 @@ class Restorer:
         """What the network sees of a tile, missing pixels filled."""
         if strip.missing is None:
             return strip.pixels[band, rows.start - strip.top : rows.stop - strip.top, columns.start : columns.stop]
+        # Beyond the last pixel a slice ends by itself; before the first one it would begin at the other end.
         left, right = max(columns.start - self.radius_px, 0), columns.stop + self.radius_px
         top, bottom = max(rows.start - self.radius_px, 0) - strip.top, rows.stop + self.radius_px - strip.top
         around = (band, slice(top, bottom), slice(left, right))
@@ -126,6 +127,7 @@ def checked_strip(raster: Raster, top: int, pixels: np.ndarray, full_scale: floa
     missing = raster.missing(pixels) if raster.may_miss else None
     strip = Strip(top, pixels, missing if missing is not None and missing.any() else None)
     known = True if strip.missing is None else ~strip.missing
+    # Where nothing is known, 0 is taken for both, which is inside.
     low, high = (float(extreme(pixels, where=known, initial=0)) for extreme in (np.min, np.max))
     if low < 0 or high > full_scale:
         remedy = "give the sensor's highest number as --full-scale, or mark missing pixels as nodata"
@@ -152,7 +154,7 @@ def fill_from_nearest(pixels: np.ndarray, missing: np.ndarray, reach_px: int) ->
 def _along_rows(pixels: np.ndarray, missing: np.ndarray, reach_px: int) -> tuple[np.ndarray, np.ndarray]:
     """Filled pixels, and where none was in reach; of two at the same distance the left one is taken."""
     width = pixels.shape[1]
-    far = width + reach_px + 1
+    far = width + reach_px + 1  # out of reach from every pixel: no known one on that side
     here = np.arange(width)
     left = np.maximum.accumulate(np.where(missing, -far, here), axis=1)
     right = np.minimum.accumulate(np.where(missing, 2 * far, here)[:, ::-1], axis=1)[:, ::-1]
@@ -205,6 +207,7 @@ def restore_rows(
     Raises:
         ImageError: unreadable rows, values outside 0 to full scale, or a network that gives NaN.
     """
+    # A single reader, since a source keeps what it decoded for the rows before, for the next ones to take.
     with ThreadPoolExecutor(1) as reader, ThreadPoolExecutor(at_once) as pool:
         coming = [reader.submit(restorer.read, source, row.start, row.stop) for row in rows[:1]]
         begun: deque[tuple[Span, Iterator[Tile]]] = deque()
@@ -218,7 +221,7 @@ def restore_rows(
             while begun:
                 yield _joined(*begun.popleft(), plan, restorer, tick)
         finally:
-            pool.shutdown(cancel_futures=True)
+            pool.shutdown(cancel_futures=True)  # or the tiles of two rows would still be restored after an error
 
 
 def restore_row(strip: Strip, row: Span, plan: Plan, restorer: Restorer, tick: Callable[[], None]) -> RestoredRow:

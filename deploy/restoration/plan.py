@@ -99,7 +99,7 @@ class Plan:
 
     @property
     def tiles(self) -> int:
-        """Windows that the network sees."""
+        """All tiles of the image: windows that the network sees."""
         return len(self.rows) * self.row_tiles
 
     @property
@@ -122,7 +122,7 @@ class Plan:
 
     @property
     def sentence(self) -> str:
-        """How the image is cut."""
+        """How the image is cut, in one sentence for the user."""
         bands = f", each of {self.bands} bands by itself" if self.bands > 1 else ""
         rows_px, columns_px = self.tile_shape
         tiles = "1 tile" if self.tiles == 1 else f"{self.tiles} tiles"

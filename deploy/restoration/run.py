@@ -88,6 +88,7 @@ def _restore(image: Path, out: Path, options: Options, say: Say) -> Row:
         infer, runtime = open_runtime(options.runtime, network, options.threads, at_once)
         restorer = Restorer(raster, infer, full_scale, plan.radius_px, str(image))
         figures = seam_figures(source, plan, restorer, fixed_tile_px(network) is not None)
+        # Another version of the runtime might give other bits: rows of one are not finished by another.
         job = _job(image, options, plan, runtime, full_scale)
         checkpoint = Checkpoint(out, raster.shape, raster.out_dtype, job, options.resume)
         done_rows = checkpoint.rows

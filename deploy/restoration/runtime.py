@@ -169,13 +169,13 @@ class Packed:
 
 
 def pack(model: onnx.ModelProto, runtime: Runtime, threads: int) -> Packed:
-    """A network made ready to be sent."""
+    """A network with how it is to be run, as bytes that another process can open."""
     content = model.SerializeToString()
     return Packed(content, hashlib.sha256(content).hexdigest(), runtime, threads)
 
 
 def open_packed(packed: Packed) -> tuple[Infer, str]:
-    """As `open_runtime`, where it arrived.
+    """A network that arrived from another process, ready to run, and the runtime's name and version.
 
     Raises:
         ModelError: not as it was sent.

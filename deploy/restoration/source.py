@@ -43,7 +43,7 @@ class Raster:
 
     @property
     def shape(self) -> tuple[int, int, int]:
-        """(bands, height, width)."""
+        """Bands, height and width, (bands, H, W) in pixels."""
         return self.bands, self.height_px, self.width_px
 
     @property
@@ -75,7 +75,7 @@ class Raster:
 
 
 def page_raster(path: str, page: tifffile.TiffPage) -> Raster:
-    """The raster of a TIFF page.
+    """What a TIFF page says of its image, before any pixel is read.
 
     Raises:
         ImageError: too large to be planned, pixels that are no real numbers, or a nodata value that the output could
@@ -146,7 +146,7 @@ DIGEST_BYTES = 1 << 16
 
 
 class Source(Protocol):
-    """An image that gives rows."""
+    """An image that gives its rows: a `raster` of facts, and pixels as they are asked for."""
 
     raster: Raster
 
@@ -201,13 +201,13 @@ def whole_source(path: Path) -> "ArraySource":
 
 
 class ArraySource:
-    """An image in memory, (bands, height, width)."""
+    """An image in memory: `pixels` (bands, height, width), of which rows are views."""
 
     def __init__(self, pixels: np.ndarray, raster: Raster) -> None:
         self._pixels, self.raster = pixels, raster
 
     def read(self, start: int, stop: int) -> np.ndarray:
-        """See Source."""
+        """Rows `start` to `stop` (excluded) of every band, (bands, rows, width), not copied."""
         return self._pixels[:, start:stop]
 
     def held_bytes(self, rows_px: int) -> int:  # noqa: ARG002
@@ -225,11 +225,16 @@ class TiffSource:
         self._segment_px = min(page.tilelength if page.is_tiled else page.rowsperstrip, height_px)
         self._down = -(-height_px // self._segment_px)
         self._across = -(-width_px // page.tilewidth) if page.is_tiled else 1
-        self._held: dict[int, np.ndarray] = {}
+        self._held: dict[int, np.ndarray] = {}  # strips of rows overlap: segments are decoded once
+        # Uncompressed and in one piece, rows lie in the file as they are: no more than those is read.
         self._flat = page.compression == 1 and page.is_contiguous and page.bitspersample in (8, 16, 32, 64)
 
     def read(self, start: int, stop: int) -> np.ndarray:
-        """See Source."""
+        """Rows `start` to `stop` (excluded) of every band, (bands, rows, width), as stored.
+
+        Raises:
+            ImageError: damaged.
+        """
         with damage_in_a_sentence(self._path, f"rows {start} to {stop - 1}"):
             return self._read_flat(start, stop) if self._flat else self._read_segments(start, stop)
 

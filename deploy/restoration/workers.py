@@ -86,7 +86,13 @@ class Opened:
         self.restorer = Restorer(self.source.raster, infer, scale, radius_px, str(work.image))
 
     def restore(self, row: Span) -> Piece:
-        """Restore one row of tiles."""
+        """Restore one row of tiles.
+
+        Raises:
+            ImageError: unreadable rows, values outside 0 to full scale, or a network that gives NaN.
+            MachineError: memory.
+            StoppedError: the run is over.
+        """
         with self.reading:
             strip = self.restorer.read(self.source, row.start, row.stop)
         restored = restore_row(strip, row, self.work.plan, self.restorer, self._tick)
