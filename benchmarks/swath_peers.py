@@ -16,7 +16,7 @@ import numpy as np
 import onnx
 import tifffile
 
-from deploy.restoration.arrays import restore_window
+from deploy.restoration.engine import restore_window
 from deploy.restoration.options import Options
 from deploy.restoration.run import restore_file
 from deploy.restoration.runtime import open_runtime

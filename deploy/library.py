@@ -12,12 +12,11 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from deploy.restoration.arrays import Infer
-from deploy.restoration.engine import NAME, Restorer, restore_array
+from deploy.restoration.engine import NAME, Restorer, checked_strip, restore_array
 from deploy.restoration.options import TILE_PX, Options, Runtime
-from deploy.restoration.plan import Plan, Span
-from deploy.restoration.run import plan_of, scale_of
-from deploy.restoration.runtime import Packed, open_packed, open_runtime, pack, tiles_at_once
+from deploy.restoration.plan import Plan, Span, plan_for
+from deploy.restoration.run import scale_of
+from deploy.restoration.runtime import Infer, Packed, open_packed, open_runtime, pack, tiles_at_once
 from deploy.restoration.source import ArraySource, Raster, require_numbers, usable_nodata
 from model.io.images import settled_scale
 from model.shipped import int8_file
@@ -80,8 +79,6 @@ def _restore(image: Any, options: Options, nodata: float | None) -> Any:
     bands = _bands_first(image)
     raster = _raster(bands, nodata)
     if hasattr(image, "__dask_graph__"):
-        from deploy.library import restore_lazily  # needs Dask, which such an image brought along
-
         restored = restore_lazily(bands, raster, options)
     else:
         restored = _restore_now(bands, raster, options)
@@ -90,7 +87,7 @@ def _restore(image: Any, options: Options, nodata: float | None) -> Any:
 
 def _restore_now(bands: np.ndarray, raster: Raster, options: Options) -> np.ndarray:
     network, source = load_onnx(options.model), ArraySource(bands, raster)
-    plan = plan_of(raster, network, options)
+    plan = plan_for(network, raster.shape, options)
     at_once = tiles_at_once(options.threads, plan.tiles)
     infer, _ = open_runtime(options.runtime, network, options.threads, at_once)
     full_scale = scale_of(source, plan, options.full_scale, NAME)
@@ -128,7 +125,7 @@ _opening = Lock()
 
 @dataclass(frozen=True)
 class Task:
-    """What all tiles of an array share."""
+    """What all tiles of a lazy array share: facts of the image and a network, as they are sent to Dask's workers."""
 
     raster: Raster
     network: Packed
@@ -153,7 +150,7 @@ def restore_lazily(bands: Any, raster: Raster, options: Options) -> Any:
     da: Any = import_module("dask.array")
     delayed: Any = import_module("dask").delayed
     network = load_onnx(options.model)
-    plan = plan_of(raster, network, options)
+    plan = plan_for(network, raster.shape, options)
     settled_scale(NAME, raster.dtype, (), options.full_scale)  # what the type alone decides comes at once
     packed = pack(network, options.runtime, options.threads or 1)
     task = delayed(Task(raster, packed, options.full_scale, plan.radius_px))
@@ -178,14 +175,15 @@ def restore_tile(task: Task, window: np.ndarray, top: int, left: int, row: Span,
     """
     restorer = task.restorer(window)
     here = Span(*(side - left for side in (column.start, column.stop, column.keep_start, column.keep_stop)))
-    pixels, _ = restorer.kept(restorer.band(top, window), 0, row, here)
+    strip = checked_strip(task.raster, top, window, restorer.full_scale, NAME)
+    pixels, _ = restorer.tile(strip, 0, row, here)
     return pixels[None]
 
 
 def _around(span: Span, raster: Raster, plan: Plan) -> slice:
     """What a tile reads along one side: its window, and what missing pixels may be filled from."""
-    margin = plan.radius_px if raster.may_miss else 0
-    return slice(max(span.start - margin, 0), span.stop + margin)
+    margin_px = raster.fill_margin_px(plan.radius_px)
+    return slice(max(span.start - margin_px, 0), span.stop + margin_px)
 
 
 @lru_cache(maxsize=NETWORKS_KEPT)

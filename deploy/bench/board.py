@@ -20,7 +20,7 @@ from deploy.bench.tables import (
 )
 from deploy.dpu.board import Dpu, load_dpu
 from deploy.dpu.cost.validation import refit
-from deploy.restoration.arrays import parse_halo
+from deploy.restoration.options import parse_halo
 from model.io.images import read_acquisition
 from model.shipped import SENSOR
 from profiles import load_target

@@ -1,7 +1,17 @@
-"""A whole acquisition restored, row of tiles by row of tiles: exact seams, little memory, resumable.
+"""Restoration of images of any size: exact seams, little memory, resumable.
 
-source (bands of rows) -> engine (tiles through the runtime) -> output (finished rows, journal, tiled TIFF)
+An image passes, in this order:
 
-With workers, `workers` takes the engine's place: each has a source and restores rows of its own. `arrays` restores
-what is in memory already, `traditional` by the chain instead of a network.
+    options      what a user can choose
+    source       an image file, or an array, as rows
+    plan         how it is cut into tiles, and the memory that takes
+    runtime      the network, on onnxruntime or OpenVINO
+    engine       the one tile loop, for files and arrays: `restore_rows`, `restore_array`, `restore_dn`
+    workers      the same rows by the workers of a Dask cluster
+    output       finished rows in a checkpoint, the lock, the TIFF
+    run          all of this for one file: `restore_file`
+    traditional  a file by the traditional chain instead of a network: `restore_file_traditionally`
+
+`deploy.library.restore` is the same for notebooks. Nothing is imported here, so that `--help` stays quick; none of
+these but `traditional` loads torch.
 """

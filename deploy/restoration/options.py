@@ -1,25 +1,24 @@
-"""How an image is to be restored."""
+"""How an image is to be restored: what a user can choose. It loads nothing, so that '--help' stays quick."""
 
-import hashlib
 from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
 
-from deploy.restoration.plan import Plan
-from model.io.files import sha256
+from profiles.errors import OptionError
 
 TILE_PX = 640
+"""Side of a tile unless somebody asks for another: what the paper's network was given on the board."""
 
 
 class Runtime(StrEnum):
-    """What runs the network."""
+    """The library that runs the network."""
 
     onnxruntime = "onnxruntime"
     openvino = "openvino"
 
 
 class Compression(StrEnum):
-    """Lossless compressions of the output."""
+    """The compressions of the output, all lossless."""
 
     none = "none"
     zlib = "zlib"
@@ -28,13 +27,13 @@ class Compression(StrEnum):
 
     @property
     def codec(self) -> str | None:
-        """As tifffile calls it."""
+        """The name by which tifffile knows it; None without compression."""
         return None if self is Compression.none else self.value
 
 
 @dataclass(frozen=True)
 class Options:
-    """What a user can choose.
+    """What a user can choose of a restoration by a network.
 
     Attributes:
         model: the network's file.
@@ -64,30 +63,19 @@ class Options:
 
     @property
     def is_spread(self) -> bool:
-        """Whether other processes restore."""
+        """Whether other processes than this one restore."""
         return bool(self.workers or self.scheduler)
 
 
-DIGEST_BYTES = 1 << 16
+def parse_halo(text: str, radius_px: int) -> int:
+    """The halo in pixels that a user asked for: 'exact' is the network's receptive radius.
 
-
-def make_job(image: Path, options: Options, plan: Plan, runtime: str, full_scale: float) -> dict[str, object]:
-    """As the journal keeps it; who computes, and on how many machines, is no part of it."""
-    return {
-        "image": [*fingerprint(image), image.stat().st_mtime_ns],
-        "model": sha256(options.model),
-        "tile_px": plan.tile_px,
-        "halo_px": plan.halo_px,
-        "full_scale": full_scale,
-        "runtime": runtime,
-    }
-
-
-def fingerprint(image: Path) -> tuple[int, str]:
-    """Size in bytes, and a digest of the file's two ends: quick, however large it is."""
-    size_bytes = image.stat().st_size
-    with image.open("rb") as stream:
-        ends = stream.read(DIGEST_BYTES)
-        stream.seek(max(size_bytes - DIGEST_BYTES, 0))
-        ends += stream.read(DIGEST_BYTES)
-    return size_bytes, hashlib.sha256(ends).hexdigest()
+    Raises:
+        OptionError: neither 'exact' nor a number of pixels.
+    """
+    if text == "exact":
+        return radius_px
+    if text.isdecimal():
+        return int(text)
+    remedy = f"{radius_px} is exact for this network"
+    raise OptionError("--halo", expected="'exact' or a number of pixels", got=repr(text), remedy=remedy)

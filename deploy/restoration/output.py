@@ -1,4 +1,4 @@
-"""Finished rows beside the output, so that a run killed at any moment goes on; at the end one tiled TIFF, or none.
+"""What a run leaves: finished rows in a checkpoint, so that one killed at any moment goes on; at the end one TIFF.
 
 One run at a time on one output: the system holds the lock, so that one left by a killed process blocks nobody.
 """
@@ -19,8 +19,8 @@ import numpy as np
 import tifffile
 from filelock import BaseFileLock, FileLock, Timeout
 
+from deploy.restoration.engine import RestoredRow
 from deploy.restoration.options import Compression
-from deploy.restoration.plan import Span
 from deploy.restoration.source import BIG_TIFF_SUFFIXES, Raster
 from model.io.files import TIFF_SUFFIXES
 from profiles.errors import MachineError, OptionError, sizes
@@ -28,12 +28,17 @@ from profiles.toml import read_json
 
 
 def part_folder(out: Path) -> Path:
-    """Where a run keeps what it needs for `out`."""
+    """The folder beside `out` in which a run keeps what it needs for it."""
     return out.with_name(f".{out.name}.part")
 
 
-class Spool:
-    """The rows of a (bands, height, width) image, finished from the top."""
+class Checkpoint:
+    """The finished rows of an image (bands, height, width), from the top, and a journal of how many there are.
+
+    Attributes:
+        rows: how many are finished.
+        known: how many of their pixels are not missing.
+    """
 
     def __init__(
         self, out: Path, shape: tuple[int, int, int], dtype: np.dtype[Any], job: Mapping[str, object], resume: bool
@@ -63,26 +68,26 @@ class Spool:
             self.folder.mkdir(exist_ok=True)
             (self.folder / "rows.raw").touch()
 
-    def append(self, span: Span, pixels: np.ndarray, known: int) -> None:
-        """Keep the rows `span.keep_start` to `span.keep_stop`, of whose pixels so many are known.
+    def append(self, row: RestoredRow) -> None:
+        """Keep a row of tiles, which must follow those that are kept.
 
         Raises:
             MachineError: the disk is full or gone.
         """
         with self.disk():
             with (self.folder / "rows.raw").open("r+b") as stream:
-                for plane in range(self.shape[0]):
-                    stream.seek(self._offset(plane, span.keep_start))
-                    stream.write(np.ascontiguousarray(pixels[plane]).data)
+                for band in range(self.shape[0]):
+                    stream.seek(self._offset(band, row.span.keep_start))
+                    stream.write(np.ascontiguousarray(row.pixels[band]).data)
                 stream.flush()
                 os.fsync(stream.fileno())
-            self.rows, self.known = span.keep_stop, self.known + known
+            self.rows, self.known = row.span.keep_stop, self.known + row.known
             self._write_journal()
 
-    def read(self, plane: int, start: int, stop: int) -> np.ndarray:
-        """Finished rows of one band, (rows, width)."""
+    def read(self, band: int, start: int, stop: int) -> np.ndarray:
+        """Finished rows `start` to `stop` (excluded) of one band, (rows, width) as they will be written."""
         count = (stop - start) * self.shape[2]
-        path, offset = self.folder / "rows.raw", self._offset(plane, start)
+        path, offset = self.folder / "rows.raw", self._offset(band, start)
         return np.fromfile(path, self.dtype, count, offset=offset).reshape(-1, self.shape[2])
 
     def remove(self) -> None:
@@ -129,8 +134,8 @@ class Spool:
         fresh.replace(path)
         sync_folder(self.folder)
 
-    def _offset(self, plane: int, row: int) -> int:
-        return (plane * self.shape[1] + row) * self.shape[2] * self.dtype.itemsize
+    def _offset(self, band: int, row: int) -> int:
+        return (band * self.shape[1] + row) * self.shape[2] * self.dtype.itemsize
 
     def _require_room(self) -> None:
         bands, height, width = self.shape
@@ -183,24 +188,24 @@ def require_codec(compression: Compression) -> None:
         raise MachineError("--compression", expected="an installed codec", got=got, remedy=remedy) from error
 
 
-def write_output(spool: Spool, raster: Raster, compression: Compression) -> None:
-    """Write the spool's rows to its output, rename it into place and remove the spool.
+def write_output(checkpoint: Checkpoint, raster: Raster, compression: Compression) -> None:
+    """Write the checkpoint's rows to its output, rename it into place and remove the checkpoint.
 
     Raises:
         MachineError: the disk is full or gone; the rows are still there.
     """
-    fresh = spool.folder / "out.tif"
+    fresh = checkpoint.folder / "out.tif"
     padded_px = raster.bands * _padded(raster.height_px) * _padded(raster.width_px)
-    with spool.disk():
+    with checkpoint.disk():
         tifffile.imwrite(
             fresh,
-            _tiles(spool),
-            shape=spool.shape if raster.bands > 1 else spool.shape[1:],
-            dtype=spool.dtype,
+            _tiles(checkpoint),
+            shape=checkpoint.shape if raster.bands > 1 else checkpoint.shape[1:],
+            dtype=checkpoint.dtype,
             tile=(TILE_PX, TILE_PX),
             compression=compression.codec,
             compressionargs={"level": FAST_LEVEL} if compression is Compression.zlib else None,
-            bigtiff=padded_px * spool.dtype.itemsize > PLAIN_LIMIT_BYTES,
+            bigtiff=padded_px * checkpoint.dtype.itemsize > PLAIN_LIMIT_BYTES,
             photometric="minisblack",
             planarconfig="separate" if raster.bands > 1 else None,
             software="beers-deploy",
@@ -210,18 +215,18 @@ def write_output(spool: Spool, raster: Raster, compression: Compression) -> None
         )
         with fresh.open("r+b") as stream:
             os.fsync(stream.fileno())
-        fresh.replace(spool.out)
-        sync_folder(spool.out.parent)
-        spool.remove()
+        fresh.replace(checkpoint.out)
+        sync_folder(checkpoint.out.parent)
+        checkpoint.remove()
 
 
-def _tiles(spool: Spool) -> Iterator[np.ndarray]:
+def _tiles(checkpoint: Checkpoint) -> Iterator[np.ndarray]:
     """Squares in the order of the file, zeros beyond the image."""
-    bands, height, width = spool.shape
-    for plane in range(bands):
+    bands, height, width = checkpoint.shape
+    for band in range(bands):
         for top in range(0, height, TILE_PX):
-            rows = spool.read(plane, top, min(top + TILE_PX, height))
-            strip = np.zeros((TILE_PX, _padded(width)), spool.dtype)
+            rows = checkpoint.read(band, top, min(top + TILE_PX, height))
+            strip = np.zeros((TILE_PX, _padded(width)), checkpoint.dtype)
             strip[: len(rows), :width] = rows
             yield from np.hsplit(strip, strip.shape[1] // TILE_PX)
 

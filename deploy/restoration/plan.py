@@ -1,16 +1,19 @@
 """How an image is cut into tiles with exact seams, and what that costs: known before the run.
 
-A tile is read with a halo of `halo_px` pixels around what is kept of it; whether a run fits into memory is looked
-at before it begins.
+A tile is read with a halo of `halo_px` pixels around what is kept of it. Where the halo is the network's receptive
+radius, the result is the whole image's, bit for bit. Whether a run fits into memory is looked at before it begins.
 """
 
 from collections.abc import Iterator
 from dataclasses import dataclass
 
+import onnx
 import psutil
 
+from deploy.restoration.options import Options, parse_halo
 from deploy.restoration.source import Source
 from profiles.errors import MachineError, OptionError, sizes
+from quant.onnx_file import fixed_tile_px, receptive_radius_px
 
 
 @dataclass(frozen=True)
@@ -24,7 +27,7 @@ class Span:
 
 
 def plan_side(size_px: int, tile_px: int, halo_px: int) -> list[Span]:
-    """The spans along one side.
+    """The spans along one side of `size_px` pixels, each of `tile_px`, or one of `size_px` where that is less.
 
     Raises:
         OptionError: a tile with no room between its two halos.
@@ -61,7 +64,18 @@ def _spans(size_px: int, tile_px: int, halo_px: int) -> Iterator[Span]:
 
 @dataclass(frozen=True)
 class Plan:
-    """Rows and columns of tiles, none longer than `tile_px`, over an image of `bands` planes."""
+    """Rows and columns of tiles over an image of `bands` bands.
+
+    Attributes:
+        bands: each is cut alike and restored by itself.
+        height_px: of the image.
+        width_px: of the image.
+        tile_px: no tile is longer.
+        halo_px: context around what is kept of a tile.
+        radius_px: the network's receptive radius; with a halo of so much the seams are exact.
+        rows: of tiles, from top to bottom.
+        columns: of tiles, from left to right.
+    """
 
     bands: int
     height_px: int
@@ -79,9 +93,14 @@ class Plan:
         return row.stop - row.start, column.stop - column.start
 
     @property
+    def row_tiles(self) -> int:
+        """Tiles of one row of tiles, those of all bands."""
+        return len(self.columns) * self.bands
+
+    @property
     def tiles(self) -> int:
-        """Windows that the network sees."""
-        return len(self.rows) * len(self.columns) * self.bands
+        """All tiles of the image: windows that the network sees."""
+        return len(self.rows) * self.row_tiles
 
     @property
     def work_factor(self) -> float:
@@ -90,13 +109,62 @@ class Plan:
         return seen / (self.height_px * self.width_px)
 
     @property
-    def band_rows_px(self) -> int:
+    def strip_rows_px(self) -> int:
         """Most rows that are read at once: a tile's, and those that missing pixels are filled from."""
         return min(self.tile_shape[0] + 2 * self.radius_px, self.height_px)
 
+    @property
+    def halo_words(self) -> str:
+        """The halo, and whether seams are exact with it."""
+        if self.halo_px >= self.radius_px:
+            return f"{self.halo_px} px (exact)"
+        return f"{self.halo_px} px (seams: exact is {self.radius_px})"
+
+    @property
+    def sentence(self) -> str:
+        """How the image is cut, in one sentence for the user."""
+        bands = f", each of {self.bands} bands by itself" if self.bands > 1 else ""
+        rows_px, columns_px = self.tile_shape
+        tiles = "1 tile" if self.tiles == 1 else f"{self.tiles} tiles"
+        return (
+            f"plan: {self.width_px} x {self.height_px} pixels{bands}; {tiles} of {columns_px} x {rows_px}, "
+            f"halo {self.halo_words}, work factor {self.work_factor:.2f}"
+        )
+
+
+def plan_for(network: onnx.ModelProto, shape: tuple[int, int, int], options: Options) -> Plan:
+    """How an image of `shape` (bands, H, W) is cut for a network, as a user's options ask.
+
+    Raises:
+        ModelError: a network that cannot be tiled.
+        OptionError: options that do not go together.
+    """
+    radius_px, fixed_px = receptive_radius_px(network), fixed_tile_px(network)
+    if fixed_px is not None:
+        require_fixed_tile(fixed_px, options.tile_px, shape[1:])
+    halo_px = parse_halo(options.halo, radius_px)
+    return make_plan(shape, options.tile_px, halo_px, radius_px, fixed_px is not None)
+
+
+def require_fixed_tile(fixed_px: int, tile_px: int, size: tuple[int, int]) -> None:
+    """A network fixed to one tile size takes only windows of that size, in an image of `size` (H, W).
+
+    Raises:
+        OptionError: another tile size, or an image smaller than the tile.
+    """
+    if fixed_px != tile_px or min(size) < fixed_px:
+        raise OptionError(
+            "--tile",
+            expected=f"{fixed_px}, the size the model is fixed to, and an image at least as large",
+            got=f"tile {tile_px}, image {size[1]} x {size[0]}",
+            remedy="use a model exported without --tile",
+        )
+
 
 def make_plan(shape: tuple[int, ...], tile_px: int, halo_px: int, radius_px: int, fixed: bool = False) -> Plan:
-    """The plan of an image (bands, H, W): tiles of at most `tile_px` a side, or just that if the network is `fixed`.
+    """The plan of an image of `shape` (bands, H, W).
+
+    Tiles are as even as can be, of at most `tile_px` a side; of just that where the network is `fixed` to it.
 
     Raises:
         OptionError: a tile with no room between its two halos.
@@ -114,15 +182,15 @@ def make_plan(shape: tuple[int, ...], tile_px: int, halo_px: int, radius_px: int
 def rows_bytes(source: Source, plan: Plan, begun: bool = False) -> int:
     """Memory that rows of the image will take beyond what is held now.
 
-    Three bands as read and three as restored: two in work and one on its way, on either side; and what the source
-    holds. Once the run has `begun`, the first band and the source's share are there already. Where pixels may be
+    Three strips as read and three as restored: two in work and one on its way, on either side; and what the source
+    holds. Once the run has `begun`, the first strip and the source's share are there already. Where pixels may be
     missing, each has a flag, and one more while flags are made.
     """
     raster = source.raster
     row_px = raster.bands * raster.width_px
-    read = plan.band_rows_px * row_px * (raster.dtype.itemsize + raster.may_miss)
-    flags = plan.band_rows_px * row_px * raster.may_miss
-    held = 0 if begun else read + source.held_bytes(plan.band_rows_px)
+    read = plan.strip_rows_px * row_px * (raster.dtype.itemsize + raster.may_miss)
+    flags = plan.strip_rows_px * row_px * raster.may_miss
+    held = 0 if begun else read + source.held_bytes(plan.strip_rows_px)
     return 2 * read + flags + 3 * restored_bytes(source, plan) + held
 
 

@@ -1,39 +1,213 @@
-"""One image file restored into another: what the command `restore` does."""
+"""One image file restored into another: what the command `restore` does with a network.
+
+open -> plan -> settle the full scale -> open the network -> rows that a checkpoint lacks -> the TIFF -> figures
+
+One row is written while the next is made. Whatever stops a run, the output is the old one or the new one; finished
+rows stay in the checkpoint where a later run can go on.
+"""
 
 import time
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import closing, contextmanager
+from functools import partial
+from itertools import count
 from pathlib import Path
 
-import onnx
+import numpy as np
 
 from deploy.bench.host_state import peak_memory
 from deploy.cluster import check_choice
-from deploy.restoration.arrays import check_fixed_tile, parse_halo
-from deploy.restoration.engine import Restorer, Say, fill_here, seam_error_dn
-from deploy.restoration.options import Options, make_job
-from deploy.restoration.output import Spool, only_run, part_folder, require_codec, require_tiff_name, write_output
-from deploy.restoration.plan import Plan, check_memory, is_bulky, make_plan, rows_bytes
+from deploy.restoration.engine import RestoredRow, Restorer, Say, Tick, restore_rows
+from deploy.restoration.options import Options
+from deploy.restoration.output import (
+    Checkpoint,
+    only_run,
+    part_folder,
+    require_codec,
+    require_tiff_name,
+    write_output,
+)
+from deploy.restoration.plan import Plan, Span, check_memory, is_bulky, plan_for, rows_bytes
 from deploy.restoration.runtime import open_runtime, tiles_at_once
-from deploy.restoration.source import Raster, Source, open_source
-from deploy.restoration.workers import fill_spread, make_work
-from model.io.files import require_writable
+from deploy.restoration.source import Source, fingerprint, open_source
+from deploy.restoration.workers import make_work, rows_of_workers
+from model.io.files import require_writable, sha256
 from model.io.images import settled_scale
 from model.processor import require_cores
-from model.progress import held_back
+from model.progress import held_back, steps
+from profiles.errors import BeersError, ImageError, MachineError
 from profiles.figures import Figure, Row, measured, predicted, unavailable
-from quant.onnx_file import fixed_tile_px, load_onnx, receptive_radius_px
+from quant.onnx_file import fixed_tile_px, load_onnx
 
+RUNS_UNTIL_STEADY = 2
+"""Of each tile in work at a time: then a runtime takes no more memory."""
 ARITHMETIC = "arithmetic on the plan of tiles"
 
+Rows = Callable[[Sequence[Span], Tick], Generator[RestoredRow, None, None]]
+"""Restores rows of tiles in order, here or by workers."""
 
-def plan_sentence(plan: Plan) -> str:
-    """How the image is cut."""
-    bands = f", each of {plan.bands} bands by itself" if plan.bands > 1 else ""
-    rows_px, columns_px = plan.tile_shape
-    tiles = "1 tile" if plan.tiles == 1 else f"{plan.tiles} tiles"
-    return (
-        f"plan: {plan.width_px} x {plan.height_px} pixels{bands}; {tiles} of {columns_px} x {rows_px}, "
-        f"halo {_halo(plan)}, work factor {plan.work_factor:.2f}"
-    )
+
+def restore_file(image: Path, out: Path, options: Options, say: Say) -> Row:
+    """Restore `image` into the TIFF `out`, and return the run's figures.
+
+    Args:
+        image: a TIFF of any size, a PNG or a JPEG.
+        out: a TIFF, uint16 of integers and float32 of floats, in the scale of the image.
+        options: what the user chose.
+        say: told the plan, the memory, and how to go on after a stop.
+
+    Raises:
+        ImageError: no such image, damaged, all missing, or values outside 0 to full scale; nothing is left behind.
+        ModelError: a network that cannot be tiled or run.
+        OptionError: options that do not go together, or `resume` after a run of another kind.
+        MachineError: another run on `out`; memory, disk, a package or lost workers: finished rows stay for `resume`.
+        KeyboardInterrupt: stopped; rows already finished stay for `resume`.
+    """
+    check_choice(options.workers, options.scheduler)
+    require_writable(out, inputs=(image, options.model))
+    if options.scheduler is None:
+        require_cores("--threads", options.threads)
+    require_tiff_name(out)
+    require_codec(options.compression)
+    with only_run(out, part_folder(out)):
+        return _restore(image, out, options, say)
+
+
+def _restore(image: Path, out: Path, options: Options, say: Say) -> Row:
+    started = time.perf_counter()
+    network = load_onnx(options.model)
+    with open_source(image) as source:
+        raster = source.raster
+        plan = plan_for(network, raster.shape, options)
+        say(plan.sentence)
+        if not options.is_spread:
+            check_memory(rows_bytes(source, plan), options.memory_bytes, is_bulky(source, plan))
+        full_scale = scale_of(source, plan, options.full_scale, str(image))
+        at_once = tiles_at_once(options.threads, plan.tiles)
+        infer, runtime = open_runtime(options.runtime, network, options.threads, at_once)
+        restorer = Restorer(raster, infer, full_scale, plan.radius_px, str(image))
+        figures = seam_figures(source, plan, restorer, fixed_tile_px(network) is not None)
+        # Another version of the runtime might give other bits: rows of one are not finished by another.
+        job = _job(image, options, plan, runtime, full_scale)
+        checkpoint = Checkpoint(out, raster.shape, raster.out_dtype, job, options.resume)
+        done_rows = checkpoint.rows
+        if options.is_spread:
+            work, peaks_gb = make_work(image, plan, network, runtime, options, full_scale), list[float]()
+            finish_rows(checkpoint, plan, str(image), say, partial(rows_of_workers, work, source, say, peaks_gb))
+            figures |= worker_figures(peaks_gb)
+        else:
+            here = partial(_rows_here, source, plan, restorer, at_once, options.memory_bytes, say)
+            finish_rows(checkpoint, plan, str(image), say, here)
+    with held_back():  # a stop now would save nothing
+        write_output(checkpoint, raster, options.compression)
+    time_s = time.perf_counter() - started
+    return run_row(image.name, plan, done_rows, time_s, runtime, options, figures, full_scale)
+
+
+def scale_of(source: Source, plan: Plan, asked: float | None, name: str) -> float:
+    """The pixel value that is full scale; float images are read to their first bright row of tiles to know it.
+
+    Raises:
+        ImageError: pixels that leave it open.
+        OptionError: a full scale that such pixels cannot have.
+    """
+    largest = (source.raster.largest(source.read(row.keep_start, row.keep_stop)) for row in plan.rows)
+    return settled_scale(name, source.raster.dtype, largest, asked)
+
+
+def _job(image: Path, options: Options, plan: Plan, runtime: str, full_scale: float) -> dict[str, object]:
+    """All that decides the pixels, as the journal keeps it; who computes, on how many machines, is no part of it."""
+    return {
+        "image": [*fingerprint(image), image.stat().st_mtime_ns],
+        "model": sha256(options.model),
+        "tile_px": plan.tile_px,
+        "halo_px": plan.halo_px,
+        "full_scale": full_scale,
+        "runtime": runtime,
+    }
+
+
+def finish_rows(checkpoint: Checkpoint, plan: Plan, name: str, say: Say, restored: Rows) -> None:
+    """Restore the rows that a checkpoint lacks, and keep each in it while the next is made.
+
+    Raises:
+        ImageError: unreadable rows, values out of range, or no known pixel at all; the rows are thrown away.
+        MachineError: memory, disk, or workers; finished rows stay.
+        KeyboardInterrupt: stopped; finished rows stay.
+    """
+    rows = [row for row in plan.rows if row.keep_start >= checkpoint.rows]
+    tiles = len(rows) * plan.row_tiles
+    with _kept_for_resuming(checkpoint, say), steps("restoring", tiles) as bar, held_back() as interrupt:
+
+        def tick(done: int) -> None:
+            if done:
+                bar.advance(done)
+            if interrupt.asked:
+                raise KeyboardInterrupt
+
+        if rows:
+            with closing(restored(rows, tick)) as finished:
+                _write_behind(finished, checkpoint)
+        if not checkpoint.known:
+            got, remedy = "NaN or nodata everywhere", "check that it is the right file"
+            raise ImageError(name, expected="some pixels with values", got=got, remedy=remedy)
+
+
+@contextmanager
+def _kept_for_resuming(checkpoint: Checkpoint, say: Say) -> Iterator[None]:
+    """Finished rows outlive a stop and a full disk, not an image or a network that no later run could finish."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        say(f"stopped at row {checkpoint.rows} of {checkpoint.shape[1]}; the same command with --resume goes on")
+        raise
+    except BeersError as error:
+        if not checkpoint.rows or not isinstance(error, MachineError):
+            checkpoint.remove()
+        raise
+
+
+def _write_behind(restored: Iterable[RestoredRow], checkpoint: Checkpoint) -> None:
+    """Keep rows, each while the next is made; never more than one waits."""
+    with ThreadPoolExecutor(1) as writer:
+        writing: Future[None] | None = None
+        for row in restored:
+            if writing is not None:
+                writing.result()
+            writing = writer.submit(checkpoint.append, row)
+        if writing is not None:
+            writing.result()
+
+
+def _rows_here(
+    source: Source,
+    plan: Plan,
+    restorer: Restorer,
+    at_once: int,
+    budget_bytes: int | None,
+    say: Say,
+    rows: Sequence[Span],
+    tick: Tick,
+) -> Generator[RestoredRow, None, None]:
+    """Rows restored in this process, `at_once` tiles at a time; once the first tiles are done, memory is looked at.
+
+    Raises:
+        MachineError: the rows to come do not fit into memory.
+    """
+    tiles, steady = count(1), min(RUNS_UNTIL_STEADY * at_once, len(rows) * plan.row_tiles)
+
+    def done() -> None:
+        if next(tiles) == steady:
+            needed = rows_bytes(source, plan, begun=True)
+            most = check_memory(needed, budget_bytes, is_bulky(source, plan))
+            say(f"memory: {most / 1e9:.2f} GB at most (measured on the first tiles, and the rows to come)")
+        tick(1)
+
+    return restore_rows(source, plan, restorer, rows, done, at_once)
+
+
+# The figures of a run.
 
 
 def seam_figures(source: Source, plan: Plan, restorer: Restorer, fixed: bool) -> dict[str, Figure]:
@@ -48,12 +222,33 @@ def seam_figures(source: Source, plan: Plan, restorer: Restorer, fixed: bool) ->
     return {"seam error max": measured(largest, "DN", how), "seam error mean": measured(mean, "DN", how)}
 
 
-def worker_figures(peak_gb: float | None) -> dict[str, Figure]:
-    """The memory of the worker that took most."""
-    if peak_gb is None:
+def seam_error_dn(source: Source, plan: Plan, restorer: Restorer) -> tuple[float, float]:
+    """Largest and mean difference of a tile in the middle from the exact result, in digital numbers.
+
+    The same kept pixels are restored twice: from the tile's own window, and from one with the whole radius around.
+    """
+    rows, columns = plan.rows[len(plan.rows) // 2], plan.columns[len(plan.columns) // 2]
+    wide = [_widened(rows, plan.radius_px, plan.height_px), _widened(columns, plan.radius_px, plan.width_px)]
+    start, stop = min(rows.start, wide[0].start), max(rows.stop, wide[0].stop)
+    strip = restorer.read(source, start, stop)
+    cheap, _ = restorer.tile(strip, 0, rows, columns)
+    exact, _ = restorer.tile(strip, 0, *wide)
+    error = np.abs(np.nan_to_num(cheap.astype(np.float64)) - np.nan_to_num(exact.astype(np.float64)))
+    return float(error.max()), float(error.mean())
+
+
+def _widened(span: Span, radius_px: int, size_px: int) -> Span:
+    """The same kept pixels with the whole radius around them, as far as the image goes."""
+    start, stop = max(span.keep_start - radius_px, 0), min(span.keep_stop + radius_px, size_px)
+    return Span(start, stop, span.keep_start, span.keep_stop)
+
+
+def worker_figures(peaks_gb: Sequence[float]) -> dict[str, Figure]:
+    """The memory of the worker that took most, of what each told with every row."""
+    if not any(peaks_gb):
         return {"worker peak memory": unavailable("GB", "no row was left, or their system counts no peak memory")}
     how = "resident memory of the largest worker, highest since it began"
-    return {"worker peak memory": measured(peak_gb, "GB", how)}
+    return {"worker peak memory": measured(max(peaks_gb), "GB", how)}
 
 
 def run_row(
@@ -78,85 +273,5 @@ def run_row(
         **more,
     }
     workers = {"workers": options.scheduler or str(options.workers)} if options.is_spread else {}
-    return Row(
-        "restore",
-        name,
-        figures,
-        {"halo": _halo(plan), "full scale": f"{full_scale:g}", "runtime": runtime, **workers},
-    )
-
-
-def _halo(plan: Plan) -> str:
-    if plan.halo_px >= plan.radius_px:
-        return f"{plan.halo_px} px (exact)"
-    return f"{plan.halo_px} px (seams: exact is {plan.radius_px})"
-
-
-def restore_file(image: Path, out: Path, options: Options, say: Say) -> Row:
-    """Restore `image` into the TIFF `out`, and return the run's figures.
-
-    Raises:
-        ImageError: no such image, damaged, all missing, or values outside 0 to full scale; nothing is left behind.
-        ModelError: a network that cannot be tiled or run.
-        OptionError: options that do not go together, or `resume` after a run of another kind.
-        MachineError: another run on `out`; memory, disk, a package or lost workers: finished rows stay for `resume`.
-        KeyboardInterrupt: stopped; rows already finished stay for `resume`.
-    """
-    check_choice(options.workers, options.scheduler)
-    require_writable(out, inputs=(image, options.model))
-    if options.scheduler is None:
-        require_cores("--threads", options.threads)
-    require_tiff_name(out)
-    require_codec(options.compression)
-    with only_run(out, part_folder(out)):
-        return _restore(image, out, options, say)
-
-
-def _restore(image: Path, out: Path, options: Options, say: Say) -> Row:
-    started = time.perf_counter()
-    network = load_onnx(options.model)
-    with open_source(image) as source:
-        plan = plan_of(source.raster, network, options)
-        say(plan_sentence(plan))
-        if not options.is_spread:
-            check_memory(rows_bytes(source, plan), options.memory_bytes, is_bulky(source, plan))
-        full_scale = scale_of(source, plan, options.full_scale, str(image))
-        at_once = tiles_at_once(options.threads, plan.tiles)
-        infer, runtime = open_runtime(options.runtime, network, options.threads, at_once)
-        restorer = Restorer(source.raster, infer, full_scale, plan.radius_px, str(image))
-        figures = seam_figures(source, plan, restorer, fixed_tile_px(network) is not None)
-        job = make_job(image, options, plan, runtime, full_scale)
-        spool = Spool(out, source.raster.shape, source.raster.out_dtype, job, options.resume)
-        done = spool.rows
-        if options.is_spread:
-            work = make_work(image, plan, network, runtime, options, full_scale)
-            figures |= worker_figures(fill_spread(spool, source, work, say))
-        else:
-            fill_here(spool, source, plan, restorer, at_once, options.memory_bytes, say)
-    with held_back():  # a stop now would save nothing
-        write_output(spool, source.raster, options.compression)
-    return run_row(image.name, plan, done, time.perf_counter() - started, runtime, options, figures, full_scale)
-
-
-def plan_of(raster: Raster, network: onnx.ModelProto, options: Options) -> Plan:
-    """How the image is cut for the network.
-
-    Raises:
-        ModelError: a network that cannot be tiled.
-        OptionError: options that do not go together.
-    """
-    radius_px = receptive_radius_px(network)
-    check_fixed_tile(network, options.tile_px, raster.shape[1:])
-    halo_px, fixed = parse_halo(options.halo, radius_px), fixed_tile_px(network) is not None
-    return make_plan(raster.shape, options.tile_px, halo_px, radius_px, fixed)
-
-
-def scale_of(source: Source, plan: Plan, asked: float | None, name: str) -> float:
-    """The pixel value that is full scale; float images are read to their first bright row of tiles to know it.
-
-    Raises:
-        ImageError: pixels that leave it open.
-        OptionError: a full scale that such pixels cannot have.
-    """
-    largest = (source.raster.largest(source.read(row.keep_start, row.keep_stop)) for row in plan.rows)
-    return settled_scale(name, source.raster.dtype, largest, asked)
+    text = {"halo": plan.halo_words, "full scale": f"{full_scale:g}", "runtime": runtime, **workers}
+    return Row("restore", name, figures, text)

@@ -15,7 +15,6 @@ import onnx
 import onnxruntime as ort
 from onnx import helper, numpy_helper
 
-from deploy.restoration.arrays import Infer
 from deploy.restoration.options import Runtime
 from model.processor import asked, require_cores
 from profiles.errors import MachineError, ModelError
@@ -23,8 +22,10 @@ from quant.kernels import is_integer, made_exact
 from quant.onnx_file import parse_onnx
 from quant.session import open_session, run
 
-LOWEST = "openvino.lowest_uint8"
+Infer = Callable[[np.ndarray], np.ndarray]
+"""A network ready to run: (1, 1, h, w) float32 in [0, 1] to the same shape."""
 
+LOWEST = "openvino.lowest_uint8"
 
 Precision = Literal["f32", "bf16"]
 
@@ -168,13 +169,13 @@ class Packed:
 
 
 def pack(model: onnx.ModelProto, runtime: Runtime, threads: int) -> Packed:
-    """A network made ready to be sent."""
+    """A network with how it is to be run, as bytes that another process can open."""
     content = model.SerializeToString()
     return Packed(content, hashlib.sha256(content).hexdigest(), runtime, threads)
 
 
 def open_packed(packed: Packed) -> tuple[Infer, str]:
-    """As `open_runtime`, where it arrived.
+    """A network that arrived from another process, ready to run, and the runtime's name and version.
 
     Raises:
         ModelError: not as it was sent.

@@ -1,9 +1,10 @@
-"""An image file as bands of rows: what is known before its pixels are read, and only what is touched is decoded.
+"""An image as a source of rows: what is known before its pixels are read, and only what is touched is decoded.
 
-Size, type, nodata value and the tags that place it on Earth come first. Missing pixels are filled from what lies
-near before a network sees them, without any arithmetic.
+A `Raster` holds size, type, nodata value and the tags that place the image on Earth. A TIFF page is a stream of rows;
+whatever else, and arrays, lie in memory.
 """
 
+import hashlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -42,7 +43,7 @@ class Raster:
 
     @property
     def shape(self) -> tuple[int, int, int]:
-        """(bands, height, width)."""
+        """Bands, height and width, (bands, H, W) in pixels."""
         return self.bands, self.height_px, self.width_px
 
     @property
@@ -68,9 +69,13 @@ class Raster:
         """Whether any pixel could be missing at all."""
         return self.dtype.kind == "f" or self.nodata is not None
 
+    def fill_margin_px(self, radius_px: int) -> int:
+        """How far around a window pixels are read that missing ones of it may be filled from."""
+        return radius_px if self.may_miss else 0
+
 
 def page_raster(path: str, page: tifffile.TiffPage) -> Raster:
-    """The raster of a TIFF page.
+    """What a TIFF page says of its image, before any pixel is read.
 
     Raises:
         ImageError: too large to be planned, pixels that are no real numbers, or a nodata value that the output could
@@ -136,10 +141,12 @@ def usable_nodata(path: str, value: float | None, dtype: np.dtype[Any]) -> float
 
 
 BIG_TIFF_SUFFIXES = {".btf", ".tf8"}
+DIGEST_BYTES = 1 << 16
+"""Of each end of a file."""
 
 
 class Source(Protocol):
-    """An image that gives rows."""
+    """An image that gives its rows: a `raster` of facts, and pixels as they are asked for."""
 
     raster: Raster
 
@@ -148,6 +155,16 @@ class Source(Protocol):
 
     def held_bytes(self, rows_px: int) -> int:
         """Memory that reading so many rows at a time takes, besides the rows themselves."""
+
+
+def fingerprint(image: Path) -> tuple[int, str]:
+    """A file's size in bytes, and the SHA-256 of its two ends: quick, however large it is."""
+    size_bytes = image.stat().st_size
+    with image.open("rb") as stream:
+        ends = stream.read(DIGEST_BYTES)
+        stream.seek(max(size_bytes - DIGEST_BYTES, 0))
+        ends += stream.read(DIGEST_BYTES)
+    return size_bytes, hashlib.sha256(ends).hexdigest()
 
 
 @contextmanager
@@ -184,13 +201,13 @@ def whole_source(path: Path) -> "ArraySource":
 
 
 class ArraySource:
-    """An image in memory, (bands, height, width)."""
+    """An image in memory: `pixels` (bands, height, width), of which rows are views."""
 
     def __init__(self, pixels: np.ndarray, raster: Raster) -> None:
         self._pixels, self.raster = pixels, raster
 
     def read(self, start: int, stop: int) -> np.ndarray:
-        """See Source."""
+        """Rows `start` to `stop` (excluded) of every band, (bands, rows, width), not copied."""
         return self._pixels[:, start:stop]
 
     def held_bytes(self, rows_px: int) -> int:  # noqa: ARG002
@@ -208,11 +225,16 @@ class TiffSource:
         self._segment_px = min(page.tilelength if page.is_tiled else page.rowsperstrip, height_px)
         self._down = -(-height_px // self._segment_px)
         self._across = -(-width_px // page.tilewidth) if page.is_tiled else 1
-        self._held: dict[int, np.ndarray] = {}
+        self._held: dict[int, np.ndarray] = {}  # strips of rows overlap: segments are decoded once
+        # Uncompressed and in one piece, rows lie in the file as they are: no more than those is read.
         self._flat = page.compression == 1 and page.is_contiguous and page.bitspersample in (8, 16, 32, 64)
 
     def read(self, start: int, stop: int) -> np.ndarray:
-        """See Source."""
+        """Rows `start` to `stop` (excluded) of every band, (bands, rows, width), as stored.
+
+        Raises:
+            ImageError: damaged.
+        """
         with damage_in_a_sentence(self._path, f"rows {start} to {stop - 1}"):
             return self._read_flat(start, stop) if self._flat else self._read_segments(start, stop)
 
@@ -261,26 +283,3 @@ class TiffSource:
             target = block[plane, :, :rows, left : left + columns]
             target[:] = page.nodata if pixels is None else np.moveaxis(pixels[0, :rows, :columns], 2, 0)
         return block.reshape(raster.bands, self._segment_px, raster.width_px)
-
-
-def fill_missing(pixels: np.ndarray, missing: np.ndarray, reach_px: int) -> np.ndarray:
-    """(h, w) pixels where each `missing` one is a copy of a known one at most `reach_px` rows and columns away.
-
-    The nearest known pixel of the row, then the nearest filled one of the column; 0 where there is none in reach. So
-    a filled pixel depends on nothing farther away, and a window gives just what the whole image gives.
-    """
-    filled, missing = _along_rows(pixels, missing, reach_px)
-    filled, missing = _along_rows(filled.T, missing.T, reach_px)
-    return np.asarray(np.where(missing, 0, filled).T)
-
-
-def _along_rows(pixels: np.ndarray, missing: np.ndarray, reach_px: int) -> tuple[np.ndarray, np.ndarray]:
-    """Filled pixels, and where none was in reach; of two at the same distance the left one is taken."""
-    width = pixels.shape[1]
-    far = width + reach_px + 1
-    here = np.arange(width)
-    left = np.maximum.accumulate(np.where(missing, -far, here), axis=1)
-    right = np.minimum.accumulate(np.where(missing, 2 * far, here)[:, ::-1], axis=1)[:, ::-1]
-    nearest = np.where(here - left <= right - here, left, right)
-    out_of_reach = np.abs(nearest - here) > reach_px
-    return np.take_along_axis(pixels, np.where(out_of_reach, here, nearest), axis=1), out_of_reach

@@ -15,11 +15,18 @@ import torch
 from torch import Tensor
 
 from deploy.bench.host_state import peak_memory
-from deploy.restoration.engine import as_stored, checked_band
-from deploy.restoration.options import Compression, fingerprint
-from deploy.restoration.output import Spool, only_run, part_folder, require_codec, require_tiff_name, write_output
+from deploy.restoration.engine import RestoredRow, as_stored, checked_strip
+from deploy.restoration.options import Compression
+from deploy.restoration.output import (
+    Checkpoint,
+    only_run,
+    part_folder,
+    require_codec,
+    require_tiff_name,
+    write_output,
+)
 from deploy.restoration.plan import Span, check_memory
-from deploy.restoration.source import Raster, Source, open_source
+from deploy.restoration.source import Raster, Source, fingerprint, open_source
 from model.io.files import require_writable
 from model.io.images import settled_scale
 from model.progress import steps
@@ -38,7 +45,7 @@ Measured at 400 and 1200 columns: 75 MB and 30 kB."""
 
 @dataclass(frozen=True)
 class Request:
-    """What a user can choose.
+    """What a user can choose of a restoration by the traditional chain.
 
     Attributes:
         sensor: the one that acquired the image, of which the middle of every range is taken.
@@ -87,17 +94,17 @@ def _restore(image: Path, out: Path, request: Request) -> Row:
         max_dn = chain.degraded.max_dn
         full_scale = settled_scale(str(image), raster.dtype, largest, request.full_scale, max_dn)
         job = {"image": list(fingerprint(image)), "method": "traditional"}
-        spool = Spool(out, raster.shape, raster.out_dtype, job, resume=False)
+        checkpoint = Checkpoint(out, raster.shape, raster.out_dtype, job, resume=False)
         try:
-            _fill(spool, source, chain, full_scale, str(image))
-            write_output(spool, raster, request.compression)
+            _fill(checkpoint, source, chain, full_scale, str(image))
+            write_output(checkpoint, raster, request.compression)
         except BaseException:  # a strip is no place to go on from: the chain looks hundreds of rows back
-            spool.remove()
+            checkpoint.remove()
             raise
     return _row(image.name, raster, time.perf_counter() - started, request, full_scale)
 
 
-def _fill(spool: Spool, source: Source, chain: Chain, full_scale: float, name: str) -> None:
+def _fill(checkpoint: Checkpoint, source: Source, chain: Chain, full_scale: float, name: str) -> None:
     """Restore every row.
 
     Raises:
@@ -111,10 +118,10 @@ def _fill(spool: Spool, source: Source, chain: Chain, full_scale: float, name: s
             kept = as_stored(raster, np.nan_to_num(strip.numpy()[None] / np.float32(to_dn)), full_scale)
             if missing.any():
                 kept = np.where(missing, source.read(top, stop).astype(raster.out_dtype), kept)
-            spool.append(Span(top, stop, top, stop), kept, int((~missing).sum()))
+            checkpoint.append(RestoredRow(Span(top, stop, top, stop), kept, int((~missing).sum())))
             bar.advance(stop - top)
             top = stop
-    if not spool.known:
+    if not checkpoint.known:
         got, remedy = "NaN or nodata everywhere", "check that it is the right file"
         raise ImageError(name, expected="some pixels with values", got=got, remedy=remedy)
 
@@ -122,10 +129,10 @@ def _fill(spool: Spool, source: Source, chain: Chain, full_scale: float, name: s
 def _read(source: Source, to_dn: float, full_scale: float, name: str) -> Iterator[Tensor]:
     """Strips (rows, width) float32 of digital numbers, NaN where they are missing."""
     for start, stop in _strips(source.raster.height_px):
-        band = checked_band(source.raster, start, source.read(start, stop), full_scale, name)
-        dn = band.pixels[0].astype(np.float32) * np.float32(to_dn)
-        if band.missing is not None:
-            dn[band.missing[0]] = np.nan
+        strip = checked_strip(source.raster, start, source.read(start, stop), full_scale, name)
+        dn = strip.pixels[0].astype(np.float32) * np.float32(to_dn)
+        if strip.missing is not None:
+            dn[strip.missing[0]] = np.nan
         yield torch.from_numpy(dn)
 
 

@@ -1,28 +1,27 @@
-"""Rows of tiles restored by the workers of a cluster: the same plan, the same bytes as here.
+"""Rows of tiles restored by the workers of a Dask cluster: the same plan, the same bytes as in one process.
 
-Image and network stay open between rows, in each process.
+The run's process plans and writes; `Work` is sent to each worker once, which keeps image and network open between
+rows. `rows_of_workers` yields their rows in order.
 """
 
 import os
 import uuid
 import weakref
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections.abc import Generator, Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from threading import Lock
 
-import numpy as np
 import onnx
 
 from deploy.bench.host_state import peak_memory
 from deploy.cluster import PIECES_PER_SLOT, here, open_cluster, slots_here, unreachable
-from deploy.restoration.engine import Restored, Restorer, Say, Tick, filling, restore_row, rows_left, write_behind
-from deploy.restoration.options import Options, fingerprint
-from deploy.restoration.output import Spool
+from deploy.restoration.engine import RestoredRow, Restorer, Say, Tick, restore_row
+from deploy.restoration.options import Options
 from deploy.restoration.plan import Plan, Span, check_memory, is_bulky, restored_bytes, rows_bytes
 from deploy.restoration.runtime import Packed, open_packed, pack
-from deploy.restoration.source import Source, open_source
+from deploy.restoration.source import Source, fingerprint, open_source
 from profiles.errors import MachineError
 
 JOBS_KEPT = 2
@@ -54,10 +53,15 @@ class Work:
 
 @dataclass(frozen=True)
 class Piece:
-    """A restored row of tiles, (bands, rows, width), and the most memory that its worker will take and took."""
+    """A restored row of tiles, and its worker's memory.
 
-    pixels: np.ndarray
-    known: int
+    Attributes:
+        row: of tiles.
+        most_bytes: what the worker will take at most.
+        peak_gb: what it took; None where its system does not count it.
+    """
+
+    row: RestoredRow
     most_bytes: int
     peak_gb: float | None
 
@@ -82,13 +86,19 @@ class Opened:
         self.restorer = Restorer(self.source.raster, infer, scale, radius_px, str(work.image))
 
     def restore(self, row: Span) -> Piece:
-        """Restore one row of tiles."""
+        """Restore one row of tiles.
+
+        Raises:
+            ImageError: unreadable rows, values outside 0 to full scale, or a network that gives NaN.
+            MachineError: memory.
+            StoppedError: the run is over.
+        """
         with self.reading:
-            band = self.restorer.read(self.source, row.start, row.stop)
-        pixels, known = restore_row(band, row, self.work.plan, self.restorer, self._tick)
+            strip = self.restorer.read(self.source, row.start, row.stop)
+        restored = restore_row(strip, row, self.work.plan, self.restorer, self._tick)
         if not self.most_bytes:
             self.most_bytes = self._check_memory(begun=True)
-        return Piece(pixels, known, self.most_bytes, peak_memory().value)
+        return Piece(restored, self.most_bytes, peak_memory().value)
 
     def _tick(self) -> None:
         if self.stopped:
@@ -105,7 +115,7 @@ _opening = Lock()
 
 
 def restore_piece(work: Work, row: Span) -> Piece:
-    """One row of tiles.
+    """Restore one row of tiles in a worker.
 
     Raises:
         ImageError: the image cannot be read here, is another one, or has values outside 0 to full scale.
@@ -158,33 +168,23 @@ def make_work(
     return Work(uuid.uuid4().hex, image.absolute(), fingerprint(image), plan, options, packed, runtime, full_scale)
 
 
-def fill_spread(spool: Spool, source: Source, work: Work, say: Say) -> float | None:
-    """Finish the spool's rows by workers; returns the peak memory of the largest one in GB.
+def rows_of_workers(
+    work: Work, source: Source, say: Say, peaks_gb: list[float], rows: Sequence[Span], tick: Tick
+) -> Generator[RestoredRow, None, None]:
+    """Rows restored by workers, in order, several under way at a time.
+
+    Args:
+        work: of the run.
+        source: the image, as it is here.
+        say: told the memory, once the first row is done.
+        peaks_gb: gets each row's worker's peak memory; 0 where its system does not count it.
+        rows: of tiles.
+        tick: told how many tiles are done, and called while waiting; may raise.
 
     Raises:
-        ImageError: as here, or an image that a worker cannot read; the rows are thrown away.
-        MachineError: memory, disk, Dask or its workers; finished rows stay.
-        KeyboardInterrupt: stopped; finished rows stay.
+        ImageError: as here, or an image that a worker cannot read.
+        MachineError: memory, Dask or its workers.
     """
-    peaks_gb: list[float] = []
-
-    def told(piece: Piece) -> None:
-        if not peaks_gb:
-            most = f"{piece.most_bytes / 1e9:.2f} GB at most in each worker"
-            say(f"memory: {most} (measured on a first row, and the rows to come)")
-        peaks_gb.append(piece.peak_gb or 0)
-
-    with filling(spool, work.plan, str(work.image), say) as tick:
-        if rows := rows_left(spool, work.plan):
-            with closing(spread_rows(work, source, rows, tick, told)) as restored:
-                write_behind(restored, spool.append)
-    return max(peaks_gb, default=0) or None
-
-
-def spread_rows(
-    work: Work, source: Source, rows: Sequence[Span], tick: Tick, told: Callable[[Piece], None]
-) -> Generator[Restored, None, None]:
-    """Restore rows of tiles in order, several under way at a time; `told` is handed each before it is yielded."""
     options, plan = work.options, work.plan
     with open_cluster(options.workers, options.scheduler) as workers:
         waiting = (PIECES_PER_SLOT * workers.slots + ROWS_HERE) * restored_bytes(source, plan)
@@ -192,9 +192,12 @@ def spread_rows(
         pieces = workers.in_order(restore_piece, workers.share(work), rows, lambda: tick(0))
         try:
             with closing(pieces):
-                for row, piece in zip(rows, pieces, strict=True):
-                    told(piece)
-                    yield row, piece.pixels, piece.known
-                    tick(len(plan.columns) * plan.bands)
+                for piece in pieces:
+                    if not peaks_gb:
+                        most = f"{piece.most_bytes / 1e9:.2f} GB at most in each worker"
+                        say(f"memory: {most} (measured on a first row, and the rows to come)")
+                    peaks_gb.append(piece.peak_gb or 0)
+                    yield piece.row
+                    tick(plan.row_tiles)
         finally:
             workers.everywhere(forget, work.key)

@@ -14,9 +14,9 @@ from torch import Tensor
 from torch.nn.functional import conv2d
 
 from deploy.export import float_model
-from deploy.restoration.arrays import Infer
 from deploy.restoration.engine import restore_floats
 from deploy.restoration.plan import make_plan
+from deploy.restoration.runtime import Infer
 from deploy.stress.cases import FULL_DN
 from model.shipped import float_file, int8_file, shipped_pair
 from profiles.errors import BeersError
@@ -34,7 +34,7 @@ WHOLE_PX = 4096
 
 @dataclass(frozen=True)
 class Network:
-    """One file: how it runs, and how far it sees."""
+    """A network's file: how it runs, and how far it sees."""
 
     model: onnx.ModelProto
 
@@ -44,13 +44,17 @@ class Network:
         return receptive_radius_px(self.model)
 
     def infer(self, threads: int = 1) -> Infer:
-        """The network on so many threads."""
+        """The network ready to run on so many threads, opened once for each number of them."""
         if threads not in self._opened:
             self._opened[threads] = open_session(any_size(self.model), threads)
         return partial(run, self._opened[threads])
 
     def restore(self, image: np.ndarray, threads: int = 1, tile_px: int = WHOLE_PX) -> np.ndarray:
-        """As the product restores digital numbers (H, W): tiled, missing pixels kept, clipped, not rounded."""
+        """As `restore` restores digital numbers (H, W) float: tiled, missing pixels kept, clipped, not rounded.
+
+        Raises:
+            ImageError: numbers outside 0 to full scale, or a network that gives NaN.
+        """
         return restore(self.infer(threads), image, self.radius_px, tile_px)
 
     @cached_property
@@ -60,7 +64,7 @@ class Network:
 
 @dataclass(frozen=True)
 class Subject:
-    """A pair of networks.
+    """The pair of networks under test.
 
     Attributes:
         float32: the float one.
@@ -104,7 +108,11 @@ def open_subject(float_path: Path | None, int8_path: Path | None, variant: str) 
 
 
 def restore(infer: Infer, image: np.ndarray, radius_px: int, tile_px: int = WHOLE_PX) -> np.ndarray:
-    """The product's own way from digital numbers (H, W) to restored ones, float32, not rounded."""
+    """The command's own way from digital numbers (H, W) to restored ones, float32, not rounded, with exact seams.
+
+    Raises:
+        ImageError: numbers outside 0 to full scale, or a network that gives NaN.
+    """
     return restore_floats(image, infer, make_plan((1, *image.shape), tile_px, radius_px, radius_px), FULL_DN)
 
 

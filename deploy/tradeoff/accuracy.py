@@ -11,9 +11,9 @@ from typing import Any, Self
 import numpy as np
 
 from deploy.bench.tables import Swath
-from deploy.restoration.arrays import Infer
 from deploy.restoration.engine import restore_dn
 from deploy.restoration.plan import Plan, Span, plan_side
+from deploy.restoration.runtime import Infer
 from deploy.tradeoff.cache import code_digest, pixels_digest
 from model.evaluation.methods import Method, Restore
 from model.evaluation.pairs import NamedPair

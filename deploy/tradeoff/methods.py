@@ -15,11 +15,10 @@ import onnx
 
 from deploy.export import float_model
 from deploy.methods import knowledge_of, method_named
-from deploy.restoration.arrays import Infer
 from deploy.restoration.engine import restore_dn
 from deploy.restoration.options import TILE_PX, Runtime
 from deploy.restoration.plan import make_plan
-from deploy.restoration.runtime import open_openvino, open_runtime
+from deploy.restoration.runtime import Infer, open_openvino, open_runtime
 from deploy.tradeoff.cache import Cache, code_digest, digest_of
 from deploy.tradeoff.points import LEGAL, Variant
 from model.convbeers import VARIANTS

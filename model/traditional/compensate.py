@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from model.simulator.mtf import NYQUIST, Axes, mtf
-from model.traditional.rows import Rows, fill_missing, map_tiles, mirrored
+from model.traditional.rows import Rows, fill_with_local_means, map_tiles, mirrored
 from profiles.errors import OptionError
 
 EPSILON_PER_PERCENT = 3.3e-3
@@ -65,7 +65,7 @@ def _block(rows: Tensor, kernel: Tensor, left: int) -> Tensor:
     # Filtered without its mean, which has gain 1: in float32 the FFT of large constant values costs digits.
     mean = block[known].mean() if bool(known.any()) else block.new_zeros(())
     size = tuple(_fast_length(side) for side in block.shape)
-    spectrum = torch.fft.rfft2(fill_missing(block, known) - mean, s=size)
+    spectrum = torch.fft.rfft2(fill_with_local_means(block, known) - mean, s=size)
     filtered: Tensor = torch.fft.irfft2(spectrum * torch.fft.rfft2(kernel, s=size).to(spectrum), s=size)
     inside = slice(2 * radius, block.shape[0]), slice(2 * radius, block.shape[1])
     core = slice(radius, -radius), slice(radius, -radius)

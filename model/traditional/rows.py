@@ -71,7 +71,7 @@ def _one_thread_per_operation() -> Iterator[int]:
         torch.set_num_threads(threads)
 
 
-def fill_missing(image: Tensor, known: Tensor) -> Tensor:
+def fill_with_local_means(image: Tensor, known: Tensor) -> Tensor:
     """Fill the pixels of (H, W) that are not `known` with the mean of the nearest known ones around.
 
     A pyramid: each level takes its missing pixels from the next, of half the resolution. 0 where nothing is known.
@@ -83,7 +83,7 @@ def fill_missing(image: Tensor, known: Tensor) -> Tensor:
     odd = (0, image.shape[1] % 2, 0, image.shape[0] % 2)
     count = _sum_2x2(pad(known.to(image.dtype), odd))
     mean = _sum_2x2(pad(filled, odd)) / count.clamp(min=1)
-    coarse = fill_missing(mean, count > 0).repeat_interleave(2, 0).repeat_interleave(2, 1)
+    coarse = fill_with_local_means(mean, count > 0).repeat_interleave(2, 0).repeat_interleave(2, 1)
     return filled.where(known, coarse[: image.shape[0], : image.shape[1]])
 
 

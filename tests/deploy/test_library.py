@@ -8,30 +8,17 @@ from typing import Any
 import numpy as np
 import pytest
 import tifffile
-import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from deploy.cluster import local_cluster
-from deploy.export import to_onnx
 from deploy.library import restore
 from deploy.restoration.options import Options
 from deploy.restoration.run import restore_file
-from model.convbeers import ConvBEERS, Variant, initialise
 from model.shipped import default_int8
 from profiles.errors import ImageError, ModelError, OptionError
-from quant.onnx_file import save_onnx
 
 SHAPES = [(61, 83), (17, 130), (1, 40), (29, 29), (3, 5), (3, 41, 35), (1, 50, 20)]
-
-
-@pytest.fixture(scope="module")
-def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    network = ConvBEERS(Variant(blocks=1, features=8))
-    initialise(network, torch.Generator().manual_seed(0))
-    path = tmp_path_factory.mktemp("model") / "small.onnx"
-    save_onnx(to_onnx(network, {}), path)
-    return path
 
 
 @pytest.fixture(scope="module")

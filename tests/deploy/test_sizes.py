@@ -12,7 +12,8 @@ from typer.testing import CliRunner
 
 from deploy.cli import app
 from deploy.export import to_onnx
-from deploy.restoration.arrays import check_fixed_tile
+from deploy.restoration.options import Options
+from deploy.restoration.plan import plan_for
 from model.io.weights import load_network
 from model.metrics.edges import find_edge
 from model.metrics.refusal import Refusal
@@ -35,7 +36,7 @@ def plan_of_restore(folder: Path) -> str:
 
 def fixed_tile(_: Path) -> str:
     model = to_onnx(load_network(default_float_weights())[0], {}, 64)
-    return said(lambda: check_fixed_tile(model, 64, IMAGE.shape))
+    return said(lambda: plan_for(model, (1, ROWS, COLUMNS), Options(Path(), 64)))
 
 
 def stored_pairs(folder: Path) -> str:

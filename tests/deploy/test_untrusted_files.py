@@ -16,7 +16,7 @@ from deploy.cli import app
 from deploy.dpu.board import load_dpu
 from deploy.dpu.cost.validation import refit
 from deploy.gate import PATCHES, baseline_mae
-from deploy.restoration.output import Spool, part_folder
+from deploy.restoration.output import Checkpoint, part_folder
 from deploy.results import Document
 from deploy.tradeoff.cache import Cache, digest_of
 from deploy.tradeoff.host_time import Times
@@ -196,9 +196,9 @@ def test_a_journal_that_counts_rows_that_are_not_there_is_refused(journal: objec
     path = part_folder(out) / "journal.json"
     path.write_text(json.dumps({**sound, **journal} if isinstance(journal, dict) else journal))
     with pytest.raises(OptionError, match="--resume"):
-        Spool(out, SHAPE, np.dtype(np.uint16), JOB, resume=True)
+        Checkpoint(out, SHAPE, np.dtype(np.uint16), JOB, resume=True)
     path.write_text(json.dumps(sound))
-    assert Spool(out, SHAPE, np.dtype(np.uint16), JOB, resume=True).rows == 4
+    assert Checkpoint(out, SHAPE, np.dtype(np.uint16), JOB, resume=True).rows == 4
 
 
 @pytest.mark.parametrize("line", ["", "{}", "[]", "3", "[" * 5000, '{"degraded": {"rejected_snr_pairs": "x"}}'])

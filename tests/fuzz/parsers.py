@@ -23,7 +23,7 @@ from deploy.dpu.cost.validation import refit
 from deploy.dpu.graph import Network
 from deploy.dpu.reading import read_network
 from deploy.gate import PATCHES, baseline_mae
-from deploy.restoration.output import Spool, part_folder
+from deploy.restoration.output import Checkpoint, part_folder
 from deploy.restoration.source import open_source
 from deploy.results import Document, by_row, cell
 from deploy.tradeoff.accuracy import Scores
@@ -228,7 +228,7 @@ def resume(path: Path) -> None:
         out = Path(name) / "out.tif"
         part_folder(out).mkdir()
         shutil.copy(path, part_folder(out) / "journal.json")
-        assert 0 <= Spool(out, SHAPE, np.dtype(np.uint16), JOB, resume=True).rows <= SHAPE[1]
+        assert 0 <= Checkpoint(out, SHAPE, np.dtype(np.uint16), JOB, resume=True).rows <= SHAPE[1]
 
 
 def log_lines(path: Path) -> None:

@@ -9,10 +9,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from deploy.restoration.arrays import Infer
 from deploy.restoration.engine import Restorer, restore_rows
 from deploy.restoration.plan import Plan, make_plan
-from deploy.restoration.runtime import AT_ONCE, session_threads, tiles_at_once
+from deploy.restoration.runtime import AT_ONCE, Infer, session_threads, tiles_at_once
 from deploy.restoration.source import ArraySource, Raster
 from profiles.errors import ImageError
 
@@ -54,10 +53,12 @@ def test_as_many_tiles_are_in_work_as_were_asked_for() -> None:
 
 
 def test_after_an_error_no_further_tile_is_begun() -> None:
-    calls: list[int] = []
+    calls, going = [], threading.Event()
 
     def broken(image: np.ndarray) -> np.ndarray:
         calls.append(1)
+        if len(calls) > 2:  # a tile takes longer than the news of an error
+            going.wait(0.2)
         return np.full_like(image, np.nan)
 
     with pytest.raises(ImageError, match="finite pixels"):

@@ -1,30 +1,18 @@
 from functools import partial
+from pathlib import Path
 
 import numpy as np
-import onnx
 import pytest
-import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from deploy.export import to_onnx
 from deploy.restoration.engine import restore_dn
 from deploy.restoration.plan import even_side_px, make_plan, plan_side
-from model.convbeers import ConvBEERS, Variant, initialise
 from profiles.errors import OptionError
+from quant.onnx_file import load_onnx
 from quant.session import open_session, run
 
 RADIUS_PX = 5
-
-
-@pytest.fixture(scope="module")
-def model() -> onnx.ModelProto:
-    network = ConvBEERS(Variant(blocks=1, features=8))
-    initialise(network, torch.Generator().manual_seed(0))
-    with torch.no_grad():
-        for value in network.parameters():
-            value.mul_(2.0)
-    return to_onnx(network, {})
 
 
 @given(st.integers(1, 90), st.integers(1, 90), st.integers(13, 40), st.integers(0, 6))
@@ -59,15 +47,15 @@ def test_a_tile_without_room_between_its_halos_is_refused() -> None:
 
 
 @pytest.mark.parametrize(("height", "width"), [(61, 83), (17, 130), (1, 40), (40, 1), (29, 29)])
-def test_tiled_equals_whole_bit_for_bit(model: onnx.ModelProto, height: int, width: int) -> None:
-    infer = partial(run, open_session(model))
+def test_tiled_equals_whole_bit_for_bit(model: Path, height: int, width: int) -> None:
+    infer = partial(run, open_session(load_onnx(model)))
     dn = np.random.default_rng(1).integers(0, 4096, (height, width)).astype(np.float32)
     tiled, whole = (make_plan((1, height, width), tile_px, RADIUS_PX, RADIUS_PX) for tile_px in (23, 256))
     np.testing.assert_array_equal(restore_dn(dn, infer, tiled), restore_dn(dn, infer, whole))
 
 
-def test_a_smaller_halo_shows_seams(model: onnx.ModelProto) -> None:
-    infer = partial(run, open_session(model))
+def test_a_smaller_halo_shows_seams(model: Path) -> None:
+    infer = partial(run, open_session(load_onnx(model)))
     dn = np.random.default_rng(1).integers(0, 4096, (61, 83)).astype(np.float32)
     tiled, whole = make_plan((1, 61, 83), 23, RADIUS_PX - 3, RADIUS_PX), make_plan((1, 61, 83), 256, 0, RADIUS_PX)
     assert (restore_dn(dn, infer, tiled) != restore_dn(dn, infer, whole)).any()

@@ -16,28 +16,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 import tifffile
-import torch
 
-from deploy.export import to_onnx
 from deploy.restoration.engine import Restorer
 from deploy.restoration.options import Compression, Options
 from deploy.restoration.run import restore_file
-from model.convbeers import ConvBEERS, Variant, initialise
 from profiles.errors import MachineError, OptionError
-from quant.onnx_file import save_onnx
 
 KILLS = int(os.environ.get("BEERS_KILLS", "2"))
 ENTRY = "from deploy.cli import app; app()"
 TILE_PX = 64
-
-
-@pytest.fixture(scope="module")
-def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    network = ConvBEERS(Variant(blocks=1, features=8))
-    initialise(network, torch.Generator().manual_seed(0))
-    path = tmp_path_factory.mktemp("model") / "small.onnx"
-    save_onnx(to_onnx(network, {}), path)
-    return path
 
 
 @pytest.fixture
@@ -104,14 +91,14 @@ def test_ctrl_c_says_how_to_go_on(image: Path, model: Path, expected: bytes, tmp
 
 def stop_after(tiles: int, monkeypatch: pytest.MonkeyPatch, error: BaseException) -> Callable[[], None]:
     """Raise an error in the network after so many tiles; the result lets it pass again."""
-    count, kept = iter(range(10**6)), Restorer.kept
+    count, tile = iter(range(10**6)), Restorer.tile
 
     def stopping(self: Restorer, *rest: object) -> tuple[np.ndarray, int]:
         if next(count) == tiles:
             raise error
-        return kept(self, *rest)  # type: ignore[arg-type]
+        return tile(self, *rest)  # type: ignore[arg-type]
 
-    monkeypatch.setattr(Restorer, "kept", stopping)
+    monkeypatch.setattr(Restorer, "tile", stopping)
     return monkeypatch.undo
 
 

@@ -10,16 +10,12 @@ import onnx
 import psutil
 import pytest
 import tifffile
-import torch
 
-from deploy.export import to_onnx
 from deploy.restoration import run as swath
 from deploy.restoration import runtime
-from deploy.restoration.arrays import Infer, restore_window
+from deploy.restoration.engine import fill_from_nearest, restore_window
 from deploy.restoration.options import Compression, Options, Runtime
-from deploy.restoration.runtime import open_runtime
-from deploy.restoration.source import fill_missing
-from model.convbeers import ConvBEERS, Variant, initialise
+from deploy.restoration.runtime import Infer, open_runtime
 from model.shipped import default_int8
 from profiles.errors import BeersError, ImageError, MachineError, ModelError, OptionError
 from profiles.figures import Row
@@ -28,18 +24,6 @@ from quant.session import open_session, run
 
 RADIUS_PX = 5
 SHAPES = [(61, 83), (17, 130), (1, 40), (40, 1), (29, 29), (3, 5)]
-
-
-@pytest.fixture(scope="module")
-def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    network = ConvBEERS(Variant(blocks=1, features=8))
-    initialise(network, torch.Generator().manual_seed(0))
-    with torch.no_grad():
-        for value in network.parameters():
-            value.mul_(2.0)
-    path = tmp_path_factory.mktemp("model") / "small.onnx"
-    save_onnx(to_onnx(network, {}), path)
-    return path
 
 
 def noise(*shape: int, seed: int = 1) -> np.ndarray:
@@ -214,8 +198,8 @@ def test_missing_pixels_stay_and_spoil_nothing(kind: str, model: Path, tmp_path:
 def test_a_filled_pixel_is_the_nearest_known_one() -> None:
     pixels, missing = np.arange(12.0).reshape(2, 6), np.zeros((2, 6), bool)
     missing[0, 1:] = missing[1, :2] = True
-    np.testing.assert_array_equal(fill_missing(pixels, missing, 2), [[0, 0, 0, 9, 10, 11], [8, 8, 8, 9, 10, 11]])
-    assert fill_missing(pixels, np.ones((2, 6), bool), 2).max() == 0
+    np.testing.assert_array_equal(fill_from_nearest(pixels, missing, 2), [[0, 0, 0, 9, 10, 11], [8, 8, 8, 9, 10, 11]])
+    assert fill_from_nearest(pixels, np.ones((2, 6), bool), 2).max() == 0
 
 
 def refused(folder: Path, pixels: np.ndarray, options: Options, error: type[BeersError], *words: str) -> None:

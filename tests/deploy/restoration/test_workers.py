@@ -16,37 +16,25 @@ import numpy as np
 import psutil
 import pytest
 import tifffile
-import torch
 
 from deploy import cluster
 from deploy.cluster import check_choice, local_cluster, open_cluster
-from deploy.export import to_onnx
 from deploy.restoration.engine import Restorer
 from deploy.restoration.options import Options, Runtime
-from deploy.restoration.plan import Span
-from deploy.restoration.run import plan_of, restore_file
+from deploy.restoration.plan import Span, plan_for
+from deploy.restoration.run import restore_file
 from deploy.restoration.runtime import open_runtime
 from deploy.restoration.source import open_source
 from deploy.restoration.workers import Piece, Work, make_work, restore_piece
-from model.convbeers import ConvBEERS, Variant, initialise
 from model.shipped import default_int8
 from profiles.errors import ImageError, MachineError, ModelError, OptionError
-from quant.onnx_file import load_onnx, save_onnx
+from quant.onnx_file import load_onnx
 from quant.session import open_session, run
 
 pytest.importorskip("distributed", reason="the extra 'dask' is not installed")
 
 ENTRY = "from deploy.cli import app; app()"
 TILE_PX = 64
-
-
-@pytest.fixture(scope="module")
-def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    network = ConvBEERS(Variant(blocks=1, features=8))
-    initialise(network, torch.Generator().manual_seed(0))
-    path = tmp_path_factory.mktemp("model") / "small.onnx"
-    save_onnx(to_onnx(network, {}), path)
-    return path
 
 
 @pytest.fixture(scope="module")
@@ -132,14 +120,14 @@ def test_a_run_begun_here_is_finished_by_workers(
 ) -> None:
     options, out = Options(model, TILE_PX), tmp_path / "out.tif"
     restore_file(image, tmp_path / "expected.tif", options, silent)
-    count, kept = iter(range(10**6)), Restorer.kept
+    count, tile = iter(range(10**6)), Restorer.tile
 
     def stopping(self: Restorer, *rest: object) -> tuple[np.ndarray, int]:
         if next(count) == 40:
             raise KeyboardInterrupt
-        return kept(self, *rest)  # type: ignore[arg-type]
+        return tile(self, *rest)  # type: ignore[arg-type]
 
-    monkeypatch.setattr(Restorer, "kept", stopping)
+    monkeypatch.setattr(Restorer, "tile", stopping)
     with pytest.raises(KeyboardInterrupt):
         restore_file(image, out, options, silent)
     row = restore_file(image, out, replace(options, resume=True, scheduler=scheduler), silent)
@@ -169,7 +157,7 @@ def work(image: Path, model: Path) -> Work:
     network = load_onnx(model)
     options = Options(model, TILE_PX)
     with open_source(image) as source:
-        plan = plan_of(source.raster, network, options)
+        plan = plan_for(network, source.raster.shape, options)
     _, runtime = open_runtime(Runtime.onnxruntime, network, 1)
     return make_work(image, plan, network, runtime, options, 4095)
 

@@ -8,7 +8,7 @@ from model.simulator.mtf import transfer_function
 from model.simulator.sampling import sample, scene_spectrum
 from model.traditional import compensate as module
 from model.traditional.compensate import compensate, compensation_gain, compensation_kernel, filter_strips
-from model.traditional.rows import fill_missing, mirrored
+from model.traditional.rows import fill_with_local_means, mirrored
 from profiles.errors import OptionError
 
 EPSILON = 3e-3
@@ -99,10 +99,10 @@ def test_holes_are_filled_from_around() -> None:
     image = torch.arange(63.0)[None].expand(37, -1)
     known = torch.ones_like(image, dtype=torch.bool)
     known[5:20, 30:40] = False
-    filled = fill_missing(image, known)
+    filled = fill_with_local_means(image, known)
     assert torch.equal(filled[known], image[known])
     torch.testing.assert_close(filled, image, rtol=0, atol=10)
-    assert torch.equal(fill_missing(image, ~known & False), torch.zeros_like(image))
+    assert torch.equal(fill_with_local_means(image, ~known & False), torch.zeros_like(image))
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (3, 200), (61, 75)])

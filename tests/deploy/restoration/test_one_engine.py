@@ -1,0 +1,146 @@
+"""One engine: one image is restored to the same pixels, whichever command or function restores it."""
+
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import tifffile
+
+from deploy import demo, methods
+from deploy.library import restore
+from deploy.report.demo_page import INT8
+from deploy.restoration.engine import restore_dn, restore_floats
+from deploy.restoration.options import Options, Runtime
+from deploy.restoration.plan import plan_for
+from deploy.restoration.run import restore_file
+from deploy.restoration.runtime import open_runtime
+from deploy.stress.subject import Network
+from deploy.tradeoff import methods as tradeoff_methods
+from deploy.tradeoff import run as tradeoff
+from deploy.tradeoff.accuracy import cut_in_four
+from deploy.tradeoff.cache import Cache
+from deploy.tradeoff.methods import Calibration, Shelf, find_networks
+from deploy.tradeoff.points import Point, Unit
+from model.shipped import default_int8
+from profiles import load_sensor
+from quant.onnx_file import load_onnx, receptive_radius_px
+
+Restored = Callable[[np.ndarray], np.ndarray]
+
+SENSOR = load_sensor("pleiades-degraded")
+REFERENCE = load_sensor("pleiades-reference")
+ODD = 131, 97
+TILES_PX = {"float": 23, "int8": 64}
+SMALL_HALOS_PX = {"float": 2, "int8": 8}
+
+
+@pytest.fixture(params=TILES_PX)
+def precision(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
+    """Of the network; evaluate, demo and the trade-off's scores take tiles so small that the image has many."""
+    for module in (methods, tradeoff_methods):
+        monkeypatch.setattr(module, "TILE_PX", TILES_PX[request.param])
+    return str(request.param)
+
+
+@pytest.fixture
+def path(precision: str, model: Path) -> Path:
+    return model if precision == "float" else default_int8()
+
+
+def image() -> np.ndarray:
+    """Noise (H, W) uint16, black and full scale among it."""
+    return np.random.default_rng(2).integers(0, 4096, ODD).astype(np.uint16)
+
+
+def by_command(pixels: np.ndarray, folder: Path, options: Options) -> np.ndarray:
+    """As `restore` writes it."""
+    tifffile.imwrite(folder / "in.tif", pixels)
+    restore_file(folder / "in.tif", folder / "out.tif", options, lambda _: None)
+    return tifffile.imread(folder / "out.tif")
+
+
+def by_engine(dn: np.ndarray, options: Options) -> np.ndarray:
+    """As an array in memory."""
+    network = load_onnx(options.model)
+    infer, _ = open_runtime(Runtime.onnxruntime, network, threads=0)
+    return restore_dn(dn, infer, plan_for(network, (1, *ODD), options))
+
+
+def opened_by_tradeoff(path: Path, folder: Path) -> tuple[Shelf, Unit]:
+    """The network as a unit of a study."""
+    (network,) = find_networks([str(path)])
+    shelf = Shelf({network.name: network}, SENSOR, REFERENCE, Calibration(None, SENSOR.name, 0), Cache(folder))
+    return shelf, Unit(network.name, "network", "float32" if network.float_file else "INT8 legal")
+
+
+def crop_of_tradeoff(dn: np.ndarray, path: Path, tile_px: int, halo: str, folder: Path) -> np.ndarray:
+    """As a study shows an operating point."""
+    shelf, unit = opened_by_tradeoff(path, folder)
+    lab: Any = SimpleNamespace(shelf=shelf)
+    pair: Any = SimpleNamespace(degraded=dn)
+    point: Any = SimpleNamespace(point=Point(unit, tile_px, halo))
+    return tradeoff._restored(point, pair, lab)
+
+
+def exact_ways(path: Path, tile_px: int, folder: Path) -> dict[str, Restored]:
+    """Every way from digital numbers (H, W) float32 to whole restored ones whose seams are exact."""
+    network = load_onnx(path)
+    infer, _ = open_runtime(Runtime.onnxruntime, network, threads=0)
+    shelf, unit = opened_by_tradeoff(path, folder)
+    eyes: Any = SimpleNamespace(degraded=SENSOR, reference=REFERENCE)
+    return {
+        "evaluate": methods.method_named(str(path), SENSOR.nominal(), REFERENCE.nominal()).restore,
+        "demo": demo._methods(network, eyes)[INT8],
+        "tradeoff's scores": shelf.open(unit).restore,
+        "tradeoff's seams": cut_in_four(infer, receptive_radius_px(network)),
+        "tradeoff's crops": partial(crop_of_tradeoff, path=path, tile_px=tile_px, halo="exact", folder=folder),
+        "stress": lambda dn: np.rint(Network(network).restore(dn, tile_px=tile_px)),
+        "the array": partial(by_engine, options=Options(path, tile_px)),
+    }
+
+
+def test_with_exact_seams_every_command_gives_the_pixels_of_restore(
+    precision: str, path: Path, tmp_path: Path
+) -> None:
+    pixels, tile_px = image(), TILES_PX[precision]
+    expected = by_command(pixels, tmp_path, Options(path, tile_px))
+    assert (expected != pixels).mean() > 0.5
+    np.testing.assert_array_equal(restore(pixels, path, tile_px=tile_px), expected)
+    for name, way in exact_ways(path, tile_px, tmp_path).items():
+        np.testing.assert_array_equal(way(pixels.astype(np.float32)), expected, err_msg=name)
+
+
+def test_with_a_halo_below_the_radius_they_have_the_same_seams(precision: str, path: Path, tmp_path: Path) -> None:
+    pixels, tile_px, halo_px = image(), TILES_PX[precision], SMALL_HALOS_PX[precision]
+    options = Options(path, tile_px, str(halo_px))
+    expected = by_command(pixels, tmp_path, options)
+    assert (expected != by_command(pixels, tmp_path, Options(path, tile_px))).any()
+    dn = pixels.astype(np.float32)
+    np.testing.assert_array_equal(restore(pixels, path, tile_px=tile_px, halo=halo_px), expected)
+    np.testing.assert_array_equal(crop_of_tradeoff(dn, path, tile_px, str(halo_px), tmp_path), expected)
+    np.testing.assert_array_equal(by_engine(dn, options), expected)
+
+
+def test_floats_are_those_of_restore_unrounded(precision: str, path: Path, tmp_path: Path) -> None:
+    dn, tile_px = np.minimum(image() + np.float32(0.37), np.float32(4095)), TILES_PX[precision]
+    expected = by_command(dn, tmp_path, Options(path, tile_px))
+    assert (expected % 1 > 0).mean() > 0.5
+    np.testing.assert_array_equal(restore(dn, path, tile_px=tile_px), expected)
+    np.testing.assert_array_equal(Network(load_onnx(path)).restore(dn, tile_px=tile_px), expected)
+
+
+@pytest.mark.parametrize("bits", [8, 14])
+def test_a_sensor_of_other_bits_has_its_own_full_scale(bits: int, model: Path, tmp_path: Path) -> None:
+    max_dn = (1 << bits) - 1
+    dn = np.random.default_rng(3).integers(0, max_dn + 1, ODD).astype(np.uint16)
+    network = load_onnx(model)
+    expected = by_command(dn, tmp_path, Options(model, 23, full_scale=max_dn))
+    evaluated = methods.network_method(network, max_dn)(dn.astype(np.float32))
+    np.testing.assert_array_equal(evaluated, expected)
+    infer, _ = open_runtime(Runtime.onnxruntime, network, threads=0)
+    plan = plan_for(network, (1, *ODD), Options(model, 23))
+    assert np.abs(restore_floats(dn, infer, plan, max_dn) - evaluated).max() <= 0.5
