@@ -105,7 +105,7 @@ def _fractions(image: np.ndarray) -> np.ndarray:
 INT8_GAIN_DN = 128.0
 """A change of 1 DN can move a rounding in every layer, and a pixel from the fine gain to the coarse one."""
 ROUNDING_DN = 128.0
-"""What the DPU's rule for halves may change: one unit in any layer, carried on."""
+"""What the DPU's tie rounding (half up) may change: one unit in any layer, carried on."""
 CROP_PX = 48
 
 
@@ -137,7 +137,7 @@ def reference(subject: Subject, case: Case, image: np.ndarray) -> list[Measure]:
     return [
         not_finite(by_rule),
         differing("runtime differs", by_rule, by_runtime),
-        Measure("DPU's halves", FULL_DN * float(np.abs(on_board - by_rule).max()), ROUNDING_DN),
+        Measure("DPU's tie rounding", FULL_DN * float(np.abs(on_board - by_rule).max()), ROUNDING_DN),
         Measure("accumulator beyond its proof", over, 0, "bits"),
         _unproven(core, reports),
     ]

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from profiles.effects import Defects, Dsnu, Effect, FullWell, Offset, Prnu, Striping, Veil
+from profiles.effects import Defects, Dsnu, Effect, FullWell, Haze, Offset, Prnu, Striping
 from profiles.sensor import Sensor
 
 NOISE_LIMIT = 6.0
@@ -97,13 +97,13 @@ def add_defects(dn: Tensor, defects: Defects, max_dn: int, generator: np.random.
     return torch.where(draw >= 1 - hot, torch.full_like(dn, float(max_dn)), dn) if hot > 0 else dn
 
 
-def add_veil(radiance: Tensor, veil: Veil) -> Tensor:
+def add_haze(radiance: Tensor, haze: Haze) -> Tensor:
     """L' = transmittance * L + path radiance, in W/m2/sr/um.
 
     Limits: (1, 0) changes nothing; transmittance 0 leaves the path radiance alone. It is the same before and after
     the blur, whose gain at zero frequency is 1: so it is applied on the small target grid.
     """
-    return radiance * veil.transmittance + veil.path_radiance
+    return radiance * haze.transmittance + haze.path_radiance
 
 
 def digitise(radiance: Tensor, sensor: Sensor) -> Tensor:
@@ -180,8 +180,8 @@ def apply_effect(
 ) -> Tensor:
     """Apply one effect of the target grid; the generator is made only for those that draw."""
     match effect:
-        case Veil():
-            return add_veil(image, effect)
+        case Haze():
+            return add_haze(image, effect)
         case FullWell():
             return saturate(image, effect)
         case Prnu():
