@@ -113,7 +113,7 @@ Table = Mapping[str, Constant]
 
 
 def read_effect(where: str, name: str, raw: object) -> Table:
-    """Read one effect's table.
+    """Read one effect's table of a TOML file: every key of its dataclass and no other, each within its limits.
 
     Raises:
         ProfileError: a wrong or missing key, or a value that cannot be.

@@ -36,12 +36,12 @@ class SceneStats:
 
     @property
     def span(self) -> float:
-        """Largest less smallest radiance."""
+        """Largest less smallest radiance, in W/m2/sr/um."""
         return self.high - self.low
 
 
 def scene_stats(radiance: Tensor, oversampling: int) -> SceneStats:
-    """Statistics of a scene (H, W), one pass over it."""
+    """Statistics of a scene's radiance (H, W), in one pass over it."""
     low, high = (float(v) for v in torch.aminmax(radiance))
     step = max(float((radiance[1:] - radiance[:-1]).abs().max()), float((radiance[0] - radiance[-1]).abs().max()))
     height, width = radiance.shape
