@@ -17,7 +17,7 @@ from profiles.errors import ProfileError
 from profiles.toml import read_toml, shipped_names
 
 MTF_NYQUIST_MAX = 2 / math.pi
-"""A perfect lens over a square detector: sinc(0.5). Nothing above it is a blur (facts: gamma < 0)."""
+"""A perfect lens over a square detector: sinc(0.5). Nothing above it is a blur: its gamma would be negative."""
 
 MAX_DRAWS = 10_000
 

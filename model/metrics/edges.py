@@ -14,7 +14,7 @@ from torch import Tensor
 from model.metrics.refusal import Refusal
 
 WINDOW_PX = 10
-"""Half width of the Hamming window around the edge (facts, metrics (a))."""
+"""Half width of the Hamming window around the edge, in pixels."""
 
 PLATEAU_PX = 5
 """What must lie beyond the window on either side of every row."""

@@ -1,4 +1,4 @@
-"""SNR of an image at given radiances, from the homogeneous areas in it (facts, metrics (b)).
+"""SNR of an image at given radiances, from the homogeneous areas in it.
 
 1. Cut windows; fit a plane and slow waves to each. The waves' energy is structure, the rest's is noise.
 2. Keep windows whose waves hold no more than the noise would put there: no look at the noise estimate itself, so

@@ -15,7 +15,7 @@ from profiles.errors import ImageError
 from profiles.sensor import Sensor
 
 MARGIN_PX = 32
-"""Target pixels cropped on each side: the FFT wraps around, and the PSF's tail is long (facts: 10.8 DN at 32)."""
+"""Target pixels cropped on each side: the FFT wraps around, and the PSF's tail is long (10.8 DN at 32)."""
 
 
 @dataclass(frozen=True)
