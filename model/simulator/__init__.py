@@ -7,7 +7,7 @@
 
 from model.simulator.acquire import Pair, acquire, simulate_pair
 from model.simulator.detector import Draw, to_dn, to_radiance
-from model.simulator.mtf import mtf, sensor_transfer
+from model.simulator.mtf import sensor_transfer
 from model.simulator.plan import Plan, make_plan
 from model.simulator.procedural import procedural_scene
 from model.simulator.sampling import Scene, read_scene, resample
@@ -19,7 +19,6 @@ __all__ = [
     "Scene",
     "acquire",
     "make_plan",
-    "mtf",
     "procedural_scene",
     "read_scene",
     "resample",
