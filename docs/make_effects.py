@@ -44,8 +44,9 @@ Every sensor blurs, samples, adds noise and digitises. The nine further effects 
 scene has their table (`profiles/effects.py` holds their parameters, `profiles/effects.toml` typical values). In the
 picture they are stronger than typical, so that the eye can see them: {shown}.
 
-Order of the light: one transfer function for MTF, anti-alias filter and smear; sampling; then on the small grid veil,
-full well, PRNU, noise, gain, DSNU, striping, offset, defects, digitising (`model/simulator/detector.py`).
+Order of the light: one transfer function for MTF, anti-alias filter and smear; sampling; then on the small grid haze
+(the table `veil`), full well, PRNU, noise, gain, DSNU, striping, offset, defects, digitising
+(`model/simulator/detector.py`).
 
 The anti-alias filter is part of the MTF's budget: the product has the MTF that the profile states, or the profile is
 refused. Motion smear comes on top, along the track only.

@@ -89,7 +89,7 @@ def repository_copy() -> Iterator[Path]:
 
 
 def failures_of(copy: Path, mutation: Mutation, *selection: str) -> Failures:
-    """Break the copy, run its stability tests, mend it."""
+    """Break the copy, run its stability tests, put it right again."""
     file = copy / mutation.file
     sound = file.read_text(encoding="utf-8")
     file.write_text(broken(sound, mutation), encoding="utf-8")

@@ -90,7 +90,7 @@ def tell(sensor: Sensor) -> Told:
 
 
 def transposed(vector: Tensor) -> Tensor:
-    """The sensor vector (..., 4) of an image whose rows and columns have changed places."""
+    """The sensor vector (..., 4) of an image whose rows and columns have changed places: (..., 4)."""
     return vector[..., [1, 0, 2, 3]]
 
 
@@ -156,7 +156,7 @@ class ToldConvBEERS(nn.Module):
         return found
 
     def forward(self, image: Tensor, vectors: Tensor) -> Tensor:
-        """Each image through the weights for its own sensor."""
+        """Send each image (N, 1, H, W) through the weights for its own sensor, of vectors (N, 4): (N, 1, H, W)."""
         return each_through(self.base, "", self.weights(vectors), image)
 
 

@@ -33,7 +33,7 @@ VARIANTS = {
 
 
 def conv3x3(inputs: int, outputs: int) -> nn.Conv2d:
-    """A size-preserving convolution."""
+    """A 3 x 3 convolution, stride 1, padding 1: (N, inputs, H, W) to (N, outputs, H, W)."""
     return nn.Conv2d(inputs, outputs, kernel_size=3, padding=1)
 
 
@@ -46,7 +46,7 @@ class ResidualBlock(nn.Module):
         self.second = conv3x3(features, features)
 
     def forward(self, x: Tensor) -> Tensor:
-        """Shape kept."""
+        """Add the block's correction to x (N, F, H, W); the shape is kept."""
         correction: Tensor = self.second(torch.relu(self.first(x)))
         return x + correction
 

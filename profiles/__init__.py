@@ -1,7 +1,30 @@
-"""The facts: sensors and targets as short TOML files, and the frozen dataclasses that read and check them."""
+"""The facts: what an instrument, a scene or a board is, and what a reported figure is. It imports nothing of ours.
 
-from profiles.sensor import SensorProfile
+- `sensor`, `effects`, `scene_call`: instruments and scenes, short TOML files that `sensor_file` reads;
+- `target`: processing boards, in `targets/`;
+- `constant`, `toml`: how such a file is read and checked, each number with its status and source;
+- `figures`: numbers with unit, mode and source; `errors`: what bad input becomes.
+"""
+
+from profiles.errors import BeersError
+from profiles.figures import Figure, Row
+from profiles.scene_call import SceneCall, load_scene_call, scene_names
+from profiles.sensor import Sensor, SensorProfile
 from profiles.sensor_file import load_sensor, sensor_names
 from profiles.target import TargetProfile, load_target, target_names
 
-__all__ = ["SensorProfile", "TargetProfile", "load_sensor", "load_target", "sensor_names", "target_names"]
+__all__ = [
+    "BeersError",
+    "Figure",
+    "Row",
+    "SceneCall",
+    "Sensor",
+    "SensorProfile",
+    "TargetProfile",
+    "load_scene_call",
+    "load_sensor",
+    "load_target",
+    "scene_names",
+    "sensor_names",
+    "target_names",
+]

@@ -27,8 +27,8 @@ class Smear:
 
 
 @dataclass(frozen=True)
-class Veil:
-    """The atmosphere: transmittance (1 is clear) and path radiance in W/m2/sr/um (0 is none)."""
+class Haze:
+    """Haze, table `veil`: transmittance of the atmosphere (1 is clear), path radiance in W/m2/sr/um (0 is none)."""
 
     transmittance: float
     path_radiance: float
@@ -79,11 +79,11 @@ class Defects:
     hot_per_million: float
 
 
-Effect = AntiAlias | Smear | Veil | Prnu | Dsnu | Striping | FullWell | Offset | Defects
+Effect = AntiAlias | Smear | Haze | Prnu | Dsnu | Striping | FullWell | Offset | Defects
 
 TABLES: dict[str, type[Effect]] = {
     "antialias": AntiAlias,
-    "veil": Veil,
+    "veil": Haze,
     "smear": Smear,
     "full_well": FullWell,
     "prnu": Prnu,
@@ -113,7 +113,7 @@ Table = Mapping[str, Constant]
 
 
 def read_effect(where: str, name: str, raw: object) -> Table:
-    """Read one effect's table.
+    """Read one effect's table of a TOML file: every key of its dataclass and no other, each within its limits.
 
     Raises:
         ProfileError: a wrong or missing key, or a value that cannot be.

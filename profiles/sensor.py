@@ -15,7 +15,7 @@ from profiles.effects import Effect, Offset, Table, draw_effect, middle_effect
 from profiles.errors import ProfileError
 
 MTF_NYQUIST_MAX = 2 / math.pi
-"""A perfect lens over a square detector: sinc(0.5). Nothing above it is a blur (facts: gamma < 0)."""
+"""A perfect lens over a square detector: sinc(0.5). Nothing above it is a blur: its gamma would be negative."""
 
 MAX_DRAWS = 10_000
 

@@ -40,7 +40,7 @@ def read_toml_text(path: Path) -> dict[str, object]:
 
 
 def read_json(path: Path) -> object:
-    """A JSON file as plain values.
+    """Read a JSON file as plain values of Python.
 
     Raises:
         OSError: not readable.
@@ -50,7 +50,7 @@ def read_json(path: Path) -> object:
 
 
 def parse_json(text: str) -> object:
-    """JSON as plain values.
+    """Read JSON text as plain values of Python.
 
     Raises:
         ValueError: no JSON, nested too deeply, or holding what cannot be computed with or printed: NaN, infinity,
@@ -65,7 +65,7 @@ def parse_json(text: str) -> object:
 
 
 def read_whole(path: Path, limit_bytes: int) -> bytes:
-    """A file's bytes.
+    """Read all bytes of a regular file that has at most `limit_bytes`.
 
     Raises:
         OSError: not readable.

@@ -145,11 +145,11 @@ class Guards:
     checksums: Mapping[str, int]
 
     def clamp(self, name: str, tensor: np.ndarray) -> np.ndarray:
-        """A tensor as the clamped network writes it."""
+        """A tensor (N, C, H, W) as the clamped network writes it: int8 units, at most its ReLU6's bound."""
         return np.minimum(tensor, self.relu6[name]) if name in self.relu6 else tensor
 
     def limit(self, correction: np.ndarray) -> np.ndarray:
-        """A correction, of full scale, within its bound."""
+        """A correction, any shape, in shares of full scale, clipped to the bound on both sides."""
         bound = np.float32(self.limit_dn / MAX_DN)
         return np.asarray(np.clip(correction, -bound, bound), np.float32)
 

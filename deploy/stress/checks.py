@@ -34,29 +34,29 @@ class Measure:
 
 
 def not_finite(*images: np.ndarray) -> Measure:
-    """Pixels that are NaN or infinite."""
+    """How many pixels of images of any shape are NaN or infinite."""
     return Measure("not finite", float(sum((~np.isfinite(image)).sum() for image in images)), 0, "px")
 
 
 def out_of_range(image: np.ndarray) -> Measure:
-    """Known pixels outside 0 to 4095."""
+    """How many known pixels of an image (H, W) lie outside 0 to 4095 DN."""
     return Measure("out of range", float(((image < 0) | (image > FULL_DN)).sum()), 0, "px")
 
 
 def differing(check: str, image: np.ndarray, other: np.ndarray) -> Measure:
-    """Pixels that are not the same, bit for bit; two NaN are."""
+    """How many pixels of two images (H, W) are not the same, bit for bit; NaN is the same as NaN."""
     same = (image == other) | (np.isnan(image) & np.isnan(other))
     return Measure(check, float((~same).sum()), 0, "px")
 
 
 def mean_shift(image: np.ndarray, source: np.ndarray, allowed: float = FLAT_DN) -> Measure:
-    """By how much the mean moved."""
+    """By how much the mean of an image (H, W) moved from its source's, in DN."""
     shift = float(np.mean(image, dtype=np.float64) - np.mean(source, dtype=np.float64))
     return Measure("mean moved", abs(shift), allowed)
 
 
 def ringing(image: np.ndarray, source: np.ndarray, radius_px: int, allowed: float) -> Measure:
-    """How far pixels leave the range of the source's pixels within the radius, over the contrast there.
+    """How far pixels (H, W) leave the range of the source's pixels within the radius, over the contrast there.
 
     One per cent of full scale does not count, and contrast is ten per cent at least: flat ground has none.
     """
@@ -73,7 +73,7 @@ def local_range(image: np.ndarray, radius_px: int) -> tuple[np.ndarray, np.ndarr
 
 
 def gain(work: Work, source: np.ndarray, result: np.ndarray, generator: np.random.Generator) -> float:
-    """Largest change of any pixel, in DN, for a change of 1 DN: of one pixel, and of all by random signs."""
+    """Largest change of a pixel (H, W), in DN, for a change of 1 DN: of one pixel, and of all by random signs."""
     one = np.zeros(source.shape, np.float32)
     one[source.shape[0] // 2, source.shape[1] // 2] = 1
     signs = generator.choice(np.array([-1, 1], np.float32), source.shape)
@@ -81,7 +81,7 @@ def gain(work: Work, source: np.ndarray, result: np.ndarray, generator: np.rando
 
 
 def change(work: Work, source: np.ndarray, result: np.ndarray, nudge: np.ndarray) -> float:
-    """Largest change of any pixel, in DN, for one of 1 DN or none at each."""
+    """Largest change of any pixel (H, W), in DN, for a nudge (H, W) of -1, 0 or 1 DN."""
     return float(np.abs(work(_nudged(source, nudge)) - result).max())
 
 
@@ -92,7 +92,7 @@ def _nudged(source: np.ndarray, nudge: np.ndarray) -> np.ndarray:
 
 
 def refused(work: Callable[[], object]) -> Measure:
-    """Runs that went through where one sentence was due."""
+    """Count 1 where work went through for which one sentence was due, else 0."""
     try:
         work()
     except BeersError:
@@ -101,7 +101,7 @@ def refused(work: Callable[[], object]) -> Measure:
 
 
 def inside(image: np.ndarray, margin_px: int) -> np.ndarray:
-    """Without so many pixels on each side; the whole where nothing would be left."""
+    """An image (H, W) without so many pixels on each side; the whole where nothing would be left."""
     if min(image.shape) <= 2 * margin_px + 1:
         return image
     return image[margin_px : image.shape[0] - margin_px, margin_px : image.shape[1] - margin_px]
@@ -109,7 +109,7 @@ def inside(image: np.ndarray, margin_px: int) -> np.ndarray:
 
 @contextmanager
 def torch_threads(count: int) -> Iterator[None]:
-    """So many of torch's threads for a while."""
+    """Hold torch to so many threads for a while."""
     before = torch.get_num_threads()
     torch.set_num_threads(count)
     try:

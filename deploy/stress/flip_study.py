@@ -85,7 +85,7 @@ class FlipRequest:
 
 
 def flip_rows(subject: Subject, request: FlipRequest, tick: Callable[[], None] = lambda: None) -> list[Row]:
-    """Curves, places and prices.
+    """The rows of the whole study: quality against flips, where one flip hurts, what guards cost.
 
     Raises:
         ModelError: no INT8 file, or one whose whole numbers cannot be told.

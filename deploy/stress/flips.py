@@ -186,7 +186,7 @@ class Flip:
 
 
 def place_rows(target: FaultTarget, seed: int, side_px: int, tick: Callable[[], None] = lambda: None) -> list[Row]:
-    """A row a layer and a row a bit."""
+    """A row for each layer and one for each bit: how far a single flip there moves the image, in DN rms."""
     flips = list(single_flips(target, seed, side_px, tick))
     layers = [
         _place_row("bit flips by layer", op.name, [f for f in flips if f.layer == op.name]) for op in target.core.ops

@@ -16,38 +16,38 @@ Draw = Callable[[int, np.random.Generator], list[np.ndarray]]
 
 
 def flat(*levels: float) -> Draw:
-    """Constant images of these shares of full scale."""
+    """Constant images (side, side) of these shares of full scale."""
     return lambda side, _: [_filled(side, level * FULL_DN) for level in levels]
 
 
 def steps(side: int, _: np.random.Generator) -> list[np.ndarray]:
-    """Black to full scale: upright, lying, slanted."""
+    """Steps from black to full scale, upright, lying and slanted: three images (side, side)."""
     row, column = np.mgrid[:side, :side]
     return [_two(column >= side // 2), _two(row >= side // 2), _two(column + 0.2 * row >= 0.6 * side)]
 
 
 def checkerboard(side: int, _: np.random.Generator) -> list[np.ndarray]:
-    """Black and full scale in turn: Nyquist along both axes."""
+    """Black and full scale in turn, which is Nyquist along both axes: one image (side, side)."""
     row, column = np.mgrid[:side, :side]
     return [_two((row + column) % 2 == 1)]
 
 
 def hot_pixel(side: int, _: np.random.Generator) -> list[np.ndarray]:
-    """One pixel at full scale on a dark ground."""
+    """One pixel at full scale on a dark ground: one image (side, side)."""
     image = _filled(side, 200)
     image[side // 2, side // 2] = FULL_DN
     return [image]
 
 
 def dead_lines(side: int, generator: np.random.Generator) -> list[np.ndarray]:
-    """A column and a row at 0 in a drawn ground."""
+    """A column and a row at 0 in a drawn ground: one image (side, side)."""
     image = ground(side, generator)
     image[:, side // 3], image[side // 2] = 0, 0
     return [image]
 
 
 def glint(side: int, generator: np.random.Generator) -> list[np.ndarray]:
-    """Dark water with sparks beyond full scale, clipped."""
+    """Dark water with sparks beyond full scale, clipped: one image (side, side)."""
     image = 150 + 10 * generator.standard_normal((side, side))
     sparks = generator.random((side, side)) > 0.97
     image[sparks] += generator.exponential(6000, int(sparks.sum()))
@@ -55,7 +55,7 @@ def glint(side: int, generator: np.random.Generator) -> list[np.ndarray]:
 
 
 def snow(side: int, generator: np.random.Generator) -> list[np.ndarray]:
-    """99 % at full scale."""
+    """99 % of the pixels at full scale, the rest in shadow: one image (side, side)."""
     image = _filled(side, FULL_DN)
     shadow = generator.random((side, side)) < 0.01
     image[shadow] = generator.uniform(500, 3500, int(shadow.sum()))
@@ -63,30 +63,30 @@ def snow(side: int, generator: np.random.Generator) -> list[np.ndarray]:
 
 
 def night(side: int, generator: np.random.Generator) -> list[np.ndarray]:
-    """1 to 20 DN."""
+    """Whole numbers of 1 to 20 DN: one image (side, side)."""
     return [generator.integers(1, 21, (side, side)).astype(np.float32)]
 
 
 def ramps(side: int, _: np.random.Generator) -> list[np.ndarray]:
-    """12 bits from left to right, and every number once."""
+    """12 bits from left to right, (side, side), and every number once, (64, 64)."""
     across = np.tile(np.linspace(0, FULL_DN, side), (side, 1))
     return [_digital(across), np.arange(4096, dtype=np.float32).reshape(64, 64)]
 
 
 def star(side: int, _: np.random.Generator) -> list[np.ndarray]:
-    """A Siemens star of 36 spokes, its middle finer than the pixels."""
+    """A Siemens star of 36 spokes, its middle finer than the pixels: one image (side, side)."""
     row, column = np.mgrid[:side, :side] - (side - 1) / 2
     return [_two(np.sin(18 * np.arctan2(row, column)) > 0)]
 
 
 def noisy(side: int, generator: np.random.Generator) -> list[np.ndarray]:
-    """A drawn ground at a signal-to-noise ratio of 3."""
+    """A drawn ground at a signal-to-noise ratio of 3: one image (side, side)."""
     clean = ground(side, generator)
     return [_digital(clean * (1 + generator.standard_normal(clean.shape) / 3))]
 
 
 def clean(side: int, generator: np.random.Generator) -> list[np.ndarray]:
-    """A drawn ground without any noise."""
+    """A drawn ground without any noise: one image (side, side)."""
     return [ground(side, generator)]
 
 
@@ -96,7 +96,7 @@ def through(mtf_nyquist: float) -> Draw:
 
 
 def stripes(side: int, generator: np.random.Generator) -> list[np.ndarray]:
-    """Every seventh column and a row missing."""
+    """A drawn ground that lacks every seventh column and a row (NaN): one image (side, side)."""
     image = ground(side, generator)
     image[:, 3::7], image[side // 4] = np.nan, np.nan
     return [image]
@@ -124,13 +124,13 @@ def sized(*shapes: tuple[int, int]) -> Draw:
 
 
 def narrow(_: int, __: np.random.Generator) -> list[np.ndarray]:
-    """A row and a column of half of full scale."""
+    """A row (1, 97) and a column (97, 1) of half of full scale."""
     row = np.full((1, 97), FULL_DN // 2, np.float32)
     return [row, row.T.copy()]
 
 
 def ground(side: int, generator: np.random.Generator, mtf_nyquist: float = DRAWN_MTF) -> np.ndarray:
-    """Rectangles of all sizes and brightnesses, seen through an MTF: whole numbers of 0 to 4095, no noise."""
+    """Rectangles of all sizes and brightnesses, seen through an MTF: (side, side), whole numbers of 0 to 4095."""
     image = _filled(side, generator.uniform(800, 1600))
     for _ in range(40):
         top, left = generator.integers(0, side, 2)

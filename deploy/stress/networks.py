@@ -35,7 +35,7 @@ MORE_THREADS = 2
 
 
 def float32(subject: Subject, case: Case, image: np.ndarray) -> list[Measure]:
-    """In float32, against float64."""
+    """The float network in float32, against float64, on an image (H, W) in DN."""
     network = subject.float32
     measures = restoration(network, case, image, GAIN_DN)
     if case.pixels == "sound" and not case.large and not isinstance(subject.graph, BeersError):
@@ -47,7 +47,7 @@ def float32(subject: Subject, case: Case, image: np.ndarray) -> list[Measure]:
 
 
 def bfloat16(subject: Subject, case: Case, image: np.ndarray) -> list[Measure]:
-    """In bfloat16 with a float32 sum, as training runs it, against float64."""
+    """The float network in bfloat16 with a float32 sum, as training runs it, on an image (H, W) in DN."""
     if isinstance(subject.graph, BeersError):
         raise subject.graph
     infer, radius_px = infer_in(subject.graph, torch.bfloat16, torch.float32), subject.float32.radius_px
@@ -63,7 +63,7 @@ def bfloat16(subject: Subject, case: Case, image: np.ndarray) -> list[Measure]:
 
 
 def restoration(network: Network, case: Case, image: np.ndarray, gain_dn: float) -> list[Measure]:
-    """What must hold of any network, by whatever it is run."""
+    """What must hold of any network on an image (H, W) in DN, by whatever it is run."""
     if case.pixels in ("infinite", "beyond"):
         return [refused(lambda: network.restore(image))]
     result = network.restore(image)
@@ -81,7 +81,7 @@ def restoration(network: Network, case: Case, image: np.ndarray, gain_dn: float)
 
 
 def fidelity(case: Case, image: np.ndarray, result: np.ndarray, radius_px: int) -> list[Measure]:
-    """What a restoration may not do to contrast and, on flat ground, to brightness."""
+    """What a restoration (H, W) may not do to contrast and, on flat ground, to brightness."""
     inner = inside(result, radius_px)
     measures = [ringing(inner, inside(image, radius_px), radius_px, RINGING_PERCENT)]
     if case.flat:
@@ -105,12 +105,12 @@ def _fractions(image: np.ndarray) -> np.ndarray:
 INT8_GAIN_DN = 128.0
 """A change of 1 DN can move a rounding in every layer, and a pixel from the fine gain to the coarse one."""
 ROUNDING_DN = 128.0
-"""What the DPU's rule for halves may change: one unit in any layer, carried on."""
+"""What the DPU's tie rounding (half up) may change: one unit in any layer, carried on."""
 CROP_PX = 48
 
 
 def runtime(subject: Subject, case: Case, image: np.ndarray) -> list[Measure]:
-    """By onnxruntime's integer kernels."""
+    """The INT8 network by onnxruntime's integer kernels, on an image (H, W) in DN."""
     network = _int8(subject)
     measures = restoration(network, case, image, INT8_GAIN_DN)
     if case.pixels == "sound" and not case.large:
@@ -120,7 +120,7 @@ def runtime(subject: Subject, case: Case, image: np.ndarray) -> list[Measure]:
 
 
 def reference(subject: Subject, case: Case, image: np.ndarray) -> list[Measure]:
-    """By whole numbers alone, 48 x 48 pixels of larger images."""
+    """The INT8 network in whole numbers alone, on 48 x 48 pixels of larger images (H, W)."""
     core, network = core_of(subject), _int8(subject)
     if case.pixels != "sound":
         return []
@@ -137,7 +137,7 @@ def reference(subject: Subject, case: Case, image: np.ndarray) -> list[Measure]:
     return [
         not_finite(by_rule),
         differing("runtime differs", by_rule, by_runtime),
-        Measure("DPU's halves", FULL_DN * float(np.abs(on_board - by_rule).max()), ROUNDING_DN),
+        Measure("DPU's tie rounding", FULL_DN * float(np.abs(on_board - by_rule).max()), ROUNDING_DN),
         Measure("accumulator beyond its proof", over, 0, "bits"),
         _unproven(core, reports),
     ]
@@ -188,7 +188,7 @@ LARGE_CORE_PX = 250
 
 
 def plans(subject: Subject, case: Case, image: np.ndarray) -> list[Measure]:
-    """Both networks, on several plans against the whole image; of unsound pixels every plan is refused."""
+    """Both networks, tiled by several plans, against the whole image (H, W); plans refuse unsound pixels."""
     networks = [network for network in (subject.float32, subject.int8) if network is not None]
     names = ("float32 plans differ", "INT8 plans differ")
     return [

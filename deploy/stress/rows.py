@@ -188,7 +188,7 @@ NOTES = {
 
 
 def title(table: str) -> str:
-    """Of a table's section."""
+    """The title of a table's section: what is shown for its name in the document."""
     return TITLES.get(table, f"{table[:1].upper()}{table[1:]}")
 
 

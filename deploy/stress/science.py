@@ -52,7 +52,7 @@ FLOAT32_DN = 0.05
 
 
 def simulator(_: Subject, case: Case, image: np.ndarray) -> list[Measure]:
-    """From radiance to digital numbers; missing radiance is refused where a file is read."""
+    """From radiance (H, W) to digital numbers; missing radiance is refused where a file is read."""
     sensor = sensor_of(case)
     if case.pixels in ("missing", "infinite"):
         return [refused(lambda: _read_back(image, sensor))]
@@ -139,7 +139,7 @@ STRIP_PX, CROP_PX = 13, 64
 
 
 def traditional(_: Subject, case: Case, image: np.ndarray) -> list[Measure]:
-    """The chain for the case's sensor, at quality "fast", on 64 x 64 pixels of larger images."""
+    """The chain for the case's sensor, at quality "fast", on 64 x 64 pixels of larger images (H, W)."""
     chain = Chain(sensor_of(case), load_sensor(REFERENCE).nominal(), "fast")
     if case.pixels == "infinite":
         return [refused(lambda: _restored(image, chain))]
@@ -190,7 +190,7 @@ LPIPS_GRADIENT = 1e4
 
 
 def losses(_: Subject, case: Case, image: np.ndarray) -> list[Measure]:
-    """L1 + 0.1 FFT, and LPIPS over a backbone of random weights; of lost pixels none may give a number."""
+    """L1 + 0.1 FFT, and LPIPS over random weights, on an image (H, W); of lost pixels none may give a number."""
     reference = torch.from_numpy(np.asarray(image, np.float32) / np.float32(FULL_DN))[None, None]
     noise = np.random.default_rng(0).standard_normal(image.shape).astype(np.float32)
     restored = reference + torch.from_numpy(NOISE * noise)
@@ -264,7 +264,7 @@ NOISE_DN = 5.0
 
 
 def metrics(_: Subject, case: Case, image: np.ndarray) -> list[Measure]:
-    """PSNR and SSIM with a reference; MTF and SNR without."""
+    """PSNR and SSIM with a reference, MTF and SNR without, of an image (H, W)."""
     noise = NOISE_DN * np.random.default_rng(0).standard_normal(image.shape)
     other = np.clip(np.rint(image + noise), 0, FULL_DN).astype(np.float32)
     measures = [Measure("instrument not finite", _instruments(case, image), 0, "figures")]

@@ -1,1 +1,22 @@
-"""What is read from disk and written to it: images, TIFF pages, weights; whole files or none."""
+"""What is read from disk and written to it, whole files or none.
+
+- `images`: pixels of TIFF, PNG and JPEG files, and which value is full scale; `tiff`: untrusted TIFF pages;
+- `files`: outputs that are written whole, and never over an input;
+- `weights`: networks as safetensors. To be imported by itself: alone here it needs torch.
+"""
+
+from model.io.files import require_writable, sha256, whole_file, write_text
+from model.io.images import list_images, read_pixels, settled_scale, site_of
+from model.io.tiff import open_tiff
+
+__all__ = [
+    "list_images",
+    "open_tiff",
+    "read_pixels",
+    "require_writable",
+    "settled_scale",
+    "sha256",
+    "site_of",
+    "whole_file",
+    "write_text",
+]

@@ -1,4 +1,4 @@
-"""Open a stranger's TIFF: as plain pages, none of which leads back to an earlier one.
+"""Open an untrusted TIFF: as plain pages, none of which leads back to an earlier one.
 
 Formats for microscopes name further files to be opened, and tifffile follows directories that lead in a circle for
 hours. What a page's pixels could do is the matter of `model.io.tiff`.

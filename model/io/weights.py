@@ -40,14 +40,14 @@ def variant_named(name: str) -> Variant:
 
 
 def write_tensors(path: Path, tensors: Mapping[str, Tensor], header: Mapping[str, object]) -> None:
-    """Write named tensors and a JSON header as safetensors, whole or not at all."""
+    """Write named tensors of any shape and a JSON header as safetensors, whole or not at all."""
     whole = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
     with whole_file(path) as temporary:
         save_file(whole, temporary, metadata={key: json.dumps(value) for key, value in header.items()})
 
 
 def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, object]]:
-    """Read named tensors and the JSON header.
+    """Read the named tensors, of any shape, and the JSON header of a safetensors file.
 
     Raises:
         ModelError: missing or not safetensors.
@@ -152,7 +152,7 @@ def _check_variant(variant: Variant, tensors: Mapping[str, Tensor], prefix: str,
 
 
 def all_finite(tensors: Mapping[str, Tensor]) -> bool:
-    """Whether every value of every tensor is finite."""
+    """Whether every value of every tensor, of any shape, is finite."""
     return all(bool(torch.isfinite(tensor).all()) for tensor in tensors.values())
 
 

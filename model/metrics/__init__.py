@@ -1,7 +1,15 @@
 """Instruments: what an image is worth beside its reference, and what it shows by itself.
 
-- with a reference: `fidelity` (PSNR, SSIM), `perceptual` (LPIPS, DISTS; `backbones`, `backbone_files`);
-- from the image alone: `sharpness` (slanted-edge MTF; `edges`, `plateaus`, `edge_spread`), `noise_level` (SNR;
-  `windows`, `noise_line`), which refuse (`refusal`) rather than guess;
-- `edge_target` draws an edge, `bootstrap` says how far a mean can be trusted.
+- with a reference: `fidelity` (PSNR, SSIM), `perceptual` (LPIPS and DISTS, over the networks of `backbones`);
+- from the image alone: `sharpness` (MTF of a slanted edge, which `edges` finds and draws) and `noise_level` (SNR),
+  which refuse (`refusal`) rather than guess;
+- `bootstrap` says how far a mean over images can be trusted.
+
+Offered here is what needs no torch, for the gate and the reports; the instruments are imported from their modules.
 """
+
+from model.metrics.bootstrap import site_interval
+from model.metrics.fidelity import psnr_db, ssim
+from model.metrics.refusal import Refusal
+
+__all__ = ["Refusal", "psnr_db", "site_interval", "ssim"]

@@ -198,7 +198,7 @@ def load_weights(module: nn.Module, path: Path) -> None:
 
 
 def read_tensors(path: Path, names: Iterable[str]) -> dict[str, Tensor]:
-    """The named tensors of a .safetensors or .npz file, as float32.
+    """The named tensors, of any shape, of a .safetensors or .npz file, as float32.
 
     Raises:
         ModelError: missing file, missing name, or of a kind that is not read.

@@ -14,7 +14,7 @@ from torch import Tensor
 from model.metrics.refusal import Refusal
 
 WINDOW_PX = 10
-"""Half width of the Hamming window around the edge (facts, metrics (a))."""
+"""Half width of the Hamming window around the edge, in pixels."""
 
 PLATEAU_PX = 5
 """What must lie beyond the window on either side of every row."""
@@ -80,7 +80,7 @@ def find_edge(image: np.ndarray) -> Edge | Refusal:
 
 
 def upright(image: np.ndarray) -> np.ndarray:
-    """Transposed and mirrored so that values rise from left to right."""
+    """The image (H, W), transposed and mirrored so that values rise from left to right: float64, (H, W) or (W, H)."""
     across, down = (_rise(image, axis) for axis in (1, 0))
     if abs(down) > abs(across):
         image, across = image.T, down
@@ -140,7 +140,7 @@ def _line(rows: np.ndarray, columns: np.ndarray) -> tuple[float, float] | Refusa
 
 
 def hamming(place: np.ndarray) -> np.ndarray:
-    """Hamming window of half width WINDOW_PX around 0, 0 beyond."""
+    """Hamming window of half width WINDOW_PX around 0, and 0 beyond; `place` in pixels, of any shape."""
     window = 0.54 + 0.46 * np.cos(np.pi * place / WINDOW_PX)
     return np.asarray(np.where(np.abs(place) <= WINDOW_PX, window, 0.0))
 
@@ -199,7 +199,7 @@ class Plateaus:
         return np.asarray(self.low + self.step * (0.5 + (f[1] - f[0]) * waves @ self.transfer(f)))
 
     def transfer(self, frequencies: np.ndarray) -> np.ndarray:
-        """MTF of that model."""
+        """MTF (F,) of that model at frequencies (F,) in cycles per pixel: 1 at 0."""
         gaussian = np.exp(-2 * (math.pi * self.softness_px * frequencies) ** 2)
         return np.asarray(np.exp(-2 * math.pi * self.tail_px * frequencies) * gaussian)
 
@@ -267,7 +267,10 @@ class EdgeSpread:
         return np.asarray(weights / (averaging * np.sinc(2 * frequencies / BINS_PER_PX))[:, None])
 
     def standard_error(self, weights: np.ndarray) -> float:
-        """Of weights @ values, from what each row adds to it (Newey and West 1987: near rows may be correlated)."""
+        """Standard error of `weights @ values` for weights (B,), from what each row adds to the sum.
+
+        Rows that lie near each other may be correlated: their products count too (Newey and West 1987).
+        """
         share = weights / np.maximum(self.counts, 1)
         rows = (share[self.index] * self.residual).sum(1)
         products = [float(rows[lag:] @ rows[: rows.size - lag]) for lag in range(ROW_LAG + 1)]
@@ -314,7 +317,7 @@ def _at_centres(averages: np.ndarray, shift: np.ndarray) -> np.ndarray:
 def slanted_edge(
     side_px: int, oversampling: int, angle_deg: float, radiance: tuple[float, float] = (40.0, 200.0)
 ) -> Tensor:
-    """A straight edge through the middle of a square scene.
+    """A straight edge through the middle of a square scene, (S, S) with S = side_px * oversampling.
 
     Simulate a scene much larger than the part you measure: its borders wrap around, which puts a second edge there.
     240 target pixels for a central part of 80 leave an error of 0.05 MTF points (measured).

@@ -1,4 +1,4 @@
-"""SNR of an image at given radiances, from the homogeneous areas in it (facts, metrics (b)).
+"""SNR of an image at given radiances, from the homogeneous areas in it.
 
 1. Cut windows; fit a plane and slow waves to each. The waves' energy is structure, the rest's is noise.
 2. Keep windows whose waves hold no more than the noise would put there: no look at the noise estimate itself, so
@@ -42,12 +42,12 @@ class Windows:
     degrees: tuple[int, int, int]
 
     def only(self, chosen: np.ndarray) -> "Windows":
-        """Some of the windows."""
+        """The windows that `chosen`, (N,) of bool, is true for."""
         structure, variance, middle = (x[chosen] for x in (self.structure, self.variance, self.middle))
         return Windows(self.mean[chosen], structure, variance, middle, self.degrees)
 
     def scaled(self, factor: float) -> "Windows":
-        """In another unit."""
+        """The same windows in another unit: means times `factor`, variances times its square."""
         structure, variance, middle = (x * factor**2 for x in (self.structure, self.variance, self.middle))
         return Windows(self.mean * factor, structure, variance, middle, self.degrees)
 
@@ -109,7 +109,7 @@ ROUNDING = 1e-6
 
 @dataclass(frozen=True)
 class NoiseLine:
-    """A fitted line.
+    """A fitted line, variance of the noise = alpha L + beta.
 
     Attributes:
         line: (alpha, beta).
@@ -122,11 +122,11 @@ class NoiseLine:
     windows: Windows
 
     def at(self, radiance: float | np.ndarray) -> np.ndarray:
-        """Variance of the noise."""
+        """Variance of the noise at radiances of any shape, in the square of their unit."""
         return np.asarray(self.line[0] * radiance + self.line[1])
 
     def error(self, radiance: float) -> float:
-        """Standard error of that variance."""
+        """Standard error of the variance at one radiance, from the fit's covariance."""
         at = np.array([radiance, 1.0])
         return float(np.sqrt(at @ self.covariance @ at))
 

@@ -1,9 +1,9 @@
-"""MTF of an image from one slanted edge in it (ISO 12233:2017; facts, metrics (a)).
+"""MTF of an image from one slanted edge in it (ISO 12233:2017, with another DC: see below).
 
-1. Locate the edge and take every pixel's distance to it along the normal (`edges`).
-2. Fit the plateaus: they give the step, which is the MTF's DC, and the PSF's far tails (`plateaus`).
+1. Locate the edge and take every pixel's distance to it along the normal (`edges.find_edge`).
+2. Fit the plateaus: they give the step, which is the MTF's DC, and the PSF's far tails (`edges.fit_plateaus`).
 3. Take off an edge with these tails, whose MTF is known. Average what it leaves in bins of a quarter pixel
-   (`edge_spread`), differentiate, window, transform; add the known MTF.
+   (`edges.spread`), differentiate, window, transform; add the known MTF.
 
 ISO 12233 divides by the windowed derivative's own sum instead. With the tails of optics, MTF = exp(-gamma f), that
 sum lacks 4 to 12 % of the step, and the MTF comes out too high by as much. The window resolves some 0.1 cycles per

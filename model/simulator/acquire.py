@@ -15,7 +15,7 @@ from profiles.errors import ImageError
 from profiles.sensor import Sensor
 
 MARGIN_PX = 32
-"""Target pixels cropped on each side: the FFT wraps around, and the PSF's tail is long (facts: 10.8 DN at 32)."""
+"""Target pixels cropped on each side: the FFT wraps around, and the PSF's tail is long (10.8 DN at 32)."""
 
 
 @dataclass(frozen=True)
@@ -35,17 +35,17 @@ class PreparedScene:
 
     @cached_property
     def stats(self) -> SceneStats:
-        """What the plan needs to know of it."""
+        """Statistics of the scene that the plan of effects needs."""
         return scene_stats(self.radiance, self.oversampling)
 
     @cached_property
     def spectrum(self) -> Tensor:
-        """Its half spectrum, computed when the first plan asks for a blur."""
+        """Half spectrum (H, W // 2 + 1) of the scene, computed when the first plan asks for a blur."""
         return scene_spectrum(self.radiance)
 
 
 def prepare_scene(radiance: Tensor, oversampling: int) -> PreparedScene:
-    """Crop a scene to whole target pixels."""
+    """Crop a scene (H, W) to whole target pixels: H and W become multiples of `oversampling`."""
     return PreparedScene(crop_divisible(radiance, oversampling), oversampling)
 
 
@@ -108,7 +108,7 @@ def acquire(
     offset_px: tuple[float, float] = (0.0, 0.0),
     margin_px: int = MARGIN_PX,
 ) -> Tensor:
-    """Digital numbers of one acquisition: blur and sampling, then what `detect` does on the target grid.
+    """Digital numbers (h, w) of one acquisition: blur and sampling, then what `detect` does on the target grid.
 
     Args:
         spectrum: see `sampling.scene_spectrum`.

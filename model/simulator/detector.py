@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from profiles.effects import Defects, Dsnu, Effect, FullWell, Offset, Prnu, Striping, Veil
+from profiles.effects import Defects, Dsnu, Effect, FullWell, Haze, Offset, Prnu, Striping
 from profiles.sensor import Sensor
 
 NOISE_LIMIT = 6.0
@@ -22,7 +22,7 @@ NOISE_LIMIT = 6.0
 
 
 def noise_sigma(radiance: Tensor, sensor: Sensor) -> Tensor:
-    """sigma(L) = sqrt(alpha L + beta), in W/m2/sr/um (paper, section 3.3).
+    """sigma(L) = sqrt(alpha L + beta), in W/m2/sr/um, for radiances of any shape (paper, section 3.3).
 
     Ringing can push L below zero, where there is no light to be noisy about: L counts as 0 there. A negative
     variance (possible only for a sensor built by hand) counts as 0 too.
@@ -31,7 +31,7 @@ def noise_sigma(radiance: Tensor, sensor: Sensor) -> Tensor:
 
 
 def add_noise(radiance: Tensor, sensor: Sensor, generator: np.random.Generator) -> Tensor:
-    """L + sigma(L) * n, n standard normal and independent per pixel; shape and device kept."""
+    """L + sigma(L) * n, n standard normal and independent per pixel; any shape, which is kept, as is the device."""
     normal = generator.standard_normal(tuple(radiance.shape), dtype=np.float32)
     np.clip(normal, -NOISE_LIMIT, NOISE_LIMIT, out=normal)
     return radiance + noise_sigma(radiance, sensor) * torch.from_numpy(normal).to(radiance.device)
@@ -42,17 +42,17 @@ PATTERN_LIMIT = 4.0
 
 
 def apply_prnu(radiance: Tensor, prnu: Prnu, generator: np.random.Generator) -> Tensor:
-    """L' = (1 + rms * n) * L, n standard normal per column, clipped at 4; rms 0 changes nothing."""
+    """L' = (1 + rms * n) * L for L (..., H, W), n standard normal per column, clipped at 4; rms 0 changes nothing."""
     return radiance * (1 + prnu.rms * _columns(radiance, generator))
 
 
 def apply_dsnu(dn: Tensor, dsnu: Dsnu, generator: np.random.Generator) -> Tensor:
-    """DN' = DN + rms_dn * n, n standard normal per column, clipped at 4; rms_dn 0 changes nothing."""
+    """DN' = DN + rms_dn * n for DN (..., H, W), n normal per column, clipped at 4; rms_dn 0 changes nothing."""
     return dn + dsnu.rms_dn * _columns(dn, generator)
 
 
 def apply_striping(dn: Tensor, striping: Striping) -> Tensor:
-    """Half of odd_even_dn is added to even columns and taken from odd ones; 0 changes nothing."""
+    """Add half of odd_even_dn to even columns of DN (..., H, W) and take it from odd ones; 0 changes nothing."""
     columns = torch.arange(dn.shape[-1], device=dn.device)
     return dn + striping.odd_even_dn * (0.5 - (columns % 2).to(dn.dtype))
 
@@ -90,29 +90,32 @@ def _spread(excess: Tensor, length_px: float) -> Tensor:
 
 
 def add_defects(dn: Tensor, defects: Defects, max_dn: int, generator: np.random.Generator) -> Tensor:
-    """A pixel is dead (0 DN) or hot (max_dn) with its rate per million, independently; rates 0 change nothing."""
+    """Pixels of DN (H, W) dead (0 DN) or hot (max_dn), each at its rate per million; rates 0 change nothing.
+
+    Rates of 0 change nothing.
+    """
     draw = torch.from_numpy(generator.random(tuple(dn.shape), dtype=np.float32)).to(dn.device)
     dead, hot = defects.dead_per_million / 1e6, defects.hot_per_million / 1e6
     dn = torch.where(draw < dead, torch.zeros_like(dn), dn)
     return torch.where(draw >= 1 - hot, torch.full_like(dn, float(max_dn)), dn) if hot > 0 else dn
 
 
-def add_veil(radiance: Tensor, veil: Veil) -> Tensor:
-    """L' = transmittance * L + path radiance, in W/m2/sr/um.
+def add_haze(radiance: Tensor, haze: Haze) -> Tensor:
+    """L' = transmittance * L + path radiance, in W/m2/sr/um, for L of any shape.
 
     Limits: (1, 0) changes nothing; transmittance 0 leaves the path radiance alone. It is the same before and after
     the blur, whose gain at zero frequency is 1: so it is applied on the small target grid.
     """
-    return radiance * veil.transmittance + veil.path_radiance
+    return radiance * haze.transmittance + haze.path_radiance
 
 
 def digitise(radiance: Tensor, sensor: Sensor) -> Tensor:
-    """DN = min(max(round(gain * L), 0), 2^bits - 1), as float32, L in W/m2/sr/um."""
+    """DN = min(max(round(gain * L), 0), 2^bits - 1), as float32, L in W/m2/sr/um of any shape."""
     return digitise_dn(radiance * sensor.gain_dn_per_radiance, sensor)
 
 
 def digitise_dn(dn: Tensor, sensor: Sensor) -> Tensor:
-    """Round to whole digital numbers and clip to the converter's range.
+    """Round digital numbers, of any shape, to whole ones and clip them to the converter's range.
 
     Rounding adds 1/12 DN^2 of variance. Clipping comes before any cast, so that nothing wraps around.
     """
@@ -120,17 +123,17 @@ def digitise_dn(dn: Tensor, sensor: Sensor) -> Tensor:
 
 
 def to_radiance(dn: Tensor, sensor: Sensor) -> Tensor:
-    """Radiance in W/m2/sr/um of digital numbers, the offset taken off."""
+    """Radiance in W/m2/sr/um of digital numbers of any shape, the offset taken off."""
     return (dn - sensor.offset_dn) / sensor.gain_dn_per_radiance
 
 
 def to_dn(radiance: Tensor, sensor: Sensor) -> Tensor:
-    """The inverse of `to_radiance`, clipped to the converter's range and not rounded."""
+    """Digital numbers of radiances of any shape: `to_radiance` backwards, clipped to the range and not rounded."""
     return (radiance * sensor.gain_dn_per_radiance + sensor.offset_dn).clamp(0, sensor.max_dn)
 
 
 def to_uint16(dn: Tensor) -> np.ndarray:
-    """Whole digital numbers of at most 16 bits as the array that a TIFF file takes."""
+    """Whole digital numbers of at most 16 bits, of any shape, as the array that a TIFF file takes."""
     return np.asarray(dn.round().clamp(0, 65535).cpu().numpy().astype(np.uint16))
 
 
@@ -178,10 +181,10 @@ def detect(signal: Tensor, sensor: Sensor, draw: Draw, role: str, skip: Collecti
 def apply_effect(
     image: Tensor, effect: Effect, sensor: Sensor, generator: Callable[[], np.random.Generator]
 ) -> Tensor:
-    """Apply one effect of the target grid; the generator is made only for those that draw."""
+    """Apply one effect of the target grid to an image (..., H, W); the generator is made only for those that draw."""
     match effect:
-        case Veil():
-            return add_veil(image, effect)
+        case Haze():
+            return add_haze(image, effect)
         case FullWell():
             return saturate(image, effect)
         case Prnu():

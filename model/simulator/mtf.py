@@ -49,8 +49,8 @@ def mtf(fx: Tensor, fy: Tensor, mtf_nyquist: Axes, antialias_sigma_px: float = 0
     axis keeps the contrast stated for it, and equal ones give the paper's formula to the last bit.
 
     Args:
-        fx: horizontal frequencies in cycles per TARGET pixel, float64, broadcast against fy.
-        fy: vertical frequencies, likewise. Beyond 1 the sinc is negative, and stays so.
+        fx: horizontal frequencies (1, W) in cycles per TARGET pixel, float64; any shape that broadcasts against fy.
+        fy: vertical frequencies (H, 1), likewise. Beyond 1 the sinc is negative, and stays so.
         mtf_nyquist: contrast kept at 0.5 cycles per pixel, the anti-alias filter G included.
         antialias_sigma_px: standard deviation of that filter in target pixels; 0 is none (G = 1).
     """
@@ -64,12 +64,12 @@ def mtf(fx: Tensor, fy: Tensor, mtf_nyquist: Axes, antialias_sigma_px: float = 0
 
 
 def gaussian_response(frequency: Tensor, sigma_px: float) -> Tensor:
-    """exp(-2 pi^2 sigma^2 f^2), the transform of a Gaussian filter; 1 for sigma 0."""
+    """exp(-2 pi^2 sigma^2 f^2), the transform of a Gaussian filter, at frequencies of any shape; 1 for sigma 0."""
     return torch.exp(-2 * (math.pi * sigma_px * frequency) ** 2)
 
 
 def smear_response(fy: Tensor, length_px: float) -> Tensor:
-    """sinc(length * fy): uniform motion along the track during an exposure; 1 for length 0."""
+    """sinc(length * fy), for fy of any shape: uniform motion along the track during an exposure; 1 for length 0."""
     return torch.sinc(length_px * fy)
 
 

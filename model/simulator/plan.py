@@ -19,7 +19,7 @@ from torch import Tensor
 
 from model.simulator.detector import NOISE_LIMIT, PATTERN_LIMIT
 from model.simulator.mtf import Axes, smear_response, transfer_function
-from profiles.effects import TABLES, AntiAlias, Defects, Dsnu, Effect, FullWell, Offset, Prnu, Smear, Striping, Veil
+from profiles.effects import TABLES, AntiAlias, Defects, Dsnu, Effect, FullWell, Haze, Offset, Prnu, Smear, Striping
 from profiles.sensor import Sensor, mtf_limit
 
 
@@ -36,12 +36,12 @@ class SceneStats:
 
     @property
     def span(self) -> float:
-        """Largest less smallest radiance."""
+        """Largest less smallest radiance, in W/m2/sr/um."""
         return self.high - self.low
 
 
 def scene_stats(radiance: Tensor, oversampling: int) -> SceneStats:
-    """Statistics of a scene (H, W), one pass over it."""
+    """Statistics of a scene's radiance (H, W), in one pass over it."""
     low, high = (float(v) for v in torch.aminmax(radiance))
     step = max(float((radiance[1:] - radiance[:-1]).abs().max()), float((radiance[0] - radiance[-1]).abs().max()))
     height, width = radiance.shape
@@ -114,7 +114,7 @@ def effect_bound_dn(effect: Effect, sensor: Sensor, low: float, high: float) -> 
     """Largest change of any pixel by an effect of the target grid, for a signal between low and high radiance."""
     gain, brightest = sensor.gain_dn_per_radiance, max(abs(low), abs(high))
     match effect:
-        case Veil():  # affine in L: the ends decide
+        case Haze():  # affine in L: the ends decide
             return gain * max(abs((effect.transmittance - 1) * v + effect.path_radiance) for v in (low, high))
         case FullWell():  # below the well nothing; above it, what is cut off or spilt
             return gain * max(high - effect.radiance, 0.0)

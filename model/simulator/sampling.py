@@ -53,7 +53,7 @@ def sample(
 
 
 def crop_divisible(radiance: Tensor, oversampling: int) -> Tensor:
-    """Cut the last rows and columns so that H and W are multiples of the oversampling."""
+    """Cut the last rows and columns of (..., H, W), so that H and W are multiples of the oversampling."""
     height, width = (size // oversampling * oversampling for size in radiance.shape[-2:])
     return radiance[..., :height, :width]
 

@@ -1,11 +1,26 @@
 """The traditional pipeline, on the CPU and without training: what a network has to beat.
 
-1. `stabilise`: radiance to a scale on which the sensor's noise has variance 1 everywhere.
-2. `nl_bayes`: two-pass non-local Bayes denoising (`passes` runs one, `patches` finds the groups, `estimate` does the
-   statistics, `noise` says what is noise, `settings` holds the published numbers, `threads` shares the tiles out).
-3. `stabilise` again, backwards: to radiance.
-4. `compensate`: regularised inverse filter, from the degraded sensor's MTF to the reference's.
+1. `noise`: radiance to a scale on which the sensor's noise has variance 1 everywhere, and back again after 2.
+2. `nl_bayes`: two-pass non-local Bayes denoising, with the published numbers of `settings`.
+3. `compensate`: regularised inverse filter, from the degraded sensor's MTF to the reference's.
 
-`pipeline` chains them, in this order or with 4 first. Every step takes and gives strips of rows (`rows`), so a chain
-of any height runs in the memory of some hundred rows; NaN marks missing pixels (`fill` bridges them for the filter).
+`pipeline` chains them, in this order or with 3 first; `peers` are restorations of scikit-image to compare it with.
+Every step takes and gives strips of rows (`rows`), so a chain of any height runs in the memory of some hundred rows;
+NaN marks missing pixels.
 """
+
+from model.traditional.noise import Noise, destabilise, stabilise
+from model.traditional.peers import PEERS
+from model.traditional.pipeline import Chain, restore_strips, restore_traditional
+from model.traditional.settings import QUALITIES
+
+__all__ = [
+    "PEERS",
+    "QUALITIES",
+    "Chain",
+    "Noise",
+    "destabilise",
+    "restore_strips",
+    "restore_traditional",
+    "stabilise",
+]

@@ -40,7 +40,7 @@ def compensate(image: Tensor, mtf_from: Axes, mtf_to: Axes, epsilon: float) -> T
 
 
 def filter_strips(strips: Iterable[Tensor], height: int, kernel: Tensor) -> Iterator[Tensor]:
-    """Filter an image of `height` rows that comes in strips, and goes in strips of BLOCK_PX rows.
+    """Filter an image (H, W) that comes in strips (any, W), by a kernel (K, K); it goes in strips of BLOCK_PX rows.
 
     Blocks lie on a grid of their own, so the strips that came change no bit. NaN pixels are filled from their
     neighbours first, and NaN again in the end.

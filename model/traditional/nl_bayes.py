@@ -167,7 +167,7 @@ Places = tuple[Tensor, Tensor]
 def denoise_pass(
     noisy: Rows, guide: Rows, height: int, noise: Noise, settings: PassSettings, stride_px: int
 ) -> Iterator[Tensor]:
-    """Each pixel's mean over all the estimates of it, in strips of rows; a pixel without any keeps its value."""
+    """Each pixel's mean over all the estimates of it, in strips (any, W); a pixel without any keeps its value."""
     margin = settings.margin_px
     runs = reference_runs(height, stride_px)
     carried: Sums | None = None
@@ -186,7 +186,7 @@ def denoise_pass(
 
 
 def reference_runs(size_px: int, stride_px: int) -> tuple[Tensor, ...]:
-    """Pixels on which references are centred along one axis, tile by tile; the last pixel always has one."""
+    """Pixels, (n,) a tile, on which references are centred along one axis; the last pixel always has one."""
     centres = torch.arange(0, size_px + stride_px - 1, stride_px).clamp(max=size_px - 1)
     return torch.split(centres, TILE_REFERENCES)
 
@@ -302,7 +302,7 @@ def nl_bayes(image: Tensor, noise: Noise, quality: Quality = QUALITIES["standard
 
 
 def nl_bayes_strips(strips: Iterable[Tensor], height: int, noise: Noise, quality: Quality) -> Iterator[Tensor]:
-    """As `nl_bayes`, bit for bit, on an image that comes and goes in strips of rows (any rows each, W).
+    """Denoise as `nl_bayes`, bit for bit, an image that comes and goes in strips of rows, (any, W) each.
 
     Holds some 150 rows of it, and the tallest strip.
     """
@@ -316,7 +316,7 @@ def nl_bayes_strips(strips: Iterable[Tensor], height: int, noise: Noise, quality
 
 
 def finite_or_missing(strips: Iterable[Tensor]) -> Iterator[Tensor]:
-    """The strips as they come.
+    """Pass strips (any, W) on as they come; NaN marks missing pixels.
 
     Raises:
         ImageError: one holds infinite values.

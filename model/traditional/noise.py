@@ -29,7 +29,7 @@ class Noise:
             raise OptionError("sigma", expected="0 or more", got=repr(self.sigma), remedy="give a standard deviation")
 
     def covariance(self, side_px: int) -> Tensor:
-        """Covariance of the k * k pixels of a patch, (k * k, k * k) float64."""
+        """Covariance of the pixels of a patch of side k: (k * k, k * k) float64, in the image's unit squared."""
         if self.correlation is None:
             return torch.eye(side_px**2, dtype=torch.float64) * self.sigma**2
         middle = self.correlation.shape[0] // 2
@@ -46,7 +46,7 @@ class Noise:
 
 
 def coloured_by(kernel: Tensor, sigma: float, most_lag_px: int = 6) -> Noise:
-    """What filtering by `kernel` (odd side, real) makes of white noise of standard deviation `sigma`.
+    """Noise that filtering by `kernel` (K, K), K odd, makes of white noise of standard deviation `sigma`.
 
     The autocorrelation of the kernel: r(d) = sum over p of k(p) k(p + d), sigma times the root of r(0).
     """
@@ -76,7 +76,7 @@ def stabilise(radiance: Tensor, sensor: Sensor) -> Tensor:
 
 
 def destabilise(stable: Tensor, sensor: Sensor) -> Tensor:
-    """L = t sqrt(beta) + alpha t^2 / 4, the exact inverse of `stabilise`; t sqrt(beta) below t = 0.
+    """L = t sqrt(beta) + alpha t^2 / 4, any shape: the inverse of `stabilise`; t sqrt(beta) below t = 0.
 
     The mean of noisy values t lies below f(mean L), f being concave: see `bias_radiance`.
     """

@@ -26,7 +26,7 @@ Peer = Callable[[Tensor, Chain], Tensor]
 
 
 def wiener(dn: Tensor, chain: Chain) -> Tensor:
-    """scikit-image's Wiener filter with a Laplacian regulariser, balance 0.01."""
+    """scikit-image's Wiener filter with a Laplacian regulariser, balance 0.01: (H, W) DN to (H, W) DN."""
 
     def deconvolve(image: Tensor, blur: Tensor) -> Tensor:
         restored = restoration.wiener(image.numpy(), blur.numpy().astype(complex), WIENER_BALANCE, clip=False)
@@ -36,7 +36,7 @@ def wiener(dn: Tensor, chain: Chain) -> Tensor:
 
 
 def unsupervised_wiener(dn: Tensor, chain: Chain) -> Tensor:
-    """scikit-image's Wiener filter that estimates its own regularisation (seed 0)."""
+    """scikit-image's Wiener filter that estimates its own regularisation (seed 0): (H, W) DN to (H, W) DN."""
 
     def deconvolve(image: Tensor, blur: Tensor) -> Tensor:
         restored, _ = restoration.unsupervised_wiener(image.numpy(), blur.numpy().astype(complex), clip=False, rng=0)
@@ -46,7 +46,7 @@ def unsupervised_wiener(dn: Tensor, chain: Chain) -> Tensor:
 
 
 def richardson_lucy(dn: Tensor, chain: Chain) -> Tensor:
-    """scikit-image's Richardson-Lucy, 20 steps."""
+    """scikit-image's Richardson-Lucy deconvolution, 20 steps: (H, W) DN to (H, W) DN."""
 
     def deconvolve(image: Tensor, blur: Tensor) -> Tensor:
         height, width = image.shape
@@ -61,7 +61,7 @@ def richardson_lucy(dn: Tensor, chain: Chain) -> Tensor:
 
 
 def nl_means(dn: Tensor, chain: Chain) -> Tensor:
-    """The chain with scikit-image's fast non-local means, patches of 5 x 5 within 6 pixels, h = 0.6 sigma."""
+    """The chain with scikit-image's non-local means, 5 x 5 patches within 6 pixels, h = 0.6 sigma: (H, W) DN."""
     sensor = with_rounding_noise(chain.degraded)
     stable = stabilise(to_radiance(dn, chain.degraded), sensor)
     clean = restoration.denoise_nl_means(

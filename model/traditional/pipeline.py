@@ -49,14 +49,14 @@ class Chain:
 
     @property
     def regularisation(self) -> float:
-        """The epsilon of the MTF compensation."""
+        """The epsilon of the MTF compensation: as given, or by the noise at the brighter stated radiance."""
         if self.epsilon is not None:
             return self.epsilon
         bright = self.degraded.radiance_1
         return EPSILON_PER_PERCENT * self.degraded.noise_sigma(bright) * (100 / bright)
 
     def kernel(self) -> Tensor:
-        """The filter of the MTF compensation."""
+        """The filter of the MTF compensation, (2 R + 1, 2 R + 1) float64."""
         return compensation_kernel(self.degraded.mtf_axes, self.reference.mtf_axes, self.regularisation)
 
 
@@ -70,7 +70,7 @@ def restore_traditional(dn: Tensor, chain: Chain) -> Tensor:
 
 
 def restore_strips(strips: Iterable[Tensor], height: int, chain: Chain) -> Iterator[Tensor]:
-    """As `restore_traditional`, bit for bit, on an image that comes and goes in strips of rows, (any, W) each.
+    """Restore as `restore_traditional`, bit for bit, an image that comes and goes in strips of rows, (any, W) each.
 
     Holds some 700 rows of it, and the tallest strip.
 
@@ -101,7 +101,7 @@ def _deconvolve_first(radiance: Iterable[Tensor], height: int, chain: Chain, qua
 def denoise_radiance(
     radiance: Iterable[Tensor], height: int, sensor: Sensor, noise: Noise, quality: Quality
 ) -> Iterator[Tensor]:
-    """NL-Bayes on the stabilised scale: strips in W/m2/sr/um, of noise variance alpha L + beta, to the same."""
+    """NL-Bayes on the stabilised scale: strips (any, W) in W/m2/sr/um, of variance alpha L + beta, to the same."""
     scale = noise.sigma
     stable = (stabilise(strip, sensor) * scale for strip in radiance)
     for clean in nl_bayes_strips(stable, height, noise, quality):

@@ -21,7 +21,7 @@ class Rows:
         self._top = 0
 
     def window(self, rows: Tensor) -> Tensor:
-        """The rows of those numbers, (len(rows), W); windows must move downwards."""
+        """The rows of those numbers: (R,) to (R, W); windows must move downwards."""
         top, bottom = int(rows.min()), int(rows.max()) + 1
         while self._top + sum(map(len, self._held)) < bottom:
             self._held.append(self._next())
@@ -38,7 +38,7 @@ class Rows:
 
 
 def mirrored(start: int, stop: int, size: int) -> Tensor:
-    """Pixel numbers start..stop - 1 of an image mirrored at its borders, the edge repeated: c b a | a b c | c b a.
+    """Pixel numbers (stop - start,) of an image mirrored at its borders, the edge repeated: c b a | a b c | c b a.
 
     Folded back into 0..size - 1: the mirror has period 2 * size, whatever the size.
     """

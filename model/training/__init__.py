@@ -1,8 +1,15 @@
 """Training: pairs made as they are needed, the paper's loss, averaged weights, exact resume.
 
-- `patches` simulates pairs on the fly, `stored_pairs` takes them from a data set on disk; both are keyed by (seed,
-  step), so any batch can be made again;
-- `losses` holds the terms, `recipe` all that decides the weights, `guards` what stops a run gone wrong;
-- `trainer` runs the steps, `checkpoint` keeps them, `interrupts` lets none break one, `workers` shares a run out,
-  `validation` judges on sites held out.
+- `patches` simulates pairs on the fly or takes stored ones; both are keyed by (seed, step), so any batch can be made
+  again;
+- `losses` holds the terms, `guards` what stops a run gone wrong, `precision` the number format of a step;
+- `trainer` runs the steps, `checkpoint` keeps them with the recipe, `run` is a whole run from options to a folder;
+- `workers` shares a run out to processes, `validation` judges on sites held out.
 """
+
+from model.training.checkpoint import TrainingRecipe
+from model.training.losses import RestorationLoss
+from model.training.patches import PatchRecipe
+from model.training.run import Run, train
+
+__all__ = ["PatchRecipe", "RestorationLoss", "Run", "TrainingRecipe", "train"]

@@ -82,7 +82,7 @@ def write_checkpoint(
     guards: Guards,
     precision: Precision,
 ) -> None:
-    """Write weights, their running average, the optimiser's moments, the step, the guards and the precision."""
+    """Write weights, running average and Adam's moments, any shape each, with step, recipe, guards and precision."""
     tensors = {f"network.{k}": v for k, v in network.state_dict().items()}
     tensors |= {f"average.{k}": v for k, v in average.items()}
     for name, parameter in network.named_parameters():
@@ -99,7 +99,7 @@ def read_checkpoint(
     optimiser: torch.optim.Optimizer,
     recipe: TrainingRecipe,
 ) -> tuple[int, Guards, Precision]:
-    """Fill network, average and optimiser from a checkpoint; its step, its guards and what it was computed in.
+    """Fill network, average (any shape each) and optimiser from a checkpoint; return its step, guards and precision.
 
     Raises:
         ModelError: not a checkpoint, or one of another recipe or network.

@@ -80,7 +80,7 @@ class PatchSource:
         self._scenes = [prepare(scene, common, device) for scene in scenes]
 
     def batches(self, first: int = 0) -> Iterator[tuple[Tensor, ...]]:
-        """Batch number `first` and all that follow: a resumed run goes on where it stopped.
+        """Batch number `first` and all that follow, of (N, 1, P, P): a resumed run goes on where it stopped.
 
         The next shard is made while the present one is used.
         """
@@ -167,7 +167,7 @@ def cut(images: Tensor, patch_px: int, generator: np.random.Generator) -> Tensor
 
 
 def turn(patches: Tensor, generator: np.random.Generator, quarters: bool = True) -> Tensor:
-    """One of the eight symmetries of the square, the same for all patches of a pass; of four without `quarters`."""
+    """Patches (..., P, P) in one of the square's eight symmetries, the same for all; of four without `quarters`."""
     return turned(patches, *draw_turn(generator, quarters))
 
 
@@ -238,7 +238,7 @@ class StoredPairs:
         self.batch, self.seed, self.worker = batch, seed, worker or Worker()
 
     def batches(self, first: int = 0) -> Iterator[tuple[Tensor, Tensor]]:
-        """Batch number `first` and all that follow."""
+        """Batch number `first` and all that follow: (degraded, reference), (N, 1, P, P) in [0, 1] each."""
         number = first
         while True:
             own = number * self.worker.count + self.worker.rank

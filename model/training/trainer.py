@@ -24,7 +24,7 @@ from profiles.errors import OptionError
 
 
 class Source(Protocol):
-    """Where batches come from."""
+    """Where the trainer's batches come from: patches made on the fly, or stored pairs."""
 
     def batches(self, first: int = 0) -> Iterator[tuple[Tensor, ...]]:
         """Batch number `first` and all that follow: (degraded, reference), (N, 1, P, P) in [0, 1] each.
@@ -207,7 +207,7 @@ class Meter:
         self._count, self._step, self._started = 0, self._trainer.step, time.monotonic()
 
     def add(self, terms: Mapping[str, Tensor]) -> None:
-        """Add a step's terms, none for a step that was skipped."""
+        """Add a step's terms of the loss, any shape () each; none for a step that was skipped."""
         for name, term in terms.items():
             self._sums[name] = self._sums.get(name, 0.0) + float(term)
         self._count += bool(terms)

@@ -30,9 +30,9 @@ def model(tmp_path: Path) -> onnx.ModelProto:
 def refusal(model: onnx.ModelProto, to_run: bool = True) -> str:
     """What is said of a model; no runtime sees it."""
     with patch("onnxruntime.InferenceSession") as session, pytest.raises(ModelError) as caught:
-        open_session(parse_onnx(model.SerializeToString(), "stranger.onnx", to_run), 1)
+        open_session(parse_onnx(model.SerializeToString(), "untrusted.onnx", to_run), 1)
     assert not session.called
-    assert str(caught.value).startswith("stranger.onnx: expected ")
+    assert str(caught.value).startswith("untrusted.onnx: expected ")
     return str(caught.value)
 
 
@@ -141,7 +141,7 @@ LOOP = helper.make_graph(
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        (ending_in(helper.make_node("Evil", ["image"], ["y"], domain="ai.strangers")), "Evil of 'ai.strangers'"),
+        (ending_in(helper.make_node("Evil", ["image"], ["y"], domain="ai.foreign")), "Evil of 'ai.foreign'"),
         (ending_in(helper.make_node("FusedConv", ["image"], ["y"], domain="com.microsoft")), "FusedConv"),
         (ending_in(helper.make_node("LinearRegressor", ["image"], ["y"], domain="ai.onnx.ml")), "LinearRegressor"),
         (ending_in(helper.make_node("Loop", ["", ""], [], body=LOOP)), "Loop with a graph within"),
@@ -173,7 +173,7 @@ LOOP = helper.make_graph(
         (ending_in(helper.make_node("DepthToSpace", ["image"], ["y"], blocksize=2**20)), "blocksize"),
     ],
 )
-def test_what_a_runtime_would_do_for_a_stranger_is_refused(
+def test_what_a_runtime_would_do_for_an_untrusted_file_is_refused(
     change: Change, words: str, model: onnx.ModelProto
 ) -> None:
     change(model)
@@ -195,7 +195,7 @@ def test_functions_and_sparse_weights_are_refused(model: onnx.ModelProto) -> Non
     assert "functions" in refusal(model)
 
 
-def test_strangers_operators_may_be_looked_at(tmp_path: Path) -> None:
+def test_foreign_operators_may_be_looked_at(tmp_path: Path) -> None:
     sketch = Sketch(1)
     path = sketch.save(tmp_path / "a.onnx", sketch.node("Mystery", "image", domain="com.microsoft"))
     assert read_network(path, 32).operations[0].op_type == "Mystery"

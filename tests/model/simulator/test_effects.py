@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from model.simulator.acquire import prepare_scene, simulate_planned
-from model.simulator.detector import Draw, add_defects, add_veil, apply_dsnu, apply_prnu, apply_striping, saturate
+from model.simulator.detector import Draw, add_defects, add_haze, apply_dsnu, apply_prnu, apply_striping, saturate
 from model.simulator.mtf import gamma_from_mtf, mtf, smear_response, transfer_function
 from model.simulator.plan import TOLERANCE_DN, Plan, make_plan, scene_stats
 from model.simulator.sampling import sample, scene_spectrum
@@ -19,11 +19,11 @@ from profiles.effects import (
     Dsnu,
     Effect,
     FullWell,
+    Haze,
     Offset,
     Prnu,
     Smear,
     Striping,
-    Veil,
 )
 from profiles.errors import OptionError
 
@@ -36,7 +36,7 @@ spec.loader.exec_module(stages)
 NEUTRAL: dict[str, Effect] = {
     "antialias": AntiAlias(0.0),
     "smear": Smear(0.0),
-    "veil": Veil(1.0, 0.0),
+    "veil": Haze(1.0, 0.0),
     "full_well": FullWell(1e6, 0.3, 4.0),
     "prnu": Prnu(0.0),
     "dsnu": Dsnu(0.0),
@@ -67,7 +67,7 @@ def test_skipping_equals_applying_at_neutral_parameters_bit_for_bit(name: str) -
 @pytest.mark.parametrize("name", ["prnu", "dsnu", "defects", "veil"])
 def test_leaving_one_effect_out_changes_no_other_draw(name: str) -> None:
     radiance, draw = torch.full((120, 140), 80.0), Draw(5)
-    sensor = stages.plain_sensor(dsnu=Dsnu(3.0), prnu=Prnu(0.01), defects=Defects(500, 500), veil=Veil(0.8, 10.0))
+    sensor = stages.plain_sensor(dsnu=Dsnu(3.0), prnu=Prnu(0.01), defects=Defects(500, 500), veil=Haze(0.8, 10.0))
     whole = stages.before_digitising(radiance, sensor, 2, draw, skip={name, "noise"})
     other = stages.plain_sensor(**{k: v for k, v in sensor.effects.items() if k != name})
     assert torch.equal(whole, stages.before_digitising(radiance, other, 2, draw, skip={"noise"}))
@@ -95,8 +95,8 @@ def test_stripes_alternate_and_keep_the_mean() -> None:
     assert striped[0].tolist() == [103.0, 97.0] * 4
 
 
-def test_the_veil_is_affine() -> None:
-    assert add_veil(torch.tensor([0.0, 100.0]), Veil(0.6, 25.0)).tolist() == [25.0, 85.0]
+def test_haze_is_affine() -> None:
+    assert add_haze(torch.tensor([0.0, 100.0]), Haze(0.6, 25.0)).tolist() == [25.0, 85.0]
 
 
 def test_below_the_well_nothing_changes_and_share_zero_is_a_clip() -> None:

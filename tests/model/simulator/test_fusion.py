@@ -7,10 +7,10 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from model.simulator.detector import add_veil
+from model.simulator.detector import add_haze
 from model.simulator.mtf import mtf, smear_response, transfer_function
 from model.simulator.sampling import sample, scene_spectrum
-from profiles.effects import Veil
+from profiles.effects import Haze
 
 GAIN = 10.2375
 
@@ -83,12 +83,12 @@ def test_a_slanted_edge_shows_the_mtf_of_the_profile(mtf_nyquist: float, sigma: 
 
 
 @pytest.mark.parametrize("ratio", [1, 2, 3, 5, 8])
-def test_the_veil_after_sampling_equals_the_veil_before_the_blur(ratio: int) -> None:
+def test_haze_after_sampling_equals_haze_before_the_blur(ratio: int) -> None:
     """An affine change of the light commutes with a blur that keeps the mean: so it may wait for the small grid."""
-    veil, radiance = Veil(0.7, 15.0), 300 * torch.rand(17 * ratio, 23 * ratio, generator=torch.Generator())
+    haze, radiance = Haze(0.7, 15.0), 300 * torch.rand(17 * ratio, 23 * ratio, generator=torch.Generator())
     transfer = transfer_function(*radiance.shape, ratio, 0.07, 0.2, 1.5)
-    fused = add_veil(sample(scene_spectrum(radiance), transfer, radiance.shape[1], ratio), veil)
-    expected = one_after_the_other(add_veil(radiance.double(), veil), ratio, 0.07, 0.2, 1.5)
+    fused = add_haze(sample(scene_spectrum(radiance), transfer, radiance.shape[1], ratio), haze)
+    expected = one_after_the_other(add_haze(radiance.double(), haze), ratio, 0.07, 0.2, 1.5)
     assert float((fused - expected).abs().max()) * GAIN < 0.02
 
 

@@ -16,7 +16,7 @@ from model.simulator.acquire import prepare_scene, simulate_planned
 from model.simulator.detector import Draw
 from model.simulator.plan import TOLERANCE_DN, Plan, effect_bounds, make_plan, scene_stats
 from model.simulator.sampling import crop_divisible
-from profiles.effects import AntiAlias, Defects, Dsnu, Effect, FullWell, Offset, Prnu, Smear, Striping, Veil
+from profiles.effects import AntiAlias, Defects, Dsnu, Effect, FullWell, Haze, Offset, Prnu, Smear, Striping
 from profiles.sensor import Sensor
 
 spec = importlib.util.spec_from_file_location("stages", Path(__file__).parent / "stages.py")
@@ -62,7 +62,7 @@ scenes = st.builds(
 OPTIONAL: dict[str, st.SearchStrategy[Effect]] = {
     "antialias": st.builds(AntiAlias, st.floats(0, 0.3)),
     "smear": st.builds(Smear, st.floats(0, 3)),
-    "veil": st.builds(Veil, st.floats(0.3, 1), st.sampled_from([0.0, 0.01, 5.0])),
+    "veil": st.builds(Haze, st.floats(0.3, 1), st.sampled_from([0.0, 0.01, 5.0])),
     "full_well": st.builds(FullWell, st.floats(1, 500), st.floats(0, 0.5), st.floats(0, 8)),
     "prnu": st.builds(Prnu, st.sampled_from([0.0, 1e-5, 1e-3, 0.05])),
     "dsnu": st.builds(Dsnu, st.sampled_from([0.0, 0.01, 2.0])),
@@ -114,7 +114,7 @@ def test_a_bound_that_is_too_small_would_be_caught(wrong: str, monkeypatch: pyte
     """The same check on a scene of full contrast, with one bound function giving a hundredth of the truth."""
     radiance = torch.zeros(60, 60)
     radiance[20:44, 10:50] = 200.0
-    tight: dict[str, Effect] = {"smear": Smear(2.0), "veil": Veil(0.5, 20.0), "offset": Offset(50.0)}
+    tight: dict[str, Effect] = {"smear": Smear(2.0), "veil": Haze(0.5, 20.0), "offset": Offset(50.0)}
     sensor = stages.plain_sensor(**tight)
     sound = getattr(plan_module, wrong)
     monkeypatch.setattr(f"model.simulator.plan.{wrong}", lambda *a: sound(*a) / 100)
@@ -125,7 +125,7 @@ def test_a_bound_that_is_too_small_would_be_caught(wrong: str, monkeypatch: pyte
 
 STRONG: dict[str, Effect] = {
     "smear": Smear(2.0),
-    "veil": Veil(0.5, 20.0),
+    "veil": Haze(0.5, 20.0),
     "full_well": FullWell(150.0, 0.0, 0.0),
     "prnu": Prnu(0.05),
     "dsnu": Dsnu(5.0),
