@@ -251,7 +251,7 @@ class Curve:
 
 @dataclass(frozen=True)
 class Panel:
-    """Some curves under a title."""
+    """Curves that share axes, under a title."""
 
     title: str
     curves: Sequence[Curve]

@@ -73,7 +73,7 @@ def ordered(fronts: Sequence[Front]) -> list[Front]:
 
 
 def render_study(study: Study) -> str:
-    """The page as HTML."""
+    """The study as one HTML page, with its plots, tables and pictures."""
     provenance, points, fronts = Provenance(), Points.of(study.points), ordered(study.fronts)
     script = Markup((TEMPLATES / "tradeoff/page.js").read_text(encoding="utf-8"))  # noqa: S704 - our own file
     shown = {

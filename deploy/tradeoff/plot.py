@@ -142,7 +142,7 @@ class Points:
 
 
 def method_of(row: Row) -> str:
-    """What the row's point runs."""
+    """The name of the method that the row's point runs."""
     return row.text.get("method", row.name)
 
 
@@ -221,7 +221,13 @@ class Plot:
 
 
 def plot_of(front: Front, points: Points, canvas: Canvas) -> Plot:
-    """The plot of one front."""
+    """Draw one front: quality up, cost to the right, a mark for each point that has both.
+
+    Args:
+        front: which two figures, and which points are on it.
+        points: all of the study, with their looks.
+        canvas: the size; it grows in height below a long legend.
+    """
     shown = points.on(front)
     rows = [row for _, row in shown]
     legend = legend_of(points, rows, canvas.width)
