@@ -14,7 +14,8 @@ from deploy.report.pictures import picture_url, stretch_of
 from deploy.report.plots import plot_style
 from deploy.results import unit_of, words_of
 from deploy.tradeoff.layer_bars import layer_bars
-from deploy.tradeoff.plot import NARROW, STATES, WIDE, Points, drawn, plot_of, state_of
+from deploy.tradeoff.marks import STATES
+from deploy.tradeoff.plot import NARROW, WIDE, Points, drawn, plot_of, state_of
 from deploy.tradeoff.study import Crop, Front, Study
 from model.io.files import write_text
 from profiles.figures import Figure, Row, by_table
