@@ -40,7 +40,7 @@ def check(
 ) -> None:
     """Place every node of a network on the host, the DPU or the CPU; exit code 1 if the DPU cannot run its part."""
     from deploy.dpu.board import load_dpu
-    from deploy.dpu.checker.table import require_picture
+    from deploy.dpu.checker.picture import require_picture
     from model.io.files import require_writable
     from model.shipped import int8_file
 
@@ -57,8 +57,9 @@ def check(
 
 def _network(path: Path, dpu: "Dpu", tile: int | None, picture: Path | None, json: Path | None) -> bool:
     """Judge a file; whether its core runs whole on the DPU."""
+    from deploy.dpu.checker.picture import write_picture
     from deploy.dpu.checker.placement import place
-    from deploy.dpu.checker.table import legality, network_rows, summary, write_picture
+    from deploy.dpu.checker.table import legality, network_rows, summary
     from deploy.dpu.reading import network_of, own_tile_px
     from deploy.results import Document, print_rows
     from quant.graph import refusal

@@ -82,7 +82,7 @@ class Report:
 
 
 def render(report: Report) -> str:
-    """The page as HTML."""
+    """The report as one HTML file, pictures embedded."""
     tables = [_grid(table) for table in report.tables]
     return templates().get_template("report/report.html").render(report=report, tables=tables, version=__version__)
 

@@ -230,8 +230,7 @@ def plot_style() -> Markup:
     light, dark = (" ".join(f"--{name}: {colour};" for name, colour in colours.items()) for colours in (LIGHT, DARK))
     return Markup(  # noqa: S704 - no foreign words
         f":root {{ {light} }}\n@media screen and (prefers-color-scheme: dark) {{ :root {{ {dark} }} }}\n"
-        '.plot text { font-family: Arial, Helvetica, "Liberation Sans", sans-serif; fill: var(--ink); }\n'
-        '.plot text[fill="var(--soft)"] { fill: var(--soft); }\n'
+        '.plot text { font-family: Arial, Helvetica, "Liberation Sans", sans-serif; pointer-events: none; }\n'
         ".plot .label text { paint-order: stroke; stroke: var(--page); stroke-width: 3px; stroke-linejoin: round; }\n"
         ".plot a.dot:hover path { stroke: var(--ink); }\n"
     )
@@ -252,7 +251,7 @@ class Curve:
 
 @dataclass(frozen=True)
 class Panel:
-    """Some curves under a title."""
+    """Curves that share axes, under a title."""
 
     title: str
     curves: Sequence[Curve]

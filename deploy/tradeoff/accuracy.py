@@ -37,13 +37,13 @@ class Scores:
     targets: Mapping[str, Figure] = field(default_factory=dict)
 
     def to_json(self) -> dict[str, object]:
-        """Plain values."""
+        """What JSON can hold, for the cache."""
         targets = {key: vars(figure) for key, figure in self.targets.items()}
         return {"images": [dict(values) for values in self.images], "targets": targets}
 
     @classmethod
     def from_json(cls, stored: Mapping[str, Any]) -> Self:
-        """The inverse."""
+        """Scores as `to_json` wrote them; raises KeyError, TypeError or ValueError on anything else."""
         targets = {
             k: Figure(**{**f, "interval": tuple(f["interval"] or ()) or None}) for k, f in stored["targets"].items()
         }
@@ -79,7 +79,7 @@ class BenchmarkSet:
 
     @property
     def sites(self) -> list[str]:
-        """The site of each pair."""
+        """The site of each pair, in the order of the pairs."""
         return [pair.site for pair in self.pairs]
 
 
@@ -93,7 +93,7 @@ def measure(restore: Restore, benchmark: BenchmarkSet, tick: Callable[[], None])
 
 
 def measure_images(restore: Restore, benchmark: BenchmarkSet, tick: Callable[[], None]) -> tuple[Values, ...]:
-    """Scores on every pair."""
+    """Scores on every pair, in their order; `tick` is called once a pair."""
     images = []
     for pair in benchmark.pairs:
         values = benchmark.instruments.score(restore(pair.degraded), pair.reference, pair.degraded)

@@ -83,11 +83,11 @@ class Goal:
 
     @property
     def words(self) -> str:
-        """As a person says it."""
+        """The goal in words: "highest PSNR"."""
         return f"{'highest' if self.sign < 0 else 'lowest'} {self.key}"
 
     def of(self, outcome: Outcome) -> float:
-        """The smaller the better."""
+        """What to make small: the figure's value, turned round where more of it is better."""
         return self.sign * (outcome.value(self.key) or 0.0)
 
 

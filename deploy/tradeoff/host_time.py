@@ -34,12 +34,12 @@ class Times:
     pixels: int
 
     def to_json(self) -> dict[str, object]:
-        """Plain values."""
+        """What JSON can hold, for the cache."""
         return dict(vars(self))
 
     @classmethod
     def from_json(cls, stored: Mapping[str, Any]) -> Self:
-        """The inverse."""
+        """Times as `to_json` wrote them; raises KeyError, TypeError or ValueError on anything else."""
         wall_s, cpu_s = (tuple(float(t) for t in stored[key]) for key in ("wall_s", "cpu_s"))
         if not wall_s or len(wall_s) != len(cpu_s):
             raise ValueError("no rounds")

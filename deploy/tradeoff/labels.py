@@ -66,7 +66,7 @@ class Label:
 
     @property
     def baselines(self) -> list[float]:
-        """Of each line, in pixels."""
+        """Where each line of text stands, in pixels from the top."""
         return [self.box[1] + PAD_PX + LINE_PX * (k + 0.75) for k in range(len(self.wish.lines))]
 
 

@@ -15,13 +15,22 @@ FILLED = 0.82
 COLOURS = {"compute": "mark0", "memory": "mark1"}
 """What bounds a layer's time; anything else is grey."""
 
+HOLLOW = "memory"
+"""What is drawn as an outline, to be distinguished without colour."""
+
 
 @dataclass(frozen=True)
 class LayerBars:
-    """A picture with a bar for each layer, what bounds them with its colour, and a sentence about them."""
+    """A picture with a bar for each layer, and a sentence about them.
+
+    Attributes:
+        svg: part of a page.
+        bounds: names of the colours of the outline and of the inside, by what bounds a time.
+        caption: the longest layer, and what bounds most of the time.
+    """
 
     svg: Markup
-    bounds: dict[str, str]
+    bounds: dict[str, tuple[str, str]]
     caption: str
 
 
@@ -40,11 +49,14 @@ def layer_bars(name: str, rows: Sequence[Row]) -> LayerBars:
         axes = figure.add_axes((0, 0, 1, 1), frameon=False, xlim=(-0.5, max(len(shown), 1) - 0.5))
         axes.set_axis_off()
         for k, row in enumerate(shown):
-            colour = LIGHT[bounds[row.text["bound"]]]
-            axes.bar(k, _time(row) or 0.0, FILLED, color=colour)[0].set_gid(f"layer-{k}")
+            edge = LIGHT[bounds[row.text["bound"]]]
+            fill = LIGHT["page"] if row.text["bound"] == HOLLOW else edge
+            bar = axes.bar(k, _time(row) or 0.0, FILLED, color=fill, edgecolor=edge, linewidth=1.4)[0]
+            bar.set_gid(f"layer-{k}")
         axes.set_ylim(bottom=0)
         svg = svg_of(figure, f"time of each layer of {name}: {_caption(shown)}", titles, stretched=True)
-    return LayerBars(svg, bounds, _caption(shown))
+    keys = {bound: (edge, "page" if bound == HOLLOW else edge) for bound, edge in bounds.items()}
+    return LayerBars(svg, keys, _caption(shown))
 
 
 def _caption(rows: Sequence[Row]) -> str:

@@ -67,11 +67,11 @@ class Meter:
         self._start = self.clock()
 
     def advance(self, work: float) -> None:
-        """So much more is done."""
+        """Count so much more work as done."""
         self.reach(self.done + work)
 
     def reach(self, done: float) -> None:
-        """So much is done."""
+        """Set how much work is done, and show it with the time left."""
         self.done = done
         left = time_left(done, self.total, self.clock() - self._start)
         self.bar.advance(round(PARTS * done / self.total) - self.bar.done, f"{self.name}{left and f', {left} left'}")
@@ -111,19 +111,19 @@ class Measurements:
         return [*jobs, self._timing(untimed)] if untimed else jobs
 
     def scores(self, variant: Variant) -> Scores | None:
-        """With exact seams."""
+        """Kept scores of a variant with exact seams, None where it is yet to be measured."""
         return self.cache.find("scores", self._key(variant), Scores)
 
     def cut_scores(self, variant: Variant, halo_px: int) -> Scores | None:
-        """Of images cut in four."""
+        """Kept scores of a variant on images cut in four, each part with so much halo; None where there are none."""
         return self.cache.find("seams", self._key(variant, halo_px=halo_px), Scores)
 
     def mae(self, variant: Variant) -> Scores | None:
-        """Of INT8 against the float network."""
+        """Kept mean differences of an INT8 variant from its float network; None where there are none."""
         return self.cache.find("mae", self._mae_key(variant), Scores) if self.float_of(variant) else None
 
     def times(self, variant: Variant) -> Times | None:
-        """On this machine."""
+        """Kept times of a variant on this machine, None where there are none."""
         return self.cache.find("host", self._host_key(variant), Times)
 
     def float_of(self, variant: Variant) -> Variant | None:

@@ -157,7 +157,7 @@ class CalibrationScenes:
         return named if named in sensor_names() else self.sensor
 
     def patches(self, model: onnx.ModelProto) -> Patches:
-        """For one network."""
+        """Simulated calibration patches for one network, by the sensor that it was trained for."""
         degraded = load_sensor(self.sensor_of(model))
         reference = reference_for(degraded)
         scenes = load_scenes(self.scenes, reference.nominal(), self.seed)
@@ -243,7 +243,7 @@ class MethodStore:
         return _model(self.networks[method])
 
     def radius_px(self, method: str) -> int:
-        """How far a network sees."""
+        """How far a network sees from each pixel, in pixels."""
         return receptive_radius_px(self.model(method))
 
     def digest(self, variant: Variant) -> str:

@@ -44,7 +44,7 @@ class Judge(Protocol):
     """Tells points apart, each with the interval of the difference."""
 
     def ratio(self, a: str, b: str) -> Interval:
-        """Cost of `a` over cost of `b`."""
+        """Interval of the cost of `a` over that of `b`."""
         ...
 
     def gain(self, a: str, b: str) -> Interval:
@@ -114,7 +114,7 @@ class Outcome:
 
     @property
     def name(self) -> str:
-        """What it is listed under."""
+        """The name under which its point is listed."""
         return self.point.name
 
     @property
@@ -124,7 +124,7 @@ class Outcome:
 
     @property
     def row(self) -> Row:
-        """For tables and documents."""
+        """Its figures and words as a row of the table of points."""
         return Row("points", self.name, self.figures, self.text)
 
     def value(self, key: str) -> float | None:
@@ -155,7 +155,7 @@ class Results:
         return _difference(first, second, tuple(self.sites), QUALITIES[key], self.seed)
 
     def ratio(self, a: str, b: str, key: str) -> Interval:
-        """Cost of `a` over cost of `b`."""
+        """Interval of the cost of `a` over that of `b`."""
         first, second = self.outcomes[a], self.outcomes[b]
         if key.startswith("host"):
             return self._host_ratio(first, second)
@@ -188,7 +188,7 @@ class Plane:
     y: str
 
     def ratio(self, a: str, b: str) -> Interval:
-        """Cost of `a` over cost of `b`."""
+        """Interval of the cost of `a` over that of `b`."""
         return self.results.ratio(a, b, self.x)
 
     def gain(self, a: str, b: str) -> Interval:
@@ -224,7 +224,7 @@ NO_INT8 = "not an INT8 network"
 
 @dataclass(frozen=True)
 class Assembly:
-    """Makes outcomes; `lacks` says of variants that cannot be had why not."""
+    """Puts together what was measured and what is predicted of each point; `lacks`: why a variant cannot be had."""
 
     measurements: Measurements
     swath: Swath

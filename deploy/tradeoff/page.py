@@ -13,7 +13,8 @@ from deploy.report.page import TEMPLATES, Grid, Provenance, figure_keys, grid_of
 from deploy.report.plots import plot_style
 from deploy.results import unit_of, words_of
 from deploy.tradeoff.layer_bars import layer_bars
-from deploy.tradeoff.plot import NARROW, STATES, WIDE, Points, drawn, plot_of, state_of
+from deploy.tradeoff.marks import STATES
+from deploy.tradeoff.plot import NARROW, WIDE, Points, drawn, plot_of, state_of
 from deploy.tradeoff.study import Crop, Front, Study
 from model.io.files import write_text
 from model.io.pictures import picture_url, stretch_of
@@ -73,7 +74,7 @@ def ordered(fronts: Sequence[Front]) -> list[Front]:
 
 
 def render_study(study: Study) -> str:
-    """The page as HTML."""
+    """The study as one HTML page, with its plots, tables and pictures."""
     provenance, points, fronts = Provenance(), Points.of(study.points), ordered(study.fronts)
     script = Markup((TEMPLATES / "tradeoff/page.js").read_text(encoding="utf-8"))  # noqa: S704 - our own file
     shown = {

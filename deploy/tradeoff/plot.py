@@ -11,22 +11,18 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
-from typing import Literal
 
-import numpy as np
 from markupsafe import Markup
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.colors import to_rgba
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.markers import MarkerStyle
 from matplotlib.patheffects import withStroke
 
 from deploy.report.plots import (
     LIGHT,
     PX_PER_INCH,
-    SERIES,
     TITLE_PX,
     look,
     new_figure,
@@ -35,89 +31,11 @@ from deploy.report.plots import (
     text_width,
 )
 from deploy.tradeoff.labels import Box, Label, Wish, place
+from deploy.tradeoff.marks import FILLINGS, RADIUS_PX, STATES, Mark, State, marks_of
 from deploy.tradeoff.outcome import QUALITIES
 from deploy.tradeoff.study import Front
 from model.io.files import whole_file
 from profiles.figures import Row
-
-Filling = Literal["full", "left", "bottom", "none"]
-FILLINGS: dict[str, Filling] = {"INT8 legal": "full", "INT8 free": "left", "bf16": "bottom", "float32": "none"}
-"""How matplotlib fills a marker, by precision."""
-
-MARKERS = ("o", "s", "^", "D", "*", "P", "v", "p", "X", "<", "d", ">", "h")
-"""matplotlib's markers that can be filled and distinguished without colour."""
-
-SIDES = {"s": 0.85, "D": 0.8, "*": 1.25}
-"""How much smaller or larger than others some of them have to be to look as large."""
-
-Polygon = list[tuple[float, float]]
-
-
-@dataclass(frozen=True)
-class Mark:
-    """How a point looks: matplotlib's marker, the name of a colour, and a filling."""
-
-    marker: str
-    colour: str
-    filling: Filling = "full"
-
-    @property
-    def outer(self) -> Polygon:
-        """Its outline in a square of side 1 about (0, 0), y downwards."""
-        return _polygon(self.marker, "full")
-
-    @property
-    def inner(self) -> Polygon:
-        """What is painted inside the outline; nothing of a hollow mark."""
-        return _polygon(self.marker, self.filling) if self.filling != "none" else []
-
-    def line(self, state: "State", x: float = 0, y: float = 0) -> Line2D:
-        """For matplotlib to draw at (x, y), as large as its state asks for."""
-        colour = LIGHT[self.colour]
-        return Line2D(
-            [x],
-            [y],
-            linestyle="",
-            marker=self.marker,
-            markersize=2 * RADIUS_PX[state] * SIDES.get(self.marker, 1),
-            fillstyle="full"
-            if self.filling == "none"
-            else self.filling,  # matplotlib's own "none" can be seen through
-            markerfacecolor=LIGHT["page"] if self.filling == "none" else colour,
-            markerfacecoloralt=LIGHT["page"],
-            markeredgecolor=colour,
-            markeredgewidth=EDGE * RADIUS_PX[state],
-            alpha=FADED if state == "dominated" else None,
-        )
-
-
-def _polygon(marker: str, filling: Filling) -> Polygon:
-    style = MarkerStyle(marker, filling)
-    corners = np.asarray(style.get_path().transformed(style.get_transform()).to_polygons()[0])
-    return [(x, -y) for x, y in corners.tolist()]
-
-
-def marks_of(methods: Iterable[str]) -> dict[str, Mark]:
-    """A mark for each method: no marker twice before all are used, no pair with a colour twice long after."""
-    count, colours = len(MARKERS), len(SERIES)
-    names = dict.fromkeys(methods)
-    return {
-        name: Mark(MARKERS[k % count], SERIES[(k % count + k // count) % colours]) for k, name in enumerate(names)
-    }
-
-
-State = Literal["front", "open", "dominated"]
-RADIUS_PX: dict[State, float] = {"front": 7.0, "open": 5.5, "dominated": 4.5}
-STATES: dict[State, str] = {
-    "front": "on the front",
-    "open": "not distinguished from it",
-    "dominated": "dominated beyond the intervals",
-}
-EDGE = 0.26
-"""Width of an outline, for a mark of radius 1."""
-
-FADED, BAR, PALE_BAR = 0.6, 0.75, 0.16
-"""Opacity of a dominated mark, of an interval, and of an interval of a point off the front."""
 
 
 @dataclass(frozen=True)
@@ -142,7 +60,7 @@ class Points:
 
 
 def method_of(row: Row) -> str:
-    """What the row's point runs."""
+    """The name of the method that the row's point runs."""
     return row.text.get("method", row.name)
 
 
@@ -221,7 +139,13 @@ class Plot:
 
 
 def plot_of(front: Front, points: Points, canvas: Canvas) -> Plot:
-    """The plot of one front."""
+    """Draw one front: quality up, cost to the right, a mark for each point that has both.
+
+    Args:
+        front: which two figures, and which points are on it.
+        points: all of the study, with their looks.
+        canvas: the size; it grows in height below a long legend.
+    """
     shown = points.on(front)
     rows = [row for _, row in shown]
     legend = legend_of(points, rows, canvas.width)
@@ -376,6 +300,10 @@ def _draw_front(axes: Axes, front: Front, rows: Sequence[Row]) -> list[tuple[flo
     axes.fill(*zip(*stairs, (right, bottom), strict=True), color=LIGHT["reached"], linewidth=0, zorder=0)
     axes.plot(*zip(*stairs, strict=True), color=LIGHT["ink"], linewidth=1.6, zorder=3, gid="front", clip_on=False)
     return stairs
+
+
+BAR, PALE_BAR = 0.75, 0.16
+"""Opacity of an interval, and of that of a point off the front."""
 
 
 def _draw_intervals(axes: Axes, front: Front, points: Points, rows: Sequence[Row]) -> None:

@@ -41,7 +41,7 @@ class Point:
 
     @property
     def name(self) -> str:
-        """What it is listed under."""
+        """The name under which the point is listed: its variant, and where it runs on the DPU."""
         if not self.configuration:
             return str(self.variant)
         return f"{self.variant}, {self.configuration}, tile {self.tile_px}, halo {self.halo}"
@@ -69,7 +69,7 @@ class Board:
 
 
 def network_points(method: str, precisions: Iterable[str], board: Board) -> list[Point]:
-    """The points of one network."""
+    """Points of one network: each precision, and INT8 legal in the tiles, halos and configurations worth a look."""
     variants = [Variant(method, "network", precision) for precision in precisions]
     points = [
         point
@@ -158,7 +158,7 @@ class Demand:
 
 
 def parse_demands(option: str, text: str | None) -> list[Demand]:
-    """Demands with commas between them.
+    """Read what a user demands, with commas between: `latency<=20s, psnr>=44`.
 
     Raises:
         OptionError: another text, an unknown name, or a unit that is not the figure's.

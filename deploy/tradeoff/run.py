@@ -160,7 +160,7 @@ def _put_together(
 
 
 def make_store(request: Request, cache: Cache) -> MethodStore:
-    """The methods of a study."""
+    """Collect the networks of a request and what chains know of the sensors."""
     networks = {network.name: network for network in find_networks(request.networks)}
     return MethodStore(
         networks, *request.profiles, CalibrationScenes(request.calibration, request.sensor, request.seed), cache
@@ -192,7 +192,7 @@ def lacking(store: MethodStore, points: Sequence[Point]) -> dict[str, str]:
 
 
 def calibrated_on(request: Request) -> str:
-    """In words."""
+    """What INT8 files were calibrated on, in words."""
     return f"the scenes of {request.calibration.name}" if request.calibration else "drawn scenes"
 
 
@@ -203,7 +203,7 @@ def layers_of(outcome: Outcome) -> list[Row]:
 
 
 def placement_of(measurements: Measurements, outcome: Outcome) -> list[Row]:
-    """What runs where."""
+    """Where each operation of a network's run on the board is placed."""
     assert isinstance(outcome.board, DpuRun)  # noqa: S101 - chosen so
     file = measurements.store.int8_file(outcome.point.variant)
     assert file is not None  # noqa: S101 - it ran on the board

@@ -66,7 +66,7 @@ def board_of(network: Network, swath: Swath) -> Board:
 
 
 def latency_s(model: onnx.ModelProto, dpu: Dpu, swath: Swath) -> float:
-    """Predicted time of a swath."""
+    """Predicted time of a swath on the DPU, in s."""
     prediction = predict_model(model, dpu, swath.tile_px)
     return swath_latency(prediction, math.ceil(swath.tiles / prediction.batch)).value or math.inf
 

@@ -6,14 +6,19 @@ from xml.etree import ElementTree as ET
 import pytest
 
 from deploy.dpu.board import load_dpu
+from deploy.dpu.checker.picture import FILLS, draw, require_picture, write_picture
 from deploy.dpu.checker.placement import Placement, place
-from deploy.dpu.checker.table import FILLS, draw, require_picture, write_picture
 from deploy.dpu.reading import read_network
 from deploy.report.plots import text_width
 from profiles.errors import OptionError
 from tests.deploy.dpu.graphs import Sketch, float_convbeers
 
 SVG = "{http://www.w3.org/2000/svg}"
+
+
+def of_class(root: ET.Element, kind: str, tag: str) -> list[ET.Element]:
+    """Elements within the groups of a class."""
+    return root.findall(f".//{SVG}g[@class='{kind}']/{SVG}{tag}")
 
 
 def placed(path: Path) -> Placement:
@@ -25,12 +30,15 @@ def test_every_node_is_drawn_in_its_devices_colour_and_says_which(tmp_path: Path
     middle = sketch.node("Sigmoid", sketch.conv("image"))
     placement = placed(sketch.save(tmp_path / "s.onnx", sketch.conv(middle)))
     root = ET.fromstring(draw(placement, "a < b & c"))  # noqa: S314 - our own output
-    boxes = [r for r in root.iter(f"{SVG}rect") if r.get("class") != "page"][len(FILLS) :]
-    labels = [t.text for t in root.iter(f"{SVG}text") if t.get("class") == "device"][len(FILLS) :]
+    boxes = of_class(root, "dot", "path")
+    labels = [text.text for text in of_class(root, "device", "text")][len(FILLS) :]
     devices = [node.device for node in placement.nodes]
     assert devices == ["DPU", "CPU", "DPU"]
     assert labels == devices
     assert [box.get("fill") for box in boxes] == [FILLS[device] for device in devices]
+    assert [group.findtext(f"{SVG}title") for group in root.iter(f"{SVG}g") if group.get("class") == "dot"] == [
+        f"{node.op.op_type}  {node.op.name}" for node in placement.nodes
+    ]
     words = [t.text or "" for t in root.iter(f"{SVG}text")]
     assert "Sigmoid always runs on the CPU" in " ".join(words)
     assert words[0] == "a < b & c"
@@ -50,10 +58,10 @@ def test_every_word_is_seen_on_a_phone(blocks: int, tmp_path: Path) -> None:
         texts = list(root.iter(f"{SVG}text"))
         for text in texts:
             assert float(text.get("x") or 0) + text_width(text.text or "", 13) <= 390
-        rows = [float(text.get("y") or 0) for text in texts if text.get("class") == "beside"]
+        rows = [float(text.get("y") or 0) for text in of_class(root, "beside", "text")]
         assert all(other - one >= 13 for one, other in pairwise(rows)), "lines below each other"
         assert float(root.get("height") or 0) > max(rows)
-        for path in root.iter(f"{SVG}path"):
+        for path in of_class(root, "edge", "path"):
             assert all(float(number) >= 0 for number in re.findall(r"-?[0-9.]+", path.get("d") or ""))
     for node in broken.nodes:
         assert node.op.name in ET.tostring(ET.fromstring(draw(broken, "net")), encoding="unicode")  # noqa: S314
@@ -64,8 +72,9 @@ def test_edges_join_writers_to_readers(tmp_path: Path) -> None:
     root = ET.fromstring(draw(placement, "net"))  # noqa: S314
     written = {name for node in placement.nodes for name in node.op.outputs}
     reads = sum(name in written for node in placement.nodes for name in node.op.inputs)
-    assert len(list(root.iter(f"{SVG}path"))) == reads
-    assert sum("C" in (p.get("d") or "") for p in root.iter(f"{SVG}path")) == 3  # two blocks' skips and the long one
+    edges = of_class(root, "edge", "path")
+    assert len(edges) == reads
+    assert sum("C" in (edge.get("d") or "") for edge in edges) == 3  # two blocks' skips and the long one
 
 
 def test_fills_are_light_enough_for_black_text_and_apart_in_brightness() -> None:
@@ -83,7 +92,7 @@ def test_a_page_and_a_drawing(tmp_path: Path) -> None:
     for name, start in (("g.svg", "<svg"), ("g.html", "<!doctype html>")):
         write_picture(placement, "net", tmp_path / name)
         assert (tmp_path / name).read_text().startswith(start)
-    assert "prefers-color-scheme:dark" in (tmp_path / "g.svg").read_text()
+    assert "prefers-color-scheme: dark" in (tmp_path / "g.svg").read_text()
 
 
 def test_other_endings_are_refused() -> None:

@@ -5,7 +5,7 @@ import pytest
 from PIL import Image, ImageDraw
 
 from deploy.report.plots import DARK, LIGHT, SERIES
-from deploy.tradeoff.plot import FILLINGS, MARKERS, Mark, marks_of
+from deploy.tradeoff.marks import FILLINGS, MARKERS, Mark, marks_of
 
 
 def luminance(colour: str) -> float:
