@@ -16,12 +16,12 @@ import onnx
 import psutil
 import torch
 
-from deploy.bench.host_state import Watch, memory_rise, watched
 from deploy.bench.interleaved import interleaved
 from deploy.bench.profile import node_rows, profile, timed
 from deploy.bench.tables import TABLE, Swath, board_cpu_row, efficiency
 from deploy.dpu.reading import network_of
 from deploy.export import other_precision
+from deploy.host_state import Watch, memory_rise, watched
 from model.processor import require_cores
 from model.simulator.acquire import MARGIN_PX, simulate_pair
 from model.simulator.detector import Draw

@@ -16,8 +16,8 @@ from pathlib import Path
 
 import numpy as np
 
-from deploy.bench.host_state import peak_memory
 from deploy.cluster import check_choice
+from deploy.host_state import peak_memory
 from deploy.restoration.engine import RestoredRow, Restorer, Say, Tick, restore_rows
 from deploy.restoration.options import Options
 from deploy.restoration.output import (

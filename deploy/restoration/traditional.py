@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from deploy.bench.host_state import peak_memory
+from deploy.host_state import peak_memory
 from deploy.restoration.engine import RestoredRow, as_stored, checked_strip
 from deploy.restoration.options import Compression
 from deploy.restoration.output import (

@@ -15,8 +15,8 @@ from threading import Lock
 
 import onnx
 
-from deploy.bench.host_state import peak_memory
 from deploy.cluster import PIECES_PER_SLOT, here, open_cluster, slots_here, unreachable
+from deploy.host_state import peak_memory
 from deploy.restoration.engine import RestoredRow, Restorer, Say, Tick, restore_row
 from deploy.restoration.options import Options
 from deploy.restoration.plan import Plan, Span, check_memory, is_bulky, restored_bytes, rows_bytes

@@ -18,10 +18,10 @@ from deploy.bench.host import (
     timed_rows,
     traditional_rows,
 )
-from deploy.bench.host_state import memory_rise, watched
 from deploy.bench.profile import node_rows, profile
 from deploy.bench.tables import Swath, board_cpu_row, slowdown
 from deploy.export import float_model, other_precision
+from deploy.host_state import memory_rise, watched
 from model.shipped import default_int8
 from profiles import load_sensor, load_target
 from profiles.constant import Constant

@@ -11,8 +11,8 @@ import pytest
 import tifffile
 
 from deploy import demo, methods
+from deploy.demo import INT8
 from deploy.library import restore
-from deploy.report.demo_page import INT8
 from deploy.restoration.engine import restore_dn, restore_floats
 from deploy.restoration.options import Options, Runtime
 from deploy.restoration.plan import plan_for
