@@ -23,8 +23,8 @@ from deploy.tradeoff import methods as tradeoff_methods
 from deploy.tradeoff import run as tradeoff
 from deploy.tradeoff.accuracy import cut_in_four
 from deploy.tradeoff.cache import Cache
-from deploy.tradeoff.methods import Calibration, Shelf, find_networks
-from deploy.tradeoff.points import Point, Unit
+from deploy.tradeoff.methods import CalibrationScenes, MethodStore, find_networks
+from deploy.tradeoff.points import Point, Variant
 from model.shipped import default_int8
 from profiles import load_sensor
 from quant.onnx_file import load_onnx, receptive_radius_px
@@ -70,32 +70,34 @@ def by_engine(dn: np.ndarray, options: Options) -> np.ndarray:
     return restore_dn(dn, infer, plan_for(network, (1, *ODD), options))
 
 
-def opened_by_tradeoff(path: Path, folder: Path) -> tuple[Shelf, Unit]:
-    """The network as a unit of a study."""
+def opened_by_tradeoff(path: Path, folder: Path) -> tuple[MethodStore, Variant]:
+    """The network as a variant of a study."""
     (network,) = find_networks([str(path)])
-    shelf = Shelf({network.name: network}, SENSOR, REFERENCE, Calibration(None, SENSOR.name, 0), Cache(folder))
-    return shelf, Unit(network.name, "network", "float32" if network.float_file else "INT8 legal")
+    store = MethodStore(
+        {network.name: network}, SENSOR, REFERENCE, CalibrationScenes(None, SENSOR.name, 0), Cache(folder)
+    )
+    return store, Variant(network.name, "network", "float32" if network.float_file else "INT8 legal")
 
 
 def crop_of_tradeoff(dn: np.ndarray, path: Path, tile_px: int, halo: str, folder: Path) -> np.ndarray:
     """As a study shows an operating point."""
-    shelf, unit = opened_by_tradeoff(path, folder)
-    lab: Any = SimpleNamespace(shelf=shelf)
+    store, variant = opened_by_tradeoff(path, folder)
+    measurements: Any = SimpleNamespace(store=store)
     pair: Any = SimpleNamespace(degraded=dn)
-    point: Any = SimpleNamespace(point=Point(unit, tile_px, halo))
-    return tradeoff._restored(point, pair, lab)
+    point: Any = SimpleNamespace(point=Point(variant, tile_px, halo))
+    return tradeoff._restored(point, pair, measurements)
 
 
 def exact_ways(path: Path, tile_px: int, folder: Path) -> dict[str, Restored]:
     """Every way from digital numbers (H, W) float32 to whole restored ones whose seams are exact."""
     network = load_onnx(path)
     infer, _ = open_runtime(Runtime.onnxruntime, network, threads=0)
-    shelf, unit = opened_by_tradeoff(path, folder)
+    store, variant = opened_by_tradeoff(path, folder)
     eyes: Any = SimpleNamespace(degraded=SENSOR, reference=REFERENCE)
     return {
         "evaluate": methods.method_named(str(path), SENSOR.nominal(), REFERENCE.nominal()).restore,
         "demo": demo._methods(network, eyes)[INT8],
-        "tradeoff's scores": shelf.open(unit).restore,
+        "tradeoff's scores": store.open(variant).restore,
         "tradeoff's seams": cut_in_four(infer, receptive_radius_px(network)),
         "tradeoff's crops": partial(crop_of_tradeoff, path=path, tile_px=tile_px, halo="exact", folder=folder),
         "stress": lambda dn: np.rint(Network(network).restore(dn, tile_px=tile_px)),
