@@ -5,12 +5,11 @@
   which refuse (`refusal`) rather than guess;
 - `bootstrap` says how far a mean over images can be trusted.
 
-What needs no torch is offered here, for the gate and the reports; import `perceptual` and `sharpness` by themselves.
+Offered here is what needs no torch, for the gate and the reports; the instruments are imported from their modules.
 """
 
 from model.metrics.bootstrap import site_interval
 from model.metrics.fidelity import psnr_db, ssim
-from model.metrics.noise_level import NoiseLevel, noise_level
 from model.metrics.refusal import Refusal
 
-__all__ = ["NoiseLevel", "Refusal", "noise_level", "psnr_db", "site_interval", "ssim"]
+__all__ = ["Refusal", "psnr_db", "site_interval", "ssim"]

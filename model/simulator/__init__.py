@@ -5,9 +5,9 @@
 - `plan` decides, with proven bounds, which optional effects a scene can show; `acquire` puts all in order.
 """
 
-from model.simulator.acquire import Pair, acquire, simulate_pair
+from model.simulator.acquire import Pair, simulate_pair
 from model.simulator.detector import Draw, to_dn, to_radiance
-from model.simulator.mtf import mtf, sensor_transfer
+from model.simulator.mtf import sensor_transfer
 from model.simulator.plan import Plan, make_plan
 from model.simulator.procedural import procedural_scene
 from model.simulator.sampling import Scene, read_scene, resample
@@ -17,9 +17,7 @@ __all__ = [
     "Pair",
     "Plan",
     "Scene",
-    "acquire",
     "make_plan",
-    "mtf",
     "procedural_scene",
     "read_scene",
     "resample",

@@ -9,8 +9,6 @@ Every step takes and gives strips of rows (`rows`), so a chain of any height run
 NaN marks missing pixels.
 """
 
-from model.traditional.compensate import compensate
-from model.traditional.nl_bayes import nl_bayes
 from model.traditional.noise import Noise, destabilise, stabilise
 from model.traditional.peers import PEERS
 from model.traditional.pipeline import Chain, restore_strips, restore_traditional
@@ -21,9 +19,7 @@ __all__ = [
     "QUALITIES",
     "Chain",
     "Noise",
-    "compensate",
     "destabilise",
-    "nl_bayes",
     "restore_strips",
     "restore_traditional",
     "stabilise",
