@@ -67,6 +67,7 @@ def sensor_values(sensor: Sensor) -> dict[str, float]:
     full_scale = sensor.max_dn / sensor.gain_dn_per_radiance
     rounding = 1 / (12 * sensor.gain_dn_per_radiance**2)
     smear = sensor.effects.get("smear")
+    # A network knows no smear of its own: what that leaves of the contrast along the track is counted there.
     kept = abs(float(np.sinc(0.5 * smear.length_px))) if isinstance(smear, Smear) else 1.0
     sigmas = [math.sqrt(sensor.noise_sigma(full_scale / part) ** 2 + rounding) / full_scale for part in (16, 4)]
     across, along = sensor.mtf_axes
@@ -107,6 +108,7 @@ class SensorFamily:
     def draw(self, generator: np.random.Generator) -> Sensor:
         """One sensor. The MTF along the track is more often near that across than far below it."""
         mtf = _log_uniform(generator, *RANGES["mtf_across"])
+        # The square draws more sensors with axes that are nearly alike, as real ones have.
         along = max(mtf * LEAST_ALONG ** float(generator.uniform() ** 2), RANGES["mtf_along"][0])
         full_scale = self.like.max_dn / self.like.gain_dn_per_radiance
         sigma = full_scale / 4 / _log_uniform(generator, *SNR_BRIGHT)

@@ -26,8 +26,8 @@ ACTIVATION, WEIGHT = 255, 127
 RESULT = 200
 """What the sum of a whole window becomes in 8 bits."""
 
-FEWEST_TURNS, ASKING_S = 3, 0.1
-"""Of a timed question: its first turn sets up, and others may meet a busy machine."""
+FEWEST_ROUNDS, ASKING_S = 3, 0.1
+"""Of a timed question: its first round sets up, and others may meet a busy machine."""
 
 _decided: dict[str, str] = {}
 
@@ -109,14 +109,14 @@ def bfloat16_speed() -> float:
         result.float().sum().backward()
         return time.perf_counter() - begun
 
-    threads, begun, turns = torch.get_num_threads(), time.perf_counter(), list[tuple[float, float]]()
+    threads, begun, rounds = torch.get_num_threads(), time.perf_counter(), list[tuple[float, float]]()
     torch.set_num_threads(1)  # threads that wait for a core which others use would be timed instead
-    try:  # in turns, so that what else the machine does falls on both
-        while len(turns) < FEWEST_TURNS or time.perf_counter() - begun < ASKING_S:
-            turns.append((time_s(in_bfloat16=False), time_s(in_bfloat16=True)))
+    try:  # interleaved, so that what else the machine does falls on both
+        while len(rounds) < FEWEST_ROUNDS or time.perf_counter() - begun < ASKING_S:
+            rounds.append((time_s(in_bfloat16=False), time_s(in_bfloat16=True)))
     finally:
         torch.set_num_threads(threads)
-    ratio = min(float32_s for float32_s, _ in turns) / min(bfloat16_s for _, bfloat16_s in turns)
+    ratio = min(float32_s for float32_s, _ in rounds) / min(bfloat16_s for _, bfloat16_s in rounds)
     _decided["bfloat16"] = f"convolutions at {ratio:.2g} times the speed of float32"
     return ratio
 

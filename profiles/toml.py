@@ -35,6 +35,7 @@ def read_toml_text(path: Path) -> dict[str, object]:
         found = tomllib.loads(text)
     except RecursionError:
         raise ValueError(TOO_DEEP) from None
+    # TOML knows no largest whole number, and Python refuses to print one of more than 4300 digits.
     _check(found, 10**2000)
     return found
 

@@ -41,7 +41,9 @@ def flip_bits(
     choices = values.size if bit is not None else values.size * bits
     chosen = generator.choice(choices, min(count, choices), replace=False, shuffle=False)
     places, which = (chosen, np.full_like(chosen, bit)) if bit is not None else divmod(chosen, bits)
+    # As unsigned bits of the memory's width: the sign comes back at the end.
     raw = (values.ravel().astype(np.int64) & ((1 << bits) - 1)).copy()
+    # `at`, because two flips may fall into one number, and plain indexing would keep the last alone.
     np.bitwise_xor.at(raw, places, np.left_shift(1, which))
     if np.issubdtype(values.dtype, np.signedinteger):
         raw = np.where(raw >> (bits - 1) == 1, raw - (1 << bits), raw)
@@ -62,6 +64,7 @@ def as_stored(core: IntCore) -> IntCore:
 
 def _narrow(op: IntConv) -> IntConv:
     bias, shift = op.bias.astype(np.int64), 0
+    # Bits go from the low end as long as the bias is too large for int8.
     while (np.clip(bias >> shift, INT8_MIN, INT8_MAX) != bias >> shift).any():
         shift += 1
     if ((bias >> shift) << shift != bias).any():
@@ -83,6 +86,7 @@ def flip_weights(core: IntCore, count: int, generator: np.random.Generator) -> I
     """The core with `count` bits of its weights and bias flipped, wherever they fall."""
     convs = [op for op in core.ops if isinstance(op, IntConv)]
     sizes = np.array([op.weight.size + op.bias.size for op in convs])
+    # How many of the bits fall into each layer, as if all were drawn from one memory without replacement.
     share = generator.multivariate_hypergeometric(sizes * INT8_BITS, count)
     hit = {op.name: flip_conv(op, int(n), generator) for op, n in zip(convs, share, strict=True) if n}
     return with_ops(core, hit)

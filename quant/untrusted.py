@@ -102,6 +102,7 @@ def _check_tensor(tensor: TensorProto, where: str) -> None:
     if len(tensor.dims) > RANK or min(tensor.dims, default=0) < 0:
         got = f"{tensor.name!r} of {times(tensor.dims)}"
         raise refused(where, f"at most {RANK} sizes from 0 on", got, "export it again")
+    # A tensor that states more than it holds makes a runtime allocate first and read afterwards.
     stated = math.prod(tensor.dims)
     raw = tensor.HasField("raw_data")
     present = len(tensor.raw_data) / value_bytes if raw else len(getattr(tensor, field))
@@ -160,6 +161,7 @@ def check_runnable(model: onnx.ModelProto, where: str) -> None:
     if model.functions or model.graph.sparse_initializer:
         raise refused(where, "plain operators and weights", "functions or sparse weights", "export it without them")
     constants = {tensor.name: tensor for tensor in model.graph.initializer}
+    # What follows from the image is sized by it; what follows from constants alone may have any size.
     of_image = {value.name for value in model.graph.input} - set(constants)
     for node in model.graph.node:
         _check_operator(node, where)

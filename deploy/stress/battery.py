@@ -71,6 +71,7 @@ def run_battery(
     outcomes = []
     with torch_threads(1):  # on images this small a second thread only waits
         for case in cases:
+            # Seeded by its name: a case draws the same images whichever others are asked for.
             images = case.draw(side_px, np.random.default_rng([seed, zlib.crc32(case.name.encode())]))
             for stage in stages:
                 outcomes.append(_outcome(subject, case, stage, images))

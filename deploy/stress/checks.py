@@ -61,6 +61,7 @@ def ringing(image: np.ndarray, source: np.ndarray, radius_px: int, allowed: floa
     One per cent of full scale does not count, and contrast is ten per cent at least: flat ground has none.
     """
     low, high = local_range(source, radius_px)
+    # Rounding and noise leave the range by a little on any ground.
     beyond = np.maximum(np.maximum(image - high, low - image) - FLAT_DN, 0)
     share = beyond / np.maximum(high - low, 10 * FLAT_DN)
     return Measure("ringing", 100 * float(share.max()), allowed, "% of contrast")

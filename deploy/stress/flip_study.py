@@ -50,6 +50,7 @@ def price_rows(target: FaultTarget, prediction: Prediction, dpu: Dpu) -> list[Ro
 def _row(name: str, time_s: float, source: str, prediction: Prediction, spread: float) -> Row:
     tile_s = prediction.batch_time_s / prediction.batch
     slow, fast = prediction.fps_interval
+    # The host prepares the next tile while the DPU runs: only what does not fit beside it costs frames.
     beside = frame_rate(prediction.batch_time_s, prediction.batch, prediction.host_s + time_s)
     times_s, most = (time_s / spread, time_s * spread), 100 * time_s * spread * fast
     figures = {

@@ -105,6 +105,7 @@ def correct_faults(
     The other two copies of the shifts suffer flips at the same rate, each on its own.
     """
     core = scrubbed(injected.core, target.core, target.guards.checksums)
+    # The copy that the injection hit is the first of the three.
     first = {**target.shifts, **injected.faults.shifts}
     second, third = (_flip_copy(target, per_megabit, generator) for _ in range(2))
     shifts = voted((first, second, third)) if injected.faults.shifts else {}
@@ -312,11 +313,14 @@ def clean_db(target: FaultTarget, number: int) -> tuple[float, float]:
 
 def _draw(target: FaultTarget, memory: str, rate: float, draw: int, seed: int, clean: tuple[float, float]) -> Draw:
     image, reference = target.pairs[draw % len(target.pairs)]
+    # Keyed by what is drawn, so that a draw is the same whatever else runs.
     generator = np.random.default_rng([seed, draw, list(MEMORIES).index(memory), rates_of(memory).index(rate)])
     injected = MEMORIES[memory](target, image, rate, generator)
+    # No flip, no change: the fault-free figures stand, at no cost.
     if injected.flips == 0:
         return Draw(0, (*clean, clean[1]))
     bare, clamped = (quality_db(target, injected, reference, c) for c in (False, True))
+    # Maps and pixels live for one tile: scrubbing has nothing to compare them with.
     if memory not in CORRECTABLE:
         return Draw(injected.flips, (bare, clamped, clamped))
     corrected = correct_faults(target, injected, rate, generator)

@@ -133,6 +133,7 @@ def reference(subject: Subject, case: Case, image: np.ndarray) -> list[Measure]:
         _restored(core, crop, even),
         _restored(core, crop, up),
     )
+    # A peak above its proof would mean that the proof is wrong, not the network.
     over = max(report.peak_bits - report.proven_bits for report in reports)
     return [
         not_finite(by_rule),

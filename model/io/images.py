@@ -114,6 +114,7 @@ def _read_tiff(path: Path) -> np.ndarray:
         for page in series.pages:
             check_page(path, page)  # type: ignore[arg-type]  # frames have what pages have; none is damage
         pixels = np.asarray(series.asarray())
+    # A last axis of 1, 3 or 4 may be bands as well; then nothing says otherwise and it stays.
     if pixels.ndim == 3 and pixels.shape[0] in (1, 3, 4) and pixels.shape[2] not in (1, 3, 4):
         pixels = np.moveaxis(pixels, 0, 2)  # planar storage: bands first
     return pixels[..., 0] if pixels.ndim == 3 and pixels.shape[2] == 1 else pixels

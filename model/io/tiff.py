@@ -119,6 +119,7 @@ def check_page(path: Path, page: tifffile.TiffPage) -> None:
         expected, got = f"strips or tiles that fit in {room}", f"{size} for one"
         raise MachineError(str(path), expected=expected, got=got, remedy="rewrite it in smaller tiles")
     _check_whole(path, page)
+    # A frame inside a strip states its own size, which the decoder believes rather than the page's.
     if page.compression == JPEG:
         _check_frames(path, page)
     elif page.compression in DEFLATE and find_spec("imagecodecs") is None:

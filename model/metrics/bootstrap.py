@@ -36,6 +36,7 @@ def _mean_interval(numbers: np.ndarray, names: np.ndarray, generator: np.random.
     groups = [numbers[names == name] for name in np.unique(names)]
     sums, counts = (np.array([f(group) for group in groups]) for f in (np.sum, np.size))
     drawn = generator.integers(len(groups), size=(DRAWS, len(groups)))
+    # Sums over counts and not a mean of means: a site of many images counts for them.
     means = sums[drawn].sum(1) / counts[drawn].sum(1)
     low, high = np.percentile(means, [50 * (1 - LEVEL), 50 * (1 + LEVEL)])
     return float(low), float(high)

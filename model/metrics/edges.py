@@ -94,6 +94,7 @@ def _rise(image: np.ndarray, axis: int) -> float:
 
 def _steepest(image: np.ndarray) -> np.ndarray:
     """Column of the steepest rise of each row, in a derivative smoothed over 9 pixels."""
+    # Wide enough that noise does not win over the edge of a faint, blurred row.
     kernel = np.hamming(9)
     rise = np.diff(image, axis=1)
     smooth = np.stack([np.convolve(row, kernel, mode="same") for row in rise])
@@ -120,6 +121,7 @@ def _refined(image: np.ndarray, rows: np.ndarray, slope: float, offset: float) -
     place = np.arange(image.shape[1] - 1) + 0.5 - centre
     weights = np.diff(image[rows], axis=1) * hamming(place)
     total = weights.sum(1)
+    # A row crossed by a defect has no rise, or one elsewhere; its centroid would be anywhere.
     sound = total > 0.25 * np.median(total)
     if np.median(total) <= 0 or sound.sum() < MIN_ROWS:
         return Refusal("no-convergence", f"only {int(sound.sum())} rows rise at the line")
@@ -261,6 +263,7 @@ class EdgeSpread:
         place = np.arange(-HALF + 1, HALF) / BINS_PER_PX
         wave = np.cos(2 * math.pi * frequencies[:, None] * place) * hamming(place)
         weights = np.zeros((frequencies.size, 2 * HALF + 1))
+        # The derivative as a central difference, turned onto the weights so that it costs no pass of its own.
         weights[:, 2:] += wave / 2
         weights[:, :-2] -= wave / 2
         averaging = np.exp(-2 * (math.pi * frequencies) ** 2 * self.variance_px2)

@@ -64,6 +64,7 @@ def cut_windows(image: np.ndarray, side_px: int, clipped_at: float) -> Windows:
     whole = np.asarray(image[: rows * side_px, : columns * side_px], np.float64)
     pixels = whole.reshape(rows, side_px, columns, side_px).swapaxes(1, 2).reshape(-1, side_px**2)
     with np.errstate(invalid="ignore"):
+        # NaN compares false and so is not sound.
         sound = ((pixels > 0) & (pixels < clipped_at)).all(1)
     return _split(pixels[sound], side_px)
 
@@ -193,6 +194,7 @@ def _weighted_line(windows: Windows) -> NoiseLine:
         weights = windows.degrees[1] / (2 * expected**2)
         covariance = np.linalg.inv(terms.T * weights @ terms)
         line = covariance @ (terms.T * weights @ windows.variance)
+        # A line that dips to 0 would give its dark windows all of the weight.
         expected = np.maximum(terms @ line, 0.05 * expected.mean())
     scatter = float((weights * (windows.variance - terms @ line) ** 2).sum() / (windows.mean.size - 2))
     return NoiseLine(line, covariance * max(scatter, 1.0), windows)

@@ -5,7 +5,7 @@
 - `plan` decides, with proven bounds, which optional effects a scene can show; `acquire` puts all in order.
 """
 
-from model.simulator.acquire import Pair, acquire, simulate_pair
+from model.simulator.acquire import Pair, simulate_pair
 from model.simulator.detector import Draw, to_dn, to_radiance
 from model.simulator.mtf import sensor_transfer
 from model.simulator.plan import Plan, make_plan
@@ -17,7 +17,6 @@ __all__ = [
     "Pair",
     "Plan",
     "Scene",
-    "acquire",
     "make_plan",
     "procedural_scene",
     "read_scene",

@@ -64,6 +64,7 @@ def simulate_planned(
     """
     height, width = scene.radiance.shape
     if "mtf" in plan.skipped:
+        # Without any blur a target pixel is the mean of its scene pixels, which needs no transform.
         pixels = torch.nn.functional.avg_pool2d(scene.radiance[None, None], scene.oversampling)[0, 0]
     else:
         kept = without(sensor, plan.skipped)

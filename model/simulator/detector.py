@@ -97,6 +97,7 @@ def add_defects(dn: Tensor, defects: Defects, max_dn: int, generator: np.random.
     draw = torch.from_numpy(generator.random(tuple(dn.shape), dtype=np.float32)).to(dn.device)
     dead, hot = defects.dead_per_million / 1e6, defects.hot_per_million / 1e6
     dn = torch.where(draw < dead, torch.zeros_like(dn), dn)
+    # One draw decides both, so a pixel is never dead and hot.
     return torch.where(draw >= 1 - hot, torch.full_like(dn, float(max_dn)), dn) if hot > 0 else dn
 
 

@@ -219,6 +219,7 @@ def make_plan(sensor: Sensor, stats: SceneStats, tolerance_dn: float = TOLERANCE
     """Decide for every effect of a sensor on a scene of these statistics."""
     bounds = effect_bounds(sensor, stats)
     spent, hidden = 0.0, set()
+    # Smallest first: as many effects as the tolerance can pay for are left out.
     for name, bound in sorted(bounds.items(), key=lambda item: item[1]):
         if bound > 0 and spent + bound <= tolerance_dn:
             spent += bound
@@ -235,6 +236,7 @@ def effect_bounds(sensor: Sensor, stats: SceneStats) -> dict[str, float]:
     if isinstance(smear, Smear):
         direct = smear_bound_dn(smear, stats, ringing, gain)
         bounds["smear"] = behind(direct, sensor, _after("smear"))
+        # The smear widens the range that every later effect may meet, whether it is applied or left out.
         low, high, total = low - direct / gain, high + direct / gain, ringing * smear_ringing(smear, stats)
     bounds["mtf"] = behind(blur_bound_dn(stats, total, gain), sensor, _after("mtf"))
     for name in ("veil", "full_well", "prnu"):

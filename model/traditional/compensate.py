@@ -45,6 +45,7 @@ def filter_strips(strips: Iterable[Tensor], height: int, kernel: Tensor) -> Iter
     Blocks lie on a grid of their own, so the strips that came change no bit. NaN pixels are filled from their
     neighbours first, and NaN again in the end.
     """
+    # The grid of blocks is fixed from row 0: the result may not depend on how the strips were cut.
     rows, radius = Rows(strips), kernel.shape[0] // 2
     for top in range(0, height, BLOCK_PX):
         bottom = min(top + BLOCK_PX, height)
@@ -78,11 +79,13 @@ def compensation_kernel(mtf_from: Axes, mtf_to: Axes, epsilon: float, radius_px:
     The weight that is cut off comes back as a smooth hill over the whole filter. So the gain is exact at DC, and
     away from it by more than some cycles per 2 R pixels; dividing by the sum would raise every other frequency.
     """
+    # Sampled this finely, the slow tail folds back onto the filter little.
     side = 8 * radius_px
     gain = compensation_gain(side, side, mtf_from, mtf_to, epsilon)
     whole = torch.fft.irfft2(gain, s=(side, side)).roll((radius_px, radius_px), (0, 1))
     kernel: Tensor = whole[: 2 * radius_px + 1, : 2 * radius_px + 1].clone()
     window = torch.hann_window(2 * radius_px + 3, periodic=False, dtype=torch.float64)[1:-1]
+    # Smooth, so that what it adds lies at frequencies near 0 alone.
     hill = window[:, None] * window
     kernel += (1 - kernel.sum()) * hill / hill.sum()
     return kernel

@@ -48,6 +48,7 @@ def estimate_groups(
     shrinkage = torch.zeros_like(covariance)
     shrinkage[~flat] = _shrinkage(covariance[~flat], noise, settings)
     estimates = torch.baddbmm(noisy, centred, shrinkage, alpha=-1)
+    # The plain mean knows that the signal is one number; the Gaussian model would have to find that out.
     estimates[flat] = mean[flat].mean(2, keepdim=True)
     return estimates
 
@@ -89,6 +90,7 @@ def _shrinkage(covariance: Tensor, noise: Noise, settings: PassSettings) -> Tens
         diagonal.add_(JITTER * noise.sigma**2)
     factor, failed = torch.linalg.cholesky_ex(covariance)
     lost = failed != 0
+    # Any factor does there, since its result is thrown away: the batch has to stay one call.
     factor[lost] = torch.eye(factor.shape[1], dtype=factor.dtype, device=factor.device)
     shrinkage = torch.cholesky_inverse(factor) @ sigma_matrix
     shrinkage[lost] = 0
@@ -135,8 +137,10 @@ def window_distances(guide: Tensor, rows: Tensor, columns: Tensor, side_px: int,
     for dy in range(window_px):
         shifted = guide[dy : dy + height].unfold(1, width, 1)[:, :window_px]  # (height, window, width)
         squares = (shifted - centre).square_().reshape(height, -1)
+        # Two small matrix products add up the k * k squares at the references alone, not at every pixel.
         sums = (box_rows @ squares).reshape(-1, width) @ box_columns.T
         distances[:, :, dy] = sums.reshape(len(rows), window_px, -1).mT
+    # Equal patches are common in drawn areas, and the reference has to be in its own group.
     distances[:, :, half, half] = -1
     return distances.reshape(len(rows) * len(columns), -1)
 
@@ -176,6 +180,7 @@ def denoise_pass(
         rows = mirrored(top, bottom, height)
         noisy_rows, guide_rows = noisy.window(rows), guide.window(rows)
         sums = _row_of_tiles(noisy_rows, guide_rows, run - run[0], noise, settings, stride_px)
+        # Tiles of two rows overlap: what the row above left below its own share counts here.
         if carried is not None:
             for sum_, before in zip(sums, carried, strict=True):
                 sum_[: len(before)] += before
@@ -230,6 +235,7 @@ def _tile(noisy: Tensor, guide: Tensor, places: Places, noise: Noise, settings: 
         weights = torch.ones_like(numbers, dtype=noisy.dtype) if taken is None else taken
         if taken is not None:
             estimates *= taken[..., None]
+        # A patch lies in many groups, so its estimates add up here before any pixel is touched.
         total.index_add_(0, numbers.reshape(-1), estimates.reshape(-1, side**2))
         count.index_add_(0, numbers.reshape(-1), weights.reshape(-1, 1))
     return overlap_add(total, noisy.shape, side), overlap_add(count.expand_as(total), noisy.shape, side)
@@ -253,6 +259,7 @@ def similar_groups(
         _rule_out(distances, first + steps, patch_matrix(known, settings.side_px).all(1))
     usual, most = settings.similar, min(settings.most_similar, distances.shape[1])
     candidate, nearest = nearest_first(distances, usual, most)
+    # Beyond the usual number a patch still counts if its pixels differ by alike_rms at most.
     enough = nearest[:, :usual].amax(1, keepdim=True).clamp(min=settings.alike_rms**2 * settings.side_px**2)
     taken = (nearest <= enough) & nearest.isfinite()
     sizes = taken.sum(1)
@@ -309,6 +316,7 @@ def nl_bayes_strips(strips: Iterable[Tensor], height: int, noise: Noise, quality
     if noise.sigma == 0:
         yield from (strip.clone() for strip in strips)
         return
+    # The second pass reads the noisy rows again, behind the first: tee keeps those between.
     as_guide, for_first, for_second = tee(finite_or_missing(strips), 3)
     basic = denoise_pass(Rows(for_first), Rows(as_guide), height, noise, first_pass(noise.sigma), quality.stride_px)
     settings = second_pass(noise.sigma, quality)

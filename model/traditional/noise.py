@@ -72,6 +72,7 @@ def stabilise(radiance: Tensor, sensor: Sensor) -> Tensor:
     _check(sensor)
     dark = math.sqrt(sensor.beta)
     denominator = (sensor.alpha * radiance.clamp(min=0) + sensor.beta).sqrt() + dark
+    # With beta = 0 the denominator is 0 at L = 0, where f is 0 too.
     return (2 * radiance / denominator).where(denominator != 0, 0.0)
 
 

@@ -52,8 +52,10 @@ def richardson_lucy(dn: Tensor, chain: Chain) -> Tensor:
         height, width = image.shape
         side = 2 * PAD_PX + 1
         spread = torch.fft.irfft2(blur, s=(height, width)).roll((PAD_PX, PAD_PX), (0, 1))[:side, :side]
+        # Richardson-Lucy is defined for kernels that are nowhere negative, and this one may ring below 0.
         spread = spread.clamp(min=0)
         point = (spread / spread.sum()).numpy()
+        # It divides by its own blurred estimate, which goes to 0 where the image is 0.
         light = image.clamp(min=1e-6).numpy()
         return torch.from_numpy(restoration.richardson_lucy(light, point, RICHARDSON_LUCY_STEPS, clip=False))
 

@@ -25,6 +25,7 @@ class Rows:
         top, bottom = int(rows.min()), int(rows.max()) + 1
         while self._top + sum(map(len, self._held)) < bottom:
             self._held.append(self._next())
+        # Strips above the window are never asked for again: forgetting them bounds the memory.
         while self._top + len(self._held[0]) <= top:
             self._top += len(self._held.pop(0))
         held = self._held[0] if len(self._held) == 1 else torch.cat(self._held)
@@ -80,6 +81,7 @@ def fill_with_local_means(image: Tensor, known: Tensor) -> Tensor:
     filled = image.where(known, 0.0)
     if bool(known.all()) or max(image.shape) == 1:
         return filled
+    # Odd sides get a row or column that counts as unknown, so that every 2 x 2 is whole.
     odd = (0, image.shape[1] % 2, 0, image.shape[0] % 2)
     count = _sum_2x2(pad(known.to(image.dtype), odd))
     mean = _sum_2x2(pad(filled, odd)) / count.clamp(min=1)

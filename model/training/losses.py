@@ -53,6 +53,7 @@ class RestorationLoss:
             reference: the same shape.
         """
         weights = self.weights
+        # In bfloat16 the differences of nearly equal images would lose most of their digits.
         with torch.autocast(restored.device.type, enabled=False):
             restored, reference = restored.float(), reference.float()
             terms = {"l1": (restored - reference).abs().mean()}

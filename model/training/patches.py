@@ -97,6 +97,7 @@ class PatchSource:
                 within = 0
 
     def _shard(self, number: int) -> tuple[Tensor, ...]:
+        # Keyed by its number and not drawn in sequence: a resumed run makes the same shard.
         own = number * self.worker.count + self.worker.rank
         generator = Draw(self.seed, own).generator("shard")
         wanted, pieces, vectors, count = self.batch * self.SHARD_BATCHES, list[Tensor](), list[Tensor](), 0
@@ -106,6 +107,7 @@ class PatchSource:
             vectors.append(vector.expand(len(piece), -1))
             count += len(piece)
             if count >= wanted:
+                # Mixed, because neighbours of one scene would make a batch whose gradient knows one scene.
                 order = torch.from_numpy(generator.permutation(count)[:wanted])
                 patches = torch.cat(pieces)
                 patches = patches[order.to(patches.device)]
@@ -136,6 +138,7 @@ def visit(scene: Visited, recipe: PatchRecipe, generator: np.random.Generator) -
         return scene.spectrum.real.new_empty(0, 2, recipe.patch_px, recipe.patch_px), torch.empty(4)
     images, sensor = _acquire_pair(scene, recipe, ratio, generator)
     patches = cut(images, recipe.patch_px, generator)
+    # A network that knows the sensor learns that its axes changed places; a blind one cannot.
     alike = sensor.mtf_axes[0] == sensor.mtf_axes[1]
     quarter, mirrored = draw_turn(generator, quarters=alike or recipe.told is not None)
     vector = tell(sensor).vector
@@ -146,7 +149,9 @@ def _acquire_pair(
     scene: Visited, recipe: PatchRecipe, ratio: int, generator: np.random.Generator
 ) -> tuple[Tensor, Sensor]:
     """Degraded and reference, (2, H, W), and the sensor of the degraded one."""
+    # Exposure is linear, so it scales the spectrum that is already there.
     spectrum = scene.spectrum * float(generator.uniform(*recipe.exposures))
+    # One phase for both images of a pair: restoring must not shift anything.
     phase_y, phase_x = (float(v) for v in generator.uniform(-ratio / 2, ratio / 2, 2))
     draw = Draw(int(generator.integers(2**31)))
     images, sensors = list[Tensor](), list[Sensor]()

@@ -129,6 +129,7 @@ class Trainer:
         last = self.step == self.recipe.steps
         if self.step % schedule.report_steps == 0 or last:
             progress = meter.read()
+            # Every worker reads the meter, which clears it, but one reports.
             if self.worker.first:
                 schedule.report(progress)
         if self.worker.first and schedule.validate_steps and (self.step % schedule.validate_steps == 0 or last):
@@ -148,6 +149,7 @@ class Trainer:
         total.backward()  # type: ignore[no-untyped-call]
         norm = torch.nn.utils.clip_grad_norm_(self.network.parameters(), self.recipe.gradient_norm)
         self.step += 1
+        # All workers skip a step that is bad for one of them, or their weights would part.
         bad = not bool(torch.isfinite(total) & torch.isfinite(norm))
         if self.worker.any(bad, self.device):
             self.guards.skipped(self.step)
@@ -168,6 +170,7 @@ class Trainer:
         return total + self.recipe.distil * distance, {**terms, "teacher": distance.detach()}
 
     def _average(self) -> None:
+        # Early on the average follows fast, or the first random weights would stay in it for long.
         decay = min(self.recipe.ema_decay, (1 + self.step) / (10 + self.step))
         for name, value in self.network.state_dict().items():
             self.average[name].lerp_(value, 1 - decay)
