@@ -1,5 +1,5 @@
 """Reports: one self-contained HTML file, pictures embedded, every number with its mode.
 
-`page` renders tables and figures, `pictures` shows 12-bit images, `plots` draws with matplotlib; `blame_page` and
-`demo_page` are the pages of `quantize --report` and `demo`.
+- `page` renders figures, tables and pictures; `plots` draws with matplotlib;
+- `evaluation_page` and `sensitivity_page` say what stands on the pages of `evaluate` and of `quantize --report`.
 """

@@ -1,1 +1,7 @@
-"""What the DPU can run: its rules, one small function each, and where each node of a network goes."""
+"""What the DPU can run: its rules, one small function each, and where each node of a network goes.
+
+- `conv_rules`, `number_rules`, `other_rules`: the rules, whose docstrings are their text;
+- `operators`: which rules each operator must keep; `finding`: what breaks one, and the remedy;
+- `placement`: each node on the DPU or the CPU, and the subgraphs; `table`: all of it as rows; `picture`: as a graph;
+- `traditional`: what of the traditional pipeline could run there.
+"""

@@ -1,0 +1,61 @@
+"""What the packages offer by name: a change here is a change for whoever imports them."""
+
+import subprocess
+import sys
+from importlib import import_module
+from pkgutil import iter_modules
+
+import pytest
+
+SURFACE = {
+    "profiles": (
+        "BeersError Figure Row SceneCall Sensor SensorProfile TargetProfile load_scene_call load_sensor "
+        "load_target scene_names sensor_names target_names"
+    ),
+    "model.evaluation": (
+        "Evaluation Instruments Method NamedPair evaluate_methods load_pairs perceptual_distances read_pairs "
+        "simulate_pairs"
+    ),
+    "model.io": (
+        "list_images open_tiff read_pixels require_writable settled_scale sha256 site_of whole_file write_text"
+    ),
+    "model.metrics": "Refusal psnr_db site_interval ssim",
+    "model.simulator": (
+        "Draw Pair Plan Scene make_plan procedural_scene read_scene resample sensor_transfer simulate_pair to_dn "
+        "to_radiance"
+    ),
+    "model.traditional": "Chain Noise PEERS QUALITIES destabilise restore_strips restore_traditional stabilise",
+    "model.training": "PatchRecipe RestorationLoss Run TrainingRecipe train",
+    "quant": (
+        "Calibration GateResult IntCore Limits Passes Patches Quantised board_model compare draw_patches "
+        "host_model judge load_onnx open_session quantise_free quantise_model read_core receptive_radius_px run "
+        "save_onnx unseen_patches"
+    ),
+    "deploy": (
+        "Document float_model load_dpu method_named network_for place predict read_network restore run_gate to_onnx"
+    ),
+}
+LIGHT = ("profiles", "model", "model.io", "model.metrics", "quant", "deploy")
+"""Looked at by commands that need no torch."""
+
+
+@pytest.mark.parametrize("package", SURFACE)
+def test_a_package_offers_these_names_and_no_others(package: str) -> None:
+    found = import_module(package)
+    assert sorted(found.__all__) == SURFACE[package].split()
+    assert all(hasattr(found, name) for name in found.__all__)
+
+
+@pytest.mark.parametrize("package", SURFACE)
+def test_no_offered_name_hides_a_module(package: str) -> None:
+    """`from model.simulator import mtf` must mean the file, wherever it stands."""
+    assert not set(SURFACE[package].split()) & {
+        module.name for module in iter_modules(import_module(package).__path__)
+    }
+
+
+@pytest.mark.parametrize("package", LIGHT)
+def test_a_package_is_looked_at_without_torch(package: str) -> None:
+    code = f"import sys, {package}; print({{'torch', 'skimage', 'matplotlib', 'onnxruntime'}} & set(sys.modules))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "set()"
