@@ -24,14 +24,7 @@ from quant.gate import compare, gate_row
 from quant.integer import integer_rows
 from quant.onnx_file import save_onnx
 from quant.quantise import Passes, Quantised, ablation_rows, ablations, quantise_model, ticks
-from quant.sensitivity import (
-    WORST,
-    headline,
-    layer_error_rows,
-    sizes_row,
-    spread_of,
-    worst_row,
-)
+from quant.sensitivity import WORST, headline, layer_error_rows, sizes_row, spread_of, worst_row
 from quant.session import LAYER_PATCHES, open_any_size
 
 

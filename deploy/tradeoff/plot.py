@@ -20,16 +20,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patheffects import withStroke
 
-from deploy.report.plots import (
-    LIGHT,
-    PX_PER_INCH,
-    TITLE_PX,
-    look,
-    new_figure,
-    set_ticks,
-    svg_of,
-    text_width,
-)
+from deploy.report.plots import LIGHT, PX_PER_INCH, TITLE_PX, look, new_figure, set_ticks, svg_of, text_width
 from deploy.tradeoff.labels import Box, Label, Wish, place
 from deploy.tradeoff.marks import FILLINGS, RADIUS_PX, STATES, Mark, State, marks_of
 from deploy.tradeoff.outcome import QUALITIES

@@ -22,15 +22,7 @@ from quant.graph import (
     read_planes,
     split,
 )
-from quant.passes.equalise import (
-    FIRST_CROPS,
-    Costs,
-    channel_ranges,
-    equalise,
-    first_guess,
-    search,
-    search_steps,
-)
+from quant.passes.equalise import FIRST_CROPS, Costs, channel_ranges, equalise, first_guess, search, search_steps
 from quant.passes.stream import (
     FINE_MAX,
     GAIN,

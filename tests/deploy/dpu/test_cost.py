@@ -9,12 +9,7 @@ from deploy.dpu.checker.placement import place
 from deploy.dpu.cost.latency import Prediction, predict
 from deploy.dpu.zoo.dense import convbeers
 from profiles.errors import ModelError
-from tests.deploy.dpu.graphs import (
-    Sketch,
-    board_convbeers,
-    float_convbeers,
-    integer_convbeers,
-)
+from tests.deploy.dpu.graphs import Sketch, board_convbeers, float_convbeers, integer_convbeers
 
 DPU = load_dpu()
 PAPER_FPS = 7.2

@@ -3,13 +3,7 @@ from pathlib import Path
 from deploy.dpu.board import load_dpu
 from deploy.dpu.checker.placement import FLOAT_NOTE, place
 from deploy.dpu.reading import read_network
-from tests.deploy.dpu.graphs import (
-    IntegerSketch,
-    Sketch,
-    board_convbeers,
-    float_convbeers,
-    integer_convbeers,
-)
+from tests.deploy.dpu.graphs import IntegerSketch, Sketch, board_convbeers, float_convbeers, integer_convbeers
 
 DPU = load_dpu()
 

@@ -12,12 +12,7 @@ from deploy.dpu.checker.placement import place
 from deploy.dpu.graph import Operation
 from deploy.dpu.reading import network_of, read_network
 from profiles.errors import ModelError
-from tests.deploy.dpu.graphs import (
-    Sketch,
-    board_convbeers,
-    float_convbeers,
-    integer_convbeers,
-)
+from tests.deploy.dpu.graphs import Sketch, board_convbeers, float_convbeers, integer_convbeers
 
 
 def core(path: Path) -> list[tuple[object, ...]]:

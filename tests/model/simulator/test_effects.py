@@ -13,18 +13,7 @@ from model.simulator.detector import Draw, add_defects, add_haze, apply_dsnu, ap
 from model.simulator.mtf import gamma_from_mtf, mtf, smear_response, transfer_function
 from model.simulator.plan import TOLERANCE_DN, Plan, make_plan, scene_stats
 from model.simulator.sampling import sample, scene_spectrum
-from profiles.effects import (
-    AntiAlias,
-    Defects,
-    Dsnu,
-    Effect,
-    FullWell,
-    Haze,
-    Offset,
-    Prnu,
-    Smear,
-    Striping,
-)
+from profiles.effects import AntiAlias, Defects, Dsnu, Effect, FullWell, Haze, Offset, Prnu, Smear, Striping
 from profiles.errors import OptionError
 
 spec = importlib.util.spec_from_file_location("stages", Path(__file__).parent / "stages.py")
