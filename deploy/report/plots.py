@@ -22,11 +22,12 @@ from markupsafe import Markup
 
 from profiles.figures import number
 from quant.graph import MAX_DN
-from quant.sensitivity import Spread
 
 if TYPE_CHECKING:
     from matplotlib.axis import Axis
     from matplotlib.figure import Figure
+
+    from quant.sensitivity import Spread  # which would load torch for a plot
 
 PX_PER_INCH = 72
 FONT_PX, TITLE_PX = 13, 15
@@ -292,7 +293,7 @@ LABELS = 5
 MOST_BARS = 81
 
 
-def histogram_url(spread: Spread) -> str:
+def histogram_url(spread: "Spread") -> str:
     """Shares of pixels by error, on a logarithmic scale, and a Gaussian of the same deviation, as a data: address."""
     centres, shares, wide = bins(spread)
     decades = math.ceil(math.log10(spread.counts.sum()))
@@ -316,7 +317,7 @@ def histogram_url(spread: Spread) -> str:
     return "data:image/svg+xml;base64," + base64.b64encode(svg.encode()).decode()
 
 
-def bins(spread: Spread) -> tuple[np.ndarray, np.ndarray, int]:
+def bins(spread: "Spread") -> tuple[np.ndarray, np.ndarray, int]:
     """Centres in DN, shares of the pixels, and the width in DN of at most MOST_BARS bins that hold every error."""
     farthest = int(np.abs(np.flatnonzero(spread.counts) - MAX_DN).max())
     wide = 1

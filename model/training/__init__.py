@@ -5,11 +5,10 @@
 - `losses` holds the terms, `guards` what stops a run gone wrong, `precision` the number format of a step;
 - `trainer` runs the steps, `checkpoint` keeps them with the recipe, `run` is a whole run from options to a folder;
 - `workers` shares a run out to processes, `validation` judges on sites held out.
+
+What is offered here is loaded when it is asked for.
 """
 
-from model.training.checkpoint import TrainingRecipe
-from model.training.losses import RestorationLoss
-from model.training.patches import PatchRecipe
-from model.training.run import Run, train
+import lazy_loader
 
-__all__ = ["PatchRecipe", "RestorationLoss", "Run", "TrainingRecipe", "train"]
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
