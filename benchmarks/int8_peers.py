@@ -35,7 +35,7 @@ from model.simulator.procedural import load_scenes
 from profiles import load_sensor
 from profiles.sensor_file import reference_for
 from quant.calibration import HELD_OUT_SEED, Pair, draw_patches
-from quant.graph import CORRECTION, PLANES, correction_graph, float_model, read_planes
+from quant.graph import CORRECTION, PLANES, correction_graph, graph_to_onnx, read_planes
 from quant.session import open_session, planes_of
 
 HERE = Path(__file__).parent
@@ -128,7 +128,7 @@ def table(arguments: argparse.Namespace, folder: Path) -> Iterator[str]:
     degraded = np.concatenate([image for image, _ in drawn[0]])
     files = {False: (folder / "plain.onnx", folder / "plain.npy"), True: (folder / "core.onnx", folder / "core.npy")}
     onnx.save(network, files[False][0])
-    onnx.save(float_model(read_planes(correction_graph(network)), [CORRECTION]), files[True][0])
+    onnx.save(graph_to_onnx(read_planes(correction_graph(network)), [CORRECTION]), files[True][0])
     np.save(files[False][1], degraded)
     np.save(files[True][1], planes_of(degraded))
     in_float = restorer(files[False][0])

@@ -36,7 +36,7 @@ from profiles.errors import BeersError
 
 
 class Group(TyperGroup):
-    """Turns what a user can mend into one sentence and exit code 2."""
+    """Turns what a user can correct into one sentence and exit code 2."""
 
     def invoke(self, ctx: Any) -> Any:
         """Run the chosen command."""

@@ -22,6 +22,7 @@ from deploy.dpu.checker.placement import place
 from deploy.dpu.checker.table import legality
 from deploy.dpu.reading import read_network
 from deploy.export import float_model
+from deploy.restoration.options import TILE_PX
 from deploy.results import Document
 from model.io.files import require_regular, require_writable, write_text
 from model.shipped import VARIANT, float_file, int8_file, shipped_pair
@@ -35,8 +36,6 @@ from quant.gate import GateResult, Limits, compare, judge, judge_saturation, ver
 from quant.onnx_file import fixed_tile_px, load_onnx, require_quantised
 from quant.session import open_any_size
 from quant.structure import saturated_shares, structure_checks
-
-TILE_PX = 640
 
 PATCHES = ("sensor", "images", "patches", "seed")
 """The arguments that say what INT8 and float are compared on."""

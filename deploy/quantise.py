@@ -111,7 +111,7 @@ def _ablated(model: onnx.ModelProto, calibration: Calibration, shifts: Shifts) -
 def _with_sensitivity(
     model: onnx.ModelProto, result: Quantised, calibration: Calibration, rows: list[Row], page: Path, say: Say
 ) -> list[Row]:
-    with steps("blaming", LAYER_PATCHES) as bar:
+    with steps("attributing errors", LAYER_PATCHES) as bar:
         found, written = sensitivity_report(model, result, calibration.unseen, rows, bar.advance)
     write_report(written, page)
     say(f"wrote {page}: {written.headline}")

@@ -26,7 +26,7 @@ from profiles.errors import ImageError
 from profiles.sensor import Sensor, SensorProfile
 from profiles.sensor_file import reference_for
 from quant.core import CANDIDATES, squared_errors, unclipped_frac_bits
-from quant.graph import PLANES, PLANES_FRAC_BITS, Graph, float_model, tensors
+from quant.graph import PLANES, PLANES_FRAC_BITS, Graph, graph_to_onnx, tensors
 from quant.session import halo_of, open_session, tensor_values
 
 VIEW_CANDIDATES = 8
@@ -254,7 +254,7 @@ def choose_frac_bits(
     image and pass. Without `least_squares` the scales are those that clip nothing.
     """
     names, halo_px = tensors(graph), halo_of(graph)
-    session = open_session(float_model(graph, names))
+    session = open_session(graph_to_onnx(graph, names))
 
     def values() -> Iterator[list[np.ndarray]]:
         for image in images:

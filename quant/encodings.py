@@ -11,9 +11,10 @@ import numpy as np
 import onnx
 from onnx import TensorProto, helper
 
+from model.io.images import MAX_DN
 from profiles.errors import ModelError
 from quant.core import IntConv, IntCore
-from quant.graph import COARSE_MAX, CORRECTION, COUNT, IMAGE, MAX_DN, PLANES, QUARTER, STEP, Add
+from quant.graph import COARSE_MAX, CORRECTION, COUNT, IMAGE, PLANES, QUARTER, STEP, Add
 from quant.onnx_file import GraphWriter, constants, fixed_tile_px, image_info, make_model, metadata
 from quant.passes.stream import FINE_MAX, GAIN
 from quant.untrusted import contradictions

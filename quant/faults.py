@@ -10,9 +10,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from model.io.images import MAX_DN
 from profiles.errors import ModelError
 from quant.core import INT8_MAX, INT8_MIN, SHIFTS, IntConv, IntCore, op_shifts
-from quant.graph import MAX_DN
 from quant.integer import Faults, merged_correction, run_core
 
 MEGABIT = 1e6
@@ -51,7 +51,7 @@ def flip_bits(
 
 
 def as_stored(core: IntCore) -> IntCore:
-    """The core with its bias in int8, at the finest position that holds it: what the board keeps in memory.
+    """The core with its bias in int8, at the finest scale that holds it: what the board keeps in memory.
 
     Raises:
         ModelError: a bias that int8 does not hold, or a shift of more than six bits.
@@ -114,7 +114,7 @@ def map_channels(core: IntCore) -> dict[str, int]:
 
 
 def shifts_of(core: IntCore) -> dict[tuple[str, str], int]:
-    """The shifts of every operation, but for an add's shift_read: 0 where a stream keeps one position."""
+    """The shifts of every operation, but for an add's shift_read: 0 where a stream shares one scale."""
     named = [(op.name, *shift) for op in core.ops for shift in op_shifts(op, core.frac_bits, SHIFTS)]
     return {(op, field): value for op, field, value, _ in named if field != "shift_read"}
 
@@ -131,7 +131,7 @@ def flip_shifts(shifts: Shifts, count: int, generator: np.random.Generator) -> d
 
 
 RELU6_UNITS = 96
-"""6 at position 4; 192 would be above int8."""
+"""6 with 4 fractional bits; with 5 it would be 192, above int8."""
 
 
 @dataclass(frozen=True)

@@ -22,7 +22,7 @@ from quant.graph import (
     Conv,
     Graph,
     correction_graph,
-    float_model,
+    graph_to_onnx,
     read_planes,
     tensors,
 )
@@ -60,7 +60,7 @@ def tensor_scales(
         tick: called once per image and pass.
     """
     names, halo_px = list(levels), halo_of(graph)
-    session = open_session(float_model(graph, names))
+    session = open_session(graph_to_onnx(graph, names))
 
     def sizes() -> Iterator[list[np.ndarray]]:
         for image in images:

@@ -11,6 +11,7 @@ import numpy as np
 import onnx
 from onnx import TensorProto, helper, numpy_helper
 
+from model.io.images import MAX_DN
 from profiles.errors import ModelError
 from quant.onnx_file import GraphWriter, image_info, make_model
 from quant.untrusted import contradictions
@@ -64,7 +65,6 @@ def relu_count(graph: Graph) -> int:
 
 
 PLANES = "planes"
-MAX_DN = 4095
 STEP = 32
 COARSE_MAX = 127
 QUARTER = 4
@@ -229,7 +229,7 @@ def _rename(op: Op, names: dict[str, str]) -> Op:
     return replace(op, inputs=(left, right), output=output)
 
 
-def float_model(graph: Graph, outputs: list[str]) -> onnx.ModelProto:
+def graph_to_onnx(graph: Graph, outputs: list[str]) -> onnx.ModelProto:
     """The graph from `planes` (N, 3, H, W) float32 to the named tensors."""
     writer = GraphWriter()
     for op in graph:

@@ -121,7 +121,7 @@ class GraphWriter:
     def graph(
         self, name: str, inputs: list[onnx.ValueInfoProto], outputs: list[onnx.ValueInfoProto]
     ) -> onnx.GraphProto:
-        """What was collected."""
+        """The ONNX graph of the nodes and constants collected so far."""
         return onnx.helper.make_graph(self.nodes, name, inputs, outputs, list(self.weights.values()))
 
 

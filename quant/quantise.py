@@ -20,7 +20,7 @@ from quant.graph import (
     Graph,
     coarse_plane_only,
     correction_graph,
-    float_model,
+    graph_to_onnx,
     read_planes,
     relu_count,
     tensors,
@@ -155,7 +155,7 @@ def search_targets(graph: Graph, images: Remade[np.ndarray]) -> Targets:
 
     Only their sizes are kept; the images of the chosen are made once more.
     """
-    session = open_session(float_model(graph, [CORRECTION]))
+    session = open_session(graph_to_onnx(graph, [CORRECTION]))
 
     def restored(crop: np.ndarray) -> np.ndarray:
         (correction,) = next(tensor_values(session, [CORRECTION], crop, halo_px=0))

@@ -14,13 +14,14 @@ import onnx
 import onnxruntime as ort
 from onnx import TensorProto, helper
 
+from model.io.images import MAX_DN
 from profiles.figures import Figure, Row, measured, unavailable
 from profiles.sensor import Sensor
 from quant.calibration import Patches
 from quant.core import INT8_MAX, INT8_MIN, IntConv, IntCore
 from quant.encodings import host_model
 from quant.gate import GateResult
-from quant.graph import CORRECTION, MAX_DN, PLANES, Conv, Graph, Op, float_model, tensors
+from quant.graph import CORRECTION, PLANES, Conv, Graph, Op, graph_to_onnx, tensors
 from quant.passes.stream import merge
 from quant.quantise import Quantised
 from quant.session import few_crops, open_session, planes_of, run, tensor_values
@@ -94,7 +95,7 @@ def layer_errors(
     """
     twins = tuple(_twin(op, whole) for op, whole in zip(graph, core.ops, strict=True) if isinstance(whole, IntConv))
     names = tensors((*graph, *twins))
-    exact, int8 = open_session(float_model((*graph, *twins), names)), open_session(host_model(core, {}))
+    exact, int8 = open_session(graph_to_onnx((*graph, *twins), names)), open_session(host_model(core, {}))
     rests = {name: open_session(_rest(graph, name)) for name in tensors(graph) if name != CORRECTION}
     layers, together = [LayerError(op.name, Loss(), Loss()) for op in graph], Loss()
     for crop in crops:
@@ -126,7 +127,7 @@ def _twin(op: Op, whole: IntConv) -> Conv:
 
 def _rest(graph: Graph, given: str) -> onnx.ModelProto:
     """The float network from one of its tensors, given beside the planes, to the correction."""
-    model = float_model(tuple(op for op in graph if op.output != given), [CORRECTION])
+    model = graph_to_onnx(tuple(op for op in graph if op.output != given), [CORRECTION])
     model.graph.input.append(helper.make_tensor_value_info(given, TensorProto.FLOAT, ["N", "C", "H", "W"]))
     return model
 

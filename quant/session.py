@@ -113,7 +113,7 @@ TILE_PX = 128
 
 
 def crops(image: np.ndarray) -> list[np.ndarray]:
-    """Crops (1, 1, h, w) of at most PIECE_PX a side that tile an image (1, 1, H, W): small images by themselves."""
+    """Crops (1, 1, h, w) of at most TILE_PX a side that tile an image (1, 1, H, W): small images by themselves."""
     return [image[..., slice(*rows), slice(*columns)] for rows, columns in _places(image)]
 
 

@@ -112,7 +112,7 @@ class Relus:
     """How many a file has.
 
     Attributes:
-        spelt: nodes that are one: Relu, or the larger of a value and zero.
+        explicit: nodes that are one: Relu, or the larger of a value and zero.
         folded: convolutions whose 8 bits begin at zero, which is a ReLU, unless their results were never below zero.
     """
 
@@ -157,17 +157,17 @@ def _begins_at_zero(node: onnx.NodeProto, rounded: dict[str, Rounded], convolved
     return bool((value.zero_point == value.lowest).all())
 
 
-def structure_checks(float_model: onnx.ModelProto, int8: onnx.ModelProto) -> list[Check]:
+def structure_checks(graph_to_onnx: onnx.ModelProto, int8: onnx.ModelProto) -> list[Check]:
     """Does the INT8 file keep its ReLUs, is it encoded as meant, and the same with onnxruntime's optimisations?"""
     image = np.random.default_rng(0).random((1, 1, 97, 101), dtype=np.float32)
     plain, optimised = (run(open_any_size(int8, optimise=o), image) for o in (False, True))
     difference = float(np.abs(plain - optimised).max())
     optimisation = Check("optimised against unoptimised", difference, 0, "of full scale")
-    return [_relus(float_model, int8), *_encoding(int8), optimisation]
+    return [_relus(graph_to_onnx, int8), *_encoding(int8), optimisation]
 
 
-def _relus(float_model: onnx.ModelProto, int8: onnx.ModelProto) -> Check:
-    wanted, kept = count_relus(float_model).explicit, count_relus(int8)
+def _relus(graph_to_onnx: onnx.ModelProto, int8: onnx.ModelProto) -> Check:
+    wanted, kept = count_relus(graph_to_onnx).explicit, count_relus(int8)
     return Check("ReLUs lost or added", kept.off_by(wanted), 0, "ReLU", detail=f"{wanted} in float, {kept} in INT8")
 
 

@@ -1,4 +1,4 @@
-"""Whether an ONNX file holds what it states, and may be run: looked at before anything else believes it."""
+"""Whether an ONNX file holds what it states, and may be run: looked at before it is used."""
 
 import math
 from collections.abc import Iterable, Iterator

@@ -14,7 +14,7 @@ EXAMPLE = "quantize float.onnx --target vck190 --sensor pleiades-degraded --out 
 
 
 class Regime(StrEnum):
-    """Whose arithmetic."""
+    """Under the rules of the target's DPU, or without them."""
 
     legal = "legal"
     free = "free"

@@ -15,7 +15,7 @@ NETWORK_ONLY = ("model", "tile", "halo", "resume", "runtime", "threads", "worker
 
 
 class Method(StrEnum):
-    """What restores."""
+    """A network, or the traditional chain."""
 
     network = "network"
     traditional = "traditional"

@@ -8,7 +8,7 @@ from profiles.errors import OptionError, ProfileError
 
 CONFIGURATION = ("batch_handlers", "cpb", "peak_tops")
 DIVISORS = ("array", "memory", "elementwise", "cost", "power")
-"""Tables of widths, rates and energies: nothing in them can be nothing."""
+"""Tables of widths, rates and energies, which the cost model divides by: a profile with a zero there is refused."""
 SMALLEST, LARGEST = 1e-30, 1e30
 
 
@@ -47,7 +47,7 @@ class Dpu:
         return lanes * self.value("array", "pl_clock_hz")
 
     def limit(self, table: str, key: str) -> Constant:
-        """A constant of the target."""
+        """A constant of the target, with both ends of its range: a rule's window, or one limit as both."""
         return self.target.constant(table, key)
 
     def value(self, table: str, key: str) -> float:

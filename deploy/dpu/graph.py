@@ -112,12 +112,6 @@ class Operation:
         """Size of the result as int8."""
         return _pixels(self.name, self.out_shape) * (self.out_shape or (0,))[0]
 
-    @property
-    def in_bytes(self) -> int:
-        """Size of the first input as int8."""
-        shape = self.in_shapes[0] if self.in_shapes else None
-        return _pixels(self.name, shape) * (shape or (0,))[0]
-
 
 @dataclass(frozen=True)
 class Network:

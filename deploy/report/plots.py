@@ -20,8 +20,8 @@ from xml.etree import ElementTree as ET
 import numpy as np
 from markupsafe import Markup
 
+from model.io.images import MAX_DN
 from profiles.figures import number
-from quant.graph import MAX_DN
 
 if TYPE_CHECKING:
     from matplotlib.axis import Axis

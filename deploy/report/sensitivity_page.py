@@ -7,10 +7,10 @@ import onnxruntime as ort
 
 from deploy.report.page import Picture, Report, Table
 from deploy.report.plots import histogram_url
+from model.io.images import MAX_DN
 from model.io.pictures import error_row, grid, picture_url, stretch_of, strip_row
 from profiles.figures import Row, by_table
 from quant.calibration import Patches
-from quant.graph import MAX_DN
 from quant.sensitivity import Spread
 from quant.session import run
 
@@ -76,15 +76,15 @@ HISTOGRAM_CAPTION = (
 CAPTIONS = {
     "layers": "Each layer in int8 by itself, all others in float. Alone: its own result, given float inputs. The "
     "other columns: what that does to the restored image, SQNR against the network's correction. The adds of a "
-    "stream of one position lose nothing but what saturates.",
+    "stream that shares one scale lose nothing but what saturates.",
     "worst patches": "The patches of the largest MAE, of those that calibration did not see.",
     "error sizes": "Share of the pixels that differ by more than so many DN.",
     "integer layers": "Accumulators as seen and as proven for any input, and what is left of 24 bits; results at "
-    "int8's ends; sums whose rounding depends on the rule for halves; the integer reference beside onnxruntime, with "
+    "int8's ends; sums whose rounding depends on the rule for ties; the integer reference beside onnxruntime, with "
     "onnxruntime's rule and with the DPU's.",
 }
 NOTES = (
     "SQNR is 10 log10 of the signal's energy over the error's; differences are of full scale, 0.001 is 4 DN.",
     "Squared errors of layers nearly add up, as independent errors do: the shares say where an effort would pay.",
-    "All figures are of simulated patches; the INT8 network ran on onnxruntime, which rounds halves to even.",
+    "All figures are of simulated patches; the INT8 network ran on onnxruntime, which rounds ties to even.",
 )

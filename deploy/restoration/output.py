@@ -105,7 +105,7 @@ class Checkpoint:
         try:
             yield
         except OSError as error:
-            remedy = f"mend that, and go on with --resume from row {self.rows} of {self.shape[1]}"
+            remedy = f"correct that, and go on with --resume from row {self.rows} of {self.shape[1]}"
             got = error.strerror or str(error)
             raise MachineError(str(self.out), expected="a disk to write to", got=got, remedy=remedy) from error
 

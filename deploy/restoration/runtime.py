@@ -95,22 +95,22 @@ def _core() -> Any:  # openvino.Core, an optional package
 
 
 def saturating_adds(model: onnx.ModelProto) -> onnx.ModelProto:
-    """The model with every QLinearAdd spelt as dequantise, add, quantise.
+    """The model with every QLinearAdd written as dequantise, add, quantise.
 
-    OpenVINO's own QLinearAdd wraps around where it should saturate (256 becomes 0). Spelt out it saturates, but a
+    OpenVINO's own QLinearAdd wraps around where it should saturate (256 becomes 0). Written out it saturates, but a
     convolution before it is fused with it, and the rounding between the two is lost; taking the larger of the value
     and 0, which changes no uint8, keeps them apart. Measured: equal to onnxruntime bit for bit.
     """
-    spelt = onnx.ModelProto()
-    spelt.CopyFrom(model)
-    spelt.graph.initializer.append(numpy_helper.from_array(np.array(0, np.uint8), LOWEST))
-    del spelt.graph.node[:]
+    written = onnx.ModelProto()
+    written.CopyFrom(model)
+    written.graph.initializer.append(numpy_helper.from_array(np.array(0, np.uint8), LOWEST))
+    del written.graph.node[:]
     for node in model.graph.node:
-        spelt.graph.node.extend(_spelt_out(node) if node.op_type == "QLinearAdd" else [node])
-    return spelt
+        written.graph.node.extend(_written_out(node) if node.op_type == "QLinearAdd" else [node])
+    return written
 
 
-def _spelt_out(add: onnx.NodeProto) -> list[onnx.NodeProto]:
+def _written_out(add: onnx.NodeProto) -> list[onnx.NodeProto]:
     (a, *a_scale), (b, *b_scale), scale = add.input[0:3], add.input[3:6], add.input[6:8]
     name = add.output[0]
     return [

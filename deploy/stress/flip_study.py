@@ -10,6 +10,7 @@ from deploy.dpu.board import Dpu, load_dpu
 from deploy.dpu.cost.latency import Prediction, frame_rate
 from deploy.dpu.cost.layers import Constants
 from deploy.report.plots import Curve, Panel, Points, curves_svg
+from deploy.restoration.options import TILE_PX
 from deploy.stress import flips
 from deploy.stress.flips import MEMORIES, SETS, FaultTarget, name_of, rates_of
 from deploy.stress.networks import core_of, planes_of
@@ -24,7 +25,6 @@ INSTRUCTED = "two instructions of 16 values, one a cycle of the host's slowest c
 READ = (
     "bytes over the rate at which the host hands them to the DPU (fitted, docs/cost-model.md; assumed to hold here)"
 )
-TILE_PX = 640
 AT_ONCE, INSTRUCTIONS = 16, 2
 
 

@@ -11,6 +11,7 @@ from functools import cached_property
 import numpy as np
 
 from deploy.stress.networks import planes_of
+from model.io.images import MAX_DN
 from model.metrics.fidelity import psnr_db
 from profiles.figures import Figure, Row, measured
 from quant.core import IntConv, IntCore
@@ -34,7 +35,7 @@ from quant.faults import (
     weight_bits,
     with_ops,
 )
-from quant.graph import MAX_DN, Add
+from quant.graph import Add
 from quant.integer import SOUND, Faults, merged_correction, run_core
 
 Pair = tuple[np.ndarray, np.ndarray]
@@ -194,11 +195,6 @@ def place_rows(target: FaultTarget, seed: int, side_px: int, tick: Callable[[], 
     ]
     bits = [_place_row("bit flips by bit", _bit_name(k), [f for f in flips if f.bit == k]) for k in range(INT8_BITS)]
     return [*layers, *bits]
-
-
-def place_ticks(target: FaultTarget) -> int:
-    """How often `place_rows` reports progress."""
-    return len(target.core.ops)
 
 
 def single_flips(

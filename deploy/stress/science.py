@@ -45,6 +45,7 @@ from model.training.losses import LossWeights, RestorationLoss
 from profiles import load_sensor
 from profiles.errors import BeersError
 from profiles.sensor import Sensor
+from profiles.sensor_file import REFERENCE
 
 RATIO = 2
 FLOAT32_DN = 0.05
@@ -131,7 +132,6 @@ def _read_back(image: np.ndarray, sensor: Sensor) -> object:
         return read_scene(path, sensor)
 
 
-REFERENCE = "pleiades-reference"
 GAIN_DN = 64.0
 CHAIN_FLOAT32_DN = 4.0
 RINGING_PERCENT, REACH_PX = 100.0, 19

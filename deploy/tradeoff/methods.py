@@ -167,7 +167,7 @@ class CalibrationScenes:
 def make_int8(
     model: onnx.ModelProto, precision: str, calibration: CalibrationScenes, tick: Callable[[], None]
 ) -> onnx.ModelProto:
-    """The network in INT8, host spelling.
+    """The network in INT8, host encoding.
 
     Raises:
         ModelError: not a graph of convolutions, ReLUs and adds that ends with the global add.

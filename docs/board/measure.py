@@ -33,7 +33,7 @@ LATENCY_CALLS = 20
 
 
 def main() -> int:
-    """Open, compare, measure, write; 0 when done, 2 for what the user can mend."""
+    """Open, compare, measure, write; 0 when done, 2 for what the user can correct."""
     given = arguments()
     try:
         entry = measure(given)

@@ -10,7 +10,7 @@ import numpy as np
 
 from model.io.images import MAX_DN, read_acquisition, site_of
 from model.shipped import SENSOR
-from model.simulator.acquire import MARGIN_PX, fitting_oversampling, simulate_pair
+from model.simulator.acquire import LEAST_SIDE_PX, MARGIN_PX, fitting_oversampling, simulate_pair
 from model.simulator.detector import Draw
 from model.simulator.sampling import Scene
 from model.training.patches import pair_files
@@ -91,7 +91,6 @@ def _require_made_by(option: str, named: SensorProfile | None, made: SensorProfi
 
 
 OVERSAMPLINGS = (4, 2)
-MIN_SIDE_PX = 48
 
 
 class Eye(Protocol):
@@ -136,7 +135,7 @@ def simulate_pairs(
     """
     pairs, small = [], []
     for number, scene in enumerate(scenes):
-        ratio = fitting_oversampling(scene.radiance, oversamplings, MIN_SIDE_PX)
+        ratio = fitting_oversampling(scene.radiance, oversamplings, LEAST_SIDE_PX)
         if ratio is None:
             small.append(scene.name)
             continue
@@ -145,7 +144,7 @@ def simulate_pairs(
         pair = simulate_pair(scene.radiance, eyes[0], eyes[1], ratio, draw)
         pairs.append(NamedPair(scene.name, pair.degraded.numpy(), pair.reference.numpy(), oversampling=ratio))
     if not pairs:
-        least = oversamplings[-1] * (2 * MARGIN_PX + MIN_SIDE_PX)
+        least = oversamplings[-1] * (2 * MARGIN_PX + LEAST_SIDE_PX)
         raise ImageError(
             "images",
             expected=f"scenes of {least} pixels a side or more",

@@ -28,7 +28,7 @@ TRUTH_KNOWN = "traditional, true sensor known"
 
 @dataclass(frozen=True)
 class Condition:
-    """A sensor with a name."""
+    """One sensor of the sweep, with the name of its row."""
 
     name: str
     sensor: Sensor
@@ -63,7 +63,7 @@ class Fixed:
     sensor: Sensor
 
     def draw(self, _generator: np.random.Generator) -> Sensor:
-        """The sensor."""
+        """The same sensor for every draw."""
         return self.sensor
 
 
@@ -123,7 +123,7 @@ class Evaluation:
 
     @property
     def rows(self) -> tuple[Row, ...]:
-        """All of them."""
+        """All rows: means, sites, images."""
         return (*self.mean, *self.sites, *self.images)
 
 

@@ -160,7 +160,6 @@ def _no_image(name: str, error: Exception) -> ImageError:
     )
 
 
-FULL_SCALE_DN = 4095.0
 """Of 12 bits."""
 
 UNIT_MAX = 2.0
@@ -175,7 +174,7 @@ def settled_scale(
     dtype: np.dtype[np.generic],
     largest: Iterable[float],
     asked: float | None = None,
-    usual: float = FULL_SCALE_DN,
+    usual: float = MAX_DN,
     remedy: str | None = None,
 ) -> float:
     """The pixel value that is full scale.

@@ -1,7 +1,7 @@
 """The feature layers of SqueezeNet 1.1, AlexNet and VGG16, named as in torchvision.
 
 Written here because torchvision does not import beside the CPU build of torch. The weights come from a user's file
-(`backbone_files`): ImageNet weights are never shipped or fetched.
+(`find_backbone`): ImageNet weights are never shipped or fetched.
 """
 
 import math

@@ -16,6 +16,7 @@ from functools import lru_cache
 
 import numpy as np
 
+from model.metrics.bootstrap import NORMAL_90
 from model.metrics.refusal import Refusal
 from profiles.errors import ImageError, OptionError
 
@@ -202,7 +203,6 @@ def _weighted_line(windows: Windows) -> NoiseLine:
 
 RADIANCES = (25.0, 100.0)
 WINDOW_PX, MIN_WINDOW_PX = 16, 8
-NORMAL_90 = 1.6449
 
 
 @dataclass(frozen=True)

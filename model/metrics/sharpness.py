@@ -15,13 +15,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from model.metrics.bootstrap import NORMAL_90
 from model.metrics.edges import MIN_ROWS, ROW_LAG, Edge, Plateaus, find_edge, fit_plateaus, spread
 from model.metrics.refusal import Refusal
 from profiles.errors import ImageError
 
 MIN_CONTRAST_SIGMA = 10
 MAX_CLIPPED, MAX_EMPTY = 0.01, 0.05
-NORMAL_90 = 1.6449
 SIGMA_PER_MEDIAN_STEP = 1.0484
 """Standard deviation of white noise over the median absolute difference of neighbours."""
 

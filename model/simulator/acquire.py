@@ -1,4 +1,4 @@
-"""One scene, seen by one sensor or by two: the order of the effects stands here and nowhere else."""
+"""One scene, seen by one sensor or by two: blur, sampling, then what `detector` does in the order of its lists."""
 
 from collections.abc import Collection, Iterable
 from dataclasses import dataclass, replace
@@ -16,6 +16,8 @@ from profiles.sensor import Sensor
 
 MARGIN_PX = 32
 """Target pixels cropped on each side: the FFT wraps around, and the PSF's tail is long (10.8 DN at 32)."""
+LEAST_SIDE_PX = 48
+"""Target pixels a side that evaluation and validation want of an image, without its margins."""
 
 
 @dataclass(frozen=True)

@@ -199,4 +199,4 @@ def apply_effect(
         case Defects():
             return add_defects(image, effect, sensor.max_dn, generator())
         case _:
-            return image  # part of the transfer function
+            return image  # anti-alias and smear: part of the transfer function

@@ -17,7 +17,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from model.simulator.detector import NOISE_LIMIT, PATTERN_LIMIT
+from model.simulator.detector import DN_EFFECTS, NOISE_LIMIT, PATTERN_LIMIT, RADIANCE_EFFECTS
 from model.simulator.mtf import Axes, smear_response, transfer_function
 from profiles.effects import TABLES, AntiAlias, Defects, Dsnu, Effect, FullWell, Haze, Offset, Prnu, Smear, Striping
 from profiles.sensor import Sensor, mtf_limit
@@ -129,7 +129,7 @@ def effect_bound_dn(effect: Effect, sensor: Sensor, low: float, high: float) -> 
         case Defects():
             return _defects_bound_dn(effect, sensor, low, high)
         case _:
-            return 0.0
+            return 0.0  # anti-alias and smear: the transfer function has bounds of its own
 
 
 def _defects_bound_dn(defects: Defects, sensor: Sensor, low: float, high: float) -> float:
@@ -171,8 +171,7 @@ TOLERANCE_DN = 0.25
 Choice = Literal["applied", "not called for", "neutral", "cannot show"]
 
 ORDER = (
-    "mtf", "antialias", "smear", "sampling", "veil", "full_well", "prnu", "noise", "dsnu", "striping", "offset",
-    "defects", "digitising",
+    "mtf", "antialias", "smear", "sampling", *RADIANCE_EFFECTS, "noise", *DN_EFFECTS, "digitising",
 )  # fmt: skip
 
 COSTS = {
@@ -239,14 +238,14 @@ def effect_bounds(sensor: Sensor, stats: SceneStats) -> dict[str, float]:
         # The smear widens the range that every later effect may meet, whether it is applied or left out.
         low, high, total = low - direct / gain, high + direct / gain, ringing * smear_ringing(smear, stats)
     bounds["mtf"] = behind(blur_bound_dn(stats, total, gain), sensor, _after("mtf"))
-    for name in ("veil", "full_well", "prnu"):
+    for name in RADIANCE_EFFECTS:
         if name in sensor.effects:
             direct = effect_bound_dn(sensor.effects[name], sensor, low, high)
             bounds[name] = behind(direct, sensor, _after(name))
             low, high = low - direct / gain, high + direct / gain  # whether it is applied or not
     bounds["noise"] = noise_bound_dn(sensor, high)
     low, high = low - bounds["noise"] / gain, high + bounds["noise"] / gain
-    for name in ("dsnu", "striping", "offset", "defects"):
+    for name in DN_EFFECTS:
         if name in sensor.effects:
             bounds[name] = effect_bound_dn(sensor.effects[name], sensor, low, high)
             low, high = low - bounds[name] / gain, high + bounds[name] / gain

@@ -10,7 +10,7 @@ from torch import Tensor
 from model.conditioning import Network, SensorFamily, ToldConvBEERS, fold, tell
 from model.io.images import site_of
 from model.metrics.fidelity import psnr_db, ssim
-from model.simulator.acquire import fitting_oversampling, simulate_pair
+from model.simulator.acquire import LEAST_SIDE_PX, fitting_oversampling, simulate_pair
 from model.simulator.detector import Draw
 from model.simulator.sampling import Scene
 from profiles.sensor import SensorProfile
@@ -20,7 +20,6 @@ SHARE = 0.05
 
 SIDE_PX = 192
 OVERSAMPLINGS = (4, 3, 2, 1)
-MIN_SIDE_PX = 48
 
 
 def split_by_site(names: Sequence[str]) -> tuple[list[int], list[int]]:
@@ -60,7 +59,7 @@ class Validation:
     ) -> None:
         self.names, self.pairs, self.vectors = list[str](), list[tuple[Tensor, Tensor]](), list[Tensor]()
         for number, scene in enumerate(scenes):
-            ratio = fitting_oversampling(scene.radiance, OVERSAMPLINGS, MIN_SIDE_PX)
+            ratio = fitting_oversampling(scene.radiance, OVERSAMPLINGS, LEAST_SIDE_PX)
             if ratio is None:
                 continue
             draw = Draw(0, number)

@@ -14,7 +14,7 @@ from itertools import product
 import numpy as np
 
 from quant.core import INT8_MAX
-from quant.graph import Conv, Graph, float_model
+from quant.graph import Conv, Graph, graph_to_onnx
 from quant.passes.stream import STREAM_FRAC_BITS, stream_tensors
 from quant.session import halo_of, open_session, tensor_values
 
@@ -59,7 +59,7 @@ def _scaled(op: Conv, factors: np.ndarray, stream: set[str]) -> Conv:
 def channel_ranges(graph: Graph, images: Iterable[np.ndarray], tick: Callable[[], None]) -> np.ndarray:
     """(C,) range of each stream channel over images (1, 1, H, W), the widest of all the stream's tensors."""
     names, halo_px = sorted(stream_tensors(graph)), halo_of(graph)
-    session, total, count = open_session(float_model(graph, names)), np.zeros(1), 0
+    session, total, count = open_session(graph_to_onnx(graph, names)), np.zeros(1), 0
     for image in images:
         for results in tensor_values(session, names, image, halo_px):
             sizes = [np.abs(r[0]).reshape(r.shape[1], -1) for r in results]

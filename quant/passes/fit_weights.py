@@ -14,7 +14,7 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
 from quant.core import INT8_MAX, INT8_MIN, SHIFTS, IntConv, IntCore, Shifts, quantise_bias
-from quant.graph import PLANES, Conv, Graph, float_model, tensors
+from quant.graph import PLANES, Conv, Graph, graph_to_onnx, tensors
 from quant.session import crops, halo_of, open_session, planes_of, tensor_values
 
 EVERY_PX = 4
@@ -56,7 +56,7 @@ def input_moments(graph: Graph, images: Iterable[np.ndarray], tick: Callable[[],
     convs = [op for op in graph if isinstance(op, Conv)]
     found = {op.name: _nothing(op) for op in convs}
     names, halo_px = tensors(graph), halo_of(graph)
-    session = open_session(float_model(graph, names))
+    session = open_session(graph_to_onnx(graph, names))
     for image in images:
         for crop, values in zip(crops(image), tensor_values(session, names, image, halo_px), strict=True):
             read = {PLANES: planes_of(crop), **dict(zip(names, values, strict=True))}

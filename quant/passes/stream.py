@@ -32,7 +32,7 @@ def common_frac_bits(graph: Graph, frac_bits: Mapping[str, int]) -> int:
 
 
 OFFSETS = np.array([-0.25, 0.25])
-"""Of a step; their mean is 0."""
+"""What the two copies of a half-LSB pair add before they are rounded, in units of their step; the mean is 0."""
 
 
 def half_lsb_pair(graph: Graph, step: float) -> Graph:

@@ -83,7 +83,7 @@ def test_calls_in_flight_end_as_often_as_asked(script: ModuleType, tmp_path: Pat
         (("core.onnx", "--provider", "CPUExecutionProvider", "--frames", "1"), "--frames"),
     ],
 )
-def test_what_the_owner_can_mend_is_one_sentence(
+def test_what_the_owner_can_correct_is_one_sentence(
     script: ModuleType,
     monkeypatch: pytest.MonkeyPatch,
     tmp_path: Path,

@@ -18,12 +18,12 @@ from deploy.export import to_onnx
 from deploy.report.plots import FONT_PX, MOST_BARS, bins, histogram_url, text_width
 from deploy.results import SCHEMA_PATH
 from model.convbeers import ConvBEERS, Variant, initialise
+from model.io.images import MAX_DN
 from model.io.tiff import write_tiff
 from model.simulator.procedural import procedural_scene
 from profiles import load_sensor
 from profiles.sensor_file import reference_for
 from quant.calibration import draw_patches
-from quant.graph import MAX_DN
 from quant.onnx_file import fixed_tile_px, load_onnx, metadata, save_onnx
 from quant.quantise import ALL, Passes, ablations
 from quant.sensitivity import Spread, kind_of_error, worst_row

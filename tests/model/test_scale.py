@@ -5,7 +5,7 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
-from model.io.images import FULL_SCALE_DN, UNIT_MAX, settled_scale
+from model.io.images import MAX_DN, UNIT_MAX, settled_scale
 from profiles.errors import BeersError, ImageError, OptionError
 
 
@@ -16,13 +16,13 @@ def settled(kind: str, *largest: float, asked: float | None = None) -> float:
 @pytest.mark.parametrize("kind", ["uint16", "int16", "uint32", "int32"])
 def test_integers_of_more_than_8_bits_are_12_bit_digital_numbers(kind: str) -> None:
     for brightest in (0, 1, 255, 4095, 60000):  # what lies beyond is refused where pixels are read
-        assert settled(kind, brightest) == FULL_SCALE_DN
+        assert settled(kind, brightest) == MAX_DN
 
 
 @pytest.mark.parametrize("kind", ["float16", "float32", "float64"])
 def test_floats_beyond_any_share_are_digital_numbers(kind: str) -> None:
-    assert settled(kind, 0.0, 1.0, 2.5) == FULL_SCALE_DN
-    assert settled(kind, 4095) == FULL_SCALE_DN
+    assert settled(kind, 0.0, 1.0, 2.5) == MAX_DN
+    assert settled(kind, 4095) == MAX_DN
     for brightest in (1e-6, 0.5, 1.0, UNIT_MAX):
         with pytest.raises(ImageError, match=r"x\.tif: .*more than 8 bits, got floats of at most .*--full-scale"):
             settled(kind, 0.0, brightest)
@@ -35,7 +35,7 @@ def test_8_bit_pixels_leave_it_open(kind: str) -> None:
 
 
 def test_black_says_nothing() -> None:
-    assert settled("float32") == settled("float32", 0.0, 0.0) == FULL_SCALE_DN
+    assert settled("float32") == settled("float32", 0.0, 0.0) == MAX_DN
 
 
 @pytest.mark.parametrize(("kind", "asked"), [("uint8", 255), ("float32", 1.0), ("float32", 4095), ("uint16", 1023)])
@@ -64,9 +64,9 @@ def test_no_more_is_looked_at_than_decides() -> None:
             looked.append(value)
             yield value
 
-    assert settled_scale("x", np.dtype("float32"), parts()) == FULL_SCALE_DN
+    assert settled_scale("x", np.dtype("float32"), parts()) == MAX_DN
     assert looked == [0.0, 0.9, 3000.0]
-    assert settled_scale("x", np.dtype("uint16"), parts()) == FULL_SCALE_DN
+    assert settled_scale("x", np.dtype("uint16"), parts()) == MAX_DN
     assert looked == [0.0, 0.9, 3000.0]
 
 

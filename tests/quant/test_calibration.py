@@ -13,7 +13,7 @@ from model.simulator.sampling import Scene
 from profiles import load_sensor
 from profiles.errors import ImageError
 from quant.calibration import Patches, choose_frac_bits, draw_patches, stratified
-from quant.graph import PLANES, Graph, correction_graph, float_model, read_planes, tensors
+from quant.graph import PLANES, Graph, correction_graph, graph_to_onnx, read_planes, tensors
 from quant.session import TILE_PX, crops, halo_of, open_session, planes_of, tensor_values
 
 VARIABLE, REFERENCE = load_sensor("pleiades-variable"), load_sensor("pleiades-reference")
@@ -103,7 +103,7 @@ def test_scenes_too_small_for_a_patch_are_refused(scenes: list[Scene]) -> None:
 @pytest.mark.parametrize("shape", [(TILE_PX, 31), (TILE_PX + 1, 37), (2 * TILE_PX + 3, TILE_PX + 70)])
 def test_pieces_hold_what_the_whole_image_gives(graph: Graph, shape: tuple[int, int]) -> None:
     names, whole = tensors(graph), image(*shape)
-    session = open_session(float_model(graph, names))
+    session = open_session(graph_to_onnx(graph, names))
     wanted = session.run(names, {PLANES: planes_of(whole)})
     pieces = list(tensor_values(session, names, whole, halo_of(graph)))
     for k, tensor in enumerate(wanted):
@@ -115,7 +115,7 @@ def test_pieces_hold_what_the_whole_image_gives(graph: Graph, shape: tuple[int, 
 
 def test_without_a_halo_they_would_not(graph: Graph) -> None:
     names, whole = [tensors(graph)[-1]], image(TILE_PX + 9, 40)
-    session = open_session(float_model(graph, names))
+    session = open_session(graph_to_onnx(graph, names))
     wanted = session.run(names, {PLANES: planes_of(whole)})[0]
     pieces = list(tensor_values(session, names, whole, halo_px=0))
     total = sum(float(np.square(piece[0], dtype=np.float64).sum()) for piece in pieces)
@@ -132,7 +132,7 @@ def test_crops_tile_the_image() -> None:
 def test_no_run_sees_more_than_a_piece_with_its_halo(graph: Graph) -> None:
     """What bounds memory: the largest array that the session returns does not grow with the image."""
     names = tensors(graph)
-    session = open_session(float_model(graph, names))
+    session = open_session(graph_to_onnx(graph, names))
     side = TILE_PX + 2 * halo_of(graph)
     for piece in tensor_values(session, names, image(3 * TILE_PX + 1, 3 * TILE_PX + 2), halo_of(graph)):
         assert max(values.base.shape[2] for values in piece if values.base is not None) <= side
@@ -143,7 +143,7 @@ def test_positions_of_a_large_image_are_those_of_its_whole(graph: Graph) -> None
     whole = image(TILE_PX + 21, 50)
     frac_bits = choose_frac_bits(graph, [whole], lambda: None, least_squares=False)
     names = tensors(graph)
-    values = open_session(float_model(graph, names)).run(names, {PLANES: planes_of(whole)})
+    values = open_session(graph_to_onnx(graph, names)).run(names, {PLANES: planes_of(whole)})
     for name, tensor in zip(names, values, strict=True):
         largest = float(np.abs(tensor).max())
         assert largest * 2.0 ** frac_bits[name] <= 127 < largest * 2.0 ** (frac_bits[name] + 1)

@@ -21,7 +21,7 @@ from quant.graph import (
     Conv,
     Graph,
     correction_graph,
-    float_model,
+    graph_to_onnx,
     read_planes,
     relu_count,
     tensors,
@@ -205,7 +205,7 @@ def test_a_channel_of_zeros_stays_zero_and_a_tiny_one_keeps_its_bias_in_reach() 
 
 def in_float(graph: Graph) -> np.ndarray:
     planes = planes_of(image(23, 31))
-    return np.asarray(open_session(float_model(graph, [CORRECTION])).run(None, {PLANES: planes})[0])
+    return np.asarray(open_session(graph_to_onnx(graph, [CORRECTION])).run(None, {PLANES: planes})[0])
 
 
 def test_the_half_lsb_pair_leave_the_float_network_as_it_was(float_onnx: onnx.ModelProto) -> None:

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from model.io.images import MAX_DN
 from quant.core import IntConv, IntCore
 from quant.faults import (
     Guards,
@@ -18,7 +19,7 @@ from quant.faults import (
     voted,
     with_ops,
 )
-from quant.graph import CORRECTION, MAX_DN, PLANES, split
+from quant.graph import CORRECTION, PLANES, split
 from quant.integer import SOUND, Faults, merged_correction, run_core
 from quant.quantise import Quantised
 

@@ -18,7 +18,7 @@ from quant.graph import (
     Graph,
     coarse_plane_only,
     correction_graph,
-    float_model,
+    graph_to_onnx,
     read_planes,
     split,
 )
@@ -47,7 +47,7 @@ def graph(float_onnx: onnx.ModelProto) -> Graph:
 def correction(graph: Graph, seed: int = 0) -> np.ndarray:
     dn = np.random.default_rng(seed).integers(0, 4096, (1, 1, 23, 31)).astype(np.float32) / np.float32(4095)
     planes = split(dn).astype(np.float32) * np.float32(2.0**-PLANES_FRAC_BITS)
-    return np.asarray(open_session(float_model(graph, [CORRECTION])).run(None, {PLANES: planes})[0])
+    return np.asarray(open_session(graph_to_onnx(graph, [CORRECTION])).run(None, {PLANES: planes})[0])
 
 
 def test_equalising_leaves_the_float_network_as_it_was(graph: Graph) -> None:

@@ -1,6 +1,7 @@
 import numpy as np
 
-from quant.graph import MAX_DN, QUARTER, STEP, split
+from model.io.images import MAX_DN
+from quant.graph import QUARTER, STEP, split
 
 
 def test_no_digital_number_is_lost() -> None:

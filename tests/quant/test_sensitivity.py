@@ -6,9 +6,10 @@ import numpy as np
 import onnx
 import pytest
 
+from model.io.images import MAX_DN
 from quant.calibration import Patches
 from quant.core import IntConv
-from quant.graph import MAX_DN, Add
+from quant.graph import Add
 from quant.quantise import ALL, Quantised, quantise_model
 from quant.sensitivity import LayerError, Loss, layer_errors, spread_of
 from quant.session import open_session, run

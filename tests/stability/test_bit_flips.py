@@ -13,7 +13,8 @@ from typer.testing import CliRunner
 from deploy.bench.tables import predict_file
 from deploy.cli import app
 from deploy.dpu.board import load_dpu
-from deploy.stress.flip_study import TILE_PX, FlipRequest, flip_curves_svg, make_target, price_rows
+from deploy.restoration.options import TILE_PX
+from deploy.stress.flip_study import FlipRequest, flip_curves_svg, make_target, price_rows
 from deploy.stress.flips import MEMORIES, RATES, FaultTarget, Injected, curve_rows, name_of, place_rows, restored
 from deploy.stress.networks import core_of
 from deploy.stress.rows import markdown

@@ -11,7 +11,6 @@ from deploy.dpu.graph import Operation, Scale
 
 # ruff: noqa: ARG001 - every rule takes the operation and the DPU
 
-
 AGAIN = "'beers-deploy quantize --regime legal' does"
 MOVE = "move the output's scale until it fits: 'beers-deploy quantize --regime legal' does"
 
@@ -126,9 +125,6 @@ def _cut(op: Operation) -> int | None:
 def _words(scale: Scale) -> str:
     scales, zeros = ", ".join(f"{s:.9g}" for s in scale.scales[:1]), scale.zero_points[:1]
     return f"{scale.integer_type} at scale {scales or 'unknown'} around {zeros[0] if zeros else 'nothing'}"
-
-
-# ruff: noqa: ARG001 - every rule takes the operation and the DPU
 
 
 BYTES = ("int8", "uint8")

@@ -1,8 +1,7 @@
 """The DPU's rules by kind of operation, their texts, and the judgement of one node: all broken rules, not the first.
 
-A rule is a small function (`conv_rules`, `other_rules`, `size_rules`, `number_rules`, `constant_rules`) whose
-docstring is its text, filled in with the limits of the target profile: text, check and documentation cannot drift
-apart.
+A rule is a small function (`conv_rules`, `other_rules`, `number_rules`) whose docstring is its text, filled in with
+the limits of the target profile: text, check and documentation cannot drift apart.
 """
 
 import inspect
@@ -10,60 +9,68 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 
 from deploy.dpu.board import Dpu
-from deploy.dpu.checker import conv_rules as c
-from deploy.dpu.checker import number_rules as k
-from deploy.dpu.checker import number_rules as n
-from deploy.dpu.checker import other_rules as o
-from deploy.dpu.checker import other_rules as s
+from deploy.dpu.checker import conv_rules, number_rules, other_rules
 from deploy.dpu.checker.finding import Finding, Rule
 from deploy.dpu.graph import Kind, Operation
 
 CONV: tuple[Rule, ...] = (
-    c.conv_kernel,
-    c.conv_stride,
-    c.conv_channels,
-    c.conv_padding,
-    c.conv_weight_bank,
-    c.conv_window,
-    c.conv_dilation,
-    c.conv_groups,
+    conv_rules.conv_kernel,
+    conv_rules.conv_stride,
+    conv_rules.conv_channels,
+    conv_rules.conv_padding,
+    conv_rules.conv_weight_bank,
+    conv_rules.conv_window,
+    conv_rules.conv_dilation,
+    conv_rules.conv_groups,
 )
 RULES: Mapping[Kind, tuple[Rule, ...]] = {
     "conv": CONV,
     "grouped conv": CONV,
-    "depthwise": (c.depthwise_kernel, c.depthwise_stride, c.depthwise_padding, c.depthwise_channels),
-    "transposed": (
-        c.transposed_kernel,
-        c.transposed_output_padding,
-        c.transposed_padding,
-        c.transposed_channels,
+    "depthwise": (
+        conv_rules.depthwise_kernel,
+        conv_rules.depthwise_stride,
+        conv_rules.depthwise_padding,
+        conv_rules.depthwise_channels,
     ),
-    "pool": (o.pool_kernel, o.pool_stride, o.pool_padding),
-    "activation": (o.activation_place, o.activation_of_sums, o.leaky_relu_alpha),
+    "transposed": (
+        conv_rules.transposed_kernel,
+        conv_rules.transposed_output_padding,
+        conv_rules.transposed_padding,
+        conv_rules.transposed_channels,
+    ),
+    "pool": (other_rules.pool_kernel, other_rules.pool_stride, other_rules.pool_padding),
+    "activation": (other_rules.activation_place, other_rules.activation_of_sums, other_rules.leaky_relu_alpha),
     "add": (),
-    "mul": (o.mul_constant,),
+    "mul": (other_rules.mul_constant,),
     "concat": (),
-    "pad": (o.pad_mode,),
-    "resize": (o.resize_mode, o.resize_scale, o.resize_channels),
-    "pixel shuffle": (o.pixel_shuffle,),
-    "quantise": (o.known_operator,),
-    "dequantise": (o.known_operator,),
-    "other": (o.known_operator,),
+    "pad": (other_rules.pad_mode,),
+    "resize": (other_rules.resize_mode, other_rules.resize_scale, other_rules.resize_channels),
+    "pixel shuffle": (other_rules.pixel_shuffle,),
+    "quantise": (other_rules.known_operator,),
+    "dequantise": (other_rules.known_operator,),
+    "other": (other_rules.known_operator,),
 }
 """What a node of each kind has to keep, float or quantised."""
 
-SIZES: tuple[Rule, ...] = (s.map_exists, s.maps_aligned, s.map_in_memory)
+SIZES: tuple[Rule, ...] = (other_rules.map_exists, other_rules.maps_aligned, other_rules.map_in_memory)
 """What the tile's size has to allow every node."""
 
-NUMBERS: tuple[Rule, ...] = (n.on_integers, n.symmetric, n.per_tensor, n.power_of_two, n.one_format, k.int8_constants)
+NUMBERS: tuple[Rule, ...] = (
+    number_rules.on_integers,
+    number_rules.symmetric,
+    number_rules.per_tensor,
+    number_rules.power_of_two,
+    number_rules.one_format,
+    number_rules.int8_constants,
+)
 SHIFTS: Mapping[Kind, tuple[Rule, ...]] = {
-    "conv": (k.int8_bias, k.int32_bias, n.shift_cut, n.shift_bias),
-    "depthwise": (k.int8_bias, k.int32_bias, n.shift_cut, n.shift_bias),
-    "transposed": (k.int8_bias, k.int32_bias, n.shift_cut, n.shift_bias),
-    "add": (n.shift_read, n.shift_write),
+    "conv": (number_rules.int8_bias, number_rules.int32_bias, number_rules.shift_cut, number_rules.shift_bias),
+    "depthwise": (number_rules.int8_bias, number_rules.int32_bias, number_rules.shift_cut, number_rules.shift_bias),
+    "transposed": (number_rules.int8_bias, number_rules.int32_bias, number_rules.shift_cut, number_rules.shift_bias),
+    "add": (number_rules.shift_read, number_rules.shift_write),
     "mul": (),
-    "concat": (n.same_scale,),
-    "pool": (n.same_scale,),
+    "concat": (number_rules.same_scale,),
+    "pool": (number_rules.same_scale,),
 }
 """What a quantised node has to keep besides."""
 

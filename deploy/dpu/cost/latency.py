@@ -1,6 +1,6 @@
 """How long a network takes on the DPU, layer by layer, and how far off that may be.
 
-The counts come from `work.py`, the formula from `rates.py`, the constants and errors from the target's [cost], where
+A layer's counts and its formula come from `layers.py`, the constants and errors from the target's [cost], where
 `docs/make_cost_model.py` writes what `fit.py` finds on published networks. None of them is ConvBEERS: the paper's own
 figure is what the model is compared with, never what it is made from.
 
