@@ -12,7 +12,6 @@ import onnx
 
 from deploy.report.page import Report, write_report
 from deploy.report.sensitivity_page import sensitivity_page
-from deploy.results import print_rows
 from model.progress import steps
 from profiles.errors import OptionError
 from profiles.figures import Row
@@ -41,6 +40,9 @@ def sensitivity_report(
 
 
 Say = Callable[[str], None]
+"""Tells a sentence as the work goes on."""
+Show = Callable[[str, list[Row]], None]
+"""Shows a table under its title as soon as it is made."""
 
 
 @dataclass(frozen=True)
@@ -52,14 +54,16 @@ class Wanted:
     page: Path | None
 
 
-def quantise_free_file(model: onnx.ModelProto, calibration: Calibration, out: Path, say: Say) -> list[Row]:
+def quantise_free_file(
+    model: onnx.ModelProto, calibration: Calibration, out: Path, say: Say, show: Show
+) -> list[Row]:
     """Write the INT8 file without the DPU's rules, and compare it with the float network."""
     with steps("calibrating", free_ticks(model, calibration.patches)) as bar:
         made = quantise_free(model, calibration.drawn, calibration.about, bar.advance)
     save_onnx(made, out)
     say(f"wrote {out}: float scales, for boards that are not the DPU")
     row = gate_row(compare(open_any_size(model), open_any_size(made), calibration.unseen.pairs))
-    print_rows("float against INT8, on patches that calibration did not see", [row])
+    show("float against INT8, on patches that calibration did not see", [row])
     return [row]
 
 
@@ -71,8 +75,9 @@ def quantise_legal_file(
     out: Path,
     wanted: Wanted,
     say: Say,
+    show: Show,
 ) -> list[Row]:
-    """Write the INT8 file under the target's rules and whatever else is wanted; print each integer layer.
+    """Write the INT8 file under the target's rules and whatever else is wanted; show each integer layer.
 
     Raises:
         OptionError: a target without a DPU.
@@ -88,9 +93,9 @@ def quantise_legal_file(
         say(f"wrote {wanted.board}: the same numbers in the board's encoding")
     images = calibration.drawn.degraded
     layers, rounding = integer_rows(model, result.core, result.host, images)
-    print_rows("integer layers", layers)
-    print_rows("tie rounding", [rounding])
-    rows = [*layers, rounding, *(_ablated(model, calibration, shifts) if wanted.ablate else [])]
+    show("integer layers", layers)
+    show("tie rounding", [rounding])
+    rows = [*layers, rounding, *(_ablated(model, calibration, shifts, show) if wanted.ablate else [])]
     return _with_sensitivity(model, result, calibration, rows, wanted.page, say) if wanted.page else rows
 
 
@@ -101,10 +106,10 @@ def _shifts_of(target: TargetProfile) -> Shifts:
     return target_shifts(target)
 
 
-def _ablated(model: onnx.ModelProto, calibration: Calibration, shifts: Shifts) -> list[Row]:
+def _ablated(model: onnx.ModelProto, calibration: Calibration, shifts: Shifts, show: Show) -> list[Row]:
     with steps("ablating", len(ablations())) as bar:
         rows = ablation_rows(model, calibration.drawn, calibration.unseen, bar.advance, shifts)
-    print_rows("what each pass buys, on patches that calibration did not see", rows)
+    show("what each pass buys, on patches that calibration did not see", rows)
     return rows
 
 

@@ -53,7 +53,7 @@ def quantize(
     """
     from deploy.export import float_model
     from deploy.quantise import Wanted, quantise_free_file, quantise_legal_file
-    from deploy.results import Document
+    from deploy.results import Document, print_rows
     from model.io.files import require_writable
     from model.shipped import float_file
     from profiles import load_target
@@ -73,10 +73,10 @@ def quantize(
     network, board_target = float_model(model), load_target(target)
     calibration = Calibration(sensor, images, patches, patch, seed)
     if regime is Regime.free:
-        rows = quantise_free_file(network, calibration, out, say)
+        rows = quantise_free_file(network, calibration, out, say, print_rows)
     else:
         wanted = Wanted(board, ablate, page)
-        rows = quantise_legal_file(network, calibration, board_target, passes, out, wanted, say)
+        rows = quantise_legal_file(network, calibration, board_target, passes, out, wanted, say, print_rows)
     arguments = {"target": target, "sensor": sensor, "images": images, "patches": patches, "patch": patch}
     arguments |= {"regime": regime.value, "without": ", ".join(without or []), "seed": seed}
     document = Document("quantize", arguments, (model, out), tuple(rows))
