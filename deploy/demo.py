@@ -153,7 +153,7 @@ class Demo:
     report: Report
 
 
-def sensors(name: str = SENSOR) -> Sensors:
+def load_sensors(name: str = SENSOR) -> Sensors:
     """The sensor that the demo simulates, and the one it imitates.
 
     Raises:
@@ -167,22 +167,22 @@ def sensors(name: str = SENSOR) -> Sensors:
     return Sensors(degraded, reference_for(degraded))
 
 
-def read_input(image: Path | None, seed: int, eyes: Sensors, full_scale: float | None = None) -> Input:
+def read_input(image: Path | None, seed: int, sensors: Sensors, full_scale: float | None = None) -> Input:
     """A drawn scene, a photograph as a scene (8 bits), or a raw acquisition (mono, up to 12 bits).
 
     With the pixel value that is its `full_scale`, any image is a raw acquisition.
     """
     if image is None:
-        side = (SIDE_PX + 2 * MARGIN_PX) * int(eyes.degraded.oversampling.low)
-        return _simulated(procedural_scene(side, side, np.random.default_rng(seed)), seed, eyes)
+        side = (SIDE_PX + 2 * MARGIN_PX) * int(sensors.degraded.oversampling.low)
+        return _simulated(procedural_scene(side, side, np.random.default_rng(seed)), seed, sensors)
     if full_scale is None and read_pixels(image).dtype == np.uint8:
-        return _simulated(read_scene(image, eyes.reference.nominal()), seed, eyes)
+        return _simulated(read_scene(image, sensors.reference.nominal()), seed, sensors)
     return Input(image.name, read_acquisition(image, full_scale, None), None)
 
 
-def _simulated(scene: Scene, seed: int, eyes: Sensors) -> Input:
-    ratio = int(eyes.degraded.oversampling.low)
-    pair = simulate_pair(scene.radiance, eyes.degraded.nominal(), eyes.reference.nominal(), ratio, Draw(seed))
+def _simulated(scene: Scene, seed: int, sensors: Sensors) -> Input:
+    ratio = int(sensors.degraded.oversampling.low)
+    pair = simulate_pair(scene.radiance, sensors.degraded.nominal(), sensors.reference.nominal(), ratio, Draw(seed))
     return Input(scene.name, pair.degraded.numpy(), pair)
 
 
@@ -199,15 +199,15 @@ def run_demo(
     Files: float.onnx, int8.onnx, core.onnx (the board's encoding), restored.tif, before-after.png.
     """
     say("reading the image")
-    eyes = sensors(sensor)
-    given = read_input(image, seed, eyes, full_scale)
+    sensors = load_sensors(sensor)
+    given = read_input(image, seed, sensors, full_scale)
     say("exporting, quantising and gating")
-    gate, int8, exact = quantise_and_gate(out, seed, eyes)
+    gate, int8, exact = quantise_and_gate(out, seed, sensors)
     say("checking every operator against the DPU")
     dpu = load_dpu()
     placement = place(read_network(out / "int8.onnx", TILE_PX), dpu)
     say("restoring: traditional pipeline and INT8 network")
-    methods = _methods(int8, eyes)
+    methods = _methods(int8, sensors)
     restored = {name: method(given.degraded) for name, method in methods.items()}
     write_tiff(out / "restored.tif", restored[INT8].astype(np.uint16))
     images = {"degraded input": given.degraded, **restored}
@@ -216,38 +216,38 @@ def run_demo(
     pictures = comparison(images, out)
     quality = _quality(given, restored)
     say("measuring the traditional pipeline, predicting the board")
-    bench, swath = bench_rows(out / "int8.onnx", given.degraded, dpu, receptive_radius_px(int8), eyes)
+    bench, swath = bench_rows(out / "int8.onnx", given.degraded, dpu, receptive_radius_px(int8), sensors)
     rows = (*bench, *swath, *quality, gate, exact)
     return Demo(rows, demo_report(given.degraded.shape, pictures, bench, swath, quality, (gate, exact), placement))
 
 
-def quantise_and_gate(out: Path, seed: int, eyes: Sensors) -> tuple[Row, onnx.ModelProto, Row]:
+def quantise_and_gate(out: Path, seed: int, sensors: Sensors) -> tuple[Row, onnx.ModelProto, Row]:
     """Export the shipped weights, quantise on drawn scenes, compare; returns the gate's row and the INT8 model."""
     model = float_model(None)
     save_onnx(model, out / "float.onnx")
     network, _ = load_network(default_float_weights())
     difference = require_parity(network, out / "float.onnx", 97)
-    scenes = load_scenes(None, eyes.reference.nominal(), seed)
-    patches = draw_patches(scenes, eyes.degraded, eyes.reference, CALIBRATION_PATCHES, seed)
-    result = quantise_model(model, patches, {"calibration_sensor": eyes.degraded.name}, lambda: None)
+    scenes = load_scenes(None, sensors.reference.nominal(), seed)
+    patches = draw_patches(scenes, sensors.degraded, sensors.reference, CALIBRATION_PATCHES, seed)
+    result = quantise_model(model, patches, {"calibration_sensor": sensors.degraded.name}, lambda: None)
     save_onnx(result.host, out / "int8.onnx")
     save_onnx(result.board, out / "core.onnx")
-    unseen = load_scenes(None, eyes.reference.nominal(), seed + HELD_OUT_SEED)
-    held_out = draw_patches(unseen, eyes.degraded, eyes.reference, GATE_PATCHES, seed + HELD_OUT_SEED)
+    unseen = load_scenes(None, sensors.reference.nominal(), seed + HELD_OUT_SEED)
+    held_out = draw_patches(unseen, sensors.degraded, sensors.reference, GATE_PATCHES, seed + HELD_OUT_SEED)
     verdict = compare(open_session(model), open_session(result.host), held_out.pairs)
     source = "one random image of 97 x 97"
     exact = Row("gate", "ONNX against torch", {"max": measured(difference, "of full scale", source)})
     return gate_row(verdict), result.host, exact
 
 
-def bench_rows(model: Path, dn: np.ndarray, dpu: Dpu, halo_px: int, eyes: Sensors) -> tuple[list[Row], list[Row]]:
+def bench_rows(model: Path, dn: np.ndarray, dpu: Dpu, halo_px: int, sensors: Sensors) -> tuple[list[Row], list[Row]]:
     """Speed for this image, and for the swath of the paper with its published rows beside."""
     prediction = predict_file(model, dpu)
     tables = []
     for width, height in ((dn.shape[1], dn.shape[0]), SWATH_PX):
         swath = Swath(width, height, TILE_PX, halo_px)
         network = predicted_rows(VARIANT, prediction, swath, dpu)
-        tables.append([*traditional_rows(dn, swath, eyes), *network])
+        tables.append([*traditional_rows(dn, swath, sensors), *network])
     return tables[0], [
         *(_in_table(row, "swath") for row in tables[1]),
         *(_in_table(r, "swath") for r in published_rows()),
@@ -258,11 +258,11 @@ def _in_table(row: Row, table: str) -> Row:
     return Row(table, row.name, row.figures, row.text)
 
 
-def _methods(int8: onnx.ModelProto, eyes: Sensors) -> dict[str, Restore]:
-    plain = eyes.degraded.nominal(), eyes.reference.nominal()
+def _methods(int8: onnx.ModelProto, sensors: Sensors) -> dict[str, Restore]:
+    plain = sensors.degraded.nominal(), sensors.reference.nominal()
     return {
         TRADITIONAL: lambda dn: restore_traditional(torch.from_numpy(dn), Chain(*plain)).numpy(),
-        INT8: network_method(int8, eyes.degraded.nominal().max_dn),
+        INT8: network_method(int8, sensors.degraded.nominal().max_dn),
     }
 
 

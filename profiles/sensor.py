@@ -132,7 +132,7 @@ class SensorProfile:
                 along = self.mtf_nyquist_along  # drawn last: a profile without it draws what it always drew
                 mtf_along = None if along is None else float(generator.uniform(along.low, along.high))
                 return self._sensor(mtf_nyquist, alpha, beta, effects, mtf_along), rejected
-        raise self._impossible_snr()
+        raise self.impossible_snr()
 
     def nominal(self) -> Sensor:
         """The middle of every range (the SNR at radiance_0 moved to the nearest physical value)."""
@@ -150,7 +150,8 @@ class SensorProfile:
         gain, bits = self.gain_dn_per_radiance.low, int(self.bits.low)
         return Sensor(mtf, alpha, beta, gain, bits, effects, mtf_along, self.radiance_1.low)
 
-    def _impossible_snr(self) -> ProfileError:
+    def impossible_snr(self) -> ProfileError:
+        """The error of SNRs that no alpha and beta can have, with the range that the first one must lie in."""
         low, high = snr_0_bounds(self.radiance_0.low, self.radiance_1.low, self.snr_1.high)
         return ProfileError(
             f"sensor profile {self.name}: noise.snr_0 and noise.snr_1",

@@ -185,7 +185,7 @@ def _check_snr(profile: SensorProfile) -> None:
         for s in (profile.snr_1.low, profile.snr_1.high)
     ]
     if profile.snr_0.high < ends[0][0] or profile.snr_0.low > ends[1][1]:
-        raise profile._impossible_snr()
+        raise profile.impossible_snr()
 
 
 def reference_beside(degraded: SensorProfile, name: str | None, say: Callable[[str], None]) -> SensorProfile:

@@ -25,8 +25,8 @@ ZERO = 128
 
 def host_model(core: IntCore, about: dict[str, str], tile_px: int | None = None) -> onnx.ModelProto:
     """The whole INT8 network on stock onnxruntime, (N, 1, H, W) float32 in [0, 1] to the same."""
-    writer = _HostWriter()
-    _split_planes(writer)
+    writer = HostWriter()
+    split_planes(writer)
     for op in core.ops:
         if isinstance(op, Add):
             _add(writer, core, op)
@@ -37,8 +37,8 @@ def host_model(core: IntCore, about: dict[str, str], tile_px: int | None = None)
     return make_model(writer.graph("convbeers-int8", *ends), about, microsoft=True)
 
 
-def _split_planes(w: "_HostWriter") -> None:
-    """See quant.graph for the arithmetic."""
+def split_planes(w: "HostWriter") -> None:
+    """Write the host's nodes in front of the core, image to uint8 planes: `quant.graph.split` as operators."""
     w.node("Mul", "host_front.scale", [IMAGE, w.scalar("max_dn", MAX_DN)])
     w.node("Round", "host_front.round", ["host_front.scale"])
     w.node("Clip", "host_front.dn", ["host_front.round", w.scalar("zero", 0), w.scalar("max_dn", MAX_DN)])
@@ -55,7 +55,7 @@ def _split_planes(w: "_HostWriter") -> None:
     w.node("Cast", PLANES, ["host_front.offset"], to=TensorProto.UINT8)
 
 
-def _host_conv(w: "_HostWriter", core: IntCore, op: IntConv) -> None:
+def _host_conv(w: "HostWriter", core: IntCore, op: IntConv) -> None:
     shift = op.weight_frac_bits + core.frac_bits[op.input] - op.bias_frac_bits
     bias = op.bias.astype(np.int32) << shift
     feeds = [op.input, w.unit(core.frac_bits[op.input]), w.zero_point()]
@@ -70,7 +70,7 @@ def _host_conv(w: "_HostWriter", core: IntCore, op: IntConv) -> None:
         w.node("Max", op.output, [result, w.zero_point()], name=f"{op.name}.relu")
 
 
-def _add(w: "_HostWriter", core: IntCore, op: Add) -> None:
+def _add(w: "HostWriter", core: IntCore, op: Add) -> None:
     feeds = []
     for name in (*op.inputs, op.output):
         quantity = [] if name == op.output else [name]
@@ -78,22 +78,22 @@ def _add(w: "_HostWriter", core: IntCore, op: Add) -> None:
     w.node("QLinearAdd", op.output, feeds, name=op.name, domain=MICROSOFT)
 
 
-def _merge(w: "_HostWriter", core: IntCore) -> None:
+def _merge(w: "HostWriter", core: IntCore) -> None:
     scale = w.unit(core.frac_bits[CORRECTION])
     if core.output_channels == 1:
         w.node("DequantizeLinear", "host_back.correction", [CORRECTION, scale, w.zero_point()])
     else:
         w.node("DequantizeLinear", "host_back.both", [CORRECTION, scale, w.zero_point()])
-        _merge_gains(w, core.scale(CORRECTION))
+        merge_gains(w, core.scale(CORRECTION))
     w.node("Add", "host_back.add", [IMAGE, "host_back.correction"])
     w.node("Clip", "restored", ["host_back.add", w.scalar("zero", 0), w.scalar("one", 1)], name="host_back.clip")
 
 
-def _merge_gains(w: "_HostWriter", scale: float) -> None:
-    """See quant.passes.stream.merge for the arithmetic."""
-    halves = w.constant("one_each", np.array([1, 1]))
+def merge_gains(w: "HostWriter", scale: float) -> None:
+    """Write the nodes that make one correction of two gains: `quant.passes.stream.merge` as operators."""
+    one_each = w.constant("one_each", np.array([1, 1]))
     w.nodes.append(
-        helper.make_node("Split", ["host_back.both", halves], ["host_back.fine", "host_back.coarse"], axis=1)
+        helper.make_node("Split", ["host_back.both", one_each], ["host_back.fine", "host_back.coarse"], axis=1)
     )
     w.nodes[-1].name = "host_back.split"
     w.node("Mul", "host_back.wide", ["host_back.coarse", w.scalar("gain", GAIN)])
@@ -102,7 +102,7 @@ def _merge_gains(w: "_HostWriter", scale: float) -> None:
     w.node("Where", "host_back.correction", ["host_back.fits", "host_back.fine", "host_back.wide"])
 
 
-class _HostWriter(GraphWriter):
+class HostWriter(GraphWriter):
     """Writes the host's operators, each with its domain, and uint8 around 128."""
 
     def node(
@@ -114,15 +114,19 @@ class _HostWriter(GraphWriter):
         domain: str | None = "",
         **attributes: int | list[int],
     ) -> str:
+        """As `GraphWriter.node`, with a domain that is written even where it is ONNX's own."""
         return super().node(kind, output, inputs, name, domain, **attributes)
 
     def scalar(self, name: str, value: float) -> str:
+        """A float32 constant."""
         return self.constant(name, np.array(value, np.float32))
 
     def unit(self, frac_bits: int) -> str:
+        """The constant 2^-frac_bits: one unit of a tensor."""
         return self.constant(f"scale_2^{-frac_bits}", np.array(2.0**-frac_bits, np.float32))
 
     def zero_point(self) -> str:
+        """The constant 128, around which uint8 stands for int8."""
         return self.constant("zero_point", np.array(ZERO, np.uint8))
 
 

@@ -12,7 +12,7 @@ import onnx
 
 from quant.calibration import Patches
 from quant.core import INT8_MAX
-from quant.encodings import MICROSOFT, ZERO, _HostWriter, _merge_gains, _split_planes
+from quant.encodings import MICROSOFT, ZERO, HostWriter, merge_gains, split_planes
 from quant.graph import (
     CORRECTION,
     IMAGE,
@@ -144,8 +144,8 @@ def free_model(
         tile_px: side of a fixed tile, or None for any size.
         moments: of what each convolution reads, for `quant.passes.fit_weights`; None rounds to nearest.
     """
-    writer = _HostWriter()
-    _split_planes(writer)
+    writer = HostWriter()
+    split_planes(writer)
     for op in graph:
         if isinstance(op, Add):
             feeds = [feed for name in op.inputs for feed in (name, *_scale(writer, scales[name]))]
@@ -155,7 +155,7 @@ def free_model(
             _conv(writer, op, scales, moments[op.name] if moments else None)
     both = [CORRECTION, *_scale(writer, scales[CORRECTION])]
     writer.node("DequantizeLinear", "host_back.both", both)
-    _merge_gains(writer, scales[CORRECTION].unit)
+    merge_gains(writer, scales[CORRECTION].unit)
     writer.node("Add", "host_back.add", [IMAGE, "host_back.correction"])
     limits = [writer.scalar("zero", 0), writer.scalar("one", 1)]
     writer.node("Clip", "restored", ["host_back.add", *limits], name="host_back.clip")
@@ -163,7 +163,7 @@ def free_model(
     return make_model(writer.graph("convbeers-int8-free", *ends), about, microsoft=True)
 
 
-def _conv(w: _HostWriter, op: Conv, scales: Mapping[str, Scale], moments: Moments | None) -> None:
+def _conv(w: HostWriter, op: Conv, scales: Mapping[str, Scale], moments: Moments | None) -> None:
     weight = round_weight(op.weight, np.abs(op.bias) / (scales[op.input].unit * MAX_BIAS))
     values, shifted = fit(op.weight, weight.values, weight.scales, moments) if moments else (weight.values, 0.0)
     products = np.float32(scales[op.input].unit) * weight.scales.astype(np.float64)
@@ -180,7 +180,7 @@ def _conv(w: _HostWriter, op: Conv, scales: Mapping[str, Scale], moments: Moment
         w.node("Max", op.output, [result, _scale(w, scales[op.output])[1]], name=f"{op.name}.relu")
 
 
-def _scale(w: _HostWriter, scale: Scale) -> list[str]:
+def _scale(w: HostWriter, scale: Scale) -> list[str]:
     unit = w.scalar(f"scale_{np.float32(scale.unit)!s}", scale.unit)
     return [unit, w.constant(f"zero_point_{scale.zero_point}", np.array(scale.zero_point, np.uint8))]
 

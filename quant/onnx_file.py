@@ -135,13 +135,13 @@ def image_info(
 
 def with_outputs(model: onnx.ModelProto, kinds: Mapping[str, int]) -> onnx.ModelProto:
     """The model with these tensors, of these ONNX types, as outputs behind its own."""
-    told = onnx.ModelProto()
-    told.CopyFrom(model)
-    own = {value.name for value in told.graph.output}
-    told.graph.output.extend(
+    extended = onnx.ModelProto()
+    extended.CopyFrom(model)
+    own = {value.name for value in extended.graph.output}
+    extended.graph.output.extend(
         onnx.helper.make_tensor_value_info(name, kind, None) for name, kind in kinds.items() if name not in own
     )
-    return told
+    return extended
 
 
 def constants(model: onnx.ModelProto) -> dict[str, np.ndarray]:

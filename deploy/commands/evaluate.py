@@ -65,20 +65,20 @@ def evaluate(
     read = (*folders, lpips, *(Path(name) for name in (sensor, reference, *names) if name))
     require_writable(out / "report.html" if out else None, json, inputs=read, folders=(out,))
     recipe = read_pairs_recipe(pairs) if pairs is not None else None
-    eyes = profiles_for(sensor, reference, recipe, say)
-    chosen = [method_named(name, eyes[0].nominal(), eyes[1].nominal(), eyes[0].name) for name in names]
-    instruments = Instruments(perceptual_distances(lpips), eyes[0].nominal().max_dn)
-    found, small = load_pairs(images, pairs, *eyes, seed, recipe)
-    result = evaluate_methods(chosen, found, instruments, eyes[0].nominal(), seed)
-    title = f"{eyes[0].name} -> {eyes[1].name}, {len(found)} image{'' if len(found) == 1 else 's'}"
+    sensors = profiles_for(sensor, reference, recipe, say)
+    chosen = [method_named(name, sensors[0].nominal(), sensors[1].nominal(), sensors[0].name) for name in names]
+    instruments = Instruments(perceptual_distances(lpips), sensors[0].nominal().max_dn)
+    found, small = load_pairs(images, pairs, *sensors, seed, recipe)
+    result = evaluate_methods(chosen, found, instruments, sensors[0].nominal(), seed)
+    title = f"{sensors[0].name} -> {sensors[1].name}, {len(found)} image{'' if len(found) == 1 else 's'}"
     print_rows(title, result.mean)
-    swept = sweep_tables(chosen, images, *eyes, seed) if sweep else ()
+    swept = sweep_tables(chosen, images, *sensors, seed) if sweep else ()
     for table, rows in by_table((*result.sites, *swept)).items():
         print_rows(table, rows)
     sites = len({pair.site for pair in found})
     if sites < LEAST_SITES:
         say(f"no interval over sites is shown: of {sites}, fewer than {LEAST_SITES}, none could be trusted")
-    sampled = oversampling_note(found, eyes[0])
+    sampled = oversampling_note(found, sensors[0])
     if sampled:
         say(sampled)
     if small:
@@ -90,8 +90,8 @@ def evaluate(
     arguments: dict[str, object] = {
         "images": images,
         "pairs": pairs,
-        "sensor": sensor or eyes[0].name,
-        "reference": eyes[1].name,
+        "sensor": sensor or sensors[0].name,
+        "reference": sensors[1].name,
     }
     arguments |= {"methods": methods, "lpips": lpips, "out": out, "sweep": sweep, "seed": seed}
     Document("evaluate", arguments, input_files(names, images, pairs, lpips), (*result.rows, *swept)).write(json)

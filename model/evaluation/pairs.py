@@ -93,7 +93,7 @@ def _require_made_by(option: str, named: SensorProfile | None, made: SensorProfi
 OVERSAMPLINGS = (4, 2)
 
 
-class Eye(Protocol):
+class SensorSource(Protocol):
     """What gives a sensor for each scene: a profile, or always the same one."""
 
     def draw(self, generator: np.random.Generator, /) -> Sensor:
@@ -123,7 +123,11 @@ class NamedPair:
 
 
 def simulate_pairs(
-    scenes: list[Scene], degraded: Eye, reference: Eye, seed: int, oversamplings: Sequence[int] = OVERSAMPLINGS
+    scenes: list[Scene],
+    degraded: SensorSource,
+    reference: SensorSource,
+    seed: int,
+    oversamplings: Sequence[int] = OVERSAMPLINGS,
 ) -> tuple[list[NamedPair], list[str]]:
     """Simulate a pair of each scene, at the first of the oversamplings that leaves enough of it.
 
@@ -140,8 +144,8 @@ def simulate_pairs(
             small.append(scene.name)
             continue
         draw = Draw(seed, number)
-        eyes = [profile.draw(draw.generator("sensor")) for profile in (degraded, reference)]
-        pair = simulate_pair(scene.radiance, eyes[0], eyes[1], ratio, draw)
+        drawn = [profile.draw(draw.generator("sensor")) for profile in (degraded, reference)]
+        pair = simulate_pair(scene.radiance, drawn[0], drawn[1], ratio, draw)
         pairs.append(NamedPair(scene.name, pair.degraded.numpy(), pair.reference.numpy(), oversampling=ratio))
     if not pairs:
         least = oversamplings[-1] * (2 * MARGIN_PX + LEAST_SIDE_PX)

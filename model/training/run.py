@@ -159,17 +159,17 @@ def loss_of(run: Run) -> tuple[RestorationLoss, str]:
 
 def data(run: Run, trainer: Trainer) -> tuple[Source, Validation, list[str]]:
     """Where batches come from, the images held out, and the names of those trained on."""
-    recipe, eyes = run.recipe, (run.patches.told or run.patches.degraded, run.patches.reference)
+    recipe, sensors = run.recipe, (run.patches.told or run.patches.degraded, run.patches.reference)
     if run.pairs is not None:
         files = pair_files(run.pairs)
         degraded = run.patches.degraded
         given = (run.patches.patch_px, degraded.nominal().max_dn, recipe.batch, recipe.seed, trainer.worker)
         source = StoredPairs(files, *given, quarters=degraded.mtf_nyquist_along is None)
-        return source, Validation([], *eyes), [degraded.name for degraded, _ in files]
+        return source, Validation([], *sensors), [degraded.name for degraded, _ in files]
     scenes = read_scenes(run)
     kept, held = split_by_site([scene.name for scene in scenes])
     views = TOLD_VIEWS if run.patches.told else 1
-    validation = Validation([scenes[k] for k in held for _ in range(views)], *eyes)
+    validation = Validation([scenes[k] for k in held for _ in range(views)], *sensors)
     train_on = [scenes[k] for k in kept] + draw_scenes(run.drawn, recipe.seed)
     if not train_on:
         remedy = "give --images, --pairs or --drawn"

@@ -63,14 +63,14 @@ class Validation:
             if ratio is None:
                 continue
             draw = Draw(0, number)
-            eyes = [profile.draw(draw.generator("sensor")) for profile in (degraded, reference)]
-            pair = simulate_pair(scene.radiance, eyes[0], eyes[1], ratio, draw)
+            sensors = [profile.draw(draw.generator("sensor")) for profile in (degraded, reference)]
+            pair = simulate_pair(scene.radiance, sensors[0], sensors[1], ratio, draw)
             height, width = (min(side, SIDE_PX) for side in pair.degraded.shape)
-            both = (pair.degraded / eyes[0].max_dn, pair.reference / eyes[1].max_dn)
+            both = (pair.degraded / sensors[0].max_dn, pair.reference / sensors[1].max_dn)
             degraded_image, reference_image = (image[None, None, :height, :width] for image in both)
             self.names.append(scene.name)
             self.pairs.append((degraded_image, reference_image))
-            self.vectors.append(tell(eyes[0]).vector)
+            self.vectors.append(tell(sensors[0]).vector)
 
     def restore(self, network: Network) -> list[np.ndarray]:
         """Each degraded image through the network in float32, (H, W), clipped to [0, 1].

@@ -18,7 +18,7 @@ from typer.main import get_command
 from typer.testing import CliRunner
 
 from deploy.cli import COMMANDS, app
-from deploy.demo import read_input, sensors
+from deploy.demo import load_sensors, read_input
 from deploy.results import SCHEMA_PATH
 from model.io.images import read_acquisition
 from model.shipped import SENSOR, default_int8
@@ -175,13 +175,13 @@ def test_an_acquisition_of_another_scale_is_read_as_digital_numbers(tmp_path: Pa
         with pytest.raises(ImageError, match="rescale it"):  # where no option settles it, as for pairs
             read_acquisition(tmp_path / name)
         with pytest.raises(ImageError, match="--full-scale"):
-            read_input(tmp_path / name, 0, sensors()) if name == "share.tif" else read_acquisition(
+            read_input(tmp_path / name, 0, load_sensors()) if name == "share.tif" else read_acquisition(
                 tmp_path / name, None, None
             )
         with pytest.raises(ImageError, match="values from 0"):
             read_acquisition(tmp_path / name, 0.5 if name == "share.tif" else 100)
-    assert read_input(tmp_path / "share.tif", 0, sensors(), 1).degraded.max() == 4095
-    assert read_input(tmp_path / "eight.tif", 0, sensors(), 255).pair is None  # a raw image, no scene
+    assert read_input(tmp_path / "share.tif", 0, load_sensors(), 1).degraded.max() == 4095
+    assert read_input(tmp_path / "eight.tif", 0, load_sensors(), 255).pair is None  # a raw image, no scene
 
 
 def test_a_full_scale_without_an_image_is_refused() -> None:

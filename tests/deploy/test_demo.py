@@ -9,7 +9,7 @@ import tifffile
 from typer.testing import CliRunner
 
 from deploy.cli import app
-from deploy.demo import read_input, sensors
+from deploy.demo import load_sensors, read_input
 from deploy.results import SCHEMA_PATH
 from profiles.errors import OptionError
 from profiles.toml import HERE
@@ -42,9 +42,9 @@ def test_the_reference_has_the_gain_of_the_sensor_named(tmp_path: Path) -> None:
     """Else every pixel of the scene would be off by the ratio of the gains, and the PSNR would say so."""
     text = (HERE / "sensors" / "pleiades-degraded.toml").read_text()
     (tmp_path / "mine.toml").write_text(text.replace("10.2375", "5.0"))
-    pair = read_input(None, 0, sensors(str(tmp_path / "mine.toml"))).pair
+    pair = read_input(None, 0, load_sensors(str(tmp_path / "mine.toml"))).pair
     assert pair is not None
     assert abs(float(pair.degraded.mean() / pair.reference.mean()) - 1) < 0.01
     (tmp_path / "wide.toml").write_text(text.replace("bits = { value = 12", "bits = { value = 14"))
     with pytest.raises(OptionError, match="--sensor: expected a sensor of 12 bits, got 14 bits"):
-        sensors(str(tmp_path / "wide.toml"))
+        load_sensors(str(tmp_path / "wide.toml"))

@@ -54,7 +54,7 @@ class Placement:
 
     @property
     def dpu_subgraphs(self) -> int:
-        """How many pieces the DPU runs, each with its own transfers."""
+        """How many subgraphs the DPU runs, each with its own transfers."""
         return len({node.subgraph for node in self.nodes if node.device == "DPU"})
 
     @property

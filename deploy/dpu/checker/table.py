@@ -22,7 +22,7 @@ def fix2float(placement: Placement, dpu: Dpu, tile_px: int) -> str | None:  # no
     return f"what leaves the DPU is int8 ({', '.join(leaving)}); making it float runs on the CPU, for every tile"
 
 
-def pieces(placement: Placement, dpu: Dpu, tile_px: int) -> str | None:  # noqa: ARG001
+def subgraphs(placement: Placement, dpu: Dpu, tile_px: int) -> str | None:  # noqa: ARG001
     """Every DPU subgraph is started by the CPU, and its maps cross memory both ways (Vitis-AI 3.0, xcompiler)."""
     count = placement.dpu_subgraphs
     return None if count < 2 else f"{count} DPU subgraphs: the CPU starts each, and carries maps between them"
@@ -42,7 +42,7 @@ def streaming(placement: Placement, dpu: Dpu, tile_px: int) -> str | None:
     )
 
 
-REMARKS: tuple[Remark, ...] = (fix2float, pieces, streaming)
+REMARKS: tuple[Remark, ...] = (fix2float, subgraphs, streaming)
 
 
 def remarks_on(placement: Placement, dpu: Dpu, tile_px: int) -> dict[str, str]:
@@ -84,7 +84,7 @@ def summary(placement: Placement, dpu: Dpu, tile_px: int, refusal: str = "") -> 
         tile_px: side of a tile.
         refusal: why `quantize` does not take a float file; empty where it does.
     """
-    lines = [f"device subgraphs: {len(_pieces(placement))}, DPU subgraphs: {placement.dpu_subgraphs}"]
+    lines = [f"device subgraphs: {len(_subgraphs_of(placement))}, DPU subgraphs: {placement.dpu_subgraphs}"]
     lines += [
         f"{'to' if cut.onto_dpu else 'from'} the DPU: {cut.tensor}, {_megabytes(cut)} an image as int8"
         for cut in placement.cuts
@@ -129,13 +129,13 @@ def _rows(name: str, words: Mapping[str, str], broken: tuple[Broken, ...]) -> li
 
 def _subgraph_rows(placement: Placement) -> list[Row]:
     rows = []
-    for number, members in _pieces(placement).items():
+    for number, members in _subgraphs_of(placement).items():
         words = {"device": members[0].device, "first": members[0].op.name, "last": members[-1].op.name}
         rows.append(Row("subgraphs", f"subgraph {number}", {"nodes": _count(len(members), "node")}, words))
     return rows
 
 
-def _pieces(placement: Placement) -> dict[int, list[PlacedNode]]:
+def _subgraphs_of(placement: Placement) -> dict[int, list[PlacedNode]]:
     """The nodes of each subgraph."""
     members: dict[int, list[PlacedNode]] = {}
     for node in placement.nodes:

@@ -53,7 +53,7 @@ def test_a_branch_past_the_cpu_does_not_join_what_it_parts(tmp_path: Path) -> No
     assert placement.dpu_subgraphs == 2
 
 
-def test_two_heads_of_one_input_are_two_pieces(tmp_path: Path) -> None:
+def test_two_heads_of_one_input_are_two_subgraphs(tmp_path: Path) -> None:
     sketch = Sketch(8)
     path = sketch.save(tmp_path / "t.onnx", sketch.conv("image"), sketch.conv("image"))
     assert place(read_network(path, 21), DPU).dpu_subgraphs == 2

@@ -28,11 +28,11 @@ def test_the_last_conversion_runs_on_the_cpu(tmp_path: Path) -> None:
     assert leaving in remarks_on(placement, DPU, 64)["fix2float"]
 
 
-def test_pieces_are_counted(tmp_path: Path) -> None:
+def test_subgraphs_are_counted(tmp_path: Path) -> None:
     sketch = Sketch(8)
     path = sketch.save(tmp_path / "s.onnx", sketch.conv(sketch.node("Sigmoid", sketch.conv("image"))))
-    assert remarks_on(placed(path, 32), DPU, 32)["pieces"].startswith("2 DPU subgraphs")
-    assert "pieces" not in remarks_on(placed(integer_convbeers(tmp_path / "i.onnx", 1, 8), 32), DPU, 32)
+    assert remarks_on(placed(path, 32), DPU, 32)["subgraphs"].startswith("2 DPU subgraphs")
+    assert "subgraphs" not in remarks_on(placed(integer_convbeers(tmp_path / "i.onnx", 1, 8), 32), DPU, 32)
 
 
 def test_remarks_read_with_the_targets_limits() -> None:

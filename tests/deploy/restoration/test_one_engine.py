@@ -93,10 +93,10 @@ def exact_ways(path: Path, tile_px: int, folder: Path) -> dict[str, Restored]:
     network = load_onnx(path)
     infer, _ = open_runtime(Runtime.onnxruntime, network, threads=0)
     store, variant = opened_by_tradeoff(path, folder)
-    eyes: Any = SimpleNamespace(degraded=SENSOR, reference=REFERENCE)
+    sensors: Any = SimpleNamespace(degraded=SENSOR, reference=REFERENCE)
     return {
         "evaluate": methods.method_named(str(path), SENSOR.nominal(), REFERENCE.nominal()).restore,
-        "demo": demo._methods(network, eyes)[INT8],
+        "demo": demo._methods(network, sensors)[INT8],
         "tradeoff's scores": store.open(variant).restore,
         "tradeoff's seams": cut_in_four(infer, receptive_radius_px(network)),
         "tradeoff's crops": partial(crop_of_tradeoff, path=path, tile_px=tile_px, halo="exact", folder=folder),
