@@ -9,7 +9,7 @@ from deploy.export import float_model
 from deploy.restoration.engine import restore_dn
 from deploy.restoration.options import TILE_PX, Runtime
 from deploy.restoration.plan import make_plan
-from deploy.restoration.runtime import open_runtime
+from deploy.restoration.runtime import Infer, open_runtime
 from model.evaluation.methods import (
     BLIND,
     DECONVOLVE_FIRST,
@@ -71,6 +71,11 @@ def _network(name: str) -> onnx.ModelProto:
 def network_method(model: onnx.ModelProto, max_dn: int) -> Restore:
     """A network as a method: digital numbers of 0 to `max_dn` become whole ones, as `restore` writes them."""
     infer, _ = open_runtime(Runtime.onnxruntime, model, threads=0)
+    return restoring(infer, model, max_dn)
+
+
+def restoring(infer: Infer, model: onnx.ModelProto, max_dn: int) -> Restore:
+    """As `network_method`, of a network that is open already; tiles are the default ones, or those it is fixed to."""
     radius_px, fixed_px = receptive_radius_px(model), fixed_tile_px(model)
 
     def restore(dn: np.ndarray) -> np.ndarray:

@@ -5,8 +5,6 @@ by itself as QDQ ONNX, with int8 bias and power-of-two scales. Reading a host fi
 about.
 """
 
-from collections.abc import Sequence
-
 import numpy as np
 import onnx
 from onnx import TensorProto, helper
@@ -105,17 +103,7 @@ def merge_gains(w: "HostWriter", scale: float) -> None:
 class HostWriter(GraphWriter):
     """Writes the host's operators, each with its domain, and uint8 around 128."""
 
-    def node(
-        self,
-        kind: str,
-        output: str,
-        inputs: Sequence[str],
-        name: str = "",
-        domain: str | None = "",
-        **attributes: int | list[int],
-    ) -> str:
-        """As `GraphWriter.node`, with a domain that is written even where it is ONNX's own."""
-        return super().node(kind, output, inputs, name, domain, **attributes)
+    domain = ""
 
     def scalar(self, name: str, value: float) -> str:
         """A float32 constant."""

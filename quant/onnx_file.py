@@ -94,6 +94,9 @@ def make_model(graph: onnx.GraphProto, about: dict[str, str], microsoft: bool = 
 class GraphWriter:
     """Collects the nodes and the constants of a graph; a constant of one name is written once."""
 
+    domain: str | None = None
+    """Of operators that name none; the empty one is ONNX's own, stated."""
+
     def __init__(self) -> None:
         self.nodes: list[onnx.NodeProto] = []
         self.weights: dict[str, onnx.TensorProto] = {}
@@ -108,7 +111,7 @@ class GraphWriter:
         **attributes: int | list[int],
     ) -> str:
         """Append an operator of one result, named as its result unless it has a name; returns the result's."""
-        node = onnx.helper.make_node(kind, inputs, [output], name=name or output, domain=domain)
+        node = onnx.helper.make_node(kind, inputs, [output], name=name or output, domain=domain or self.domain)
         node.attribute.extend(onnx.helper.make_attribute(key, value) for key, value in attributes.items())
         self.nodes.append(node)
         return output

@@ -6,7 +6,7 @@ INT8 files that a study lacks are made on patches of the sensor that the float n
 import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from functools import cache, cached_property, partial
+from functools import cache, cached_property
 from importlib.metadata import version
 from pathlib import Path
 
@@ -14,10 +14,8 @@ import numpy as np
 import onnx
 
 from deploy.export import float_model
-from deploy.methods import knowledge_of, method_named
-from deploy.restoration.engine import restore_dn
-from deploy.restoration.options import TILE_PX, Runtime
-from deploy.restoration.plan import make_plan
+from deploy.methods import knowledge_of, method_named, restoring
+from deploy.restoration.options import Runtime
 from deploy.restoration.runtime import Infer, open_openvino, open_runtime
 from deploy.tradeoff.cache import Cache, code_digest, digest_of
 from deploy.tradeoff.points import LEGAL, Variant
@@ -298,9 +296,7 @@ class MethodStore:
         model = load_onnx(path) if path else self.model(variant.method)
         half = variant.precision == "bf16"
         infer, _ = open_openvino(model, 0, "bf16") if half else open_runtime(Runtime.onnxruntime, model, 0)
-        return Opened(
-            partial(_whole, infer=infer, radius_px=self.radius_px(variant.method), max_dn=self.max_dn), infer
-        )
+        return Opened(restoring(infer, model, self.max_dn), infer)
 
 
 def runtime_of(variant: Variant) -> str:
@@ -308,10 +304,6 @@ def runtime_of(variant: Variant) -> str:
     if variant.kind == "network":
         return "OpenVINO" if variant.precision == "bf16" else "onnxruntime"
     return "scikit-image" if variant.kind == "peer" else "PyTorch"
-
-
-def _whole(dn: np.ndarray, infer: Infer, radius_px: int, max_dn: int) -> np.ndarray:
-    return restore_dn(dn, infer, make_plan((1, *dn.shape), TILE_PX, radius_px, radius_px), max_dn)
 
 
 @cache

@@ -63,7 +63,7 @@ def test_the_document_holds_subgraphs_cuts_and_remarks(tmp_path: Path) -> None:
     assert code == 1
     assert [row["text"]["device"] for row in found["subgraphs"]] == ["DPU", "CPU", "DPU"]
     assert [row["figures"]["size"]["value"] for row in found["cuts"]] == [8 * 96 * 96] * 4
-    assert {row["name"] for row in found["remarks"]} == {"fix2float", "pieces"}
+    assert {row["name"] for row in found["remarks"]} == {"fix2float", "subgraphs"}
     assert "device subgraphs: 3, DPU subgraphs: 2" in output
     assert "check FAILED: nodes the DPU refuses 1 (" in output.splitlines()[-1]
 
@@ -141,3 +141,10 @@ def test_of_a_float_file_check_says_what_quantize_would(tmp_path: Path) -> None:
 
 def test_of_an_int8_file_nothing_is_said_of_quantising(tmp_path: Path) -> None:
     assert "'quantize'" not in run(str(integer_convbeers(tmp_path / "int8.onnx", 1, 8)))[1]
+
+
+def test_a_check_and_its_picture_need_no_torch(tmp_path: Path) -> None:
+    call = f"app(['check', '--picture', {str(tmp_path / 'graph.png')!r}], standalone_mode=False)"
+    code = f"import sys; from deploy.cli import app; {call}; print({{'torch', 'skimage'}} & set(sys.modules))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.splitlines()[-1] == "set()"

@@ -19,7 +19,6 @@ from deploy.restoration.plan import plan_for
 from deploy.restoration.run import restore_file
 from deploy.restoration.runtime import open_runtime
 from deploy.stress.subject import Network
-from deploy.tradeoff import methods as tradeoff_methods
 from deploy.tradeoff import run as tradeoff
 from deploy.tradeoff.accuracy import cut_in_four
 from deploy.tradeoff.cache import Cache
@@ -41,8 +40,7 @@ SMALL_HALOS_PX = {"float": 2, "int8": 8}
 @pytest.fixture(params=TILES_PX)
 def precision(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
     """Of the network; evaluate, demo and the trade-off's scores take tiles so small that the image has many."""
-    for module in (methods, tradeoff_methods):
-        monkeypatch.setattr(module, "TILE_PX", TILES_PX[request.param])
+    monkeypatch.setattr(methods, "TILE_PX", TILES_PX[request.param])
     return str(request.param)
 
 
