@@ -5,7 +5,8 @@
 - `dpu`: the checker of operators, the cost model and the published networks that it is fitted on;
 - `export`, `quantise`, `gate`, `compare`: a network as a file, in INT8, judged, and two runs' figures side by side;
 - `bench`, `tradeoff`, `stress`, `demo`: how fast, at what price, how sturdy, and all of it in minutes;
-- `methods`: restorations by name; `results` and `report`: figures as tables, JSON and HTML;
+- `methods`: restorations by name, which `evaluate` compares;
+- `results` and `report`: figures as tables, JSON and HTML;
 - `cluster`, `dataset_workers`: the workers of Dask.
 
 What is offered here is loaded when it is asked for.

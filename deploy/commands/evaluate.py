@@ -45,15 +45,10 @@ def evaluate(
     PSNR leaves out clipped pixels. MTF and SNR are measured on restored slanted edges and flat fields. Traditional
     methods know both sensors' nominal figures; networks are blind, but may have been made for the sensor.
     """
-    from deploy.methods import method_named
-    from deploy.report.evaluation_page import evaluation_report, pictures
-    from deploy.report.page import write_report
+    from deploy.evaluate import EvaluationRequest, run_evaluation
     from deploy.results import Document, print_rows
-    from model.evaluation.pairs import oversampling_note, profiles_for, read_pairs_recipe
-    from model.evaluation.run import evaluate_methods, input_files, load_pairs, sweep_tables
-    from model.evaluation.scores import Instruments, perceptual_distances
+    from model.evaluation.run import input_files
     from model.io.files import require_writable
-    from model.metrics.bootstrap import LEAST_SITES
     from profiles.errors import OptionError
     from profiles.figures import by_table
 
@@ -64,34 +59,16 @@ def evaluate(
     folders = [pairs, *(pairs / role for role in ("degraded", "reference"))] if pairs else [images]
     read = (*folders, lpips, *(Path(name) for name in (sensor, reference, *names) if name))
     require_writable(out / "report.html" if out else None, json, inputs=read, folders=(out,))
-    recipe = read_pairs_recipe(pairs) if pairs is not None else None
-    sensors = profiles_for(sensor, reference, recipe, say)
-    chosen = [method_named(name, sensors[0].nominal(), sensors[1].nominal(), sensors[0].name) for name in names]
-    instruments = Instruments(perceptual_distances(lpips), sensors[0].nominal().max_dn)
-    found, small = load_pairs(images, pairs, *sensors, seed, recipe)
-    result = evaluate_methods(chosen, found, instruments, sensors[0].nominal(), seed)
-    title = f"{sensors[0].name} -> {sensors[1].name}, {len(found)} image{'' if len(found) == 1 else 's'}"
-    print_rows(title, result.mean)
-    swept = sweep_tables(chosen, images, *sensors, seed) if sweep else ()
-    for table, rows in by_table((*result.sites, *swept)).items():
+    found = run_evaluation(EvaluationRequest(names, images, pairs, sensor, reference, lpips, sweep, seed), say)
+    print_rows(found.title, found.result.mean)
+    for table, rows in by_table((*found.result.sites, *found.swept)).items():
         print_rows(table, rows)
-    sites = len({pair.site for pair in found})
-    if sites < LEAST_SITES:
-        say(f"no interval over sites is shown: of {sites}, fewer than {LEAST_SITES}, none could be trusted")
-    sampled = oversampling_note(found, sensors[0])
-    if sampled:
-        say(sampled)
-    if small:
-        say(f"left out, too small: {', '.join(small)}")
+    for note in found.notes:
+        say(note)
     if out is not None:
-        strips = pictures(found, chosen, out)
-        write_report(evaluation_report(title, result.mean, result.sites, swept, strips, sampled), out / "report.html")
-        say(f"wrote {out / 'report.html'}")
-    arguments: dict[str, object] = {
-        "images": images,
-        "pairs": pairs,
-        "sensor": sensor or sensors[0].name,
-        "reference": sensors[1].name,
-    }
-    arguments |= {"methods": methods, "lpips": lpips, "out": out, "sweep": sweep, "seed": seed}
-    Document("evaluate", arguments, input_files(names, images, pairs, lpips), (*result.rows, *swept)).write(json)
+        say(f"wrote {found.write(out)}")
+    degraded, wanted = (profile.name for profile in found.sensors)
+    arguments: dict[str, object] = {"images": images, "pairs": pairs, "sensor": sensor or degraded}
+    arguments |= {"reference": wanted, "methods": methods, "lpips": lpips, "out": out, "sweep": sweep, "seed": seed}
+    inputs = input_files(names, images, pairs, lpips)
+    Document("evaluate", arguments, inputs, (*found.result.rows, *found.swept)).write(json)
