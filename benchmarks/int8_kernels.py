@@ -4,7 +4,7 @@
 
 `int8` is what every command runs here. `ways` takes, whatever the processor, the ways of one whose int8 kernels
 saturate (`quant.kernels`): where they do, the two are the same. `plain` is the file as it stands, which is right only
-where int8 products add exactly; int8 / plain is what exactness costs. The sessions take turns, so that what else the
+where int8 products add exactly; int8 / plain is what exactness costs. Sessions are interleaved, so that what else the
 machine does falls on each of them; ratios are of the fastest turns. On another processor: benchmarks/without_vnni.py.
 """
 

@@ -5,7 +5,7 @@
 (a) the same effects, each by itself at full resolution, then sampling; (b) all effects at full resolution, whatever
 the scene calls for. The plain ways keep their transfer functions from one pair to the next, as ours does.
 
-Ratios are what counts: machines differ and are shared. The ways take turns, so that what else the machine does falls
+Ratios are what counts: machines differ and are shared. Ways are interleaved, so that what else the machine does falls
 on all of them alike; the figures are medians over the turns.
 """
 

@@ -3,10 +3,10 @@
     python benchmarks/swath.py [--size 3000x2000] [--runtimes onnxruntime,openvino] [--swaths 13600x9016,20000x20000]
     python benchmarks/swath.py --peers [--monai-python monai/bin/python]
 
-Random weights: speed and memory do not depend on them. Engine and bare runtime take turns in one run; the ratios are
+Random weights: speed and memory do not depend on them. Engine and bare runtime are interleaved; the ratios are
 of their fastest times, by the clock and by the processor (with --threads 1 the latter also holds on a busy machine).
 Swaths run in a process of their own, through a network of one block. With --peers the engine runs beside
-dask.array.map_overlap, and beside MONAI where its Python is given, from file to file: times in turns, and how far
+dask.array.map_overlap, and beside MONAI where its Python is given, from file to file: times interleaved, and how far
 their pixels lie from the engine's, which are the whole image's.
 """
 
@@ -123,7 +123,7 @@ def write_noise(path: Path, size: tuple[int, int]) -> np.ndarray:
 
 
 def fastest(works: Sequence[Callable[[], float | None]], repeats: int) -> np.ndarray:
-    """The fastest (clock, processor) times of each in s, taking turns; the first turn is not counted.
+    """The fastest (clock, processor) times of each in s, interleaved; the first turn is not counted.
 
     A work returns what another process took of the processor, if one did.
     """

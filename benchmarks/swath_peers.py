@@ -1,7 +1,7 @@
 """Peers of the swath engine: dask.array.map_overlap here, MONAI's SlidingWindowInferer in an environment of its own.
 
 `swath.py --peers` and `--monai-python` run them, from file to file like the engine: the same image, network, tile,
-overlap and runtime, in turns. `monai_child.py` says how to make MONAI's environment.
+overlap and runtime, interleaved. `monai_child.py` says how to make MONAI's environment.
 """
 
 import json

@@ -3,7 +3,7 @@
     python benchmarks/training.py --variant convbeers-s
 
 Both are timed in float32 and in bfloat16, and the one that `train` would choose here is named. What the ratio lacks
-of 1 is what simulating, guarding, averaging and logging cost. All take turns, so that what else the machine does
+of 1 is what simulating, guarding, averaging and logging cost. All are interleaved, so that what else the machine does
 falls on each of them.
 """
 

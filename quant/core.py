@@ -49,10 +49,20 @@ def best_frac_bits(values: np.ndarray) -> int:
 
 @dataclass(frozen=True)
 class Shifts:
-    """The shift windows of the DPU's arithmetic (UG1414 3.5 and the quantiser's source, Vitis-AI 3.0)."""
+    """The shift windows of the DPU's arithmetic (UG1414 3.5 and the quantiser's source, Vitis-AI 3.0).
+
+    They are what the quantiser writes within; what any file is checked against stands in
+    `deploy.dpu.checker.number_rules`, which allows a little more (a bias finer than the accumulator).
+
+    Attributes:
+        cut: fractional bits of a convolution's weight and input less those of its result.
+        bias: those of weight and input less those of the int8 bias; below 0 it would be finer than the accumulator.
+        read: by how many fractional bits the inputs of an add may differ.
+        write: those of an add's coarsest input less those of its result.
+    """
 
     cut: tuple[int, int] = (0, 16)
-    bias: tuple[int, int] = (0, 16)  # below 0 the int8 bias would be finer than the accumulator's unit
+    bias: tuple[int, int] = (0, 16)
     read: tuple[int, int] = (0, 15)
     write: tuple[int, int] = (-15, 15)
 
