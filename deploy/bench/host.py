@@ -16,8 +16,7 @@ import onnx
 import psutil
 import torch
 
-from deploy.bench.interleaved import interleaved
-from deploy.bench.profile import node_rows, profile, timed
+from deploy.bench.profile import interleaved, node_rows, profile, timed
 from deploy.bench.tables import TABLE, Swath, board_cpu_row, efficiency
 from deploy.dpu.reading import network_of
 from deploy.export import other_precision

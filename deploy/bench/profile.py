@@ -1,12 +1,12 @@
-"""Where a network's time and energy go on this machine: onnxruntime's profiler by node, and RAPL's counters.
+"""How work is timed on this machine: a network node by node, a call with its power, several calls interleaved.
 
-Never a guess from a data sheet.
+Time by node is onnxruntime's profiler's, power that of RAPL's counters: never a guess from a data sheet.
 """
 
 import json
 import tempfile
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
@@ -82,6 +82,7 @@ def _number(event: dict[str, object], key: str) -> float:
 POWERCAP = Path("/sys/class/powercap")
 
 Result = TypeVar("Result")
+Call = Callable[[], object]
 
 
 def timed(work: Callable[[], Result], powercap: Path = POWERCAP) -> tuple[Result, float, Figure]:
@@ -124,3 +125,24 @@ def _read(powercap: Path) -> dict[Path, int] | str:
         reason = error.strerror if isinstance(error, OSError) else "no number in it"
         return f"RAPL energy counters cannot be read here ({reason})"
     return counters or "this machine shows no RAPL energy counters (usual in virtual machines)"
+
+
+def interleaved(
+    calls: Sequence[Call], measure: Callable[[Call], Result], enough: Callable[[Sequence[Sequence[Result]]], bool]
+) -> list[list[Result]]:
+    """Run every call once a round until there are enough rounds, and so compare them fairly.
+
+    Args:
+        calls: what is timed, already warmed up.
+        measure: runs one call and says what it took.
+        enough: asked after each round, with what was measured so far of each call, in the order of `calls`.
+
+    Returns:
+        What was measured of each call, round by round.
+    """
+    found: list[list[Result]] = [[] for _ in calls]
+    while True:
+        for call, taken in zip(calls, found, strict=True):
+            taken.append(measure(call))
+        if enough(found):
+            return found

@@ -8,7 +8,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from deploy.bench.interleaved import Call, interleaved
+from deploy.bench.profile import Call, interleaved
 from model.evaluation.methods import Restore
 from profiles.figures import Figure, measured
 
