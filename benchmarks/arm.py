@@ -18,6 +18,8 @@ from pathlib import Path
 
 import numpy as np
 
+from deploy.networks import shipped_pair
+
 PROJECT = Path(__file__).resolve().parents[1]
 PROCESSORS = ("cortex-a72", "neoverse-n1", "max")
 """Of `qemu-aarch64 -cpu help`: NEON alone; dot products of int8 too; matrix products of int8 too."""
@@ -79,24 +81,15 @@ def restored(networks: list[Path], out: Path) -> None:
     np.savez(out, **{path.stem: restore(image, path, tile_px=64, threads=1) for path in networks})
 
 
-def networks(folder: Path) -> list[Path]:
-    """The shipped pairs as ONNX files: the INT8 ones, and the float ones written into the folder."""
-    from deploy.export import float_model
-    from model.shipped import shipped_pair
-    from quant.onnx_file import save_onnx
-
-    found = []
-    for name in NETWORKS:
-        weights, int8 = shipped_pair(name)
-        save_onnx(float_model(weights), folder / f"{name}-float.onnx")
-        found += [int8, folder / f"{name}-float.onnx"]
-    return found
+def networks() -> list[Path]:
+    """The shipped pairs as ONNX files."""
+    return [file for name in NETWORKS for file in shipped_pair(name)]
 
 
 def compare(root: Path, processors: tuple[str, ...]) -> dict[str, dict[str, float]]:
     """The largest difference in DN from this processor's pixels, by emulated processor and network."""
     with tempfile.TemporaryDirectory() as folder:
-        files, here = networks(Path(folder)), Path(folder) / "here.npz"
+        files, here = networks(), Path(folder) / "here.npz"
         restored(files, here)
         expected, found = dict(np.load(here)), {}
         for processor in processors:

@@ -18,6 +18,7 @@ import onnx
 import onnxruntime as ort
 
 from deploy.export import to_onnx
+from deploy.networks import shipped_pair
 from model.io.weights import load_network
 from model.processor import decided, int8_adds_exactly, processor_name
 from model.shipped import SHIPPED
@@ -40,7 +41,7 @@ def main() -> None:
     print(f"{processor_name()}, onnxruntime {ort.__version__}; int8: {decided()['int8 on onnxruntime']}")
     image = np.random.default_rng(0).random((1, 1, arguments.tile, arguments.tile), dtype=np.float32)
     for variant in arguments.variant:
-        integer = load_onnx(SHIPPED / f"{variant}-int8.onnx")
+        integer = load_onnx(shipped_pair(variant)[1])
         print_ways(variant, integer)
         network, _ = load_network(SHIPPED / f"{variant}.safetensors")
         for threads in arguments.threads:

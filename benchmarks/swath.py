@@ -31,7 +31,8 @@ from deploy.restoration.options import Options, Runtime
 from deploy.restoration.plan import make_plan
 from deploy.restoration.run import restore_file
 from deploy.restoration.runtime import open_runtime
-from model.convbeers import VARIANTS, ConvBEERS, Variant, initialise
+from model.convbeers import ConvBEERS, initialise
+from model.variants import VARIANTS, Variant
 from quant.onnx_file import receptive_radius_px
 
 TILE_PX = 640

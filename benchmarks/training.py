@@ -22,13 +22,13 @@ import torch
 from torch import Tensor
 
 from deploy.tradeoff.measurements import machine
-from model.convbeers import VARIANTS
 from model.simulator.procedural import procedural_scene
 from model.training.checkpoint import TrainingRecipe
 from model.training.losses import LossWeights, RestorationLoss
 from model.training.patches import PatchRecipe, PatchSource
 from model.training.precision import Precision, in_precision
 from model.training.trainer import Trainer
+from model.variants import VARIANTS
 from profiles import load_sensor
 
 BATCH, PATCH_PX, TURNS = 8, 96, 5

@@ -16,18 +16,19 @@ from deploy.bench.tables import Swath, predict_file, predicted_rows, published_r
 from deploy.dpu.board import Dpu, load_dpu
 from deploy.dpu.checker.placement import Placement, place
 from deploy.dpu.reading import read_network
-from deploy.export import float_model, require_parity
+from deploy.export import require_parity, weights_for
 from deploy.methods import network_method
+from deploy.networks import KnownSensor, Say, float_file
 from deploy.report.page import Picture, Report, Table
 from deploy.restoration.options import TILE_PX
+from model.convbeers import plain_network
 from model.evaluation.methods import Restore
 from model.evaluation.scores import fidelity_row
 from model.io.files import whole_file
 from model.io.images import read_acquisition, read_pixels
 from model.io.pictures import busiest_windows, picture_url, stretch_of, strip
 from model.io.tiff import write_tiff
-from model.io.weights import load_network
-from model.shipped import SENSOR, VARIANT, default_float_weights
+from model.shipped import SENSOR, VARIANT, shipped_weights
 from model.simulator.acquire import MARGIN_PX, Pair, simulate_pair
 from model.simulator.detector import Draw
 from model.simulator.procedural import load_scenes, procedural_scene
@@ -39,7 +40,7 @@ from profiles.figures import Row, measured
 from profiles.sensor_file import reference_for
 from quant.calibration import HELD_OUT_SEED, draw_patches
 from quant.gate import compare, gate_row
-from quant.onnx_file import receptive_radius_px, save_onnx
+from quant.onnx_file import load_onnx, receptive_radius_px, save_onnx
 from quant.quantise import quantise_model
 from quant.session import open_session
 
@@ -202,7 +203,7 @@ def run_demo(
     sensors = load_sensors(sensor)
     given = read_input(image, seed, sensors, full_scale)
     say("exporting, quantising and gating")
-    gate, int8, exact = quantise_and_gate(out, seed, sensors)
+    gate, int8, exact = quantise_and_gate(out, seed, sensors, say)
     say("checking every operator against the DPU")
     dpu = load_dpu()
     placement = place(read_network(out / "int8.onnx", TILE_PX), dpu)
@@ -221,12 +222,12 @@ def run_demo(
     return Demo(rows, demo_report(given.degraded.shape, pictures, bench, swath, quality, (gate, exact), placement))
 
 
-def quantise_and_gate(out: Path, seed: int, sensors: Sensors) -> tuple[Row, onnx.ModelProto, Row]:
-    """Export the shipped weights, quantise on drawn scenes, compare; returns the gate's row and the INT8 model."""
-    model = float_model(None)
+def quantise_and_gate(out: Path, seed: int, sensors: Sensors, say: Say) -> tuple[Row, onnx.ModelProto, Row]:
+    """Specialise the shipped network, quantise on drawn scenes, compare; the gate's row and the INT8 model."""
+    model = load_onnx(float_file(Path(VARIANT), KnownSensor(sensors.degraded.name, sensors.degraded), say))
     save_onnx(model, out / "float.onnx")
-    network, _ = load_network(default_float_weights())
-    difference = require_parity(network, out / "float.onnx", 97)
+    weights, _ = weights_for(shipped_weights(VARIANT), sensors.degraded.nominal())
+    difference = require_parity(plain_network(weights.tensors, weights.variant), out / "float.onnx", 97)
     scenes = load_scenes(None, sensors.reference.nominal(), seed)
     patches = draw_patches(scenes, sensors.degraded, sensors.reference, CALIBRATION_PATCHES, seed)
     result = quantise_model(model, patches, {"calibration_sensor": sensors.degraded.name}, lambda: None)

@@ -101,8 +101,8 @@ def run_evaluation(request: EvaluationRequest, say: Callable[[str], None]) -> Ev
     """
     recipe = read_pairs_recipe(request.pairs) if request.pairs is not None else None
     sensors = profiles_for(request.sensor, request.reference, recipe, say)
-    degraded, reference = (profile.nominal() for profile in sensors)
-    methods = [method_named(name, degraded, reference, sensors[0].name) for name in request.names]
+    degraded = sensors[0].nominal()
+    methods = [method_named(name, *sensors, say) for name in request.names]
     instruments = Instruments(perceptual_distances(request.lpips), degraded.max_dn)
     pairs, small = load_pairs(request.images, request.pairs, *sensors, request.seed, recipe)
     result = evaluate_methods(methods, pairs, instruments, degraded, request.seed)

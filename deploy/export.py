@@ -1,59 +1,48 @@
 """ConvBEERS as ONNX: `image` (N, 1, H, W) in [0, 1] to `restored`, written node by node under readable names.
 
-Also how any float network is had as ONNX: from an ONNX file, from weights, or the shipped one.
+Also how any float network is had as ONNX: from an ONNX file or from weights, which may be specialised to a sensor.
 """
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import onnx
-import torch
 
 from deploy import __version__
-from model.conditioning import fold, tell
-from model.convbeers import ConvBEERS
-from model.io.weights import is_told, load_network, load_told
-from model.shipped import SHIPPED, default_float_weights, float_file, shipped_names, shipped_weights, told_names
+from model.io.tensors import Arrays, Weights, read_conditioned, read_plain
+from model.specialise import sensor_vector, specialised
 from profiles.errors import ModelError
-from profiles.sensor_file import load_sensor
-from quant.onnx_file import GraphWriter, image_info, is_quantised, load_onnx, make_model, metadata
+from profiles.sensor import Sensor
+from quant.onnx_file import GraphWriter, image_info, load_onnx, make_model
 from quant.session import open_session, run
+
+if TYPE_CHECKING:
+    from model.convbeers import ConvBEERS
 
 MAX_DIFFERENCE = 1e-5
 """Of full scale: a twentieth of a digital number, above what float32 summation order explains."""
 
 
-def network_for(path: Path, sensor: str | None) -> tuple[ConvBEERS, dict[str, object], tuple[str, ...]]:
-    """A plain network from a weights file; weights that can be told their sensor are folded for the one named.
-
-    Args:
-        path: weights that `train` wrote.
-        sensor: a profile's name or .toml file, of which the middle of every range is told; None for plain weights.
+def weights_for(path: Path, sensor: Sensor) -> tuple[Weights, tuple[str, ...]]:
+    """The weights of a conditioned network specialised to a sensor.
 
     Returns:
-        The network, its recipe, and a sentence for each value of the sensor outside the range it was trained for.
+        Those of a plain network, and a sentence for each value of the sensor outside the range that was trained.
 
     Raises:
-        ModelError: told weights without a sensor, or a sensor for plain ones.
-        ProfileError: no such sensor.
+        ModelError: no conditioned network's weights.
     """
-    if sensor is None:
-        return (*load_network(path), ())
-    if not is_told(path):
-        remedy = f"leave --sensor out, or give weights of 'train --told' or one of {', '.join(told_names())}"
-        expected = "weights that can be told their sensor"
-        raise ModelError(str(path), expected=expected, got="those of a plain network", remedy=remedy)
-    told, recipe = load_told(path)
-    profile = load_sensor(sensor)
-    found = tell(profile.nominal())
-    return fold(told, found.vector), {**recipe, "degraded": profile.name}, found.outside
+    found, vector = read_conditioned(path), sensor_vector(sensor)
+    tensors = specialised(found.tensors, found.variant, vector)
+    return Weights(tensors, found.variant, found.recipe), vector.outside
 
 
-def to_onnx(network: ConvBEERS, about: dict[str, str], tile_px: int | None = None) -> onnx.ModelProto:
-    """The network as an ONNX model; `tile_px` fixes one square image, None leaves number and size free."""
+def to_onnx(network: "Weights | ConvBEERS", about: dict[str, str], tile_px: int | None = None) -> onnx.ModelProto:
+    """A plain network as an ONNX model; `tile_px` fixes one square image, None leaves number and size free."""
     writer = GraphWriter()
-    for name, value in network.state_dict().items():
-        writer.constant(name, value.numpy())
+    for name, value in _arrays(network).items():
+        writer.constant(name, value)
     stream = head = _conv(writer, "head", "image")
     for k in range(network.variant.blocks):
         inner = writer.node("Relu", f"body.{k}.relu", [_conv(writer, f"body.{k}.first", stream)])
@@ -64,12 +53,20 @@ def to_onnx(network: ConvBEERS, about: dict[str, str], tile_px: int | None = Non
     return make_model(graph, {"beers_deploy_version": __version__, "precision": "float32", **about})
 
 
-def parity(network: ConvBEERS, model: Path | onnx.ModelProto, side_px: int) -> float:
+def _arrays(network: "Weights | ConvBEERS") -> Arrays:
+    if isinstance(network, Weights):
+        return network.tensors
+    return {name: value.numpy() for name, value in network.state_dict().items()}
+
+
+def parity(network: "ConvBEERS", model: Path | onnx.ModelProto, side_px: int) -> float:
     """Largest absolute difference between torch and onnxruntime on one random image, in [0, 1] of full scale.
 
     Raises:
         ModelError: the network gives NaN or infinity; then nothing can be compared.
     """
+    import torch  # seconds to load, and a restoration begins with what this module writes
+
     image = np.random.default_rng(0).random((1, 1, side_px, side_px), dtype=np.float32)
     with torch.inference_mode():
         expected = network(torch.from_numpy(image)).numpy()
@@ -81,7 +78,7 @@ def parity(network: ConvBEERS, model: Path | onnx.ModelProto, side_px: int) -> f
     return difference
 
 
-def require_parity(network: ConvBEERS, model: Path | onnx.ModelProto, side_px: int) -> float:
+def require_parity(network: "ConvBEERS", model: Path | onnx.ModelProto, side_px: int) -> float:
     """As `parity`, and small.
 
     Raises:
@@ -100,35 +97,22 @@ def _conv(writer: GraphWriter, name: str, source: str) -> str:
     return writer.node("Conv", name, feeds, pads=[1] * 4, kernel_shape=[3, 3])
 
 
-def float_model(path: Path | None) -> onnx.ModelProto:
-    """A float network as ONNX: from an .onnx or a .safetensors file, or the shipped one.
+def float_model(path: Path) -> onnx.ModelProto:
+    """A float network as ONNX: from an .onnx file, or from the .safetensors file of a plain one.
 
     Raises:
         ModelError: neither of these.
     """
-    path = float_file(path) if path else default_float_weights()
     if path.suffix != ".safetensors":
         return load_onnx(path)
-    network, recipe = load_network(path)
-    return to_onnx(network, about(path.stem, recipe))
+    weights = read_plain(path)
+    return to_onnx(weights, about(path.stem, weights.recipe))
 
 
-def about(variant: str, recipe: dict[str, object]) -> dict[str, str]:
-    """What an exported file says of itself."""
+def about(variant: str, recipe: dict[str, object], sensor: str | None = None) -> dict[str, str]:
+    """What an exported file says of itself; `sensor` is the name of the one that it was specialised to."""
     return {
         "variant": variant,
-        "sensor": str(recipe.get("degraded", "")),
+        "sensor": sensor if sensor is not None else str(recipe.get("degraded", "")),
         "reference": str(recipe.get("reference", "")),
     }
-
-
-def other_precision(model: onnx.ModelProto) -> onnx.ModelProto | None:
-    """A shipped network of the same variant in the other precision, or None; its weights may be others.
-
-    Time depends on the shapes, not on the weights: for a comparison of time any weights will do.
-    """
-    variant = metadata(model).get("variant", "")
-    if is_quantised(model):
-        return float_model(shipped_weights(variant)) if variant in shipped_names() else None
-    int8 = SHIPPED / f"{variant}-int8.onnx"
-    return load_onnx(int8) if variant and int8.is_file() else None

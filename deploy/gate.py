@@ -22,10 +22,11 @@ from deploy.dpu.checker.placement import place
 from deploy.dpu.checker.table import legality
 from deploy.dpu.reading import read_network
 from deploy.export import float_model
+from deploy.networks import Say, float_file, int8_file, known_sensor, shipped_pair, silent
 from deploy.restoration.options import TILE_PX
 from deploy.results import Document
 from model.io.files import require_regular, require_writable, write_text
-from model.shipped import VARIANT, float_file, int8_file, shipped_pair
+from model.shipped import SENSOR, VARIANT
 from profiles import load_sensor, load_target
 from profiles.errors import BeersError, MachineError, OptionError, printable
 from profiles.figures import Row
@@ -111,22 +112,26 @@ def run_gate(request: Request) -> Outcome:
     return Outcome(result, shares, tuple(checks))
 
 
-def files_or_shipped(float_path: Path | None, int8_path: Path | None, variant: str | None) -> tuple[Path, Path]:
-    """The two files given, or shipped ones of that name; the shipped pair where neither is given.
+def files_or_shipped(
+    float_path: Path | None, int8_path: Path | None, variant: str | None, sensor: str = SENSOR, say: Say = silent
+) -> tuple[Path, Path]:
+    """The two files given, or a shipped network in both precisions where neither is, specialised to the sensor.
 
     Raises:
         OptionError: one file without the other, which have nothing to do with each other; files and a variant.
-        ModelError: no pair of that name is shipped.
+        ModelError: no network of that name is shipped.
+        ProfileError: no such sensor.
     """
     if float_path is None:
-        return shipped_pair(variant or VARIANT)
+        return shipped_pair(variant or VARIANT, sensor, say)
     if int8_path is None:
         remedy = "give its INT8 file too, or none of both for a shipped pair"
         raise OptionError("INT8", expected=f"the INT8 network of {float_path.name}", got="none", remedy=remedy)
     if variant is not None:
         expected, remedy = "it without files", "leave it out, or the files"
         raise OptionError("--variant", expected=expected, got=float_path.name, remedy=remedy)
-    return float_file(float_path), int8_file(int8_path)
+    known = known_sensor(sensor)
+    return float_file(float_path, known, say), int8_file(int8_path, known, say)
 
 
 def baseline_mae(path: Path, arguments: Mapping[str, Any]) -> float:

@@ -3,6 +3,7 @@
 The pixels are those that the command `restore` writes of the same image.
 """
 
+import warnings
 from dataclasses import dataclass
 from functools import lru_cache
 from importlib import import_module
@@ -12,6 +13,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from deploy.networks import known_sensor, network_file
 from deploy.restoration.engine import NAME, Restorer, checked_strip, restore_array
 from deploy.restoration.options import TILE_PX, Options, Runtime
 from deploy.restoration.plan import Plan, Span, plan_for
@@ -19,7 +21,7 @@ from deploy.restoration.run import scale_of
 from deploy.restoration.runtime import Infer, Packed, open_packed, open_runtime, pack, tiles_at_once
 from deploy.restoration.source import ArraySource, Raster, require_numbers, usable_nodata
 from model.io.images import settled_scale
-from model.shipped import int8_file
+from model.shipped import BLIND
 from profiles.errors import ImageError, OptionError
 from quant.onnx_file import load_onnx
 
@@ -37,13 +39,15 @@ def restore(
     runtime: str = "onnxruntime",
     threads: int = 0,
     nodata: float | None = None,
+    sensor: str = BLIND,
 ) -> Image:
     """Restore an image of raw digital numbers, (H, W) or (bands, H, W); bands are restored one by one.
 
     Args:
         image: of numpy it is restored at once; of Dask the result is lazy, a chunk for each tile and band, and may be
             computed on a cluster that has this package; an xarray.DataArray keeps coordinates and attributes.
-        model: ONNX file, float or INT8, or the name of a shipped network; the shipped INT8 network if None.
+        model: ONNX file, float or INT8, or the name of a shipped network, in INT8 with -int8 behind it;
+            convbeers-s-int8 if None.
         tile_px: side of a tile.
         halo: 'exact', or pixels of context around a tile.
         full_scale: the pixel value that is 1.0 to the network. None is 4095 (12 bits) for integers of more than 8
@@ -52,6 +56,8 @@ def restore(
         runtime: 'onnxruntime' or 'openvino'.
         threads: of the runtime; 0 takes every core, or one for each of Dask's own threads.
         nodata: the value of missing pixels, besides NaN; a DataArray's own `_FillValue` if None.
+        sensor: that a shipped network is specialised to: a profile's name, a .toml file, or 'blind' where it is not
+            known. INT8 for a sensor of your own takes minutes once, and is kept.
 
     Returns:
         The same kind, shape and scale: uint16 of integers, float32 of floats. Missing pixels stay as they are.
@@ -61,11 +67,11 @@ def restore(
             Dask when it is computed.
         ModelError: a network that cannot be tiled or run.
         OptionError: options that do not go together.
-        MachineError: a missing package.
+        ProfileError: no such sensor.
+        MachineError: a missing package, or a cache that cannot be written.
     """
-    options = Options(
-        int8_file(Path(model) if model else None), tile_px, str(halo), full_scale, _runtime(runtime), threads
-    )
+    network = network_file(Path(model) if model else None, known_sensor(sensor), warnings.warn)
+    options = Options(network, tile_px, str(halo), full_scale, _runtime(runtime), threads)
     if hasattr(image, "coords") and hasattr(image, "dims"):  # an xarray.DataArray, without importing it
         labelled: Any = image
         missing = labelled.attrs.get("_FillValue") if nodata is None else nodata

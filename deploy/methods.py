@@ -1,11 +1,13 @@
 """The methods that can be compared, by name."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import onnx
 
 from deploy.export import float_model
+from deploy.networks import KnownSensor, Say, conditioned, known_sensor, network_file, silent
 from deploy.restoration.engine import restore_dn
 from deploy.restoration.options import TILE_PX, Runtime
 from deploy.restoration.plan import make_plan
@@ -13,59 +15,91 @@ from deploy.restoration.runtime import Infer, open_runtime
 from model.evaluation.methods import (
     BLIND,
     DECONVOLVE_FIRST,
+    KNOWN,
     TRADITIONAL,
-    TRAINED,
     Method,
     Restore,
     method_without_network,
 )
-from model.shipped import SHIPPED, shipped_names, shipped_weights
+from model.shipped import BLIND as NOT_KNOWN
+from model.shipped import BLIND_PROFILE, INT8, shipped_names
 from model.traditional.peers import PEERS
+from profiles.constant import Constant
 from profiles.errors import OptionError
-from profiles.sensor import Sensor
-from quant.onnx_file import fixed_tile_px, load_onnx, metadata, receptive_radius_px
+from profiles.sensor import Sensor, SensorProfile
+from quant.onnx_file import fixed_tile_px, metadata, receptive_radius_px
 
 EXPECTED = (
     f"degraded, {TRADITIONAL}, {DECONVOLVE_FIRST} (each also with -fast or -best), {', '.join(PEERS)}, "
-    f"a shipped network ({', '.join(shipped_names())}, each also with -int8), or an ONNX or safetensors file"
+    f"a shipped network ({', '.join(shipped_names())}, each also with -int8, and with @SENSOR or @blind to know "
+    "another), or an ONNX or safetensors file"
 )
 
+DRAWN = "drawn"
+"""What a sensor is called that no profile states."""
 
-def method_named(name: str, degraded: Sensor, reference: Sensor, sensor_name: str = "") -> Method:
-    """The method of that name; the traditional ones know both sensors, a network full scale alone.
+AT = "@"
+"""Between a network's name and the sensor that it is to know in the place of the images' own."""
+
+
+def method_named(name: str, degraded: SensorProfile, reference: SensorProfile, say: Say = silent) -> Method:
+    """The method of that name; the traditional ones know both sensors, a shipped network the degraded one.
 
     Args:
         name: as in EXPECTED.
         degraded: the sensor of the images.
         reference: the one that is aimed at.
-        sensor_name: of the degraded sensor's profile, by which a network's file says that it was made for it.
+        say: is told what of the sensor lies outside the range that a network was trained for.
 
     Raises:
         OptionError: no such method.
         ModelError: a file that is no network.
+        ProfileError: no such sensor behind an @.
         MachineError: a peer whose library is not installed.
     """
-    plain = method_without_network(name, degraded, reference)
+    plain = method_without_network(name, degraded.nominal(), reference.nominal())
     if plain is not None:
         return plain
-    model = _network(name)
-    return Method(name, network_method(model, degraded.max_dn), knowledge_of(model, sensor_name))
+    network, _, other = name.partition(AT)
+    if not _is_network(network):
+        raise OptionError("--methods", expected=EXPECTED, got=repr(name), remedy="correct that name")
+    sensor = known_sensor(other) if other else KnownSensor(degraded.name, degraded)
+    model = float_model(network_file(Path(network), sensor, say))
+    max_dn = degraded.nominal().max_dn
+
+    def specialise(truth: Sensor) -> Restore:
+        profile = profile_of(truth, degraded)
+        file = network_file(Path(network), KnownSensor(DRAWN, profile), say)
+        return network_method(float_model(file), truth.max_dn)
+
+    alike = other or conditioned(Path(network)) is None
+    return Method(
+        name, network_method(model, max_dn), knowledge_of(model, degraded.name), None if alike else specialise
+    )
+
+
+def _is_network(name: str) -> bool:
+    return Path(name).suffix in (".onnx", ".safetensors") or name.removesuffix(INT8) in shipped_names()
 
 
 def knowledge_of(model: onnx.ModelProto, sensor_name: str) -> str:
-    """What a network knows of the sensor of that name: nothing, or that it was trained or folded for it."""
-    return TRAINED if sensor_name and metadata(model).get("sensor") == sensor_name else BLIND
+    """What a network knows of the sensor of that name: it, nothing, or another one."""
+    own = metadata(model).get("sensor", "")
+    if own == sensor_name:
+        return KNOWN
+    return BLIND if own in ("", NOT_KNOWN, BLIND_PROFILE) else f"another: {own}"
 
 
-def _network(name: str) -> onnx.ModelProto:
-    path = Path(name)
-    if path.suffix in (".onnx", ".safetensors"):
-        return float_model(path)
-    if name in shipped_names():
-        return float_model(shipped_weights(name))
-    if (SHIPPED / f"{name}.onnx").is_file():
-        return load_onnx(SHIPPED / f"{name}.onnx")
-    raise OptionError("--methods", expected=EXPECTED, got=repr(name), remedy="correct that name")
+def profile_of(sensor: Sensor, like: SensorProfile) -> SensorProfile:
+    """A profile of which every draw is that sensor, in the grid of another profile."""
+    across, along = sensor.mtf_axes
+    snr_0, snr_1 = (
+        radiance / sensor.noise_sigma(radiance) for radiance in (like.radiance_0.low, like.radiance_1.low)
+    )
+    numbers = {"mtf_nyquist": across, "mtf_nyquist_along": along, "snr_0": snr_0, "snr_1": snr_1}
+    numbers |= {"gain_dn_per_radiance": sensor.gain_dn_per_radiance, "bits": float(sensor.bits)}
+    constants = {name: Constant(value, "assumed", "a sensor drawn") for name, value in numbers.items()}
+    return replace(like, **constants)  # type: ignore[arg-type]  # each is a field that holds a Constant
 
 
 def network_method(model: onnx.ModelProto, max_dn: int) -> Restore:

@@ -154,8 +154,8 @@ REFUSED = {
         Refused(("workers", "scheduler", "resume"), without="--out"),
     ],
     "train": [
-        Refused(("images", "drawn", "told"), "--pairs PAIRS"),
-        Refused(("teacher",), "--told"),
+        Refused(("images", "drawn", "conditioned"), "--pairs PAIRS"),
+        Refused(("teacher",), "--conditioned"),
         Refused(("validate_every",), without="--images"),
         Refused(("distil",), without="--teacher"),
         Refused(("lpips",), "--lpips-weight 0"),

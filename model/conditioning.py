@@ -1,13 +1,6 @@
-"""Networks that are told their sensor: one set of weights for a whole range of sensors.
+"""The network that is conditioned on its sensor, as it is trained: one set of weights for a whole range of sensors.
 
-    weights(sensor) = base + sum over k of tanh(g(sensor))_k * direction_k
-
-`base` and the K directions are whole sets of ConvBEERS weights; g, a small network, gives each convolution its own K
-coefficients. For one sensor the sum is taken once (`fold`), and what is left is a plain ConvBEERS: knowing the sensor
-costs nothing at run time. (Mixed kernels: Tunable Convolutions, Maggioni et al., CVPR 2023.)
-
-The network sees images over full scale, so noise is told over full scale too, at 1/16 and at 1/4 of it: that is at 25
-and at 100 W/m2/sr/um where full scale is 400.
+What it is given of a sensor, and how it becomes a plain network for one, says `model.specialise`.
 """
 
 import math
@@ -19,75 +12,21 @@ import torch
 from torch import Tensor, nn
 from torch.func import functional_call
 
-from model.convbeers import ConvBEERS, Variant
-from profiles.effects import Smear
+from model.convbeers import ConvBEERS, plain_network
+from model.specialise import DIRECTIONS, HIDDEN, LEAST_ALONG, RANGES, SensorVector, sensor_vector, specialised
+from model.variants import Variant
 from profiles.sensor import Sensor
-
-DIRECTIONS, HIDDEN = 3, 64
-
-RANGES: Mapping[str, tuple[float, float]] = {
-    "mtf_across": (0.015, 0.15),
-    "mtf_along": (0.015, 0.15),
-    "sigma_dark": (0.00056, 0.0072),
-    "sigma_bright": (0.0011, 0.0072),
-}
-"""What a network can be told, in this order: MTF at Nyquist across (horizontal) and along the track (vertical), and
-the noise's standard deviation over full scale at 1/16 and at 1/4 of it. The logarithm of each, -1 to 1 from end to
-end, is the sensor vector."""
 
 SNR_BRIGHT = (35.0, 220.0)
 """Of the sensors trained on, at 1/4 of full scale; at 1/16 all that physics allows for it."""
-
-LEAST_ALONG = 0.4
-"""The lower MTF of the two axes over the higher one: the least that is drawn."""
-
-ROUNDING = 1e-9
-"""What a ratio may miss its end by."""
 
 EDGE = 0.05
 """Draws reach this share of a range beyond its ends and are brought back: no draws from outside train the ends."""
 
 
-@dataclass(frozen=True)
-class Told:
-    """What a network is told of a sensor.
-
-    Attributes:
-        vector: (4,) float32, each in [-1, 1].
-        outside: a sentence for each value that lies outside its range, and was moved to the nearest end of it; and
-            one for axes that differ more than any sensor did in training.
-    """
-
-    vector: Tensor
-    outside: tuple[str, ...]
-
-
-def sensor_values(sensor: Sensor) -> dict[str, float]:
-    """The four values of `RANGES`, smear and rounding noise counted."""
-    full_scale = sensor.max_dn / sensor.gain_dn_per_radiance
-    rounding = 1 / (12 * sensor.gain_dn_per_radiance**2)
-    smear = sensor.effects.get("smear")
-    # A network knows no smear of its own: what that leaves of the contrast along the track is counted there.
-    kept = abs(float(np.sinc(0.5 * smear.length_px))) if isinstance(smear, Smear) else 1.0
-    sigmas = [math.sqrt(sensor.noise_sigma(full_scale / part) ** 2 + rounding) / full_scale for part in (16, 4)]
-    across, along = sensor.mtf_axes
-    return dict(zip(RANGES, (across, along * kept, *sigmas), strict=True))
-
-
-def tell(sensor: Sensor) -> Told:
-    """The sensor vector, clamped to the ranges."""
-    values, entries, outside = sensor_values(sensor), list[float](), list[str]()
-    for (name, value), (low, high) in zip(values.items(), RANGES.values(), strict=True):
-        inside = min(max(value, low), high)
-        if inside != value:
-            outside.append(f"{name} {value:.3g} is outside {low:g} to {high:g}, told as {inside:g}")
-        entries.append(2 * math.log(inside / low) / math.log(high / low) - 1)
-    lower, higher = sorted((values["mtf_across"], values["mtf_along"]))
-    if lower < (1 - ROUNDING) * LEAST_ALONG * higher:
-        outside.append(
-            f"the lower MTF is {lower / higher:.2g} of the other axis'; {LEAST_ALONG:g} and more was trained"
-        )
-    return Told(torch.tensor(entries), tuple(outside))
+def vector_tensor(sensor: Sensor) -> Tensor:
+    """The sensor vector (4,) float32, clamped to the ranges."""
+    return torch.tensor(sensor_vector(sensor).values)
 
 
 def transposed(vector: Tensor) -> Tensor:
@@ -97,7 +36,7 @@ def transposed(vector: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class SensorFamily:
-    """The sensors that a told network is trained on: every number log-uniform over its range.
+    """The sensors that a conditioned network is trained on: every number log-uniform over its range.
 
     Attributes:
         like: gives gain and bits; its MTF and noise do not matter.
@@ -124,10 +63,10 @@ def _log_uniform(generator: np.random.Generator, low: float, high: float) -> flo
     return min(low * math.exp(share * math.log(high / low)), high)
 
 
-class ToldConvBEERS(nn.Module):
+class ConditionedConvBEERS(nn.Module):
     """A ConvBEERS for every sensor in range: (N, 1, H, W) in [0, 1] of full scale and (N, 4) to (N, 1, H, W).
 
-    Before training the directions are zero: whatever it is told, it computes what its base does.
+    Before training the directions are zero: whatever the sensor, it computes what its base does.
     """
 
     def __init__(self, variant: Variant) -> None:
@@ -162,7 +101,7 @@ class ToldConvBEERS(nn.Module):
         return each_through(self.base, "", self.weights(vectors), image)
 
 
-Network = ConvBEERS | ToldConvBEERS
+Network = ConvBEERS | ConditionedConvBEERS
 """What can be trained and kept: a network, or one for every sensor in range."""
 
 
@@ -175,7 +114,7 @@ def each_through(module: nn.Module, prefix: str, weights: Mapping[str, Tensor], 
     return torch.cat(restored)
 
 
-def initialise_coefficients(network: ToldConvBEERS, generator: torch.Generator) -> None:
+def initialise_coefficients(network: ConditionedConvBEERS, generator: torch.Generator) -> None:
     """He-normal, so that sensors get different coefficients from the first step on; the directions do nothing yet."""
     for module in network.coefficients:
         if isinstance(module, nn.Linear):
@@ -184,10 +123,8 @@ def initialise_coefficients(network: ToldConvBEERS, generator: torch.Generator) 
                 module.bias.zero_()
 
 
-def fold(network: ToldConvBEERS, vector: Tensor) -> ConvBEERS:
+def fold(network: ConditionedConvBEERS, vector: Tensor) -> ConvBEERS:
     """The plain network for one sensor vector (4,), in evaluation mode, on the CPU."""
-    plain = ConvBEERS(network.variant)
-    with torch.no_grad():
-        weights = network.weights(vector[None].to(next(network.parameters()).device))
-    plain.load_state_dict({name: weight[0].contiguous() for name, weight in weights.items()})
-    return plain.eval()
+    tensors = {name: value.detach().cpu().numpy() for name, value in network.state_dict().items()}
+    weights = specialised(tensors, network.variant, SensorVector(tuple(vector.tolist()), ()))
+    return plain_network(weights, network.variant)

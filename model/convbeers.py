@@ -5,31 +5,13 @@
 Every convolution is 3 x 3 with stride 1 and zero padding 1. 16 blocks of 64 features make 1.2 M parameters.
 """
 
-from dataclasses import dataclass
+from collections.abc import Mapping
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
-
-@dataclass(frozen=True)
-class Variant:
-    """A named point of the family."""
-
-    blocks: int
-    features: int
-
-    @property
-    def radius_px(self) -> int:
-        """How far an output pixel sees: one pixel per convolution (head, two a block, body end, tail)."""
-        return 2 * self.blocks + 3
-
-
-VARIANTS = {
-    "convbeers": Variant(blocks=16, features=64),  # the paper's
-    "convbeers-m": Variant(blocks=16, features=32),
-    "convbeers-s": Variant(blocks=8, features=32),
-    "convbeers-xs": Variant(blocks=4, features=16),
-}
+from model.variants import Variant
 
 
 def conv3x3(inputs: int, outputs: int) -> nn.Conv2d:
@@ -83,3 +65,10 @@ def initialise(network: ConvBEERS, generator: torch.Generator) -> None:
                 module.weight.normal_(0.0, scale * (2 / fan_in) ** 0.5, generator=generator)
                 if module.bias is not None:
                     module.bias.zero_()
+
+
+def plain_network(weights: Mapping[str, np.ndarray], variant: Variant) -> ConvBEERS:
+    """A network with those weights, by name and of any shape each, in evaluation mode, on the CPU."""
+    network = ConvBEERS(variant)
+    network.load_state_dict({name: torch.from_numpy(np.array(value)) for name, value in weights.items()})
+    return network.eval()

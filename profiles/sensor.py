@@ -231,10 +231,11 @@ OPTIONAL: dict[str, tuple[str, ...]] = {"mtf": ("mtf_nyquist_along",)}
 
 def same_instrument(one: SensorProfile, other: SensorProfile) -> bool:
     """Whether two profiles state the same numbers, whatever they are called and wherever the numbers come from."""
-    return _numbers(one) == _numbers(other)
+    return numbers_of(one) == numbers_of(other)
 
 
-def _numbers(profile: SensorProfile) -> dict[str, object]:
+def numbers_of(profile: SensorProfile) -> dict[str, object]:
+    """The low and high end of each constant by name: what of a profile decides what its images are like."""
     keys = [key for table, keys in TABLES.items() for key in (*keys, *OPTIONAL.get(table, ()))]
     constants: dict[str, Constant | None] = {key: getattr(profile, key) for key in keys}
     constants |= {f"{n}.{key}": value for n, table in profile.effects.items() for key, value in table.items()}

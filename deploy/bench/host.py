@@ -19,8 +19,8 @@ import torch
 from deploy.bench.profile import interleaved, node_rows, profile, timed
 from deploy.bench.tables import TABLE, Swath, board_cpu_row, efficiency
 from deploy.dpu.reading import network_of
-from deploy.export import other_precision
 from deploy.host_state import Watch, memory_rise, watched
+from deploy.networks import other_precision
 from model.processor import require_cores
 from model.simulator.acquire import MARGIN_PX, simulate_pair
 from model.simulator.detector import Draw

@@ -1,11 +1,13 @@
 """`beers-deploy bench`: time, throughput, power and efficiency; predicted, measured and published side by side."""
 
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from deploy.commands.shared import refuse, say
+from model.shipped import SENSOR
 
 EXAMPLE = "bench --target vck190-model --size 13600x9016 --config C32B3"
 
@@ -25,6 +27,9 @@ def bench(
     target: Annotated[
         str, typer.Option(help="The modelled board, with or without -model behind its name; or host, this machine.")
     ] = BOARD,
+    sensor: Annotated[
+        str, typer.Option(help="What a shipped network is specialised to: a profile, your .toml file, or blind.")
+    ] = SENSOR,
     image: Annotated[Path | None, typer.Option(help="Mono image of at most 12 bits: the swath.")] = None,
     full_scale: Annotated[
         float | None, typer.Option(help="Pixel value of --image that is full scale; 4095 if none.")
@@ -48,14 +53,15 @@ def bench(
     from deploy.bench.board import BoardRequest, bench_board
     from deploy.bench.host import host_rows
     from deploy.bench.tables import parse_tiles
+    from deploy.networks import int8_file, known_sensor
     from deploy.results import Document, print_rows
     from model.io.files import require_writable
-    from model.shipped import int8_file
     from profiles import load_target
     from profiles.figures import by_table
 
-    path, tiles, here = int8_file(model), parse_tiles(tile), _is_host(target)
+    tiles, here = parse_tiles(tile), _is_host(target)
     _refuse_unused(context, here)
+    path = int8_file(model, known_sensor(sensor), partial(say, err=True))
     require_writable(json, inputs=(path, image, measured))
     if here:
         rows = host_rows(path, load_target("host-cpu"), _single(tiles), threads)
@@ -71,6 +77,7 @@ def bench(
             say(note)
     arguments = {
         "target": target,
+        "sensor": sensor,
         "full_scale": full_scale,
         "size": size,
         "tile": tile,

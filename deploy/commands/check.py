@@ -1,5 +1,6 @@
 """`beers-deploy check`: can the DPU run this network? Each node, the rules it breaks, and what to change."""
 
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -41,17 +42,19 @@ def check(
     """Place every node of a network on the host, the DPU or the CPU; exit code 1 if the DPU cannot run its part."""
     from deploy.dpu.board import load_dpu
     from deploy.dpu.checker.picture import require_picture
+    from deploy.networks import int8_file, known_sensor
     from model.io.files import require_writable
-    from model.shipped import int8_file
+    from model.shipped import SENSOR
 
     if model == TRADITIONAL:
         remedy = "leave the option out, or give a network"
         refuse(context, ["picture", "tile"], expected="none with 'traditional'", got="one", remedy=remedy)
     require_picture(picture)
-    require_writable(picture, json, inputs=(int8_file(model), Path(target)))
-    dpu = load_dpu(target, config)
     chain = model == TRADITIONAL
-    if not (_traditional(dpu, json) if chain else _network(int8_file(model), dpu, tile, picture, json)):
+    path = None if chain else int8_file(model, known_sensor(SENSOR), partial(say, err=True))
+    require_writable(picture, json, inputs=(path, Path(target)))
+    dpu = load_dpu(target, config)
+    if not (_traditional(dpu, json) if path is None else _network(path, dpu, tile, picture, json)):
         raise typer.Exit(1)
 
 

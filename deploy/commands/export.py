@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from deploy.commands.shared import refuse, say
-from model.shipped import VARIANT
+from model.shipped import SENSOR, VARIANT
 
 EXAMPLE = "export --variant convbeers-s --out float.onnx"
 
@@ -20,7 +20,7 @@ def export(
     ] = None,
     sensor: Annotated[
         str | None,
-        typer.Option(help="Specialise weights that can be told their sensor: a profile's name, or your .toml file."),
+        typer.Option(help=f"Specialise to this: a profile's name, your .toml file, or blind; {SENSOR} if none."),
     ] = None,
     tile: Annotated[
         int | None, typer.Option(min=16, max=8192, help="Fix the input to one tile of this side, 640 for a board.")
@@ -28,23 +28,36 @@ def export(
 ) -> None:
     """Write the network as ONNX, any height and width unless --tile fixes them, and check it against torch.
 
-    Weights of 'train --told' become the network for one --sensor, at no cost when it runs; of a profile with ranges,
-    for the middle of each. What lies outside the range that they were trained for is told as the nearest end of it,
-    with a warning.
+    Weights that are conditioned on their sensor, as all shipped ones are, become the network for one, at no cost when
+    it runs: of a profile with ranges, for the middle of each. A value outside the range that was trained is taken as
+    the nearest end of it, with a warning.
     """
-    from deploy.export import about, network_for, require_parity, to_onnx
+    from deploy.export import about, require_parity, to_onnx, weights_for
+    from deploy.networks import known_sensor, weights_file
+    from model.convbeers import plain_network
     from model.io.files import require_writable
-    from model.shipped import float_file, shipped_weights
+    from model.io.tensors import is_conditioned, read_plain
+    from model.shipped import shipped_weights
+    from profiles.errors import ModelError
     from quant.onnx_file import save_onnx
 
     if checkpoint is not None:
         refuse(context, ["variant"], expected="no --checkpoint beside it", got="both", remedy="leave one out")
-    path = float_file(checkpoint) if checkpoint else shipped_weights(variant)
+    path = weights_file(checkpoint) if checkpoint else shipped_weights(variant)
     require_writable(out, inputs=(path, Path(sensor) if sensor else None))
-    network, recipe, warnings = network_for(path, sensor)
-    for warning in warnings:
-        say(f"warning: {warning}", err=True)
-    model = to_onnx(network, about(path.stem, recipe), tile)
-    difference = require_parity(network, model, tile or 97)
+    if is_conditioned(path):
+        known = known_sensor(sensor or SENSOR)
+        weights, outside = weights_for(path, known.profile.nominal())
+        for sentence in outside:
+            say(f"warning: {sentence}", err=True)
+        said = about(path.stem, weights.recipe, known.name)
+    elif sensor is not None:
+        expected, remedy = "weights of 'train --conditioned'", "leave --sensor out, or give such weights"
+        raise ModelError(str(path), expected=expected, got="those of a plain network", remedy=remedy)
+    else:
+        weights = read_plain(path)
+        said = about(path.stem, weights.recipe)
+    model = to_onnx(weights, said, tile)
+    difference = require_parity(plain_network(weights.tensors, weights.variant), model, tile or 97)
     save_onnx(model, out)
     say(f"wrote {out}: largest difference from torch {difference:.2g} of full scale (measured)")

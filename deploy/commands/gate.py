@@ -1,6 +1,7 @@
 """`beers-deploy gate`: does INT8 stay close enough to float? Exit code 1 when it does not."""
 
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -64,7 +65,9 @@ def gate(
     config: Annotated[Path | None, typer.Option(help="TOML file of limits; see docs/gate.md.")] = None,
     baseline: Annotated[Path | None, typer.Option(help="What 'gate --json' wrote before: MAE may not grow.")] = None,
     target: Annotated[str, typer.Option(help="Board whose rules the INT8 file must keep.")] = "vck190",
-    sensor: Annotated[str, typer.Option(help="Profile of the test patches.")] = SENSOR,
+    sensor: Annotated[
+        str, typer.Option(help="Profile of the test patches, and what a shipped network is specialised to.")
+    ] = SENSOR,
     images: Annotated[Path | None, typer.Option(help="Folder of scenes; drawn ones if none.")] = None,
     patches: Annotated[int, typer.Option(min=1, max=100_000, help="Test patches of 128 x 128.")] = 32,
     seed: Annotated[int, typer.Option(min=0, max=SEEDS, help="Seed of the patches.")] = 0,
@@ -91,7 +94,7 @@ def gate(
     with reports.of_bad_input("INT8 gate"):
         require_writable(json)
         limits = read_limits(config, max_mae)
-        files = files_or_shipped(float_model, int8_model, variant)
+        files = files_or_shipped(float_model, int8_model, variant, sensor, partial(say, err=True))
         request = Request(*files, limits, baseline, target, sensor, images, patches, seed)
         outcome = run_gate(request)
     print_rows("float against INT8", [outcome.row])

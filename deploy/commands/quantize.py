@@ -1,6 +1,7 @@
 """`beers-deploy quantize`: float ONNX to static INT8 under the DPU's rules, or free of them."""
 
 from enum import StrEnum
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -21,7 +22,9 @@ class Regime(StrEnum):
 
 
 def quantize(
-    model: Annotated[Path, typer.Argument(help="Float ONNX or weights, or a shipped network's name.")],
+    model: Annotated[
+        Path, typer.Argument(help="Float ONNX or weights, or a shipped network's name, then specialised to --sensor.")
+    ],
     out: Annotated[Path, typer.Option(help="INT8 ONNX for the host, runs on stock onnxruntime.")],
     target: Annotated[str, typer.Option(help="Whose rules to obey.")] = "vck190",
     sensor: Annotated[str, typer.Option(help="Profile that calibration patches are drawn from.")] = SENSOR,
@@ -52,10 +55,10 @@ def quantize(
     Prints each integer layer: bits of its accumulator, seen and proven, and the share of saturated results.
     """
     from deploy.export import float_model
+    from deploy.networks import float_file, known_sensor
     from deploy.quantise import Wanted, quantise_free_file, quantise_legal_file
     from deploy.results import Document, print_rows
     from model.io.files import require_writable
-    from model.shipped import float_file
     from profiles import load_target
     from profiles.errors import OptionError
     from quant.calibration import Calibration
@@ -65,7 +68,7 @@ def quantize(
         remedy = "leave it out, or take --regime legal"
         expected = "no --board, --ablate, --report or --without"
         raise OptionError("--regime free", expected=expected, got="one", remedy=remedy)
-    model = float_file(model)
+    model = float_file(model, known_sensor(sensor), partial(say, err=True))
     passes = passes_without(without or [])
     page, figures = (report / "report.html", report / "report.json") if report else (None, None)
     read = (model, images, *map(Path, (target, sensor)))

@@ -1,6 +1,7 @@
 """`beers-deploy restore`: a raw image in, the restored one out, of any size."""
 
 from enum import StrEnum
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -26,12 +27,15 @@ def restore(
     image: Annotated[Path, typer.Argument(metavar="IN", help="Image of at most 12 bits (TIFF of any size, or PNG).")],
     out: Annotated[Path, typer.Argument(metavar="OUT", help="TIFF to write: uint16, or float32 where IN is float.")],
     model: Annotated[
-        Path | None, typer.Option(help="ONNX network, or a shipped one's name; the INT8 convbeers-s if none.")
+        Path | None, typer.Option(help="ONNX network, or a shipped one's name; convbeers-s-int8 if none.")
     ] = None,
     method: Annotated[Method, typer.Option(help="A network, or the traditional chain of --sensor.")] = Method.network,
     sensor: Annotated[
         str | None,
-        typer.Option(help="With --method traditional: the sensor of IN, a profile's name or your .toml file."),
+        typer.Option(
+            help="The sensor of IN, a profile's name or your .toml file, to which a shipped network is specialised; "
+            "blind if none."
+        ),
     ] = None,
     tile: Annotated[int, typer.Option(min=16, help="Longest side of a tile in pixels.")] = TILE_PX,
     halo: Annotated[str, typer.Option(help="Context around a tile: 'exact' (no seams) or pixels.")] = "exact",
@@ -59,16 +63,20 @@ def restore(
 
     The image is read and written by rows, so memory does not grow with its height. Bands are restored one by one.
     OUT has the scale of IN: 8-bit pixels with --full-scale 255 come out as 0..255, floats with 1 as 0..1.
+    A shipped network is specialised to --sensor at no cost: NAME is float32 and ready at once, NAME-int8 for a sensor
+    of your own is made once, in minutes, and kept. Without --sensor it is taken to be in the middle of what
+    it may be.
     With --method traditional the image is stabilised, denoised and sharpened as its --sensor asks, in strips of rows:
     one band, about a minute a megapixel on two cores, not resumable.
     Georeference, RPCs and missing pixels (NaN, or the nodata value) are kept. Until OUT is finished its rows lie in
     .OUT.part beside it. Workers change no pixel: where they are of one processor and the same versions, the bytes are
     those of one process. Those of a scheduler must find IN under its path; only this process writes.
     """
+    from deploy.networks import conditioned, known_sensor, network_file
     from deploy.restoration.run import restore_file
     from deploy.results import Document, print_rows
     from model.io.files import require_writable
-    from model.shipped import int8_file
+    from model.shipped import BLIND
     from profiles.errors import OptionError
 
     budget_bytes = max(int(memory * 1e9), 1) if memory else None
@@ -78,12 +86,11 @@ def restore(
         refuse(context, NETWORK_ONLY, expected=expected, got="one", remedy=remedy)
         _by_the_chain(image, out, sensor, full_scale, compression, budget_bytes, json)
         return
-    if sensor is not None:
-        made = "'beers-deploy export --variant convbeers-s-told --sensor ... --out mine.onnx'"
-        remedy = f"add --method traditional, or make a network for it with {made} and give that as --model"
-        raise OptionError("--sensor", expected="--method traditional beside it", got="a network", remedy=remedy)
-    path = int8_file(model)
-    require_writable(out, json, inputs=(image, path))
+    require_writable(out, json, inputs=(image, model, Path(sensor) if sensor else None))
+    if sensor is not None and conditioned(model) is None:
+        expected, remedy = "a shipped network, or weights of 'train --conditioned'", "leave --sensor out"
+        raise OptionError("--sensor", expected=expected, got=f"{model}, made for one already", remedy=remedy)
+    path = network_file(model, known_sensor(sensor or BLIND), partial(say, err=True))
     options = Options(
         path,
         tile,
@@ -99,7 +106,14 @@ def restore(
     )
     row = restore_file(image, out, options, say)
     print_rows(f"wrote {out}", [row])
-    arguments = {"tile": tile, "halo": halo, "full_scale": full_scale, "runtime": runtime, "threads": threads}
+    arguments = {
+        "sensor": sensor or BLIND,
+        "tile": tile,
+        "halo": halo,
+        "full_scale": full_scale,
+        "runtime": runtime,
+        "threads": threads,
+    }
     arguments |= {"workers": workers, "scheduler": scheduler}
     Document("restore", arguments, (path, image), (row,)).write(json)
 

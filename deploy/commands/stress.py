@@ -1,5 +1,6 @@
 """`beers-deploy stress`: hard cases against a network and everything around it. Exit code 1 when something fails."""
 
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -17,7 +18,7 @@ EXAMPLE = "stress float.onnx int8.onnx --out stability.md"
 
 
 HARD_CASES_ONLY = ("cases", "stages")
-BIT_FLIPS_ONLY = ("draws", "sensor", "images", "target")
+BIT_FLIPS_ONLY = ("draws", "images", "target")
 
 
 def stress(
@@ -43,7 +44,10 @@ def stress(
     draws: Annotated[
         int, typer.Option(min=1, max=10_000, help="Injections into each memory at each rate, with --bit-flips.")
     ] = 6,
-    sensor: Annotated[str, typer.Option(help="Sensor profile of the patches, with --bit-flips.")] = SENSOR,
+    sensor: Annotated[
+        str,
+        typer.Option(help="What a shipped network is specialised to; with --bit-flips also what sees the patches."),
+    ] = SENSOR,
     images: Annotated[
         Path | None,
         typer.Option(help="Folder of aerial images for the patches, with --bit-flips; else drawn scenes."),
@@ -84,13 +88,14 @@ def stress(
     picture = _picture_beside(out, json) if bit_flips else None
     read = (float_model, int8_model, images, *map(Path, (sensor, target)))
     require_writable(out, json, picture, inputs=read)
+    files, tell = (float_model, int8_model, variant), partial(say, err=True)
     if bit_flips:
         request = FlipRequest(sensor, images, target, draws, size, seed)
-        _flip_bits(open_subject(float_model, int8_model, variant), request, (out, picture, json))
+        _flip_bits(open_subject(*files, sensor, tell), request, (out, picture, json))
         return
     names = chosen(cases, [case.name for case in CASES], "--cases")
     wanted = chosen(stages, STAGES, "--stages")
-    subject = open_subject(float_model, int8_model, variant)
+    subject = open_subject(*files, sensor, tell)
     selected = [case for case in CASES if case.name in names]
     with steps("stressing", len(selected) * len(wanted)) as bar:
         outcomes = run_battery(subject, selected, wanted, seed, bar.advance, size)
@@ -98,7 +103,7 @@ def stress(
     shown = [row for table in (*tables, proof_rows(subject, outcomes), layer_rows(subject)) for row in table]
     for table, rows in by_table(shown).items():
         print_rows(title(table), rows)
-    arguments = {"variant": variant, "cases": cases, "stages": stages, "size": size, "seed": seed}
+    arguments = {"variant": variant, "sensor": sensor, "cases": cases, "stages": stages, "size": size, "seed": seed}
     Document("stress", arguments, subject.paths, (*shown, *finding_rows(outcomes))).write(json)
     if out is not None:
         write_text(out, markdown(shown))

@@ -1,5 +1,6 @@
 """`beers-deploy tradeoff`: what accuracy costs in time, over many operating points."""
 
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -55,8 +56,8 @@ def tradeoff(
     point keeps --budget and --need; the report is written all the same.
     """
     from deploy.bench.tables import parse_size
+    from deploy.cache import Cache
     from deploy.results import Document
-    from deploy.tradeoff.cache import Cache
     from deploy.tradeoff.page import FILES, write_study
     from deploy.tradeoff.points import parse_demands
     from deploy.tradeoff.run import run_study
@@ -84,7 +85,7 @@ def tradeoff(
         demands[1],
         seed,
     )
-    result = run_study(request, Cache(kept))
+    result = run_study(request, Cache(kept), partial(say, err=True))
     write_study(result.study, out)
     show(result.study)
     arguments: dict[str, object] = {"images": images, "sensor": sensor, "reference": aim, "size": size}

@@ -25,8 +25,9 @@ def train(
         str | None,
         typer.Option(help=f"Profile of the degraded input; of pairs their recipe's, else {RANGE} if none."),
     ] = None,
-    told: Annotated[
-        bool, typer.Option("--told", help="Draw sensors of a wide range with that gain, and tell the network each.")
+    conditioned: Annotated[
+        bool,
+        typer.Option("--conditioned", help="Draw sensors of a wide range with that gain, and condition on each."),
     ] = False,
     reference: Annotated[
         str | None,
@@ -67,13 +68,14 @@ def train(
     The loss is the paper's: 1.0 L1 + 0.5 LPIPS + 0.1 L1 of spectra; without weights for LPIPS that term is left out,
     which is said and kept in the recipe. Pairs bring sensor, reference and full scale in a recipe.json: others are
     refused. A twentieth of the images, whole sites, is held out for validation. Several GPUs: start it with torchrun.
+    With --conditioned the weights become the network of any sensor in range, as the shipped ones do.
     """
     from typing import get_args
 
+    from deploy.networks import weights_file
     from model.conditioning import SensorFamily
     from model.evaluation.pairs import profiles_for, read_pairs_recipe
     from model.io.files import require_writable
-    from model.shipped import float_file
     from model.training.checkpoint import Optimiser, TrainingRecipe
     from model.training.losses import LossWeights
     from model.training.patches import PatchRecipe
@@ -90,14 +92,14 @@ def train(
     if pairs is not None and (images is not None or drawn):
         remedy = "leave one out"
         raise OptionError("--pairs", expected="no --images or --drawn beside it", got="both", remedy=remedy)
-    if told and (pairs is not None or teacher is not None):
-        remedy = "leave one out: stored pairs do not say what sensor each had, and a teacher is not told"
-        raise OptionError("--told", expected="no --pairs or --teacher beside it", got="both", remedy=remedy)
+    if conditioned and (pairs is not None or teacher is not None):
+        remedy = "leave one out: stored pairs do not say what sensor each had, and a teacher knows one"
+        raise OptionError("--conditioned", expected="no --pairs or --teacher beside it", got="both", remedy=remedy)
     _refuse_unused(context)
     stored = [pairs, *(pairs / role for role in ("degraded", "reference"))] if pairs else [images]
-    start, teacher = (float_file(path) if path else None for path in (start, teacher))
+    start, teacher = (weights_file(path) if path else None for path in (start, teacher))
     read = (*stored, lpips, start, teacher, *(Path(name) for name in (sensor, reference) if name))
-    require_writable(*(out / name for name in (*FILES, weights_name(variant, told))), inputs=read)
+    require_writable(*(out / name for name in (*FILES, weights_name(variant))), inputs=read)
     recipe = TrainingRecipe(
         steps=steps,
         batch=batch,
@@ -109,8 +111,8 @@ def train(
     )
     made = read_pairs_recipe(pairs) if pairs else None
     degraded, wanted = profiles_for(sensor or (None if made else RANGE), reference, made, say)
-    family = SensorFamily(degraded.nominal()) if told else None
-    patches = PatchRecipe(degraded, wanted, patch_px=patch, told=family)
+    family = SensorFamily(degraded.nominal()) if conditioned else None
+    patches = PatchRecipe(degraded, wanted, patch_px=patch, family=family)
     run = Run(
         variant,
         recipe,

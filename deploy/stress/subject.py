@@ -14,11 +14,12 @@ from torch import Tensor
 from torch.nn.functional import conv2d
 
 from deploy.export import float_model
+from deploy.networks import Say, float_file, int8_file, known_sensor, shipped_pair, silent
 from deploy.restoration.engine import restore_floats
 from deploy.restoration.plan import make_plan
 from deploy.restoration.runtime import Infer
 from deploy.stress.cases import FULL_DN
-from model.shipped import float_file, int8_file, shipped_pair
+from model.shipped import SENSOR
 from profiles.errors import BeersError
 from quant.core import IntCore
 from quant.encodings import read_core
@@ -88,15 +89,19 @@ class Subject:
         return None if int8 is None else _or_reason(lambda: read_core(int8.model))
 
 
-def open_subject(float_path: Path | None, int8_path: Path | None, variant: str) -> Subject:
-    """The files given, or shipped ones of that name; the shipped pair of a variant where neither is given.
+def open_subject(
+    float_path: Path | None, int8_path: Path | None, variant: str, sensor: str = SENSOR, say: Say = silent
+) -> Subject:
+    """The files given, or a shipped network in both precisions where neither is, specialised to the sensor.
 
     Raises:
         ModelError: no such file or variant, the two swapped, or a network that cannot be tiled.
     """
     if float_path is None:
-        float_path, int8_path = shipped_pair(variant)
-    float_path, int8_path = float_file(float_path), int8_file(int8_path) if int8_path else None
+        float_path, int8_path = shipped_pair(variant, sensor, say)
+    known = known_sensor(sensor)
+    float_path = float_file(float_path, known, say)
+    int8_path = int8_file(int8_path, known, say) if int8_path else None
     float32 = Network(float_model(float_path))
     int8 = None if int8_path is None else Network(load_onnx(int8_path))
     for path, network, wanted in ((float_path, float32, False), (int8_path, int8, True)):

@@ -11,10 +11,10 @@ from typing import Any, Self
 import numpy as np
 
 from deploy.bench.tables import Swath
+from deploy.cache import code_digest, pixels_digest
 from deploy.restoration.engine import restore_dn
 from deploy.restoration.plan import Plan, Span, plan_side
 from deploy.restoration.runtime import Infer
-from deploy.tradeoff.cache import code_digest, pixels_digest
 from model.evaluation.methods import Method, Restore
 from model.evaluation.pairs import NamedPair
 from model.evaluation.scores import Instruments

@@ -9,8 +9,8 @@ from functools import partial
 import numpy as np
 import psutil
 
+from deploy.cache import Cache, Key, code_digest, pixels_digest
 from deploy.tradeoff.accuracy import BenchmarkSet, Scores, cut_in_four, measure, measure_images, measure_mae
-from deploy.tradeoff.cache import Cache, Key, code_digest, pixels_digest
 from deploy.tradeoff.host_time import ROUNDS, Times, time_variants
 from deploy.tradeoff.methods import MethodStore, int8_ticks, operations_per_px, search_operations
 from deploy.tradeoff.points import EXACT, Point, Variant

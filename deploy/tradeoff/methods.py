@@ -13,18 +13,19 @@ from pathlib import Path
 import numpy as np
 import onnx
 
+from deploy.cache import Cache, code_digest, digest_of
 from deploy.export import float_model
 from deploy.methods import knowledge_of, method_named, restoring
+from deploy.networks import KnownSensor, Say, float_file, int8_file, known_sensor, silent
 from deploy.restoration.options import Runtime
 from deploy.restoration.runtime import Infer, open_openvino, open_runtime
-from deploy.tradeoff.cache import Cache, code_digest, digest_of
 from deploy.tradeoff.points import LEGAL, Variant
-from model.convbeers import VARIANTS
 from model.evaluation.methods import KNOWN, Restore
 from model.io.files import sha256
 from model.io.images import list_images
-from model.shipped import SHIPPED, shipped_names, shipped_weights
+from model.shipped import SENSOR, shipped_names
 from model.simulator.procedural import load_scenes
+from model.variants import VARIANTS
 from profiles import load_sensor, sensor_names
 from profiles.errors import BeersError, ModelError, OptionError
 from profiles.sensor import SensorProfile
@@ -60,38 +61,37 @@ class Network:
         return float_model(self.float_file) if self.float_file else load_onnx(self.int8_file or Path())
 
 
-def find_networks(names: Iterable[str]) -> list[Network]:
-    """Networks by shipped name or file, each once.
+def find_networks(names: Iterable[str], sensor: str = SENSOR, say: Say = silent) -> list[Network]:
+    """Networks by shipped name or file, each once; conditioned ones specialised to the sensor.
 
     Raises:
         OptionError: neither a shipped name nor a file of weights, two files of one name, or a model of one tile size.
         ModelError: a file that is no network.
     """
-    found: dict[str, Network] = {}
+    known, found = known_sensor(sensor), dict[str, Network]()
     for name in dict.fromkeys(each.strip() for each in names):
-        network = _network(name)
+        network = _network(name, known, say)
         if network.name in found:
             raise OptionError("--networks", expected="names that differ", got=repr(name), remedy="rename one file")
         found[network.name] = network
     return list(found.values())
 
 
-def _network(name: str) -> Network:
+def _network(name: str, sensor: KnownSensor, say: Say) -> Network:
     path = Path(name)
     if name in shipped_names():
-        int8 = SHIPPED / f"{name}-int8.onnx"
-        return Network(name, shipped_weights(name), int8 if int8.is_file() else None)
+        return Network(name, float_file(path, sensor, say), int8_file(path, sensor, say))
     if path.suffix not in (".onnx", ".safetensors"):
         expected = f"a shipped network ({', '.join(shipped_names())}) or an ONNX or safetensors file"
         raise OptionError("--networks", expected=expected, got=repr(name), remedy="correct that name")
-    model = float_model(path)
+    model = float_model(float_file(path, sensor, say))
     if fixed_tile_px(model):
         got, remedy = f"{name} for one tile size", "export it without --tile"
         raise OptionError("--networks", expected="networks for images of any size", got=got, remedy=remedy)
     if is_quantised(model):
         precision = metadata(model).get("precision", "int8 legal").replace("int8", "INT8")
         return Network(path.stem, None, path, precision)
-    return Network(path.stem, path, None)
+    return Network(path.stem, float_file(path, sensor, say), None)
 
 
 def shape_of(model: onnx.ModelProto) -> tuple[int, int]:
@@ -291,7 +291,7 @@ class MethodStore:
             ModelError: the runtime refuses the model.
         """
         if variant.kind != "network":
-            return Opened(method_named(variant.method, self.degraded.nominal(), self.reference.nominal()).restore)
+            return Opened(method_named(variant.method, self.degraded, self.reference).restore)
         path = self.int8_file(variant)
         model = load_onnx(path) if path else self.model(variant.method)
         half = variant.precision == "bf16"

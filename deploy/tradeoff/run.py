@@ -10,16 +10,17 @@ import numpy as np
 
 from deploy.bench.host import Sensors, drawn_acquisition
 from deploy.bench.tables import Swath, layer_rows
+from deploy.cache import Cache
 from deploy.dpu.board import load_dpu
 from deploy.dpu.checker.placement import place
 from deploy.dpu.checker.table import network_rows
 from deploy.dpu.reading import network_of
+from deploy.networks import Say, silent
 from deploy.restoration.engine import restore_dn
 from deploy.restoration.plan import make_plan
 from deploy.tradeoff.accuracy import BenchmarkSet
 from deploy.tradeoff.advice import Choice, choose, findings, fronts, headline, notes, paper_outcomes, papers_point
 from deploy.tradeoff.board import DpuRun
-from deploy.tradeoff.cache import Cache
 from deploy.tradeoff.host_time import TILE_PX
 from deploy.tradeoff.measurements import Measurements, run_jobs
 from deploy.tradeoff.methods import CalibrationScenes, MethodStore, find_networks, is_papers
@@ -114,14 +115,14 @@ class StudyRun:
         return [("layers", self.study.layers), ("placement", self.study.placement)]
 
 
-def run_study(request: Request, cache: Cache) -> StudyRun:
+def run_study(request: Request, cache: Cache, say: Say = silent) -> StudyRun:
     """Measure what the cache lacks, and put it together.
 
     Raises:
         BeersError: a network, an image, a profile or weights that cannot be used.
     """
     swath = Swath(*request.size_px)
-    store = make_store(request, cache)
+    store = make_store(request, cache, say)
     benchmark, small = make_benchmark(request)
     measurements = Measurements(store, benchmark, host_tile(store, request.seed), cache)
     points = select_points(store, swath)
@@ -159,9 +160,10 @@ def _put_together(
     return StudyRun(study, not asked or choice.outcome is not None)
 
 
-def make_store(request: Request, cache: Cache) -> MethodStore:
+def make_store(request: Request, cache: Cache, say: Say) -> MethodStore:
     """Collect the networks of a request and what chains know of the sensors."""
-    networks = {network.name: network for network in find_networks(request.networks)}
+    found = find_networks(request.networks, request.sensor, say)
+    networks = {network.name: network for network in found}
     return MethodStore(
         networks, *request.profiles, CalibrationScenes(request.calibration, request.sensor, request.seed), cache
     )

@@ -17,10 +17,13 @@ from profiles.sensor import Sensor
 Restore = Callable[[np.ndarray], np.ndarray]
 """Degraded digital numbers (H, W) float32 to restored ones."""
 
+Specialise = Callable[[Sensor], Restore]
+"""How a method restores when it knows a sensor."""
+
 TRADITIONAL, DECONVOLVE_FIRST = "traditional", "deconvolve-first"
 
-KNOWN, BLIND, TRAINED = "known", "blind", "trained for it"
-"""What a method knows of the sensor: the last of a network whose file names it."""
+KNOWN, BLIND = "known", "blind"
+"""What a method knows of the sensor."""
 
 
 @dataclass(frozen=True)
@@ -30,6 +33,7 @@ class Method:
     name: str
     restore: Restore
     sensor_known: str
+    specialise: Specialise | None = None
 
 
 def method_without_network(name: str, degraded: Sensor, reference: Sensor) -> Method | None:

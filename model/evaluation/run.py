@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from model.evaluation.methods import BLIND, TRAINED, Method, method_without_network
+from model.evaluation.methods import BLIND, Method, method_without_network
 from model.evaluation.pairs import NamedPair, PairsRecipe, oversamplings_of, read_pairs, simulate_pairs
 from model.evaluation.scores import Instruments, fidelity_db, paper_rows, score, site_rows
 from model.evaluation.targets import acquire_targets, mtf_figure, restored_mtfs, target_figures
@@ -167,7 +167,7 @@ def sweep_tables(
     """PSNR and MTF of the networks and the chain under conditions other than the nominal ones; a scene a site."""
     scenes = load_scenes(images, reference.nominal(), seed)
     first = {site_of(scene.name): scene for scene in reversed(scenes)}
-    networks = [method for method in methods if method.sensor_known in (BLIND, TRAINED)]
+    networks = [method for method in methods if method.sensor_known == BLIND]
     with steps("sweep", len(conditions(degraded.nominal(), degraded))) as bar:
         return tuple(sweep_rows(networks, list(first.values()), degraded, reference, seed, bar.advance))
 

@@ -8,8 +8,9 @@ from typing import Literal, cast, get_args
 import torch
 from torch import Tensor
 
-from model.conditioning import Network, ToldConvBEERS
-from model.io.weights import all_finite, load_network, load_told, read_tensors, save_network, write_tensors
+from model.conditioning import ConditionedConvBEERS, Network
+from model.io.tensors import all_finite, read_tensors, write_tensors
+from model.io.weights import arrays, load_conditioned, load_network, save_network
 from model.training.guards import Guards, require_finite_output
 from model.training.losses import PAPER, LossWeights
 from model.training.precision import Precision
@@ -89,7 +90,7 @@ def write_checkpoint(
         for moment, value in optimiser.state.get(parameter, {}).items():
             tensors[f"moment.{name}.{moment}"] = value
     header = {"step": step, "guards": guards.to_json(), "recipe": asdict(recipe), "precision": precision}
-    write_tensors(path, tensors, header)
+    write_tensors(path, arrays(tensors), header)
 
 
 def read_checkpoint(
@@ -104,7 +105,8 @@ def read_checkpoint(
     Raises:
         ModelError: not a checkpoint, or one of another recipe or network.
     """
-    tensors, header = read_tensors(path)
+    found, header = read_tensors(path)
+    tensors = {name: torch.from_numpy(array) for name, array in found.items()}
     if header.get("recipe") != asdict(recipe):
         remedy = "repeat its options, or choose another --out"
         raise ModelError(str(path), expected=f"a checkpoint of {recipe}", got="another recipe", remedy=remedy)
@@ -136,12 +138,12 @@ def finish(network: Network, path: Path, recipe: dict[str, object]) -> Network:
     Raises:
         ModelError: a weight is not finite, or what the network makes of an image.
     """
-    if not all_finite(network.state_dict()):
+    if not all_finite(arrays(network.state_dict())):
         remedy = "lower the learning rate"
         raise ModelError(str(path), expected="finite weights", got="NaN or infinity", remedy=remedy)
     require_finite_output(network, str(path))
     save_network(path, network, recipe)
-    return load_told(path)[0] if isinstance(network, ToldConvBEERS) else load_network(path)[0]
+    return load_conditioned(path)[0] if isinstance(network, ConditionedConvBEERS) else load_network(path)[0]
 
 
 def _check_parts(tensors: dict[str, Tensor], network: Network, steps: int) -> None:
@@ -166,7 +168,7 @@ def _check_parts(tensors: dict[str, Tensor], network: Network, steps: int) -> No
             raise ValueError(f"{name} that Adam cannot have")
     if len(tensors) != 2 * len(wanted) + len(moments) or len(moments) not in (0, len(MOMENTS) * len(parameters)):
         raise ValueError(f"{len(tensors)} tensors")
-    if {name.rsplit(".", 1)[1] for name in moments} - set(MOMENTS) or not all_finite(tensors):
+    if {name.rsplit(".", 1)[1] for name in moments} - set(MOMENTS) or not all_finite(arrays(tensors)):
         raise ValueError("other moments than Adam's, or values that are not finite")
 
 

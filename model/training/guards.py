@@ -4,7 +4,8 @@ import math
 
 import torch
 
-from model.conditioning import RANGES, Network, ToldConvBEERS, fold
+from model.conditioning import ConditionedConvBEERS, Network, fold
+from model.specialise import RANGES
 from profiles.errors import ModelError
 
 MAX_BAD_STEPS = 10
@@ -68,7 +69,7 @@ def require_finite_output(network: Network, where: str, remedy: str = "lower the
     """Refuse a network that makes NaN or infinity of an image in [0, 1]: its weights may be finite all the same.
 
     Args:
-        network: on the CPU; one that is told its sensor is told the middle of every range.
+        network: on the CPU; a conditioned one is specialised to the middle of every range.
         where: what to name in the message.
         remedy: what to do about it.
 
@@ -76,7 +77,7 @@ def require_finite_output(network: Network, where: str, remedy: str = "lower the
         ModelError: it does.
     """
     image = torch.rand((1, 1, TEST_SIDE_PX, TEST_SIDE_PX), generator=torch.Generator().manual_seed(0))
-    plain = fold(network, torch.zeros(len(RANGES))) if isinstance(network, ToldConvBEERS) else network
+    plain = fold(network, torch.zeros(len(RANGES))) if isinstance(network, ConditionedConvBEERS) else network
     with torch.inference_mode():
         restored = plain(torch.cat([torch.zeros_like(image), image, torch.ones_like(image)]))
     if not bool(torch.isfinite(restored).all()):

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from model.conditioning import SensorFamily, tell, transposed
+from model.conditioning import SensorFamily, transposed, vector_tensor
 from model.io.images import list_images, read_pixels, remedy_outside, settled_scale
 from model.simulator.acquire import acquire
 from model.simulator.detector import Draw
@@ -34,7 +34,7 @@ class PatchRecipe:
         oversamplings: ratios to draw from; every ratio shows the same ground at another scale.
         exposures: darker and brighter days than the photograph's.
         margin_px: target pixels cropped on each side.
-        told: draws the sensors instead of `degraded`; each patch then comes with the vector of its sensor.
+        family: draws the sensors instead of `degraded`; each patch then comes with the vector of its sensor.
     """
 
     degraded: SensorProfile
@@ -43,7 +43,7 @@ class PatchRecipe:
     oversamplings: tuple[int, ...] = (2, 3, 4, 5)
     exposures: tuple[float, float] = (0.5, 1.25)
     margin_px: int = 16
-    told: SensorFamily | None = None
+    family: SensorFamily | None = None
 
     def __post_init__(self) -> None:
         require_same_units(self.degraded, self.reference)
@@ -60,7 +60,7 @@ class Visited:
 class PatchSource:
     """Endless batches of (degraded, reference) patches, (N, 1, P, P) in [0, 1]; the same for the same seed.
 
-    With sensors told, of (degraded, reference, sensor vectors (N, 4)).
+    Where the recipe has a family of sensors, of (degraded, reference, sensor vectors (N, 4)).
     """
 
     SHARD_BATCHES = 16
@@ -112,7 +112,7 @@ class PatchSource:
                 patches = torch.cat(pieces)
                 patches = patches[order.to(patches.device)]
                 pair = patches[:, :1].contiguous(), patches[:, 1:].contiguous()
-                return (*pair, torch.cat(vectors)[order]) if self.recipe.told else pair
+                return (*pair, torch.cat(vectors)[order]) if self.recipe.family else pair
         raise ImageError(
             "training images",
             expected=f"scenes that hold a patch of {self.recipe.patch_px} target pixels",
@@ -140,8 +140,8 @@ def visit(scene: Visited, recipe: PatchRecipe, generator: np.random.Generator) -
     patches = cut(images, recipe.patch_px, generator)
     # A network that knows the sensor learns that its axes changed places; a blind one cannot.
     alike = sensor.mtf_axes[0] == sensor.mtf_axes[1]
-    quarter, mirrored = draw_turn(generator, quarters=alike or recipe.told is not None)
-    vector = tell(sensor).vector
+    quarter, mirrored = draw_turn(generator, quarters=alike or recipe.family is not None)
+    vector = vector_tensor(sensor)
     return turned(patches, quarter, mirrored), transposed(vector) if quarter % 2 else vector
 
 
@@ -155,7 +155,7 @@ def _acquire_pair(
     phase_y, phase_x = (float(v) for v in generator.uniform(-ratio / 2, ratio / 2, 2))
     draw = Draw(int(generator.integers(2**31)))
     images, sensors = list[Tensor](), list[Sensor]()
-    for profile, role in ((recipe.told or recipe.degraded, "degraded"), (recipe.reference, "reference")):
+    for profile, role in ((recipe.family or recipe.degraded, "degraded"), (recipe.reference, "reference")):
         sensor = profile.draw(generator)
         dn = acquire(spectrum, scene.width, sensor, ratio, draw, role, (phase_y, phase_x), recipe.margin_px)
         images.append(dn / sensor.max_dn)

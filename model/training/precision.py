@@ -8,7 +8,7 @@ from typing import Literal
 import torch
 from torch import Tensor, nn
 
-from model.conditioning import Network, ToldConvBEERS, each_through
+from model.conditioning import ConditionedConvBEERS, Network, each_through
 from model.convbeers import ConvBEERS
 from model.processor import bfloat16_speed
 from model.training.workers import Worker
@@ -61,10 +61,10 @@ class MixedPrecision(nn.Module):
         return image + correction
 
 
-class ToldMixedPrecision(nn.Module):
+class ConditionedMixedPrecision(nn.Module):
     """As `MixedPrecision`, each image with the weights for its own sensor; these are mixed in float32."""
 
-    def __init__(self, network: ToldConvBEERS, precision: Precision) -> None:
+    def __init__(self, network: ConditionedConvBEERS, precision: Precision) -> None:
         super().__init__()
         self.network, self.plain = network, MixedPrecision(network.base, precision)
 
@@ -75,6 +75,6 @@ class ToldMixedPrecision(nn.Module):
 
 def in_precision(network: Network, precision: Precision) -> nn.Module:
     """The network as it is trained."""
-    if isinstance(network, ToldConvBEERS):
-        return ToldMixedPrecision(network, precision)
+    if isinstance(network, ConditionedConvBEERS):
+        return ConditionedMixedPrecision(network, precision)
     return MixedPrecision(network, precision)

@@ -14,15 +14,16 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from model.conditioning import Network
+from model.conditioning import Network, fold, vector_tensor
+from model.convbeers import ConvBEERS
 from model.io.files import whole_file
 from model.io.images import list_images
 from model.io.pictures import Stretch, busiest_windows, grid, strip_row
-from model.io.weights import N, is_told, load_network, load_told, variant_named, widen, widen_told
+from model.io.tensors import is_conditioned
+from model.io.weights import N, load_conditioned, load_network, widen, widen_conditioned
 from model.metrics.backbones import find_backbone, not_found
 from model.metrics.perceptual import Lpips
 from model.progress import Steps, steps
-from model.shipped import TOLD_SUFFIX
 from model.simulator.procedural import draw_scenes
 from model.simulator.sampling import Scene, read_scene
 from model.training.checkpoint import TrainingRecipe, finish
@@ -33,6 +34,7 @@ from model.training.precision import Precision
 from model.training.trainer import Progress, Schedule, Source, Trainer, new_network
 from model.training.validation import Validation, split_by_site
 from model.training.workers import Worker
+from model.variants import variant_named
 from profiles.errors import OptionError
 
 STEP = re.compile(r"[0-9]{1,18}(?=,)")
@@ -43,8 +45,8 @@ if TYPE_CHECKING:
 
 VALIDATION_CROP_PX, ZOOM = 96, 2
 
-TOLD_VIEWS = 4
-"""Sensors that each validation image is seen by where the network is told them: they differ by far more."""
+SENSOR_VIEWS = 4
+"""Sensors that each validation image is seen by where the network is conditioned: they differ by far more."""
 
 
 @dataclass(frozen=True)
@@ -74,16 +76,16 @@ class Run:
     @property
     def weights(self) -> Path:
         """Where the averaged weights go in the end."""
-        return self.out / weights_name(self.variant, self.patches.told is not None)
+        return self.out / weights_name(self.variant)
 
 
 FILES = ("checkpoint.safetensors", "log.csv", "validation.csv", "validation.png")
 """What a run leaves in its folder besides the weights."""
 
 
-def weights_name(variant: str, told: bool) -> str:
-    """The file of the averaged weights; of a network that is told its sensor under a name of its own."""
-    return f"{variant}{TOLD_SUFFIX if told else ''}.safetensors"
+def weights_name(variant: str) -> str:
+    """The file of the averaged weights."""
+    return f"{variant}.safetensors"
 
 
 def train(run: Run, resume: bool, worker: Worker, say: Callable[[str], None]) -> None:
@@ -103,9 +105,9 @@ def train(run: Run, resume: bool, worker: Worker, say: Callable[[str], None]) ->
         worker,
         run.device,
         start_weights(run),
-        _sound(load_network, run.teacher) if run.teacher else None,
+        _plain(run, run.teacher) if run.teacher else None,
         run.precision,
-        run.patches.told is not None,
+        run.patches.family is not None,
     )
     if loss.perceptual is not None:
         loss.perceptual.to(trainer.device)
@@ -130,13 +132,20 @@ def start_weights(run: Run) -> Mapping[str, Tensor] | None:
     if run.start is None:
         return None
     variant, generator = variant_named(run.variant), torch.Generator().manual_seed(run.recipe.seed)
-    if run.patches.told is None:
-        return widen(_sound(load_network, run.start), variant, generator).state_dict()
-    if is_told(run.start):
-        return widen_told(_sound(load_told, run.start), variant, generator).state_dict()
-    network = new_network(variant, generator, told=True)
+    if run.patches.family is None:
+        return widen(_plain(run, run.start), variant, generator).state_dict()
+    if is_conditioned(run.start):
+        return widen_conditioned(_sound(load_conditioned, run.start), variant, generator).state_dict()
+    network = new_network(variant, generator, conditioned=True)
     base = widen(_sound(load_network, run.start), variant, generator).state_dict()
     return network.state_dict() | {f"base.{name}": weight for name, weight in base.items()}
+
+
+def _plain(run: Run, path: Path) -> ConvBEERS:
+    """A plain network from its file; a conditioned one for the middle of the run's sensor profile."""
+    if not is_conditioned(path):
+        return _sound(load_network, path)
+    return fold(_sound(load_conditioned, path), vector_tensor(run.patches.degraded.nominal()))
 
 
 def _sound(load: Callable[[Path], tuple[N, object]], path: Path) -> N:
@@ -159,7 +168,7 @@ def loss_of(run: Run) -> tuple[RestorationLoss, str]:
 
 def data(run: Run, trainer: Trainer) -> tuple[Source, Validation, list[str]]:
     """Where batches come from, the images held out, and the names of those trained on."""
-    recipe, sensors = run.recipe, (run.patches.told or run.patches.degraded, run.patches.reference)
+    recipe, sensors = run.recipe, (run.patches.family or run.patches.degraded, run.patches.reference)
     if run.pairs is not None:
         files = pair_files(run.pairs)
         degraded = run.patches.degraded
@@ -168,7 +177,7 @@ def data(run: Run, trainer: Trainer) -> tuple[Source, Validation, list[str]]:
         return source, Validation([], *sensors), [degraded.name for degraded, _ in files]
     scenes = read_scenes(run)
     kept, held = split_by_site([scene.name for scene in scenes])
-    views = TOLD_VIEWS if run.patches.told else 1
+    views = SENSOR_VIEWS if run.patches.family else 1
     validation = Validation([scenes[k] for k in held for _ in range(views)], *sensors)
     train_on = [scenes[k] for k in kept] + draw_scenes(run.drawn, recipe.seed)
     if not train_on:
@@ -290,7 +299,7 @@ def about(run: Run, images: Sequence[str], held_out: Sequence[str], loss: Restor
         "lpips": "squeeze" if loss.perceptual is not None else "left out: no weights",
         "start": run.start.name if run.start else "drawn weights",
         "teacher": run.teacher.name if run.teacher else "none",
-        "degraded": patches.degraded.name if patches.told is None else "told, drawn over the ranges",
+        "degraded": patches.degraded.name if patches.family is None else "drawn over the ranges",
         "reference": patches.reference.name,
         "patch_px": patches.patch_px,
         "oversamplings": patches.oversamplings if run.pairs is None else "as stored",

@@ -12,14 +12,15 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
-from model.conditioning import Network, ToldConvBEERS, initialise_coefficients
-from model.convbeers import ConvBEERS, Variant, initialise
+from model.conditioning import ConditionedConvBEERS, Network, initialise_coefficients
+from model.convbeers import ConvBEERS, initialise
 from model.progress import held_back
 from model.training.checkpoint import TrainingRecipe, read_checkpoint, write_checkpoint
 from model.training.guards import Guards
 from model.training.losses import RestorationLoss
 from model.training.precision import MixedPrecision, Precision, choose_precision, in_precision
 from model.training.workers import Worker
+from model.variants import Variant
 from profiles.errors import OptionError
 
 
@@ -29,7 +30,7 @@ class Source(Protocol):
     def batches(self, first: int = 0) -> Iterator[tuple[Tensor, ...]]:
         """Batch number `first` and all that follow: (degraded, reference), (N, 1, P, P) in [0, 1] each.
 
-        For a network that is told its sensor, (degraded, reference, sensor vectors (N, 4)).
+        For a conditioned network, (degraded, reference, sensor vectors (N, 4)).
         """
         ...
 
@@ -68,7 +69,7 @@ class Trainer:
         start: weights to go on from, as `state_dict`; None draws new ones.
         teacher: a network whose outputs the recipe's `distil` weighs.
         precision: what the body is computed in; None measures what is faster here.
-        told: whether the network is told the sensor of each patch.
+        conditioned: whether the network is given the sensor of each patch.
 
     Raises:
         OptionError: a loss of which nothing is weighed.
@@ -84,13 +85,13 @@ class Trainer:
         start: Mapping[str, Tensor] | None = None,
         teacher: ConvBEERS | None = None,
         precision: Precision | None = None,
-        told: bool = False,
+        conditioned: bool = False,
     ) -> None:
         self.recipe, self.worker = recipe, worker or Worker()
         self.loss, self.device = loss or RestorationLoss(recipe.loss), self.worker.device(device)
         require_loss(self.loss, recipe.distil if teacher is not None else 0.0)
         self.step, self.guards = 0, Guards()
-        self.network = new_network(variant, torch.Generator().manual_seed(recipe.seed), told)
+        self.network = new_network(variant, torch.Generator().manual_seed(recipe.seed), conditioned)
         if start is not None:
             self.network.load_state_dict(dict(start))
         self.network.to(self.device).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
@@ -138,13 +139,13 @@ class Trainer:
     def train_step(self, degraded: Tensor, reference: Tensor, *vectors: Tensor) -> Mapping[str, Tensor]:
         """One step on a batch, (N, 1, P, P) each; the loss's terms, none for a step that was skipped.
 
-        A network that is told its sensor takes the sensor vectors (N, 4) too.
+        A conditioned network takes the sensor vectors (N, 4) too.
         """
         for group in self.optimiser.param_groups:
             group["lr"] = self.recipe.rate_at(self.step)
         degraded = degraded.to(self.device, memory_format=torch.channels_last)
-        told = (vector.to(self.device) for vector in vectors)
-        total, terms = self._loss(degraded, reference.to(self.device), *told)
+        known = (vector.to(self.device) for vector in vectors)
+        total, terms = self._loss(degraded, reference.to(self.device), *known)
         self.optimiser.zero_grad(set_to_none=True)
         total.backward()  # type: ignore[no-untyped-call]
         norm = torch.nn.utils.clip_grad_norm_(self.network.parameters(), self.recipe.gradient_norm)
@@ -238,16 +239,16 @@ def require_loss(loss: RestorationLoss, distil: float) -> None:
     raise OptionError("loss", expected="a term of weight above 0", got=got, remedy=remedy)
 
 
-def new_network(variant: Variant, generator: torch.Generator, told: bool) -> Network:
+def new_network(variant: Variant, generator: torch.Generator, conditioned: bool) -> Network:
     """A network that nothing was trained into yet."""
-    if not told:
-        network = ConvBEERS(variant)
-        initialise(network, generator)
-        return network
-    conditioned = ToldConvBEERS(variant)
-    initialise(conditioned.base, generator)
-    initialise_coefficients(conditioned, generator)
-    return conditioned
+    if not conditioned:
+        plain = ConvBEERS(variant)
+        initialise(plain, generator)
+        return plain
+    network = ConditionedConvBEERS(variant)
+    initialise(network.base, generator)
+    initialise_coefficients(network, generator)
+    return network
 
 
 def _optimiser(network: Network, recipe: TrainingRecipe) -> torch.optim.Optimizer:

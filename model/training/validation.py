@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from model.conditioning import Network, SensorFamily, ToldConvBEERS, fold, tell
+from model.conditioning import ConditionedConvBEERS, Network, SensorFamily, fold, vector_tensor
 from model.io.images import site_of
 from model.metrics.fidelity import psnr_db, ssim
 from model.simulator.acquire import LEAST_SIDE_PX, fitting_oversampling, simulate_pair
@@ -70,16 +70,16 @@ class Validation:
             degraded_image, reference_image = (image[None, None, :height, :width] for image in both)
             self.names.append(scene.name)
             self.pairs.append((degraded_image, reference_image))
-            self.vectors.append(tell(sensors[0]).vector)
+            self.vectors.append(vector_tensor(sensors[0]))
 
     def restore(self, network: Network) -> list[np.ndarray]:
         """Each degraded image through the network in float32, (H, W), clipped to [0, 1].
 
-        A network that can be told its sensor is told the one that acquired the image.
+        A conditioned network is specialised to the sensor that acquired the image.
         """
         restored = []
         for (degraded, _), vector in zip(self.pairs, self.vectors, strict=True):
-            plain = fold(network, vector) if isinstance(network, ToldConvBEERS) else network
+            plain = fold(network, vector) if isinstance(network, ConditionedConvBEERS) else network
             with torch.inference_mode():
                 restored.append(plain(degraded)[0, 0].clamp(0, 1).numpy())
         return restored

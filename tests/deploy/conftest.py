@@ -6,7 +6,8 @@ import pytest
 import torch
 
 from deploy.export import to_onnx
-from model.convbeers import ConvBEERS, Variant, initialise
+from model.convbeers import ConvBEERS, initialise
+from model.variants import Variant
 from quant.onnx_file import save_onnx
 
 

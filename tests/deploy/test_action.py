@@ -13,7 +13,8 @@ from onnx import numpy_helper
 from typer.testing import CliRunner
 
 from deploy.cli import app
-from model.shipped import SENSOR, shipped_pair
+from deploy.networks import shipped_pair
+from model.shipped import SENSOR
 from tests.deploy.workflow_steps import ACTION, BASH, KEPT, ROOT, Runner, read_yaml
 
 WORKFLOW = ROOT / ".github" / "workflows" / "int8-gate.yml"

@@ -19,9 +19,10 @@ from typer.testing import CliRunner
 
 from deploy.cli import COMMANDS, app
 from deploy.demo import load_sensors, read_input
+from deploy.networks import shipped_pair
 from deploy.results import SCHEMA_PATH
 from model.io.images import read_acquisition
-from model.shipped import SENSOR, default_int8
+from model.shipped import SENSOR
 from profiles.errors import ImageError
 from profiles.toml import profile_path
 
@@ -243,7 +244,7 @@ def test_the_gate_passes_the_shipped_network_and_stops_a_broken_one(tmp_path: Pa
 
 def broken_copy(folder: Path) -> Path:
     """The shipped INT8 network with one convolution's weights turned upside down."""
-    model = onnx.load(default_int8())
+    model = onnx.load(shipped_pair()[1])
     tensor = next(t for t in model.graph.initializer if t.name == "body.3.first.weight")
     tensor.CopyFrom(numpy_helper.from_array(numpy_helper.to_array(tensor)[:, :, ::-1].copy(), tensor.name))
     onnx.save(model, folder / "broken.onnx")
@@ -253,7 +254,7 @@ def broken_copy(folder: Path) -> Path:
 def test_swapped_models_are_noticed(tmp_path: Path) -> None:
     weights = tmp_path / "float.onnx"
     assert runner.invoke(app, ["export", "--out", str(weights)]).exit_code == 0
-    fails(["gate", str(default_int8()), str(weights)], "first")
+    fails(["gate", str(shipped_pair()[1]), str(weights)], "first")
 
 
 @pytest.mark.parametrize("name", ["snow", "vck190", "pleiades-variable"])

@@ -14,7 +14,7 @@ from deploy.methods import method_named
 from deploy.report.evaluation_page import chosen_pairs, strip_of
 from deploy.results import SCHEMA_PATH, Document, missing
 from model.evaluation import targets as targets_module
-from model.evaluation.methods import TRAINED, Method
+from model.evaluation.methods import Method
 from model.evaluation.pairs import NamedPair, oversampling_note, oversamplings_of, read_pairs, simulate_pairs
 from model.evaluation.scores import Instruments, fidelity_db, paper_rows, score, site_rows
 from model.evaluation.targets import acquire_targets, flat_figure, mtf_figure, snr_name, target_figures
@@ -119,21 +119,39 @@ def test_of_pairs_from_a_folder_no_oversampling_is_known() -> None:
 @pytest.mark.parametrize("name", ["magic", "traditional-superb", "convbeers-huge", ""])
 def test_an_unknown_method_is_refused(name: str) -> None:
     with pytest.raises(OptionError, match=r"--methods|variant"):
-        method_named(name, *SENSORS)
+        method_named(name, DEGRADED, REFERENCE)
 
 
-def test_what_a_network_was_made_for_is_no_secret() -> None:
-    """By the sensor that its file names; a name that is not asked about says nothing."""
-    told = {
-        (name, sensor): method_named(name, *SENSORS, sensor).sensor_known
-        for name in ("convbeers-s-nominal", "convbeers-s-nominal-int8", "convbeers-xs", "traditional", "degraded")
-        for sensor in ("pleiades-degraded", "dior-high", "")
+def test_what_a_network_knows_of_the_sensor_is_no_secret() -> None:
+    """A shipped network knows the images' sensor unless its name says another."""
+    known = {
+        name: method_named(name, DEGRADED, REFERENCE).sensor_known
+        for name in (
+            "convbeers-xs",
+            "convbeers-xs-int8",
+            "convbeers-xs@blind",
+            "convbeers-xs@dior-medium",
+            "traditional",
+        )
     }
-    made = {name for (name, sensor), words in told.items() if words == TRAINED and sensor == "pleiades-degraded"}
-    assert made == {"convbeers-s-nominal", "convbeers-s-nominal-int8"}
-    assert TRAINED not in [words for (_, sensor), words in told.items() if sensor != "pleiades-degraded"]
-    assert told["convbeers-xs", "pleiades-degraded"] == "blind"
-    assert told["traditional", "dior-high"] == "known"
+    assert known == {
+        "convbeers-xs": "known",
+        "convbeers-xs-int8": "known",
+        "convbeers-xs@blind": "blind",
+        "convbeers-xs@dior-medium": "another: dior-medium",
+        "traditional": "known",
+    }
+
+
+def test_a_shipped_network_restores_as_it_knows_the_sensor() -> None:
+    """Specialised to the sensor that is given, and to no other where its name says one."""
+    dn = np.random.default_rng(0).uniform(300, 900, (47, 53)).astype(np.float32)
+    blurred = replace(DEGRADED.nominal(), mtf_nyquist=0.03)
+    method = method_named("convbeers-xs", DEGRADED, REFERENCE)
+    assert method.specialise is not None
+    np.testing.assert_allclose(method.specialise(DEGRADED.nominal())(dn), method.restore(dn), rtol=0, atol=1)
+    assert np.abs(method.specialise(blurred)(dn) - method.restore(dn)).max() > 5
+    assert method_named("convbeers-xs@blind", DEGRADED, REFERENCE).specialise is None
 
 
 def test_clipped_pixels_do_not_count() -> None:
@@ -200,7 +218,7 @@ def test_targets_measure_the_sensor_and_what_a_chain_makes_of_it(monkeypatch: py
     assert snr_name(25) == "SNR at 25 W/m2/sr/um"
     assert before[snr_name(25)].value == pytest.approx(50, rel=0.05)
     assert before[snr_name(100)].value == pytest.approx(110, rel=0.05)
-    after = target_figures(method_named("traditional-fast", *SENSORS), targets)
+    after = target_figures(method_named("traditional-fast", DEGRADED, REFERENCE), targets)
     assert (after["MTF at Nyquist"].value or 0) > 12
     assert (after[snr_name(25)].value or 0) > 200
 

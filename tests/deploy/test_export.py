@@ -8,9 +8,10 @@ from typer.testing import CliRunner, Result
 
 from deploy.cli import app
 from deploy.export import parity, require_parity, to_onnx
-from model.conditioning import ToldConvBEERS, initialise_coefficients, tell
-from model.convbeers import ConvBEERS, Variant, initialise
-from model.io.weights import load_told, save_network
+from model.conditioning import ConditionedConvBEERS, initialise_coefficients, vector_tensor
+from model.convbeers import ConvBEERS, initialise
+from model.io.weights import load_conditioned, save_network
+from model.variants import Variant
 from profiles import load_sensor
 from profiles.errors import ModelError
 from profiles.toml import HERE
@@ -80,15 +81,15 @@ def test_a_relu_stands_behind_every_first_convolution(network: ConvBEERS) -> Non
 
 
 @pytest.fixture
-def told(tmp_path: Path) -> Path:
-    """Weights as `train --told` leaves them."""
-    network, generator = ToldConvBEERS(Variant(blocks=2, features=8)), torch.Generator().manual_seed(0)
+def conditioned(tmp_path: Path) -> Path:
+    """Weights as `train --conditioned` leaves them."""
+    network, generator = ConditionedConvBEERS(Variant(blocks=2, features=8)), torch.Generator().manual_seed(0)
     initialise(network.base, generator)
     initialise_coefficients(network, generator)
     for parameter in network.directions.parameters():
         torch.nn.init.normal_(parameter, 0.0, 0.05, generator)
-    save_network(tmp_path / "told.safetensors", network, {"degraded": "many"})
-    return tmp_path / "told.safetensors"
+    save_network(tmp_path / "conditioned.safetensors", network, {"degraded": "many"})
+    return tmp_path / "conditioned.safetensors"
 
 
 def export(*options: str) -> Result:
@@ -96,12 +97,12 @@ def export(*options: str) -> Result:
 
 
 @pytest.mark.parametrize("sensor", ["pleiades-degraded", "pleiades-variable"])
-def test_told_weights_are_exported_for_the_sensor_named(told: Path, sensor: str, tmp_path: Path) -> None:
+def test_conditioned_weights_become_the_sensors(conditioned: Path, sensor: str, tmp_path: Path) -> None:
     path = tmp_path / "x.onnx"
-    result = export("--checkpoint", str(told), "--sensor", sensor, "--out", str(path))
+    result = export("--checkpoint", str(conditioned), "--sensor", sensor, "--out", str(path))
     assert result.exit_code == 0, result.output
     assert "warning" not in result.output
-    unfolded, vector = load_told(told)[0], tell(load_sensor(sensor).nominal()).vector
+    unfolded, vector = load_conditioned(conditioned)[0], vector_tensor(load_sensor(sensor).nominal())
     image = np.random.default_rng(1).random((1, 1, 27, 35), dtype=np.float32)
     with torch.inference_mode():
         expected = unfolded(torch.from_numpy(image), vector[None]).numpy()
@@ -109,31 +110,37 @@ def test_told_weights_are_exported_for_the_sensor_named(told: Path, sensor: str,
     assert metadata(onnx.load(path))["sensor"] == sensor
 
 
-def test_another_sensor_makes_another_file_and_the_same_one_the_same_bytes(told: Path, tmp_path: Path) -> None:
+def test_another_sensor_makes_another_file_and_the_same_one_the_same_bytes(conditioned: Path, tmp_path: Path) -> None:
     files = [tmp_path / f"{number}.onnx" for number in range(3)]
     for file, sensor in zip(files, ("pleiades-degraded", "pleiades-degraded", "pleiades-variable"), strict=True):
-        assert export("--checkpoint", str(told), "--sensor", sensor, "--out", str(file)).exit_code == 0
+        assert export("--checkpoint", str(conditioned), "--sensor", sensor, "--out", str(file)).exit_code == 0
     same, again, other = (file.read_bytes() for file in files)
     assert same == again
     assert same != other
 
 
-def test_a_users_own_sensor_and_what_lies_outside_the_ranges_is_said(told: Path, tmp_path: Path) -> None:
+def test_a_users_own_sensor_and_what_lies_outside_the_ranges_is_said(conditioned: Path, tmp_path: Path) -> None:
     text = (HERE / "sensors" / "pleiades-degraded.toml").read_text()
     mine = tmp_path / "mine.toml"
     mine.write_text(text.replace("[noise]", "mtf_nyquist_along = 0.004\n[noise]"))
-    result = export("--checkpoint", str(told), "--sensor", str(mine), "--out", str(tmp_path / "x.onnx"))
+    result = export("--checkpoint", str(conditioned), "--sensor", str(mine), "--out", str(tmp_path / "x.onnx"))
     assert result.exit_code == 0, result.output
-    assert "warning: mtf_along 0.004 is outside 0.015 to 0.15, told as 0.015" in " ".join(result.stderr.split())
+    assert "warning: mtf_along 0.004 is outside 0.015 to 0.15, the network is specialised for 0.015" in " ".join(
+        result.stderr.split()
+    )
 
 
-def test_told_weights_need_a_sensor_and_plain_ones_take_none(told: Path, tmp_path: Path) -> None:
-    out = tmp_path / "x.onnx"
-    missing = export("--checkpoint", str(told), "--out", str(out))
-    useless = export("--variant", "convbeers-xs", "--sensor", "pleiades-degraded", "--out", str(out))
-    unknown = export("--checkpoint", str(told), "--sensor", "hubble", "--out", str(out))
-    for result, words in ((missing, "--sensor NAME"), (useless, "can be told"), (unknown, "hubble")):
+def test_plain_weights_take_no_sensor_and_conditioned_ones_the_default(
+    network: ConvBEERS, conditioned: Path, tmp_path: Path
+) -> None:
+    plain, out = tmp_path / "plain.safetensors", tmp_path / "x.onnx"
+    save_network(plain, network, {})
+    useless = export("--checkpoint", str(plain), "--sensor", "pleiades-degraded", "--out", str(out))
+    unknown = export("--checkpoint", str(conditioned), "--sensor", "hubble", "--out", str(out))
+    for result, words in ((useless, "train --conditioned"), (unknown, "hubble")):
         assert result.exit_code == 2
         assert words in " ".join(result.output.split())
         assert "Traceback" not in result.output
     assert not out.exists()
+    assert export("--checkpoint", str(conditioned), "--out", str(out)).exit_code == 0
+    assert metadata(onnx.load(out))["sensor"] == "pleiades-degraded"

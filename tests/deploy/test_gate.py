@@ -15,8 +15,8 @@ from typer.testing import CliRunner
 from deploy.cli import app
 from deploy.export import float_model
 from deploy.gate import baseline_mae, file_checks, junit, markdown, sentence
+from deploy.networks import shipped_pair
 from deploy.results import Document
-from model.shipped import SHIPPED, default_int8, shipped_pair
 from model.simulator.procedural import procedural_scene
 from profiles import load_sensor
 from profiles.errors import OptionError
@@ -35,7 +35,7 @@ SENSORS = load_sensor("pleiades-degraded"), load_sensor("pleiades-reference")
 
 @pytest.fixture(scope="module")
 def reference_model() -> onnx.ModelProto:
-    return float_model(None)
+    return float_model(shipped_pair()[0])
 
 
 @pytest.fixture(scope="module")
@@ -47,7 +47,7 @@ def failed(
     reference_model: onnx.ModelProto, unseen: Patches, folder: Path, spoil: Callable[[onnx.ModelProto], None]
 ) -> set[str]:
     """The names of the checks that a spoilt copy of the shipped file fails."""
-    model = onnx.load(default_int8())
+    model = onnx.load(shipped_pair()[1])
     spoil(model)
     save_onnx(model, folder / "spoilt.onnx")
     result = compare(open_session(reference_model), open_session(model), unseen.pairs)
@@ -216,7 +216,6 @@ def test_one_file_alone_is_no_pair(tmp_path: Path) -> None:
     done = CliRunner().invoke(app, ["gate", *map(str, shipped_pair("convbeers-xs")), "--variant", "convbeers-s"])
     assert done.exit_code == 2
     assert "--variant: expected it without files" in " ".join(done.output.split())
-    assert shipped_pair("convbeers-xs") == (SHIPPED / "convbeers-xs.safetensors", SHIPPED / "convbeers-xs-int8.onnx")
 
 
 ASKED = {"sensor": "pleiades-degraded", "images": None, "patches": 2, "seed": 0}
@@ -267,7 +266,7 @@ def test_bad_input_is_told_where_a_job_looks(tmp_path: Path) -> None:
     paths = {name: tmp_path / name for name in ("junit", "summary", "outputs")}
     paths["summary"].write_text("before\n")
     wanted = [text for name, path in paths.items() for text in (f"--{name}", str(path))]
-    pair = [str(tmp_path / "<none>.onnx"), str(default_int8())]
+    pair = [str(tmp_path / "<none>.onnx"), str(shipped_pair()[1])]
     done = CliRunner().invoke(app, ["gate", *pair, *wanted])
     assert done.exit_code == 2
     told = done.stderr.removeprefix("beers-deploy: ").strip()
@@ -347,7 +346,7 @@ def as_nodes(model: onnx.ModelProto) -> onnx.ModelProto:
 
 
 def test_constants_may_be_nodes() -> None:
-    sound, other = onnx.load(default_int8()), as_nodes(onnx.load(default_int8()))
+    sound, other = onnx.load(shipped_pair()[1]), as_nodes(onnx.load(shipped_pair()[1]))
     assert count_relus(other) == count_relus(sound) == Relus(8, 0)
     assert [t.name for t in rounded_tensors(other)] == [t.name for t in rounded_tensors(sound)]
     assert read_core(other).frac_bits == read_core(sound).frac_bits
@@ -417,7 +416,7 @@ def test_a_free_file_is_judged_without_the_rules_of_a_dpu(
 def test_two_networks_of_one_kind_are_refused(reference_model: onnx.ModelProto, tmp_path: Path) -> None:
     path = tmp_path / "float.onnx"
     save_onnx(reference_model, path)
-    for pair, expected in (([path, path], "an INT8"), ([default_int8()] * 2, "a float")):
+    for pair, expected in (([path, path], "an INT8"), ([shipped_pair()[1]] * 2, "a float")):
         done = CliRunner().invoke(app, ["gate", *map(str, pair)])
         assert done.exit_code == 2
         assert f"expected {expected} network" in " ".join(done.output.split())

@@ -20,8 +20,9 @@ import tifffile
 from typer.testing import CliRunner
 
 from deploy.cli import app
-from model.convbeers import ConvBEERS, Variant, initialise
+from model.convbeers import ConvBEERS, initialise
 from model.io.weights import save_network
+from model.variants import Variant
 from tests.deploy.sealed import SOCKET_CALL
 
 runner = CliRunner()

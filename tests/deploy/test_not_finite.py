@@ -13,9 +13,10 @@ from typer.testing import CliRunner
 
 from deploy.cli import app
 from deploy.export import to_onnx
-from model.convbeers import VARIANTS, ConvBEERS
+from deploy.networks import shipped_pair
+from model.convbeers import ConvBEERS
 from model.io.weights import save_network
-from model.shipped import shipped_pair
+from model.variants import VARIANTS
 from profiles.errors import ModelError
 from quant.gate import compare
 from quant.onnx_file import load_onnx, parse_onnx, save_onnx

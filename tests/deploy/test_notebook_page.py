@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 import tifffile
 
+from deploy.networks import shipped_pair
 from deploy.restoration.options import Options
 from deploy.restoration.run import restore_file
-from model.shipped import default_int8
 
 PAGE = Path(__file__).parents[2] / "docs" / "notebook.md"
 
@@ -28,7 +28,7 @@ def test_the_page_gives_what_the_command_gives(tmp_path: Path, monkeypatch: pyte
     names: dict[str, Any] = {}
     for code in re.findall(r"```python\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL):
         exec(code, names)  # noqa: S102 - our own page
-    restore_file(Path("raw.tif"), Path("expected.tif"), Options(default_int8()), lambda _: None)
+    restore_file(Path("raw.tif"), Path("expected.tif"), Options(shipped_pair()[1]), lambda _: None)
     expected = tifffile.imread("expected.tif")
     with rasterio.open("restored.tif") as ours, rasterio.open("expected.tif") as theirs:
         np.testing.assert_array_equal(ours.read(1), expected)

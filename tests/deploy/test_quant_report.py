@@ -17,10 +17,11 @@ from deploy.cli import app
 from deploy.export import to_onnx
 from deploy.report.plots import FONT_PX, MOST_BARS, bins, histogram_url, text_width
 from deploy.results import SCHEMA_PATH
-from model.convbeers import ConvBEERS, Variant, initialise
+from model.convbeers import ConvBEERS, initialise
 from model.io.images import MAX_DN
 from model.io.tiff import write_tiff
 from model.simulator.procedural import procedural_scene
+from model.variants import Variant
 from profiles import load_sensor
 from profiles.sensor_file import reference_for
 from quant.calibration import draw_patches

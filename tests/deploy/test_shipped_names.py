@@ -9,34 +9,37 @@ from typer.testing import CliRunner
 
 from deploy.cli import app
 from deploy.gate import files_or_shipped
-from model.shipped import VARIANT, default_int8, float_file, int8_file, shipped_pair
+from deploy.networks import float_file, int8_file, known_sensor, network_file, shipped_pair, weights_file
+from model.shipped import SENSOR, VARIANT, shipped_weights
 from quant.onnx_file import load_onnx, metadata
 
+KNOWN = known_sensor(SENSOR)
 
-@pytest.mark.parametrize("name", ["convbeers-xs", "convbeers-s", "convbeers-s-nominal"])
+
+@pytest.mark.parametrize("name", ["convbeers-xs", "convbeers-s"])
 def test_a_name_is_the_shipped_network(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    weights, int8 = shipped_pair(name)
-    assert int8_file(Path(name)) == int8_file(Path(f"{name}-int8")) == int8
-    assert float_file(Path(name)) == weights
-    assert weights.is_file()
-    assert int8.is_file()
+    floating, int8 = shipped_pair(name)
+    assert int8_file(Path(name), KNOWN) == int8_file(Path(f"{name}-int8"), KNOWN) == int8
+    assert network_file(Path(name), KNOWN) == float_file(Path(f"{name}-int8"), KNOWN) == floating
+    assert network_file(Path(f"{name}-int8"), KNOWN) == int8
+    assert weights_file(Path(name)) == shipped_weights(name)
     monkeypatch.chdir(tmp_path)
     Path(name).write_bytes(b"mine")  # a file of that name is what was meant
-    assert int8_file(Path(name)) == float_file(Path(name)) == Path(name)
+    assert int8_file(Path(name), KNOWN) == float_file(Path(name), KNOWN) == weights_file(Path(name)) == Path(name)
 
 
 @pytest.mark.parametrize("given", ["none", "none.onnx", "folder/convbeers-s"])
 def test_anything_else_stays_a_path(given: str) -> None:
-    assert int8_file(Path(given)) == float_file(Path(given)) == Path(given)
+    assert int8_file(Path(given), KNOWN) == float_file(Path(given), KNOWN) == weights_file(Path(given)) == Path(given)
 
 
 def test_nothing_given_is_the_default() -> None:
-    assert int8_file(None) == default_int8() == int8_file(Path(VARIANT))
+    assert network_file(None, KNOWN) == int8_file(None, KNOWN) == int8_file(Path(VARIANT), KNOWN)
 
 
 def test_commands_take_the_name(tmp_path: Path) -> None:
     tifffile.imwrite(tmp_path / "in.tif", np.random.default_rng(0).integers(200, 1800, (37, 41)).astype(np.uint16))
-    for model in ("convbeers-xs", str(shipped_pair("convbeers-xs")[1])):
+    for model in ("convbeers-xs-int8", str(shipped_pair("convbeers-xs", "blind")[1])):
         out = tmp_path / f"{len(model)}.tif"
         result = CliRunner().invoke(app, ["restore", str(tmp_path / "in.tif"), str(out), "--model", model])
         assert result.exit_code == 0, result.output

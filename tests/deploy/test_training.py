@@ -11,13 +11,16 @@ from PIL import Image
 from typer.testing import CliRunner
 
 from deploy.cli import app
+from deploy.export import weights_for
 from model.conditioning import fold
-from model.io.weights import load_network, load_told, read_tensors
+from model.io.tensors import read_tensors, write_weights
+from model.io.weights import load_conditioned, load_network
 from model.shipped import shipped_weights
 from model.simulator.procedural import procedural_scene
 from model.training import run as training
 from model.training.patches import StoredPairs
 from model.training.run import Log
+from profiles import load_sensor
 from profiles.toml import profile_path
 
 SIDE = 420
@@ -69,32 +72,48 @@ def test_a_finished_run_resumes_to_the_same_weights(images: Path, tmp_path: Path
     assert all(torch.equal(first[name], again[name]) for name in first)
 
 
-def test_a_told_run_starts_from_blind_weights_and_resumes_to_the_same(images: Path, tmp_path: Path) -> None:
-    blind = shipped_weights("convbeers-xs")
-    run(images, tmp_path / "a", "--told", "--start", str(blind), "--validate-every", "2")
-    path = tmp_path / "a" / "convbeers-xs-told.safetensors"
+def test_a_conditioned_run_starts_from_plain_weights_and_resumes_to_the_same(images: Path, tmp_path: Path) -> None:
+    options = ["--conditioned", "--start", str(plain_weights(tmp_path)), "--validate-every", "2"]
+    run(images, tmp_path / "a", *options)
+    path = tmp_path / "a" / "convbeers-xs.safetensors"
     tensors, header = read_tensors(path)
-    run(images, tmp_path / "a", "--told", "--start", str(blind), "--validate-every", "2", "--resume")
+    run(images, tmp_path / "a", *options, "--resume")
     again, again_header = read_tensors(path)
     assert header == again_header
-    assert all(torch.equal(tensor, again[name]) for name, tensor in tensors.items())
+    assert all(np.array_equal(tensor, again[name]) for name, tensor in tensors.items())
     assert [row["step"] for row in rows(tmp_path / "a" / "validation.csv")] == ["2", "4"]
-    recipe = load_told(path)[1]
-    assert recipe["degraded"] == "told, drawn over the ranges"
+    recipe = load_conditioned(path)[1]
+    assert recipe["degraded"] == "drawn over the ranges"
     assert recipe["held_out"] == ["coast_1.png"]
 
 
-def test_a_told_run_that_learns_nothing_is_what_it_started_from(images: Path, tmp_path: Path) -> None:
-    options = ["--told", "--learning-rate", "0", "--validate-every", "0", "--start"]
-    run(images, tmp_path / "a", *options, str(shipped_weights("convbeers-xs")), steps=1)
-    path, blind = tmp_path / "a" / "convbeers-xs-told.safetensors", load_network(shipped_weights("convbeers-xs"))[0]
-    image, told = torch.rand(1, 1, 27, 33, generator=torch.Generator().manual_seed(0)), load_told(path)[0]
+def plain_weights(folder: Path) -> Path:
+    """The shipped network for one sensor, as a plain one."""
+    weights, _ = weights_for(shipped_weights("convbeers-xs"), load_sensor("pleiades-degraded").nominal())
+    write_weights(folder / "plain.safetensors", weights, conditioned=False)
+    return folder / "plain.safetensors"
+
+
+def test_a_conditioned_run_that_learns_nothing_is_what_it_started_from(images: Path, tmp_path: Path) -> None:
+    start = plain_weights(tmp_path)
+    options = ["--conditioned", "--learning-rate", "0", "--validate-every", "0", "--start"]
+    run(images, tmp_path / "a", *options, str(start), steps=1)
+    path, plain = tmp_path / "a" / "convbeers-xs.safetensors", load_network(start)[0]
+    image, trained = torch.rand(1, 1, 27, 33, generator=torch.Generator().manual_seed(0)), load_conditioned(path)[0]
     vector = torch.tensor([-1.0, 0.3, 0.5, 1.0])
     with torch.inference_mode():
-        torch.testing.assert_close(fold(told, vector)(image), blind(image), rtol=0, atol=1e-6)
+        torch.testing.assert_close(fold(trained, vector)(image), plain(image), rtol=0, atol=1e-6)
     run(images, tmp_path / "b", *options, str(path), steps=1)
-    again = load_told(tmp_path / "b" / path.name)[0].state_dict()
-    assert all(torch.allclose(value, again[name]) for name, value in told.state_dict().items())
+    again = load_conditioned(tmp_path / "b" / path.name)[0].state_dict()
+    assert all(torch.allclose(value, again[name]) for name, value in trained.state_dict().items())
+
+
+def test_a_plain_run_starts_from_the_shipped_network_for_its_sensor(images: Path, tmp_path: Path) -> None:
+    options = ["--sensor", "pleiades-degraded", "--learning-rate", "0", "--validate-every", "0"]
+    run(images, tmp_path / "a", *options, "--start", "convbeers-xs", steps=1)
+    trained = load_network(tmp_path / "a" / "convbeers-xs.safetensors")[0]
+    start = load_network(plain_weights(tmp_path))[0]
+    assert all(torch.allclose(value, start.state_dict()[name]) for name, value in trained.state_dict().items())
 
 
 @pytest.mark.parametrize(
@@ -109,8 +128,8 @@ def test_a_told_run_that_learns_nothing_is_what_it_started_from(images: Path, tm
         (["--drawn", "1", "--lpips", "none.npz"], "no such file"),
         (["--drawn", "1", "--device", "cuda"], "CUDA"),
         (["--resume", "--drawn", "1"], "no such file"),
-        (["--told", "--pairs", "here"], "do not say what sensor"),
-        (["--told", "--drawn", "1", "--teacher", "here"], "teacher is not told"),
+        (["--conditioned", "--pairs", "here"], "do not say what sensor"),
+        (["--conditioned", "--drawn", "1", "--teacher", "here"], "teacher knows one"),
         (["--drawn", "1", "--learning-rate", "inf"], "learning rate: expected a finite number"),
         (["--drawn", "1", "--fft-weight", "inf"], "weight of fft in the loss: expected a finite number"),
         (
@@ -174,11 +193,17 @@ def test_a_loss_of_nothing_but_lpips_needs_its_weights(tmp_path: Path, monkeypat
 
 
 @pytest.mark.parametrize("validate_every", ["0", "2"])
-@pytest.mark.parametrize("told", [False, True])
+@pytest.mark.parametrize("conditioned", [False, True])
 def test_a_run_that_ends_in_nan_leaves_no_weights(
-    told: bool, validate_every: str, images: Path, tmp_path: Path
+    conditioned: bool, validate_every: str, images: Path, tmp_path: Path
 ) -> None:
-    more = ["--learning-rate", "1e30", "--validate-every", validate_every, *(["--told"] if told else [])]
+    more = [
+        "--learning-rate",
+        "1e30",
+        "--validate-every",
+        validate_every,
+        *(["--conditioned"] if conditioned else []),
+    ]
     options = ["--variant", "convbeers-xs", "--steps", "2", "--batch", "2", "--patch", "32", *more]
     result = CliRunner().invoke(app, ["train", "--images", str(images), "--out", str(tmp_path / "r"), *options])
     assert result.exit_code == 2, result.output

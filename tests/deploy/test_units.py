@@ -36,10 +36,12 @@ def with_units(profile: SensorProfile, gain: float, bits: int, offset_dn: float 
 
 def psnr_db(degraded: SensorProfile, reference: SensorProfile) -> list[float]:
     """Of each method, on one pair."""
-    sensors = degraded.nominal(), reference.nominal()
     (pair,), _ = simulate_pairs([SCENE], degraded, reference, 0)
-    methods = [method_named(name, *sensors) for name in METHODS]
-    return [fidelity_db(m.restore(pair.degraded), pair.reference, pair.degraded, sensors[0].max_dn) for m in methods]
+    methods = [method_named(name, degraded, reference) for name in METHODS]
+    return [
+        fidelity_db(m.restore(pair.degraded), pair.reference, pair.degraded, degraded.nominal().max_dn)
+        for m in methods
+    ]
 
 
 @pytest.fixture(scope="module")
@@ -77,7 +79,7 @@ def evaluated(bits: int, dimmer: float, offset_dn: float) -> tuple[np.ndarray, i
     )
     scene = replace(SCENE, radiance=SCENE.radiance / dimmer)
     (pair,), _ = simulate_pairs([scene], degraded, reference, 0, (2,))
-    methods = [method_named(name, degraded.nominal(), reference.nominal()) for name in METHODS]
+    methods = [method_named(name, degraded, reference) for name in METHODS]
     instruments = Instruments({}, degraded.nominal().max_dn)
     scores = [instruments.score(m.restore(pair.degraded), pair.reference, pair.degraded) for m in methods]
     return np.array([each["PSNR"] for each in scores]), pair.degraded.size

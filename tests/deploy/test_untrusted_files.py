@@ -12,18 +12,19 @@ import tifffile
 import torch
 from typer.testing import CliRunner
 
+from deploy.cache import Cache, digest_of
 from deploy.cli import app
 from deploy.dpu.board import load_dpu
 from deploy.dpu.cost.validation import refit
 from deploy.gate import PATCHES, baseline_mae
 from deploy.restoration.output import Checkpoint, part_folder
 from deploy.results import Document
-from deploy.tradeoff.cache import Cache, digest_of
 from deploy.tradeoff.host_time import Times
 from model.dataset import _read_summary
 from model.io.images import read_pixels
-from model.io.weights import load_network, write_tensors
-from model.io.weights import read_tensors as read_weights
+from model.io.tensors import read_tensors as read_weights
+from model.io.tensors import write_tensors
+from model.io.weights import arrays, load_network
 from model.metrics.backbones import read_tensors
 from model.training.run import Log
 from profiles.errors import BeersError, ModelError, OptionError, ProfileError
@@ -94,7 +95,9 @@ def test_runs_of_a_board_beyond_reason_are_refused(run: dict[str, object], tmp_p
     [{"blocks": 10**9, "features": 2}, {"blocks": 1, "features": 10**6}, {"blocks": 10**400, "features": 2}],
 )
 def test_a_header_of_weights_takes_no_memory(variant: dict[str, int], tmp_path: Path) -> None:
-    write_tensors(tmp_path / "w.safetensors", {"head.weight": torch.zeros(2, 1, 3, 3)}, {"variant": variant})
+    write_tensors(
+        tmp_path / "w.safetensors", {"head.weight": np.zeros((2, 1, 3, 3), np.float32)}, {"variant": variant}
+    )
     with pytest.raises(ModelError):
         load_network(tmp_path / "w.safetensors")
 
@@ -165,9 +168,10 @@ def test_a_spoilt_checkpoint_is_refused(spoil: Spoil, tmp_path: Path) -> None:
     path = tmp_path / "c.safetensors"
     path.write_bytes(checkpoint_seeds(tmp_path)[1])
     go_on(path)
-    tensors, header = read_weights(path)
+    found, header = read_weights(path)
+    tensors = {name: torch.from_numpy(array) for name, array in found.items()}
     spoil(tensors)
-    write_tensors(path, tensors, header)
+    write_tensors(path, arrays(tensors), header)
     with pytest.raises(ModelError, match="checkpoint of this network"):
         go_on(path)
 

@@ -15,6 +15,7 @@ import tifffile
 import torch
 from PIL import Image
 
+from deploy.cache import Cache, Keepable
 from deploy.compare import change_rows, compare, read_document
 from deploy.dpu.board import load_dpu
 from deploy.dpu.checker.placement import place
@@ -27,17 +28,17 @@ from deploy.restoration.output import Checkpoint, part_folder
 from deploy.restoration.source import open_source
 from deploy.results import Document, by_row, cell
 from deploy.tradeoff.accuracy import Scores
-from deploy.tradeoff.cache import Cache, Keepable
 from deploy.tradeoff.host_time import Times
-from model.conditioning import ToldConvBEERS
-from model.convbeers import ConvBEERS, Variant
+from model.conditioning import ConditionedConvBEERS
+from model.convbeers import ConvBEERS
 from model.dataset import _read_summary
 from model.io.images import read_pixels
-from model.io.weights import load_network, load_told, save_network
+from model.io.weights import load_conditioned, load_network, save_network
 from model.metrics.backbones import read_tensors
 from model.training.checkpoint import TrainingRecipe, read_checkpoint, write_checkpoint
 from model.training.guards import Guards
 from model.training.run import Log
+from model.variants import Variant
 from profiles import load_sensor, load_target
 from profiles.errors import BeersError
 from profiles.figures import Figure, Row, measured, predicted, unavailable
@@ -279,7 +280,7 @@ def weights_seeds(folder: Path) -> list[bytes]:
 
 def told_seeds(folder: Path) -> list[bytes]:
     """The weights of a network that is told its sensor."""
-    network = ToldConvBEERS(SMALL)
+    network = ConditionedConvBEERS(SMALL)
     return [_written(partial(save_network, network=network, recipe={"degraded": "x"}), folder / "w.safetensors")]
 
 
@@ -331,7 +332,7 @@ PARSERS: tuple[Parser, ...] = (
     Parser("dataset manifest", ".jsonl", manifest_seeds, _read_summary, of_json),
     Parser("training log", ".csv", lambda _: [b"step,loss\n10,0.5\n20,0.25\n"], log_lines, share=0.5),
     Parser("weights", ".safetensors", weights_seeds, load_network, of_safetensors),
-    Parser("told weights", ".safetensors", told_seeds, load_told, of_safetensors),
+    Parser("told weights", ".safetensors", told_seeds, load_conditioned, of_safetensors),
     Parser("checkpoint", ".safetensors", checkpoint_seeds, go_on, of_safetensors),
     Parser("backbone npz", ".npz", partial(backbone_seeds, packed=True), lambda p: read_tensors(p, ["a", "b"])),
 )

@@ -1,4 +1,4 @@
-"""What a network is told, and that folding changes nothing."""
+"""What a network knows of its sensor, and that folding changes nothing."""
 
 from dataclasses import replace
 
@@ -9,17 +9,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from model.conditioning import (
-    DIRECTIONS,
-    RANGES,
+    ConditionedConvBEERS,
     SensorFamily,
-    ToldConvBEERS,
     fold,
     initialise_coefficients,
-    sensor_values,
-    tell,
     transposed,
+    vector_tensor,
 )
-from model.convbeers import Variant, initialise
+from model.convbeers import initialise
+from model.specialise import DIRECTIONS, RANGES, sensor_values, sensor_vector
+from model.variants import Variant
 from profiles import load_sensor
 from profiles.effects import Smear
 from profiles.sensor import Sensor, noise_from_snr
@@ -28,10 +27,10 @@ NOMINAL = load_sensor("pleiades-degraded").nominal()
 FAMILY = SensorFamily(NOMINAL)
 
 
-def trained(seed: int = 0) -> ToldConvBEERS:
+def trained(seed: int = 0) -> ConditionedConvBEERS:
     """A network whose directions do something, as training leaves it."""
     generator = torch.Generator().manual_seed(seed)
-    network = ToldConvBEERS(Variant(blocks=2, features=5))
+    network = ConditionedConvBEERS(Variant(blocks=2, features=5))
     initialise(network.base, generator)
     initialise_coefficients(network, generator)
     with torch.no_grad():
@@ -47,7 +46,7 @@ def drawn(seed: int) -> Sensor:
 @settings(max_examples=60)
 @given(st.integers(0, 2**20), st.integers(1, 41), st.integers(1, 37))
 def test_the_folded_network_computes_what_the_unfolded_one_does(seed: int, height: int, width: int) -> None:
-    network, vector = trained(seed % 3), tell(drawn(seed)).vector
+    network, vector = trained(seed % 3), vector_tensor(drawn(seed))
     image = torch.rand(1, 1, height, width, generator=torch.Generator().manual_seed(seed))
     with torch.inference_mode():
         unfolded, folded = network(image, vector[None]), fold(network, vector)(image)
@@ -55,7 +54,7 @@ def test_the_folded_network_computes_what_the_unfolded_one_does(seed: int, heigh
 
 
 def test_each_image_of_a_batch_meets_its_own_sensor() -> None:
-    network, vectors = trained(), torch.stack([tell(drawn(seed)).vector for seed in range(3)])
+    network, vectors = trained(), torch.stack([vector_tensor(drawn(seed)) for seed in range(3)])
     images = torch.rand(3, 1, 13, 17, generator=torch.Generator().manual_seed(0))
     with torch.inference_mode():
         together = network(images, vectors)
@@ -67,7 +66,7 @@ def test_each_image_of_a_batch_meets_its_own_sensor() -> None:
 
 
 def test_folding_takes_no_part_of_the_network_along() -> None:
-    network, vector = trained(), tell(NOMINAL).vector
+    network, vector = trained(), vector_tensor(NOMINAL)
     image, folded = torch.rand(1, 1, 9, 14), fold(network, vector)
     with torch.no_grad():
         before = folded(image)
@@ -76,22 +75,22 @@ def test_folding_takes_no_part_of_the_network_along() -> None:
         assert torch.equal(folded(image), before)
 
 
-def test_before_training_the_network_is_its_base_whatever_it_is_told() -> None:
+def test_before_training_the_network_is_its_base_whatever_the_sensor() -> None:
     network = trained()
     for parameter in network.directions.parameters():
         torch.nn.init.zeros_(parameter)
     image = torch.rand(2, 1, 11, 15)
-    vectors = torch.stack([tell(drawn(seed)).vector for seed in (1, 2)])
+    vectors = torch.stack([vector_tensor(drawn(seed)) for seed in (1, 2)])
     with torch.inference_mode():
         torch.testing.assert_close(network(image, vectors), network.base(image), rtol=0, atol=1e-6)
 
 
 def test_training_can_leave_the_base_at_once() -> None:
     """The coefficients differ from sensor to sensor before the first step: a direction has a gradient to follow."""
-    network = ToldConvBEERS(Variant(1, 4))
+    network = ConditionedConvBEERS(Variant(1, 4))
     initialise(network.base, torch.Generator().manual_seed(0))
     initialise_coefficients(network, torch.Generator().manual_seed(1))
-    vectors = torch.stack([tell(drawn(seed)).vector for seed in range(6)])
+    vectors = torch.stack([vector_tensor(drawn(seed)) for seed in range(6)])
     assert float(network.coefficients(vectors).detach().std(0).mean()) > 0.1
     network(torch.rand(6, 1, 9, 9), vectors).abs().sum().backward()
     gradients = [p.grad for direction in network.directions for p in direction.parameters()]
@@ -99,7 +98,7 @@ def test_training_can_leave_the_base_at_once() -> None:
     assert all(gradient is not None and float(gradient.abs().max()) > 0 for gradient in gradients)
 
 
-def test_what_is_told_of_a_sensor_known_by_hand() -> None:
+def test_the_values_of_a_sensor_known_by_hand() -> None:
     values = sensor_values(NOMINAL)  # SNR 50 at 25 and 110 at 100 W/m2/sr/um, 400 of them full scale
     assert values["mtf_across"] == values["mtf_along"] == 0.07
     assert values["sigma_dark"] == pytest.approx(25 / 50 / 400, rel=2e-3)
@@ -109,10 +108,10 @@ def test_what_is_told_of_a_sensor_known_by_hand() -> None:
 
 
 def test_the_ends_of_the_ranges_are_minus_one_and_one() -> None:
-    ends = [tell(replace(NOMINAL, mtf_nyquist=mtf)).vector for mtf in RANGES["mtf_across"]]
+    ends = [vector_tensor(replace(NOMINAL, mtf_nyquist=mtf)) for mtf in RANGES["mtf_across"]]
     assert [vector[:2].tolist() for vector in ends] == [[-1.0, -1.0], [1.0, 1.0]]
     middle = (RANGES["mtf_across"][0] * RANGES["mtf_across"][1]) ** 0.5
-    assert float(tell(replace(NOMINAL, mtf_nyquist=middle)).vector[0]) == pytest.approx(0, abs=1e-6)
+    assert float(vector_tensor(replace(NOMINAL, mtf_nyquist=middle))[0]) == pytest.approx(0, abs=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -125,9 +124,9 @@ def test_the_ends_of_the_ranges_are_minus_one_and_one() -> None:
     ],
 )
 def test_what_lies_outside_is_moved_to_the_end_and_said(sensor: Sensor, name: str) -> None:
-    told = tell(sensor)
-    assert float(told.vector.abs().max()) == 1
-    said = [sentence for sentence in told.outside if sentence.startswith(name)]
+    known = sensor_vector(sensor)
+    assert max(map(abs, known.values)) == 1
+    said = [sentence for sentence in known.outside if sentence.startswith(name)]
     assert len(said) == 1
     assert "outside" in said[0]
 
@@ -138,14 +137,14 @@ def test_axes_further_apart_than_any_in_training_are_said(along: float, said: bo
         replace(NOMINAL, mtf_nyquist_along=along),
         replace(NOMINAL, mtf_nyquist=along, mtf_nyquist_along=0.07),
     ):
-        told = tell(sensor)
-        assert [sentence.startswith("the lower MTF") for sentence in told.outside] == [True] * said
+        known = sensor_vector(sensor)
+        assert [sentence.startswith("the lower MTF") for sentence in known.outside] == [True] * said
 
 
 @given(st.integers(0, 2**20))
 def test_no_sensor_that_is_trained_on_is_clamped_or_impossible(seed: int) -> None:
     sensor = drawn(seed)
-    assert tell(sensor).outside == ()
+    assert sensor_vector(sensor).outside == ()
     assert sensor.alpha >= 0
     assert sensor.beta >= 0
     across, along = sensor.mtf_axes
@@ -156,7 +155,7 @@ def test_no_sensor_that_is_trained_on_is_clamped_or_impossible(seed: int) -> Non
 def test_no_corner_of_the_ranges_is_starved() -> None:
     """Blurred and noisy together, and each mixture: more than one sensor in a hundred for each of eight corners."""
     generator = np.random.default_rng(0)
-    vectors = torch.stack([tell(FAMILY.draw(generator)).vector for _ in range(3000)])
+    vectors = torch.stack([vector_tensor(FAMILY.draw(generator)) for _ in range(3000)])
     low, high = vectors[:, [0, 1, 3]] < -1 / 3, vectors[:, [0, 1, 3]] > 1 / 3
     for sharp in (False, True):
         for noisy in (False, True):
@@ -178,7 +177,7 @@ def test_the_vector_speaks_of_full_scale_whatever_the_gain(gain: float) -> None:
         alpha=NOMINAL.alpha / gain,
         beta=NOMINAL.beta / gain**2,
     )
-    torch.testing.assert_close(tell(other).vector, tell(NOMINAL).vector)
+    torch.testing.assert_close(vector_tensor(other), vector_tensor(NOMINAL))
 
 
 def test_few_bits_are_noise() -> None:
@@ -186,7 +185,7 @@ def test_few_bits_are_noise() -> None:
     assert sensor_values(coarse)["sigma_dark"] > 1.5 * sensor_values(NOMINAL)["sigma_dark"]
 
 
-def test_smear_is_told_as_contrast_lost_along_the_track() -> None:
+def test_smear_counts_as_contrast_lost_along_the_track() -> None:
     smeared = replace(NOMINAL, effects={"smear": Smear(1.0)})
     across, along = (sensor_values(smeared)[name] for name in ("mtf_across", "mtf_along"))
     assert across == 0.07
@@ -196,5 +195,5 @@ def test_smear_is_told_as_contrast_lost_along_the_track() -> None:
 def test_a_turned_image_has_the_turned_vector() -> None:
     sensor = replace(NOMINAL, mtf_nyquist=0.12, mtf_nyquist_along=0.05)
     turned = replace(NOMINAL, mtf_nyquist=0.05, mtf_nyquist_along=0.12)
-    assert torch.equal(transposed(tell(sensor).vector), tell(turned).vector)
-    assert not torch.equal(tell(sensor).vector, tell(turned).vector)
+    assert torch.equal(transposed(vector_tensor(sensor)), vector_tensor(turned))
+    assert not torch.equal(vector_tensor(sensor), vector_tensor(turned))

@@ -1,7 +1,8 @@
 import pytest
 import torch
 
-from model.convbeers import VARIANTS, ConvBEERS, Variant, initialise
+from model.convbeers import ConvBEERS, initialise
+from model.variants import VARIANTS, Variant
 
 
 def build(variant: Variant, seed: int = 0) -> ConvBEERS:

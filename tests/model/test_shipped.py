@@ -7,12 +7,12 @@ from pathlib import Path
 import numpy as np
 import tifffile
 
-from model.shipped import default_float_weights, default_int8
+from deploy.networks import shipped_pair
 
 
 def test_the_shipped_files_are_there() -> None:
-    assert default_int8().is_file()
-    assert default_float_weights().is_file()
+    assert shipped_pair()[1].is_file()
+    assert shipped_pair()[0].is_file()
 
 
 def test_restoring_with_the_shipped_network_needs_neither_torch_nor_scikit_image(tmp_path: Path) -> None:

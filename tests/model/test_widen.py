@@ -3,9 +3,10 @@
 import pytest
 import torch
 
-from model.conditioning import ToldConvBEERS, fold, initialise_coefficients
-from model.convbeers import ConvBEERS, Variant, initialise
-from model.io.weights import widen, widen_told
+from model.conditioning import ConditionedConvBEERS, fold, initialise_coefficients
+from model.convbeers import ConvBEERS, initialise
+from model.io.weights import widen, widen_conditioned
+from model.variants import Variant
 from profiles.errors import ModelError
 
 
@@ -36,13 +37,13 @@ def test_the_copies_of_a_feature_learn_different_things() -> None:
 
 
 def test_a_told_network_is_wider_for_every_sensor() -> None:
-    narrow = ToldConvBEERS(Variant(2, 6))
+    narrow = ConditionedConvBEERS(Variant(2, 6))
     narrow.base.load_state_dict(network(6).state_dict())
     initialise_coefficients(narrow, torch.Generator().manual_seed(5))
     for seed, direction in enumerate(narrow.directions):
         for parameter in direction.parameters():
             torch.nn.init.normal_(parameter, 0.0, 0.05, torch.Generator().manual_seed(seed))
-    wide = widen_told(narrow, Variant(2, 12), torch.Generator().manual_seed(3))
+    wide = widen_conditioned(narrow, Variant(2, 12), torch.Generator().manual_seed(3))
     image = torch.rand(1, 1, 13, 17, generator=torch.Generator().manual_seed(4))
     for vector in (torch.tensor([-1.0, -0.5, 0.2, 0.9]), torch.tensor([0.7, 0.7, -1.0, -0.6])):
         torch.testing.assert_close(fold(wide, vector)(image), fold(narrow, vector)(image), atol=1e-5, rtol=1e-5)

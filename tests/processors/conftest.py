@@ -9,7 +9,7 @@ import numpy as np
 import onnx
 import pytest
 
-from model.shipped import shipped_pair
+from deploy.networks import shipped_pair
 from quant.core import INT8_MAX, INT8_MIN, IntConv, IntCore
 from quant.encodings import board_model, read_core
 from quant.onnx_file import load_onnx

@@ -9,7 +9,7 @@ from onnx import numpy_helper
 from typer.testing import CliRunner
 
 from deploy.cli import app
-from model.shipped import shipped_pair
+from deploy.networks import shipped_pair
 from model.simulator.procedural import procedural_scene
 from quant.onnx_file import load_onnx, save_onnx
 

@@ -9,7 +9,7 @@ from typer.testing import CliRunner
 
 from deploy.cli import app
 from deploy.library import restore
-from model.shipped import shipped_pair
+from deploy.networks import shipped_pair
 from quant.encodings import read_core
 from quant.graph import split
 from quant.integer import merged_correction, run_core

@@ -6,8 +6,9 @@ import pytest
 import torch
 
 from deploy.export import to_onnx
-from model.convbeers import ConvBEERS, Variant, initialise
+from model.convbeers import ConvBEERS, initialise
 from model.simulator.procedural import procedural_scene
+from model.variants import Variant
 from profiles import load_sensor
 from quant.calibration import Patches, draw_patches
 from quant.quantise import Quantised, quantise_model

@@ -7,11 +7,11 @@ import onnx
 import onnxruntime as ort
 import pytest
 
-from model.shipped import SHIPPED, default_int8
+from deploy.networks import shipped_pair
 from quant.kernels import FEWEST_OUTPUTS, filled
 from quant.onnx_file import load_onnx
 
-NETWORKS = [default_int8(), SHIPPED / "convbeers-xs-int8.onnx"]
+NETWORKS = [shipped_pair()[1], shipped_pair("convbeers-xs")[1]]
 
 
 def weights(model: onnx.ModelProto) -> list[tuple[int, ...]]:
@@ -35,7 +35,7 @@ def test_the_numbers_are_the_same(path: Path, shape: tuple[int, int]) -> None:
 
 
 def test_no_convolution_stays_narrow_and_wide_ones_stay_as_they_are() -> None:
-    before = load_onnx(default_int8())
+    before = load_onnx(shipped_pair()[1])
     after = filled(before)
     onnx.checker.check_model(after)
     for old, new in zip(weights(before), weights(after), strict=True):
@@ -46,7 +46,7 @@ def test_no_convolution_stays_narrow_and_wide_ones_stay_as_they_are() -> None:
 
 def test_a_channel_that_is_not_zero_would_show() -> None:
     """The control: what was filled in is read."""
-    model = load_onnx(default_int8())
+    model = load_onnx(shipped_pair()[1])
     image = np.random.default_rng(0).random((1, 1, 24, 24), dtype=np.float32)
     spoilt = filled(model)
     spoil_inputs(spoilt)

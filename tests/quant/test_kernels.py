@@ -14,8 +14,8 @@ from hypothesis import strategies as st
 from onnx import TensorProto, helper, numpy_helper
 from onnxruntime.quantization import CalibrationDataReader, QuantFormat, QuantType, quantize_static
 
+from deploy.networks import shipped_pair
 from model.processor import int8_adds_exactly
-from model.shipped import SHIPPED
 from profiles.errors import ModelError
 from quant.encodings import read_core
 from quant.graph import split
@@ -157,7 +157,7 @@ def test_the_limit_is_that_of_int16(pair: tuple[int, int], largest: int, proven:
     assert cannot_saturate("QLinearConv", weight, largest) == proven
 
 
-SMALL = [SHIPPED / f"{name}-int8.onnx" for name in ("convbeers-xs", "convbeers-s", "convbeers-s-nominal")]
+SMALL = [shipped_pair(name)[1] for name in ("convbeers-xs", "convbeers-s")]
 
 
 @pytest.mark.parametrize("path", SMALL, ids=lambda path: path.stem)

@@ -7,7 +7,7 @@ import onnx
 import pytest
 from onnx import helper, numpy_helper
 
-from model.shipped import SHIPPED
+from deploy.networks import shipped_pair
 from quant.encodings import read_core
 from quant.graph import CORRECTION, split
 from quant.integer import run_core
@@ -72,7 +72,7 @@ def test_a_scale_that_fits_saturates_nothing() -> None:
 
 
 def test_the_shipped_file_saturates_as_the_integer_reference_says() -> None:
-    model = load_onnx(SHIPPED / "convbeers-xs-int8.onnx")
+    model = load_onnx(shipped_pair("convbeers-xs")[1])
     harsh = np.where(IMAGE > 0.5, 1.0, 0.0).astype(np.float32)  # every edge as strong as can be
     shares = saturated_shares(model, [harsh])
     core = read_core(model)

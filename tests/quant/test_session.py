@@ -5,7 +5,7 @@ import time
 import numpy as np
 import pytest
 
-from model.shipped import default_int8
+from deploy.networks import shipped_pair
 from quant.session import open_session, run
 
 IMAGE = np.full((1, 1, 96, 96), 0.5, np.float32)
@@ -20,7 +20,7 @@ def idle_cpu_s(wait_s: float) -> float:
 
 def test_a_session_that_has_run_leaves_the_processor_alone() -> None:
     """Its threads would wait busily for the next run, and take that from a session timed after it."""
-    session = open_session(default_int8(), threads=2)
+    session = open_session(shipped_pair()[1], threads=2)
     run(session, IMAGE)
     idle = []
     for _ in range(5):
@@ -32,4 +32,6 @@ def test_a_session_that_has_run_leaves_the_processor_alone() -> None:
 @pytest.mark.parametrize("threads", [1, 2, 3])
 def test_the_number_of_threads_changes_no_bit(threads: int) -> None:
     image = np.random.default_rng(0).random((1, 1, 53, 71), dtype=np.float32)
-    assert np.array_equal(run(open_session(default_int8(), threads), image), run(open_session(default_int8()), image))
+    assert np.array_equal(
+        run(open_session(shipped_pair()[1], threads), image), run(open_session(shipped_pair()[1]), image)
+    )

@@ -12,8 +12,9 @@ import torch
 from deploy.export import to_onnx
 from deploy.stress.checks import torch_threads
 from deploy.stress.subject import Subject, open_subject
-from model.convbeers import ConvBEERS, Variant, initialise
+from model.convbeers import ConvBEERS, initialise
 from model.simulator.procedural import procedural_scene
+from model.variants import Variant
 from profiles import load_sensor
 from quant.calibration import draw_patches
 from quant.onnx_file import save_onnx

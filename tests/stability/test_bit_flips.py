@@ -13,13 +13,13 @@ from typer.testing import CliRunner
 from deploy.bench.tables import predict_file
 from deploy.cli import app
 from deploy.dpu.board import load_dpu
+from deploy.networks import shipped_pair
 from deploy.restoration.options import TILE_PX
 from deploy.stress.flip_study import FlipRequest, flip_curves_svg, make_target, price_rows
 from deploy.stress.flips import MEMORIES, RATES, FaultTarget, Injected, curve_rows, name_of, place_rows, restored
 from deploy.stress.networks import core_of
 from deploy.stress.rows import markdown
 from deploy.stress.subject import open_subject
-from model.shipped import SHIPPED
 from profiles.figures import Row, by_table
 from quant.core import IntConv
 from quant.faults import Guards, as_stored, checksums
@@ -95,7 +95,7 @@ def test_all_guards_cost_under_two_per_cent_on_the_board(variant: str) -> None:
     core = as_stored(core_of(open_subject(None, None, variant)))
     relus = {op.output: 96 for op in core.ops if isinstance(op, IntConv) and op.relu}
     dpu, target = load_dpu("vck190", None), FaultTarget(core, Guards(relus, 1024.0, checksums(core)), ())
-    found = price_rows(target, predict_file(SHIPPED / f"{variant}-int8.onnx", dpu, TILE_PX), dpu)
+    found = price_rows(target, predict_file(shipped_pair(variant)[1], dpu, TILE_PX), dpu)
     *parts, together = (db(row, "time") for row in found)
     assert together == pytest.approx(sum(parts))
     assert 0 < db(found[-1], "of a tile, if nothing hides") < 2
@@ -164,7 +164,7 @@ def price_lines(maker: ModuleType) -> list[str]:
     lines = []
     for variant in maker.VARIANTS:
         target, dpu = make_target(open_subject(None, None, variant), maker.REQUEST), load_dpu("vck190", None)
-        prediction = predict_file(SHIPPED / f"{variant}-int8.onnx", dpu, TILE_PX)
+        prediction = predict_file(shipped_pair(variant)[1], dpu, TILE_PX)
         lines += markdown(price_rows(target, prediction, dpu)).splitlines()
     return [line for line in lines if line.startswith("|")]
 

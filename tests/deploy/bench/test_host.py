@@ -20,9 +20,9 @@ from deploy.bench.host import (
 )
 from deploy.bench.profile import node_rows, profile
 from deploy.bench.tables import Swath, board_cpu_row, slowdown
-from deploy.export import float_model, other_precision
+from deploy.export import float_model
 from deploy.host_state import memory_rise, watched
-from model.shipped import default_int8
+from deploy.networks import other_precision, shipped_pair
 from profiles import load_sensor, load_target
 from profiles.constant import Constant
 from profiles.errors import ModelError
@@ -44,7 +44,7 @@ def value(row: Row, key: str) -> float:
 
 
 def test_float_and_int8_are_interleaved_and_nodes_add_up() -> None:
-    rows = host_rows(default_int8(), QUICK, 48, threads=1)
+    rows = host_rows(shipped_pair()[1], QUICK, 48, threads=1)
     host = [row for row in rows if row.table == "host"]
     assert [row.name for row in host[:2]] == ["convbeers-s-int8, 48 x 48", "float32 of the same shape, 48 x 48"]
     for row in host[:2]:
@@ -70,7 +70,7 @@ def test_turns_last_for_the_minimum_time_and_count(tmp_path: Path) -> None:
 
 
 def test_the_other_precision_is_a_shipped_network_of_the_same_variant() -> None:
-    int8 = load_onnx(default_int8())
+    int8 = load_onnx(shipped_pair()[1])
     float32 = other_precision(int8)
     assert is_quantised(int8)
     assert float32 is not None
@@ -78,7 +78,9 @@ def test_the_other_precision_is_a_shipped_network_of_the_same_variant() -> None:
     back = other_precision(float32)
     assert back is not None
     assert is_quantised(back)
-    shapes = ([t.dims for t in m.graph.initializer if len(t.dims) == 4] for m in (float_model(None), float32))
+    shapes = (
+        [t.dims for t in m.graph.initializer if len(t.dims) == 4] for m in (float_model(shipped_pair()[0]), float32)
+    )
     assert len({str(s) for s in shapes}) == 1
 
 

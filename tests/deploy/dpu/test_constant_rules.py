@@ -17,9 +17,11 @@ from deploy.dpu.checker.placement import place
 from deploy.dpu.graph import Operation, Scale
 from deploy.dpu.reading import network_of, read_network
 from deploy.export import to_onnx
-from model.convbeers import ConvBEERS, Variant, initialise
-from model.shipped import shipped_names, shipped_pair
+from deploy.networks import shipped_pair
+from model.convbeers import ConvBEERS, initialise
+from model.shipped import shipped_names
 from model.simulator.procedural import procedural_scene
+from model.variants import Variant
 from profiles import load_sensor
 from quant.calibration import draw_patches
 from quant.quantise import quantise_model

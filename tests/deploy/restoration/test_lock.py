@@ -12,11 +12,11 @@ import psutil
 import pytest
 import tifffile
 
+from deploy.networks import shipped_pair
 from deploy.restoration import output
 from deploy.restoration.options import Options
 from deploy.restoration.output import only_run
 from deploy.restoration.run import restore_file
-from model.shipped import default_int8
 from profiles.errors import MachineError
 
 ENTRY = "from deploy.cli import app; app()"
@@ -41,7 +41,7 @@ def begin(image: Path, out: Path) -> subprocess.Popen[str]:
 
 
 def restore(image: Path, out: Path, resume: bool = False) -> None:
-    restore_file(image, out, Options(default_int8(), TILE_PX, resume=resume), lambda _: None)
+    restore_file(image, out, Options(shipped_pair()[1], TILE_PX, resume=resume), lambda _: None)
 
 
 def test_a_second_run_is_refused_and_the_first_one_unharmed(image: Path, tmp_path: Path) -> None:

@@ -11,8 +11,10 @@ import pytest
 import tifffile
 
 from deploy import demo, methods
+from deploy.cache import Cache
 from deploy.demo import INT8
 from deploy.library import restore
+from deploy.networks import shipped_pair
 from deploy.restoration.engine import restore_dn, restore_floats
 from deploy.restoration.options import Options, Runtime
 from deploy.restoration.plan import plan_for
@@ -21,10 +23,8 @@ from deploy.restoration.runtime import open_runtime
 from deploy.stress.subject import Network
 from deploy.tradeoff import run as tradeoff
 from deploy.tradeoff.accuracy import cut_in_four
-from deploy.tradeoff.cache import Cache
 from deploy.tradeoff.methods import CalibrationScenes, MethodStore, find_networks
 from deploy.tradeoff.points import Point, Variant
-from model.shipped import default_int8
 from profiles import load_sensor
 from quant.onnx_file import load_onnx, receptive_radius_px
 
@@ -46,7 +46,7 @@ def precision(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -
 
 @pytest.fixture
 def path(precision: str, model: Path) -> Path:
-    return model if precision == "float" else default_int8()
+    return model if precision == "float" else shipped_pair()[1]
 
 
 def image() -> np.ndarray:
@@ -93,7 +93,7 @@ def exact_ways(path: Path, tile_px: int, folder: Path) -> dict[str, Restored]:
     store, variant = opened_by_tradeoff(path, folder)
     sensors: Any = SimpleNamespace(degraded=SENSOR, reference=REFERENCE)
     return {
-        "evaluate": methods.method_named(str(path), SENSOR.nominal(), REFERENCE.nominal()).restore,
+        "evaluate": methods.method_named(str(path), SENSOR, REFERENCE).restore,
         "demo": demo._methods(network, sensors)[INT8],
         "tradeoff's scores": store.open(variant).restore,
         "tradeoff's seams": cut_in_four(infer, receptive_radius_px(network)),

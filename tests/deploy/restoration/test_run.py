@@ -11,12 +11,12 @@ import psutil
 import pytest
 import tifffile
 
+from deploy.networks import shipped_pair
 from deploy.restoration import run as swath
 from deploy.restoration import runtime
 from deploy.restoration.engine import fill_from_nearest, restore_window
 from deploy.restoration.options import Compression, Options, Runtime
 from deploy.restoration.runtime import Infer, open_runtime
-from model.shipped import default_int8
 from profiles.errors import BeersError, ImageError, MachineError, ModelError, OptionError
 from profiles.figures import Row
 from quant.onnx_file import load_onnx, receptive_radius_px, save_onnx
@@ -57,8 +57,8 @@ def test_tiled_equals_whole_bit_for_bit(shape: tuple[int, int], model: Path, tmp
 
 @pytest.mark.parametrize("shape", [(131, 97), (20, 150)])
 def test_int8_tiled_equals_whole_bit_for_bit(shape: tuple[int, int], tmp_path: Path) -> None:
-    restored, _ = restore(tmp_path, noise(*shape), Options(default_int8(), tile_px=64))
-    expected = np.rint(whole_image(default_int8(), noise(*shape))).astype(np.uint16)
+    restored, _ = restore(tmp_path, noise(*shape), Options(shipped_pair()[1], tile_px=64))
+    expected = np.rint(whole_image(shipped_pair()[1], noise(*shape))).astype(np.uint16)
     np.testing.assert_array_equal(restored, expected)
 
 
@@ -74,10 +74,10 @@ def test_one_pixel_less_than_the_radius_shows_seams_and_says_so(model: Path, tmp
 
 
 def test_int8_shows_seams_at_one_pixel_less_than_the_radius(tmp_path: Path) -> None:
-    radius_px = receptive_radius_px(load_onnx(default_int8()))
+    radius_px = receptive_radius_px(load_onnx(shipped_pair()[1]))
     pixels = noise(180, 200)
-    restored, _ = restore(tmp_path, pixels, Options(default_int8(), tile_px=64, halo=str(radius_px - 1)))
-    assert (restored != np.rint(whole_image(default_int8(), pixels))).any()
+    restored, _ = restore(tmp_path, pixels, Options(shipped_pair()[1], tile_px=64, halo=str(radius_px - 1)))
+    assert (restored != np.rint(whole_image(shipped_pair()[1], pixels))).any()
 
 
 def test_the_seam_error_is_that_of_the_tile_in_the_middle(model: Path, tmp_path: Path) -> None:
@@ -313,8 +313,8 @@ def test_a_tile_without_known_pixels_costs_no_inference(
 def test_openvino_gives_the_same_int8_numbers(tmp_path: Path) -> None:
     pytest.importorskip("openvino")
     pixels = np.concatenate([noise(100, 110), np.linspace(0, 4095, 11000).reshape(100, 110).astype(np.uint16)])
-    one, _ = restore(tmp_path, pixels, Options(default_int8(), tile_px=64))
-    other, row = restore(tmp_path, pixels, Options(default_int8(), tile_px=64, runtime=Runtime.openvino))
+    one, _ = restore(tmp_path, pixels, Options(shipped_pair()[1], tile_px=64))
+    other, row = restore(tmp_path, pixels, Options(shipped_pair()[1], tile_px=64, runtime=Runtime.openvino))
     np.testing.assert_array_equal(other, one)
     assert row.text["runtime"].startswith("openvino")
 
@@ -323,7 +323,7 @@ def test_openvino_gives_them_on_processors_whose_kernels_saturate_too(monkeypatc
     """In the ways that are taken there; the image is of the extremes, at which sums are largest."""
     pytest.importorskip("openvino")
     image = np.random.default_rng(3).integers(0, 2, (1, 1, 41, 67)).astype(np.float32)
-    model = load_onnx(default_int8())
+    model = load_onnx(shipped_pair()[1])
     monkeypatch.setattr(runtime, "_adds_exactly", lambda _: False)
     restored = runtime.open_openvino(model, 1)[0](image)
     np.testing.assert_array_equal(restored, run(open_session(model), image))

@@ -19,6 +19,7 @@ import tifffile
 
 from deploy import cluster
 from deploy.cluster import check_choice, local_cluster, open_cluster
+from deploy.networks import shipped_pair
 from deploy.restoration.engine import Restorer
 from deploy.restoration.options import Options, Runtime
 from deploy.restoration.plan import Span, plan_for
@@ -26,7 +27,6 @@ from deploy.restoration.run import restore_file
 from deploy.restoration.runtime import open_runtime
 from deploy.restoration.source import open_source
 from deploy.restoration.workers import Piece, Work, make_work, restore_piece
-from model.shipped import default_int8
 from profiles.errors import ImageError, MachineError, ModelError, OptionError
 from quant.onnx_file import load_onnx
 from quant.session import open_session, run
@@ -81,7 +81,7 @@ def test_two_workers_give_the_bytes_of_one_process(
 @pytest.mark.parametrize("halo", ["exact", "5"])
 def test_and_with_int8(halo: str, scheduler: str, tmp_path: Path) -> None:
     tifffile.imwrite(tmp_path / "in.tif", noise(171, 97))
-    one, two = both(tmp_path, Options(default_int8(), tile_px=TILE_PX, halo=halo), scheduler)
+    one, two = both(tmp_path, Options(shipped_pair()[1], tile_px=TILE_PX, halo=halo), scheduler)
     assert two == one
 
 
@@ -109,7 +109,7 @@ def test_and_on_openvino(model: Path, scheduler: str, tmp_path: Path) -> None:
 @pytest.mark.parametrize("int8", [False, True])
 def test_the_number_of_threads_changes_no_bit(int8: bool, model: Path) -> None:
     window = np.random.default_rng(0).random((1, 1, 131, 97), dtype=np.float32)
-    network = load_onnx(default_int8() if int8 else model)
+    network = load_onnx(shipped_pair()[1] if int8 else model)
     one, *others = (run(open_session(network, threads), window) for threads in (1, 2, 3, 5))
     for other in others:
         np.testing.assert_array_equal(other, one)
@@ -344,14 +344,14 @@ def slow(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, bytes]:
     """An image that takes two workers some seconds, and what one process makes of it."""
     folder = tmp_path_factory.mktemp("slow")
     tifffile.imwrite(folder / "in.tif", noise(700, 300), tile=(16, 16))
-    restore_file(folder / "in.tif", folder / "out.tif", Options(default_int8(), TILE_PX), silent)
+    restore_file(folder / "in.tif", folder / "out.tif", Options(shipped_pair()[1], TILE_PX), silent)
     return folder / "in.tif", (folder / "out.tif").read_bytes()
 
 
 @pytest.fixture
 def running(slow: tuple[Path, bytes], tmp_path: Path) -> Iterator[subprocess.Popen[str]]:
     """Two workers in the middle of a run into out.tif."""
-    begun = begin(slow[0], tmp_path / "out.tif", default_int8(), "--workers", "2")
+    begun = begin(slow[0], tmp_path / "out.tif", shipped_pair()[1], "--workers", "2")
     try:
         until(begun, "memory")
         until_a_row_is_finished(tmp_path / "out.tif", begun)
@@ -362,7 +362,7 @@ def running(slow: tuple[Path, bytes], tmp_path: Path) -> Iterator[subprocess.Pop
 
 
 def finish(slow: tuple[Path, bytes], out: Path) -> bytes:
-    restore_file(slow[0], out, Options(default_int8(), TILE_PX, resume=True), silent)
+    restore_file(slow[0], out, Options(shipped_pair()[1], TILE_PX, resume=True), silent)
     return out.read_bytes()
 
 

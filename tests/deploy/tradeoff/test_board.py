@@ -8,6 +8,7 @@ import pytest
 
 from deploy.bench.tables import Swath
 from deploy.dpu.board import load_dpu
+from deploy.networks import shipped_pair
 from deploy.tradeoff.board import (
     CpuRun,
     DpuRun,
@@ -17,7 +18,6 @@ from deploy.tradeoff.board import (
     pair_error,
     predict_model,
 )
-from model.shipped import default_int8
 from profiles.errors import ModelError
 from quant.onnx_file import load_onnx
 
@@ -26,7 +26,7 @@ SWATH = Swath(2600, 1900)
 
 @pytest.fixture(scope="module")
 def model() -> onnx.ModelProto:
-    return load_onnx(default_int8())
+    return load_onnx(shipped_pair()[1])
 
 
 def run(model: onnx.ModelProto, tile_px: int = 640, halo_px: int = 19, configuration: str = "C32B3") -> DpuRun:

@@ -7,10 +7,11 @@ import pytest
 from deploy.bench.tables import Swath
 from deploy.dpu.board import load_dpu
 from deploy.export import float_model
+from deploy.networks import shipped_pair
 from deploy.tradeoff.methods import Network, find_networks, is_papers, operations_per_px, shape_of
 from deploy.tradeoff.points import EXACT, LEGAL, PRECISIONS, Board, Variant, network_points, other_points, tiles_px
 from deploy.tradeoff.selection import board_of, configurations_for, precisions_of
-from model.shipped import SHIPPED, shipped_names, shipped_weights
+from model.shipped import shipped_names, shipped_weights
 from profiles.errors import ModelError, OptionError
 
 BOARD = Board(19, 176, 176, ("C32B3", "C32B1", "C32B6"))
@@ -67,7 +68,7 @@ def test_the_shipped_family_makes_some_forty_to_seventy_points() -> None:
 def test_wide_engines_are_looked_at_for_wide_layers_alone() -> None:
     dpu = load_dpu()
     for name, widths in (("convbeers-s", {"C32"}), ("convbeers", {"C32", "C64"})):
-        found = configurations_for(float_model(shipped_weights(name)), dpu)
+        found = configurations_for(float_model(shipped_pair(name)[0]), dpu)
         assert found[0] == dpu.name
         assert {configuration[:3] for configuration in found} == widths
         assert len(set(found)) == len(found)
@@ -75,21 +76,23 @@ def test_wide_engines_are_looked_at_for_wide_layers_alone() -> None:
 
 def test_the_papers_network_is_known_by_its_shape() -> None:
     for name in shipped_names():
-        for model in (float_model(shipped_weights(name)), Network(name, None, SHIPPED / f"{name}-int8.onnx").model()):
+        for model in (float_model(shipped_pair(name)[0]), Network(name, None, shipped_pair(name)[1]).model()):
             assert is_papers(model) == (name == "convbeers")
-    assert shape_of(float_model(shipped_weights("convbeers-xs"))) == (4, 16)
-    assert operations_per_px(float_model(shipped_weights("convbeers"))) == pytest.approx(2.4e6, rel=0.02)
+    assert shape_of(float_model(shipped_pair("convbeers-xs")[0])) == (4, 16)
+    assert operations_per_px(float_model(shipped_pair("convbeers")[0])) == pytest.approx(2.4e6, rel=0.02)
 
 
 def test_networks_come_by_name_and_by_file(tmp_path: Path) -> None:
     mine = tmp_path / "mine.safetensors"
     mine.write_bytes(shipped_weights("convbeers-xs").read_bytes())
-    shipped, own, given = find_networks(["convbeers-xs", str(mine), str(SHIPPED / "convbeers-s-int8.onnx")])
+    int8 = tmp_path / "other-int8.onnx"
+    int8.write_bytes(shipped_pair("convbeers-xs")[1].read_bytes())
+    shipped, own, given = find_networks(["convbeers-xs", str(mine), str(int8)])
     assert shipped.float_file
     assert shipped.int8_file
-    assert own == Network("mine", mine, None)
+    assert (own.name, own.int8_file) == ("mine", None)
     assert given.float_file is None
-    assert (given.name, given.given) == ("convbeers-s-int8", LEGAL)
+    assert (given.name, given.given) == ("other-int8", LEGAL)
     assert precisions_of(given) == (LEGAL,)
     assert precisions_of(own) == PRECISIONS
 

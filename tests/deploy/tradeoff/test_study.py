@@ -13,18 +13,19 @@ import torch
 from PIL import Image
 from typer.testing import CliRunner
 
+from deploy.cache import Cache
 from deploy.cli import app
 from deploy.compare import compare, read_document
 from deploy.tradeoff import measurements, methods, selection
-from deploy.tradeoff.cache import Cache
 from deploy.tradeoff.host_time import Times
 from deploy.tradeoff.run import StudyRun, run_study
 from deploy.tradeoff.selection import Request
-from model.convbeers import ConvBEERS, Variant, initialise
+from model.convbeers import ConvBEERS, initialise
 from model.evaluation import targets as targets_module
 from model.evaluation.methods import Restore
 from model.io.weights import save_network
 from model.simulator.procedural import procedural_scene
+from model.variants import Variant
 from profiles.figures import Row
 from quant.onnx_file import load_onnx, save_onnx
 
@@ -227,7 +228,7 @@ def test_a_variants_scores_are_those_of_its_own_restoration(folder: Path, kept: 
     from profiles import load_sensor
 
     benchmark, _ = make_benchmark(request(folder))
-    sensors = load_sensor("pleiades-degraded").nominal(), load_sensor("pleiades-reference").nominal()
+    sensors = load_sensor("pleiades-degraded"), load_sensor("pleiades-reference")
     restore = method_named(str(folder / "wide.safetensors"), *sensors).restore
     values = [fidelity_db(restore(p.degraded), p.reference, p.degraded) for p in benchmark.pairs]
     row = next(row for row in kept[0].study.points if row.name == "wide float32")

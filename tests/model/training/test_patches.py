@@ -52,7 +52,9 @@ def steps(image: torch.Tensor) -> tuple[float, float]:
 def test_a_turned_patch_comes_with_the_sensor_as_it_lies() -> None:
     """Against its reference, a patch has lost more along the axis that its vector calls the more blurred one."""
     scene = Scene("noise", 100 + 60 * torch.rand(420, 480, generator=torch.Generator().manual_seed(0)))
-    recipe = replace(source().recipe, told=OneSensor(load_sensor("pleiades-degraded").nominal()), oversamplings=(2,))
+    recipe = replace(
+        source().recipe, family=OneSensor(load_sensor("pleiades-degraded").nominal()), oversamplings=(2,)
+    )
     ways = set()
     for degraded, reference, vectors in islice(PatchSource([scene], recipe, 3, 0).batches(), 30):
         for one, other, vector in zip(degraded, reference, vectors, strict=True):
@@ -62,8 +64,8 @@ def test_a_turned_patch_comes_with_the_sensor_as_it_lies() -> None:
     assert ways == {True, False}
 
 
-def test_told_patches_come_with_vectors_of_many_sensors_and_the_same_again() -> None:
-    recipe = replace(source().recipe, told=SensorFamily(load_sensor("pleiades-degraded").nominal()))
+def test_conditioned_patches_come_with_vectors_of_many_sensors_and_the_same_again() -> None:
+    recipe = replace(source().recipe, family=SensorFamily(load_sensor("pleiades-degraded").nominal()))
     scene = procedural_scene(420, 480, np.random.default_rng(2))
     first, again = ([*islice(PatchSource([scene], recipe, 3, 0).batches(k), 20 - k)] for k in (0, 17))
     vectors = torch.cat([batch[2] for batch in first])

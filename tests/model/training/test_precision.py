@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 import torch
 
-from model.convbeers import ConvBEERS, Variant
-from model.io.weights import read_tensors, write_tensors
+from model.convbeers import ConvBEERS
+from model.io.tensors import read_tensors, write_tensors
 from model.simulator.procedural import procedural_scene
 from model.training import precision as precision_module
 from model.training.checkpoint import TrainingRecipe
@@ -16,6 +16,7 @@ from model.training.patches import PatchRecipe, PatchSource
 from model.training.precision import MixedPrecision, Precision, choose_precision
 from model.training.trainer import Progress, Schedule, Trainer
 from model.training.workers import Worker
+from model.variants import Variant
 from profiles import load_sensor
 from profiles.errors import ModelError
 

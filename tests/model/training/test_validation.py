@@ -2,9 +2,10 @@
 
 import numpy as np
 
-from model.convbeers import ConvBEERS, Variant
+from model.convbeers import ConvBEERS
 from model.simulator.procedural import procedural_scene
 from model.training.validation import Validation, split_by_site
+from model.variants import Variant
 from profiles import load_sensor
 
 NAMES = [f"village_{k:03d}.jpg" for k in range(30)] + [f"forest_{k:03d}.jpg" for k in range(10)] + ["dunes.jpg"]

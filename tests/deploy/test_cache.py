@@ -9,8 +9,8 @@ from typing import Any, Self
 import numpy as np
 import pytest
 
-from deploy.tradeoff import cache as cache_module
-from deploy.tradeoff.cache import Cache, code_digest, digest_of, pixels_digest
+from deploy import cache as cache_module
+from deploy.cache import Cache, code_digest, digest_of, pixels_digest
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ import numpy as np
 
 from model.io.files import write_text
 
-ROOT = Path(__file__).resolve().parents[2]
+ROOT = Path(__file__).resolve().parents[1]
 
 Key = Mapping[str, object]
 """Everything that a measurement depends on, by name: digests of inputs, options, code, runtime."""

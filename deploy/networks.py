@@ -1,0 +1,208 @@
+"""Which network a command means: a file of the user's, or a shipped one specialised to a sensor.
+
+A shipped network is one set of weights for every sensor in range. NAME is that network in float32 and NAME-int8 in
+INT8, each for one sensor. Both are ONNX files, made when they are first asked for and kept in a cache by what they
+depend on: weights, the sensor's numbers, and for INT8 the code that makes it. For the shipped sensor profiles the
+INT8 files are shipped too: the very bytes that would be made.
+"""
+
+import os
+import re
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import onnx
+import platformdirs
+
+from deploy.cache import code_digest, digest_of
+from deploy.export import about, to_onnx, weights_for
+from model.io.files import require_writable, sha256
+from model.io.tensors import is_conditioned
+from model.progress import steps
+from model.shipped import BLIND, BLIND_PROFILE, INT8, SENSOR, SHIPPED, VARIANT, shipped_names, shipped_weights
+from profiles.sensor import SensorProfile, numbers_of
+from profiles.sensor_file import load_sensor
+from quant.onnx_file import is_quantised, load_onnx, metadata, save_onnx
+
+MAKING = {"float32": ("deploy.export",), "int8": ("quant.quantise", "quant.calibration")}
+"""The modules that make a file of each precision: with other code they are made anew."""
+
+MADE_FROM = "made_from"
+"""In the metadata of a file: a digest of weights and sensor."""
+
+PATCHES, PATCH_PX, SEED = 64, 128, 0
+"""Of calibration, on drawn scenes: what `quantize` takes where nothing else is asked for."""
+
+CACHE_VARIABLE = "BEERS_DEPLOY_CACHE"
+
+Say = Callable[[str], None]
+"""Tells a sentence as the work goes on."""
+
+
+def silent(_: str) -> None:
+    """Tell nobody."""
+
+
+@dataclass(frozen=True)
+class KnownSensor:
+    """The sensor that a network is specialised to: the middle of every range of its profile.
+
+    Attributes:
+        name: of the profile, or `blind`.
+        profile: what INT8 is calibrated on.
+    """
+
+    name: str
+    profile: SensorProfile
+
+
+def known_sensor(name: str) -> KnownSensor:
+    """The sensor by its profile's name or .toml file; `blind` is the middle of what an unknown one may be.
+
+    Raises:
+        ProfileError: no such profile, or a faulty one.
+    """
+    if name == BLIND:
+        return KnownSensor(BLIND, load_sensor(BLIND_PROFILE))
+    profile = load_sensor(name)
+    return KnownSensor(profile.name, profile)
+
+
+@dataclass(frozen=True)
+class Conditioned:
+    """Weights of a conditioned network, and the name that it is listed under."""
+
+    name: str
+    weights: Path
+
+
+def conditioned(given: Path | None) -> Conditioned | None:
+    """The conditioned network that is meant, None meaning the default one; None for any other file.
+
+    Raises:
+        ModelError: weights that cannot be read.
+    """
+    if given is None:
+        return Conditioned(VARIANT, shipped_weights(VARIANT))
+    name = given.name.removesuffix(INT8)
+    if given == Path(given.name) and name in shipped_names() and not given.exists():
+        return Conditioned(name, shipped_weights(name))
+    return Conditioned(given.stem, given) if given.suffix == ".safetensors" and is_conditioned(given) else None
+
+
+def weights_file(given: Path) -> Path:
+    """The weights given, or the shipped ones of that name where no such file lies.
+
+    Raises:
+        ModelError: weights that cannot be read.
+    """
+    found = conditioned(given)
+    return found.weights if found else given
+
+
+def network_file(given: Path | None, sensor: KnownSensor, say: Say = silent) -> Path:
+    """The file of a network: the one given, or a conditioned network's for the sensor, INT8 where its name says so.
+
+    Args:
+        given: a file, or a shipped name where no such file lies; None is the default network in INT8.
+        sensor: what a conditioned network is specialised to.
+        say: is told what of the sensor lies outside the range that was trained.
+
+    Raises:
+        ModelError: weights that cannot be read.
+        MachineError: the cache cannot be written.
+    """
+    int8 = given is None or given.name.endswith(INT8)
+    return int8_file(given, sensor, say) if int8 else float_file(given, sensor, say)
+
+
+def float_file(given: Path | None, sensor: KnownSensor, say: Say = silent) -> Path:
+    """As `network_file`, a conditioned network always in float32.
+
+    Raises:
+        ModelError: weights that cannot be read.
+        MachineError: the cache cannot be written.
+    """
+    found = conditioned(given)
+    return _kept(found, sensor, "float32", say) if found else given or Path()
+
+
+def int8_file(given: Path | None, sensor: KnownSensor, say: Say = silent) -> Path:
+    """As `network_file`, a conditioned network always in INT8.
+
+    Raises:
+        ModelError: weights that cannot be read.
+        MachineError: the cache cannot be written.
+    """
+    found = conditioned(given)
+    return _kept(found, sensor, "int8", say) if found else given or Path()
+
+
+def shipped_pair(name: str = VARIANT, sensor: str = SENSOR, say: Say = silent) -> tuple[Path, Path]:
+    """A shipped network in float32 and in INT8, specialised to a sensor.
+
+    Raises:
+        ModelError: no network of that name is shipped.
+        ProfileError: no such sensor.
+        MachineError: the cache cannot be written.
+    """
+    known, given = known_sensor(sensor), Path(shipped_weights(name).stem)
+    return float_file(given, known, say), int8_file(given, known, say)
+
+
+def specialised_model(network: Conditioned, sensor: KnownSensor, say: Say) -> onnx.ModelProto:
+    """A conditioned network in float32 for one sensor, as ONNX."""
+    weights, outside = weights_for(network.weights, sensor.profile.nominal())
+    for sentence in outside:
+        say(f"warning: {sentence}")
+    return to_onnx(weights, about(network.name, weights.recipe, sensor.name))
+
+
+def other_precision(model: onnx.ModelProto) -> onnx.ModelProto | None:
+    """A shipped network of the same variant in the other precision, or None; its weights may be others.
+
+    Time depends on the shapes, not on the weights: for a comparison of time any weights will do.
+    """
+    variant = metadata(model).get("variant", "")
+    if variant not in shipped_names():
+        return None
+    find = float_file if is_quantised(model) else int8_file
+    return load_onnx(find(Path(variant), known_sensor(SENSOR)))
+
+
+def cache_folder() -> Path:
+    """Where specialised networks are kept: the user's cache, or what the environment names in its place."""
+    own = os.environ.get(CACHE_VARIABLE)
+    return Path(own) if own else platformdirs.user_cache_path("beers-deploy")
+
+
+def _kept(network: Conditioned, sensor: KnownSensor, precision: str, say: Say) -> Path:
+    model = specialised_model(network, sensor, say)
+    made_from = digest_of({"weights": sha256(network.weights), "sensor": numbers_of(sensor.profile)})
+    shipped = SHIPPED / f"{network.name}{INT8}-{sensor.name}.onnx"
+    if precision == "int8" and shipped.is_file() and metadata(load_onnx(shipped)).get(MADE_FROM) == made_from:
+        return shipped
+    stem = network.name + (INT8 if precision == "int8" else "")
+    known = re.sub(r"[^\w.-]+", "-", sensor.name)[:40]
+    digest = digest_of([made_from, precision, code_digest(*MAKING[precision])])
+    path = cache_folder() / f"{stem}-{known}-{digest[:12]}.onnx"
+    if not path.is_file():
+        require_writable(path)
+        made = _in_int8(model, sensor, {MADE_FROM: made_from}) if precision == "int8" else model
+        save_onnx(made, path)
+    return path
+
+
+def _in_int8(model: onnx.ModelProto, sensor: KnownSensor, more: dict[str, str]) -> onnx.ModelProto:
+    from model.simulator.procedural import load_scenes  # torch, which what is kept already does not need
+    from profiles.sensor_file import reference_for
+    from quant.calibration import draw_patches
+    from quant.quantise import quantise_model, ticks
+
+    reference = reference_for(sensor.profile)
+    scenes = load_scenes(None, reference.nominal(), SEED)
+    patches = draw_patches(scenes, sensor.profile, reference, PATCHES, SEED, PATCH_PX)
+    about = {"calibration_sensor": sensor.name, "calibration_seed": str(SEED), **more}
+    with steps(f"making INT8 for {sensor.name}, once", ticks(model, PATCHES)) as bar:
+        return quantise_model(model, patches, about, bar.advance).host

@@ -1,0 +1,29 @@
+"""Makes the shipped INT8 files anew: each shipped network for each shipped sensor profile, and for a blind one.
+
+    python docs/make_int8.py [convbeers-s ...]
+
+The same bytes that a user's cache would hold: calibrated on drawn scenes. Minutes a file.
+"""
+
+import shutil
+import sys
+from pathlib import Path
+
+from deploy.networks import int8_file, known_sensor
+from model.shipped import BLIND, INT8, SENSOR, SHIPPED, shipped_names
+
+SENSORS = (SENSOR, BLIND)
+
+
+def main() -> None:
+    """Make them one by one."""
+    for name in sys.argv[1:] or shipped_names():
+        for sensor in SENSORS:
+            shipped = SHIPPED / f"{name}{INT8}-{sensor}.onnx"
+            shipped.unlink(missing_ok=True)
+            shutil.copyfile(int8_file(Path(name), known_sensor(sensor), print), shipped)
+            print(shipped.name, flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,163 @@
+"""Weights as safetensors: named arrays and a JSON header, read and written without torch, and validated as read.
+
+A file of ours states its variant and the recipe that made it; a conditioned network's also its kind, and the ranges
+of sensors that it was trained for.
+"""
+
+import json
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from safetensors import SafetensorError, safe_open
+from safetensors.numpy import save_file
+
+from model.io.files import whole_file
+from model.specialise import DIRECTIONS, LINEAR, RANGES, conditioned_shapes
+from model.variants import Variant
+from profiles.errors import ModelError
+from profiles.toml import parse_json, unreadable
+
+CONDITIONED = "conditioned on its sensor"
+"""The kind of weights, in the header, that need a sensor before they are a network; plain ones state no kind."""
+
+FAULTS = (AttributeError, LookupError, TypeError, ValueError, OverflowError, RuntimeError)
+"""What reading a header or filling a network may raise on a file that is not ours."""
+
+Arrays = Mapping[str, np.ndarray]
+"""Arrays of any shape by name."""
+
+
+@dataclass(frozen=True)
+class Weights:
+    """What a file of weights holds: arrays by name, the variant that they make, and the recipe that made them."""
+
+    tensors: Arrays
+    variant: Variant
+    recipe: dict[str, object]
+
+
+def write_tensors(path: Path, tensors: Arrays, header: Mapping[str, object]) -> None:
+    """Write named arrays of any shape and a JSON header as safetensors, whole or not at all."""
+    whole = {name: np.asarray(array, order="C") for name, array in tensors.items()}
+    with whole_file(path) as temporary:
+        save_file(whole, temporary, metadata={key: json.dumps(value) for key, value in header.items()})
+
+
+def read_tensors(path: Path) -> tuple[dict[str, np.ndarray], dict[str, object]]:
+    """Read the named arrays, of any shape, and the JSON header of a safetensors file.
+
+    Raises:
+        ModelError: missing or not safetensors.
+    """
+    try:
+        with safe_open(path, framework="np") as file:
+            header = {key: parse_json(value) for key, value in (file.metadata() or {}).items()}
+            # Copies: the library's own lie in the file, which Windows then does not replace, and others may change.
+            return {key: np.array(file.get_tensor(key)) for key in file.keys()}, header  # noqa: SIM118 - no mapping
+    except (SafetensorError, OSError, ValueError, LookupError, TypeError, RuntimeError) as error:
+        got = unreadable(path) or " ".join(str(error).split())[:120]
+        remedy = "give a file written by 'beers-deploy train'"
+        raise ModelError(str(path), expected="safetensors weights", got=got, remedy=remedy) from error
+
+
+def write_weights(path: Path, weights: Weights, conditioned: bool) -> None:
+    """Write a network's weights, its variant and recipe; of a conditioned one its kind and the ranges it knows."""
+    header: dict[str, object] = {"variant": asdict(weights.variant), "recipe": weights.recipe}
+    if conditioned:
+        header |= {"kind": CONDITIONED, "ranges": dict(RANGES)}
+    write_tensors(path, weights.tensors, header)
+
+
+def read_plain(path: Path) -> Weights:
+    """The weights of a plain network.
+
+    Raises:
+        ModelError: not our weights, weights of another shape, or of a conditioned network.
+    """
+    tensors, header = read_tensors(path)
+    if header.get("kind") == CONDITIONED:
+        remedy = "name the sensor: beers-deploy export --checkpoint FILE --sensor NAME"
+        got = "one that is conditioned on its sensor"
+        raise ModelError(str(path), expected="the weights of a plain network", got=got, remedy=remedy)
+    try:
+        variant = _variant(header)
+        _check_count(tensors, variant, 4 * variant.blocks + 6)
+        _check_like(tensors, variant.shapes)
+    except FAULTS as error:
+        raise _not_weights(path, "the weights of a ConvBEERS", error) from error
+    return Weights(tensors, variant, _recipe(header))
+
+
+def read_conditioned(path: Path) -> Weights:
+    """The weights of a network that is conditioned on its sensor.
+
+    Raises:
+        ModelError: not such weights, or of other ranges of sensors than this version's.
+    """
+    tensors, header = read_tensors(path)
+    try:
+        if header.get("kind") != CONDITIONED:
+            raise ValueError("a network that cannot be specialised to a sensor")
+        if header.get("ranges") != {name: list(ends) for name, ends in RANGES.items()}:
+            raise ValueError("other ranges of sensors than this version's")
+        variant = _variant(header)
+        _check_count(tensors, variant, (1 + DIRECTIONS) * (4 * variant.blocks + 6) + 2 * len(LINEAR))
+        _check_like(tensors, conditioned_shapes(variant))
+    except FAULTS as error:
+        raise _not_weights(path, "weights that 'train --conditioned' wrote", error) from error
+    return Weights(tensors, variant, _recipe(header))
+
+
+def is_conditioned(path: Path) -> bool:
+    """Whether a weights file holds a network that is conditioned on its sensor.
+
+    Raises:
+        ModelError: missing or not safetensors.
+    """
+    return read_tensors(path)[1].get("kind") == CONDITIONED
+
+
+def all_finite(tensors: Arrays) -> bool:
+    """Whether every value of every array is finite."""
+    return all(bool(np.isfinite(tensor).all()) for tensor in tensors.values())
+
+
+def _not_weights(path: Path, expected: str, error: Exception) -> ModelError:
+    got = " ".join(str(error).split())[:120]
+    return ModelError(str(path), expected=expected, got=got, remedy="give a file written by 'beers-deploy train'")
+
+
+def _recipe(header: Mapping[str, object]) -> dict[str, object]:
+    recipe = header.get("recipe", {})
+    return recipe if isinstance(recipe, dict) else {}
+
+
+def _variant(header: Mapping[str, Any]) -> Variant:
+    shape = header["variant"]
+    return Variant(int(shape["blocks"]), int(shape["features"]))
+
+
+def _check_count(tensors: Arrays, variant: Variant, count: int) -> None:
+    """The number of tensors, before a list of a network's is made: a header alone must not take memory.
+
+    Raises:
+        ValueError: another number than a network of that variant has.
+    """
+    if len(tensors) != count:
+        raise ValueError(f"{len(tensors)} tensors for {variant}")
+
+
+def _check_like(tensors: Arrays, shapes: Mapping[str, tuple[int, ...]]) -> None:
+    """Compare with what a network has.
+
+    Raises:
+        ValueError: a tensor that is missing, misshapen, of another type or not finite.
+    """
+    for name, shape in shapes.items():
+        if tensors[name].shape != shape:
+            raise ValueError(f"{name} of shape {tensors[name].shape}, for {shape}")
+    if not all(tensor.dtype == np.float32 for tensor in tensors.values()) or not all_finite(tensors):
+        raise ValueError("weights that are not finite float32")

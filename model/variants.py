@@ -1,0 +1,55 @@
+"""The sizes of ConvBEERS by name, and the tensors that each is made of; nothing is loaded to know them."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from profiles.errors import OptionError
+
+
+@dataclass(frozen=True)
+class Variant:
+    """A named point of the family."""
+
+    blocks: int
+    features: int
+
+    @property
+    def radius_px(self) -> int:
+        """How far an output pixel sees: one pixel per convolution (head, two a block, body end, tail)."""
+        return 2 * self.blocks + 3
+
+    @property
+    def convolutions(self) -> Mapping[str, tuple[int, int]]:
+        """(outputs, inputs) of each 3 x 3 convolution by name, in the order in which an image meets them."""
+        inner = [f"body.{k}.{place}" for k in range(self.blocks) for place in ("first", "second")]
+        same = (self.features, self.features)
+        return {"head": (self.features, 1), **dict.fromkeys([*inner, "body_end"], same), "tail": (1, self.features)}
+
+    @property
+    def shapes(self) -> dict[str, tuple[int, ...]]:
+        """The shape of each weight and bias by name."""
+        found: dict[str, tuple[int, ...]] = {}
+        for name, (outputs, inputs) in self.convolutions.items():
+            found |= {f"{name}.weight": (outputs, inputs, 3, 3), f"{name}.bias": (outputs,)}
+        return found
+
+
+VARIANTS = {
+    "convbeers": Variant(blocks=16, features=64),  # the paper's
+    "convbeers-m": Variant(blocks=16, features=32),
+    "convbeers-s": Variant(blocks=8, features=32),
+    "convbeers-xs": Variant(blocks=4, features=16),
+}
+
+
+def variant_named(name: str) -> Variant:
+    """The variant of that name.
+
+    Raises:
+        OptionError: no such variant.
+    """
+    if name not in VARIANTS:
+        raise OptionError(
+            "variant", expected=f"one of {', '.join(VARIANTS)}", got=repr(name), remedy="choose one of them"
+        )
+    return VARIANTS[name]

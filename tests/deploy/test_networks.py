@@ -1,0 +1,182 @@
+"""Shipped networks by sensor: made once, kept by what they depend on, and shipped as they would be made."""
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnx
+import pytest
+import tifffile
+import torch
+from typer.testing import CliRunner
+
+from deploy import networks
+from deploy.cache import digest_of
+from deploy.cli import app
+from deploy.networks import (
+    CACHE_VARIABLE,
+    MADE_FROM,
+    KnownSensor,
+    cache_folder,
+    float_file,
+    int8_file,
+    known_sensor,
+    network_file,
+    shipped_pair,
+)
+from model.conditioning import ConditionedConvBEERS, initialise_coefficients
+from model.convbeers import initialise
+from model.io.files import sha256
+from model.io.weights import save_network
+from model.shipped import BLIND, BLIND_PROFILE, INT8, SENSOR, SHIPPED, shipped_names, shipped_weights
+from model.variants import Variant
+from profiles import load_sensor
+from profiles.errors import ModelError, ProfileError
+from profiles.sensor import numbers_of
+from profiles.toml import HERE
+from quant.onnx_file import is_quantised, load_onnx, metadata
+
+KNOWN = known_sensor(SENSOR)
+
+
+@pytest.fixture(autouse=True)
+def own_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path / "cache"))
+    return tmp_path / "cache"
+
+
+@pytest.fixture
+def small(tmp_path: Path) -> Path:
+    """Weights of a small conditioned network, as `train --conditioned` leaves them."""
+    network, generator = ConditionedConvBEERS(Variant(blocks=1, features=4)), torch.Generator().manual_seed(0)
+    initialise(network.base, generator)
+    initialise_coefficients(network, generator)
+    for parameter in network.directions.parameters():
+        torch.nn.init.normal_(parameter, 0.0, 0.05, generator)
+    save_network(tmp_path / "small.safetensors", network, {"degraded": "many"})
+    return tmp_path / "small.safetensors"
+
+
+def own_sensor(folder: Path, old: str = "", new: str = "", name: str = "mine.toml") -> Path:
+    """The default sensor as a user's own file, a text in it replaced."""
+    path = folder / name
+    path.write_text((HERE / "sensors" / f"{SENSOR}.toml").read_text(encoding="utf-8").replace(old, new))
+    return path
+
+
+def test_a_float_network_is_made_once_for_a_sensor(small: Path, own_cache: Path) -> None:
+    first = float_file(small, KNOWN)
+    written = first.stat().st_mtime_ns
+    assert first.parent == own_cache == cache_folder()
+    assert float_file(small, KNOWN) == first
+    assert first.stat().st_mtime_ns == written
+    assert metadata(onnx.load(first))["sensor"] == SENSOR
+    assert len(list(own_cache.iterdir())) == 1
+
+
+def test_the_same_numbers_are_the_same_sensor_and_others_are_not(small: Path, tmp_path: Path) -> None:
+    """Sources and descriptions make no other network; a number does, under the same name of a file."""
+    files = []
+    for folder, old, new in (("a", "", ""), ("b", "Raw", "My raw"), ("c", "value = 0.07", "value = 0.08")):
+        (tmp_path / folder).mkdir()
+        sensor = known_sensor(str(own_sensor(tmp_path / folder, old, new)))
+        files.append(float_file(small, sensor))
+    assert files[0] == files[1]
+    assert files[2] != files[0]
+    assert files[2].read_bytes() != files[0].read_bytes()
+
+
+def test_int8_is_made_once_and_shows_progress(
+    small: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(networks, "PATCHES", 2)
+    made = int8_file(small, KNOWN)
+    assert is_quantised(load_onnx(made))
+    assert metadata(load_onnx(made))[MADE_FROM]
+    assert f"making INT8 for {SENSOR}, once" in capsys.readouterr().err
+
+    def never(*_: Any) -> None:
+        raise AssertionError("made again")
+
+    monkeypatch.setattr(networks, "_in_int8", never)
+    assert int8_file(small, KNOWN) == made
+    assert float_file(small, KNOWN) != made
+
+
+@pytest.mark.parametrize("name", shipped_names())
+@pytest.mark.parametrize("sensor", [SENSOR, BLIND])
+def test_the_shipped_int8_files_are_of_these_weights_and_sensors(name: str, sensor: str, own_cache: Path) -> None:
+    """Other weights, or other numbers in a profile, need other files: docs/make_int8.py makes them."""
+    int8 = SHIPPED / f"{name}{INT8}-{sensor}.onnx"
+    said = metadata(load_onnx(int8))
+    sources = {"weights": sha256(shipped_weights(name)), "sensor": numbers_of(known_sensor(sensor).profile)}
+    assert said[MADE_FROM] == digest_of(sources)
+    assert (said["variant"], said["sensor"]) == (name, sensor)
+    assert int8_file(Path(name), known_sensor(sensor)) == int8
+    assert not own_cache.exists()
+
+
+def test_blind_is_the_middle_of_a_range_of_sensors() -> None:
+    blind = known_sensor(BLIND)
+    assert (blind.name, blind.profile) == (BLIND, load_sensor(BLIND_PROFILE))
+    floating = [load_onnx(shipped_pair("convbeers-xs", name)[0]) for name in (BLIND, BLIND_PROFILE)]
+    weights = [[tensor.raw_data for tensor in model.graph.initializer] for model in floating]
+    assert weights[0] == weights[1]
+
+
+def test_what_lies_outside_is_said_each_time(small: Path, tmp_path: Path) -> None:
+    said = list[str]()
+    sensor = known_sensor(str(own_sensor(tmp_path, "value = 0.07", "value = 0.004")))
+    for _ in range(2):
+        float_file(small, sensor, said.append)
+    assert len(said) == 4
+    assert all(re.match("warning: mtf_(across|along) 0.004 is outside 0.015 to 0.15", sentence) for sentence in said)
+
+
+def test_what_cannot_be_had_is_one_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(ProfileError, match="hubble"):
+        known_sensor("hubble")
+    with pytest.raises(ModelError, match="no such file"):
+        network_file(tmp_path / "none.safetensors", KNOWN)
+    (tmp_path / "file").touch()
+    monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path / "file"))
+    tifffile.imwrite(tmp_path / "in.tif", np.full((20, 30), 900, np.uint16))
+    words = ["restore", str(tmp_path / "in.tif"), str(tmp_path / "out.tif"), "--model", "convbeers-xs"]
+    done = CliRunner().invoke(app, words)
+    assert done.exit_code == 2
+    assert "place to write" in " ".join(done.output.split())
+    assert not (tmp_path / "out.tif").exists()
+
+
+def test_restoring_for_a_sensor_needs_no_torch_and_is_what_the_sensor_makes_of_it(tmp_path: Path) -> None:
+    """In float32 at once: weights are specialised without what training needs."""
+    dn = np.random.default_rng(0).integers(200, 1800, (37, 41)).astype(np.uint16)
+    tifffile.imwrite(tmp_path / "in.tif", dn)
+    sensor = own_sensor(tmp_path, "value = 0.07", "value = 0.05")
+    words = ["restore", str(tmp_path / "in.tif"), "out.tif", "--model", "convbeers-xs", "--sensor", str(sensor)]
+    call = f"app({words!r}, standalone_mode=False)"
+    code = f"import sys; from deploy.cli import app; {call}; print('torch' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=True)
+    assert done.stdout.splitlines()[-1] == "False"
+    other = [*words[:2], str(tmp_path / "other.tif"), *words[3:5], "--sensor", SENSOR]
+    assert CliRunner().invoke(app, other).exit_code == 0
+    restored = [tifffile.imread(tmp_path / name).astype(int) for name in ("out.tif", "other.tif")]
+    assert np.abs(restored[0] - restored[1]).max() > 5
+
+
+def test_a_network_that_is_made_already_takes_no_sensor(tmp_path: Path) -> None:
+    tifffile.imwrite(tmp_path / "in.tif", np.full((20, 30), 900, np.uint16))
+    mine = shipped_pair("convbeers-xs")[0]
+    words = ["restore", str(tmp_path / "in.tif"), str(tmp_path / "out.tif"), "--model", str(mine), "--sensor", SENSOR]
+    done = CliRunner().invoke(app, words)
+    assert done.exit_code == 2
+    assert "leave --sensor out" in " ".join(done.output.split())
+    assert not (tmp_path / "out.tif").exists()
+
+
+def test_a_sensors_name_cannot_leave_the_cache(small: Path, own_cache: Path) -> None:
+    odd = KnownSensor("../../x y/" + 99 * "z", KNOWN.profile)
+    assert float_file(small, odd).parent == own_cache
