@@ -19,8 +19,8 @@ from deploy.export import network_for
 from model.conditioning import fold, tell
 from model.convbeers import ConvBEERS
 from model.evaluation.pairs import NamedPair, simulate_pairs
-from model.evaluation.run import Fixed, conditions
 from model.evaluation.scores import fidelity_db
+from model.evaluation.sweep import Fixed, conditions
 from model.io.images import list_images, site_of
 from model.io.weights import is_told, load_told
 from model.simulator.sampling import Scene, read_scene
