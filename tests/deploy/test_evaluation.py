@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 
 from deploy.cli import app
 from deploy.methods import method_named
-from deploy.report.evaluation_page import chosen_pairs, strip_of
+from deploy.report.evaluation_page import chosen_pairs, evaluation_report, strip_of
 from deploy.results import SCHEMA_PATH, Document, missing
 from model.evaluation import targets as targets_module
 from model.evaluation.methods import TRAINED, Method
@@ -26,7 +26,7 @@ from model.simulator.procedural import procedural_scene
 from profiles import load_sensor
 from profiles.constant import Constant
 from profiles.errors import ImageError, OptionError
-from profiles.figures import by_table
+from profiles.figures import Row, by_table, measured
 
 DEGRADED, REFERENCE = load_sensor("pleiades-degraded"), load_sensor("pleiades-reference")
 SENSORS = DEGRADED.nominal(), REFERENCE.nominal()
@@ -262,6 +262,13 @@ def test_strips_hold_every_method_and_black_below_the_reference() -> None:
 def test_one_pair_a_site_is_shown() -> None:
     pairs = [pair(f"{site}_{k}.tif") for site in "abcdef" for k in range(2)]
     assert [each.name for each in chosen_pairs(pairs)] == ["a_0.tif", "b_0.tif", "c_0.tif", "d_0.tif"]
+
+
+def test_tables_of_a_sweep_keep_their_words_on_the_page() -> None:
+    mean, *_ = score(IDENTITY, [pair()], PLAIN, 0, lambda: None)
+    swept = Row("sweep, MTF at Nyquist", "nominal", {"degraded": measured(7, "%", "edges")})
+    report = evaluation_report("a test", [mean], [], [swept], [])
+    assert [table.title for table in report.tables] == ["Means over all pairs", "Sweep, MTF at Nyquist"]
 
 
 def test_the_papers_rows_are_published() -> None:
