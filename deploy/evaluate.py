@@ -9,8 +9,9 @@ from deploy.report.evaluation_page import evaluation_report, pictures
 from deploy.report.page import write_report
 from model.evaluation.methods import Method
 from model.evaluation.pairs import NamedPair, oversampling_note, profiles_for, read_pairs_recipe
-from model.evaluation.run import Evaluation, evaluate_methods, load_pairs, sweep_tables
+from model.evaluation.run import Evaluation, evaluate_methods, load_pairs
 from model.evaluation.scores import Instruments, perceptual_distances
+from model.evaluation.sweep import sweep_tables
 from model.metrics.bootstrap import LEAST_SITES
 from profiles.figures import Row
 from profiles.sensor import SensorProfile

@@ -7,7 +7,16 @@ import numpy as np
 import onnx
 
 from deploy.export import float_model
-from deploy.networks import KnownSensor, Say, conditioned, known_sensor, network_file, silent
+from deploy.networks import (
+    KnownSensor,
+    Say,
+    conditioned,
+    int8_file,
+    known_sensor,
+    network_file,
+    silent,
+    specialised_model,
+)
 from deploy.restoration.engine import restore_dn
 from deploy.restoration.options import TILE_PX, Runtime
 from deploy.restoration.plan import make_plan
@@ -19,6 +28,7 @@ from model.evaluation.methods import (
     TRADITIONAL,
     Method,
     Restore,
+    Specialise,
     method_without_network,
 )
 from model.shipped import BLIND as NOT_KNOWN
@@ -27,7 +37,7 @@ from model.traditional.peers import PEERS
 from profiles.constant import Constant
 from profiles.errors import OptionError
 from profiles.sensor import Sensor, SensorProfile
-from quant.onnx_file import fixed_tile_px, metadata, receptive_radius_px
+from quant.onnx_file import fixed_tile_px, load_onnx, metadata, receptive_radius_px
 
 EXPECTED = (
     f"degraded, {TRADITIONAL}, {DECONVOLVE_FIRST} (each also with -fast or -best), {', '.join(PEERS)}, "
@@ -65,17 +75,24 @@ def method_named(name: str, degraded: SensorProfile, reference: SensorProfile, s
         raise OptionError("--methods", expected=EXPECTED, got=repr(name), remedy="correct that name")
     sensor = known_sensor(other) if other else KnownSensor(degraded.name, degraded)
     model = float_model(network_file(Path(network), sensor, say))
-    max_dn = degraded.nominal().max_dn
+    known = knowledge_of(model, degraded.name)
+    specialise = None if other else _specialise(network, degraded, say)
+    return Method(name, network_method(model, degraded.nominal().max_dn), known, specialise)
 
-    def specialise(truth: Sensor) -> Restore:
-        profile = profile_of(truth, degraded)
-        file = network_file(Path(network), KnownSensor(DRAWN, profile), say)
-        return network_method(float_model(file), truth.max_dn)
 
-    alike = other or conditioned(Path(network)) is None
-    return Method(
-        name, network_method(model, max_dn), knowledge_of(model, degraded.name), None if alike else specialise
-    )
+def _specialise(name: str, like: SensorProfile, say: Say) -> Specialise | None:
+    """A conditioned network specialised to any sensor in the grid of a profile; None of a network that is plain."""
+    found = conditioned(Path(name))
+    if found is None:
+        return None
+
+    def specialise(sensor: Sensor) -> Restore:
+        known = KnownSensor(DRAWN, profile_of(sensor, like))
+        if name.endswith(INT8):  # minutes, so it is kept; float32 is made in a moment
+            return network_method(load_onnx(int8_file(Path(name), known, say)), sensor.max_dn)
+        return network_method(specialised_model(found, known, say), sensor.max_dn)
+
+    return specialise
 
 
 def _is_network(name: str) -> bool:

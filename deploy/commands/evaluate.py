@@ -35,15 +35,16 @@ def evaluate(
     ] = None,
     out: Annotated[Path | None, typer.Option(help="Folder for report.html and picture strips.")] = None,
     sweep: Annotated[
-        bool, typer.Option("--sweep", help="Also PSNR and MTF under other blurs, noises and gains.")
+        bool, typer.Option("--sweep", help="Also under 16 sensors known as they are, and 7 known wrongly.")
     ] = False,
     seed: Annotated[int, typer.Option(min=0, max=SEEDS, help="Seed of every random draw.")] = 0,
     json: Annotated[Path | None, typer.Option(help="Write the figures here.")] = None,
 ) -> None:
     """Compare restorations with the reference, on average and by site; the degraded input is always a row.
 
-    PSNR leaves out clipped pixels. MTF and SNR are measured on restored slanted edges and flat fields. Traditional
-    methods know both sensors' nominal figures; networks are blind, but may have been made for the sensor.
+    PSNR leaves out clipped pixels; of simulated pairs it is also taken against the reference without its noise. MTF
+    and SNR are measured on restored slanted edges and flat fields. Traditional methods know both sensors' nominal
+    figures; networks are blind, but may have been made for the sensor.
     """
     from deploy.evaluate import EvaluationRequest, run_evaluation
     from deploy.results import Document, print_rows

@@ -70,7 +70,7 @@ def evaluation_report(
     """The page: pictures, means, sites, and the sweep where there was one; `sampled` is one more note."""
     tables = [Table("Means over all pairs", mean, MEAN_CAPTION)]
     tables += [Table(name, rows, SITES_CAPTION) for name, rows in by_table(sites).items()]
-    tables += [Table(name.capitalize(), rows) for name, rows in by_table(swept).items()]
+    tables += [Table(f"{name[0].upper()}{name[1:]}", rows, SWEEP_CAPTION) for name, rows in by_table(swept).items()]
     notes = (*NOTES, f"{sampled[0].upper()}{sampled[1:]}.") if sampled else NOTES
     return Report(title, headline(mean), tables, pictures, notes)
 
@@ -81,6 +81,10 @@ MEAN_CAPTION = (
     "stands beside it: one that knows it has an advantage that it may not have in orbit."
 )
 SITES_CAPTION = "Over full scale; from PSNR, pixels that clipped in the input or the reference are left out."
+SWEEP_CAPTION = (
+    "One image of each site. The chain and every network that can know a sensor know that of the row, unless it says "
+    "that another one is supposed. Of gains and losses the interval is that of differences on the same images."
+)
 NOTES = (
     "MTF at Nyquist is measured on restored slanted edges.",
     "SNR is measured in restored flat fields, where nothing is to be seen: a denoiser may reach any SNR there.",

@@ -10,7 +10,14 @@ import numpy as np
 
 from model.io.images import MAX_DN, read_acquisition, site_of
 from model.shipped import SENSOR
-from model.simulator.acquire import LEAST_SIDE_PX, MARGIN_PX, fitting_oversampling, simulate_pair
+from model.simulator.acquire import (
+    LEAST_SIDE_PX,
+    MARGIN_PX,
+    NOISE,
+    acquire,
+    fitting_oversampling,
+    prepare_scene,
+)
 from model.simulator.detector import Draw
 from model.simulator.sampling import Scene
 from model.training.patches import pair_files
@@ -108,6 +115,7 @@ class NamedPair:
     Attributes:
         place: its site, where one is known by more than the name.
         oversampling: scene pixels per pixel, where the pair was simulated here.
+        noise_free: the reference without noise and rounding, (H, W) float32, where the pair was simulated here.
     """
 
     name: str
@@ -115,6 +123,7 @@ class NamedPair:
     reference: np.ndarray
     place: str | None = None
     oversampling: int | None = None
+    noise_free: np.ndarray | None = None
 
     @property
     def site(self) -> str:
@@ -145,8 +154,7 @@ def simulate_pairs(
             continue
         draw = Draw(seed, number)
         drawn = [profile.draw(draw.generator("sensor")) for profile in (degraded, reference)]
-        pair = simulate_pair(scene.radiance, drawn[0], drawn[1], ratio, draw)
-        pairs.append(NamedPair(scene.name, pair.degraded.numpy(), pair.reference.numpy(), oversampling=ratio))
+        pairs.append(_simulated(scene, drawn[0], drawn[1], ratio, draw))
     if not pairs:
         least = oversamplings[-1] * (2 * MARGIN_PX + LEAST_SIDE_PX)
         raise ImageError(
@@ -156,6 +164,21 @@ def simulate_pairs(
             remedy="give larger images",
         )
     return pairs, small
+
+
+def _simulated(scene: Scene, degraded: Sensor, reference: Sensor, ratio: int, draw: Draw) -> NamedPair:
+    """Three acquisitions of one scene: the pair, and the reference once more without its noise."""
+    prepared = prepare_scene(scene.radiance, ratio)
+    spectrum, width = prepared.spectrum, prepared.radiance.shape[-1]
+    seen, meant, clean = (
+        acquire(spectrum, width, sensor, ratio, draw, role, skip=skip).numpy()
+        for sensor, role, skip in (
+            (degraded, "degraded", ()),
+            (reference, "reference", ()),
+            (reference, "reference", NOISE),
+        )
+    )
+    return NamedPair(scene.name, seen, meant, oversampling=ratio, noise_free=clean)
 
 
 def oversamplings_of(profile: SensorProfile) -> tuple[int, ...]:

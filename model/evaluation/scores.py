@@ -54,7 +54,9 @@ def _distance(metric: Lpips | Dists) -> Perceptual:
 
 
 DISTANCE = "distance"
-UNITS = {"PSNR": "dB", "PSNR gain": "dB", "SSIM": "ratio"}
+NOISE_FREE = "PSNR, reference without noise"
+UNITS = {"PSNR": "dB", "PSNR gain": "dB", NOISE_FREE: "dB", "SSIM": "ratio"}
+READ = "pairs read from files hold no reference without noise"
 IDENTICAL = "infinite: identical to the reference"
 
 
@@ -80,13 +82,20 @@ class Instruments:
             scores[name] = None if isinstance(distance, str) else distance(*both)
         return scores
 
+    def score_pair(self, dn: np.ndarray, pair: NamedPair) -> dict[str, float | None]:
+        """The figures of one restored image of a pair, and its PSNR against the reference without noise."""
+        clean = pair.noise_free
+        psnr = None if clean is None else fidelity_db(dn, clean, pair.degraded, self.max_dn)
+        scores = self.score(dn, pair.reference, pair.degraded)
+        return {"PSNR": scores["PSNR"], NOISE_FREE: psnr, **scores}
+
     def figure(
         self, key: str, value: float | None, source: str, interval: tuple[float, float] | None = None
     ) -> Figure:
         """A score as a figure; unavailable with the reason where there is none."""
         unit = UNITS.get(key, DISTANCE)
         if value is None:
-            return unavailable(unit, str(self.perceptual[key]))
+            return unavailable(unit, READ if key == NOISE_FREE else str(self.perceptual[key]))
         return measured(value, unit, source, interval) if np.isfinite(value) else unavailable(unit, IDENTICAL)
 
 
@@ -102,7 +111,7 @@ def score(
     """The mean row of a method, then one row an image."""
     rows, scores = [], []
     for pair in pairs:
-        values = instruments.score(method.restore(pair.degraded), pair.reference, pair.degraded)
+        values = instruments.score_pair(method.restore(pair.degraded), pair)
         figures = {key: instruments.figure(key, value, "one pair") for key, value in values.items()}
         rows.append(Row("images", f"{method.name}: {pair.name}", figures, {"site": pair.site}))
         scores.append(values)
@@ -134,7 +143,7 @@ def mean_row(
 
 
 def site_rows(rows: Sequence[Row]) -> list[Row]:
-    """PSNR, SSIM and what perceptual distances there are, by site: a row a site, a column a method."""
+    """PSNR, SSIM and what other scores there are, by site: a row a site, a column a method."""
     images = [row for row in rows if row.table == "images"]
     keys = [key for key in images[0].figures if key != "PSNR gain" and any(row.figures[key].value for row in images)]
     sites = list(dict.fromkeys(row.text["site"] for row in images))

@@ -20,6 +20,10 @@ LEAST_SIDE_PX = 48
 """Target pixels a side that evaluation and validation want of an image, without its margins."""
 
 
+NOISE = ("noise", "digitising")
+"""What an acquisition leaves out to be free of noise: that of the light and the detector, and that of rounding."""
+
+
 @dataclass(frozen=True)
 class Pair:
     """Two acquisitions of one scene, (..., H, W) float32 holding whole digital numbers."""
@@ -110,6 +114,7 @@ def acquire(
     role: str,
     offset_px: tuple[float, float] = (0.0, 0.0),
     margin_px: int = MARGIN_PX,
+    skip: Collection[str] = (),
 ) -> Tensor:
     """Digital numbers (h, w) of one acquisition: blur and sampling, then what `detect` does on the target grid.
 
@@ -122,10 +127,11 @@ def acquire(
         role: "degraded" or "reference"; keeps the two noises of a pair independent.
         offset_px: sub-pixel phase of the sampling grid, in scene pixels.
         margin_px: target pixels cropped on each side.
+        skip: what to leave out of `detect`.
     """
     transfer = sensor_transfer(spectrum.shape[-2], width, oversampling, sensor, spectrum.device)
     signal = crop_margin(sample(spectrum, transfer, width, oversampling, offset_px), margin_px)
-    return detect(signal, sensor, draw, role)
+    return detect(signal, sensor, draw, role, skip)
 
 
 def fitting_oversampling(radiance: Tensor, oversamplings: Iterable[int], side_px: int) -> int | None:

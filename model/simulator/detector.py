@@ -156,14 +156,14 @@ DN_EFFECTS = ("dsnu", "striping", "offset", "defects")
 
 
 def detect(signal: Tensor, sensor: Sensor, draw: Draw, role: str, skip: Collection[str] = ()) -> Tensor:
-    """Whole digital numbers of a blurred, sampled signal (..., H, W) in W/m2/sr/um.
+    """Digital numbers of a blurred, sampled signal (..., H, W) in W/m2/sr/um: whole ones, unless told otherwise.
 
     Args:
         signal: radiance on the target grid.
         sensor: the instrument; it has an effect by having its table.
         draw: seed and patch number; each effect takes its own generator from it.
         role: "degraded" or "reference", so that the two draws of a pair differ.
-        skip: effects to leave out, see `plan.Plan.skipped`.
+        skip: effects to leave out, see `plan.Plan.skipped`; without "digitising" they are clipped and not rounded.
     """
     wanted = {name: effect for name, effect in sensor.effects.items() if name not in skip}
 
@@ -176,7 +176,8 @@ def detect(signal: Tensor, sensor: Sensor, draw: Draw, role: str, skip: Collecti
     signal = apply(signal, RADIANCE_EFFECTS)
     if "noise" not in skip:
         signal = add_noise(signal, sensor, draw.generator(f"noise-{role}"))
-    return digitise_dn(apply(signal * sensor.gain_dn_per_radiance, DN_EFFECTS), sensor)
+    dn = apply(signal * sensor.gain_dn_per_radiance, DN_EFFECTS)
+    return dn.clamp(0, sensor.max_dn) if "digitising" in skip else digitise_dn(dn, sensor)
 
 
 def apply_effect(

@@ -11,20 +11,22 @@ from typer.testing import CliRunner
 
 from deploy.cli import app
 from deploy.methods import method_named
-from deploy.report.evaluation_page import chosen_pairs, strip_of
+from deploy.report.evaluation_page import chosen_pairs, evaluation_report, strip_of
 from deploy.results import SCHEMA_PATH, Document, missing
 from model.evaluation import targets as targets_module
 from model.evaluation.methods import Method
 from model.evaluation.pairs import NamedPair, oversampling_note, oversamplings_of, read_pairs, simulate_pairs
-from model.evaluation.scores import Instruments, fidelity_db, paper_rows, score, site_rows
+from model.evaluation.scores import NOISE_FREE, READ, Instruments, fidelity_db, paper_rows, score, site_rows
 from model.evaluation.targets import acquire_targets, flat_figure, mtf_figure, snr_name, target_figures
 from model.io.tiff import write_tiff
 from model.metrics.refusal import Refusal
+from model.simulator.acquire import simulate_pair
+from model.simulator.detector import Draw
 from model.simulator.procedural import procedural_scene
 from profiles import load_sensor
 from profiles.constant import Constant
 from profiles.errors import ImageError, OptionError
-from profiles.figures import by_table
+from profiles.figures import Row, by_table, measured
 
 DEGRADED, REFERENCE = load_sensor("pleiades-degraded"), load_sensor("pleiades-reference")
 SENSORS = DEGRADED.nominal(), REFERENCE.nominal()
@@ -177,7 +179,7 @@ def test_the_degraded_input_gains_nothing_and_missing_figures_have_a_reason() ->
     assert mean.figures["PSNR gain"].value == 0
     assert len(images) == 5
     assert mean.figures["LPIPS-squeeze"].reason == "no weights"
-    assert missing([mean, *images]) == ["- LPIPS-squeeze: no weights"]
+    assert missing([mean, *images]) == [f"- {NOISE_FREE}: {READ}", "- LPIPS-squeeze: no weights"]
     interval = mean.figures["PSNR"].interval
     assert interval is not None
     assert interval[0] <= (mean.figures["PSNR"].value or 0) <= interval[1]
@@ -194,6 +196,41 @@ def test_identical_images_are_no_number() -> None:
     mean, image = score(IDENTITY, [perfect], PLAIN, 0, lambda: None)
     assert mean.figures["PSNR"].value is None
     assert "identical" in image.figures["PSNR"].reason
+
+
+def test_the_reference_without_noise_is_the_same_acquisition_otherwise() -> None:
+    """What is left between the two is the reference sensor's noise and rounding; the pair's bytes are as ever."""
+    scene = procedural_scene(700, 760, np.random.default_rng(3))
+    (one,), _ = simulate_pairs([scene], DEGRADED, REFERENCE, 7)
+    same = simulate_pair(scene.radiance, *SENSORS, 4, Draw(7))
+    assert np.array_equal(one.degraded, same.degraded.numpy())
+    assert np.array_equal(one.reference, same.reference.numpy())
+    assert one.noise_free is not None
+    noise, sensor = one.reference - one.noise_free, SENSORS[1]
+    light = np.clip(one.noise_free / sensor.gain_dn_per_radiance, 0, None)
+    variance = (sensor.alpha * light + sensor.beta) * sensor.gain_dn_per_radiance**2 + 1 / 12
+    sound = one.reference < sensor.max_dn
+    assert float((noise**2 / variance)[sound].mean()) == pytest.approx(1, abs=0.05)
+    assert abs(float(noise[sound].mean())) < 3 * float(np.sqrt(variance.mean() / noise.size))
+
+
+def test_noise_of_the_reference_is_no_error_of_a_method_that_leaves_it_out() -> None:
+    scene = procedural_scene(700, 760, np.random.default_rng(3))
+    (one,), _ = simulate_pairs([scene], DEGRADED, REFERENCE, 7)
+    clean = one.noise_free
+    assert clean is not None
+    oracle = Method("oracle", lambda _: clean + np.float32(2), "known")
+    mean, image = score(oracle, [one], PLAIN, 0, lambda: None)
+    assert f"{NOISE_FREE} by site" in by_table(site_rows([image]))
+    noise_free = mean.figures[NOISE_FREE].value or 0
+    assert noise_free == pytest.approx(20 * np.log10(4095 / 2), abs=1e-3)
+    assert noise_free > (mean.figures["PSNR"].value or 0) + 5
+
+
+def test_pairs_from_files_hold_no_reference_without_noise() -> None:
+    mean, image = score(IDENTITY, [pair()], PLAIN, 0, lambda: None)
+    assert [row.figures[NOISE_FREE].reason for row in (mean, image)] == [READ, READ]
+    assert NOISE_FREE not in {row.table.removesuffix(" by site") for row in site_rows([image])}
 
 
 def test_sites_are_means_of_their_images() -> None:
@@ -243,6 +280,13 @@ def test_strips_hold_every_method_and_black_below_the_reference() -> None:
 def test_one_pair_a_site_is_shown() -> None:
     pairs = [pair(f"{site}_{k}.tif") for site in "abcdef" for k in range(2)]
     assert [each.name for each in chosen_pairs(pairs)] == ["a_0.tif", "b_0.tif", "c_0.tif", "d_0.tif"]
+
+
+def test_tables_of_a_sweep_keep_their_words_on_the_page() -> None:
+    mean, *_ = score(IDENTITY, [pair()], PLAIN, 0, lambda: None)
+    swept = Row("sweep, MTF at Nyquist", "nominal", {"degraded": measured(7, "%", "edges")})
+    report = evaluation_report("a test", [mean], [], [swept], [])
+    assert [table.title for table in report.tables] == ["Means over all pairs", "Sweep, MTF at Nyquist"]
 
 
 def test_the_papers_rows_are_published() -> None:

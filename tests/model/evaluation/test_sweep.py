@@ -1,69 +1,132 @@
-"""Conditions of a sweep, and what a chain loses when it is told the wrong sensor."""
+"""Conditions of a sweep: who is told which sensor, and what a chain loses when it is told the wrong one."""
 
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
 
-from model.evaluation import run as module
+from model.evaluation import sweep as module
 from model.evaluation import targets as targets_module
-from model.evaluation.methods import Method
-from model.evaluation.run import NOMINAL_KNOWN, TRUTH_KNOWN, Condition, Fixed, conditions, sweep_rows
+from model.evaluation.methods import BLIND, Method, Restore
+from model.evaluation.sweep import Condition, Fixed, Sweep, conditions, suppositions
+from model.evaluation.sweep_rows import NOMINAL_KNOWN, TRUTH_KNOWN
 from model.simulator.procedural import procedural_scene
 from profiles import SensorProfile, load_sensor
-from profiles.figures import Row
+from profiles.figures import Row, by_table
 from profiles.sensor import Sensor
 
 PROFILE, REFERENCE = load_sensor("pleiades-degraded"), load_sensor("pleiades-reference")
 NOMINAL = PROFILE.nominal()
+DRIFTED = Condition("MTF 3%", replace(NOMINAL, mtf_nyquist=0.03))
+DIM = Condition("dim", replace(NOMINAL, gain_dn_per_radiance=0.7 * NOMINAL.gain_dn_per_radiance))
+
+WRONG = "MTF 3%, supposed MTF 7%"
+WRONGLY = "sweep, sensor known wrongly", "sweep, lost by a sensor known wrongly"
 
 
 def test_every_condition_is_a_sensor_that_can_be() -> None:
     found = conditions(NOMINAL, PROFILE)
     assert found[0].sensor == NOMINAL
-    assert len({each.name for each in found}) == len(found)
+    assert len({each.name for each in found}) == len(found) == 16
     for each in found:
-        assert 0 < each.sensor.mtf_nyquist < 0.6
+        assert all(0 < mtf < 0.6 for mtf in each.sensor.mtf_axes)
         assert each.sensor.alpha >= 0
         assert each.sensor.beta >= 0
+
+
+def test_what_is_supposed_wrongly_is_another_sensor_than_the_one_of_a_condition() -> None:
+    sensors = {each.name: each.sensor for each in conditions(NOMINAL, PROFILE)}
+    for truth, supposed in suppositions(NOMINAL, PROFILE).items():
+        assert all(each.sensor != sensors[truth] for each in supposed)
+    more, less = (each.sensor for each in suppositions(NOMINAL, PROFILE)["nominal"])
+    for radiance in (25, 100):
+        sigma = NOMINAL.noise_sigma(radiance)
+        assert (sigma / more.noise_sigma(radiance), sigma / less.noise_sigma(radiance)) == pytest.approx(
+            (4 / 3, 2 / 3)
+        )
 
 
 def test_a_fixed_sensor_is_what_every_draw_gives() -> None:
     assert Fixed(NOMINAL).draw(np.random.default_rng(0)) is NOMINAL
 
 
-def rows(monkeypatch: pytest.MonkeyPatch, chosen: Sequence[Condition]) -> dict[str, Row]:
-    monkeypatch.setattr(targets_module, "REPEATS", 1)
-
-    def few(_nominal: Sensor, _profile: SensorProfile) -> list[Condition]:
-        return list(chosen)
-
-    monkeypatch.setattr(module, "conditions", few)
-    scene = procedural_scene(700, 760, np.random.default_rng(5))
-    half = Method("half", lambda dn: dn / 2, "blind")
-    ticks: list[int] = []
-    found = sweep_rows([half], [scene], PROFILE, REFERENCE, 0, lambda: ticks.append(1))
-    assert len(ticks) == len(chosen)
-    assert [row.table for row in found] == sorted(row.table for row in found)
-    return {row.name: row for row in found if row.table == "sweep, PSNR"}
+def half(dn: np.ndarray) -> np.ndarray:
+    return dn / 2
 
 
-def level(row: Row, method: str) -> float:
-    return row.figures[method].value or 0.0
+@dataclass(frozen=True)
+class Swept:
+    """One sweep under three conditions: its rows, its ticks, and the sensors that the able network was given."""
+
+    tables: dict[str, dict[str, Row]]
+    ticks: list[str]
+    given: list[Sensor]
+    size: int
 
 
-def test_the_truth_pays_where_the_sensor_has_drifted(monkeypatch: pytest.MonkeyPatch) -> None:
-    drifted = Condition("MTF 3%", replace(NOMINAL, mtf_nyquist=0.03))
-    found = rows(monkeypatch, [Condition("nominal", NOMINAL), drifted])
-    assert level(found["nominal"], TRUTH_KNOWN) == level(found["nominal"], NOMINAL_KNOWN)
-    assert level(found["MTF 3%"], TRUTH_KNOWN) > level(found["MTF 3%"], NOMINAL_KNOWN) + 1
-    assert level(found["nominal"], "half") < level(found["nominal"], "degraded") - 5
+@pytest.fixture(scope="module")
+def swept() -> Iterator[Swept]:
+    given: list[Sensor] = []
+
+    def specialise(sensor: Sensor) -> Restore:
+        given.append(sensor)
+        return lambda dn: dn + np.float32(1000 * sensor.mtf_nyquist)
+
+    able = Method("able", half, BLIND, specialise)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(targets_module, "REPEATS", 1)
+        patch.setattr(targets_module, "ANGLES_DEG", (5.0, 8.0))
+        patch.setattr(targets_module, "SIDE_PX", 100)
+        patch.setattr(module, "conditions", few)
+        scene = procedural_scene(500, 560, np.random.default_rng(5))
+        sweep, ticks = Sweep([Method("half", half, BLIND), able], [scene], PROFILE, REFERENCE, 0), list[str]()
+        rows = sweep.run(ticks.append).rows
+        tables = {table: {row.name: row for row in rows} for table, rows in by_table(rows).items()}
+        yield Swept(tables, ticks, given, sweep.size)
 
 
-def test_another_gain_is_told_to_the_chains_and_kept(monkeypatch: pytest.MonkeyPatch) -> None:
+def few(_nominal: Sensor, _profile: SensorProfile) -> list[Condition]:
+    return [Condition("nominal", NOMINAL), DRIFTED, DIM]
+
+
+def psnr(swept: Swept, condition: str) -> Callable[[str], float]:
+    return lambda method: swept.tables["sweep, PSNR"][condition].figures[method].value or 0.0
+
+
+def test_every_trial_ticks_and_says_what_it_was(swept: Swept) -> None:
+    assert len(swept.ticks) == swept.size
+    assert swept.ticks[:2] == ["nominal: degraded", "nominal: traditional"]
+
+
+def test_a_network_that_can_know_the_sensor_knows_that_of_each_condition(swept: Swept) -> None:
+    """Then those that are supposed in its place; it never restores as it does by itself."""
+    wrong = suppositions(NOMINAL, PROFILE)
+    supposed = [[each.sensor for each in wrong[name]] for name in ("nominal", "MTF 3%")]
+    assert swept.given == [NOMINAL, *supposed[0], DRIFTED.sensor, *supposed[1], DIM.sensor]
+    at = psnr(swept, "nominal")
+    assert at("half") < at("able") - 3
+
+
+def test_the_truth_pays_where_the_sensor_has_drifted(swept: Swept) -> None:
+    nominal, drifted = psnr(swept, "nominal"), psnr(swept, "MTF 3%")
+    assert nominal(TRUTH_KNOWN) == nominal(NOMINAL_KNOWN)
+    assert drifted(TRUTH_KNOWN) > drifted(NOMINAL_KNOWN) + 1
+    assert nominal("half") < nominal("degraded") - 5
+
+
+def test_another_gain_is_told_to_the_chains_and_kept(swept: Swept) -> None:
     """The reference has the gain of the input, so brightness is no error of a method that knows no gains."""
-    dimmer = replace(NOMINAL, gain_dn_per_radiance=0.7 * NOMINAL.gain_dn_per_radiance)
-    found = rows(monkeypatch, [Condition("nominal", NOMINAL), Condition("dim", dimmer)])
-    assert level(found["dim"], NOMINAL_KNOWN) == level(found["dim"], TRUTH_KNOWN)
-    assert level(found["dim"], "degraded") == pytest.approx(level(found["nominal"], "degraded") + 3.1, abs=0.5)
+    nominal, dim = psnr(swept, "nominal"), psnr(swept, "dim")
+    assert dim(NOMINAL_KNOWN) == dim(TRUTH_KNOWN)
+    assert dim("degraded") == pytest.approx(nominal("degraded") + 3.1, abs=0.5)
+
+
+def test_what_a_wrong_sensor_costs_is_counted_from_the_truth_known(swept: Swept) -> None:
+    wrong, lost = (swept.tables[name] for name in WRONGLY)
+    assert list(wrong) == list(lost) == ["nominal, supposed SNR x 1.33", "nominal, supposed SNR x 0.67", WRONG]
+    for method, known in (("traditional", TRUTH_KNOWN), ("able", "able")):
+        row, cost = wrong[WRONG].figures[method].value or 0, lost[WRONG].figures[method].value or 0
+        assert cost == pytest.approx(psnr(swept, "MTF 3%")(known) - row)
+    assert (lost[WRONG].figures["traditional"].value or 0) > 1
+    assert list(wrong[WRONG].figures) == ["traditional", "able"]
