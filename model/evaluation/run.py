@@ -47,8 +47,8 @@ def conditions(nominal: Sensor, profile: SensorProfile) -> list[Condition]:
 
 
 def _sharp(sensor: Sensor, mtf: float) -> Sensor:
-    """The sensor with that MTF at Nyquist on both axes."""
-    return replace(sensor, mtf_nyquist=mtf, mtf_nyquist_along=None)
+    """The sensor with the formula's MTF, that at Nyquist on both axes."""
+    return replace(sensor, mtf_nyquist=mtf, mtf_nyquist_along=None, response=None)
 
 
 def _noisy(sensor: Sensor, profile: SensorProfile, snr_0: float, snr_1: float) -> Sensor:
