@@ -110,13 +110,11 @@ def knowledge_of(model: onnx.ModelProto, sensor_name: str) -> str:
 def profile_of(sensor: Sensor, like: SensorProfile) -> SensorProfile:
     """A profile of which every draw is that sensor, in the grid of another profile."""
     across, along = sensor.mtf_axes
-    snr_0, snr_1 = (
-        radiance / sensor.noise_sigma(radiance) for radiance in (like.radiance_0.low, like.radiance_1.low)
-    )
-    numbers = {"mtf_nyquist": across, "mtf_nyquist_along": along, "snr_0": snr_0, "snr_1": snr_1}
+    numbers = {"mtf_nyquist": across, "mtf_nyquist_along": along, "alpha": sensor.alpha, "beta": sensor.beta}
     numbers |= {"gain_dn_per_radiance": sensor.gain_dn_per_radiance, "bits": float(sensor.bits)}
     constants = {name: Constant(value, "assumed", "a sensor drawn") for name, value in numbers.items()}
-    return replace(like, **constants)  # type: ignore[arg-type]  # each is a field that holds a Constant
+    noise = {"snr_0": None, "snr_1": None}
+    return replace(like, **constants, **noise, response=sensor.response)  # type: ignore[arg-type]
 
 
 def network_method(model: onnx.ModelProto, max_dn: int) -> Restore:

@@ -9,7 +9,7 @@ import shutil
 import sys
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from itertools import groupby
 from pathlib import Path
 from typing import Any
@@ -136,7 +136,8 @@ def _make_patch(recipe: DatasetRecipe, window: Window, radiance: torch.Tensor, o
         plan = make_plan(sensor, part.stats, recipe.tolerance_dn)
         dn = simulate_planned(part, sensor, draw, plan, role)
         write_tiff(out / role / f"{window.name}.tif", to_uint16(dn))
-        line[role] = {"sensor": asdict(sensor), "rejected_snr_pairs": rejected, "plan": plan.to_json()}
+        drawn = asdict(replace(sensor, response=None))  # a response is the same for all: the recipe keeps it
+        line[role] = {"sensor": drawn, "rejected_snr_pairs": rejected, "plan": plan.to_json()}
     return line
 
 

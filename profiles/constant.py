@@ -41,8 +41,18 @@ def read_constant(where: str, raw: object) -> Constant:
 
     A bare number is the user's own statement: status "stated".
     """
+    value, status, source = read_stated(where, raw)
+    return Constant(_number(where, value), status, source)
+
+
+def read_stated(where: str, raw: object) -> tuple[object, Status, str]:
+    """Value, status and source of what a profile states in either way; the value, of any kind, is not checked.
+
+    Raises:
+        ProfileError: no such status, or no source.
+    """
     if not isinstance(raw, Mapping):
-        return Constant(_number(where, raw), "stated", "stated by the profile without a source")
+        return raw, "stated", "stated by the profile without a source"
     check_keys(where, raw, required={"value", "status", "source"})
     status, source = raw["status"], raw["source"]
     if status not in get_args(Status):
@@ -59,7 +69,7 @@ def read_constant(where: str, raw: object) -> Constant:
             got=repr(source),
             remedy="say where the number comes from",
         )
-    return Constant(_number(where, raw["value"]), status, source)
+    return raw["value"], status, source
 
 
 def check_keys(

@@ -13,6 +13,7 @@ from profiles.constant import Constant
 from profiles.effects import TABLES as EFFECT_TABLES
 from profiles.effects import Effect, Offset, Table, draw_effect, middle_effect
 from profiles.errors import ProfileError
+from profiles.response import Response
 
 MTF_NYQUIST_MAX = 2 / math.pi
 """A perfect lens over a square detector: sinc(0.5). Nothing above it is a blur: its gamma would be negative."""
@@ -43,6 +44,11 @@ class Sensor:
             detectors lies across the track: image rows are lines in time, so "across" is the horizontal axis (along
             a row, fx) and "along" the vertical one (down a column, fy).
         radiance_1: of what is bright in its scenes, in W/m2/sr/um: the brighter point at which its SNR is stated.
+        response: the blur in full, by a table or a point-spread function; its contrasts at Nyquist then stand in
+            `mtf_nyquist` and `mtf_nyquist_along`. None for the formula's blur, which these two settle.
+
+    Raises:
+        ValueError: contrasts at Nyquist that are not those of the response.
     """
 
     mtf_nyquist: float
@@ -53,6 +59,16 @@ class Sensor:
     effects: Mapping[str, Effect] = field(default_factory=dict)
     mtf_nyquist_along: float | None = None
     radiance_1: float = 100.0
+    response: Response | None = None
+
+    def __post_init__(self) -> None:
+        if self.response is not None and not np.allclose(self.mtf_axes, self.response.at_nyquist):
+            raise ValueError(f"MTF {self.mtf_axes} at Nyquist beside a response of {self.response.at_nyquist}")
+
+    @property
+    def blur(self) -> tuple[float, float] | Response:
+        """What settles the MTF at every frequency: the response where there is one, else the two contrasts."""
+        return self.mtf_axes if self.response is None else self.response
 
     @property
     def mtf_axes(self) -> tuple[float, float]:
@@ -83,7 +99,11 @@ class Sensor:
 
 @dataclass(frozen=True)
 class SensorProfile:
-    """What one TOML file under `profiles/sensors/` states, each constant with its source."""
+    """What one TOML file under `profiles/sensors/` states, each constant with its source.
+
+    Its noise is stated by two SNRs, at `radiance_0` and `radiance_1`, or by `alpha` and `beta`. Its blur is that of a
+    table or a point-spread function where `response` is one.
+    """
 
     name: str
     description: str
@@ -91,13 +111,16 @@ class SensorProfile:
     oversampling: Constant
     mtf_nyquist: Constant
     radiance_0: Constant
-    snr_0: Constant
     radiance_1: Constant
-    snr_1: Constant
     bits: Constant
     gain_dn_per_radiance: Constant
+    snr_0: Constant | None = None
+    snr_1: Constant | None = None
+    alpha: Constant | None = None
+    beta: Constant | None = None
     effects: Mapping[str, Table] = field(default_factory=dict)
     mtf_nyquist_along: Constant | None = None
+    response: Response | None = None
 
     @property
     def units(self) -> tuple[float, float, float]:
@@ -122,42 +145,66 @@ class SensorProfile:
 
     def draw_counted(self, generator: np.random.Generator) -> tuple[Sensor, int]:
         """As `draw`, with the number of SNR pairs that were rejected as impossible."""
-        mtf_nyquist = float(generator.uniform(self.mtf_nyquist.low, self.mtf_nyquist.high))
+        mtf_nyquist = _uniform(generator, self.mtf_nyquist)
+        (alpha, beta), rejected = self._draw_noise(generator)
+        effects = {name: draw_effect(name, table, generator) for name, table in self.effects.items()}
+        along = self.mtf_nyquist_along  # drawn last: a profile without it draws what it always drew
+        mtf_along = None if along is None else _uniform(generator, along)
+        return self._sensor(mtf_nyquist, alpha, beta, effects, mtf_along), rejected
+
+    def _draw_noise(self, generator: np.random.Generator) -> tuple[tuple[float, float], int]:
+        """Alpha and beta, and the number of SNR pairs that were rejected."""
+        if self.alpha is not None and self.beta is not None:
+            return (_uniform(generator, self.alpha), _uniform(generator, self.beta)), 0
+        pair = self.snr_pair
         for rejected in range(MAX_DRAWS):
-            snr_0 = float(generator.uniform(self.snr_0.low, self.snr_0.high))
-            snr_1 = float(generator.uniform(self.snr_1.low, self.snr_1.high))
+            snr_0, snr_1 = (_uniform(generator, snr) for snr in pair)
             alpha, beta = noise_from_snr(self.radiance_0.low, snr_0, self.radiance_1.low, snr_1)
             if alpha >= 0 and beta >= 0:
-                effects = {name: draw_effect(name, table, generator) for name, table in self.effects.items()}
-                along = self.mtf_nyquist_along  # drawn last: a profile without it draws what it always drew
-                mtf_along = None if along is None else float(generator.uniform(along.low, along.high))
-                return self._sensor(mtf_nyquist, alpha, beta, effects, mtf_along), rejected
+                return (alpha, beta), rejected
         raise self.impossible_snr()
 
     def nominal(self) -> Sensor:
         """The middle of every range (the SNR at radiance_0 moved to the nearest physical value)."""
-        snr_1 = _middle(self.snr_1)
-        low, high = snr_0_bounds(self.radiance_0.low, self.radiance_1.low, snr_1)
-        snr_0 = min(max(_middle(self.snr_0), low), high)
-        alpha, beta = noise_from_snr(self.radiance_0.low, snr_0, self.radiance_1.low, snr_1)
+        alpha, beta = self._middle_noise()
         effects = {name: middle_effect(name, table) for name, table in self.effects.items()}
         mtf_along = None if self.mtf_nyquist_along is None else _middle(self.mtf_nyquist_along)
-        return self._sensor(_middle(self.mtf_nyquist), max(alpha, 0.0), max(beta, 0.0), effects, mtf_along)
+        return self._sensor(_middle(self.mtf_nyquist), alpha, beta, effects, mtf_along)
+
+    def _middle_noise(self) -> tuple[float, float]:
+        if self.alpha is not None and self.beta is not None:
+            return _middle(self.alpha), _middle(self.beta)
+        snr_0, snr_1 = map(_middle, self.snr_pair)
+        low, high = snr_0_bounds(self.radiance_0.low, self.radiance_1.low, snr_1)
+        alpha, beta = noise_from_snr(self.radiance_0.low, min(max(snr_0, low), high), self.radiance_1.low, snr_1)
+        return max(alpha, 0.0), max(beta, 0.0)
+
+    @property
+    def snr_pair(self) -> tuple[Constant, Constant]:
+        """The SNRs at `radiance_0` and `radiance_1`.
+
+        Raises:
+            ValueError: the noise is stated by alpha and beta.
+        """
+        if self.snr_0 is None or self.snr_1 is None:
+            raise ValueError(f"sensor profile {self.name} states no SNR")
+        return self.snr_0, self.snr_1
 
     def _sensor(
         self, mtf: float, alpha: float, beta: float, effects: Mapping[str, Effect], mtf_along: float | None
     ) -> Sensor:
-        gain, bits = self.gain_dn_per_radiance.low, int(self.bits.low)
-        return Sensor(mtf, alpha, beta, gain, bits, effects, mtf_along, self.radiance_1.low)
+        gain, bits, bright = self.gain_dn_per_radiance.low, int(self.bits.low), self.radiance_1.low
+        return Sensor(mtf, alpha, beta, gain, bits, effects, mtf_along, bright, self.response)
 
     def impossible_snr(self) -> ProfileError:
         """The error of SNRs that no alpha and beta can have, with the range that the first one must lie in."""
-        low, high = snr_0_bounds(self.radiance_0.low, self.radiance_1.low, self.snr_1.high)
+        snr_0, snr_1 = self.snr_pair
+        low, high = snr_0_bounds(self.radiance_0.low, self.radiance_1.low, snr_1.high)
         return ProfileError(
             f"sensor profile {self.name}: noise.snr_0 and noise.snr_1",
-            expected=f"an SNR of {low:g} to {high:g} at {self.radiance_0} W/m2/sr/um for {self.snr_1.high:g} at "
+            expected=f"an SNR of {low:g} to {high:g} at {self.radiance_0} W/m2/sr/um for {snr_1.high:g} at "
             f"{self.radiance_1} (variance alpha L + beta with alpha, beta >= 0)",
-            got=f"{self.snr_0}",
+            got=f"{snr_0}",
             remedy="correct one of the two; both are linear ratios, not dB",
         )
 
@@ -195,6 +242,10 @@ def _middle(constant: Constant) -> float:
     return (constant.low + constant.high) / 2
 
 
+def _uniform(generator: np.random.Generator, constant: Constant) -> float:
+    return float(generator.uniform(constant.low, constant.high))
+
+
 def noise_from_snr(radiance_0: float, snr_0: float, radiance_1: float, snr_1: float) -> tuple[float, float]:
     """Solve sigma_i^2 = (L_i / SNR_i)^2 = alpha L_i + beta for (alpha, beta) (paper, section 3.3).
 
@@ -217,16 +268,46 @@ def snr_0_bounds(radiance_0: float, radiance_1: float, snr_1: float) -> tuple[fl
     return snr_1 * ratio, snr_1 * math.sqrt(ratio)
 
 
-TABLES: dict[str, tuple[str, ...]] = {
-    "grid": ("gsd_m", "oversampling"),
-    "mtf": ("mtf_nyquist",),
-    "noise": ("radiance_0", "snr_0", "radiance_1", "snr_1"),
-    "digitiser": ("bits", "gain_dn_per_radiance"),
+@dataclass(frozen=True)
+class Way:
+    """One way in which a table of a profile states its matter: the keys that it needs, and those it may have."""
+
+    required: tuple[str, ...]
+    optional: tuple[str, ...] = ()
+
+    @property
+    def keys(self) -> tuple[str, ...]:
+        """All of them."""
+        return self.required + self.optional
+
+
+TABLES: dict[str, tuple[Way, ...]] = {
+    "grid": (Way(("gsd_m", "oversampling")),),
+    "mtf": (
+        Way(("mtf_nyquist",), ("mtf_nyquist_along",)),
+        Way(("frequency", "across"), ("along",)),
+        Way(("psf", "psf_samples_per_px")),
+    ),
+    "noise": (
+        Way(("radiance_0", "snr_0", "radiance_1", "snr_1")),
+        Way(("alpha", "beta"), ("radiance_0", "radiance_1")),
+    ),
+    "digitiser": (Way(("bits", "gain_dn_per_radiance")),),
 }
+"""Every table that a profile has, and the ways to fill it: exactly one of them."""
+
+RESPONSE = ("frequency", "across", "along", "psf", "psf_samples_per_px")
+"""Keys that make up the response; each other key of `TABLES` is a constant, and a field of `SensorProfile`."""
 
 
-OPTIONAL: dict[str, tuple[str, ...]] = {"mtf": ("mtf_nyquist_along",)}
-"""Keys that a table may leave out: without its own, the MTF along the track is that across."""
+def table_keys(table: str) -> tuple[str, ...]:
+    """Every key that a table may have, each once, in the order of its ways."""
+    return tuple(dict.fromkeys(key for way in TABLES[table] for key in way.keys))
+
+
+def constant_keys(table: str) -> tuple[str, ...]:
+    """Those of them that are constants."""
+    return tuple(key for key in table_keys(table) if key not in RESPONSE)
 
 
 def same_instrument(one: SensorProfile, other: SensorProfile) -> bool:
@@ -236,7 +317,10 @@ def same_instrument(one: SensorProfile, other: SensorProfile) -> bool:
 
 def numbers_of(profile: SensorProfile) -> dict[str, object]:
     """The low and high end of each constant by name: what of a profile decides what its images are like."""
-    keys = [key for table, keys in TABLES.items() for key in (*keys, *OPTIONAL.get(table, ()))]
+    keys = [key for table in TABLES for key in constant_keys(table)]
     constants: dict[str, Constant | None] = {key: getattr(profile, key) for key in keys}
     constants |= {f"{n}.{key}": value for n, table in profile.effects.items() for key, value in table.items()}
-    return {key: constant and (constant.low, constant.high) for key, constant in constants.items()}
+    numbers: dict[str, object] = {
+        key: constant and (constant.low, constant.high) for key, constant in constants.items()
+    }
+    return {**numbers, "response": repr(profile.response)}  # all of it: as text it would be cut short

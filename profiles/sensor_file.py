@@ -2,23 +2,27 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 from profiles.constant import Constant, check_keys, read_constant
 from profiles.effects import TABLES as EFFECT_TABLES
-from profiles.effects import read_effect
+from profiles.effects import Table, read_effect
 from profiles.errors import ProfileError
+from profiles.response_file import axes_of, read_response, response_from_json
 from profiles.sensor import (
     MTF_NYQUIST_MAX,
     OFFSET,
-    OPTIONAL,
+    RESPONSE,
     TABLES,
     SensorProfile,
+    constant_keys,
     describe_units,
     mtf_limit,
     snr_0_bounds,
+    table_keys,
 )
-from profiles.toml import read_toml, shipped_names
+from profiles.toml import profile_path, read_toml, shipped_names
 
 REFERENCE = "pleiades-reference"
 """The shipped profile of the image that restoration aims at, unless another is named."""
@@ -44,7 +48,7 @@ def load_sensor(name: str) -> SensorProfile:
     Raises:
         ProfileError: unknown name, wrong or missing key, or numbers that no instrument can have.
     """
-    return read_sensor(*read_toml("sensors", name))
+    return read_sensor(*read_toml("sensors", name), profile_path("sensors", name).parent)
 
 
 def sensor_from_json(label: str, raw: Mapping[str, Any]) -> SensorProfile:
@@ -53,118 +57,164 @@ def sensor_from_json(label: str, raw: Mapping[str, Any]) -> SensorProfile:
     Raises:
         ProfileError: keys or numbers that no profile has.
     """
-    known = {key for table, keys in TABLES.items() for key in (*keys, *OPTIONAL.get(table, ()))}
-    check_keys(label, raw, required={"name", "description"}, optional={*known, "effects"})
-    tables: dict[str, Any] = {
-        table: {key: raw[key] for key in (*keys, *OPTIONAL.get(table, ())) if raw.get(key) is not None}
-        for table, keys in TABLES.items()
-    }
+    known = {key for table in TABLES for key in constant_keys(table)}
+    check_keys(label, raw, required={"name", "description"}, optional={*known, "effects", "response"})
+    tables = {table: {key: raw[key] for key in constant_keys(table) if raw.get(key) is not None} for table in TABLES}
     effects = raw.get("effects", {})
     if not isinstance(effects, Mapping):
         raise ProfileError(label, expected="a table of effects", got=repr(effects), remedy="make it anew")
-    return replace(
-        read_sensor(label, {"description": raw["description"], **tables, **effects}), name=str(raw["name"])
-    )
+    found = read_sensor(label, {"description": raw["description"], **tables, **effects})
+    if raw.get("response") is not None:
+        response, mtf = response_from_json(f"{label} response", raw["response"]), found.mtf_nyquist
+        found = replace(found, response=response, **axes_of(response, mtf.status, mtf.source))
+        _check_budget(label, found)
+    return replace(found, name=str(raw["name"]))
 
 
-def read_sensor(label: str, raw: Mapping[str, Any]) -> SensorProfile:
-    """A profile from the tables of its file; `label` names the file in errors.
+def read_sensor(label: str, raw: Mapping[str, Any], folder: Path = Path()) -> SensorProfile:
+    """A profile from the tables of its file.
+
+    Args:
+        label: names the file in errors.
+        raw: its tables.
+        folder: where it lies, from which the path of a point-spread function counts.
 
     Raises:
         ProfileError: wrong or missing key, or numbers that no instrument can have.
     """
     check_keys(label, raw, required={"description", *TABLES}, optional=set(EFFECT_TABLES))
-    constants: dict[str, Constant] = {}
-    for table, keys in TABLES.items():
-        content = raw[table]
-        if not isinstance(content, Mapping):
-            raise ProfileError(label, expected=f"a table [{table}]", got=repr(content), remedy="write it as one")
-        optional = OPTIONAL.get(table, ())
-        check_keys(f"{label} [{table}]", content, required=set(keys), optional=set(optional))
-        given = [*keys, *(key for key in optional if key in content)]
-        constants |= {key: read_constant(f"{label} [{table}] {key}", content[key]) for key in given}
+    stated = {table: _read_table(label, table, raw[table]) for table in TABLES}
+    constants = {
+        key: read_constant(f"{label} [{table}] {key}", value)
+        for table, content in stated.items()
+        for key, value in content.items()
+        if key not in RESPONSE
+    }
     effects = {name: read_effect(f"{label} [{name}]", name, raw[name]) for name in EFFECT_TABLES if name in raw}
-    profile = SensorProfile(
-        name=label.removesuffix(".toml"), description=str(raw["description"]), effects=effects, **constants
-    )
-    _check_physics(label, profile)
+    _check_single(label, constants, effects)
+    _check_each(label, constants)
+    _check_noise(label, constants)
+    blur: dict[str, Any] = {}
+    if "mtf_nyquist" not in constants:
+        response, status, source = read_response(f"{label} [mtf]", stated["mtf"], folder)
+        blur = {"response": response, **axes_of(response, status, source)}
+    name, description = label.removesuffix(".toml"), str(raw["description"])
+    # Two radiances that only name where noise is spoken of, unless SNRs are stated there.
+    values = {**_default_radiances(constants), **constants, **blur}
+    profile = SensorProfile(name=name, description=description, effects=effects, **values)
+    _check_budget(label, profile)
+    _check_snr(profile)
     return profile
+
+
+def _read_table(label: str, table: str, content: object) -> Mapping[str, object]:
+    """The content of a table that is filled in one of its ways, and in no other.
+
+    Raises:
+        ProfileError: two ways at once, or keys too many or missing.
+    """
+    if not isinstance(content, Mapping):
+        raise ProfileError(label, expected=f"a table [{table}]", got=repr(content), remedy="write it as one")
+    where, ways = f"{label} [{table}]", TABLES[table]
+    check_keys(where, content, required=set(), optional=set(table_keys(table)))
+    others = {way: {key for other in ways if other is not way for key in other.keys} for way in ways}
+    begun = [way for way in ways if any(key in content for key in set(way.keys) - others[way])]
+    if len(begun) > 1:
+        raise ProfileError(
+            where,
+            expected="one of " + ", or ".join(" and ".join(way.required) for way in ways),
+            got="keys of several: " + ", ".join(content),
+            remedy="keep one of them",
+        )
+    way = begun[0] if begun else ways[0]
+    check_keys(where, content, required=set(way.required), optional=set(way.optional))
+    return content
 
 
 SINGLE = ("radiance_0", "radiance_1", "bits", "gain_dn_per_radiance")
 """Constants that define what the others mean: no range to draw from."""
 
 
-def _check_single(label: str, profile: SensorProfile) -> None:
-    single: dict[str, Constant] = {key: getattr(profile, key) for key in SINGLE}
-    single |= {f"[{OFFSET}] {key}": constant for key, constant in profile.effects.get(OFFSET, {}).items()}
+def _check_single(label: str, constants: Mapping[str, Constant], effects: Mapping[str, Table]) -> None:
+    single = {key: constants[key] for key in SINGLE if key in constants}
+    single |= {f"[{OFFSET}] {key}": constant for key, constant in effects.get(OFFSET, {}).items()}
     for key, constant in single.items():
         if constant.low != constant.high:
             remedy = "write a profile for each"
             raise ProfileError(f"{label} {key}", expected="one number", got=f"a range, {constant}", remedy=remedy)
 
 
-def _check_physics(label: str, profile: SensorProfile) -> None:
-    _check_single(label, profile)
-    mtf_max = MTF_NYQUIST_MAX
-    contrast: tuple[Callable[[float], bool], str, str] = (
-        lambda v: 0 < v <= mtf_max,
-        f"a contrast above 0 and up to {mtf_max:.4f} (2/pi, the square detector alone)",
-        "give a ratio, 0.07 for 7 %",
-    )
-    checks: list[tuple[str, Constant, Callable[[float], bool], str, str]] = [
-        (
-            "[grid] gsd_m",
-            profile.gsd_m,
-            lambda v: v > 0,
-            "metres above 0",
-            "give the ground sampling distance",
-        ),
-        (
-            "[grid] oversampling",
-            profile.oversampling,
-            lambda v: v >= 1 and v == int(v),
-            "whole numbers from 1 on",
-            "give the number of scene pixels per sensor pixel",
-        ),
-        ("[mtf] mtf_nyquist", profile.mtf_nyquist, *contrast),
-        ("[noise] snr_0", profile.snr_0, lambda v: v > 0, "linear ratios above 0", "convert dB first"),
-        ("[noise] snr_1", profile.snr_1, lambda v: v > 0, "linear ratios above 0", "convert dB first"),
-        (
-            "[noise] radiance_0",
-            profile.radiance_0,
-            lambda v: 0 < v < profile.radiance_1.low,
-            "W/m2/sr/um above 0 and below radiance_1",
-            "name the darker of the two points radiance_0",
-        ),
-        (
-            "[digitiser] bits",
-            profile.bits,
-            lambda v: v in range(1, 17),
-            "a whole number from 1 to 16",
-            "give the bits per pixel",
-        ),
-        (
-            "[digitiser] gain_dn_per_radiance",
-            profile.gain_dn_per_radiance,
-            lambda v: v > 0,
-            "DN per W/m2/sr/um above 0",
-            "give full-scale DN divided by full-scale radiance",
-        ),
-    ]
-    if profile.mtf_nyquist_along is not None:
-        checks.append(("[mtf] mtf_nyquist_along", profile.mtf_nyquist_along, *contrast))
-    for key, constant, valid, expected, remedy in checks:
+Check = tuple[Callable[[float], bool], str, str]
+CONTRAST: Check = (
+    lambda v: 0 < v <= MTF_NYQUIST_MAX,
+    f"a contrast above 0 and up to {MTF_NYQUIST_MAX:.4f} (2/pi, the square detector alone)",
+    "give a ratio, 0.07 for 7 %",
+)
+SNR: Check = (lambda v: v > 0, "linear ratios above 0", "convert dB first")
+CHECKS: dict[str, Check] = {
+    "gsd_m": (lambda v: v > 0, "metres above 0", "give the ground sampling distance"),
+    "oversampling": (
+        lambda v: v >= 1 and v == int(v),
+        "whole numbers from 1 on",
+        "give the number of scene pixels per sensor pixel",
+    ),
+    "mtf_nyquist": CONTRAST,
+    "mtf_nyquist_along": CONTRAST,
+    "snr_0": SNR,
+    "snr_1": SNR,
+    "radiance_0": (lambda v: v > 0, "W/m2/sr/um above 0", "give the darker of two radiances"),
+    "radiance_1": (lambda v: v > 0, "W/m2/sr/um above 0", "give the brighter of two radiances"),
+    "alpha": (lambda v: v >= 0, "W/m2/sr/um, 0 or more", "the noise's variance is alpha L + beta"),
+    "beta": (lambda v: v >= 0, "(W/m2/sr/um)^2, 0 or more", "the noise's variance is alpha L + beta"),
+    "bits": (lambda v: v in range(1, 17), "a whole number from 1 to 16", "give the bits per pixel"),
+    "gain_dn_per_radiance": (
+        lambda v: v > 0,
+        "DN per W/m2/sr/um above 0",
+        "give full-scale DN divided by full-scale radiance",
+    ),
+}
+"""What each constant may be, both ends of a range: in words, and what to do otherwise."""
+
+
+def _check_each(label: str, constants: Mapping[str, Constant]) -> None:
+    tables = {key: table for table in TABLES for key in constant_keys(table)}
+    for key, constant in constants.items():
+        valid, expected, remedy = CHECKS[key]
         if not (valid(constant.low) and valid(constant.high)):
-            raise ProfileError(f"{label} {key}", expected=expected, got=str(constant), remedy=remedy)
-    _check_budget(label, profile)
-    _check_snr(profile)
+            where = f"{label} [{tables[key]}] {key}"
+            raise ProfileError(where, expected=expected, got=str(constant), remedy=remedy)
+
+
+def _check_noise(label: str, constants: Mapping[str, Constant]) -> None:
+    """Two radiances in order, and noise that alpha and beta, not both 0, can have."""
+    dark, bright = ({**_default_radiances(constants), **constants}[key].low for key in ("radiance_0", "radiance_1"))
+    if not dark < bright:
+        raise ProfileError(
+            f"{label} [noise] radiance_0",
+            expected=f"W/m2/sr/um below radiance_1, {bright:g}",
+            got=f"{dark:g}",
+            remedy="name the darker of the two points radiance_0",
+        )
+    if "alpha" in constants and constants["alpha"].high == constants["beta"].high == 0:
+        remedy = "give the variance of the dark as beta"
+        raise ProfileError(f"{label} [noise] alpha and beta", expected="not both 0", got="0 and 0", remedy=remedy)
+
+
+def _default_radiances(constants: Mapping[str, Constant]) -> dict[str, Constant]:
+    """A quarter of full scale, and a quarter of the brighter radiance."""
+    full_scale = (2 ** constants["bits"].low - 1) / constants["gain_dn_per_radiance"].low
+    bright = constants.get("radiance_1", Constant(full_scale / 4, "inferred", "a quarter of full scale"))
+    return {"radiance_0": Constant(bright.low / 4, "inferred", "a quarter of radiance_1"), "radiance_1": bright}
 
 
 def _check_budget(label: str, profile: SensorProfile) -> None:
     """The anti-alias filter alone must leave the MTF that the profile states."""
     if "antialias" not in profile.effects:
         return
+    if profile.response is not None:
+        remedy = "remove it"
+        got = f"one beside the {profile.response}, which has it already"
+        raise ProfileError(f"{label} [antialias]", expected="no such table", got=got, remedy=remedy)
     sigma = profile.effects["antialias"]["sigma_px"]
     limit = mtf_limit(sigma.high)
     for key in ("mtf_nyquist", "mtf_nyquist_along"):
@@ -180,6 +230,8 @@ def _check_budget(label: str, profile: SensorProfile) -> None:
 
 def _check_snr(profile: SensorProfile) -> None:
     """Some pair in the ranges must be physical: the bounds grow with snr_1, so its two ends decide."""
+    if profile.snr_0 is None or profile.snr_1 is None:
+        return
     ends = [
         snr_0_bounds(profile.radiance_0.low, profile.radiance_1.low, s)
         for s in (profile.snr_1.low, profile.snr_1.high)

@@ -112,7 +112,8 @@ def draw_views(
 
 
 def _blurred_as(sensor: Sensor, other: Sensor) -> Sensor:
-    return replace(sensor, mtf_nyquist=other.mtf_nyquist, mtf_nyquist_along=other.mtf_nyquist_along)
+    across, along = other.mtf_nyquist, other.mtf_nyquist_along
+    return replace(sensor, mtf_nyquist=across, mtf_nyquist_along=along, response=other.response)
 
 
 def stratified(

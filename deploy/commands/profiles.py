@@ -9,8 +9,11 @@ from deploy.commands.shared import say
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
+    from profiles import SensorProfile
     from profiles.constant import Constant
     from profiles.effects import Table
+
+    Row = tuple[str, str, str, str]
 
 EXAMPLE = "profiles pleiades-degraded"
 
@@ -47,10 +50,10 @@ def profiles(
     else:
         for column in ("value", "status", "source"):
             table.add_column(column)
-        title, constants = _constants(name)
+        title, rows = _shown(name)
         table.title = plain(title)
-        for key, constant in constants:
-            table.add_row(*map(plain, (key, str(constant), constant.status, constant.source)))
+        for row in rows:
+            table.add_row(*map(plain, row))
     default_console().print(table)
 
 
@@ -65,42 +68,63 @@ def _file_text(name: str | None) -> str:
     if name is None:
         remedy = f"name one, such as {SENSOR}"
         raise OptionError("--toml", expected="the name of a profile beside it", got="none", remedy=remedy)
-    _constants(name)
+    _shown(name)
     kind = "sensors" if name in sensor_names() else "scenes" if name in scene_names() else "targets"
     return profile_path(kind, name).read_text(encoding="utf-8")
 
 
-def _constants(name: str) -> "tuple[str, list[tuple[str, Constant]]]":
-    """Title and constants of a sensor, a scene or a target, tried in that order."""
+def _shown(name: str) -> "tuple[str, list[Row]]":
+    """Title and rows (constant, value, status, source) of a sensor, a scene or a target, tried in that order."""
     from profiles import load_sensor, load_target, sensor_names, target_names
     from profiles.errors import OptionError
     from profiles.scene_call import load_scene_call, scene_names
-    from profiles.sensor import OPTIONAL, TABLES
     from profiles.toml import read_toml
 
     if name in sensor_names() or (name.endswith(".toml") and "mtf" in read_toml("sensors", name)[1]):
         sensor = load_sensor(name)
-        keys = [(table, key) for table, keys in TABLES.items() for key in (*keys, *OPTIONAL.get(table, ()))]
-        given = [(f"{table}.{key}", getattr(sensor, key)) for table, key in keys]
-        rows = [(key, constant) for key, constant in given if constant is not None] + _effects(sensor.effects)
-        return f"{sensor.name}: {sensor.description}", rows
+        return f"{sensor.name}: {sensor.description}", _sensor_rows(sensor)
     if name in scene_names() or (name.endswith(".toml") and "radiance_scale" in read_toml("scenes", name)[1]):
         scene = load_scene_call(name)
-        return f"{scene.name}: {scene.description}", [
-            ("radiance_scale", scene.radiance_scale),
-            *_effects(scene.effects),
-        ]
+        rows = [_row("radiance_scale", scene.radiance_scale), *_effects(scene.effects)]
+        return f"{scene.name}: {scene.description}", rows
     if name in target_names() or name.endswith(".toml"):
         target = load_target(name)
         groups = {**target.tables, **{f"configurations.{k}": v for k, v in target.configurations.items()}}
-        return f"{target.name}: {target.description}", [
-            (f"{group}.{key}", value) for group, table in groups.items() for key, value in table.items()
-        ]
+        rows = [_row(f"{group}.{key}", value) for group, table in groups.items() for key, value in table.items()]
+        return f"{target.name}: {target.description}", rows
     known = ", ".join([*sensor_names(), *scene_names(), *target_names()])
     raise OptionError(
         "profile", expected=f"one of {known}", got=repr(name), remedy="choose one, or give a .toml file"
     )
 
 
-def _effects(effects: "Mapping[str, Table]") -> "list[tuple[str, Constant]]":
-    return [(f"{name}.{key}", constant) for name, table in effects.items() for key, constant in table.items()]
+def _sensor_rows(sensor: "SensorProfile") -> "list[Row]":
+    from profiles.sensor import TABLES, constant_keys
+
+    rows: list[Row] = []
+    for table in TABLES:
+        given = [(f"{table}.{key}", getattr(sensor, key)) for key in constant_keys(table)]
+        rows += [_row(key, constant) for key, constant in given if constant is not None]
+        rows += _response(sensor) if table == "mtf" else []
+    return rows + _effects(sensor.effects)
+
+
+def _response(sensor: "SensorProfile") -> "list[Row]":
+    """A table's numbers, or what a point-spread function is made of."""
+    from profiles.response import MtfTable
+
+    response, said = sensor.response, (sensor.mtf_nyquist.status, sensor.mtf_nyquist.source)
+    if response is None:
+        return []
+    if not isinstance(response, MtfTable):
+        return [("mtf.psf", str(response), *said)]
+    columns = {"frequency": response.frequency, "across": response.across, "along": response.along}
+    return [(f"mtf.{key}", ", ".join(f"{v:g}" for v in values), *said) for key, values in columns.items()]
+
+
+def _effects(effects: "Mapping[str, Table]") -> "list[Row]":
+    return [_row(f"{name}.{key}", constant) for name, table in effects.items() for key, constant in table.items()]
+
+
+def _row(key: str, constant: "Constant") -> "Row":
+    return key, str(constant), constant.status, constant.source

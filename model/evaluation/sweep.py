@@ -35,7 +35,7 @@ def conditions(nominal: Sensor, profile: SensorProfile) -> list[Condition]:
     """The nominal sensor; other MTFs, both axes alike or not; other SNRs; both at once; and one with another gain."""
     found = [Condition(NOMINAL, nominal)]
     found += [Condition(f"MTF {mtf:.0%}", _sharp(nominal, mtf)) for mtf in SHARPNESS]
-    uneven = replace(nominal, mtf_nyquist=0.12, mtf_nyquist_along=0.05)
+    uneven = replace(_sharp(nominal, 0.12), mtf_nyquist_along=0.05)
     found += [Condition("MTF 12% across, 5% along", uneven)]
     found += [Condition(f"SNR {a:g} / {b:g}", _noisy(nominal, profile, a, b)) for a, b in NOISE]
     low = _noisy(nominal, profile, 25, 55)
@@ -64,8 +64,8 @@ def suppositions(nominal: Sensor, profile: SensorProfile) -> dict[str, list[Cond
 
 
 def _sharp(sensor: Sensor, mtf: float) -> Sensor:
-    """The sensor with that MTF at Nyquist on both axes."""
-    return replace(sensor, mtf_nyquist=mtf, mtf_nyquist_along=None)
+    """The sensor with the formula's MTF, that at Nyquist on both axes."""
+    return replace(sensor, mtf_nyquist=mtf, mtf_nyquist_along=None, response=None)
 
 
 def _noisy(sensor: Sensor, profile: SensorProfile, snr_0: float, snr_1: float) -> Sensor:

@@ -8,6 +8,7 @@ from torch import Tensor
 
 from profiles.effects import AntiAlias, Smear
 from profiles.errors import OptionError
+from profiles.response import PointSpread, Response
 from profiles.sensor import MTF_NYQUIST_MAX, Sensor, mtf_limit
 
 NYQUIST = 0.5
@@ -38,29 +39,47 @@ def gamma_from_mtf(mtf_nyquist: float, antialias_sigma_px: float = 0.0) -> float
     return max(-2 * math.log(mtf_nyquist / limit), 0.0)
 
 
-Axes = float | tuple[float, float]
-"""An MTF at Nyquist: one for both axes, or (across the track, along it), that is horizontal and vertical."""
+Blur = float | tuple[float, float] | Response
+"""What settles an MTF: its contrast at Nyquist, one for both axes or (across the track, along it), that is horizontal
+and vertical; or the whole of it, by a table or a point-spread function."""
 
 
-def mtf(fx: Tensor, fy: Tensor, mtf_nyquist: Axes, antialias_sigma_px: float = 0.0) -> Tensor:
+def mtf(fx: Tensor, fy: Tensor, blur: Blur, antialias_sigma_px: float = 0.0) -> Tensor:
     """MTF(fx, fy) = exp(-gamma * sqrt(fx^2 + fy^2)) * sinc(fx) * sinc(fy) * G(fx, fy) (paper, section 3.3).
 
     With a second MTF, along the track, gamma * sqrt(fx^2 + fy^2) becomes sqrt((gamma_x fx)^2 + (gamma_y fy)^2): each
-    axis keeps the contrast stated for it, and equal ones give the paper's formula to the last bit.
+    axis keeps the contrast stated for it, and equal ones give the paper's formula to the last bit. A table or a
+    point-spread function gives its own: see `profiles.response`.
 
     Args:
-        fx: horizontal frequencies (1, W) in cycles per TARGET pixel, float64; any shape that broadcasts against fy.
+        fx: horizontal frequencies (1, W) in cycles per TARGET pixel, float64; for the formula any shape that
+            broadcasts against fy.
         fy: vertical frequencies (H, 1), likewise. Beyond 1 the sinc is negative, and stays so.
-        mtf_nyquist: contrast kept at 0.5 cycles per pixel, the anti-alias filter G included.
+        blur: contrast kept at 0.5 cycles per pixel, the anti-alias filter G included; or the whole response.
         antialias_sigma_px: standard deviation of that filter in target pixels; 0 is none (G = 1).
+
+    Returns:
+        (H, W) float64; complex128 for a point-spread function.
+
+    Raises:
+        OptionError: a contrast that no blur leaves, or an anti-alias filter beside a whole response.
     """
-    across, along = mtf_nyquist if isinstance(mtf_nyquist, tuple) else (mtf_nyquist, mtf_nyquist)
+    if isinstance(blur, Response):
+        return _whole_response(fx, fy, blur, antialias_sigma_px)
+    across, along = blur if isinstance(blur, tuple) else (blur, blur)
     gamma_x, gamma_y = (gamma_from_mtf(value, antialias_sigma_px) for value in (across, along))
     radius = torch.hypot(fx, fy)
     # gamma * radius where it can be: hypot(gamma fx, gamma fy) rounds otherwise, and one gamma is the usual case
     optics = torch.exp(-gamma_x * radius if gamma_x == gamma_y else -torch.hypot(gamma_x * fx, gamma_y * fy))
     response = optics * torch.sinc(fx) * torch.sinc(fy)
     return response * gaussian_response(radius, antialias_sigma_px) if antialias_sigma_px else response
+
+
+def _whole_response(fx: Tensor, fy: Tensor, response: Response, antialias_sigma_px: float) -> Tensor:
+    if antialias_sigma_px:
+        expected, got = "none beside a whole response", f"one of {antialias_sigma_px:g} px beside the {response}"
+        raise OptionError("anti-alias filter", expected=expected, got=got, remedy="leave it out: it is part of that")
+    return torch.from_numpy(response.at(fx.cpu().numpy(), fy.cpu().numpy())).to(fx.device)
 
 
 def gaussian_response(frequency: Tensor, sigma_px: float) -> Tensor:
@@ -76,11 +95,11 @@ def smear_response(fy: Tensor, length_px: float) -> Tensor:
 def sensor_transfer(
     height: int, width: int, oversampling: int, sensor: Sensor, device: torch.device | None = None
 ) -> Tensor:
-    """All the linear, shift-invariant effects of a sensor as one (H, W // 2 + 1) float32 transfer function."""
+    """All the linear, shift-invariant effects of a sensor as one transfer function (H, W // 2 + 1)."""
     antialias, smear = sensor.effects.get("antialias"), sensor.effects.get("smear")
     sigma_px = antialias.sigma_px if isinstance(antialias, AntiAlias) else 0.0
     length_px = smear.length_px if isinstance(smear, Smear) else 0.0
-    return transfer_function(height, width, oversampling, sensor.mtf_axes, sigma_px, length_px, device)
+    return transfer_function(height, width, oversampling, sensor.blur, sigma_px, length_px, device)
 
 
 @lru_cache(maxsize=64)
@@ -88,20 +107,24 @@ def transfer_function(
     height: int,
     width: int,
     oversampling: int,
-    mtf_nyquist: Axes,
+    blur: Blur,
     antialias_sigma_px: float = 0.0,
     smear_px: float = 0.0,
     device: torch.device | None = None,
 ) -> Tensor:
     """MTF and smear on the half spectrum of a scene: (H, W // 2 + 1) float32, ready to multiply an rfft2.
 
-    `height` and `width` are in scene pixels, `oversampling` of which make one target pixel.
+    `height` and `width` are in scene pixels, `oversampling` of which make one target pixel. Complex64 for a
+    point-spread function, which may be lopsided or lie aslant.
     """
-    fy, fx = (
-        torch.fft.rfftfreq(side, 1 / oversampling, dtype=torch.float64, device=device) for side in (height, width)
-    )
-    upper = mtf(fx[None, :], fy[:, None], mtf_nyquist, antialias_sigma_px)
+    aslant = isinstance(blur, PointSpread)
+    vertical = torch.fft.fftfreq if aslant else torch.fft.rfftfreq
+    fy = vertical(height, 1 / oversampling, dtype=torch.float64, device=device)
+    fx = torch.fft.rfftfreq(width, 1 / oversampling, dtype=torch.float64, device=device)
+    found = mtf(fx[None, :], fy[:, None], blur, antialias_sigma_px)
     if smear_px:
-        upper = upper * smear_response(fy[:, None], smear_px)
-    upper = upper.float()
+        found = found * smear_response(fy[:, None], smear_px)
+    if aslant:
+        return found.to(torch.complex64)
+    upper = found.float()
     return torch.cat([upper, upper[1 : (height + 1) // 2].flip(0)])  # even in fy: the rows below are the same

@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from model.simulator.detector import DN_EFFECTS, NOISE_LIMIT, PATTERN_LIMIT, RADIANCE_EFFECTS
-from model.simulator.mtf import Axes, smear_response, transfer_function
+from model.simulator.mtf import Blur, smear_response, transfer_function
 from profiles.effects import TABLES, AntiAlias, Defects, Dsnu, Effect, FullWell, Haze, Offset, Prnu, Smear, Striping
 from profiles.sensor import Sensor, mtf_limit
 
@@ -53,22 +53,22 @@ def ringing_of(sensor: Sensor, stats: SceneStats) -> float:
 
     A blurrier sensor is a sharper one followed by a positive kernel of sum 1, which cannot enlarge the sum: so the
     MTF is rounded up to the next whole percent, and sensors share what was computed once. Of two axes rounded each by
-    itself that would not hold: they are taken as they are.
+    itself that would not hold, nor of a table or a point-spread function: they are taken as they are.
     """
     antialias = sensor.effects.get("antialias")
     sigma_px = antialias.sigma_px if isinstance(antialias, AntiAlias) else 0.0
     size = stats.height, stats.width, stats.oversampling
     across, along = sensor.mtf_axes
-    if across != along:
-        return _kernel_sum(*size, (across, along), sigma_px)
+    if sensor.response is not None or across != along:
+        return _kernel_sum(*size, sensor.blur, sigma_px)
     rounded = min(math.ceil(across * 100) / 100, mtf_limit(sigma_px))
     return _kernel_sum(*size, max(rounded, across), sigma_px)
 
 
 @lru_cache(maxsize=256)
-def _kernel_sum(height: int, width: int, oversampling: int, mtf_nyquist: Axes, sigma_px: float) -> float:
-    transfer = transfer_function(height, width, oversampling, mtf_nyquist, sigma_px)
-    return float(torch.fft.irfft2(transfer.double(), s=(height, width)).abs().sum())
+def _kernel_sum(height: int, width: int, oversampling: int, blur: Blur, sigma_px: float) -> float:
+    transfer = transfer_function(height, width, oversampling, blur, sigma_px).to(torch.complex128)
+    return float(torch.fft.irfft2(transfer, s=(height, width)).abs().sum())
 
 
 def blurred_range(stats: SceneStats, ringing: float) -> tuple[float, float]:

@@ -31,7 +31,7 @@ def sample(
 
     Args:
         spectrum: (..., H, W // 2 + 1) complex, of a scene whose H and W are multiples of r.
-        transfer: (H, W // 2 + 1) real, see `mtf.transfer_function`.
+        transfer: (H, W // 2 + 1), see `mtf.transfer_function`.
         width: W in scene pixels.
         oversampling: r, scene pixels per target pixel.
         offset_px: further shift of the sampling grid (down, right), in scene pixels.

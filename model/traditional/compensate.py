@@ -10,7 +10,7 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from model.simulator.mtf import NYQUIST, Axes, mtf
+from model.simulator.mtf import NYQUIST, Blur, mtf
 from model.traditional.rows import Rows, fill_with_local_means, map_tiles, mirrored
 from profiles.errors import OptionError
 
@@ -30,12 +30,12 @@ BLOCK_PX = 384
 """Side of the blocks that are filtered at once: with the radius around it, an FFT of 512."""
 
 
-def compensate(image: Tensor, mtf_from: Axes, mtf_to: Axes, epsilon: float) -> Tensor:
+def compensate(image: Tensor, blur_from: Blur, blur_to: Blur, epsilon: float) -> Tensor:
     """Filter (H, W) by `compensation_kernel`, on mirrored borders; unit and mean are kept, NaN stays NaN.
 
     Limits: a constant image is unchanged, up to rounding. With equal MTFs only the regularisation acts.
     """
-    kernel = compensation_kernel(mtf_from, mtf_to, epsilon)
+    kernel = compensation_kernel(blur_from, blur_to, epsilon)
     return torch.cat(list(filter_strips([image], image.shape[0], kernel)))
 
 
@@ -73,7 +73,7 @@ def _block(rows: Tensor, kernel: Tensor, left: int) -> Tensor:
     return (filtered[inside] + mean).where(known[core], torch.nan)
 
 
-def compensation_kernel(mtf_from: Axes, mtf_to: Axes, epsilon: float, radius_px: int = RADIUS_PX) -> Tensor:
+def compensation_kernel(blur_from: Blur, blur_to: Blur, epsilon: float, radius_px: int = RADIUS_PX) -> Tensor:
     """The filter whose gain is `compensation_gain`, cut at `radius_px`: (2 R + 1, 2 R + 1) float64, of sum 1.
 
     The weight that is cut off comes back as a smooth hill over the whole filter. So the gain is exact at DC, and
@@ -81,7 +81,7 @@ def compensation_kernel(mtf_from: Axes, mtf_to: Axes, epsilon: float, radius_px:
     """
     # Sampled this finely, the slow tail folds back onto the filter little.
     side = 8 * radius_px
-    gain = compensation_gain(side, side, mtf_from, mtf_to, epsilon)
+    gain = compensation_gain(side, side, blur_from, blur_to, epsilon)
     whole = torch.fft.irfft2(gain, s=(side, side)).roll((radius_px, radius_px), (0, 1))
     kernel: Tensor = whole[: 2 * radius_px + 1, : 2 * radius_px + 1].clone()
     window = torch.hann_window(2 * radius_px + 3, periodic=False, dtype=torch.float64)[1:-1]
@@ -91,27 +91,28 @@ def compensation_kernel(mtf_from: Axes, mtf_to: Axes, epsilon: float, radius_px:
     return kernel
 
 
-def compensation_gain(height: int, width: int, mtf_from: Axes, mtf_to: Axes, epsilon: float) -> Tensor:
-    """G = T H / (H^2 + epsilon r^2) on the half spectrum, (height, width // 2 + 1) float64.
+def compensation_gain(height: int, width: int, blur_from: Blur, blur_to: Blur, epsilon: float) -> Tensor:
+    """G = T H* / (|H|^2 + epsilon r^2) on the half spectrum, (height, width // 2 + 1) float64.
 
-    H is the MTF to undo, T the one to reach, r = |f| / f_Nyquist. Weighted by r^2, epsilon leaves G(0) at exactly 1;
-    a constant epsilon would scale the image by 1 / (1 + epsilon). Limits: epsilon = 0 gives T / H, with up to 20
-    times the noise at the corner of the spectrum for 3 to 25 %; a large epsilon blurs.
+    Complex128 where H or T is that of a point-spread function, H* its conjugate. H is the MTF to undo, T the one to
+    reach, r = |f| / f_Nyquist. Weighted by r^2, epsilon leaves G(0) at exactly 1; a constant epsilon would scale the
+    image by 1 / (1 + epsilon). Limits: epsilon = 0 gives T / H, with up to 20 times the noise at the corner of the
+    spectrum for 3 to 25 %; a large epsilon blurs.
 
     Args:
         height: rows of the image.
         width: columns of the image.
-        mtf_from: MTF at Nyquist of the image, in (0, 2 / pi]; one, or across and along the track.
-        mtf_to: MTF at Nyquist to reach, likewise.
+        blur_from: MTF at Nyquist of the image, in (0, 2 / pi], one, or across and along the track; or its response.
+        blur_to: what to reach, likewise.
         epsilon: regularisation, 0 or more.
     """
     if not 0 <= epsilon < float("inf"):
         raise OptionError("epsilon", expected="0 or more", got=repr(epsilon), remedy="a few thousandths are usual")
     fy = torch.fft.fftfreq(height, dtype=torch.float64)[:, None]
     fx = torch.fft.rfftfreq(width, dtype=torch.float64)[None, :]
-    blur, target = mtf(fx, fy, mtf_from), mtf(fx, fy, mtf_to)
+    blur, target = mtf(fx, fy, blur_from), mtf(fx, fy, blur_to)
     r_squared = (fx.square() + fy.square()) / NYQUIST**2
-    gain: Tensor = target * blur / (blur.square() + epsilon * r_squared)
+    gain: Tensor = target * blur.conj() / (blur.abs().square() + epsilon * r_squared)
     return gain
 
 

@@ -88,7 +88,7 @@ def _deconvolved(dn: Tensor, chain: Chain, deconvolve: Callable[[Tensor, Tensor]
     rows, columns = (mirrored(-PAD_PX, size + PAD_PX, size) for size in dn.shape)
     height, width = len(rows), len(columns)
     wide = ((dn.double() - chain.degraded.offset_dn) / chain.degraded.max_dn)[rows][:, columns]
-    blur, target = (transfer_function(height, width, 1, s.mtf_axes) for s in (chain.degraded, chain.reference))
+    blur, target = (transfer_function(height, width, 1, s.blur) for s in (chain.degraded, chain.reference))
     sharp = torch.fft.rfft2(deconvolve(wide, blur)) * target
     inside = torch.fft.irfft2(sharp, s=(height, width))[PAD_PX:-PAD_PX, PAD_PX:-PAD_PX]
     return to_dn((inside * full_scale).float(), chain.reference)

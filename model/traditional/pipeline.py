@@ -57,7 +57,7 @@ class Chain:
 
     def kernel(self) -> Tensor:
         """The filter of the MTF compensation, (2 R + 1, 2 R + 1) float64."""
-        return compensation_kernel(self.degraded.mtf_axes, self.reference.mtf_axes, self.regularisation)
+        return compensation_kernel(self.degraded.blur, self.reference.blur, self.regularisation)
 
 
 def restore_traditional(dn: Tensor, chain: Chain) -> Tensor:
@@ -120,15 +120,16 @@ def quality_named(name: str) -> Quality:
     return QUALITIES[name]
 
 
-def _axes_text(across: float, along: float) -> str:
-    return f"{across:.3g}" if across == along else f"{across:.3g} across and {along:.3g} along the track"
+def _blur_text(sensor: Sensor) -> str:
+    across, along = sensor.mtf_axes
+    axes = f"{across:.3g}" if across == along else f"{across:.3g} across and {along:.3g} along the track"
+    return axes if sensor.response is None else f"{axes} ({sensor.response})"
 
 
 def describe(chain: Chain) -> list[str]:
     """The steps that `restore_traditional` would take, one line each, with their numbers."""
     sensor, chosen, epsilon = with_rounding_noise(chain.degraded), quality_named(chain.quality), chain.regularisation
-    mtf_from, mtf_to = chain.degraded.mtf_axes, chain.reference.mtf_axes
-    gain = float(compensation_gain(64, 64, mtf_from, mtf_to, epsilon).max())
+    gain = float(compensation_gain(64, 64, chain.degraded.blur, chain.reference.blur, epsilon).abs().max())
     coloured = ", its covariance that of the filtered noise" if chain.order == "deconvolve-first" else ""
     denoise = [
         f"stabilise noise of variance {sensor.alpha:.4g} L + {sensor.beta:.4g}, L in W/m2/sr/um, rounding counted",
@@ -136,7 +137,7 @@ def describe(chain: Chain) -> list[str]:
         + coloured,
         f"back to radiance, {bias_radiance(sensor):.2g} W/m2/sr/um of bias restored",
     ]
-    mtfs = " to ".join(_axes_text(*axes) for axes in (mtf_from, mtf_to))
+    mtfs = " to ".join(map(_blur_text, (chain.degraded, chain.reference)))
     sharpen = [f"compensate the MTF at Nyquist from {mtfs}: epsilon {epsilon:.2g}, largest gain {gain:.2f}"]
     steps = denoise + sharpen if chain.order == "denoise-first" else sharpen + denoise
     return [*steps, f"clip to 0..{chain.reference.max_dn} DN"]

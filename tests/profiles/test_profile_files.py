@@ -13,7 +13,7 @@ from profiles.sensor import TABLES, noise_from_snr, snr_0_bounds
 from profiles.toml import HERE
 
 SHIPPED = (HERE / "sensors" / "pleiades-degraded.toml").read_text()
-KEYS = [(table, key) for table, keys in TABLES.items() for key in keys]
+KEYS = [(table, key) for table, ways in TABLES.items() for key in ways[0].required]
 
 
 def sensor_file(folder: Path, text: str) -> str:

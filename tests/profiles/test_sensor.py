@@ -33,7 +33,7 @@ def test_the_promised_profiles_are_shipped() -> None:
 @pytest.mark.parametrize("name", SHIPPED)
 def test_every_sensor_constant_has_a_source(name: str) -> None:
     profile = load_sensor(name)
-    for key in (key for keys in TABLES.values() for key in keys):
+    for key in (key for ways in TABLES.values() for key in ways[0].required):
         constant = getattr(profile, key)
         assert constant.source.strip()
         assert constant.status in ("published", "inferred", "assumed")
@@ -117,7 +117,7 @@ def test_every_draw_is_physical_and_within_its_ranges(name: str, seed: int) -> N
     assert sensor.alpha >= 0
     assert sensor.beta >= 0
     assert profile.mtf_nyquist.low <= sensor.mtf_nyquist <= profile.mtf_nyquist.high
-    for radiance, snr in ((profile.radiance_0, profile.snr_0), (profile.radiance_1, profile.snr_1)):
+    for radiance, snr in zip((profile.radiance_0, profile.radiance_1), profile.snr_pair, strict=True):
         drawn = radiance.low / sensor.noise_sigma(radiance.low)
         assert snr.low * (1 - 1e-9) <= drawn <= snr.high * (1 + 1e-9)
     assert sensor == profile.draw(np.random.default_rng(seed))

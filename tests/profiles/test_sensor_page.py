@@ -1,12 +1,15 @@
 """docs/sensor-profile.md names every key of a profile, with its range, and no other."""
 
+import math
 import re
 import tomllib
 from dataclasses import fields
 from pathlib import Path
 from typing import get_args
 
+import numpy as np
 import pytest
+import tifffile
 from typer.core import TyperGroup
 from typer.main import get_command
 from typer.testing import CliRunner
@@ -15,7 +18,7 @@ from deploy.cli import app
 from profiles.constant import Status, read_constant
 from profiles.effects import LIMITS
 from profiles.effects import TABLES as EFFECTS
-from profiles.sensor import MTF_NYQUIST_MAX, OPTIONAL, TABLES, same_instrument
+from profiles.sensor import MTF_NYQUIST_MAX, TABLES, same_instrument, table_keys
 from profiles.sensor_file import SINGLE, load_sensor, read_sensor, sensor_names
 
 PAGE = (Path(__file__).parents[2] / "docs" / "sensor-profile.md").read_text(encoding="utf-8")
@@ -23,7 +26,7 @@ ROWS = dict(re.findall(r"^\| `(\[\w+\] \w+)` \|(.*)\|$", PAGE, re.MULTILINE))
 
 
 def test_the_page_has_every_key_and_no_other() -> None:
-    wanted = {f"[{table}] {key}" for tables in (TABLES, OPTIONAL) for table, keys in tables.items() for key in keys}
+    wanted = {f"[{table}] {key}" for table in TABLES for key in table_keys(table)}
     wanted |= {f"[{name}] {field.name}" for name, effect in EFFECTS.items() for field in fields(effect)}
     assert set(ROWS) == wanted
     assert all(len(cells.split("|")) == 3 and all(map(str.strip, cells.split("|"))) for cells in ROWS.values())
@@ -38,7 +41,7 @@ def test_the_page_gives_the_ranges_of_effects(name: str, key: str) -> None:
 
 
 def test_the_page_says_where_a_range_is_refused_and_what_bounds_the_mtf() -> None:
-    single = {f"[{table}] {key}" for table, keys in TABLES.items() for key in keys if key in SINGLE}
+    single = {f"[{table}] {key}" for table in TABLES for key in table_keys(table) if key in SINGLE}
     assert {key for key, cells in ROWS.items() if "no range" in cells} == {*single, "[offset] offset_dn"}
     assert f"{MTF_NYQUIST_MAX:.4f}" in ROWS["[mtf] mtf_nyquist"]
 
@@ -49,11 +52,27 @@ def test_the_page_names_every_status_and_each_is_read(status: str) -> None:
     assert read_constant("a test", {"value": 1, "status": status, "source": "a test"}).status == status
 
 
+WHOLE, *PARTS = re.findall(r"```toml\n(.*?)```", PAGE, re.DOTALL)
+
+
 def test_the_example_of_the_page_is_a_profile(tmp_path: Path) -> None:
-    (example,) = re.findall(r"```toml\n(.*?)```", PAGE, re.DOTALL)
-    (tmp_path / "my-sensor.toml").write_text(example, encoding="utf-8")
+    (tmp_path / "my-sensor.toml").write_text(WHOLE, encoding="utf-8")
     assert load_sensor(str(tmp_path / "my-sensor.toml")).units == (10, 12, 0)
-    assert read_sensor("a test", tomllib.loads(example)).mtf_nyquist.low == 0.05
+    assert read_sensor("a test", tomllib.loads(WHOLE)).mtf_nyquist.low == 0.05
+
+
+@pytest.mark.parametrize(("part", "axes"), [*zip(PARTS, [(0.11, 0.08), (0.2, 0.1), (0.05, 0.05)], strict=True)])
+def test_each_other_way_of_the_page_fits_into_the_example(
+    part: str, axes: tuple[float, float], tmp_path: Path
+) -> None:
+    x = np.arange(-20, 21) / 8
+    widths_px = (math.sqrt(-math.log(contrast) / 2) / (math.pi * 0.5) for contrast in (0.1, 0.2))
+    down, right = (np.exp(-0.5 * (x / width) ** 2) for width in widths_px)
+    tifffile.imwrite(tmp_path / "psf.tif", (down[:, None] * right).astype(np.float32))
+    (name,) = tomllib.loads(part)
+    text = re.sub(rf"\[{name}\].*?(?=\n\[)", lambda _: part, WHOLE, flags=re.DOTALL)
+    (tmp_path / "my-sensor.toml").write_text(text, encoding="utf-8")
+    assert load_sensor(str(tmp_path / "my-sensor.toml")).nominal().mtf_axes == pytest.approx(axes, abs=1e-3)
 
 
 def test_profiles_print_the_file_to_start_from(tmp_path: Path) -> None:

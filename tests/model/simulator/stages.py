@@ -1,18 +1,21 @@
-"""Sensors and scenes for the simulator's tests, and the signal before digitising."""
+"""Sensors and scenes for the simulator's tests, the signal before digitising, and the contrast of a slanted edge."""
 
+import math
 from collections.abc import Collection
 from dataclasses import replace
 from functools import partial
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from model.simulator.acquire import without
 from model.simulator.detector import DN_EFFECTS, RADIANCE_EFFECTS, Draw, add_noise, apply_effect
-from model.simulator.mtf import sensor_transfer
+from model.simulator.mtf import Blur, mtf, sensor_transfer
 from model.simulator.sampling import sample, scene_spectrum
 from profiles import load_sensor
 from profiles.effects import Effect, middle_effect
+from profiles.response import MtfTable, PointSpread, Response, packed
 from profiles.scene_call import typical_effects
 from profiles.sensor import Sensor
 
@@ -46,3 +49,76 @@ def _apply(image: Tensor, name: str, sensor: Sensor, draw: Draw, skip: Collectio
     if name in skip or name not in sensor.effects:
         return image
     return apply_effect(image, sensor.effects[name], sensor, partial(draw.generator, f"{name}-degraded"))
+
+
+def with_response(sensor: Sensor, response: Response) -> Sensor:
+    """The sensor with another blur."""
+    across, along = response.at_nyquist
+    return replace(sensor, mtf_nyquist=across, mtf_nyquist_along=along, response=response)
+
+
+def point_spread(samples: np.ndarray, per_px: float) -> PointSpread:
+    """These samples (H, W), as a profile keeps them."""
+    return PointSpread(len(samples), samples.shape[1], per_px, packed(samples))
+
+
+def formula_table(across: float, along: float, steps: int = 5) -> MtfTable:
+    """The paper's formula at `steps` frequencies above 0, up to Nyquist."""
+    f = torch.linspace(0, 0.5, steps + 1, dtype=torch.float64)
+    columns = (mtf(f, torch.zeros(()), contrast).tolist() for contrast in (across, along))
+    return MtfTable(tuple(f.tolist()), *map(tuple, columns))
+
+
+def formula_point(blur: Blur, per_px: int, side_px: int, odd: bool) -> PointSpread:
+    """The formula's own point-spread function, by inverse transform; of an even side the middle is no sample's."""
+    side = per_px * side_px + odd
+    f = torch.fft.fftfreq(side, 1 / per_px, dtype=torch.float64)
+    samples = torch.fft.fftshift(torch.fft.ifft2(mtf(f[None], f[:, None], blur)).real)
+    return point_spread(samples.numpy(), per_px)
+
+
+def gaussian_pixel(sigma_x: float, sigma_y: float, per_px: int, side: int) -> PointSpread:
+    """A Gaussian of other widths across and along, seen by a square pixel: side x (side + 4) samples."""
+
+    def line(size: int, sigma: float) -> np.ndarray:
+        x = (np.arange(size) - (size - 1) / 2) / per_px
+        return np.array([math.erf((v + 0.5) / 2**0.5 / sigma) - math.erf((v - 0.5) / 2**0.5 / sigma) for v in x])
+
+    return point_spread(line(side, sigma_y)[:, None] * line(side + 4, sigma_x), per_px)
+
+
+def lopsided_point(per_px: int = 4, rows: int = 37, columns: int = 48) -> PointSpread:
+    """Aslant, with a tail to one side and a faint dark ring: its response is complex."""
+    y, x = (np.arange(size) - (size - 1) / 2 for size in (rows, columns))
+    y, x = y[:, None] / per_px, x / per_px
+    core, tail = np.exp(-2 * y**2 - 1.5 * (x + 0.3 * y) ** 2), np.exp(-(y**2) - (x - 1) ** 2)
+    return point_spread(core + 0.2 * tail - 0.02 * np.exp(-((np.hypot(x, y) - 2.5) ** 2)), per_px)
+
+
+def slanted_edge(side: int, ratio: int, slope: float) -> tuple[Tensor, Tensor]:
+    """A scene with an edge that moves `slope` target pixels a row, and each target pixel's distance from it."""
+    y, x = (torch.arange(side * ratio, dtype=torch.float64) + 0.5 for _ in range(2))
+    middle = side * ratio / 2
+    coverage = (0.5 + x - (middle + slope * (y[:, None] - middle))).clamp(0, 1)  # of each scene pixel
+    pixels = (torch.arange(side, dtype=torch.float64) + 0.5) - side / 2
+    return (40 + 200 * coverage).float(), pixels - slope * pixels[:, None]
+
+
+def edge_contrast(image: Tensor, distance: Tensor, ratio: int) -> float:
+    """Contrast at Nyquist of an edge's image (160, 160), ISO 12233 in short.
+
+    Rows shifted onto one another, finely binned, differentiated, transformed.
+    """
+    bins, inner = 8, slice(40, 120)  # far from where the borders wrap
+    index = ((distance[inner] + 36) * bins).round().long().flatten()
+    wanted = (index >= 0) & (index < 72 * bins)
+    value = image[inner].double().flatten()[wanted]
+    total = torch.zeros(72 * bins, dtype=torch.float64).index_add_(0, index[wanted], value)
+    edge = total / torch.bincount(index[wanted], minlength=72 * bins)
+    spread = torch.diff(edge)
+    cycles = torch.arange(len(spread), dtype=torch.float64) / bins
+    wave = torch.exp(-2j * math.pi * 0.5 * cycles)
+    measured = float((spread * wave).sum().abs() / spread.sum())
+    steps = math.sin(math.pi * 0.5 / bins) / (math.pi * 0.5 / bins)  # of the bins' differences
+    raster = math.sin(math.pi * 0.5 / ratio) / (math.pi * 0.5 / ratio)  # of the scene's own pixels
+    return measured / (steps * raster)

@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from model.simulator import plan as plan_module
-from model.simulator.acquire import prepare_scene, simulate_planned
+from model.simulator.acquire import prepare_scene, simulate_planned, without
 from model.simulator.detector import Draw
 from model.simulator.plan import TOLERANCE_DN, Plan, effect_bounds, make_plan, scene_stats
 from model.simulator.sampling import crop_divisible
@@ -71,13 +71,27 @@ OPTIONAL: dict[str, st.SearchStrategy[Effect]] = {
     "defects": st.builds(Defects, st.sampled_from([0.0, 1000.0]), st.sampled_from([0.0, 2000.0])),
 }
 effects = st.fixed_dictionaries({}, optional=OPTIONAL)
-sensors = st.builds(
+formula_sensors = st.builds(
     lambda m, a, b, e, along: Sensor(m, a, b, 10.2375, 12, e, along),
     st.floats(0.005, 0.3),
     st.sampled_from([0.0, 0.0077]),
     st.sampled_from([0.0, 1e-6, 0.058]),
     effects,
     st.one_of(st.none(), st.floats(0.005, 0.3)),
+)
+RESPONSES = (
+    stages.formula_table(0.12, 0.05),
+    stages.gaussian_pixel(0.3, 0.5, 4, 21),
+    stages.formula_point(0.07, 2, 12, odd=True),
+    stages.lopsided_point(),
+)
+sensors = st.one_of(
+    formula_sensors,
+    st.builds(
+        lambda sensor, response: stages.with_response(without(sensor, ["antialias"]), response),
+        formula_sensors,
+        st.sampled_from(RESPONSES),
+    ),
 )
 
 

@@ -10,11 +10,12 @@ from torch import Tensor
 
 from model.simulator.acquire import Pair, simulate_pair
 from model.simulator.detector import Draw
-from model.simulator.mtf import transfer_function
+from model.simulator.mtf import mtf, transfer_function
 from model.simulator.sampling import sample, scene_spectrum
 from model.traditional import pipeline
 from model.traditional.compensate import compensate
 from model.traditional.noise import Noise, coloured_by
+from model.traditional.peers import PEERS
 from model.traditional.pipeline import (
     Chain,
     Order,
@@ -26,6 +27,7 @@ from model.traditional.pipeline import (
 from model.traditional.rows import mirrored
 from profiles import load_sensor
 from profiles.errors import OptionError
+from profiles.response import MtfTable, PointSpread, Response, packed
 from profiles.sensor import Sensor, noise_from_snr
 
 DEGRADED = load_sensor("pleiades-degraded").nominal()
@@ -172,6 +174,75 @@ def test_the_chain_undoes_each_axis_by_its_own_blur(camera: Tensor) -> None:
         for told in (sensor, turned, one)
     )
     assert right > max(wrong) + 1
+
+
+def formula_point(blur: tuple[float, float], per_px: int = 2, side_px: int = 129) -> PointSpread:
+    """The point-spread function that belongs to two contrasts at Nyquist, on an odd number of samples."""
+    f = torch.fft.fftfreq(per_px * side_px + 1, 1 / per_px, dtype=torch.float64)
+    samples = torch.fft.fftshift(torch.fft.ifft2(mtf(f[None], f[:, None], blur)).real).numpy()
+    return PointSpread(len(f), len(f), per_px, packed(samples))
+
+
+def with_response(response: Response) -> Sensor:
+    across, along = response.at_nyquist
+    return replace(DEGRADED, mtf_nyquist=across, mtf_nyquist_along=along, response=response)
+
+
+def test_the_chain_restores_a_point_spread_as_the_formula_it_was_made_of(camera: Tensor) -> None:
+    formula = replace(DEGRADED, mtf_nyquist=0.12, mtf_nyquist_along=0.05)
+    point = with_response(formula_point(formula.mtf_axes))
+    radiance = camera[64:267, 128:337] * (200 / 255)
+    found = []
+    for sensor in (formula, point):
+        seen = simulate_pair(radiance, sensor, NOISE_FREE, 1, Draw(seed=1))
+        found.append(psnr_db(restore_traditional(seen.degraded, Chain(sensor, REFERENCE)), seen.reference))
+    assert found[1] == pytest.approx(found[0], abs=0.05)
+
+
+@pytest.mark.parametrize("order", ORDERS)
+def test_the_whole_response_restores_what_two_numbers_cannot(order: Order, camera: Tensor) -> None:
+    """A disc of defocus, shifted light and all: the formula with its two contrasts is another blur."""
+    y, x = np.mgrid[-16:17, -16:17] / 8
+    disc = np.hypot(y, x) < 0.85
+    leaning = disc + 2.0 * (disc & (x + y > 0.4))
+    sensor = with_response(PointSpread(33, 33, 8.0, packed(leaning)))
+    seen = simulate_pair(camera[64:267, 128:337] * (200 / 255), sensor, NOISE_FREE, 1, Draw(seed=1))
+    right, wrong = (
+        psnr_db(restore_traditional(seen.degraded, Chain(told, REFERENCE, order=order)), seen.reference)
+        for told in (sensor, replace(sensor, response=None))
+    )
+    assert right > wrong + 1
+
+
+def test_peers_undo_the_whole_response(pair: Pair) -> None:
+    """Told the formula's own point-spread function, each restores what it restores told the formula."""
+    point = with_response(formula_point(DEGRADED.mtf_axes))
+    for name in ("wiener", "richardson-lucy"):
+        plain, whole = (PEERS[name](pair.degraded[:96, :96], Chain(told, REFERENCE)) for told in (DEGRADED, point))
+        assert psnr_db(whole, plain) > 55
+
+
+def test_a_table_of_the_formula_gives_the_formulas_filter() -> None:
+    f = torch.linspace(0, 0.5, 6, dtype=torch.float64)
+    contrast = tuple(mtf(f, torch.zeros(()), 0.07).tolist())
+    table = with_response(MtfTable(tuple(f.tolist()), contrast, contrast))
+    kernels = [Chain(sensor, REFERENCE, epsilon=3e-3).kernel() for sensor in (table, DEGRADED)]
+    torch.testing.assert_close(*kernels, rtol=0, atol=1e-12)
+    assert "MTF table of 6 frequencies" in " ".join(describe(Chain(table, REFERENCE)))
+
+
+@pytest.mark.parametrize("bits", [8, 10, 14])
+def test_any_bits_are_restored(bits: int, camera: Tensor) -> None:
+    """Rounding to 8 bits counts as noise, and costs a decibel; 14 bits are as good as 12."""
+    gain = (2**bits - 1) / 400
+    degraded, reference = (replace(s, bits=bits, gain_dn_per_radiance=gain) for s in (DEGRADED, NOISE_FREE))
+    seen = simulate_pair(camera[64:267, 128:337] * (200 / 255), degraded, reference, 1, Draw(seed=1))
+    restored = restore_traditional(seen.degraded, Chain(degraded, reference))
+    before, after = (
+        psnr_db(dn * (4095 / (2**bits - 1)), seen.reference * (4095 / (2**bits - 1)))
+        for dn in (seen.degraded, restored)
+    )
+    assert after > before + 11
 
 
 def test_a_turned_sensor_gives_the_turned_filter() -> None:

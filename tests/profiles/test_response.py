@@ -1,0 +1,317 @@
+"""A tabulated MTF and a point-spread function: read, compared, kept, and refused in one sentence."""
+
+import json
+import math
+import re
+from collections.abc import Callable
+from dataclasses import asdict, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tifffile
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from typer.testing import CliRunner
+
+from deploy.cli import app
+from profiles import SensorProfile, load_sensor
+from profiles.errors import ProfileError
+from profiles.response import MtfTable, PointSpread, centroid, packed, unpacked
+from profiles.sensor import same_instrument
+from profiles.sensor_file import sensor_from_json
+from profiles.toml import HERE
+
+SHIPPED = (HERE / "sensors" / "pleiades-degraded.toml").read_text(encoding="utf-8")
+TABLE = "frequency = [0, 0.25, 0.5]\nacross = [1, 0.5, 0.12]\nalong = [1, 0.4, 0.05]"
+PSF = 'psf = "psf.npy"\npsf_samples_per_px = 4'
+
+
+def lopsided(rows: int = 33, columns: int = 44) -> np.ndarray:
+    """A point's image of other widths down and right, leaning, with a one-sided tail: (rows, columns)."""
+    y, x = np.mgrid[:rows, :columns] - np.array([rows - 1, columns - 1])[:, None, None] / 2
+    samples: np.ndarray = np.exp(-(y**2) / 18 - (x + 0.4 * y) ** 2 / 10)
+    samples += 0.1 * np.exp(-(y**2) / 30 - (x - 3) ** 2 / 30)
+    return samples
+
+
+def sensor_file(folder: Path, mtf: str, noise: str | None = None) -> str:
+    """The nominal sensor with another [mtf], and another [noise] where one is given."""
+    text = re.sub(r"\[mtf\].*?(?=\n\[)", lambda _: f"[mtf]\n{mtf}\n", SHIPPED, flags=re.DOTALL)
+    if noise is not None:
+        text = re.sub(r"\[noise\].*?(?=\n\[)", lambda _: f"[noise]\n{noise}\n", text, flags=re.DOTALL)
+    path = folder / "mine.toml"
+    path.write_text(text, encoding="utf-8")
+    return str(path)
+
+
+def with_psf(folder: Path, samples: np.ndarray, mtf: str = PSF) -> SensorProfile:
+    np.save(folder / "psf.npy", samples)
+    return load_sensor(sensor_file(folder, mtf))
+
+
+def formula(frequency: np.ndarray, contrast: float) -> np.ndarray:
+    return np.asarray(np.exp(2 * np.log(contrast * np.pi / 2) * frequency) * np.sinc(frequency))
+
+
+def refusal(path: str) -> ProfileError:
+    with pytest.raises(ProfileError) as caught:
+        load_sensor(path)
+    error = caught.value
+    assert str(error) == f"{error.where}: expected {error.expected}, got {error.got}; {error.remedy}."
+    assert all(part.strip() for part in (error.where, error.expected, error.got, error.remedy))
+    assert "mine" in error.where
+    assert "\n" not in str(error)
+    return error
+
+
+def test_a_table_says_what_stands_in_it(tmp_path: Path) -> None:
+    profile = load_sensor(sensor_file(tmp_path, TABLE))
+    sensor, f = profile.nominal(), np.array([[0.0, 0.25, 0.5]])
+    assert isinstance(sensor.response, MtfTable)
+    assert sensor.response.at(f, np.zeros((1, 1)))[0] == pytest.approx([1, 0.5, 0.12])
+    assert sensor.response.at(np.zeros((1, 1)), f.T)[:, 0] == pytest.approx([1, 0.4, 0.05])
+    assert sensor.mtf_axes == pytest.approx((0.12, 0.05))
+    assert sensor == profile.draw(np.random.default_rng(3))
+    one_axis = load_sensor(sensor_file(tmp_path, TABLE.rsplit("\n", 1)[0]))
+    assert one_axis.mtf_nyquist_along is None
+    assert one_axis.nominal().mtf_axes == pytest.approx((0.12, 0.12))
+
+
+@settings(max_examples=30)
+@given(st.floats(0.005, 0.6), st.floats(0.005, 0.6), st.lists(st.floats(0.01, 0.99), max_size=6))
+def test_a_table_never_rises_beyond_its_end(across: float, along: float, inner: list[float]) -> None:
+    frequency = (0.0, *sorted({f / 2 for f in inner}), 0.5)
+    contrast = [tuple(formula(np.array(frequency), c)) for c in (across, along)]
+    table = MtfTable(frequency, *contrast)
+    beyond = np.linspace(0.5, 4, 50)[None]
+    for response in (table.at(beyond, np.zeros((1, 1)))[0], table.at(np.zeros((1, 1)), beyond.T)[:, 0]):
+        optics = response / np.where(np.abs(np.sinc(beyond[0])) < 1e-9, np.nan, np.sinc(beyond[0]))
+        assert (np.diff(optics[np.isfinite(optics)]) <= 0).all()
+
+
+def test_a_point_spread_is_its_transform_about_its_centroid(tmp_path: Path) -> None:
+    """Against a padded FFT, whose frequencies are multiples of 4 / 96 cycles per pixel, shifted by hand."""
+    samples = lopsided(24, 32)
+    sensor = with_psf(tmp_path, samples).nominal()
+    row, column = centroid(samples)
+    f = np.fft.fftfreq(96, 1 / 4)
+    shift = np.exp(2j * np.pi * f[:, None] * (row + 11.5) / 4) * np.exp(2j * np.pi * f * (column + 15.5) / 4)
+    wanted = np.fft.fft2(samples, (96, 96)) * shift / samples.sum()
+    assert sensor.response is not None
+    assert np.abs(sensor.response.at(f[None], f[:, None]) - wanted).max() < 3e-6
+    across, along = (abs(wanted[0, 12]), abs(wanted[12, 0]))
+    assert sensor.mtf_axes == pytest.approx((across, along), abs=3e-6)
+
+
+def test_beyond_its_own_sampling_a_point_spread_says_nothing(tmp_path: Path) -> None:
+    response = with_psf(tmp_path, lopsided()).response
+    assert response is not None
+    found = response.at(np.array([[1.9, 2.1, 4.0]]), np.zeros((1, 1)))[0]
+    assert abs(found[0]) > 0
+    assert (found[1:] == 0).all()
+
+
+@settings(max_examples=25)
+@given(st.integers(1, 40), st.integers(1, 40), st.integers(0, 99))
+def test_packed_samples_come_back(height: int, width: int, seed: int) -> None:
+    values = np.random.default_rng(seed).normal(size=(height, width)).astype(np.float32)
+    assert (unpacked(PointSpread(height, width, 8.0, packed(values))) == values).all()
+
+
+@pytest.mark.parametrize("scale", [1e-300, 1e300])
+def test_the_unit_of_the_samples_does_not_matter(scale: float, tmp_path: Path) -> None:
+    one, other = (with_psf(tmp_path, samples).nominal().mtf_axes for samples in (lopsided(), lopsided() * scale))
+    assert one == pytest.approx(other, rel=1e-6)
+
+
+def test_the_empty_rim_of_a_point_spread_is_cut_and_changes_nothing(tmp_path: Path) -> None:
+    samples = lopsided()
+    (tmp_path / "wide").mkdir()
+    tight, wide = with_psf(tmp_path, samples).response, with_psf(tmp_path / "wide", np.pad(samples, 400)).response
+    assert isinstance(wide, PointSpread)
+    assert wide.height <= samples.shape[0]
+    assert wide.width <= samples.shape[1]
+    f = np.linspace(-2, 2, 41)
+    assert tight is not None
+    assert np.abs(tight.at(f[None], f[:, None]) - wide.at(f[None], f[:, None])).max() < 3e-6
+
+
+@pytest.mark.parametrize("dtype", ["<f4", ">f8", "<u2"])
+def test_npy_and_tiff_are_the_same_instrument(dtype: str, tmp_path: Path) -> None:
+    samples = np.rint(lopsided() * 4000).astype(dtype)
+    (tmp_path / "tiff").mkdir()
+    tifffile.imwrite(tmp_path / "tiff" / "psf.tif", samples, byteorder=">" if dtype[0] == ">" else "<")
+    other = load_sensor(sensor_file(tmp_path / "tiff", PSF.replace("npy", "tif")))
+    assert same_instrument(with_psf(tmp_path, samples), other)
+
+
+@pytest.mark.parametrize("mtf", [TABLE, PSF])
+@pytest.mark.parametrize("noise", [None, "alpha = 0.0077\nbeta = [0.05, 0.07]"])
+def test_a_profile_comes_back_from_json_without_its_file(mtf: str, noise: str | None, tmp_path: Path) -> None:
+    np.save(tmp_path / "psf.npy", lopsided())
+    profile = load_sensor(sensor_file(tmp_path, mtf, noise))
+    (tmp_path / "psf.npy").unlink()
+    back = sensor_from_json("a test", json.loads(json.dumps(asdict(profile))))
+    assert back == profile
+    assert same_instrument(back, profile)
+    assert hash(back.response) == hash(profile.response)
+    other = replace(profile, response=None)
+    assert not same_instrument(other, profile)
+
+
+@pytest.mark.parametrize("key", ["samples", "height", "samples_per_px"])
+@pytest.mark.parametrize("value", [0, -3, 1 << 40, "x", None, [], 1e400])
+def test_a_recipe_with_other_samples_is_refused(key: str, value: object, tmp_path: Path) -> None:
+    raw = json.loads(json.dumps(asdict(with_psf(tmp_path, lopsided()))))
+    raw["response"][key] = value
+    with pytest.raises(ProfileError, match="a test response"):
+        sensor_from_json("a test", raw)
+
+
+def test_another_contrast_beside_a_response_is_refused(tmp_path: Path) -> None:
+    sensor = load_sensor(sensor_file(tmp_path, TABLE)).nominal()
+    with pytest.raises(ValueError, match="beside a response"):
+        replace(sensor, mtf_nyquist=0.2)
+    assert replace(sensor, mtf_nyquist=0.2, mtf_nyquist_along=None, response=None).mtf_axes == (0.2, 0.2)
+
+
+@pytest.mark.parametrize(
+    ("mtf", "words"),
+    [
+        (TABLE + "\nmtf_nyquist = 0.07", ("one of mtf_nyquist, or frequency and across, or psf", "keep one")),
+        (TABLE + "\n" + PSF, ("keep one",)),
+        (PSF + "\nmtf_nyquist_along = 0.07", ("keep one",)),
+        ("across = [1, 0.1]", ("'frequency'",)),
+        ("frequency = [0, 0.5]", ("'across'",)),
+        ("psf_samples_per_px = 8", ("'psf'",)),
+        (TABLE.replace("0.25", "0.6"), ("ascending",)),
+        (TABLE.replace("[0, 0.25", "[0.1, 0.25"), ("ascending from 0",)),
+        (TABLE.replace("0.25, 0.5]", "0.25, 0.4]"), ("to 0.5 at least",)),
+        (TABLE.replace("0.25, 0.5]", "0.25, 1.0]"), ("below 1",)),
+        (TABLE.replace("0.5]", "nan]"), ("finite numbers",)),
+        (TABLE.replace("0.25, 0.5]", '0.25, "x"]'), ("finite numbers",)),
+        (TABLE.replace("[1, 0.4", "[0.9, 0.4"), ("the first of them 1", "along")),
+        (TABLE.replace("[1, 0.4, 0.05]", "[1, 0.4]"), ("3 contrasts", "along")),
+        (TABLE.replace("0.12", "0"), ("above 0", "across", "psf")),
+        (TABLE.replace("0.05]", "-0.05]"), ("above 0", "along", "psf")),
+        (TABLE.replace("1, 0.5, 0.12", "1, 0.95, 0.12"), ("0.9003", "sinc")),
+        (TABLE + "\n[antialias]\nsigma_px = 0.1", ("[antialias]", "no such table")),
+        (PSF.replace("4", "1"), ("2 to 64",)),
+        (PSF.replace("4", "true"), ("2 to 64",)),
+        (PSF.replace("4", '"x"'), ("2 to 64",)),
+        (PSF.replace("psf.npy", "none.npy"), ("no such file", "none.npy")),
+        (PSF.replace("psf.npy", "psf.png"), (".npy or .tif", "'.png'")),
+        (PSF.replace("psf.npy", "."), (".npy or .tif",)),
+        (PSF.replace("psf.npy", "../psf.npy"), ("beneath",)),
+        (PSF.replace("psf.npy", "/psf.npy"), ("beneath",)),
+        (PSF.replace('"psf.npy"', "3"), ("beneath",)),
+    ],
+)
+def test_a_wrong_blur_gets_one_sentence(mtf: str, words: tuple[str, ...], tmp_path: Path) -> None:
+    (tmp_path / "in").mkdir()
+    for folder in (tmp_path, tmp_path / "in"):
+        np.save(folder / "psf.npy", lopsided())
+    error = refusal(sensor_file(tmp_path / "in", mtf))
+    assert all(word in str(error) for word in words)
+
+
+def spoilt(change: Callable[[np.ndarray], object]) -> np.ndarray:
+    samples = lopsided()
+    change(samples)
+    return samples
+
+
+@pytest.mark.parametrize(
+    ("samples", "words"),
+    [
+        (spoilt(lambda s: s.__setitem__((3, 4), np.nan)), ("finite", "NaN")),
+        (spoilt(lambda s: s.__setitem__((3, 4), np.inf)), ("finite",)),
+        (-lopsided(), ("sum is above 0",)),
+        (np.zeros((5, 5)), ("a sum of 0",)),
+        (np.stack([lopsided()] * 3), ("(rows, columns)", "(3, 33, 44)")),
+        (np.ones(7), ("(rows, columns)",)),
+        (np.ones((0, 7)), ("(rows, columns)",)),
+        (lopsided().astype(complex), ("real numbers",)),
+        (lopsided() > 0.5, ("real numbers",)),
+        (np.zeros((4097, 2), np.uint8), ("4096 a side",)),
+        (np.ones((1100, 2), np.uint8), ("1024 x 1024",)),
+        (np.roll(np.pad(lopsided(), 40), 17, 1), ("centroid", "pixels off")),
+        (np.ones((1, 1)), ("0.6366", "detector included")),
+    ],
+)
+def test_samples_that_are_no_point_spread_get_one_sentence(
+    samples: np.ndarray, words: tuple[str, ...], tmp_path: Path
+) -> None:
+    np.save(tmp_path / "psf.npy", samples)
+    error = refusal(sensor_file(tmp_path, PSF))
+    assert all(word in str(error) for word in words)
+
+
+@pytest.mark.parametrize("suffix", ["npy", "tif"])
+@pytest.mark.parametrize(
+    "content", [b"", b"\x93NUMPY", b"II*\0\x08\0\0\0", b"version https://git-lfs.github.com", b"x" * 999]
+)
+def test_a_damaged_file_gets_one_sentence(suffix: str, content: bytes, tmp_path: Path) -> None:
+    (tmp_path / f"psf.{suffix}").write_bytes(content)
+    refusal(sensor_file(tmp_path, PSF.replace("npy", suffix)))
+
+
+def test_a_tiff_that_would_have_to_be_unpacked_or_paged_through_gets_one_sentence(tmp_path: Path) -> None:
+    path, mtf = tmp_path / "psf.tif", PSF.replace("npy", "tif")
+    tifffile.imwrite(path, lopsided().astype(np.float32), compression="zlib")
+    assert "compressed" in refusal(sensor_file(tmp_path, mtf)).got
+    with tifffile.TiffWriter(path) as writer:
+        for _ in range(2):
+            writer.write(lopsided().astype(np.float32), metadata=None)
+    assert "pages" in refusal(sensor_file(tmp_path, mtf)).got
+
+
+def test_alpha_and_beta_are_the_noise_itself(tmp_path: Path) -> None:
+    plain = load_sensor("pleiades-degraded")
+    alpha, beta = plain.nominal().alpha, plain.nominal().beta
+    profile = load_sensor(sensor_file(tmp_path, "mtf_nyquist = 0.07", f"alpha = {alpha}\nbeta = {beta}"))
+    assert profile.nominal() == plain.nominal()
+    assert (profile.radiance_0.low, profile.radiance_1.low) == (25, 100)  # of the shipped full scale, 400
+    ranged = load_sensor(sensor_file(tmp_path, "mtf_nyquist = 0.07", "alpha = [0.1, 0.2]\nbeta = 0\nradiance_1 = 60"))
+    drawn = [ranged.draw_counted(np.random.default_rng(seed)) for seed in range(20)]
+    assert all(0.1 <= sensor.alpha <= 0.2 and sensor.beta == rejected == 0 for sensor, rejected in drawn)
+    assert len({sensor.alpha for sensor, _ in drawn}) == 20
+    assert ranged.nominal().noise_sigma(60) == pytest.approx(math.sqrt(0.15 * 60))
+    assert (ranged.radiance_0.low, ranged.nominal().radiance_1) == (15, 60)
+
+
+@pytest.mark.parametrize(
+    ("noise", "words"),
+    [
+        ("alpha = -1\nbeta = 1", ("alpha", "0 or more")),
+        ("alpha = 1\nbeta = [-1, 1]", ("beta", "0 or more")),
+        ("alpha = 0\nbeta = 0", ("not both 0",)),
+        ("alpha = 1", ("'beta'",)),
+        ("alpha = 1\nbeta = 1\nsnr_0 = 50", ("alpha and beta", "keep one")),
+        ("alpha = 1\nbeta = 1\nradiance_0 = 300", ("below radiance_1, 100",)),
+        ("alpha = 1\nbeta = 1\nradiance_1 = [3, 4]", ("one number",)),
+        ("radiance_0 = 25\nradiance_1 = 100", ("'snr_0'",)),
+    ],
+)
+def test_a_wrong_noise_gets_one_sentence(noise: str, words: tuple[str, ...], tmp_path: Path) -> None:
+    error = refusal(sensor_file(tmp_path, "mtf_nyquist = 0.07", noise))
+    assert all(word in str(error) for word in words)
+
+
+def test_profiles_print_the_response_and_its_source(tmp_path: Path) -> None:
+    def shown(mtf: str, *more: str) -> str:
+        run = CliRunner(env={"COLUMNS": "400"}).invoke(app, ["profiles", sensor_file(tmp_path, mtf), *more])
+        assert run.exit_code == 0
+        return run.output
+
+    np.save(tmp_path / "psf.npy", lopsided())
+    table = shown(
+        TABLE.replace(
+            "across = [1, 0.5, 0.12]", 'across = {value = [1, 0.5, 0.12], status = "measured", source = "a lab"}'
+        )
+    )
+    assert re.search(r"mtf\.across .*1, 0\.5, 0\.12 .*measured .*a lab", table)
+    assert re.search(r"mtf\.mtf_nyquist_along .*0\.05", table)
+    assert re.search(r"mtf\.psf .*37 x 33 samples, 4 to a pixel", shown(PSF))
+    assert PSF in shown(PSF, "--toml")
