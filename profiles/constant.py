@@ -101,14 +101,15 @@ def _rename(key: str, allowed: set[str]) -> str:
 
 
 def _number(where: str, raw: object) -> Number:
-    if _is_number(raw):
+    if is_number(raw):
         return float(raw)  # type: ignore[arg-type]
-    if isinstance(raw, list) and len(raw) == 2 and all(map(_is_number, raw)) and raw[0] <= raw[1]:
+    if isinstance(raw, list) and len(raw) == 2 and all(map(is_number, raw)) and raw[0] <= raw[1]:
         return (float(raw[0]), float(raw[1]))
     raise ProfileError(
         where, expected="a finite number or a range [low, high]", got=repr(raw), remedy="give one of the two"
     )
 
 
-def _is_number(raw: object) -> bool:
+def is_number(raw: object) -> bool:
+    """Whether a value of a file is a finite number that float64 holds."""
     return isinstance(raw, int | float) and not isinstance(raw, bool) and abs(raw) <= sys.float_info.max

@@ -9,14 +9,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from profiles.constant import Constant, Status, check_keys, read_stated
+from profiles.constant import Constant, Status, check_keys, is_number, read_stated
 from profiles.errors import ProfileError
 from profiles.response import NYQUIST, MtfTable, PointSpread, Response, centroid, packed, unpacked
 from profiles.toml import unreadable
 
 READING = 0.005
 """How far a table may lie above what the square detector leaves: half the last digit of two. The detector counts."""
-MOST_FREQUENCIES = 1000
+MOST_FREQUENCIES, LEAST_STEP = 1000, 1e-4
 SAMPLES_PER_PX = (2.0, 64.0)
 """With fewer than two, nothing is said of the frequencies that sampling by the sensor folds back."""
 FILE_SIDE, KEPT_SIDE = 4096, 1024
@@ -91,13 +91,14 @@ def _require_contrast(where: str, response: Response) -> None:
 
 def _table(label: str, stated: Mapping[str, Any]) -> MtfTable:
     frequency = _numbers(f"{label} frequency", stated["frequency"])
-    falling = any(after <= before for before, after in pairwise(frequency))
-    if falling or frequency[0] != 0 or not NYQUIST <= frequency[-1] < 1:
+    rising = all(after - before >= LEAST_STEP for before, after in pairwise(frequency))
+    if not rising or frequency[0] != 0 or not NYQUIST <= frequency[-1] < 1:
         raise ProfileError(
             f"{label} frequency",
             expected="cycles per pixel, ascending from 0 to 0.5 at least and below 1, the detector's first zero",
-            got=f"{len(frequency)} from {frequency[0]:g} to {frequency[-1]:g}" + ", not ascending" * falling,
-            remedy="give them in that order, in cycles per target pixel",
+            got=f"{len(frequency)} from {frequency[0]:g} to {frequency[-1]:g}"
+            + ("" if rising else ", not ascending"),
+            remedy=f"give them in that order, in cycles per target pixel, {LEAST_STEP:g} apart at least",
         )
     across = _contrasts(f"{label} across", stated["across"], frequency)
     given = stated.get("along")
@@ -125,11 +126,10 @@ def _contrasts(where: str, raw: object, frequency: tuple[float, ...]) -> tuple[f
 
 def _numbers(where: str, raw: object) -> tuple[float, ...]:
     numbers = raw if isinstance(raw, list | tuple) else []
-    plain = all(isinstance(each, int | float) and not isinstance(each, bool) for each in numbers)
-    if not plain or not 2 <= len(numbers) <= MOST_FREQUENCIES or not all(math.isfinite(each) for each in numbers):
+    if not 2 <= len(numbers) <= MOST_FREQUENCIES or not all(map(is_number, numbers)):
         expected = f"a list of 2 to {MOST_FREQUENCIES} finite numbers"
         raise ProfileError(where, expected=expected, got=repr(raw), remedy="give one for each frequency")
-    return tuple(float(each) for each in numbers)
+    return tuple(map(float, numbers))
 
 
 def _point_spread(label: str, stated: Mapping[str, Any], folder: Path) -> PointSpread:
@@ -149,9 +149,9 @@ def _lies_within(folder: Path, name: str) -> bool:
         return False
 
 
-def _samples_per_px(where: str, raw: object) -> float:
+def _samples_per_px(where: str, raw: Any) -> float:
     low, high = SAMPLES_PER_PX
-    if isinstance(raw, bool) or not isinstance(raw, int | float) or not low <= raw <= high:
+    if not is_number(raw) or not low <= raw <= high:
         expected = f"samples that make one target pixel, {low:g} to {high:g}"
         raise ProfileError(where, expected=expected, got=repr(raw), remedy="resample the point-spread function")
     return float(raw)
@@ -208,13 +208,11 @@ def _read_samples(where: str, path: Path) -> Samples:
     Raises:
         ProfileError: no such file, another kind, damage, or another shape.
     """
-    readers = {".npy": _open_npy, ".tif": _open_tiff, ".tiff": _open_tiff}
-    reader = readers.get(path.suffix.lower())
+    reader = {".npy": _open_npy, ".tif": _open_tiff, ".tiff": _open_tiff}.get(path.suffix.lower())
     reason = unreadable(path) if reader else f"one that ends in {path.suffix!r}"
     if reader is None or reason:
-        raise ProfileError(
-            where, expected="a .npy or .tif file", got=reason or "none", remedy="check the path from the profile"
-        )
+        remedy = "check the path, which counts from the profile's folder"
+        raise ProfileError(where, expected="a .npy or .tif file", got=str(reason), remedy=remedy)
     try:
         found = reader(path)
         _check_shape(where, found)
@@ -222,10 +220,8 @@ def _read_samples(where: str, path: Path) -> Samples:
     except ProfileError:
         raise
     except Exception as error:  # whatever the bytes of a damaged file lead to
-        remedy = "write it as a plain array of numbers, (rows, columns)"
-        raise ProfileError(
-            where, expected="one array of samples", got=str(error) or type(error).__name__, remedy=remedy
-        ) from error
+        got, remedy = str(error) or type(error).__name__, "write it as a plain array of numbers, (rows, columns)"
+        raise ProfileError(where, expected="one array of samples", got=got, remedy=remedy) from error
 
 
 def _check_shape(where: str, found: NDArray[Any]) -> None:

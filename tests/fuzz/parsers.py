@@ -4,7 +4,7 @@ import io
 import json
 import shutil
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import cache, partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -32,6 +32,7 @@ from deploy.tradeoff.host_time import Times
 from model.conditioning import ConditionedConvBEERS
 from model.convbeers import ConvBEERS
 from model.dataset import _read_summary
+from model.evaluation.pairs import read_pairs_recipe
 from model.io.images import read_pixels
 from model.io.weights import load_conditioned, load_network, save_network
 from model.metrics.backbones import read_tensors
@@ -42,6 +43,7 @@ from model.variants import Variant
 from profiles import load_sensor, load_target
 from profiles.errors import BeersError
 from profiles.figures import Figure, Row, measured, predicted, unavailable
+from profiles.response_file import read_response
 from profiles.scene_call import load_scene_call
 from quant.checks import Check
 from quant.encodings import encoding_faults
@@ -84,6 +86,58 @@ class Parser:
 
 def _files(*folders: str) -> list[bytes]:
     return [path.read_bytes() for folder in folders for path in sorted((ROOT / "profiles" / folder).glob("*.toml"))]
+
+
+def described_seeds(_: Path) -> list[bytes]:
+    """A sensor with a tabulated MTF, alpha and beta."""
+    text = (ROOT / "profiles" / "sensors" / "pleiades-degraded.toml").read_text(encoding="utf-8")
+    head, rest = text.split("[mtf]")
+    mtf, noise = (
+        "frequency = [0, 0.25, 0.5]\nacross = [1, 0.5, 0.12]\nalong = [1, 0.4, 0.1]",
+        "alpha = 0.01\nbeta = [0.1, 0.2]",
+    )
+    return [f"{head}[mtf]\n{mtf}\n\n[noise]\n{noise}\n\n[digitiser]{rest.split('[digitiser]')[1]}".encode()]
+
+
+def point_seeds(folder: Path, suffix: str) -> list[bytes]:
+    """A small point-spread function."""
+    x = np.arange(-6, 7) / 2
+    samples = np.exp(-(x[:, None] ** 2) / 4 - x**2 / 3).astype(np.float32)
+    write = np.save if suffix == ".npy" else tifffile.imwrite
+    return [_written(lambda path: write(path, samples), folder / f"a{suffix}")]
+
+
+def read_point(path: Path) -> object:
+    """As a sensor's blur."""
+    response, *_ = read_response("a test", {"psf": path.name, "psf_samples_per_px": 4}, path.parent)
+    return response.at(np.ones((1, 1)), np.ones((1, 1)))
+
+
+def recipe_seeds(folder: Path) -> list[bytes]:
+    """The sensors of a folder of pairs, with a table and with a point-spread function."""
+    path = folder / "a.toml"
+    path.write_bytes(described_seeds(folder)[0])
+    profile = load_sensor(str(path))
+    point, *_ = read_response("a test", {"psf": _saved_point(folder), "psf_samples_per_px": 4}, folder)
+    across, along = (replace(profile.mtf_nyquist, value=value) for value in point.at_nyquist)
+    other = replace(profile, response=point, mtf_nyquist=across, mtf_nyquist_along=along)
+    recipe = {"scenes": [{"name": "a", "sha256": "b"}], "degraded": asdict(profile), "reference": asdict(other)}
+    return [json.dumps(recipe).encode()]
+
+
+def _saved_point(folder: Path) -> str:
+    (folder / "point.npy").write_bytes(point_seeds(folder, ".npy")[0])
+    return "point.npy"
+
+
+def read_recipe(path: Path) -> None:
+    """The sensors of a folder of pairs, drawn."""
+    with TemporaryDirectory() as name:
+        shutil.copy(path, Path(name) / "recipe.json")
+        recipe = read_pairs_recipe(Path(name))
+    assert recipe is not None
+    for profile in (recipe.degraded, recipe.reference):
+        profile.nominal()
 
 
 def _written(make: Callable[[Path], object], path: Path) -> bytes:
@@ -321,6 +375,10 @@ PARSERS: tuple[Parser, ...] = (
     Parser("PNG", ".png", lambda _: [_image({"format": "PNG"})], read_pixels, of_png),
     Parser("JPEG", ".jpg", lambda _: [_image({"format": "JPEG"})], read_pixels),
     Parser("sensor TOML", ".toml", lambda _: _files("sensors"), lambda p: load_sensor(str(p)).nominal()),
+    Parser("sensor TOML, MTF table", ".toml", described_seeds, lambda p: load_sensor(str(p)).nominal()),
+    Parser("point spread, TIFF", ".tif", partial(point_seeds, suffix=".tif"), read_point, of_tiff),
+    Parser("point spread, npy", ".npy", partial(point_seeds, suffix=".npy"), read_point),
+    Parser("recipe of pairs", ".json", recipe_seeds, read_recipe, of_json),
     Parser("scene TOML", ".toml", lambda _: _files("scenes"), lambda p: load_scene_call(str(p))),
     Parser("target TOML", ".toml", lambda _: _files("targets"), board_of, share=0.3),
     Parser("gate limits TOML", ".toml", lambda _: LIMITS, lambda p: read_limits(p, None)),

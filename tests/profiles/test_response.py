@@ -191,6 +191,8 @@ def test_another_contrast_beside_a_response_is_refused(tmp_path: Path) -> None:
         (TABLE.replace("0.25, 0.5]", "0.25, 1.0]"), ("below 1",)),
         (TABLE.replace("0.5]", "nan]"), ("finite numbers",)),
         (TABLE.replace("0.25, 0.5]", '0.25, "x"]'), ("finite numbers",)),
+        (TABLE.replace("0.25, 0.5]", f"0.25, {'9' * 320}]"), ("finite numbers",)),
+        (TABLE.replace("0.25", "1e-310"), ("0.0001 apart",)),
         (TABLE.replace("[1, 0.4", "[0.9, 0.4"), ("the first of them 1", "along")),
         (TABLE.replace("[1, 0.4, 0.05]", "[1, 0.4]"), ("3 contrasts", "along")),
         (TABLE.replace("0.12", "0"), ("above 0", "across", "psf")),
@@ -265,6 +267,18 @@ def test_a_tiff_that_would_have_to_be_unpacked_or_paged_through_gets_one_sentenc
         for _ in range(2):
             writer.write(lopsided().astype(np.float32), metadata=None)
     assert "pages" in refusal(sensor_file(tmp_path, mtf)).got
+
+
+def test_a_tiff_whose_pages_lead_in_a_circle_is_refused_at_once(tmp_path: Path) -> None:
+    path = tmp_path / "psf.tif"
+    tifffile.imwrite(path, lopsided().astype(np.float32), metadata=None)
+    content = bytearray(path.read_bytes())
+    first = int.from_bytes(content[4:8], "little")
+    count = int.from_bytes(content[first : first + 2], "little")
+    end = first + 2 + 12 * count
+    content[end : end + 4] = content[4:8]
+    path.write_bytes(content)
+    assert "pages" in refusal(sensor_file(tmp_path, PSF.replace("npy", "tif"))).got
 
 
 def test_alpha_and_beta_are_the_noise_itself(tmp_path: Path) -> None:
