@@ -32,7 +32,7 @@ SURFACE = {
         "save_onnx unseen_patches"
     ),
     "deploy": (
-        "Document float_model load_dpu method_named network_for place predict read_network restore run_gate to_onnx"
+        "Document float_model load_dpu method_named place predict read_network restore run_gate to_onnx weights_for"
     ),
 }
 LIGHT = ("profiles", "model", "model.io", "model.metrics", "quant", "deploy")

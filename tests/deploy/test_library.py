@@ -16,6 +16,7 @@ from deploy.library import restore
 from deploy.networks import shipped_pair
 from deploy.restoration.options import Options
 from deploy.restoration.run import restore_file
+from model.shipped import BLIND
 from profiles.errors import ImageError, ModelError, OptionError
 
 SHAPES = [(61, 83), (17, 130), (1, 40), (29, 29), (3, 5), (3, 41, 35), (1, 50, 20)]
@@ -53,7 +54,7 @@ def test_an_array_gives_the_pixels_of_the_file(
 
 
 def test_the_shipped_int8_network_is_the_default(da: Any, tmp_path: Path) -> None:
-    expected = of_file(tmp_path, noise(97, 110), Options(shipped_pair()[1], 64))
+    expected = of_file(tmp_path, noise(97, 110), Options(shipped_pair(sensor=BLIND)[1], 64))
     np.testing.assert_array_equal(restore(noise(97, 110), tile_px=64), expected)
     lazy = restore(da.from_array(noise(97, 110), chunks=50), tile_px=64)
     np.testing.assert_array_equal(lazy.compute(), expected)
