@@ -32,7 +32,8 @@ MIN_RANGE = 0.25
 """Least spread of the blocks' means, of the brightest: less gives no line."""
 ROUNDING = 1 / 12
 """Variance that rounding to whole digital numbers adds, DN^2."""
-LEAST_NOISE = 0.5 * ROUNDING
+LEAST_NOISE, QUIET_PERCENT = 0.5 * ROUNDING, 5.0
+"""Above rounding, DN^2, in the quietest blocks: what was restored or resampled has less."""
 DRAWS, PASSES = 200, 6
 FINE_WAVES, MAX_SCATTER = 21, 3.5
 """Waves beyond FINE in a block; how many deviations of their mean square, by chance, a block may lie off."""
@@ -154,13 +155,14 @@ def fit_noise_model(blocks: Blocks, generator: np.random.Generator) -> NoiseMode
     """
     if blocks.mean.size < LEAST:
         return Refusal("few-windows", f"{blocks.mean.size} blocks of 16 x 16 unclipped pixels, {LEAST} are needed")
+    quietest = float(np.percentile(blocks.fine, QUIET_PERCENT))
+    if quietest < ROUNDING + LEAST_NOISE:
+        got = f"a variance of {quietest:.2g} DN^2 at the finest detail, where rounding alone makes {ROUNDING:.2g}"
+        return Refusal("no-noise", got)
     used, fit = _choose(blocks)
     parts = np.unique(used.part)
     if used.mean.size < LEAST or parts.size < LEAST_PARTS:
         return Refusal("few-windows", f"{used.mean.size} blocks without much texture, {LEAST} are needed")
-    if (used.fine.mean() - ROUNDING) < LEAST_NOISE:
-        got = f"a variance of {used.fine.mean():.2g} DN^2 in the pixels, where rounding alone makes {ROUNDING:.2g}"
-        return Refusal("no-noise", got)
     dark, bright = (float(v) for v in np.percentile(used.mean, [EDGE_PERCENT, 100 - EDGE_PERCENT]))
     if bright - dark < MIN_RANGE * bright:
         return Refusal("range", f"even areas from {dark:.4g} to {bright:.4g} DN only, too narrow for a line")
