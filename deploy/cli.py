@@ -18,6 +18,7 @@ import model
 from deploy import __version__
 from deploy.commands import (
     bench,
+    characterise,
     check,
     compare,
     demo,
@@ -122,6 +123,7 @@ def example(text: str) -> str:
 COMMANDS: dict[str, tuple[Callable[..., None], str]] = {
     "demo": (demo.demo, demo.EXAMPLE),
     "profiles": (profiles.profiles, profiles.EXAMPLE),
+    "characterise": (characterise.characterise, characterise.EXAMPLE),
     "simulate": (simulate.simulate, simulate.EXAMPLE),
     "train": (train.train, train.EXAMPLE),
     "export": (export.export, export.EXAMPLE),

@@ -42,6 +42,7 @@ class Paths:
 PATHS = {
     "demo": Paths({"out": FOLDER, "json": FILE}, ("image",), ("sensor",)),
     "profiles": Paths({}, (), ("name",)),
+    "characterise": Paths({"out": FILE, "json": FILE}, ("images",)),
     "simulate": Paths({"out": FOLDER}, ("scenes",), ("sensor", "reference", "scene")),
     "train": Paths({"out": FOLDER}, ("images", "pairs", "lpips", "start", "teacher"), ("sensor", "reference")),
     "export": Paths({"out": FILE}, ("checkpoint",), ("sensor",)),
@@ -70,11 +71,14 @@ PATHS = {
 
 UNITS = {
     "batch": "patches",
+    "bits": "bit",
     "budget": "s",
     "distil": "a weight",
     "drawn": "scenes",
     "draws": "draws",
     "fft_weight": "a weight",
+    "gain": "DN per W/m2/sr/um, above 0",
+    "gsd": "m, above 0",
     "full_scale": "pixel value above 0",
     "l1_weight": "a weight",
     "l2_weight": "a weight",
@@ -103,6 +107,7 @@ WORDS = {
     "cases": "names of cases, with commas",
     "config": "C32B1 to C64B5",
     "device": "cpu or cuda",
+    "edge": "FILE:X,Y,WIDTH,HEIGHT in px",
     "fail_on": "a change such as PSNR<-0.05",
     "forbid": "an effect's name",
     "halo": "exact, or whole px from 0",

@@ -44,7 +44,8 @@ def evaluate(
 
     PSNR leaves out clipped pixels; of simulated pairs it is also taken against the reference without its noise. MTF
     and SNR are measured on restored slanted edges and flat fields. Traditional methods know both sensors' nominal
-    figures; networks are blind, but may have been made for the sensor.
+    figures; so do shipped networks, unless their name ends with
+    @blind or with @ and another sensor.
     """
     from deploy.evaluate import EvaluationRequest, run_evaluation
     from deploy.results import Document, print_rows

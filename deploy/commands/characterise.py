@@ -1,0 +1,48 @@
+"""`beers-deploy characterise`: a sensor profile from the user's own raw images, with intervals."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from deploy.commands.shared import say
+
+EXAMPLE = "characterise raw1.tif raw2.tif --bits 12 --out my-sensor.toml"
+
+
+def characterise(
+    images: Annotated[list[Path], typer.Argument(help="Raw images of one sensor: whole digital numbers, one band.")],
+    out: Annotated[Path, typer.Option(help="The sensor profile, a TOML file.")],
+    edge: Annotated[
+        list[str] | None,
+        typer.Option(metavar="FILE:X,Y,WIDTH,HEIGHT", help="A box with one straight edge; searched for if none."),
+    ] = None,
+    bits: Annotated[
+        int | None, typer.Option(min=1, max=16, help="Of a digital number; told by clipped pixels if none.")
+    ] = None,
+    gain: Annotated[
+        float | None, typer.Option(help="DN per W/m2/sr/um; full scale is taken for 400 W/m2/sr/um if none.")
+    ] = None,
+    gsd: Annotated[float | None, typer.Option(help="Ground sampling distance in m; no pixel depends on it.")] = None,
+    json: Annotated[Path | None, typer.Option(help="Write the figures with their intervals here.")] = None,
+) -> None:
+    """Measure MTF and noise on raw images and write them as a sensor profile, for every --sensor.
+
+    The MTF needs straight edges between even areas: a target, a large roof, an apron. The noise needs raw pixels:
+    what was denoised, sharpened or resampled is refused.
+    """
+    from deploy.characterise import Request, positive, profile_toml, read_box
+    from deploy.characterise import characterise as measure
+    from deploy.results import Document, print_rows
+    from model.io.files import require_writable, write_text
+
+    require_writable(out, json, inputs=images)
+    known = positive("--gain", gain), positive("--gsd", gsd)
+    boxes = tuple(read_box(text, images) for text in edge or ())
+    found = measure(Request(tuple(images), boxes, bits, *known))
+    rows = found.rows()
+    print_rows(f"sensor of {len(images)} image{'' if len(images) == 1 else 's'}", rows)
+    write_text(out, profile_toml(found))
+    arguments = {"bits": bits, "gain": gain, "gsd": gsd, "edge": ", ".join(map(str, boxes)) or None}
+    Document("characterise", arguments, tuple(images), tuple(rows)).write(json)
+    say(f"wrote {out}: beers-deploy profiles {out}")

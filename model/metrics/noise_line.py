@@ -1,0 +1,254 @@
+"""The noise line of an instrument, variance = alpha L + beta, from blurred images of anything.
+
+`noise_level` wants homogeneous areas, which natural scenes of a few hundred pixels do not have. Here the blur helps:
+it leaves next to no texture in the corners of the spectrum, beyond 0.55 cycles per pixel, and noise is white.
+
+1. Cut blocks; the energy of a block's waves up to 0.2 cycles per pixel is its structure, that beyond 0.55 its noise.
+2. Keep the blocks of little structure. Noise does not choose: the two bands share no wave.
+3. Fit noise = alpha L + beta + leak * structure, none of them negative: what texture leaks is taken off.
+4. Draw parts of the images with replacement: the spread is the interval.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from model.metrics.refusal import Refusal
+
+SIDE_PX, PART_BLOCKS = 16, 4
+SLOW, MIDDLE, FINE = 0.2, 0.5, 0.55
+"""Cycles per pixel."""
+
+STRUCTURES = (10.0, 30.0, 100.0, 300.0, 1000.0, 3000.0)
+"""How much structure a block may have, of its noise: the least that leaves enough blocks."""
+ENOUGH, LEAST, LEAST_PARTS = 300, 60, 5
+MAX_LEAK = 0.5
+"""Of the energy of the corners, what may come from texture."""
+MAX_COLOUR, COLOUR_SCATTER = 0.15, 3.0
+"""What the noise at middle frequencies may differ from that of the corners by: white noise does not."""
+MIN_RANGE = 0.25
+"""Least spread of the blocks' means, of the brightest: less gives no line."""
+ROUNDING = 1 / 12
+"""Variance that rounding to whole digital numbers adds, DN^2."""
+LEAST_NOISE, QUIET_PERCENT = 0.5 * ROUNDING, 5.0
+"""Above rounding, DN^2, in the quietest blocks: what was restored or resampled has less."""
+DRAWS, PASSES = 200, 6
+FINE_WAVES, MAX_SCATTER = 21, 3.5
+"""Waves beyond FINE in a block; how many deviations of their mean square, by chance, a block may lie off."""
+EDGE_PERCENT = 2.0
+"""Of the blocks lie below, and above, the radiances that are said to be measured."""
+
+
+@dataclass(frozen=True)
+class Blocks:
+    """N blocks of 16 x 16 pixels, less a plane each.
+
+    Attributes:
+        mean: (N,) in DN.
+        structure: (N,) mean square of the waves up to 0.2 cycles per pixel, for white noise its variance in DN^2.
+        middle: (N,) that of the waves from 0.5 to 0.55.
+        fine: (N,) that of the waves beyond.
+        part: (N,) which part of which image a block lies in.
+    """
+
+    mean: np.ndarray
+    structure: np.ndarray
+    middle: np.ndarray
+    fine: np.ndarray
+    part: np.ndarray
+
+    def only(self, chosen: np.ndarray) -> "Blocks":
+        """The blocks that `chosen`, bool or indices, picks."""
+        bands = (self.structure[chosen], self.middle[chosen], self.fine[chosen])
+        return Blocks(self.mean[chosen], *bands, self.part[chosen])
+
+
+def join(images: Sequence[Blocks]) -> Blocks:
+    """The blocks of several images as one; their parts stay apart."""
+    first = np.cumsum([0] + [int(b.part.max(initial=-1)) + 1 for b in images])
+    parts = [b.part + start for b, start in zip(images, first, strict=False)]
+    columns = ([b.mean for b in images], [b.structure for b in images], [b.middle for b in images])
+    return Blocks(*map(np.concatenate, (*columns, [b.fine for b in images], parts)))
+
+
+def cut_blocks(image: np.ndarray, clipped_at: float) -> Blocks:
+    """Cut (H, W) digital numbers into blocks side by side, without those with a pixel at 0 or at `clipped_at`."""
+    rows, columns = (size // SIDE_PX for size in image.shape)
+    pixels = np.asarray(image[: rows * SIDE_PX, : columns * SIDE_PX], np.float64)
+    pixels = pixels.reshape(rows, SIDE_PX, columns, SIDE_PX).swapaxes(1, 2).reshape(-1, SIDE_PX, SIDE_PX)
+    sound = ((pixels > 0) & (pixels < clipped_at)).all((1, 2))
+    across = columns // PART_BLOCKS + 1
+    part = (np.arange(rows)[:, None] // PART_BLOCKS * across + np.arange(columns) // PART_BLOCKS).ravel()
+    pixels = pixels[sound]
+    energy, frequency = _energies(pixels)
+    slow, middle, fine = (
+        energy[:, (frequency > low) & (frequency <= high)].mean(1)
+        for low, high in ((1.5 / (2 * SIDE_PX), SLOW), (MIDDLE, FINE), (FINE, 1.0))
+    )
+    return Blocks(pixels.mean((1, 2)), slow, middle, fine, part[sound])
+
+
+def _energies(pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Squared cosine coefficients (N, S, S) of blocks less their planes, and their frequencies (S, S)."""
+    place = np.arange(SIDE_PX)
+    ramp = place - (SIDE_PX - 1) / 2
+    flat = pixels - pixels.mean((1, 2), keepdims=True)
+    slopes = [(flat.sum(axis) @ ramp) / (SIDE_PX * (ramp**2).sum()) for axis in (1, 2)]
+    flat = flat - slopes[0][:, None, None] * ramp - slopes[1][:, None, None] * ramp[:, None]
+    waves = np.cos(np.pi * place[:, None] * (place + 0.5) / SIDE_PX) * math.sqrt(2 / SIDE_PX)
+    waves[0] /= math.sqrt(2)
+    return (waves @ flat @ waves.T) ** 2, np.hypot(place[:, None], place) / (2 * SIDE_PX)
+
+
+@dataclass(frozen=True)
+class Variance:
+    """Variance of the noise at one value: DN^2, without the rounding, and its 95 % interval."""
+
+    value: float
+    interval: tuple[float, float]
+    extrapolated: bool
+
+
+@dataclass(frozen=True)
+class NoiseModel:
+    """Variance of the noise in DN^2, alpha * DN + beta, the rounding taken off.
+
+    Attributes:
+        alpha: DN.
+        beta: DN^2.
+        draws: (D, 2) alpha and beta of each draw of the bootstrap.
+        blocks: how many were used.
+        measured_dn: means that the blocks reach from and to.
+        leak: share of texture in the corners of the spectrum, taken off.
+    """
+
+    alpha: float
+    beta: float
+    draws: np.ndarray
+    blocks: int
+    measured_dn: tuple[float, float]
+    leak: float
+
+    def total(self, dn: np.ndarray) -> np.ndarray:
+        """Variance in the pixels, of the values `dn` of any shape: the rounding included."""
+        return np.asarray(self.alpha * np.maximum(dn, 0) + self.beta + ROUNDING)
+
+    def at(self, dn: float) -> Variance:
+        """Variance at one value; the further it lies outside what was measured, the wider the interval."""
+        value = self.alpha * dn + self.beta
+        low, high = np.percentile(self.draws @ (dn, 1.0), [2.5, 97.5])
+        dark, bright = self.measured_dn
+        beyond = max(math.log(dark / dn), math.log(dn / bright), 0.0)
+        # What texture leaked is taken off by a straight line, which may be wrong by a part of it.
+        wider, model = 1 + beyond, 0.04 + 0.2 * self.leak
+        low, high = (value + wider * (end - value) for end in (min(low, value), max(high, value)))
+        return Variance(value, (max(low - model * value, 0.0), high + model * value), beyond > 0)
+
+
+def fit_noise_model(blocks: Blocks, generator: np.random.Generator) -> NoiseModel | Refusal:
+    """Fit the line to blocks of any number of images of one instrument.
+
+    Returns:
+        The line, or why there is none: "few-windows", "range", "no-noise".
+    """
+    if blocks.mean.size < LEAST:
+        return Refusal("few-windows", f"{blocks.mean.size} blocks of 16 x 16 unclipped pixels, {LEAST} are needed")
+    quietest = float(np.percentile(blocks.fine, QUIET_PERCENT))
+    if quietest < ROUNDING + LEAST_NOISE:
+        got = f"a variance of {quietest:.2g} DN^2 at the finest detail, where rounding alone makes {ROUNDING:.2g}"
+        return Refusal("no-noise", got)
+    used, fit = _choose(blocks)
+    parts = np.unique(used.part)
+    if used.mean.size < LEAST or parts.size < LEAST_PARTS:
+        return Refusal("few-windows", f"{used.mean.size} blocks without much texture, {LEAST} are needed")
+    dark, bright = (float(v) for v in np.percentile(used.mean, [EDGE_PERCENT, 100 - EDGE_PERCENT]))
+    if bright - dark < MIN_RANGE * bright:
+        return Refusal("range", f"even areas from {dark:.4g} to {bright:.4g} DN only, too narrow for a line")
+    draws = np.array([_fitted(used, _weights(used.part, parts, generator)) for _ in range(DRAWS)])
+    leak = float((fit[2] * _excess(used, fit)).mean() / used.fine.mean())
+    alpha, beta = _unrounded(fit)
+    shown = np.array([_unrounded(draw) for draw in draws])
+    model = NoiseModel(alpha, beta, shown, used.mean.size, (dark, bright), leak)
+    return _doubtful(used, model) or model
+
+
+def _choose(blocks: Blocks) -> tuple[Blocks, np.ndarray]:
+    """The blocks of least structure that are enough, and their fit; what is enough shrinks with the images."""
+    for limit in STRUCTURES:
+        used, fit = _quiet(blocks, limit)
+        if used.mean.size >= ENOUGH:
+            break
+    return used, fit
+
+
+def _quiet(blocks: Blocks, limit: float) -> tuple[Blocks, np.ndarray]:
+    """The blocks of so little structure whose finest detail is what the others' is, but for chance; and the fit."""
+    noise = expected = np.full(blocks.mean.size, max(np.percentile(blocks.fine, 10), ROUNDING))
+    for _ in range(PASSES):
+        quiet = blocks.structure <= limit * noise
+        if quiet.sum() < LEAST:
+            quiet = blocks.structure <= np.partition(blocks.structure, LEAST - 1)[LEAST - 1]
+        # Rows of crops, nets and ripples are as fine as noise: such blocks stand apart from the rest.
+        alike = np.abs(blocks.fine - expected) <= MAX_SCATTER * math.sqrt(2 / FINE_WAVES) * expected
+        used = blocks.only(quiet & alike if (quiet & alike).sum() >= LEAST else quiet)
+        fit = _fitted(used, np.ones(used.mean.size))
+        noise = np.maximum(fit[0] * blocks.mean + fit[1], ROUNDING)
+        expected = noise + fit[2] * np.maximum(blocks.structure - noise, 0)
+    return blocks.only((blocks.structure <= limit * noise) & alike), fit
+
+
+def _fitted(blocks: Blocks, weights: np.ndarray, band: str = "fine") -> np.ndarray:
+    """(alpha, beta, leak), none negative, of a band; a mean square scatters by its own size."""
+    seen = getattr(blocks, band)
+    size, fit = np.full(seen.size, max(float(weights @ seen / weights.sum()), ROUNDING)), np.zeros(3)
+    for _ in range(4):
+        noise = np.maximum(fit[0] * blocks.mean + fit[1], ROUNDING) if fit.any() else size
+        terms = np.stack([blocks.mean, np.ones(seen.size), np.maximum(blocks.structure - noise, 0)], axis=1)
+        fit = _not_negative(terms, seen, weights / size**2)
+        size = np.maximum(terms @ fit, 0.3 * ROUNDING)
+    return fit
+
+
+def _not_negative(terms: np.ndarray, seen: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """Weighted least squares of three terms without negative factors: the best of the subsets that have none."""
+    normal, right = (terms.T * weights) @ terms, (terms.T * weights) @ seen
+    best, least = np.zeros(3), math.inf
+    for chosen in ([0, 1, 2], [0, 1], [0, 2], [1, 2], [0], [1], [2]):
+        part = np.zeros(3)
+        part[chosen] = np.linalg.lstsq(normal[np.ix_(chosen, chosen)], right[chosen], rcond=None)[0]
+        cost = float(part @ normal @ part - 2 * part @ right)
+        if (part >= 0).all() and cost < least:
+            best, least = part, cost
+            if len(chosen) == 3:
+                break
+    return best
+
+
+def _weights(part: np.ndarray, parts: np.ndarray, generator: np.random.Generator) -> np.ndarray:
+    """How often each block is drawn, (N,), when parts are drawn with replacement."""
+    counts = np.bincount(generator.integers(parts.size, size=parts.size), minlength=parts.size)
+    return counts[np.searchsorted(parts, part)].astype(np.float64)
+
+
+def _excess(blocks: Blocks, fit: np.ndarray) -> np.ndarray:
+    return np.asarray(np.maximum(blocks.structure - np.maximum(fit[0] * blocks.mean + fit[1], ROUNDING), 0))
+
+
+def _unrounded(fit: np.ndarray) -> tuple[float, float]:
+    """Alpha and beta of the instrument: the rounding's variance taken off, first of what does not grow."""
+    return float(fit[0]), max(float(fit[1]) - ROUNDING, 0.0)
+
+
+def _doubtful(used: Blocks, model: NoiseModel) -> Refusal | None:
+    """Texture that passes for noise, or noise that is not white; both would be told to a network as they stand."""
+    if model.leak > MAX_LEAK:
+        return Refusal("few-windows", f"{model.leak:.0%} of the finest detail is texture, {MAX_LEAK:.0%} at most")
+    place = (float(np.median(used.mean)), 1.0)
+    fine = (model.alpha, model.beta) @ np.array(place)
+    coarse = _fitted(used, np.ones(used.mean.size), "middle")[:2] @ place - ROUNDING
+    scatter = float((model.draws @ place).std()) / fine
+    if abs(coarse / fine - 1) > MAX_COLOUR + COLOUR_SCATTER * scatter:
+        return Refusal("few-windows", f"noise {coarse / fine:.2f} times as strong at middle frequencies: not white")
+    return None

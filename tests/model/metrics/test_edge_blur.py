@@ -1,0 +1,118 @@
+import math
+from functools import lru_cache
+
+import numpy as np
+import pytest
+import torch
+
+from model.metrics.edge_blur import FOUND, HALF_PX, POINTED_AT, EdgeBlur, combine, find_blurs, fit_blur
+from model.metrics.edges import slanted_edge
+from model.metrics.refusal import Refusal
+from model.simulator.mtf import Axes, gamma_from_mtf, transfer_function
+from model.simulator.procedural import procedural_scene
+from model.simulator.sampling import sample, scene_spectrum
+
+RATIO, SIDE_PX, SIGMA = 4, 120, 6.0
+
+
+def noise(values: np.ndarray) -> np.ndarray:
+    return np.full(values.shape, SIGMA**2)
+
+
+def blurred(scene: torch.Tensor, mtf_nyquist: Axes) -> np.ndarray:
+    side = scene.shape[-1]
+    return (
+        sample(scene_spectrum(scene), transfer_function(side, side, RATIO, mtf_nyquist), side, RATIO).numpy() * 10.0
+    )
+
+
+@lru_cache
+def clean(mtf_nyquist: float, angle_deg: float) -> np.ndarray:
+    """An edge through the middle, its values those of digital numbers."""
+    return blurred(slanted_edge(SIDE_PX, RATIO, angle_deg, (40.0, 160.0)), mtf_nyquist)
+
+
+def square(image: np.ndarray, angle_deg: float, rng: np.random.Generator) -> np.ndarray:
+    """17 x 17 pixels around a place on the edge, with noise of its own."""
+    middle = (SIDE_PX - 1) / 2
+    row = int(rng.integers(45, 75))
+    column = round(middle - (row - middle) * math.tan(math.radians(angle_deg)))
+    part = image[row - HALF_PX : row + HALF_PX + 1, column - HALF_PX : column + HALF_PX + 1]
+    return np.asarray(part + SIGMA * rng.standard_normal(part.shape))
+
+
+def edges(mtf_nyquist: float, angle_deg: float, count: int, seed: int = 0) -> list[EdgeBlur]:
+    rng = np.random.default_rng(seed)
+    fits = [fit_blur(square(clean(mtf_nyquist, angle_deg), angle_deg, rng), noise, FOUND) for _ in range(count)]
+    return [fit for fit in fits if isinstance(fit, EdgeBlur)]
+
+
+@pytest.mark.parametrize("mtf_nyquist", [0.02, 0.05, 0.12])
+@pytest.mark.parametrize("angle_deg", [0.0, 4.0, 15.0, 30.0])
+def test_one_small_square_tells_the_blur(mtf_nyquist: float, angle_deg: float) -> None:
+    found = edges(mtf_nyquist, angle_deg, 30)
+    assert len(found) >= 25
+    off = np.array([edge.gamma for edge in found]) - gamma_from_mtf(mtf_nyquist)
+    assert abs(off.mean()) < 0.07
+    assert off.std() == pytest.approx(np.mean([edge.error for edge in found]), rel=0.5)
+
+
+@pytest.mark.parametrize("mtf_nyquist", [0.03, 0.1])
+def test_the_interval_of_a_few_edges_holds_the_truth(mtf_nyquist: float) -> None:
+    found = [combine(edges(mtf_nyquist, 6.0, 4, seed), []) for seed in range(20)]
+    assert sum(axis.interval[0] <= mtf_nyquist <= axis.interval[1] for axis in found) >= 18
+    assert np.median([axis.mtf_nyquist for axis in found]) == pytest.approx(mtf_nyquist, rel=0.05)
+    assert all(axis.interval[1] < 1.5 * axis.interval[0] for axis in found)
+
+
+def board(mtf_nyquist: Axes, lean_deg: float = 8.0) -> np.ndarray:
+    upright = slanted_edge(SIDE_PX, RATIO, lean_deg, (-1.0, 1.0))
+    image = blurred(100 + 60 * upright * slanted_edge(SIDE_PX, RATIO, -lean_deg, (-1.0, 1.0)).T, mtf_nyquist)
+    return np.asarray(image + SIGMA * np.random.default_rng(1).standard_normal(image.shape))
+
+
+@pytest.mark.parametrize("lean_deg", [8.0, 25.0])
+def test_a_board_shows_both_axes(lean_deg: float) -> None:
+    image = board((0.12, 0.05), lean_deg)[10:-10, 10:-10]
+    upright, lying = find_blurs(image, noise, 4095), find_blurs(image.T, noise, 4095)
+    assert min(len(upright), len(lying)) >= 3
+    assert combine(upright, lying).mtf_nyquist == pytest.approx(0.12, rel=0.08)
+    assert combine(lying, upright).mtf_nyquist == pytest.approx(0.05, rel=0.08)
+
+
+def test_clipped_edges_are_left_alone() -> None:
+    image = board(0.07)[10:-10, 10:-10]
+    assert find_blurs(image, noise, 4095)
+    assert not find_blurs(image, noise, 1500)
+    assert not find_blurs(image - 500, noise, 4095)
+
+
+def test_a_landscape_has_no_such_edge() -> None:
+    """Roads, roofs and crop rows, textured: steep places by the hundred, and none that is a plain step."""
+    scene = procedural_scene(1200, 1200, np.random.default_rng(3)).radiance.clone()
+    scene[:400] = scene[400:800]  # the drawn calibration site
+    image = blurred(scene, 0.07)
+    image = image + SIGMA * np.random.default_rng(2).standard_normal(image.shape)
+    assert len(find_blurs(image, noise, 4095)) + len(find_blurs(image.T, noise, 4095)) == 0
+
+
+def refused(region: np.ndarray) -> str:
+    region = region + SIGMA * np.random.default_rng(4).standard_normal(region.shape)
+    found = fit_blur(region, noise, POINTED_AT)
+    assert isinstance(found, Refusal), found
+    assert found.reason
+    return found.status
+
+
+def test_what_is_no_blurred_step_is_refused() -> None:
+    edge = clean(0.07, 6.0)[40:80, 40:80]
+    sharpened = edge.copy()
+    sharpened[:, 2:-2] += 1.5 * (2 * edge[:, 2:-2] - edge[:, :-4] - edge[:, 4:])
+    column = np.arange(40) - 19.5
+    flat = np.ones((40, 1))
+    assert refused(sharpened) == "no-convergence"
+    assert refused(flat * (900 + 600 * np.exp(-((column / 2) ** 2)))) == "no-convergence"  # a road
+    assert refused(flat * np.clip(1000 + 60 * column, 400, 1600)) == "no-convergence"  # a slope
+    assert refused(flat * np.where(column < 0, 1000.0, 1020.0)) in ("contrast", "no-convergence")
+    assert refused(np.full((40, 40), 1000.0)) in ("contrast", "no-convergence")
+    assert refused(edge[:2]) in ("few-rows", "contrast", "no-convergence")

@@ -1,0 +1,121 @@
+import math
+from functools import lru_cache
+
+import numpy as np
+import pytest
+import torch
+
+from model.metrics.noise_line import Blocks, NoiseModel, cut_blocks, fit_noise_model, join
+from model.metrics.refusal import Refusal
+from model.simulator.acquire import acquire
+from model.simulator.detector import Draw
+from model.simulator.procedural import procedural_scene
+from model.simulator.sampling import scene_spectrum
+from profiles.sensor import Sensor, noise_from_snr
+
+RATIO, GAIN, MAX_DN = 4, 10.2375, 4095
+PAIRS = ((50.0, 110.0), (80.0, 170.0), (20.0, 45.0))
+RADIANCES = (25.0, 100.0)
+
+
+@lru_cache
+def spectra() -> list[torch.Tensor]:
+    """Two drawn landscapes, nothing on which is flat."""
+    generators = np.random.default_rng(7).spawn(2)
+    return [scene_spectrum(procedural_scene(1280, 1280, g).radiance) for g in generators]
+
+
+def seen(pair: tuple[float, float], seed: int, mtf_nyquist: float = 0.07) -> Blocks:
+    alpha, beta = noise_from_snr(RADIANCES[0], pair[0], RADIANCES[1], pair[1])
+    sensor = Sensor(mtf_nyquist, alpha, beta, GAIN, 12)
+    images = [acquire(s, 1280, sensor, RATIO, Draw(seed, k), "degraded").numpy() for k, s in enumerate(spectra())]
+    return join([cut_blocks(image, MAX_DN) for image in images])
+
+
+def fitted(blocks: Blocks) -> NoiseModel | Refusal:
+    return fit_noise_model(blocks, np.random.default_rng(0))
+
+
+def model(blocks: Blocks) -> NoiseModel:
+    found = fitted(blocks)
+    assert isinstance(found, NoiseModel), found
+    return found
+
+
+@pytest.mark.parametrize("pair", PAIRS)
+def test_the_noise_of_a_textured_landscape_is_right(pair: tuple[float, float]) -> None:
+    found = [model(seen(pair, seed)) for seed in range(3)]
+    held = []
+    for radiance, snr in zip(RADIANCES, pair, strict=True):
+        true = (radiance * GAIN / snr) ** 2
+        at = [line.at(radiance * GAIN) for line in found]
+        assert np.mean([math.sqrt(v.value / true) for v in at]) == pytest.approx(1, abs=0.07)
+        held += [v.interval[0] <= true <= v.interval[1] for v in at]
+    assert np.mean(held) > 0.8
+
+
+def plain(shape: tuple[int, int] = (320, 320), low: float = 200, high: float = 2200) -> np.ndarray:
+    """Stripes of eight levels, 40 pixels wide for 320."""
+    level = np.arange(shape[1]) * 8 // shape[1]
+    return np.broadcast_to(low + (high - low) * level / 7, shape).copy()
+
+
+def noisy(sigma: float, image: np.ndarray | None = None, seed: int = 0) -> np.ndarray:
+    image = plain() if image is None else image
+    return np.asarray(np.rint(image + sigma * np.random.default_rng(seed).standard_normal(image.shape)))
+
+
+@pytest.mark.parametrize("sigma", [0.6, 5.0])
+def test_the_rounding_is_taken_off(sigma: float) -> None:
+    found = [model(cut_blocks(noisy(sigma, seed=seed), MAX_DN)) for seed in range(5)]
+    assert np.mean([line.at(1000).value for line in found]) == pytest.approx(sigma**2, rel=0.03)
+    assert found[0].total(np.array(1000.0)) == pytest.approx(sigma**2 + 1 / 12, rel=0.1)
+
+
+def test_what_lies_beyond_the_blocks_is_less_sure() -> None:
+    line = model(cut_blocks(noisy(5.0), MAX_DN))
+    inside, outside = line.at(1000), line.at(40)
+    assert (inside.extrapolated, outside.extrapolated) == (False, True)
+    assert np.ptp(outside.interval) > 1.5 * np.ptp(inside.interval)
+
+
+def test_clipped_pixels_are_left_out() -> None:
+    image = noisy(5.0)
+    whole = model(cut_blocks(image, MAX_DN))
+    image[:, 275:] = MAX_DN
+    image[:20] = 0
+    part = model(cut_blocks(image, MAX_DN))
+    assert part.blocks < whole.blocks
+    assert part.measured_dn[1] < 2000 < whole.measured_dn[1]
+    assert part.at(1000).value == pytest.approx(25, rel=0.08)
+
+
+def refused(image: np.ndarray) -> str:
+    found = fitted(cut_blocks(image, MAX_DN))
+    assert isinstance(found, Refusal), found
+    assert found.reason
+    return found.status
+
+
+def test_what_cannot_be_known_is_refused() -> None:
+    assert refused(np.rint(plain())) == "no-noise"
+    assert refused(noisy(0.1)) == "no-noise"
+    assert refused(noisy(5.0, plain(low=1000, high=1100))) == "range"
+    assert refused(noisy(5.0, plain((64, 64)))) == "few-windows"
+    assert refused(np.zeros((320, 320))) == "few-windows"
+    assert refused(np.zeros((3, 0))) == "few-windows"
+
+
+def test_smoothed_noise_is_refused() -> None:
+    """What a denoiser or a resampling leaves is weaker at the finest detail."""
+    noise = 10 * np.random.default_rng(6).standard_normal((320, 320))
+    smooth = (noise + np.roll(noise, 1, 0) + np.roll(noise, 1, 1) + np.roll(noise, (1, 1), (0, 1))) / 4
+    assert refused(plain() + smooth) == "few-windows"
+
+
+def test_texture_as_sharp_as_a_pixel_is_refused() -> None:
+    """A photograph that no instrument has blurred: its texture would pass for noise."""
+    rng = np.random.default_rng(8)
+    radius = np.hypot(np.fft.fftfreq(512)[:, None], np.fft.rfftfreq(512)[None, :])
+    waves = np.fft.irfft2(np.fft.rfft2(rng.standard_normal((512, 512))) / np.maximum(radius, 1 / 100), s=(512, 512))
+    assert refused(np.rint(plain((512, 512)) * np.exp(0.2 * waves / waves.std()))) == "few-windows"
