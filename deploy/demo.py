@@ -18,7 +18,7 @@ from deploy.dpu.checker.placement import Placement, place
 from deploy.dpu.reading import read_network
 from deploy.export import require_parity, weights_for
 from deploy.methods import network_method
-from deploy.networks import KnownSensor, Say, float_file
+from deploy.networks import Say, float_file
 from deploy.report.page import Picture, Report, Table
 from deploy.restoration.options import TILE_PX
 from model.convbeers import plain_network
@@ -224,7 +224,7 @@ def run_demo(
 
 def quantise_and_gate(out: Path, seed: int, sensors: Sensors, say: Say) -> tuple[Row, onnx.ModelProto, Row]:
     """Specialise the shipped network, quantise on drawn scenes, compare; the gate's row and the INT8 model."""
-    model = load_onnx(float_file(Path(VARIANT), KnownSensor(sensors.degraded.name, sensors.degraded), say))
+    model = load_onnx(float_file(Path(VARIANT), sensors.degraded, say))
     save_onnx(model, out / "float.onnx")
     weights, _ = weights_for(shipped_weights(VARIANT), sensors.degraded.nominal())
     difference = require_parity(plain_network(weights.tensors, weights.variant), out / "float.onnx", 97)

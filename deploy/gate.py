@@ -22,7 +22,7 @@ from deploy.dpu.checker.placement import place
 from deploy.dpu.checker.table import legality
 from deploy.dpu.reading import read_network
 from deploy.export import float_model
-from deploy.networks import Say, float_file, int8_file, known_sensor, shipped_pair, silent
+from deploy.networks import Say, float_file, int8_file, shipped_pair, silent
 from deploy.restoration.options import TILE_PX
 from deploy.results import Document
 from model.io.files import require_regular, require_writable, write_text
@@ -130,7 +130,7 @@ def files_or_shipped(
     if variant is not None:
         expected, remedy = "it without files", "leave it out, or the files"
         raise OptionError("--variant", expected=expected, got=float_path.name, remedy=remedy)
-    known = known_sensor(sensor)
+    known = load_sensor(sensor)
     return float_file(float_path, known, say), int8_file(int8_path, known, say)
 
 

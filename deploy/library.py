@@ -13,7 +13,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from deploy.networks import known_sensor, network_file
+from deploy.networks import network_file
 from deploy.restoration.engine import NAME, Restorer, checked_strip, restore_array
 from deploy.restoration.options import TILE_PX, Options, Runtime
 from deploy.restoration.plan import Plan, Span, plan_for
@@ -21,8 +21,8 @@ from deploy.restoration.run import scale_of
 from deploy.restoration.runtime import Infer, Packed, open_packed, open_runtime, pack, tiles_at_once
 from deploy.restoration.source import ArraySource, Raster, require_numbers, usable_nodata
 from model.io.images import settled_scale
-from model.shipped import BLIND
 from profiles.errors import ImageError, OptionError
+from profiles.sensor_file import BLIND, load_sensor
 from quant.onnx_file import load_onnx
 
 Image = TypeVar("Image")
@@ -70,7 +70,7 @@ def restore(
         ProfileError: no such sensor.
         MachineError: a missing package, or a cache that cannot be written.
     """
-    network = network_file(Path(model) if model else None, known_sensor(sensor), warnings.warn)
+    network = network_file(Path(model) if model else None, load_sensor(sensor), warnings.warn)
     options = Options(network, tile_px, str(halo), full_scale, _runtime(runtime), threads)
     if hasattr(image, "coords") and hasattr(image, "dims"):  # an xarray.DataArray, without importing it
         labelled: Any = image

@@ -8,11 +8,9 @@ import onnx
 
 from deploy.export import float_model
 from deploy.networks import (
-    KnownSensor,
     Say,
     conditioned,
     int8_file,
-    known_sensor,
     network_file,
     silent,
     specialised_model,
@@ -31,12 +29,13 @@ from model.evaluation.methods import (
     Specialise,
     method_without_network,
 )
-from model.shipped import BLIND as NOT_KNOWN
-from model.shipped import BLIND_PROFILE, INT8, shipped_names
+from model.shipped import INT8, shipped_names
 from model.traditional.peers import PEERS
 from profiles.constant import Constant
 from profiles.errors import OptionError
 from profiles.sensor import Sensor, SensorProfile
+from profiles.sensor_file import BLIND as NOT_KNOWN
+from profiles.sensor_file import BLIND_PROFILE, load_sensor
 from quant.onnx_file import fixed_tile_px, load_onnx, metadata, receptive_radius_px
 
 EXPECTED = (
@@ -73,7 +72,7 @@ def method_named(name: str, degraded: SensorProfile, reference: SensorProfile, s
     network, _, other = name.partition(AT)
     if not _is_network(network):
         raise OptionError("--methods", expected=EXPECTED, got=repr(name), remedy="correct that name")
-    sensor = known_sensor(other) if other else KnownSensor(degraded.name, degraded)
+    sensor = load_sensor(other) if other else degraded
     model = float_model(network_file(Path(network), sensor, say))
     known = knowledge_of(model, degraded.name)
     specialise = None if other else _specialise(network, degraded, say)
@@ -87,7 +86,7 @@ def _specialise(name: str, like: SensorProfile, say: Say) -> Specialise | None:
         return None
 
     def specialise(sensor: Sensor) -> Restore:
-        known = KnownSensor(DRAWN, profile_of(sensor, like))
+        known = profile_of(sensor, like)
         if name.endswith(INT8):  # minutes, so it is kept; float32 is made in a moment
             return network_method(load_onnx(int8_file(Path(name), known, say)), sensor.max_dn)
         return network_method(specialised_model(found, known, say), sensor.max_dn)
@@ -102,9 +101,9 @@ def _is_network(name: str) -> bool:
 def knowledge_of(model: onnx.ModelProto, sensor_name: str) -> str:
     """What a network knows of the sensor of that name: it, nothing, or another one."""
     own = metadata(model).get("sensor", "")
-    if own == sensor_name:
-        return KNOWN
-    return BLIND if own in ("", NOT_KNOWN, BLIND_PROFILE) else f"another: {own}"
+    if own in ("", NOT_KNOWN, BLIND_PROFILE):
+        return BLIND
+    return KNOWN if own == sensor_name else f"another: {own}"
 
 
 def profile_of(sensor: Sensor, like: SensorProfile) -> SensorProfile:
@@ -114,7 +113,7 @@ def profile_of(sensor: Sensor, like: SensorProfile) -> SensorProfile:
     numbers |= {"gain_dn_per_radiance": sensor.gain_dn_per_radiance, "bits": float(sensor.bits)}
     constants = {name: Constant(value, "assumed", "a sensor drawn") for name, value in numbers.items()}
     noise = {"snr_0": None, "snr_1": None}
-    return replace(like, **constants, **noise, response=sensor.response)  # type: ignore[arg-type]
+    return replace(like, name=DRAWN, **constants, **noise, response=sensor.response)  # type: ignore[arg-type]
 
 
 def network_method(model: onnx.ModelProto, max_dn: int) -> Restore:

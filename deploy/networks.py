@@ -20,7 +20,7 @@ from deploy.export import about, to_onnx, weights_for
 from model.io.files import require_writable, sha256
 from model.io.tensors import is_conditioned
 from model.progress import steps
-from model.shipped import BLIND, BLIND_PROFILE, INT8, SENSOR, SHIPPED, VARIANT, shipped_names, shipped_weights
+from model.shipped import INT8, SENSOR, SHIPPED, VARIANT, shipped_names, shipped_weights
 from profiles.sensor import SensorProfile, numbers_of
 from profiles.sensor_file import load_sensor
 from quant.onnx_file import is_quantised, load_onnx, metadata, save_onnx
@@ -42,31 +42,6 @@ Say = Callable[[str], None]
 
 def silent(_: str) -> None:
     """Tell nobody."""
-
-
-@dataclass(frozen=True)
-class KnownSensor:
-    """The sensor that a network is specialised to: the middle of every range of its profile.
-
-    Attributes:
-        name: of the profile, or `blind`.
-        profile: what INT8 is calibrated on.
-    """
-
-    name: str
-    profile: SensorProfile
-
-
-def known_sensor(name: str) -> KnownSensor:
-    """The sensor by its profile's name or .toml file; `blind` is the middle of what an unknown one may be.
-
-    Raises:
-        ProfileError: no such profile, or a faulty one.
-    """
-    if name == BLIND:
-        return KnownSensor(BLIND, load_sensor(BLIND_PROFILE))
-    profile = load_sensor(name)
-    return KnownSensor(profile.name, profile)
 
 
 @dataclass(frozen=True)
@@ -101,12 +76,12 @@ def weights_file(given: Path) -> Path:
     return found.weights if found else given
 
 
-def network_file(given: Path | None, sensor: KnownSensor, say: Say = silent) -> Path:
+def network_file(given: Path | None, sensor: SensorProfile, say: Say = silent) -> Path:
     """The file of a network: the one given, or a conditioned network's for the sensor, INT8 where its name says so.
 
     Args:
         given: a file, or a shipped name where no such file lies; None is the default network in INT8.
-        sensor: what a conditioned network is specialised to.
+        sensor: what a conditioned network is specialised to: the middle of each of its ranges.
         say: is told what of the sensor lies outside the range that was trained.
 
     Raises:
@@ -117,7 +92,7 @@ def network_file(given: Path | None, sensor: KnownSensor, say: Say = silent) -> 
     return int8_file(given, sensor, say) if int8 else float_file(given, sensor, say)
 
 
-def float_file(given: Path | None, sensor: KnownSensor, say: Say = silent) -> Path:
+def float_file(given: Path | None, sensor: SensorProfile, say: Say = silent) -> Path:
     """As `network_file`, a conditioned network always in float32.
 
     Raises:
@@ -128,7 +103,7 @@ def float_file(given: Path | None, sensor: KnownSensor, say: Say = silent) -> Pa
     return _kept(found, sensor, "float32", say) if found else given or Path()
 
 
-def int8_file(given: Path | None, sensor: KnownSensor, say: Say = silent) -> Path:
+def int8_file(given: Path | None, sensor: SensorProfile, say: Say = silent) -> Path:
     """As `network_file`, a conditioned network always in INT8.
 
     Raises:
@@ -147,13 +122,13 @@ def shipped_pair(name: str = VARIANT, sensor: str = SENSOR, say: Say = silent) -
         ProfileError: no such sensor.
         MachineError: the cache cannot be written.
     """
-    known, given = known_sensor(sensor), Path(shipped_weights(name).stem)
+    known, given = load_sensor(sensor), Path(shipped_weights(name).stem)
     return float_file(given, known, say), int8_file(given, known, say)
 
 
-def specialised_model(network: Conditioned, sensor: KnownSensor, say: Say) -> onnx.ModelProto:
+def specialised_model(network: Conditioned, sensor: SensorProfile, say: Say) -> onnx.ModelProto:
     """A conditioned network in float32 for one sensor, as ONNX."""
-    weights, outside = weights_for(network.weights, sensor.profile.nominal())
+    weights, outside = weights_for(network.weights, sensor.nominal())
     for sentence in outside:
         say(f"warning: {sentence}")
     return to_onnx(weights, about(network.name, weights.recipe, sensor.name))
@@ -168,7 +143,7 @@ def other_precision(model: onnx.ModelProto) -> onnx.ModelProto | None:
     if variant not in shipped_names():
         return None
     find = float_file if is_quantised(model) else int8_file
-    return load_onnx(find(Path(variant), known_sensor(SENSOR)))
+    return load_onnx(find(Path(variant), load_sensor(SENSOR)))
 
 
 def cache_folder() -> Path:
@@ -177,9 +152,9 @@ def cache_folder() -> Path:
     return Path(own) if own else platformdirs.user_cache_path("beers-deploy")
 
 
-def _kept(network: Conditioned, sensor: KnownSensor, precision: str, say: Say) -> Path:
+def _kept(network: Conditioned, sensor: SensorProfile, precision: str, say: Say) -> Path:
     model = specialised_model(network, sensor, say)
-    made_from = digest_of({"weights": sha256(network.weights), "sensor": numbers_of(sensor.profile)})
+    made_from = digest_of({"weights": sha256(network.weights), "sensor": numbers_of(sensor)})
     shipped = SHIPPED / f"{network.name}{INT8}-{sensor.name}.onnx"
     if precision == "int8" and shipped.is_file() and metadata(load_onnx(shipped)).get(MADE_FROM) == made_from:
         return shipped
@@ -194,15 +169,15 @@ def _kept(network: Conditioned, sensor: KnownSensor, precision: str, say: Say) -
     return path
 
 
-def _in_int8(model: onnx.ModelProto, sensor: KnownSensor, more: dict[str, str]) -> onnx.ModelProto:
+def _in_int8(model: onnx.ModelProto, sensor: SensorProfile, more: dict[str, str]) -> onnx.ModelProto:
     from model.simulator.procedural import load_scenes  # torch, which what is kept already does not need
     from profiles.sensor_file import reference_for
     from quant.calibration import draw_patches
     from quant.quantise import quantise_model, ticks
 
-    reference = reference_for(sensor.profile)
+    reference = reference_for(sensor)
     scenes = load_scenes(None, reference.nominal(), SEED)
-    patches = draw_patches(scenes, sensor.profile, reference, PATCHES, SEED, PATCH_PX)
+    patches = draw_patches(scenes, sensor, reference, PATCHES, SEED, PATCH_PX)
     about = {"calibration_sensor": sensor.name, "calibration_seed": str(SEED), **more}
     with steps(f"making INT8 for {sensor.name}, once", ticks(model, PATCHES)) as bar:
         return quantise_model(model, patches, about, bar.advance).host

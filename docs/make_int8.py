@@ -9,8 +9,9 @@ import shutil
 import sys
 from pathlib import Path
 
-from deploy.networks import int8_file, known_sensor
-from model.shipped import BLIND, INT8, SENSOR, SHIPPED, shipped_names
+from deploy.networks import int8_file
+from model.shipped import INT8, SENSOR, SHIPPED, shipped_names
+from profiles.sensor_file import BLIND, load_sensor
 
 SENSORS = (SENSOR, BLIND)
 
@@ -21,7 +22,7 @@ def main() -> None:
         for sensor in SENSORS:
             shipped = SHIPPED / f"{name}{INT8}-{sensor}.onnx"
             shipped.unlink(missing_ok=True)
-            shutil.copyfile(int8_file(Path(name), known_sensor(sensor), print), shipped)
+            shutil.copyfile(int8_file(Path(name), load_sensor(sensor), print), shipped)
             print(shipped.name, flush=True)
 
 

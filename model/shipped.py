@@ -15,9 +15,6 @@ SENSOR = "pleiades-degraded"
 """The sensor profile of a command that names none: the same for all, so that a network is judged where it was
 calibrated. (`train` alone defaults to a range of sensors, and `restore` to a sensor that is not known.)"""
 
-BLIND, BLIND_PROFILE = "blind", "pleiades-variable"
-"""What stands for a sensor that is not known, and the profile in whose middle a network then takes it to be."""
-
 
 def shipped_names() -> list[str]:
     """The names of the shipped networks: each the weights of one network for every sensor in range."""

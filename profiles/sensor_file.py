@@ -42,13 +42,19 @@ def sensor_names() -> list[str]:
     return shipped_names("sensors")
 
 
+BLIND, BLIND_PROFILE = "blind", "pleiades-variable"
+"""The name of a sensor that is not known, and the profile in whose ranges it then counts to be."""
+
+
 def load_sensor(name: str) -> SensorProfile:
-    """Read a shipped sensor profile by name, or the user's own by the path of its .toml file.
+    """Read a shipped sensor profile by name, or the user's own by the path of its .toml file; `blind` is one too.
 
     Raises:
         ProfileError: unknown name, wrong or missing key, or numbers that no instrument can have.
     """
-    return read_sensor(*read_toml("sensors", name), profile_path("sensors", name).parent)
+    shipped = BLIND_PROFILE if name == BLIND else name
+    found = read_sensor(*read_toml("sensors", shipped), profile_path("sensors", shipped).parent)
+    return replace(found, name=BLIND) if name == BLIND else found
 
 
 def sensor_from_json(label: str, raw: Mapping[str, Any]) -> SensorProfile:

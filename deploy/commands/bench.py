@@ -53,15 +53,15 @@ def bench(
     from deploy.bench.board import BoardRequest, bench_board
     from deploy.bench.host import host_rows
     from deploy.bench.tables import parse_tiles
-    from deploy.networks import int8_file, known_sensor
+    from deploy.networks import int8_file
     from deploy.results import Document, print_rows
     from model.io.files import require_writable
-    from profiles import load_target
+    from profiles import load_sensor, load_target
     from profiles.figures import by_table
 
     tiles, here = parse_tiles(tile), _is_host(target)
     _refuse_unused(context, here)
-    path = int8_file(model, known_sensor(sensor), partial(say, err=True))
+    path = int8_file(model, load_sensor(sensor), partial(say, err=True))
     require_writable(json, inputs=(path, image, measured))
     if here:
         rows = host_rows(path, load_target("host-cpu"), _single(tiles), threads)

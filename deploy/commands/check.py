@@ -42,16 +42,17 @@ def check(
     """Place every node of a network on the host, the DPU or the CPU; exit code 1 if the DPU cannot run its part."""
     from deploy.dpu.board import load_dpu
     from deploy.dpu.checker.picture import require_picture
-    from deploy.networks import int8_file, known_sensor
+    from deploy.networks import int8_file
     from model.io.files import require_writable
     from model.shipped import SENSOR
+    from profiles import load_sensor
 
     if model == TRADITIONAL:
         remedy = "leave the option out, or give a network"
         refuse(context, ["picture", "tile"], expected="none with 'traditional'", got="one", remedy=remedy)
     require_picture(picture)
     chain = model == TRADITIONAL
-    path = None if chain else int8_file(model, known_sensor(SENSOR), partial(say, err=True))
+    path = None if chain else int8_file(model, load_sensor(SENSOR), partial(say, err=True))
     require_writable(picture, json, inputs=(path, Path(target)))
     dpu = load_dpu(target, config)
     if not (_traditional(dpu, json) if path is None else _network(path, dpu, tile, picture, json)):

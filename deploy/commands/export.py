@@ -33,11 +33,12 @@ def export(
     the nearest end of it, with a warning.
     """
     from deploy.export import about, require_parity, to_onnx, weights_for
-    from deploy.networks import known_sensor, weights_file
+    from deploy.networks import weights_file
     from model.convbeers import plain_network
     from model.io.files import require_writable
     from model.io.tensors import is_conditioned, read_plain
     from model.shipped import shipped_weights
+    from profiles import load_sensor
     from profiles.errors import ModelError
     from quant.onnx_file import save_onnx
 
@@ -46,8 +47,8 @@ def export(
     path = weights_file(checkpoint) if checkpoint else shipped_weights(variant)
     require_writable(out, inputs=(path, Path(sensor) if sensor else None))
     if is_conditioned(path):
-        known = known_sensor(sensor or SENSOR)
-        weights, outside = weights_for(path, known.profile.nominal())
+        known = load_sensor(sensor or SENSOR)
+        weights, outside = weights_for(path, known.nominal())
         for sentence in outside:
             say(f"warning: {sentence}", err=True)
         said = about(path.stem, weights.recipe, known.name)

@@ -55,11 +55,11 @@ def quantize(
     Prints each integer layer: bits of its accumulator, seen and proven, and the share of saturated results.
     """
     from deploy.export import float_model
-    from deploy.networks import float_file, known_sensor
+    from deploy.networks import float_file
     from deploy.quantise import Wanted, quantise_free_file, quantise_legal_file
     from deploy.results import Document, print_rows
     from model.io.files import require_writable
-    from profiles import load_target
+    from profiles import load_sensor, load_target
     from profiles.errors import OptionError
     from quant.calibration import Calibration
     from quant.quantise import passes_without
@@ -68,7 +68,7 @@ def quantize(
         remedy = "leave it out, or take --regime legal"
         expected = "no --board, --ablate, --report or --without"
         raise OptionError("--regime free", expected=expected, got="one", remedy=remedy)
-    model = float_file(model, known_sensor(sensor), partial(say, err=True))
+    model = float_file(model, load_sensor(sensor), partial(say, err=True))
     passes = passes_without(without or [])
     page, figures = (report / "report.html", report / "report.json") if report else (None, None)
     read = (model, images, *map(Path, (target, sensor)))

@@ -72,12 +72,12 @@ def restore(
     .OUT.part beside it. Workers change no pixel: where they are of one processor and the same versions, the bytes are
     those of one process. Those of a scheduler must find IN under its path; only this process writes.
     """
-    from deploy.networks import conditioned, known_sensor, network_file
+    from deploy.networks import conditioned, network_file
     from deploy.restoration.run import restore_file
     from deploy.results import Document, print_rows
     from model.io.files import require_writable
-    from model.shipped import BLIND
     from profiles.errors import OptionError
+    from profiles.sensor_file import BLIND, load_sensor
 
     budget_bytes = max(int(memory * 1e9), 1) if memory else None
     if method is Method.traditional:
@@ -90,7 +90,7 @@ def restore(
     if sensor is not None and conditioned(model) is None:
         expected, remedy = "a shipped network, or weights of 'train --conditioned'", "leave --sensor out"
         raise OptionError("--sensor", expected=expected, got=f"{model}, made for one already", remedy=remedy)
-    path = network_file(model, known_sensor(sensor or BLIND), partial(say, err=True))
+    path = network_file(model, load_sensor(sensor or BLIND), partial(say, err=True))
     options = Options(
         path,
         tile,

@@ -14,12 +14,13 @@ from torch import Tensor
 from torch.nn.functional import conv2d
 
 from deploy.export import float_model
-from deploy.networks import Say, float_file, int8_file, known_sensor, shipped_pair, silent
+from deploy.networks import Say, float_file, int8_file, shipped_pair, silent
 from deploy.restoration.engine import restore_floats
 from deploy.restoration.plan import make_plan
 from deploy.restoration.runtime import Infer
 from deploy.stress.cases import FULL_DN
 from model.shipped import SENSOR
+from profiles import load_sensor
 from profiles.errors import BeersError
 from quant.core import IntCore
 from quant.encodings import read_core
@@ -99,7 +100,7 @@ def open_subject(
     """
     if float_path is None:
         float_path, int8_path = shipped_pair(variant, sensor, say)
-    known = known_sensor(sensor)
+    known = load_sensor(sensor)
     float_path = float_file(float_path, known, say)
     int8_path = int8_file(int8_path, known, say) if int8_path else None
     float32 = Network(float_model(float_path))

@@ -16,7 +16,7 @@ import onnx
 from deploy.cache import Cache, code_digest, digest_of
 from deploy.export import float_model
 from deploy.methods import knowledge_of, method_named, restoring
-from deploy.networks import KnownSensor, Say, float_file, int8_file, known_sensor, silent
+from deploy.networks import Say, float_file, int8_file, silent
 from deploy.restoration.options import Runtime
 from deploy.restoration.runtime import Infer, open_openvino, open_runtime
 from deploy.tradeoff.points import LEGAL, Variant
@@ -68,7 +68,7 @@ def find_networks(names: Iterable[str], sensor: str = SENSOR, say: Say = silent)
         OptionError: neither a shipped name nor a file of weights, two files of one name, or a model of one tile size.
         ModelError: a file that is no network.
     """
-    known, found = known_sensor(sensor), dict[str, Network]()
+    known, found = load_sensor(sensor), dict[str, Network]()
     for name in dict.fromkeys(each.strip() for each in names):
         network = _network(name, known, say)
         if network.name in found:
@@ -77,7 +77,7 @@ def find_networks(names: Iterable[str], sensor: str = SENSOR, say: Say = silent)
     return list(found.values())
 
 
-def _network(name: str, sensor: KnownSensor, say: Say) -> Network:
+def _network(name: str, sensor: SensorProfile, say: Say) -> Network:
     path = Path(name)
     if name in shipped_names():
         return Network(name, float_file(path, sensor, say), int8_file(path, sensor, say))

@@ -16,8 +16,8 @@ from deploy.library import restore
 from deploy.networks import shipped_pair
 from deploy.restoration.options import Options
 from deploy.restoration.run import restore_file
-from model.shipped import BLIND
 from profiles.errors import ImageError, ModelError, OptionError
+from profiles.sensor_file import BLIND
 
 SHAPES = [(61, 83), (17, 130), (1, 40), (29, 29), (3, 5), (3, 41, 35), (1, 50, 20)]
 

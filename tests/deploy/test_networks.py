@@ -3,6 +3,7 @@
 import re
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,11 +20,9 @@ from deploy.cli import app
 from deploy.networks import (
     CACHE_VARIABLE,
     MADE_FROM,
-    KnownSensor,
     cache_folder,
     float_file,
     int8_file,
-    known_sensor,
     network_file,
     shipped_pair,
 )
@@ -31,15 +30,15 @@ from model.conditioning import ConditionedConvBEERS, initialise_coefficients
 from model.convbeers import initialise
 from model.io.files import sha256
 from model.io.weights import save_network
-from model.shipped import BLIND, BLIND_PROFILE, INT8, SENSOR, SHIPPED, shipped_names, shipped_weights
+from model.shipped import INT8, SENSOR, SHIPPED, shipped_names, shipped_weights
 from model.variants import Variant
-from profiles import load_sensor
 from profiles.errors import ModelError, ProfileError
 from profiles.sensor import numbers_of
+from profiles.sensor_file import BLIND, BLIND_PROFILE, load_sensor
 from profiles.toml import HERE
 from quant.onnx_file import is_quantised, load_onnx, metadata
 
-KNOWN = known_sensor(SENSOR)
+KNOWN = load_sensor(SENSOR)
 
 
 @pytest.fixture(autouse=True)
@@ -82,7 +81,7 @@ def test_the_same_numbers_are_the_same_sensor_and_others_are_not(small: Path, tm
     files = []
     for folder, old, new in (("a", "", ""), ("b", "Raw", "My raw"), ("c", "value = 0.07", "value = 0.08")):
         (tmp_path / folder).mkdir()
-        sensor = known_sensor(str(own_sensor(tmp_path / folder, old, new)))
+        sensor = load_sensor(str(own_sensor(tmp_path / folder, old, new)))
         files.append(float_file(small, sensor))
     assert files[0] == files[1]
     assert files[2] != files[0]
@@ -112,16 +111,16 @@ def test_the_shipped_int8_files_are_of_these_weights_and_sensors(name: str, sens
     """Other weights, or other numbers in a profile, need other files: docs/make_int8.py makes them."""
     int8 = SHIPPED / f"{name}{INT8}-{sensor}.onnx"
     said = metadata(load_onnx(int8))
-    sources = {"weights": sha256(shipped_weights(name)), "sensor": numbers_of(known_sensor(sensor).profile)}
+    sources = {"weights": sha256(shipped_weights(name)), "sensor": numbers_of(load_sensor(sensor))}
     assert said[MADE_FROM] == digest_of(sources)
     assert (said["variant"], said["sensor"]) == (name, sensor)
-    assert int8_file(Path(name), known_sensor(sensor)) == int8
+    assert int8_file(Path(name), load_sensor(sensor)) == int8
     assert not own_cache.exists()
 
 
 def test_blind_is_the_middle_of_a_range_of_sensors() -> None:
-    blind = known_sensor(BLIND)
-    assert (blind.name, blind.profile) == (BLIND, load_sensor(BLIND_PROFILE))
+    blind = load_sensor(BLIND)
+    assert (blind.name, numbers_of(blind)) == (BLIND, numbers_of(load_sensor(BLIND_PROFILE)))
     floating = [load_onnx(shipped_pair("convbeers-xs", name)[0]) for name in (BLIND, BLIND_PROFILE)]
     weights = [[tensor.raw_data for tensor in model.graph.initializer] for model in floating]
     assert weights[0] == weights[1]
@@ -129,7 +128,7 @@ def test_blind_is_the_middle_of_a_range_of_sensors() -> None:
 
 def test_what_lies_outside_is_said_each_time(small: Path, tmp_path: Path) -> None:
     said = list[str]()
-    sensor = known_sensor(str(own_sensor(tmp_path, "value = 0.07", "value = 0.004")))
+    sensor = load_sensor(str(own_sensor(tmp_path, "value = 0.07", "value = 0.004")))
     for _ in range(2):
         float_file(small, sensor, said.append)
     assert len(said) == 4
@@ -138,7 +137,7 @@ def test_what_lies_outside_is_said_each_time(small: Path, tmp_path: Path) -> Non
 
 def test_what_cannot_be_had_is_one_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(ProfileError, match="hubble"):
-        known_sensor("hubble")
+        load_sensor("hubble")
     with pytest.raises(ModelError, match="no such file"):
         network_file(tmp_path / "none.safetensors", KNOWN)
     (tmp_path / "file").touch()
@@ -178,5 +177,5 @@ def test_a_network_that_is_made_already_takes_no_sensor(tmp_path: Path) -> None:
 
 
 def test_a_sensors_name_cannot_leave_the_cache(small: Path, own_cache: Path) -> None:
-    odd = KnownSensor("../../x y/" + 99 * "z", KNOWN.profile)
+    odd = replace(KNOWN, name="../../x y/" + 99 * "z")
     assert float_file(small, odd).parent == own_cache

@@ -9,11 +9,12 @@ from typer.testing import CliRunner
 
 from deploy.cli import app
 from deploy.gate import files_or_shipped
-from deploy.networks import float_file, int8_file, known_sensor, network_file, shipped_pair, weights_file
+from deploy.networks import float_file, int8_file, network_file, shipped_pair, weights_file
 from model.shipped import SENSOR, VARIANT, shipped_weights
+from profiles import load_sensor
 from quant.onnx_file import load_onnx, metadata
 
-KNOWN = known_sensor(SENSOR)
+KNOWN = load_sensor(SENSOR)
 
 
 @pytest.mark.parametrize("name", ["convbeers-xs", "convbeers-s"])
