@@ -49,7 +49,7 @@ Order of the light: one transfer function for MTF, anti-alias filter and smear; 
 (`model/simulator/detector.py`).
 
 The anti-alias filter is part of the MTF's budget: the product has the MTF that the profile states, or the profile is
-refused. Motion smear comes on top, along the track only.
+refused; a tabulated MTF or a point-spread function has it already. Motion smear comes on top, along the track only.
 
 ## Plans
 

@@ -70,7 +70,7 @@ def test_the_profile_is_that_of_the_sensor(raw: tuple[Path, Path], tmp_path: Pat
     for radiance, snr in zip((25, 100), SNRS, strict=True):
         assert radiance / sensor.noise_sigma(radiance) == pytest.approx(snr, rel=0.1)
     assert (sensor.bits, sensor.gain_dn_per_radiance, profile.gsd_m.low) == (12, GAIN, 0.7)
-    assert {profile.mtf_nyquist.status, profile.snr_0.status} == {"measured"}
+    assert {profile.mtf_nyquist.status, profile.snr_pair[0].status} == {"measured"}
     assert {profile.gain_dn_per_radiance.status, profile.bits.status, profile.gsd_m.status} == {"stated"}
     assert run(*raw, "--bits", 12, "--gain", GAIN, "--gsd", 0.7, "--out", tmp_path / "again.toml")[0] == 0
     assert (tmp_path / "again.toml").read_bytes() == out.read_bytes()

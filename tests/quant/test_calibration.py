@@ -1,6 +1,7 @@
 """Calibration patches: spread over light, blur and noise; made anew each time; statistics the same in pieces."""
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import onnx
@@ -12,6 +13,7 @@ from model.simulator.procedural import procedural_scene
 from model.simulator.sampling import Scene
 from profiles import load_sensor
 from profiles.errors import ImageError
+from profiles.response import MtfTable
 from quant.calibration import Patches, choose_frac_bits, draw_patches, stratified
 from quant.graph import PLANES, Graph, correction_graph, graph_to_onnx, read_planes, tensors
 from quant.session import TILE_PX, crops, halo_of, open_session, planes_of, tensor_values
@@ -73,6 +75,15 @@ def test_the_ranges_are_covered_without_gaps(scenes: list[Scene]) -> None:
     assert found[0] < 2 / 40
     assert found[-1] > 1 - 2 / 40
     assert np.diff(found).max() < 3 / 40
+
+
+def test_a_whole_response_stays_with_every_view(scenes: list[Scene]) -> None:
+    table = MtfTable((0.0, 0.25, 0.5), (1.0, 0.5, 0.12), (1.0, 0.4, 0.05))
+    across, along = (replace(VARIABLE.mtf_nyquist, value=contrast) for contrast in table.at_nyquist)
+    profile = replace(VARIABLE, response=table, mtf_nyquist=across, mtf_nyquist_along=along)
+    views = draw_patches(scenes, profile, REFERENCE, count=3, seed=0, patch_px=40).views
+    assert all(view.degraded.response == table for view in views)
+    assert len({view.degraded.noise_sigma(25) for view in views}) == 3
 
 
 @settings(max_examples=40, deadline=None)

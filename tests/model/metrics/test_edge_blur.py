@@ -8,7 +8,7 @@ import torch
 from model.metrics.edge_blur import FOUND, HALF_PX, POINTED_AT, EdgeBlur, combine, find_blurs, fit_blur
 from model.metrics.edges import slanted_edge
 from model.metrics.refusal import Refusal
-from model.simulator.mtf import Axes, gamma_from_mtf, transfer_function
+from model.simulator.mtf import Blur, gamma_from_mtf, transfer_function
 from model.simulator.procedural import procedural_scene
 from model.simulator.sampling import sample, scene_spectrum
 
@@ -19,7 +19,7 @@ def noise(values: np.ndarray) -> np.ndarray:
     return np.full(values.shape, SIGMA**2)
 
 
-def blurred(scene: torch.Tensor, mtf_nyquist: Axes) -> np.ndarray:
+def blurred(scene: torch.Tensor, mtf_nyquist: Blur) -> np.ndarray:
     side = scene.shape[-1]
     return (
         sample(scene_spectrum(scene), transfer_function(side, side, RATIO, mtf_nyquist), side, RATIO).numpy() * 10.0
@@ -65,7 +65,7 @@ def test_the_interval_of_a_few_edges_holds_the_truth(mtf_nyquist: float) -> None
     assert all(axis.interval[1] < 1.5 * axis.interval[0] for axis in found)
 
 
-def board(mtf_nyquist: Axes, lean_deg: float = 8.0) -> np.ndarray:
+def board(mtf_nyquist: Blur, lean_deg: float = 8.0) -> np.ndarray:
     upright = slanted_edge(SIDE_PX, RATIO, lean_deg, (-1.0, 1.0))
     image = blurred(100 + 60 * upright * slanted_edge(SIDE_PX, RATIO, -lean_deg, (-1.0, 1.0)).T, mtf_nyquist)
     return np.asarray(image + SIGMA * np.random.default_rng(1).standard_normal(image.shape))

@@ -14,9 +14,10 @@ from hypothesis import strategies as st
 from model.simulator import plan as plan_module
 from model.simulator.acquire import prepare_scene, simulate_planned, without
 from model.simulator.detector import Draw
-from model.simulator.plan import TOLERANCE_DN, Plan, effect_bounds, make_plan, scene_stats
+from model.simulator.plan import TOLERANCE_DN, Plan, effect_bounds, make_plan, ringing_of, scene_stats
 from model.simulator.sampling import crop_divisible
 from profiles.effects import AntiAlias, Defects, Dsnu, Effect, FullWell, Haze, Offset, Prnu, Smear, Striping
+from profiles.response import MtfTable
 from profiles.sensor import Sensor
 
 spec = importlib.util.spec_from_file_location("stages", Path(__file__).parent / "stages.py")
@@ -79,7 +80,9 @@ formula_sensors = st.builds(
     effects,
     st.one_of(st.none(), st.floats(0.005, 0.3)),
 )
+EDGED = (1, 0.85, 0.75, 0.01)
 RESPONSES = (
+    MtfTable((0, 0.3, 0.4, 0.5), EDGED, EDGED),  # falls so steeply that it rings
     stages.formula_table(0.12, 0.05),
     stages.gaussian_pixel(0.3, 0.5, 4, 21),
     stages.formula_point(0.07, 2, 12, odd=True),
@@ -121,6 +124,17 @@ def test_the_plan_keeps_within_its_tolerance(radiance: torch.Tensor, sensor: Sen
     assert float((whole - planned).abs().max()) <= TOLERANCE_DN + ROUNDING_DN
     products = [simulate_planned(scene, sensor, Draw(seed), p, margin_px=2) for p in (plan, ALL_APPLIED)]
     assert float((products[0] - products[1]).abs().max()) <= 1  # two roundings of almost the same number
+
+
+def test_a_table_that_rings_is_bounded_by_its_own_ringing() -> None:
+    """Not by that of the formula of the same contrast at Nyquist, which hardly rings."""
+    radiance = torch.zeros(90, 90)
+    radiance[20:70, 15:60] = 200.0
+    plain = stages.plain_sensor()
+    sensor = stages.with_response(plain, RESPONSES[0])
+    stats = scene_stats(radiance, 3)
+    assert change(radiance, sensor, 3, "mtf", 0) <= effect_bounds(sensor, stats)["mtf"] + ROUNDING_DN
+    assert ringing_of(sensor, stats) > 1.1 * ringing_of(replace(sensor, response=None), stats)
 
 
 @pytest.mark.parametrize("wrong", ["smear_bound_dn", "blur_bound_dn", "effect_bound_dn", "noise_bound_dn"])

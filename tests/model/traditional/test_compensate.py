@@ -4,12 +4,13 @@ import numpy as np
 import pytest
 import torch
 
-from model.simulator.mtf import transfer_function
+from model.simulator.mtf import mtf, transfer_function
 from model.simulator.sampling import sample, scene_spectrum
 from model.traditional import compensate as module
 from model.traditional.compensate import compensate, compensation_gain, compensation_kernel, filter_strips
 from model.traditional.rows import fill_with_local_means, mirrored
 from profiles.errors import OptionError
+from profiles.response import PointSpread, packed
 
 EPSILON = 3e-3
 
@@ -31,6 +32,22 @@ def test_gain_is_one_at_dc_and_finite_everywhere(mtf_from: float, mtf_to: float,
 def test_without_regularisation_it_is_the_ratio_of_the_mtfs() -> None:
     gain = compensation_gain(26, 34, 0.07, 0.25, epsilon=0)
     assert float(gain[0, 17]) == pytest.approx(0.25 / 0.07)
+
+
+def lopsided_point() -> PointSpread:
+    """A hill with a second one beside it, whose response is complex, and nowhere 0."""
+    y, x = (np.arange(-12, 13)[:, None] / 4, np.arange(-12, 13) / 4)
+    samples = np.exp(-2 * y**2 - 2 * x**2) + 0.3 * np.exp(-2 * (y - 0.5) ** 2 - 2 * (x - 0.75) ** 2)
+    return PointSpread(25, 25, 4.0, packed(samples))
+
+
+def test_without_regularisation_a_point_spread_is_undone_whole() -> None:
+    """What it shifted and turned lies straight again: gain times blur is the target, phase and all."""
+    fx, fy = torch.fft.rfftfreq(34, dtype=torch.float64)[None], torch.fft.fftfreq(26, dtype=torch.float64)[:, None]
+    blur, target = mtf(fx, fy, lopsided_point()), mtf(fx, fy, 0.25)
+    undone = compensation_gain(26, 34, lopsided_point(), 0.25, epsilon=0) * blur
+    assert float(blur.imag.abs().max()) > 0.02
+    torch.testing.assert_close(undone, target.to(undone.dtype), rtol=1e-9, atol=1e-12)
 
 
 def test_regularisation_holds_the_noise_of_a_weak_mtf_down() -> None:
