@@ -13,7 +13,7 @@ from profiles.constant import Constant
 from profiles.effects import TABLES as EFFECT_TABLES
 from profiles.effects import Effect, Offset, Table, draw_effect, middle_effect
 from profiles.errors import ProfileError
-from profiles.response import Response
+from profiles.response import PointSpread, Response
 
 MTF_NYQUIST_MAX = 2 / math.pi
 """A perfect lens over a square detector: sinc(0.5). Nothing above it is a blur: its gamma would be negative."""
@@ -69,6 +69,14 @@ class Sensor:
     def blur(self) -> tuple[float, float] | Response:
         """What settles the MTF at every frequency: the response where there is one, else the two contrasts."""
         return self.mtf_axes if self.response is None else self.response
+
+    @property
+    def symmetry(self) -> tuple[bool, bool]:
+        """Whether its images still are images of this sensor when (mirrored, turned by a quarter)."""
+        if isinstance(self.response, PointSpread):
+            return False, False
+        across, along = (self.response.across, self.response.along) if self.response else self.mtf_axes
+        return True, across == along
 
     @property
     def mtf_axes(self) -> tuple[float, float]:

@@ -138,9 +138,9 @@ def visit(scene: Visited, recipe: PatchRecipe, generator: np.random.Generator) -
         return scene.spectrum.real.new_empty(0, 2, recipe.patch_px, recipe.patch_px), torch.empty(4)
     images, sensor = _acquire_pair(scene, recipe, ratio, generator)
     patches = cut(images, recipe.patch_px, generator)
-    # A network that knows the sensor learns that its axes changed places; a blind one cannot.
-    alike = sensor.mtf_axes[0] == sensor.mtf_axes[1]
-    quarter, mirrored = draw_turn(generator, quarters=alike or recipe.family is not None)
+    # A conditioned network learns that a sensor's axes changed places; a plain one cannot.
+    mirrors, quarters = sensor.symmetry
+    quarter, mirrored = draw_turn(generator, quarters or recipe.family is not None, mirrors)
     vector = vector_tensor(sensor)
     return turned(patches, quarter, mirrored), transposed(vector) if quarter % 2 else vector
 
@@ -171,18 +171,21 @@ def cut(images: Tensor, patch_px: int, generator: np.random.Generator) -> Tensor
     return grid.permute(1, 2, 0, 3, 4).reshape(-1, images.shape[0], patch_px, patch_px)
 
 
-def turn(patches: Tensor, generator: np.random.Generator, quarters: bool = True) -> Tensor:
-    """Patches (..., P, P) in one of the square's eight symmetries, the same for all; of four without `quarters`."""
-    return turned(patches, *draw_turn(generator, quarters))
+def turn(patches: Tensor, generator: np.random.Generator, quarters: bool = True, mirrors: bool = True) -> Tensor:
+    """Patches (..., P, P) in one of the square's eight symmetries, the same for all; see `draw_turn`."""
+    return turned(patches, *draw_turn(generator, quarters, mirrors))
 
 
-def draw_turn(generator: np.random.Generator, quarters: bool) -> tuple[int, bool]:
+def draw_turn(generator: np.random.Generator, quarters: bool, mirrors: bool = True) -> tuple[int, bool]:
     """Quarter turns, and whether to mirror afterwards; an odd number of quarters makes columns of rows.
 
-    A blind network learns one sensor: where its two axes differ they must not change places, and `quarters` is False.
+    A plain network learns one sensor. Where its two axes differ they must not change places, and `quarters` is False:
+    four symmetries are left. Where its blur is lopsided it stays as it is, and `mirrors` is False.
     """
-    quarter = int(generator.integers(4))
-    return quarter if quarters else quarter - quarter % 2, bool(generator.integers(2))
+    quarter, mirrored = int(generator.integers(4)), bool(generator.integers(2))
+    if not mirrors:
+        return 0, False
+    return quarter if quarters else quarter - quarter % 2, mirrored
 
 
 def turned(patches: Tensor, quarter: int, mirrored: bool) -> Tensor:
@@ -226,6 +229,7 @@ class StoredPairs:
         seed: of what is drawn.
         worker: which of several this is.
         quarters: whether patches may be turned by quarters: not those of a sensor whose two axes differ.
+        mirrors: whether they may be mirrored: not those of a sensor whose blur is lopsided.
     """
 
     def __init__(
@@ -237,8 +241,9 @@ class StoredPairs:
         seed: int,
         worker: Worker | None = None,
         quarters: bool = True,
+        mirrors: bool = True,
     ) -> None:
-        self.quarters = quarters
+        self.quarters, self.mirrors = quarters, mirrors
         self.files, self.patch_px, self.max_dn = files, patch_px, max_dn
         self.batch, self.seed, self.worker = batch, seed, worker or Worker()
 
@@ -267,7 +272,7 @@ class StoredPairs:
         top, left = (int(generator.integers(size - self.patch_px + 1)) for size in (height, width))
         window = slice(top, top + self.patch_px), slice(left, left + self.patch_px)
         both = torch.stack([torch.from_numpy(image[window].astype(np.float32)) for image in images])
-        return turn(both[None], generator, self.quarters)[0]
+        return turn(both[None], generator, self.quarters, self.mirrors)[0]
 
     def _digital_numbers(self, file: Path) -> np.ndarray:
         """The pixels of an image, refused where they are not those of the sensor."""

@@ -173,7 +173,8 @@ def data(run: Run, trainer: Trainer) -> tuple[Source, Validation, list[str]]:
         files = pair_files(run.pairs)
         degraded = run.patches.degraded
         given = (run.patches.patch_px, degraded.nominal().max_dn, recipe.batch, recipe.seed, trainer.worker)
-        source = StoredPairs(files, *given, quarters=degraded.mtf_nyquist_along is None)
+        mirrors, alike = degraded.nominal().symmetry
+        source = StoredPairs(files, *given, alike and degraded.mtf_nyquist_along is None, mirrors)
         return source, Validation([], *sensors), [degraded.name for degraded, _ in files]
     scenes = read_scenes(run)
     kept, held = split_by_site([scene.name for scene in scenes])

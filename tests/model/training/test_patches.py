@@ -12,10 +12,11 @@ from model.conditioning import SensorFamily
 from model.io.tiff import write_tiff
 from model.simulator.procedural import procedural_scene
 from model.simulator.sampling import Scene
-from model.training.patches import PatchRecipe, PatchSource, StoredPairs, cut, pair_files, turn
+from model.training.patches import PatchRecipe, PatchSource, StoredPairs, cut, draw_turn, pair_files, turn
 from model.training.workers import Worker
 from profiles import load_sensor
 from profiles.errors import ImageError
+from profiles.response import MtfTable, PointSpread, packed
 from profiles.sensor import Sensor
 
 
@@ -86,6 +87,30 @@ def test_a_blind_network_sees_the_axes_of_one_sensor_as_they_are() -> None:
     for degraded, reference in islice(PatchSource([scene], recipe, 3, 0).batches(), 30):
         kept = [a / b for a, b in zip(steps(degraded), steps(reference), strict=True)]
         assert kept[0] > kept[1]
+
+
+def test_a_lopsided_blur_is_neither_mirrored_nor_turned() -> None:
+    generator = np.random.default_rng(0)
+    ways = [draw_turn(generator, quarters, mirrors) for quarters, mirrors in ((True, True), (False, True))]
+    for _ in range(50):
+        assert draw_turn(generator, True, mirrors=False) == (0, False)
+        ways.append(draw_turn(generator, False))
+    assert {quarter for quarter, _ in ways[2:]} == {0, 2}
+    nominal = load_sensor("pleiades-degraded").nominal()
+    samples = np.zeros((9, 9))
+    samples[3:6, 4:8] = 1
+    table = MtfTable((0, 0.25, 0.5), (1, 0.5, 0.1), (1, 0.5, 0.1))
+    lopsided = PointSpread(9, 9, 4, packed(samples))
+    assert nominal.symmetry == (True, True)
+    assert replace(nominal, mtf_nyquist_along=0.05).symmetry == (True, False)
+    for response, symmetry in (
+        (table, (True, True)),
+        (replace(table, along=(1, 0.4, 0.1)), (True, False)),
+        (lopsided, (False, False)),
+    ):
+        across, along = response.at_nyquist
+        sensor = replace(nominal, response=response, mtf_nyquist=across, mtf_nyquist_along=along)
+        assert sensor.symmetry == symmetry
 
 
 def test_patches_lie_within_full_scale() -> None:
