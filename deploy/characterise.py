@@ -342,6 +342,8 @@ def _axis_lines(key: str, axis: AxisMtf, images: str) -> Iterator[str]:
     low, high = axis.interval
     edges = f"{axis.edges} edge{'' if axis.edges == 1 else 's'}"
     yield f"# 95 % interval {low:.3g} to {high:.3g}, {edges}"
+    if not low <= axis.nearest <= high:
+        yield f"# the curve is not the profile's, whose nearest one has {axis.nearest:.3g}"
     yield _constant(key, f"{axis.mtf_nyquist:.4g}", "measured", f"{edges} in {images}")
 
 
