@@ -1,6 +1,6 @@
 """What `characterise` finds on simulated images of known sensors: errors, and how often the intervals hold the truth.
 
-    python benchmarks/characterise.py --images aerial-test/ --weights convbeers-s-told.safetensors
+    python benchmarks/characterise.py --images aerial-test/ --weights convbeers-s.safetensors
 
 Each sensor sees six of the folder's photographs; then with a checkerboard laid into one of them (60 m a side at
 0.5 m, two by two fields, as calibration sites have), searched for and pointed at. MTF 2 to 12 %, along the track down
@@ -21,17 +21,18 @@ import torch
 from torch import Tensor
 
 from deploy.characterise import Box, Characterised, Request, Snr, characterise, measured_noise, profile_toml, snr_at
-from model.conditioning import LEAST_ALONG, SensorFamily, ToldConvBEERS, fold, tell
+from model.conditioning import ConditionedConvBEERS, SensorFamily, fold, vector_tensor
 from model.evaluation.pairs import simulate_pairs
-from model.evaluation.run import Fixed
 from model.evaluation.scores import fidelity_db
+from model.evaluation.sweep import Fixed
 from model.io.images import list_images
-from model.io.weights import load_told
+from model.io.weights import load_conditioned
 from model.metrics.edge_blur import AxisMtf
 from model.metrics.edges import slanted_edge
 from model.simulator.acquire import acquire, fitting_oversampling
 from model.simulator.detector import Draw, to_uint16
 from model.simulator.sampling import Scene, crop_divisible, read_scene, scene_spectrum
+from model.specialise import LEAST_ALONG
 from profiles import load_sensor
 from profiles.errors import ImageError
 from profiles.sensor import Sensor
@@ -47,12 +48,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--images", type=Path, required=True)
     parser.add_argument("--sensors", type=int, default=20)
-    parser.add_argument("--weights", type=Path, help="of a network told its sensor")
+    parser.add_argument("--weights", type=Path, help="of a conditioned network")
     arguments = parser.parse_args()
     scenes = [read_scene(path, LIKE) for path in list_images(arguments.images)]
     scenes = [scene for scene in scenes if fitting_oversampling(scene.radiance, [RATIO], LEAST_SIDE_PX)]
     ways = {name: Findings() for name in ("photographs alone", "one with a checkerboard", "two boxes on it")}
-    lost, network = list[float](), load_told(arguments.weights)[0] if arguments.weights else None
+    lost, network = list[float](), load_conditioned(arguments.weights)[0] if arguments.weights else None
     generator = np.random.default_rng(22)
     for number in range(arguments.sensors):
         sensor = draw(generator)
@@ -95,14 +96,14 @@ def as_read(found: Characterised, path: Path) -> Sensor:
     return load_sensor(str(path)).nominal()
 
 
-def psnr_lost(network: ToldConvBEERS, scene: Scene, sensor: Sensor, found: Sensor) -> float:
-    """By a network told the sensor that was found, beside the same network told the true one, in dB."""
+def psnr_lost(network: ConditionedConvBEERS, scene: Scene, sensor: Sensor, found: Sensor) -> float:
+    """By a network that knows the sensor that was found, beside the same that knows the true one, in dB."""
     (pair,), _ = simulate_pairs([scene], Fixed(sensor), Fixed(REFERENCE.in_units_of(sensor)), 0)
     image = torch.from_numpy(pair.degraded.astype(np.float32) / sensor.max_dn)[None, None]
     scores = []
-    for told in (sensor, found):
+    for known in (sensor, found):
         with torch.inference_mode():
-            restored = fold(network, tell(told).vector)(image)[0, 0] * sensor.max_dn
+            restored = fold(network, vector_tensor(known))(image)[0, 0] * sensor.max_dn
         scores.append(fidelity_db(restored.round().clamp(0, sensor.max_dn).numpy(), pair.reference, pair.degraded))
     return scores[0] - scores[1]
 

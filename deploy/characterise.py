@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from model.io.images import read_pixels
-from model.metrics.edge_blur import MIN_FOUND, POINTED_AT, AxisMtf, EdgeBlur, combine, find_blurs, fit_blur
+from model.metrics.edge_blur import HALF_PX, MIN_FOUND, POINTED_AT, AxisMtf, EdgeBlur, combine, find_blurs, fit_blur
 from model.metrics.noise_line import NoiseModel, cut_blocks, fit_noise_model, join
 from model.metrics.refusal import Refusal
 from profiles.errors import ImageError, OptionError, printable
@@ -25,7 +25,8 @@ FULL_SCALE_RADIANCE = 400.0
 PARTS = (16, 4)
 """Of full scale: the radiances at which SNRs are stated, as those that a network is told of."""
 GSD_M, OVERSAMPLING, SEED = 0.5, 4, 0
-TILE_PX = 1024
+TILE_PX, BOX_PX = 1024, 2 * HALF_PX + 1
+MAX_DN = 65535
 CLIPPED_PIXELS, PILE = 10, 4
 """Pixels at one value, 2^n - 1, and how many times as many as just below: what shows that it is full scale."""
 MARGIN = 1e-5
@@ -43,14 +44,16 @@ class Box:
     height: int
 
     def cut(self, pixels: np.ndarray) -> np.ndarray:
-        """The part, near-vertical edge or not.
+        """The part of its pixels (H, W).
 
         Raises:
-            OptionError: outside the image.
+            OptionError: outside the image, or too small for an edge.
         """
         height, width = pixels.shape
-        if self.left + self.width > width or self.top + self.height > height:
-            got, expected = f"{self}", f"a box inside its {width} x {height} pixels"
+        small = min(self.width, self.height) < BOX_PX
+        if small or self.left + self.width > width or self.top + self.height > height:
+            got = str(self)
+            expected = f"a box of {BOX_PX} x {BOX_PX} pixels or more inside its {width} x {height}"
             raise OptionError("--edge", expected=expected, got=got, remedy="X,Y is the upper left pixel, from 0")
         return pixels[self.top : self.top + self.height, self.left : self.left + self.width]
 
@@ -153,6 +156,10 @@ def characterise(request: Request) -> Characterised:
         ImageError: images that are not raw, or that do not hold what is needed; the message says what that is.
         OptionError: an option that contradicts the pixels.
     """
+    names = [path.resolve() for path in request.images]
+    if len(set(names)) < len(names):
+        got, remedy = "one of them twice", "give each once: a second look at the same pixels knows nothing new"
+        raise OptionError("images", expected="different images", got=got, remedy=remedy)
     digitised = [_digitised(path) for path in request.images]
     bits = _settled_bits(request, digitised)
     clipped_at = 2**bits - 1
@@ -173,10 +180,10 @@ def read_raw(path: Path) -> np.ndarray:
     if pixels.ndim != 2:
         got, remedy = f"{pixels.shape[2]} bands", "extract one band; each has a sensor of its own"
         raise ImageError(str(path), expected="one band", got=got, remedy=remedy)
-    if (pixels.dtype.kind == "f" and (pixels != np.rint(pixels)).any()) or pixels.min() < 0:
+    if (pixels.dtype.kind == "f" and (pixels != np.rint(pixels)).any()) or pixels.min() < 0 or pixels.max() > MAX_DN:
         got = f"{pixels.dtype} from {float(pixels.min()):.4g} to {float(pixels.max()):.4g}"
         remedy = "give the raw image: what was resampled, calibrated or scaled has lost its noise"
-        raise ImageError(str(path), expected="whole digital numbers from 0 on", got=got, remedy=remedy)
+        raise ImageError(str(path), expected=f"whole digital numbers from 0 to {MAX_DN}", got=got, remedy=remedy)
     return pixels
 
 
@@ -335,6 +342,8 @@ def _axis_lines(key: str, axis: AxisMtf, images: str) -> Iterator[str]:
     low, high = axis.interval
     edges = f"{axis.edges} edge{'' if axis.edges == 1 else 's'}"
     yield f"# 95 % interval {low:.3g} to {high:.3g}, {edges}"
+    if not low <= axis.nearest <= high:
+        yield f"# the curve is not the profile's, whose nearest one has {axis.nearest:.3g}"
     yield _constant(key, f"{axis.mtf_nyquist:.4g}", "measured", f"{edges} in {images}")
 
 

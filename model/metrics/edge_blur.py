@@ -1,9 +1,12 @@
 """The blur of an instrument from short straight edges, fitted by the curve that a sensor profile states.
 
 `sharpness` measures a whole MTF curve across one long edge. Here a profile's own curve is fitted instead,
-MTF(f) = exp(-gamma f) sinc(f) (`simulator.mtf`): one number an edge, for which 17 x 17 pixels are enough. What has
-been sharpened, or was never a step, does not fit and is told apart by that: of 21 000 steep places that six sensors
-saw in ten aerial photographs not one passed. A hedge or a shore is softer than any step, and would be taken for blur.
+MTF(f) = exp(-gamma f) sinc(f) (`simulator.mtf`): one number an edge, for which 17 x 17 pixels are enough. All edges
+together tell how much steeper the curve falls, by a Gaussian part exp(-shape f^2).
+
+What has been sharpened, or was never a step, does not fit and is told apart by that: of 21 000 steep places that six
+sensors saw in ten aerial photographs not one passed. A hedge or a shore is softer than any step, and would be taken
+for blur.
 """
 
 import math
@@ -21,6 +24,11 @@ HALF_PX = 8
 
 GAMMAS = np.linspace(0.0, 10.0, 101)
 """For which the edge is tabulated: MTF at Nyquist from 64 to 0.4 %."""
+
+SHAPES = (0.0, 0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0, 10.0, 13.0)
+"""Of the Gaussian part: 0 is the profile's curve. Smear, jitter and diffraction fall more steeply than it."""
+STEEPER = (4.0, 8.0)
+"""Tried on an edge that the profile's curve does not fit."""
 
 PER_PX, REACH_PX = 16, 24
 START_GAMMA, LEAST_GAMMA, LARGEST_GAMMA = 4.0, 0.05, 9.9
@@ -41,6 +49,9 @@ class EdgeBlur:
         slope: pixels by which the edge leans each line; 0 runs along the grid.
         step_sigma: difference of the plateaus over the noise of a pixel.
         misfit: root mean square of what the noise does not explain, of the step.
+        pixels: (H, W) that it was fitted to, over their noise.
+        chi2: sum of squares that the fit leaves of those near the edge.
+        count: how many these are, less the five numbers fitted.
     """
 
     gamma: float
@@ -48,6 +59,9 @@ class EdgeBlur:
     slope: float
     step_sigma: float
     misfit: float
+    pixels: np.ndarray
+    chi2: float
+    count: int
 
 
 @dataclass(frozen=True)
@@ -65,23 +79,26 @@ class Limits:
     error: float = 0.6
 
 
-FOUND, POINTED_AT = Limits(30, 0.012), Limits(10, 0.03)
-"""For edges found by search among much that is none, and for those that a person vouches for."""
+FOUND, POINTED_AT, ANY = Limits(30, 0.012), Limits(10, 0.03), Limits(0, math.inf, math.inf)
+"""For edges found by search among much that is none, for those that a person vouches for, and for those known."""
 
 
-@lru_cache
-def _responses() -> np.ndarray:
+@lru_cache(maxsize=16)
+def _responses(shape: float) -> np.ndarray:
     """A step of 1 at 0, blurred, for each of GAMMAS and each distance: (101, 2 * REACH_PX * PER_PX + 1)."""
     step = 0.004  # the sum repeats, with the other sign, after 1 / 0.004 = 250 px
     f = np.arange(step / 2, 2.5, step)
     distance = np.arange(-REACH_PX * PER_PX, REACH_PX * PER_PX + 1) / PER_PX
     waves = np.sin(2 * math.pi * np.outer(f, distance)) / (math.pi * f)[:, None]
-    return np.asarray(0.5 + step * (np.exp(-np.outer(GAMMAS, f)) * np.sinc(f)) @ waves)
+    return np.asarray(0.5 + step * (np.exp(-np.outer(GAMMAS, f) - shape * f**2) * np.sinc(f)) @ waves)
 
 
-def edge_response(distance: np.ndarray, gamma: float) -> np.ndarray:
-    """What a detector sees of a step of 1 at `distance` pixels (any shape) from it, behind a blur of `gamma`."""
-    table = _responses()
+def edge_response(distance: np.ndarray, gamma: float, shape: float = 0.0) -> np.ndarray:
+    """What a detector sees of a step of 1 at `distance` pixels (any shape) from it, behind a blur of `gamma`.
+
+    `shape` adds a Gaussian part to the blur: MTF(f) = exp(-gamma f - shape f^2) sinc(f).
+    """
+    table = _responses(shape)
     place = np.clip((distance + REACH_PX) * PER_PX, 0, table.shape[1] - 1.001)
     column, row = place.astype(int), min(int(gamma / GAMMAS[1]), GAMMAS.size - 2)
     share, part = place - column, gamma / GAMMAS[1] - row
@@ -96,9 +113,13 @@ class _Line:
     place: float
     slope: float
     gamma: float = START_GAMMA
+    shape: float = 0.0
 
     def distance(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
         return np.asarray((x - self.place - self.slope * y) / math.sqrt(1 + self.slope**2))
+
+    def response(self, distance: np.ndarray) -> np.ndarray:
+        return edge_response(distance, self.gamma, self.shape)
 
     def move(self, change: np.ndarray) -> float:
         """Take a bounded step; how far gamma went."""
@@ -118,23 +139,35 @@ def fit_blur(region: np.ndarray, noise: Noise, limits: Limits) -> EdgeBlur | Ref
         limits: what the edge must keep to.
 
     Returns:
-        The blur, or why there is none: "few-rows", "no-convergence", "contrast".
+        The blur by the profile's curve, or, of an edge that no shape of the curve fits, why there is none:
+        "few-rows", "no-convergence", "contrast".
     """
-    y, x = (axis - (size - 1) / 2 for axis, size in zip(np.indices(region.shape), region.shape, strict=True))
-    line = _centroids(region, y[:, 0], x[0])
-    start, sigma = line.place, math.sqrt(float(noise(region).mean()))
+    pixels = region / math.sqrt(float(noise(region).mean()))
+    found = _fitted(pixels, limits)
+    if isinstance(found, EdgeBlur):
+        return found
+    steeper = (_fitted(pixels, limits, shape) for shape in STEEPER)
+    return _fitted(pixels, ANY) if any(isinstance(fit, EdgeBlur) for fit in steeper) else found
+
+
+def _fitted(pixels: np.ndarray, limits: Limits, shape: float = 0.0) -> EdgeBlur | Refusal:
+    """As `fit_blur`, for pixels whose noise is 1, and another shape of the curve."""
+    y, x = (axis - (size - 1) / 2 for axis, size in zip(np.indices(pixels.shape), pixels.shape, strict=True))
+    line = _centroids(pixels, y[:, 0], x[0])
+    line.shape = shape
+    start = line.place
     for _ in range(PASSES):
         near = np.abs(x - line.place - line.slope * y) <= HALF_PX
         if near.sum() < 10 * HALF_PX:
             return Refusal("few-rows", f"{int(near.sum())} pixels near the edge, {10 * HALF_PX} are needed")
-        terms, fitted = _linearised(line, x[near], y[near], region[near] / sigma)
-        left = region[near] / sigma - fitted
+        terms, fitted = _linearised(line, x[near], y[near], pixels[near])
+        left = pixels[near] - fitted
         covariance = np.linalg.pinv(terms.T @ terms)
         moved = line.move((covariance @ (terms.T @ left))[2:])
         if abs(line.place - start) > MAX_PLACE_PX or abs(line.slope) > MAX_SLOPE:
             break
         if moved < 1e-3:
-            return _judged(line, float(np.ptp(fitted)), left, float(covariance[4, 4]), limits)
+            return _judged(line, pixels, float(np.ptp(fitted)), left, float(covariance[4, 4]), limits)
     return Refusal("no-convergence", "no straight edge near to an axis")
 
 
@@ -149,26 +182,30 @@ def _centroids(region: np.ndarray, rows: np.ndarray, columns: np.ndarray) -> _Li
 def _linearised(line: _Line, x: np.ndarray, y: np.ndarray, seen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Derivatives (N, 5) by the plateau, the step, place, slope and gamma; and the best fit (N,) of the first two."""
     distance = line.distance(x, y)
-    plateaus = np.stack([np.ones_like(x), edge_response(distance, line.gamma)], axis=1)
+    plateaus = np.stack([np.ones_like(x), line.response(distance)], axis=1)
     levels, *_ = np.linalg.lstsq(plateaus, seen, rcond=None)
-    rise = edge_response(distance + 0.1, line.gamma) - edge_response(distance - 0.1, line.gamma)
+    rise = line.response(distance + 0.1) - line.response(distance - 0.1)
     rise *= levels[1] / 0.2 / math.sqrt(1 + line.slope**2)
     low, high = max(line.gamma - 0.15, 0.0), min(line.gamma + 0.15, float(GAMMAS[-1]))
-    softer = (edge_response(distance, high) - edge_response(distance, low)) * levels[1] / (high - low)
+    change = edge_response(distance, high, line.shape) - edge_response(distance, low, line.shape)
+    softer = change * levels[1] / (high - low)
     return np.column_stack([plateaus, -rise, -rise * y, softer]), plateaus @ levels
 
 
-def _judged(line: _Line, step: float, left: np.ndarray, variance: float, limits: Limits) -> EdgeBlur | Refusal:
-    scatter = float((left**2).sum() / (left.size - 5))
+def _judged(
+    line: _Line, pixels: np.ndarray, step: float, left: np.ndarray, variance: float, limits: Limits
+) -> EdgeBlur | Refusal:
+    chi2, count = float((left**2).sum()), left.size - 5
+    scatter = chi2 / count
     misfit = math.sqrt(max(scatter - 1, 0.0)) / max(step, 1e-9)
     error = math.sqrt(variance * max(scatter, 1.0))
-    if not LEAST_GAMMA < line.gamma < LARGEST_GAMMA:
+    if limits is not ANY and not LEAST_GAMMA * (not line.shape) <= line.gamma < LARGEST_GAMMA:
         return Refusal("no-convergence", "sharper than a detector's pixel or softer than any profile: no plain edge")
     if misfit > limits.misfit:
         return Refusal("no-convergence", f"{misfit:.1%} of the step fit no blurred edge, {limits.misfit:.1%} at most")
     if step < limits.step_sigma or error > limits.error:
         return Refusal("contrast", f"a step of {step:.3g} times the noise, {limits.step_sigma:g} are needed")
-    return EdgeBlur(line.gamma, error, line.slope, step, misfit)
+    return EdgeBlur(line.gamma, error, line.slope, step, misfit, pixels, chi2, count)
 
 
 MAX_CANDIDATES, MAX_FITS = 6000, 400
@@ -244,34 +281,67 @@ LONE_ERROR = 0.1
 NORMAL_95 = 1.96
 
 
+SHAPED_EDGES = 40
+"""As many tell the shape."""
+OTHER_SHAPES = 0.25
+"""Standard error for shapes that no Gaussian part has, of what the Gaussian part changes."""
+
+
 @dataclass(frozen=True)
 class AxisMtf:
     """The MTF at Nyquist along one axis.
 
     Attributes:
-        mtf_nyquist: contrast kept at 0.5 cycles per pixel.
-        interval: 95 % interval of it, from the scatter between edges.
+        mtf_nyquist: contrast kept at 0.5 cycles per pixel, of whichever shapes of the curve explain the edges.
+        interval: 95 % interval of it, from the scatter between edges and between such shapes.
         edges: how many.
+        nearest: that of the profile's curve that comes nearest to the edges, whatever their own shape.
     """
 
     mtf_nyquist: float
     interval: tuple[float, float]
     edges: int
+    nearest: float
 
 
 def combine(own: Sequence[EdgeBlur], others: Sequence[EdgeBlur]) -> AxisMtf:
     """The MTF along one axis from the edges across it, at least one, and those across the other axis.
 
+    The shape of the curve is left open: each one counts by what it leaves unexplained of the edges.
+    """
+    other = float(np.median([edge.gamma for edge in others])) if others else None
+    logs, errors, weights = np.transpose([_of_shape(own, other, shape) for shape in SHAPES])
+    # Before any edge is seen, half of the belief is in the profile's curve: of few edges nothing else can be said.
+    belief = np.gradient(SHAPES)
+    belief[0] = belief[1:].sum()
+    weights = np.exp(weights - weights.max()) * belief
+    weights /= weights.sum()
+    value = float(weights @ logs)
+    error = math.sqrt(float(weights @ ((logs - value) ** 2 + errors**2)))
+    reach = _student_95(len(own)) * math.hypot(error, FLOOR / 2, OTHER_SHAPES * (logs[0] - value))
+    low, centre, high, nearest = (
+        MTF_NYQUIST_MAX * math.exp(x) for x in (value - reach, value, value + reach, logs[0])
+    )
+    return AxisMtf(centre, (low, min(high, MTF_NYQUIST_MAX)), len(own), nearest)
+
+
+def _of_shape(own: Sequence[EdgeBlur], other: float | None, shape: float) -> tuple[float, float, float]:
+    """Logarithm of the MTF at Nyquist over a perfect lens', its standard error, and that of its likelihood.
+
     gamma^2 of a leaning edge is (gamma_x cos)^2 + (gamma_y sin)^2: the other axis has a part in it.
     """
-    gammas, errors = (np.array([getattr(edge, name) for edge in own]) for name in ("gamma", "error"))
-    lean = np.array([edge.slope for edge in own]) ** 2
-    other = float(np.median([edge.gamma for edge in others])) if others else float(np.median(gammas))
-    along = np.sqrt(np.maximum(gammas**2 * (1 + lean) - lean * other**2, 1e-4))
-    gamma, error = _centre(along, errors)
-    reach = _student_95(len(own)) * math.hypot(error, FLOOR)
-    value, low, high = (MTF_NYQUIST_MAX * math.exp(-g / 2) for g in (gamma, gamma + reach, max(gamma - reach, 0)))
-    return AxisMtf(value, (low, high), len(own))
+    refits = [_fitted(edge.pixels, ANY, shape) for edge in own[:SHAPED_EDGES]] if shape else list(own)
+    fits = [fit for fit in refits if isinstance(fit, EdgeBlur)]
+    if len(fits) < min(len(own), SHAPED_EDGES):
+        return 0.0, 0.0, -math.inf
+    gammas, errors = (np.array([getattr(edge, name) for edge in fits]) for name in ("gamma", "error"))
+    if other is not None and not shape:
+        lean = np.array([edge.slope for edge in fits]) ** 2
+        gammas = np.sqrt(np.maximum(gammas**2 * (1 + lean) - lean * other**2, 1e-4))
+    gamma, error = _centre(gammas, errors)
+    known = fits[:SHAPED_EDGES]
+    scatter = max(sum(edge.chi2 for edge in own[:SHAPED_EDGES]) / sum(edge.count for edge in known), 1.0)
+    return -gamma / 2 - shape / 4, error / 2, -sum(edge.chi2 for edge in known) / (2 * scatter)
 
 
 def _centre(values: np.ndarray, errors: np.ndarray) -> tuple[float, float]:

@@ -139,7 +139,10 @@ def test_a_box_written_wrongly_is_refused(box: str, words: str) -> None:
         read_box(box, [Path("board.tif")])
 
 
-@pytest.mark.parametrize(("box", "words"), [("0,0,9999,20", "a box inside"), ("2,2,30,40", "one straight edge")])
+@pytest.mark.parametrize(
+    ("box", "words"),
+    [("0,0,9999,20", "or more inside"), ("9,9,0,0", "or more inside"), ("2,2,30,40", "one straight edge")],
+)
 def test_a_box_that_holds_no_edge_is_refused(raw: tuple[Path, Path], tmp_path: Path, box: str, words: str) -> None:
     code, said = run(*raw, "--bits", 12, "--edge", f"{raw[0]}:{box}", "--out", tmp_path / "mine.toml")
     assert (code, list(tmp_path.iterdir())) == (2, [])
@@ -156,7 +159,8 @@ WRONG: dict[str, tuple[np.ndarray, tuple[str, ...], str]] = {
     "8-bit": (np.clip(FLAT / 8, 0, 255).astype(np.uint8), (), "in 8 bits; give the digitiser's"),
     "bands": (np.full((64, 64, 3), 7, np.uint16), ("--bits", "12"), "one band"),
     "fractions": (FLAT.astype(np.float32), ("--bits", "12"), "whole digital numbers"),
-    "negative": (FLAT.astype(np.int16) - 2000, ("--bits", "12"), "from 0 on"),
+    "negative": (FLAT.astype(np.int16) - 2000, ("--bits", "12"), "from 0 to 65535"),
+    "wide": (FLAT.astype(np.uint32) * 70, ("--bits", "16"), "from 0 to 65535"),
     "nan": (np.where(FLAT > 1060, np.nan, 7).astype(np.float32), ("--bits", "12"), "finite pixels"),
     "steps": (FLAT.astype(np.uint16) * 16, ("--bits", "16"), "divide it by 16"),
     "open bits": (FLAT.astype(np.uint16), (), "such as --bits 12"),
@@ -183,6 +187,12 @@ def test_an_empty_file_is_refused(tmp_path: Path) -> None:
     (tmp_path / "raw.tif").write_bytes(b"")
     code, said = run(tmp_path / "raw.tif", "--out", tmp_path / "mine.toml")
     assert (code, "empty" in said) == (2, True)
+
+
+def test_one_image_twice_is_refused(raw: tuple[Path, Path], tmp_path: Path) -> None:
+    """Its blocks would count twice, and the intervals would shrink for nothing."""
+    code, said = run(raw[0], raw[0], "--bits", 12, "--out", tmp_path / "mine.toml")
+    assert (code, "twice" in said) == (2, True)
 
 
 def test_pixels_clipped_at_full_scale_tell_the_bits(raw: tuple[Path, Path], tmp_path: Path) -> None:

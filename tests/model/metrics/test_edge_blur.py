@@ -19,11 +19,10 @@ def noise(values: np.ndarray) -> np.ndarray:
     return np.full(values.shape, SIGMA**2)
 
 
-def blurred(scene: torch.Tensor, mtf_nyquist: Blur) -> np.ndarray:
+def blurred(scene: torch.Tensor, mtf_nyquist: Blur, smear_px: float = 0.0) -> np.ndarray:
     side = scene.shape[-1]
-    return (
-        sample(scene_spectrum(scene), transfer_function(side, side, RATIO, mtf_nyquist), side, RATIO).numpy() * 10.0
-    )
+    transfer = transfer_function(side, side, RATIO, mtf_nyquist, 0.0, smear_px)
+    return np.asarray(sample(scene_spectrum(scene), transfer, side, RATIO)) * 10.0
 
 
 @lru_cache
@@ -65,9 +64,11 @@ def test_the_interval_of_a_few_edges_holds_the_truth(mtf_nyquist: float) -> None
     assert all(axis.interval[1] < 1.5 * axis.interval[0] for axis in found)
 
 
-def board(mtf_nyquist: Blur, lean_deg: float = 8.0) -> np.ndarray:
+def board(mtf_nyquist: Blur, lean_deg: float = 8.0, smear_px: float = 0.0) -> np.ndarray:
     upright = slanted_edge(SIDE_PX, RATIO, lean_deg, (-1.0, 1.0))
-    image = blurred(100 + 60 * upright * slanted_edge(SIDE_PX, RATIO, -lean_deg, (-1.0, 1.0)).T, mtf_nyquist)
+    image = blurred(
+        100 + 60 * upright * slanted_edge(SIDE_PX, RATIO, -lean_deg, (-1.0, 1.0)).T, mtf_nyquist, smear_px
+    )
     return np.asarray(image + SIGMA * np.random.default_rng(1).standard_normal(image.shape))
 
 
@@ -78,6 +79,16 @@ def test_a_board_shows_both_axes(lean_deg: float) -> None:
     assert min(len(upright), len(lying)) >= 3
     assert combine(upright, lying).mtf_nyquist == pytest.approx(0.12, rel=0.08)
     assert combine(lying, upright).mtf_nyquist == pytest.approx(0.05, rel=0.08)
+
+
+def test_a_curve_that_falls_more_steeply_is_no_higher_at_nyquist() -> None:
+    """Smear of a pixel keeps 0.64 at Nyquist and more before: the profile's own curve would pass too high there."""
+    image = board(0.1, smear_px=1.0)[10:-10, 10:-10]
+    smeared = combine(find_blurs(image.T, noise, 4095), find_blurs(image, noise, 4095))
+    true = 0.1 * float(np.sinc(0.5))
+    assert smeared.interval[0] <= true <= smeared.interval[1]
+    assert smeared.mtf_nyquist == pytest.approx(true, rel=0.1)
+    assert smeared.nearest > 1.2 * true
 
 
 def test_clipped_edges_are_left_alone() -> None:
