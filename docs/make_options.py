@@ -90,6 +90,7 @@ UNITS = {
     "patch": "px",
     "patches": "patches",
     "radiance_weight": "a weight",
+    "psnr_weight": "a weight",
     "seed": "no unit",
     "size": "px",
     "steps": "steps",

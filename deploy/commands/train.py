@@ -48,6 +48,9 @@ def train(
     radiance_weight: Annotated[
         float, typer.Option(min=0, help="Weight of the error of patches' means in the loss.")
     ] = 0.0,
+    psnr_weight: Annotated[
+        float, typer.Option(min=0, help="Weight of the patches' mean PSNR in the loss; 0.01 without L1.")
+    ] = 0.0,
     lpips: Annotated[Path | None, typer.Option(help="Weights of SqueezeNet 1.1 for LPIPS, or their folder.")] = None,
     start: Annotated[
         Path | None, typer.Option(help="Weights to go on from; of a narrower network, they are widened.")
@@ -105,7 +108,7 @@ def train(
         batch=batch,
         learning_rate=learning_rate,
         optimiser=optimiser,  # type: ignore[arg-type]
-        loss=LossWeights(l1_weight, l2_weight, lpips_weight, fft_weight, radiance_weight),
+        loss=LossWeights(l1_weight, l2_weight, lpips_weight, fft_weight, radiance_weight, psnr_weight),
         distil=distil if teacher else 0.0,
         seed=seed,
     )

@@ -1,8 +1,9 @@
 """The paper's loss: 1.0 L1 + 0.5 LPIPS + 0.1 FFT-L1 (paper, training section), each term reported.
 
-Besides, an L2 term for who wants the highest PSNR, which is a mean of squares: L1 forgives the strongest edges. And a
-radiance term, the distance of the patches' means: L1 aims at medians, and the skewed errors of a blind network then
-leave the mean off.
+Besides, an L2 term for who wants the highest PSNR, which is a mean of squares: L1 forgives the strongest edges; and a
+PSNR term, its mean over the patches, in which a sharp and quiet sensor's small errors count as much as a blurred and
+noisy one's large ones (as in NAFNet, Chen et al., ECCV 2022). And a radiance term, the distance of the patches'
+means: L1 aims at medians, and the skewed errors of a blind network then leave the mean off.
 
 LPIPS needs weights that are not shipped; without them the loss is L1 + FFT-L1, and the recipe says so.
 """
@@ -13,6 +14,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from model.io.images import MAX_DN
 from model.metrics.perceptual import Lpips
 
 
@@ -25,10 +27,11 @@ class LossWeights:
     lpips: float = 0.5
     fft: float = 0.1
     radiance: float = 0.0
+    psnr: float = 0.0
 
     def total(self, perceptual: bool = True) -> float:
         """The sum of the weights, that of LPIPS only where it is computed."""
-        return self.l1 + self.l2 + self.fft + self.radiance + (self.lpips if perceptual else 0.0)
+        return self.l1 + self.l2 + self.fft + self.radiance + self.psnr + (self.lpips if perceptual else 0.0)
 
 
 PAPER = LossWeights()
@@ -67,10 +70,27 @@ class RestorationLoss:
             if weights.radiance:
                 terms["radiance"] = radiance_l1(restored, reference)
                 total = total + weights.radiance * terms["radiance"]
+            if weights.psnr:
+                terms["psnr"] = log_mse(restored, reference)
+                total = total + weights.psnr * terms["psnr"]
             if self.perceptual is not None:
                 terms["lpips"] = self.perceptual(restored, reference).mean()
                 total = total + weights.lpips * terms["lpips"]
         return total, {name: term.detach() for name, term in terms.items()}
+
+
+def log_mse(restored: Tensor, reference: Tensor) -> Tensor:
+    """Mean over the batch of ln(1 + mean squared error in DN^2 of 12 bits): 10 / ln 10 of it is lost PSNR in dB.
+
+    The 1 keeps it above 0, and forgives what rounding does to a patch.
+
+    Args:
+        restored: (N, 1, H, W) float32.
+        reference: the same shape.
+    """
+    squares = ((restored - reference) * MAX_DN).square().mean((1, 2, 3))
+    distance: Tensor = torch.log1p(squares).mean()
+    return distance
 
 
 def radiance_l1(restored: Tensor, reference: Tensor) -> Tensor:

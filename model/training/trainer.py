@@ -235,7 +235,10 @@ def require_loss(loss: RestorationLoss, distil: float) -> None:
     if loss.weights.total(loss.perceptual is not None) + distil > 0:
         return
     left_out = ", and none but LPIPS, which lacks its weights" if loss.weights.lpips else ""
-    got, remedy = f"weights of 0{left_out}", "raise one of --l1-weight, --l2-weight, --fft-weight, --radiance-weight"
+    got, remedy = (
+        f"weights of 0{left_out}",
+        "raise one of --l1-weight, --l2-weight, --fft-weight, --radiance-weight, --psnr-weight",
+    )
     raise OptionError("loss", expected="a term of weight above 0", got=got, remedy=remedy)
 
 

@@ -1,11 +1,13 @@
 """The loss: its terms, their balance, and gradients that stay finite where images are equal."""
 
+import math
+
 import pytest
 import torch
 from torch import Tensor, nn
 
 from model.metrics.perceptual import Lpips
-from model.training.losses import PAPER, LossWeights, RestorationLoss, fft_l1, radiance_l1
+from model.training.losses import PAPER, LossWeights, RestorationLoss, fft_l1, log_mse, radiance_l1
 
 
 def images(side: int = 33, batch: int = 2, seed: int = 0) -> tuple[Tensor, Tensor]:
@@ -53,6 +55,26 @@ def test_the_terms_add_up() -> None:
     assert set(terms) == {"l1", "fft", "lpips"}
     expected = terms["l1"] + 0.1 * terms["fft"] + 0.5 * terms["lpips"]
     torch.testing.assert_close(total, expected)
+
+
+def test_a_psnr_term_is_lost_psnr_and_no_patch_counts_more() -> None:
+    """A tenth of the error on one patch of two is worth 10 dB in the mean, whichever of the two it is."""
+    generator = torch.Generator().manual_seed(0)
+    reference = torch.rand(2, 1, 13, 17, generator=generator)
+    errors = 0.05 * torch.randn(2, 1, 13, 17, generator=generator) * torch.tensor([1.0, 0.3]).view(2, 1, 1, 1)
+    before = log_mse(reference + errors, reference)
+    for patch in range(2):
+        better = errors.clone()
+        better[patch] *= 0.1
+        gained_db = 10 / math.log(10) * float(before - log_mse(reference + better, reference))
+        assert gained_db == pytest.approx(10, abs=0.15)
+    assert float(log_mse(reference, reference)) == 0
+    restored = (reference + errors).requires_grad_()
+    total, terms = RestorationLoss(LossWeights(0, 0, 0, 0, 0, psnr=0.01))(restored, reference)
+    assert set(terms) == {"l1", "psnr"}
+    total.backward()
+    assert restored.grad is not None
+    assert bool(torch.isfinite(restored.grad).all())
 
 
 def test_a_radiance_term_sees_the_mean_and_nothing_else() -> None:
