@@ -48,13 +48,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--images", type=Path, required=True)
     parser.add_argument("--sensors", type=int, default=20)
+    parser.add_argument("--seed", type=int, default=22)
     parser.add_argument("--weights", type=Path, help="of a conditioned network")
     arguments = parser.parse_args()
     scenes = [read_scene(path, LIKE) for path in list_images(arguments.images)]
     scenes = [scene for scene in scenes if fitting_oversampling(scene.radiance, [RATIO], LEAST_SIDE_PX)]
     ways = {name: Findings() for name in ("photographs alone", "one with a checkerboard", "two boxes on it")}
     lost, network = list[float](), load_conditioned(arguments.weights)[0] if arguments.weights else None
-    generator = np.random.default_rng(22)
+    generator = np.random.default_rng(arguments.seed)
     for number in range(arguments.sensors):
         sensor = draw(generator)
         chosen = [scenes[i] for i in generator.permutation(len(scenes))[:SCENES]]

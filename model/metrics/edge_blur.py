@@ -283,6 +283,8 @@ NORMAL_95 = 1.96
 
 SHAPED_EDGES = 40
 """As many tell the shape."""
+WORST = 1e12
+"""Sum of squares over noise that stands for no fit at all."""
 OTHER_SHAPES = 0.25
 """Standard error for shapes that no Gaussian part has, of what the Gaussian part changes."""
 
@@ -310,7 +312,11 @@ def combine(own: Sequence[EdgeBlur], others: Sequence[EdgeBlur]) -> AxisMtf:
     The shape of the curve is left open: each one counts by what it leaves unexplained of the edges.
     """
     other = float(np.median([edge.gamma for edge in others])) if others else None
-    logs, errors, weights = np.transpose([_of_shape(own, other, shape) for shape in SHAPES])
+    known = own[:SHAPED_EDGES]
+    logs, errors, left = (np.array(part) for part in zip(*(_of_shape(own, other, s) for s in SHAPES), strict=True))
+    scatter = np.maximum(left.min(0) / [edge.count for edge in known], 1.0)
+    # The median and not the sum: an edge that another crosses nearby has a shape of its own.
+    weights = -len(known) / 2 * np.median((left - left[0]) / scatter, axis=1)
     # Before any edge is seen, half of the belief is in the profile's curve: of few edges nothing else can be said.
     belief = np.gradient(SHAPES)
     belief[0] = belief[1:].sum()
@@ -325,23 +331,21 @@ def combine(own: Sequence[EdgeBlur], others: Sequence[EdgeBlur]) -> AxisMtf:
     return AxisMtf(centre, (low, min(high, MTF_NYQUIST_MAX)), len(own), nearest)
 
 
-def _of_shape(own: Sequence[EdgeBlur], other: float | None, shape: float) -> tuple[float, float, float]:
-    """Logarithm of the MTF at Nyquist over a perfect lens', its standard error, and that of its likelihood.
+def _of_shape(own: Sequence[EdgeBlur], other: float | None, shape: float) -> tuple[float, float, np.ndarray]:
+    """Logarithm of the MTF at Nyquist over a perfect lens', its standard error, and what each edge leaves over.
 
-    gamma^2 of a leaning edge is (gamma_x cos)^2 + (gamma_y sin)^2: the other axis has a part in it.
+    gamma^2 of a leaning edge is (gamma_x cos)^2 + (gamma_y sin)^2: the other axis has a part in it. An edge that the
+    shape cannot be fitted to leaves more than any other.
     """
-    refits = [_fitted(edge.pixels, ANY, shape) for edge in own[:SHAPED_EDGES]] if shape else list(own)
-    fits = [fit for fit in refits if isinstance(fit, EdgeBlur)]
-    if len(fits) < min(len(own), SHAPED_EDGES):
-        return 0.0, 0.0, -math.inf
-    gammas, errors = (np.array([getattr(edge, name) for edge in fits]) for name in ("gamma", "error"))
+    fits = [_fitted(edge.pixels, ANY, shape) for edge in own[:SHAPED_EDGES]] if shape else list(own)
+    known = [fit for fit in fits if isinstance(fit, EdgeBlur)] or list(own)
+    gammas, errors = (np.array([getattr(edge, name) for edge in known]) for name in ("gamma", "error"))
     if other is not None and not shape:
-        lean = np.array([edge.slope for edge in fits]) ** 2
+        lean = np.array([edge.slope for edge in known]) ** 2
         gammas = np.sqrt(np.maximum(gammas**2 * (1 + lean) - lean * other**2, 1e-4))
     gamma, error = _centre(gammas, errors)
-    known = fits[:SHAPED_EDGES]
-    scatter = max(sum(edge.chi2 for edge in own[:SHAPED_EDGES]) / sum(edge.count for edge in known), 1.0)
-    return -gamma / 2 - shape / 4, error / 2, -sum(edge.chi2 for edge in known) / (2 * scatter)
+    left = [fit.chi2 if isinstance(fit, EdgeBlur) else WORST for fit in fits[:SHAPED_EDGES]]
+    return -gamma / 2 - shape / 4, error / 2, np.array(left)
 
 
 def _centre(values: np.ndarray, errors: np.ndarray) -> tuple[float, float]:
