@@ -123,7 +123,6 @@ def test_the_command(pair: list[Path], tmp_path: Path) -> None:
     [
         (["FLOAT", "--bit-flips"], "INT8 network"),
         (["FLOAT", "INT8", "--bit-flips", "--cases", "snow"], "--bit-flips"),
-        (["FLOAT", "INT8", "--sensor", "pleiades-degraded"], "--sensor: expected --bit-flips"),
         (["FLOAT", "INT8", "--draws", "6"], "--draws: expected --bit-flips"),
         (["FLOAT", "INT8", "--bit-flips", "--sensor", "nobody"], "nobody"),
         (["FLOAT", "INT8", "--bit-flips", "--target", "nobody"], "nobody"),

@@ -72,7 +72,7 @@ def test_a_psnr_term_is_lost_psnr_and_no_patch_counts_more() -> None:
     restored = (reference + errors).requires_grad_()
     total, terms = RestorationLoss(LossWeights(0, 0, 0, 0, 0, psnr=0.01))(restored, reference)
     assert set(terms) == {"l1", "psnr"}
-    total.backward()
+    total.backward()  # type: ignore[no-untyped-call]
     assert restored.grad is not None
     assert bool(torch.isfinite(restored.grad).all())
 
