@@ -60,20 +60,21 @@ def conditioned(given: Path | None) -> Conditioned | None:
     """
     if given is None:
         return Conditioned(VARIANT, shipped_weights(VARIANT))
-    name = given.name.removesuffix(INT8)
-    if given == Path(given.name) and name in shipped_names() and not given.exists():
+    if _is_shipped(given):
+        name = given.name.removesuffix(INT8)
         return Conditioned(name, shipped_weights(name))
     return Conditioned(given.stem, given) if given.suffix == ".safetensors" and is_conditioned(given) else None
 
 
 def weights_file(given: Path) -> Path:
-    """The weights given, or the shipped ones of that name where no such file lies.
+    """The weights given, or the shipped ones of that name where no such file lies; nothing is read."""
+    return shipped_weights(given.name.removesuffix(INT8)) if _is_shipped(given) else given
 
-    Raises:
-        ModelError: weights that cannot be read.
-    """
-    found = conditioned(given)
-    return found.weights if found else given
+
+def _is_shipped(given: Path) -> bool:
+    """Whether a shipped network is meant by its name, with INT8 behind it or without."""
+    named = given == Path(given.name) and given.name.removesuffix(INT8) in shipped_names()
+    return named and not given.exists()
 
 
 def network_file(given: Path | None, sensor: SensorProfile, say: Say = silent) -> Path:

@@ -1,4 +1,4 @@
-"""Write docs/bit-flips.md and .svg: `python docs/make_bit_flips.py`, half an hour on two cores.
+"""Write docs/bit-flips.md and .svg: `python docs/make_bit_flips.py`, some ten minutes on two cores.
 
 It runs what `beers-deploy stress --bit-flips` runs, on two shipped networks. A test keeps its words and rows fresh.
 """
@@ -15,7 +15,7 @@ from model.progress import steps
 from profiles.figures import Row
 
 HERE = Path(__file__).parent
-VARIANTS = ("convbeers-s", "convbeers")
+VARIANTS = ("convbeers-s", "convbeers-xs")
 REQUEST = FlipRequest("pleiades-degraded", None, "vck190", draws=6, size_px=96, seed=0)
 
 OPENING = f"""# Bit flips

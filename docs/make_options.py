@@ -180,7 +180,6 @@ REFUSED = {
         Refused(
             ("model", "tile", "halo", "runtime", "threads", "workers", "scheduler", "resume"), "--method traditional"
         ),
-        Refused(("sensor",), without="--method traditional"),
         Refused(("method",), without="--sensor"),
         Refused(("workers",), SCHEDULER),
     ],
@@ -188,7 +187,7 @@ REFUSED = {
     "stress": [
         Refused(("variant",), "FLOAT"),
         Refused(("cases", "stages"), "--bit-flips"),
-        Refused(("draws", "sensor", "images", "target"), without="--bit-flips"),
+        Refused(("draws", "images", "target"), without="--bit-flips"),
     ],
 }
 

@@ -68,11 +68,11 @@ def quantize(
         remedy = "leave it out, or take --regime legal"
         expected = "no --board, --ablate, --report or --without"
         raise OptionError("--regime free", expected=expected, got="one", remedy=remedy)
-    model = float_file(model, load_sensor(sensor), partial(say, err=True))
     passes = passes_without(without or [])
     page, figures = (report / "report.html", report / "report.json") if report else (None, None)
     read = (model, images, *map(Path, (target, sensor)))
     require_writable(out, board, json, page, figures, inputs=read)
+    model = float_file(model, load_sensor(sensor), partial(say, err=True))
     network, board_target = float_model(model), load_target(target)
     calibration = Calibration(sensor, images, patches, patch, seed)
     if regime is Regime.free:

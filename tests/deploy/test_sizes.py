@@ -11,17 +11,17 @@ from PIL import Image
 from typer.testing import CliRunner
 
 from deploy.cli import app
-from deploy.export import to_onnx
-from deploy.networks import shipped_pair
+from deploy.export import to_onnx, weights_for
 from deploy.restoration.options import Options
 from deploy.restoration.plan import plan_for
-from model.io.weights import load_network
 from model.metrics.edges import find_edge
 from model.metrics.refusal import Refusal
 from model.metrics.sharpness import edge_mtf
+from model.shipped import SENSOR, VARIANT, shipped_weights
 from model.simulator.acquire import crop_margin
 from model.simulator.sampling import check_divisible
 from model.training.patches import StoredPairs, pair_files
+from profiles import load_sensor
 from profiles.errors import BeersError
 
 ROWS, COLUMNS = 37, 61
@@ -35,7 +35,7 @@ def plan_of_restore(folder: Path) -> str:
 
 
 def fixed_tile(_: Path) -> str:
-    model = to_onnx(load_network(shipped_pair()[0])[0], {}, 64)
+    model = to_onnx(weights_for(shipped_weights(VARIANT), load_sensor(SENSOR).nominal())[0], {}, 64)
     return said(lambda: plan_for(model, (1, ROWS, COLUMNS), Options(Path(), 64)))
 
 

@@ -18,6 +18,7 @@ from deploy.restoration.options import Options
 from deploy.restoration.output import only_run
 from deploy.restoration.run import restore_file
 from profiles.errors import MachineError
+from profiles.sensor_file import BLIND
 
 ENTRY = "from deploy.cli import app; app()"
 TILE_PX = 64
@@ -41,7 +42,7 @@ def begin(image: Path, out: Path) -> subprocess.Popen[str]:
 
 
 def restore(image: Path, out: Path, resume: bool = False) -> None:
-    restore_file(image, out, Options(shipped_pair()[1], TILE_PX, resume=resume), lambda _: None)
+    restore_file(image, out, Options(shipped_pair(sensor=BLIND)[1], TILE_PX, resume=resume), lambda _: None)
 
 
 def test_a_second_run_is_refused_and_the_first_one_unharmed(image: Path, tmp_path: Path) -> None:

@@ -117,7 +117,6 @@ def test_the_command_needs_a_sensor_and_no_option_of_a_network(tmp_path: Path) -
     named = [*chain, "--sensor", "pleiades-degraded"]
     for arguments, words in (
         (chain, "--sensor: expected the sensor that acquired IN"),
-        ([*start, "--sensor", "pleiades-degraded"], "expected --method traditional beside it"),
         ([*chain, "--sensor", "hubble"], "hubble"),
         ([*named, "--tile", "64"], "--tile: expected none with --method traditional"),
         ([*named, "--resume"], "--resume: expected none"),
