@@ -14,7 +14,7 @@ FAMILY = {
     "tiny": Made(44.0, 4, 16),
     "small": Made(45.3, 8, 32),
     "papers": Made(45.0, 16, 64),
-    "tuned": Made(46.9, 8, 32, sensor="trained for it"),
+    "tuned": Made(46.9, 8, 32, sensor="known"),
 }
 
 

@@ -116,7 +116,7 @@ def test_every_figure_of_every_point_is_a_number_or_has_a_reason(kept: tuple[Stu
                 assert figure.source
     legal = next(row for row in points if "wide INT8 legal" in row.name)
     assert all(figure.value is not None for key, figure in legal.figures.items() if key != "LPIPS-squeeze")
-    assert legal.text["sensor"] == "trained for it"
+    assert legal.text["sensor"] == "known"
 
 
 def test_two_sites_give_no_interval_and_images_smaller_than_the_profile_asks_for_are_owned_up_to(
