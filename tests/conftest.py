@@ -1,9 +1,17 @@
 """Machines are shared: no property test is judged by its time. Real images lie beside the repository, or nowhere."""
 
+import atexit
+import os
+import shutil
+import tempfile
 from pathlib import Path
 
 import pytest
 from hypothesis import settings
+
+# Before any test is imported: what is made for a sensor goes into no user's cache.
+os.environ["BEERS_DEPLOY_CACHE"] = tempfile.mkdtemp(prefix="beers-deploy-tests-")
+atexit.register(shutil.rmtree, os.environ["BEERS_DEPLOY_CACHE"], ignore_errors=True)
 
 settings.register_profile("project", deadline=None)
 settings.load_profile("project")

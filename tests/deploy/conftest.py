@@ -6,7 +6,9 @@ import pytest
 import torch
 
 from deploy.export import to_onnx
+from model.conditioning import ConditionedConvBEERS, initialise_coefficients
 from model.convbeers import ConvBEERS, initialise
+from model.io.weights import save_network
 from model.variants import Variant
 from quant.onnx_file import save_onnx
 
@@ -22,3 +24,15 @@ def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("model") / "small.onnx"
     save_onnx(to_onnx(network, {}), path)
     return path
+
+
+@pytest.fixture
+def conditioned(tmp_path: Path) -> Path:
+    """Weights of a small conditioned network, as `train --conditioned` leaves them."""
+    network, generator = ConditionedConvBEERS(Variant(blocks=2, features=8)), torch.Generator().manual_seed(0)
+    initialise(network.base, generator)
+    initialise_coefficients(network, generator)
+    for parameter in network.directions.parameters():
+        torch.nn.init.normal_(parameter, 0.0, 0.05, generator)
+    save_network(tmp_path / "conditioned.safetensors", network, {"degraded": "many"})
+    return tmp_path / "conditioned.safetensors"

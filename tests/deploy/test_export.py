@@ -8,7 +8,7 @@ from typer.testing import CliRunner, Result
 
 from deploy.cli import app
 from deploy.export import parity, require_parity, to_onnx
-from model.conditioning import ConditionedConvBEERS, initialise_coefficients, vector_tensor
+from model.conditioning import vector_tensor
 from model.convbeers import ConvBEERS, initialise
 from model.io.weights import load_conditioned, save_network
 from model.variants import Variant
@@ -78,18 +78,6 @@ def test_a_relu_stands_behind_every_first_convolution(network: ConvBEERS) -> Non
     kinds = [node.op_type for node in to_onnx(network, {}).graph.node]
     assert kinds.count("Relu") == network.variant.blocks
     assert kinds.count("Add") == network.variant.blocks + 2
-
-
-@pytest.fixture
-def conditioned(tmp_path: Path) -> Path:
-    """Weights as `train --conditioned` leaves them."""
-    network, generator = ConditionedConvBEERS(Variant(blocks=2, features=8)), torch.Generator().manual_seed(0)
-    initialise(network.base, generator)
-    initialise_coefficients(network, generator)
-    for parameter in network.directions.parameters():
-        torch.nn.init.normal_(parameter, 0.0, 0.05, generator)
-    save_network(tmp_path / "conditioned.safetensors", network, {"degraded": "many"})
-    return tmp_path / "conditioned.safetensors"
 
 
 def export(*options: str) -> Result:

@@ -11,7 +11,6 @@ import numpy as np
 import onnx
 import pytest
 import tifffile
-import torch
 from typer.testing import CliRunner
 
 from deploy import networks
@@ -26,12 +25,8 @@ from deploy.networks import (
     network_file,
     shipped_pair,
 )
-from model.conditioning import ConditionedConvBEERS, initialise_coefficients
-from model.convbeers import initialise
 from model.io.files import sha256
-from model.io.weights import save_network
 from model.shipped import INT8, SENSOR, SHIPPED, shipped_names, shipped_weights
-from model.variants import Variant
 from profiles.errors import ModelError, ProfileError
 from profiles.sensor import numbers_of
 from profiles.sensor_file import BLIND, BLIND_PROFILE, load_sensor
@@ -47,18 +42,6 @@ def own_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path / "cache"
 
 
-@pytest.fixture
-def small(tmp_path: Path) -> Path:
-    """Weights of a small conditioned network, as `train --conditioned` leaves them."""
-    network, generator = ConditionedConvBEERS(Variant(blocks=1, features=4)), torch.Generator().manual_seed(0)
-    initialise(network.base, generator)
-    initialise_coefficients(network, generator)
-    for parameter in network.directions.parameters():
-        torch.nn.init.normal_(parameter, 0.0, 0.05, generator)
-    save_network(tmp_path / "small.safetensors", network, {"degraded": "many"})
-    return tmp_path / "small.safetensors"
-
-
 def own_sensor(folder: Path, old: str = "", new: str = "", name: str = "mine.toml") -> Path:
     """The default sensor as a user's own file, a text in it replaced."""
     path = folder / name
@@ -66,33 +49,33 @@ def own_sensor(folder: Path, old: str = "", new: str = "", name: str = "mine.tom
     return path
 
 
-def test_a_float_network_is_made_once_for_a_sensor(small: Path, own_cache: Path) -> None:
-    first = float_file(small, KNOWN)
+def test_a_float_network_is_made_once_for_a_sensor(conditioned: Path, own_cache: Path) -> None:
+    first = float_file(conditioned, KNOWN)
     written = first.stat().st_mtime_ns
     assert first.parent == own_cache == cache_folder()
-    assert float_file(small, KNOWN) == first
+    assert float_file(conditioned, KNOWN) == first
     assert first.stat().st_mtime_ns == written
     assert metadata(onnx.load(first))["sensor"] == SENSOR
     assert len(list(own_cache.iterdir())) == 1
 
 
-def test_the_same_numbers_are_the_same_sensor_and_others_are_not(small: Path, tmp_path: Path) -> None:
+def test_the_same_numbers_are_the_same_sensor_and_others_are_not(conditioned: Path, tmp_path: Path) -> None:
     """Sources and descriptions make no other network; a number does, under the same name of a file."""
     files = []
     for folder, old, new in (("a", "", ""), ("b", "Raw", "My raw"), ("c", "value = 0.07", "value = 0.08")):
         (tmp_path / folder).mkdir()
         sensor = load_sensor(str(own_sensor(tmp_path / folder, old, new)))
-        files.append(float_file(small, sensor))
+        files.append(float_file(conditioned, sensor))
     assert files[0] == files[1]
     assert files[2] != files[0]
     assert files[2].read_bytes() != files[0].read_bytes()
 
 
 def test_int8_is_made_once_and_shows_progress(
-    small: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    conditioned: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(networks, "PATCHES", 2)
-    made = int8_file(small, KNOWN)
+    made = int8_file(conditioned, KNOWN)
     assert is_quantised(load_onnx(made))
     assert metadata(load_onnx(made))[MADE_FROM]
     assert f"making INT8 for {SENSOR}, once" in capsys.readouterr().err
@@ -101,8 +84,8 @@ def test_int8_is_made_once_and_shows_progress(
         raise AssertionError("made again")
 
     monkeypatch.setattr(networks, "_in_int8", never)
-    assert int8_file(small, KNOWN) == made
-    assert float_file(small, KNOWN) != made
+    assert int8_file(conditioned, KNOWN) == made
+    assert float_file(conditioned, KNOWN) != made
 
 
 @pytest.mark.parametrize("name", shipped_names())
@@ -126,11 +109,11 @@ def test_blind_is_the_middle_of_a_range_of_sensors() -> None:
     assert weights[0] == weights[1]
 
 
-def test_what_lies_outside_is_said_each_time(small: Path, tmp_path: Path) -> None:
+def test_what_lies_outside_is_said_each_time(conditioned: Path, tmp_path: Path) -> None:
     said = list[str]()
     sensor = load_sensor(str(own_sensor(tmp_path, "value = 0.07", "value = 0.004")))
     for _ in range(2):
-        float_file(small, sensor, said.append)
+        float_file(conditioned, sensor, said.append)
     assert len(said) == 4
     assert all(re.match("warning: mtf_(across|along) 0.004 is outside 0.015 to 0.15", sentence) for sentence in said)
 
@@ -176,6 +159,6 @@ def test_a_network_that_is_made_already_takes_no_sensor(tmp_path: Path) -> None:
     assert not (tmp_path / "out.tif").exists()
 
 
-def test_a_sensors_name_cannot_leave_the_cache(small: Path, own_cache: Path) -> None:
+def test_a_sensors_name_cannot_leave_the_cache(conditioned: Path, own_cache: Path) -> None:
     odd = replace(KNOWN, name="../../x y/" + 99 * "z")
-    assert float_file(small, odd).parent == own_cache
+    assert float_file(conditioned, odd).parent == own_cache
