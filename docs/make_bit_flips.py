@@ -47,8 +47,8 @@ The copy that weights are loaded from, and the checksums, are taken to be sound.
 
 """
 
-FINDINGS = """- Up to 10 bits in a megabit of weights nobody would see a difference (0.05 dB). One in a megabit of feature maps costs
-  0.1 dB in the network of 8 x 32, and 0.6 dB in that of 4 x 16, which has fewer to share it.
+FINDINGS = """- Up to 10 bits in a megabit of weights nobody would see a difference (0.05 dB). One in a megabit of
+  feature maps costs 0.1 dB in the network of 8 x 32, and 0.6 dB in that of 4 x 16, which has fewer to share it.
 - Weights: CRC-32 finds every injection here, and after scrubbing the network is the fault-free one.
 - Shifts are few and seldom hit, but one of them wrong costs 4 to 10 dB in the mean and above 20 dB at worst;
   triple modular redundancy corrects all but two flips of the same bit, which are met at 10 000 in a megabit.
