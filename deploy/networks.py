@@ -21,6 +21,7 @@ from model.io.files import require_writable, sha256
 from model.io.tensors import is_conditioned
 from model.progress import steps
 from model.shipped import INT8, SENSOR, SHIPPED, VARIANT, shipped_names, shipped_weights
+from model.specialise import sensor_vector
 from profiles.sensor import SensorProfile, numbers_of
 from profiles.sensor_file import load_sensor
 from quant.onnx_file import is_quantised, load_onnx, metadata, save_onnx
@@ -154,7 +155,8 @@ def cache_folder() -> Path:
 
 
 def _kept(network: Conditioned, sensor: SensorProfile, precision: str, say: Say) -> Path:
-    model = specialised_model(network, sensor, say)
+    for sentence in sensor_vector(sensor.nominal()).outside:
+        say(f"warning: {sentence}")
     made_from = digest_of({"weights": sha256(network.weights), "sensor": numbers_of(sensor)})
     shipped = SHIPPED / f"{network.name}{INT8}-{sensor.name}.onnx"
     if precision == "int8" and shipped.is_file() and metadata(load_onnx(shipped)).get(MADE_FROM) == made_from:
@@ -165,6 +167,7 @@ def _kept(network: Conditioned, sensor: SensorProfile, precision: str, say: Say)
     path = cache_folder() / f"{stem}-{known}-{digest[:12]}.onnx"
     if not path.is_file():
         require_writable(path)
+        model = specialised_model(network, sensor, silent)
         made = _in_int8(model, sensor, {MADE_FROM: made_from}) if precision == "int8" else model
         save_onnx(made, path)
     return path

@@ -21,6 +21,7 @@ from profiles.response import MtfTable, PointSpread, centroid, packed, unpacked
 from profiles.sensor import same_instrument
 from profiles.sensor_file import sensor_from_json
 from profiles.toml import HERE
+from tests.profiles.test_profile_files import refusal
 
 SHIPPED = (HERE / "sensors" / "pleiades-degraded.toml").read_text(encoding="utf-8")
 TABLE = "frequency = [0, 0.25, 0.5]\nacross = [1, 0.5, 0.12]\nalong = [1, 0.4, 0.05]"
@@ -52,17 +53,6 @@ def with_psf(folder: Path, samples: np.ndarray, mtf: str = PSF) -> SensorProfile
 
 def formula(frequency: np.ndarray, contrast: float) -> np.ndarray:
     return np.asarray(np.exp(2 * np.log(contrast * np.pi / 2) * frequency) * np.sinc(frequency))
-
-
-def refusal(path: str) -> ProfileError:
-    with pytest.raises(ProfileError) as caught:
-        load_sensor(path)
-    error = caught.value
-    assert str(error) == f"{error.where}: expected {error.expected}, got {error.got}; {error.remedy}."
-    assert all(part.strip() for part in (error.where, error.expected, error.got, error.remedy))
-    assert "mine" in error.where
-    assert "\n" not in str(error)
-    return error
 
 
 def test_a_table_says_what_stands_in_it(tmp_path: Path) -> None:
