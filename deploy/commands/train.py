@@ -53,7 +53,7 @@ def train(
     ] = 0.0,
     lpips: Annotated[Path | None, typer.Option(help="Weights of SqueezeNet 1.1 for LPIPS, or their folder.")] = None,
     start: Annotated[
-        Path | None, typer.Option(help="Weights to go on from; of a narrower network, they are widened.")
+        Path | None, typer.Option(help="Weights to go on from; those of a smaller network grow.")
     ] = None,
     teacher: Annotated[Path | None, typer.Option(help="Weights of a network to imitate (distilling).")] = None,
     distil: Annotated[float, typer.Option(min=0, help="Weight of the distance to the teacher.")] = 1.0,

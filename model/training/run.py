@@ -20,13 +20,14 @@ from model.io.files import whole_file
 from model.io.images import list_images
 from model.io.pictures import Stretch, busiest_windows, grid, strip_row
 from model.io.tensors import is_conditioned
-from model.io.weights import N, load_conditioned, load_network, widen, widen_conditioned
+from model.io.weights import N, load_conditioned, load_network
 from model.metrics.backbones import find_backbone, not_found
 from model.metrics.perceptual import Lpips
 from model.progress import Steps, steps
 from model.simulator.procedural import draw_scenes
 from model.simulator.sampling import Scene, read_scene
 from model.training.checkpoint import TrainingRecipe, finish
+from model.training.grow import grow, grow_conditioned
 from model.training.guards import require_finite_output
 from model.training.losses import RestorationLoss
 from model.training.patches import PatchRecipe, PatchSource, StoredPairs, pair_files
@@ -124,20 +125,20 @@ def train(run: Run, resume: bool, worker: Worker, say: Callable[[str], None]) ->
 
 
 def start_weights(run: Run) -> Mapping[str, Tensor] | None:
-    """The weights to go on from, widened to the run's variant; None draws new ones.
+    """The weights to go on from, grown to the run's variant; None draws new ones.
 
     Raises:
-        ModelError: no such weights, or a network that cannot be widened to the variant.
+        ModelError: no such weights, or a network that cannot grow to the variant.
     """
     if run.start is None:
         return None
     variant, generator = variant_named(run.variant), torch.Generator().manual_seed(run.recipe.seed)
     if run.patches.family is None:
-        return widen(_plain(run, run.start), variant, generator).state_dict()
+        return grow(_plain(run, run.start), variant, generator).state_dict()
     if is_conditioned(run.start):
-        return widen_conditioned(_sound(load_conditioned, run.start), variant, generator).state_dict()
+        return grow_conditioned(_sound(load_conditioned, run.start), variant, generator).state_dict()
     network = new_network(variant, generator, conditioned=True)
-    base = widen(_sound(load_network, run.start), variant, generator).state_dict()
+    base = grow(_sound(load_network, run.start), variant, generator).state_dict()
     return network.state_dict() | {f"base.{name}": weight for name, weight in base.items()}
 
 

@@ -1,0 +1,80 @@
+"""Growing keeps the function, and leaves what was added free to learn."""
+
+import pytest
+import torch
+
+from model.conditioning import ConditionedConvBEERS, fold, initialise_coefficients
+from model.convbeers import ConvBEERS, initialise
+from model.training.grow import grow, grow_conditioned
+from model.variants import Variant
+from profiles.errors import ModelError
+
+
+def network(features: int) -> ConvBEERS:
+    made = ConvBEERS(Variant(blocks=2, features=features))
+    initialise(made, torch.Generator().manual_seed(1))
+    with torch.no_grad():
+        for parameter in made.parameters():
+            parameter.add_(0.05 * torch.randn(parameter.shape, generator=torch.Generator().manual_seed(2)))
+    return made
+
+
+LARGER = [Variant(2, 6), Variant(2, 18), Variant(3, 6), Variant(5, 12), Variant(4, 6)]
+
+
+@pytest.mark.parametrize("variant", LARGER)
+def test_the_larger_network_computes_the_same(variant: Variant) -> None:
+    small = network(6)
+    large = grow(small, variant, torch.Generator().manual_seed(3))
+    image = torch.rand(2, 1, 13, 17, generator=torch.Generator().manual_seed(4))
+    torch.testing.assert_close(large(image), small(image), atol=1e-5, rtol=1e-5)
+
+
+def test_added_blocks_lie_between_the_others_and_can_learn() -> None:
+    large = grow(network(6), Variant(4, 6), torch.Generator().manual_seed(3))
+    large(torch.rand(1, 1, 13, 17, generator=torch.Generator().manual_seed(4))).square().sum().backward()
+    weights = dict(large.named_parameters())
+    seconds = [weights[f"body.{block}.second.weight"] for block in range(4)]
+    assert [bool(second.any()) for second in seconds] == [True, False, True, False]
+    assert all(second.grad is not None and second.grad.any() for second in seconds)
+
+
+def test_the_copies_of_a_feature_learn_different_things() -> None:
+    wide = grow(network(6), Variant(2, 12), torch.Generator().manual_seed(3))
+    image = torch.rand(2, 1, 13, 17, generator=torch.Generator().manual_seed(4))
+    wide(image).abs().sum().backward()
+    gradient = wide.body[0].first.weight.grad  # type: ignore[union-attr]
+    assert isinstance(gradient, torch.Tensor)
+    assert (gradient[:6] - gradient[6:]).abs().max() > 1e-3 * gradient.abs().max()
+
+
+@pytest.mark.parametrize("variant", LARGER)
+def test_a_conditioned_network_grows_for_every_sensor(variant: Variant) -> None:
+    small = ConditionedConvBEERS(Variant(2, 6))
+    small.base.load_state_dict(network(6).state_dict())
+    initialise_coefficients(small, torch.Generator().manual_seed(5))
+    for seed, direction in enumerate(small.directions):
+        for parameter in direction.parameters():
+            torch.nn.init.normal_(parameter, 0.0, 0.05, torch.Generator().manual_seed(seed))
+    large = grow_conditioned(small, variant, torch.Generator().manual_seed(3))
+    image = torch.rand(1, 1, 13, 17, generator=torch.Generator().manual_seed(4))
+    for vector in (torch.tensor([-1.0, -0.5, 0.2, 0.9]), torch.tensor([0.7, 0.7, -1.0, -0.6])):
+        torch.testing.assert_close(fold(large, vector)(image), fold(small, vector)(image), atol=1e-5, rtol=1e-5)
+
+
+@pytest.mark.parametrize("variant", [Variant(1, 12), Variant(2, 9), Variant(2, 3)])
+def test_a_network_that_does_not_fit_is_refused(variant: Variant) -> None:
+    with pytest.raises(ModelError, match="features"):
+        grow(network(6), variant, torch.Generator().manual_seed(3))
+
+
+def test_added_directions_can_learn() -> None:
+    small = ConditionedConvBEERS(Variant(1, 4))
+    initialise_coefficients(small, torch.Generator().manual_seed(5))
+    large = grow_conditioned(small, Variant(3, 4), torch.Generator().manual_seed(3))
+    vectors = torch.tensor([[-1.0, -0.5, 0.2, 0.9]])
+    large(torch.rand(1, 1, 9, 11, generator=torch.Generator().manual_seed(4)), vectors).square().sum().backward()
+    for name, parameter in large.directions.named_parameters():
+        if name.endswith("second.weight"):
+            assert parameter.grad is not None, name
+            assert parameter.grad.any(), name
