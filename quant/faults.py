@@ -13,6 +13,7 @@ import numpy as np
 from model.io.images import MAX_DN
 from profiles.errors import ModelError
 from quant.core import INT8_MAX, INT8_MIN, SHIFTS, IntConv, IntCore, op_shifts
+from quant.graph import Activation
 from quant.integer import Faults, merged_correction, run_core
 
 MEGABIT = 1e6
@@ -160,7 +161,7 @@ class Guards:
 
 def learn_guards(core: IntCore, planes: Iterable[np.ndarray]) -> Guards:
     """Guards from what a fault-free core reaches on calibration patches, planes (N, 3, H, W) each."""
-    relus = {op.output: 0 for op in core.ops if isinstance(op, IntConv) and op.relu}
+    relus = {op.output: 0 for op in core.ops if isinstance(op, IntConv) and op.activation is Activation.relu}
     largest_dn = 0.0
     for each in planes:
         tensors, _ = run_core(core, each)

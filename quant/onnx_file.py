@@ -108,7 +108,7 @@ class GraphWriter:
         inputs: Sequence[str],
         name: str = "",
         domain: str | None = None,
-        **attributes: int | list[int],
+        **attributes: int | float | str | list[int],
     ) -> str:
         """Append an operator of one result, named as its result unless it has a name; returns the result's."""
         node = onnx.helper.make_node(kind, inputs, [output], name=name or output, domain=domain or self.domain)
