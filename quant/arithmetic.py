@@ -1,5 +1,6 @@
-"""The integer reference's operators on whole numbers (N, C, H, W), exact: products, sums, maxima, and their bounds."""
+"""The integer reference's operators on whole numbers (N, C, H, W): exact products, sums, maxima, and their bounds."""
 
+from collections.abc import Sequence
 from itertools import product
 
 import numpy as np
@@ -7,7 +8,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 
 from quant.core import IntConv
 from quant.fixed_point import bilinear_weights, mean_factor
-from quant.graph import Activation, AveragePool, MaxPool
+from quant.graph import Activation, AveragePool, MaxPool, Window
 
 FLOAT32_WHOLE_MAX = 2**24
 """Up to here float32 holds whole numbers exactly, and sums them in any order."""
@@ -17,36 +18,45 @@ LEAKY_OF_256 = 26
 SIX = 6
 
 
-def convolve(image: np.ndarray, op: IntConv) -> np.ndarray:
+def convolve(
+    image: np.ndarray, weight: np.ndarray, window: Window, groups: int = 1, transposed: bool = False
+) -> np.ndarray:
     """The sums of products of a convolution with zero padding, (N, I, H, W) to (N, O, H', W') int64.
 
     A product of matrices a strip of rows, in floats that hold its sums exactly: the windows of a whole image would
     take kh kw times its memory.
     """
-    weight, wide, steps = _laid_out(image, op)
+    if transposed:
+        weight, wide, window = weight[:, :, ::-1, ::-1], *_between_zeros(image, weight, window)
+    else:
+        wide = _padded(image, window)
     largest = 128 * int(np.abs(weight.astype(np.int64)).sum((1, 2, 3)).max(initial=0))
     exact = np.float32 if largest <= FLOAT32_WHOLE_MAX else np.float64
-    kernel = (np.array(weight.shape[2:]) - 1) * op.window.dilations + 1
-    windows = sliding_window_view(wide.astype(exact), tuple(kernel), (2, 3))
-    windows = windows[:, :, :: steps[0], :: steps[1], :: op.window.dilations[0], :: op.window.dilations[1]]
-    return _products(windows, weight.astype(exact), op.groups)
+    windows = _windows(wide.astype(exact), weight.shape[2:], window)
+    return _products(windows, weight.astype(exact), groups)
 
 
-def _laid_out(image: np.ndarray, op: IntConv) -> tuple[np.ndarray, np.ndarray, tuple[int, int]]:
-    """The weights, the image with its zeros, and the strides of the convolution that remains.
+def _padded(image: np.ndarray, window: Window, fill: int = 0) -> np.ndarray:
+    top, left, bottom, right = window.pads
+    return np.pad(image, ((0, 0), (0, 0), (top, bottom), (left, right)), constant_values=fill)
 
-    A transposed one is one of stride 1, its kernel turned, over an image with zeros between its pixels.
-    """
-    top, left, bottom, right = op.window.pads
-    if not op.transposed:
-        return op.weight, np.pad(image, ((0, 0), (0, 0), (top, bottom), (left, right))), op.window.strides
+
+def _windows(wide: np.ndarray, kernel: Sequence[int], window: Window) -> np.ndarray:
+    """The windows (N, C, H, W, kh, kw) of an image that is padded already."""
+    (rows, columns), (tall, broad) = window.strides, window.dilations
+    extent = (kernel[0] - 1) * tall + 1, (kernel[1] - 1) * broad + 1
+    return sliding_window_view(wide, extent, (2, 3))[:, :, ::rows, ::columns, ::tall, ::broad]
+
+
+def _between_zeros(image: np.ndarray, weight: np.ndarray, window: Window) -> tuple[np.ndarray, Window]:
+    """What a transposed convolution is of stride 1 over, its kernel turned: the pixels with zeros between them."""
     count, channels, height, width = image.shape
-    rows, columns = op.window.strides
+    (rows, columns), (top, left, bottom, right) = window.strides, window.pads
     between = np.zeros((count, channels, (height - 1) * rows + 1, (width - 1) * columns + 1), image.dtype)
     between[:, :, ::rows, ::columns] = image
-    tall, broad = (k - 1 for k in op.weight.shape[2:])
-    ends = (tall - top, tall - bottom), (broad - left, broad - right)
-    return op.weight[:, :, ::-1, ::-1], np.pad(between, ((0, 0), (0, 0), *ends)), (1, 1)
+    tall, broad = (k - 1 for k in weight.shape[2:])
+    plain = Window(pads=(tall - top, broad - left, tall - bottom, broad - right))
+    return _padded(between, plain), plain
 
 
 def _products(windows: np.ndarray, weight: np.ndarray, groups: int) -> np.ndarray:
@@ -65,7 +75,7 @@ def _products(windows: np.ndarray, weight: np.ndarray, groups: int) -> np.ndarra
 
 
 def bound_of(op: IntConv, bias: np.ndarray) -> float:
-    """Bits, without the sign, that no input makes the sums exceed: 128 times the sizes of the weights, and the bias."""
+    """Bits, without the sign, that no sum exceeds: of 128 times the sizes of the weights, and the bias."""
     sizes = np.abs(op.weight.astype(np.int64)).sum((1, 2, 3))
     return float(np.log2(max(int((128 * sizes + np.abs(bias)).max()), 1)))
 
@@ -83,25 +93,16 @@ def activated(sums: np.ndarray, activation: Activation, frac_bits: int) -> tuple
 
 def window_maxima(image: np.ndarray, op: MaxPool) -> np.ndarray:
     """The largest value of each window (N, C, H, W), padding never."""
-    windows = _windows(image, op, fill=np.iinfo(image.dtype).min)
-    return np.asarray(windows.max((4, 5)))
+    wide = _padded(image, op.window, int(np.iinfo(image.dtype).min))
+    return np.asarray(_windows(wide, op.kernel, op.window).max((4, 5)))
 
 
 def means(image: np.ndarray, op: AveragePool) -> tuple[np.ndarray, int, float]:
     """Each window's sum times the DPU's factor, the shift behind it, and the bits that it cannot exceed."""
     assert op.kernel is not None  # noqa: S101 - resolved before anything is quantised
     factor, shift = mean_factor(op.kernel)
-    sums = _windows(image, op, fill=0).sum((4, 5), dtype=np.int64) * factor
+    sums = _windows(_padded(image, op.window), op.kernel, op.window).sum((4, 5), dtype=np.int64) * factor
     return sums, shift, float(np.log2(128 * factor * op.kernel[0] * op.kernel[1]))
-
-
-def _windows(image: np.ndarray, op: MaxPool | AveragePool, fill: int) -> np.ndarray:
-    assert op.kernel is not None  # noqa: S101
-    top, left, bottom, right = op.window.pads
-    wide = np.pad(image, ((0, 0), (0, 0), (top, bottom), (left, right)), constant_values=fill)
-    (rows, columns), (tall, broad) = op.window.strides, op.window.dilations
-    kernel = (op.kernel[0] - 1) * tall + 1, (op.kernel[1] - 1) * broad + 1
-    return sliding_window_view(wide, kernel, (2, 3))[:, :, ::rows, ::columns, ::tall, ::broad]
 
 
 def enlarged(image: np.ndarray, factor: int) -> tuple[np.ndarray, int, float]:

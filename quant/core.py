@@ -205,7 +205,7 @@ def _move_add(op: Add, frac_bits: dict[str, int], shifts: Shifts) -> None:
 
 
 def _tie(op: Op, frac_bits: dict[str, int]) -> None:
-    """One scale for what it reads and writes: the coarsest that one of them needs, but that of the planes is fixed."""
+    """One scale for what it reads and writes: the coarsest that one of them needs; that of the planes is fixed."""
     names = (*op.inputs, op.output)
     shared = frac_bits[PLANES] if PLANES in names else min(frac_bits[name] for name in names)
     frac_bits.update(dict.fromkeys(names, shared))

@@ -42,7 +42,8 @@ class Ends:
         planes: of int8 that each channel becomes.
         front: pixel unshuffles of the image.
         back: pixel shuffles of the correction.
-        adds_image: whether the image is added at the end, and the sum clipped to [0, 1].
+        adds_image: whether the image is added, and the sum clipped to [0, 1].
+        last: pixel shuffles of the sum.
         flat: whether the result is (N, K).
         gains: 2 where the correction's channels come twice, fine and coarse by `GAIN`.
         outputs: channels of the correction, gains not counted.
@@ -53,6 +54,7 @@ class Ends:
     front: tuple[Shuffle, ...] = ()
     back: tuple[Shuffle, ...] = ()
     adds_image: bool = True
+    last: tuple[Shuffle, ...] = ()
     flat: bool = False
     gains: int = 1
     outputs: int = 1
@@ -85,7 +87,10 @@ class Ends:
             result = shuffle(result)
         if self.flat:
             result = result.reshape(len(result), -1)
-        return self.clipped(image + result) if self.adds_image else result
+        result = self.clipped(image + result) if self.adds_image else result
+        for shuffle in self.last:
+            result = shuffle(result)
+        return result
 
     def clipped(self, result: np.ndarray) -> np.ndarray:
         """A float network's result as the host would clip its own: to [0, 1] where the image is added."""
@@ -98,7 +103,7 @@ ONE_CHANNEL = Ends()
 
 def ends_of(network: Network, gains: int = 1) -> Ends:
     """The ends of a network whose correction comes in so many gains."""
-    kept = network.front, network.back, network.adds_image, network.flat
+    kept = network.front, network.back, network.adds_image, network.last, network.flat
     outputs = channels_of(network.graph, {IMAGE: network.core_channels})[CORRECTION]
     return Ends(network.core_channels, plane_count(network.graph), *kept, gains, outputs)
 
@@ -168,7 +173,11 @@ def write_back(w: HostWriter, ends: Ends, feeds: list[str], scale: float) -> Non
     if ends.adds_image:
         w.node("Add", "host_back.add", [IMAGE, result])
         limits = [w.scalar("zero", 0), w.scalar("one", 1)]
-        w.node("Clip", "restored", ["host_back.add", *limits], name="host_back.clip")
+        name = "host_back.clipped" if ends.last else "restored"
+        w.node("Clip", name, ["host_back.add", *limits], name="host_back.clip")
+        for k, shuffle in enumerate(ends.last):
+            result, name = name, "restored" if k + 1 == len(ends.last) else f"host_back.last_{k}"
+            write_shuffle(w, shuffle, result, name)
     else:
         w.node("Flatten" if ends.flat else "Identity", "restored", [result], name="host_back.result")
 

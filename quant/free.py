@@ -29,10 +29,10 @@ from quant.graph import (
     tensors,
 )
 from quant.onnx_file import fixed_tile_px, image_info, make_model, metadata
-from quant.passes.equalise import channel_ranges, equalise, search, search_steps
+from quant.passes.equalise import Costs, channel_ranges, equalise, search, search_steps
 from quant.passes.fit_weights import Moments, fit, input_moments
 from quant.passes.stream import STREAM_FRAC_BITS, half_lsb_pair, streams, two_gains
-from quant.quantise import crop_costs, search_targets
+from quant.quantise import Targets, crop_costs, search_targets
 from quant.session import halo_of, open_session, tensor_values
 
 BINS = 4096
@@ -206,7 +206,11 @@ def quantise_free(
     for stream in streams(graph):
         ranges = channel_ranges(graph, stream, patches.degraded, tick)
         targets = search_targets(graph, ONE_CHANNEL, patches.degraded)
-        factors = search(graph, stream, ranges, lambda tried: crop_costs(_written(tried, scales, {}), targets), tick)
+
+        def trial(tried: Graph, targets: Targets = targets) -> Costs:
+            return crop_costs(_written(tried, scales, {}), targets)
+
+        factors = search(graph, stream, ranges, trial, tick)
         graph = equalise(graph, stream, factors)
     about = {**metadata(model), "precision": "int8 free", "calibration_sha256": patches.digest, **about}
     moments = input_moments(_fine(graph), patches.degraded, tick)

@@ -138,7 +138,7 @@ def _moving(core: IntCore, op: Op, read: list[np.ndarray]) -> np.ndarray:
 def _conv(core: IntCore, op: IntConv, image: np.ndarray, faults: Faults) -> Sums:
     product = op.weight_frac_bits + core.frac_bits[op.input]
     bias = _moved(op.bias.astype(np.int64), faults.shift(op.name, "shift_bias", product - op.bias_frac_bits))
-    sums = convolve(image, op) + bias[:, None, None]
+    sums = convolve(image, op.weight, op.window, op.groups, op.transposed) + bias[:, None, None]
     sums, finer = activated(sums, op.activation, product)
     cut = faults.shift(op.name, "shift_cut", product - core.frac_bits[op.output])
     return sums, cut + finer, bound_of(op, bias)

@@ -161,13 +161,13 @@ def fixed_tile_px(model: onnx.ModelProto) -> int | None:
     """The tile side that a model is fixed to, or None when it takes any size.
 
     Raises:
-        ModelError: not one (N, 1, H, W) input, or a fixed size that is not square.
+        ModelError: not one (N, C, H, W) input, or a fixed size that is not square.
     """
     sizes = [d.dim_value for d in model.graph.input[0].type.tensor_type.shape.dim] if model.graph.input else []
-    if len(model.graph.input) != 1 or len(sizes) != 4 or sizes[1] != 1 or sizes[2] != sizes[3]:
+    if len(model.graph.input) != 1 or len(sizes) != 4 or sizes[2] != sizes[3]:
         raise ModelError(
             "ONNX model",
-            expected="one input (N, 1, H, W)",
+            expected="one input (N, C, H, W)",
             got=f"{sizes}",
             remedy="export it with 'beers-deploy export'",
         )
@@ -185,9 +185,8 @@ def any_size(model: onnx.ModelProto) -> onnx.ModelProto:
     free = onnx.ModelProto()
     free.CopyFrom(model)
     for value in (*free.graph.input, *free.graph.output):
-        if len(value.type.tensor_type.shape.dim) != 4:
-            got = f"{value.name!r} of {len(value.type.tensor_type.shape.dim)} sizes"
-            raise ModelError("ONNX model", expected="an image in and out", got=got, remedy=REMEDY)
+        if len(value.type.tensor_type.shape.dim) != 4:  # such as a classifier's, which has one size of image
+            return model
         for side, name in zip(value.type.tensor_type.shape.dim[2:], ("H", "W"), strict=True):
             side.dim_param = name
     del free.graph.value_info[:]

@@ -75,7 +75,7 @@ class Quantised:
 
 @dataclass(frozen=True)
 class _Plan:
-    """What is to be quantised: the graph that reads the planes wanted, and all of them; the host's part; the streams."""
+    """What is to be quantised: the graph that reads the planes wanted, and that of all; the host's part; streams."""
 
     graph: Graph
     full: Graph
@@ -196,7 +196,8 @@ def search_targets(graph: Graph, ends: Ends, images: Remade[np.ndarray]) -> Targ
         return ends.finished(crop, correction)
 
     def size(crop: np.ndarray) -> float:
-        return float(np.abs(restored(crop) - (crop if ends.adds_image else 0)).max())
+        result = restored(crop)
+        return float(np.abs(result - crop if result.shape == crop.shape else result).max())
 
     sizes = {(k, n): size(crop) for k, image in enumerate(images) for n, crop in enumerate(crops(image, halo_px))}
     order = sorted(sizes, key=lambda place: sizes[place], reverse=True)

@@ -118,13 +118,14 @@ def layer_errors(
         for op, layer in zip(graph, layers, strict=True):
             result, meant = _in_int8(op, core, wanted), wanted[op.output]
             if op.output == CORRECTION:  # of two gains one is coarse and the other clipped: together they count
-                correction = result = core.ends.merge(result, core.scale(CORRECTION))
+                result = core.ends.merge(result, core.scale(CORRECTION))
                 meant = meant[:, : core.ends.outputs]
+                found = core.ends.finished(crop, result)
             else:
                 feed = {PLANES: planes_of(crop, core.ends), op.output: result}
-                correction = rests[op.output].run(None, feed)[0]
+                found = _restored(crop, rests[op.output].run(None, feed)[0], core)
             layer.alone.add(result, meant)
-            layer.network.add(_restored(crop, correction, core), restored, offset)
+            layer.network.add(found, restored, offset)
         together.add(result_of(int8, crop), restored, offset)
         tick()
     return layers, together

@@ -24,7 +24,7 @@ from profiles import load_sensor
 from profiles.errors import BeersError
 from quant.core import IntCore
 from quant.encodings import read_core
-from quant.graph import CORRECTION, IMAGE, Add, Graph, correction_graph
+from quant.graph import CORRECTION, IMAGE, Activation, Add, Conv, Graph, correction_graph
 from quant.onnx_file import any_size, load_onnx, receptive_radius_px, require_quantised
 from quant.session import open_session, run
 
@@ -157,9 +157,10 @@ def _correction(graph: Graph, image: Tensor) -> Tensor:
         if isinstance(op, Add):
             tensors[op.output] = tensors[op.inputs[0]] + tensors[op.inputs[1]]
             continue
+        assert isinstance(op, Conv)  # noqa: S101 - correction_graph has seen to it
         weight, bias = (_as(values, image.dtype) for values in (op.weight, op.bias))
-        result = conv2d(tensors[op.input], weight, bias, padding=op.pad_px)
-        tensors[op.output] = torch.relu(result) if op.relu else result
+        result = conv2d(tensors[op.input], weight, bias, padding=op.window.pads[0])
+        tensors[op.output] = torch.relu(result) if op.activation is Activation.relu else result
     return tensors[CORRECTION]
 
 

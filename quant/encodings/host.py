@@ -1,8 +1,8 @@
 """The host's file: the integer core on stock onnxruntime by integer kernels, from image to restored image.
 
 Every operation rounds once, ties to even, and adds exactly. What onnxruntime has no integer operator for is written
-with those it has: transposed convolution and bilinear enlargement as convolutions and a pixel shuffle, average pooling
-as a depthwise convolution, activations by themselves as tables of 256, LeakyReLU on the convolution's int32 sums.
+with those it has: transposed convolution and bilinear enlargement as convolutions and a pixel shuffle, average
+pooling as a depthwise convolution, activations by themselves as tables of 256, LeakyReLU on the convolution's sums.
 """
 
 from collections.abc import Callable
@@ -13,7 +13,9 @@ import onnx
 from onnx import TensorProto
 
 from quant.core import INT8_MAX, INT8_MIN, IntConv, IntCore
-from quant.ends import ZERO, HostWriter, write_back, write_front
+from quant.encodings.description import KEY, describe
+from quant.encodings.phases import phases
+from quant.ends import ZERO, Ends, HostWriter, write_back, write_front
 from quant.fixed_point import activation_table, bilinear_weights, mean_factor, six_in_units
 from quant.graph import (
     CORRECTION,
@@ -48,16 +50,17 @@ def host_model(core: IntCore, about: dict[str, str], tile_px: int | None = None)
     graph = writer.graph(
         "convbeers-int8", [image_info(IMAGE, core.ends.image_channels, tile_px)], [_result(core, tile_px)]
     )
-    return make_model(graph, about, microsoft=True)
+    plain = all(isinstance(op, IntConv | Add) for op in core.ops) and core.ends == Ends(gains=core.ends.gains)
+    return make_model(graph, about if plain else {**about, KEY: describe(core)}, microsoft=True)
 
 
 def _result(core: IntCore, tile_px: int | None) -> onnx.ValueInfoProto:
     ends = core.ends
     if ends.flat:
         return onnx.helper.make_tensor_value_info("restored", TensorProto.FLOAT, ["N", ends.outputs])
-    if ends.adds_image:
+    if ends.adds_image and not ends.last:
         return image_info("restored", ends.image_channels, tile_px)
-    shuffled = int(np.prod([shuffle.block**2 for shuffle in ends.back], initial=1))
+    shuffled = int(np.prod([shuffle.block**2 for shuffle in (*ends.back, *ends.last)], initial=1))
     sizes: list[str | int | None] = ["N", ends.outputs // shuffled, "rows", "columns"]
     return onnx.helper.make_tensor_value_info("restored", TensorProto.FLOAT, sizes)
 
@@ -164,20 +167,6 @@ def _transposed(w: HostWriter, core: IntCore, op: IntConv) -> None:
     w.node("Slice", op.output, [shuffle.output, *places], name=f"{op.name}.cut")
 
 
-def phases(weight: np.ndarray, stride: int) -> tuple[np.ndarray, int]:
-    """The weights (stride^2 O, I, J, J) of a transposed convolution's phases, and their padding, J - 1.
-
-    Output row q stride + f takes x[q - j] w[f + stride j]: a convolution over rows q - J + 1 .. q for each f. The
-    phases come first in the channels, as ONNX's own DepthToSpace wants them.
-    """
-    outputs, inputs, *kernel = weight.shape
-    reach = max(-(-k // stride) for k in kernel)
-    padded = np.zeros((outputs, inputs, reach * stride, reach * stride), weight.dtype)
-    padded[:, :, : kernel[0], : kernel[1]] = weight
-    taps = padded.reshape(outputs, inputs, reach, stride, reach, stride)[:, :, ::-1, :, ::-1]
-    return np.ascontiguousarray(taps.transpose(3, 5, 0, 1, 2, 4)).reshape(-1, inputs, reach, reach), reach - 1
-
-
 def _add(w: HostWriter, core: IntCore, op: Add | Mul) -> None:
     activation = getattr(op, "activation", Activation.none)
     result = op.output if activation is Activation.none else f"{op.output}.linear"
@@ -190,7 +179,7 @@ def _add(w: HostWriter, core: IntCore, op: Add | Mul) -> None:
         _clamp(w, core, op, result, op.output)
 
 
-def _max_pool(w: HostWriter, core: IntCore, op: MaxPool) -> None:
+def _max_pool(w: HostWriter, _: IntCore, op: MaxPool) -> None:
     assert op.kernel is not None  # noqa: S101
     w.node(
         "MaxPool", op.output, [op.input], name=op.name, kernel_shape=list(op.kernel), **window_attributes(op.window)
@@ -253,10 +242,10 @@ _WRITERS: dict[type, Callable[..., Any]] = {
     IntConv: _conv,
     Add: _add,
     Mul: _add,
-    Concat: lambda w, core, op: w.node("Concat", op.output, list(op.inputs), name=op.name, axis=1),
+    Concat: lambda w, _, op: w.node("Concat", op.output, list(op.inputs), name=op.name, axis=1),
     MaxPool: _max_pool,
     AveragePool: _average_pool,
     Resize: _resize,
-    Shuffle: lambda w, core, op: write_shuffle(w, op, op.input, op.output),
+    Shuffle: lambda w, _, op: write_shuffle(w, op, op.input, op.output),
     Pointwise: _pointwise,
 }

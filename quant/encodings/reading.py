@@ -9,6 +9,7 @@ import onnx
 
 from profiles.errors import ModelError
 from quant.core import IntConv, IntCore
+from quant.encodings.description import KEY, described_core
 from quant.encodings.host import host_model
 from quant.ends import ZERO, Ends
 from quant.graph import CORRECTION, PLANES, Activation, Add, Op, Window
@@ -22,6 +23,9 @@ def read_core(model: onnx.ModelProto) -> IntCore:
     Raises:
         ModelError: another encoding, float scales, or asymmetric numbers.
     """
+    said = metadata(model).get(KEY)
+    if said is not None:
+        return described_core(said, constants(model))
     reader = _Reader(model)
     for node in model.graph.node:
         if node.op_type == "QLinearConv":
@@ -32,9 +36,11 @@ def read_core(model: onnx.ModelProto) -> IntCore:
             reader.relu(node)
     if not reader.ops or PLANES not in reader.frac_bits or CORRECTION not in reader.frac_bits:
         raise _refuse("no such core")
-    last = reader.ops[-1]
-    gains = len(last.weight) if isinstance(last, IntConv) else 1
-    return IntCore(tuple(reader.ops), reader.frac_bits, Ends(gains=gains))
+    first, last = reader.ops[0], reader.ops[-1]
+    if not (isinstance(first, IntConv) and isinstance(last, IntConv)):
+        raise _refuse("ends that are no convolutions")
+    ends = Ends(planes=first.weight.shape[1], gains=len(last.weight))
+    return IntCore(tuple(reader.ops), reader.frac_bits, ends)
 
 
 def encoding_faults(model: onnx.ModelProto) -> list[str] | None:

@@ -44,8 +44,9 @@ from quant.graph.reader import correction_graph, read_network, refusal
 from quant.graph.writer import graph_to_onnx
 
 __all__ = [
-    "COARSE_MAX", "CORRECTION", "COUNT", "IMAGE", "PLANES", "PLANES_FRAC_BITS", "QUARTER", "STEP", "Activation", "Add",
-    "AveragePool", "Concat", "Conv", "Graph", "MaxPool", "Mul", "Network", "Op", "Pointwise", "Resize", "Shuffle",
-    "Window", "channels_of", "check_network", "coarse_plane_only", "correction_graph", "graph_to_onnx", "plane_count", "read_network", "read_planes", "refusal", "refused_graph", "relu_count", "same", "split", "tensors",
-    "tied", "ties_scales",
+    "COARSE_MAX", "CORRECTION", "COUNT", "IMAGE", "PLANES", "PLANES_FRAC_BITS", "QUARTER", "STEP", "Activation",
+    "Add", "AveragePool", "Concat", "Conv", "Graph", "MaxPool", "Mul", "Network", "Op", "Pointwise", "Resize",
+    "Shuffle", "Window", "channels_of", "check_network", "coarse_plane_only", "correction_graph",
+    "graph_to_onnx", "plane_count", "read_network", "read_planes", "refusal", "refused_graph", "relu_count",
+    "same", "split", "tensors", "tied", "ties_scales",
 ]  # fmt: skip

@@ -1,13 +1,29 @@
 """A network cut where the DPU's part begins and ends, and whether its operations fit together."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
 from profiles.errors import ModelError
-from quant.graph.operations import CORRECTION, IMAGE, Activation, Add, Concat, Conv, Graph, Mul, Op, Shuffle
+from quant.graph.operations import (
+    CORRECTION,
+    IMAGE,
+    Activation,
+    Add,
+    AveragePool,
+    Concat,
+    Conv,
+    Graph,
+    HasWeight,
+    MaxPool,
+    Mul,
+    Op,
+    Pair,
+    Resize,
+    Shuffle,
+)
 
 
 @dataclass(frozen=True)
@@ -20,14 +36,16 @@ class Network:
         front: what the host does to the image first: pixel unshuffle.
         back: what it does to the correction: pixel shuffle.
         adds_image: whether the image is added to the result (the global add), in the host's float numbers.
+        last: what it does to the sum: pixel shuffle. An image of one channel is added to each of the sum's.
         flat: whether the result is (N, K) rather than an image.
     """
 
-    graph: Graph
+    graph: Graph = field(compare=False)
     channels: int = 1
     front: tuple[Shuffle, ...] = ()
     back: tuple[Shuffle, ...] = ()
     adds_image: bool = True
+    last: tuple[Shuffle, ...] = ()
     flat: bool = False
 
     @property
@@ -47,19 +65,29 @@ def cut(graph: Graph, channels: int, flat: bool) -> Network:
 
     Pixel shuffles there move values and cost the host next to nothing; DPUs have been seen to compute them wrongly.
     """
-    last = graph[-1]
-    adds_image = isinstance(last, Add) and IMAGE in last.inputs and last.activation is Activation.none
-    back: list[Shuffle] = []
+    graph, last = _without_shuffles(graph)
+    end = graph[-1] if graph else None
+    adds_image = isinstance(end, Add) and IMAGE in end.inputs and end.activation is Activation.none
     if adds_image:
-        graph = _ended(graph[:-1], last.inputs[1 - last.inputs.index(IMAGE)])
-    while graph and isinstance(shuffle := graph[-1], Shuffle) and shuffle.up and not _read(graph, CORRECTION):
-        back.insert(0, shuffle)
-        graph = _ended(graph[:-1], shuffle.input)
+        assert end is not None  # noqa: S101
+        graph = _ended(graph[:-1], end.inputs[1 - end.inputs.index(IMAGE)])
+        graph, back = _without_shuffles(graph)
+    else:
+        back, last = last, ()
     front: list[Shuffle] = []
     while isinstance(first := _only_reader(graph), Shuffle) and not first.up:
         front.append(first)
         graph = tuple(renamed(op, {first.output: IMAGE}) for op in graph if op is not first)
-    return Network(graph, channels, tuple(front), tuple(back), adds_image, flat)
+    return Network(graph, channels, tuple(front), back, adds_image, last, flat)
+
+
+def _without_shuffles(graph: Graph) -> tuple[Graph, tuple[Shuffle, ...]]:
+    """The graph up to the pixel shuffles that it ends with, and these in their order."""
+    found: list[Shuffle] = []
+    while graph and isinstance(end := graph[-1], Shuffle) and end.up:
+        found.insert(0, end)
+        graph = _ended(graph[:-1], end.input)
+    return graph, tuple(found)
 
 
 def _ended(graph: Graph, name: str) -> Graph:
@@ -67,10 +95,6 @@ def _ended(graph: Graph, name: str) -> Graph:
     if name == IMAGE or not any(op.output == name for op in graph):
         raise refused_graph("a correction that the network computes", f"{name} of nobody")
     return tuple(renamed(op, {name: CORRECTION}) for op in graph)
-
-
-def _read(graph: Graph, name: str) -> bool:
-    return any(name in op.inputs for op in graph)
 
 
 def _only_reader(graph: Graph) -> Op | None:
@@ -103,6 +127,34 @@ def check_network(network: Network) -> None:
             raise refused_graph("finite weights", f"NaN or infinity in {op.name}")
 
 
+def sized(graph: Graph, size: Pair) -> Graph:
+    """The graph for images of one size (rows, columns), the windows of global pooling known."""
+    sizes, found = {IMAGE: size}, list[Op]()
+    for op in graph:
+        read = sizes[op.inputs[0]]
+        if isinstance(op, AveragePool) and op.kernel is None:
+            op = replace(op, kernel=read)
+        sizes[op.output] = _size(op, read)
+        found.append(op)
+    return tuple(found)
+
+
+def _size(op: Op, read: Pair) -> Pair:
+    if isinstance(op, Conv) and op.transposed:
+        (rows, columns), (top, left, bottom, right) = op.window.strides, op.window.pads
+        tall, broad = op.weight.shape[2:]
+        return (read[0] - 1) * rows + tall - top - bottom, (read[1] - 1) * columns + broad - left - right
+    if isinstance(op, Conv | MaxPool | AveragePool):
+        kernel = (op.weight.shape[2], op.weight.shape[3]) if isinstance(op, Conv) else op.kernel
+        assert kernel is not None  # noqa: S101
+        return op.window.out_size(read, kernel)
+    if isinstance(op, Resize):
+        return read[0] * op.factor, read[1] * op.factor
+    if isinstance(op, Shuffle):
+        return (read[0] * op.block, read[1] * op.block) if op.up else (read[0] // op.block, read[1] // op.block)
+    return read
+
+
 def channels_of(graph: Graph, given: Mapping[str, int]) -> dict[str, int]:
     """Channels of every tensor, from those of the given ones.
 
@@ -119,7 +171,7 @@ def channels_of(graph: Graph, given: Mapping[str, int]) -> dict[str, int]:
 
 
 def _width(op: Op, read: list[int]) -> int:
-    if isinstance(op, Conv):
+    if isinstance(op, HasWeight):  # in float or in whole numbers
         if read[0] != op.weight.shape[1] * op.groups:
             raise refused_graph(f"{op.weight.shape[1] * op.groups} channels for {op.name}", f"{read[0]}")
         return len(op.weight)

@@ -6,7 +6,7 @@ Every operation reads and writes tensors (N, C, H, W) by their names, each writt
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 
@@ -73,6 +73,19 @@ class Op(Protocol):
     @property
     def output(self) -> str:
         """The tensor it writes."""
+
+
+@runtime_checkable
+class HasWeight(Op, Protocol):
+    """A convolution, in float or in whole numbers."""
+
+    @property
+    def weight(self) -> np.ndarray:
+        """(O, I / groups, kh, kw)."""
+
+    @property
+    def groups(self) -> int:
+        """1, or the channels of a depthwise one."""
 
 
 Graph = tuple[Op, ...]
