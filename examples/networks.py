@@ -44,13 +44,13 @@ class DnCNN(nn.Module):
 class FFDNet(nn.Sequential):
     """Works at half the sampling between pixel unshuffling and shuffling, without a global add (Zhang et al., 2018).
 
-    Its map of noise levels is left out: one sensor is one level. Images (N, 1, H, W) of even sides to the same.
+    Its map of noise levels is left out, one sensor is one level, and so is batch normalisation, whose statistics of
+    a batch would hide how bright each image is. Images (N, 1, H, W) of even sides to the same.
     """
 
     def __init__(self, layers: int = 6, features: int = 32) -> None:
-        middle = [_batch_normed(features, features, nn.ReLU()) for _ in range(layers - 2)]
-        head, tail = nn.Conv2d(4, features, 3, padding=1), nn.Conv2d(features, 4, 3, padding=1)
-        super().__init__(nn.PixelUnshuffle(2), head, nn.ReLU(), *middle, tail, nn.PixelShuffle(2))
+        body = [_activated(4 if k == 0 else features, features, nn.ReLU()) for k in range(layers - 1)]
+        super().__init__(nn.PixelUnshuffle(2), *body, nn.Conv2d(features, 4, 3, padding=1), nn.PixelShuffle(2))
 
 
 class ESPCN(nn.Sequential):

@@ -46,7 +46,7 @@ CYCLES, ANGLES, TURN_RAD, NOISE = (4.0, 8.0), 5, 0.1, 0.1
 """The ten gratings: cycles of an image, directions of each, how far they stray, and the noise on them."""
 MIXED, MOST = 4, 64
 """Passes over scenes whose patches of four bands are mixed, and the most that one of them gives."""
-LEARNING_RATE = 1e-3
+LEARNING_RATE = 2e-3
 
 Batch = tuple[Tensor, Tensor]
 """What a network gets, (N, C, H, W) in [0, 1], and what it should give: as much, or classes of pixels or images."""
