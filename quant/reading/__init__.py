@@ -1,0 +1,5 @@
+"""A float file of anyone's becomes its simplest equal, before anything else looks at it.
+
+- `folding`: what holds behind it, and what onnxruntime and onnx's converter do for it;
+- `equivalents`: the rewritings that they lack.
+"""
