@@ -1,5 +1,6 @@
 """A float file of anyone's becomes its simplest equal, before anything else looks at it.
 
 - `folding`: what holds behind it, and what onnxruntime and onnx's converter do for it;
-- `equivalents`: the rewritings that they lack.
+- `equivalents`: the rewritings that they lack;
+- `arithmetic`: short lists computed of constants, known before a runtime has them.
 """
