@@ -2,5 +2,6 @@
 
 - `folding`: what holds behind it, and what onnxruntime and onnx's converter do for it;
 - `equivalents`: the rewritings that they lack;
+- `external`: weights in a file beside the model are taken in;
 - `arithmetic`: short lists computed of constants, known before a runtime has them.
 """
