@@ -60,8 +60,11 @@ def simplest(model: onnx.ModelProto, where: str) -> onnx.ModelProto:
     Raises:
         ModelError: the runtime does not read it.
     """
-    if _is_plain(model):
-        return model
+    with contradictions(where):
+        return model if _is_plain(model) else _simplest(model, where)
+
+
+def _simplest(model: onnx.ModelProto, where: str) -> onnx.ModelProto:
     folded = onnx.ModelProto()
     folded.CopyFrom(model)
     _widen(folded)
@@ -73,8 +76,7 @@ def simplest(model: onnx.ModelProto, where: str) -> onnx.ModelProto:
     if _opset(model) < OPSET:  # an operator's own sizes become constants, which are then folded
         folded = _of_our_opset(folded)
     folded = _of_our_opset(_folded(folded, where))
-    with contradictions(where):
-        rewrite(folded)
+    rewrite(folded)
     _replace(folded.graph.input, ends[0])
     _replace(folded.graph.output, ends[1])
     _tidy(folded, model)
