@@ -18,17 +18,18 @@ from onnx import numpy_helper
 from model.io.files import whole_file
 from profiles.errors import ModelError
 from profiles.toml import read_whole, unreadable
+from quant.reading.external import take_in
+from quant.reading.folding import IR_VERSION, OPSET, simplest
 from quant.untrusted import FILE_BYTES, check_content, check_runnable, contradictions
-
-OPSET = 17
-IR_VERSION = 8
-
 
 REMEDY = "give a file written by 'beers-deploy export' or 'beers-deploy quantize'"
 
 
 def load_onnx(path: Path, to_run: bool = True) -> onnx.ModelProto:
-    """Read an ONNX model that carries all its weights: the one way by which a file comes in.
+    """Read an ONNX model, with weights that it keeps beside it: the one way by which a file comes in.
+
+    A float network comes as its simplest equal (`quant.reading.folding`), an INT8 one as it is. One that no runtime
+    may get comes as it is too, where it is only looked at.
 
     Args:
         path: the file.
@@ -46,20 +47,39 @@ def load_onnx(path: Path, to_run: bool = True) -> onnx.ModelProto:
     except (OSError, ValueError) as error:
         got = unreadable(path) or " ".join(str(error).split())[:120]
         raise ModelError(str(path), expected="an ONNX file", got=got, remedy=REMEDY) from error
-    return parse_onnx(content, str(path), to_run)
+    return _simplest(_parsed(content, str(path), to_run, path), str(path), to_run)
+
+
+def _simplest(model: onnx.ModelProto, where: str, to_run: bool) -> onnx.ModelProto:
+    if is_quantised(model):
+        return model
+    try:
+        check_runnable(model, where)
+        return simplest(model, where)
+    except ModelError:
+        if to_run:
+            raise
+        return model
 
 
 def parse_onnx(content: bytes, where: str, to_run: bool = True) -> onnx.ModelProto:
-    """As `load_onnx`, of a file's bytes.
+    """As `load_onnx`, of the bytes of a file that holds all its weights; what is read stays as it is.
 
     Raises:
         ModelError: as there.
     """
+    return _parsed(content, where, to_run, None)
+
+
+def _parsed(content: bytes, where: str, to_run: bool, path: Path | None) -> onnx.ModelProto:
+    """The model in a file's bytes, checked; with a path its weights may lie beside it."""
     if not content:
         raise ModelError(where, expected="an ONNX file", got="an empty file", remedy=REMEDY)
     try:
         model = onnx.ModelProto()
         model.ParseFromString(content)
+        if path is not None:
+            take_in(model, path)
         check_content(model, where)  # before the checker, which looks for files that weights are said to be in
         onnx.checker.check_model(model)
     except (DecodeError, onnx.checker.ValidationError, ValueError) as error:
