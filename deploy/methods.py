@@ -36,7 +36,8 @@ from profiles.errors import OptionError
 from profiles.sensor import Sensor, SensorProfile
 from profiles.sensor_file import BLIND as NOT_KNOWN
 from profiles.sensor_file import BLIND_PROFILE, load_sensor
-from quant.onnx_file import fixed_tile_px, load_onnx, metadata, receptive_radius_px
+from quant.onnx_file import fixed_tile_px, load_onnx, metadata
+from quant.tiling import receptive_radius_px
 
 EXPECTED = (
     f"degraded, {TRADITIONAL}, {DECONVOLVE_FIRST} (each also with -fast or -best), {', '.join(PEERS)}, "

@@ -13,7 +13,8 @@ import psutil
 from deploy.restoration.options import Options, parse_halo
 from deploy.restoration.source import Source
 from profiles.errors import MachineError, OptionError, sizes
-from quant.onnx_file import fixed_tile_px, receptive_radius_px
+from quant.onnx_file import fixed_tile_px
+from quant.tiling import receptive_radius_px
 
 
 @dataclass(frozen=True)

@@ -25,8 +25,9 @@ from profiles.errors import BeersError
 from quant.core import IntCore
 from quant.encodings import read_core
 from quant.graph import CORRECTION, IMAGE, Add, Graph, correction_graph
-from quant.onnx_file import any_size, load_onnx, receptive_radius_px, require_quantised
+from quant.onnx_file import any_size, load_onnx, require_quantised
 from quant.session import open_session, run
+from quant.tiling import receptive_radius_px
 
 T = TypeVar("T")
 

@@ -32,9 +32,10 @@ from profiles.sensor import SensorProfile
 from profiles.sensor_file import reference_for
 from quant.calibration import Patches, draw_patches
 from quant.free import free_ticks, quantise_free
-from quant.onnx_file import fixed_tile_px, is_quantised, load_onnx, metadata, receptive_radius_px, save_onnx
+from quant.onnx_file import fixed_tile_px, is_quantised, load_onnx, metadata, save_onnx
 from quant.passes.equalise import search_steps
 from quant.quantise import SEARCH_CROPS, quantise_model, ticks
+from quant.tiling import receptive_radius_px
 
 PAPER = VARIANTS["convbeers"]
 """The paper's network: 16 blocks of 64 features."""
