@@ -121,6 +121,18 @@ STRIDED = {
     "nearest, half": (resized("nearest", "half_pixel", 2), Tiling(0, 1, Fraction(2))),
     "linear": (resized("linear", "half_pixel", 2), Tiling(1, 1, Fraction(2))),
     "linear down": (resized("linear", "half_pixel", 0.5), Tiling(0, 2, Fraction(1, 2))),
+    "transposed with a dilation, then windows": (
+        graph(
+            [
+                helper.make_node(
+                    "ConvTranspose", ["image", "far"], ["wide"], strides=[2, 2], dilations=[3, 3], pads=[1] * 4
+                ),
+                helper.make_node("MaxPool", ["wide"], ["restored"], kernel_shape=[2, 2], pads=[0, 0, 1, 1]),
+            ],
+            constant("far", 1, 1, 2, 2),
+        ),
+        Tiling(1, 1, Fraction(2)),
+    ),
     "every second": (
         graph(
             [helper.make_node("Slice", ["image", "from", "to", "axes", "steps"], ["restored"])],
