@@ -24,6 +24,7 @@ from model.io.images import settled_scale
 from profiles.errors import ImageError, OptionError
 from profiles.sensor_file import BLIND, load_sensor
 from quant.onnx_file import load_onnx
+from quant.tiling import Tiling
 
 Image = TypeVar("Image")
 """numpy.ndarray, dask.array.Array or xarray.DataArray."""
@@ -97,7 +98,7 @@ def _restore_now(bands: np.ndarray, raster: Raster, options: Options) -> np.ndar
     at_once = tiles_at_once(options.threads, plan.tiles)
     infer, _ = open_runtime(options.runtime, network, options.threads, at_once)
     full_scale = scale_of(source, plan, options.full_scale, NAME)
-    restorer = Restorer(raster, infer, full_scale, plan.radius_px, NAME)
+    restorer = Restorer(raster, infer, full_scale, plan.tiling, NAME)
     return restore_array(source, plan, restorer, at_once)
 
 
@@ -136,7 +137,7 @@ class Task:
     raster: Raster
     network: Packed
     full_scale: float | None
-    radius_px: int
+    tiling: Tiling
 
     def restorer(self, window: np.ndarray) -> Restorer:
         """For this process, at the full scale that was asked for or that the window's pixels tell.
@@ -148,7 +149,7 @@ class Task:
         full_scale = settled_scale(NAME, self.raster.dtype, largest, self.full_scale)
         with _opening:
             infer = _kept(self.network)
-        return Restorer(self.raster, infer, full_scale, self.radius_px, NAME)
+        return Restorer(self.raster, infer, full_scale, self.tiling, NAME)
 
 
 def restore_lazily(bands: Any, raster: Raster, options: Options) -> Any:
@@ -159,22 +160,22 @@ def restore_lazily(bands: Any, raster: Raster, options: Options) -> Any:
     plan = plan_for(network, raster.shape, options)
     settled_scale(NAME, raster.dtype, (), options.full_scale)  # what the type alone decides comes at once
     packed = pack(network, options.runtime, options.threads or 1)
-    task = delayed(Task(raster, packed, options.full_scale, plan.radius_px))
+    task = delayed(Task(raster, packed, options.full_scale, plan.tiling))
     tile = delayed(restore_tile)
 
-    def block(plane: int, row: Span, column: Span) -> Any:
+    def block(group: int, row: Span, column: Span) -> Any:
         rows, columns = (_around(span, raster, plan) for span in (row, column))
-        window = bands[plane : plane + 1, rows, columns]
-        shape = (1, row.keep_stop - row.keep_start, column.keep_stop - column.keep_start)
+        window = bands[group * count : (group + 1) * count, rows, columns]
+        sides = ((span.keep_stop - span.keep_start) * plan.scale for span in (row, column))
         restored = tile(task, window, rows.start, columns.start, row, column)
-        return da.from_delayed(restored, shape, raster.out_dtype)
+        return da.from_delayed(restored, (plan.tiling.channels_out, *sides), raster.out_dtype)
 
-    planes = range(raster.bands)
-    return da.block([[[block(p, row, column) for column in plan.columns] for row in plan.rows] for p in planes])
+    count, groups = plan.tiling.channels_in, range(plan.groups)
+    return da.block([[[block(g, row, column) for column in plan.columns] for row in plan.rows] for g in groups])
 
 
 def restore_tile(task: Task, window: np.ndarray, top: int, left: int, row: Span, column: Span) -> np.ndarray:
-    """The kept pixels (1, h, w) of one tile, from a window (1, ., .) whose first pixel is at (top, left).
+    """The kept pixels (bands, h, w) of one tile, from a window (bands, ., .) whose first pixel is at (top, left).
 
     Raises:
         ImageError: values outside 0 to full scale, or a full scale left open.
@@ -183,7 +184,7 @@ def restore_tile(task: Task, window: np.ndarray, top: int, left: int, row: Span,
     here = Span(*(side - left for side in (column.start, column.stop, column.keep_start, column.keep_stop)))
     strip = checked_strip(task.raster, top, window, restorer.full_scale, NAME)
     pixels, _ = restorer.tile(strip, 0, row, here)
-    return pixels[None]
+    return pixels
 
 
 def _around(span: Span, raster: Raster, plan: Plan) -> slice:

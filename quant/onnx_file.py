@@ -158,13 +158,13 @@ def fixed_tile_px(model: onnx.ModelProto) -> int | None:
     """The tile side that a model is fixed to, or None when it takes any size.
 
     Raises:
-        ModelError: not one (N, 1, H, W) input, or a fixed size that is not square.
+        ModelError: not one (N, C, H, W) input, or a fixed size that is not square.
     """
     sizes = [d.dim_value for d in model.graph.input[0].type.tensor_type.shape.dim] if model.graph.input else []
-    if len(model.graph.input) != 1 or len(sizes) != 4 or sizes[1] != 1 or sizes[2] != sizes[3]:
+    if len(model.graph.input) != 1 or len(sizes) != 4 or sizes[2] != sizes[3]:
         raise ModelError(
             "ONNX model",
-            expected="one input (N, 1, H, W)",
+            expected="one input (N, C, H, W), of one side where it is fixed",
             got=f"{sizes}",
             remedy="export it with 'beers-deploy export'",
         )

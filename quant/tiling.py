@@ -23,6 +23,7 @@ from typing import Any
 
 import onnx
 
+from quant.onnx_file import fixed_tile_px
 from quant.reach import IMAGE, STEPS, Constants, Reach, Side, joined, refused, require
 from quant.untrusted import contradictions
 
@@ -37,6 +38,7 @@ class Tiling:
         scale: pixels of the output for one of the image, along either side.
         channels_in: bands that the network reads together.
         channels_out: bands that it gives.
+        fixed_px: the tile side that the network is fixed to; None where it takes any size.
     """
 
     halo_px: int
@@ -44,6 +46,15 @@ class Tiling:
     scale: Fraction = Fraction(1)
     channels_in: int = 1
     channels_out: int = 1
+    fixed_px: int | None = None
+
+    @property
+    def words(self) -> str:
+        """What a message says of it."""
+        bands = f"of {self.channels_in} bands in and {self.channels_out} out"
+        return (
+            f"{bands}, a result of {self.scale} times the image's size and tiles of multiples of {self.lattice_px} px"
+        )
 
 
 def receptive_radius_px(model: onnx.ModelProto) -> int:
@@ -62,14 +73,16 @@ def tiling_of(model: onnx.ModelProto) -> Tiling:
         ModelError: a network that cannot be tiled; the sentence names the node.
     """
     with contradictions("tiled model"):
-        channels_in, channels_out = _channels(model)
+        (channels_in, channels_out), fixed_px = _channels(model), fixed_tile_px(model)
         rows, columns = (_Walk(model, side) for side in (ROWS, COLUMNS))
         lattice_px = math.lcm(rows.lattice_px, columns.lattice_px)
         radius_px = max(rows.radius_px, columns.radius_px)
         if rows.scale != columns.scale:
             raise refused("as many pixels of output along both sides", f"{rows.scale} and {columns.scale}")
+        if fixed_px is not None and fixed_px % lattice_px:
+            raise refused(f"tiles of a multiple of {lattice_px} pixels a side", f"a network fixed to {fixed_px}")
         halo_px = -(-radius_px // lattice_px) * lattice_px
-        return Tiling(halo_px, lattice_px, rows.scale, channels_in, channels_out)
+        return Tiling(halo_px, lattice_px, rows.scale, channels_in, channels_out, fixed_px)
 
 
 def _channels(model: onnx.ModelProto) -> tuple[int, int]:
