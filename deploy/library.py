@@ -42,7 +42,9 @@ def restore(
     nodata: float | None = None,
     sensor: str = BLIND,
 ) -> Image:
-    """Restore an image of raw digital numbers, (H, W) or (bands, H, W); bands are restored one by one.
+    """Restore an image of raw digital numbers, (H, W) or (bands, H, W).
+
+    A network of one band restores bands one by one, another one those that it takes together.
 
     Args:
         image: of numpy it is restored at once; of Dask the result is lazy, a chunk for each tile and band, and may be
@@ -61,7 +63,8 @@ def restore(
             known. INT8 for a sensor of your own takes minutes once, and is kept.
 
     Returns:
-        The same kind, shape and scale: uint16 of integers, float32 of floats. Missing pixels stay as they are.
+        The same kind and scale, uint16 of integers, float32 of floats; of the same shape, unless the network makes
+        more pixels or other bands. Missing pixels stay as they are.
 
     Raises:
         ImageError: no such array, pixels that leave the full scale open, or values outside 0 to full scale; of
@@ -76,7 +79,7 @@ def restore(
     if hasattr(image, "coords") and hasattr(image, "dims"):  # an xarray.DataArray, without importing it
         labelled: Any = image
         missing = labelled.attrs.get("_FillValue") if nodata is None else nodata
-        restored: Image = labelled.copy(data=_restore(labelled.data, options, missing))
+        restored: Image = _labelled(labelled, _restore(labelled.data, options, missing))
         return restored
     plain: Image = _restore(image, options, nodata)
     return plain
@@ -89,7 +92,32 @@ def _restore(image: Any, options: Options, nodata: float | None) -> Any:
         restored = restore_lazily(bands, raster, options)
     else:
         restored = _restore_now(bands, raster, options)
-    return restored.reshape(image.shape)
+    return restored[0] if image.ndim == 2 and len(restored) == 1 else restored
+
+
+def _labelled(image: Any, pixels: Any) -> Any:
+    """Restored pixels with an xarray.DataArray's labels; where they are more than it had, those of their places."""
+    if pixels.shape == image.shape:
+        return image.copy(data=pixels)
+    dims = image.dims if pixels.ndim == image.ndim else ("band", *image.dims)
+    sizes = dict(zip(dims, pixels.shape, strict=True))
+    changed = {dim for dim in image.dims if sizes[dim] != image.sizes[dim]}
+    coordinates = {name: each.copy() for name, each in image.coords.items() if not changed.intersection(each.dims)}
+    for each in coordinates.values():
+        each.attrs.pop("GeoTransform", None)  # of the pixels before; what lies where is told by the places
+    for dim in changed.intersection(image.dims[-2:], image.coords):
+        places = _between(image.coords[dim].values, sizes[dim])
+        coordinates |= {dim: (dim, places, image.coords[dim].attrs)} if places is not None else {}
+    return type(image)(pixels, coordinates, dims, image.name, image.attrs)
+
+
+def _between(places: np.ndarray, count: int) -> np.ndarray | None:
+    """The middles of `count` pixels over those at `places`, evenly between; None where these are no two numbers."""
+    if len(places) < 2 or places.dtype.kind not in "iuf":
+        return None
+    at = (np.arange(count) + 0.5) * (len(places) / count) - 0.5
+    left = np.clip(np.floor(at).astype(int), 0, len(places) - 2)
+    return np.asarray(places[left] + (at - left) * (places[left + 1] - places[left]))
 
 
 def _restore_now(bands: np.ndarray, raster: Raster, options: Options) -> np.ndarray:
