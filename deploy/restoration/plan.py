@@ -71,13 +71,13 @@ def even_side_px(size_px: int, tile_px: int, halo_px: int, lattice_px: int = 1) 
     return max(_up(even_px, lattice_px), 2 * halo_px + lattice_px)
 
 
-def _spans(size_px: int, whole_px: int, tile_px: int, halo_px: int) -> Iterator[Span]:
-    """Spans over `whole_px`, of which what is kept ends with the image."""
+def _spans(image_px: int, size_px: int, tile_px: int, halo_px: int) -> Iterator[Span]:
+    """Spans over `size_px`, the image and its extension; what is kept ends with the image."""
     done = 0
-    while done < size_px:
-        start = min(max(done - halo_px, 0), whole_px - tile_px)
+    while done < image_px:
+        start = min(max(done - halo_px, 0), size_px - tile_px)
         stop = start + tile_px
-        kept = size_px if stop == whole_px else stop - halo_px
+        kept = image_px if stop == size_px else stop - halo_px
         yield Span(start, stop, done, kept)
         done = kept
 
