@@ -25,6 +25,7 @@ import onnx
 
 from quant.onnx_file import fixed_tile_px
 from quant.reach import IMAGE, STEPS, Constants, Reach, Side, joined, refused, require
+from quant.spelled_out import with_shuffles
 from quant.untrusted import contradictions
 
 
@@ -73,8 +74,9 @@ def tiling_of(model: onnx.ModelProto) -> Tiling:
         ModelError: a network that cannot be tiled; the sentence names the node.
     """
     with contradictions("tiled model"):
+        plain = with_shuffles(model)
+        rows, columns = (_Walk(plain, side) for side in (ROWS, COLUMNS))
         (channels_in, channels_out), fixed_px = _channels(model), fixed_tile_px(model)
-        rows, columns = (_Walk(model, side) for side in (ROWS, COLUMNS))
         lattice_px = math.lcm(rows.lattice_px, columns.lattice_px)
         radius_px = max(rows.radius_px, columns.radius_px)
         if rows.scale != columns.scale:
