@@ -1,14 +1,11 @@
 """ONNX files, read and written without trusting them: one sentence for whatever is not a sound model.
 
-Also what a network's file says of itself: its metadata, the tile that it is fixed to, and its receptive radius. Only
-graphs that compute the same thing at every pixel have one. Refused is what does not: ranges measured on the image
-(dynamic quantisation), means over it (global pooling, instance normalisation), resampling, and constants that are
-not the same at every pixel.
+Also what a network's file says of itself: its metadata, and the tile that it is fixed to. How an image may be cut
+into tiles for it is `quant.tiling`'s matter.
 """
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import onnx
@@ -20,7 +17,7 @@ from profiles.errors import ModelError
 from profiles.toml import read_whole, unreadable
 from quant.reading.external import take_in
 from quant.reading.folding import IR_VERSION, OPSET, simplest
-from quant.untrusted import FILE_BYTES, check_content, check_runnable, contradictions
+from quant.untrusted import FILE_BYTES, check_content, check_runnable
 
 REMEDY = "give a file written by 'beers-deploy export' or 'beers-deploy quantize'"
 
@@ -187,7 +184,7 @@ def fixed_tile_px(model: onnx.ModelProto) -> int | None:
     if len(model.graph.input) != 1 or len(sizes) != 4 or sizes[2] != sizes[3]:
         raise ModelError(
             "ONNX model",
-            expected="one input (N, C, H, W)",
+            expected="one input (N, C, H, W), of one side where it is fixed",
             got=f"{sizes}",
             remedy="export it with 'beers-deploy export'",
         )
@@ -229,89 +226,3 @@ def require_quantised(model: onnx.ModelProto, path: Path, wanted: bool) -> None:
         expected, got = ("an INT8 network", "a float one") if wanted else ("a float network", "an INT8 one")
         remedy = "give the float model first, the INT8 model second"
         raise ModelError(str(path), expected=expected, got=got, remedy=remedy)
-
-
-CONVOLUTIONS = {"Conv": 1, "QLinearConv": 3}
-"""Operator and the index of its weights among the inputs."""
-
-POOLS = {"AveragePool", "MaxPool"}
-POINTWISE = {
-    "Abs", "Add", "Cast", "Clip", "Div", "Elu", "Exp", "Greater", "HardSigmoid", "HardSwish", "Identity",
-    "LeakyRelu", "Less", "LessOrEqual", "Max", "Min", "Mul", "Neg", "PRelu", "Pow", "QLinearAdd", "Relu", "Round",
-    "Sigmoid", "Sqrt", "Sub", "Tanh", "Where",
-}  # fmt: skip
-PER_CHANNEL = {"BatchNormalization", "DequantizeLinear", "QuantizeLinear"}
-"""Point-wise, with vectors of one number a channel."""
-OVER_CHANNELS = {"Concat", "Split"}
-"""Point-wise where they work along the channels."""
-
-
-def receptive_radius_px(model: onnx.ModelProto) -> int:
-    """The farthest input pixel that an output pixel depends on, in pixels.
-
-    Raises:
-        ModelError: an operator that is no same-size convolution or pool of stride 1 and not point-wise.
-    """
-    with contradictions("tiled model"):
-        return _radius_px(model)
-
-
-def _radius_px(model: onnx.ModelProto) -> int:
-    constants = {t.name: tuple(t.dims) for t in model.graph.initializer}
-    reach = {tensor.name: 0 for tensor in model.graph.input if tensor.name not in constants}
-    for node in model.graph.node:
-        radii = [reach[name] for name in node.input if name in reach]
-        if radii:
-            reach.update(dict.fromkeys(node.output, max(radii) + _node_radius(node, constants)))
-        else:
-            constants.update(dict.fromkeys(node.output, _constant_shape(node, constants)))
-    return reach.get(model.graph.output[0].name, 0)
-
-
-def _constant_shape(node: onnx.NodeProto, constants: dict[str, tuple[int, ...]]) -> tuple[int, ...]:
-    """The shape of what is made of constants alone, such as weights dequantised in a board file."""
-    if node.op_type == "Constant":
-        return next((tuple(a.t.dims) for a in node.attribute if a.name == "value"), ())
-    _require(node, node.op_type in PER_CHANNEL | {"Cast", "Identity"})
-    return constants[node.input[0]]
-
-
-def _node_radius(node: onnx.NodeProto, constants: dict[str, tuple[int, ...]]) -> int:
-    """What one operator adds to the radius."""
-    given = {a.name: onnx.helper.get_attribute_value(a) for a in node.attribute}
-    if node.op_type in CONVOLUTIONS:
-        weights = constants.get(node.input[CONVOLUTIONS[node.op_type]], ())
-        _require(node, len(weights) == 4)
-        return _window_radius(node, given, weights[2:])
-    if node.op_type in POOLS:
-        _require(node, len(node.output) == 1)  # MaxPool's indices count from the corner of the window
-        return _window_radius(node, given, given["kernel_shape"])
-    if node.op_type in OVER_CHANNELS:
-        _require(node, given.get("axis", 0) == 1)
-    elif node.op_type in PER_CHANNEL:
-        _require(node, given.get("axis", 1) == 1)
-    else:
-        _require(node, node.op_type in POINTWISE)
-        _require(node, all(set(constants.get(name, ())[-2:]) <= {1} for name in node.input))
-    return 0
-
-
-def _window_radius(node: onnx.NodeProto, given: dict[str, Any], kernel: tuple[int, ...]) -> int:
-    """The wider side of a window that keeps the image's size."""
-    extents = [(k - 1) * d for k, d in zip(kernel, given.get("dilations", [1, 1]), strict=True)]
-    _require(node, set(given.get("strides", [1])) == {1})
-    if given.get("auto_pad", b"NOTSET") in (b"SAME_UPPER", b"SAME_LOWER"):
-        return int(max((extent + 1) // 2 for extent in extents))
-    pads = given.get("pads", [0, 0, 0, 0])
-    _require(node, [pads[0] + pads[2], pads[1] + pads[3]] == extents)
-    return int(max(pads))
-
-
-def _require(node: onnx.NodeProto, sound: bool) -> None:
-    if not sound:
-        raise ModelError(
-            "tiled model",
-            expected="operators that do the same at every pixel, from near pixels alone",
-            got=f"{node.op_type} {node.name}".strip(),
-            remedy="run it on the whole image instead",
-        )

@@ -49,14 +49,14 @@ def bfloat16(subject: Subject, case: Case, image: np.ndarray) -> list[Measure]:
     """The float network in bfloat16 with a float32 sum, as training runs it, on an image (H, W) in DN."""
     if isinstance(subject.graph, BeersError):
         raise subject.graph
-    infer, radius_px = infer_in(subject.graph, torch.bfloat16, torch.float32), subject.float32.radius_px
+    infer, tiling = infer_in(subject.graph, torch.bfloat16, torch.float32), subject.float32.tiling
     if case.pixels in ("infinite", "beyond"):
-        return [refused(lambda: restore(infer, image, radius_px))]
-    result, again = (restore(infer, image, radius_px) for _ in range(2))
+        return [refused(lambda: restore(infer, image, tiling))]
+    result, again = (restore(infer, image, tiling) for _ in range(2))
     known = ~np.isnan(image)
     measures = [not_finite(result[known]), out_of_range(result), differing("runs differ", result, again)]
     if case.pixels == "sound":
-        truth = restore(infer_in(subject.graph, torch.float64), image, radius_px)
+        truth = restore(infer_in(subject.graph, torch.float64), image, tiling)
         measures.append(Measure("error against float64", float(np.abs(result - truth).max()), BFLOAT16_DN))
     return measures
 

@@ -12,9 +12,10 @@ from quant.encodings import host_model
 from quant.ends import Ends
 from quant.gate import Limits, compare, judge
 from quant.graph import CORRECTION, PLANES_FRAC_BITS, correction_graph, read_planes, split
-from quant.onnx_file import metadata, receptive_radius_px, save_onnx
+from quant.onnx_file import metadata, save_onnx
 from quant.quantise import Quantised, quantise_model
 from quant.session import open_session, run
+from quant.tiling import receptive_radius_px
 
 
 def image(height: int = 37, width: int = 53, seed: int = 0) -> np.ndarray:
