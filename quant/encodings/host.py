@@ -31,6 +31,7 @@ from quant.graph import (
     Resize,
     Shuffle,
     channels_of,
+    is_plain,
 )
 from quant.graph.operations import LEAKY_SLOPE
 from quant.graph.writer import window_attributes, write_shuffle
@@ -50,7 +51,7 @@ def host_model(core: IntCore, about: dict[str, str], tile_px: int | None = None)
     graph = writer.graph(
         "convbeers-int8", [image_info(IMAGE, core.ends.image_channels, tile_px)], [_result(core, tile_px)]
     )
-    plain = all(isinstance(op, IntConv | Add) for op in core.ops) and core.ends == Ends(gains=core.ends.gains)
+    plain = all(is_plain(op) for op in core.ops) and core.ends == Ends(gains=core.ends.gains)
     return make_model(graph, about if plain else {**about, KEY: describe(core)}, microsoft=True)
 
 

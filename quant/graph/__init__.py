@@ -22,6 +22,7 @@ from quant.graph.operations import (
     Resize,
     Shuffle,
     Window,
+    is_plain,
     relu_count,
     same,
     tensors,
@@ -47,6 +48,6 @@ __all__ = [
     "COARSE_MAX", "CORRECTION", "COUNT", "IMAGE", "PLANES", "PLANES_FRAC_BITS", "QUARTER", "STEP", "Activation",
     "Add", "AveragePool", "Concat", "Conv", "Graph", "MaxPool", "Mul", "Network", "Op", "Pointwise", "Resize",
     "Shuffle", "Window", "channels_of", "check_network", "coarse_plane_only", "correction_graph",
-    "graph_to_onnx", "plane_count", "read_network", "read_planes", "refusal", "refused_graph", "relu_count",
+    "graph_to_onnx", "is_plain", "plane_count", "read_network", "read_planes", "refusal", "refused_graph", "relu_count",
     "same", "split", "tensors", "tied", "ties_scales",
 ]  # fmt: skip

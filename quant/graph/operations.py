@@ -116,6 +116,19 @@ def same(weight: np.ndarray) -> Window:
     return Window(pads=(rows, columns, rows, columns))
 
 
+def is_plain(op: Op) -> bool:
+    """Whether an operation is of the short list that ConvBEERS is made of.
+
+    A same-size convolution of stride 1, in float or whole numbers, with or without ReLU; or an add without one.
+    """
+    activation = getattr(op, "activation", None)
+    if not isinstance(op, HasWeight):
+        return isinstance(op, Add) and activation is Activation.none
+    dense = op.groups == 1 and not getattr(op, "transposed", False)
+    kept = activation in (Activation.none, Activation.relu)
+    return dense and kept and getattr(op, "window", None) == same(op.weight)
+
+
 class _OneInput:
     """Operations that read one tensor, `input`."""
 

@@ -33,7 +33,7 @@ from quant.graph.operations import (
     Resize,
     Shuffle,
     Window,
-    same,
+    is_plain,
 )
 from quant.onnx_file import constants
 from quant.untrusted import contradictions
@@ -62,14 +62,9 @@ def correction_graph(model: onnx.ModelProto) -> Graph:
     if network != Network(network.graph):
         raise refused_graph("an image of one channel, and a global add of it at the end", "another network")
     for op in network.graph:
-        if not (isinstance(op, Add) and op.activation is Activation.none) and not _is_plain(op):
+        if not (isinstance(op, Conv | Add) and is_plain(op)):
             raise refused_graph("only same-size convolutions of stride 1, ReLU and adds", op.name)
     return network.graph
-
-
-def _is_plain(op: Op) -> bool:
-    kept = (Activation.none, Activation.relu)
-    return isinstance(op, Conv) and op.groups == 1 and op.activation in kept and op.window == same(op.weight)
 
 
 def refusal(model: onnx.ModelProto) -> str:
