@@ -158,6 +158,7 @@ DEGRADED = "degraded"
 
 T = TypeVar("T")
 Pair = tuple[np.ndarray, np.ndarray]
+"""(degraded, reference) of a patch; the reference of a user's own sample that has none is empty."""
 
 
 @dataclass(frozen=True)

@@ -139,7 +139,7 @@ WINDOW_PX = 1024
 """Kernel, stride, dilation or padding of a window, or a factor of enlargement."""
 
 STANDARD = ("", "ai.onnx")
-ONNXRUNTIMES = {("com.microsoft", "QLinearAdd")}
+ONNXRUNTIMES = {("com.microsoft", "QLinearAdd"), ("com.microsoft", "QLinearMul")}
 
 WINDOWS = {"kernel_shape", "strides", "dilations", "pads", "output_padding", "blocksize"}
 SIZES = {"CenterCropPad": (1,), "Expand": (1,), "MaxUnpool": (2,), "OneHot": (1,), "Resize": (3,)}
