@@ -14,8 +14,11 @@ Shapes = dict[str, tuple[int, ...]]
 
 
 def shapes_of(model: onnx.ModelProto) -> Shapes:
-    """The sizes of each float32 tensor whose rank is known, 0 for a size that is not."""
-    values = shape_inference.infer_shapes(model).graph
+    """The sizes of each float32 tensor whose rank is known, 0 for a size that is not; none where sizes differ."""
+    try:
+        values = shape_inference.infer_shapes(model).graph
+    except shape_inference.InferenceError:
+        return {}
     known = {v.name: v.type.tensor_type for v in (*values.input, *values.value_info, *values.output)}
     floats = {n: t for n, t in known.items() if t.elem_type == TensorProto.FLOAT and t.HasField("shape")}
     return {name: tuple(d.dim_value for d in t.shape.dim) for name, t in floats.items()}
