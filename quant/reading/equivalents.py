@@ -4,19 +4,20 @@ Every rewriting is exact but for the rounding of float32, borders included. `qua
 what holds behind it.
 """
 
-from collections import Counter
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
 
 import numpy as np
 import onnx
-from onnx import NodeProto, TensorProto, helper, numpy_helper, shape_inference
+from onnx import NodeProto, TensorProto, helper
+
+from quant.reading.flat import Unflatten
+from quant.reading.nodes import Nodes, Shapes, attributes_of, shapes_of
 
 ARITHMETIC = {"Add", "Div", "Mul", "Sub"}
-LINEAR = {"Conv", "ConvTranspose"}
 NORMALISATION = "BatchNormalization"
+SHAPED = {"Cast", "Gemm", "ReduceMean"}
+"""What may be rewritten where shapes are known."""
 
 
 @dataclass(frozen=True)
@@ -38,112 +39,20 @@ class Affine:
 
 def rewrite(model: onnx.ModelProto) -> None:
     """Rewrite a float network's nodes; its inputs and outputs keep their names."""
-    graph = _Graph(model.graph)
+    graph = Nodes(model.graph)
     for step in (_sum, _difference, _behind, _hard_swish):
         graph.pass_over(step)
     graph.write()
-    if any(node.op_type in ("Cast", "ReduceMean") or _affine(graph, node) for node in graph.nodes):
-        shapes = _shapes(model)
+    if any(node.op_type in SHAPED or _affine(graph, node) for node in graph.nodes):
+        shapes = shapes_of(model)
         _in_front(graph, shapes)
         for shaped in (_cast, _mean, _depthwise):
             graph.pass_over(partial(shaped, shapes))
+        graph.pass_over(Unflatten(shapes))
         graph.write()
 
 
-Shapes = dict[str, tuple[int, ...]]
-
-
-def _shapes(model: onnx.ModelProto) -> Shapes:
-    """The sizes of each float32 tensor whose rank is known, 0 for a size that is not."""
-    values = shape_inference.infer_shapes(model).graph
-    known = {v.name: v.type.tensor_type for v in (*values.input, *values.value_info, *values.output)}
-    floats = {n: t for n, t in known.items() if t.elem_type == TensorProto.FLOAT and t.HasField("shape")}
-    return {name: tuple(d.dim_value for d in t.shape.dim) for name, t in floats.items()}
-
-
-class _Graph:
-    """The nodes in order, and who writes and reads what."""
-
-    def __init__(self, graph: onnx.GraphProto) -> None:
-        self._graph = graph
-        self.nodes = list(graph.node)
-        self.constants = {tensor.name: tensor for tensor in graph.initializer}
-        self.ends = [value.name for value in graph.output]
-        self._taken = {name for node in graph.node for name in (*node.input, *node.output)} | set(self.constants)
-        self._find()
-
-    def _find(self) -> None:
-        self.reads = Counter([name for node in self.nodes for name in node.input] + self.ends)
-        self.writers = {name: node for node in self.nodes for name in node.output if name}
-
-    def pass_over(self, step: "Step") -> None:
-        """Each node replaced by what `step(graph, node)` gives for it, in order; None leaves it as it is."""
-        kept: list[NodeProto] = []
-        for node in self.nodes:
-            found = step(self, node)
-            new = [node] if found is None else found
-            self.writers |= {name: n for n in new for name in n.output if name}
-            kept.extend(new)
-        self.nodes = kept
-        self._find()
-
-    def write(self) -> None:
-        """Put the nodes that lead to an output, and the constants, into the graph."""
-        needed, kept = set(self.ends), list[NodeProto]()
-        for node in reversed(self.nodes):
-            if needed.intersection(node.output):
-                needed.update(node.input)
-                kept.append(NodeProto.FromString(node.SerializeToString()))
-        self.nodes = kept[::-1]
-        del self._graph.node[:]
-        self._graph.node.extend(self.nodes)
-        held = {tensor.name for tensor in self._graph.initializer}
-        self._graph.initializer.extend(t for name, t in self.constants.items() if name not in held)
-        self._find()
-
-    def value(self, name: str) -> np.ndarray | None:
-        """A constant of float32 in float64, None where it is none."""
-        found = self.constants.get(name)
-        return (
-            None
-            if found is None or found.data_type != TensorProto.FLOAT
-            else numpy_helper.to_array(found).astype(np.float64)
-        )
-
-    def keep(self, name: str, value: np.ndarray) -> str:
-        """Note a constant as float32 under a name that is free, and return it."""
-        while name in self._taken:
-            name += "_"
-        self._taken.add(name)
-        self.constants[name] = numpy_helper.from_array(value.astype(np.float32), name)
-        return name
-
-    def sole_writer(self, name: str) -> NodeProto | None:
-        """The node that writes a tensor which one node alone reads."""
-        return self.writers.get(name) if self.reads[name] == 1 else None
-
-    def is_linear(self, node: NodeProto | None) -> bool:
-        """Whether it is a convolution of images, transposed or not, of weights and bias that the file holds."""
-        if node is None or node.op_type not in LINEAR:
-            return False
-        numbers = [self.constants.get(name) for name in node.input[1:] if name]
-        sound = all(t is not None and t.data_type == TensorProto.FLOAT for t in numbers)
-        return bool(numbers) and sound and len(self.constants[node.input[1]].dims) == 4
-
-    def width(self, node: NodeProto) -> int:
-        """The channels that a convolution writes."""
-        dims = self.constants[node.input[1]].dims
-        return int(dims[0] if node.op_type == "Conv" else dims[1] * _given(node).get("group", 1))
-
-
-Step = Callable[[_Graph, NodeProto], list[NodeProto] | None]
-
-
-def _given(node: NodeProto) -> dict[str, Any]:
-    return {a.name: helper.get_attribute_value(a) for a in node.attribute}
-
-
-def _sum(_: _Graph, node: NodeProto) -> list[NodeProto] | None:
+def _sum(_: Nodes, node: NodeProto) -> list[NodeProto] | None:
     """A Sum of several as Adds, one after the other."""
     if node.op_type != "Sum" or len(node.input) < 2:
         return None
@@ -156,7 +65,7 @@ def _sum(_: _Graph, node: NodeProto) -> list[NodeProto] | None:
     return adds
 
 
-def _difference(graph: _Graph, node: NodeProto) -> list[NodeProto] | None:
+def _difference(graph: Nodes, node: NodeProto) -> list[NodeProto] | None:
     """What is subtracted is negated in the convolution that computes it, and added."""
     if node.op_type != "Sub":
         return None
@@ -167,7 +76,7 @@ def _difference(graph: _Graph, node: NodeProto) -> list[NodeProto] | None:
     return [helper.make_node("Add", node.input, node.output, name=node.name)]
 
 
-def _behind(graph: _Graph, node: NodeProto) -> list[NodeProto] | None:
+def _behind(graph: Nodes, node: NodeProto) -> list[NodeProto] | None:
     """What works on each channel by itself, folded into the convolution or normalisation that it follows."""
     found = _affine(graph, node)
     before = graph.sole_writer(found[0]) if found else None
@@ -187,13 +96,13 @@ def _behind(graph: _Graph, node: NodeProto) -> list[NodeProto] | None:
     return []
 
 
-def _rename(graph: _Graph, result: str, name: str) -> None:
+def _rename(graph: Nodes, result: str, name: str) -> None:
     """Let a result have the name of the one that it takes the place of."""
     writer = graph.writers[name] = graph.writers[result]
     writer.output[list(writer.output).index(result)] = name
 
 
-def _set_normalisation(graph: _Graph, node: NodeProto, source: str, affine: Affine) -> None:
+def _set_normalisation(graph: Nodes, node: NodeProto, source: str, affine: Affine) -> None:
     """Make a node the normalisation of mean 0 and variance 1 that computes this."""
     scale, shift = np.broadcast_arrays(affine.scale, affine.shift)
     values = (scale, shift, np.zeros(scale.shape), np.ones(scale.shape))
@@ -203,7 +112,7 @@ def _set_normalisation(graph: _Graph, node: NodeProto, source: str, affine: Affi
     node.CopyFrom(made)
 
 
-def _affine(graph: _Graph, node: NodeProto) -> tuple[str, Affine] | None:
+def _affine(graph: Nodes, node: NodeProto) -> tuple[str, Affine] | None:
     """The tensor that a node works on and what it does to each channel, None where it does something else."""
     if node.op_type == NORMALISATION:
         return _normalisation(graph, node)
@@ -229,9 +138,9 @@ def _arithmetic(kind: str, value: np.ndarray, place: int) -> Affine | None:
     return Affine(1 / value, zero) if place == 0 and value.all() else None
 
 
-def _normalisation(graph: _Graph, node: NodeProto) -> tuple[str, Affine] | None:
+def _normalisation(graph: Nodes, node: NodeProto) -> tuple[str, Affine] | None:
     values = [graph.value(name) for name in node.input[1:5]]
-    given = _given(node)
+    given = attributes_of(node)
     if given.get("training_mode", 0) or len(node.output) > 1 or any(value is None for value in values):
         return None
     gain, offset, mean, variance = values
@@ -247,10 +156,10 @@ def _per_channel(value: np.ndarray | None) -> np.ndarray | None:
     return value.reshape(-1) if shape[0] == shape[2] == shape[3] == 1 else None
 
 
-def _scale_results(graph: _Graph, node: NodeProto, affine: Affine) -> None:
+def _scale_results(graph: Nodes, node: NodeProto, affine: Affine) -> None:
     """Fold into a convolution what is done to its results; its weights may serve others too."""
     weight, bias = _numbers(graph, node)
-    groups = _given(node).get("group", 1)
+    groups = attributes_of(node).get("group", 1)
     scale = np.broadcast_to(affine.scale, bias.shape)
     if node.op_type == "Conv":
         weight = weight * scale.reshape(-1, 1, 1, 1)
@@ -260,7 +169,7 @@ def _scale_results(graph: _Graph, node: NodeProto, affine: Affine) -> None:
     _set_numbers(graph, node, weight, bias * scale + affine.shift)
 
 
-def _numbers(graph: _Graph, node: NodeProto) -> tuple[np.ndarray, np.ndarray]:
+def _numbers(graph: Nodes, node: NodeProto) -> tuple[np.ndarray, np.ndarray]:
     """Weights and bias (O,) of a convolution."""
     weight = graph.value(node.input[1])
     bias = graph.value(node.input[2]) if len(node.input) > 2 and node.input[2] else np.zeros(graph.width(node))
@@ -269,14 +178,14 @@ def _numbers(graph: _Graph, node: NodeProto) -> tuple[np.ndarray, np.ndarray]:
     return weight, bias
 
 
-def _set_numbers(graph: _Graph, node: NodeProto, weight: np.ndarray, bias: np.ndarray) -> None:
+def _set_numbers(graph: Nodes, node: NodeProto, weight: np.ndarray, bias: np.ndarray) -> None:
     name = node.name or node.output[0]
     inputs = [node.input[0], graph.keep(f"{name}.weight", weight), graph.keep(f"{name}.bias", bias)]
     del node.input[:]
     node.input.extend(inputs)
 
 
-def _hard_swish(graph: _Graph, node: NodeProto) -> list[NodeProto] | None:
+def _hard_swish(graph: Nodes, node: NodeProto) -> list[NodeProto] | None:
     """A tensor times its own HardSigmoid, as the runtime and older exporters spell it."""
     if node.op_type != "Mul":
         return None
@@ -284,24 +193,24 @@ def _hard_swish(graph: _Graph, node: NodeProto) -> list[NodeProto] | None:
         before = graph.writers.get(gate)
         if before is None or before.op_type != "HardSigmoid" or before.input[0] != source:
             continue
-        given = _given(before)
+        given = attributes_of(before)
         if np.allclose((given.get("alpha", 0.2), given.get("beta", 0.5)), (1 / 6, 0.5), atol=1e-6):
             return [helper.make_node("HardSwish", [source], node.output, name=node.name)]
     return None
 
 
-def _cast(shapes: Shapes, graph: _Graph, node: NodeProto) -> list[NodeProto] | None:
+def _cast(shapes: Shapes, graph: Nodes, node: NodeProto) -> list[NodeProto] | None:
     """What is float32 already; the runtime leaves such a cast where it writes a result."""
     before = graph.sole_writer(node.input[0]) if node.op_type == "Cast" and node.input[0] in shapes else None
-    if before is None or _given(node)["to"] != TensorProto.FLOAT:
+    if before is None or attributes_of(node)["to"] != TensorProto.FLOAT:
         return None
     _rename(graph, node.input[0], node.output[0])
     return []
 
 
-def _mean(shapes: Shapes, _: _Graph, node: NodeProto) -> list[NodeProto] | None:
+def _mean(shapes: Shapes, _: Nodes, node: NodeProto) -> list[NodeProto] | None:
     """A mean over height and width."""
-    given = _given(node)
+    given = attributes_of(node)
     axes, image = {axis % 4 for axis in given.get("axes", [])}, len(shapes.get(node.input[0], ())) == 4
     if node.op_type != "ReduceMean" or not image or axes != {2, 3}:
         return None
@@ -309,10 +218,10 @@ def _mean(shapes: Shapes, _: _Graph, node: NodeProto) -> list[NodeProto] | None:
     pool = helper.make_node("GlobalAveragePool", node.input, [pooled], name=node.name)
     if pooled == node.output[0]:
         return [pool]
-    return [pool, helper.make_node("Flatten", [pooled], node.output, name=f"{node.name}.flat")]
+    return [pool, helper.make_node("Flatten", [pooled], node.output, name=f"{node.output[0]}.flat")]
 
 
-def _in_front(graph: _Graph, shapes: Shapes) -> None:
+def _in_front(graph: Nodes, shapes: Shapes) -> None:
     """What works on each channel by itself, folded into all the convolutions that read it, where that is exact."""
     for node in graph.nodes[::-1]:
         found = _affine(graph, node)
@@ -331,17 +240,17 @@ def _keeps_channels(source: str, affine: Affine, shapes: Shapes) -> bool:
     return affine.channels == 1 or (len(shapes.get(source, ())) == 4 and shapes[source][1] == affine.channels)
 
 
-def _may_scale_inputs(graph: _Graph, node: NodeProto, name: str, affine: Affine) -> bool:
+def _may_scale_inputs(graph: Nodes, node: NodeProto, name: str, affine: Affine) -> bool:
     """Zeros that a convolution pads with are not shifted: a shift passes one without padding alone."""
-    given = _given(node)
+    given = attributes_of(node)
     unpadded = node.op_type == "Conv" and given.get("auto_pad", b"NOTSET") in (b"NOTSET", b"VALID")
     unpadded = unpadded and not any(given.get("pads", []))
     return graph.is_linear(node) and list(node.input).count(name) == 1 and (unpadded or not affine.shift.any())
 
 
-def _scale_inputs(graph: _Graph, node: NodeProto, affine: Affine) -> None:
+def _scale_inputs(graph: Nodes, node: NodeProto, affine: Affine) -> None:
     weight, bias = _numbers(graph, node)
-    groups = _given(node).get("group", 1)
+    groups = attributes_of(node).get("group", 1)
     if node.op_type == "ConvTranspose":
         _set_numbers(graph, node, weight * affine.scale.reshape(-1, 1, 1, 1), bias)
         return
@@ -354,7 +263,7 @@ def _scale_inputs(graph: _Graph, node: NodeProto, affine: Affine) -> None:
     _set_numbers(graph, node, (split * scale).reshape(weight.shape), bias + moved)
 
 
-def _depthwise(shapes: Shapes, graph: _Graph, node: NodeProto) -> list[NodeProto] | None:
+def _depthwise(shapes: Shapes, graph: Nodes, node: NodeProto) -> list[NodeProto] | None:
     """A normalisation of images that no convolution took in: a depthwise one of a single pixel."""
     found = _affine(graph, node) if node.op_type == NORMALISATION else None
     if found is None or len(shapes.get(node.input[0], ())) != 4:

@@ -30,6 +30,7 @@ import numpy as np
 import onnx
 import onnxruntime as ort
 from onnx import TensorProto, numpy_helper, version_converter
+from onnx.shape_inference import InferenceError
 
 from quant.reading.equivalents import rewrite
 from quant.untrusted import contradictions, refused
@@ -148,7 +149,7 @@ def _of_our_opset(model: onnx.ModelProto) -> onnx.ModelProto:
         return model
     try:
         converted = version_converter.convert_version(model, OPSET)
-    except (RuntimeError, ValueError):
+    except (InferenceError, RuntimeError, ValueError):
         return model
     if version < RESIZE_HAS_MODES:
         _place_corners(converted)

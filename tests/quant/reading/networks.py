@@ -18,7 +18,8 @@ WEIGHTS: dict[str, tuple[int, ...]] = {
     "one": (1, 4, 3, 3),
     "b": (4,),
     "image": (4, 1, 1),
-    "half": (2, 1, 1),
+    "square": (4, 4),
+    "wide": (24, 5),
 }
 
 
@@ -34,6 +35,7 @@ def values() -> dict[str, np.ndarray]:
         "pads": np.array([0, 0, 1, 1, 0, 0, 1, 1]),
     }
     found |= {"around": np.array([0, 0, 1, 2, 0, 0, 2, 1]), "twice": np.array([1, 1, 2, 2], np.float32)}
+    found |= {"small": np.array([2, 4, 2, 3]), "rows": np.array([0, -1])}
     found |= {"two": np.array([2]), "four": np.array([4])}
     found |= {"axes": np.array([2, 3]), "roi": np.zeros(0, np.float32)}
     return found
@@ -158,6 +160,27 @@ CASES: dict[str, tuple[list[NodeProto], dict[str, int]]] = {
             conv("p", "y", pad_px=0),
         ],
         {"Conv": 1},
+    ),
+    "fully connected": (
+        [
+            node("MaxPool", "x", to="m", kernel_shape=[9, 11]),
+            node("GlobalAveragePool", "m", to="p"),
+            node("Flatten", "p", to="f"),
+            node("Gemm", "f", "square", "b", to="g", transB=1, alpha=0.5, beta=2.0),
+            node("Relu", "g", to="r"),
+            node("Gemm", "r", "square", to="h"),
+            node("Unsqueeze", "h", "axes"),
+        ],
+        {"MaxPool": 1, "GlobalAveragePool": 1, "Conv": 2, "Relu": 1, "Flatten": 1, "Unsqueeze": 1},
+    ),
+    "fully connected to a map of known size": (
+        [
+            node("Resize", "x", "", "", "small", to="s"),
+            node("Reshape", "s", "rows", to="f"),
+            node("Gemm", "f", "wide", to="g"),
+            node("Unsqueeze", "g", "axes"),
+        ],
+        {"Resize": 1, "Conv": 1, "Flatten": 1, "Unsqueeze": 1},
     ),
     "equal layers": ([conv(), conv(to="d"), node("Add", "c", "d")], {"Conv": 2, "Add": 1}),
 }
