@@ -15,7 +15,7 @@ from quant.onnx_file import metadata, save_onnx
 from quant.passes.stream import merge
 from quant.quantise import Quantised, quantise_model
 from quant.session import open_session, run
-from quant.tiling import receptive_radius_px
+from quant.tiling.walk import receptive_radius_px
 
 
 def image(height: int = 37, width: int = 53, seed: int = 0) -> np.ndarray:
