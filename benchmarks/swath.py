@@ -33,7 +33,7 @@ from deploy.restoration.run import restore_file
 from deploy.restoration.runtime import open_runtime
 from model.convbeers import ConvBEERS, initialise
 from model.variants import VARIANTS, Variant
-from quant.tiling import tiling_of
+from quant.tiling.walk import tiling_of
 
 TILE_PX = 640
 ENTRY = "from deploy.cli import app; app()"

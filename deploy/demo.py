@@ -43,7 +43,7 @@ from quant.gate import compare, gate_row
 from quant.onnx_file import load_onnx, save_onnx
 from quant.quantise import quantise_model
 from quant.session import open_session
-from quant.tiling import receptive_radius_px
+from quant.tiling.walk import receptive_radius_px
 
 CROP_PX, ZOOM = 110, 3
 LARGEST_PX = 1280

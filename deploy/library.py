@@ -24,7 +24,7 @@ from model.io.images import settled_scale
 from profiles.errors import ImageError, OptionError
 from profiles.sensor_file import BLIND, load_sensor
 from quant.onnx_file import load_onnx
-from quant.tiling import Tiling
+from quant.tiling.walk import Tiling
 
 Image = TypeVar("Image")
 """numpy.ndarray, dask.array.Array or xarray.DataArray."""

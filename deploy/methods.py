@@ -37,7 +37,7 @@ from profiles.sensor import Sensor, SensorProfile
 from profiles.sensor_file import BLIND as NOT_KNOWN
 from profiles.sensor_file import BLIND_PROFILE, load_sensor
 from quant.onnx_file import load_onnx, metadata
-from quant.tiling import tiling_of
+from quant.tiling.walk import tiling_of
 
 EXPECTED = (
     f"degraded, {TRADITIONAL}, {DECONVOLVE_FIRST} (each also with -fast or -best), {', '.join(PEERS)}, "

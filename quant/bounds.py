@@ -8,9 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from quant.arithmetic import activated
 from quant.core import INT8_MAX, INT8_MIN, IntConv, IntCore
-from quant.fixed_point import activation_table, mean_factor
 from quant.graph import (
     COARSE_MAX,
     CORRECTION,
@@ -29,6 +27,8 @@ from quant.graph import (
     Pointwise,
     Shuffle,
 )
+from quant.integer.arithmetic import activated
+from quant.integer.fixed_point import activation_table, mean_factor
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,7 @@ from profiles.errors import ImageError, ModelError, OptionError
 from profiles.toml import unreadable
 from quant.calibration import PATCH_PX, Pair, Patches, Remade
 from quant.onnx_file import fixed_tile_px
-from quant.tiling import tiling_of
+from quant.tiling.walk import tiling_of
 from quant.untrusted import times
 
 HELD_OUT_EVERY = 4

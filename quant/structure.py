@@ -17,7 +17,7 @@ from quant.encodings import encoding_faults
 from quant.graph import CORRECTION
 from quant.onnx_file import any_size, constants, with_outputs
 from quant.session import open_any_size, open_session, result_of, tensors_of
-from quant.tiling import tiling_of
+from quant.tiling.walk import tiling_of
 from quant.untrusted import contradictions
 
 ZERO_POINTS = {"QuantizeLinear": 2, "QLinearConv": 7, "QLinearAdd": 7, "QLinearMul": 7, "QLinearMatMul": 7}

@@ -27,7 +27,7 @@ from profiles import load_target
 from profiles.figures import Row
 from profiles.sensor_file import REFERENCE, load_sensor
 from quant.onnx_file import load_onnx
-from quant.tiling import receptive_radius_px
+from quant.tiling.walk import receptive_radius_px
 
 TRAFFIC = "LdFM, StFM: feature maps loaded and stored, an image; LdWB: weights and biases loaded, a batch."
 

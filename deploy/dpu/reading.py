@@ -16,6 +16,7 @@ from onnx import TensorProto, helper, numpy_helper
 from deploy.dpu.graph import Kind, Network, Operation, Shape, Window, out_shape, padding
 from deploy.dpu.integers import Integers
 from profiles.errors import ModelError
+from quant.encodings import as_on_board
 from quant.onnx_file import load_onnx
 from quant.untrusted import contradictions
 
@@ -47,7 +48,7 @@ def read_network(path: Path, tile_px: int = 640) -> Network:
     Raises:
         ModelError: not an ONNX file, or not a network of images.
     """
-    return network_of(load_onnx(path, to_run=False), tile_px, str(path))
+    return network_of(as_on_board(load_onnx(path, to_run=False)), tile_px, str(path))
 
 
 def own_tile_px(model: onnx.ModelProto) -> int | None:

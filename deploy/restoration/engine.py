@@ -18,7 +18,7 @@ from deploy.restoration.runtime import Infer
 from deploy.restoration.source import ArraySource, Raster, Source
 from model.io.images import MAX_DN, remedy_outside
 from profiles.errors import ImageError, ModelError
-from quant.tiling import Tiling
+from quant.tiling.walk import Tiling
 from quant.untrusted import times
 
 NAME = "image"

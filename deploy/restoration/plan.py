@@ -15,7 +15,7 @@ import psutil
 from deploy.restoration.options import Options, parse_halo
 from deploy.restoration.source import Source
 from profiles.errors import MachineError, ModelError, OptionError, sizes
-from quant.tiling import Tiling, tiling_of
+from quant.tiling.walk import Tiling, tiling_of
 
 
 @dataclass(frozen=True)

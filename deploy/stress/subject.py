@@ -27,7 +27,7 @@ from quant.encodings import read_core
 from quant.graph import CORRECTION, IMAGE, Activation, Add, Conv, Graph, correction_graph
 from quant.onnx_file import any_size, load_onnx, require_quantised
 from quant.session import open_session, run
-from quant.tiling import Tiling, tiling_of
+from quant.tiling.walk import Tiling, tiling_of
 
 T = TypeVar("T")
 

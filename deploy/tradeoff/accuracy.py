@@ -21,7 +21,7 @@ from model.evaluation.scores import Instruments
 from model.evaluation.targets import Targets, snr_name, target_figures
 from model.io.images import MAX_DN
 from profiles.figures import Figure
-from quant.tiling import Tiling
+from quant.tiling.walk import Tiling
 
 MAE = "float-INT8 MAE"
 FLAT = "flat SNR"

@@ -35,7 +35,7 @@ from quant.free import free_ticks, quantise_free
 from quant.onnx_file import is_quantised, load_onnx, metadata, save_onnx
 from quant.passes.equalise import search_steps
 from quant.quantise import SEARCH_CROPS, quantise_model, ticks
-from quant.tiling import Tiling, tiling_of
+from quant.tiling.walk import Tiling, tiling_of
 
 PAPER = VARIANTS["convbeers"]
 """The paper's network: 16 blocks of 64 features."""

@@ -37,7 +37,7 @@ from model.io.images import MAX_DN
 from model.io.pictures import busiest_windows
 from profiles.figures import Row
 from quant.onnx_file import load_onnx
-from quant.tiling import Tiling
+from quant.tiling.walk import Tiling
 
 CROP_PX, MOST = 128, 8
 FRONT = ("board latency", "PSNR")

@@ -31,7 +31,7 @@ from profiles.errors import ModelError
 from profiles.sensor import SensorProfile
 from profiles.sensor_file import load_sensor, reference_for
 from quant.onnx_file import load_onnx
-from quant.tiling import receptive_radius_px
+from quant.tiling.walk import receptive_radius_px
 
 
 def select_points(store: MethodStore, swath: Swath) -> list[Point]:

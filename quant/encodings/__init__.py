@@ -4,8 +4,8 @@ The host's file runs on stock onnxruntime by integer kernels, from image to rest
 itself as QDQ ONNX, with int8 bias and power-of-two scales. Reading a host file back gives numbers to reason about.
 """
 
-from quant.encodings.board import board_model
+from quant.encodings.board import as_on_board, board_model
 from quant.encodings.host import MICROSOFT, host_model
 from quant.encodings.reading import encoding_faults, read_core
 
-__all__ = ["MICROSOFT", "board_model", "encoding_faults", "host_model", "read_core"]
+__all__ = ["MICROSOFT", "as_on_board", "board_model", "encoding_faults", "host_model", "read_core"]

@@ -4,9 +4,11 @@ import numpy as np
 import onnx
 
 from quant.core import IntConv, IntCore
+from quant.encodings.description import KEY, described_core
 from quant.graph import CORRECTION, PLANES, Conv
 from quant.graph.writer import onnx_weight, write_float
-from quant.onnx_file import GraphWriter, image_info, make_model
+from quant.onnx_file import GraphWriter, constants, fixed_tile_px, image_info, make_model, metadata
+from quant.untrusted import contradictions
 
 
 def board_model(core: IntCore, about: dict[str, str], tile_px: int | None = None) -> onnx.ModelProto:
@@ -31,6 +33,21 @@ def board_model(core: IntCore, about: dict[str, str], tile_px: int | None = None
         for side, name in zip(result.type.tensor_type.shape.dim[2:], ("rows", "columns"), strict=True):
             side.dim_param = name
     return make_model(writer.graph("convbeers-core", [size], [result]), about)
+
+
+def as_on_board(model: onnx.ModelProto) -> onnx.ModelProto:
+    """A host's file whose core is described in it as the board gets it; any other model as it is.
+
+    What the host spells with several operators, such as a transposed convolution, is one of the DPU's own.
+
+    Raises:
+        ModelError: a description that contradicts the file.
+    """
+    if KEY not in metadata(model):
+        return model
+    with contradictions("INT8 model"):
+        core = described_core(metadata(model)[KEY], constants(model))
+        return board_model(core, {}, fixed_tile_px(model))
 
 
 def _conv(w: "_BoardWriter", op: IntConv, source: str, output: str) -> None:

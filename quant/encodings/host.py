@@ -16,7 +16,6 @@ from quant.core import INT8_MAX, INT8_MIN, IntConv, IntCore
 from quant.encodings.description import KEY, describe
 from quant.encodings.phases import phases
 from quant.ends import ZERO, Ends, HostWriter, write_back, write_front
-from quant.fixed_point import activation_table, bilinear_weights, mean_factor, six_in_units
 from quant.graph import (
     CORRECTION,
     IMAGE,
@@ -35,6 +34,7 @@ from quant.graph import (
 )
 from quant.graph.operations import LEAKY_SLOPE
 from quant.graph.writer import window_attributes, write_shuffle
+from quant.integer.fixed_point import activation_table, bilinear_weights, mean_factor, six_in_units
 from quant.onnx_file import image_info, make_model
 
 MICROSOFT = "com.microsoft"

@@ -25,7 +25,8 @@ def read_core(model: onnx.ModelProto) -> IntCore:
     """
     said = metadata(model).get(KEY)
     if said is not None:
-        return described_core(said, constants(model))
+        with contradictions("INT8 model"):
+            return described_core(said, constants(model))
     reader = _Reader(model)
     for node in model.graph.node:
         if node.op_type == "QLinearConv":

@@ -11,7 +11,6 @@ from onnx import numpy_helper
 
 from model.simulator.procedural import procedural_scene
 from profiles import load_sensor
-from quant.arithmetic import convolve
 from quant.calibration import Patches, draw_patches
 from quant.free import BINS, Scale, best_scale, free_model, free_ticks, quantise_free, round_weight, tensor_scales
 from quant.gate import compare
@@ -29,6 +28,7 @@ from quant.graph import (
     same,
     tensors,
 )
+from quant.integer.arithmetic import convolve
 from quant.onnx_file import metadata, save_onnx
 from quant.passes.equalise import channel_ranges, equalise, first_guess
 from quant.passes.stream import OFFSETS, half_lsb_pair, streams, two_gains

@@ -15,7 +15,7 @@ from quant.graph import CORRECTION, PLANES_FRAC_BITS, correction_graph, read_pla
 from quant.onnx_file import metadata, save_onnx
 from quant.quantise import Quantised, quantise_model
 from quant.session import open_session, run
-from quant.tiling import receptive_radius_px
+from quant.tiling.walk import receptive_radius_px
 
 
 def image(height: int = 37, width: int = 53, seed: int = 0) -> np.ndarray:

@@ -19,7 +19,7 @@ from deploy.stress.checks import LIMITATIONS, Measure, differing, local_range, r
 from deploy.stress.subject import Subject, open_subject, restore
 from profiles.errors import ModelError
 from quant.onnx_file import save_onnx
-from quant.tiling import Tiling
+from quant.tiling.walk import Tiling
 
 BY_NAME = {case.name: case for case in CASES}
 SIDE_PX = 32

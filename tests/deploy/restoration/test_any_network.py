@@ -20,8 +20,8 @@ from deploy.restoration.run import restore_file
 from profiles.errors import MachineError, ModelError, OptionError
 from quant.onnx_file import load_onnx, save_onnx
 from quant.session import open_session, tensors_of
-from quant.tiling import Tiling, tiling_of
-from tests.quant.small_networks import (
+from quant.tiling.walk import Tiling, tiling_of
+from tests.quant.tiling.small_networks import (
     espcn,
     ffdnet,
     float_unet,

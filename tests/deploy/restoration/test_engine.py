@@ -14,7 +14,7 @@ from deploy.restoration.plan import Plan, make_plan
 from deploy.restoration.runtime import AT_ONCE, Infer, session_threads, tiles_at_once
 from deploy.restoration.source import ArraySource, Raster
 from profiles.errors import ImageError
-from quant.tiling import Tiling
+from quant.tiling.walk import Tiling
 
 SHAPE = (2, 75, 133)
 TILE_PX, RADIUS_PX = 32, 3

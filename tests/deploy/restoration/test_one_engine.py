@@ -27,7 +27,7 @@ from deploy.tradeoff.methods import CalibrationScenes, MethodStore, find_network
 from deploy.tradeoff.points import Point, Variant
 from profiles import load_sensor
 from quant.onnx_file import load_onnx
-from quant.tiling import receptive_radius_px
+from quant.tiling.walk import receptive_radius_px
 
 Restored = Callable[[np.ndarray], np.ndarray]
 

@@ -11,7 +11,7 @@ from deploy.restoration.plan import even_side_px, make_plan, plan_side
 from profiles.errors import OptionError
 from quant.onnx_file import load_onnx
 from quant.session import open_session, run
-from quant.tiling import Tiling
+from quant.tiling.walk import Tiling
 
 RADIUS_PX = 5
 TILING = Tiling(RADIUS_PX)

@@ -21,7 +21,7 @@ from profiles.errors import BeersError, ImageError, MachineError, ModelError, Op
 from profiles.figures import Row
 from quant.onnx_file import load_onnx, save_onnx
 from quant.session import open_session, run
-from quant.tiling import receptive_radius_px
+from quant.tiling.walk import receptive_radius_px
 
 RADIUS_PX = 5
 SHAPES = [(61, 83), (17, 130), (1, 40), (40, 1), (29, 29), (3, 5)]

@@ -10,7 +10,7 @@ from deploy.restoration.engine import restore_dn
 from deploy.restoration.plan import make_plan
 from deploy.tradeoff.accuracy import Scores, cut_in_four, halves, seam_density, with_seams
 from model.evaluation.scores import fidelity_db
-from quant.tiling import Tiling
+from quant.tiling.walk import Tiling
 
 RADIUS_PX = 2
 

@@ -14,13 +14,13 @@ import numpy as np
 import onnx
 
 from profiles.figures import Figure, Row, measured, predicted
-from quant.arithmetic import activated, bound_of, convolve, enlarged, means, window_maxima
 from quant.core import INT8_MAX, INT8_MIN, IntConv, IntCore
 from quant.ends import ZERO
-from quant.fixed_point import activation_table
 from quant.graph import CORRECTION, PLANES, Add, AveragePool, Concat, MaxPool, Mul, Op, Pointwise, Resize, Shuffle
+from quant.integer.arithmetic import activated, bound_of, convolve, enlarged, means, window_maxima
+from quant.integer.fixed_point import activation_table
 from quant.onnx_file import any_size, with_outputs
-from quant.session import few_crops, open_any_size, open_session, run
+from quant.session import few_crops, open_any_size, open_session, result_of
 
 INT32_BITS = 31
 """Of an accumulator, without the sign."""
@@ -234,7 +234,7 @@ def integer_rows(
         [core.ends.finished(crop, result) for result in (one.up, one.even)]
         for crop, one in zip(seen, found, strict=True)
     ]
-    in_float = [core.ends.clipped(run(session, crop)) for crop in seen]
+    in_float = [core.ends.clipped(result_of(session, crop)) for crop in seen]
     return layers, _rounding_row(in_float, both, source)
 
 

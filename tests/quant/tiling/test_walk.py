@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 from onnx import TensorProto, helper, numpy_helper
 
 from profiles.errors import ModelError
-from quant.tiling import Tiling, receptive_radius_px, tiling_of
-from tests.quant.small_networks import constant, float_unet, graph, int8_unet, networks, whole
+from quant.tiling.walk import Tiling, receptive_radius_px, tiling_of
+from tests.quant.tiling.small_networks import constant, float_unet, graph, int8_unet, networks, whole
 
 
 def one(

@@ -7,8 +7,8 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
 from quant.core import IntConv
-from quant.fixed_point import bilinear_weights, mean_factor
 from quant.graph import Activation, AveragePool, MaxPool, Window
+from quant.integer.fixed_point import bilinear_weights, mean_factor
 
 FLOAT32_WHOLE_MAX = 2**24
 """Up to here float32 holds whole numbers exactly, and sums them in any order."""

@@ -11,9 +11,9 @@ from onnx import helper
 from torch import Tensor, nn
 
 from profiles.errors import ModelError
-from quant.spelled_out import with_shuffles
-from quant.tiling import Tiling, tiling_of
-from tests.quant.small_networks import graph, whole
+from quant.tiling.spelled_out import with_shuffles
+from quant.tiling.walk import Tiling, tiling_of
+from tests.quant.tiling.small_networks import graph, whole
 
 
 class Old(nn.Module):
