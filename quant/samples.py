@@ -207,11 +207,12 @@ def samples_of(model: onnx.ModelProto, path: Path | None) -> OwnSamples | None:
         OptionError: no path, for a network that simulated patches do not suit.
         ModelError: no network of images.
     """
-    channels, fixed_px = _channels(model), fixed_tile_px(model)
+    channels, fixed_px, multiple_px = _channels(model), fixed_tile_px(model), _multiple_px(model)
     if path is not None:
-        return OwnSamples(path, channels, fixed_px, _multiple_px(model))
-    if channels != 1:
-        expected = f"samples for a network of {channels} channels: simulated patches have one"
+        return OwnSamples(path, channels, fixed_px, multiple_px or 1)
+    if channels != 1 or multiple_px is None:
+        what = f"{channels} channels" if channels != 1 else f"images of {fixed_px} x {fixed_px} pixels alone"
+        expected = f"samples for a network of {what}: simulated patches are others"
         remedy = "give a .npy or .npz file of (N, C, H, W) in [0, 1], or a folder of images"
         raise OptionError("--data", expected=expected, got="none", remedy=remedy)
     return None
@@ -221,9 +222,9 @@ def _channels(model: onnx.ModelProto) -> int:
     return int(model.graph.input[0].type.tensor_type.shape.dim[1].dim_value) or 1
 
 
-def _multiple_px(model: onnx.ModelProto) -> int:
-    """What the sides of an image must be multiples of; of a network that cannot be tiled its own size says it."""
+def _multiple_px(model: onnx.ModelProto) -> int | None:
+    """What the sides of an image must be multiples of; None of a network that has one size."""
     try:
         return tiling_of(model).lattice_px
     except ModelError:
-        return 1
+        return None

@@ -47,7 +47,7 @@ def read_network(model: onnx.ModelProto) -> Network:
     """
     with contradictions("float model"):
         reader = _Reader(model)
-        network = cut(reader.sized_graph(), _channels_in(model), model.graph.output[0].name in reader.flat)
+        network = cut(reader.sized_graph(), _channels_in(model), reader.flat)
         check_network(network)
     return network
 
@@ -127,7 +127,7 @@ class _Reader:
         for node in model.graph.node:
             for name in node.input:
                 self.readers[name] = self.readers.get(name, 0) + 1
-        self.flat: set[str] = set()
+        self.flat = False
         # Chains of moves by the tensor that they have come to; and which tensors another move goes on from.
         self.chains: dict[str, list[_Node]] = {}
         self.moving = {node.input[0]: True for node in model.graph.node if node.op_type in MOVES}
@@ -214,27 +214,12 @@ class _Reader:
             pads = [*less, *more] if auto == "SAME_UPPER" else [*more, *less]
         return Window(strides, (int(pads[0]), int(pads[1]), int(pads[2]), int(pads[3])), dilations)
 
-    def _gemm(self, node: _Node) -> Op:
-        weight, bias = self._weights(node)
-        plain = (
-            node.given.get("alpha", 1.0) == 1.0
-            and node.given.get("beta", 1.0) == 1.0
-            and not node.given.get("transA", 0)
-        )
-        self._require(plain and node.input[0] in self.flat, node, "a fully connected layer behind Flatten", "another")
-        weight = weight if node.given.get("transB", 0) else weight.T
-        self.flat.add(node.output[0])
-        bias = np.zeros(len(weight)) if bias is None else bias
-        whole = np.ascontiguousarray(weight)[:, :, None, None]
-        return Conv(node.name, node.input[0], node.output[0], whole, bias.astype(np.float32))
-
     def _flatten(self, node: _Node) -> None:
-        """Of a map of one pixel, which keeps its four sizes inside: (N, K) is (N, K, 1, 1)."""
-        before = self.ops[-1] if self.ops else None
-        pooled = isinstance(before, AveragePool) and before.kernel is None and before.output == node.input[0]
-        self._require(pooled, node, "Flatten behind global average pooling", "another")
+        """At the end, where what is flat is (N, K): inside it stays (N, K, 1, 1)."""
+        ends = node.output[0] == self.model.graph.output[0].name and bool(self.ops)
+        self._require(ends and self.ops[-1].output == node.input[0], node, "Flatten at the end alone", "another")
         self.ops[-1] = renamed(self.ops[-1], {node.input[0]: node.output[0]})
-        self.flat.add(node.output[0])
+        self.flat = True
 
     def _add(self, node: _Node) -> Op:
         return self._by_constant(node) or Add(node.name, (node.input[0], node.input[1]), node.output[0])

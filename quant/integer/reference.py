@@ -76,11 +76,11 @@ def run_core(
     """Every tensor of the core for its int8 planes (N, P, H, W), as int16, and a report a layer."""
     tensors, reports = {PLANES: faults.touch(PLANES, planes.astype(np.int16))}, []
     for op in core.ops:
-        sums, shift, bound = _sums(core, op, tensors, faults)
+        sums, shift, bound, finer = _sums(core, op, tensors, faults)
         result, ties = _shifted(sums, shift, half_even)
         tensors[op.output] = faults.touch(op.output, result)
         ends = (result == INT8_MAX) | (result == INT8_MIN)
-        peak = float(np.log2(max(int(np.abs(sums).max()), 1)))
+        peak = max(float(np.log2(max(int(np.abs(sums).max()), 1))) - finer, 0.0)
         reports.append(LayerReport(op.name, peak, bound, float(ends.mean()), ties))
     return tensors, reports
 
@@ -97,8 +97,9 @@ def merged_correction(core: IntCore, tensors: Mapping[str, np.ndarray]) -> np.nd
     return core.ends.merge((tensors[CORRECTION] * np.float32(scale)).astype(np.float32), scale)
 
 
-Sums = tuple[np.ndarray, int, float]
-"""The accumulators (N, O, H, W) int64, the shift to int8, and the bits that they cannot exceed."""
+Sums = tuple[np.ndarray, int, float, int]
+"""Sums (N, O, H, W) int64, the shift to int8, the bits that accumulators cannot exceed, and by how many more
+fractional bits an activation has made these sums longer than the accumulators were."""
 
 INT8_BITS = 7.0
 """Of what only moves values, without the sign."""
@@ -112,12 +113,12 @@ def _sums(core: IntCore, op: IntConv | Op, tensors: Mapping[str, np.ndarray], fa
         return _add(core, op, read, faults)
     if isinstance(op, Mul):
         product = read[0].astype(np.int64) * read[1]
-        return product, sum(core.frac_bits[name] for name in op.inputs) - core.frac_bits[op.output], 14.0
+        return product, sum(core.frac_bits[name] for name in op.inputs) - core.frac_bits[op.output], 14.0, 0
     if isinstance(op, AveragePool):
-        return means(read[0], op)
+        return *means(read[0], op), 0
     if isinstance(op, Resize) and op.bilinear:
-        return enlarged(read[0], op.factor)
-    return _moving(core, op, read), 0, INT8_BITS
+        return *enlarged(read[0], op.factor), 0
+    return _moving(core, op, read), 0, INT8_BITS, 0
 
 
 def _moving(core: IntCore, op: Op, read: list[np.ndarray]) -> np.ndarray:
@@ -141,7 +142,7 @@ def _conv(core: IntCore, op: IntConv, image: np.ndarray, faults: Faults) -> Sums
     sums = convolve(image, op.weight, op.window, op.groups, op.transposed) + bias[:, None, None]
     sums, finer = activated(sums, op.activation, product)
     cut = faults.shift(op.name, "shift_cut", product - core.frac_bits[op.output])
-    return sums, cut + finer, bound_of(op, bias)
+    return sums, cut + finer, bound_of(op, bias), finer
 
 
 def _add(core: IntCore, op: Add, read: list[np.ndarray], faults: Faults) -> Sums:
@@ -153,7 +154,7 @@ def _add(core: IntCore, op: Add, read: list[np.ndarray], faults: Faults) -> Sums
     bound = sum(128 << shift for shift in shifts)
     coarsest = min(core.frac_bits[name] for name in op.inputs)
     write = faults.shift(op.name, "shift_write", coarsest - core.frac_bits[op.output])
-    return sums, finest - coarsest + write + finer, float(np.log2(bound))
+    return sums, finest - coarsest + write + finer, float(np.log2(bound)), finer
 
 
 def _moved(values: np.ndarray, shift: int) -> np.ndarray:
