@@ -53,8 +53,8 @@ def quantize(
 ) -> None:
     """Quantise to int8 with power-of-two scales: the correction on the DPU, the 12-bit add on the host.
 
-    Taken are residual networks of one channel: same-size convolutions of stride 1, each ReLU right behind one, adds,
-    and at the end the add of the image. 'check' says of a float file whether it is one of these.
+    Taken is any network that a DPU computes, of one band or several, with or without a global add; see
+    docs/any-network.md. 'check' says of a float file whether it is one of these.
 
     Prints each integer layer: bits of its accumulator, seen and proven, and the share of saturated results.
     """
