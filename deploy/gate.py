@@ -161,14 +161,14 @@ def baseline_mae(path: Path, arguments: Mapping[str, Any]) -> float:
     """
     try:
         document: Any = read_json(path)
-        before = {name: _plain(name, document["arguments"][name]) for name in PATCHES}
+        before = {name: _plain(name, document["arguments"].get(name)) for name in PATCHES}
         mae = float(next(row["figures"]["MAE"]["value"] for row in document["rows"] if row["table"] == "gate"))
     except (OSError, ValueError, KeyError, TypeError, StopIteration) as error:
         got = unreadable(path) or "another document"
         remedy = "give what 'gate --json' wrote"
         raise OptionError(str(path), expected="a gate's results", got=got, remedy=remedy) from error
     for name in PATCHES:
-        now = _plain(name, arguments[name])
+        now = _plain(name, arguments.get(name))
         if before[name] != now:
             expected, got = f"a baseline of the same patches ({name} {now})", f"{name} {before[name]}"
             raise OptionError(str(path), expected=expected, got=got, remedy="make it anew with these")

@@ -96,9 +96,10 @@ def _channels(model: onnx.ModelProto) -> tuple[int, int]:
     counts = [_channel_count(images[0]), _channel_count(model.graph.output[0])]
     if not all(counts):
         counts[1] = counts[1] or _channel_count(onnx.shape_inference.infer_shapes(model).graph.output[0])
-    if not all(counts):
-        raise refused("images (N, C, H, W) of a stated number of channels", f"{counts[0]} in and {counts[1]} out")
-    return counts[0], counts[1]
+    if not counts[0]:
+        raise refused("an image (N, C, H, W) of a stated number of channels", "none stated")
+    # Where neither file nor inference tells, as with a runtime's own operators, what comes out is judged as it comes.
+    return counts[0], counts[1] or counts[0]
 
 
 def _channel_count(value: onnx.ValueInfoProto) -> int:
