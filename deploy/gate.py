@@ -161,7 +161,7 @@ def baseline_mae(path: Path, arguments: Mapping[str, Any]) -> float:
     """
     try:
         document: Any = read_json(path)
-        before = {name: _plain(name, document["arguments"].get(name)) for name in PATCHES}
+        before = {name: _plain(name, dict(document["arguments"]).get(name)) for name in PATCHES}
         mae = float(next(row["figures"]["MAE"]["value"] for row in document["rows"] if row["table"] == "gate"))
     except (OSError, ValueError, KeyError, TypeError, StopIteration) as error:
         got = unreadable(path) or "another document"
