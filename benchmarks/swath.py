@@ -33,7 +33,7 @@ from deploy.restoration.run import restore_file
 from deploy.restoration.runtime import open_runtime
 from model.convbeers import ConvBEERS, initialise
 from model.variants import VARIANTS, Variant
-from quant.onnx_file import receptive_radius_px
+from quant.tiling.walk import tiling_of
 
 TILE_PX = 640
 ENTRY = "from deploy.cli import app; app()"
@@ -73,8 +73,8 @@ def speed(folder: Path, options: Options, size: tuple[int, int], repeats: int) -
     image = folder / "image.tif"
     dn = write_noise(image, size)
     network = onnx.load(options.model)
-    radius_px = receptive_radius_px(network)
-    plan = make_plan((1, *dn.shape), TILE_PX, radius_px, radius_px)
+    tiling = tiling_of(network)
+    plan = make_plan((1, *dn.shape), TILE_PX, tiling.halo_px, tiling)
     seen = [dn[r.start : r.stop, c.start : c.stop] for r in plan.rows for c in plan.columns]
     windows = [np.ascontiguousarray(pixels, np.float32)[None, None] / np.float32(4095) for pixels in seen]
     infer, version = open_runtime(options.runtime, network, options.threads)

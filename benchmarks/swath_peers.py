@@ -20,7 +20,7 @@ from deploy.restoration.engine import restore_window
 from deploy.restoration.options import Options
 from deploy.restoration.run import restore_file
 from deploy.restoration.runtime import open_runtime
-from quant.onnx_file import receptive_radius_px
+from quant.tiling.walk import receptive_radius_px
 
 HERE = Path(__file__).parent
 CHILD = HERE / "monai_child.py"

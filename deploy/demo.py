@@ -40,9 +40,10 @@ from profiles.figures import Row, measured
 from profiles.sensor_file import reference_for
 from quant.calibration import HELD_OUT_SEED, draw_patches
 from quant.gate import compare, gate_row
-from quant.onnx_file import load_onnx, receptive_radius_px, save_onnx
+from quant.onnx_file import load_onnx, save_onnx
 from quant.quantise import quantise_model
 from quant.session import open_session
+from quant.tiling.walk import receptive_radius_px
 
 CROP_PX, ZOOM = 110, 3
 LARGEST_PX = 1280

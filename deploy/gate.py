@@ -31,14 +31,15 @@ from profiles import load_sensor, load_target
 from profiles.errors import BeersError, MachineError, OptionError, printable
 from profiles.figures import Row
 from profiles.toml import read_json, unreadable
-from quant.calibration import unseen_patches
+from quant.calibration import Patches, unseen_patches
 from quant.checks import Check
 from quant.gate import GateResult, Limits, compare, judge, judge_saturation, verdict_row
 from quant.onnx_file import fixed_tile_px, load_onnx, require_quantised
+from quant.samples import samples_of
 from quant.session import open_any_size
 from quant.structure import saturated_shares, structure_checks
 
-PATCHES = ("sensor", "images", "patches", "seed")
+PATCHES = ("sensor", "images", "patches", "seed", "data")
 """The arguments that say what INT8 and float are compared on."""
 
 
@@ -54,6 +55,7 @@ class Request:
         target: name of the board whose rules the INT8 file must keep.
         sensor: name or file of the profile of the test patches.
         images: folder of scenes; None for drawn ones.
+        data: the user's own samples in place of simulated patches, or None.
         patches: number of test patches of 128 x 128.
         seed: of the patches.
     """
@@ -67,6 +69,7 @@ class Request:
     images: Path | None
     patches: int
     seed: int
+    data: Path | None = None
 
 
 @dataclass(frozen=True)
@@ -105,11 +108,23 @@ def run_gate(request: Request) -> Outcome:
     require_quantised(floating, request.float_path, wanted=False)
     require_quantised(int8, request.int8_path, wanted=True)
     sessions = open_any_size(floating), open_any_size(int8)
-    unseen = unseen_patches(load_sensor(request.sensor), request.images, request.patches, request.seed)
-    result, shares = compare(*sessions, unseen.pairs), saturated_shares(int8, unseen.degraded)
+    unseen, simulated = _unseen(request, floating)
+    result, shares = compare(*sessions, unseen.pairs, simulated), saturated_shares(int8, unseen.degraded)
     checks = judge(result, request.limits, before) + judge_saturation(shares, request.limits)
     checks += file_checks(floating, request.int8_path, int8, request.target)
     return Outcome(result, shares, tuple(checks))
+
+
+def _unseen(request: Request, model: onnx.ModelProto) -> tuple[Patches, bool]:
+    """What the two are compared on, and whether it is simulated."""
+    own = samples_of(model, request.data)
+    if own is None:
+        sensor = load_sensor(request.sensor)
+        return unseen_patches(sensor, request.images, request.patches, request.seed), True
+    if request.limits.psnr_drop_db is not None and all(reference is None for _, reference in own.all.pairs):
+        expected, remedy = "references for psnr_drop_db", "give a .npz file with image and reference, or no limit"
+        raise OptionError("--data", expected=expected, got="images alone", remedy=remedy)
+    return own.all, False
 
 
 def files_or_shipped(
@@ -146,14 +161,14 @@ def baseline_mae(path: Path, arguments: Mapping[str, Any]) -> float:
     """
     try:
         document: Any = read_json(path)
-        before = {name: _plain(name, document["arguments"][name]) for name in PATCHES}
+        before = {name: _plain(name, dict(document["arguments"]).get(name)) for name in PATCHES}
         mae = float(next(row["figures"]["MAE"]["value"] for row in document["rows"] if row["table"] == "gate"))
     except (OSError, ValueError, KeyError, TypeError, StopIteration) as error:
         got = unreadable(path) or "another document"
         remedy = "give what 'gate --json' wrote"
         raise OptionError(str(path), expected="a gate's results", got=got, remedy=remedy) from error
     for name in PATCHES:
-        now = _plain(name, arguments[name])
+        now = _plain(name, arguments.get(name))
         if before[name] != now:
             expected, got = f"a baseline of the same patches ({name} {now})", f"{name} {before[name]}"
             raise OptionError(str(path), expected=expected, got=got, remedy="make it anew with these")

@@ -24,6 +24,7 @@ from model.io.images import settled_scale
 from profiles.errors import ImageError, OptionError
 from profiles.sensor_file import BLIND, load_sensor
 from quant.onnx_file import load_onnx
+from quant.tiling.walk import Tiling
 
 Image = TypeVar("Image")
 """numpy.ndarray, dask.array.Array or xarray.DataArray."""
@@ -41,7 +42,9 @@ def restore(
     nodata: float | None = None,
     sensor: str = BLIND,
 ) -> Image:
-    """Restore an image of raw digital numbers, (H, W) or (bands, H, W); bands are restored one by one.
+    """Restore an image of raw digital numbers, (H, W) or (bands, H, W).
+
+    A network of one band restores bands one by one, another one those that it takes together.
 
     Args:
         image: of numpy it is restored at once; of Dask the result is lazy, a chunk for each tile and band, and may be
@@ -60,7 +63,8 @@ def restore(
             known. INT8 for a sensor of your own takes minutes once, and is kept.
 
     Returns:
-        The same kind, shape and scale: uint16 of integers, float32 of floats. Missing pixels stay as they are.
+        The same kind and scale, uint16 of integers, float32 of floats; of the same shape, unless the network makes
+        more pixels or other bands. Missing pixels stay as they are.
 
     Raises:
         ImageError: no such array, pixels that leave the full scale open, or values outside 0 to full scale; of
@@ -75,7 +79,7 @@ def restore(
     if hasattr(image, "coords") and hasattr(image, "dims"):  # an xarray.DataArray, without importing it
         labelled: Any = image
         missing = labelled.attrs.get("_FillValue") if nodata is None else nodata
-        restored: Image = labelled.copy(data=_restore(labelled.data, options, missing))
+        restored: Image = _labelled(labelled, _restore(labelled.data, options, missing))
         return restored
     plain: Image = _restore(image, options, nodata)
     return plain
@@ -88,7 +92,32 @@ def _restore(image: Any, options: Options, nodata: float | None) -> Any:
         restored = restore_lazily(bands, raster, options)
     else:
         restored = _restore_now(bands, raster, options)
-    return restored.reshape(image.shape)
+    return restored[0] if image.ndim == 2 and len(restored) == 1 else restored
+
+
+def _labelled(image: Any, pixels: Any) -> Any:
+    """Restored pixels with an xarray.DataArray's labels; where they are more than it had, those of their places."""
+    if pixels.shape == image.shape:
+        return image.copy(data=pixels)
+    dims = image.dims if pixels.ndim == image.ndim else ("band", *image.dims)
+    sizes = dict(zip(dims, pixels.shape, strict=True))
+    changed = {dim for dim in image.dims if sizes[dim] != image.sizes[dim]}
+    coordinates = {name: each.copy() for name, each in image.coords.items() if not changed.intersection(each.dims)}
+    for each in coordinates.values():
+        each.attrs.pop("GeoTransform", None)  # of the pixels before; what lies where is told by the places
+    for dim in changed.intersection(image.dims[-2:], image.coords):
+        places = _between(image.coords[dim].values, sizes[dim])
+        coordinates |= {dim: (dim, places, image.coords[dim].attrs)} if places is not None else {}
+    return type(image)(pixels, coordinates, dims, image.name, image.attrs)
+
+
+def _between(places: np.ndarray, count: int) -> np.ndarray | None:
+    """The middles of `count` pixels over those at `places`, evenly between; None where these are no two numbers."""
+    if len(places) < 2 or places.dtype.kind not in "iuf":
+        return None
+    at = (np.arange(count) + 0.5) * (len(places) / count) - 0.5
+    left = np.clip(np.floor(at).astype(int), 0, len(places) - 2)
+    return np.asarray(places[left] + (at - left) * (places[left + 1] - places[left]))
 
 
 def _restore_now(bands: np.ndarray, raster: Raster, options: Options) -> np.ndarray:
@@ -97,7 +126,7 @@ def _restore_now(bands: np.ndarray, raster: Raster, options: Options) -> np.ndar
     at_once = tiles_at_once(options.threads, plan.tiles)
     infer, _ = open_runtime(options.runtime, network, options.threads, at_once)
     full_scale = scale_of(source, plan, options.full_scale, NAME)
-    restorer = Restorer(raster, infer, full_scale, plan.radius_px, NAME)
+    restorer = Restorer(raster, infer, full_scale, plan.tiling, NAME)
     return restore_array(source, plan, restorer, at_once)
 
 
@@ -136,7 +165,7 @@ class Task:
     raster: Raster
     network: Packed
     full_scale: float | None
-    radius_px: int
+    tiling: Tiling
 
     def restorer(self, window: np.ndarray) -> Restorer:
         """For this process, at the full scale that was asked for or that the window's pixels tell.
@@ -148,7 +177,7 @@ class Task:
         full_scale = settled_scale(NAME, self.raster.dtype, largest, self.full_scale)
         with _opening:
             infer = _kept(self.network)
-        return Restorer(self.raster, infer, full_scale, self.radius_px, NAME)
+        return Restorer(self.raster, infer, full_scale, self.tiling, NAME)
 
 
 def restore_lazily(bands: Any, raster: Raster, options: Options) -> Any:
@@ -159,22 +188,22 @@ def restore_lazily(bands: Any, raster: Raster, options: Options) -> Any:
     plan = plan_for(network, raster.shape, options)
     settled_scale(NAME, raster.dtype, (), options.full_scale)  # what the type alone decides comes at once
     packed = pack(network, options.runtime, options.threads or 1)
-    task = delayed(Task(raster, packed, options.full_scale, plan.radius_px))
+    task = delayed(Task(raster, packed, options.full_scale, plan.tiling))
     tile = delayed(restore_tile)
 
-    def block(plane: int, row: Span, column: Span) -> Any:
+    def block(group: int, row: Span, column: Span) -> Any:
         rows, columns = (_around(span, raster, plan) for span in (row, column))
-        window = bands[plane : plane + 1, rows, columns]
-        shape = (1, row.keep_stop - row.keep_start, column.keep_stop - column.keep_start)
+        window = bands[group * count : (group + 1) * count, rows, columns]
+        sides = ((span.keep_stop - span.keep_start) * plan.scale for span in (row, column))
         restored = tile(task, window, rows.start, columns.start, row, column)
-        return da.from_delayed(restored, shape, raster.out_dtype)
+        return da.from_delayed(restored, (plan.tiling.channels_out, *sides), raster.out_dtype)
 
-    planes = range(raster.bands)
-    return da.block([[[block(p, row, column) for column in plan.columns] for row in plan.rows] for p in planes])
+    count, groups = plan.tiling.channels_in, range(plan.groups)
+    return da.block([[[block(g, row, column) for column in plan.columns] for row in plan.rows] for g in groups])
 
 
 def restore_tile(task: Task, window: np.ndarray, top: int, left: int, row: Span, column: Span) -> np.ndarray:
-    """The kept pixels (1, h, w) of one tile, from a window (1, ., .) whose first pixel is at (top, left).
+    """The kept pixels (bands, h, w) of one tile, from a window (bands, ., .) whose first pixel is at (top, left).
 
     Raises:
         ImageError: values outside 0 to full scale, or a full scale left open.
@@ -183,7 +212,7 @@ def restore_tile(task: Task, window: np.ndarray, top: int, left: int, row: Span,
     here = Span(*(side - left for side in (column.start, column.stop, column.keep_start, column.keep_stop)))
     strip = checked_strip(task.raster, top, window, restorer.full_scale, NAME)
     pixels, _ = restorer.tile(strip, 0, row, here)
-    return pixels[None]
+    return pixels
 
 
 def _around(span: Span, raster: Raster, plan: Plan) -> slice:

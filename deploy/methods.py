@@ -36,7 +36,8 @@ from profiles.errors import OptionError
 from profiles.sensor import Sensor, SensorProfile
 from profiles.sensor_file import BLIND as NOT_KNOWN
 from profiles.sensor_file import BLIND_PROFILE, load_sensor
-from quant.onnx_file import fixed_tile_px, load_onnx, metadata, receptive_radius_px
+from quant.onnx_file import load_onnx, metadata
+from quant.tiling.walk import tiling_of
 
 EXPECTED = (
     f"degraded, {TRADITIONAL}, {DECONVOLVE_FIRST} (each also with -fast or -best), {', '.join(PEERS)}, "
@@ -124,10 +125,10 @@ def network_method(model: onnx.ModelProto, max_dn: int) -> Restore:
 
 def restoring(infer: Infer, model: onnx.ModelProto, max_dn: int) -> Restore:
     """As `network_method`, of a network that is open already; tiles are the default ones, or those it is fixed to."""
-    radius_px, fixed_px = receptive_radius_px(model), fixed_tile_px(model)
+    tiling = tiling_of(model)
 
     def restore(dn: np.ndarray) -> np.ndarray:
-        plan = make_plan((1, *dn.shape), fixed_px or TILE_PX, radius_px, radius_px, fixed_px is not None)
+        plan = make_plan((1, *dn.shape), tiling.fixed_px or TILE_PX, tiling.halo_px, tiling)
         return restore_dn(dn, infer, plan, max_dn)
 
     return restore

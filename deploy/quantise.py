@@ -23,6 +23,7 @@ from quant.gate import compare, gate_row
 from quant.integer import integer_rows
 from quant.onnx_file import save_onnx
 from quant.quantise import Passes, Quantised, ablation_rows, ablations, quantise_model, ticks
+from quant.samples import OwnSamples
 from quant.sensitivity import WORST, headline, layer_error_rows, sizes_row, spread_of, worst_row
 from quant.session import LAYER_PATCHES, open_any_size
 
@@ -39,6 +40,8 @@ def sensitivity_report(
     return rows, sensitivity_page(headline(gate, layers), [*rows, *more], spread, held_out, sessions, worst)
 
 
+Source = Calibration | OwnSamples
+"""Where patches come from: simulated ones, or a user's own."""
 Say = Callable[[str], None]
 """Tells a sentence as the work goes on."""
 Show = Callable[[str, list[Row]], None]
@@ -54,22 +57,21 @@ class Wanted:
     page: Path | None
 
 
-def quantise_free_file(
-    model: onnx.ModelProto, calibration: Calibration, out: Path, say: Say, show: Show
-) -> list[Row]:
+def quantise_free_file(model: onnx.ModelProto, calibration: Source, out: Path, say: Say, show: Show) -> list[Row]:
     """Write the INT8 file without the DPU's rules, and compare it with the float network."""
     with steps("calibrating", free_ticks(model, calibration.patches)) as bar:
         made = quantise_free(model, calibration.drawn, calibration.about, bar.advance)
     save_onnx(made, out)
     say(f"wrote {out}: float scales, for boards that are not the DPU")
-    row = gate_row(compare(open_any_size(model), open_any_size(made), calibration.unseen.pairs))
+    sessions, simulated = (open_any_size(model), open_any_size(made)), isinstance(calibration, Calibration)
+    row = gate_row(compare(*sessions, calibration.unseen.pairs, simulated))
     show("float against INT8, on patches that calibration did not see", [row])
     return [row]
 
 
 def quantise_legal_file(
     model: onnx.ModelProto,
-    calibration: Calibration,
+    calibration: Source,
     target: TargetProfile,
     passes: Passes,
     out: Path,
@@ -106,7 +108,7 @@ def _shifts_of(target: TargetProfile) -> Shifts:
     return target_shifts(target)
 
 
-def _ablated(model: onnx.ModelProto, calibration: Calibration, shifts: Shifts, show: Show) -> list[Row]:
+def _ablated(model: onnx.ModelProto, calibration: Source, shifts: Shifts, show: Show) -> list[Row]:
     with steps("ablating", len(ablations())) as bar:
         rows = ablation_rows(model, calibration.drawn, calibration.unseen, bar.advance, shifts)
     show("what each pass buys, on patches that calibration did not see", rows)
@@ -114,7 +116,7 @@ def _ablated(model: onnx.ModelProto, calibration: Calibration, shifts: Shifts, s
 
 
 def _with_sensitivity(
-    model: onnx.ModelProto, result: Quantised, calibration: Calibration, rows: list[Row], page: Path, say: Say
+    model: onnx.ModelProto, result: Quantised, calibration: Source, rows: list[Row], page: Path, say: Say
 ) -> list[Row]:
     with steps("attributing errors", LAYER_PATCHES) as bar:
         found, written = sensitivity_report(model, result, calibration.unseen, rows, bar.advance)

@@ -47,11 +47,13 @@ PATHS = {
     "train": Paths({"out": FOLDER}, ("images", "pairs", "lpips", "start", "teacher"), ("sensor", "reference")),
     "export": Paths({"out": FILE}, ("checkpoint",), ("sensor",)),
     "quantize": Paths(
-        {"out": FILE, "board": FILE, "report": FOLDER, "json": FILE}, ("model", "images"), ("sensor", "target")
+        {"out": FILE, "board": FILE, "report": FOLDER, "json": FILE},
+        ("model", "images", "data"),
+        ("sensor", "target"),
     ),
     "gate": Paths(
         {"summary": FILE, "junit": FILE, "outputs": FILE, "json": FILE},
-        ("float_model", "int8_model", "config", "baseline", "images"),
+        ("float_model", "int8_model", "config", "baseline", "images", "data"),
         ("sensor", "target"),
     ),
     "check": Paths({"picture": FILE, "json": FILE}, ("model",), ("target",)),

@@ -12,10 +12,12 @@ from .gate import Limits as Limits
 from .gate import compare as compare
 from .gate import judge as judge
 from .onnx_file import load_onnx as load_onnx
-from .onnx_file import receptive_radius_px as receptive_radius_px
 from .onnx_file import save_onnx as save_onnx
 from .quantise import Passes as Passes
 from .quantise import Quantised as Quantised
 from .quantise import quantise_model as quantise_model
 from .session import open_session as open_session
 from .session import run as run
+from .tiling.walk import Tiling as Tiling
+from .tiling.walk import receptive_radius_px as receptive_radius_px
+from .tiling.walk import tiling_of as tiling_of

@@ -9,7 +9,26 @@ from dataclasses import dataclass
 import numpy as np
 
 from quant.core import INT8_MAX, INT8_MIN, IntConv, IntCore
-from quant.graph import COARSE_MAX, CORRECTION, IMAGE, PLANES, QUARTER, STEP, Add, Conv, Graph
+from quant.graph import (
+    COARSE_MAX,
+    CORRECTION,
+    IMAGE,
+    PLANES,
+    QUARTER,
+    STEP,
+    Activation,
+    Add,
+    AveragePool,
+    Concat,
+    Conv,
+    Graph,
+    Mul,
+    Op,
+    Pointwise,
+    Shuffle,
+)
+from quant.integer.arithmetic import activated
+from quant.integer.fixed_point import activation_table, mean_factor
 
 
 @dataclass(frozen=True)
@@ -59,9 +78,10 @@ def bound_anywhere(graph: Graph) -> Bound:
         if isinstance(op, Add):
             spans[op.output] = spans[op.inputs[0]] + spans[op.inputs[1]]
             continue
+        assert isinstance(op, Conv)  # noqa: S101 - correction_graph has seen to it
         sums = spans[op.input].padded().through(op.weight.astype(np.float64))
         span = Span(sums.low + op.bias, sums.high + op.bias, sums.change)
-        spans[op.output] = span.relu() if op.relu else span
+        spans[op.output] = span.relu() if op.activation is Activation.relu else span
     return _largest(spans[CORRECTION] + ALL_IMAGES)
 
 
@@ -99,8 +119,9 @@ def bound_inside(graph: Graph) -> Bound:
         if isinstance(op, Add):
             forms[op.output] = forms[op.inputs[0]] + forms[op.inputs[1]]
             continue
+        assert isinstance(op, Conv)  # noqa: S101
         form = forms[op.input].through(op)
-        if op.relu:
+        if op.activation is Activation.relu:
             sources[op.output] = form.span(sources).relu()
             channels = len(op.bias)
             form = Form({op.output: np.eye(channels)[:, :, None, None]}, np.zeros(channels))
@@ -164,7 +185,7 @@ def layer_bounds(core: IntCore) -> list[LayerBound]:
     ranges: dict[str, Range] = {PLANES: _planes(core)}
     bounds = []
     for op in core.ops:
-        low, high, shift = _conv(core, op, ranges) if isinstance(op, IntConv) else _whole_add(core, op, ranges)
+        low, high, shift = _accumulated(core, op, [ranges[name] for name in op.inputs])
         bits = float(np.log2(max(int(np.abs(low).max()), int(np.abs(high).max()), 1)))
         low, high = _shifted(low, shift), _shifted(high, shift)
         ranges[op.output] = np.clip(low, INT8_MIN, INT8_MAX), np.clip(high, INT8_MIN, INT8_MAX)
@@ -181,35 +202,77 @@ def correction_bound(core: IntCore, gain: int) -> float:
     """The largest size of the correction, of full scale, where its last channel counts `gain` times."""
     low, high = layer_bounds(core)[-1].low, layer_bounds(core)[-1].high
     size = max(min(high, INT8_MAX), -max(low, INT8_MIN))
-    return size * core.scale(CORRECTION) * (gain if core.output_channels == 2 else 1)
+    return size * core.scale(CORRECTION) * (gain if core.ends.gains == 2 else 1)
 
 
 def _planes(core: IntCore) -> Range:
-    first = core.ops[0]
-    count = first.weight.shape[1] if isinstance(first, IntConv) else 1
-    return PLANE_LOW[:count], PLANE_HIGH[:count]
+    count, channels = core.ends.planes, core.ends.channels
+    return PLANE_LOW[:count].repeat(channels), PLANE_HIGH[:count].repeat(channels)
 
 
-def _conv(core: IntCore, op: IntConv, ranges: dict[str, Range]) -> tuple[np.ndarray, np.ndarray, int]:
-    """The accumulators' interval, zero padding included, and the shift to int8."""
-    low, high = np.minimum(ranges[op.input][0], 0), np.maximum(ranges[op.input][1], 0)
+Accumulated = tuple[np.ndarray, np.ndarray, int]
+"""The accumulators' interval, zero padding included, and the shift to int8."""
+
+
+def _accumulated(core: IntCore, op: IntConv | Op, read: list[Range]) -> Accumulated:
+    if isinstance(op, IntConv):
+        return _conv(core, op, read[0])
+    if isinstance(op, Add):
+        return _whole_add(core, op, read)
+    if isinstance(op, Mul):
+        corners = np.array([a.astype(np.int64) * b for a in read[0] for b in read[1]])
+        shift = sum(core.frac_bits[name] for name in op.inputs) - core.frac_bits[op.output]
+        return corners.min(0), corners.max(0), shift
+    if isinstance(op, AveragePool):
+        assert op.kernel is not None  # noqa: S101 - resolved before anything is quantised
+        factor, shift = mean_factor(op.kernel)
+        low, high = (op.kernel[0] * op.kernel[1] * factor * end.astype(np.int64) for end in _padded(read[0]))
+        return low, high, shift
+    low, high = _moved(core, op, read)
+    return low, high, 0
+
+
+def _moved(core: IntCore, op: Op, read: list[Range]) -> Range:
+    """Behind what hands values on, or looks them up."""
+    low, high = (np.concatenate([ends[k] for ends in read]) for k in (0, 1))
+    if isinstance(op, Concat):
+        return low, high
+    if isinstance(op, Pointwise):
+        table = activation_table(op, core.frac_bits)
+        spans = [table[a - INT8_MIN : b - INT8_MIN + 1] for a, b in zip(low, high, strict=True)]
+        return np.array([span.min() for span in spans]), np.array([span.max() for span in spans])
+    if isinstance(op, Shuffle):
+        side = 1 if op.up else op.block
+        maps = [op(np.tile(end[None, :, None, None], (1, 1, side, side)))[0] for end in (low, high)]
+        return maps[0].min((1, 2)), maps[1].max((1, 2))
+    return low, high
+
+
+def _padded(ends: Range) -> Range:
+    return np.minimum(ends[0], 0), np.maximum(ends[1], 0)
+
+
+def _conv(core: IntCore, op: IntConv, read: Range) -> Accumulated:
+    low, high = _padded(read)
     weight = op.weight.astype(np.int64)
     up, down = np.maximum(weight, 0).sum((2, 3)), np.minimum(weight, 0).sum((2, 3))
     product = op.weight_frac_bits + core.frac_bits[op.input]
     bias = op.bias.astype(np.int64) << (product - op.bias_frac_bits)
-    least, most = up @ low + down @ high + bias, up @ high + down @ low + bias
-    if op.relu:
-        least, most = np.maximum(least, 0), np.maximum(most, 0)
-    return least, most, product - core.frac_bits[op.output]
+    if op.groups == 1:
+        least, most = up @ low + down @ high + bias, up @ high + down @ low + bias
+    else:  # depthwise: each channel its own
+        up, down = up[:, 0], down[:, 0]
+        least, most = up * low + down * high + bias, up * high + down * low + bias
+    (least, finer), (most, _) = (activated(end, op.activation, product) for end in (least, most))
+    return least, most, product - core.frac_bits[op.output] + finer
 
 
-def _whole_add(core: IntCore, op: Add, ranges: dict[str, Range]) -> tuple[np.ndarray, np.ndarray, int]:
+def _whole_add(core: IntCore, op: Add, read: list[Range]) -> Accumulated:
     finest = max(core.frac_bits[name] for name in op.inputs)
-    low, high = (
-        sum(ranges[name][end].astype(np.int64) << (finest - core.frac_bits[name]) for name in op.inputs)
-        for end in (0, 1)
-    )
-    return np.asarray(low), np.asarray(high), finest - core.frac_bits[op.output]
+    shifts = [finest - core.frac_bits[name] for name in op.inputs]
+    ends = (sum(r[k].astype(np.int64) << s for r, s in zip(read, shifts, strict=True)) for k in (0, 1))
+    (low, finer), (high, _) = (activated(np.asarray(end), op.activation, finest) for end in ends)
+    return low, high, finest - core.frac_bits[op.output] + finer
 
 
 def _shifted(sums: np.ndarray, shift: int) -> np.ndarray:

@@ -26,7 +26,8 @@ from profiles.errors import ImageError
 from profiles.sensor import Sensor, SensorProfile
 from profiles.sensor_file import reference_for
 from quant.core import CANDIDATES, squared_errors, unclipped_frac_bits
-from quant.graph import PLANES, PLANES_FRAC_BITS, Graph, graph_to_onnx, tensors
+from quant.ends import ONE_CHANNEL, Ends
+from quant.graph import PLANES, PLANES_FRAC_BITS, Graph, graph_to_onnx, tensors, tied
 from quant.session import halo_of, open_session, tensor_values
 
 VIEW_CANDIDATES = 8
@@ -157,6 +158,7 @@ DEGRADED = "degraded"
 
 T = TypeVar("T")
 Pair = tuple[np.ndarray, np.ndarray]
+"""(degraded, reference) of a patch; the reference of a user's own sample that has none is empty."""
 
 
 @dataclass(frozen=True)
@@ -246,30 +248,41 @@ def _simulate(ground: Ground, sensors: dict[str, Sensor], draw: Draw) -> list[np
 
 
 def choose_frac_bits(
-    graph: Graph, images: Iterable[np.ndarray], tick: Callable[[], None], least_squares: bool = True
+    graph: Graph,
+    images: Iterable[np.ndarray],
+    tick: Callable[[], None],
+    least_squares: bool = True,
+    ends: Ends = ONE_CHANNEL,
 ) -> dict[str, int]:
-    """Least-squares scale of every tensor of a plane-reading graph over images (1, 1, H, W) in [0, 1].
+    """Least-squares scale of every tensor of a plane-reading graph over images (1, C, H, W) in [0, 1].
+
+    Tensors that must share a scale (`quant.graph.tied`) get that of least error in all of them together.
 
     Two passes, so images that can be passed over twice: the largest values, then the squared errors of the scales
     around them. `tick` is called once per
     image and pass. Without `least_squares` the scales are those that clip nothing.
     """
     names, halo_px = tensors(graph), halo_of(graph)
-    session = open_session(graph_to_onnx(graph, names))
+    session = open_session(graph_to_onnx(graph, names, ends.planes * ends.channels))
+    shared = tied(graph)
+    groups = np.array([names.index(shared[name]) if shared[name] in names else -1 for name in names])
 
     def values() -> Iterator[list[np.ndarray]]:
         for image in images:
-            yield from tensor_values(session, names, image, halo_px)
+            yield from tensor_values(session, names, image, halo_px, ends)
             tick()
+
+    def together(of_each: np.ndarray, join: Callable[..., np.ndarray]) -> np.ndarray:
+        return np.stack([join(of_each[groups == group], axis=0) for group in groups])
 
     largest = np.zeros(len(names))
     for results in values():
         largest = np.maximum(largest, [float(np.abs(r).max()) for r in results])
-    first = [unclipped_frac_bits(m) for m in largest]
+    first = [unclipped_frac_bits(m) for m in together(largest, np.max)]
     errors = np.zeros((len(names), CANDIDATES))
     for results in values():
         errors += [_errors(r[0], f) for r, f in zip(results, first, strict=True)]
-    moves = np.argmin(errors, axis=1) if least_squares else np.zeros(len(names), int)
+    moves = np.argmin(together(errors, np.sum), axis=1) if least_squares else np.zeros(len(names), int)
     best = {name: f + int(move) for name, f, move in zip(names, first, moves, strict=True)}
     return {PLANES: PLANES_FRAC_BITS, **best}
 

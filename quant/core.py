@@ -5,13 +5,14 @@ vai_q). `frac_bits` is n everywhere; a finer scale has more of them.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from profiles.errors import ModelError
 from profiles.target import TargetProfile
-from quant.graph import Add, Conv, Graph
+from quant.ends import Ends
+from quant.graph import PLANES, Activation, Add, Conv, Graph, Mul, Op, Window, ties_scales
 
 INT8_MIN, INT8_MAX = -128, 127
 CANDIDATES = 6
@@ -96,60 +97,61 @@ ROUNDS = 8
 
 @dataclass(frozen=True)
 class IntConv:
-    """int8 convolution: sum of products, plus bias << shift_bias, ReLU, shifted right by shift_cut, clipped."""
+    """int8 convolution: sum of products, plus bias << shift_bias, activation, shifted right by shift_cut, clipped."""
 
     name: str
     input: str
     output: str
-    weight: np.ndarray  # (O, I, kh, kw) int8
+    weight: np.ndarray  # (O, I / groups, kh, kw) int8
     weight_frac_bits: int
     bias: np.ndarray  # (O,) int8
     bias_frac_bits: int
-    relu: bool
+    activation: Activation = Activation.none
+    window: Window = field(default_factory=Window)
+    groups: int = 1
+    transposed: bool = False
 
     @property
     def inputs(self) -> tuple[str, ...]:
         """The tensors it reads."""
         return (self.input,)
 
-    @property
-    def pad_px(self) -> int:
-        """Zero padding on each side."""
-        return int(self.weight.shape[2]) // 2
-
 
 @dataclass(frozen=True)
 class IntCore:
-    """Operations in order, and the scale of every activation tensor."""
+    """Operations in order, convolutions in whole numbers; the scale of every tensor; and the host's part around."""
 
-    ops: tuple[IntConv | Add, ...]
+    ops: tuple[IntConv | Op, ...]
     frac_bits: Mapping[str, int]
-
-    @property
-    def output_channels(self) -> int:
-        """Channels of the correction: 1, or 2 where it has two gains."""
-        last = self.ops[-1]
-        return len(last.weight) if isinstance(last, IntConv) else 1
+    ends: Ends = field(default_factory=Ends)
 
     def scale(self, tensor: str) -> float:
         """The value of one unit of a tensor, 2^-n."""
         return float(2.0 ** -self.frac_bits[tensor])
 
+    @property
+    def convolutions(self) -> list[IntConv]:
+        """Those of its operations that have weights."""
+        return [op for op in self.ops if isinstance(op, IntConv)]
 
-def build_core(graph: Graph, frac_bits: Mapping[str, int], shifts: Shifts = SHIFTS) -> IntCore:
+
+def build_core(
+    graph: Graph, frac_bits: Mapping[str, int], shifts: Shifts = SHIFTS, ends: Ends | None = None
+) -> IntCore:
     """Quantise the weights of a graph, and move scales that the DPU's shifts cannot reach.
 
     Args:
         graph: a plane-reading graph.
         frac_bits: the least-squares number of fractional bits of every activation.
         shifts: the windows of the target.
+        ends: what the host does around; by default an image of one channel and a correction of it.
 
     Raises:
         ModelError: no scales are within reach: sizes of values that have nothing to do with each other.
     """
     legal = dict(frac_bits)
     for _ in range(ROUNDS):
-        core = _in_one_round(graph, legal, shifts)
+        core = _in_one_round(graph, legal, shifts, ends or Ends())
         faults = shift_faults(core, shifts)
         if not faults:
             return core
@@ -157,16 +159,22 @@ def build_core(graph: Graph, frac_bits: Mapping[str, int], shifts: Shifts = SHIF
     raise ModelError("float model", expected="values that the DPU's shifts reach", got=faults[0], remedy=remedy)
 
 
-def _in_one_round(graph: Graph, frac_bits: dict[str, int], shifts: Shifts) -> IntCore:
+def _in_one_round(graph: Graph, frac_bits: dict[str, int], shifts: Shifts, ends: Ends) -> IntCore:
     """Every operation within reach of the scales before it, which it may move."""
-    ops: list[IntConv | Add] = []
+    ops: list[IntConv | Op] = []
     for op in graph:
         if isinstance(op, Conv):
             ops.append(_quantise_conv(op, frac_bits, shifts))
-        else:
+            continue
+        if isinstance(op, Add):
             _move_add(op, frac_bits, shifts)
-            ops.append(op)
-    return IntCore(tuple(ops), dict(frac_bits))
+        elif isinstance(op, Mul):
+            finest = sum(frac_bits[name] for name in op.inputs)
+            frac_bits[op.output] = finest - clamp(finest - frac_bits[op.output], shifts.cut)
+        elif ties_scales(op):
+            _tie(op, frac_bits)
+        ops.append(op)
+    return IntCore(tuple(ops), dict(frac_bits), ends)
 
 
 def _quantise_conv(op: Conv, frac_bits: dict[str, int], shifts: Shifts) -> IntConv:
@@ -176,9 +184,9 @@ def _quantise_conv(op: Conv, frac_bits: dict[str, int], shifts: Shifts) -> IntCo
     cut = clamp(product - frac_bits[op.output], shifts.cut)
     frac_bits[op.output] = product - cut
     weight = quantise(op.weight, weight_frac_bits)
-    return IntConv(
-        op.name, op.input, op.output, weight, weight_frac_bits, *quantise_bias(op.bias, product, shifts), op.relu
-    )
+    bias, bias_frac_bits = quantise_bias(op.bias, product, shifts)
+    kind = (op.activation, op.window, op.groups, op.transposed)
+    return IntConv(op.name, op.input, op.output, weight, weight_frac_bits, bias, bias_frac_bits, *kind)
 
 
 def quantise_bias(bias: np.ndarray, product: int, shifts: Shifts = SHIFTS) -> tuple[np.ndarray, int]:
@@ -196,6 +204,13 @@ def _move_add(op: Add, frac_bits: dict[str, int], shifts: Shifts) -> None:
     frac_bits[op.output] = coarse - clamp(coarse - frac_bits[op.output], shifts.write)
 
 
+def _tie(op: Op, frac_bits: dict[str, int]) -> None:
+    """One scale for what it reads and writes: the coarsest that one of them needs; that of the planes is fixed."""
+    names = (*op.inputs, op.output)
+    shared = frac_bits[PLANES] if PLANES in names else min(frac_bits[name] for name in names)
+    frac_bits.update(dict.fromkeys(names, shared))
+
+
 def shift_faults(core: IntCore, shifts: Shifts = SHIFTS) -> list[str]:
     """Every shift outside its window, one sentence each; empty for a legal core."""
     faults = []
@@ -207,13 +222,19 @@ def shift_faults(core: IntCore, shifts: Shifts = SHIFTS) -> list[str]:
 
 
 def op_shifts(
-    op: IntConv | Add, frac_bits: Mapping[str, int], shifts: Shifts
+    op: IntConv | Op, frac_bits: Mapping[str, int], shifts: Shifts
 ) -> list[tuple[str, int, tuple[int, int]]]:
     """(name, value, window) of the shifts that one operation needs."""
     inputs, output = [frac_bits[i] for i in op.inputs], frac_bits[op.output]
     if isinstance(op, Add):
         read, write = max(inputs) - min(inputs), min(inputs) - output
         return [("shift_read", read, shifts.read), ("shift_write", write, shifts.write)]
+    if isinstance(op, Mul):
+        return [("shift_cut", sum(inputs) - output, shifts.cut)]
+    if ties_scales(op):
+        return [("shift_read", max(*inputs, output) - min(*inputs, output), (0, 0))]
+    if not isinstance(op, IntConv):
+        return []
     product = op.weight_frac_bits + inputs[0]
     return [
         ("shift_cut", product - output, shifts.cut),

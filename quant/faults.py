@@ -13,6 +13,7 @@ import numpy as np
 from model.io.images import MAX_DN
 from profiles.errors import ModelError
 from quant.core import INT8_MAX, INT8_MIN, SHIFTS, IntConv, IntCore, op_shifts
+from quant.graph import PLANES, Activation, channels_of
 from quant.integer import Faults, merged_correction, run_core
 
 MEGABIT = 1e6
@@ -106,11 +107,7 @@ def with_ops(core: IntCore, others: Mapping[str, IntConv]) -> IntCore:
 
 def map_channels(core: IntCore) -> dict[str, int]:
     """Channels of every tensor that the core reads or writes."""
-    first = core.ops[0]
-    found = {first.input: first.weight.shape[1]} if isinstance(first, IntConv) else {}
-    for op in core.ops:
-        found[op.output] = len(op.weight) if isinstance(op, IntConv) else found[op.inputs[0]]
-    return found
+    return channels_of(core.ops, {PLANES: core.ends.planes * core.ends.channels})
 
 
 def shifts_of(core: IntCore) -> dict[tuple[str, str], int]:
@@ -160,7 +157,7 @@ class Guards:
 
 def learn_guards(core: IntCore, planes: Iterable[np.ndarray]) -> Guards:
     """Guards from what a fault-free core reaches on calibration patches, planes (N, 3, H, W) each."""
-    relus = {op.output: 0 for op in core.ops if isinstance(op, IntConv) and op.relu}
+    relus = {op.output: 0 for op in core.ops if isinstance(op, IntConv) and op.activation is Activation.relu}
     largest_dn = 0.0
     for each in planes:
         tensors, _ = run_core(core, each)

@@ -12,12 +12,14 @@ import onnx
 
 from quant.calibration import Patches
 from quant.core import INT8_MAX
-from quant.encodings import MICROSOFT, ZERO, HostWriter, merge_gains, split_planes
+from quant.encodings import MICROSOFT
+from quant.ends import ONE_CHANNEL, ZERO, Ends, HostWriter, write_back, write_front
 from quant.graph import (
     CORRECTION,
     IMAGE,
     PLANES,
     PLANES_FRAC_BITS,
+    Activation,
     Add,
     Conv,
     Graph,
@@ -27,10 +29,10 @@ from quant.graph import (
     tensors,
 )
 from quant.onnx_file import fixed_tile_px, image_info, make_model, metadata
-from quant.passes.equalise import channel_ranges, equalise, search, search_steps
+from quant.passes.equalise import Costs, channel_ranges, equalise, search, search_steps
 from quant.passes.fit_weights import Moments, fit, input_moments
-from quant.passes.stream import STREAM_FRAC_BITS, half_lsb_pair, stream_tensors, two_gains
-from quant.quantise import crop_costs, search_targets
+from quant.passes.stream import STREAM_FRAC_BITS, half_lsb_pair, streams, two_gains
+from quant.quantise import Targets, crop_costs, search_targets
 from quant.session import halo_of, open_session, tensor_values
 
 BINS = 4096
@@ -145,22 +147,19 @@ def free_model(
         moments: of what each convolution reads, for `quant.passes.fit_weights`; None rounds to nearest.
     """
     writer = HostWriter()
-    split_planes(writer)
+    ends = Ends(gains=2)
+    write_front(writer, ends)
     for op in graph:
         if isinstance(op, Add):
             feeds = [feed for name in op.inputs for feed in (name, *_scale(writer, scales[name]))]
             feeds += _scale(writer, scales[op.output])
             writer.node("QLinearAdd", op.output, feeds, name=op.name, domain=MICROSOFT)
         else:
+            assert isinstance(op, Conv)  # noqa: S101 - correction_graph has seen to it
             _conv(writer, op, scales, moments[op.name] if moments else None)
-    both = [CORRECTION, *_scale(writer, scales[CORRECTION])]
-    writer.node("DequantizeLinear", "host_back.both", both)
-    merge_gains(writer, scales[CORRECTION].unit)
-    writer.node("Add", "host_back.add", [IMAGE, "host_back.correction"])
-    limits = [writer.scalar("zero", 0), writer.scalar("one", 1)]
-    writer.node("Clip", "restored", ["host_back.add", *limits], name="host_back.clip")
-    ends = [image_info(IMAGE, 1, tile_px)], [image_info("restored", 1, tile_px)]
-    return make_model(writer.graph("convbeers-int8-free", *ends), about, microsoft=True)
+    write_back(writer, ends, [CORRECTION, *_scale(writer, scales[CORRECTION])], scales[CORRECTION].unit)
+    sides = [image_info(IMAGE, 1, tile_px)], [image_info("restored", 1, tile_px)]
+    return make_model(writer.graph("convbeers-int8-free", *sides), about, microsoft=True)
 
 
 def _conv(w: HostWriter, op: Conv, scales: Mapping[str, Scale], moments: Moments | None) -> None:
@@ -173,9 +172,9 @@ def _conv(w: HostWriter, op: Conv, scales: Mapping[str, Scale], moments: Moments
     feeds += [w.constant(f"{op.name}.weight_zero_point", np.zeros(len(op.weight), np.int8))]
     feeds += [*_scale(w, scales[op.output]), w.constant(f"{op.name}.bias", bias)]
     kernel, zero_point = list(op.weight.shape[2:]), scales[op.output].zero_point
-    clipped = op.relu and zero_point != 0
+    clipped = (op.activation is Activation.relu) and zero_point != 0
     result = f"{op.output}.linear" if clipped else op.output
-    w.node("QLinearConv", result, feeds, name=op.name, pads=[op.pad_px] * 4, kernel_shape=kernel)
+    w.node("QLinearConv", result, feeds, name=op.name, pads=list(op.window.pads), kernel_shape=kernel)
     if clipped:
         w.node("Max", op.output, [result, _scale(w, scales[op.output])[1]], name=f"{op.name}.relu")
 
@@ -204,11 +203,15 @@ def quantise_free(
     """
     graph = read_planes(correction_graph(model))
     scales = _scales(graph, patches, tick)
-    if stream_tensors(graph):
-        ranges = channel_ranges(graph, patches.degraded, tick)
-        targets = search_targets(graph, patches.degraded)
-        factors = search(graph, ranges, lambda tried: crop_costs(_written(tried, scales, {}), targets), tick)
-        graph = equalise(graph, factors)
+    for stream in streams(graph):
+        ranges = channel_ranges(graph, stream, patches.degraded, tick)
+        targets = search_targets(graph, ONE_CHANNEL, patches.degraded)
+
+        def trial(tried: Graph, targets: Targets = targets) -> Costs:
+            return crop_costs(_written(tried, scales, {}), targets)
+
+        factors = search(graph, stream, ranges, trial, tick)
+        graph = equalise(graph, stream, factors)
     about = {**metadata(model), "precision": "int8 free", "calibration_sha256": patches.digest, **about}
     moments = input_moments(_fine(graph), patches.degraded, tick)
     return _written(graph, scales, about, fixed_tile_px(model), moments)
@@ -217,7 +220,7 @@ def quantise_free(
 def free_ticks(model: onnx.ModelProto, patches: int) -> int:
     """How often `quantise_free` will call `tick`."""
     graph = read_planes(correction_graph(model))
-    if not stream_tensors(graph):
+    if not streams(graph):
         return 3 * patches
     first = graph[0]
     assert isinstance(first, Conv)  # noqa: S101 - correction_graph has seen to it
@@ -226,11 +229,15 @@ def free_ticks(model: onnx.ModelProto, patches: int) -> int:
 
 def _scales(graph: Graph, patches: Patches, tick: Callable[[], None]) -> dict[str, Scale]:
     """Least-squares scales of what is not the stream; that has any, because `equalise` scales its channels to it."""
-    convs = [op for op in graph if isinstance(op, Conv) and op.output not in stream_tensors(graph)]
-    levels = {op.output: UINT8_MAX if op.relu else INT8_MAX for op in convs}
+    in_streams = {name for stream in streams(graph) for name in stream}
+    convs = [op for op in graph if isinstance(op, Conv) and op.output not in in_streams]
+    levels = {op.output: UINT8_MAX if (op.activation is Activation.relu) else INT8_MAX for op in convs}
     units = tensor_scales(graph, levels, patches.degraded, tick)
     units[CORRECTION] /= FINER
-    found = {op.output: Scale(units[op.output], 0) if op.relu else Scale(units[op.output]) for op in convs}
+    found = {
+        op.output: Scale(units[op.output], 0) if (op.activation is Activation.relu) else Scale(units[op.output])
+        for op in convs
+    }
     return {PLANES: Scale(2.0**-PLANES_FRAC_BITS), **found}
 
 

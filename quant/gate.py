@@ -14,13 +14,17 @@ from model.metrics.fidelity import psnr_db
 from profiles.errors import OptionError
 from profiles.figures import Figure, Row, measured, unavailable
 from profiles.toml import read_toml_text, unreadable
+from quant.calibration import Pair
 from quant.checks import Check
-from quant.session import run
+from quant.session import result_of
 
 
 @dataclass(frozen=True)
 class GateResult:
-    """Differences in [0, 1] of full scale over all pixels; PSNRs over full scale, in dB."""
+    """Differences in [0, 1] of full scale over all pixels; PSNRs over full scale, in dB, NaN without references.
+
+    `same_class` is the share of results whose largest channel is the same: of networks that tell classes, else NaN.
+    """
 
     mae: float
     std: float
@@ -31,6 +35,13 @@ class GateResult:
     psnr_float_db: float
     psnr_int8_db: float
     patches: int
+    same_class: float = math.nan
+    simulated: bool = True
+
+    @property
+    def source(self) -> str:
+        """Where the figures come from."""
+        return f"{self.patches} simulated patches of 128 x 128" if self.simulated else f"{self.patches} samples"
 
     @property
     def drop_db(self) -> float:
@@ -46,14 +57,20 @@ class GateResult:
 def compare(
     float_session: ort.InferenceSession,
     int8_session: ort.InferenceSession,
-    pairs: Iterable[tuple[np.ndarray, np.ndarray]],
+    pairs: Iterable[Pair],
+    simulated: bool = True,
 ) -> GateResult:
-    """Run both networks on (degraded, reference) pairs of (1, 1, H, W) in [0, 1]; outputs clipped as a file would."""
-    differences, errors = [], []
+    """Run both networks on (degraded, reference) pairs of (1, C, H, W) in [0, 1]; outputs clipped as a file would.
+
+    Without references, or where they have another size than what is compared, the PSNRs to them are NaN.
+    """
+    differences, errors, agreeing = [], [], []
     for degraded, reference in pairs:
-        in_float, in_int8 = (_as_in_a_file(run(s, degraded)) for s in (float_session, int8_session))
+        results = [result_of(s, degraded) for s in (float_session, int8_session)]
+        agreeing.append(_same_class(*results) if results[0].shape[1] > degraded.shape[1] else math.nan)
+        in_float, in_int8 = (_as_in_a_file(result, degraded) for result in results)
         differences.append((in_int8 - in_float).ravel())
-        errors.append([psnr_db(image, reference, 1.0) for image in (degraded, in_float, in_int8)])
+        errors.append([_psnr_db(image, reference) for image in (degraded, in_float, in_int8)])
     difference = np.concatenate(differences).astype(np.float64)
     degraded_db, float_db, int8_db = np.mean(errors, axis=0)
     return GateResult(
@@ -66,12 +83,24 @@ def compare(
         psnr_float_db=float(float_db),
         psnr_int8_db=float(int8_db),
         patches=len(errors),
+        same_class=float(np.mean(agreeing)),
+        simulated=simulated,
     )
 
 
-def _as_in_a_file(restored: np.ndarray) -> np.ndarray:
-    """Clipped to [0, 1]; NaN where infinite, which no clipping makes a pixel."""
-    return np.where(np.isinf(restored), np.nan, np.clip(restored, 0, 1))
+def _as_in_a_file(result: np.ndarray, image: np.ndarray) -> np.ndarray:
+    """An image clipped to [0, 1], anything else as it is; NaN where infinite, which no clipping makes a pixel."""
+    clipped = np.clip(result, 0, 1) if result.shape[1:2] == image.shape[1:2] and result.ndim == 4 else result
+    return np.where(np.isinf(result), np.nan, clipped)
+
+
+def _psnr_db(image: np.ndarray, reference: np.ndarray) -> float:
+    return psnr_db(image, reference, 1.0) if reference.shape == image.shape else math.nan
+
+
+def _same_class(one: np.ndarray, other: np.ndarray) -> float:
+    """The share of results (N, classes, ...) whose largest is the same class."""
+    return float((one.argmax(1) == other.argmax(1)).mean())
 
 
 @dataclass(frozen=True)
@@ -172,28 +201,30 @@ def gate_row(result: GateResult) -> Row:
         "PSNR float": (result.psnr_float_db, "dB"),
         "PSNR INT8": (result.psnr_int8_db, "dB"),
     }
-    figures = {name: _figure(value, unit, result.patches) for name, (value, unit) in found.items()}
+    figures = {name: _figure(value, unit, result) for name, (value, unit) in found.items()}
+    if not math.isnan(result.same_class):
+        figures["same class"] = _figure(100 * result.same_class, "%", result)
     return Row("gate", "INT8 against float", figures)
 
 
 def verdict_row(result: GateResult, shares: Mapping[str, float]) -> Row:
     """The figures of a gate: those of `gate_row`, the PSNR lost to the reference, the worst layer's saturation."""
-    row, drop = gate_row(result), _figure(result.drop_db, "dB", result.patches)
-    worst = saturation_figure(shares, result.patches)
+    row, drop = gate_row(result), _figure(result.drop_db, "dB", result)
+    worst = saturation_figure(shares, result.source)
     return replace(row, figures={**row.figures, "PSNR drop": drop, "saturated results": worst})
 
 
-def _figure(value: float, unit: str, patches: int) -> Figure:
+def _figure(value: float, unit: str, result: GateResult) -> Figure:
     if math.isinf(value):
         return unavailable(unit, "infinite: the two images are identical")
     if math.isnan(value):
-        return unavailable(unit, "a network gave NaN")
-    return measured(value, unit, f"{patches} simulated patches of 128 x 128")
+        return unavailable(unit, "a network gave NaN" if math.isnan(result.mae) else "no reference of that size")
+    return measured(value, unit, result.source)
 
 
-def saturation_figure(shares: Mapping[str, float], patches: int) -> Figure:
+def saturation_figure(shares: Mapping[str, float], source: str) -> Figure:
     """What share of its results comes to the ends of 8 bits, in the layer where most do."""
     if not shares:
         return unavailable("%", "no result in the file is rounded to 8 bits")
     layer = max(shares, key=lambda name: shares[name])
-    return measured(100 * shares[layer], "%", f"{layer}, the worst of {len(shares)}; {patches} patches of 128 x 128")
+    return measured(100 * shares[layer], "%", f"{layer}, the worst of {len(shares)}; {source}")

@@ -1,14 +1,11 @@
 """ONNX files, read and written without trusting them: one sentence for whatever is not a sound model.
 
-Also what a network's file says of itself: its metadata, the tile that it is fixed to, and its receptive radius. Only
-graphs that compute the same thing at every pixel have one. Refused is what does not: ranges measured on the image
-(dynamic quantisation), means over it (global pooling, instance normalisation), resampling, and constants that are
-not the same at every pixel.
+Also what a network's file says of itself: its metadata, and the tile that it is fixed to. How an image may be cut
+into tiles for it is `quant.tiling`'s matter.
 """
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import onnx
@@ -18,17 +15,18 @@ from onnx import numpy_helper
 from model.io.files import whole_file
 from profiles.errors import ModelError
 from profiles.toml import read_whole, unreadable
-from quant.untrusted import FILE_BYTES, check_content, check_runnable, contradictions
-
-OPSET = 17
-IR_VERSION = 8
-
+from quant.reading.external import take_in
+from quant.reading.folding import IR_VERSION, OPSET, simplest
+from quant.untrusted import FILE_BYTES, check_content, check_runnable
 
 REMEDY = "give a file written by 'beers-deploy export' or 'beers-deploy quantize'"
 
 
 def load_onnx(path: Path, to_run: bool = True) -> onnx.ModelProto:
-    """Read an ONNX model that carries all its weights: the one way by which a file comes in.
+    """Read an ONNX model, with weights that it keeps beside it: the one way by which a file comes in.
+
+    A float network comes as its simplest equal (`quant.reading.folding`), an INT8 one as it is. One that no runtime
+    may get comes as it is too, where it is only looked at.
 
     Args:
         path: the file.
@@ -46,20 +44,39 @@ def load_onnx(path: Path, to_run: bool = True) -> onnx.ModelProto:
     except (OSError, ValueError) as error:
         got = unreadable(path) or " ".join(str(error).split())[:120]
         raise ModelError(str(path), expected="an ONNX file", got=got, remedy=REMEDY) from error
-    return parse_onnx(content, str(path), to_run)
+    return _simplest(_parsed(content, str(path), to_run, path), str(path), to_run)
+
+
+def _simplest(model: onnx.ModelProto, where: str, to_run: bool) -> onnx.ModelProto:
+    if is_quantised(model):
+        return model
+    try:
+        check_runnable(model, where)
+        return simplest(model, where)
+    except ModelError:
+        if to_run:
+            raise
+        return model
 
 
 def parse_onnx(content: bytes, where: str, to_run: bool = True) -> onnx.ModelProto:
-    """As `load_onnx`, of a file's bytes.
+    """As `load_onnx`, of the bytes of a file that holds all its weights; what is read stays as it is.
 
     Raises:
         ModelError: as there.
     """
+    return _parsed(content, where, to_run, None)
+
+
+def _parsed(content: bytes, where: str, to_run: bool, path: Path | None) -> onnx.ModelProto:
+    """The model in a file's bytes, checked; with a path its weights may lie beside it."""
     if not content:
         raise ModelError(where, expected="an ONNX file", got="an empty file", remedy=REMEDY)
     try:
         model = onnx.ModelProto()
         model.ParseFromString(content)
+        if path is not None:
+            take_in(model, path)
         check_content(model, where)  # before the checker, which looks for files that weights are said to be in
         onnx.checker.check_model(model)
     except (DecodeError, onnx.checker.ValidationError, ValueError) as error:
@@ -108,7 +125,7 @@ class GraphWriter:
         inputs: Sequence[str],
         name: str = "",
         domain: str | None = None,
-        **attributes: int | list[int],
+        **attributes: int | float | str | list[int],
     ) -> str:
         """Append an operator of one result, named as its result unless it has a name; returns the result's."""
         node = onnx.helper.make_node(kind, inputs, [output], name=name or output, domain=domain or self.domain)
@@ -161,13 +178,13 @@ def fixed_tile_px(model: onnx.ModelProto) -> int | None:
     """The tile side that a model is fixed to, or None when it takes any size.
 
     Raises:
-        ModelError: not one (N, 1, H, W) input, or a fixed size that is not square.
+        ModelError: not one (N, C, H, W) input, or a fixed size that is not square.
     """
     sizes = [d.dim_value for d in model.graph.input[0].type.tensor_type.shape.dim] if model.graph.input else []
-    if len(model.graph.input) != 1 or len(sizes) != 4 or sizes[1] != 1 or sizes[2] != sizes[3]:
+    if len(model.graph.input) != 1 or len(sizes) != 4 or sizes[2] != sizes[3]:
         raise ModelError(
             "ONNX model",
-            expected="one input (N, 1, H, W)",
+            expected="one input (N, C, H, W), of one side where it is fixed",
             got=f"{sizes}",
             remedy="export it with 'beers-deploy export'",
         )
@@ -185,9 +202,8 @@ def any_size(model: onnx.ModelProto) -> onnx.ModelProto:
     free = onnx.ModelProto()
     free.CopyFrom(model)
     for value in (*free.graph.input, *free.graph.output):
-        if len(value.type.tensor_type.shape.dim) != 4:
-            got = f"{value.name!r} of {len(value.type.tensor_type.shape.dim)} sizes"
-            raise ModelError("ONNX model", expected="an image in and out", got=got, remedy=REMEDY)
+        if len(value.type.tensor_type.shape.dim) != 4:  # such as a classifier's, which has one size of image
+            return model
         for side, name in zip(value.type.tensor_type.shape.dim[2:], ("H", "W"), strict=True):
             side.dim_param = name
     del free.graph.value_info[:]
@@ -210,89 +226,3 @@ def require_quantised(model: onnx.ModelProto, path: Path, wanted: bool) -> None:
         expected, got = ("an INT8 network", "a float one") if wanted else ("a float network", "an INT8 one")
         remedy = "give the float model first, the INT8 model second"
         raise ModelError(str(path), expected=expected, got=got, remedy=remedy)
-
-
-CONVOLUTIONS = {"Conv": 1, "QLinearConv": 3}
-"""Operator and the index of its weights among the inputs."""
-
-POOLS = {"AveragePool", "MaxPool"}
-POINTWISE = {
-    "Abs", "Add", "Cast", "Clip", "Div", "Elu", "Exp", "Greater", "HardSigmoid", "HardSwish", "Identity",
-    "LeakyRelu", "Less", "LessOrEqual", "Max", "Min", "Mul", "Neg", "PRelu", "Pow", "QLinearAdd", "Relu", "Round",
-    "Sigmoid", "Sqrt", "Sub", "Tanh", "Where",
-}  # fmt: skip
-PER_CHANNEL = {"BatchNormalization", "DequantizeLinear", "QuantizeLinear"}
-"""Point-wise, with vectors of one number a channel."""
-OVER_CHANNELS = {"Concat", "Split"}
-"""Point-wise where they work along the channels."""
-
-
-def receptive_radius_px(model: onnx.ModelProto) -> int:
-    """The farthest input pixel that an output pixel depends on, in pixels.
-
-    Raises:
-        ModelError: an operator that is no same-size convolution or pool of stride 1 and not point-wise.
-    """
-    with contradictions("tiled model"):
-        return _radius_px(model)
-
-
-def _radius_px(model: onnx.ModelProto) -> int:
-    constants = {t.name: tuple(t.dims) for t in model.graph.initializer}
-    reach = {tensor.name: 0 for tensor in model.graph.input if tensor.name not in constants}
-    for node in model.graph.node:
-        radii = [reach[name] for name in node.input if name in reach]
-        if radii:
-            reach.update(dict.fromkeys(node.output, max(radii) + _node_radius(node, constants)))
-        else:
-            constants.update(dict.fromkeys(node.output, _constant_shape(node, constants)))
-    return reach.get(model.graph.output[0].name, 0)
-
-
-def _constant_shape(node: onnx.NodeProto, constants: dict[str, tuple[int, ...]]) -> tuple[int, ...]:
-    """The shape of what is made of constants alone, such as weights dequantised in a board file."""
-    if node.op_type == "Constant":
-        return next((tuple(a.t.dims) for a in node.attribute if a.name == "value"), ())
-    _require(node, node.op_type in PER_CHANNEL | {"Cast", "Identity"})
-    return constants[node.input[0]]
-
-
-def _node_radius(node: onnx.NodeProto, constants: dict[str, tuple[int, ...]]) -> int:
-    """What one operator adds to the radius."""
-    given = {a.name: onnx.helper.get_attribute_value(a) for a in node.attribute}
-    if node.op_type in CONVOLUTIONS:
-        weights = constants.get(node.input[CONVOLUTIONS[node.op_type]], ())
-        _require(node, len(weights) == 4)
-        return _window_radius(node, given, weights[2:])
-    if node.op_type in POOLS:
-        _require(node, len(node.output) == 1)  # MaxPool's indices count from the corner of the window
-        return _window_radius(node, given, given["kernel_shape"])
-    if node.op_type in OVER_CHANNELS:
-        _require(node, given.get("axis", 0) == 1)
-    elif node.op_type in PER_CHANNEL:
-        _require(node, given.get("axis", 1) == 1)
-    else:
-        _require(node, node.op_type in POINTWISE)
-        _require(node, all(set(constants.get(name, ())[-2:]) <= {1} for name in node.input))
-    return 0
-
-
-def _window_radius(node: onnx.NodeProto, given: dict[str, Any], kernel: tuple[int, ...]) -> int:
-    """The wider side of a window that keeps the image's size."""
-    extents = [(k - 1) * d for k, d in zip(kernel, given.get("dilations", [1, 1]), strict=True)]
-    _require(node, set(given.get("strides", [1])) == {1})
-    if given.get("auto_pad", b"NOTSET") in (b"SAME_UPPER", b"SAME_LOWER"):
-        return int(max((extent + 1) // 2 for extent in extents))
-    pads = given.get("pads", [0, 0, 0, 0])
-    _require(node, [pads[0] + pads[2], pads[1] + pads[3]] == extents)
-    return int(max(pads))
-
-
-def _require(node: onnx.NodeProto, sound: bool) -> None:
-    if not sound:
-        raise ModelError(
-            "tiled model",
-            expected="operators that do the same at every pixel, from near pixels alone",
-            got=f"{node.op_type} {node.name}".strip(),
-            remedy="run it on the whole image instead",
-        )

@@ -1,7 +1,7 @@
 """Static INT8 in one call: float ONNX and calibration patches in, the two encodings of the integer core out."""
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, fields, replace
 
@@ -13,30 +13,34 @@ from profiles.figures import Row
 from quant.calibration import Patches, Remade, choose_frac_bits
 from quant.core import SHIFTS, IntCore, Shifts, build_core
 from quant.encodings import board_model, host_model
+from quant.ends import Ends, ends_of
 from quant.gate import compare, gate_row
 from quant.graph import (
     CORRECTION,
-    Conv,
+    PLANES,
     Graph,
+    channels_of,
     coarse_plane_only,
-    correction_graph,
     graph_to_onnx,
+    read_network,
     read_planes,
     relu_count,
     tensors,
 )
 from quant.onnx_file import fixed_tile_px, metadata
-from quant.passes.equalise import Costs, channel_ranges, equalise, search, search_steps
+from quant.passes.equalise import LEVELLING, Costs, channel_ranges, equalise, first_guess, search, search_steps
 from quant.passes.fit_weights import fit_weights, input_moments
 from quant.passes.stream import (
     STREAM_FRAC_BITS,
+    Stream,
     common_frac_bits,
     half_lsb_pair,
     share_stream_scale,
-    stream_tensors,
+    streams,
+    takes_gains,
     two_gains,
 )
-from quant.session import crops, open_any_size, open_session, run, tensor_values
+from quant.session import crops, halo_of, open_any_size, open_session, result_of, tensor_values
 
 SEARCH_CROPS = 16
 """What the equalisation is searched on, a quarter of them with the strongest edges: there int8 clips."""
@@ -69,6 +73,50 @@ class Quantised:
     graph: Graph
 
 
+@dataclass(frozen=True)
+class _Plan:
+    """What is to be quantised: the graph that reads the planes wanted, and that of all; the host's part; streams."""
+
+    graph: Graph
+    full: Graph
+    ends: Ends
+    streams: list[Stream]
+    passes: Passes
+    shifts: Shifts
+
+    @property
+    def shares(self) -> bool:
+        return bool(self.streams) and (self.passes.shared_residual_scale or self.passes.equalise)
+
+    def stream_frac_bits(self, frac_bits: Mapping[str, int]) -> int:
+        return STREAM_FRAC_BITS if self.passes.equalise else common_frac_bits(self.streams, frac_bits)
+
+    def rounded(self, graph: Graph, frac_bits: Mapping[str, int]) -> Graph:
+        """The graph that is rounded: with the half-LSB pair and two gains where wanted."""
+        if self.passes.half_lsb_pair and self.shares:
+            graph = half_lsb_pair(graph, 2.0 ** -self.stream_frac_bits(frac_bits))
+        return two_gains(graph) if self.ends.gains == 2 else graph
+
+    def core(self, graph: Graph, frac_bits: Mapping[str, int]) -> IntCore:
+        """The integer core of a graph whose tensors have these least-squares scales, the passes applied."""
+        chosen, final = dict(frac_bits), self.rounded(graph, frac_bits)
+        if self.shares:
+            found = streams(final)
+            chosen = share_stream_scale(found, frac_bits, self.stream_frac_bits(frac_bits))
+        if self.ends.gains == 2:
+            chosen[CORRECTION] += 1
+        assert set(tensors(final)) <= set(chosen)  # noqa: S101
+        return build_core(final, chosen, self.shifts, self.ends)
+
+
+def _plan(model: onnx.ModelProto, passes: Passes, shifts: Shifts = SHIFTS) -> _Plan:
+    network = read_network(model)
+    full = read_planes(network.graph)
+    gains = 2 if passes.dual_gain and network.adds_image and takes_gains(full) else 1
+    graph = full if passes.fine_planes else coarse_plane_only(full)
+    return _Plan(graph, full, ends_of(network, gains), streams(graph), passes, shifts)
+
+
 def quantise_model(
     model: onnx.ModelProto,
     patches: Patches,
@@ -77,29 +125,22 @@ def quantise_model(
     passes: Passes = ALL,
     shifts: Shifts = SHIFTS,
 ) -> Quantised:
-    """Quantise a float ConvBEERS under the DPU's rules: int8, symmetric, per tensor, power-of-two scales.
+    """Quantise a float network under the DPU's rules: int8, symmetric, per tensor, power-of-two scales.
 
-    The global add stays on the host, in 12 bits: only the correction is computed in int8. The rest is `passes`.
-    `shifts` are the windows of the target.
+    The global add, where there is one, stays on the host, in 12 bits: only the correction is computed in int8. The
+    rest is `passes`. `shifts` are the windows of the target.
 
     Raises:
-        ModelError: not a graph of convolutions, ReLUs and adds that ends with the global add, or with weights of no
-            sensible size.
+        ModelError: an operation that the DPU does not compute, or weights of no sensible size.
     """
-    graph = _reads_planes(model, passes)
-    frac_bits = choose_frac_bits(graph, patches.degraded, tick, passes.least_squares)
-    if passes.equalise and stream_tensors(graph):
-        ranges = channel_ranges(graph, patches.degraded, tick)
-        targets = search_targets(read_planes(correction_graph(model)), patches.degraded)
-
-        def trial(tried: Graph) -> Costs:
-            return crop_costs(host_model(_core(tried, frac_bits, passes, shifts), {}), targets)
-
-        factors = search(graph, ranges, trial, tick)
-        graph = equalise(graph, factors)
-    final, core = _final(graph, frac_bits, passes), _core(graph, frac_bits, passes, shifts)
+    plan = _plan(model, passes, shifts)
+    graph, images = plan.graph, patches.degraded
+    frac_bits = choose_frac_bits(graph, images, tick, passes.least_squares, plan.ends)
+    if passes.equalise and plan.streams:
+        graph = _equalised(plan, frac_bits, images, tick)
+    final, core = plan.rounded(graph, frac_bits), plan.core(graph, frac_bits)
     if passes.fit_weights:
-        core = fit_weights(final, core, input_moments(final, patches.degraded, tick), shifts)
+        core = fit_weights(final, core, input_moments(final, images, tick, plan.ends), shifts)
     about = {**metadata(model), "precision": "int8 legal", "calibration_sha256": patches.digest, **about}
     about["passes"] = ", ".join(name for name, on in asdict(passes).items() if on)
     tile_px = fixed_tile_px(model)
@@ -108,68 +149,61 @@ def quantise_model(
     )
 
 
+def _equalised(plan: _Plan, frac_bits: dict[str, int], images: Remade[np.ndarray], tick: Callable[[], None]) -> Graph:
+    """Stream after stream, the others levelled by a first guess until their turn comes."""
+    targets = search_targets(plan.full, plan.ends, images)
+
+    def trial(tried: Graph) -> Costs:
+        return crop_costs(host_model(plan.core(tried, frac_bits), {}), targets)
+
+    graph, ranges = plan.graph, {}
+    for stream in plan.streams:
+        ranges[stream] = channel_ranges(plan.graph, stream, images, tick, plan.ends)
+    for stream in plan.streams[1:]:
+        graph = equalise(graph, stream, first_guess(ranges[stream], LEVELLING[0], 1.0))
+    for number, stream in enumerate(plan.streams):
+        if number:
+            graph = equalise(graph, stream, 1 / first_guess(ranges[stream], LEVELLING[0], 1.0))
+        graph = equalise(graph, stream, search(graph, stream, ranges[stream], trial, tick))
+    return graph
+
+
 def ticks(model: onnx.ModelProto, patches: int, passes: Passes = ALL) -> int:
     """How often `quantise_model` will call `tick`."""
-    graph = _reads_planes(model, passes)
+    plan = _plan(model, passes)
     passings = 2 + passes.fit_weights
-    if not (passes.equalise and stream_tensors(graph)):
+    if not (passes.equalise and plan.streams):
         return passings * patches
-    first = graph[0]
-    assert isinstance(first, Conv)  # noqa: S101 - correction_graph has seen to it
-    return (passings + 1) * patches + search_steps(len(first.weight))
-
-
-def _reads_planes(model: onnx.ModelProto, passes: Passes) -> Graph:
-    graph = read_planes(correction_graph(model))
-    return graph if passes.fine_planes else coarse_plane_only(graph)
-
-
-def _core(graph: Graph, frac_bits: dict[str, int], passes: Passes, shifts: Shifts) -> IntCore:
-    """The integer core of a graph whose tensors have these least-squares scales, the passes applied."""
-    chosen, final = dict(frac_bits), _final(graph, frac_bits, passes)
-    if passes.shared_residual_scale or passes.equalise:
-        chosen = share_stream_scale(final, frac_bits, _stream_frac_bits(graph, frac_bits, passes))
-    if passes.dual_gain:
-        chosen[CORRECTION] += 1
-    assert set(tensors(final)) <= set(chosen)  # noqa: S101
-    return build_core(final, chosen, shifts)
-
-
-def _final(graph: Graph, frac_bits: dict[str, int], passes: Passes) -> Graph:
-    """The graph that is rounded: with the half-LSB pair and two gains where wanted."""
-    if passes.half_lsb_pair and (passes.shared_residual_scale or passes.equalise):
-        graph = half_lsb_pair(graph, 2.0 ** -_stream_frac_bits(graph, frac_bits, passes))
-    return two_gains(graph) if passes.dual_gain else graph
-
-
-def _stream_frac_bits(graph: Graph, frac_bits: dict[str, int], passes: Passes) -> int:
-    return STREAM_FRAC_BITS if passes.equalise else common_frac_bits(graph, frac_bits)
+    widths = channels_of(plan.graph, {PLANES: plan.ends.planes * plan.ends.channels})
+    steps = sum(search_steps(widths[min(stream)]) for stream in plan.streams)
+    return (passings + len(plan.streams)) * patches + steps
 
 
 Targets = list[tuple[np.ndarray, np.ndarray]]
 """Degraded crops (1, 1, h, w) and what the float network makes of them, clipped to [0, 1]."""
 
 
-def search_targets(graph: Graph, images: Remade[np.ndarray]) -> Targets:
+def search_targets(graph: Graph, ends: Ends, images: Remade[np.ndarray]) -> Targets:
     """Of all crops of the images, those with the largest corrections, and others of all sizes.
 
     Only their sizes are kept; the images of the chosen are made once more.
     """
-    session = open_session(graph_to_onnx(graph, [CORRECTION]))
+    session = open_session(graph_to_onnx(graph, [CORRECTION], ends.planes * ends.channels))
+    halo_px = 0 if halo_of(graph) is not None else None
 
     def restored(crop: np.ndarray) -> np.ndarray:
-        (correction,) = next(tensor_values(session, [CORRECTION], crop, halo_px=0))
-        return np.asarray(np.clip(crop + correction, 0, 1))
+        (correction,) = next(tensor_values(session, [CORRECTION], crop, halo_px, ends))
+        return ends.finished(crop, correction)
 
-    sizes = {
-        (k, n): float(np.abs(restored(crop) - crop).max())
-        for k, image in enumerate(images)
-        for n, crop in enumerate(crops(image))
-    }
+    def size(crop: np.ndarray) -> float:
+        result = restored(crop)
+        return float(np.abs(result - crop if result.shape == crop.shape else result).max())
+
+    sizes = {(k, n): size(crop) for k, image in enumerate(images) for n, crop in enumerate(crops(image, halo_px))}
     order = sorted(sizes, key=lambda place: sizes[place], reverse=True)
     hard = SEARCH_CROPS // 4
     others = order[hard :: max((len(order) - hard) // (SEARCH_CROPS - hard), 1)]
-    chosen = [crops(images[k])[n].copy() for k, n in (*order[:hard], *others[: SEARCH_CROPS - hard])]
+    chosen = [crops(images[k], halo_px)[n].copy() for k, n in (*order[:hard], *others[: SEARCH_CROPS - hard])]
     return [(crop, restored(crop)) for crop in chosen]
 
 
@@ -182,7 +216,7 @@ def crop_costs(model: onnx.ModelProto, targets: Targets) -> Costs:
 
     def cost(number: int) -> float:
         image, wanted = targets[number]
-        return float(np.sqrt(np.square(run(session, image) - wanted, dtype=np.float64).mean()))
+        return float(np.sqrt(np.square(result_of(session, image) - wanted, dtype=np.float64).mean()))
 
     def of(crops: np.ndarray | None) -> np.ndarray:
         # Small crops keep cores busier one to each than all on one: threads that share a crop wait for each other.

@@ -21,10 +21,21 @@ from quant.calibration import Patches
 from quant.core import INT8_MAX, INT8_MIN, IntConv, IntCore
 from quant.encodings import host_model
 from quant.gate import GateResult
-from quant.graph import CORRECTION, PLANES, Conv, Graph, Op, graph_to_onnx, tensors
-from quant.passes.stream import merge
+from quant.graph import (
+    CORRECTION,
+    PLANES,
+    Add,
+    AveragePool,
+    Conv,
+    Graph,
+    Op,
+    Resize,
+    graph_to_onnx,
+    tensors,
+    ties_scales,
+)
 from quant.quantise import Quantised
-from quant.session import few_crops, open_session, planes_of, run, tensor_values
+from quant.session import few_crops, halo_of, open_session, planes_of, result_of, run, tensor_values
 
 IN_INT8 = ".in_int8"
 """Behind the name of a tensor: as int8 weights and bias make it of float inputs, not yet rounded."""
@@ -94,25 +105,28 @@ def layer_errors(
         tick: called after each crop.
     """
     twins = tuple(_twin(op, whole) for op, whole in zip(graph, core.ops, strict=True) if isinstance(whole, IntConv))
-    names = tensors((*graph, *twins))
-    exact, int8 = open_session(graph_to_onnx((*graph, *twins), names)), open_session(host_model(core, {}))
-    rests = {name: open_session(_rest(graph, name)) for name in tensors(graph) if name != CORRECTION}
+    names, width = tensors((*graph, *twins)), core.ends.planes * core.ends.channels
+    halo_px = None if halo_of(graph) is None else 0
+    exact, int8 = open_session(graph_to_onnx((*graph, *twins), names, width)), open_session(host_model(core, {}))
+    rests = {name: open_session(_rest(graph, name, width)) for name in tensors(graph) if name != CORRECTION}
     layers, together = [LayerError(op.name, Loss(), Loss()) for op in graph], Loss()
     for crop in crops:
-        (values,) = tensor_values(exact, names, crop, halo_px=0)
+        (values,) = tensor_values(exact, names, crop, halo_px, core.ends)
         wanted = dict(zip(names, values, strict=True))
         restored = _restored(crop, wanted[CORRECTION], core)
+        offset = crop if core.ends.adds_image else 0.0
         for op, layer in zip(graph, layers, strict=True):
             result, meant = _in_int8(op, core, wanted), wanted[op.output]
             if op.output == CORRECTION:  # of two gains one is coarse and the other clipped: together they count
-                correction = result = merge(result, core.scale(CORRECTION))
-                meant = meant[:, :1]
+                result = core.ends.merge(result, core.scale(CORRECTION))
+                meant = meant[:, : core.ends.outputs]
+                found = core.ends.finished(crop, result)
             else:
-                feed = {PLANES: planes_of(crop), op.output: result}
-                correction = rests[op.output].run(None, feed)[0]
+                feed = {PLANES: planes_of(crop, core.ends), op.output: result}
+                found = _restored(crop, rests[op.output].run(None, feed)[0], core)
             layer.alone.add(result, meant)
-            layer.network.add(_restored(crop, correction, core), restored, crop)
-        together.add(run(int8, crop), restored, crop)
+            layer.network.add(found, restored, offset)
+        together.add(result_of(int8, crop), restored, offset)
         tick()
     return layers, together
 
@@ -125,10 +139,10 @@ def _twin(op: Op, whole: IntConv) -> Conv:
     return replace(changed, name=op.name + IN_INT8, output=op.output + IN_INT8)
 
 
-def _rest(graph: Graph, given: str) -> onnx.ModelProto:
+def _rest(graph: Graph, given: str, width: int) -> onnx.ModelProto:
     """The float network from one of its tensors, given beside the planes, to the correction."""
-    model = graph_to_onnx(tuple(op for op in graph if op.output != given), [CORRECTION])
-    model.graph.input.append(helper.make_tensor_value_info(given, TensorProto.FLOAT, ["N", "C", "H", "W"]))
+    model = graph_to_onnx(tuple(op for op in graph if op.output != given), [CORRECTION], width)
+    model.graph.input.append(helper.make_tensor_value_info(given, TensorProto.FLOAT, ["N", "C", None, None]))
     return model
 
 
@@ -136,6 +150,10 @@ def _in_int8(op: Op, core: IntCore, exact: Mapping[str, np.ndarray]) -> np.ndarr
     """A layer's result when it alone is in int8."""
     if isinstance(op, Conv):
         return _rounded(exact[op.output + IN_INT8], core.frac_bits[op.output])
+    if ties_scales(op) and not isinstance(op, AveragePool | Resize):
+        return exact[op.output]
+    if not isinstance(op, Add):
+        return _rounded(exact[op.output], core.frac_bits[op.output])
     left, right = (_rounded(exact[name], core.frac_bits[name]) for name in op.inputs)
     return np.asarray(exact[op.output] + (_rounded(left + right, core.frac_bits[op.output]) - (left + right)))
 
@@ -147,7 +165,7 @@ def _rounded(values: np.ndarray, frac_bits: int) -> np.ndarray:
 
 
 def _restored(crop: np.ndarray, correction: np.ndarray, core: IntCore) -> np.ndarray:
-    return np.asarray(np.clip(crop + merge(correction, core.scale(CORRECTION)), 0, 1))
+    return core.ends.restored(crop, correction, core.scale(CORRECTION))
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,8 @@ import onnxruntime as ort
 
 from model.processor import int8_adds_exactly
 from profiles.errors import ModelError
-from quant.graph import PLANES, PLANES_FRAC_BITS, Conv, Graph, split
+from quant.ends import ONE_CHANNEL, Ends
+from quant.graph import PLANES, PLANES_FRAC_BITS, Add, Concat, Conv, Graph, Mul, Op, Pointwise, same
 from quant.kernels import filled, is_integer, made_exact
 from quant.onnx_file import any_size, load_onnx
 from quant.untrusted import contradictions, times
@@ -80,6 +81,15 @@ def run(session: ort.InferenceSession, image: np.ndarray) -> np.ndarray:
     return restored
 
 
+def result_of(session: ort.InferenceSession, image: np.ndarray) -> np.ndarray:
+    """What a network makes of (N, C, H, W) float32 in [0, 1], whatever its size.
+
+    Raises:
+        ModelError: a model that does not run on this image.
+    """
+    return tensors_of(session, None, image)[0]
+
+
 def tensors_of(session: ort.InferenceSession, names: list[str] | None, image: np.ndarray) -> list[np.ndarray]:
     """The named outputs, or all, for an image (N, 1, H, W) float32 in [0, 1].
 
@@ -112,39 +122,59 @@ TILE_PX = 128
 """Side of the largest tile, halo not counted."""
 
 
-def crops(image: np.ndarray) -> list[np.ndarray]:
-    """Crops (1, 1, h, w) of at most TILE_PX a side that tile an image (1, 1, H, W): small images by themselves."""
+def crops(image: np.ndarray, halo_px: int | None = 0) -> list[np.ndarray]:
+    """Crops (1, C, h, w) of at most TILE_PX a side that tile an image (1, C, H, W): small images by themselves.
+
+    Where the network has no halo, None, the image is left whole: as `tensor_values` does.
+    """
+    if halo_px is None:
+        return [image]
     return [image[..., slice(*rows), slice(*columns)] for rows, columns in _places(image)]
 
 
 def tensor_values(
-    session: ort.InferenceSession, names: list[str], image: np.ndarray, halo_px: int
+    session: ort.InferenceSession, names: list[str], image: np.ndarray, halo_px: int | None, ends: Ends = ONE_CHANNEL
 ) -> Iterator[list[np.ndarray]]:
-    """The named tensors (1, C, h, w) of a plane-reading float network, tile by tile of an image (1, 1, H, W).
+    """The named tensors (1, C, h, w) of a plane-reading float network, tile by tile of an image (1, C', H, W).
 
     Each tile is computed with a halo of the pixels that its values depend on, which is then cut off: together the
-    tiles hold what the whole image would have given, its zero-padded borders included.
+    tiles hold what the whole image would have given, its zero-padded borders included. Without a halo (None) the
+    image is one tile.
 
     Raises:
         ModelError: NaN or infinity inside the network.
     """
+    if halo_px is None:
+        values = session.run(names, {PLANES: planes_of(image, ends)})
+        require_finite(values, "float network")
+        yield values
+        return
     for (top, bottom), (left, right) in _places(image):
         above, before = min(top, halo_px), min(left, halo_px)
         with_halo = image[..., top - above : bottom + halo_px, left - before : right + halo_px]
         inner = ..., slice(above, above + bottom - top), slice(before, before + right - left)
-        values = [result[inner] for result in session.run(names, {PLANES: planes_of(with_halo)})]
+        values = [result[inner] for result in session.run(names, {PLANES: planes_of(with_halo, ends)})]
         require_finite(values, "float network")
         yield values
 
 
-def planes_of(image: np.ndarray) -> np.ndarray:
-    """An image (N, 1, H, W) in [0, 1] as a plane-reading float network takes it: (N, 3, H, W) float32."""
-    return split(image).astype(np.float32) * np.float32(2.0**-PLANES_FRAC_BITS)
+def planes_of(image: np.ndarray, ends: Ends = ONE_CHANNEL) -> np.ndarray:
+    """An image (N, C, H, W) in [0, 1] as a plane-reading float network takes it: (N, P, H, W) float32."""
+    return ends.split(image).astype(np.float32) * np.float32(2.0**-PLANES_FRAC_BITS)
 
 
-def halo_of(graph: Graph) -> int:
-    """Pixels on each side that a value can depend on: no path passes more than all of the convolutions."""
-    return sum(op.pad_px for op in graph if isinstance(op, Conv))
+def halo_of(graph: Graph) -> int | None:
+    """Pixels on each side that a value can depend on: no path passes more than all of the convolutions.
+
+    None where values are not on the image's own lattice, or windows do not keep it.
+    """
+    if not all(isinstance(op, Add | Mul | Concat | Pointwise) or _keeps_lattice(op) for op in graph):
+        return None
+    return sum(max(op.window.pads) for op in graph if isinstance(op, Conv))
+
+
+def _keeps_lattice(op: Op) -> bool:
+    return isinstance(op, Conv) and not op.transposed and op.window == same(op.weight)
 
 
 def _places(image: np.ndarray) -> Iterator[tuple[tuple[int, int], tuple[int, int]]]:

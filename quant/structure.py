@@ -16,10 +16,11 @@ from quant.checks import Check
 from quant.encodings import encoding_faults
 from quant.graph import CORRECTION
 from quant.onnx_file import any_size, constants, with_outputs
-from quant.session import open_any_size, open_session, run, tensors_of
+from quant.session import open_any_size, open_session, result_of, tensors_of
+from quant.tiling.walk import tiling_of
 from quant.untrusted import contradictions
 
-ZERO_POINTS = {"QuantizeLinear": 2, "QLinearConv": 7, "QLinearAdd": 7, "QLinearMatMul": 7}
+ZERO_POINTS = {"QuantizeLinear": 2, "QLinearConv": 7, "QLinearAdd": 7, "QLinearMul": 7, "QLinearMatMul": 7}
 """ONNX's and onnxruntime's operators that round to 8 bits, of those that may run (`quant.untrusted`), and which input
 holds the zero point of their result."""
 
@@ -143,6 +144,8 @@ def count_relus(model: onnx.ModelProto) -> Relus:
 def _cuts_at_zero(node: onnx.NodeProto, known: dict[str, np.ndarray], rounded: dict[str, Rounded]) -> bool:
     """Whether it is a Max with zero, which in 8 bits is the zero point of what it is compared with."""
     floors = [known[name] for name in node.input if name in known]
+    if node.op_type == "Clip":  # ReLU6
+        return [float(floor) for floor in floors if floor.size == 1] == [0.0, 6.0]
     if node.op_type != "Max" or not floors:
         return False
     zeros = [rounded[name].zero_point for name in node.input if name in rounded] or [np.zeros(())]
@@ -159,11 +162,19 @@ def _begins_at_zero(node: onnx.NodeProto, rounded: dict[str, Rounded], convolved
 
 def structure_checks(graph_to_onnx: onnx.ModelProto, int8: onnx.ModelProto) -> list[Check]:
     """Does the INT8 file keep its ReLUs, is it encoded as meant, and the same with onnxruntime's optimisations?"""
-    image = np.random.default_rng(0).random((1, 1, 97, 101), dtype=np.float32)
-    plain, optimised = (run(open_any_size(int8, optimise=o), image) for o in (False, True))
+    image = np.random.default_rng(0).random(_odd_size(int8), dtype=np.float32)
+    plain, optimised = (result_of(open_any_size(int8, optimise=o), image) for o in (False, True))
     difference = float(np.abs(plain - optimised).max())
     optimisation = Check("optimised against unoptimised", difference, 0, "of full scale")
     return [_relus(graph_to_onnx, int8), *_encoding(int8), optimisation]
+
+
+def _odd_size(model: onnx.ModelProto) -> tuple[int, int, int, int]:
+    """Of an image that the network takes, on the lattice of its strides, its sides otherwise odd."""
+    sizes = [side.dim_value for side in model.graph.input[0].type.tensor_type.shape.dim]
+    lattice_px = 1 if sizes[2] else tiling_of(model).lattice_px
+    rows, columns = (fixed or -(-n // lattice_px) * lattice_px for fixed, n in zip(sizes[2:], (97, 101), strict=True))
+    return 1, sizes[1] or 1, rows, columns
 
 
 def _relus(graph_to_onnx: onnx.ModelProto, int8: onnx.ModelProto) -> Check:

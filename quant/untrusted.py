@@ -9,6 +9,7 @@ import onnx
 from onnx import AttributeProto, NodeProto, TensorProto, numpy_helper
 
 from profiles.errors import ModelError
+from quant.reading.arithmetic import LIST_VALUES, computed
 
 FILE_BYTES = 1 << 30
 VALUES = 1 << 28
@@ -138,7 +139,7 @@ WINDOW_PX = 1024
 """Kernel, stride, dilation or padding of a window, or a factor of enlargement."""
 
 STANDARD = ("", "ai.onnx")
-ONNXRUNTIMES = {("com.microsoft", "QLinearAdd")}
+ONNXRUNTIMES = {("com.microsoft", "QLinearAdd"), ("com.microsoft", "QLinearMul")}
 
 WINDOWS = {"kernel_shape", "strides", "dilations", "pads", "output_padding", "blocksize"}
 SIZES = {"CenterCropPad": (1,), "Expand": (1,), "MaxUnpool": (2,), "OneHot": (1,), "Resize": (3,)}
@@ -160,29 +161,78 @@ def check_runnable(model: onnx.ModelProto, where: str) -> None:
     """
     if model.functions or model.graph.sparse_initializer:
         raise refused(where, "plain operators and weights", "functions or sparse weights", "export it without them")
-    constants = {tensor.name: tensor for tensor in model.graph.initializer}
+    constants = _Constants(model, where)
     # What follows from the image is sized by it; what follows from constants alone may have any size.
-    of_image = {value.name for value in model.graph.input} - set(constants)
+    of_image = {value.name for value in model.graph.input} - set(constants.values)
     for node in model.graph.node:
         _check_operator(node, where)
         _check_windows(node, where)
-        _check_growth(node, constants, of_image, where)
+        _check_growth(node, constants.values, of_image, where)
         if of_image.intersection(node.input):
             of_image.update(node.output)
-        elif node.op_type not in KEEPING:
-            got, remedy = f"{node.op_type} of constants alone", "fold its constants"
-            raise refused(where, "operators that work on the image", got, remedy)
-        values = [a.t for a in node.attribute if a.name == "value"]
-        if node.op_type == "Constant" and values:
-            constants[node.output[0]] = values[0]
+        else:
+            constants.follow(node)
+
+
+class _Constants:
+    """What is computed of constants alone: its values, where they are a short list, and how much there is of it."""
+
+    def __init__(self, model: onnx.ModelProto, where: str) -> None:
+        self.values = {tensor.name: tensor for tensor in model.graph.initializer}
+        self._arrays: dict[str, np.ndarray] = {}
+        self._made = 0
+        self._where = where
+        self._opset = max((o.version for o in model.opset_import if o.domain in STANDARD), default=1)
+
+    def follow(self, node: NodeProto) -> None:
+        """Note a node that reads no image.
+
+        Raises:
+            ModelError: it could make anything of what it reads.
+        """
+        stored = [a.t for a in node.attribute if a.name == "value"] if node.op_type == "Constant" else []
+        if stored:
+            self.values[node.output[0]] = stored[0]
+            return
+        arrays = [self._array(name) for name in node.input]
+        self._check_filled(node, arrays)
+        result = computed(node, arrays, self._opset)
+        if result is not None:
+            self.values[node.output[0]] = numpy_helper.from_array(result, node.output[0])
+        elif node.op_type not in KEEPING | {"ConstantOfShape"}:
+            got = f"{named(node)} of constants alone"
+            raise refused(self._where, "operators that work on the image", got, "fold its constants")
+
+    def _array(self, name: str) -> np.ndarray | None:
+        """A short list, None where it is none."""
+        tensor = self.values.get(name)
+        if name not in self._arrays and tensor is not None and math.prod(tensor.dims) <= LIST_VALUES:
+            self._arrays[name] = numpy_helper.to_array(tensor)
+        return self._arrays.get(name)
+
+    def _check_filled(self, node: NodeProto, arrays: list[np.ndarray | None]) -> None:
+        """Weights may be filled with one number, as far as the file states how many."""
+        if node.op_type != "ConstantOfShape":
+            return
+        if len(arrays) != 1 or arrays[0] is None:
+            raise refused(self._where, "sizes that the file states", f"a computed one in {named(node)}", "fold it")
+        sizes = [int(size) for size in arrays[0].ravel()[: RANK + 1]]
+        check_size(named(node), sizes, self._where)
+        self._made += math.prod(max(size, 0) for size in sizes)
+        check_size("what constants fill", [self._made], self._where)
+
+
+def named(node: NodeProto) -> str:
+    """A node's operator and name, as sentences say it."""
+    return f"{node.op_type} {node.name}".strip()
 
 
 def _check_operator(node: NodeProto, where: str) -> None:
     if node.domain not in STANDARD and (node.domain, node.op_type) not in ONNXRUNTIMES:
-        got = f"{node.op_type} of {node.domain!r}"
+        got = f"{named(node)} of {node.domain!r}"
         raise refused(where, "operators of ONNX itself", got, "export it without operators of others")
     if any(a.HasField("g") or a.graphs or a.HasField("sparse_tensor") for a in node.attribute):
-        raise refused(where, "nodes that run once", f"{node.op_type} with a graph within", "unroll it")
+        raise refused(where, "nodes that run once", f"{named(node)} with a graph within", "unroll it")
 
 
 def _check_windows(node: NodeProto, where: str) -> None:
@@ -190,10 +240,10 @@ def _check_windows(node: NodeProto, where: str) -> None:
         if attribute.name in WINDOWS and attribute.type in (AttributeProto.INT, AttributeProto.INTS):
             largest = max(map(abs, (attribute.i, *attribute.ints)))
             if largest > WINDOW_PX:
-                got = f"{attribute.name} of {largest} in {node.op_type}"
+                got = f"{attribute.name} of {largest} in {named(node)}"
                 raise refused(where, f"windows of at most {WINDOW_PX} pixels", got, "export the network again")
         elif attribute.name in ("shape", "output_shape"):
-            check_size(node.op_type, attribute.ints, where)
+            check_size(named(node), attribute.ints, where)
 
 
 def _check_growth(node: NodeProto, constants: dict[str, TensorProto], of_image: set[str], where: str) -> None:
@@ -203,11 +253,11 @@ def _check_growth(node: NodeProto, constants: dict[str, TensorProto], of_image: 
             if not name or name in of_image:
                 continue
             if name not in constants:
-                raise refused(where, "sizes that the file states", f"a computed one in {node.op_type}", "fold it")
+                raise refused(where, "sizes that the file states", f"a computed one in {named(node)}", "fold it")
             if absolute:
-                check_size(node.op_type, _values(constants[name]), where)
+                check_size(named(node), _values(constants[name]), where)
             else:
-                _check_factor(node.op_type, _values(constants[name]), where)
+                _check_factor(named(node), _values(constants[name]), where)
 
 
 def _check_factor(name: str, values: list[float], where: str) -> None:

@@ -27,9 +27,9 @@ SURFACE = {
     "model.traditional": "Chain Noise PEERS QUALITIES destabilise restore_strips restore_traditional stabilise",
     "model.training": "PatchRecipe RestorationLoss Run TrainingRecipe train",
     "quant": (
-        "Calibration GateResult IntCore Limits Passes Patches Quantised board_model compare draw_patches "
+        "Calibration GateResult IntCore Limits Passes Patches Quantised Tiling board_model compare draw_patches "
         "host_model judge load_onnx open_session quantise_free quantise_model read_core receptive_radius_px run "
-        "save_onnx unseen_patches"
+        "save_onnx tiling_of unseen_patches"
     ),
     "deploy": (
         "Document float_model load_dpu method_named place predict read_network restore run_gate to_onnx weights_for"

@@ -26,7 +26,8 @@ from model.shipped import SENSOR
 from profiles import load_target
 from profiles.figures import Row
 from profiles.sensor_file import REFERENCE, load_sensor
-from quant.onnx_file import load_onnx, receptive_radius_px
+from quant.onnx_file import load_onnx
+from quant.tiling.walk import receptive_radius_px
 
 TRAFFIC = "LdFM, StFM: feature maps loaded and stored, an image; LdWB: weights and biases loaded, a batch."
 

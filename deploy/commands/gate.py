@@ -69,6 +69,10 @@ def gate(
         str, typer.Option(help="Profile of the test patches, and what a shipped network is specialised to.")
     ] = SENSOR,
     images: Annotated[Path | None, typer.Option(help="Folder of scenes; drawn ones if none.")] = None,
+    data: Annotated[
+        Path | None,
+        typer.Option(help="Your own samples in their place: .npy or .npz (N, C, H, W), or a folder of images."),
+    ] = None,
     patches: Annotated[int, typer.Option(min=1, max=100_000, help="Test patches of 128 x 128.")] = 32,
     seed: Annotated[int, typer.Option(min=0, max=SEEDS, help="Seed of the patches.")] = 0,
     summary: Annotated[Path | None, typer.Option(help="Add the verdict to this file as Markdown.")] = None,
@@ -88,14 +92,14 @@ def gate(
     from model.io.files import claim_outputs, require_writable
     from quant.gate import read_limits
 
-    read = (float_model, int8_model, config, baseline, images, *map(Path, (target, sensor)))
+    read = (float_model, int8_model, config, baseline, images, data, *map(Path, (target, sensor)))
     claim_outputs(json, junit, summary, outputs, inputs=read)  # before bad input is told there
     reports = Reports(summary, junit, outputs)
     with reports.of_bad_input("INT8 gate"):
         require_writable(json)
         limits = read_limits(config, max_mae)
         files = files_or_shipped(float_model, int8_model, variant, sensor, partial(say, err=True))
-        request = Request(*files, limits, baseline, target, sensor, images, patches, seed)
+        request = Request(*files, limits, baseline, target, sensor, images, patches, seed, data)
         outcome = run_gate(request)
     print_rows("float against INT8", [outcome.row])
     for check in outcome.checks:

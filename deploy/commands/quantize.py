@@ -33,6 +33,10 @@ def quantize(
     ] = Regime.legal,
     board: Annotated[Path | None, typer.Option(help="Also write the DPU's core in the board's encoding.")] = None,
     images: Annotated[Path | None, typer.Option(help="Folder of scenes for calibration; drawn ones if none.")] = None,
+    data: Annotated[
+        Path | None,
+        typer.Option(help="Your own samples in place of simulated patches: .npy or .npz (N, C, H, W), or a folder."),
+    ] = None,
     patches: Annotated[int, typer.Option(min=1, max=100_000, help="Calibration patches.")] = 64,
     patch: Annotated[int, typer.Option(min=32, max=2048, help="Side of a calibration patch in pixels.")] = 128,
     ablate: Annotated[bool, typer.Option("--ablate", help="Show what each pass buys, on other patches.")] = False,
@@ -49,8 +53,8 @@ def quantize(
 ) -> None:
     """Quantise to int8 with power-of-two scales: the correction on the DPU, the 12-bit add on the host.
 
-    Taken are residual networks of one channel: same-size convolutions of stride 1, each ReLU right behind one, adds,
-    and at the end the add of the image. 'check' says of a float file whether it is one of these.
+    Taken is any network that a DPU computes, of one band or several, with or without a global add; see
+    docs/any-network.md. 'check' says of a float file whether it is one of these.
 
     Prints each integer layer: bits of its accumulator, seen and proven, and the share of saturated results.
     """
@@ -63,6 +67,7 @@ def quantize(
     from profiles.errors import OptionError
     from quant.calibration import Calibration
     from quant.quantise import passes_without
+    from quant.samples import samples_of
 
     if regime is Regime.free and (board or ablate or report or without):
         remedy = "leave it out, or take --regime legal"
@@ -70,17 +75,18 @@ def quantize(
         raise OptionError("--regime free", expected=expected, got="one", remedy=remedy)
     passes = passes_without(without or [])
     page, figures = (report / "report.html", report / "report.json") if report else (None, None)
-    read = (model, images, *map(Path, (target, sensor)))
+    read = (model, images, data, *map(Path, (target, sensor)))
     require_writable(out, board, json, page, figures, inputs=read)
     model = float_file(model, load_sensor(sensor), partial(say, err=True))
     network, board_target = float_model(model), load_target(target)
-    calibration = Calibration(sensor, images, patches, patch, seed)
+    calibration = samples_of(network, data) or Calibration(sensor, images, patches, patch, seed)
     if regime is Regime.free:
         rows = quantise_free_file(network, calibration, out, say, print_rows)
     else:
         wanted = Wanted(board, ablate, page)
         rows = quantise_legal_file(network, calibration, board_target, passes, out, wanted, say, print_rows)
     arguments = {"target": target, "sensor": sensor, "images": images, "patches": patches, "patch": patch}
+    arguments |= {"data": data}
     arguments |= {"regime": regime.value, "without": ", ".join(without or []), "seed": seed}
     document = Document("quantize", arguments, (model, out), tuple(rows))
     for path in (figures, json):

@@ -16,6 +16,7 @@ from onnx import TensorProto, helper, numpy_helper
 from deploy.dpu.graph import Kind, Network, Operation, Shape, Window, out_shape, padding
 from deploy.dpu.integers import Integers
 from profiles.errors import ModelError
+from quant.encodings import as_on_board
 from quant.onnx_file import load_onnx
 from quant.untrusted import contradictions
 
@@ -45,9 +46,9 @@ def read_network(path: Path, tile_px: int = 640) -> Network:
     """Read an ONNX file as a network for one image with sides of `tile_px`.
 
     Raises:
-        ModelError: not a self-contained ONNX file, or not a network of images.
+        ModelError: not an ONNX file, or not a network of images.
     """
-    return network_of(load_onnx(path, to_run=False), tile_px, str(path))
+    return network_of(as_on_board(load_onnx(path, to_run=False)), tile_px, str(path))
 
 
 def own_tile_px(model: onnx.ModelProto) -> int | None:
@@ -73,9 +74,6 @@ class _Reader:
         self.nodes = list(graph.node)
         self.constants: dict[str, TensorProto] = {t.name: t for t in graph.initializer}
         self.constants |= {n.output[0]: t for n in graph.node for t in _constant(n)}
-        if any(t.data_location == TensorProto.EXTERNAL for t in self.constants.values()):
-            got, remedy = "constants kept in another file", "save it as one file"
-            raise ModelError(where, expected="one self-contained ONNX file", got=got, remedy=remedy)
         self.inputs = {i.name: _input_shape(i, tile_px, where) for i in graph.input if i.name not in self.constants}
         self.outputs = tuple(o.name for o in graph.output)
         self.shapes: dict[str, Shape | None] = dict(self.inputs)

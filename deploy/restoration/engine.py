@@ -17,7 +17,9 @@ from deploy.restoration.plan import Plan, Span
 from deploy.restoration.runtime import Infer
 from deploy.restoration.source import ArraySource, Raster, Source
 from model.io.images import MAX_DN, remedy_outside
-from profiles.errors import ImageError
+from profiles.errors import ImageError, ModelError
+from quant.tiling.walk import Tiling
+from quant.untrusted import times
 
 NAME = "image"
 """What messages call an image that came without a file."""
@@ -28,7 +30,7 @@ Tick = Callable[[int], None]
 """Told how many tiles are done since; stops the run where somebody asked to."""
 
 Tile = tuple[np.ndarray, int]
-"""The kept pixels of a tile, (h, w) as stored, and how many of them are known."""
+"""The kept pixels of a tile, (bands, h, w) restored and as stored, and how many of them are known."""
 
 
 @dataclass(frozen=True)
@@ -44,7 +46,7 @@ class Strip:
 
 
 class RestoredRow(NamedTuple):
-    """A restored row of tiles: its `span`, its kept `pixels` (bands, rows, width), and how many are `known`."""
+    """A row of tiles: its `span` in the image, restored `pixels` (bands, rows, width), and how many are `known`."""
 
     span: Span
     pixels: np.ndarray
@@ -59,15 +61,15 @@ class Restorer:
         raster: the image's facts.
         infer: the network.
         full_scale: the pixel value that is 1.0 to the network.
-        radius_px: the network's receptive radius; missing pixels are filled from no farther away, so what lies
-            beyond, filled or not, is nothing that a known pixel sees.
+        tiling: how the network meets an image; missing pixels are filled from no farther away than its halo, so what
+            lies beyond, filled or not, is nothing that a known pixel sees.
         name: of the image, for messages.
     """
 
     raster: Raster
     infer: Infer
     full_scale: float
-    radius_px: int
+    tiling: Tiling
     name: str = NAME
 
     def read(self, source: Source, start: int, stop: int) -> Strip:
@@ -76,46 +78,82 @@ class Restorer:
         Raises:
             ImageError: unreadable rows, or values outside 0 to full scale.
         """
-        margin_px = self.raster.fill_margin_px(self.radius_px)
+        margin_px = self.raster.fill_margin_px(self.tiling.halo_px)
         start, stop = max(start - margin_px, 0), min(stop + margin_px, self.raster.height_px)
         return checked_strip(self.raster, start, source.read(start, stop), self.full_scale, self.name)
 
-    def tile(self, strip: Strip, band: int, rows: Span, columns: Span) -> Tile:
-        """The tile of one band that reads `rows` and `columns`; one without a known pixel costs no inference.
+    def tile(self, strip: Strip, group: int, rows: Span, columns: Span) -> Tile:
+        """The tile of one group of bands that reads `rows` and `columns`; one without a known pixel is not inferred.
 
         Raises:
             ImageError: the network gives NaN or infinity.
+            ModelError: it gives another shape than its file states.
         """
-        keep = (
-            band,
-            slice(rows.keep_start - strip.top, rows.keep_stop - strip.top),
-            slice(columns.keep_start, columns.keep_stop),
-        )
-        stored = strip.pixels[keep].astype(self.raster.out_dtype)  # what missing pixels stay
-        missing = None if strip.missing is None else strip.missing[keep]
-        if missing is not None and missing.all():
-            return stored, 0
-        window = restore_window(self._window(strip, band, rows, columns), self.infer, self.full_scale)
-        result = as_stored(self.raster, window[_within(rows), _within(columns)], self.full_scale)
-        if missing is None:
+        bands = slice(group * self.tiling.channels_in, (group + 1) * self.tiling.channels_in)
+        unknown = self._unknown(strip, bands, rows, columns)
+        if unknown is not None and unknown[1].all():
+            return unknown[0], 0
+        window = restore_window(self._window(strip, bands, rows, columns), self.infer, self.full_scale)
+        self._require_shape(window, rows, columns)
+        result = as_stored(self.raster, window[:, self._within(rows), self._within(columns)], self.full_scale)
+        if unknown is None:
             return result, result.size
+        stored, missing = unknown
         return np.where(missing, stored, result), int((~missing).sum())
 
-    def _window(self, strip: Strip, band: int, rows: Span, columns: Span) -> np.ndarray:
-        """What the network sees of a tile, missing pixels filled."""
+    def _unknown(self, strip: Strip, bands: slice, rows: Span, columns: Span) -> tuple[np.ndarray, np.ndarray] | None:
+        """What the kept pixels of a tile stay where they are missing, and where; of the restored shape, as stored.
+
+        Where a network makes other bands of several, a pixel is missing that is missing in any.
+        """
         if strip.missing is None:
-            return strip.pixels[band, rows.start - strip.top : rows.stop - strip.top, columns.start : columns.stop]
+            return None
+        down = slice(rows.keep_start - strip.top, rows.keep_stop - strip.top)
+        kept = (bands, down, slice(columns.keep_start, columns.keep_stop))
+        stored, missing = strip.pixels[kept].astype(self.raster.out_dtype), strip.missing[kept]
+        tiling, scale = self.tiling, int(self.tiling.scale)
+        if tiling.channels_in != tiling.channels_out:
+            blank = np.nan if self.raster.nodata is None else self.raster.nodata
+            missing = np.repeat(missing.any(axis=0, keepdims=True), tiling.channels_out, axis=0)
+            stored = np.full(missing.shape, blank, stored.dtype)
+        if scale > 1:
+            stored, missing = (each.repeat(scale, axis=1).repeat(scale, axis=2) for each in (stored, missing))
+        return stored, missing
+
+    def _window(self, strip: Strip, bands: slice, rows: Span, columns: Span) -> np.ndarray:
+        """What the network sees of a tile, (bands, h, w): missing pixels filled, extended to the lattice."""
+        if strip.missing is None:
+            down = slice(rows.start - strip.top, rows.stop - strip.top)
+            window = strip.pixels[bands, down, columns.start : columns.stop]
+        else:
+            window = self._filled(strip, strip.missing, bands, rows, columns)
+        lack = rows.stop - rows.start - window.shape[1], columns.stop - columns.start - window.shape[2]
+        return np.pad(window, ((0, 0), (0, lack[0]), (0, lack[1])), mode="edge") if any(lack) else window
+
+    def _filled(self, strip: Strip, flags: np.ndarray, bands: slice, rows: Span, columns: Span) -> np.ndarray:
+        """A window with its missing pixels filled, as far as the image goes."""
+        radius_px = self.tiling.halo_px
         # Beyond the last pixel a slice ends by itself; before the first one it would begin at the other end.
-        left, right = max(columns.start - self.radius_px, 0), columns.stop + self.radius_px
-        top, bottom = max(rows.start - self.radius_px, 0) - strip.top, rows.stop + self.radius_px - strip.top
-        around = (band, slice(top, bottom), slice(left, right))
-        filled = fill_from_nearest(strip.pixels[around], strip.missing[around], self.radius_px)
+        left, right = max(columns.start - radius_px, 0), columns.stop + radius_px
+        top, bottom = max(rows.start - radius_px, 0) - strip.top, rows.stop + radius_px - strip.top
+        around = (bands, slice(top, bottom), slice(left, right))
+        planes = zip(strip.pixels[around], flags[around], strict=True)
+        filled = np.stack([fill_from_nearest(pixels, missing, radius_px) for pixels, missing in planes])
         above, aside = rows.start - strip.top - top, columns.start - left
-        return filled[above : above + rows.stop - rows.start, aside : aside + columns.stop - columns.start]
+        return filled[:, above : above + rows.stop - rows.start, aside : aside + columns.stop - columns.start]
 
+    def _within(self, span: Span) -> slice:
+        """What is kept of a restored window."""
+        scale = int(self.tiling.scale)
+        return slice((span.keep_start - span.start) * scale, (span.keep_stop - span.start) * scale)
 
-def _within(span: Span) -> slice:
-    return slice(span.keep_start - span.start, span.keep_stop - span.start)
+    def _require_shape(self, window: np.ndarray, rows: Span, columns: Span) -> None:
+        scale = int(self.tiling.scale)
+        sides = (rows.stop - rows.start) * scale, (columns.stop - columns.start) * scale
+        if window.shape != (self.tiling.channels_out, *sides):
+            expected = f"a result of {times((self.tiling.channels_out, *sides))}, as its file says"
+            remedy = "export it for images of any size, or check its sizes"
+            raise ModelError("ONNX model", expected=expected, got=times(window.shape), remedy=remedy)
 
 
 def checked_strip(raster: Raster, top: int, pixels: np.ndarray, full_scale: float, name: str) -> Strip:
@@ -164,17 +202,27 @@ def _along_rows(pixels: np.ndarray, missing: np.ndarray, reach_px: int) -> tuple
 
 
 def restore_window(dn: np.ndarray, infer: Infer, full_scale: float = MAX_DN) -> np.ndarray:
-    """One (h, w) window of digital numbers through the network: (h, w) float32 in 0..full_scale, not rounded.
+    """A window of digital numbers through the network: float32 in 0..full_scale, not rounded.
+
+    Args:
+        dn: (h, w) or (bands, h, w).
+        infer: the network.
+        full_scale: the number that is 1.0 to it.
+
+    Returns:
+        Of as many axes; of other bands and sizes where the network makes others.
 
     Raises:
         ImageError: the network gives NaN or infinity.
     """
-    image = np.ascontiguousarray(dn, dtype=np.float32)[None, None] / np.float32(full_scale)
+    bands = dn[None] if dn.ndim == 2 else dn
+    image = np.ascontiguousarray(bands, dtype=np.float32)[None] / np.float32(full_scale)
     with np.errstate(over="ignore"):  # what overflows is refused
-        restored = infer(image)[0, 0] * np.float32(full_scale)
+        restored = infer(image)[0] * np.float32(full_scale)
     if not np.isfinite(restored).all():
         raise ImageError("restored tile", expected="finite pixels", got="NaN", remedy="check the model with 'gate'")
-    return np.asarray(np.clip(restored, 0, np.float32(full_scale)))
+    restored = np.clip(restored, 0, np.float32(full_scale))
+    return np.asarray(restored[0] if dn.ndim == 2 else restored)
 
 
 def as_stored(raster: Raster, restored: np.ndarray, full_scale: float) -> np.ndarray:
@@ -244,28 +292,31 @@ def _joined(
     row: Span, tiles: Iterable[Tile], plan: Plan, restorer: Restorer, tick: Callable[[], None]
 ) -> RestoredRow:
     """One row of its tiles."""
-    shape = (plan.bands, row.keep_stop - row.keep_start, plan.width_px)
+    bands, _, width_px = plan.out_shape
+    shape = (bands, (row.keep_stop - row.keep_start) * plan.scale, width_px)
     result, known = np.empty(shape, restorer.raster.out_dtype), 0
-    for (band, columns), (pixels, known_here) in zip(_places(plan), tiles, strict=True):
-        result[band, :, columns.keep_start : columns.keep_stop] = pixels
+    count = plan.tiling.channels_out
+    for (group, columns), (pixels, known_here) in zip(_places(plan), tiles, strict=True):
+        at = slice(columns.keep_start * plan.scale, columns.keep_stop * plan.scale)
+        result[group * count : (group + 1) * count, :, at] = pixels
         known += known_here
         tick()
     return RestoredRow(row, result, known)
 
 
 def _places(plan: Plan) -> list[tuple[int, Span]]:
-    return [(band, columns) for band in range(plan.bands) for columns in plan.columns]
+    return [(group, columns) for group in range(plan.groups) for columns in plan.columns]
 
 
 def restore_array(source: Source, plan: Plan, restorer: Restorer, at_once: int = 1) -> np.ndarray:
-    """Restore all rows of an image, `at_once` tiles at a time: (bands, H, W) of the raster's `out_dtype`.
+    """Restore all rows of an image, `at_once` tiles at a time: the plan's `out_shape` of the raster's `out_dtype`.
 
     Raises:
         ImageError: unreadable rows, values outside 0 to full scale, or a network that gives NaN.
     """
-    result = np.empty(restorer.raster.shape, restorer.raster.out_dtype)
+    result = np.empty(plan.out_shape, restorer.raster.out_dtype)
     for row, pixels, _ in restore_rows(source, plan, restorer, plan.rows, lambda: None, at_once):
-        result[:, row.keep_start : row.keep_stop] = pixels
+        result[:, row.keep_start * plan.scale : row.keep_stop * plan.scale] = pixels
     return result
 
 
@@ -276,11 +327,15 @@ def restore_floats(dn: np.ndarray, infer: Infer, plan: Plan, max_dn: float = MAX
 
     Raises:
         ImageError: values outside 0 to `max_dn`, or a network that gives NaN.
+        ModelError: a network whose result has another size or more bands.
     """
+    if plan.out_shape != (1, *dn.shape):
+        got, remedy = f"one of {times(plan.out_shape)}", "restore files with it, or arrays by deploy.library"
+        raise ModelError("ONNX model", expected=f"a result of {times(dn.shape)}", got=got, remedy=remedy)
     pixels = np.asarray(dn, np.float32)[None]
     _, height_px, width_px = pixels.shape
     raster = Raster(1, height_px, width_px, pixels.dtype)
-    restorer = Restorer(raster, infer, float(max_dn), plan.radius_px)
+    restorer = Restorer(raster, infer, float(max_dn), plan.tiling)
     return np.asarray(restore_array(ArraySource(pixels, raster), plan, restorer)[0])
 
 

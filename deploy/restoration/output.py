@@ -21,7 +21,7 @@ from filelock import BaseFileLock, FileLock, Timeout
 
 from deploy.restoration.engine import RestoredRow
 from deploy.restoration.options import Compression
-from deploy.restoration.source import BIG_TIFF_SUFFIXES, Raster
+from deploy.restoration.source import BIG_TIFF_SUFFIXES, Tag
 from model.io.files import TIFF_SUFFIXES
 from profiles.errors import MachineError, OptionError, sizes
 from profiles.toml import read_json
@@ -33,7 +33,7 @@ def part_folder(out: Path) -> Path:
 
 
 class Checkpoint:
-    """The finished rows of an image (bands, height, width), from the top, and a journal of how many there are.
+    """The finished rows of a restored image (bands, height, width), from the top, and a journal of their number.
 
     Attributes:
         rows: how many are finished.
@@ -77,11 +77,11 @@ class Checkpoint:
         with self.disk():
             with (self.folder / "rows.raw").open("r+b") as stream:
                 for band in range(self.shape[0]):
-                    stream.seek(self._offset(band, row.span.keep_start))
+                    stream.seek(self._offset(band, self.rows))
                     stream.write(np.ascontiguousarray(row.pixels[band]).data)
                 stream.flush()
                 os.fsync(stream.fileno())
-            self.rows, self.known = row.span.keep_stop, self.known + row.known
+            self.rows, self.known = self.rows + row.pixels.shape[1], self.known + row.known
             self._write_journal()
 
     def read(self, band: int, start: int, stop: int) -> np.ndarray:
@@ -188,29 +188,30 @@ def require_codec(compression: Compression) -> None:
         raise MachineError("--compression", expected="an installed codec", got=got, remedy=remedy) from error
 
 
-def write_output(checkpoint: Checkpoint, raster: Raster, compression: Compression) -> None:
-    """Write the checkpoint's rows to its output, rename it into place and remove the checkpoint.
+def write_output(checkpoint: Checkpoint, tags: tuple[Tag, ...], compression: Compression) -> None:
+    """Write the checkpoint's rows and an image's `tags` to the output, rename it into place, remove the checkpoint.
 
     Raises:
         MachineError: the disk is full or gone; the rows are still there.
     """
     fresh = checkpoint.folder / "out.tif"
-    padded_px = raster.bands * _padded(raster.height_px) * _padded(raster.width_px)
+    bands, height, width = checkpoint.shape
+    padded_px = bands * _padded(height) * _padded(width)
     with checkpoint.disk():
         tifffile.imwrite(
             fresh,
             _tiles(checkpoint),
-            shape=checkpoint.shape if raster.bands > 1 else checkpoint.shape[1:],
+            shape=checkpoint.shape if bands > 1 else checkpoint.shape[1:],
             dtype=checkpoint.dtype,
             tile=(TILE_PX, TILE_PX),
             compression=compression.codec,
             compressionargs={"level": FAST_LEVEL} if compression is Compression.zlib else None,
             bigtiff=padded_px * checkpoint.dtype.itemsize > PLAIN_LIMIT_BYTES,
             photometric="minisblack",
-            planarconfig="separate" if raster.bands > 1 else None,
+            planarconfig="separate" if bands > 1 else None,
             software="beers-deploy",
             metadata=None,
-            extratags=raster.tags,
+            extratags=tags,
             buffersize=BUFFER_BYTES,
         )
         with fresh.open("r+b") as stream:

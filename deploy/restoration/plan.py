@@ -1,7 +1,9 @@
 """How an image is cut into tiles with exact seams, and what that costs: known before the run.
 
 A tile is read with a halo of `halo_px` pixels around what is kept of it. Where the halo is the network's receptive
-radius, the result is the whole image's, bit for bit. Whether a run fits into memory is looked at before it begins.
+radius, the result is the whole image's, bit for bit (`quant.tiling`). A network with strides is given tiles that
+begin and end at multiples of its lattice; the last ones reach beyond an image that is no multiple of it, which is
+extended there by copies of its last row and column. Whether a run fits into memory is looked at before it begins.
 """
 
 from collections.abc import Iterator
@@ -12,13 +14,16 @@ import psutil
 
 from deploy.restoration.options import Options, parse_halo
 from deploy.restoration.source import Source
-from profiles.errors import MachineError, OptionError, sizes
-from quant.onnx_file import fixed_tile_px, receptive_radius_px
+from profiles.errors import MachineError, ModelError, OptionError, sizes
+from quant.tiling.walk import Tiling, tiling_of
 
 
 @dataclass(frozen=True)
 class Span:
-    """One side of a tile: what it reads, and the part of it that is kept, in image pixels (end excluded)."""
+    """One side of a tile: what it reads, and the part of it that is kept, in image pixels (end excluded).
+
+    What it reads may end beyond the image, by less than the network's lattice.
+    """
 
     start: int
     stop: int
@@ -26,38 +31,53 @@ class Span:
     keep_stop: int
 
 
-def plan_side(size_px: int, tile_px: int, halo_px: int) -> list[Span]:
-    """The spans along one side of `size_px` pixels, each of `tile_px`, or one of `size_px` where that is less.
+def plan_side(size_px: int, tile_px: int, halo_px: int, lattice_px: int = 1) -> list[Span]:
+    """The spans along one side of `size_px` pixels, each of `tile_px`, or one of all where that is less.
+
+    Args:
+        size_px: of the image.
+        tile_px: side of a tile; rounded down to the lattice.
+        halo_px: a multiple of the lattice.
+        lattice_px: spans begin at its multiples, and read to one.
 
     Raises:
         OptionError: a tile with no room between its two halos.
     """
-    if tile_px <= 2 * halo_px or halo_px < 0:
+    if tile_px < 2 * halo_px + lattice_px or halo_px < 0:
+        least = f", {2 * halo_px + lattice_px} px at least" if lattice_px > 1 else ""
         raise OptionError(
             "--tile",
-            expected=f"more than twice the halo of {halo_px} px",
+            expected=f"more than twice the halo of {halo_px} px{least}",
             got=f"{tile_px} px",
             remedy="take larger tiles or a smaller halo",
         )
-    return list(_spans(size_px, min(tile_px, size_px), halo_px))
+    whole_px = _up(size_px, lattice_px)
+    return list(_spans(size_px, whole_px, min(tile_px // lattice_px * lattice_px, whole_px), halo_px))
 
 
-def even_side_px(size_px: int, tile_px: int, halo_px: int) -> int:
+def _up(size_px: int, lattice_px: int) -> int:
+    """The next multiple of the lattice."""
+    return -(-size_px // lattice_px) * lattice_px
+
+
+def even_side_px(size_px: int, tile_px: int, halo_px: int, lattice_px: int = 1) -> int:
     """The shortest side that needs no more tiles than `tile_px` does: what a last tile overlaps is work done twice.
 
     Raises:
         OptionError: as `plan_side`.
     """
-    count = len(plan_side(size_px, tile_px, halo_px))
-    return max(-(-(size_px + 2 * halo_px * (count - 1)) // count), 2 * halo_px + 1)
+    count = len(plan_side(size_px, tile_px, halo_px, lattice_px))
+    even_px = -(-(_up(size_px, lattice_px) + 2 * halo_px * (count - 1)) // count)
+    return max(_up(even_px, lattice_px), 2 * halo_px + lattice_px)
 
 
-def _spans(size_px: int, tile_px: int, halo_px: int) -> Iterator[Span]:
+def _spans(image_px: int, size_px: int, tile_px: int, halo_px: int) -> Iterator[Span]:
+    """Spans over `size_px`, the image and its extension; what is kept ends with the image."""
     done = 0
-    while done < size_px:
+    while done < image_px:
         start = min(max(done - halo_px, 0), size_px - tile_px)
         stop = start + tile_px
-        kept = size_px if stop == size_px else stop - halo_px
+        kept = image_px if stop == size_px else stop - halo_px
         yield Span(start, stop, done, kept)
         done = kept
 
@@ -67,12 +87,12 @@ class Plan:
     """Rows and columns of tiles over an image of `bands` bands.
 
     Attributes:
-        bands: each is cut alike and restored by itself.
+        bands: of the image, each cut alike and restored by itself, or all together as the network takes them.
         height_px: of the image.
         width_px: of the image.
         tile_px: no tile is longer.
         halo_px: context around what is kept of a tile.
-        radius_px: the network's receptive radius; with a halo of so much the seams are exact.
+        tiling: how the network meets an image.
         rows: of tiles, from top to bottom.
         columns: of tiles, from left to right.
     """
@@ -82,9 +102,29 @@ class Plan:
     width_px: int
     tile_px: int
     halo_px: int
-    radius_px: int
+    tiling: Tiling
     rows: tuple[Span, ...]
     columns: tuple[Span, ...]
+
+    @property
+    def radius_px(self) -> int:
+        """The network's receptive radius; with a halo of so much the seams are exact."""
+        return self.tiling.halo_px
+
+    @property
+    def scale(self) -> int:
+        """Pixels of the restored image for one of the image, along either side."""
+        return int(self.tiling.scale)
+
+    @property
+    def groups(self) -> int:
+        """Of bands that the network takes together."""
+        return self.bands // self.tiling.channels_in
+
+    @property
+    def out_shape(self) -> tuple[int, int, int]:
+        """Of the restored image: (bands, H, W)."""
+        return self.groups * self.tiling.channels_out, self.height_px * self.scale, self.width_px * self.scale
 
     @property
     def tile_shape(self) -> tuple[int, int]:
@@ -94,8 +134,8 @@ class Plan:
 
     @property
     def row_tiles(self) -> int:
-        """Tiles of one row of tiles, those of all bands."""
-        return len(self.columns) * self.bands
+        """Tiles of one row of tiles, those of all groups of bands."""
+        return len(self.columns) * self.groups
 
     @property
     def tiles(self) -> int:
@@ -123,12 +163,14 @@ class Plan:
     @property
     def sentence(self) -> str:
         """How the image is cut, in one sentence for the user."""
-        bands = f", each of {self.bands} bands by itself" if self.bands > 1 else ""
+        bands = f", each of {self.bands} bands by itself" if self.groups > 1 else ""
+        bands = f", {self.bands} bands together" if self.tiling.channels_in > 1 else bands
+        larger = f", {self.scale} times as large" if self.scale > 1 else ""
         rows_px, columns_px = self.tile_shape
         tiles = "1 tile" if self.tiles == 1 else f"{self.tiles} tiles"
         return (
             f"plan: {self.width_px} x {self.height_px} pixels{bands}; {tiles} of {columns_px} x {rows_px}, "
-            f"halo {self.halo_words}, work factor {self.work_factor:.2f}"
+            f"halo {self.halo_words}, work factor {self.work_factor:.2f}{larger}"
         )
 
 
@@ -139,11 +181,10 @@ def plan_for(network: onnx.ModelProto, shape: tuple[int, int, int], options: Opt
         ModelError: a network that cannot be tiled.
         OptionError: options that do not go together.
     """
-    radius_px, fixed_px = receptive_radius_px(network), fixed_tile_px(network)
-    if fixed_px is not None:
-        require_fixed_tile(fixed_px, options.tile_px, shape[1:])
-    halo_px = parse_halo(options.halo, radius_px)
-    return make_plan(shape, options.tile_px, halo_px, radius_px, fixed_px is not None)
+    tiling = tiling_of(network)
+    if tiling.fixed_px is not None:
+        require_fixed_tile(tiling.fixed_px, options.tile_px, shape[1:])
+    return make_plan(shape, options.tile_px, parse_halo(options.halo, tiling.halo_px), tiling)
 
 
 def require_fixed_tile(fixed_px: int, tile_px: int, size: tuple[int, int]) -> None:
@@ -161,22 +202,39 @@ def require_fixed_tile(fixed_px: int, tile_px: int, size: tuple[int, int]) -> No
         )
 
 
-def make_plan(shape: tuple[int, ...], tile_px: int, halo_px: int, radius_px: int, fixed: bool = False) -> Plan:
+def make_plan(shape: tuple[int, ...], tile_px: int, halo_px: int, tiling: Tiling) -> Plan:
     """The plan of an image of `shape` (bands, H, W).
 
-    Tiles are as even as can be, of at most `tile_px` a side; of just that where the network is `fixed` to it.
+    Tiles are as even as can be, of at most `tile_px` a side; of just that where the network is fixed to it.
 
     Raises:
-        OptionError: a tile with no room between its two halos.
+        ModelError: a network whose result is smaller than the image.
+        OptionError: a tile with no room between its two halos, a halo off the lattice, or bands that the network
+            does not take.
     """
     bands, height_px, width_px = shape
+    _require_fit(bands, halo_px, tiling)
 
     def side(size_px: int) -> tuple[Span, ...]:
-        longest_px = tile_px if fixed else even_side_px(size_px, tile_px, halo_px)
-        return tuple(plan_side(size_px, longest_px, halo_px))
+        lattice_px = tiling.lattice_px
+        longest_px = even_side_px(size_px, tile_px, halo_px, lattice_px) if tiling.fixed_px is None else tile_px
+        return tuple(plan_side(size_px, longest_px, halo_px, lattice_px))
 
-    rows, columns = side(height_px), side(width_px)
-    return Plan(bands, height_px, width_px, tile_px, halo_px, radius_px, rows, columns)
+    return Plan(bands, height_px, width_px, tile_px, halo_px, tiling, side(height_px), side(width_px))
+
+
+def _require_fit(bands: int, halo_px: int, tiling: Tiling) -> None:
+    """That a network can restore an image of so many bands, with such a halo."""
+    if tiling.scale.denominator != 1:
+        got, remedy = f"one of {tiling.scale} of it", "add what enlarges it to the network"
+        raise ModelError("tiled model", expected="a result of the image's size or a multiple", got=got, remedy=remedy)
+    if tiling.channels_in not in (1, bands):
+        expected = f"an image of {tiling.channels_in} bands, as the network takes them"
+        raise OptionError("--model", expected=expected, got=f"{bands}", remedy="choose bands, or another network")
+    if halo_px % tiling.lattice_px:
+        expected = f"a multiple of {tiling.lattice_px} px, after which the network's strides repeat"
+        remedy = f"{tiling.halo_px} is exact for this network"
+        raise OptionError("--halo", expected=expected, got=f"{halo_px} px", remedy=remedy)
 
 
 def rows_bytes(source: Source, plan: Plan, begun: bool = False) -> int:
@@ -196,8 +254,8 @@ def rows_bytes(source: Source, plan: Plan, begun: bool = False) -> int:
 
 def restored_bytes(source: Source, plan: Plan) -> int:
     """Memory of one row of tiles as it is stored."""
-    raster = source.raster
-    return plan.tile_shape[0] * raster.bands * raster.width_px * raster.out_dtype.itemsize
+    bands, _, width_px = plan.out_shape
+    return plan.tile_shape[0] * plan.scale * bands * width_px * source.raster.out_dtype.itemsize
 
 
 def check_memory(rows: int, budget_bytes: int | None, bulky: bool, share: int = 1) -> int:

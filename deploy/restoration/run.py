@@ -19,6 +19,7 @@ import numpy as np
 from deploy.cluster import check_choice
 from deploy.host_state import peak_memory
 from deploy.restoration.engine import RestoredRow, Restorer, Say, Tick, restore_rows
+from deploy.restoration.georeference import enlarged_tags
 from deploy.restoration.options import Options
 from deploy.restoration.output import (
     Checkpoint,
@@ -38,7 +39,7 @@ from model.processor import require_cores
 from model.progress import held_back, steps
 from profiles.errors import BeersError, ImageError, MachineError
 from profiles.figures import Figure, Row, measured, predicted, unavailable
-from quant.onnx_file import fixed_tile_px, load_onnx
+from quant.onnx_file import load_onnx
 
 RUNS_UNTIL_STEADY = 2
 """Of each tile in work at a time: then a runtime takes no more memory."""
@@ -53,7 +54,8 @@ def restore_file(image: Path, out: Path, options: Options, say: Say) -> Row:
 
     Args:
         image: a TIFF of any size, a PNG or a JPEG.
-        out: a TIFF, uint16 of integers and float32 of floats, in the scale of the image.
+        out: a TIFF, uint16 of integers and float32 of floats, in the scale of the image; larger by the network's
+            factor where it has one, and in its place on Earth.
         options: what the user chose.
         say: told the plan, the memory, and how to go on after a stop.
 
@@ -86,12 +88,12 @@ def _restore(image: Path, out: Path, options: Options, say: Say) -> Row:
         full_scale = scale_of(source, plan, options.full_scale, str(image))
         at_once = tiles_at_once(options.threads, plan.tiles)
         infer, runtime = open_runtime(options.runtime, network, options.threads, at_once)
-        restorer = Restorer(raster, infer, full_scale, plan.radius_px, str(image))
-        figures = seam_figures(source, plan, restorer, fixed_tile_px(network) is not None)
+        restorer = Restorer(raster, infer, full_scale, plan.tiling, str(image))
+        figures = seam_figures(source, plan, restorer)
         # Another version of the runtime might give other bits: rows of one are not finished by another.
         job = _job(image, options, plan, runtime, full_scale)
-        checkpoint = Checkpoint(out, raster.shape, raster.out_dtype, job, options.resume)
-        done_rows = checkpoint.rows
+        checkpoint = Checkpoint(out, plan.out_shape, raster.out_dtype, job, options.resume)
+        done_rows = checkpoint.rows // plan.scale
         if options.is_spread:
             work, peaks_gb = make_work(image, plan, network, runtime, options, full_scale), list[float]()
             finish_rows(checkpoint, plan, str(image), say, partial(rows_of_workers, work, source, say, peaks_gb))
@@ -100,7 +102,7 @@ def _restore(image: Path, out: Path, options: Options, say: Say) -> Row:
             here = partial(_rows_here, source, plan, restorer, at_once, options.memory_bytes, say)
             finish_rows(checkpoint, plan, str(image), say, here)
     with held_back():  # a stop now would save nothing
-        write_output(checkpoint, raster, options.compression)
+        write_output(checkpoint, enlarged_tags(raster.tags, plan.scale), options.compression)
     time_s = time.perf_counter() - started
     return run_row(image.name, plan, done_rows, time_s, runtime, options, figures, full_scale)
 
@@ -136,7 +138,7 @@ def finish_rows(checkpoint: Checkpoint, plan: Plan, name: str, say: Say, restore
         MachineError: memory, disk, or workers; finished rows stay.
         KeyboardInterrupt: stopped; finished rows stay.
     """
-    rows = [row for row in plan.rows if row.keep_start >= checkpoint.rows]
+    rows = [row for row in plan.rows if row.keep_start * plan.scale >= checkpoint.rows]
     tiles = len(rows) * plan.row_tiles
     with _kept_for_resuming(checkpoint, say), steps("restoring", tiles) as bar, held_back() as interrupt:
 
@@ -210,11 +212,11 @@ def _rows_here(
 # The figures of a run.
 
 
-def seam_figures(source: Source, plan: Plan, restorer: Restorer, fixed: bool) -> dict[str, Figure]:
-    """The error of seams, where the halo leaves any; `fixed`: the network takes one tile size only."""
+def seam_figures(source: Source, plan: Plan, restorer: Restorer) -> dict[str, Figure]:
+    """The error of seams, where the halo leaves any."""
     if plan.halo_px >= plan.radius_px or len(plan.rows) == len(plan.columns) == 1:
         return {}
-    if fixed:
+    if plan.tiling.fixed_px is not None:
         reason = "the network is fixed to one tile size: no wider window to compare with"
         return {key: unavailable("DN", reason) for key in ("seam error max", "seam error mean")}
     largest, mean = seam_error_dn(source, plan, restorer)
@@ -228,7 +230,8 @@ def seam_error_dn(source: Source, plan: Plan, restorer: Restorer) -> tuple[float
     The same kept pixels are restored twice: from the tile's own window, and from one with the whole radius around.
     """
     rows, columns = plan.rows[len(plan.rows) // 2], plan.columns[len(plan.columns) // 2]
-    wide = [_widened(rows, plan.radius_px, plan.height_px), _widened(columns, plan.radius_px, plan.width_px)]
+    ends_px = plan.rows[-1].stop, plan.columns[-1].stop
+    wide = [_widened(span, plan.radius_px, end_px) for span, end_px in zip((rows, columns), ends_px, strict=True)]
     start, stop = min(rows.start, wide[0].start), max(rows.stop, wide[0].stop)
     strip = restorer.read(source, start, stop)
     cheap, _ = restorer.tile(strip, 0, rows, columns)
@@ -238,8 +241,12 @@ def seam_error_dn(source: Source, plan: Plan, restorer: Restorer) -> tuple[float
 
 
 def _widened(span: Span, radius_px: int, size_px: int) -> Span:
-    """The same kept pixels with the whole radius around them, as far as the image goes."""
+    """The same kept pixels with the whole radius around them, as far as the image goes, with its extension.
+
+    What is kept ends on the network's lattice, or with the image: then what is read ends with the extension too.
+    """
     start, stop = max(span.keep_start - radius_px, 0), min(span.keep_stop + radius_px, size_px)
+    stop = size_px if span.stop == size_px else stop
     return Span(start, stop, span.keep_start, span.keep_stop)
 
 

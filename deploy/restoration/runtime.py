@@ -4,7 +4,7 @@ import hashlib
 import os
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import lru_cache, partial
+from functools import lru_cache
 from importlib import import_module
 from importlib.metadata import version
 from threading import Lock, get_ident
@@ -20,10 +20,10 @@ from model.processor import asked, require_cores
 from profiles.errors import MachineError, ModelError
 from quant.kernels import is_integer, made_exact
 from quant.onnx_file import parse_onnx
-from quant.session import open_session, run
+from quant.session import open_session, tensors_of
 
 Infer = Callable[[np.ndarray], np.ndarray]
-"""A network ready to run: (1, 1, h, w) float32 in [0, 1] to the same shape."""
+"""A network ready to run: (1, C, h, w) float32 in [0, 1] to what it makes of it, of the shape that its file says."""
 
 LOWEST = "openvino.lowest_uint8"
 
@@ -33,7 +33,7 @@ Precision = Literal["f32", "bf16"]
 def open_openvino(
     model: onnx.ModelProto, threads: int, precision: Precision = "f32", at_once: int = 1
 ) -> tuple[Callable[[np.ndarray], np.ndarray], str]:
-    """A callable (1, 1, h, w) float32 -> (1, 1, h, w) for `at_once` callers, and the runtime's name and version.
+    """A callable (1, C, h, w) float32 -> (1, C', h', w') for `at_once` callers, and the runtime's name and version.
 
     Raises:
         MachineError: OpenVINO is not installed, or this processor does not compute in that precision.
@@ -150,7 +150,8 @@ def open_runtime(runtime: Runtime, model: onnx.ModelProto, threads: int, at_once
     require_cores("--threads", threads)
     if runtime is Runtime.openvino:
         return open_openvino(model, threads, at_once=at_once)
-    return partial(run, open_session(model, session_threads(threads, at_once))), f"onnxruntime {ort.__version__}"
+    session = open_session(model, session_threads(threads, at_once))
+    return lambda image: tensors_of(session, None, image)[0], f"onnxruntime {ort.__version__}"
 
 
 def session_threads(threads: int, at_once: int) -> int:

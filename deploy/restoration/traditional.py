@@ -97,7 +97,7 @@ def _restore(image: Path, out: Path, request: Request) -> Row:
         checkpoint = Checkpoint(out, raster.shape, raster.out_dtype, job, resume=False)
         try:
             _fill(checkpoint, source, chain, full_scale, str(image))
-            write_output(checkpoint, raster, request.compression)
+            write_output(checkpoint, raster.tags, request.compression)
         except BaseException:  # a strip is no place to go on from: the chain looks hundreds of rows back
             checkpoint.remove()
             raise

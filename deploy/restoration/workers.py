@@ -82,8 +82,8 @@ class Opened:
         infer, runtime = open_packed(work.network)
         if runtime != work.runtime:
             raise MachineError(here(), expected=work.runtime, got=runtime, remedy="install the same everywhere")
-        scale, radius_px = work.full_scale, work.plan.radius_px
-        self.restorer = Restorer(self.source.raster, infer, scale, radius_px, str(work.image))
+        scale, tiling = work.full_scale, work.plan.tiling
+        self.restorer = Restorer(self.source.raster, infer, scale, tiling, str(work.image))
 
     def restore(self, row: Span) -> Piece:
         """Restore one row of tiles.

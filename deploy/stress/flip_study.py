@@ -13,12 +13,12 @@ from deploy.report.plots import Curve, Panel, Points, curves_svg
 from deploy.restoration.options import TILE_PX
 from deploy.stress import flips
 from deploy.stress.flips import MEMORIES, SETS, FaultTarget, name_of, rates_of
-from deploy.stress.networks import core_of, planes_of
+from deploy.stress.networks import core_of
 from deploy.stress.subject import Subject
 from profiles.figures import Row, predicted
 from quant.calibration import HELD_OUT_SEED, Calibration
-from quant.core import IntConv
 from quant.faults import INT8_BITS, as_stored, learn_guards, weight_bits
+from quant.graph import Activation
 
 FUSED = "fused into the convolution (UG1414 3.5)"
 INSTRUCTED = "two instructions of 16 values, one a cycle of the host's slowest clock (assumed)"
@@ -30,8 +30,8 @@ AT_ONCE, INSTRUCTIONS = 16, 2
 
 def price_rows(target: FaultTarget, prediction: Prediction, dpu: Dpu) -> list[Row]:
     """A row a guard and one for all of them, at work for every tile of 640 x 640."""
-    relus = sum(op.relu for op in target.core.ops if isinstance(op, IntConv))
-    rate, values = Constants.of(dpu).host_in_bytes_per_s, target.core.output_channels * TILE_PX**2
+    relus = sum(op.activation is Activation.relu for op in target.core.convolutions)
+    rate, values = Constants.of(dpu).host_in_bytes_per_s, target.core.ends.gains * TILE_PX**2
     clock_hz = 1e9 * dpu.limit("cpu", "clock_ghz").low
     limit_s = INSTRUCTIONS * values / AT_ONCE / clock_hz
     scrubbing_s = weight_bits(target.core) / INT8_BITS / rate
@@ -113,7 +113,7 @@ def make_target(subject: Subject, request: FlipRequest) -> FaultTarget:
         Calibration(request.sensor, request.images, count, request.size_px, seed).drawn
         for seed, count in ((request.seed, CALIBRATION_PATCHES), (request.seed + HELD_OUT_SEED, request.draws))
     )
-    guards = learn_guards(core, (planes_of(core, image) for image in taught.degraded))
+    guards = learn_guards(core, (core.ends.split(image) for image in taught.degraded))
     return FaultTarget(core, guards, list(tried.pairs))
 
 

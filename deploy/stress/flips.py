@@ -10,7 +10,6 @@ from functools import cached_property
 
 import numpy as np
 
-from deploy.stress.networks import planes_of
 from model.io.images import MAX_DN
 from model.metrics.fidelity import psnr_db
 from profiles.figures import Figure, Row, measured
@@ -35,7 +34,7 @@ from quant.faults import (
     weight_bits,
     with_ops,
 )
-from quant.graph import Add
+from quant.graph import Op
 from quant.integer import SOUND, Faults, merged_correction, run_core
 
 Pair = tuple[np.ndarray, np.ndarray]
@@ -87,7 +86,7 @@ class Injected:
 def restored(target: FaultTarget, injected: Injected, clamped: bool = False) -> np.ndarray:
     """The restored image (1, 1, H, W) in [0, 1]; `clamped` turns the ReLU6 and the limit of the correction on."""
     faults = guarded(injected.faults, target.guards) if clamped else injected.faults
-    tensors, _ = run_core(injected.core, planes_of(injected.core, injected.image), faults=faults)
+    tensors, _ = run_core(injected.core, injected.core.ends.split(injected.image), faults=faults)
     correction = merged_correction(injected.core, tensors)
     correction = target.guards.limit(correction) if clamped else correction
     return np.asarray(np.clip(injected.image + correction, 0, 1), np.float32)
@@ -212,7 +211,7 @@ def single_flips(
 
 
 def _injections(
-    target: FaultTarget, op: IntConv | Add, image: np.ndarray, generator: np.random.Generator
+    target: FaultTarget, op: IntConv | Op, image: np.ndarray, generator: np.random.Generator
 ) -> Iterator[tuple[str, int, Injected]]:
     fault_free = Injected(target.core, SOUND, image, 1)
     for bit in range(INT8_BITS):

@@ -23,8 +23,7 @@ from deploy.stress.checks import (
 from deploy.stress.subject import Network, Subject, infer_in, restore, steepest_signs
 from profiles.errors import BeersError, ModelError
 from quant.bounds import saturable
-from quant.core import IntConv, IntCore
-from quant.graph import split
+from quant.core import IntCore
 from quant.integer import LayerReport, merged_correction, run_core
 
 RINGING_PERCENT = 100.0
@@ -50,14 +49,14 @@ def bfloat16(subject: Subject, case: Case, image: np.ndarray) -> list[Measure]:
     """The float network in bfloat16 with a float32 sum, as training runs it, on an image (H, W) in DN."""
     if isinstance(subject.graph, BeersError):
         raise subject.graph
-    infer, radius_px = infer_in(subject.graph, torch.bfloat16, torch.float32), subject.float32.radius_px
+    infer, tiling = infer_in(subject.graph, torch.bfloat16, torch.float32), subject.float32.tiling
     if case.pixels in ("infinite", "beyond"):
-        return [refused(lambda: restore(infer, image, radius_px))]
-    result, again = (restore(infer, image, radius_px) for _ in range(2))
+        return [refused(lambda: restore(infer, image, tiling))]
+    result, again = (restore(infer, image, tiling) for _ in range(2))
     known = ~np.isnan(image)
     measures = [not_finite(result[known]), out_of_range(result), differing("runs differ", result, again)]
     if case.pixels == "sound":
-        truth = restore(infer_in(subject.graph, torch.float64), image, radius_px)
+        truth = restore(infer_in(subject.graph, torch.float64), image, tiling)
         measures.append(Measure("error against float64", float(np.abs(result - truth).max()), BFLOAT16_DN))
     return measures
 
@@ -125,7 +124,7 @@ def reference(subject: Subject, case: Case, image: np.ndarray) -> list[Measure]:
     if case.pixels != "sound":
         return []
     crop = (np.asarray(image[:CROP_PX, :CROP_PX], np.float32) / np.float32(FULL_DN))[None, None]
-    planes = planes_of(core, crop)
+    planes = core.ends.split(crop)
     even, reports = run_core(core, planes, half_even=True)
     up, _ = run_core(core, planes)
     by_runtime, by_rule, on_board = (
@@ -156,13 +155,6 @@ def core_of(subject: Subject) -> IntCore:
         raise core
     assert core is not None  # noqa: S101 - there is a file
     return core
-
-
-def planes_of(core: IntCore, image: np.ndarray) -> np.ndarray:
-    """As many planes (N, 2 or 3, H, W) as the core reads."""
-    first = core.ops[0]
-    planes = split(image)
-    return planes[:, : first.weight.shape[1]] if isinstance(first, IntConv) else planes
 
 
 def _restored(core: IntCore, image: np.ndarray, tensors: dict[str, np.ndarray]) -> np.ndarray:

@@ -11,8 +11,8 @@ from profiles.errors import BeersError
 from profiles.figures import Figure, Row, by_table, measured, predicted, unavailable
 from quant.bounds import Bound, bound_anywhere, bound_inside, correction_bound, layer_bounds
 from quant.core import IntCore
+from quant.ends import GAIN
 from quant.integer import INT32_BITS
-from quant.passes.stream import GAIN
 
 COUNT, COUNTED = "count", ("px", "runs", "figures", "layers")
 SOURCE = "stress: worst over the images of the case"

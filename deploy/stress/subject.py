@@ -24,9 +24,10 @@ from profiles import load_sensor
 from profiles.errors import BeersError
 from quant.core import IntCore
 from quant.encodings import read_core
-from quant.graph import CORRECTION, IMAGE, Add, Graph, correction_graph
-from quant.onnx_file import any_size, load_onnx, receptive_radius_px, require_quantised
+from quant.graph import CORRECTION, IMAGE, Activation, Add, Conv, Graph, correction_graph
+from quant.onnx_file import any_size, load_onnx, require_quantised
 from quant.session import open_session, run
+from quant.tiling.walk import Tiling, tiling_of
 
 T = TypeVar("T")
 
@@ -41,9 +42,14 @@ class Network:
     model: onnx.ModelProto
 
     @cached_property
+    def tiling(self) -> Tiling:
+        """How it meets an image of any size."""
+        return tiling_of(any_size(self.model))
+
+    @property
     def radius_px(self) -> int:
         """How far from a pixel its result depends on."""
-        return receptive_radius_px(self.model)
+        return self.tiling.halo_px
 
     def infer(self, threads: int = 1) -> Infer:
         """The network ready to run on so many threads, opened once for each number of them."""
@@ -57,7 +63,7 @@ class Network:
         Raises:
             ImageError: numbers outside 0 to full scale, or a network that gives NaN.
         """
-        return restore(self.infer(threads), image, self.radius_px, tile_px)
+        return restore(self.infer(threads), image, self.tiling, tile_px)
 
     @cached_property
     def _opened(self) -> dict[int, ort.InferenceSession]:
@@ -113,13 +119,13 @@ def open_subject(
     return Subject(float32, int8, paths)
 
 
-def restore(infer: Infer, image: np.ndarray, radius_px: int, tile_px: int = WHOLE_PX) -> np.ndarray:
+def restore(infer: Infer, image: np.ndarray, tiling: Tiling, tile_px: int = WHOLE_PX) -> np.ndarray:
     """The command's own way from digital numbers (H, W) to restored ones, float32, not rounded, with exact seams.
 
     Raises:
         ImageError: numbers outside 0 to full scale, or a network that gives NaN.
     """
-    return restore_floats(image, infer, make_plan((1, *image.shape), tile_px, radius_px, radius_px), FULL_DN)
+    return restore_floats(image, infer, make_plan((1, *image.shape), tile_px, tiling.halo_px, tiling), FULL_DN)
 
 
 def _or_reason(work: Callable[[], T]) -> T | BeersError:
@@ -157,9 +163,10 @@ def _correction(graph: Graph, image: Tensor) -> Tensor:
         if isinstance(op, Add):
             tensors[op.output] = tensors[op.inputs[0]] + tensors[op.inputs[1]]
             continue
+        assert isinstance(op, Conv)  # noqa: S101 - correction_graph has seen to it
         weight, bias = (_as(values, image.dtype) for values in (op.weight, op.bias))
-        result = conv2d(tensors[op.input], weight, bias, padding=op.pad_px)
-        tensors[op.output] = torch.relu(result) if op.relu else result
+        result = conv2d(tensors[op.input], weight, bias, padding=op.window.pads[0])
+        tensors[op.output] = torch.relu(result) if op.activation is Activation.relu else result
     return tensors[CORRECTION]
 
 

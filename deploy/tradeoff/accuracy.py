@@ -21,6 +21,7 @@ from model.evaluation.scores import Instruments
 from model.evaluation.targets import Targets, snr_name, target_figures
 from model.io.images import MAX_DN
 from profiles.figures import Figure
+from quant.tiling.walk import Tiling
 
 MAE = "float-INT8 MAE"
 FLAT = "flat SNR"
@@ -125,7 +126,7 @@ def cut_in_four(infer: Infer, halo_px: int, max_dn: int = MAX_DN) -> Restore:
 def _restore(dn: np.ndarray, infer: Infer, halo_px: int, max_dn: int) -> np.ndarray:
     height_px, width_px = dn.shape
     rows, columns = (tuple(halves(size_px, halo_px)) for size_px in dn.shape)
-    plan = Plan(1, height_px, width_px, max(dn.shape), halo_px, halo_px, rows, columns)
+    plan = Plan(1, height_px, width_px, max(dn.shape), halo_px, Tiling(halo_px), rows, columns)
     return restore_dn(dn, infer, plan, max_dn)
 
 

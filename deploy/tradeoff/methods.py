@@ -32,9 +32,10 @@ from profiles.sensor import SensorProfile
 from profiles.sensor_file import reference_for
 from quant.calibration import Patches, draw_patches
 from quant.free import free_ticks, quantise_free
-from quant.onnx_file import fixed_tile_px, is_quantised, load_onnx, metadata, receptive_radius_px, save_onnx
+from quant.onnx_file import is_quantised, load_onnx, metadata, save_onnx
 from quant.passes.equalise import search_steps
 from quant.quantise import SEARCH_CROPS, quantise_model, ticks
+from quant.tiling.walk import Tiling, tiling_of
 
 PAPER = VARIANTS["convbeers"]
 """The paper's network: 16 blocks of 64 features."""
@@ -85,9 +86,14 @@ def _network(name: str, sensor: SensorProfile, say: Say) -> Network:
         expected = f"a shipped network ({', '.join(shipped_names())}) or an ONNX or safetensors file"
         raise OptionError("--networks", expected=expected, got=repr(name), remedy="correct that name")
     model = float_model(float_file(path, sensor, say))
-    if fixed_tile_px(model):
+    tiling = tiling_of(model)
+    if tiling.fixed_px is not None:
         got, remedy = f"{name} for one tile size", "export it without --tile"
         raise OptionError("--networks", expected="networks for images of any size", got=got, remedy=remedy)
+    if tiling != Tiling(tiling.halo_px):
+        expected = "networks of one band without strides, of which halos and tiles of all sizes are compared"
+        got = f"{name}, {tiling.words}"
+        raise OptionError("--networks", expected=expected, got=got, remedy="bench it and restore with it instead")
     if is_quantised(model):
         precision = metadata(model).get("precision", "int8 legal").replace("int8", "INT8")
         return Network(path.stem, None, path, precision)
@@ -242,7 +248,7 @@ class MethodStore:
 
     def radius_px(self, method: str) -> int:
         """How far a network sees from each pixel, in pixels."""
-        return receptive_radius_px(self.model(method))
+        return tiling_of(self.model(method)).halo_px
 
     def digest(self, variant: Variant) -> str:
         """What the variant's pictures depend on; known before a missing INT8 file is made."""

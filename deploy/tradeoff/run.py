@@ -37,6 +37,7 @@ from model.io.images import MAX_DN
 from model.io.pictures import busiest_windows
 from profiles.figures import Row
 from quant.onnx_file import load_onnx
+from quant.tiling.walk import Tiling
 
 CROP_PX, MOST = 128, 8
 FRONT = ("board latency", "PSNR")
@@ -86,7 +87,7 @@ def _restored(outcome: Outcome, pair: NamedPair, measurements: Measurements) -> 
     if opened.infer is None:
         return opened.restore(pair.degraded)
     radius_px = measurements.store.radius_px(point.variant.method)
-    plan = make_plan((1, *pair.degraded.shape), point.tile_px, point.halo_px(radius_px), radius_px)
+    plan = make_plan((1, *pair.degraded.shape), point.tile_px, point.halo_px(radius_px), Tiling(radius_px))
     return restore_dn(pair.degraded, opened.infer, plan, measurements.store.max_dn)
 
 

@@ -30,7 +30,8 @@ from model.traditional.settings import QUALITIES
 from profiles.errors import ModelError
 from profiles.sensor import SensorProfile
 from profiles.sensor_file import load_sensor, reference_for
-from quant.onnx_file import load_onnx, receptive_radius_px
+from quant.onnx_file import load_onnx
+from quant.tiling.walk import receptive_radius_px
 
 
 def select_points(store: MethodStore, swath: Swath) -> list[Point]:

@@ -14,8 +14,9 @@ from itertools import product
 import numpy as np
 
 from quant.core import INT8_MAX
+from quant.ends import ONE_CHANNEL, Ends
 from quant.graph import Conv, Graph, graph_to_onnx
-from quant.passes.stream import STREAM_FRAC_BITS, stream_tensors
+from quant.passes.stream import STREAM_FRAC_BITS, Stream
 from quant.session import halo_of, open_session, tensor_values
 
 QUANTILE = 0.9999
@@ -41,27 +42,32 @@ Costs = Callable[[np.ndarray | None], np.ndarray]
 Trial = Callable[[Graph], Costs]
 
 
-def equalise(graph: Graph, factors: np.ndarray) -> Graph:
-    """The same network with stream channel c scaled by factors[c], (C,) above 0."""
-    stream = stream_tensors(graph)
+def equalise(graph: Graph, stream: Stream, factors: np.ndarray) -> Graph:
+    """The same network with channel c of a stream scaled by factors[c], (C,) above 0."""
     return tuple(_scaled(op, factors, stream) if isinstance(op, Conv) else op for op in graph)
 
 
-def _scaled(op: Conv, factors: np.ndarray, stream: set[str]) -> Conv:
+def _scaled(op: Conv, factors: np.ndarray, stream: Stream) -> Conv:
     weight, bias = op.weight.astype(np.float64), op.bias.astype(np.float64)
     if op.output in stream:
         weight, bias = weight * factors[:, None, None, None], bias * factors
     if op.input in stream:
-        weight = weight / factors[None, :, None, None]
+        weight = weight / (factors[None, :, None, None] if op.groups == 1 else factors[:, None, None, None])
     return replace(op, weight=weight.astype(np.float32), bias=bias.astype(np.float32))
 
 
-def channel_ranges(graph: Graph, images: Iterable[np.ndarray], tick: Callable[[], None]) -> np.ndarray:
-    """(C,) range of each stream channel over images (1, 1, H, W), the widest of all the stream's tensors."""
-    names, halo_px = sorted(stream_tensors(graph)), halo_of(graph)
-    session, total, count = open_session(graph_to_onnx(graph, names)), np.zeros(1), 0
+def channel_ranges(
+    graph: Graph,
+    stream: Stream,
+    images: Iterable[np.ndarray],
+    tick: Callable[[], None],
+    ends: Ends = ONE_CHANNEL,
+) -> np.ndarray:
+    """(C,) range of each stream channel over images (1, C', H, W), the widest of all the stream's tensors."""
+    names, halo_px = sorted(stream), halo_of(graph)
+    session, total, count = open_session(graph_to_onnx(graph, names, ends.planes * ends.channels)), np.zeros(1), 0
     for image in images:
-        for results in tensor_values(session, names, image, halo_px):
+        for results in tensor_values(session, names, image, halo_px, ends):
             sizes = [np.abs(r[0]).reshape(r.shape[1], -1) for r in results]
             total = total + np.stack([np.quantile(size, QUANTILE, axis=1) for size in sizes])
             count += 1
@@ -78,11 +84,11 @@ def first_guess(ranges: np.ndarray, levelling: float, headroom: float) -> np.nda
     return np.asarray(factors * headroom * limit / (ranges * factors).max())
 
 
-def search(graph: Graph, ranges: np.ndarray, trial: Trial, tick: Callable[[], None]) -> np.ndarray:
+def search(graph: Graph, stream: Stream, ranges: np.ndarray, trial: Trial, tick: Callable[[], None]) -> np.ndarray:
     """The factors of least error: the best first guess, then channel by channel."""
     best = None
     for levelling, headroom in product(LEVELLING, HEADROOM):
-        best = _race(graph, first_guess(ranges, levelling, headroom), trial, best)
+        best = _race(graph, stream, first_guess(ranges, levelling, headroom), trial, best)
         tick()
     assert best is not None  # noqa: S101
     for step in STEPS:
@@ -90,7 +96,7 @@ def search(graph: Graph, ranges: np.ndarray, trial: Trial, tick: Callable[[], No
             for factor in (step, 1 / step):
                 tried = best.factors.copy()
                 tried[channel] *= factor
-                winner = _race(graph, tried, trial, best)
+                winner = _race(graph, stream, tried, trial, best)
                 if winner is not best:
                     best = winner
                     break  # the other way leads back
@@ -106,9 +112,9 @@ class _Best:
     costs: np.ndarray
 
 
-def _race(graph: Graph, factors: np.ndarray, trial: Trial, best: _Best | None) -> _Best:
+def _race(graph: Graph, stream: Stream, factors: np.ndarray, trial: Trial, best: _Best | None) -> _Best:
     """The better of two, the costliest crops first: six of seven trials fail, and most of them show it on two."""
-    costs_of = trial(equalise(graph, factors))
+    costs_of = trial(equalise(graph, stream, factors))
     if best is None:
         return _Best(factors, costs_of(None))
     order = np.argsort(-best.costs, kind="stable")

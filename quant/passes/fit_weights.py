@@ -14,6 +14,7 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
 from quant.core import INT8_MAX, INT8_MIN, SHIFTS, IntConv, IntCore, Shifts, quantise_bias
+from quant.ends import ONE_CHANNEL, Ends
 from quant.graph import PLANES, Conv, Graph, graph_to_onnx, tensors
 from quant.session import crops, halo_of, open_session, planes_of, tensor_values
 
@@ -48,18 +49,21 @@ class Moments:
         return np.asarray(covariance + floor * np.eye(len(covariance)))
 
 
-def input_moments(graph: Graph, images: Iterable[np.ndarray], tick: Callable[[], None]) -> dict[str, Moments]:
-    """The moments of every convolution of a plane-reading graph, by its name, over images (1, 1, H, W) in [0, 1].
+def input_moments(
+    graph: Graph, images: Iterable[np.ndarray], tick: Callable[[], None], ends: Ends = ONE_CHANNEL
+) -> dict[str, Moments]:
+    """The moments of every convolution of a plane-reading graph, by its name, over images (1, C, H, W) in [0, 1].
 
     The values are those of the float network. `tick` is called once an image.
     """
-    convs = [op for op in graph if isinstance(op, Conv)]
+    convs = [op for op in graph if isinstance(op, Conv) and fits(op)]
     found = {op.name: _nothing(op) for op in convs}
     names, halo_px = tensors(graph), halo_of(graph)
-    session = open_session(graph_to_onnx(graph, names))
+    session = open_session(graph_to_onnx(graph, names, ends.planes * ends.channels))
     for image in images:
-        for crop, values in zip(crops(image), tensor_values(session, names, image, halo_px), strict=True):
-            read = {PLANES: planes_of(crop), **dict(zip(names, values, strict=True))}
+        tiles = tensor_values(session, names, image, halo_px, ends)
+        for crop, values in zip(crops(image, halo_px), tiles, strict=True):
+            read = {PLANES: planes_of(crop, ends), **dict(zip(names, values, strict=True))}
             for op in convs:
                 found[op.name].add(_windows(read[op.input], op))
         tick()
@@ -71,10 +75,19 @@ def _nothing(op: Conv) -> Moments:
     return Moments(np.zeros((size, size)), np.zeros(size))
 
 
+def fits(op: Conv) -> bool:
+    """Whether a convolution's windows are gathered: of one group, and not transposed."""
+    return op.groups == 1 and not op.transposed
+
+
 def _windows(values: np.ndarray, op: Conv) -> np.ndarray:
     """(K, I kh kw) of the windows within (1, I, H, W), some pixels apart."""
-    kernel = op.weight.shape[2:]
-    windows = sliding_window_view(values[0], kernel, axis=(1, 2))[:, ::EVERY_PX, ::EVERY_PX]
+    (rows, columns), (tall, broad) = op.window.strides, op.window.dilations
+    kernel = (op.weight.shape[2] - 1) * tall + 1, (op.weight.shape[3] - 1) * broad + 1
+    every = -(-EVERY_PX // rows) * rows, -(-EVERY_PX // columns) * columns
+    if min(n - k for n, k in zip(values.shape[2:], kernel, strict=True)) < 0:
+        return np.empty((0, int(np.prod(op.weight.shape[1:]))), np.float32)
+    windows = sliding_window_view(values[0], kernel, axis=(1, 2))[:, :: every[0], :: every[1], ::tall, ::broad]
     return np.ascontiguousarray(windows.transpose(1, 2, 0, 3, 4)).reshape(-1, int(np.prod(op.weight.shape[1:])))
 
 
@@ -94,11 +107,16 @@ def fit_weights(graph: Graph, core: IntCore, moments: Mapping[str, Moments], shi
     pairs = zip(graph, core.ops, strict=True)
     ops = [
         _fit(op, whole, core.frac_bits[whole.input], moments[op.name], shifts)
-        if isinstance(op, Conv) and isinstance(whole, IntConv)
+        if isinstance(op, Conv) and isinstance(whole, IntConv) and _enough(moments.get(op.name))
         else whole
         for op, whole in pairs
     ]
     return replace(core, ops=tuple(ops))
+
+
+def _enough(moments: Moments | None) -> bool:
+    """Whether there are more windows than weights: fewer say nothing of how errors add up."""
+    return moments is not None and moments.count > len(moments.total)
 
 
 def _fit(op: Conv, whole: IntConv, input_frac_bits: int, moments: Moments, shifts: Shifts) -> IntConv:

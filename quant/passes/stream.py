@@ -5,30 +5,50 @@ apart, together hold nine bits. Two gains for the correction: a fine one for nea
 strongest edges.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 
 import numpy as np
 
-from quant.graph import Add, Conv, Graph
+from quant.ends import GAIN
+from quant.graph import CORRECTION, PLANES, Activation, Add, Conv, Graph
+from quant.graph.operations import united
 
 STREAM_FRAC_BITS = 8
 """Any would do: `equalise` scales the stream to it."""
 
 
-def stream_tensors(graph: Graph) -> set[str]:
-    """The tensors that adds read and write."""
-    return {name for op in graph if isinstance(op, Add) for name in (*op.inputs, op.output)}
+Stream = frozenset[str]
+"""Tensors that adds read and write: each is added to another of them, or is such a sum."""
 
 
-def share_stream_scale(graph: Graph, frac_bits: Mapping[str, int], shared: int) -> dict[str, int]:
-    """The scales with one for the stream."""
-    return {**frac_bits, **dict.fromkeys(stream_tensors(graph), shared)}
+def streams(graph: Graph) -> list[Stream]:
+    """The streams that can share a scale and be equalised, in the order of the graph.
+
+    Those that convolutions and adds alone write and read, with nothing between that a factor does not pass; so not
+    where a pool, a concat or the network's end reads them.
+    """
+    leader = united((*op.inputs, op.output) for op in graph if isinstance(op, Add))
+    groups = [frozenset(name for name in leader if leader[name] == first) for first in dict.fromkeys(leader.values())]
+    return [group for group in groups if _passes_factors(graph, group)]
 
 
-def common_frac_bits(graph: Graph, frac_bits: Mapping[str, int]) -> int:
-    """The coarsest least-squares scale on the stream: what a stream that is not equalised takes."""
-    return min((frac_bits[name] for name in stream_tensors(graph)), default=STREAM_FRAC_BITS)
+def _passes_factors(graph: Graph, stream: Stream) -> bool:
+    touching = [op for op in graph if stream.intersection((*op.inputs, op.output))]
+    known = all(isinstance(op, Conv | Add) for op in touching)
+    writers = [op for op in touching if op.output in stream]
+    homogeneous = all(isinstance(op, Conv | Add) and op.activation.homogeneous for op in writers)
+    return known and homogeneous and not stream & {PLANES, CORRECTION}
+
+
+def share_stream_scale(streams: Iterable[Stream], frac_bits: Mapping[str, int], shared: int) -> dict[str, int]:
+    """The scales with one for all streams."""
+    return {**frac_bits, **{name: shared for stream in streams for name in stream}}
+
+
+def common_frac_bits(streams: Iterable[Stream], frac_bits: Mapping[str, int]) -> int:
+    """The coarsest least-squares scale on the streams: what those that are not equalised take."""
+    return min((frac_bits[name] for stream in streams for name in stream), default=STREAM_FRAC_BITS)
 
 
 OFFSETS = np.array([-0.25, 0.25])
@@ -42,10 +62,15 @@ def half_lsb_pair(graph: Graph, step: float) -> Graph:
         graph: that ends with an add and a convolution; any other is returned as it is.
         step: the value of one unit of the tensors that the add reads and writes.
     """
-    writers = {op.output: op for op in graph if isinstance(op, Conv) and not op.relu}
+    writers = {op.output: op for op in graph if isinstance(op, Conv) and _plain(op)}
     before, end = graph[:-2], graph[-2:]
     add, tail = end if len(end) == 2 else (None, None)
-    if not (isinstance(add, Add) and isinstance(tail, Conv) and set(add.inputs) <= set(writers)):
+    shared = isinstance(add, Add) and any(add.output in stream for stream in streams(graph))
+    sums = isinstance(add, Add) and add.activation is Activation.none and set(add.inputs) <= set(writers)
+    if not (shared and sums and isinstance(tail, Conv) and tail.groups == 1):
+        return graph
+    assert isinstance(add, Add)  # noqa: S101
+    if tail.input != add.output:
         return graph
     left, right = (_twice(writers[name], step) for name in add.inputs)
     read = {name for op in before for name in op.inputs}
@@ -55,6 +80,10 @@ def half_lsb_pair(graph: Graph, step: float) -> Graph:
     return (*kept, left, right, both, halved)
 
 
+def _plain(op: Conv) -> bool:
+    return op.activation is Activation.none and op.groups == 1
+
+
 def _twice(op: Conv, step: float) -> Conv:
     """Its output channels down, then up."""
     bias = np.concatenate([op.bias + np.float32(offset * step) for offset in OFFSETS])
@@ -62,23 +91,21 @@ def _twice(op: Conv, step: float) -> Conv:
     return replace(op, name=f"{op.name}.twice", output=f"{op.output}.twice", weight=weight, bias=bias)
 
 
-GAIN = 8
-FINE_MAX = 126
-"""The largest size at which the fine channel is believed: one below int8's end."""
-
-
 def two_gains(graph: Graph) -> Graph:
-    """The graph with a last convolution of two output channels: fine, and coarse by GAIN."""
+    """The graph whose last convolution writes its channels twice: fine, and coarse by GAIN.
+
+    Any other last operation stays as it is, and so does one with an activation that factors do not pass.
+    """
     last = graph[-1]
-    assert isinstance(last, Conv)  # noqa: S101 - correction_graph ends with the tail
+    if not takes_gains(graph):
+        return graph
+    assert isinstance(last, Conv)  # noqa: S101
     weight = np.concatenate([last.weight, last.weight / GAIN])
     bias = np.concatenate([last.bias, last.bias / GAIN])
     return (*graph[:-1], replace(last, weight=weight.astype(np.float32), bias=bias.astype(np.float32)))
 
 
-def merge(correction: np.ndarray, scale: float) -> np.ndarray:
-    """The correction (N, 1, H, W) from one or two channels (N, 1 or 2, H, W) of multiples of `scale`."""
-    if correction.shape[1] == 1:
-        return correction
-    fine, coarse = correction[:, :1], correction[:, 1:]
-    return np.where(np.abs(fine) <= (FINE_MAX + 0.5) * scale, fine, coarse * np.float32(GAIN))
+def takes_gains(graph: Graph) -> bool:
+    """Whether the last operation is a convolution that can write its channels twice."""
+    last = graph[-1]
+    return isinstance(last, Conv) and last.activation is Activation.none and last.groups == 1

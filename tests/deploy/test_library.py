@@ -18,6 +18,8 @@ from deploy.restoration.options import Options
 from deploy.restoration.run import restore_file
 from profiles.errors import ImageError, ModelError, OptionError
 from profiles.sensor_file import BLIND
+from quant.onnx_file import save_onnx
+from tests.quant.tiling.small_networks import espcn
 
 SHAPES = [(61, 83), (17, 130), (1, 40), (29, 29), (3, 5), (3, 41, 35), (1, 50, 20)]
 
@@ -135,6 +137,20 @@ def test_a_data_array_keeps_what_it_says(lazy: bool, da: Any, model: Path) -> No
     assert (restored.attrs, restored.name, restored.dims) == (image.attrs, image.name, image.dims)
     other = restore(image, model, tile_px=23, nodata=4000)
     assert (other.values != restored.values).any()
+
+
+def test_a_data_array_of_more_pixels_has_their_places(tmp_path: Path) -> None:
+    xarray = pytest.importorskip("xarray")
+    save_onnx(espcn(), tmp_path / "twice.onnx")
+    places = {"y": 99 - 2 * np.arange(20), "x": np.arange(30.0), "band": [1], "spatial_ref": 0}
+    image = xarray.DataArray(noise(1, 20, 30), dims=("band", "y", "x"), coords=places, name="scene")
+    image.coords["spatial_ref"].attrs["GeoTransform"] = "of the pixels before"
+    restored = restore(image, tmp_path / "twice.onnx")
+    assert restored.shape == (1, 40, 60)
+    np.testing.assert_array_equal(restored.y, 99.5 - np.arange(40))
+    np.testing.assert_array_equal(restored.x, np.arange(60) / 2 - 0.25)
+    assert restored.spatial_ref.attrs == {}
+    assert (restored.name, list(restored.band)) == ("scene", [1])
 
 
 def test_values_beyond_full_scale_are_refused_at_once_or_when_computed(da: Any, model: Path) -> None:

@@ -220,13 +220,16 @@ def test_a_run_in_the_way_is_not_overwritten(images: Path, tmp_path: Path) -> No
     assert "--resume" in result.output
 
 
-def test_a_wider_network_starts_where_a_narrower_one_stopped(images: Path, tmp_path: Path) -> None:
+def test_a_larger_network_starts_where_a_smaller_one_stopped(images: Path, tmp_path: Path) -> None:
     run(images, tmp_path / "narrow", steps=3)
     narrow = tmp_path / "narrow" / "convbeers-xs.safetensors"
-    wide = ["--start", str(narrow), "--variant", "convbeers-s", "--steps", "1"]
-    result = CliRunner().invoke(app, ["train", "--images", str(images), "--out", str(tmp_path / "wide"), *wide])
-    assert result.exit_code == 2  # 8 blocks are not 4
-    assert "4 blocks of 16 features" in " ".join(result.output.split())
+    large = ["--start", str(narrow), "--variant", "convbeers-s", "--steps", "1"]
+    grown = CliRunner().invoke(app, ["train", "--images", str(images), "--out", str(tmp_path / "large"), *large])
+    assert grown.exit_code == 0, grown.output
+    small = ["--start", str(tmp_path / "large" / "convbeers-s.safetensors"), "--variant", "convbeers-xs"]
+    result = CliRunner().invoke(app, ["train", "--images", str(images), "--out", str(tmp_path / "small"), *small])
+    assert result.exit_code == 2
+    assert "8 blocks of 32 features" in " ".join(result.output.split())
     again = run(images, tmp_path / "again", "--start", str(narrow), "--learning-rate", "0", "--validate-every", "0")
     assert "wrote" in again
     weights = (load_network(path)[0].state_dict() for path in (narrow, tmp_path / "again" / narrow.name))

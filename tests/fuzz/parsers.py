@@ -49,11 +49,13 @@ from quant.checks import Check
 from quant.encodings import encoding_faults
 from quant.gate import read_limits
 from quant.graph import correction_graph
-from quant.onnx_file import fixed_tile_px, load_onnx, receptive_radius_px
+from quant.onnx_file import fixed_tile_px, load_onnx
 from quant.session import open_any_size, open_session, run
 from quant.structure import count_relus, rounded_tensors, saturated_shares
+from quant.tiling.walk import receptive_radius_px
 from tests.deploy.dpu.graphs import board_convbeers, float_convbeers, integer_convbeers
 from tests.fuzz.mutation import Mutate, of_json, of_onnx, of_png, of_safetensors, of_tiff
+from tests.quant.reading.networks import CASES, made
 
 ROOT = Path(__file__).parents[2]
 SIDE_PX = 16
@@ -154,6 +156,14 @@ def onnx_seeds(folder: Path) -> list[bytes]:
         for dim, size in zip(value.type.tensor_type.shape.dim, (1, 1, SIDE_PX, SIDE_PX), strict=True):
             dim.dim_value = size
     return [*made, fixed.SerializeToString()]
+
+
+def exported_seeds(_: Path) -> list[bytes]:
+    """What exporters leave: constants computed, normalisation, padding, other opsets, 16-bit floats."""
+    sizes, scaled = CASES["sizes of constants"][0], CASES["normalised and scaled again"][0]
+    idle = CASES["what does nothing"][0]
+    networks = [made(sizes), made(scaled, 9), made(sizes, 20), made(idle, kind=onnx.TensorProto.FLOAT16)]
+    return [network.SerializeToString() for network in networks]
 
 
 def look_at_onnx(path: Path) -> None:
@@ -368,6 +378,7 @@ LIMITS = [b"mae = 0.0007\np999 = 0.01\n", b"psnr_drop_db = 0.05\nmae_growth = 1.
 
 PARSERS: tuple[Parser, ...] = (
     Parser("ONNX, looked at", ".onnx", onnx_seeds, look_at_onnx, of_onnx),
+    Parser("ONNX, folded", ".onnx", exported_seeds, look_at_onnx, of_onnx),
     Parser("ONNX, understood", ".onnx", onnx_seeds, understand_onnx, of_onnx, 2.0),
     Parser("ONNX, run", ".onnx", onnx_seeds, run_onnx, of_onnx, 0.3),
     Parser("TIFF, whole", ".tif", tiff_seeds, read_pixels, of_tiff, 2.0),

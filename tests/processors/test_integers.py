@@ -7,7 +7,7 @@ import pytest
 
 from quant.core import INT8_MAX, INT8_MIN, IntConv, IntCore
 from quant.encodings import board_model, host_model
-from quant.graph import CORRECTION, PLANES, PLANES_FRAC_BITS, split
+from quant.graph import CORRECTION, PLANES, PLANES_FRAC_BITS, Activation, same, split
 from quant.integer import agreement, correction, merged_correction, run_core
 from quant.session import open_session, run
 from tests.processors.conftest import Encodings
@@ -64,7 +64,8 @@ def harsh_core(seed: int, channels: int) -> IntCore:
     def conv(name: str, source: str, result: str, shape: tuple[int, int, int, int], relu: bool) -> IntConv:
         weight = generator.choice(np.array([INT8_MIN, -100, 100, INT8_MAX], np.int8), shape)
         bias = generator.integers(INT8_MIN, INT8_MAX, shape[0]).astype(np.int8)
-        return IntConv(name, source, result, weight, 10, bias, 12, relu)
+        activation = Activation.relu if relu else Activation.none
+        return IntConv(name, source, result, weight, 10, bias, 12, activation, same(weight))
 
     first = conv("first", PLANES, "inner", (channels, 3, 3, 3), relu=bool(seed % 2))
     last = conv("last", "inner", CORRECTION, (1, channels, 3, 3), relu=False)

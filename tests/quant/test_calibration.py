@@ -144,7 +144,9 @@ def test_no_run_sees_more_than_a_piece_with_its_halo(graph: Graph) -> None:
     """What bounds memory: the largest array that the session returns does not grow with the image."""
     names = tensors(graph)
     session = open_session(graph_to_onnx(graph, names))
-    side = TILE_PX + 2 * halo_of(graph)
+    halo_px = halo_of(graph)
+    assert halo_px is not None
+    side = TILE_PX + 2 * halo_px
     for piece in tensor_values(session, names, image(3 * TILE_PX + 1, 3 * TILE_PX + 2), halo_of(graph)):
         assert max(values.base.shape[2] for values in piece if values.base is not None) <= side
 

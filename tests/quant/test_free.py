@@ -18,18 +18,20 @@ from quant.graph import (
     CORRECTION,
     PLANES,
     PLANES_FRAC_BITS,
+    Activation,
     Conv,
     Graph,
     correction_graph,
     graph_to_onnx,
     read_planes,
     relu_count,
+    same,
     tensors,
 )
-from quant.integer import _convolve
+from quant.integer.arithmetic import convolve
 from quant.onnx_file import metadata, save_onnx
 from quant.passes.equalise import channel_ranges, equalise, first_guess
-from quant.passes.stream import OFFSETS, half_lsb_pair, two_gains
+from quant.passes.stream import OFFSETS, half_lsb_pair, streams, two_gains
 from quant.quantise import Quantised
 from quant.session import open_session, planes_of, run
 
@@ -69,9 +71,9 @@ def whole_numbers(model: onnx.ModelProto, planes: np.ndarray, around: str = "zer
             x, unit, zero, weight, scales, _, out_unit, out_zero, bias = node.input
             taps, offset = constant[weight].astype(np.int64), int(constant[zero])
             if around == "zeros":
-                sums = _convolve(found[x] - offset, taps)
+                sums = convolve(found[x] - offset, taps, same(taps))
             else:
-                sums = _convolve(found[x], taps) - offset * taps.sum((1, 2, 3))[:, None, None]
+                sums = convolve(found[x], taps, same(taps)) - offset * taps.sum((1, 2, 3))[:, None, None]
             sums = sums + constant[bias][:, None, None]
             value = sums * (constant[unit] * constant[scales] / constant[out_unit])[:, None, None]
         elif node.op_type == "QLinearAdd":
@@ -229,8 +231,13 @@ def test_two_copies_hold_half_an_lsb(value: float) -> None:
 
 def test_the_half_lsb_pair_lose_less(float_onnx: onnx.ModelProto, patches: Patches, unseen: Patches) -> None:
     step, graph = 2.0**-8, read_planes(correction_graph(float_onnx))
-    graph = equalise(graph, first_guess(channel_ranges(graph, patches.degraded, lambda: None), 0.5, 0.8))
-    levels = {op.output: 255 for op in graph if isinstance(op, Conv) and op.relu} | {CORRECTION: 127}
+    (stream,) = streams(graph)
+    graph = equalise(
+        graph, stream, first_guess(channel_ranges(graph, stream, patches.degraded, lambda: None), 0.5, 0.8)
+    )
+    levels = {op.output: 255 for op in graph if isinstance(op, Conv) and op.activation is Activation.relu} | {
+        CORRECTION: 127
+    }
     units = tensor_scales(graph, levels, patches.degraded, lambda: None)
     scales = {name: Scale(unit, 0 if levels[name] == 255 else 128) for name, unit in units.items()}
     scales[PLANES] = Scale(2.0**-PLANES_FRAC_BITS)

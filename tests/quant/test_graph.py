@@ -41,7 +41,7 @@ def test_a_strided_convolution_is_refused(float_onnx: onnx.ModelProto) -> None:
     model = onnx.ModelProto()
     model.CopyFrom(float_onnx)
     model.graph.node[0].attribute.append(helper.make_attribute("strides", [2, 2]))
-    with pytest.raises(ModelError, match="stride 1"):
+    with pytest.raises(ModelError, match="stride 1, ReLU and adds, got head"):
         correction_graph(model)
 
 

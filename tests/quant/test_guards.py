@@ -19,7 +19,7 @@ from quant.faults import (
     voted,
     with_ops,
 )
-from quant.graph import CORRECTION, PLANES, split
+from quant.graph import CORRECTION, PLANES, Activation, split
 from quant.integer import SOUND, Faults, merged_correction, run_core
 from quant.quantise import Quantised
 
@@ -61,7 +61,9 @@ def test_bounds_are_the_next_ones_that_hold_what_was_seen(core: IntCore) -> None
 
 
 def test_a_clamped_result_keeps_its_bound_whatever_the_weights(core: IntCore) -> None:
-    some = Guards({op.output: 24 for op in core.ops if isinstance(op, IntConv) and op.relu}, 64.0, {})
+    some = Guards(
+        {op.output: 24 for op in core.ops if isinstance(op, IntConv) and op.activation is Activation.relu}, 64.0, {}
+    )
     injected = flip_weights(core, 2000, np.random.default_rng(0))
     bare, clamped = (run_core(injected, split(image(9)), faults=f)[0] for f in (SOUND, guarded(SOUND, some)))
     assert max(int(bare[name].max()) for name in some.relu6) > 24
@@ -72,7 +74,7 @@ def test_a_clamped_result_keeps_its_bound_whatever_the_weights(core: IntCore) ->
 
 
 def test_faults_enter_memory_after_the_clamp(core: IntCore) -> None:
-    name = next(op.output for op in core.ops if isinstance(op, IntConv) and op.relu)
+    name = next(op.output for op in core.ops if isinstance(op, IntConv) and op.activation is Activation.relu)
     faults = Faults({}, lambda found, tensor: np.full_like(tensor, 127) if found == name else tensor)
     tensors, _ = run_core(core, split(image(0)), faults=guarded(faults, Guards({name: 3}, 1.0, {})))
     assert (tensors[name] == 127).all()
@@ -122,7 +124,7 @@ def test_a_wrong_shift_is_used(core: IntCore) -> None:
 def test_shifts_as_wrong_as_can_be_keep_every_sign() -> None:
     """Nothing wraps around: bias moved left by 31, sums by 32."""
     bias = np.array([57, 20, -3, 0], np.int8)
-    op = IntConv("c", PLANES, CORRECTION, np.zeros((4, 1, 1, 1), np.int8), 0, bias, 0, False)
+    op = IntConv("c", PLANES, CORRECTION, np.zeros((4, 1, 1, 1), np.int8), 0, bias, 0)
     core = IntCore((op,), {PLANES: 0, CORRECTION: 0})
     faults = Faults({("c", "shift_bias"): 31, ("c", "shift_cut"): -32})
     tensors, _ = run_core(core, np.zeros((1, 1, 1, 1), np.int8), faults=faults)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from quant.core import IntConv, IntCore
-from quant.graph import CORRECTION, PLANES, PLANES_FRAC_BITS, Add, split
+from quant.graph import CORRECTION, PLANES, PLANES_FRAC_BITS, Activation, Add, split
 from quant.integer import INT32_BITS, LayerReport, correction, run_core
 from quant.quantise import Quantised
 from quant.session import open_session
@@ -45,9 +45,9 @@ def test_under_the_dpu_s_rounding_it_differs_by_halves_alone(quantised: Quantise
     assert np.abs(up[CORRECTION] - even[CORRECTION]).max() <= 8
 
 
-def one_conv(weight: int, bias: int, cut: int, relu: bool = False) -> IntCore:
+def one_conv(weight: int, bias: int, cut: int, activation: Activation = Activation.none) -> IntCore:
     op = IntConv(
-        "c", PLANES, CORRECTION, np.full((1, 1, 1, 1), weight, np.int8), 0, np.array([bias], np.int8), 0, relu
+        "c", PLANES, CORRECTION, np.full((1, 1, 1, 1), weight, np.int8), 0, np.array([bias], np.int8), 0, activation
     )
     return IntCore((op,), {PLANES: 0, CORRECTION: -cut})
 
@@ -68,7 +68,7 @@ def test_products_saturate_at_int8_s_ends() -> None:
 
 
 def test_bias_is_aligned_and_relu_comes_before_the_shift() -> None:
-    op = one_conv(1, 3, 1, relu=True).ops[0]
+    op = one_conv(1, 3, 1, Activation.relu).ops[0]
     assert isinstance(op, IntConv)
     aligned = IntCore((replace(op, bias_frac_bits=-2),), {PLANES: 0, CORRECTION: -1})  # 3 << 2 = 12
     assert values(aligned, [-20, -12, -10, 0, 10]) == [0, 0, 1, 6, 11]
@@ -77,8 +77,8 @@ def test_bias_is_aligned_and_relu_comes_before_the_shift() -> None:
 def test_an_add_aligns_to_the_finer_scale() -> None:
     add = Add("a", ("x", "y"), CORRECTION)
     ops = (
-        IntConv("x", PLANES, "x", np.ones((1, 1, 1, 1), np.int8), 0, np.zeros(1, np.int8), 0, False),
-        IntConv("y", PLANES, "y", np.ones((1, 1, 1, 1), np.int8), 1, np.zeros(1, np.int8), 0, False),
+        IntConv("x", PLANES, "x", np.ones((1, 1, 1, 1), np.int8), 0, np.zeros(1, np.int8), 0),
+        IntConv("y", PLANES, "y", np.ones((1, 1, 1, 1), np.int8), 1, np.zeros(1, np.int8), 0),
         add,
     )
     core = IntCore(ops, {PLANES: 0, "x": 0, "y": 1, CORRECTION: 0})

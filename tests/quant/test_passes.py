@@ -8,6 +8,7 @@ import pytest
 
 from quant.calibration import Patches
 from quant.core import SHIFTS, IntConv, op_shifts
+from quant.ends import FINE_MAX, GAIN, Ends
 from quant.gate import compare
 from quant.graph import (
     CORRECTION,
@@ -24,17 +25,21 @@ from quant.graph import (
 )
 from quant.passes.equalise import FIRST_CROPS, Costs, channel_ranges, equalise, first_guess, search, search_steps
 from quant.passes.stream import (
-    FINE_MAX,
-    GAIN,
     STREAM_FRAC_BITS,
+    Stream,
     common_frac_bits,
-    merge,
     share_stream_scale,
-    stream_tensors,
+    streams,
     two_gains,
 )
 from quant.quantise import ALL, Passes, Quantised, quantise_model, ticks
 from quant.session import open_session
+
+
+def stream_of(graph: Graph) -> Stream:
+    (stream,) = streams(graph)
+    return stream
+
 
 NONE = Passes(**{field.name: False for field in fields(Passes)})
 
@@ -52,31 +57,33 @@ def correction(graph: Graph, seed: int = 0) -> np.ndarray:
 
 def test_equalising_leaves_the_float_network_as_it_was(graph: Graph) -> None:
     factors = np.random.default_rng(1).uniform(0.2, 5, 8)
-    np.testing.assert_allclose(correction(equalise(graph, factors)), correction(graph), atol=2e-6)
-    first = equalise(graph, factors)[0]
+    np.testing.assert_allclose(correction(equalise(graph, stream_of(graph), factors)), correction(graph), atol=2e-6)
+    first = equalise(graph, stream_of(graph), factors)[0]
     assert isinstance(first, Conv)
-    assert not np.allclose(first.weight, graph[0].weight)  # type: ignore[union-attr]
+    assert not np.allclose(first.weight, graph[0].weight)  # type: ignore[attr-defined]
 
 
 def test_scaling_the_writers_alone_would_change_it(graph: Graph) -> None:
-    wrong = (equalise(graph, np.full(8, 2.0))[0], *graph[1:])
+    wrong = (equalise(graph, stream_of(graph), np.full(8, 2.0))[0], *graph[1:])
     assert np.abs(correction(wrong) - correction(graph)).max() > 1e-3
 
 
 def test_ranges_are_levelled_to_the_stream_s_own(graph: Graph, patches: Patches) -> None:
     images = [image for image, _ in patches.pairs]
-    ranges = channel_ranges(graph, images, lambda: None)
+    ranges = channel_ranges(graph, stream_of(graph), images, lambda: None)
     assert ranges.shape == (8,)
     factors = first_guess(ranges, 1.0, 1.0)
     np.testing.assert_allclose(ranges * factors, 127 * 2.0**-STREAM_FRAC_BITS)
-    again = channel_ranges(equalise(graph, factors), images, lambda: None)
+    again = channel_ranges(equalise(graph, stream_of(graph), factors), stream_of(graph), images, lambda: None)
     np.testing.assert_allclose(again, ranges * factors, rtol=1e-4)
 
 
 def test_a_dead_channel_is_not_blown_up(graph: Graph, patches: Patches) -> None:
     dead = np.ones(8)
     dead[3] = 1e-12
-    ranges = channel_ranges(equalise(graph, dead), [patches.pairs[0][0]], lambda: None)
+    ranges = channel_ranges(
+        equalise(graph, stream_of(graph), dead), stream_of(graph), [patches.pairs[0][0]], lambda: None
+    )
     assert ranges[3] >= 1e-4 * ranges.max()
 
 
@@ -89,11 +96,11 @@ def searched(graph: Graph, weights: np.ndarray) -> tuple[list[float], float, lis
 
     The cost on each crop is known: how far the channels are from factors of their own, times the crop's weight.
     """
-    sizes = np.abs(graph[0].weight).sum((1, 2, 3))  # type: ignore[union-attr]
+    sizes = np.abs(graph[0].weight).sum((1, 2, 3))  # type: ignore[attr-defined]
     runs: list[int] = []
 
     def costs(tried: Graph) -> np.ndarray:
-        factors = np.abs(tried[0].weight).sum((1, 2, 3)) / sizes  # type: ignore[union-attr]
+        factors = np.abs(tried[0].weight).sum((1, 2, 3)) / sizes  # type: ignore[attr-defined]
         return np.asarray(np.square(np.log(factors / np.geomspace(0.1, 3, 8))).sum() * weights)
 
     def trial(tried: Graph) -> Costs:
@@ -107,10 +114,10 @@ def searched(graph: Graph, weights: np.ndarray) -> tuple[list[float], float, lis
         return of
 
     ticked: list[int] = []
-    factors = search(graph, RANGES, trial, lambda: ticked.append(1))
+    factors = search(graph, stream_of(graph), RANGES, trial, lambda: ticked.append(1))
     assert len(ticked) == search_steps(8)
     guesses = [first_guess(RANGES, g, h) for g in (0.5, 0.75, 1.0) for h in (0.64, 0.8, 1.0, 1.25)]
-    ends = [float(costs(equalise(graph, each)).sum()) for each in (*guesses, factors)]
+    ends = [float(costs(equalise(graph, stream_of(graph), each)).sum()) for each in (*guesses, factors)]
     return ends[:-1], ends[-1], runs
 
 
@@ -148,9 +155,10 @@ def test_without_it_adds_round(float_onnx: onnx.ModelProto, patches: Patches) ->
 
 
 def test_the_common_scale_is_the_coarsest_of_the_stream(graph: Graph) -> None:
-    frac_bits = {name: 7 + k for k, name in enumerate(sorted(stream_tensors(graph)))} | {CORRECTION: 3}
-    assert common_frac_bits(graph, frac_bits) == 7
-    assert share_stream_scale(graph, frac_bits, 7) == dict.fromkeys(stream_tensors(graph), 7) | {CORRECTION: 3}
+    stream = stream_of(graph)
+    frac_bits = {name: 7 + k for k, name in enumerate(sorted(stream))} | {CORRECTION: 3}
+    assert common_frac_bits([stream], frac_bits) == 7
+    assert share_stream_scale([stream], frac_bits, 7) == dict.fromkeys(stream, 7) | {CORRECTION: 3}
 
 
 def test_the_second_gain_is_the_same_correction_coarser(graph: Graph) -> None:
@@ -163,11 +171,11 @@ def test_the_fine_gain_is_believed_until_its_end() -> None:
     scale = 2.0**-11
     fine = np.array([0, 126, -126, 127, -127, -128]) * scale
     coarse = np.array([50, 51, 52, 53, -54, -55]) * scale
-    merged = merge(np.stack([fine, coarse]).astype(np.float32)[None, :, None], scale)[0, 0, 0]
+    merged = Ends(gains=2).merge(np.stack([fine, coarse]).astype(np.float32)[None, :, None], scale)[0, 0, 0]
     np.testing.assert_array_equal(merged / scale, [0, 126, -126, 53 * GAIN, -54 * GAIN, -55 * GAIN])
     assert FINE_MAX == 126
     one = np.full((1, 1, 2, 2), 127 * scale, np.float32)
-    assert merge(one, scale) is one
+    assert Ends().merge(one, scale) is one
 
 
 def test_the_coarse_plane_alone_sees_seven_bits(graph: Graph) -> None:

@@ -9,12 +9,13 @@ from onnx import numpy_helper
 from quant.calibration import Patches
 from quant.core import IntConv, build_core, shift_faults
 from quant.encodings import host_model
+from quant.ends import Ends
 from quant.gate import Limits, compare, judge
 from quant.graph import CORRECTION, PLANES_FRAC_BITS, correction_graph, read_planes, split
-from quant.onnx_file import metadata, receptive_radius_px, save_onnx
-from quant.passes.stream import merge
+from quant.onnx_file import metadata, save_onnx
 from quant.quantise import Quantised, quantise_model
 from quant.session import open_session, run
+from quant.tiling.walk import receptive_radius_px
 
 
 def image(height: int = 37, width: int = 53, seed: int = 0) -> np.ndarray:
@@ -56,7 +57,7 @@ def test_host_and_board_files_compute_the_same(size: tuple[int, int], quantised:
     for seed in range(3):
         dn = image(*size, seed=seed)
         planes = split(dn).astype(np.float32) * np.float32(2.0**-PLANES_FRAC_BITS)
-        correction = merge(board.run(None, {"planes": planes})[0], quantised.core.scale(CORRECTION))
+        correction = Ends(gains=2).merge(board.run(None, {"planes": planes})[0], quantised.core.scale(CORRECTION))
         restored = np.clip(dn + correction, 0, 1)
         np.testing.assert_array_equal(run(host, dn), restored)
 

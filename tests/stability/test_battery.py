@@ -19,6 +19,7 @@ from deploy.stress.checks import LIMITATIONS, Measure, differing, local_range, r
 from deploy.stress.subject import Subject, open_subject, restore
 from profiles.errors import ModelError
 from quant.onnx_file import save_onnx
+from quant.tiling.walk import Tiling
 
 BY_NAME = {case.name: case for case in CASES}
 SIDE_PX = 32
@@ -107,9 +108,9 @@ def test_a_halo_one_pixel_short_fails(subject: Subject) -> None:
     """Of the network's receptive radius: tile plans differ."""
     image, radius_px = BY_NAME["no noise"].draw(48, np.random.default_rng(0))[0], subject.float32.radius_px
     infer = subject.float32.infer()
-    whole = restore(infer, image, radius_px)
+    whole = restore(infer, image, Tiling(radius_px))
     for short, same in ((0, True), (1, False)):
-        tiled = restore(infer, image, radius_px - short, tile_px=2 * radius_px + 9)
+        tiled = restore(infer, image, Tiling(radius_px - short), tile_px=2 * radius_px + 9)
         assert differing("plans differ", tiled, whole).holds == same
 
 

@@ -23,6 +23,7 @@ from deploy.stress.subject import open_subject
 from profiles.figures import Row, by_table
 from quant.core import IntConv
 from quant.faults import Guards, as_stored, checksums
+from quant.graph import Activation
 from quant.integer import SOUND
 from tests.stability.makers import DOCS, load_maker
 
@@ -93,7 +94,7 @@ def test_the_sign_hurts_more_than_the_least_bit(target: FaultTarget) -> None:
 @pytest.mark.parametrize("variant", ["convbeers-xs", "convbeers-s", "convbeers-m", "convbeers"])
 def test_all_guards_cost_under_two_per_cent_on_the_board(variant: str) -> None:
     core = as_stored(core_of(open_subject(None, None, variant)))
-    relus = {op.output: 96 for op in core.ops if isinstance(op, IntConv) and op.relu}
+    relus = {op.output: 96 for op in core.ops if isinstance(op, IntConv) and op.activation is Activation.relu}
     dpu, target = load_dpu("vck190", None), FaultTarget(core, Guards(relus, 1024.0, checksums(core)), ())
     found = price_rows(target, predict_file(shipped_pair(variant)[1], dpu, TILE_PX), dpu)
     *parts, together = (db(row, "time") for row in found)

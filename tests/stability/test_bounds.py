@@ -16,10 +16,10 @@ from profiles.errors import ModelError
 from quant.bounds import bound_anywhere, bound_inside, compose, layer_bounds
 from quant.core import IntConv
 from quant.encodings import read_core
-from quant.graph import CORRECTION, Graph, correction_graph, split
+from quant.ends import Ends
+from quant.graph import CORRECTION, Conv, Graph, correction_graph, split
 from quant.integer import INT32_BITS, correction, run_core
 from quant.onnx_file import load_onnx
-from quant.passes.stream import merge
 from quant.quantise import Quantised
 from quant.session import open_session, run
 
@@ -71,7 +71,7 @@ def test_the_gain_is_reached_where_a_network_is_linear() -> None:
 
 
 def test_a_bound_that_forgets_the_negative_weights_would_be_left(graph: Graph) -> None:
-    forgetful = tuple(replace(op, weight=np.maximum(op.weight, 0)) if hasattr(op, "weight") else op for op in graph)
+    forgetful = tuple(replace(op, weight=np.maximum(op.weight, 0)) if isinstance(op, Conv) else op for op in graph)
     bound = bound_anywhere(forgetful)
     worst = [infer_in(graph, torch.float64)(images(seed, (16, 16), True)).min() for seed in range(20)]
     assert min(worst) < bound.low
@@ -114,7 +114,7 @@ def test_shipped_accumulators_cannot_overflow(path: Path) -> None:
 def test_a_core_is_read_back_from_its_file(quantised: Quantised) -> None:
     core = read_core(quantised.host)
     image = images(3, (19, 26), False).astype(np.float32)
-    whole = merge(correction(core, split(image), half_even=True), core.scale(CORRECTION))
+    whole = Ends(gains=2).merge(correction(core, split(image), half_even=True), core.scale(CORRECTION))
     np.testing.assert_array_equal(np.clip(image + whole, 0, 1), run(open_session(quantised.host), image))
 
 

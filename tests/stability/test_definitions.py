@@ -17,9 +17,9 @@ from model.simulator.mtf import NYQUIST, mtf
 from model.traditional.compensate import compensation_gain
 from quant.core import IntConv, IntCore
 from quant.encodings import board_model, host_model
+from quant.ends import Ends
 from quant.graph import CORRECTION, PLANES, PLANES_FRAC_BITS, split
 from quant.integer import correction
-from quant.passes.stream import merge
 from quant.quantise import Quantised
 from quant.session import open_session, run
 
@@ -73,7 +73,7 @@ def test_both_files_hold_every_bias_at_its_scale(seed: int, shape: tuple[int, in
     image = generator.uniform(0.3, 0.7, (1, 1, *shape)).astype(np.float32)
     planes = split(image)
     whole = correction(core, planes, half_even=True)
-    restored = np.clip(image + merge(whole, core.scale(CORRECTION)), 0, 1)
+    restored = np.clip(image + Ends(gains=2).merge(whole, core.scale(CORRECTION)), 0, 1)
     np.testing.assert_array_equal(run(open_session(host_model(core, {})), image), restored)
     feed = {PLANES: planes.astype(np.float32) * np.float32(2.0**-PLANES_FRAC_BITS)}
     np.testing.assert_array_equal(open_session(board_model(core, {})).run(None, feed)[0], whole)

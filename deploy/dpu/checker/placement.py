@@ -21,6 +21,9 @@ Device = Literal["host", "DPU", "CPU"]
 SCALING = {"Mul", "Div", "Add", "Sub", "Clip", "Cast", "Round", "Floor", "Identity", "Min", "Max"}
 """What a float file may do to the image before the network and to the result behind it."""
 
+SHAPING = {"ArgMax", "DepthToSpace", "Flatten", "Reshape", "Softmax", "Squeeze", "Unsqueeze"}
+"""What a float file may do to the result behind the network: it moves numbers, or compares them."""
+
 FLOAT_NOTE = "a float file: judged as if its tensors had 8 bits, its final add left to the host"
 
 
@@ -93,9 +96,9 @@ def _parts(network: Network) -> list[Part]:
     finished: set[str] = set()
     for op in operations:
         leads, trails = op.output not in behind, op.output not in before
-        if leads and _is_host_front(op, network):
+        if leads and _is_host_front(op, network, trails=trails):
             parts.append("host-front")
-        elif trails and (_is_host_back(op, network) or finished & set(op.inputs)):
+        elif trails and (_is_host_back(op, network, leads=leads) or finished & set(op.inputs)):
             parts.append("host-back")
             finished |= set(op.outputs)
         else:
@@ -113,17 +116,20 @@ def _reached(operations: tuple[Operation, ...], network: Network, *, forwards: b
     return found
 
 
-def _is_host_front(op: Operation, network: Network) -> bool:
-    """In a quantised file whatever leads to the core; in a float file only scaling."""
-    return network.quantised or op.op_type in SCALING
+def _is_host_front(op: Operation, network: Network, *, trails: bool) -> bool:
+    """In a quantised file whatever leads to the core; in a float file only scaling, and pixels moved to channels."""
+    moves = op.op_type == "SpaceToDepth" and not trails
+    return network.quantised or op.op_type in SCALING or moves
 
 
-def _is_host_back(op: Operation, network: Network) -> bool:
-    """In a quantised file what is float again; in a float file the add of the image, or scaling by constants."""
+def _is_host_back(op: Operation, network: Network, *, leads: bool) -> bool:
+    """In a quantised file what is float again; in a float file the add of the image, scaling, shaping."""
     if op.kind in CONVOLUTIONS:
         return False
     if network.quantised:
         return not op.integer and (op.kind == "dequantise" or op.op_type in SCALING)
+    if op.op_type in SHAPING:
+        return not leads
     return op.op_type in SCALING and (bool(set(op.inputs) & set(network.inputs)) or len(op.inputs) == 1)
 
 

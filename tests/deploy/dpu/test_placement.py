@@ -1,5 +1,7 @@
 from pathlib import Path
 
+import onnx
+
 from deploy.dpu.board import load_dpu
 from deploy.dpu.checker.placement import FLOAT_NOTE, place
 from deploy.dpu.reading import read_network
@@ -65,10 +67,33 @@ def test_scaling_in_front_is_the_hosts_but_other_operators_are_refused(tmp_path:
     placement = place(read_network(sketch.save(tmp_path / "d.onnx", sketch.conv(scaled)), 20), DPU)
     assert [node.part for node in placement.nodes] == ["host-front", "dpu-core"]
 
-    sketch = Sketch(2)
-    apart = sketch.node("SpaceToDepth", "image", blocksize=2)
+    sketch = Sketch(8)
+    apart = sketch.node("Softmax", "image", axis=1)
     placement = place(read_network(sketch.save(tmp_path / "a.onnx", sketch.conv(apart)), 20), DPU)
     assert [node.device for node in placement.nodes] == ["CPU", "DPU"]
+
+
+def test_pixels_are_moved_to_channels_and_back_by_the_host_at_the_ends_alone(tmp_path: Path) -> None:
+    sketch = Sketch(2)
+    apart = sketch.conv(sketch.node("SpaceToDepth", "image", blocksize=2))
+    inside = sketch.conv(sketch.node("DepthToSpace", apart, blocksize=2), (8, 2, 3, 3))
+    path = sketch.save(tmp_path / "p.onnx", sketch.node("DepthToSpace", inside, blocksize=2))
+    placement = place(read_network(path, 20), DPU)
+    assert [node.part for node in placement.nodes] == ["host-front", *["dpu-core"] * 3, "host-back"]
+    assert [node.op.op_type for node in placement.failed] == ["DepthToSpace"]
+
+
+def test_what_a_classifier_ends_in_is_the_hosts(tmp_path: Path) -> None:
+    sketch = Sketch(8)
+    pooled = sketch.node("GlobalAveragePool", sketch.conv("image"))
+    scores = sketch.node("Gemm", sketch.node("Flatten", pooled), sketch.weight(8, 3))
+    model = onnx.load_model(sketch.save(tmp_path / "c.onnx", sketch.node("Softmax", scores, axis=1)))
+    del model.graph.output[0].type.tensor_type.shape.dim[2:]
+    onnx.save_model(model, tmp_path / "c.onnx")
+    placement = place(read_network(tmp_path / "c.onnx", 20), DPU)
+    kinds = [(node.op.op_type, node.part) for node in placement.nodes]
+    assert kinds[:3] == [(kind, "dpu-core") for kind in ("Conv", "GlobalAveragePool", "Conv")]
+    assert kinds[3:] == [("Flatten", "host-back"), ("Softmax", "host-back")]
 
 
 def test_a_relu_behind_the_last_convolution_stays_on_the_dpu(tmp_path: Path) -> None:

@@ -10,7 +10,7 @@ from onnx import TensorProto, numpy_helper
 from deploy.dpu.board import load_dpu
 from deploy.dpu.checker.placement import place
 from deploy.dpu.graph import Operation
-from deploy.dpu.reading import network_of, read_network
+from deploy.dpu.reading import read_network
 from profiles.errors import ModelError
 from tests.deploy.dpu.graphs import Sketch, board_convbeers, float_convbeers, integer_convbeers
 
@@ -144,14 +144,3 @@ def test_nodes_that_cannot_be_never_end_in_a_traceback(tmp_path: Path, draw: Cal
     path = sketch.save(tmp_path / "x.onnx", draw(sketch))
     with contextlib.suppress(ModelError):
         place(read_network(path, 32), load_dpu())
-
-
-def test_constant_nodes_in_other_files_are_refused(tmp_path: Path) -> None:
-    sketch = Sketch(2)
-    path = sketch.save(tmp_path / "e.onnx", sketch.conv("image", (2, 2, 3, 3)))
-    model = onnx.load_model(path)
-    tensor = TensorProto(name="far", dims=[1], data_type=TensorProto.FLOAT, data_location=TensorProto.EXTERNAL)
-    tensor.external_data.add(key="location", value="far.bin")
-    model.graph.node.insert(0, onnx.helper.make_node("Constant", [], ["far"], value=tensor))
-    with pytest.raises(ModelError, match="another file"):
-        network_of(model, 32)

@@ -14,6 +14,7 @@ from deploy.restoration.plan import Plan, make_plan
 from deploy.restoration.runtime import AT_ONCE, Infer, session_threads, tiles_at_once
 from deploy.restoration.source import ArraySource, Raster
 from profiles.errors import ImageError
+from quant.tiling.walk import Tiling
 
 SHAPE = (2, 75, 133)
 TILE_PX, RADIUS_PX = 32, 3
@@ -23,8 +24,8 @@ def running(infer: Infer, at_once: int, tick: Callable[[], None] = lambda: None)
     """A noisy image of two bands through `infer`."""
     pixels = np.random.default_rng(0).integers(0, 4096, SHAPE).astype(np.uint16)
     raster = Raster(*SHAPE, pixels.dtype, None)
-    plan: Plan = make_plan(raster.shape, TILE_PX, RADIUS_PX, RADIUS_PX)
-    restorer = Restorer(raster, infer, 4095.0, RADIUS_PX)
+    plan: Plan = make_plan(raster.shape, TILE_PX, RADIUS_PX, Tiling(RADIUS_PX))
+    restorer = Restorer(raster, infer, 4095.0, Tiling(RADIUS_PX))
     result = np.empty(SHAPE, np.uint16)
     for row, kept, known in restore_rows(ArraySource(pixels, raster), plan, restorer, plan.rows, tick, at_once):
         assert known == kept.size

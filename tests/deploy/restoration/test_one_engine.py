@@ -26,7 +26,8 @@ from deploy.tradeoff.accuracy import cut_in_four
 from deploy.tradeoff.methods import CalibrationScenes, MethodStore, find_networks
 from deploy.tradeoff.points import Point, Variant
 from profiles import load_sensor
-from quant.onnx_file import load_onnx, receptive_radius_px
+from quant.onnx_file import load_onnx
+from quant.tiling.walk import receptive_radius_px
 
 Restored = Callable[[np.ndarray], np.ndarray]
 

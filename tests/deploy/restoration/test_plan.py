@@ -11,13 +11,15 @@ from deploy.restoration.plan import even_side_px, make_plan, plan_side
 from profiles.errors import OptionError
 from quant.onnx_file import load_onnx
 from quant.session import open_session, run
+from quant.tiling.walk import Tiling
 
 RADIUS_PX = 5
+TILING = Tiling(RADIUS_PX)
 
 
 @given(st.integers(1, 90), st.integers(1, 90), st.integers(13, 40), st.integers(0, 6))
 def test_kept_parts_cover_every_pixel_once(height: int, width: int, tile_px: int, halo_px: int) -> None:
-    plan = make_plan((1, height, width), tile_px, halo_px, halo_px)
+    plan = make_plan((1, height, width), tile_px, halo_px, Tiling(halo_px))
     for size, spans in ((height, plan.rows), (width, plan.columns)):
         assert [p for span in spans for p in range(span.keep_start, span.keep_stop)] == list(range(size))
         assert {span.stop - span.start for span in spans} == {spans[0].stop}, "all of one size"
@@ -50,12 +52,12 @@ def test_a_tile_without_room_between_its_halos_is_refused() -> None:
 def test_tiled_equals_whole_bit_for_bit(model: Path, height: int, width: int) -> None:
     infer = partial(run, open_session(load_onnx(model)))
     dn = np.random.default_rng(1).integers(0, 4096, (height, width)).astype(np.float32)
-    tiled, whole = (make_plan((1, height, width), tile_px, RADIUS_PX, RADIUS_PX) for tile_px in (23, 256))
+    tiled, whole = (make_plan((1, height, width), tile_px, RADIUS_PX, TILING) for tile_px in (23, 256))
     np.testing.assert_array_equal(restore_dn(dn, infer, tiled), restore_dn(dn, infer, whole))
 
 
 def test_a_smaller_halo_shows_seams(model: Path) -> None:
     infer = partial(run, open_session(load_onnx(model)))
     dn = np.random.default_rng(1).integers(0, 4096, (61, 83)).astype(np.float32)
-    tiled, whole = make_plan((1, 61, 83), 23, RADIUS_PX - 3, RADIUS_PX), make_plan((1, 61, 83), 256, 0, RADIUS_PX)
+    tiled, whole = make_plan((1, 61, 83), 23, RADIUS_PX - 3, TILING), make_plan((1, 61, 83), 256, 0, TILING)
     assert (restore_dn(dn, infer, tiled) != restore_dn(dn, infer, whole)).any()

@@ -19,8 +19,9 @@ from deploy.restoration.options import Compression, Options, Runtime
 from deploy.restoration.runtime import Infer, open_runtime
 from profiles.errors import BeersError, ImageError, MachineError, ModelError, OptionError
 from profiles.figures import Row
-from quant.onnx_file import load_onnx, receptive_radius_px, save_onnx
+from quant.onnx_file import load_onnx, save_onnx
 from quant.session import open_session, run
+from quant.tiling.walk import receptive_radius_px
 
 RADIUS_PX = 5
 SHAPES = [(61, 83), (17, 130), (1, 40), (40, 1), (29, 29), (3, 5)]

@@ -5,7 +5,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import closing
 from dataclasses import replace
 from importlib import import_module
@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import onnx
 import psutil
 import pytest
 import tifffile
@@ -28,8 +29,10 @@ from deploy.restoration.runtime import open_runtime
 from deploy.restoration.source import open_source
 from deploy.restoration.workers import Piece, Work, make_work, restore_piece
 from profiles.errors import ImageError, MachineError, ModelError, OptionError
-from quant.onnx_file import load_onnx
+from quant.onnx_file import load_onnx, save_onnx
 from quant.session import open_session, run
+from quant.tiling.walk import tiling_of
+from tests.quant.tiling.small_networks import espcn, float_unet, four_bands
 
 pytest.importorskip("distributed", reason="the extra 'dask' is not installed")
 
@@ -96,6 +99,17 @@ def test_and_with_three_bands_and_missing_pixels(model: Path, scheduler: str, tm
     floats = np.where(pixels == 7, np.nan, pixels / 2).astype(np.float32)
     tifffile.imwrite(tmp_path / "in.tif", floats, **planes)
     one, two = both(tmp_path, options, scheduler)
+    assert two == one
+
+
+@pytest.mark.parametrize("make", [float_unet, espcn, four_bands])
+def test_and_with_users_networks(make: Callable[[], onnx.ModelProto], scheduler: str, tmp_path: Path) -> None:
+    """With strides, a larger result, and several bands."""
+    (tmp_path / "in").mkdir()
+    save_onnx(make(), tmp_path / "network.onnx")
+    bands = tiling_of(load_onnx(tmp_path / "network.onnx")).channels_in
+    tifffile.imwrite(tmp_path / "in" / "in.tif", noise(bands, 91, 73), photometric="minisblack")
+    one, two = both(tmp_path / "in", Options(tmp_path / "network.onnx", tile_px=48), scheduler)
     assert two == one
 
 

@@ -10,6 +10,7 @@ from deploy.restoration.engine import restore_dn
 from deploy.restoration.plan import make_plan
 from deploy.tradeoff.accuracy import Scores, cut_in_four, halves, seam_density, with_seams
 from model.evaluation.scores import fidelity_db
+from quant.tiling.walk import Tiling
 
 RADIUS_PX = 2
 
@@ -87,4 +88,4 @@ def test_predicted_from_a_cut_is_what_a_swath_of_tiles_really_shows() -> None:
 
 
 def in_tiles(dn: np.ndarray, tile_px: int) -> np.ndarray:
-    return restore_dn(dn, blur, make_plan((1, *dn.shape), tile_px, 0, 0))
+    return restore_dn(dn, blur, make_plan((1, *dn.shape), tile_px, 0, Tiling(0)))

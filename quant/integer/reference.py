@@ -9,31 +9,25 @@ one half the two differ by one unit: `half_even` takes the runtime's rule, so th
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
-from itertools import product
 
 import numpy as np
 import onnx
-from numpy.lib.stride_tricks import sliding_window_view
 
 from profiles.figures import Figure, Row, measured, predicted
 from quant.core import INT8_MAX, INT8_MIN, IntConv, IntCore
-from quant.encodings import ZERO
-from quant.graph import CORRECTION, PLANES, Add, split
+from quant.ends import ZERO
+from quant.graph import CORRECTION, PLANES, Add, AveragePool, Concat, MaxPool, Mul, Op, Pointwise, Resize, Shuffle
+from quant.integer.arithmetic import activated, bound_of, convolve, enlarged, means, window_maxima
+from quant.integer.fixed_point import activation_table
 from quant.onnx_file import any_size, with_outputs
-from quant.passes.stream import merge
-from quant.session import few_crops, open_any_size, open_session, run
+from quant.session import few_crops, open_any_size, open_session, result_of
 
 INT32_BITS = 31
 """Of an accumulator, without the sign."""
 
-FLOAT32_WHOLE_MAX = 2**24
-"""Up to here float32 holds whole numbers exactly, and sums them in any order."""
-
 NARROW_BITS = 23
 """Of a 24-bit accumulator, without the sign: the documents hint at one (facts on the DPU's rules), int32 has 31."""
 BITS_SOURCE = "128 times the sum of the weights' sizes, plus the bias: no input exceeds it"
-STRIP_VALUES = 1 << 22
-"""Values of the windows that are laid out at a time: 16 MB of float32."""
 
 
 @dataclass(frozen=True)
@@ -79,17 +73,14 @@ class LayerReport:
 def run_core(
     core: IntCore, planes: np.ndarray, half_even: bool = False, faults: Faults = SOUND
 ) -> tuple[dict[str, np.ndarray], list[LayerReport]]:
-    """Every tensor of the core for int8 planes (N, 3, H, W), as int16, and a report a layer."""
+    """Every tensor of the core for its int8 planes (N, P, H, W), as int16, and a report a layer."""
     tensors, reports = {PLANES: faults.touch(PLANES, planes.astype(np.int16))}, []
     for op in core.ops:
-        if isinstance(op, IntConv):
-            sums, shift, bound = _conv(core, op, tensors, faults)
-        else:
-            sums, shift, bound = _add(core, op, tensors, faults)
+        sums, shift, bound, finer = _sums(core, op, tensors, faults)
         result, ties = _shifted(sums, shift, half_even)
         tensors[op.output] = faults.touch(op.output, result)
         ends = (result == INT8_MAX) | (result == INT8_MIN)
-        peak = float(np.log2(max(int(np.abs(sums).max()), 1)))
+        peak = max(float(np.log2(max(int(np.abs(sums).max()), 1))) - finer, 0.0)
         reports.append(LayerReport(op.name, peak, bound, float(ends.mean()), ties))
     return tensors, reports
 
@@ -103,51 +94,67 @@ def correction(core: IntCore, planes: np.ndarray, half_even: bool = False) -> np
 def merged_correction(core: IntCore, tensors: Mapping[str, np.ndarray]) -> np.ndarray:
     """The correction (N, 1, H, W) of full scale as the host reads it, from the tensors of a run."""
     scale = core.scale(CORRECTION)
-    return merge((tensors[CORRECTION] * np.float32(scale)).astype(np.float32), scale)
+    return core.ends.merge((tensors[CORRECTION] * np.float32(scale)).astype(np.float32), scale)
 
 
-def _conv(
-    core: IntCore, op: IntConv, tensors: dict[str, np.ndarray], faults: Faults
-) -> tuple[np.ndarray, int, float]:
-    """The accumulators (N, O, H, W), the shift to int8, and the bits that they cannot exceed."""
+Sums = tuple[np.ndarray, int, float, int]
+"""Sums (N, O, H, W) int64, the shift to int8, the bits that accumulators cannot exceed, and by how many more
+fractional bits an activation has made these sums longer than the accumulators were."""
+
+INT8_BITS = 7.0
+"""Of what only moves values, without the sign."""
+
+
+def _sums(core: IntCore, op: IntConv | Op, tensors: Mapping[str, np.ndarray], faults: Faults) -> Sums:
+    read = [tensors[name] for name in op.inputs]
+    if isinstance(op, IntConv):
+        return _conv(core, op, read[0], faults)
+    if isinstance(op, Add):
+        return _add(core, op, read, faults)
+    if isinstance(op, Mul):
+        product = read[0].astype(np.int64) * read[1]
+        return product, sum(core.frac_bits[name] for name in op.inputs) - core.frac_bits[op.output], 14.0, 0
+    if isinstance(op, AveragePool):
+        return *means(read[0], op), 0
+    if isinstance(op, Resize) and op.bilinear:
+        return *enlarged(read[0], op.factor), 0
+    return _moving(core, op, read), 0, INT8_BITS, 0
+
+
+def _moving(core: IntCore, op: Op, read: list[np.ndarray]) -> np.ndarray:
+    """What hands values on, or looks them up."""
+    if isinstance(op, Concat):
+        return np.concatenate(read, axis=1)
+    if isinstance(op, MaxPool):
+        return window_maxima(read[0], op)
+    if isinstance(op, Resize):
+        return read[0].repeat(op.factor, axis=2).repeat(op.factor, axis=3)
+    if isinstance(op, Shuffle):
+        return np.asarray(op(read[0]))
+    assert isinstance(op, Pointwise)  # noqa: S101
+    table: np.ndarray = activation_table(op, core.frac_bits)
+    return np.asarray(table[read[0] - INT8_MIN])
+
+
+def _conv(core: IntCore, op: IntConv, image: np.ndarray, faults: Faults) -> Sums:
     product = op.weight_frac_bits + core.frac_bits[op.input]
     bias = _moved(op.bias.astype(np.int64), faults.shift(op.name, "shift_bias", product - op.bias_frac_bits))
-    sums = _convolve(tensors[op.input], op.weight) + bias[:, None, None]
-    bound = 128 * np.abs(op.weight.astype(np.int64)).sum((1, 2, 3)) + np.abs(bias)
-    if op.relu:
-        sums = np.maximum(sums, 0)
+    sums = convolve(image, op.weight, op.window, op.groups, op.transposed) + bias[:, None, None]
+    sums, finer = activated(sums, op.activation, product)
     cut = faults.shift(op.name, "shift_cut", product - core.frac_bits[op.output])
-    return sums, cut, float(np.log2(max(int(bound.max()), 1)))
+    return sums, cut + finer, bound_of(op, bias), finer
 
 
-def _convolve(image: np.ndarray, weight: np.ndarray) -> np.ndarray:
-    """Same-size convolution with zero padding, (N, I, H, W) by (O, I, k, k): a product of matrices a strip of rows.
-
-    In floats that hold its sums exactly; the windows of a whole image would take kh kw times its memory.
-    """
-    largest = 128 * int(np.abs(weight.astype(np.int64)).sum((1, 2, 3)).max(initial=0))
-    exact = np.float32 if largest <= FLOAT32_WHOLE_MAX else np.float64
-    kernel, matrix = weight.shape[2], weight.reshape(len(weight), -1).astype(exact)
-    ends = (kernel // 2, kernel // 2)
-    wide = np.pad(image.astype(exact), ((0, 0), (0, 0), ends, ends))
-    windows = sliding_window_view(wide, (kernel, kernel), (2, 3))
-    count, _, height, width = image.shape
-    sums = np.empty((count, len(weight), height, width), np.int64)
-    rows = max(STRIP_VALUES // (matrix.shape[1] * width), 1)
-    for number, top in product(range(count), range(0, height, rows)):
-        strip = windows[number, :, top : top + rows].transpose(0, 3, 4, 1, 2).reshape(matrix.shape[1], -1)
-        sums[number, :, top : top + rows] = (matrix @ strip).reshape(len(weight), -1, width)
-    return sums
-
-
-def _add(core: IntCore, op: Add, tensors: dict[str, np.ndarray], faults: Faults) -> tuple[np.ndarray, int, float]:
+def _add(core: IntCore, op: Add, read: list[np.ndarray], faults: Faults) -> Sums:
     """The sum at the finer input's scale, exact; the shift that remains; and its bits."""
     finest = max(core.frac_bits[name] for name in op.inputs)
-    aligned = [tensors[name].astype(np.int64) << (finest - core.frac_bits[name]) for name in op.inputs]
-    bound = sum(128 << (finest - core.frac_bits[name]) for name in op.inputs)
+    shifts = [finest - core.frac_bits[name] for name in op.inputs]
+    sums = sum(values.astype(np.int64) << shift for values, shift in zip(read, shifts, strict=True))
+    sums, finer = activated(np.asarray(sums), op.activation, finest)
+    bound = sum(128 << shift for shift in shifts)
     coarsest = min(core.frac_bits[name] for name in op.inputs)
     write = faults.shift(op.name, "shift_write", coarsest - core.frac_bits[op.output])
-    return aligned[0] + aligned[1], finest - coarsest + write, float(np.log2(bound))
+    return sums, finest - coarsest + write + finer, float(np.log2(bound)), finer
 
 
 def _moved(values: np.ndarray, shift: int) -> np.ndarray:
@@ -205,8 +212,8 @@ def agreement(core: IntCore, host: onnx.ModelProto, image: np.ndarray) -> Agreem
     names = [op.output for op in core.ops]
     session = open_session(with_outputs(any_size(host), dict.fromkeys(names, onnx.TensorProto.UINT8)))
     stored = session.run(names, {session.get_inputs()[0].name: image})
-    up, reports = run_core(core, split(image))
-    even, _ = run_core(core, split(image), half_even=True)
+    up, reports = run_core(core, core.ends.split(image))
+    even, _ = run_core(core, core.ends.split(image), half_even=True)
     layers = []
     for name, report, runtime in zip(names, reports, stored, strict=True):
         difference = np.abs(up[name] - even[name])
@@ -225,9 +232,10 @@ def integer_rows(
     layers = [_layer_row(list(same), source) for same in zip(*(one.layers for one in found), strict=True)]
     session = open_any_size(model)
     both = [
-        [np.clip(crop + result, 0, 1) for result in (one.up, one.even)] for crop, one in zip(seen, found, strict=True)
+        [core.ends.finished(crop, result) for result in (one.up, one.even)]
+        for crop, one in zip(seen, found, strict=True)
     ]
-    in_float = [np.clip(run(session, crop), 0, 1) for crop in seen]
+    in_float = [core.ends.clipped(result_of(session, crop)) for crop in seen]
     return layers, _rounding_row(in_float, both, source)
 
 

@@ -1,0 +1,65 @@
+"""Where an image lies on Earth, carried to one of more pixels: TIFF's tags of geography, scaled.
+
+A pixel's corner at (column, row) comes to `scale` times both. Tags that say what a pixel's middle is (rational
+polynomials, and GeoTIFF's where the raster is of points) move by the half pixel between the two.
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+from deploy.restoration.source import Tag
+
+PIXEL_SCALE, TIE_POINTS, TRANSFORMATION, KEYS, POLYNOMIALS = 33550, 33922, 34264, 34735, 50844
+RASTER_TYPE, POINTS = 1025, 2
+"""The key that says whether a raster is of areas or of points, and what it says of points."""
+OFFSETS, SCALES = (2, 3), (7, 8)
+"""Of lines and samples, among the numbers of rational polynomials."""
+
+
+def enlarged_tags(tags: tuple[Tag, ...], scale: int) -> tuple[Tag, ...]:
+    """An image's tags for one of `scale` times the pixels along either side; the same where that is 1."""
+    if scale == 1:
+        return tags
+    values = {tag[0]: tag[3] for tag in tags}
+    points = _is_of_points(values.get(KEYS, ()))
+    return tuple((tag[0], tag[1], tag[2], _enlarged(tag[0], tag[3], scale, points), tag[4]) for tag in tags)
+
+
+def _is_of_points(keys: Any) -> bool:
+    """The keys are a head of four numbers, and four for each: code, place of the value, count, value."""
+    found = [tuple(keys[k : k + 4]) for k in range(4, len(keys), 4)]
+    return any(key[0] == RASTER_TYPE and key[-1] == POINTS for key in found)
+
+
+def _enlarged(code: int, value: Any, scale: int, points: bool) -> Any:
+    if code == PIXEL_SCALE:
+        return (value[0] / scale, value[1] / scale, *value[2:])
+    if code == TIE_POINTS:
+        return _tie_points(value, scale, points)
+    if code == TRANSFORMATION and len(value) == 16:
+        return _transformation(value, scale, points)
+    if code == POLYNOMIALS:
+        places = dict.fromkeys(OFFSETS, _middle) | dict.fromkeys(SCALES, lambda number, by: number * by)
+        return tuple(places[k](number, scale) if k in places else number for k, number in enumerate(value))
+    return value
+
+
+def _middle(place: float, scale: int) -> float:
+    """Where the middle of a pixel at this place comes to, counted from the middle of the first one."""
+    return (place + 0.5) * scale - 0.5
+
+
+def _tie_points(value: Sequence[float], scale: int, points: bool) -> tuple[float, ...]:
+    """Six numbers each: column, row, level, and three on Earth."""
+    moved = [_middle(number, scale) if points else number * scale for number in value]
+    return tuple(moved[k] if k % 6 < 2 else number for k, number in enumerate(value))
+
+
+def _transformation(value: Sequence[float], scale: int, points: bool) -> tuple[float, ...]:
+    """A matrix (4, 4) row by row, from column, row and level to three on Earth."""
+    rows = [list(value[k : k + 4]) for k in range(0, 16, 4)]
+    shift = (0.5 / scale - 0.5) if points else 0.0
+    for row in rows[:3]:
+        row[3] += shift * (row[0] + row[1])
+        row[0], row[1] = row[0] / scale, row[1] / scale
+    return tuple(number for row in rows for number in row)

@@ -1,0 +1,11 @@
+"""The integer core as ONNX, in two encodings of the same numbers, and read back.
+
+The host's file runs on stock onnxruntime by integer kernels, from image to restored image; the board's is the core by
+itself as QDQ ONNX, with int8 bias and power-of-two scales. Reading a host file back gives numbers to reason about.
+"""
+
+from quant.encodings.board import as_on_board, board_model
+from quant.encodings.host import MICROSOFT, host_model
+from quant.encodings.reading import encoding_faults, read_core
+
+__all__ = ["MICROSOFT", "as_on_board", "board_model", "encoding_faults", "host_model", "read_core"]

@@ -1,0 +1,76 @@
+"""The board's file: the integer core by itself as QDQ ONNX, with int8 bias and power-of-two scales."""
+
+import numpy as np
+import onnx
+
+from quant.core import IntConv, IntCore
+from quant.encodings.description import KEY, described_core
+from quant.graph import CORRECTION, PLANES, Conv
+from quant.graph.writer import onnx_weight, write_float
+from quant.onnx_file import GraphWriter, constants, fixed_tile_px, image_info, make_model, metadata
+from quant.untrusted import contradictions
+
+
+def board_model(core: IntCore, about: dict[str, str], tile_px: int | None = None) -> onnx.ModelProto:
+    """`planes` (N, C, H, W) float32, as q * 2^-7, to `correction` (N, C', H', W') float32.
+
+    The correction's channels come twice where it has two gains: `quant.ends.Ends.merge` makes one of them.
+    """
+    writer = _BoardWriter()
+    writer.quantised("planes.dequantised", PLANES, core.frac_bits[PLANES])
+    for op in core.ops:
+        feeds = ["planes.dequantised" if i == PLANES else i for i in op.inputs]
+        output = f"{op.output}.float"
+        if isinstance(op, IntConv):
+            _conv(writer, op, feeds[0], output)
+        else:
+            write_float(writer, op, feeds, output)
+        writer.quantised(op.output, output, core.frac_bits[op.output])
+    ends = core.ends
+    size = image_info(PLANES, ends.planes * ends.channels, tile_px)
+    result = image_info(CORRECTION, ends.gains * ends.outputs, tile_px)
+    if not ends.adds_image:  # of another size than the image, perhaps
+        for side, name in zip(result.type.tensor_type.shape.dim[2:], ("rows", "columns"), strict=True):
+            side.dim_param = name
+    return make_model(writer.graph("convbeers-core", [size], [result]), about)
+
+
+def as_on_board(model: onnx.ModelProto) -> onnx.ModelProto:
+    """A host's file whose core is described in it as the board gets it; any other model as it is.
+
+    What the host spells with several operators, such as a transposed convolution, is one of the DPU's own.
+
+    Raises:
+        ModelError: a description that contradicts the file.
+    """
+    if KEY not in metadata(model):
+        return model
+    with contradictions("INT8 model"):
+        core = described_core(metadata(model)[KEY], constants(model))
+        return board_model(core, {}, fixed_tile_px(model))
+
+
+def _conv(w: "_BoardWriter", op: IntConv, source: str, output: str) -> None:
+    weight = w.dequantised(f"{op.name}.weight", onnx_weight(op.weight, op.transposed), op.weight_frac_bits)
+    bias = w.dequantised(f"{op.name}.bias", op.bias, op.bias_frac_bits)
+    kind = (op.activation, op.window, op.groups, op.transposed)
+    as_float = Conv(op.name, op.input, op.output, op.weight, op.bias, *kind)
+    write_float(w, as_float, [source, weight, bias], output)
+
+
+class _BoardWriter(GraphWriter):
+    """Writes tensors as the board's flow reads them: quantised to int8, and seen as float again."""
+
+    def scale(self, frac_bits: int) -> list[str]:
+        name = self.constant(f"scale_2^{-frac_bits}", np.array(2.0**-frac_bits, np.float32))
+        return [name, self.constant("zero_point", np.array(0, np.int8))]
+
+    def quantised(self, output: str, source: str, frac_bits: int) -> None:
+        """Quantise and dequantise an activation."""
+        middle = self.node("QuantizeLinear", f"{source}.int8", [source, *self.scale(frac_bits)])
+        self.node("DequantizeLinear", output, [middle, *self.scale(frac_bits)], f"{middle}.float")
+
+    def dequantised(self, name: str, value: np.ndarray, frac_bits: int) -> str:
+        """An int8 constant seen as float."""
+        feeds = [self.constant(name, value), *self.scale(frac_bits)]
+        return self.node("DequantizeLinear", f"{name}.float", feeds)

@@ -1,0 +1,71 @@
+"""What a host's file says of its core in its metadata: the operations and scales, without weights and biases.
+
+An operation such as a transposed convolution is several nodes there. Written again from the description and the
+file's own weights, all nodes must come out the same (`quant.encodings.reading.encoding_faults`).
+"""
+
+import json
+from collections.abc import Mapping
+from dataclasses import asdict, fields
+from typing import Any
+
+import numpy as np
+
+from quant.core import IntConv, IntCore
+from quant.encodings.phases import of_phases
+from quant.ends import Ends
+from quant.graph import Activation, Add, AveragePool, Concat, MaxPool, Mul, Op, Pointwise, Resize, Shuffle, Window
+
+KEY = "core"
+KINDS: dict[str, type] = {
+    kind.__name__: kind for kind in (IntConv, Add, Mul, Concat, MaxPool, AveragePool, Resize, Shuffle, Pointwise)
+}
+
+
+def describe(core: IntCore) -> str:
+    """The core as JSON, without its arrays."""
+    ops = [{"kind": type(op).__name__, **_plain(op)} for op in core.ops]
+    return json.dumps({"ops": ops, "frac_bits": dict(core.frac_bits), "ends": asdict(core.ends)}, sort_keys=True)
+
+
+def _plain(op: IntConv | Op) -> dict[str, Any]:
+    found = {field.name: getattr(op, field.name) for field in fields(op)}  # type: ignore[arg-type]
+    if isinstance(op, IntConv):
+        found["weight"], found["bias"] = list(op.weight.shape), len(op.bias)
+    if "window" in found:
+        found["window"] = asdict(found["window"])
+    return found
+
+
+def described_core(text: str, constants: Mapping[str, np.ndarray]) -> IntCore:
+    """The core that a description and the constants of its file make.
+
+    Raises:
+        LookupError, TypeError, ValueError: a description that contradicts itself or them.
+    """
+    said = json.loads(text)
+    frac_bits = {str(name): int(bits) for name, bits in said["frac_bits"].items()}
+    ops = tuple(_op(dict(op), frac_bits, constants) for op in said["ops"])
+    ends = said["ends"]
+    shuffles = {key: tuple(Shuffle(**each) for each in ends[key]) for key in ("front", "back", "last")}
+    return IntCore(ops, frac_bits, Ends(**{**ends, **shuffles}))
+
+
+def _op(said: dict[str, Any], frac_bits: Mapping[str, int], constants: Mapping[str, np.ndarray]) -> IntConv | Op:
+    kind = KINDS[said.pop("kind")]
+    if "window" in said:
+        said["window"] = Window(**{key: tuple(value) for key, value in said["window"].items()})
+    if "activation" in said:
+        said["activation"] = Activation(said["activation"])
+    for key in ("inputs", "kernel"):
+        if key in said:
+            said[key] = tuple(said[key])
+    if kind is IntConv:
+        shift = said["weight_frac_bits"] + frac_bits[said["input"]] - said["bias_frac_bits"]
+        whole = constants[f"{said['name']}.bias"].ravel()[: said["bias"]].astype(np.int64)
+        weight = constants[f"{said['name']}.weight"]
+        if said["transposed"]:
+            weight = of_phases(weight, tuple(said["weight"]), said["window"].strides[0])
+        said |= {"weight": weight.reshape(said["weight"]), "bias": (whole >> shift).astype(np.int8)}
+    op: IntConv | Op = kind(**said)
+    return op

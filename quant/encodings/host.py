@@ -1,0 +1,252 @@
+"""The host's file: the integer core on stock onnxruntime by integer kernels, from image to restored image.
+
+Every operation rounds once, ties to even, and adds exactly. What onnxruntime has no integer operator for is written
+with those it has: transposed convolution and bilinear enlargement as convolutions and a pixel shuffle, average
+pooling as a depthwise convolution, activations by themselves as tables of 256, LeakyReLU on the convolution's sums.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import onnx
+from onnx import TensorProto
+
+from quant.core import INT8_MAX, INT8_MIN, IntConv, IntCore
+from quant.encodings.description import KEY, describe
+from quant.encodings.phases import phases
+from quant.ends import ZERO, Ends, HostWriter, write_back, write_front
+from quant.graph import (
+    CORRECTION,
+    IMAGE,
+    PLANES,
+    Activation,
+    Add,
+    AveragePool,
+    Concat,
+    MaxPool,
+    Mul,
+    Pointwise,
+    Resize,
+    Shuffle,
+    channels_of,
+    is_plain,
+)
+from quant.graph.operations import LEAKY_SLOPE
+from quant.graph.writer import window_attributes, write_shuffle
+from quant.integer.fixed_point import activation_table, bilinear_weights, mean_factor, six_in_units
+from quant.onnx_file import image_info, make_model
+
+MICROSOFT = "com.microsoft"
+
+
+def host_model(core: IntCore, about: dict[str, str], tile_px: int | None = None) -> onnx.ModelProto:
+    """The whole INT8 network on stock onnxruntime, (N, C, H, W) float32 in [0, 1] to what its float network gives."""
+    writer = HostWriter()
+    write_front(writer, core.ends)
+    for op in core.ops:
+        _WRITERS[type(op)](writer, core, op)
+    feeds = [CORRECTION, writer.unit(core.frac_bits[CORRECTION]), writer.zero_point()]
+    write_back(writer, core.ends, feeds, core.scale(CORRECTION))
+    graph = writer.graph(
+        "convbeers-int8", [image_info(IMAGE, core.ends.image_channels, tile_px)], [_result(core, tile_px)]
+    )
+    plain = all(is_plain(op) for op in core.ops) and core.ends == Ends(gains=core.ends.gains)
+    return make_model(graph, about if plain else {**about, KEY: describe(core)}, microsoft=True)
+
+
+def _result(core: IntCore, tile_px: int | None) -> onnx.ValueInfoProto:
+    ends = core.ends
+    if ends.flat:
+        return onnx.helper.make_tensor_value_info("restored", TensorProto.FLOAT, ["N", ends.outputs])
+    if ends.adds_image and not ends.last:
+        return image_info("restored", ends.image_channels, tile_px)
+    shuffled = int(np.prod([shuffle.block**2 for shuffle in (*ends.back, *ends.last)], initial=1))
+    sizes: list[str | int | None] = ["N", ends.outputs // shuffled, "rows", "columns"]
+    return onnx.helper.make_tensor_value_info("restored", TensorProto.FLOAT, sizes)
+
+
+def _conv(w: HostWriter, core: IntCore, op: IntConv) -> None:
+    if op.transposed:
+        _transposed(w, core, op)
+    elif op.activation is Activation.leaky_relu:
+        _leaky(w, core, op)
+    else:
+        attributes = {**window_attributes(op.window, op.groups), "kernel_shape": list(op.weight.shape[2:])}
+        _qlinear(w, core, op, op.weight, _bias(core, op), op.output, attributes)
+
+
+def _bias(core: IntCore, op: IntConv) -> np.ndarray:
+    """At the accumulator's scale, (O,) int32."""
+    shift = op.weight_frac_bits + core.frac_bits[op.input] - op.bias_frac_bits
+    return op.bias.astype(np.int32) << shift
+
+
+def _qlinear(
+    w: HostWriter,
+    core: IntCore,
+    op: IntConv,
+    weight: np.ndarray,
+    bias: np.ndarray,
+    output: str,
+    attributes: dict[str, Any],
+) -> None:
+    feeds = [op.input, w.unit(core.frac_bits[op.input]), w.zero_point()]
+    feeds += [w.constant(f"{op.name}.weight", weight), w.unit(op.weight_frac_bits)]
+    # One a weight: where onnxruntime rewrites weights (see quant.session), it trips over a shared one.
+    feeds += [w.constant(f"{op.name}.weight_zero_point", np.array(0, np.int8))]
+    feeds += [w.unit(core.frac_bits[op.output]), w.zero_point(), w.constant(f"{op.name}.bias", bias)]
+    result = output if op.activation is Activation.none else f"{output}.linear"
+    w.node("QLinearConv", result, feeds, name=op.name, **attributes)
+    _clamp(w, core, op, result, output)
+
+
+def _clamp(w: HostWriter, core: IntCore, op: IntConv | Add, source: str, output: str) -> None:
+    """ReLU and ReLU6 of what is rounded already: they only clip."""
+    if op.activation is Activation.none:
+        return
+    relu = output if op.activation is Activation.relu else f"{output}.above_0"
+    w.node("Max", relu, [source, w.zero_point()], name=f"{op.name}.relu")
+    if op.activation is Activation.relu6:
+        six = ZERO + six_in_units(core.frac_bits[op.output])
+        w.node("Min", output, [relu, w.constant(f"{op.name}.six", np.array(six, np.uint8))], name=f"{op.name}.relu6")
+
+
+def _leaky(w: HostWriter, core: IntCore, op: IntConv) -> None:
+    """max(256 x, 26 x) of the int32 sums, exact in float64, rounded once."""
+    name, product = op.output, op.weight_frac_bits + core.frac_bits[op.input]
+    feeds = [op.input, w.constant(f"{op.name}.weight", op.weight), w.zero_point()]
+    feeds += [w.constant(f"{op.name}.weight_zero_point", np.array(0, np.int8))]
+    attributes = {**window_attributes(op.window, op.groups), "kernel_shape": list(op.weight.shape[2:])}
+    w.node("ConvInteger", f"{name}.products", feeds, name=op.name, **attributes)
+    bias = w.constant(f"{op.name}.bias", _bias(core, op)[:, None, None])
+    w.node("Add", f"{name}.sums", [f"{name}.products", bias])
+    w.node("Cast", f"{name}.wide", [f"{name}.sums"], to=TensorProto.DOUBLE)
+    scales = {"whole": 2.0 ** (core.frac_bits[op.output] - product)}
+    scales["leaking"] = LEAKY_SLOPE * scales["whole"]
+    for kind, factor in scales.items():
+        by = w.constant(f"{op.name}.{kind}", np.array(factor, np.float64))
+        w.node("Mul", f"{name}.{kind}", [f"{name}.wide", by])
+    w.node("Max", f"{name}.linear", [f"{name}.whole", f"{name}.leaking"], name=f"{op.name}.leaky_relu")
+    _rounded(w, f"{name}.linear", name)
+
+
+def _rounded(w: HostWriter, source: str, output: str) -> None:
+    """A float64 tensor of units to uint8."""
+    w.node("Round", f"{output}.round", [source])
+    limits = [w.constant(f"int8_{end}", np.array(end, np.float64)) for end in (INT8_MIN, INT8_MAX)]
+    w.node("Clip", f"{output}.clip", [f"{output}.round", *limits])
+    w.node("Add", f"{output}.offset", [f"{output}.clip", w.constant("offset_64", np.array(ZERO, np.float64))])
+    w.node("Cast", output, [f"{output}.offset"], to=TensorProto.UINT8)
+
+
+def _transposed(w: HostWriter, core: IntCore, op: IntConv) -> None:
+    """One convolution for each phase of the enlarged lattice, then a pixel shuffle, then the pads cut."""
+    stride, top, left = op.window.strides[0], op.window.pads[0], op.window.pads[1]
+    weight, reach = phases(op.weight, stride)
+    phased = IntConv(
+        op.name,
+        op.input,
+        f"{op.output}.phases",
+        weight,
+        op.weight_frac_bits,
+        op.bias,
+        op.bias_frac_bits,
+        op.activation,
+    )
+    both = IntCore((), {**core.frac_bits, phased.output: core.frac_bits[op.output]})
+    window = {"pads": [reach] * 4, "kernel_shape": list(weight.shape[2:])}
+    _qlinear(w, both, phased, weight, np.tile(_bias(core, op), stride**2), phased.output, window)
+    shuffle = Shuffle(f"{op.name}.shuffle", phased.output, f"{op.output}.whole", stride, True, False)
+    write_shuffle(w, shuffle, shuffle.input, shuffle.output)
+    # Behind the last pixel the phases go on: as many rows and columns as the kernel does not reach are cut as well.
+    rows, columns = (stride * (reach + 1) - k for k in op.weight.shape[2:])
+    ends = [-(op.window.pads[2] + rows), -(op.window.pads[3] + columns)]
+    stops = [end if end else np.iinfo(np.int64).max for end in ends]
+    feeds = {"from": [top, left], "to": stops, "axes": [2, 3]}
+    places = [w.constant(f"{op.name}.{name}", np.array(value, np.int64)) for name, value in feeds.items()]
+    w.node("Slice", op.output, [shuffle.output, *places], name=f"{op.name}.cut")
+
+
+def _add(w: HostWriter, core: IntCore, op: Add | Mul) -> None:
+    activation = getattr(op, "activation", Activation.none)
+    result = op.output if activation is Activation.none else f"{op.output}.linear"
+    feeds = []
+    for name in (*op.inputs, op.output):
+        quantity = [] if name == op.output else [name]
+        feeds += [*quantity, w.unit(core.frac_bits[name]), w.zero_point()]
+    w.node("QLinearAdd" if isinstance(op, Add) else "QLinearMul", result, feeds, name=op.name, domain=MICROSOFT)
+    if isinstance(op, Add):
+        _clamp(w, core, op, result, op.output)
+
+
+def _max_pool(w: HostWriter, _: IntCore, op: MaxPool) -> None:
+    assert op.kernel is not None  # noqa: S101
+    w.node(
+        "MaxPool", op.output, [op.input], name=op.name, kernel_shape=list(op.kernel), **window_attributes(op.window)
+    )
+
+
+def _average_pool(w: HostWriter, core: IntCore, op: AveragePool) -> None:
+    assert op.kernel is not None  # noqa: S101 - resolved before anything is quantised
+    factor, shift = mean_factor(op.kernel)
+    channels = _channels(core, op.input)
+    weight = np.full((channels, 1, *op.kernel), factor, np.int8)
+    _by_weights(
+        w, core, op, weight, shift, op.output, {**window_attributes(op.window), "kernel_shape": list(op.kernel)}
+    )
+
+
+def _by_weights(
+    w: HostWriter,
+    core: IntCore,
+    op: AveragePool | Resize,
+    weight: np.ndarray,
+    shift: int,
+    output: str,
+    attributes: dict[str, Any],
+    source: str = "",
+) -> None:
+    """A depthwise convolution whose result has its input's scale."""
+    unit = w.unit(core.frac_bits[op.input])
+    feeds = [source or op.input, unit, w.zero_point(), w.constant(f"{op.name}.weight", weight), w.unit(shift)]
+    feeds += [w.constant(f"{op.name}.weight_zero_point", np.array(0, np.int8)), unit, w.zero_point()]
+    w.node("QLinearConv", output, feeds, name=op.name, group=_channels(core, op.input), **attributes)
+
+
+def _channels(core: IntCore, name: str) -> int:
+    found = channels_of(core.ops, {PLANES: core.ends.planes * core.ends.channels})
+    return found[name]
+
+
+def _resize(w: HostWriter, core: IntCore, op: Resize) -> None:
+    if not op.bilinear:
+        scales = w.constant(f"resize_by_{op.factor}", np.array([1, 1, op.factor, op.factor], np.float32))
+        how = {"mode": "nearest", "coordinate_transformation_mode": "asymmetric", "nearest_mode": "floor"}
+        w.node("Resize", op.output, [op.input, "", scales], name=op.name, **how)
+        return
+    weight, shift = bilinear_weights(op.factor)
+    wide, phased = f"{op.output}.edged", f"{op.output}.phases"
+    w.node("Pad", wide, [op.input, w.constant("edge_pads", np.array([0, 0, 1, 1, 0, 0, 1, 1]))], mode="edge")
+    weight = np.tile(weight[:, None], (_channels(core, op.input), 1, 1, 1))
+    _by_weights(w, core, op, weight, shift, phased, {"pads": [0] * 4, "kernel_shape": [3, 3]}, wide)
+    write_shuffle(w, Shuffle(f"{op.name}.shuffle", phased, op.output, op.factor), phased, op.output)
+
+
+def _pointwise(w: HostWriter, core: IntCore, op: Pointwise) -> None:
+    table = (activation_table(op, core.frac_bits) + ZERO).astype(np.uint8)
+    w.node("Cast", f"{op.output}.place", [op.input], to=TensorProto.INT32)
+    w.node("Gather", op.output, [w.constant(f"{op.name}.table", table), f"{op.output}.place"], name=op.name)
+
+
+_WRITERS: dict[type, Callable[..., Any]] = {
+    IntConv: _conv,
+    Add: _add,
+    Mul: _add,
+    Concat: lambda w, _, op: w.node("Concat", op.output, list(op.inputs), name=op.name, axis=1),
+    MaxPool: _max_pool,
+    AveragePool: _average_pool,
+    Resize: _resize,
+    Shuffle: lambda w, _, op: write_shuffle(w, op, op.input, op.output),
+    Pointwise: _pointwise,
+}

@@ -1,0 +1,195 @@
+"""What the host does around the integer core, in numpy and as ONNX: planes in front, the result made behind.
+
+image -> pixel unshuffle -> planes -> core -> one correction of its gains or windows -> pixel shuffle -> + image
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from onnx import TensorProto, helper
+
+from model.io.images import MAX_DN
+from quant.graph import (
+    COARSE_MAX,
+    CORRECTION,
+    COUNT,
+    IMAGE,
+    PLANES,
+    QUARTER,
+    STEP,
+    Network,
+    Shuffle,
+    channels_of,
+    plane_count,
+    split,
+)
+from quant.graph.writer import write_shuffle
+from quant.onnx_file import GraphWriter
+
+ZERO = 128
+"""Around which uint8 stands for int8 in the host's file."""
+GAIN = 8
+FINE_MAX = 126
+"""The largest size at which the fine channel is believed: one below int8's end."""
+
+
+@dataclass(frozen=True)
+class Ends:
+    """The host's part of an INT8 network.
+
+    Attributes:
+        channels: of the core's image, behind `front`.
+        planes: of int8 that each channel becomes.
+        front: pixel unshuffles of the image.
+        back: pixel shuffles of the correction.
+        adds_image: whether the image is added, and the sum clipped to [0, 1].
+        last: pixel shuffles of the sum.
+        flat: whether the result is (N, K).
+        gains: 2 where the correction's channels come twice, fine and coarse by `GAIN`.
+        outputs: channels of the correction, gains not counted.
+    """
+
+    channels: int = 1
+    planes: int = COUNT
+    front: tuple[Shuffle, ...] = ()
+    back: tuple[Shuffle, ...] = ()
+    adds_image: bool = True
+    last: tuple[Shuffle, ...] = ()
+    flat: bool = False
+    gains: int = 1
+    outputs: int = 1
+
+    @property
+    def image_channels(self) -> int:
+        """Of the image as it comes."""
+        return self.channels // int(np.prod([shuffle.block**2 for shuffle in self.front], initial=1))
+
+    def split(self, image: np.ndarray) -> np.ndarray:
+        """An image (N, C, H, W) in [0, 1] to the core's planes, int8."""
+        for shuffle in self.front:
+            image = shuffle(image)
+        return split(image, self.planes)
+
+    def merge(self, correction: np.ndarray, scale: float) -> np.ndarray:
+        """One correction (N, C, H, W) from its gains: (N, 1 or 2 C, H, W) multiples of `scale`."""
+        if self.gains == 1:
+            return correction
+        fine, coarse = np.split(correction, 2, axis=1)
+        return np.where(np.abs(fine) <= (FINE_MAX + 0.5) * scale, fine, coarse * np.float32(GAIN))
+
+    def restored(self, image: np.ndarray, correction: np.ndarray, scale: float) -> np.ndarray:
+        """What the host makes of an image (N, C, H, W) and the core's result."""
+        return self.finished(image, self.merge(correction, scale))
+
+    def finished(self, image: np.ndarray, result: np.ndarray) -> np.ndarray:
+        """As `restored`, of a correction that is one already."""
+        for shuffle in self.back:
+            result = shuffle(result)
+        if self.flat:
+            result = result.reshape(len(result), -1)
+        result = self.clipped(image + result) if self.adds_image else result
+        for shuffle in self.last:
+            result = shuffle(result)
+        return result
+
+    def clipped(self, result: np.ndarray) -> np.ndarray:
+        """A float network's result as the host would clip its own: to [0, 1] where the image is added."""
+        return np.clip(result, 0, 1) if self.adds_image else result
+
+
+ONE_CHANNEL = Ends()
+"""An image of one channel, and a correction of it that is added."""
+
+
+def ends_of(network: Network, gains: int = 1) -> Ends:
+    """The ends of a network whose correction comes in so many gains."""
+    kept = network.front, network.back, network.adds_image, network.last, network.flat
+    outputs = channels_of(network.graph, {IMAGE: network.core_channels})[CORRECTION]
+    return Ends(network.core_channels, plane_count(network.graph), *kept, gains, outputs)
+
+
+class HostWriter(GraphWriter):
+    """Writes the host's operators, each with its domain, and uint8 around 128."""
+
+    domain = ""
+
+    def scalar(self, name: str, value: float) -> str:
+        """A float32 constant."""
+        return self.constant(name, np.array(value, np.float32))
+
+    def unit(self, frac_bits: int) -> str:
+        """The constant 2^-frac_bits: one unit of a tensor."""
+        return self.constant(f"scale_2^{-frac_bits}", np.array(2.0**-frac_bits, np.float32))
+
+    def zero_point(self) -> str:
+        """The constant 128, around which uint8 stands for int8."""
+        return self.constant("zero_point", np.array(ZERO, np.uint8))
+
+
+def write_front(w: HostWriter, ends: Ends) -> None:
+    """Write the host's nodes in front of the core, image to uint8 planes: `Ends.split` as operators."""
+    image, channels = IMAGE, ends.image_channels
+    for k, shuffle in enumerate(ends.front):
+        write_shuffle(w, shuffle, image, f"host_front.shuffled_{k}", channels)
+        image, channels = f"host_front.shuffled_{k}", channels * shuffle.block**2
+    w.node("Mul", "host_front.scale", [image, w.scalar("max_dn", MAX_DN)])
+    w.node("Round", "host_front.round", ["host_front.scale"])
+    w.node("Clip", "host_front.dn", ["host_front.round", w.scalar("zero", 0), w.scalar("max_dn", MAX_DN)])
+    w.node("Mul", "host_front.steps", ["host_front.dn", w.scalar("one_step", 1 / STEP)])
+    w.node("Round", "host_front.whole_steps", ["host_front.steps"])
+    w.node("Min", "host_front.coarse", ["host_front.whole_steps", w.scalar("coarse_max", COARSE_MAX)])
+    planes = "host_front.coarse" if ends.planes == 1 else _write_remainder(w)
+    w.node("Add", "host_front.offset", [planes, w.scalar("offset", ZERO)])
+    w.node("Cast", PLANES, ["host_front.offset"], to=TensorProto.UINT8)
+
+
+def _write_remainder(w: HostWriter) -> str:
+    w.node("Mul", "host_front.coarse_dn", ["host_front.coarse", w.scalar("step", STEP)])
+    w.node("Sub", "host_front.remainder", ["host_front.dn", "host_front.coarse_dn"])
+    w.node("Mul", "host_front.quarters", ["host_front.remainder", w.scalar("one_quarter", 1 / QUARTER)])
+    w.node("Round", "host_front.quarter", ["host_front.quarters"])
+    planes = ["host_front.coarse", "host_front.remainder", "host_front.quarter"]
+    return w.node("Concat", "host_front.planes", planes, axis=1)
+
+
+def write_back(w: HostWriter, ends: Ends, feeds: list[str], scale: float) -> None:
+    """Write the host's nodes behind the core: `Ends.restored` as operators.
+
+    Args:
+        w: gets the nodes.
+        ends: of the network.
+        feeds: the core's result with its scale and its zero point, as names.
+        scale: the value of one unit of it.
+    """
+    result = "host_back.correction"
+    if ends.gains == 1:
+        w.node("DequantizeLinear", result, feeds)
+    else:
+        w.node("DequantizeLinear", "host_back.both", feeds)
+        _write_merge(w, ends.outputs, scale)
+    for k, shuffle in enumerate(ends.back):
+        write_shuffle(w, shuffle, result, f"host_back.shuffled_{k}")
+        result = f"host_back.shuffled_{k}"
+    if ends.adds_image:
+        w.node("Add", "host_back.add", [IMAGE, result])
+        limits = [w.scalar("zero", 0), w.scalar("one", 1)]
+        name = "host_back.clipped" if ends.last else "restored"
+        w.node("Clip", name, ["host_back.add", *limits], name="host_back.clip")
+        for k, shuffle in enumerate(ends.last):
+            result, name = name, "restored" if k + 1 == len(ends.last) else f"host_back.last_{k}"
+            write_shuffle(w, shuffle, result, name)
+    else:
+        w.node("Flatten" if ends.flat else "Identity", "restored", [result], name="host_back.result")
+
+
+def _write_merge(w: HostWriter, channels: int, scale: float) -> None:
+    """Write the nodes that make one correction of two gains: `Ends.merge` as operators."""
+    each = w.constant("one_each" if channels == 1 else "channels_each", np.array([channels, channels]))
+    w.nodes.append(
+        helper.make_node("Split", ["host_back.both", each], ["host_back.fine", "host_back.coarse"], axis=1)
+    )
+    w.nodes[-1].name = "host_back.split"
+    w.node("Mul", "host_back.wide", ["host_back.coarse", w.scalar("gain", GAIN)])
+    w.node("Abs", "host_back.size", ["host_back.fine"])
+    w.node("LessOrEqual", "host_back.fits", ["host_back.size", w.scalar("fine_max", (FINE_MAX + 0.5) * scale)])
+    w.node("Where", "host_back.correction", ["host_back.fits", "host_back.fine", "host_back.wide"])

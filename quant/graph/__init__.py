@@ -1,0 +1,53 @@
+"""A network as the short list of operations that a DPU computes: what quantisation works on.
+
+- `operations`: what there is, convolutions to pixel shuffles, and which tensors must share a scale;
+- `reader`: from float ONNX to a `network`, cut where the host's part ends; `writer`: back to float ONNX;
+- `planes`: how 12 bits enter int8.
+"""
+
+from quant.graph.network import Network, channels_of, check_network, refused_graph
+from quant.graph.operations import (
+    CORRECTION,
+    IMAGE,
+    Activation,
+    Add,
+    AveragePool,
+    Concat,
+    Conv,
+    Graph,
+    MaxPool,
+    Mul,
+    Op,
+    Pointwise,
+    Resize,
+    Shuffle,
+    Window,
+    is_plain,
+    relu_count,
+    same,
+    tensors,
+    tied,
+    ties_scales,
+)
+from quant.graph.planes import (
+    COARSE_MAX,
+    COUNT,
+    PLANES,
+    PLANES_FRAC_BITS,
+    QUARTER,
+    STEP,
+    coarse_plane_only,
+    plane_count,
+    read_planes,
+    split,
+)
+from quant.graph.reader import correction_graph, read_network, refusal
+from quant.graph.writer import graph_to_onnx
+
+__all__ = [
+    "COARSE_MAX", "CORRECTION", "COUNT", "IMAGE", "PLANES", "PLANES_FRAC_BITS", "QUARTER", "STEP", "Activation",
+    "Add", "AveragePool", "Concat", "Conv", "Graph", "MaxPool", "Mul", "Network", "Op", "Pointwise", "Resize",
+    "Shuffle", "Window", "channels_of", "check_network", "coarse_plane_only", "correction_graph",
+    "graph_to_onnx", "is_plain", "plane_count", "read_network", "read_planes", "refusal", "refused_graph",
+    "relu_count", "same", "split", "tensors", "tied", "ties_scales",
+]  # fmt: skip

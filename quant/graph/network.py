@@ -1,0 +1,186 @@
+"""A network cut where the DPU's part begins and ends, and whether its operations fit together."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from profiles.errors import ModelError
+from quant.graph.operations import (
+    CORRECTION,
+    IMAGE,
+    Activation,
+    Add,
+    AveragePool,
+    Concat,
+    Conv,
+    Graph,
+    HasWeight,
+    MaxPool,
+    Mul,
+    Op,
+    Pair,
+    Resize,
+    Shuffle,
+)
+
+
+@dataclass(frozen=True)
+class Network:
+    """A float network, cut where the DPU's part begins and ends.
+
+    Attributes:
+        graph: from `IMAGE` to `CORRECTION`, what is computed in INT8.
+        channels: of the image, before `front`.
+        front: what the host does to the image first: pixel unshuffle.
+        back: what it does to the correction: pixel shuffle.
+        adds_image: whether the image is added to the result (the global add), in the host's float numbers.
+        last: what it does to the sum: pixel shuffle. An image of one channel is added to each of the sum's.
+        flat: whether the result is (N, K) rather than an image.
+    """
+
+    graph: Graph = field(compare=False)
+    channels: int = 1
+    front: tuple[Shuffle, ...] = ()
+    back: tuple[Shuffle, ...] = ()
+    adds_image: bool = True
+    last: tuple[Shuffle, ...] = ()
+    flat: bool = False
+
+    @property
+    def core_channels(self) -> int:
+        """Of what the DPU's part reads."""
+        return self.channels * int(np.prod([shuffle.block**2 for shuffle in self.front], initial=1))
+
+
+def refused_graph(expected: str, got: str, remedy: str = "") -> ModelError:
+    """The sentence for a network that cannot be quantised."""
+    remedy = remedy or "see docs/commands.md for what 'quantize' takes; 'check' names what a DPU does not run"
+    return ModelError("float model", expected=expected, got=got, remedy=remedy)
+
+
+def cut(graph: Graph, channels: int, flat: bool) -> Network:
+    """The network of operations from `IMAGE` to `CORRECTION`: what the host does at both ends is taken off.
+
+    Pixel shuffles there move values and cost the host next to nothing; DPUs have been seen to compute them wrongly.
+    """
+    graph, last = _without_shuffles(graph)
+    end = graph[-1] if graph else None
+    adds_image = isinstance(end, Add) and IMAGE in end.inputs and end.activation is Activation.none
+    if adds_image:
+        assert end is not None  # noqa: S101
+        graph = _ended(graph[:-1], end.inputs[1 - end.inputs.index(IMAGE)])
+        graph, back = _without_shuffles(graph)
+    else:
+        back, last = last, ()
+    front: list[Shuffle] = []
+    while isinstance(first := _only_reader(graph), Shuffle) and not first.up:
+        front.append(first)
+        graph = tuple(renamed(op, {first.output: IMAGE}) for op in graph if op is not first)
+    return Network(graph, channels, tuple(front), back, adds_image, last, flat)
+
+
+def _without_shuffles(graph: Graph) -> tuple[Graph, tuple[Shuffle, ...]]:
+    """The graph up to the pixel shuffles that it ends with, and these in their order."""
+    found: list[Shuffle] = []
+    while graph and isinstance(end := graph[-1], Shuffle) and end.up:
+        found.insert(0, end)
+        graph = _ended(graph[:-1], end.input)
+    return graph, tuple(found)
+
+
+def _ended(graph: Graph, name: str) -> Graph:
+    """The graph that ends with the tensor of that name."""
+    if name == IMAGE or not any(op.output == name for op in graph):
+        raise refused_graph("a correction that the network computes", f"{name} of nobody")
+    return tuple(renamed(op, {name: CORRECTION}) for op in graph)
+
+
+def _only_reader(graph: Graph) -> Op | None:
+    readers = [op for op in graph if IMAGE in op.inputs]
+    return readers[0] if len(readers) == 1 else None
+
+
+def renamed(op: Op, names: Mapping[str, str]) -> Op:
+    """An operation whose tensors have other names."""
+    changed: dict[str, Any] = {"output": names.get(op.output, op.output)}
+    if hasattr(op, "input"):
+        changed["input"] = names.get(op.inputs[0], op.inputs[0])
+    else:
+        changed["inputs"] = tuple(names.get(name, name) for name in op.inputs)
+    return replace(op, **changed)  # type: ignore[type-var]
+
+
+def check_network(network: Network) -> None:
+    """Refuse what cannot be quantised, before anything is computed.
+
+    Raises:
+        ModelError: a tensor read that nobody wrote, widths that do not fit, or weights that are no numbers.
+    """
+    graph = network.graph
+    if not graph or graph[-1].output != CORRECTION:
+        raise refused_graph("a last operation that writes the result", graph[-1].name if graph else "no operation")
+    channels_of(graph, {IMAGE: network.core_channels})
+    for op in graph:
+        if isinstance(op, Conv) and not (np.isfinite(op.weight).all() and np.isfinite(op.bias).all()):
+            raise refused_graph("finite weights", f"NaN or infinity in {op.name}")
+
+
+def sized(graph: Graph, size: Pair) -> Graph:
+    """The graph for images of one size (rows, columns), the windows of global pooling known."""
+    sizes, found = {IMAGE: size}, list[Op]()
+    for op in graph:
+        read = sizes[op.inputs[0]]
+        if isinstance(op, AveragePool) and op.kernel is None:
+            op = replace(op, kernel=read)
+        sizes[op.output] = _size(op, read)
+        found.append(op)
+    return tuple(found)
+
+
+def _size(op: Op, read: Pair) -> Pair:
+    if isinstance(op, Conv) and op.transposed:
+        (rows, columns), (top, left, bottom, right) = op.window.strides, op.window.pads
+        tall, broad = op.weight.shape[2:]
+        return (read[0] - 1) * rows + tall - top - bottom, (read[1] - 1) * columns + broad - left - right
+    if isinstance(op, Conv | MaxPool | AveragePool):
+        kernel = (op.weight.shape[2], op.weight.shape[3]) if isinstance(op, Conv) else op.kernel
+        assert kernel is not None  # noqa: S101
+        return op.window.out_size(read, kernel)
+    if isinstance(op, Resize):
+        return read[0] * op.factor, read[1] * op.factor
+    if isinstance(op, Shuffle):
+        return (read[0] * op.block, read[1] * op.block) if op.up else (read[0] // op.block, read[1] // op.block)
+    return read
+
+
+def channels_of(graph: Graph, given: Mapping[str, int]) -> dict[str, int]:
+    """Channels of every tensor, from those of the given ones.
+
+    Raises:
+        ModelError: an operation that reads what nobody wrote, or channels that do not fit.
+    """
+    widths = dict(given)
+    for op in graph:
+        missing = [name for name in op.inputs if name not in widths]
+        if missing:
+            raise refused_graph(f"{op.name} behind what it reads", missing[0])
+        widths[op.output] = _width(op, [widths[name] for name in op.inputs])
+    return widths
+
+
+def _width(op: Op, read: list[int]) -> int:
+    if isinstance(op, HasWeight):  # in float or in whole numbers
+        if read[0] != op.weight.shape[1] * op.groups:
+            raise refused_graph(f"{op.weight.shape[1] * op.groups} channels for {op.name}", f"{read[0]}")
+        return len(op.weight)
+    if isinstance(op, Concat):
+        return sum(read)
+    if isinstance(op, Add | Mul) and len(set(read)) > 1:
+        raise refused_graph(f"two tensors of one width for {op.name}", f"{read[0]} and {read[1]} channels")
+    if isinstance(op, Shuffle):
+        if op.up and read[0] % op.block**2:
+            raise refused_graph(f"a multiple of {op.block**2} channels for {op.name}", f"{read[0]}")
+        return read[0] // op.block**2 if op.up else read[0] * op.block**2
+    return read[0]

@@ -1,0 +1,298 @@
+"""The short list of operations that a DPU computes, and what quantisation works on: a network as a tuple of them.
+
+Every operation reads and writes tensors (N, C, H, W) by their names, each written once.
+"""
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
+from enum import StrEnum
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+
+IMAGE, CORRECTION = "image", "correction"
+"""What a network reads, and what its last operation writes."""
+
+Pair = tuple[int, int]
+LEAKY_SLOPE = 26 / 256
+"""The one slope of LeakyReLU that a DPU computes."""
+SIXTH = 2731 / 2**14
+"""What its fixed-point HardSigmoid has for 1/6 (UG1414)."""
+
+
+class Activation(StrEnum):
+    """What follows an operation at once, by ONNX's names."""
+
+    none = ""
+    relu = "Relu"
+    relu6 = "Clip"
+    leaky_relu = "LeakyRelu"
+    hard_sigmoid = "HardSigmoid"
+    hard_swish = "HardSwish"
+
+    def __call__(self, values: np.ndarray) -> np.ndarray:
+        """Of values of any shape, as the DPU computes it, in their own type."""
+        return _FUNCTIONS[self](values)
+
+    @property
+    def fused(self) -> bool:
+        """Whether it is computed on the accumulator, before anything is rounded."""
+        return self not in (Activation.hard_sigmoid, Activation.hard_swish)
+
+    @property
+    def homogeneous(self) -> bool:
+        """Whether f(k x) = k f(x) for k above 0: what lets factors pass through."""
+        return self in (Activation.none, Activation.relu, Activation.leaky_relu)
+
+
+def _hard_sigmoid(values: np.ndarray) -> np.ndarray:
+    return np.asarray(np.clip(values + 3, 0, 6) * values.dtype.type(SIXTH))
+
+
+_FUNCTIONS: Mapping[Activation, Callable[[np.ndarray], np.ndarray]] = {
+    Activation.none: lambda values: values,
+    Activation.relu: lambda values: np.maximum(values, 0),
+    Activation.relu6: lambda values: np.clip(values, 0, 6),
+    Activation.leaky_relu: lambda values: np.where(values < 0, values * values.dtype.type(LEAKY_SLOPE), values),
+    Activation.hard_sigmoid: _hard_sigmoid,
+    Activation.hard_swish: lambda values: values * _hard_sigmoid(values),
+}
+
+
+class Op(Protocol):
+    """What all operations have."""
+
+    @property
+    def name(self) -> str:
+        """Its name, of no other operation."""
+
+    @property
+    def inputs(self) -> tuple[str, ...]:
+        """The tensors it reads."""
+
+    @property
+    def output(self) -> str:
+        """The tensor it writes."""
+
+
+@runtime_checkable
+class HasWeight(Op, Protocol):
+    """A convolution, in float or in whole numbers."""
+
+    @property
+    def weight(self) -> np.ndarray:
+        """(O, I / groups, kh, kw)."""
+
+    @property
+    def groups(self) -> int:
+        """1, or the channels of a depthwise one."""
+
+
+Graph = tuple[Op, ...]
+
+
+@dataclass(frozen=True)
+class Window:
+    """How a window moves over the image: strides and dilations (rows, columns); pads top, left, bottom, right."""
+
+    strides: Pair = (1, 1)
+    pads: tuple[int, int, int, int] = (0, 0, 0, 0)
+    dilations: Pair = (1, 1)
+
+    def out_size(self, size: Pair, kernel: Pair) -> Pair:
+        """Rows and columns of what a window of `kernel` makes of an image of `size`."""
+        top, left, bottom, right = self.pads
+        padded = size[0] + top + bottom, size[1] + left + right
+        places = [
+            (side - (k - 1) * dilation - 1) // stride + 1
+            for side, k, dilation, stride in zip(padded, kernel, self.dilations, self.strides, strict=True)
+        ]
+        return places[0], places[1]
+
+
+def same(weight: np.ndarray) -> Window:
+    """Of stride 1, with the padding that keeps the size: for weights (O, I, kh, kw) of odd sides."""
+    rows, columns = weight.shape[2] // 2, weight.shape[3] // 2
+    return Window(pads=(rows, columns, rows, columns))
+
+
+def is_plain(op: Op) -> bool:
+    """Whether an operation is of the short list that ConvBEERS is made of.
+
+    A same-size convolution of stride 1, in float or whole numbers, with or without ReLU; or an add without one.
+    """
+    activation = getattr(op, "activation", None)
+    if not isinstance(op, HasWeight):
+        return isinstance(op, Add) and activation is Activation.none
+    dense = op.groups == 1 and not getattr(op, "transposed", False)
+    kept = activation in (Activation.none, Activation.relu)
+    return dense and kept and getattr(op, "window", None) == same(op.weight)
+
+
+class _OneInput:
+    """Operations that read one tensor, `input`."""
+
+    input: str
+
+    @property
+    def inputs(self) -> tuple[str, ...]:
+        """The tensors it reads."""
+        return (self.input,)
+
+
+@dataclass(frozen=True)
+class Conv(_OneInput):
+    """A convolution with zero padding and an activation; `groups` is 1, or as many as channels (depthwise).
+
+    Transposed, its weights stay (O, I, kh, kw), O the channels that it writes, and `window` is ONNX's: its strides
+    enlarge, its pads cut.
+    """
+
+    name: str
+    input: str
+    output: str
+    weight: np.ndarray  # (O, I / groups, kh, kw) float32
+    bias: np.ndarray  # (O,) float32
+    activation: Activation = Activation.none
+    window: Window = field(default_factory=Window)
+    groups: int = 1
+    transposed: bool = False
+
+
+@dataclass(frozen=True)
+class Add:
+    """An element-wise sum of two tensors."""
+
+    name: str
+    inputs: tuple[str, str]
+    output: str
+    activation: Activation = Activation.none
+
+
+@dataclass(frozen=True)
+class Mul:
+    """An element-wise product of two tensors of one size."""
+
+    name: str
+    inputs: tuple[str, str]
+    output: str
+
+
+@dataclass(frozen=True)
+class Concat:
+    """Tensors one behind the other along the channels; they share a scale."""
+
+    name: str
+    inputs: tuple[str, ...]
+    output: str
+
+
+@dataclass(frozen=True)
+class MaxPool(_OneInput):
+    """The largest value of each window; what is padded never is."""
+
+    name: str
+    input: str
+    output: str
+    kernel: Pair
+    window: Window = field(default_factory=Window)
+
+
+@dataclass(frozen=True)
+class AveragePool(_OneInput):
+    """The mean of each window, padding counted as zeros; `kernel` None is the whole image (global pooling)."""
+
+    name: str
+    input: str
+    output: str
+    kernel: Pair | None
+    window: Window = field(default_factory=Window)
+
+
+@dataclass(frozen=True)
+class Resize(_OneInput):
+    """Rows and columns `factor` times as many: nearest, or bilinear with half-pixel centres."""
+
+    name: str
+    input: str
+    output: str
+    factor: int
+    bilinear: bool = False
+
+
+@dataclass(frozen=True)
+class Shuffle(_OneInput):
+    """Pixel shuffle: blocks of block^2 channels become block x block pixels; or, `up` False, the other way round.
+
+    `columns_first` is torch's order of the channels (ONNX's CRD), without it ONNX's own (DCR, and SpaceToDepth).
+    """
+
+    name: str
+    input: str
+    output: str
+    block: int
+    up: bool = True
+    columns_first: bool = True
+
+    def __call__(self, values: np.ndarray) -> np.ndarray:
+        """The values (N, C, H, W), of any type, moved."""
+        count, channels, height, width = values.shape
+        r = self.block
+        if self.up:
+            inner = channels // r**2
+            parts = (inner, r, r) if self.columns_first else (r, r, inner)
+            blocks = values.reshape(count, *parts, height, width)
+            order = (0, 1, 4, 2, 5, 3) if self.columns_first else (0, 3, 4, 1, 5, 2)
+            return blocks.transpose(order).reshape(count, inner, height * r, width * r)
+        blocks = values.reshape(count, channels, height // r, r, width // r, r)
+        order = (0, 1, 3, 5, 2, 4) if self.columns_first else (0, 3, 5, 1, 2, 4)
+        return blocks.transpose(order).reshape(count, channels * r**2, height // r, width // r)
+
+
+@dataclass(frozen=True)
+class Pointwise(_OneInput):
+    """An activation by itself: a function of each value, which the integer core keeps as a table of 256."""
+
+    name: str
+    input: str
+    output: str
+    activation: Activation
+
+
+TYING = (Concat, MaxPool, AveragePool, Resize, Shuffle)
+
+
+def ties_scales(op: Op) -> bool:
+    """Whether all that an operation reads and writes has one scale, as the DPU wants of what hands values on."""
+    return isinstance(op, TYING)
+
+
+def united(links: Iterable[Iterable[str]]) -> dict[str, str]:
+    """For every name, the first of those that it is linked with, however indirectly."""
+    leader: dict[str, str] = {}
+
+    def find(name: str) -> str:
+        while leader.setdefault(name, name) != name:
+            name = leader[name]
+        return name
+
+    for link in links:
+        first, *others = dict.fromkeys(map(find, link))
+        leader.update(dict.fromkeys(others, first))
+    return {name: find(name) for name in leader}
+
+
+def tied(graph: Graph) -> dict[str, str]:
+    """For every tensor, the first of those that must share its scale: by concat, pooling, resizing, shuffling."""
+    alone = [(name,) for op in graph for name in (*op.inputs, op.output)]
+    return united([*alone, *((*op.inputs, op.output) for op in graph if ties_scales(op))])
+
+
+def tensors(graph: Graph) -> list[str]:
+    """The names of all results, in order."""
+    return [op.output for op in graph]
+
+
+def relu_count(graph: Graph) -> int:
+    """How many operations carry a ReLU: quantisers have been seen to drop them without a word."""
+    return sum(getattr(op, "activation", None) is Activation.relu for op in graph)

@@ -1,0 +1,72 @@
+"""How an image of 12 bits enters a network of int8: in planes, a coarse one and what it leaves.
+
+Each channel becomes a coarse plane, its remainder, and a third for finer weights: (N, C, H, W) to (N, 3 C, H, W), all
+coarse planes first. A network that reads the image by something other than a convolution gets the coarse ones alone.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+
+from model.io.images import MAX_DN
+from quant.graph.network import renamed
+from quant.graph.operations import IMAGE, Conv, Graph, Op
+
+PLANES = "planes"
+STEP = 32
+COARSE_MAX = 127
+QUARTER = 4
+COUNT = 3
+PLANES_FRAC_BITS = 7
+"""The planes' scale is 2^-7: coarse 127 stands for about 1, the full scale."""
+
+
+def split(image: np.ndarray, count: int = COUNT) -> np.ndarray:
+    """(N, C, H, W) float32 in [0, 1] to the planes (N, count C, H, W) int8."""
+    dn = np.clip(np.rint(image * np.float32(MAX_DN)), 0, MAX_DN)
+    coarse = np.minimum(np.rint(dn / STEP), COARSE_MAX)
+    remainder = dn - STEP * coarse
+    planes = [coarse, remainder, np.rint(remainder / QUARTER)]
+    return np.concatenate(planes[:count], axis=1).astype(np.int8)
+
+
+def plane_count(graph: Graph) -> int:
+    """Planes a channel: three where only convolutions read the image, else the coarse one."""
+    readers = [op for op in graph if IMAGE in op.inputs]
+    return COUNT if all(isinstance(op, Conv) and not op.transposed for op in readers) else 1
+
+
+def read_planes(graph: Graph, count: int | None = None) -> Graph:
+    """The same graph, its first convolutions reading the planes (as q * 2^-7) instead of the image."""
+    count = count or plane_count(graph)
+    return tuple(_reads_planes(op, count) if IMAGE in op.inputs else op for op in graph)
+
+
+def _reads_planes(op: Op, count: int) -> Op:
+    unit = np.float32(2.0**PLANES_FRAC_BITS / MAX_DN)
+    if not isinstance(op, Conv):
+        return renamed(op, {IMAGE: PLANES})
+    weight = dense(op).weight
+    planes = [weight * (STEP * unit), weight * unit, np.zeros_like(weight)]
+    return replace(op, input=PLANES, weight=np.concatenate(planes[:count], axis=1).astype(np.float32), groups=1)
+
+
+def dense(op: Conv) -> Conv:
+    """A depthwise convolution as one of a single group; any other as it is."""
+    if op.groups == 1:
+        return op
+    weight = np.zeros((len(op.weight), op.groups, *op.weight.shape[2:]), np.float32)
+    channels = np.arange(op.groups)
+    weight[channels, channels] = op.weight[:, 0]
+    return replace(op, weight=weight, groups=1)
+
+
+def coarse_plane_only(graph: Graph) -> Graph:
+    """A plane-reading graph that does not look at the remainder: 7 bits of the image, to show what the others buy."""
+    return tuple(_coarse_only(op) if isinstance(op, Conv) and op.input == PLANES else op for op in graph)
+
+
+def _coarse_only(op: Conv) -> Conv:
+    weight = op.weight.copy()
+    weight[:, op.weight.shape[1] // COUNT :] = 0
+    return replace(op, weight=weight)

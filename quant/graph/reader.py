@@ -1,0 +1,403 @@
+"""A float ONNX network as the short list of operations, and what stays on the host around it.
+
+A file from outside is looked at once, here; behind it nothing asks again.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from itertools import product
+from typing import Any
+
+import numpy as np
+import onnx
+from onnx import helper, numpy_helper
+from onnx.reference import ReferenceEvaluator
+
+from profiles.errors import ModelError
+from quant.graph.network import Network, channels_of, check_network, cut, refused_graph, renamed, sized
+from quant.graph.operations import (
+    CORRECTION,
+    IMAGE,
+    LEAKY_SLOPE,
+    Activation,
+    Add,
+    AveragePool,
+    Concat,
+    Conv,
+    Graph,
+    MaxPool,
+    Mul,
+    Op,
+    Pair,
+    Pointwise,
+    Resize,
+    Shuffle,
+    Window,
+    is_plain,
+)
+from quant.onnx_file import constants
+from quant.untrusted import contradictions
+
+
+def read_network(model: onnx.ModelProto) -> Network:
+    """The operations of a float network that has been simplified (`quant.reading`).
+
+    Raises:
+        ModelError: an operation that the DPU does not compute, named with its node.
+    """
+    with contradictions("float model"):
+        reader = _Reader(model)
+        network = cut(reader.sized_graph(), _channels_in(model), reader.flat)
+        check_network(network)
+    return network
+
+
+def correction_graph(model: onnx.ModelProto) -> Graph:
+    """The operations from `image` to `correction` of a network that restores one channel by a global add.
+
+    Raises:
+        ModelError: any other network.
+    """
+    network = read_network(model)
+    if network != Network(network.graph):
+        raise refused_graph("an image of one channel, and a global add of it at the end", "another network")
+    for op in network.graph:
+        if not (isinstance(op, Conv | Add) and is_plain(op)):
+            raise refused_graph("only same-size convolutions of stride 1, ReLU and adds", op.name)
+    return network.graph
+
+
+def refusal(model: onnx.ModelProto) -> str:
+    """Why a float network cannot be quantised, as a sentence; empty where it can."""
+    try:
+        read_network(model)
+    except ModelError as error:
+        return f"expected {error.expected}, got {error.got}"
+    return ""
+
+
+def _channels_in(model: onnx.ModelProto) -> int:
+    sizes = model.graph.input[0].type.tensor_type.shape.dim
+    if len(sizes) != 4:
+        raise refused_graph("an input of (N, C, H, W)", f"{len(sizes)} sizes")
+    return int(sizes[1].dim_value) or 1
+
+
+MOVES = ("Reshape", "Transpose", "Squeeze", "Unsqueeze")
+BLOCKS = 8
+"""The largest side of a pixel shuffle's blocks that is looked for."""
+
+
+@dataclass(frozen=True)
+class _Node:
+    """An ONNX node: what it reads and writes, and its attributes by name."""
+
+    proto: onnx.NodeProto
+    given: dict[str, Any]
+
+    @classmethod
+    def of(cls, proto: onnx.NodeProto) -> "_Node":
+        return cls(proto, {a.name: helper.get_attribute_value(a) for a in proto.attribute})
+
+    @property
+    def op_type(self) -> str:
+        return self.proto.op_type
+
+    @property
+    def name(self) -> str:
+        return self.proto.name or self.proto.output[0]
+
+    @property
+    def input(self) -> Sequence[str]:
+        return list(self.proto.input)
+
+    @property
+    def output(self) -> Sequence[str]:
+        return list(self.proto.output)
+
+
+class _Reader:
+    """Walks the nodes once; a tensor that is another's by a new name is known by the first."""
+
+    def __init__(self, model: onnx.ModelProto) -> None:
+        self.model, self.values = model, constants(model)
+        self.image = model.graph.input[0].name
+        self.ops: list[Op] = []
+        self.readers: dict[str, int] = {value.name: 1 for value in model.graph.output}
+        for node in model.graph.node:
+            for name in node.input:
+                self.readers[name] = self.readers.get(name, 0) + 1
+        self.flat = False
+        # Chains of moves by the tensor that they have come to; and which tensors another move goes on from.
+        self.chains: dict[str, list[_Node]] = {}
+        self.moving = {node.input[0]: True for node in model.graph.node if node.op_type in MOVES}
+
+    def graph(self) -> tuple[Op, ...]:
+        """The operations, from the network's own input to its own output."""
+        if len(self.model.graph.output) != 1:
+            got = ", ".join(value.name for value in self.model.graph.output)
+            raise refused_graph("one output", f"{len(self.model.graph.output)}: {got}", "export it with one of them")
+        for node in self.model.graph.node:
+            if node.op_type != "Constant":
+                self._read(node)
+        if not self.ops or self.ops[-1].output != self.model.graph.output[0].name:
+            raise refused_graph("an operation that writes the output", "none")
+        names = {self.image: IMAGE, self.ops[-1].output: CORRECTION}
+        return tuple(renamed(op, names) for op in self.ops)
+
+    def sized_graph(self) -> tuple[Op, ...]:
+        """As `graph`, the windows of global pooling known: a network that pools so has one size of image."""
+        graph = self.graph()
+        pools = [op for op in graph if isinstance(op, AveragePool) and op.kernel is None]
+        rows, columns = (side.dim_value for side in self.model.graph.input[0].type.tensor_type.shape.dim[2:])
+        if pools and not (rows and columns):
+            remedy = "export it with fixed height and width: what pools over the whole image has one size"
+            raise refused_graph("images of one size", f"any size, and global pooling at {pools[0].name}", remedy)
+        return sized(graph, (rows, columns)) if pools else graph
+
+    def _read(self, proto: onnx.NodeProto) -> None:
+        node = _Node.of(proto)
+        if node.op_type in ACTIVATIONS:
+            self._activation(node)
+            return
+        reader: Callable[[_Node], Op | None] | None = getattr(self, f"_{node.op_type.lower()}", None)
+        if reader is None:
+            remedy = "replace it by one that the DPU computes, or cut the network in front of it"
+            raise refused_graph("operations that a DPU computes", f"{node.op_type} {node.name}", remedy)
+        op = reader(node)
+        if op is not None:
+            self.ops.append(op)
+
+    def _require(self, sound: bool, node: _Node, expected: str, got: str) -> None:
+        if not sound:
+            raise refused_graph(expected, f"{got} at {node.op_type} {node.name}")
+
+    def _constant(self, node: _Node, place: int) -> np.ndarray | None:
+        return self.values.get(node.input[place]) if place < len(node.input) else None
+
+    def _weights(self, node: _Node) -> tuple[np.ndarray, np.ndarray | None]:
+        weight = self._constant(node, 1)
+        if weight is None:
+            raise refused_graph("weights that are constants", f"computed ones at {node.op_type} {node.name}")
+        return weight.astype(np.float32), self._constant(node, 2)
+
+    def _conv(self, node: _Node) -> Op:
+        weight, bias = self._weights(node)
+        self._require(weight.ndim == 4, node, "convolutions over rows and columns", f"weights of {weight.ndim} sizes")
+        groups = int(node.given.get("group", 1))
+        depthwise = groups == len(weight) and weight.shape[1] == 1
+        self._require(groups == 1 or depthwise, node, "one group, or one a channel (depthwise)", f"{groups} groups")
+        bias = np.zeros(len(weight)) if bias is None else bias
+        window = self._window(node, (weight.shape[2], weight.shape[3]))
+        return Conv(
+            node.name, node.input[0], node.output[0], weight, bias.astype(np.float32), window=window, groups=groups
+        )
+
+    def _convtranspose(self, node: _Node) -> Op:
+        weight, bias = self._weights(node)
+        plain = int(node.given.get("group", 1)) == 1 and not any(node.given.get("output_padding", [0]))
+        self._require(plain, node, "transposed convolutions of one group, without output padding", "another")
+        weight = np.ascontiguousarray(weight.swapaxes(0, 1))
+        bias = np.zeros(len(weight)) if bias is None else bias
+        window = self._window(node, (weight.shape[2], weight.shape[3]))
+        kind = {"window": window, "transposed": True}
+        return Conv(node.name, node.input[0], node.output[0], weight, bias.astype(np.float32), **kind)  # type: ignore[arg-type]
+
+    def _window(self, node: _Node, kernel: Pair) -> Window:
+        strides, dilations = _pair(node.given.get("strides", [1, 1])), _pair(node.given.get("dilations", [1, 1]))
+        auto = node.given.get("auto_pad", b"NOTSET").decode()
+        pads = node.given.get("pads", [0, 0, 0, 0])
+        if auto.startswith("SAME"):
+            self._require(strides == (1, 1), node, "stated pads", f"auto_pad {auto} with strides")
+            extents = [(k - 1) * d for k, d in zip(kernel, dilations, strict=True)]
+            less, more = [e // 2 for e in extents], [e - e // 2 for e in extents]
+            pads = [*less, *more] if auto == "SAME_UPPER" else [*more, *less]
+        return Window(strides, (int(pads[0]), int(pads[1]), int(pads[2]), int(pads[3])), dilations)
+
+    def _flatten(self, node: _Node) -> None:
+        """At the end, where what is flat is (N, K): inside it stays (N, K, 1, 1)."""
+        ends = node.output[0] == self.model.graph.output[0].name and bool(self.ops)
+        self._require(ends and self.ops[-1].output == node.input[0], node, "Flatten at the end alone", "another")
+        self.ops[-1] = renamed(self.ops[-1], {node.input[0]: node.output[0]})
+        self.flat = True
+
+    def _add(self, node: _Node) -> Op:
+        return self._by_constant(node) or Add(node.name, (node.input[0], node.input[1]), node.output[0])
+
+    def _mul(self, node: _Node) -> Op:
+        return self._by_constant(node) or Mul(node.name, (node.input[0], node.input[1]), node.output[0])
+
+    def _sub(self, node: _Node) -> Op:
+        """What a convolution wrote taken off something: added, its weights negated."""
+        if (by := self._by_constant(node)) is not None:
+            return by
+        writer = next((k for k, op in enumerate(self.ops) if op.output == node.input[1]), None)
+        before = self.ops[writer] if writer is not None else None
+        linear = (
+            isinstance(before, Conv) and before.activation is Activation.none and self.readers[node.input[1]] == 1
+        )
+        self._require(linear, node, "a difference whose second tensor a convolution writes, for it alone", "another")
+        assert isinstance(before, Conv)  # noqa: S101
+        assert writer is not None  # noqa: S101
+        self.ops[writer] = replace(before, weight=-before.weight, bias=-before.bias)
+        return Add(node.name, (node.input[0], node.input[1]), node.output[0])
+
+    def _by_constant(self, node: _Node) -> Op | None:
+        """A sum, difference or product with one number a channel: a depthwise convolution of one pixel."""
+        found = [k for k in (0, 1) if self._constant(node, k) is not None]
+        if not found:
+            return None
+        value = np.atleast_1d(np.squeeze(self.values[node.input[found[0]]])).astype(np.float32)
+        self._require(value.ndim == 1 and found != [0, 1], node, "a constant of one number a channel", "another")
+        self._require(node.op_type != "Sub" or found == [1], node, "a constant that is taken off", "another")
+        channels = self._width(node.input[1 - found[0]])
+        value = np.broadcast_to(value, (channels,))
+        one, none = np.ones(channels, np.float32), np.zeros(channels, np.float32)
+        factor, offset = {"Add": (one, value), "Sub": (one, -value), "Mul": (value, none)}[node.op_type]
+        weight = factor[:, None, None, None]
+        return Conv(
+            node.name, node.input[1 - found[0]], node.output[0], weight, offset.astype(np.float32), groups=channels
+        )
+
+    def _width(self, name: str) -> int:
+        return channels_of(tuple(self.ops), {self.image: _channels_in(self.model)})[name]
+
+    def _batchnormalization(self, node: _Node) -> Op:
+        scale, shift, mean, variance = (self.values[node.input[k]].astype(np.float64) for k in (1, 2, 3, 4))
+        factor = scale / np.sqrt(variance + node.given.get("epsilon", 1e-5))
+        weight, bias = factor.astype(np.float32)[:, None, None, None], (shift - mean * factor).astype(np.float32)
+        return Conv(node.name, node.input[0], node.output[0], weight, bias, groups=len(weight))
+
+    def _concat(self, node: _Node) -> Op:
+        self._require(
+            node.given.get("axis") in (1, -3), node, "concat along the channels", f"axis {node.given.get('axis')}"
+        )
+        self._require(not any(i in self.values for i in node.input), node, "computed tensors", "a constant")
+        return Concat(node.name, tuple(node.input), node.output[0])
+
+    def _maxpool(self, node: _Node) -> Op:
+        kernel = _pair(node.given["kernel_shape"])
+        plain = len(node.output) == 1 and not node.given.get("ceil_mode", 0)
+        self._require(plain, node, "max pooling without indices or ceil_mode", "another")
+        return MaxPool(node.name, node.input[0], node.output[0], kernel, self._window(node, kernel))
+
+    def _averagepool(self, node: _Node) -> Op:
+        kernel = _pair(node.given["kernel_shape"])
+        window = self._window(node, kernel)
+        zeros = bool(node.given.get("count_include_pad", 0)) or not any(window.pads)
+        self._require(
+            zeros and not node.given.get("ceil_mode", 0), node, "average pooling that counts padding", "another"
+        )
+        return AveragePool(node.name, node.input[0], node.output[0], kernel, window)
+
+    def _globalaveragepool(self, node: _Node) -> Op:
+        return AveragePool(node.name, node.input[0], node.output[0], None)
+
+    def _resize(self, node: _Node) -> Op:
+        scales = self._constant(node, 2)
+        sound = scales is not None and scales.size == 4 and (scales[:2] == 1).all() and scales[2] == scales[3]
+        self._require(bool(sound), node, "a resize by a constant factor of rows and columns", "another")
+        assert scales is not None  # noqa: S101
+        factor, mode = float(scales[2]), node.given.get("mode", b"nearest").decode()
+        self._require(factor == int(factor) >= 1, node, "a whole factor", f"{factor:g}")
+        where = node.given.get("coordinate_transformation_mode", b"half_pixel").decode()
+        if mode == "linear":
+            half = where in ("half_pixel", "pytorch_half_pixel") and factor in (2, 4)
+            self._require(half, node, "bilinear by 2 or 4 with half-pixel centres", f"{where} by {factor:g}")
+        else:
+            self._require(mode == "nearest" and where != "align_corners", node, "nearest or bilinear", mode)
+        return Resize(node.name, node.input[0], node.output[0], int(factor), mode == "linear")
+
+    def _upsample(self, node: _Node) -> Op:
+        raise refused_graph(
+            "Resize, which opset 10 brought", f"Upsample {node.name}", "export it with opset 11 or later"
+        )
+
+    def _depthtospace(self, node: _Node) -> Op:
+        columns_first = node.given.get("mode", b"DCR") == b"CRD"
+        return Shuffle(node.name, node.input[0], node.output[0], int(node.given["blocksize"]), True, columns_first)
+
+    def _spacetodepth(self, node: _Node) -> Op:
+        return Shuffle(node.name, node.input[0], node.output[0], int(node.given["blocksize"]), False, False)
+
+    def _move(self, node: _Node) -> Op | None:
+        """Reshape and Transpose as exporters spell pixel shuffles: followed to the last of them, then tried out."""
+        chain = [*self.chains.pop(node.input[0], []), node]
+        if self.moving.get(node.output[0]):
+            self._require(
+                self.readers[node.output[0]] == 1, node, "a pixel shuffle that is read at its end", "another"
+            )
+            self.chains[node.output[0]] = chain
+            return None
+        return self._shuffle(chain, node.name)
+
+    def _shuffle(self, chain: list[_Node], name: str) -> Op:
+        """What a chain of moves does to numbered pixels: one of the shuffles, or nothing that is known."""
+        source, output = chain[0].input[0], chain[-1].output[0]
+        channels = self._width(source)
+        for block, up, columns_first in product(range(2, BLOCKS + 1), (True, False), (True, False)):
+            shuffle = Shuffle(name, source, output, block, up, columns_first)
+            if (channels % block**2 == 0 or not up) and self._does(chain, shuffle, channels):
+                return shuffle
+        raise refused_graph(
+            "Reshape and Transpose that spell a pixel shuffle", f"another at {chain[0].op_type} {chain[0].name}"
+        )
+
+    def _does(self, chain: list[_Node], shuffle: Shuffle, channels: int) -> bool:
+        sizes = 2, channels, 2 * shuffle.block, 3 * shuffle.block
+        numbered = np.arange(np.prod(sizes), dtype=np.float32).reshape(sizes)
+        feeds = {name: self.values[name] for node in chain for name in node.input if name in self.values}
+        ends = [
+            helper.make_tensor_value_info(n, onnx.TensorProto.FLOAT, None) for n in (shuffle.input, shuffle.output)
+        ]
+        constant = [numpy_helper.from_array(value, name) for name, value in feeds.items()]
+        graph = helper.make_graph([node.proto for node in chain], "moves", ends[:1], ends[1:], constant)
+        model = helper.make_model(graph, opset_imports=self.model.opset_import)
+        try:
+            (moved,) = ReferenceEvaluator(model).run(None, {shuffle.input: numbered})
+        except ValueError:  # sizes that do not fit this block
+            return False
+        return bool(np.array_equal(moved, shuffle(numbered)))
+
+    _reshape = _transpose = _squeeze = _unsqueeze = _move
+
+    def _activation(self, node: _Node) -> None:
+        activation = self._which(node)
+        writer = next((k for k, op in enumerate(self.ops) if op.output == node.input[0]), None)
+        before = self.ops[writer] if writer is not None else None
+        fusible = isinstance(before, Conv) or (isinstance(before, Add) and activation is Activation.relu)
+        free = getattr(before, "activation", None) is Activation.none and self.readers[node.input[0]] == 1
+        if activation.fused and fusible and free and writer is not None:
+            assert isinstance(before, Conv | Add)  # noqa: S101
+            self.ops[writer] = replace(before, output=node.output[0], activation=activation)
+        else:
+            self.ops.append(Pointwise(node.name, node.input[0], node.output[0], activation))
+
+    def _which(self, node: _Node) -> Activation:
+        activation = ACTIVATIONS[node.op_type]
+        if node.op_type == "LeakyRelu":
+            slope = float(node.given.get("alpha", 0.01))
+            self._require(slope == np.float32(LEAKY_SLOPE), node, "a slope of 26/256 (0.1015625)", f"{slope:g}")
+        if node.op_type == "Clip":
+            low, high = (self._constant(node, k) for k in (1, 2))
+            six = low is not None and high is not None and float(low) == 0 and float(high) == 6
+            self._require(six, node, "a clip from 0 to 6 (ReLU6)", "another")
+        if node.op_type == "HardSigmoid":
+            plain = np.isclose(node.given.get("alpha", 0.2), 1 / 6, 1e-4) and node.given.get("beta", 0.5) == 0.5
+            self._require(bool(plain), node, "HardSigmoid with alpha 1/6", f"{node.given.get('alpha', 0.2):g}")
+        return activation
+
+
+ACTIVATIONS = {
+    "Relu": Activation.relu,
+    "Clip": Activation.relu6,
+    "LeakyRelu": Activation.leaky_relu,
+    "HardSigmoid": Activation.hard_sigmoid,
+    "HardSwish": Activation.hard_swish,
+}
+
+
+def _pair(values: list[int]) -> Pair:
+    if len(values) != 2:
+        raise refused_graph("windows over rows and columns", f"one over {len(values)} sizes")
+    return int(values[0]), int(values[1])

@@ -1,0 +1,140 @@
+"""The operations as float ONNX: what calibration looks at, and what a board's file holds between its roundings."""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+import onnx
+from onnx import TensorProto, helper
+
+from quant.graph.operations import (
+    LEAKY_SLOPE,
+    Activation,
+    Add,
+    AveragePool,
+    Concat,
+    Conv,
+    Graph,
+    MaxPool,
+    Mul,
+    Op,
+    Pointwise,
+    Resize,
+    Shuffle,
+    Window,
+)
+from quant.graph.planes import PLANES
+from quant.onnx_file import GraphWriter, image_info, make_model
+
+
+def graph_to_onnx(graph: Graph, outputs: list[str], channels: int = 3) -> onnx.ModelProto:
+    """The graph from `planes` (N, channels, H, W) float32 to the named tensors."""
+    writer = GraphWriter()
+    for op in graph:
+        feeds = list(op.inputs)
+        if isinstance(op, Conv):
+            feeds += [
+                writer.constant(f"{op.name}.weight", onnx_weight(op.weight, op.transposed)),
+                writer.constant(f"{op.name}.bias", op.bias),
+            ]
+        write_float(writer, op, feeds, op.output)
+    results = [helper.make_tensor_value_info(n, TensorProto.FLOAT, ["N", "C", None, None]) for n in outputs]
+    return make_model(writer.graph("core", [image_info(PLANES, channels, None)], results), {})
+
+
+def onnx_weight(weight: np.ndarray, transposed: bool) -> np.ndarray:
+    """Weights (O, I, kh, kw) as ONNX wants them: (I, O, kh, kw) of a transposed convolution."""
+    return np.ascontiguousarray(weight.swapaxes(0, 1)) if transposed else weight
+
+
+def write_float(w: GraphWriter, op: Op, feeds: Sequence[str], output: str) -> None:
+    """Write an operation as ONNX's own operators.
+
+    Args:
+        w: gets the nodes.
+        op: the operation.
+        feeds: the names of what it reads; of a convolution with those of its weights and bias.
+        output: the name of its result.
+    """
+    activation = Activation.none if isinstance(op, Pointwise) else getattr(op, "activation", Activation.none)
+    result = output if activation is Activation.none else f"{op.output}.linear"
+    _WRITERS[type(op)](w, op, list(feeds), result)
+    if activation is not Activation.none:
+        _activation(w, activation, result, output, f"{op.name}.{activation.name}")
+
+
+def _conv(w: GraphWriter, op: Conv, feeds: list[str], output: str) -> None:
+    window = {"kernel_shape": list(op.weight.shape[2:]), **window_attributes(op.window, op.groups)}
+    if op.transposed:
+        w.node("ConvTranspose", output, feeds, op.name, **window)
+    else:
+        w.node("Conv", output, feeds, op.name, **window)
+
+
+def window_attributes(window: Window, groups: int = 1) -> dict[str, Any]:
+    """The attributes that differ from ONNX's defaults, and the pads."""
+    found: dict[str, Any] = {"pads": list(window.pads)}
+    if window.strides != (1, 1):
+        found["strides"] = list(window.strides)
+    if window.dilations != (1, 1):
+        found["dilations"] = list(window.dilations)
+    if groups != 1:
+        found["group"] = groups
+    return found
+
+
+def _activation(w: GraphWriter, activation: Activation, source: str, output: str, name: str) -> None:
+    if activation is Activation.relu6:
+        limits = [w.constant(f"limit_{value}", np.array(value, np.float32)) for value in (0, 6)]
+        w.node("Clip", output, [source, *limits], name)
+    elif activation is Activation.leaky_relu:
+        w.node("LeakyRelu", output, [source], name, alpha=LEAKY_SLOPE)
+    elif activation is Activation.hard_sigmoid:
+        w.node("HardSigmoid", output, [source], name, alpha=1 / 6, beta=0.5)
+    else:
+        w.node(activation.value, output, [source], name)
+
+
+def _pool(w: GraphWriter, op: MaxPool | AveragePool, feeds: list[str], output: str) -> None:
+    if op.kernel is None:
+        w.node("GlobalAveragePool", output, feeds, op.name)
+        return
+    kernel = {"kernel_shape": list(op.kernel), **window_attributes(op.window)}
+    if isinstance(op, MaxPool):
+        w.node("MaxPool", output, feeds, op.name, **kernel)
+    else:
+        w.node("AveragePool", output, feeds, op.name, count_include_pad=1, **kernel)
+
+
+def _resize(w: GraphWriter, op: Resize, feeds: list[str], output: str) -> None:
+    scales = w.constant(f"resize_by_{op.factor}", np.array([1, 1, op.factor, op.factor], np.float32))
+    how = {"mode": "linear", "coordinate_transformation_mode": "half_pixel"}
+    nearest = {"mode": "nearest", "coordinate_transformation_mode": "asymmetric", "nearest_mode": "floor"}
+    w.node("Resize", output, [feeds[0], "", scales], op.name, **(how if op.bilinear else nearest))
+
+
+def write_shuffle(w: GraphWriter, op: Shuffle, source: str, output: str, channels: int = 1) -> None:
+    """Write a pixel shuffle, or its inverse, of a tensor of any type with so many channels."""
+    if op.up:
+        mode = "CRD" if op.columns_first else "DCR"
+        w.node("DepthToSpace", output, [source], op.name, blocksize=op.block, mode=mode)
+    elif not op.columns_first or channels == 1:
+        w.node("SpaceToDepth", output, [source], op.name, blocksize=op.block)
+    else:  # ONNX has its own order only, blocks before channels
+        taps = op.block**2
+        order = w.constant(f"{op.name}.order", np.arange(taps * channels).reshape(taps, channels).T.ravel())
+        moved = w.node("SpaceToDepth", f"{output}.blocks", [source], op.name, blocksize=op.block)
+        w.node("Gather", output, [moved, order], f"{op.name}.channels", axis=1)
+
+
+_WRITERS: dict[type, Callable[..., None]] = {
+    Conv: _conv,
+    Add: lambda w, op, feeds, output: w.node("Add", output, feeds, op.name),
+    Mul: lambda w, op, feeds, output: w.node("Mul", output, feeds, op.name),
+    Concat: lambda w, op, feeds, output: w.node("Concat", output, feeds, op.name, axis=1),
+    MaxPool: _pool,
+    AveragePool: _pool,
+    Resize: _resize,
+    Shuffle: lambda w, op, feeds, output: write_shuffle(w, op, feeds[0], output),
+    Pointwise: lambda w, op, feeds, output: _activation(w, op.activation, feeds[0], output, op.name),
+}

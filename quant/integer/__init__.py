@@ -1,0 +1,24 @@
+"""The DPU's arithmetic in whole numbers: the reference that every file is held to.
+
+- `reference`: a core run on planes, layer by layer, and how far onnxruntime agrees;
+- `arithmetic`: exact convolutions, maxima and means; `fixed_point`: the DPU's constants.
+"""
+
+from quant.integer.reference import (
+    INT32_BITS,
+    SOUND,
+    Agreement,
+    Faults,
+    LayerAgreement,
+    LayerReport,
+    agreement,
+    correction,
+    integer_rows,
+    merged_correction,
+    run_core,
+)
+
+__all__ = [
+    "INT32_BITS", "SOUND", "Agreement", "Faults", "LayerAgreement", "LayerReport", "agreement", "correction",
+    "integer_rows", "merged_correction", "run_core",
+]  # fmt: skip

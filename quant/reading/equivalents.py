@@ -1,0 +1,279 @@
+"""Nodes rewritten as the equal ones that a DPU and a quantiser know, in place: what no runtime's optimisation does.
+
+Every rewriting is exact but for the rounding of float32, borders included. `quant.reading.folding` calls it, and says
+what holds behind it.
+"""
+
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+import onnx
+from onnx import NodeProto, TensorProto, helper
+
+from quant.reading.flat import Unflatten
+from quant.reading.nodes import Nodes, Shapes, attributes_of, shapes_of
+
+ARITHMETIC = {"Add", "Div", "Mul", "Sub"}
+NORMALISATION = "BatchNormalization"
+SHAPED = {"Cast", "Gemm", "ReduceMean"}
+"""What may be rewritten where shapes are known."""
+
+
+@dataclass(frozen=True)
+class Affine:
+    """scale * x + shift, each (C,) float64, or (1,) for all channels."""
+
+    scale: np.ndarray
+    shift: np.ndarray
+
+    @property
+    def channels(self) -> int:
+        """How many numbers it has."""
+        return max(len(self.scale), len(self.shift))
+
+    def after(self, first: "Affine") -> "Affine":
+        """Both in one."""
+        return Affine(self.scale * first.scale, self.scale * first.shift + self.shift)
+
+
+def rewrite(model: onnx.ModelProto) -> None:
+    """Rewrite a float network's nodes; its inputs and outputs keep their names."""
+    graph = Nodes(model.graph)
+    for step in (_sum, _difference, _behind, _hard_swish):
+        graph.pass_over(step)
+    graph.write()
+    if any(node.op_type in SHAPED or _affine(graph, node) for node in graph.nodes):
+        shapes = shapes_of(model)
+        _in_front(graph, shapes)
+        for shaped in (_cast, _mean, _depthwise):
+            graph.pass_over(partial(shaped, shapes))
+        graph.pass_over(Unflatten(shapes))
+        graph.write()
+
+
+def _sum(_: Nodes, node: NodeProto) -> list[NodeProto] | None:
+    """A Sum of several as Adds, one after the other."""
+    if node.op_type != "Sum" or len(node.input) < 2:
+        return None
+    last, adds = node.input[0], []
+    for number, name in enumerate(node.input[1:], 1):
+        whole = number == len(node.input) - 1
+        output = node.output[0] if whole else f"{node.output[0]}.{number}"
+        adds.append(helper.make_node("Add", [last, name], [output], name=output if not whole else node.name))
+        last = output
+    return adds
+
+
+def _difference(graph: Nodes, node: NodeProto) -> list[NodeProto] | None:
+    """What is subtracted is negated in the convolution that computes it, and added."""
+    if node.op_type != "Sub":
+        return None
+    before = graph.sole_writer(node.input[1])
+    if before is None or not graph.is_linear(before) or node.input[0] in graph.constants:
+        return None
+    _scale_results(graph, before, Affine(np.full(1, -1.0), np.zeros(1)))
+    return [helper.make_node("Add", node.input, node.output, name=node.name)]
+
+
+def _behind(graph: Nodes, node: NodeProto) -> list[NodeProto] | None:
+    """What works on each channel by itself, folded into the convolution or normalisation that it follows."""
+    found = _affine(graph, node)
+    before = graph.sole_writer(found[0]) if found else None
+    if found is None or before is None:
+        return None
+    affine = found[1]
+    if graph.is_linear(before):
+        if affine.channels not in (1, graph.width(before)):
+            return None
+        _scale_results(graph, before, affine)
+    else:
+        first = _affine(graph, before) if NORMALISATION in (before.op_type, node.op_type) else None
+        if first is None or min(affine.channels, first[1].channels) not in (1, affine.channels):
+            return None
+        _set_normalisation(graph, before, first[0], affine.after(first[1]))
+    _rename(graph, found[0], node.output[0])
+    return []
+
+
+def _rename(graph: Nodes, result: str, name: str) -> None:
+    """Let a result have the name of the one that it takes the place of."""
+    writer = graph.writers[name] = graph.writers[result]
+    writer.output[list(writer.output).index(result)] = name
+
+
+def _set_normalisation(graph: Nodes, node: NodeProto, source: str, affine: Affine) -> None:
+    """Make a node the normalisation of mean 0 and variance 1 that computes this."""
+    scale, shift = np.broadcast_arrays(affine.scale, affine.shift)
+    values = (scale, shift, np.zeros(scale.shape), np.ones(scale.shape))
+    names = ("scale", "shift", "mean", "variance")
+    inputs = [graph.keep(f"{node.output[0]}.{name}", value) for name, value in zip(names, values, strict=True)]
+    made = helper.make_node(NORMALISATION, [source, *inputs], node.output, name=node.name, epsilon=0.0)
+    node.CopyFrom(made)
+
+
+def _affine(graph: Nodes, node: NodeProto) -> tuple[str, Affine] | None:
+    """The tensor that a node works on and what it does to each channel, None where it does something else."""
+    if node.op_type == NORMALISATION:
+        return _normalisation(graph, node)
+    if node.op_type not in ARITHMETIC:
+        return None
+    for place in (0, 1):
+        value = _per_channel(graph.value(node.input[1 - place]))
+        if value is not None and node.input[place] not in graph.constants:
+            found = _arithmetic(node.op_type, value, place)
+            return None if found is None else (node.input[place], found)
+    return None
+
+
+def _arithmetic(kind: str, value: np.ndarray, place: int) -> Affine | None:
+    """What one constant a channel does to the operand at this place."""
+    one, zero = np.ones_like(value), np.zeros_like(value)
+    if kind == "Add":
+        return Affine(one, value)
+    if kind == "Mul":
+        return Affine(value, zero)
+    if kind == "Sub":
+        return Affine(one, -value) if place == 0 else Affine(-one, value)
+    return Affine(1 / value, zero) if place == 0 and value.all() else None
+
+
+def _normalisation(graph: Nodes, node: NodeProto) -> tuple[str, Affine] | None:
+    values = [graph.value(name) for name in node.input[1:5]]
+    given = attributes_of(node)
+    if given.get("training_mode", 0) or len(node.output) > 1 or any(value is None for value in values):
+        return None
+    gain, offset, mean, variance = values
+    scale = gain / np.sqrt(variance + given.get("epsilon", 1e-5))
+    return node.input[0], Affine(scale, offset - mean * scale)
+
+
+def _per_channel(value: np.ndarray | None) -> np.ndarray | None:
+    """(C,) or (1,) of a constant that is one number a channel of (N, C, H, W), None of any other."""
+    if value is None or value.ndim > 4:
+        return None
+    shape = (1,) * (4 - value.ndim) + value.shape
+    return value.reshape(-1) if shape[0] == shape[2] == shape[3] == 1 else None
+
+
+def _scale_results(graph: Nodes, node: NodeProto, affine: Affine) -> None:
+    """Fold into a convolution what is done to its results; its weights may serve others too."""
+    weight, bias = _numbers(graph, node)
+    groups = attributes_of(node).get("group", 1)
+    scale = np.broadcast_to(affine.scale, bias.shape)
+    if node.op_type == "Conv":
+        weight = weight * scale.reshape(-1, 1, 1, 1)
+    else:
+        split = weight.reshape(groups, -1, *weight.shape[1:]) * scale.reshape(groups, 1, -1, 1, 1)
+        weight = split.reshape(weight.shape)
+    _set_numbers(graph, node, weight, bias * scale + affine.shift)
+
+
+def _numbers(graph: Nodes, node: NodeProto) -> tuple[np.ndarray, np.ndarray]:
+    """Weights and bias (O,) of a convolution."""
+    weight = graph.value(node.input[1])
+    bias = graph.value(node.input[2]) if len(node.input) > 2 and node.input[2] else np.zeros(graph.width(node))
+    if weight is None or bias is None:  # `is_linear` has seen to it
+        raise ValueError(f"{node.name} without weights")
+    return weight, bias
+
+
+def _set_numbers(graph: Nodes, node: NodeProto, weight: np.ndarray, bias: np.ndarray) -> None:
+    name = node.name or node.output[0]
+    inputs = [node.input[0], graph.keep(f"{name}.weight", weight), graph.keep(f"{name}.bias", bias)]
+    del node.input[:]
+    node.input.extend(inputs)
+
+
+def _hard_swish(graph: Nodes, node: NodeProto) -> list[NodeProto] | None:
+    """A tensor times its own HardSigmoid, as the runtime and older exporters spell it."""
+    if node.op_type != "Mul":
+        return None
+    for source, gate in (node.input, reversed(node.input)):
+        before = graph.writers.get(gate)
+        if before is None or before.op_type != "HardSigmoid" or before.input[0] != source:
+            continue
+        given = attributes_of(before)
+        if np.allclose((given.get("alpha", 0.2), given.get("beta", 0.5)), (1 / 6, 0.5), atol=1e-6):
+            return [helper.make_node("HardSwish", [source], node.output, name=node.name)]
+    return None
+
+
+def _cast(shapes: Shapes, graph: Nodes, node: NodeProto) -> list[NodeProto] | None:
+    """What is float32 already; the runtime leaves such a cast where it writes a result."""
+    before = graph.sole_writer(node.input[0]) if node.op_type == "Cast" and node.input[0] in shapes else None
+    if before is None or attributes_of(node)["to"] != TensorProto.FLOAT:
+        return None
+    _rename(graph, node.input[0], node.output[0])
+    return []
+
+
+def _mean(shapes: Shapes, _: Nodes, node: NodeProto) -> list[NodeProto] | None:
+    """A mean over height and width."""
+    given = attributes_of(node)
+    axes, image = {axis % 4 for axis in given.get("axes", [])}, len(shapes.get(node.input[0], ())) == 4
+    if node.op_type != "ReduceMean" or not image or axes != {2, 3}:
+        return None
+    pooled = node.output[0] if given.get("keepdims", 1) else f"{node.output[0]}.pooled"
+    pool = helper.make_node("GlobalAveragePool", node.input, [pooled], name=node.name)
+    if pooled == node.output[0]:
+        return [pool]
+    return [pool, helper.make_node("Flatten", [pooled], node.output, name=f"{node.output[0]}.flat")]
+
+
+def _in_front(graph: Nodes, shapes: Shapes) -> None:
+    """What works on each channel by itself, folded into all the convolutions that read it, where that is exact."""
+    for node in graph.nodes[::-1]:
+        found = _affine(graph, node)
+        readers = [reader for reader in graph.nodes if node.output[0] in reader.input]
+        if found is None or not readers or node.output[0] in graph.ends or not _keeps_channels(*found, shapes):
+            continue
+        if all(_may_scale_inputs(graph, reader, node.output[0], found[1]) for reader in readers):
+            for reader in readers:
+                _scale_inputs(graph, reader, found[1])
+                reader.input[0] = found[0]
+            graph.nodes = [other for other in graph.nodes if other is not node]
+
+
+def _keeps_channels(source: str, affine: Affine, shapes: Shapes) -> bool:
+    """Whether each constant meets a channel of its own: one channel times many constants would be many."""
+    return affine.channels == 1 or (len(shapes.get(source, ())) == 4 and shapes[source][1] == affine.channels)
+
+
+def _may_scale_inputs(graph: Nodes, node: NodeProto, name: str, affine: Affine) -> bool:
+    """Zeros that a convolution pads with are not shifted: a shift passes one without padding alone."""
+    given = attributes_of(node)
+    unpadded = node.op_type == "Conv" and given.get("auto_pad", b"NOTSET") in (b"NOTSET", b"VALID")
+    unpadded = unpadded and not any(given.get("pads", []))
+    return graph.is_linear(node) and list(node.input).count(name) == 1 and (unpadded or not affine.shift.any())
+
+
+def _scale_inputs(graph: Nodes, node: NodeProto, affine: Affine) -> None:
+    weight, bias = _numbers(graph, node)
+    groups = attributes_of(node).get("group", 1)
+    if node.op_type == "ConvTranspose":
+        _set_numbers(graph, node, weight * affine.scale.reshape(-1, 1, 1, 1), bias)
+        return
+    split = weight.reshape(groups, -1, *weight.shape[1:])  # (G, O / G, I / G, kh, kw)
+    scale, shift = (
+        np.broadcast_to(v, groups * weight.shape[1]).reshape(groups, 1, -1, 1, 1)
+        for v in (affine.scale, affine.shift)
+    )
+    moved = (split * shift).sum(axis=(2, 3, 4)).reshape(-1)
+    _set_numbers(graph, node, (split * scale).reshape(weight.shape), bias + moved)
+
+
+def _depthwise(shapes: Shapes, graph: Nodes, node: NodeProto) -> list[NodeProto] | None:
+    """A normalisation of images that no convolution took in: a depthwise one of a single pixel."""
+    found = _affine(graph, node) if node.op_type == NORMALISATION else None
+    if found is None or len(shapes.get(node.input[0], ())) != 4:
+        return None
+    source, affine = found
+    name = node.name or node.output[0]
+    numbers = (
+        graph.keep(f"{name}.weight", affine.scale.reshape(-1, 1, 1, 1)),
+        graph.keep(f"{name}.bias", affine.shift),
+    )
+    made = helper.make_node("Conv", [source, *numbers], node.output, name=name, kernel_shape=[1, 1])
+    made.attribute.append(helper.make_attribute("group", affine.channels))
+    return [made]

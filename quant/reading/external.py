@@ -1,0 +1,75 @@
+"""Weights that a model keeps in a file beside it, taken in: from the model's own folder, or not at all.
+
+Exporters write one for large networks, torch's newer one for all. Only initializers are taken in; whatever else says
+that it lies elsewhere is refused by `quant.untrusted.check_content`, which looks at all of it afterwards.
+"""
+
+import math
+from pathlib import Path, PurePosixPath
+
+import onnx
+from onnx import TensorProto
+
+from profiles.errors import ModelError
+from profiles.toml import unreadable
+from quant.untrusted import FIELDS, FILE_BYTES, check_size, refused
+
+
+def take_in(model: onnx.ModelProto, path: Path) -> None:
+    """Put the weights that a model of this file keeps beside it into the model.
+
+    Raises:
+        ModelError: they lie outside its folder, are missing, are more than 1 GiB in all, or are not as many as the
+            model states.
+    """
+    taken = 0
+    for tensor in model.graph.initializer:
+        if tensor.data_location == TensorProto.EXTERNAL:
+            content = _content(tensor, path, FILE_BYTES - taken)
+            taken += len(content)
+            tensor.ClearField("external_data")
+            tensor.ClearField("data_location")
+            tensor.raw_data = content
+
+
+def _content(tensor: TensorProto, path: Path, limit_bytes: int) -> bytes:
+    """The bytes of one tensor, as many as its sizes ask for."""
+    said = {entry.key: entry.value for entry in tensor.external_data}
+    where = str(path)
+    check_size(tensor.name, tensor.dims, where)
+    if tensor.data_type not in FIELDS or min(tensor.dims, default=0) < 0:
+        raise _refused(tensor, where, "a tensor of plain numbers")
+    size = math.prod(tensor.dims) * FIELDS[tensor.data_type][0]
+    if size > limit_bytes:
+        raise _refused(tensor, where, f"more than {FILE_BYTES} bytes in all")
+    start, length = (_whole(said.get(key, default)) for key, default in (("offset", "0"), ("length", str(size))))
+    beside = _beside(tensor, said.get("location", ""), path)
+    if start is None or length != size or start + size > beside.stat().st_size:
+        raise _refused(tensor, where, f"not the {size} bytes of its weights in {beside.name!r}")
+    with beside.open("rb") as stream:
+        stream.seek(start)
+        return stream.read(size)
+
+
+def _whole(text: str) -> int | None:
+    """A number of bytes."""
+    return int(text) if text.isascii() and text.isdigit() and len(text) < 19 else None
+
+
+def _beside(tensor: TensorProto, location: str, path: Path) -> Path:
+    """The regular file in the model's folder, or one within it, that is meant; no link leads there."""
+    parts = PurePosixPath(location.replace("\\", "/")).parts
+    where = str(path)
+    if not parts or location.startswith(("/", "\\")) or ".." in parts or ":" in location or "\0" in location:
+        raise _refused(tensor, where, f"one in {location!r}, outside the model's folder")
+    places = [path.parent.joinpath(*parts[: number + 1]) for number in range(len(parts))]
+    if any(place.is_symlink() for place in places):
+        raise _refused(tensor, where, f"a link, {location!r}")
+    if reason := unreadable(places[-1]):
+        raise _refused(tensor, where, f"{location!r}: {reason}")
+    return places[-1]
+
+
+def _refused(tensor: TensorProto, where: str, got: str) -> ModelError:
+    remedy = "copy its data file beside the model, or save both as one file"
+    return refused(where, f"the weights of {tensor.name!r} in a file beside the model", got, remedy)

@@ -1,0 +1,199 @@
+"""A float ONNX file as exporters leave it, turned into its simplest equal: `simplest(model, where) -> model`.
+
+`quant.onnx_file.load_onnx` calls it for whoever reads a file, once; behind it these hold of a float network:
+
+- constants are initializers, each float32 where it was float16 too, and no initializer is an input;
+- no Identity, Constant, Dropout, needless Cast, no arithmetic on constants;
+- no BatchNormalization, and no Mul, Add, Sub or Div by one constant a channel, behind a convolution that only it
+  reads, nor in front of convolutions where they are exact; a BatchNormalization of images that is left is a depthwise
+  1 x 1 convolution; zeros that Pad adds are the convolution's own;
+- Sub of a convolution's result is Add, Sum is Add, a mean over the image is GlobalAveragePool, HardSwish is itself,
+  ReLU6 is Clip from 0 to 6;
+- operators of opset 17, unless one has no form there; inputs, outputs, metadata and nodes that stay keep their names,
+  each node has one, and no two convolutions share what was folded into one of them.
+
+A network that needs none of it is returned as it is: its results stay the same to the bit. The same file gives the
+same bytes. INT8 files do not come here.
+
+Constants, normalisation behind convolutions, padding and what does nothing are folded by onnxruntime's basic
+optimisation, which every installation has: it keeps to standard operators, and its own tests run on every release.
+(onnxsim or onnxscript's optimizer would be further packages for the same.) What it leaves is rewritten by
+`quant.reading.equivalents`; onnx's own converter changes the opset. Only what `quant.untrusted` has let through may
+come here: a runtime opens it.
+"""
+
+from collections.abc import Iterator
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+import onnx
+import onnxruntime as ort
+from onnx import TensorProto, numpy_helper, version_converter
+from onnx.shape_inference import InferenceError
+
+from quant.reading.equivalents import rewrite
+from quant.untrusted import contradictions, refused
+
+OPSET = 17
+IR_VERSION = 8
+
+PLAIN = {
+    "Add", "AveragePool", "Concat", "Conv", "ConvTranspose", "DepthToSpace", "GlobalAveragePool", "LeakyRelu",
+    "MaxPool", "Relu",
+}  # fmt: skip
+"""Operators behind which nothing is to be folded, where they read no constants but weights."""
+
+ALTERING = ["CommonSubexpressionElimination", "TransposeOptimizer"]
+"""Optimisers of the runtime's that make other networks: layers of equal weights would be one, pixel shuffles that are
+spelled out would not be recognised."""
+
+HALVES = (TensorProto.FLOAT16, TensorProto.BFLOAT16)
+
+
+def simplest(model: onnx.ModelProto, where: str) -> onnx.ModelProto:
+    """The float network's simplest equal, as the module says.
+
+    Args:
+        model: what `check_content` and `check_runnable` let through; not changed.
+        where: its file, for the sentence.
+
+    Raises:
+        ModelError: the runtime does not read it.
+    """
+    with contradictions(where):
+        return model if _is_plain(model) else _simplest(model, where)
+
+
+def _simplest(model: onnx.ModelProto, where: str) -> onnx.ModelProto:
+    folded = onnx.ModelProto()
+    folded.CopyFrom(model)
+    _widen(folded)
+    held = {tensor.name for tensor in folded.graph.initializer}
+    inputs = [value for value in folded.graph.input if value.name not in held]
+    _replace(folded.graph.input, inputs)  # one that is an input could be another when it runs
+    folded.ir_version = IR_VERSION
+    ends = list(inputs), list(folded.graph.output)
+    if _opset(model) < OPSET:  # an operator's own sizes become constants, which are then folded
+        folded = _of_our_opset(folded)
+    folded = _of_our_opset(_folded(folded, where))
+    rewrite(folded)
+    _replace(folded.graph.input, ends[0])
+    _replace(folded.graph.output, ends[1])
+    _tidy(folded, model)
+    return folded
+
+
+def _is_plain(model: onnx.ModelProto) -> bool:
+    held = {tensor.name for tensor in model.graph.initializer}
+    return (
+        _opset(model) == OPSET
+        and not any(tensor.data_type in HALVES for tensor in model.graph.initializer)
+        and not any(value.name in held for value in model.graph.input)
+        and all(
+            node.op_type in PLAIN and node.name and (held.isdisjoint(node.input) or "Conv" in node.op_type)
+            for node in model.graph.node
+        )
+    )
+
+
+def _widen(model: onnx.ModelProto) -> None:
+    """16-bit floats become float32, where they are weights and wherever they are computed."""
+    graph = model.graph
+    for value in (*graph.input, *graph.output, *graph.value_info):
+        if value.type.tensor_type.elem_type in HALVES:
+            value.type.tensor_type.elem_type = TensorProto.FLOAT
+    for tensor in _constants(graph):
+        if tensor.data_type in HALVES:
+            tensor.CopyFrom(numpy_helper.from_array(numpy_helper.to_array(tensor).astype(np.float32), tensor.name))
+    for attribute in (a for node in graph.node for a in node.attribute if a.name in ("to", "dtype")):
+        attribute.i = TensorProto.FLOAT if attribute.i in HALVES else attribute.i
+
+
+def _constants(graph: onnx.GraphProto) -> Iterator[TensorProto]:
+    yield from graph.initializer
+    yield from (a.t for node in graph.node for a in node.attribute if a.HasField("t"))
+
+
+def _folded(model: onnx.ModelProto, where: str) -> onnx.ModelProto:
+    """The network as the runtime's basic optimisation leaves it."""
+    options = ort.SessionOptions()
+    options.graph_optimization_level = ort.GraphOptimizationLevel.ORT_ENABLE_BASIC
+    options.intra_op_num_threads = 1
+    options.log_severity_level = 4  # what fails is raised, and said once
+    folded = onnx.ModelProto()
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "folded.onnx"
+        options.optimized_model_filepath = str(path)
+        try:
+            ort.InferenceSession(
+                model.SerializeToString(), options, ["CPUExecutionProvider"], disabled_optimizers=ALTERING
+            )
+        except Exception as error:  # onnxruntime raises a class of its own for each status code
+            got, remedy = " ".join(str(error).split())[:160], "check the file with onnx.checker, and export it again"
+            raise refused(where, "a model that onnxruntime runs", got, remedy) from error
+        folded.ParseFromString(path.read_bytes())
+    return folded
+
+
+def _opset(model: onnx.ModelProto) -> int:
+    """The version of ONNX's own operators."""
+    return max((opset.version for opset in model.opset_import if opset.domain in ("", "ai.onnx")), default=1)
+
+
+def _of_our_opset(model: onnx.ModelProto) -> onnx.ModelProto:
+    """With operators of our opset; as it is where the converter knows no way, or ours has no such operator."""
+    version = _opset(model)
+    _replace(model.opset_import, [onnx.helper.make_opsetid("", version)])
+    if version == OPSET:
+        return model
+    try:
+        converted = version_converter.convert_version(model, OPSET)
+    except (InferenceError, RuntimeError, ValueError):
+        return model
+    if version < RESIZE_HAS_MODES:
+        _place_corners(converted)
+    return converted
+
+
+RESIZE_HAS_MODES = 11
+
+
+def _place_corners(model: onnx.ModelProto) -> None:
+    """What older operators enlarge starts at the corner; the converter leaves the default, half a pixel off."""
+    for node in model.graph.node:
+        if node.op_type == "Resize":
+            modes = {"coordinate_transformation_mode": "asymmetric", "nearest_mode": "floor"}
+            kept = [a for a in node.attribute if a.name not in modes]
+            _replace(node.attribute, [*kept, *(onnx.helper.make_attribute(*mode) for mode in modes.items())])
+
+
+def _tidy(folded: onnx.ModelProto, model: onnx.ModelProto) -> None:
+    """What is said beside the graph is the file's own; constants that nothing reads are dropped."""
+    folded.ir_version = IR_VERSION
+    folded.producer_name, folded.producer_version = model.producer_name, model.producer_version
+    _replace(folded.metadata_props, model.metadata_props)
+    graph = folded.graph
+    graph.name = model.graph.name
+    graph.ClearField("value_info")
+    read = {name for node in graph.node for name in node.input} | {value.name for value in graph.output}
+    kept = sorted((t for t in graph.initializer if t.name in read), key=lambda tensor: str(tensor.name))
+    _replace(graph.initializer, kept)
+    taken = {node.name for node in graph.node}
+    for node in graph.node:
+        if not node.name:
+            node.name = _fresh(node.output[0] or node.op_type, taken)
+
+
+def _fresh(name: str, taken: set[str]) -> str:
+    while name in taken:
+        name += "_"
+    taken.add(name)
+    return name
+
+
+def _replace(field: object, values: object) -> None:
+    """Put other messages in the place of a repeated field's own."""
+    kept = list(values)  # type: ignore[call-overload]
+    del field[:]  # type: ignore[attr-defined]
+    field.extend(kept)  # type: ignore[attr-defined]

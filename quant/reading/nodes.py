@@ -1,0 +1,113 @@
+"""The nodes of a network while they are rewritten: who writes and reads what, and the numbers they hold."""
+
+from collections import Counter
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import onnx
+from onnx import NodeProto, TensorProto, helper, numpy_helper, shape_inference
+
+LINEAR = {"Conv", "ConvTranspose"}
+
+Shapes = dict[str, tuple[int, ...]]
+
+
+def shapes_of(model: onnx.ModelProto) -> Shapes:
+    """The sizes of each float32 tensor whose rank is known, 0 for a size that is not; none where sizes differ."""
+    try:
+        values = shape_inference.infer_shapes(model).graph
+    except shape_inference.InferenceError:
+        return {}
+    known = {v.name: v.type.tensor_type for v in (*values.input, *values.value_info, *values.output)}
+    floats = {n: t for n, t in known.items() if t.elem_type == TensorProto.FLOAT and t.HasField("shape")}
+    return {name: tuple(d.dim_value for d in t.shape.dim) for name, t in floats.items()}
+
+
+class Nodes:
+    """The nodes in order, and who writes and reads what."""
+
+    def __init__(self, graph: onnx.GraphProto) -> None:
+        self._graph = graph
+        self.nodes = list(graph.node)
+        self.constants = {tensor.name: tensor for tensor in graph.initializer}
+        self.ends = [value.name for value in graph.output]
+        self._taken = {name for node in graph.node for name in (*node.input, *node.output)} | set(self.constants)
+        self._find()
+
+    def _find(self) -> None:
+        self.reads = Counter([name for node in self.nodes for name in node.input] + self.ends)
+        self.writers = {name: node for node in self.nodes for name in node.output if name}
+
+    def pass_over(self, step: "Step") -> None:
+        """Each node replaced by what `step(graph, node)` gives for it, in order; None leaves it as it is."""
+        kept: list[NodeProto] = []
+        for node in self.nodes:
+            found = step(self, node)
+            new = [node] if found is None else found
+            self.writers |= {name: n for n in new for name in n.output if name}
+            kept.extend(new)
+        self.nodes = kept
+        self._find()
+
+    def write(self) -> None:
+        """Put the nodes that lead to an output, and the constants, into the graph."""
+        needed, kept = set(self.ends), list[NodeProto]()
+        for node in reversed(self.nodes):
+            if needed.intersection(node.output):
+                needed.update(node.input)
+                kept.append(NodeProto.FromString(node.SerializeToString()))
+        self.nodes = kept[::-1]
+        del self._graph.node[:]
+        self._graph.node.extend(self.nodes)
+        held = {tensor.name for tensor in self._graph.initializer}
+        self._graph.initializer.extend(t for name, t in self.constants.items() if name not in held)
+        self._find()
+
+    def value(self, name: str) -> np.ndarray | None:
+        """As `array`, in float64."""
+        found = self.array(name)
+        return None if found is None else found.astype(np.float64)
+
+    def array(self, name: str) -> np.ndarray | None:
+        """A constant of float32 as it is, None where it is none."""
+        found = self.constants.get(name)
+        return None if found is None or found.data_type != TensorProto.FLOAT else numpy_helper.to_array(found)
+
+    def integers(self, name: str) -> list[int] | None:
+        """A constant list of whole numbers, None where it is none."""
+        found = self.constants.get(name)
+        return None if found is None else [int(size) for size in numpy_helper.to_array(found).ravel()]
+
+    def keep(self, name: str, value: np.ndarray) -> str:
+        """Note a constant as float32 under a name that is free, and return it."""
+        while name in self._taken:
+            name += "_"
+        self._taken.add(name)
+        self.constants[name] = numpy_helper.from_array(value.astype(np.float32), name)
+        return name
+
+    def sole_writer(self, name: str) -> NodeProto | None:
+        """The node that writes a tensor which one node alone reads."""
+        return self.writers.get(name) if self.reads[name] == 1 else None
+
+    def is_linear(self, node: NodeProto | None) -> bool:
+        """Whether it is a convolution of images, transposed or not, of weights and bias that the file holds."""
+        if node is None or node.op_type not in LINEAR:
+            return False
+        numbers = [self.constants.get(name) for name in node.input[1:] if name]
+        sound = all(t is not None and t.data_type == TensorProto.FLOAT for t in numbers)
+        return bool(numbers) and sound and len(self.constants[node.input[1]].dims) == 4
+
+    def width(self, node: NodeProto) -> int:
+        """The channels that a convolution writes."""
+        dims = self.constants[node.input[1]].dims
+        return int(dims[0] if node.op_type == "Conv" else dims[1] * attributes_of(node).get("group", 1))
+
+
+Step = Callable[[Nodes, NodeProto], list[NodeProto] | None]
+
+
+def attributes_of(node: NodeProto) -> dict[str, Any]:
+    """The attributes that a node states, by name."""
+    return {a.name: helper.get_attribute_value(a) for a in node.attribute}

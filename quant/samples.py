@@ -1,0 +1,230 @@
+"""Images of a user's own, as their network reads them: what any network is calibrated and judged on.
+
+One .npy or .npz file of a batch (N, C, H, W), or a folder of images and .npy files of one image each, (C, H, W).
+Values are in [0, 1] of full scale: of pixels of 8 bits 255, of more 4095. A .npz file may hold what the network
+should give beside what it reads, as `image` and `reference`.
+"""
+
+import zipfile
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+import onnx
+
+from model.io.files import IMAGE_SUFFIXES
+from model.io.images import MAX_DN, read_pixels
+from profiles.errors import ImageError, ModelError, OptionError
+from profiles.toml import unreadable
+from quant.calibration import PATCH_PX, Pair, Patches, Remade
+from quant.onnx_file import fixed_tile_px
+from quant.tiling.walk import tiling_of
+from quant.untrusted import times
+
+HELD_OUT_EVERY = 4
+"""One sample of so many is kept from calibration, to look at what INT8 changes."""
+LARGEST = 1 + 1e-6
+FULL_SCALE_8 = 255
+REMEDY = "see docs/any-network.md for how samples are given"
+
+
+def read_samples(path: Path, channels: int, fixed_px: int | None, multiple_px: int = 1) -> Patches:
+    """The samples of a file or folder, cut to what the network takes: each (1, C, h, w) float32 in [0, 1].
+
+    Args:
+        path: the file or folder.
+        channels: that the network reads.
+        fixed_px: side of the image that the network is fixed to; None cuts large samples to patches.
+        multiple_px: what sides must be multiples of; the rest is cut off.
+
+    Raises:
+        ImageError: no samples, values outside [0, 1], or images of other channels or sizes.
+    """
+    pairs = [
+        pair
+        for name, image, reference in _samples(path)
+        for pair in _cut(_sound(name, image, channels), reference, name, fixed_px, multiple_px)
+    ]
+    if not pairs:
+        raise ImageError(str(path), expected="at least one sample", got="none", remedy=REMEDY)
+    return _patches(pairs)
+
+
+NO_REFERENCE = np.empty(0, np.float32)
+
+
+def _patches(pairs: Sequence[Pair]) -> Patches:
+    return Patches([], Remade(lambda k: pairs[k], len(pairs)), Remade(lambda k: pairs[k][0], len(pairs)))
+
+
+def split_samples(samples: Patches) -> tuple[Patches, Patches]:
+    """What to calibrate on, and every fourth sample to look at what INT8 changes; of fewer both are all."""
+    pairs = list(samples.pairs)
+    held_out = pairs[HELD_OUT_EVERY - 1 :: HELD_OUT_EVERY]
+    if not held_out:
+        return samples, samples
+    return _patches([pair for k, pair in enumerate(pairs) if (k + 1) % HELD_OUT_EVERY]), _patches(held_out)
+
+
+def _samples(path: Path) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
+    """(name, image (C, H, W), reference)."""
+    if path.is_dir():
+        for file in sorted(path.iterdir()):
+            if file.suffix.lower() == ".npy":
+                yield file.name, _one(file, _array(file)), NO_REFERENCE
+            elif file.suffix.lower() in IMAGE_SUFFIXES:
+                yield file.name, _bands_first(file, read_pixels(file)), NO_REFERENCE
+        return
+    if path.suffix.lower() == ".npz":
+        images, references = _archive(path)
+    else:
+        images, references = _array(path), NO_REFERENCE
+    if images.ndim != 4 or (references.size and len(references) != len(images)):
+        got = times(images.shape) + (f" and references of {times(references.shape)}" if references.size else "")
+        raise ImageError(str(path), expected="a batch of (N, C, H, W)", got=got, remedy=REMEDY)
+    for number, image in enumerate(images):
+        yield f"{path.name}[{number}]", image, references[number] if references.size else references
+
+
+def _one(file: Path, array: np.ndarray) -> np.ndarray:
+    if array.ndim != 3:
+        raise ImageError(str(file), expected="one image (C, H, W)", got=times(array.shape), remedy=REMEDY)
+    return array
+
+
+def _array(path: Path) -> np.ndarray:
+    """A .npy file's array, mapped rather than read; nothing is unpickled."""
+    got = unreadable(path)
+    if got is not None:
+        raise ImageError(str(path), expected="a .npy file", got=got, remedy="check the path")
+    try:
+        return np.asarray(np.load(path, mmap_mode="r", allow_pickle=False))
+    except (OSError, ValueError, EOFError) as error:
+        raise ImageError(str(path), expected="a .npy file of numbers", got="another file", remedy=REMEDY) from error
+
+
+def _archive(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    """`image` and `reference`, or the only array there is."""
+    got = unreadable(path)
+    if got is not None:
+        raise ImageError(str(path), expected="a .npz file", got=got, remedy="check the path")
+    try:
+        with np.load(path, allow_pickle=False) as held:
+            names = list(held.files)
+            image = "image" if "image" in names else names[0] if len(names) == 1 else None
+            if image is None:
+                got = ", ".join(names) or "no array"
+                raise ImageError(str(path), expected="arrays named image and reference", got=got, remedy=REMEDY)
+            return held[image], held["reference"] if "reference" in names else NO_REFERENCE
+    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
+        raise ImageError(str(path), expected="a .npz file of numbers", got="another file", remedy=REMEDY) from error
+
+
+def _bands_first(path: Path, pixels: np.ndarray) -> np.ndarray:
+    """(H, W) or (H, W, bands) as stored to (C, H, W) of full scale; floats are of full scale already."""
+    bands = pixels[None] if pixels.ndim == 2 else np.moveaxis(pixels, -1, 0)
+    if bands.dtype.kind == "f":
+        return bands
+    if bands.dtype.kind not in "ui":
+        raise ImageError(str(path), expected="pixels that are numbers", got=f"{bands.dtype}", remedy=REMEDY)
+    return bands / np.float32(FULL_SCALE_8 if bands.dtype.itemsize == 1 else MAX_DN)
+
+
+def _sound(name: str, image: np.ndarray, channels: int) -> np.ndarray:
+    if image.dtype.kind not in "fui" or len(image) != channels:
+        got = f"{len(image)} channels of {image.dtype}"
+        raise ImageError(name, expected=f"{channels} channels of numbers", got=got, remedy=REMEDY)
+    values = np.asarray(image, np.float32)
+    low, high = (float(values.min()), float(values.max())) if values.size else (0.0, 0.0)
+    if not (low >= 0 and high <= LARGEST):
+        remedy = "divide them by full scale"
+        raise ImageError(name, expected="values in [0, 1]", got=f"{low:.4g} to {high:.4g}", remedy=remedy)
+    return np.minimum(values, 1)
+
+
+def _cut(
+    image: np.ndarray, reference: np.ndarray, name: str, fixed_px: int | None, multiple_px: int
+) -> Iterator[Pair]:
+    """Patches of an image (C, H, W), or the whole where a reference belongs to it."""
+    height, width = image.shape[1:]
+    if fixed_px is not None and (height, width) != (fixed_px, fixed_px) and reference.size:
+        got = times((height, width))
+        raise ImageError(name, expected=f"images of {fixed_px} x {fixed_px} pixels", got=got, remedy=REMEDY)
+    if reference.size:
+        yield image[None], np.asarray(reference, np.float32)[None]
+        return
+    side = fixed_px or PATCH_PX
+    sizes = [side if n >= side else n // multiple_px * multiple_px for n in (height, width)]
+    if 0 in sizes or (fixed_px is not None and sizes != [side, side]):
+        expected = f"images of at least {fixed_px or multiple_px} pixels a side"
+        raise ImageError(name, expected=expected, got=times((height, width)), remedy="give larger ones")
+    for top in range(0, height - sizes[0] + 1, sizes[0]):
+        for left in range(0, width - sizes[1] + 1, sizes[1]):
+            yield np.ascontiguousarray(image[None, :, top : top + sizes[0], left : left + sizes[1]]), NO_REFERENCE
+
+
+@dataclass(frozen=True)
+class OwnSamples:
+    """Where a run's samples come from, in the place of `quant.calibration.Calibration`."""
+
+    path: Path
+    channels: int
+    fixed_px: int | None
+    multiple_px: int
+
+    @cached_property
+    def all(self) -> Patches:
+        """Every sample."""
+        return read_samples(self.path, self.channels, self.fixed_px, self.multiple_px)
+
+    @property
+    def drawn(self) -> Patches:
+        """What the network is calibrated on."""
+        return split_samples(self.all)[0]
+
+    @property
+    def unseen(self) -> Patches:
+        """What calibration does not see."""
+        return split_samples(self.all)[1]
+
+    @property
+    def patches(self) -> int:
+        """How many it is calibrated on."""
+        return len(self.drawn.pairs)
+
+    @property
+    def about(self) -> dict[str, str]:
+        """What the file says of it."""
+        return {"calibration_data": self.path.name}
+
+
+def samples_of(model: onnx.ModelProto, path: Path | None) -> OwnSamples | None:
+    """A user's samples for a network; None where it takes simulated patches and no path is given.
+
+    Raises:
+        OptionError: no path, for a network that simulated patches do not suit.
+        ModelError: no network of images.
+    """
+    channels, fixed_px, multiple_px = _channels(model), fixed_tile_px(model), _multiple_px(model)
+    if path is not None:
+        return OwnSamples(path, channels, fixed_px, multiple_px or 1)
+    if channels != 1 or multiple_px is None:
+        what = f"{channels} channels" if channels != 1 else f"images of {fixed_px} x {fixed_px} pixels alone"
+        expected = f"samples for a network of {what}: simulated patches are others"
+        remedy = "give a .npy or .npz file of (N, C, H, W) in [0, 1], or a folder of images"
+        raise OptionError("--data", expected=expected, got="none", remedy=remedy)
+    return None
+
+
+def _channels(model: onnx.ModelProto) -> int:
+    return int(model.graph.input[0].type.tensor_type.shape.dim[1].dim_value) or 1
+
+
+def _multiple_px(model: onnx.ModelProto) -> int | None:
+    """What the sides of an image must be multiples of; None of a network that has one size."""
+    try:
+        return tiling_of(model).lattice_px
+    except ModelError:
+        return None

@@ -1,0 +1,250 @@
+"""Users' networks, with strides, larger results and several bands: tiled is whole, bit for bit."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnx
+import pytest
+import tifffile
+from onnx import helper
+
+from deploy.library import restore
+from deploy.restoration.engine import Restorer
+from deploy.restoration.georeference import enlarged_tags
+from deploy.restoration.options import Options
+from deploy.restoration.plan import make_plan
+from deploy.restoration.run import restore_file
+from profiles.errors import MachineError, ModelError, OptionError
+from quant.onnx_file import load_onnx, save_onnx
+from quant.session import open_session, tensors_of
+from quant.tiling.walk import Tiling, tiling_of
+from tests.quant.tiling.small_networks import (
+    espcn,
+    ffdnet,
+    float_unet,
+    four_bands,
+    graph,
+    plain_int8_unet,
+)
+
+NETWORKS: dict[str, tuple[Callable[[], onnx.ModelProto], Tiling]] = {
+    "U-Net": (float_unet, Tiling(6, 2)),
+    "INT8 U-Net": (plain_int8_unet, Tiling(16, 8)),
+    "ESPCN": (espcn, tiling_of(espcn())),
+    "FFDNet": (ffdnet, Tiling(6, 2)),
+    "4 bands": (four_bands, Tiling(2, 1, tiling_of(four_bands()).scale, 4, 4)),
+    "4 bands to 2": (lambda: four_bands(2), Tiling(2, 1, tiling_of(four_bands()).scale, 4, 2)),
+}
+SIZE = 141, 107
+
+
+@pytest.fixture(params=NETWORKS)
+def path(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
+    """A network's file."""
+    return saved(NETWORKS[request.param][0](), tmp_path)
+
+
+def saved(model: onnx.ModelProto, folder: Path) -> Path:
+    (folder / "models").mkdir(exist_ok=True)
+    save_onnx(model, folder / "models" / "network.onnx")
+    return folder / "models" / "network.onnx"
+
+
+def noise(path: Path, size: tuple[int, int] = SIZE) -> np.ndarray:
+    """An image (bands, H, W) uint16, or (H, W), as the network takes it."""
+    bands = tiling_of(load_onnx(path)).channels_in
+    shape = (bands, *size) if bands > 1 else size
+    return np.random.default_rng(4).integers(0, 4096, shape).astype(np.uint16)
+
+
+def whole(path: Path, pixels: np.ndarray) -> np.ndarray:
+    """The result without the engine: the image extended by copies of its last row and column, and cut again."""
+    model, (height, width) = load_onnx(path), pixels.shape[-2:]
+    tiling, bands = tiling_of(model), pixels.reshape(-1, height, width)
+    more = [-side % tiling.lattice_px for side in (height, width)]
+    image = np.pad(bands, ((0, 0), (0, more[0]), (0, more[1])), mode="edge").astype(np.float32)
+    (result,) = tensors_of(open_session(model, 1), None, image[None] / np.float32(4095))
+    scale = int(tiling.scale)
+    cut = result[0, :, : height * scale, : width * scale] * np.float32(4095)
+    return np.asarray(np.rint(np.clip(cut, 0, 4095)).squeeze())
+
+
+def by_file(pixels: np.ndarray, folder: Path, options: Options, **written: Any) -> np.ndarray:
+    """As `restore` writes it."""
+    planar: dict[str, Any] = {"planarconfig": "separate"} if pixels.ndim == 3 else {}
+    tifffile.imwrite(folder / "in.tif", pixels, photometric="minisblack", **planar, **written)
+    restore_file(folder / "in.tif", folder / "out.tif", options, lambda _: None)
+    return tifffile.imread(folder / "out.tif")
+
+
+@pytest.mark.parametrize("name", NETWORKS)
+def test_the_walk_finds_what_each_needs(name: str) -> None:
+    make, tiling = NETWORKS[name]
+    assert tiling_of(make()) == tiling
+
+
+@pytest.mark.parametrize("tile_px", [56, 83])
+def test_tiled_is_whole_at_an_odd_size(tile_px: int, path: Path, tmp_path: Path) -> None:
+    pixels, options = noise(path), Options(path, tile_px, threads=1)
+    expected = whole(path, pixels)
+    assert len(np.unique(expected)) > 50
+    np.testing.assert_array_equal(by_file(pixels, tmp_path, options), expected)
+    np.testing.assert_array_equal(restore(pixels, path, tile_px=tile_px, threads=1), expected)
+
+
+def test_one_lattice_less_of_halo_shows_seams(path: Path, tmp_path: Path) -> None:
+    tiling, pixels = tiling_of(load_onnx(path)), noise(path)
+    options = Options(path, 56, str(tiling.halo_px - tiling.lattice_px), threads=1)
+    assert (by_file(pixels, tmp_path, options) != whole(path, pixels)).any()
+
+
+@pytest.mark.parametrize("size", [(1, 1), (3, 50), (47, 2)])
+def test_tiny_images_are_extended_too(size: tuple[int, int], path: Path, tmp_path: Path) -> None:
+    pixels = noise(path, size)
+    restored = by_file(pixels, tmp_path, Options(path, 83, threads=1))
+    np.testing.assert_array_equal(restored.squeeze(), whole(path, pixels))
+
+
+def test_missing_pixels_stay_and_spoil_no_others(path: Path, tmp_path: Path) -> None:
+    """Behind the last row and column too, which the extension copies."""
+    pixels = np.maximum(noise(path), 1)
+    pixels[..., 60:90, 40:60] = 0
+    pixels[..., -3:, -5:] = 0
+    pixels[(0, 5, 5) if pixels.ndim == 3 else (5, 5)] = 0
+    nodata: dict[str, Any] = {"extratags": [(42113, "s", 0, "0", True)]}
+    tiled, one = (by_file(pixels, tmp_path, Options(path, side, threads=1), **nodata) for side in (56, 500))
+    np.testing.assert_array_equal(tiled, one)
+    tiling = tiling_of(load_onnx(path))
+    missing = pixels == 0
+    if tiling.channels_in != tiling.channels_out:
+        missing = np.broadcast_to(missing.any(axis=0), (tiling.channels_out, *SIZE))
+    scale = int(tiling.scale)
+    np.testing.assert_array_equal(tiled == 0, missing.repeat(scale, -2).repeat(scale, -1))
+
+
+def test_a_lazy_array_gives_the_same(path: Path) -> None:
+    da = pytest.importorskip("dask.array")
+    pixels = noise(path)
+    lazy = restore(da.from_array(pixels, chunks=40), path, tile_px=56)
+    expected = whole(path, pixels)
+    assert lazy.shape == expected.shape
+    np.testing.assert_array_equal(lazy.compute(scheduler="synchronous"), expected)
+
+
+def test_a_run_that_was_stopped_is_resumed_to_the_same_bytes(
+    path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    options = Options(path, 56, threads=1)
+    by_file(noise(path), tmp_path, options)
+    expected, left = (tmp_path / "out.tif").read_bytes(), iter(range(4))
+    tile: Any = Restorer.tile
+
+    def stopping(*arguments: Any) -> Any:
+        if next(left, None) is None:
+            raise MachineError("machine", expected="power", got="none", remedy="wait")
+        return tile(*arguments)
+
+    monkeypatch.setattr(Restorer, "tile", stopping)
+    with pytest.raises(MachineError):
+        restore_file(tmp_path / "in.tif", tmp_path / "out.tif", options, lambda _: None)
+    monkeypatch.undo()
+    said: list[str] = []
+    row = restore_file(tmp_path / "in.tif", tmp_path / "out.tif", replace(options, resume=True), said.append)
+    assert (tmp_path / "out.tif").read_bytes() == expected
+    assert row.figures["tiles"].value
+
+
+REFUSED: dict[str, tuple[Callable[[], onnx.ModelProto], type[Exception], str]] = {
+    "classifier": (
+        lambda: graph([helper.make_node("GlobalAveragePool", ["image"], ["restored"], name="head")]),
+        ModelError,
+        "GlobalAveragePool head, which looks at the whole image",
+    ),
+    "segmentation": (
+        lambda: graph([helper.make_node("MaxPool", ["image"], ["restored"], kernel_shape=[2, 2], strides=[2, 2])]),
+        ModelError,
+        "expected a result of the image's size or a multiple, got one of 1/2",
+    ),
+    "4 bands": (four_bands, OptionError, "expected an image of 4 bands, as the network takes them, got 1"),
+}
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_what_cannot_be_restored_is_refused_in_one_sentence(name: str, tmp_path: Path) -> None:
+    make, error, sentence = REFUSED[name]
+    path = saved(make(), tmp_path)
+    with pytest.raises(error, match=sentence):
+        by_file(np.ones((30, 30), np.uint16), tmp_path, Options(path, 20))
+    assert not (tmp_path / "out.tif").exists()
+
+
+def test_halos_and_tiles_off_the_lattice_are_refused_or_rounded() -> None:
+    tiling = Tiling(8, 4)
+    with pytest.raises(OptionError, match=r"--halo: expected a multiple of 4 px.*got 7 px.*8 is exact"):
+        make_plan((1, 100, 100), 40, 7, tiling)
+    with pytest.raises(OptionError, match="20 px at least, got 19 px"):
+        make_plan((1, 100, 100), 19, 8, tiling)
+    assert make_plan((1, 101, 99), 31, 8, tiling).tile_shape[0] % 4 == 0
+
+
+def test_a_result_of_another_shape_than_the_file_says_is_refused(tmp_path: Path) -> None:
+    model = espcn()
+    model.graph.output[0].type.tensor_type.shape.dim[1].dim_value = 2
+    path = saved(model, tmp_path)
+    with pytest.raises(ModelError, match="expected a result of 2 x 60 x 60, as its file says, got 1 x 60 x 60"):
+        by_file(np.ones((30, 30), np.uint16), tmp_path, Options(path, 40))
+
+
+AREA, POINT = (1, 1, 0, 1, 1025, 0, 1, 1), (1, 1, 0, 1, 1025, 0, 1, 2)
+
+
+@pytest.mark.parametrize("keys", [AREA, POINT])
+def test_places_on_earth_stay_where_they_are(keys: tuple[int, ...]) -> None:
+    """By tie point and by matrix: the middle of four pixels is that of the one they came from."""
+    tie, scale = (3.0, 5.0, 0.0, 700.0, 900.0, 0.0), (2.0, 4.0, 0.0)
+    matrix = (2.0, 0.5, 0, 10, 0.25, -4, 0, 20, 0, 0, 1, 0, 0, 0, 0, 1)
+    values = {33550: scale, 33922: tie, 34264: matrix}
+    tags = tuple((code, 12, len(value), value, True) for code, value in values.items())
+    larger = {tag[0]: tag[3] for tag in enlarged_tags((*tags, (34735, 3, 8, keys, True)), 2)}
+    middle = 0.5 if keys is AREA else 0.0
+
+    def by_tie(given: dict[int, Any], column: float, row: float) -> list[float]:
+        point, size = given[33922], given[33550]
+        return [point[3] + (column + middle - point[0]) * size[0], point[4] - (row + middle - point[1]) * size[1]]
+
+    def by_matrix(given: dict[int, Any], column: float, row: float) -> list[float]:
+        m = given[34264]
+        return [m[k] * (column + middle) + m[k + 1] * (row + middle) + m[k + 3] for k in (0, 4)]
+
+    for place in (by_tie, by_matrix):
+        four = [place(larger, 2 * 7 + i, 2 * 9 + j) for i in (0, 1) for j in (0, 1)]
+        np.testing.assert_allclose(np.mean(four, axis=0), place(values, 7, 9))
+    assert enlarged_tags(tags, 1) is tags
+
+
+def test_a_larger_file_has_its_tags(tmp_path: Path) -> None:
+    path = saved(espcn(), tmp_path)
+    polynomials = tuple(float(k) for k in range(92))
+    tags: Any = [
+        (33550, 12, 3, (2.0, 2.0, 0.0), True),
+        (33922, 12, 6, (0.0, 0.0, 0.0, 700.0, 900.0, 0.0), True),
+        (50844, 12, 92, polynomials, True),
+    ]
+    by_file(np.ones((31, 30), np.uint16), tmp_path, Options(path, 20), extratags=tags)
+    with tifffile.TiffFile(tmp_path / "out.tif") as file:
+        page: Any = file.pages[0]
+        assert page.shape == (62, 60)
+        assert page.tags[33550].value == (1.0, 1.0, 0.0)
+        assert page.tags[50844].value[:9] == (0.0, 1.0, 4.5, 6.5, 4.0, 5.0, 6.0, 14.0, 16.0)
+
+
+def test_a_one_band_network_still_takes_bands_one_by_one(tmp_path: Path) -> None:
+    path = saved(espcn(), tmp_path)
+    bands = np.random.default_rng(1).integers(0, 4096, (3, 41, 35)).astype(np.uint16)
+    restored = by_file(bands, tmp_path, Options(path, 23))
+    assert restored.shape == (3, 82, 70)
+    for band, result in zip(bands, restored, strict=True):
+        np.testing.assert_array_equal(result, whole(path, band))

@@ -1,0 +1,87 @@
+"""Networks as users bring them: what torch exports of them computes the same, at every size that is legal."""
+
+from collections import Counter
+
+import numpy as np
+import onnx
+import pytest
+import torch
+from torch import nn
+
+from examples.networks import NETWORKS, build, to_onnx
+from quant.session import open_session
+
+MAX_DIFFERENCE = 1e-5
+
+
+def made(name: str, seed: int = 0) -> nn.Module:
+    return build(name, torch.Generator().manual_seed(seed))
+
+
+def shapes(name: str) -> list[tuple[int, int, int, int]]:
+    """Odd and even sizes in steps of the network's own, or batches of its only size."""
+    example = NETWORKS[name]
+    if example.side_px:
+        return [
+            (1, example.inputs, example.side_px, example.side_px),
+            (3, example.inputs, example.side_px, example.side_px),
+        ]
+    step = example.multiple_px
+    return [(1, example.inputs, 9 * step, 10 * step), (2, example.inputs, 12 * step, 7 * step)]
+
+
+def differences(network: nn.Module, model: onnx.ModelProto, sizes: list[tuple[int, int, int, int]]) -> list[float]:
+    session, found = open_session(model), []
+    for size in sizes:
+        image = np.random.default_rng(0).random(size, dtype=np.float32)
+        with torch.inference_mode():
+            expected = network(torch.from_numpy(image)).numpy()
+        (output,) = session.run(None, {"input": image})
+        assert output.shape == expected.shape
+        found.append(float(np.abs(output - expected).max()))
+    return found
+
+
+@pytest.mark.parametrize("name", NETWORKS)
+def test_the_exported_network_equals_torch_at_odd_and_even_sizes(name: str) -> None:
+    network = made(name)
+    assert max(differences(network, to_onnx(name, network), shapes(name))) <= MAX_DIFFERENCE
+
+
+@pytest.mark.parametrize("name", NETWORKS)
+def test_sizes_and_channels_are_those_that_the_example_states(name: str) -> None:
+    example, network = NETWORKS[name], made(name)
+    for size in shapes(name):
+        with torch.inference_mode():
+            output = network(torch.rand(size, generator=torch.Generator().manual_seed(0)))
+        whole = (*(side * example.scale for side in size[2:]),) if not example.side_px else ()
+        assert output.shape == (size[0], example.outputs, *whole)
+
+
+@pytest.mark.parametrize("name", NETWORKS)
+def test_the_same_seed_gives_the_same_bytes_and_another_gives_others(name: str) -> None:
+    first, again, other = (to_onnx(name, made(name, seed)).SerializeToString() for seed in (0, 0, 1))
+    assert first == again
+    assert first != other
+
+
+@pytest.mark.parametrize("name", ["dncnn", "mobile", "classifier"])
+def test_batch_normalisation_may_stay_unfolded_and_is_not_the_identity(name: str) -> None:
+    network = made(name)
+    model = to_onnx(name, network, fold=False)
+    assert Counter(node.op_type for node in model.graph.node)["BatchNormalization"] == sum(
+        isinstance(module, nn.BatchNorm2d) for module in network.modules()
+    )
+    assert max(differences(network, model, shapes(name))) <= MAX_DIFFERENCE
+    for module in network.modules():
+        if isinstance(module, nn.BatchNorm2d):
+            module.reset_running_stats()
+    assert min(differences(network, model, shapes(name))) > 100 * MAX_DIFFERENCE
+
+
+@pytest.mark.parametrize("opset", [11, 20])
+def test_older_and_newer_operator_sets_compute_the_same(opset: int) -> None:
+    network = made("unet")
+    model = to_onnx("unet", network, opset=opset)
+    assert model.opset_import[0].version == opset
+    assert max(differences(network, model, shapes("unet"))) <= MAX_DIFFERENCE

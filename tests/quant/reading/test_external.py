@@ -1,0 +1,140 @@
+"""Weights in a file beside the model: taken in from the model's own folder, and from nowhere else."""
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import onnx
+import pytest
+from onnx import TensorProto
+
+from profiles.errors import ModelError
+from quant.onnx_file import load_onnx
+from quant.reading.external import take_in
+from quant.session import open_session, run
+from tests.deploy.dpu.graphs import float_convbeers
+
+IMAGE = np.full((1, 1, 12, 14), 0.25, np.float32)
+Damage = Callable[[onnx.ModelProto], object]
+
+
+@pytest.fixture
+def saved(tmp_path: Path) -> Path:
+    """A network whose weights lie in `model/weights.bin` beside it."""
+    model = onnx.load_model(float_convbeers(tmp_path / "whole.onnx", 1, 4))
+    rng = np.random.default_rng(0)
+    for tensor in model.graph.initializer:
+        tensor.raw_data = rng.normal(0, 0.1, tuple(tensor.dims)).astype(np.float32).tobytes()
+    onnx.save_model(model, tmp_path / "whole.onnx")
+    (tmp_path / "model").mkdir()
+    path = tmp_path / "model" / "apart.onnx"
+    onnx.save_model(
+        model,
+        path,
+        save_as_external_data=True,
+        all_tensors_to_one_file=True,
+        location="weights.bin",
+        size_threshold=0,
+    )
+    return path
+
+
+def rewritten(path: Path, change: Damage) -> Path:
+    model = onnx.load_model(path, load_external_data=False)
+    change(model)
+    path.write_bytes(model.SerializeToString())
+    return path
+
+
+def stating(key: str, value: str) -> Damage:
+    def change(model: onnx.ModelProto) -> None:
+        entries = model.graph.initializer[1].external_data
+        kept = [(e.key, e.value) for e in entries if e.key != key]
+        del entries[:]
+        for name, text in (*kept, (key, value)):
+            entries.add(key=name, value=text)
+
+    return change
+
+
+def test_the_same_network_apart_and_whole_computes_the_same(saved: Path) -> None:
+    whole, apart = load_onnx(saved.parents[1] / "whole.onnx"), load_onnx(saved)
+    assert apart.graph.initializer == whole.graph.initializer
+    expected, result = (run(open_session(model, 1), IMAGE) for model in (whole, apart))
+    np.testing.assert_array_equal(result, expected)
+    assert result.std() > 0
+
+
+def refused(path: Path) -> str:
+    with pytest.raises(ModelError) as caught:
+        load_onnx(path)
+    assert str(caught.value).startswith(str(path))
+    return str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "place", ["../weights.bin", "/etc/passwd", "a/../../weights.bin", "C:\\weights.bin", "", "\\x"]
+)
+def test_no_file_outside_the_models_folder_is_opened(
+    place: str, saved: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (saved.parents[1] / "weights.bin").write_bytes((saved.parent / "weights.bin").read_bytes())
+    rewritten(saved, stating("location", place))
+    model = onnx.load_model(saved, load_external_data=False)
+    model.graph.initializer.pop(0)
+    monkeypatch.setattr(Path, "open", lambda *_: pytest.fail("opened"))
+    with pytest.raises(ModelError, match="outside the model's folder"):
+        take_in(model, saved)
+
+
+def test_no_link_is_followed(saved: Path) -> None:
+    weights = saved.parent / "weights.bin"
+    outside = saved.parents[1] / "outside.bin"
+    weights.rename(outside)
+    try:
+        weights.symlink_to(outside)
+    except OSError:
+        pytest.skip("no links here")
+    assert "a link" in refused(saved)
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no pipes with names here")
+def test_no_pipe_is_waited_for(saved: Path) -> None:
+    (saved.parent / "weights.bin").unlink()
+    os.mkfifo(saved.parent / "weights.bin")
+    assert "no regular file" in refused(saved)
+
+
+@pytest.mark.parametrize(
+    ("damage", "words"),
+    [
+        (stating("offset", "99999999"), "not the"),
+        (stating("offset", "-4"), "not the"),
+        (stating("offset", "9" * 4000), "not the"),
+        (stating("length", "12"), "not the"),
+        (stating("location", "missing.bin"), "no such file"),
+        (lambda m: m.graph.initializer[1].dims.append(2**22), "values"),
+        (lambda m: m.graph.initializer[1].dims.append(1000), "not the"),
+        (lambda m: m.graph.initializer[1].dims.append(-1), "plain numbers"),
+        (lambda m: setattr(m.graph.initializer[1], "data_type", TensorProto.STRING), "plain numbers"),
+    ],
+)
+def test_what_the_model_states_of_its_weights_is_looked_at(damage: Damage, words: str, saved: Path) -> None:
+    assert words in refused(rewritten(saved, damage))
+
+
+def test_weights_that_are_not_finite_are_refused_there_too(saved: Path) -> None:
+    weights = saved.parent / "weights.bin"
+    weights.write_bytes(b"\xff" * weights.stat().st_size)
+    assert "NaN or infinite" in refused(saved)
+
+
+def test_constants_of_nodes_are_not_looked_for(saved: Path) -> None:
+    def change(model: onnx.ModelProto) -> None:
+        tensor = TensorProto(name="apart", data_type=TensorProto.FLOAT, dims=[1])
+        tensor.data_location = TensorProto.EXTERNAL
+        tensor.external_data.add(key="location", value="weights.bin")
+        model.graph.node.insert(0, onnx.helper.make_node("Constant", [], ["c"], value=tensor))
+
+    assert "another file" in refused(rewritten(saved, change))

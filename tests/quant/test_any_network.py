@@ -1,0 +1,137 @@
+"""Networks of users: quantised, held to the integer reference bit for bit, bounded, read back, and tiled."""
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import onnx
+import pytest
+import torch
+
+from deploy.dpu.board import load_dpu
+from deploy.dpu.checker.placement import place
+from deploy.dpu.checker.table import legality
+from deploy.dpu.reading import network_of
+from examples.networks import NETWORKS, build, to_onnx
+from profiles.errors import ModelError
+from quant.bounds import layer_bounds
+from quant.calibration import Patches, Remade
+from quant.core import INT8_MAX, INT8_MIN
+from quant.encodings import as_on_board, encoding_faults, read_core
+from quant.graph import correction_graph
+from quant.integer import agreement, run_core
+from quant.quantise import ALL, Quantised, quantise_model, ticks
+from quant.reading.folding import simplest
+from quant.session import open_any_size, open_session, result_of
+from quant.tiling.walk import tiling_of
+
+WITHOUT_SEARCH = replace(ALL, equalise=False)
+SIDE_PX = 48
+
+
+def images(name: str, count: int = 3, side_px: int = SIDE_PX) -> list[np.ndarray]:
+    """Smooth patches with an edge, of the network's channels and size: (1, C, h, w) float32 in [0, 1]."""
+    side, generator = NETWORKS[name].side_px or side_px, np.random.default_rng(7)
+    rows, columns = np.mgrid[:side, :side] / side
+    found = []
+    for k in range(count):
+        waves = 0.3 + 0.2 * np.sin(9 * rows + k) * np.cos(7 * columns) + 0.3 * (rows + columns > 0.8 + 0.2 * k)
+        bands = [waves * share for share in np.linspace(1, 0.5, NETWORKS[name].inputs)]
+        noisy = np.stack(bands) + 0.01 * generator.standard_normal((len(bands), side, side))
+        found.append(np.clip(noisy, 0, 1).astype(np.float32)[None])
+    return found
+
+
+def float_network(name: str) -> onnx.ModelProto:
+    return simplest(to_onnx(name, build(name, torch.Generator().manual_seed(0))), name)
+
+
+@cache
+def quantised(name: str) -> Quantised:
+    seen = images(name)
+    patches = Patches([], Remade(lambda k: (seen[k], seen[k]), len(seen)), Remade(lambda k: seen[k], len(seen)))
+    ticked: list[int] = []
+    made = quantise_model(float_network(name), patches, {}, lambda: ticked.append(1), WITHOUT_SEARCH)
+    assert len(ticked) == ticks(float_network(name), len(seen), WITHOUT_SEARCH)
+    return made
+
+
+@pytest.mark.parametrize("name", NETWORKS)
+def test_int8_stays_near_float(name: str) -> None:
+    made, seen = quantised(name), images(name)[1]
+    wanted = made.core.ends.clipped(result_of(open_session(float_network(name)), seen))
+    found = result_of(open_session(made.host), seen)
+    assert found.shape == wanted.shape
+    assert np.abs(found - wanted).mean() < 0.15 * max(float(wanted.std()), 0.05)
+
+
+@pytest.mark.parametrize("name", NETWORKS)
+def test_the_integer_reference_is_the_runtime_bit_for_bit(name: str) -> None:
+    made, seen = quantised(name), images(name)[2]
+    found = agreement(made.core, made.host, seen)
+    assert [layer.report.name for layer in found.layers if layer.unequal] == []
+    whole = result_of(open_session(made.host), seen)
+    np.testing.assert_array_equal(made.core.ends.finished(seen, found.even), whole)
+
+
+@pytest.mark.parametrize("name", NETWORKS)
+def test_no_image_leaves_the_proven_bounds(name: str) -> None:
+    core = quantised(name).core
+    tensors, reports = run_core(core, core.ends.split(np.round(images(name)[0])))
+    for op, bound, report in zip(core.ops, layer_bounds(core), reports, strict=True):
+        assert max(bound.low, INT8_MIN) <= tensors[op.output].min(), op.name
+        assert tensors[op.output].max() <= min(bound.high, INT8_MAX), op.name
+        assert report.peak_bits <= report.proven_bits, op.name
+
+
+@pytest.mark.parametrize("name", NETWORKS)
+def test_a_file_is_read_back_as_the_core_it_was_written_from(name: str) -> None:
+    made = quantised(name)
+    again = read_core(made.host)
+    assert encoding_faults(made.host) == []
+    for one, other in zip(again.convolutions, made.core.convolutions, strict=True):
+        np.testing.assert_array_equal(one.weight, other.weight)
+        assert (one.window, one.groups, one.activation) == (other.window, other.groups, other.activation)
+    planes = made.core.ends.split(images(name)[0])
+    np.testing.assert_array_equal(
+        run_core(again, planes)[0]["correction"], run_core(made.core, planes)[0]["correction"]
+    )
+
+
+def test_a_weight_that_is_not_what_the_file_says_is_a_fault() -> None:
+    spoilt = onnx.ModelProto()
+    spoilt.CopyFrom(quantised("unet").host)
+    node = next(each for each in spoilt.graph.node if each.op_type == "ConvInteger")
+    node.attribute[0].ints[0] += 1
+    assert encoding_faults(spoilt) == [f"node {node.name}"]
+
+
+@pytest.mark.parametrize("name", NETWORKS)
+def test_the_core_is_legal_on_the_dpu(name: str) -> None:
+    dpu = load_dpu("vck190", None)
+    on_board = as_on_board(quantised(name).host)
+    assert legality(place(network_of(on_board, NETWORKS[name].side_px or 64), dpu)).passed
+
+
+TILED = [name for name in NETWORKS if name != "classifier"]
+
+
+@pytest.mark.parametrize("tile_px", [16, 24])
+@pytest.mark.parametrize("name", TILED)
+def test_tiles_of_int8_are_the_whole(name: str, tile_px: int) -> None:
+    model = quantised(name).host
+    tiling, seen = tiling_of(model), images(name, 1, 64)[0]
+    session = open_any_size(model)
+    whole, halo_px, scale = result_of(session, seen), tiling.halo_px, int(tiling.scale)
+    for top, left in ((0, 0), (24, 16), (64 - tile_px, 64 - tile_px)):
+        first = [max(place - halo_px, 0) for place in (top, left)]
+        tile = seen[..., first[0] : top + tile_px + halo_px, first[1] : left + tile_px + halo_px]
+        found = result_of(session, tile)
+        inner = [slice((p - f) * scale, (p - f + tile_px) * scale) for p, f in zip((top, left), first, strict=True)]
+        kept = [slice(p * scale, (p + tile_px) * scale) for p in (top, left)]
+        np.testing.assert_array_equal(found[..., inner[0], inner[1]], whole[..., kept[0], kept[1]])
+
+
+def test_what_stress_takes_is_the_plain_family() -> None:
+    with pytest.raises(ModelError, match="convolutions of stride 1"):
+        correction_graph(float_network("unet"))
