@@ -5,7 +5,7 @@ vai_q). `frac_bits` is n everywhere; a finer scale has more of them.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -116,6 +116,11 @@ class IntConv:
         """The tensors it reads."""
         return (self.input,)
 
+    @property
+    def float_bias(self) -> np.ndarray:
+        """The values (O,) float64 that the bias stands for."""
+        return np.asarray(self.bias * 2.0**-self.bias_frac_bits)
+
 
 @dataclass(frozen=True)
 class IntCore:
@@ -154,9 +159,17 @@ def build_core(
         core = _in_one_round(graph, legal, shifts, ends or Ends())
         faults = shift_faults(core, shifts)
         if not faults:
-            return core
+            return _with_biases_left(core, graph)
     remedy = "look for weights that are far too large or small"
     raise ModelError("float model", expected="values that the DPU's shifts reach", got=faults[0], remedy=remedy)
+
+
+def _with_biases_left(core: IntCore, graph: Graph) -> IntCore:
+    """What rounding the last bias leaves is known, and where a result comes in windows the host adds it."""
+    last, whole = graph[-1], core.ops[-1]
+    if not (core.ends.offsets and isinstance(last, Conv) and isinstance(whole, IntConv)):
+        return core
+    return replace(core, ends=core.ends.moved(last.bias - whole.float_bias))
 
 
 def _in_one_round(graph: Graph, frac_bits: dict[str, int], shifts: Shifts, ends: Ends) -> IntCore:

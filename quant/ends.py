@@ -3,7 +3,7 @@
 image -> pixel unshuffle -> planes -> core -> one correction of its gains or windows -> pixel shuffle -> + image
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from onnx import TensorProto, helper
@@ -46,7 +46,9 @@ class Ends:
         last: pixel shuffles of the sum.
         flat: whether the result is (N, K).
         gains: 2 where the correction's channels come twice, fine and coarse by `GAIN`.
-        outputs: channels of the correction, gains not counted.
+        outputs: channels of the correction, gains and windows not counted.
+        offsets: what each window has taken off each channel, (windows, outputs): the channels come coarse
+            by `GAIN` first, then once for each window.
     """
 
     channels: int = 1
@@ -58,6 +60,7 @@ class Ends:
     flat: bool = False
     gains: int = 1
     outputs: int = 1
+    offsets: tuple[tuple[float, ...], ...] = ()
 
     @property
     def image_channels(self) -> int:
@@ -71,11 +74,37 @@ class Ends:
         return split(image, self.planes)
 
     def merge(self, correction: np.ndarray, scale: float) -> np.ndarray:
-        """One correction (N, C, H, W) from its gains: (N, 1 or 2 C, H, W) multiples of `scale`."""
+        """One correction (N, C, H, W) from its gains or windows: (N, copies C, H, W) multiples of `scale`."""
+        if self.offsets:
+            return self._of_windows(correction, scale)
         if self.gains == 1:
             return correction
         fine, coarse = np.split(correction, 2, axis=1)
         return np.where(np.abs(fine) <= (FINE_MAX + 0.5) * scale, fine, coarse * np.float32(GAIN))
+
+    def whole(self, correction: np.ndarray) -> np.ndarray:
+        """One correction from all its copies in float, which rounding has not touched: (N, C, H, W)."""
+        first = correction[:, : self.outputs]
+        return first * np.float32(GAIN) if self.offsets else first
+
+    def _of_windows(self, correction: np.ndarray, scale: float) -> np.ndarray:
+        coarse, *windows = np.split(correction, self.copies, axis=1)
+        value = coarse * np.float32(GAIN)
+        for window, offset in zip(windows, np.array(self.offsets, np.float32), strict=True):
+            inside = np.abs(window) <= np.float32((FINE_MAX + 0.5) * scale)
+            value = np.where(inside, window + offset[:, None, None], value)
+        return value
+
+    def moved(self, left: np.ndarray) -> "Ends":
+        """With what rounding left of the biases of all channels, (copies outputs,), put into the windows' offsets."""
+        windows = np.asarray(left[self.outputs :]).reshape(-1, self.outputs)
+        offsets = np.array(self.offsets) + windows
+        return replace(self, offsets=tuple(tuple(float(each) for each in window) for window in offsets))
+
+    @property
+    def copies(self) -> int:
+        """How often the core writes each channel of its result."""
+        return 1 + len(self.offsets) if self.offsets else self.gains
 
     def restored(self, image: np.ndarray, correction: np.ndarray, scale: float) -> np.ndarray:
         """What the host makes of an image (N, C, H, W) and the core's result."""
@@ -162,8 +191,11 @@ def write_back(w: HostWriter, ends: Ends, feeds: list[str], scale: float) -> Non
         scale: the value of one unit of it.
     """
     result = "host_back.correction"
-    if ends.gains == 1:
+    if ends.copies == 1:
         w.node("DequantizeLinear", result, feeds)
+    elif ends.offsets:
+        w.node("DequantizeLinear", "host_back.all", feeds)
+        _write_windows(w, ends, scale)
     else:
         w.node("DequantizeLinear", "host_back.both", feeds)
         _write_merge(w, ends.outputs, scale)
@@ -180,6 +212,22 @@ def write_back(w: HostWriter, ends: Ends, feeds: list[str], scale: float) -> Non
             write_shuffle(w, shuffle, result, name)
     else:
         w.node("Flatten" if ends.flat else "Identity", "restored", [result], name="host_back.result")
+
+
+def _write_windows(w: HostWriter, ends: Ends, scale: float) -> None:
+    """Write the nodes that find each value in the window that holds it."""
+    names = [f"host_back.window_{k}" for k in range(ends.copies)]
+    each = w.constant("channels_each", np.full(ends.copies, ends.outputs))
+    w.nodes.append(helper.make_node("Split", ["host_back.all", each], names, axis=1, name="host_back.split"))
+    value = w.node("Mul", "host_back.wide", [names[0], w.scalar("gain", GAIN)])
+    limit = w.scalar("fine_max", (FINE_MAX + 0.5) * scale)
+    for k, (name, offset) in enumerate(zip(names[1:], ends.offsets, strict=True)):
+        taken_off = w.constant(f"offset_{k}", np.array(offset, np.float32)[None, :, None, None])
+        w.node("Abs", f"{name}.size", [name])
+        w.node("LessOrEqual", f"{name}.inside", [f"{name}.size", limit])
+        w.node("Add", f"{name}.value", [name, taken_off])
+        result = "host_back.correction" if k + 1 == len(ends.offsets) else f"{name}.chosen"
+        value = w.node("Where", result, [f"{name}.inside", f"{name}.value", value])
 
 
 def _write_merge(w: HostWriter, channels: int, scale: float) -> None:

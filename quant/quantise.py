@@ -13,7 +13,7 @@ from profiles.figures import Row
 from quant.calibration import Patches, Remade, choose_frac_bits
 from quant.core import SHIFTS, IntCore, Shifts, build_core
 from quant.encodings import board_model, host_model
-from quant.ends import Ends, ends_of
+from quant.ends import GAIN, Ends, ends_of
 from quant.gate import compare, gate_row
 from quant.graph import (
     CORRECTION,
@@ -39,11 +39,17 @@ from quant.passes.stream import (
     streams,
     takes_gains,
     two_gains,
+    window_offsets,
+    windowed,
 )
 from quant.session import crops, halo_of, open_any_size, open_session, result_of, tensor_values
 
 SEARCH_CROPS = 16
 """What the equalisation is searched on, a quarter of them with the strongest edges: there int8 clips."""
+
+
+FINER = GAIN.bit_length() - 1
+"""Fractional bits by which a window is finer than the result's own scale."""
 
 
 @dataclass(frozen=True)
@@ -85,6 +91,16 @@ class _Plan:
     shifts: Shifts
 
     @property
+    def takes_windows(self) -> bool:
+        return self.passes.dual_gain and not self.ends.adds_image and takes_gains(self.graph)
+
+    def with_windows(self, frac_bits: int, low: np.ndarray, high: np.ndarray) -> "_Plan":
+        """The result in windows from low to high (C,), finer by GAIN than its own scale of so many bits."""
+        offsets = window_offsets(low, high, 2.0 ** -(frac_bits + FINER))
+        found = tuple(tuple(float(each) for each in window) for window in offsets)
+        return replace(self, ends=replace(self.ends, offsets=found))
+
+    @property
     def shares(self) -> bool:
         return bool(self.streams) and (self.passes.shared_residual_scale or self.passes.equalise)
 
@@ -95,6 +111,8 @@ class _Plan:
         """The graph that is rounded: with the half-LSB pair and two gains where wanted."""
         if self.passes.half_lsb_pair and self.shares:
             graph = half_lsb_pair(graph, 2.0 ** -self.stream_frac_bits(frac_bits))
+        if self.ends.offsets:
+            return windowed(graph, np.array(self.ends.offsets))
         return two_gains(graph) if self.ends.gains == 2 else graph
 
     def core(self, graph: Graph, frac_bits: Mapping[str, int]) -> IntCore:
@@ -103,7 +121,9 @@ class _Plan:
         if self.shares:
             found = streams(final)
             chosen = share_stream_scale(found, frac_bits, self.stream_frac_bits(frac_bits))
-        if self.ends.gains == 2:
+        if self.ends.offsets:
+            chosen[CORRECTION] += FINER
+        elif self.ends.gains == 2:
             chosen[CORRECTION] += 1
         assert set(tensors(final)) <= set(chosen)  # noqa: S101
         return build_core(final, chosen, self.shifts, self.ends)
@@ -136,6 +156,8 @@ def quantise_model(
     plan = _plan(model, passes, shifts)
     graph, images = plan.graph, patches.degraded
     frac_bits = choose_frac_bits(graph, images, tick, passes.least_squares, plan.ends)
+    if plan.takes_windows:
+        plan = plan.with_windows(frac_bits[CORRECTION], *_result_range(plan, images, tick))
     if passes.equalise and plan.streams:
         graph = _equalised(plan, frac_bits, images, tick)
     final, core = plan.rounded(graph, frac_bits), plan.core(graph, frac_bits)
@@ -147,6 +169,17 @@ def quantise_model(
     return Quantised(
         host_model(core, about, tile_px), board_model(core, about, tile_px), core, relu_count(graph), final
     )
+
+
+def _result_range(plan: _Plan, images: Remade[np.ndarray], tick: Callable[[], None]) -> tuple[np.ndarray, np.ndarray]:
+    """The smallest and the largest value (C,) of each channel of the float network's result."""
+    session = open_session(graph_to_onnx(plan.full, [CORRECTION], plan.ends.planes * plan.ends.channels))
+    low, high = np.array(np.inf), np.array(-np.inf)
+    for image in images:
+        for (result,) in tensor_values(session, [CORRECTION], image, halo_of(plan.full), plan.ends):
+            low, high = np.minimum(low, result[0].min((1, 2))), np.maximum(high, result[0].max((1, 2)))
+        tick()
+    return low, high
 
 
 def _equalised(plan: _Plan, frac_bits: dict[str, int], images: Remade[np.ndarray], tick: Callable[[], None]) -> Graph:
@@ -171,7 +204,7 @@ def _equalised(plan: _Plan, frac_bits: dict[str, int], images: Remade[np.ndarray
 def ticks(model: onnx.ModelProto, patches: int, passes: Passes = ALL) -> int:
     """How often `quantise_model` will call `tick`."""
     plan = _plan(model, passes)
-    passings = 2 + passes.fit_weights
+    passings = 2 + passes.fit_weights + plan.takes_windows
     if not (passes.equalise and plan.streams):
         return passings * patches
     widths = channels_of(plan.graph, {PLANES: plan.ends.planes * plan.ends.channels})

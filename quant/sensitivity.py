@@ -119,7 +119,7 @@ def layer_errors(
             result, meant = _in_int8(op, core, wanted), wanted[op.output]
             if op.output == CORRECTION:  # of two gains one is coarse and the other clipped: together they count
                 result = core.ends.merge(result, core.scale(CORRECTION))
-                meant = meant[:, : core.ends.outputs]
+                meant = core.ends.whole(meant)
                 found = core.ends.finished(crop, result)
             else:
                 feed = {PLANES: planes_of(crop, core.ends), op.output: result}

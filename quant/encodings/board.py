@@ -14,7 +14,7 @@ from quant.untrusted import contradictions
 def board_model(core: IntCore, about: dict[str, str], tile_px: int | None = None) -> onnx.ModelProto:
     """`planes` (N, C, H, W) float32, as q * 2^-7, to `correction` (N, C', H', W') float32.
 
-    The correction's channels come twice where it has two gains: `quant.ends.Ends.merge` makes one of them.
+    The correction's channels come several times where it has gains or windows: `quant.ends.Ends.merge` makes one.
     """
     writer = _BoardWriter()
     writer.quantised("planes.dequantised", PLANES, core.frac_bits[PLANES])
@@ -28,7 +28,7 @@ def board_model(core: IntCore, about: dict[str, str], tile_px: int | None = None
         writer.quantised(op.output, output, core.frac_bits[op.output])
     ends = core.ends
     size = image_info(PLANES, ends.planes * ends.channels, tile_px)
-    result = image_info(CORRECTION, ends.gains * ends.outputs, tile_px)
+    result = image_info(CORRECTION, ends.copies * ends.outputs, tile_px)
     if not ends.adds_image:  # of another size than the image, perhaps
         for side, name in zip(result.type.tensor_type.shape.dim[2:], ("rows", "columns"), strict=True):
             side.dim_param = name

@@ -48,7 +48,8 @@ def described_core(text: str, constants: Mapping[str, np.ndarray]) -> IntCore:
     ops = tuple(_op(dict(op), frac_bits, constants) for op in said["ops"])
     ends = said["ends"]
     shuffles = {key: tuple(Shuffle(**each) for each in ends[key]) for key in ("front", "back", "last")}
-    return IntCore(ops, frac_bits, Ends(**{**ends, **shuffles}))
+    offsets = tuple(tuple(float(each) for each in window) for window in ends["offsets"])
+    return IntCore(ops, frac_bits, Ends(**{**ends, **shuffles, "offsets": offsets}))
 
 
 def _op(said: dict[str, Any], frac_bits: Mapping[str, int], constants: Mapping[str, np.ndarray]) -> IntConv | Op:

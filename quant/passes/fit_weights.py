@@ -15,7 +15,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 
 from quant.core import INT8_MAX, INT8_MIN, SHIFTS, IntConv, IntCore, Shifts, quantise_bias
 from quant.ends import ONE_CHANNEL, Ends
-from quant.graph import PLANES, Conv, Graph, graph_to_onnx, tensors
+from quant.graph import CORRECTION, PLANES, Conv, Graph, Op, graph_to_onnx, tensors
 from quant.session import crops, halo_of, open_session, planes_of, tensor_values
 
 EVERY_PX = 4
@@ -105,13 +105,16 @@ def fit_weights(graph: Graph, core: IntCore, moments: Mapping[str, Moments], shi
         shifts: the windows of the target.
     """
     pairs = zip(graph, core.ops, strict=True)
-    ops = [
-        _fit(op, whole, core.frac_bits[whole.input], moments[op.name], shifts)
-        if isinstance(op, Conv) and isinstance(whole, IntConv) and _enough(moments.get(op.name))
-        else whole
-        for op, whole in pairs
-    ]
-    return replace(core, ops=tuple(ops))
+    ops, ends = list[IntConv | Op](), core.ends
+    for op, whole in pairs:
+        if isinstance(op, Conv) and isinstance(whole, IntConv) and _enough(moments.get(op.name)):
+            fitted, shifted = _fit(op, whole, core.frac_bits[whole.input], moments[op.name], shifts)
+            if op.output == CORRECTION and ends.offsets:  # the biases left over are others now
+                ends = ends.moved(whole.float_bias - shifted - fitted.float_bias)
+            ops.append(fitted)
+        else:
+            ops.append(whole)
+    return replace(core, ops=tuple(ops), ends=ends)
 
 
 def _enough(moments: Moments | None) -> bool:
@@ -119,10 +122,13 @@ def _enough(moments: Moments | None) -> bool:
     return moments is not None and moments.count > len(moments.total)
 
 
-def _fit(op: Conv, whole: IntConv, input_frac_bits: int, moments: Moments, shifts: Shifts) -> IntConv:
+def _fit(
+    op: Conv, whole: IntConv, input_frac_bits: int, moments: Moments, shifts: Shifts
+) -> tuple[IntConv, np.ndarray]:
+    """The fitted convolution, and by how much its weights raise the mean results, (O,): what its bias takes off."""
     weight, shifted = fit(op.weight, whole.weight, np.array([2.0**-whole.weight_frac_bits]), moments)
     bias, bias_frac_bits = quantise_bias(op.bias - shifted, whole.weight_frac_bits + input_frac_bits, shifts)
-    return replace(whole, weight=weight, bias=bias, bias_frac_bits=bias_frac_bits)
+    return replace(whole, weight=weight, bias=bias, bias_frac_bits=bias_frac_bits), shifted
 
 
 def fit(

@@ -2,7 +2,8 @@
 
 One scale for the whole stream makes its adds exact. Two copies of the last stream tensor, rounded half a step
 apart, together hold nine bits. Two gains for the correction: a fine one for nearly all pixels, a coarse one for the
-strongest edges.
+strongest edges. Windows for a result that nothing is added to: fine ones side by side over all that it can be, and a
+coarse one for what lies outside.
 """
 
 from collections.abc import Iterable, Mapping
@@ -10,7 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from quant.ends import GAIN
+from quant.ends import FINE_MAX, GAIN
 from quant.graph import CORRECTION, PLANES, Activation, Add, Conv, Graph
 from quant.graph.operations import united
 
@@ -103,6 +104,25 @@ def two_gains(graph: Graph) -> Graph:
     weight = np.concatenate([last.weight, last.weight / GAIN])
     bias = np.concatenate([last.bias, last.bias / GAIN])
     return (*graph[:-1], replace(last, weight=weight.astype(np.float32), bias=bias.astype(np.float32)))
+
+
+def windowed(graph: Graph, offsets: np.ndarray) -> Graph:
+    """The graph whose last convolution writes its channels coarse by GAIN, then less each of the offsets (W, C)."""
+    last = graph[-1]
+    assert isinstance(last, Conv)  # noqa: S101 - takes_gains has seen to it
+    weight = np.concatenate([last.weight / GAIN, *[last.weight] * len(offsets)])
+    bias = np.concatenate([last.bias / GAIN, *(last.bias - offset for offset in offsets)])
+    return (*graph[:-1], replace(last, weight=weight.astype(np.float32), bias=bias.astype(np.float32)))
+
+
+MAX_WINDOWS = 8
+
+
+def window_offsets(low: np.ndarray, high: np.ndarray, unit: float) -> np.ndarray:
+    """The middles (W, C) of as many windows of int8, its step `unit`, as hold values from low to high, (C,) each."""
+    count = int(np.clip(np.ceil((high - low).max() / (2 * FINE_MAX * unit)), 1, MAX_WINDOWS))
+    shares = (np.arange(count)[:, None] + 0.5) / count
+    return np.asarray(low + shares * (high - low))
 
 
 def takes_gains(graph: Graph) -> bool:

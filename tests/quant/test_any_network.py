@@ -20,6 +20,7 @@ from quant.core import INT8_MAX, INT8_MIN
 from quant.encodings import as_on_board, encoding_faults, read_core
 from quant.graph import correction_graph
 from quant.integer import agreement, run_core
+from quant.onnx_file import GraphWriter, image_info, make_model
 from quant.quantise import ALL, Quantised, quantise_model, ticks
 from quant.reading.folding import simplest
 from quant.session import open_any_size, open_session, result_of
@@ -130,6 +131,27 @@ def test_tiles_of_int8_are_the_whole(name: str, tile_px: int) -> None:
         inner = [slice((p - f) * scale, (p - f + tile_px) * scale) for p, f in zip((top, left), first, strict=True)]
         kept = [slice(p * scale, (p + tile_px) * scale) for p in (top, left)]
         np.testing.assert_array_equal(found[..., inner[0], inner[1]], whole[..., kept[0], kept[1]])
+
+
+def one_convolution(weight: float, bias: float) -> onnx.ModelProto:
+    """image * weight + bias, without a global add."""
+    writer = GraphWriter()
+    weights = writer.constant("w", np.full((1, 1, 1, 1), weight, np.float32))
+    writer.node("Conv", "restored", ["image", weights, writer.constant("b", np.full(1, bias, np.float32))], "c")
+    return make_model(writer.graph("one", [image_info("image", 1, None)], [image_info("restored", 1, None)]), {})
+
+
+@pytest.mark.parametrize(("weight", "bias"), [(1.0, 0.0), (-0.7, 0.93), (0.4, -0.31)])
+def test_windows_make_a_result_finer_than_8_bits(weight: float, bias: float) -> None:
+    seen = images("ffdnet")
+    patches = Patches([], Remade(lambda k: (seen[k], seen[k]), len(seen)), Remade(lambda k: seen[k], len(seen)))
+    model, errors = one_convolution(weight, bias), []
+    for passes in (ALL, replace(ALL, dual_gain=False)):
+        made = quantise_model(model, patches, {}, lambda: None, passes)
+        wanted = result_of(open_session(model), seen[0])
+        errors.append(float(np.abs(result_of(open_session(made.host), seen[0]) - wanted).mean()))
+        assert encoding_faults(made.host) == []
+    assert errors[0] < 0.4 * errors[1]
 
 
 def test_what_stress_takes_is_the_plain_family() -> None:
