@@ -33,13 +33,14 @@ from deploy.restoration.plan import Plan, Span, check_memory, is_bulky, plan_for
 from deploy.restoration.runtime import open_runtime, tiles_at_once
 from deploy.restoration.source import Source, fingerprint, open_source
 from deploy.restoration.workers import make_work, rows_of_workers
-from model.io.files import require_writable, sha256
+from model.io.files import require_writable
 from model.io.images import settled_scale
 from model.processor import require_cores
 from model.progress import held_back, steps
 from profiles.errors import BeersError, ImageError, MachineError
 from profiles.figures import Figure, Row, measured, predicted, unavailable
 from quant.onnx_file import load_onnx
+from quant.reading.external import network_sha256
 
 RUNS_UNTIL_STEADY = 2
 """Of each tile in work at a time: then a runtime takes no more memory."""
@@ -122,7 +123,7 @@ def _job(image: Path, options: Options, plan: Plan, runtime: str, full_scale: fl
     """All that decides the pixels, as the journal keeps it; who computes, on how many machines, is no part of it."""
     return {
         "image": [*fingerprint(image), image.stat().st_mtime_ns],
-        "model": sha256(options.model),
+        "model": network_sha256(options.model),
         "tile_px": plan.tile_px,
         "halo_px": plan.halo_px,
         "full_scale": full_scale,

@@ -35,6 +35,7 @@ from quant.free import free_ticks, quantise_free
 from quant.onnx_file import is_quantised, load_onnx, metadata, save_onnx
 from quant.passes.equalise import search_steps
 from quant.quantise import SEARCH_CROPS, quantise_model, ticks
+from quant.reading.external import network_sha256
 from quant.tiling.walk import Tiling, tiling_of
 
 PAPER = VARIANTS["convbeers"]
@@ -259,8 +260,8 @@ class MethodStore:
             return f"{variant.method} {self.degraded!r} {self.reference!r} {code_digest(*CHAINS)}"
         path = self.int8_file(variant)
         if path is None:
-            return sha256(self.networks[variant.method].float_file or Path())
-        return path.name if self.makes(variant) else sha256(path)
+            return network_sha256(self.networks[variant.method].float_file or Path())
+        return path.name if self.makes(variant) else network_sha256(path)
 
     def makes(self, variant: Variant) -> bool:
         """Whether its INT8 file is made here."""
@@ -276,7 +277,10 @@ class MethodStore:
             return None
         if not self.makes(variant):
             return network.int8_file
-        key = {"float": sha256(network.float_file or Path()), **self.calibration.key(self.model(variant.method))}
+        key = {
+            "float": network_sha256(network.float_file or Path()),
+            **self.calibration.key(self.model(variant.method)),
+        }
         key |= {"precision": variant.precision, "code": code_digest(*MAKING)}
         return self.cache.path(variant.precision.replace(" ", "-").lower(), key, "onnx")
 

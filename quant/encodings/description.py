@@ -17,6 +17,8 @@ from quant.ends import Ends
 from quant.graph import Activation, Add, AveragePool, Concat, MaxPool, Mul, Op, Pointwise, Resize, Shuffle, Window
 
 KEY = "core"
+LARGEST = 4096
+"""The DPU has no more channels; windows, strides and factors are smaller still."""
 KINDS: dict[str, type] = {
     kind.__name__: kind for kind in (IntConv, Add, Mul, Concat, MaxPool, AveragePool, Resize, Shuffle, Pointwise)
 }
@@ -44,12 +46,26 @@ def described_core(text: str, constants: Mapping[str, np.ndarray]) -> IntCore:
         LookupError, TypeError, ValueError: a description that contradicts itself or them.
     """
     said = json.loads(text)
+    _require_small(said)
     frac_bits = {str(name): int(bits) for name, bits in said["frac_bits"].items()}
     ops = tuple(_op(dict(op), frac_bits, constants) for op in said["ops"])
     ends = said["ends"]
     shuffles = {key: tuple(Shuffle(**each) for each in ends[key]) for key in ("front", "back", "last")}
     offsets = tuple(tuple(float(each) for each in window) for window in ends["offsets"])
-    return IntCore(ops, frac_bits, Ends(**{**ends, **shuffles, "offsets": offsets}))
+    counts = {key: int(ends[key]) for key in ("channels", "planes", "gains", "outputs")}
+    return IntCore(ops, frac_bits, Ends(**{**ends, **counts, **shuffles, "offsets": offsets}))
+
+
+def _require_small(said: object) -> None:
+    """Numbers that size something are looked at before anything is made of them.
+
+    Raises:
+        ValueError: one beyond what a network of the DPU's has.
+    """
+    for each in said.values() if isinstance(said, dict) else said if isinstance(said, list) else ():
+        _require_small(each)
+    if isinstance(said, int | float) and not abs(said) <= LARGEST:
+        raise ValueError(f"a size of {said}")
 
 
 def _op(said: dict[str, Any], frac_bits: Mapping[str, int], constants: Mapping[str, np.ndarray]) -> IntConv | Op:

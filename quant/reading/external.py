@@ -4,12 +4,15 @@ Exporters write one for large networks, torch's newer one for all. Only initiali
 that it lies elsewhere is refused by `quant.untrusted.check_content`, which looks at all of it afterwards.
 """
 
+import hashlib
 import math
 from pathlib import Path, PurePosixPath
 
 import onnx
+from google.protobuf.message import DecodeError
 from onnx import TensorProto
 
+from model.io.files import sha256
 from profiles.errors import ModelError
 from profiles.toml import unreadable
 from quant.untrusted import FIELDS, FILE_BYTES, check_size, refused
@@ -32,9 +35,31 @@ def take_in(model: onnx.ModelProto, path: Path) -> None:
             tensor.raw_data = content
 
 
+def network_sha256(path: Path) -> str:
+    """SHA-256 of a network's file, and of the files beside it that its weights are in.
+
+    Raises:
+        ModelError: weights elsewhere than beside it.
+    """
+    own = sha256(path)
+    if path.suffix != ".onnx":
+        return own
+    try:
+        model = onnx.load(path, load_external_data=False)
+    except (DecodeError, OSError, ValueError):  # no network: whoever reads it says so
+        return own
+    apart = [tensor for tensor in model.graph.initializer if tensor.external_data]
+    beside = sorted({_beside(tensor, _said(tensor).get("location", ""), path) for tensor in apart})
+    return hashlib.sha256("".join([own, *map(sha256, beside)]).encode()).hexdigest() if beside else own
+
+
+def _said(tensor: TensorProto) -> dict[str, str]:
+    return {entry.key: entry.value for entry in tensor.external_data}
+
+
 def _content(tensor: TensorProto, path: Path, limit_bytes: int) -> bytes:
     """The bytes of one tensor, as many as its sizes ask for."""
-    said = {entry.key: entry.value for entry in tensor.external_data}
+    said = _said(tensor)
     where = str(path)
     check_size(tensor.name, tensor.dims, where)
     if tensor.data_type not in FIELDS or min(tensor.dims, default=0) < 0:

@@ -1,7 +1,11 @@
 """Networks of users: quantised, held to the integer reference bit for bit, bounded, read back, and tiled."""
 
+import json
+from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import replace
 from functools import cache
+from typing import Any
 
 import numpy as np
 import onnx
@@ -18,6 +22,7 @@ from quant.bounds import layer_bounds
 from quant.calibration import Patches, Remade
 from quant.core import INT8_MAX, INT8_MIN
 from quant.encodings import as_on_board, encoding_faults, read_core
+from quant.encodings.description import KEY
 from quant.graph import correction_graph
 from quant.integer import agreement, run_core
 from quant.onnx_file import GraphWriter, image_info, make_model
@@ -105,6 +110,31 @@ def test_a_weight_that_is_not_what_the_file_says_is_a_fault() -> None:
     node = next(each for each in spoilt.graph.node if each.op_type == "ConvInteger")
     node.attribute[0].ints[0] += 1
     assert encoding_faults(spoilt) == [f"node {node.name}"]
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda said: said["ops"][0].update(kind="Sort"),
+        lambda said: said["ops"][0]["window"].update(strides=[10**9, 10**9]),
+        lambda said: said["ends"].update(planes="three"),
+        lambda said: said["frac_bits"].update(planes=10**9),
+        lambda said: said["ops"][0].pop("weight"),
+        lambda said: said.pop("ends"),
+        lambda said: said["ops"].clear(),
+    ],
+)
+def test_a_description_of_something_else_is_one_sentence(change: Callable[[dict[str, Any]], object]) -> None:
+    spoilt = onnx.ModelProto()
+    spoilt.CopyFrom(quantised("unet").host)
+    entry = next(each for each in spoilt.metadata_props if each.key == KEY)
+    said = json.loads(entry.value)
+    change(said)
+    entry.value = json.dumps(said)
+    with suppress(ModelError):  # read or refused, by nothing else
+        assert encoding_faults(spoilt)
+    with suppress(ModelError):
+        as_on_board(spoilt)
 
 
 @pytest.mark.parametrize("name", NETWORKS)

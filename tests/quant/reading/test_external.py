@@ -9,9 +9,10 @@ import onnx
 import pytest
 from onnx import TensorProto
 
+from model.io.files import sha256
 from profiles.errors import ModelError
 from quant.onnx_file import load_onnx
-from quant.reading.external import take_in
+from quant.reading.external import network_sha256, take_in
 from quant.session import open_session, run
 from tests.deploy.dpu.graphs import float_convbeers
 
@@ -138,3 +139,14 @@ def test_constants_of_nodes_are_not_looked_for(saved: Path) -> None:
         model.graph.node.insert(0, onnx.helper.make_node("Constant", [], ["c"], value=tensor))
 
     assert "another file" in refused(rewritten(saved, change))
+
+
+def test_a_digest_tells_networks_apart_that_differ_in_the_file_beside_alone(saved: Path) -> None:
+    before, own = network_sha256(saved), sha256(saved)
+    assert before != own
+    beside = saved.parent / "weights.bin"
+    beside.write_bytes(beside.read_bytes()[::-1])
+    assert sha256(saved) == own
+    assert network_sha256(saved) != before
+    whole = saved.parents[1] / "whole.onnx"
+    assert network_sha256(whole) == sha256(whole)
