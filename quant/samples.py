@@ -111,7 +111,7 @@ def _archive(path: Path) -> tuple[np.ndarray, np.ndarray]:
     if got is not None:
         raise ImageError(str(path), expected="a .npz file", got=got, remedy="check the path")
     try:
-        with np.load(path, allow_pickle=False) as held:
+        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as held:
             names = list(held.files)
             image = "image" if "image" in names else names[0] if len(names) == 1 else None
             if image is None:

@@ -1,0 +1,123 @@
+"""A user's own samples: read as the network takes them, cut, split, or refused in a sentence."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import onnx
+import pytest
+import tifffile
+from onnx import TensorProto, helper
+
+from profiles.errors import ImageError, OptionError
+from quant.onnx_file import GraphWriter, image_info, make_model
+from quant.samples import read_samples, samples_of, split_samples
+
+RAMP = np.linspace(0, 1, 3 * 2 * 150 * 137, dtype=np.float32).reshape(3, 2, 150, 137)
+
+
+def test_large_samples_are_cut_to_patches_on_the_lattice(tmp_path: Path) -> None:
+    np.save(tmp_path / "ramp.npy", RAMP)
+    found = read_samples(tmp_path / "ramp.npy", 2, None, 4)
+    assert [image.shape for image in found.degraded] == [(1, 2, 128, 128)] * 3
+    np.testing.assert_array_equal(found.degraded[1][0], RAMP[1, :, :128, :128])
+    np.save(tmp_path / "small.npy", RAMP[:, :, :50, :37])
+    assert read_samples(tmp_path / "small.npy", 2, None, 4).degraded[0].shape == (1, 2, 48, 36)
+    assert len(read_samples(tmp_path / "ramp.npy", 2, 32).pairs) == 3 * 4 * 4
+
+
+def test_references_stay_with_their_images(tmp_path: Path) -> None:
+    np.savez(tmp_path / "both.npz", image=RAMP[:, :1, :20, :24], reference=RAMP[:, :1, :40, :48])
+    for (image, reference), whole in zip(read_samples(tmp_path / "both.npz", 1, None).pairs, RAMP, strict=True):
+        np.testing.assert_array_equal(image[0], whole[:1, :20, :24])
+        np.testing.assert_array_equal(reference[0], whole[:1, :40, :48])
+
+
+@pytest.mark.parametrize(("kind", "full_scale"), [(np.uint8, 255), (np.uint16, 4095)])
+def test_a_folder_holds_images_and_arrays(kind: type[np.generic], full_scale: int, tmp_path: Path) -> None:
+    pixels = (np.arange(40 * 30).reshape(40, 30) % full_scale).astype(kind)
+    tifffile.imwrite(tmp_path / "a.tif", pixels)
+    np.save(tmp_path / "b.npy", RAMP[0, :1, :40, :30])
+    (tmp_path / "notes.txt").write_text("of no matter")
+    first, second = read_samples(tmp_path, 1, None).degraded
+    np.testing.assert_allclose(first[0, 0] * full_scale, pixels, atol=1e-3)
+    np.testing.assert_array_equal(second[0], RAMP[0, :1, :40, :30])
+
+
+def test_every_fourth_sample_is_kept_from_calibration(tmp_path: Path) -> None:
+    np.save(tmp_path / "nine.npy", np.arange(9, dtype=np.float32).reshape(9, 1, 1, 1).repeat(8, 2).repeat(8, 3) / 9)
+    seen, unseen = split_samples(read_samples(tmp_path / "nine.npy", 1, None))
+    assert [round(9 * float(image[0, 0, 0, 0])) for image in unseen.degraded] == [3, 7]
+    assert len(seen.pairs) == 7
+    assert seen.digest != unseen.digest
+    few = read_samples(tmp_path / "nine.npy", 1, None, 8)
+    assert split_samples(split_samples(few)[1])[0].digest == split_samples(few)[1].digest
+
+
+def of(array: np.ndarray) -> Callable[[Path], Path]:
+    def write(folder: Path) -> Path:
+        np.save(folder / "x.npy", array)
+        return folder / "x.npy"
+
+    return write
+
+
+def pickled(folder: Path) -> Path:
+    np.save(folder / "x.npy", np.array([{"a": 1}], dtype=object), allow_pickle=True)
+    return folder / "x.npy"
+
+
+def two_arrays(folder: Path) -> Path:
+    np.savez(folder / "x.npz", first=RAMP, second=RAMP)
+    return folder / "x.npz"
+
+
+def cut_off(folder: Path) -> Path:
+    np.savez(folder / "x.npz", image=RAMP)
+    content = (folder / "x.npz").read_bytes()
+    (folder / "x.npz").write_bytes(content[: len(content) // 2])
+    return folder / "x.npz"
+
+
+@pytest.mark.parametrize(
+    ("write", "said"),
+    [
+        (of(RAMP), "expected 1 channels"),
+        (of(RAMP[:, :1] * 300), "values in"),
+        (of(np.full((1, 1, 9, 9), np.nan)), "got nan"),
+        (of(RAMP[0, 0]), "a batch of"),
+        (of(RAMP[:, :1, :3, :3]), "at least 4 pixels"),
+        (of(RAMP[:0, :1]), "at least one sample"),
+        (of(RAMP[:, :1].astype(np.complex64)), "numbers"),
+        (pickled, "a .npy file of numbers"),
+        (two_arrays, "got first, second"),
+        (cut_off, "a .npz file of numbers"),
+        (lambda folder: folder / "missing.npy", "no such file"),
+        (lambda folder: folder, "at least one sample"),
+    ],
+)
+def test_what_are_no_samples_is_refused(write: Callable[[Path], Path], said: str, tmp_path: Path) -> None:
+    with pytest.raises(ImageError, match=said):
+        read_samples(write(tmp_path), 1, None, 4)
+
+
+def network(channels: int) -> onnx.ModelProto:
+    writer = GraphWriter()
+    writer.node("Relu", "restored", ["image"])
+    ends = [image_info("image", channels, None)], [image_info("restored", channels, None)]
+    return make_model(writer.graph("none", *ends), {})
+
+
+def test_networks_that_simulated_patches_do_not_suit_ask_for_samples(tmp_path: Path) -> None:
+    assert samples_of(network(1), None) is None
+    with pytest.raises(OptionError, match="4 channels"):
+        samples_of(network(4), None)
+    found = samples_of(network(4), tmp_path)
+    assert found is not None
+    assert (found.channels, found.fixed_px, found.multiple_px) == (4, None, 1)
+    pooled = network(1)
+    pooled.graph.node[0].op_type = "GlobalAveragePool"
+    for value in (*pooled.graph.input, *pooled.graph.output):
+        value.CopyFrom(helper.make_tensor_value_info(value.name, TensorProto.FLOAT, ["N", 1, 32, 32]))
+    with pytest.raises(OptionError, match="32 x 32 pixels alone"):
+        samples_of(pooled, None)
