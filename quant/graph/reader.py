@@ -160,11 +160,10 @@ class _Reader:
         if node.op_type in ACTIVATIONS:
             self._activation(node)
             return
-        reader: Callable[[_Node], Op | None] | None = getattr(self, f"_{node.op_type.lower()}", None)
-        if reader is None:
+        if node.op_type not in READERS:
             remedy = "replace it by one that the DPU computes, or cut the network in front of it"
             raise refused_graph("operations that a DPU computes", f"{node.op_type} {node.name}", remedy)
-        op = reader(node)
+        op = READERS[node.op_type](self, node)
         if op is not None:
             self.ops.append(op)
 
@@ -195,8 +194,12 @@ class _Reader:
 
     def _convtranspose(self, node: _Node) -> Op:
         weight, bias = self._weights(node)
-        plain = int(node.given.get("group", 1)) == 1 and not any(node.given.get("output_padding", [0]))
+        given, strides = node.given, node.given.get("strides", [1, 1])
+        plain = int(given.get("group", 1)) == 1 and not any(given.get("output_padding", [0]))
         self._require(plain, node, "transposed convolutions of one group, without output padding", "another")
+        even = set(given.get("dilations", [1])) == {1} and len(set(strides)) == 1 and "output_shape" not in given
+        self._require(even, node, "transposed convolutions of one stride, undilated, sized by it", f"{list(strides)}")
+        self._require(given.get("auto_pad", b"NOTSET") == b"NOTSET", node, "stated pads", "auto_pad")
         weight = np.ascontiguousarray(weight.swapaxes(0, 1))
         bias = np.zeros(len(weight)) if bias is None else bias
         window = self._window(node, (weight.shape[2], weight.shape[3]))
@@ -305,7 +308,10 @@ class _Reader:
             half = where in ("half_pixel", "pytorch_half_pixel") and factor in (2, 4)
             self._require(half, node, "bilinear by 2 or 4 with half-pixel centres", f"{where} by {factor:g}")
         else:
-            self._require(mode == "nearest" and where != "align_corners", node, "nearest or bilinear", mode)
+            rounding = node.given.get("nearest_mode", b"round_prefer_floor").decode()
+            blocks = mode == "nearest" and _makes_blocks(int(factor), where, rounding)
+            expected = "a nearest resize that makes a block of each pixel"
+            self._require(blocks, node, expected, f"{mode}, {where}, {rounding} by {factor:g}")
         return Resize(node.name, node.input[0], node.output[0], int(factor), mode == "linear")
 
     def _upsample(self, node: _Node) -> Op:
@@ -355,11 +361,9 @@ class _Reader:
         model = helper.make_model(graph, opset_imports=self.model.opset_import)
         try:
             (moved,) = ReferenceEvaluator(model).run(None, {shuffle.input: numbered})
-        except ValueError:  # sizes that do not fit this block
+        except Exception:  # noqa: BLE001 - sizes that do not fit this block fail in many ways
             return False
         return bool(np.array_equal(moved, shuffle(numbered)))
-
-    _reshape = _transpose = _squeeze = _unsqueeze = _move
 
     def _activation(self, node: _Node) -> None:
         activation = self._which(node)
@@ -388,6 +392,25 @@ class _Reader:
         return activation
 
 
+READERS: dict[str, Callable[[_Reader, _Node], Op | None]] = {
+    "Add": _Reader._add,
+    "AveragePool": _Reader._averagepool,
+    "BatchNormalization": _Reader._batchnormalization,
+    "Concat": _Reader._concat,
+    "Conv": _Reader._conv,
+    "ConvTranspose": _Reader._convtranspose,
+    "DepthToSpace": _Reader._depthtospace,
+    "Flatten": _Reader._flatten,
+    "GlobalAveragePool": _Reader._globalaveragepool,
+    "MaxPool": _Reader._maxpool,
+    "Mul": _Reader._mul,
+    "Resize": _Reader._resize,
+    "SpaceToDepth": _Reader._spacetodepth,
+    "Sub": _Reader._sub,
+    "Upsample": _Reader._upsample,
+    **dict.fromkeys(MOVES, _Reader._move),
+}
+
 ACTIVATIONS = {
     "Relu": Activation.relu,
     "Clip": Activation.relu6,
@@ -395,6 +418,29 @@ ACTIVATIONS = {
     "HardSigmoid": Activation.hard_sigmoid,
     "HardSwish": Activation.hard_swish,
 }
+
+
+PLACES: dict[str, Callable[[np.ndarray, int], np.ndarray]] = {
+    "asymmetric": lambda place, factor: place / factor,
+    "half_pixel": lambda place, factor: (place + 0.5) / factor - 0.5,
+    "pytorch_half_pixel": lambda place, factor: (place + 0.5) / factor - 0.5,
+    "tf_half_pixel_for_nn": lambda place, factor: (place + 0.5) / factor,
+}
+ROUNDINGS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
+    "floor": np.floor,
+    "ceil": np.ceil,
+    "round_prefer_floor": lambda place: np.ceil(place - 0.5),
+    "round_prefer_ceil": lambda place: np.floor(place + 0.5),
+}
+
+
+def _makes_blocks(factor: int, where: str, rounding: str) -> bool:
+    """Whether ONNX's coordinates, so rounded, give each pixel of the result the one whose block it lies in."""
+    if where not in PLACES or rounding not in ROUNDINGS:
+        return False
+    place = np.arange(4 * factor)
+    nearest = np.clip(ROUNDINGS[rounding](PLACES[where](place, factor)), 0, 3)
+    return bool((nearest == place // factor).all())
 
 
 def _pair(values: list[int]) -> Pair:

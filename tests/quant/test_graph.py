@@ -1,11 +1,15 @@
+from collections.abc import Callable
+from typing import Any
+
 import numpy as np
 import onnx
 import pytest
 from onnx import helper
 
 from profiles.errors import ModelError
-from quant.graph import CORRECTION, IMAGE, Add, Conv, correction_graph, relu_count
-from quant.onnx_file import image_info, make_model
+from quant.graph import CORRECTION, IMAGE, Add, Conv, Resize, correction_graph, read_network, relu_count
+from quant.onnx_file import GraphWriter, image_info, make_model
+from quant.session import open_session, result_of
 
 
 def test_the_global_add_is_left_to_the_host(float_onnx: onnx.ModelProto) -> None:
@@ -50,3 +54,59 @@ def test_weights_are_read_as_stored(float_onnx: onnx.ModelProto) -> None:
     assert isinstance(first, Conv)
     stored = next(t for t in float_onnx.graph.initializer if t.name == "head.weight")
     np.testing.assert_array_equal(first.weight, onnx.numpy_helper.to_array(stored))
+
+
+def of_one(write: Callable[[GraphWriter], object]) -> onnx.ModelProto:
+    """A convolution, and behind it what `write` writes from `x` to `restored`."""
+    writer = GraphWriter()
+    weight = writer.constant("w", np.ones((2, 1, 1, 1), np.float32))
+    writer.node("Conv", "x", ["image", weight], "first")
+    write(writer)
+    result = helper.make_tensor_value_info("restored", onnx.TensorProto.FLOAT, ["N", 2, "rows", "columns"])
+    return make_model(writer.graph("g", [image_info("image", 1, None)], [result]), {})
+
+
+@pytest.mark.parametrize("factor", [2, 3, 4])
+@pytest.mark.parametrize("rounding", ["floor", "ceil", "round_prefer_floor", "round_prefer_ceil"])
+@pytest.mark.parametrize("where", ["asymmetric", "half_pixel", "pytorch_half_pixel", "align_corners"])
+def test_a_nearest_resize_is_taken_where_it_makes_blocks(where: str, rounding: str, factor: int) -> None:
+    def write(w: GraphWriter) -> None:
+        how = {"mode": "nearest", "coordinate_transformation_mode": where, "nearest_mode": rounding}
+        w.node(
+            "Resize", "restored", ["x", "", w.constant("s", np.array([1, 1, factor, factor], np.float32))], "r", **how
+        )
+
+    model, pixels = of_one(write), np.random.default_rng(0).random((1, 1, 5, 7), np.float32)
+    found = result_of(open_session(model), pixels)[:, :1]
+    # With aligned corners the places depend on the image's size: right for this one is not right for all.
+    if where != "align_corners" and np.array_equal(found, pixels.repeat(factor, 2).repeat(factor, 3)):
+        last = read_network(model).graph[-1]
+        assert isinstance(last, Resize)
+        assert last.factor == factor
+    else:
+        with pytest.raises(ModelError, match="a block of each pixel"):
+            read_network(model)
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        ({"strides": [2, 1]}, "one stride"),
+        ({"strides": [2, 2], "dilations": [2, 2]}, "one stride"),
+        ({"strides": [2, 2], "output_padding": [1, 1]}, "output padding"),
+        ({"strides": [2, 2], "auto_pad": "SAME_UPPER"}, "stated pads"),
+    ],
+)
+def test_transposed_convolutions_that_the_dpu_lacks_are_refused(given: dict[str, Any], said: str) -> None:
+    def write(w: GraphWriter) -> None:
+        w.node("ConvTranspose", "restored", ["x", w.constant("t", np.ones((2, 2, 2, 2), np.float32))], "up", **given)
+
+    with pytest.raises(ModelError, match=f"{said}.* at ConvTranspose up"):
+        read_network(of_one(write))
+
+
+def test_two_outputs_are_refused_by_name() -> None:
+    model = of_one(lambda w: w.node("Relu", "restored", ["x"]))
+    model.graph.output.append(helper.make_tensor_value_info("x", onnx.TensorProto.FLOAT, ["N", 2, "H", "W"]))
+    with pytest.raises(ModelError, match="one output, got 2: restored, x"):
+        read_network(model)
