@@ -20,7 +20,6 @@ from quant.graph import (
     Network,
     Shuffle,
     channels_of,
-    plane_count,
     split,
 )
 from quant.graph.writer import write_shuffle
@@ -134,7 +133,7 @@ def ends_of(network: Network, gains: int = 1) -> Ends:
     """The ends of a network whose correction comes in so many gains."""
     kept = network.front, network.back, network.adds_image, network.last, network.flat
     outputs = channels_of(network.graph, {IMAGE: network.core_channels})[CORRECTION]
-    return Ends(network.core_channels, plane_count(network.graph), *kept, gains, outputs)
+    return Ends(network.core_channels, COUNT, *kept, gains, outputs)
 
 
 class HostWriter(GraphWriter):
@@ -167,18 +166,14 @@ def write_front(w: HostWriter, ends: Ends) -> None:
     w.node("Mul", "host_front.steps", ["host_front.dn", w.scalar("one_step", 1 / STEP)])
     w.node("Round", "host_front.whole_steps", ["host_front.steps"])
     w.node("Min", "host_front.coarse", ["host_front.whole_steps", w.scalar("coarse_max", COARSE_MAX)])
-    planes = "host_front.coarse" if ends.planes == 1 else _write_remainder(w)
-    w.node("Add", "host_front.offset", [planes, w.scalar("offset", ZERO)])
-    w.node("Cast", PLANES, ["host_front.offset"], to=TensorProto.UINT8)
-
-
-def _write_remainder(w: HostWriter) -> str:
     w.node("Mul", "host_front.coarse_dn", ["host_front.coarse", w.scalar("step", STEP)])
     w.node("Sub", "host_front.remainder", ["host_front.dn", "host_front.coarse_dn"])
     w.node("Mul", "host_front.quarters", ["host_front.remainder", w.scalar("one_quarter", 1 / QUARTER)])
     w.node("Round", "host_front.quarter", ["host_front.quarters"])
     planes = ["host_front.coarse", "host_front.remainder", "host_front.quarter"]
-    return w.node("Concat", "host_front.planes", planes, axis=1)
+    w.node("Concat", "host_front.planes", planes, axis=1)
+    w.node("Add", "host_front.offset", ["host_front.planes", w.scalar("offset", ZERO)])
+    w.node("Cast", PLANES, ["host_front.offset"], to=TensorProto.UINT8)
 
 
 def write_back(w: HostWriter, ends: Ends, feeds: list[str], scale: float) -> None:

@@ -31,6 +31,7 @@ from quant.onnx_file import fixed_tile_px, metadata
 from quant.passes.equalise import LEVELLING, Costs, channel_ranges, equalise, first_guess, search, search_steps
 from quant.passes.fit_weights import fit_weights, input_moments
 from quant.passes.stream import (
+    MAX_CHANNELS,
     STREAM_FRAC_BITS,
     Stream,
     common_frac_bits,
@@ -92,7 +93,8 @@ class _Plan:
 
     @property
     def takes_windows(self) -> bool:
-        return self.passes.dual_gain and not self.ends.adds_image and takes_gains(self.graph)
+        room = self.ends.outputs <= MAX_CHANNELS // 2
+        return self.passes.dual_gain and not self.ends.adds_image and takes_gains(self.graph) and room
 
     def with_windows(self, frac_bits: int, low: np.ndarray, high: np.ndarray) -> "_Plan":
         """The result in windows from low to high (C,), finer by GAIN than its own scale of so many bits."""
@@ -213,7 +215,7 @@ def ticks(model: onnx.ModelProto, patches: int, passes: Passes = ALL) -> int:
 
 
 Targets = list[tuple[np.ndarray, np.ndarray]]
-"""Degraded crops (1, 1, h, w) and what the float network makes of them, clipped to [0, 1]."""
+"""Degraded crops (1, C, h, w) and what the float network makes of them, clipped to [0, 1]."""
 
 
 def search_targets(graph: Graph, ends: Ends, images: Remade[np.ndarray]) -> Targets:

@@ -152,10 +152,13 @@ def _cut(
     if fixed_px is not None and (height, width) != (fixed_px, fixed_px) and reference.size:
         got = times((height, width))
         raise ImageError(name, expected=f"images of {fixed_px} x {fixed_px} pixels", got=got, remedy=REMEDY)
+    if reference.size and (height % multiple_px or width % multiple_px):
+        expected, got = f"images of multiples of {multiple_px} pixels beside a reference", times((height, width))
+        raise ImageError(name, expected=expected, got=got, remedy="cut both")
     if reference.size:
         yield image[None], np.asarray(reference, np.float32)[None]
         return
-    side = fixed_px or PATCH_PX
+    side = fixed_px or PATCH_PX // multiple_px * multiple_px
     sizes = [side if n >= side else n // multiple_px * multiple_px for n in (height, width)]
     if 0 in sizes or (fixed_px is not None and sizes != [side, side]):
         expected = f"images of at least {fixed_px or multiple_px} pixels a side"
@@ -210,8 +213,10 @@ def samples_of(model: onnx.ModelProto, path: Path | None) -> OwnSamples | None:
     channels, fixed_px, multiple_px = _channels(model), fixed_tile_px(model), _multiple_px(model)
     if path is not None:
         return OwnSamples(path, channels, fixed_px, multiple_px or 1)
-    if channels != 1 or multiple_px is None:
-        what = f"{channels} channels" if channels != 1 else f"images of {fixed_px} x {fixed_px} pixels alone"
+    if channels != 1 or multiple_px is None or PATCH_PX % multiple_px:
+        what = f"images of {fixed_px} x {fixed_px} pixels alone"
+        if multiple_px is not None:
+            what = f"{channels} channels" if channels != 1 else f"images of multiples of {multiple_px} pixels"
         expected = f"samples for a network of {what}: simulated patches are others"
         remedy = "give a .npy or .npz file of (N, C, H, W) in [0, 1], or a folder of images"
         raise OptionError("--data", expected=expected, got="none", remedy=remedy)

@@ -7,13 +7,15 @@ or where a ReLU reads it, for that is the ReLU, and those of the fine gain, whic
 """
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import onnx
 
+from profiles.errors import ModelError
 from quant.checks import Check
-from quant.encodings import encoding_faults
+from quant.encodings import encoding_faults, read_core
+from quant.ends import ZERO
 from quant.graph import CORRECTION
 from quant.onnx_file import any_size, constants, with_outputs
 from quant.session import open_any_size, open_session, result_of, tensors_of
@@ -25,6 +27,8 @@ ZERO_POINTS = {"QuantizeLinear": 2, "QLinearConv": 7, "QLinearAdd": 7, "QLinearM
 holds the zero point of their result."""
 
 RELUS = ("Relu", "Max")
+TABLE = 256
+"""Values of 8 bits, each of which a table of ours maps."""
 
 
 @dataclass(frozen=True)
@@ -35,11 +39,13 @@ class Rounded:
         name: in the graph.
         zero_point: its value for 0, which says its type too.
         low_is_relu: whether what is clipped at the lower end would have become zero anyway.
+        counted: which channels count: of a result in gains or windows the coarse ones, which hold what others clip.
     """
 
     name: str
     zero_point: np.ndarray
     low_is_relu: bool
+    counted: slice = field(default_factory=lambda: slice(None))
 
     @property
     def lowest(self) -> int:
@@ -48,7 +54,7 @@ class Rounded:
 
     def at_ends(self, values: np.ndarray) -> np.ndarray:
         """Which of its values (N, C, H, W) lie at an end."""
-        kept = values[:, 1:] if self.name == CORRECTION and values.shape[1:2] == (2,) else values
+        kept = values[:, self.counted] if values.ndim > 1 else values
         low = (kept == self.lowest) & (not self.low_is_relu and bool(self.zero_point.min() > self.lowest))
         return np.asarray((kept == self.lowest + 255) | low)
 
@@ -97,8 +103,20 @@ def _rounded(model: onnx.ModelProto) -> list[Rounded]:
         if place is not None and node.input[0] not in known:
             stored = known.get(node.input[place]) if len(node.input) > place else None
             zero_point = _default_zero_point(node) if stored is None else stored
-            found.append(Rounded(node.output[0], zero_point, node.output[0] in relus))
+            counted = _coarse(model) if node.output[0] == CORRECTION else slice(None)
+            found.append(Rounded(node.output[0], zero_point, node.output[0] in relus, counted))
     return found
+
+
+def _coarse(model: onnx.ModelProto) -> slice:
+    """The correction's coarse channels, as `quant.ends` lays them out; all where there are no finer ones."""
+    try:
+        ends = read_core(model).ends
+    except ModelError:  # another's file
+        return slice(None)
+    if ends.offsets:
+        return slice(0, ends.outputs)
+    return slice(ends.outputs, None) if ends.gains == 2 else slice(None)
 
 
 def _default_zero_point(node: onnx.NodeProto) -> np.ndarray:
@@ -138,7 +156,9 @@ def count_relus(model: onnx.ModelProto) -> Relus:
         known, rounded = constants(model), {tensor.name: tensor for tensor in rounded_tensors(model)}
         convolved = {name for node in model.graph.node if "Conv" in node.op_type for name in node.output}
         explicit = [n.op_type == "Relu" or _cuts_at_zero(n, known, rounded) for n in model.graph.node]
-        return Relus(sum(explicit), sum(_begins_at_zero(node, rounded, convolved) for node in model.graph.node))
+        tables = sum(_is_table_of_relu(node, known) for node in model.graph.node)
+        folded = sum(_begins_at_zero(node, rounded, convolved) for node in model.graph.node)
+        return Relus(sum(explicit) + tables, folded)
 
 
 def _cuts_at_zero(node: onnx.NodeProto, known: dict[str, np.ndarray], rounded: dict[str, Rounded]) -> bool:
@@ -150,6 +170,15 @@ def _cuts_at_zero(node: onnx.NodeProto, known: dict[str, np.ndarray], rounded: d
         return False
     zeros = [rounded[name].zero_point for name in node.input if name in rounded] or [np.zeros(())]
     return bool((floors[0] == zeros[0]).all())
+
+
+def _is_table_of_relu(node: onnx.NodeProto, known: dict[str, np.ndarray]) -> bool:
+    """Whether it looks up what our files keep a ReLU behind other than a convolution as: nothing below zero."""
+    table = known.get(node.input[0]) if node.op_type == "Gather" else None
+    if table is None or table.shape != (TABLE,) or table.dtype != np.uint8:
+        return False
+    values = table.astype(np.int16) - ZERO
+    return bool((values[:ZERO] == 0).all() and (np.diff(values[ZERO:]) >= 0).all() and values[-1] > 0)
 
 
 def _begins_at_zero(node: onnx.NodeProto, rounded: dict[str, Rounded], convolved: set[str]) -> bool:

@@ -51,8 +51,14 @@ def host_model(core: IntCore, about: dict[str, str], tile_px: int | None = None)
     graph = writer.graph(
         "convbeers-int8", [image_info(IMAGE, core.ends.image_channels, tile_px)], [_result(core, tile_px)]
     )
-    plain = all(is_plain(op) for op in core.ops) and core.ends == Ends(gains=core.ends.gains)
-    return make_model(graph, about if plain else {**about, KEY: describe(core)}, microsoft=True)
+    return make_model(graph, about if _needs_no_words(core) else {**about, KEY: describe(core)}, microsoft=True)
+
+
+def _needs_no_words(core: IntCore) -> bool:
+    """Whether the nodes alone tell what the core is: ConvBEERS and its like."""
+    square = all(op.weight.shape[2] == op.weight.shape[3] for op in core.convolutions)
+    ends = isinstance(core.ops[0], IntConv) and isinstance(core.ops[-1], IntConv)
+    return square and ends and all(map(is_plain, core.ops)) and core.ends == Ends(gains=core.ends.gains)
 
 
 def _result(core: IntCore, tile_px: int | None) -> onnx.ValueInfoProto:

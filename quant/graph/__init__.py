@@ -37,7 +37,6 @@ from quant.graph.planes import (
     QUARTER,
     STEP,
     coarse_plane_only,
-    plane_count,
     read_planes,
     split,
 )
@@ -48,6 +47,6 @@ __all__ = [
     "COARSE_MAX", "CORRECTION", "COUNT", "IMAGE", "PLANES", "PLANES_FRAC_BITS", "QUARTER", "STEP", "Activation",
     "Add", "AveragePool", "Concat", "Conv", "Graph", "MaxPool", "Mul", "Network", "Op", "Pointwise", "Resize",
     "Shuffle", "Window", "channels_of", "check_network", "coarse_plane_only", "correction_graph",
-    "graph_to_onnx", "is_plain", "plane_count", "read_network", "read_planes", "refusal", "refused_graph",
+    "graph_to_onnx", "is_plain", "read_network", "read_planes", "refusal", "refused_graph",
     "relu_count", "same", "split", "tensors", "tied", "ties_scales",
 ]  # fmt: skip

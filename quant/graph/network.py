@@ -56,7 +56,7 @@ class Network:
 
 def refused_graph(expected: str, got: str, remedy: str = "") -> ModelError:
     """The sentence for a network that cannot be quantised."""
-    remedy = remedy or "see docs/commands.md for what 'quantize' takes; 'check' names what a DPU does not run"
+    remedy = remedy or "see docs/any-network.md for what 'quantize' takes; 'check' names what a DPU does not run"
     return ModelError("float model", expected=expected, got=got, remedy=remedy)
 
 
@@ -78,7 +78,21 @@ def cut(graph: Graph, channels: int, flat: bool) -> Network:
     while isinstance(first := _only_reader(graph), Shuffle) and not first.up:
         front.append(first)
         graph = tuple(renamed(op, {first.output: IMAGE}) for op in graph if op is not first)
-    return Network(graph, channels, tuple(front), back, adds_image, last, flat)
+    found = Network(graph, channels, tuple(front), back, adds_image, last, flat)
+    return replace(found, graph=_image_for_convolutions(graph, found.core_channels))
+
+
+def _image_for_convolutions(graph: Graph, channels: int) -> Graph:
+    """The graph in which convolutions alone read the image: whatever else does gets it from one that copies it.
+
+    So the image enters in all its planes, and its copy among the features has a scale of its own.
+    """
+    if all(IMAGE not in op.inputs or (isinstance(op, Conv) and not op.transposed) for op in graph):
+        return graph
+    weight = np.eye(channels, dtype=np.float32)[:, :, None, None]
+    copy = Conv(f"{IMAGE}.copy", IMAGE, f"{IMAGE}.copied", weight, np.zeros(channels, np.float32))
+    others = (op if isinstance(op, Conv) and not op.transposed else renamed(op, {IMAGE: copy.output}) for op in graph)
+    return (copy, *others)
 
 
 def _without_shuffles(graph: Graph) -> tuple[Graph, tuple[Shuffle, ...]]:
@@ -121,8 +135,11 @@ def check_network(network: Network) -> None:
     graph = network.graph
     if not graph or graph[-1].output != CORRECTION:
         raise refused_graph("a last operation that writes the result", graph[-1].name if graph else "no operation")
-    channels_of(graph, {IMAGE: network.core_channels})
+    widths = channels_of(graph, {IMAGE: network.core_channels})
     for op in graph:
+        if isinstance(op, Shuffle) and not op.up and op.columns_first and widths[op.input] > 1:
+            remedy = "put it at the network's start, where the host does it, or take a strided convolution"
+            raise refused_graph("pixel unshuffle of several channels at the image alone", op.name, remedy)
         if isinstance(op, Conv) and not (np.isfinite(op.weight).all() and np.isfinite(op.bias).all()):
             raise refused_graph("finite weights", f"NaN or infinity in {op.name}")
 
@@ -132,6 +149,9 @@ def sized(graph: Graph, size: Pair) -> Graph:
     sizes, found = {IMAGE: size}, list[Op]()
     for op in graph:
         read = sizes[op.inputs[0]]
+        if any(sizes[name] != read for name in op.inputs):
+            found_sizes = " and ".join(f"{rows} x {columns}" for rows, columns in (sizes[name] for name in op.inputs))
+            raise refused_graph(f"tensors of one size for {op.name}", found_sizes)
         if isinstance(op, AveragePool) and op.kernel is None:
             op = replace(op, kernel=read)
         sizes[op.output] = _size(op, read)

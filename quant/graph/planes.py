@@ -1,7 +1,7 @@
 """How an image of 12 bits enters a network of int8: in planes, a coarse one and what it leaves.
 
 Each channel becomes a coarse plane, its remainder, and a third for finer weights: (N, C, H, W) to (N, 3 C, H, W), all
-coarse planes first. A network that reads the image by something other than a convolution gets the coarse ones alone.
+coarse planes first. Convolutions alone read them (`quant.graph.network` sees to it).
 """
 
 from dataclasses import replace
@@ -9,8 +9,7 @@ from dataclasses import replace
 import numpy as np
 
 from model.io.images import MAX_DN
-from quant.graph.network import renamed
-from quant.graph.operations import IMAGE, Conv, Graph, Op
+from quant.graph.operations import IMAGE, Conv, Graph
 
 PLANES = "planes"
 STEP = 32
@@ -30,25 +29,16 @@ def split(image: np.ndarray, count: int = COUNT) -> np.ndarray:
     return np.concatenate(planes[:count], axis=1).astype(np.int8)
 
 
-def plane_count(graph: Graph) -> int:
-    """Planes a channel: three where only convolutions read the image, else the coarse one."""
-    readers = [op for op in graph if IMAGE in op.inputs]
-    return COUNT if all(isinstance(op, Conv) and not op.transposed for op in readers) else 1
+def read_planes(graph: Graph) -> Graph:
+    """The same graph, the convolutions that read the image reading the planes (as q * 2^-7) instead."""
+    return tuple(_reads_planes(op) if isinstance(op, Conv) and op.input == IMAGE else op for op in graph)
 
 
-def read_planes(graph: Graph, count: int | None = None) -> Graph:
-    """The same graph, its first convolutions reading the planes (as q * 2^-7) instead of the image."""
-    count = count or plane_count(graph)
-    return tuple(_reads_planes(op, count) if IMAGE in op.inputs else op for op in graph)
-
-
-def _reads_planes(op: Op, count: int) -> Op:
+def _reads_planes(op: Conv) -> Conv:
     unit = np.float32(2.0**PLANES_FRAC_BITS / MAX_DN)
-    if not isinstance(op, Conv):
-        return renamed(op, {IMAGE: PLANES})
     weight = dense(op).weight
     planes = [weight * (STEP * unit), weight * unit, np.zeros_like(weight)]
-    return replace(op, input=PLANES, weight=np.concatenate(planes[:count], axis=1).astype(np.float32), groups=1)
+    return replace(op, input=PLANES, weight=np.concatenate(planes, axis=1).astype(np.float32), groups=1)
 
 
 def dense(op: Conv) -> Conv:

@@ -35,8 +35,9 @@ from quant.graph.operations import (
     Window,
     is_plain,
 )
+from quant.graph.planes import PLANES
 from quant.onnx_file import constants
-from quant.untrusted import contradictions
+from quant.untrusted import contradictions, times
 
 
 def read_network(model: onnx.ModelProto) -> Network:
@@ -142,8 +143,9 @@ class _Reader:
                 self._read(node)
         if not self.ops or self.ops[-1].output != self.model.graph.output[0].name:
             raise refused_graph("an operation that writes the output", "none")
-        names = {self.image: IMAGE, self.ops[-1].output: CORRECTION}
-        return tuple(renamed(op, names) for op in self.ops)
+        own = {op.output: f"net.{op.output}" for op in self.ops if _is_ours(op.output)}
+        names = own | {self.image: IMAGE, self.ops[-1].output: CORRECTION}
+        return tuple(_named_apart(renamed(op, names)) for op in self.ops)
 
     def sized_graph(self) -> tuple[Op, ...]:
         """As `graph`, the windows of global pooling known: a network that pools so has one size of image."""
@@ -219,7 +221,7 @@ class _Reader:
 
     def _flatten(self, node: _Node) -> None:
         """At the end, where what is flat is (N, K): inside it stays (N, K, 1, 1)."""
-        ends = node.output[0] == self.model.graph.output[0].name and bool(self.ops)
+        ends = node.output[0] == self.model.graph.output[0].name and bool(self.ops) and node.given.get("axis", 1) == 1
         self._require(ends and self.ops[-1].output == node.input[0], node, "Flatten at the end alone", "another")
         self.ops[-1] = renamed(self.ops[-1], {node.input[0]: node.output[0]})
         self.flat = True
@@ -250,10 +252,14 @@ class _Reader:
         found = [k for k in (0, 1) if self._constant(node, k) is not None]
         if not found:
             return None
-        value = np.atleast_1d(np.squeeze(self.values[node.input[found[0]]])).astype(np.float32)
-        self._require(value.ndim == 1 and found != [0, 1], node, "a constant of one number a channel", "another")
+        value = self.values[node.input[found[0]]].astype(np.float32)
+        shape = (1,) * (4 - value.ndim) + value.shape  # as ONNX aligns it with (N, C, H, W)
+        own = value.ndim <= 4 and shape[0] == shape[2] == shape[3] == 1 and found != [0, 1]
+        self._require(own, node, "a constant of one number a channel", f"one of {times(value.shape)}")
+        value = value.ravel()
         self._require(node.op_type != "Sub" or found == [1], node, "a constant that is taken off", "another")
         channels = self._width(node.input[1 - found[0]])
+        self._require(len(value) in (1, channels), node, f"{channels} numbers", f"{len(value)}")
         value = np.broadcast_to(value, (channels,))
         one, none = np.ones(channels, np.float32), np.zeros(channels, np.float32)
         factor, offset = {"Add": (one, value), "Sub": (one, -value), "Mul": (value, none)}[node.op_type]
@@ -371,7 +377,9 @@ class _Reader:
         before = self.ops[writer] if writer is not None else None
         fusible = isinstance(before, Conv) or (isinstance(before, Add) and activation is Activation.relu)
         free = getattr(before, "activation", None) is Activation.none and self.readers[node.input[0]] == 1
-        if activation.fused and fusible and free and writer is not None:
+        # The host computes LeakyReLU on a convolution's own sums, which a transposed one has in phases.
+        phased = isinstance(before, Conv) and before.transposed and activation is Activation.leaky_relu
+        if activation.fused and fusible and free and not phased and writer is not None:
             assert isinstance(before, Conv | Add)  # noqa: S101
             self.ops[writer] = replace(before, output=node.output[0], activation=activation)
         else:
@@ -390,6 +398,16 @@ class _Reader:
             plain = np.isclose(node.given.get("alpha", 0.2), 1 / 6, 1e-4) and node.given.get("beta", 0.5) == 0.5
             self._require(bool(plain), node, "HardSigmoid with alpha 1/6", f"{node.given.get('alpha', 0.2):g}")
         return activation
+
+
+def _is_ours(name: str) -> bool:
+    """Whether the files that we write have a tensor of that name themselves."""
+    ours = IMAGE, CORRECTION, PLANES, "restored"
+    return name in ours or name.startswith(("host_front.", "host_back.", f"{IMAGE}."))
+
+
+def _named_apart(op: Op) -> Op:
+    return replace(op, name=f"net.{op.name}") if _is_ours(op.name) else op  # type: ignore[type-var]
 
 
 READERS: dict[str, Callable[[_Reader, _Node], Op | None]] = {

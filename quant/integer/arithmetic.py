@@ -85,7 +85,7 @@ def activated(sums: np.ndarray, activation: Activation, frac_bits: int) -> tuple
     if activation is Activation.relu:
         return np.maximum(sums, 0), 0
     if activation is Activation.relu6:
-        return np.clip(sums, 0, SIX << frac_bits if frac_bits >= 0 else SIX), 0
+        return np.clip(sums, 0, SIX << frac_bits if frac_bits >= 0 else SIX >> -frac_bits), 0
     if activation is Activation.leaky_relu:
         return np.where(sums < 0, sums * LEAKY_OF_256, sums << 8), 8
     return sums, 0

@@ -86,13 +86,13 @@ def run_core(
 
 
 def correction(core: IntCore, planes: np.ndarray, half_even: bool = False) -> np.ndarray:
-    """The correction (N, 1 or 2, H, W) as float32 multiples of its scale, of int8 planes (N, 3, H, W)."""
+    """The correction (N, C, H, W), all its copies, as float32 multiples of its scale, of int8 planes (N, P, H, W)."""
     tensors, _ = run_core(core, planes, half_even)
     return np.asarray(tensors[CORRECTION] * np.float32(core.scale(CORRECTION)), np.float32)
 
 
 def merged_correction(core: IntCore, tensors: Mapping[str, np.ndarray]) -> np.ndarray:
-    """The correction (N, 1, H, W) of full scale as the host reads it, from the tensors of a run."""
+    """The correction (N, C, H, W) of full scale as the host reads it, from the tensors of a run."""
     scale = core.scale(CORRECTION)
     return core.ends.merge((tensors[CORRECTION] * np.float32(scale)).astype(np.float32), scale)
 
@@ -194,7 +194,7 @@ class LayerAgreement:
 
 @dataclass(frozen=True)
 class Agreement:
-    """All operations in order, and the correction (N, 1, H, W) of full scale with half up, and to even."""
+    """All operations in order, and the correction (N, C, H, W) of full scale with half up, and to even."""
 
     layers: list[LayerAgreement]
     up: np.ndarray
@@ -207,7 +207,7 @@ def agreement(core: IntCore, host: onnx.ModelProto, image: np.ndarray) -> Agreem
     Args:
         core: whole numbers.
         host: the same in the host's encoding.
-        image: (N, 1, H, W) in [0, 1].
+        image: (N, C, H, W) in [0, 1].
     """
     names = [op.output for op in core.ops]
     session = open_session(with_outputs(any_size(host), dict.fromkeys(names, onnx.TensorProto.UINT8)))
@@ -225,7 +225,7 @@ def agreement(core: IntCore, host: onnx.ModelProto, image: np.ndarray) -> Agreem
 def integer_rows(
     model: onnx.ModelProto, core: IntCore, host: onnx.ModelProto, images: Iterable[np.ndarray]
 ) -> tuple[list[Row], Row]:
-    """Each integer operation on a crop of a few images (1, 1, H, W), and what the DPU's tie rounding changes."""
+    """Each integer operation on a crop of a few images (1, C, H, W), and what the DPU's tie rounding changes."""
     seen = few_crops(images)
     found = [agreement(core, host, crop) for crop in seen]
     source = f"the integer reference on {len(found)} calibration patches"

@@ -87,7 +87,10 @@ def _windows(values: np.ndarray, op: Conv) -> np.ndarray:
     every = -(-EVERY_PX // rows) * rows, -(-EVERY_PX // columns) * columns
     if min(n - k for n, k in zip(values.shape[2:], kernel, strict=True)) < 0:
         return np.empty((0, int(np.prod(op.weight.shape[1:]))), np.float32)
-    windows = sliding_window_view(values[0], kernel, axis=(1, 2))[:, :: every[0], :: every[1], ::tall, ::broad]
+    # In step with the windows that are computed, which begin in the padding.
+    first = -op.window.pads[0] % rows, -op.window.pads[1] % columns
+    windows = sliding_window_view(values[0], kernel, axis=(1, 2))
+    windows = windows[:, first[0] :: every[0], first[1] :: every[1], ::tall, ::broad]
     return np.ascontiguousarray(windows.transpose(1, 2, 0, 3, 4)).reshape(-1, int(np.prod(op.weight.shape[1:])))
 
 

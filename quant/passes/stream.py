@@ -67,7 +67,8 @@ def half_lsb_pair(graph: Graph, step: float) -> Graph:
     before, end = graph[:-2], graph[-2:]
     add, tail = end if len(end) == 2 else (None, None)
     shared = isinstance(add, Add) and any(add.output in stream for stream in streams(graph))
-    sums = isinstance(add, Add) and add.activation is Activation.none and set(add.inputs) <= set(writers)
+    two = isinstance(add, Add) and add.activation is Activation.none and len(set(add.inputs)) == 2
+    sums = isinstance(add, Add) and two and set(add.inputs) <= set(writers)
     if not (shared and sums and isinstance(tail, Conv) and tail.groups == 1):
         return graph
     assert isinstance(add, Add)  # noqa: S101
@@ -116,11 +117,14 @@ def windowed(graph: Graph, offsets: np.ndarray) -> Graph:
 
 
 MAX_WINDOWS = 8
+MAX_CHANNELS = 4096
+"""That a convolution of the DPU writes."""
 
 
 def window_offsets(low: np.ndarray, high: np.ndarray, unit: float) -> np.ndarray:
     """The middles (W, C) of as many windows of int8, its step `unit`, as hold values from low to high, (C,) each."""
-    count = int(np.clip(np.ceil((high - low).max() / (2 * FINE_MAX * unit)), 1, MAX_WINDOWS))
+    most = min(MAX_WINDOWS, MAX_CHANNELS // len(low) - 1)
+    count = int(np.clip(np.ceil((high - low).max() / (2 * FINE_MAX * unit)), 1, max(most, 1)))
     shares = (np.arange(count)[:, None] + 0.5) / count
     return np.asarray(low + shares * (high - low))
 

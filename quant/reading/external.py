@@ -14,7 +14,7 @@ from onnx import TensorProto
 
 from model.io.files import sha256
 from profiles.errors import ModelError
-from profiles.toml import unreadable
+from profiles.toml import read_whole, unreadable
 from quant.untrusted import FIELDS, FILE_BYTES, check_size, refused
 
 
@@ -44,8 +44,9 @@ def network_sha256(path: Path) -> str:
     own = sha256(path)
     if path.suffix != ".onnx":
         return own
+    model = onnx.ModelProto()
     try:
-        model = onnx.load(path, load_external_data=False)
+        model.ParseFromString(read_whole(path, FILE_BYTES))
     except (DecodeError, OSError, ValueError):  # no network: whoever reads it says so
         return own
     apart = [tensor for tensor in model.graph.initializer if tensor.external_data]

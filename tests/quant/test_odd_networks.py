@@ -1,0 +1,176 @@
+"""Networks of odd shapes, a few operations each: right in INT8 and without faults, or refused by the node's name."""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+import onnx
+import pytest
+from onnx import TensorProto, helper
+
+from profiles.errors import ModelError
+from quant.calibration import Patches, Remade
+from quant.graph import read_network
+from quant.integer import agreement
+from quant.onnx_file import GraphWriter, make_model
+from quant.quantise import quantise_model
+from quant.session import open_session, result_of
+from quant.structure import saturated_shares, structure_checks
+
+SLOPE = 26 / 256
+
+
+class Sketch(GraphWriter):
+    """Writes networks in few words; results have the names of their nodes."""
+
+    def conv(
+        self, name: str, source: str, shape: Sequence[int], size: float = 0.3, kind: str = "Conv", **given: Any
+    ) -> str:
+        generator = np.random.default_rng(len(self.nodes))
+        weight = (size * generator.standard_normal(tuple(shape))).astype(np.float32)
+        outputs = shape[1] if kind == "ConvTranspose" else shape[0]
+        bias = (0.1 * generator.standard_normal(outputs)).astype(np.float32)
+        feeds = [source, self.constant(f"{name}.w", weight), self.constant(f"{name}.b", bias)]
+        return self.node(kind, name, feeds, **given)
+
+    def model(self, outputs: int, side_px: int | None = None) -> onnx.ModelProto:
+        sides: list[str | int | None] = [side_px or "H", side_px or "W"]
+        image = helper.make_tensor_value_info("in", TensorProto.FLOAT, ["N", 1, *sides])
+        result = helper.make_tensor_value_info("out", TensorProto.FLOAT, None)
+        result.type.tensor_type.shape.dim.add(dim_param="N")
+        for size in (outputs, None, None):
+            result.type.tensor_type.shape.dim.add(dim_value=size)
+        return make_model(self.graph("sketch", [image], [result]), {})
+
+
+def features_beside_the_image(w: Sketch) -> onnx.ModelProto:
+    large = w.node("Relu", "r", [w.conv("large", "in", (3, 1, 3, 3), 4.0, pads=[1] * 4)])
+    w.conv("out", w.node("Concat", "both", ["in", large], axis=1), (1, 4, 1, 1))
+    return w.model(1)
+
+
+def pooled_image(w: Sketch) -> onnx.ModelProto:
+    pooled = w.node("MaxPool", "p", ["in"], kernel_shape=[3, 3], pads=[1] * 4)
+    w.conv("out", w.node("Add", "s", [pooled, "in"]), (2, 1, 3, 3), pads=[1] * 4)
+    return w.model(2)
+
+
+def preactivation(w: Sketch) -> onnx.ModelProto:
+    first = w.conv("first", "in", (4, 1, 3, 3), pads=[1] * 4)
+    inner = w.conv("inner", w.node("Relu", "r", [first]), (4, 4, 3, 3), 0.1, pads=[1] * 4)
+    last = w.conv("last", w.node("Add", "sum", [inner, first]), (1, 4, 3, 3), 0.1, pads=[1] * 4)
+    w.node("Add", "out", ["in", last])
+    return w.model(1)
+
+
+def leaking_upwards(w: Sketch) -> onnx.ModelProto:
+    down = w.conv("down", "in", (4, 1, 2, 2), strides=[2, 2])
+    up = w.conv("up", down, (4, 3, 4, 4), kind="ConvTranspose", strides=[2, 2], pads=[1] * 4)
+    w.conv("out", w.node("LeakyRelu", "leaky", [up], alpha=SLOPE), (1, 3, 1, 1))
+    return w.model(1)
+
+
+def one_tensor_twice(w: Sketch) -> onnx.ModelProto:
+    first = w.conv("first", "in", (4, 1, 3, 3), pads=[1] * 4)
+    last = w.conv("last", w.node("Add", "double", [first, first]), (1, 4, 3, 3), 0.05, pads=[1] * 4)
+    w.node("Add", "out", ["in", last])
+    return w.model(1)
+
+
+def sum_of_two(w: Sketch) -> onnx.ModelProto:
+    branches = [w.conv(name, "in", (1, 1, 3, 3), 0.05, pads=[1] * 4) for name in ("a", "b")]
+    w.node("Add", "out", ["in", w.node("Add", "sum", branches)])
+    return w.model(1)
+
+
+def separable(w: Sketch) -> onnx.ModelProto:
+    rows = w.node("Relu", "r", [w.conv("rows", "in", (4, 1, 1, 3), pads=[0, 1, 0, 1])])
+    w.node("Add", "out", ["in", w.conv("columns", rows, (1, 4, 3, 1), 0.1, pads=[1, 0, 1, 0])])
+    return w.model(1)
+
+
+def names_of_ours(w: Sketch) -> onnx.ModelProto:
+    first = w.node("Relu", "image", [w.conv("planes", "in", (4, 1, 3, 3), pads=[1] * 4)])
+    second = w.node("Relu", "correction", [w.conv("restored", first, (4, 4, 3, 3), pads=[1] * 4)])
+    w.node("Add", "out", ["in", w.conv("host_back.both", second, (1, 4, 1, 1), 0.1)])
+    return w.model(1)
+
+
+def thirds(w: Sketch) -> onnx.ModelProto:
+    down = w.conv("down", "in", (4, 1, 3, 3), strides=[3, 3])
+    w.node("Add", "out", ["in", w.conv("up", down, (4, 1, 3, 3), 0.1, "ConvTranspose", strides=[3, 3])])
+    return w.model(1)
+
+
+def products(w: Sketch) -> onnx.ModelProto:
+    first, second = (w.conv(name, "in", (3, 1, 3, 3), pads=[1] * 4) for name in ("a", "b"))
+    gate = w.node("HardSigmoid", "gate", [second], alpha=1 / 6, beta=0.5)
+    w.conv("out", w.node("Relu", "r", [w.node("Mul", "m", [first, gate])]), (2, 3, 3, 3), pads=[1] * 4)
+    return w.model(2)
+
+
+def many_classes(w: Sketch) -> onnx.ModelProto:
+    w.conv("out", "in", (1200, 1, 3, 3), 40.0, strides=[3, 3])
+    return w.model(1200)
+
+
+SOUND = [
+    features_beside_the_image, pooled_image, preactivation, leaking_upwards, one_tensor_twice, sum_of_two, separable,
+    names_of_ours, thirds, products, many_classes,
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("make", SOUND)
+def test_near_float_equal_to_the_reference_and_without_faults(
+    make: Callable[[Sketch], onnx.ModelProto],
+) -> None:
+    model = make(Sketch())
+    rows, columns = np.mgrid[:48, :36] / 40
+    seen = [(0.4 + 0.3 * np.sin(7 * rows + k) * np.cos(5 * columns)).astype(np.float32)[None, None] for k in range(3)]
+    patches = Patches([], Remade(lambda k: (seen[k], seen[k]), 3), Remade(lambda k: seen[k], 3))
+    made = quantise_model(model, patches, {}, lambda: None)
+    wanted = made.core.ends.clipped(result_of(open_session(model), seen[1]))
+    found = result_of(open_session(made.host), seen[1])
+    assert np.abs(found - wanted).mean() < 0.06 * wanted.std()
+    assert not any(layer.unequal for layer in agreement(made.core, made.host, seen[2]).layers)
+    assert [str(check) for check in structure_checks(model, made.host) if not check.passed] == []
+    assert saturated_shares(made.host, seen).get("correction", 0) < 0.01
+
+
+def unshuffled_inside(w: Sketch) -> onnx.ModelProto:
+    inner = w.conv("c", "in", (4, 1, 1, 1))
+    five = w.node("Reshape", "five", [inner, w.constant("s5", np.array([0, 4, 18, 2, 18, 2]))])
+    w.node("Transpose", "moved", [five], perm=[0, 1, 3, 5, 2, 4])
+    w.conv("out", w.node("Reshape", "four", ["moved", w.constant("s4", np.array([0, 16, 18, 18]))]), (1, 16, 1, 1))
+    return w.model(1, 36)
+
+
+def column_by_column(w: Sketch) -> onnx.ModelProto:
+    w.node("Mul", "out", [w.conv("c", "in", (36, 1, 1, 1)), w.constant("each", np.ones(36, np.float32))])
+    return w.model(36, 36)
+
+
+def squeezed(w: Sketch) -> onnx.ModelProto:
+    inner = w.conv("c", "in", (4, 1, 1, 1))
+    gate = w.conv("g", w.node("GlobalAveragePool", "mean", [inner]), (4, 4, 1, 1))
+    w.conv("out", w.node("Mul", "gated", [gate, inner]), (1, 4, 1, 1))
+    return w.model(1, 36)
+
+
+def flattened_elsewhere(w: Sketch) -> onnx.ModelProto:
+    w.node("Flatten", "out", [w.conv("c", "in", (4, 1, 1, 1))], axis=2)
+    return w.model(4, 36)
+
+
+@pytest.mark.parametrize(
+    ("make", "said"),
+    [
+        (unshuffled_inside, "Reshape|pixel unshuffle of several channels at the image alone"),
+        (column_by_column, "one number a channel, got one of 36 at Mul out"),
+        (squeezed, "tensors of one size for gated, got 1 x 1 and 36 x 36"),
+        (flattened_elsewhere, "Flatten at the end"),
+    ],
+)
+def test_what_would_be_computed_wrongly_is_refused(make: Callable[[Sketch], onnx.ModelProto], said: str) -> None:
+    with pytest.raises(ModelError, match=said):
+        read_network(make(Sketch()))
