@@ -27,8 +27,7 @@ from quant.graph import (
     Pointwise,
     Shuffle,
 )
-from quant.integer.arithmetic import activated
-from quant.integer.fixed_point import activation_table, mean_factor
+from quant.integer.arithmetic import activated, activation_table, mean_factor
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 
 from quant.core import IntConv, IntCore
-from quant.encodings.phases import of_phases
 from quant.ends import Ends
 from quant.graph import Activation, Add, AveragePool, Concat, MaxPool, Mul, Op, Pointwise, Resize, Shuffle, Window
 
@@ -86,3 +85,26 @@ def _op(said: dict[str, Any], frac_bits: Mapping[str, int], constants: Mapping[s
         said |= {"weight": weight.reshape(said["weight"]), "bias": (whole >> shift).astype(np.int8)}
     op: IntConv | Op = kind(**said)
     return op
+
+
+def phases(weight: np.ndarray, stride: int) -> tuple[np.ndarray, int]:
+    """The weights (stride^2 O, I, J, J) of a transposed convolution's phases, and their padding, J - 1.
+
+    Output row q stride + f takes x[q - j] w[f + stride j]: a convolution over rows q - J + 1 .. q for each f. The
+    phases come first in the channels, as ONNX's own DepthToSpace wants them.
+    """
+    outputs, inputs, *kernel = weight.shape
+    reach = max(-(-k // stride) for k in kernel)
+    padded = np.zeros((outputs, inputs, reach * stride, reach * stride), weight.dtype)
+    padded[:, :, : kernel[0], : kernel[1]] = weight
+    taps = padded.reshape(outputs, inputs, reach, stride, reach, stride)[:, :, ::-1, :, ::-1]
+    return np.ascontiguousarray(taps.transpose(3, 5, 0, 1, 2, 4)).reshape(-1, inputs, reach, reach), reach - 1
+
+
+def of_phases(weight: np.ndarray, shape: tuple[int, ...], stride: int) -> np.ndarray:
+    """The weights (O, I, kh, kw) that `phases` made (stride^2 O, I, J, J) of."""
+    outputs, inputs, rows, columns = shape
+    reach = weight.shape[2]
+    taps = weight.reshape(stride, stride, outputs, inputs, reach, reach).transpose(2, 3, 4, 0, 5, 1)
+    padded = taps[:, :, ::-1, :, ::-1].reshape(outputs, inputs, reach * stride, reach * stride)
+    return np.ascontiguousarray(padded[:, :, :rows, :columns])

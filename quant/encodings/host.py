@@ -13,8 +13,7 @@ import onnx
 from onnx import TensorProto
 
 from quant.core import INT8_MAX, INT8_MIN, IntConv, IntCore
-from quant.encodings.description import KEY, describe
-from quant.encodings.phases import phases
+from quant.encodings.description import KEY, describe, phases
 from quant.ends import ZERO, Ends, HostWriter, write_back, write_front
 from quant.graph import (
     CORRECTION,
@@ -34,7 +33,7 @@ from quant.graph import (
 )
 from quant.graph.operations import LEAKY_SLOPE
 from quant.graph.writer import window_attributes, write_shuffle
-from quant.integer.fixed_point import activation_table, bilinear_weights, mean_factor, six_in_units
+from quant.integer.arithmetic import activation_table, bilinear_weights, mean_factor, six_in_units
 from quant.onnx_file import image_info, make_model
 
 MICROSOFT = "com.microsoft"

@@ -1,7 +1,8 @@
 """A network as the short list of operations that a DPU computes: what quantisation works on.
 
 - `operations`: what there is, convolutions to pixel shuffles, and which tensors must share a scale;
-- `reader`: from float ONNX to a `network`, cut where the host's part ends; `writer`: back to float ONNX;
+- `reader`: from float ONNX to a `network`, cut where the host's part ends, with `trials` of what exporters spell out;
+- `writer`: back to float ONNX;
 - `planes`: how 12 bits enter int8.
 """
 

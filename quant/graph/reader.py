@@ -10,8 +10,7 @@ from typing import Any
 
 import numpy as np
 import onnx
-from onnx import helper, numpy_helper
-from onnx.reference import ReferenceEvaluator
+from onnx import helper
 
 from profiles.errors import ModelError
 from quant.graph.network import Network, channels_of, check_network, cut, refused_graph, renamed, sized
@@ -36,6 +35,7 @@ from quant.graph.operations import (
     is_plain,
 )
 from quant.graph.planes import PLANES
+from quant.graph.trials import makes_blocks, spells
 from quant.onnx_file import constants
 from quant.untrusted import contradictions, times
 
@@ -232,20 +232,12 @@ class _Reader:
     def _mul(self, node: _Node) -> Op:
         return self._by_constant(node) or Mul(node.name, (node.input[0], node.input[1]), node.output[0])
 
-    def _sub(self, node: _Node) -> Op:
-        """What a convolution wrote taken off something: added, its weights negated."""
-        if (by := self._by_constant(node)) is not None:
-            return by
-        writer = next((k for k, op in enumerate(self.ops) if op.output == node.input[1]), None)
-        before = self.ops[writer] if writer is not None else None
-        linear = (
-            isinstance(before, Conv) and before.activation is Activation.none and self.readers[node.input[1]] == 1
-        )
-        self._require(linear, node, "a difference whose second tensor a convolution writes, for it alone", "another")
-        assert isinstance(before, Conv)  # noqa: S101
-        assert writer is not None  # noqa: S101
-        self.ops[writer] = replace(before, weight=-before.weight, bias=-before.bias)
-        return Add(node.name, (node.input[0], node.input[1]), node.output[0])
+    def _sub(self, node: _Node) -> Op | None:
+        """Of a constant; what a convolution wrote is added since the file was folded (`quant.reading`)."""
+        op = self._by_constant(node)
+        expected = "a difference whose second tensor a convolution writes, for it alone"
+        self._require(op is not None, node, expected, "another")
+        return op
 
     def _by_constant(self, node: _Node) -> Op | None:
         """A sum, difference or product with one number a channel: a depthwise convolution of one pixel."""
@@ -270,12 +262,6 @@ class _Reader:
 
     def _width(self, name: str) -> int:
         return channels_of(tuple(self.ops), {self.image: _channels_in(self.model)})[name]
-
-    def _batchnormalization(self, node: _Node) -> Op:
-        scale, shift, mean, variance = (self.values[node.input[k]].astype(np.float64) for k in (1, 2, 3, 4))
-        factor = scale / np.sqrt(variance + node.given.get("epsilon", 1e-5))
-        weight, bias = factor.astype(np.float32)[:, None, None, None], (shift - mean * factor).astype(np.float32)
-        return Conv(node.name, node.input[0], node.output[0], weight, bias, groups=len(weight))
 
     def _concat(self, node: _Node) -> Op:
         self._require(
@@ -315,15 +301,10 @@ class _Reader:
             self._require(half, node, "bilinear by 2 or 4 with half-pixel centres", f"{where} by {factor:g}")
         else:
             rounding = node.given.get("nearest_mode", b"round_prefer_floor").decode()
-            blocks = mode == "nearest" and _makes_blocks(int(factor), where, rounding)
+            blocks = mode == "nearest" and makes_blocks(int(factor), where, rounding)
             expected = "a nearest resize that makes a block of each pixel"
             self._require(blocks, node, expected, f"{mode}, {where}, {rounding} by {factor:g}")
         return Resize(node.name, node.input[0], node.output[0], int(factor), mode == "linear")
-
-    def _upsample(self, node: _Node) -> Op:
-        raise refused_graph(
-            "Resize, which opset 10 brought", f"Upsample {node.name}", "export it with opset 11 or later"
-        )
 
     def _depthtospace(self, node: _Node) -> Op:
         columns_first = node.given.get("mode", b"DCR") == b"CRD"
@@ -349,27 +330,12 @@ class _Reader:
         channels = self._width(source)
         for block, up, columns_first in product(range(2, BLOCKS + 1), (True, False), (True, False)):
             shuffle = Shuffle(name, source, output, block, up, columns_first)
-            if (channels % block**2 == 0 or not up) and self._does(chain, shuffle, channels):
+            protos = [node.proto for node in chain]
+            if (channels % block**2 == 0 or not up) and spells(protos, shuffle, channels, self.values, self.model):
                 return shuffle
         raise refused_graph(
             "Reshape and Transpose that spell a pixel shuffle", f"another at {chain[0].op_type} {chain[0].name}"
         )
-
-    def _does(self, chain: list[_Node], shuffle: Shuffle, channels: int) -> bool:
-        sizes = 2, channels, 2 * shuffle.block, 3 * shuffle.block
-        numbered = np.arange(np.prod(sizes), dtype=np.float32).reshape(sizes)
-        feeds = {name: self.values[name] for node in chain for name in node.input if name in self.values}
-        ends = [
-            helper.make_tensor_value_info(n, onnx.TensorProto.FLOAT, None) for n in (shuffle.input, shuffle.output)
-        ]
-        constant = [numpy_helper.from_array(value, name) for name, value in feeds.items()]
-        graph = helper.make_graph([node.proto for node in chain], "moves", ends[:1], ends[1:], constant)
-        model = helper.make_model(graph, opset_imports=self.model.opset_import)
-        try:
-            (moved,) = ReferenceEvaluator(model).run(None, {shuffle.input: numbered})
-        except Exception:  # noqa: BLE001 - sizes that do not fit this block fail in many ways
-            return False
-        return bool(np.array_equal(moved, shuffle(numbered)))
 
     def _activation(self, node: _Node) -> None:
         activation = self._which(node)
@@ -413,7 +379,6 @@ def _named_apart(op: Op) -> Op:
 READERS: dict[str, Callable[[_Reader, _Node], Op | None]] = {
     "Add": _Reader._add,
     "AveragePool": _Reader._averagepool,
-    "BatchNormalization": _Reader._batchnormalization,
     "Concat": _Reader._concat,
     "Conv": _Reader._conv,
     "ConvTranspose": _Reader._convtranspose,
@@ -425,7 +390,6 @@ READERS: dict[str, Callable[[_Reader, _Node], Op | None]] = {
     "Resize": _Reader._resize,
     "SpaceToDepth": _Reader._spacetodepth,
     "Sub": _Reader._sub,
-    "Upsample": _Reader._upsample,
     **dict.fromkeys(MOVES, _Reader._move),
 }
 
@@ -436,29 +400,6 @@ ACTIVATIONS = {
     "HardSigmoid": Activation.hard_sigmoid,
     "HardSwish": Activation.hard_swish,
 }
-
-
-PLACES: dict[str, Callable[[np.ndarray, int], np.ndarray]] = {
-    "asymmetric": lambda place, factor: place / factor,
-    "half_pixel": lambda place, factor: (place + 0.5) / factor - 0.5,
-    "pytorch_half_pixel": lambda place, factor: (place + 0.5) / factor - 0.5,
-    "tf_half_pixel_for_nn": lambda place, factor: (place + 0.5) / factor,
-}
-ROUNDINGS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
-    "floor": np.floor,
-    "ceil": np.ceil,
-    "round_prefer_floor": lambda place: np.ceil(place - 0.5),
-    "round_prefer_ceil": lambda place: np.floor(place + 0.5),
-}
-
-
-def _makes_blocks(factor: int, where: str, rounding: str) -> bool:
-    """Whether ONNX's coordinates, so rounded, give each pixel of the result the one whose block it lies in."""
-    if where not in PLACES or rounding not in ROUNDINGS:
-        return False
-    place = np.arange(4 * factor)
-    nearest = np.clip(ROUNDINGS[rounding](PLACES[where](place, factor)), 0, 3)
-    return bool((nearest == place // factor).all())
 
 
 def _pair(values: list[int]) -> Pair:

@@ -1,7 +1,7 @@
 """The DPU's arithmetic in whole numbers: the reference that every file is held to.
 
 - `reference`: a core run on planes, layer by layer, and how far onnxruntime agrees;
-- `arithmetic`: exact convolutions, maxima and means; `fixed_point`: the DPU's constants.
+- `arithmetic`: exact convolutions, maxima and means, and the DPU's fixed-point constants.
 """
 
 from quant.integer.reference import (

@@ -17,8 +17,7 @@ from profiles.figures import Figure, Row, measured, predicted
 from quant.core import INT8_MAX, INT8_MIN, IntConv, IntCore
 from quant.ends import ZERO
 from quant.graph import CORRECTION, PLANES, Add, AveragePool, Concat, MaxPool, Mul, Op, Pointwise, Resize, Shuffle
-from quant.integer.arithmetic import activated, bound_of, convolve, enlarged, means, window_maxima
-from quant.integer.fixed_point import activation_table
+from quant.integer.arithmetic import activated, activation_table, bound_of, convolve, enlarged, means, window_maxima
 from quant.onnx_file import any_size, with_outputs
 from quant.session import few_crops, open_any_size, open_session, result_of
 
