@@ -1,6 +1,7 @@
 """Our INT8 beside onnxruntime's and AMD Quark's: the same network, calibration patches and held-out patches, one run.
 
     python benchmarks/int8_peers.py --images aerial-train/ --held-out aerial-test/ --quark-python quark/bin/python
+    python benchmarks/int8_peers.py --float mine.onnx --data samples.npz --held-out-data others.npz
 
 On Linux. Prints a Markdown table. Each way quantises in a process of its own; its peak memory has the interpreter and
 libraries in it. Peers get the plain graph, and the one that we quantise: planes in, the correction out, the add
@@ -16,6 +17,7 @@ would fetch gigabytes of CUDA packages:
 
 import argparse
 import json
+import math
 import os
 import re
 import subprocess
@@ -35,8 +37,10 @@ from model.simulator.procedural import load_scenes
 from profiles import load_sensor
 from profiles.sensor_file import reference_for
 from quant.calibration import HELD_OUT_SEED, Pair, draw_patches
-from quant.graph import CORRECTION, PLANES, correction_graph, graph_to_onnx, read_planes
-from quant.session import open_session, planes_of
+from quant.ends import Ends, ends_of
+from quant.graph import CORRECTION, PLANES, graph_to_onnx, read_network, read_planes
+from quant.samples import samples_of
+from quant.session import open_session, planes_of, result_of
 
 HERE = Path(__file__).parent
 QUARK = HERE / "quark_child.py"
@@ -69,31 +73,58 @@ def ways(adaround_iterations: int) -> list[Way]:
     ]
 
 
-def restorer(path: Path) -> Restore:
-    """A network as a function of images (1, 1, H, W): one that reads planes gets the host's add."""
-    session = open_session(path)
-    name = session.get_inputs()[0].name
+@dataclass(frozen=True)
+class Peered:
+    """A float network, and the host's part around its graph as we quantise it."""
 
-    def restore(image: np.ndarray) -> np.ndarray:
-        fed = planes_of(image) if name == PLANES else image
-        result = np.asarray(session.run(None, {name: fed})[0])
-        return np.asarray(np.clip(image + result if name == PLANES else result, 0, 1))
+    model: onnx.ModelProto
+    ends: Ends
 
-    return restore
+    def written(self, plain: Path, core: Path) -> None:
+        """The network as it came, and its graph rewritten: planes in, the correction out."""
+        onnx.save(self.model, plain)
+        graph = read_planes(read_network(self.model).graph)
+        onnx.save(graph_to_onnx(graph, [CORRECTION], self.ends.planes * self.ends.channels), core)
+
+    def runner(self, path: Path) -> Restore:
+        """A file as a function of images (1, C, H, W): one that reads planes gets the host's part."""
+        session = open_session(onnx.load(path))
+        if session.get_inputs()[0].name != PLANES:
+            return lambda image: result_of(session, image)
+        return lambda image: self.ends.finished(image, result_of(session, planes_of(image, self.ends)))
 
 
 def scores(in_float: Restore, in_int8: Restore, pairs: list[Pair]) -> list[str]:
-    """The table's columns of accuracy; PSNR and SSIM are means over patches."""
+    """The table's columns of accuracy; PSNR and SSIM are means over patches, of images with references alone."""
     differences, rows = [], []
-    for degraded, reference in pairs:
-        both = in_float(degraded), in_int8(degraded)
+    for image, reference in pairs:
+        both = [_as_in_a_file(run(image), image) for run in (in_float, in_int8)]
         differences.append((both[1] - both[0]).ravel())
-        rows.append([*(psnr_db(b, reference, 1.0) for b in both), ssim(both[1][0, 0], reference[0, 0], 1.0)])
+        rows.append([*_against(reference, both), *_alike(image, both)])
     difference = np.concatenate(differences).astype(np.float64)
     mae, std = float(np.abs(difference).mean()), float(difference.std())
-    db_float, db_int8, similarity = np.mean(rows, axis=0)
+    db_float, db_int8, similarity, same = np.mean(rows, axis=0)
     sizes = [f"{mae:.6f}", f"{std:.6f}", f"{np.abs(difference).max():.4f}", f"{std / mae:.2f}"]
-    return [*sizes, f"{db_float:.2f}", f"{db_int8:.2f}", f"{db_float - db_int8:.3f}", f"{similarity:.4f}"]
+    found = f"{db_float:.2f}", f"{db_int8:.2f}", f"{db_float - db_int8:.3f}", f"{similarity:.4f}", f"{100 * same:.2f}"
+    return [*sizes, *(cell.replace("nan", "") for cell in found)]
+
+
+def _as_in_a_file(result: np.ndarray, image: np.ndarray) -> np.ndarray:
+    return np.clip(result, 0, 1) if result.shape[1:2] == image.shape[1:2] else result
+
+
+def _against(reference: np.ndarray, both: list[np.ndarray]) -> list[float]:
+    if reference.shape != both[0].shape:
+        return [math.nan] * 3
+    similarity = [ssim(one, other, 1.0) for one, other in zip(both[1][0], reference[0], strict=True)]
+    return [*(psnr_db(result, reference, 1.0) for result in both), float(np.mean(similarity))]
+
+
+def _alike(image: np.ndarray, both: list[np.ndarray]) -> list[float]:
+    """The share of pixels or images that are told the same class, of networks that tell classes."""
+    if both[0].shape[1] <= image.shape[1]:
+        return [math.nan]
+    return [float((both[0].argmax(1) == both[1].argmax(1)).mean())]
 
 
 def quantise(way: Way, files: dict[bool, tuple[Path, Path]], out: Path, python: str) -> tuple[float, float]:
@@ -113,42 +144,63 @@ def quantise(way: Way, files: dict[bool, tuple[Path, Path]], out: Path, python: 
     return told["seconds"], told["peak_mb"]
 
 
+COLUMNS = (
+    *("tool", "graph", "MAE", "std", "max", "std / MAE", "PSNR float dB", "PSNR INT8 dB", "drop dB", "SSIM"),
+    *("same class %", "s", "peak MB"),
+)
+
+
+def drawn(model: onnx.ModelProto, arguments: argparse.Namespace) -> tuple[list[Pair], list[Pair]]:
+    """What the network is calibrated and judged on: a user's samples where given, else simulated patches."""
+    if arguments.data:
+        both = (samples_of(model, path) for path in (arguments.data, arguments.held_out_data or arguments.data))
+        calibration, held_out = (list(samples.all.pairs) for samples in both if samples)
+        return calibration, held_out
+    asked = (
+        (arguments.images, arguments.sensor, arguments.patches, arguments.seed),
+        (
+            *(arguments.held_out, arguments.held_out_sensor, arguments.held_out_patches),
+            arguments.seed + HELD_OUT_SEED,
+        ),
+    )
+    calibration, held_out = (_simulated(*each) for each in asked)
+    return calibration, held_out
+
+
+def _simulated(images: Path | None, sensor: str, count: int, seed: int) -> list[Pair]:
+    profile = load_sensor(sensor)
+    aim = reference_for(profile)
+    return list(draw_patches(load_scenes(images, aim.nominal(), seed), profile, aim, count, seed).pairs)
+
+
 def table(arguments: argparse.Namespace, folder: Path) -> Iterator[str]:
     """Line by line, as each way ends."""
-    network = read_float(arguments.float or shipped_weights(arguments.variant))
-    drawn = []
-    for images, sensor, count, seed in (
-        (arguments.images, arguments.sensor, arguments.patches, arguments.seed),
-        (arguments.held_out, arguments.held_out_sensor, arguments.held_out_patches, arguments.seed + HELD_OUT_SEED),
-    ):
-        profile = load_sensor(sensor)
-        aim = reference_for(profile)
-        scenes = load_scenes(images, aim.nominal(), seed)
-        drawn.append(list(draw_patches(scenes, profile, aim, count, seed).pairs))
-    degraded = np.concatenate([image for image, _ in drawn[0]])
+    model = read_float(arguments.float or shipped_weights(arguments.variant))
+    network = Peered(model, ends_of(read_network(model)))
+    calibration, held_out = drawn(model, arguments)
+    images = np.concatenate([image for image, _ in calibration])
     files = {False: (folder / "plain.onnx", folder / "plain.npy"), True: (folder / "core.onnx", folder / "core.npy")}
-    onnx.save(network, files[False][0])
-    onnx.save(graph_to_onnx(read_planes(correction_graph(network)), [CORRECTION]), files[True][0])
-    np.save(files[False][1], degraded)
-    np.save(files[True][1], planes_of(degraded))
-    in_float = restorer(files[False][0])
-    yield "| tool | graph | MAE | std | max | std/MAE | PSNR float dB | PSNR INT8 dB | drop dB | SSIM | s | peak MB |"
-    yield "|---|---|---|---|---|---|---|---|---|---|---|---|"
+    network.written(files[False][0], files[True][0])
+    np.save(files[False][1], images)
+    np.save(files[True][1], planes_of(images, network.ends))
+    in_float = network.runner(files[False][0])
+    yield f"| {' | '.join(COLUMNS)} |"
+    yield "|---" * len(COLUMNS) + "|"
     for number, way in enumerate(ways(arguments.adaround_iterations)):
         graph = "rewritten" if way.rewritten or way.name.startswith("beers") else "plain"
         if not re.search(arguments.only, f"{way.name}, {graph}"):
             continue
         python = sys.executable if way.script == OURS else arguments.quark_python
         if python is None:
-            yield f"| {way.name} | {graph} | unavailable: no --quark-python |{' |' * 9}"
+            yield f"| {way.name} | {graph} | unavailable: no --quark-python |{' |' * (len(COLUMNS) - 3)}"
             continue
         out = folder / f"{number:02d}-{way.name.replace(' ', '-')}-{graph}.onnx"
         try:
             seconds, peak_mb = quantise(way, files, out, python)
         except RuntimeError as error:
-            yield f"| {way.name} | {graph} | unavailable: {error} |{' |' * 9}"
+            yield f"| {way.name} | {graph} | unavailable: {error} |{' |' * (len(COLUMNS) - 3)}"
             continue
-        cells = [*scores(in_float, restorer(out), drawn[1]), f"{seconds:.0f}", f"{peak_mb:.0f}"]
+        cells = [*scores(in_float, network.runner(out), held_out), f"{seconds:.0f}", f"{peak_mb:.0f}"]
         yield f"| {way.name} | {graph} | {' | '.join(cells)} |"
 
 
@@ -157,6 +209,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--variant", default="convbeers-s", help="shipped weights of this name")
     parser.add_argument("--float", type=Path, help="another float network, .onnx or .safetensors")
+    parser.add_argument("--data", type=Path, help="samples to calibrate on, as 'quantize --data' takes them")
+    parser.add_argument("--held-out-data", type=Path, help="samples to judge on; those of --data if none")
     parser.add_argument("--images", type=Path, help="folder of scenes for calibration; drawn ones if none")
     parser.add_argument("--sensor", default="pleiades-variable", help="profile of the calibration patches")
     parser.add_argument("--held-out", type=Path, help="folder of scenes for evaluation; drawn ones if none")
