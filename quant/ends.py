@@ -44,6 +44,7 @@ class Ends:
         adds_image: whether the image is added, and the sum clipped to [0, 1].
         last: pixel shuffles of the sum.
         flat: whether the result is (N, K).
+        softmax: whether it is made probabilities, along the channels.
         gains: 2 where the correction's channels come twice, fine and coarse by `GAIN`.
         outputs: channels of the correction, gains and windows not counted.
         offsets: what each window has taken off each channel, (windows, outputs): the channels come coarse
@@ -57,6 +58,7 @@ class Ends:
     adds_image: bool = True
     last: tuple[Shuffle, ...] = ()
     flat: bool = False
+    softmax: bool = False
     gains: int = 1
     outputs: int = 1
     offsets: tuple[tuple[float, ...], ...] = ()
@@ -113,6 +115,9 @@ class Ends:
         """As `restored`, of a correction that is one already."""
         for shuffle in self.back:
             result = shuffle(result)
+        if self.softmax:
+            powers = np.exp(result - result.max(axis=1, keepdims=True))
+            result = powers / powers.sum(axis=1, keepdims=True)
         if self.flat:
             result = result.reshape(len(result), -1)
         result = self.clipped(image + result) if self.adds_image else result
@@ -131,7 +136,7 @@ ONE_CHANNEL = Ends()
 
 def ends_of(network: Network, gains: int = 1) -> Ends:
     """The ends of a network whose correction comes in so many gains."""
-    kept = network.front, network.back, network.adds_image, network.last, network.flat
+    kept = network.front, network.back, network.adds_image, network.last, network.flat, network.softmax
     outputs = channels_of(network.graph, {IMAGE: network.core_channels})[CORRECTION]
     return Ends(network.core_channels, COUNT, *kept, gains, outputs)
 
@@ -197,6 +202,8 @@ def write_back(w: HostWriter, ends: Ends, feeds: list[str], scale: float) -> Non
     for k, shuffle in enumerate(ends.back):
         write_shuffle(w, shuffle, result, f"host_back.shuffled_{k}")
         result = f"host_back.shuffled_{k}"
+    if ends.softmax:
+        result = w.node("Softmax", "host_back.probabilities", [result], axis=1)
     if ends.adds_image:
         w.node("Add", "host_back.add", [IMAGE, result])
         limits = [w.scalar("zero", 0), w.scalar("one", 1)]

@@ -38,6 +38,7 @@ class Network:
         adds_image: whether the image is added to the result (the global add), in the host's float numbers.
         last: what it does to the sum: pixel shuffle. An image of one channel is added to each of the sum's.
         flat: whether the result is (N, K) rather than an image.
+        softmax: whether the host makes probabilities of the result, along its channels.
     """
 
     graph: Graph = field(compare=False)
@@ -47,6 +48,7 @@ class Network:
     adds_image: bool = True
     last: tuple[Shuffle, ...] = ()
     flat: bool = False
+    softmax: bool = False
 
     @property
     def core_channels(self) -> int:
@@ -60,7 +62,7 @@ def refused_graph(expected: str, got: str, remedy: str = "") -> ModelError:
     return ModelError("float model", expected=expected, got=got, remedy=remedy)
 
 
-def cut(graph: Graph, channels: int, flat: bool) -> Network:
+def cut(graph: Graph, channels: int, flat: bool, softmax: bool) -> Network:
     """The network of operations from `IMAGE` to `CORRECTION`: what the host does at both ends is taken off.
 
     Pixel shuffles there move values and cost the host next to nothing; DPUs have been seen to compute them wrongly.
@@ -78,7 +80,7 @@ def cut(graph: Graph, channels: int, flat: bool) -> Network:
     while isinstance(first := _only_reader(graph), Shuffle) and not first.up:
         front.append(first)
         graph = tuple(renamed(op, {first.output: IMAGE}) for op in graph if op is not first)
-    found = Network(graph, channels, tuple(front), back, adds_image, last, flat)
+    found = Network(graph, channels, tuple(front), back, adds_image, last, flat, softmax)
     return replace(found, graph=_image_for_convolutions(graph, found.core_channels))
 
 

@@ -5,7 +5,6 @@ A file from outside is looked at once, here; behind it nothing asks again.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from itertools import product
 from typing import Any
 
 import numpy as np
@@ -35,7 +34,7 @@ from quant.graph.operations import (
     is_plain,
 )
 from quant.graph.planes import PLANES
-from quant.graph.trials import makes_blocks, spells
+from quant.graph.trials import makes_blocks, spelled_shuffle
 from quant.onnx_file import constants
 from quant.untrusted import contradictions, times
 
@@ -48,7 +47,7 @@ def read_network(model: onnx.ModelProto) -> Network:
     """
     with contradictions("float model"):
         reader = _Reader(model)
-        network = cut(reader.sized_graph(), _channels_in(model), reader.flat)
+        network = cut(reader.sized_graph(), _channels_in(model), reader.flat, reader.softmax)
         check_network(network)
     return network
 
@@ -85,8 +84,6 @@ def _channels_in(model: onnx.ModelProto) -> int:
 
 
 MOVES = ("Reshape", "Transpose", "Squeeze", "Unsqueeze")
-BLOCKS = 8
-"""The largest side of a pixel shuffle's blocks that is looked for."""
 
 
 @dataclass(frozen=True)
@@ -128,7 +125,7 @@ class _Reader:
         for node in model.graph.node:
             for name in node.input:
                 self.readers[name] = self.readers.get(name, 0) + 1
-        self.flat = False
+        self.flat = self.softmax = False
         # Chains of moves by the tensor that they have come to; and which tensors another move goes on from.
         self.chains: dict[str, list[_Node]] = {}
         self.moving = {node.input[0]: True for node in model.graph.node if node.op_type in MOVES}
@@ -226,6 +223,17 @@ class _Reader:
         self.ops[-1] = renamed(self.ops[-1], {node.input[0]: node.output[0]})
         self.flat = True
 
+    def _softmax(self, node: _Node) -> None:
+        """Along the channels, at the end, where the host does it."""
+        rest = [_Node.of(proto) for proto in self.model.graph.node if node.output[0] in proto.input]
+        ends = node.output[0] == self.model.graph.output[0].name
+        flattened = [each.op_type for each in rest] == ["Flatten"]
+        last = bool(self.ops) and self.ops[-1].output == node.input[0] and self.readers[node.input[0]] == 1
+        channels = node.given.get("axis", -1) in (1, -3)
+        self._require((ends or flattened) and last and channels, node, "Softmax of channels at the end alone", "another")
+        self.ops[-1] = renamed(self.ops[-1], {node.input[0]: node.output[0]})
+        self.softmax = True
+
     def _add(self, node: _Node) -> Op:
         return self._by_constant(node) or Add(node.name, (node.input[0], node.input[1]), node.output[0])
 
@@ -322,20 +330,10 @@ class _Reader:
             )
             self.chains[node.output[0]] = chain
             return None
-        return self._shuffle(chain, node.name)
-
-    def _shuffle(self, chain: list[_Node], name: str) -> Op:
-        """What a chain of moves does to numbered pixels: one of the shuffles, or nothing that is known."""
-        source, output = chain[0].input[0], chain[-1].output[0]
-        channels = self._width(source)
-        for block, up, columns_first in product(range(2, BLOCKS + 1), (True, False), (True, False)):
-            shuffle = Shuffle(name, source, output, block, up, columns_first)
-            protos = [node.proto for node in chain]
-            if (channels % block**2 == 0 or not up) and spells(protos, shuffle, channels, self.values, self.model):
-                return shuffle
-        raise refused_graph(
-            "Reshape and Transpose that spell a pixel shuffle", f"another at {chain[0].op_type} {chain[0].name}"
-        )
+        protos, channels = [each.proto for each in chain], self._width(chain[0].input[0])
+        found = spelled_shuffle(protos, node.name, channels, self.values, self.model)
+        self._require(found is not None, chain[0], "Reshape and Transpose that spell a pixel shuffle", "another")
+        return found
 
     def _activation(self, node: _Node) -> None:
         activation = self._which(node)
@@ -388,6 +386,7 @@ READERS: dict[str, Callable[[_Reader, _Node], Op | None]] = {
     "MaxPool": _Reader._maxpool,
     "Mul": _Reader._mul,
     "Resize": _Reader._resize,
+    "Softmax": _Reader._softmax,
     "SpaceToDepth": _Reader._spacetodepth,
     "Sub": _Reader._sub,
     **dict.fromkeys(MOVES, _Reader._move),

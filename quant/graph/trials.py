@@ -1,6 +1,7 @@
 """What exporters write in several ways is tried out on numbers: spelled-out shuffles, coordinates of resizes."""
 
 from collections.abc import Callable, Mapping, Sequence
+from itertools import product
 
 import numpy as np
 import onnx
@@ -8,6 +9,24 @@ from onnx import helper, numpy_helper
 from onnx.reference import ReferenceEvaluator
 
 from quant.graph.operations import Shuffle
+
+BLOCKS = 8
+"""The largest side of a pixel shuffle's blocks that is looked for."""
+
+
+def spelled_shuffle(
+    chain: Sequence[onnx.NodeProto],
+    name: str,
+    channels: int,
+    constants: Mapping[str, np.ndarray],
+    model: onnx.ModelProto,
+) -> Shuffle | None:
+    """The pixel shuffle, to be of that name, that a chain of moves is; None of any other."""
+    for block, up, columns_first in product(range(2, BLOCKS + 1), (True, False), (True, False)):
+        shuffle = Shuffle(name, chain[0].input[0], chain[-1].output[0], block, up, columns_first)
+        if (channels % block**2 == 0 or not up) and spells(chain, shuffle, channels, constants, model):
+            return shuffle
+    return None
 
 
 def spells(

@@ -16,7 +16,7 @@ from quant.reading.nodes import Nodes, Shapes, attributes_of, shapes_of
 
 ARITHMETIC = {"Add", "Div", "Mul", "Sub"}
 NORMALISATION = "BatchNormalization"
-SHAPED = {"Cast", "Gemm", "ReduceMean"}
+SHAPED = {"Cast", "Gemm", "ReduceMean", "Softmax"}
 """What may be rewritten where shapes are known."""
 
 

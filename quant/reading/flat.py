@@ -1,6 +1,7 @@
 """Fully connected layers as convolutions of the whole map that they read, the flattening left behind them.
 
-A DPU runs them as such, and a quantiser that knows convolutions knows them too.
+A DPU runs them as such, and a quantiser that knows convolutions knows them too. A Softmax over what is flat becomes
+one along the channels of a map of one pixel.
 """
 
 from math import prod
@@ -31,14 +32,28 @@ class Unflatten:
         found = self._maps.get(node.input[0]) if node.input else None
         if found is None or len(node.output) != 1:
             return None
+        source, size = found
         if node.op_type == "Gemm":
-            return self._connected(graph, node, *found)
+            return self._connected(graph, node, source, size)
+        if node.op_type == "Softmax" and size[1:] == (1, 1) and attributes_of(node).get("axis", -1) in (1, -1):
+            return self._flat(helper.make_node("Softmax", [source], node.output, name=node.name, axis=1), size)
         if node.op_type in POINTWISE:
             image = NodeProto()
             image.CopyFrom(node)
-            image.input[0] = found[0]
-            return self._flat(image, found[1])
+            image.input[0] = source
+            return self._flat(image, size)
+        if node.op_type == "Reshape" and graph.integers(node.input[1]) in ([1, *size], [0, *size], [-1, *size]):
+            return self._map_again(graph, node, source)
         return None
+
+    def _map_again(self, graph: Nodes, node: NodeProto, source: str) -> list[NodeProto] | None:
+        """Nothing in the place of what makes a map of it again, where no other node reads what was flat."""
+        writer = graph.writers.get(source)
+        if graph.reads[node.input[0]] != 1 or graph.reads[source] > 1 or writer is None:
+            return None
+        writer.output[list(writer.output).index(source)] = node.output[0]
+        graph.writers[node.output[0]] = writer
+        return []
 
     def _flattens(self, graph: Nodes, node: NodeProto) -> bool:
         """Whether a node makes (N, C H W) of a map whose size is known."""

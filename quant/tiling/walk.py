@@ -167,7 +167,7 @@ POINTWISE = {
 }  # fmt: skip
 PER_CHANNEL = {"BatchNormalization", "DequantizeLinear", "QuantizeLinear"}
 """Point-wise, with vectors of one number a channel."""
-OVER_CHANNELS = {"Concat", "QLinearConcat", "Split"}
+OVER_CHANNELS = {"Concat", "QLinearConcat", "Softmax", "Split"}
 """Point-wise where they work along the channels."""
 
 WHY = {

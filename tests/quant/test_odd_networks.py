@@ -114,9 +114,14 @@ def many_classes(w: Sketch) -> onnx.ModelProto:
     return w.model(1200)
 
 
+def shares_of_classes(w: Sketch) -> onnx.ModelProto:
+    w.node("Softmax", "out", [w.conv("c", "in", (3, 1, 3, 3), 1.0, pads=[1] * 4)], axis=1)
+    return w.model(3)
+
+
 SOUND = [
     features_beside_the_image, pooled_image, preactivation, leaking_upwards, one_tensor_twice, sum_of_two, separable,
-    names_of_ours, thirds, products, many_classes,
+    names_of_ours, thirds, products, many_classes, shares_of_classes,
 ]  # fmt: skip
 
 
@@ -157,6 +162,12 @@ def squeezed(w: Sketch) -> onnx.ModelProto:
     return w.model(1, 36)
 
 
+def shares_inside(w: Sketch) -> onnx.ModelProto:
+    shares = w.node("Softmax", "shares", [w.conv("c", "in", (4, 1, 1, 1))], axis=1)
+    w.conv("out", shares, (1, 4, 1, 1))
+    return w.model(1, 36)
+
+
 def flattened_elsewhere(w: Sketch) -> onnx.ModelProto:
     w.node("Flatten", "out", [w.conv("c", "in", (4, 1, 1, 1))], axis=2)
     return w.model(4, 36)
@@ -168,6 +179,7 @@ def flattened_elsewhere(w: Sketch) -> onnx.ModelProto:
         (unshuffled_inside, "Reshape|pixel unshuffle of several channels at the image alone"),
         (column_by_column, "one number a channel, got one of 36 at Mul out"),
         (squeezed, "tensors of one size for gated, got 1 x 1 and 36 x 36"),
+        (shares_inside, "Softmax of channels at the end alone, got another at Softmax shares"),
         (flattened_elsewhere, "Flatten at the end"),
     ],
 )

@@ -37,6 +37,7 @@ def values() -> dict[str, np.ndarray]:
     found |= {"around": np.array([0, 0, 1, 2, 0, 0, 2, 1]), "twice": np.array([1, 1, 2, 2], np.float32)}
     found |= {"small": np.array([2, 4, 2, 3]), "rows": np.array([0, -1])}
     found |= {"two": np.array([2]), "four": np.array([4])}
+    found |= {"map again": np.array([-1, 4, 1, 1])}
     found |= {"axes": np.array([2, 3]), "roi": np.zeros(0, np.float32)}
     return found
 
@@ -181,6 +182,17 @@ CASES: dict[str, tuple[list[NodeProto], dict[str, int]]] = {
             node("Unsqueeze", "g", "axes"),
         ],
         {"Resize": 1, "Conv": 1, "Flatten": 1, "Unsqueeze": 1},
+    ),
+    "shares of classes": (
+        [
+            node("Mul", "x", "six", to="l"),
+            node("MaxPool", "l", to="m", kernel_shape=[9, 11]),
+            node("GlobalAveragePool", "m", to="p"),
+            node("Flatten", "p", to="f"),
+            node("Softmax", "f", to="s", axis=1),
+            node("Reshape", "s", "map again"),
+        ],
+        {"Mul": 1, "MaxPool": 1, "GlobalAveragePool": 1, "Softmax": 1},
     ),
     "equal layers": ([conv(), conv(to="d"), node("Add", "c", "d")], {"Conv": 2, "Add": 1}),
 }
