@@ -28,14 +28,16 @@ from quant.graph import (
     tensors,
 )
 from quant.onnx_file import fixed_tile_px, metadata
-from quant.passes.equalise import LEVELLING, Costs, channel_ranges, equalise, first_guess, search, search_steps
+from quant.passes.equalise import LEVELLING, Costs, Trial, channel_ranges, equalise, first_guess, search, search_steps
 from quant.passes.fit_weights import fit_weights, input_moments
+from quant.passes.level import Chain, chain_ranges, level
 from quant.passes.stream import (
     MAX_CHANNELS,
     STREAM_FRAC_BITS,
     Stream,
     common_frac_bits,
     half_lsb_pair,
+    lone_tensors,
     share_stream_scale,
     streams,
     takes_gains,
@@ -43,10 +45,11 @@ from quant.passes.stream import (
     window_offsets,
     windowed,
 )
-from quant.session import crops, halo_of, open_any_size, open_session, result_of, tensor_values
+from quant.session import TILE_PX, crops, halo_of, open_any_size, open_session, result_of, tensor_values
 
 SEARCH_CROPS = 16
 """What the equalisation is searched on, a quarter of them with the strongest edges: there int8 clips."""
+MOST_CROPS = 64
 
 
 FINER = GAIN.bit_length() - 1
@@ -82,12 +85,16 @@ class Quantised:
 
 @dataclass(frozen=True)
 class _Plan:
-    """What is to be quantised: the graph that reads the planes wanted, and that of all; the host's part; streams."""
+    """What is to be quantised: the graph that reads the planes wanted, and that of all; the host's part; streams.
+
+    `chain` is what is levelled where there is no stream.
+    """
 
     graph: Graph
     full: Graph
     ends: Ends
     streams: list[Stream]
+    chain: Chain
     passes: Passes
     shifts: Shifts
 
@@ -123,6 +130,8 @@ class _Plan:
         if self.shares:
             found = streams(final)
             chosen = share_stream_scale(found, frac_bits, self.stream_frac_bits(frac_bits))
+        elif self.passes.equalise:
+            chosen |= dict.fromkeys(self.chain.tensors, STREAM_FRAC_BITS)
         if self.ends.offsets:
             chosen[CORRECTION] += FINER
         elif self.ends.gains == 2:
@@ -136,7 +145,11 @@ def _plan(model: onnx.ModelProto, passes: Passes, shifts: Shifts = SHIFTS) -> _P
     full = read_planes(network.graph)
     gains = 2 if passes.dual_gain and network.adds_image and takes_gains(full) else 1
     graph = full if passes.fine_planes else coarse_plane_only(full)
-    return _Plan(graph, full, ends_of(network, gains), streams(graph), passes, shifts)
+    ends, found = ends_of(network, gains), streams(graph)
+    widths = channels_of(graph, {PLANES: ends.planes * ends.channels})
+    alone = [] if found else lone_tensors(graph)
+    chain = Chain(tuple(alone), tuple(widths[name] for name in alone))
+    return _Plan(graph, full, ends, found, chain, passes, shifts)
 
 
 def quantise_model(
@@ -162,6 +175,8 @@ def quantise_model(
         plan = plan.with_windows(frac_bits[CORRECTION], *_result_range(plan, images, tick))
     if passes.equalise and plan.streams:
         graph = _equalised(plan, frac_bits, images, tick)
+    elif passes.equalise and plan.chain.tensors:
+        graph = _levelled(plan, frac_bits, images, tick)
     final, core = plan.rounded(graph, frac_bits), plan.core(graph, frac_bits)
     if passes.fit_weights:
         core = fit_weights(final, core, input_moments(final, images, tick, plan.ends), shifts)
@@ -186,12 +201,7 @@ def _result_range(plan: _Plan, images: Remade[np.ndarray], tick: Callable[[], No
 
 def _equalised(plan: _Plan, frac_bits: dict[str, int], images: Remade[np.ndarray], tick: Callable[[], None]) -> Graph:
     """Stream after stream, the others levelled by a first guess until their turn comes."""
-    targets = search_targets(plan.full, plan.ends, images)
-
-    def trial(tried: Graph) -> Costs:
-        return crop_costs(host_model(plan.core(tried, frac_bits), {}), targets)
-
-    graph, ranges = plan.graph, {}
+    graph, ranges, trial = plan.graph, {}, _trial(plan, frac_bits, images)
     for stream in plan.streams:
         ranges[stream] = channel_ranges(plan.graph, stream, images, tick, plan.ends)
     for stream in plan.streams[1:]:
@@ -203,10 +213,26 @@ def _equalised(plan: _Plan, frac_bits: dict[str, int], images: Remade[np.ndarray
     return graph
 
 
+def _trial(plan: _Plan, frac_bits: dict[str, int], images: Remade[np.ndarray]) -> Trial:
+    """What a graph costs once it is rounded, on crops of the images."""
+    targets = search_targets(plan.full, plan.ends, images)
+    return lambda tried: crop_costs(host_model(plan.core(tried, frac_bits), {}), targets)
+
+
+def _levelled(plan: _Plan, frac_bits: dict[str, int], images: Remade[np.ndarray], tick: Callable[[], None]) -> Graph:
+    """The network without a stream, every tensor levelled."""
+    chain, trial = plan.chain, _trial(plan, frac_bits, images)
+    ranges = chain_ranges(plan.graph, chain, images, tick, plan.ends)
+    factors = level(plan.graph, chain, ranges, chain.unscaled(frac_bits), trial, tick)
+    return chain.scaled(plan.graph, factors)
+
+
 def ticks(model: onnx.ModelProto, patches: int, passes: Passes = ALL) -> int:
     """How often `quantise_model` will call `tick`."""
     plan = _plan(model, passes)
     passings = 2 + passes.fit_weights + plan.takes_windows
+    if passes.equalise and plan.chain.tensors:
+        return (passings + 1) * patches + plan.chain.steps
     if not (passes.equalise and plan.streams):
         return passings * patches
     widths = channels_of(plan.graph, {PLANES: plan.ends.planes * plan.ends.channels})
@@ -236,10 +262,17 @@ def search_targets(graph: Graph, ends: Ends, images: Remade[np.ndarray]) -> Targ
 
     sizes = {(k, n): size(crop) for k, image in enumerate(images) for n, crop in enumerate(crops(image, halo_px))}
     order = sorted(sizes, key=lambda place: sizes[place], reverse=True)
-    hard = SEARCH_CROPS // 4
-    others = order[hard :: max((len(order) - hard) // (SEARCH_CROPS - hard), 1)]
-    chosen = [crops(images[k], halo_px)[n].copy() for k, n in (*order[:hard], *others[: SEARCH_CROPS - hard])]
+    count = _crop_count(crops(images[0], halo_px)[0])
+    hard = count // 4
+    others = order[hard :: max((len(order) - hard) // (count - hard), 1)]
+    chosen = [crops(images[k], halo_px)[n].copy() for k, n in (*order[:hard], *others[: count - hard])]
     return [(crop, restored(crop)) for crop in chosen]
+
+
+def _crop_count(crop: np.ndarray) -> int:
+    """How many crops like this one are searched on: small ones say less each."""
+    height, width = map(int, crop.shape[2:])
+    return min(max(SEARCH_CROPS * TILE_PX**2 // (height * width), SEARCH_CROPS), MOST_CROPS)
 
 
 def crop_costs(model: onnx.ModelProto, targets: Targets) -> Costs:

@@ -7,7 +7,7 @@ k ~ range^-gamma; then each channel is tried larger and smaller on calibration p
 channel's rounding does to the output.
 """
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from itertools import product
 
@@ -64,17 +64,27 @@ def channel_ranges(
     ends: Ends = ONE_CHANNEL,
 ) -> np.ndarray:
     """(C,) range of each stream channel over images (1, C', H, W), the widest of all the stream's tensors."""
-    names, halo_px = sorted(stream), halo_of(graph)
-    session, total, count = open_session(graph_to_onnx(graph, names, ends.planes * ends.channels)), np.zeros(1), 0
+    total, count = np.zeros(1), 0
+    for sizes in channel_sizes(graph, sorted(stream), images, tick, ends):
+        total, count = total + np.stack(sizes), count + 1
+    return above_dead(np.asarray(total / max(count, 1)).max(axis=0))
+
+
+def channel_sizes(
+    graph: Graph, names: list[str], images: Iterable[np.ndarray], tick: Callable[[], None], ends: Ends = ONE_CHANNEL
+) -> Iterator[list[np.ndarray]]:
+    """The QUANTILE of each channel's sizes, (C,) of each of the named tensors, for every tile of the images."""
+    halo_px = halo_of(graph)
+    session = open_session(graph_to_onnx(graph, names, ends.planes * ends.channels))
     for image in images:
         for results in tensor_values(session, names, image, halo_px, ends):
-            sizes = [np.abs(r[0]).reshape(r.shape[1], -1) for r in results]
-            total = total + np.stack([np.quantile(size, QUANTILE, axis=1) for size in sizes])
-            count += 1
+            yield [np.quantile(np.abs(r[0]).reshape(r.shape[1], -1), QUANTILE, axis=1) for r in results]
         tick()
-    ranges = np.asarray(total / max(count, 1)).max(axis=0)
-    floor = 1e-3 * float(ranges.max()) + 1e-12  # a dead channel must not be blown up
-    return np.asarray(np.maximum(ranges, floor))
+
+
+def above_dead(ranges: np.ndarray) -> np.ndarray:
+    """Ranges (C,) of which none is next to nothing: a dead channel must not be blown up."""
+    return np.asarray(np.maximum(ranges, 1e-3 * float(ranges.max()) + 1e-12))
 
 
 def first_guess(ranges: np.ndarray, levelling: float, headroom: float) -> np.ndarray:
@@ -88,35 +98,42 @@ def search(graph: Graph, stream: Stream, ranges: np.ndarray, trial: Trial, tick:
     """The factors of least error: the best first guess, then channel by channel."""
     best = None
     for levelling, headroom in product(LEVELLING, HEADROOM):
-        best = _race(graph, stream, first_guess(ranges, levelling, headroom), trial, best)
+        guess = first_guess(ranges, levelling, headroom)
+        best = race(trial(equalise(graph, stream, guess)), guess, best)
         tick()
     assert best is not None  # noqa: S101
+    return stepped(lambda factors: trial(equalise(graph, stream, factors)), range(len(ranges)), best, tick).factors
+
+
+def stepped(
+    costs_of: Callable[[np.ndarray], Costs], channels: Iterable[int], best: "Best", tick: Callable[[], None]
+) -> "Best":
+    """The best factors once each of these channels has been tried larger and smaller."""
     for step in STEPS:
-        for channel in range(len(ranges)):
+        for channel in channels:
             for factor in (step, 1 / step):
                 tried = best.factors.copy()
                 tried[channel] *= factor
-                winner = _race(graph, stream, tried, trial, best)
+                winner = race(costs_of(tried), tried, best)
                 if winner is not best:
                     best = winner
                     break  # the other way leads back
             tick()
-    return best.factors
+    return best
 
 
 @dataclass(frozen=True)
-class _Best:
+class Best:
     """The best factors so far, (C,), and what they cost on each crop, (N,)."""
 
     factors: np.ndarray
     costs: np.ndarray
 
 
-def _race(graph: Graph, stream: Stream, factors: np.ndarray, trial: Trial, best: _Best | None) -> _Best:
+def race(costs_of: Costs, factors: np.ndarray, best: Best | None) -> Best:
     """The better of two, the costliest crops first: six of seven trials fail, and most of them show it on two."""
-    costs_of = trial(equalise(graph, stream, factors))
     if best is None:
-        return _Best(factors, costs_of(None))
+        return Best(factors, costs_of(None))
     order = np.argsort(-best.costs, kind="stable")
     costs, seen = np.zeros(len(order)), 0
     while seen < len(order):
@@ -126,7 +143,7 @@ def _race(graph: Graph, stream: Stream, factors: np.ndarray, trial: Trial, best:
         margin = MARGIN if seen < len(order) else 0.0
         if costs.sum() >= best.costs[order[:seen]].sum() * (1 + margin):
             return best
-    return _Best(factors, costs)
+    return Best(factors, costs)
 
 
 def search_steps(channels: int) -> int:

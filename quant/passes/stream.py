@@ -34,6 +34,13 @@ def streams(graph: Graph) -> list[Stream]:
     return [group for group in groups if _passes_factors(graph, group)]
 
 
+def lone_tensors(graph: Graph) -> list[str]:
+    """Tensors of no stream that convolutions alone write and read: each of their channels may have a factor."""
+    added = {name for op in graph if isinstance(op, Add) for name in (*op.inputs, op.output)}
+    written = [op.output for op in graph if isinstance(op, Conv) and op.output not in added]
+    return [name for name in written if _passes_factors(graph, frozenset([name]))]
+
+
 def _passes_factors(graph: Graph, stream: Stream) -> bool:
     touching = [op for op in graph if stream.intersection((*op.inputs, op.output))]
     known = all(isinstance(op, Conv | Add) for op in touching)

@@ -1,0 +1,129 @@
+"""Level the channels of a network without a residual stream, tensor by tensor, at no cost in the network.
+
+Between two convolutions each channel may be scaled by a factor of its own, as `quant.passes.equalise` does with a
+stream: then one scale suits all channels, and because a factor is any number, the tensor's own scale and that of the
+weights that read it are no longer bound to powers of two. Networks with a stream are left alone: there the stream is
+what counts, and levelling the rest too made none better.
+
+All tensors are levelled together first, for what the worst of them errs hides the others; then one after the other
+from the last, for what is rounded late reaches the result.
+"""
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from itertools import pairwise, product
+
+import numpy as np
+
+from quant.ends import ONE_CHANNEL, Ends
+from quant.graph import Graph
+from quant.passes.equalise import (
+    STEPS,
+    Best,
+    Costs,
+    Trial,
+    above_dead,
+    channel_sizes,
+    equalise,
+    first_guess,
+    stepped,
+)
+from quant.passes.stream import STREAM_FRAC_BITS
+
+LEVELLING = (0.0, 0.25, 0.5, 0.75, 1.0)
+HEADROOM = (0.8, 1.0, 1.25, 1.6, 2.0, 2.6)
+"""First guesses tried, as in `quant.passes.equalise`; a range here is the largest of all tiles, so more may be
+clipped."""
+MOST_CHANNELS = 1024
+"""More are not tried one by one: each costs four runs of all crops at most."""
+
+
+@dataclass(frozen=True)
+class Chain:
+    """Tensors that may be levelled, in the graph's order, and how many channels each has.
+
+    Factors and ranges of all of them are one array (sum of the channels,), tensor behind tensor.
+    """
+
+    tensors: tuple[str, ...]
+    widths: tuple[int, ...]
+
+    @property
+    def parts(self) -> list[slice]:
+        """Where each tensor's channels stand."""
+        ends = np.cumsum([0, *self.widths]).tolist()
+        return [slice(first, end) for first, end in pairwise(ends)]
+
+    @property
+    def stepped(self) -> bool:
+        """Whether there are few enough channels to try each."""
+        return sum(self.widths) <= MOST_CHANNELS
+
+    @property
+    def steps(self) -> int:
+        """How often `level` ticks."""
+        return len(LEVELLING) * len(HEADROOM) + len(self.widths) + self.stepped * len(STEPS) * sum(self.widths)
+
+    def scaled(self, graph: Graph, factors: np.ndarray) -> Graph:
+        """The same network with each channel scaled by its factor."""
+        for name, part in zip(self.tensors, self.parts, strict=True):
+            graph = equalise(graph, frozenset([name]), factors[part])
+        return graph
+
+    def unscaled(self, frac_bits: Mapping[str, int]) -> np.ndarray:
+        """The factors that leave every tensor the scale that it has by itself."""
+        own = [2.0 ** (frac_bits[name] - STREAM_FRAC_BITS) for name in self.tensors]
+        return np.repeat(own, self.widths)
+
+    def guess(self, ranges: np.ndarray, levelling: float, headroom: float) -> np.ndarray:
+        """A first guess for each tensor."""
+        return np.concatenate([first_guess(ranges[part], levelling, headroom) for part in self.parts])
+
+
+def chain_ranges(
+    graph: Graph,
+    chain: Chain,
+    images: Iterable[np.ndarray],
+    tick: Callable[[], None],
+    ends: Ends = ONE_CHANNEL,
+) -> np.ndarray:
+    """The range of every channel over images (1, C, H, W), that of the tile where it is widest."""
+    widest = [np.zeros(width) for width in chain.widths]
+    for sizes in channel_sizes(graph, list(chain.tensors), images, tick, ends):
+        widest = [np.maximum(most, size) for most, size in zip(widest, sizes, strict=True)]
+    return np.concatenate([above_dead(ranges) for ranges in widest])
+
+
+def level(
+    graph: Graph, chain: Chain, ranges: np.ndarray, start: np.ndarray, trial: Trial, tick: Callable[[], None]
+) -> np.ndarray:
+    """The factors of least error that were found, never more than that of `start`."""
+
+    def costs_of(factors: np.ndarray) -> Costs:
+        return trial(chain.scaled(graph, factors))
+
+    best = Best(start, costs_of(start)(None))
+    for shape in product(LEVELLING, HEADROOM):
+        best = _better(chain.guess(ranges, *shape), costs_of, best)
+        tick()
+    for part in reversed(chain.parts):
+        best = _one_tensor(ranges, part, costs_of, best)
+        tick()
+        if chain.stepped:
+            best = stepped(costs_of, range(part.start, part.stop), best, tick)
+    return best.factors
+
+
+def _one_tensor(ranges: np.ndarray, part: slice, costs_of: Callable[[np.ndarray], Costs], best: Best) -> Best:
+    """The best of the first guesses for one tensor, the others as they are."""
+    for shape in product(LEVELLING, HEADROOM):
+        tried = best.factors.copy()
+        tried[part] = first_guess(ranges[part], *shape)
+        best = _better(tried, costs_of, best)
+    return best
+
+
+def _better(factors: np.ndarray, costs_of: Callable[[np.ndarray], Costs], best: Best) -> Best:
+    """The better of two on all crops: so large a step may cost the hardest ones and be worth it."""
+    costs = costs_of(factors)(None)
+    return Best(factors, costs) if costs.sum() < best.costs.sum() else best
