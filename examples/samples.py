@@ -163,11 +163,14 @@ def write_samples(name: str, count: int, out: Path, folder: Path | None, seed: i
     require_writable(out)
     drawn = list(islice(batches_of(name, folder, seed), -(-count // BATCH)))
     image, wanted = (torch.cat(tensors)[:count].numpy() for tensors in zip(*drawn, strict=True))
-    arrays = {"image": image, "reference": wanted} if NETWORKS[name].restores else {"image": image}
+    restores = NETWORKS[name].restores
     with whole_file(out) as temporary, temporary.open("wb") as file:
-        np.savez(file, **arrays)
+        if restores:
+            np.savez(file, image=image, reference=wanted)
+        else:
+            np.savez(file, image=image)
     shape = " x ".join(map(str, image.shape))
-    sys.stdout.write(f"wrote {out}: {shape}{', with references' if len(arrays) > 1 else ''}\n")
+    sys.stdout.write(f"wrote {out}: {shape}{', with references' if restores else ''}\n")
 
 
 if __name__ == "__main__":

@@ -16,7 +16,7 @@ from itertools import pairwise, product
 import numpy as np
 
 from quant.ends import ONE_CHANNEL, Ends
-from quant.graph import Graph
+from quant.graph import Conv, Graph
 from quant.passes.equalise import (
     STEPS,
     Best,
@@ -36,6 +36,24 @@ HEADROOM = (0.8, 1.0, 1.25, 1.6, 2.0, 2.6)
 clipped."""
 MOST_CHANNELS = 1024
 """More are not tried one by one: each costs four runs of all crops at most."""
+
+
+@dataclass(frozen=True)
+class Channels:
+    """What is known of channels (C,): the range of their values, and the largest of the weights that write each."""
+
+    ranges: np.ndarray
+    weights: np.ndarray
+
+    def guess(self, levelling: float, headroom: float) -> np.ndarray:
+        """Factors (C,) that level the ranges, but let no weak channel's weights outgrow those of the stronger half.
+
+        A channel that is hardly ever on would else be blown up until its weights ruled the scale of all.
+        """
+        factors = first_guess(self.ranges, levelling, headroom)
+        strong = self.ranges >= np.median(self.ranges)
+        limit = (self.weights * factors)[strong].max()
+        return np.asarray(np.minimum(factors, limit / np.maximum(self.weights, 1e-12)))
 
 
 @dataclass(frozen=True)
@@ -75,10 +93,6 @@ class Chain:
         own = [2.0 ** (frac_bits[name] - STREAM_FRAC_BITS) for name in self.tensors]
         return np.repeat(own, self.widths)
 
-    def guess(self, ranges: np.ndarray, levelling: float, headroom: float) -> np.ndarray:
-        """A first guess for each tensor."""
-        return np.concatenate([first_guess(ranges[part], levelling, headroom) for part in self.parts])
-
 
 def chain_ranges(
     graph: Graph,
@@ -98,27 +112,29 @@ def level(
     graph: Graph, chain: Chain, ranges: np.ndarray, start: np.ndarray, trial: Trial, tick: Callable[[], None]
 ) -> np.ndarray:
     """The factors of least error that were found, never more than that of `start`."""
+    written = {op.output: np.abs(op.weight).max((1, 2, 3)) for op in graph if isinstance(op, Conv)}
+    known = [Channels(ranges[part], written[name]) for name, part in zip(chain.tensors, chain.parts, strict=True)]
 
     def costs_of(factors: np.ndarray) -> Costs:
         return trial(chain.scaled(graph, factors))
 
     best = Best(start, costs_of(start)(None))
     for shape in product(LEVELLING, HEADROOM):
-        best = _better(chain.guess(ranges, *shape), costs_of, best)
+        best = _better(np.concatenate([channels.guess(*shape) for channels in known]), costs_of, best)
         tick()
-    for part in reversed(chain.parts):
-        best = _one_tensor(ranges, part, costs_of, best)
+    for channels, part in reversed(list(zip(known, chain.parts, strict=True))):
+        best = _one_tensor(channels, part, costs_of, best)
         tick()
         if chain.stepped:
             best = stepped(costs_of, range(part.start, part.stop), best, tick)
     return best.factors
 
 
-def _one_tensor(ranges: np.ndarray, part: slice, costs_of: Callable[[np.ndarray], Costs], best: Best) -> Best:
+def _one_tensor(channels: Channels, part: slice, costs_of: Callable[[np.ndarray], Costs], best: Best) -> Best:
     """The best of the first guesses for one tensor, the others as they are."""
     for shape in product(LEVELLING, HEADROOM):
         tried = best.factors.copy()
-        tried[part] = first_guess(ranges[part], *shape)
+        tried[part] = channels.guess(*shape)
         best = _better(tried, costs_of, best)
     return best
 

@@ -1,0 +1,127 @@
+"""Levelling a network without a stream: the float network stays, the search only gains, most on unequal channels."""
+
+from dataclasses import replace
+
+import numpy as np
+import onnx
+import pytest
+import torch
+
+from examples.networks import build, to_onnx
+from quant.calibration import Patches, Remade
+from quant.ends import Ends, ends_of
+from quant.gate import compare
+from quant.graph import CORRECTION, PLANES, Conv, Graph, channels_of, graph_to_onnx, read_network, read_planes
+from quant.passes import level
+from quant.passes.equalise import Costs
+from quant.passes.level import Chain, chain_ranges
+from quant.passes.stream import STREAM_FRAC_BITS, lone_tensors
+from quant.quantise import ALL, Passes, quantise_model, ticks
+from quant.reading.folding import simplest
+from quant.session import open_session, planes_of
+
+
+def read(name: str) -> tuple[onnx.ModelProto, Graph, Ends, Chain]:
+    model = simplest(to_onnx(name, build(name, torch.Generator().manual_seed(0))), name)
+    network = read_network(model)
+    graph, ends = read_planes(network.graph), ends_of(network)
+    widths, alone = channels_of(graph, {PLANES: ends.planes * ends.channels}), lone_tensors(graph)
+    return model, graph, ends, Chain(tuple(alone), tuple(widths[tensor] for tensor in alone))
+
+
+def images(count: int = 3, side_px: int = 40) -> list[np.ndarray]:
+    rows, columns = np.mgrid[:side_px, :side_px] / side_px
+    waves = [0.4 + 0.3 * np.sin(9 * rows + k) * np.cos(7 * columns) for k in range(count)]
+    return [wave.astype(np.float32)[None, None] for wave in waves]
+
+
+def correction(graph: Graph, ends: Ends) -> np.ndarray:
+    session = open_session(graph_to_onnx(graph, [CORRECTION], ends.planes * ends.channels))
+    return np.asarray(session.run(None, {PLANES: planes_of(images()[1], ends)})[0])
+
+
+@pytest.mark.parametrize("name", ["dncnn", "espcn", "unet", "segment"])
+def test_levelling_leaves_the_float_network_as_it_was(name: str) -> None:
+    _, graph, ends, chain = read(name)
+    factors = np.random.default_rng(1).uniform(0.2, 5, sum(chain.widths))
+    wanted = correction(graph, ends)
+    np.testing.assert_allclose(
+        correction(chain.scaled(graph, factors), ends), wanted, atol=2e-5 * np.abs(wanted).max()
+    )
+    moved = zip(chain.scaled(graph, factors), graph, strict=True)
+    assert any(isinstance(op, Conv) and not np.allclose(op.weight, was.weight) for op, was in moved)  # type: ignore[attr-defined]
+
+
+def test_what_anything_but_convolutions_reads_is_left_alone() -> None:
+    _, graph, _, chain = read("unet")
+    readers = {tensor: [op for op in graph if tensor in op.inputs] for tensor in chain.tensors}
+    assert all(isinstance(op, Conv) for ops in readers.values() for op in ops)
+    pooled = {tensor for op in graph if not isinstance(op, Conv) for tensor in (*op.inputs, op.output)}
+    assert pooled
+    assert not pooled & set(chain.tensors)
+
+
+def test_activations_that_factors_do_not_pass_are_left_alone() -> None:
+    _, graph, _, chain = read("segment")
+    curved = {op.output for op in graph if op.name.endswith("HardSwish") or "Hardswish" in op.name}
+    assert not curved & set(chain.tensors)
+    assert CORRECTION not in chain.tensors
+
+
+class Bowl:
+    """A cost that is known: how far the channels of the first tensor are from factors of their own, on two crops."""
+
+    def __init__(self, graph: Graph) -> None:
+        self.sizes = self._sizes(graph)
+        self.lowest = np.geomspace(0.3, 3, len(self.sizes))
+
+    @staticmethod
+    def _sizes(graph: Graph) -> np.ndarray:
+        return np.asarray(np.abs(graph[0].weight).sum((1, 2, 3)))  # type: ignore[attr-defined]
+
+    def __call__(self, tried: Graph) -> Costs:
+        off = np.square(np.log(self._sizes(tried) / self.sizes / self.lowest)).sum()
+        return lambda crops: np.array([1.0, 2.0])[slice(None) if crops is None else crops] * off
+
+
+@pytest.mark.parametrize("most", [level.MOST_CHANNELS, 10])
+def test_the_search_ticks_as_told_and_never_ends_above_its_start(most: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(level, "MOST_CHANNELS", most)
+    _, graph, ends, chain = read("espcn")
+    ranges, ticked = chain_ranges(graph, chain, images(), lambda: None, ends), list[int]()
+    trial = Bowl(graph)
+    for start in (np.ones(sum(chain.widths)), np.concatenate([trial.lowest, np.ones(chain.widths[1])])):
+        ticked.clear()
+        found = level.level(graph, chain, ranges, start, trial, lambda: ticked.append(1))
+        before, after = (trial(chain.scaled(graph, each))(None).sum() for each in (start, found))
+        assert after <= before
+        assert len(ticked) == chain.steps
+    assert chain.steps < 100 or most > 10
+
+
+def test_the_start_leaves_each_tensor_the_scale_it_has() -> None:
+    *_, chain = read("espcn")
+    factors = chain.unscaled(dict.fromkeys(chain.tensors, STREAM_FRAC_BITS - 2))
+    np.testing.assert_array_equal(factors, np.full(sum(chain.widths), 0.25))
+
+
+def test_unequal_channels_err_half_as_much_once_they_are_levelled() -> None:
+    """A network whose channels differ thirtyfold, as training with batch normalisation leaves them."""
+    network = build("dncnn", torch.Generator().manual_seed(0))
+    layers = [layer for layer in network.modules() if isinstance(layer, torch.nn.Conv2d | torch.nn.BatchNorm2d)]
+    with torch.no_grad():
+        for norm, conv in zip(layers[2::2], layers[3::2], strict=True):
+            factors = torch.logspace(0, -1.5, norm.weight.numel())
+            norm.weight.mul_(factors)
+            norm.bias.mul_(factors)  # type: ignore[union-attr]
+            conv.weight.div_(factors[:, None, None])
+    model, seen = simplest(to_onnx("dncnn", network), "dncnn"), images()
+    patches = Patches([], Remade(lambda k: (seen[k], seen[k]), len(seen)), Remade(lambda k: seen[k], len(seen)))
+
+    def mae(passes: Passes) -> float:
+        ticked: list[int] = []
+        made = quantise_model(model, patches, {}, lambda: ticked.append(1), passes)
+        assert len(ticked) == ticks(model, len(seen), passes)
+        return compare(open_session(model), open_session(made.host), patches.pairs, simulated=False).mae
+
+    assert mae(ALL) < 0.5 * mae(replace(ALL, equalise=False))
