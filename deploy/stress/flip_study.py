@@ -94,6 +94,7 @@ def flip_rows(subject: Subject, request: FlipRequest, tick: Callable[[], None] =
     """
     core_of(subject)  # refused before anything is drawn
     dpu = load_dpu(request.target, None)
+    dpu.limit("cpu", "clock_ghz")  # and so is a board that cannot price the guards
     prediction = predict_file(subject.paths[-1], dpu, TILE_PX)
     target = make_target(subject, request)
     curves = flips.curve_rows(target, request.draws, request.seed, tick)
