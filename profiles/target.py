@@ -25,12 +25,9 @@ PLACES = frozenset({"conv", "depthwise", "pool", "sum", "alone"})
 DOCUMENTS = frozenset({"operators", "numbers", "quantiser"})
 """Where a DPU's operators are listed, where its numbers are described, and the quantiser that knows their windows."""
 
-OWN = "power"
-"""A table that no board takes from another: power is measured on one."""
-ABSENT = {
-    "cost": ("no cost constants yet", "take those of a board with the same DPU: base = its name"),
-    "power": ("no published power", "measure it, and add it to the file"),
-}
+WATTS = "_w"
+"""How the names of measured powers end, which no board takes from another."""
+ABSENT = {"cost": ("no cost constants yet", "take those of a board with the same DPU: base = its name")}
 """What the lack of a whole table means, and the remedy."""
 
 
@@ -143,8 +140,8 @@ def _with_base(label: str, raw: dict[str, object]) -> tuple[str, dict[str, objec
         known = ", ".join(board_names())
         raise ProfileError(f"{label} base", expected=f"one of {known}", got=repr(base), remedy="name a shipped board")
     below = _with_base(*read_toml("targets", str(base)))[1]
-    below.pop(OWN, None)
-    return label, _over(raw, below, depth=1)
+    power = {key: value for key, value in _mapping(label, below.get("power", {})).items() if not key.endswith(WATTS)}
+    return label, _over(raw, {**below, "power": power}, depth=1)
 
 
 def _over(above: Mapping[str, object], below: Mapping[str, object], depth: int) -> dict[str, object]:
