@@ -11,10 +11,10 @@ from profiles.target import board_names
 SMALLEST, LARGEST = 1e-30, 1e30
 CONFIGURATION = {"cores": 1.0, "batch_handlers": 1.0, "cpb": 1.0, "peak_tops": SMALLEST}
 """What every configuration states, and the least that it can be."""
-DIVISORS = ("array", "memory", "elementwise", "cost", "power")
-"""Tables of widths, rates and energies, which the cost model divides by: a profile with a zero there is refused."""
 SIZED = ("array", "memory", "elementwise")
 """Tables whose constants a configuration may state for itself, by their names: a smaller array has smaller banks."""
+DIVISORS = {**dict.fromkeys(SIZED, 1.0), "cost": SMALLEST, "power": SMALLEST}
+"""Tables of widths, rates and energies, by which rules and cost model divide, and the least that each can be."""
 
 
 @dataclass(frozen=True)
@@ -117,13 +117,13 @@ def load_dpu(target: str, configuration: str | None = None) -> Dpu:
         got, remedy = "none", "add it, or begin with base = the name of a board with the same DPU"
         raise ProfileError(profile.name, expected="a table [documents]", got=got, remedy=remedy)
     dpu = Dpu(profile, name, constants)
-    for table in DIVISORS:
+    for table, least in DIVISORS.items():
         for key, constant in dpu.tables.get(table, {}).items():
-            _require(f"{profile.name} [{table}] {key}", constant)
+            _require(f"{profile.name} [{table}] {key}", constant, least)
     return dpu
 
 
-def _require(where: str, constant: Constant | None, least: float = SMALLEST) -> None:
+def _require(where: str, constant: Constant | None, least: float) -> None:
     if constant is None or not least <= constant.low <= constant.high < LARGEST:
         got = "none" if constant is None else str(constant)
         raise ProfileError(

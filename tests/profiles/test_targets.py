@@ -114,3 +114,17 @@ def test_without_cost_constants_what_predicts_refuses_and_the_rest_works(tmp_pat
 def test_a_target_without_a_dpu_is_told_the_boards() -> None:
     with pytest.raises(BeersError, match=", ".join(board_names())):
         load_dpu("host-cpu")
+
+
+@pytest.mark.parametrize("name", board_names())
+def test_check_takes_every_board_and_its_model(name: str) -> None:
+    for target in (name, f"{name}-model"):
+        done = CliRunner().invoke(app, ["check", "--tile", "64", "--target", target])
+        assert done.exit_code == 0, done.output
+        assert f"on {name} {load_dpu(name).name}" in " ".join(done.output.split())
+
+
+@pytest.mark.parametrize("command", ["check", "quantize", "gate", "stress"])
+def test_the_help_names_every_board(command: str) -> None:
+    done = CliRunner().invoke(app, [command, "--help"], env={"COLUMNS": "200"})
+    assert all(name in done.output for name in board_names())

@@ -62,7 +62,7 @@ def conv_weight_bank(op: Operation, dpu: Dpu) -> Finding | None:
 def conv_window(op: Operation, dpu: Dpu) -> Finding | None:
     """Kernel area * ceil(ic / {conv[window_channels]}) is at most {conv[window_max]} ({conv[window_max].source})."""
     area = op.window.kernel[0] * op.window.kernel[1]
-    size = area * groups_of(op.channels[0], dpu.whole("conv", "window_channels"))
+    size = area * groups_of(op.channels[0], max(dpu.whole("conv", "window_channels"), 1))
     most = dpu.whole("conv", "window_max")
     if size <= most:
         return None
@@ -74,7 +74,7 @@ def conv_area(op: Operation, dpu: Dpu) -> Finding | None:
     area, most = op.window.kernel[0] * op.window.kernel[1], dpu.value("conv", "area_max")
     if area <= most:
         return None
-    side = math.isqrt(int(most))
+    side = math.isqrt(max(int(most), 1))
     reason = f"kernel ({shown(op.window.kernel)}) has {area} positions: at most {int(most)}"
     return Finding(reason, f"use a kernel of at most {side} x {side}, or stack small ones")
 

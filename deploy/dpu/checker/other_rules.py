@@ -40,7 +40,6 @@ INSTEAD = {
     "ReduceMean": "use GlobalAveragePool",
     "Transpose": "keep the layout (N, C, H, W) throughout",
     "Slice": "use a convolution that picks these channels or pixels",
-    "SpaceToDepth": "use a strided convolution, or rearrange on the host before the network",
     "Gather": "to pick fixed channels, use a 1 x 1 convolution; what is picked by value stays with the host",
     "Gemm": "write it as a 1 x 1 convolution",
     "MatMul": "write it as a 1 x 1 convolution where one factor is constant; else leave it to the host",
@@ -62,16 +61,18 @@ def known_operator(op: Operation, dpu: Dpu) -> Finding | None:
 
 
 def shuffle_place(op: Operation, dpu: Dpu) -> Finding | None:
-    """A pixel shuffle stands right behind a convolution, or its activation ({documents[operators]}, reorg)."""
+    """A pixel shuffle or its inverse stands behind a convolution or its activation ({documents[operators]})."""
     if op.follows in CONVOLUTIONS or op.follows == "activation":
         return None
-    remedy = "move it right behind a convolution, or use a nearest Resize and a convolution"
+    other = "a nearest Resize and a convolution" if op.op_type == "DepthToSpace" else "a strided convolution"
+    remedy = f"move it right behind a convolution, or use {other}"
     return Finding(f"{op.op_type} stands behind {op.follows or 'the input'}", remedy)
 
 
 def shuffle_channels(op: Operation, dpu: Dpu) -> Finding | None:
-    """Its input has at most {limits[channels]} channels ({documents[operators]})."""
-    return _too_many(op.channels[0], dpu.channels_max, "shuffle in two steps, each behind a convolution")
+    """Its smaller map has at most {limits[channels]} channels ({documents[operators]}, reorg)."""
+    channels = max(op.channels[0], op.out_shape[0] if op.out_shape else 0)
+    return _too_many(channels, dpu.channels_max, "shuffle in two steps, each behind a convolution")
 
 
 def argmax_channels(op: Operation, dpu: Dpu) -> Finding | None:

@@ -46,7 +46,10 @@ def streaming(placement: Placement, dpu: Dpu, tile_px: int) -> str | None:
 
 
 def shuffles(placement: Placement, dpu: Dpu, tile_px: int) -> str | None:  # noqa: ARG001
-    """A pixel shuffle inside compiles, but has given wrong numbers on a board (Vitis-AI issue 1486)."""
+    """A pixel shuffle inside compiles, but has given wrong numbers on a board (Vitis-AI issues 1486, 1199).
+
+    Its inverse as torch writes it, PixelUnshuffle, has run on the CPU.
+    """
     names = [node.op.name for node in placement.nodes if node.op.kind == "pixel shuffle" and node.device == "DPU"]
     if not names:
         return None

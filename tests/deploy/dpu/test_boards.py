@@ -1,6 +1,7 @@
 """Each board by its own file: what one refuses and another takes, what a remedy repairs, whose manual is named."""
 
 import re
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -166,7 +167,8 @@ def test_weights_fit_by_each_manuals_formula(height: int, width: int, channels: 
 @pytest.mark.parametrize("name", DPUS)
 def test_every_text_names_the_boards_own_dpu(name: str) -> None:
     own = next(kind for kind, boards in KINDS.items() if name in boards)
-    texts = {rule_name(r): rule_text(r, DPUS[name]) for r in (*all_rules(), *REMARKS) if applies(r, DPUS[name])}
+    rules: list[Callable[..., object]] = [*all_rules(), *REMARKS]
+    texts = {rule_name(rule): rule_text(rule, DPUS[name]) for rule in rules if applies(rule, DPUS[name])}
     assert {kind for text in texts.values() for kind in re.findall(r"DPUC\w*8G", text)} == {own}
     assert not [text for text in texts.values() if "{" in text or "(" not in text]
 
@@ -228,6 +230,17 @@ def test_a_pixel_shuffle_inside_is_taken_with_a_warning(tmp_path: Path) -> None:
         placement = place(read_network(path, 16), dpu)
         assert placement.failed == ()
         assert "depthtospace1" in str(REMARKS[-1](placement, dpu, 16))
+
+
+def test_pixels_become_channels_behind_a_convolution(tmp_path: Path) -> None:
+    """The `reorg` of YOLOv2; 32 x 32 pixels into 8192 channels are too many but for the VEK280."""
+    unshuffled = node("SpaceToDepth", blocksize=2)
+    deep = node("SpaceToDepth", blocksize=32)
+    behind = in_two(node("MaxPool", kernel_shape=[1, 1]), unshuffled)
+    for name, dpu in DPUS.items():
+        assert between_convs(tmp_path, unshuffled, dpu) == []
+        assert between_convs(tmp_path, behind, dpu) == ["shuffle place"]
+        assert between_convs(tmp_path, deep, dpu) == ([] if name == "vek280" else ["shuffle channels"])
 
 
 def test_the_default_is_the_papers_board() -> None:
