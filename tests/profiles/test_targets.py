@@ -93,6 +93,15 @@ def test_a_wrong_board_gets_one_sentence(old: str, new: str, words: tuple[str, .
         assert word in str(caught.value)
 
 
+def test_a_misspelt_constant_does_not_silence_its_rule(tmp_path: Path) -> None:
+    text = (HERE / "targets" / "vek280.toml").read_text(encoding="utf-8").replace("\narea_max =", "\narea_mox =")
+    done = CliRunner().invoke(app, ["check", "--tile", "64", "--target", written(tmp_path, text)])
+    assert done.exit_code == 2
+    assert "[conv]" in done.stderr
+    assert "'area_mox'" in done.stderr
+    assert done.stderr.count("\n") == 1
+
+
 def test_a_board_without_a_base_names_its_documents(tmp_path: Path) -> None:
     text = (HERE / "targets" / "vek280.toml").read_text(encoding="utf-8")
     without = re.sub(r"\[documents].*?\n\n", "", text, flags=re.DOTALL)

@@ -11,10 +11,11 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cache
 
-from deploy.dpu.board import Dpu
+from deploy.dpu.board import SIZED, Dpu
 from deploy.dpu.checker import conv_rules, number_rules, other_rules
 from deploy.dpu.checker.finding import Finding, Rule
 from deploy.dpu.graph import Kind, Operation
+from profiles.constant import check_keys
 
 CONV: tuple[Rule, ...] = (
     conv_rules.conv_kernel,
@@ -102,6 +103,20 @@ def all_rules() -> Iterator[Rule]:
     """Every rule once, in the order of the tables."""
     chains = [*RULES.values(), SIZES, NUMBERS, *SHIFTS.values()]
     yield from dict.fromkeys(rule for chain in chains for rule in chain)
+
+
+def require_known(dpu: Dpu) -> None:
+    """Refuse a constant that no rule names: misspelt, it would silence the rule that it is for.
+
+    Raises:
+        ProfileError: such a constant in a table that only rules read.
+    """
+    known: dict[str, set[str]] = {}
+    for rule in all_rules():
+        for table, key in _named(rule):
+            known.setdefault(table, set()).add(key)
+    for table in known.keys() - set(SIZED):
+        check_keys(f"{dpu.target.name} [{table}]", dpu.tables.get(table, {}), set(), known[table])
 
 
 def rule_name(rule: Callable[..., object]) -> str:
