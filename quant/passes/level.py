@@ -34,7 +34,7 @@ LEVELLING = (0.0, 0.25, 0.5, 0.75, 1.0)
 HEADROOM = (0.8, 1.0, 1.25, 1.6, 2.0, 2.6)
 """First guesses tried, as in `quant.passes.equalise`; a range here is the largest of all tiles, so more may be
 clipped."""
-MOST_CHANNELS = 1024
+MOST_CHANNELS = 256
 """More are not tried one by one: each costs four runs of all crops at most."""
 
 
