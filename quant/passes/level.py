@@ -30,10 +30,12 @@ from quant.passes.equalise import (
 )
 from quant.passes.stream import STREAM_FRAC_BITS
 
-LEVELLING = (0.0, 0.25, 0.5, 0.75, 1.0)
-HEADROOM = (0.8, 1.0, 1.25, 1.6, 2.0, 2.6)
+LEVELLING = (0.0, 0.25, 0.5, 1.0)
+HEADROOM = (0.8, 1.0, 1.25, 1.6, 2.2)
 """First guesses tried, as in `quant.passes.equalise`; a range here is the largest of all tiles, so more may be
 clipped."""
+EVERY, CLEARLY = 8, 1.1
+"""A guess is tried on one of so many crops first, and dropped where it costs so much more there."""
 MOST_CHANNELS = 256
 """More are not tried one by one: each costs four runs of all crops at most."""
 
@@ -140,6 +142,12 @@ def _one_tensor(channels: Channels, part: slice, costs_of: Callable[[np.ndarray]
 
 
 def _better(factors: np.ndarray, costs_of: Callable[[np.ndarray], Costs], best: Best) -> Best:
-    """The better of two on all crops: so large a step may cost the hardest ones and be worth it."""
-    costs = costs_of(factors)(None)
+    """The better of two on all crops: so large a step may cost the hardest ones and be worth it.
+
+    Given up where every eighth of the crops says that it is clearly worse.
+    """
+    cost, some = costs_of(factors), np.arange(0, len(best.costs), EVERY)
+    if cost(some).sum() > CLEARLY * best.costs[some].sum():
+        return best
+    costs = cost(None)
     return Best(factors, costs) if costs.sum() < best.costs.sum() else best
