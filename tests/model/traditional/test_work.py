@@ -19,7 +19,7 @@ from model.traditional.work import UNITS, Tile, chain_work, tile_work
 from profiles import load_sensor
 
 DEGRADED, REFERENCE = (load_sensor(f"pleiades-{name}").nominal() for name in ("degraded", "reference"))
-SIDE_PX = 112
+SIDE_PX = 160
 SIZES = st.integers(1, 3000)
 NAMES = st.sampled_from(sorted(QUALITIES))
 
