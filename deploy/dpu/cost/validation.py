@@ -105,7 +105,7 @@ def published_cases(*, sorting: bool = False) -> Cases:
     """
     chosen = [rate for rate in published_rates() if (NETWORKS[rate.network].host_reads == "sorts") is sorting]
     rows = tuple(network_case(rate.network, _dpu(rate.configuration), rate.fps) for rate in chosen)
-    return Cases(rows, load_dpu().value("cost", "serial"))
+    return Cases(rows, load_dpu("vck190").value("cost", "serial"))
 
 
 def network_case(name: str, dpu: Dpu, fps: float) -> Case:
