@@ -82,11 +82,10 @@ def bench_board(model: Path, request: BoardRequest, budget_s: float) -> BoardBen
     single = len(boards) == len(request.tiles_px) == 1
     found = _single(model, boards[0], swath) if single else _sweep(model, boards, request.tiles_px, swath)
     scene = dn if dn is not None else drawn_acquisition(swath, sensors)
-    here, there, *by_kind = traditional_rows(scene, swath, sensors, boards[0].target, budget_s)
-    beside = [here, there, *published_rows()]
+    traditional, by_kind = traditional_rows(scene, swath, sensors, boards[0].target, budget_s)
     # of one configuration the swath's rows stand beside the rivals', and its layers apart
     size = f"{swath.width_px} x {swath.height_px} pixels in tiles of {swath.tile_px}"
-    rows = [*(found.rows if single else []), *beside]
+    rows = [*(found.rows if single else []), *traditional, *published_rows()]
     kinds = (f"traditional pipeline by kind of work, one core here and of {boards[0].target.name}", by_kind)
     apart = [row for _, part in (*found.shown, kinds, *refitted) for row in part]
     return BoardBench([*rows, *apart], [*refitted, *found.shown, kinds, (size, rows)], found.notes)

@@ -145,8 +145,8 @@ def drawn_acquisition(swath: Swath, sensors: Sensors, seed: int = 0) -> np.ndarr
 
 def traditional_rows(
     dn: np.ndarray, swath: Swath, sensors: Sensors, board: TargetProfile, budget_s: float = 60.0
-) -> list[Row]:
-    """The traditional pipeline on (H, W) digital numbers, here, scaled to the board's processor, and kind by kind.
+) -> tuple[list[Row], list[Row]]:
+    """The traditional pipeline on (H, W) digital numbers, here and scaled to the board's processor; its work by kind.
 
     Crops are timed first, one small run for warm-up left out. When `dn` is the whole swath and its estimate lies
     within `budget_s`, it is run whole and its time is measured; else the swath's is predicted from the crops', with
@@ -168,13 +168,13 @@ def traditional_rows(
         **_conditions(watch, threads),
     }
     here = Row(TABLE, "traditional pipeline on this CPU", figures)
-    return [here, board_cpu_row(time, swath, board, rates), *kind_rows(time, work, board, rates)]
+    return [here, board_cpu_row(time, swath, board, rates)], kind_rows(time, work, board, rates)
 
 
 def _one_core(crops: Sequence[np.ndarray], sensors: Sensors, rates: Rates) -> tuple[float, float]:
-    """CPU time of one core for a pixel, in s, and the share of it that the counted work explains: median of the crops.
+    """CPU time of one core for a pixel, in s, and the share of it that the counted work explains.
 
-    With several threads on a busy machine their waiting for one another is CPU time too.
+    Of the median crop. With several threads on a busy machine their waiting for one another is CPU time too.
     """
     with one_thread_per_operation():
         cpu_s = [_wall_and_cpu_s(crop, sensors)[1] for crop in crops]
