@@ -64,7 +64,7 @@ class Tile:
 
     def covered_px(self, side_px: int) -> tuple[int, int]:
         """Rows and columns of pixels that squares of `side_px` at every reference cover."""
-        return tuple((n - 1) * self.stride_px + side_px for n in (self.rows, self.columns))  # type: ignore[return-value]
+        return (self.rows - 1) * self.stride_px + side_px, (self.columns - 1) * self.stride_px + side_px
 
 
 def chain_work(height: int, width: int, quality: Quality) -> Work:

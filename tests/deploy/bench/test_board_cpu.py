@@ -23,8 +23,9 @@ from deploy.bench.tables import Swath
 from model.traditional.settings import QUALITIES
 from model.traditional.work import UNITS, chain_work
 from profiles import TargetProfile, load_target, target_names
-from profiles.constant import Constant
+from profiles.constant import Constant, Number
 from profiles.errors import ProfileError
+from profiles.figures import Row
 
 # Of one core of a Zen 4 server under load, 25 turns of each kernel; and the chain's CPU time on it, then.
 MEASURED = Rates(
@@ -50,13 +51,13 @@ WORK = chain_work(SWATH.height_px, SWATH.width_px, QUALITIES["standard"])
 RATE = st.floats(0.2, 5.0)
 
 
-def value(row: object, key: str) -> float:
-    number = row.figures[key].value  # type: ignore[attr-defined]
+def value(row: Row, key: str) -> float:
+    number = row.figures[key].value
     assert number is not None
-    return float(number)
+    return number
 
 
-def changed(board: TargetProfile, **values: float) -> TargetProfile:
+def changed(board: TargetProfile, **values: Number) -> TargetProfile:
     cpu = board.tables["cpu"] | {key: Constant(number, "stated", "test") for key, number in values.items()}
     return replace(board, tables=board.tables | {"cpu": cpu})
 
@@ -117,7 +118,7 @@ def test_a_board_is_faster_with_its_clock_and_its_cores(name: str, factor: float
     board = load_target(name)
     clock, cores = board.constant("cpu", "clock_ghz"), board.value("cpu", "cores")
     base = board_latency_s(chain(), board, MEASURED)
-    faster = changed(board, clock_ghz=(clock.low * factor, clock.high * factor))  # type: ignore[arg-type]
+    faster = changed(board, clock_ghz=(clock.low * factor, clock.high * factor))
     for end, latency_s in enumerate(board_latency_s(chain(), faster, MEASURED)):
         assert base[end] / factor < latency_s < base[end]  # the memory keeps its own
     for end, latency_s in enumerate(board_latency_s(chain(), changed(board, cores=2 * cores), MEASURED)):
