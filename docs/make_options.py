@@ -101,6 +101,7 @@ UNITS = {
     "tolerance": "DN",
     "validate_every": "steps",
     "workers": "processes, at most the cores",
+    "within": "s",
 }
 """Of numbers."""
 
@@ -173,7 +174,7 @@ REFUSED = {
     "gate": [Refused(("variant",), "FLOAT INT8")],
     "check": [Refused(("picture", "tile"), "traditional")],
     "bench": [
-        Refused(("image", "full_scale", "size", "halo", "config", "measured", "budget"), "--target host"),
+        Refused(("image", "full_scale", "size", "halo", "config", "measured", "budget", "within"), "--target host"),
         Refused(("threads",), without="--target host"),
         Refused(("full_scale",), without="--image"),
         Refused(("size",), "--image IMAGE"),

@@ -1,42 +1,57 @@
-"""A swath on the DPU, predicted, beside the traditional pipeline measured here and the paper's figures.
+"""A swath on a board or on all, predicted, beside the traditional pipeline measured here and the paper's figures.
 
-One configuration and one tile size show every layer; several are swept.
+One configuration and one tile size show every layer; several are swept. Networks that cannot be tiled are
+predicted by the frame.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import onnx
+
 from deploy.bench.host import Sensors, drawn_acquisition, traditional_rows
 from deploy.bench.tables import (
     PAPER_SIZE,
+    PAPER_TARGET,
     Swath,
+    frame_rows,
     layer_rows,
     parse_size,
     predict_file,
     predicted_rows,
     published_rows,
     sweep_rows,
+    within_words,
 )
 from deploy.dpu.board import Dpu, load_dpu
 from deploy.dpu.cost.validation import refit
+from deploy.dpu.reading import own_tile_px
 from deploy.restoration.options import parse_halo
 from model.io.images import read_acquisition
 from model.shipped import SENSOR
-from profiles import load_target
+from profiles import TargetProfile, load_target
+from profiles.errors import ModelError, OptionError
 from profiles.figures import Row
 from profiles.sensor_file import REFERENCE, load_sensor
+from profiles.target import board_names
 from quant.onnx_file import load_onnx
-from quant.tiling.walk import receptive_radius_px
+from quant.tiling.walk import receptive_radius_px, tiling_of
 
 TRAFFIC = "LdFM, StFM: feature maps loaded and stored, an image; LdWB: weights and biases loaded, a batch."
 
 
+ALL = "all"
+"""Every board, or every configuration."""
+FREE_TILE_PX = 640
+
+
 @dataclass(frozen=True)
 class BoardRequest:
-    """What a user wants to know of the board.
+    """What a user wants to know of a board, or of all.
 
     Attributes:
+        target: the board, or "all".
         image: the swath; None for a drawn one of `size`.
         full_scale: the image's pixel value that is full scale; None lets its type and values decide.
         size: WIDTHxHEIGHT in pixels; None for the paper's.
@@ -44,8 +59,10 @@ class BoardRequest:
         halo: "exact" or a number of pixels.
         config: the DPU's configuration, "all", or None for the target's own.
         measured: runs of the user's board, to which the cost model is refitted.
+        within_s: what the swath may take; None does not ask.
     """
 
+    target: str
     image: Path | None
     full_scale: float | None
     size: str | None
@@ -53,6 +70,7 @@ class BoardRequest:
     halo: str
     config: str | None
     measured: Path | None
+    within_s: float | None = None
 
 
 @dataclass(frozen=True)
@@ -65,7 +83,9 @@ class BoardBench:
 
 
 def bench_board(model: Path, request: BoardRequest, budget_s: float) -> BoardBench:
-    """Predict a network's swath on the DPU, and measure the traditional pipeline on this processor.
+    """Predict a network's swath on boards, and measure the traditional pipeline on this processor.
+
+    A network that cannot be tiled is predicted by the frame, with nothing beside it.
 
     Args:
         model: ONNX file.
@@ -75,18 +95,22 @@ def bench_board(model: Path, request: BoardRequest, budget_s: float) -> BoardBen
     Raises:
         BeersError: a file or an option that is not what it should be.
     """
-    sensors = Sensors(load_sensor(SENSOR), load_sensor(REFERENCE))
-    dn = read_acquisition(request.image, request.full_scale, None) if request.image else None
-    swath = _swath(model, dn.shape if dn is not None else None, request)
+    network, sensors = load_onnx(model), Sensors(load_sensor(SENSOR), load_sensor(REFERENCE))
     boards, refitted = _boards(request)
-    single = len(boards) == len(request.tiles_px) == 1
-    found = _single(model, boards[0], swath) if single else _sweep(model, boards, request.tiles_px, swath)
-    scene = dn if dn is not None else drawn_acquisition(swath, sensors)
-    traditional, by_kind = traditional_rows(scene, swath, sensors, boards[0].target, budget_s)
+    whole = _untiled(network, request)
+    if whole is not None:
+        return _frames(model, network, boards, refitted, whole)
+    dn = read_acquisition(request.image, request.full_scale, None) if request.image else None
+    swath = _swath(network, dn.shape if dn is not None else None, request)
+    single = len(boards) == len(request.tiles_px) == 1 and request.within_s is None
+    found = _single(model, boards[0], swath) if single else _sweep(model, boards, request, swath)
+    scene, targets = dn if dn is not None else drawn_acquisition(swath, sensors), _targets(boards)
+    traditional, by_kind = traditional_rows(scene, swath, sensors, targets, budget_s)
+    papers = published_rows() if any(target.name == PAPER_TARGET for target in targets) else []
     # of one configuration the swath's rows stand beside the rivals', and its layers apart
     size = f"{swath.width_px} x {swath.height_px} pixels in tiles of {swath.tile_px}"
-    rows = [*(found.rows if single else []), *traditional, *published_rows()]
-    kinds = (f"traditional pipeline by kind of work, one core here and of {boards[0].target.name}", by_kind)
+    rows = [*(found.rows if single else []), *traditional, *papers]
+    kinds = (f"traditional pipeline by kind of work, one core here and of {targets[0].name}", by_kind)
     apart = [row for _, part in (*found.shown, kinds, *refitted) for row in part]
     return BoardBench([*rows, *apart], [*refitted, *found.shown, kinds, (size, rows)], found.notes)
 
@@ -95,21 +119,62 @@ def _single(model: Path, dpu: Dpu, swath: Swath) -> BoardBench:
     """The rows of the swath, and those of the layers to show."""
     prediction = predict_file(model, dpu, swath.tile_px)
     notes = [TRAFFIC, *([prediction.note] if prediction.note else [])]
-    layers = (f"{model.name}, one batch on {dpu.name}", layer_rows(prediction, dpu))
+    layers = (f"{model.name}, one batch on {dpu.target.name} {dpu.name}", layer_rows(prediction, dpu))
     return BoardBench(predicted_rows(model.stem, prediction, swath, dpu), [layers], notes)
 
 
-def _sweep(model: Path, boards: Sequence[Dpu], tiles_px: Sequence[int], swath: Swath) -> BoardBench:
-    """A row for each configuration and tile size."""
-    rows = sweep_rows(model, swath, boards, tiles_px)
+def _sweep(model: Path, boards: Sequence[Dpu], request: BoardRequest, swath: Swath) -> BoardBench:
+    """A row for each configuration and tile size, and which of them meet the time asked for."""
+    rows = sweep_rows(model, swath, boards, request.tiles_px)
     size = f"{swath.width_px} x {swath.height_px} pixels"
-    return BoardBench(rows, [(f"{model.name}, {size} in whole tiles, halo {swath.halo_px} px", rows)], [])
+    notes = [] if request.within_s is None else [within_words(rows, boards, request.within_s)]
+    return BoardBench(rows, [(f"{model.name}, {size} in whole tiles, halo {swath.halo_px} px", rows)], notes)
+
+
+def _frames(
+    model: Path,
+    network: onnx.ModelProto,
+    boards: Sequence[Dpu],
+    refitted: list[tuple[str, list[Row]]],
+    why: ModelError,
+) -> BoardBench:
+    """The network on whole images; of one configuration each layer too."""
+    tile_px = None if own_tile_px(network) else FREE_TILE_PX
+    rows = frame_rows(model, boards, tile_px)
+    size = " x ".join(
+        str(side.dim_value or tile_px) for side in network.graph.input[0].type.tensor_type.shape.dim[2:]
+    )
+    shown = [*refitted, (f"{model.name}, frames of {size}", rows)]
+    if len(boards) == 1:
+        layers = layer_rows(predict_file(model, boards[0], tile_px), boards[0])
+        shown.insert(-1, (f"{model.name}, one batch on {boards[0].target.name} {boards[0].name}", layers))
+    note = f"not tiled, but run on whole images: expected {why.expected}, got {why.got}"
+    return BoardBench([row for _, part in shown for row in part], shown, [TRAFFIC, note])
+
+
+def _untiled(network: onnx.ModelProto, request: BoardRequest) -> ModelError | None:
+    """Why a network cannot be tiled, None where it can.
+
+    Raises:
+        ModelError: it cannot, and a swath was asked for.
+    """
+    try:
+        tiling_of(network)
+    except ModelError as error:
+        if request.image or request.size or request.within_s is not None:
+            raise
+        return error
+    return None
 
 
 def _boards(request: BoardRequest) -> tuple[list[Dpu], list[tuple[str, list[Row]]]]:
     """The configurations asked for; their constants refitted where runs are given, and the tables that say so."""
-    names = list(load_target("vck190").configurations) if request.config == "all" else [request.config]
-    boards = [load_dpu("vck190", name) for name in names]
+    if request.target == ALL:
+        _require_all(request)
+        names = board_names()
+    else:
+        names = [request.target]
+    boards = [load_dpu(name, config) for name in names for config in _configurations(name, request.config)]
     if request.measured is None:
         return boards, []
     found = refit(request.measured, boards[0])
@@ -117,7 +182,25 @@ def _boards(request: BoardRequest) -> tuple[list[Dpu], list[tuple[str, list[Row]
     return [found.applied(dpu) for dpu in boards], shown
 
 
-def _swath(model: Path, shape: tuple[int, ...] | None, request: BoardRequest) -> Swath:
+def _configurations(target: str, config: str | None) -> list[str | None]:
+    return list(load_target(target).configurations) if config == ALL else [config]
+
+
+def _require_all(request: BoardRequest) -> None:
+    if request.config not in (None, ALL):
+        expected, remedy = "'all' or none beside --target all", "leave it out, or name the board"
+        raise OptionError("--config", expected=expected, got=repr(request.config), remedy=remedy)
+    if request.measured is not None:
+        expected, remedy = "one board beside --measured", "name the board that the runs are of"
+        raise OptionError("--target", expected=expected, got=repr(request.target), remedy=remedy)
+
+
+def _targets(boards: Sequence[Dpu]) -> list[TargetProfile]:
+    """The boards, each once."""
+    return list({dpu.target.name: dpu.target for dpu in boards}.values())
+
+
+def _swath(network: onnx.ModelProto, shape: tuple[int, ...] | None, request: BoardRequest) -> Swath:
     width_px, height_px = (shape[1], shape[0]) if shape else parse_size(request.size or PAPER_SIZE)
-    radius_px = receptive_radius_px(load_onnx(model)) if request.halo == "exact" else 0
+    radius_px = receptive_radius_px(network) if request.halo == "exact" else 0
     return Swath(width_px, height_px, request.tiles_px[0], parse_halo(request.halo, radius_px))

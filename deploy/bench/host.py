@@ -144,9 +144,9 @@ def drawn_acquisition(swath: Swath, sensors: Sensors, seed: int = 0) -> np.ndarr
 
 
 def traditional_rows(
-    dn: np.ndarray, swath: Swath, sensors: Sensors, board: TargetProfile, budget_s: float = 60.0
+    dn: np.ndarray, swath: Swath, sensors: Sensors, boards: Sequence[TargetProfile], budget_s: float = 60.0
 ) -> tuple[list[Row], list[Row]]:
-    """The traditional pipeline on (H, W) digital numbers, here and scaled to the board's processor; its work by kind.
+    """The traditional pipeline on (H, W) digital numbers, here and scaled to the boards' processors; work by kind.
 
     Crops are timed first, one small run for warm-up left out. When `dn` is the whole swath and its estimate lies
     within `budget_s`, it is run whole and its time is measured; else the swath's is predicted from the crops', with
@@ -168,7 +168,8 @@ def traditional_rows(
         **_conditions(watch, threads),
     }
     here = Row(TABLE, "traditional pipeline on this CPU", figures)
-    return [here, board_cpu_row(time, swath, board, rates)], kind_rows(time, work, board, rates)
+    there = [board_cpu_row(time, swath, board, rates) for board in boards]
+    return [here, *there], kind_rows(time, work, boards[0], rates)
 
 
 def _one_core(crops: Sequence[np.ndarray], sensors: Sensors, rates: Rates) -> tuple[float, float]:

@@ -32,6 +32,8 @@ COST_SOURCE = "cost model fitted on published networks, docs/cost-model.md"
 ARITHMETIC = "arithmetic of the tile grid"
 PAPER = "ConvBEERS paper, table of the VCK190 benchmark, 13600 x 9016"
 PAPER_TILE_PX, PAPER_SIZE = 640, "13600x9016"
+PAPER_TARGET = "vck190"
+"""The board that the paper measured: its rows stand beside that one alone."""
 
 
 @dataclass(frozen=True)
@@ -63,8 +65,8 @@ class Swath:
         return tiles * self.tile_px**2 / self.pixels
 
 
-def predict_file(model: Path, dpu: Dpu, tile_px: int = PAPER_TILE_PX) -> Prediction:
-    """What the cost model says of an ONNX file.
+def predict_file(model: Path, dpu: Dpu, tile_px: int | None = PAPER_TILE_PX) -> Prediction:
+    """What the cost model says of an ONNX file, for tiles of that side or, with None, for the size it is fixed to.
 
     Raises:
         ModelError: not a network, or one that does not run whole on the DPU.
@@ -205,18 +207,21 @@ MOST_TILE_PX = 8192
 def sweep_rows(model: Path, swath: Swath, boards: Sequence[Dpu], tiles_px: Sequence[int]) -> list[Row]:
     """A row a configuration and tile size, for whole tiles with the swath's halo."""
     return [
-        _row(predict_file(model, dpu, tile_px), replace(swath, tile_px=tile_px))
+        _row(predict_file(model, dpu, tile_px), replace(swath, tile_px=tile_px), dpu)
         for dpu in boards
         for tile_px in tiles_px
     ]
 
 
-def _row(prediction: Prediction, swath: Swath) -> Row:
+def _row(prediction: Prediction, swath: Swath, dpu: Dpu) -> Row:
+    latency, power = swath_latency(prediction, math.ceil(swath.tiles / prediction.batch)), dpu_power(dpu)
     figures = {
         "tiles": exact(swath.tiles, "tile", ARITHMETIC),
         "work factor": exact(swath.work_factor(swath.tiles), "px/px", ARITHMETIC),
-        "latency": swath_latency(prediction, math.ceil(swath.tiles / prediction.batch)),
+        "latency": latency,
         "throughput": predicted(prediction.fps, "frame/s", prediction.fps_interval, COST_SOURCE),
+        "power": power,
+        "efficiency": efficiency(swath.pixels, latency, power),
         "maps through memory": exact(prediction.streamed_bytes / 1e6, "MB/tile"),
         "layers on chip": exact(on_chip(prediction), "%"),
     }
@@ -224,7 +229,57 @@ def _row(prediction: Prediction, swath: Swath) -> Row:
     for layer in prediction.layers:
         bound[layer.bound] += round(1e12 * layer.time_s)
     words = {"bound": bound.most_common(1)[0][0], "fitted range": fitted_range(prediction)}
-    return Row("sweep", f"{prediction.configuration}, tiles of {swath.tile_px}", figures, words)
+    return Row("sweep", f"{dpu.target.name} {prediction.configuration}, tiles of {swath.tile_px}", figures, words)
+
+
+def within_words(rows: Sequence[Row], boards: Sequence[Dpu], within_s: float) -> str:
+    """Which DPU, the one of the lowest peak, meets a time for the swath: surely, probably, or only at best.
+
+    Args:
+        rows: those of `sweep_rows`, the boards' one behind the other, as many of each.
+        boards: as given there.
+        within_s: what the swath may take.
+    """
+    each = len(rows) // len(boards)
+    latencies = [(boards[k // each], row, row.figures["latency"]) for k, row in enumerate(rows)]
+    found = []
+    for how, end in (("by the whole interval", 1), ("by the prediction", None), ("at best", 0)):
+        fits = [(dpu, row) for dpu, row, time in latencies if _end(time, end) <= within_s]
+        if fits:
+            dpu, row = min(fits, key=lambda fit: fit[0].peak_ops_per_s)
+            found.append(f"{how} {row.name} ({dpu.peak_ops_per_s / 1e12:.3g} TOPS)")
+    words = "; ".join(found) or "none of these"
+    return f"the smallest DPU that takes {within_s:g} s or less: {words}"
+
+
+def _end(figure: Figure, end: int | None) -> float:
+    value = figure.value if end is None or figure.interval is None else figure.interval[end]
+    return math.inf if value is None else value
+
+
+def frame_rows(model: Path, boards: Sequence[Dpu], tile_px: int | None) -> list[Row]:
+    """A row a configuration for a network that is run on whole images: frames instead of a swath.
+
+    Args:
+        model: ONNX file.
+        boards: the configurations.
+        tile_px: side of an image; None for the size that the network is fixed to.
+    """
+    return [_frame_row(predict_file(model, dpu, tile_px), dpu) for dpu in boards]
+
+
+def _frame_row(prediction: Prediction, dpu: Dpu) -> Row:
+    power, frame_s = dpu_power(dpu), swath_latency(prediction, 1 / prediction.batch)
+    figures = {
+        "work": exact(prediction.operations / 1e9, "GOP"),
+        "batch": exact(prediction.batch, "frame", "images in flight"),
+        "throughput": predicted(prediction.fps, "frame/s", prediction.fps_interval, COST_SOURCE),
+        "host beside the DPU": scaled(1e3 * prediction.host_s, "ms/frame", prediction, COST_SOURCE),
+        "power": power,
+        "energy": energy(frame_s, power),
+    }
+    name = f"{dpu.target.name} {prediction.configuration}, whole images"
+    return Row("frames", name, figures, {"fitted range": fitted_range(prediction)})
 
 
 def on_chip(prediction: Prediction) -> float:

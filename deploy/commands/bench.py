@@ -8,13 +8,15 @@ import typer
 
 from deploy.commands.shared import refuse, say
 from model.shipped import SENSOR
+from profiles.target import DEFAULT_TARGET, MODEL_SUFFIX, board_names
 
 EXAMPLE = "bench --target vck190-model --size 13600x9016 --config C32B3"
 
 PAPER_SIZE = "13600x9016"  # as in deploy.bench.tables, which is imported late
-BOARD_ONLY = ("image", "full_scale", "size", "halo", "config", "measured", "budget")
+BOARD_ONLY = ("image", "full_scale", "size", "halo", "config", "measured", "budget", "within")
 HOST_ONLY = ("threads",)
-BOARD, HOSTS = "vck190-model", ("host", "host-cpu")
+BOARD, HOSTS = f"{DEFAULT_TARGET}{MODEL_SUFFIX}", ("host", "host-cpu")
+BOARDS = ", ".join(board_names())
 PREDICTED = "No board was used: the DPU's figures come from a cost model, its power from an assumption."
 NO_PROXY = "Time on this CPU is no proxy for the DPU: here INT8 may even run slower than float."
 
@@ -25,7 +27,11 @@ def bench(
         Path | None, typer.Argument(metavar="[MODEL]", help="ONNX network; the shipped INT8 one if none.")
     ] = None,
     target: Annotated[
-        str, typer.Option(help="The modelled board, with or without -model behind its name; or host, this machine.")
+        str,
+        typer.Option(
+            help=f"The modelled board ({BOARDS}, or your .toml file), with or without -model behind its name; "
+            "'all' of them; or host, this machine."
+        ),
     ] = BOARD,
     sensor: Annotated[
         str, typer.Option(help="What a shipped network is specialised to: a profile, your .toml file, or blind.")
@@ -39,13 +45,19 @@ def bench(
     ] = None,
     tile: Annotated[str, typer.Option(help="Tile side in pixels; several with commas are swept.")] = "640",
     halo: Annotated[str, typer.Option(help="Context around a tile: 'exact' (no seams) or pixels.")] = "exact",
-    config: Annotated[str | None, typer.Option(help="DPU configuration, C32B1 to C64B5; 'all' sweeps them.")] = None,
+    config: Annotated[
+        str | None, typer.Option(help="DPU configuration, such as C32B3; 'all' sweeps the board's.")
+    ] = None,
     measured: Annotated[
         Path | None, typer.Option(help="JSON list of your board's runs: the cost model is refitted to them first.")
     ] = None,
     budget: Annotated[
         float, typer.Option(min=0, help="Seconds that the traditional pipeline may take to be run on a whole image.")
     ] = 60.0,
+    within: Annotated[
+        float | None,
+        typer.Option(min=0, help="Seconds that the swath may take: which is the smallest DPU that meets them?"),
+    ] = None,
     threads: Annotated[int, typer.Option(min=0, help="Threads of the host's runtime; 0 takes every core.")] = 0,
     json: Annotated[Path | None, typer.Option(help="Write the figures here.")] = None,
 ) -> None:
@@ -59,7 +71,7 @@ def bench(
     from profiles import load_sensor, load_target
     from profiles.figures import by_table
 
-    tiles, here = parse_tiles(tile), _is_host(target)
+    tiles, here, board = parse_tiles(tile), target in HOSTS, target.removesuffix(MODEL_SUFFIX)
     _refuse_unused(context, here)
     path = int8_file(model, load_sensor(sensor), partial(say, err=True))
     require_writable(json, inputs=(path, image, measured))
@@ -69,7 +81,8 @@ def bench(
             print_rows(f"{path.name} on this machine: {table}", part)
         say(NO_PROXY)
     else:
-        found = bench_board(path, BoardRequest(image, full_scale, size, tiles, halo, config, measured), budget)
+        asked = BoardRequest(board, image, full_scale, size, tiles, halo, config, measured, within)
+        found = bench_board(path, asked, budget)
         rows = found.rows
         for title, part in found.shown:
             print_rows(title, part)
@@ -84,6 +97,7 @@ def bench(
         "halo": halo,
         "config": config,
         "measured": measured.name if measured else None,
+        "within": within,
     }
     inputs = tuple(file for file in (path, image, measured) if file)
     Document("bench", arguments, inputs, tuple(rows)).write(json)
@@ -108,17 +122,3 @@ def _single(tiles: list[int]) -> int:
             "--tile", expected="one size with --target host", got=str(tiles), remedy="run it once a size"
         )
     return tiles[0]
-
-
-def _is_host(target: str) -> bool:
-    """Whether this machine is meant, by the name of its profile or as `host`; else the one board that is modelled.
-
-    Raises:
-        OptionError: another target.
-    """
-    from profiles.errors import OptionError
-    from profiles.target import MODEL_SUFFIX
-
-    if target.removesuffix(MODEL_SUFFIX) not in (*HOSTS, BOARD.removesuffix(MODEL_SUFFIX)):
-        raise OptionError("--target", expected=f"{BOARD} or host", got=repr(target), remedy="pick one")
-    return target in HOSTS

@@ -73,7 +73,12 @@ class Dpu:
 
         The configuration's peak is that of all cores together.
         """
-        return self.constants["peak_tops"].low * 1e12 / self.batch
+        return self.peak_ops_per_s / self.batch
+
+    @property
+    def peak_ops_per_s(self) -> float:
+        """Peak int8 operations a second of all cores together."""
+        return self.constants["peak_tops"].low * 1e12
 
     @property
     def lane_steps_per_s(self) -> float:

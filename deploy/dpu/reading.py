@@ -44,8 +44,8 @@ KINDS |= dict.fromkeys(("MaxPool", "AveragePool", "GlobalAveragePool", "GlobalMa
 KINDS |= dict.fromkeys(("QLinearAveragePool", "QLinearGlobalAveragePool"), "pool")
 
 
-def read_network(path: Path, tile_px: int = 640) -> Network:
-    """Read an ONNX file as a network for one image with sides of `tile_px`.
+def read_network(path: Path, tile_px: int | None = 640) -> Network:
+    """Read an ONNX file as a network for one image with sides of `tile_px`; None is the size that it is fixed to.
 
     Raises:
         ModelError: not an ONNX file, or not a network of images.
@@ -59,7 +59,7 @@ def own_tile_px(model: onnx.ModelProto) -> int | None:
     return max((d.dim_value for d in dims[2:]), default=0) or None
 
 
-def network_of(model: onnx.ModelProto, tile_px: int, where: str = "ONNX model") -> Network:
+def network_of(model: onnx.ModelProto, tile_px: int | None, where: str = "ONNX model") -> Network:
     """As `read_network`, of a model in memory."""
     if not model.graph.node:
         remedy = "give a file written by 'beers-deploy export' or 'beers-deploy quantize'"
@@ -71,7 +71,7 @@ def network_of(model: onnx.ModelProto, tile_px: int, where: str = "ONNX model") 
 class _Reader:
     """Walks the nodes once, in their topological order, carrying shapes and number formats along."""
 
-    def __init__(self, model: onnx.ModelProto, tile_px: int, where: str) -> None:
+    def __init__(self, model: onnx.ModelProto, tile_px: int | None, where: str) -> None:
         graph = model.graph
         self.nodes = list(graph.node)
         self.constants: dict[str, TensorProto] = {t.name: t for t in graph.initializer}
@@ -205,8 +205,8 @@ def _count(tensor: TensorProto) -> int:
     return count
 
 
-def _input_shape(info: onnx.ValueInfoProto, tile_px: int, where: str) -> Shape:
-    """(C, tile, tile) of an input (N, C, H, W).
+def _input_shape(info: onnx.ValueInfoProto, tile_px: int | None, where: str) -> Shape:
+    """(C, tile, tile) of an input (N, C, H, W); without a tile (C, H, W) as the file states them.
 
     Raises:
         ModelError: not such an input, or one fixed to another tile.
@@ -216,6 +216,10 @@ def _input_shape(info: onnx.ValueInfoProto, tile_px: int, where: str) -> Shape:
         raise ModelError(
             where, expected="inputs (N, C, H, W)", got=f"{info.name} {sizes}", remedy="export the network as such"
         )
+    if tile_px is None:
+        if not all(sizes[2:]):
+            raise ModelError(where, expected="an input of a stated size", got="any size", remedy="pass --tile")
+        return sizes[1], sizes[2], sizes[3]
     fixed = {size for size in sizes[2:] if size} - {tile_px}
     if fixed:
         raise ModelError(

@@ -129,7 +129,7 @@ def test_load_and_clock_are_figures_or_reasons() -> None:
 
 def test_the_chain_says_under_what_conditions_it_ran() -> None:
     swath = Swath(61, 47)
-    (here, board), kinds = traditional_rows(drawn_acquisition(swath, SENSORS), swath, SENSORS, BOARD)
+    (here, board), kinds = traditional_rows(drawn_acquisition(swath, SENSORS), swath, SENSORS, [BOARD])
     assert {"threads", "CPU load", "clock", "explained by kinds"} <= set(here.figures)
     assert here.figures["latency"].mode == "measured"
     assert board.figures["latency"].mode == "predicted"

@@ -1,0 +1,110 @@
+"""Several boards in one table, what meets a time, and networks that are run on whole images."""
+
+import math
+from pathlib import Path
+
+import numpy as np
+import onnx
+import pytest
+import torch
+
+from deploy.bench.board import BoardRequest, bench_board
+from deploy.bench.tables import Swath, frame_rows, sweep_rows, within_words
+from deploy.dpu.board import load_dpu
+from examples.networks import build, to_onnx
+from profiles.errors import ModelError, OptionError
+from profiles.figures import Row
+from profiles.target import board_names
+from tests.deploy.dpu.graphs import integer_convbeers
+
+
+def asked(target: str = "vck190", **given: object) -> BoardRequest:
+    plain = {"image": None, "full_scale": None, "size": "300x260", "tiles_px": [128], "halo": "exact", "config": None}
+    return BoardRequest(target, **{**plain, "measured": None, **given})  # type: ignore[arg-type]
+
+
+@pytest.fixture(scope="module")
+def network(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return integer_convbeers(tmp_path_factory.mktemp("net") / "net.onnx", 2, 16)
+
+
+@pytest.fixture(scope="module")
+def classifier(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("net") / "classifier.onnx"
+    onnx.save(to_onnx("classifier", build("classifier", torch.Generator().manual_seed(0))), path)
+    return path
+
+
+def names(rows: list[Row]) -> list[str]:
+    return [row.name for row in rows]
+
+
+def test_all_boards_stand_in_one_table_with_their_processors_and_the_papers_rows(network: Path) -> None:
+    found = bench_board(network, asked("all"), 0.0)
+    swept = [row for row in found.rows if row.table == "sweep"]
+    assert [name.split()[0] for name in names(swept)] == board_names()
+    for row in swept:
+        low, high = row.figures["latency"].interval or (0.0, 0.0)
+        assert 0 < low < (row.figures["latency"].value or 0) < high
+        assert {"throughput", "power", "efficiency"} <= set(row.figures)
+    processors = [name for name in names(found.rows) if "processor of" in name]
+    assert len(processors) == len(board_names())
+    assert sum(name.startswith("paper") for name in names(found.rows)) == 2
+
+
+def test_the_papers_rows_stand_beside_its_own_board_alone(network: Path) -> None:
+    found = bench_board(network, asked("kv260"), 0.0)
+    assert not any(name.startswith("paper") for name in names(found.rows))
+    assert any("kv260" in name for name in names(found.rows))
+
+
+def test_every_configuration_of_a_board_is_swept(network: Path) -> None:
+    found = bench_board(network, asked("zcu104", config="all"), 0.0)
+    swept = [row for row in found.rows if row.table == "sweep"]
+    assert len(swept) == len(load_dpu("zcu104").target.configurations) > 1
+
+
+def test_the_smallest_dpu_that_meets_a_time_is_named(network: Path) -> None:
+    boards = [load_dpu("vck190", name) for name in ("C32B1", "C32B3", "C32B6")]
+    rows = sweep_rows(network, Swath(3000, 2600, 128, 5), boards, [256, 128])
+    sizes = [row.figures["latency"].value or math.inf for row in rows]
+    slowest, fastest = max(sizes), min(sizes)
+    assert "C32B1" in within_words(rows, boards, 10 * slowest)
+    assert within_words(rows, boards, fastest / 1000).endswith("none of these")
+    words = within_words(rows, boards, fastest)
+    name = rows[int(np.argmin(sizes))].name
+    assert f"by the prediction {name}" in words
+    assert "by the whole interval" not in words
+
+
+def test_a_network_that_is_not_tiled_is_predicted_by_the_frame(classifier: Path) -> None:
+    found = bench_board(classifier, asked(size=None), 0.0)
+    (frame,) = [row for row in found.rows if row.table == "frames"]
+    assert (frame.figures["throughput"].interval or (0, 0))[0] > 0
+    layers = [row for row in found.rows if row.table == "layers"]
+    work = math.fsum(row.figures["work"].value or 0 for row in layers if "work" in row.figures)
+    assert frame.figures["work"].value == pytest.approx(work)
+    assert any("whole images" in note and "GlobalAveragePool" in note for note in found.notes)
+    assert not any("traditional" in name for name in names(found.rows))
+
+
+def test_a_frame_need_not_be_square(tmp_path: Path, classifier: Path) -> None:
+    model = onnx.load(classifier)
+    for side, size in zip(model.graph.input[0].type.tensor_type.shape.dim[2:], (32, 96), strict=True):
+        side.dim_value = size
+    onnx.save(model, tmp_path / "wide.onnx")
+    boards = [load_dpu("vck190", None)]
+    (square,), (wide,) = (frame_rows(path, boards, None) for path in (classifier, tmp_path / "wide.onnx"))
+    assert (wide.figures["work"].value or 0) > 2.5 * (square.figures["work"].value or 0)
+
+
+def test_a_swath_of_a_network_that_is_not_tiled_is_refused(classifier: Path) -> None:
+    with pytest.raises(ModelError, match="GlobalAveragePool"):
+        bench_board(classifier, asked(), 0.0)
+
+
+def test_one_configuration_or_runs_beside_all_boards_are_refused(network: Path, tmp_path: Path) -> None:
+    with pytest.raises(OptionError, match="--config"):
+        bench_board(network, asked("all", config="C32B3"), 0.0)
+    with pytest.raises(OptionError, match="--measured"):
+        bench_board(network, asked("all", measured=tmp_path / "runs.json"), 0.0)
