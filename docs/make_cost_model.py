@@ -28,7 +28,7 @@ from deploy.dpu.cost.validation import (
     rank_correlation,
     relative,
 )
-from deploy.dpu.zoo.dense import convbeers
+from deploy.dpu.zoo.networks import convbeers
 
 PROFILE = Path(__file__).parents[1] / "profiles" / "targets" / "vck190.toml"
 PAGE = Path(__file__).parent / "cost-model.md"

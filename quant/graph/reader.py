@@ -230,7 +230,9 @@ class _Reader:
         flattened = [each.op_type for each in rest] == ["Flatten"]
         last = bool(self.ops) and self.ops[-1].output == node.input[0] and self.readers[node.input[0]] == 1
         channels = node.given.get("axis", -1) in (1, -3)
-        self._require((ends or flattened) and last and channels, node, "Softmax of channels at the end alone", "another")
+        self._require(
+            (ends or flattened) and last and channels, node, "Softmax of channels at the end alone", "another"
+        )
         self.ops[-1] = renamed(self.ops[-1], {node.input[0]: node.output[0]})
         self.softmax = True
 

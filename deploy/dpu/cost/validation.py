@@ -18,7 +18,7 @@ from deploy.dpu.cost.fit import FIRM_PRIOR, Case, Cases, fit
 from deploy.dpu.cost.latency import Profile, crossing_bytes
 from deploy.dpu.cost.layers import Array, Constants, Layers, count_work
 from deploy.dpu.reading import read_network
-from deploy.dpu.zoo.networks import NETWORKS, network, published_rates
+from deploy.dpu.zoo.networks import NETWORKS, family, network, published_rates, read_bytes
 from profiles.constant import Constant
 from profiles.errors import ModelError, OptionError
 from profiles.figures import Row, predicted, published
@@ -103,20 +103,23 @@ def published_cases(*, sorting: bool = False) -> Cases:
     Args:
         sorting: those whose host sorts boxes or key points, which the model cannot know and the fit leaves out.
     """
-    chosen = [rate for rate in published_rates() if (NETWORKS[rate.network].host_reads == "sorts") is sorting]
+    chosen = [r for r in published_rates() if r.board == "vck190" and (family(r.network) in SORTING) is sorting]
     rows = tuple(network_case(rate.network, _dpu(rate.configuration), rate.fps) for rate in chosen)
     return Cases(rows, load_dpu().value("cost", "serial"))
 
 
+SORTING = ("ssd", "superpoint")
+"""Families whose hosts sort most of what they read."""
+
+
 def network_case(name: str, dpu: Dpu, fps: float) -> Case:
     """One of NETWORKS on a configuration, with its rate."""
-    entry, net = NETWORKS[name], network(name)
+    net = network(name)
     works = count_work(net.operations, dpu)
-    sizes = {op.output: op.out_bytes for op in net.operations}
     taken = sum(math.prod(shape) for shape in net.inputs.values())
-    read = 0 if entry.host_reads == "scores" else sum(sizes[result] for result in net.outputs)
     profile = Profile.of(net.operations, works)
-    return Case(name, entry.family, dpu.name, Layers.of(works, dpu), dpu.batch, (taken, read), fps, profile)
+    crossing = (taken, read_bytes(name))
+    return Case(name, family(name), dpu.name, Layers.of(works, dpu), dpu.batch, crossing, fps, profile)
 
 
 @cache

@@ -7,7 +7,7 @@ from deploy.bench.tables import PAPER_TILE_PX, predict_file
 from deploy.dpu.board import load_dpu
 from deploy.dpu.checker.placement import place
 from deploy.dpu.cost.latency import Prediction, predict
-from deploy.dpu.zoo.dense import convbeers
+from deploy.dpu.zoo.networks import convbeers
 from profiles.errors import ModelError
 from tests.deploy.dpu.graphs import Sketch, board_convbeers, float_convbeers, integer_convbeers
 
