@@ -130,13 +130,13 @@ class Builder:
             self._refuse(f"channels below {x.channels}", f"{first} to {first + count - 1}", "take fewer")
         return self._append("Slice", "other", (x,), (count, *x.shape[1:]))
 
-    def resize(self, x: Tensor, factor: int = 2) -> Tensor:
-        """Larger by a whole factor, nearest neighbour."""
-        return self._resize(x, factor, "nearest")
+    def resize(self, x: Tensor, to: int | Tensor = 2) -> Tensor:
+        """Larger by a whole factor, or as large as another result: nearest neighbour."""
+        return self._resize(x, to, "nearest")
 
-    def bilinear(self, x: Tensor, factor: int = 2) -> Tensor:
-        """Larger by a whole factor, bilinear."""
-        return self._resize(x, factor, "linear")
+    def bilinear(self, x: Tensor, to: int | Tensor = 2) -> Tensor:
+        """Larger by a whole factor, or as large as another result: bilinear."""
+        return self._resize(x, to, "linear")
 
     def shuffle(self, x: Tensor, block: int = 2) -> Tensor:
         """Channels become blocks of pixels (pixel shuffle)."""
@@ -174,8 +174,9 @@ class Builder:
         window = _window(kernel, stride, valid, 1)
         return self._append(op_type, "pool", (x,), (x.channels, *_slide(x.shape, window, valid)), window)
 
-    def _resize(self, x: Tensor, factor: int, mode: str) -> Tensor:
-        shape = (x.channels, x.shape[1] * factor, x.shape[2] * factor)
+    def _resize(self, x: Tensor, to: int | Tensor, mode: str) -> Tensor:
+        height, width = to.shape[1:] if isinstance(to, Tensor) else (x.shape[1] * to, x.shape[2] * to)
+        shape = (x.channels, height, width)
         return self._append("Resize", "resize", (x,), shape, attributes={"mode": mode})
 
     def _expect_same(self, one: tuple[int, ...], other: tuple[int, ...]) -> None:

@@ -27,7 +27,7 @@ the block was called on, and its last x is what it returns.
     pool K S [valid]     mean K S [valid]    largest of a window, its mean
     global                                   mean of each channel
     scale                                    batch norm that no convolution can take in
-    resize [N=2]         bilinear [N=2]      N times as large: nearest, bilinear
+    resize [N=2|NAME]    bilinear [N=2|NAME] N times as large, or as a kept result: nearest, bilinear
     shuffle [N=2]        unshuffle [N=2]     channels to N x N pixels and back
     add NAME...          concat NAME...      joins the result so far with kept ones
     mul NAME                                 the same, a product
@@ -78,7 +78,8 @@ STEPS: Mapping[str, Callable[..., Tensor]] = {
     "hswish": lambda builder, x: builder.activation(x, "HardSwish"),
     "out": Builder.out,
 }
-JOINS = ("add", "mul", "concat")
+JOINS, RESIZES = ("add", "mul", "concat"), ("resize", "bilinear")
+"""Steps that take kept results alone, and those that may take one."""
 SIGNS: Mapping[type[ast.operator], Callable[[int, int], int]] = {
     ast.Add: operator.add,
     ast.Sub: operator.sub,
@@ -286,7 +287,8 @@ class _Scope:
         if word not in ("slice", "out") and any(_has_zero(value) for value in [*values, *named.values()]):
             _refuse(where, f"{word} with numbers of 1 and more", " ".join([word, *arguments]), "correct the zero")
         step = STEPS[word]
-        fits = all(isinstance(value, Tensor) == (word in JOINS) for value in values) and (values or word not in JOINS)
+        kept = [isinstance(value, Tensor) for value in values]
+        fits = all(kept) and bool(kept) if word in JOINS else word in RESIZES or not any(kept)
         try:
             inspect.signature(step).bind(self.builder, x, *values, **named)
         except TypeError:
