@@ -5,7 +5,7 @@ fused into it by the DPU's compiler, so they are not written down.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import MappingProxyType
 
 from deploy.dpu.graph import Kind, Network, Operation, Shape, Window
@@ -91,13 +91,13 @@ class Builder:
         shape = (channels, x.shape[1] * stride, x.shape[2] * stride)
         return self._append("ConvTranspose", "transposed", (x,), shape, window, channels * x.channels * kernel**2)
 
-    def pool(self, x: Tensor, kernel: Size, stride: Size, *, valid: int = 0) -> Tensor:
-        """The largest value of a window."""
-        return self._pool("MaxPool", x, kernel, stride, valid)
+    def pool(self, x: Tensor, kernel: Size, stride: Size, *, valid: int = 0, ceil: int = 0) -> Tensor:
+        """The largest value of a window; `ceil` counts windows that only begin inside an image without padding."""
+        return self._pool("MaxPool", x, kernel, stride, valid, ceil)
 
-    def mean(self, x: Tensor, kernel: Size, stride: Size, *, valid: int = 0) -> Tensor:
-        """The mean of a window."""
-        return self._pool("AveragePool", x, kernel, stride, valid)
+    def mean(self, x: Tensor, kernel: Size, stride: Size, *, valid: int = 0, ceil: int = 0) -> Tensor:
+        """The mean of a window, `ceil` as in `pool`."""
+        return self._pool("AveragePool", x, kernel, stride, valid, ceil)
 
     def global_mean(self, x: Tensor) -> Tensor:
         """The mean of each channel."""
@@ -170,9 +170,13 @@ class Builder:
         net = Network(tuple(self._operations), {self.image.name: self.image.shape}, names, quantised=False)
         return Written(net, self._read_bytes)
 
-    def _pool(self, op_type: str, x: Tensor, kernel: Size, stride: Size, valid: int) -> Tensor:
-        window = _window(kernel, stride, valid, 1)
-        return self._append(op_type, "pool", (x,), (x.channels, *_slide(x.shape, window, valid)), window)
+    def _pool(self, op_type: str, x: Tensor, kernel: Size, stride: Size, valid: int, ceil: int) -> Tensor:
+        window, seen = _window(kernel, stride, valid or ceil, 1), x.shape
+        if ceil:  # as much padding behind the image as may be lost to a stride
+            behind = window.stride[0] - 1, window.stride[1] - 1
+            window = replace(window, pads=(0, 0, *behind))
+            seen = (x.channels, x.shape[1] + behind[0], x.shape[2] + behind[1])
+        return self._append(op_type, "pool", (x,), (x.channels, *_slide(seen, window, valid or ceil)), window)
 
     def _resize(self, x: Tensor, to: int | Tensor, mode: str) -> Tensor:
         height, width = to.shape[1:] if isinstance(to, Tensor) else (x.shape[1] * to, x.shape[2] * to)

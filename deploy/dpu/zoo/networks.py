@@ -1,9 +1,22 @@
 """The published networks by name, what the host does with their results, and their published rates.
 
-Layers stand in the `.net` files beside this module (see `notation`), rates in `published.csv`. Rows of the published
-tables that cannot be are left out:
-mobilenetv1 pruned and "62 GOP" mobilenetv2 are slips of the operations alone (the name has the right count); the
-super-resolution network `xilinxSR` on the VCK190 and yolov6m on the KV260 are faster than their DPU's peak.
+Layers stand in the `.net` files beside this module (see `notation`), rates in `published.csv`: tables of AMD's model
+zoo (github.com/Xilinx/Vitis-AI), each row with the release and the line, row or record that prints it. A rate
+contains the host: images lie decoded in memory, then each thread runs mean and scale, DPU and post-processing for a
+batch (src/vai_library/benchmark). How many threads `fps` took is not stated; `fps_single` took one.
+
+What a host does follows from the post-processing in src/vai_library/xnnpp/src:
+
+- softmax: exponentials of every class, then the best few (classification.cpp, ultrafast_postimp.cpp);
+- argmax: the largest channel of every pixel (segmentation.cpp);
+- sort: scores above a threshold, their boxes, then non-maximum suppression. YOLO reads one score a box and skips the
+  rest (yolov3.cpp, yolovx.cpp), SSD every score of every class (tfssd_detector.cpp), DenseBox and RetinaFace every
+  score (facedetect.cpp, retinaface_detector.cpp); the boxes of the few that pass are not counted;
+- image: every value becomes a pixel of an image (rcan.cpp, medicalsegcell_imp.cpp);
+- copy: every value is read once, little else (reid.cpp, facequality.cpp).
+
+A row of the tables is left out: ResNet-152 on the KV260 in release 2.0 repeats the rates of ResNet-101. Where a table
+prints another number of operations for the same rates, the `.net` file says so.
 """
 
 import csv

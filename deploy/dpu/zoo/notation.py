@@ -20,24 +20,26 @@ be a sum, difference, product or exact quotient of numbers, parameters and `ch`,
 is one number or HEIGHTxWIDTH: `1x7`. A parameter of a block may also stand for a kept result. In a block, x is what
 the block was called on, and its last x is what it returns.
 
-    conv C [K=3 [S=1]] [d=1] [g=1] [valid]   convolution into C channels, kernel, stride, dilation, groups
-    dw [K=3 [S=1]] [d=1] [m=1]               depthwise, into m times the channels
-    transposed C K S                         transposed convolution, S times as large
-    fc C                                     fully connected
-    pool K S [valid]     mean K S [valid]    largest of a window, its mean
-    global                                   mean of each channel
-    scale                                    batch norm that no convolution can take in
-    resize [N=2|NAME]    bilinear [N=2|NAME] N times as large, or as a kept result: nearest, bilinear
-    shuffle [N=2]        unshuffle [N=2]     channels to N x N pixels and back
-    add NAME...          concat NAME...      joins the result so far with kept ones
-    mul NAME                                 the same, a product
-    slice FIRST COUNT                        some of the channels
-    hsigmoid  hswish                         an activation that is a step of its own
-    out [CHANNELS]                           a result of the network, of which the host reads so many channels
+    conv C [K=3 [S=1]] [d=1] [g=1] [valid]    convolution into C channels, kernel, stride, dilation, groups
+    dw [K=3 [S=1]] [d=1] [m=1]                depthwise, into m times the channels
+    transposed C K S                          transposed convolution, S times as large
+    fc C                                      fully connected
+    pool K S [valid|ceil]                     largest of a window
+    mean K S [valid|ceil]                     mean of a window
+    global                                    mean of each channel
+    scale                                     batch norm that no convolution can take in
+    resize [N=2|NAME]                         N times as large, or as a kept result: nearest neighbour
+    bilinear [N=2|NAME]                       the same, bilinear
+    shuffle [N=2]    unshuffle [N=2]          channels to N x N pixels and back
+    add NAME...      concat NAME...           joins the result so far with kept ones
+    mul NAME                                  the same, a product
+    slice FIRST COUNT                         some of the channels
+    hsigmoid         hswish                   an activation that is a step of its own
+    out [CHANNELS]                            a result of the network, of which the host reads so many channels
 
-Sizes are divided by a stride and rounded up, unless `valid` (no padding). A network without `out` has one result, its
-last x, read whole. Batch norms and activations behind a convolution are fused into it and not written. Every file
-knows the blocks of all files.
+Sizes are divided by a stride and rounded up, unless `valid` (no padding) or `ceil` (no padding before an image, as
+much as needed behind it). A network without `out` has one result, its last x, read whole. Batch norms and activations
+behind a convolution are fused into it and not written. Every file knows the blocks of all files.
 """
 
 import ast
@@ -78,6 +80,7 @@ STEPS: Mapping[str, Callable[..., Tensor]] = {
     "hswish": lambda builder, x: builder.activation(x, "HardSwish"),
     "out": Builder.out,
 }
+FLAGS = ("valid", "ceil")
 JOINS, RESIZES = ("add", "mul", "concat"), ("resize", "bilinear")
 """Steps that take kept results alone, and those that may take one."""
 SIGNS: Mapping[type[ast.operator], Callable[[int, int], int]] = {
@@ -281,9 +284,9 @@ class _Scope:
         return scope.x
 
     def _append(self, x: Tensor, word: str, arguments: list[str], where: str) -> Tensor:
-        options = [text.partition("=") for text in arguments if "=" in text or text == "valid"]
+        options = [text.partition("=") for text in arguments if "=" in text or text in FLAGS]
         named = {key: self._number(text or "1", where) for key, _, text in options}
-        values = [self._value(text, where) for text in arguments if "=" not in text and text != "valid"]
+        values = [self._value(text, where) for text in arguments if "=" not in text and text not in FLAGS]
         if word not in ("slice", "out") and any(_has_zero(value) for value in [*values, *named.values()]):
             _refuse(where, f"{word} with numbers of 1 and more", " ".join([word, *arguments]), "correct the zero")
         step = STEPS[word]
