@@ -46,6 +46,7 @@ def test_weights_are_the_published_ones(name: str, weights: float) -> None:
 
 def test_every_network_has_a_rate_and_every_rate_a_network() -> None:
     assert {rate.network for rate in RATES} == set(NETWORKS)
+    assert len(NETWORKS) >= 60
     assert {rate.board for rate in RATES} == {"vck190", "zcu102", "zcu104", "kv260", "vek280"}
     assert len(set(RATES)) == len(RATES)
 
@@ -75,6 +76,24 @@ def assert_sound(net: Network) -> None:
         if op.kind == "add":
             assert len(set(op.in_shapes)) == 1
     assert set(net.outputs) <= set(made)
+
+
+@pytest.mark.parametrize("name", NETWORKS)
+def test_every_result_is_read(name: str) -> None:
+    """Nothing is computed in vain: a kept result that no line reads would be a slip."""
+    net = network(name)
+    read = {tensor for op in net.operations for tensor in op.inputs} | set(net.outputs)
+    assert [op.name for op in net.operations if op.output not in read] == []
+
+
+@pytest.mark.parametrize("name", [name for name in NETWORKS if name.startswith(("yolo", "tiny"))])
+def test_a_yolo_host_reads_one_score_a_box(name: str) -> None:
+    """yolov3.cpp and yolovx.cpp of AMD's library; YOLOv6 has no such score, its classes are read instead."""
+    net, boxes = network(name), {"yolo v2": 5, "yolox m": 1, "yolox nano": 1}.get(name, 3)
+    maps = [op for op in net.operations if op.output in net.outputs]
+    cells = sum(op.out_bytes // op.channels[1] for op in maps)
+    expected = 80 * cells // 2 if name == "yolo v6 m" else boxes * cells
+    assert read_bytes(name) == expected
 
 
 @pytest.mark.parametrize("name", NETWORKS)
@@ -118,6 +137,8 @@ STEPS = {
     "mean 2 2": ((8, 4, 4), 0),
     "global": ((8, 1, 1), 0),
     "scale": ((8, 8, 8), 8),
+    "pool 3 2 ceil": ((8, 4, 4), 0),
+    "pool 3 3 ceil": ((8, 3, 3), 0),
     "resize": ((8, 16, 16), 0),
     "bilinear 4": ((8, 32, 32), 0),
     "shuffle": ((2, 16, 16), 0),
@@ -127,6 +148,7 @@ STEPS = {
     "s = global\nmul s": ((8, 8, 8), 0),
     "slice 2 3": ((3, 8, 8), 0),
     "hsigmoid": ((8, 8, 8), 0),
+    "y = pool 2 2\npool 3 3 | resize y": ((8, 4, 4), 0),
 }
 
 
@@ -171,6 +193,8 @@ WRONG = {
     "concat": "concat with",
     "concat 5": "concat with",
     "conv x": "conv with channels",
+    "resize x x": "resize with",
+    "conv 5 3 1 ceil": "conv with channels",
     "y = conv 4\nadd y": "shapes that agree",
     "y = conv 4 3 2\nconcat y": "shapes that agree",
     "shuffle": "a multiple of 4 channels",
