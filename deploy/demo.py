@@ -38,6 +38,7 @@ from profiles import load_sensor
 from profiles.errors import OptionError
 from profiles.figures import Row, measured
 from profiles.sensor_file import reference_for
+from profiles.target import DEFAULT_TARGET
 from quant.calibration import HELD_OUT_SEED, draw_patches
 from quant.gate import compare, gate_row
 from quant.onnx_file import load_onnx, save_onnx
@@ -101,7 +102,7 @@ def headline(bench: list[Row], quality: list[Row], placement: Placement) -> str:
         if placement.dpu_subgraphs == 1 and not placement.failed
         else "does not fit the DPU whole"
     )
-    text = f"{VARIANT} in INT8 {fits}: predicted {latency} s for this image on a VCK190"
+    text = f"{VARIANT} in INT8 {fits}: predicted {latency} s for this image on a {DEFAULT_TARGET.upper()}"
     text += f", against {cpu} s {cpu.mode} for the traditional pipeline on this CPU"
     if quality:
         before, after = quality[0].figures["PSNR"], quality[-1].figures["PSNR"]
@@ -206,7 +207,7 @@ def run_demo(
     say("exporting, quantising and gating")
     gate, int8, exact = quantise_and_gate(out, seed, sensors, say)
     say("checking every operator against the DPU")
-    dpu = load_dpu()
+    dpu = load_dpu(DEFAULT_TARGET)
     placement = place(read_network(out / "int8.onnx", TILE_PX), dpu)
     say("restoring: traditional pipeline and INT8 network")
     methods = _methods(int8, sensors)

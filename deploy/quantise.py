@@ -15,7 +15,7 @@ from deploy.report.sensitivity_page import sensitivity_page
 from model.progress import steps
 from profiles.errors import OptionError
 from profiles.figures import Row
-from profiles.target import TargetProfile
+from profiles.target import TargetProfile, board_names
 from quant.calibration import Calibration, Patches
 from quant.core import Shifts, target_shifts
 from quant.free import free_ticks, quantise_free
@@ -103,7 +103,8 @@ def quantise_legal_file(
 
 def _shifts_of(target: TargetProfile) -> Shifts:
     if not target.configurations:
-        expected, remedy = "a target with a DPU, such as vck190", "choose another, or take --regime free"
+        expected = f"a target with a DPU: {', '.join(board_names())}"
+        remedy = "choose another, or take --regime free"
         raise OptionError("--target", expected=expected, got=repr(target.name), remedy=remedy)
     return target_shifts(target)
 

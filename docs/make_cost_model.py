@@ -98,7 +98,7 @@ SERIAL = (
 def page(cases: Cases) -> str:
     """The page as Markdown."""
     names = [row.network for row in cases.rows]
-    constants = Constants.of(load_dpu())
+    constants = Constants.of(load_dpu("vck190"))
     errors = leave_out(cases, names)
     parts = [HEAD, constants_section(constants), accuracy_section(cases, errors), networks_section(cases, errors)]
     return "\n".join([*parts, not_fitted_section(constants), convbeers_section()])
@@ -106,7 +106,7 @@ def page(cases: Cases) -> str:
 
 def constants_section(constants: Constants) -> str:
     """What is fitted, and what is not."""
-    dpu = load_dpu()
+    dpu = load_dpu("vck190")
     rows = [
         (f"`{key}`", meaning, f"{value * scale:.3g} {unit}".strip(), "fitted")
         for (key, value), (meaning, scale, unit) in zip(asdict(constants).items(), MEANING.values(), strict=True)
@@ -232,7 +232,7 @@ def not_fitted_section(constants: Constants) -> str:
 def convbeers_section() -> str:
     """The paper's network for each configuration, beside its published figure."""
     frames, rows, outside = paper_frames(13600, 9016, 640), [], ""
-    for name in load_dpu().target.configurations:
+    for name in load_dpu("vck190").target.configurations:
         dpu = load_dpu("vck190", name)
         p: Prediction = predict(place(convbeers(), dpu), dpu)
         low, high = p.fps_interval

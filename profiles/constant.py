@@ -1,7 +1,7 @@
-"""A number and where it comes from: the one kind of value that a profile holds."""
+"""A number, or a list of names, and where it comes from: what a profile holds."""
 
 import sys
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from typing import Literal, get_args
 
@@ -34,6 +34,31 @@ class Constant:
 
     def __str__(self) -> str:
         return f"{self.low:g}" if self.low == self.high else f"{self.low:g} to {self.high:g}"
+
+
+@dataclass(frozen=True)
+class Words:
+    """A list of names, which may be empty, with its provenance: what an operation can be fused with."""
+
+    value: tuple[str, ...]
+    status: Status
+    source: str
+
+    def __str__(self) -> str:
+        return ", ".join(self.value) or "none"
+
+
+def read_words(where: str, raw: object, known: Collection[str]) -> Words:
+    """Read `["ReLU"]` or `{ value = ["ReLU"], status = ..., source = ... }`.
+
+    Raises:
+        ProfileError: no list, or a name that is not among the known ones.
+    """
+    value, status, source = read_stated(where, raw)
+    if not isinstance(value, list) or not all(isinstance(name, str) and name in known for name in value):
+        remedy = "correct the names; an empty list stands for none"
+        raise ProfileError(where, expected=f"a list out of {', '.join(known)}", got=repr(value), remedy=remedy)
+    return Words(tuple(value), status, source)
 
 
 def read_constant(where: str, raw: object) -> Constant:

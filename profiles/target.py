@@ -1,22 +1,43 @@
-"""Target profiles: what a processing board can do, every constant with its source."""
+"""Target profiles: what a processing board can do, every constant with its source.
 
+A file may begin with `base = "zcu102"`: what it does not state is then that shipped board's. So a board with a DPU of
+a known kind states its cores, clock and memory, and nothing else.
+"""
+
+import re
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
-from profiles.constant import Constant, check_keys, read_constant
+from profiles.constant import Constant, Words, check_keys, read_constant, read_words
 from profiles.errors import ProfileError
-from profiles.toml import read_toml, shipped_names
+from profiles.toml import profile_path, read_toml, shipped_names
+
+DEFAULT_TARGET = "vck190"
+"""The board of the paper: what a command takes where no board is named."""
 
 MODEL_SUFFIX = "-model"
 """What `bench` adds to a board's name: its figures are of a model of the board."""
 
+FUSED = ("ReLU", "ReLU6", "LeakyReLU", "PReLU", "hard-sigmoid", "hard-swish")
+"""The activations that a board's file can list, as its manual names them."""
+PLACES = frozenset({"conv", "depthwise", "pool", "sum", "alone"})
+"""Where: behind a convolution, a depthwise one, a pool, an add or a mul; or by themselves, behind anything."""
+DOCUMENTS = frozenset({"operators", "numbers", "quantiser"})
+"""Where a DPU's operators are listed, where its numbers are described, and the quantiser that knows their windows."""
+
+WATTS = "_w"
+"""How the names of measured powers end, which no board takes from another."""
+ABSENT = {"cost": ("no cost constants yet", "take those of a board with the same DPU: base = its name")}
+"""What the lack of a whole table means, and the remedy."""
+
 
 @dataclass(frozen=True)
 class TargetProfile:
-    """What one TOML file under `profiles/targets/` states.
+    """What one TOML file under `profiles/targets/` states, its base included.
 
     `tables` maps a topic ("array", "memory", "conv", "power", ...) to its constants; `configurations` maps the name
-    of a build of the accelerator to its constants, and is empty where there is but one.
+    of a build of the accelerator to its constants, and is empty where there is but one. `activations` says what is
+    fused with which operation, `documents` names the manuals; both are empty of a board without a DPU.
     """
 
     name: str
@@ -24,6 +45,8 @@ class TargetProfile:
     default_configuration: str | None
     configurations: dict[str, dict[str, Constant]]
     tables: dict[str, dict[str, Constant]]
+    activations: dict[str, Words] = field(default_factory=dict)
+    documents: dict[str, str] = field(default_factory=dict)
 
     def value(self, table: str, key: str) -> float:
         """The single value of a constant that states no range.
@@ -42,11 +65,11 @@ class TargetProfile:
         try:
             return self.tables[table][key]
         except KeyError:
+            got, remedy = ("none", "add it to the file")
+            if table not in self.tables:
+                got, remedy = ABSENT.get(table, (got, remedy))
             raise ProfileError(
-                f"target profile {self.name}",
-                expected=f"[{table}] {key}",
-                got="none",
-                remedy="add it to the file",
+                f"target profile {self.name}", expected=f"[{table}] {key}", got=got, remedy=remedy
             ) from None
 
     def configuration(self, name: str | None = None) -> tuple[str, dict[str, Constant]]:
@@ -71,6 +94,12 @@ def target_names() -> list[str]:
     return shipped_names("targets")
 
 
+def board_names() -> list[str]:
+    """The names of the shipped targets with a DPU: their files name its manual."""
+    texts = {name: profile_path("targets", name).read_text(encoding="utf-8") for name in target_names()}
+    return [name for name, text in texts.items() if re.search(r"^(base =|\[documents])", text, re.MULTILINE)]
+
+
 def load_target(name: str) -> TargetProfile:
     """Read a shipped target profile by name, or the user's own by the path of its .toml file.
 
@@ -79,8 +108,8 @@ def load_target(name: str) -> TargetProfile:
     Raises:
         ProfileError: unknown name, or a table that is not made of constants.
     """
-    label, raw = read_toml("targets", name.removesuffix(MODEL_SUFFIX))
-    special = {"description", "default_configuration", "configurations"}
+    label, raw = _with_base(*read_toml("targets", name.removesuffix(MODEL_SUFFIX)))
+    special = {"description", "default_configuration", "configurations", "activations", "documents"}
     check_keys(label, {k: v for k, v in raw.items() if k in special}, {"description"}, special)
     tables = {k: _table(f"{label} [{k}]", v) for k, v in raw.items() if k not in special}
     configurations = {
@@ -94,10 +123,53 @@ def load_target(name: str) -> TargetProfile:
         str(default) if default else None,
         configurations,
         tables,
+        _activations(f"{label} [activations]", raw.get("activations")),
+        _documents(f"{label} [documents]", raw.get("documents")),
     )
     if configurations:
         profile.configuration()
     return profile
+
+
+def _with_base(label: str, raw: dict[str, object]) -> tuple[str, dict[str, object]]:
+    """The file's own tables over those of its base, key by key; a configuration's too."""
+    base = raw.pop("base", None)
+    if base is None:
+        return label, raw
+    if base not in target_names():
+        known = ", ".join(board_names())
+        raise ProfileError(f"{label} base", expected=f"one of {known}", got=repr(base), remedy="name a shipped board")
+    below = _with_base(*read_toml("targets", str(base)))[1]
+    power = {key: value for key, value in _mapping(label, below.get("power", {})).items() if not key.endswith(WATTS)}
+    return label, _over(raw, {**below, "power": power}, depth=1)
+
+
+def _over(above: Mapping[str, object], below: Mapping[str, object], depth: int) -> dict[str, object]:
+    """One table over another: `depth` levels of tables are joined, below them what stands above replaces."""
+    joined = dict(below)
+    for key, value in above.items():
+        under = below.get(key)
+        if depth and isinstance(value, Mapping) and isinstance(under, Mapping):
+            joined[key] = _over(value, under, depth if key == "configurations" else depth - 1)
+        else:
+            joined[key] = value
+    return joined
+
+
+def _activations(where: str, raw: object) -> dict[str, Words]:
+    if raw is None:
+        return {}
+    table = _mapping(where, raw)
+    check_keys(where, table, set(PLACES))
+    return {key: read_words(f"{where} {key}", value, FUSED) for key, value in table.items()}
+
+
+def _documents(where: str, raw: object) -> dict[str, str]:
+    if raw is None:
+        return {}
+    table = _mapping(where, raw)
+    check_keys(where, table, set(DOCUMENTS))
+    return {key: str(value) for key, value in table.items()}
 
 
 def _table(where: str, raw: object) -> dict[str, Constant]:

@@ -26,7 +26,7 @@ from deploy.dpu.cost.latency import (
 from deploy.dpu.reading import read_network
 from profiles import TargetProfile
 from profiles.errors import OptionError
-from profiles.figures import Figure, Row, predicted, published
+from profiles.figures import Figure, Row, predicted, published, unavailable
 
 TABLE, LAYERS = "bench", "layers"
 COST_SOURCE = "cost model fitted on published networks, docs/cost-model.md"
@@ -117,6 +117,8 @@ def fitted_range(prediction: Prediction) -> str:
 
 def energy(latency: Figure, power: Figure) -> Figure:
     """Energy of the swath, in J: time and power, and their ends."""
+    if power.value is None or latency.value is None:
+        return unavailable("J", power.reason or latency.reason)
     (fast_s, slow_s), (low_w, high_w) = (f.interval or (f.value or 0.0, f.value or 0.0) for f in (latency, power))
     value = (latency.value or 0.0) * (power.value or 0.0)
     return predicted(value, "J", (fast_s * low_w, slow_s * high_w), f"{latency.source}; {power.source}")

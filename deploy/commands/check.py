@@ -6,12 +6,13 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from deploy.commands.shared import refuse, say
+from deploy.commands.shared import BOARDS, refuse, say
+from profiles.target import DEFAULT_TARGET
 
 if TYPE_CHECKING:
     from deploy.dpu.board import Dpu
 
-EXAMPLE = "check network.onnx --target vck190 --config C32B3"
+EXAMPLE = "check network.onnx --target zcu102 --config B4096"
 TRADITIONAL = Path("traditional")
 TILE_PX = 640
 
@@ -26,9 +27,9 @@ def check(
             "the shipped INT8 one if none.",
         ),
     ] = None,
-    target: Annotated[str, typer.Option(help="Profile of a board with a DPU.")] = "vck190",
+    target: Annotated[str, typer.Option(help=f"Profile of a board with a DPU: {BOARDS}.")] = DEFAULT_TARGET,
     config: Annotated[
-        str | None, typer.Option(help="DPU configuration, C32B1 to C64B5; the target's own if none.")
+        str | None, typer.Option(help="DPU configuration that the profile lists; the target's own if none.")
     ] = None,
     tile: Annotated[
         int | None,

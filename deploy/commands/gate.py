@@ -8,9 +8,10 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperCommand
 
-from deploy.commands.shared import say
+from deploy.commands.shared import BOARDS, say
 from model.processor import SEEDS
 from model.shipped import SENSOR
+from profiles.target import DEFAULT_TARGET
 
 EXAMPLE = "gate float.onnx int8.onnx --max-mae 0.0007"
 UsageError: type[Exception] = typer.BadParameter.__bases__[0]
@@ -64,7 +65,9 @@ def gate(
     ] = None,
     config: Annotated[Path | None, typer.Option(help="TOML file of limits; see docs/gate.md.")] = None,
     baseline: Annotated[Path | None, typer.Option(help="What 'gate --json' wrote before: MAE may not grow.")] = None,
-    target: Annotated[str, typer.Option(help="Board whose rules the INT8 file must keep.")] = "vck190",
+    target: Annotated[
+        str, typer.Option(help=f"Board whose rules the INT8 file must keep: {BOARDS}.")
+    ] = DEFAULT_TARGET,
     sensor: Annotated[
         str, typer.Option(help="Profile of the test patches, and what a shipped network is specialised to.")
     ] = SENSOR,

@@ -10,7 +10,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from profiles import SensorProfile
-    from profiles.constant import Constant
+    from profiles.constant import Constant, Words
     from profiles.effects import Table
 
     Row = tuple[str, str, str, str]
@@ -89,7 +89,11 @@ def _shown(name: str) -> "tuple[str, list[Row]]":
         return f"{scene.name}: {scene.description}", rows
     if name in target_names() or name.endswith(".toml"):
         target = load_target(name)
-        groups = {**target.tables, **{f"configurations.{k}": v for k, v in target.configurations.items()}}
+        groups: dict[str, Mapping[str, Constant | Words]] = {
+            **target.tables,
+            **{f"configurations.{k}": v for k, v in target.configurations.items()},
+        }
+        groups |= {"activations": target.activations}
         rows = [_row(f"{group}.{key}", value) for group, table in groups.items() for key, value in table.items()]
         return f"{target.name}: {target.description}", rows
     known = ", ".join([*sensor_names(), *scene_names(), *target_names()])
@@ -126,5 +130,5 @@ def _effects(effects: "Mapping[str, Table]") -> "list[Row]":
     return [_row(f"{name}.{key}", constant) for name, table in effects.items() for key, constant in table.items()]
 
 
-def _row(key: str, constant: "Constant") -> "Row":
+def _row(key: str, constant: "Constant | Words") -> "Row":
     return key, str(constant), constant.status, constant.source

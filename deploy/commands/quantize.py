@@ -7,11 +7,12 @@ from typing import Annotated
 
 import typer
 
-from deploy.commands.shared import say
+from deploy.commands.shared import BOARDS, say
 from model.processor import SEEDS
 from model.shipped import SENSOR
+from profiles.target import DEFAULT_TARGET
 
-EXAMPLE = "quantize float.onnx --target vck190 --sensor pleiades-degraded --out int8.onnx"
+EXAMPLE = "quantize float.onnx --target zcu104 --sensor pleiades-degraded --out int8.onnx"
 
 
 class Regime(StrEnum):
@@ -26,7 +27,7 @@ def quantize(
         Path, typer.Argument(help="Float ONNX or weights, or a shipped network's name, then specialised to --sensor.")
     ],
     out: Annotated[Path, typer.Option(help="INT8 ONNX for the host, runs on stock onnxruntime.")],
-    target: Annotated[str, typer.Option(help="Whose rules to obey.")] = "vck190",
+    target: Annotated[str, typer.Option(help=f"Whose rules to obey: {BOARDS}.")] = DEFAULT_TARGET,
     sensor: Annotated[str, typer.Option(help="Profile that calibration patches are drawn from.")] = SENSOR,
     regime: Annotated[
         Regime, typer.Option(help="legal: the DPU's rules; free: float scales, a channel's own for weights.")

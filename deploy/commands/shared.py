@@ -5,6 +5,10 @@ from collections.abc import Iterable
 import typer
 
 from profiles.errors import OptionError, visible
+from profiles.target import board_names
+
+BOARDS = f"{', '.join(board_names())}, or your .toml file"
+"""What --target takes, for its help."""
 
 
 def refuse(context: typer.Context, names: Iterable[str], *, expected: str, got: str, remedy: str) -> None:

@@ -6,9 +6,10 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from deploy.commands.shared import refuse, say
+from deploy.commands.shared import BOARDS, refuse, say
 from model.processor import SEEDS
 from model.shipped import SENSOR, VARIANT
+from profiles.target import DEFAULT_TARGET
 
 if TYPE_CHECKING:
     from deploy.stress.flip_study import FlipRequest
@@ -52,7 +53,9 @@ def stress(
         Path | None,
         typer.Option(help="Folder of aerial images for the patches, with --bit-flips; else drawn scenes."),
     ] = None,
-    target: Annotated[str, typer.Option(help="Board that prices the guards, with --bit-flips.")] = "vck190",
+    target: Annotated[
+        str, typer.Option(help=f"Board that prices the guards, with --bit-flips: {BOARDS}.")
+    ] = DEFAULT_TARGET,
     out: Annotated[
         Path | None, typer.Option(help="Write the tables here as Markdown; with --bit-flips the curves beside it.")
     ] = None,

@@ -1,29 +1,61 @@
 """One build of the DPU: a target profile and a configuration of it."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
 from profiles import TargetProfile, load_target
 from profiles.constant import Constant
 from profiles.errors import OptionError, ProfileError
+from profiles.target import board_names
 
-CONFIGURATION = ("batch_handlers", "cpb", "peak_tops")
-DIVISORS = ("array", "memory", "elementwise", "cost", "power")
-"""Tables of widths, rates and energies, which the cost model divides by: a profile with a zero there is refused."""
 SMALLEST, LARGEST = 1e-30, 1e30
+CONFIGURATION = {"cores": 1.0, "batch_handlers": 1.0, "cpb": 1.0, "peak_tops": SMALLEST}
+"""What every configuration states, and the least that it can be."""
+SIZED = ("array", "memory", "elementwise")
+"""Tables whose constants a configuration may state for itself, by their names: a smaller array has smaller banks."""
+DIVISORS = {**dict.fromkeys(SIZED, 1.0), "cost": SMALLEST, "power": SMALLEST}
+"""Tables of widths, rates and energies, by which rules and cost model divide, and the least that each can be."""
 
 
 @dataclass(frozen=True)
 class Dpu:
-    """A DPU configuration: C32B3 has 3 batch handlers, each of 32 AI engines and 32 output channels at a time."""
+    """A DPU configuration: C32B3 has 3 batch handlers, each of 32 AI engines and 32 output channels at a time.
+
+    A board may hold several cores of it, which share its memory and nothing else: three of the ZCU102's B4096, each
+    with one batch handler, run three images at once and load the weights three times.
+    """
 
     target: TargetProfile
     name: str
     constants: dict[str, Constant]
 
+    @cached_property
+    def tables(self) -> dict[str, dict[str, Constant]]:
+        """The target's tables, with what the configuration states in place of theirs."""
+        sized = {
+            name: {k: self.constants.get(k, v) for k, v in self.target.tables.get(name, {}).items()} for name in SIZED
+        }
+        return {**self.target.tables, **{name: table for name, table in sized.items() if table}}
+
+    @property
+    def cores(self) -> int:
+        """Copies of the compute unit, each with instructions, maps and weights of its own."""
+        return int(self.constants["cores"].low)
+
     @property
     def batch(self) -> int:
-        """Images that go through at once, one a batch handler."""
-        return int(self.constants["batch_handlers"].low)
+        """Images that go through at once, one a batch handler of every core."""
+        return self.cores * int(self.constants["batch_handlers"].low)
+
+    @property
+    def weight_loads(self) -> int:
+        """How often the weights cross the memory for these images: the batch handlers of a core share them."""
+        return self.cores
+
+    @property
+    def channels_max(self) -> int:
+        """The most channels that an operator of the array can take."""
+        return self.whole("array", "channel_groups") * self.input_parallel
 
     @property
     def input_parallel(self) -> int:
@@ -37,7 +69,10 @@ class Dpu:
 
     @property
     def engine_ops_per_s(self) -> float:
-        """Peak int8 operations a second of one batch handler; a multiply-accumulate counts as two."""
+        """Peak int8 operations a second of one batch handler; a multiply-accumulate counts as two.
+
+        The configuration's peak is that of all cores together.
+        """
         return self.constants["peak_tops"].low * 1e12 / self.batch
 
     @property
@@ -47,19 +82,24 @@ class Dpu:
         return lanes * self.value("array", "pl_clock_hz")
 
     def limit(self, table: str, key: str) -> Constant:
-        """A constant of the target, with both ends of its range: a rule's window, or one limit as both."""
-        return self.target.constant(table, key)
+        """A constant with both ends of its range: a rule's window, or one limit as both.
+
+        Raises:
+            ProfileError: neither the configuration nor the target states it.
+        """
+        found = self.tables.get(table, {}).get(key)
+        return self.target.constant(table, key) if found is None else found
 
     def value(self, table: str, key: str) -> float:
-        """The single value of a constant of the target."""
-        return self.target.value(table, key)
+        """The single value of a constant."""
+        return self.limit(table, key).low
 
     def whole(self, table: str, key: str) -> int:
         """The value of a constant that counts something."""
         return int(self.value(table, key))
 
 
-def load_dpu(target: str = "vck190", configuration: str | None = None) -> Dpu:
+def load_dpu(target: str, configuration: str | None = None) -> Dpu:
     """Read a target profile and one of its configurations.
 
     Raises:
@@ -68,19 +108,24 @@ def load_dpu(target: str = "vck190", configuration: str | None = None) -> Dpu:
     """
     profile = load_target(target)
     if not profile.configurations:
-        raise OptionError(
-            "--target", expected="a target with a DPU, such as vck190", got=repr(target), remedy="choose another"
-        )
+        expected = f"a target with a DPU: {', '.join(board_names())}"
+        raise OptionError("--target", expected=expected, got=repr(target), remedy="choose another")
     name, constants = profile.configuration(configuration)
-    for key in CONFIGURATION:
-        _require(f"{profile.name} [configurations.{name}] {key}", constants.get(key))
-    for table in DIVISORS:
-        for key, constant in profile.tables.get(table, {}).items():
-            _require(f"{profile.name} [{table}] {key}", constant)
-    return Dpu(profile, name, constants)
+    for key, least in CONFIGURATION.items():
+        _require(f"{profile.name} [configurations.{name}] {key}", constants.get(key), least)
+    if not profile.documents:
+        got, remedy = "none", "add it, or begin with base = the name of a board with the same DPU"
+        raise ProfileError(profile.name, expected="a table [documents]", got=got, remedy=remedy)
+    dpu = Dpu(profile, name, constants)
+    for table, least in DIVISORS.items():
+        for key, constant in dpu.tables.get(table, {}).items():
+            _require(f"{profile.name} [{table}] {key}", constant, least)
+    return dpu
 
 
-def _require(where: str, constant: Constant | None) -> None:
-    if constant is None or not SMALLEST < constant.low <= constant.high < LARGEST:
+def _require(where: str, constant: Constant | None, least: float) -> None:
+    if constant is None or not least <= constant.low <= constant.high < LARGEST:
         got = "none" if constant is None else str(constant)
-        raise ProfileError(where, expected="a number above 0 that a board can have", got=got, remedy="correct it")
+        raise ProfileError(
+            where, expected=f"a number of at least {least:g} that a board can have", got=got, remedy="correct it"
+        )

@@ -24,6 +24,7 @@ Kind = Literal[
     "pad",
     "resize",
     "pixel shuffle",
+    "argmax",
     "quantise",
     "dequantise",
     "other",

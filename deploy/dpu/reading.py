@@ -34,6 +34,8 @@ KINDS: dict[str, Kind] = {
     "Resize": "resize",
     "Upsample": "resize",
     "DepthToSpace": "pixel shuffle",
+    "SpaceToDepth": "pixel shuffle",
+    "ArgMax": "argmax",
     "QuantizeLinear": "quantise",
     "DequantizeLinear": "dequantise",
 }

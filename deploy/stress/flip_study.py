@@ -95,6 +95,7 @@ def flip_rows(subject: Subject, request: FlipRequest, tick: Callable[[], None] =
     core_of(subject)  # refused before anything is drawn
     dpu = load_dpu(request.target, None)
     prediction = predict_file(subject.paths[-1], dpu, TILE_PX)
+    dpu.limit("cpu", "clock_ghz")  # and so is a board that cannot price the guards
     target = make_target(subject, request)
     curves = flips.curve_rows(target, request.draws, request.seed, tick)
     places = flips.place_rows(target, request.seed, request.size_px // 2, tick)

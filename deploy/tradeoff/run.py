@@ -143,7 +143,7 @@ def _put_together(
     request: Request, measurements: Measurements, results: Results, remarks: tuple[str, ...]
 ) -> StudyRun:
     outcomes, found = list(results.outcomes.values()), fronts(results)
-    paper = papers_point(results, lambda method: is_papers(measurements.store.model(method)), load_dpu().name)
+    paper = papers_point(results, lambda method: is_papers(measurements.store.model(method)), load_dpu("vck190").name)
     asked = [*request.budget, *request.need]
     choice = choose(results, request.budget, request.need) if asked else Choice(None, ())
     shown = crop_points(outcomes, found, [choice.outcome, paper])

@@ -52,7 +52,7 @@ def precisions_of(network: Network) -> Sequence[str]:
 def board_of(network: Network, swath: Swath) -> Board:
     """Its tiles and configurations worth a look, from the cost model."""
     model = load_onnx(network.int8_file) if network.int8_file and network.given == LEGAL else network.model()
-    dpu, radius_px = load_dpu(), receptive_radius_px(model)
+    dpu, radius_px = load_dpu("vck190"), receptive_radius_px(model)
 
     def seconds(side_px: int) -> float:
         return latency_s(model, dpu, replace(swath, tile_px=side_px, halo_px=radius_px))

@@ -83,11 +83,11 @@ def test_runs_of_a_board_beyond_reason_are_refused(run: dict[str, object], tmp_p
     sound = {"network": "resnet-50", "configuration": "C32B3", "tile_px": 640, "fps": 95.0}
     path = tmp_path / "runs.json"
     path.write_text(json.dumps([sound]))
-    refit(path, load_dpu())
+    refit(path, load_dpu("vck190"))
     for runs in ([{**sound, **run}], [sound] * 1001):
         path.write_text(json.dumps(runs))
         with pytest.raises(OptionError):
-            refit(path, load_dpu())
+            refit(path, load_dpu("vck190"))
 
 
 @pytest.mark.parametrize(
@@ -130,7 +130,7 @@ def test_a_name_too_long_for_the_disk_is_a_sentence(tmp_path: Path) -> None:
     [
         ("\ncpb = {", "\ncpbb = {"),
         ("\nbatch_handlers = { value = 3,", "\nbatch_handlers = { value = 0,"),
-        ("\nweight_bank_width = {", "\nmine = 0\nweight_bank_width = {"),
+        ("\nweight_banks = {", "\nmine = 0\nweight_banks = {"),
     ],
 )
 def test_a_target_with_constants_that_no_board_has_is_refused(line: str, changed: str, tmp_path: Path) -> None:

@@ -168,7 +168,7 @@ def exported_seeds(_: Path) -> list[bytes]:
 
 def look_at_onnx(path: Path) -> None:
     """What `check` does."""
-    place(read_network(path, SIDE_PX), load_dpu())
+    place(read_network(path, SIDE_PX), load_dpu("vck190"))
 
 
 def understand_onnx(path: Path) -> None:
@@ -395,7 +395,7 @@ PARSERS: tuple[Parser, ...] = (
     Parser("gate limits TOML", ".toml", lambda _: LIMITS, lambda p: read_limits(p, None)),
     Parser("results JSON", ".json", document_seeds, read_results, of_json),
     Parser("gate baseline JSON", ".json", document_seeds, lambda p: baseline_mae(p, GATED), of_json),
-    Parser("board's runs JSON", ".json", runs_seeds, lambda p: refit(p, load_dpu()), of_json, 0.3),
+    Parser("board's runs JSON", ".json", runs_seeds, lambda p: refit(p, load_dpu("vck190")), of_json, 0.3),
     Parser("kept measurements", ".json", cache_seeds, find_kept, of_json),
     Parser("journal of a run", ".json", journal_seeds, resume, of_json, 0.5),
     Parser("dataset manifest", ".jsonl", manifest_seeds, _read_summary, of_json),

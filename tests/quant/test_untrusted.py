@@ -305,7 +305,7 @@ def test_a_long_chain_of_activations_is_followed_in_a_moment(tmp_path: Path) -> 
     last = sketch.node("DequantizeLinear", sketch.node("QuantizeLinear", "image", scale, zero), scale, zero)
     for _ in range(1200):
         last = sketch.node("Relu", last)
-    place(read_network(sketch.save(tmp_path / "long.onnx", last), 32), load_dpu())
+    place(read_network(sketch.save(tmp_path / "long.onnx", last), 32), load_dpu("vck190"))
 
 
 def test_there_is_one_door() -> None:

@@ -1,5 +1,7 @@
 """What the DPU demands of convolutions, plain, depthwise and transposed: one rule, one function."""
 
+import math
+
 from deploy.dpu.board import Dpu
 from deploy.dpu.checker.finding import Finding, groups_of, outside, shown
 from deploy.dpu.graph import Operation
@@ -8,7 +10,7 @@ from deploy.dpu.graph import Operation
 
 
 def conv_kernel(op: Operation, dpu: Dpu) -> Finding | None:
-    """Kernel height and width are {conv[kernel]} (UG1414 3.5, conv2d)."""
+    """Kernel height and width are {conv[kernel]} ({conv[kernel].source})."""
     limit, kernel = dpu.limit("conv", "kernel"), op.window.kernel
     if not outside(kernel, limit):
         return None
@@ -17,7 +19,7 @@ def conv_kernel(op: Operation, dpu: Dpu) -> Finding | None:
 
 
 def conv_stride(op: Operation, dpu: Dpu) -> Finding | None:
-    """Strides are {conv[stride]} (UG1414 3.5, conv2d)."""
+    """Strides are {conv[stride]} ({conv[stride].source})."""
     limit, stride = dpu.limit("conv", "stride"), op.window.stride
     if not outside(stride, limit):
         return None
@@ -26,12 +28,12 @@ def conv_stride(op: Operation, dpu: Dpu) -> Finding | None:
 
 
 def conv_channels(op: Operation, dpu: Dpu) -> Finding | None:
-    """Input and output channels are at most {conv[channels_max]} (UG1414 3.5, conv2d)."""
-    return _channels(op, dpu.whole("conv", "channels_max"))
+    """Input and output channels are at most {limits[channels]} ({documents[operators]}, conv2d)."""
+    return _channels(op, dpu)
 
 
 def conv_padding(op: Operation, dpu: Dpu) -> Finding | None:
-    """Padding on each side is 0 to (kernel - 1) * dilation (UG1414 3.5, conv2d)."""
+    """Padding on each side is 0 to (kernel - 1) * dilation ({documents[operators]}, conv2d)."""
     window = op.window
     room = [(k - 1) * d for k, d in zip(window.kernel, window.dilation, strict=True)] * 2
     if all(0 <= pad <= most for pad, most in zip(window.pads, room, strict=True)):
@@ -41,14 +43,15 @@ def conv_padding(op: Operation, dpu: Dpu) -> Finding | None:
 
 
 def conv_weight_bank(op: Operation, dpu: Dpu) -> Finding | None:
-    """Weights fit the parameter buffer's depth of {memory[weight_bank_depth]} (Vitis-AI master, dpu_op_filter.py).
+    """Weights fit the parameter buffer's depth of {memory[weight_bank_depth]} ({memory[weight_bank_depth].source}).
 
-    The depth is kernel height * width * ceil(input channels / {memory[weight_bank_width]}) * ceil(output channels at
-    a time / {memory[weight_banks]}).
+    The depth is kernel height * width * ceil(input channels / {array[input_channel_parallel]}) * ceil(output channels
+    at a time / {memory[weight_banks]}) + {conv[weight_bias_depth]} for the bias.
     """
     area = op.window.kernel[0] * op.window.kernel[1]
-    inputs = groups_of(op.channels[0], dpu.whole("memory", "weight_bank_width"))
+    inputs = groups_of(op.channels[0], dpu.input_parallel)
     depth = area * inputs * groups_of(dpu.output_parallel, dpu.whole("memory", "weight_banks"))
+    depth += dpu.whole("conv", "weight_bias_depth")
     most = dpu.whole("memory", "weight_bank_depth")
     if depth <= most:
         return None
@@ -57,18 +60,28 @@ def conv_weight_bank(op: Operation, dpu: Dpu) -> Finding | None:
 
 
 def conv_window(op: Operation, dpu: Dpu) -> Finding | None:
-    """The kernel's area * ceil(ic / {conv[window_channels]}) is at most {conv[window_max]} (UG1414 3.5, conv2d)."""
+    """Kernel area * ceil(ic / {conv[window_channels]}) is at most {conv[window_max]} ({conv[window_max].source})."""
     area = op.window.kernel[0] * op.window.kernel[1]
-    size = area * groups_of(op.channels[0], dpu.whole("conv", "window_channels"))
+    size = area * groups_of(op.channels[0], max(dpu.whole("conv", "window_channels"), 1))
     most = dpu.whole("conv", "window_max")
     if size <= most:
         return None
     return Finding(f"window of {size} exceeds {most}", f"keep kernel height * width within {most}, such as 8 x 8")
 
 
+def conv_area(op: Operation, dpu: Dpu) -> Finding | None:
+    """The kernel's height * width is at most {conv[area_max]} ({conv[area_max].source})."""
+    area, most = op.window.kernel[0] * op.window.kernel[1], dpu.value("conv", "area_max")
+    if area <= most:
+        return None
+    side = math.isqrt(max(int(most), 1))
+    reason = f"kernel ({shown(op.window.kernel)}) has {area} positions: at most {int(most)}"
+    return Finding(reason, f"use a kernel of at most {side} x {side}, or stack small ones")
+
+
 def conv_dilation(op: Operation, dpu: Dpu) -> Finding | None:
-    """Dilation * input channels is at most {conv[dilated_channels_max]} (UG1414 3.5, conv2d)."""
-    size, most = max(op.window.dilation) * op.channels[0], dpu.whole("conv", "dilated_channels_max")
+    """Dilation * input channels is at most {limits[channels]} ({documents[operators]}, conv2d)."""
+    size, most = max(op.window.dilation) * op.channels[0], dpu.channels_max
     if max(op.window.dilation) == 1 or size <= most:
         return None
     remedy = f"use a dilation of at most {most // op.channels[0]}, or fewer input channels"
@@ -76,7 +89,7 @@ def conv_dilation(op: Operation, dpu: Dpu) -> Finding | None:
 
 
 def conv_groups(op: Operation, dpu: Dpu) -> Finding | None:
-    """A convolution has one group, or as many as input channels: depthwise (UG1414 3.5, conv2d)."""
+    """A convolution has one group, or as many as input channels: depthwise ({documents[operators]}, conv2d)."""
     if op.kind != "grouped conv":
         return None
     groups = op.attributes.get("group")
@@ -85,9 +98,9 @@ def conv_groups(op: Operation, dpu: Dpu) -> Finding | None:
 
 
 def depthwise_kernel(op: Operation, dpu: Dpu) -> Finding | None:
-    """Kernel sides are {depthwise[kernel]} (PG389 1.3, ALU).
+    """Kernel sides are {depthwise[kernel]} ({depthwise[kernel].source}).
 
-    Their product is at most {depthwise[window_max]} (UG1414 3.5, depthwise-conv2d).
+    Their product is at most {depthwise[window_max]} ({depthwise[window_max].source}).
     """
     kernel, limit, most = op.window.kernel, dpu.limit("depthwise", "kernel"), dpu.whole("depthwise", "window_max")
     if not outside(kernel, limit) and kernel[0] * kernel[1] <= most:
@@ -97,7 +110,7 @@ def depthwise_kernel(op: Operation, dpu: Dpu) -> Finding | None:
 
 
 def depthwise_stride(op: Operation, dpu: Dpu) -> Finding | None:
-    """Strides are {depthwise[stride]} (PG389 1.3, ALU)."""
+    """Strides are {depthwise[stride]} ({depthwise[stride].source})."""
     limit, stride = dpu.limit("depthwise", "stride"), op.window.stride
     if not outside(stride, limit):
         return None
@@ -106,17 +119,20 @@ def depthwise_stride(op: Operation, dpu: Dpu) -> Finding | None:
 
 
 def depthwise_padding(op: Operation, dpu: Dpu) -> Finding | None:
-    """Padding is {depthwise[pad_begin]} top and left, {depthwise[pad_end]} bottom and right (PG389 1.3, ALU)."""
+    """Padding is {depthwise[pad_begin]} top and left, {depthwise[pad_end]} bottom and right.
+
+    Those are the ALU's limits ({depthwise[pad_end].source}).
+    """
     return alu_padding(op, dpu, "depthwise")
 
 
 def depthwise_channels(op: Operation, dpu: Dpu) -> Finding | None:
-    """Channels are at most {depthwise[channels_max]} (UG1414 3.5, depthwise-conv2d)."""
-    return _channels(op, dpu.whole("depthwise", "channels_max"))
+    """Input and output channels are at most {limits[channels]} ({documents[operators]})."""
+    return _channels(op, dpu)
 
 
 def transposed_kernel(op: Operation, dpu: Dpu) -> Finding | None:
-    """Kernel / stride, rounded down and up, is {transposed[kernel_per_stride]} (UG1414 3.5, transposed-conv2d)."""
+    """Kernel / stride, rounded down and up, is {transposed[kernel_per_stride]} ({documents[operators]})."""
     limit = dpu.limit("transposed", "kernel_per_stride")
     pairs = list(zip(op.window.kernel, op.window.stride, strict=True))
     if not outside(tuple(n for k, s in pairs for n in (k // s, groups_of(k, s))), limit):
@@ -128,7 +144,7 @@ def transposed_kernel(op: Operation, dpu: Dpu) -> Finding | None:
 
 
 def transposed_output_padding(op: Operation, dpu: Dpu) -> Finding | None:
-    """output_padding is {transposed[output_padding]} (UG1414 3.5, transposed-conv2d)."""
+    """output_padding is {transposed[output_padding]} ({transposed[output_padding].source})."""
     if max(op.window.output_padding) == dpu.whole("transposed", "output_padding"):
         return None
     reason = f"the DPU does not support output_padding {op.window.output_padding}"
@@ -136,7 +152,7 @@ def transposed_output_padding(op: Operation, dpu: Dpu) -> Finding | None:
 
 
 def transposed_padding(op: Operation, dpu: Dpu) -> Finding | None:
-    """Padding on each side is 0 to the kernel's side (UG1414 3.5, transposed-conv2d)."""
+    """Padding on each side is 0 to the kernel's side ({documents[operators]}, transposed-conv2d)."""
     room = op.window.kernel * 2
     if all(0 <= pad <= most for pad, most in zip(op.window.pads, room, strict=True)):
         return None
@@ -145,8 +161,8 @@ def transposed_padding(op: Operation, dpu: Dpu) -> Finding | None:
 
 
 def transposed_channels(op: Operation, dpu: Dpu) -> Finding | None:
-    """Input and output channels are at most {transposed[channels_max]} (UG1414 3.5, transposed-conv2d)."""
-    return _channels(op, dpu.whole("transposed", "channels_max"))
+    """Input and output channels are at most {limits[channels]} ({documents[operators]})."""
+    return _channels(op, dpu)
 
 
 def alu_padding(op: Operation, dpu: Dpu, table: str) -> Finding | None:
@@ -158,7 +174,8 @@ def alu_padding(op: Operation, dpu: Dpu, table: str) -> Finding | None:
     return Finding(reason, f"pad at most {begin.high:g} at top and left, the rest with a Pad node of constant mode")
 
 
-def _channels(op: Operation, most: int) -> Finding | None:
+def _channels(op: Operation, dpu: Dpu) -> Finding | None:
+    most = dpu.channels_max
     if max(op.channels) <= most:
         return None
     reason = f"{op.channels[0]} input and {op.channels[1]} output channels: at most {most}"

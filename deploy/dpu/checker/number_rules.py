@@ -16,14 +16,14 @@ MOVE = "move the output's scale until it fits: 'beers-deploy quantize --regime l
 
 
 def on_integers(op: Operation, dpu: Dpu) -> Finding | None:
-    """A node on the DPU computes on int8 tensors (UG1414 3.5, quantisation)."""
+    """A node on the DPU computes on int8 tensors ({documents[numbers]})."""
     return (
         None if op.integer else Finding("the file computes it in floating point", f"quantise this node too; {AGAIN}")
     )
 
 
 def symmetric(op: Operation, dpu: Dpu) -> Finding | None:
-    """Tensors are int8 around zero, or the same numbers as uint8 around 128 (Vitis-AI 3.0, vai_q_pytorch)."""
+    """Tensors are int8 around zero, or the same numbers as uint8 around 128 ({documents[quantiser]})."""
     faults = [
         f"{role} {scale.integer_type} around {scale.zero_points[0]}"
         for role, scale in op.scales.items()
@@ -33,13 +33,13 @@ def symmetric(op: Operation, dpu: Dpu) -> Finding | None:
 
 
 def per_tensor(op: Operation, dpu: Dpu) -> Finding | None:
-    """A tensor has one scale, not one a channel (Vitis-AI 3.0, vai_q_pytorch)."""
+    """A tensor has one scale, not one a channel ({documents[quantiser]})."""
     faults = [f"{role} has {len(scale.scales)} scales" for role, scale in op.scales.items() if len(scale.scales) != 1]
     return Finding("; ".join(faults), f"quantise with one scale a tensor; {AGAIN}") if faults else None
 
 
 def power_of_two(op: Operation, dpu: Dpu) -> Finding | None:
-    """Scales are powers of two (UG1414 3.5, quantisation)."""
+    """Scales are powers of two ({documents[numbers]})."""
     single = {role: scale for role, scale in op.scales.items() if len(scale.scales) == 1}
     faults = [f"{role} scale {scale.scales[0]:.4g}" for role, scale in single.items() if scale.frac_bits is None]
     return (
@@ -50,19 +50,19 @@ def power_of_two(op: Operation, dpu: Dpu) -> Finding | None:
 
 
 def one_format(op: Operation, dpu: Dpu) -> Finding | None:
-    """Who writes a tensor and who reads it give it the same scale and zero point (Vitis-AI 3.0, vai_q_pytorch)."""
+    """Who writes a tensor and who reads it give it the same scale and zero point ({documents[quantiser]})."""
     faults = [f"{role} is {' and '.join(map(_words, formats))}" for role, formats in op.disputed.items()]
     return Finding("; ".join(faults), f"give each tensor one scale and zero point; {AGAIN}") if faults else None
 
 
 def shift_cut(op: Operation, dpu: Dpu) -> Finding | None:
-    """Weight + input - output fractional bits: {numbers[shift_cut]} (Vitis-AI 3.0, vai_q_pytorch)."""
+    """Weight + input - output fractional bits: {numbers[shift_cut]} ({documents[quantiser]})."""
     cut, limit = _cut(op), dpu.limit("numbers", "shift_cut")
     return None if cut is None or not outside((cut,), limit) else Finding(f"shift_cut {cut}, allowed {limit}", MOVE)
 
 
 def shift_bias(op: Operation, dpu: Dpu) -> Finding | None:
-    """Weight + input - bias fractional bits: at most {numbers[shift_bias_max]} (Vitis-AI 3.0, vai_q_pytorch).
+    """Weight + input - bias fractional bits: at most {numbers[shift_bias_max]} ({documents[quantiser]}).
 
     And at least min(0, shift_cut + 8 - {numbers[accumulator_bits]}).
     """
@@ -75,14 +75,14 @@ def shift_bias(op: Operation, dpu: Dpu) -> Finding | None:
 
 
 def shift_read(op: Operation, dpu: Dpu) -> Finding | None:
-    """The fractional bits of an add's inputs lie {numbers[shift_read]} apart (Vitis-AI 3.0, vai_q_pytorch)."""
+    """The fractional bits of an add's inputs lie {numbers[shift_read]} apart ({documents[quantiser]})."""
     inputs, limit = _inputs(op), dpu.limit("numbers", "shift_read")
     shift = max(inputs) - min(inputs) if inputs else 0
     return Finding(f"shift_read {shift}, allowed {limit}", MOVE) if outside((shift,), limit) else None
 
 
 def shift_write(op: Operation, dpu: Dpu) -> Finding | None:
-    """An add's coarsest input - output fractional bits: {numbers[shift_write]} (Vitis-AI 3.0, vai_q_pytorch)."""
+    """An add's coarsest input - output fractional bits: {numbers[shift_write]} ({documents[quantiser]})."""
     inputs, output, limit = _inputs(op), _frac_bits(op, "output"), dpu.limit("numbers", "shift_write")
     if not inputs or output is None or not outside((min(inputs) - output,), limit):
         return None
@@ -90,7 +90,7 @@ def shift_write(op: Operation, dpu: Dpu) -> Finding | None:
 
 
 def same_scale(op: Operation, dpu: Dpu) -> Finding | None:
-    """Inputs and output of a concat or a pool share one scale (Vitis-AI 3.0, vai_q_pytorch)."""
+    """Inputs and output of a concat or a pool share one scale ({documents[quantiser]})."""
     frac_bits = {role: p for role in op.scales if (p := _frac_bits(op, role)) is not None}
     if len(set(frac_bits.values())) < 2:
         return None
@@ -132,7 +132,7 @@ BYTES = ("int8", "uint8")
 
 
 def int8_constants(op: Operation, dpu: Dpu) -> Finding | None:
-    """Weights, and constants that are added, multiplied or joined, are stored as int8 (UG1414 3.5, quantisation)."""
+    """Weights, and constants that are added, multiplied or joined, are stored as int8 ({documents[numbers]})."""
     kinds = {role: _kind(values) for role, values in op.constants.items() if role != "bias"}
     faults = [f"{role} is {kind}" for role, kind in kinds.items() if kind not in BYTES]
     faults += [f"{role} has no scale" for role, kind in kinds.items() if kind in BYTES and role not in op.scales]
@@ -140,7 +140,7 @@ def int8_constants(op: Operation, dpu: Dpu) -> Finding | None:
 
 
 def int8_bias(op: Operation, dpu: Dpu) -> Finding | None:
-    """A bias is int8 with a scale of its own, not int32 at the products' scale (Vitis-AI 3.0, vai_q_pytorch).
+    """A bias is int8 with a scale of its own, not int32 at the products' scale ({documents[quantiser]}).
 
     The operator QLinearConv demands int32: its bias has a rule of its own.
     """
@@ -151,7 +151,7 @@ def int8_bias(op: Operation, dpu: Dpu) -> Finding | None:
 
 
 def int32_bias(op: Operation, dpu: Dpu) -> Finding | None:
-    """A QLinearConv's int32 bias is int8 << k, k at most {numbers[shift_bias_max]} (Vitis-AI 3.0, vai_q_pytorch).
+    """A QLinearConv's int32 bias is int8 << k, k at most {numbers[shift_bias_max]} ({documents[quantiser]}).
 
     One k for all values: weight + input - bias fractional bits. A change that keeps this form no rule can see: one
     more where k is 0 is another bias, and as legal. Judged where the products have a scale.

@@ -1,17 +1,21 @@
 """The DPU's rules by kind of operation, their texts, and the judgement of one node: all broken rules, not the first.
 
 A rule is a small function (`conv_rules`, `other_rules`, `number_rules`) whose docstring is its text, filled in with
-the limits of the target profile: text, check and documentation cannot drift apart.
+the limits of the target profile: text, check and documentation cannot drift apart. A rule holds on the targets that
+state what its text names, so no rule knows a board's name.
 """
 
 import inspect
+import re
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
+from functools import cache
 
-from deploy.dpu.board import Dpu
+from deploy.dpu.board import SIZED, Dpu
 from deploy.dpu.checker import conv_rules, number_rules, other_rules
 from deploy.dpu.checker.finding import Finding, Rule
 from deploy.dpu.graph import Kind, Operation
+from profiles.constant import check_keys
 
 CONV: tuple[Rule, ...] = (
     conv_rules.conv_kernel,
@@ -20,6 +24,7 @@ CONV: tuple[Rule, ...] = (
     conv_rules.conv_padding,
     conv_rules.conv_weight_bank,
     conv_rules.conv_window,
+    conv_rules.conv_area,
     conv_rules.conv_dilation,
     conv_rules.conv_groups,
 )
@@ -40,12 +45,13 @@ RULES: Mapping[Kind, tuple[Rule, ...]] = {
     ),
     "pool": (other_rules.pool_kernel, other_rules.pool_stride, other_rules.pool_padding),
     "activation": (other_rules.activation_place, other_rules.activation_of_sums, other_rules.leaky_relu_alpha),
-    "add": (),
-    "mul": (other_rules.mul_constant,),
+    "add": (other_rules.elementwise_channels,),
+    "mul": (other_rules.elementwise_channels, other_rules.mul_constant),
     "concat": (),
     "pad": (other_rules.pad_mode,),
     "resize": (other_rules.resize_mode, other_rules.resize_scale, other_rules.resize_channels),
-    "pixel shuffle": (other_rules.pixel_shuffle,),
+    "pixel shuffle": (other_rules.shuffle_place, other_rules.shuffle_channels),
+    "argmax": (other_rules.argmax_channels,),
     "quantise": (other_rules.known_operator,),
     "dequantise": (other_rules.known_operator,),
     "other": (other_rules.known_operator,),
@@ -87,9 +93,9 @@ class Broken:
 def judge(op: Operation, dpu: Dpu, quantised: bool) -> tuple[Broken, ...]:
     """Every rule that a node breaks; the rules of numbers only where the file holds quantised ones."""
     rules = RULES[op.kind] + SIZES
-    if quantised and op.kind != "other":
+    if quantised and op.kind not in ("other", "argmax"):  # whose results are no numbers of 8 bits
         rules += NUMBERS + SHIFTS.get(op.kind, ())
-    findings = ((rule, rule(op, dpu)) for rule in rules)
+    findings = ((rule, rule(op, dpu)) for rule in rules if applies(rule, dpu))
     return tuple(Broken(rule_name(rule), rule_text(rule, dpu), found) for rule, found in findings if found)
 
 
@@ -99,11 +105,50 @@ def all_rules() -> Iterator[Rule]:
     yield from dict.fromkeys(rule for chain in chains for rule in chain)
 
 
-def rule_name(rule: Rule) -> str:
+def require_known(dpu: Dpu) -> None:
+    """Refuse a constant that no rule names: misspelt, it would silence the rule that it is for.
+
+    Raises:
+        ProfileError: such a constant in a table that only rules read.
+    """
+    known: dict[str, set[str]] = {}
+    for rule in all_rules():
+        for table, key in _named(rule):
+            known.setdefault(table, set()).add(key)
+    for table in known.keys() - set(SIZED):
+        check_keys(f"{dpu.target.name} [{table}]", dpu.tables.get(table, {}), set(), known[table])
+
+
+def rule_name(rule: Callable[..., object]) -> str:
     """The rule's name in tables, such as "conv kernel"."""
-    return rule.__name__.replace("_", " ")
+    return getattr(rule, "__name__", "").replace("_", " ")
+
+
+def applies(rule: Callable[..., object], dpu: Dpu) -> bool:
+    """Whether the target states every constant that the rule's text names: a rule of other DPUs it does not."""
+    facts = _facts(dpu)
+    return all(key in facts.get(table, {}) for table, key in _named(rule))
 
 
 def rule_text(rule: Callable[..., object], dpu: Dpu) -> str:
-    """The text of a rule or a remark, with the target's limits filled in."""
-    return " ".join((inspect.getdoc(rule) or "").split()).format(**dpu.target.tables)
+    """The text of a rule or a remark, with the target's limits and its own documents filled in."""
+    return _template(rule).format(**_facts(dpu))
+
+
+def _facts(dpu: Dpu) -> Mapping[str, Mapping[str, object]]:
+    """What texts name: constants, what is fused where, documents, and the limits that follow from constants."""
+    facts: dict[str, Mapping[str, object]] = {**dpu.tables}
+    if "channel_groups" in facts.get("array", {}):
+        facts["limits"] = {"channels": dpu.channels_max}
+    return facts | {"activations": dpu.target.activations, "documents": dpu.target.documents}
+
+
+@cache
+def _template(rule: Callable[..., object]) -> str:
+    return " ".join((inspect.getdoc(rule) or "").split())
+
+
+@cache
+def _named(rule: Callable[..., object]) -> tuple[tuple[str, str], ...]:
+    """Tables and keys of the constants in the rule's text: "{conv[kernel].source}" names ("conv", "kernel")."""
+    return tuple(re.findall(r"{(\w+)\[(\w+)]", _template(rule)))

@@ -5,14 +5,25 @@ import math
 from deploy.dpu.board import Dpu
 from deploy.dpu.checker.conv_rules import alu_padding
 from deploy.dpu.checker.finding import Finding, outside, shown
-from deploy.dpu.graph import Operation
+from deploy.dpu.graph import CONVOLUTIONS, Operation
 from profiles.errors import sizes
 
 # ruff: noqa: ARG001 - every rule takes the operation and the DPU
 
 
-ALU = {"LeakyRelu", "QLinearLeakyRelu", "PRelu", "HardSigmoid"}
-FUSING = {"conv", "depthwise", "transposed", "add", "mul"}
+MANUAL = {
+    "Relu": "ReLU",
+    "Max": "ReLU",
+    "Clip": "ReLU6",
+    "LeakyRelu": "LeakyReLU",
+    "QLinearLeakyRelu": "LeakyReLU",
+    "PRelu": "PReLU",
+    "HardSigmoid": "hard-sigmoid",
+    "HardSwish": "hard-swish",
+}
+"""The activations of ONNX as manuals name them."""
+PLACE = {"conv": "conv", "transposed": "conv", "depthwise": "depthwise", "pool": "pool", "add": "sum", "mul": "sum"}
+"""Behind which operations something may be fused, and under which name a profile lists it."""
 INSTEAD = {
     "Sub": "fold the minus sign into the weights before it, and add",
     "Neg": "fold the minus sign into the weights before it",
@@ -29,7 +40,6 @@ INSTEAD = {
     "ReduceMean": "use GlobalAveragePool",
     "Transpose": "keep the layout (N, C, H, W) throughout",
     "Slice": "use a convolution that picks these channels or pixels",
-    "SpaceToDepth": "use a strided convolution, or rearrange on the host before the network",
     "Gather": "to pick fixed channels, use a 1 x 1 convolution; what is picked by value stays with the host",
     "Gemm": "write it as a 1 x 1 convolution",
     "MatMul": "write it as a 1 x 1 convolution where one factor is constant; else leave it to the host",
@@ -45,18 +55,43 @@ INSTEAD = {
 
 
 def known_operator(op: Operation, dpu: Dpu) -> Finding | None:
-    """Only operators of the supported list run on the DPU (UG1414 3.5, supported operators)."""
+    """Only operators of the supported list run on the DPU ({documents[operators]})."""
     remedy = INSTEAD.get(op.op_type, "leave it to the host before or behind the network, or do without it")
     return Finding(f"{op.op_type} always runs on the CPU", remedy)
 
 
-def pixel_shuffle(op: Operation, dpu: Dpu) -> Finding | None:
-    """PixelShuffle is avoided: it compiles but has given wrong numbers (Vitis-AI issue 1486)."""
-    return Finding(f"{op.op_type} compiles but has given wrong numbers", "use a nearest Resize and a convolution")
+def shuffle_place(op: Operation, dpu: Dpu) -> Finding | None:
+    """A pixel shuffle or its inverse stands behind a convolution or its activation ({documents[operators]})."""
+    if op.follows in CONVOLUTIONS or op.follows == "activation":
+        return None
+    other = "a nearest Resize and a convolution" if op.op_type == "DepthToSpace" else "a strided convolution"
+    remedy = f"move it right behind a convolution, or use {other}"
+    return Finding(f"{op.op_type} stands behind {op.follows or 'the input'}", remedy)
+
+
+def shuffle_channels(op: Operation, dpu: Dpu) -> Finding | None:
+    """Its smaller map has at most {limits[channels]} channels ({documents[operators]}, reorg)."""
+    channels = max(op.channels[0], op.out_shape[0] if op.out_shape else 0)
+    return _too_many(channels, dpu.channels_max, "shuffle in two steps, each behind a convolution")
+
+
+def argmax_channels(op: Operation, dpu: Dpu) -> Finding | None:
+    """ArgMax compares at most {argmax[channels_max]} channels ({argmax[channels_max].source})."""
+    return _too_many(op.channels[0], dpu.whole("argmax", "channels_max"), "leave it to the host, behind the network")
+
+
+def elementwise_channels(op: Operation, dpu: Dpu) -> Finding | None:
+    """Maps have at most {limits[channels]} channels ({documents[operators]})."""
+    remedy = "add or multiply parts of the channels, and join them behind"
+    return _too_many(op.out_shape[0] if op.out_shape else 0, dpu.channels_max, remedy)
+
+
+def _too_many(channels: int, most: int, remedy: str) -> Finding | None:
+    return None if channels <= most else Finding(f"{channels} channels: at most {most}", remedy)
 
 
 def pool_kernel(op: Operation, dpu: Dpu) -> Finding | None:
-    """Pool kernel sides are {pool[kernel]} (PG389 1.3, ALU)."""
+    """Pool kernel sides are {pool[kernel]} ({pool[kernel].source})."""
     kernel, limit = op.window.kernel, dpu.limit("pool", "kernel")
     if not outside(kernel, limit):
         return None
@@ -65,7 +100,7 @@ def pool_kernel(op: Operation, dpu: Dpu) -> Finding | None:
 
 
 def pool_stride(op: Operation, dpu: Dpu) -> Finding | None:
-    """Pool strides are {pool[stride]} (PG389 1.3, ALU)."""
+    """Pool strides are {pool[stride]} ({pool[stride].source})."""
     stride, limit = op.window.stride, dpu.limit("pool", "stride")
     if not outside(stride, limit):
         return None
@@ -74,31 +109,42 @@ def pool_stride(op: Operation, dpu: Dpu) -> Finding | None:
 
 
 def pool_padding(op: Operation, dpu: Dpu) -> Finding | None:
-    """Pool padding is {pool[pad_begin]} at top and left, {pool[pad_end]} at bottom and right (PG389 1.3, ALU)."""
+    """Pool padding is {pool[pad_begin]} at top and left, {pool[pad_end]} at bottom and right.
+
+    Those are the ALU's limits ({pool[pad_end].source}).
+    """
     return alu_padding(op, dpu, "pool")
 
 
 def activation_place(op: Operation, dpu: Dpu) -> Finding | None:
-    """ReLU, ReLU6 and hard-swish are fused: right behind a convolution, an add or a mul (UG1414 3.5, activations).
+    """An activation is fused with what it stands right behind, and each operation has a list of its own.
 
-    Leaky ReLU, PReLU and hard-sigmoid stand anywhere: the ALU does them (PG389 1.3, ALU).
+    A convolution: {activations[conv]} ({activations[conv].source}). A depthwise one: {activations[depthwise]}
+    ({activations[depthwise].source}). A pool: {activations[pool]} ({activations[pool].source}). Behind anything:
+    {activations[alone]} ({activations[alone].source}).
     """
-    if op.follows in FUSING or op.op_type in ALU:
+    place = PLACE.get(op.follows or "")
+    fused = dpu.target.activations[place].value if place else ()
+    if place == "sum" or MANUAL[op.op_type] in (*fused, *dpu.target.activations["alone"].value):
         return None
-    before = op.follows or "the input"
-    return Finding(f"{op.op_type} stands behind {before}", "move it right behind the convolution or add before")
+    remedy = f"use {' or '.join(fused)} there" if fused else "move it right behind the convolution or add before"
+    return Finding(f"{op.op_type} stands behind {op.follows or 'the input'}", remedy)
 
 
 def activation_of_sums(op: Operation, dpu: Dpu) -> Finding | None:
-    """Behind an add or a mul only ReLU is fused (UG1414 3.5, element-wise)."""
-    if op.follows not in ("add", "mul") or op.op_type in {"Relu", "Max", *ALU}:
+    """Behind an add or a mul are fused: {activations[sum]} ({activations[sum].source}).
+
+    Behind anything: {activations[alone]}.
+    """
+    fused, alone = (dpu.target.activations[place].value for place in ("sum", "alone"))
+    if PLACE.get(op.follows or "") != "sum" or MANUAL[op.op_type] in (*fused, *alone):
         return None
-    return Finding(f"{op.op_type} stands behind {op.follows}", "use ReLU there")
+    return Finding(f"{op.op_type} stands behind {op.follows}", f"use {' or '.join(fused)} there")
 
 
 def leaky_relu_alpha(op: Operation, dpu: Dpu) -> Finding | None:
-    """LeakyReLU has alpha = 26 / 256 = {activation[leaky_relu_alpha].low} (UG1414 3.5, leaky_relu)."""
-    given, wanted = op.attributes.get("alpha", 0.01), dpu.value("activation", "leaky_relu_alpha")
+    """LeakyReLU has alpha = 26 / 256 = {leaky_relu[alpha].low} ({documents[operators]}, leaky_relu)."""
+    given, wanted = op.attributes.get("alpha", 0.01), dpu.value("leaky_relu", "alpha")
     is_leaky = op.op_type in ("LeakyRelu", "QLinearLeakyRelu")
     if not is_leaky or (isinstance(given, int | float) and abs(given - wanted) < 1e-6):
         return None
@@ -108,7 +154,7 @@ def leaky_relu_alpha(op: Operation, dpu: Dpu) -> Finding | None:
 
 
 def mul_constant(op: Operation, dpu: Dpu) -> Finding | None:
-    """A constant factor is one number a channel: it becomes a 1 x 1 depthwise convolution (UG1414 3.5, mul)."""
+    """A constant factor is one number a channel, a 1 x 1 depthwise convolution ({documents[operators]}, mul)."""
     shape = op.constant_shape or ()
     if sum(size > 1 for size in shape) <= 1 and (len(shape) < 2 or max(shape[-2:]) == 1):
         return None
@@ -116,7 +162,7 @@ def mul_constant(op: Operation, dpu: Dpu) -> Finding | None:
 
 
 def pad_mode(op: Operation, dpu: Dpu) -> Finding | None:
-    """Padding is constant or symmetric; reflect runs on the CPU (UG1414 3.5, pad)."""
+    """Padding is constant or symmetric; reflect runs on the CPU ({documents[operators]}, pad)."""
     mode = op.attributes.get("mode", b"constant")
     if mode == b"constant":
         return None
@@ -125,7 +171,7 @@ def pad_mode(op: Operation, dpu: Dpu) -> Finding | None:
 
 
 def resize_mode(op: Operation, dpu: Dpu) -> Finding | None:
-    """Resize is nearest without align_corners, or bilinear (UG1414 3.5, resize)."""
+    """Resize is nearest without align_corners, or bilinear ({documents[operators]}, resize)."""
     mode, corners = _text(op, "mode", "nearest"), _text(op, "coordinate_transformation_mode", "half_pixel")
     if mode == "linear" or (mode == "nearest" and corners != "align_corners"):
         return None
@@ -133,9 +179,9 @@ def resize_mode(op: Operation, dpu: Dpu) -> Finding | None:
 
 
 def resize_scale(op: Operation, dpu: Dpu) -> Finding | None:
-    """Bilinear scales are one power of two, {resize[bilinear_scale]} (UG1414 3.5, resize).
+    """Bilinear scales are one power of two, {resize[bilinear_scale]} ({resize[bilinear_scale].source}).
 
-    With half-pixel centres {resize[half_pixel_scale]}.
+    With half-pixel centres {resize[half_pixel_scale]} ({resize[half_pixel_scale].source}).
     """
     before, after = op.in_shapes[0] if op.in_shapes else None, op.out_shape
     if _text(op, "mode", "nearest") != "linear" or before is None or after is None:
@@ -150,11 +196,8 @@ def resize_scale(op: Operation, dpu: Dpu) -> Finding | None:
 
 
 def resize_channels(op: Operation, dpu: Dpu) -> Finding | None:
-    """Resize takes at most {resize[channels_max]} channels (UG1414 3.5, resize)."""
-    most = dpu.whole("resize", "channels_max")
-    if op.channels[0] <= most:
-        return None
-    return Finding(f"{op.channels[0]} channels: at most {most}", "reduce them with a 1 x 1 convolution before")
+    """Resize takes at most {limits[channels]} channels ({documents[operators]})."""
+    return _too_many(op.channels[0], dpu.channels_max, "reduce them with a 1 x 1 convolution before")
 
 
 def _text(op: Operation, key: str, default: str) -> str:
@@ -187,7 +230,7 @@ def maps_aligned(op: Operation, dpu: Dpu) -> Finding | None:
 
 
 def map_in_memory(op: Operation, dpu: Dpu) -> Finding | None:
-    """A map, for all images of a batch, fits {tile[memory_bytes].low:.0f} bytes (assumed: the board's LPDDR4)."""
+    """A map, for all images of a batch, fits {tile[memory_bytes].low:.0f} bytes ({tile[memory_bytes].source})."""
     most = dpu.value("tile", "memory_bytes")
     size = math.prod(op.out_shape) * dpu.batch if op.out_shape else 0
     if size <= most:

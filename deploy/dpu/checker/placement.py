@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from deploy.dpu.board import Dpu
-from deploy.dpu.checker.operators import Broken, judge
+from deploy.dpu.checker.operators import Broken, judge, require_known
 from deploy.dpu.graph import CONVOLUTIONS, Network, Operation
 
 Part = Literal["host-front", "dpu-core", "host-back"]
@@ -72,7 +72,12 @@ class Placement:
 
 
 def place(network: Network, dpu: Dpu) -> Placement:
-    """Judge every node of a network against the rules of a DPU."""
+    """Judge every node of a network against the rules of a DPU.
+
+    Raises:
+        ProfileError: a constant of the target that no rule knows.
+    """
+    require_known(dpu)
     parts = _parts(network)
     broken = [
         judge(op, dpu, network.quantised) if part == "dpu-core" else ()

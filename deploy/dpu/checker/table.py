@@ -29,7 +29,10 @@ def subgraphs(placement: Placement, dpu: Dpu, tile_px: int) -> str | None:  # no
 
 
 def streaming(placement: Placement, dpu: Dpu, tile_px: int) -> str | None:
-    """A map above {memory[feature_map_bytes].low:.0f} bytes streams through memory, at every layer (PG389 1.3)."""
+    """A map above {memory[feature_map_bytes].low:.0f} bytes streams through memory, at every layer.
+
+    That is the room of one image on chip ({memory[feature_map_bytes].source}).
+    """
     room = dpu.whole("memory", "feature_map_bytes")
     sizes = [op.out_bytes for op in placement.core if op.out_shape is not None]
     large = [size for size in sizes if size > room]
@@ -42,7 +45,18 @@ def streaming(placement: Placement, dpu: Dpu, tile_px: int) -> str | None:
     )
 
 
-REMARKS: tuple[Remark, ...] = (fix2float, subgraphs, streaming)
+def shuffles(placement: Placement, dpu: Dpu, tile_px: int) -> str | None:  # noqa: ARG001
+    """A pixel shuffle inside compiles, but has given wrong numbers on a board (Vitis-AI issues 1486, 1199).
+
+    Its inverse as torch writes it, PixelUnshuffle, has run on the CPU.
+    """
+    names = [node.op.name for node in placement.nodes if node.op.kind == "pixel shuffle" and node.device == "DPU"]
+    if not names:
+        return None
+    return f"{', '.join(names)}: has given wrong numbers on a board; compare the board's results with this file's"
+
+
+REMARKS: tuple[Remark, ...] = (fix2float, subgraphs, streaming, shuffles)
 
 
 def remarks_on(placement: Placement, dpu: Dpu, tile_px: int) -> dict[str, str]:

@@ -23,7 +23,7 @@ from deploy.dpu.cost.layers import FUSED, Constants, Layers, Work, count_work, h
 from deploy.dpu.graph import Operation
 from deploy.restoration.plan import plan_side
 from profiles.errors import ModelError
-from profiles.figures import Figure, predicted
+from profiles.figures import Figure, predicted, unavailable
 
 
 @dataclass(frozen=True)
@@ -195,7 +195,9 @@ def whole_tiles(width_px: int, height_px: int, tile_px: int, halo_px: int) -> in
 
 
 def dpu_power(dpu: Dpu) -> Figure:
-    """Power in W while the DPU runs, with the range assumed for it."""
+    """Power in W while the DPU runs, with the range assumed for it; unavailable where none is published."""
+    if "dpu_run_w" not in dpu.tables.get("power", {}):
+        return unavailable("W", f"no power of {dpu.target.name} under its DPU is published")
     anchor, assumed = dpu.limit("power", "dpu_run_w"), dpu.limit("power", "dpu_range_w")
     source = f"assumption anchored at {anchor.source}; range: {assumed.source}"
     return predicted(anchor.low, "W", (assumed.low, assumed.high), source)

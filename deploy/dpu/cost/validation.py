@@ -105,7 +105,7 @@ def published_cases(*, sorting: bool = False) -> Cases:
     """
     chosen = [r for r in published_rates() if r.board == "vck190" and (family(r.network) in SORTING) is sorting]
     rows = tuple(network_case(rate.network, _dpu(rate.configuration), rate.fps) for rate in chosen)
-    return Cases(rows, load_dpu().value("cost", "serial"))
+    return Cases(rows, load_dpu("vck190").value("cost", "serial"))
 
 
 SORTING = ("ssd", "superpoint")

@@ -34,7 +34,7 @@ from profiles.errors import BeersError, ImageError, OptionError, ProfileError
 from profiles.figures import Row, measured, predicted, unavailable
 from tests.deploy.dpu.graphs import Sketch, float_convbeers, integer_convbeers
 
-DPU = load_dpu()
+DPU = load_dpu("vck190")
 SENSORS = Sensors(load_sensor("pleiades-degraded"), load_sensor("pleiades-reference"))
 
 

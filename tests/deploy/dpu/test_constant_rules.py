@@ -27,7 +27,7 @@ from quant.calibration import draw_patches
 from quant.quantise import quantise_model
 from tests.deploy.dpu.graphs import IntegerSketch
 
-DPU = load_dpu()
+DPU = load_dpu("vck190")
 HALF = Scale((0.5,), (0,), "int8")
 SMALLEST = "convbeers-xs"
 

@@ -11,7 +11,7 @@ from deploy.dpu.zoo.networks import convbeers
 from profiles.errors import ModelError
 from tests.deploy.dpu.graphs import Sketch, board_convbeers, float_convbeers, integer_convbeers
 
-DPU = load_dpu()
+DPU = load_dpu("vck190")
 PAPER_FPS = 7.2
 
 

@@ -9,7 +9,7 @@ from deploy.dpu.cost.latency import counted_power, image_energy_j, layer_energy_
 from deploy.dpu.zoo.networks import convbeers
 from tests.deploy.dpu.graphs import float_convbeers
 
-DPU = load_dpu()
+DPU = load_dpu("vck190")
 
 
 def test_energy_counts_products_and_bytes(tmp_path: Path) -> None:

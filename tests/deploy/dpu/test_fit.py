@@ -20,7 +20,7 @@ from deploy.dpu.cost.validation import (
     relative,
 )
 
-DPU = load_dpu()
+DPU = load_dpu("vck190")
 
 
 @pytest.fixture(scope="module")

@@ -13,7 +13,7 @@ from deploy.dpu.checker.placement import place
 from deploy.dpu.reading import read_network
 from tests.deploy.dpu.graphs import QdqSketch
 
-DPU = load_dpu()
+DPU = load_dpu("vck190")
 Draw = Callable[[QdqSketch, str], str]
 
 

@@ -7,7 +7,7 @@ from deploy.dpu.checker import number_rules
 from deploy.dpu.checker.finding import Rule
 from deploy.dpu.graph import Kind, Operation, Scale
 
-DPU = load_dpu()
+DPU = load_dpu("vck190")
 
 
 def at(frac_bits: int) -> Scale:

@@ -1,79 +1,33 @@
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
 from deploy.dpu.board import Dpu, load_dpu
-from deploy.dpu.checker.operators import all_rules, rule_name, rule_text
+from deploy.dpu.checker.operators import all_rules, applies, rule_name, rule_text
 from deploy.dpu.checker.placement import place
 from deploy.dpu.reading import read_network
 from profiles.errors import OptionError, ProfileError
-from tests.deploy.dpu.graphs import IntegerSketch, Sketch, Value, integer_convbeers
+from tests.deploy.dpu.draws import (
+    TILE_PX,
+    Draw,
+    behind_conv,
+    behind_sum,
+    between_convs,
+    conv,
+    node,
+    padded,
+    resized,
+    scaled,
+    transposed,
+)
+from tests.deploy.dpu.draws import broken_rules as rules_on
+from tests.deploy.dpu.graphs import IntegerSketch, Sketch, integer_convbeers
 
-Draw = Callable[[Sketch, str], str]
-DPU = load_dpu()
-TILE_PX = 288
+DPU = load_dpu("vck190")
 
 
 def broken_rules(path: Path, dpu: Dpu = DPU, tile_px: int = TILE_PX) -> list[str]:
-    return [broken.rule for node in place(read_network(path, tile_px), dpu).nodes for broken in node.broken]
-
-
-def between_convs(tmp_path: Path, draw: Draw, channels: int = 8) -> list[str]:
-    """Rules broken by what `draw` puts between two convolutions."""
-    sketch = Sketch(channels)
-    middle = draw(sketch, sketch.conv("image", (channels, channels, 1, 1)))
-    result = sketch.node("AveragePool", middle, kernel_shape=[1, 1])
-    end = sketch.conv(result, (1, sketch_channels(sketch, middle, channels), 1, 1))
-    return broken_rules(sketch.save(tmp_path / "net.onnx", end))
-
-
-def sketch_channels(sketch: Sketch, tensor: str, default: int) -> int:
-    """Output channels of a convolution's result; the stream's own for all else."""
-    weights = {t.name: t.dims for t in sketch.constants}
-    for node in sketch.nodes:
-        if node.output[0] == tensor and node.op_type in ("Conv", "ConvTranspose"):
-            return int(weights[node.input[1]][0 if node.op_type == "Conv" else 1])
-    return default
-
-
-def conv(*weight: int, **attributes: Value) -> Draw:
-    return lambda sketch, source: sketch.conv(source, weight, **attributes)
-
-
-def transposed(*weight: int, **attributes: Value) -> Draw:
-    return lambda sketch, source: sketch.node("ConvTranspose", source, sketch.weight(*weight), **attributes)
-
-
-def node(op_type: str, **attributes: Value) -> Draw:
-    return lambda sketch, source: sketch.node(op_type, source, **attributes)
-
-
-def scaled(*shape: int) -> Draw:
-    return lambda sketch, source: sketch.node("Mul", source, sketch.weight(*shape))
-
-
-def resized(scale: float, **attributes: Value) -> Draw:
-    import numpy as np
-
-    return lambda sketch, source: sketch.node(
-        "Resize", source, "", sketch.constant(np.array([1, 1, scale, scale], np.float32)), **attributes
-    )
-
-
-def padded(mode: str) -> Draw:
-    import numpy as np
-
-    pads = np.array([0, 0, 2, 2, 0, 0, 2, 2], np.int64)
-    return lambda sketch, source: sketch.node("Pad", source, sketch.constant(pads), mode=mode)
-
-
-def behind_conv(op_type: str, **attributes: Value) -> Draw:
-    return lambda sketch, source: sketch.node(op_type, sketch.conv(source, (8, 8, 3, 3)), **attributes)
-
-
-def behind_sum(op_type: str, **attributes: Value) -> Draw:
-    return lambda sketch, source: sketch.node(op_type, sketch.node("Add", source, source), **attributes)
+    return rules_on(path, dpu, tile_px)
 
 
 # Each rule with a network that breaks it alone, and the same network with the remedy followed.
@@ -115,10 +69,17 @@ CASES: dict[str, tuple[Draw, Draw]] = {
     "pad mode": (padded("reflect"), padded("constant")),
     "resize mode": (resized(2, mode="cubic"), resized(2, mode="nearest")),
     "resize scale": (resized(3, mode="linear"), resized(2, mode="linear")),
-    "pixel shuffle": (node("DepthToSpace", blocksize=1), resized(1, mode="nearest")),
+    "shuffle place": (
+        lambda s, x: s.node("DepthToSpace", s.node("MaxPool", x, kernel_shape=[2, 2]), blocksize=1),
+        node("DepthToSpace", blocksize=1),
+    ),
+    "argmax channels": (node("ArgMax", axis=1), behind_conv("Relu")),
     "known operator": (behind_conv("Sigmoid"), behind_conv("HardSigmoid")),
 }
 WIDE = {"conv channels", "conv weight bank", "depthwise channels", "transposed channels", "resize channels"}
+WIDE |= {"elementwise channels", "shuffle channels"}
+OTHERS = {"conv area"}
+"""Rules of other boards: tests/deploy/dpu/test_boards.py."""
 SIZES = {"map exists", "maps aligned", "map in memory"}
 NUMBERS = {
     "int8 bias",
@@ -138,17 +99,17 @@ NUMBERS = {
 
 
 def test_every_rule_has_a_case() -> None:
-    assert {rule_name(rule) for rule in all_rules()} == set(CASES) | WIDE | SIZES | NUMBERS
+    assert {rule_name(rule) for rule in all_rules()} == set(CASES) | WIDE | SIZES | NUMBERS | OTHERS
 
 
 @pytest.mark.parametrize("rule", CASES)
 def test_each_rule_refuses_its_case_alone(tmp_path: Path, rule: str) -> None:
-    assert between_convs(tmp_path, CASES[rule][0]) == [rule]
+    assert between_convs(tmp_path, CASES[rule][0], DPU) == [rule]
 
 
 @pytest.mark.parametrize("rule", CASES)
 def test_following_the_remedy_passes(tmp_path: Path, rule: str) -> None:
-    assert between_convs(tmp_path, CASES[rule][1]) == []
+    assert between_convs(tmp_path, CASES[rule][1], DPU) == []
 
 
 @pytest.mark.parametrize(
@@ -171,6 +132,19 @@ def test_wide_layers(tmp_path: Path, rule: str, draw: Draw, channels: int) -> No
 def test_too_many_channels_for_the_alu_and_resize(tmp_path: Path, rule: str, draw: Draw) -> None:
     sketch = Sketch(4097)
     assert broken_rules(sketch.save(tmp_path / "w.onnx", draw(sketch, "image"))) == [rule]
+
+
+def test_too_many_channels_for_sums_and_shuffles(tmp_path: Path) -> None:
+    sketch = Sketch(8)
+    half = sketch.conv("image", (2049, 8, 1, 1))
+    whole = sketch.node("Concat", half, half, axis=1)
+    assert broken_rules(sketch.save(tmp_path / "w.onnx", sketch.node("Add", whole, whole))) == [
+        "elementwise channels"
+    ]
+    sketch = Sketch(8)
+    deep = sketch.node("DepthToSpace", sketch.conv("image", (4100, 8, 1, 1)), blocksize=2)
+    path = sketch.save(tmp_path / "s.onnx", sketch.conv(deep, (8, 1025, 1, 1)))
+    assert broken_rules(path) == ["conv channels", "shuffle channels"]
 
 
 def test_a_tile_too_small_for_a_window(tmp_path: Path) -> None:
@@ -209,7 +183,7 @@ def test_a_tile_that_the_memory_cannot_hold(tmp_path: Path) -> None:
 
 def test_all_broken_rules_of_a_node_are_listed(tmp_path: Path) -> None:
     draw = conv(8, 4, 17, 9, group=2, strides=[9, 1], pads=[0, 0, 20, 0])
-    found = between_convs(tmp_path, draw)
+    found = between_convs(tmp_path, draw, DPU)
     assert found == ["conv kernel", "conv stride", "conv padding", "conv window", "conv groups"]
 
 
@@ -252,8 +226,8 @@ def test_a_float_convolution_in_a_quantised_file_is_refused(tmp_path: Path) -> N
 
 
 def test_rules_read_with_the_targets_limits() -> None:
-    texts = {rule_name(rule): rule_text(rule, DPU) for rule in all_rules()}
-    assert texts["conv kernel"] == "Kernel height and width are 1 to 16 (UG1414 3.5, conv2d)."
+    texts = {rule_name(rule): rule_text(rule, DPU) for rule in all_rules() if applies(rule, DPU)}
+    assert texts["conv kernel"] == "Kernel height and width are 1 to 16 (UG1414 3.5, DPUCVDX8G, conv2d)."
     assert not [text for text in texts.values() if "{" in text or "(" not in text]
 
 

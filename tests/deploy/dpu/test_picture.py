@@ -22,7 +22,7 @@ def of_class(root: ET.Element, kind: str, tag: str) -> list[ET.Element]:
 
 
 def placed(path: Path) -> Placement:
-    return place(read_network(path, 40), load_dpu())
+    return place(read_network(path, 40), load_dpu("vck190"))
 
 
 def test_every_node_is_drawn_in_its_devices_colour_and_says_which(tmp_path: Path) -> None:

@@ -143,4 +143,4 @@ def test_nodes_that_cannot_be_never_end_in_a_traceback(tmp_path: Path, draw: Cal
     sketch = Sketch(2)
     path = sketch.save(tmp_path / "x.onnx", draw(sketch))
     with contextlib.suppress(ModelError):
-        place(read_network(path, 32), load_dpu())
+        place(read_network(path, 32), load_dpu("vck190"))

@@ -7,7 +7,7 @@ from deploy.dpu.checker.table import REMARKS, remarks_on
 from deploy.dpu.reading import read_network
 from tests.deploy.dpu.graphs import Sketch, integer_convbeers
 
-DPU = load_dpu()
+DPU = load_dpu("vck190")
 
 
 def placed(path: Path, tile_px: int) -> Placement:

@@ -3,7 +3,7 @@ from deploy.dpu.checker.operators import judge
 from deploy.dpu.checker.traditional import judge_traditional, verdict
 from model.traditional.compensate import RADIUS_PX
 
-DPU = load_dpu()
+DPU = load_dpu("vck190")
 STEPS = judge_traditional(DPU)
 
 

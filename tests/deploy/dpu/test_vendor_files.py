@@ -14,7 +14,7 @@ from deploy.dpu.checker.placement import Placement, place
 from deploy.dpu.reading import read_network
 from tests.deploy.dpu.graphs import Sketch
 
-DPU = load_dpu()
+DPU = load_dpu("vck190")
 TILE_PX = 34
 
 

@@ -91,7 +91,7 @@ def test_published_pairs_disagree_by_some_tens_of_percent() -> None:
 
 def test_tiles_stay_on_chip_up_to_where_the_memory_traffic_jumps(model: onnx.ModelProto) -> None:
     """32 features of 1 MiB: 181 x 181 pixels, so 176 in steps of 16."""
-    dpu = load_dpu()
+    dpu = load_dpu("vck190")
     found = kept_tiles_px(model, dpu, 16, 640)
     assert found[-1] == 176
     streamed = {side: predict_model(model, dpu, side).streamed_bytes / side**2 for side in range(16, 641, 16)}
@@ -99,7 +99,7 @@ def test_tiles_stay_on_chip_up_to_where_the_memory_traffic_jumps(model: onnx.Mod
 
 
 def test_more_banks_keep_larger_tiles(model: onnx.ModelProto) -> None:
-    dpu = load_dpu()
+    dpu = load_dpu("vck190")
     tables = dict(dpu.target.tables)
     size = tables["memory"]["feature_map_bytes"]
     tables["memory"] = {**tables["memory"], "feature_map_bytes": replace(size, value=4 * size.low)}
@@ -113,4 +113,4 @@ def test_a_network_that_the_dpu_cannot_run_is_refused(model: onnx.ModelProto) ->
     relu = next(node for node in spoilt.graph.node if node.op_type == "Max")
     relu.op_type = "Pow"
     with pytest.raises(ModelError):
-        kept_tiles_px(spoilt, load_dpu(), 16, 640)
+        kept_tiles_px(spoilt, load_dpu("vck190"), 16, 640)

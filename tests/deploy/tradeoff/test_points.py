@@ -66,7 +66,7 @@ def test_the_shipped_family_makes_some_forty_to_seventy_points() -> None:
 
 
 def test_wide_engines_are_looked_at_for_wide_layers_alone() -> None:
-    dpu = load_dpu()
+    dpu = load_dpu("vck190")
     for name, widths in (("convbeers-s", {"C32"}), ("convbeers", {"C32", "C64"})):
         found = configurations_for(float_model(shipped_pair(name)[0]), dpu)
         assert found[0] == dpu.name

@@ -1,0 +1,71 @@
+"""What stands between two convolutions of a small network, drawn by one call, and the rules that the whole breaks."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from deploy.dpu.board import Dpu
+from deploy.dpu.checker.placement import place
+from deploy.dpu.reading import read_network
+from tests.deploy.dpu.graphs import Sketch, Value
+
+Draw = Callable[[Sketch, str], str]
+TILE_PX = 288
+
+
+def broken_rules(path: Path, dpu: Dpu, tile_px: int = TILE_PX) -> list[str]:
+    return [broken.rule for node in place(read_network(path, tile_px), dpu).nodes for broken in node.broken]
+
+
+def between_convs(tmp_path: Path, draw: Draw, dpu: Dpu, channels: int = 8) -> list[str]:
+    """Rules broken by what `draw` puts between two convolutions."""
+    sketch = Sketch(channels)
+    middle = draw(sketch, sketch.conv("image", (channels, channels, 1, 1)))
+    result = sketch.node("AveragePool", middle, kernel_shape=[1, 1])
+    end = sketch.conv(result, (1, sketch_channels(sketch, middle, channels), 1, 1))
+    return broken_rules(sketch.save(tmp_path / "net.onnx", end), dpu)
+
+
+def sketch_channels(sketch: Sketch, tensor: str, default: int) -> int:
+    """Output channels of a convolution's result; the stream's own for all else."""
+    weights = {t.name: t.dims for t in sketch.constants}
+    for node in sketch.nodes:
+        if node.output[0] == tensor and node.op_type in ("Conv", "ConvTranspose"):
+            return int(weights[node.input[1]][0 if node.op_type == "Conv" else 1])
+    return default
+
+
+def conv(*weight: int, **attributes: Value) -> Draw:
+    return lambda sketch, source: sketch.conv(source, weight, **attributes)
+
+
+def transposed(*weight: int, **attributes: Value) -> Draw:
+    return lambda sketch, source: sketch.node("ConvTranspose", source, sketch.weight(*weight), **attributes)
+
+
+def node(op_type: str, **attributes: Value) -> Draw:
+    return lambda sketch, source: sketch.node(op_type, source, **attributes)
+
+
+def scaled(*shape: int) -> Draw:
+    return lambda sketch, source: sketch.node("Mul", source, sketch.weight(*shape))
+
+
+def resized(scale: float, **attributes: Value) -> Draw:
+    return lambda sketch, source: sketch.node(
+        "Resize", source, "", sketch.constant(np.array([1, 1, scale, scale], np.float32)), **attributes
+    )
+
+
+def padded(mode: str) -> Draw:
+    pads = np.array([0, 0, 2, 2, 0, 0, 2, 2], np.int64)
+    return lambda sketch, source: sketch.node("Pad", source, sketch.constant(pads), mode=mode)
+
+
+def behind_conv(op_type: str, **attributes: Value) -> Draw:
+    return lambda sketch, source: sketch.node(op_type, sketch.conv(source, (8, 8, 3, 3)), **attributes)
+
+
+def behind_sum(op_type: str, **attributes: Value) -> Draw:
+    return lambda sketch, source: sketch.node(op_type, sketch.node("Add", source, source), **attributes)

@@ -1,0 +1,247 @@
+"""Each board by its own file: what one refuses and another takes, what a remedy repairs, whose manual is named."""
+
+import re
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from deploy.bench.tables import efficiency, energy
+from deploy.dpu.board import load_dpu
+from deploy.dpu.checker.conv_rules import conv_area, conv_weight_bank
+from deploy.dpu.checker.operators import all_rules, applies, rule_name, rule_text
+from deploy.dpu.checker.placement import place
+from deploy.dpu.checker.table import REMARKS
+from deploy.dpu.cost.latency import dpu_power
+from deploy.dpu.graph import Operation, Window
+from deploy.dpu.reading import network_of, read_network
+from deploy.networks import shipped_pair
+from model.shipped import shipped_names
+from profiles import load_target
+from profiles.figures import predicted
+from profiles.target import DEFAULT_TARGET, board_names
+from quant.core import SHIFTS, target_shifts
+from quant.onnx_file import load_onnx
+from tests.deploy.dpu.draws import Draw, behind_conv, behind_sum, between_convs, broken_rules, conv, node
+from tests.deploy.dpu.graphs import Sketch
+
+DPUS = {name: load_dpu(name) for name in board_names()}
+ZYNQ = ("kv260", "zcu102", "zcu104")
+KINDS = {"DPUCZDX8G": ZYNQ, "DPUCVDX8G": ("vck190",), "DPUCV2DX8G": ("vek280",)}
+ALPHA = 26 / 256
+
+
+def behind_depthwise(op_type: str, **attributes: float) -> Draw:
+    return lambda s, x: s.node(op_type, s.conv(x, (8, 1, 3, 3), group=8), **attributes)
+
+
+def behind_pool(op_type: str) -> Draw:
+    return lambda s, x: s.node(op_type, s.node("MaxPool", x, kernel_shape=[2, 2]))
+
+
+def added(s: Sketch, x: str) -> str:
+    return s.node("Add", x, x)
+
+
+def prelu(s: Sketch, x: str) -> str:
+    return s.node("PRelu", x, s.weight(8, 1, 1))
+
+
+def in_two(first: Draw, second: Draw) -> Draw:
+    return lambda s, x: second(s, first(s, x))
+
+
+# What only these boards refuse, with the rule, the network, the same with the remedy followed, and its channels.
+CASES: list[tuple[tuple[str, ...], str, Draw, Draw, int]] = [
+    (
+        ZYNQ,
+        "conv weight bank",
+        conv(8, 1312, 5, 5),
+        in_two(conv(1296, 1312, 1, 1), conv(8, 1296, 5, 5)),
+        1312,
+    ),
+    (
+        (*ZYNQ, "vek280"),
+        "depthwise kernel",
+        conv(8, 1, 64, 33, group=8, pads=[0] * 4),
+        in_two(conv(8, 1, 64, 1, group=8, pads=[0] * 4), conv(8, 1, 1, 33, group=8, pads=[0] * 4)),
+        8,
+    ),
+    (ZYNQ, "activation place", behind_depthwise("LeakyRelu", alpha=ALPHA), behind_depthwise("Relu"), 8),
+    (ZYNQ, "activation of sums", behind_sum("LeakyRelu", alpha=ALPHA), behind_sum("Relu"), 8),
+    (("vek280",), "conv area", conv(8, 8, 8, 8, pads=[3] * 4), conv(8, 8, 7, 7), 8),
+    (
+        ("vek280",),
+        "depthwise kernel",
+        conv(8, 1, 21, 21, group=8, pads=[0] * 4),
+        in_two(conv(8, 1, 21, 1, group=8, pads=[0] * 4), conv(8, 1, 1, 21, group=8, pads=[0] * 4)),
+        8,
+    ),
+    (("vek280",), "activation place", prelu, behind_conv("Relu"), 8),
+    (("vek280",), "activation of sums", in_two(added, prelu), behind_sum("Relu"), 8),
+    (("vck190",), "conv window", conv(8, 8, 9, 8), conv(8, 8, 7, 7), 8),
+]
+NOT_OF_VEK280 = {"conv window"}
+"""Its conv area is tighter: it refuses the same network for that."""
+
+
+@pytest.mark.parametrize(
+    ("boards", "rule", "draw", "channels"), [(boards, rule, draw, n) for boards, rule, draw, _, n in CASES]
+)
+def test_a_rule_refuses_its_case_on_its_boards_alone(
+    boards: tuple[str, ...], rule: str, draw: Draw, channels: int, tmp_path: Path
+) -> None:
+    found = {name: between_convs(tmp_path, draw, dpu, channels) for name, dpu in DPUS.items()}
+    for name, broken in found.items():
+        if name in boards:
+            assert broken == [rule]
+        elif not (name == "vek280" and rule in NOT_OF_VEK280):
+            assert broken == []
+
+
+@pytest.mark.parametrize(("remedied", "channels"), [(remedied, n) for *_, remedied, n in CASES])
+def test_the_remedy_passes_on_every_board(remedied: Draw, channels: int, tmp_path: Path) -> None:
+    assert {name: between_convs(tmp_path, remedied, dpu, channels) for name, dpu in DPUS.items()} == {
+        name: [] for name in DPUS
+    }
+
+
+@pytest.mark.parametrize(
+    ("draw", "boards"),
+    [
+        (behind_pool("Relu"), {"vek280"}),
+        (behind_sum("HardSwish"), {"vek280"}),
+        (behind_depthwise("HardSwish"), set(DPUS)),
+        (behind_conv("HardSigmoid"), set(DPUS)),
+        (behind_sum("HardSigmoid"), set(DPUS)),
+        (node("ArgMax", axis=1), {*ZYNQ, "vek280"}),
+        (conv(8, 8, 16, 16, pads=[7] * 4), set(ZYNQ)),
+    ],
+)
+def test_which_boards_take_what(draw: Draw, boards: set[str], tmp_path: Path) -> None:
+    assert {name for name, dpu in DPUS.items() if not between_convs(tmp_path, draw, dpu)} == boards
+
+
+def compared(channels: int) -> Draw:
+    return lambda s, x: s.node("ArgMax", s.conv(x, (channels, 8, 1, 1)), axis=1)
+
+
+def test_how_many_channels_are_compared(tmp_path: Path) -> None:
+    assert between_convs(tmp_path, compared(128), DPUS["zcu102"]) == []
+    assert between_convs(tmp_path, compared(129), DPUS["zcu102"]) == ["argmax channels"]
+    assert between_convs(tmp_path, compared(129), DPUS["vek280"]) == []
+
+
+def test_a_smaller_dpu_takes_fewer_channels(tmp_path: Path) -> None:
+    sketch = Sketch(8)
+    path = sketch.save(tmp_path / "c.onnx", sketch.conv("image", (2049, 8, 1, 1)))
+    assert broken_rules(path, load_dpu("zcu102", "B512")) == ["conv channels"]
+    assert broken_rules(path, load_dpu("zcu102", "B1152")) == []
+    assert broken_rules(path, load_dpu("zcu102")) == []
+
+
+def test_more_channels_than_others_take(tmp_path: Path) -> None:
+    sketch = Sketch(8)
+    path = sketch.save(tmp_path / "c.onnx", sketch.conv("image", (4097, 8, 1, 1)))
+    refused = {name: broken_rules(path, dpu) for name, dpu in DPUS.items()}
+    assert refused == {name: [] if name == "vek280" else ["conv channels"] for name in DPUS}
+
+
+def wide(kernel: tuple[int, int], channels: int) -> Operation:
+    return Operation("c", "Conv", "conv", ("in",), ("out",), window=Window(kernel), channels=(channels, 8))
+
+
+@given(st.integers(1, 16), st.integers(1, 16), st.integers(1, 8192))
+def test_weights_fit_by_each_manuals_formula(height: int, width: int, channels: int) -> None:
+    """UG1414 3.5, conv2d; for the VCK190 by dpu_op_filter.py."""
+    op, area = wide((height, width), channels), height * width
+    depths = {"zcu102": area * -(-channels // 16), "vek280": area * -(-channels // 32) * 8 + 4}
+    depths["vck190"] = area * -(-channels // 16) * 2
+    most = {"zcu102": 2048, "vek280": 65528, "vck190": 8192}
+    assert {n: conv_weight_bank(op, DPUS[n]) is None for n in most} == {n: depths[n] <= most[n] for n in most}
+    assert (conv_area(op, DPUS["vek280"]) is None) == (256 * area <= 13760)
+
+
+@pytest.mark.parametrize("name", DPUS)
+def test_every_text_names_the_boards_own_dpu(name: str) -> None:
+    own = next(kind for kind, boards in KINDS.items() if name in boards)
+    rules: list[Callable[..., object]] = [*all_rules(), *REMARKS]
+    texts = {rule_name(rule): rule_text(rule, DPUS[name]) for rule in rules if applies(rule, DPUS[name])}
+    assert {kind for text in texts.values() for kind in re.findall(r"DPUC\w*8G", text)} == {own}
+    assert not [text for text in texts.values() if "{" in text or "(" not in text]
+
+
+def test_a_rule_whose_constants_no_file_states_would_be_dead() -> None:
+    assert all(any(applies(rule, dpu) for dpu in DPUS.values()) for rule in all_rules())
+
+
+def test_cores_load_their_own_weights_and_batch_handlers_share_them() -> None:
+    images = {name: (dpu.cores, dpu.batch, dpu.weight_loads) for name, dpu in DPUS.items()}
+    assert images == {
+        "kv260": (1, 1, 1),
+        "vck190": (1, 3, 1),
+        "vek280": (1, 14, 1),
+        "zcu102": (3, 3, 3),
+        "zcu104": (2, 2, 2),
+    }
+
+
+@pytest.mark.parametrize("size", load_target("zcu102").configurations)
+@pytest.mark.parametrize("name", ZYNQ)
+def test_a_smaller_dpu_has_a_smaller_array_and_smaller_banks(name: str, size: str) -> None:
+    """PG338: the name is the operations of a cycle; banks of the width of the channels, 2048 deep."""
+    dpu, clock_hz = load_dpu(name, size), load_target(name).value("array", "pl_clock_hz")
+    lanes, pixels = dpu.input_parallel, dpu.whole("array", "pixel_parallel")
+    cycle = 2 * lanes * dpu.output_parallel * pixels
+    assert size == f"B{cycle}"
+    assert dpu.engine_ops_per_s == pytest.approx(cycle * clock_hz, rel=1e-5)
+    assert dpu.whole("memory", "feature_map_bytes") == 2048 * lanes * pixels
+    assert dpu.whole("memory", "weight_bytes") == 2048 * lanes * dpu.whole("memory", "weight_banks")
+    assert dpu.value("memory", "ddr_bytes_per_s") == DPUS[name].value("memory", "ddr_bytes_per_s")
+
+
+@pytest.mark.parametrize("variant", shipped_names())
+def test_the_shipped_files_run_whole_on_every_board(variant: str) -> None:
+    network = network_of(load_onnx(shipped_pair(variant)[1]), 128)
+    assert {name: place(network, dpu).dpu_subgraphs for name, dpu in DPUS.items()} == dict.fromkeys(DPUS, 1)
+    assert [node for dpu in DPUS.values() for node in place(network, dpu).failed] == []
+
+
+def test_every_board_has_the_shifts_of_the_quantiser() -> None:
+    assert {name: target_shifts(dpu.target) for name, dpu in DPUS.items()} == dict.fromkeys(DPUS, SHIFTS)
+
+
+def test_power_that_nobody_published_is_unavailable_and_so_is_what_follows() -> None:
+    latency = predicted(2.0, "s", (1.0, 3.0), "test")
+    for name, known in {"zcu104": False, "vek280": False, "zcu102": True, "kv260": True, "vck190": True}.items():
+        power = dpu_power(DPUS[name])
+        found = (power, energy(latency, power), efficiency(100, latency, power))
+        assert all((figure.value is not None) == known for figure in found)
+        assert all(name in figure.reason for figure in found if not known)
+
+
+def test_a_pixel_shuffle_inside_is_taken_with_a_warning(tmp_path: Path) -> None:
+    sketch = Sketch(8)
+    shuffled = sketch.node("DepthToSpace", sketch.conv("image"), blocksize=2)
+    path = sketch.save(tmp_path / "p.onnx", sketch.conv(shuffled, (8, 2, 3, 3)))
+    for dpu in DPUS.values():
+        placement = place(read_network(path, 16), dpu)
+        assert placement.failed == ()
+        assert "depthtospace1" in str(REMARKS[-1](placement, dpu, 16))
+
+
+def test_pixels_become_channels_behind_a_convolution(tmp_path: Path) -> None:
+    """The `reorg` of YOLOv2; 32 x 32 pixels into 8192 channels are too many but for the VEK280."""
+    unshuffled = node("SpaceToDepth", blocksize=2)
+    deep = node("SpaceToDepth", blocksize=32)
+    behind = in_two(node("MaxPool", kernel_shape=[1, 1]), unshuffled)
+    for name, dpu in DPUS.items():
+        assert between_convs(tmp_path, unshuffled, dpu) == []
+        assert between_convs(tmp_path, behind, dpu) == ["shuffle place"]
+        assert between_convs(tmp_path, deep, dpu) == ([] if name == "vek280" else ["shuffle channels"])
+
+
+def test_the_default_is_the_papers_board() -> None:
+    assert DEFAULT_TARGET in DPUS

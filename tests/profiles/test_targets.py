@@ -1,0 +1,139 @@
+"""A board after another: a file that names its base states what differs, and nothing else."""
+
+import re
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from deploy.cli import app
+from deploy.dpu.board import load_dpu
+from profiles import load_target, target_names
+from profiles.errors import BeersError, ProfileError
+from profiles.target import board_names
+from profiles.toml import HERE
+
+PAGE = (HERE.parent / "docs" / "boards.md").read_text(encoding="utf-8")
+(EXAMPLE,) = re.findall(r"```toml\n(.*?)```", PAGE, re.DOTALL)
+
+
+def written(folder: Path, text: str) -> str:
+    path = folder / "my-board.toml"
+    path.write_text(text, encoding="utf-8")
+    return str(path)
+
+
+def test_the_boards_are_the_targets_with_a_dpu() -> None:
+    assert board_names() == [name for name in target_names() if load_target(name).configurations]
+
+
+def test_the_pages_board_is_the_zcu102_but_for_what_it_states(tmp_path: Path) -> None:
+    mine, base = load_dpu(written(tmp_path, EXAMPLE)), load_dpu("zcu102", "B2304")
+    assert (mine.name, mine.cores, mine.batch, mine.weight_loads) == ("B2304", 2, 2, 2)
+    assert mine.engine_ops_per_s == pytest.approx(2304 * 250e6)
+    stated = {("array", "pl_clock_hz"), ("memory", "ddr_bytes_per_s"), ("tile", "memory_bytes")}
+    watts = {("power", "dpu_run_w"), ("power", "dpu_range_w")}
+    differing = {
+        (table, key)
+        for table, constants in base.tables.items()
+        for key, constant in constants.items()
+        if mine.tables[table].get(key) != constant
+    }
+    assert differing == stated | watts
+    assert not {key for _, key in watts} & set(mine.tables["power"])
+    assert mine.target.activations == base.target.activations
+    assert mine.target.documents == base.target.documents
+
+
+def test_the_zcu104_is_the_zcu102_but_for_cores_clock_and_memory() -> None:
+    one, other = load_target("zcu102"), load_target("zcu104")
+    differing = {
+        (table, key)
+        for table, constants in one.tables.items()
+        for key, constant in constants.items()
+        if key not in other.tables[table] or other.tables[table][key].value != constant.value
+    }
+    assert differing == {
+        ("array", "pl_clock_hz"),
+        ("tile", "memory_bytes"),
+        ("power", "dpu_run_w"),
+        ("power", "dpu_range_w"),
+    }
+    for size, constants in other.configurations.items():
+        changed = {key for key, constant in one.configurations[size].items() if constants[key] != constant}
+        assert changed == {"cores", "peak_tops"}
+
+
+def test_check_takes_the_pages_board(tmp_path: Path) -> None:
+    done = CliRunner().invoke(app, ["check", "--tile", "64", "--target", written(tmp_path, EXAMPLE)])
+    assert done.exit_code == 0, done.output
+    assert "B2304" in done.output
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ('"zcu102"', '"zcu999"', ("base", "zcu102", "'zcu999'")),
+        ('"zcu102"', '"./zcu102.toml"', ("base", "shipped")),
+        ('"zcu102"', "3", ("base", "got 3")),
+        ('"zcu102"', '["zcu102"]', ("base", "shipped")),
+        ("value = 250e6", 'value = "fast"', ("pl_clock_hz", "finite number")),
+        ("[tile]", '[activations]\nconv = ["relu"]\n[tile]', ("[activations] conv", "ReLU6", "['relu']")),
+        ("[tile]", '[activations]\nconf = ["ReLU"]\n[tile]', ("'conf'", "conv")),
+        ("[tile]", '[documents]\nmanual = "mine"\n[tile]', ("'manual'", "operators")),
+        ("cores = { value = 2,", "cores = { value = 0,", ("cores", "at least 1", "got 0")),
+    ],
+)
+def test_a_wrong_board_gets_one_sentence(old: str, new: str, words: tuple[str, ...], tmp_path: Path) -> None:
+    assert old in EXAMPLE
+    with pytest.raises(ProfileError) as caught:
+        load_dpu(written(tmp_path, EXAMPLE.replace(old, new)))
+    assert "\n" not in str(caught.value)
+    for word in ("my-board", "expected", "got", *words):
+        assert word in str(caught.value)
+
+
+def test_a_misspelt_constant_does_not_silence_its_rule(tmp_path: Path) -> None:
+    text = (HERE / "targets" / "vek280.toml").read_text(encoding="utf-8").replace("\narea_max =", "\narea_mox =")
+    done = CliRunner().invoke(app, ["check", "--tile", "64", "--target", written(tmp_path, text)])
+    assert done.exit_code == 2
+    assert "[conv]" in done.stderr
+    assert "'area_mox'" in done.stderr
+    assert done.stderr.count("\n") == 1
+
+
+def test_a_board_without_a_base_names_its_documents(tmp_path: Path) -> None:
+    text = (HERE / "targets" / "vek280.toml").read_text(encoding="utf-8")
+    without = re.sub(r"\[documents].*?\n\n", "", text, flags=re.DOTALL)
+    with pytest.raises(ProfileError, match=r"a table \[documents\], got none"):
+        load_dpu(written(tmp_path, without))
+
+
+def test_without_cost_constants_what_predicts_refuses_and_the_rest_works(tmp_path: Path) -> None:
+    text = (HERE / "targets" / "vck190.toml").read_text(encoding="utf-8")
+    path = written(tmp_path, re.sub(r"\n\[cost].*?\n\n", "\n", text, flags=re.DOTALL))
+    run = CliRunner().invoke
+    assert run(app, ["check", "--tile", "64", "--target", path]).exit_code == 0
+    done = run(app, ["stress", "--bit-flips", "--target", path, "--size", "32"])
+    assert done.exit_code == 2
+    assert "no cost constants yet" in done.output + done.stderr
+    assert done.stderr.count("\n") == 1
+
+
+def test_a_target_without_a_dpu_is_told_the_boards() -> None:
+    with pytest.raises(BeersError, match=", ".join(board_names())):
+        load_dpu("host-cpu")
+
+
+@pytest.mark.parametrize("name", board_names())
+def test_check_takes_every_board_and_its_model(name: str) -> None:
+    for target in (name, f"{name}-model"):
+        done = CliRunner().invoke(app, ["check", "--tile", "64", "--target", target])
+        assert done.exit_code == 0, done.output
+        assert f"on {name} {load_dpu(name).name}" in " ".join(done.output.split())
+
+
+@pytest.mark.parametrize("command", ["check", "quantize", "gate", "stress"])
+def test_the_help_names_every_board(command: str) -> None:
+    done = CliRunner().invoke(app, [command, "--help"], env={"COLUMNS": "200"})
+    assert all(name in done.output for name in board_names())
