@@ -19,7 +19,7 @@ from deploy.bench.tables import (
     sweep_rows,
 )
 from deploy.dpu.board import Dpu, load_dpu
-from deploy.dpu.cost.validation import refit
+from deploy.dpu.cost.runs import refit
 from deploy.restoration.options import parse_halo
 from model.io.images import read_acquisition
 from model.shipped import SENSOR

@@ -148,7 +148,7 @@ class Builder:
     def unshuffle(self, x: Tensor, block: int = 2) -> Tensor:
         """Blocks of pixels become channels (the `reorg` of YOLOv2, the Focus of YOLOX)."""
         shape = (x.channels * block**2, x.shape[1] // block, x.shape[2] // block)
-        return self._append("SpaceToDepth", "other", (x,), shape)
+        return self._append("SpaceToDepth", "pixel shuffle", (x,), shape)
 
     def activation(self, x: Tensor, op_type: str) -> Tensor:
         """One that no convolution takes in."""
@@ -216,6 +216,7 @@ class Builder:
                 channels=(inputs[0].channels, shape[0]),
                 weight_bytes=weights,
                 attributes=attributes,
+                follows=next((op.kind for op in reversed(self._operations) if inputs[0].name in op.outputs), None),
             )
         )
         return result
