@@ -25,7 +25,7 @@ from deploy.bench.tables import (
     within_words,
 )
 from deploy.dpu.board import Dpu, load_dpu
-from deploy.dpu.cost.validation import refit
+from deploy.dpu.cost.runs import refit
 from deploy.dpu.reading import own_tile_px
 from deploy.restoration.options import parse_halo
 from model.io.images import read_acquisition

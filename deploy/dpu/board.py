@@ -15,6 +15,8 @@ SIZED = ("array", "memory", "elementwise")
 """Tables whose constants a configuration may state for itself, by their names: a smaller array has smaller banks."""
 DIVISORS = {**dict.fromkeys(SIZED, 1.0), "cost": SMALLEST, "power": SMALLEST}
 """Tables of widths, rates and energies, by which rules and cost model divide, and the least that each can be."""
+CHOICES = ("serial", "joined")
+"""Constants of the cost model by which nothing is divided: they may be 0."""
 
 
 @dataclass(frozen=True)
@@ -124,7 +126,7 @@ def load_dpu(target: str, configuration: str | None = None) -> Dpu:
     dpu = Dpu(profile, name, constants)
     for table, least in DIVISORS.items():
         for key, constant in dpu.tables.get(table, {}).items():
-            _require(f"{profile.name} [{table}] {key}", constant, least)
+            _require(f"{profile.name} [{table}] {key}", constant, 0.0 if key in CHOICES else least)
     return dpu
 
 

@@ -7,8 +7,8 @@ from pathlib import Path
 
 from deploy.bench.tables import predict_file
 from deploy.dpu.board import Dpu, load_dpu
-from deploy.dpu.cost.latency import Prediction, frame_rate
-from deploy.dpu.cost.layers import Constants
+from deploy.dpu.cost.constants import Constants
+from deploy.dpu.cost.latency import Prediction
 from deploy.report.plots import Curve, Panel, Points, curves_svg
 from deploy.restoration.options import TILE_PX
 from deploy.stress import flips
@@ -36,7 +36,7 @@ def price_rows(target: FaultTarget, prediction: Prediction, dpu: Dpu) -> list[Ro
     limit_s = INSTRUCTIONS * values / AT_ONCE / clock_hz
     scrubbing_s = weight_bits(target.core) / INT8_BITS / rate
     copies_s = 3 * len(target.shifts) / rate
-    spread = exp(dpu.value("cost", "error_outside"))
+    spread = exp(dpu.value("cost", "width_outside"))
     guards = {
         f"ReLU6 at {len(target.guards.relu6)} of {relus} ReLUs": (0.0, FUSED),
         f"limit of the correction, {target.guards.limit_dn:g} DN": (limit_s, INSTRUCTED),
@@ -51,7 +51,7 @@ def _row(name: str, time_s: float, source: str, prediction: Prediction, spread: 
     tile_s = prediction.batch_time_s / prediction.batch
     slow, fast = prediction.fps_interval
     # The host prepares the next tile while the DPU runs: only what does not fit beside it costs frames.
-    beside = frame_rate(prediction.batch_time_s, prediction.batch, prediction.host_s + time_s)
+    beside = prediction.rate(prediction.batch_time_s, prediction.host_s + time_s)
     times_s, most = (time_s / spread, time_s * spread), 100 * time_s * spread * fast
     figures = {
         "time": predicted(1e3 * time_s, "ms/tile", (1e3 * times_s[0], 1e3 * times_s[1]), source),

@@ -27,9 +27,10 @@ from deploy.bench.rates import measured_rates
 from deploy.bench.tables import Swath, efficiency, energy, swath_latency
 from deploy.dpu.board import Dpu, load_dpu
 from deploy.dpu.checker.placement import place
-from deploy.dpu.cost.latency import Prediction, dpu_power, frame_rate, predict
-from deploy.dpu.cost.layers import Constants
-from deploy.dpu.cost.validation import bound_by_dpu, leave_out, published_cases
+from deploy.dpu.cost.constants import Constants, Structure
+from deploy.dpu.cost.latency import Prediction, dpu_power, predict
+from deploy.dpu.cost.published import published_cases
+from deploy.dpu.cost.validation import leave_out, regimes_of
 from deploy.dpu.reading import network_of
 from model.traditional.settings import QUALITIES
 from model.traditional.work import chain_work
@@ -63,11 +64,11 @@ class DpuRun:
 
     def latency_s(self, serial: float) -> float:
         """Of the swath, if that share is not hidden."""
-        hidden = serial - self.dpu.value("cost", "serial")
+        hidden = serial - self.prediction.structure.serial
         shorter_s = math.fsum(min(layer.compute_s, layer.memory_s) for layer in self.prediction.layers)
         batch_s = self.prediction.batch_time_s + hidden * shorter_s
         images = self.batches * self.prediction.batch
-        return images / frame_rate(batch_s, self.prediction.batch, self.prediction.host_s)
+        return images / self.prediction.rate(batch_s, self.prediction.host_s)
 
     def figures(self) -> dict[str, Figure]:
         """The five figures of the board."""
@@ -156,10 +157,11 @@ def pair_error() -> float:
 
     Each network predicted without itself; only rates that the DPU bounds.
     """
-    cases = published_cases()
+    dpu = load_dpu("vck190")
+    cases = published_cases("vck190", Structure.of(dpu))
     errors = leave_out(cases, [row.network for row in cases.rows])
-    bound = bound_by_dpu(cases, Constants.of(load_dpu("vck190")))
-    kept = [(row, error) for row, error, inside in zip(cases.rows, errors, bound, strict=True) if inside]
+    regimes = regimes_of(cases, Constants.of(dpu))
+    kept = [(row, error) for row, error, kind in zip(cases.rows, errors, regimes, strict=True) if kind != "host"]
     apart = [
         abs(x - y) for (a, x), (b, y) in combinations(kept, 2) if a.family == b.family and a.network != b.network
     ]

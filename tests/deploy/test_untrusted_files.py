@@ -15,7 +15,7 @@ from typer.testing import CliRunner
 from deploy.cache import Cache, digest_of
 from deploy.cli import app
 from deploy.dpu.board import load_dpu
-from deploy.dpu.cost.validation import refit
+from deploy.dpu.cost.runs import refit
 from deploy.gate import PATCHES, baseline_mae
 from deploy.restoration.output import Checkpoint, part_folder
 from deploy.results import Document

@@ -1,13 +1,12 @@
 """How long a network takes on the DPU, layer by layer, and how far off that may be.
 
-A layer's counts and its formula come from `layers.py`, the constants and errors from the target's [cost], where
-`docs/make_cost_model.py` writes what `fit.py` finds on published networks. None of them is ConvBEERS: the paper's own
-figure is what the model is compared with, never what it is made from.
+Counts come from `work.py`, the formula from `layers.py` and `host.py`, constants and errors from the target's [cost],
+where `docs/make_cost_model.py` writes what `fit.py` and `validation.py` find on published networks. None of them is
+ConvBEERS: the paper's own figure is what the model is compared with, never what it is made from.
 
-The interval is FPS e^-error to FPS e^+error. `error_inside` is the 90 % quantile of |ln(predicted / published)| of
-networks left out of the fit, each network counting once. Where a network lies outside the range of the fitted ones,
-`error_outside` takes its place (networks with large maps, predicted from those with small ones), and the interval
-starts from FPS with nothing hidden (serial = 1) and with everything hidden (serial = 0).
+The interval is FPS e^-width to FPS e^width: nine of ten families of networks, left out of the fit, lay inside theirs.
+It has one width where the host sets the rate, one for small maps, one for large ones, and the widest where a network
+lies beyond all fitted ones.
 """
 
 import math
@@ -15,11 +14,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
-import numpy as np
-
 from deploy.dpu.board import Dpu
 from deploy.dpu.checker.placement import Placement
-from deploy.dpu.cost.layers import FUSED, Constants, Layers, Work, count_work, host_s
+from deploy.dpu.cost.constants import Constants, Structure
+from deploy.dpu.cost.host import Task, frame_rate, placed_work, task_of
+from deploy.dpu.cost.layers import Layers
+from deploy.dpu.cost.regimes import Regime, regime_of
+from deploy.dpu.cost.work import Work, count_work, largest_map_bytes
 from deploy.dpu.graph import Operation
 from deploy.restoration.plan import plan_side
 from profiles.errors import ModelError
@@ -48,26 +49,20 @@ class LayerCost:
 
 
 @dataclass(frozen=True)
-class Profile:
-    """What places a network inside or outside the range of the fitted ones."""
-
-    operations: float
-    map_bytes: float  # the largest result
-    intensity: float  # operations per map byte moved
-
-    @classmethod
-    def of(cls, operations: Sequence[Operation], works: Sequence[Work]) -> "Profile":
-        """The profile of a network, one image."""
-        total = sum(work.operations for work in works)
-        moved = sum(work.load_map_bytes + work.store_map_bytes for work in works)
-        return cls(total, max(op.out_bytes for op in operations if op.kind not in FUSED), total / max(moved, 1))
-
-
-@dataclass(frozen=True)
 class Prediction:
     """What the model says of one network on one configuration; `note` says what was assumed of the file.
 
-    `outside` names what lies beyond the fitted networks, and is empty where nothing does.
+    Attributes:
+        configuration: of the DPU.
+        batch: images in flight: batch handlers of all cores.
+        layers: what each costs, for a batch.
+        overhead_s: start of a batch.
+        host_s: time of an image on the host's cores together.
+        task: what the host does with the results.
+        regime: what sets the rate.
+        width: half that of the interval, in ln(FPS).
+        structure: variants of the formula.
+        outside: what lies beyond the fitted networks; empty where nothing does.
     """
 
     configuration: str
@@ -75,7 +70,10 @@ class Prediction:
     layers: tuple[LayerCost, ...]
     overhead_s: float
     host_s: float
-    fps_interval: tuple[float, float]
+    task: Task
+    regime: Regime
+    width: float
+    structure: Structure
     outside: tuple[str, ...] = ()
     note: str = ""
 
@@ -87,7 +85,17 @@ class Prediction:
     @property
     def fps(self) -> float:
         """Images a second, batches back to back, the host working on others beside them."""
-        return frame_rate(self.batch_time_s, self.batch, self.host_s)
+        return self.rate(self.batch_time_s, self.host_s)
+
+    @property
+    def fps_interval(self) -> tuple[float, float]:
+        """Least and most images a second."""
+        spread = math.exp(self.width)
+        return self.fps / spread, self.fps * spread
+
+    def rate(self, batch_time_s: float, host_s: float) -> float:
+        """Images a second if a batch took that long on the DPU, and an image that long on the host."""
+        return frame_rate(batch_time_s / self.batch, host_s, self.structure.crowding)
 
     @property
     def operations(self) -> int:
@@ -100,75 +108,63 @@ class Prediction:
         return sum(layer.work.load_map_bytes + layer.work.store_map_bytes for layer in self.layers)
 
 
-def frame_rate(batch_time_s: float, batch: int, host_time_s: float) -> float:
-    """Images a second: the slower of the DPU and the host."""
-    return 1 / max(batch_time_s / batch, host_time_s)
-
-
 def predict(placement: Placement, dpu: Dpu) -> Prediction:
     """Predict a network that runs whole on the DPU.
 
     Raises:
         ModelError: a node that the DPU cannot run, or nothing for it to do.
+        ProfileError: a target without cost constants.
     """
     if placement.failed:
         names = ", ".join(node.op.name for node in placement.failed[:3])
         remedy = "run 'beers-deploy check' for the reasons and remedies"
         raise ModelError("cost model", expected="a core that runs whole on the DPU", got=names, remedy=remedy)
-    works = count_work(placement.core, dpu)
+    constants, structure = Constants.of(dpu), Structure.of(dpu)
+    works = count_work(placement.core, dpu, structure)
     if not any(work.operations for work in works):
         remedy = "give a network with convolutions"
         raise ModelError("cost model", expected="work for the DPU", got="no convolution", remedy=remedy)
-    constants, serial = Constants.of(dpu), dpu.value("cost", "serial")
+    layers = _layer_costs(works, dpu, constants, structure)
+    host_s = float(placed_work(placement) @ constants.host_s_per_unit) / dpu.whole("cpu", "cores")
+    dpu_s = math.fsum([*(layer.time_s for layer in layers), constants.batch_s]) / dpu.batch
+    map_bytes = largest_map_bytes(placement.core)
+    regime = regime_of(host_s > dpu_s, map_bytes)
+    outside = _outside(placement.core, map_bytes, dpu)
+    width = dpu.value("cost", WIDTHS["outside" if outside else regime])
+    task, note = task_of(placement), placement.note
+    return Prediction(
+        dpu.name, dpu.batch, layers, constants.batch_s, host_s, task, regime, width, structure, outside, note
+    )
+
+
+def _layer_costs(
+    works: Sequence[Work], dpu: Dpu, constants: Constants, structure: Structure
+) -> tuple[LayerCost, ...]:
     layers = Layers.of(works, dpu)
-    columns = (layers.compute_s(constants), layers.memory_s(constants), layers.time_s(constants, serial))
-    costs = tuple(LayerCost(*row) for row in zip(works, *(c.tolist() for c in columns), strict=True))
-    host_time_s = crossing_s(placement, constants)
-    outside = _outside(Profile.of(placement.core, works), dpu)
-    interval = _interval(layers, constants, host_time_s, dpu, bool(outside))
-    return Prediction(dpu.name, dpu.batch, costs, constants.batch_s, host_time_s, interval, outside, placement.note)
+    columns = (layers.compute_s(constants), layers.memory_s(constants), layers.time_s(constants, structure.serial))
+    return tuple(LayerCost(*row) for row in zip(works, *(c.tolist() for c in columns), strict=True))
 
 
-def crossing_bytes(placement: Placement) -> tuple[int, int]:
-    """Bytes of one image that the host hands to the DPU, and takes back."""
-    onto = sum(cut.size_bytes or 0 for cut in placement.cuts if cut.onto_dpu)
-    back = sum(cut.size_bytes or 0 for cut in placement.cuts if not cut.onto_dpu)
-    return onto, back
-
-
-def crossing_s(placement: Placement, constants: Constants) -> float:
-    """Time of the host for one image: making planes, reading corrections, adding them."""
-    taken, read = (np.array([size], float) for size in crossing_bytes(placement))
-    return float(host_s(taken, read, constants)[0])
-
-
-def _interval(
-    layers: Layers, constants: Constants, host_time_s: float, dpu: Dpu, outside: bool
-) -> tuple[float, float]:
-    serial = dpu.value("cost", "serial")
-    shares = (1.0, 0.0) if outside else (serial, serial)
-    times_s = [math.fsum([*layers.time_s(constants, share).tolist(), constants.batch_s]) for share in shares]
-    slow, fast = (frame_rate(time_s, dpu.batch, host_time_s) for time_s in times_s)
-    spread = math.exp(dpu.value("cost", "error_outside" if outside else "error_inside"))
-    return slow / spread, fast * spread
-
-
-RANGES = {
-    "map_bytes": ("largest map", 1e6, " MB"),
-    "operations": ("work", 1e9, " GOP"),
-    "intensity": ("operations per byte moved", 1.0, ""),
+WIDTHS = {
+    "host": "width_host",
+    "small maps": "width_small_maps",
+    "large maps": "width_large_maps",
+    "outside": "width_outside",
 }
+"""Where [cost] keeps half the width of an interval, in ln(FPS)."""
 
 
-def _outside(profile: Profile, dpu: Dpu) -> tuple[str, ...]:
+def _outside(core: Sequence[Operation], map_bytes: float, dpu: Dpu) -> tuple[str, ...]:
     """What of a network lies beyond the fitted ones, each with the end of the range that it passes."""
+    values = {
+        "map_bytes": ("largest map", map_bytes / 1e6, 1e-6, " MB"),
+        "operations": ("work", sum(op.operations for op in core) / 1e9, 1e-9, " GOP"),
+    }
     found = []
-    for key, (name, scale, unit) in RANGES.items():
-        value, fitted = getattr(profile, key), dpu.limit("cost", f"fitted_{key}")
-        if value > fitted.high:
-            found.append(f"{name} {value / scale:.3g}{unit} (fitted up to {fitted.high / scale:.3g})")
-        if value < fitted.low:
-            found.append(f"{name} {value / scale:.3g}{unit} (fitted from {fitted.low / scale:.3g})")
+    for key, (name, value, scale, unit) in values.items():
+        most = scale * dpu.limit("cost", f"fitted_{key}").high
+        if value > most:
+            found.append(f"{name} {value:.3g}{unit} (fitted up to {most:.3g})")
     return tuple(found)
 
 

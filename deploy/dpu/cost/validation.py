@@ -1,74 +1,190 @@
-"""How wrong the cost model is about networks that its fit has not seen: published ones, and an owner's own runs.
+"""How wrong the cost model is about networks that its fit has not seen, and the intervals that follow.
 
-`bench --measured board.json` refits the model to the latter.
+Networks of one family resemble one another, so a family is left out as a whole. What is chosen and what is judged
+are kept apart by two rounds (nested cross-validation): for each family left out, the structure is chosen, and the
+width of the interval made, from errors on others of the families that remain. `nested` is what the errors of the
+documents and the widths of [cost] come from.
 """
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import cache
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from deploy.dpu.board import Dpu, load_dpu
-from deploy.dpu.checker.placement import place
-from deploy.dpu.cost.fit import FIRM_PRIOR, Case, Cases, fit
-from deploy.dpu.cost.latency import Profile, crossing_bytes
-from deploy.dpu.cost.layers import Array, Constants, Layers, count_work
-from deploy.dpu.reading import read_network
-from deploy.dpu.zoo.networks import NETWORKS, network, published_rates
-from profiles.constant import Constant
-from profiles.errors import ModelError, OptionError
-from profiles.figures import Row, predicted, published
-from profiles.toml import read_json
+from deploy.dpu.cost.constants import STRUCTURES, Array, Constants, Structure
+from deploy.dpu.cost.fit import Cases, fit
+from deploy.dpu.cost.published import published_cases
+from deploy.dpu.cost.regimes import REGIMES, Regime, regime_of
+
+FOLDS = 5
+SHARE = 0.9
+"""Of left-out families that the intervals hold."""
+SHRINK = 3
+"""A regime's typical error counts this many families of all regimes' typical error besides its own."""
+
+
+@dataclass(frozen=True)
+class Widths:
+    """Half the width of an interval, in ln(FPS), by regime."""
+
+    by_regime: dict[Regime, float]
+
+    @classmethod
+    def of(cls, errors: Array, cases: Cases, regimes: Sequence[Regime]) -> "Widths":
+        """So wide that SHARE of the families lie inside with all their networks.
+
+        A regime's scale is the mean over families of the mean error (drawn to that of all regimes); a family's score
+        is its largest error over scale; the widths are the scales times the conformal quantile of the scores, the
+        ceil(SHARE (n + 1))-th smallest of n, or the largest.
+        """
+        families = np.array([row.family for row in cases.rows])
+        kinds, sizes = np.array(regimes), np.abs(errors)
+        overall = _family_mean(sizes, families)
+        scales = {}
+        for kind in REGIMES:
+            mine = kinds == kind
+            count = len(set(families[mine]))
+            own = count * _family_mean(sizes[mine], families[mine]) if count else 0.0
+            scales[kind] = (own + SHRINK * overall) / (count + SHRINK)
+        score = family_quantile(sizes / np.array([scales[kind] for kind in regimes]), families.tolist())
+        return cls({kind: float(scale * score) for kind, scale in scales.items()})
+
+
+def _family_mean(sizes: Array, families: NDArray[np.str_]) -> float:
+    """Mean over families of the mean."""
+    return float(np.mean([sizes[families == name].mean() for name in dict.fromkeys(families)]))
+
+
+@dataclass(frozen=True)
+class LeftOut:
+    """What was found of a network on a configuration, its family left out.
+
+    Attributes:
+        network: its name.
+        family: its family.
+        configuration: of the DPU.
+        regime: by the prediction.
+        error: ln(predicted / observed), the observed rate being the geometric mean.
+        rates: ln(predicted / rate) of each published rate.
+        width: half that of the interval that was predicted, in ln(FPS).
+    """
+
+    network: str
+    family: str
+    configuration: str
+    regime: Regime
+    error: float
+    rates: tuple[float, ...]
+    width: float
+
+    @property
+    def held(self) -> float:
+        """Share of the published rates inside the interval."""
+        return float(np.mean([abs(error) <= self.width for error in self.rates]))
+
+
+@dataclass(frozen=True)
+class Nested:
+    """The outcome for a board: all networks left out in turn, the structure of most, the widths that follow."""
+
+    board: str
+    rows: tuple[LeftOut, ...]
+    structure: Structure
+    widths: Widths
+
+
+@cache
+def nested(board: str) -> Nested:
+    """Leave each family out; choose a structure and make widths from the others alone; predict what was left out."""
+    trials = [Trial(published_cases(board, structure)) for structure in STRUCTURES]
+    rows = [row for name in trials[0].names for row in left_out_rows(trials, name)]
+    structure = _choose(trials, "")[0].cases.structure
+    order = {(row.network, row.configuration): row for row in rows}
+    cases = published_cases(board, structure)
+    rows = [order[row.network, row.configuration] for row in cases.rows]
+    widths = Widths.of(np.array([row.error for row in rows]), cases, [row.regime for row in rows])
+    return Nested(board, tuple(rows), structure, widths)
+
+
+class Trial:
+    """A structure under trial: its cases and their families; fits begin near that of all rows."""
+
+    def __init__(self, cases: Cases) -> None:
+        self.cases = cases
+        self.families = np.array([row.family for row in cases.rows])
+        self.names = sorted(set(self.families))
+        self.near = fit(cases)
+        self._fits: dict[frozenset[str], Constants] = {}
+
+    def fit_without(self, unseen: frozenset[str]) -> Constants:
+        """The constants that the other families give."""
+        if unseen not in self._fits:
+            out = np.isin(self.families, list(unseen))
+            self._fits[unseen] = fit(self.cases.only(~out), near=self.near)
+        return self._fits[unseen]
+
+    def inner(self, left_out: str) -> tuple[Array, Cases, list[Regime]]:
+        """Errors and regimes of all families but one, which no fit sees, by folds of the others."""
+        kept = self.cases.only(self.families != left_out)
+        families = self.families[self.families != left_out]
+        errors, regimes = np.zeros(len(kept.rows)), np.zeros(len(kept.rows), dtype=object)
+        for fold in range(FOLDS):
+            tested = set(self.names[fold::FOLDS])
+            mine, constants = np.isin(families, list(tested)), self.fit_without(frozenset(tested | {left_out}))
+            errors[mine] = kept.only(mine).errors(constants)
+            regimes[mine] = regimes_of(kept.only(mine), constants)
+        return errors, kept, list(regimes)
+
+
+def _choose(trials: Sequence[Trial], left_out: str) -> tuple[Trial, tuple[Array, Cases, list[Regime]]]:
+    """The structure with the least error on families left out, none of them the one that is judged."""
+    found = [(trial, trial.inner(left_out)) for trial in trials]
+    return min(found, key=lambda item: _score(item[1][0], item[1][1]))
+
+
+def _score(errors: Array, cases: Cases) -> float:
+    return _family_mean(np.abs(errors), np.array([row.family for row in cases.rows]))
+
+
+def left_out_rows(trials: Sequence[Trial], name: str) -> list[LeftOut]:
+    """A family, predicted without it by a structure that was chosen without it; widths made without it."""
+    trial, inner = _choose(trials, name)
+    widths = Widths.of(*inner)
+    tested, constants = trial.cases.only(trial.families == name), trial.fit_without(frozenset({name}))
+    return [
+        LeftOut(
+            case.network,
+            case.family,
+            case.configuration,
+            regime,
+            float(error),
+            tuple((error + seen - np.log(case.fps)).tolist()),
+            widths.by_regime[regime],
+        )
+        for case, regime, error, seen in zip(
+            tested.rows, regimes_of(tested, constants), tested.errors(constants), tested.observed, strict=True
+        )
+    ]
+
+
+def regimes_of(cases: Cases, constants: Constants) -> list[Regime]:
+    """What sets each case's rate, by prediction."""
+    times = cases.times(constants)
+    bound = times.host_s / cases.host_cores > times.dpu_s
+    return [regime_of(bool(b), row.map_bytes) for b, row in zip(bound, cases.rows, strict=True)]
 
 
 def leave_out(cases: Cases, names: Sequence[str]) -> Array:
-    """ln(predicted / observed) of each row (n,), predicted without the rows that share its name."""
-    groups, errors = np.asarray(names), np.zeros(len(cases.rows))
+    """ln(predicted / observed) of each case (n,), predicted without those that share its name."""
+    groups, errors, near = np.asarray(names), np.zeros(len(cases.rows)), fit(cases)
     for name in dict.fromkeys(names):
         out = groups == name
-        errors[out] = cases.only(out).errors(fit(cases.only(~out)))
+        errors[out] = cases.only(out).errors(fit(cases.only(~out), near=near))
     return errors
-
-
-def quantile(errors: Array, names: Sequence[str], share: float = 0.9) -> float:
-    """The size of error that `share` of the rows do not exceed, each name counting once."""
-    _, index, counts = np.unique(np.asarray(names), return_inverse=True, return_counts=True)
-    sizes, weights = np.abs(errors), 1 / counts[index]
-    order = np.argsort(sizes, kind="stable")
-    reached = np.cumsum(weights[order]) / weights.sum()
-    return float(sizes[order][np.searchsorted(reached, min(share, reached[-1]))])
-
-
-def coverage(errors: Array, names: Sequence[str]) -> float:
-    """Share of rows inside an interval made of the other names' errors."""
-    groups = np.asarray(names)
-    inside = [
-        abs(error) <= quantile(errors[groups != name], groups[groups != name].tolist())
-        for error, name in zip(errors, names, strict=True)
-    ]
-    return float(np.mean(inside))
-
-
-def beyond(cases: Cases, share: float = 0.25) -> tuple[Array, list[str]]:
-    """Errors of networks with large maps, predicted from networks with small ones, and the names of their rows.
-
-    Large: above `share` of the largest map. Only rows that the DPU bounds are predicted; those that the host bounds
-    say nothing of maps and stay in the fit.
-    """
-    bound = bound_by_dpu(cases, fit(cases))
-    sizes = np.array([row.profile.map_bytes for row in cases.rows])
-    large = bound & (sizes > share * sizes[bound].max())
-    tested = cases.only(large)
-    return tested.errors(fit(cases.only(~large))), [row.network for row in tested.rows]
-
-
-def bound_by_dpu(cases: Cases, constants: Constants) -> NDArray[np.bool_]:
-    """Where the DPU takes longer than the host, (n,)."""
-    return np.asarray(cases.dpu_s(constants) > cases.host_s(constants))
 
 
 def rank_correlation(cases: Cases, errors: Array) -> float:
@@ -90,155 +206,48 @@ def relative(errors: Array) -> Array:
     return np.asarray(np.abs(np.expm1(errors)))
 
 
-def fitted_ranges(cases: Cases, constants: Constants) -> dict[str, tuple[float, float]]:
-    """Ranges of the networks that the DPU bounds: the others tell nothing of it."""
-    profiles = [row.profile for row in cases.only(bound_by_dpu(cases, constants)).rows]
-    keys = ("map_bytes", "operations", "intensity")
-    return {key: (min(getattr(p, key) for p in profiles), max(getattr(p, key) for p in profiles)) for key in keys}
+def by_network(rows: Sequence[LeftOut]) -> dict[str, float]:
+    """Mean |predicted / published - 1| of each network, over its configurations and rates."""
+    found: dict[str, list[float]] = {}
+    for row in rows:
+        found.setdefault(row.network, []).extend(relative(np.array(row.rates)).tolist())
+    return {name: float(np.mean(values)) for name, values in found.items()}
 
 
-def published_cases(*, sorting: bool = False) -> Cases:
-    """The published rates.
+def coverage(rows: Sequence[LeftOut]) -> tuple[float, float]:
+    """Share of published rates inside their intervals, each network weighing the same; share of families whole."""
+    counts = Counter(row.network for row in rows)
+    networks = sum(row.held / counts[row.network] for row in rows) / len(counts)
+    families = {row.family for row in rows}
+    whole = [all(row.held == 1 for row in rows if row.family == name) for name in families]
+    return networks, float(np.mean(whole))
 
-    Args:
-        sorting: those whose host sorts boxes or key points, which the model cannot know and the fit leaves out.
+
+def transferred(source: str, target: str) -> Array:
+    """Errors of a board's cases (n,) with another's constants, fitted to that one's rates without their family."""
+    structure = nested(source).structure
+    known, wanted = published_cases(source, structure), published_cases(target, structure)
+    families, errors = np.array([row.family for row in wanted.rows]), np.zeros(len(wanted.rows))
+    trial = Trial(known)
+    for name in dict.fromkeys(families.tolist()):
+        mine = families == name
+        errors[mine] = wanted.only(mine).errors(trial.fit_without(frozenset({name})))
+    return errors
+
+
+def beyond(cases: Cases, share: float = 0.25) -> tuple[Array, list[str]]:
+    """Errors of networks with the largest maps, predicted from the others, and the families of their rows.
+
+    The largest: above `share` of the largest map of a network that the DPU bounds. Only such are predicted.
     """
-    chosen = [rate for rate in published_rates() if (NETWORKS[rate.network].host_reads == "sorts") is sorting]
-    rows = tuple(network_case(rate.network, _dpu(rate.configuration), rate.fps) for rate in chosen)
-    return Cases(rows, load_dpu("vck190").value("cost", "serial"))
+    bound = np.array([kind != "host" for kind in regimes_of(cases, fit(cases))])
+    sizes = np.array([row.map_bytes for row in cases.rows])
+    large = bound & (sizes > share * sizes[bound].max())
+    tested = cases.only(large)
+    return tested.errors(fit(cases.only(~large))), [row.family for row in tested.rows]
 
 
-def network_case(name: str, dpu: Dpu, fps: float) -> Case:
-    """One of NETWORKS on a configuration, with its rate."""
-    entry, net = NETWORKS[name], network(name)
-    works = count_work(net.operations, dpu)
-    sizes = {op.output: op.out_bytes for op in net.operations}
-    taken = sum(math.prod(shape) for shape in net.inputs.values())
-    read = 0 if entry.host_reads == "scores" else sum(sizes[result] for result in net.outputs)
-    profile = Profile.of(net.operations, works)
-    return Case(name, entry.family, dpu.name, Layers.of(works, dpu), dpu.batch, (taken, read), fps, profile)
-
-
-@cache
-def _dpu(configuration: str) -> Dpu:
-    return load_dpu("vck190", configuration)
-
-
-UNITS = {
-    "efficiency": "1",
-    "map_bytes_per_s": "B/s",
-    "batch_s": "s",
-    "layer_s": "s",
-    "host_in_bytes_per_s": "B/s",
-    "host_out_bytes_per_s": "B/s",
-}
-
-
-@dataclass(frozen=True)
-class Refit:
-    """What the runs changed."""
-
-    source: str
-    cases: Cases
-    old: Constants
-    new: Constants
-
-    def applied(self, dpu: Dpu) -> Dpu:
-        """The board with the new constants; its interval stays that of the published networks."""
-        cost = dict(dpu.target.tables["cost"])
-        for field in fields(Constants):
-            cost[field.name] = Constant(getattr(self.new, field.name), "inferred", self.source)
-        return replace(dpu, target=replace(dpu.target, tables={**dpu.target.tables, "cost": cost}))
-
-    def constant_rows(self) -> list[Row]:
-        """The constants before and after."""
-        return [self._constant_row(field.name) for field in fields(Constants)]
-
-    def run_rows(self) -> list[Row]:
-        """What each run was predicted to be, before and after."""
-        before, after = (self.cases.errors(constants).tolist() for constants in (self.old, self.new))
-        return [self._run_row(*row) for row in zip(self.cases.rows, before, after, strict=True)]
-
-    def _constant_row(self, name: str) -> Row:
-        values = {"shipped": getattr(self.old, name), "refitted": getattr(self.new, name)}
-        figures = {key: predicted(value, UNITS[name], (value, value), self.source) for key, value in values.items()}
-        return Row("constants", name, figures)
-
-    def _run_row(self, case: Case, before: float, after: float) -> Row:
-        ratios = {"shipped": math.exp(before), "refitted": math.exp(after)}
-        figures = {"given": published(case.fps, "frame/s", self.source)}
-        for key, ratio in ratios.items():
-            rate = ratio * case.fps
-            figures[key] = predicted(rate, "frame/s", (rate, rate), f"cost model, {key} constants")
-            figures[f"{key} is off by"] = predicted(100 * (ratio - 1), "%", (100 * (ratio - 1),) * 2, "arithmetic")
-        return Row("runs", f"{case.network}, {case.configuration}", figures)
-
-
-def refit(path: Path, dpu: Dpu) -> Refit:
-    """Refit the constants of `dpu`'s target to the runs in a file.
-
-    Raises:
-        OptionError: not such a file, or a run that cannot be understood.
-        ModelError: a model that does not run whole on the DPU.
-    """
-    runs = _read(path)
-    cases = Cases(tuple(_case(run, path, index) for index, run in enumerate(runs)), dpu.value("cost", "serial"))
-    old = Constants.of(dpu)
-    new = fit(cases, old, FIRM_PRIOR).rounded()
-    return Refit(f"refitted to {len(runs)} runs in {path.name}", cases, old, new)
-
-
-def _read(path: Path) -> Sequence[Mapping[str, object]]:
-    try:
-        runs = read_json(path)
-    except OSError as error:
-        got = error.strerror or str(error)
-        raise OptionError(str(path), expected="a readable file", got=got, remedy="check the path") from error
-    except ValueError as error:
-        raise OptionError(str(path), expected="JSON", got=str(error), remedy="correct the file") from error
-    if not isinstance(runs, list) or not 0 < len(runs) <= RUNS or not all(isinstance(run, dict) for run in runs):
-        expected, got = f"a list of 1 to {RUNS} runs", type(runs).__name__
-        raise OptionError(str(path), expected=expected, got=got, remedy=EXAMPLE)
-    return runs
-
-
-EXAMPLE = 'write [{"model": "core.onnx", "configuration": "C32B3", "tile_px": 640, "fps": 9.5}]'
-RUNS, TILE_MAX_PX, FPS = 1000, 1 << 16, (1e-9, 1e9)
-"""A board has seen far fewer runs; beyond these sizes and rates the fit has no digits left."""
-KEYS = {"model", "network", "configuration", "tile_px", "fps", "power_w"}
-
-
-def _case(run: Mapping[str, object], path: Path, index: int) -> Case:
-    where = f"{path.name}, run {index + 1}"
-    unknown = set(run) - KEYS
-    fps, tile = run.get("fps"), run.get("tile_px", 640)
-    if unknown or ("model" in run) == ("network" in run):
-        raise OptionError(
-            where, expected="model or network, configuration, tile_px, fps", got=str(sorted(run)), remedy=EXAMPLE
-        )
-    if isinstance(fps, bool) or not isinstance(fps, int | float) or not FPS[0] < fps < FPS[1]:
-        raise OptionError(where, expected="frames a second above zero", got=repr(fps), remedy=EXAMPLE)
-    if isinstance(tile, bool) or not isinstance(tile, int) or not 16 <= tile <= TILE_MAX_PX:
-        raise OptionError(
-            where, expected=f"a tile side of 16 to {TILE_MAX_PX} pixels", got=repr(tile), remedy=EXAMPLE
-        )
-    dpu = load_dpu("vck190", str(run.get("configuration", "")) or None)
-    if "network" in run:
-        name = str(run["network"])
-        if name not in NETWORKS:
-            raise OptionError(
-                where, expected=f"one of {', '.join(NETWORKS)}", got=repr(name), remedy="or give a model"
-            )
-        return network_case(name, dpu, float(fps))
-    return _model_case(path.parent / str(run["model"]), dpu, tile, float(fps))
-
-
-def _model_case(model: Path, dpu: Dpu, tile_px: int, fps: float) -> Case:
-    placement = place(read_network(model, tile_px), dpu)
-    if placement.failed:
-        remedy = "run 'beers-deploy check' for the reasons"
-        raise ModelError(str(model), expected="a core that runs whole on the DPU", got="refused nodes", remedy=remedy)
-    works = count_work(placement.core, dpu)
-    profile = Profile.of(placement.core, works)
-    name, layers = f"{model.stem}, tiles of {tile_px}", Layers.of(works, dpu)
-    return Case(name, model.stem, dpu.name, layers, dpu.batch, crossing_bytes(placement), fps, profile)
+def family_quantile(errors: Array, families: Sequence[str]) -> float:
+    """The size of error that the largest of SHARE of the families do not exceed: ceil(SHARE (n + 1)) of n."""
+    largest = sorted(np.abs(errors)[np.array(families) == name].max() for name in set(families))
+    return float(largest[min(math.ceil(SHARE * (len(largest) + 1)), len(largest)) - 1])

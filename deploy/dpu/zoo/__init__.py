@@ -1,1 +1,1 @@
-"""Published networks written down from their papers, without weights: what the cost model is fitted on."""
+"""Published networks as text, without weights, and their published rates: what the cost model is fitted on."""

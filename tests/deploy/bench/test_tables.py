@@ -26,8 +26,8 @@ from deploy.bench.tables import (
 from deploy.commands.bench import bench
 from deploy.commands.check import check
 from deploy.dpu.board import load_dpu
-from deploy.dpu.cost.layers import Constants
-from deploy.dpu.cost.validation import refit
+from deploy.dpu.cost.constants import Constants
+from deploy.dpu.cost.runs import refit
 from deploy.results import SCHEMA_PATH
 from profiles import load_sensor
 from profiles.errors import BeersError, ImageError, OptionError, ProfileError
@@ -67,7 +67,7 @@ def test_a_swath_is_predicted_as_the_paper_counts_and_in_whole_tiles(tmp_path: P
     fraction, whole = predicted_rows("ConvBEERS", prediction, swath, DPU)
     assert value(fraction, "latency") == pytest.approx(swath.frames / prediction.fps)
     assert value(whole, "tiles") == 384
-    assert value(whole, "latency") == pytest.approx(128 * prediction.batch_time_s)
+    assert value(whole, "latency") == pytest.approx(128 * prediction.batch / prediction.fps)
     for row in (fraction, whole):
         assert {figure.mode for figure in row.figures.values()} == {"predicted"}
         low, high = row.figures["latency"].interval or (0, 0)
@@ -81,7 +81,7 @@ def test_a_swath_is_predicted_as_the_paper_counts_and_in_whole_tiles(tmp_path: P
 def test_a_last_batch_that_is_not_full_still_takes_its_time(tmp_path: Path) -> None:
     prediction = predict_file(float_convbeers(tmp_path / "f.onnx", 1, 16), DPU, 64)
     _, whole = predicted_rows("net", prediction, Swath(64, 64, 64, 5), DPU)
-    assert value(whole, "latency") == pytest.approx(prediction.batch_time_s)
+    assert value(whole, "latency") == pytest.approx(prediction.batch / prediction.fps)
 
 
 def test_rows_of_layers_sum_to_their_last(tmp_path: Path) -> None:
@@ -211,7 +211,7 @@ def test_constants_are_refitted_to_a_boards_runs(tmp_path: Path) -> None:
     assert {row["name"] for row in rows if row["table"] == "constants"} == {f.name for f in fields(Constants)}
     found = [dict(row["figures"]) for row in rows if row["table"] == "runs"]  # type: ignore[call-overload]
     for figures in found:
-        assert figures["shipped is off by"]["value"] == pytest.approx(100, abs=1 if figures is found[0] else 20)
+        assert figures["shipped is off by"]["value"] == pytest.approx(100, abs=1 if figures is found[0] else 60)
         assert abs(figures["refitted is off by"]["value"]) < 50
     (swath, *_) = (dict(row["figures"]) for row in rows if row["table"] == "bench")  # type: ignore[call-overload]
     assert swath["throughput"]["value"] == pytest.approx(found[0]["refitted"]["value"], rel=1e-6)

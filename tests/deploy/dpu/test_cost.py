@@ -6,8 +6,12 @@ import pytest
 from deploy.bench.tables import PAPER_TILE_PX, predict_file
 from deploy.dpu.board import load_dpu
 from deploy.dpu.checker.placement import place
+from deploy.dpu.cost.constants import Structure
 from deploy.dpu.cost.latency import Prediction, predict
-from deploy.dpu.zoo.dense import convbeers
+from deploy.dpu.cost.work import count_work
+from deploy.dpu.graph import Network
+from deploy.dpu.zoo.builder import Builder
+from deploy.dpu.zoo.networks import convbeers
 from profiles.errors import ModelError
 from tests.deploy.dpu.graphs import Sketch, board_convbeers, float_convbeers, integer_convbeers
 
@@ -59,7 +63,8 @@ def test_layers_and_overhead_sum_to_the_batch(tmp_path: Path, configuration: str
     prediction = predict_file(integer_convbeers(tmp_path / "i.onnx", 3, 20), dpu, 177)
     parts = [*(layer.time_s for layer in prediction.layers), prediction.overhead_s]
     assert math.fsum(parts) == prediction.batch_time_s
-    assert prediction.fps * prediction.batch_time_s == pytest.approx(dpu.batch, rel=1e-12)
+    assert prediction.fps == prediction.rate(prediction.batch_time_s, prediction.host_s)
+    assert prediction.fps * prediction.batch_time_s < dpu.batch
 
 
 def test_the_three_encodings_cost_the_same(tmp_path: Path) -> None:
@@ -98,20 +103,64 @@ def test_first_layers_gather_their_window(tmp_path: Path) -> None:
     assert head.array_operations == 2 * 3 * 16 * 32 * 96 * 96
 
 
-def test_what_three_branches_read_passes_through_memory(tmp_path: Path) -> None:
-    """A module of three branches: its input read thrice, each branch written for the concat; of two branches: not."""
-    moved = {}
+def moved(network: Network, joined: float) -> int:
+    """Map bytes that an image moves."""
+    works = count_work(network.operations, DPU, Structure(0, 2, joined))
+    return sum(work.load_map_bytes + work.store_map_bytes for work in works)
+
+
+@pytest.mark.parametrize("joined", [0, 1])
+def test_what_three_branches_read_passes_through_memory(joined: float) -> None:
+    """A module of three branches: its input read thrice, each branch written for the concat or not; of two: not."""
+    found = {}
     for branches in (2, 3):
-        sketch = Sketch(16)
-        stem = sketch.conv("image", (16, 16, 3, 3))
-        ends = [sketch.conv(stem, (16, 16, 1, 1)) for _ in range(branches)]
-        path = sketch.save(
-            tmp_path / f"{branches}.onnx", sketch.conv(sketch.node("Concat", *ends, axis=1), (8, 16 * branches, 1, 1))
+        b = Builder(32, 32, 16)
+        stem = b.conv(b.image, 16)
+        ends = [b.conv(stem, 16, 1) for _ in range(branches)]
+        found[branches] = moved(b.written(b.conv(b.concat(ends[0], *ends[1:]), 8, 1)).network, joined) / (
+            16 * 32 * 32
         )
-        moved[branches] = predict_file(path, DPU, 32).streamed_bytes / (16 * 32 * 32)
     image, result = 1, 0.5
-    assert moved[2] == image + 2 + result
-    assert moved[3] == image + 1 + 3 + 3 + result
+    assert found[2] == image + 2 * joined + result
+    assert found[3] == image + 1 + 3 + 3 * joined + result
+
+
+def test_an_add_that_reads_what_its_convolution_read_reads_it_once() -> None:
+    """Its operand is on the chip while the convolution runs; behind two convolutions it is not."""
+    extra = {}
+    for convs in (1, 2):
+        sums = []
+        for added in (False, True):
+            b = Builder(256, 256, 32)
+            x = first = b.conv(b.image, 32)
+            for _ in range(convs):
+                x = b.conv(x, 32)
+            sums.append(moved(b.written(b.conv(b.add(x, first) if added else x, 8, 1)).network, 1))
+        extra[convs] = sums[1] - sums[0]
+    assert extra == {1: 0, 2: 32 * 256 * 256}
+
+
+@pytest.mark.parametrize("block", [2, 4])
+def test_a_pixel_shuffle_is_no_more_than_where_results_go(block: int) -> None:
+    sums = []
+    for shuffled in (False, True):
+        b = Builder(256, 256, 3)
+        x = b.conv(b.image, 3 * block**2)
+        x = b.shuffle(x, block) if shuffled else x
+        net = b.written(b.conv(x, x.channels, 1)).network
+        sums.append(moved(net, 1) - net.operations[-1].out_bytes)
+        assert len(count_work(net.operations, DPU, Structure(0, 2, 1))) == 2
+    assert sums[0] == sums[1]
+
+
+def test_a_transposed_convolution_runs_over_the_zeros_between_its_pixels() -> None:
+    b = Builder(64, 64, 32)
+    grown, plain = b.transposed(b.image, 32, 2, 2), Builder(128, 128, 32)
+    works = [
+        count_work(net.operations, DPU, Structure(0, 2, 1))[0]
+        for net in (b.written(grown).network, plain.written(plain.conv(plain.image, 32, 2)).network)
+    ]
+    assert works[0].array_operations == works[1].array_operations == 4 * works[0].operations
 
 
 def test_each_layer_names_its_bound(papers_prediction: Prediction) -> None:
@@ -121,24 +170,26 @@ def test_each_layer_names_its_bound(papers_prediction: Prediction) -> None:
         assert max(parts.values()) <= layer.time_s <= math.fsum(parts.values()) * (1 + 1e-12)
 
 
-def test_inside_the_fitted_range_the_interval_is_the_narrow_one(tmp_path: Path) -> None:
-    """3 blocks of 64 at 128 x 128 lie inside; at 640 x 640 the maps do not, and the interval says so."""
+def test_the_interval_is_that_of_the_regime(tmp_path: Path) -> None:
+    """3 blocks of 64 at 128 x 128 have small maps, at 640 x 640 large ones; 1024 x 1024 lies beyond all fitted."""
     path = float_convbeers(tmp_path / "f.onnx", 3, 64)
-    inside, outside = (predict_file(path, DPU, side) for side in (128, 640))
-    spread = math.exp(DPU.value("cost", "error_inside"))
-    assert inside.outside == ()
-    assert inside.fps_interval == pytest.approx((inside.fps / spread, inside.fps * spread))
+    small, large, outside = (predict_file(path, DPU, side) for side in (128, 640, 1024))
+    for prediction, name in ((small, "width_small_maps"), (large, "width_large_maps"), (outside, "width_outside")):
+        spread = math.exp(DPU.value("cost", name))
+        assert prediction.fps_interval == pytest.approx((prediction.fps / spread, prediction.fps * spread))
+    assert (small.outside, large.outside) == ((), ())
     assert any("largest map" in word for word in outside.outside)
-    low, high = outside.fps_interval
-    assert low < outside.fps / spread < outside.fps * spread < high
+    assert DPU.value("cost", "width_outside") >= DPU.value("cost", "width_large_maps")
 
 
 def test_a_host_that_is_slower_sets_the_rate(tmp_path: Path) -> None:
     """A network of one small layer: the host cannot bring its images fast enough."""
     sketch = Sketch(8)
     prediction = predict_file(sketch.save(tmp_path / "s.onnx", sketch.conv("image", (1, 8, 1, 1))), DPU, 640)
-    assert prediction.host_s > prediction.batch_time_s / prediction.batch
-    assert prediction.fps == pytest.approx(1 / prediction.host_s)
+    dpu_s = prediction.batch_time_s / prediction.batch
+    assert prediction.host_s > dpu_s
+    assert prediction.regime == "host"
+    assert 1 / (prediction.host_s + dpu_s) < prediction.fps < 1 / prediction.host_s
 
 
 def test_more_batch_handlers_gain_less_on_large_maps(papers: Path) -> None:

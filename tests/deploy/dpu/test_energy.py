@@ -6,7 +6,7 @@ from deploy.bench.tables import predict_file
 from deploy.dpu.board import load_dpu
 from deploy.dpu.checker.placement import place
 from deploy.dpu.cost.latency import counted_power, image_energy_j, layer_energy_j, predict
-from deploy.dpu.zoo.dense import convbeers
+from deploy.dpu.zoo.networks import convbeers
 from tests.deploy.dpu.graphs import float_convbeers
 
 DPU = load_dpu("vck190")

@@ -9,7 +9,7 @@ from deploy.bench.tables import Swath
 from deploy.dpu.board import load_dpu
 from deploy.dpu.checker.placement import place
 from deploy.dpu.cost.latency import predict
-from deploy.dpu.zoo.dense import convbeers
+from deploy.dpu.zoo.networks import convbeers
 from deploy.tradeoff.accuracy import Scores
 from deploy.tradeoff.board import DpuRun
 from deploy.tradeoff.host_time import Times

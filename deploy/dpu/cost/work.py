@@ -1,0 +1,149 @@
+"""What one image asks of the DPU's parts, operation by operation, counted from shapes alone."""
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from deploy.dpu.board import Dpu
+from deploy.dpu.checker.finding import groups_of
+from deploy.dpu.cost.constants import Structure
+from deploy.dpu.graph import Operation, Shape
+
+FUSED = ("activation", "quantise", "dequantise", "pixel shuffle")
+"""Kinds that cost nothing: done on the way out of the operation before; a pixel shuffle is where its results go."""
+UNSTARTED = ("add", "mul", "concat")
+"""Kinds without a start of their own: fused with the operation before, or no more than places."""
+SHARING = 2
+"""Readers of one result up to which the DPU keeps it; with more of them it passes through memory."""
+
+
+@dataclass(frozen=True)
+class Work:
+    """One operation: what it counts for one image; its weights are loaded once a batch and core."""
+
+    name: str
+    kind: str
+    operations: int
+    array_operations: int  # computed by the array, used or not
+    lane_steps: int  # values that the ALU or the element-wise engine takes in, unused lanes included
+    weight_bytes: int
+    load_map_bytes: int
+    store_map_bytes: int
+
+    @property
+    def array_use(self) -> float:
+        """Operations used over computed, 0 to 1; 1 for what does not run on the array."""
+        return self.operations / self.array_operations if self.array_operations else 1.0
+
+    @property
+    def launched(self) -> bool:
+        """Whether it has a start of its own."""
+        return self.kind not in UNSTARTED
+
+
+def count_work(operations: Sequence[Operation], dpu: Dpu, structure: Structure) -> tuple[Work, ...]:
+    """The work of operations that run one behind the other on the DPU."""
+    flow = _Flow(operations, dpu, joined=bool(structure.joined))
+    return tuple(_count(op, flow, dpu) for op in operations if op.kind not in FUSED)
+
+
+def _count(op: Operation, flow: "_Flow", dpu: Dpu) -> Work:
+    array, lanes = _array_operations(op, dpu), _lane_steps(op, dpu)
+    return Work(op.name, op.kind, op.operations, array, lanes, op.weight_bytes, flow.load(op), flow.store(op))
+
+
+def _array_operations(op: Operation, dpu: Dpu) -> int:
+    """Input and output channels and pixels are filled up; fewer inputs than lanes gather the columns of a window.
+
+    A transposed convolution runs over the zeros between its pixels.
+    """
+    if op.kind not in ("conv", "transposed"):
+        return 0
+    lanes, (inputs, outputs), (rows, columns) = dpu.input_parallel, op.channels, op.window.kernel
+    gathered = rows * _up(columns * inputs, lanes) if inputs < lanes else rows * columns * _up(inputs, lanes)
+    pixels = _positions(op.out_shape, dpu, "array", "pixel_parallel")
+    return 2 * gathered * _up(outputs, dpu.output_parallel) * pixels
+
+
+def _lane_steps(op: Operation, dpu: Dpu) -> int:
+    if op.kind not in ("depthwise", "pool", "add", "mul") or not op.in_shapes or op.in_shapes[0] is None:
+        return 0
+    passes = max(op.channels[1] // max(op.channels[0], 1), 1) if op.kind == "depthwise" else 1
+    taps = op.window.kernel[0] * op.window.kernel[1] * passes
+    channels = _up(op.in_shapes[0][0], dpu.whole("elementwise", "channels_per_cycle"))
+    return taps * channels * _positions(op.out_shape, dpu, "elementwise", "pixels_per_cycle")
+
+
+def _positions(shape: Shape | None, dpu: Dpu, table: str, key: str) -> int:
+    """Output pixels, rows filled up to the pixels computed at a time."""
+    return shape[1] * _up(shape[2], dpu.whole(table, key)) if shape else 0
+
+
+def _up(count: int, size: int) -> int:
+    return groups_of(count, size) * size
+
+
+class _Flow:
+    """Which results pass through memory: those that a group of feature-map banks cannot hold, or not for long."""
+
+    def __init__(self, operations: Sequence[Operation], dpu: Dpu, *, joined: bool) -> None:
+        self._kept_bytes, self._lanes = kept_bytes(dpu), dpu.input_parallel
+        self._same: dict[str, str] = {}
+        for op in operations:
+            if op.kind in FUSED:
+                self._same |= dict.fromkeys(op.outputs, self._root(op.inputs[0]))
+        computing = [op for op in operations if op.kind not in FUSED]
+        self._order = {name: when for when, op in enumerate(computing) for name in op.outputs}
+        self._shapes = {op.output: op.out_shape for op in computing}
+        self._reads = {name: {self._root(i) for i in op.inputs} for op in computing for name in op.outputs}
+        self._readers = Counter(self._root(name) for op in computing for name in op.inputs)
+        self._joined = {self._root(i) for op in computing if joined and op.kind == "concat" for i in op.inputs}
+        self._sums = {self._root(self._fused(op)): op.output for op in computing if op.kind in ("add", "mul")}
+
+    def load(self, op: Operation) -> int:
+        """Bytes read: all operands but the one that an add is fused with, and what that one has read already."""
+        if op.kind == "concat":
+            return 0
+        here = set()
+        if op.kind in ("add", "mul"):
+            fused = self._root(self._fused(op))
+            here = {fused, *self._reads.get(fused, ())}
+        fed = zip(op.inputs, op.in_shapes, strict=True)
+        return sum(_size(shape) for name, shape in fed if self._root(name) not in here and self._leaves(name))
+
+    def store(self, op: Operation) -> int:
+        """Bytes written; an add's are those of the operation that it is fused with."""
+        if op.kind in UNSTARTED:
+            return 0
+        name = self._root(op.output)
+        while name in self._sums and self._readers[name] == 1:
+            name = self._sums[name]
+        last = not self._readers[name]
+        return _size(op.out_shape) if last or name in self._joined or self._leaves(name) else 0
+
+    def _fused(self, add: Operation) -> str:
+        """The operand of an add that is made last."""
+        return max(add.inputs, key=lambda name: self._order.get(self._root(name), -1))
+
+    def _leaves(self, name: str) -> bool:
+        root = self._root(name)
+        shape = self._shapes.get(root)
+        held = _up(shape[0], self._lanes) * shape[1] * shape[2] if shape else 0
+        return root not in self._order or held > self._kept_bytes or self._readers[root] > SHARING
+
+    def _root(self, name: str) -> str:
+        return self._same.get(name, name)
+
+
+def kept_bytes(dpu: Dpu) -> float:
+    """The largest result that stays on the chip: a group of banks is read while another is written."""
+    return dpu.value("memory", "feature_map_bytes") * dpu.value("memory", "feature_map_groups") / 2
+
+
+def _size(shape: Shape | None) -> int:
+    return shape[0] * shape[1] * shape[2] if shape else 0
+
+
+def largest_map_bytes(operations: Sequence[Operation]) -> int:
+    """The largest result of a network."""
+    return max(op.out_bytes for op in operations if op.kind not in FUSED)

@@ -1,0 +1,86 @@
+"""What is judged is never what was chosen by, and intervals hold what they promise."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from deploy.dpu.cost.constants import STRUCTURES
+from deploy.dpu.cost.fit import Cases
+from deploy.dpu.cost.published import boards, published_cases
+from deploy.dpu.cost.regimes import LARGE_MAP_BYTES, regime_of
+from deploy.dpu.cost.validation import (
+    Trial,
+    Widths,
+    by_network,
+    coverage,
+    family_quantile,
+    left_out_rows,
+)
+
+BOARD = "vek280"  # the fewest rates
+
+
+@pytest.fixture(scope="module")
+def trials() -> list[Trial]:
+    return [Trial(published_cases(BOARD, structure)) for structure in STRUCTURES]
+
+
+def test_nothing_of_a_family_reaches_what_is_said_of_it(trials: list[Trial]) -> None:
+    """Its rates a thousand times as high: the structure, the prediction and the width stay the same."""
+    name = "yolo v4"
+    before = left_out_rows(trials, name)
+    after = left_out_rows([Trial(_raised(trial.cases, name)) for trial in trials], name)
+    assert before
+    for was, now in zip(before, after, strict=True):
+        assert now.width == pytest.approx(was.width, rel=1e-2)
+        assert now.error - was.error == pytest.approx(-np.log(1000), abs=1e-2)
+
+
+def _raised(cases: Cases, family: str) -> Cases:
+    return Cases(
+        tuple(
+            replace(row, fps=tuple(1000 * f for f in row.fps), fps_single=()) if row.family == family else row
+            for row in cases.rows
+        ),
+        cases.structure,
+    )
+
+
+sizes = st.lists(st.floats(0.01, 2), min_size=3, max_size=30)
+
+
+@given(sizes)
+def test_the_quantile_is_a_familys_largest_and_holds_nine_of_ten(values: list[float]) -> None:
+    families = [f"f{index // 2}" for index in range(len(values))]
+    found = family_quantile(np.array(values), families)
+    largest = [max(v for v, f in zip(values, families, strict=True) if f == name) for name in set(families)]
+    assert found in largest
+    assert np.mean([value <= found for value in largest]) >= min(0.9, 1 - 1 / (len(largest) + 1))
+
+
+@pytest.mark.parametrize("board", boards())
+def test_widths_made_of_errors_hold_nine_of_ten_of_their_families(board: str) -> None:
+    cases = published_cases(board, STRUCTURES[0])
+    errors = np.linspace(-0.5, 0.5, len(cases.rows))
+    regimes = [regime_of(index % 3 == 0, row.map_bytes) for index, row in enumerate(cases.rows)]
+    widths = Widths.of(errors, cases, regimes).by_regime
+    inside = np.array([abs(x) <= widths[kind] + 1e-12 for x, kind in zip(errors, regimes, strict=True)])
+    families = np.array([row.family for row in cases.rows])
+    assert np.mean([inside[families == name].all() for name in set(families)]) >= 0.9
+
+
+def test_regimes() -> None:
+    assert regime_of(host_bound=True, map_bytes=1e9) == "host"
+    assert regime_of(host_bound=False, map_bytes=LARGE_MAP_BYTES) == "small maps"
+    assert regime_of(host_bound=False, map_bytes=LARGE_MAP_BYTES + 1) == "large maps"
+
+
+def test_a_network_weighs_the_same_however_many_rates_it_has(trials: list[Trial]) -> None:
+    row = left_out_rows(trials, "yolo v4")[0]
+    good = replace(row, network="a", family="a", rates=(0.0,) * 9, width=0.1)
+    bad = replace(row, network="b", family="b", rates=(1.0,), width=0.1)
+    assert coverage([good, bad]) == (0.5, 0.5)
+    assert by_network([good, bad]) == pytest.approx({"a": 0.0, "b": np.expm1(1)})
