@@ -57,7 +57,7 @@ PATHS = {
         ("sensor", "target"),
     ),
     "check": Paths({"picture": FILE, "json": FILE}, ("model",), ("target",)),
-    "bench": Paths({"json": FILE}, ("model", "image", "measured")),
+    "bench": Paths({"json": FILE}, ("model", "image", "measured"), ("target",)),
     "restore": Paths({"out": FILE, "json": FILE}, ("image", "model"), ("sensor",)),
     "evaluate": Paths(
         {"out": FOLDER, "json": FILE}, ("images", "pairs", "lpips"), ("sensor", "reference", "methods")
@@ -66,7 +66,7 @@ PATHS = {
     "tradeoff": Paths(
         {"out": FOLDER, "cache": FOLDER, "json": FILE},
         ("images", "lpips", "calibration"),
-        ("sensor", "reference", "networks"),
+        ("sensor", "reference", "networks", "target"),
     ),
     "compare": Paths({"json": FILE}, ("before", "after")),
 }

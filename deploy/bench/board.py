@@ -24,7 +24,7 @@ from deploy.bench.tables import (
     sweep_rows,
     within_words,
 )
-from deploy.dpu.board import Dpu, load_dpu
+from deploy.dpu.board import Dpu, dpu_of
 from deploy.dpu.cost.runs import refit
 from deploy.dpu.reading import own_tile_px
 from deploy.restoration.options import parse_halo
@@ -174,7 +174,8 @@ def _boards(request: BoardRequest) -> tuple[list[Dpu], list[tuple[str, list[Row]
         names = board_names()
     else:
         names = [request.target]
-    boards = [load_dpu(name, config) for name in names for config in _configurations(name, request.config)]
+    targets = map(load_target, names)
+    boards = [dpu_of(target, config) for target in targets for config in _configurations(target, request.config)]
     if request.measured is None:
         return boards, []
     found = refit(request.measured, boards[0])
@@ -182,8 +183,8 @@ def _boards(request: BoardRequest) -> tuple[list[Dpu], list[tuple[str, list[Row]
     return [found.applied(dpu) for dpu in boards], shown
 
 
-def _configurations(target: str, config: str | None) -> list[str | None]:
-    return list(load_target(target).configurations) if config == ALL else [config]
+def _configurations(target: TargetProfile, config: str | None) -> list[str | None]:
+    return list(target.configurations) if config == ALL else [config]
 
 
 def _require_all(request: BoardRequest) -> None:

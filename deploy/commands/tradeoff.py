@@ -9,12 +9,14 @@ import typer
 from deploy.commands.shared import say
 from model.processor import SEEDS
 from model.shipped import SENSOR
+from profiles.target import DEFAULT_TARGET, board_names
 
 if TYPE_CHECKING:
     from deploy.tradeoff.study import Study
 
 EXAMPLE = "tradeoff --images aerial/ --out study/ --budget 'latency<=20s'"
 PAPER_SIZE = "13600x9016"
+BOARDS = ", ".join(board_names())
 SHOWN = ("PSNR", "LPIPS-squeeze", "host p50", "board latency", "board energy")
 """Figures on the terminal; the report and the document hold all."""
 
@@ -45,6 +47,7 @@ def tradeoff(
     calibration: Annotated[
         Path | None, typer.Option(help="Folder of scenes to make missing INT8 files on; drawn ones if none.")
     ] = None,
+    target: Annotated[str, typer.Option(help=f"The modelled board: {BOARDS}, or your .toml file.")] = DEFAULT_TARGET,
     size: Annotated[str, typer.Option(help="Width x height of the swath in pixels.")] = PAPER_SIZE,
     cache: Annotated[Path | None, typer.Option(help="Folder of kept measurements; OUT/cache if none.")] = None,
     seed: Annotated[int, typer.Option(min=0, max=SEEDS, help="Seed of every random draw.")] = 0,
@@ -84,12 +87,14 @@ def tradeoff(
         demands[0],
         demands[1],
         seed,
+        target,
     )
     result = run_study(request, Cache(kept), partial(say, err=True))
     write_study(result.study, out)
     show(result.study)
     arguments: dict[str, object] = {"images": images, "sensor": sensor, "reference": aim, "size": size}
     arguments |= {"networks": networks, "budget": budget, "need": need, "calibration": calibration, "seed": seed}
+    arguments |= {"target": target}
     document = Document("tradeoff", arguments, request.files, result.rows)
     for path in (figures, json):
         document.write(path)

@@ -113,10 +113,14 @@ def load_dpu(target: str, configuration: str | None = None) -> Dpu:
         ProfileError: unknown target or configuration, or constants that no board has.
         OptionError: a target without a DPU.
     """
-    profile = load_target(target)
+    return dpu_of(load_target(target), configuration)
+
+
+def dpu_of(profile: TargetProfile, configuration: str | None = None) -> Dpu:
+    """As `load_dpu`, of a target that has been read: of a user's file its name alone would not be found."""
     if not profile.configurations:
         expected = f"a target with a DPU: {', '.join(board_names())}"
-        raise OptionError("--target", expected=expected, got=repr(target), remedy="choose another")
+        raise OptionError("--target", expected=expected, got=repr(profile.name), remedy="choose another")
     name, constants = profile.configuration(configuration)
     for key, least in CONFIGURATION.items():
         _require(f"{profile.name} [configurations.{name}] {key}", constants.get(key), least)

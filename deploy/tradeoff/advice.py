@@ -317,12 +317,17 @@ def _of(outcome: Outcome, *keys: str) -> str:
 
 
 def notes(
-    benchmark: BenchmarkSet, sampled: str, small: Sequence[str], lacks: Mapping[str, str], calibrated_on: str
+    benchmark: BenchmarkSet,
+    sampled: str,
+    small: Sequence[str],
+    lacks: Mapping[str, str],
+    calibrated_on: str,
+    board: str,
 ) -> tuple[str, ...]:
     """Sentences, the most important first; `sampled` says at what oversampling, where that is not the profile's."""
-    spread = f"{math.exp(pair_error()):.2f} times either way ({PAIR_QUANTILE:.0%} of published pairs)"
+    spread = f"{math.exp(pair_error(board)):.2f} times either way ({PAIR_QUANTILE:.0%} of published pairs)"
     found = [
-        "No board was used: figures of the board are predicted, its power is an assumption that no network changes.",
+        f"No board was used: figures of {board} are predicted, its power is an assumption that no network changes.",
         f"Pictures are judged on {len(benchmark.pairs)} whole images of {len(set(benchmark.sites))} sites.",
         "The paper's shape is judged with the weights of that shape at hand, not with the paper's own.",
         "Points are distinguished by the differences on the same images: their own intervals show how images differ.",

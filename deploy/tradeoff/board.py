@@ -29,12 +29,12 @@ from deploy.dpu.board import Dpu, load_dpu
 from deploy.dpu.checker.placement import place
 from deploy.dpu.cost.constants import Constants, Structure
 from deploy.dpu.cost.latency import Prediction, dpu_power, predict
-from deploy.dpu.cost.published import published_cases
+from deploy.dpu.cost.published import boards, published_cases
 from deploy.dpu.cost.validation import leave_out, regimes_of
 from deploy.dpu.reading import network_of
 from model.traditional.settings import QUALITIES
 from model.traditional.work import chain_work
-from profiles import load_target
+from profiles import TargetProfile
 from profiles.figures import Figure, predicted
 
 FRAME_PX = 640
@@ -82,27 +82,29 @@ class CpuRun:
 
     time: CpuTime
     swath: Swath
+    board: TargetProfile
 
     def figures(self) -> dict[str, Figure]:
         """The five figures of the board."""
-        row = board_cpu_row(self.time, self.swath, load_target("vck190"), measured_rates())
+        row = board_cpu_row(self.time, self.swath, self.board, measured_rates())
         return _figures(row.figures["latency"], row.figures["power"], self.swath)
 
 
-def cpu_run(method: str, cpu_s: Interval, swath: Swath) -> CpuRun:
+def cpu_run(method: str, cpu_s: Interval, swath: Swath, board: TargetProfile) -> CpuRun:
     """A method of that name; of the chains the kinds of work are known, of others not.
 
     Args:
         method: as points are called.
         cpu_s: CPU time here that the swath takes, least and most, in s.
         swath: the image it is about.
+        board: whose processor is meant.
     """
     quality = QUALITIES.get(method.removeprefix(CHAIN))
     if quality is None:
-        return CpuRun(CpuTime(cpu_s, {}), swath)
+        return CpuRun(CpuTime(cpu_s, {}), swath, board)
     rates, work = measured_rates(), chain_work(swath.height_px, swath.width_px, quality)
     explained = math.fsum(rates.times_s(work).values()) / math.sqrt(cpu_s[0] * cpu_s[1])
-    return CpuRun(chain_time(cpu_s, work, rates, explained), swath)
+    return CpuRun(chain_time(cpu_s, work, rates, explained), swath, board)
 
 
 BoardRun = DpuRun | CpuRun
@@ -120,7 +122,9 @@ def latency_ratio(a: BoardRun, b: BoardRun) -> Interval:
     """How many times as long `a` takes as `b`: see the module's rule."""
     if isinstance(a, DpuRun) and isinstance(b, DpuRun):
         ratios = [a.latency_s(serial) / b.latency_s(serial) for serial in HIDING]
-        spread = 1.0 if _same(a, b) and a.swath.tile_px == b.swath.tile_px else math.exp(pair_error())
+        spread = (
+            1.0 if _same(a, b) and a.swath.tile_px == b.swath.tile_px else math.exp(pair_error(a.dpu.target.name))
+        )
         return min(ratios) / spread, max(ratios) * spread
     if isinstance(a, CpuRun) and isinstance(b, CpuRun):
         if a == b:
@@ -152,13 +156,16 @@ def _apart(a: BoardRun, b: BoardRun, key: str) -> Interval:
 
 
 @cache
-def pair_error() -> float:
+def pair_error(board: str) -> float:
     """What ln of the ratio of two published rates was off by, at most, in 9 of 10 pairs of one family.
 
-    Each network predicted without itself; only rates that the DPU bounds.
+    Each network predicted without itself; only rates that the DPU bounds. Of a board without published rates it is
+    that of the board which is farthest off.
     """
-    dpu = load_dpu("vck190")
-    cases = published_cases("vck190", Structure.of(dpu))
+    if board not in boards():
+        return max(pair_error(other) for other in boards())
+    dpu = load_dpu(board)
+    cases = published_cases(board, Structure.of(dpu))
     errors = leave_out(cases, [row.network for row in cases.rows])
     regimes = regimes_of(cases, Constants.of(dpu))
     kept = [(row, error) for row, error, kind in zip(cases.rows, errors, regimes, strict=True) if kind != "host"]

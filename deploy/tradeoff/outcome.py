@@ -13,7 +13,7 @@ from typing import Protocol
 import numpy as np
 
 from deploy.bench.tables import Swath
-from deploy.dpu.board import load_dpu
+from deploy.dpu.board import dpu_of
 from deploy.tradeoff.accuracy import FLAT, MAE, Scores, seam_density, with_seams
 from deploy.tradeoff.board import FIGURES as BOARD
 from deploy.tradeoff.board import BoardRun, DpuRun, cpu_run, energy_ratio, latency_ratio, predict_model
@@ -24,6 +24,7 @@ from deploy.tradeoff.points import EXACT, NAMES, Point, on_dpu
 from model.evaluation.methods import Method
 from model.evaluation.scores import mean_row
 from model.metrics.bootstrap import site_interval
+from profiles import TargetProfile
 from profiles.errors import ModelError
 from profiles.figures import Figure, Row, measured, predicted, unavailable
 from quant.onnx_file import load_onnx
@@ -229,6 +230,7 @@ class Assembly:
     measurements: Measurements
     swath: Swath
     lacks: Mapping[str, str]
+    target: TargetProfile
 
     def outcome(self, point: Point) -> Outcome:
         """All that is known of a point."""
@@ -291,12 +293,12 @@ class Assembly:
         if point.variant.kind != "network":
             assert times is not None  # noqa: S101 - its job has run
             low, high = times.cpu_per_px()
-            return cpu_run(point.variant.method, (low * swath.pixels, high * swath.pixels), swath)
+            return cpu_run(point.variant.method, (low * swath.pixels, high * swath.pixels), swath, self.target)
         file = self.measurements.store.int8_file(point.variant)
         if not on_dpu(point.variant) or file is None:
             return DPU_ONLY
         try:
-            dpu = load_dpu("vck190", point.configuration)
+            dpu = dpu_of(self.target, point.configuration)
             return DpuRun(point.variant.method, dpu, predict_model(load_onnx(file), dpu, point.tile_px), swath)
         except ModelError as error:
             return str(error).rstrip(".")

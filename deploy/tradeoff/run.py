@@ -9,9 +9,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from deploy.bench.host import Sensors, drawn_acquisition
-from deploy.bench.tables import Swath, layer_rows
+from deploy.bench.tables import PAPER_TARGET, Swath, layer_rows
 from deploy.cache import Cache
-from deploy.dpu.board import load_dpu
+from deploy.dpu.board import dpu_of
 from deploy.dpu.checker.placement import place
 from deploy.dpu.checker.table import network_rows
 from deploy.dpu.reading import network_of
@@ -35,6 +35,7 @@ from model.evaluation.targets import acquire_targets
 from model.io.files import sha256
 from model.io.images import MAX_DN
 from model.io.pictures import busiest_windows
+from profiles import load_target
 from profiles.figures import Row
 from quant.onnx_file import load_onnx
 from quant.tiling.walk import Tiling
@@ -122,20 +123,23 @@ def run_study(request: Request, cache: Cache, say: Say = silent) -> StudyRun:
     Raises:
         BeersError: a network, an image, a profile or weights that cannot be used.
     """
-    swath = Swath(*request.size_px)
+    swath, target = Swath(*request.size_px), load_target(request.target)
     store = make_store(request, cache, say)
     benchmark, small = make_benchmark(request)
     measurements = Measurements(store, benchmark, host_tile(store, request.seed), cache)
-    points = select_points(store, swath)
+    points = select_points(store, swath, target)
     lacks = lacking(store, points)
     there = [point for point in points if str(point.variant) not in lacks]
     run_jobs(measurements.jobs(there, list(dict.fromkeys(point.variant for point in there))))
-    assembly = Assembly(measurements, swath, lacks)
-    outcomes = [*(assembly.outcome(point) for point in points), *paper_outcomes(swath)]
+    assembly = Assembly(measurements, swath, lacks, target)
+    outcomes = [
+        *(assembly.outcome(point) for point in points),
+        *(paper_outcomes(swath) if target.name == PAPER_TARGET else []),
+    ]
     results = Results({each.name: each for each in outcomes}, benchmark.sites, request.seed)
     sampled = oversampling_note(benchmark.pairs, request.profiles[0])
     return _put_together(
-        request, measurements, results, notes(benchmark, sampled, small, lacks, calibrated_on(request))
+        request, measurements, results, notes(benchmark, sampled, small, lacks, calibrated_on(request), target.name)
     )
 
 
@@ -143,7 +147,9 @@ def _put_together(
     request: Request, measurements: Measurements, results: Results, remarks: tuple[str, ...]
 ) -> StudyRun:
     outcomes, found = list(results.outcomes.values()), fronts(results)
-    paper = papers_point(results, lambda method: is_papers(measurements.store.model(method)), load_dpu("vck190").name)
+    paper = papers_point(
+        results, lambda method: is_papers(measurements.store.model(method)), dpu_of(load_target(request.target)).name
+    )
     asked = [*request.budget, *request.need]
     choice = choose(results, request.budget, request.need) if asked else Choice(None, ())
     shown = crop_points(outcomes, found, [choice.outcome, paper])

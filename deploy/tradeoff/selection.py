@@ -9,7 +9,7 @@ from pathlib import Path
 import onnx
 
 from deploy.bench.tables import PAPER_TILE_PX, Swath, swath_latency
-from deploy.dpu.board import Dpu, load_dpu
+from deploy.dpu.board import Dpu, dpu_of
 from deploy.tradeoff.board import CHAIN, kept_tiles_px, predict_model
 from deploy.tradeoff.methods import MethodStore, Network, conv_weights
 from deploy.tradeoff.points import (
@@ -27,19 +27,21 @@ from model.io.images import list_images
 from model.metrics.backbones import find_backbone
 from model.traditional.peers import PEERS
 from model.traditional.settings import QUALITIES
+from profiles import TargetProfile
 from profiles.errors import ModelError
 from profiles.sensor import SensorProfile
 from profiles.sensor_file import load_sensor, reference_for
+from profiles.target import DEFAULT_TARGET
 from quant.onnx_file import load_onnx
 from quant.tiling.walk import receptive_radius_px
 
 
-def select_points(store: MethodStore, swath: Swath) -> list[Point]:
+def select_points(store: MethodStore, swath: Swath, target: TargetProfile) -> list[Point]:
     """Networks in the order given, then chains, then library peers."""
     points = [
         point
         for network in store.networks.values()
-        for point in network_points(network.name, precisions_of(network), board_of(network, swath))
+        for point in network_points(network.name, precisions_of(network), board_of(network, swath, target))
     ]
     return points + other_points([CHAIN + quality for quality in QUALITIES], PEERS)
 
@@ -49,10 +51,10 @@ def precisions_of(network: Network) -> Sequence[str]:
     return PRECISIONS if network.float_file else (network.given,)
 
 
-def board_of(network: Network, swath: Swath) -> Board:
+def board_of(network: Network, swath: Swath, target: TargetProfile) -> Board:
     """Its tiles and configurations worth a look, from the cost model."""
     model = load_onnx(network.int8_file) if network.int8_file and network.given == LEGAL else network.model()
-    dpu, radius_px = load_dpu("vck190"), receptive_radius_px(model)
+    dpu, radius_px = dpu_of(target), receptive_radius_px(model)
 
     def seconds(side_px: int) -> float:
         return latency_s(model, dpu, replace(swath, tile_px=side_px, halo_px=radius_px))
@@ -75,7 +77,7 @@ def latency_s(model: onnx.ModelProto, dpu: Dpu, swath: Swath) -> float:
 def configurations_for(model: onnx.ModelProto, default: Dpu) -> list[str]:
     """The default one; of each width of engine the smallest and the largest, the wide only where most layers are."""
     names = list(default.target.configurations)
-    boards = [load_dpu(default.target.name, name) for name in names]
+    boards = [dpu_of(default.target, name) for name in names]
     usual = statistics.median(shape[0] for shape in conv_weights(model))
     fitting = [dpu for dpu in boards if dpu.output_parallel <= max(usual, default.output_parallel)]
     ends = []
@@ -100,6 +102,7 @@ class Request:
         budget: limits within which the best picture is wanted.
         need: limits that are to be kept at the least cost.
         seed: of every random draw.
+        target: the board.
     """
 
     networks: tuple[str, ...]
@@ -112,6 +115,7 @@ class Request:
     budget: tuple[Demand, ...] = ()
     need: tuple[Demand, ...] = ()
     seed: int = 0
+    target: str = DEFAULT_TARGET
 
     @property
     def profiles(self) -> tuple[SensorProfile, SensorProfile]:

@@ -18,10 +18,11 @@ from deploy.tradeoff.board import (
     pair_error,
     predict_model,
 )
+from profiles import load_target
 from profiles.errors import ModelError
 from quant.onnx_file import load_onnx
 
-SWATH = Swath(2600, 1900)
+SWATH, BOARD = Swath(2600, 1900), load_target("vck190")
 
 
 @pytest.fixture(scope="module")
@@ -49,14 +50,14 @@ def test_another_tile_or_configuration_widens_the_ratio_and_the_power_the_energy
         low, high = latency_ratio(other, base)
         value = (other.figures()["board latency"].value or 0) / (base.figures()["board latency"].value or 1)
         assert low < value < high
-        assert high / low >= math.exp(2 * pair_error()) * (1 - 1e-9)
+        assert high / low >= math.exp(2 * pair_error("vck190")) * (1 - 1e-9)
     (low, high), (least, most) = (f(run(model, configuration="C32B6"), base) for f in (latency_ratio, energy_ratio))
     watts = base.dpu.limit("power", "dpu_range_w")
     assert (least, most) == pytest.approx((low * watts.low / watts.high, high * watts.high / watts.low))
 
 
 def test_a_ratio_read_the_other_way_is_its_inverse(model: onnx.ModelProto) -> None:
-    chain, peer = cpu_run("traditional-fast", (40.0, 60.0), SWATH), cpu_run("peer", (10.0, 12.0), SWATH)
+    chain, peer = cpu_run("traditional-fast", (40.0, 60.0), SWATH, BOARD), cpu_run("peer", (10.0, 12.0), SWATH, BOARD)
     for a, b in ((run(model), run(model, 176)), (run(model), chain), (chain, peer)):
         low, high = latency_ratio(a, b)
         assert latency_ratio(b, a) == pytest.approx((1 / high, 1 / low))
@@ -72,7 +73,7 @@ def test_the_prediction_lies_between_the_two_extremes(model: onnx.ModelProto) ->
 
 def test_chains_compare_without_the_factor_and_against_the_dpu_with_it(model: onnx.ModelProto) -> None:
     slow, fast = (
-        cpu_run(f"traditional-{name}", cpu_s, SWATH)
+        cpu_run(f"traditional-{name}", cpu_s, SWATH, BOARD)
         for name, cpu_s in (("standard", (40.0, 44.0)), ("fast", (20.0, 22.0)))
     )
     assert latency_ratio(slow, fast) == pytest.approx((40 / 22, 44 / 20))
@@ -83,7 +84,10 @@ def test_chains_compare_without_the_factor_and_against_the_dpu_with_it(model: on
 
 
 def test_a_method_of_unknown_kinds_shares_no_factor_and_is_known_worse() -> None:
-    chain, peer = cpu_run("traditional-fast", (20.0, 22.0), SWATH), cpu_run("wiener", (20.0, 22.0), SWATH)
+    chain, peer = (
+        cpu_run("traditional-fast", (20.0, 22.0), SWATH, BOARD),
+        cpu_run("wiener", (20.0, 22.0), SWATH, BOARD),
+    )
     (low, high), (least, most) = (each.figures()["board latency"].interval or (0.0, 0.0) for each in (chain, peer))
     assert least < low < high < most
     assert latency_ratio(chain, peer) == pytest.approx((low / most, high / least))
@@ -98,7 +102,7 @@ def test_figures_of_the_board_hang_together(model: onnx.ModelProto) -> None:
 
 
 def test_published_pairs_disagree_by_some_tens_of_percent() -> None:
-    assert 0.1 < pair_error() < 0.5
+    assert 0.1 < pair_error("vck190") < 0.5
 
 
 def test_tiles_stay_on_chip_up_to_where_the_memory_traffic_jumps(model: onnx.ModelProto) -> None:

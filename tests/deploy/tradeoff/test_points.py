@@ -12,6 +12,7 @@ from deploy.tradeoff.methods import Network, find_networks, is_papers, operation
 from deploy.tradeoff.points import EXACT, LEGAL, PRECISIONS, Board, Variant, network_points, other_points, tiles_px
 from deploy.tradeoff.selection import board_of, configurations_for, precisions_of
 from model.shipped import shipped_names, shipped_weights
+from profiles import load_target
 from profiles.errors import ModelError, OptionError
 
 BOARD = Board(19, 176, 176, ("C32B3", "C32B1", "C32B6"))
@@ -58,7 +59,11 @@ def test_the_shipped_family_makes_some_forty_to_seventy_points() -> None:
     """More would not be measured in 45 minutes, fewer would leave an axis out."""
     networks = find_networks(shipped_names())
     swath = Swath(13600, 9016)
-    points = [p for n in networks for p in network_points(n.name, precisions_of(n), board_of(n, swath))]
+    points = [
+        p
+        for n in networks
+        for p in network_points(n.name, precisions_of(n), board_of(n, swath, load_target("vck190")))
+    ]
     assert 40 <= len(points) + 7 <= 72
     assert {point.halo for point in points} == {"0", "8", "16", EXACT}
     assert len({point.configuration for point in points if point.configuration}) >= 4
