@@ -37,6 +37,7 @@ TARGETS = Path(__file__).parents[1] / "profiles" / "targets"
 PAGE = Path(__file__).parent / "cost-model.md"
 PAPER_BOARD, PAPER_FPS, PAPER_S = "vck190", 7.2, 42
 WORST = 8
+CHOSEN = "the choice of least error on families left out: deploy/dpu/cost/validation.py"
 FITTED = "the published rates of {rows} networks and configurations, deploy/dpu/zoo/published.csv"
 
 
@@ -68,8 +69,7 @@ def cost_table(board: str) -> dict[str, tuple[str, str]]:
     cases = published_cases(board, outcome.structure)
     fitted = "fit to " + FITTED.format(rows=len(cases.rows))
     found = {key: (f"{value:.4g}", fitted) for key, value in asdict(fit(cases).rounded()).items()}
-    chosen = "the one of least error on families left out: deploy/dpu/cost/validation.py"
-    found |= {key: (f"{value:g}", chosen) for key, value in asdict(outcome.structure).items()}
+    found |= {key: (f"{value:g}", CHOSEN) for key, value in asdict(outcome.structure).items()}
     families = len({row.family for row in outcome.rows})
     left_out = f"|ln(predicted / published)| within which nine of ten of {families} families lie, each left out once"
     for kind, width in outcome.widths.by_regime.items():
@@ -113,7 +113,7 @@ def constants_section() -> str:
     structures = {board: nested(board).structure for board in boards()}
     rows += [
         (f"`{name}`", "chosen", *(f"{getattr(s, name):g}" for s in structures.values()))
-        for name in ("serial", "crowding", "joined")
+        for name in ("serial", "crowding", "bursts")
     ]
     return "## Constants\n\n" + table(("constant", "unit", *fitted), rows)
 
@@ -283,28 +283,30 @@ METHOD = """
 ## Formula
 
     compute = array operations / (peak array_efficiency) + lane steps / (lanes lane_efficiency)
-    memory  = longer of (weights + maps) / port and cores (weights + batch handlers maps) / (DDR memory_efficiency)
+    memory  = longer of (weights + maps) / port and cores (weights / BW + handlers maps / (DDR memory_efficiency))
     layer   = longer of the two + serial shorter of the two + layer_s
     DPU     = (sum of layers + batch_s) / images in flight
     host    = (host_image_s + bytes in / rate + bytes out / rate + values / the task's rate) / host's cores
     FPS     = 1 / (DPU^crowding + host^crowding)^(1 / crowding)
 
 One formula for three kinds of DPU: `cores` load their own weights and share the DDR; batch handlers of a core share
-the weights too. Peak, lanes, clocks and DDR are the board's, in its file; what is fitted is shares of them and times.
-With one thread DPU and host take turns: 1 / (one core's DPU + host); such rates are fitted beside.
+the weights too. BW is the DDR's peak where weights cross it in `bursts`, else the rate of maps. Peak, lanes, clocks
+and DDR are the board's, in its file; what is fitted is shares of them and times. With one thread DPU and host take
+turns, 1 / (one core's DPU + host); such rates are fitted beside.
 
 What is counted, from shapes alone (`deploy/dpu/cost/work.py`): input channels, output channels and pixels filled up
 to the array's; layers of fewer input channels than it takes gather their window's columns; transposed convolutions
 run over the zeros between their pixels. Pools and depthwise convolutions run on the ALU, adds on the element-wise
 engine. A result passes through memory where a group of feature-map banks cannot hold it, where more than two
-operations read it, or (`joined`) where a concat joins it. An add reads no operand that its own convolution has read,
+operations read it, or where a concat joins it. An add reads no operand that its own convolution has read,
 a pixel shuffle is no more than where results go.
 
 The host's tasks (`deploy/dpu/cost/host.py`): copy, argmax, softmax, sort (boxes, key points) and image, the same in
 the fit and for a file, where the operators behind the last convolution tell.
 
 Least squares on ln(FPS) with a soft L1 loss over `deploy/dpu/zoo/published.csv`; every network weighs the same,
-however many rates it has. `serial`, `crowding` and `joined` are chosen by cross-validation.
+however many rates it has. `crowding` and `bursts` are chosen by cross-validation; `serial` is assumed: the rates do
+not tell how much is hidden.
 
 """
 

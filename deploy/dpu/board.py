@@ -15,7 +15,7 @@ SIZED = ("array", "memory", "elementwise")
 """Tables whose constants a configuration may state for itself, by their names: a smaller array has smaller banks."""
 DIVISORS = {**dict.fromkeys(SIZED, 1.0), "cost": SMALLEST, "power": SMALLEST}
 """Tables of widths, rates and energies, by which rules and cost model divide, and the least that each can be."""
-CHOICES = ("serial", "joined")
+CHOICES = ("serial", "bursts")
 """Constants of the cost model by which nothing is divided: they may be 0."""
 
 

@@ -19,7 +19,6 @@ from deploy.cache import Cache, Keepable
 from deploy.compare import change_rows, compare, read_document
 from deploy.dpu.board import load_dpu
 from deploy.dpu.checker.placement import place
-from deploy.dpu.cost.constants import Structure
 from deploy.dpu.cost.layers import Layers
 from deploy.dpu.cost.runs import refit
 from deploy.dpu.cost.work import count_work
@@ -367,7 +366,7 @@ def board_of(path: Path) -> None:
     """A target of the user's, and a network placed on it and timed."""
     load_target(str(path))
     dpu = load_dpu(str(path))
-    Layers.of(count_work(place(_network(), dpu).core, dpu, Structure.of(dpu)), dpu)
+    Layers.of(count_work(place(_network(), dpu).core, dpu), dpu)
 
 
 @cache

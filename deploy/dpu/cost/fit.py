@@ -13,13 +13,13 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from deploy.dpu.cost.constants import DPU_CONSTANTS, Array, Constants, Structure
+from deploy.dpu.cost.constants import DPU_CONSTANTS, NAMES, Array, Constants, Structure
 from deploy.dpu.cost.layers import Layers
 
-START = Constants(0.8, 1.0, 24, 0.6, 6e-6, 1e-4, 5e-5, 0.4e9, 0.8e9, 0.3e9, 30e6, 60e6, 0.8e9)
+START = Constants(0.8, 1.0, 40, 0.6, 6e-6, 1e-4, 5e-5, 0.4e9, 0.8e9, 0.3e9, 30e6, 60e6, 0.8e9)
 """Where the fit begins: the right orders of magnitude."""
 
-SPREAD = np.array([0.3, 0.5, 0.7, 0.5, 1, 1, 1, 0.7, 0.7, 0.7, 1, 1, 1])
+SPREAD = np.array([0.3, 0.5, 1, 0.5, 1, 1, 1, 0.7, 0.7, 0.7, 1, 1, 1])
 """How far each logarithm may lie from its start, a standard deviation: shares less than times and rates."""
 
 SOFT = 0.1
@@ -32,8 +32,12 @@ WEAK_PRIOR, FIRM_PRIOR = 1.0, 2.0
 STEP = 1e-5
 """Of a logarithm, for slopes."""
 
-ENOUGH = 1e-5
-"""A step that gains less than this share of the cost is the last."""
+SHIFTS = np.outer((0.0, -0.4, 0.4), np.eye(len(NAMES))[NAMES.index("memory_efficiency")])
+"""Where the fit begins, from the start: where one part of a layer outruns another the cost has kinks, and the nearest
+low point need not be the lowest."""
+
+ENOUGH, STUCK = 1e-5, 1e5
+"""A step that gains less than this share of the cost is the last, and so is one that needs this much damping."""
 
 
 @dataclass(frozen=True)
@@ -109,11 +113,15 @@ class Cases:
         return np.array([np.log(row.fps_single).mean() if row.fps_single else np.nan for row in self.rows])
 
     @cached_property
+    def _has_single(self) -> NDArray[np.bool_]:
+        return ~np.isnan(self.observed_single)
+
+    @cached_property
     def weights(self) -> Array:
         """Weights of the rates with several and with one thread, (2 n,): a network counts once."""
         counts = Counter(row.network for row in self.rows)
         each = np.array([1 / counts[row.network] for row in self.rows])
-        return np.concatenate([each, ALONE * each * ~np.isnan(self.observed_single)])
+        return np.concatenate([each, ALONE * each * self._has_single])
 
     def times(self, constants: Constants) -> Times:
         """What an image takes."""
@@ -132,7 +140,7 @@ class Cases:
 
     def _core_s(self, constants: Constants, *, alone: bool) -> Array:
         """Time of one batch on every core, or on one core alone (n,)."""
-        times = self.layers.time_s(constants, self.structure.serial, alone=alone)
+        times = self.layers.time_s(constants, self.structure, alone=alone)
         return np.add.reduceat(times, self._starts) + constants.batch_s
 
     def _of_cases(self, of_layers: Array) -> Array:
@@ -147,7 +155,8 @@ class Cases:
     def residuals(self, times: Times) -> Array:
         """ln(predicted / observed) with several and with one thread, (2 n,); 0 where nothing was observed."""
         single = -np.log(times.alone_s + times.host_s) - self.observed_single
-        return np.concatenate([self.predicted(times) - self.observed, np.nan_to_num(single)])
+        single[~self._has_single] = 0
+        return np.concatenate([self.predicted(times) - self.observed, single])
 
     def errors(self, constants: Constants) -> Array:
         """ln(predicted / observed) of FPS with several threads, (n,)."""
@@ -186,48 +195,56 @@ def fit(
         cases: what was observed.
         start: what `prior` pulls to.
         prior: how firmly.
-        near: where to begin, if not at `start`.
+        near: where to begin, if not around `start`.
     """
-    anchor = start.logs
-    logs, damping = (near or start).logs, 1e-3
-    point = _Point.at(cases, logs, anchor, prior)
-    for _ in range(60):
-        new = _Point.at(cases, logs + point.step(cases, damping), anchor, prior)
+    begins = [near.logs] if near else [start.logs + shift for shift in SHIFTS]
+    points = [_descend(cases, logs, start.logs, prior) for logs in begins]
+    return Constants.from_logs(min(points, key=lambda point: point.cost).logs)
+
+
+def _descend(cases: Cases, logs: Array, anchor: Array, prior: float) -> "_Point":
+    """Where damped steps end."""
+    point, damping = _Point.at(cases, logs, anchor, prior), 1e-3
+    while damping < STUCK:
+        new = _Point.at(cases, point.logs + point.step(damping), anchor, prior)
         if new.cost >= point.cost:
             damping *= 4
-            if damping > 1e6:
-                break
             continue
         done = point.cost - new.cost < ENOUGH * point.cost and damping < 1
-        logs, point, damping = new.logs, new, max(damping / 4, 1e-9)
+        point, damping = new, max(damping / 4, 1e-9)
         if done:
             break
-    return Constants.from_logs(logs)
+    return point
 
 
 @dataclass(frozen=True)
 class _Point:
     """Where the fit stands."""
 
+    cases: Cases
     logs: Array
     times: Times
     residuals: Array
     pull: Array  # distance from the start, in standard deviations
-    prior: float
+    firm: Array  # 1 / standard deviations
     cost: float
 
     @classmethod
     def at(cls, cases: Cases, logs: Array, anchor: Array, prior: float) -> "_Point":
-        times = cases.times(Constants.from_logs(logs))
-        residuals, pull = cases.residuals(times), (logs - anchor) * prior / SPREAD
+        times, firm = cases.times(Constants.from_logs(logs)), prior / SPREAD
+        residuals, pull = cases.residuals(times), (logs - anchor) * firm
         soft = 2 * (np.sqrt(1 + (residuals / SOFT) ** 2) - 1)
-        return cls(logs, times, residuals, pull, prior, float(cases.weights @ soft + pull @ pull))
+        return cls(cases, logs, times, residuals, pull, firm, float(cases.weights @ soft + pull @ pull))
 
-    def step(self, cases: Cases, damping: float) -> Array:
+    @cached_property
+    def _downhill(self) -> tuple[Array, Array]:
+        """The normal matrix (13, 13) and minus half the gradient (13,)."""
+        slopes = self.cases.slopes(self.logs, self.times, self.residuals)
+        weights = self.cases.weights / np.sqrt(1 + (self.residuals / SOFT) ** 2) / SOFT**2
+        normal = slopes.T @ (weights[:, None] * slopes) + np.diag(self.firm**2)
+        return normal, -(slopes.T @ (weights * self.residuals) + self.firm * self.pull)
+
+    def step(self, damping: float) -> Array:
         """A damped Gauss-Newton step, (13,)."""
-        slopes = cases.slopes(self.logs, self.times, self.residuals)
-        weights = cases.weights / np.sqrt(1 + (self.residuals / SOFT) ** 2) / SOFT**2
-        firm = self.prior / SPREAD
-        normal = slopes.T @ (weights[:, None] * slopes) + np.diag(firm**2)
-        down = slopes.T @ (weights * self.residuals) + firm * self.pull
-        return np.asarray(np.linalg.solve(normal + damping * np.diag(np.diag(normal)), -down))
+        normal, down = self._downhill
+        return np.asarray(np.linalg.solve(normal + damping * np.diag(np.diag(normal)), down))

@@ -120,7 +120,7 @@ def predict(placement: Placement, dpu: Dpu) -> Prediction:
         remedy = "run 'beers-deploy check' for the reasons and remedies"
         raise ModelError("cost model", expected="a core that runs whole on the DPU", got=names, remedy=remedy)
     constants, structure = Constants.of(dpu), Structure.of(dpu)
-    works = count_work(placement.core, dpu, structure)
+    works = count_work(placement.core, dpu)
     if not any(work.operations for work in works):
         remedy = "give a network with convolutions"
         raise ModelError("cost model", expected="work for the DPU", got="no convolution", remedy=remedy)
@@ -141,7 +141,11 @@ def _layer_costs(
     works: Sequence[Work], dpu: Dpu, constants: Constants, structure: Structure
 ) -> tuple[LayerCost, ...]:
     layers = Layers.of(works, dpu)
-    columns = (layers.compute_s(constants), layers.memory_s(constants), layers.time_s(constants, structure.serial))
+    columns = (
+        layers.compute_s(constants),
+        layers.memory_s(constants, structure),
+        layers.time_s(constants, structure),
+    )
     return tuple(LayerCost(*row) for row in zip(works, *(c.tolist() for c in columns), strict=True))
 
 

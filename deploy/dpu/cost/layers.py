@@ -13,7 +13,7 @@ from typing import Self
 import numpy as np
 
 from deploy.dpu.board import Dpu
-from deploy.dpu.cost.constants import Array, Constants
+from deploy.dpu.cost.constants import Array, Constants, Structure
 from deploy.dpu.cost.work import Work
 
 
@@ -57,16 +57,16 @@ class Layers:
         """Time of the array and of the engines beside it, (n,): all batch handlers work at once."""
         return self.array_s / constants.array_efficiency + self.lane_s / constants.lane_efficiency
 
-    def memory_s(self, constants: Constants, *, alone: bool = False) -> Array:
+    def memory_s(self, constants: Constants, structure: Structure, *, alone: bool = False) -> Array:
         """Time of the transfers, for a batch of every core or, `alone`, of one core (n,)."""
         port = constants.port_bytes_per_cycle * self.pl_clock_hz
-        shared = constants.memory_efficiency * self.memory_bytes_per_s
-        cores = 1.0 if alone else self.cores
-        batch_bytes = self.weight_bytes + self.handlers * self.map_bytes
-        return np.maximum((self.weight_bytes + self.map_bytes) / port, cores * batch_bytes / shared)
+        maps_rate = constants.memory_efficiency * self.memory_bytes_per_s
+        weights_rate = self.memory_bytes_per_s if structure.bursts else maps_rate
+        shared_s = self.weight_bytes / weights_rate + self.handlers * self.map_bytes / maps_rate
+        return np.maximum((self.weight_bytes + self.map_bytes) / port, (1.0 if alone else self.cores) * shared_s)
 
-    def time_s(self, constants: Constants, serial: float, *, alone: bool = False) -> Array:
+    def time_s(self, constants: Constants, structure: Structure, *, alone: bool = False) -> Array:
         """Time of each layer, for a batch (n,)."""
-        compute, memory = self.compute_s(constants), self.memory_s(constants, alone=alone)
-        busy: Array = np.maximum(compute, memory) + serial * np.minimum(compute, memory)
+        compute, memory = self.compute_s(constants), self.memory_s(constants, structure, alone=alone)
+        busy: Array = np.maximum(compute, memory) + structure.serial * np.minimum(compute, memory)
         return busy + constants.layer_s * self.launched

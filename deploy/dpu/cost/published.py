@@ -30,7 +30,6 @@ def published_cases(board: str, structure: Structure) -> Cases:
         network_case(
             name,
             _dpu(board, configuration),
-            structure,
             tuple(rate.fps for rate in rates),
             tuple(rate.fps_single for rate in rates if rate.fps_single),
         )
@@ -39,15 +38,13 @@ def published_cases(board: str, structure: Structure) -> Cases:
     return Cases(tuple(rows), structure)
 
 
-def network_case(
-    name: str, dpu: Dpu, structure: Structure, fps: tuple[float, ...], fps_single: tuple[float, ...] = ()
-) -> Case:
+def network_case(name: str, dpu: Dpu, fps: tuple[float, ...], fps_single: tuple[float, ...] = ()) -> Case:
     """One of NETWORKS on a configuration, with its rates."""
     net = network(name)
     sizes = {op.output: op.out_bytes for op in net.operations}
     taken = sum(math.prod(shape) for shape in net.inputs.values())
     host = host_work(taken, sum(sizes[result] for result in net.outputs), read_bytes(name), NETWORKS[name].host)
-    layers = Layers.of(count_work(net.operations, dpu, structure), dpu)
+    layers = Layers.of(count_work(net.operations, dpu), dpu)
     cores, largest = dpu.whole("cpu", "cores"), largest_map_bytes(net.operations)
     return Case(name, family(name), dpu.name, layers, host, cores, fps, fps_single, largest)
 

@@ -117,7 +117,7 @@ def _case(run: Mapping[str, object], path: Path, index: int, board: Dpu) -> Case
             raise OptionError(
                 where, expected=f"one of {', '.join(NETWORKS)}", got=repr(name), remedy="or give a model"
             )
-        return network_case(name, dpu, Structure.of(dpu), (float(fps),))
+        return network_case(name, dpu, (float(fps),))
     return _model_case(path.parent / str(run["model"]), dpu, tile, float(fps))
 
 
@@ -126,7 +126,7 @@ def _model_case(model: Path, dpu: Dpu, tile_px: int, fps: float) -> Case:
     if placement.failed:
         remedy = "run 'beers-deploy check' for the reasons"
         raise ModelError(str(model), expected="a core that runs whole on the DPU", got="refused nodes", remedy=remedy)
-    layers = Layers.of(count_work(placement.core, dpu, Structure.of(dpu)), dpu)
+    layers = Layers.of(count_work(placement.core, dpu), dpu)
     name, cores, largest = (
         f"{model.stem}, tiles of {tile_px}",
         dpu.whole("cpu", "cores"),

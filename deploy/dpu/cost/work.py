@@ -6,7 +6,6 @@ from dataclasses import dataclass
 
 from deploy.dpu.board import Dpu
 from deploy.dpu.checker.finding import groups_of
-from deploy.dpu.cost.constants import Structure
 from deploy.dpu.graph import Operation, Shape
 
 FUSED = ("activation", "quantise", "dequantise", "pixel shuffle")
@@ -41,9 +40,9 @@ class Work:
         return self.kind not in UNSTARTED
 
 
-def count_work(operations: Sequence[Operation], dpu: Dpu, structure: Structure) -> tuple[Work, ...]:
+def count_work(operations: Sequence[Operation], dpu: Dpu) -> tuple[Work, ...]:
     """The work of operations that run one behind the other on the DPU."""
-    flow = _Flow(operations, dpu, joined=bool(structure.joined))
+    flow = _Flow(operations, dpu)
     return tuple(_count(op, flow, dpu) for op in operations if op.kind not in FUSED)
 
 
@@ -84,9 +83,9 @@ def _up(count: int, size: int) -> int:
 
 
 class _Flow:
-    """Which results pass through memory: those that a group of feature-map banks cannot hold, or not for long."""
+    """Which results pass through memory: what banks cannot hold, or not for long, and what a concat joins."""
 
-    def __init__(self, operations: Sequence[Operation], dpu: Dpu, *, joined: bool) -> None:
+    def __init__(self, operations: Sequence[Operation], dpu: Dpu) -> None:
         self._kept_bytes, self._lanes = kept_bytes(dpu), dpu.input_parallel
         self._same: dict[str, str] = {}
         for op in operations:
@@ -97,7 +96,7 @@ class _Flow:
         self._shapes = {op.output: op.out_shape for op in computing}
         self._reads = {name: {self._root(i) for i in op.inputs} for op in computing for name in op.outputs}
         self._readers = Counter(self._root(name) for op in computing for name in op.inputs)
-        self._joined = {self._root(i) for op in computing if joined and op.kind == "concat" for i in op.inputs}
+        self._joined = {self._root(i) for op in computing if op.kind == "concat" for i in op.inputs}
         self._sums = {self._root(self._fused(op)): op.output for op in computing if op.kind in ("add", "mul")}
 
     def load(self, op: Operation) -> int:

@@ -6,7 +6,6 @@ import pytest
 from deploy.bench.tables import PAPER_TILE_PX, predict_file
 from deploy.dpu.board import load_dpu
 from deploy.dpu.checker.placement import place
-from deploy.dpu.cost.constants import Structure
 from deploy.dpu.cost.latency import Prediction, predict
 from deploy.dpu.cost.work import count_work
 from deploy.dpu.graph import Network
@@ -103,26 +102,24 @@ def test_first_layers_gather_their_window(tmp_path: Path) -> None:
     assert head.array_operations == 2 * 3 * 16 * 32 * 96 * 96
 
 
-def moved(network: Network, joined: float) -> int:
+def moved(network: Network) -> int:
     """Map bytes that an image moves."""
-    works = count_work(network.operations, DPU, Structure(0, 2, joined))
+    works = count_work(network.operations, DPU)
     return sum(work.load_map_bytes + work.store_map_bytes for work in works)
 
 
-@pytest.mark.parametrize("joined", [0, 1])
-def test_what_three_branches_read_passes_through_memory(joined: float) -> None:
-    """A module of three branches: its input read thrice, each branch written for the concat or not; of two: not."""
+def test_what_three_branches_read_passes_through_memory() -> None:
+    """A module of three branches: its input read thrice, each branch written for the concat; of two branches: not."""
     found = {}
     for branches in (2, 3):
         b = Builder(32, 32, 16)
         stem = b.conv(b.image, 16)
         ends = [b.conv(stem, 16, 1) for _ in range(branches)]
-        found[branches] = moved(b.written(b.conv(b.concat(ends[0], *ends[1:]), 8, 1)).network, joined) / (
-            16 * 32 * 32
-        )
+        joined = b.conv(b.concat(ends[0], *ends[1:]), 8, 1)
+        found[branches] = moved(b.written(joined).network) / (16 * 32 * 32)
     image, result = 1, 0.5
-    assert found[2] == image + 2 * joined + result
-    assert found[3] == image + 1 + 3 + 3 * joined + result
+    assert found[2] == image + 2 + result
+    assert found[3] == image + 1 + 3 + 3 + result
 
 
 def test_an_add_that_reads_what_its_convolution_read_reads_it_once() -> None:
@@ -135,7 +132,7 @@ def test_an_add_that_reads_what_its_convolution_read_reads_it_once() -> None:
             x = first = b.conv(b.image, 32)
             for _ in range(convs):
                 x = b.conv(x, 32)
-            sums.append(moved(b.written(b.conv(b.add(x, first) if added else x, 8, 1)).network, 1))
+            sums.append(moved(b.written(b.conv(b.add(x, first) if added else x, 8, 1)).network))
         extra[convs] = sums[1] - sums[0]
     assert extra == {1: 0, 2: 32 * 256 * 256}
 
@@ -148,8 +145,8 @@ def test_a_pixel_shuffle_is_no_more_than_where_results_go(block: int) -> None:
         x = b.conv(b.image, 3 * block**2)
         x = b.shuffle(x, block) if shuffled else x
         net = b.written(b.conv(x, x.channels, 1)).network
-        sums.append(moved(net, 1) - net.operations[-1].out_bytes)
-        assert len(count_work(net.operations, DPU, Structure(0, 2, 1))) == 2
+        sums.append(moved(net) - net.operations[-1].out_bytes)
+        assert len(count_work(net.operations, DPU)) == 2
     assert sums[0] == sums[1]
 
 
@@ -157,7 +154,7 @@ def test_a_transposed_convolution_runs_over_the_zeros_between_its_pixels() -> No
     b = Builder(64, 64, 32)
     grown, plain = b.transposed(b.image, 32, 2, 2), Builder(128, 128, 32)
     works = [
-        count_work(net.operations, DPU, Structure(0, 2, 1))[0]
+        count_work(net.operations, DPU)[0]
         for net in (b.written(grown).network, plain.written(plain.conv(plain.image, 32, 2)).network)
     ]
     assert works[0].array_operations == works[1].array_operations == 4 * works[0].operations

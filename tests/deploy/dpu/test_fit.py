@@ -80,4 +80,4 @@ def test_a_firm_prior_holds_what_the_rows_do_not_tell(cases: Cases) -> None:
     slow = Cases((replace(one.rows[0], fps=(half,), fps_single=()),), cases.structure)
     new = fit(slow, old, FIRM_PRIOR)
     assert new.sort_values_per_s == pytest.approx(old.sort_values_per_s)
-    assert abs(slow.errors(new)[0]) < 0.5 * math.log(2)
+    assert abs(slow.errors(new)[0]) < 0.7 * math.log(2)
