@@ -121,7 +121,7 @@ def _unseen(request: Request, model: onnx.ModelProto) -> tuple[Patches, bool]:
     if own is None:
         sensor = load_sensor(request.sensor)
         return unseen_patches(sensor, request.images, request.patches, request.seed), True
-    if request.limits.psnr_drop_db is not None and all(reference is None for _, reference in own.all.pairs):
+    if request.limits.psnr_drop_db is not None and not any(reference.size for _, reference in own.all.pairs):
         expected, remedy = "references for psnr_drop_db", "give a .npz file with image and reference, or no limit"
         raise OptionError("--data", expected=expected, got="images alone", remedy=remedy)
     return own.all, False

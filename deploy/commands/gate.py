@@ -2,6 +2,7 @@
 
 from contextlib import suppress
 from functools import partial
+from math import isnan
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -110,7 +111,8 @@ def gate(
     figures = {"mae": outcome.result.mae, "drop": outcome.result.drop_db}
     outcome.document(request, config).write(json)
     reports.write(f"INT8 gate of {files[1].name}", outcome.checks, figures)
-    shown = f"MAE {figures['mae']:.3g} of full scale, PSNR drop {figures['drop']:.2f} dB"
+    drop = "" if isnan(figures["drop"]) else f", PSNR drop {figures['drop']:.2f} dB"
+    shown = f"MAE {figures['mae']:.3g} of full scale{drop}"
     say(f"gate {sentence(outcome.checks, shown)}")
     if not outcome.passed:
         raise typer.Exit(1)

@@ -446,3 +446,17 @@ def test_a_usage_error_is_told_over_nothing_else_that_is_named(how: list[str], t
     done = CliRunner().invoke(app, ["gate", "--junit", str(mine), *words, "--typo"])
     assert done.exit_code == 2
     assert mine.read_bytes() == b"mine"
+
+
+def test_samples_without_references_tell_no_loss_and_cannot_keep_a_limit_on_it(tmp_path: Path) -> None:
+    samples, limits = tmp_path / "samples.npy", tmp_path / "limits.toml"
+    np.save(samples, np.random.default_rng(0).uniform(0.1, 0.9, (2, 1, 40, 40)).astype(np.float32))
+    command = ["gate", *map(str, shipped_pair()), "--data", str(samples), "--max-mae", "0.5"]
+    plain = CliRunner().invoke(app, command)
+    assert plain.exit_code == 0
+    assert "gate passed" in plain.output
+    assert "nan" not in plain.output.lower()
+    limits.write_text("psnr_drop_db = 0.25\n", encoding="utf-8")
+    asked = CliRunner().invoke(app, [*command, "--config", str(limits)])
+    assert asked.exit_code == 2
+    assert "references for psnr_drop_db, got images alone" in asked.output

@@ -50,6 +50,7 @@ def test_the_zcu104_is_the_zcu102_but_for_cores_clock_and_memory() -> None:
     differing = {
         (table, key)
         for table, constants in one.tables.items()
+        if table != "cost"  # fitted to its own rates
         for key, constant in constants.items()
         if key not in other.tables[table] or other.tables[table][key].value != constant.value
     }
