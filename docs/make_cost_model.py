@@ -149,8 +149,7 @@ def transfer_section() -> str:
     rows = []
     for target in ("zcu104", "kv260"):
         errors = transferred("zcu102", target)
-        structure = nested("zcu102").structure
-        cases = published_cases(target, structure)
+        cases = published_cases(target, nested(target).structure)
         left = [LeftOut(c.network, c.family, "", "host", e, (e,), 0) for c, e in zip(cases.rows, errors, strict=True)]
         foreign, own = (np.array(list(by_network(found).values())) for found in (left, nested(target).rows))
         for name, off in (("the ZCU102's constants", foreign), ("its own", own)):
