@@ -250,7 +250,7 @@ def bench_rows(model: Path, dn: np.ndarray, dpu: Dpu, halo_px: int, sensors: Sen
     for width, height in ((dn.shape[1], dn.shape[0]), SWATH_PX):
         swath = Swath(width, height, TILE_PX, halo_px)
         network = predicted_rows(VARIANT, prediction, swath, dpu)
-        tables.append([*traditional_rows(dn, swath, sensors), *network])
+        tables.append([*traditional_rows(dn, swath, sensors, dpu.target)[0], *network])
     return tables[0], [
         *(_in_table(row, "swath") for row in tables[1]),
         *(_in_table(r, "swath") for r in published_rows()),

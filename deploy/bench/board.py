@@ -81,13 +81,14 @@ def bench_board(model: Path, request: BoardRequest, budget_s: float) -> BoardBen
     boards, refitted = _boards(request)
     single = len(boards) == len(request.tiles_px) == 1
     found = _single(model, boards[0], swath) if single else _sweep(model, boards, request.tiles_px, swath)
-    beside = traditional_rows(dn if dn is not None else drawn_acquisition(swath, sensors), swath, sensors, budget_s)
-    beside += published_rows()
+    scene = dn if dn is not None else drawn_acquisition(swath, sensors)
+    traditional, by_kind = traditional_rows(scene, swath, sensors, boards[0].target, budget_s)
     # of one configuration the swath's rows stand beside the rivals', and its layers apart
     size = f"{swath.width_px} x {swath.height_px} pixels in tiles of {swath.tile_px}"
-    rows = [*(found.rows if single else []), *beside]
-    apart = [row for _, part in (*found.shown, *refitted) for row in part]
-    return BoardBench([*rows, *apart], [*refitted, *found.shown, (size, rows)], found.notes)
+    rows = [*(found.rows if single else []), *traditional, *published_rows()]
+    kinds = (f"traditional pipeline by kind of work, one core here and of {boards[0].target.name}", by_kind)
+    apart = [row for _, part in (*found.shown, kinds, *refitted) for row in part]
+    return BoardBench([*rows, *apart], [*refitted, *found.shown, kinds, (size, rows)], found.notes)
 
 
 def _single(model: Path, dpu: Dpu, swath: Swath) -> BoardBench:

@@ -4,6 +4,7 @@ Networks are timed interleaved, so that whatever else runs here meets them alike
 and memory stand beside what was measured.
 """
 
+import math
 import statistics
 import time
 from collections.abc import Iterator, Mapping, Sequence
@@ -16,8 +17,10 @@ import onnx
 import psutil
 import torch
 
+from deploy.bench.board_cpu import board_cpu_row, chain_time, kind_rows
 from deploy.bench.profile import interleaved, node_rows, profile, timed
-from deploy.bench.tables import TABLE, Swath, board_cpu_row, efficiency
+from deploy.bench.rates import Rates, measured_rates
+from deploy.bench.tables import TABLE, Swath, efficiency
 from deploy.dpu.reading import network_of
 from deploy.host_state import Watch, memory_rise, watched
 from deploy.networks import other_precision
@@ -25,8 +28,10 @@ from model.processor import require_cores
 from model.simulator.acquire import MARGIN_PX, simulate_pair
 from model.simulator.detector import Draw
 from model.simulator.procedural import procedural_scene
-from model.traditional.pipeline import Chain, restore_traditional
-from profiles import SensorProfile, TargetProfile, load_target
+from model.traditional.pipeline import Chain, quality_named, restore_traditional
+from model.traditional.rows import one_thread_per_operation
+from model.traditional.work import chain_work
+from profiles import SensorProfile, TargetProfile
 from profiles.figures import Figure, Row, measured, predicted, unavailable
 from quant.onnx_file import is_quantised, load_onnx
 from quant.session import open_session, require_finite
@@ -115,6 +120,8 @@ def _mean_power(run: Timed) -> Figure:
 
 CROP_PX = 256
 CROPS = 3
+QUALITY = quality_named("standard")
+"""What `Chain` takes when nothing is said."""
 
 
 @dataclass(frozen=True)
@@ -136,44 +143,61 @@ def drawn_acquisition(swath: Swath, sensors: Sensors, seed: int = 0) -> np.ndarr
     return pair.degraded.numpy()
 
 
-def traditional_rows(dn: np.ndarray, swath: Swath, sensors: Sensors, budget_s: float = 60.0) -> list[Row]:
-    """The traditional pipeline on (H, W) digital numbers, here, and scaled to the board's processor.
+def traditional_rows(
+    dn: np.ndarray, swath: Swath, sensors: Sensors, board: TargetProfile, budget_s: float = 60.0
+) -> tuple[list[Row], list[Row]]:
+    """The traditional pipeline on (H, W) digital numbers, here and scaled to the board's processor; its work by kind.
 
     Crops are timed first, one small run for warm-up left out. When `dn` is the whole swath and its estimate lies
     within `budget_s`, it is run whole and its time is measured; else the swath's is predicted from the crops', with
-    the fastest and the slowest crop as its interval.
+    the fastest and the slowest crop as its interval. The board's is scaled from their median CPU time on one core.
     """
     threads = torch.get_num_threads()
     with watched() as watch:
-        latency, cpu_s, power = _chain_latency(dn, swath, sensors, budget_s, f"here, {threads} threads")
+        latency, power = _chain_latency(dn, swath, sensors, budget_s, f"here, {threads} threads")
+    rates, work = measured_rates(), chain_work(swath.height_px, swath.width_px, QUALITY)
+    cpu_s_per_px, explained = _one_core(list(_crops(dn)), sensors, rates)
+    time = chain_time((cpu_s_per_px * swath.pixels,) * 2, work, rates, explained)
+    counted = "time of the work counted by kind over CPU time, one core, median of the crops"
     figures = {
         "latency": latency,
         "throughput": _rate(swath.frames, latency),
         "power": power,
         "efficiency": efficiency(swath.pixels, latency, power),
+        "explained by kinds": measured(100 * explained, "%", counted),
         **_conditions(watch, threads),
     }
-    board = board_cpu_row(cpu_s, swath, load_target("vck190"), load_target("host-cpu"))
-    return [Row(TABLE, "traditional pipeline on this CPU", figures), board]
+    here = Row(TABLE, "traditional pipeline on this CPU", figures)
+    return [here, board_cpu_row(time, swath, board, rates)], kind_rows(time, work, board, rates)
+
+
+def _one_core(crops: Sequence[np.ndarray], sensors: Sensors, rates: Rates) -> tuple[float, float]:
+    """CPU time of one core for a pixel, in s, and the share of it that the counted work explains.
+
+    Of the median crop. With several threads on a busy machine their waiting for one another is CPU time too.
+    """
+    with one_thread_per_operation():
+        cpu_s = [_wall_and_cpu_s(crop, sensors)[1] for crop in crops]
+    height, width = crops[0].shape
+    counted_s = math.fsum(rates.times_s(chain_work(height, width, QUALITY)).values())
+    median_s = statistics.median(cpu_s)
+    return median_s / crops[0].size, counted_s / median_s
 
 
 def _chain_latency(
     dn: np.ndarray, swath: Swath, sensors: Sensors, budget_s: float, place: str
-) -> tuple[Figure, tuple[float, float], Figure]:
-    """Of the chain on the swath: latency, CPU time of all cores in s (lowest, highest), and the processor's power."""
+) -> tuple[Figure, Figure]:
+    """Of the chain on the swath: latency, and the processor's power."""
     crops = list(_crops(dn))
     _restore(crops[0][:32, :32], sensors)
-    timings, _, power = timed(lambda: [_wall_and_cpu_s(crop, sensors) for crop in crops])
-    wall_s, cpu_s = (
-        [t * swath.pixels / crop.size for t, crop in zip(times, crops, strict=True)]
-        for times in zip(*timings, strict=True)
-    )
+    times_s, _, power = timed(lambda: [_wall_and_cpu_s(crop, sensors)[0] for crop in crops])
+    wall_s = [t * swath.pixels / crop.size for t, crop in zip(times_s, crops, strict=True)]
     estimate_s = statistics.median(wall_s)
     if dn.size == swath.pixels and estimate_s <= budget_s:
-        (elapsed_s, whole_cpu_s), _, power = timed(lambda: _wall_and_cpu_s(dn, sensors))
-        return measured(elapsed_s, "s", f"the whole image, {place}"), (whole_cpu_s, whole_cpu_s), power
+        _, elapsed_s, power = timed(lambda: _restore(dn, sensors))
+        return measured(elapsed_s, "s", f"the whole image, {place}"), power
     source = f"by proportion from {len(crops)} crops of {crops[0].shape[1]} x {crops[0].shape[0]}, {place}"
-    return predicted(estimate_s, "s", (min(wall_s), max(wall_s)), source), (min(cpu_s), max(cpu_s)), power
+    return predicted(estimate_s, "s", (min(wall_s), max(wall_s)), source), power
 
 
 def _wall_and_cpu_s(dn: np.ndarray, sensors: Sensors) -> tuple[float, float]:

@@ -1,7 +1,7 @@
 """The rows of the bench: a network on the DPU (predicted), the traditional pipeline (measured here), the paper's.
 
 One network on several configurations of the DPU, in tiles of several sizes; the traditional pipeline on the board's
-own processor is CPU time spent here, scaled by published benchmarks.
+own processor is in `board_cpu`.
 """
 
 import math
@@ -24,7 +24,6 @@ from deploy.dpu.cost.latency import (
     whole_tiles,
 )
 from deploy.dpu.reading import read_network
-from profiles import TargetProfile
 from profiles.errors import OptionError
 from profiles.figures import Figure, Row, predicted, published, unavailable
 
@@ -249,9 +248,6 @@ def parse_tiles(text: str) -> list[int]:
     return [int(part) for part in parts]
 
 
-NAME = "traditional pipeline on the board's CPU, 2 x Cortex-A72"
-
-
 def parse_size(text: str) -> tuple[int, int]:
     """WIDTHxHEIGHT in pixels as (width, height).
 
@@ -263,37 +259,3 @@ def parse_size(text: str) -> tuple[int, int]:
         remedy = f"write it as {PAPER_SIZE}"
         raise OptionError("--size", expected="WIDTHxHEIGHT in pixels", got=repr(text), remedy=remedy)
     return int(parts[0]), int(parts[1])
-
-
-def slowdown(board: TargetProfile, host: TargetProfile) -> tuple[float, float]:
-    """How many times longer a core of the board's processor takes than one of a common server: lowest, highest."""
-    clock, integers, floats = (
-        board.constant("cpu", key) for key in ("clock_ghz", "zip_mips_per_ghz", "linpack_gflops_per_ghz")
-    )
-    low = host.value("cpu", "zip_mips") / (integers.high * clock.high)
-    return low, host.value("cpu", "linpack_gflops") / (floats.low * clock.low)
-
-
-def board_cpu_row(cpu_s: tuple[float, float], swath: Swath, board: TargetProfile, host: TargetProfile) -> Row:
-    """CPU time scaled to the board's processor: shared by its cores at best, on one core at worst.
-
-    Args:
-        cpu_s: time of this host's cores together that the swath takes, lowest and highest, in s.
-        swath: the image it is about.
-        board: profile with a table [cpu], and the power of its CPU run.
-        host: profile of a common server core.
-    """
-    fast, slow = slowdown(board, host)
-    low, high = cpu_s[0] * fast / board.value("cpu", "cores"), cpu_s[1] * slow
-    source = (
-        f"CPU time here x {fast:.2g} to {slow:.2g} (7-zip and HPL of A72 and common server cores), on 1 or 2 cores"
-    )
-    latency = predicted(math.sqrt(low * high), "s", (low, high), source)  # the ends are ratios: their geometric mean
-    rates = swath.frames / high, swath.frames / low
-    power = board.constant("power", "cpu_run_w")
-    figures = {
-        "latency": latency,
-        "throughput": predicted(math.sqrt(rates[0] * rates[1]), "frame/s", rates, source),
-        "power": published(power.low, "W", power.source),
-    }
-    return Row(TABLE, NAME, {**figures, "efficiency": efficiency(swath.pixels, latency, figures["power"])})

@@ -334,7 +334,8 @@ def notes(
         f"Host times, {ROUNDS} rounds of a tile of {HOST_TILE_PX} px, interleaved, are no proxy for the board.",
         f"INT8 files made here: {PATCHES} patches of {PATCH_PX} x {PATCH_PX} from {calibrated_on}.",
         "Chains and peers know both sensors; what a network knows of them stands beside it.",
-        "A chain on the board's CPU is scaled from CPU time here by benchmarks of other programs: a wide interval.",
+        "A chain on the board's CPU is CPU time here, each kind of its work scaled by published rates of its cores.",
+        "Of other methods there the kinds are not known, nor how many cores they use: a wide interval.",
     ]
     sites = len(set(benchmark.sites))
     if sites < LEAST_SITES:

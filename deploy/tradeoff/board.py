@@ -9,7 +9,8 @@ times, and its interval is made by this rule:
   on one configuration each, neither seen by the fit.
 - The power of a run is known for one network and no configuration: energies of two networks or configurations may
   also differ by the whole range assumed for it.
-- Two methods on the board's CPU share the factor by which it is slower than this host: their CPU times are compared.
+- Two chains on the board's CPU do the same kinds of work and share the factor by which it is slower than this host:
+  their CPU times are compared. A method of unknown kinds may be slowed down otherwise: intervals must not overlap.
 - A method on the CPU and a network on the DPU share nothing: their intervals must not overlap.
 """
 
@@ -21,7 +22,9 @@ from itertools import combinations, pairwise
 import numpy as np
 import onnx
 
-from deploy.bench.tables import Swath, board_cpu_row, efficiency, energy, swath_latency
+from deploy.bench.board_cpu import CpuTime, board_cpu_row, chain_time
+from deploy.bench.rates import measured_rates
+from deploy.bench.tables import Swath, efficiency, energy, swath_latency
 from deploy.dpu.board import Dpu, load_dpu
 from deploy.dpu.checker.placement import place
 from deploy.dpu.cost.constants import Constants, Structure
@@ -29,12 +32,16 @@ from deploy.dpu.cost.latency import Prediction, dpu_power, predict
 from deploy.dpu.cost.published import published_cases
 from deploy.dpu.cost.validation import leave_out, regimes_of
 from deploy.dpu.reading import network_of
+from model.traditional.settings import QUALITIES
+from model.traditional.work import chain_work
 from profiles import load_target
 from profiles.figures import Figure, predicted
 
 FRAME_PX = 640
 FIGURES = ("latency", "throughput", "power", "energy", "efficiency")
 PAIR_QUANTILE = 0.9
+CHAIN = "traditional-"
+"""What a chain's quality follows in its name."""
 HIDING = (0.0, 1.0)
 """Shares of the shorter of compute and memory that do not hide behind the longer: all that is possible."""
 
@@ -71,15 +78,31 @@ class DpuRun:
 
 @dataclass(frozen=True)
 class CpuRun:
-    """A method on the board's own processor: CPU time of this host that the swath takes, least and most, in s."""
+    """A method on the board's own processor: what the swath takes on one core of this host, and of which kinds."""
 
-    cpu_s: Interval
+    time: CpuTime
     swath: Swath
 
     def figures(self) -> dict[str, Figure]:
         """The five figures of the board."""
-        row = board_cpu_row(self.cpu_s, self.swath, load_target("vck190"), load_target("host-cpu"))
+        row = board_cpu_row(self.time, self.swath, load_target("vck190"), measured_rates())
         return _figures(row.figures["latency"], row.figures["power"], self.swath)
+
+
+def cpu_run(method: str, cpu_s: Interval, swath: Swath) -> CpuRun:
+    """A method of that name; of the chains the kinds of work are known, of others not.
+
+    Args:
+        method: as points are called.
+        cpu_s: CPU time here that the swath takes, least and most, in s.
+        swath: the image it is about.
+    """
+    quality = QUALITIES.get(method.removeprefix(CHAIN))
+    if quality is None:
+        return CpuRun(CpuTime(cpu_s, {}), swath)
+    rates, work = measured_rates(), chain_work(swath.height_px, swath.width_px, quality)
+    explained = math.fsum(rates.times_s(work).values()) / math.sqrt(cpu_s[0] * cpu_s[1])
+    return CpuRun(chain_time(cpu_s, work, rates, explained), swath)
 
 
 BoardRun = DpuRun | CpuRun
@@ -100,7 +123,10 @@ def latency_ratio(a: BoardRun, b: BoardRun) -> Interval:
         spread = 1.0 if _same(a, b) and a.swath.tile_px == b.swath.tile_px else math.exp(pair_error())
         return min(ratios) / spread, max(ratios) * spread
     if isinstance(a, CpuRun) and isinstance(b, CpuRun):
-        return (1.0, 1.0) if a == b else (a.cpu_s[0] / b.cpu_s[1], a.cpu_s[1] / b.cpu_s[0])
+        if a == b:
+            return 1.0, 1.0
+        if a.time.shares and b.time.shares:
+            return a.time.cpu_s[0] / b.time.cpu_s[1], a.time.cpu_s[1] / b.time.cpu_s[0]
     return _apart(a, b, "board latency")
 
 

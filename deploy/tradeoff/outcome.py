@@ -16,7 +16,7 @@ from deploy.bench.tables import Swath
 from deploy.dpu.board import load_dpu
 from deploy.tradeoff.accuracy import FLAT, MAE, Scores, seam_density, with_seams
 from deploy.tradeoff.board import FIGURES as BOARD
-from deploy.tradeoff.board import BoardRun, CpuRun, DpuRun, energy_ratio, latency_ratio, predict_model
+from deploy.tradeoff.board import BoardRun, DpuRun, cpu_run, energy_ratio, latency_ratio, predict_model
 from deploy.tradeoff.host_time import Times, host_figures, ratio_interval
 from deploy.tradeoff.measurements import Measurements
 from deploy.tradeoff.methods import runtime_of
@@ -291,7 +291,7 @@ class Assembly:
         if point.variant.kind != "network":
             assert times is not None  # noqa: S101 - its job has run
             low, high = times.cpu_per_px()
-            return CpuRun((low * swath.pixels, high * swath.pixels), swath)
+            return cpu_run(point.variant.method, (low * swath.pixels, high * swath.pixels), swath)
         file = self.measurements.store.int8_file(point.variant)
         if not on_dpu(point.variant) or file is None:
             return DPU_ONLY

@@ -10,7 +10,7 @@ import onnx
 
 from deploy.bench.tables import PAPER_TILE_PX, Swath, swath_latency
 from deploy.dpu.board import Dpu, load_dpu
-from deploy.tradeoff.board import kept_tiles_px, predict_model
+from deploy.tradeoff.board import CHAIN, kept_tiles_px, predict_model
 from deploy.tradeoff.methods import MethodStore, Network, conv_weights
 from deploy.tradeoff.points import (
     LEGAL,
@@ -41,7 +41,7 @@ def select_points(store: MethodStore, swath: Swath) -> list[Point]:
         for network in store.networks.values()
         for point in network_points(network.name, precisions_of(network), board_of(network, swath))
     ]
-    return points + other_points([f"traditional-{quality}" for quality in QUALITIES], PEERS)
+    return points + other_points([CHAIN + quality for quality in QUALITIES], PEERS)
 
 
 def precisions_of(network: Network) -> Sequence[str]:

@@ -65,7 +65,7 @@ def _block(rows: Tensor, kernel: Tensor, left: int) -> Tensor:
     known = torch.isfinite(block)
     # Filtered without its mean, which has gain 1: in float32 the FFT of large constant values costs digits.
     mean = block[known].mean() if bool(known.any()) else block.new_zeros(())
-    size = tuple(_fast_length(side) for side in block.shape)
+    size = tuple(fast_length(side) for side in block.shape)
     spectrum = torch.fft.rfft2(fill_with_local_means(block, known) - mean, s=size)
     filtered: Tensor = torch.fft.irfft2(spectrum * torch.fft.rfft2(kernel, s=size).to(spectrum), s=size)
     inside = slice(2 * radius, block.shape[0]), slice(2 * radius, block.shape[1])
@@ -116,7 +116,7 @@ def compensation_gain(height: int, width: int, blur_from: Blur, blur_to: Blur, e
     return gain
 
 
-def _fast_length(size: int) -> int:
+def fast_length(size: int) -> int:
     """The next size of factors 2, 3 and 5, on which an FFT is quick."""
     while _rest(size) > 1:
         size += 1

@@ -57,12 +57,12 @@ def map_tiles(work: Callable[[Item], Result], items: Iterable[Item]) -> Iterator
     A tile is thousands of operations on small tensors. Split up inside, each ends with its threads waiting for one
     another: on a busy machine five times slower with two threads than with one (measured).
     """
-    with _one_thread_per_operation() as threads, ThreadPoolExecutor(threads) as pool:
+    with one_thread_per_operation() as threads, ThreadPoolExecutor(threads) as pool:
         yield from pool.map(work, items)
 
 
 @contextmanager
-def _one_thread_per_operation() -> Iterator[int]:
+def one_thread_per_operation() -> Iterator[int]:
     """Hold torch to one thread per operation meanwhile; gives the number there was."""
     threads = torch.get_num_threads()
     torch.set_num_threads(1)

@@ -109,7 +109,7 @@ def test_efficiency_is_only_as_good_as_its_parts() -> None:
 
 def test_a_small_image_is_measured_whole() -> None:
     swath = Swath(61, 47)
-    row, *_ = traditional_rows(drawn_acquisition(swath, SENSORS), swath, SENSORS)
+    (row, _), _ = traditional_rows(drawn_acquisition(swath, SENSORS), swath, SENSORS, DPU.target)
     assert row.figures["latency"].mode == "measured"
     assert row.figures["throughput"].mode == "measured"
 
@@ -117,7 +117,7 @@ def test_a_small_image_is_measured_whole() -> None:
 def test_a_large_swath_is_predicted_from_crops_and_says_so() -> None:
     swath = Swath(13600, 9016)
     dn = np.full((70, 90), 1000, np.float32)
-    row, *_ = traditional_rows(dn, swath, SENSORS)
+    (row, _), _ = traditional_rows(dn, swath, SENSORS, DPU.target)
     latency = row.figures["latency"]
     assert latency.mode == "predicted"
     assert "3 crops of 90 x 70" in latency.source
@@ -127,7 +127,7 @@ def test_a_large_swath_is_predicted_from_crops_and_says_so() -> None:
 
 def test_no_budget_means_no_whole_run() -> None:
     swath = Swath(33, 33)
-    row, *_ = traditional_rows(drawn_acquisition(swath, SENSORS), swath, SENSORS, budget_s=0)
+    (row, _), _ = traditional_rows(drawn_acquisition(swath, SENSORS), swath, SENSORS, DPU.target, budget_s=0)
     assert row.figures["latency"].mode == "predicted"
 
 

@@ -10,8 +10,8 @@ from deploy.bench.tables import Swath
 from deploy.dpu.board import load_dpu
 from deploy.networks import shipped_pair
 from deploy.tradeoff.board import (
-    CpuRun,
     DpuRun,
+    cpu_run,
     energy_ratio,
     kept_tiles_px,
     latency_ratio,
@@ -56,8 +56,8 @@ def test_another_tile_or_configuration_widens_the_ratio_and_the_power_the_energy
 
 
 def test_a_ratio_read_the_other_way_is_its_inverse(model: onnx.ModelProto) -> None:
-    chain = CpuRun((40.0, 60.0), SWATH)
-    for a, b in ((run(model), run(model, 176)), (run(model), chain), (chain, CpuRun((10.0, 12.0), SWATH))):
+    chain, peer = cpu_run("traditional-fast", (40.0, 60.0), SWATH), cpu_run("peer", (10.0, 12.0), SWATH)
+    for a, b in ((run(model), run(model, 176)), (run(model), chain), (chain, peer)):
         low, high = latency_ratio(a, b)
         assert latency_ratio(b, a) == pytest.approx((1 / high, 1 / low))
 
@@ -70,12 +70,23 @@ def test_the_prediction_lies_between_the_two_extremes(model: onnx.ModelProto) ->
     assert base.latency_s(0.0) < base.latency_s(1.0)
 
 
-def test_on_the_cpu_times_compare_without_the_factor_and_against_the_dpu_with_it(model: onnx.ModelProto) -> None:
-    slow, fast = CpuRun((40.0, 44.0), SWATH), CpuRun((20.0, 22.0), SWATH)
+def test_chains_compare_without_the_factor_and_against_the_dpu_with_it(model: onnx.ModelProto) -> None:
+    slow, fast = (
+        cpu_run(f"traditional-{name}", cpu_s, SWATH)
+        for name, cpu_s in (("standard", (40.0, 44.0)), ("fast", (20.0, 22.0)))
+    )
     assert latency_ratio(slow, fast) == pytest.approx((40 / 22, 44 / 20))
+    assert energy_ratio(slow, fast) == latency_ratio(slow, fast)
     assert latency_ratio(slow, slow) == (1.0, 1.0)
     low, high = latency_ratio(slow, run(model))
-    assert high / low > 10  # the board's processor is known to a factor of forty
+    assert high / low > 2  # what is known of the board's processor
+
+
+def test_a_method_of_unknown_kinds_shares_no_factor_and_is_known_worse() -> None:
+    chain, peer = cpu_run("traditional-fast", (20.0, 22.0), SWATH), cpu_run("wiener", (20.0, 22.0), SWATH)
+    (low, high), (least, most) = (each.figures()["board latency"].interval or (0.0, 0.0) for each in (chain, peer))
+    assert least < low < high < most
+    assert latency_ratio(chain, peer) == pytest.approx((low / most, high / least))
 
 
 def test_figures_of_the_board_hang_together(model: onnx.ModelProto) -> None:
