@@ -38,6 +38,8 @@ PAGE = Path(__file__).parent / "cost-model.md"
 PAPER_BOARD, PAPER_FPS, PAPER_S = "vck190", 7.2, 42
 WORST = 8
 CHOSEN = "the choice of least error on families left out: deploy/dpu/cost/validation.py"
+STATUS = {"serial": "assumed"}
+CHOICE = {"serial": "the middle of 0 to 1: the published rates do not tell"}
 FITTED = "the published rates of {rows} networks and configurations, deploy/dpu/zoo/published.csv"
 
 
@@ -54,7 +56,7 @@ def with_cost(profile: str, board: str) -> str:
     """The profile's text with its [cost] fitted anew."""
     lines = ["[cost] # written by docs/make_cost_model.py; the formula: deploy/dpu/cost/layers.py and host.py"]
     lines += [
-        f'{key} = {{ value = {value}, status = "inferred", source = "{source}" }}'
+        f'{key} = {{ value = {value}, status = "{STATUS.get(key, "inferred")}", source = "{source}" }}'
         for key, (value, source) in cost_table(board).items()
     ]
     block = "\n".join(lines) + "\n"
@@ -69,7 +71,7 @@ def cost_table(board: str) -> dict[str, tuple[str, str]]:
     cases = published_cases(board, outcome.structure)
     fitted = "fit to " + FITTED.format(rows=len(cases.rows))
     found = {key: (f"{value:.4g}", fitted) for key, value in asdict(fit(cases).rounded()).items()}
-    found |= {key: (f"{value:g}", CHOSEN) for key, value in asdict(outcome.structure).items()}
+    found |= {key: (f"{value:g}", CHOICE.get(key, CHOSEN)) for key, value in asdict(outcome.structure).items()}
     families = len({row.family for row in outcome.rows})
     left_out = f"|ln(predicted / published)| within which nine of ten of {families} families lie, each left out once"
     for kind, width in outcome.widths.by_regime.items():
@@ -112,7 +114,7 @@ def constants_section() -> str:
     rows = [(f"`{name}`", UNITS[name], *(f"{getattr(c, name):.3g}" for c in fitted.values())) for name in NAMES]
     structures = {board: nested(board).structure for board in boards()}
     rows += [
-        (f"`{name}`", "chosen", *(f"{getattr(s, name):g}" for s in structures.values()))
+        (f"`{name}`", STATUS.get(name, "chosen"), *(f"{getattr(s, name):g}" for s in structures.values()))
         for name in ("serial", "crowding", "bursts")
     ]
     return "## Constants\n\n" + table(("constant", "unit", *fitted), rows)
@@ -149,8 +151,7 @@ def transfer_section() -> str:
     rows = []
     for target in ("zcu104", "kv260"):
         errors = transferred("zcu102", target)
-        structure = nested("zcu102").structure
-        cases = published_cases(target, structure)
+        cases = published_cases(target, nested(target).structure)
         left = [LeftOut(c.network, c.family, "", "host", e, (e,), 0) for c, e in zip(cases.rows, errors, strict=True)]
         foreign, own = (np.array(list(by_network(found).values())) for found in (left, nested(target).rows))
         for name, off in (("the ZCU102's constants", foreign), ("its own", own)):

@@ -1,5 +1,6 @@
-"""How long a network takes on the DPU, at what power, and how the constants behind that are fitted.
+"""How long a network takes on a DPU, at what power, and how the constants behind that are fitted.
 
-- `layers`: what each layer computes and moves; `latency`: how long that takes, with an interval;
-- `fit`: the constants from published rates; `validation`: the errors on networks left out, and a user's own runs.
+- `work`: what each layer computes and moves; `layers`, `host`: how long that takes; `latency`: the prediction;
+- `constants`, `regimes`: what stands in a target's [cost];
+- `fit`: the constants from the rates in `published`; `validation`: errors on families left out; `runs`: a user's own.
 """

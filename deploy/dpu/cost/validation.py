@@ -2,8 +2,8 @@
 
 Networks of one family resemble one another, so a family is left out as a whole. What is chosen and what is judged
 are kept apart by two rounds (nested cross-validation): for each family left out, the structure is chosen, and the
-width of the interval made, from errors on others of the families that remain. `nested` is what the errors of the
-documents and the widths of [cost] come from.
+width of the interval made, from errors on others of the families that remain. The structure is one for all boards.
+`nested` is what the errors of the documents and the widths of [cost] come from.
 """
 
 import math
@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from deploy.dpu.cost.constants import STRUCTURES, Array, Constants, Structure
 from deploy.dpu.cost.fit import Cases, fit
-from deploy.dpu.cost.published import published_cases
+from deploy.dpu.cost.published import boards, published_cases
 from deploy.dpu.cost.regimes import REGIMES, Regime, regime_of
 
 FOLDS = 5
@@ -89,7 +89,7 @@ class LeftOut:
 
 @dataclass(frozen=True)
 class Nested:
-    """The outcome for a board: all networks left out in turn, the structure of most, the widths that follow."""
+    """The outcome for a board: all networks left out in turn, the structure of all boards, the widths that follow."""
 
     board: str
     rows: tuple[LeftOut, ...]
@@ -100,14 +100,37 @@ class Nested:
 @cache
 def nested(board: str) -> Nested:
     """Leave each family out; choose a structure and make widths from the others alone; predict what was left out."""
-    trials = [Trial(published_cases(board, structure)) for structure in STRUCTURES]
-    rows = [row for name in trials[0].names for row in left_out_rows(trials, name)]
-    structure = _choose(trials, "")[0].cases.structure
+    names = _trial(board, STRUCTURES[0]).names
+    rows = [row for name in names for row in left_out_rows(_trial(board, chosen(name)), name)]
+    structure = chosen()
     order = {(row.network, row.configuration): row for row in rows}
     cases = published_cases(board, structure)
     rows = [order[row.network, row.configuration] for row in cases.rows]
     widths = Widths.of(np.array([row.error for row in rows]), cases, [row.regime for row in rows])
     return Nested(board, tuple(rows), structure, widths)
+
+
+@cache
+def chosen(left_out: str = "", unseen_board: str = "") -> Structure:
+    """The structure of least error on families left out, one for all boards; no fit sees `left_out`.
+
+    Args:
+        left_out: a family that has no say.
+        unseen_board: a board that has none.
+    """
+    known = [board for board in boards() if board != unseen_board]
+    return best([[_trial(board, structure) for board in known] for structure in STRUCTURES], left_out)
+
+
+@cache
+def _trial(board: str, structure: Structure) -> "Trial":
+    return Trial(published_cases(board, structure))
+
+
+def best(trials: Sequence[Sequence["Trial"]], left_out: str) -> Structure:
+    """Of structures, each tried on several boards, that of the least mean error of families but the one left out."""
+    scores = [float(np.mean([trial.score(left_out) for trial in tried])) for tried in trials]
+    return trials[int(np.argmin(scores))][0].cases.structure
 
 
 class Trial:
@@ -122,6 +145,7 @@ class Trial:
 
     def fit_without(self, unseen: frozenset[str]) -> Constants:
         """The constants that the other families give."""
+        unseen &= frozenset(self.names)
         if unseen not in self._fits:
             out = np.isin(self.families, list(unseen))
             self._fits[unseen] = fit(self.cases.only(~out), near=self.near)
@@ -139,21 +163,15 @@ class Trial:
             regimes[mine] = regimes_of(kept.only(mine), constants)
         return errors, kept, list(regimes)
 
-
-def _choose(trials: Sequence[Trial], left_out: str) -> tuple[Trial, tuple[Array, Cases, list[Regime]]]:
-    """The structure with the least error on families left out, none of them the one that is judged."""
-    found = [(trial, trial.inner(left_out)) for trial in trials]
-    return min(found, key=lambda item: _score(item[1][0], item[1][1]))
-
-
-def _score(errors: Array, cases: Cases) -> float:
-    return _family_mean(np.abs(errors), np.array([row.family for row in cases.rows]))
+    def score(self, left_out: str) -> float:
+        """Mean over families of the mean error, all but one."""
+        errors, kept, _ = self.inner(left_out)
+        return _family_mean(np.abs(errors), np.array([row.family for row in kept.rows]))
 
 
-def left_out_rows(trials: Sequence[Trial], name: str) -> list[LeftOut]:
-    """A family, predicted without it by a structure that was chosen without it; widths made without it."""
-    trial, inner = _choose(trials, name)
-    widths = Widths.of(*inner)
+def left_out_rows(trial: Trial, name: str) -> list[LeftOut]:
+    """A family, predicted without it, in intervals whose widths were made without it."""
+    widths = Widths.of(*trial.inner(name))
     tested, constants = trial.cases.only(trial.families == name), trial.fit_without(frozenset({name}))
     return [
         LeftOut(
@@ -225,7 +243,7 @@ def coverage(rows: Sequence[LeftOut]) -> tuple[float, float]:
 
 def transferred(source: str, target: str) -> Array:
     """Errors of a board's cases (n,) with another's constants, fitted to that one's rates without their family."""
-    structure = nested(source).structure
+    structure = chosen(unseen_board=target)
     known, wanted = published_cases(source, structure), published_cases(target, structure)
     families, errors = np.array([row.family for row in wanted.rows]), np.zeros(len(wanted.rows))
     trial = Trial(known)
