@@ -74,7 +74,7 @@ def bench(
     tiles, here, board = parse_tiles(tile), target in HOSTS, target.removesuffix(MODEL_SUFFIX)
     _refuse_unused(context, here)
     path = int8_file(model, load_sensor(sensor), partial(say, err=True))
-    require_writable(json, inputs=(path, image, measured))
+    require_writable(json, inputs=(path, image, measured, Path(target)))
     if here:
         rows = host_rows(path, load_target("host-cpu"), _single(tiles), threads)
         for table, part in by_table(rows).items():

@@ -73,7 +73,7 @@ def tradeoff(
     demands = [tuple(parse_demands(name, text)) for name, text in (("--budget", budget), ("--need", need))]
     names = tuple(networks.split(",")) if networks is not None else tuple(shipped_names())
     aim = reference or REFERENCE
-    read = (images, calibration, lpips, *map(Path, (sensor, aim, *names)))
+    read = (images, calibration, lpips, *map(Path, (sensor, aim, target, *names)))
     require_writable(figures, *(out / name for name in FILES), json, inputs=read, folders=(kept,))
     reference_beside(load_sensor(sensor), reference, say)
     request = Request(
