@@ -36,8 +36,9 @@ SHIFTS = np.outer((0.0, -0.4, 0.4), np.eye(len(NAMES))[NAMES.index("memory_effic
 """Where the fit begins, from the start: where one part of a layer outruns another the cost has kinks, and the nearest
 low point need not be the lowest."""
 
-ENOUGH, STUCK = 1e-5, 1e5
-"""A step that gains less than this share of the cost is the last, and so is one that needs this much damping."""
+ENOUGH, STUCK, MOST = 1e-5, 1e5, 200
+"""A step that gains less than this share of the cost is the last, and so is one that needs this much damping, or the
+one with this number: along a kink steps grow ever smaller."""
 
 
 @dataclass(frozen=True)
@@ -205,10 +206,12 @@ def fit(
 def _descend(cases: Cases, logs: Array, anchor: Array, prior: float) -> "_Point":
     """Where damped steps end."""
     point, damping = _Point.at(cases, logs, anchor, prior), 1e-3
-    while damping < STUCK:
+    for _ in range(MOST):
         new = _Point.at(cases, point.logs + point.step(damping), anchor, prior)
         if new.cost >= point.cost:
             damping *= 4
+            if damping > STUCK:
+                break
             continue
         done = point.cost - new.cost < ENOUGH * point.cost and damping < 1
         point, damping = new, max(damping / 4, 1e-9)
