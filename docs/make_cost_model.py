@@ -319,10 +319,10 @@ alone. Errors are means over a network's rates; a network counts once. Intervals
 rate: the host, small maps (up to {LARGE_MAP_BYTES >> 20} MiB), large maps. A family's score is its largest error over
 the typical one of the regime; the width is the typical error times the score that nine of ten families keep to.
 
-What nesting does not cover, so that errors here are somewhat too kind: what the formula counts, the variants that were
-offered to the choice, that it is one for all boards, the starts of the fit and some labels of the host were settled
-while looking at these same networks, the last two variants after seeing such a table. A fit without a family begins
-near the fit of all. Networks that nobody here has looked at are the better judge.
+What nesting does not cover, so that errors here are somewhat too kind: what the formula counts, the variants offered
+to the choice, that it is one for all boards, the starts of the fit and some labels of the host were settled while
+looking at these same networks, some after seeing such a table. A fit without a family begins near the fit
+of all. Networks that nobody here has looked at are the better judge.
 
 """
 
