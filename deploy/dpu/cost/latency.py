@@ -6,7 +6,7 @@ ConvBEERS: the paper's own figure is what the model is compared with, never what
 
 The interval is FPS e^-width to FPS e^width, so wide that nine of ten families of networks, each left out of the fit
 once, lie inside; what widths made without a family hold of it is in docs/cost-model.md. It has one width where the
-host sets the rate, one for small maps, one for large ones, and the widest where a network lies beyond all fitted ones.
+host sets the rate, one for small maps, one for large ones, and the widest where a network lies beyond all of them.
 """
 
 import math
