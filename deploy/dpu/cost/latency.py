@@ -4,9 +4,9 @@ Counts come from `work.py`, the formula from `layers.py` and `host.py`, constant
 where `docs/make_cost_model.py` writes what `fit.py` and `validation.py` find on published networks. None of them is
 ConvBEERS: the paper's own figure is what the model is compared with, never what it is made from.
 
-The interval is FPS e^-width to FPS e^width: nine of ten families of networks, left out of the fit, lay inside theirs.
-It has one width where the host sets the rate, one for small maps, one for large ones, and the widest where a network
-lies beyond all fitted ones.
+The interval is FPS e^-width to FPS e^width, so wide that nine of ten families of networks, each left out of the fit
+once, lie inside; what widths made without a family hold of it is in docs/cost-model.md. It has one width where the
+host sets the rate, one for small maps, one for large ones, and the widest where a network lies beyond all of them.
 """
 
 import math
