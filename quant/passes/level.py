@@ -18,6 +18,7 @@ import numpy as np
 from quant.ends import ONE_CHANNEL, Ends
 from quant.graph import Conv, Graph
 from quant.passes.equalise import (
+    MOST_CHANNELS,
     STEPS,
     Best,
     Costs,
@@ -36,8 +37,6 @@ HEADROOM = (0.8, 1.0, 1.25, 1.6, 2.2)
 clipped."""
 EVERY, CLEARLY = 8, 1.1
 """A guess is tried on one of so many crops first, and dropped where it costs so much more there."""
-MOST_CHANNELS = 256
-"""More are not tried one by one: each costs four runs of all crops at most."""
 
 
 @dataclass(frozen=True)

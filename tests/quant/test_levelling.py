@@ -13,7 +13,7 @@ from quant.ends import Ends, ends_of
 from quant.gate import compare
 from quant.graph import CORRECTION, PLANES, Conv, Graph, channels_of, graph_to_onnx, read_network, read_planes
 from quant.passes import level
-from quant.passes.equalise import Costs
+from quant.passes.equalise import MOST_CHANNELS, Costs
 from quant.passes.level import Chain, chain_ranges
 from quant.passes.stream import STREAM_FRAC_BITS, lone_tensors
 from quant.quantise import ALL, Passes, quantise_model, ticks
@@ -84,7 +84,7 @@ class Bowl:
         return lambda crops: np.array([1.0, 2.0])[slice(None) if crops is None else crops] * off
 
 
-@pytest.mark.parametrize("most", [level.MOST_CHANNELS, 10])
+@pytest.mark.parametrize("most", [MOST_CHANNELS, 10])
 def test_the_search_ticks_as_told_and_never_ends_above_its_start(most: int, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(level, "MOST_CHANNELS", most)
     _, graph, ends, chain = read("espcn")

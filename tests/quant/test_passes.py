@@ -126,6 +126,13 @@ def test_the_search_never_ends_above_its_best_guess(graph: Graph) -> None:
     assert found < min(guesses)
 
 
+def test_a_wide_stream_is_not_searched_channel_by_channel(graph: Graph, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("quant.passes.equalise.MOST_CHANNELS", 7)
+    guesses, found, runs = searched(graph, np.arange(1.0, CROPS + 1))
+    assert found == min(guesses)
+    assert len(runs) == len(guesses)
+
+
 def test_a_trial_that_fails_on_its_first_crops_is_run_on_no_others(graph: Graph) -> None:
     _, _, runs = searched(graph, np.arange(1.0, CROPS + 1))
     assert set(runs) == {FIRST_CROPS, CROPS}  # every crop says the same here: it fails at once or not at all
