@@ -31,7 +31,8 @@ AT_ONCE, INSTRUCTIONS = 16, 2
 def price_rows(target: FaultTarget, prediction: Prediction, dpu: Dpu) -> list[Row]:
     """A row a guard and one for all of them, at work for every tile of 640 x 640."""
     relus = sum(op.activation is Activation.relu for op in target.core.convolutions)
-    rate, values = Constants.of(dpu).host_in_bytes_per_s, target.core.ends.gains * TILE_PX**2
+    rate = Constants.of(dpu).host_in_bytes_per_s * dpu.whole("cpu", "cores")  # fitted for one core
+    values = target.core.ends.gains * TILE_PX**2
     clock_hz = 1e9 * dpu.limit("cpu", "clock_ghz").low
     limit_s = INSTRUCTIONS * values / AT_ONCE / clock_hz
     scrubbing_s = weight_bits(target.core) / INT8_BITS / rate
@@ -51,12 +52,12 @@ def _row(name: str, time_s: float, source: str, prediction: Prediction, spread: 
     tile_s = prediction.batch_time_s / prediction.batch
     slow, fast = prediction.fps_interval
     # The host prepares the next tile while the DPU runs: only what does not fit beside it costs frames.
-    beside = prediction.rate(prediction.batch_time_s, prediction.host_s + time_s)
+    before_s, beside_s = max(tile_s, prediction.host_s), max(tile_s, prediction.host_s + time_s)
     times_s, most = (time_s / spread, time_s * spread), 100 * time_s * spread * fast
     figures = {
         "time": predicted(1e3 * time_s, "ms/tile", (1e3 * times_s[0], 1e3 * times_s[1]), source),
         "of a tile, if nothing hides": predicted(100 * time_s / tile_s, "%", (100 * times_s[0] * slow, most), source),
-        "frame rate lost beside the DPU": predicted(100 * (1 - beside / prediction.fps), "%", (0.0, most), source),
+        "frame rate lost beside the DPU": predicted(100 * (1 - before_s / beside_s), "%", (0.0, most), source),
     }
     return Row("guards", name, figures)
 

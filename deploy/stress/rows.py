@@ -182,7 +182,7 @@ NOTES = {
     "layer's shifts. A flip in a map stays near its place, so a larger crop would make its figure smaller.",
     "bit flips by bit": "The same, over all layers. A shift has six bits.",
     "guards": "ReLU6 only where calibration stays below 96 units. Three rows are the host's time; the DPU is busy "
-    "meanwhile, so next to nothing is lost while the host has time left.",
+    "meanwhile, so nothing is lost while the host has time left.",
     "integer layers": "Intervals of whole numbers through the file's weights: true of every image.",
 }
 

@@ -1,6 +1,6 @@
 """A network cut where the DPU's part begins and ends, and whether its operations fit together."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -24,6 +24,7 @@ from quant.graph.operations import (
     Resize,
     Shuffle,
 )
+from quant.graph.planes import PLANES
 
 
 @dataclass(frozen=True)
@@ -126,6 +127,19 @@ def renamed(op: Op, names: Mapping[str, str]) -> Op:
     else:
         changed["inputs"] = tuple(names.get(name, name) for name in op.inputs)
     return replace(op, **changed)  # type: ignore[type-var]
+
+
+def named_apart(ops: Sequence[Op], ends: Mapping[str, str]) -> Graph:
+    """The operations with these names for the ends, and with others where ours would mean something else."""
+    names = {op.output: f"net.{op.output}" for op in ops if _is_ours(op.output)} | dict(ends)
+    moved = (renamed(op, names) for op in ops)
+    return tuple(replace(op, name=f"net.{op.name}") if _is_ours(op.name) else op for op in moved)  # type: ignore[type-var]
+
+
+def _is_ours(name: str) -> bool:
+    """Whether the files that we write have a tensor of that name themselves."""
+    ours = IMAGE, CORRECTION, PLANES, "restored"
+    return name in ours or name.startswith(("host_front.", "host_back.", f"{IMAGE}."))
 
 
 def check_network(network: Network) -> None:

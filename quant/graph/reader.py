@@ -12,7 +12,7 @@ import onnx
 from onnx import helper
 
 from profiles.errors import ModelError
-from quant.graph.network import Network, channels_of, check_network, cut, refused_graph, renamed, sized
+from quant.graph.network import Network, channels_of, check_network, cut, named_apart, refused_graph, renamed, sized
 from quant.graph.operations import (
     CORRECTION,
     IMAGE,
@@ -33,7 +33,6 @@ from quant.graph.operations import (
     Window,
     is_plain,
 )
-from quant.graph.planes import PLANES
 from quant.graph.trials import makes_blocks, spelled_shuffle
 from quant.onnx_file import constants
 from quant.untrusted import contradictions, times
@@ -140,9 +139,7 @@ class _Reader:
                 self._read(node)
         if not self.ops or self.ops[-1].output != self.model.graph.output[0].name:
             raise refused_graph("an operation that writes the output", "none")
-        own = {op.output: f"net.{op.output}" for op in self.ops if _is_ours(op.output)}
-        names = own | {self.image: IMAGE, self.ops[-1].output: CORRECTION}
-        return tuple(_named_apart(renamed(op, names)) for op in self.ops)
+        return named_apart(self.ops, {self.image: IMAGE, self.ops[-1].output: CORRECTION})
 
     def sized_graph(self) -> tuple[Op, ...]:
         """As `graph`, the windows of global pooling known: a network that pools so has one size of image."""
@@ -364,16 +361,6 @@ class _Reader:
             plain = np.isclose(node.given.get("alpha", 0.2), 1 / 6, 1e-4) and node.given.get("beta", 0.5) == 0.5
             self._require(bool(plain), node, "HardSigmoid with alpha 1/6", f"{node.given.get('alpha', 0.2):g}")
         return activation
-
-
-def _is_ours(name: str) -> bool:
-    """Whether the files that we write have a tensor of that name themselves."""
-    ours = IMAGE, CORRECTION, PLANES, "restored"
-    return name in ours or name.startswith(("host_front.", "host_back.", f"{IMAGE}."))
-
-
-def _named_apart(op: Op) -> Op:
-    return replace(op, name=f"net.{op.name}") if _is_ours(op.name) else op  # type: ignore[type-var]
 
 
 READERS: dict[str, Callable[[_Reader, _Node], Op | None]] = {

@@ -1,11 +1,11 @@
-"""The numbers of the cost model: what is fitted, and which of the formula's variants a board follows.
+"""The numbers of the cost model: what is fitted, which variant of the formula a board follows, regimes of its errors.
 
 They stand in a target's [cost], where `docs/make_cost_model.py` writes what `fit` and `validation` find.
 """
 
 from dataclasses import dataclass, fields
 from itertools import product
-from typing import Self
+from typing import Literal, Self, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -102,3 +102,17 @@ class Structure:
 
 STRUCTURES = tuple(Structure(*values) for values in product((0.5,), (2.0, 4.0), (0.0, 1.0)))
 """What the cross-validation chooses from; the rates do not tell how much is hidden, so `serial` is assumed."""
+
+
+Regime = Literal["host", "small maps", "large maps"]
+"""The host; or the DPU, on maps of at most LARGE_MAP_BYTES, or with larger ones."""
+REGIMES: tuple[Regime, ...] = get_args(Regime)
+
+LARGE_MAP_BYTES = 2 << 20
+
+
+def regime_of(host_bound: bool, map_bytes: float) -> Regime:
+    """The regime of a network, from its largest result."""
+    if host_bound:
+        return "host"
+    return "large maps" if map_bytes > LARGE_MAP_BYTES else "small maps"

@@ -16,10 +16,9 @@ from functools import cached_property
 
 from deploy.dpu.board import Dpu
 from deploy.dpu.checker.placement import Placement
-from deploy.dpu.cost.constants import Constants, Structure
+from deploy.dpu.cost.constants import Constants, Regime, Structure, regime_of
 from deploy.dpu.cost.host import Task, frame_rate, placed_work, task_of
 from deploy.dpu.cost.layers import Layers
-from deploy.dpu.cost.regimes import Regime, regime_of
 from deploy.dpu.cost.work import Work, count_work, largest_map_bytes
 from deploy.dpu.graph import Operation
 from deploy.restoration.plan import plan_side

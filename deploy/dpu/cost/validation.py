@@ -15,10 +15,9 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from deploy.dpu.cost.constants import STRUCTURES, Array, Constants, Structure
+from deploy.dpu.cost.constants import REGIMES, STRUCTURES, Array, Constants, Regime, Structure, regime_of
 from deploy.dpu.cost.fit import Cases, fit
 from deploy.dpu.cost.published import boards, published_cases
-from deploy.dpu.cost.regimes import REGIMES, Regime, regime_of
 
 FOLDS = 5
 SHARE = 0.9

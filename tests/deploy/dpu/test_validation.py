@@ -7,10 +7,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from deploy.dpu.cost.constants import STRUCTURES
+from deploy.dpu.cost.constants import LARGE_MAP_BYTES, STRUCTURES, regime_of
 from deploy.dpu.cost.fit import Cases
 from deploy.dpu.cost.published import boards, published_cases
-from deploy.dpu.cost.regimes import LARGE_MAP_BYTES, regime_of
 from deploy.dpu.cost.validation import (
     Trial,
     Widths,
