@@ -7,7 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from deploy.dpu.cost.constants import LARGE_MAP_BYTES, STRUCTURES, regime_of
+from deploy.dpu.board import load_dpu
+from deploy.dpu.cost.constants import LARGE_MAP_BYTES, STRUCTURES, Structure, regime_of
 from deploy.dpu.cost.fit import Cases
 from deploy.dpu.cost.published import boards, published_cases
 from deploy.dpu.cost.validation import (
@@ -17,7 +18,11 @@ from deploy.dpu.cost.validation import (
     by_network,
     coverage,
     family_quantile,
+    leave_out,
     left_out_rows,
+    nested,
+    rank_correlation,
+    relative,
 )
 
 BOARD = "vek280"  # the fewest rates
@@ -26,6 +31,24 @@ BOARD = "vek280"  # the fewest rates
 @pytest.fixture(scope="module")
 def trials() -> list[Trial]:
     return [Trial(published_cases(BOARD, structure)) for structure in STRUCTURES]
+
+
+def test_left_out_networks_are_predicted_as_well_as_the_docs_say() -> None:
+    dpu = load_dpu("vck190")
+    cases = published_cases("vck190", Structure.of(dpu))
+    names = [row.network for row in cases.rows]
+    errors = leave_out(cases, names)
+    assert len(set(names)) >= 20
+    assert len(names) >= 60
+    assert np.median(relative(errors)) <= 0.10
+    assert relative(errors).mean() <= 0.20
+    assert rank_correlation(cases, errors) >= 0.95
+
+
+def test_intervals_of_families_left_out_hold_what_was_published() -> None:
+    inside, families = coverage(nested("vck190").rows)
+    assert inside >= 0.85
+    assert families <= inside
 
 
 def test_nothing_of_a_family_reaches_what_is_said_of_it(trials: list[Trial]) -> None:
