@@ -15,11 +15,10 @@ import numpy as np
 
 from deploy.dpu.board import load_dpu
 from deploy.dpu.checker.placement import place
-from deploy.dpu.cost.constants import NAMES, UNITS, Constants
+from deploy.dpu.cost.constants import LARGE_MAP_BYTES, NAMES, UNITS, Constants
 from deploy.dpu.cost.fit import fit
 from deploy.dpu.cost.latency import WIDTHS, paper_frames, predict
 from deploy.dpu.cost.published import boards, published_cases
-from deploy.dpu.cost.regimes import LARGE_MAP_BYTES
 from deploy.dpu.cost.validation import (
     LeftOut,
     Nested,
