@@ -302,12 +302,12 @@ the weights too. BW is the DDR's peak where weights cross it in `bursts`, else t
 and DDR are the board's, in its file; what is fitted is shares of them and times. With one thread DPU and host take
 turns, 1 / (one core's DPU + host); such rates are fitted beside.
 
-What is counted, from shapes alone (`deploy/dpu/cost/work.py`): input channels, output channels and pixels filled up
-to the array's; layers of fewer input channels than it takes gather their window's columns; transposed convolutions
-run over the zeros between their pixels. Pools and depthwise convolutions run on the ALU, adds on the element-wise
-engine. A result passes through memory where a group of feature-map banks cannot hold it, where more than two
-operations read it, or where a concat joins it. An add reads no operand that its own convolution has read,
-a pixel shuffle is no more than where results go.
+What is counted, from shapes alone (`deploy/dpu/cost/work.py`): input channels, output channels, rows and, on Versal,
+columns filled up to the array's; layers of fewer input channels than it takes gather their window's columns;
+transposed convolutions run over the zeros between their pixels. Pools and depthwise convolutions run on the ALU, adds
+on the element-wise engine. A result passes through memory where a group of feature-map banks cannot hold it, where
+more than two operations read it, or where a concat joins it. An add reads no operand that its own convolution has
+read, a pixel shuffle is no more than where results go.
 
 The host's tasks (`deploy/dpu/cost/host.py`): copy, argmax, softmax, sort (boxes, key points) and image, the same in
 the fit and for a file, where the operators behind the last convolution tell.
