@@ -24,7 +24,7 @@ class Method(StrEnum):
 
 def restore(
     context: typer.Context,
-    image: Annotated[Path, typer.Argument(metavar="IN", help="Image of at most 12 bits (TIFF of any size, or PNG).")],
+    image: Annotated[Path, typer.Argument(metavar="IN", help="Image: TIFF or what GDAL reads, of any size, or PNG.")],
     out: Annotated[Path, typer.Argument(metavar="OUT", help="TIFF to write: uint16, or float32 where IN is float.")],
     model: Annotated[
         Path | None, typer.Option(help="ONNX network, or a shipped one's name; convbeers-s-int8 if none.")
@@ -56,6 +56,9 @@ def restore(
     scheduler: Annotated[
         str | None, typer.Option(help="Dask scheduler whose workers restore, such as tcp://host:8786.")
     ] = None,
+    trust_index: Annotated[
+        bool, typer.Option("--trust-index", help="Let a VRT or DIMAP name tiles outside its folder and at URLs.")
+    ] = False,
     resume: Annotated[bool, typer.Option("--resume", help="Go on with a run that was stopped or killed.")] = False,
     json: Annotated[Path | None, typer.Option(help="Write the figures here.")] = None,
 ) -> None:
@@ -68,6 +71,7 @@ def restore(
     it may be.
     With --method traditional the image is stabilised, denoised and sharpened as its --sensor asks, in strips of rows:
     one band, about a minute a megapixel on two cores, not resumable.
+    JPEG 2000, NITF and HFA files, VRT mosaics and DIMAP indexes need the extra 'gdal'.
     Georeference, RPCs and missing pixels (NaN, or the nodata value) are kept. Until OUT is finished its rows lie in
     .OUT.part beside it. Workers change no pixel: where they are of one processor and the same versions, the bytes are
     those of one process. Those of a scheduler must find IN under its path; only this process writes.
@@ -84,7 +88,7 @@ def restore(
         require_writable(out, json, inputs=(image, Path(sensor) if sensor else None))
         expected, remedy = "none with --method traditional", "leave it out"
         refuse(context, NETWORK_ONLY, expected=expected, got="one", remedy=remedy)
-        _by_the_chain(image, out, sensor, full_scale, compression, budget_bytes, json)
+        _by_the_chain(image, out, sensor, full_scale, compression, budget_bytes, trust_index, json)
         return
     require_writable(out, json, inputs=(image, model, Path(sensor) if sensor else None))
     if sensor is not None and conditioned(model) is None:
@@ -103,6 +107,7 @@ def restore(
         resume,
         workers,
         scheduler,
+        trust_index,
     )
     row = restore_file(image, out, options, say)
     print_rows(f"wrote {out}", [row])
@@ -125,6 +130,7 @@ def _by_the_chain(
     full_scale: float | None,
     compression: Compression,
     memory_bytes: int | None,
+    trust_index: bool,
     json: Path | None,
 ) -> None:
     from deploy.restoration.traditional import Request, restore_file_traditionally
@@ -137,7 +143,7 @@ def _by_the_chain(
         remedy = "name a profile ('beers-deploy profiles' lists them) or give your .toml file"
         raise OptionError("--sensor", expected="the sensor that acquired IN", got="none", remedy=remedy)
     degraded = load_sensor(sensor)
-    request = Request(degraded, reference_for(degraded), full_scale, compression, memory_bytes)
+    request = Request(degraded, reference_for(degraded), full_scale, compression, memory_bytes, trust_index)
     row = restore_file_traditionally(image, out, request)
     print_rows(f"wrote {out}", [row])
     arguments = {"method": "traditional", "sensor": sensor, "full_scale": full_scale}

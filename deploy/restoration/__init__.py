@@ -4,6 +4,8 @@ An image passes, in this order:
 
     options      what a user can choose
     source       an image file, or an array, as rows
+    gdal_source  the same of what GDAL reads by windows: JPEG 2000, NITF, HFA, VRT, DIMAP
+    index_files  which files an untrusted VRT or DIMAP names, and that it names no others
     plan         how it is cut into tiles, and the memory that takes
     runtime      the network, on onnxruntime or OpenVINO
     engine       the one tile loop, for files and arrays: `restore_rows`, `restore_array`, `restore_dn`

@@ -47,6 +47,7 @@ class Options:
         resume: go on with a stopped run.
         workers: processes of this machine that restore; 0 is this process alone.
         scheduler: address of a Dask scheduler whose workers restore.
+        trust_index: whether a VRT or DIMAP may name tiles outside its folder, at URLs too.
     """
 
     model: Path
@@ -60,6 +61,7 @@ class Options:
     resume: bool = False
     workers: int = 0
     scheduler: str | None = None
+    trust_index: bool = False
 
     @property
     def is_spread(self) -> bool:

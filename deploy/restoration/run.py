@@ -20,6 +20,7 @@ from deploy.cluster import check_choice
 from deploy.host_state import peak_memory
 from deploy.restoration.engine import RestoredRow, Restorer, Say, Tick, restore_rows
 from deploy.restoration.georeference import enlarged_tags
+from deploy.restoration.index_files import index_files
 from deploy.restoration.options import Options
 from deploy.restoration.output import (
     Checkpoint,
@@ -34,7 +35,7 @@ from deploy.restoration.runtime import open_runtime, tiles_at_once
 from deploy.restoration.source import Source, fingerprint, open_source
 from deploy.restoration.workers import make_work, rows_of_workers
 from model.io.files import require_writable
-from model.io.images import settled_scale
+from model.io.images import require_image_file, settled_scale
 from model.processor import require_cores
 from model.progress import held_back, steps
 from profiles.errors import BeersError, ImageError, MachineError
@@ -54,8 +55,8 @@ def restore_file(image: Path, out: Path, options: Options, say: Say) -> Row:
     """Restore `image` into the TIFF `out`, and return the run's figures.
 
     Args:
-        image: a TIFF of any size, a PNG or a JPEG.
-        out: a TIFF, uint16 of integers and float32 of floats, in the scale of the image; larger by the network's
+        image: a TIFF of any size, a PNG, a JPEG, or what GDAL reads (deploy.restoration.source).
+        out: a TIFF of the type `Raster.out_dtype`, in the scale of the image; larger by the network's
             factor where it has one, and in its place on Earth.
         options: what the user chose.
         say: told the plan, the memory, and how to go on after a stop.
@@ -68,7 +69,8 @@ def restore_file(image: Path, out: Path, options: Options, say: Say) -> Row:
         KeyboardInterrupt: stopped; rows already finished stay for `resume`.
     """
     check_choice(options.workers, options.scheduler)
-    require_writable(out, inputs=(image, options.model))
+    require_image_file(image)
+    require_writable(out, inputs=(image, *index_files(image, options.trust_index), options.model))
     if options.scheduler is None:
         require_cores("--threads", options.threads)
     require_tiff_name(out)
@@ -80,7 +82,7 @@ def restore_file(image: Path, out: Path, options: Options, say: Say) -> Row:
 def _restore(image: Path, out: Path, options: Options, say: Say) -> Row:
     started = time.perf_counter()
     network = load_onnx(options.model)
-    with open_source(image) as source:
+    with open_source(image, options.trust_index) as source:
         raster = source.raster
         plan = plan_for(network, raster.shape, options)
         say(plan.sentence)

@@ -16,6 +16,7 @@ from torch import Tensor
 
 from deploy.host_state import peak_memory
 from deploy.restoration.engine import RestoredRow, as_stored, checked_strip
+from deploy.restoration.index_files import index_files
 from deploy.restoration.options import Compression
 from deploy.restoration.output import (
     Checkpoint,
@@ -28,7 +29,7 @@ from deploy.restoration.output import (
 from deploy.restoration.plan import Span, check_memory
 from deploy.restoration.source import Raster, Source, fingerprint, open_source
 from model.io.files import require_writable
-from model.io.images import settled_scale
+from model.io.images import require_image_file, settled_scale
 from model.progress import steps
 from model.traditional.pipeline import Chain, restore_strips
 from profiles.errors import ImageError
@@ -53,6 +54,7 @@ class Request:
         full_scale: the pixel value that is the sensor's highest digital number; None lets type and values decide.
         compression: of the output.
         memory_bytes: budget of the process; None is what is free.
+        trust_index: whether a VRT or DIMAP may name tiles outside its folder, at URLs too.
     """
 
     sensor: SensorProfile
@@ -60,6 +62,7 @@ class Request:
     full_scale: float | None = None
     compression: Compression = Compression.zlib
     memory_bytes: int | None = None
+    trust_index: bool = False
 
     def chain(self) -> Chain:
         """The chain from the sensor to the reference, both in the sensor's digital numbers."""
@@ -76,7 +79,8 @@ def restore_file_traditionally(image: Path, out: Path, request: Request) -> Row:
         MachineError: another run on `out`; memory or disk.
         KeyboardInterrupt: stopped; nothing is left behind.
     """
-    require_writable(out, inputs=(image,))
+    require_image_file(image)
+    require_writable(out, inputs=(image, *index_files(image, request.trust_index)))
     require_tiff_name(out)
     require_codec(request.compression)
     with only_run(out, part_folder(out)):
@@ -85,7 +89,7 @@ def restore_file_traditionally(image: Path, out: Path, request: Request) -> Row:
 
 def _restore(image: Path, out: Path, request: Request) -> Row:
     started, chain = time.perf_counter(), request.chain()
-    with open_source(image) as source:
+    with open_source(image, request.trust_index) as source:
         raster = source.raster
         _require_one_band(raster, image)
         needed = FIXED_BYTES + BYTES_PER_COLUMN * raster.width_px + source.held_bytes(STRIP_PX)

@@ -148,7 +148,7 @@ def _reachable(work: Work) -> Iterator[Source]:
         raise unreachable(work.image, error.strerror or str(error)) from error
     if seen != work.seen:
         raise unreachable(work.image, "another file of that name")
-    with open_source(work.image) as source:
+    with open_source(work.image, work.options.trust_index) as source:
         yield source
 
 
