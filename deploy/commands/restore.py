@@ -25,7 +25,7 @@ class Method(StrEnum):
 def restore(
     context: typer.Context,
     image: Annotated[Path, typer.Argument(metavar="IN", help="Image: TIFF or what GDAL reads, of any size, or PNG.")],
-    out: Annotated[Path, typer.Argument(metavar="OUT", help="TIFF to write: uint16, or float32 where IN is float.")],
+    out: Annotated[Path, typer.Argument(metavar="OUT", help="TIFF to write, of the type of IN.")],
     model: Annotated[
         Path | None, typer.Option(help="ONNX network, or a shipped one's name; convbeers-s-int8 if none.")
     ] = None,
@@ -41,7 +41,10 @@ def restore(
     halo: Annotated[str, typer.Option(help="Context around a tile: 'exact' (no seams) or pixels.")] = "exact",
     full_scale: Annotated[
         float | None,
-        typer.Option(help="Pixel value that is full scale; 4095 if none, but 8-bit and 0..1 pixels need it."),
+        typer.Option(
+            help="Pixel value that is full scale; else what IN states, the bits of --sensor, or 12 bits. "
+            "8-bit and 0..1 pixels need it."
+        ),
     ] = None,
     runtime: Annotated[Runtime, typer.Option(help="What runs the network.")] = Runtime.onnxruntime,
     threads: Annotated[int, typer.Option(min=0, help="Threads; 0 takes every core, or what falls to a worker.")] = 0,
@@ -94,7 +97,8 @@ def restore(
     if sensor is not None and conditioned(model) is None:
         expected, remedy = "a shipped network, or weights of 'train --conditioned'", "leave --sensor out"
         raise OptionError("--sensor", expected=expected, got=f"{model}, made for one already", remedy=remedy)
-    path = network_file(model, load_sensor(sensor or BLIND), partial(say, err=True))
+    known = load_sensor(sensor or BLIND)
+    path = network_file(model, known, partial(say, err=True))
     options = Options(
         path,
         tile,
@@ -108,6 +112,7 @@ def restore(
         workers,
         scheduler,
         trust_index,
+        int(known.bits.low) if sensor else None,
     )
     row = restore_file(image, out, options, say)
     print_rows(f"wrote {out}", [row])

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import tifffile
 
-from deploy.restoration.index_files import dimap_bits, index_files
+from deploy.restoration.index_files import dimap_bits, index_files, is_index
 from deploy.restoration.source import (
     GDAL_DRIVERS,
     Raster,
@@ -62,12 +62,21 @@ def open_gdal(path: Path, trusted: bool = False) -> Iterator["GdalSource"]:
         MachineError: rasterio is not installed.
     """
     rasterio = _rasterio(path)
-    index_files(path, trusted)
+    tiles = [file for file in index_files(path, trusted) if not is_index(file)]
     environment = ENVIRONMENT if trusted else ENVIRONMENT | OFFLINE
     with _damage_in_a_sentence(path), rasterio.Env(**environment):
         dataset = rasterio.open(path.resolve(), driver=GDAL_DRIVERS[path.suffix.lower()])
+        block_px = _block_px(dataset)
+        if tiles:  # a mosaic states blocks of its own, and decodes those of its tiles, which are mostly alike
+            with rasterio.open(tiles[0]) as tile:
+                block_px = max(block_px, _block_px(tile))
     with dataset:
-        yield GdalSource(path, dataset, environment)
+        yield GdalSource(path, dataset, block_px, environment)
+
+
+def _block_px(dataset: Any) -> int:
+    """Rows of the blocks in which an image is decoded."""
+    return max((int(rows) for rows, _ in dataset.block_shapes), default=1)
 
 
 @contextmanager
@@ -95,12 +104,11 @@ def _damage_in_a_sentence(path: Path, where: str = "") -> Iterator[None]:
 class GdalSource:
     """An image that GDAL has opened; one thread reads at a time."""
 
-    def __init__(self, path: Path, dataset: Any, environment: dict[str, str]) -> None:
+    def __init__(self, path: Path, dataset: Any, block_px: int, environment: dict[str, str]) -> None:
         self._path, self._dataset, self._environment = path, dataset, environment
         with _damage_in_a_sentence(path):
             self.raster = _raster(path, dataset)
-        self._block_px = max(rows for rows, _ in dataset.block_shapes)
-        self._cache_bytes = LEAST_CACHE_BYTES
+        self._block_px = block_px
 
     def read(self, start: int, stop: int) -> np.ndarray:
         """Rows `start` to `stop` (excluded) of every band, (bands, rows, width), as stored.
@@ -109,21 +117,18 @@ class GdalSource:
             ImageError: damaged.
         """
         rasterio = _rasterio(self._path)
-        self._cache_bytes = max(self._cache_bytes, self._cache_for(stop - start))
         with (
             _damage_in_a_sentence(self._path, f"rows {start} to {stop - 1}"),
-            rasterio.Env(GDAL_CACHEMAX=self._cache_bytes, **self._environment),
+            rasterio.Env(GDAL_CACHEMAX=self.held_bytes(stop - start), **self._environment),
         ):
             window = rasterio.windows.Window(0, start, self.raster.width_px, stop - start)
             return np.asarray(self._dataset.read(window=window))
 
     def held_bytes(self, rows_px: int) -> int:
         """GDAL's cache: the blocks around the rows, so that none is decoded for two strips."""
-        return max(LEAST_CACHE_BYTES, self._cache_for(rows_px))
-
-    def _cache_for(self, rows_px: int) -> int:
         rows = rows_px + 2 * self._block_px
-        return rows * self.raster.bands * self.raster.width_px * self.raster.dtype.itemsize
+        row_bytes = self.raster.bands * self.raster.width_px * self.raster.dtype.itemsize
+        return int(max(LEAST_CACHE_BYTES, rows * row_bytes))
 
 
 def _raster(path: Path, dataset: Any) -> Raster:
@@ -148,13 +153,17 @@ def _raster(path: Path, dataset: Any) -> Raster:
 
 
 def _bits(path: Path, dataset: Any) -> int | None:
-    """The bits per pixel that the file states, the largest of its bands'; None where any band states none."""
+    """The bits per pixel that the file states, the largest of its bands'; None where any band states none.
+
+    A DIMAP says it of the product; of other files what fills the type is a container, as in a plain TIFF.
+    """
+    if (of_product := dimap_bits(path)) is not None:
+        return of_product
     bands = range(1, dataset.count + 1)
     stated = [str(dataset.tags(band, ns="IMAGE_STRUCTURE").get("NBITS", "")) for band in bands]
-    if all(stated):
-        return max(int(bits) for bits in stated)
-    actual = str(dataset.tags().get("NITF_ABPP", "")).strip()
-    return int(actual) if actual.isdecimal() else dimap_bits(path)
+    actual = stated if all(stated) else [str(dataset.tags().get("NITF_ABPP", "")).strip()]
+    most = max((int(each) for each in actual if each.isdecimal()), default=0)
+    return most if 0 < most < 8 * np.dtype(dataset.dtypes[0]).itemsize else None
 
 
 def _tags(dataset: Any, nodata: float | None) -> tuple[Tag, ...]:

@@ -46,6 +46,7 @@ VRT_ATTRIBUTES = {
     "BlockXSize", "BlockYSize", "resampling",
 }  # fmt: skip
 VRT = "VRTDataset"
+MOST_BITS = 16
 PIXELS = "data_file_path"
 DIMAP_PATHS = {PIXELS, "component_path"}
 """GDAL compares names of elements without regard to case."""
@@ -180,8 +181,13 @@ def _refused(path: Path, expected: str, got: str, remedy: str) -> ImageError:
 
 
 def dimap_bits(path: Path) -> int | None:
-    """The bits per pixel that a DIMAP states (Raster_Encoding/NBITS); None where it states none or is none."""
+    """The bits per pixel of a DIMAP's product; None where it states none, or is none.
+
+    Dynamic_Range/PRODUCT_RANGE, else Raster_Encoding/NBITS, as Airbus' Pleiades Imagery User Guide has them.
+    """
     if path.suffix.lower() != ".xml":
         return None
-    stated = [element.text or "" for element in _parsed(path).iter("NBITS")]
-    return int(stated[0]) if len(stated) == 1 and stated[0].strip().isdecimal() else None
+    root = _parsed(path)
+    stated = [(root.findtext(f".//{name}") or "").strip() for name in ("PRODUCT_RANGE", "NBITS")]
+    known = [int(text) for text in stated if text.isdecimal() and 1 <= int(text) <= MOST_BITS]
+    return known[0] if known else None

@@ -39,7 +39,7 @@ class Options:
         model: the network's file.
         tile_px: side of a tile.
         halo: 'exact', or pixels of context around a tile.
-        full_scale: the pixel value that is 1.0 to the network; None lets type and values decide (model.io.images).
+        full_scale: the pixel value that is 1.0 to the network; None leaves it to deploy.restoration.radiometry.
         runtime: what runs the network.
         threads: of the runtime; 0 takes every core, or a worker's share of them.
         compression: of the output.
@@ -47,6 +47,7 @@ class Options:
         resume: go on with a stopped run.
         workers: processes of this machine that restore; 0 is this process alone.
         scheduler: address of a Dask scheduler whose workers restore.
+        sensor_bits: bits per pixel of the sensor, where the user named its profile.
         trust_index: whether a VRT or DIMAP may name tiles outside its folder, at URLs too.
     """
 
@@ -62,6 +63,7 @@ class Options:
     workers: int = 0
     scheduler: str | None = None
     trust_index: bool = False
+    sensor_bits: int | None = None
 
     @property
     def is_spread(self) -> bool:

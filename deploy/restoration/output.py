@@ -38,6 +38,7 @@ class Checkpoint:
     Attributes:
         rows: how many are finished.
         known: how many of their pixels are not missing.
+        clipped: how many pixels of the image were above full scale.
     """
 
     def __init__(
@@ -59,7 +60,7 @@ class Checkpoint:
         self.out, self.shape, self.dtype = out, shape, dtype
         self.folder = part_folder(out)
         self._job = dict(job)
-        self.rows, self.known = self._left() if resume else (0, 0)
+        self.rows, self.known, self.clipped = self._left() if resume else (0, 0, 0)
         with self.disk():
             if not self.rows:
                 self.remove()
@@ -82,6 +83,7 @@ class Checkpoint:
                 stream.flush()
                 os.fsync(stream.fileno())
             self.rows, self.known = self.rows + row.pixels.shape[1], self.known + row.known
+            self.clipped += row.clipped
             self._write_journal()
 
     def read(self, band: int, start: int, stop: int) -> np.ndarray:
@@ -109,15 +111,16 @@ class Checkpoint:
             got = error.strerror or str(error)
             raise MachineError(str(self.out), expected="a disk to write to", got=got, remedy=remedy) from error
 
-    def _left(self) -> tuple[int, int]:
+    def _left(self) -> tuple[int, int, int]:
         path = self.folder / "journal.json"
         if not path.is_file():
-            return 0, 0
+            return 0, 0, 0
         with suppress(ValueError, KeyError, TypeError, OSError):
             journal: Any = read_json(path)
-            rows, known = int(journal["rows"]), int(journal["known"])
-            if journal["job"] == self._job and 0 <= rows <= self.shape[1] and 0 <= known <= math.prod(self.shape):
-                return rows, known
+            rows, known, clipped = int(journal["rows"]), int(journal["known"]), int(journal.get("clipped", 0))
+            sound = 0 <= rows <= self.shape[1] and 0 <= known <= math.prod(self.shape) and clipped >= 0
+            if journal["job"] == self._job and sound:
+                return rows, known, clipped
         raise OptionError(
             "--resume",
             expected="the image, the model and the options of the run that was stopped",
@@ -128,7 +131,8 @@ class Checkpoint:
     def _write_journal(self) -> None:
         path, fresh = self.folder / "journal.json", self.folder / "journal.new"
         with fresh.open("w", encoding="utf-8") as stream:
-            json.dump({"job": self._job, "rows": self.rows, "known": self.known}, stream)
+            counts = {"rows": self.rows, "known": self.known, "clipped": self.clipped}
+            json.dump({"job": self._job, **counts}, stream)
             stream.flush()
             os.fsync(stream.fileno())
         fresh.replace(path)

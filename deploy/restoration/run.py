@@ -31,11 +31,12 @@ from deploy.restoration.output import (
     write_output,
 )
 from deploy.restoration.plan import Plan, Span, check_memory, is_bulky, plan_for, rows_bytes
+from deploy.restoration.radiometry import FullScale, full_scale_of
 from deploy.restoration.runtime import open_runtime, tiles_at_once
 from deploy.restoration.source import Source, fingerprint, open_source
 from deploy.restoration.workers import make_work, rows_of_workers
 from model.io.files import require_writable
-from model.io.images import require_image_file, settled_scale
+from model.io.images import require_image_file
 from model.processor import require_cores
 from model.progress import held_back, steps
 from profiles.errors import BeersError, ImageError, MachineError
@@ -88,17 +89,17 @@ def _restore(image: Path, out: Path, options: Options, say: Say) -> Row:
         say(plan.sentence)
         if not options.is_spread:
             check_memory(rows_bytes(source, plan), options.memory_bytes, is_bulky(source, plan))
-        full_scale = scale_of(source, plan, options.full_scale, str(image))
+        scale = scale_of(source, plan, options, str(image))
         at_once = tiles_at_once(options.threads, plan.tiles)
         infer, runtime = open_runtime(options.runtime, network, options.threads, at_once)
-        restorer = Restorer(raster, infer, full_scale, plan.tiling, str(image))
+        restorer = Restorer(raster, infer, scale.value, plan.tiling, str(image), not scale.assumed)
         figures = seam_figures(source, plan, restorer)
         # Another version of the runtime might give other bits: rows of one are not finished by another.
-        job = _job(image, options, plan, runtime, full_scale)
+        job = _job(image, options, plan, runtime, scale.value)
         checkpoint = Checkpoint(out, plan.out_shape, raster.out_dtype, job, options.resume)
         done_rows = checkpoint.rows // plan.scale
         if options.is_spread:
-            work, peaks_gb = make_work(image, plan, network, runtime, options, full_scale), list[float]()
+            work, peaks_gb = make_work(image, plan, network, runtime, options, scale), list[float]()
             finish_rows(checkpoint, plan, str(image), say, partial(rows_of_workers, work, source, say, peaks_gb))
             figures |= worker_figures(peaks_gb)
         else:
@@ -107,10 +108,14 @@ def _restore(image: Path, out: Path, options: Options, say: Say) -> Row:
     with held_back():  # a stop now would save nothing
         write_output(checkpoint, enlarged_tags(raster.tags, plan.scale), options.compression)
     time_s = time.perf_counter() - started
-    return run_row(image.name, plan, done_rows, time_s, runtime, options, figures, full_scale)
+    if checkpoint.clipped:
+        above = f"{checkpoint.clipped} pixels above full scale"
+        say(f"{above}, {scale.value:g} ({scale.source}), were clipped to it")
+    figures["clipped pixels"] = measured(checkpoint.clipped, "1", "pixels of the image above its full scale")
+    return run_row(image.name, plan, done_rows, time_s, runtime, options, figures, scale)
 
 
-def scale_of(source: Source, plan: Plan, asked: float | None, name: str) -> float:
+def scale_of(source: Source, plan: Plan, options: Options, name: str) -> FullScale:
     """The pixel value that is full scale; float images are read to their first bright row of tiles to know it.
 
     Raises:
@@ -118,7 +123,7 @@ def scale_of(source: Source, plan: Plan, asked: float | None, name: str) -> floa
         OptionError: a full scale that such pixels cannot have.
     """
     largest = (source.raster.largest(source.read(row.keep_start, row.keep_stop)) for row in plan.rows)
-    return settled_scale(name, source.raster.dtype, largest, asked)
+    return full_scale_of(name, source.raster, largest, options.full_scale, options.sensor_bits)
 
 
 def _job(image: Path, options: Options, plan: Plan, runtime: str, full_scale: float) -> dict[str, object]:
@@ -237,9 +242,8 @@ def seam_error_dn(source: Source, plan: Plan, restorer: Restorer) -> tuple[float
     wide = [_widened(span, plan.radius_px, end_px) for span, end_px in zip((rows, columns), ends_px, strict=True)]
     start, stop = min(rows.start, wide[0].start), max(rows.stop, wide[0].stop)
     strip = restorer.read(source, start, stop)
-    cheap, _ = restorer.tile(strip, 0, rows, columns)
-    exact, _ = restorer.tile(strip, 0, *wide)
-    error = np.abs(np.nan_to_num(cheap.astype(np.float64)) - np.nan_to_num(exact.astype(np.float64)))
+    cheap, exact = (restorer.tile(strip, 0, *spans).pixels.astype(np.float64) for spans in ((rows, columns), wide))
+    error = np.abs(np.nan_to_num(cheap) - np.nan_to_num(exact))
     return float(error.max()), float(error.mean())
 
 
@@ -269,7 +273,7 @@ def run_row(
     runtime: str,
     options: Options,
     more: dict[str, Figure],
-    full_scale: float,
+    scale: FullScale,
 ) -> Row:
     """The figures of one run, of which `done_rows` were finished before."""
     useful_px = plan.bands * (plan.height_px - done_rows) * plan.width_px
@@ -283,5 +287,6 @@ def run_row(
         **more,
     }
     workers = {"workers": options.scheduler or str(options.workers)} if options.is_spread else {}
-    text = {"halo": plan.halo_words, "full scale": f"{full_scale:g}", "runtime": runtime, **workers}
+    scales = {"full scale": f"{scale.value:g}", "full scale from": scale.source}
+    text = {"halo": plan.halo_words, **scales, "runtime": runtime, **workers}
     return Row("restore", name, figures, text)

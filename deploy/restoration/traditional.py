@@ -27,9 +27,10 @@ from deploy.restoration.output import (
     write_output,
 )
 from deploy.restoration.plan import Span, check_memory
+from deploy.restoration.radiometry import FullScale, full_scale_of
 from deploy.restoration.source import Raster, Source, fingerprint, open_source
 from model.io.files import require_writable
-from model.io.images import require_image_file, settled_scale
+from model.io.images import require_image_file
 from model.progress import steps
 from model.traditional.pipeline import Chain, restore_strips
 from profiles.errors import ImageError
@@ -95,17 +96,17 @@ def _restore(image: Path, out: Path, request: Request) -> Row:
         needed = FIXED_BYTES + BYTES_PER_COLUMN * raster.width_px + source.held_bytes(STRIP_PX)
         check_memory(needed, request.memory_bytes, bulky=False)
         largest = (raster.largest(source.read(*rows)) for rows in _strips(raster.height_px))
-        max_dn = chain.degraded.max_dn
-        full_scale = settled_scale(str(image), raster.dtype, largest, request.full_scale, max_dn)
+        bits = int(chain.degraded.max_dn).bit_length()
+        scale = full_scale_of(str(image), raster, largest, request.full_scale, bits)
         job = {"image": list(fingerprint(image)), "method": "traditional"}
         checkpoint = Checkpoint(out, raster.shape, raster.out_dtype, job, resume=False)
         try:
-            _fill(checkpoint, source, chain, full_scale, str(image))
+            _fill(checkpoint, source, chain, scale.value, str(image))
             write_output(checkpoint, raster.tags, request.compression)
         except BaseException:  # a strip is no place to go on from: the chain looks hundreds of rows back
             checkpoint.remove()
             raise
-    return _row(image.name, raster, time.perf_counter() - started, request, full_scale)
+    return _row(image.name, raster, time.perf_counter() - started, request, scale)
 
 
 def _fill(checkpoint: Checkpoint, source: Source, chain: Chain, full_scale: float, name: str) -> None:
@@ -152,7 +153,7 @@ def _require_one_band(raster: Raster, image: Path) -> None:
         raise ImageError(str(image), expected="one band", got=f"{raster.bands} bands", remedy=remedy)
 
 
-def _row(name: str, raster: Raster, time_s: float, request: Request, full_scale: float) -> Row:
+def _row(name: str, raster: Raster, time_s: float, request: Request, scale: FullScale) -> Row:
     source = f"from opening the image to the finished file, {torch.get_num_threads()} threads"
     pixels = raster.height_px * raster.width_px
     figures = {
@@ -160,5 +161,6 @@ def _row(name: str, raster: Raster, time_s: float, request: Request, full_scale:
         "throughput": measured(pixels / time_s / 1e6, "Mpx/s", source),
         "peak memory": peak_memory(),
     }
-    text = {"method": "traditional", "sensor": request.sensor.name, "full scale": f"{full_scale:g}"}
+    scales = {"full scale": f"{scale.value:g}", "full scale from": scale.source}
+    text = {"method": "traditional", "sensor": request.sensor.name, **scales}
     return Row("restore", name, figures, text)

@@ -96,7 +96,7 @@ def source(name: str, band: int, row: int, column: int, rows: int, columns: int)
     )
 
 
-def write_dimap(path: Path, pixels: np.ndarray, bits: int = 12) -> Path:
+def write_dimap(path: Path, pixels: np.ndarray, bits: int = 12, more: str = "") -> Path:
     """A DIMAP index of two tiles beside it, one above the other, with bits, gains and rational polynomials."""
     bands, height, width = pixels.shape
     for k in range(2):
@@ -128,7 +128,7 @@ def write_dimap(path: Path, pixels: np.ndarray, bits: int = 12) -> Path:
 <Regular_Tiling><NTILES_SIZE nrows="{2 * TILE_PX}" ncols="{width}"/><NTILES_COUNT ntiles_R="2" ntiles_C="1"/>
 <OVERLAP_ROW>0</OVERLAP_ROW><OVERLAP_COL>0</OVERLAP_COL></Regular_Tiling></Tile_Set></Raster_Dimensions>
 <Raster_Encoding><NBITS>{bits}</NBITS></Raster_Encoding></Raster_Data>
-<Radiometric_Data><Radiometric_Calibration><Instrument_Calibration><Band_Measurement_List>{gains}
+<Radiometric_Data>{more}<Radiometric_Calibration><Instrument_Calibration><Band_Measurement_List>{gains}
 </Band_Measurement_List></Instrument_Calibration></Radiometric_Calibration></Radiometric_Data></Dimap_Document>"""
     )
     coefficients = "".join(

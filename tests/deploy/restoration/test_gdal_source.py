@@ -116,9 +116,10 @@ def test_workers_read_it_too(model: Path, tmp_path: Path) -> None:
     assert (tmp_path / "one.tif").read_bytes() == (tmp_path / "two.tif").read_bytes()
 
 
-def test_the_cache_is_counted(tmp_path: Path) -> None:
-    image = images.write_jp2(tmp_path / "a.jp2", images.digital_numbers())
-    with open_source(image) as source:
+@pytest.mark.parametrize("name", ["a.jp2", "DIM.XML"])
+def test_the_cache_is_counted(name: str, tmp_path: Path) -> None:
+    """It holds the tiles' blocks."""
+    with open_source(FORMATS[name](tmp_path / name, images.digital_numbers())) as source:
         rows = 1 << 20
         assert source.held_bytes(rows) == (rows + 2 * images.TILE_PX) * images.BANDS * images.WIDTH * 2
         assert source.held_bytes(1) == LEAST_CACHE_BYTES
