@@ -181,7 +181,8 @@ REFUSED = {
     ],
     "restore": [
         Refused(
-            ("model", "tile", "halo", "runtime", "threads", "workers", "scheduler", "resume"), "--method traditional"
+            ("model", "tile", "halo", "runtime", "threads", "workers", "scheduler", "cog", "resume"),
+            "--method traditional",
         ),
         Refused(("method",), without="--sensor"),
         Refused(("workers",), SCHEDULER),

@@ -11,7 +11,7 @@ from deploy.commands.shared import refuse, say
 from deploy.restoration.options import TILE_PX, Compression, Options, Runtime
 
 EXAMPLE = "restore raw.tif restored.tif"
-NETWORK_ONLY = ("model", "tile", "halo", "resume", "runtime", "threads", "workers", "scheduler")
+NETWORK_ONLY = ("model", "tile", "halo", "resume", "runtime", "threads", "workers", "scheduler", "cog")
 """Options of which the traditional chain takes none."""
 
 
@@ -59,6 +59,9 @@ def restore(
     scheduler: Annotated[
         str | None, typer.Option(help="Dask scheduler whose workers restore, such as tcp://host:8786.")
     ] = None,
+    cog: Annotated[
+        bool, typer.Option("--cog", help="Write OUT as a Cloud-Optimised GeoTIFF: tiles, overviews, what was done.")
+    ] = False,
     trust_index: Annotated[
         bool, typer.Option("--trust-index", help="Let a VRT or DIMAP name tiles outside its folder and at URLs.")
     ] = False,
@@ -113,6 +116,7 @@ def restore(
         scheduler,
         trust_index,
         int(known.bits.low) if sensor else None,
+        cog,
     )
     row = restore_file(image, out, options, say)
     print_rows(f"wrote {out}", [row])

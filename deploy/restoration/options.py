@@ -47,6 +47,7 @@ class Options:
         resume: go on with a stopped run.
         workers: processes of this machine that restore; 0 is this process alone.
         scheduler: address of a Dask scheduler whose workers restore.
+        cog: whether the output is a Cloud-Optimised GeoTIFF.
         sensor_bits: bits per pixel of the sensor, where the user named its profile.
         trust_index: whether a VRT or DIMAP may name tiles outside its folder, at URLs too.
     """
@@ -64,6 +65,7 @@ class Options:
     scheduler: str | None = None
     trust_index: bool = False
     sensor_bits: int | None = None
+    cog: bool = False
 
     @property
     def is_spread(self) -> bool:

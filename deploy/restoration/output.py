@@ -10,7 +10,7 @@ import math
 import os
 import shutil
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
@@ -96,6 +96,8 @@ class Checkpoint:
         """Throw the rows away; the journal first, so that nothing is left that counts on them."""
         for name in ("journal.json", "journal.new", "rows.raw", "out.tif"):
             (self.folder / name).unlink(missing_ok=True)
+        for path in self.folder.glob(f"{COG}*"):  # GDAL writes overviews beside it first
+            path.unlink()
 
     @contextmanager
     def disk(self) -> Iterator[None]:
@@ -192,8 +194,21 @@ def require_codec(compression: Compression) -> None:
         raise MachineError("--compression", expected="an installed codec", got=got, remedy=remedy) from error
 
 
-def write_output(checkpoint: Checkpoint, tags: tuple[Tag, ...], compression: Compression) -> None:
+COG = "cog.tif"
+ToCog = Callable[[Path, Path], None]
+"""Writes a TIFF again, cloud-optimised."""
+
+
+def write_output(
+    checkpoint: Checkpoint, tags: tuple[Tag, ...], compression: Compression, to_cog: ToCog | None = None
+) -> None:
     """Write the checkpoint's rows and an image's `tags` to the output, rename it into place, remove the checkpoint.
+
+    Args:
+        checkpoint: with every row.
+        tags: of the image.
+        compression: of the TIFF; none where it is on its way to be cloud-optimised.
+        to_cog: None leaves the TIFF as it is.
 
     Raises:
         MachineError: the disk is full or gone; the rows are still there.
@@ -218,6 +233,9 @@ def write_output(checkpoint: Checkpoint, tags: tuple[Tag, ...], compression: Com
             extratags=tags,
             buffersize=BUFFER_BYTES,
         )
+        if to_cog is not None:
+            plain, fresh = fresh, checkpoint.folder / COG
+            to_cog(plain, fresh)
         with fresh.open("r+b") as stream:
             os.fsync(stream.fileno())
         fresh.replace(checkpoint.out)

@@ -18,10 +18,11 @@ import numpy as np
 
 from deploy.cluster import check_choice
 from deploy.host_state import peak_memory
+from deploy.restoration.cog import require_cog, what_was_done, write_cog
 from deploy.restoration.engine import RestoredRow, Restorer, Say, Tick, restore_rows
 from deploy.restoration.georeference import enlarged_tags
 from deploy.restoration.index_files import index_files
-from deploy.restoration.options import Options
+from deploy.restoration.options import Compression, Options
 from deploy.restoration.output import (
     Checkpoint,
     only_run,
@@ -75,7 +76,10 @@ def restore_file(image: Path, out: Path, options: Options, say: Say) -> Row:
     if options.scheduler is None:
         require_cores("--threads", options.threads)
     require_tiff_name(out)
-    require_codec(options.compression)
+    if options.cog:
+        require_cog()
+    else:
+        require_codec(options.compression)
     with only_run(out, part_folder(out)):
         return _restore(image, out, options, say)
 
@@ -106,7 +110,13 @@ def _restore(image: Path, out: Path, options: Options, say: Say) -> Row:
             here = partial(_rows_here, source, plan, restorer, at_once, options.memory_bytes, say)
             finish_rows(checkpoint, plan, str(image), say, here)
     with held_back():  # a stop now would save nothing
-        write_output(checkpoint, enlarged_tags(raster.tags, plan.scale), options.compression)
+        tags = enlarged_tags(raster.tags, plan.scale)
+        if options.cog:
+            about = what_was_done(network, network_sha256(options.model), scale)
+            to_cog = partial(write_cog, compression=options.compression, about=about)
+            write_output(checkpoint, tags, Compression.none, to_cog)
+        else:
+            write_output(checkpoint, tags, options.compression)
     time_s = time.perf_counter() - started
     if checkpoint.clipped:
         above = f"{checkpoint.clipped} pixels above full scale"

@@ -116,13 +116,21 @@ def test_workers_read_it_too(model: Path, tmp_path: Path) -> None:
     assert (tmp_path / "one.tif").read_bytes() == (tmp_path / "two.tif").read_bytes()
 
 
-@pytest.mark.parametrize("name", ["a.jp2", "DIM.XML"])
-def test_the_cache_is_counted(name: str, tmp_path: Path) -> None:
-    """It holds the tiles' blocks."""
-    with open_source(FORMATS[name](tmp_path / name, images.digital_numbers())) as source:
-        rows = 1 << 20
-        assert source.held_bytes(rows) == (rows + 2 * images.TILE_PX) * images.BANDS * images.WIDTH * 2
-        assert source.held_bytes(1) == LEAST_CACHE_BYTES
+def test_the_cache_is_counted_with_the_blocks_of_a_mosaic_s_tiles(tmp_path: Path) -> None:
+    pixels, rows = images.digital_numbers(), 1 << 20
+    one = images.write_jp2(tmp_path / "a.jp2", pixels)
+    images.write(tmp_path / "strip.tif", pixels, "GTiff", blockysize=140)
+    size = f'rasterXSize="{images.WIDTH}" rasterYSize="{images.HEIGHT}"'
+    bands = "".join(
+        f'<VRTRasterBand dataType="UInt16" band="{band}">'
+        f"{images.source('strip.tif', band, 0, 0, images.HEIGHT, images.WIDTH)}</VRTRasterBand>"
+        for band in (1, 2)
+    )
+    (tmp_path / "a.vrt").write_text(f"<VRTDataset {size}>{bands}</VRTDataset>")
+    for image, block_px in ((one, images.TILE_PX), (tmp_path / "a.vrt", 140)):
+        with open_source(image) as source:
+            assert source.held_bytes(rows) == (rows + 2 * block_px) * images.BANDS * images.WIDTH * 2
+            assert source.held_bytes(1) == LEAST_CACHE_BYTES
 
 
 def refused(image: Path, out: Path, model: Path, error: type[BeersError], *words: str) -> None:
