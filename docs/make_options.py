@@ -58,6 +58,7 @@ PATHS = {
     ),
     "check": Paths({"picture": FILE, "json": FILE}, ("model",), ("target",)),
     "bench": Paths({"json": FILE}, ("model", "image", "measured"), ("target",)),
+    "info": Paths({"json": FILE}, ("image", "model"), ("sensor", "target")),
     "restore": Paths({"out": FILE, "json": FILE}, ("image", "model"), ("sensor",)),
     "evaluate": Paths(
         {"out": FOLDER, "json": FILE}, ("images", "pairs", "lpips"), ("sensor", "reference", "methods")
