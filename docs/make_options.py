@@ -59,7 +59,7 @@ PATHS = {
     "check": Paths({"picture": FILE, "json": FILE}, ("model",), ("target",)),
     "bench": Paths({"json": FILE}, ("model", "image", "measured"), ("target",)),
     "info": Paths({"json": FILE}, ("image", "model"), ("sensor", "target")),
-    "restore": Paths({"out": FILE, "json": FILE}, ("image", "model"), ("sensor",)),
+    "restore": Paths({"out": FILE, "json": FILE, "stac": FILE}, ("image", "model"), ("sensor",)),
     "evaluate": Paths(
         {"out": FOLDER, "json": FILE}, ("images", "pairs", "lpips"), ("sensor", "reference", "methods")
     ),
@@ -182,10 +182,11 @@ REFUSED = {
     ],
     "restore": [
         Refused(
-            ("model", "tile", "halo", "runtime", "threads", "workers", "scheduler", "cog", "resume"),
+            ("model", "tile", "halo", "runtime", "threads", "workers", "scheduler", "cog", "stac", "resume"),
             "--method traditional",
         ),
         Refused(("method",), without="--sensor"),
+        Refused(("stac",), without="--cog"),
         Refused(("workers",), SCHEDULER),
     ],
     "evaluate": [Refused(("images", "sweep"), "--pairs PAIRS")],

@@ -41,12 +41,14 @@ def info(
     """
     from deploy.info import InfoRequest, info_row
     from deploy.networks import network_file
+    from deploy.restoration.index_files import index_files
     from deploy.results import Document, print_rows
     from model.io.files import require_writable
     from profiles import load_sensor, load_target
     from profiles.sensor_file import BLIND
 
-    require_writable(json, inputs=(image, model, Path(sensor) if sensor else None, Path(target)))
+    tiles = index_files(image, trust_index)
+    require_writable(json, inputs=(image, *tiles, model, Path(sensor) if sensor else None, Path(target)))
     known = load_sensor(sensor or BLIND)
     path = network_file(model, known, partial(say, err=True))
     bits = int(known.bits.low) if sensor else None

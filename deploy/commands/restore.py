@@ -11,7 +11,7 @@ from deploy.commands.shared import refuse, say
 from deploy.restoration.options import TILE_PX, Compression, Options, Runtime
 
 EXAMPLE = "restore raw.tif restored.tif"
-NETWORK_ONLY = ("model", "tile", "halo", "resume", "runtime", "threads", "workers", "scheduler", "cog")
+NETWORK_ONLY = ("model", "tile", "halo", "resume", "runtime", "threads", "workers", "scheduler", "cog", "stac")
 """Options of which the traditional chain takes none."""
 
 
@@ -62,6 +62,7 @@ def restore(
     cog: Annotated[
         bool, typer.Option("--cog", help="Write OUT as a Cloud-Optimised GeoTIFF: tiles, overviews, what was done.")
     ] = False,
+    stac: Annotated[Path | None, typer.Option(help="Write a STAC item of OUT here; with --cog.")] = None,
     trust_index: Annotated[
         bool, typer.Option("--trust-index", help="Let a VRT or DIMAP name tiles outside its folder and at URLs.")
     ] = False,
@@ -83,20 +84,26 @@ def restore(
     those of one process. Those of a scheduler must find IN under its path; only this process writes.
     """
     from deploy.networks import conditioned, network_file
+    from deploy.restoration.index_files import index_files
     from deploy.restoration.run import restore_file
+    from deploy.restoration.stac import require_stac, write_item
     from deploy.results import Document, print_rows
     from model.io.files import require_writable
     from profiles.errors import OptionError
     from profiles.sensor_file import BLIND, load_sensor
 
     budget_bytes = max(int(memory * 1e9), 1) if memory else None
+    tiles = index_files(image, trust_index)
+    require_writable(out, json, stac, inputs=(image, *tiles, model, Path(sensor) if sensor else None))
     if method is Method.traditional:
-        require_writable(out, json, inputs=(image, Path(sensor) if sensor else None))
         expected, remedy = "none with --method traditional", "leave it out"
         refuse(context, NETWORK_ONLY, expected=expected, got="one", remedy=remedy)
         _by_the_chain(image, out, sensor, full_scale, compression, budget_bytes, trust_index, json)
         return
-    require_writable(out, json, inputs=(image, model, Path(sensor) if sensor else None))
+    if stac is not None:
+        if not cog:
+            raise OptionError("--stac", expected="--cog beside it", got="none", remedy="add it, or leave --stac out")
+        require_stac()
     if sensor is not None and conditioned(model) is None:
         expected, remedy = "a shipped network, or weights of 'train --conditioned'", "leave --sensor out"
         raise OptionError("--sensor", expected=expected, got=f"{model}, made for one already", remedy=remedy)
@@ -119,6 +126,8 @@ def restore(
         cog,
     )
     row = restore_file(image, out, options, say)
+    if stac is not None:
+        write_item(out, stac)
     print_rows(f"wrote {out}", [row])
     arguments = {
         "sensor": sensor or BLIND,

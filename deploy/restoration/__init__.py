@@ -12,7 +12,7 @@ An image passes, in this order:
     engine       the one tile loop, for files and arrays: `restore_rows`, `restore_array`, `restore_dn`
     workers      the same rows by the workers of a Dask cluster
     output       finished rows in a checkpoint, the lock, the TIFF
-    cog          the finished TIFF cloud-optimised, by GDAL
+    cog          the finished TIFF cloud-optimised, by GDAL; `stac` its item for a catalogue
     run          all of this for one file: `restore_file`
     traditional  a file by the traditional chain instead of a network: `restore_file_traditionally`
 

@@ -8,7 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 import tifffile
+from typer.testing import CliRunner
 
+from deploy.cli import app
 from deploy.networks import shipped_pair
 from deploy.restoration.gdal_source import LEAST_CACHE_BYTES, GdalSource
 from deploy.restoration.options import Options
@@ -170,10 +172,15 @@ def test_what_gdal_needs_and_cannot_take_is_said(
 
 def test_a_tile_is_no_output(model: Path, tmp_path: Path) -> None:
     image = images.write_dimap(tmp_path / "DIM.XML", images.digital_numbers())
-    before = (tmp_path / "IMG_R2C1.TIF").read_bytes()
+    tile, out = tmp_path / "IMG_R2C1.TIF", tmp_path / "out.tif"
+    before = tile.read_bytes()
     with pytest.raises(BeersError, match="an input of this run"):
-        restore_file(image, tmp_path / "IMG_R2C1.TIF", Options(model), lambda _: None)
-    assert (tmp_path / "IMG_R2C1.TIF").read_bytes() == before
+        restore_file(image, tile, Options(model), lambda _: None)
+    for words in (["restore", str(image), str(out), "--json", str(tile)], ["info", str(image), "--json", str(tile)]):
+        done = CliRunner().invoke(app, words)
+        assert done.exit_code == 2
+        assert "an input of this run" in done.stderr
+    assert tile.read_bytes() == before
 
 
 def test_a_changed_tile_makes_another_image(tmp_path: Path) -> None:
