@@ -90,6 +90,23 @@ def test_names_and_gains_of_bands_are_kept(model: Path, tmp_path: Path) -> None:
         assert (after.scales, after.offsets) == ((0.25, 0.25), (-0.5, -0.5))
 
 
+def test_ground_control_points_are_kept(model: Path, tmp_path: Path) -> None:
+    points = "".join(
+        f'<GCP Id="{k}" Pixel="{17 * k}" Line="{9 * k * k}" X="{k / 3!r}" Y="{45 - k / 7!r}" Z="0"/>'
+        for k in range(5)
+    )
+    image = images.write_vrt(tmp_path / "a.vrt", images.digital_numbers())
+    text = image.read_text()
+    place = text[text.index("<SRS>") : text.index("</GeoTransform>") + len("</GeoTransform>")]
+    image.write_text(text.replace(place, f'<GCPList Projection="EPSG:4326">{points}</GCPList>'))
+    restore_file(image, tmp_path / "out.tif", Options(model), lambda _: None)
+    with rasterio.open(image) as before, rasterio.open(tmp_path / "out.tif") as after:
+        assert before.gcps[1] == after.gcps[1] == rasterio.CRS.from_epsg(4326)
+        found = [[(p.col, p.row, p.x, p.y) for p in file.gcps[0]] for file in (before, after)]
+    assert len(found[0]) == 5
+    np.testing.assert_allclose(found[1], found[0], rtol=0, atol=1e-9)
+
+
 def test_missing_pixels_stay_missing(model: Path, tmp_path: Path) -> None:
     pixels = np.maximum(images.digital_numbers(), 1)
     pixels[:, 20:70, 30:90] = 0

@@ -89,6 +89,17 @@ def test_an_index_that_leads_elsewhere_is_refused(case: str, tmp_path: Path, mon
     assert words in str(caught.value)
 
 
+def test_a_link_out_of_the_folder_is_refused(tmp_path: Path) -> None:
+    folder = folder_of(tmp_path)
+    try:
+        (folder / "link.tif").symlink_to(tmp_path / "outside.tif")
+    except OSError:
+        pytest.skip("this account cannot make links")
+    (folder / "a.vrt").write_text(vrt(naming("link.tif")))
+    with pytest.raises(ImageError, match="in its own folder"):
+        index_files(folder / "a.vrt")
+
+
 def test_a_bomb_in_utf_16_is_seen(tmp_path: Path) -> None:
     folder = folder_of(tmp_path)
     (folder / "a.vrt").write_text(BOMB + vrt(ONE), encoding="utf-16")
