@@ -34,7 +34,7 @@ def restore(
         str | None,
         typer.Option(
             help="The sensor of IN, a profile's name or your .toml file, to which a shipped network is specialised; "
-            "blind if none."
+            "B0=a.toml,B1=b.toml for each band; blind if none."
         ),
     ] = None,
     tile: Annotated[int, typer.Option(min=16, help="Longest side of a tile in pixels.")] = TILE_PX,
@@ -84,6 +84,7 @@ def restore(
     those of one process. Those of a scheduler must find IN under its path; only this process writes.
     """
     from deploy.networks import conditioned, network_file
+    from deploy.restoration.bands import parse_sensors
     from deploy.restoration.index_files import index_files
     from deploy.restoration.run import restore_file
     from deploy.restoration.stac import require_stac, write_item
@@ -93,8 +94,9 @@ def restore(
     from profiles.sensor_file import BLIND, load_sensor
 
     budget_bytes = max(int(memory * 1e9), 1) if memory else None
-    tiles = index_files(image, trust_index)
-    require_writable(out, json, stac, inputs=(image, *tiles, model, Path(sensor) if sensor else None))
+    sensors = parse_sensors(sensor or BLIND)
+    profiles = (Path(each) for each in sensors.values()) if sensor else ()
+    require_writable(out, json, stac, inputs=(image, *index_files(image, trust_index), model, *profiles))
     if method is Method.traditional:
         expected, remedy = "none with --method traditional", "leave it out"
         refuse(context, NETWORK_ONLY, expected=expected, got="one", remedy=remedy)
@@ -107,8 +109,12 @@ def restore(
     if sensor is not None and conditioned(model) is None:
         expected, remedy = "a shipped network, or weights of 'train --conditioned'", "leave --sensor out"
         raise OptionError("--sensor", expected=expected, got=f"{model}, made for one already", remedy=remedy)
-    known = load_sensor(sensor or BLIND)
-    path = network_file(model, known, partial(say, err=True))
+    known = {band: load_sensor(each) for band, each in sensors.items()}
+    paths = {band: network_file(model, each, partial(say, err=True)) for band, each in known.items()}
+    path, bits = next(iter(paths.values())), {int(each.bits.low) for each in known.values()}
+    if len(bits) > 1 and full_scale is None:
+        remedy = "give --full-scale, or restore such bands apart"
+        raise OptionError("--sensor", expected="sensors of equal bits", got=f"{sorted(bits)}", remedy=remedy)
     options = Options(
         path,
         tile,
@@ -122,8 +128,9 @@ def restore(
         workers,
         scheduler,
         trust_index,
-        int(known.bits.low) if sensor else None,
+        min(bits) if sensor else None,
         cog,
+        {} if "" in paths else paths,
     )
     row = restore_file(image, out, options, say)
     if stac is not None:
@@ -138,7 +145,7 @@ def restore(
         "threads": threads,
     }
     arguments |= {"workers": workers, "scheduler": scheduler}
-    Document("restore", arguments, (path, image), (row,)).write(json)
+    Document("restore", arguments, (*paths.values(), image), (row,)).write(json)
 
 
 def _by_the_chain(

@@ -6,6 +6,7 @@ An image passes, in this order:
     source       an image file, or an array, as rows
     gdal_source  the same of what GDAL reads by windows: JPEG 2000, NITF, HFA, VRT, DIMAP
     index_files  which files an untrusted VRT or DIMAP names, and that it names no others
+    bands        a sensor, and so a network, for each band
     plan         how it is cut into tiles, and the memory that takes
     radiometry   which pixel value is full scale, and who says so
     runtime      the network, on onnxruntime or OpenVINO

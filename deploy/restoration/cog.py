@@ -5,7 +5,7 @@ done to the image goes into its metadata, beside what the image said of itself.
 """
 
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from importlib import import_module
 from importlib.metadata import version
 from pathlib import Path
@@ -41,14 +41,14 @@ def require_cog() -> None:
         raise MachineError("--cog", expected="GDAL to write it", got=got, remedy=remedy) from error
 
 
-def what_was_done(network: onnx.ModelProto, digest: str, scale: FullScale) -> dict[str, str]:
-    """The run as an image's metadata: tool, network, sensor and full scale."""
-    said = metadata(network)
+def what_was_done(networks: Sequence[onnx.ModelProto], digests: str, scale: FullScale) -> dict[str, str]:
+    """The run as an image's metadata: tool, networks in the order of the bands, their sensors and full scale."""
+    said = [metadata(network) for network in networks]
     return {
         "RESTORED_BY": f"beers-deploy {version('beers-deploy')}",
-        "RESTORED_NETWORK_SHA256": digest,
-        "RESTORED_NETWORK": said.get("variant", "not stated"),
-        "RESTORED_SENSOR": said.get("sensor", "not stated"),
+        "RESTORED_NETWORK_SHA256": digests,
+        "RESTORED_NETWORK": ", ".join(each.get("variant", "not stated") for each in said),
+        "RESTORED_SENSOR": ", ".join(each.get("sensor", "not stated") for each in said),
         "RESTORED_FULL_SCALE": f"{scale.value:g} ({scale.source})",
     }
 

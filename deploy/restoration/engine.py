@@ -77,6 +77,7 @@ class Restorer:
             lies beyond, filled or not, is nothing that a known pixel sees.
         name: of the image, for messages.
         clips: whether values above full scale are clipped and counted; else they are an error.
+        others: the networks of the bands behind the first, where each has its own.
     """
 
     raster: Raster
@@ -85,6 +86,7 @@ class Restorer:
     tiling: Tiling
     name: str = NAME
     clips: bool = False
+    others: tuple[Infer, ...] = ()
 
     def __post_init__(self) -> None:
         require_room(self.raster, self.full_scale)
@@ -110,7 +112,8 @@ class Restorer:
         unknown = self._unknown(strip, bands, rows, columns)
         if unknown is not None and unknown[1].all():
             return Tile(unknown[0], 0, 0)
-        window = restore_window(self._window(strip, bands, rows, columns), self.infer, self.full_scale)
+        infer = self.others[group - 1] if self.others and group else self.infer
+        window = restore_window(self._window(strip, bands, rows, columns), infer, self.full_scale)
         self._require_shape(window, rows, columns)
         result = as_stored(self.raster, window[:, self._within(rows), self._within(columns)], self.full_scale)
         clipped = self._above(strip, bands, rows, columns)

@@ -52,10 +52,11 @@ DIMAP_PATHS = {PIXELS, "component_path"}
 """GDAL compares names of elements without regard to case."""
 
 
-class _NoDoctype(ET.TreeBuilder):
-    """Entities are declared in a document type: with none, nothing can be expanded."""
+class NoDoctype(ET.TreeBuilder):
+    """A tree of untrusted XML: entities are declared in a document type; with none, nothing can be expanded."""
 
     def doctype(self, name: str, pubid: str | None, system: str | None) -> None:  # noqa: ARG002
+        """Refuse it."""
         raise ValueError("a document type, which may declare entities")
 
 
@@ -121,7 +122,7 @@ def _require_pixels(index: Path, text: str, file: Path) -> None:
 def _parsed(path: Path) -> ET.Element:
     try:
         content = read_whole(path, INDEX_BYTES)
-        parser = ET.XMLParser(target=_NoDoctype())  # noqa: S314 - without a document type there are no entities
+        parser = ET.XMLParser(target=NoDoctype())  # noqa: S314 - without a document type there are no entities
         root = ET.fromstring(content, parser)  # noqa: S314
         if sum(1 for _ in root.iter()) > ELEMENTS:
             raise ValueError(f"more than {ELEMENTS} elements")

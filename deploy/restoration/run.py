@@ -18,6 +18,7 @@ import numpy as np
 
 from deploy.cluster import check_choice
 from deploy.host_state import peak_memory
+from deploy.restoration.bands import in_order, require_alike
 from deploy.restoration.cog import require_cog, what_was_done, write_cog
 from deploy.restoration.engine import RestoredRow, Restorer, Say, Tick, restore_rows
 from deploy.restoration.georeference import enlarged_tags
@@ -40,7 +41,7 @@ from model.io.files import require_writable
 from model.io.images import require_image_file
 from model.processor import require_cores
 from model.progress import held_back, steps
-from profiles.errors import BeersError, ImageError, MachineError
+from profiles.errors import BeersError, ImageError, MachineError, OptionError
 from profiles.figures import Figure, Row, measured, predicted, unavailable
 from quant.onnx_file import load_onnx
 from quant.reading.external import network_sha256
@@ -71,6 +72,9 @@ def restore_file(image: Path, out: Path, options: Options, say: Say) -> Row:
         KeyboardInterrupt: stopped; rows already finished stay for `resume`.
     """
     check_choice(options.workers, options.scheduler)
+    if options.bands and options.is_spread:
+        got, remedy = "one for each band", "leave --workers and --scheduler out"
+        raise OptionError("--sensor", expected="one sensor for workers", got=got, remedy=remedy)
     require_image_file(image)
     require_writable(out, inputs=(image, *index_files(image, options.trust_index), options.model))
     if options.scheduler is None:
@@ -86,9 +90,11 @@ def restore_file(image: Path, out: Path, options: Options, say: Say) -> Row:
 
 def _restore(image: Path, out: Path, options: Options, say: Say) -> Row:
     started = time.perf_counter()
-    network = load_onnx(options.model)
     with open_source(image, options.trust_index) as source:
         raster = source.raster
+        paths = in_order(options.bands, raster) if options.bands else [options.model]
+        network, *others = networks = [load_onnx(path) for path in paths]
+        require_alike(networks)
         plan = plan_for(network, raster.shape, options)
         say(plan.sentence)
         if not options.is_spread:
@@ -96,10 +102,12 @@ def _restore(image: Path, out: Path, options: Options, say: Say) -> Row:
         scale = scale_of(source, plan, options, str(image))
         at_once = tiles_at_once(options.threads, plan.tiles)
         infer, runtime = open_runtime(options.runtime, network, options.threads, at_once)
-        restorer = Restorer(raster, infer, scale.value, plan.tiling, str(image), not scale.assumed)
+        more = tuple(open_runtime(options.runtime, other, options.threads, at_once)[0] for other in others)
+        restorer = Restorer(raster, infer, scale.value, plan.tiling, str(image), not scale.assumed, more)
         figures = seam_figures(source, plan, restorer)
         # Another version of the runtime might give other bits: rows of one are not finished by another.
-        job = _job(image, options, plan, runtime, scale.value)
+        digests = ", ".join(network_sha256(path) for path in paths)
+        job = _job(image, digests, plan, runtime, scale.value)
         checkpoint = Checkpoint(out, plan.out_shape, raster.out_dtype, job, options.resume)
         done_rows = checkpoint.rows // plan.scale
         if options.is_spread:
@@ -112,7 +120,7 @@ def _restore(image: Path, out: Path, options: Options, say: Say) -> Row:
     with held_back():  # a stop now would save nothing
         tags = enlarged_tags(raster.tags, plan.scale)
         if options.cog:
-            about = what_was_done(network, network_sha256(options.model), scale)
+            about = what_was_done(networks, digests, scale)
             to_cog = partial(write_cog, compression=options.compression, about=about)
             write_output(checkpoint, tags, Compression.none, to_cog)
         else:
@@ -136,11 +144,11 @@ def scale_of(source: Source, plan: Plan, options: Options, name: str) -> FullSca
     return full_scale_of(name, source.raster, largest, options.full_scale, options.sensor_bits)
 
 
-def _job(image: Path, options: Options, plan: Plan, runtime: str, full_scale: float) -> dict[str, object]:
+def _job(image: Path, model: str, plan: Plan, runtime: str, full_scale: float) -> dict[str, object]:
     """All that decides the pixels, as the journal keeps it; who computes, on how many machines, is no part of it."""
     return {
         "image": [*fingerprint(image), image.stat().st_mtime_ns],
-        "model": network_sha256(options.model),
+        "model": model,
         "tile_px": plan.tile_px,
         "halo_px": plan.halo_px,
         "full_scale": full_scale,

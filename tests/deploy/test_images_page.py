@@ -24,9 +24,10 @@ def test_the_page_s_commands_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     images.write_jp2(Path("raw.jp2"), pixels, NBITS=12)
     images.write_vrt(Path("mosaic.vrt"), pixels)
     images.write_dimap(Path("DIM_product.XML"), pixels)
+    images.write_tiff(Path("bands.tif"), images.digital_numbers())
     blocks = re.findall(r"```console\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL)
     lines = [line.split() for block in blocks for line in block.splitlines()]
-    assert len(lines) == 6
+    assert len(lines) == 7
     for program, *words in lines:
         done: Any
         if program == "rio":
