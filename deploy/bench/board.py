@@ -15,7 +15,8 @@ from deploy.bench.tables import (
     PAPER_SIZE,
     PAPER_TARGET,
     Swath,
-    frame_rows,
+    frame_row,
+    host_words,
     layer_rows,
     parse_size,
     predict_file,
@@ -118,7 +119,7 @@ def bench_board(model: Path, request: BoardRequest, budget_s: float) -> BoardBen
 def _single(model: Path, dpu: Dpu, swath: Swath) -> BoardBench:
     """The rows of the swath, and those of the layers to show."""
     prediction = predict_file(model, dpu, swath.tile_px)
-    notes = [TRAFFIC, *([prediction.note] if prediction.note else [])]
+    notes = [TRAFFIC, *host_words(prediction, dpu)]
     layers = (f"{model.name}, one batch on {dpu.target.name} {dpu.name}", layer_rows(prediction, dpu))
     return BoardBench(predicted_rows(model.stem, prediction, swath, dpu), [layers], notes)
 
@@ -140,16 +141,19 @@ def _frames(
 ) -> BoardBench:
     """The network on whole images; of one configuration each layer too."""
     tile_px = None if own_tile_px(network) else FREE_TILE_PX
-    rows = frame_rows(model, boards, tile_px)
+    predictions = [predict_file(model, dpu, tile_px) for dpu in boards]
+    rows = [frame_row(prediction, dpu) for prediction, dpu in zip(predictions, boards, strict=True)]
     size = " x ".join(
         str(side.dim_value or tile_px) for side in network.graph.input[0].type.tensor_type.shape.dim[2:]
     )
     shown = [*refitted, (f"{model.name}, frames of {size}", rows)]
     if len(boards) == 1:
-        layers = layer_rows(predict_file(model, boards[0], tile_px), boards[0])
+        layers = layer_rows(predictions[0], boards[0])
         shown.insert(-1, (f"{model.name}, one batch on {boards[0].target.name} {boards[0].name}", layers))
-    note = f"not tiled, but run on whole images: expected {why.expected}, got {why.got}"
-    return BoardBench([row for _, part in shown for row in part], shown, [TRAFFIC, note])
+    whole = f"not tiled, but run on whole images: expected {why.expected}, got {why.got}"
+    said = [words for found, dpu in zip(predictions, boards, strict=True) for words in host_words(found, dpu)]
+    notes = [TRAFFIC, whole, *dict.fromkeys(said)]
+    return BoardBench([row for _, part in shown for row in part], shown, notes)
 
 
 def _untiled(network: onnx.ModelProto, request: BoardRequest) -> ModelError | None:

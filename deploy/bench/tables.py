@@ -25,7 +25,7 @@ from deploy.dpu.cost.latency import (
 )
 from deploy.dpu.reading import read_network
 from profiles.errors import OptionError
-from profiles.figures import Figure, Row, predicted, published, unavailable
+from profiles.figures import Figure, Row, number, predicted, published, unavailable
 
 TABLE, LAYERS = "bench", "layers"
 COST_SOURCE = "cost model fitted on published networks, docs/cost-model.md"
@@ -89,19 +89,24 @@ def predicted_rows(name: str, prediction: Prediction, swath: Swath, dpu: Dpu) ->
 
 def _predicted_row(name: str, prediction: Prediction, swath: Swath, dpu: Dpu, frames: float, batches: float) -> Row:
     power, latency = dpu_power(dpu), swath_latency(prediction, batches)
-    host_ms = 1e3 * prediction.host_s
     figures = {
         "tiles": exact(frames, "tile", ARITHMETIC),
         "work factor": exact(swath.work_factor(frames), "px/px", ARITHMETIC),
         "latency": latency,
         "throughput": predicted(prediction.fps, "frame/s", prediction.fps_interval, COST_SOURCE),
-        "host beside the DPU": scaled(host_ms, "ms/tile", prediction, COST_SOURCE),
+        "host beside the DPU": host_time(prediction, "ms/tile"),
         "power": power,
         "power of products and traffic": counted_power(prediction, dpu),
         "energy": energy(latency, power),
         "efficiency": efficiency(swath.pixels, latency, power),
     }
     return Row(TABLE, name, figures, {"fitted range": fitted_range(prediction)})
+
+
+def host_time(prediction: Prediction, unit: str) -> Figure:
+    """What the host's cores together take for an image, in ms."""
+    low_s, high_s = prediction.host_interval_s
+    return predicted(1e3 * prediction.host_s, unit, (1e3 * low_s, 1e3 * high_s), COST_SOURCE)
 
 
 def swath_latency(prediction: Prediction, batches: float) -> Figure:
@@ -171,11 +176,11 @@ def _layer_row(layer: LayerCost, prediction: Prediction, dpu: Dpu) -> Row:
     figures = {
         "work": exact(work.operations / 1e9, "GOP"),
         "time": _time(layer.time_s, prediction),
-        "rate": scaled(batch * work.operations / seconds / 1e9, "GOP/s", prediction, COST_SOURCE, falls=True),
+        "rate": scaled(batch * work.operations / seconds / 1e9, "GOP/s", prediction, COST_SOURCE),
         "LdFM": exact(work.load_map_bytes / 1e6, "MB", "feature maps that an image loads, by the graph's shapes"),
         "LdWB": exact(work.weight_bytes / 1e6, "MB", "weights and biases that a batch loads, by the graph's shapes"),
         "StFM": exact(work.store_map_bytes / 1e6, "MB", "feature maps that an image stores, by the graph's shapes"),
-        "bandwidth": scaled(moved / seconds / 1e9, "GB/s", prediction, COST_SOURCE, falls=True),
+        "bandwidth": scaled(moved / seconds / 1e9, "GB/s", prediction, COST_SOURCE),
         "array use": exact(100 * work.array_use, "%"),
         "energy": predicted(
             500 * sum(low_high_j), "mJ", (1e3 * low_high_j[0], 1e3 * low_high_j[1]), energy_source(dpu)
@@ -193,11 +198,9 @@ def exact(value: float, unit: str, source: str = "arithmetic of the graph's shap
     return predicted(value, unit, (value, value), source)
 
 
-def scaled(value: float, unit: str, prediction: Prediction, source: str, *, falls: bool = False) -> Figure:
-    """A part of the prediction, with the relative error of the whole; `falls` where more time means less of it."""
-    slow, fast = (prediction.fps / fps for fps in prediction.fps_interval)
-    ends = (value / slow, value / fast) if falls else (value * fast, value * slow)
-    return predicted(value, unit, ends, source)
+def scaled(value: float, unit: str, prediction: Prediction, source: str) -> Figure:
+    """A part of the prediction, with the relative error of the whole."""
+    return predicted(value, unit, (value / prediction.spread, value * prediction.spread), source)
 
 
 MOST_TILE_PX = 8192
@@ -257,29 +260,33 @@ def _end(figure: Figure, end: int | None) -> float:
     return math.inf if value is None else value
 
 
-def frame_rows(model: Path, boards: Sequence[Dpu], tile_px: int | None) -> list[Row]:
-    """A row a configuration for a network that is run on whole images: frames instead of a swath.
-
-    Args:
-        model: ONNX file.
-        boards: the configurations.
-        tile_px: side of an image; None for the size that the network is fixed to.
-    """
-    return [_frame_row(predict_file(model, dpu, tile_px), dpu) for dpu in boards]
-
-
-def _frame_row(prediction: Prediction, dpu: Dpu) -> Row:
+def frame_row(prediction: Prediction, dpu: Dpu) -> Row:
+    """A network that is run on whole images, on one configuration: frames instead of a swath."""
     power, frame_s = dpu_power(dpu), swath_latency(prediction, 1 / prediction.batch)
     figures = {
         "work": exact(prediction.operations / 1e9, "GOP"),
         "batch": exact(prediction.batch, "frame", "images in flight"),
         "throughput": predicted(prediction.fps, "frame/s", prediction.fps_interval, COST_SOURCE),
-        "host beside the DPU": scaled(1e3 * prediction.host_s, "ms/frame", prediction, COST_SOURCE),
+        "host beside the DPU": host_time(prediction, "ms/frame"),
         "power": power,
         "energy": energy(frame_s, power),
     }
     name = f"{dpu.target.name} {prediction.configuration}, whole images"
-    return Row("frames", name, figures, {"fitted range": fitted_range(prediction)})
+    words = {"host's task": prediction.task, "fitted range": fitted_range(prediction)}
+    return Row("frames", name, figures, words)
+
+
+def host_words(prediction: Prediction, dpu: Dpu) -> list[str]:
+    """What was assumed of the file, and what the processor runs because the DPU refuses it; a sentence each."""
+    found = [prediction.note] if prediction.note else []
+    if prediction.refused:
+        low_ms, high_ms = (1e3 * end_s for end_s in prediction.refused_s)
+        found.append(
+            f"the processor of {dpu.target.name} runs what its DPU refuses ('beers-deploy check' says why): "
+            f"{', '.join(prediction.refused)}; {number(low_ms, 2)} to {number(high_ms, 2)} ms an image, from the "
+            "best that is published of its cores to plain code"
+        )
+    return found
 
 
 def on_chip(prediction: Prediction) -> float:

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from deploy.bench.board import BoardRequest, bench_board
-from deploy.bench.tables import Swath, frame_rows, sweep_rows, within_words
+from deploy.bench.tables import Swath, frame_row, predict_file, sweep_rows, within_words
 from deploy.dpu.board import load_dpu
 from examples.networks import build, to_onnx
 from profiles.errors import ModelError, OptionError
@@ -93,8 +93,8 @@ def test_a_frame_need_not_be_square(tmp_path: Path, classifier: Path) -> None:
     for side, size in zip(model.graph.input[0].type.tensor_type.shape.dim[2:], (32, 96), strict=True):
         side.dim_value = size
     onnx.save(model, tmp_path / "wide.onnx")
-    boards = [load_dpu("vck190", None)]
-    (square,), (wide,) = (frame_rows(path, boards, None) for path in (classifier, tmp_path / "wide.onnx"))
+    dpu = load_dpu("vck190", None)
+    square, wide = (frame_row(predict_file(path, dpu, None), dpu) for path in (classifier, tmp_path / "wide.onnx"))
     assert (wide.figures["work"].value or 0) > 2.5 * (square.figures["work"].value or 0)
 
 
