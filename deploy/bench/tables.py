@@ -238,6 +238,8 @@ def _row(prediction: Prediction, swath: Swath, dpu: Dpu) -> Row:
 def within_words(rows: Sequence[Row], boards: Sequence[Dpu], within_s: float) -> str:
     """Which DPU, the one of the lowest peak, meets a time for the swath: surely, probably, or only at best.
 
+    One that does so surely is not named again for what is less. Peaks stand for prices, which no file states.
+
     Args:
         rows: those of `sweep_rows`, the boards' one behind the other, as many of each.
         boards: as given there.
@@ -245,13 +247,13 @@ def within_words(rows: Sequence[Row], boards: Sequence[Dpu], within_s: float) ->
     """
     each = len(rows) // len(boards)
     latencies = [(boards[k // each], row, row.figures["latency"]) for k, row in enumerate(rows)]
-    found = []
+    found: dict[str, str] = {}
     for how, end in (("by the whole interval", 1), ("by the prediction", None), ("at best", 0)):
         fits = [(dpu, row) for dpu, row, time in latencies if _end(time, end) <= within_s]
         if fits:
             dpu, row = min(fits, key=lambda fit: fit[0].peak_ops_per_s)
-            found.append(f"{how} {row.name} ({dpu.peak_ops_per_s / 1e12:.3g} TOPS)")
-    words = "; ".join(found) or "none of these"
+            found.setdefault(f"{row.name} ({dpu.peak_ops_per_s / 1e12:.3g} TOPS)", how)
+    words = "; ".join(f"{how} {name}" for name, how in found.items()) or "none of these"
     return f"the smallest DPU that takes {within_s:g} s or less: {words}"
 
 

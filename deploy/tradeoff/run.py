@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import onnx
 
 from deploy.bench.host import Sensors, drawn_acquisition
 from deploy.bench.tables import PAPER_TARGET, Swath, layer_rows
@@ -21,6 +22,7 @@ from deploy.restoration.plan import make_plan
 from deploy.tradeoff.accuracy import BenchmarkSet
 from deploy.tradeoff.advice import Choice, choose, findings, fronts, headline, notes, paper_outcomes, papers_point
 from deploy.tradeoff.board import DpuRun
+from deploy.tradeoff.boards import board_rows
 from deploy.tradeoff.host_time import TILE_PX
 from deploy.tradeoff.measurements import Measurements, run_jobs
 from deploy.tradeoff.methods import CalibrationScenes, MethodStore, find_networks, is_papers
@@ -104,12 +106,13 @@ class StudyRun:
 
     @property
     def rows(self) -> tuple[Row, ...]:
-        """Points, layers and placement, for a document."""
+        """Points, boards, layers and placement, for a document."""
         named = [
             (kind, name, row) for kind, tables in self._by_network() for name, rows in tables.items() for row in rows
         ]
         return (
             *self.study.points,
+            *self.study.boards,
             *(Row(f"{kind} of {name}: {r.table}", r.name, r.figures, r.text) for kind, name, r in named),
         )
 
@@ -163,6 +166,7 @@ def _put_together(
         {name: tuple(layers_of(run)) for name, run in sorted(runs.items())},
         {name: tuple(placement_of(measurements, run)) for name, run in sorted(runs.items())},
         remarks,
+        board_rows(outcomes, request.boards or (request.target,), lambda variant: legal_model(measurements, variant)),
     )
     return StudyRun(study, not asked or choice.outcome is not None)
 
@@ -214,7 +218,13 @@ def layers_of(outcome: Outcome) -> list[Row]:
 def placement_of(measurements: Measurements, outcome: Outcome) -> list[Row]:
     """Where each operation of a network's run on the board is placed."""
     assert isinstance(outcome.board, DpuRun)  # noqa: S101 - chosen so
-    file = measurements.store.int8_file(outcome.point.variant)
-    assert file is not None  # noqa: S101 - it ran on the board
     tile_px, dpu = outcome.point.tile_px, outcome.board.dpu
-    return network_rows(place(network_of(load_onnx(file), tile_px), dpu), dpu, tile_px)
+    network = network_of(legal_model(measurements, outcome.point.variant), tile_px)
+    return network_rows(place(network, dpu), dpu, tile_px)
+
+
+def legal_model(measurements: Measurements, variant: Variant) -> onnx.ModelProto:
+    """The INT8 network that ran on the board."""
+    file = measurements.store.int8_file(variant)
+    assert file is not None  # noqa: S101 - it ran on the board
+    return load_onnx(file)
