@@ -12,6 +12,7 @@ from pathlib import Path
 
 from deploy.dpu.board import Dpu
 from deploy.dpu.checker.placement import place
+from deploy.dpu.cost.host import Task
 from deploy.dpu.cost.latency import (
     LayerCost,
     Prediction,
@@ -65,13 +66,15 @@ class Swath:
         return tiles * self.tile_px**2 / self.pixels
 
 
-def predict_file(model: Path, dpu: Dpu, tile_px: int | None = PAPER_TILE_PX) -> Prediction:
+def predict_file(model: Path, dpu: Dpu, tile_px: int | None = PAPER_TILE_PX, task: Task | None = None) -> Prediction:
     """What the cost model says of an ONNX file, for tiles of that side or, with None, for the size it is fixed to.
+
+    The `task` of the host is what the file tells, if none is given.
 
     Raises:
         ModelError: not a network, or one that does not run whole on the DPU.
     """
-    return predict(place(read_network(model, tile_px), dpu), dpu)
+    return predict(place(read_network(model, tile_px), dpu), dpu, task)
 
 
 def predicted_rows(name: str, prediction: Prediction, swath: Swath, dpu: Dpu) -> list[Row]:
@@ -94,6 +97,7 @@ def _predicted_row(name: str, prediction: Prediction, swath: Swath, dpu: Dpu, fr
         "work factor": exact(swath.work_factor(frames), "px/px", ARITHMETIC),
         "latency": latency,
         "throughput": predicted(prediction.fps, "frame/s", prediction.fps_interval, COST_SOURCE),
+        "one-thread latency": one_thread_latency(prediction),
         "host beside the DPU": host_time(prediction, "ms/tile"),
         "power": power,
         "power of products and traffic": counted_power(prediction, dpu),
@@ -107,6 +111,14 @@ def host_time(prediction: Prediction, unit: str) -> Figure:
     """What the host's cores together take for an image, in ms."""
     low_s, high_s = prediction.host_interval_s
     return predicted(1e3 * prediction.host_s, unit, (1e3 * low_s, 1e3 * high_s), COST_SOURCE)
+
+
+def one_thread_latency(prediction: Prediction) -> Figure:
+    """From image to result where one thread runs one core's batch and does the host's work itself, in ms."""
+    low_s, high_s = prediction.latency_interval_s
+    images = f"a batch of {prediction.handlers}" if prediction.handlers > 1 else "one image"
+    source = f"{COST_SOURCE}, its fit to rates with one thread: {images} through one core, then the host"
+    return predicted(1e3 * prediction.latency_s, "ms/batch", (1e3 * low_s, 1e3 * high_s), source)
 
 
 def swath_latency(prediction: Prediction, batches: float) -> Figure:
@@ -207,10 +219,12 @@ MOST_TILE_PX = 8192
 """One layer's result of 64 channels has 17 GB there; no board has a tenth of it."""
 
 
-def sweep_rows(model: Path, swath: Swath, boards: Sequence[Dpu], tiles_px: Sequence[int]) -> list[Row]:
+def sweep_rows(
+    model: Path, swath: Swath, boards: Sequence[Dpu], tiles_px: Sequence[int], task: Task | None = None
+) -> list[Row]:
     """A row a configuration and tile size, for whole tiles with the swath's halo."""
     return [
-        _row(predict_file(model, dpu, tile_px), replace(swath, tile_px=tile_px), dpu)
+        _row(predict_file(model, dpu, tile_px, task), replace(swath, tile_px=tile_px), dpu)
         for dpu in boards
         for tile_px in tiles_px
     ]
@@ -269,6 +283,7 @@ def frame_row(prediction: Prediction, dpu: Dpu) -> Row:
         "work": exact(prediction.operations / 1e9, "GOP"),
         "batch": exact(prediction.batch, "frame", "images in flight"),
         "throughput": predicted(prediction.fps, "frame/s", prediction.fps_interval, COST_SOURCE),
+        "one-thread latency": one_thread_latency(prediction),
         "host beside the DPU": host_time(prediction, "ms/frame"),
         "power": power,
         "energy": energy(frame_s, power),

@@ -55,6 +55,9 @@ class Prediction:
     Attributes:
         configuration: of the DPU.
         batch: images in flight: batch handlers of all cores.
+        handlers: images of one core's batch.
+        alone_s: such a batch on the DPU while its other cores rest.
+        host_cores: of the board's processor.
         layers: what each costs, for a batch.
         overhead_s: start of a batch.
         host_s: time of an image on the host's cores together.
@@ -69,6 +72,9 @@ class Prediction:
 
     configuration: str
     batch: int
+    handlers: int
+    alone_s: float
+    host_cores: int
     layers: tuple[LayerCost, ...]
     overhead_s: float
     host_s: float
@@ -104,6 +110,23 @@ class Prediction:
         return low_s / self.spread, high_s * self.spread
 
     @property
+    def latency_s(self) -> float:
+        """From the first image of a batch to the last result, with one thread: one core, then one core of the host.
+
+        Its error is no larger than that of the rate (docs/boards.md), and it shares the rate's width.
+        """
+        return self._latency_s(self.host_s)
+
+    @property
+    def latency_interval_s(self) -> tuple[float, float]:
+        """Least and most of `latency_s`."""
+        low_s, high_s = map(self._latency_s, self._host_ends_s)
+        return low_s / self.spread, high_s * self.spread
+
+    def _latency_s(self, host_s: float) -> float:
+        return self.alone_s + self.handlers * host_s * self.host_cores
+
+    @property
     def spread(self) -> float:
         """By how many times a part may be off either way."""
         return math.exp(self.width)
@@ -129,8 +152,13 @@ class Prediction:
         return sum(layer.work.load_map_bytes + layer.work.store_map_bytes for layer in self.layers)
 
 
-def predict(placement: Placement, dpu: Dpu) -> Prediction:
+def predict(placement: Placement, dpu: Dpu, task: Task | None = None) -> Prediction:
     """Predict a network whose convolutions the DPU runs; what it refuses at the ends of a float file the host does.
+
+    Args:
+        placement: where its nodes run.
+        dpu: a board's.
+        task: what the host does with the results; None for what the file tells.
 
     Raises:
         ModelError: a node that the DPU cannot run between others that it does, or nothing for it to do.
@@ -145,10 +173,12 @@ def predict(placement: Placement, dpu: Dpu) -> Prediction:
     if not any(work.operations for work in works):
         remedy = "give a network with convolutions"
         raise ModelError("cost model", expected="work for the DPU", got="no convolution", remedy=remedy)
-    layers = _layer_costs(works, dpu, constants, structure)
+    columns = Layers.of(works, dpu)
+    layers = _layer_costs(works, columns, constants, structure)
     refused = [node.op for node in placement.failed]
     cores, refused_s = dpu.whole("cpu", "cores"), processor_s(refused, dpu)
-    host_s = float(placed_work(placement) @ constants.host_s_per_unit) / cores + between(refused_s)
+    task = task or task_of(placement)
+    host_s = float(placed_work(placement, task) @ constants.host_s_per_unit) / cores + between(refused_s)
     dpu_s = math.fsum([*(layer.time_s for layer in layers), constants.batch_s]) / dpu.batch
     map_bytes = largest_map_bytes(placement.core)
     regime = regime_of(host_s > dpu_s, map_bytes)
@@ -157,10 +187,13 @@ def predict(placement: Placement, dpu: Dpu) -> Prediction:
     return Prediction(
         configuration=dpu.name,
         batch=dpu.batch,
+        handlers=dpu.batch // dpu.cores,
+        alone_s=float(columns.time_s(constants, structure, alone=True).sum()) + constants.batch_s,
+        host_cores=cores,
         layers=layers,
         overhead_s=constants.batch_s,
         host_s=host_s,
-        task=task_of(placement),
+        task=task,
         regime=regime,
         width=width,
         structure=structure,
@@ -172,9 +205,8 @@ def predict(placement: Placement, dpu: Dpu) -> Prediction:
 
 
 def _layer_costs(
-    works: Sequence[Work], dpu: Dpu, constants: Constants, structure: Structure
+    works: Sequence[Work], layers: Layers, constants: Constants, structure: Structure
 ) -> tuple[LayerCost, ...]:
-    layers = Layers.of(works, dpu)
     columns = (
         layers.compute_s(constants),
         layers.memory_s(constants, structure),
@@ -192,6 +224,10 @@ WIDTHS = {
 """Where [cost] keeps half the width of an interval, in ln(FPS)."""
 
 
+ROUNDED = 1e-3
+"""How far [cost] rounds the ends of the fitted range: the largest fitted network is not beyond it."""
+
+
 def _outside(core: Sequence[Operation], map_bytes: float, dpu: Dpu) -> tuple[str, ...]:
     """What of a network lies beyond the fitted ones, each with the end of the range that it passes."""
     values = {
@@ -201,7 +237,7 @@ def _outside(core: Sequence[Operation], map_bytes: float, dpu: Dpu) -> tuple[str
     found = []
     for key, (name, value, scale, unit) in values.items():
         most = scale * dpu.limit("cost", f"fitted_{key}").high
-        if value > most:
+        if value > most * (1 + ROUNDED):
             found.append(f"{name} {value:.3g}{unit} (fitted up to {most:.3g})")
     return tuple(found)
 
