@@ -11,6 +11,7 @@ import onnx
 from deploy.bench.tables import fitted_range
 from deploy.dpu.board import Dpu, dpu_of
 from deploy.dpu.checker.placement import place
+from deploy.dpu.cost.constants import Constants
 from deploy.dpu.cost.latency import predict
 from deploy.dpu.graph import Network
 from deploy.dpu.reading import network_of
@@ -42,21 +43,30 @@ def parse_targets(text: str) -> tuple[str, ...]:
 
 
 def board_rows(
-    outcomes: Sequence[Outcome], boards: Sequence[str], model_of: Callable[[Variant], onnx.ModelProto]
+    outcomes: Sequence[Outcome], dpus: Sequence[Dpu], model_of: Callable[[Variant], onnx.ModelProto]
 ) -> tuple[Row, ...]:
-    """A row for each network, tile, board and configuration, the boards' default configurations first.
+    """A row for each network, tile and DPU.
 
     Args:
         outcomes: of the study.
-        boards: names of target profiles, or their files.
+        dpus: as `every_configuration` lists them.
         model_of: the INT8 file of a variant.
+    """
+    shown = [each for each in outcomes if _compares(each)]
+    return tuple(row for each in shown for row in _rows(each, dpus, model_of(each.point.variant)))
+
+
+def every_configuration(boards: Sequence[str]) -> list[Dpu]:
+    """Those of several boards, by name or file.
 
     Raises:
         ProfileError: an unknown board, or one without cost constants.
+        OptionError: a target without a DPU.
     """
-    shown = [each for each in outcomes if _compares(each)]
     dpus = [dpu for target in map(load_target, boards) for dpu in configurations(target)]
-    return tuple(row for each in shown for row in _rows(each, dpus, model_of(each.point.variant)))
+    for dpu in dpus:
+        Constants.of(dpu)
+    return dpus
 
 
 def configurations(target: TargetProfile) -> list[Dpu]:

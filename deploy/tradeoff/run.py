@@ -12,7 +12,7 @@ import onnx
 from deploy.bench.host import Sensors, drawn_acquisition
 from deploy.bench.tables import PAPER_TARGET, Swath, layer_rows
 from deploy.cache import Cache
-from deploy.dpu.board import dpu_of
+from deploy.dpu.board import Dpu, dpu_of
 from deploy.dpu.checker.placement import place
 from deploy.dpu.checker.table import network_rows
 from deploy.dpu.reading import network_of
@@ -22,7 +22,7 @@ from deploy.restoration.plan import make_plan
 from deploy.tradeoff.accuracy import BenchmarkSet
 from deploy.tradeoff.advice import Choice, choose, findings, fronts, headline, notes, paper_outcomes, papers_point
 from deploy.tradeoff.board import DpuRun
-from deploy.tradeoff.boards import board_rows
+from deploy.tradeoff.boards import board_rows, every_configuration
 from deploy.tradeoff.host_time import TILE_PX
 from deploy.tradeoff.measurements import Measurements, run_jobs
 from deploy.tradeoff.methods import CalibrationScenes, MethodStore, find_networks, is_papers
@@ -127,6 +127,7 @@ def run_study(request: Request, cache: Cache, say: Say = silent) -> StudyRun:
         BeersError: a network, an image, a profile or weights that cannot be used.
     """
     swath, target = Swath(*request.size_px), load_target(request.target)
+    dpus = every_configuration(request.boards or (request.target,))
     store = make_store(request, cache, say)
     benchmark, small = make_benchmark(request)
     measurements = Measurements(store, benchmark, host_tile(store, request.seed), cache)
@@ -141,13 +142,12 @@ def run_study(request: Request, cache: Cache, say: Say = silent) -> StudyRun:
     ]
     results = Results({each.name: each for each in outcomes}, benchmark.sites, request.seed)
     sampled = oversampling_note(benchmark.pairs, request.profiles[0])
-    return _put_together(
-        request, measurements, results, notes(benchmark, sampled, small, lacks, calibrated_on(request), target.name)
-    )
+    remarks = notes(benchmark, sampled, small, lacks, calibrated_on(request), target.name)
+    return _put_together(request, measurements, results, remarks, dpus)
 
 
 def _put_together(
-    request: Request, measurements: Measurements, results: Results, remarks: tuple[str, ...]
+    request: Request, measurements: Measurements, results: Results, remarks: tuple[str, ...], dpus: Sequence[Dpu]
 ) -> StudyRun:
     outcomes, found = list(results.outcomes.values()), fronts(results)
     paper = papers_point(
@@ -166,7 +166,7 @@ def _put_together(
         {name: tuple(layers_of(run)) for name, run in sorted(runs.items())},
         {name: tuple(placement_of(measurements, run)) for name, run in sorted(runs.items())},
         remarks,
-        board_rows(outcomes, request.boards or (request.target,), lambda variant: legal_model(measurements, variant)),
+        board_rows(outcomes, dpus, lambda variant: legal_model(measurements, variant)),
     )
     return StudyRun(study, not asked or choice.outcome is not None)
 

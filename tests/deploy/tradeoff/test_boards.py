@@ -9,10 +9,10 @@ import pytest
 from deploy.bench.tables import Swath
 from deploy.dpu.board import load_dpu
 from deploy.tradeoff.board import FIGURES, DpuRun, predict_model
-from deploy.tradeoff.boards import ALL, board_rows, configurations, parse_targets
+from deploy.tradeoff.boards import ALL, board_rows, configurations, every_configuration, parse_targets
 from deploy.tradeoff.outcome import QUALITIES, Outcome
 from profiles import load_target
-from profiles.errors import OptionError
+from profiles.errors import BeersError, OptionError
 from profiles.figures import Row
 from profiles.target import DEFAULT_TARGET, board_names
 from tests.deploy.dpu.graphs import Sketch, integer_convbeers
@@ -44,7 +44,7 @@ def outcomes(models: dict[str, onnx.ModelProto]) -> list[Outcome]:
 
 @pytest.fixture(scope="module")
 def rows(outcomes: list[Outcome], models: dict[str, onnx.ModelProto]) -> tuple[Row, ...]:
-    return board_rows(outcomes, ["vck190", "zcu104"], lambda variant: models[variant.method])
+    return board_rows(outcomes, every_configuration(["vck190", "zcu104"]), lambda variant: models[variant.method])
 
 
 def test_every_network_stands_on_every_configuration_once(rows: tuple[Row, ...]) -> None:
@@ -83,10 +83,16 @@ def test_what_a_board_cannot_run_says_why(outcomes: list[Outcome], tmp_path: Pat
     """A Sigmoid between two convolutions."""
     sketch = Sketch(8)
     path = sketch.save(tmp_path / "n.onnx", sketch.conv(sketch.node("Sigmoid", sketch.conv("image"))))
-    found = board_rows(outcomes[:1], ["zcu104"], lambda _: onnx.load(path))
+    found = board_rows(outcomes[:1], every_configuration(["zcu104"]), lambda _: onnx.load(path))
     for row in found:
         assert {row.figures[f"board {name}"].value for name in FIGURES} == {None}
         assert "cost model" in row.figures["board latency"].reason
+
+
+@pytest.mark.parametrize("board", ["nope", "host-cpu"])
+def test_what_is_no_board_is_refused_before_anything_is_measured(board: str) -> None:
+    with pytest.raises(BeersError, match=board):
+        every_configuration(["vck190", board])
 
 
 def test_the_default_configuration_stands_first() -> None:

@@ -9,7 +9,7 @@ import pytest
 from PIL import Image
 
 from deploy.report.plots import DARK, LIGHT
-from deploy.tradeoff.boards import board_rows, configurations
+from deploy.tradeoff.boards import board_rows, configurations, every_configuration
 from deploy.tradeoff.page import render_study
 from deploy.tradeoff.plot import NARROW, WIDE
 from deploy.tradeoff.study import Study
@@ -203,7 +203,9 @@ def on_boards(tmp_path_factory: pytest.TempPathFactory) -> Study:
     made = {"convbeers-s": Made(40.0, 2, 8), "convbeers": Made(41.0, 2, 16)}
     path = integer_convbeers(tmp_path_factory.mktemp("net") / "net.onnx", 2, 8)
     rows = board_rows(
-        [outcome(name, each) for name, each in made.items()], ["vck190", "zcu104"], lambda _: onnx.load(path)
+        [outcome(name, each) for name, each in made.items()],
+        every_configuration(["vck190", "zcu104"]),
+        lambda _: onnx.load(path),
     )
     return replace(study(), boards=rows)
 
