@@ -83,6 +83,7 @@ def bench(
     from deploy.bench.board import BoardRequest, bench_board
     from deploy.bench.host import host_rows
     from deploy.bench.tables import parse_tiles
+    from deploy.dpu.cost.host import TASKS
     from deploy.networks import int8_file
     from deploy.results import Document, print_rows
     from model.io.files import require_writable
@@ -99,7 +100,7 @@ def bench(
             print_rows(f"{path.name} on this machine: {table}", part)
         say(NO_PROXY)
     else:
-        task = host_task.value if host_task else None
+        task = next((name for name in TASKS if name == host_task), None)
         asked = BoardRequest(board, image, full_scale, size, tiles, halo, config, measured, within, task)
         found = bench_board(path, asked, budget)
         rows = found.rows
