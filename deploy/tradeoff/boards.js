@@ -73,8 +73,12 @@
         last = across(value);
         parts.push(label(last, bottom + 17, written(value)));
       }
-      for (const value of evenSteps(...ys, 6)) {
-        parts.push(line(left, up(value), width - right, up(value), "grid"), label(left - 6, up(value) + 4, written(value), "end"));
+      const heights = evenSteps(...ys, 6);
+      const digits = Math.max(0, Math.ceil(-Math.log10(heights[1] - heights[0]) - 1e-9));
+      for (const value of heights) {
+        const words = label(left - 6, up(value) + 4, value.toFixed(digits), "end");
+        words.setAttribute("class", "height");
+        parts.push(line(left, up(value), width - right, up(value), "grid"), words);
       }
       const title = (which) => `${which}, ${head(which).querySelector("small").textContent}`;
       parts.push(label((left + width - right) / 2, height - 8, `${title(key)} (predicted)`));
