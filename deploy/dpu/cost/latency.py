@@ -113,7 +113,7 @@ class Prediction:
     def latency_s(self) -> float:
         """From the first image of a batch to the last result, with one thread: one core, then one core of the host.
 
-        Its error is no larger than that of the rate (docs/boards.md), and it shares the rate's width.
+        Its error is about that of the rate (docs/boards.md), and it shares the rate's width.
         """
         return self._latency_s(self.host_s)
 
