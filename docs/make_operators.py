@@ -33,7 +33,12 @@ is not listed under does not hold there: its file states no such limit. The boar
 [boards.md](boards.md).
 
 A node runs on the DPU when it keeps every rule of its kind, the rules of size, and in a quantised file those of
-numbers.
+numbers. A fully connected layer, a convolution as large as its map, runs there too where the rules are kept by the
+1 x 1 convolution over the map laid flat, or by a part of its outputs (sources: `deploy/dpu/checker/forms.py`).
+
+What the DPU refuses goes to the board's processor. At the ends of a float network that costs time: `check` still
+fails, with rule and remedy, and `bench` counts it, from the best that is published of the processor to plain code.
+Between two parts of the DPU, or in a quantised file, `bench` refuses.
 """
 
 

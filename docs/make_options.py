@@ -175,7 +175,10 @@ REFUSED = {
     "gate": [Refused(("variant",), "FLOAT INT8")],
     "check": [Refused(("picture", "tile"), "traditional")],
     "bench": [
-        Refused(("image", "full_scale", "size", "halo", "config", "measured", "budget", "within"), "--target host"),
+        Refused(
+            ("image", "full_scale", "size", "halo", "config", "host_task", "measured", "budget", "within"),
+            "--target host",
+        ),
         Refused(("threads",), without="--target host"),
         Refused(("full_scale",), without="--image"),
         Refused(("size",), "--image IMAGE"),

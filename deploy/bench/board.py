@@ -15,7 +15,8 @@ from deploy.bench.tables import (
     PAPER_SIZE,
     PAPER_TARGET,
     Swath,
-    frame_rows,
+    frame_row,
+    host_words,
     layer_rows,
     parse_size,
     predict_file,
@@ -25,6 +26,7 @@ from deploy.bench.tables import (
     within_words,
 )
 from deploy.dpu.board import Dpu, dpu_of
+from deploy.dpu.cost.host import Task
 from deploy.dpu.cost.runs import refit
 from deploy.dpu.reading import own_tile_px
 from deploy.restoration.options import parse_halo
@@ -60,6 +62,7 @@ class BoardRequest:
         config: the DPU's configuration, "all", or None for the target's own.
         measured: runs of the user's board, to which the cost model is refitted.
         within_s: what the swath may take; None does not ask.
+        host_task: what the host does with the results; None for what the file tells.
     """
 
     target: str
@@ -71,6 +74,7 @@ class BoardRequest:
     config: str | None
     measured: Path | None
     within_s: float | None = None
+    host_task: Task | None = None
 
 
 @dataclass(frozen=True)
@@ -99,11 +103,11 @@ def bench_board(model: Path, request: BoardRequest, budget_s: float) -> BoardBen
     boards, refitted = _boards(request)
     whole = _untiled(network, request)
     if whole is not None:
-        return _frames(model, network, boards, refitted, whole)
+        return _frames(model, network, boards, refitted, whole, request.host_task)
     dn = read_acquisition(request.image, request.full_scale, None) if request.image else None
     swath = _swath(network, dn.shape if dn is not None else None, request)
     single = len(boards) == len(request.tiles_px) == 1 and request.within_s is None
-    found = _single(model, boards[0], swath) if single else _sweep(model, boards, request, swath)
+    found = _single(model, boards[0], swath, request.host_task) if single else _sweep(model, boards, request, swath)
     scene, targets = dn if dn is not None else drawn_acquisition(swath, sensors), _targets(boards)
     traditional, by_kind = traditional_rows(scene, swath, sensors, targets, budget_s)
     papers = published_rows() if any(target.name == PAPER_TARGET for target in targets) else []
@@ -115,17 +119,17 @@ def bench_board(model: Path, request: BoardRequest, budget_s: float) -> BoardBen
     return BoardBench([*rows, *apart], [*refitted, *found.shown, kinds, (size, rows)], found.notes)
 
 
-def _single(model: Path, dpu: Dpu, swath: Swath) -> BoardBench:
+def _single(model: Path, dpu: Dpu, swath: Swath, task: Task | None) -> BoardBench:
     """The rows of the swath, and those of the layers to show."""
-    prediction = predict_file(model, dpu, swath.tile_px)
-    notes = [TRAFFIC, *([prediction.note] if prediction.note else [])]
+    prediction = predict_file(model, dpu, swath.tile_px, task)
+    notes = [TRAFFIC, *host_words(prediction, dpu)]
     layers = (f"{model.name}, one batch on {dpu.target.name} {dpu.name}", layer_rows(prediction, dpu))
     return BoardBench(predicted_rows(model.stem, prediction, swath, dpu), [layers], notes)
 
 
 def _sweep(model: Path, boards: Sequence[Dpu], request: BoardRequest, swath: Swath) -> BoardBench:
     """A row for each configuration and tile size, and which of them meet the time asked for."""
-    rows = sweep_rows(model, swath, boards, request.tiles_px)
+    rows = sweep_rows(model, swath, boards, request.tiles_px, request.host_task)
     size = f"{swath.width_px} x {swath.height_px} pixels"
     notes = [] if request.within_s is None else [within_words(rows, boards, request.within_s)]
     return BoardBench(rows, [(f"{model.name}, {size} in whole tiles, halo {swath.halo_px} px", rows)], notes)
@@ -137,19 +141,23 @@ def _frames(
     boards: Sequence[Dpu],
     refitted: list[tuple[str, list[Row]]],
     why: ModelError,
+    task: Task | None,
 ) -> BoardBench:
     """The network on whole images; of one configuration each layer too."""
     tile_px = None if own_tile_px(network) else FREE_TILE_PX
-    rows = frame_rows(model, boards, tile_px)
+    predictions = [predict_file(model, dpu, tile_px, task) for dpu in boards]
+    rows = [frame_row(prediction, dpu) for prediction, dpu in zip(predictions, boards, strict=True)]
     size = " x ".join(
         str(side.dim_value or tile_px) for side in network.graph.input[0].type.tensor_type.shape.dim[2:]
     )
     shown = [*refitted, (f"{model.name}, frames of {size}", rows)]
     if len(boards) == 1:
-        layers = layer_rows(predict_file(model, boards[0], tile_px), boards[0])
+        layers = layer_rows(predictions[0], boards[0])
         shown.insert(-1, (f"{model.name}, one batch on {boards[0].target.name} {boards[0].name}", layers))
-    note = f"not tiled, but run on whole images: expected {why.expected}, got {why.got}"
-    return BoardBench([row for _, part in shown for row in part], shown, [TRAFFIC, note])
+    whole = f"not tiled, but run on whole images: expected {why.expected}, got {why.got}"
+    said = [words for found, dpu in zip(predictions, boards, strict=True) for words in host_words(found, dpu)]
+    notes = [TRAFFIC, whole, *dict.fromkeys(said)]
+    return BoardBench([row for _, part in shown for row in part], shown, notes)
 
 
 def _untiled(network: onnx.ModelProto, request: BoardRequest) -> ModelError | None:

@@ -12,6 +12,7 @@ from pathlib import Path
 
 from deploy.dpu.board import Dpu
 from deploy.dpu.checker.placement import place
+from deploy.dpu.cost.host import Task
 from deploy.dpu.cost.latency import (
     LayerCost,
     Prediction,
@@ -25,7 +26,7 @@ from deploy.dpu.cost.latency import (
 )
 from deploy.dpu.reading import read_network
 from profiles.errors import OptionError
-from profiles.figures import Figure, Row, predicted, published, unavailable
+from profiles.figures import Figure, Row, number, predicted, published, unavailable
 
 TABLE, LAYERS = "bench", "layers"
 COST_SOURCE = "cost model fitted on published networks, docs/cost-model.md"
@@ -65,13 +66,15 @@ class Swath:
         return tiles * self.tile_px**2 / self.pixels
 
 
-def predict_file(model: Path, dpu: Dpu, tile_px: int | None = PAPER_TILE_PX) -> Prediction:
+def predict_file(model: Path, dpu: Dpu, tile_px: int | None = PAPER_TILE_PX, task: Task | None = None) -> Prediction:
     """What the cost model says of an ONNX file, for tiles of that side or, with None, for the size it is fixed to.
+
+    The `task` of the host is what the file tells, if none is given.
 
     Raises:
         ModelError: not a network, or one that does not run whole on the DPU.
     """
-    return predict(place(read_network(model, tile_px), dpu), dpu)
+    return predict(place(read_network(model, tile_px), dpu), dpu, task)
 
 
 def predicted_rows(name: str, prediction: Prediction, swath: Swath, dpu: Dpu) -> list[Row]:
@@ -89,19 +92,33 @@ def predicted_rows(name: str, prediction: Prediction, swath: Swath, dpu: Dpu) ->
 
 def _predicted_row(name: str, prediction: Prediction, swath: Swath, dpu: Dpu, frames: float, batches: float) -> Row:
     power, latency = dpu_power(dpu), swath_latency(prediction, batches)
-    host_ms = 1e3 * prediction.host_s
     figures = {
         "tiles": exact(frames, "tile", ARITHMETIC),
         "work factor": exact(swath.work_factor(frames), "px/px", ARITHMETIC),
         "latency": latency,
         "throughput": predicted(prediction.fps, "frame/s", prediction.fps_interval, COST_SOURCE),
-        "host beside the DPU": scaled(host_ms, "ms/tile", prediction, COST_SOURCE),
+        "one-thread latency": one_thread_latency(prediction),
+        "host beside the DPU": host_time(prediction, "ms/tile"),
         "power": power,
         "power of products and traffic": counted_power(prediction, dpu),
         "energy": energy(latency, power),
         "efficiency": efficiency(swath.pixels, latency, power),
     }
     return Row(TABLE, name, figures, {"fitted range": fitted_range(prediction)})
+
+
+def host_time(prediction: Prediction, unit: str) -> Figure:
+    """What the host's cores together take for an image, in ms."""
+    low_s, high_s = prediction.host_interval_s
+    return predicted(1e3 * prediction.host_s, unit, (1e3 * low_s, 1e3 * high_s), COST_SOURCE)
+
+
+def one_thread_latency(prediction: Prediction) -> Figure:
+    """From image to result where one thread runs one core's batch and does the host's work itself, in ms."""
+    low_s, high_s = prediction.latency_interval_s
+    images = f"a batch of {prediction.handlers}" if prediction.handlers > 1 else "one image"
+    source = f"{COST_SOURCE}, its fit to rates with one thread: {images} through one core, then the host"
+    return predicted(1e3 * prediction.latency_s, "ms/batch", (1e3 * low_s, 1e3 * high_s), source)
 
 
 def swath_latency(prediction: Prediction, batches: float) -> Figure:
@@ -171,11 +188,11 @@ def _layer_row(layer: LayerCost, prediction: Prediction, dpu: Dpu) -> Row:
     figures = {
         "work": exact(work.operations / 1e9, "GOP"),
         "time": _time(layer.time_s, prediction),
-        "rate": scaled(batch * work.operations / seconds / 1e9, "GOP/s", prediction, COST_SOURCE, falls=True),
+        "rate": scaled(batch * work.operations / seconds / 1e9, "GOP/s", prediction, COST_SOURCE),
         "LdFM": exact(work.load_map_bytes / 1e6, "MB", "feature maps that an image loads, by the graph's shapes"),
         "LdWB": exact(work.weight_bytes / 1e6, "MB", "weights and biases that a batch loads, by the graph's shapes"),
         "StFM": exact(work.store_map_bytes / 1e6, "MB", "feature maps that an image stores, by the graph's shapes"),
-        "bandwidth": scaled(moved / seconds / 1e9, "GB/s", prediction, COST_SOURCE, falls=True),
+        "bandwidth": scaled(moved / seconds / 1e9, "GB/s", prediction, COST_SOURCE),
         "array use": exact(100 * work.array_use, "%"),
         "energy": predicted(
             500 * sum(low_high_j), "mJ", (1e3 * low_high_j[0], 1e3 * low_high_j[1]), energy_source(dpu)
@@ -193,21 +210,21 @@ def exact(value: float, unit: str, source: str = "arithmetic of the graph's shap
     return predicted(value, unit, (value, value), source)
 
 
-def scaled(value: float, unit: str, prediction: Prediction, source: str, *, falls: bool = False) -> Figure:
-    """A part of the prediction, with the relative error of the whole; `falls` where more time means less of it."""
-    slow, fast = (prediction.fps / fps for fps in prediction.fps_interval)
-    ends = (value / slow, value / fast) if falls else (value * fast, value * slow)
-    return predicted(value, unit, ends, source)
+def scaled(value: float, unit: str, prediction: Prediction, source: str) -> Figure:
+    """A part of the prediction, with the relative error of the whole."""
+    return predicted(value, unit, (value / prediction.spread, value * prediction.spread), source)
 
 
 MOST_TILE_PX = 8192
 """One layer's result of 64 channels has 17 GB there; no board has a tenth of it."""
 
 
-def sweep_rows(model: Path, swath: Swath, boards: Sequence[Dpu], tiles_px: Sequence[int]) -> list[Row]:
+def sweep_rows(
+    model: Path, swath: Swath, boards: Sequence[Dpu], tiles_px: Sequence[int], task: Task | None = None
+) -> list[Row]:
     """A row a configuration and tile size, for whole tiles with the swath's halo."""
     return [
-        _row(predict_file(model, dpu, tile_px), replace(swath, tile_px=tile_px), dpu)
+        _row(predict_file(model, dpu, tile_px, task), replace(swath, tile_px=tile_px), dpu)
         for dpu in boards
         for tile_px in tiles_px
     ]
@@ -235,6 +252,8 @@ def _row(prediction: Prediction, swath: Swath, dpu: Dpu) -> Row:
 def within_words(rows: Sequence[Row], boards: Sequence[Dpu], within_s: float) -> str:
     """Which DPU, the one of the lowest peak, meets a time for the swath: surely, probably, or only at best.
 
+    One that does so surely is not named again for what is less. Peaks stand for prices, which no file states.
+
     Args:
         rows: those of `sweep_rows`, the boards' one behind the other, as many of each.
         boards: as given there.
@@ -242,13 +261,13 @@ def within_words(rows: Sequence[Row], boards: Sequence[Dpu], within_s: float) ->
     """
     each = len(rows) // len(boards)
     latencies = [(boards[k // each], row, row.figures["latency"]) for k, row in enumerate(rows)]
-    found = []
+    found: dict[str, str] = {}
     for how, end in (("by the whole interval", 1), ("by the prediction", None), ("at best", 0)):
         fits = [(dpu, row) for dpu, row, time in latencies if _end(time, end) <= within_s]
         if fits:
             dpu, row = min(fits, key=lambda fit: fit[0].peak_ops_per_s)
-            found.append(f"{how} {row.name} ({dpu.peak_ops_per_s / 1e12:.3g} TOPS)")
-    words = "; ".join(found) or "none of these"
+            found.setdefault(f"{row.name} ({dpu.peak_ops_per_s / 1e12:.3g} TOPS)", how)
+    words = "; ".join(f"{how} {name}" for name, how in found.items()) or "none of these"
     return f"the smallest DPU that takes {within_s:g} s or less: {words}"
 
 
@@ -257,29 +276,34 @@ def _end(figure: Figure, end: int | None) -> float:
     return math.inf if value is None else value
 
 
-def frame_rows(model: Path, boards: Sequence[Dpu], tile_px: int | None) -> list[Row]:
-    """A row a configuration for a network that is run on whole images: frames instead of a swath.
-
-    Args:
-        model: ONNX file.
-        boards: the configurations.
-        tile_px: side of an image; None for the size that the network is fixed to.
-    """
-    return [_frame_row(predict_file(model, dpu, tile_px), dpu) for dpu in boards]
-
-
-def _frame_row(prediction: Prediction, dpu: Dpu) -> Row:
+def frame_row(prediction: Prediction, dpu: Dpu) -> Row:
+    """A network that is run on whole images, on one configuration: frames instead of a swath."""
     power, frame_s = dpu_power(dpu), swath_latency(prediction, 1 / prediction.batch)
     figures = {
         "work": exact(prediction.operations / 1e9, "GOP"),
         "batch": exact(prediction.batch, "frame", "images in flight"),
         "throughput": predicted(prediction.fps, "frame/s", prediction.fps_interval, COST_SOURCE),
-        "host beside the DPU": scaled(1e3 * prediction.host_s, "ms/frame", prediction, COST_SOURCE),
+        "one-thread latency": one_thread_latency(prediction),
+        "host beside the DPU": host_time(prediction, "ms/frame"),
         "power": power,
         "energy": energy(frame_s, power),
     }
     name = f"{dpu.target.name} {prediction.configuration}, whole images"
-    return Row("frames", name, figures, {"fitted range": fitted_range(prediction)})
+    words = {"host's task": prediction.task, "fitted range": fitted_range(prediction)}
+    return Row("frames", name, figures, words)
+
+
+def host_words(prediction: Prediction, dpu: Dpu) -> list[str]:
+    """What was assumed of the file, and what the processor runs because the DPU refuses it; a sentence each."""
+    found = [prediction.note] if prediction.note else []
+    if prediction.refused:
+        low_ms, high_ms = (1e3 * end_s for end_s in prediction.refused_s)
+        found.append(
+            f"the processor of {dpu.target.name} runs what its DPU refuses ('beers-deploy check' says why): "
+            f"{', '.join(prediction.refused)}; {number(low_ms, 2)} to {number(high_ms, 2)} ms an image, from the "
+            "best that is published of its cores to plain code"
+        )
+    return found
 
 
 def on_chip(prediction: Prediction) -> float:

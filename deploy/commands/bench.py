@@ -1,5 +1,6 @@
 """`beers-deploy bench`: time, throughput, power and efficiency; predicted, measured and published side by side."""
 
+from enum import StrEnum
 from functools import partial
 from pathlib import Path
 from typing import Annotated
@@ -13,12 +14,22 @@ from profiles.target import DEFAULT_TARGET, MODEL_SUFFIX, board_names
 EXAMPLE = "bench --target vck190-model --size 13600x9016 --config C32B3"
 
 PAPER_SIZE = "13600x9016"  # as in deploy.bench.tables, which is imported late
-BOARD_ONLY = ("image", "full_scale", "size", "halo", "config", "measured", "budget", "within")
+BOARD_ONLY = ("image", "full_scale", "size", "halo", "config", "host_task", "measured", "budget", "within")
 HOST_ONLY = ("threads",)
 BOARD, HOSTS = f"{DEFAULT_TARGET}{MODEL_SUFFIX}", ("host", "host-cpu")
 BOARDS = ", ".join(board_names())
 PREDICTED = "No board was used: the DPU's figures come from a cost model, its power from an assumption."
 NO_PROXY = "Time on this CPU is no proxy for the DPU: here INT8 may even run slower than float."
+
+
+class HostTask(StrEnum):
+    """What the host does with a network's results; the names are those of `deploy.dpu.cost.host`."""
+
+    copy = "copy"
+    argmax = "argmax"
+    softmax = "softmax"
+    sort = "sort"
+    image = "image"
 
 
 def bench(
@@ -48,6 +59,13 @@ def bench(
     config: Annotated[
         str | None, typer.Option(help="DPU configuration, such as C32B3; 'all' sweeps the board's.")
     ] = None,
+    host_task: Annotated[
+        HostTask | None,
+        typer.Option(
+            help="What the host does with the results where the file does not tell: read them (copy), the best of "
+            "classes (argmax, softmax), boxes (sort), an image."
+        ),
+    ] = None,
     measured: Annotated[
         Path | None, typer.Option(help="JSON list of your board's runs: the cost model is refitted to them first.")
     ] = None,
@@ -65,6 +83,7 @@ def bench(
     from deploy.bench.board import BoardRequest, bench_board
     from deploy.bench.host import host_rows
     from deploy.bench.tables import parse_tiles
+    from deploy.dpu.cost.host import TASKS
     from deploy.networks import int8_file
     from deploy.results import Document, print_rows
     from model.io.files import require_writable
@@ -81,7 +100,8 @@ def bench(
             print_rows(f"{path.name} on this machine: {table}", part)
         say(NO_PROXY)
     else:
-        asked = BoardRequest(board, image, full_scale, size, tiles, halo, config, measured, within)
+        task = next((name for name in TASKS if name == host_task), None)
+        asked = BoardRequest(board, image, full_scale, size, tiles, halo, config, measured, within, task)
         found = bench_board(path, asked, budget)
         rows = found.rows
         for title, part in found.shown:
@@ -96,6 +116,7 @@ def bench(
         "tile": tile,
         "halo": halo,
         "config": config,
+        "host_task": host_task,
         "measured": measured.name if measured else None,
         "within": within,
     }

@@ -47,7 +47,13 @@ def tradeoff(
     calibration: Annotated[
         Path | None, typer.Option(help="Folder of scenes to make missing INT8 files on; drawn ones if none.")
     ] = None,
-    target: Annotated[str, typer.Option(help=f"The modelled board: {BOARDS}, or your .toml file.")] = DEFAULT_TARGET,
+    target: Annotated[
+        str,
+        typer.Option(
+            help=f"The modelled board: {BOARDS}, or your .toml file; several with commas, or 'all': the first is the "
+            "study's, on the others its networks are compared."
+        ),
+    ] = DEFAULT_TARGET,
     size: Annotated[str, typer.Option(help="Width x height of the swath in pixels.")] = PAPER_SIZE,
     cache: Annotated[Path | None, typer.Option(help="Folder of kept measurements; OUT/cache if none.")] = None,
     seed: Annotated[int, typer.Option(min=0, max=SEEDS, help="Seed of every random draw.")] = 0,
@@ -61,6 +67,7 @@ def tradeoff(
     from deploy.bench.tables import parse_size
     from deploy.cache import Cache
     from deploy.results import Document
+    from deploy.tradeoff.boards import parse_targets
     from deploy.tradeoff.page import FILES, write_study
     from deploy.tradeoff.points import parse_demands
     from deploy.tradeoff.run import run_study
@@ -73,7 +80,8 @@ def tradeoff(
     demands = [tuple(parse_demands(name, text)) for name, text in (("--budget", budget), ("--need", need))]
     names = tuple(networks.split(",")) if networks is not None else tuple(shipped_names())
     aim = reference or REFERENCE
-    read = (images, calibration, lpips, *map(Path, (sensor, aim, target, *names)))
+    boards = parse_targets(target)
+    read = (images, calibration, lpips, *map(Path, (sensor, aim, *boards, *names)))
     require_writable(figures, *(out / name for name in FILES), json, inputs=read, folders=(kept,))
     reference_beside(load_sensor(sensor), reference, say)
     request = Request(
@@ -87,7 +95,8 @@ def tradeoff(
         demands[0],
         demands[1],
         seed,
-        target,
+        boards[0],
+        boards,
     )
     result = run_study(request, Cache(kept), partial(say, err=True))
     write_study(result.study, out)

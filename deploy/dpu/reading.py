@@ -18,6 +18,7 @@ from deploy.dpu.integers import Integers
 from profiles.errors import ModelError
 from quant.encodings import as_on_board
 from quant.onnx_file import load_onnx
+from quant.tiling.spelled_out import with_shuffles
 from quant.untrusted import contradictions
 
 KINDS: dict[str, Kind] = {
@@ -65,7 +66,7 @@ def network_of(model: onnx.ModelProto, tile_px: int | None, where: str = "ONNX m
         remedy = "give a file written by 'beers-deploy export' or 'beers-deploy quantize'"
         raise ModelError(where, expected="a network", got="an ONNX file without nodes", remedy=remedy)
     with contradictions(where):
-        return _Reader(model, tile_px, where).network()
+        return _Reader(with_shuffles(model), tile_px, where).network()
 
 
 class _Reader:

@@ -170,7 +170,7 @@ class Provenance:
 
 @dataclass(frozen=True)
 class Cell:
-    """A figure as a table shows it; `value` is what it sorts by, empty where there is none."""
+    """A figure as a table shows it; `value` is what it sorts by, empty where there is none, `ends` its interval's."""
 
     text: str
     unit: str
@@ -178,6 +178,7 @@ class Cell:
     mode: str
     value: str
     note: Note
+    ends: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -225,4 +226,5 @@ def _sourced_cell(key: str, figure: Figure, provenance: Provenance) -> Cell:
         return Cell("\u2013", "", "", "unavailable", "", note)
     text, bracket, interval = str(figure).partition(" [")
     unit = "" if figure.unit in ("ratio", "distance") else figure.unit
-    return Cell(text, unit, bracket.strip() + interval, figure.mode, repr(figure.value), note)
+    ends = tuple(map(repr, figure.interval or ()))
+    return Cell(text, unit, bracket.strip() + interval, figure.mode, repr(figure.value), note, ends)

@@ -76,7 +76,7 @@ def ordered(fronts: Sequence[Front]) -> list[Front]:
 def render_study(study: Study) -> str:
     """The study as one HTML page, with its plots, tables and pictures."""
     provenance, points, fronts = Provenance(), Points.of(study.points), ordered(study.fronts)
-    script = Markup((TEMPLATES / "tradeoff/page.js").read_text(encoding="utf-8"))  # noqa: S704 - our own file
+    boards = Points(study.boards, points.marks)
     shown = {
         "study": study,
         "plots": [_shown(front, points) for front in fronts],
@@ -84,13 +84,21 @@ def render_study(study: Study) -> str:
         "qualities": list(dict.fromkeys(front.y for front in fronts)),
         "points": grid_of([_with_place(row, fronts) for row in study.points], provenance),
         "marks": [points.mark(row) for row in study.points],
+        "boards": grid_of(study.boards, provenance),
+        "board_marks": [boards.mark(row) for row in study.boards],
         "crops": crop_urls(study.crops),
         "layers": {name: (layer_bars(name, rows), grid_of(rows, provenance)) for name, rows in study.layers.items()},
         "placement": {name: _grids(rows, provenance) for name, rows in study.placement.items()},
         "provenance": provenance,
     }
     template = templates().get_template("tradeoff/page.html")
-    return template.render(shown, plot_style=plot_style(), script=script, version=__version__).lstrip()
+    return template.render(shown, plot_style=plot_style(), script=_script(), version=__version__).lstrip()
+
+
+def _script() -> Markup:
+    """All that the page runs, in one piece."""
+    files = (TEMPLATES / "tradeoff" / name for name in ("page.js", "boards.js"))
+    return Markup("\n".join(file.read_text(encoding="utf-8") for file in files))  # noqa: S704 - our own files
 
 
 @dataclass(frozen=True)

@@ -7,11 +7,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import onnx
 
 from deploy.bench.host import Sensors, drawn_acquisition
 from deploy.bench.tables import PAPER_TARGET, Swath, layer_rows
 from deploy.cache import Cache
-from deploy.dpu.board import dpu_of
+from deploy.dpu.board import Dpu, dpu_of
 from deploy.dpu.checker.placement import place
 from deploy.dpu.checker.table import network_rows
 from deploy.dpu.reading import network_of
@@ -21,6 +22,7 @@ from deploy.restoration.plan import make_plan
 from deploy.tradeoff.accuracy import BenchmarkSet
 from deploy.tradeoff.advice import Choice, choose, findings, fronts, headline, notes, paper_outcomes, papers_point
 from deploy.tradeoff.board import DpuRun
+from deploy.tradeoff.boards import board_rows, every_configuration
 from deploy.tradeoff.host_time import TILE_PX
 from deploy.tradeoff.measurements import Measurements, run_jobs
 from deploy.tradeoff.methods import CalibrationScenes, MethodStore, find_networks, is_papers
@@ -104,12 +106,13 @@ class StudyRun:
 
     @property
     def rows(self) -> tuple[Row, ...]:
-        """Points, layers and placement, for a document."""
+        """Points, boards, layers and placement, for a document."""
         named = [
             (kind, name, row) for kind, tables in self._by_network() for name, rows in tables.items() for row in rows
         ]
         return (
             *self.study.points,
+            *self.study.boards,
             *(Row(f"{kind} of {name}: {r.table}", r.name, r.figures, r.text) for kind, name, r in named),
         )
 
@@ -124,6 +127,7 @@ def run_study(request: Request, cache: Cache, say: Say = silent) -> StudyRun:
         BeersError: a network, an image, a profile or weights that cannot be used.
     """
     swath, target = Swath(*request.size_px), load_target(request.target)
+    dpus = every_configuration(request.boards or (request.target,))
     store = make_store(request, cache, say)
     benchmark, small = make_benchmark(request)
     measurements = Measurements(store, benchmark, host_tile(store, request.seed), cache)
@@ -138,13 +142,12 @@ def run_study(request: Request, cache: Cache, say: Say = silent) -> StudyRun:
     ]
     results = Results({each.name: each for each in outcomes}, benchmark.sites, request.seed)
     sampled = oversampling_note(benchmark.pairs, request.profiles[0])
-    return _put_together(
-        request, measurements, results, notes(benchmark, sampled, small, lacks, calibrated_on(request), target.name)
-    )
+    remarks = notes(benchmark, sampled, small, lacks, calibrated_on(request), target.name)
+    return _put_together(request, measurements, results, remarks, dpus)
 
 
 def _put_together(
-    request: Request, measurements: Measurements, results: Results, remarks: tuple[str, ...]
+    request: Request, measurements: Measurements, results: Results, remarks: tuple[str, ...], dpus: Sequence[Dpu]
 ) -> StudyRun:
     outcomes, found = list(results.outcomes.values()), fronts(results)
     paper = papers_point(
@@ -163,6 +166,7 @@ def _put_together(
         {name: tuple(layers_of(run)) for name, run in sorted(runs.items())},
         {name: tuple(placement_of(measurements, run)) for name, run in sorted(runs.items())},
         remarks,
+        board_rows(outcomes, dpus, lambda variant: legal_model(measurements, variant)),
     )
     return StudyRun(study, not asked or choice.outcome is not None)
 
@@ -214,7 +218,13 @@ def layers_of(outcome: Outcome) -> list[Row]:
 def placement_of(measurements: Measurements, outcome: Outcome) -> list[Row]:
     """Where each operation of a network's run on the board is placed."""
     assert isinstance(outcome.board, DpuRun)  # noqa: S101 - chosen so
-    file = measurements.store.int8_file(outcome.point.variant)
-    assert file is not None  # noqa: S101 - it ran on the board
     tile_px, dpu = outcome.point.tile_px, outcome.board.dpu
-    return network_rows(place(network_of(load_onnx(file), tile_px), dpu), dpu, tile_px)
+    network = network_of(legal_model(measurements, outcome.point.variant), tile_px)
+    return network_rows(place(network, dpu), dpu, tile_px)
+
+
+def legal_model(measurements: Measurements, variant: Variant) -> onnx.ModelProto:
+    """The INT8 network that ran on the board."""
+    file = measurements.store.int8_file(variant)
+    assert file is not None  # noqa: S101 - it ran on the board
+    return load_onnx(file)

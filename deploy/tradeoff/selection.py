@@ -103,6 +103,7 @@ class Request:
         need: limits that are to be kept at the least cost.
         seed: of every random draw.
         target: the board.
+        boards: all that the networks are to be compared on; empty for the board alone.
     """
 
     networks: tuple[str, ...]
@@ -116,6 +117,7 @@ class Request:
     need: tuple[Demand, ...] = ()
     seed: int = 0
     target: str = DEFAULT_TARGET
+    boards: tuple[str, ...] = ()
 
     @property
     def profiles(self) -> tuple[SensorProfile, SensorProfile]:

@@ -59,6 +59,7 @@ class Study:
         layers: time of each layer on the board, by network.
         placement: what runs where, by network.
         notes: limits, and how to read it.
+        boards: the networks on every configuration of the boards asked for, a row of the table "boards" each.
     """
 
     headline: str
@@ -69,3 +70,4 @@ class Study:
     layers: Mapping[str, tuple[Row, ...]]
     placement: Mapping[str, tuple[Row, ...]]
     notes: tuple[str, ...]
+    boards: tuple[Row, ...] = ()

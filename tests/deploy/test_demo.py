@@ -12,6 +12,7 @@ from deploy.cli import app
 from deploy.demo import load_sensors, read_input
 from deploy.results import SCHEMA_PATH
 from profiles.errors import OptionError
+from profiles.target import board_names
 from profiles.toml import HERE
 from quant.onnx_file import metadata
 
@@ -35,7 +36,13 @@ def test_the_demo_takes_a_raw_image_through_the_whole_chain(tmp_path: Path) -> N
     assert metadata(onnx.load(out / "int8.onnx"))["calibration_sensor"] == "mine"
     modes = {figure["mode"] for row in document["rows"] for figure in row["figures"].values()}
     assert {"measured", "predicted", "published"} <= modes
-    assert "fits the DPU whole" in (out / "report.html").read_text()
+    page = (out / "report.html").read_text()
+    assert "fits the DPU whole" in page
+    boards = {row["name"].split()[0]: row["figures"] for row in document["rows"] if row["table"] == "boards"}
+    assert list(boards) == board_names()
+    assert boards["zcu104"]["power"]["mode"] == "unavailable"
+    assert "no power of zcu104 under its DPU is published" in page
+    assert "the smallest DPU that takes 60 s or less" in page
 
 
 def test_the_reference_has_the_gain_of_the_sensor_named(tmp_path: Path) -> None:

@@ -14,6 +14,7 @@ from functools import cache
 from deploy.dpu.board import SIZED, Dpu
 from deploy.dpu.checker import conv_rules, number_rules, other_rules
 from deploy.dpu.checker.finding import Finding, Rule
+from deploy.dpu.checker.forms import forms
 from deploy.dpu.graph import Kind, Operation
 from profiles.constant import check_keys
 
@@ -91,7 +92,15 @@ class Broken:
 
 
 def judge(op: Operation, dpu: Dpu, quantised: bool) -> tuple[Broken, ...]:
-    """Every rule that a node breaks; the rules of numbers only where the file holds quantised ones."""
+    """Every rule that a node breaks, none where one of its `forms` breaks none.
+
+    The rules of numbers are asked only where the file holds quantised ones.
+    """
+    found = [_broken(form, dpu, quantised) for form in forms(op, dpu)]
+    return found[0] if all(found) else ()
+
+
+def _broken(op: Operation, dpu: Dpu, quantised: bool) -> tuple[Broken, ...]:
     rules = RULES[op.kind] + SIZES
     if quantised and op.kind not in ("other", "argmax"):  # whose results are no numbers of 8 bits
         rules += NUMBERS + SHIFTS.get(op.kind, ())

@@ -5,9 +5,12 @@ A network on this board has three parts:
 1. host-front: scaling and splitting the image, before the first convolution.
 2. dpu-core: everything from the first convolution to the last, and int8 nodes right behind it.
 3. host-back: making numbers of integers, adding the correction to the 12-bit image, clipping.
+
+What of the core the DPU cannot take goes to the CPU, as the vendor's compiler places it. At the ends of a float file
+that costs time and no more; between two parts of the DPU it would cut the core.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -21,8 +24,12 @@ Device = Literal["host", "DPU", "CPU"]
 SCALING = {"Mul", "Div", "Add", "Sub", "Clip", "Cast", "Round", "Floor", "Identity", "Min", "Max"}
 """What a float file may do to the image before the network and to the result behind it."""
 
-SHAPING = {"ArgMax", "DepthToSpace", "Flatten", "Reshape", "Softmax", "Squeeze", "Unsqueeze"}
-"""What a float file may do to the result behind the network: it moves numbers, or compares them."""
+SHAPING = {
+    "ArgMax", "DepthToSpace", "Flatten", "Gather", "NonMaxSuppression", "Reshape", "Sigmoid", "Slice", "Softmax",
+    "Split", "Squeeze", "TopK", "Transpose", "Unsqueeze",
+}  # fmt: skip
+"""What a float file may do to the result behind the network: it moves numbers, compares them or makes scores of
+them."""
 
 FLOAT_NOTE = "a float file: judged as if its tensors had 8 bits, its final add left to the host"
 
@@ -66,9 +73,19 @@ class Placement:
         return tuple(node for node in self.nodes if node.broken)
 
     @property
+    def cutting(self) -> tuple[PlacedNode, ...]:
+        """Those of them that part the core in two; of a quantised file all, whose numbers can be made again."""
+        if not self.note:
+            return self.failed
+        operations = tuple(node.op for node in self.nodes)
+        starts = {node.op.output for node in self.nodes if node.device == "DPU"}
+        behind, before = (_reached(operations, starts, forwards=forwards) for forwards in (True, False))
+        return tuple(node for node in self.failed if node.op.output in behind & before)
+
+    @property
     def core(self) -> tuple[Operation, ...]:
-        """The operations of the DPU's part."""
-        return tuple(node.op for node in self.nodes if node.part == "dpu-core")
+        """The operations that the DPU runs."""
+        return tuple(node.op for node in self.nodes if node.device == "DPU")
 
 
 def place(network: Network, dpu: Dpu) -> Placement:
@@ -83,6 +100,8 @@ def place(network: Network, dpu: Dpu) -> Placement:
         judge(op, dpu, network.quantised) if part == "dpu-core" else ()
         for op, part in zip(network.operations, parts, strict=True)
     ]
+    if not network.quantised:
+        parts = _left_to_the_host(network, parts, broken)
     devices: list[Device] = [
         "host" if part != "dpu-core" else "CPU" if found else "DPU" for part, found in zip(parts, broken, strict=True)
     ]
@@ -95,8 +114,7 @@ def place(network: Network, dpu: Dpu) -> Placement:
 def _parts(network: Network) -> list[Part]:
     """A node before the first or behind the last convolution is the host's if it is one of the host's kinds."""
     operations = network.operations
-    behind = _reached(operations, network, forwards=True)
-    before = _reached(operations, network, forwards=False)
+    behind, before = (_reached(operations, _convolved(network), forwards=forwards) for forwards in (True, False))
     parts: list[Part] = []
     finished: set[str] = set()
     for op in operations:
@@ -111,13 +129,32 @@ def _parts(network: Network) -> list[Part]:
     return parts
 
 
-def _reached(operations: tuple[Operation, ...], network: Network, *, forwards: bool) -> set[str]:
-    """The results computed from a convolution's, its own included (forwards), or that one is computed from."""
+def _left_to_the_host(network: Network, parts: list[Part], broken: list[tuple[Broken, ...]]) -> list[Part]:
+    """Behind the last convolution, what reads a result of the CPU stays with it: it is not handed over again."""
+    before = _reached(network.operations, _convolved(network), forwards=False)
+    given: set[str] = set()
+    found: list[Part] = []
+    for op, part, rules in zip(network.operations, parts, broken, strict=True):
+        trails = op.output not in before
+        follows = trails and not rules and part == "dpu-core" and bool(given & set(op.inputs))
+        found.append("host-back" if follows else part)
+        if trails and (rules or follows):
+            given |= set(op.outputs)
+    return found
+
+
+def _convolved(network: Network) -> set[str]:
+    """The results of convolutions."""
+    return {name for op in network.operations if op.kind in CONVOLUTIONS for name in op.outputs}
+
+
+def _reached(operations: Sequence[Operation], starts: set[str], *, forwards: bool) -> set[str]:
+    """The results computed from one of `starts`, these included (forwards), or that one is computed from."""
     found: set[str] = set()
     for op in operations if forwards else reversed(operations):
-        ends = op.inputs if forwards else [r.output for name in op.outputs for r in network.consumers(name)]
-        if op.kind in CONVOLUTIONS or found & set(ends):
-            found |= set(op.outputs)
+        reads = op.inputs if forwards else op.outputs
+        if not found.isdisjoint(reads) or not starts.isdisjoint(op.outputs):
+            found |= set(op.outputs) | (set() if forwards else set(op.inputs))
     return found
 
 

@@ -40,18 +40,28 @@ def crossing_bytes(placement: Placement) -> tuple[int, int]:
     return onto, back
 
 
+BANDS = 4
+"""Most that an image has: red, green, blue and transparency or infrared."""
+
+
 def task_of(placement: Placement) -> Task:
-    """What the host does behind the DPU; results no smaller than the image become an image."""
+    """What a file tells of the host; one result of few bands, no smaller than the image, becomes an image."""
     behind = [node.op.op_type for node in placement.nodes if node.part == "host-back"]
     found = next((OPERATORS[name] for name in behind if name in OPERATORS), None)
     onto, back = crossing_bytes(placement)
-    return found or ("image" if back >= onto else "copy")
+    return found or ("image" if back >= onto and _gives_an_image(placement) else "copy")
 
 
-def placed_work(placement: Placement) -> Array:
-    """Units of the host's work for a network of a file, (7,)."""
+def _gives_an_image(placement: Placement) -> bool:
+    read = {name for node in placement.nodes for name in node.op.inputs}
+    shapes = [node.op.out_shape for node in placement.nodes if read.isdisjoint(node.op.outputs)]
+    return len(shapes) == 1 and shapes[0] is not None and shapes[0][0] <= BANDS
+
+
+def placed_work(placement: Placement, task: Task) -> Array:
+    """Units of the host's work for a network of a file, (7,): the task takes every value of the results."""
     onto, back = crossing_bytes(placement)
-    return host_work(onto, back, back, task_of(placement))
+    return host_work(onto, back, back, task)
 
 
 def frame_rate(dpu_s: float, host_s: float, crowding: float) -> float:

@@ -19,6 +19,7 @@ from deploy.dpu.checker.placement import Placement
 from deploy.dpu.cost.constants import Constants, Regime, Structure, regime_of
 from deploy.dpu.cost.host import Task, frame_rate, placed_work, task_of
 from deploy.dpu.cost.layers import Layers
+from deploy.dpu.cost.processor import between, processor_s
 from deploy.dpu.cost.work import Work, count_work, largest_map_bytes
 from deploy.dpu.graph import Operation
 from deploy.restoration.plan import plan_side
@@ -54,6 +55,9 @@ class Prediction:
     Attributes:
         configuration: of the DPU.
         batch: images in flight: batch handlers of all cores.
+        handlers: images of one core's batch.
+        alone_s: such a batch on the DPU while its other cores rest.
+        host_cores: of the board's processor.
         layers: what each costs, for a batch.
         overhead_s: start of a batch.
         host_s: time of an image on the host's cores together.
@@ -62,10 +66,15 @@ class Prediction:
         width: half that of the interval, in ln(FPS).
         structure: variants of the formula.
         outside: what lies beyond the fitted networks; empty where nothing does.
+        refused: names of nodes that the DPU refuses and the host runs.
+        refused_s: what they take of `host_s`, least and most.
     """
 
     configuration: str
     batch: int
+    handlers: int
+    alone_s: float
+    host_cores: int
     layers: tuple[LayerCost, ...]
     overhead_s: float
     host_s: float
@@ -75,6 +84,8 @@ class Prediction:
     structure: Structure
     outside: tuple[str, ...] = ()
     note: str = ""
+    refused: tuple[str, ...] = ()
+    refused_s: tuple[float, float] = (0.0, 0.0)
 
     @cached_property
     def batch_time_s(self) -> float:
@@ -88,9 +99,43 @@ class Prediction:
 
     @property
     def fps_interval(self) -> tuple[float, float]:
-        """Least and most images a second."""
-        spread = math.exp(self.width)
-        return self.fps / spread, self.fps * spread
+        """Least and most images a second: the host at its slowest and at its fastest, and the width."""
+        fast, slow = (self.rate(self.batch_time_s, host_s) for host_s in self._host_ends_s)
+        return slow / self.spread, fast * self.spread
+
+    @property
+    def host_interval_s(self) -> tuple[float, float]:
+        """Least and most of `host_s`."""
+        low_s, high_s = self._host_ends_s
+        return low_s / self.spread, high_s * self.spread
+
+    @property
+    def latency_s(self) -> float:
+        """From the first image of a batch to the last result, with one thread: one core, then one core of the host.
+
+        Its error is about that of the rate (docs/boards.md), and it shares the rate's width.
+        """
+        return self._latency_s(self.host_s)
+
+    @property
+    def latency_interval_s(self) -> tuple[float, float]:
+        """Least and most of `latency_s`."""
+        low_s, high_s = map(self._latency_s, self._host_ends_s)
+        return low_s / self.spread, high_s * self.spread
+
+    def _latency_s(self, host_s: float) -> float:
+        return self.alone_s + self.handlers * host_s * self.host_cores
+
+    @property
+    def spread(self) -> float:
+        """By how many times a part may be off either way."""
+        return math.exp(self.width)
+
+    @property
+    def _host_ends_s(self) -> tuple[float, float]:
+        """With the refused nodes at their least and at their most."""
+        rest_s = self.host_s - between(self.refused_s)
+        return rest_s + self.refused_s[0], rest_s + self.refused_s[1]
 
     def rate(self, batch_time_s: float, host_s: float) -> float:
         """Images a second if a batch took that long on the DPU, and an image that long on the host."""
@@ -107,15 +152,20 @@ class Prediction:
         return sum(layer.work.load_map_bytes + layer.work.store_map_bytes for layer in self.layers)
 
 
-def predict(placement: Placement, dpu: Dpu) -> Prediction:
-    """Predict a network that runs whole on the DPU.
+def predict(placement: Placement, dpu: Dpu, task: Task | None = None) -> Prediction:
+    """Predict a network whose convolutions the DPU runs; what it refuses at the ends of a float file the host does.
+
+    Args:
+        placement: where its nodes run.
+        dpu: a board's.
+        task: what the host does with the results; None for what the file tells.
 
     Raises:
-        ModelError: a node that the DPU cannot run, or nothing for it to do.
+        ModelError: a node that the DPU cannot run between others that it does, or nothing for it to do.
         ProfileError: a target without cost constants.
     """
-    if placement.failed:
-        names = ", ".join(node.op.name for node in placement.failed[:3])
+    if placement.cutting:
+        names = ", ".join(node.op.name for node in placement.cutting[:3])
         remedy = "run 'beers-deploy check' for the reasons and remedies"
         raise ModelError("cost model", expected="a core that runs whole on the DPU", got=names, remedy=remedy)
     constants, structure = Constants.of(dpu), Structure.of(dpu)
@@ -123,23 +173,40 @@ def predict(placement: Placement, dpu: Dpu) -> Prediction:
     if not any(work.operations for work in works):
         remedy = "give a network with convolutions"
         raise ModelError("cost model", expected="work for the DPU", got="no convolution", remedy=remedy)
-    layers = _layer_costs(works, dpu, constants, structure)
-    host_s = float(placed_work(placement) @ constants.host_s_per_unit) / dpu.whole("cpu", "cores")
+    columns = Layers.of(works, dpu)
+    layers = _layer_costs(works, columns, constants, structure)
+    refused = [node.op for node in placement.failed]
+    cores, refused_s = dpu.whole("cpu", "cores"), processor_s(refused, dpu)
+    task = task or task_of(placement)
+    host_s = float(placed_work(placement, task) @ constants.host_s_per_unit) / cores + between(refused_s)
     dpu_s = math.fsum([*(layer.time_s for layer in layers), constants.batch_s]) / dpu.batch
     map_bytes = largest_map_bytes(placement.core)
     regime = regime_of(host_s > dpu_s, map_bytes)
     outside = _outside(placement.core, map_bytes, dpu)
     width = dpu.value("cost", WIDTHS["outside" if outside else regime])
-    task, note = task_of(placement), placement.note
     return Prediction(
-        dpu.name, dpu.batch, layers, constants.batch_s, host_s, task, regime, width, structure, outside, note
+        configuration=dpu.name,
+        batch=dpu.batch,
+        handlers=dpu.batch // dpu.cores,
+        alone_s=float(columns.time_s(constants, structure, alone=True).sum()) + constants.batch_s,
+        host_cores=cores,
+        layers=layers,
+        overhead_s=constants.batch_s,
+        host_s=host_s,
+        task=task,
+        regime=regime,
+        width=width,
+        structure=structure,
+        outside=outside,
+        note=placement.note,
+        refused=tuple(op.name for op in refused),
+        refused_s=refused_s,
     )
 
 
 def _layer_costs(
-    works: Sequence[Work], dpu: Dpu, constants: Constants, structure: Structure
+    works: Sequence[Work], layers: Layers, constants: Constants, structure: Structure
 ) -> tuple[LayerCost, ...]:
-    layers = Layers.of(works, dpu)
     columns = (
         layers.compute_s(constants),
         layers.memory_s(constants, structure),
@@ -157,6 +224,10 @@ WIDTHS = {
 """Where [cost] keeps half the width of an interval, in ln(FPS)."""
 
 
+ROUNDED = 1e-3
+"""How far [cost] rounds the ends of the fitted range: the largest fitted network is not beyond it."""
+
+
 def _outside(core: Sequence[Operation], map_bytes: float, dpu: Dpu) -> tuple[str, ...]:
     """What of a network lies beyond the fitted ones, each with the end of the range that it passes."""
     values = {
@@ -166,7 +237,7 @@ def _outside(core: Sequence[Operation], map_bytes: float, dpu: Dpu) -> tuple[str
     found = []
     for key, (name, value, scale, unit) in values.items():
         most = scale * dpu.limit("cost", f"fitted_{key}").high
-        if value > most:
+        if value > most * (1 + ROUNDED):
             found.append(f"{name} {value:.3g}{unit} (fitted up to {most:.3g})")
     return tuple(found)
 

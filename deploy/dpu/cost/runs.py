@@ -9,7 +9,7 @@ from deploy.dpu.board import Dpu
 from deploy.dpu.checker.placement import place
 from deploy.dpu.cost.constants import NAMES, UNITS, Constants, Structure
 from deploy.dpu.cost.fit import FIRM_PRIOR, Case, Cases, fit
-from deploy.dpu.cost.host import placed_work
+from deploy.dpu.cost.host import placed_work, task_of
 from deploy.dpu.cost.layers import Layers
 from deploy.dpu.cost.published import network_case
 from deploy.dpu.cost.work import count_work, largest_map_bytes
@@ -132,4 +132,6 @@ def _model_case(model: Path, dpu: Dpu, tile_px: int, fps: float) -> Case:
         dpu.whole("cpu", "cores"),
         largest_map_bytes(placement.core),
     )
-    return Case(name, model.stem, dpu.name, layers, placed_work(placement), cores, (fps,), (), largest)
+    return Case(
+        name, model.stem, dpu.name, layers, placed_work(placement, task_of(placement)), cores, (fps,), (), largest
+    )

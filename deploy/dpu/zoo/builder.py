@@ -135,8 +135,8 @@ class Builder:
         return self._resize(x, to, "nearest")
 
     def bilinear(self, x: Tensor, to: int | Tensor = 2) -> Tensor:
-        """Larger by a whole factor, or as large as another result: bilinear."""
-        return self._resize(x, to, "linear")
+        """Larger by a whole factor, or as large as another result: bilinear, its corners in place."""
+        return self._resize(x, to, "linear", coordinate_transformation_mode="asymmetric")
 
     def shuffle(self, x: Tensor, block: int = 2) -> Tensor:
         """Channels become blocks of pixels (pixel shuffle)."""
@@ -178,10 +178,10 @@ class Builder:
             seen = (x.channels, x.shape[1] + behind[0], x.shape[2] + behind[1])
         return self._append(op_type, "pool", (x,), (x.channels, *_slide(seen, window, valid or ceil)), window)
 
-    def _resize(self, x: Tensor, to: int | Tensor, mode: str) -> Tensor:
+    def _resize(self, x: Tensor, to: int | Tensor, mode: str, **given: object) -> Tensor:
         height, width = to.shape[1:] if isinstance(to, Tensor) else (x.shape[1] * to, x.shape[2] * to)
         shape = (x.channels, height, width)
-        return self._append("Resize", "resize", (x,), shape, attributes={"mode": mode})
+        return self._append("Resize", "resize", (x,), shape, attributes={"mode": mode, **given})
 
     def _expect_same(self, one: tuple[int, ...], other: tuple[int, ...]) -> None:
         if one != other:

@@ -9,8 +9,10 @@ import pytest
 import torch
 
 from deploy.bench.board import BoardRequest, bench_board
-from deploy.bench.tables import Swath, frame_rows, sweep_rows, within_words
+from deploy.bench.tables import Swath, frame_row, predict_file, sweep_rows, within_words
+from deploy.commands.bench import HostTask
 from deploy.dpu.board import load_dpu
+from deploy.dpu.cost.host import TASKS
 from examples.networks import build, to_onnx
 from profiles.errors import ModelError, OptionError
 from profiles.figures import Row
@@ -93,8 +95,8 @@ def test_a_frame_need_not_be_square(tmp_path: Path, classifier: Path) -> None:
     for side, size in zip(model.graph.input[0].type.tensor_type.shape.dim[2:], (32, 96), strict=True):
         side.dim_value = size
     onnx.save(model, tmp_path / "wide.onnx")
-    boards = [load_dpu("vck190", None)]
-    (square,), (wide,) = (frame_rows(path, boards, None) for path in (classifier, tmp_path / "wide.onnx"))
+    dpu = load_dpu("vck190", None)
+    square, wide = (frame_row(predict_file(path, dpu, None), dpu) for path in (classifier, tmp_path / "wide.onnx"))
     assert (wide.figures["work"].value or 0) > 2.5 * (square.figures["work"].value or 0)
 
 
@@ -108,3 +110,21 @@ def test_one_configuration_or_runs_beside_all_boards_are_refused(network: Path, 
         bench_board(network, asked("all", config="C32B3"), 0.0)
     with pytest.raises(OptionError, match="--measured"):
         bench_board(network, asked("all", measured=tmp_path / "runs.json"), 0.0)
+
+
+def test_a_stated_task_of_the_host_is_that_of_every_row(classifier: Path, network: Path) -> None:
+    found = bench_board(classifier, asked("all", size=None, host_task="softmax"), 0.0)
+    frames = [row for row in found.rows if row.table == "frames"]
+    assert {row.text["host's task"] for row in frames} == {"softmax"}
+    plain, ranked = (
+        [row for row in bench_board(network, asked(host_task=task), 0.0).rows if "one-thread latency" in row.figures]
+        for task in (None, "sort")
+    )
+    for before, after in zip(plain, ranked, strict=True):
+        assert (
+            (after.figures["one-thread latency"].value or 0) > (before.figures["one-thread latency"].value or 0) > 0
+        )
+
+
+def test_the_commands_names_of_tasks_are_the_models() -> None:
+    assert [task.value for task in HostTask] == list(TASKS)

@@ -1,16 +1,21 @@
 import math
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from deploy.bench.tables import PAPER_TILE_PX, predict_file
 from deploy.dpu.board import load_dpu
 from deploy.dpu.checker.placement import place
-from deploy.dpu.cost.latency import Prediction, predict
+from deploy.dpu.cost.constants import Constants, Structure
+from deploy.dpu.cost.fit import Cases
+from deploy.dpu.cost.latency import WIDTHS, Prediction, predict
+from deploy.dpu.cost.published import network_case, published_cases
+from deploy.dpu.cost.validation import regimes_of
 from deploy.dpu.cost.work import count_work
 from deploy.dpu.graph import Network
 from deploy.dpu.zoo.builder import Builder
-from deploy.dpu.zoo.networks import convbeers
+from deploy.dpu.zoo.networks import NETWORKS, convbeers, network
 from profiles.errors import ModelError
 from tests.deploy.dpu.graphs import Sketch, board_convbeers, float_convbeers, integer_convbeers
 
@@ -215,3 +220,57 @@ def test_a_network_without_convolutions_has_no_prediction(tmp_path: Path) -> Non
     path = sketch.save(tmp_path / "p.onnx", sketch.node("MaxPool", "image", kernel_shape=[2, 2]))
     with pytest.raises(ModelError, match="no convolution"):
         predict_file(path, DPU)
+
+
+@pytest.mark.parametrize("board", ["vck190", "vek280"])
+def test_the_largest_of_the_fitted_networks_is_not_outside(board: str) -> None:
+    """[cost] keeps four digits of the ends; RCAN has the largest map that the DPU bounds."""
+    dpu = load_dpu(board)
+    largest = place(network("rcan"), dpu)
+    assert predict(largest, dpu).outside == ()
+    assert predict(place(convbeers(1280), dpu), dpu).outside
+
+
+@pytest.mark.parametrize("board", ["vck190", "zcu102", "zcu104", "kv260", "vek280"])
+def test_published_rates_of_one_thread_lie_inside_the_intervals(board: str) -> None:
+    """With the widths of rates with several threads, and the host's task as it is timed."""
+    dpu = load_dpu(board)
+    cases, constants = published_cases(board, Structure.of(dpu)), Constants.of(dpu)
+    errors = cases.residuals(cases.times(constants))[len(cases.rows) :]
+    widths = np.array([dpu.value("cost", WIDTHS[kind]) for kind in regimes_of(cases, constants)])
+    known = ~np.isnan(cases.observed_single)
+    assert known.sum() > 30
+    assert (np.abs(errors) <= widths)[known].mean() >= 0.9
+
+
+@pytest.mark.parametrize(("board", "name"), [("vck190", "resnet-50"), ("zcu102", "rcan"), ("vek280", "erfnet")])
+def test_latency_is_what_is_fitted_to_rates_of_one_thread(board: str, name: str) -> None:
+    """A core's batch in its latency: the fit's own sum, of a network whose results the host reads whole."""
+    dpu = load_dpu(board)
+    case = Cases((network_case(name, dpu, (1.0,)),), Structure.of(dpu))
+    times = case.times(Constants.of(dpu))
+    found = predict(place(network(name), dpu), dpu, NETWORKS[name].host)
+    assert found.handlers / found.latency_s == pytest.approx(1 / float(times.alone_s[0] + times.host_s[0]))
+    assert found.fps == pytest.approx(math.exp(float(case.predicted(times)[0])))
+
+
+def test_a_task_that_is_stated_takes_the_place_of_what_the_file_tells() -> None:
+    """Heads that are read and no more, or ranked: SSD's file is the same."""
+    dpu = load_dpu("vck190")
+    placement = place(network("ssd-resnet-34"), dpu)
+    read, ranked = predict(placement, dpu), predict(placement, dpu, "sort")
+    assert (read.task, ranked.task) == ("copy", "sort")
+    assert ranked.host_s > read.host_s
+    assert ranked.batch_time_s == read.batch_time_s
+
+
+def test_latency_is_that_of_one_core_and_one_thread(tmp_path: Path) -> None:
+    """Cores share the memory and the host: alone a core and a thread are no slower than among others."""
+    path = float_convbeers(tmp_path / "n.onnx", 2, 16)
+    three, one = load_dpu("zcu102"), load_dpu("kv260")
+    found, single = predict_file(path, three), predict_file(path, one)
+    assert (found.handlers, single.handlers) == (1, 1)
+    assert found.alone_s <= found.batch_time_s
+    assert single.alone_s == pytest.approx(single.batch_time_s)
+    assert found.latency_s == pytest.approx(found.alone_s + found.host_s * three.whole("cpu", "cores"))
+    assert found.handlers / found.latency_s < found.fps

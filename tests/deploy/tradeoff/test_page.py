@@ -137,6 +137,7 @@ def test_names_are_escaped(tmp_path: Path, found: Study) -> None:
         layers={NASTY: found.layers["convbeers-s, C32B3, tile 640"]},
         placement={NASTY: found.placement["convbeers"]},
         notes=(NASTY,),
+        boards=(replace(odd, text={"method": NASTY, "board": NASTY, "configuration": NASTY}),),
     )
     write_study(nasty, tmp_path)
     page = (tmp_path / "tradeoff.html").read_text()

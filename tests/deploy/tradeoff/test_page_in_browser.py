@@ -1,16 +1,23 @@
 """The page's table, buttons and slider, driven in a real browser; skipped where there is none."""
 
+from dataclasses import replace
 from itertools import combinations
 from pathlib import Path
 
+import onnx
 import pytest
 from PIL import Image
 
 from deploy.report.plots import DARK, LIGHT
+from deploy.tradeoff.boards import board_rows, configurations, every_configuration
 from deploy.tradeoff.page import render_study
 from deploy.tradeoff.plot import NARROW, WIDE
+from deploy.tradeoff.study import Study
+from profiles import load_target
 from profiles.figures import Row
+from tests.deploy.dpu.graphs import integer_convbeers
 from tests.deploy.tradeoff.browser import Report, browser, drive, framed
+from tests.deploy.tradeoff.made_results import Made, outcome
 from tests.deploy.tradeoff.studies import study
 from tests.deploy.tradeoff.test_page import apart, within
 
@@ -93,6 +100,37 @@ const drive = (report) => {
 };
 """
 
+CHOOSE = """
+const drive = (report) => {
+  const section = document.querySelector("#boards");
+  const [board, configuration, figure] = section.querySelectorAll("select");
+  const options = (select) => [...select.options].map((each) => each.value);
+  const choose = (select, value) => { select.value = value; select.dispatchEvent(new Event("change")); };
+  const see = () => ({
+    rows: [...section.querySelectorAll("tbody tr")].filter((row) => row.getClientRects().length)
+      .map((row) => row.cells[0].dataset.value),
+    marks: [...section.querySelectorAll(".drawn .chip")]
+      .map((mark) => ["x", "y"].map((side) => Number(mark.getAttribute(side)))),
+    titles: [...section.querySelectorAll(".drawn title")].map((each) => each.textContent),
+    heights: [...section.querySelectorAll(".drawn .height")].map((each) => each.textContent),
+    drawn: section.querySelector(".drawn").getClientRects().length > 0,
+    status: section.querySelector("[role=status]").textContent,
+    configuration: configuration.value,
+  });
+  report.boards = options(board);
+  report.first = see();
+  choose(board, "zcu104");
+  report.configurations = options(configuration);
+  report.other = see();
+  choose(configuration, "all");
+  report.all = see();
+  choose(figure, "board efficiency");
+  report.unavailable = see();
+  choose(board, "vck190");
+  report.back = see();
+};
+"""
+
 TEMPT = """
 const drive = (report) => {
   report.widths = [...document.querySelectorAll(".bait")].map((each) => each.naturalWidth);
@@ -158,6 +196,46 @@ def test_buttons_choose_the_plot(page: str, tmp_path: Path) -> None:
     assert report["cost"] == ["PSNR host p50"]
     assert report["both"] == ["SSIM host p50"]
     assert report["pressed"] == ["SSIM", "host p50"]
+
+
+@pytest.fixture(scope="module")
+def on_boards(tmp_path_factory: pytest.TempPathFactory) -> Study:
+    """A study of two networks on two boards."""
+    made = {"convbeers-s": Made(40.0, 2, 8), "convbeers": Made(40.03, 2, 16)}
+    path = integer_convbeers(tmp_path_factory.mktemp("net") / "net.onnx", 2, 8)
+    rows = board_rows(
+        [outcome(name, each) for name, each in made.items()],
+        every_configuration(["vck190", "zcu104"]),
+        lambda _: onnx.load(path),
+    )
+    return replace(study(), boards=rows)
+
+
+def test_a_choice_of_board_and_configuration_redraws_the_networks(on_boards: Study, tmp_path: Path) -> None:
+    browser()
+    report = drive(render_study(on_boards), CHOOSE, tmp_path)
+    first, other, every = report["first"], report["other"], report["all"]
+    assert report["boards"] == ["vck190", "zcu104"]
+    assert first["rows"] == ["convbeers-s, tile 640, vck190 C32B3", "convbeers, tile 640, vck190 C32B3"]
+    assert report["configurations"] == ["all", *(dpu.name for dpu in configurations(load_target("zcu104")))]
+    assert (other["configuration"], len(other["rows"])) == ("B4096", 2)
+    assert all("zcu104 B4096" in title for title in other["titles"])
+    assert len(every["rows"]) == len(every["marks"]) == 2 * len(load_target("zcu104").configurations)
+    places = {row.name: row.figures["board latency"].value or 0.0 for row in on_boards.boards}
+    across = [x for x, _ in every["marks"]]
+    assert sorted(across) == [x for _, x in sorted(zip([places[n] for n in every["rows"]], across, strict=True))]
+    up = [y for _, y in first["marks"]]
+    assert up[0] > up[1]  # the better picture stands higher
+    assert len(set(first["heights"])) == len(first["heights"]) > 1  # however near the pictures are
+    assert first["status"] == ""
+    assert "no power of zcu104 under its DPU is published" in report["unavailable"]["status"]
+    assert not report["unavailable"]["drawn"]
+    assert report["back"]["drawn"]
+    assert report["back"]["configuration"] == "C32B3"
+
+
+def test_the_choice_is_not_there_without_boards(page: str) -> None:
+    assert 'id="boards"' not in page
 
 
 def rgb(colour: str) -> str:

@@ -295,6 +295,26 @@ def test_the_command_writes_a_report_and_a_document_that_compare_reads(
     assert list((tmp_path / "a").glob("*.html"))
 
 
+def test_several_boards_stand_in_the_document_and_as_a_choice_on_the_page(
+    folder: Path, kept: tuple[StudyRun, Path], tmp_path: Path
+) -> None:
+    code, output = command(folder, kept, tmp_path / "b", "--target", "vck190,zcu104")
+    assert code == 0
+    assert "figures of vck190 are predicted" in (tmp_path / "b/tradeoff.html").read_text(encoding="utf-8")
+    rows = json.loads((tmp_path / "b/tradeoff.json").read_text(encoding="utf-8"))["rows"]
+    points = {row["name"]: row["figures"] for row in rows if row["table"] == "points"}
+    boards = [row for row in rows if row["table"] == "boards"]
+    assert {row["text"]["board"] for row in boards} == {"vck190", "zcu104"}
+    own = [row for row in boards if row["text"]["configuration"] == "C32B3"]
+    assert own
+    for row in own:
+        same = f"{row['text']['method']} INT8 legal, C32B3, tile {row['text']['tile']}, halo exact"
+        assert row["figures"]["board latency"] == points[same]["board latency"]
+        assert row["figures"]["PSNR"] == points[same]["PSNR"]
+    assert 'id="boards"' in (tmp_path / "b/tradeoff.html").read_text(encoding="utf-8")
+    assert "zcu104" not in output  # the study on the terminal is about the first
+
+
 def test_a_need_that_nothing_meets_exits_1_and_writes_the_report(
     folder: Path, kept: tuple[StudyRun, Path], tmp_path: Path
 ) -> None:

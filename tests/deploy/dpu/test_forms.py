@@ -1,0 +1,56 @@
+from pathlib import Path
+
+import pytest
+
+from deploy.dpu.board import load_dpu
+from deploy.dpu.checker.forms import forms, fully_connected
+from deploy.dpu.checker.placement import PlacedNode, place
+from deploy.dpu.graph import Operation
+from deploy.dpu.reading import read_network
+from tests.deploy.dpu.graphs import Sketch
+
+DPU = load_dpu("vck190")
+
+
+def placed(path: Path, weight: tuple[int, ...], tile_px: int) -> PlacedNode:
+    """A convolution without padding over a map of that side."""
+    sketch = Sketch(weight[1])
+    sketch.save(path, sketch.conv("image", weight, pads=[0] * 4))
+    return place(read_network(path, tile_px), DPU).nodes[-1]
+
+
+def shape(op: Operation) -> tuple[tuple[int, int], tuple[int, int]]:
+    return op.window.kernel, op.channels
+
+
+def test_a_layer_as_large_as_its_map_is_also_one_pixel_of_all_its_values(tmp_path: Path) -> None:
+    op = placed(tmp_path / "n.onnx", (10, 8, 20, 20), 20).op
+    assert fully_connected(op)
+    assert [shape(form) for form in forms(op, DPU)][1:] == [((20, 20), (8, 10)), ((1, 1), (3200, 10))]
+
+
+@pytest.mark.parametrize(
+    ("weight", "tile_px", "rules"),
+    [
+        ((10, 8, 20, 20), 20, set()),  # larger than any kernel, 3200 values
+        ((10, 8, 20, 20), 21, {"conv kernel", "conv window"}),  # the same kernel, but a result of four pixels
+        ((10, 11, 20, 20), 20, {"conv kernel", "conv window"}),  # 4400 values
+        ((14472, 2048, 1, 1), 1, set()),  # in four parts
+        ((14472, 2048, 1, 1), 2, {"conv channels"}),
+        ((4096, 512, 7, 7), 7, set()),  # VGG's first: fits as it is, and not laid flat
+    ],
+)
+def test_a_fully_connected_layer_is_taken_in_any_form_that_fits(
+    tmp_path: Path, weight: tuple[int, ...], tile_px: int, rules: set[str]
+) -> None:
+    node = placed(tmp_path / "n.onnx", weight, tile_px)
+    assert {broken.rule for broken in node.broken} == rules
+    assert node.device == ("CPU" if rules else "DPU")
+
+
+def test_padding_makes_it_another_layer(tmp_path: Path) -> None:
+    sketch = Sketch(8)
+    sketch.save(tmp_path / "p.onnx", sketch.conv("image", (10, 8, 20, 20), pads=[0, 0, 1, 1]))
+    (node,) = place(read_network(tmp_path / "p.onnx", 20), DPU).nodes
+    assert not fully_connected(node.op)
+    assert node.broken
