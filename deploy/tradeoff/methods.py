@@ -5,7 +5,7 @@ INT8 files that a study lacks are made on patches of the sensor that the float n
 
 import math
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache, cached_property
 from importlib.metadata import version
 from pathlib import Path
@@ -19,7 +19,7 @@ from deploy.methods import knowledge_of, method_named, restoring
 from deploy.networks import Say, float_file, int8_file, silent
 from deploy.restoration.options import Runtime
 from deploy.restoration.runtime import Infer, open_openvino, open_runtime
-from deploy.tradeoff.points import LEGAL, Variant
+from deploy.tradeoff.points import HALO_STEP_PX, LEGAL, Variant
 from model.evaluation.methods import KNOWN, Restore
 from model.io.files import sha256
 from model.io.images import list_images
@@ -91,8 +91,10 @@ def _network(name: str, sensor: SensorProfile, say: Say) -> Network:
     if tiling.fixed_px is not None:
         got, remedy = f"{name} for one tile size", "export it without --tile"
         raise OptionError("--networks", expected="networks for images of any size", got=got, remedy=remedy)
-    if tiling != Tiling(tiling.halo_px):
-        expected = "networks of one band without strides, of which halos and tiles of all sizes are compared"
+    if replace(tiling, lattice_px=1) != Tiling(tiling.halo_px) or HALO_STEP_PX % tiling.lattice_px:
+        expected = (
+            f"networks of one band, of which halos and tiles of all multiples of {HALO_STEP_PX} px are compared"
+        )
         got = f"{name}, {tiling.words}"
         raise OptionError("--networks", expected=expected, got=got, remedy="bench it and restore with it instead")
     if is_quantised(model):
@@ -247,9 +249,9 @@ class MethodStore:
         """A network as its user gave it."""
         return _model(self.networks[method])
 
-    def radius_px(self, method: str) -> int:
-        """How far a network sees from each pixel, in pixels."""
-        return tiling_of(self.model(method)).halo_px
+    def tiling(self, method: str) -> Tiling:
+        """How a network's image may be cut into tiles."""
+        return tiling_of(self.model(method))
 
     def digest(self, variant: Variant) -> str:
         """What the variant's pictures depend on; known before a missing INT8 file is made."""

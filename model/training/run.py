@@ -93,9 +93,11 @@ def train(run: Run, resume: bool, worker: Worker, say: Callable[[str], None]) ->
     """Run or resume a training to its end; says first whether LPIPS is part of the loss.
 
     Raises:
-        OptionError: the folder holds a run and `resume` is not asked for, or there is nothing to train on.
+        OptionError: the folder holds a run and `resume` is not asked for, there is nothing to train on, or patches
+            that are no multiple of the network's scale.
         KeyboardInterrupt: stopped; a checkpoint was written.
     """
+    require_whole_places(run)
     loss, said = loss_of(run)
     if said and worker.first:
         say(said)
@@ -122,6 +124,18 @@ def train(run: Run, resume: bool, worker: Worker, say: Callable[[str], None]) ->
     if worker.first:
         recipe = about(run, names, validation.names, loss) | {"precision": trainer.precision}
         finish(trainer.averaged(), run.weights, recipe)
+
+
+def require_whole_places(run: Run) -> None:
+    """Refuse patches that a network at a lower resolution cannot rearrange.
+
+    Raises:
+        OptionError: such a side.
+    """
+    scale = variant_named(run.variant).scale
+    if run.patches.patch_px % scale:
+        expected, got = f"a multiple of {scale} px, for {run.variant}", f"{run.patches.patch_px} px"
+        raise OptionError("--patch", expected=expected, got=got, remedy="choose another")
 
 
 def start_weights(run: Run) -> Mapping[str, Tensor] | None:
