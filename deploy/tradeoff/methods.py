@@ -3,7 +3,6 @@
 INT8 files that a study lacks are made on patches of the sensor that the float network was trained for.
 """
 
-import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
@@ -14,6 +13,7 @@ import numpy as np
 import onnx
 
 from deploy.cache import Cache, code_digest, digest_of
+from deploy.dpu.reading import network_of
 from deploy.export import float_model
 from deploy.methods import knowledge_of, method_named, restoring
 from deploy.networks import Say, float_file, int8_file, silent
@@ -31,6 +31,7 @@ from profiles.errors import BeersError, ModelError, OptionError
 from profiles.sensor import SensorProfile
 from profiles.sensor_file import reference_for
 from quant.calibration import Patches, draw_patches
+from quant.encodings import as_on_board
 from quant.free import free_ticks, quantise_free
 from quant.onnx_file import is_quantised, load_onnx, metadata, save_onnx
 from quant.passes.equalise import search_steps
@@ -40,6 +41,8 @@ from quant.tiling.walk import Tiling, tiling_of
 
 PAPER = VARIANTS["convbeers"]
 """The paper's network: 16 blocks of 64 features."""
+COUNTED_PX = 64
+"""Side of the image whose work is counted; any lattice of networks that are compared divides it."""
 
 
 @dataclass(frozen=True)
@@ -110,13 +113,14 @@ def shape_of(model: onnx.ModelProto) -> tuple[int, int]:
 
 
 def is_papers(model: onnx.ModelProto) -> bool:
-    """Whether a network has the paper's shape."""
-    return shape_of(model) == (PAPER.blocks, PAPER.features)
+    """Whether a network has the paper's shape, at full resolution."""
+    return shape_of(model) == (PAPER.blocks, PAPER.features) and tiling_of(model).lattice_px == 1
 
 
 def operations_per_px(model: onnx.ModelProto) -> int:
-    """Operations of the convolutions for each pixel, a product and its sum counting as two."""
-    return 2 * sum(math.prod(shape) for shape in conv_weights(model))
+    """Operations of the convolutions for each pixel of the image, a product and its sum counting as two."""
+    operations = network_of(as_on_board(model), COUNTED_PX).operations
+    return sum(op.operations for op in operations) // COUNTED_PX**2
 
 
 def conv_weights(model: onnx.ModelProto) -> list[tuple[int, ...]]:
