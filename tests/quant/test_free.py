@@ -256,7 +256,7 @@ def test_at_half_resolution_the_pixels_of_a_place_find_their_way_back(patches: P
     model = half_resolution()
     made = quantise_free(model, patches, {}, tick=lambda: None)
     assert {"SpaceToDepth", "DepthToSpace"} < {node.op_type for node in made.graph.node}
-    sessions = [open_session(each) for each in (model, made)]
-    found = compare(*sessions, unseen.pairs).mae
-    corrections = [float(np.abs(run(sessions[0], degraded) - degraded).mean()) for degraded, _ in unseen.pairs]
+    in_float, in_int8 = open_session(model), open_session(made)
+    found = compare(in_float, in_int8, unseen.pairs).mae
+    corrections = [float(np.abs(run(in_float, degraded) - degraded).mean()) for degraded, _ in unseen.pairs]
     assert found < 0.05 * np.mean(corrections)

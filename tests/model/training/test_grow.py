@@ -76,10 +76,10 @@ def test_the_pixels_of_a_place_learn_different_things() -> None:
     coarse = grow(network(6), Variant(2, 24, 2), torch.Generator().manual_seed(3))
     image = torch.rand(2, 1, 18, 24, generator=torch.Generator().manual_seed(4))
     coarse(image).abs().sum().backward()
-    gradient = coarse.body[0].first.weight.grad  # type: ignore[union-attr]
-    assert isinstance(gradient, torch.Tensor)
-    assert (coarse.body[0].first.weight[0] == 0).any()  # type: ignore[union-attr]
-    assert bool(gradient[0][coarse.body[0].first.weight[0] == 0].any())  # type: ignore[union-attr]
+    weight = dict(coarse.named_parameters())["body.0.first.weight"]
+    assert weight.grad is not None
+    assert (weight == 0).any()
+    assert weight.grad[weight == 0].any()
 
 
 def test_a_finer_network_is_refused() -> None:
