@@ -12,7 +12,7 @@ import onnx
 from deploy import __version__
 from model.io.tensors import Arrays, Weights, read_conditioned, read_plain
 from model.specialise import sensor_vector, specialised
-from profiles.errors import ModelError
+from profiles.errors import ModelError, OptionError
 from profiles.sensor import Sensor
 from quant.onnx_file import GraphWriter, image_info, load_onnx, make_model
 from quant.session import open_session, run
@@ -39,16 +39,25 @@ def weights_for(path: Path, sensor: Sensor) -> tuple[Weights, tuple[str, ...]]:
 
 
 def to_onnx(network: "Weights | ConvBEERS", about: dict[str, str], tile_px: int | None = None) -> onnx.ModelProto:
-    """A plain network as an ONNX model; `tile_px` fixes one square image, None leaves number and size free."""
+    """A plain network as an ONNX model; `tile_px` fixes one square image, None leaves number and size free.
+
+    Raises:
+        OptionError: a tile that is no multiple of the network's scale.
+    """
+    scale = network.variant.scale
+    if tile_px is not None and tile_px % scale:
+        remedy = "choose another, or leave it out"
+        raise OptionError("--tile", expected=f"a multiple of {scale} px", got=f"{tile_px} px", remedy=remedy)
     writer = GraphWriter()
     for name, value in _arrays(network).items():
         writer.constant(name, value)
-    stream = head = _conv(writer, "head", "image")
+    stream = head = _conv(writer, "head", _moved(writer, "SpaceToDepth", "unshuffled", "image", scale))
     for k in range(network.variant.blocks):
         inner = writer.node("Relu", f"body.{k}.relu", [_conv(writer, f"body.{k}.first", stream)])
         stream = writer.node("Add", f"body.{k}.add", [stream, _conv(writer, f"body.{k}.second", inner)])
     deep = writer.node("Add", "body_end.add", [head, _conv(writer, "body_end", stream)])
-    writer.node("Add", "restored", ["image", _conv(writer, "tail", deep)])
+    correction = _moved(writer, "DepthToSpace", "shuffled", _conv(writer, "tail", deep), scale)
+    writer.node("Add", "restored", ["image", correction])
     graph = writer.graph("convbeers", [image_info("image", 1, tile_px)], [image_info("restored", 1, tile_px)])
     return make_model(graph, {"beers_deploy_version": __version__, "precision": "float32", **about})
 
@@ -62,11 +71,14 @@ def _arrays(network: "Weights | ConvBEERS") -> Arrays:
 def parity(network: "ConvBEERS", model: Path | onnx.ModelProto, side_px: int) -> float:
     """Largest absolute difference between torch and onnxruntime on one random image, in [0, 1] of full scale.
 
+    The image's side is the next multiple of the network's scale.
+
     Raises:
         ModelError: the network gives NaN or infinity; then nothing can be compared.
     """
     import torch  # seconds to load, and a restoration begins with what this module writes
 
+    side_px += -side_px % network.variant.scale
     image = np.random.default_rng(0).random((1, 1, side_px, side_px), dtype=np.float32)
     with torch.inference_mode():
         expected = network(torch.from_numpy(image)).numpy()
@@ -95,6 +107,11 @@ def require_parity(network: "ConvBEERS", model: Path | onnx.ModelProto, side_px:
 def _conv(writer: GraphWriter, name: str, source: str) -> str:
     feeds = [source, f"{name}.weight", f"{name}.bias"]
     return writer.node("Conv", name, feeds, pads=[1] * 4, kernel_shape=[3, 3])
+
+
+def _moved(writer: GraphWriter, operator: str, name: str, source: str, scale: int) -> str:
+    """Pixels into channels or back, in an order in which ONNX and torch agree: the image has one channel."""
+    return writer.node(operator, name, [source], blocksize=scale) if scale > 1 else source
 
 
 def float_model(path: Path) -> onnx.ModelProto:

@@ -1,4 +1,8 @@
-"""The sizes of ConvBEERS by name, and the tensors that each is made of; nothing is loaded to know them."""
+"""The sizes of ConvBEERS by name, and the tensors that each is made of; nothing is loaded to know them.
+
+The paper's family works at full resolution. A variant of scale 2 sees each square of 2 x 2 pixels as one place of
+four channels, and so works at half resolution: its maps have a quarter of the places.
+"""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -8,22 +12,35 @@ from profiles.errors import OptionError
 
 @dataclass(frozen=True)
 class Variant:
-    """A named point of the family."""
+    """A named point of the family.
+
+    Attributes:
+        blocks: residual blocks.
+        features: channels of the maps between head and tail.
+        scale: side in pixels of the square that is one place of the maps; images have multiples of it as sides.
+    """
 
     blocks: int
     features: int
+    scale: int = 1
 
     @property
     def radius_px(self) -> int:
-        """How far an output pixel sees: one pixel per convolution (head, two a block, body end, tail)."""
-        return 2 * self.blocks + 3
+        """How far an output pixel sees around its place: one per convolution (head, two a block, body end, tail)."""
+        return self.scale * (2 * self.blocks + 3)
+
+    @property
+    def pixels(self) -> int:
+        """Pixels of one place of the maps, each a channel of the network's ends."""
+        return self.scale**2
 
     @property
     def convolutions(self) -> Mapping[str, tuple[int, int]]:
         """(outputs, inputs) of each 3 x 3 convolution by name, in the order in which an image meets them."""
         inner = [f"body.{k}.{place}" for k in range(self.blocks) for place in ("first", "second")]
         same = (self.features, self.features)
-        return {"head": (self.features, 1), **dict.fromkeys([*inner, "body_end"], same), "tail": (1, self.features)}
+        ends = {"head": (self.features, self.pixels)}, {"tail": (self.pixels, self.features)}
+        return {**ends[0], **dict.fromkeys([*inner, "body_end"], same), **ends[1]}
 
     @property
     def shapes(self) -> dict[str, tuple[int, ...]]:
@@ -39,6 +56,7 @@ VARIANTS = {
     "convbeers-m": Variant(blocks=16, features=32),
     "convbeers-s": Variant(blocks=8, features=32),
     "convbeers-xs": Variant(blocks=4, features=16),
+    "convbeers-half": Variant(blocks=4, features=64, scale=2),
 }
 
 

@@ -26,6 +26,7 @@ from quant.graph import (
     Op,
     Pointwise,
     Shuffle,
+    image_channels,
 )
 from quant.integer.arithmetic import activated, activation_table, mean_factor
 
@@ -67,12 +68,15 @@ class Span:
         return Span(low, high, sizes @ self.change)
 
 
-ALL_IMAGES = Span(np.zeros(1), np.ones(1), np.ones(1))
+def all_images(graph: Graph) -> Span:
+    """Every image, its channels the pixels of a place."""
+    channels = image_channels(graph)
+    return Span(np.zeros(channels), np.ones(channels), np.ones(channels))
 
 
 def bound_anywhere(graph: Graph) -> Bound:
     """Of the image plus the graph's correction, at every pixel of every image."""
-    spans = {IMAGE: ALL_IMAGES}
+    spans = {IMAGE: all_images(graph)}
     for op in graph:
         if isinstance(op, Add):
             spans[op.output] = spans[op.inputs[0]] + spans[op.inputs[1]]
@@ -81,7 +85,7 @@ def bound_anywhere(graph: Graph) -> Bound:
         sums = spans[op.input].padded().through(op.weight.astype(np.float64))
         span = Span(sums.low + op.bias, sums.high + op.bias, sums.change)
         spans[op.output] = span.relu() if op.activation is Activation.relu else span
-    return _largest(spans[CORRECTION] + ALL_IMAGES)
+    return _largest(spans[CORRECTION] + spans[IMAGE])
 
 
 @dataclass(frozen=True)
@@ -112,8 +116,8 @@ class Form:
 
 def bound_inside(graph: Graph) -> Bound:
     """Of the image plus the graph's correction, farther from the border than the receptive radius."""
-    sources, one = {IMAGE: ALL_IMAGES}, np.ones((1, 1, 1, 1))
-    forms = {IMAGE: Form({IMAGE: one}, np.zeros(1))}
+    sources = {IMAGE: all_images(graph)}
+    forms = {IMAGE: _itself(IMAGE, image_channels(graph))}
     for op in graph:
         if isinstance(op, Add):
             forms[op.output] = forms[op.inputs[0]] + forms[op.inputs[1]]
@@ -122,10 +126,14 @@ def bound_inside(graph: Graph) -> Bound:
         form = forms[op.input].through(op)
         if op.activation is Activation.relu:
             sources[op.output] = form.span(sources).relu()
-            channels = len(op.bias)
-            form = Form({op.output: np.eye(channels)[:, :, None, None]}, np.zeros(channels))
+            form = _itself(op.output, len(op.bias))
         forms[op.output] = form
     return _largest((forms[CORRECTION] + forms[IMAGE]).span(sources))
+
+
+def _itself(name: str, channels: int) -> Form:
+    """A source as a form of its own."""
+    return Form({name: np.eye(channels)[:, :, None, None]}, np.zeros(channels))
 
 
 def compose(second: np.ndarray, first: np.ndarray) -> np.ndarray:

@@ -3,6 +3,7 @@
 image -> pixel unshuffle -> planes -> core -> one correction of its gains or windows -> pixel shuffle -> + image
 """
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -66,7 +67,17 @@ class Ends:
     @property
     def image_channels(self) -> int:
         """Of the image as it comes."""
-        return self.channels // int(np.prod([shuffle.block**2 for shuffle in self.front], initial=1))
+        return self.channels // self.place_px**2
+
+    @property
+    def place_px(self) -> int:
+        """Side in pixels of the square of the image that is one place of the core's planes."""
+        return math.prod(shuffle.block for shuffle in self.front)
+
+    @property
+    def correction_px(self) -> int:
+        """As `place_px`, of the core's result where the image is added to it."""
+        return math.prod(shuffle.block for shuffle in self.back)
 
     def split(self, image: np.ndarray) -> np.ndarray:
         """An image (N, C, H, W) in [0, 1] to the core's planes, int8."""

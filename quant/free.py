@@ -5,7 +5,7 @@ written with the host file's integer kernels. What stays is the residual stream 
 """
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import onnx
@@ -13,7 +13,7 @@ import onnx
 from quant.calibration import Patches
 from quant.core import INT8_MAX
 from quant.encodings import MICROSOFT
-from quant.ends import ONE_CHANNEL, ZERO, Ends, HostWriter, write_back, write_front
+from quant.ends import ONE_CHANNEL, ZERO, Ends, HostWriter, ends_of, write_back, write_front
 from quant.graph import (
     CORRECTION,
     IMAGE,
@@ -25,6 +25,7 @@ from quant.graph import (
     Graph,
     correction_graph,
     graph_to_onnx,
+    plain_network,
     read_planes,
     tensors,
 )
@@ -51,7 +52,11 @@ class RoundedWeight:
 
 
 def tensor_scales(
-    graph: Graph, levels: Mapping[str, int], images: Iterable[np.ndarray], tick: Callable[[], None]
+    graph: Graph,
+    levels: Mapping[str, int],
+    images: Iterable[np.ndarray],
+    tick: Callable[[], None],
+    ends: Ends = ONE_CHANNEL,
 ) -> dict[str, float]:
     """The least-squares scale of each named tensor of a plane-reading graph.
 
@@ -60,13 +65,14 @@ def tensor_scales(
         levels: names, and the largest whole number that the size of a value may take: 255, or 127 beside a sign.
         images: (1, 1, H, W) float32 in [0, 1], passed over twice; one is in memory at a time.
         tick: called once per image and pass.
+        ends: of the network.
     """
     names, halo_px = list(levels), halo_of(graph)
-    session = open_session(graph_to_onnx(graph, names))
+    session = open_session(graph_to_onnx(graph, names, ends.planes * ends.channels))
 
     def sizes() -> Iterator[list[np.ndarray]]:
         for image in images:
-            for results in tensor_values(session, names, image, halo_px):
+            for results in tensor_values(session, names, image, halo_px, ends):
                 yield [np.abs(r) for r in results]
             tick()
 
@@ -136,6 +142,7 @@ def free_model(
     about: dict[str, str],
     tile_px: int | None = None,
     moments: Mapping[str, Moments] | None = None,
+    ends: Ends = ONE_CHANNEL,
 ) -> onnx.ModelProto:
     """The network on stock onnxruntime, (N, 1, H, W) float32 in [0, 1] to the same.
 
@@ -145,9 +152,9 @@ def free_model(
         about: metadata.
         tile_px: side of a fixed tile, or None for any size.
         moments: of what each convolution reads, for `quant.passes.fit_weights`; None rounds to nearest.
+        ends: of the network.
     """
-    writer = HostWriter()
-    ends = Ends(gains=2)
+    writer, ends = HostWriter(), replace(ends, gains=2)
     write_front(writer, ends)
     for op in graph:
         if isinstance(op, Add):
@@ -201,20 +208,21 @@ def quantise_free(
     Raises:
         ModelError: not a graph of convolutions, ReLUs and adds that ends with the global add.
     """
-    graph = read_planes(correction_graph(model))
-    scales = _scales(graph, patches, tick)
+    network = plain_network(model)
+    graph, ends = read_planes(network.graph), ends_of(network)
+    scales = _scales(graph, patches, tick, ends)
     for stream in streams(graph):
-        ranges = channel_ranges(graph, stream, patches.degraded, tick)
-        targets = search_targets(graph, ONE_CHANNEL, patches.degraded)
+        ranges = channel_ranges(graph, stream, patches.degraded, tick, ends)
+        targets = search_targets(graph, ends, patches.degraded)
 
         def trial(tried: Graph, targets: Targets = targets) -> Costs:
-            return crop_costs(_written(tried, scales, {}), targets)
+            return crop_costs(_written(tried, scales, {}, ends), targets)
 
         factors = search(graph, stream, ranges, trial, tick)
         graph = equalise(graph, stream, factors)
     about = {**metadata(model), "precision": "int8 free", "calibration_sha256": patches.digest, **about}
-    moments = input_moments(_fine(graph), patches.degraded, tick)
-    return _written(graph, scales, about, fixed_tile_px(model), moments)
+    moments = input_moments(_fine(graph), patches.degraded, tick, ends)
+    return _written(graph, scales, about, ends, fixed_tile_px(model), moments)
 
 
 def free_ticks(model: onnx.ModelProto, patches: int) -> int:
@@ -227,12 +235,12 @@ def free_ticks(model: onnx.ModelProto, patches: int) -> int:
     return 4 * patches + search_steps(len(first.weight))
 
 
-def _scales(graph: Graph, patches: Patches, tick: Callable[[], None]) -> dict[str, Scale]:
+def _scales(graph: Graph, patches: Patches, tick: Callable[[], None], ends: Ends) -> dict[str, Scale]:
     """Least-squares scales of what is not the stream; that has any, because `equalise` scales its channels to it."""
     in_streams = {name for stream in streams(graph) for name in stream}
     convs = [op for op in graph if isinstance(op, Conv) and op.output not in in_streams]
     levels = {op.output: UINT8_MAX if (op.activation is Activation.relu) else INT8_MAX for op in convs}
-    units = tensor_scales(graph, levels, patches.degraded, tick)
+    units = tensor_scales(graph, levels, patches.degraded, tick, ends)
     units[CORRECTION] /= FINER
     found = {
         op.output: Scale(units[op.output], 0) if (op.activation is Activation.relu) else Scale(units[op.output])
@@ -249,9 +257,10 @@ def _written(
     graph: Graph,
     scales: dict[str, Scale],
     about: dict[str, str],
+    ends: Ends,
     tile_px: int | None = None,
     moments: dict[str, Moments] | None = None,
 ) -> onnx.ModelProto:
     stream, fine = Scale(STREAM_STEP), _fine(graph)
     known = {name: scales.get(name, stream) for name in (PLANES, *tensors(fine))}
-    return free_model(fine, known, about, tile_px, moments)
+    return free_model(fine, known, about, tile_px, moments, ends)

@@ -16,8 +16,8 @@ from onnx import TensorProto, helper, numpy_helper
 from deploy.dpu.graph import Kind, Network, Operation, Shape, Window, out_shape, padding
 from deploy.dpu.integers import Integers
 from profiles.errors import ModelError
-from quant.encodings import as_on_board
-from quant.onnx_file import load_onnx
+from quant.encodings import PLACE_PX, as_on_board
+from quant.onnx_file import load_onnx, metadata
 from quant.tiling.spelled_out import with_shuffles
 from quant.untrusted import contradictions
 
@@ -45,8 +45,14 @@ KINDS |= dict.fromkeys(("MaxPool", "AveragePool", "GlobalAveragePool", "GlobalMa
 KINDS |= dict.fromkeys(("QLinearAveragePool", "QLinearGlobalAveragePool"), "pool")
 
 
+PLACE_MAX_PX = 64
+"""Beyond what any network rearranges: a place of more pixels is a damaged file."""
+
+
 def read_network(path: Path, tile_px: int | None = 640) -> Network:
     """Read an ONNX file as a network for one image with sides of `tile_px`; None is the size that it is fixed to.
+
+    The image is the whole network's: of a core that reads places of 2 x 2 pixels, planes have half of its sides.
 
     Raises:
         ModelError: not an ONNX file, or not a network of images.
@@ -55,9 +61,21 @@ def read_network(path: Path, tile_px: int | None = 640) -> Network:
 
 
 def own_tile_px(model: onnx.ModelProto) -> int | None:
-    """The side of the tile that a network is fixed to, None where it takes any."""
+    """The side of the tile that a network is fixed to, in pixels of the image; None where it takes any."""
     dims = model.graph.input[0].type.tensor_type.shape.dim
-    return max((d.dim_value for d in dims[2:]), default=0) or None
+    return max((d.dim_value for d in dims[2:]), default=0) * _place_px(model) or None
+
+
+def _place_px(model: onnx.ModelProto) -> int:
+    """The side in pixels of what one place of the input stands for: more than 1 of a board's file alone.
+
+    Raises:
+        ValueError: no such side.
+    """
+    side_px = int(metadata(model).get(PLACE_PX, "1"))
+    if not 1 <= side_px <= PLACE_MAX_PX:
+        raise ValueError(f"{PLACE_PX} {side_px}")
+    return side_px
 
 
 def network_of(model: onnx.ModelProto, tile_px: int | None, where: str = "ONNX model") -> Network:
@@ -77,7 +95,8 @@ class _Reader:
         self.nodes = list(graph.node)
         self.constants: dict[str, TensorProto] = {t.name: t for t in graph.initializer}
         self.constants |= {n.output[0]: t for n in graph.node for t in _constant(n)}
-        self.inputs = {i.name: _input_shape(i, tile_px, where) for i in graph.input if i.name not in self.constants}
+        images = (i for i in graph.input if i.name not in self.constants)
+        self.inputs = {i.name: _input_shape(i, tile_px, _place_px(model), where) for i in images}
         self.outputs = tuple(o.name for o in graph.output)
         self.shapes: dict[str, Shape | None] = dict(self.inputs)
         self.kinds: dict[str, Kind] = {}
@@ -206,8 +225,8 @@ def _count(tensor: TensorProto) -> int:
     return count
 
 
-def _input_shape(info: onnx.ValueInfoProto, tile_px: int | None, where: str) -> Shape:
-    """(C, tile, tile) of an input (N, C, H, W); without a tile (C, H, W) as the file states them.
+def _input_shape(info: onnx.ValueInfoProto, tile_px: int | None, place_px: int, where: str) -> Shape:
+    """(C, tile, tile) of an input (N, C, H, W), in places; without a tile (C, H, W) as the file states them.
 
     Raises:
         ModelError: not such an input, or one fixed to another tile.
@@ -221,12 +240,16 @@ def _input_shape(info: onnx.ValueInfoProto, tile_px: int | None, where: str) -> 
         if not all(sizes[2:]):
             raise ModelError(where, expected="an input of a stated size", got="any size", remedy="pass --tile")
         return sizes[1], sizes[2], sizes[3]
-    fixed = {size for size in sizes[2:] if size} - {tile_px}
+    side, beyond = divmod(tile_px, place_px)
+    if beyond:
+        expected, remedy = f"a tile of a multiple of {place_px} px", "choose another --tile"
+        raise ModelError(where, expected=expected, got=f"{tile_px} px", remedy=remedy)
+    fixed = {size for size in sizes[2:] if size} - {side}
     if fixed:
         raise ModelError(
             where,
             expected=f"an input that takes {tile_px} x {tile_px} pixels",
-            got=f"one fixed to {sizes[3] or 'any'} x {sizes[2] or 'any'}",
-            remedy=f"pass --tile {min(fixed)}, or export it with free sizes",
+            got=f"one fixed to {sizes[3] * place_px or 'any'} x {sizes[2] * place_px or 'any'}",
+            remedy=f"pass --tile {min(fixed) * place_px}, or export it with free sizes",
         )
-    return (sizes[1], tile_px, tile_px)
+    return (sizes[1], side, side)

@@ -89,7 +89,7 @@ def restored(target: FaultTarget, injected: Injected, clamped: bool = False) -> 
     tensors, _ = run_core(injected.core, injected.core.ends.split(injected.image), faults=faults)
     correction = merged_correction(injected.core, tensors)
     correction = target.guards.limit(correction) if clamped else correction
-    return np.asarray(np.clip(injected.image + correction, 0, 1), np.float32)
+    return np.asarray(injected.core.ends.finished(injected.image, correction), np.float32)
 
 
 def quality_db(target: FaultTarget, injected: Injected, reference: np.ndarray, clamped: bool = False) -> float:
@@ -130,8 +130,8 @@ def _shifts(target: FaultTarget, image: np.ndarray, per_megabit: float, generato
 
 def _maps(target: FaultTarget, image: np.ndarray, per_megabit: float, generator: np.random.Generator) -> Injected:
     """Faults enter every tensor once, between the operation that writes it and those that read it."""
-    pixels, channels = image[0, 0].size, map_channels(target.core)
-    counts = {name: flip_count(INT8_BITS * pixels * n, per_megabit, generator) for name, n in channels.items()}
+    places, channels = image[0, 0].size // target.core.ends.place_px**2, map_channels(target.core)
+    counts = {name: flip_count(INT8_BITS * places * n, per_megabit, generator) for name, n in channels.items()}
     return inject_maps(target, image, counts, int(generator.integers(2**63)))
 
 

@@ -38,8 +38,9 @@ def float32(subject: Subject, case: Case, image: np.ndarray) -> list[Measure]:
     network = subject.float32
     measures = restoration(network, case, image, GAIN_DN)
     if case.pixels == "sound" and not case.large and not isinstance(subject.graph, BeersError):
-        truth, signs = infer_in(subject.graph, torch.float64), steepest_signs(subject.graph, _fractions(image)[0, 0])
-        measures.append(_error(network.infer()(_fractions(image)), truth(_fractions(image)), FLOAT32_DN))
+        truth, whole = infer_in(subject.graph, torch.float64), network.extended(_fractions(image))
+        measures.append(_error(network.infer()(whole), truth(whole), FLOAT32_DN))
+        signs = steepest_signs(subject.graph, whole[0, 0])[: image.shape[0], : image.shape[1]]
         steepest = change(network.restore, image, network.restore(image), signs)
         measures.append(Measure("gain, steepest", steepest, STEEPEST_DN, "DN per DN"))
     return measures
@@ -123,7 +124,7 @@ def reference(subject: Subject, case: Case, image: np.ndarray) -> list[Measure]:
     core, network = core_of(subject), _int8(subject)
     if case.pixels != "sound":
         return []
-    crop = (np.asarray(image[:CROP_PX, :CROP_PX], np.float32) / np.float32(FULL_DN))[None, None]
+    crop = network.extended(_fractions(image[:CROP_PX, :CROP_PX]))
     planes = core.ends.split(crop)
     even, reports = run_core(core, planes, half_even=True)
     up, _ = run_core(core, planes)
@@ -158,7 +159,7 @@ def core_of(subject: Subject) -> IntCore:
 
 
 def _restored(core: IntCore, image: np.ndarray, tensors: dict[str, np.ndarray]) -> np.ndarray:
-    return np.asarray(np.clip(image + merged_correction(core, tensors), 0, 1)[0, 0])
+    return np.asarray(core.ends.finished(image, merged_correction(core, tensors))[0, 0])
 
 
 def _unproven(core: IntCore, reports: list[LayerReport]) -> Measure:

@@ -1,5 +1,6 @@
 """What is under test: a float network and its INT8 file, opened once."""
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property, partial
@@ -11,7 +12,7 @@ import onnx
 import onnxruntime as ort
 import torch
 from torch import Tensor
-from torch.nn.functional import conv2d
+from torch.nn.functional import conv2d, pixel_shuffle, pixel_unshuffle
 
 from deploy.export import float_model
 from deploy.networks import Say, float_file, int8_file, shipped_pair, silent
@@ -24,7 +25,7 @@ from profiles import load_sensor
 from profiles.errors import BeersError
 from quant.core import IntCore
 from quant.encodings import read_core
-from quant.graph import CORRECTION, IMAGE, Activation, Add, Conv, Graph, correction_graph
+from quant.graph import CORRECTION, IMAGE, Activation, Add, Conv, Graph, correction_graph, image_channels
 from quant.onnx_file import any_size, load_onnx, require_quantised
 from quant.session import open_session, run
 from quant.tiling.walk import Tiling, tiling_of
@@ -50,6 +51,11 @@ class Network:
     def radius_px(self) -> int:
         """How far from a pixel its result depends on."""
         return self.tiling.halo_px
+
+    def extended(self, image: np.ndarray) -> np.ndarray:
+        """An image (N, 1, H, W) with copies of its last row and column, up to what the network takes whole."""
+        lack = [-side % self.tiling.lattice_px for side in image.shape[2:]]
+        return np.pad(image, ((0, 0), (0, 0), (0, lack[0]), (0, lack[1])), mode="edge")
 
     def infer(self, threads: int = 1) -> Infer:
         """The network ready to run on so many threads, opened once for each number of them."""
@@ -158,7 +164,8 @@ def steepest_signs(graph: Graph, image: np.ndarray) -> np.ndarray:
 
 
 def _correction(graph: Graph, image: Tensor) -> Tensor:
-    tensors = {IMAGE: image}
+    place_px = math.isqrt(image_channels(graph))
+    tensors = {IMAGE: pixel_unshuffle(image, place_px)}
     for op in graph:
         if isinstance(op, Add):
             tensors[op.output] = tensors[op.inputs[0]] + tensors[op.inputs[1]]
@@ -167,7 +174,7 @@ def _correction(graph: Graph, image: Tensor) -> Tensor:
         weight, bias = (_as(values, image.dtype) for values in (op.weight, op.bias))
         result = conv2d(tensors[op.input], weight, bias, padding=op.window.pads[0])
         tensors[op.output] = torch.relu(result) if op.activation is Activation.relu else result
-    return tensors[CORRECTION]
+    return pixel_shuffle(tensors[CORRECTION], place_px)
 
 
 def _as(values: np.ndarray, dtype: torch.dtype) -> Tensor:

@@ -118,22 +118,22 @@ def measure_mae(
 LEAST_SQUARED_ERROR = 1e-12
 
 
-def cut_in_four(infer: Infer, halo_px: int, max_dn: int = MAX_DN) -> Restore:
+def cut_in_four(infer: Infer, halo_px: int, max_dn: int = MAX_DN, lattice_px: int = 1) -> Restore:
     """Restores (H, W) digital numbers in four windows, each with so much of the others around it."""
-    return partial(_restore, infer=infer, halo_px=halo_px, max_dn=max_dn)
+    return partial(_restore, infer=infer, tiling=Tiling(halo_px, lattice_px), max_dn=max_dn)
 
 
-def _restore(dn: np.ndarray, infer: Infer, halo_px: int, max_dn: int) -> np.ndarray:
+def _restore(dn: np.ndarray, infer: Infer, tiling: Tiling, max_dn: int) -> np.ndarray:
     height_px, width_px = dn.shape
-    rows, columns = (tuple(halves(size_px, halo_px)) for size_px in dn.shape)
-    plan = Plan(1, height_px, width_px, max(dn.shape), halo_px, Tiling(halo_px), rows, columns)
+    rows, columns = (tuple(halves(size_px, tiling.halo_px, tiling.lattice_px)) for size_px in dn.shape)
+    plan = Plan(1, height_px, width_px, max(dn.shape), tiling.halo_px, tiling, rows, columns)
     return restore_dn(dn, infer, plan, max_dn)
 
 
-def halves(size_px: int, halo_px: int) -> list[Span]:
-    """Both halves of a side, each reading `halo_px` of the other."""
-    cut = size_px // 2
-    return [Span(0, min(cut + halo_px, size_px), 0, cut), Span(max(cut - halo_px, 0), size_px, cut, size_px)]
+def halves(size_px: int, halo_px: int, lattice_px: int = 1) -> list[Span]:
+    """Both halves of a side, cut at a multiple of `lattice_px` as the halo is one, each reading the halo beyond."""
+    whole_px, cut = -(-size_px // lattice_px) * lattice_px, size_px // 2 // lattice_px * lattice_px
+    return [Span(0, min(cut + halo_px, whole_px), 0, cut), Span(max(cut - halo_px, 0), whole_px, cut, size_px)]
 
 
 def seam_density(swath: Swath) -> float:

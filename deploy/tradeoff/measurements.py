@@ -160,7 +160,8 @@ class Measurements:
         def run(tick: Tick) -> None:
             infer = self.store.open(variant).infer
             assert infer is not None  # noqa: S101 - only networks have tiles
-            found = Scores(measure_images(cut_in_four(infer, halo_px, self.store.max_dn), self.benchmark, tick))
+            cut = cut_in_four(infer, halo_px, self.store.max_dn, self.store.tiling(variant.method).lattice_px)
+            found = Scores(measure_images(cut, self.benchmark, tick))
             self.cache.keep("seams", self._key(variant, halo_px=halo_px), found)
 
         return self._job(f"seams of {variant}, halo {halo_px}", variant, run)

@@ -3,9 +3,8 @@
 INT8 files that a study lacks are made on patches of the sensor that the float network was trained for.
 """
 
-import math
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache, cached_property
 from importlib.metadata import version
 from pathlib import Path
@@ -14,12 +13,13 @@ import numpy as np
 import onnx
 
 from deploy.cache import Cache, code_digest, digest_of
+from deploy.dpu.reading import network_of
 from deploy.export import float_model
 from deploy.methods import knowledge_of, method_named, restoring
 from deploy.networks import Say, float_file, int8_file, silent
 from deploy.restoration.options import Runtime
 from deploy.restoration.runtime import Infer, open_openvino, open_runtime
-from deploy.tradeoff.points import LEGAL, Variant
+from deploy.tradeoff.points import HALO_STEP_PX, LEGAL, Variant
 from model.evaluation.methods import KNOWN, Restore
 from model.io.files import sha256
 from model.io.images import list_images
@@ -31,6 +31,7 @@ from profiles.errors import BeersError, ModelError, OptionError
 from profiles.sensor import SensorProfile
 from profiles.sensor_file import reference_for
 from quant.calibration import Patches, draw_patches
+from quant.encodings import as_on_board
 from quant.free import free_ticks, quantise_free
 from quant.onnx_file import is_quantised, load_onnx, metadata, save_onnx
 from quant.passes.equalise import search_steps
@@ -40,6 +41,8 @@ from quant.tiling.walk import Tiling, tiling_of
 
 PAPER = VARIANTS["convbeers"]
 """The paper's network: 16 blocks of 64 features."""
+COUNTED_PX = 64
+"""Side of the image whose work is counted; any lattice of networks that are compared divides it."""
 
 
 @dataclass(frozen=True)
@@ -91,8 +94,10 @@ def _network(name: str, sensor: SensorProfile, say: Say) -> Network:
     if tiling.fixed_px is not None:
         got, remedy = f"{name} for one tile size", "export it without --tile"
         raise OptionError("--networks", expected="networks for images of any size", got=got, remedy=remedy)
-    if tiling != Tiling(tiling.halo_px):
-        expected = "networks of one band without strides, of which halos and tiles of all sizes are compared"
+    if replace(tiling, lattice_px=1) != Tiling(tiling.halo_px) or HALO_STEP_PX % tiling.lattice_px:
+        expected = (
+            f"networks of one band, of which halos and tiles of all multiples of {HALO_STEP_PX} px are compared"
+        )
         got = f"{name}, {tiling.words}"
         raise OptionError("--networks", expected=expected, got=got, remedy="bench it and restore with it instead")
     if is_quantised(model):
@@ -108,13 +113,14 @@ def shape_of(model: onnx.ModelProto) -> tuple[int, int]:
 
 
 def is_papers(model: onnx.ModelProto) -> bool:
-    """Whether a network has the paper's shape."""
-    return shape_of(model) == (PAPER.blocks, PAPER.features)
+    """Whether a network has the paper's shape, at full resolution."""
+    return shape_of(model) == (PAPER.blocks, PAPER.features) and tiling_of(model).lattice_px == 1
 
 
 def operations_per_px(model: onnx.ModelProto) -> int:
-    """Operations of the convolutions for each pixel, a product and its sum counting as two."""
-    return 2 * sum(math.prod(shape) for shape in conv_weights(model))
+    """Operations of the convolutions for each pixel of the image, a product and its sum counting as two."""
+    operations = network_of(as_on_board(model), COUNTED_PX).operations
+    return sum(op.operations for op in operations) // COUNTED_PX**2
 
 
 def conv_weights(model: onnx.ModelProto) -> list[tuple[int, ...]]:
@@ -247,9 +253,9 @@ class MethodStore:
         """A network as its user gave it."""
         return _model(self.networks[method])
 
-    def radius_px(self, method: str) -> int:
-        """How far a network sees from each pixel, in pixels."""
-        return tiling_of(self.model(method)).halo_px
+    def tiling(self, method: str) -> Tiling:
+        """How a network's image may be cut into tiles."""
+        return tiling_of(self.model(method))
 
     def digest(self, variant: Variant) -> str:
         """What the variant's pictures depend on; known before a missing INT8 file is made."""

@@ -249,7 +249,7 @@ class Assembly:
 
     def _swath(self, point: Point) -> Swath:
         halo_px = (
-            point.halo_px(self.measurements.store.radius_px(point.variant.method))
+            point.halo_px(self.measurements.store.tiling(point.variant.method).halo_px)
             if point.variant.kind == "network"
             else 0
         )

@@ -13,9 +13,9 @@ from profiles.figures import Figure
 Kind = Literal["network", "chain", "peer", "paper"]
 PRECISIONS = ("float32", "bf16", "INT8 free", "INT8 legal")
 LEGAL, EXACT = "INT8 legal", "exact"
-HALOS_PX = (0, 8, 16)
-STEP_PX = 16
-"""Tile sides are multiples of it."""
+HALO_STEP_PX, STEP_PX = 8, 16
+"""What halos and what tile sides are multiples of: so they fit every network whose lattice divides the former."""
+HALOS_PX = (0, HALO_STEP_PX, 2 * HALO_STEP_PX)
 
 
 @dataclass(frozen=True)

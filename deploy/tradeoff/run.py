@@ -40,7 +40,6 @@ from model.io.pictures import busiest_windows
 from profiles import load_target
 from profiles.figures import Row
 from quant.onnx_file import load_onnx
-from quant.tiling.walk import Tiling
 
 CROP_PX, MOST = 128, 8
 FRONT = ("board latency", "PSNR")
@@ -89,8 +88,8 @@ def _restored(outcome: Outcome, pair: NamedPair, measurements: Measurements) -> 
     opened, point = measurements.store.open(outcome.point.variant), outcome.point
     if opened.infer is None:
         return opened.restore(pair.degraded)
-    radius_px = measurements.store.radius_px(point.variant.method)
-    plan = make_plan((1, *pair.degraded.shape), point.tile_px, point.halo_px(radius_px), Tiling(radius_px))
+    tiling = measurements.store.tiling(point.variant.method)
+    plan = make_plan((1, *pair.degraded.shape), point.tile_px, point.halo_px(tiling.halo_px), tiling)
     return restore_dn(pair.degraded, opened.infer, plan, measurements.store.max_dn)
 
 

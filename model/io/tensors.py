@@ -137,7 +137,10 @@ def _recipe(header: Mapping[str, object]) -> dict[str, object]:
 
 def _variant(header: Mapping[str, Any]) -> Variant:
     shape = header["variant"]
-    return Variant(int(shape["blocks"]), int(shape["features"]))
+    found = Variant(int(shape["blocks"]), int(shape["features"]), int(shape.get("scale", 1)))
+    if found.scale < 1:
+        raise ValueError(f"a scale of {found.scale}")
+    return found
 
 
 def _check_count(tensors: Arrays, variant: Variant, count: int) -> None:

@@ -1,6 +1,7 @@
-"""A larger network that begins where a smaller one stands: wider, deeper or both, with the same outputs."""
+"""A larger network that begins where a smaller one stands: wider, deeper or coarser, with the same outputs."""
 
 from collections.abc import Mapping
+from itertools import product
 
 import torch
 from torch import Tensor
@@ -20,10 +21,10 @@ def grow(network: ConvBEERS, variant: Variant, generator: torch.Generator) -> Co
 
     Features are copied, and their weights shared out among the copies (Net2Net, Chen et al. 2016). Added blocks lie
     evenly between the others; their second convolution is zero, so that each hands on what it is given until it has
-    learnt something.
+    learnt something. At a larger scale each feature becomes one for each pixel of a place (see `_coarser`).
 
     Raises:
-        ModelError: fewer blocks, or features that are no multiple.
+        ModelError: fewer blocks, a finer scale, or features that are no multiple.
     """
     sources = _sources(network.variant, variant)
     large = ConvBEERS(variant)
@@ -32,7 +33,7 @@ def grow(network: ConvBEERS, variant: Variant, generator: torch.Generator) -> Co
     for name, source in sources.items():
         if source is None and name.endswith("second"):
             weights[f"{name}.weight"].zero_()
-    large.load_state_dict(weights | _copied(network.state_dict(), sources, variant, generator))
+    large.load_state_dict(weights | _copied(network.state_dict(), sources, (network.variant, variant), generator))
     return large
 
 
@@ -49,7 +50,7 @@ def grow_conditioned(
     initialise_coefficients(large, generator)
     large.base.load_state_dict(grow(network.base, variant, generator).state_dict())
     for old, new in zip(network.directions, large.directions, strict=True):
-        copied = _copied(old.state_dict(), sources, variant, generator)
+        copied = _copied(old.state_dict(), sources, (network.variant, variant), generator)
         new.load_state_dict(new.state_dict() | copied)  # an added one is zero, as drawn
     large.coefficients.load_state_dict(_coefficients(network, large, sources))
     return large
@@ -57,9 +58,11 @@ def grow_conditioned(
 
 def _sources(small: Variant, large: Variant) -> dict[str, str | None]:
     """The convolution of the small network that each of the large one's is made from; None for an added one."""
-    if large.blocks < small.blocks or large.features % small.features:
-        expected = f"at most {large.blocks} blocks, and features that divide {large.features}"
-        got = f"{small.blocks} blocks of {small.features} features"
+    factor = large.scale // small.scale
+    fits = small.scale in (1, large.scale) and large.features % (small.features * factor**2) == 0
+    if large.blocks < small.blocks or not fits:
+        expected = f"at most {large.blocks} blocks, of features that divide {large.features} at scale {large.scale}"
+        got = f"{small.blocks} blocks of {small.features} features at scale {small.scale}"
         raise ModelError("weights to start from", expected=expected, got=got, remedy="start from a smaller network")
     places = [old * large.blocks // small.blocks for old in range(small.blocks)]
     kept = {f"body.{place}.": f"body.{old}." for old, place in enumerate(places)}
@@ -72,16 +75,35 @@ def _sources(small: Variant, large: Variant) -> dict[str, str | None]:
 
 
 def _copied(
-    tensors: Mapping[str, Tensor], sources: Mapping[str, str | None], variant: Variant, generator: torch.Generator
+    tensors: Mapping[str, Tensor],
+    sources: Mapping[str, str | None],
+    variants: tuple[Variant, Variant],
+    generator: torch.Generator,
 ) -> dict[str, Tensor]:
     """The weights and biases that come from the small network's `tensors`, by the large one's names."""
-    found = {}
+    found, (small, variant) = dict[str, Tensor](), variants
+    factor = variant.scale // small.scale
     for name, source in sources.items():
         if source is not None:
-            channels, bias = variant.convolutions[name], tensors[f"{source}.bias"]
-            found[f"{name}.weight"] = _widened(tensors[f"{source}.weight"], channels, generator)
+            weight, channels = _coarser(tensors[f"{source}.weight"], factor), variant.convolutions[name]
+            bias = tensors[f"{source}.bias"].repeat_interleave(factor**2)
+            found[f"{name}.weight"] = _widened(weight, channels, generator)
             found[f"{name}.bias"] = bias.repeat(channels[0] // len(bias))
     return found
+
+
+def _coarser(weight: Tensor, factor: int) -> Tensor:
+    """(O, I, 3, 3) to (O S^2, I S^2, 3, 3): the same convolution where S x S places are the channels of one.
+
+    Row i of a place reads row i + d of the same channels, d from -1 to 1: it lies in row (i + d) mod S of the place
+    that is floor((i + d) / S) below. So for columns. The channels are ordered as a pixel unshuffle orders them.
+    """
+    outputs, inputs, steps = *weight.shape[:2], range(-1, 2)
+    coarse = weight.new_zeros(outputs, factor, factor, inputs, factor, factor, 3, 3)
+    for row, column, down, right in product(range(factor), range(factor), steps, steps):
+        (place_y, y), (place_x, x) = divmod(row + down, factor), divmod(column + right, factor)
+        coarse[:, row, column, :, y, x, place_y + 1, place_x + 1] = weight[:, :, down + 1, right + 1]
+    return coarse.reshape(outputs * factor**2, inputs * factor**2, 3, 3)
 
 
 def _widened(weight: Tensor, channels: tuple[int, int], generator: torch.Generator) -> Tensor:

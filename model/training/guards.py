@@ -10,7 +10,7 @@ from profiles.errors import ModelError
 
 MAX_BAD_STEPS = 10
 WINDOW_STEPS = 200
-TEST_SIDE_PX = 65
+TEST_PLACES = 65
 DIVERGED = 5.0
 """A mean loss this many times the best one so far is no fluctuation: batches vary by a factor of two."""
 
@@ -76,7 +76,8 @@ def require_finite_output(network: Network, where: str, remedy: str = "lower the
     Raises:
         ModelError: it does.
     """
-    image = torch.rand((1, 1, TEST_SIDE_PX, TEST_SIDE_PX), generator=torch.Generator().manual_seed(0))
+    side_px = network.variant.scale * TEST_PLACES
+    image = torch.rand((1, 1, side_px, side_px), generator=torch.Generator().manual_seed(0))
     plain = fold(network, torch.zeros(len(RANGES))) if isinstance(network, ConditionedConvBEERS) else network
     with torch.inference_mode():
         restored = plain(torch.cat([torch.zeros_like(image), image, torch.ones_like(image)]))

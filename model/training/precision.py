@@ -54,11 +54,10 @@ class MixedPrecision(nn.Module):
 
     def forward(self, image: Tensor) -> Tensor:
         """(N, 1, H, W) to the same."""
-        shallow = self.network.head(image)
+        shallow = self.network.entered(image)
         with torch.autocast(image.device.type, dtype=torch.bfloat16, enabled=self.precision == "bfloat16"):
             deep = self.network.body_end(self.network.body(shallow))
-        correction: Tensor = self.network.tail(shallow + deep.float())
-        return image + correction
+        return image + self.network.left(shallow + deep.float())
 
 
 class ConditionedMixedPrecision(nn.Module):

@@ -4,6 +4,7 @@ RUN/checkpoint.safetensors  RUN/log.csv  RUN/validation.csv  RUN/validation.png 
 """
 
 import csv
+import math
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -35,7 +36,7 @@ from model.training.precision import Precision
 from model.training.trainer import Progress, Schedule, Source, Trainer, new_network
 from model.training.validation import Validation, split_by_site
 from model.training.workers import Worker
-from model.variants import variant_named
+from model.variants import Variant, variant_named
 from profiles.errors import OptionError
 
 STEP = re.compile(r"[0-9]{1,18}(?=,)")
@@ -93,9 +94,12 @@ def train(run: Run, resume: bool, worker: Worker, say: Callable[[str], None]) ->
     """Run or resume a training to its end; says first whether LPIPS is part of the loss.
 
     Raises:
-        OptionError: the folder holds a run and `resume` is not asked for, or there is nothing to train on.
+        OptionError: the folder holds a run and `resume` is not asked for, there is nothing to train on, or patches
+            that are no multiple of the network's scale.
         KeyboardInterrupt: stopped; a checkpoint was written.
     """
+    teacher = _plain(run, run.teacher) if run.teacher else None
+    require_whole_places(run, [variant_named(run.variant), *([teacher.variant] if teacher else [])])
     loss, said = loss_of(run)
     if said and worker.first:
         say(said)
@@ -106,7 +110,7 @@ def train(run: Run, resume: bool, worker: Worker, say: Callable[[str], None]) ->
         worker,
         run.device,
         start_weights(run),
-        _plain(run, run.teacher) if run.teacher else None,
+        teacher,
         run.precision,
         run.patches.family is not None,
     )
@@ -122,6 +126,21 @@ def train(run: Run, resume: bool, worker: Worker, say: Callable[[str], None]) ->
     if worker.first:
         recipe = about(run, names, validation.names, loss) | {"precision": trainer.precision}
         finish(trainer.averaged(), run.weights, recipe)
+
+
+def require_whole_places(run: Run, variants: Sequence[Variant]) -> None:
+    """Refuse patches that a network at a lower resolution, or a teacher at one, cannot rearrange.
+
+    Raises:
+        OptionError: such a side.
+    """
+    scale = math.lcm(*(variant.scale for variant in variants))
+    if run.patches.patch_px % scale:
+        expected, got = (
+            f"a multiple of {scale} px, for a network at 1/{scale} resolution",
+            f"{run.patches.patch_px} px",
+        )
+        raise OptionError("--patch", expected=expected, got=got, remedy="choose another")
 
 
 def start_weights(run: Run) -> Mapping[str, Tensor] | None:

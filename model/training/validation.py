@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
 from model.conditioning import ConditionedConvBEERS, Network, SensorFamily, fold, vector_tensor
 from model.io.images import site_of
@@ -75,13 +76,17 @@ class Validation:
     def restore(self, network: Network) -> list[np.ndarray]:
         """Each degraded image through the network in float32, (H, W), clipped to [0, 1].
 
-        A conditioned network is specialised to the sensor that acquired the image.
+        A conditioned network is specialised to the sensor that acquired the image. An image whose sides are no
+        multiples of the network's scale is extended by copies of its last row and column, as in a restoration.
         """
         restored = []
         for (degraded, _), vector in zip(self.pairs, self.vectors, strict=True):
             plain = fold(network, vector) if isinstance(network, ConditionedConvBEERS) else network
+            height, width = degraded.shape[-2:]
+            lack = (-size % plain.variant.scale for size in (width, height))
+            extended = pad(degraded, [each for side in lack for each in (0, side)], mode="replicate")
             with torch.inference_mode():
-                restored.append(plain(degraded)[0, 0].clamp(0, 1).numpy())
+                restored.append(plain(extended)[0, 0, :height, :width].clamp(0, 1).numpy())
         return restored
 
     def judge(self, network: Network) -> Judged:

@@ -4,7 +4,7 @@ import numpy as np
 import onnx
 
 from quant.core import IntConv, IntCore
-from quant.encodings.description import KEY, described_core
+from quant.encodings.description import KEY, PLACE_PX, described_core
 from quant.graph import CORRECTION, PLANES, Conv
 from quant.graph.writer import onnx_weight, write_float
 from quant.onnx_file import GraphWriter, constants, fixed_tile_px, image_info, make_model, metadata
@@ -12,7 +12,9 @@ from quant.untrusted import contradictions
 
 
 def board_model(core: IntCore, about: dict[str, str], tile_px: int | None = None) -> onnx.ModelProto:
-    """`planes` (N, C, H, W) float32, as q * 2^-7, to `correction` (N, C', H', W') float32.
+    """`planes` (N, C, H, W) float32, as q * 2^-7, to `correction` (N, C', H', W') float32; `tile_px` is the image's.
+
+    Where the host moves pixels into channels first, the file says of how many pixels a place of the planes is.
 
     The correction's channels come several times where it has gains or windows: `quant.ends.Ends.merge` makes one.
     """
@@ -27,12 +29,13 @@ def board_model(core: IntCore, about: dict[str, str], tile_px: int | None = None
             write_float(writer, op, feeds, output)
         writer.quantised(op.output, output, core.frac_bits[op.output])
     ends = core.ends
-    size = image_info(PLANES, ends.planes * ends.channels, tile_px)
-    result = image_info(CORRECTION, ends.copies * ends.outputs, tile_px)
+    size = image_info(PLANES, ends.planes * ends.channels, tile_px and tile_px // ends.place_px)
+    result = image_info(CORRECTION, ends.copies * ends.outputs, tile_px and tile_px // ends.correction_px)
     if not ends.adds_image:  # of another size than the image, perhaps
         for side, name in zip(result.type.tensor_type.shape.dim[2:], ("rows", "columns"), strict=True):
             side.dim_param = name
-    return make_model(writer.graph("convbeers-core", [size], [result]), about)
+    places = {PLACE_PX: str(ends.place_px)} if ends.place_px > 1 else {}
+    return make_model(writer.graph("convbeers-core", [size], [result]), about | places)
 
 
 def as_on_board(model: onnx.ModelProto) -> onnx.ModelProto:

@@ -16,6 +16,9 @@ from quant.ends import Ends
 from quant.graph import Activation, Add, AveragePool, Concat, MaxPool, Mul, Op, Pointwise, Resize, Shuffle, Window
 
 KEY = "core"
+PLACE_PX = "place_px"
+"""In the metadata of a board's file: the side in pixels of the square of the image that is one place of its planes;
+1 where nothing is said."""
 LARGEST = 1 << 16
 """Channels, windows, strides and factors of whatever a DPU runs are smaller still."""
 KINDS: dict[str, type] = {

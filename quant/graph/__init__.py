@@ -2,6 +2,7 @@
 
 - `operations`: what there is, convolutions to pixel shuffles, and which tensors must share a scale;
 - `reader`: from float ONNX to a `network`, cut where the host's part ends, with `trials` of what exporters spell out;
+- `plain`: which networks are of ConvBEERS' kind;
 - `writer`: back to float ONNX;
 - `planes`: how 12 bits enter int8.
 """
@@ -30,6 +31,7 @@ from quant.graph.operations import (
     tied,
     ties_scales,
 )
+from quant.graph.plain import correction_graph, image_channels, plain_network
 from quant.graph.planes import (
     COARSE_MAX,
     COUNT,
@@ -41,13 +43,13 @@ from quant.graph.planes import (
     read_planes,
     split,
 )
-from quant.graph.reader import correction_graph, read_network, refusal
+from quant.graph.reader import read_network, refusal
 from quant.graph.writer import graph_to_onnx
 
 __all__ = [
     "COARSE_MAX", "CORRECTION", "COUNT", "IMAGE", "PLANES", "PLANES_FRAC_BITS", "QUARTER", "STEP", "Activation",
     "Add", "AveragePool", "Concat", "Conv", "Graph", "MaxPool", "Mul", "Network", "Op", "Pointwise", "Resize",
     "Shuffle", "Window", "channels_of", "check_network", "coarse_plane_only", "correction_graph",
-    "graph_to_onnx", "is_plain", "read_network", "read_planes", "refusal", "refused_graph",
-    "relu_count", "same", "split", "tensors", "tied", "ties_scales",
+    "graph_to_onnx", "image_channels", "is_plain", "plain_network", "read_network", "read_planes", "refusal",
+    "refused_graph", "relu_count", "same", "split", "tensors", "tied", "ties_scales",
 ]  # fmt: skip

@@ -22,7 +22,6 @@ from quant.graph.operations import (
     AveragePool,
     Concat,
     Conv,
-    Graph,
     MaxPool,
     Mul,
     Op,
@@ -31,7 +30,6 @@ from quant.graph.operations import (
     Resize,
     Shuffle,
     Window,
-    is_plain,
 )
 from quant.graph.trials import makes_blocks, spelled_shuffle
 from quant.onnx_file import constants
@@ -49,21 +47,6 @@ def read_network(model: onnx.ModelProto) -> Network:
         network = cut(reader.sized_graph(), _channels_in(model), reader.flat, reader.softmax)
         check_network(network)
     return network
-
-
-def correction_graph(model: onnx.ModelProto) -> Graph:
-    """The operations from `image` to `correction` of a network that restores one channel by a global add.
-
-    Raises:
-        ModelError: any other network.
-    """
-    network = read_network(model)
-    if network != Network(network.graph):
-        raise refused_graph("an image of one channel, and a global add of it at the end", "another network")
-    for op in network.graph:
-        if not (isinstance(op, Conv | Add) and is_plain(op)):
-            raise refused_graph("only same-size convolutions of stride 1, ReLU and adds", op.name)
-    return network.graph
 
 
 def refusal(model: onnx.ModelProto) -> str:

@@ -7,13 +7,15 @@ import torch
 from typer.testing import CliRunner, Result
 
 from deploy.cli import app
-from deploy.export import parity, require_parity, to_onnx
+from deploy.export import parity, require_parity, to_onnx, weights_for
 from model.conditioning import vector_tensor
-from model.convbeers import ConvBEERS, initialise
+from model.convbeers import ConvBEERS, initialise, plain_network
 from model.io.weights import load_conditioned, save_network
-from model.variants import Variant
+from model.shipped import shipped_weights
+from model.training.grow import grow
+from model.variants import VARIANTS, Variant
 from profiles import load_sensor
-from profiles.errors import ModelError
+from profiles.errors import ModelError, OptionError
 from profiles.toml import HERE
 from quant.onnx_file import fixed_tile_px, metadata, save_onnx
 from quant.session import open_session, run
@@ -32,6 +34,26 @@ def test_torch_and_onnxruntime_agree(network: ConvBEERS, tile_px: int | None, tm
     save_onnx(to_onnx(network, {"variant": "test"}, tile_px), path)
     assert parity(network, path, tile_px or 33) < 1e-6
     assert fixed_tile_px(onnx.load(path)) == tile_px
+
+
+@pytest.mark.parametrize("scale", [2, 3])
+def test_they_agree_at_a_lower_resolution_and_a_tile_is_whole_places(scale: int) -> None:
+    coarse = ConvBEERS(Variant(1, 8, scale))
+    initialise(coarse, torch.Generator().manual_seed(0))
+    assert parity(coarse.eval(), to_onnx(coarse, {}), 32) < 1e-6
+    assert parity(coarse, to_onnx(coarse, {}, 12 * scale), 12 * scale) < 1e-6
+    with pytest.raises(OptionError, match=f"--tile: expected a multiple of {scale} px, got 41 px"):
+        to_onnx(coarse, {}, 41)
+
+
+def test_the_shipped_network_at_half_resolution_restores_the_same_image() -> None:
+    """Rearranged on both sides: in torch's order of the channels and in ONNX's."""
+    weights, _ = weights_for(shipped_weights("convbeers-xs"), load_sensor("pleiades-degraded").nominal())
+    small = plain_network(weights.tensors, weights.variant)
+    coarse = grow(small, VARIANTS["convbeers-half"], torch.Generator().manual_seed(0)).eval()
+    image = np.random.default_rng(1).random((1, 1, 34, 50), dtype=np.float32)
+    expected, found = (run(open_session(to_onnx(network, {})), image) for network in (small, coarse))
+    np.testing.assert_allclose(found, expected, atol=2e-6)
 
 
 def test_parity_notices_other_weights(network: ConvBEERS, tmp_path: Path) -> None:

@@ -108,6 +108,40 @@ def test_a_conditioned_run_that_learns_nothing_is_what_it_started_from(images: P
     assert all(torch.allclose(value, again[name]) for name, value in trained.state_dict().items())
 
 
+def test_a_run_at_half_resolution_starts_from_a_network_at_full_resolution(images: Path, tmp_path: Path) -> None:
+    options = ["--variant", "convbeers-half", "--conditioned", "--validate-every", "2", "--start", "convbeers-xs"]
+    run(images, tmp_path / "still", *options, "--learning-rate", "0", steps=1)
+    weights, start = (
+        tmp_path / "still" / "convbeers-half.safetensors",
+        load_conditioned(shipped_weights("convbeers-xs")),
+    )
+    image, vector = (
+        torch.rand(1, 1, 26, 34, generator=torch.Generator().manual_seed(0)),
+        torch.tensor([0.3, 0, -1, 1]),
+    )
+    with torch.inference_mode():
+        grown, small = (fold(each[0], vector)(image) for each in (load_conditioned(weights), start))
+    torch.testing.assert_close(grown, small, rtol=0, atol=1e-5)
+    run(images, tmp_path / "a", *options)
+    assert [row["step"] for row in rows(tmp_path / "a" / "validation.csv")] == ["2", "4"]
+    first = weights_of(tmp_path / "a" / weights.name)
+    run(images, tmp_path / "a", *options, "--resume")
+    assert all(torch.equal(value, first[name]) for name, value in weights_of(tmp_path / "a" / weights.name).items())
+
+
+def weights_of(path: Path) -> dict[str, torch.Tensor]:
+    return load_conditioned(path)[0].state_dict()
+
+
+def test_a_patch_must_be_whole_places_of_the_teacher_too(images: Path, tmp_path: Path) -> None:
+    run(images, tmp_path / "a", "--variant", "convbeers-half", "--validate-every", "0", steps=1)
+    teacher = ["--teacher", str(tmp_path / "a" / "convbeers-half.safetensors"), "--patch", "33", "--steps", "1"]
+    result = CliRunner().invoke(app, ["train", "--images", str(images), "--out", str(tmp_path / "b"), *teacher])
+    assert result.exit_code == 2
+    assert "a multiple of 2 px" in " ".join(result.output.split())
+    assert not list((tmp_path / "b").iterdir())
+
+
 def test_a_plain_run_starts_from_the_shipped_network_for_its_sensor(images: Path, tmp_path: Path) -> None:
     options = ["--sensor", "pleiades-degraded", "--learning-rate", "0", "--validate-every", "0"]
     run(images, tmp_path / "a", *options, "--start", "convbeers-xs", steps=1)
@@ -139,6 +173,7 @@ def test_a_plain_run_starts_from_the_shipped_network_for_its_sensor(images: Path
         (["--pairs", "here", "--validate-every", "5"], "nothing to validate on"),
         (["--drawn", "1", "--validate-every", "5"], "--validate-every: expected --images"),
         (["--drawn", "1", "--distil", "2"], "--distil: expected --teacher"),
+        (["--drawn", "1", "--variant", "convbeers-half", "--patch", "33"], "--patch: expected a multiple of 2 px"),
     ],
 )
 def test_wrong_options_get_one_sentence(options: list[str], words: str, tmp_path: Path) -> None:

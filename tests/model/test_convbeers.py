@@ -16,10 +16,11 @@ def test_the_parameters_are_those_of_the_paper(name: str, parameters: int) -> No
     assert sum(p.numel() for p in ConvBEERS(VARIANTS[name]).parameters()) == parameters
 
 
-@pytest.mark.parametrize("blocks", [0, 1, 3])
-def test_the_radius_is_how_far_a_gradient_reaches(blocks: int) -> None:
-    variant = Variant(blocks=blocks, features=4)
-    side, middle = 4 * variant.radius_px + 1, 2 * variant.radius_px
+@pytest.mark.parametrize(("blocks", "scale"), [(0, 1), (1, 1), (3, 1), (0, 2), (2, 2), (1, 3)])
+def test_the_radius_is_how_far_a_gradient_reaches(blocks: int, scale: int) -> None:
+    """Of the first pixel of a place, whose other pixels are below it."""
+    variant = Variant(blocks=blocks, features=4, scale=scale)
+    side, middle = 4 * scale * variant.radius_px + scale, 2 * scale * variant.radius_px
     image = torch.rand(1, 1, side, side, generator=torch.Generator().manual_seed(1)).requires_grad_()
     network = build(variant)
     for module in network.modules():
@@ -28,12 +29,14 @@ def test_the_radius_is_how_far_a_gradient_reaches(blocks: int) -> None:
     network(image)[0, 0, middle, middle].backward()
     assert image.grad is not None
     rows = image.grad[0, 0].abs().sum(1).nonzero().flatten()
-    assert (middle - int(rows.min()), int(rows.max()) - middle) == (variant.radius_px, variant.radius_px)
+    reached = (middle - int(rows.min()), int(rows.max()) - middle)
+    assert reached == (variant.radius_px, variant.radius_px + scale - 1)
 
 
 @pytest.mark.parametrize("name", VARIANTS)
 def test_a_new_network_is_nearly_the_identity(name: str) -> None:
-    image = torch.rand(1, 1, 37, 53, generator=torch.Generator().manual_seed(1))
+    scale = VARIANTS[name].scale
+    image = torch.rand(1, 1, 37 * scale, 53 * scale, generator=torch.Generator().manual_seed(1))
     difference = (build(VARIANTS[name])(image) - image).detach()
     assert bool(torch.isfinite(difference).all())
     assert float(difference.std()) < 0.1
@@ -55,7 +58,22 @@ def test_the_same_seed_gives_the_same_network() -> None:
     assert not all(map(torch.equal, first, other))
 
 
-def test_any_size_keeps_its_shape() -> None:
-    network = build(Variant(1, 4))
-    for shape in ((1, 1, 1, 1), (2, 1, 13, 21), (1, 1, 1, 40)):
+@pytest.mark.parametrize("scale", [1, 2])
+def test_any_size_keeps_its_shape(scale: int) -> None:
+    network = build(Variant(1, 4, scale))
+    for number, rows, columns in ((1, 1, 1), (2, 13, 21), (1, 1, 40)):
+        shape = (number, 1, rows * scale, columns * scale)
         assert network(torch.zeros(shape)).shape == shape
+
+
+def test_at_half_resolution_a_shift_by_a_place_shifts_the_result_and_a_pixel_does_not() -> None:
+    """The four pixels of a place are channels of their own: the lattice, by which tiles are cut, is 2."""
+    network, side = build(Variant(1, 4, 2)), 32
+    image = torch.rand(1, 1, side, side, generator=torch.Generator().manual_seed(1))
+    inner, whole = slice(12, -12), network(image)
+    apart = [
+        float((network(image.roll(step, -1)).roll(-step, -1) - whole)[..., inner, inner].detach().abs().max())
+        for step in (2, 1)
+    ]
+    assert apart[0] < 1e-6
+    assert apart[1] > 1e-4

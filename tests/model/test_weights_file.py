@@ -35,6 +35,14 @@ def test_a_network_comes_back_as_it_was(blocks: int, features: int, tmp_path: Pa
     assert [p.name for p in path.parent.iterdir()] == ["w.safetensors"]
 
 
+def test_the_scale_is_kept_and_full_resolution_where_none_is_said(tmp_path: Path) -> None:
+    coarse, path = ConvBEERS(Variant(1, 4, 2)), tmp_path / "w.safetensors"
+    save_network(path, coarse, {})
+    assert load_network(path)[0].variant == coarse.variant
+    write_tensors(path, arrays(network().state_dict()), {"variant": {"blocks": 1, "features": 4}})
+    assert load_network(path)[0].variant.scale == 1
+
+
 def test_tensors_of_any_layout_and_kind_come_back(tmp_path: Path) -> None:
     tensors = {
         "turned": np.arange(6.0).reshape(2, 3).T,
@@ -72,6 +80,9 @@ def test_a_truncated_file_is_refused(tmp_path: Path) -> None:
         {"blocks": 1},
         {"blocks": "many", "features": 4},
         {"blocks": float("inf"), "features": 4},
+        {"blocks": 1, "features": 4, "scale": 2},
+        {"blocks": 1, "features": 4, "scale": -1},
+        {"blocks": 1, "features": 4, "scale": 0},
         "convbeers",
         None,
     ],

@@ -34,6 +34,7 @@ from quant.passes.equalise import channel_ranges, equalise, first_guess
 from quant.passes.stream import OFFSETS, half_lsb_pair, streams, two_gains
 from quant.quantise import Quantised
 from quant.session import open_session, planes_of, run
+from tests.quant.tiling.small_networks import half_resolution
 
 SIZES = [(37, 53), (16, 91), (5, 3)]
 
@@ -248,3 +249,14 @@ def test_the_half_lsb_pair_lose_less(float_onnx: onnx.ModelProto, patches: Patch
         return compare(open_session(float_onnx), open_session(model), unseen.pairs).mae
 
     assert mae(step) < 0.95 * mae(0.0)
+
+
+def test_at_half_resolution_the_pixels_of_a_place_find_their_way_back(patches: Patches, unseen: Patches) -> None:
+    """The same ends as in the legal regime around other numbers: a channel in another's place would be far off."""
+    model = half_resolution()
+    made = quantise_free(model, patches, {}, tick=lambda: None)
+    assert {"SpaceToDepth", "DepthToSpace"} < {node.op_type for node in made.graph.node}
+    in_float, in_int8 = open_session(model), open_session(made)
+    found = compare(in_float, in_int8, unseen.pairs).mae
+    corrections = [float(np.abs(run(in_float, degraded) - degraded).mean()) for degraded, _ in unseen.pairs]
+    assert found < 0.05 * np.mean(corrections)

@@ -30,7 +30,11 @@ def one_thread() -> Iterator[None]:
 
 @pytest.fixture(scope="session")
 def network() -> ConvBEERS:
-    made = ConvBEERS(Variant(blocks=1, features=6))
+    return small_network(Variant(blocks=1, features=6))
+
+
+def small_network(variant: Variant) -> ConvBEERS:
+    made = ConvBEERS(variant)
     initialise(made, torch.Generator().manual_seed(3))
     with torch.no_grad():
         made.tail.weight.mul_(0.03)  # a trained network keeps flat ground; a new one nearly does
@@ -44,6 +48,10 @@ def float_onnx(network: ConvBEERS) -> onnx.ModelProto:
 
 @pytest.fixture(scope="session")
 def quantised(float_onnx: onnx.ModelProto) -> Quantised:
+    return quickly_quantised(float_onnx)
+
+
+def quickly_quantised(float_onnx: onnx.ModelProto) -> Quantised:
     scene = procedural_scene(700, 700, np.random.default_rng(1))
     sensors = load_sensor("pleiades-degraded"), load_sensor("pleiades-reference")
     patches = draw_patches([scene], *sensors, count=2, seed=5)
@@ -54,7 +62,10 @@ def quantised(float_onnx: onnx.ModelProto) -> Quantised:
 @pytest.fixture(scope="session")
 def pair(float_onnx: onnx.ModelProto, quantised: Quantised, tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     """The two files."""
-    folder = tmp_path_factory.mktemp("pair")
+    return saved(float_onnx, quantised, tmp_path_factory.mktemp("pair"))
+
+
+def saved(float_onnx: onnx.ModelProto, quantised: Quantised, folder: Path) -> list[Path]:
     paths = [folder / "float.onnx", folder / "int8.onnx"]
     for model, path in zip((float_onnx, quantised.host), paths, strict=True):
         save_onnx(model, path)
@@ -64,3 +75,11 @@ def pair(float_onnx: onnx.ModelProto, quantised: Quantised, tmp_path_factory: py
 @pytest.fixture(scope="session")
 def subject(pair: list[Path]) -> Subject:
     return open_subject(pair[0], pair[1], "")
+
+
+@pytest.fixture(scope="session")
+def coarse(tmp_path_factory: pytest.TempPathFactory) -> Subject:
+    """A network at half resolution, in both precisions."""
+    model = to_onnx(small_network(Variant(blocks=1, features=8, scale=2)), {"variant": "test"})
+    paths = saved(model, quickly_quantised(model), tmp_path_factory.mktemp("coarse"))
+    return open_subject(paths[0], paths[1], "")

@@ -36,6 +36,14 @@ def test_a_small_network_passes_every_case(case: Case, subject: Subject) -> None
     assert not [(o.stage, o.verdict, o.reason) for o in outcomes if o.failed]
 
 
+@pytest.mark.parametrize("name", ["full scale", "steps", "NaN pixels", "nodata stripes", "1 x 1", "flat 1 x N"])
+def test_a_network_at_half_resolution_passes(name: str, coarse: Subject) -> None:
+    """At odd sizes too, which are extended to whole places."""
+    outcomes = look(coarse, [name], ("float32", "bfloat16", "INT8", "INT8 reference", "tiling"))
+    assert not [(o.stage, o.verdict, o.reason) for o in outcomes if o.failed or o.reason]
+    assert any(o.measures for o in outcomes if o.stage != "INT8 reference")
+
+
 @pytest.mark.parametrize("name", ["full scale", "hot pixel", "night", "NaN pixels", "1 x 1"])
 def test_the_traditional_chain_passes(name: str, subject: Subject) -> None:
     case = BY_NAME[name]

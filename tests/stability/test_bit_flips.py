@@ -19,10 +19,10 @@ from deploy.stress.flip_study import FlipRequest, flip_curves_svg, make_target, 
 from deploy.stress.flips import MEMORIES, RATES, FaultTarget, Injected, curve_rows, name_of, place_rows, restored
 from deploy.stress.networks import core_of
 from deploy.stress.rows import markdown
-from deploy.stress.subject import open_subject
+from deploy.stress.subject import Subject, open_subject
 from profiles.figures import Row, by_table
 from quant.core import IntConv
-from quant.faults import Guards, as_stored, checksums
+from quant.faults import Guards, as_stored, checksums, map_channels
 from quant.graph import Activation
 from quant.integer import SOUND
 from tests.stability.makers import DOCS, load_maker
@@ -81,6 +81,17 @@ def test_an_injection_leaves_the_target_alone(memory: str, target: FaultTarget) 
     np.testing.assert_array_equal(restored(target, injected), restored(target, injected))
     np.testing.assert_array_equal(image, before)
     np.testing.assert_array_equal(restored(target, target.fault_free(0)), fault_free)
+
+
+def test_at_half_resolution_maps_have_a_bit_for_each_channel_of_each_place(coarse: Subject) -> None:
+    target = make_target(coarse, REQUEST)
+    image, _ = target.pairs[0]
+    sound = restored(target, target.fault_free(0))
+    assert sound.shape == image.shape
+    assert np.abs(sound - image).max() > 0
+    every = MEMORIES["maps"](target, image, 1e6, np.random.default_rng(0))
+    assert every.flips == 8 * image.size // 4 * sum(map_channels(target.core).values())
+    assert (restored(target, every) != sound).mean() > 0.5
 
 
 def test_the_sign_hurts_more_than_the_least_bit(target: FaultTarget) -> None:

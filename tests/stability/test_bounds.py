@@ -10,9 +10,9 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from deploy.stress.subject import infer_in, open_subject
+from deploy.stress.subject import Subject, infer_in, open_subject
 from model.shipped import SHIPPED
-from profiles.errors import ModelError
+from profiles.errors import BeersError, ModelError
 from quant.bounds import bound_anywhere, bound_inside, compose, layer_bounds
 from quant.core import IntConv
 from quant.encodings import read_core
@@ -49,6 +49,22 @@ def test_no_image_leaves_the_float_bounds(seed: int, shape: tuple[int, int], bin
         inside = bound_inside(graph)
         assert inside.low <= inner.min()
         assert inner.max() <= inside.high
+
+
+@settings(max_examples=20)
+@given(seed=st.integers(0, 999), shape=st.tuples(st.integers(1, 12), st.integers(1, 12)), binary=st.booleans())
+def test_no_image_leaves_the_bounds_at_half_resolution(
+    seed: int, shape: tuple[int, int], binary: bool, coarse: Subject
+) -> None:
+    """There the pixels of a place are channels, each with its own bound; the largest is told."""
+    assert not isinstance(coarse.graph, BeersError)
+    image = images(seed, (2 * shape[0], 2 * shape[1]), binary)
+    restored, anywhere = infer_in(coarse.graph, torch.float64)(image), bound_anywhere(coarse.graph)
+    inside = bound_inside(coarse.graph)
+    assert anywhere.low <= restored.min()
+    assert restored.max() <= anywhere.high
+    assert anywhere.low <= inside.low < inside.high <= anywhere.high
+    np.testing.assert_allclose(restored, coarse.float32.infer()(image.astype(np.float32)), atol=1e-5)
 
 
 def test_the_bound_inside_is_the_tighter_one_and_neither_is_loose_without_reason(graph: Graph) -> None:

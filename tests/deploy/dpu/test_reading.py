@@ -10,9 +10,12 @@ from onnx import TensorProto, numpy_helper
 from deploy.dpu.board import load_dpu
 from deploy.dpu.checker.placement import place
 from deploy.dpu.graph import Operation
-from deploy.dpu.reading import read_network
+from deploy.dpu.reading import own_tile_px, read_network
 from profiles.errors import ModelError
+from quant.encodings import PLACE_PX, board_model
+from quant.onnx_file import save_onnx
 from tests.deploy.dpu.graphs import Sketch, board_convbeers, float_convbeers, integer_convbeers
+from tests.quant.tiling.small_networks import quantised_half_resolution
 
 
 def core(path: Path) -> list[tuple[object, ...]]:
@@ -144,3 +147,35 @@ def test_nodes_that_cannot_be_never_end_in_a_traceback(tmp_path: Path, draw: Cal
     path = sketch.save(tmp_path / "x.onnx", draw(sketch))
     with contextlib.suppress(ModelError):
         place(read_network(path, 32), load_dpu("vck190"))
+
+
+@pytest.mark.parametrize("encoding", ["host", "board"])
+def test_the_core_of_a_network_at_half_resolution_has_maps_of_half_the_tile(encoding: str, tmp_path: Path) -> None:
+    """In the host's file the core is only described, and the board's begins behind the rearranging."""
+    model = getattr(quantised_half_resolution(), encoding)
+    save_onnx(model, tmp_path / "half.onnx")
+    convolutions = [op for op in read_network(tmp_path / "half.onnx", 64).operations if op.kind == "conv"]
+    assert {op.out_shape[1:] for op in convolutions if op.out_shape} == {(32, 32)}
+    assert convolutions[0].channels[0] == 3 * 4
+    with pytest.raises(ModelError, match="expected a tile of a multiple of 2 px, got 63 px"):
+        read_network(tmp_path / "half.onnx", 63)
+
+
+def test_a_core_at_half_resolution_that_is_fixed_to_a_tile_is_fixed_to_half_of_it(tmp_path: Path) -> None:
+    model = quantised_half_resolution()
+    fixed = board_model(model.core, {}, 64)
+    assert [d.dim_value for d in fixed.graph.input[0].type.tensor_type.shape.dim[2:]] == [32, 32]
+    assert own_tile_px(fixed) == 64
+    save_onnx(fixed, tmp_path / "fixed.onnx")
+    with pytest.raises(ModelError, match="one fixed to 64 x 64; pass --tile 64"):
+        read_network(tmp_path / "fixed.onnx", 66)
+
+
+@pytest.mark.parametrize("said", ["0", "-2", "half", "1000000"])
+def test_places_that_cannot_be_are_refused(said: str, tmp_path: Path) -> None:
+    model = onnx.ModelProto()
+    model.CopyFrom(quantised_half_resolution().board)
+    next(each for each in model.metadata_props if each.key == PLACE_PX).value = said
+    save_onnx(model, tmp_path / "half.onnx")
+    with pytest.raises(ModelError, match="contradict"):
+        read_network(tmp_path / "half.onnx", 64)

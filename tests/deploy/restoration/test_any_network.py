@@ -27,6 +27,8 @@ from tests.quant.tiling.small_networks import (
     float_unet,
     four_bands,
     graph,
+    half_resolution,
+    int8_half_resolution,
     plain_int8_unet,
 )
 
@@ -35,6 +37,8 @@ NETWORKS: dict[str, tuple[Callable[[], onnx.ModelProto], Tiling]] = {
     "INT8 U-Net": (plain_int8_unet, Tiling(16, 8)),
     "ESPCN": (espcn, tiling_of(espcn())),
     "FFDNet": (ffdnet, Tiling(6, 2)),
+    "half resolution": (half_resolution, Tiling(10, 2)),
+    "INT8 half resolution": (int8_half_resolution, Tiling(10, 2)),
     "4 bands": (four_bands, Tiling(2, 1, tiling_of(four_bands()).scale, 4, 4)),
     "4 bands to 2": (lambda: four_bands(2), Tiling(2, 1, tiling_of(four_bands()).scale, 4, 2)),
 }

@@ -6,12 +6,15 @@ import pytest
 
 from deploy.bench.tables import Swath
 from deploy.dpu.board import load_dpu
-from deploy.export import float_model
+from deploy.export import float_model, to_onnx
 from deploy.networks import shipped_pair
 from deploy.tradeoff.methods import Network, find_networks, is_papers, operations_per_px, shape_of
 from deploy.tradeoff.points import EXACT, LEGAL, PRECISIONS, Board, Variant, network_points, other_points, tiles_px
 from deploy.tradeoff.selection import board_of, configurations_for, precisions_of
+from model.convbeers import ConvBEERS
+from model.io.weights import save_network
 from model.shipped import shipped_names, shipped_weights
+from model.variants import Variant as Shape
 from profiles import load_target
 from profiles.errors import ModelError, OptionError
 
@@ -108,6 +111,21 @@ def test_one_network_twice_is_once_and_two_of_one_name_are_refused(tmp_path: Pat
     other.write_bytes(shipped_weights("convbeers-xs").read_bytes())
     with pytest.raises(OptionError, match="names that differ"):
         find_networks(["convbeers-xs", str(other)])
+
+
+def test_a_network_at_half_resolution_is_taken_and_one_of_a_coarse_lattice_is_not(tmp_path: Path) -> None:
+    """Halos and tiles are compared in steps that its lattice must divide."""
+    for name, scale in (("half", 2), ("sixteenth", 16)):
+        save_network(tmp_path / f"{name}.safetensors", ConvBEERS(Shape(1, 4, scale)).eval(), {})
+    (half,) = find_networks([str(tmp_path / "half.safetensors")])
+    assert operations_per_px(half.model()) == 2 * 9 * (4 * 4 + 3 * 4 * 4 + 4 * 4) / 4
+    assert not is_papers(to_onnx(ConvBEERS(Shape(16, 64, 2)).eval(), {}))
+    board = board_of(half, Swath(13600, 9016), load_target("vck190"))
+    assert board.radius_px == 10
+    for point in network_points("half", [LEGAL], board):
+        assert point.tile_px % 2 == point.halo_px(board.radius_px) % 2 == 0
+    with pytest.raises(OptionError, match="all multiples of 8 px are compared"):
+        find_networks([str(tmp_path / "sixteenth.safetensors")])
 
 
 @pytest.mark.parametrize("name", ["", "convbeers-huge", "traditional"])

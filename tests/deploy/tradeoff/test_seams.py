@@ -1,5 +1,7 @@
 """The price of seams: measured where an image is cut, weighed by how many seams a swath has."""
 
+from functools import partial
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -10,7 +12,9 @@ from deploy.restoration.engine import restore_dn
 from deploy.restoration.plan import make_plan
 from deploy.tradeoff.accuracy import Scores, cut_in_four, halves, seam_density, with_seams
 from model.evaluation.scores import fidelity_db
-from quant.tiling.walk import Tiling
+from quant.session import open_session, run
+from quant.tiling.walk import Tiling, tiling_of
+from tests.quant.tiling.small_networks import half_resolution
 
 RADIUS_PX = 2
 
@@ -36,6 +40,25 @@ def test_with_the_whole_radius_the_cut_does_not_show_and_with_less_it_does() -> 
     assert np.all(
         (abs(rows - 17.5) <= RADIUS_PX) | (abs(columns - 24.5) <= RADIUS_PX)
     )  # cut before row 18, column 25
+
+
+def test_a_network_at_half_resolution_is_cut_on_its_lattice() -> None:
+    """At odd sizes too: with the whole radius nothing shows, with less it does."""
+    model = half_resolution()
+    infer, tiling = partial(run, open_session(model)), tiling_of(model)
+    dn = image((83, 70))
+    whole = restore_dn(dn, infer, make_plan((1, *dn.shape), 500, tiling.halo_px, tiling))
+    np.testing.assert_array_equal(cut_in_four(infer, tiling.halo_px, lattice_px=2)(dn), whole)
+    assert (cut_in_four(infer, 0, lattice_px=2)(dn) != whole).any()
+
+
+@given(st.integers(2, 99), st.integers(0, 24), st.sampled_from([1, 2, 4, 8]))
+def test_halves_begin_on_the_lattice_and_read_to_its_end(size_px: int, halo: int, lattice_px: int) -> None:
+    spans = halves(size_px, halo * lattice_px, lattice_px)
+    assert [p for span in spans for p in range(span.keep_start, span.keep_stop)] == list(range(size_px))
+    for span in spans:
+        assert span.start % lattice_px == span.stop % lattice_px == 0
+        assert span.start <= span.keep_start <= span.keep_stop <= span.stop < size_px + lattice_px
 
 
 @given(st.integers(2, 99), st.integers(0, 99))

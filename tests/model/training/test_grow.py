@@ -20,13 +20,15 @@ def network(features: int) -> ConvBEERS:
 
 
 LARGER = [Variant(2, 6), Variant(2, 18), Variant(3, 6), Variant(5, 12), Variant(4, 6)]
+LARGER += [Variant(2, 24, 2), Variant(3, 48, 2), Variant(2, 54, 3)]
+"""Coarser ones too: at scale S a feature becomes S x S."""
 
 
 @pytest.mark.parametrize("variant", LARGER)
 def test_the_larger_network_computes_the_same(variant: Variant) -> None:
     small = network(6)
     large = grow(small, variant, torch.Generator().manual_seed(3))
-    image = torch.rand(2, 1, 13, 17, generator=torch.Generator().manual_seed(4))
+    image = torch.rand(2, 1, 18, 24, generator=torch.Generator().manual_seed(4))
     torch.testing.assert_close(large(image), small(image), atol=1e-5, rtol=1e-5)
 
 
@@ -57,12 +59,37 @@ def test_a_conditioned_network_grows_for_every_sensor(variant: Variant) -> None:
         for parameter in direction.parameters():
             torch.nn.init.normal_(parameter, 0.0, 0.05, torch.Generator().manual_seed(seed))
     large = grow_conditioned(small, variant, torch.Generator().manual_seed(3))
-    image = torch.rand(1, 1, 13, 17, generator=torch.Generator().manual_seed(4))
+    image = torch.rand(1, 1, 18, 24, generator=torch.Generator().manual_seed(4))
     for vector in (torch.tensor([-1.0, -0.5, 0.2, 0.9]), torch.tensor([0.7, 0.7, -1.0, -0.6])):
         torch.testing.assert_close(fold(large, vector)(image), fold(small, vector)(image), atol=1e-5, rtol=1e-5)
 
 
-@pytest.mark.parametrize("variant", [Variant(1, 12), Variant(2, 9), Variant(2, 3)])
+def test_a_coarser_network_grows_from_one_of_its_own_scale() -> None:
+    coarse = grow(network(6), Variant(2, 24, 2), torch.Generator().manual_seed(3))
+    wider = grow(coarse, Variant(3, 48, 2), torch.Generator().manual_seed(3))
+    image = torch.rand(2, 1, 18, 24, generator=torch.Generator().manual_seed(4))
+    torch.testing.assert_close(wider(image), network(6)(image), atol=1e-5, rtol=1e-5)
+
+
+def test_the_pixels_of_a_place_learn_different_things() -> None:
+    """Else a coarser network would keep to what the finer one could have learnt."""
+    coarse = grow(network(6), Variant(2, 24, 2), torch.Generator().manual_seed(3))
+    image = torch.rand(2, 1, 18, 24, generator=torch.Generator().manual_seed(4))
+    coarse(image).abs().sum().backward()
+    weight = dict(coarse.named_parameters())["body.0.first.weight"]
+    assert weight.grad is not None
+    assert (weight == 0).any()
+    assert weight.grad[weight == 0].any()
+
+
+def test_a_finer_network_is_refused() -> None:
+    coarse = grow(network(6), Variant(2, 24, 2), torch.Generator().manual_seed(3))
+    for variant in (Variant(2, 24), Variant(2, 96, 4)):
+        with pytest.raises(ModelError, match="scale 2"):
+            grow(coarse, variant, torch.Generator().manual_seed(3))
+
+
+@pytest.mark.parametrize("variant", [Variant(1, 12), Variant(2, 9), Variant(2, 3), Variant(2, 12, 2)])
 def test_a_network_that_does_not_fit_is_refused(variant: Variant) -> None:
     with pytest.raises(ModelError, match="features"):
         grow(network(6), variant, torch.Generator().manual_seed(3))

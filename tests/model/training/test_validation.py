@@ -28,6 +28,19 @@ def test_few_sites_are_all_trained_on() -> None:
     assert split_by_site([]) == ([], [])
 
 
+def test_images_of_odd_sides_are_judged_at_half_resolution_too() -> None:
+    validation = Validation([procedural_scene(303, 303, np.random.default_rng(1))], *EYES)
+    height, width = validation.pairs[0][0].shape[-2:]
+    assert height % 2
+    assert width % 2
+    network = ConvBEERS(Variant(1, 4, 2)).eval()
+    for parameter in network.tail.parameters():
+        parameter.data.zero_()
+    judged = validation.judge(network)
+    assert validation.restore(network)[0].shape == (height, width)
+    assert judged.psnr_db == judged.degraded_psnr_db
+
+
 def test_a_new_network_is_judged_like_its_input() -> None:
     scenes = [procedural_scene(side, side, np.random.default_rng(side)) for side in (300, 460, 90)]
     validation = Validation(scenes, *EYES)

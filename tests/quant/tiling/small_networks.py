@@ -3,14 +3,21 @@
 import math
 from dataclasses import dataclass, field
 from fractions import Fraction
+from functools import cache
 from typing import Any
 
 import numpy as np
 import onnx
+import torch
 from hypothesis import strategies as st
 from onnx import TensorProto, helper, numpy_helper
 
+from deploy.export import to_onnx
+from model.convbeers import ConvBEERS, initialise
+from model.variants import Variant
+from quant.calibration import Patches, Remade
 from quant.onnx_file import image_info, make_model
+from quant.quantise import Passes, Quantised, quantise_model
 
 
 def constant(name: str, *shape: int) -> onnx.TensorProto:
@@ -317,3 +324,26 @@ def plain_int8_unet() -> onnx.ModelProto:
         weight("third", 8, 4, 3, 3),
         weight("last", 1, 4, 3, 3),
     )
+
+
+def half_resolution() -> onnx.ModelProto:
+    """A ConvBEERS of one block at scale 2, of weights that are large enough to show a seam."""
+    network = ConvBEERS(Variant(blocks=1, features=8, scale=2))
+    initialise(network, torch.Generator().manual_seed(0))
+    with torch.no_grad():
+        for value in network.parameters():
+            value.mul_(2.0)
+    return to_onnx(network.eval(), {})
+
+
+@cache
+def quantised_half_resolution() -> Quantised:
+    """The same in legal INT8, for the host and for the board."""
+    seen = np.random.default_rng(5).random((2, 1, 1, 48, 48), dtype=np.float32)
+    patches = Patches([], Remade(lambda k: (seen[k], seen[k]), 2), Remade(lambda k: seen[k], 2))
+    return quantise_model(half_resolution(), patches, {}, lambda: None, Passes(equalise=False))
+
+
+def int8_half_resolution() -> onnx.ModelProto:
+    """The host's file of it."""
+    return quantised_half_resolution().host

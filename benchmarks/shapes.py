@@ -1,0 +1,83 @@
+"""What shapes of ConvBEERS cost on boards, before anyone trains them: BLOCKSxFEATURES, at 1/SCALE resolution @SCALE.
+
+    python benchmarks/shapes.py [--shapes 4x16,8x32,4x64@2] [--boards vck190:C32B3,vck190:C32B6] [--tile 640]
+
+Random weights, quantised without a search: predicted time does not depend on numbers. A swath of 13600 x 9016 is cut
+into whole tiles with exact seams. What a shape is worth only training tells: `beers-deploy train`, then `evaluate`.
+"""
+
+import argparse
+import math
+import re
+
+import numpy as np
+import onnx
+import torch
+
+from deploy.bench.tables import PAPER_SIZE, Swath, parse_size, swath_latency
+from deploy.dpu.board import Dpu, load_dpu
+from deploy.export import to_onnx
+from deploy.tradeoff.board import predict_model
+from model.convbeers import ConvBEERS, initialise
+from model.variants import Variant
+from quant.calibration import Patches, Remade
+from quant.quantise import Passes, quantise_model
+from quant.tiling.walk import receptive_radius_px
+
+SHAPES = "4x16,8x32,16x32,16x64,4x32@2,8x32@2,4x48@2,8x48@2,3x64@2,4x64@2,2x64@4,4x96@4,4x128@4"
+SHAPE = re.compile(r"(\d+)x(\d+)(?:@(\d+))?")
+SIDE_PX = 48
+QUICK = Passes(equalise=False, fit_weights=False)
+
+
+def main() -> None:
+    """Print a row a shape."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--shapes", default=SHAPES)
+    parser.add_argument("--boards", default="vck190:C32B3,vck190:C32B6", help="each with its configuration")
+    parser.add_argument("--tile", type=int, default=640)
+    arguments = parser.parse_args()
+    boards = [load_dpu(*board.split(":")) for board in arguments.boards.split(",")]
+    heads = [f"{dpu.target.name} {dpu.name}, {unit}" for dpu in boards for unit in ("frame/s", "s a swath")]
+    print("| shape | 1000 products a pixel | halo, px |", " | ".join(heads), "|")
+    print("|---|---|---|" + "---|" * len(heads))
+    for text in arguments.shapes.split(","):
+        variant = parse_shape(text)
+        model = int8(variant)
+        products = sum(9 * a * b for a, b in variant.convolutions.values()) / variant.pixels
+        cells = [cell for dpu in boards for cell in cells_of(model, dpu, arguments.tile)]
+        print(f"| {text} | {products / 1e3:.0f} | {receptive_radius_px(model)} |", " | ".join(cells), "|", flush=True)
+
+
+def parse_shape(text: str) -> Variant:
+    """A shape as the command line names it."""
+    found = SHAPE.fullmatch(text)
+    if found is None:
+        raise SystemExit(f"expected BLOCKSxFEATURES or BLOCKSxFEATURES@SCALE, got {text!r}")
+    blocks, features, scale = found.groups(default="1")
+    return Variant(int(blocks), int(features), int(scale))
+
+
+def int8(variant: Variant) -> onnx.ModelProto:
+    """An INT8 file of that shape."""
+    network = ConvBEERS(variant)
+    initialise(network, torch.Generator().manual_seed(0))
+    seen = np.random.default_rng(0).random((1, 1, SIDE_PX, SIDE_PX), dtype=np.float32)
+    patches = Patches([], Remade(lambda _: (seen, seen), 1), Remade(lambda _: seen, 1))
+    return quantise_model(to_onnx(network.eval(), {}), patches, {}, lambda: None, QUICK).host
+
+
+def cells_of(model: onnx.ModelProto, dpu: Dpu, tile_px: int) -> tuple[str, str]:
+    """Frames a second and seconds a swath, each as its interval and the middle."""
+    prediction = predict_model(model, dpu, tile_px)
+    width_px, height_px = parse_size(PAPER_SIZE)
+    swath = Swath(width_px, height_px, tile_px, receptive_radius_px(model))
+    latency = swath_latency(prediction, math.ceil(swath.tiles / prediction.batch))
+    low, high = latency.interval or (math.nan, math.nan)
+    slow, fast = prediction.fps_interval
+    star = " *" if prediction.outside else ""
+    return f"{slow:.3g} to {fast:.3g} ({prediction.fps:.3g}){star}", f"{low:.3g} to {high:.3g} ({latency.value:.3g})"
+
+
+if __name__ == "__main__":
+    main()
