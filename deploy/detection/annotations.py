@@ -103,6 +103,7 @@ def _labels_near(top: Path, folder: Path) -> Path:
             )
         if found:
             return found[0]
+    list_images(folder)  # which says so where there is no image either
     raise OptionError(str(folder), expected=LAYOUTS, got="none beside the images", remedy="give them as --labels")
 
 
@@ -183,12 +184,12 @@ def _size(one: FileLabels) -> tuple[int, int]:
 
 def _remarks(images: Sequence[LabelledImage], lost: Sequence[str]) -> list[str]:
     found = []
-    empty = sum(not len(image.truth) for image in images)
-    if empty:
-        found.append(f"{empty} of {len(images)} images show no labelled object: whatever is found there is false.")
+    if empty := sum(not len(image.truth) for image in images):
+        found.append(
+            f"Images without a labelled object, on which whatever is found is false: {empty} of {len(images)}."
+        )
     if lost:
-        found.append(f"{len(lost)} boxes without area inside their image are left out, the first in {lost[0]}.")
-    ignored = sum(int(image.truth.ignored.sum()) for image in images)
-    if ignored:
-        found.append(f"{ignored} boxes count neither way: difficult, crowds, or visible by less than 30 %.")
+        found.append(f"Boxes left out, without area inside their image: {len(lost)}, the first in {lost[0]}.")
+    if ignored := sum(int(image.truth.ignored.sum()) for image in images):
+        found.append(f"Boxes that count neither way, difficult, a crowd or visible by less than 30 %: {ignored}.")
     return found

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from numpy.typing import ArrayLike
 from skimage.transform import resize
 
 from profiles.errors import OptionError
@@ -47,10 +48,10 @@ class Boxes:
     @classmethod
     def of(
         cls,
-        corners: np.ndarray,
-        classes: np.ndarray,
-        scores: np.ndarray | None = None,
-        ignored: np.ndarray | None = None,
+        corners: ArrayLike,
+        classes: ArrayLike,
+        scores: ArrayLike | None = None,
+        ignored: ArrayLike | None = None,
     ) -> "Boxes":
         """Boxes of any array-like; without scores they are labelled ones, and none is ignored unless it is said."""
         found = np.asarray(corners, np.float64).reshape(-1, 4)
@@ -70,8 +71,8 @@ class Boxes:
     def __len__(self) -> int:
         return len(self.corners)
 
-    def __getitem__(self, which: np.ndarray) -> "Boxes":
-        """The boxes that a mask or indices choose."""
+    def __getitem__(self, which: np.ndarray | slice) -> "Boxes":
+        """The boxes that a mask, indices or a slice choose."""
         return Boxes(self.corners[which], self.classes[which], self.scores[which], self.ignored[which])
 
     def at(self, corners: np.ndarray) -> "Boxes":

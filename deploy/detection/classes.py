@@ -70,7 +70,7 @@ def class_map(labelled: Sequence[str], detector: Sequence[str], given: Mapping[s
         got = "two classes of the same letters"
         raise OptionError("detector", expected="classes told apart by their letters", got=got, remedy=remedy)
     asked = {letters(name): known for name, known in (given or {}).items()}
-    _require_known("labelled", (given or {}), labelled)
+    _require_known("the labelled", (given or {}), labelled)
     _require_known("the detector's", (given or {}).values(), detector)
     truth = np.array([number.get(letters(asked.get(letters(name), name)), -1) for name in labelled], np.int64)
     unknown = tuple(name for name, found in zip(labelled, truth, strict=True) if found < 0)
