@@ -39,7 +39,7 @@ class Canvas:
     def textured(self) -> np.ndarray:
         """The radiance (H, W) float32 with the ground's texture."""
         width, height = self._size
-        return (np.asarray(self._image) * texture(height, width, self.generator)).astype(np.float32)
+        return np.asarray(np.asarray(self._image) * texture(height, width, self.generator), np.float32)
 
     def area(self, points: Sequence[Point], radiance: float) -> None:
         """Fill a polygon of the ground."""

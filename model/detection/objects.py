@@ -1,8 +1,8 @@
 """What is looked for in drawn scenes: vehicles, ships, aircraft and storage tanks, as polygons on the ground.
 
 Each is a list of parts, a polygon (x, y) in metres around (0, 0) with its radiance, the first one the lowest; the
-nose points along x. Sizes are those of common types: cars of 3.8 to 5.2 m, lorries and buses to 14 m, ships of 9 to 70
-m, aircraft from a light twin (12 m span) to a narrow-body (38 m), tanks of 5 to 15 m radius.
+nose points along x. Sizes are those of common types: cars of 3.8 to 5.2 m, lorries and buses to 14 m, ships of 9 to
+70 m, aircraft from a light twin (12 m span) to a narrow-body (38 m), tanks of 5 to 15 m radius.
 """
 
 import math
