@@ -11,6 +11,7 @@ from functools import cached_property
 
 import numpy as np
 import onnx
+from google.protobuf.message import DecodeError
 from onnx import GraphProto, ModelProto, NodeProto, TensorProto, helper
 from onnx.reference import ReferenceEvaluator
 
@@ -45,7 +46,10 @@ class Tail:
         Raises:
             ValueError: no such graph, or one that holds other operators.
         """
-        graph = GraphProto.FromString(base64.b64decode(self.text, validate=True))
+        try:
+            graph = GraphProto.FromString(base64.b64decode(self.text, validate=True))
+        except DecodeError as error:
+            raise ValueError("a tail that is no graph") from error
         others = {node.op_type for node in graph.node} - PLAIN
         if others or len(graph.input) != 1 or len(graph.output) != 1:
             raise ValueError(f"a tail of {', '.join(sorted(others)) or 'several ends'}")
