@@ -28,9 +28,9 @@ class DetectorRecipe:
         precision: of the convolutions; the losses are in float32.
     """
 
-    steps: int = 3000
-    batch: int = 16
-    learning_rate: float = 4e-3
+    steps: int = 2000
+    batch: int = 8
+    learning_rate: float = 3e-3
     weight_decay: float = 1e-3
     seed: int = 0
     precision: Precision = "float32"

@@ -47,7 +47,7 @@ class Tail:
             ValueError: no such graph, or one that holds other operators.
         """
         try:
-            graph = GraphProto.FromString(base64.b64decode(self.text, validate=True))
+            graph: GraphProto = GraphProto.FromString(base64.b64decode(self.text, validate=True))
         except DecodeError as error:
             raise ValueError("a tail that is no graph") from error
         others = {node.op_type for node in graph.node} - PLAIN
@@ -58,7 +58,8 @@ class Tail:
     @property
     def result(self) -> onnx.ValueInfoProto:
         """The name and sizes of what it gives."""
-        return self.graph.output[0]
+        result: onnx.ValueInfoProto = self.graph.output[0]
+        return result
 
     def __call__(self, values: np.ndarray) -> np.ndarray:
         """What it makes of a map (N, C, H, W), in float32."""
