@@ -87,14 +87,15 @@ def _step(
     with torch.autocast("cpu", dtype=torch.bfloat16, enabled=precision == "bfloat16"):
         found = network(images)
     loss = torch.stack(loss_of(found.float(), targets)).sum()
-    if not torch.isfinite(loss):
+    value = float(loss.detach())
+    if not math.isfinite(value):
         remedy = "train with a lower learning rate, and look at the boxes"
-        raise ModelError("detector", expected="a finite loss", got=str(float(loss)), remedy=remedy)
+        raise ModelError("detector", expected="a finite loss", got=str(value), remedy=remedy)
     optimiser.zero_grad(set_to_none=True)
     loss.backward()  # type: ignore[no-untyped-call]
     torch.nn.utils.clip_grad_norm_(network.parameters(), 10.0)
     optimiser.step()
-    return float(loss.detach())
+    return value
 
 
 def _average(average: dict[str, Tensor], network: DetectorNetwork, step: int) -> None:
