@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 from PIL import Image
+from torch import Tensor
 
 from model.io.pictures import Stretch, strip
 from model.simulator.acquire import MARGIN_PX, prepare_scene, simulate_planned
@@ -102,9 +103,9 @@ def stronger(name: str, effect: Effect) -> Effect:
     return replace(effect, **SHOWN.get(name, {}))  # type: ignore[arg-type]
 
 
-def plan_section(name: str, call: SceneCall, radiance: object) -> str:
+def plan_section(name: str, call: SceneCall, radiance: Tensor) -> str:
     """The plan of one scene as Markdown."""
-    scaled = radiance * call.radiance_scale.low  # type: ignore[operator]
+    scaled = radiance * call.radiance_scale.low
     sensor = calling_for(load_sensor("pleiades-degraded"), call).nominal()
     return f"### {name}\n\n{call.description}\n\n{table(make_plan(sensor, scene_stats(scaled, RATIO)))}\n"
 

@@ -10,6 +10,7 @@ does not hold stays as it is.
 import re
 import sys
 from collections.abc import Iterable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -31,11 +32,11 @@ def main() -> None:
         tables: dict[str, list[Row]] = {}
         for row in document["rows"]:
             tables.setdefault(row["table"], []).append(row)
-        text = MARKED.sub(lambda found, known=tables: filled(found, known), text)
+        text = MARKED.sub(partial(filled, tables), text)
     PAGE.write_text(text, encoding="utf-8", newline="")
 
 
-def filled(found: re.Match[str], tables: Mapping[str, list[Row]]) -> str:
+def filled(tables: Mapping[str, list[Row]], found: re.Match[str]) -> str:
     """A marked table made anew, or as it stands where the document has none of that name."""
     name = found["name"]
     if name not in tables:

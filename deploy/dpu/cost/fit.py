@@ -163,6 +163,11 @@ class Cases:
         """ln(predicted / observed) of FPS with several threads, (n,)."""
         return self.predicted(self.times(constants)) - self.observed
 
+    def rate_errors(self, errors: Array) -> list[Array]:
+        """ln(predicted / rate) of each case's rates with several threads, from the `errors` of their means (n,)."""
+        centres = errors + self.observed
+        return [centre - np.log(row.fps) for centre, row in zip(centres, self.rows, strict=True)]
+
     def slopes(self, logs: Array, times: Times, residuals: Array) -> Array:
         """Derivatives of the residuals by the logarithms of the constants, (2 n, 13)."""
         columns = []

@@ -22,6 +22,8 @@ from deploy.dpu.cost.published import boards, published_cases
 FOLDS = 5
 SHARE = 0.9
 """Of left-out families that the intervals hold."""
+CONFIDENCE = 0.75
+"""That they do: of some thirty families the luck of who is among them moves a mere quantile by several."""
 SHRINK = 3
 """A regime's typical error counts this many families of all regimes' typical error besides its own."""
 
@@ -34,14 +36,15 @@ class Widths:
 
     @classmethod
     def of(cls, errors: Array, cases: Cases, regimes: Sequence[Regime]) -> "Widths":
-        """So wide that SHARE of the families lie inside with all their networks.
+        """So wide that SHARE of the families lie inside with every rate of all their networks.
 
-        A regime's scale is the mean over families of the mean error (drawn to that of all regimes); a family's score
-        is its largest error over scale; the widths are the scales times the conformal quantile of the scores, the
-        ceil(SHARE (n + 1))-th smallest of n, or the largest.
+        What counts of a case is its rate that lies farthest off. A regime's scale is the mean over families of its
+        mean (drawn to that of all regimes); a family's score is its largest error over scale; the widths are the
+        scales times the score that SHARE of all families keep to.
         """
         families = np.array([row.family for row in cases.rows])
-        kinds, sizes = np.array(regimes), np.abs(errors)
+        kinds = np.array(regimes)
+        sizes = np.array([np.abs(rates).max() for rates in cases.rate_errors(errors)])
         overall = _family_mean(sizes, families)
         scales = {}
         for kind in REGIMES:
@@ -172,6 +175,7 @@ def left_out_rows(trial: Trial, name: str) -> list[LeftOut]:
     """A family, predicted without it, in intervals whose widths were made without it."""
     widths = Widths.of(*trial.inner(name))
     tested, constants = trial.cases.only(trial.families == name), trial.fit_without(frozenset({name}))
+    errors = tested.errors(constants)
     return [
         LeftOut(
             case.network,
@@ -179,11 +183,11 @@ def left_out_rows(trial: Trial, name: str) -> list[LeftOut]:
             case.configuration,
             regime,
             float(error),
-            tuple((error + seen - np.log(case.fps)).tolist()),
+            tuple(rates.tolist()),
             widths.by_regime[regime],
         )
-        for case, regime, error, seen in zip(
-            tested.rows, regimes_of(tested, constants), tested.errors(constants), tested.observed, strict=True
+        for case, regime, error, rates in zip(
+            tested.rows, regimes_of(tested, constants), errors, tested.rate_errors(errors), strict=True
         )
     ]
 
@@ -265,6 +269,20 @@ def beyond(cases: Cases, share: float = 0.25) -> tuple[Array, list[str]]:
 
 
 def family_quantile(errors: Array, families: Sequence[str]) -> float:
-    """The size of error that the largest of SHARE of the families do not exceed: ceil(SHARE (n + 1)) of n."""
+    """The size of error that SHARE of all families keep to with every one of theirs, at CONFIDENCE."""
     largest = sorted(np.abs(errors)[np.array(families) == name].max() for name in set(families))
-    return float(largest[min(math.ceil(SHARE * (len(largest) + 1)), len(largest)) - 1])
+    return float(largest[tolerance_rank(len(largest)) - 1])
+
+
+def tolerance_rank(count: int) -> int:
+    """Which of `count` scores, sorted, SHARE of all families stay below, at CONFIDENCE; or the last.
+
+    The k-th of n does if fewer than k of n draws fall among that share: at a binomial probability (S. S. Wilks, 1941,
+    doi:10.1214/aoms/1177731788).
+    """
+    below = 0.0
+    for rank in range(1, count):
+        below += math.comb(count, rank - 1) * SHARE ** (rank - 1) * (1 - SHARE) ** (count - rank + 1)
+        if below >= CONFIDENCE:
+            return rank
+    return count

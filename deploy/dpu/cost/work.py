@@ -12,6 +12,9 @@ FUSED = ("activation", "quantise", "dequantise", "pixel shuffle")
 """Kinds that cost nothing: done on the way out of the operation before; a pixel shuffle is where its results go."""
 UNSTARTED = ("add", "mul", "concat")
 """Kinds without a start of their own: fused with the operation before, or no more than places."""
+AUGMENTATION = 2
+"""Channels of several columns that the array takes in side by side, over input_channel_parallel: up to 32 of the
+DPUCZDX8G and DPUCVDX8G, 64 of the DPUCV2DX8G (Vitis-AI master, targets/*.prototxt)."""
 SHARING = 2
 """Readers of one result up to which the DPU keeps it; with more of them it passes through memory."""
 
@@ -52,16 +55,26 @@ def _count(op: Operation, flow: "_Flow", dpu: Dpu) -> Work:
 
 
 def _array_operations(op: Operation, dpu: Dpu) -> int:
-    """Input and output channels and pixels are filled up; fewer inputs than lanes gather the columns of a window.
+    """Input and output channels, rows and columns are filled up.
 
     A transposed convolution runs over the zeros between its pixels.
     """
     if op.kind not in ("conv", "transposed"):
         return 0
-    lanes, (inputs, outputs), (rows, columns) = dpu.input_parallel, op.channels, op.window.kernel
-    gathered = rows * _up(columns * inputs, lanes) if inputs < lanes else rows * columns * _up(inputs, lanes)
-    pixels = _positions(op.out_shape, dpu, "array", "pixel_parallel")
-    return 2 * gathered * _up(outputs, dpu.output_parallel) * pixels
+    pixels = _positions(op.out_shape, dpu.whole("array", "pixel_parallel"), dpu.whole("array", "column_parallel"))
+    inputs = op.window.kernel[0] * _row_inputs(op.channels[0], op.window.kernel[1], dpu)
+    return 2 * inputs * _up(op.channels[1], dpu.output_parallel) * pixels
+
+
+def _row_inputs(channels: int, columns: int, dpu: Dpu) -> int:
+    """Inputs that a row of a window takes, used or not.
+
+    Where there are few channels, several columns of the window are taken in side by side (channel augmentation).
+    """
+    together = min(max(AUGMENTATION * dpu.input_parallel // channels, 1), columns)
+    full, rest = divmod(columns, together)
+    lanes = dpu.input_parallel * dpu.whole("array", "input_groups")
+    return full * _up(together * channels, lanes) + _up(rest * channels, lanes)
 
 
 def _lane_steps(op: Operation, dpu: Dpu) -> int:
@@ -70,12 +83,13 @@ def _lane_steps(op: Operation, dpu: Dpu) -> int:
     passes = max(op.channels[1] // max(op.channels[0], 1), 1) if op.kind == "depthwise" else 1
     taps = op.window.kernel[0] * op.window.kernel[1] * passes
     channels = _up(op.in_shapes[0][0], dpu.whole("elementwise", "channels_per_cycle"))
-    return taps * channels * _positions(op.out_shape, dpu, "elementwise", "pixels_per_cycle")
+    rows = min(dpu.whole("elementwise", "pixels_per_cycle"), dpu.whole("array", "pixel_parallel"))
+    return taps * channels * _positions(op.out_shape, rows)
 
 
-def _positions(shape: Shape | None, dpu: Dpu, table: str, key: str) -> int:
-    """Output pixels, rows filled up to the pixels computed at a time."""
-    return shape[1] * _up(shape[2], dpu.whole(table, key)) if shape else 0
+def _positions(shape: Shape | None, rows: int, columns: int = 1) -> int:
+    """Output pixels, filled up to the rows, and to the columns of them, that are computed at a time."""
+    return _up(shape[1], rows) * _up(shape[2], columns) if shape else 0
 
 
 def _up(count: int, size: int) -> int:

@@ -90,16 +90,24 @@ def test_unused_channels_take_time_all_the_same(tmp_path: Path) -> None:
     assert narrow.layers[1].compute_s == pytest.approx(full.layers[1].compute_s)
 
 
-def test_a_row_that_does_not_fill_the_pixels_takes_time_all_the_same(tmp_path: Path) -> None:
+@pytest.mark.parametrize(("board", "rows", "columns"), [("vck190", 8, 4), ("zcu102", 8, 1), ("vek280", 4, 8)])
+def test_rows_and_columns_that_do_not_fill_the_array_take_time_all_the_same(
+    tmp_path: Path, board: str, rows: int, columns: int
+) -> None:
     path = float_convbeers(tmp_path / "f.onnx", 1, 32)
-    odd, even = (predict_file(path, DPU, side).layers[1] for side in (97, 104))
-    assert odd.compute_s / even.compute_s == pytest.approx(97 / 104)
+    odd, even = (predict_file(path, load_dpu(board), side).layers[1] for side in (97, 104))
+    filled = (math.ceil(97 / rows) * rows) * (math.ceil(97 / columns) * columns)
+    assert odd.compute_s / even.compute_s == pytest.approx(filled / 104**2)
 
 
-def test_first_layers_gather_their_window(tmp_path: Path) -> None:
-    """One channel by three columns fill one group of 16, not three."""
-    head = predict_file(float_convbeers(tmp_path / "f.onnx", 1, 32), DPU, 96).layers[0].work
-    assert head.array_operations == 2 * 3 * 16 * 32 * 96 * 96
+@pytest.mark.parametrize(
+    ("board", "taken_in", "given_out"), [("vck190", 32, 32), ("zcu102", 16, 16), ("vek280", 32, 32)]
+)
+def test_first_layers_gather_their_window(tmp_path: Path, board: str, taken_in: int, given_out: int) -> None:
+    """One channel by three columns fill what is taken in at a time, not three of them."""
+    head = predict_file(float_convbeers(tmp_path / "f.onnx", 1, 32), load_dpu(board), 96).layers[0].work
+    assert given_out == load_dpu(board).output_parallel
+    assert head.array_operations == 2 * 3 * taken_in * 32 * 96 * 96
 
 
 def moved(network: Network) -> int:
@@ -168,8 +176,8 @@ def test_each_layer_names_its_bound(papers_prediction: Prediction) -> None:
 
 
 def test_the_interval_is_that_of_the_regime(tmp_path: Path) -> None:
-    """3 blocks of 64 at 128 x 128 have small maps, at 640 x 640 large ones; 1024 x 1024 lies beyond all fitted."""
-    path = float_convbeers(tmp_path / "f.onnx", 3, 64)
+    """3 blocks of 32 at 128 x 128 have small maps, at 640 x 640 large ones; 1024 x 1024 lies beyond all fitted."""
+    path = float_convbeers(tmp_path / "f.onnx", 3, 32)
     small, large, outside = (predict_file(path, DPU, side) for side in (128, 640, 1024))
     for prediction, name in ((small, "width_small_maps"), (large, "width_large_maps"), (outside, "width_outside")):
         spread = math.exp(DPU.value("cost", name))
