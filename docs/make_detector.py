@@ -2,7 +2,7 @@
 
     OMP_NUM_THREADS=1 python docs/make_detector.py
 
-The same bytes on the same machine. Half an hour on one core.
+The same bytes on the same machine. The training is most of it: see model/weights/detector.md for how long it took.
 """
 
 from collections.abc import Sequence
