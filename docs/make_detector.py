@@ -6,7 +6,6 @@ The same bytes on the same machine. The training is most of it: see model/weight
 """
 
 from collections.abc import Sequence
-from itertools import islice
 
 import numpy as np
 import torch
@@ -46,10 +45,12 @@ def main() -> None:
 
 def drawn(seed: int, count: int) -> list[Picture]:
     """Pictures of the reference sensor."""
-    sensor = load_sensor(REFERENCE).nominal()
+    sensor, made = load_sensor(REFERENCE).nominal(), list[Picture]()
     with steps("drawing", count) as bar:
-        made = drawn_pictures(sensor, OVERSAMPLING, SIDE_PX, seed, count)
-        return [picture for picture in islice(made, count) if not bar.advance()]
+        for picture in drawn_pictures(sensor, OVERSAMPLING, SIDE_PX, seed, count):
+            made.append(picture)
+            bar.advance()
+    return made
 
 
 def quantise(pictures: Sequence[Picture]) -> None:
