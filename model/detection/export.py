@@ -42,7 +42,7 @@ def detector_to_onnx(
             opset_version=OPSET,
             dynamo=False,
         )
-    model = onnx.load_model_from_string(buffer.getvalue())
+    model: onnx.ModelProto = onnx.ModelProto.FromString(buffer.getvalue())
     stated = {
         "task": "detect", "stride": MULTIPLE_PX, "batch": 1, "imgsz": [side_px, side_px], "channels": 3,
         "names": dict(enumerate(names)),
