@@ -81,16 +81,27 @@ class Detector:
             output: (1, 4 + classes, anchors) raw, or (1, N, 6) final; float.
 
         Raises:
-            ModelError: scores outside 0 to 1, or values that are not finite.
+            ModelError: of another size, scores outside 0 to 1, or values that are not finite.
         """
-        scores = output[:, 4:] if self.layout == "raw" else output[:, :, 4]
-        if not np.isfinite(output).all() or scores.min(initial=0) < -ROUNDING or scores.max(initial=0) > 1 + ROUNDING:
-            got = "others: logits or an objectness perhaps" if np.isfinite(output).all() else "NaN or infinity"
-            raise ModelError("detector", expected="finite boxes with scores in 0 to 1", got=got, remedy=REMEDY)
+        self._check(output)
         if self.layout == "raw":
             return suppress(_raw(output[0]))
         found = _final(output[0], len(self.names))
         return found[np.argsort(-found.scores, kind="stable")[:MOST]]
+
+    def _check(self, output: np.ndarray) -> None:
+        axis, size = (1, 4 + len(self.names)) if self.layout == "raw" else (2, 6)
+        if output.ndim != 3 or len(output) != 1 or output.shape[axis] != size:
+            got = " x ".join(map(str, output.shape))
+            raise ModelError(
+                "detector", expected="an answer of the sizes that its file states", got=got, remedy=REMEDY
+            )
+        if not np.isfinite(output).all():
+            raise ModelError("detector", expected="finite boxes and scores", got="NaN or infinity", remedy=REMEDY)
+        scores = output[:, 4:] if self.layout == "raw" else output[:, :, 4]
+        if scores.min(initial=0) < -ROUNDING or scores.max(initial=0) > 1 + ROUNDING:
+            got = "others: logits or an objectness perhaps"
+            raise ModelError("detector", expected="scores in 0 to 1", got=got, remedy=REMEDY)
 
 
 def open_detector(path: Path, threads: int = 0, size_px: int | None = None) -> Detector:
@@ -168,7 +179,7 @@ def _layout(model: onnx.ModelProto, about: dict[str, Any], classes: int, path: P
             return "final"
     read = f"for RGB, 1 x {4 + classes} x anchors for {classes} classes (raw) or 1 x N x 6 (nms=True or end2end)"
     shapes = ", ".join(" x ".join(map(str, sizes)) for sizes in outputs)
-    got = f"task {task}, {channels} channels, output {shapes}{', of RT-DETR' if other else ''}"
+    got = f"task {task}, {' '.join(map(str, channels))} channels, output {shapes}{', of RT-DETR' if other else ''}"
     raise _unread(path, f"a detector's output as Ultralytics exports it {read}", got)
 
 

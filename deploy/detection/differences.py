@@ -11,16 +11,17 @@ import numpy as np
 
 from deploy.detection.matching import Matched
 from deploy.detection.scores import Scores, score
+from model.metrics.bootstrap import LEAST_SITES, LEVEL
 
 DRAWS = 1000
-PERCENTILES = (2.5, 97.5)
+PERCENTILES = (50 * (1 - LEVEL), 50 * (1 + LEVEL))
 FEW_SITES = 10
-"""Below it the percentiles of a bootstrap are too narrow to be trusted."""
+"""Below it the percentiles of a bootstrap are too narrow to be trusted, and it is said."""
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """A figure and its interval at 95 %; none where there are not two sites, or where there is no figure (NaN)."""
+    """A figure and its interval at 95 %; none of too few sites (`LEAST_SITES`), or where there is no figure (NaN)."""
 
     value: float
     interval: tuple[float, float] | None
@@ -50,8 +51,8 @@ class Differences:
     @property
     def warning(self) -> str | None:
         """What a reader must know of the intervals, in a sentence; None where there is nothing to say."""
-        if self.sites < 2:
-            return "All images show one site, so no interval can be given."
+        if self.sites < LEAST_SITES:
+            return f"No interval: of {self.sites} sites, fewer than {LEAST_SITES}, none could be trusted."
         if self.sites < FEW_SITES:
             return f"Only {self.sites} sites: the intervals are too narrow to be trusted."
         return None
@@ -80,7 +81,7 @@ class Differences:
         value = float(combine(lambda row, figure: np.array(self.scores[row].figures()[figure])))
         draws = combine(lambda row, figure: self.drawn[row][figure])
         known = draws[~np.isnan(draws)]
-        if np.isnan(value) or self.sites < 2 or not len(known):
+        if np.isnan(value) or self.sites < LEAST_SITES or not len(known):
             return Estimate(value, None)
         low, high = np.percentile(known, PERCENTILES)
         return Estimate(value, (float(low), float(high)))

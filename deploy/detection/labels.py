@@ -44,14 +44,14 @@ class FileLabels:
     size_px: tuple[int, int] | None = field(default=None)
 
 
-def read_labels(path: Path) -> bytes:
-    """The bytes of a file of labels.
+def read_labels(path: Path, limit_bytes: int = LABEL_BYTES) -> bytes:
+    """The bytes of a file of labels, or of what stands beside them.
 
     Raises:
-        OptionError: missing, not readable, or larger than the labels of an image are.
+        OptionError: missing, not readable, or larger than such a file is.
     """
     try:
-        return read_whole(path, LABEL_BYTES)
+        return read_whole(path, limit_bytes)
     except (OSError, ValueError) as error:
         got = getattr(error, "strerror", None) or str(error)
         raise faulty(path, "a file of labels", got) from error

@@ -152,7 +152,7 @@ def _cells(
     images: Sequence[Image], found: Boxes, image: np.ndarray, count: int
 ) -> Iterator[tuple[int, str, int, dict[str, Any]]]:
     """What pycocotools makes of each class, size and image on which there is anything of the class."""
-    coco, evaluation_of = _library()
+    coco, evaluation_of = require_library()
     # Its loops are Python's: what overlaps no object by half, nine of ten detections, can hit at no level.
     near = np.flatnonzero(np.concatenate([np.empty(0, bool), *(_near(one) for one in images)]))
     truth, place = together([one.truth for one in images])
@@ -173,7 +173,12 @@ def _cells(
     yield from ((*key, cell) for key, cell in zip(keys, evaluation.evalImgs, strict=True) if cell is not None)
 
 
-def _library() -> tuple[Any, Any]:
+def require_library() -> tuple[Any, Any]:
+    """The two classes of pycocotools that are used here, COCO and COCOeval; asked for before long work.
+
+    Raises:
+        MachineError: it is not installed.
+    """
     try:
         from pycocotools.coco import COCO
         from pycocotools.cocoeval import COCOeval

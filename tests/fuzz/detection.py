@@ -11,10 +11,9 @@ from PIL import Image
 from deploy.detection.annotations import read_labelled
 from deploy.detection.detectors import open_detector
 from deploy.detection.text_labels import yolo_names
-from tests.deploy.detection.folders import OBJECTS, SIZE_PX, coco, dota, voc, yolo
+from tests.deploy.detection.folders import OBJECTS, SIZE_PX
 from tests.deploy.detection.networks import detector, final, raw
 
-STEM = "00001"
 GREY = np.full((*SIZE_PX, 3), 90, np.uint8)
 
 
@@ -29,14 +28,12 @@ def names_seeds(_: Path) -> list[bytes]:
     return [b"names: [ship, tank]\nnc: 2\n", b"path: a\nnames:\n  0: ship\n  1: tank\n"]
 
 
-def read_beside(path: Path, name: str = STEM) -> None:
-    """Labels, beside the images that they are of."""
+def read_beside(path: Path) -> None:
+    """Labels, beside the images that they are of: one file of all, or a copy for each."""
     with TemporaryDirectory() as made:
         for stem in OBJECTS:
             Image.fromarray(GREY).save(Path(made) / f"{stem}.png")
-        names = [name] if name != STEM else list(OBJECTS)
-        for stem in names:
-            shutil.copy(path, Path(made) / f"{stem}{path.suffix}")
+            shutil.copy(path, Path(made) / f"{'labels' if path.suffix == '.json' else stem}{path.suffix}")
         (Path(made) / "classes.txt").write_text("Expressway-Service-area\nship\n", encoding="utf-8")
         read_labelled(Path(made))
 
@@ -58,9 +55,3 @@ def detector_seeds(folder: Path) -> list[bytes]:
 def detect(path: Path) -> None:
     """What is found on an image."""
     open_detector(path, 1).detect(GREY.astype(np.float32) / 255)
-
-
-VOC_SEEDS = (voc, ".xml")
-COCO_SEEDS = (coco, ".json")
-YOLO_SEEDS = (yolo, ".txt")
-DOTA_SEEDS = (dota, ".txt")

@@ -76,7 +76,7 @@ def test_the_size_is_the_file_s_or_the_one_asked_for(tmp_path: Path) -> None:
         (raw((1, 1, 1, 1, 0.5, 0)), {"names": "__import__('os')"}, "the names of its classes"),
         (raw((1, 1, 1, 1, 0.5, 0)), {"names": "(" * 9000}, "the names of its classes"),
         (raw((1, 1, 1, 1, 0.5, 0)), {"task": "segment"}, "task segment, "),
-        (raw((1, 1, 1, 1, 0.5, 0)), {"channels": 1}, r"for RGB, 1 x 6 x anchors"),
+        (raw((1, 1, 1, 1, 0.5, 0)), {"channels": 1}, r"for RGB, 1 x 6 x anchors .* got task detect, 1 channels"),
         (raw((1, 1, 1, 1, 0.5, 0)), {"outputs": 3}, r"output 1 x 6 x 20, 1 x 6 x 20, 1 x 6 x 20"),
         (final(), {"head": "RTDETRDecoder"}, "output 1 x 300 x 6, of RT-DETR"),
         (np.zeros((1, 20, 7)), {}, r"1 x 6 x anchors for 2 classes \(raw\) or 1 x N x 6 .* output 1 x 20 x 7"),
@@ -112,6 +112,13 @@ def test_values_that_are_not_finite_are_refused(tmp_path: Path) -> None:
     for value in (np.nan, np.inf):
         with pytest.raises(ModelError, match="got NaN or infinity"):
             opened.decoded(raw((value, 1, 1, 1, 0.5, 0)))
+
+
+@pytest.mark.parametrize("answer", [np.zeros((1, 7, 20)), np.zeros((2, 6, 20)), np.zeros((6, 20)), np.zeros(0)])
+def test_an_answer_of_other_sizes_than_stated_is_refused(answer: np.ndarray, tmp_path: Path) -> None:
+    opened = open_detector(detector(tmp_path / "a.onnx", raw((1, 1, 1, 1, 0.5, 0))), 1)
+    with pytest.raises(ModelError, match="an answer of the sizes that its file states"):
+        opened.decoded(answer)
 
 
 def test_what_is_no_detector_s_file_is_refused(tmp_path: Path) -> None:

@@ -84,20 +84,24 @@ def test_frames_of_a_site_are_drawn_together() -> None:
 
 
 def test_a_class_that_no_site_of_a_draw_holds_drops_out_of_every_row() -> None:
-    ship = Image(Boxes.of(ONE, [0]), Boxes.of(ONE, [0]), "ship")
-    tank = Image(Boxes.of(ONE, [1]), Boxes.none(), "tank")
-    found = compared({"reference": match([ship, tank], ("ship", "tank"))})
+    images = [Image(Boxes.of(ONE, [0]), Boxes.of(ONE, [0]), f"ship {i}") for i in range(3)]
+    images += [Image(Boxes.of(ONE, [1]), Boxes.none(), f"tank {i}") for i in range(2)]
+    found = compared({"reference": match(images, ("ship", "tank"))}, 400)
     assert set(found.drawn["reference"]["ap50"]) == {0.0, 0.5, 1.0}
     absent = np.isnan(found.drawn["reference"]["ap50 of tank"])
     assert 0 < absent.sum() < len(absent)
     assert found.value("reference", "ap50 of tank").interval == (0.0, 0.0)
 
 
-def test_few_sites_are_said_and_one_gives_no_interval() -> None:
-    one = compared({"r": row([0.5])})
-    assert one.value("r", "ap50").interval is None
-    assert not one.difference("r", "r", "ap50").told_from_zero
-    assert "one site" in (one.warning or "")
+def test_below_five_sites_there_is_no_interval_and_below_ten_it_is_said_to_be_narrow() -> None:
+    four = compared({"r": row([0.5, 0.2, 0.9, 0.4])}, 50)
+    assert four.value("r", "ap50").interval is None
+    assert not four.difference("r", "r", "ap50").told_from_zero
+    assert four.regained("r", "r", "r", "ap50") is None
+    assert "of 4 sites, fewer than 5" in (four.warning or "")
+    five = compared({"r": row([0.5, 0.2, 0.9, 0.4, 0.1])}, 50)
+    assert five.value("r", "ap50").interval is not None
+    assert "Only 5 sites" in (five.warning or "")
     assert "Only 9 sites" in (compared({"r": row([0.5] * 9)}, 3).warning or "")
     assert compared({"r": row([0.5] * 10)}, 3).warning is None
 

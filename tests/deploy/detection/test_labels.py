@@ -113,6 +113,12 @@ def test_a_faulty_table_of_names_is_refused_by_a_sentence(content: str, sentence
     refused(folder, sentence)
 
 
+def test_a_table_of_names_that_would_take_minutes_is_refused(tmp_path: Path) -> None:
+    folder = yolo(tmp_path)
+    text(folder / "data.yaml", "names: [" + "ab, " * 20000 + "]")
+    refused(folder, "more than 65536 bytes")
+
+
 def test_names_stand_in_a_list_a_table_or_lines(tmp_path: Path) -> None:
     text(tmp_path / "a" / "data.yaml", "names: [ship, tank]")
     text(tmp_path / "b" / "data.yml", "names: {1: tank, 0: ship}")
