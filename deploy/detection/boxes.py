@@ -123,24 +123,14 @@ def suppress(found: Boxes, overlap: float = OVERLAP, most: int = MOST) -> Boxes:
     Returns:
         What stays, best score first.
     """
-    order = np.argsort(-found.scores, kind="stable")[:CANDIDATES]
-    kept = np.concatenate([_greedy(found, order[found.classes[order] == c], overlap, most) for c in _classes(found)])
-    best_first = kept[np.lexsort((kept, -found.scores[kept]))]
-    return found[best_first[:most]]
-
-
-def _classes(found: Boxes) -> list[int]:
-    """Every class once; one at least, so that there is something to put together."""
-    return sorted(set(found.classes.tolist())) or [0]
-
-
-def _greedy(found: Boxes, order: np.ndarray, overlap: float, most: int) -> np.ndarray:
-    kept: list[int] = []
-    while len(order) and len(kept) < most:
-        best, order = order[0], order[1:]
-        kept.append(int(best))
-        order = order[iou(found.corners[best][None], found.corners[order])[0] <= overlap]
-    return np.array(kept, np.int64)
+    left, kept = np.argsort(-found.scores, kind="stable")[:CANDIDATES], list[int]()
+    while len(left) and len(kept) < most:
+        best, left = int(left[0]), left[1:]
+        kept.append(best)
+        crowded = found.classes[left] == found.classes[best]
+        crowded[crowded] = iou(found.corners[best][None], found.corners[left[crowded]])[0] > overlap
+        left = left[~crowded]
+    return found[np.array(kept, np.int64)]
 
 
 @dataclass(frozen=True)
