@@ -71,12 +71,8 @@ def detect(
     names = list(dict.fromkeys(["degraded", *(name.strip() for name in methods.split(","))]))
     sensors = list(dict.fromkeys(name.strip() for name in sensor.split(",")))
     trees = [tree.rglob("*") for tree in (images, labels) if tree is not None and tree.is_dir()]
-    read = (
-        labels,
-        detector,
-        *chain.from_iterable(trees),
-        *map(Path, (name for name in (*sensors, *names, reference) if name)),
-    )
+    named = [Path(name) for name in (*sensors, *names, reference) if name]
+    read = (images, labels, detector, *chain.from_iterable(trees), *named)
     require_writable(out / REPORT, json, inputs=read, folders=(out,))
     known = {} if classes is None else parse_classes(classes)
     request = DetectionRequest(
