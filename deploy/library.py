@@ -63,8 +63,8 @@ def restore(
             known. INT8 for a sensor of your own takes minutes once, and is kept.
 
     Returns:
-        The same kind and scale, uint16 of integers, float32 of floats; of the same shape, unless the network makes
-        more pixels or other bands. Missing pixels stay as they are.
+        The same kind and scale, uint8 of uint8, uint16 of other integers, float32 of floats; of the same shape,
+        unless the network makes more pixels or other bands. Missing pixels stay as they are.
 
     Raises:
         ImageError: no such array, pixels that leave the full scale open, or values outside 0 to full scale; of
@@ -125,7 +125,7 @@ def _restore_now(bands: np.ndarray, raster: Raster, options: Options) -> np.ndar
     plan = plan_for(network, raster.shape, options)
     at_once = tiles_at_once(options.threads, plan.tiles)
     infer, _ = open_runtime(options.runtime, network, options.threads, at_once)
-    full_scale = scale_of(source, plan, options.full_scale, NAME)
+    full_scale = scale_of(source, plan, options, NAME).value
     restorer = Restorer(raster, infer, full_scale, plan.tiling, NAME)
     return restore_array(source, plan, restorer, at_once)
 
@@ -211,8 +211,7 @@ def restore_tile(task: Task, window: np.ndarray, top: int, left: int, row: Span,
     restorer = task.restorer(window)
     here = Span(*(side - left for side in (column.start, column.stop, column.keep_start, column.keep_stop)))
     strip = checked_strip(task.raster, top, window, restorer.full_scale, NAME)
-    pixels, _ = restorer.tile(strip, 0, row, here)
-    return pixels
+    return restorer.tile(strip, 0, row, here).pixels
 
 
 def _around(span: Span, raster: Raster, plan: Plan) -> slice:

@@ -58,7 +58,8 @@ PATHS = {
     ),
     "check": Paths({"picture": FILE, "json": FILE}, ("model",), ("target",)),
     "bench": Paths({"json": FILE}, ("model", "image", "measured"), ("target",)),
-    "restore": Paths({"out": FILE, "json": FILE}, ("image", "model"), ("sensor",)),
+    "info": Paths({"json": FILE}, ("image", "model"), ("sensor", "target")),
+    "restore": Paths({"out": FILE, "json": FILE, "stac": FILE}, ("image", "model"), ("sensor",)),
     "evaluate": Paths(
         {"out": FOLDER, "json": FILE}, ("images", "pairs", "lpips"), ("sensor", "reference", "methods")
     ),
@@ -186,9 +187,11 @@ REFUSED = {
     ],
     "restore": [
         Refused(
-            ("model", "tile", "halo", "runtime", "threads", "workers", "scheduler", "resume"), "--method traditional"
+            ("model", "tile", "halo", "runtime", "threads", "workers", "scheduler", "cog", "stac", "resume"),
+            "--method traditional",
         ),
         Refused(("method",), without="--sensor"),
+        Refused(("stac",), without="--cog"),
         Refused(("workers",), SCHEDULER),
     ],
     "evaluate": [Refused(("images", "sweep"), "--pairs PAIRS")],

@@ -11,7 +11,7 @@ from deploy.commands.shared import refuse, say
 from deploy.restoration.options import TILE_PX, Compression, Options, Runtime
 
 EXAMPLE = "restore raw.tif restored.tif"
-NETWORK_ONLY = ("model", "tile", "halo", "resume", "runtime", "threads", "workers", "scheduler")
+NETWORK_ONLY = ("model", "tile", "halo", "resume", "runtime", "threads", "workers", "scheduler", "cog", "stac")
 """Options of which the traditional chain takes none."""
 
 
@@ -24,8 +24,8 @@ class Method(StrEnum):
 
 def restore(
     context: typer.Context,
-    image: Annotated[Path, typer.Argument(metavar="IN", help="Image of at most 12 bits (TIFF of any size, or PNG).")],
-    out: Annotated[Path, typer.Argument(metavar="OUT", help="TIFF to write: uint16, or float32 where IN is float.")],
+    image: Annotated[Path, typer.Argument(metavar="IN", help="Image: TIFF or what GDAL reads, of any size, or PNG.")],
+    out: Annotated[Path, typer.Argument(metavar="OUT", help="TIFF to write, of the type of IN.")],
     model: Annotated[
         Path | None, typer.Option(help="ONNX network, or a shipped one's name; convbeers-s-int8 if none.")
     ] = None,
@@ -34,14 +34,17 @@ def restore(
         str | None,
         typer.Option(
             help="The sensor of IN, a profile's name or your .toml file, to which a shipped network is specialised; "
-            "blind if none."
+            "B0=a.toml,B1=b.toml for each band; blind if none."
         ),
     ] = None,
     tile: Annotated[int, typer.Option(min=16, help="Longest side of a tile in pixels.")] = TILE_PX,
     halo: Annotated[str, typer.Option(help="Context around a tile: 'exact' (no seams) or pixels.")] = "exact",
     full_scale: Annotated[
         float | None,
-        typer.Option(help="Pixel value that is full scale; 4095 if none, but 8-bit and 0..1 pixels need it."),
+        typer.Option(
+            help="Pixel value that is full scale; else what IN states, the bits of --sensor, or 12 bits. "
+            "8-bit and 0..1 pixels need it."
+        ),
     ] = None,
     runtime: Annotated[Runtime, typer.Option(help="What runs the network.")] = Runtime.onnxruntime,
     threads: Annotated[int, typer.Option(min=0, help="Threads; 0 takes every core, or what falls to a worker.")] = 0,
@@ -56,6 +59,13 @@ def restore(
     scheduler: Annotated[
         str | None, typer.Option(help="Dask scheduler whose workers restore, such as tcp://host:8786.")
     ] = None,
+    cog: Annotated[
+        bool, typer.Option("--cog", help="Write OUT as a Cloud-Optimised GeoTIFF: tiles, overviews, what was done.")
+    ] = False,
+    stac: Annotated[Path | None, typer.Option(help="Write a STAC item of OUT here; with --cog.")] = None,
+    trust_index: Annotated[
+        bool, typer.Option("--trust-index", help="Let a VRT or DIMAP name tiles outside its folder and at URLs.")
+    ] = False,
     resume: Annotated[bool, typer.Option("--resume", help="Go on with a run that was stopped or killed.")] = False,
     json: Annotated[Path | None, typer.Option(help="Write the figures here.")] = None,
 ) -> None:
@@ -68,29 +78,43 @@ def restore(
     it may be.
     With --method traditional the image is stabilised, denoised and sharpened as its --sensor asks, in strips of rows:
     one band, about a minute a megapixel on two cores, not resumable.
+    JPEG 2000, NITF and HFA files, VRT mosaics and DIMAP indexes need the extra 'gdal'.
     Georeference, RPCs and missing pixels (NaN, or the nodata value) are kept. Until OUT is finished its rows lie in
     .OUT.part beside it. Workers change no pixel: where they are of one processor and the same versions, the bytes are
     those of one process. Those of a scheduler must find IN under its path; only this process writes.
     """
     from deploy.networks import conditioned, network_file
+    from deploy.restoration.bands import parse_sensors
+    from deploy.restoration.index_files import index_files
     from deploy.restoration.run import restore_file
+    from deploy.restoration.stac import require_stac, write_item
     from deploy.results import Document, print_rows
     from model.io.files import require_writable
     from profiles.errors import OptionError
     from profiles.sensor_file import BLIND, load_sensor
 
     budget_bytes = max(int(memory * 1e9), 1) if memory else None
+    sensors = parse_sensors(sensor or BLIND)
+    profiles = (Path(each) for each in sensors.values()) if sensor else ()
+    require_writable(out, json, stac, inputs=(image, *index_files(image, trust_index), model, *profiles))
     if method is Method.traditional:
-        require_writable(out, json, inputs=(image, Path(sensor) if sensor else None))
         expected, remedy = "none with --method traditional", "leave it out"
         refuse(context, NETWORK_ONLY, expected=expected, got="one", remedy=remedy)
-        _by_the_chain(image, out, sensor, full_scale, compression, budget_bytes, json)
+        _by_the_chain(image, out, sensor, full_scale, compression, budget_bytes, trust_index, json)
         return
-    require_writable(out, json, inputs=(image, model, Path(sensor) if sensor else None))
+    if stac is not None:
+        if not cog:
+            raise OptionError("--stac", expected="--cog beside it", got="none", remedy="add it, or leave --stac out")
+        require_stac()
     if sensor is not None and conditioned(model) is None:
         expected, remedy = "a shipped network, or weights of 'train --conditioned'", "leave --sensor out"
         raise OptionError("--sensor", expected=expected, got=f"{model}, made for one already", remedy=remedy)
-    path = network_file(model, load_sensor(sensor or BLIND), partial(say, err=True))
+    known = {band: load_sensor(each) for band, each in sensors.items()}
+    paths = {band: network_file(model, each, partial(say, err=True)) for band, each in known.items()}
+    path, bits = next(iter(paths.values())), {int(each.bits.low) for each in known.values()}
+    if len(bits) > 1 and full_scale is None:
+        remedy = "give --full-scale, or restore such bands apart"
+        raise OptionError("--sensor", expected="sensors of equal bits", got=f"{sorted(bits)}", remedy=remedy)
     options = Options(
         path,
         tile,
@@ -103,8 +127,14 @@ def restore(
         resume,
         workers,
         scheduler,
+        trust_index,
+        min(bits) if sensor else None,
+        cog,
+        {} if "" in paths else paths,
     )
     row = restore_file(image, out, options, say)
+    if stac is not None:
+        write_item(out, stac)
     print_rows(f"wrote {out}", [row])
     arguments = {
         "sensor": sensor or BLIND,
@@ -115,7 +145,7 @@ def restore(
         "threads": threads,
     }
     arguments |= {"workers": workers, "scheduler": scheduler}
-    Document("restore", arguments, (path, image), (row,)).write(json)
+    Document("restore", arguments, (*paths.values(), image), (row,)).write(json)
 
 
 def _by_the_chain(
@@ -125,6 +155,7 @@ def _by_the_chain(
     full_scale: float | None,
     compression: Compression,
     memory_bytes: int | None,
+    trust_index: bool,
     json: Path | None,
 ) -> None:
     from deploy.restoration.traditional import Request, restore_file_traditionally
@@ -137,7 +168,7 @@ def _by_the_chain(
         remedy = "name a profile ('beers-deploy profiles' lists them) or give your .toml file"
         raise OptionError("--sensor", expected="the sensor that acquired IN", got="none", remedy=remedy)
     degraded = load_sensor(sensor)
-    request = Request(degraded, reference_for(degraded), full_scale, compression, memory_bytes)
+    request = Request(degraded, reference_for(degraded), full_scale, compression, memory_bytes, trust_index)
     row = restore_file_traditionally(image, out, request)
     print_rows(f"wrote {out}", [row])
     arguments = {"method": "traditional", "sensor": sensor, "full_scale": full_scale}

@@ -4,11 +4,16 @@ An image passes, in this order:
 
     options      what a user can choose
     source       an image file, or an array, as rows
+    gdal_source  the same of what GDAL reads by windows: JPEG 2000, NITF, HFA, VRT, DIMAP
+    index_files  which files an untrusted VRT or DIMAP names, and that it names no others
+    bands        a sensor, and so a network, for each band
     plan         how it is cut into tiles, and the memory that takes
+    radiometry   which pixel value is full scale, and who says so
     runtime      the network, on onnxruntime or OpenVINO
     engine       the one tile loop, for files and arrays: `restore_rows`, `restore_array`, `restore_dn`
     workers      the same rows by the workers of a Dask cluster
     output       finished rows in a checkpoint, the lock, the TIFF
+    cog          the finished TIFF cloud-optimised, by GDAL; `stac` its item for a catalogue
     run          all of this for one file: `restore_file`
     traditional  a file by the traditional chain instead of a network: `restore_file_traditionally`
 

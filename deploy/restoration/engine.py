@@ -14,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from deploy.restoration.plan import Plan, Span
+from deploy.restoration.radiometry import require_room
 from deploy.restoration.runtime import Infer
 from deploy.restoration.source import ArraySource, Raster, Source
 from model.io.images import MAX_DN, remedy_outside
@@ -29,28 +30,39 @@ Say = Callable[[str], None]
 Tick = Callable[[int], None]
 """Told how many tiles are done since; stops the run where somebody asked to."""
 
-Tile = tuple[np.ndarray, int]
-"""The kept pixels of a tile, (bands, h, w) restored and as stored, and how many of them are known."""
+
+class Tile(NamedTuple):
+    """The kept pixels of a tile, (bands, h, w) restored and as stored, how many are known, how many were clipped."""
+
+    pixels: np.ndarray
+    known: int
+    clipped: int
 
 
 @dataclass(frozen=True)
 class Strip:
     """Rows of an image from `top` on: `pixels` (bands, rows, width) as stored, and which are missing.
 
-    `missing` is bool of the same shape, or None where no pixel is missing.
+    `missing` is bool of the same shape, or None where no pixel is missing; `above` says whether a known pixel is
+    above full scale.
     """
 
     top: int
     pixels: np.ndarray
     missing: np.ndarray | None
+    above: bool = False
 
 
 class RestoredRow(NamedTuple):
-    """A row of tiles: its `span` in the image, restored `pixels` (bands, rows, width), and how many are `known`."""
+    """A row of tiles: its `span` in the image, restored `pixels` (bands, rows, width), and how many are `known`.
+
+    `clipped` is how many of the image's pixels were above full scale.
+    """
 
     span: Span
     pixels: np.ndarray
     known: int
+    clipped: int = 0
 
 
 @dataclass(frozen=True)
@@ -64,6 +76,8 @@ class Restorer:
         tiling: how the network meets an image; missing pixels are filled from no farther away than its halo, so what
             lies beyond, filled or not, is nothing that a known pixel sees.
         name: of the image, for messages.
+        clips: whether values above full scale are clipped and counted; else they are an error.
+        others: the networks of the bands behind the first, where each has its own.
     """
 
     raster: Raster
@@ -71,6 +85,11 @@ class Restorer:
     full_scale: float
     tiling: Tiling
     name: str = NAME
+    clips: bool = False
+    others: tuple[Infer, ...] = ()
+
+    def __post_init__(self) -> None:
+        require_room(self.raster, self.full_scale)
 
     def read(self, source: Source, start: int, stop: int) -> Strip:
         """The strip that tiles from row `start` to `stop` (excluded) need.
@@ -80,7 +99,7 @@ class Restorer:
         """
         margin_px = self.raster.fill_margin_px(self.tiling.halo_px)
         start, stop = max(start - margin_px, 0), min(stop + margin_px, self.raster.height_px)
-        return checked_strip(self.raster, start, source.read(start, stop), self.full_scale, self.name)
+        return checked_strip(self.raster, start, source.read(start, stop), self.full_scale, self.name, self.clips)
 
     def tile(self, strip: Strip, group: int, rows: Span, columns: Span) -> Tile:
         """The tile of one group of bands that reads `rows` and `columns`; one without a known pixel is not inferred.
@@ -92,14 +111,25 @@ class Restorer:
         bands = slice(group * self.tiling.channels_in, (group + 1) * self.tiling.channels_in)
         unknown = self._unknown(strip, bands, rows, columns)
         if unknown is not None and unknown[1].all():
-            return unknown[0], 0
-        window = restore_window(self._window(strip, bands, rows, columns), self.infer, self.full_scale)
+            return Tile(unknown[0], 0, 0)
+        infer = self.others[group - 1] if self.others and group else self.infer
+        window = restore_window(self._window(strip, bands, rows, columns), infer, self.full_scale)
         self._require_shape(window, rows, columns)
         result = as_stored(self.raster, window[:, self._within(rows), self._within(columns)], self.full_scale)
+        clipped = self._above(strip, bands, rows, columns)
         if unknown is None:
-            return result, result.size
+            return Tile(result, result.size, clipped)
         stored, missing = unknown
-        return np.where(missing, stored, result), int((~missing).sum())
+        return Tile(np.where(missing, stored, result), int((~missing).sum()), clipped)
+
+    def _above(self, strip: Strip, bands: slice, rows: Span, columns: Span) -> int:
+        """How many known pixels of what is kept of a tile are above full scale."""
+        if not strip.above:
+            return 0
+        down = slice(rows.keep_start - strip.top, rows.keep_stop - strip.top)
+        kept = (bands, down, slice(columns.keep_start, columns.keep_stop))
+        above = strip.pixels[kept] > self.full_scale
+        return int((above if strip.missing is None else above & ~strip.missing[kept]).sum())
 
     def _unknown(self, strip: Strip, bands: slice, rows: Span, columns: Span) -> tuple[np.ndarray, np.ndarray] | None:
         """What the kept pixels of a tile stay where they are missing, and where; of the restored shape, as stored.
@@ -127,6 +157,8 @@ class Restorer:
             window = strip.pixels[bands, down, columns.start : columns.stop]
         else:
             window = self._filled(strip, strip.missing, bands, rows, columns)
+        if strip.above:
+            window = np.minimum(window, window.dtype.type(self.full_scale))
         lack = rows.stop - rows.start - window.shape[1], columns.stop - columns.start - window.shape[2]
         return np.pad(window, ((0, 0), (0, lack[0]), (0, lack[1])), mode="edge") if any(lack) else window
 
@@ -156,18 +188,20 @@ class Restorer:
             raise ModelError("ONNX model", expected=expected, got=times(window.shape), remedy=remedy)
 
 
-def checked_strip(raster: Raster, top: int, pixels: np.ndarray, full_scale: float, name: str) -> Strip:
+def checked_strip(
+    raster: Raster, top: int, pixels: np.ndarray, full_scale: float, name: str, clips: bool = False
+) -> Strip:
     """Rows from `top` on, (bands, rows, width) as stored, and which of their pixels are missing.
 
     Raises:
-        ImageError: values outside 0 to full scale.
+        ImageError: values below 0, infinite, or, unless it `clips`, above full scale.
     """
     missing = raster.missing(pixels) if raster.may_miss else None
-    strip = Strip(top, pixels, missing if missing is not None and missing.any() else None)
-    known = True if strip.missing is None else ~strip.missing
+    missing = missing if missing is not None and missing.any() else None
+    known = True if missing is None else ~missing
     # Where nothing is known, 0 is taken for both, which is inside.
     low, high = (float(extreme(pixels, where=known, initial=0)) for extreme in (np.min, np.max))
-    if low < 0 or high > full_scale:
+    if low < 0 or (high > full_scale and not (clips and np.isfinite(high))):
         remedy = "give the sensor's highest number as --full-scale, or mark missing pixels as nodata"
         raise ImageError(
             f"{name}, rows {top} to {top + pixels.shape[1] - 1}",
@@ -175,7 +209,7 @@ def checked_strip(raster: Raster, top: int, pixels: np.ndarray, full_scale: floa
             got=f"values from {low:g} to {high:g}",
             remedy=remedy_outside(low, high, remedy),
         )
-    return strip
+    return Strip(top, pixels, missing, high > full_scale)
 
 
 def fill_from_nearest(pixels: np.ndarray, missing: np.ndarray, reach_px: int) -> np.ndarray:
@@ -294,14 +328,14 @@ def _joined(
     """One row of its tiles."""
     bands, _, width_px = plan.out_shape
     shape = (bands, (row.keep_stop - row.keep_start) * plan.scale, width_px)
-    result, known = np.empty(shape, restorer.raster.out_dtype), 0
+    result, known, clipped = np.empty(shape, restorer.raster.out_dtype), 0, 0
     count = plan.tiling.channels_out
-    for (group, columns), (pixels, known_here) in zip(_places(plan), tiles, strict=True):
+    for (group, columns), tile in zip(_places(plan), tiles, strict=True):
         at = slice(columns.keep_start * plan.scale, columns.keep_stop * plan.scale)
-        result[group * count : (group + 1) * count, :, at] = pixels
-        known += known_here
+        result[group * count : (group + 1) * count, :, at] = tile.pixels
+        known, clipped = known + tile.known, clipped + tile.clipped
         tick()
-    return RestoredRow(row, result, known)
+    return RestoredRow(row, result, known, clipped)
 
 
 def _places(plan: Plan) -> list[tuple[int, Span]]:
@@ -315,8 +349,8 @@ def restore_array(source: Source, plan: Plan, restorer: Restorer, at_once: int =
         ImageError: unreadable rows, values outside 0 to full scale, or a network that gives NaN.
     """
     result = np.empty(plan.out_shape, restorer.raster.out_dtype)
-    for row, pixels, _ in restore_rows(source, plan, restorer, plan.rows, lambda: None, at_once):
-        result[:, row.keep_start * plan.scale : row.keep_stop * plan.scale] = pixels
+    for row in restore_rows(source, plan, restorer, plan.rows, lambda: None, at_once):
+        result[:, row.span.keep_start * plan.scale : row.span.keep_stop * plan.scale] = row.pixels
     return result
 
 

@@ -1,6 +1,7 @@
 """How an image is to be restored: what a user can choose. It loads nothing, so that '--help' stays quick."""
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from enum import StrEnum
 from pathlib import Path
 
@@ -39,7 +40,7 @@ class Options:
         model: the network's file.
         tile_px: side of a tile.
         halo: 'exact', or pixels of context around a tile.
-        full_scale: the pixel value that is 1.0 to the network; None lets type and values decide (model.io.images).
+        full_scale: the pixel value that is 1.0 to the network; None leaves it to deploy.restoration.radiometry.
         runtime: what runs the network.
         threads: of the runtime; 0 takes every core, or a worker's share of them.
         compression: of the output.
@@ -47,6 +48,10 @@ class Options:
         resume: go on with a stopped run.
         workers: processes of this machine that restore; 0 is this process alone.
         scheduler: address of a Dask scheduler whose workers restore.
+        bands: networks of single bands by their names, each for its own sensor; empty where `model` is for all.
+        cog: whether the output is a Cloud-Optimised GeoTIFF.
+        sensor_bits: bits per pixel of the sensor, where the user named its profile.
+        trust_index: whether a VRT or DIMAP may name tiles outside its folder, at URLs too.
     """
 
     model: Path
@@ -60,6 +65,10 @@ class Options:
     resume: bool = False
     workers: int = 0
     scheduler: str | None = None
+    trust_index: bool = False
+    sensor_bits: int | None = None
+    cog: bool = False
+    bands: Mapping[str, Path] = field(default_factory=dict)
 
     @property
     def is_spread(self) -> bool:

@@ -10,7 +10,7 @@ import math
 import os
 import shutil
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
@@ -38,6 +38,7 @@ class Checkpoint:
     Attributes:
         rows: how many are finished.
         known: how many of their pixels are not missing.
+        clipped: how many pixels of the image were above full scale.
     """
 
     def __init__(
@@ -59,7 +60,7 @@ class Checkpoint:
         self.out, self.shape, self.dtype = out, shape, dtype
         self.folder = part_folder(out)
         self._job = dict(job)
-        self.rows, self.known = self._left() if resume else (0, 0)
+        self.rows, self.known, self.clipped = self._left() if resume else (0, 0, 0)
         with self.disk():
             if not self.rows:
                 self.remove()
@@ -82,6 +83,7 @@ class Checkpoint:
                 stream.flush()
                 os.fsync(stream.fileno())
             self.rows, self.known = self.rows + row.pixels.shape[1], self.known + row.known
+            self.clipped += row.clipped
             self._write_journal()
 
     def read(self, band: int, start: int, stop: int) -> np.ndarray:
@@ -94,6 +96,8 @@ class Checkpoint:
         """Throw the rows away; the journal first, so that nothing is left that counts on them."""
         for name in ("journal.json", "journal.new", "rows.raw", "out.tif"):
             (self.folder / name).unlink(missing_ok=True)
+        for path in self.folder.glob(f"{COG}*"):  # GDAL writes overviews beside it first
+            path.unlink()
 
     @contextmanager
     def disk(self) -> Iterator[None]:
@@ -109,15 +113,16 @@ class Checkpoint:
             got = error.strerror or str(error)
             raise MachineError(str(self.out), expected="a disk to write to", got=got, remedy=remedy) from error
 
-    def _left(self) -> tuple[int, int]:
+    def _left(self) -> tuple[int, int, int]:
         path = self.folder / "journal.json"
         if not path.is_file():
-            return 0, 0
+            return 0, 0, 0
         with suppress(ValueError, KeyError, TypeError, OSError):
             journal: Any = read_json(path)
-            rows, known = int(journal["rows"]), int(journal["known"])
-            if journal["job"] == self._job and 0 <= rows <= self.shape[1] and 0 <= known <= math.prod(self.shape):
-                return rows, known
+            rows, known, clipped = int(journal["rows"]), int(journal["known"]), int(journal.get("clipped", 0))
+            sound = 0 <= rows <= self.shape[1] and 0 <= known <= math.prod(self.shape) and clipped >= 0
+            if journal["job"] == self._job and sound:
+                return rows, known, clipped
         raise OptionError(
             "--resume",
             expected="the image, the model and the options of the run that was stopped",
@@ -128,7 +133,8 @@ class Checkpoint:
     def _write_journal(self) -> None:
         path, fresh = self.folder / "journal.json", self.folder / "journal.new"
         with fresh.open("w", encoding="utf-8") as stream:
-            json.dump({"job": self._job, "rows": self.rows, "known": self.known}, stream)
+            counts = {"rows": self.rows, "known": self.known, "clipped": self.clipped}
+            json.dump({"job": self._job, **counts}, stream)
             stream.flush()
             os.fsync(stream.fileno())
         fresh.replace(path)
@@ -188,8 +194,21 @@ def require_codec(compression: Compression) -> None:
         raise MachineError("--compression", expected="an installed codec", got=got, remedy=remedy) from error
 
 
-def write_output(checkpoint: Checkpoint, tags: tuple[Tag, ...], compression: Compression) -> None:
+COG = "cog.tif"
+ToCog = Callable[[Path, Path], None]
+"""Writes a TIFF again, cloud-optimised."""
+
+
+def write_output(
+    checkpoint: Checkpoint, tags: tuple[Tag, ...], compression: Compression, to_cog: ToCog | None = None
+) -> None:
     """Write the checkpoint's rows and an image's `tags` to the output, rename it into place, remove the checkpoint.
+
+    Args:
+        checkpoint: with every row.
+        tags: of the image.
+        compression: of the TIFF; none where it is on its way to be cloud-optimised.
+        to_cog: None leaves the TIFF as it is.
 
     Raises:
         MachineError: the disk is full or gone; the rows are still there.
@@ -214,6 +233,9 @@ def write_output(checkpoint: Checkpoint, tags: tuple[Tag, ...], compression: Com
             extratags=tags,
             buffersize=BUFFER_BYTES,
         )
+        if to_cog is not None:
+            plain, fresh = fresh, checkpoint.folder / COG
+            to_cog(plain, fresh)
         with fresh.open("r+b") as stream:
             os.fsync(stream.fileno())
         fresh.replace(checkpoint.out)

@@ -18,9 +18,12 @@ import numpy as np
 
 from deploy.cluster import check_choice
 from deploy.host_state import peak_memory
+from deploy.restoration.bands import in_order, require_alike
+from deploy.restoration.cog import require_cog, what_was_done, write_cog
 from deploy.restoration.engine import RestoredRow, Restorer, Say, Tick, restore_rows
 from deploy.restoration.georeference import enlarged_tags
-from deploy.restoration.options import Options
+from deploy.restoration.index_files import index_files
+from deploy.restoration.options import Compression, Options
 from deploy.restoration.output import (
     Checkpoint,
     only_run,
@@ -30,14 +33,15 @@ from deploy.restoration.output import (
     write_output,
 )
 from deploy.restoration.plan import Plan, Span, check_memory, is_bulky, plan_for, rows_bytes
+from deploy.restoration.radiometry import FullScale, full_scale_of
 from deploy.restoration.runtime import open_runtime, tiles_at_once
 from deploy.restoration.source import Source, fingerprint, open_source
 from deploy.restoration.workers import make_work, rows_of_workers
 from model.io.files import require_writable
-from model.io.images import settled_scale
+from model.io.images import require_image_file
 from model.processor import require_cores
 from model.progress import held_back, steps
-from profiles.errors import BeersError, ImageError, MachineError
+from profiles.errors import BeersError, ImageError, MachineError, OptionError
 from profiles.figures import Figure, Row, measured, predicted, unavailable
 from quant.onnx_file import load_onnx
 from quant.reading.external import network_sha256
@@ -54,8 +58,8 @@ def restore_file(image: Path, out: Path, options: Options, say: Say) -> Row:
     """Restore `image` into the TIFF `out`, and return the run's figures.
 
     Args:
-        image: a TIFF of any size, a PNG or a JPEG.
-        out: a TIFF, uint16 of integers and float32 of floats, in the scale of the image; larger by the network's
+        image: a TIFF of any size, a PNG, a JPEG, or what GDAL reads (deploy.restoration.source).
+        out: a TIFF of the type `Raster.out_dtype`, in the scale of the image; larger by the network's
             factor where it has one, and in its place on Earth.
         options: what the user chose.
         say: told the plan, the memory, and how to go on after a stop.
@@ -68,47 +72,68 @@ def restore_file(image: Path, out: Path, options: Options, say: Say) -> Row:
         KeyboardInterrupt: stopped; rows already finished stay for `resume`.
     """
     check_choice(options.workers, options.scheduler)
-    require_writable(out, inputs=(image, options.model))
+    if options.bands and options.is_spread:
+        got, remedy = "one for each band", "leave --workers and --scheduler out"
+        raise OptionError("--sensor", expected="one sensor for workers", got=got, remedy=remedy)
+    require_image_file(image)
+    require_writable(out, inputs=(image, *index_files(image, options.trust_index), options.model))
     if options.scheduler is None:
         require_cores("--threads", options.threads)
     require_tiff_name(out)
-    require_codec(options.compression)
+    if options.cog:
+        require_cog()
+    else:
+        require_codec(options.compression)
     with only_run(out, part_folder(out)):
         return _restore(image, out, options, say)
 
 
 def _restore(image: Path, out: Path, options: Options, say: Say) -> Row:
     started = time.perf_counter()
-    network = load_onnx(options.model)
-    with open_source(image) as source:
+    with open_source(image, options.trust_index) as source:
         raster = source.raster
+        paths = in_order(options.bands, raster) if options.bands else [options.model]
+        network, *others = networks = [load_onnx(path) for path in paths]
+        require_alike(networks)
         plan = plan_for(network, raster.shape, options)
         say(plan.sentence)
         if not options.is_spread:
             check_memory(rows_bytes(source, plan), options.memory_bytes, is_bulky(source, plan))
-        full_scale = scale_of(source, plan, options.full_scale, str(image))
+        scale = scale_of(source, plan, options, str(image))
         at_once = tiles_at_once(options.threads, plan.tiles)
         infer, runtime = open_runtime(options.runtime, network, options.threads, at_once)
-        restorer = Restorer(raster, infer, full_scale, plan.tiling, str(image))
+        more = tuple(open_runtime(options.runtime, other, options.threads, at_once)[0] for other in others)
+        restorer = Restorer(raster, infer, scale.value, plan.tiling, str(image), not scale.assumed, more)
         figures = seam_figures(source, plan, restorer)
         # Another version of the runtime might give other bits: rows of one are not finished by another.
-        job = _job(image, options, plan, runtime, full_scale)
+        digests = ", ".join(network_sha256(path) for path in paths)
+        job = _job(image, digests, plan, runtime, scale.value)
         checkpoint = Checkpoint(out, plan.out_shape, raster.out_dtype, job, options.resume)
         done_rows = checkpoint.rows // plan.scale
         if options.is_spread:
-            work, peaks_gb = make_work(image, plan, network, runtime, options, full_scale), list[float]()
+            work, peaks_gb = make_work(image, plan, network, runtime, options, scale), list[float]()
             finish_rows(checkpoint, plan, str(image), say, partial(rows_of_workers, work, source, say, peaks_gb))
             figures |= worker_figures(peaks_gb)
         else:
             here = partial(_rows_here, source, plan, restorer, at_once, options.memory_bytes, say)
             finish_rows(checkpoint, plan, str(image), say, here)
     with held_back():  # a stop now would save nothing
-        write_output(checkpoint, enlarged_tags(raster.tags, plan.scale), options.compression)
+        tags = enlarged_tags(raster.tags, plan.scale)
+        if options.cog:
+            about = what_was_done(networks, digests, scale)
+            to_cog = partial(write_cog, compression=options.compression, about=about)
+            write_output(checkpoint, tags, Compression.none, to_cog)
+        else:
+            write_output(checkpoint, tags, options.compression)
     time_s = time.perf_counter() - started
-    return run_row(image.name, plan, done_rows, time_s, runtime, options, figures, full_scale)
+    if checkpoint.clipped:
+        above = f"{checkpoint.clipped} pixels above full scale"
+        say(f"{above}, {scale.value:g} ({scale.source}), were clipped to it")
+    figures["clipped pixels"] = measured(checkpoint.clipped, "1", "pixels of the image above its full scale")
+    return run_row(image.name, plan, done_rows, time_s, runtime, options, figures, scale)
 
 
-def scale_of(source: Source, plan: Plan, asked: float | None, name: str) -> float:
+def scale_of(source: Source, plan: Plan, options: Options, name: str) -> FullScale:
     """The pixel value that is full scale; float images are read to their first bright row of tiles to know it.
 
     Raises:
@@ -116,14 +141,14 @@ def scale_of(source: Source, plan: Plan, asked: float | None, name: str) -> floa
         OptionError: a full scale that such pixels cannot have.
     """
     largest = (source.raster.largest(source.read(row.keep_start, row.keep_stop)) for row in plan.rows)
-    return settled_scale(name, source.raster.dtype, largest, asked)
+    return full_scale_of(name, source.raster, largest, options.full_scale, options.sensor_bits)
 
 
-def _job(image: Path, options: Options, plan: Plan, runtime: str, full_scale: float) -> dict[str, object]:
+def _job(image: Path, model: str, plan: Plan, runtime: str, full_scale: float) -> dict[str, object]:
     """All that decides the pixels, as the journal keeps it; who computes, on how many machines, is no part of it."""
     return {
         "image": [*fingerprint(image), image.stat().st_mtime_ns],
-        "model": network_sha256(options.model),
+        "model": model,
         "tile_px": plan.tile_px,
         "halo_px": plan.halo_px,
         "full_scale": full_scale,
@@ -235,9 +260,8 @@ def seam_error_dn(source: Source, plan: Plan, restorer: Restorer) -> tuple[float
     wide = [_widened(span, plan.radius_px, end_px) for span, end_px in zip((rows, columns), ends_px, strict=True)]
     start, stop = min(rows.start, wide[0].start), max(rows.stop, wide[0].stop)
     strip = restorer.read(source, start, stop)
-    cheap, _ = restorer.tile(strip, 0, rows, columns)
-    exact, _ = restorer.tile(strip, 0, *wide)
-    error = np.abs(np.nan_to_num(cheap.astype(np.float64)) - np.nan_to_num(exact.astype(np.float64)))
+    cheap, exact = (restorer.tile(strip, 0, *spans).pixels.astype(np.float64) for spans in ((rows, columns), wide))
+    error = np.abs(np.nan_to_num(cheap) - np.nan_to_num(exact))
     return float(error.max()), float(error.mean())
 
 
@@ -267,7 +291,7 @@ def run_row(
     runtime: str,
     options: Options,
     more: dict[str, Figure],
-    full_scale: float,
+    scale: FullScale,
 ) -> Row:
     """The figures of one run, of which `done_rows` were finished before."""
     useful_px = plan.bands * (plan.height_px - done_rows) * plan.width_px
@@ -281,5 +305,6 @@ def run_row(
         **more,
     }
     workers = {"workers": options.scheduler or str(options.workers)} if options.is_spread else {}
-    text = {"halo": plan.halo_words, "full scale": f"{full_scale:g}", "runtime": runtime, **workers}
+    scales = {"full scale": f"{scale.value:g}", "full scale from": scale.source}
+    text = {"halo": plan.halo_words, **scales, "runtime": runtime, **workers}
     return Row("restore", name, figures, text)

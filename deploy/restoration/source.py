@@ -14,6 +14,7 @@ from typing import Any, Protocol
 import numpy as np
 import tifffile
 
+from deploy.restoration.index_files import index_files
 from model.io.files import TIFF_SUFFIXES
 from model.io.images import damage_in_a_sentence, read_pixels, require_image_file
 from model.io.tiff import check_page, open_tiff
@@ -32,7 +33,7 @@ Tag = tuple[int, int, int, Any, bool]
 
 @dataclass(frozen=True)
 class Raster:
-    """An image as stored: `bands` planes of (height_px, width_px)."""
+    """An image as stored: `bands` planes of (height_px, width_px), of so many `bits` where the file says it."""
 
     bands: int
     height_px: int
@@ -40,6 +41,7 @@ class Raster:
     dtype: np.dtype[Any]
     nodata: float | None = None
     tags: tuple[Tag, ...] = ()
+    bits: int | None = None
 
     @property
     def shape(self) -> tuple[int, int, int]:
@@ -48,8 +50,10 @@ class Raster:
 
     @property
     def out_dtype(self) -> np.dtype[Any]:
-        """Of the restored image: uint16 of integers, float32 of floats."""
-        return np.dtype(np.float32 if self.dtype.kind == "f" else np.uint16)
+        """Of the restored image: float32 of floats, uint8 of uint8, uint16 of all other integers."""
+        if self.dtype.kind == "f":
+            return np.dtype(np.float32)
+        return np.dtype(np.uint8 if self.dtype == np.uint8 else np.uint16)
 
     def missing(self, pixels: np.ndarray) -> np.ndarray:
         """Where stored pixels hold no measurement: NaN or the nodata value; bool of the same shape."""
@@ -82,22 +86,31 @@ def page_raster(path: str, page: tifffile.TiffPage) -> Raster:
             not hold.
     """
     planes, _, height_px, width_px, samples = page.shaped
-    if max(height_px, width_px) > SIDE_PX or planes * samples > BANDS:
-        got = f"{planes * samples} bands of {width_px} x {height_px} pixels"
+    require_size(path, planes * samples, height_px, width_px)
+    dtype = require_numbers(path, page.dtype)
+    nodata = _nodata(path, page, dtype)
+    tags = tuple(tag for tag in carried_tags(page) if tag[0] != NODATA_TAG or nodata is not None)
+    # A container of whole bytes says nothing of the sensor; packed bits were counted by somebody.
+    bits = page.bitspersample if dtype.kind == "u" and page.bitspersample < 8 * dtype.itemsize else None
+    return Raster(planes * samples, height_px, width_px, dtype, nodata, tags, bits)
+
+
+def carried_tags(page: tifffile.TiffPage) -> tuple[Tag, ...]:
+    """The tags of a page that a restored image keeps."""
+    tags = [page.tags[code] for code in CARRIED_TAGS if code in page.tags]
+    return tuple((tag.code, int(tag.dtype), tag.count, tag.value, True) for tag in tags)
+
+
+def require_size(path: str, bands: int, height_px: int, width_px: int) -> None:
+    """That an image can be planned.
+
+    Raises:
+        ImageError: too large.
+    """
+    if max(height_px, width_px) > SIDE_PX or bands > BANDS:
+        got = f"{bands} bands of {width_px} x {height_px} pixels"
         expected = f"at most {BANDS} bands of {SIDE_PX} pixels a side"
         raise ImageError(path, expected=expected, got=got, remedy="cut it into pieces")
-    dtype = require_numbers(path, page.dtype)
-    tags = [page.tags[code] for code in CARRIED_TAGS if code in page.tags]
-    nodata = _nodata(path, page, dtype)
-    carried = [t for t in tags if t.code != NODATA_TAG or nodata is not None]
-    return Raster(
-        planes * samples,
-        height_px,
-        width_px,
-        dtype,
-        nodata,
-        tuple((t.code, int(t.dtype), t.count, t.value, True) for t in carried),
-    )
 
 
 def require_numbers(path: str, dtype: np.dtype[Any] | None) -> np.dtype[Any]:
@@ -141,6 +154,16 @@ def usable_nodata(path: str, value: float | None, dtype: np.dtype[Any]) -> float
 
 
 BIG_TIFF_SUFFIXES = {".btf", ".tf8"}
+GDAL_DRIVERS = {
+    ".jp2": "JP2OpenJPEG",
+    ".j2k": "JP2OpenJPEG",
+    ".ntf": "NITF",
+    ".nitf": "NITF",
+    ".img": "HFA",
+    ".vrt": "VRT",
+    ".xml": "DIMAP",
+}
+"""By a file's suffix: others of GDAL's drivers open further files, or the network."""
 DIGEST_BYTES = 1 << 16
 """Of each end of a file."""
 
@@ -158,27 +181,56 @@ class Source(Protocol):
 
 
 def fingerprint(image: Path) -> tuple[int, str]:
-    """A file's size in bytes, and the SHA-256 of its two ends: quick, however large it is."""
-    size_bytes = image.stat().st_size
-    with image.open("rb") as stream:
+    """A file's size in bytes, and the SHA-256 of its two ends: quick at any size; an index with its tiles."""
+    digest, size_bytes = hashlib.sha256(), 0
+    for file in (image, *index_files(image, trusted=True)):
+        size_bytes += file.stat().st_size
+        digest.update(_ends(file))
+    return size_bytes, digest.hexdigest()
+
+
+def _ends(file: Path) -> bytes:
+    with file.open("rb") as stream:
         ends = stream.read(DIGEST_BYTES)
-        stream.seek(max(size_bytes - DIGEST_BYTES, 0))
-        ends += stream.read(DIGEST_BYTES)
-    return size_bytes, hashlib.sha256(ends).hexdigest()
+        stream.seek(max(file.stat().st_size - DIGEST_BYTES, 0))
+        return ends + stream.read(DIGEST_BYTES)
 
 
 @contextmanager
-def open_source(path: Path) -> Iterator[Source]:
-    """Open an image for reading by rows: a TIFF page as a stream, anything else whole.
+def open_source(path: Path, trusted: bool = False) -> Iterator[Source]:
+    """Open an image for reading by rows: a TIFF page as a stream, PNG and JPEG whole, others by windows of GDAL.
+
+    Args:
+        path: of the file, or of the index of its tiles.
+        trusted: whether an index may name files outside its folder and at URLs.
 
     Raises:
         ImageError: no such file, or no image of numbers.
-        MachineError: an unknown compression, or an image read whole that does not fit in memory.
+        MachineError: an unknown compression, a format that needs a package which is not installed, or an image read
+            whole that does not fit in memory.
     """
     require_image_file(path)
-    if path.suffix.lower() not in TIFF_SUFFIXES | BIG_TIFF_SUFFIXES:
+    suffix = path.suffix.lower()
+    if suffix in GDAL_DRIVERS:
+        from deploy.restoration.gdal_source import open_gdal  # of an optional package
+
+        with open_gdal(path, trusted) as source:
+            yield source
+    elif suffix in TIFF_SUFFIXES | BIG_TIFF_SUFFIXES:
+        with open_page(path) as source:
+            yield source
+    else:
         yield whole_source(path)
-        return
+
+
+@contextmanager
+def open_page(path: Path) -> Iterator[Source]:
+    """A TIFF of one page as a stream, of several whole.
+
+    Raises:
+        ImageError: no image of numbers.
+        MachineError: an unknown compression, or an image read whole that does not fit in memory.
+    """
     with damage_in_a_sentence(path):
         file = open_tiff(path)
     with file:

@@ -16,6 +16,7 @@ from torch import Tensor
 
 from deploy.host_state import peak_memory
 from deploy.restoration.engine import RestoredRow, as_stored, checked_strip
+from deploy.restoration.index_files import index_files
 from deploy.restoration.options import Compression
 from deploy.restoration.output import (
     Checkpoint,
@@ -26,9 +27,10 @@ from deploy.restoration.output import (
     write_output,
 )
 from deploy.restoration.plan import Span, check_memory
+from deploy.restoration.radiometry import FullScale, full_scale_of
 from deploy.restoration.source import Raster, Source, fingerprint, open_source
 from model.io.files import require_writable
-from model.io.images import settled_scale
+from model.io.images import require_image_file
 from model.progress import steps
 from model.traditional.pipeline import Chain, restore_strips
 from profiles.errors import ImageError
@@ -53,6 +55,7 @@ class Request:
         full_scale: the pixel value that is the sensor's highest digital number; None lets type and values decide.
         compression: of the output.
         memory_bytes: budget of the process; None is what is free.
+        trust_index: whether a VRT or DIMAP may name tiles outside its folder, at URLs too.
     """
 
     sensor: SensorProfile
@@ -60,6 +63,7 @@ class Request:
     full_scale: float | None = None
     compression: Compression = Compression.zlib
     memory_bytes: int | None = None
+    trust_index: bool = False
 
     def chain(self) -> Chain:
         """The chain from the sensor to the reference, both in the sensor's digital numbers."""
@@ -76,7 +80,8 @@ def restore_file_traditionally(image: Path, out: Path, request: Request) -> Row:
         MachineError: another run on `out`; memory or disk.
         KeyboardInterrupt: stopped; nothing is left behind.
     """
-    require_writable(out, inputs=(image,))
+    require_image_file(image)
+    require_writable(out, inputs=(image, *index_files(image, request.trust_index)))
     require_tiff_name(out)
     require_codec(request.compression)
     with only_run(out, part_folder(out)):
@@ -85,23 +90,23 @@ def restore_file_traditionally(image: Path, out: Path, request: Request) -> Row:
 
 def _restore(image: Path, out: Path, request: Request) -> Row:
     started, chain = time.perf_counter(), request.chain()
-    with open_source(image) as source:
+    with open_source(image, request.trust_index) as source:
         raster = source.raster
         _require_one_band(raster, image)
         needed = FIXED_BYTES + BYTES_PER_COLUMN * raster.width_px + source.held_bytes(STRIP_PX)
         check_memory(needed, request.memory_bytes, bulky=False)
         largest = (raster.largest(source.read(*rows)) for rows in _strips(raster.height_px))
-        max_dn = chain.degraded.max_dn
-        full_scale = settled_scale(str(image), raster.dtype, largest, request.full_scale, max_dn)
+        bits = int(chain.degraded.max_dn).bit_length()
+        scale = full_scale_of(str(image), raster, largest, request.full_scale, bits)
         job = {"image": list(fingerprint(image)), "method": "traditional"}
         checkpoint = Checkpoint(out, raster.shape, raster.out_dtype, job, resume=False)
         try:
-            _fill(checkpoint, source, chain, full_scale, str(image))
+            _fill(checkpoint, source, chain, scale.value, str(image))
             write_output(checkpoint, raster.tags, request.compression)
         except BaseException:  # a strip is no place to go on from: the chain looks hundreds of rows back
             checkpoint.remove()
             raise
-    return _row(image.name, raster, time.perf_counter() - started, request, full_scale)
+    return _row(image.name, raster, time.perf_counter() - started, request, scale)
 
 
 def _fill(checkpoint: Checkpoint, source: Source, chain: Chain, full_scale: float, name: str) -> None:
@@ -148,7 +153,7 @@ def _require_one_band(raster: Raster, image: Path) -> None:
         raise ImageError(str(image), expected="one band", got=f"{raster.bands} bands", remedy=remedy)
 
 
-def _row(name: str, raster: Raster, time_s: float, request: Request, full_scale: float) -> Row:
+def _row(name: str, raster: Raster, time_s: float, request: Request, scale: FullScale) -> Row:
     source = f"from opening the image to the finished file, {torch.get_num_threads()} threads"
     pixels = raster.height_px * raster.width_px
     figures = {
@@ -156,5 +161,6 @@ def _row(name: str, raster: Raster, time_s: float, request: Request, full_scale:
         "throughput": measured(pixels / time_s / 1e6, "Mpx/s", source),
         "peak memory": peak_memory(),
     }
-    text = {"method": "traditional", "sensor": request.sensor.name, "full scale": f"{full_scale:g}"}
+    scales = {"full scale": f"{scale.value:g}", "full scale from": scale.source}
+    text = {"method": "traditional", "sensor": request.sensor.name, **scales}
     return Row("restore", name, figures, text)

@@ -20,6 +20,7 @@ from deploy.host_state import peak_memory
 from deploy.restoration.engine import RestoredRow, Restorer, Say, Tick, restore_row
 from deploy.restoration.options import Options
 from deploy.restoration.plan import Plan, Span, check_memory, is_bulky, restored_bytes, rows_bytes
+from deploy.restoration.radiometry import FullScale
 from deploy.restoration.runtime import Packed, open_packed, pack
 from deploy.restoration.source import Source, fingerprint, open_source
 from profiles.errors import MachineError
@@ -38,7 +39,7 @@ class Work:
         seen: the image's fingerprint, to know another file of that name.
         network: to be opened.
         runtime: name and version of what runs it where the run began; another might give other bytes.
-        full_scale: the pixel value that is 1.0 to the network, settled where the run began.
+        scale: the pixel value that is 1.0 to the network, settled where the run began.
     """
 
     key: str
@@ -48,7 +49,7 @@ class Work:
     options: Options
     network: Packed
     runtime: str
-    full_scale: float
+    scale: FullScale
 
 
 @dataclass(frozen=True)
@@ -82,8 +83,9 @@ class Opened:
         infer, runtime = open_packed(work.network)
         if runtime != work.runtime:
             raise MachineError(here(), expected=work.runtime, got=runtime, remedy="install the same everywhere")
-        scale, tiling = work.full_scale, work.plan.tiling
-        self.restorer = Restorer(self.source.raster, infer, scale, tiling, str(work.image))
+        scale, tiling = work.scale, work.plan.tiling
+        raster, name = self.source.raster, str(work.image)
+        self.restorer = Restorer(raster, infer, scale.value, tiling, name, not scale.assumed)
 
     def restore(self, row: Span) -> Piece:
         """Restore one row of tiles.
@@ -148,7 +150,7 @@ def _reachable(work: Work) -> Iterator[Source]:
         raise unreachable(work.image, error.strerror or str(error)) from error
     if seen != work.seen:
         raise unreachable(work.image, "another file of that name")
-    with open_source(work.image) as source:
+    with open_source(work.image, work.options.trust_index) as source:
         yield source
 
 
@@ -157,7 +159,7 @@ ROWS_HERE = 2
 
 
 def make_work(
-    image: Path, plan: Plan, network: onnx.ModelProto, runtime: str, options: Options, full_scale: float
+    image: Path, plan: Plan, network: onnx.ModelProto, runtime: str, options: Options, scale: FullScale
 ) -> Work:
     """What the workers of one run are to do.
 
@@ -165,7 +167,7 @@ def make_work(
     """
     share = (os.cpu_count() or 1) // options.workers if options.workers else 1
     packed = pack(network, options.runtime, options.threads or max(share, 1))
-    return Work(uuid.uuid4().hex, image.absolute(), fingerprint(image), plan, options, packed, runtime, full_scale)
+    return Work(uuid.uuid4().hex, image.absolute(), fingerprint(image), plan, options, packed, runtime, scale)
 
 
 def rows_of_workers(

@@ -159,7 +159,7 @@ def test_a_photograph_is_no_raw_image_until_its_scale_is_named(tmp_path: Path) -
     result = runner.invoke(app, ["restore", str(picture), str(out), "--full-scale", "255"])
     assert result.exit_code == 0, result.output
     restored = tifffile.imread(out)
-    assert restored.dtype == np.uint16
+    assert restored.dtype == np.uint8
     assert restored.shape == (3, 40, 50)
     assert restored.max() <= 255
 

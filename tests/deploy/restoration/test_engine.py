@@ -27,8 +27,9 @@ def running(infer: Infer, at_once: int, tick: Callable[[], None] = lambda: None)
     plan: Plan = make_plan(raster.shape, TILE_PX, RADIUS_PX, Tiling(RADIUS_PX))
     restorer = Restorer(raster, infer, 4095.0, Tiling(RADIUS_PX))
     result = np.empty(SHAPE, np.uint16)
-    for row, kept, known in restore_rows(ArraySource(pixels, raster), plan, restorer, plan.rows, tick, at_once):
-        assert known == kept.size
+    source = ArraySource(pixels, raster)
+    for row, kept, known, clipped in restore_rows(source, plan, restorer, plan.rows, tick, at_once):
+        assert (known, clipped) == (kept.size, 0)
         result[:, row.keep_start : row.keep_stop] = kept
     return result
 

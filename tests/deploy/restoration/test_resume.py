@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 import tifffile
 
-from deploy.restoration.engine import Restorer
+from deploy.restoration.engine import Restorer, Tile
 from deploy.restoration.options import Compression, Options
 from deploy.restoration.run import restore_file
 from profiles.errors import MachineError, OptionError
@@ -93,7 +93,7 @@ def stop_after(tiles: int, monkeypatch: pytest.MonkeyPatch, error: BaseException
     """Raise an error in the network after so many tiles; the result lets it pass again."""
     count, tile = iter(range(10**6)), Restorer.tile
 
-    def stopping(self: Restorer, *rest: object) -> tuple[np.ndarray, int]:
+    def stopping(self: Restorer, *rest: object) -> Tile:
         if next(count) == tiles:
             raise error
         return tile(self, *rest)  # type: ignore[arg-type]

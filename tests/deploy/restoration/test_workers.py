@@ -21,9 +21,10 @@ import tifffile
 from deploy import cluster
 from deploy.cluster import check_choice, local_cluster, open_cluster
 from deploy.networks import shipped_pair
-from deploy.restoration.engine import Restorer
+from deploy.restoration.engine import Restorer, Tile
 from deploy.restoration.options import Options, Runtime
 from deploy.restoration.plan import Span, plan_for
+from deploy.restoration.radiometry import FullScale
 from deploy.restoration.run import restore_file
 from deploy.restoration.runtime import open_runtime
 from deploy.restoration.source import open_source
@@ -136,7 +137,7 @@ def test_a_run_begun_here_is_finished_by_workers(
     restore_file(image, tmp_path / "expected.tif", options, silent)
     count, tile = iter(range(10**6)), Restorer.tile
 
-    def stopping(self: Restorer, *rest: object) -> tuple[np.ndarray, int]:
+    def stopping(self: Restorer, *rest: object) -> Tile:
         if next(count) == 40:
             raise KeyboardInterrupt
         return tile(self, *rest)  # type: ignore[arg-type]
@@ -173,7 +174,7 @@ def work(image: Path, model: Path) -> Work:
     with open_source(image) as source:
         plan = plan_for(network, source.raster.shape, options)
     _, runtime = open_runtime(Runtime.onnxruntime, network, 1)
-    return make_work(image, plan, network, runtime, options, 4095)
+    return make_work(image, plan, network, runtime, options, FullScale(4095, "--full-scale"))
 
 
 def in_workers(scheduler: str, work: Work) -> None:

@@ -1,0 +1,60 @@
+"""`beers-deploy info`: what the tool makes of an image, before it is restored."""
+
+from functools import partial
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from deploy.commands.shared import say
+from deploy.restoration.options import TILE_PX, Options
+from profiles.target import DEFAULT_TARGET
+
+EXAMPLE = "info raw.jp2"
+
+
+def info(
+    image: Annotated[Path, typer.Argument(metavar="FILE", help="Image, or the index of its tiles.")],
+    model: Annotated[
+        Path | None, typer.Option(help="ONNX network, or a shipped one's name; convbeers-s-int8 if none.")
+    ] = None,
+    sensor: Annotated[
+        str | None, typer.Option(help="The sensor of FILE, a profile's name or your .toml file; blind if none.")
+    ] = None,
+    full_scale: Annotated[
+        float | None, typer.Option(help="Pixel value that is full scale; else what FILE or --sensor states.")
+    ] = None,
+    tile: Annotated[int, typer.Option(min=16, help="Longest side of a tile in pixels.")] = TILE_PX,
+    target: Annotated[
+        str, typer.Option(help="The modelled board whose time is predicted, or your .toml file.")
+    ] = DEFAULT_TARGET,
+    trust_index: Annotated[
+        bool, typer.Option("--trust-index", help="Let a VRT or DIMAP name tiles outside its folder and at URLs.")
+    ] = False,
+    measure: Annotated[bool, typer.Option("--measure", help="Time some tiles here, and predict the whole.")] = False,
+    json: Annotated[Path | None, typer.Option(help="Write the figures here.")] = None,
+) -> None:
+    """Say what an image is, how it would be cut and how long that would take.
+
+    Size, type, full scale and who states it, place on Earth, missing pixels; the plan of `restore` with its defaults.
+    No pixel is read but of PNG, JPEG and TIFFs of several pages. Time here is unavailable without --measure.
+    """
+    from deploy.info import InfoRequest, info_row
+    from deploy.networks import network_file
+    from deploy.restoration.index_files import index_files
+    from deploy.results import Document, print_rows
+    from model.io.files import require_writable
+    from profiles import load_sensor, load_target
+    from profiles.sensor_file import BLIND
+
+    tiles = index_files(image, trust_index)
+    require_writable(json, inputs=(image, *tiles, model, Path(sensor) if sensor else None, Path(target)))
+    known = load_sensor(sensor or BLIND)
+    path = network_file(model, known, partial(say, err=True))
+    bits = int(known.bits.low) if sensor else None
+    options = Options(path, tile, full_scale=full_scale, trust_index=trust_index, sensor_bits=bits)
+    row = info_row(image, InfoRequest(options, load_target(target), measure))
+    print_rows(str(image), [row])
+    arguments = {"sensor": sensor or BLIND, "tile": tile, "full_scale": full_scale, "target": target}
+    # No digest of FILE: it would be read whole.
+    Document("info", {**arguments, "file": image.name}, (path,), (row,)).write(json)

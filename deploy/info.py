@@ -1,0 +1,139 @@
+"""What the tool makes of an image file, before anyone waits for it: no pixel of a TIFF is read.
+
+Time here is predicted only from tiles that were timed; time on the board is the cost model's.
+"""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from statistics import median
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+import onnx
+
+from deploy.bench.tables import predict_file, swath_latency
+from deploy.dpu.board import dpu_of
+from deploy.restoration.georeference import KEYS, PIXEL_SCALE, POLYNOMIALS, TIE_POINTS, TRANSFORMATION
+from deploy.restoration.options import Options
+from deploy.restoration.plan import Plan, plan_for
+from deploy.restoration.radiometry import full_scale_of
+from deploy.restoration.runtime import open_runtime, tiles_at_once
+from deploy.restoration.source import Raster, open_source
+from profiles.errors import BeersError, ImageError
+from profiles.figures import Figure, Row, measured, predicted, unavailable
+from profiles.target import TargetProfile
+from quant.onnx_file import load_onnx
+
+HEADER = "the file's own header"
+ARITHMETIC = "arithmetic on the plan of tiles"
+PROJECTED, GEOGRAPHIC = 3072, 2048
+"""Keys of GeoTIFF that hold an EPSG code (OGC 19-008r4, annex D)."""
+RUNS = 3
+UNPLACED = "none"
+
+
+@dataclass(frozen=True)
+class InfoRequest:
+    """What a user wants to know of an image.
+
+    Attributes:
+        options: as a restoration would be given them.
+        target: the board whose time is predicted.
+        measure: whether tiles are timed here.
+    """
+
+    options: Options
+    target: TargetProfile
+    measure: bool = False
+
+
+def info_row(image: Path, request: InfoRequest) -> Row:
+    """The facts of an image and of its restoration.
+
+    Raises:
+        ImageError: no such image, damaged, or one that cannot be followed.
+        ModelError: a network that cannot be tiled.
+        OptionError: options that do not go together.
+    """
+    options = request.options
+    network = load_onnx(options.model)
+    with open_source(image, options.trust_index) as source:
+        raster = source.raster
+    plan = plan_for(network, raster.shape, options)
+    figures = {
+        "width": measured(raster.width_px, "px", HEADER),
+        "height": measured(raster.height_px, "px", HEADER),
+        "bands": measured(raster.bands, "1", HEADER),
+        "tiles": predicted(plan.tiles, "1", (plan.tiles, plan.tiles), ARITHMETIC),
+        "work factor": predicted(plan.work_factor, "1", (plan.work_factor, plan.work_factor), ARITHMETIC),
+        "time here": time_here(network, plan, options) if request.measure else _not_measured(),
+        f"time on {request.target.name}": time_on_board(options.model, plan, request.target),
+    }
+    text = {"pixels": str(raster.dtype), **scale_words(image.name, raster, options), **place_words(raster)}
+    nodata = "none" if raster.nodata is None else f"{raster.nodata:g}"
+    return Row("info", image.name, figures, {**text, "nodata": nodata, "halo": plan.halo_words})
+
+
+def scale_words(name: str, raster: Raster, options: Options) -> Mapping[str, str]:
+    """Full scale, and from where; what is open is said."""
+    if raster.dtype.kind == "f" and options.full_scale is None:
+        why = "the pixels decide when they are read: digital numbers if one is above 2, else --full-scale is needed"
+        return {"full scale": "open", "full scale from": why}
+    try:
+        scale = full_scale_of(name, raster, (), options.full_scale, options.sensor_bits)
+    except ImageError as error:
+        return {"full scale": "open", "full scale from": f"{error.got}; {error.remedy}"}
+    return {"full scale": f"{scale.value:g}", "full scale from": scale.source}
+
+
+def place_words(raster: Raster) -> Mapping[str, str]:
+    """Where the image lies, as its tags say it."""
+    tags = {tag[0]: tag[3] for tag in raster.tags}
+    placed = PIXEL_SCALE in tags or TRANSFORMATION in tags
+    words = {"georeference": f"{_code(tags.get(KEYS, ()))}" if placed or KEYS in tags else UNPLACED}
+    if PIXEL_SCALE in tags and TIE_POINTS in tags:
+        (right, down), (x, y) = tags[PIXEL_SCALE][:2], tags[TIE_POINTS][3:5]
+        words["georeference"] += f", first corner ({x:.9g}, {y:.9g}), pixels of {right:.9g} x {down:.9g}"
+    return words | {"rational polynomials": "yes" if POLYNOMIALS in tags else "none"}
+
+
+def _code(keys: Any) -> str:
+    """The coordinate system among GeoTIFF's keys: a head of four numbers, then four for each."""
+    values = {keys[k]: keys[k + 3] for k in range(4, len(keys) - 3, 4)}
+    code = values.get(PROJECTED, values.get(GEOGRAPHIC))
+    return f"EPSG:{code}" if code not in (None, 32767) else "a coordinate system without a code"
+
+
+def _not_measured() -> Figure:
+    return unavailable("s", "no tile was timed here: --measure times some")
+
+
+def time_here(network: onnx.ModelProto, plan: Plan, options: Options) -> Figure:
+    """The time of all tiles, from those timed here; reading and writing are done beside it.
+
+    The interval is of the quickest and the slowest of the runs.
+    """
+    at_once = tiles_at_once(options.threads, plan.tiles)
+    infer, runtime = open_runtime(options.runtime, network, options.threads)
+    shape = (1, plan.tiling.channels_in, *plan.tile_shape)
+    tile = np.random.default_rng(0).random(shape, np.float32)
+    infer(tile)  # the first one prepares
+    times = []
+    for _ in range(RUNS):
+        started = perf_counter()
+        infer(tile)
+        times.append((perf_counter() - started) * plan.tiles)
+    how = f"{RUNS} runs of one tile with every thread ({at_once} at a time in a run), {runtime}, times the tiles"
+    return predicted(median(times), "s", (min(times), max(times)), how)
+
+
+def time_on_board(model: Path, plan: Plan, target: TargetProfile) -> Figure:
+    """The time of all tiles on a board's DPU, by the cost model, in whole batches."""
+    try:
+        prediction = predict_file(model, dpu_of(target), max(plan.tile_shape))
+    except BeersError as error:
+        return unavailable("s", f"the cost model does not take this network: {error.got}")
+    return swath_latency(prediction, math.ceil(plan.tiles / prediction.batch))

@@ -1,0 +1,73 @@
+"""Bands of several sensors: `B0=a.toml,B1=b.toml` gives each band a network of its own.
+
+Where the image names its bands, each is found by its name; else they are taken in the order given.
+"""
+
+import xml.etree.ElementTree as ET
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import onnx
+
+from deploy.restoration.index_files import NoDoctype
+from deploy.restoration.source import Raster
+from profiles.errors import ModelError, OptionError
+from quant.tiling.walk import tiling_of
+
+METADATA_TAG = 42112
+"""GDAL's own of a TIFF, where bands' names stand (https://gdal.org/en/stable/drivers/raster/gtiff.html)."""
+
+
+def parse_sensors(text: str) -> dict[str, str]:
+    """A profile for each band by the band's name; under no name at all where one is for all bands.
+
+    Raises:
+        OptionError: a band without a name or a profile, or named twice.
+    """
+    if "=" not in text or Path(text).is_file():
+        return {"": text}
+    pairs = [part.partition("=") for part in text.split(",")]
+    found = {name.strip(): profile.strip() for name, _, profile in pairs}
+    if not all((*found, *found.values())) or len(found) < len(pairs):
+        remedy = "name each band once"
+        raise OptionError("--sensor", expected="BAND=PROFILE,BAND=PROFILE", got=repr(text), remedy=remedy)
+    return found
+
+
+def band_names(raster: Raster) -> tuple[str, ...]:
+    """The names of an image's bands, as GDAL keeps them in a TIFF; empty where any has none."""
+    text = next((str(tag[3]) for tag in raster.tags if tag[0] == METADATA_TAG), "")
+    try:
+        root = ET.fromstring(text, ET.XMLParser(target=NoDoctype()))  # noqa: S314 - no document type, no entities
+    except (ET.ParseError, ValueError, RecursionError):
+        return ()
+    found = {item.get("sample"): item.text or "" for item in root.iter("Item") if item.get("role") == "description"}
+    names = tuple(found.get(str(band), "") for band in range(raster.bands))
+    return names if all(names) else ()
+
+
+def in_order(given: Mapping[str, Path], raster: Raster) -> list[Path]:
+    """The networks of the bands, in the order of the image's bands.
+
+    Raises:
+        OptionError: other names or another number of bands than the image has.
+    """
+    names = band_names(raster) or tuple(given)
+    if len(given) != raster.bands or set(names) != set(given):
+        expected = f"a sensor for each of {raster.bands} bands" + (f": {', '.join(names)}" if names else "")
+        remedy = "name every band of the image; pansharpening is out of scope"
+        raise OptionError("--sensor", expected=expected, got=", ".join(given), remedy=remedy)
+    return [given[name] for name in names]
+
+
+def require_alike(networks: Sequence[onnx.ModelProto]) -> None:
+    """That networks of several bands are met alike by an image: one plan of tiles serves them all.
+
+    Raises:
+        ModelError: they differ, or take several bands each.
+    """
+    tilings = [tiling_of(network) for network in networks]
+    if len(networks) > 1 and (len(set(map(repr, tilings))) > 1 or tilings[0].channels_in != 1):
+        remedy = "give one network for all bands"
+        got = "networks of several bands, or of different halos"
+        raise ModelError("--sensor", expected="networks of one band, alike but for weights", got=got, remedy=remedy)

@@ -1,0 +1,77 @@
+"""A finished TIFF as a Cloud-Optimised GeoTIFF: tiles, overviews and a head that says where they lie.
+
+GDAL's driver COG writes it, of the package rasterio (https://gdal.org/en/stable/drivers/raster/cog.html). What was
+done to the image goes into its metadata, beside what the image said of itself.
+"""
+
+import warnings
+from collections.abc import Mapping, Sequence
+from importlib import import_module
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import onnx
+
+from deploy.restoration.gdal_source import ENVIRONMENT, LEAST_CACHE_BYTES, OFFLINE
+from deploy.restoration.options import Compression
+from deploy.restoration.radiometry import FullScale
+from profiles.errors import MachineError
+from quant.onnx_file import metadata
+
+CODECS = {
+    Compression.none: "NONE",
+    Compression.zlib: "DEFLATE",
+    Compression.zstd: "ZSTD",
+    Compression.lzw: "LZW",
+}
+BLOCK_PX = 512
+
+
+def require_cog() -> None:
+    """Find out before the run that rasterio is missing.
+
+    Raises:
+        MachineError: it is not installed.
+    """
+    try:
+        import_module("rasterio")
+    except ImportError as error:
+        got, remedy = "no package rasterio", "pip install 'beers-deploy[gdal]'"
+        raise MachineError("--cog", expected="GDAL to write it", got=got, remedy=remedy) from error
+
+
+def what_was_done(networks: Sequence[onnx.ModelProto], digests: str, scale: FullScale) -> dict[str, str]:
+    """The run as an image's metadata: tool, networks in the order of the bands, their sensors and full scale."""
+    said = [metadata(network) for network in networks]
+    return {
+        "RESTORED_BY": f"beers-deploy {version('beers-deploy')}",
+        "RESTORED_NETWORK_SHA256": digests,
+        "RESTORED_NETWORK": ", ".join(each.get("variant", "not stated") for each in said),
+        "RESTORED_SENSOR": ", ".join(each.get("sensor", "not stated") for each in said),
+        "RESTORED_FULL_SCALE": f"{scale.value:g} ({scale.source})",
+    }
+
+
+def write_cog(plain: Path, cog: Path, compression: Compression, about: Mapping[str, str]) -> None:
+    """Write the TIFF `plain` as the Cloud-Optimised GeoTIFF `cog`, with `about` among its metadata.
+
+    Raises:
+        OSError: the disk is full or gone.
+    """
+    rasterio: Any = import_module("rasterio")
+    options = {
+        "COMPRESS": CODECS[compression],
+        "PREDICTOR": "NO" if compression is Compression.none else "YES",  # the horizontal one of integers
+        "BLOCKSIZE": BLOCK_PX,
+        "BIGTIFF": "IF_SAFER",
+        "RESAMPLING": "AVERAGE",  # of known pixels, and no overshoot beyond them
+    }
+    environment = {**ENVIRONMENT, **OFFLINE, "GDAL_CACHEMAX": LEAST_CACHE_BYTES}
+    try:
+        with warnings.catch_warnings(action="ignore"), rasterio.Env(**environment):
+            with rasterio.open(plain, "r+", driver="GTiff") as file:
+                file.update_tags(**about)
+            import_module("rasterio.shutil").copy(plain, cog, driver="COG", **options)
+    except Exception as error:  # rasterio has a class of its own for each of GDAL's
+        raise OSError(" ".join(str(error.__cause__ or error).split())) from error

@@ -1,0 +1,193 @@
+"""What GDAL reads, by windows: JPEG 2000, NITF, HFA, and the indexes VRT and DIMAP that make one image of many tiles.
+
+GDAL comes with rasterio, an optional package. It is given one driver for one file, sees no file beside it and no
+network unless the user trusts the index, and keeps a cache of blocks that counts as memory of the run.
+"""
+
+import io
+import logging
+import os
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import tifffile
+
+from deploy.restoration.index_files import dimap_bits, index_files, is_index
+from deploy.restoration.source import (
+    GDAL_DRIVERS,
+    Raster,
+    Tag,
+    carried_tags,
+    require_numbers,
+    require_size,
+    usable_nodata,
+)
+from profiles.errors import BeersError, ImageError, MachineError
+
+LEAST_CACHE_BYTES = 1 << 26
+ENVIRONMENT = {
+    "GDAL_DISABLE_READDIR_ON_OPEN": "EMPTY_DIR",  # no file beside it: what is beside was not looked at
+    "GDAL_PAM_ENABLED": "NO",
+    "GDAL_VRT_ENABLE_PYTHON": "NO",
+    "CPL_LOG": os.devnull,  # threads that decode print their errors, which come back as one exception as well
+}
+OFFLINE = {"CPL_VSIL_CURL_ALLOWED_EXTENSIONS": "{none}"}
+
+logging.getLogger("rasterio").addHandler(logging.NullHandler())  # who asks for its remarks still has them
+
+
+def _rasterio(path: Path) -> Any:  # an optional package
+    try:
+        return import_module("rasterio")
+    except ImportError as error:
+        got, remedy = "no package rasterio", "pip install 'beers-deploy[gdal]', or convert it to TIFF"
+        raise MachineError(str(path), expected="GDAL to read it", got=got, remedy=remedy) from error
+
+
+@contextmanager
+def open_gdal(path: Path, trusted: bool = False) -> Iterator["GdalSource"]:
+    """Open an image of a suffix in `GDAL_DRIVERS` for reading by rows.
+
+    Args:
+        path: of the file or the index.
+        trusted: as in `index_files`.
+
+    Raises:
+        ImageError: damaged, an index that cannot be followed, or no image of numbers.
+        MachineError: rasterio is not installed.
+    """
+    rasterio = _rasterio(path)
+    tiles = [file for file in index_files(path, trusted) if not is_index(file)]
+    environment = ENVIRONMENT if trusted else ENVIRONMENT | OFFLINE
+    with _damage_in_a_sentence(path), rasterio.Env(**environment):
+        dataset = rasterio.open(path.resolve(), driver=GDAL_DRIVERS[path.suffix.lower()])
+        block_px = _block_px(dataset)
+        if tiles:  # a mosaic states blocks of its own, and decodes those of its tiles, which are mostly alike
+            with rasterio.open(tiles[0]) as tile:
+                block_px = max(block_px, _block_px(tile))
+    with dataset:
+        yield GdalSource(path, dataset, block_px, environment)
+
+
+def _block_px(dataset: Any) -> int:
+    """Rows of the blocks in which an image is decoded."""
+    return max((int(rows) for rows, _ in dataset.block_shapes), default=1)
+
+
+@contextmanager
+def _damage_in_a_sentence(path: Path, where: str = "") -> Iterator[None]:
+    """One sentence for whatever GDAL finds wrong.
+
+    Raises:
+        ImageError: damaged.
+    """
+    try:
+        with warnings.catch_warnings(action="ignore"):  # an image need not lie anywhere on Earth
+            yield
+    except (BeersError, MemoryError):
+        raise
+    except Exception as error:
+        cause: BaseException = error
+        while cause.__cause__ is not None:  # rasterio's own words are "see previous exception"
+            cause = cause.__cause__
+        name = f"{path}, {where}" if where else str(path)
+        got, remedy = " ".join(str(cause).split())[:160] or type(cause).__name__, "check that it is a whole image"
+        expected = f"an image that GDAL reads as {GDAL_DRIVERS[path.suffix.lower()]}"
+        raise ImageError(name, expected=expected, got=got, remedy=remedy) from error
+
+
+class GdalSource:
+    """An image that GDAL has opened; one thread reads at a time."""
+
+    def __init__(self, path: Path, dataset: Any, block_px: int, environment: dict[str, str]) -> None:
+        self._path, self._dataset, self._environment = path, dataset, environment
+        with _damage_in_a_sentence(path):
+            self.raster = _raster(path, dataset)
+        self._block_px = block_px
+
+    def read(self, start: int, stop: int) -> np.ndarray:
+        """Rows `start` to `stop` (excluded) of every band, (bands, rows, width), as stored.
+
+        Raises:
+            ImageError: damaged.
+        """
+        rasterio = _rasterio(self._path)
+        with (
+            _damage_in_a_sentence(self._path, f"rows {start} to {stop - 1}"),
+            rasterio.Env(GDAL_CACHEMAX=self.held_bytes(stop - start), **self._environment),
+        ):
+            window = rasterio.windows.Window(0, start, self.raster.width_px, stop - start)
+            return np.asarray(self._dataset.read(window=window))
+
+    def held_bytes(self, rows_px: int) -> int:
+        """GDAL's cache: the blocks around the rows, so that none is decoded for two strips."""
+        rows = rows_px + 2 * self._block_px
+        row_bytes = self.raster.bands * self.raster.width_px * self.raster.dtype.itemsize
+        return int(max(LEAST_CACHE_BYTES, rows * row_bytes))
+
+
+def _raster(path: Path, dataset: Any) -> Raster:
+    """What GDAL says of an image, before any pixel is read.
+
+    Raises:
+        ImageError: none or several images, bands of different kinds, too large, no numbers, or a nodata value that
+            the output could not hold.
+    """
+    if dataset.count == 0:
+        remedy = "give the file of one of them" + (f", as {dataset.subdatasets[0]}" if dataset.subdatasets else "")
+        raise ImageError(str(path), expected="one image", got="several, or none", remedy=remedy)
+    for kind, each in (("types", dataset.dtypes), ("nodata values", dataset.nodatavals)):
+        if len({str(one) for one in each}) > 1:
+            got = ", ".join(str(one) for one in each)
+            raise ImageError(str(path), expected=f"bands of equal {kind}", got=got, remedy="split the bands")
+    name, dtype = str(path), require_numbers(str(path), np.dtype(dataset.dtypes[0]))
+    require_size(name, dataset.count, dataset.height, dataset.width)
+    nodata = usable_nodata(name, dataset.nodatavals[0], dtype)
+    tags, bits = _tags(dataset, nodata), _bits(path, dataset)
+    return Raster(dataset.count, dataset.height, dataset.width, dtype, nodata, tags, bits)
+
+
+def _bits(path: Path, dataset: Any) -> int | None:
+    """The bits per pixel that the file states, the largest of its bands'; None where any band states none.
+
+    A DIMAP says it of the product; of other files what fills the type is a container, as in a plain TIFF.
+    """
+    if (of_product := dimap_bits(path)) is not None:
+        return of_product
+    bands = range(1, dataset.count + 1)
+    stated = [str(dataset.tags(band, ns="IMAGE_STRUCTURE").get("NBITS", "")) for band in bands]
+    actual = stated if all(stated) else [str(dataset.tags().get("NITF_ABPP", "")).strip()]
+    most = max((int(each) for each in actual if each.isdecimal()), default=0)
+    return most if 0 < most < 8 * np.dtype(dataset.dtypes[0]).itemsize else None
+
+
+def _tags(dataset: Any, nodata: float | None) -> tuple[Tag, ...]:
+    """Georeference, RPCs, names and gains of bands as TIFF tags: those of a file of one pixel that GDAL writes."""
+    profile = {"driver": "GTiff", "width": 1, "height": 1, "count": dataset.count, "dtype": dataset.dtypes[0]}
+    profile |= {} if nodata is None else {"nodata": nodata}
+    with import_module("rasterio.io").MemoryFile() as memory:
+        with memory.open(**profile, **_place(dataset)) as small:
+            small.update_tags(**{key: value for key, value in dataset.tags().items() if key == "AREA_OR_POINT"})
+            if dataset.rpcs is not None:
+                small.rpcs = dataset.rpcs
+            small.descriptions, small.units = dataset.descriptions, [unit or "" for unit in dataset.units]
+            small.scales, small.offsets = dataset.scales, dataset.offsets
+            for band in range(1, dataset.count + 1):
+                small.update_tags(band, **dataset.tags(band))
+        content = memory.read()
+    with tifffile.TiffFile(io.BytesIO(content)) as file:
+        return carried_tags(file.pages.first)
+
+
+def _place(dataset: Any) -> dict[str, Any]:
+    """Where an image lies, as rasterio takes it: by a transform or by ground control points; empty for none."""
+    points, points_crs = dataset.gcps
+    if points:
+        return {"gcps": points, "crs": points_crs}
+    placed = {} if dataset.transform.is_identity else {"transform": dataset.transform}
+    return placed | ({"crs": dataset.crs} if dataset.crs else {})

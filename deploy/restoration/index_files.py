@@ -1,0 +1,194 @@
+"""Untrusted indexes: an XML file that names an image's tiles is read here before GDAL follows it anywhere.
+
+A VRT may hold only what a mosaic needs (an element or attribute that is not listed is refused, and with it code in
+Python, pansharpening, warping and open options). A DIMAP is followed by the two paths that GDAL's driver takes from
+it. Whatever an index names must be an image that lies in its folder or below, unless the user trusts it.
+
+Sources: https://gdal.org/en/stable/drivers/raster/vrt.html, and GDAL's frmts/dimap/dimapdataset.cpp.
+"""
+
+import xml.etree.ElementTree as ET
+from collections.abc import Iterator
+from pathlib import Path
+
+from profiles.errors import ImageError
+from profiles.toml import read_whole
+
+INDEX_SUFFIXES = {".vrt", ".xml"}
+INDEX_BYTES = 1 << 23
+"""A tile takes some 500 bytes of a VRT: over ten thousand tiles."""
+ELEMENTS, LEVELS, HEAD_BYTES = 200_000, 4, 1000
+"""Of one index, of indexes that name indexes, and of what GDAL tells a file's kind from."""
+
+MAGIC = {
+    b"II*\0": "TIFF",
+    b"MM\0*": "TIFF",
+    b"II+\0": "BigTIFF",
+    b"MM\0+": "BigTIFF",
+    b"\0\0\0\x0cjP  \r\n\x87\n": "JPEG 2000",
+    b"\xff\x4f\xff\x51": "JPEG 2000",
+    b"NITF": "NITF",
+    b"NSIF": "NITF",
+    b"\x89PNG\r\n\x1a\n": "PNG",
+    b"\xff\xd8\xff": "JPEG",
+}
+"""How the files begin that an index may name: none of them names others."""
+
+VRT_ELEMENTS = {
+    "VRTDataset", "VRTRasterBand", "SRS", "GeoTransform", "GCPList", "GCP", "Metadata", "MDI", "ColorInterp",
+    "NoDataValue", "HideNoDataValue", "Description", "UnitType", "Scale", "Offset", "SimpleSource", "ComplexSource",
+    "SourceFilename", "SourceBand", "SourceProperties", "SrcRect", "DstRect", "NODATA", "ScaleOffset", "ScaleRatio",
+}  # fmt: skip
+VRT_ATTRIBUTES = {
+    "rasterXSize", "rasterYSize", "dataType", "band", "blockXSize", "blockYSize", "dataAxisToSRSAxisMapping",
+    "coordinateEpoch", "domain", "key", "Projection", "Id", "Info", "Pixel", "Line", "X", "Y", "Z", "relativeToVRT",
+    "relativetoVRT", "shared", "xOff", "yOff", "xSize", "ySize", "RasterXSize", "RasterYSize", "DataType",
+    "BlockXSize", "BlockYSize", "resampling",
+}  # fmt: skip
+VRT = "VRTDataset"
+MOST_BITS = 16
+PIXELS = "data_file_path"
+DIMAP_PATHS = {PIXELS, "component_path"}
+"""GDAL compares names of elements without regard to case."""
+
+
+class NoDoctype(ET.TreeBuilder):
+    """A tree of untrusted XML: entities are declared in a document type; with none, nothing can be expanded."""
+
+    def doctype(self, name: str, pubid: str | None, system: str | None) -> None:  # noqa: ARG002
+        """Refuse it."""
+        raise ValueError("a document type, which may declare entities")
+
+
+def is_index(path: Path) -> bool:
+    """Whether a file names an image's tiles instead of holding them, by its name."""
+    return path.suffix.lower() in INDEX_SUFFIXES
+
+
+def index_files(path: Path, trusted: bool = False) -> tuple[Path, ...]:
+    """The files that an index, and the indexes it names, make an image of; none for a file that is no index.
+
+    Args:
+        path: of any image.
+        trusted: whether tiles may lie outside the index's folder; what lies at a URL is then not looked at.
+
+    Raises:
+        ImageError: no sound index, or one that names what is missing, outside its folder, at a URL, or no image.
+    """
+    if not is_index(path):
+        return ()
+    home, found, pending = path.resolve().parent, dict[Path, None](), [(path.resolve(), LEVELS)]
+    while pending:
+        index, levels = pending.pop()
+        found[index] = None
+        for file in dict.fromkeys(_named(index, home, trusted)):  # once each, in order
+            if file.suffix.lower() == ".vrt" and (levels == 0 or file in found):
+                got = "one that comes back to itself" if file in found else "deeper ones"
+                raise _refused(path, f"mosaics of mosaics, {LEVELS} deep at most", got, "flatten it")
+            if is_index(file) and file not in found and levels:
+                pending.append((file, levels - 1))
+            found[file] = None
+    return tuple(found)[1:]
+
+
+def _named(index: Path, home: Path, trusted: bool) -> Iterator[Path]:
+    """The files that one index names; `home` is the folder of the first one."""
+    root = _parsed(index)
+    for text, folder, pixels in _of_vrt(index, root) if root.tag == VRT else _of_dimap(index, root):
+        if trusted and _is_elsewhere(text):
+            continue
+        file = _located(index, text, folder, None if trusted else home)
+        if pixels:
+            _require_pixels(index, text, file)
+        if pixels or (is_index(file) and file.is_file()):
+            yield file
+
+
+def _require_pixels(index: Path, text: str, file: Path) -> None:
+    """That a tile is there, and is an image or a VRT.
+
+    Raises:
+        ImageError: it is not.
+    """
+    if not (text and file.is_file()):
+        raise _refused(index, f"the tile {text or '(no name)'}", "no such file", "fetch it or make the index anew")
+    with file.open("rb") as stream:
+        known = stream.read(16).startswith(tuple(MAGIC))
+    if not known and file.suffix.lower() != ".vrt":
+        expected = "tiles that are TIFF, JPEG 2000, NITF, PNG or JPEG"
+        raise _refused(index, expected, f"another file, {text}", "convert it to TIFF")
+
+
+def _parsed(path: Path) -> ET.Element:
+    try:
+        content = read_whole(path, INDEX_BYTES)
+        parser = ET.XMLParser(target=NoDoctype())  # noqa: S314 - without a document type there are no entities
+        root = ET.fromstring(content, parser)  # noqa: S314
+        if sum(1 for _ in root.iter()) > ELEMENTS:
+            raise ValueError(f"more than {ELEMENTS} elements")
+        # GDAL looks for this word in the first bytes, and gives what lacks it to the next of its drivers.
+        if path.suffix.lower() == ".vrt" and not (root.tag == VRT and b"<VRTDataset" in content[:HEAD_BYTES]):
+            raise ValueError(f"a document that does not begin as a {VRT}")
+    except (ET.ParseError, ValueError, OSError, RecursionError) as error:
+        got = getattr(error, "strerror", None) or str(error)
+        raise _refused(path, "a VRT or a DIMAP, plain XML", got, "write it again") from error
+    return root
+
+
+Named = Iterator[tuple[str, Path, bool]]
+"""A path as an index has it, the folder that it counts from, and whether pixels are there."""
+
+
+def _of_vrt(path: Path, root: ET.Element) -> Named:
+    for element in root.iter():
+        unknown = [element.tag] if element.tag not in VRT_ELEMENTS else sorted(set(element.attrib) - VRT_ATTRIBUTES)
+        if unknown:
+            remedy = "make it a file with gdal_translate if you trust it"
+            raise _refused(path, "a VRT that is a plain mosaic", f"{unknown[0]} in it", remedy)
+        if element.tag == "SourceFilename":
+            relative = element.get("relativeToVRT", element.get("relativetoVRT", "0"))
+            # Where it is not 1, GDAL looks from the working directory.
+            yield (element.text or "").strip(), path.parent if relative == "1" else Path.cwd(), True
+
+
+def _of_dimap(path: Path, root: ET.Element) -> Named:
+    """Paths by attribute, or by an element in an attribute's place, which are the same to GDAL."""
+    for element in root.iter():
+        name = element.tag.rpartition("}")[2].lower()
+        if name in DIMAP_PATHS:
+            given = [*element.attrib.items(), *((child.tag, child.text or "") for child in element)]
+            for key, text in given:
+                if key.rpartition("}")[2].lower() == "href":
+                    yield text.strip(), path.parent, name == PIXELS
+
+
+def _is_elsewhere(text: str) -> bool:
+    """Whether GDAL would take it for more than a path: a URL, a virtual file, XML itself, a part of a file."""
+    return "://" in text or text.startswith(("/vsi", "<")) or (":" in text and not Path(text).drive)
+
+
+def _located(index: Path, text: str, folder: Path, home: Path | None) -> Path:
+    """A path that an index names; in `home` or below, unless that is None."""
+    file = (folder / text).resolve()
+    elsewhere = _is_elsewhere(text)
+    if elsewhere or (home is not None and not file.is_relative_to(home)):
+        remedy = "put its tiles beside it, or trust it with --trust-index"
+        raise _refused(index, "tiles in its own folder", f"one at {text if elsewhere else file}", remedy)
+    return file
+
+
+def _refused(path: Path, expected: str, got: str, remedy: str) -> ImageError:
+    return ImageError(str(path), expected=expected, got=got, remedy=remedy)
+
+
+def dimap_bits(path: Path) -> int | None:
+    """The bits per pixel of a DIMAP's product; None where it states none, or is none.
+
+    Dynamic_Range/PRODUCT_RANGE, else Raster_Encoding/NBITS, as Airbus' Pleiades Imagery User Guide has them.
+    """
+    if path.suffix.lower() != ".xml":
+        return None
+    root = _parsed(path)
+    stated = [(root.findtext(f".//{name}") or "").strip() for name in ("PRODUCT_RANGE", "NBITS")]
+    known = [int(text) for text in stated if text.isdecimal() and 1 <= int(text) <= MOST_BITS]
+    return known[0] if known else None

@@ -1,0 +1,70 @@
+"""Which pixel value is full scale, and who says so: the user, the file, the sensor's profile, or nobody.
+
+What nobody states is assumed in sight: 12 bits. Values above a stated full scale are clipped, counted and told; above
+an assumed one they show that the assumption is wrong, and are refused.
+"""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from deploy.restoration.source import Raster
+from model.io.images import MAX_DN, settled_scale
+from profiles.errors import OptionError
+
+
+@dataclass(frozen=True)
+class FullScale:
+    """The pixel value that is full scale, in words where it is from, and whether that is an assumption."""
+
+    value: float
+    source: str
+    assumed: bool = False
+
+
+def full_scale_of(
+    name: str, raster: Raster, largest: Iterable[float], asked: float | None = None, bits: int | None = None
+) -> FullScale:
+    """The full scale of an image.
+
+    Args:
+        name: of the image, for messages.
+        raster: what its file states.
+        largest: as for `model.io.images.settled_scale`, drawn for floats only.
+        asked: by the user.
+        bits: of the sensor, where the user names its profile.
+
+    Raises:
+        ImageError: pixels that leave it open.
+        OptionError: a full scale that such pixels, or their restored ones, cannot have.
+    """
+    if asked is not None:
+        settled_scale(name, raster.dtype, largest, asked)
+        require_room(raster, asked)
+        return FullScale(asked, "--full-scale")
+    if raster.bits is not None:
+        return FullScale(2**raster.bits - 1, f"{raster.bits} bits, as the file states")
+    if bits is None or not _holds(raster.dtype, bits):
+        return FullScale(settled_scale(name, raster.dtype, largest), f"assumed: {MAX_DN.bit_length()} bits", True)
+    usual = 2**bits - 1
+    value = settled_scale(name, raster.dtype, largest, usual=usual) if raster.dtype.kind == "f" else usual
+    return FullScale(value, f"{bits} bits, of --sensor")
+
+
+def _holds(dtype: np.dtype[Any], bits: int) -> bool:
+    """Whether pixels of this type can have so many bits."""
+    return dtype.kind == "f" or 2**bits - 1 <= np.iinfo(dtype).max
+
+
+def require_room(raster: Raster, full_scale: float) -> None:
+    """That restored pixels up to full scale fit into the output's type.
+
+    Raises:
+        OptionError: they do not.
+    """
+    kind = raster.out_dtype
+    if kind.kind == "u" and full_scale > np.iinfo(kind).max:
+        expected, remedy = f"at most {np.iinfo(kind).max} for {kind} pixels", "convert the image to uint16"
+        raise OptionError("--full-scale", expected=expected, got=f"{full_scale:g}", remedy=remedy)

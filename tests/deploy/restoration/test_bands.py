@@ -1,0 +1,81 @@
+"""A sensor for each band: each band is restored by its own network, found by its name."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tifffile
+from typer.testing import CliRunner
+
+from deploy.cli import app
+from deploy.restoration.bands import band_names, parse_sensors
+from deploy.restoration.source import Raster, open_source
+from profiles.errors import OptionError
+from tests.deploy.restoration import images
+
+FIRST, SECOND = "pleiades-degraded", "blind"
+
+
+def restored(image: Path, sensor: str, *more: str) -> tuple[np.ndarray, str]:
+    out = image.with_name("out.tif")
+    words = ["restore", str(image), str(out), "--model", "convbeers-xs", "--sensor", sensor, *more]
+    done = CliRunner().invoke(app, words)
+    assert done.exit_code == 0, done.output
+    return tifffile.imread(out), done.output
+
+
+@pytest.mark.parametrize("names", [("B0", "B1"), ("B1", "B0")])
+def test_each_band_has_its_own_network(names: tuple[str, str], tmp_path: Path) -> None:
+    """Named in either order; the bands of the file are B0 and B1."""
+    image = images.write_tiff(tmp_path / "in.tif", images.digital_numbers())
+    of = dict(zip(names, (FIRST, SECOND), strict=True))
+    both, _ = restored(image, f"{names[0]}={FIRST},{names[1]}={SECOND}", "--tile", "64")
+    alone = {sensor: restored(image, sensor)[0] for sensor in (FIRST, SECOND)}
+    assert (alone[FIRST] != alone[SECOND]).any()
+    for band in (0, 1):
+        np.testing.assert_array_equal(both[band], alone[of[f"B{band}"]][band])
+
+
+def test_bands_without_names_are_taken_in_order(tmp_path: Path) -> None:
+    tifffile.imwrite(tmp_path / "in.tif", images.digital_numbers(), planarconfig="separate", photometric="minisblack")
+    with open_source(tmp_path / "in.tif") as source:
+        assert source.raster.bands == 2
+        assert band_names(source.raster) == ()
+    both, _ = restored(tmp_path / "in.tif", f"red={SECOND},blue={FIRST}")
+    for band, sensor in ((0, SECOND), (1, FIRST)):
+        np.testing.assert_array_equal(both[band], restored(tmp_path / "in.tif", sensor)[0][band])
+
+
+def test_a_cog_names_the_sensors_in_the_order_of_the_bands(tmp_path: Path) -> None:
+    image = images.write_tiff(tmp_path / "in.tif", images.digital_numbers())
+    restored(image, f"B1={FIRST},B0={SECOND}", "--cog")
+    with images.rasterio.open(tmp_path / "out.tif") as file:
+        assert file.tags()["RESTORED_SENSOR"] == f"{SECOND}, {FIRST}"
+        assert len(file.tags()["RESTORED_NETWORK_SHA256"].split(", ")) == 2
+
+
+@pytest.mark.parametrize(
+    ("sensor", "more", "words"),
+    [
+        (f"B0={FIRST}", (), "a sensor for each of 2 bands: B0, B1"),
+        (f"B0={FIRST},B7={FIRST}", (), "a sensor for each of 2 bands: B0, B1"),
+        (f"B0={FIRST},B0={SECOND}", (), "name each band once"),
+        (f"B0={FIRST},{SECOND}", (), "BAND=PROFILE"),
+        (f"B0={FIRST},B1={SECOND}", ("--workers", "1"), "one sensor for workers"),
+    ],
+)
+def test_what_does_not_fit_is_refused(sensor: str, more: tuple[str, ...], words: str, tmp_path: Path) -> None:
+    image = images.write_tiff(tmp_path / "in.tif", images.digital_numbers())
+    arguments = ["restore", str(image), str(tmp_path / "out.tif"), "--model", "convbeers-xs", "--sensor", sensor]
+    done = CliRunner().invoke(app, [*arguments, *more])
+    assert done.exit_code == 2, done.output
+    assert words in done.stderr
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["in.tif"]
+
+
+def test_names_are_read_from_no_bomb() -> None:
+    bomb = '<!DOCTYPE a [<!ENTITY b "x">]><a><Item sample="0" role="description">&b;</Item></a>'
+    assert band_names(Raster(1, 9, 9, np.dtype(np.uint16), None, ((42112, 2, 0, bomb, True),))) == ()
+    assert parse_sensors("my.toml") == {"": "my.toml"}
+    with pytest.raises(OptionError):
+        parse_sensors("=a,B1=b")

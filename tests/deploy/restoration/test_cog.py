@@ -1,0 +1,125 @@
+"""Cloud-Optimised GeoTIFFs: valid, with the pixels and the place of the plain output, and what was done."""
+
+import sys
+from dataclasses import replace
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from deploy.networks import shipped_pair
+from deploy.restoration.options import Compression, Options
+from deploy.restoration.run import restore_file
+from model.io.files import sha256
+from profiles.errors import MachineError
+from tests.deploy.restoration import images
+
+rasterio: Any = images.rasterio
+cogeo: Any = pytest.importorskip("rio_cogeo")
+
+
+def both(folder: Path, pixels: np.ndarray, options: Options) -> tuple[Path, Path]:
+    """The plain output and the cloud-optimised one of an image."""
+    image = images.write_tiff(folder / "in.tif", pixels)
+    restore_file(image, folder / "plain.tif", options, lambda _: None)
+    restore_file(image, folder / "cog.tif", replace(options, cog=True), lambda _: None)
+    assert sorted(path.name for path in folder.iterdir()) == ["cog.tif", "in.tif", "plain.tif"]
+    return folder / "plain.tif", folder / "cog.tif"
+
+
+@pytest.mark.parametrize("compression", Compression)
+def test_it_is_valid_and_holds_the_same(compression: Compression, model: Path, tmp_path: Path) -> None:
+    pixels = np.tile(images.digital_numbers(), (1, 5, 6))
+    if compression is Compression.none:
+        pixels = pixels.astype(np.float32)
+    options = Options(model, compression=Compression.zlib)
+    plain, cog = both(tmp_path, pixels, options)
+    restore_file(tmp_path / "in.tif", cog, replace(options, compression=compression, cog=True), lambda _: None)
+    valid, errors, warnings = cogeo.cog_validate(cog, strict=True)
+    assert (valid, errors, warnings) == (True, [], [])
+    with rasterio.open(plain) as before, rasterio.open(cog) as after:
+        np.testing.assert_array_equal(after.read(), before.read())
+        np.testing.assert_allclose(after.transform, images.profile()["transform"], rtol=0, atol=1e-9)
+        assert after.crs == rasterio.CRS.from_epsg(32631)
+        assert (after.descriptions, after.scales) == (("B0", "B1"), (0.1, 0.2))
+        assert after.overviews(1) == [2]
+        if compression is not Compression.none:  # GDAL 3.10 marks no file of uncompressed planes
+            assert after.tags(ns="IMAGE_STRUCTURE")["LAYOUT"] == "COG"
+        names = {"zlib": "deflate", "zstd": "zstd", "lzw": "lzw", "none": None}
+        assert (after.compression and after.compression.value.lower()) == names[compression.value]
+        predictor = after.tags(ns="IMAGE_STRUCTURE").get("PREDICTOR")
+    assert predictor == (None if compression is Compression.none else "2")
+
+
+def test_it_says_what_was_done(tmp_path: Path) -> None:
+    int8 = shipped_pair()[1]
+    _, cog = both(tmp_path, images.digital_numbers(), Options(int8, tile_px=64))
+    with rasterio.open(cog) as file:
+        said = file.tags()
+    assert said["RESTORED_NETWORK_SHA256"] == sha256(int8)
+    assert said["RESTORED_NETWORK"] == "convbeers-s"
+    assert said["RESTORED_SENSOR"] == "pleiades-degraded"
+    assert said["RESTORED_FULL_SCALE"] == "4095 (assumed: 12 bits)"
+    assert said["RESTORED_BY"].startswith("beers-deploy ")
+
+
+def test_polynomials_and_missing_pixels_are_kept(model: Path, tmp_path: Path) -> None:
+    index = images.write_dimap(tmp_path / "DIM.XML", images.digital_numbers())
+    restore_file(index, tmp_path / "out.tif", Options(model, tile_px=64, cog=True), lambda _: None)
+    with rasterio.open(index) as before, rasterio.open(tmp_path / "out.tif") as after:
+        kept, stated = after.rpcs.to_dict(), before.rpcs.to_dict()
+        for key in stated.keys() - {"err_bias", "err_rand"}:
+            np.testing.assert_allclose(kept[key], stated[key], rtol=0, atol=1e-9)
+    pixels = np.maximum(images.digital_numbers(), 1)
+    pixels[:, 30:60, 20:90] = 0
+    image = images.write_tiff(tmp_path / "in.tif", pixels, nodata=0)
+    restore_file(image, tmp_path / "out.tif", Options(model, tile_px=64, cog=True), lambda _: None)
+    with rasterio.open(tmp_path / "out.tif") as file:
+        assert file.nodata == 0
+        np.testing.assert_array_equal(file.read() == 0, pixels == 0)
+
+
+def test_a_run_stopped_while_it_is_written_goes_on(
+    model: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    options = Options(model, tile_px=64, cog=True)
+    image = images.write_tiff(tmp_path / "in.tif", images.digital_numbers())
+    restore_file(image, tmp_path / "expected.tif", options, lambda _: None)
+    (tmp_path / "out.tif").write_bytes(b"the old one")
+
+    def full(*_: object, **__: object) -> None:
+        (tmp_path / ".out.tif.part" / "cog.tif.ovr.tmp").touch()
+        raise RuntimeError("no space left")
+
+    shutil: Any = import_module("rasterio.shutil")
+    with monkeypatch.context() as patch:
+        patch.setattr(shutil, "copy", full)
+        with pytest.raises(MachineError, match=r"no space left.*--resume from row 150 of 150"):
+            restore_file(image, tmp_path / "out.tif", options, lambda _: None)
+    assert (tmp_path / "out.tif").read_bytes() == b"the old one"
+    calls: list[str] = []
+    monkeypatch.setattr("deploy.restoration.engine.restore_window", lambda *_: calls.append("tile"))
+    restore_file(image, tmp_path / "out.tif", replace(options, resume=True), lambda _: None)
+    assert calls == []
+    assert (tmp_path / "out.tif").read_bytes() == (tmp_path / "expected.tif").read_bytes()
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["expected.tif", "in.tif", "out.tif"]
+
+
+@settings(max_examples=10, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(height=st.integers(1, 700), width=st.integers(1, 700))
+def test_it_is_valid_at_any_size(height: int, width: int, model: Path, tmp_path: Path) -> None:
+    images.write_tiff(tmp_path / "in.tif", np.full((1, height, width), 700, np.uint16))
+    restore_file(tmp_path / "in.tif", tmp_path / "out.tif", Options(model, tile_px=256, cog=True), lambda _: None)
+    assert cogeo.cog_validate(tmp_path / "out.tif")[0]
+
+
+def test_without_rasterio_it_is_one_sentence(model: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    image = images.write_tiff(tmp_path / "in.tif", images.digital_numbers())
+    monkeypatch.setitem(sys.modules, "rasterio", None)
+    with pytest.raises(MachineError, match=r"--cog.*pip install 'beers-deploy\[gdal\]'"):
+        restore_file(image, tmp_path / "out.tif", Options(model, cog=True), lambda _: None)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["in.tif"]

@@ -1,0 +1,207 @@
+"""What GDAL reads: the same pixels and the same place on Earth as of a TIFF, whatever the format."""
+
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import tifffile
+from typer.testing import CliRunner
+
+from deploy.cli import app
+from deploy.networks import shipped_pair
+from deploy.restoration.gdal_source import LEAST_CACHE_BYTES, GdalSource
+from deploy.restoration.options import Options
+from deploy.restoration.run import restore_file
+from deploy.restoration.source import TiffSource, fingerprint, open_source
+from profiles.errors import BeersError, ImageError, MachineError
+from tests.deploy.restoration import images
+
+rasterio: Any = images.rasterio
+
+Writer = Callable[[Path, np.ndarray], Path]
+FORMATS: dict[str, Writer] = {
+    "a.tif": images.write_tiff,
+    "cog.tif": images.write_cog,
+    "a.jp2": lambda path, pixels: images.write_jp2(path, pixels, NBITS=12),
+    "a.vrt": images.write_vrt,
+    "a.ntf": lambda path, pixels: images.write(path, pixels, "NITF", ICORDS="N"),
+    "a.img": lambda path, pixels: images.write(path, pixels, "HFA"),
+    "DIM.XML": images.write_dimap,
+}
+PLACED = ["a.tif", "cog.tif", "a.jp2", "a.vrt", "a.img", "DIM.XML"]
+"""A NITF holds an image's corners, to a tenth of a pixel."""
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_rows_are_those_of_the_image(name: str, tmp_path: Path) -> None:
+    pixels = images.digital_numbers()
+    with open_source(FORMATS[name](tmp_path / name, pixels)) as source:
+        assert source.raster.shape == pixels.shape
+        assert isinstance(source, TiffSource if name.endswith("tif") else GdalSource)
+        for start, stop in ((0, 7), (5, 70), (60, images.HEIGHT), (0, images.HEIGHT)):
+            np.testing.assert_array_equal(source.read(start, stop), pixels[:, start:stop])
+
+
+@pytest.mark.parametrize("precision", ["float32", "int8"])
+def test_the_restored_pixels_are_the_same_from_every_format(precision: str, model: Path, tmp_path: Path) -> None:
+    pixels = images.digital_numbers()
+    options = Options(model if precision == "float32" else shipped_pair()[1], tile_px=64)
+    results = []
+    for name, write in FORMATS.items():
+        folder = tmp_path / name
+        folder.mkdir()
+        restore_file(write(folder / name, pixels), folder / "out.tif", options, lambda _: None)
+        results.append(tifffile.imread(folder / "out.tif"))
+    for result in results[1:]:
+        np.testing.assert_array_equal(result, results[0])
+
+
+@pytest.mark.parametrize("name", PLACED)
+def test_the_place_on_earth_is_kept(name: str, model: Path, tmp_path: Path) -> None:
+    image = FORMATS[name](tmp_path / name, images.digital_numbers())
+    restore_file(image, tmp_path / "out.tif", Options(model), lambda _: None)
+    with rasterio.open(image) as before, rasterio.open(tmp_path / "out.tif") as after:
+        np.testing.assert_allclose(after.transform, images.profile()["transform"], rtol=0, atol=1e-9)
+        assert after.crs == before.crs == rasterio.CRS.from_epsg(32631)
+
+
+def test_polynomials_bits_and_gains_of_a_dimap_are_kept(model: Path, tmp_path: Path) -> None:
+    image = images.write_dimap(tmp_path / "DIM.XML", images.digital_numbers(10), bits=10)
+    with open_source(image) as source:
+        assert source.raster.bits == 10
+    restore_file(image, tmp_path / "out.tif", Options(model), lambda _: None)
+    with rasterio.open(image) as before, rasterio.open(tmp_path / "out.tif") as after:
+        kept, stated = after.rpcs.to_dict(), before.rpcs.to_dict()
+        for key in stated.keys() - {"err_bias", "err_rand"}:
+            np.testing.assert_allclose(kept[key], stated[key], rtol=0, atol=1e-9)
+        assert [after.tags(band)["RADIANCE_GAIN"] for band in (1, 2)] == ["9.0", "9.1"]
+        assert [after.tags(band)["RADIANCE_BIAS"] for band in (1, 2)] == ["0.0", "0.1"]
+
+
+def test_names_and_gains_of_bands_are_kept(model: Path, tmp_path: Path) -> None:
+    more = "<Description>B0</Description><Offset>-0.5</Offset><Scale>0.25</Scale>"
+    image = images.write_vrt(tmp_path / "a.vrt", images.digital_numbers(), more)
+    restore_file(image, tmp_path / "out.tif", Options(model), lambda _: None)
+    with rasterio.open(tmp_path / "out.tif") as after:
+        assert after.descriptions == ("B0", "B0")
+        assert (after.scales, after.offsets) == ((0.25, 0.25), (-0.5, -0.5))
+
+
+def test_ground_control_points_are_kept(model: Path, tmp_path: Path) -> None:
+    points = "".join(
+        f'<GCP Id="{k}" Pixel="{17 * k}" Line="{9 * k * k}" X="{k / 3!r}" Y="{45 - k / 7!r}" Z="0"/>'
+        for k in range(5)
+    )
+    image = images.write_vrt(tmp_path / "a.vrt", images.digital_numbers())
+    text = image.read_text()
+    place = text[text.index("<SRS>") : text.index("</GeoTransform>") + len("</GeoTransform>")]
+    image.write_text(text.replace(place, f'<GCPList Projection="EPSG:4326">{points}</GCPList>'))
+    restore_file(image, tmp_path / "out.tif", Options(model), lambda _: None)
+    with rasterio.open(image) as before, rasterio.open(tmp_path / "out.tif") as after:
+        assert before.gcps[1] == after.gcps[1] == rasterio.CRS.from_epsg(4326)
+        found = [[(p.col, p.row, p.x, p.y) for p in file.gcps[0]] for file in (before, after)]
+    assert len(found[0]) == 5
+    np.testing.assert_allclose(found[1], found[0], rtol=0, atol=1e-9)
+
+
+def test_missing_pixels_stay_missing(model: Path, tmp_path: Path) -> None:
+    pixels = np.maximum(images.digital_numbers(), 1)
+    pixels[:, 20:70, 30:90] = 0
+    results = []
+    for name, write in (("a.tif", images.write_tiff), ("a.img", FORMATS["a.img"])):
+        image = write(tmp_path / name, pixels)
+        with rasterio.open(image, "r+") as file:
+            file.nodata = 0
+        if name == "a.img":
+            assert not list(tmp_path.glob("*.aux.xml"))  # it is in the file
+        restore_file(image, tmp_path / f"{name}.tif", Options(model, tile_px=64), lambda _: None)
+        results.append(tifffile.imread(tmp_path / f"{name}.tif"))
+    np.testing.assert_array_equal(results[0] == 0, pixels == 0)
+    np.testing.assert_array_equal(results[1], results[0])
+    more = "<NoDataValue>0</NoDataValue>"
+    image = images.write_vrt(tmp_path / "a.vrt", pixels, more)
+    restore_file(image, tmp_path / "vrt.tif", Options(model, tile_px=64), lambda _: None)
+    np.testing.assert_array_equal(tifffile.imread(tmp_path / "vrt.tif"), results[0])
+
+
+def test_workers_read_it_too(model: Path, tmp_path: Path) -> None:
+    pytest.importorskip("distributed")
+    image = images.write_vrt(tmp_path / "a.vrt", images.digital_numbers())
+    restore_file(image, tmp_path / "one.tif", Options(model, tile_px=64), lambda _: None)
+    restore_file(image, tmp_path / "two.tif", Options(model, tile_px=64, workers=1), lambda _: None)
+    assert (tmp_path / "one.tif").read_bytes() == (tmp_path / "two.tif").read_bytes()
+
+
+def test_the_cache_is_counted_with_the_blocks_of_a_mosaic_s_tiles(tmp_path: Path) -> None:
+    pixels, rows = images.digital_numbers(), 1 << 20
+    one = images.write_jp2(tmp_path / "a.jp2", pixels)
+    images.write(tmp_path / "strip.tif", pixels, "GTiff", blockysize=140)
+    size = f'rasterXSize="{images.WIDTH}" rasterYSize="{images.HEIGHT}"'
+    bands = "".join(
+        f'<VRTRasterBand dataType="UInt16" band="{band}">'
+        f"{images.source('strip.tif', band, 0, 0, images.HEIGHT, images.WIDTH)}</VRTRasterBand>"
+        for band in (1, 2)
+    )
+    (tmp_path / "a.vrt").write_text(f"<VRTDataset {size}>{bands}</VRTDataset>")
+    for image, block_px in ((one, images.TILE_PX), (tmp_path / "a.vrt", 140)):
+        with open_source(image) as source:
+            assert source.held_bytes(rows) == (rows + 2 * block_px) * images.BANDS * images.WIDTH * 2
+            assert source.held_bytes(1) == LEAST_CACHE_BYTES
+
+
+def refused(image: Path, out: Path, model: Path, error: type[BeersError], *words: str) -> None:
+    """One sentence, and nothing written."""
+    before = sorted(out.parent.iterdir())
+    with pytest.raises(error) as caught:
+        restore_file(image, out, Options(model, tile_px=64), lambda _: None)
+    for word in words:
+        assert word in str(caught.value)
+    assert "\n" not in str(caught.value)
+    assert sorted(out.parent.iterdir()) == before
+
+
+@pytest.mark.parametrize("share", [0.0, 0.05, 0.5, 0.95])
+def test_a_truncated_jpeg_2000_is_one_sentence(
+    share: float, model: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    image = images.write_jp2(tmp_path / "a.jp2", images.digital_numbers())
+    content = image.read_bytes()
+    image.write_bytes(content[: int(share * len(content)) + 50])
+    refused(image, tmp_path / "out.tif", model, ImageError, "a.jp2", "whole image")
+    assert capfd.readouterr().err == ""
+
+
+def test_what_gdal_needs_and_cannot_take_is_said(
+    model: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out = tmp_path / "out.tif"
+    (tmp_path / "a.xml").write_text("<WMS_Service/>")
+    refused(tmp_path / "a.xml", out, model, ImageError, "DIMAP")
+    images.write(tmp_path / "c.img", np.ones((1, 9, 9), np.complex64), "HFA")
+    refused(tmp_path / "c.img", out, model, ImageError, "complex64")
+    image = images.write_jp2(tmp_path / "a.jp2", images.digital_numbers())
+    monkeypatch.setitem(sys.modules, "rasterio", None)
+    refused(image, out, model, MachineError, "pip install 'beers-deploy[gdal]'")
+
+
+def test_a_tile_is_no_output(model: Path, tmp_path: Path) -> None:
+    image = images.write_dimap(tmp_path / "DIM.XML", images.digital_numbers())
+    tile, out = tmp_path / "IMG_R2C1.TIF", tmp_path / "out.tif"
+    before = tile.read_bytes()
+    with pytest.raises(BeersError, match="an input of this run"):
+        restore_file(image, tile, Options(model), lambda _: None)
+    for words in (["restore", str(image), str(out), "--json", str(tile)], ["info", str(image), "--json", str(tile)]):
+        done = CliRunner().invoke(app, words)
+        assert done.exit_code == 2
+        assert "an input of this run" in done.stderr
+    assert tile.read_bytes() == before
+
+
+def test_a_changed_tile_makes_another_image(tmp_path: Path) -> None:
+    image = images.write_vrt(tmp_path / "a.vrt", images.digital_numbers())
+    before = fingerprint(image)
+    images.write_jp2(tmp_path / "R64C80.jp2", np.zeros((2, images.HEIGHT - 64, images.WIDTH - 80), np.uint16))
+    assert fingerprint(image) != before

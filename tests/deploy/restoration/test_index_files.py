@@ -1,0 +1,183 @@
+"""Indexes of strangers: followed to images in their own folder, and nowhere else."""
+
+import http.server
+import threading
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from deploy.restoration import index_files as indexes
+from deploy.restoration.index_files import index_files
+from deploy.restoration.source import open_source
+from profiles.errors import ImageError
+from tests.deploy.restoration import images
+
+ONE = images.source("tile.tif", 1, 0, 0, 9, 9)
+
+
+def vrt(body: str, more: str = "") -> str:
+    band = f'<VRTRasterBand dataType="UInt16" band="1">{body}</VRTRasterBand>'
+    return f'<VRTDataset rasterXSize="9" rasterYSize="9"{more}>{band}</VRTDataset>'
+
+
+def naming(name: str, relative: int = 1) -> str:
+    return ONE.replace("tile.tif", name).replace('relativeToVRT="1"', f'relativeToVRT="{relative}"')
+
+
+def folder_of(tmp_path: Path) -> Path:
+    """A folder with a tile, beside which another one lies."""
+    folder = tmp_path / "product"
+    folder.mkdir()
+    images.write(folder / "tile.tif", np.ones((1, 9, 9), np.uint16), "GTiff")
+    images.write(tmp_path / "outside.tif", np.ones((1, 9, 9), np.uint16), "GTiff")
+    (folder / "notes.txt").write_text("no image")
+    (folder / "service.xml").write_text("<GDAL_WMS/>")
+    return folder
+
+
+def test_what_an_index_names_is_found_once_each(tmp_path: Path) -> None:
+    folder = folder_of(tmp_path)
+    (folder / "a.vrt").write_text(vrt(naming("sub.vrt") + naming("sub.vrt")))
+    (folder / "sub.vrt").write_text(vrt(ONE))
+    assert index_files(folder / "a.vrt") == (folder / "sub.vrt", folder / "tile.tif")
+    assert index_files(folder / "tile.tif") == ()
+    images.write_dimap(folder / "DIM.XML", images.digital_numbers())
+    names = [path.name for path in index_files(folder / "DIM.XML")]
+    assert names == ["RPC.XML", "IMG_R1C1.TIF", "IMG_R2C1.TIF"]
+
+
+BOMB = '<!DOCTYPE a [<!ENTITY a "aa"><!ENTITY b "&a;&a;">]>'
+REFUSED = {
+    "missing": (vrt(naming("no.tif")), "the tile no.tif, got no such file"),
+    "no name": (vrt(naming("")), "no such file"),
+    "above": (vrt(naming("../outside.tif")), "in its own folder"),
+    "absolute": (vrt(naming("/etc/passwd")), "/etc/passwd"),
+    "from where it runs": (vrt(naming("outside.tif", relative=0)), "in its own folder"),
+    "URL": (vrt(naming("http://localhost/a.tif")), "http://localhost/a.tif"),
+    "network path": (vrt(naming("/vsicurl/http://localhost/a.tif")), "vsicurl"),
+    "part of a file": (vrt(naming("GTIFF_DIR:1:tile.tif")), "GTIFF_DIR"),
+    "XML in a name": (vrt(naming("&lt;GDAL_WMS/&gt;")), "GDAL_WMS"),
+    "as an attribute": (vrt('<SimpleSource SourceFilename="/vsicurl/http://a"/>'), "SourceFilename in it"),
+    "no image": (vrt(naming("notes.txt")), "another file, notes.txt"),
+    "a service": (vrt(naming("service.xml")), "another file, service.xml"),
+    "itself": (vrt(naming("a.vrt")), "comes back to itself"),
+    "a circle": (vrt(naming("b.vrt")), "comes back to itself"),
+    "code": (vrt("<PixelFunctionCode>import os</PixelFunctionCode>"), "PixelFunctionCode in it"),
+    "open options": (
+        vrt('<SimpleSource><OpenOptions><OOI key="A">B</OOI></OpenOptions></SimpleSource>'),
+        "OpenOptions",
+    ),
+    "pansharpening": (vrt("", ' subClass="VRTPansharpenedDataset"'), "subClass in it"),
+    "bomb": (BOMB + vrt("<Description>&b;</Description>"), "a document type"),
+    "no XML": ("<VRTDataset", "plain XML"),
+    "another root": ("<!--<VRTDataset>--><vrtdataset/>", "does not begin"),
+    "a late root": (f"<!--{' ' * 2000}-->" + vrt(ONE), "does not begin"),
+}
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_an_index_that_leads_elsewhere_is_refused(case: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = folder_of(tmp_path)
+    monkeypatch.chdir(tmp_path)
+    text, words = REFUSED[case]
+    (folder / "a.vrt").write_text(text)
+    (folder / "b.vrt").write_text(vrt(naming("a.vrt")))
+    with pytest.raises(ImageError) as caught, open_source(folder / "a.vrt"):
+        pass
+    assert words in str(caught.value)
+
+
+def test_a_link_out_of_the_folder_is_refused(tmp_path: Path) -> None:
+    folder = folder_of(tmp_path)
+    try:
+        (folder / "link.tif").symlink_to(tmp_path / "outside.tif")
+    except OSError:
+        pytest.skip("this account cannot make links")
+    (folder / "a.vrt").write_text(vrt(naming("link.tif")))
+    with pytest.raises(ImageError, match="in its own folder"):
+        index_files(folder / "a.vrt")
+
+
+def test_a_bomb_in_utf_16_is_seen(tmp_path: Path) -> None:
+    folder = folder_of(tmp_path)
+    (folder / "a.vrt").write_text(BOMB + vrt(ONE), encoding="utf-16")
+    with pytest.raises(ImageError, match="document type"):
+        index_files(folder / "a.vrt")
+
+
+def test_large_and_deep_indexes_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = folder_of(tmp_path)
+    for k in range(indexes.LEVELS + 1):
+        (folder / f"{k}.vrt").write_text(vrt(naming(f"{k + 1}.vrt")))
+    (folder / f"{k + 1}.vrt").write_text(vrt(ONE))
+    with pytest.raises(ImageError, match="deeper"):
+        index_files(folder / "0.vrt")
+    assert len(index_files(folder / "1.vrt")) == indexes.LEVELS + 1
+    monkeypatch.setattr(indexes, "ELEMENTS", 3)
+    with pytest.raises(ImageError, match="more than 3 elements"):
+        index_files(folder / "1.vrt")
+    monkeypatch.setattr(indexes, "INDEX_BYTES", 30)
+    with pytest.raises(ImageError, match="more than 30 bytes"):
+        index_files(folder / "1.vrt")
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "words"),
+    [
+        ('href="IMG_R2C1.TIF"', 'href="../outside.tif"', "in its own folder"),
+        (
+            '<DATA_FILE_PATH href="IMG_R2C1.TIF"/>',
+            "<data_file_path><HREF>/vsicurl/x</HREF></data_file_path>",
+            "vsicurl",
+        ),
+        ('href="IMG_R2C1.TIF"', 'href="gone.TIF"', "no such file"),
+        ('href="RPC.XML"', 'href="/etc/RPC.XML"', "in its own folder"),
+        ("<Dimap_Document>", BOMB + "<Dimap_Document>", "document type"),
+    ],
+)
+def test_a_dimap_that_leads_elsewhere_is_refused(before: str, after: str, words: str, tmp_path: Path) -> None:
+    folder = folder_of(tmp_path)
+    index = images.write_dimap(folder / "DIM.XML", images.digital_numbers())
+    text = index.read_text()
+    assert before in text
+    index.write_text(text.replace(before, after, 1))
+    with pytest.raises(ImageError) as caught, open_source(index):
+        pass
+    assert words in str(caught.value)
+
+
+def test_a_bomb_beside_a_dimap_is_seen(tmp_path: Path) -> None:
+    index = images.write_dimap(tmp_path / "DIM.XML", images.digital_numbers())
+    (tmp_path / "RPC.XML").write_text(BOMB + "<Dimap_Document>&b;</Dimap_Document>")
+    with pytest.raises(ImageError, match="document type"):
+        index_files(index)
+
+
+class Silent(http.server.SimpleHTTPRequestHandler):
+    """Serves a folder and prints nothing."""
+
+    def log_message(self, *_: object) -> None:
+        pass
+
+
+def test_a_trusted_index_reaches_outside_and_to_urls_and_never_runs_code(tmp_path: Path) -> None:
+    folder, index = folder_of(tmp_path), tmp_path / "product" / "a.vrt"
+    index.write_text(vrt(naming("../outside.tif")))
+    with open_source(index, trusted=True) as source:
+        assert source.read(0, 9).sum() == 81
+    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), partial(Silent, directory=tmp_path)) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        url = f"/vsicurl/http://127.0.0.1:{server.server_port}/outside.tif"
+        index.write_text(vrt(naming(url)))
+        with open_source(index, trusted=True) as source:
+            assert source.read(0, 9).sum() == 81
+        with pytest.raises(ImageError, match="--trust-index"), open_source(index):
+            pass
+        server.shutdown()
+    for body in ("<PixelFunctionLanguage>Python</PixelFunctionLanguage>", naming("no.tif")):
+        index.write_text(vrt(body))
+        with pytest.raises(ImageError), open_source(index, trusted=True):
+            pass
+    assert folder.is_dir()

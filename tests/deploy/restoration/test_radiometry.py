@@ -1,0 +1,172 @@
+"""Which value is full scale and who says so; what lies above it; and that the type of the pixels is kept."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tifffile
+
+from deploy.restoration.options import Options
+from deploy.restoration.radiometry import FullScale, full_scale_of
+from deploy.restoration.run import restore_file
+from deploy.restoration.source import Raster, open_source
+from profiles.errors import ImageError, OptionError
+from profiles.figures import Row
+
+SHAPE = 61, 47
+
+
+def noise(bits: int) -> np.ndarray:
+    return np.random.default_rng(bits).integers(1, 1 << bits, SHAPE).astype(np.uint16)
+
+
+def run(folder: Path, pixels: np.ndarray, options: Options) -> tuple[np.ndarray, Row, list[str]]:
+    tifffile.imwrite(folder / "in.tif", pixels)
+    said: list[str] = []
+    row = restore_file(folder / "in.tif", folder / "out.tif", options, said.append)
+    return tifffile.imread(folder / "out.tif"), row, said
+
+
+def scale(raster: Raster, asked: float | None = None, bits: int | None = None) -> FullScale:
+    return full_scale_of("x", raster, (), asked, bits)
+
+
+def test_the_user_goes_before_the_file_and_the_file_before_the_sensor() -> None:
+    silent = Raster(1, 9, 9, np.dtype(np.uint16))
+    stated = replace(silent, bits=10)
+    assert scale(stated, 16383, 14) == FullScale(16383, "--full-scale")
+    assert scale(stated, None, 14) == FullScale(1023, "10 bits, as the file states")
+    assert scale(silent, None, 14) == FullScale(16383, "14 bits, of --sensor")
+    assert scale(silent) == FullScale(4095, "assumed: 12 bits", assumed=True)
+
+
+def test_8_bit_pixels_need_it_stated_and_cannot_be_of_more() -> None:
+    eight = Raster(1, 9, 9, np.dtype(np.uint8))
+    for bits in (None, 12):
+        with pytest.raises(ImageError, match="8-bit pixels"):
+            scale(eight, bits=bits)
+    assert scale(eight, bits=8).value == 255
+    assert scale(replace(eight, bits=6)).value == 63
+    with pytest.raises(OptionError, match="at most 255 for uint8"):
+        scale(eight, asked=4095)
+
+
+def test_floats_of_digital_numbers_have_the_sensor_s_full_scale_and_shares_none() -> None:
+    floats = Raster(1, 9, 9, np.dtype(np.float32))
+    assert full_scale_of("x", floats, [900.0], bits=10).value == 1023
+    with pytest.raises(ImageError, match="--full-scale"):
+        full_scale_of("x", floats, [0.9], bits=10)
+
+
+@pytest.mark.parametrize("bits", [10, 14, 16])
+def test_a_file_of_such_bits_is_restored_to_its_own_full_scale(bits: int, model: Path, tmp_path: Path) -> None:
+    """Three ways to state it give the same pixels; that they reach half of it shows that none took 12 bits."""
+    full = 2**bits - 1
+    asked, row, _ = run(tmp_path, noise(bits), Options(model, 23, full_scale=full))
+    assert row.text["full scale from"] == "--full-scale"
+    assert asked.dtype == np.uint16
+    assert full / 2 < asked.max() <= full
+    profiled, row, _ = run(tmp_path, noise(bits), Options(model, 23, sensor_bits=bits))
+    assert row.text["full scale"] == f"{full:g}"
+    assert row.text["full scale from"] == f"{bits} bits, of --sensor"
+    np.testing.assert_array_equal(profiled, asked)
+    if bits == 10:
+        _, row, said = run(tmp_path, noise(bits), Options(model, 23))
+        assert row.text["full scale from"] == "assumed: 12 bits"
+        assert not any("clipped" in sentence for sentence in said)
+    else:
+        with pytest.raises(ImageError, match=r"0 to 4095.*--full-scale"):
+            run(tmp_path, noise(bits), Options(model, 23))
+
+
+@pytest.mark.parametrize("bits", [10, 14])
+def test_a_file_states_its_bits(bits: int, model: Path, tmp_path: Path) -> None:
+    images = pytest.importorskip("tests.deploy.restoration.images", exc_type=ImportError)
+    pixels = images.digital_numbers(bits)
+    asked = Options(model, 64, full_scale=2**bits - 1)
+    restore_file(images.write_tiff(tmp_path / "a.tif", pixels), tmp_path / "out.tif", asked, lambda _: None)
+    expected = tifffile.imread(tmp_path / "out.tif")
+    jp2 = images.write_jp2(tmp_path / "a.jp2", pixels, NBITS=bits)
+    for image in (jp2, images.write_dimap(tmp_path / "DIM.XML", pixels, bits)):
+        row = restore_file(image, tmp_path / "out.tif", Options(model, 64), lambda _: None)
+        assert row.text["full scale from"] == f"{bits} bits, as the file states"
+        np.testing.assert_array_equal(tifffile.imread(tmp_path / "out.tif"), expected)
+
+
+def test_a_container_states_nothing_and_a_product_s_range_does(tmp_path: Path) -> None:
+    images = pytest.importorskip("tests.deploy.restoration.images", exc_type=ImportError)
+    pixels = images.digital_numbers()
+    found = []
+    for image in (
+        images.write_tiff(tmp_path / "a.tif", pixels),
+        images.write_jp2(tmp_path / "a.jp2", pixels),
+        images.write(tmp_path / "a.ntf", pixels, "NITF", ICORDS="N"),
+        images.write(tmp_path / "b.ntf", pixels, "NITF", ICORDS="N", ABPP="12"),
+        images.write_dimap(
+            tmp_path / "DIM.XML", pixels, 16, "<Dynamic_Range><PRODUCT_RANGE>12</PRODUCT_RANGE></Dynamic_Range>"
+        ),
+    ):
+        with open_source(image) as source:
+            found.append(source.raster.bits)
+    assert found == [None, None, None, 12, 12]
+
+
+def test_values_above_a_stated_full_scale_are_clipped_counted_and_told(model: Path, tmp_path: Path) -> None:
+    """Counted once each, though tiles overlap; restored as if they were full scale."""
+    pixels = noise(10)
+    pixels[5:9, 3:40] = 5000
+    pixels[30, 30] = 1024
+    clipped, row, said = run(tmp_path, pixels, Options(model, 23, full_scale=1023))
+    assert row.figures["clipped pixels"].value == 4 * 37 + 1
+    assert sum("149 pixels above full scale, 1023 (--full-scale), were clipped" in each for each in said) == 1
+    expected, row, said = run(tmp_path, np.minimum(pixels, 1023), Options(model, 23, full_scale=1023))
+    np.testing.assert_array_equal(clipped, expected)
+    assert row.figures["clipped pixels"].value == 0
+    assert not any("clipped" in each for each in said)
+
+
+def test_missing_pixels_are_not_above(model: Path, tmp_path: Path) -> None:
+    pixels = noise(10)
+    pixels[5:9, 3:40] = 65535
+    pixels[30, 30] = 2000
+    nodata = [(42113, "s", 0, "65535", True)]
+    tifffile.imwrite(tmp_path / "in.tif", pixels, extratags=nodata)
+    options = Options(model, 23, full_scale=1023)
+    row = restore_file(tmp_path / "in.tif", tmp_path / "out.tif", options, lambda _: None)
+    assert row.figures["clipped pixels"].value == 1
+    restored = tifffile.imread(tmp_path / "out.tif")
+    np.testing.assert_array_equal(restored == 65535, pixels == 65535)
+    assert restored[pixels != 65535].max() <= 1023
+
+
+def test_the_count_outlives_a_stop(model: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pixels = noise(10)
+    pixels[2, :] = 3000
+    options = Options(model, 23, full_scale=1023)
+
+    def stopped(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr("deploy.restoration.run.write_output", stopped)
+        with pytest.raises(KeyboardInterrupt):
+            run(tmp_path, pixels, options)
+    row = restore_file(tmp_path / "in.tif", tmp_path / "out.tif", replace(options, resume=True), lambda _: None)
+    assert row.figures["clipped pixels"].value == SHAPE[1]
+
+
+@pytest.mark.parametrize("value", [-1.0, np.inf])
+def test_negative_and_infinite_values_stay_an_error(value: float, model: Path, tmp_path: Path) -> None:
+    pixels = noise(10).astype(np.float32)
+    pixels[4, 4] = value
+    with pytest.raises(ImageError, match="expected digital numbers of 0 to 1023"):
+        run(tmp_path, pixels, Options(model, 23, full_scale=1023))
+
+
+def test_8_bits_come_back_as_8_bits(model: Path, tmp_path: Path) -> None:
+    eight = (noise(10) >> 2).astype(np.uint8)
+    restored, _, _ = run(tmp_path, eight, Options(model, 23, full_scale=255))
+    assert restored.dtype == np.uint8
+    wide, _, _ = run(tmp_path, eight.astype(np.uint16), Options(model, 23, full_scale=255))
+    np.testing.assert_array_equal(restored, wide)

@@ -1,0 +1,67 @@
+"""STAC items: valid by the core schema, on the place of the image, with what was done."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+from typer.testing import CliRunner
+
+from deploy.cli import app
+from tests.deploy.restoration import images
+
+pystac: Any = pytest.importorskip("pystac")
+rasterio: Any = images.rasterio
+
+
+def restored(image: Path, item: Path, model: Path) -> dict[str, Any]:
+    out = image.with_name("out.tif")
+    words = ["restore", str(image), str(out), "--model", str(model), "--cog", "--stac", str(item)]
+    done = CliRunner().invoke(app, words)
+    assert done.exit_code == 0, done.output
+    found: dict[str, Any] = json.loads(item.read_text())
+    return found
+
+
+def test_an_item_is_valid_and_lies_where_the_image_does(model: Path, tmp_path: Path) -> None:
+    image = images.write_tiff(tmp_path / "in.tif", images.digital_numbers())
+    found = restored(image, tmp_path / "catalogue" / "item.json", model)
+    pystac.Item.from_dict(found).validate()
+    assert found["assets"]["restored"]["href"] == "../out.tif"
+    assert "cloud-optimized" in found["assets"]["restored"]["type"]
+    assert [band["name"] for band in found["assets"]["restored"]["bands"]] == ["B0", "B1"]
+    assert found["properties"]["restored_full_scale"] == "4095 (assumed: 12 bits)"
+    with rasterio.open(image) as file:
+        from rasterio.warp import transform_bounds
+
+        expected = transform_bounds(file.crs, "EPSG:4326", *file.bounds)
+    assert found["bbox"] == pytest.approx(list(expected), abs=1e-8)
+
+
+def test_an_image_that_lies_nowhere_has_no_geometry(model: Path, tmp_path: Path) -> None:
+    image = images.write_tiff(tmp_path / "in.tif", images.digital_numbers(), crs=None, transform=None)
+    found = restored(image, tmp_path / "item.json", model)
+    pystac.Item.from_dict(found).validate()
+    assert found["geometry"] is None
+    assert "bbox" not in found
+
+
+def test_it_goes_with_a_cog_and_needs_its_package(
+    model: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    image = images.write_tiff(tmp_path / "in.tif", images.digital_numbers())
+    words = [
+        "restore",
+        str(image),
+        str(tmp_path / "out.tif"),
+        "--model",
+        str(model),
+        "--stac",
+        str(tmp_path / "i.json"),
+    ]
+    monkeypatch.setitem(__import__("sys").modules, "pystac", None)
+    for more, sentence in (([], "--stac: expected --cog"), (["--cog"], "beers-deploy[gdal]")):
+        done = CliRunner().invoke(app, [*words, *more])
+        assert done.exit_code == 2
+        assert sentence in done.stderr
+        assert sorted(path.name for path in tmp_path.iterdir()) == ["in.tif"]

@@ -1,0 +1,110 @@
+"""`info`: what restore would make of a file, told before any pixel is read."""
+
+import json
+import math
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tifffile
+from typer.testing import CliRunner
+
+from deploy.cli import app
+from deploy.info import InfoRequest, info_row
+from deploy.networks import shipped_pair
+from deploy.restoration.options import Options
+from deploy.restoration.run import restore_file
+from deploy.restoration.source import TiffSource
+from profiles import load_target
+from profiles.figures import Row
+
+TAGS = [
+    (33550, "d", 3, (0.5, 0.25, 0.0), True),
+    (33922, "d", 6, (0.0, 0.0, 0.0, 3e5, 4.8e6, 0.0), True),
+    (34735, "H", 8, (1, 1, 0, 1, 3072, 0, 1, 32631), True),
+    (42113, "s", 0, "7", True),
+    (50844, "d", 92, tuple(np.linspace(-1, 1, 92)), True),
+]
+
+
+def about(image: Path, options: Options, measure: bool = False) -> Row:
+    return info_row(image, InfoRequest(options, load_target("vck190"), measure))
+
+
+def test_it_says_what_the_header_says(model: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    tifffile.imwrite(tmp_path / "in.tif", np.ones((90, 70), np.uint16), extratags=TAGS)
+
+    def read(*_: object) -> None:
+        raise AssertionError("a pixel was read")
+
+    monkeypatch.setattr(TiffSource, "read", read)
+    row = about(tmp_path / "in.tif", Options(model, tile_px=23))
+    assert [row.figures[key].value for key in ("width", "height", "bands")] == [70, 90, 1]
+    assert row.text["pixels"] == "uint16"
+    assert (row.text["full scale"], row.text["full scale from"]) == ("4095", "assumed: 12 bits")
+    assert row.text["georeference"] == "EPSG:32631, first corner (300000, 4800000), pixels of 0.5 x 0.25"
+    assert (row.text["nodata"], row.text["rational polynomials"]) == ("7", "yes")
+    assert row.figures["time here"].mode == "unavailable"
+
+
+def test_its_plan_is_that_of_the_restoration(model: Path, tmp_path: Path) -> None:
+    tifffile.imwrite(tmp_path / "in.tif", np.ones((90, 70), np.uint16))
+    options = Options(model, tile_px=23)
+    told = about(tmp_path / "in.tif", options)
+    done = restore_file(tmp_path / "in.tif", tmp_path / "out.tif", options, lambda _: None)
+    for key in ("tiles", "work factor"):
+        assert told.figures[key].value == done.figures[key].value
+    for key in ("halo", "full scale", "full scale from"):
+        assert told.text[key] == done.text[key]
+
+
+@pytest.mark.parametrize("kind", ["uint8", "float32"])
+def test_a_full_scale_that_is_open_is_said_to_be(kind: str, model: Path, tmp_path: Path) -> None:
+    tifffile.imwrite(tmp_path / "in.tif", np.ones((40, 40), kind))
+    text = about(tmp_path / "in.tif", Options(model)).text
+    assert text["full scale"] == "open"
+    assert "--full-scale" in text["full scale from"]
+    assert about(tmp_path / "in.tif", Options(model, full_scale=200)).text["full scale from"] == "--full-scale"
+
+
+def test_time_here_is_predicted_from_what_was_timed(model: Path, tmp_path: Path) -> None:
+    tifffile.imwrite(tmp_path / "in.tif", np.ones((90, 70), np.uint16))
+    figure = about(tmp_path / "in.tif", Options(model, tile_px=23), measure=True).figures["time here"]
+    assert figure.mode == "predicted"
+    assert figure.value is not None
+    assert figure.interval is not None
+    assert 0 < figure.interval[0] <= figure.value <= figure.interval[1]
+
+
+def test_time_on_the_board_is_the_cost_model_s(tmp_path: Path) -> None:
+    """Twice the height is twice the tiles, and twice the time but for a last batch."""
+    times = []
+    for height in (6000, 12000):
+        image = tifffile.memmap(tmp_path / f"{height}.tif", shape=(height, 6000), dtype="uint16")
+        del image
+        times.append(about(tmp_path / f"{height}.tif", Options(shipped_pair()[1])).figures["time on vck190"])
+    assert all(each.mode == "predicted" for each in times)
+    first, second = (each.value or math.nan for each in times)
+    assert second / first == pytest.approx(2, abs=0.1)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="other systems write its zeros")
+def test_it_reads_none_of_a_file_of_ten_gigabytes(model: Path, tmp_path: Path) -> None:
+    image = tifffile.memmap(tmp_path / "big.tif", shape=(73_000, 73_000), dtype="uint16", bigtiff=True)
+    del image
+    out = tmp_path / "a.json"
+    arguments = ["info", str(tmp_path / "big.tif"), "--model", str(model), "--json", str(out)]
+    done = CliRunner().invoke(app, arguments)
+    assert done.exit_code == 0, done.output
+    (row,) = json.loads(out.read_text())["rows"]
+    assert row["figures"]["width"]["value"] == 73_000
+    assert [each["name"] for each in json.loads(out.read_text())["inputs"]] == [model.name]
+
+
+def test_no_image_is_one_sentence(tmp_path: Path) -> None:
+    (tmp_path / "a.tif").write_text("no image")
+    for name in ("a.tif", "missing.tif"):
+        done = CliRunner().invoke(app, ["info", str(tmp_path / name)])
+        assert done.exit_code == 2
+        assert done.stderr.count("\n") == 1
