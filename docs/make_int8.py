@@ -1,4 +1,4 @@
-"""Makes the shipped INT8 files anew: each shipped network for each shipped sensor profile, and for a blind one.
+"""Makes the shipped INT8 files anew: each network for the default sensor and a blind one, the default one for more.
 
     python docs/make_int8.py [convbeers-s ...]
 
@@ -10,16 +10,18 @@ import sys
 from pathlib import Path
 
 from deploy.networks import int8_file
-from model.shipped import INT8, SENSOR, SHIPPED, shipped_names
+from model.shipped import INT8, SENSOR, SHIPPED, VARIANT, shipped_names
 from profiles.sensor_file import BLIND, load_sensor
 
 SENSORS = (SENSOR, BLIND)
+DETECTION = ("dior-medium", "dior-high")
+"""What `detect` runs on with nothing given, by the default network alone."""
 
 
 def main() -> None:
     """Make them one by one."""
     for name in sys.argv[1:] or shipped_names():
-        for sensor in SENSORS:
+        for sensor in (*SENSORS, *(DETECTION if name == VARIANT else ())):
             shipped = SHIPPED / f"{name}{INT8}-{sensor}.onnx"
             shipped.unlink(missing_ok=True)
             shutil.copyfile(int8_file(Path(name), load_sensor(sensor), print), shipped)

@@ -63,6 +63,9 @@ PATHS = {
     "evaluate": Paths(
         {"out": FOLDER, "json": FILE}, ("images", "pairs", "lpips"), ("sensor", "reference", "methods")
     ),
+    "detect": Paths(
+        {"out": FOLDER, "json": FILE}, ("images", "labels", "detector"), ("sensor", "reference", "methods")
+    ),
     "stress": Paths({"out": FILE, "json": FILE}, ("float_model", "int8_model", "images"), ("sensor", "target")),
     "tradeoff": Paths(
         {"out": FOLDER, "cache": FOLDER, "json": FILE},
@@ -110,6 +113,7 @@ WORDS = {
     "add": "an effect's name",
     "budget": "limits such as latency<=20s",
     "cases": "names of cases, with commas",
+    "classes": "pairs such as car=vehicle, with commas",
     "config": "C32B1 to C64B5",
     "device": "cpu or cuda",
     "edge": "FILE:X,Y,WIDTH,HEIGHT in px",
@@ -128,6 +132,7 @@ WORDS = {
     "scheduler": "an address such as tcp://host:8786",
     "sensor": "a profile's name",
     "size": "width x height in px, such as 13600x9016",
+    "split": "the name of a list of pictures",
     "stages": "names of stages, with commas",
     "target": "a board's name",
     "tile": "px, several with commas",
@@ -193,6 +198,11 @@ REFUSED = {
         Refused(("workers",), SCHEDULER),
     ],
     "evaluate": [Refused(("images", "sweep"), "--pairs PAIRS")],
+    "detect": [
+        Refused(("labels", "split"), without="--images"),
+        Refused(("drawn", "retrain"), "--images IMAGES"),
+        Refused(("retrain",), "--detector DETECTOR"),
+    ],
     "stress": [
         Refused(("variant",), "FLOAT"),
         Refused(("cases", "stages"), "--bit-flips"),

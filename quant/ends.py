@@ -23,6 +23,7 @@ from quant.graph import (
     channels_of,
     split,
 )
+from quant.graph.tail import Tail
 from quant.graph.writer import write_shuffle
 from quant.onnx_file import GraphWriter
 
@@ -46,6 +47,7 @@ class Ends:
         last: pixel shuffles of the sum.
         flat: whether the result is (N, K).
         softmax: whether it is made probabilities, along the channels.
+        tail: what else is done to the result, such as decoding boxes.
         gains: 2 where the correction's channels come twice, fine and coarse by `GAIN`.
         outputs: channels of the correction, gains and windows not counted.
         offsets: what each window has taken off each channel, (windows, outputs): the channels come coarse
@@ -63,6 +65,7 @@ class Ends:
     gains: int = 1
     outputs: int = 1
     offsets: tuple[tuple[float, ...], ...] = ()
+    tail: Tail | None = None
 
     @property
     def image_channels(self) -> int:
@@ -134,7 +137,7 @@ class Ends:
         result = self.clipped(image + result) if self.adds_image else result
         for shuffle in self.last:
             result = shuffle(result)
-        return result
+        return self.tail(result) if self.tail else result
 
     def clipped(self, result: np.ndarray) -> np.ndarray:
         """A float network's result as the host would clip its own: to [0, 1] where the image is added."""
@@ -223,6 +226,8 @@ def write_back(w: HostWriter, ends: Ends, feeds: list[str], scale: float) -> Non
         for k, shuffle in enumerate(ends.last):
             result, name = name, "restored" if k + 1 == len(ends.last) else f"host_back.last_{k}"
             write_shuffle(w, shuffle, result, name)
+    elif ends.tail:
+        ends.tail.write(w, result)
     else:
         w.node("Flatten" if ends.flat else "Identity", "restored", [result], name="host_back.result")
 

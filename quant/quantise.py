@@ -27,6 +27,7 @@ from quant.graph import (
     relu_count,
     tensors,
 )
+from quant.graph.tail import Tail
 from quant.onnx_file import fixed_tile_px, metadata
 from quant.passes.equalise import LEVELLING, Costs, Trial, channel_ranges, equalise, first_guess, search, search_steps
 from quant.passes.fit_weights import fit_weights, input_moments
@@ -87,7 +88,8 @@ class Quantised:
 class _Plan:
     """What is to be quantised: the graph that reads the planes wanted, and that of all; the host's part; streams.
 
-    `chain` is what is levelled where there is no stream.
+    `chain` is what is levelled where there is no stream. What is calibrated and searched is the map in front of the
+    network's `tail`, which is put behind it in the end: values of boxes that no object has would outweigh all others.
     """
 
     graph: Graph
@@ -95,6 +97,7 @@ class _Plan:
     ends: Ends
     streams: list[Stream]
     chain: Chain
+    tail: Tail | None
     passes: Passes
     shifts: Shifts
 
@@ -149,7 +152,7 @@ def _plan(model: onnx.ModelProto, passes: Passes, shifts: Shifts = SHIFTS) -> _P
     widths = channels_of(graph, {PLANES: ends.planes * ends.channels})
     alone = [] if found else lone_tensors(graph)
     chain = Chain(tuple(alone), tuple(widths[name] for name in alone))
-    return _Plan(graph, full, ends, found, chain, passes, shifts)
+    return _Plan(graph, full, ends, found, chain, network.tail, passes, shifts)
 
 
 def quantise_model(
@@ -180,6 +183,7 @@ def quantise_model(
     final, core = plan.rounded(graph, frac_bits), plan.core(graph, frac_bits)
     if passes.fit_weights:
         core = fit_weights(final, core, input_moments(final, images, tick, plan.ends), shifts)
+    core = replace(core, ends=replace(core.ends, tail=plan.tail))
     about = {**metadata(model), "precision": "int8 legal", "calibration_sha256": patches.digest, **about}
     about["passes"] = ", ".join(name for name, on in asdict(passes).items() if on)
     tile_px = fixed_tile_px(model)

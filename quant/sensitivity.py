@@ -214,7 +214,7 @@ def spread_of(
 
 def layer_error_rows(result: Quantised, patches: Patches, tick: Callable[[], None]) -> list[Row]:
     """Every layer in int8 by itself, and all of them."""
-    seen = few_crops(patches.degraded)
+    seen = few_crops(patches.degraded, result.host)
     layers, together = layer_errors(result.graph, result.core, seen, tick)
     source = f"{len(seen)} simulated patches, all other layers in float"
     whole = sum(layer.network.squared for layer in layers)

@@ -16,7 +16,7 @@ from profiles.errors import ModelError
 from quant.ends import ONE_CHANNEL, Ends
 from quant.graph import PLANES, PLANES_FRAC_BITS, Add, Concat, Conv, Graph, Mul, Op, Pointwise, same
 from quant.kernels import filled, is_integer, made_exact
-from quant.onnx_file import any_size, load_onnx
+from quant.onnx_file import any_size, fixed_tile_px, load_onnx
 from quant.untrusted import contradictions, times
 
 
@@ -191,6 +191,7 @@ def _edges(size: int) -> list[int]:
 LAYER_PATCHES = 4
 
 
-def few_crops(images: Iterable[np.ndarray]) -> list[np.ndarray]:
-    """One crop of each of the first few images: what is looked at layer by layer."""
-    return [crops(image)[0] for image in islice(images, LAYER_PATCHES)]
+def few_crops(images: Iterable[np.ndarray], model: onnx.ModelProto) -> list[np.ndarray]:
+    """One crop of each of the first few images: what is looked at layer by layer; all of it where a size is fixed."""
+    whole = fixed_tile_px(any_size(model)) is not None
+    return [crops(image, None if whole else 0)[0] for image in islice(images, LAYER_PATCHES)]

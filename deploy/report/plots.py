@@ -242,7 +242,7 @@ Points = tuple[tuple[float, float], ...]
 
 @dataclass(frozen=True)
 class Curve:
-    """Points (x, y) with x above 0; curves of one name look alike in all panels."""
+    """Points (x, y), x above 0 on a logarithmic axis; curves of one name look alike in all panels."""
 
     name: str
     colour: int
@@ -262,8 +262,14 @@ CURVES_PX = (960, 370)
 CURVES_FRAME = {"left": 0.065, "right": 0.985, "top": 0.89, "bottom": 0.22, "wspace": 0.12}
 
 
-def curves_svg(panels: Sequence[Panel], x_title: str, y_title: str) -> str:
-    """Panels side by side that share the axis upwards, each with a logarithmic axis of its own to the right.
+def curves_svg(panels: Sequence[Panel], x_title: str, y_title: str, *, logarithmic: bool = True) -> str:
+    """Panels side by side that share the axis upwards, each with an axis of its own to the right.
+
+    Args:
+        panels: what to draw.
+        x_title: of the axis to the right.
+        y_title: of the axis upwards.
+        logarithmic: whether the axis to the right is, with a dot at each point; else lines alone are drawn.
 
     Returns:
         An SVG file, light or dark as its reader's screen is.
@@ -273,10 +279,11 @@ def curves_svg(panels: Sequence[Panel], x_title: str, y_title: str) -> str:
         all_axes = figure.subplots(1, len(panels), sharey=True, squeeze=False, gridspec_kw=CURVES_FRAME)[0]
         named = {}
         for axes, panel in zip(all_axes, panels, strict=True):
-            axes.set(xscale="log", title=panel.title)
+            axes.set(xscale="log" if logarithmic else "linear", title=panel.title)
             axes.margins(0.06)
             for curve in panel.curves:
-                style = {"color": LIGHT[SERIES[curve.colour]], "ls": "--" if curve.dashed else "-", "marker": "o"}
+                style = {"color": LIGHT[SERIES[curve.colour]], "ls": "--" if curve.dashed else "-"}
+                style["marker"] = "o" if logarithmic else ""
                 named[curve.name] = axes.plot(*zip(*curve.points, strict=True), **style, ms=5, lw=2, gid="curve")[0]
             set_ticks(axes.xaxis, 5)
         set_ticks(all_axes[0].yaxis, 8)

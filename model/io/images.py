@@ -89,6 +89,23 @@ def damage_in_a_sentence(path: Path, where: str = "") -> Iterator[None]:
         raise _no_image(name, error) from error
 
 
+def image_size_px(path: Path) -> tuple[int, int]:
+    """Height and width of an image file as its header has them: no pixel is read.
+
+    Raises:
+        ImageError: missing, empty, or not an image.
+    """
+    require_image_file(path)
+    with damage_in_a_sentence(path), warnings.catch_warnings(action="ignore"):
+        if path.suffix.lower() in TIFF_SUFFIXES:
+            with open_tiff(path) as file:
+                height, width = file.series[0].keyframe.imagelength, file.series[0].keyframe.imagewidth
+        else:
+            with Image.open(path, formats=("PNG", "JPEG")) as image:
+                width, height = image.size
+    return int(height), int(width)
+
+
 def list_images(folder: Path) -> list[Path]:
     """The image files of a folder, sorted by name.
 

@@ -79,13 +79,17 @@ def error_row(errors: Iterable[np.ndarray], white_dn: float) -> list[np.ndarray]
 
 
 def grid(names: list[str], rows: list[list[np.ndarray]], zoom: int) -> Image.Image:
-    """Rows of equally large (h, w) uint8 cells, each column under its name, every pixel `zoom` pixels wide."""
-    height, width = (side * zoom for side in rows[0][0].shape)
-    canvas = Image.new("L", (len(names) * (width + GAP_PX) - GAP_PX, len(rows) * (height + GAP_PX) + LABEL_PX), 255)
+    """Rows of equally large uint8 cells, each column under its name, every pixel `zoom` pixels wide.
+
+    Cells are (h, w), or all of them (h, w, 3).
+    """
+    height, width = (side * zoom for side in rows[0][0].shape[:2])
+    size = len(names) * (width + GAP_PX) - GAP_PX, len(rows) * (height + GAP_PX) + LABEL_PX
+    canvas = Image.new("L" if rows[0][0].ndim == 2 else "RGB", size, "white")
     draw = ImageDraw.Draw(canvas)
     for column, name in enumerate(names):
         left = column * (width + GAP_PX)
-        draw.text((left + 2, 1), name, fill=0, font=_font_for(name, width))
+        draw.text((left + 2, 1), name, fill="black", font=_font_for(name, width))
         for number, row in enumerate(rows):
             cell = Image.fromarray(row[column]).resize((width, height), Image.Resampling.NEAREST)
             canvas.paste(cell, (left, LABEL_PX + number * (height + GAP_PX)))

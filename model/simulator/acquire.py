@@ -4,6 +4,7 @@ from collections.abc import Collection, Iterable
 from dataclasses import dataclass, replace
 from functools import cached_property
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -132,6 +133,22 @@ def acquire(
     transfer = sensor_transfer(spectrum.shape[-2], width, oversampling, sensor, spectrum.device)
     signal = crop_margin(sample(spectrum, transfer, width, oversampling, offset_px), margin_px)
     return detect(signal, sensor, draw, role, skip)
+
+
+def acquire_padded(
+    radiance: Tensor, sensor: Sensor, oversampling: int, draw: Draw, role: str, skip: Collection[str] = ()
+) -> Tensor:
+    """Acquire a scene (H, W) whole: what the margin would cut off is a mirror image around it.
+
+    Returns:
+        Digital numbers (ceil(H / r), ceil(W / r)). Pixel n covers scene pixels r*n to r*n + r - 1: a place x of the
+        scene, with pixel i from i to i + 1, lies at x / r.
+    """
+    margin_px = MARGIN_PX * oversampling
+    after = [margin_px - size % -oversampling for size in radiance.shape]
+    mirrored = np.pad(radiance.cpu().numpy(), [(margin_px, each) for each in after], mode="reflect")
+    scene = torch.from_numpy(mirrored)
+    return acquire(scene_spectrum(scene), scene.shape[1], sensor, oversampling, draw, role, skip=skip)
 
 
 def fitting_oversampling(radiance: Tensor, oversamplings: Iterable[int], side_px: int) -> int | None:

@@ -16,15 +16,28 @@ import torch
 from PIL import Image, ImageDraw
 
 from model.io.images import list_images
+from model.simulator.drawing import (
+    ASPHALT,
+    CONCRETE,
+    GRASS,
+    SHADOW,
+    SOIL,
+    WATER,
+    WHITE,
+    Point,
+    around,
+    box,
+    rectangle,
+    shift,
+    texture,
+    tree,
+    turn,
+)
 from model.simulator.sampling import Scene, read_scene
 from profiles.sensor import Sensor
 
-Point = tuple[float, float]
-
 SCENES, SCENE_SIDE_PX = 3, 2400
 """Drawn where no folder of images is given."""
-
-SHADOW, ASPHALT, GRASS, SOIL, CONCRETE, WHITE, WATER = 12.0, 30.0, 45.0, 75.0, 120.0, 260.0, 16.0
 
 
 def procedural_scene(height_px: int, width_px: int, generator: np.random.Generator) -> Scene:
@@ -39,20 +52,10 @@ def procedural_scene(height_px: int, width_px: int, generator: np.random.Generat
     _forest(draw, canvas.size, generator)
     _river(draw, canvas.size, generator)
     _town(draw, canvas.size, generator)
-    radiance = np.asarray(canvas) * _texture(height_px, width_px, generator)
+    radiance = np.asarray(canvas) * texture(height_px, width_px, generator)
     canvas = Image.fromarray(radiance.astype(np.float32))
     _pattern(ImageDraw.Draw(canvas), canvas.size)
     return Scene("procedural", torch.from_numpy(np.array(canvas, dtype=np.float32)))
-
-
-def _texture(height_px: int, width_px: int, generator: np.random.Generator) -> np.ndarray:
-    """Multiplicative 1/f texture around 1, some 12 % rms: nothing on the ground is flat."""
-    white = generator.standard_normal((height_px, width_px), dtype=np.float32)
-    fy, fx = np.fft.fftfreq(height_px)[:, None], np.fft.rfftfreq(width_px)[None, :]
-    radius = np.hypot(fx, fy)
-    spectrum = np.fft.rfft2(white) / np.maximum(radius, 1 / 400)
-    texture = np.fft.irfft2(spectrum, s=(height_px, width_px))
-    return np.asarray(np.exp(0.12 * texture / texture.std()))
 
 
 def _fields(draw: ImageDraw.ImageDraw, size: tuple[int, int], generator: np.random.Generator) -> None:
@@ -62,7 +65,7 @@ def _fields(draw: ImageDraw.ImageDraw, size: tuple[int, int], generator: np.rand
     for top in range(-step, height + step, step):
         for left in range(-step, width + step, step):
             corner = (left + generator.uniform(-90, 90), top + generator.uniform(-90, 90))
-            parcel = _box(corner, step - 12, step - 12, generator.uniform(-0.06, 0.06))
+            parcel = box(corner, step - 12, step - 12, generator.uniform(-0.06, 0.06))
             base = float(generator.choice([38, 55, 70, 88]))
             draw.polygon(parcel, fill=base)
             _rows(draw, parcel, base, generator)
@@ -87,16 +90,7 @@ def _forest(draw: ImageDraw.ImageDraw, size: tuple[int, int], generator: np.rand
         x, y = generator.uniform(0, width * 0.42), generator.uniform(height * 0.55, height)
         if x > width * 0.36 and generator.random() < 0.6:
             continue
-        _tree(draw, x, y, generator.uniform(14, 34), generator)
-
-
-def _tree(draw: ImageDraw.ImageDraw, x: float, y: float, radius: float, generator: np.random.Generator) -> None:
-    draw.ellipse(_around(x + 0.6 * radius, y + 0.6 * radius, radius), fill=SHADOW)
-    draw.ellipse(_around(x, y, radius), fill=float(generator.uniform(24, 34)))
-    draw.ellipse(_around(x - 0.25 * radius, y - 0.25 * radius, 0.65 * radius), fill=float(generator.uniform(36, 60)))
-    for _ in range(6):
-        dx, dy = generator.uniform(-0.6, 0.4, 2) * radius
-        draw.ellipse(_around(x + dx, y + dy, 0.14 * radius), fill=float(generator.uniform(20, 80)))
+        tree(draw, x, y, generator.uniform(14, 34), generator)
 
 
 def _river(draw: ImageDraw.ImageDraw, size: tuple[int, int], generator: np.random.Generator) -> None:
@@ -106,14 +100,14 @@ def _river(draw: ImageDraw.ImageDraw, size: tuple[int, int], generator: np.rando
     middle = [(width * (0.1 + 0.04 * math.sin(phase + 5 * y / height)), y) for y in range(-50, height + 51, 5)]
     for half_width, value in ((width / 36, SOIL * 1.3), (width / 48, WATER)):
         for x, y in middle:
-            draw.ellipse(_around(x, y, half_width), fill=value)
+            draw.ellipse(around(x, y, half_width), fill=value)
 
 
 def _town(draw: ImageDraw.ImageDraw, size: tuple[int, int], generator: np.random.Generator) -> None:
     """Blocks of houses along turned streets, over the right part."""
     width, height = size
     angle = float(generator.uniform(-0.25, 0.25))
-    place = _turn(width * 0.72, height * 0.55, angle)
+    place = turn(width * 0.72, height * 0.55, angle)
     reach_x, reach_y = width * 0.3, height * 0.62
     for v in np.arange(-reach_y, reach_y, 420):
         _street(draw, place, [(-reach_x, v), (reach_x, v)], generator)
@@ -143,8 +137,8 @@ def _street(
     for s in generator.uniform(40, max(length - 60, 41), int(length / 240)):
         side = 22 * float(generator.choice([-1, 1]))
         u, v = u0 + along[0] * s - along[1] * side, v0 + along[1] * s + along[0] * side
-        car = [(u - along[0] * a - along[1] * b, v - along[1] * a + along[0] * b) for a, b in _rectangle(20, 9)]
-        draw.polygon([_shift(place(*p), 5) for p in car], fill=SHADOW)
+        car = [(u - along[0] * a - along[1] * b, v - along[1] * a + along[0] * b) for a, b in rectangle(20, 9)]
+        draw.polygon([shift(place(*p), 5) for p in car], fill=SHADOW)
         draw.polygon([place(*p) for p in car], fill=float(generator.choice([18, 60, 110, 190, 280])))
 
 
@@ -159,7 +153,7 @@ def _house(
     long, wide = generator.uniform(90, 130), generator.uniform(64, 92)
     bright = float(generator.uniform(60, 160))
     roof = [(u, v), (u + long, v), (u + long, v + wide), (u, v + wide)]
-    draw.polygon([_shift(place(*p), 22) for p in roof], fill=SHADOW)
+    draw.polygon([shift(place(*p), 22) for p in roof], fill=SHADOW)
     ridge = v + wide / 2
     draw.polygon([place(*p) for p in [(u, v), (u + long, v), (u + long, ridge), (u, ridge)]], fill=bright)
     draw.polygon(
@@ -170,7 +164,7 @@ def _house(
     x, y = place(u + 0.3 * long, v + 0.3 * wide)
     draw.rectangle((x, y, x + 9, y + 9), fill=CONCRETE)
     if generator.random() < 0.6:
-        _tree(draw, *place(u + long + 24, v + wide), generator.uniform(12, 22), generator)
+        tree(draw, *place(u + long + 24, v + wide), generator.uniform(12, 22), generator)
 
 
 def _pattern(draw: ImageDraw.ImageDraw, size: tuple[int, int]) -> None:
@@ -193,33 +187,10 @@ def _pattern(draw: ImageDraw.ImageDraw, size: tuple[int, int]) -> None:
 
 
 def _star(draw: ImageDraw.ImageDraw, x: float, y: float, radius: float, sectors: int = 36) -> None:
-    draw.ellipse(_around(x, y, radius), fill=WHITE)
+    draw.ellipse(around(x, y, radius), fill=WHITE)
     for k in range(sectors):
         start = 360 * k / sectors
-        draw.pieslice(_around(x, y, radius), start, start + 180 / sectors, fill=ASPHALT)
-
-
-def _box(corner: Point, width: float, height: float, angle: float) -> list[Point]:
-    place = _turn(*corner, angle)
-    return [place(0, 0), place(width, 0), place(width, height), place(0, height)]
-
-
-def _rectangle(half_long: float, half_wide: float) -> list[Point]:
-    return [(-half_long, -half_wide), (half_long, -half_wide), (half_long, half_wide), (-half_long, half_wide)]
-
-
-def _turn(x: float, y: float, angle: float) -> Callable[[float, float], Point]:
-    """From a turned frame centred at (x, y) to the canvas."""
-    cosine, sine = math.cos(angle), math.sin(angle)
-    return lambda u, v: (x + cosine * u - sine * v, y + sine * u + cosine * v)
-
-
-def _shift(point: Point, by: float) -> Point:
-    return (point[0] + by, point[1] + by)
-
-
-def _around(x: float, y: float, radius: float) -> tuple[float, float, float, float]:
-    return (x - radius, y - radius, x + radius, y + radius)
+        draw.pieslice(around(x, y, radius), start, start + 180 / sectors, fill=ASPHALT)
 
 
 def load_scenes(folder: Path | None, sensor: Sensor, seed: int) -> list[Scene]:

@@ -14,6 +14,7 @@ import numpy as np
 from quant.core import IntConv, IntCore
 from quant.ends import Ends
 from quant.graph import Activation, Add, AveragePool, Concat, MaxPool, Mul, Op, Pointwise, Resize, Shuffle, Window
+from quant.graph.tail import Tail
 
 KEY = "core"
 PLACE_PX = "place_px"
@@ -55,7 +56,8 @@ def described_core(text: str, constants: Mapping[str, np.ndarray]) -> IntCore:
     shuffles = {key: tuple(Shuffle(**each) for each in ends[key]) for key in ("front", "back", "last")}
     offsets = tuple(tuple(float(each) for each in window) for window in ends["offsets"])
     counts = {key: int(ends[key]) for key in ("channels", "planes", "gains", "outputs")}
-    return IntCore(ops, frac_bits, Ends(**{**ends, **counts, **shuffles, "offsets": offsets}))
+    tail = Tail(**ends["tail"]) if ends["tail"] else None
+    return IntCore(ops, frac_bits, Ends(**{**ends, **counts, **shuffles, "offsets": offsets, "tail": tail}))
 
 
 def _require_small(said: object) -> None:

@@ -62,6 +62,8 @@ def _needs_no_words(core: IntCore) -> bool:
 
 def _result(core: IntCore, tile_px: int | None) -> onnx.ValueInfoProto:
     ends = core.ends
+    if ends.tail:
+        return ends.tail.result
     if ends.flat:
         return onnx.helper.make_tensor_value_info("restored", TensorProto.FLOAT, ["N", ends.outputs])
     if ends.adds_image and not ends.last:

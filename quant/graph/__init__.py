@@ -3,6 +3,7 @@
 - `operations`: what there is, convolutions to pixel shuffles, and which tensors must share a scale;
 - `reader`: from float ONNX to a `network`, cut where the host's part ends, with `trials` of what exporters spell out;
 - `plain`: which networks are of ConvBEERS' kind;
+- `tail`: what the host computes behind the last map, kept as ONNX nodes;
 - `writer`: back to float ONNX;
 - `planes`: how 12 bits enter int8.
 """

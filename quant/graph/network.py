@@ -25,6 +25,7 @@ from quant.graph.operations import (
     Shuffle,
 )
 from quant.graph.planes import PLANES
+from quant.graph.tail import Tail
 
 
 @dataclass(frozen=True)
@@ -40,6 +41,7 @@ class Network:
         last: what it does to the sum: pixel shuffle. An image of one channel is added to each of the sum's.
         flat: whether the result is (N, K) rather than an image.
         softmax: whether the host makes probabilities of the result, along its channels.
+        tail: what else it does to the result, as the nodes that it is.
     """
 
     graph: Graph = field(compare=False)
@@ -50,6 +52,7 @@ class Network:
     last: tuple[Shuffle, ...] = ()
     flat: bool = False
     softmax: bool = False
+    tail: Tail | None = None
 
     @property
     def core_channels(self) -> int:
@@ -139,7 +142,7 @@ def named_apart(ops: Sequence[Op], ends: Mapping[str, str]) -> Graph:
 def _is_ours(name: str) -> bool:
     """Whether the files that we write have a tensor of that name themselves."""
     ours = IMAGE, CORRECTION, PLANES, "restored"
-    return name in ours or name.startswith(("host_front.", "host_back.", f"{IMAGE}."))
+    return name in ours or name.startswith(("host_front.", "host_back.", "host_tail.", f"{IMAGE}."))
 
 
 def check_network(network: Network) -> None:
@@ -151,6 +154,9 @@ def check_network(network: Network) -> None:
     graph = network.graph
     if not graph or graph[-1].output != CORRECTION:
         raise refused_graph("a last operation that writes the result", graph[-1].name if graph else "no operation")
+    if network.tail and (network.adds_image or network.flat or network.softmax):
+        expected = "nothing behind the global add, a Flatten or a Softmax at the end"
+        raise refused_graph(expected, str(network.tail.graph.node[0].name))
     widths = channels_of(graph, {IMAGE: network.core_channels})
     for op in graph:
         if isinstance(op, Shuffle) and not op.up and op.columns_first and widths[op.input] > 1:

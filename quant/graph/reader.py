@@ -31,6 +31,7 @@ from quant.graph.operations import (
     Shuffle,
     Window,
 )
+from quant.graph.tail import without_tail
 from quant.graph.trials import makes_blocks, spelled_shuffle
 from quant.onnx_file import constants
 from quant.untrusted import contradictions, times
@@ -43,8 +44,9 @@ def read_network(model: onnx.ModelProto) -> Network:
         ModelError: an operation that the DPU does not compute, named with its node.
     """
     with contradictions("float model"):
-        reader = _Reader(model)
-        network = cut(reader.sized_graph(), _channels_in(model), reader.flat, reader.softmax)
+        body, tail = without_tail(model, {*READERS, *ACTIVATIONS})
+        reader = _Reader(body)
+        network = replace(cut(reader.sized_graph(), _channels_in(model), reader.flat, reader.softmax), tail=tail)
         check_network(network)
     return network
 

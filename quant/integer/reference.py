@@ -225,7 +225,7 @@ def integer_rows(
     model: onnx.ModelProto, core: IntCore, host: onnx.ModelProto, images: Iterable[np.ndarray]
 ) -> tuple[list[Row], Row]:
     """Each integer operation on a crop of a few images (1, C, H, W), and what the DPU's tie rounding changes."""
-    seen = few_crops(images)
+    seen = few_crops(images, model)
     found = [agreement(core, host, crop) for crop in seen]
     source = f"the integer reference on {len(found)} calibration patches"
     layers = [_layer_row(list(same), source) for same in zip(*(one.layers for one in found), strict=True)]

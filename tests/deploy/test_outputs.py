@@ -57,11 +57,12 @@ INSIDE = {
     "train": "checkpoint.safetensors",
     "quantize": "report.html",
     "evaluate": "report.html",
+    "detect": "report.html",
     "tradeoff": "tradeoff.html",
 }
 SUFFIXES = {"check": ".svg", "compare": ".json"}
 MORE = {"stress": ("--bit-flips",)}
-BESIDE = {("restore", "sensor"): ("--method", "traditional")}
+BESIDE = {("restore", "sensor"): ("--method", "traditional"), ("detect", "labels"): ("--images", "pictures")}
 """What an option is refused without."""
 CASES = {
     name: Case(paths, INSIDE.get(name, ""), SUFFIXES.get(name, ".tif"), MORE.get(name, ()))

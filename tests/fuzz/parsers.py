@@ -54,7 +54,9 @@ from quant.onnx_file import fixed_tile_px, load_onnx
 from quant.session import open_any_size, open_session, run
 from quant.structure import count_relus, rounded_tensors, saturated_shares
 from quant.tiling.walk import receptive_radius_px
+from tests.deploy.detection.folders import coco, dota, voc, yolo
 from tests.deploy.dpu.graphs import board_convbeers, float_convbeers, integer_convbeers
+from tests.fuzz.detection import detect, detector_seeds, label_seeds, names_seeds, read_beside, read_names
 from tests.fuzz.mutation import Mutate, of_json, of_onnx, of_png, of_safetensors, of_tiff
 from tests.quant.reading.networks import CASES, made
 
@@ -405,4 +407,10 @@ PARSERS: tuple[Parser, ...] = (
     Parser("told weights", ".safetensors", told_seeds, load_conditioned, of_safetensors),
     Parser("checkpoint", ".safetensors", checkpoint_seeds, go_on, of_safetensors),
     Parser("backbone npz", ".npz", partial(backbone_seeds, packed=True), lambda p: read_tensors(p, ["a", "b"])),
+    Parser("labels of VOC", ".xml", partial(label_seeds, make=voc, suffix=".xml"), read_beside),
+    Parser("labels of COCO", ".json", partial(label_seeds, make=coco, suffix=".json"), read_beside, of_json),
+    Parser("labels of YOLO", ".txt", partial(label_seeds, make=yolo, suffix=".txt"), read_beside),
+    Parser("labels of DOTA", ".txt", partial(label_seeds, make=dota, suffix=".txt"), read_beside),
+    Parser("names of classes", ".yaml", names_seeds, read_names),
+    Parser("detector", ".onnx", detector_seeds, detect, of_onnx, 0.5),
 )

@@ -10,7 +10,7 @@ import torch
 from PIL import Image
 
 from model.io.files import require_writable, whole_file
-from model.io.images import list_images, read_pixels
+from model.io.images import image_size_px, list_images, read_pixels
 from model.simulator.sampling import read_scene
 from profiles import load_sensor
 from profiles.errors import ImageError, MachineError
@@ -33,6 +33,16 @@ def test_every_kind_of_file_reads_as_stored(tmp_path: Path) -> None:
     for name in ("planar.tif", "colour.png"):
         np.testing.assert_array_equal(read_pixels(tmp_path / name), colour)
     assert len(list_images(tmp_path)) == 6
+    assert {image_size_px(path) for path in list_images(tmp_path)} == {(13, 21)}
+
+
+def test_the_size_of_what_is_no_image_is_refused(tmp_path: Path) -> None:
+    for name in ("a.png", "a.tif", "a.jpg"):
+        (tmp_path / name).write_bytes(b"neither")
+        with pytest.raises(ImageError, match="a readable TIFF, PNG or JPEG"):
+            image_size_px(tmp_path / name)
+    with pytest.raises(ImageError, match="no such file"):
+        image_size_px(tmp_path / "none.png")
 
 
 def test_scenes_become_radiance(tmp_path: Path) -> None:

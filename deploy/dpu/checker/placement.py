@@ -31,6 +31,9 @@ SHAPING = {
 """What a float file may do to the result behind the network: it moves numbers, compares them or makes scores of
 them."""
 
+DECODING = {"Exp", "Pow", "Sigmoid", "Slice", "Softplus", "Split", "Sqrt", "Tanh", "Transpose"}
+"""What it may do to make boxes of the result, which `quant.graph.tail` leaves to the host too."""
+
 FLOAT_NOTE = "a float file: judged as if its tensors had 8 bits, its final add left to the host"
 
 
@@ -170,7 +173,7 @@ def _is_host_back(op: Operation, network: Network, *, leads: bool) -> bool:
         return False
     if network.quantised:
         return not op.integer and (op.kind == "dequantise" or op.op_type in SCALING)
-    if op.op_type in SHAPING:
+    if op.op_type in SHAPING | DECODING:
         return not leads
     return op.op_type in SCALING and (bool(set(op.inputs) & set(network.inputs)) or len(op.inputs) == 1)
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from model.simulator.acquire import acquire, simulate_pair
+from model.simulator.acquire import MARGIN_PX, acquire, acquire_padded, simulate_pair
 from model.simulator.detector import Draw
 from model.simulator.procedural import procedural_scene
 from model.simulator.sampling import scene_spectrum
@@ -84,6 +84,24 @@ def test_the_margin_keeps_the_wrapped_border_out() -> None:
 def test_a_scene_within_its_margin_is_refused() -> None:
     with pytest.raises(ImageError, match="64 target pixels"):
         simulate_pair(torch.zeros(300, 900), DEGRADED, REFERENCE, 5, Draw(0))
+
+
+@pytest.mark.parametrize(("height", "width"), [(96, 96), (95, 100), (5, 7)])
+def test_a_padded_acquisition_covers_the_whole_scene(height: int, width: int) -> None:
+    dn = acquire_padded(torch.full((height, width), 80.0), QUIET, 3, Draw(0), "degraded")
+    assert dn.shape == (math.ceil(height / 3), math.ceil(width / 3))
+    torch.testing.assert_close(dn, torch.full_like(dn, 800.0), rtol=0, atol=1)
+
+
+def test_padding_shifts_nothing() -> None:
+    """Where a margin of real scene surrounds it, an acquisition is the same to what the mirror brings in."""
+    radiance = procedural_scene(600, 600, np.random.default_rng(3)).radiance
+    whole = acquire_padded(radiance, QUIET, 3, Draw(0), "degraded")
+    cropped = acquire(scene_spectrum(radiance), 600, QUIET, 3, Draw(0), "degraded")
+    inner = whole[MARGIN_PX:-MARGIN_PX, MARGIN_PX:-MARGIN_PX]
+    assert float((inner - cropped).abs().mean()) < 2
+    shifted = whole[MARGIN_PX:-MARGIN_PX, MARGIN_PX + 1 : 1 - MARGIN_PX or None]
+    assert float((shifted[:, :-1] - cropped[:, :-1]).abs().mean()) > 20
 
 
 def test_drawn_scenes_are_physical_and_repeatable() -> None:

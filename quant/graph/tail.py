@@ -1,0 +1,133 @@
+"""What a network does behind its last map that a DPU can compute, such as decoding boxes: the host's, in float.
+
+A detector's file ends in slices, sums with a grid, exponentials and sigmoids. They are kept as the ONNX nodes that
+they are, from `correction` to the result, and written behind the core again.
+"""
+
+import base64
+from collections.abc import Collection
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import onnx
+from google.protobuf.message import DecodeError
+from onnx import GraphProto, ModelProto, NodeProto, TensorProto, helper
+from onnx.reference import ReferenceEvaluator
+
+from quant.graph.operations import CORRECTION
+from quant.onnx_file import GraphWriter
+from quant.reading.folding import IR_VERSION, OPSET
+
+PLAIN = {
+    "Add", "Clip", "Concat", "Div", "Exp", "Flatten", "Mul", "Pow", "Reshape", "Sigmoid", "Slice", "Softmax",
+    "Softplus", "Split", "Sqrt", "Squeeze", "Sub", "Tanh", "Transpose", "Unsqueeze",
+}  # fmt: skip
+"""What a tail may hold: value by value, or moving values, so that it costs next to nothing. No weights."""
+
+RESULT = "restored"
+"""The name of a host file's result."""
+
+
+@dataclass(frozen=True)
+class Tail:
+    """Nodes behind the core, which read `correction` and write `restored`.
+
+    Attributes:
+        text: an ONNX graph in base64, so that a file can hold it among its words.
+    """
+
+    text: str
+
+    @cached_property
+    def graph(self) -> GraphProto:
+        """The nodes and their constants.
+
+        Raises:
+            ValueError: no such graph, or one that holds other operators.
+        """
+        try:
+            graph: GraphProto = GraphProto.FromString(base64.b64decode(self.text, validate=True))
+        except DecodeError as error:
+            raise ValueError("a tail that is no graph") from error
+        others = {node.op_type for node in graph.node} - PLAIN
+        if others or len(graph.input) != 1 or len(graph.output) != 1:
+            raise ValueError(f"a tail of {', '.join(sorted(others)) or 'several ends'}")
+        return graph
+
+    @property
+    def result(self) -> onnx.ValueInfoProto:
+        """The name and sizes of what it gives."""
+        result: onnx.ValueInfoProto = self.graph.output[0]
+        return result
+
+    def __call__(self, values: np.ndarray) -> np.ndarray:
+        """What it makes of a map (N, C, H, W), in float32."""
+        found: list[np.ndarray] = self._evaluator.run(None, {CORRECTION: values.astype(np.float32)})  # type: ignore[assignment]
+        return found[0]
+
+    def write(self, writer: GraphWriter, source: str) -> None:
+        """Write its nodes behind the tensor `source`."""
+        for node in self.graph.node:
+            written = _renamed(node, {CORRECTION: source})
+            writer.nodes.append(written)
+        for tensor in self.graph.initializer:
+            writer.weights.setdefault(tensor.name, tensor)
+
+    @cached_property
+    def _evaluator(self) -> ReferenceEvaluator:
+        opset = [helper.make_opsetid("", OPSET)]
+        return ReferenceEvaluator(helper.make_model(self.graph, opset_imports=opset, ir_version=IR_VERSION))
+
+
+def without_tail(model: ModelProto, known: Collection[str]) -> tuple[ModelProto, Tail | None]:
+    """The network up to the map behind which operators begin that are not `known`, and these as its tail.
+
+    None, and the network as it is, where all are known, where they read more than one map, or where something lies
+    behind them that is not the host's to compute.
+    """
+    nodes = [node for node in model.graph.node if node.op_type != "Constant"]
+    first = next((k for k, node in enumerate(nodes) if node.op_type not in known), None)
+    if first is None or len(model.graph.output) != 1:
+        return model, None
+    held = {tensor.name for tensor in model.graph.initializer}
+    for start in range(first, 0, -1):
+        tail = nodes[start:]
+        written = {name for node in tail for name in node.output}
+        read = {name for node in tail for name in node.input if name} - written - held
+        if len(read) == 1 and all(node.op_type in PLAIN for node in tail):
+            source = read.pop()
+            return (
+                (model, None) if source == model.graph.input[0].name else _parted(model, nodes[:start], tail, source)
+            )
+    return model, None
+
+
+def _parted(model: ModelProto, nodes: list[NodeProto], tail: list[NodeProto], source: str) -> tuple[ModelProto, Tail]:
+    body, output = ModelProto(), model.graph.output[0]
+    body.CopyFrom(model)
+    del body.graph.node[:], body.graph.output[:]
+    body.graph.node.extend(nodes)
+    body.graph.output.append(helper.make_tensor_value_info(source, TensorProto.FLOAT, None))
+    names = {name: f"host_tail.{name}" for node in tail for name in (*node.input, *node.output) if name}
+    names |= {source: CORRECTION, output.name: RESULT}
+    kept = [tensor for tensor in model.graph.initializer if tensor.name in names]
+    read, result = onnx.ValueInfoProto(name=CORRECTION), onnx.ValueInfoProto(name=RESULT, type=output.type)
+    read.type.tensor_type.elem_type = TensorProto.FLOAT
+    graph = helper.make_graph([_renamed(node, names) for node in tail], "tail", [read], [result])
+    for tensor in kept:
+        graph.initializer.add().CopyFrom(tensor)
+        graph.initializer[-1].name = names[tensor.name]
+    return body, Tail(base64.b64encode(graph.SerializeToString(deterministic=True)).decode())
+
+
+def _renamed(node: NodeProto, names: dict[str, str]) -> NodeProto:
+    found = NodeProto()
+    found.CopyFrom(node)
+    for field in (found.input, found.output):
+        renamed = [names.get(name, name) for name in field]
+        del field[:]
+        field.extend(renamed)
+    if not found.name.startswith("host_tail."):
+        found.name = f"host_tail.{found.name or found.output[0]}"
+    return found

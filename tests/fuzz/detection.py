@@ -1,0 +1,57 @@
+"""Labels and detectors that others wrote, as the fuzzer damages them."""
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+from PIL import Image
+
+from deploy.detection.annotations import read_labelled
+from deploy.detection.detectors import open_detector
+from deploy.detection.text_labels import yolo_names
+from tests.deploy.detection.folders import OBJECTS, SIZE_PX
+from tests.deploy.detection.networks import detector, final, raw
+
+GREY = np.full((*SIZE_PX, 3), 90, np.uint8)
+
+
+def label_seeds(folder: Path, make: Callable[[Path], Path], suffix: str) -> list[bytes]:
+    """The files of labels in a folder of some layout."""
+    found = sorted(path for path in make(folder / "made").rglob(f"*{suffix}") if path.stem != "data")
+    return [path.read_bytes() for path in found]
+
+
+def names_seeds(_: Path) -> list[bytes]:
+    """Names of classes, as a list and as a table."""
+    return [b"names: [ship, tank]\nnc: 2\n", b"path: a\nnames:\n  0: ship\n  1: tank\n"]
+
+
+def read_beside(path: Path) -> None:
+    """Labels, beside the images that they are of: one file of all, or a copy for each."""
+    with TemporaryDirectory() as made:
+        for stem in OBJECTS:
+            Image.fromarray(GREY).save(Path(made) / f"{stem}.png")
+            shutil.copy(path, Path(made) / f"{'labels' if path.suffix == '.json' else stem}{path.suffix}")
+        (Path(made) / "classes.txt").write_text("Expressway-Service-area\nship\n", encoding="utf-8")
+        read_labelled(Path(made))
+
+
+def read_names(path: Path) -> None:
+    """Names of classes."""
+    with TemporaryDirectory() as made:
+        yolo_names([Path(shutil.copy(path, made)).parent])
+
+
+def detector_seeds(folder: Path) -> list[bytes]:
+    """Both layouts, of a fixed size and of any, one with a suppression inside."""
+    row = (20.0, 30.0, 40.0, 50.0, 0.5, 0.0)
+    kinds = [detector(folder / "a.onnx", raw(row)), detector(folder / "b.onnx", raw(row), size_px="side")]
+    kinds.append(detector(folder / "c.onnx", final(row), cut=0.25))
+    return [path.read_bytes() for path in kinds]
+
+
+def detect(path: Path) -> None:
+    """What is found on an image."""
+    open_detector(path, 1).detect(GREY.astype(np.float32) / 255)

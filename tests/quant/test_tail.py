@@ -1,0 +1,180 @@
+"""What a network does behind its last map stays on the host, as it is: decoding of boxes."""
+
+import base64
+from collections.abc import Callable
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import onnx
+import pytest
+import torch
+from onnx import TensorProto, helper
+
+from deploy.dpu.board import load_dpu
+from deploy.dpu.checker.placement import place
+from deploy.dpu.checker.table import legality
+from deploy.dpu.reading import network_of
+from model.detection.export import detector_to_onnx
+from model.detection.network import DetectorNetwork, initialise
+from profiles.errors import ModelError
+from quant.calibration import Patches, Remade
+from quant.encodings import as_on_board, encoding_faults, read_core
+from quant.encodings.description import KEY
+from quant.graph import CORRECTION, read_network
+from quant.graph.tail import Tail
+from quant.integer import agreement, integer_rows
+from quant.onnx_file import GraphWriter, image_info, make_model
+from quant.quantise import ALL, Quantised, quantise_model
+from quant.reading.folding import simplest
+from quant.session import open_session, result_of
+
+SIDE_PX = 160
+
+
+def detector() -> onnx.ModelProto:
+    """Untrained, with statistics of its own, and a last layer whose boxes and scores differ from place to place."""
+    network, generator = DetectorNetwork(2), torch.Generator().manual_seed(0)
+    initialise(network, generator)
+    with torch.no_grad():
+        network.tail.weight.mul_(3)
+    return simplest(detector_to_onnx(network.eval(), ("a", "b"), SIDE_PX, {"kept": "said"}), "detector")
+
+
+def images(count: int = 3) -> list[np.ndarray]:
+    generator = np.random.default_rng(1)
+    blocks = generator.random((count, 1, 3, SIDE_PX // 8, SIDE_PX // 8), dtype=np.float32)
+    return list(np.kron(blocks, np.ones((8, 8), np.float32)))
+
+
+def samples() -> Patches:
+    seen = images()
+    return Patches([], Remade(lambda k: (seen[k], seen[k]), len(seen)), Remade(lambda k: seen[k], len(seen)))
+
+
+@cache
+def quantised() -> Quantised:
+    return quantise_model(detector(), samples(), {}, lambda: None, replace(ALL, equalise=False))
+
+
+def test_the_tail_begins_behind_the_last_convolution() -> None:
+    model = detector()
+    network = read_network(model)
+    assert network.tail is not None
+    assert network.graph[-1].name == [node for node in model.graph.node if node.op_type == "Conv"][-1].name
+    behind = {"Slice", "Exp", "Sigmoid", "Add", "Mul", "Concat", "Reshape"}
+    assert {node.op_type for node in network.tail.graph.node} == behind
+    assert len(network.tail.graph.node) + 10 + len(network.graph) == len(model.graph.node)  # 10 ReLUs are fused
+
+
+def test_the_tail_by_itself_is_what_the_runtime_computes() -> None:
+    model, seen = detector(), images()[0]
+    tail = read_network(model).tail
+    assert tail is not None
+    last = next(node for node in reversed(model.graph.node) if node.op_type == "Conv").output[0]
+    wanted = result_of(open_session(model), seen)
+    model.graph.output.append(helper.make_tensor_value_info(last, TensorProto.FLOAT, None))
+    found = open_session(model).run([last], {"images": seen})[0]
+    np.testing.assert_allclose(tail(np.asarray(found)), wanted, rtol=1e-5, atol=1e-5)
+
+
+def test_int8_gives_boxes_and_scores_as_float_does() -> None:
+    seen = images()[1]
+    wanted, found = (result_of(open_session(model), seen) for model in (detector(), quantised().host))
+    assert found.shape == wanted.shape == (1, 6, (SIDE_PX // 4) ** 2)
+    for row, spread in zip(np.abs(found - wanted)[0], wanted[0].std(axis=1), strict=True):
+        assert row.mean() < 0.15 * max(float(spread), 1e-6)
+
+
+def test_the_file_is_read_back_with_its_tail() -> None:
+    made = quantised()
+    again = read_core(made.host)
+    assert encoding_faults(made.host) == []
+    assert again.ends == made.core.ends
+    seen = images()[2]
+    found = agreement(again, made.host, seen)
+    assert [layer.report.name for layer in found.layers if layer.unequal] == []
+    whole = result_of(open_session(made.host), seen)
+    np.testing.assert_allclose(again.ends.finished(seen, found.even), whole, rtol=1e-5, atol=1e-5)
+    assert {entry.key: entry.value for entry in made.host.metadata_props}["kept"] == "said"
+
+
+def test_a_network_of_one_size_is_looked_at_whole() -> None:
+    made = quantised()
+    layers, _ = integer_rows(detector(), made.core, made.host, images())
+    assert {row.figures["as onnxruntime"].value for row in layers} == {100.0}
+
+
+@pytest.mark.parametrize("target", ["vck190", "zcu102", "kv260"])
+def test_the_core_and_the_float_file_are_legal_on_the_dpu(target: str) -> None:
+    dpu = load_dpu(target, None)
+    for model in (detector(), as_on_board(quantised().host)):
+        assert legality(place(network_of(model, SIDE_PX), dpu)).passed
+
+
+def test_a_tail_that_was_changed_is_a_fault() -> None:
+    spoilt = onnx.ModelProto()
+    spoilt.CopyFrom(quantised().host)
+    node = next(each for each in spoilt.graph.node if each.op_type == "Exp")
+    node.op_type = "Sqrt"
+    assert encoding_faults(spoilt) == [f"node {node.name}"]
+
+
+def graph_text(kind: str) -> str:
+    read, result = (helper.make_tensor_value_info(n, TensorProto.FLOAT, None) for n in (CORRECTION, "restored"))
+    node = helper.make_node(kind, [CORRECTION], ["restored"])
+    return base64.b64encode(helper.make_graph([node], "t", [read], [result]).SerializeToString()).decode()
+
+
+@pytest.mark.parametrize("text", [graph_text("Loop"), graph_text("Conv"), "bm8gZ3JhcGg=", "not base64"])
+def test_a_description_with_another_tail_is_one_sentence(text: str) -> None:
+    spoilt = onnx.ModelProto()
+    spoilt.CopyFrom(quantised().host)
+    ends, entry = quantised().core.ends, next(each for each in spoilt.metadata_props if each.key == KEY)
+    assert ends.tail is not None
+    entry.value = entry.value.replace(ends.tail.text, text)
+    with pytest.raises(ModelError, match="contradict"):
+        encoding_faults(spoilt)
+
+
+def behind_conv(write: Callable[[GraphWriter], object]) -> onnx.ModelProto:
+    writer = GraphWriter()
+    weight = writer.constant("w", np.ones((2, 1, 3, 3), np.float32))
+    writer.node("Conv", "x", ["image", weight], "conv", kernel_shape=[3, 3], pads=[1] * 4)
+    write(writer)
+    result = helper.make_tensor_value_info("restored", TensorProto.FLOAT, None)
+    return make_model(writer.graph("g", [image_info("image", 1, 32)], [result]), {})
+
+
+def sigmoid_then_conv(w: GraphWriter) -> None:
+    weight = w.constant("v", np.ones((1, 2, 1, 1), np.float32))
+    w.node("Conv", "restored", [w.node("Sigmoid", "s", ["x"]), weight], "last")
+
+
+def of_two_maps(w: GraphWriter) -> None:
+    other = w.node("MaxPool", "y", ["x"], kernel_shape=[2, 2], strides=[2, 2])
+    flat = [w.node("Flatten", f"{name}.flat", [w.node("Sigmoid", f"{name}.s", [name])]) for name in ("x", other)]
+    w.node("Concat", "restored", flat, axis=1)
+
+
+@pytest.mark.parametrize("write", [sigmoid_then_conv, of_two_maps])
+def test_what_is_no_tail_is_refused_as_before(write: Callable[[GraphWriter], object]) -> None:
+    with pytest.raises(ModelError, match="Sigmoid"):
+        read_network(behind_conv(write))
+
+
+def test_nothing_may_follow_a_global_add() -> None:
+    def write(w: GraphWriter) -> None:
+        weight = w.constant("v", np.ones((1, 2, 1, 1), np.float32))
+        w.node("Add", "sum", ["image", w.node("Conv", "y", ["x", weight], "last")])
+        w.node("Sigmoid", "restored", ["sum"])
+
+    with pytest.raises(ModelError, match="nothing behind the global add"):
+        read_network(behind_conv(write))
+
+
+def test_a_tail_of_a_single_sigmoid_is_the_hosts() -> None:
+    network = read_network(behind_conv(lambda w: w.node("Sigmoid", "restored", ["x"])))
+    assert isinstance(network.tail, Tail)
+    values = np.linspace(-3, 3, 8, dtype=np.float32).reshape(1, 2, 2, 2)
+    np.testing.assert_allclose(network.tail(values), 1 / (1 + np.exp(-values)), rtol=1e-6)
