@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from deploy.methods import method_named
+from deploy.networks import once
 from deploy.report.evaluation_page import evaluation_report, pictures
 from deploy.report.page import write_report
 from model.evaluation.methods import Method
@@ -103,7 +104,8 @@ def run_evaluation(request: EvaluationRequest, say: Callable[[str], None]) -> Ev
     recipe = read_pairs_recipe(request.pairs) if request.pairs is not None else None
     sensors = profiles_for(request.sensor, request.reference, recipe, say)
     degraded = sensors[0].nominal()
-    methods = [method_named(name, *sensors, say) for name in request.names]
+    told = once(say)
+    methods = [method_named(name, *sensors, told) for name in request.names]
     instruments = Instruments(perceptual_distances(request.lpips), degraded.max_dn)
     pairs, small = load_pairs(request.images, request.pairs, *sensors, request.seed, recipe)
     result = evaluate_methods(methods, pairs, instruments, degraded, request.seed)

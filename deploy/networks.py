@@ -45,6 +45,18 @@ def silent(_: str) -> None:
     """Tell nobody."""
 
 
+def once(say: Say) -> Say:
+    """Tells each sentence the first time alone: several networks of one sensor have the same to say."""
+    told = set[str]()
+
+    def tell(sentence: str) -> None:
+        if sentence not in told:
+            told.add(sentence)
+            say(sentence)
+
+    return tell
+
+
 @dataclass(frozen=True)
 class Conditioned:
     """Weights of a conditioned network, and the name that it is listed under."""

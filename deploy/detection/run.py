@@ -26,7 +26,7 @@ from deploy.detection.study import Comparison, Sensors, Study, network_digest, r
 from deploy.detection.subjects import Subject, drawn_subjects, labelled_subjects
 from deploy.dpu.board import load_dpu
 from deploy.methods import AT
-from deploy.networks import Say, network_file
+from deploy.networks import Say, network_file, once
 from deploy.report.page import Report, Table, write_report
 from model.detection.scenes import CLASSES
 from model.metrics.bootstrap import LEAST_SITES
@@ -161,15 +161,16 @@ def run_detection(request: DetectionRequest, cache: Cache, say: Say) -> Detectio
         BeersError: a name, a file or a folder that is not what it should be.
     """
     require_library()
-    sensors = [_sensors(name, request.reference, say) for name in request.sensors]
-    rows = [rows_of(each, request.methods, say) for each in sensors]
     detector = open_detector(request.detector_file, size_px=request.size_px)
     subjects, notes = _subjects(request, detector)
+    told = once(say)
+    sensors = [_sensors(name, request.reference, told) for name in request.sensors]
+    rows = [rows_of(each, request.methods, told) for each in sensors]
     study = Study(detector, request.detector_file, subjects, request.seed, cache)
     compared = [study.compare(*each) for each in zip(sensors, rows, strict=True)]
     more, remarks = _pair(request, sensors[0].degraded)
     if request.retrain:
-        trained = conditions(sensors, request.methods[-1], say)
+        trained = conditions(sensors, request.methods[-1], told)
         more += Retraining(trained, subjects, request.seed, cache).run()
     sites, warning = compared[0].differences.sites, compared[0].differences.warning
     said = (detector.flag, few_sites(sites) if sites < LEAST_SITES else warning, *notes, *remarks)

@@ -23,6 +23,7 @@ from deploy.networks import (
     float_file,
     int8_file,
     network_file,
+    once,
     shipped_pair,
 )
 from model.io.files import sha256
@@ -162,3 +163,11 @@ def test_a_network_that_is_made_already_takes_no_sensor(tmp_path: Path) -> None:
 def test_a_sensors_name_cannot_leave_the_cache(conditioned: Path, own_cache: Path) -> None:
     odd = replace(KNOWN, name="../../x y/" + 99 * "z")
     assert float_file(conditioned, odd).parent == own_cache
+
+
+def test_what_several_networks_have_to_say_is_said_once() -> None:
+    said: list[str] = []
+    tell = once(said.append)
+    for sentence in ("a", "b", "a", "b", "c"):
+        tell(sentence)
+    assert said == ["a", "b", "c"]
