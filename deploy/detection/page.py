@@ -3,6 +3,7 @@
 import base64
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import cycle
 
 import numpy as np
 from PIL import Image, ImageDraw
@@ -50,9 +51,25 @@ def marks_of(truth: Boxes, boxes: Boxes, confidence: float) -> Marks:
 
 
 def crops(compared: Sequence[Comparison]) -> list[Picture]:
-    """The same crops of a few scenes, a row a sensor and a column a method, where degradation costs most objects."""
-    chosen = sorted(range(len(compared[0].views)), key=lambda number: -_lost(compared, number))[:SCENES]
-    return [_picture(compared, number) for number in chosen]
+    """The same crops of a few scenes, a row a sensor and a column a method, where degradation costs most objects.
+
+    The classes take turns, those with most objects first, each with a scene that no other has shown.
+    """
+    truths = [view.subject.truth for view in compared[0].views]
+    kinds, counts = np.unique(np.concatenate([truth.classes for truth in truths]), return_counts=True)
+    left, pictures = set(range(len(truths))), []
+    turns = cycle(kinds[np.argsort(-counts, kind="stable")].tolist())
+    for kind, _ in zip(turns, range(min(SCENES, len(truths))), strict=False):
+        number = max(sorted(left), key=lambda each: _worth(compared, each, kind))
+        left.remove(number)
+        pictures.append(_picture(compared, number, kind))
+    return pictures
+
+
+def _worth(compared: Sequence[Comparison], number: int, kind: int) -> tuple[int, int]:
+    """By which a scene is chosen: objects of a class that are lost, then objects of it."""
+    lost = sum(int(_lost_objects(found, number, kind).sum()) for found in compared)
+    return lost, int((compared[0].views[number].subject.truth.classes == kind).sum())
 
 
 def _marks(found: Comparison, row: str, number: int) -> Marks:
@@ -60,32 +77,29 @@ def _marks(found: Comparison, row: str, number: int) -> Marks:
     return marks_of(truth, found.found[row][number], found.differences.confidence)
 
 
-def _lost_objects(found: Comparison, number: int) -> np.ndarray:
-    """(M,) objects of a scene that are found on the reference and not on degraded images."""
-    return np.asarray(_marks(found, REFERENCE, number).found & ~_marks(found, DEGRADED, number).found)
+def _lost_objects(found: Comparison, number: int, kind: int) -> np.ndarray:
+    """(M,) objects of a class in a scene that are found on the reference and not on degraded images."""
+    lost = _marks(found, REFERENCE, number).found & ~_marks(found, DEGRADED, number).found
+    return np.asarray(lost & (found.views[number].subject.truth.classes == kind))
 
 
-def _lost(compared: Sequence[Comparison], number: int) -> int:
-    return sum(int(_lost_objects(found, number).sum()) for found in compared)
-
-
-def _picture(compared: Sequence[Comparison], number: int) -> Picture:
-    subject = compared[0].views[number].subject
+def _picture(compared: Sequence[Comparison], number: int, kind: int) -> Picture:
+    subject, name = compared[0].views[number].subject, next(iter(compared[0].matched.values())).names[kind]
     names = list(compared[0].methods)
-    middle = _middle(compared[0], number)
+    middle = _middle(compared[0], number, kind)
     rows = [_cells(found, number, middle) for found in compared]
     where = " and ".join(found.name for found in compared)
     caption = (
         f"Rows: {where}. {CROP_PX} pixels of the sensor a side, enlarged {ZOOM} times, one display for all. Boxes at "
         "the confidence of the table: green found, red missed, yellow false."
     )
-    return Picture(f"{subject.name}: what is found", picture_url(np.asarray(grid(names, rows, 1))), caption)
+    return Picture(f"{subject.name}, {name}: what is found", picture_url(np.asarray(grid(names, rows, 1))), caption)
 
 
-def _middle(found: Comparison, number: int) -> np.ndarray:
-    """(2,) x and y in scene pixels of the object, a lost one if there is any, with most of its kind near it."""
-    corners, lost = found.views[number].subject.truth.corners, _lost_objects(found, number)
-    middles = (corners[:, :2] + corners[:, 2:])[lost if lost.any() else slice(None)] / 2
+def _middle(found: Comparison, number: int, kind: int) -> np.ndarray:
+    """(2,) x and y in scene pixels of the object of a class, a lost one if there is any, with most such near it."""
+    truth, lost = found.views[number].subject.truth, _lost_objects(found, number, kind)
+    middles = (truth.corners[:, :2] + truth.corners[:, 2:])[lost if lost.any() else truth.classes == kind] / 2
     if not len(middles):
         return np.zeros(2)
     reach = CROP_PX * found.sensors.oversampling / 2

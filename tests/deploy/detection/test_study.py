@@ -34,12 +34,12 @@ def sensors(name: str = "dior-medium", ratio: int = 3) -> Sensors:
 
 
 def subject(
-    corners: list[tuple[int, int, int, int]], height: int = 150, width: int = 210, name: str = "a"
+    corners: list[tuple[int, int, int, int]], height: int = 150, width: int = 210, name: str = "a", kind: int = 0
 ) -> Subject:
     radiance = torch.full((height, width), GROUND)
     for x1, y1, x2, y2 in corners:
         radiance[y1:y2, x1:x2] = SHIP
-    truth = Boxes.of(np.array(corners, float), np.zeros(len(corners)))
+    truth = Boxes.of(np.array(corners, float), np.full(len(corners), kind))
     return Subject(name, name, truth, f"{name} {corners}", None, lambda _: radiance)
 
 
@@ -132,9 +132,9 @@ def test_a_network_is_named_by_its_bytes(tmp_path: Path) -> None:
     assert network_digest(str(own), degraded) != before
 
 
-def handmade(folder: Path, sites: int = 12, **found: int) -> Comparison:
-    """Sites of one object each, of which each row finds so many, and all of them surely."""
-    scenes = [subject([(30, 30, 90, 80)], name=str(k)) for k in range(sites)]
+def handmade(folder: Path, sites: int = 12, tanks: int = 0, **found: int) -> Comparison:
+    """Sites of one object each, ships and at last `tanks`, of which each row finds so many, and all surely."""
+    scenes = [subject([(30, 30, 90, 80)], name=str(k), kind=int(k >= sites - tanks)) for k in range(sites)]
     made, seen = study(folder, scenes), sensors("dior-high")
     methods = {name: method_named(name, seen.degraded, seen.reference) for name in found if name != REFERENCE}
     boxes = {
@@ -240,3 +240,10 @@ def test_pictures_and_curves_are_drawn(tmp_path: Path) -> None:
     pictures = [curves([found]), *crops([found])]
     assert [picture.source.split(";")[0] for picture in pictures] == ["data:image/svg+xml", *["data:image/png"] * 4]
     assert all(picture.caption for picture in pictures)
+
+
+def test_classes_take_turns_in_pictures_and_no_scene_is_shown_twice(tmp_path: Path) -> None:
+    """Ships 0 to 8 and tanks 9 to 11, of which degraded images lose all from 3 on: shown are what is lost."""
+    found = handmade(tmp_path, tanks=3, reference=12, degraded=3)
+    titles = [picture.title for picture in crops([found])]
+    assert titles == [f"{scene}: what is found" for scene in ("3, ship", "9, tank", "4, ship", "10, tank")]
