@@ -56,11 +56,12 @@ def test_every_command_has_help_with_an_example(name: str) -> None:
 
 
 def test_what_is_told_no_sensor_takes_the_same_one() -> None:
-    """A network calibrated on one and judged on another is no fair trial."""
+    """A network calibrated on one and judged on another is no fair trial; `detect` takes the paper's two of DIOR."""
     group = get_command(app)
     assert isinstance(group, TyperGroup)
     defaults = {name: p.default for name, c in group.commands.items() for p in c.params if p.name == "sensor"}
     assert {"quantize", "gate", "evaluate"} <= set(defaults)
+    assert defaults.pop("detect") == "dior-medium,dior-high"
     assert set(defaults.values()) == {SENSOR, None}
 
 
