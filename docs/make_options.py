@@ -69,7 +69,7 @@ PATHS = {
     "stress": Paths({"out": FILE, "json": FILE}, ("float_model", "int8_model", "images"), ("sensor", "target")),
     "tradeoff": Paths(
         {"out": FOLDER, "cache": FOLDER, "json": FILE},
-        ("images", "lpips", "calibration"),
+        ("images", "lpips", "calibration", "labelled", "detector"),
         ("sensor", "reference", "networks", "target"),
     ),
     "compare": Paths({"json": FILE}, ("before", "after")),
@@ -203,6 +203,7 @@ REFUSED = {
         Refused(("drawn", "retrain"), "--images IMAGES"),
         Refused(("retrain",), "--detector DETECTOR"),
     ],
+    "tradeoff": [Refused(("detector", "classes"), without="--labelled")],
     "stress": [
         Refused(("variant",), "FLOAT"),
         Refused(("cases", "stages"), "--bit-flips"),

@@ -6,22 +6,26 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from deploy.commands.shared import say
+from deploy.commands.shared import refuse, say
 from model.processor import SEEDS
 from model.shipped import SENSOR
 from profiles.target import DEFAULT_TARGET, board_names
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from deploy.tradeoff.points import Demand
     from deploy.tradeoff.study import Study
 
 EXAMPLE = "tradeoff --images aerial/ --out study/ --budget 'latency<=20s'"
 PAPER_SIZE = "13600x9016"
 BOARDS = ", ".join(board_names())
-SHOWN = ("PSNR", "LPIPS-squeeze", "host p50", "board latency", "board energy")
+SHOWN = ("PSNR", "LPIPS-squeeze", "mAP50", "host p50", "board latency", "board energy")
 """Figures on the terminal; the report and the document hold all."""
 
 
 def tradeoff(
+    context: typer.Context,
     out: Annotated[Path, typer.Option(help="Folder for the report, tradeoff.json and the cache of measurements.")],
     images: Annotated[
         Path | None, typer.Option(help="Folder of held-out scenes to simulate from; drawn ones if none.")
@@ -47,6 +51,16 @@ def tradeoff(
     calibration: Annotated[
         Path | None, typer.Option(help="Folder of scenes to make missing INT8 files on; drawn ones if none.")
     ] = None,
+    labelled: Annotated[
+        Path | None,
+        typer.Option(help="Folder of labelled pictures, as detect reads them: what a detector finds is a quality."),
+    ] = None,
+    detector: Annotated[
+        Path | None, typer.Option(help="ONNX as Ultralytics exports it; the embedded one if none.")
+    ] = None,
+    classes: Annotated[
+        str | None, typer.Option(help="Labelled classes under the detector's names: car=vehicle,minibus=vehicle.")
+    ] = None,
     target: Annotated[
         str,
         typer.Option(
@@ -66,8 +80,10 @@ def tradeoff(
     """
     from deploy.bench.tables import parse_size
     from deploy.cache import Cache
+    from deploy.detection.classes import parse_classes
     from deploy.results import Document
     from deploy.tradeoff.boards import parse_targets
+    from deploy.tradeoff.detection import Request as DetectionRequest
     from deploy.tradeoff.page import FILES, write_study
     from deploy.tradeoff.points import parse_demands
     from deploy.tradeoff.run import run_study
@@ -78,12 +94,16 @@ def tradeoff(
 
     figures, kept = out / "tradeoff.json", cache or out / "cache"
     demands = [tuple(parse_demands(name, text)) for name, text in (("--budget", budget), ("--need", need))]
+    if labelled is None:
+        _refuse_unlabelled(context, *demands)
     names = tuple(networks.split(",")) if networks is not None else tuple(shipped_names())
     aim = reference or REFERENCE
     boards = parse_targets(target)
-    read = (images, calibration, lpips, *map(Path, (sensor, aim, *boards, *names)))
+    tree = labelled.rglob("*") if labelled else ()
+    read = (images, calibration, lpips, labelled, detector, *tree, *map(Path, (sensor, aim, *boards, *names)))
     require_writable(figures, *(out / name for name in FILES), json, inputs=read, folders=(kept,))
     reference_beside(load_sensor(sensor), reference, say)
+    looked = DetectionRequest(labelled, detector, parse_classes(classes) if classes else {}) if labelled else None
     request = Request(
         names,
         images,
@@ -97,6 +117,7 @@ def tradeoff(
         seed,
         boards[0],
         boards,
+        looked,
     )
     result = run_study(request, Cache(kept), partial(say, err=True))
     write_study(result.study, out)
@@ -104,11 +125,24 @@ def tradeoff(
     arguments: dict[str, object] = {"images": images, "sensor": sensor, "reference": aim, "size": size}
     arguments |= {"networks": networks, "budget": budget, "need": need, "calibration": calibration, "seed": seed}
     arguments |= {"target": target}
-    document = Document("tradeoff", arguments, request.files, result.rows)
+    if labelled:
+        arguments |= {"labelled": labelled, "detector": detector, "classes": classes}
+    document = Document("tradeoff", arguments, (*request.files, *result.labelled), result.rows)
     for path in (figures, json):
         document.write(path)
     if not result.met:
         raise typer.Exit(1)
+
+
+def _refuse_unlabelled(context: typer.Context, *demands: "Sequence[Demand]") -> None:
+    """Refuse what only labelled pictures have: a detector, its classes, and demands on what it finds."""
+    from deploy.tradeoff.points import MAP50
+
+    expected, got = "--labelled beside it", "none"
+    refuse(context, ["detector", "classes"], expected=expected, got=got, remedy="leave it out")
+    for option, asked in zip(("budget", "need"), demands, strict=True):
+        if any(demand.key == MAP50 for demand in asked):
+            refuse(context, [option], expected=f"{expected} for {MAP50}", got=got, remedy="give labelled pictures")
 
 
 def show(study: "Study") -> None:
@@ -117,12 +151,12 @@ def show(study: "Study") -> None:
     from profiles.figures import Row
 
     rows = [
-        Row(r.table, r.name, {key: r.figures[key] for key in SHOWN}, {"sensor": r.text["sensor"]})
+        Row(r.table, r.name, {key: r.figures[key] for key in SHOWN if key in r.figures}, {"sensor": r.text["sensor"]})
         for r in study.points
     ]
     print_rows("operating points", rows)
     for front in study.fronts:
-        if front.y == "PSNR":
+        if front.y in ("PSNR", "mAP50"):
             say(f"front of {front.y} against {front.x}: {'; '.join(front.members)}")
             for price in front.prices:
                 say(f"  {price}")

@@ -4,7 +4,7 @@ As Everingham et al. (IJCV 111, 2015, section 3.5) test the entries of the VOC c
 percentiles of the paired difference. A mean average precision is no mean over images, so each draw scores anew.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -79,12 +79,35 @@ class Differences:
     def _estimate(self, combine: Callable[[Callable[[str, str], np.ndarray]], np.ndarray]) -> Estimate:
         """A combination of figures, on all images and in every draw."""
         value = float(combine(lambda row, figure: np.array(self.scores[row].figures()[figure])))
-        draws = combine(lambda row, figure: self.drawn[row][figure])
-        known = draws[~np.isnan(draws)]
-        if np.isnan(value) or self.sites < LEAST_SITES or not len(known):
-            return Estimate(value, None)
-        low, high = np.percentile(known, PERCENTILES)
-        return Estimate(value, (float(low), float(high)))
+        return estimate(value, combine(lambda row, figure: self.drawn[row][figure]), self.sites)
+
+
+def estimate(value: float, draws: np.ndarray, sites: int) -> Estimate:
+    """A figure with its interval at 95 %.
+
+    Args:
+        value: on all images.
+        draws: (draws,) the same in each draw of the sites, NaN where a draw has none.
+        sites: how many different ones.
+    """
+    known = draws[~np.isnan(draws)]
+    if np.isnan(value) or sites < LEAST_SITES or not len(known):
+        return Estimate(value, None)
+    low, high = np.percentile(known, PERCENTILES)
+    return Estimate(value, (float(low), float(high)))
+
+
+def site_draws(sites: Sequence[str], generator: np.random.Generator, draws: int = DRAWS) -> Iterator[np.ndarray]:
+    """How often each image counts, (I,), in each of so many draws of the sites with replacement.
+
+    Args:
+        sites: of the images, in their order.
+        generator: of the draws; one of the same seed gives the same to all rows of the same sites.
+        draws: how many.
+    """
+    names, site = np.unique(np.array(sites), return_inverse=True)
+    for counts in generator.multinomial(len(names), np.full(len(names), 1 / len(names)), size=draws):
+        yield counts[site]
 
 
 def differences(rows: Mapping[str, Matched], generator: np.random.Generator, draws: int = DRAWS) -> Differences:
@@ -103,15 +126,14 @@ def differences(rows: Mapping[str, Matched], generator: np.random.Generator, dra
     first = next(iter(rows.values()), None)
     if first is None or any(row.sites != first.sites for row in rows.values()):
         raise ValueError("rows of the same images are compared, one at least")
-    names, site = np.unique(np.array(first.sites), return_inverse=True)
     confidence = score(first).confidence
     known = {name: score(row, confidence=confidence) for name, row in rows.items()}
     collected: dict[str, list[dict[str, float]]] = {name: [] for name in rows}
-    for counts in generator.multinomial(len(names), np.full(len(names), 1 / len(names)), size=draws):
+    for weights in site_draws(first.sites, generator, draws):
         for name, row in rows.items():
-            collected[name].append(score(row, counts[site], confidence).figures())
+            collected[name].append(score(row, weights, confidence).figures())
     drawn = {
         name: {figure: np.array([one[figure] for one in each]) for figure in known[name].figures()}
         for name, each in collected.items()
     }
-    return Differences(known, confidence, len(names), drawn)
+    return Differences(known, confidence, len(set(first.sites)), drawn)

@@ -94,10 +94,13 @@ def _values(found: Comparison, name: str, keys: Mapping[str, str]) -> dict[str, 
 
 
 def _figure(found: Comparison, estimate: Estimate, unit: str = PERCENT) -> Figure:
-    """A share, or a difference of shares, times 100; with its interval where there are sites enough."""
+    return share_figure(estimate, len(found.views), found.differences.sites, unit)
+
+
+def share_figure(estimate: Estimate, images: int, sites: int, unit: str = PERCENT) -> Figure:
+    """A share of 0 to 1, or a difference of shares, times 100; with its interval where there are sites enough."""
     if isnan(estimate.value):
         return unavailable(unit, NO_OBJECT)
-    images, sites = len(found.views), found.differences.sites
     source, ends = f"{images} images of {sites} sites", estimate.interval
     if ends is None or sites < LEAST_SITES:
         return measured(100 * estimate.value, unit, source)

@@ -7,7 +7,6 @@ from pathlib import Path
 from deploy.bench.pair import TABLE as PAIR
 from deploy.bench.pair import pair_on_board
 from deploy.cache import Cache
-from deploy.detection.annotations import read_labelled
 from deploy.detection.classes import class_map
 from deploy.detection.detectors import Detector, open_detector
 from deploy.detection.matching import require_library
@@ -23,7 +22,7 @@ from deploy.detection.rows import (
     paper_rows,
 )
 from deploy.detection.study import Comparison, Sensors, Study, network_digest, rows_of
-from deploy.detection.subjects import Subject, drawn_subjects, labelled_subjects
+from deploy.detection.subjects import Subject, drawn_subjects, left_out, read_subjects
 from deploy.dpu.board import load_dpu
 from deploy.methods import AT
 from deploy.networks import Say, network_file, once
@@ -184,18 +183,12 @@ def _sensors(name: str, reference: str | None, say: Say) -> Sensors:
 
 def _subjects(request: DetectionRequest, detector: Detector) -> tuple[list[Subject], list[str]]:
     """The scenes, and what a reader must know of them."""
-    if request.images is None:
-        known = class_map(CLASSES, detector.names, request.classes)
-        subjects = drawn_subjects(request.drawn, request.seed, known)
-        notes = [f"The {len(subjects)} scenes are drawn, each a site of its own: no photographs."]
-    else:
-        labelled = read_labelled(request.images, request.labels, request.split)
-        known = class_map(labelled.names, detector.names, request.classes)
-        subjects, notes = labelled_subjects(labelled, known), list(labelled.notes)
-    if known.unknown:
-        names = ", ".join(known.unknown)
-        notes.append(f"Not known to the detector and left out: {names}. What it finds there counts as false.")
-    return subjects, notes
+    if request.images is not None:
+        return read_subjects(detector.names, request.classes, request.images, request.labels, request.split)
+    known = class_map(CLASSES, detector.names, request.classes)
+    subjects = drawn_subjects(request.drawn, request.seed, known)
+    said = f"The {len(subjects)} scenes are drawn, each a site of its own: no photographs."
+    return subjects, [said, *left_out(known)]
 
 
 def _pair(request: DetectionRequest, sensor: SensorProfile) -> tuple[list[Row], list[str]]:

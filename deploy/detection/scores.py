@@ -90,11 +90,7 @@ def score(matched: Matched, weights: np.ndarray | None = None, confidence: float
     by_class = np.array([average_precisions(one, counts) for one in matched.by_size[ALL]]).reshape(-1, len(OVERLAPS))
     curve = confidence_curve(matched, counts)
     best = curve.best()
-    small = {
-        size: mean([average_precisions(one, counts, 1)[0] for one in matched.by_size[size]])
-        for size in SIZES_PX
-        if size != ALL
-    }
+    small = {size: ap50(matched, counts, size) for size in SIZES_PX if size != ALL}
     return Scores(
         ap50=mean(by_class[:, 0]),
         ap=mean(by_class.mean(axis=1)),
@@ -104,6 +100,17 @@ def score(matched: Matched, weights: np.ndarray | None = None, confidence: float
         by_class=dict(zip(matched.names, by_class[:, 0].tolist(), strict=True)),
         by_size=small,
     )
+
+
+def ap50(matched: Matched, weights: np.ndarray, size: str = ALL) -> float:
+    """Average precision at an overlap of one half alone, mean over classes; NaN where there is no object.
+
+    Args:
+        matched: of a row.
+        weights: (I,) how often each image counts.
+        size: of the objects, a key of `SIZES_PX`.
+    """
+    return mean([average_precisions(one, weights, 1)[0] for one in matched.by_size[size]])
 
 
 def mean(values: Sequence[float] | np.ndarray) -> float:

@@ -162,19 +162,22 @@ class Study:
 
     def views(self, sensors: Sensors) -> list[View]:
         """Every scene in front of the sensors; nothing is acquired before it is asked for."""
-        return [View(subject, sensors, Draw(self.seed, number)) for number, subject in enumerate(self.subjects)]
+        return [self.view(sensors, number) for number in range(len(self.subjects))]
+
+    def view(self, sensors: Sensors, number: int) -> View:
+        """One scene by its number in front of the sensors."""
+        return View(self.subjects[number], sensors, Draw(self.seed, number))
 
     def look(self, sensors: Sensors, methods: Mapping[str, Method | None]) -> dict[str, list[Boxes]]:
         """What the detector finds on every scene, by row; None stands for the reference."""
-        keys = {name: self._key(name, sensors) for name in methods}
+        keys = {name: self.key(name, network_digest(name, sensors.degraded), sensors) for name in methods}
         found: dict[str, list[Boxes]] = {name: [] for name in methods}
         views = self.views(sensors)[::-1]
         with steps(f"detecting, {sensors.degraded.name}", len(views) * len(methods)) as bar:
             while views:
                 view = views.pop()  # and its acquisitions with it: those of thousands would fill the memory
                 for name, method in methods.items():
-                    scene = {"scene": view.subject.digest, "number": view.draw.patch}
-                    found[name].append(self._found(view, method, {**keys[name], **scene}))
+                    found[name].append(self.found(view, method, keys[name]))
                     bar.advance(1, name)
         return found
 
@@ -183,25 +186,42 @@ class Study:
         pairs = zip(self.subjects, found, strict=True)
         return match([Image(subject.truth, boxes, subject.site) for subject, boxes in pairs], self.detector.names)
 
-    def _found(self, view: View, method: Method | None, key: Key) -> Boxes:
+    def found(self, view: View, method: Method | None, key: Key) -> Boxes:
+        """Boxes in scene pixels on one scene, kept under the `key` of its row; the reference for None.
+
+        Raises:
+            BeersError: a picture that cannot be used.
+        """
+
         def detect() -> Found:
             boxes = self.detector.detect(view.shown(method))
             return Found(boxes.at(boxes.corners * view.sensors.oversampling))
 
-        return self.cache.make("found", key, Found, detect).boxes
+        scene = {"scene": view.subject.digest, "number": view.draw.patch}
+        return self.cache.make("found", {**key, **scene}, Found, detect).boxes
 
-    def _key(self, name: str, sensors: Sensors) -> dict[str, object]:
-        """Everything besides the scene that what is found under a row depends on."""
+    def key(self, name: str, network: str, sensors: Sensors) -> dict[str, object]:
+        """Everything besides the scene that what is found under a row depends on.
+
+        Args:
+            name: of the row.
+            network: digest of what the pictures of a network depend on; empty of others.
+            sensors: that acquire the scenes.
+        """
         numbers = [numbers_of(profile) for profile in (sensors.degraded, sensors.reference)]
         return {
             "row": name,
-            "network": network_digest(name, sensors.degraded),
+            "network": network,
             "sensors": numbers,
-            "detector": sha256(self.file),
+            "detector": self._file_digest,
             "size_px": self.detector.size_px,
             "seed": self.seed,
             "code": code_digest(__name__),
         }
+
+    @cached_property
+    def _file_digest(self) -> str:
+        return sha256(self.file)
 
 
 def rows_of(sensors: Sensors, names: Sequence[str], say: Say) -> dict[str, Method | None]:

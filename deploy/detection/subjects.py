@@ -1,6 +1,6 @@
 """The labelled scenes of a detection study: pictures of a folder, or drawn ones."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -9,9 +9,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from deploy.detection.annotations import LabelledSet
+from deploy.detection.annotations import LabelledSet, read_labelled
 from deploy.detection.boxes import Boxes
-from deploy.detection.classes import ClassMap
+from deploy.detection.classes import ClassMap, class_map
 from model.detection.scenes import labelled_scene
 from model.io.files import sha256
 from model.progress import steps
@@ -65,6 +65,36 @@ def drawn_subject(number: int, seed: int, known: ClassMap) -> Subject:
     truth = Boxes.of(scene.corners, scene.classes).renamed(known.truth)
     radiance, name = torch.from_numpy(scene.radiance), f"drawn {number}"
     return Subject(name, name, truth, f"drawn {seed} {number}", None, lambda _: radiance)
+
+
+def read_subjects(
+    detector: Sequence[str],
+    given: Mapping[str, str],
+    images: Path,
+    labels: Path | None = None,
+    split: str | None = None,
+) -> tuple[list[Subject], list[str]]:
+    """The labelled pictures of a folder as scenes, and sentences on what is left out.
+
+    Args:
+        detector: names of the classes that it knows.
+        given: of them by labelled ones, where letters do not match.
+        images: as `read_labelled` takes it.
+        labels: where they lie, if not beside the pictures.
+        split: which part of a tree.
+
+    Raises:
+        BeersError: pictures or labels that cannot be used, or not one class in common.
+    """
+    labelled = read_labelled(images, labels, split)
+    known = class_map(labelled.names, detector, given)
+    return labelled_subjects(labelled, known), [*labelled.notes, *left_out(known)]
+
+
+def left_out(known: ClassMap) -> list[str]:
+    """A sentence on the labelled classes that the detector does not know, where there are such."""
+    names = ", ".join(known.unknown)
+    return [f"Not known to the detector and left out: {names}. What it finds there counts as false."] if names else []
 
 
 def labelled_subjects(labelled: LabelledSet, known: ClassMap) -> list[Subject]:

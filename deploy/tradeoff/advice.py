@@ -14,7 +14,7 @@ from deploy.tradeoff.board import PAIR_QUANTILE, DpuRun, pair_error
 from deploy.tradeoff.host_time import ROUNDS
 from deploy.tradeoff.host_time import TILE_PX as HOST_TILE_PX
 from deploy.tradeoff.methods import PATCH_PX, PATCHES
-from deploy.tradeoff.outcome import COSTS, QUALITIES, UNITS, Outcome, Place, Plane, Results, dominated, front
+from deploy.tradeoff.outcome import COSTS, DIRECTIONS, Outcome, Place, Plane, Results, dominated, front
 from deploy.tradeoff.points import EXACT, Demand, Point, Variant, on_dpu, shortfall
 from deploy.tradeoff.study import Front
 from model.evaluation.scores import NOTE
@@ -147,7 +147,7 @@ def fronts(results: Results) -> tuple[Front, ...]:
 
 
 def _fronts(results: Results) -> Iterator[Front]:
-    for y in QUALITIES:
+    for y in DIRECTIONS:
         for x in COSTS:
             found = places(results, x, y)
             if found:
@@ -187,12 +187,16 @@ def _price(results: Results, cheap: str, dear: str, x: str, y: str, *, last: boo
     return f"{bought}, from {cheap} to {dear}, costs {times}."
 
 
+GAINED = {"dB": "dB", "%": "points"}
+"""Unit of a difference, by that of the figures; none of others."""
+
+
 def gain_words(results: Results, better: str, worse: str, key: str) -> str:
     """By how much one point is better, with its interval where there is one: "0.32 dB [0.2, 0.5] of PSNR"."""
     values = [results.outcomes[name].figures[key] for name in (better, worse)]
-    gain = QUALITIES[key] * ((values[0].value or 0.0) - (values[1].value or 0.0))
+    gain = DIRECTIONS[key] * ((values[0].value or 0.0) - (values[1].value or 0.0))
     low, high = results.gain(better, worse, key)
-    unit = values[0].unit if values[0].unit == "dB" else ""
+    unit = GAINED.get(values[0].unit, "")
     interval = f"[{number(low, 2)}, {number(high, 2)}]" if math.isfinite(high - low) else ""
     return " ".join(f"{number(gain, 2)} {unit} {interval} of {key}".split())
 
@@ -361,19 +365,21 @@ RUNS = {
 """Precision; latency, throughput, power and efficiency as printed."""
 
 
-def paper_outcomes(swath: Swath) -> list[Outcome]:
-    """Both runs, where the swath is the paper's; else none."""
+def paper_outcomes(swath: Swath, units: Mapping[str, str]) -> list[Outcome]:
+    """Both runs, where the swath is the paper's; else none. `units`: of every figure of a point."""
     if (swath.width_px, swath.height_px) != SIZE_PX:
         return []
-    return [_outcome(name, precision, values) for name, (precision, values) in RUNS.items()]
+    return [_outcome(name, precision, values, units) for name, (precision, values) in RUNS.items()]
 
 
-def _outcome(name: str, precision: str, values: tuple[float, float, float, float]) -> Outcome:
+def _outcome(
+    name: str, precision: str, values: tuple[float, float, float, float], units: Mapping[str, str]
+) -> Outcome:
     latency_s, rate, power_w, efficiency = values
     printed = {"latency": latency_s, "throughput": rate, "power": power_w, "efficiency": efficiency}
-    found = {f"board {key}": published(value, UNITS[f"board {key}"], PAPER) for key, value in printed.items()}
+    found = {f"board {key}": published(value, units[f"board {key}"], PAPER) for key, value in printed.items()}
     found["board energy"] = published(latency_s * power_w, "J", f"{PAPER}: latency x power")
-    figures: dict[str, Figure] = {key: found.get(key) or unavailable(unit, NOTE) for key, unit in UNITS.items()}
+    figures: dict[str, Figure] = {key: found.get(key) or unavailable(unit, NOTE) for key, unit in units.items()}
     text = dict.fromkeys(("halo", "tile", "configuration", "runtime"), "not stated")
     text |= {"method": name, "kind": "paper", "precision": precision, "sensor": "not stated"}
     return Outcome(Point(Variant(name, "paper", precision)), figures, text)

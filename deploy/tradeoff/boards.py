@@ -16,7 +16,7 @@ from deploy.dpu.cost.latency import predict
 from deploy.dpu.graph import Network
 from deploy.dpu.reading import network_of
 from deploy.tradeoff.board import FIGURES, DpuRun
-from deploy.tradeoff.outcome import QUALITIES, UNITS, Outcome
+from deploy.tradeoff.outcome import DIRECTIONS, UNITS, Outcome
 from deploy.tradeoff.points import EXACT, Variant
 from profiles import TargetProfile, load_target
 from profiles.errors import ModelError, OptionError
@@ -82,7 +82,7 @@ def _compares(outcome: Outcome) -> bool:
 
 def _rows(outcome: Outcome, dpus: Sequence[Dpu], model: onnx.ModelProto) -> Iterator[Row]:
     network = network_of(model, outcome.point.tile_px)
-    quality = {key: outcome.figures[key] for key in QUALITIES}
+    quality = {key: outcome.figures[key] for key in DIRECTIONS if key in outcome.figures}
     for dpu in dpus:
         point, where = outcome.point, f"{dpu.target.name} {dpu.name}"
         figures, fitted = _figures(outcome, network, dpu)

@@ -11,6 +11,7 @@ import psutil
 
 from deploy.cache import Cache, Key, code_digest, pixels_digest
 from deploy.tradeoff.accuracy import BenchmarkSet, Scores, cut_in_four, measure, measure_images, measure_mae
+from deploy.tradeoff.detection import BESIDE, Detected, Detection
 from deploy.tradeoff.host_time import ROUNDS, Times, time_variants
 from deploy.tradeoff.methods import MethodStore, int8_ticks, operations_per_px, search_operations
 from deploy.tradeoff.points import EXACT, Point, Variant
@@ -98,6 +99,7 @@ class Measurements:
     benchmark: BenchmarkSet
     tile: np.ndarray
     cache: Cache
+    detection: Detection | None = None
 
     def jobs(self, points: Sequence[Point], variants: Sequence[Variant]) -> list[Job]:
         """What the cache lacks of these points, whose variants can all be had, in the order in which to do it."""
@@ -107,6 +109,7 @@ class Measurements:
         jobs += [self._scoring(variant) for variant in variants if self.scores(variant) is None]
         jobs += [self._cutting(*seam) for seam in seams if self.cut_scores(*seam) is None]
         jobs += [self._comparing(variant) for variant in compared if self.mae(variant) is None]
+        jobs += self._detections(variants)
         untimed = [variant for variant in variants if self.times(variant) is None]
         return [*jobs, self._timing(untimed)] if untimed else jobs
 
@@ -125,6 +128,10 @@ class Measurements:
     def times(self, variant: Variant) -> Times | None:
         """Kept times of a variant on this machine, None where there are none."""
         return self.cache.find("host", self._host_key(variant), Times)
+
+    def detected(self, variant: Variant) -> Detected | None:
+        """Kept score of a detector on what a variant restored; None where there is none, or none was asked for."""
+        return self.detection.find(str(variant), self.store.digest(variant)) if self.detection else None
 
     def float_of(self, variant: Variant) -> Variant | None:
         """The float network that an INT8 one was made from."""
@@ -172,6 +179,23 @@ class Measurements:
             self.cache.keep("mae", self._mae_key(variant), measure_mae(both[0], both[1], self.benchmark, tick))
 
         return self._job(f"{variant} against float32", variant, run, 3)
+
+    def _detections(self, variants: Sequence[Variant]) -> list[Job]:
+        """One job for all that a detector is yet to look at: each scene is acquired once."""
+        detection = self.detection
+        if detection is None:
+            return []
+        by_name = {str(variant): variant for variant in variants}
+        known = {**BESIDE, **{name: self.store.digest(variant) for name, variant in by_name.items()}}
+        contents = {name: content for name, content in known.items() if detection.find(name, content) is None}
+
+        def run(tick: Tick) -> None:
+            restores = {name: self.store.open(by_name[name]).restore for name in contents if name in by_name}
+            detection.measure(contents, restores, tick)
+
+        work = 1 + sum(self._seconds(by_name[name], detection.pixels) for name in contents if name in by_name)
+        job = Job(f"objects found by {len(contents)} methods", work, detection.ticks(len(contents)), run)
+        return [job] if contents else []
 
     def _timing(self, variants: Sequence[Variant]) -> Job:
         def run(tick: Tick) -> None:

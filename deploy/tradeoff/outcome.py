@@ -17,10 +17,11 @@ from deploy.dpu.board import dpu_of
 from deploy.tradeoff.accuracy import FLAT, MAE, Scores, seam_density, with_seams
 from deploy.tradeoff.board import FIGURES as BOARD
 from deploy.tradeoff.board import BoardRun, DpuRun, cpu_run, energy_ratio, latency_ratio, predict_model
+from deploy.tradeoff.detection import OTHER_HALO, Detected
 from deploy.tradeoff.host_time import Times, host_figures, ratio_interval
 from deploy.tradeoff.measurements import Measurements
 from deploy.tradeoff.methods import runtime_of
-from deploy.tradeoff.points import EXACT, NAMES, Point, on_dpu
+from deploy.tradeoff.points import EXACT, MAP50, NAMES, NAMES_LABELLED, Point, on_dpu
 from model.evaluation.methods import Method
 from model.evaluation.scores import mean_row
 from model.metrics.bootstrap import site_interval
@@ -88,7 +89,9 @@ def dominated(places: Sequence[Place], judge: Judge) -> Mapping[str, str]:
 
 COSTS = ("board latency", "board energy", "host p50")
 QUALITIES = {"PSNR": 1, "SSIM": 1, "LPIPS-squeeze": -1}
-"""Figures of quality, and whether more (1) or less (-1) of it is better."""
+"""Figures of quality that every study has, and whether more (1) or less (-1) of it is better."""
+DIRECTIONS = {**QUALITIES, MAP50: 1}
+"""The same of all: a study has mAP50 where labelled images are given."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,6 +105,7 @@ class Outcome:
         scores: image by image; None where there are none.
         board: its run on the board; None where it has none.
         host: its times here; None where there are none.
+        detected: what a detector finds on what it restored; None where it was not asked.
         work_factor: pixels computed for each of the swath's.
     """
 
@@ -111,6 +115,7 @@ class Outcome:
     scores: Scores | None = None
     board: BoardRun | None = None
     host: Times | None = None
+    detected: Detected | None = None
     work_factor: float = 1.0
 
     @property
@@ -130,13 +135,13 @@ class Outcome:
 
     def value(self, key: str) -> float | None:
         """A figure's value, where it can be compared: a published one was found elsewhere."""
-        figure = self.figures[key]
-        return figure.value if figure.mode != "published" else None
+        figure = self.figures.get(key)
+        return figure.value if figure is not None and figure.mode != "published" else None
 
     def place(self, x: str, y: str) -> Place | None:
         """Where it lies in a plane; None where it lacks one of the two."""
         cost, quality = self.value(x), self.value(y)
-        return None if cost is None or quality is None else Place(self.name, cost, QUALITIES[y] * quality)
+        return None if cost is None or quality is None else Place(self.name, cost, DIRECTIONS[y] * quality)
 
 
 @dataclass(frozen=True)
@@ -152,6 +157,8 @@ class Results:
 
         Endless either way where the sites are too few to tell anything apart.
         """
+        if key == MAP50:
+            return _detected_gain(self.outcomes[a], self.outcomes[b])
         first, second = (self._values(name, key) for name in (a, b))
         return _difference(first, second, tuple(self.sites), QUALITIES[key], self.seed)
 
@@ -202,6 +209,12 @@ def _together(a: Outcome, b: Outcome) -> bool:
     return a.host is not None and b.host is not None and a.host.session == b.host.session
 
 
+def _detected_gain(a: Outcome, b: Outcome) -> Interval:
+    if a.point.variant == b.point.variant:  # the same pictures, on however many sites
+        return 0.0, 0.0
+    return a.detected.gain(b.detected) if a.detected and b.detected else (-math.inf, math.inf)
+
+
 @cache
 def _difference(
     first: tuple[float, ...], second: tuple[float, ...], sites: tuple[str, ...], sign: int, seed: int
@@ -217,6 +230,8 @@ def _difference(
 
 UNITS = dict(NAMES.values())
 """Every figure of a point, in the order in which they are shown, with its unit."""
+UNITS_LABELLED = dict(NAMES_LABELLED.values())
+"""The same where labelled images are given."""
 
 DPU_ONLY = "the DPU takes INT8 alone, with scales that are powers of two"
 NOT_PAIRED = "no float network of it at hand"
@@ -232,20 +247,32 @@ class Assembly:
     lacks: Mapping[str, str]
     target: TargetProfile
 
+    @property
+    def units(self) -> Mapping[str, str]:
+        """Every figure of this study's points, with its unit."""
+        return UNITS_LABELLED if self.measurements.detection else UNITS
+
     def outcome(self, point: Point) -> Outcome:
         """All that is known of a point."""
         reason = self.lacks.get(str(point.variant), "")
         if reason:
-            return Outcome(point, {key: unavailable(unit, reason) for key, unit in UNITS.items()}, self._text(point))
+            lacking = {key: unavailable(unit, reason) for key, unit in self.units.items()}
+            return Outcome(point, lacking, self._text(point))
         swath = self._swath(point)
         times, work_factor = self.measurements.times(point.variant), swath.work_factor(swath.tiles)
         work_factor = work_factor if point.variant.kind == "network" else 1.0
         scores, run = self._scores(point, swath), self._board(point, swath, times)
         figures = self._quality(point, scores) | self._host(times, work_factor, point)
         figures |= run.figures() if not isinstance(run, str) else {f"board {k}": unavailable("", run) for k in BOARD}
-        ordered = {key: replace(figures[key], unit=unit) for key, unit in UNITS.items()}
+        detected = self._detected(point)
+        figures[MAP50] = detected.figure if detected else unavailable("%", OTHER_HALO)
+        ordered = {key: replace(figures[key], unit=unit) for key, unit in self.units.items()}
         board = None if isinstance(run, str) else run
-        return Outcome(point, ordered, self._text(point), scores, board, times, work_factor)
+        return Outcome(point, ordered, self._text(point), scores, board, times, detected, work_factor)
+
+    def _detected(self, point: Point) -> Detected | None:
+        """What is found on its pictures: those of its variant, where no seam can be seen."""
+        return self.measurements.detected(point.variant) if point.halo == EXACT else None
 
     def _swath(self, point: Point) -> Swath:
         halo_px = (

@@ -23,7 +23,7 @@ from matplotlib.patheffects import withStroke
 from deploy.report.plots import LIGHT, PX_PER_INCH, TITLE_PX, look, new_figure, set_ticks, svg_of, text_width
 from deploy.tradeoff.labels import Box, Label, Wish, place
 from deploy.tradeoff.marks import FILLINGS, RADIUS_PX, STATES, Mark, State, marks_of
-from deploy.tradeoff.outcome import QUALITIES
+from deploy.tradeoff.outcome import DIRECTIONS
 from deploy.tradeoff.study import Front
 from model.io.files import whole_file
 from profiles.figures import Row
@@ -252,7 +252,7 @@ def _make_axes(figure: Figure, front: Front, rows: Sequence[Row], frame: Box, ca
     axes = figure.add_axes((left / width, 1 - bottom / height, (right - left) / width, (bottom - top) / height))
     y_limits = _limits(rows, front, front.y, logarithmic=False)
     axes.set(xscale="log", xlim=_limits(rows, front, front.x, logarithmic=True))
-    axes.set(ylim=y_limits if QUALITIES[front.y] > 0 else y_limits[::-1])  # good is up, whichever way it runs
+    axes.set(ylim=y_limits if DIRECTIONS[front.y] > 0 else y_limits[::-1])  # good is up, whichever way it runs
     axes.set(xlabel=_axis_title(front.x, rows), ylabel=_axis_title(front.y, rows))
     axes.yaxis.set_label_coords(-(left - 22) / (right - left), 0.5)
     set_ticks(axes.xaxis, int((right - left) / TICK_PX[0]))
@@ -356,7 +356,7 @@ def wishes_of(front: Front, shown: Sequence[tuple[Row, tuple[float, float]]], ca
         shown: its points, each with its place in pixels.
         canvas: what it is plotted on.
     """
-    by_quality = sorted(shown, key=lambda each: -QUALITIES[front.y] * _value(each[0], front.y))
+    by_quality = sorted(shown, key=lambda each: -DIRECTIONS[front.y] * _value(each[0], front.y))
     named = {method_of(row) for row, _ in shown if row.name in front.members}
     best = {method_of(row): (row, at) for row, at in reversed(by_quality) if method_of(row) not in named}
     steps = [each for each in by_quality if each[0].name in front.steps]

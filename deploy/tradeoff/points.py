@@ -126,6 +126,10 @@ NAMES = {
 }
 """What a user writes: the figure that it stands for, and its unit."""
 
+MAP50 = "mAP50"
+NAMES_LABELLED = {"psnr": NAMES["psnr"], "map50": (MAP50, "%"), **NAMES}
+"""The same where labelled images are given."""
+
 DEMAND = re.compile(
     r"(?P<name>[a-z0-9-]+)\s*(?P<side><=|>=)\s*(?P<limit>[+-]?\d+(\.\d+)?([eE][+-]?\d+)?)\s*(?P<unit>\S*)"
 )
@@ -171,10 +175,10 @@ def _parse(option: str, text: str) -> Demand:
     if found is None:
         expected, remedy = "NAME<=NUMBER or NAME>=NUMBER", "write 'latency<=20s' or 'psnr>=44'"
         raise OptionError(option, expected=expected, got=repr(text), remedy=remedy)
-    if found["name"] not in NAMES:
-        expected = f"one of {', '.join(NAMES)}"
+    if found["name"] not in NAMES_LABELLED:
+        expected = f"one of {', '.join(NAMES_LABELLED)}"
         raise OptionError(option, expected=expected, got=repr(found["name"]), remedy="correct the name")
-    key, unit = NAMES[found["name"]]
+    key, unit = NAMES_LABELLED[found["name"]]
     if found["unit"] not in ("", unit.lower()):
         remedy = f"write {found['name']}{found['side']}{found['limit']}{unit}"
         raise OptionError(option, expected=f"{key} in {unit}", got=repr(found["unit"]), remedy=remedy)

@@ -5,6 +5,7 @@ networks, pairs -> points -> what the cache lacks is measured -> outcomes -> fro
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import onnx
@@ -23,6 +24,7 @@ from deploy.tradeoff.accuracy import BenchmarkSet
 from deploy.tradeoff.advice import Choice, choose, findings, fronts, headline, notes, paper_outcomes, papers_point
 from deploy.tradeoff.board import DpuRun
 from deploy.tradeoff.boards import board_rows, every_configuration
+from deploy.tradeoff.detection import Detection
 from deploy.tradeoff.host_time import TILE_PX
 from deploy.tradeoff.measurements import Measurements, run_jobs
 from deploy.tradeoff.methods import CalibrationScenes, MethodStore, find_networks, is_papers
@@ -98,10 +100,11 @@ LPIPS = "LPIPS-squeeze"
 
 @dataclass(frozen=True)
 class StudyRun:
-    """A study; `met` is false where no point keeps what was asked for."""
+    """A study; `met` is false where no point keeps what was asked for, `labelled` are files that a detector took."""
 
     study: Study
     met: bool
+    labelled: tuple[Path, ...] = ()
 
     @property
     def rows(self) -> tuple[Row, ...]:
@@ -127,9 +130,10 @@ def run_study(request: Request, cache: Cache, say: Say = silent) -> StudyRun:
     """
     swath, target = Swath(*request.size_px), load_target(request.target)
     dpus = every_configuration(request.boards or (request.target,))
+    detection = make_detection(request, cache)
     store = make_store(request, cache, say)
     benchmark, small = make_benchmark(request)
-    measurements = Measurements(store, benchmark, host_tile(store, request.seed), cache)
+    measurements = Measurements(store, benchmark, host_tile(store, request.seed), cache, detection)
     points = select_points(store, swath, target)
     lacks = lacking(store, points)
     there = [point for point in points if str(point.variant) not in lacks]
@@ -137,11 +141,12 @@ def run_study(request: Request, cache: Cache, say: Say = silent) -> StudyRun:
     assembly = Assembly(measurements, swath, lacks, target)
     outcomes = [
         *(assembly.outcome(point) for point in points),
-        *(paper_outcomes(swath) if target.name == PAPER_TARGET else []),
+        *(paper_outcomes(swath, assembly.units) if target.name == PAPER_TARGET else []),
     ]
     results = Results({each.name: each for each in outcomes}, benchmark.sites, request.seed)
     sampled = oversampling_note(benchmark.pairs, request.profiles[0])
     remarks = notes(benchmark, sampled, small, lacks, calibrated_on(request), target.name)
+    remarks += detection.notes() if detection else ()
     return _put_together(request, measurements, results, remarks, dpus)
 
 
@@ -167,7 +172,8 @@ def _put_together(
         remarks,
         board_rows(outcomes, dpus, lambda variant: legal_model(measurements, variant)),
     )
-    return StudyRun(study, not asked or choice.outcome is not None)
+    labelled = measurements.detection.files if measurements.detection else ()
+    return StudyRun(study, not asked or choice.outcome is not None, tuple(labelled))
 
 
 def make_store(request: Request, cache: Cache, say: Say) -> MethodStore:
@@ -177,6 +183,13 @@ def make_store(request: Request, cache: Cache, say: Say) -> MethodStore:
     return MethodStore(
         networks, *request.profiles, CalibrationScenes(request.calibration, request.sensor, request.seed), cache
     )
+
+
+def make_detection(request: Request, cache: Cache) -> Detection | None:
+    """Labelled images and a detector, where they are asked for."""
+    if request.detection is None:
+        return None
+    return Detection.open(request.detection, request.profiles, request.seed, cache)
 
 
 def make_benchmark(request: Request) -> tuple[BenchmarkSet, list[str]]:

@@ -11,6 +11,7 @@ import onnx
 from deploy.bench.tables import PAPER_TILE_PX, Swath, swath_latency
 from deploy.dpu.board import Dpu, dpu_of
 from deploy.tradeoff.board import CHAIN, kept_tiles_px, predict_model
+from deploy.tradeoff.detection import Request as DetectionRequest
 from deploy.tradeoff.methods import MethodStore, Network, conv_weights
 from deploy.tradeoff.points import (
     LEGAL,
@@ -104,6 +105,7 @@ class Request:
         seed: of every random draw.
         target: the board.
         boards: all that the networks are to be compared on; empty for the board alone.
+        detection: labelled images that a detector is to look at; None for none.
     """
 
     networks: tuple[str, ...]
@@ -118,6 +120,7 @@ class Request:
     seed: int = 0
     target: str = DEFAULT_TARGET
     boards: tuple[str, ...] = ()
+    detection: DetectionRequest | None = None
 
     @property
     def profiles(self) -> tuple[SensorProfile, SensorProfile]:

@@ -7,6 +7,11 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
+from deploy.detection.classes import class_map
+from deploy.detection.subjects import drawn_subject
+from model.detection.scenes import CLASSES
+from profiles import load_sensor
+
 Object = tuple[str, float, float, float, float]
 """A name, then left, top, right and bottom in continuous px."""
 
@@ -20,6 +25,8 @@ DIOR = [
     "Expressway-Service-area", "Expressway-toll-station", "golffield", "groundtrackfield", "harbor",
     "overpass", "ship", "stadium", "storagetank", "tenniscourt", "trainstation", "vehicle", "windmill",
 ]  # fmt: skip
+SPELT = ("Motor-Car", "SHIP", "aircraft", "Storage tank")
+"""Of the drawn classes, as a folder spells them."""
 
 
 def image(path: Path, size_px: tuple[int, int] = SIZE_PX) -> Path:
@@ -106,4 +113,22 @@ def dota(folder: Path) -> Path:
         image(folder / "images" / f"{stem}.png")
         lines = [f"{x1} {y1} {x2} {y1} {x2} {y2} {x1} {y2} {name} 0" for name, x1, y1, x2, y2 in objects]
         text(folder / "labelTxt" / f"{stem}.txt", "imagesource:GoogleEarth\ngsd:0.15\n" + "\n".join(lines) + "\n")
+    return folder
+
+
+def labelled(folder: Path, count: int) -> Path:
+    """Drawn scenes as pictures in sRGB with VOC labels beside them."""
+    full_scale = load_sensor("pleiades-reference").nominal()
+    folder.mkdir()
+    for number in range(count):
+        one = drawn_subject(number, 0, class_map(CLASSES, CLASSES))
+        light = np.clip(one.radiance(full_scale).numpy() / (4095 / full_scale.gain_dn_per_radiance), 0, 1)
+        code = np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
+        Image.fromarray(np.repeat(np.rint(255 * code)[..., None], 3, 2).astype(np.uint8)).save(
+            folder / f"s{number}x.png"
+        )
+        boxes: list[Object] = [
+            (SPELT[c], *corners.tolist()) for c, corners in zip(one.truth.classes, one.truth.corners, strict=True)
+        ]
+        text(folder / f"s{number}x.xml", xml(boxes, (768, 768)))
     return folder

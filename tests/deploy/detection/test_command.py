@@ -10,16 +10,9 @@ from PIL import Image
 from typer.testing import CliRunner, Result
 
 from deploy.cli import app
-from deploy.detection.classes import class_map
 from deploy.detection.rows import PAPER_TABLE, paper_rows
-from deploy.detection.subjects import drawn_subject
 from deploy.results import SCHEMA_PATH
-from model.detection.scenes import CLASSES
-from profiles import load_sensor
-from tests.deploy.detection.folders import Object, dior, text, xml
-
-NAMES = ("Motor-Car", "SHIP", "aircraft", "Storage tank")
-"""Of the drawn classes, as a folder spells them."""
+from tests.deploy.detection.folders import Object, dior, labelled, text, xml
 
 
 def run(*arguments: object) -> Result:
@@ -34,24 +27,6 @@ def document(path: Path) -> dict[str, dict[str, dict[str, float]]]:
     for row in found["rows"]:
         tables.setdefault(row["table"], {})[row["name"]] = {k: f["value"] or 0.0 for k, f in row["figures"].items()}
     return tables
-
-
-def labelled(folder: Path, count: int) -> Path:
-    """Drawn scenes as pictures in sRGB with VOC labels beside them."""
-    full_scale = load_sensor("pleiades-reference").nominal()
-    folder.mkdir()
-    for number in range(count):
-        one = drawn_subject(number, 0, class_map(CLASSES, CLASSES))
-        light = np.clip(one.radiance(full_scale).numpy() / (4095 / full_scale.gain_dn_per_radiance), 0, 1)
-        code = np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
-        Image.fromarray(np.repeat(np.rint(255 * code)[..., None], 3, 2).astype(np.uint8)).save(
-            folder / f"s{number}x.png"
-        )
-        boxes: list[Object] = [
-            (NAMES[c], *corners.tolist()) for c, corners in zip(one.truth.classes, one.truth.corners, strict=True)
-        ]
-        text(folder / f"s{number}x.xml", xml(boxes, (768, 768)))
-    return folder
 
 
 SMALL = ("--sensor", "dior-medium", "--methods", "degraded")
