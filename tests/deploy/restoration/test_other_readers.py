@@ -12,7 +12,6 @@ import pytest
 from deploy.restoration.options import Options
 from deploy.restoration.run import restore_file
 from tests.deploy.restoration import images
-from tests.deploy.restoration.test_gdal_source import FORMATS
 
 PYTHON = Path("/usr/bin/python3")
 """Of the system: packages of QGIS belong to no virtual environment."""
@@ -70,7 +69,7 @@ def qgis() -> Path:
 
 @pytest.mark.parametrize("name", ["a.tif", "a.jp2", "a.vrt", "DIM.XML"])
 def test_gdalinfo_finds_it_where_the_input_was(name: str, gdalinfo: str, model: Path, tmp_path: Path) -> None:
-    image = FORMATS[name](tmp_path / name, images.digital_numbers())
+    image = images.FORMATS[name](tmp_path / name, images.digital_numbers())
     restore_file(image, tmp_path / "out.tif", Options(model, cog=True), lambda _: None)
     before, after = (answer(gdalinfo, "-json", path) for path in (image, tmp_path / "out.tif"))
     assert after["geoTransform"] == pytest.approx(before["geoTransform"], rel=0, abs=1e-9)

@@ -11,7 +11,6 @@ from deploy.restoration.options import Options
 from deploy.restoration.output import part_folder
 from deploy.restoration.run import restore_file
 from tests.deploy.restoration import images
-from tests.deploy.restoration.test_gdal_source import FORMATS
 from tests.deploy.restoration.test_resume import ENTRY
 
 TILE_PX = 16
@@ -27,7 +26,7 @@ def begin(image: Path, out: Path, model: Path) -> subprocess.Popen[str]:
 def test_killed_among_its_rows_and_at_its_cog_it_is_resumed_to_the_same_bytes(
     name: str, model: Path, tmp_path: Path
 ) -> None:
-    image = FORMATS[name](tmp_path / name, images.digital_numbers())
+    image = images.FORMATS[name](tmp_path / name, images.digital_numbers())
     expected, out = tmp_path / "expected.tif", tmp_path / "out.tif"
     restore_file(image, expected, Options(model, TILE_PX, threads=1, cog=True), lambda _: None)
     before = {path.name for path in tmp_path.iterdir()}
