@@ -5,6 +5,7 @@ import struct
 import xml.etree.ElementTree as ET
 import zlib
 from collections.abc import Callable, Sequence
+from copy import deepcopy
 
 import numpy as np
 import onnx
@@ -103,22 +104,14 @@ def of_xml(content: bytes, rng: Rng) -> bytes:
     if kind < 0.1:
         parent.remove(child)
     elif kind < 0.2:
-        parent.append(other)
+        parent.append(deepcopy(other))  # an element within itself is no tree
     elif kind < 0.3:
         child.tag = other.tag
     elif child.attrib and kind < 0.65:
         child.set(sorted(child.attrib)[int(rng.integers(len(child.attrib)))], text)
     else:
         child.text = text
-    return _as_xml(root, content)
-
-
-def _as_xml(root: ET.Element, content: bytes) -> bytes:
-    """A tree in which an element came into itself is none: then the document stays as it was."""
-    try:
-        return bytes(ET.tostring(root))
-    except RecursionError:
-        return content
+    return bytes(ET.tostring(root))
 
 
 def of_safetensors(content: bytes, rng: Rng) -> bytes:
