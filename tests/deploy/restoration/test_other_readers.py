@@ -3,25 +3,35 @@
 import json
 import shutil
 import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+from deploy.networks import shipped_pair
 from deploy.restoration.options import Options
 from deploy.restoration.run import restore_file
+from deploy.restoration.stac import write_item
+from profiles.sensor_file import BLIND
 from tests.deploy.restoration import images
 
+ROOT = Path(__file__).parents[3]
 PYTHON = Path("/usr/bin/python3")
 """Of the system: packages of QGIS belong to no virtual environment."""
 PIXELS = np.tile(images.digital_numbers(), (1, 5, 6))
-READ_IN_QGIS = """
-import json, os, sys
+IN_QGIS = """
+import json, os, runpy, sys
 os.environ["QT_QPA_PLATFORM"] = "offscreen"
-from qgis.core import QgsApplication, QgsRasterLayer
+from qgis.core import *
 application = QgsApplication([], False)
 application.initQgis()
+{}
+sys.stdout.flush()
+os._exit(0)  # no clean end: objects that outlive the application crash there
+"""
+READ = """
 layer = QgsRasterLayer(sys.argv[1], "restored", "gdal")
 data, box = layer.dataProvider(), layer.extent()
 bands = range(1, layer.bandCount() + 1)
@@ -39,14 +49,29 @@ said = {
     "values": values,
 }
 print(json.dumps(said))
-del blocks, data, layer
-application.exitQgis()
+"""
+
+RUN = """
+algorithm = runpy.run_path(sys.argv[1])["RestoreImage"]().create()
+layer, context = QgsRasterLayer(sys.argv[3], "raw", "gdal"), QgsProcessingContext()
+runs = []
+for out in sys.argv[4:]:
+    feedback = QgsProcessingFeedback()
+    _, done = algorithm.run({"PROGRAM": sys.argv[2], "IMAGE": layer, "OUT": out}, context, feedback)
+    runs.append([done, feedback.textLog()])
+print(json.dumps({"runs": runs}))
+"""
+FOOTPRINT = """
+layer = QgsVectorLayer(sys.argv[1], "footprint", "ogr")
+box = layer.extent()
+said = {"box": [box.xMinimum(), box.yMinimum(), box.xMaximum(), box.yMaximum()], "crs": layer.crs().authid()}
+print(json.dumps(said | {"features": layer.featureCount()}))
 """
 
 
 def answer(*command: str | Path) -> dict[str, Any]:
     """What a program prints as JSON."""
-    done = subprocess.run(list(map(str, command)), capture_output=True, text=True, check=True, timeout=120)
+    done = subprocess.run(list(map(str, command)), capture_output=True, text=True, check=True, timeout=300)
     said: dict[str, Any] = json.loads(done.stdout)
     return said
 
@@ -108,7 +133,7 @@ def restore_with_a_hole(folder: Path, model: Path) -> np.ndarray:
 
 def test_qgis_shows_what_was_written(qgis: Path, model: Path, tmp_path: Path) -> None:
     restored = restore_with_a_hole(tmp_path, model)
-    said = answer(qgis, "-c", READ_IN_QGIS, tmp_path / "out.tif")
+    said = answer(qgis, "-c", IN_QGIS.replace("{}", READ), tmp_path / "out.tif")
     place, (_, height, width) = images.profile()["transform"], restored.shape
     assert said["valid"]
     assert said["crs"] == "EPSG:32631"
@@ -121,3 +146,32 @@ def test_qgis_shows_what_was_written(qgis: Path, model: Path, tmp_path: Path) ->
     known = restored[:, :90:7, :90:7] > 0
     np.testing.assert_allclose(np.asarray(said["values"])[known], physical[known], rtol=1e-6)
     assert said["scales"] == [0.1, 0.2]
+
+
+def test_qgis_s_toolbox_restores(qgis: Path, tmp_path: Path) -> None:
+    """With what is example code for its users; what the program refuses is QGIS's error."""
+    image = images.write_tiff(tmp_path / "raw.tif", images.digital_numbers(bands=1))
+    program = tmp_path / "beers-deploy"
+    program.write_text(
+        f'#!/bin/sh\nPYTHONPATH={ROOT} exec {sys.executable} -c "from deploy.cli import app; app()" "$@"\n'
+    )
+    program.chmod(0o755)
+    script, outs = ROOT / "examples" / "qgis_restore.py", [tmp_path / "restored.tif", tmp_path / "restored.xyz"]
+    (done, _), (refused, why) = answer(qgis, "-c", IN_QGIS.replace("{}", RUN), script, program, image, *outs)["runs"]
+    assert done
+    assert not refused
+    assert "expected a TIFF's name" in why
+    restore_file(image, tmp_path / "expected.tif", Options(shipped_pair(sensor=BLIND)[1]), lambda _: None)
+    with images.rasterio.open(outs[0]) as ours, images.rasterio.open(tmp_path / "expected.tif") as theirs:
+        np.testing.assert_array_equal(ours.read(), theirs.read())
+        assert ours.tags(ns="IMAGE_STRUCTURE")["LAYOUT"] == "COG"
+
+
+def test_qgis_draws_the_footprint_of_a_stac_item(qgis: Path, model: Path, tmp_path: Path) -> None:
+    pytest.importorskip("pystac")
+    image = images.write_tiff(tmp_path / "in.tif", images.digital_numbers())
+    restore_file(image, tmp_path / "out.tif", Options(model, cog=True), lambda _: None)
+    write_item(tmp_path / "out.tif", tmp_path / "out.json")
+    said = answer(qgis, "-c", IN_QGIS.replace("{}", FOOTPRINT), tmp_path / "out.json")
+    assert (said["features"], said["crs"]) == (1, "EPSG:4326")
+    assert said["box"] == pytest.approx(json.loads((tmp_path / "out.json").read_text())["bbox"], rel=0, abs=1e-9)
