@@ -194,3 +194,17 @@ def test_a_changed_tile_makes_another_image(tmp_path: Path) -> None:
     before = fingerprint(image)
     images.write_jp2(tmp_path / "R64C80.jp2", np.zeros((2, images.HEIGHT - 64, images.WIDTH - 80), np.uint16))
     assert fingerprint(image) != before
+
+
+def test_bytes_that_are_no_text_print_no_traceback(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """GDAL repeats a damaged type of an HFA's dictionary, and rasterio's log cannot decode it."""
+    path, unraisable = images.FORMATS["a.img"](tmp_path / "a.img", images.digital_numbers()), list[object]()
+    path.write_bytes(path.read_bytes().replace(b"1:Loffset", b"1:\xf5offset"))
+    monkeypatch.setattr(sys, "unraisablehook", unraisable.append)
+    with open_source(path):
+        pass
+    assert unraisable == []
+    assert capfd.readouterr().err == ""
+    assert sys.unraisablehook == unraisable.append
