@@ -15,6 +15,7 @@ import onnx
 
 from deploy.restoration.gdal_source import ENVIRONMENT, LEAST_CACHE_BYTES, OFFLINE
 from deploy.restoration.options import Compression
+from deploy.restoration.output import padded_px
 from deploy.restoration.radiometry import FullScale
 from profiles.errors import MachineError
 from quant.onnx_file import metadata
@@ -51,6 +52,19 @@ def what_was_done(networks: Sequence[onnx.ModelProto], digests: str, scale: Full
         "RESTORED_SENSOR": ", ".join(each.get("sensor", "not stated") for each in said),
         "RESTORED_FULL_SCALE": f"{scale.value:g} ({scale.source})",
     }
+
+
+def disk_bytes(shape: tuple[int, int, int], itemsize: int) -> int:
+    """Disk that writing a COG of an image (bands, height, width) takes, as if nothing could be packed.
+
+    The driver halves the image until it is one block, and writes these overviews into a file of their own first.
+    """
+    bands, height, width = shape
+    full, overviews = padded_px(shape, BLOCK_PX), 0
+    while max(height, width) > BLOCK_PX:
+        height, width = -(-height // 2), -(-width // 2)
+        overviews += padded_px((bands, height, width), BLOCK_PX)
+    return (full + 2 * overviews) * itemsize
 
 
 def write_cog(plain: Path, cog: Path, compression: Compression, about: Mapping[str, str]) -> None:

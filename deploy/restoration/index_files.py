@@ -129,7 +129,7 @@ def _parsed(path: Path) -> ET.Element:
         # GDAL looks for this word in the first bytes, and gives what lacks it to the next of its drivers.
         if path.suffix.lower() == ".vrt" and not (root.tag == VRT and b"<VRTDataset" in content[:HEAD_BYTES]):
             raise ValueError(f"a document that does not begin as a {VRT}")
-    except (ET.ParseError, ValueError, OSError, RecursionError) as error:
+    except (ET.ParseError, ValueError, LookupError, OSError, RecursionError) as error:  # lookup: of an encoding
         got = getattr(error, "strerror", None) or str(error)
         raise _refused(path, "a VRT or a DIMAP, plain XML", got, "write it again") from error
     return root
@@ -169,7 +169,11 @@ def _is_elsewhere(text: str) -> bool:
 
 def _located(index: Path, text: str, folder: Path, home: Path | None) -> Path:
     """A path that an index names; in `home` or below, unless that is None."""
-    file = (folder / text).resolve()
+    try:
+        file = (folder / text).resolve()
+        file.is_file()  # whether the system takes such a name
+    except (OSError, RuntimeError, ValueError) as error:
+        raise _refused(index, "names of tiles", f"no path, {text}", "make the index anew") from error
     elsewhere = _is_elsewhere(text)
     if elsewhere or (home is not None and not file.is_relative_to(home)):
         remedy = "put its tiles beside it, or trust it with --trust-index"

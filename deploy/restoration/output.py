@@ -42,7 +42,13 @@ class Checkpoint:
     """
 
     def __init__(
-        self, out: Path, shape: tuple[int, int, int], dtype: np.dtype[Any], job: Mapping[str, object], resume: bool
+        self,
+        out: Path,
+        shape: tuple[int, int, int],
+        dtype: np.dtype[Any],
+        job: Mapping[str, object],
+        resume: bool,
+        cog_bytes: int = 0,
     ) -> None:
         """Begin, or go on with what an earlier run left.
 
@@ -52,9 +58,10 @@ class Checkpoint:
             dtype: of the pixels.
             job: all that decides the pixels; a run is resumed only by one of the same job.
             resume: go on; where nothing was left, begin.
+            cog_bytes: of disk that the output takes beside the rows and the plain TIFF.
 
         Raises:
-            MachineError: no room for the rows.
+            MachineError: no room for the rows and what is made of them.
             OptionError: what was left belongs to another job.
         """
         self.out, self.shape, self.dtype = out, shape, dtype
@@ -64,8 +71,9 @@ class Checkpoint:
         with self.disk():
             if not self.rows:
                 self.remove()
+            self._remove_outputs()  # half-written ones: their room is free again
             out.parent.mkdir(parents=True, exist_ok=True)
-            self._require_room()
+            self._require_room(cog_bytes)
             self.folder.mkdir(exist_ok=True)
             (self.folder / "rows.raw").touch()
 
@@ -94,10 +102,9 @@ class Checkpoint:
 
     def remove(self) -> None:
         """Throw the rows away; the journal first, so that nothing is left that counts on them."""
-        for name in ("journal.json", "journal.new", "rows.raw", "out.tif"):
+        for name in ("journal.json", "journal.new", "rows.raw"):
             (self.folder / name).unlink(missing_ok=True)
-        for path in self.folder.glob(f"{COG}*"):  # GDAL writes overviews beside it first
-            path.unlink()
+        self._remove_outputs()
 
     @contextmanager
     def disk(self) -> Iterator[None]:
@@ -143,13 +150,21 @@ class Checkpoint:
     def _offset(self, band: int, row: int) -> int:
         return (band * self.shape[1] + row) * self.shape[2] * self.dtype.itemsize
 
-    def _require_room(self) -> None:
+    def _remove_outputs(self) -> None:
+        (self.folder / PLAIN).unlink(missing_ok=True)
+        for path in self.folder.glob(f"{COG}*"):  # GDAL writes overviews beside it first
+            path.unlink()
+
+    def _require_room(self, cog_bytes: int) -> None:
         bands, height, width = self.shape
-        needed = bands * (height - self.rows) * width * self.dtype.itemsize
+        rows_bytes = bands * (height - self.rows) * width * self.dtype.itemsize
+        needed = rows_bytes + padded_px(self.shape, TILE_PX) * self.dtype.itemsize + cog_bytes
         free = shutil.disk_usage(self.out.parent).free
         if needed > free:
             (wanted, left), remedy = sizes(needed, free), "free some space or write elsewhere"
-            raise MachineError(str(self.out), expected=f"{wanted} of disk", got=f"{left} free", remedy=remedy)
+            raise MachineError(
+                str(self.out), expected=f"{wanted} of disk (nothing packed)", got=f"{left} free", remedy=remedy
+            )
 
 
 def sync_folder(folder: Path) -> None:
@@ -194,7 +209,7 @@ def require_codec(compression: Compression) -> None:
         raise MachineError("--compression", expected="an installed codec", got=got, remedy=remedy) from error
 
 
-COG = "cog.tif"
+PLAIN, COG = "out.tif", "cog.tif"
 ToCog = Callable[[Path, Path], None]
 """Writes a TIFF again, cloud-optimised."""
 
@@ -213,9 +228,8 @@ def write_output(
     Raises:
         MachineError: the disk is full or gone; the rows are still there.
     """
-    fresh = checkpoint.folder / "out.tif"
-    bands, height, width = checkpoint.shape
-    padded_px = bands * _padded(height) * _padded(width)
+    fresh, bands = checkpoint.folder / PLAIN, checkpoint.shape[0]
+    plain_bytes = padded_px(checkpoint.shape, TILE_PX) * checkpoint.dtype.itemsize
     with checkpoint.disk():
         tifffile.imwrite(
             fresh,
@@ -225,7 +239,7 @@ def write_output(
             tile=(TILE_PX, TILE_PX),
             compression=compression.codec,
             compressionargs={"level": FAST_LEVEL} if compression is Compression.zlib else None,
-            bigtiff=padded_px * checkpoint.dtype.itemsize > PLAIN_LIMIT_BYTES,
+            bigtiff=plain_bytes > PLAIN_LIMIT_BYTES,
             photometric="minisblack",
             planarconfig="separate" if bands > 1 else None,
             software="beers-deploy",
@@ -254,8 +268,14 @@ def _tiles(checkpoint: Checkpoint) -> Iterator[np.ndarray]:
             yield from np.hsplit(strip, strip.shape[1] // TILE_PX)
 
 
-def _padded(size_px: int) -> int:
-    return -(-size_px // TILE_PX) * TILE_PX
+def _padded(size_px: int, tile_px: int = TILE_PX) -> int:
+    return -(-size_px // tile_px) * tile_px
+
+
+def padded_px(shape: tuple[int, int, int], tile_px: int) -> int:
+    """Pixels of an image (bands, height, width) in whole tiles."""
+    bands, height, width = shape
+    return bands * _padded(height, tile_px) * _padded(width, tile_px)
 
 
 NAME = "lock"

@@ -19,7 +19,7 @@ import numpy as np
 from deploy.cluster import check_choice
 from deploy.host_state import peak_memory
 from deploy.restoration.bands import in_order, require_alike
-from deploy.restoration.cog import require_cog, what_was_done, write_cog
+from deploy.restoration.cog import disk_bytes, require_cog, what_was_done, write_cog
 from deploy.restoration.engine import RestoredRow, Restorer, Say, Tick, restore_rows
 from deploy.restoration.georeference import enlarged_tags
 from deploy.restoration.index_files import index_files
@@ -108,7 +108,8 @@ def _restore(image: Path, out: Path, options: Options, say: Say) -> Row:
         # Another version of the runtime might give other bits: rows of one are not finished by another.
         digests = ", ".join(network_sha256(path) for path in paths)
         job = _job(image, digests, plan, runtime, scale.value)
-        checkpoint = Checkpoint(out, plan.out_shape, raster.out_dtype, job, options.resume)
+        cog_bytes = disk_bytes(plan.out_shape, raster.out_dtype.itemsize) if options.cog else 0
+        checkpoint = Checkpoint(out, plan.out_shape, raster.out_dtype, job, options.resume, cog_bytes)
         done_rows = checkpoint.rows // plan.scale
         if options.is_spread:
             work, peaks_gb = make_work(image, plan, network, runtime, options, scale), list[float]()

@@ -33,7 +33,8 @@ from profiles.toml import HERE, read_json, read_toml_text
 from quant.checks import Check
 from quant.gate import read_limits
 from quant.onnx_file import load_onnx
-from tests.fuzz.parsers import JOB, SHAPE, checkpoint_seeds, go_on, weights_seeds
+from tests.fuzz.networks import checkpoint_seeds, go_on, weights_seeds
+from tests.fuzz.parsers import JOB, SHAPE
 
 runner = CliRunner()
 

@@ -2,8 +2,10 @@
 
 import json
 import struct
+import xml.etree.ElementTree as ET
 import zlib
 from collections.abc import Callable, Sequence
+from copy import deepcopy
 
 import numpy as np
 import onnx
@@ -37,6 +39,7 @@ TEXTS = (
     "", "a", "\0", "\n", "../../x", "/etc/passwd", "1e999", "NaN", "\ud800", "é", "a" * 5000, "9" * 5000, "%s%n",
     "com.microsoft", "If", "Loop", "Conv", "image",
 )  # fmt: skip
+PATHS = ("/vsicurl/http://a/b.tif", "http://a/b.tif", "/vsimem/a", "a.vrt", ".", "R0C0.jp2", "IMG_R2C1.TIF")
 TOKENS = (
     b"\0", b"\n", b'"', b"[", b"]", b"{", b"}", b"=", b".", b",", b"-", b"inf", b"nan", b"1e999", b"0x" + b"f" * 600,
     b"9" * 5000, b"[" * 400, b"{\"a\":" * 400, b"a." * 90, b"\xff\xff\xff\xff", b"\\ud800", b"true", b"null", b"'''",
@@ -84,6 +87,31 @@ def of_json(content: bytes, rng: Rng) -> bytes:
         return json.dumps(_tree(json.loads(content), rng)).encode("utf-8", "surrogatepass")
     except (ValueError, RecursionError):
         return content
+
+
+def of_xml(content: bytes, rng: Rng) -> bytes:
+    """Change an element's text, name, place or one of its attributes; as it was where it is no XML any more."""
+    try:
+        root = ET.fromstring(content)  # noqa: S314 - our own seeds, damaged
+    except (ET.ParseError, ValueError, LookupError):
+        return content
+    pairs = [(parent, child) for parent in root.iter() for child in parent]
+    if not pairs:
+        return content
+    (parent, child), (_, other) = (pairs[int(rng.integers(len(pairs)))] for _ in range(2))
+    texts = (*map(str, NUMBERS), *TEXTS, *PATHS, other.text or "")
+    text, kind = texts[int(rng.integers(len(texts)))], rng.random()
+    if kind < 0.1:
+        parent.remove(child)
+    elif kind < 0.2:
+        parent.append(deepcopy(other))  # an element within itself is no tree
+    elif kind < 0.3:
+        child.tag = other.tag
+    elif child.attrib and kind < 0.65:
+        child.set(sorted(child.attrib)[int(rng.integers(len(child.attrib)))], text)
+    else:
+        child.text = text
+    return bytes(ET.tostring(root))
 
 
 def of_safetensors(content: bytes, rng: Rng) -> bytes:

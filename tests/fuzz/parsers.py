@@ -10,10 +10,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import numpy as np
-import onnx
 import tifffile
-import torch
-from PIL import Image
 
 from deploy.cache import Cache, Keepable
 from deploy.compare import change_rows, compare, read_document
@@ -26,44 +23,40 @@ from deploy.dpu.graph import Network
 from deploy.dpu.reading import read_network
 from deploy.gate import PATCHES, baseline_mae
 from deploy.restoration.output import Checkpoint, part_folder
-from deploy.restoration.source import open_source
 from deploy.results import Document, by_row, cell
 from deploy.tradeoff.accuracy import Scores
 from deploy.tradeoff.host_time import Times
-from model.conditioning import ConditionedConvBEERS
-from model.convbeers import ConvBEERS
 from model.dataset import _read_summary
 from model.evaluation.pairs import read_pairs_recipe
 from model.io.images import read_pixels
-from model.io.weights import load_conditioned, load_network, save_network
+from model.io.weights import load_conditioned, load_network
 from model.metrics.backbones import read_tensors
-from model.training.checkpoint import TrainingRecipe, read_checkpoint, write_checkpoint
-from model.training.guards import Guards
 from model.training.run import Log
-from model.variants import Variant
 from profiles import load_sensor, load_target
-from profiles.errors import BeersError
 from profiles.figures import Figure, Row, measured, predicted, unavailable
 from profiles.response_file import read_response
 from profiles.scene_call import load_scene_call
 from quant.checks import Check
-from quant.encodings import encoding_faults
 from quant.gate import read_limits
-from quant.graph import correction_graph
-from quant.onnx_file import fixed_tile_px, load_onnx
-from quant.session import open_any_size, open_session, run
-from quant.structure import count_relus, rounded_tensors, saturated_shares
-from quant.tiling.walk import receptive_radius_px
 from tests.deploy.detection.folders import coco, dota, voc, yolo
-from tests.deploy.dpu.graphs import board_convbeers, float_convbeers, integer_convbeers
+from tests.deploy.dpu.graphs import integer_convbeers
 from tests.fuzz.detection import detect, detector_seeds, label_seeds, names_seeds, read_beside, read_names
-from tests.fuzz.mutation import Mutate, of_json, of_onnx, of_png, of_safetensors, of_tiff
-from tests.quant.reading.networks import CASES, made
+from tests.fuzz.mutation import Mutate, of_json, of_onnx, of_png, of_safetensors, of_tiff, of_xml
+from tests.fuzz.networks import (
+    SIDE_PX,
+    checkpoint_seeds,
+    exported_seeds,
+    go_on,
+    look_at_onnx,
+    onnx_seeds,
+    run_onnx,
+    told_seeds,
+    understand_onnx,
+    weights_seeds,
+)
+from tests.fuzz.pictures import gdal_seeds, image_of, read_rows, read_with_tiles, tiff_seeds, written
 
 ROOT = Path(__file__).parents[2]
-SIDE_PX = 16
-RECIPE = TrainingRecipe(steps=10)
-SMALL = Variant(1, 2)
 JOB: dict[str, object] = {"image": [1, "a", 2], "model": "b", "tile_px": 64, "halo_px": 4, "full_scale": 4095.0}
 SHAPE = (1, 8, 8)
 
@@ -109,7 +102,7 @@ def point_seeds(folder: Path, suffix: str) -> list[bytes]:
     x = np.arange(-6, 7) / 2
     samples = np.exp(-(x[:, None] ** 2) / 4 - x**2 / 3).astype(np.float32)
     write = np.save if suffix == ".npy" else tifffile.imwrite
-    return [_written(lambda path: write(path, samples), folder / f"a{suffix}")]
+    return [written(lambda path: write(path, samples), folder / f"a{suffix}")]
 
 
 def read_point(path: Path) -> object:
@@ -143,105 +136,6 @@ def read_recipe(path: Path) -> None:
     assert recipe is not None
     for profile in (recipe.degraded, recipe.reference):
         profile.nominal()
-
-
-def _written(make: Callable[[Path], object], path: Path) -> bytes:
-    make(path)
-    return path.read_bytes()
-
-
-def onnx_seeds(folder: Path) -> list[bytes]:
-    """The three encodings of a small network, one of them fixed to a tile."""
-    encodings = (float_convbeers, integer_convbeers, board_convbeers)
-    made = [_written(partial(encoding, blocks=1, features=2), folder / "a.onnx") for encoding in encodings]
-    fixed = onnx.load_model(float_convbeers(folder / "a.onnx", 1, 2))
-    for value in (*fixed.graph.input, *fixed.graph.output):
-        for dim, size in zip(value.type.tensor_type.shape.dim, (1, 1, SIDE_PX, SIDE_PX), strict=True):
-            dim.dim_value = size
-    return [*made, fixed.SerializeToString()]
-
-
-def exported_seeds(_: Path) -> list[bytes]:
-    """What exporters leave: constants computed, normalisation, padding, other opsets, 16-bit floats."""
-    sizes, scaled = CASES["sizes of constants"][0], CASES["normalised and scaled again"][0]
-    idle = CASES["what does nothing"][0]
-    networks = [made(sizes), made(scaled, 9), made(sizes, 20), made(idle, kind=onnx.TensorProto.FLOAT16)]
-    return [network.SerializeToString() for network in networks]
-
-
-def look_at_onnx(path: Path) -> None:
-    """What `check` does."""
-    place(read_network(path, SIDE_PX), load_dpu("vck190"))
-
-
-def understand_onnx(path: Path) -> None:
-    """What `quantize`, `restore` and `gate` ask of a network before they run it."""
-    model = load_onnx(path)
-    for question in (
-        fixed_tile_px,
-        receptive_radius_px,
-        correction_graph,
-        count_relus,
-        encoding_faults,
-        rounded_tensors,
-    ):
-        _asked(question, model)
-
-
-def _asked(question: Callable[[onnx.ModelProto], object], model: onnx.ModelProto) -> None:
-    try:
-        question(model)
-    except BeersError as error:
-        if not str(error).isprintable():
-            raise ValueError("no sentence") from error
-
-
-def run_onnx(path: Path) -> None:
-    """What `gate` does: the runtime gets the file, fixed to a tile or not."""
-    model = load_onnx(path)
-    image = np.full((1, 1, SIDE_PX, SIDE_PX), 0.25, np.float32)
-    run(open_session(model, 1), image)
-    run(open_any_size(model), image[:, :, :9])
-    saturated_shares(model, [image])
-
-
-def tiff_seeds(folder: Path) -> list[bytes]:
-    """Strips and tiles, packed or not, bands in planes or mixed, pages, tags of geography, every byte order."""
-    rng = np.random.default_rng(0)
-    grey = rng.integers(0, 4096, (17, 19)).astype(np.uint16)
-    colour = rng.integers(0, 256, (17, 19, 3)).astype(np.uint8)
-    nodata = [(42113, "s", 0, "7", True), (33550, "d", 3, (1.0, 1.0, 0.0), True)]
-    path = folder / "a.tif"
-    kinds: list[tuple[np.ndarray, dict[str, object]]] = [
-        (grey, {"rowsperstrip": 5}),
-        (grey, {"tile": (16, 16), "compression": "zlib", "predictor": True}),
-        (grey.astype(np.float32), {"extratags": nodata, "metadata": None}),
-        (colour, {"photometric": "rgb", "compression": "zlib"}),
-        (np.moveaxis(colour, 2, 0), {"photometric": "rgb", "planarconfig": "separate"}),
-        (np.stack([grey, grey]), {"photometric": "minisblack"}),
-        (grey, {"bigtiff": True}),
-        (grey, {"byteorder": ">"}),
-        (grey, {"imagej": True}),
-        (grey, {"ome": True}),
-    ]
-    made = [_written(partial(tifffile.imwrite, data=pixels, **given), path) for pixels, given in kinds]  # type: ignore[arg-type]
-    return [*made, *(_image(kind) for kind in ({"format": "TIFF", "compression": c} for c in ("jpeg", "tiff_lzw")))]
-
-
-def _image(given: dict[str, str]) -> bytes:
-    stream, pixels = io.BytesIO(), np.random.default_rng(1).integers(0, 256, (17, 19)).astype(np.uint8)
-    Image.fromarray(pixels).save(stream, **given)
-    return stream.getvalue()
-
-
-def read_rows(path: Path) -> None:
-    """What `restore` reads: bands of rows, a large image only in part."""
-    with open_source(path) as source:
-        raster = source.raster
-        if raster.bands * raster.width_px * min(raster.height_px, 64) < 1 << 24:
-            source.held_bytes(64)
-            for top in range(0, min(raster.height_px, 64), 7):
-                raster.missing(source.read(top, min(top + 9, raster.height_px)))
 
 
 GATED = dict.fromkeys(PATCHES, 1)
@@ -305,50 +199,11 @@ def log_lines(path: Path) -> None:
         Log(Path(shutil.copy(path, Path(name) / "log.csv")), 20)
 
 
-def checkpoint_seeds(folder: Path) -> list[bytes]:
-    """A checkpoint after a step, and one before any."""
-    return [_written(partial(_checkpoint, steps=steps), folder / "c.safetensors") for steps in (0, 1)]
-
-
-def _checkpoint(path: Path, steps: int) -> None:
-    network, optimiser = _fresh()
-    for _ in range(steps):
-        network(torch.ones(1, 1, 5, 5)).sum().backward()
-        optimiser.step()
-    average = {k: v.detach().clone() for k, v in network.state_dict().items()}
-    write_checkpoint(path, network, average, optimiser, RECIPE, steps, Guards(), "float32")
-
-
-def _fresh() -> tuple[ConvBEERS, torch.optim.Optimizer]:
-    network = ConvBEERS(SMALL)
-    return network, torch.optim.Adam(network.parameters(), lr=1e-9)
-
-
-def go_on(path: Path) -> None:
-    """Read a checkpoint, and take a step."""
-    network, optimiser = _fresh()
-    average = {k: v.detach().clone() for k, v in network.state_dict().items()}
-    read_checkpoint(path, network, average, optimiser, RECIPE)
-    network(torch.ones(1, 1, 3, 3)).sum().backward()
-    optimiser.step()
-
-
 def backbone_seeds(_: Path, packed: bool) -> list[bytes]:
     """An archive of arrays."""
     stream = io.BytesIO()
     (np.savez_compressed if packed else np.savez)(stream, a=np.ones((2, 3), np.float32), b=np.zeros(4, np.float16))
     return [stream.getvalue()]
-
-
-def weights_seeds(folder: Path) -> list[bytes]:
-    """A network's weights."""
-    return [_written(partial(save_network, network=_fresh()[0], recipe={"degraded": "x"}), folder / "w.safetensors")]
-
-
-def told_seeds(folder: Path) -> list[bytes]:
-    """The weights of a network that is told its sensor."""
-    network = ConditionedConvBEERS(SMALL)
-    return [_written(partial(save_network, network=network, recipe={"degraded": "x"}), folder / "w.safetensors")]
 
 
 def runs_seeds(_: Path) -> list[bytes]:
@@ -379,6 +234,13 @@ def _network() -> Network:
 
 LIMITS = [b"mae = 0.0007\np999 = 0.01\n", b"psnr_drop_db = 0.05\nmae_growth = 1.1\nmin_psnr_float_int8_db = 60\n"]
 
+GDAL = (
+    ("VRT", "a.vrt", of_xml),
+    ("DIMAP", "DIM.XML", of_xml),
+    ("JPEG 2000", "a.jp2", None),
+    ("NITF", "a.ntf", None),
+    ("HFA", "a.img", None),
+)
 PARSERS: tuple[Parser, ...] = (
     Parser("ONNX, looked at", ".onnx", onnx_seeds, look_at_onnx, of_onnx),
     Parser("ONNX, folded", ".onnx", exported_seeds, look_at_onnx, of_onnx),
@@ -386,8 +248,18 @@ PARSERS: tuple[Parser, ...] = (
     Parser("ONNX, run", ".onnx", onnx_seeds, run_onnx, of_onnx, 0.3),
     Parser("TIFF, whole", ".tif", tiff_seeds, read_pixels, of_tiff, 2.0),
     Parser("TIFF, by rows", ".tif", tiff_seeds, read_rows, of_tiff, 2.0),
-    Parser("PNG", ".png", lambda _: [_image({"format": "PNG"})], read_pixels, of_png),
-    Parser("JPEG", ".jpg", lambda _: [_image({"format": "JPEG"})], read_pixels),
+    Parser("PNG", ".png", lambda _: [image_of({"format": "PNG"})], read_pixels, of_png),
+    Parser("JPEG", ".jpg", lambda _: [image_of({"format": "JPEG"})], read_pixels),
+    *(
+        Parser(
+            kind,
+            Path(name).suffix.lower(),
+            partial(gdal_seeds, name=name),
+            partial(read_with_tiles, name=name),
+            meaning,
+        )
+        for kind, name, meaning in GDAL
+    ),
     Parser("sensor TOML", ".toml", lambda _: _files("sensors"), lambda p: load_sensor(str(p)).nominal()),
     Parser("sensor TOML, MTF table", ".toml", described_seeds, lambda p: load_sensor(str(p)).nominal()),
     Parser("point spread, TIFF", ".tif", partial(point_seeds, suffix=".tif"), read_point, of_tiff),

@@ -1,6 +1,7 @@
 """One georeferenced image in the formats of ground segments, written by GDAL."""
 
 import warnings
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -144,3 +145,16 @@ def write_dimap(path: Path, pixels: np.ndarray, bits: int = 12, more: str = "") 
         f"<RFM_Validity>{validity}</RFM_Validity></Global_RFM></Rational_Function_Model></Dimap_Document>"
     )
     return path
+
+
+Writer = Callable[[Path, np.ndarray], Path]
+FORMATS: dict[str, Writer] = {
+    "a.tif": write_tiff,
+    "cog.tif": write_cog,
+    "a.jp2": lambda path, pixels: write_jp2(path, pixels, NBITS=12),
+    "a.vrt": write_vrt,
+    "a.ntf": lambda path, pixels: write(path, pixels, "NITF", ICORDS="N"),
+    "a.img": lambda path, pixels: write(path, pixels, "HFA"),
+    "DIM.XML": write_dimap,
+}
+"""An image of digital numbers (bands, height, width) in each format, with its tiles beside it."""

@@ -4,6 +4,7 @@ import sys
 from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from deploy.networks import shipped_pair
+from deploy.restoration.cog import disk_bytes
 from deploy.restoration.options import Compression, Options
 from deploy.restoration.run import restore_file
 from model.io.files import sha256
@@ -123,3 +125,29 @@ def test_without_rasterio_it_is_one_sentence(model: Path, tmp_path: Path, monkey
     with pytest.raises(MachineError, match=r"--cog.*pip install 'beers-deploy\[gdal\]'"):
         restore_file(image, tmp_path / "out.tif", Options(model, cog=True), lambda _: None)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["in.tif"]
+
+
+@pytest.mark.parametrize("shape", [(1, 150, 118), (2, 520, 90), (2, 90, 1700), (3, 1100, 1300)])
+def test_the_disk_is_asked_for_all_that_stands_on_it_at_a_time(
+    shape: tuple[int, int, int], model: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One byte less is refused before any work; what was asked for is taken, and tags and indexes beside it."""
+    image, out = images.write_tiff(tmp_path / "in.tif", np.full(shape, 700, np.uint16)), tmp_path / "out.tif"
+    options, free = Options(model, tile_px=256, cog=True, compression=Compression.none), 0
+    tiles = shape[0] * -(-shape[1] // 256) * -(-shape[2] // 256) * 256**2
+    needed = 2 * shape[0] * shape[1] * shape[2] + 2 * tiles + disk_bytes(shape, 2)
+    monkeypatch.setattr("shutil.disk_usage", lambda _: SimpleNamespace(free=free))
+    free = needed - 1
+    with pytest.raises(MachineError, match="of disk"):
+        restore_file(image, out, options, lambda _: None)
+    assert [path.name for path in tmp_path.iterdir()] == ["in.tif"]
+    free, taken, replace_file = needed, list[int](), Path.replace
+
+    def counted(self: Path, target: Path) -> Path:
+        if target == out:
+            taken.append(sum(path.stat().st_size for path in self.parent.iterdir()))
+        return replace_file(self, target)
+
+    monkeypatch.setattr(Path, "replace", counted)
+    restore_file(image, out, options, lambda _: None)
+    assert 0.4 * needed < taken[0] < needed + 64_000

@@ -1,7 +1,6 @@
 """What GDAL reads: the same pixels and the same place on Earth as of a TIFF, whatever the format."""
 
 import sys
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -21,24 +20,14 @@ from tests.deploy.restoration import images
 
 rasterio: Any = images.rasterio
 
-Writer = Callable[[Path, np.ndarray], Path]
-FORMATS: dict[str, Writer] = {
-    "a.tif": images.write_tiff,
-    "cog.tif": images.write_cog,
-    "a.jp2": lambda path, pixels: images.write_jp2(path, pixels, NBITS=12),
-    "a.vrt": images.write_vrt,
-    "a.ntf": lambda path, pixels: images.write(path, pixels, "NITF", ICORDS="N"),
-    "a.img": lambda path, pixels: images.write(path, pixels, "HFA"),
-    "DIM.XML": images.write_dimap,
-}
 PLACED = ["a.tif", "cog.tif", "a.jp2", "a.vrt", "a.img", "DIM.XML"]
 """A NITF holds an image's corners, to a tenth of a pixel."""
 
 
-@pytest.mark.parametrize("name", FORMATS)
+@pytest.mark.parametrize("name", images.FORMATS)
 def test_rows_are_those_of_the_image(name: str, tmp_path: Path) -> None:
     pixels = images.digital_numbers()
-    with open_source(FORMATS[name](tmp_path / name, pixels)) as source:
+    with open_source(images.FORMATS[name](tmp_path / name, pixels)) as source:
         assert source.raster.shape == pixels.shape
         assert isinstance(source, TiffSource if name.endswith("tif") else GdalSource)
         for start, stop in ((0, 7), (5, 70), (60, images.HEIGHT), (0, images.HEIGHT)):
@@ -50,7 +39,7 @@ def test_the_restored_pixels_are_the_same_from_every_format(precision: str, mode
     pixels = images.digital_numbers()
     options = Options(model if precision == "float32" else shipped_pair()[1], tile_px=64)
     results = []
-    for name, write in FORMATS.items():
+    for name, write in images.FORMATS.items():
         folder = tmp_path / name
         folder.mkdir()
         restore_file(write(folder / name, pixels), folder / "out.tif", options, lambda _: None)
@@ -61,7 +50,7 @@ def test_the_restored_pixels_are_the_same_from_every_format(precision: str, mode
 
 @pytest.mark.parametrize("name", PLACED)
 def test_the_place_on_earth_is_kept(name: str, model: Path, tmp_path: Path) -> None:
-    image = FORMATS[name](tmp_path / name, images.digital_numbers())
+    image = images.FORMATS[name](tmp_path / name, images.digital_numbers())
     restore_file(image, tmp_path / "out.tif", Options(model), lambda _: None)
     with rasterio.open(image) as before, rasterio.open(tmp_path / "out.tif") as after:
         np.testing.assert_allclose(after.transform, images.profile()["transform"], rtol=0, atol=1e-9)
@@ -111,7 +100,7 @@ def test_missing_pixels_stay_missing(model: Path, tmp_path: Path) -> None:
     pixels = np.maximum(images.digital_numbers(), 1)
     pixels[:, 20:70, 30:90] = 0
     results = []
-    for name, write in (("a.tif", images.write_tiff), ("a.img", FORMATS["a.img"])):
+    for name, write in (("a.tif", images.write_tiff), ("a.img", images.FORMATS["a.img"])):
         image = write(tmp_path / name, pixels)
         with rasterio.open(image, "r+") as file:
             file.nodata = 0
@@ -205,3 +194,17 @@ def test_a_changed_tile_makes_another_image(tmp_path: Path) -> None:
     before = fingerprint(image)
     images.write_jp2(tmp_path / "R64C80.jp2", np.zeros((2, images.HEIGHT - 64, images.WIDTH - 80), np.uint16))
     assert fingerprint(image) != before
+
+
+def test_bytes_that_are_no_text_print_no_traceback(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """GDAL repeats a damaged type of an HFA's dictionary, and rasterio's log cannot decode it."""
+    path, unraisable = images.FORMATS["a.img"](tmp_path / "a.img", images.digital_numbers()), list[object]()
+    path.write_bytes(path.read_bytes().replace(b"1:Loffset", b"1:\xf5offset"))
+    monkeypatch.setattr(sys, "unraisablehook", unraisable.append)
+    with open_source(path):
+        pass
+    assert unraisable == []
+    assert capfd.readouterr().err == ""
+    assert sys.unraisablehook == unraisable.append

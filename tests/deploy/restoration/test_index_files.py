@@ -52,6 +52,7 @@ BOMB = '<!DOCTYPE a [<!ENTITY a "aa"><!ENTITY b "&a;&a;">]>'
 REFUSED = {
     "missing": (vrt(naming("no.tif")), "the tile no.tif, got no such file"),
     "no name": (vrt(naming("")), "no such file"),
+    "a name too long": (vrt(naming("9" * 5000)), "expected names of tiles, got no path, 999"),
     "above": (vrt(naming("../outside.tif")), "in its own folder"),
     "absolute": (vrt(naming("/etc/passwd")), "/etc/passwd"),
     "from where it runs": (vrt(naming("outside.tif", relative=0)), "in its own folder"),
@@ -72,6 +73,7 @@ REFUSED = {
     "pansharpening": (vrt("", ' subClass="VRTPansharpenedDataset"'), "subClass in it"),
     "bomb": (BOMB + vrt("<Description>&b;</Description>"), "a document type"),
     "no XML": ("<VRTDataset", "plain XML"),
+    "unknown letters": ('<?xml version="1.0" encoding="UTFZ8"?>' + vrt(""), "unknown encoding: UTFZ8"),
     "another root": ("<!--<VRTDataset>--><vrtdataset/>", "does not begin"),
     "a late root": (f"<!--{' ' * 2000}-->" + vrt(ONE), "does not begin"),
 }

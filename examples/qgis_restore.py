@@ -1,0 +1,70 @@
+"""`beers-deploy restore` in QGIS's processing toolbox: Scripts, Add Script to Toolbox, then this file.
+
+QGIS has a Python of its own, and this tool another one: the program is started, nothing of it is imported. Names of
+methods are QGIS's (https://docs.qgis.org/latest/en/docs/user_manual/processing/scripts.html).
+"""
+
+import os
+import subprocess
+from typing import Any
+
+from qgis.core import (
+    QgsProcessingAlgorithm,
+    QgsProcessingContext,
+    QgsProcessingException,
+    QgsProcessingFeedback,
+    QgsProcessingParameterRasterDestination,
+    QgsProcessingParameterRasterLayer,
+    QgsProcessingParameterString,
+)
+
+PROGRAM, IMAGE, SENSOR, OUT = "PROGRAM", "IMAGE", "SENSOR", "OUT"
+
+
+class RestoreImage(QgsProcessingAlgorithm):
+    """The command `beers-deploy restore IMAGE OUT --cog`."""
+
+    def name(self) -> str:
+        """In models and in `qgis_process`."""
+        return "restoreimage"
+
+    def displayName(self) -> str:  # noqa: N802
+        """In the toolbox."""
+        return "Restore a raw satellite image"
+
+    def createInstance(self) -> "RestoreImage":  # noqa: N802
+        """Another one: QGIS runs each in a thread."""
+        return RestoreImage()
+
+    def initAlgorithm(self, configuration: Any = None) -> None:  # noqa: N802, ARG002
+        """The fields of its form."""
+        self.addParameter(QgsProcessingParameterRasterLayer(IMAGE, "Raw image"))
+        self.addParameter(QgsProcessingParameterString(SENSOR, "Sensor (empty: not known)", optional=True))
+        self.addParameter(QgsProcessingParameterString(PROGRAM, "Path of beers-deploy", "beers-deploy"))
+        self.addParameter(QgsProcessingParameterRasterDestination(OUT, "Restored image, .tif"))
+
+    def processAlgorithm(  # noqa: N802
+        self, parameters: dict[str, Any], context: QgsProcessingContext, feedback: QgsProcessingFeedback
+    ) -> dict[str, Any]:
+        """Restore; the program's one sentence is the error of QGIS.
+
+        Raises:
+            QgsProcessingException: the program refused, or is not there.
+        """
+        image = self.parameterAsRasterLayer(parameters, IMAGE, context).source()
+        out = self.parameterAsOutputLayer(parameters, OUT, context)
+        program, sensor = (self.parameterAsString(parameters, key, context) for key in (PROGRAM, SENSOR))
+        command = [program, "restore", image, out, "--cog", *(["--sensor", sensor] if sensor else [])]
+        feedback.pushCommandInfo(" ".join(command))
+        # QGIS tells its own Python where its modules lie; another Python must not look there.
+        environment = {key: value for key, value in os.environ.items() if not key.startswith("PYTHON")}
+        try:
+            done = subprocess.run(  # noqa: S603 - the user's own program
+                command, capture_output=True, encoding="utf-8", errors="replace", check=False, env=environment
+            )
+        except OSError as error:
+            raise QgsProcessingException(f"{program}: {error.strerror}; give its whole path") from error
+        if done.returncode:
+            raise QgsProcessingException(done.stderr)
+        feedback.pushInfo(done.stdout)
+        return {OUT: out}

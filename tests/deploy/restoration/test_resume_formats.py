@@ -1,0 +1,49 @@
+"""A run killed on an image that GDAL reads, or while its COG is written, is resumed to the same bytes."""
+
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from deploy.restoration.options import Options
+from deploy.restoration.output import part_folder
+from deploy.restoration.run import restore_file
+from tests.deploy.restoration import images
+from tests.deploy.restoration.test_resume import ENTRY
+
+TILE_PX = 16
+
+
+def begin(image: Path, out: Path, model: Path) -> subprocess.Popen[str]:
+    arguments = ["restore", image, out, "--model", model, "--tile", TILE_PX, "--threads", 1, "--cog", "--resume"]
+    command = [sys.executable, "-c", ENTRY, *map(str, arguments)]
+    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+
+
+@pytest.mark.parametrize("name", ["a.jp2", "a.vrt", "DIM.XML"])
+def test_killed_among_its_rows_and_at_its_cog_it_is_resumed_to_the_same_bytes(
+    name: str, model: Path, tmp_path: Path
+) -> None:
+    image = images.FORMATS[name](tmp_path / name, images.digital_numbers())
+    expected, out = tmp_path / "expected.tif", tmp_path / "out.tif"
+    restore_file(image, expected, Options(model, TILE_PX, threads=1, cog=True), lambda _: None)
+    before = {path.name for path in tmp_path.iterdir()}
+    out.write_bytes(b"old")
+    killed = []
+    for sign in ("journal.json", "out.tif"):  # some rows are finished; all are, and the TIFF is begun
+        running = begin(image, out, model)
+        while running.poll() is None and not (part_folder(out) / sign).exists():
+            time.sleep(0.001)
+        running.kill()
+        said, _ = running.communicate()
+        killed.append(running.returncode != 0)
+        assert running.returncode <= 0, said
+        assert out.read_bytes() in (b"old", expected.read_bytes())
+    assert killed[0]
+    last = begin(image, out, model)
+    said, _ = last.communicate(timeout=120)
+    assert last.returncode == 0, said
+    assert out.read_bytes() == expected.read_bytes()
+    assert {path.name for path in tmp_path.iterdir()} == before | {"out.tif"}

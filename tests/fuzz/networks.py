@@ -1,0 +1,127 @@
+"""Networks that others wrote, as ONNX and as weights, as the fuzzer damages them."""
+
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import onnx
+import torch
+
+from deploy.dpu.board import load_dpu
+from deploy.dpu.checker.placement import place
+from deploy.dpu.reading import read_network
+from model.conditioning import ConditionedConvBEERS
+from model.convbeers import ConvBEERS
+from model.io.weights import save_network
+from model.training.checkpoint import TrainingRecipe, read_checkpoint, write_checkpoint
+from model.training.guards import Guards
+from model.variants import Variant
+from profiles.errors import BeersError
+from quant.encodings import encoding_faults
+from quant.graph import correction_graph
+from quant.onnx_file import fixed_tile_px, load_onnx
+from quant.session import open_any_size, open_session, run
+from quant.structure import count_relus, rounded_tensors, saturated_shares
+from quant.tiling.walk import receptive_radius_px
+from tests.deploy.dpu.graphs import board_convbeers, float_convbeers, integer_convbeers
+from tests.fuzz.pictures import written
+from tests.quant.reading.networks import CASES, made
+
+SIDE_PX = 16
+RECIPE = TrainingRecipe(steps=10)
+SMALL = Variant(1, 2)
+
+
+def onnx_seeds(folder: Path) -> list[bytes]:
+    """The three encodings of a small network, one of them fixed to a tile."""
+    encodings = (float_convbeers, integer_convbeers, board_convbeers)
+    made = [written(partial(encoding, blocks=1, features=2), folder / "a.onnx") for encoding in encodings]
+    fixed = onnx.load_model(float_convbeers(folder / "a.onnx", 1, 2))
+    for value in (*fixed.graph.input, *fixed.graph.output):
+        for dim, size in zip(value.type.tensor_type.shape.dim, (1, 1, SIDE_PX, SIDE_PX), strict=True):
+            dim.dim_value = size
+    return [*made, fixed.SerializeToString()]
+
+
+def exported_seeds(_: Path) -> list[bytes]:
+    """What exporters leave: constants computed, normalisation, padding, other opsets, 16-bit floats."""
+    sizes, scaled = CASES["sizes of constants"][0], CASES["normalised and scaled again"][0]
+    idle = CASES["what does nothing"][0]
+    networks = [made(sizes), made(scaled, 9), made(sizes, 20), made(idle, kind=onnx.TensorProto.FLOAT16)]
+    return [network.SerializeToString() for network in networks]
+
+
+def look_at_onnx(path: Path) -> None:
+    """What `check` does."""
+    place(read_network(path, SIDE_PX), load_dpu("vck190"))
+
+
+def understand_onnx(path: Path) -> None:
+    """What `quantize`, `restore` and `gate` ask of a network before they run it."""
+    model = load_onnx(path)
+    for question in (
+        fixed_tile_px,
+        receptive_radius_px,
+        correction_graph,
+        count_relus,
+        encoding_faults,
+        rounded_tensors,
+    ):
+        _asked(question, model)
+
+
+def _asked(question: Callable[[onnx.ModelProto], object], model: onnx.ModelProto) -> None:
+    try:
+        question(model)
+    except BeersError as error:
+        if not str(error).isprintable():
+            raise ValueError("no sentence") from error
+
+
+def run_onnx(path: Path) -> None:
+    """What `gate` does: the runtime gets the file, fixed to a tile or not."""
+    model = load_onnx(path)
+    image = np.full((1, 1, SIDE_PX, SIDE_PX), 0.25, np.float32)
+    run(open_session(model, 1), image)
+    run(open_any_size(model), image[:, :, :9])
+    saturated_shares(model, [image])
+
+
+def checkpoint_seeds(folder: Path) -> list[bytes]:
+    """A checkpoint after a step, and one before any."""
+    return [written(partial(_checkpoint, steps=steps), folder / "c.safetensors") for steps in (0, 1)]
+
+
+def _checkpoint(path: Path, steps: int) -> None:
+    network, optimiser = _fresh()
+    for _ in range(steps):
+        network(torch.ones(1, 1, 5, 5)).sum().backward()
+        optimiser.step()
+    average = {k: v.detach().clone() for k, v in network.state_dict().items()}
+    write_checkpoint(path, network, average, optimiser, RECIPE, steps, Guards(), "float32")
+
+
+def _fresh() -> tuple[ConvBEERS, torch.optim.Optimizer]:
+    network = ConvBEERS(SMALL)
+    return network, torch.optim.Adam(network.parameters(), lr=1e-9)
+
+
+def go_on(path: Path) -> None:
+    """Read a checkpoint, and take a step."""
+    network, optimiser = _fresh()
+    average = {k: v.detach().clone() for k, v in network.state_dict().items()}
+    read_checkpoint(path, network, average, optimiser, RECIPE)
+    network(torch.ones(1, 1, 3, 3)).sum().backward()
+    optimiser.step()
+
+
+def weights_seeds(folder: Path) -> list[bytes]:
+    """A network's weights."""
+    return [written(partial(save_network, network=_fresh()[0], recipe={"degraded": "x"}), folder / "w.safetensors")]
+
+
+def told_seeds(folder: Path) -> list[bytes]:
+    """The weights of a network that is told its sensor."""
+    network = ConditionedConvBEERS(SMALL)
+    return [written(partial(save_network, network=network, recipe={"degraded": "x"}), folder / "w.safetensors")]

@@ -1,0 +1,83 @@
+"""Images that others wrote, and the indexes that make one of many, as the fuzzer damages them."""
+
+import io
+import shutil
+from collections.abc import Callable
+from functools import cache, partial
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+import tifffile
+from PIL import Image
+
+from deploy.restoration.source import open_source
+
+
+def written(make: Callable[[Path], object], path: Path) -> bytes:
+    """The bytes of a file that `make` writes."""
+    make(path)
+    return path.read_bytes()
+
+
+def tiff_seeds(folder: Path) -> list[bytes]:
+    """Strips and tiles, packed or not, bands in planes or mixed, pages, tags of geography, every byte order."""
+    rng = np.random.default_rng(0)
+    grey = rng.integers(0, 4096, (17, 19)).astype(np.uint16)
+    colour = rng.integers(0, 256, (17, 19, 3)).astype(np.uint8)
+    nodata = [(42113, "s", 0, "7", True), (33550, "d", 3, (1.0, 1.0, 0.0), True)]
+    path = folder / "a.tif"
+    kinds: list[tuple[np.ndarray, dict[str, object]]] = [
+        (grey, {"rowsperstrip": 5}),
+        (grey, {"tile": (16, 16), "compression": "zlib", "predictor": True}),
+        (grey.astype(np.float32), {"extratags": nodata, "metadata": None}),
+        (colour, {"photometric": "rgb", "compression": "zlib"}),
+        (np.moveaxis(colour, 2, 0), {"photometric": "rgb", "planarconfig": "separate"}),
+        (np.stack([grey, grey]), {"photometric": "minisblack"}),
+        (grey, {"bigtiff": True}),
+        (grey, {"byteorder": ">"}),
+        (grey, {"imagej": True}),
+        (grey, {"ome": True}),
+    ]
+    made = [written(partial(tifffile.imwrite, data=pixels, **given), path) for pixels, given in kinds]  # type: ignore[arg-type]
+    return [*made, *(image_of(kind) for kind in ({"format": "TIFF", "compression": c} for c in ("jpeg", "tiff_lzw")))]
+
+
+def image_of(given: dict[str, str]) -> bytes:
+    """A small grey image as Pillow writes it."""
+    stream, pixels = io.BytesIO(), np.random.default_rng(1).integers(0, 256, (17, 19)).astype(np.uint8)
+    Image.fromarray(pixels).save(stream, **given)
+    return stream.getvalue()
+
+
+def read_rows(path: Path) -> None:
+    """What `restore` reads: bands of rows, a large image only in part."""
+    with open_source(path) as source:
+        raster = source.raster
+        if raster.bands * raster.width_px * min(raster.height_px, 64) < 1 << 24:
+            source.held_bytes(64)
+            for top in range(0, min(raster.height_px, 64), 7):
+                raster.missing(source.read(top, min(top + 9, raster.height_px)))
+
+
+def gdal_seeds(_: Path, name: str) -> list[bytes]:
+    """A small image of two bands in one of GDAL's formats."""
+    return [_with_tiles(name)[name]]
+
+
+@cache
+def _with_tiles(name: str) -> dict[str, bytes]:
+    """An image, or an index and what it names, by their names; a test is skipped where rasterio is not installed."""
+    from tests.deploy.restoration import images
+
+    with TemporaryDirectory() as folder:
+        images.FORMATS[name](Path(folder) / name, images.digital_numbers())
+        return {path.name: path.read_bytes() for path in Path(folder).iterdir()}
+
+
+def read_with_tiles(path: Path, name: str) -> None:
+    """An image, or an index beside sound tiles, by rows."""
+    with TemporaryDirectory() as folder:
+        for tile, content in _with_tiles(name).items():
+            (Path(folder) / tile).write_bytes(content)
+        read_rows(Path(shutil.copy(path, Path(folder) / name)))
