@@ -51,11 +51,7 @@ class Differences:
     @property
     def warning(self) -> str | None:
         """What a reader must know of the intervals, in a sentence; None where there is nothing to say."""
-        if self.sites < LEAST_SITES:
-            return f"No interval: of {self.sites} sites, fewer than {LEAST_SITES}, none could be trusted."
-        if self.sites < FEW_SITES:
-            return f"Only {self.sites} sites: the intervals are too narrow to be trusted."
-        return None
+        return warning_of(self.sites)
 
     def value(self, row: str, figure: str) -> Estimate:
         """A figure (a key of `Scores.figures`) of a row."""
@@ -80,6 +76,15 @@ class Differences:
         """A combination of figures, on all images and in every draw."""
         value = float(combine(lambda row, figure: np.array(self.scores[row].figures()[figure])))
         return estimate(value, combine(lambda row, figure: self.drawn[row][figure]), self.sites)
+
+
+def warning_of(sites: int) -> str | None:
+    """What a reader must know of intervals over so many sites, in a sentence; None where there is nothing to say."""
+    if sites < LEAST_SITES:
+        return f"No interval: of {sites} sites, fewer than {LEAST_SITES}, none could be trusted."
+    if sites < FEW_SITES:
+        return f"Only {sites} sites: the intervals are too narrow to be trusted."
+    return None
 
 
 def estimate(value: float, draws: np.ndarray, sites: int) -> Estimate:

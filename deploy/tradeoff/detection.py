@@ -15,7 +15,7 @@ import numpy as np
 from deploy.cache import Cache, Key, code_digest, digest_of
 from deploy.detection.boxes import Boxes
 from deploy.detection.detectors import open_detector
-from deploy.detection.differences import estimate, site_draws
+from deploy.detection.differences import estimate, site_draws, warning_of
 from deploy.detection.matching import Matched, require_library
 from deploy.detection.rows import share_figure
 from deploy.detection.scores import ap50
@@ -178,10 +178,12 @@ class Detection:
         ends = {name: found.figure for name, content in BESIDE.items() if (found := self.find(name, content))}
         beside = ", ".join(f"{name} {figure} %" for name, figure in ends.items())
         scenes = f"{len(self.study.subjects)} labelled images as {self.sensors.degraded.name} acquires them"
+        warning = warning_of(len({subject.site for subject in self.study.subjects}))
         return (
             f"mAP50: average precision at an overlap of half, mean over classes, of one fixed detector on {scenes}.",
             f"The same detector on the same images, measured: {beside}.",
             "Points differ in it where the interval of their paired difference over sites leaves 0 out.",
+            *([f"mAP50: {warning}"] if warning else []),
             *self.remarks,
         )
 

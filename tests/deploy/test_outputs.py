@@ -62,7 +62,11 @@ INSIDE = {
 }
 SUFFIXES = {"check": ".svg", "compare": ".json"}
 MORE = {"stress": ("--bit-flips",)}
-BESIDE = {("restore", "sensor"): ("--method", "traditional"), ("detect", "labels"): ("--images", "pictures")}
+BESIDE = {
+    ("restore", "sensor"): ("--method", "traditional"),
+    ("detect", "labels"): ("--images", "pictures"),
+    ("tradeoff", "detector"): ("--labelled", "pictures"),
+}
 """What an option is refused without."""
 CASES = {
     name: Case(paths, INSIDE.get(name, ""), SUFFIXES.get(name, ".tif"), MORE.get(name, ()))

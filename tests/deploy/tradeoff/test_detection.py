@@ -114,6 +114,7 @@ def test_a_point_has_the_map50_that_detect_finds_with_its_method(
         assert value.interval is not None
         assert figures[name].value == pytest.approx(100 * value.value)
         assert figures[name].interval == pytest.approx([100 * end for end in value.interval])
+    assert f"mAP50: Only {SITES} sites: the intervals are too narrow to be trusted." in kept[0].study.notes
     beside = next(note for note in kept[0].study.notes if "same detector" in note)
     for row in ("reference", "degraded"):
         shown = re.search(rf"{row} ([0-9.]+) \[", beside)
