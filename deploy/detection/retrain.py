@@ -37,7 +37,7 @@ SEEDS = 3
 SCENES = 128
 """That a detector is trained on."""
 SIDE_PX = 256
-RECIPE = DetectorRecipe(steps=200, batch=8, precision="bfloat16")
+RECIPE = DetectorRecipe(steps=600, batch=8, precision="bfloat16")
 FIRST = 1_000_000
 """Number of the first scene of training: no study draws so many."""
 
