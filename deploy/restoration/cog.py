@@ -74,7 +74,7 @@ def write_cog(plain: Path, cog: Path, compression: Compression, about: Mapping[s
         OSError: the disk is full or gone.
     """
     rasterio: Any = import_module("rasterio")
-    options = {
+    options: dict[str, Any] = {
         "COMPRESS": CODECS[compression],
         "PREDICTOR": "NO" if compression is Compression.none else "YES",  # the horizontal one of integers
         "BLOCKSIZE": BLOCK_PX,
@@ -86,6 +86,8 @@ def write_cog(plain: Path, cog: Path, compression: Compression, about: Mapping[s
         with warnings.catch_warnings(action="ignore"), rasterio.Env(**environment):
             with rasterio.open(plain, "r+", driver="GTiff") as file:
                 file.update_tags(**about)
+                if file.width == 1:  # readers tell how far an overview is reduced from its width
+                    options["OVERVIEWS"] = "NONE"
             import_module("rasterio.shutil").copy(plain, cog, driver="COG", **options)
     except Exception as error:  # rasterio has a class of its own for each of GDAL's
         raise OSError(" ".join(str(error.__cause__ or error).split())) from error

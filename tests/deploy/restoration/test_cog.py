@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
 from deploy.networks import shipped_pair
@@ -113,6 +113,7 @@ def test_a_run_stopped_while_it_is_written_goes_on(
 
 @settings(max_examples=10, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(height=st.integers(1, 700), width=st.integers(1, 700))
+@example(height=600, width=1)
 def test_it_is_valid_at_any_size(height: int, width: int, model: Path, tmp_path: Path) -> None:
     images.write_tiff(tmp_path / "in.tif", np.full((1, height, width), 700, np.uint16))
     restore_file(tmp_path / "in.tif", tmp_path / "out.tif", Options(model, tile_px=256, cog=True), lambda _: None)
