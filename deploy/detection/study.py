@@ -21,9 +21,9 @@ from deploy.detection.matching import Image, Matched, match
 from deploy.detection.subjects import Subject
 from deploy.methods import AT, method_named
 from deploy.networks import Say, conditioned, network_file
-from model.detection.display import Display, display_of
 from model.evaluation.methods import DEGRADED, Method
 from model.io.files import sha256
+from model.io.pictures import Stretch, stretch_of
 from model.progress import steps
 from model.simulator.acquire import acquire_padded
 from model.simulator.detector import Draw
@@ -72,13 +72,13 @@ class View:
         return self._acquired(self.sensors.degraded, DEGRADED)
 
     @cached_property
-    def display(self) -> Display:
+    def display(self) -> Stretch:
         """How every row's image of this scene is shown."""
-        return display_of(self.reference)
+        return stretch_of(self.reference)
 
     def shown(self, method: Method | None) -> np.ndarray:
         """What a detector is given, (h, w, 3) float32 in 0 to 1: restored by a method; the reference for None."""
-        return self.display.rgb(self.reference if method is None else method.restore(self.degraded))
+        return self.display.to_srgb(self.reference if method is None else method.restore(self.degraded))
 
     def _acquired(self, profile: SensorProfile, role: str) -> np.ndarray:
         sensor, radiance = profile.draw(self.draw.generator("sensor")), self.subject.radiance(profile.nominal())

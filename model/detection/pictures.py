@@ -6,8 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from model.detection.display import display_of
 from model.detection.scenes import labelled_scene
+from model.io.pictures import stretch_of
 from model.simulator.acquire import acquire_padded
 from model.simulator.detector import Draw
 from profiles.sensor import Sensor
@@ -50,7 +50,7 @@ def drawn_picture(sensor: Sensor, oversampling: int, side_px: int, seed: int, nu
     scene = labelled_scene(np.random.default_rng([STREAM, seed, number]), side, side)
     radiance, draw = torch.from_numpy(scene.radiance), Draw(seed, number)
     dn = acquire_padded(radiance, sensor, oversampling, draw, "reference").numpy()
-    rgb = display_of(dn).rgb(dn).transpose(2, 0, 1)
+    rgb = stretch_of(dn).to_srgb(dn).transpose(2, 0, 1)
     return picture_of(rgb, scene.corners / oversampling, scene.classes)
 
 

@@ -21,8 +21,16 @@ class Stretch:
 
     def to_bytes(self, dn: np.ndarray) -> np.ndarray:
         """(H, W) digital numbers to 8-bit grey, with a gamma for the eye."""
-        share = np.clip((dn - self.black) / max(self.white - self.black, 1e-6), 0, 1)
-        return np.asarray(np.rint(255 * share**GAMMA), np.uint8)
+        return np.asarray(np.rint(255 * self._share(dn) ** GAMMA), np.uint8)
+
+    def to_srgb(self, dn: np.ndarray) -> np.ndarray:
+        """(H, W) digital numbers to (H, W, 3) float32 in [0, 1], by sRGB's curve, in three equal bands."""
+        light = self._share(dn)
+        code = np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)  # IEC 61966-2-1
+        return np.repeat(code.astype(np.float32)[..., None], 3, axis=2)
+
+    def _share(self, dn: np.ndarray) -> np.ndarray:
+        return np.asarray(np.clip((dn - self.black) / max(self.white - self.black, 1e-6), 0, 1))
 
 
 def stretch_of(dn: np.ndarray) -> Stretch:

@@ -83,8 +83,8 @@ def test_boxes_come_back_to_where_the_object_lies(
 def test_all_rows_are_shown_under_the_stretch_of_the_reference() -> None:
     view = View(subject([(60, 60, 110, 100)]), sensors("dior-high"), Draw(0))
     assert view.degraded.shape == view.reference.shape == (50, 70)
-    np.testing.assert_array_equal(view.shown(None), view.display.rgb(view.reference))
-    assert view.display.black_dn == pytest.approx(np.percentile(view.reference, 0.5))
+    np.testing.assert_array_equal(view.shown(None), view.display.to_srgb(view.reference))
+    assert view.display.black == pytest.approx(np.percentile(view.reference, 0.5))
 
 
 def test_a_study_that_was_stopped_goes_on_and_finds_the_same(tmp_path: Path) -> None:

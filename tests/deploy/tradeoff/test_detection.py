@@ -4,7 +4,7 @@ import csv
 import json
 import re
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -23,16 +23,12 @@ from deploy.detection.matching import match
 from deploy.detection.study import Sensors, Study, rows_of
 from deploy.detection.subjects import read_subjects
 from deploy.networks import silent
-from deploy.tradeoff import measurements, methods, selection
 from deploy.tradeoff.detection import OTHER_HALO, Detected
 from deploy.tradeoff.detection import Request as DetectionRequest
-from deploy.tradeoff.host_time import Times
 from deploy.tradeoff.points import MAP50
 from deploy.tradeoff.run import StudyRun, run_study
 from deploy.tradeoff.selection import Request
 from model.convbeers import ConvBEERS, initialise
-from model.evaluation import targets as targets_module
-from model.evaluation.methods import Restore
 from model.io.weights import save_network
 from model.shipped import DETECTOR
 from model.simulator.procedural import procedural_scene
@@ -40,6 +36,7 @@ from model.variants import Variant
 from profiles.figures import Figure
 from tests.deploy.detection.drawn import NAMES, drawn_images
 from tests.deploy.detection.folders import labelled
+from tests.deploy.tradeoff.small import small_studies
 
 SITES = 6
 CLASSES = {"Motor-Car": "vehicle", "Storage tank": "tank"}
@@ -61,24 +58,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module", autouse=True)
 def small() -> Iterator[None]:
-    """Less of everything, and a clock that always says the same."""
-    with pytest.MonkeyPatch.context() as patch:
-        for module, name, value in (
-            (targets_module, "ANGLES_DEG", (5.0, 8.0)),
-            (targets_module, "REPEATS", 1),
-            (methods, "PATCHES", 2),
-            (methods, "PATCH_PX", 32),
-            (selection, "QUALITIES", ("fast",)),
-            (selection, "PEERS", ("nl-means",)),
-            (measurements, "time_variants", steady),
-        ):
-            patch.setattr(module, name, value)
+    with small_studies():
         yield
-
-
-def steady(methods: Sequence[Restore], tile: np.ndarray, tick: Callable[[], None]) -> list[Times]:
-    tick()
-    return [Times("one", (0.1, 0.2, 0.1), (0.1, 0.1, 0.1), tile.size) for _ in methods]
 
 
 def request(folder: Path, pictures: Path | None) -> Request:

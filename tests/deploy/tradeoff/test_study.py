@@ -16,18 +16,16 @@ from typer.testing import CliRunner
 from deploy.cache import Cache
 from deploy.cli import app
 from deploy.compare import compare, read_document
-from deploy.tradeoff import measurements, methods, selection
-from deploy.tradeoff.host_time import Times
+from deploy.tradeoff import measurements
 from deploy.tradeoff.run import StudyRun, run_study
 from deploy.tradeoff.selection import Request
 from model.convbeers import ConvBEERS, initialise
-from model.evaluation import targets as targets_module
-from model.evaluation.methods import Restore
 from model.io.weights import save_network
 from model.simulator.procedural import procedural_scene
 from model.variants import Variant
 from profiles.figures import Row
 from quant.onnx_file import load_onnx, save_onnx
+from tests.deploy.tradeoff.small import small_studies
 
 
 @pytest.fixture(scope="module")
@@ -48,24 +46,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module", autouse=True)
 def small() -> Iterator[None]:
-    """Less of everything, and a clock that always says the same."""
-    with pytest.MonkeyPatch.context() as patch:
-        for module, name, value in (
-            (targets_module, "ANGLES_DEG", (5.0, 8.0)),
-            (targets_module, "REPEATS", 1),
-            (methods, "PATCHES", 2),
-            (methods, "PATCH_PX", 32),
-            (selection, "QUALITIES", ("fast",)),
-            (selection, "PEERS", ("nl-means",)),
-            (measurements, "time_variants", steady),
-        ):
-            patch.setattr(module, name, value)
+    with small_studies():
         yield
-
-
-def steady(methods: Sequence[Restore], tile: np.ndarray, tick: Callable[[], None]) -> list[Times]:
-    tick()
-    return [Times("one", (0.1, 0.2, 0.1), (0.1, 0.1, 0.1), tile.size) for _ in methods]
 
 
 def request(folder: Path, *names: str, **more: object) -> Request:
