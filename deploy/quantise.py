@@ -22,6 +22,7 @@ from quant.free import free_ticks, quantise_free
 from quant.gate import compare, gate_row
 from quant.integer import integer_rows
 from quant.onnx_file import save_onnx
+from quant.passes.tune import Tuning
 from quant.quantise import Passes, Quantised, ablation_rows, ablations, quantise_model, ticks
 from quant.samples import OwnSamples
 from quant.sensitivity import WORST, headline, layer_error_rows, sizes_row, spread_of, worst_row
@@ -50,11 +51,12 @@ Show = Callable[[str, list[Row]], None]
 
 @dataclass(frozen=True)
 class Wanted:
-    """What a run is to write and to show besides the INT8 file."""
+    """What a run is to write and to show besides the INT8 file, and for how many steps to train its numbers."""
 
     board: Path | None
     ablate: bool
     page: Path | None
+    finetune: int = 0
 
 
 def quantise_free_file(model: onnx.ModelProto, calibration: Source, out: Path, say: Say, show: Show) -> list[Row]:
@@ -85,9 +87,10 @@ def quantise_legal_file(
         OptionError: a target without a DPU.
     """
     shifts = _shifts_of(target)
-    with steps("calibrating", ticks(model, calibration.patches, passes)) as bar:
+    tuning = Tuning(calibration.for_tuning.pairs, wanted.finetune) if wanted.finetune else None
+    with steps("calibrating", ticks(model, calibration.patches, passes) + wanted.finetune) as bar:
         about = {**calibration.about, "target": target.name}
-        result = quantise_model(model, calibration.drawn, about, bar.advance, passes, shifts)
+        result = quantise_model(model, calibration.drawn, about, bar.advance, passes, shifts, tuning)
     save_onnx(result.host, out)
     say(f"wrote {out}: {len(result.core.ops)} integer operations, {result.relus} ReLUs kept")
     if wanted.board is not None:

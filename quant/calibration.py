@@ -38,6 +38,9 @@ Candidate = TypeVar("Candidate")
 HELD_OUT_SEED = 1000
 """Added to a run's seed where patches must be others than calibration's."""
 HELD_OUT_PATCHES = 32
+TUNING_SEED = 2000
+"""Added to a run's seed for the patches that the whole numbers are trained on."""
+TUNING_PATCHES = 256
 
 
 @dataclass(frozen=True)
@@ -306,7 +309,12 @@ class Calibration:
     @cached_property
     def drawn(self) -> Patches:
         """What the network is calibrated on."""
-        return draw_patches(self._scenes, self._degraded, self._reference, self.patches, self.seed, self.patch_px)
+        return self._draw(self.patches, self.seed)
+
+    @property
+    def for_tuning(self) -> Patches:
+        """Other patches of the same scenes, for what takes more of them."""
+        return self._draw(TUNING_PATCHES, self.seed + TUNING_SEED)
 
     @property
     def unseen(self) -> Patches:
@@ -317,6 +325,9 @@ class Calibration:
     def about(self) -> dict[str, str]:
         """What the file says of it."""
         return {"calibration_sensor": self._degraded.name, "calibration_seed": str(self.seed)}
+
+    def _draw(self, count: int, seed: int) -> Patches:
+        return draw_patches(self._scenes, self._degraded, self._reference, count, seed, self.patch_px)
 
     @cached_property
     def _scenes(self) -> list[Scene]:

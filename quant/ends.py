@@ -139,6 +139,20 @@ class Ends:
             result = shuffle(result)
         return self.tail(result) if self.tail else result
 
+    @property
+    def is_image(self) -> bool:
+        """Whether the result is an image, and nothing but moved values and a sum away from the core's."""
+        return not (self.softmax or self.flat or self.tail)
+
+    def correction_of(self, image: np.ndarray, result: np.ndarray) -> np.ndarray:
+        """The correction from which `finished` makes that result (N, C, H, W), in [0, 1] where the image is added."""
+        for shuffle in reversed(self.last):
+            result = shuffle.inverse(result)
+        result = result - image if self.adds_image else result
+        for shuffle in reversed(self.back):
+            result = shuffle.inverse(result)
+        return np.ascontiguousarray(result)
+
     def clipped(self, result: np.ndarray) -> np.ndarray:
         """A float network's result as the host would clip its own: to [0, 1] where the image is added."""
         return np.clip(result, 0, 1) if self.adds_image else result

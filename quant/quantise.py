@@ -46,6 +46,7 @@ from quant.passes.stream import (
     window_offsets,
     windowed,
 )
+from quant.passes.tune import Tuning, tune
 from quant.session import TILE_PX, crops, halo_of, open_any_size, open_session, result_of, tensor_values
 
 SEARCH_CROPS = 16
@@ -162,11 +163,12 @@ def quantise_model(
     tick: Callable[[], None],
     passes: Passes = ALL,
     shifts: Shifts = SHIFTS,
+    tuning: Tuning | None = None,
 ) -> Quantised:
     """Quantise a float network under the DPU's rules: int8, symmetric, per tensor, power-of-two scales.
 
     The global add, where there is one, stays on the host, in 12 bits: only the correction is computed in int8. The
-    rest is `passes`. `shifts` are the windows of the target.
+    rest is `passes`. `shifts` are the windows of the target. With `tuning` the whole numbers are trained at last.
 
     Raises:
         ModelError: an operation that the DPU does not compute, or weights of no sensible size.
@@ -184,8 +186,12 @@ def quantise_model(
     if passes.fit_weights:
         core = fit_weights(final, core, input_moments(final, images, tick, plan.ends), shifts)
     core = replace(core, ends=replace(core.ends, tail=plan.tail))
+    if tuning:
+        core = tune(core, final, plan.full, tuning, tick)
     about = {**metadata(model), "precision": "int8 legal", "calibration_sha256": patches.digest, **about}
     about["passes"] = ", ".join(name for name, on in asdict(passes).items() if on)
+    if tuning:
+        about["finetune"] = f"{tuning.steps} steps on {len(tuning.pairs)} patches"
     tile_px = fixed_tile_px(model)
     return Quantised(
         host_model(core, about, tile_px), board_model(core, about, tile_px), core, relu_count(graph), final

@@ -188,6 +188,11 @@ class OwnSamples:
         return split_samples(self.all)[0]
 
     @property
+    def for_tuning(self) -> Patches:
+        """The same, for the training of whole numbers."""
+        return self.drawn
+
+    @property
     def unseen(self) -> Patches:
         """What calibration does not see."""
         return split_samples(self.all)[1]

@@ -49,6 +49,9 @@ def quantize(
         list[str] | None,
         typer.Option(help="Leave out a pass that --ablate lists, as half-lsb-pair; may be repeated."),
     ] = None,
+    finetune: Annotated[
+        int, typer.Option(min=0, max=100_000, help="Gradient steps that train the INT8 numbers themselves; 400 pay.")
+    ] = 0,
     seed: Annotated[int, typer.Option(min=0, max=SEEDS, help="Seed of the patches.")] = 0,
     json: Annotated[Path | None, typer.Option(help="Write the figures here.")] = None,
 ) -> None:
@@ -70,9 +73,9 @@ def quantize(
     from quant.quantise import passes_without
     from quant.samples import samples_of
 
-    if regime is Regime.free and (board or ablate or report or without):
+    if regime is Regime.free and (board or ablate or report or without or finetune):
         remedy = "leave it out, or take --regime legal"
-        expected = "no --board, --ablate, --report or --without"
+        expected = "no --board, --ablate, --report, --without or --finetune"
         raise OptionError("--regime free", expected=expected, got="one", remedy=remedy)
     passes = passes_without(without or [])
     page, figures = (report / "report.html", report / "report.json") if report else (None, None)
@@ -84,11 +87,11 @@ def quantize(
     if regime is Regime.free:
         rows = quantise_free_file(network, calibration, out, say, print_rows)
     else:
-        wanted = Wanted(board, ablate, page)
+        wanted = Wanted(board, ablate, page, finetune)
         rows = quantise_legal_file(network, calibration, board_target, passes, out, wanted, say, print_rows)
     arguments = {"target": target, "sensor": sensor, "images": images, "patches": patches, "patch": patch}
     arguments |= {"data": data}
-    arguments |= {"regime": regime.value, "without": ", ".join(without or []), "seed": seed}
+    arguments |= {"regime": regime.value, "without": ", ".join(without or []), "finetune": finetune, "seed": seed}
     document = Document("quantize", arguments, (model, out), tuple(rows))
     for path in (figures, json):
         document.write(path)

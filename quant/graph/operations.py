@@ -4,7 +4,7 @@ Every operation reads and writes tensors (N, C, H, W) by their names, each writt
 """
 
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from typing import Protocol, runtime_checkable
 
@@ -247,6 +247,11 @@ class Shuffle(_OneInput):
         blocks = values.reshape(count, channels, height // r, r, width // r, r)
         order = (0, 1, 3, 5, 2, 4) if self.columns_first else (0, 3, 5, 1, 2, 4)
         return blocks.transpose(order).reshape(count, channels * r**2, height // r, width // r)
+
+    @property
+    def inverse(self) -> "Shuffle":
+        """The one that moves all values back."""
+        return replace(self, up=not self.up)
 
 
 @dataclass(frozen=True)

@@ -23,8 +23,9 @@ from quant.calibration import Patches, Remade
 from quant.core import INT8_MAX, INT8_MIN
 from quant.encodings import as_on_board, encoding_faults, read_core
 from quant.encodings.description import KEY
-from quant.graph import correction_graph
-from quant.integer import agreement, run_core
+from quant.graph import Conv, correction_graph
+from quant.integer import agreement, merged_correction, run_core
+from quant.integer.trainable import TrainableCore
 from quant.onnx_file import GraphWriter, image_info, make_model
 from quant.quantise import ALL, Quantised, quantise_model, ticks
 from quant.reading.folding import simplest
@@ -78,6 +79,20 @@ def test_the_integer_reference_is_the_runtime_bit_for_bit(name: str) -> None:
     assert [layer.report.name for layer in found.layers if layer.unequal] == []
     whole = result_of(open_session(made.host), seen)
     np.testing.assert_array_equal(made.core.ends.finished(seen, found.even), whole)
+
+
+@pytest.mark.parametrize("name", NETWORKS)
+def test_what_is_trained_computes_the_reference_s_whole_numbers(name: str) -> None:
+    made = quantised(name)
+    trainable = TrainableCore(made.core, [op for op in made.graph if isinstance(op, Conv)])
+    planes = made.core.ends.split(images(name, 4)[3])
+    with torch.no_grad():
+        found = trainable.tensors(torch.from_numpy(planes.astype(np.float32)))
+        result = trainable(torch.from_numpy(planes.astype(np.float32)))
+    wanted, _ = run_core(made.core, planes)
+    for tensor, values in wanted.items():
+        np.testing.assert_array_equal(found[tensor].numpy(), values, err_msg=tensor)
+    np.testing.assert_allclose(result.numpy(), merged_correction(made.core, wanted), rtol=1e-6)
 
 
 @pytest.mark.parametrize("name", NETWORKS)

@@ -1,0 +1,144 @@
+"""Train the whole numbers themselves: weights and biases of the integer core, roundings and clippings in the loop.
+
+Rounding each tensor as well as it can be done leaves errors that meet behind many layers, and noise that no rounding
+takes back. Here the core is run as it is, and its numbers follow the slope of what its result errs by (training that
+sees the quantiser, Jacob et al. 2018): from the reference where there is one, and from the float network. Scales and
+shifts stay, so the core stays as legal as it was.
+"""
+
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from quant.calibration import Pair, Remade
+from quant.core import IntCore
+from quant.ends import Ends
+from quant.graph import CORRECTION, PLANES, Conv, Graph, graph_to_onnx
+from quant.integer.trainable import Tensor, TrainableCore
+from quant.session import open_session, planes_of, require_finite
+
+HELD_OUT_EVERY = 8
+"""One pair of so many is not trained on, but judges what is kept."""
+JUDGEMENTS = 20
+BATCH_PIXELS = 4 * 128**2
+"""Of the planes that one step looks at."""
+BORDER_PX = 8
+"""Not looked at in a result of at least four times as many a side: there a patch ends, and its image goes on."""
+
+
+@dataclass(frozen=True)
+class Tuning:
+    """What to train on, how long and how fast.
+
+    Attributes:
+        pairs: images (1, C, H, W) in [0, 1] and their references, which may be empty.
+        steps: gradient steps.
+        rate: the highest rate of learning, in units of each number's scale.
+        seed: of the order of the pairs.
+    """
+
+    pairs: Remade[Pair]
+    steps: int
+    rate: float = 0.05
+    seed: int = 0
+
+
+@dataclass(frozen=True)
+class Sample:
+    """What a pair is to the core: planes (1, P, H, W) as float32 in, corrections (1, C, H', W') wanted out.
+
+    Attributes:
+        planes: of the image.
+        floats: what the float network makes of it.
+        reference: the correction that would restore it wholly, or None.
+        weight: of its errors: over the float network's own, so that dark and busy patches count alike.
+    """
+
+    planes: Tensor
+    floats: Tensor
+    reference: Tensor | None
+    weight: float
+
+    def error(self, correction: Tensor) -> Tensor:
+        """The mean squared errors of a correction, added up and weighted."""
+        wanted = [self.floats] if self.reference is None else [self.floats, self.reference]
+        return self.weight * sum((_mean_square(correction, each) for each in wanted), start=torch.zeros(()))
+
+
+def tune(core: IntCore, rounded: Graph, full: Graph, tuning: Tuning, tick: Callable[[], None]) -> IntCore:
+    """The core with the numbers that erred least on pairs that they were not trained on.
+
+    Args:
+        core: to start from; it comes back as it is where training finds nothing better.
+        rounded: the float operations that it was rounded from.
+        full: the float network that reads all planes.
+        tuning: on what, how long, how fast.
+        tick: called once a step.
+
+    Raises:
+        ModelError: NaN or infinity in the float network.
+    """
+    samples = list(_samples(core.ends, full, tuning.pairs))
+    held = samples[HELD_OUT_EVERY - 1 :: HELD_OUT_EVERY] or samples
+    seen = [sample for k, sample in enumerate(samples) if (k + 1) % HELD_OUT_EVERY] or samples
+    trainable = TrainableCore(core, [op for op in rounded if isinstance(op, Conv)])
+    least, kept, every = _cost(trainable, held), core, max(tuning.steps // JUDGEMENTS, 1)
+    for step in _descend(trainable, seen, tuning):
+        tick()
+        if step % every and step < tuning.steps:
+            continue
+        cost = _cost(trainable, held)
+        if cost < least:
+            least, kept = cost, trainable.core()
+    return kept
+
+
+def _samples(ends: Ends, full: Graph, pairs: Remade[Pair]) -> Iterator[Sample]:
+    session = open_session(graph_to_onnx(full, [CORRECTION], ends.planes * ends.channels))
+    for image, reference in pairs:
+        (floats,) = session.run([CORRECTION], {PLANES: planes_of(image, ends)})
+        require_finite([floats], "float network")
+        planes, result = torch.from_numpy(ends.split(image).astype(np.float32)), torch.from_numpy(floats)
+        if not (reference.size and ends.is_image):
+            yield Sample(planes, result, None, 1.0)
+            continue
+        wanted = torch.from_numpy(ends.correction_of(image, reference))
+        yield Sample(planes, result, wanted, 1 / max(float(_mean_square(result, wanted)), LEAST_ERROR))
+
+
+LEAST_ERROR = 1e-9
+"""Mean squared, of full scale: below it, by 90 dB, a float network is as good as perfect."""
+
+
+def _mean_square(result: Tensor, wanted: Tensor) -> Tensor:
+    border_px = BORDER_PX if min(result.shape[2:]) >= 4 * BORDER_PX else 0
+    height, width = result.shape[2:]
+    inner = (result - wanted)[..., border_px : height - border_px, border_px : width - border_px]
+    return inner.square().mean()
+
+
+def _descend(trainable: TrainableCore, samples: list[Sample], tuning: Tuning) -> Iterator[int]:
+    """Step after step by Adam, the rate falling to 0 as a half cosine; yields the steps done."""
+    generator = torch.Generator().manual_seed(tuning.seed)
+    optimiser = torch.optim.Adam(trainable.parameters(), lr=tuning.rate)
+    falling = torch.optim.lr_scheduler.LambdaLR(
+        optimiser, lambda step: 0.5 * (1 + math.cos(math.pi * step / tuning.steps))
+    )
+    batch = max(BATCH_PIXELS // math.prod(samples[0].planes.shape[2:]), 1)
+    for step in range(1, tuning.steps + 1):
+        optimiser.zero_grad()
+        for number in torch.randint(len(samples), (batch,), generator=generator).tolist():
+            sample = samples[number]
+            (sample.error(trainable(sample.planes)) / batch).backward()
+        optimiser.step()
+        falling.step()
+        yield step
+
+
+@torch.no_grad()
+def _cost(trainable: TrainableCore, samples: list[Sample]) -> float:
+    """The mean error of the whole numbers as they stand."""
+    return float(np.mean([float(sample.error(trainable(sample.planes))) for sample in samples]))

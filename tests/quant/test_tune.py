@@ -1,0 +1,135 @@
+"""Whole numbers trained with their roundings: nearer to what is wanted, never worse, as legal as before."""
+
+from dataclasses import replace
+
+import numpy as np
+import onnx
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from quant.calibration import Patches, Remade
+from quant.core import IntConv, IntCore, shift_faults
+from quant.ends import Ends
+from quant.graph import Conv, Shuffle, correction_graph, read_planes
+from quant.integer import merged_correction, run_core
+from quant.integer.trainable import TrainableCore
+from quant.passes.tune import Tuning, tune
+from quant.quantise import Quantised, quantise_model
+
+
+def origins(made: Quantised) -> list[Conv]:
+    return [op for op in made.graph if isinstance(op, Conv)]
+
+
+def spoilt(core: IntCore) -> IntCore:
+    """A core some of whose weights are off by a few units."""
+    generator = np.random.default_rng(5)
+
+    def off(op: IntConv) -> IntConv:
+        noise = generator.integers(-4, 5, op.weight.shape)
+        return replace(op, weight=np.clip(op.weight + noise, -128, 127).astype(np.int8))
+
+    return replace(core, ops=tuple(off(op) if isinstance(op, IntConv) else op for op in core.ops))
+
+
+def error(core: IntCore, patches: Patches) -> float:
+    """Mean squared difference of the correction from the one that restores wholly."""
+    found = []
+    for seen, meant in patches.pairs:
+        tensors, _ = run_core(core, core.ends.split(seen))
+        wanted = core.ends.correction_of(seen, meant)
+        found.append(float(np.square(merged_correction(core, tensors) - wanted).mean()))
+    return float(np.mean(found))
+
+
+def alone(patches: Patches) -> Remade[tuple[np.ndarray, np.ndarray]]:
+    """The pairs without their references."""
+    nothing = np.empty(0, np.float32)
+    return Remade(lambda k: (patches.pairs[k][0], nothing), len(patches.pairs))
+
+
+def trained(made: Quantised, core: IntCore, model: onnx.ModelProto, tuning: Tuning) -> IntCore:
+    return tune(core, made.graph, read_planes(correction_graph(model)), tuning, lambda: None)
+
+
+def difference(core: IntCore, other: IntCore, patches: Patches) -> float:
+    """Mean squared difference between two cores' corrections."""
+    results = [
+        [merged_correction(each, run_core(each, each.ends.split(seen))[0]) for seen in patches.degraded]
+        for each in (core, other)
+    ]
+    return float(np.mean([np.square(a - b).mean() for a, b in zip(*results, strict=True)]))
+
+
+def test_it_begins_with_the_core_s_own_numbers(quantised: Quantised) -> None:
+    again = TrainableCore(quantised.core, origins(quantised)).core()
+    for one, other in zip(quantised.core.convolutions, again.convolutions, strict=True):
+        np.testing.assert_array_equal(one.weight, other.weight)
+        np.testing.assert_array_equal(one.bias, other.bias)
+
+
+def test_without_references_it_comes_back_towards_the_float_network(
+    quantised: Quantised, float_onnx: onnx.ModelProto, patches: Patches, unseen: Patches
+) -> None:
+    bad = spoilt(quantised.core)
+    found = trained(quantised, bad, float_onnx, Tuning(alone(patches), 40, rate=0.3))
+    assert difference(found, quantised.core, unseen) < 0.7 * difference(bad, quantised.core, unseen)
+    assert shift_faults(found) == []
+    assert found.frac_bits == quantised.core.frac_bits
+
+
+def test_what_comes_out_worse_is_not_kept(
+    quantised: Quantised, float_onnx: onnx.ModelProto, patches: Patches
+) -> None:
+    found = trained(quantised, quantised.core, float_onnx, Tuning(alone(patches), 2, rate=60.0))
+    assert found is quantised.core
+
+
+def test_the_same_seed_gives_the_same_numbers_and_a_step_is_a_tick(
+    float_onnx: onnx.ModelProto, patches: Patches
+) -> None:
+    def made(seed: int) -> bytes:
+        ticks = []
+        tuning = Tuning(patches.pairs, 3, rate=0.3, seed=seed)
+        model = quantise_model(float_onnx, patches, {}, lambda: ticks.append(1), tuning=tuning)
+        plain = []
+        quantise_model(float_onnx, patches, {}, lambda: plain.append(1))
+        assert len(ticks) == len(plain) + 3
+        assert {each.key: each.value for each in model.host.metadata_props}["finetune"].startswith("3 steps")
+        return bytes(model.host.SerializeToString())
+
+    assert made(1) == made(1)
+
+
+def test_slopes_pass_roundings_and_stop_where_int8_ends(quantised: Quantised, patches: Patches) -> None:
+    trainable = TrainableCore(quantised.core, origins(quantised))
+    planes = torch.from_numpy(quantised.core.ends.split(patches.degraded[0]).astype(np.float32))
+    trainable(planes).square().mean().backward()
+    assert all(bool(weight.grad.abs().max() > 0) for weight in trainable.weights)
+    with torch.no_grad():
+        trainable.weights[0].fill_(200.0)
+    trainable.zero_grad()
+    trainable(planes).square().mean().backward()
+    assert float(trainable.weights[0].grad.abs().max()) == 0
+
+
+@given(
+    backs=st.lists(st.tuples(st.integers(1, 3), st.booleans()), max_size=2),
+    adds=st.booleans(),
+    seed=st.integers(0, 2**32 - 1),
+)
+def test_the_correction_of_a_result_makes_it(backs: list[tuple[int, bool]], adds: bool, seed: int) -> None:
+    generator = np.random.default_rng(seed)
+    back = tuple(Shuffle(f"s{k}", "a", "b", block, True, order) for k, (block, order) in enumerate(backs))
+    ends = Ends(back=back, adds_image=adds)
+    image, result = (generator.random((1, 1, 36, 72)).astype(np.float32) for _ in range(2))
+    found = ends.finished(image, ends.correction_of(image, result))
+    np.testing.assert_allclose(found, result, atol=2e-7)
+
+
+def test_training_on_references_pays_on_others(
+    quantised: Quantised, float_onnx: onnx.ModelProto, patches: Patches, unseen: Patches
+) -> None:
+    found = trained(quantised, quantised.core, float_onnx, Tuning(patches.pairs, 20, rate=0.3))
+    assert error(found, unseen) < 0.97 * error(quantised.core, unseen)
