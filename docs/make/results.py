@@ -1,4 +1,4 @@
-"""Puts the figures of an evaluation into docs/results/restoration.md: the tables between its markers.
+"""Puts the figures of an evaluation into the pages of docs/results: the tables between their markers.
 
     beers-deploy evaluate --images aerial-test/ --sweep ... --json evaluation.json
     python docs/make/results.py evaluation.json
@@ -16,7 +16,7 @@ from typing import Any
 
 from profiles.toml import read_json
 
-PAGE = Path(__file__).parents[1] / "results" / "restoration.md"
+PAGES = Path(__file__).parents[1] / "results"
 MARKED = re.compile(r"(<!-- (?P<name>[^>]+?) -->\n)(?P<table>.*?)(<!-- end -->\n)", re.DOTALL)
 DIGITS = {"dB": 2, "%": 1, "ratio": 4, "distance": 4}
 
@@ -25,15 +25,22 @@ Row = Mapping[str, Any]
 
 
 def main() -> None:
-    """Fill each table that a document given holds."""
-    text = PAGE.read_text(encoding="utf-8")
+    """Fill each table that a document given holds, on whichever page it stands; the last document counts."""
+    tables: dict[str, list[Row]] = {}
     for path in map(Path, sys.argv[1:]):
-        document: Any = read_json(path)
-        tables: dict[str, list[Row]] = {}
-        for row in document["rows"]:
-            tables.setdefault(row["table"], []).append(row)
-        text = MARKED.sub(partial(filled, tables), text)
-    PAGE.write_text(text, encoding="utf-8", newline="")
+        tables |= tables_of(path)
+    for page in sorted(PAGES.glob("*.md")):
+        text = page.read_text(encoding="utf-8")
+        page.write_text(MARKED.sub(partial(filled, tables), text), encoding="utf-8", newline="")
+
+
+def tables_of(path: Path) -> dict[str, list[Row]]:
+    """The rows of a document, by their table."""
+    document: Any = read_json(path)
+    tables: dict[str, list[Row]] = {}
+    for row in document["rows"]:
+        tables.setdefault(row["table"], []).append(row)
+    return tables
 
 
 def filled(tables: Mapping[str, list[Row]], found: re.Match[str]) -> str:
