@@ -9,7 +9,7 @@ DOCS = Path(__file__).resolve().parents[2] / "docs"
 
 
 def load_maker(name: str) -> ModuleType:
-    """The script docs/make/NAME.py."""
+    """The script NAME.py of docs/make."""
     spec = importlib.util.spec_from_file_location(name, DOCS / "make" / f"{name}.py")
     assert spec is not None
     assert spec.loader is not None
