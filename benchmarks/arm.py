@@ -4,7 +4,8 @@
 
 As root on Debian with debootstrap and qemu-user (apt-get install debootstrap qemu-user). ROOT becomes a small ARM
 system, 0.5 GB: bookworm's Python, and the packages of the versions here from their own wheels. It is kept, and what
-is there already is not made again. Nothing is changed outside of it. docs/processors.md says what came out.
+is there already is not made again. Nothing is changed outside of it. docs/explanation/processors.md says what
+came out.
 """
 
 import argparse

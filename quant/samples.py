@@ -27,7 +27,7 @@ HELD_OUT_EVERY = 4
 """One sample of so many is kept from calibration, to look at what INT8 changes."""
 LARGEST = 1 + 1e-6
 FULL_SCALE_8 = 255
-REMEDY = "see docs/any-network.md for how samples are given"
+REMEDY = "see docs/reference/any-network.md for how samples are given"
 
 
 def read_samples(path: Path, channels: int, fixed_px: int | None, multiple_px: int = 1) -> Patches:

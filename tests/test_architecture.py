@@ -1,4 +1,4 @@
-"""What docs/architecture.md says of the packages, held against the code."""
+"""What docs/explanation/architecture.md says of the packages, held against the code."""
 
 import ast
 from graphlib import TopologicalSorter
@@ -50,20 +50,20 @@ def test_packages_stay_small_enough_to_look_through_and_say_what_is_inside() -> 
 
 
 def test_the_page_names_files_that_are_there() -> None:
-    page = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
+    page = (ROOT / "docs" / "explanation" / "architecture.md").read_text(encoding="utf-8")
     named = {word for word in page.split("`") if word.startswith(tuple(f"{each}/" for each in PACKAGES))}
     assert len(named) > 40
     assert not [word for word in named if not (ROOT / word).exists()]
 
 
 def test_the_picture_is_drawn_from_the_imports_of_today() -> None:
-    """Else run python docs/make_architecture.py."""
-    specification = spec_from_file_location("make_architecture", ROOT / "docs" / "make_architecture.py")
+    """Else run python docs/make/architecture.py."""
+    specification = spec_from_file_location("architecture", ROOT / "docs" / "make" / "architecture.py")
     assert specification is not None
     assert specification.loader is not None
     script = module_from_spec(specification)
     specification.loader.exec_module(script)
-    page = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
+    page = (ROOT / "docs" / "explanation" / "architecture.md").read_text(encoding="utf-8")
     assert script.page(page) == page
 
 

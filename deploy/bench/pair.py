@@ -27,7 +27,8 @@ def pair_on_board(restorer: Path, detector: Path, dpu: Dpu) -> list[Row]:
 
     Returns:
         Rows of the table `pair`: the restorer, the detector, and both. Throughput in frames a second, efficiency in
-        pixels of the frame a second and watt; the power is that of any network on this board (docs/cost-model.md).
+        pixels of the frame a second and watt; the power is that of any network on this board
+        (docs/explanation/cost-model.md).
 
     Raises:
         ModelError: a detector that is not fixed to one size, or a network that does not run whole on the DPU.

@@ -29,7 +29,7 @@ from profiles.errors import OptionError
 from profiles.figures import Figure, Row, number, predicted, published, unavailable
 
 TABLE, LAYERS = "bench", "layers"
-COST_SOURCE = "cost model fitted on published networks, docs/cost-model.md"
+COST_SOURCE = "cost model fitted on published networks, docs/explanation/cost-model.md"
 ARITHMETIC = "arithmetic of the tile grid"
 PAPER = "ConvBEERS paper, table of the VCK190 benchmark, 13600 x 9016"
 PAPER_TILE_PX, PAPER_SIZE = 640, "13600x9016"

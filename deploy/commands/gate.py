@@ -64,7 +64,7 @@ def gate(
     max_mae: Annotated[
         float | None, typer.Option(min=0, help="Largest mean absolute difference, of full scale; 0.0007 if none.")
     ] = None,
-    config: Annotated[Path | None, typer.Option(help="TOML file of limits; see docs/gate.md.")] = None,
+    config: Annotated[Path | None, typer.Option(help="TOML file of limits; see docs/how-to/gate.md.")] = None,
     baseline: Annotated[Path | None, typer.Option(help="What 'gate --json' wrote before: MAE may not grow.")] = None,
     target: Annotated[
         str, typer.Option(help=f"Board whose rules the INT8 file must keep: {BOARDS}.")

@@ -26,7 +26,7 @@ def profiles(
 ) -> None:
     """List sensors, scenes and targets, or show one: every constant, its status and its source.
 
-    The keys of a sensor's file, with units and ranges: docs/sensor-profile.md.
+    The keys of a sensor's file, with units and ranges: docs/reference/sensor-profile.md.
     """
     if toml:
         say(_file_text(name).removesuffix("\n"))

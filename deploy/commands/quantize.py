@@ -58,7 +58,7 @@ def quantize(
     """Quantise to int8 with power-of-two scales: the correction on the DPU, the 12-bit add on the host.
 
     Taken is any network that a DPU computes, of one band or several, with or without a global add; see
-    docs/any-network.md. 'check' says of a float file whether it is one of these.
+    docs/reference/any-network.md. 'check' says of a float file whether it is one of these.
 
     Prints each integer layer: bits of its accumulator, seen and proven, and the share of saturated results.
     """

@@ -1,4 +1,6 @@
-"""Hard cases and bit flips against a network and everything around it: `beers-deploy stress`, docs/stability.md.
+"""Hard cases and bit flips against a network and everything around it: `beers-deploy stress`.
+
+docs/explanation/stability.md says what comes out.
 
 - `subject` opens the pair of networks; `cases` lists the hard cases, `images` draws them;
 - `networks` and `science` look at a case at one stage; `checks` measures, and knows the limitations;

@@ -23,7 +23,8 @@ from quant.graph import Activation
 FUSED = "fused into the convolution (UG1414 3.5)"
 INSTRUCTED = "two instructions of 16 values, one a cycle of the host's slowest clock (assumed)"
 READ = (
-    "bytes over the rate at which the host hands them to the DPU (fitted, docs/cost-model.md; assumed to hold here)"
+    "bytes over the rate at which the host hands them to the DPU "
+    "(fitted, docs/explanation/cost-model.md; assumed to hold here)"
 )
 AT_ONCE, INSTRUCTIONS = 16, 2
 

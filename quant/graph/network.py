@@ -27,6 +27,8 @@ from quant.graph.operations import (
 from quant.graph.planes import PLANES
 from quant.graph.tail import Tail
 
+REMEDY = "see docs/reference/any-network.md for what 'quantize' takes; 'check' names what a DPU does not run"
+
 
 @dataclass(frozen=True)
 class Network:
@@ -62,8 +64,7 @@ class Network:
 
 def refused_graph(expected: str, got: str, remedy: str = "") -> ModelError:
     """The sentence for a network that cannot be quantised."""
-    remedy = remedy or "see docs/any-network.md for what 'quantize' takes; 'check' names what a DPU does not run"
-    return ModelError("float model", expected=expected, got=got, remedy=remedy)
+    return ModelError("float model", expected=expected, got=got, remedy=remedy or REMEDY)
 
 
 def cut(graph: Graph, channels: int, flat: bool, softmax: bool) -> Network:

@@ -4,7 +4,8 @@ The contract, of `tiling_of`: cut tiles at multiples of `lattice_px`; read each 
 it, less only where the image ends; extend the image at the bottom and right to a multiple of `lattice_px` first.
 Then a kept pixel is computed from the same numbers in the same places as in the whole image, the zeros that layers
 pad with included, and the output is `scale` times the image's size. (A runtime's float sums are the same too where
-it adds in one order: onnxruntime changes that for maps of fewer than some 80 pixels a thread, see docs/tiling.md.)
+it adds in one order: onnxruntime changes that for maps of fewer than some 80 pixels a thread, see
+docs/explanation/tiling.md.)
 
 It is found by a walk along the graph, once for the rows and once for the columns. For each tensor it carries how
 many pixels it has for one of the image (a fraction behind a pool or a stride), and for each of its pixels within one

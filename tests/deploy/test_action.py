@@ -153,12 +153,12 @@ def test_names_are_never_run(runner: Runner) -> None:
 
 
 def test_the_action_says_what_it_takes() -> None:
-    action, page = read_yaml(ACTION), (ROOT / "docs" / "gate.md").read_text(encoding="utf-8")
+    action, page = read_yaml(ACTION), (ROOT / "docs" / "how-to" / "gate.md").read_text(encoding="utf-8")
     assert action["inputs"]["sensor"]["default"] == SENSOR
     for kind in ("inputs", "outputs"):
         for name, about in action[kind].items():
             assert about["description"].endswith(".")
-            assert f"| `{name}` |" in page, f"docs/gate.md lacks the {kind[:-1]} {name}"
+            assert f"| `{name}` |" in page, f"docs/how-to/gate.md lacks the {kind[:-1]} {name}"
 
 
 def test_installing_puts_the_command_alone_on_the_path(tmp_path: Path) -> None:

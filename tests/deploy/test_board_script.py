@@ -9,7 +9,7 @@ import pytest
 
 from tests.deploy.dpu.graphs import board_convbeers
 
-SCRIPT = Path(__file__).resolve().parents[2] / "docs" / "board" / "measure.py"
+SCRIPT = Path(__file__).resolve().parents[2] / "docs" / "how-to" / "board" / "measure.py"
 
 
 @pytest.fixture

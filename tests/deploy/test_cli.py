@@ -74,11 +74,10 @@ def test_help_imports_nothing_heavy() -> None:
 
 def test_the_command_reference_is_fresh() -> None:
     root = Path(__file__).parents[2]
-    code = (
-        "import sys; sys.path.insert(0, 'docs'); from make_commands import reference; sys.stdout.write(reference())"
-    )
+    code = "import sys; from docs.make.commands import reference; sys.stdout.write(reference())"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=root)
-    assert done.stdout == (root / "docs" / "commands.md").read_text(), "run python docs/make_commands.py"
+    page = (root / "docs" / "reference" / "commands.md").read_text()
+    assert done.stdout == page, "run python docs/make/commands.py"
 
 
 def test_version() -> None:

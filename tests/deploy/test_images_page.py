@@ -1,4 +1,4 @@
-"""The commands of docs/images.md, as a reader would run them."""
+"""The commands of docs/how-to/images.md, as a reader would run them."""
 
 import re
 from pathlib import Path
@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 from deploy.cli import app
 from tests.deploy.restoration import images
 
-PAGE = Path(__file__).parents[2] / "docs" / "images.md"
+PAGE = Path(__file__).parents[2] / "docs" / "how-to" / "images.md"
 
 
 def test_the_page_s_commands_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,4 +1,4 @@
-"""The cells of docs/jp2-to-cog.ipynb, as a reader would run them, and the words that it keeps of such a run."""
+"""The cells of docs/tutorials/jp2-to-cog.ipynb, as a reader would run them, and the words it keeps of such a run."""
 
 import contextlib
 import io
@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 
 from deploy.cli import app
 
-NOTEBOOK = Path(__file__).parents[2] / "docs" / "jp2-to-cog.ipynb"
+NOTEBOOK = Path(__file__).parents[2] / "docs" / "tutorials" / "jp2-to-cog.ipynb"
 CELLS: list[dict[str, Any]] = json.loads(NOTEBOOK.read_text(encoding="utf-8"))["cells"]
 MOST_BYTES = 100_000
 """Of the whole notebook with its picture: a clone carries every version of it."""

@@ -92,7 +92,7 @@ def test_int8_is_made_once_and_shows_progress(
 @pytest.mark.parametrize("name", shipped_names())
 @pytest.mark.parametrize("sensor", [SENSOR, BLIND])
 def test_the_shipped_int8_files_are_of_these_weights_and_sensors(name: str, sensor: str, own_cache: Path) -> None:
-    """Other weights, or other numbers in a profile, need other files: docs/make_int8.py makes them."""
+    """Other weights, or other numbers in a profile, need other files: docs/make/int8.py makes them."""
     int8 = SHIPPED / f"{name}{INT8}-{sensor}.onnx"
     said = metadata(load_onnx(int8))
     sources = {"weights": sha256(shipped_weights(name)), "sensor": numbers_of(load_sensor(sensor))}

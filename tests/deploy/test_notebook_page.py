@@ -1,4 +1,4 @@
-"""The code of docs/notebook.md, as a reader would run it."""
+"""The code of docs/how-to/notebook.md, as a reader would run it."""
 
 import re
 from pathlib import Path
@@ -12,7 +12,7 @@ from deploy.networks import shipped_pair
 from deploy.restoration.options import Options
 from deploy.restoration.run import restore_file
 
-PAGE = Path(__file__).parents[2] / "docs" / "notebook.md"
+PAGE = Path(__file__).parents[2] / "docs" / "how-to" / "notebook.md"
 
 
 @pytest.mark.filterwarnings("ignore::PendingDeprecationWarning")  # between rioxarray and affine

@@ -1,4 +1,4 @@
-"""Every option of every command, as docs/make_options.py lists them: what it takes, and what it must not meet."""
+"""Every option of every command, as docs/make/options.py lists them: what it takes, and what it must not meet."""
 
 from enum import StrEnum
 from pathlib import Path
@@ -7,7 +7,7 @@ import pytest
 from typer.testing import CliRunner
 
 from deploy.cli import COMMANDS, app
-from docs.make_options import PATHS, REFUSED, TARGET, UNITS, WORDS, Parameter, Refused, page, parameters
+from docs.make.options import PATHS, REFUSED, TARGET, UNITS, WORDS, Parameter, Refused, page, parameters
 
 CASES = [(name, option, case) for name, cases in REFUSED.items() for case in cases for option in case.options]
 GIVEN = {
@@ -25,12 +25,12 @@ GIVEN = {
 
 
 def test_the_audit_is_fresh() -> None:
-    assert TARGET.read_text(encoding="utf-8") == page(), "run python docs/make_options.py"
+    assert TARGET.read_text(encoding="utf-8") == page(), "run python docs/make/options.py"
 
 
 @pytest.mark.parametrize("name", COMMANDS)
 def test_every_option_is_known(name: str) -> None:
-    """A KeyError of `kind` is an option that the tables of docs/make_options.py lack."""
+    """A KeyError of `kind` is an option that the tables of docs/make/options.py lack."""
     known = parameters(name)
     assert all(each.kind for each in known)
     names = {each.name for each in known}

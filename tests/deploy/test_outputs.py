@@ -1,6 +1,6 @@
 """One rule for every output of every command: no input, no other output, nothing but a regular file or a new name.
 
-docs/make_options.py says of every path that a command takes whether it is read or written.
+docs/make/options.py says of every path that a command takes whether it is read or written.
 """
 
 import os
@@ -18,7 +18,7 @@ from typer.main import get_command
 from typer.testing import CliRunner
 
 from deploy.cli import COMMANDS, app
-from docs.make_options import FILE, FOLDER, PATHS, Paths
+from docs.make.options import FILE, FOLDER, PATHS, Paths
 from model.io import files
 
 

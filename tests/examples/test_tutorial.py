@@ -1,4 +1,4 @@
-"""The commands of docs/own-network-tutorial.md, one after the other, on a network trained for a moment."""
+"""The commands of docs/tutorials/your-network.md, one after the other, on a network trained for a moment."""
 
 import re
 import subprocess
@@ -10,7 +10,7 @@ import pytest
 import tifffile
 
 ROOT = Path(__file__).parents[2]
-PAGE = ROOT / "docs" / "own-network-tutorial.md"
+PAGE = ROOT / "docs" / "tutorials" / "your-network.md"
 SMALLER = {"--steps 1000": "--steps 2", "--count 64": "--count 8", "--size 2048x2048": "--size 700x700 --budget 0"}
 COMMANDS = re.findall(
     r"^    ((?:python -m examples|beers-deploy).*)$", PAGE.read_text(encoding="utf-8"), re.MULTILINE

@@ -1,4 +1,4 @@
-"""docs/sensor-profile.md names every key of a profile, with its range, and no other."""
+"""docs/reference/sensor-profile.md names every key of a profile, with its range, and no other."""
 
 import math
 import re
@@ -21,7 +21,7 @@ from profiles.effects import TABLES as EFFECTS
 from profiles.sensor import MTF_NYQUIST_MAX, TABLES, same_instrument, table_keys
 from profiles.sensor_file import SINGLE, load_sensor, read_sensor, sensor_names
 
-PAGE = (Path(__file__).parents[2] / "docs" / "sensor-profile.md").read_text(encoding="utf-8")
+PAGE = (Path(__file__).parents[2] / "docs" / "reference" / "sensor-profile.md").read_text(encoding="utf-8")
 ROWS = dict(re.findall(r"^\| `(\[\w+\] \w+)` \|(.*)\|$", PAGE, re.MULTILINE))
 
 

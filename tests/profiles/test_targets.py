@@ -13,7 +13,7 @@ from profiles.errors import BeersError, ProfileError
 from profiles.target import board_names
 from profiles.toml import HERE
 
-PAGE = (HERE.parent / "docs" / "boards.md").read_text(encoding="utf-8")
+PAGE = (HERE.parent / "docs" / "reference" / "boards.md").read_text(encoding="utf-8")
 (EXAMPLE,) = re.findall(r"```toml\n(.*?)```", PAGE, re.DOTALL)
 
 

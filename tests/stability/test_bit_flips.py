@@ -155,11 +155,11 @@ def test_wrong_arguments(
 
 @pytest.fixture(scope="module")
 def maker() -> ModuleType:
-    return load_maker("make_bit_flips")
+    return load_maker("bit_flips")
 
 
 def test_the_page_is_fresh(maker: ModuleType) -> None:
-    page = (DOCS / "bit-flips.md").read_text(encoding="utf-8")
+    page = (DOCS / "explanation" / "bit-flips.md").read_text(encoding="utf-8")
     assert page.startswith(maker.OPENING + maker.FINDINGS)
     for variant in maker.VARIANTS:
         core = open_subject(None, None, variant).core

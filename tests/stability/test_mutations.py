@@ -1,4 +1,4 @@
-"""docs/mutations.md is true to the code: what would be broken is there, and so are the tests that noticed."""
+"""docs/explanation/mutations.md is true to the code: what would be broken is there, and the tests that noticed."""
 
 import re
 import shutil
@@ -11,7 +11,7 @@ import pytest
 from tests.stability.makers import load_maker
 
 ROOT = Path(__file__).resolve().parents[2]
-PAGE = ROOT / "docs" / "mutations.md"
+PAGE = ROOT / "docs" / "explanation" / "mutations.md"
 NAMES = (
     "clamp removed",
     "float32 variance",
@@ -34,7 +34,7 @@ REPORT = """<testsuites><testsuite>
 
 @pytest.fixture(scope="module")
 def maker() -> ModuleType:
-    return load_maker("make_mutations")
+    return load_maker("mutations")
 
 
 def faults(page: str, maker: ModuleType) -> list[str]:

@@ -1,4 +1,4 @@
-"""docs/stability.md names every case, stage and limitation that the code knows."""
+"""docs/explanation/stability.md names every case, stage and limitation that the code knows."""
 
 from types import ModuleType
 
@@ -14,7 +14,7 @@ from tests.stability.makers import DOCS, load_maker
 
 @pytest.fixture(scope="module")
 def maker() -> ModuleType:
-    return load_maker("make_stability")
+    return load_maker("stability")
 
 
 def faults(page: str, maker: ModuleType) -> list[str]:
@@ -27,11 +27,11 @@ def faults(page: str, maker: ModuleType) -> list[str]:
 
 
 def test_the_page_is_fresh(maker: ModuleType) -> None:
-    assert faults((DOCS / "stability.md").read_text(encoding="utf-8"), maker) == []
+    assert faults((DOCS / "explanation" / "stability.md").read_text(encoding="utf-8"), maker) == []
 
 
 def test_a_stale_page_is_found(maker: ModuleType) -> None:
-    page = (DOCS / "stability.md").read_text(encoding="utf-8")
+    page = (DOCS / "explanation" / "stability.md").read_text(encoding="utf-8")
     for text in ("\n| snow | ", LIMITATIONS[0].meaning, "| losses |"):
         assert text in page
         assert faults(page.replace(text, ""), maker)

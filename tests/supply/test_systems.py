@@ -74,7 +74,7 @@ def test_the_workflow_and_its_page_name_the_same_systems() -> None:
     pythons = [job["strategy"]["matrix"]["python"] for job in jobs.values()]
     assert pythons == [["3.11", "3.12", "3.13", "3.14"]] * 2
     assert jobs["elsewhere"]["strategy"]["matrix"]["system"] == ["macos-latest", "windows-latest"]
-    page = (ROOT / "docs" / "systems.md").read_text(encoding="utf-8")
+    page = (ROOT / "docs" / "reference" / "systems.md").read_text(encoding="utf-8")
     rows = [line.split("|") for line in page.splitlines() if "job `elsewhere`)" in line]
     assert [row[1].split(",")[0].strip() for row in rows] == ["macOS", "Windows"]
     assert {row[2].strip() for row in rows} == {f"{pythons[1][0]} to {pythons[1][-1]}"}

@@ -1,6 +1,6 @@
 """The numbers of the cost model: what is fitted, which variant of the formula a board follows, regimes of its errors.
 
-They stand in a target's [cost], where `docs/make_cost_model.py` writes what `fit` and `validation` find.
+They stand in a target's [cost], where `docs/make/cost_model.py` writes what `fit` and `validation` find.
 """
 
 from dataclasses import dataclass, fields

@@ -1,12 +1,13 @@
 """How long a network takes on the DPU, layer by layer, and how far off that may be.
 
 Counts come from `work.py`, the formula from `layers.py` and `host.py`, constants and errors from the target's [cost],
-where `docs/make_cost_model.py` writes what `fit.py` and `validation.py` find on published networks. None of them is
+where `docs/make/cost_model.py` writes what `fit.py` and `validation.py` find on published networks. None of them is
 ConvBEERS: the paper's own figure is what the model is compared with, never what it is made from.
 
 The interval is FPS e^-width to FPS e^width, so wide that nine of ten families of networks, each left out of the fit
-once, lie inside; what widths made without a family hold of it is in docs/cost-model.md. It has one width where the
-host sets the rate, one for small maps, one for large ones, and the widest where a network lies beyond all of them.
+once, lie inside; what widths made without a family hold of it is in docs/explanation/cost-model.md. It has one
+width where the host sets the rate, one for small maps, one for large ones, and the widest where a network lies beyond
+all of them.
 """
 
 import math
@@ -113,7 +114,7 @@ class Prediction:
     def latency_s(self) -> float:
         """From the first image of a batch to the last result, with one thread: one core, then one core of the host.
 
-        Its error is about that of the rate (docs/boards.md), and it shares the rate's width.
+        Its error is about that of the rate (docs/reference/boards.md), and it shares the rate's width.
         """
         return self._latency_s(self.host_s)
 

@@ -89,7 +89,9 @@ def point(name: str, psnr_db: float, host_s: float, latency_s: float | None, tex
         figures |= {key: unavailable(UNITS[key], DPU_ONLY) for key in UNITS if key.startswith("board")}
     else:
         figures |= board(
-            latency_s, 1.6 if ours else 4.5, "cost model, docs/cost-model.md" if ours else "CPU time scaled"
+            latency_s,
+            1.6 if ours else 4.5,
+            "cost model, docs/explanation/cost-model.md" if ours else "CPU time scaled",
         )
     return Row("points", name, {key: figures[key] for key in UNITS}, text)
 

@@ -1,0 +1,217 @@
+#!/usr/bin/env python3
+"""Measure a network on a board, and write what `beers-deploy bench --measured board.json` reads.
+
+Needs Python 3.8, numpy and onnxruntime with the board's execution provider; nothing of beers-deploy. Copy this file
+and the model to the board, then:
+
+    python3 measure.py core.onnx --provider VitisAIExecutionProvider --option config_file=/usr/bin/vaip_config.json \
+        --configuration C32B3 --frames 300 --threads 3 --out board.json
+
+It has been run with onnxruntime's CPU provider only, never on a board: see docs/how-to/board.md.
+"""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+import json
+import os
+import statistics
+import sys
+import threading
+import time
+from pathlib import Path
+
+import numpy as np
+
+os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")  # before it is loaded: from 1.29 on it reports its use
+import onnxruntime as ort
+
+POWER_SAMPLE_S = 0.05
+WARM_UP_CALLS = 5
+LATENCY_CALLS = 20
+
+
+def main() -> int:
+    """Open, compare, measure, write; 0 when done, 2 for what the user can correct."""
+    given = arguments()
+    try:
+        entry = measure(given)
+        write_entry(entry, given.out)
+    except (OSError, RuntimeError, ValueError) as error:
+        print(f"measure.py: {error}", file=sys.stderr)
+        return 2
+    print(f"wrote {given.out}: {entry}")
+    return 0
+
+
+def arguments() -> argparse.Namespace:
+    """What the user asks for."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("model", type=Path, help="QDQ ONNX: the file of 'beers-deploy quantize --board'")
+    parser.add_argument("--out", type=Path, default=Path("board.json"), help="JSON list; a new run is added to it")
+    parser.add_argument("--provider", default="VitisAIExecutionProvider", help="onnxruntime's execution provider")
+    parser.add_argument(
+        "--option", action="append", default=[], metavar="KEY=VALUE", help="of the provider; repeatable"
+    )
+    parser.add_argument("--configuration", default="C32B3", help="DPU in the board's bitstream, C32B1 to C64B5")
+    parser.add_argument("--tile", type=int, default=640, help="tile side in pixels")
+    parser.add_argument("--batch", type=int, default=1, help="tiles in one call")
+    parser.add_argument("--frames", type=int, default=300, help="tiles to time, after a warm-up")
+    parser.add_argument("--threads", type=int, default=1, help="calls in flight; try 1, 2, 3, ... batch handlers")
+    parser.add_argument(
+        "--power-file",
+        type=Path,
+        action="append",
+        default=[],
+        help="microwatts, such as hwmon's power1_input; repeatable, summed",
+    )
+    parser.add_argument("--no-compare", action="store_true", help="skip the comparison with the CPU provider")
+    return parser.parse_args()
+
+
+def measure(given: argparse.Namespace) -> dict[str, object]:
+    """One run, as an entry of the list."""
+    session = open_session(given.model, given.provider, dict(option.split("=", 1) for option in given.option))
+    feed = make_feed(session, given.batch, given.tile)
+    if not given.no_compare:
+        compare(given.model, session, feed)
+    latency_s = time_calls(session, feed)
+    print(
+        f"latency of a call of {given.batch}: median {1e3 * latency_s:.2f} ms over {LATENCY_CALLS} calls, one thread"
+    )
+    with PowerMeter(given.power_file) as meter:
+        stamps = run_threads(session, feed, -(-given.frames // given.batch), given.threads)
+    fps = throughput(stamps, given.batch)
+    print(f"throughput: {fps:.3f} frame/s over {len(stamps) * given.batch} frames, {given.threads} threads")
+    entry: dict[str, object] = {
+        "model": given.model.name,
+        "configuration": given.configuration,
+        "tile_px": given.tile,
+        "fps": round(fps, 4),
+    }
+    if meter.samples_w:
+        entry["power_w"] = round(statistics.fmean(meter.samples_w), 3)
+    return entry
+
+
+def open_session(model: Path, provider: str, options: dict[str, str]) -> ort.InferenceSession:
+    """A session that really runs on the provider.
+
+    Raises:
+        ValueError: the provider is not there, or onnxruntime fell back to another.
+    """
+    if provider not in ort.get_available_providers():
+        raise ValueError(f"expected the provider {provider}, got only {', '.join(ort.get_available_providers())}")
+    if not model.is_file():
+        raise ValueError(f"{model}: expected an ONNX file, got no such file")
+    session = ort.InferenceSession(str(model), providers=[provider], provider_options=[options])
+    if session.get_providers()[0] != provider:
+        raise ValueError(f"{provider} did not take the model: onnxruntime fell back to {session.get_providers()[0]}")
+    return session
+
+
+def make_feed(session: ort.InferenceSession, batch: int, tile_px: int) -> dict[str, np.ndarray]:
+    """Noise that survives quantisation unchanged: multiples of 2^-7, or int8 itself; the same at every run."""
+    random, feed = np.random.default_rng(0), {}
+    for tensor in session.get_inputs():
+        shape = [batch, tensor.shape[1], tile_px, tile_px]
+        if any(isinstance(size, int) and size != wanted for size, wanted in zip(tensor.shape, shape)):  # noqa: B905
+            raise ValueError(f"{tensor.name} is fixed to {tensor.shape}, not {shape}: give its --tile and --batch")
+        values = random.integers(-100, 100, shape)
+        feed[tensor.name] = values.astype(np.int8) if "int8" in tensor.type else (values / 128).astype(np.float32)
+    return feed
+
+
+def compare(model: Path, session: ort.InferenceSession, feed: dict[str, np.ndarray]) -> None:
+    """Print how far the outputs lie from the CPU provider's: what compiles may still compute other numbers."""
+    expected = ort.InferenceSession(str(model), providers=["CPUExecutionProvider"]).run(None, feed)
+    for tensor, ours, reference in zip(session.get_outputs(), session.run(None, feed), expected):  # noqa: B905
+        difference = np.abs(ours.astype(np.float64) - reference)
+        print(
+            f"{tensor.name}: largest difference from the CPU provider {difference.max():.3g}, "
+            f"mean {difference.mean():.3g}, {100 * np.mean(difference > 0):.1f} % of values differ"
+        )
+
+
+def time_calls(session: ort.InferenceSession, feed: dict[str, np.ndarray]) -> float:
+    """Median seconds of a call, one at a time, after a warm-up."""
+    for _ in range(WARM_UP_CALLS):
+        session.run(None, feed)
+    times_s = []
+    for _ in range(LATENCY_CALLS):
+        start = time.perf_counter()
+        session.run(None, feed)
+        times_s.append(time.perf_counter() - start)
+    return statistics.median(times_s)
+
+
+def run_threads(session: ort.InferenceSession, feed: dict[str, np.ndarray], calls: int, threads: int) -> list[float]:
+    """When each of so many calls ended, in seconds, several in flight at a time."""
+    stamps: list[float] = []
+    numbers, lock = itertools.count(), threading.Lock()
+
+    def work() -> None:
+        while True:
+            with lock:
+                if next(numbers) >= calls:
+                    return
+            session.run(None, feed)
+            stamps.append(time.perf_counter())
+
+    workers = [threading.Thread(target=work) for _ in range(threads)]
+    for worker in workers:
+        worker.start()
+    for worker in workers:
+        worker.join()
+    return sorted(stamps)
+
+
+def throughput(stamps: list[float], batch: int) -> float:
+    """Frames a second: (N - 1) / (t_N - t_1) calls, free of the latency of the first.
+
+    Raises:
+        ValueError: fewer than two calls.
+    """
+    if len(stamps) < 2:
+        raise ValueError(f"expected at least two calls, got {len(stamps)}: give more --frames")
+    return batch * (len(stamps) - 1) / (stamps[-1] - stamps[0])
+
+
+class PowerMeter:
+    """Samples the sum of some power files while a block runs."""
+
+    def __init__(self, files: list[Path]) -> None:
+        self.samples_w: list[float] = []
+        self._files, self._done = files, threading.Event()
+        self._thread = threading.Thread(target=self._sample, daemon=True)
+
+    def __enter__(self) -> PowerMeter:
+        if self._files:
+            self.samples_w.append(self._read_w())
+            self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._done.set()
+        if self._files:
+            self._thread.join()
+
+    def _sample(self) -> None:
+        while not self._done.wait(POWER_SAMPLE_S):
+            self.samples_w.append(self._read_w())
+
+    def _read_w(self) -> float:
+        return sum(int(file.read_text(encoding="utf-8")) for file in self._files) / 1e6
+
+
+def write_entry(entry: dict[str, object], path: Path) -> None:
+    """Add a run to the list in a file."""
+    runs = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else []
+    if not isinstance(runs, list):
+        raise ValueError(f"{path}: expected a JSON list of runs, got {type(runs).__name__}: give another --out")
+    path.write_text(json.dumps([*runs, entry], indent=1) + "\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    sys.exit(main())

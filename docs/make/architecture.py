@@ -1,0 +1,82 @@
+"""Draw the packages in docs/explanation/architecture.md from what their files import, as a Mermaid flowchart.
+
+An arrow is drawn where a file of one imports a file of the other, late imports included, unless a longer way along
+other arrows says it already. Run it in the checkout's root, with the checkout on PYTHONPATH.
+"""
+
+import ast
+from collections import defaultdict
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[2]
+PAGE = ROOT / "docs" / "explanation" / "architecture.md"
+PACKAGES = ("deploy", "quant", "model", "profiles")
+WHOLE = ("quant", "profiles")
+"""Drawn as one box each."""
+BEGIN, END = "<!-- packages: made by docs/make/architecture.py -->\n", "<!-- end of packages -->\n"
+
+
+def box_of(name: str) -> str:
+    """The box that a module is drawn in: its top-level package, or the package or the module one level below."""
+    parts = name.split(".")
+    return parts[0] if parts[0] in WHOLE else ".".join(parts[:2])
+
+
+def modules() -> dict[str, Path]:
+    """Every module by its name, but for the files that only say what a package offers."""
+    files = [path for package in PACKAGES for path in sorted((ROOT / package).rglob("*.py"))]
+    named = {".".join(path.relative_to(ROOT).with_suffix("").parts): path for path in files}
+    return {name: path for name, path in named.items() if path.name != "__init__.py"}
+
+
+def imports_of(path: Path, known: dict[str, Path]) -> set[str]:
+    """The modules of ours that a file imports, anywhere in it."""
+    found: set[str] = set()
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.ImportFrom) and node.module:
+            found |= {f"{node.module}.{alias.name}" for alias in node.names} | {node.module}
+    return found & known.keys()
+
+
+def arrows() -> dict[str, set[str]]:
+    """From each box to those that it needs."""
+    known, found = modules(), defaultdict[str, set[str]](set)
+    for name, path in known.items():
+        found[box_of(name)] |= {box_of(other) for other in imports_of(path, known)} - {box_of(name)}
+    return dict(found)
+
+
+def beyond(box: str, edges: dict[str, set[str]]) -> set[str]:
+    """All that a box needs by way of others."""
+    seen, waiting = set[str](), list(edges.get(box, ()))
+    while waiting:
+        for further in edges.get(waiting.pop(), set()) - seen:
+            seen.add(further)
+            waiting.append(further)
+    return seen
+
+
+def chart() -> str:
+    """The Mermaid text: a frame a package, a box a part, and the arrows that no longer way replaces."""
+    edges = arrows()
+    boxes = sorted(set(edges).union(*edges.values()))
+    lines = ["flowchart TD"]
+    for package in PACKAGES:
+        inside = [box for box in boxes if box.startswith(f"{package}.")]
+        if not inside:
+            lines.append(f"  {package}")
+            continue
+        lines += [f"  subgraph {package}", *(f"    {box}[{box.split('.')[1]}]" for box in inside), "  end"]
+    for box in boxes:
+        lines += [f"  {box} --> {other}" for other in sorted(edges.get(box, set()) - beyond(box, edges))]
+    return "\n".join(["```mermaid", *lines, "```", ""])
+
+
+def page(text: str) -> str:
+    """The page with the picture as it is now."""
+    before, rest = text.split(BEGIN)
+    return before + BEGIN + chart() + END + rest.split(END)[1]
+
+
+if __name__ == "__main__":
+    PAGE.write_text(page(PAGE.read_text(encoding="utf-8")), encoding="utf-8")

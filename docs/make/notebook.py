@@ -1,0 +1,44 @@
+"""Shows the tutorials' notebooks as pages of the site: a hook of MkDocs, which mkdocs.yml names.
+
+`tutorials/NAME.ipynb` becomes the page `tutorials/NAME.md` as the site is built; no such file is written. Code
+becomes fenced code, printed text a block, a picture an image inside the page. The notebook itself stays beside it.
+"""
+
+import json
+from pathlib import Path
+from typing import Any
+
+from mkdocs.config.defaults import MkDocsConfig
+from mkdocs.structure.files import File, Files
+
+
+def on_files(files: Files, config: MkDocsConfig) -> Files:
+    """Add a page for each notebook."""
+    for file in list(files):
+        if file.src_uri.endswith(".ipynb"):
+            name = Path(file.src_uri)
+            text = page(json.loads(file.content_string), name.name)
+            files.append(File.generated(config, str(name.with_suffix(".md").as_posix()), content=text))
+    return files
+
+
+def page(notebook: dict[str, Any], name: str) -> str:
+    """The notebook as Markdown, with a link to the file at its end."""
+    parts = [part for cell in notebook["cells"] for part in cell_parts(cell)]
+    return "\n\n".join([*parts, f"[The notebook itself]({name}), to run."]) + "\n"
+
+
+def cell_parts(cell: dict[str, Any]) -> list[str]:
+    """A cell as Markdown, then what it gave."""
+    source = "".join(cell["source"])
+    if cell["cell_type"] == "markdown":
+        return [source]
+    return [f"```python\n{source}\n```", *(output_part(output) for output in cell["outputs"])]
+
+
+def output_part(output: dict[str, Any]) -> str:
+    """What a cell gave: a picture where there is one, its text where there is none."""
+    data = output.get("data", {})
+    if "image/png" in data:
+        return f"![What the cell shows](data:image/png;base64,{''.join(data['image/png']).replace(chr(10), '')})"
+    return f"```text\n{''.join(output.get('text') or data.get('text/plain', [])).rstrip()}\n```"

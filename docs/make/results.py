@@ -1,0 +1,97 @@
+"""Puts the figures of an evaluation into the pages of docs/results: the tables between their markers.
+
+    beers-deploy evaluate --images aerial-test/ --sweep ... --json evaluation.json
+    python docs/make/results.py evaluation.json
+
+A table lies between `<!-- NAME -->` and `<!-- end -->`, NAME being that of the document's table; what the document
+does not hold stays as it is.
+"""
+
+import re
+import sys
+from collections.abc import Iterable, Mapping
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from profiles.toml import read_json
+
+PAGES = Path(__file__).parents[1] / "results"
+MARKED = re.compile(r"(<!-- (?P<name>[^>]+?) -->\n)(?P<table>.*?)(<!-- end -->\n)", re.DOTALL)
+DIGITS = {"dB": 2, "%": 1, "ratio": 4, "distance": 4}
+
+Figure = Mapping[str, Any]
+Row = Mapping[str, Any]
+
+
+def main() -> None:
+    """Fill each table that a document given holds, on whichever page it stands; the last document counts."""
+    tables: dict[str, list[Row]] = {}
+    for path in map(Path, sys.argv[1:]):
+        tables |= tables_of(path)
+    for page in sorted(PAGES.glob("*.md")):
+        text = page.read_text(encoding="utf-8")
+        page.write_text(MARKED.sub(partial(filled, tables), text), encoding="utf-8", newline="")
+
+
+def tables_of(path: Path) -> dict[str, list[Row]]:
+    """The rows of a document, by their table."""
+    document: Any = read_json(path)
+    tables: dict[str, list[Row]] = {}
+    for row in document["rows"]:
+        tables.setdefault(row["table"], []).append(row)
+    return tables
+
+
+def filled(tables: Mapping[str, list[Row]], found: re.Match[str]) -> str:
+    """A marked table made anew, or as it stands where the document has none of that name."""
+    name = found["name"]
+    if name not in tables:
+        return found[0]
+    made = mean_table(tables[name]) if name == "mean" else plain_table(tables[name])
+    return f"{found[1]}{made}{found[4]}"
+
+
+def mean_table(rows: Iterable[Row]) -> str:
+    """Methods down, what the page speaks of across; the paper's rows stand elsewhere."""
+    ours = [row for row in rows if not row["name"].startswith("paper")]
+    keys = ["PSNR", "PSNR gain", "PSNR, reference without noise", "SSIM", "LPIPS-squeeze", "MTF at Nyquist"]
+    keys += [key for key in ours[0]["figures"] if key.startswith("SNR")]
+    head = ["method", "sensor", *(f"{key} {unit(ours, key)}".replace(" ratio", "") for key in keys)]
+    return markdown(
+        head, [[r["name"], r["text"]["sensor"], *(shown(r["figures"].get(k)) for k in keys)] for r in ours]
+    )
+
+
+def plain_table(rows: list[Row]) -> str:
+    """A row a line, a column for each figure that any has; intervals of differences alone."""
+    keys = list(dict.fromkeys(key for row in rows for key in row["figures"]))
+    differences = "gain" in rows[0]["table"] or "lost" in rows[0]["table"]
+    cells = ([shown(row["figures"].get(key), differences) for key in keys] for row in rows)
+    return markdown(["", *keys], [[row["name"], *line] for row, line in zip(rows, cells, strict=True)])
+
+
+def unit(rows: Iterable[Row], key: str) -> str:
+    """The unit of a figure, in the first row that has it."""
+    return next((str(row["figures"][key]["unit"]) for row in rows if key in row["figures"]), "")
+
+
+def shown(figure: Figure | None, interval: bool = True) -> str:
+    """A figure as the page writes it, with its interval where there is one."""
+    if figure is None or figure.get("value") is None:
+        return str(figure["source"]) if figure and figure.get("unit") == "" else "-"
+    digits = 0 if figure["unit"] == "ratio" and figure["value"] > 2 else DIGITS.get(figure["unit"], 2)
+    text, ends = f"{figure['value']:.{digits}f}", figure.get("interval")
+    return f"{text} [{ends[0]:.{digits}f}, {ends[1]:.{digits}f}]" if ends and interval else text
+
+
+def markdown(head: list[str], lines: Iterable[list[str]]) -> str:
+    """A table in Markdown."""
+    rule = "|".join("---" for _ in head)
+    return "".join(
+        f"{line}\n" for line in (f"| {' | '.join(head)} |", f"|{rule}|", *(f"| {' | '.join(x)} |" for x in lines))
+    )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,80 @@
+"""Every command that a page shows is read by the command line itself: a changed option fails here. None is run."""
+
+import re
+import shlex
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+import typer
+from typer.core import TyperGroup
+from typer.main import get_command
+
+from deploy.cli import app
+
+ROOT = Path(__file__).parents[2]
+PAGES = sorted([ROOT / "README.md", ROOT / "CONTRIBUTING.md", *(ROOT / "docs").rglob("*.md")])
+GENERATED_FROM_IT = ("commands.md", "options.md")
+NAME = "beers-deploy"
+UsageError: type[Exception] = typer.BadParameter.__bases__[0]
+"""Of click, which Typer may bring itself."""
+
+
+def commands(text: str) -> Iterator[str]:
+    """Of blocks, fenced and indented, and of code within a sentence; lines that end in a backslash are joined."""
+    for line in re.sub(r"\\\n\s*", "", text).splitlines():
+        if re.match(rf"(    |\$ )?(\S+/)?{NAME} ", line):
+            yield line.strip()
+        else:
+            yield from re.findall(rf"`({NAME} [^`]+)`", line)
+
+
+def words_of(line: str) -> list[str]:
+    """What stands behind the program's name, up to a comment or the next program."""
+    line = line.replace("`", "").replace(r"\|", "|")
+    words = shlex.split(line[line.index(NAME) :], comments=True)[1:]
+    ends = [place for place, word in enumerate(words) if word in {"&&", "|", ">", "..."}]
+    return words[: ends[0]] if ends else words
+
+
+def refusal(line: str) -> str:
+    """What the command line says against it; nothing where it is read."""
+    group = get_command(app)
+    assert isinstance(group, TyperGroup)
+    name, *words = words_of(line) or ["--help"]
+    if name in {"--help", "--version", "--verbose"}:
+        return ""
+    if name not in group.commands:
+        return f"{line}: no command {name}"
+    if not words:
+        return ""  # a command's name, within a sentence
+    try:
+        group.commands[name].make_context(name, words)
+    except typer.Exit:
+        return ""
+    except UsageError as error:
+        return f"{line}: {error}"
+    return ""
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_every_command_of_a_page_is_read_by_the_command_line(page: Path) -> None:
+    found = [] if page.name in GENERATED_FROM_IT else [*commands(page.read_text(encoding="utf-8"))]
+    assert [said for said in map(refusal, found) if said] == []
+
+
+def test_pages_have_commands_in_each_way_of_writing_them() -> None:
+    whole = [line for page in PAGES for line in commands(page.read_text(encoding="utf-8"))]
+    assert len(whole) > 80
+    assert [
+        *commands(f"    {NAME} check a.onnx\nsee `{NAME} info b.tif`\n```bash\n{NAME} bench \\\n  --size 2x2\n```")
+    ] == [
+        f"{NAME} check a.onnx",
+        f"{NAME} info b.tif",
+        f"{NAME} bench --size 2x2",
+    ]
+
+
+@pytest.mark.parametrize("line", ["bench --no-such-option", "no-such-command", "check --tile many", "gate a b c d"])
+def test_a_wrong_command_is_refused(line: str) -> None:
+    assert refusal(f"{NAME} {line}")

@@ -1,0 +1,102 @@
+"""What files say of the documentation is there: paths of pages, links, keys of generated pages, words, exit codes."""
+
+import re
+import subprocess
+import tomllib
+from pathlib import Path
+
+import pytest
+
+from deploy.cli import COMMANDS
+from docs.make import api, target_file
+from profiles.effects import TABLES
+from profiles.scene_call import load_scene_call, scene_names
+
+ROOT = Path(__file__).parents[2]
+DOCS = ROOT / "docs"
+PATH = re.compile(r"(?<![\w/.-])docs/[\w./-]*\w\.(?:md|py|toml|svg|png|ipynb)\b")
+LINK = re.compile(r"\]\((?!https?:|data:|#)([^)#\s]+)")
+TERMS = ("halo", "told sensor", "DPU", "MTF", "residual stream", "encoding", "gate", "swath", "haze", "dominated")
+
+
+def tracked() -> list[Path]:
+    command = ["git", "ls-files", "-z"]
+    names = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True).stdout
+    texts = (".md", ".py", ".toml", ".yml", ".cff", ".html", ".ipynb")
+    return [ROOT / name for name in names.split("\0") if name.endswith(texts) or name == ".ci/run"]
+
+
+def test_paths_of_the_documentation_are_there() -> None:
+    """But for the change log, which tells of pages as they were."""
+    named = {
+        (path.relative_to(ROOT), word)
+        for path in tracked()
+        if path.name not in {"CHANGELOG.md", Path(__file__).name}
+        for word in PATH.findall(path.read_text(encoding="utf-8"))
+    }
+    assert len(named) > 100
+    assert [(str(path), word) for path, word in sorted(named) if not (ROOT / word).exists()] == []
+
+
+@pytest.mark.parametrize("name", ["README.md", "CONTRIBUTING.md", "model/weights/convbeers-s.md"])
+def test_links_outside_of_the_site_lead_somewhere(name: str) -> None:
+    page = ROOT / name
+    targets = LINK.findall(page.read_text(encoding="utf-8"))
+    assert targets
+    assert [target for target in targets if not (page.parent / target).exists()] == []
+
+
+def test_generated_pages_are_fresh() -> None:
+    """Else run python docs/make/api.py, python docs/make/target_file.py."""
+    for maker in (api, target_file):
+        assert maker.TARGET.read_text(encoding="utf-8") == maker.document(), f"run python {maker.__file__}"
+
+
+def test_a_boards_keys_are_those_that_have_a_meaning() -> None:
+    shipped = {table: {*keys} for table, keys in target_file.shipped().items()}
+    assert {table: {*keys} for table, keys in target_file.KEYS.items()} == shipped
+
+
+def test_the_scenes_page_is_true() -> None:
+    page = (DOCS / "reference" / "scene-file.md").read_text(encoding="utf-8")
+    (example,) = re.findall(r"```toml\n(.*?)```", page, re.DOTALL)
+    assert {*tomllib.loads(example)} <= {"description", "radiance_scale", "without", *TABLES}
+    assert re.findall(r"Shipped: (.*)\.", page) == [", ".join(f"`{name}`" for name in scene_names())]
+
+
+def test_the_scenes_example_is_a_scene(tmp_path: Path) -> None:
+    page = (DOCS / "reference" / "scene-file.md").read_text(encoding="utf-8")
+    (example,) = re.findall(r"```toml\n(.*?)```", page, re.DOTALL)
+    (tmp_path / "mine.toml").write_text(example, encoding="utf-8")
+    assert load_scene_call(str(tmp_path / "mine.toml")).without == ("striping",)
+
+
+def test_the_commands_that_give_a_verdict_are_named() -> None:
+    page = (DOCS / "reference" / "exit-codes.md").read_text(encoding="utf-8")
+    failing = {
+        name
+        for name in COMMANDS
+        if "Exit(1)" in (ROOT / "deploy" / "commands" / f"{name}.py").read_text(encoding="utf-8")
+    }
+    assert {*re.findall(r"^\| `(\w+)` \|", page, re.MULTILINE)} == failing
+
+
+def test_the_glossary_has_the_words_of_the_pages() -> None:
+    page = (DOCS / "reference" / "glossary.md").read_text(encoding="utf-8")
+    terms = " ".join(re.findall(r"^\| (.*?) \|", page, re.MULTILINE))
+    assert [term for term in TERMS if term not in terms] == []
+
+
+def test_the_citation_is_of_this_version() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    cited = dict(re.findall(r"^([\w-]+): (.+)$", (ROOT / "CITATION.cff").read_text(encoding="utf-8"), re.MULTILINE))
+    assert (cited["cff-version"], cited["version"]) == ("1.2.0", project["version"])
+    assert cited["license"] == project["license"]
+
+
+def test_the_site_is_built_from_what_the_extra_asks_for() -> None:
+    extra = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["optional-dependencies"]
+    workflow = (ROOT / ".github" / "workflows" / "docs.yml").read_text(encoding="utf-8")
+    installed = re.findall(r"pip install (.*?')(?: #.*)?$", workflow, re.MULTILINE)
+    assert installed
+    assert all(re.findall(r"'(.*?)'", line) == extra["docs"] for line in installed)

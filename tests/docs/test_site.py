@@ -1,0 +1,189 @@
+"""The documentation's site, built strictly and looked at in a real browser; skipped where either is missing.
+
+`pip install -e '.[dev,docs]'` brings MkDocs. Every page is opened at the width of a desk and of a telephone.
+"""
+
+import json
+import re
+import subprocess
+import sys
+from collections.abc import Callable
+from functools import partial
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
+from importlib.util import find_spec
+from pathlib import Path
+from queue import Queue
+from threading import Thread
+from typing import Any
+from urllib.parse import urlsplit
+
+import pytest
+
+from tests.deploy.tradeoff.browser import browser
+
+Run = Callable[..., Any]
+
+ROOT = Path(__file__).parents[2]
+WIDTHS_PX = (1280, 390)
+ASKED = {"halo": "tiling", "KV260": "boards", "told sensor": "glossary"}
+"""What a reader may search for, and the page that must be among the first ten found."""
+FIRST = 10
+TIMEOUT_S = 240
+HARNESS = """<!doctype html><body><script>
+const sleep = (ms) => new Promise((done) => setTimeout(done, ms));
+const frame = (address, width) => new Promise((done) => {
+  const made = document.createElement("iframe");
+  Object.assign(made, { width, height: 900, onload: () => done(made) });
+  made.src = address;
+  document.body.append(made);
+});
+const tell = (report) => fetch("/told", { method: "POST", body: JSON.stringify(report) });
+const drive = async () => { %s };
+drive().then(tell, (error) => tell({ failed: String(error) + error.stack }));
+</script></body>"""
+LOOK = """
+const report = [];
+for (const address of %s) {
+  const shown = await frame(address, 1280), page = shown.contentDocument, root = page.documentElement;
+  for (const width of %s) {
+    shown.width = width;
+    await sleep(50);
+    report.push({
+      address, width,
+      over: root.scrollWidth - root.clientWidth,
+      broken: [...page.images].filter((each) => !each.naturalWidth).map((each) => each.getAttribute("src")),
+      scheme: page.body.getAttribute("data-md-color-scheme"),
+      back: getComputedStyle(page.body).backgroundColor,
+      words: getComputedStyle(page.body).color,
+      elsewhere: shown.contentWindow.performance.getEntriesByType("resource").map((each) => each.name)
+        .filter((each) => !each.startsWith(location.origin) && !each.startsWith("data:")),
+    });
+  }
+  shown.remove();
+}
+return report;
+"""
+SEARCH = """
+const shown = await frame("index.html", 1280), page = shown.contentDocument;
+const box = page.querySelector("[data-md-component=search-query]"), report = {};
+page.querySelector("#__search").checked = true;
+box.focus();
+const found = () => [...page.querySelectorAll(".md-search-result__link")].map((each) => each.getAttribute("href"));
+for (const words of %s) {
+  box.value = words;
+  box.dispatchEvent(new Event("keyup", { bubbles: true }));
+  box.dispatchEvent(new Event("input", { bubbles: true }));
+  for (let tries = 0; tries < 50 && !(found().length && found()[0].includes(encodeURI(words.split(" ")[0]))); tries++)
+    await sleep(200);
+  report[words] = found();
+}
+return report;
+"""
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    if find_spec("mkdocs") is None:
+        pytest.skip("no MkDocs here: pip install -e '.[docs]'")
+    folder = tmp_path_factory.mktemp("site")
+    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--quiet", "--site-dir", str(folder)]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    return folder
+
+
+class Server(SimpleHTTPRequestHandler):
+    """Serves the site, a page with a script in it, and takes what the script tells."""
+
+    def __init__(self, script: str, told: "Queue[Any]", *given: Any, directory: str) -> None:
+        self.script, self.told = script, told
+        super().__init__(*given, directory=directory)
+
+    def log_message(self, *_: object) -> None:
+        """Say nothing."""
+
+    def do_GET(self) -> None:
+        if self.path.endswith("search_index.json") and self.script.startswith(LOOK[:20]):
+            return self.answer(404, b"")  # a megabyte that every page would read, and look for nothing in it
+        if self.path != "/harness":
+            return super().do_GET()
+        return self.answer(200, (HARNESS % self.script).encode())
+
+    def do_POST(self) -> None:
+        self.told.put(json.loads(self.rfile.read(int(self.headers["Content-Length"]))))
+        self.answer(200, b"")
+
+    def answer(self, status: int, body: bytes) -> None:
+        self.send_response(status)
+        self.send_header("Content-Type", "text/html")
+        self.send_header("Content-Length", str(len(body)))
+        self.end_headers()
+        self.wfile.write(body)
+
+
+@pytest.fixture
+def run(site: Path, tmp_path: Path) -> Run:
+    """What a script answers in a page of the site."""
+
+    def answer(script: str, *, dark: bool = False) -> Any:
+        told: Queue[Any] = Queue()
+        handler = partial(Server, script, told, directory=str(site))
+        with ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
+            thread = Thread(target=server.serve_forever)
+            thread.start()
+            address = f"http://127.0.0.1:{server.server_address[1]}/harness"
+            started = subprocess.Popen([*command(tmp_path, dark=dark), address], stderr=subprocess.DEVNULL)
+            try:
+                report = told.get(timeout=TIMEOUT_S)
+            finally:
+                started.terminate()
+                started.wait()
+                server.shutdown()
+                thread.join()
+        assert "failed" not in report, report["failed"]
+        return report
+
+    return answer
+
+
+def command(profile: Path, *, dark: bool) -> list[str]:
+    options = ["--headless", "--no-sandbox", "--disable-gpu", "--remote-debugging-port=0", "--window-size=1400,1000"]
+    options += [f"--user-data-dir={profile}", f"--blink-settings=preferredColorScheme={0 if dark else 1}"]
+    return [browser(), *options]
+
+
+def pages(site: Path) -> list[str]:
+    return sorted(str(path.relative_to(site)) for path in site.rglob("*.html") if path.name == "index.html")
+
+
+def test_no_page_is_wider_than_its_window_and_every_picture_loads(site: Path, run: Run) -> None:
+    looks = run(LOOK % (json.dumps(pages(site)), json.dumps(WIDTHS_PX)))
+    assert len(looks) == len(pages(site)) * len(WIDTHS_PX) > 80
+    assert [(each["address"], each["width"], each["over"]) for each in looks if each["over"] > 0] == []
+    assert [(each["address"], each["broken"]) for each in looks if each["broken"]] == []
+
+
+@pytest.mark.parametrize(("dark", "scheme"), [(False, "default"), (True, "slate")])
+def test_the_colours_are_those_that_the_reader_prefers(site: Path, run: Run, dark: bool, scheme: str) -> None:
+    some = [page for page in pages(site) if page.count("/") < 2]
+    for look in run(LOOK % (json.dumps(some), json.dumps(WIDTHS_PX)), dark=dark):
+        assert look["scheme"] == scheme
+        assert (brightness(look["back"]) < brightness(look["words"])) is dark
+
+
+def brightness(colour: str) -> float:
+    return sum(float(each) for each in re.findall(r"[\d.]+", colour)[:3])
+
+
+def test_pages_ask_nothing_of_other_places(site: Path, run: Run) -> None:
+    """But for Mermaid, which the published site has beside it: see mkdocs.yml."""
+    some = [page for page in pages(site) if "architecture" not in page][::6]
+    looks = run(LOOK % (json.dumps(some), json.dumps(WIDTHS_PX[:1])))
+    assert [each["elsewhere"] for each in looks if each["elsewhere"]] == []
+
+
+def test_the_search_finds_what_readers_look_for(run: Run) -> None:
+    found = run(SEARCH % json.dumps([*ASKED]))
+    for words, wanted in ASKED.items():
+        first = [*dict.fromkeys(urlsplit(address).path for address in found[words])][:FIRST]
+        assert any(path.endswith(f"/{wanted}/") for path in first), (words, first)
