@@ -41,3 +41,25 @@ def test_your_sensor(tmp_path: Path) -> None:
     walked("your-sensor", tmp_path)
     assert (tmp_path / "report" / "report.html").is_file()
     assert tifffile.imread(tmp_path / "network.tif").shape == (256, 256)
+
+
+def test_your_network(tmp_path: Path) -> None:
+    walked("your-network", tmp_path)
+    raw, restored = (tifffile.imread(tmp_path / name) for name in ("pairs/degraded/0000-drawn.tif", "restored.tif"))
+    assert (restored.shape, restored.dtype) == (raw.shape, raw.dtype)
+    assert (restored != raw).any()
+
+
+def test_gate_in_ci(tmp_path: Path) -> None:
+    """Beside the commands: the workflow gives the action inputs that it has, and files that the page made."""
+    import yaml  # type: ignore[import-untyped]
+
+    walked("gate-in-ci", tmp_path)
+    action, workflow = (
+        yaml.safe_load(path.read_text(encoding="utf-8"))
+        for path in (ROOT / "action.yml", tmp_path / ".github" / "workflows" / "gate.yml")
+    )
+    given = workflow["jobs"]["gate"]["steps"][1]["with"]
+    assert set(given) <= set(action["inputs"])
+    assert all((tmp_path / path).is_file() for path in given.values())
+    assert 'failures="1"' in (tmp_path / "gate.xml").read_text(encoding="utf-8")

@@ -26,7 +26,7 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[2]
 PROGRAMS = {"beers-deploy": [sys.executable, "-c", "from deploy.cli import app; app()"], "python": [sys.executable]}
 PART = re.compile(r'^```(\w+)(?: title="([^"]+)")?\n(.*?)^```$|^<!-- test: (.+?) -->$', re.MULTILINE | re.DOTALL)
-NUMBER = re.compile(r"(?<![\w.])\d[\d,]*(?:\.\d+)?(?:e[-+]?\d+)?")
+NUMBER = re.compile(r"(?<![\w.])-?\d[\d,]*(?:\.\d+)?(?:e[-+]?\d+)?")
 RELATIVE = 0.02
 
 
