@@ -63,3 +63,10 @@ def test_gate_in_ci(tmp_path: Path) -> None:
     assert set(given) <= set(action["inputs"])
     assert all((tmp_path / path).is_file() for path in given.values())
     assert 'failures="1"' in (tmp_path / "gate.xml").read_text(encoding="utf-8")
+
+
+def test_accuracy_and_time(tmp_path: Path) -> None:
+    walked("accuracy-and-time", tmp_path)
+    files = {"tradeoff.html", "tradeoff.svg", "tradeoff.png", "points.csv", "tradeoff.json", "cache"}
+    assert {path.name for path in (tmp_path / "study").iterdir()} == files
+    assert "For latency" in (tmp_path / "study" / "tradeoff.html").read_text(encoding="utf-8")
