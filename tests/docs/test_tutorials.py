@@ -1,0 +1,72 @@
+"""Every command of docs/tutorials, as a reader would type it, and what it shows; each tutorial in an empty folder."""
+
+import re
+from pathlib import Path
+
+import pytest
+import tifffile
+
+from tests.docs.walk import ROOT, Walk
+
+FOLDER = ROOT / "docs" / "tutorials"
+PAGES = sorted({path.stem for path in FOLDER.glob("*.md")} - {"index"})
+INSTALLED = "python3 -m venv .venv && .venv/bin/pip install --quiet ."
+
+
+def walked(name: str, folder: Path) -> Walk:
+    walk = Walk(folder)
+    walk.page((FOLDER / f"{name}.md").read_text(encoding="utf-8"))
+    return walk
+
+
+@pytest.mark.parametrize("name", PAGES)
+def test_it_is_set_up_as_the_readme_says(name: str) -> None:
+    """That command is run by .ci/run, in an empty environment; it is the one fence of a tutorial that is not run."""
+    page = (FOLDER / f"{name}.md").read_text(encoding="utf-8")
+    (block,) = re.findall(r"```sh\n(.*?)```", page, re.DOTALL)
+    assert block.splitlines()[0] == INSTALLED
+    assert INSTALLED in (ROOT / "README.md").read_text(encoding="utf-8")
+    assert set(re.findall(r"^```(\w+)", page, re.MULTILINE)) <= {"sh", "bash", "text", "python", "toml", "yaml"}
+
+
+def test_restore_an_image(tmp_path: Path) -> None:
+    walked("restore-an-image", tmp_path)
+    raw = tifffile.imread(tmp_path / "pairs" / "degraded" / "0000-drawn.tif")
+    assert raw.max() < 4096
+    assert tifffile.imread(tmp_path / "known.tif").shape == raw.shape
+    assert tifffile.imread(tmp_path / "8bit-restored.tif").dtype == "uint8"
+
+
+def test_your_sensor(tmp_path: Path) -> None:
+    walked("your-sensor", tmp_path)
+    assert (tmp_path / "report" / "report.html").is_file()
+    assert tifffile.imread(tmp_path / "network.tif").shape == (256, 256)
+
+
+def test_your_network(tmp_path: Path) -> None:
+    walked("your-network", tmp_path)
+    raw, restored = (tifffile.imread(tmp_path / name) for name in ("pairs/degraded/0000-drawn.tif", "restored.tif"))
+    assert (restored.shape, restored.dtype) == (raw.shape, raw.dtype)
+    assert (restored != raw).any()
+
+
+def test_gate_in_ci(tmp_path: Path) -> None:
+    """Beside the commands: the workflow gives the action inputs that it has, and files that the page made."""
+    import yaml  # type: ignore[import-untyped]
+
+    walked("gate-in-ci", tmp_path)
+    action, workflow = (
+        yaml.safe_load(path.read_text(encoding="utf-8"))
+        for path in (ROOT / "action.yml", tmp_path / ".github" / "workflows" / "gate.yml")
+    )
+    given = workflow["jobs"]["gate"]["steps"][1]["with"]
+    assert set(given) <= set(action["inputs"])
+    assert all((tmp_path / path).is_file() for path in given.values())
+    assert 'failures="1"' in (tmp_path / "gate.xml").read_text(encoding="utf-8")
+
+
+def test_accuracy_and_time(tmp_path: Path) -> None:
+    walked("accuracy-and-time", tmp_path)
+    files = {"tradeoff.html", "tradeoff.svg", "tradeoff.png", "points.csv", "tradeoff.json", "cache"}
+    assert {path.name for path in (tmp_path / "study").iterdir()} == files
+    assert "For latency" in (tmp_path / "study" / "tradeoff.html").read_text(encoding="utf-8")

@@ -1,0 +1,155 @@
+"""Walks a page as a reader would: writes its files, runs its commands in order, and holds them to what it shows.
+
+Of a page's fences these count, in order:
+
+- any with a title, as ```toml title="my-sensor.toml": a file, written as it stands;
+- ```bash: commands, a line each, of `beers-deploy` or `python`, run without a shell (so also on Windows);
+- ```text: what the commands before it print. Each of its lines must come, in this order; `...` stands for anything,
+  blanks and rules of tables have any length, and a number must be within 2 %, for processors differ.
+
+Comments of the page say where a test differs from a reader:
+
+- `<!-- test: A -> B -->`: from here on commands have B in the place of A, once each at most in a line;
+- `<!-- test: figures vary -->`: of the next output the numbers are another machine's: only their place is compared;
+- `<!-- test: exits 1 -->`: the next commands end with this code, not with 0.
+"""
+
+import math
+import os
+import re
+import shlex
+import subprocess
+import sys
+from dataclasses import dataclass, field
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[2]
+PROGRAMS = {"beers-deploy": [sys.executable, "-c", "from deploy.cli import app; app()"], "python": [sys.executable]}
+PART = re.compile(r'^```(\w+)(?: title="([^"]+)")?\n(.*?)^```$|^<!-- test: (.+?) -->$', re.MULTILINE | re.DOTALL)
+NUMBER = re.compile(r"(?<![\w.])-?\d[\d,]*(?:\.\d+)?(?:e[-+]?\d+)?")
+RELATIVE = 0.02
+
+
+class PageError(AssertionError):
+    """The page says what does not hold, or what this module does not understand."""
+
+
+@dataclass
+class Walk:
+    """One walk through a page, in a folder of its own.
+
+    Attributes:
+        folder: where the commands run.
+        printed: what each command printed, by the command as the page has it.
+        shorter: substitutions in force, each with whether a command had it.
+    """
+
+    folder: Path
+    printed: dict[str, str] = field(default_factory=dict)
+    shorter: dict[tuple[str, str], bool] = field(default_factory=dict)
+    _code: int = 0
+    _vary: bool = False
+    _last: str = ""
+
+    def page(self, text: str) -> None:
+        """Walk through a whole page.
+
+        Raises:
+            PageError: a command ends with another code, prints something else, or a comment is of no use.
+        """
+        for language, title, body, comment in PART.findall(text):
+            if comment:
+                self._note(comment)
+            elif title:
+                self._write(title, body)
+            elif language == "bash":
+                self._run_all(body)
+            elif language == "text":
+                self._compare(body)
+        unused = [f"{long} -> {short}" for (long, short), used in self.shorter.items() if not used]
+        if unused or self._code or self._vary:
+            raise PageError(f"comments that no command or output follows: {unused or 'exits, or figures vary'}")
+
+    def _note(self, comment: str) -> None:
+        if " -> " in comment:
+            long, short = comment.split(" -> ")
+            self.shorter[long, short] = False
+        elif comment == "figures vary":
+            self._vary = True
+        elif found := re.fullmatch(r"exits (\d)", comment):
+            self._code = int(found[1])
+        else:
+            raise PageError(f"no such comment: {comment}")
+
+    def _write(self, name: str, text: str) -> None:
+        path = self.folder / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text, encoding="utf-8")
+
+    def _run_all(self, block: str) -> None:
+        expected, self._code, self._last = self._code, 0, ""
+        for command in block.replace("\\\n", " ").splitlines():
+            done = self._run(command)
+            if done.returncode != expected:
+                raise PageError(f"{command}\nended with {done.returncode}, not {expected}:\n{done.stdout}")
+            self.printed[command] = done.stdout
+            self._last += done.stdout
+
+    def _run(self, command: str) -> subprocess.CompletedProcess[str]:
+        """One command with its substitutions; both streams as a terminal shows them."""
+        short = command
+        for pair in self.shorter:
+            self.shorter[pair] |= pair[0] in short
+            short = short.replace(*pair, 1)
+        words = shlex.split(short)
+        if not words or words[0] not in PROGRAMS:
+            raise PageError(f"{command}\nis no command of {' or '.join(PROGRAMS)}")
+        return subprocess.run(
+            [*PROGRAMS[words[0]], *words[1:]],
+            cwd=self.folder,
+            env=environment(self.folder),
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            encoding="utf-8",
+            check=False,
+        )
+
+    def _compare(self, shown: str) -> None:
+        lines, vary, self._vary = iter(plain(self._last)), self._vary, False
+        for line in plain(shown):
+            if line != "..." and not any(agrees(line, found, vary) for found in lines):
+                raise PageError(f"not printed, or not in this place:\n{line}\nwhat was printed:\n{self._last}")
+
+
+def environment(folder: Path) -> dict[str, str]:
+    """What a command sees: this tree, a home of its own, one thread, and no other program."""
+    kept = {name: os.environ[name] for name in ("SYSTEMROOT", "TEMP", "BEERS_DEPLOY_CACHE") if name in os.environ}
+    ours = {"PYTHONPATH": str(ROOT), "PYTHONUNBUFFERED": "1", "PYTHONUTF8": "1", "OMP_NUM_THREADS": "1"}
+    return kept | ours | {"PATH": "", "HOME": str(folder), "USERPROFILE": str(folder)}
+
+
+def plain(text: str) -> list[str]:
+    """The lines that are not empty; blanks and rules of tables have one length."""
+    return [line for raw in text.splitlines() if (line := re.sub(r"([\s━─])\1*", r"\1", raw.strip()))]
+
+
+def agrees(shown: str, found: str, vary: bool) -> bool:
+    """Whether a line of the page is what a command printed: the same words, and numbers that are close.
+
+    Args:
+        shown: the page's, where `...` stands for anything.
+        found: the command's.
+        vary: numbers may be any.
+    """
+    parts = shown.split("...")
+    texts = (re.escape(NUMBER.sub("\0", part)).replace("\0", f"({NUMBER.pattern})") for part in parts)
+    match = re.fullmatch(".*?".join(texts), found)
+    if match is None or vary:
+        return match is not None
+    wanted = (number for part in parts for number in NUMBER.findall(part))
+    pairs = zip(wanted, match.groups(), strict=True)
+    return all(math.isclose(_value(a), _value(b), rel_tol=RELATIVE) for a, b in pairs)
+
+
+def _value(number: str) -> float:
+    return float(number.replace(",", ""))
