@@ -83,6 +83,7 @@ UNITS = {
     "drawn": "scenes",
     "draws": "draws",
     "fft_weight": "a weight",
+    "finetune": "steps",
     "gain": "DN per W/m2/sr/um, above 0",
     "gsd": "m, above 0",
     "full_scale": "pixel value above 0",
@@ -176,7 +177,7 @@ REFUSED = {
         Refused(("lpips",), "--lpips-weight 0"),
     ],
     "export": [Refused(("variant",), "--checkpoint WEIGHTS")],
-    "quantize": [Refused(("board", "ablate", "report", "without"), "--regime free")],
+    "quantize": [Refused(("board", "ablate", "report", "without", "finetune"), "--regime free")],
     "gate": [Refused(("variant",), "FLOAT INT8")],
     "check": [Refused(("picture", "tile"), "traditional")],
     "bench": [

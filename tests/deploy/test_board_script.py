@@ -16,9 +16,9 @@ SCRIPT = Path(__file__).resolve().parents[2] / "docs" / "how-to" / "board" / "me
 def script(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
     monkeypatch.syspath_prepend(str(SCRIPT.parent))
     monkeypatch.delitem(sys.modules, "measure", raising=False)
-    import measure  # type: ignore[import-not-found]
+    import measure
 
-    return measure  # type: ignore[no-any-return]
+    return measure
 
 
 def run(script: ModuleType, monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
