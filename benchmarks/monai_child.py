@@ -19,6 +19,7 @@ import os
 import sys
 import time
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import onnxruntime as ort
@@ -44,7 +45,7 @@ def main() -> None:
         with torch.inference_mode():
             restored = inferer(image, predictor(session))[0, 0].numpy()
         dn = np.rint(np.clip(restored * FULL_SCALE, 0, FULL_SCALE)).astype(np.uint16)
-        packed = {"compression": "zlib", "compressionargs": {"level": 1}, "predictor": 2}
+        packed: dict[str, Any] = {"compression": "zlib", "compressionargs": {"level": 1}, "predictor": 2}
         tifffile.imwrite(out, dn, tile=(256, 256), maxworkers=os.cpu_count(), **packed)
         print(json.dumps({"cpu_seconds": time.process_time() - before_s}), flush=True)
 

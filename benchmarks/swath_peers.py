@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import dask.array as da
 import numpy as np
@@ -87,7 +88,7 @@ def overlapped(task: Task, way: str, chunks_at_once: int) -> Run:
 
 def write(path: Path, pixels: np.ndarray) -> None:
     """As the engine writes, but for its strategy of zlib, which tifffile has no option for."""
-    packed = {"compression": "zlib", "compressionargs": {"level": 1}, "predictor": 2}
+    packed: dict[str, Any] = {"compression": "zlib", "compressionargs": {"level": 1}, "predictor": 2}
     tifffile.imwrite(path, pixels, tile=(256, 256), maxworkers=os.cpu_count(), **packed)
 
 
