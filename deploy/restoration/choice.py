@@ -37,7 +37,7 @@ KIND = "runtime"
 SIDES_PX = (320, 448, 896)
 """Sides of tiles that are tried beside the usual one."""
 FLOAT_LEAST_PX = TILE_PX
-"""Of float networks: for small maps a runtime may add in another order (docs/tiling.md)."""
+"""Of float networks: for small maps a runtime may add in another order (docs/explanation/tiling.md)."""
 
 WALL, PROCESSOR = "the wall's clock", "processor time"
 """What times are compared by. Where others use the cores, the wall's clock tells of them."""
