@@ -5,11 +5,13 @@ overlap and runtime, interleaved. `monai_child.py` says how to make MONAI's envi
 """
 
 import json
+import os
 import subprocess
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import dask.array as da
 import numpy as np
@@ -17,7 +19,7 @@ import onnx
 import tifffile
 
 from deploy.restoration.engine import restore_window
-from deploy.restoration.options import Options
+from deploy.restoration.options import TILE_PX, Options
 from deploy.restoration.run import restore_file
 from deploy.restoration.runtime import open_runtime
 from quant.tiling.walk import receptive_radius_px
@@ -67,7 +69,7 @@ def ways(task: Task, monai_python: str | None) -> Iterator[dict[str, Run]]:
 
 def overlapped(task: Task, way: str, chunks_at_once: int) -> Run:
     """dask.array.map_overlap over chunks that are a tile with their overlap, the cores shared among those at work."""
-    core_px, halo_px = task.options.tile_px - 2 * task.halo_px, task.halo_px
+    core_px, halo_px = (task.options.tile_px or TILE_PX) - 2 * task.halo_px, task.halo_px
     out, threads = task.out(way), max(task.cores // chunks_at_once, 1)
 
     def run() -> None:
@@ -85,14 +87,15 @@ def overlapped(task: Task, way: str, chunks_at_once: int) -> Run:
 
 
 def write(path: Path, pixels: np.ndarray) -> None:
-    """As the engine writes."""
-    tifffile.imwrite(path, pixels, tile=(256, 256), compression="zlib", compressionargs={"level": 1})
+    """As the engine writes, but for its strategy of zlib, which tifffile has no option for."""
+    packed: dict[str, Any] = {"compression": "zlib", "compressionargs": {"level": 1}, "predictor": 2}
+    tifffile.imwrite(path, pixels, tile=(256, 256), maxworkers=os.cpu_count(), **packed)
 
 
 @contextmanager
 def child(task: Task, python: str) -> Iterator[Run]:
     """MONAI in its process, loaded and waiting; each call is one turn, and returns its seconds of the processor."""
-    out, tile_px = task.out("MONAI"), task.options.tile_px
+    out, tile_px = task.out("MONAI"), task.options.tile_px or TILE_PX
     given = (task.options.model, task.image, out, tile_px, 2 * task.halo_px / tile_px, task.cores)
     command = [python, str(CHILD), *map(str, given)]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:  # noqa: S603

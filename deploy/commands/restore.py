@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from deploy.commands.shared import refuse, say
-from deploy.restoration.options import TILE_PX, Compression, Options, Runtime
+from deploy.restoration.options import Compression, Options, Runtime
 
 EXAMPLE = "restore raw.tif restored.tif"
 NETWORK_ONLY = ("model", "tile", "halo", "resume", "runtime", "threads", "workers", "scheduler", "cog", "stac")
@@ -37,7 +37,10 @@ def restore(
             "B0=a.toml,B1=b.toml for each band; blind if none."
         ),
     ] = None,
-    tile: Annotated[int, typer.Option(min=16, help="Longest side of a tile in pixels.")] = TILE_PX,
+    tile: Annotated[
+        int | None,
+        typer.Option(min=16, help="Longest side of a tile in pixels; 640 if none, unless --runtime is auto."),
+    ] = None,
     halo: Annotated[str, typer.Option(help="Context around a tile: 'exact' (no seams) or pixels.")] = "exact",
     full_scale: Annotated[
         float | None,
@@ -46,7 +49,9 @@ def restore(
             "8-bit and 0..1 pixels need it."
         ),
     ] = None,
-    runtime: Annotated[Runtime, typer.Option(help="What runs the network.")] = Runtime.onnxruntime,
+    runtime: Annotated[
+        Runtime, typer.Option(help="What runs the network; auto measures runtimes, tiles and lanes once, for speed.")
+    ] = Runtime.onnxruntime,
     threads: Annotated[int, typer.Option(min=0, help="Threads; 0 takes every core, or what falls to a worker.")] = 0,
     compression: Annotated[Compression, typer.Option(help="Of the output, lossless.")] = Compression.zlib,
     memory: Annotated[
@@ -79,6 +84,7 @@ def restore(
     With --method traditional the image is stabilised, denoised and sharpened as its --sensor asks, in strips of rows:
     one band, about a minute a megapixel on two cores, not resumable.
     JPEG 2000, NITF and HFA files, VRT mosaics and DIMAP indexes need the extra 'gdal'.
+    --runtime auto changes no pixel: it takes what is fastest here among what gives onnxruntime's bytes, and keeps it.
     Georeference, RPCs and missing pixels (NaN, or the nodata value) are kept. Until OUT is finished its rows lie in
     .OUT.part beside it. Workers change no pixel: where they are of one processor and the same versions, the bytes are
     those of one process. Those of a scheduler must find IN under its path; only this process writes.

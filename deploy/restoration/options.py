@@ -16,6 +16,7 @@ class Runtime(StrEnum):
 
     onnxruntime = "onnxruntime"
     openvino = "openvino"
+    auto = "auto"  # what is fastest here, and gives onnxruntime's bytes: deploy.restoration.choice
 
 
 class Compression(StrEnum):
@@ -38,7 +39,7 @@ class Options:
 
     Attributes:
         model: the network's file.
-        tile_px: side of a tile.
+        tile_px: longest side of a tile; None leaves it to `runtime` where that is auto, and else is TILE_PX.
         halo: 'exact', or pixels of context around a tile.
         full_scale: the pixel value that is 1.0 to the network; None leaves it to deploy.restoration.radiometry.
         runtime: what runs the network.
@@ -51,11 +52,12 @@ class Options:
         bands: networks of single bands by their names, each for its own sensor; empty where `model` is for all.
         cog: whether the output is a Cloud-Optimised GeoTIFF.
         sensor_bits: bits per pixel of the sensor, where the user named its profile.
+        lanes: tiles in work at a time; None leaves it to the number of cores.
         trust_index: whether a VRT or DIMAP may name tiles outside its folder, at URLs too.
     """
 
     model: Path
-    tile_px: int = TILE_PX
+    tile_px: int | None = None
     halo: str = "exact"
     full_scale: float | None = None
     runtime: Runtime = Runtime.onnxruntime
@@ -69,6 +71,7 @@ class Options:
     sensor_bits: int | None = None
     cog: bool = False
     bands: Mapping[str, Path] = field(default_factory=dict)
+    lanes: int | None = None
 
     @property
     def is_spread(self) -> bool:

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import onnx
 import psutil
 
-from deploy.restoration.options import Options, parse_halo
+from deploy.restoration.options import TILE_PX, Options, parse_halo
 from deploy.restoration.source import Source
 from profiles.errors import MachineError, ModelError, OptionError, sizes
 from quant.tiling.walk import Tiling, tiling_of
@@ -182,9 +182,10 @@ def plan_for(network: onnx.ModelProto, shape: tuple[int, int, int], options: Opt
         OptionError: options that do not go together.
     """
     tiling = tiling_of(network)
+    tile_px = options.tile_px or TILE_PX
     if tiling.fixed_px is not None:
-        require_fixed_tile(tiling.fixed_px, options.tile_px, shape[1:])
-    return make_plan(shape, options.tile_px, parse_halo(options.halo, tiling.halo_px), tiling)
+        require_fixed_tile(tiling.fixed_px, tile_px, shape[1:])
+    return make_plan(shape, tile_px, parse_halo(options.halo, tiling.halo_px), tiling)
 
 
 def require_fixed_tile(fixed_px: int, tile_px: int, size: tuple[int, int]) -> None:

@@ -1,6 +1,7 @@
 """One image file restored into another: what the command `restore` does with a network.
 
-open -> plan -> settle the full scale -> open the network -> rows that a checkpoint lacks -> the TIFF -> figures
+open -> settle runtime auto -> plan -> full scale -> open the network -> rows that a checkpoint lacks -> the TIFF
+-> figures
 
 One row is written while the next is made. Whatever stops a run, the output is the old one or the new one; finished
 rows stay in the checkpoint where a later run can go on.
@@ -19,6 +20,7 @@ import numpy as np
 from deploy.cluster import check_choice
 from deploy.host_state import peak_memory
 from deploy.restoration.bands import in_order, require_alike
+from deploy.restoration.choice import require_one_process, settled
 from deploy.restoration.cog import disk_bytes, require_cog, what_was_done, write_cog
 from deploy.restoration.engine import RestoredRow, Restorer, Say, Tick, restore_rows
 from deploy.restoration.georeference import enlarged_tags
@@ -72,6 +74,7 @@ def restore_file(image: Path, out: Path, options: Options, say: Say) -> Row:
         KeyboardInterrupt: stopped; rows already finished stay for `resume`.
     """
     check_choice(options.workers, options.scheduler)
+    require_one_process(options)
     if options.bands and options.is_spread:
         got, remedy = "one for each band", "leave --workers and --scheduler out"
         raise OptionError("--sensor", expected="one sensor for workers", got=got, remedy=remedy)
@@ -95,16 +98,17 @@ def _restore(image: Path, out: Path, options: Options, say: Say) -> Row:
         paths = in_order(options.bands, raster) if options.bands else [options.model]
         network, *others = networks = [load_onnx(path) for path in paths]
         require_alike(networks)
+        options, chosen = settled(network, raster.shape, options, say)
         plan = plan_for(network, raster.shape, options)
         say(plan.sentence)
         if not options.is_spread:
             check_memory(rows_bytes(source, plan), options.memory_bytes, is_bulky(source, plan))
         scale = scale_of(source, plan, options, str(image))
-        at_once = tiles_at_once(options.threads, plan.tiles)
+        at_once = options.lanes or tiles_at_once(options.threads, plan.tiles)
         infer, runtime = open_runtime(options.runtime, network, options.threads, at_once)
         more = tuple(open_runtime(options.runtime, other, options.threads, at_once)[0] for other in others)
         restorer = Restorer(raster, infer, scale.value, plan.tiling, str(image), not scale.assumed, more)
-        figures = seam_figures(source, plan, restorer)
+        figures = {**chosen, **seam_figures(source, plan, restorer)}
         # Another version of the runtime might give other bits: rows of one are not finished by another.
         digests = ", ".join(network_sha256(path) for path in paths)
         job = _job(image, digests, plan, runtime, scale.value)

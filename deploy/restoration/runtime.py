@@ -128,9 +128,14 @@ AT_ONCE = 4
 
 
 def tiles_at_once(threads: int, tiles: int) -> int:
-    """How many tiles are best restored at a time; 0 threads takes every core."""
+    """How many tiles are usually best restored at a time; 0 threads takes every core."""
+    return max(lanes_for(threads, tiles))
+
+
+def lanes_for(threads: int, tiles: int) -> list[int]:
+    """How many tiles can be restored at a time such that each has as many threads; 0 threads takes every core."""
     cores = threads or os.cpu_count() or 1
-    return max(count for count in range(1, AT_ONCE + 1) if cores % count == 0 and count <= max(tiles, 1))
+    return [count for count in range(1, AT_ONCE + 1) if cores % count == 0 and count <= max(tiles, 1)]
 
 
 def open_runtime(runtime: Runtime, model: onnx.ModelProto, threads: int, at_once: int = 1) -> tuple[Infer, str]:

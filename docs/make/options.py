@@ -197,6 +197,7 @@ REFUSED = {
         Refused(("method",), without="--sensor"),
         Refused(("stac",), without="--cog"),
         Refused(("workers",), SCHEDULER),
+        Refused(("workers", "scheduler"), "--runtime auto"),
     ],
     "evaluate": [Refused(("images", "sweep"), "--pairs PAIRS")],
     "detect": [

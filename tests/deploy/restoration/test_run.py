@@ -287,6 +287,22 @@ def test_compressions_are_lossless(compression: Compression, model: Path, tmp_pa
         assert (file.pages.first.compression == 1) == (compression is Compression.none)
 
 
+@pytest.mark.filterwarnings("ignore:Dataset has no geotransform")
+@pytest.mark.parametrize(("dtype", "predictor"), [(np.uint8, 2), (np.uint16, 2), (np.float32, 1)])
+def test_integers_are_packed_as_differences_and_gdal_reads_them(
+    dtype: type, predictor: int, model: Path, tmp_path: Path
+) -> None:
+    rasterio = pytest.importorskip("rasterio")
+    pixels: np.ndarray = np.tile(noise(70, 90) // 20, (1, 4, 4)).astype(
+        dtype
+    )  # of several squares, none of them whole
+    restored, _ = restore(tmp_path, pixels, Options(model, full_scale=255))
+    with rasterio.open(tmp_path / "out.tif") as file:
+        np.testing.assert_array_equal(file.read(), restored.reshape(-1, *restored.shape[-2:]))
+    with tifffile.TiffFile(tmp_path / "out.tif") as file:
+        assert file.pages.first.predictor == predictor
+
+
 def test_large_outputs_are_big_tiffs(model: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("deploy.restoration.output.PLAIN_LIMIT_BYTES", 1000)
     restore(tmp_path, noise(40, 50), Options(model))
