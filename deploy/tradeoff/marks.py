@@ -1,7 +1,7 @@
 """How points look: a marker and a colour for each method, a filling for each precision, a size for each state."""
 
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
@@ -9,6 +9,8 @@ from matplotlib.lines import Line2D
 from matplotlib.markers import MarkerStyle
 
 from deploy.report.plots import LIGHT, SERIES
+from deploy.tradeoff.study import Front
+from profiles.figures import Row
 
 Filling = Literal["full", "left", "bottom", "none"]
 FILLINGS: dict[str, Filling] = {"INT8 legal": "full", "INT8 free": "left", "bf16": "bottom", "float32": "none"}
@@ -88,3 +90,52 @@ EDGE = 0.26
 
 FADED = 0.6
 """Opacity of a dominated mark."""
+
+
+@dataclass(frozen=True)
+class Points:
+    """The rows of a study, and how their methods look; a row's number is its place in the table.
+
+    `against` names the point that all are held against, and `differences` holds theirs from it by name.
+    """
+
+    rows: Sequence[Row]
+    marks: Mapping[str, Mark]
+    against: str = ""
+    differences: Mapping[str, Row] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, rows: Sequence[Row], against: str = "", differences: Sequence[Row] = ()) -> "Points":
+        """Rows with a look for each of their methods."""
+        return cls(rows, marks_of(map(method_of, rows)), against, {row.name: row for row in differences})
+
+    def mark(self, row: Row) -> Mark:
+        """The marker and colour of its method, filled as its precision; an unknown precision is left hollow."""
+        return replace(self.marks[method_of(row)], filling=FILLINGS.get(row.text.get("precision", ""), "none"))
+
+    def on(self, front: Front) -> list[tuple[str, Row]]:
+        """The points that can be drawn, each with the id of its row in the page's table."""
+        return [(f"point-{k}", row) for k, row in enumerate(self.rows, 1) if drawn(row, front)]
+
+
+def method_of(row: Row) -> str:
+    """The name of the method that the row's point runs."""
+    return row.text.get("method", row.name)
+
+
+def drawn(row: Row, front: Front) -> bool:
+    """Whether it has both figures, a cost above zero, and neither published: those were found on other images."""
+    found = [row.figures.get(key) for key in (front.x, front.y)]
+    if any(figure is None or figure.value is None or figure.mode == "published" for figure in found):
+        return False
+    return value_of(row, front.x) > 0
+
+
+def value_of(row: Row, key: str) -> float:
+    """A figure of a row; 0 where there is none."""
+    return row.figures[key].value or 0.0
+
+
+def state_of(front: Front, name: str) -> State:
+    """Where a point lies beside the front."""
+    return "front" if name in front.members else "dominated" if name in front.dominated else "open"

@@ -1,4 +1,4 @@
-"""The plot of one front: a mark for each point with its intervals, the front's line, labels and a legend.
+"""The plot of one front: a mark for each point with its bars, the front's line, labels and a legend.
 
 Quality is up and cost to the right. Every plot is laid out twice, for a wide screen and for a phone; the page's style
 sheet shows one of them.
@@ -22,50 +22,11 @@ from matplotlib.patheffects import withStroke
 
 from deploy.report.plots import LIGHT, PX_PER_INCH, TITLE_PX, look, new_figure, set_ticks, svg_of, text_width
 from deploy.tradeoff.labels import Box, Label, Wish, place
-from deploy.tradeoff.marks import FILLINGS, RADIUS_PX, STATES, Mark, State, marks_of
+from deploy.tradeoff.marks import FILLINGS, RADIUS_PX, STATES, Mark, Points, State, method_of, state_of, value_of
 from deploy.tradeoff.outcome import DIRECTIONS
-from deploy.tradeoff.study import Front
+from deploy.tradeoff.study import Front, figure_words
 from model.io.files import whole_file
 from profiles.figures import Row
-
-
-@dataclass(frozen=True)
-class Points:
-    """The rows of a study, and how their methods look; a row's number is its place in the table."""
-
-    rows: Sequence[Row]
-    marks: Mapping[str, Mark]
-
-    @classmethod
-    def of(cls, rows: Sequence[Row]) -> "Points":
-        """Rows with a look for each of their methods."""
-        return cls(rows, marks_of(map(method_of, rows)))
-
-    def mark(self, row: Row) -> Mark:
-        """The marker and colour of its method, filled as its precision; an unknown precision is left hollow."""
-        return replace(self.marks[method_of(row)], filling=FILLINGS.get(row.text.get("precision", ""), "none"))
-
-    def on(self, front: Front) -> list[tuple[str, Row]]:
-        """The points that can be drawn, each with the id of its row in the page's table."""
-        return [(f"point-{k}", row) for k, row in enumerate(self.rows, 1) if drawn(row, front)]
-
-
-def method_of(row: Row) -> str:
-    """The name of the method that the row's point runs."""
-    return row.text.get("method", row.name)
-
-
-def drawn(row: Row, front: Front) -> bool:
-    """Whether it has both figures, a cost above zero, and neither published: those were found on other images."""
-    found = [row.figures.get(key) for key in (front.x, front.y)]
-    if any(figure is None or figure.value is None or figure.mode == "published" for figure in found):
-        return False
-    return _value(row, front.x) > 0
-
-
-def state_of(front: Front, name: str) -> State:
-    """Where a point lies beside the front."""
-    return "front" if name in front.members else "dominated" if name in front.dominated else "open"
 
 
 @dataclass(frozen=True)
@@ -150,6 +111,7 @@ def plot_of(front: Front, points: Points, canvas: Canvas) -> Plot:
         axes = _make_axes(figure, front, rows, frame, canvas)
         stairs = _draw_front(axes, front, rows)
         _draw_intervals(axes, front, points, rows)
+        _draw_level(axes, front, points)
         for anchor, row in shown:
             line = points.mark(row).line(state := state_of(front, row.name), *_values(front, row))
             line.set(gid=anchor, clip_on=False, zorder=4 + RADIUS_PX[state])
@@ -164,21 +126,20 @@ def plot_of(front: Front, points: Points, canvas: Canvas) -> Plot:
         _write(figure, frame[0] + 8, frame[1] + 18, BETTER, canvas, color=LIGHT["soft"])
         for label in labels:
             _draw_label(figure, label, canvas)
-    return Plot(front, figure, frame, places, boxes, labels, {a: _title(front, r) for a, r in shown}, parts)
-
-
-def _value(row: Row, key: str) -> float:
-    return row.figures[key].value or 0.0
+    return Plot(front, figure, frame, places, boxes, labels, {a: _title(front, r, points) for a, r in shown}, parts)
 
 
 def _values(front: Front, row: Row) -> tuple[float, float]:
-    return _value(row, front.x), _value(row, front.y)
+    return value_of(row, front.x), value_of(row, front.y)
 
 
-def _title(front: Front, row: Row) -> str:
-    said = [
-        f"{key} {row.figures[key]} {row.figures[key].unit}, {row.figures[key].mode}" for key in (front.y, front.x)
-    ]
+def _title(front: Front, row: Row, points: Points) -> str:
+    said = [f"{key} {figure_words(row.figures[key])}, {row.figures[key].mode}" for key in (front.y, front.x)]
+    before, held = front.differences.get(row.name), points.differences.get(row.name)
+    if before:
+        said.append(f"{front.y} less that of {before.against}: {figure_words(before.figure)}")
+    if held and row.name != points.against:
+        said.append(f"{front.y} less that of {points.against}: {figure_words(held.figures[f'{front.y} difference'])}")
     dominated = f"dominated by {front.dominated[row.name]}" if row.name in front.dominated else ""
     return "\n".join(line for line in (row.name, *said, dominated) if line)
 
@@ -261,11 +222,11 @@ def _make_axes(figure: Figure, front: Front, rows: Sequence[Row], frame: Box, ca
 
 
 def _limits(rows: Sequence[Row], front: Front, key: str, *, logarithmic: bool) -> tuple[float, float]:
-    """They hold all values, and the intervals of the front's members as far as they do not squeeze the values."""
+    """They hold all values, and the bars of the front's members as far as they do not squeeze the values."""
     forth, back = (math.log, math.exp) if logarithmic else (float, float)
-    values = [forth(_value(row, key)) for row in rows] or [0.0, 1.0]
-    members = [row.figures[key].interval for row in rows if row.name in front.members]
-    ends = [forth(end) for interval in members if interval for end in interval if end > 0 or not logarithmic]
+    values = [forth(value_of(row, key)) for row in rows] or [0.0, 1.0]
+    members = [_bar(front, row, key) for row in rows if row.name in front.members]
+    ends = [forth(end) for bar in members if bar for end in bar if end > 0 or not logarithmic]
     low, high = min(values), max(values)
     span = high - low or max(abs(high), 1.0)
     inner, outer = ((low - share * span, high + share * span) for share in (MARGIN, REACH))
@@ -306,15 +267,35 @@ def _draw_intervals(axes: Axes, front: Front, points: Points, rows: Sequence[Row
     axes.add_collection(LineCollection(segments, colors=colours, linewidths=1.4, zorder=2), autolim=False)
 
 
+def _bar(front: Front, row: Row, key: str) -> tuple[float, float] | None:
+    """What a bar covers: a cost's own interval; of a quality that of the paired difference, about the value."""
+    if key == front.x:
+        return row.figures[key].interval
+    before = front.differences.get(row.name)
+    if before is None or before.figure.interval is None:
+        return None
+    level = value_of(row, key) - (before.figure.value or 0.0)
+    return level + before.figure.interval[0], level + before.figure.interval[1]
+
+
 def _intervals(axes: Axes, front: Front, row: Row) -> Iterator[tuple[tuple[float, float], tuple[float, float]]]:
-    """Both ends of the interval of each figure; one that goes on beyond the axes ends at their edge."""
-    (x, y), (across, up) = _values(front, row), (row.figures[key].interval for key in (front.x, front.y))
+    """Both ends of both bars; one that goes on beyond the axes ends at their edge."""
+    (x, y), (across, up) = _values(front, row), (_bar(front, row, key) for key in (front.x, front.y))
     if across:
         low, high = _within(across, axes.get_xlim())
         yield (low, y), (high, y)
     if up:
         low, high = _within(up, axes.get_ylim())
         yield (x, low), (x, high)
+
+
+def _draw_level(axes: Axes, front: Front, points: Points) -> None:
+    """A dotted line at the quality of the point that all are held against, where it lies within the axes."""
+    found = [row.figures[front.y].value for row in points.rows if row.name == points.against]
+    low, high = sorted(axes.get_ylim())
+    for value in found:
+        if value is not None and low < value < high:
+            axes.axhline(value, color=LIGHT["soft"], linewidth=1.2, linestyle=(0, (1, 3)), zorder=1, gid="against")
 
 
 def _within(ends: tuple[float, float], limits: tuple[float, float]) -> list[float]:
@@ -356,7 +337,7 @@ def wishes_of(front: Front, shown: Sequence[tuple[Row, tuple[float, float]]], ca
         shown: its points, each with its place in pixels.
         canvas: what it is plotted on.
     """
-    by_quality = sorted(shown, key=lambda each: -DIRECTIONS[front.y] * _value(each[0], front.y))
+    by_quality = sorted(shown, key=lambda each: -DIRECTIONS[front.y] * value_of(each[0], front.y))
     named = {method_of(row) for row, _ in shown if row.name in front.members}
     best = {method_of(row): (row, at) for row, at in reversed(by_quality) if method_of(row) not in named}
     steps = [each for each in by_quality if each[0].name in front.steps]

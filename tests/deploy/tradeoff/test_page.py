@@ -14,8 +14,9 @@ from markupsafe import escape
 from PIL import Image
 
 from deploy.tradeoff.labels import Box
+from deploy.tradeoff.marks import Points
 from deploy.tradeoff.page import render_study, write_study
-from deploy.tradeoff.plot import NARROW, WIDE, Canvas, Plot, Points, plot_of
+from deploy.tradeoff.plot import NARROW, WIDE, Canvas, Plot, plot_of
 from deploy.tradeoff.study import Front, Study
 from profiles.errors import MachineError
 from profiles.figures import Row, unavailable
