@@ -6,7 +6,7 @@ difference leaves 0 out. Of fewer sites than an interval takes, values alone dec
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from deploy.tradeoff.accuracy import BenchmarkSet
 from deploy.tradeoff.board import PAIR_QUANTILE, pair_error
@@ -15,9 +15,9 @@ from deploy.tradeoff.host_time import TILE_PX as HOST_TILE_PX
 from deploy.tradeoff.methods import PATCH_PX, PATCHES
 from deploy.tradeoff.outcome import COSTS, DIRECTIONS, Outcome, Place, Results, front
 from deploy.tradeoff.points import Demand, shortfall
-from deploy.tradeoff.study import apart, figure_words, gain_words, places
+from deploy.tradeoff.study import CHEAPER, apart, figure_words, gain_words, places
 from model.metrics.bootstrap import LEAST_SITES
-from profiles.figures import Figure, Row, measured, number, predicted, unavailable
+from profiles.figures import Figure, Row, number, unavailable
 
 QUALITY = "PSNR"
 ALIKE = {"PSNR": 0.05}
@@ -53,7 +53,7 @@ def choose(results: Results, budget: Sequence[Demand], need: Sequence[Demand]) -
 
 def _best_and_taken(results: Results, kept: Sequence[Outcome], goal: "Goal", cost: str) -> tuple[Outcome, Outcome]:
     """The best of some points, and the cheapest of those that the images cannot tell from it."""
-    best = min(kept, key=goal.of)
+    best = min(kept, key=lambda each: (goal.of(each), each.value(cost) or math.inf))
     if goal.key not in DIRECTIONS:
         return best, best
     near = [each for each in kept if each is best or not told_better(results, best, each, goal.key)]
@@ -180,36 +180,112 @@ class Recommendation:
 def recommendations(
     results: Results, budget: Sequence[Demand], need: Sequence[Demand], board: str
 ) -> list[Recommendation]:
-    """One for each quality that points have, PSNR first."""
-    had = [key for key in DIRECTIONS if any(each.value(key) is not None for each in results.outcomes.values())]
-    return [_recommend(results, budget, need, quality, board) for quality in had]
+    """One for each quality that points have beside the cost, PSNR first."""
+    asked = [Question(results, key, board, tuple(budget), tuple(need)) for key in DIRECTIONS]
+    return [question.answer() for question in asked if question.ranked]
 
 
-def _recommend(
-    results: Results, budget: Sequence[Demand], need: Sequence[Demand], quality: str, board: str
-) -> Recommendation:
-    demands, cost = [*budget, *need], _paid(results, budget)
-    ranked = [each for each in results.outcomes.values() if None not in (each.value(quality), each.value(cost))]
-    kept = [each for each in ranked if not shortfall(each.figures, demands)]
-    asked = " and ".join(map(str, demands))
-    if not kept:
-        sentence = _nearest(ranked or list(results.outcomes.values()), demands, asked)
-        reason = {quality: unavailable("", f"no point keeps {asked}")}
-        return Recommendation(quality, board, sentence, None, None, reason)
-    if demands:
-        goal, lead = best_of(quality) if budget else Goal(cost, 1), f"For {asked} take"
-        best, taken = _best_and_taken(results, kept, goal, cost)
-    else:
-        steps, lead = steps_of(results, quality, cost), "Without a budget take"
-        best = taken = results.outcomes[knee(steps).name]
-    following = _following(results, taken, quality, cost)
-    step = _step(results, taken, following, quality, cost)
-    why = "" if demands else f", the {'knee' if len(steps) > KNEE else 'cheapest step'} of the front"
-    found = f"{lead} {taken.point.spoken}{why}: {_quality_words(taken, quality)} at {_cost_words(taken, cost, board)}"
-    remarks = _alike_words(results, [best, following or best], taken, quality)
-    sentences = [f"{found}; {_next_words(following, step)}.", *remarks]
-    figures = {quality: taken.figures[quality], cost: taken.figures[cost], **step}
-    return Recommendation(quality, board, " ".join(sentences), taken, following, figures)
+@dataclass(frozen=True)
+class Question:
+    """What to take on one board for one quality, within a budget, for a need, or without either."""
+
+    results: Results
+    quality: str
+    board: str
+    budget: tuple[Demand, ...]
+    need: tuple[Demand, ...]
+
+    @property
+    def cost(self) -> str:
+        """The figure that is paid."""
+        return _paid(self.results, self.budget)
+
+    @property
+    def ranked(self) -> list[Outcome]:
+        """The points that have the quality and the cost."""
+        had = (self.quality, self.cost)
+        return [each for each in self.results.outcomes.values() if None not in map(each.value, had)]
+
+    def answer(self) -> Recommendation:
+        """The point, and the sentence about it."""
+        demands = [*self.budget, *self.need]
+        kept = [each for each in self.ranked if not shortfall(each.figures, demands)]
+        asked = " and ".join(map(str, demands))
+        if not kept:
+            return self._nothing_fits(demands, asked)
+        if not demands:
+            steps = steps_of(self.results, self.quality, self.cost)
+            taken = self.results.outcomes[knee(steps).name]
+            why = "the knee of the front" if len(steps) > KNEE else "the cheapest on the front"
+            return self._recommend(f"Without a budget take {taken.point.spoken}, {why}", taken, taken)
+        goal = best_of(self.quality) if self.budget else Goal(self.cost, 1)
+        best, taken = _best_and_taken(self.results, kept, goal, self.cost)
+        return self._recommend(f"For {asked} take {taken.point.spoken}", taken, best)
+
+    def _nothing_fits(self, demands: Sequence[Demand], asked: str) -> Recommendation:
+        nearest = min(self.ranked, key=lambda each: shortfall(each.figures, demands))
+        sentence = (
+            f"Nothing in this study fits {asked}; nearest comes {nearest.point.spoken}: {self._words(nearest)}."
+        )
+        if math.isinf(shortfall(nearest.figures, demands)):
+            sentence = _nearest(self.ranked, demands, asked)
+        lacking = unavailable(nearest.figures[self.quality].unit, f"nothing fits {asked}")
+        return Recommendation(self.quality, self.board, sentence, None, None, {self.quality: lacking})
+
+    def _recommend(self, lead: str, taken: Outcome, best: Outcome) -> Recommendation:
+        following = self._following(taken)
+        step = self._step(taken, following)
+        after = "nothing dearer in this study is shown to be better"
+        if following:
+            gain = gain_words(self.results, following.name, taken.name, self.quality)
+            after = f"the next {gain}, with {following.point.spoken}, cost {figure_words(step['next cost'])} more"
+        sentences = [f"{lead}: {self._words(taken)}; {after}.", *self._remarks(taken, best, following or best)]
+        sentences += _unsure(taken, [*self.budget, *self.need])
+        figures = {key: taken.figures[key] for key in (self.quality, self.cost)} | step
+        return Recommendation(self.quality, self.board, " ".join(sentences), taken, following, figures)
+
+    def _words(self, outcome: Outcome) -> str:
+        good, paid = (outcome.figures[key] for key in (self.quality, self.cost))
+        where = "this machine" if self.cost.startswith("host") else self.board
+        value = figure_words(replace(good, interval=None))  # over sites: it is no measure of what differs
+        return f"{self.quality} {value} at {figure_words(paid)} on {where} ({paid.mode})"
+
+    def _following(self, taken: Outcome) -> Outcome | None:
+        """The next step beyond a point: shown to be better, and of those as dear for all we know the best."""
+        results, paid = self.results, taken.value(self.cost) or 0.0
+        beyond = front([place for place in places(results, self.cost, self.quality) if place.cost >= paid])
+        found: Outcome | None = None
+        for each in (results.outcomes[name] for name in beyond):
+            if not told_better(results, each, found or taken, self.quality):
+                continue
+            if found and results.ratio(each.name, found.name, self.cost)[0] > 1:
+                break
+            found = each
+        return found
+
+    def _step(self, taken: Outcome, following: Outcome | None) -> dict[str, Figure]:
+        """What the next step gains and costs; the interval of the cost is that of the ratio of both."""
+        paid = taken.figures[self.cost]
+        if following is None:
+            reason = f"no dearer point is shown to have a better {self.quality}"
+            units = {"next gain": taken.figures[self.quality].unit, "next cost": paid.unit}
+            return {key: unavailable(unit, reason) for key, unit in units.items()}
+        now, then = (each.value(self.cost) or 0.0 for each in (taken, following))
+        low, high = (now * (times - 1) for times in self.results.ratio(following.name, taken.name, self.cost))
+        source = f"{self.cost} of {following.name} less that of {taken.name}, interval by the ratio of both"
+        extra = Figure(then - now, paid.unit, paid.mode, source, (low, high))
+        return {"next gain": self.results.difference(following.name, taken.name, self.quality), "next cost": extra}
+
+    def _remarks(self, taken: Outcome, best: Outcome, following: Outcome) -> list[str]:
+        """What is to be said of a point with a better value, and of sites too few to tell."""
+        ends = [self.results.gain(each.name, taken.name, self.quality)[1] for each in (best, following)]
+        if not all(map(math.isfinite, ends)):
+            return [f"By value alone: of fewer than {LEAST_SITES} sites no difference can be trusted."]
+        if best is taken:
+            return []
+        more = gain_words(self.results, best.name, taken.name, self.quality)
+        better = f"{best.point.spoken} is better by {more}"
+        return [f"{better}, but these images cannot tell the two apart: take the {CHEAPER[self.cost]}."]
 
 
 def knee(steps: Sequence[Place]) -> Place:
@@ -233,66 +309,6 @@ def steps_of(results: Results, quality: str, cost: str) -> list[Place]:
     members = front(list(found.values()))
     known = any(math.isfinite(results.gain(name, members[0], quality)[0]) for name in members[1:])
     return [found[name] for name in (apart(results, members, cost, quality) if known else members)]
-
-
-def _following(results: Results, taken: Outcome, quality: str, cost: str) -> Outcome | None:
-    """The next step beyond a point: told to be better, and of those as dear for all we know the best."""
-    members = front([place for place in places(results, cost, quality) if place.cost > (taken.value(cost) or 0.0)])
-    found: Outcome | None = None
-    for each in (results.outcomes[name] for name in members):
-        if not told_better(results, each, found or taken, quality):
-            continue
-        if found and results.ratio(each.name, found.name, cost)[0] > 1:
-            break
-        found = each
-    return found
-
-
-def _step(results: Results, taken: Outcome, following: Outcome | None, quality: str, cost: str) -> dict[str, Figure]:
-    """What the next step gains and costs; the interval of the cost is that of the ratio of both."""
-    paid = taken.figures[cost]
-    if following is None:
-        reason = f"no dearer point is told to have a better {quality}"
-        return {
-            "next gain": unavailable(taken.figures[quality].unit, reason),
-            "next cost": unavailable(paid.unit, reason),
-        }
-    now, then = (each.value(cost) or 0.0 for each in (taken, following))
-    low, high = (now * (times - 1) for times in results.ratio(following.name, taken.name, cost))
-    source = f"{cost} of {following.name} less that of {taken.name}, interval by the ratio of both"
-    tag = measured(then - now, paid.unit, source, (low, high))
-    if paid.mode == "predicted":
-        tag = predicted(then - now, paid.unit, (low, high), source)
-    return {"next gain": results.difference(following.name, taken.name, quality), "next cost": tag}
-
-
-def _quality_words(outcome: Outcome, quality: str) -> str:
-    figure = outcome.figures[quality]
-    unit = "" if figure.unit in ("ratio", "distance") else f" {figure.unit}"
-    return f"{quality} {number(figure.value or 0.0, 4)}{unit}"
-
-
-def _cost_words(outcome: Outcome, cost: str, board: str) -> str:
-    where = "this machine" if cost.startswith("host") else board
-    return f"{figure_words(outcome.figures[cost])} on {where} ({outcome.figures[cost].mode})"
-
-
-def _next_words(following: Outcome | None, step: Mapping[str, Figure]) -> str:
-    if following is None:
-        return "no dearer point of this study is told to be better"
-    gain, cost = (figure_words(step[key]) for key in ("next gain", "next cost"))
-    return f"the next {gain}, with {following.point.spoken}, cost {cost} more"
-
-
-def _alike_words(results: Results, beside: Sequence[Outcome], taken: Outcome, quality: str) -> list[str]:
-    """What is to be said of a point with a better value (the first beside it), and of sites too few to tell."""
-    ends = [results.gain(each.name, taken.name, quality)[1] for each in beside]
-    if not all(map(math.isfinite, ends)):
-        return [f"By value alone: of fewer than {LEAST_SITES} sites no difference can be trusted."]
-    if beside[0] is taken:
-        return []
-    more = gain_words(results, beside[0].name, taken.name, quality)
-    return [f"{beside[0].point.spoken} and it cannot be told apart on these images ({more}): take the faster."]
 
 
 def notes(

@@ -1,6 +1,9 @@
-"""How points look: a marker and a colour for each method, a filling for each precision, a size for each state."""
+"""How points look: a marker and a colour for each method, a filling for each precision, a size for each state.
 
-from collections.abc import Iterable, Mapping, Sequence
+Also the legend that says so.
+"""
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
@@ -8,7 +11,7 @@ import numpy as np
 from matplotlib.lines import Line2D
 from matplotlib.markers import MarkerStyle
 
-from deploy.report.plots import LIGHT, SERIES
+from deploy.report.plots import LIGHT, SERIES, text_width
 from deploy.tradeoff.study import Front
 from profiles.figures import Row
 
@@ -139,3 +142,53 @@ def value_of(row: Row, key: str) -> float:
 def state_of(front: Front, name: str) -> State:
     """Where a point lies beside the front."""
     return "front" if name in front.members else "dominated" if name in front.dominated else "open"
+
+
+LABEL_PX, EDGE_PX = 12, 18
+ROW_PX, WORDS_PX, GAP_PX = 20, 13, 22
+"""In the legend: between lines, from a mark to its words, and from them to the next mark."""
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A part of the legend: a mark at (x, y) in pixels from the legend's upper left corner, and its words."""
+
+    mark: Mark
+    text: str
+    state: State = "front"
+    x: float = 0.0
+    y: float = 0.0
+
+
+def legend_of(points: Points, rows: Sequence[Row], width_px: float) -> list[Entry]:
+    """Which marker is which method, which filling which precision, which size which state, in lines so wide."""
+    methods = dict.fromkeys(map(method_of, rows))
+    precisions = filter(None, dict.fromkeys(row.text.get("precision", "") for row in rows))
+    groups = [
+        [Entry(points.marks[method], _short(method)) for method in methods],
+        [Entry(Mark("o", "ink", FILLINGS.get(name, "none")), name) for name in precisions],
+        [Entry(Mark("o", "ink"), text, state) for state, text in STATES.items()],
+    ]
+    return list(_flow(groups, width_px))
+
+
+def _flow(groups: Iterable[Sequence[Entry]], width_px: float) -> Iterator[Entry]:
+    """From left to right, each group from a new line on."""
+    y = ROW_PX / 2
+    for group in groups:
+        x = float(EDGE_PX)
+        for entry in group:
+            reach = x + WORDS_PX + text_width(entry.text, LABEL_PX)
+            if reach > width_px and x > EDGE_PX:
+                x, y, reach = float(EDGE_PX), y + ROW_PX, reach - x + EDGE_PX
+            yield replace(entry, x=x, y=y)
+            x = reach + GAP_PX
+        y += ROW_PX if group else 0
+
+
+LETTERS = 40
+
+
+def _short(text: str) -> str:
+    line = " ".join(text.split())
+    return line if len(line) <= LETTERS else f"{line[: LETTERS - 1]}\u2026"

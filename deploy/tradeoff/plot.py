@@ -7,22 +7,36 @@ sheet shows one of them.
 import math
 import textwrap
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 
+import numpy as np
 from markupsafe import Markup
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.colors import to_rgba
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from matplotlib.markers import CARETDOWN
 from matplotlib.patheffects import withStroke
 
 from deploy.report.plots import LIGHT, PX_PER_INCH, TITLE_PX, look, new_figure, set_ticks, svg_of, text_width
 from deploy.tradeoff.labels import Box, Label, Wish, place
-from deploy.tradeoff.marks import FILLINGS, RADIUS_PX, STATES, Mark, Points, State, method_of, state_of, value_of
+from deploy.tradeoff.marks import (
+    LABEL_PX,
+    RADIUS_PX,
+    ROW_PX,
+    WORDS_PX,
+    Entry,
+    Points,
+    State,
+    legend_of,
+    method_of,
+    state_of,
+    value_of,
+)
 from deploy.tradeoff.outcome import DIRECTIONS
 from deploy.tradeoff.study import Front, figure_words
 from model.io.files import whole_file
@@ -40,15 +54,11 @@ class Canvas:
 
 
 WIDE, NARROW = Canvas(1080, 660, 30, brief=False), Canvas(400, 640, 24, brief=True)
-LEFT_PX, RIGHT_PX, TOP_PX, BELOW_PX, EDGE_PX = 66, 14, 34, 54, 18
+LEFT_PX, RIGHT_PX, TOP_PX, BELOW_PX = 80, 14, 34, 54
 LEAST_PX = 260
 """The frame's least height: below a long legend the canvas grows."""
 
-ROW_PX, WORDS_PX, GAP_PX = 20, 13, 22
-"""In the legend: between lines, from a mark to its words, and from them to the next mark."""
-
 TICK_PX = (64, 44)
-LABEL_PX = 12
 BETTER = "better: up and to the left"
 
 
@@ -98,8 +108,9 @@ def plot_of(front: Front, points: Points, canvas: Canvas) -> Plot:
         points: all of the study, with their looks.
         canvas: the size; it grows in height below a long legend.
     """
-    shown = points.on(front)
-    rows = [row for _, row in shown]
+    titles = {anchor: _title(front, row, points) for anchor, row in points.on(front)}
+    front, rows = pressed(front, points, [row for _, row in points.on(front)])
+    shown = list(zip(titles, rows, strict=True))
     legend = legend_of(points, rows, canvas.width)
     legend_px = max((entry.y for entry in legend), default=0.0) + ROW_PX / 2
     height = max(canvas.height, TOP_PX + LEAST_PX + BELOW_PX + math.ceil(legend_px))
@@ -116,6 +127,10 @@ def plot_of(front: Front, points: Points, canvas: Canvas) -> Plot:
             line = points.mark(row).line(state := state_of(front, row.name), *_values(front, row))
             line.set(gid=anchor, clip_on=False, zorder=4 + RADIUS_PX[state])
             axes.add_line(line)
+            if OFF in row.text:
+                axes.plot(
+                    value_of(row, front.x), axes.get_ylim()[0], marker=CARETDOWN, color=LIGHT["ink"], clip_on=False
+                )
         places = {anchor: _pixels(axes, [_values(front, row)], canvas)[0] for anchor, row in shown}
         boxes = [_covered(places[anchor], state_of(front, row.name)) for anchor, row in shown]
         better = (frame[0], frame[1], frame[0] + text_width(BETTER) + 12, frame[1] + 26)
@@ -126,11 +141,44 @@ def plot_of(front: Front, points: Points, canvas: Canvas) -> Plot:
         _write(figure, frame[0] + 8, frame[1] + 18, BETTER, canvas, color=LIGHT["soft"])
         for label in labels:
             _draw_label(figure, label, canvas)
-    return Plot(front, figure, frame, places, boxes, labels, {a: _title(front, r, points) for a, r in shown}, parts)
+    return Plot(front, figure, frame, places, boxes, labels, titles, parts)
 
 
 def _values(front: Front, row: Row) -> tuple[float, float]:
     return value_of(row, front.x), value_of(row, front.y)
+
+
+OFF = "off the scale"
+"""The word of a row whose mark stands at the lower edge, with its value."""
+PRESSED = 0.12
+"""How far below the others such marks stand, as a share of what those span."""
+
+
+def pressed(front: Front, points: Points, rows: Sequence[Row]) -> tuple[Front, list[Row]]:
+    """The front and its rows with poor outliers moved to the lower edge: else a few would press all others together.
+
+    Poor is what lies below Tukey's lower fence (Exploratory Data Analysis, 1977), 1.5 interquartile ranges below the
+    lower quartile, and below the point that all are held against, by more than a quarter of its own distance from
+    the best.
+    """
+    sign = DIRECTIONS[front.y]
+    good = {row.name: sign * value_of(row, front.y) for row in rows}
+    low, high = np.percentile(list(good.values()), (25, 75)) if good else (0.0, 0.0)
+    held, best = good.get(points.against, np.inf), max(good.values(), default=0.0)
+    fence = min(low - 1.5 * (high - low), held - max(best - held, 0.0) / 4)
+    inside = [each for each in good.values() if each >= fence]
+    if high == low or len(inside) == len(good):
+        return front, list(rows)
+    edge = sign * float(min(inside) - PRESSED * (max(inside) - min(inside)))
+    kept = {name: each for name, each in front.differences.items() if good[name] >= fence}
+    found = [row if good[row.name] >= fence else _moved(row, front.y, edge) for row in rows]
+    return replace(front, differences=kept), found
+
+
+def _moved(row: Row, key: str, value: float) -> Row:
+    figure = row.figures[key]
+    figures = {**row.figures, key: replace(figure, value=value, interval=None)}
+    return replace(row, figures=figures, text={**row.text, OFF: figure_words(replace(figure, interval=None))})
 
 
 def _title(front: Front, row: Row, points: Points) -> str:
@@ -142,43 +190,6 @@ def _title(front: Front, row: Row, points: Points) -> str:
         said.append(f"{front.y} less that of {points.against}: {figure_words(held.figures[f'{front.y} difference'])}")
     dominated = f"dominated by {front.dominated[row.name]}" if row.name in front.dominated else ""
     return "\n".join(line for line in (row.name, *said, dominated) if line)
-
-
-@dataclass(frozen=True)
-class Entry:
-    """A part of the legend: a mark at (x, y) in pixels from the legend's upper left corner, and its words."""
-
-    mark: Mark
-    text: str
-    state: State = "front"
-    x: float = 0.0
-    y: float = 0.0
-
-
-def legend_of(points: Points, rows: Sequence[Row], width_px: float) -> list[Entry]:
-    """Which marker is which method, which filling which precision, which size which state, in lines so wide."""
-    methods = dict.fromkeys(map(method_of, rows))
-    precisions = filter(None, dict.fromkeys(row.text.get("precision", "") for row in rows))
-    groups = [
-        [Entry(points.marks[method], _short(method)) for method in methods],
-        [Entry(Mark("o", "ink", FILLINGS.get(name, "none")), name) for name in precisions],
-        [Entry(Mark("o", "ink"), text, state) for state, text in STATES.items()],
-    ]
-    return list(_flow(groups, width_px))
-
-
-def _flow(groups: Iterable[Sequence[Entry]], width_px: float) -> Iterator[Entry]:
-    """From left to right, each group from a new line on."""
-    y = ROW_PX / 2
-    for group in groups:
-        x = float(EDGE_PX)
-        for entry in group:
-            reach = x + WORDS_PX + text_width(entry.text, LABEL_PX)
-            if reach > width_px and x > EDGE_PX:
-                x, y, reach = float(EDGE_PX), y + ROW_PX, reach - x + EDGE_PX
-            yield replace(entry, x=x, y=y)
-            x = reach + GAP_PX
-        y += ROW_PX if group else 0
 
 
 def _draw_legend(figure: Figure, legend: Sequence[Entry], top_px: float, canvas: Canvas) -> list[Box]:
@@ -193,14 +204,6 @@ def _draw_legend(figure: Figure, legend: Sequence[Entry], top_px: float, canvas:
         (e.x - reach, top_px + e.y - reach, e.x + WORDS_PX + text_width(e.text, LABEL_PX), top_px + e.y + reach)
         for e in legend
     ]
-
-
-LETTERS = 40
-
-
-def _short(text: str) -> str:
-    line = " ".join(text.split())
-    return line if len(line) <= LETTERS else f"{line[: LETTERS - 1]}\u2026"
 
 
 MARGIN, REACH = 0.07, 0.5
@@ -344,8 +347,7 @@ def wishes_of(front: Front, shown: Sequence[tuple[Row, tuple[float, float]]], ca
     wanted = [*steps, *sorted(best.values(), key=lambda each: each[1][1])]
     heads = Counter(_head(row.name) for row, _ in wanted)
     return [
-        Wish(*at, _lines(row.name, canvas, heads[_head(row.name)] == 1), row.name in front.members)
-        for row, at in wanted
+        Wish(*at, _lines(row, canvas, heads[_head(row.name)] == 1), row.name in front.members) for row, at in wanted
     ]
 
 
@@ -353,13 +355,14 @@ def _head(name: str) -> str:
     return name.partition(", ")[0]
 
 
-def _lines(name: str, canvas: Canvas, alone: bool) -> tuple[str, ...]:
+def _lines(row: Row, canvas: Canvas, alone: bool) -> tuple[str, ...]:
     """A name in a few lines, a new one after its first comma; brief where that is enough to tell it by."""
-    parts = [_head(name)] if canvas.brief and alone else name.split(", ", 1)
+    parts = [_head(row.name)] if canvas.brief and alone else row.name.split(", ", 1)
     lines = [line for part in parts for line in textwrap.wrap(part, canvas.letters)] or [""]
     if len(lines) > LABEL_LINES:
         lines[LABEL_LINES - 1] = lines[LABEL_LINES - 1][: canvas.letters - 1] + "\u2026"
-    return tuple(lines[:LABEL_LINES])
+    beyond = [f"{row.text[OFF]}, {OFF}"] if OFF in row.text else []
+    return (*lines[:LABEL_LINES], *beyond)
 
 
 def _draw_label(figure: Figure, label: Label, canvas: Canvas) -> None:

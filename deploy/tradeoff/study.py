@@ -106,6 +106,8 @@ class Study:
 
 BESIDE = {"board latency": ("board energy",), "board energy": ("board latency",), "host p50": ()}
 """What else a step costs."""
+CHEAPER = {"board latency": "faster", "board energy": "thriftier", "host p50": "faster"}
+"""What a point is called that costs less."""
 
 
 def fronts(results: Results) -> tuple[Front, ...]:
@@ -154,10 +156,9 @@ def apart(results: Results, members: Sequence[str], x: str, y: str) -> tuple[str
 
 def alike(results: Results, members: Sequence[str], x: str, y: str) -> tuple[str, ...]:
     """A sentence for each two neighbours whose paired interval holds 0."""
-    faster = "cheaper" if x == "board energy" else "faster"
     return tuple(
         f"{cheap} and {dear} cannot be told apart on these images: {gain_words(results, dear, cheap, y)}. "
-        f"Take {cheap}, the {faster}."
+        f"Take {cheap}, the {CHEAPER[x]}."
         for cheap, dear in pairwise(members)
         if -math.inf < results.gain(dear, cheap, y)[0] <= 0
     )
