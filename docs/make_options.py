@@ -111,6 +111,7 @@ UNITS = {
 
 WORDS = {
     "add": "an effect's name",
+    "against": "a method of the study",
     "budget": "limits such as latency<=20s",
     "cases": "names of cases, with commas",
     "classes": "pairs such as car=vehicle, with commas",

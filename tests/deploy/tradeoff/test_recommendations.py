@@ -1,7 +1,7 @@
 """The sentence for a manager: what to take, how good it is, how long it takes, what the next step costs."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable
 from dataclasses import replace
 
 import pytest
@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from deploy.tradeoff.advice import Recommendation, knee, recommendations, steps_of
-from deploy.tradeoff.outcome import DIRECTIONS, Place, Results, front
+from deploy.tradeoff.outcome import DIRECTIONS, Place, Results
 from deploy.tradeoff.points import parse_demands
 from deploy.tradeoff.study import difference_rows, fronts, held_against
 from tests.deploy.tradeoff.made_results import Made, named, results
@@ -174,7 +174,7 @@ def test_steps_leave_out_what_images_cannot_tell(family: Results) -> None:
     assert [each.name.split()[0] for each in steps_of(noisy, "PSNR", "board latency")] == ["tiny"]
 
 
-def methods(found: Sequence[str]) -> list[str]:
+def methods(found: Iterable[str]) -> list[str]:
     return [name.split()[0] for name in found]
 
 
@@ -227,9 +227,3 @@ def test_a_difference_with_a_predicted_figure_is_predicted_and_without_sites_has
     few = replace(family, sites=FEW).difference(tiny, small, "PSNR")
     assert few.interval is None
     assert "fewer than 5 sites" in few.source
-
-
-def test_a_front_by_value_is_the_one_that_differences_are_from(family: Results) -> None:
-    for each in fronts(family):
-        places = [place for o in family.outcomes.values() if (place := o.place(each.x, each.y))]
-        assert each.members == front(places)
