@@ -39,6 +39,17 @@ def tradeoff(
         str | None,
         typer.Option(help="Shipped names and ONNX or safetensors files, with commas; all shipped if none."),
     ] = None,
+    network: Annotated[
+        list[Path] | None,
+        typer.Option(
+            help="Your own network beside them: float ONNX or safetensors, made INT8 as the shipped ones are, or an "
+            "INT8 file as it is. The board's DPU must run it; may be given again."
+        ),
+    ] = None,
+    against: Annotated[
+        str | None,
+        typer.Option(help="Method that all are held against, image by image; the best traditional chain if none."),
+    ] = None,
     budget: Annotated[
         str | None, typer.Option(help="What you can afford: 'latency<=20s', 'energy<=600J,host<=2'. Best PSNR wins.")
     ] = None,
@@ -96,7 +107,8 @@ def tradeoff(
     demands = [tuple(parse_demands(name, text)) for name, text in (("--budget", budget), ("--need", need))]
     if labelled is None:
         _refuse_unlabelled(context, *demands)
-    names = tuple(networks.split(",")) if networks is not None else tuple(shipped_names())
+    own = tuple(map(str, network or ()))
+    names = (*(networks.split(",") if networks is not None else shipped_names()), *own)
     aim = reference or REFERENCE
     boards = parse_targets(target)
     tree = labelled.rglob("*") if labelled else ()
@@ -118,13 +130,15 @@ def tradeoff(
         boards[0],
         boards,
         looked,
+        own,
+        against,
     )
     result = run_study(request, Cache(kept), partial(say, err=True))
     write_study(result.study, out)
     show(result.study)
     arguments: dict[str, object] = {"images": images, "sensor": sensor, "reference": aim, "size": size}
     arguments |= {"networks": networks, "budget": budget, "need": need, "calibration": calibration, "seed": seed}
-    arguments |= {"target": target}
+    arguments |= {"target": target, "network": ",".join(own) or None, "against": against}
     if labelled:
         arguments |= {"labelled": labelled, "detector": detector, "classes": classes}
     document = Document("tradeoff", arguments, (*request.files, *result.labelled), result.rows)
@@ -158,7 +172,9 @@ def show(study: "Study") -> None:
     for front in study.fronts:
         if front.y in ("PSNR", "mAP50"):
             say(f"front of {front.y} against {front.x}: {'; '.join(front.members)}")
-            for price in front.prices:
-                say(f"  {price}")
-    for sentence in (*study.advice, study.headline):
+            for sentence in (*front.prices, *front.alike):
+                say(f"  {sentence}")
+    own = [row for row in study.recommended if row.text["board"] == study.recommended[0].text["board"]]
+    others = [f"{row.name}: {row.text['sentence']}" for row in own[1:]]
+    for sentence in (*study.advice, *others, study.headline):
         say(sentence)

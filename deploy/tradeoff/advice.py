@@ -1,29 +1,29 @@
-"""What a study says: the best point for a budget or a need, what a step along a front costs, and how to read it.
+"""What a study advises: the best point for a budget or a need, and what the next step costs; how to read it.
 
-The paper's two runs stand beside as points: their times on the board compare, their pictures do not.
+A dearer point is advised only where the images tell it apart from a cheaper one: where the interval of the paired
+difference leaves 0 out. Of fewer sites than an interval takes, values alone decide, and it is said.
 """
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from itertools import pairwise
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 
-from deploy.bench.tables import PAPER, PAPER_TILE_PX, Swath
 from deploy.tradeoff.accuracy import BenchmarkSet
-from deploy.tradeoff.board import PAIR_QUANTILE, DpuRun, pair_error
+from deploy.tradeoff.board import PAIR_QUANTILE, pair_error
 from deploy.tradeoff.host_time import ROUNDS
 from deploy.tradeoff.host_time import TILE_PX as HOST_TILE_PX
 from deploy.tradeoff.methods import PATCH_PX, PATCHES
-from deploy.tradeoff.outcome import COSTS, DIRECTIONS, Outcome, Place, Plane, Results, dominated, front
-from deploy.tradeoff.points import EXACT, Demand, Point, Variant, on_dpu, shortfall
-from deploy.tradeoff.study import Front
-from model.evaluation.scores import NOTE
+from deploy.tradeoff.outcome import COSTS, DIRECTIONS, Outcome, Place, Results, front
+from deploy.tradeoff.points import Demand, shortfall
+from deploy.tradeoff.study import CHEAPER, apart, figure_words, gain_words, places
 from model.metrics.bootstrap import LEAST_SITES
-from profiles.figures import Figure, number, published, unavailable
+from profiles.figures import Figure, Row, number, unavailable
 
 QUALITY = "PSNR"
-ALIKE_DB = 0.05
-"""Within it a cheaper point is chosen where the images tell none apart."""
+ALIKE = {"PSNR": 0.05}
+"""Where the sites are too few to tell points apart, a cheaper one within it is chosen."""
+KNEE = 2
+"""A front of more steps than that has a knee."""
 
 
 @dataclass(frozen=True)
@@ -37,16 +37,13 @@ class Choice:
 def choose(results: Results, budget: Sequence[Demand], need: Sequence[Demand]) -> Choice:
     """Within a budget the best PSNR; for a need alone the least board latency, or host time where none has one."""
     demands = [*budget, *need]
-    goal = Goal(QUALITY, -1) if budget else Goal(_cost(results), 1)
+    goal = best_of(QUALITY) if budget else Goal(_cost(results), 1)
     ranked = [each for each in results.outcomes.values() if each.value(goal.key) is not None]
     kept = [each for each in ranked if not shortfall(each.figures, demands)]
     asked = " and ".join(map(str, demands))
     if not kept:
         return Choice(None, (_nearest(ranked or list(results.outcomes.values()), demands, asked),))
-    best = chosen = min(kept, key=goal.of)
-    if goal.key == QUALITY:
-        paid = next((demand.key for demand in budget if demand.key in COSTS), _cost(results))
-        chosen = min(_alike(results, best, kept), key=lambda each: each.value(paid) or math.inf)
+    best, chosen = _best_and_taken(results, kept, goal, _paid(results, budget))
     found = f"{chosen.name} (sensor: {chosen.text['sensor']}), {figures_words(chosen, demands, goal.key)}"
     sentences = [f"For {asked}: {found}; {_why(chosen, best, goal, len(kept))}."]
     sentences += _unsure(chosen, demands)
@@ -54,11 +51,21 @@ def choose(results: Results, budget: Sequence[Demand], need: Sequence[Demand]) -
     return Choice(chosen, tuple(sentences))
 
 
-def _alike(results: Results, best: Outcome, kept: Sequence[Outcome]) -> list[Outcome]:
-    """Points near the best that the images cannot tell from it."""
-    least = (best.value(QUALITY) or 0.0) - ALIKE_DB
-    near = [each for each in kept if (each.value(QUALITY) or 0.0) >= least]
-    return [each for each in near if results.gain(best.name, each.name, QUALITY)[0] <= 0]
+def _best_and_taken(results: Results, kept: Sequence[Outcome], goal: "Goal", cost: str) -> tuple[Outcome, Outcome]:
+    """The best of some points, and the cheapest of those that the images cannot tell from it."""
+    best = min(kept, key=lambda each: (goal.of(each), each.value(cost) or math.inf))
+    if goal.key not in DIRECTIONS:
+        return best, best
+    near = [each for each in kept if each is best or not told_better(results, best, each, goal.key)]
+    return best, min(near, key=lambda each: each.value(cost) or math.inf)
+
+
+def told_better(results: Results, a: Outcome, b: Outcome, key: str) -> bool:
+    """Whether `a` is better than `b` over the whole paired interval; by value where there is none."""
+    low, high = results.gain(a.name, b.name, key)
+    if math.isfinite(high - low):
+        return low > 0
+    return DIRECTIONS[key] * ((a.value(key) or 0.0) - (b.value(key) or 0.0)) > ALIKE.get(key, 0.0)
 
 
 def _why(chosen: Outcome, best: Outcome, goal: "Goal", count: int) -> str:
@@ -72,6 +79,11 @@ def _why(chosen: Outcome, best: Outcome, goal: "Goal", count: int) -> str:
 def _cost(results: Results) -> str:
     had = (key for key in COSTS if any(each.value(key) is not None for each in results.outcomes.values()))
     return next(had, COSTS[0])
+
+
+def _paid(results: Results, budget: Sequence[Demand]) -> str:
+    """What a budget is about; board latency where it names no cost, or host time where none has one."""
+    return next((demand.key for demand in budget if demand.key in COSTS), _cost(results))
 
 
 @dataclass(frozen=True)
@@ -91,16 +103,15 @@ class Goal:
         return self.sign * (outcome.value(self.key) or 0.0)
 
 
+def best_of(quality: str) -> Goal:
+    """The best of a quality, whichever way it runs."""
+    return Goal(quality, -DIRECTIONS[quality])
+
+
 def figures_words(outcome: Outcome, demands: Sequence[Demand], *more: str) -> str:
     """The figures that matter, each with its unit."""
     keys = dict.fromkeys([*more, *(demand.key for demand in demands)])
     return ", ".join(f"{key} {figure_words(outcome.figures[key])}" for key in keys)
-
-
-def figure_words(figure: Figure) -> str:
-    """A figure with its interval and unit."""
-    unit = "" if figure.unit in ("ratio", "distance") else f" {figure.unit}"
-    return f"{figure}{unit if figure.value is not None else ''}"
 
 
 def _unsure(best: Outcome, demands: Sequence[Demand]) -> list[str]:
@@ -137,187 +148,167 @@ def _nearest(outcomes: Sequence[Outcome], demands: Sequence[Demand], asked: str)
     )
 
 
-BESIDE = {"board latency": ("board energy",), "board energy": ("board latency",), "host p50": ()}
-"""What else a step costs."""
+@dataclass(frozen=True)
+class Recommendation:
+    """What to take on one board for one quality, in a sentence.
+
+    Attributes:
+        quality: key of the figure that is bought.
+        board: the target's name.
+        sentence: what a manager needs: what to take, how good it is, how long it takes, what the next step costs.
+        taken: the point; None where nothing keeps the demands.
+        following: the cheapest dearer point that the images tell to be better; None where there is none.
+        figures: of the point, and what the next step gains and costs.
+    """
+
+    quality: str
+    board: str
+    sentence: str
+    taken: Outcome | None
+    following: Outcome | None
+    figures: Mapping[str, Figure]
+
+    @property
+    def row(self) -> Row:
+        """For a document and the page."""
+        names = {"take": self.taken, "next": self.following}
+        text = {key: each.name if each else "none" for key, each in names.items()}
+        words = {"board": self.board, **text, "sentence": self.sentence}
+        return Row("recommendations", f"{self.quality} on {self.board}", self.figures, words)
 
 
-def fronts(results: Results) -> tuple[Front, ...]:
-    """A front for each pair of a cost and a quality that some points have."""
-    return tuple(_fronts(results))
+def recommendations(
+    results: Results, budget: Sequence[Demand], need: Sequence[Demand], board: str
+) -> list[Recommendation]:
+    """One for each quality that points have beside the cost, PSNR first."""
+    asked = [Question(results, key, board, tuple(budget), tuple(need)) for key in DIRECTIONS]
+    return [question.answer() for question in asked if question.ranked]
 
 
-def _fronts(results: Results) -> Iterator[Front]:
-    for y in DIRECTIONS:
-        for x in COSTS:
-            found = places(results, x, y)
-            if found:
-                members = front(found)
-                steps = apart(results, members, x, y)
-                yield Front(
-                    x, y, members, steps, dominated(found, Plane(results, x, y)), prices(results, steps, x, y)
-                )
+@dataclass(frozen=True)
+class Question:
+    """What to take on one board for one quality, within a budget, for a need, or without either."""
 
+    results: Results
+    quality: str
+    board: str
+    budget: tuple[Demand, ...]
+    need: tuple[Demand, ...]
 
-def places(results: Results, x: str, y: str) -> list[Place]:
-    """The points that have both figures."""
-    return [place for outcome in results.outcomes.values() if (place := outcome.place(x, y))]
+    @property
+    def cost(self) -> str:
+        """The figure that is paid."""
+        return _paid(self.results, self.budget)
 
+    @property
+    def ranked(self) -> list[Outcome]:
+        """The points that have the quality and the cost."""
+        had = (self.quality, self.cost)
+        return [each for each in self.results.outcomes.values() if None not in map(each.value, had)]
 
-def prices(results: Results, steps: tuple[str, ...], x: str, y: str) -> tuple[str, ...]:
-    """A sentence for each step, from cheap to dear."""
-    found = list(pairwise(steps))
-    return tuple(_price(results, *step, x, y, last=step == found[-1]) for step in found)
+    def answer(self) -> Recommendation:
+        """The point, and the sentence about it."""
+        demands = [*self.budget, *self.need]
+        kept = [each for each in self.ranked if not shortfall(each.figures, demands)]
+        asked = " and ".join(map(str, demands))
+        if not kept:
+            return self._nothing_fits(demands, asked)
+        if not demands:
+            steps = steps_of(self.results, self.quality, self.cost)
+            taken = self.results.outcomes[knee(steps).name]
+            why = "the knee of the front" if len(steps) > KNEE else "the cheapest on the front"
+            return self._recommend(f"Without a budget take {taken.point.spoken}, {why}", taken, taken)
+        goal = best_of(self.quality) if self.budget else Goal(self.cost, 1)
+        best, taken = _best_and_taken(self.results, kept, goal, self.cost)
+        return self._recommend(f"For {asked} take {taken.point.spoken}", taken, best)
 
-
-def apart(results: Results, members: Sequence[str], x: str, y: str) -> tuple[str, ...]:
-    """Members that are better and dearer than the one before beyond the intervals; of those as dear the best."""
-    kept = list(members[:1])
-    for name in members[1:]:
-        if results.gain(name, kept[-1], y)[0] <= 0:
-            continue
-        if results.ratio(name, kept[-1], x)[0] <= 1:
-            kept.pop()
-        kept.append(name)
-    return tuple(kept)
-
-
-def _price(results: Results, cheap: str, dear: str, x: str, y: str, *, last: bool) -> str:
-    times = " and ".join(times_words(results, dear, cheap, key) for key in (x, *BESIDE[x]))
-    bought = f"{'The last' if last else 'A step of'} {gain_words(results, dear, cheap, y)}"
-    return f"{bought}, from {cheap} to {dear}, costs {times}."
-
-
-GAINED = {"dB": "dB", "%": "points"}
-"""Unit of a difference, by that of the figures; none of others."""
-
-
-def gain_words(results: Results, better: str, worse: str, key: str) -> str:
-    """By how much one point is better, with its interval where there is one: "0.32 dB [0.2, 0.5] of PSNR"."""
-    values = [results.outcomes[name].figures[key] for name in (better, worse)]
-    gain = DIRECTIONS[key] * ((values[0].value or 0.0) - (values[1].value or 0.0))
-    low, high = results.gain(better, worse, key)
-    unit = GAINED.get(values[0].unit, "")
-    interval = f"[{number(low, 2)}, {number(high, 2)}]" if math.isfinite(high - low) else ""
-    return " ".join(f"{number(gain, 2)} {unit} {interval} of {key}".split())
-
-
-def times_words(results: Results, a: str, b: str, key: str) -> str:
-    """How many times as much one point costs: "2.1 times [1.7, 2.6] the board latency"."""
-    low, high = results.ratio(a, b, key)
-    return f"{number(results.times(a, b, key), 2)} times [{number(low, 2)}, {number(high, 2)}] the {key}"
-
-
-EQUAL_DB = 0.1
-ENERGY_SHARE = 0.1
-LATENCY, ENERGY = "board latency", "board energy"
-
-
-def papers_point(results: Results, is_papers: Callable[[str], bool], configuration: str) -> Outcome | None:
-    """The paper's network among the outcomes; `is_papers` tells it by a method's name."""
-    for outcome in results.outcomes.values():
-        point = outcome.point
-        usual = (point.tile_px, point.halo, point.configuration) == (PAPER_TILE_PX, EXACT, configuration)
-        if usual and on_dpu(point.variant) and is_papers(point.variant.method) and outcome.board:
-            return outcome
-    return None
-
-
-def findings(results: Results, paper: Outcome | None) -> tuple[str, ...]:
-    """As sentences; without the paper's network the reason why there are none."""
-    if paper is None:
-        return (
-            "The paper's network (16 blocks of 64 features) is not among the networks: nothing is held against it.",
+    def _nothing_fits(self, demands: Sequence[Demand], asked: str) -> Recommendation:
+        nearest = min(self.ranked, key=lambda each: shortfall(each.figures, demands))
+        sentence = (
+            f"Nothing in this study fits {asked}; nearest comes {nearest.point.spoken}: {self._words(nearest)}."
         )
-    best, throughout = (as_good(results, paper, whole_interval=whole) for whole in (False, True))
-    sentences = [equal_quality(results, paper, best, f"within {EQUAL_DB} dB")]
-    if throughout is not best:
-        sentences.append(equal_quality(results, paper, throughout, f"within {EQUAL_DB} dB over the whole interval"))
-    return (*sentences, tenth_energy(results, paper))
+        if math.isinf(shortfall(nearest.figures, demands)):
+            sentence = _nearest(self.ranked, demands, asked)
+        lacking = unavailable(nearest.figures[self.quality].unit, f"nothing fits {asked}")
+        return Recommendation(self.quality, self.board, sentence, None, None, {self.quality: lacking})
+
+    def _recommend(self, lead: str, taken: Outcome, best: Outcome) -> Recommendation:
+        following = self._following(taken)
+        step = self._step(taken, following)
+        after = "nothing dearer in this study is shown to be better"
+        if following:
+            gain = gain_words(self.results, following.name, taken.name, self.quality)
+            after = f"the next {gain}, with {following.point.spoken}, cost {figure_words(step['next cost'])} more"
+        sentences = [f"{lead}: {self._words(taken)}; {after}.", *self._remarks(taken, best, following or best)]
+        sentences += _unsure(taken, [*self.budget, *self.need])
+        figures = {key: taken.figures[key] for key in (self.quality, self.cost)} | step
+        return Recommendation(self.quality, self.board, " ".join(sentences), taken, following, figures)
+
+    def _words(self, outcome: Outcome) -> str:
+        good, paid = (outcome.figures[key] for key in (self.quality, self.cost))
+        where = "this machine" if self.cost.startswith("host") else self.board
+        value = figure_words(replace(good, interval=None))  # over sites: it is no measure of what differs
+        return f"{self.quality} {value} at {figure_words(paid)} on {where} ({paid.mode})"
+
+    def _following(self, taken: Outcome) -> Outcome | None:
+        """The next step beyond a point: shown to be better, and of those as dear for all we know the best."""
+        results, paid = self.results, taken.value(self.cost) or 0.0
+        beyond = front([place for place in places(results, self.cost, self.quality) if place.cost >= paid])
+        found: Outcome | None = None
+        for each in (results.outcomes[name] for name in beyond):
+            if not told_better(results, each, found or taken, self.quality):
+                continue
+            if found and results.ratio(each.name, found.name, self.cost)[0] > 1:
+                break
+            found = each
+        return found
+
+    def _step(self, taken: Outcome, following: Outcome | None) -> dict[str, Figure]:
+        """What the next step gains and costs; the interval of the cost is that of the ratio of both."""
+        paid = taken.figures[self.cost]
+        if following is None:
+            reason = f"no dearer point is shown to have a better {self.quality}"
+            units = {"next gain": taken.figures[self.quality].unit, "next cost": paid.unit}
+            return {key: unavailable(unit, reason) for key, unit in units.items()}
+        now, then = (each.value(self.cost) or 0.0 for each in (taken, following))
+        low, high = (now * (times - 1) for times in self.results.ratio(following.name, taken.name, self.cost))
+        source = f"{self.cost} of {following.name} less that of {taken.name}, interval by the ratio of both"
+        extra = Figure(then - now, paid.unit, paid.mode, source, (low, high))
+        return {"next gain": self.results.difference(following.name, taken.name, self.quality), "next cost": extra}
+
+    def _remarks(self, taken: Outcome, best: Outcome, following: Outcome) -> list[str]:
+        """What is to be said of a point with a better value, and of sites too few to tell."""
+        ends = [self.results.gain(each.name, taken.name, self.quality)[1] for each in (best, following)]
+        if not all(map(math.isfinite, ends)):
+            return [f"By value alone: of fewer than {LEAST_SITES} sites no difference can be trusted."]
+        if best is taken:
+            return []
+        more = gain_words(self.results, best.name, taken.name, self.quality)
+        better = f"{best.point.spoken} is better by {more}"
+        return [f"{better}, but these images cannot tell the two apart: take the {CHEAPER[self.cost]}."]
 
 
-def as_good(results: Results, paper: Outcome, *, whole_interval: bool) -> Outcome | None:
-    """The fastest of the points that reach its PSNR within EQUAL_DB: by value, or over the whole interval."""
+def knee(steps: Sequence[Place]) -> Place:
+    """The step of a front farthest above the straight line from its first step to its last, the cost logarithmic.
 
-    def lead_db(each: Outcome) -> float:
-        by_value = (each.value("PSNR") or 0.0) - (paper.value("PSNR") or 0.0)
-        return min(results.gain(each.name, paper.name, "PSNR")[0], by_value) if whole_interval else by_value
+    So Satopaa et al. find a knee ("Finding a Kneedle in a Haystack", ICDCS Workshops 2011): beyond it a doubling of
+    the cost buys less than along the whole front. Of two steps the cheaper one.
 
-    found = [each for each in _rivals(results, paper) if lead_db(each) >= -EQUAL_DB]
-    return min(found, key=lambda each: each.value(LATENCY) or 0.0, default=None)
-
-
-def equal_quality(results: Results, paper: Outcome, best: Outcome | None, how: str) -> str:
-    """That the fastest of the points that are as good is faster, or that none is."""
-    start = f"The paper's shape with the weights of {paper.point.variant.method}, {_of(paper, 'PSNR', LATENCY)}"
-    if best is None or (best.value(LATENCY) or 0.0) >= (paper.value(LATENCY) or 0.0):
-        return f"{start}: no point that knows as much of the sensor reaches its PSNR {how} in less time."
-    half = results.ratio(best.name, paper.name, LATENCY)[1] <= 0.5
-    halved = "; less than half the time over the whole interval" if half else ""
-    beside = _beside(results, best, paper, LATENCY, ENERGY)
-    return f"{start}, is matched {how} by {best.name} ({_of(best, 'PSNR', LATENCY)}): {beside}{halved}."
+    Args:
+        steps: from cheap to dear, at least one, each with a cost above 0.
+    """
+    first, last = steps[0], steps[-1]
+    gained, times = last.quality - first.quality or 1.0, math.log(last.cost / first.cost) or 1.0
+    above = [(step.quality - first.quality) / gained - math.log(step.cost / first.cost) / times for step in steps]
+    return steps[above.index(max(above))]
 
 
-def tenth_energy(results: Results, paper: Outcome) -> str:
-    """The best of the points that take a tenth of its energy, or that there is none."""
-    most = ENERGY_SHARE * (paper.value(ENERGY) or 0.0)
-    found = [each for each in _rivals(results, paper) if (each.value(ENERGY) or 0.0) <= most]
-    start = f"At a tenth of its energy ({number(most, 3)} of {number(paper.value(ENERGY) or 0.0, 3)} J)"
-    if not found:
-        cheapest = min(_rivals(results, paper), key=lambda each: each.value(ENERGY) or 0.0, default=paper)
-        return f"{start} there is no point; the least takes {cheapest.name}, {_of(cheapest, ENERGY, 'PSNR')}."
-    best = max(found, key=lambda each: each.value("PSNR") or 0.0)
-    return f"{start} the best is {best.name} ({_of(best, 'PSNR', ENERGY)}): {_beside(results, best, paper, ENERGY)}."
-
-
-def headline(results: Results, paper: Outcome | None) -> str:
-    """One sentence for a project manager."""
-    best = as_good(results, paper, whole_interval=False) if paper else None
-    if paper is None or best is None or (best.value(LATENCY) or 0.0) >= (paper.value(LATENCY) or 0.0):
-        return _plain_headline(list(results.outcomes.values()))
-    seconds = "in {} instead of {} s on the board (predicted)"
-    swift = seconds.format(*(number(each.value(LATENCY) or 0.0, 2) for each in (best, paper)))
-    decibels = " beside ".join(f"{each.value('PSNR') or 0.0:.2f}" for each in (best, paper))
-    where = f"tiles of {best.point.tile_px} on {best.point.configuration}"
-    return (
-        f"{best.point.variant} in {where} restores the swath {swift}, within {EQUAL_DB} dB of the paper's shape: "
-        f"PSNR {decibels} dB on the same pairs."
-    )
-
-
-def _plain_headline(outcomes: Sequence[Outcome]) -> str:
-    known = [each for each in outcomes if each.value("PSNR") is not None]
-    if not known:
-        return "No point could be measured."
-    best = max(known, key=lambda each: each.value("PSNR") or 0.0)
-    timed = [each for each in known if isinstance(each.board, DpuRun)]
-    sentence = f"Of {len(known)} points {best.name} is best, {_of(best, 'PSNR')}"
-    if not timed:
-        return f"{sentence}; none has a time on the board."
-    fastest = min(timed, key=lambda each: each.value(LATENCY) or 0.0)
-    return f"{sentence}; the fastest on the board is {fastest.name}, {_of(fastest, LATENCY, 'PSNR')}."
-
-
-def _rivals(results: Results, paper: Outcome) -> list[Outcome]:
-    """The points that compare with the paper's network: see the module."""
-    return [
-        each
-        for each in results.outcomes.values()
-        if each is not paper
-        and isinstance(each.board, DpuRun)
-        and each.point.configuration == paper.point.configuration
-        and each.text["sensor"] == paper.text["sensor"]
-    ]
-
-
-def _beside(results: Results, a: Outcome, b: Outcome, *costs: str) -> str:
-    times = " and ".join(times_words(results, a.name, b.name, key) for key in costs)
-    more = (a.value("PSNR") or 0.0) >= (b.value("PSNR") or 0.0)
-    better, worse = (a, b) if more else (b, a)
-    return f"{gain_words(results, better.name, worse.name, 'PSNR')} {'more' if more else 'less'}, for {times}"
-
-
-def _of(outcome: Outcome, *keys: str) -> str:
-    return ", ".join(f"{key} {figure_words(outcome.figures[key])}" for key in keys)
+def steps_of(results: Results, quality: str, cost: str) -> list[Place]:
+    """A front's members that are told apart, from cheap to dear; all of them where the sites are too few to tell."""
+    found = {place.name: place for place in places(results, cost, quality)}
+    members = front(list(found.values()))
+    known = any(math.isfinite(results.gain(name, members[0], quality)[0]) for name in members[1:])
+    return [found[name] for name in (apart(results, members, cost, quality) if known else members)]
 
 
 def notes(
@@ -335,6 +326,7 @@ def notes(
         f"Pictures are judged on {len(benchmark.pairs)} whole images of {len(set(benchmark.sites))} sites.",
         "The paper's shape is judged with the weights of that shape at hand, not with the paper's own.",
         "Points are distinguished by the differences on the same images: their own intervals show how images differ.",
+        "Without a budget the knee is advised: beyond it a doubling of the cost buys less than on the whole front.",
         f"Times on the board are distinguished by their ratio, none and all of the memory's hidden, and {spread}.",
         "Points of one network, tile and configuration are distinguished on the board by their count of tiles alone.",
         "Energies of two networks or configurations may also differ by the whole range assumed for the power.",
@@ -355,31 +347,3 @@ def notes(
     found += [f"{sampled[0].upper()}{sampled[1:]}."] if sampled else []
     found += [f"Left out, too small: {', '.join(small)}."] if small else []
     return (*found, *(f"{variant} is not there: {reason}." for variant, reason in lacks.items()))
-
-
-SIZE_PX = (13600, 9016)
-RUNS = {
-    "paper: ConvBEERS on the DPU": ("INT8", (42, 7.2, 29.6, 98965)),
-    "paper: traditional on the board's CPU": ("float32", (1724, 0.2, 22.5, 3161)),
-}
-"""Precision; latency, throughput, power and efficiency as printed."""
-
-
-def paper_outcomes(swath: Swath, units: Mapping[str, str]) -> list[Outcome]:
-    """Both runs, where the swath is the paper's; else none. `units`: of every figure of a point."""
-    if (swath.width_px, swath.height_px) != SIZE_PX:
-        return []
-    return [_outcome(name, precision, values, units) for name, (precision, values) in RUNS.items()]
-
-
-def _outcome(
-    name: str, precision: str, values: tuple[float, float, float, float], units: Mapping[str, str]
-) -> Outcome:
-    latency_s, rate, power_w, efficiency = values
-    printed = {"latency": latency_s, "throughput": rate, "power": power_w, "efficiency": efficiency}
-    found = {f"board {key}": published(value, units[f"board {key}"], PAPER) for key, value in printed.items()}
-    found["board energy"] = published(latency_s * power_w, "J", f"{PAPER}: latency x power")
-    figures: dict[str, Figure] = {key: found.get(key) or unavailable(unit, NOTE) for key, unit in units.items()}
-    text = dict.fromkeys(("halo", "tile", "configuration", "runtime"), "not stated")
-    text |= {"method": name, "kind": "paper", "precision": precision, "sensor": "not stated"}
-    return Outcome(Point(Variant(name, "paper", precision)), figures, text)

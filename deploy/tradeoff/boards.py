@@ -4,7 +4,8 @@ A legal network computes the same integers on all of them, so its pictures are t
 figures differ. The networks are those of the default configuration with exact seams, one row a tile.
 """
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
 
 import onnx
 
@@ -42,10 +43,29 @@ def parse_targets(text: str) -> tuple[str, ...]:
     return names
 
 
-def board_rows(
+@dataclass(frozen=True)
+class OnBoard:
+    """A network of the study on another DPU; `fitted` says whether the fitted networks speak for its figures."""
+
+    outcome: Outcome
+    dpu: Dpu
+    fitted: str
+
+    @property
+    def row(self) -> Row:
+        """Its figures of the board, and the pictures' own beside them."""
+        found, point = self.outcome.figures, self.outcome.point
+        keys = [*(f"board {name}" for name in FIGURES), *(key for key in DIRECTIONS if key in found)]
+        words = {"board": self.dpu.target.name, "configuration": self.dpu.name, "tile": str(point.tile_px)}
+        words |= {"fitted range": self.fitted, "method": point.variant.method}
+        name = f"{point.variant.method}, tile {point.tile_px}, {self.dpu.target.name} {self.dpu.name}"
+        return Row(TABLE, name, {key: found[key] for key in keys}, words)
+
+
+def on_boards(
     outcomes: Sequence[Outcome], dpus: Sequence[Dpu], model_of: Callable[[Variant], onnx.ModelProto]
-) -> tuple[Row, ...]:
-    """A row for each network, tile and DPU.
+) -> list[OnBoard]:
+    """Each network and tile on each DPU.
 
     Args:
         outcomes: of the study.
@@ -53,7 +73,7 @@ def board_rows(
         model_of: the INT8 file of a variant.
     """
     shown = [each for each in outcomes if _compares(each)]
-    return tuple(row for each in shown for row in _rows(each, dpus, model_of(each.point.variant)))
+    return [found for each in shown for found in _on_boards(each, dpus, model_of(each.point.variant))]
 
 
 def every_configuration(boards: Sequence[str]) -> list[Dpu]:
@@ -80,24 +100,31 @@ def _compares(outcome: Outcome) -> bool:
     return isinstance(run, DpuRun) and run.dpu.name == dpu_of(run.dpu.target).name and point.halo == EXACT
 
 
-def _rows(outcome: Outcome, dpus: Sequence[Dpu], model: onnx.ModelProto) -> Iterator[Row]:
+def _on_boards(outcome: Outcome, dpus: Sequence[Dpu], model: onnx.ModelProto) -> Iterator[OnBoard]:
     network = network_of(model, outcome.point.tile_px)
-    quality = {key: outcome.figures[key] for key in DIRECTIONS if key in outcome.figures}
     for dpu in dpus:
-        point, where = outcome.point, f"{dpu.target.name} {dpu.name}"
-        figures, fitted = _figures(outcome, network, dpu)
-        words = {"board": dpu.target.name, "configuration": dpu.name, "tile": str(point.tile_px)}
-        words |= {"fitted range": fitted, "method": point.variant.method}
-        yield Row(TABLE, f"{point.variant.method}, tile {point.tile_px}, {where}", {**figures, **quality}, words)
+        run, fitted = _run(outcome, network, dpu)
+        figures = (
+            run.figures() if isinstance(run, DpuRun) else {f"board {name}": _lacking(name, run) for name in FIGURES}
+        )
+        moved = replace(
+            outcome,
+            point=replace(outcome.point, configuration=dpu.name),
+            figures={**outcome.figures, **figures},
+            board=run if isinstance(run, DpuRun) else None,
+        )
+        yield OnBoard(moved, dpu, fitted)
 
 
-def _figures(outcome: Outcome, network: Network, dpu: Dpu) -> tuple[Mapping[str, Figure], str]:
-    """The board's figures, and whether the fitted networks speak for them."""
+def _run(outcome: Outcome, network: Network, dpu: Dpu) -> tuple[DpuRun | str, str]:
+    """Its run there, or why there is none; and whether the fitted networks speak for it."""
     assert isinstance(outcome.board, DpuRun)  # noqa: S101 - chosen so
     try:
         prediction = predict(place(network, dpu), dpu)
     except ModelError as error:
-        reason = str(error).rstrip(".")
-        return {f"board {name}": unavailable(UNITS[f"board {name}"], reason) for name in FIGURES}, ""
-    run = DpuRun(outcome.board.network, dpu, prediction, outcome.board.swath)
-    return run.figures(), fitted_range(prediction)
+        return str(error).rstrip("."), ""
+    return DpuRun(outcome.board.network, dpu, prediction, outcome.board.swath), fitted_range(prediction)
+
+
+def _lacking(name: str, reason: str) -> Figure:
+    return unavailable(UNITS[f"board {name}"], reason)

@@ -66,8 +66,20 @@ class Network:
         return float_model(self.float_file) if self.float_file else load_onnx(self.int8_file or Path())
 
 
-def find_networks(names: Iterable[str], sensor: str = SENSOR, say: Say = silent) -> list[Network]:
+OWN = "--network"
+"""The option by which a user's own networks come."""
+
+
+def find_networks(
+    names: Iterable[str], sensor: str = SENSOR, say: Say = silent, own: Sequence[str] = ()
+) -> list[Network]:
     """Networks by shipped name or file, each once; conditioned ones specialised to the sensor.
+
+    Args:
+        names: shipped ones and files.
+        sensor: profile of the study.
+        say: is told what of the sensor lies outside the range that a network was trained for.
+        own: those of the names that are the user's own files.
 
     Raises:
         OptionError: neither a shipped name nor a file of weights, two files of one name, or a model of one tile size.
@@ -75,31 +87,33 @@ def find_networks(names: Iterable[str], sensor: str = SENSOR, say: Say = silent)
     """
     known, found = load_sensor(sensor), dict[str, Network]()
     for name in dict.fromkeys(each.strip() for each in names):
-        network = _network(name, known, say)
+        option = OWN if name in own else "--networks"
+        network = _network(name, known, say, option)
         if network.name in found:
-            raise OptionError("--networks", expected="names that differ", got=repr(name), remedy="rename one file")
+            raise OptionError(option, expected="names that differ", got=repr(name), remedy="rename one file")
         found[network.name] = network
     return list(found.values())
 
 
-def _network(name: str, sensor: SensorProfile, say: Say) -> Network:
+def _network(name: str, sensor: SensorProfile, say: Say, option: str) -> Network:
     path = Path(name)
-    if name in shipped_names():
+    if name in shipped_names() and option != OWN:
         return Network(name, float_file(path, sensor, say), int8_file(path, sensor, say))
     if path.suffix not in (".onnx", ".safetensors"):
-        expected = f"a shipped network ({', '.join(shipped_names())}) or an ONNX or safetensors file"
-        raise OptionError("--networks", expected=expected, got=repr(name), remedy="correct that name")
+        shipped = "" if option == OWN else f"a shipped network ({', '.join(shipped_names())}) or "
+        expected = f"{shipped}an ONNX or safetensors file"
+        raise OptionError(option, expected=expected, got=repr(name), remedy="correct that name")
     model = float_model(float_file(path, sensor, say))
     tiling = tiling_of(model)
     if tiling.fixed_px is not None:
         got, remedy = f"{name} for one tile size", "export it without --tile"
-        raise OptionError("--networks", expected="networks for images of any size", got=got, remedy=remedy)
+        raise OptionError(option, expected="networks for images of any size", got=got, remedy=remedy)
     if replace(tiling, lattice_px=1) != Tiling(tiling.halo_px) or HALO_STEP_PX % tiling.lattice_px:
         expected = (
             f"networks of one band, of which halos and tiles of all multiples of {HALO_STEP_PX} px are compared"
         )
         got = f"{name}, {tiling.words}"
-        raise OptionError("--networks", expected=expected, got=got, remedy="bench it and restore with it instead")
+        raise OptionError(option, expected=expected, got=got, remedy="bench it and restore with it instead")
     if is_quantised(model):
         precision = metadata(model).get("precision", "int8 legal").replace("int8", "INT8")
         return Network(path.stem, None, path, precision)

@@ -24,7 +24,7 @@ from deploy.tradeoff.methods import runtime_of
 from deploy.tradeoff.points import EXACT, MAP50, NAMES, NAMES_LABELLED, Point, on_dpu
 from model.evaluation.methods import Method
 from model.evaluation.scores import mean_row
-from model.metrics.bootstrap import site_interval
+from model.metrics.bootstrap import LEAST_SITES, site_interval
 from profiles import TargetProfile
 from profiles.errors import ModelError
 from profiles.figures import Figure, Row, measured, predicted, unavailable
@@ -92,6 +92,9 @@ QUALITIES = {"PSNR": 1, "SSIM": 1, "LPIPS-squeeze": -1}
 """Figures of quality that every study has, and whether more (1) or less (-1) of it is better."""
 DIRECTIONS = {**QUALITIES, MAP50: 1}
 """The same of all: a study has mAP50 where labelled images are given."""
+DIFFERENCE_UNITS = {"%": "points"}
+"""Units of differences where they are not those of the figures."""
+PAIRED = "on the same images, 95 % bootstrap interval of the paired difference over sites"
 
 
 @dataclass(frozen=True, eq=False)
@@ -161,6 +164,23 @@ class Results:
             return _detected_gain(self.outcomes[a], self.outcomes[b])
         first, second = (self._values(name, key) for name in (a, b))
         return _difference(first, second, tuple(self.sites), QUALITIES[key], self.seed)
+
+    def difference(self, a: str, b: str, key: str) -> Figure:
+        """A quality of `a` less that of `b` on the same images, with the interval of the paired difference."""
+        pair = [self.outcomes[name] for name in (a, b)]
+        unit = DIFFERENCE_UNITS.get(pair[0].figures[key].unit, pair[0].figures[key].unit)
+        first, second = (each.value(key) for each in pair)
+        if first is None or second is None:
+            return unavailable(unit, f"no {key} of {b if second is None else a} on the images of this study")
+        low, high = sorted(DIRECTIONS[key] * end for end in self.gain(a, b, key))
+        known = math.isfinite(high - low)
+        source = (
+            f"{key} less that of {b} {PAIRED if known else f'on the same images of fewer than {LEAST_SITES} sites'}"
+        )
+        value = first - second
+        if "predicted" in {each.figures[key].mode for each in pair}:
+            return predicted(value, unit, (low, high) if known else (value, value), source)
+        return measured(value, unit, source, (low, high) if known else None)
 
     def ratio(self, a: str, b: str, key: str) -> Interval:
         """Interval of the cost of `a` over that of `b`."""

@@ -9,13 +9,13 @@ from pathlib import Path
 from markupsafe import Markup
 
 from deploy import __version__
+from deploy.report.layer_bars import layer_bars
 from deploy.report.page import TEMPLATES, Grid, Provenance, figure_keys, grid_of, templates
 from deploy.report.plots import plot_style
 from deploy.results import unit_of, words_of
-from deploy.tradeoff.layer_bars import layer_bars
-from deploy.tradeoff.marks import STATES
-from deploy.tradeoff.plot import NARROW, WIDE, Points, drawn, plot_of, state_of
-from deploy.tradeoff.study import Crop, Front, Study
+from deploy.tradeoff.marks import STATES, Points, drawn, state_of
+from deploy.tradeoff.plot import NARROW, WIDE, plot_of
+from deploy.tradeoff.study import Crop, Front, Study, front_rows
 from model.io.files import write_text
 from model.io.pictures import picture_url, stretch_of
 from profiles.figures import Figure, Row, by_table
@@ -61,7 +61,7 @@ def write_study(study: Study, out: Path) -> None:
         MachineError: a file cannot be written.
     """
     fronts = ordered(study.fronts)
-    first = plot_of(fronts[0] if fronts else Front(*FIRST, (), (), {}, ()), Points.of(study.points), WIDE)
+    first = plot_of(fronts[0] if fronts else Front(*FIRST, (), (), {}, ()), points_of(study), WIDE)
     write_text(out / "tradeoff.svg", first.svg(alone=True))
     first.write_png(out / "tradeoff.png")
     write_points(study.points, out / "points.csv")
@@ -75,14 +75,14 @@ def ordered(fronts: Sequence[Front]) -> list[Front]:
 
 def render_study(study: Study) -> str:
     """The study as one HTML page, with its plots, tables and pictures."""
-    provenance, points, fronts = Provenance(), Points.of(study.points), ordered(study.fronts)
+    provenance, points, fronts = Provenance(), points_of(study), ordered(study.fronts)
     boards = Points(study.boards, points.marks)
     shown = {
         "study": study,
-        "plots": [_shown(front, points) for front in fronts],
+        "plots": [_shown(study, front, points, provenance) for front in fronts],
         "costs": list(dict.fromkeys(front.x for front in fronts)),
         "qualities": list(dict.fromkeys(front.y for front in fronts)),
-        "points": grid_of([_with_place(row, fronts) for row in study.points], provenance),
+        "points": grid_of([_with_differences(_with_place(row, fronts), points) for row in study.points], provenance),
         "marks": [points.mark(row) for row in study.points],
         "boards": grid_of(study.boards, provenance),
         "board_marks": [boards.mark(row) for row in study.boards],
@@ -103,15 +103,36 @@ def _script() -> Markup:
 
 @dataclass(frozen=True)
 class Shown:
-    """A front with its plot, for a wide screen and for a narrow one."""
+    """A front with its plot, for a wide screen and for a narrow one, and a table of its members."""
 
     front: Front
     wide: Markup
     narrow: Markup
+    members: Grid
 
 
-def _shown(front: Front, points: Points) -> Shown:
-    return Shown(front, *(plot_of(front, points, canvas).svg() for canvas in (WIDE, NARROW)))
+def _shown(study: Study, front: Front, points: Points, provenance: Provenance) -> Shown:
+    wide, narrow = (plot_of(front, points, canvas).svg() for canvas in (WIDE, NARROW))
+    return Shown(front, wide, narrow, grid_of(front_rows(study, front), provenance))
+
+
+def points_of(study: Study) -> Points:
+    """A study's points with their looks, and what they are held against."""
+    return Points.of(study.points, study.against, study.differences)
+
+
+def _with_differences(row: Row, points: Points) -> Row:
+    """The row, with each difference behind its quality."""
+    if row.name not in points.differences:
+        return row
+    beside, found = points.differences[row.name].figures, dict[str, Figure]()
+    for key, figure in row.figures.items():
+        found |= {
+            name: each
+            for name, each in ((key, figure), (f"{key} difference", beside.get(f"{key} difference")))
+            if each
+        }
+    return replace(row, figures=found)
 
 
 def _with_place(row: Row, fronts: Sequence[Front]) -> Row:

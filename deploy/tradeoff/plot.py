@@ -1,4 +1,4 @@
-"""The plot of one front: a mark for each point with its intervals, the front's line, labels and a legend.
+"""The plot of one front: a mark for each point with its bars, the front's line, labels and a legend.
 
 Quality is up and cost to the right. Every plot is laid out twice, for a wide screen and for a phone; the page's style
 sheet shows one of them.
@@ -7,65 +7,40 @@ sheet shows one of them.
 import math
 import textwrap
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 
+import numpy as np
 from markupsafe import Markup
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.colors import to_rgba
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from matplotlib.markers import CARETDOWN
 from matplotlib.patheffects import withStroke
 
 from deploy.report.plots import LIGHT, PX_PER_INCH, TITLE_PX, look, new_figure, set_ticks, svg_of, text_width
 from deploy.tradeoff.labels import Box, Label, Wish, place
-from deploy.tradeoff.marks import FILLINGS, RADIUS_PX, STATES, Mark, State, marks_of
+from deploy.tradeoff.marks import (
+    LABEL_PX,
+    RADIUS_PX,
+    ROW_PX,
+    WORDS_PX,
+    Entry,
+    Points,
+    State,
+    legend_of,
+    method_of,
+    state_of,
+    value_of,
+)
 from deploy.tradeoff.outcome import DIRECTIONS
-from deploy.tradeoff.study import Front
+from deploy.tradeoff.study import Front, figure_words
 from model.io.files import whole_file
 from profiles.figures import Row
-
-
-@dataclass(frozen=True)
-class Points:
-    """The rows of a study, and how their methods look; a row's number is its place in the table."""
-
-    rows: Sequence[Row]
-    marks: Mapping[str, Mark]
-
-    @classmethod
-    def of(cls, rows: Sequence[Row]) -> "Points":
-        """Rows with a look for each of their methods."""
-        return cls(rows, marks_of(map(method_of, rows)))
-
-    def mark(self, row: Row) -> Mark:
-        """The marker and colour of its method, filled as its precision; an unknown precision is left hollow."""
-        return replace(self.marks[method_of(row)], filling=FILLINGS.get(row.text.get("precision", ""), "none"))
-
-    def on(self, front: Front) -> list[tuple[str, Row]]:
-        """The points that can be drawn, each with the id of its row in the page's table."""
-        return [(f"point-{k}", row) for k, row in enumerate(self.rows, 1) if drawn(row, front)]
-
-
-def method_of(row: Row) -> str:
-    """The name of the method that the row's point runs."""
-    return row.text.get("method", row.name)
-
-
-def drawn(row: Row, front: Front) -> bool:
-    """Whether it has both figures, a cost above zero, and neither published: those were found on other images."""
-    found = [row.figures.get(key) for key in (front.x, front.y)]
-    if any(figure is None or figure.value is None or figure.mode == "published" for figure in found):
-        return False
-    return _value(row, front.x) > 0
-
-
-def state_of(front: Front, name: str) -> State:
-    """Where a point lies beside the front."""
-    return "front" if name in front.members else "dominated" if name in front.dominated else "open"
 
 
 @dataclass(frozen=True)
@@ -79,15 +54,11 @@ class Canvas:
 
 
 WIDE, NARROW = Canvas(1080, 660, 30, brief=False), Canvas(400, 640, 24, brief=True)
-LEFT_PX, RIGHT_PX, TOP_PX, BELOW_PX, EDGE_PX = 66, 14, 34, 54, 18
+LEFT_PX, RIGHT_PX, TOP_PX, BELOW_PX = 80, 14, 34, 54
 LEAST_PX = 260
 """The frame's least height: below a long legend the canvas grows."""
 
-ROW_PX, WORDS_PX, GAP_PX = 20, 13, 22
-"""In the legend: between lines, from a mark to its words, and from them to the next mark."""
-
 TICK_PX = (64, 44)
-LABEL_PX = 12
 BETTER = "better: up and to the left"
 
 
@@ -137,8 +108,9 @@ def plot_of(front: Front, points: Points, canvas: Canvas) -> Plot:
         points: all of the study, with their looks.
         canvas: the size; it grows in height below a long legend.
     """
-    shown = points.on(front)
-    rows = [row for _, row in shown]
+    titles = {anchor: _title(front, row, points) for anchor, row in points.on(front)}
+    front, rows = pressed(front, points, [row for _, row in points.on(front)])
+    shown = list(zip(titles, rows, strict=True))
     legend = legend_of(points, rows, canvas.width)
     legend_px = max((entry.y for entry in legend), default=0.0) + ROW_PX / 2
     height = max(canvas.height, TOP_PX + LEAST_PX + BELOW_PX + math.ceil(legend_px))
@@ -150,10 +122,15 @@ def plot_of(front: Front, points: Points, canvas: Canvas) -> Plot:
         axes = _make_axes(figure, front, rows, frame, canvas)
         stairs = _draw_front(axes, front, rows)
         _draw_intervals(axes, front, points, rows)
+        _draw_level(axes, front, points)
         for anchor, row in shown:
             line = points.mark(row).line(state := state_of(front, row.name), *_values(front, row))
             line.set(gid=anchor, clip_on=False, zorder=4 + RADIUS_PX[state])
             axes.add_line(line)
+            if OFF in row.text:
+                axes.plot(
+                    value_of(row, front.x), axes.get_ylim()[0], marker=CARETDOWN, color=LIGHT["ink"], clip_on=False
+                )
         places = {anchor: _pixels(axes, [_values(front, row)], canvas)[0] for anchor, row in shown}
         boxes = [_covered(places[anchor], state_of(front, row.name)) for anchor, row in shown]
         better = (frame[0], frame[1], frame[0] + text_width(BETTER) + 12, frame[1] + 26)
@@ -164,60 +141,55 @@ def plot_of(front: Front, points: Points, canvas: Canvas) -> Plot:
         _write(figure, frame[0] + 8, frame[1] + 18, BETTER, canvas, color=LIGHT["soft"])
         for label in labels:
             _draw_label(figure, label, canvas)
-    return Plot(front, figure, frame, places, boxes, labels, {a: _title(front, r) for a, r in shown}, parts)
-
-
-def _value(row: Row, key: str) -> float:
-    return row.figures[key].value or 0.0
+    return Plot(front, figure, frame, places, boxes, labels, titles, parts)
 
 
 def _values(front: Front, row: Row) -> tuple[float, float]:
-    return _value(row, front.x), _value(row, front.y)
+    return value_of(row, front.x), value_of(row, front.y)
 
 
-def _title(front: Front, row: Row) -> str:
-    said = [
-        f"{key} {row.figures[key]} {row.figures[key].unit}, {row.figures[key].mode}" for key in (front.y, front.x)
-    ]
+OFF = "off the scale"
+"""The word of a row whose mark stands at the lower edge, with its value."""
+PRESSED = 0.12
+"""How far below the others such marks stand, as a share of what those span."""
+
+
+def pressed(front: Front, points: Points, rows: Sequence[Row]) -> tuple[Front, list[Row]]:
+    """The front and its rows with poor outliers moved to the lower edge: else a few would press all others together.
+
+    Poor is what lies below Tukey's lower fence (Exploratory Data Analysis, 1977), 1.5 interquartile ranges below the
+    lower quartile, and below the point that all are held against, by more than a quarter of its own distance from
+    the best.
+    """
+    sign = DIRECTIONS[front.y]
+    good = {row.name: sign * value_of(row, front.y) for row in rows}
+    low, high = np.percentile(list(good.values()), (25, 75)) if good else (0.0, 0.0)
+    held, best = good.get(points.against, np.inf), max(good.values(), default=0.0)
+    fence = min(low - 1.5 * (high - low), held - max(best - held, 0.0) / 4)
+    inside = [each for each in good.values() if each >= fence]
+    if high == low or len(inside) == len(good):
+        return front, list(rows)
+    edge = sign * float(min(inside) - PRESSED * (max(inside) - min(inside)))
+    kept = {name: each for name, each in front.differences.items() if good[name] >= fence}
+    found = [row if good[row.name] >= fence else _moved(row, front.y, edge) for row in rows]
+    return replace(front, differences=kept), found
+
+
+def _moved(row: Row, key: str, value: float) -> Row:
+    figure = row.figures[key]
+    figures = {**row.figures, key: replace(figure, value=value, interval=None)}
+    return replace(row, figures=figures, text={**row.text, OFF: figure_words(replace(figure, interval=None))})
+
+
+def _title(front: Front, row: Row, points: Points) -> str:
+    said = [f"{key} {figure_words(row.figures[key])}, {row.figures[key].mode}" for key in (front.y, front.x)]
+    before, held = front.differences.get(row.name), points.differences.get(row.name)
+    if before:
+        said.append(f"{front.y} less that of {before.against}: {figure_words(before.figure)}")
+    if held and row.name != points.against:
+        said.append(f"{front.y} less that of {points.against}: {figure_words(held.figures[f'{front.y} difference'])}")
     dominated = f"dominated by {front.dominated[row.name]}" if row.name in front.dominated else ""
     return "\n".join(line for line in (row.name, *said, dominated) if line)
-
-
-@dataclass(frozen=True)
-class Entry:
-    """A part of the legend: a mark at (x, y) in pixels from the legend's upper left corner, and its words."""
-
-    mark: Mark
-    text: str
-    state: State = "front"
-    x: float = 0.0
-    y: float = 0.0
-
-
-def legend_of(points: Points, rows: Sequence[Row], width_px: float) -> list[Entry]:
-    """Which marker is which method, which filling which precision, which size which state, in lines so wide."""
-    methods = dict.fromkeys(map(method_of, rows))
-    precisions = filter(None, dict.fromkeys(row.text.get("precision", "") for row in rows))
-    groups = [
-        [Entry(points.marks[method], _short(method)) for method in methods],
-        [Entry(Mark("o", "ink", FILLINGS.get(name, "none")), name) for name in precisions],
-        [Entry(Mark("o", "ink"), text, state) for state, text in STATES.items()],
-    ]
-    return list(_flow(groups, width_px))
-
-
-def _flow(groups: Iterable[Sequence[Entry]], width_px: float) -> Iterator[Entry]:
-    """From left to right, each group from a new line on."""
-    y = ROW_PX / 2
-    for group in groups:
-        x = float(EDGE_PX)
-        for entry in group:
-            reach = x + WORDS_PX + text_width(entry.text, LABEL_PX)
-            if reach > width_px and x > EDGE_PX:
-                x, y, reach = float(EDGE_PX), y + ROW_PX, reach - x + EDGE_PX
-            yield replace(entry, x=x, y=y)
-            x = reach + GAP_PX
-        y += ROW_PX if group else 0
 
 
 def _draw_legend(figure: Figure, legend: Sequence[Entry], top_px: float, canvas: Canvas) -> list[Box]:
@@ -232,14 +204,6 @@ def _draw_legend(figure: Figure, legend: Sequence[Entry], top_px: float, canvas:
         (e.x - reach, top_px + e.y - reach, e.x + WORDS_PX + text_width(e.text, LABEL_PX), top_px + e.y + reach)
         for e in legend
     ]
-
-
-LETTERS = 40
-
-
-def _short(text: str) -> str:
-    line = " ".join(text.split())
-    return line if len(line) <= LETTERS else f"{line[: LETTERS - 1]}\u2026"
 
 
 MARGIN, REACH = 0.07, 0.5
@@ -261,11 +225,11 @@ def _make_axes(figure: Figure, front: Front, rows: Sequence[Row], frame: Box, ca
 
 
 def _limits(rows: Sequence[Row], front: Front, key: str, *, logarithmic: bool) -> tuple[float, float]:
-    """They hold all values, and the intervals of the front's members as far as they do not squeeze the values."""
+    """They hold all values, and the bars of the front's members as far as they do not squeeze the values."""
     forth, back = (math.log, math.exp) if logarithmic else (float, float)
-    values = [forth(_value(row, key)) for row in rows] or [0.0, 1.0]
-    members = [row.figures[key].interval for row in rows if row.name in front.members]
-    ends = [forth(end) for interval in members if interval for end in interval if end > 0 or not logarithmic]
+    values = [forth(value_of(row, key)) for row in rows] or [0.0, 1.0]
+    members = [_bar(front, row, key) for row in rows if row.name in front.members]
+    ends = [forth(end) for bar in members if bar for end in bar if end > 0 or not logarithmic]
     low, high = min(values), max(values)
     span = high - low or max(abs(high), 1.0)
     inner, outer = ((low - share * span, high + share * span) for share in (MARGIN, REACH))
@@ -306,15 +270,35 @@ def _draw_intervals(axes: Axes, front: Front, points: Points, rows: Sequence[Row
     axes.add_collection(LineCollection(segments, colors=colours, linewidths=1.4, zorder=2), autolim=False)
 
 
+def _bar(front: Front, row: Row, key: str) -> tuple[float, float] | None:
+    """What a bar covers: a cost's own interval; of a quality that of the paired difference, about the value."""
+    if key == front.x:
+        return row.figures[key].interval
+    before = front.differences.get(row.name)
+    if before is None or before.figure.interval is None:
+        return None
+    level = value_of(row, key) - (before.figure.value or 0.0)
+    return level + before.figure.interval[0], level + before.figure.interval[1]
+
+
 def _intervals(axes: Axes, front: Front, row: Row) -> Iterator[tuple[tuple[float, float], tuple[float, float]]]:
-    """Both ends of the interval of each figure; one that goes on beyond the axes ends at their edge."""
-    (x, y), (across, up) = _values(front, row), (row.figures[key].interval for key in (front.x, front.y))
+    """Both ends of both bars; one that goes on beyond the axes ends at their edge."""
+    (x, y), (across, up) = _values(front, row), (_bar(front, row, key) for key in (front.x, front.y))
     if across:
         low, high = _within(across, axes.get_xlim())
         yield (low, y), (high, y)
     if up:
         low, high = _within(up, axes.get_ylim())
         yield (x, low), (x, high)
+
+
+def _draw_level(axes: Axes, front: Front, points: Points) -> None:
+    """A dotted line at the quality of the point that all are held against, where it lies within the axes."""
+    found = [row.figures[front.y].value for row in points.rows if row.name == points.against]
+    low, high = sorted(axes.get_ylim())
+    for value in found:
+        if value is not None and low < value < high:
+            axes.axhline(value, color=LIGHT["soft"], linewidth=1.2, linestyle=(0, (1, 3)), zorder=1, gid="against")
 
 
 def _within(ends: tuple[float, float], limits: tuple[float, float]) -> list[float]:
@@ -356,15 +340,14 @@ def wishes_of(front: Front, shown: Sequence[tuple[Row, tuple[float, float]]], ca
         shown: its points, each with its place in pixels.
         canvas: what it is plotted on.
     """
-    by_quality = sorted(shown, key=lambda each: -DIRECTIONS[front.y] * _value(each[0], front.y))
+    by_quality = sorted(shown, key=lambda each: -DIRECTIONS[front.y] * value_of(each[0], front.y))
     named = {method_of(row) for row, _ in shown if row.name in front.members}
     best = {method_of(row): (row, at) for row, at in reversed(by_quality) if method_of(row) not in named}
     steps = [each for each in by_quality if each[0].name in front.steps]
     wanted = [*steps, *sorted(best.values(), key=lambda each: each[1][1])]
     heads = Counter(_head(row.name) for row, _ in wanted)
     return [
-        Wish(*at, _lines(row.name, canvas, heads[_head(row.name)] == 1), row.name in front.members)
-        for row, at in wanted
+        Wish(*at, _lines(row, canvas, heads[_head(row.name)] == 1), row.name in front.members) for row, at in wanted
     ]
 
 
@@ -372,13 +355,14 @@ def _head(name: str) -> str:
     return name.partition(", ")[0]
 
 
-def _lines(name: str, canvas: Canvas, alone: bool) -> tuple[str, ...]:
+def _lines(row: Row, canvas: Canvas, alone: bool) -> tuple[str, ...]:
     """A name in a few lines, a new one after its first comma; brief where that is enough to tell it by."""
-    parts = [_head(name)] if canvas.brief and alone else name.split(", ", 1)
+    parts = [_head(row.name)] if canvas.brief and alone else row.name.split(", ", 1)
     lines = [line for part in parts for line in textwrap.wrap(part, canvas.letters)] or [""]
     if len(lines) > LABEL_LINES:
         lines[LABEL_LINES - 1] = lines[LABEL_LINES - 1][: canvas.letters - 1] + "\u2026"
-    return tuple(lines[:LABEL_LINES])
+    beyond = [f"{row.text[OFF]}, {OFF}"] if OFF in row.text else []
+    return (*lines[:LABEL_LINES], *beyond)
 
 
 def _draw_label(figure: Figure, label: Label, canvas: Canvas) -> None:

@@ -46,6 +46,12 @@ class Point:
             return str(self.variant)
         return f"{self.variant}, {self.configuration}, tile {self.tile_px}, halo {self.halo}"
 
+    @property
+    def spoken(self) -> str:
+        """The name as it stands in a sentence."""
+        variant, comma, where = self.name.partition(", ")
+        return f"{variant} ({where})" if comma else variant
+
     def halo_px(self, radius_px: int) -> int:
         """In pixels, for a network that sees so far."""
         return radius_px if self.halo == EXACT else int(self.halo)

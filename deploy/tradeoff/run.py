@@ -4,7 +4,7 @@ networks, pairs -> points -> what the cache lacks is measured -> outcomes -> fro
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -21,17 +21,18 @@ from deploy.networks import Say, silent
 from deploy.restoration.engine import restore_dn
 from deploy.restoration.plan import make_plan
 from deploy.tradeoff.accuracy import BenchmarkSet
-from deploy.tradeoff.advice import Choice, choose, findings, fronts, headline, notes, paper_outcomes, papers_point
+from deploy.tradeoff.advice import Choice, Recommendation, choose, notes, recommendations
 from deploy.tradeoff.board import DpuRun
-from deploy.tradeoff.boards import board_rows, every_configuration
+from deploy.tradeoff.boards import OnBoard, every_configuration, on_boards
 from deploy.tradeoff.detection import Detection
 from deploy.tradeoff.host_time import TILE_PX
 from deploy.tradeoff.measurements import Measurements, run_jobs
 from deploy.tradeoff.methods import CalibrationScenes, MethodStore, find_networks, is_papers
 from deploy.tradeoff.outcome import Assembly, Outcome, Results
+from deploy.tradeoff.paper import at_a_glance, findings, paper_outcomes, papers_point
 from deploy.tradeoff.points import Point, Variant
-from deploy.tradeoff.selection import Request, select_points
-from deploy.tradeoff.study import Crop, Front, Study
+from deploy.tradeoff.selection import Request, require_method, require_on_dpu, select_points
+from deploy.tradeoff.study import Crop, Front, Study, difference_rows, front_rows, fronts, held_against
 from model.evaluation.pairs import NamedPair, oversampling_note
 from model.evaluation.run import load_pairs
 from model.evaluation.scores import Instruments, fidelity_db, perceptual_distances
@@ -108,12 +109,15 @@ class StudyRun:
 
     @property
     def rows(self) -> tuple[Row, ...]:
-        """Points, boards, layers and placement, for a document."""
+        """What to take, points, differences, boards, layers and placement, for a document."""
         named = [
             (kind, name, row) for kind, tables in self._by_network() for name, rows in tables.items() for row in rows
         ]
         return (
+            *self.study.recommended,
             *self.study.points,
+            *self.study.differences,
+            *(row for front in self.study.fronts for row in front_rows(self.study, front)),
             *self.study.boards,
             *(Row(f"{kind} of {name}: {r.table}", r.name, r.figures, r.text) for kind, name, r in named),
         )
@@ -132,9 +136,11 @@ def run_study(request: Request, cache: Cache, say: Say = silent) -> StudyRun:
     dpus = every_configuration(request.boards or (request.target,))
     detection = make_detection(request, cache)
     store = make_store(request, cache, say)
+    require_on_dpu(store, request.own, target)
+    points = select_points(store, swath, target)
+    require_method(points, request.against)
     benchmark, small = make_benchmark(request)
     measurements = Measurements(store, benchmark, host_tile(store, request.seed), cache, detection)
-    points = select_points(store, swath, target)
     lacks = lacking(store, points)
     there = [point for point in points if str(point.variant) not in lacks]
     run_jobs(measurements.jobs(there, list(dict.fromkeys(point.variant for point in there))))
@@ -161,24 +167,41 @@ def _put_together(
     choice = choose(results, request.budget, request.need) if asked else Choice(None, ())
     shown = crop_points(outcomes, found, [choice.outcome, paper])
     runs = {each.board.network: each for each in reversed(outcomes) if isinstance(each.board, DpuRun)}
+    moved = on_boards(outcomes, dpus, lambda variant: legal_model(measurements, variant))
+    advised = advise(request, results, moved)
+    against = held_against(results, request.against)
     study = Study(
-        headline(results, paper),
+        advised[0].sentence if advised else "No point could be measured.",
         tuple(each.row for each in outcomes),
         found,
-        (*choice.advice, *findings(results, paper)),
+        (*choice.advice, at_a_glance(results, paper), *findings(results, paper)),
         make_crops(shown, measurements),
         {name: tuple(layers_of(run)) for name, run in sorted(runs.items())},
         {name: tuple(placement_of(measurements, run)) for name, run in sorted(runs.items())},
         remarks,
-        board_rows(outcomes, dpus, lambda variant: legal_model(measurements, variant)),
+        tuple(each.row for each in moved),
+        tuple(each.row for each in advised),
+        against,
+        difference_rows(results, against),
     )
     labelled = measurements.detection.files if measurements.detection else ()
     return StudyRun(study, not asked or choice.outcome is not None, tuple(labelled))
 
 
+def advise(request: Request, results: Results, moved: Sequence[OnBoard]) -> list[Recommendation]:
+    """What to take on the study's board, and of its networks on each other board."""
+    asked = request.budget, request.need
+    found = recommendations(results, *asked, load_target(request.target).name)
+    for board in dict.fromkeys(each.dpu.target.name for each in moved):
+        if board != load_target(request.target).name:
+            there = {each.outcome.name: each.outcome for each in moved if each.dpu.target.name == board}
+            found += recommendations(replace(results, outcomes=there), *asked, board)
+    return found
+
+
 def make_store(request: Request, cache: Cache, say: Say) -> MethodStore:
     """Collect the networks of a request and what chains know of the sensors."""
-    found = find_networks(request.networks, request.sensor, say)
+    found = find_networks(request.networks, request.sensor, say, request.own)
     networks = {network.name: network for network in found}
     return MethodStore(
         networks, *request.profiles, CalibrationScenes(request.calibration, request.sensor, request.seed), cache

@@ -12,7 +12,8 @@ from deploy.bench.tables import PAPER_TILE_PX, Swath, swath_latency
 from deploy.dpu.board import Dpu, dpu_of
 from deploy.tradeoff.board import CHAIN, kept_tiles_px, predict_model
 from deploy.tradeoff.detection import Request as DetectionRequest
-from deploy.tradeoff.methods import MethodStore, Network, conv_weights
+from deploy.tradeoff.methods import OWN, MethodStore, Network, conv_weights
+from deploy.tradeoff.outcome import DPU_ONLY
 from deploy.tradeoff.points import (
     LEGAL,
     PRECISIONS,
@@ -20,6 +21,7 @@ from deploy.tradeoff.points import (
     Board,
     Demand,
     Point,
+    Variant,
     network_points,
     other_points,
     tiles_px,
@@ -29,7 +31,7 @@ from model.metrics.backbones import find_backbone
 from model.traditional.peers import PEERS
 from model.traditional.settings import QUALITIES
 from profiles import TargetProfile
-from profiles.errors import ModelError
+from profiles.errors import ModelError, OptionError
 from profiles.sensor import SensorProfile
 from profiles.sensor_file import load_sensor, reference_for
 from profiles.target import DEFAULT_TARGET
@@ -45,6 +47,42 @@ def select_points(store: MethodStore, swath: Swath, target: TargetProfile) -> li
         for point in network_points(network.name, precisions_of(network), board_of(network, swath, target))
     ]
     return points + other_points([CHAIN + quality for quality in QUALITIES], PEERS)
+
+
+def require_on_dpu(store: MethodStore, names: Sequence[str], target: TargetProfile) -> None:
+    """Refuse a user's network that the board's DPU does not run whole in INT8 with scales that are powers of two.
+
+    Raises:
+        OptionError: such a network, with the reason.
+    """
+    for path in map(Path, names):
+        network = store.networks[path.stem]
+        lacks = store.lack(Variant(network.name, "network", LEGAL)) if network.float_file else _not_legal(network)
+        try:
+            if not lacks:
+                predict_model(network.model(), dpu_of(target), PAPER_TILE_PX)
+        except ModelError as error:
+            lacks = str(error).rstrip(".")
+        if lacks:
+            expected, got = f"a network that the DPU of {target.name} runs", f"{path.name}: {lacks}"
+            remedy = "change it as 'check' says, or leave it out"
+            raise OptionError(OWN, expected=expected, got=got, remedy=remedy)
+
+
+def _not_legal(network: Network) -> str:
+    return "" if network.given == LEGAL else f"{network.given}, and {DPU_ONLY}"
+
+
+def require_method(points: Sequence[Point], name: str | None) -> None:
+    """Refuse to hold points against a method that the study does not have.
+
+    Raises:
+        OptionError: with the methods that it has.
+    """
+    known = list(dict.fromkeys(point.variant.method for point in points))
+    if name is not None and name not in known:
+        expected = f"a method of this study ({', '.join(known)})"
+        raise OptionError("--against", expected=expected, got=repr(name), remedy="correct that name")
 
 
 def precisions_of(network: Network) -> Sequence[str]:
@@ -93,7 +131,7 @@ class Request:
     """The options of `tradeoff`.
 
     Attributes:
-        networks: shipped names and files.
+        networks: shipped names and files, the user's own among them.
         images: folder of held-out scenes; drawn ones if None.
         calibration: folder of scenes that INT8 files are made on; drawn ones if None.
         sensor: profile of the degraded images.
@@ -106,6 +144,8 @@ class Request:
         target: the board.
         boards: all that the networks are to be compared on; empty for the board alone.
         detection: labelled images that a detector is to look at; None for none.
+        own: those of the networks that must run on the board.
+        against: the method that all are held against; the best chain if None.
     """
 
     networks: tuple[str, ...]
@@ -121,6 +161,8 @@ class Request:
     target: str = DEFAULT_TARGET
     boards: tuple[str, ...] = ()
     detection: DetectionRequest | None = None
+    own: tuple[str, ...] = ()
+    against: str | None = None
 
     @property
     def profiles(self) -> tuple[SensorProfile, SensorProfile]:

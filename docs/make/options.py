@@ -69,7 +69,7 @@ PATHS = {
     "stress": Paths({"out": FILE, "json": FILE}, ("float_model", "int8_model", "images"), ("sensor", "target")),
     "tradeoff": Paths(
         {"out": FOLDER, "cache": FOLDER, "json": FILE},
-        ("images", "lpips", "calibration", "labelled", "detector"),
+        ("images", "lpips", "calibration", "labelled", "detector", "network"),
         ("sensor", "reference", "networks", "target"),
     ),
     "compare": Paths({"json": FILE}, ("before", "after")),
@@ -112,6 +112,7 @@ UNITS = {
 
 WORDS = {
     "add": "an effect's name",
+    "against": "a method of the study",
     "budget": "limits such as latency<=20s",
     "cases": "names of cases, with commas",
     "classes": "pairs such as car=vehicle, with commas",

@@ -5,7 +5,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from deploy.tradeoff.study import Crop, Front, Study
+from deploy.tradeoff.study import Crop, Difference, Front, Study
 from profiles.figures import Figure, Row, measured, predicted, published, unavailable
 
 NETWORKS = {
@@ -171,7 +171,51 @@ def front(points: Sequence[Row], x: str, y: str) -> Front:
     steps = pairwise(members)
     prices = [f"From {a[2]} to {b[2]}: {b[0] / a[0]:.1f} times the {x}." for a, b in steps]
     names = tuple(each[2] for each in members)
-    return Front(x, y, names, names, dominated, tuple(prices))
+    before = {b[2]: [a for a in members if a[0] <= b[0] and a[2] != b[2]] for b in places}
+    differences = {
+        name: Difference(found[-1][2], difference(sign * (place[1] - found[-1][1]), found[-1][2]))
+        for name, found in before.items()
+        if found
+        for place in places
+        if place[2] == name
+    }
+    return Front(x, y, names, names, dominated, tuple(prices), (), differences)
+
+
+def difference(value: float, other: str) -> Figure:
+    """Of two qualities, with a narrow interval."""
+    ends = (value - 0.3 * abs(value), value + 0.4 * abs(value))
+    return measured(value, "dB", f"less that of {other} on the same images", ends)
+
+
+AGAINST = "traditional-best"
+
+
+def differences(points: Sequence[Row]) -> tuple[Row, ...]:
+    """Every point's qualities less those of the best chain."""
+    best = next(row for row in points if row.name == AGAINST)
+    return tuple(
+        Row(
+            "differences",
+            row.name,
+            {
+                f"{key} difference": unavailable("dB", "printed for another test set")
+                if row.figures[key].value is None
+                else difference((row.figures[key].value or 0.0) - (best.figures[key].value or 0.0), AGAINST)
+                for key in ("PSNR", "SSIM", "LPIPS-squeeze")
+            },
+            {"against": AGAINST},
+        )
+        for row in points
+    )
+
+
+def recommended() -> tuple[Row, ...]:
+    """What to take on two boards."""
+    return tuple(
+        Row("recommendations", f"PSNR on {board}", {}, {"board": board, "sentence": f"On {board} take convbeers-s."})
+        for board in ("vck190", "zcu104")
+    )
 
 
 def layer(name: str, ms: float, **text: str) -> Row:
@@ -236,4 +280,7 @@ def study() -> Study:
         layers={"convbeers-s, C32B3, tile 640": layers(19), "convbeers, C32B3, tile 640": layers(35)},
         placement={"convbeers-s": placement(), "convbeers": placement()},
         notes=("No board was used: figures of the board are predicted.", "Host times are no proxy for the board."),
+        recommended=recommended(),
+        against=AGAINST,
+        differences=differences(points),
     )

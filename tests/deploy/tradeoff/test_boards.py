@@ -9,7 +9,7 @@ import pytest
 from deploy.bench.tables import Swath
 from deploy.dpu.board import load_dpu
 from deploy.tradeoff.board import FIGURES, DpuRun, predict_model
-from deploy.tradeoff.boards import ALL, board_rows, configurations, every_configuration, parse_targets
+from deploy.tradeoff.boards import ALL, configurations, every_configuration, on_boards, parse_targets
 from deploy.tradeoff.outcome import QUALITIES, Outcome
 from profiles import load_target
 from profiles.errors import BeersError, OptionError
@@ -44,7 +44,8 @@ def outcomes(models: dict[str, onnx.ModelProto]) -> list[Outcome]:
 
 @pytest.fixture(scope="module")
 def rows(outcomes: list[Outcome], models: dict[str, onnx.ModelProto]) -> tuple[Row, ...]:
-    return board_rows(outcomes, every_configuration(["vck190", "zcu104"]), lambda variant: models[variant.method])
+    dpus = every_configuration(["vck190", "zcu104"])
+    return tuple(each.row for each in on_boards(outcomes, dpus, lambda variant: models[variant.method]))
 
 
 def test_every_network_stands_on_every_configuration_once(rows: tuple[Row, ...]) -> None:
@@ -83,8 +84,8 @@ def test_what_a_board_cannot_run_says_why(outcomes: list[Outcome], tmp_path: Pat
     """A Sigmoid between two convolutions."""
     sketch = Sketch(8)
     path = sketch.save(tmp_path / "n.onnx", sketch.conv(sketch.node("Sigmoid", sketch.conv("image"))))
-    found = board_rows(outcomes[:1], every_configuration(["zcu104"]), lambda _: onnx.load(path))
-    for row in found:
+    found = on_boards(outcomes[:1], every_configuration(["zcu104"]), lambda _: onnx.load(path))
+    for row in (each.row for each in found):
         assert {row.figures[f"board {name}"].value for name in FIGURES} == {None}
         assert "cost model" in row.figures["board latency"].reason
 

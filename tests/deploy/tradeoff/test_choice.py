@@ -5,9 +5,11 @@ from dataclasses import replace
 
 import pytest
 
-from deploy.tradeoff.advice import as_good, choose, findings, fronts, gain_words, headline, papers_point
+from deploy.tradeoff.advice import choose
 from deploy.tradeoff.outcome import Results
+from deploy.tradeoff.paper import as_good, at_a_glance, findings, papers_point
 from deploy.tradeoff.points import parse_demands
+from deploy.tradeoff.study import fronts, gain_words
 from tests.deploy.tradeoff.made_results import Made, named, results
 
 FAMILY = {
@@ -83,7 +85,7 @@ def test_the_paper_is_matched_by_what_knows_no_more(family: Results) -> None:
     assert "the best is tiny" in tenth
     assert "1 dB [" in tenth
     assert "of PSNR less" in tenth
-    assert "small INT8 legal in tiles of 640" in headline(family, paper)
+    assert "small INT8 legal in tiles of 640" in at_a_glance(family, paper)
 
 
 def test_where_nothing_matches_the_paper_it_is_said() -> None:
@@ -92,7 +94,7 @@ def test_where_nothing_matches_the_paper_it_is_said() -> None:
     equal, tenth = findings(worse, paper)
     assert "no point that knows as much" in equal
     assert "the best is tiny" in tenth
-    assert "papers" in headline(worse, paper)
+    assert "papers" in at_a_glance(worse, paper)
     slower = results({"huge": Made(46.0, 32, 64), "papers": Made(45.0, 16, 64)})
     equal, tenth = findings(slower, papers_point(slower, lambda method: method == "papers", "C32B3"))
     assert "in less time" in equal
@@ -109,7 +111,7 @@ def test_points_on_another_configuration_are_not_held_against_the_paper() -> Non
 def test_without_the_papers_network_there_is_no_finding(family: Results) -> None:
     assert papers_point(family, lambda _: False, "C32B3") is None
     assert "not among the networks" in findings(family, None)[0]
-    assert "tuned" in headline(family, None)
+    assert "tuned" in at_a_glance(family, None)
 
 
 def test_pairs_of_images_tell_apart_what_intervals_of_means_do_not(family: Results) -> None:
@@ -196,4 +198,14 @@ def test_of_points_that_images_cannot_tell_apart_the_cheaper_is_chosen() -> None
     assert "of papers INT8 legal" in words
     assert "is not distinguishable from it" in words
     far = results({"small": Made(45.0, 8, 32), "papers": Made(45.1, 16, 64, scatter_db=2.0)})
-    assert asked(far, budget="latency<=1000s")[0] == "papers"
+    assert asked(far, budget="latency<=1000s")[0] == "small"
+    close = results({"small": Made(45.0, 8, 32), "papers": Made(45.01, 16, 64, scatter_db=0.001)})
+    assert asked(close, budget="latency<=1000s")[0] == "papers"
+
+
+def test_where_sites_are_too_few_to_tell_points_apart_values_decide_beyond_a_twentieth_of_a_decibel() -> None:
+    few = ("a", "a", "b", "c", "d", "d")
+    far = results({"small": Made(45.0, 8, 32), "papers": Made(45.1, 16, 64, scatter_db=2.0)})
+    assert asked(replace(far, sites=few), budget="latency<=1000s")[0] == "papers"
+    near = results({"small": Made(45.0, 8, 32), "papers": Made(45.04, 16, 64, scatter_db=2.0)})
+    assert asked(replace(near, sites=few), budget="latency<=1000s")[0] == "small"

@@ -11,12 +11,15 @@ import pytest
 from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 from markupsafe import escape
+from matplotlib.collections import LineCollection
 from PIL import Image
 
+from deploy.report.plots import PX_PER_INCH
 from deploy.tradeoff.labels import Box
+from deploy.tradeoff.marks import Points
 from deploy.tradeoff.page import render_study, write_study
-from deploy.tradeoff.plot import NARROW, WIDE, Canvas, Plot, Points, plot_of
-from deploy.tradeoff.study import Front, Study
+from deploy.tradeoff.plot import NARROW, WIDE, Canvas, Plot, plot_of
+from deploy.tradeoff.study import Front, Study, front_rows
 from profiles.errors import MachineError
 from profiles.figures import Row, unavailable
 from tests.deploy.tradeoff.studies import PEERS, UNITS, crops, front, point, study, words
@@ -116,7 +119,15 @@ def test_what_is_unavailable_says_why_to_the_pointer_and_to_the_reader(page: str
 
 
 def test_sections_stand_in_the_order_of_reading(found: Study, page: str) -> None:
-    order = [found.headline, 'class="front-of"', found.advice[0], 'id="crop-1"', 'id="point-1"', 'class="layers"']
+    order = [
+        found.headline,
+        found.recommended[0].text["sentence"],
+        'class="front-of"',
+        found.advice[0],
+        'id="crop-1"',
+        'id="point-1"',
+        'class="layers"',
+    ]
     order += ["What runs where", 'id="sources"', "How to read this", found.notes[0]]
     places = [page.index(each if each in page else str(escape(each))) for each in order]
     assert places == sorted(places)
@@ -306,3 +317,100 @@ def test_an_empty_front_has_no_line(found: Study) -> None:
         plot = plot_of(each, Points.of(found.points if each.members else ()), WIDE)
         assert ('class="front"' in plot.svg()) == bool(each.members)
         assert bool(plot.places) == bool(each.members)
+
+
+def bars(plot: Plot, at: tuple[float, float]) -> list[tuple[float, float]]:
+    """Lower and upper end in pixels of the upright bars that pass through a place."""
+    axes = plot.figure.axes[0]
+    (drawn,) = (each for each in axes.collections if isinstance(each, LineCollection))
+    height = plot.figure.get_size_inches()[1] * PX_PER_INCH
+    ends = [axes.transData.transform(segment) for segment in drawn.get_segments()]
+    upright = [each for each in ends if abs(each[0][0] - each[1][0]) < 1e-6 < abs(each[0][1] - each[1][1])]
+    return [(height - a[1], height - b[1]) for a, b in upright if abs(a[0] - at[0]) < 1e-6]
+
+
+def test_an_upright_bar_is_that_of_the_paired_difference_and_not_of_the_figure(found: Study) -> None:
+    each = found.fronts[0]
+    plot = plot_of(each, Points.of(found.points), WIDE)
+    places, by_name = shown(found, plot), {row.name: row for row in found.points}
+    scale = [
+        (places[name][1], by_name[name].figures["PSNR"].value or 0.0) for name in (each.members[0], each.members[-1])
+    ]
+    px_per_db = (scale[0][0] - scale[1][0]) / (scale[1][1] - scale[0][1])
+    name = each.members[2]
+    low, high = each.differences[name].figure.interval or (0.0, 0.0)
+    value = each.differences[name].figure.value or 0.0
+    (a, b) = next(pair for pair in bars(plot, places[name]) if min(pair) < places[name][1] < max(pair))
+    assert max(a, b) - places[name][1] == pytest.approx(px_per_db * (value - low), rel=0.01)
+    assert places[name][1] - min(a, b) == pytest.approx(px_per_db * (high - value), rel=0.01)
+    assert (high - low) < 0.5 * sum(
+        (by_name[name].figures["PSNR"].interval or (0, 0))[k] * (-1, 1)[k] for k in (0, 1)
+    )
+    bare = plot_of(replace(each, differences={}), Points.of(found.points), WIDE)
+    assert not bars(bare, shown(found, bare)[name])
+
+
+def test_the_level_of_what_all_are_held_against_is_drawn_and_told(found: Study) -> None:
+    held = Points.of(found.points, found.against, found.differences)
+    plot, bare = plot_of(found.fronts[0], held, WIDE), plot_of(found.fronts[0], Points.of(found.points), WIDE)
+    assert 'class="against"' in plot.svg()
+    assert 'class="against"' not in bare.svg()
+    (level,) = (np.asarray(line.get_ydata())[0] for line in plot.figure.axes[0].lines if line.get_gid() == "against")
+    best = next(row for row in found.points if row.name == found.against)
+    assert level == best.figures["PSNR"].value
+    titles = {title.partition("\n")[0]: title for title in plot.titles.values()}
+    assert f"PSNR less that of {found.against}: " in titles["traditional-fast"]
+    assert f"PSNR less that of {found.against}: " not in titles[found.against]
+    member = found.fronts[0].members[1]
+    assert f"PSNR less that of {found.fronts[0].members[0]}: " in titles[member]
+
+
+def usual(study: Study) -> list[Row]:
+    """The points but for the poorest."""
+    return [row for row in study.points if row.name != "unsupervised-wiener"]
+
+
+def test_a_poor_outlier_stands_at_the_lower_edge_with_its_value(found: Study) -> None:
+    """Else it would press all others together."""
+    poor = point("awful", 11, 1, 3, words("awful", "peer", "float32", "none", "none", "none"))
+    rows = (*usual(found), poor)
+    for x, y in (("board latency", "PSNR"), ("board latency", "LPIPS-squeeze")):
+        each = front(rows, x, y)
+        plot = plot_of(each, Points.of(rows, found.against), WIDE)
+        places = shown(replace(found, points=rows), plot)
+        others = [at[1] for name, at in places.items() if name != "awful"]
+        assert max(others) < places["awful"][1] < plot.frame[3]
+        assert max(others) - min(others) > 0.5 * (plot.frame[3] - plot.frame[1])
+        (label,) = (label for label in plot.labels if label.wish.lines[0] == "awful")
+        assert label.wish.lines[-1].endswith("off the scale")
+        value = str(replace(poor.figures[y], interval=None))
+        assert value in label.wish.lines[-1]
+        assert any(value in title for title in plot.titles.values() if title.startswith("awful"))
+        check_labels(plot)
+
+
+def test_where_none_is_poor_all_stand_at_their_values(found: Study) -> None:
+    rows = [row for row in found.points if row.text["kind"] == "network"]
+    plot = plot_of(front(rows, "board latency", "PSNR"), Points.of(rows), WIDE)
+    assert not any("off the scale" in line for label in plot.labels for line in label.wish.lines)
+
+
+def test_differences_stand_behind_their_qualities_and_on_each_front(found: Study, page: str) -> None:
+    heads = re.findall(r'data-key="([^"]+)"', page[page.index('id="point-1"') - 6000 : page.index('id="point-1"')])
+    assert heads[heads.index("PSNR") + 1] == "PSNR difference"
+    assert "PSNR difference from the one before" in page
+    assert f"The dotted line is the PSNR of {found.against}." in page
+    assert "95 % intervals of the paired difference" in page
+    for row in found.recommended:
+        assert row.text["sentence"] in page
+    assert "on each board" in page
+
+
+def test_a_front_of_one_member_has_a_reason_in_place_of_a_difference(found: Study) -> None:
+    rows = front_rows(found, found.fronts[0])
+    assert [row.name for row in rows] == list(found.fronts[0].members)
+    steps = [row.figures["PSNR difference from the one before"] for row in rows]
+    assert "cheapest" in steps[0].reason
+    assert [row.text["before"] for row in rows] == ["none", *found.fronts[0].members[:-1]]
+    assert all(step.interval for step in steps[1:])
+    assert all(row.figures["PSNR difference"].value is not None for row in rows)

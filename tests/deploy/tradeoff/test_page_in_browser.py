@@ -9,7 +9,8 @@ import pytest
 from PIL import Image
 
 from deploy.report.plots import DARK, LIGHT
-from deploy.tradeoff.boards import board_rows, configurations, every_configuration
+from deploy.tradeoff import boards
+from deploy.tradeoff.boards import configurations, every_configuration
 from deploy.tradeoff.page import render_study
 from deploy.tradeoff.plot import NARROW, WIDE
 from deploy.tradeoff.study import Study
@@ -203,12 +204,12 @@ def on_boards(tmp_path_factory: pytest.TempPathFactory) -> Study:
     """A study of two networks on two boards."""
     made = {"convbeers-s": Made(40.0, 2, 8), "convbeers": Made(40.03, 2, 16)}
     path = integer_convbeers(tmp_path_factory.mktemp("net") / "net.onnx", 2, 8)
-    rows = board_rows(
+    found = boards.on_boards(
         [outcome(name, each) for name, each in made.items()],
         every_configuration(["vck190", "zcu104"]),
         lambda _: onnx.load(path),
     )
-    return replace(study(), boards=rows)
+    return replace(study(), boards=tuple(each.row for each in found))
 
 
 def test_a_choice_of_board_and_configuration_redraws_the_networks(on_boards: Study, tmp_path: Path) -> None:

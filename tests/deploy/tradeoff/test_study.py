@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import onnx
 import pytest
 import torch
 from PIL import Image
@@ -16,6 +17,7 @@ from typer.testing import CliRunner
 from deploy.cache import Cache
 from deploy.cli import app
 from deploy.compare import compare, read_document
+from deploy.export import float_model
 from deploy.tradeoff import measurements
 from deploy.tradeoff.run import StudyRun, run_study
 from deploy.tradeoff.selection import Request
@@ -24,7 +26,8 @@ from model.io.weights import save_network
 from model.simulator.procedural import procedural_scene
 from model.variants import Variant
 from profiles.figures import Row
-from quant.onnx_file import load_onnx, save_onnx
+from quant.onnx_file import GraphWriter, image_info, load_onnx, make_model, save_onnx
+from tests.deploy.dpu.graphs import Sketch
 from tests.deploy.tradeoff.small import small_studies
 
 
@@ -297,6 +300,97 @@ def test_several_boards_stand_in_the_document_and_as_a_choice_on_the_page(
     assert "zcu104" not in output  # the study on the terminal is about the first
 
 
+def rows_of(out: Path) -> dict[str, dict[str, dict[str, dict[str, object]]]]:
+    """The rows of a document by table and name."""
+    found: dict[str, dict[str, dict[str, dict[str, object]]]] = {}
+    for row in json.loads((out / "tradeoff.json").read_text(encoding="utf-8"))["rows"]:
+        found.setdefault(row["table"], {})[row["name"]] = row
+    return found
+
+
+def test_what_to_take_stands_on_the_terminal_on_the_page_and_in_the_document_for_each_board(
+    folder: Path, kept: tuple[StudyRun, Path], tmp_path: Path
+) -> None:
+    code, output = command(folder, kept, tmp_path / "e", "--target", "vck190,zcu104", "--budget", "latency<=100s")
+    page = (tmp_path / "e/tradeoff.html").read_text(encoding="utf-8").replace("\N{NO-BREAK SPACE}", " ")
+    rows = rows_of(tmp_path / "e")["recommendations"]
+    assert code == 0
+    assert list(rows) == [f"{key} on {board}" for board in ("vck190", "zcu104") for key in ("PSNR", "SSIM")]
+    for name, row in rows.items():
+        sentence = str(row["text"]["sentence"])
+        assert sentence.startswith("For board latency at most 100 s take ")
+        assert sentence in page
+        assert (sentence in output) == name.endswith("vck190")
+        assert row["text"]["take"]
+
+
+def test_all_are_held_against_the_best_chain_or_the_method_that_is_named(
+    folder: Path, kept: tuple[StudyRun, Path], tmp_path: Path
+) -> None:
+    for options, method in (((), "traditional-fast"), (("--against", "narrow"), "narrow")):
+        assert command(folder, kept, tmp_path / method, *options)[0] == 0
+        rows = rows_of(tmp_path / method)
+        assert all(row["text"]["against"].startswith(method) for row in rows["differences"].values())  # type: ignore[attr-defined]
+        assert rows["differences"].keys() == rows["points"].keys()
+        values = {name: row["figures"]["PSNR"]["value"] for name, row in rows["points"].items()}  # type: ignore[index]
+        against = str(next(iter(rows["differences"].values()))["text"]["against"])
+        for name, row in rows["differences"].items():
+            if values[name] is not None:
+                assert row["figures"]["PSNR difference"]["value"] == pytest.approx(values[name] - values[against])  # type: ignore[index]
+        assert "front of PSNR against board latency" in rows
+
+
+def test_a_network_of_the_users_stands_beside_those_that_are_named(
+    folder: Path, kept: tuple[StudyRun, Path], tmp_path: Path
+) -> None:
+    """In every precision, or as the INT8 file that it is."""
+    mine, given = tmp_path / "mine.onnx", tmp_path / "given.onnx"
+    save_onnx(float_model(folder / "narrow.safetensors"), mine)
+    save_onnx(load_onnx(next(kept[1].glob("int8-legal-*.onnx"))), given)
+    code, _ = command(folder, kept, tmp_path / "o", "--network", str(mine), "--network", str(given))
+    assert code == 0
+    points = rows_of(tmp_path / "o")["points"].values()
+    found = {name: {row["text"]["precision"] for row in points if row["text"]["method"] == name} for name in METHODS}
+    assert {"float32", "INT8 legal"} <= found["mine"] == found["narrow"] == found["wide"]
+    assert found["given"] == {"INT8 legal"}
+
+
+METHODS = ("narrow", "wide", "mine", "given")
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda path: path.write_text("not a network"), "network.onnx"),
+        (lambda _: None, "network.onnx"),
+        (lambda path: save_onnx(with_sigmoid(path), path), "a network that the DPU of vck190 runs"),
+        (lambda path: save_onnx(without_layers(), path), "--network"),
+    ],
+)
+def test_a_network_that_cannot_be_a_point_gets_one_sentence(
+    make: Callable[[Path], object], words: str, folder: Path, kept: tuple[StudyRun, Path], tmp_path: Path
+) -> None:
+    make(tmp_path / "network.onnx")
+    code, output = command(folder, kept, tmp_path / "c", "--network", str(tmp_path / "network.onnx"))
+    assert code == 2, output
+    assert words in output
+    assert not list((tmp_path / "c").glob("*"))
+
+
+def with_sigmoid(path: Path) -> onnx.ModelProto:
+    """A float network with an operator that no DPU has."""
+    sketch = Sketch(1)
+    inner = sketch.node("Sigmoid", sketch.conv("image", (8, 1, 3, 3)))
+    return onnx.load(sketch.save(path, sketch.conv(inner, (1, 8, 3, 3))))
+
+
+def without_layers() -> onnx.ModelProto:
+    """A network that hands its image on."""
+    writer = GraphWriter()
+    writer.node("Relu", "restored", ["image"])
+    return make_model(writer.graph("none", [image_info("image", 1, None)], [image_info("restored", 1, None)]), {})
+
+
 def test_a_need_that_nothing_meets_exits_1_and_writes_the_report(
     folder: Path, kept: tuple[StudyRun, Path], tmp_path: Path
 ) -> None:
@@ -314,6 +408,9 @@ def test_a_need_that_nothing_meets_exits_1_and_writes_the_report(
         (["--need", "psnr"], "NAME<=NUMBER"),
         (["--size", "wide"], "WIDTHxHEIGHT"),
         (["--networks", "nothing"], "a shipped network"),
+        (["--network", "nothing"], "an ONNX or safetensors file"),
+        (["--network", "nothing.onnx"], "nothing.onnx"),
+        (["--against", "nothing"], "a method of this study (narrow, wide, traditional-fast, nl-means)"),
         (["--sensor", "nothing"], "nothing"),
         (["--lpips", "nothing.npz"], "nothing.npz"),
         (["--images", "nothing"], "no such folder"),

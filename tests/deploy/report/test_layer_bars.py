@@ -4,7 +4,7 @@ import re
 from itertools import pairwise
 from xml.etree import ElementTree as ET
 
-from deploy.tradeoff.layer_bars import SIZE_PX, LayerBars, layer_bars
+from deploy.report.layer_bars import SIZE_PX, LayerBars, layer_bars
 from profiles.figures import Row, unavailable
 from tests.deploy.tradeoff.studies import layer, layers
 
