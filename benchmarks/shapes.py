@@ -24,7 +24,7 @@ from quant.calibration import Patches, Remade
 from quant.quantise import Passes, quantise_model
 from quant.tiling.walk import receptive_radius_px
 
-SHAPES = "4x16,8x32,16x32,16x64,4x32@2,8x32@2,4x48@2,8x48@2,3x64@2,4x64@2,2x64@4,4x96@4,4x128@4"
+SHAPES = "4x16,8x32,16x32,16x64,2x32@2,4x32@2,8x32@2,4x48@2,8x48@2,3x64@2,4x64@2,2x64@4,4x96@4,4x128@4"
 SHAPE = re.compile(r"(\d+)x(\d+)(?:@(\d+))?")
 SIDE_PX = 48
 QUICK = Passes(equalise=False, fit_weights=False)

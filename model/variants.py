@@ -57,6 +57,7 @@ VARIANTS = {
     "convbeers-s": Variant(blocks=8, features=32),
     "convbeers-xs": Variant(blocks=4, features=16),
     "convbeers-half": Variant(blocks=4, features=64, scale=2),
+    "convbeers-half-xs": Variant(blocks=2, features=32, scale=2),
 }
 
 
