@@ -22,6 +22,7 @@ from model.io.tensors import is_conditioned
 from model.progress import steps
 from model.shipped import INT8, SENSOR, SHIPPED, VARIANT, shipped_names, shipped_weights
 from model.specialise import sensor_vector
+from profiles.errors import ModelError
 from profiles.sensor import SensorProfile, numbers_of
 from profiles.sensor_file import load_sensor
 from quant.onnx_file import is_quantised, load_onnx, metadata, save_onnx
@@ -69,13 +70,16 @@ def conditioned(given: Path | None) -> Conditioned | None:
     """The conditioned network that is meant, None meaning the default one; None for any other file.
 
     Raises:
-        ModelError: weights that cannot be read.
+        ModelError: weights that cannot be read, or a name that is neither a file's nor a shipped network's.
     """
     if given is None:
         return Conditioned(VARIANT, shipped_weights(VARIANT))
     if _is_shipped(given):
         name = given.name.removesuffix(INT8)
         return Conditioned(name, shipped_weights(name))
+    if not given.suffix and not given.exists():
+        expected = f"a file, or a shipped network ({', '.join(shipped_names())}, each also with {INT8})"
+        raise ModelError(str(given), expected=expected, got="neither", remedy="correct the name, or the path")
     return Conditioned(given.stem, given) if given.suffix == ".safetensors" and is_conditioned(given) else None
 
 

@@ -24,6 +24,11 @@ def shipped_names() -> list[str]:
     return sorted(path.stem for path in SHIPPED.glob("*.safetensors"))
 
 
+def studied_names() -> list[str]:
+    """Those that a study compares where none is named: all but `convbeers-m`, slower than `-s` and no better."""
+    return [name for name in shipped_names() if name != "convbeers-m"]
+
+
 def shipped_weights(name: str) -> Path:
     """The shipped weights of that name.
 

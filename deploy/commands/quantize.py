@@ -50,7 +50,10 @@ def quantize(
         typer.Option(help="Leave out a pass that --ablate lists, as half-lsb-pair; may be repeated."),
     ] = None,
     finetune: Annotated[
-        int, typer.Option(min=0, max=100_000, help="Gradient steps that train the INT8 numbers themselves; 400 pay.")
+        int,
+        typer.Option(
+            min=0, max=100_000, help="Steps that train the INT8 numbers on --images or --data; some 250, minutes."
+        ),
     ] = 0,
     seed: Annotated[int, typer.Option(min=0, max=SEEDS, help="Seed of the patches.")] = 0,
     json: Annotated[Path | None, typer.Option(help="Write the figures here.")] = None,

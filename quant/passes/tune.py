@@ -42,7 +42,7 @@ class Tuning:
 
     pairs: Remade[Pair]
     steps: int
-    rate: float = 0.05
+    rate: float = 0.015
     seed: int = 0
 
 

@@ -102,6 +102,13 @@ def test_the_shipped_int8_files_are_of_these_weights_and_sensors(name: str, sens
     assert not own_cache.exists()
 
 
+def test_a_name_that_is_none_is_told_the_names_that_there_are(own_cache: Path) -> None:
+    for name in ("convbeers-z", "convbeers-z-int8"):
+        with pytest.raises(ModelError, match=r"shipped network \(convbeers, convbeers-half, .*convbeers-xs"):
+            network_file(Path(name), load_sensor(SENSOR))
+    assert not own_cache.exists()
+
+
 def test_blind_is_the_middle_of_a_range_of_sensors() -> None:
     blind = load_sensor(BLIND)
     assert (blind.name, numbers_of(blind)) == (BLIND, numbers_of(load_sensor(BLIND_PROFILE)))
