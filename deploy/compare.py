@@ -155,6 +155,7 @@ def change_rows(changes: Sequence[Change]) -> list[Row]:
             {"before": change.before, "after": change.after},
             {
                 "figure": f"{change.place[2]} ({change.after.unit})",
+                "by": f"{change.difference:+.3g}",
                 "change": "-" if change.percent is None else f"{change.percent:+.2g} %",
             },
         )
