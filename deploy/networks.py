@@ -70,16 +70,13 @@ def conditioned(given: Path | None) -> Conditioned | None:
     """The conditioned network that is meant, None meaning the default one; None for any other file.
 
     Raises:
-        ModelError: weights that cannot be read, or a name that is neither a file's nor a shipped network's.
+        ModelError: weights that cannot be read.
     """
     if given is None:
         return Conditioned(VARIANT, shipped_weights(VARIANT))
     if _is_shipped(given):
         name = given.name.removesuffix(INT8)
         return Conditioned(name, shipped_weights(name))
-    if not given.suffix and not given.exists():
-        expected = f"a file, or a shipped network ({', '.join(shipped_names())}, each also with {INT8})"
-        raise ModelError(str(given), expected=expected, got="neither", remedy="correct the name, or the path")
     return Conditioned(given.stem, given) if given.suffix == ".safetensors" and is_conditioned(given) else None
 
 
@@ -103,9 +100,12 @@ def network_file(given: Path | None, sensor: SensorProfile, say: Say = silent) -
         say: is told what of the sensor lies outside the range that was trained.
 
     Raises:
-        ModelError: weights that cannot be read.
+        ModelError: weights that cannot be read, or a name that is neither a file's nor a shipped network's.
         MachineError: the cache cannot be written.
     """
+    if given is not None and not (given.suffix or given.exists() or _is_shipped(given)):
+        expected = f"a file, or a shipped network ({', '.join(shipped_names())}, each also with {INT8})"
+        raise ModelError(str(given), expected=expected, got="neither", remedy="correct the name, or the path")
     int8 = given is None or given.name.endswith(INT8)
     return int8_file(given, sensor, say) if int8 else float_file(given, sensor, say)
 

@@ -145,6 +145,9 @@ def _parse(path: Path) -> Limits:
         raise OptionError(
             str(path), expected="a TOML file of limits", got=got, remedy="write mae = 0.0007"
         ) from error
+    if not raw:
+        expected = f"at least one of {', '.join(names)}"
+        raise OptionError(str(path), expected=expected, got="no limit", remedy="write mae = 0.0007")
     for name, value in raw.items():
         if name not in names or not _is_limit(value):
             expected = f"numbers above 0 named {', '.join(names)}"

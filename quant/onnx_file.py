@@ -19,7 +19,7 @@ from quant.reading.external import take_in
 from quant.reading.folding import IR_VERSION, OPSET, simplest
 from quant.untrusted import FILE_BYTES, check_content, check_runnable
 
-REMEDY = "give a file written by 'beers-deploy export' or 'beers-deploy quantize'"
+REMEDY = "give an ONNX file, as 'beers-deploy export', 'beers-deploy quantize' or PyTorch writes it"
 
 
 def load_onnx(path: Path, to_run: bool = True) -> onnx.ModelProto:

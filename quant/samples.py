@@ -102,7 +102,8 @@ def _array(path: Path) -> np.ndarray:
     try:
         return np.asarray(np.load(path, mmap_mode="r", allow_pickle=False))
     except (OSError, ValueError, EOFError) as error:
-        raise ImageError(str(path), expected="a .npy file of numbers", got="another file", remedy=REMEDY) from error
+        expected = "a .npy or .npz file of numbers, or a folder of images"
+        raise ImageError(str(path), expected=expected, got="another file", remedy=REMEDY) from error
 
 
 def _archive(path: Path) -> tuple[np.ndarray, np.ndarray]:

@@ -96,6 +96,7 @@ def restore(
     from deploy.restoration.stac import require_stac, write_item
     from deploy.results import Document, print_rows
     from model.io.files import require_writable
+    from model.shipped import INT8
     from profiles.errors import OptionError
     from profiles.sensor_file import BLIND, load_sensor
 
@@ -116,6 +117,10 @@ def restore(
         expected, remedy = "a shipped network, or weights of 'train --conditioned'", "leave --sensor out"
         raise OptionError("--sensor", expected=expected, got=f"{model}, made for one already", remedy=remedy)
     known = {band: load_sensor(each) for band, each in sensors.items()}
+    if found := conditioned(model):
+        told = f"told {sensor}" if sensor else "told no sensor (blind): --sensor tells it yours, and restores better"
+        name = model.name if model else f"{found.name}{INT8}"
+        say(f"network: {name}, {told}")
     paths = {band: network_file(model, each, partial(say, err=True)) for band, each in known.items()}
     path, bits = next(iter(paths.values())), {int(each.bits.low) for each in known.values()}
     if len(bits) > 1 and full_scale is None:

@@ -141,7 +141,7 @@ def test_limits_come_from_a_file(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "text", ["mae = 'small'", "mae = true", "mea = 0.1", "mae = -1", "mae = nan", "= 3", "[mae]"]
+    "text", ["mae = 'small'", "mae = true", "mea = 0.1", "mae = -1", "mae = nan", "= 3", "[mae]", "", "# none"]
 )
 def test_limits_that_are_none_are_refused(text: str, tmp_path: Path) -> None:
     (tmp_path / "gate.toml").write_text(text)

@@ -44,12 +44,14 @@ def test_commands_take_the_name(tmp_path: Path) -> None:
         out = tmp_path / f"{len(model)}.tif"
         result = CliRunner().invoke(app, ["restore", str(tmp_path / "in.tif"), str(out), "--model", model])
         assert result.exit_code == 0, result.output
+        assert ("network: convbeers-xs-int8, told no sensor" in result.output) == (model == "convbeers-xs-int8")
     first, second = (tifffile.imread(path) for path in tmp_path.glob("*.tif") if path.name != "in.tif")
     np.testing.assert_array_equal(first, second)
     result = CliRunner().invoke(
         app, ["restore", str(tmp_path / "in.tif"), str(tmp_path / "x.tif"), "--model", "huge"]
     )
     assert result.exit_code == 2
+    assert "a shipped network (convbeers, convbeers-half" in " ".join(result.output.split())
 
 
 @pytest.mark.parametrize(

@@ -69,4 +69,6 @@ def test_accuracy_and_time(tmp_path: Path) -> None:
     walked("accuracy-and-time", tmp_path)
     files = {"tradeoff.html", "tradeoff.svg", "tradeoff.png", "points.csv", "tradeoff.json", "cache"}
     assert {path.name for path in (tmp_path / "study").iterdir()} == files
-    assert "For board latency at most 5 s take convbeers-xs INT8" in (tmp_path / "study" / "tradeoff.html").read_text(encoding="utf-8")
+    assert "For board latency at most 5 s take convbeers-xs INT8" in (tmp_path / "study" / "tradeoff.html").read_text(
+        encoding="utf-8"
+    )

@@ -89,7 +89,7 @@ def cut_off(folder: Path) -> Path:
         (of(RAMP[:, :1, :3, :3]), "at least 4 pixels"),
         (of(RAMP[:0, :1]), "at least one sample"),
         (of(RAMP[:, :1].astype(np.complex64)), "numbers"),
-        (pickled, "a .npy file of numbers"),
+        (pickled, "a .npy or .npz file of numbers, or a folder"),
         (two_arrays, "got first, second"),
         (cut_off, "a .npz file of numbers"),
         (lambda folder: folder / "missing.npy", "no such file"),
