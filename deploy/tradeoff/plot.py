@@ -58,7 +58,7 @@ LEFT_PX, RIGHT_PX, TOP_PX, BELOW_PX = 80, 14, 34, 54
 LEAST_PX = 260
 """The frame's least height: below a long legend the canvas grows."""
 
-TICK_PX = (64, 44)
+TICK_PX = (60, 44)
 BETTER = "better: up and to the left"
 
 
