@@ -13,12 +13,14 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
+from profiles.errors import ImageError
 from quant.calibration import Pair, Remade
 from quant.core import IntCore
 from quant.ends import Ends
 from quant.graph import CORRECTION, PLANES, Conv, Graph, graph_to_onnx
 from quant.integer.trainable import Tensor, TrainableCore
 from quant.session import open_session, planes_of, require_finite
+from quant.untrusted import times
 
 HELD_OUT_EVERY = 8
 """One pair of so many is not trained on, but judges what is kept."""
@@ -80,6 +82,7 @@ def tune(core: IntCore, rounded: Graph, full: Graph, tuning: Tuning, tick: Calla
 
     Raises:
         ModelError: NaN or infinity in the float network.
+        ImageError: a reference of another size than the network's result.
     """
     samples = list(_samples(core.ends, full, tuning.pairs))
     held = samples[HELD_OUT_EVERY - 1 :: HELD_OUT_EVERY] or samples
@@ -105,6 +108,10 @@ def _samples(ends: Ends, full: Graph, pairs: Remade[Pair]) -> Iterator[Sample]:
         if not (reference.size and ends.is_image):
             yield Sample(planes, result, None, 1.0)
             continue
+        given, made = times(reference.shape), times(ends.finished(image, floats).shape)
+        if given != made:
+            remedy = "give references of the size that the network makes"
+            raise ImageError("reference", expected=f"one of {made}", got=given, remedy=remedy)
         wanted = torch.from_numpy(ends.correction_of(image, reference))
         yield Sample(planes, result, wanted, 1 / max(float(_mean_square(result, wanted)), LEAST_ERROR))
 

@@ -4,10 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 import onnx
+import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+from profiles.errors import ImageError
 from quant.calibration import Patches, Remade
 from quant.core import IntConv, IntCore, shift_faults
 from quant.ends import Ends
@@ -84,6 +86,15 @@ def test_what_comes_out_worse_is_not_kept(
 ) -> None:
     found = trained(quantised, quantised.core, float_onnx, Tuning(alone(patches), 2, rate=60.0))
     assert found is quantised.core
+
+
+def test_a_reference_of_another_size_is_one_sentence(
+    quantised: Quantised, float_onnx: onnx.ModelProto, patches: Patches
+) -> None:
+    seen, meant = patches.pairs[0]
+    short = Remade(lambda _: (seen, meant[..., :-2]), 2)
+    with pytest.raises(ImageError, match=r"reference: expected one of 1 x 1 x 128 x 128, got 1 x 1 x 128 x 126"):
+        trained(quantised, quantised.core, float_onnx, Tuning(short, 1))
 
 
 def test_the_same_seed_gives_the_same_numbers_and_a_step_is_a_tick(
