@@ -8,6 +8,7 @@ candidate whose result of the measured tiles is not onnxruntime's, bit for bit, 
 
 import os
 import time
+from collections import deque
 from collections.abc import Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
@@ -22,10 +23,13 @@ import onnx
 
 from deploy.cache import Cache, code_digest
 from deploy.networks import Say, cache_folder
+from deploy.restoration.engine import Restorer, Strip
 from deploy.restoration.options import TILE_PX, Options, Runtime
-from deploy.restoration.plan import Plan, plan_for
+from deploy.restoration.plan import Plan, Span, plan_for
 from deploy.restoration.runtime import Infer, lanes_for, open_runtime, tiles_at_once
+from deploy.restoration.source import Raster
 from model.io.files import require_writable
+from model.io.images import MAX_DN
 from model.processor import processor_name
 from profiles.errors import ModelError, OptionError
 from profiles.figures import Figure, measured
@@ -82,7 +86,7 @@ class Choice:
 
     def figures(self) -> dict[str, Figure]:
         """Both rates."""
-        how = f"network alone, on tiles of noise, before this run or an earlier one of the same image size{self._by}"
+        how = f"on tiles of noise in memory, before this run or an earlier one of the same image size{self._by}"
         return {
             "rate as chosen": measured(self.best_mpx_s, "Mpx/s", f"{self.best}; {how}"),
             "rate as usual": measured(self.usual_mpx_s, "Mpx/s", f"{self.usual}; {how}"),
@@ -214,31 +218,52 @@ class Trial:
 
     Attributes:
         setting: of the trial.
-        infer: the network.
-        image: noise of a tile's shape, (1, C, h, w) in [0, 1].
+        restorer: of images as large as one tile.
+        strip: such an image, of noise.
         batches: of as many tiles as are in work at a time, that the image takes.
-        times_s: by the wall and by the processor of each batch that was run, the first of which warmed up.
+        opened_s: what opening the network took, by the wall and by the processor.
+        times_s: of each batch that was run, by both clocks; the first one warmed up.
     """
 
     setting: Setting
-    infer: Infer
-    image: np.ndarray
+    restorer: Restorer
+    strip: Strip
     batches: int
+    opened_s: tuple[float, float]
     times_s: list[tuple[float, float]]
 
     @property
     def total_s(self) -> tuple[float, float]:
-        """Of the whole image by the wall and by the processor, as the fastest batch; or as the warm-up alone."""
-        wall_s, processor_s = np.min(self.times_s[1:] or self.times_s, axis=0) * self.batches
+        """Of the whole image, opening and warming up included, by the wall and by the processor."""
+        first, fastest = np.array(self.times_s[0]), np.min(self.times_s[1:] or self.times_s, axis=0)
+        wall_s, processor_s = self.opened_s + np.maximum(first - fastest, 0) + fastest * self.batches
         return float(wall_s), float(processor_s)
 
-    def run(self) -> np.ndarray:
-        """One batch, as the engine runs it, each tile in a thread of its own; what the network makes of one."""
+    def run(self) -> None:
+        """One batch, each tile in a thread of its own, from stored pixels to stored pixels, as the engine runs it."""
+        _, height_px, width_px = self.strip.pixels.shape
+        rows, columns = Span(0, height_px, 0, height_px), Span(0, width_px, 0, width_px)
+        tiles = range(self.setting.lanes)
         with ThreadPoolExecutor(self.setting.lanes) as pool:
-            begun = time.perf_counter(), time.process_time()
-            results = list(pool.map(self.infer, [self.image] * self.setting.lanes))
-            self.times_s.append((time.perf_counter() - begun[0], time.process_time() - begun[1]))
-        return results[0]
+            taken = _Stopwatch()
+            deque(pool.map(lambda _: self.restorer.tile(self.strip, 0, rows, columns), tiles), maxlen=0)
+            self.times_s.append(taken.seconds())
+
+    def gives_what(self, infer: Infer) -> bool:
+        """Whether the network makes of the strip what another makes of it, bit for bit."""
+        image = self.strip.pixels[None] / np.float32(MAX_DN)
+        return np.array_equal(self.restorer.infer(image), infer(image))
+
+
+class _Stopwatch:
+    """Runs from where it is made."""
+
+    def __init__(self) -> None:
+        self._begun = time.perf_counter(), time.process_time()
+
+    def seconds(self) -> tuple[float, float]:
+        """So far, by the wall and by the processor."""
+        return time.perf_counter() - self._begun[0], time.process_time() - self._begun[1]
 
 
 @dataclass(frozen=True)
@@ -254,7 +279,7 @@ class Race:
         return plan_for(self.network, self.shape, replace(self.options, tile_px=tile_px))
 
     def times_s(self, settings: Iterable[Setting]) -> tuple[dict[Setting, float], str]:
-        """Seconds that the network takes for the whole image in each setting, interleaved, and by which clock.
+        """Seconds that the whole image takes in each setting, interleaved, and by which clock.
 
         Settings that cannot run it, or whose result is not onnxruntime's bit for bit, are left out; the first one is
         onnxruntime's.
@@ -286,12 +311,15 @@ class Race:
     def _warm(self, setting: Setting, usual: Infer) -> list[Trial]:
         """A setting after its first run; none where the runtime refuses the network, or gives other bits."""
         plan = self.plan(setting.tile_px)
-        sides = (1, plan.tiling.channels_in, *plan.tile_shape)
-        image = np.random.default_rng(0).random(sides, dtype=np.float32)
+        raster = Raster(plan.tiling.channels_in, *plan.tile_shape, np.dtype(np.uint16))
+        noise = np.random.default_rng(0).integers(0, MAX_DN + 1, raster.shape, np.uint16)
         try:
+            taken = _Stopwatch()
             infer, _ = open_runtime(setting.runtime, self.network, self.options.threads, setting.lanes)
-            trial = Trial(setting, infer, image, ceil(plan.tiles / setting.lanes), [])
-            return [trial] if np.array_equal(trial.run(), usual(image)) else []
+            opened_s, restorer = taken.seconds(), Restorer(raster, infer, float(MAX_DN), plan.tiling)
+            trial = Trial(setting, restorer, Strip(0, noise, None), ceil(plan.tiles / setting.lanes), opened_s, [])
+            trial.run()
+            return [trial] if trial.gives_what(usual) else []
         except ModelError:
             if setting.runtime is Runtime.onnxruntime:
                 raise

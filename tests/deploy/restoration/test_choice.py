@@ -14,11 +14,14 @@ from deploy.cache import Cache
 from deploy.networks import CACHE_VARIABLE, shipped_pair
 from deploy.restoration import choice
 from deploy.restoration.choice import Choice, Race, Setting, Trial, settled
+from deploy.restoration.engine import Restorer, Strip
 from deploy.restoration.options import Options, Runtime
 from deploy.restoration.run import restore_file
 from deploy.restoration.runtime import open_runtime
+from deploy.restoration.source import Raster
 from profiles.errors import OptionError
 from quant.onnx_file import load_onnx
+from quant.tiling.walk import Tiling
 
 SHAPE = (1, 150, 131)
 SMALL_PX = (64, 80, 112)
@@ -43,11 +46,10 @@ def clocked(monkeypatch: pytest.MonkeyPatch, tile_s: Callable[[Setting], float])
     """Batches take what `tile_s` says; returns the settings that are tried, as they are."""
     tried, run = list[Setting](), Trial.run
 
-    def timed(trial: Trial) -> np.ndarray:
-        result = run(trial)
-        trial.times_s[-1] = (tile_s(trial.setting),) * 2
+    def timed(trial: Trial) -> None:
+        run(trial)
+        trial.opened_s, trial.times_s[-1] = (0.0, 0.0), (tile_s(trial.setting),) * 2
         tried.append(trial.setting)
-        return result
 
     monkeypatch.setattr(Trial, "run", timed)
     return tried
@@ -174,16 +176,31 @@ def test_a_choice_survives_the_cache(tmp_path: Path) -> None:
     assert "by processor time: others used the cores too" in str(replace(found, clock=choice.PROCESSOR))
 
 
+def trial(tile_px: int, times_s: list[tuple[float, float]], opened_s: tuple[float, float] = (0.0, 0.0)) -> Trial:
+    """Of two batches, that is never run."""
+    pixels = np.zeros((1, 8, 8), np.uint16)
+    restorer = Restorer(Raster(*pixels.shape, pixels.dtype), lambda x: x, 4095.0, Tiling(0))
+    return Trial(Setting(Runtime.onnxruntime, tile_px, 1), restorer, Strip(0, pixels, None), 2, opened_s, times_s)
+
+
 @pytest.mark.parametrize(("wall_s", "clock"), [(1.0, choice.WALL), (9.0, choice.PROCESSOR)])
 def test_where_others_use_the_cores_processor_time_decides(wall_s: float, clock: str, int8: Path) -> None:
-    race, image = Race(load_onnx(int8), SHAPE, Options(int8, threads=1)), np.zeros(1)
-    settings = [Setting(Runtime.onnxruntime, tile_px, 1) for tile_px in (64, 80)]
-    times_s = [[(9.0, 9.0), (wall_s, 0.9)], [(9.0, 9.0), (wall_s * 1.1, 0.8 if wall_s > 1 else 1.1)]]
-    trials = [Trial(each, lambda x: x, image, 2, taken) for each, taken in zip(settings, times_s, strict=True)]
+    race = Race(load_onnx(int8), SHAPE, Options(int8, threads=1))
+    trials = [
+        trial(64, [(wall_s, 0.9), (wall_s, 0.9)]),
+        trial(80, [(wall_s * 1.1, 0.8 if wall_s > 1 else 1.1)] * 2),
+    ]
     found, by = race._compared(trials)
     assert by == clock
-    assert min(found, key=lambda each: found[each]) == settings[clock == choice.PROCESSOR]
-    assert found[settings[0]] == pytest.approx(2 * (wall_s if clock == choice.WALL else 0.9))
+    assert min(found, key=lambda each: found[each]) == trials[clock == choice.PROCESSOR].setting
+    assert found[trials[0].setting] == pytest.approx(2 * (wall_s if clock == choice.WALL else 0.9))
+
+
+def test_what_opening_and_warming_up_take_is_counted_once() -> None:
+    assert trial(64, [(5.0, 4.0), (1.0, 0.9), (1.2, 1.0)], opened_s=(10.0, 9.0)).total_s == pytest.approx(
+        (16.0, 13.9)
+    )
+    assert trial(64, [(5.0, 4.0)], opened_s=(10.0, 9.0)).total_s == pytest.approx((20.0, 17.0))
 
 
 @pytest.mark.parametrize("spread", [{"workers": 2}, {"scheduler": "tcp://127.0.0.1:1"}])
