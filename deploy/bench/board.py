@@ -1,11 +1,11 @@
 """A swath on a board or on all, predicted, beside the traditional pipeline measured here and the paper's figures.
 
-One configuration and one tile size show every layer; several are swept. Networks that cannot be tiled are
+One configuration and one tile size are predicted layer by layer; several are swept. Networks that cannot be tiled are
 predicted by the frame.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import onnx
@@ -27,6 +27,7 @@ from deploy.bench.tables import (
 )
 from deploy.dpu.board import Dpu, dpu_of
 from deploy.dpu.cost.host import Task
+from deploy.dpu.cost.latency import Prediction
 from deploy.dpu.cost.runs import refit
 from deploy.dpu.reading import own_tile_px
 from deploy.restoration.options import parse_halo
@@ -40,9 +41,7 @@ from profiles.target import board_names
 from quant.onnx_file import load_onnx
 from quant.tiling.walk import receptive_radius_px, tiling_of
 
-TRAFFIC = "LdFM, StFM: feature maps loaded and stored, an image; LdWB: weights and biases loaded, a batch."
-
-
+TRAFFIC = "LdFM, StFM: feature maps loaded and stored, an image; LdWB: weights and biases loaded, a batch"
 ALL = "all"
 """Every board, or every configuration."""
 FREE_TILE_PX = 640
@@ -79,11 +78,19 @@ class BoardRequest:
 
 @dataclass(frozen=True)
 class BoardBench:
-    """What was found: all rows, the tables to show in their order, and sentences to say with them."""
+    """What was found.
+
+    Attributes:
+        rows: all of them.
+        shown: tables that answer, in their order.
+        notes: sentences to say with them.
+        layers: tables that say where the time goes: layer by layer, and the pipeline's by kind of work.
+    """
 
     rows: list[Row]
     shown: list[tuple[str, list[Row]]]
     notes: list[str]
+    layers: list[tuple[str, list[Row]]] = field(default_factory=list)
 
 
 def bench_board(model: Path, request: BoardRequest, budget_s: float) -> BoardBench:
@@ -111,20 +118,24 @@ def bench_board(model: Path, request: BoardRequest, budget_s: float) -> BoardBen
     scene, targets = dn if dn is not None else drawn_acquisition(swath, sensors), _targets(boards)
     traditional, by_kind = traditional_rows(scene, swath, sensors, targets, budget_s)
     papers = published_rows() if any(target.name == PAPER_TARGET for target in targets) else []
-    # of one configuration the swath's rows stand beside the rivals', and its layers apart
+    # of one configuration the swath's rows stand beside the rivals'
     size = f"{swath.width_px} x {swath.height_px} pixels in tiles of {swath.tile_px}"
     rows = [*(found.rows if single else []), *traditional, *papers]
     kinds = (f"traditional pipeline by kind of work, one core here and of {targets[0].name}", by_kind)
-    apart = [row for _, part in (*found.shown, kinds, *refitted) for row in part]
-    return BoardBench([*rows, *apart], [*refitted, *found.shown, kinds, (size, rows)], found.notes)
+    layers = [*found.layers, kinds]
+    apart = [row for _, part in (*found.shown, *layers, *refitted) for row in part]
+    return BoardBench([*rows, *apart], [*refitted, *found.shown, (size, rows)], found.notes, layers)
 
 
 def _single(model: Path, dpu: Dpu, swath: Swath, task: Task | None) -> BoardBench:
-    """The rows of the swath, and those of the layers to show."""
+    """The rows of the swath, and its layers."""
     prediction = predict_file(model, dpu, swath.tile_px, task)
-    notes = [TRAFFIC, *host_words(prediction, dpu)]
-    layers = (f"{model.name}, one batch on {dpu.target.name} {dpu.name}", layer_rows(prediction, dpu))
-    return BoardBench(predicted_rows(model.stem, prediction, swath, dpu), [layers], notes)
+    rows, notes = predicted_rows(model.stem, prediction, swath, dpu), host_words(prediction, dpu)
+    return BoardBench(rows, [], notes, [_layers(model, prediction, dpu)])
+
+
+def _layers(model: Path, prediction: Prediction, dpu: Dpu) -> tuple[str, list[Row]]:
+    return f"{model.name}, one batch on {dpu.target.name} {dpu.name}; {TRAFFIC}", layer_rows(prediction, dpu)
 
 
 def _sweep(model: Path, boards: Sequence[Dpu], request: BoardRequest, swath: Swath) -> BoardBench:
@@ -151,13 +162,11 @@ def _frames(
         str(side.dim_value or tile_px) for side in network.graph.input[0].type.tensor_type.shape.dim[2:]
     )
     shown = [*refitted, (f"{model.name}, frames of {size}", rows)]
-    if len(boards) == 1:
-        layers = layer_rows(predictions[0], boards[0])
-        shown.insert(-1, (f"{model.name}, one batch on {boards[0].target.name} {boards[0].name}", layers))
+    layers = [_layers(model, predictions[0], boards[0])] if len(boards) == 1 else []
     whole = f"not tiled, but run on whole images: expected {why.expected}, got {why.got}"
     said = [words for found, dpu in zip(predictions, boards, strict=True) for words in host_words(found, dpu)]
-    notes = [TRAFFIC, whole, *dict.fromkeys(said)]
-    return BoardBench([row for _, part in shown for row in part], shown, notes)
+    notes = [whole, *dict.fromkeys(said)]
+    return BoardBench([row for _, part in (*shown, *layers) for row in part], shown, notes, layers)
 
 
 def _untiled(network: onnx.ModelProto, request: BoardRequest) -> ModelError | None:

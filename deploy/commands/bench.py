@@ -14,11 +14,12 @@ from profiles.target import DEFAULT_TARGET, MODEL_SUFFIX, board_names
 EXAMPLE = "bench --target vck190-model --size 13600x9016 --config C32B3"
 
 PAPER_SIZE = "13600x9016"  # as in deploy.bench.tables, which is imported late
-BOARD_ONLY = ("image", "full_scale", "size", "halo", "config", "host_task", "measured", "budget", "within")
+BOARD_ONLY = ("image", "full_scale", "size", "halo", "config", "host_task", "measured", "budget", "within", "layers")
 HOST_ONLY = ("threads",)
 BOARD, HOSTS = f"{DEFAULT_TARGET}{MODEL_SUFFIX}", ("host", "host-cpu")
 BOARDS = ", ".join(board_names())
 PREDICTED = "No board was used: the DPU's figures come from a cost model, its power from an assumption."
+LAYERS = "--layers shows where the time goes, layer by layer; --json holds it always."
 NO_PROXY = "Time on this CPU is no proxy for the DPU: here INT8 may even run slower than float."
 
 
@@ -76,6 +77,9 @@ def bench(
         float | None,
         typer.Option(min=0, help="Seconds that the swath may take: which is the smallest DPU that meets them?"),
     ] = None,
+    layers: Annotated[
+        bool, typer.Option("--layers", help="Show where the time goes: each layer, and the pipeline's kinds of work.")
+    ] = False,
     threads: Annotated[int, typer.Option(min=0, help="Threads of the host's runtime; 0 takes every core.")] = 0,
     json: Annotated[Path | None, typer.Option(help="Write the figures here.")] = None,
 ) -> None:
@@ -104,9 +108,9 @@ def bench(
         asked = BoardRequest(board, image, full_scale, size, tiles, halo, config, measured, within, task)
         found = bench_board(path, asked, budget)
         rows = found.rows
-        for title, part in found.shown:
+        for title, part in (*(found.layers if layers else []), *found.shown):
             print_rows(title, part)
-        for note in (*found.notes, PREDICTED):
+        for note in (*found.notes, PREDICTED, *([LAYERS] if found.layers and not layers else [])):
             say(note)
     arguments = {
         "target": target,

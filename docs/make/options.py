@@ -183,7 +183,7 @@ REFUSED = {
     "check": [Refused(("picture", "tile"), "traditional")],
     "bench": [
         Refused(
-            ("image", "full_scale", "size", "halo", "config", "host_task", "measured", "budget", "within"),
+            ("image", "full_scale", "size", "halo", "config", "host_task", "measured", "budget", "within", "layers"),
             "--target host",
         ),
         Refused(("threads",), without="--target host"),

@@ -158,6 +158,17 @@ def test_bench_writes_a_valid_document(tmp_path: Path) -> None:
     assert any("halo 5 px" in name for name in names)
 
 
+def test_layers_are_shown_when_asked_for_and_written_always(tmp_path: Path) -> None:
+    model, out = str(integer_convbeers(tmp_path / "net.onnx", 1, 8)), tmp_path / "out.json"
+    options = ("--size", "41x33", "--tile", "32", "--budget", "0", "--json", str(out))
+    (_, brief), (_, full) = run("bench", model, *options), run("bench", model, *options, "--layers")
+    assert ("LdFM" in brief, "LdFM" in full) == (False, True)
+    assert ("transforms, FLOP" in brief, "transforms, FLOP" in full) == (False, True)
+    assert ("--layers" in brief, "--layers" in full) == (True, False)
+    assert full.index("LdFM") < full.index("throughput")
+    assert {"bench", "layers"} <= {row["table"] for row in document(out)["rows"]}
+
+
 def test_layer_rows_have_the_columns_of_vaitrace(tmp_path: Path) -> None:
     rows = layer_rows(predict_file(integer_convbeers(tmp_path / "i.onnx", 2, 64), DPU, 333), DPU)
     columns = {"work", "time", "rate", "LdFM", "LdWB", "StFM", "bandwidth", "array use", "energy"}
