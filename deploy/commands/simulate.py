@@ -1,5 +1,6 @@
 """`beers-deploy simulate`: what two sensors would see of a scene, as 12-bit TIFF pairs; or why, with --explain."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -85,7 +86,7 @@ def simulate(
     from model.progress import steps
     from profiles import load_sensor
     from profiles.errors import OptionError
-    from profiles.scene_call import calling_for, load_scene_call
+    from profiles.scene_call import calling_for, load_scene_call, origins
     from profiles.sensor_file import reference_beside
 
     if out is None:
@@ -98,7 +99,8 @@ def simulate(
         require_writable(out / "manifest.jsonl", out / "recipe.json", inputs=read, folders=folders)
     chosen = _preset(preset)
     call = load_scene_call(scene) if scene else None
-    degraded = calling_for(load_sensor(sensor or chosen.sensor), call, add or (), forbid or ())
+    own = load_sensor(sensor or chosen.sensor)
+    degraded = calling_for(own, call, add or (), forbid or ())
     wanted = oversampling or degraded.oversampling.low
     ratio = math.ceil(wanted)
     recipe = DatasetRecipe(
@@ -117,7 +119,7 @@ def simulate(
     if out is None and not explain:
         raise OptionError("--out", expected="a folder", got="none", remedy="give one, or ask for --explain alone")
     if explain:
-        _explain(recipe)
+        _explain(recipe, origins(own, call, add or (), forbid or ()))
     if out is None:
         return
     with steps("simulating", len(plan_windows(recipe))) as bar:
@@ -138,7 +140,7 @@ def _preset(name: str | None) -> Preset:
     return PRESETS[name]
 
 
-def _explain(recipe: object) -> None:
+def _explain(recipe: object, origins: Mapping[str, str]) -> None:
     """The plan of the first draw of the degraded sensor, for every scene."""
     from model.dataset import DatasetRecipe, load
     from model.simulator.acquire import prepare_scene
@@ -151,16 +153,16 @@ def _explain(recipe: object) -> None:
         stats = prepare_scene(scene.radiance, recipe.oversampling).stats
         sensor = recipe.degraded.draw(Draw(recipe.seed, index).generator("sensor-degraded"))
         title = f"{scene.name}: {stats.low:.1f} to {stats.high:.1f} W/m2/sr/um, {recipe.degraded.name}"
-        _print_plan(title, make_plan(sensor, stats, recipe.tolerance_dn))
+        _print_plan(title, make_plan(sensor, stats, recipe.tolerance_dn), origins)
 
 
-def _print_plan(title: str, plan: "Plan") -> None:
+def _print_plan(title: str, plan: "Plan", origins: Mapping[str, str]) -> None:
     from rich.table import Table
 
     from deploy.results import default_console, plain
 
-    table = Table("effect", "decision", "why", "bound DN", "cost", title=plain(title), title_justify="left")
+    table = Table("effect", "from", "decision", "why", "bound DN", "cost", title=plain(title), title_justify="left")
     for d in plan.decisions:
         bound = "" if d.bound_dn is None else f"{d.bound_dn:.3g}"
-        table.add_row(*map(plain, (d.effect, d.choice, d.why, bound, d.cost)))
+        table.add_row(*map(plain, (d.effect, origins.get(d.effect, ""), d.choice, d.why, bound, d.cost)))
     default_console().print(table)

@@ -2,7 +2,7 @@
 
 Each effect is applied, or skipped because
 
-1. not called for: neither sensor nor scene has its table;
+1. not called for: neither sensor nor scene has its table, or it is left out;
 2. neutral: its parameters change nothing;
 3. this scene cannot show it: a bound proves that no pixel changes by more than the tolerance.
 
@@ -261,7 +261,7 @@ def _decide(name: str, sensor: Sensor, bounds: dict[str, float], hidden: set[str
     if name in ("sampling", "digitising"):
         return Decision(name, "applied", "every sensor has it", None, cost)
     if name in TABLES and name not in sensor.effects:
-        return Decision(name, "not called for", "neither sensor nor scene has its table", None, "none")
+        return Decision(name, "not called for", "nothing asks for it", None, "none")
     if name in ("antialias", "smear") and ("mtf" in hidden or bounds["mtf"] == 0):
         return Decision(name, "cannot show", "the scene is too flat for any blur to show", bounds["mtf"], "none")
     if name == "antialias":

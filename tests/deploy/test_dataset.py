@@ -19,7 +19,7 @@ from deploy.dataset_workers import spread_patches
 from model.dataset import CHUNK, DatasetRecipe, make_patches, plan_windows, write_dataset
 from profiles import load_sensor
 from profiles.errors import ImageError, OptionError
-from profiles.scene_call import calling_for, load_scene_call, scene_names, typical_effects
+from profiles.scene_call import calling_for, load_scene_call, origins, scene_names, typical_effects
 
 
 @pytest.fixture
@@ -125,6 +125,20 @@ def test_effects_are_added_and_forbidden() -> None:
     assert stated.low == 0.6  # the scene's own value, not the typical one
     with pytest.raises(OptionError, match="clouds"):
         calling_for(profile, None, ["clouds"])
+
+
+def test_each_effect_says_who_asks_for_it() -> None:
+    profile, haze = load_sensor("pleiades-degraded"), load_scene_call("haze-over-sea")
+    base = {"mtf": "sensor pleiades-degraded", "noise": "sensor pleiades-degraded"}
+    assert origins(profile, None) == base
+    assert origins(profile, haze, ["prnu", "striping"], ["veil"]) == base | {
+        "veil": "left out by --without", "striping": "scene haze-over-sea", "prnu": "--with",
+    }  # fmt: skip
+    striped = replace(profile, effects=typical_effects())
+    assert origins(striped, replace(haze, without=("dsnu",)))["dsnu"] == "left out by scene haze-over-sea"
+    for scene, add in ((None, []), (haze, ["prnu"])):
+        kept = {name for name in origins(profile, scene, add) if name not in base}
+        assert kept == set(calling_for(profile, scene, add).effects)
 
 
 @pytest.fixture(scope="module")
