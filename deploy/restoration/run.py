@@ -234,7 +234,7 @@ def _rows_here(
         if next(tiles) == steady:
             needed = rows_bytes(source, plan, begun=True)
             most = check_memory(needed, budget_bytes, is_bulky(source, plan))
-            say(f"memory: {most / 1e9:.2f} GB at most (measured on the first tiles, and the rows to come)")
+            say(f"memory: about {most / 1e9:.2f} GB (measured after the first tiles, and the rows to come)")
         tick(1)
 
     return restore_rows(source, plan, restorer, rows, done, at_once)

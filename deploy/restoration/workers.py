@@ -196,7 +196,7 @@ def rows_of_workers(
             with closing(pieces):
                 for piece in pieces:
                     if not peaks_gb:
-                        most = f"{piece.most_bytes / 1e9:.2f} GB at most in each worker"
+                        most = f"about {piece.most_bytes / 1e9:.2f} GB in each worker"
                         say(f"memory: {most} (measured on a first row, and the rows to come)")
                     peaks_gb.append(piece.peak_gb or 0)
                     yield piece.row
