@@ -34,6 +34,15 @@ def train(
         typer.Option(help="Profile of the wanted output, in the sensor's DN; pleiades-reference if none."),
     ] = None,
     drawn: Annotated[int, typer.Option(min=0, max=1000, help="Drawn scenes to add to the images.")] = 0,
+    rough: Annotated[
+        float,
+        typer.Option(
+            min=0,
+            max=0.5,
+            help="Share of patches of strong contrast between pixels, to be left as they are: keeps "
+            "a network calm on what no sensor makes.",
+        ),
+    ] = 0.0,
     steps: Annotated[int, typer.Option(min=1, help="Gradient steps.")] = 20_000,
     batch: Annotated[int, typer.Option(min=1, max=4096, help="Patches a step and worker.")] = 8,
     patch: Annotated[int, typer.Option(min=17, max=2048, help="Patch side in pixels.")] = 96,
@@ -95,6 +104,9 @@ def train(
     if pairs is not None and (images is not None or drawn):
         remedy = "leave one out"
         raise OptionError("--pairs", expected="no --images or --drawn beside it", got="both", remedy=remedy)
+    if pairs is not None and rough:
+        got, remedy = "both", "leave one out: stored pairs are taken as they are"
+        raise OptionError("--pairs", expected="no --rough beside it", got=got, remedy=remedy)
     if conditioned and (pairs is not None or teacher is not None):
         remedy = "leave one out: stored pairs do not say what sensor each had, and a teacher knows one"
         raise OptionError("--conditioned", expected="no --pairs or --teacher beside it", got="both", remedy=remedy)
@@ -115,7 +127,7 @@ def train(
     made = read_pairs_recipe(pairs) if pairs else None
     degraded, wanted = profiles_for(sensor or (None if made else RANGE), reference, made, say)
     family = SensorFamily(degraded.nominal()) if conditioned else None
-    patches = PatchRecipe(degraded, wanted, patch_px=patch, family=family)
+    patches = PatchRecipe(degraded, wanted, patch_px=patch, rough=rough, family=family)
     run = Run(
         variant,
         recipe,

@@ -98,6 +98,7 @@ UNITS = {
     "patches": "patches",
     "radiance_weight": "a weight",
     "psnr_weight": "a weight",
+    "rough": "of the patches",
     "seed": "no unit",
     "size": "px",
     "steps": "steps",
@@ -171,7 +172,7 @@ REFUSED = {
         Refused(("workers", "scheduler", "resume"), without="--out"),
     ],
     "train": [
-        Refused(("images", "drawn", "conditioned"), "--pairs PAIRS"),
+        Refused(("images", "drawn", "conditioned", "rough"), "--pairs PAIRS"),
         Refused(("teacher",), "--conditioned"),
         Refused(("validate_every",), without="--images"),
         Refused(("distil",), without="--teacher"),

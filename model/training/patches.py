@@ -34,6 +34,7 @@ class PatchRecipe:
         oversamplings: ratios to draw from; every ratio shows the same ground at another scale.
         exposures: darker and brighter days than the photograph's.
         margin_px: target pixels cropped on each side.
+        rough: share of patches that no sensor makes; see `roughened`.
         family: draws the sensors instead of `degraded`; each patch then comes with the vector of its sensor.
     """
 
@@ -43,6 +44,7 @@ class PatchRecipe:
     oversamplings: tuple[int, ...] = (2, 3, 4, 5)
     exposures: tuple[float, float] = (0.5, 1.25)
     margin_px: int = 16
+    rough: float = 0.0
     family: SensorFamily | None = None
 
     def __post_init__(self) -> None:
@@ -111,6 +113,7 @@ class PatchSource:
                 order = torch.from_numpy(generator.permutation(count)[:wanted])
                 patches = torch.cat(pieces)
                 patches = patches[order.to(patches.device)]
+                patches = roughened(patches, self.recipe.rough, generator)
                 pair = patches[:, :1].contiguous(), patches[:, 1:].contiguous()
                 return (*pair, torch.cat(vectors)[order]) if self.recipe.family else pair
         raise ImageError(
@@ -192,6 +195,32 @@ def turned(patches: Tensor, quarter: int, mirrored: bool) -> Tensor:
     """Patches (..., P, P) turned by quarters, then mirrored."""
     rotated = torch.rot90(patches, quarter, (-2, -1))
     return rotated.flip(-1) if mirrored else rotated
+
+
+LEAST_CONTRAST = 0.25
+"""Between neighbouring pixels of a rough patch, of full scale: more than any sensor trained on lets through."""
+
+
+def roughened(patches: Tensor, share: float, generator: np.random.Generator) -> Tensor:
+    """Pairs (N, 2, P, P) of which a share, at random, became contrast between pixels that is to be left as it is.
+
+    No sensor makes such images, but faults do, and a network that never saw one may answer with black: at half
+    resolution a checkerboard is four even planes. Both images of such a pair are the same.
+    """
+    chosen = generator.permutation(len(patches))[: round(share * len(patches))]
+    if len(chosen):
+        made = np.stack([_rough_image(patches.shape[-1], generator) for _ in chosen])
+        patches[torch.from_numpy(chosen)] = torch.from_numpy(made)[:, None].to(patches)
+    return patches
+
+
+def _rough_image(side_px: int, generator: np.random.Generator) -> np.ndarray:
+    """Checkerboard, rows, columns or noise of two values in [0, 1], (P, P) float32."""
+    rows, columns = np.indices((side_px, side_px))
+    kinds = (rows + columns) % 2, rows % 2, columns % 2, generator.integers(0, 2, rows.shape)
+    contrast = float(generator.uniform(LEAST_CONTRAST, 1))
+    low = float(generator.uniform(0, 1 - contrast))
+    return np.asarray(low + contrast * kinds[generator.integers(len(kinds))], np.float32)
 
 
 RESCALE = "rescale it to the digital numbers of the sensor that made the pairs"

@@ -325,6 +325,7 @@ def about(run: Run, images: Sequence[str], held_out: Sequence[str], loss: Restor
         "patch_px": patches.patch_px,
         "oversamplings": patches.oversamplings if run.pairs is None else "as stored",
         "exposures": patches.exposures if run.pairs is None else "as stored",
+        "rough": patches.rough,
         "images": list(images),
         "held_out": list(dict.fromkeys(held_out)),
     }

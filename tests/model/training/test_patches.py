@@ -126,6 +126,27 @@ def test_the_pair_shows_the_same_ground() -> None:
         assert np.corrcoef(one.flatten().numpy(), other.flatten().numpy())[0, 1] > 0.7
 
 
+def test_rough_patches_are_a_share_of_strong_contrast_left_as_it_is() -> None:
+    profiles = load_sensor("pleiades-variable"), load_sensor("pleiades-reference")
+    recipe = PatchRecipe(*profiles, patch_px=32, rough=0.25)
+    scene = procedural_scene(420, 480, np.random.default_rng(2))
+    made, again = (PatchSource([scene], recipe, batch=4, seed=0).batches() for _ in range(2))
+    batches = [next(made) for _ in range(PatchSource.SHARD_BATCHES)]
+    assert all(torch.equal(a, b) for pair in batches[:2] for a, b in zip(pair, next(again), strict=True))
+    degraded, reference = (torch.cat(part) for part in zip(*batches, strict=True))
+    same = (degraded == reference).flatten(1).all(dim=1)
+    assert int(same.sum()) == len(degraded) / 4
+    rough, natural = degraded[same], degraded[~same]
+    assert ((rough >= 0) & (rough <= 1)).all()
+    spread = rough.flatten(1).amax(1) - rough.flatten(1).amin(1)
+    assert (spread > 0.2499).all()
+    assert all(len(patch.unique()) == 2 for patch in rough)
+    assert all(len(patch.unique()) > 2 for patch in natural)
+    plain, _ = next(PatchSource([scene], replace(recipe, rough=0.0), batch=4, seed=0).batches())
+    unchanged = (batches[0][0] == plain).flatten(1).all(dim=1)
+    assert torch.equal(~unchanged, same[:4]), "the others are as they were"
+
+
 def test_scenes_too_small_for_a_patch_are_refused() -> None:
     with pytest.raises(ImageError, match="64 target pixels"):
         next(source(procedural_scene(120, 120, np.random.default_rng(0)), patch_px=64).batches())
