@@ -2,6 +2,7 @@
 
 import json
 import math
+import re
 import stat
 import sys
 import tomllib
@@ -17,6 +18,8 @@ JSON_BYTES = 1 << 26
 DEPTH = 32
 TOO_DEEP = f"more than {DEPTH} levels of nesting"
 LFS_POINTER = b"version https://git-lfs"
+QUOTED = 80
+"""Characters of a line at fault that a message shows at most."""
 LINE_DOTS = 100
 """A line's dots may all be of one key: tomllib takes 4 s of processor time for one of 16 384 parts (measured)."""
 
@@ -26,18 +29,29 @@ def read_toml_text(path: Path) -> dict[str, object]:
 
     Raises:
         OSError: not readable.
-        ValueError: too large, no UTF-8, no TOML, nested too deeply, or with a longer number.
+        ValueError: too large, no UTF-8, no TOML (the line is quoted), nested too deeply, or with a longer number.
     """
     text = read_whole(path, TOML_BYTES).decode("utf-8-sig")  # some editors on Windows begin with a mark
     if any(line.count(".") > LINE_DOTS for line in text.split("\n")):
         raise ValueError(f"a line with more than {LINE_DOTS} dots")
     try:
         found = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise ValueError(_line_at_fault(text, str(error))) from None
     except RecursionError:
         raise ValueError(TOO_DEEP) from None
     # TOML knows no largest whole number, and Python refuses to print one of more than 4300 digits.
     _check(found, 10**2000)
     return found
+
+
+def _line_at_fault(text: str, reason: str) -> str:
+    """The line quoted, its number, and tomllib's reason, which ends in "(at line 3, column 9)" or "(at end ...)"."""
+    what, _, where = reason.rpartition(" (at ")
+    lines = text.rstrip().split("\n")
+    number = int(found[1]) if (found := re.match(r"line (\d+)", where)) else len(lines)
+    line = lines[number - 1].strip() if number <= len(lines) else ""
+    return f"line {number}, {line[:QUOTED]!r}: {what}"
 
 
 def read_json(path: Path) -> object:

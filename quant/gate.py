@@ -141,7 +141,7 @@ def _parse(path: Path) -> Limits:
     try:
         raw = read_toml_text(path)
     except (OSError, ValueError) as error:
-        got = unreadable(path) or " ".join(str(error).split())[:120]
+        got = unreadable(path) or str(error)
         raise OptionError(
             str(path), expected="a TOML file of limits", got=got, remedy="write mae = 0.0007"
         ) from error

@@ -9,8 +9,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from profiles import load_sensor, load_target
-from profiles.errors import OptionError, ProfileError
-from profiles.toml import DEPTH, JSON_BYTES, TOML_BYTES, parse_json, read_json, read_toml_text
+from profiles.errors import BeersError, OptionError, ProfileError
+from profiles.scene_call import load_scene_call
+from profiles.toml import DEPTH, JSON_BYTES, QUOTED, TOML_BYTES, parse_json, read_json, read_toml_text
+from quant.gate import read_limits
 
 BAD_TOML = {
     "nested arrays": "a = " + "[" * 20_000,
@@ -35,6 +37,31 @@ def test_hostile_toml_is_a_sentence_in_a_moment(name: str, tmp_path: Path) -> No
     for load in (load_sensor, load_target):
         with pytest.raises(ProfileError) as caught:
             load(str(path))
+        assert str(caught.value).isprintable()
+
+
+@pytest.mark.parametrize(
+    ("text", "shown"),
+    [
+        ("a = 1\nsnr_0 = 32 dB\nb = 2\n", "line 2, 'snr_0 = 32 dB': Expected newline"),
+        ("a = 1\r\n\r\n  b = 1,5\r\n", "line 3, 'b = 1,5': Expected newline"),
+        ("a = 1\nb = [1,\n\n", "line 2, 'b = [1,': Invalid value"),
+        ("a = 1\n[noise", "line 2, '[noise': Expected"),
+        ("[noise]\na = 1\n[noise]\n", "line 3, '[noise]': Cannot declare"),
+        ("a = " + "b" * 1000, f"line 1, 'a = {'b' * (QUOTED - 4)}': Invalid value"),
+        ("a", "line 1, 'a': Expected"),
+        ("\u007f", "line 1, '\\x7f': Invalid statement"),
+    ],
+)
+def test_the_line_that_is_no_toml_is_quoted_wherever_a_user_s_toml_is_read(
+    text: str, shown: str, tmp_path: Path
+) -> None:
+    path = tmp_path / "mine.toml"
+    path.write_bytes(text.encode())
+    for load in (load_sensor, load_target, load_scene_call, lambda name: read_limits(Path(name), None)):
+        with pytest.raises(BeersError) as caught:
+            load(str(path))
+        assert shown in str(caught.value)
         assert str(caught.value).isprintable()
 
 
