@@ -304,6 +304,7 @@ def _append(path: Path | None, text: str) -> None:
         return
     require_regular(path)
     try:
+        path.parent.mkdir(parents=True, exist_ok=True)
         with path.open("a", encoding="utf-8", newline="\n") as stream:
             stream.write(text)
     except OSError as error:

@@ -324,11 +324,13 @@ NO_LOCKS = (errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOLCK, ENOTSUP
 def only_run(out: Path, folder: Path) -> Iterator[None]:
     """Hold `folder`, where a run keeps what it needs for `out`; in the end it is gone, unless rows were left in it.
 
-    It locks nothing on a disk that has no locks, as some of networks.
+    Folders above it that were made for it are gone then, too, unless something was written there. It locks nothing on
+    a disk that has no locks, as some of networks.
 
     Raises:
         MachineError: another run holds it, or it cannot be made.
     """
+    new = [parent for parent in folder.parents if not parent.exists()]
     lock = _take(out, folder)
     try:
         yield
@@ -338,7 +340,8 @@ def only_run(out: Path, folder: Path) -> Iterator[None]:
         with suppress(OSError):
             lock.release()
         with suppress(OSError):  # rows for --resume lie there
-            folder.rmdir()
+            for each in (folder, *new):
+                each.rmdir()
 
 
 def _take(out: Path, folder: Path) -> BaseFileLock:

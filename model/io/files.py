@@ -126,13 +126,26 @@ def require_regular(path: Path | None) -> None:
 
 
 def _probe(path: Path) -> None:
-    probe = path.with_name(f".{path.name}.{os.getpid()}.probe")
+    """Try to write into the nearest folder that exists: a new one would outlive a command that is refused later."""
+    path = path.absolute()
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
+        folder = next(parent for parent in path.parents if _stands(parent))
+        for name in path.parent.relative_to(folder).parts:
+            _stands(folder / name)  # a new folder's name may be too long for this disk
+        probe = folder / f".{path.name}.{os.getpid()}.probe"
         probe.touch()
         probe.unlink()
     except OSError as error:
         raise _unwritable(path, error.strerror or str(error)) from error
+
+
+def _stands(path: Path) -> bool:
+    """Whether something stands there, a link to nothing included; what cannot be asked for is an error."""
+    try:
+        path.lstat()
+    except FileNotFoundError:
+        return False
+    return True
 
 
 def _exists(path: Path) -> bool:

@@ -263,7 +263,7 @@ def test_a_document_that_is_no_baseline_is_refused(tmp_path: Path) -> None:
 
 
 def test_bad_input_is_told_where_a_job_looks(tmp_path: Path) -> None:
-    paths = {name: tmp_path / name for name in ("junit", "summary", "outputs")}
+    paths = {"junit": tmp_path / "junit", "summary": tmp_path / "summary", "outputs": tmp_path / "new" / "outputs"}
     paths["summary"].write_text("before\n")
     wanted = [text for name, path in paths.items() for text in (f"--{name}", str(path))]
     pair = [str(tmp_path / "<none>.onnx"), str(shipped_pair()[1])]

@@ -133,13 +133,13 @@ def output_at(name: str, option: str, folder: Path) -> tuple[Path, Path]:
 
 
 def state(folder: Path) -> dict[str, bytes | str]:
-    """Every entry: bytes of files, kinds of others; folders that were made to be written to do not count."""
+    """Every entry: bytes of files, kinds of others."""
     found: dict[str, bytes | str] = {}
     for path in sorted(folder.rglob("*")):
         mode = path.lstat().st_mode
         if stat.S_ISREG(mode):
             found[str(path.relative_to(folder))] = path.read_bytes()
-        elif not stat.S_ISDIR(mode):
+        else:
             found[str(path.relative_to(folder))] = f"kind {stat.S_IFMT(mode)}"
     return found
 
@@ -208,6 +208,20 @@ def test_only_a_regular_file_is_written_over(name: str, option: str, what: str, 
 def test_an_output_folder_is_a_folder(name: str, option: str, make: Callable[[Path], object], tmp_path: Path) -> None:
     make(tmp_path / "place")
     refused(given(name, tmp_path, **{option: tmp_path / "place"}), tmp_path, "place")
+
+
+TOLD = {("gate", name) for name in ("summary", "junit", "outputs")}
+"""There the gate tells bad input."""
+
+
+@pytest.mark.parametrize(("name", "option"), [pair for pair in WRITERS if pair not in TOLD], ids=str)
+def test_what_is_refused_for_its_input_leaves_no_new_folder(name: str, option: str, tmp_path: Path) -> None:
+    source = kept(tmp_path / f"source{CASES[name].suffix}")
+    value, _ = output_at(name, option, tmp_path / "new" / "below")
+    command = given(name, tmp_path, **{option: value, CASES[name].read[0]: source})
+    before = state(tmp_path)
+    assert CliRunner().invoke(app, command).exit_code == 2, command
+    assert state(tmp_path) == before, command
 
 
 def inputs_met() -> Iterator[tuple[str, str, str]]:

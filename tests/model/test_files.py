@@ -1,11 +1,57 @@
+import os
 from pathlib import Path
 
 import pytest
 
-from model.io.files import write_text
+from model.io.files import require_writable, write_text
+from profiles.errors import MachineError
 
 
 @pytest.mark.parametrize("text", ["one\ntwo\n", "one\r\ntwo\r\n", "\u00b5m, \u6771\u4eac\n", ""])
 def test_text_is_the_same_bytes_on_every_system(text: str, tmp_path: Path) -> None:
     write_text(tmp_path / "text", text)
     assert (tmp_path / "text").read_bytes() == text.encode("utf-8")
+
+
+@pytest.mark.parametrize(
+    ("below", "reason"),
+    [
+        ("file/out", "Not a directory"),
+        ("file/new/out", "Not a directory"),
+        ("link/out", "No such file or directory"),
+        ("link/new/out", "No such file or directory"),
+        ("o" * 300, "File name too long"),
+        (f"new/{'o' * 300}/out", "File name too long"),
+        (f"new/{'o' * 300}", "File name too long"),
+    ],
+)
+@pytest.mark.skipif(os.name != "posix", reason="the words are those of POSIX")
+def test_where_no_folder_can_be_made_is_said_before_any_is(below: str, reason: str, tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    (tmp_path / "link").symlink_to("nothing")
+    path = tmp_path / below
+    with pytest.raises(MachineError) as caught:
+        require_writable(path)
+    assert (caught.value.expected, caught.value.got) == ("a place to write to", reason)
+    assert sorted(each.name for each in tmp_path.iterdir()) == ["file", "link"]
+
+
+@pytest.mark.parametrize("below", ["out", "new/out", "new/below/out"])
+def test_what_is_found_writable_can_be_written_and_the_asking_leaves_nothing(below: str, tmp_path: Path) -> None:
+    require_writable(tmp_path / below)
+    assert list(tmp_path.iterdir()) == []
+    write_text(tmp_path / below, "text")
+    assert (tmp_path / below).read_text(encoding="utf-8") == "text"
+
+
+def test_a_relative_path_is_looked_for_where_the_run_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    require_writable(Path("new/out"))
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.skipif(not hasattr(os, "geteuid") or os.geteuid() == 0, reason="an administrator may write anywhere")
+def test_a_folder_that_is_not_ours_to_write_to_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "theirs").mkdir(mode=0o500)
+    with pytest.raises(MachineError, match="Permission denied"):
+        require_writable(tmp_path / "theirs" / "new" / "out")

@@ -182,5 +182,5 @@ def test_outputs_that_cannot_be_written_are_found_early(tmp_path: Path) -> None:
     for path, got in ((tmp_path, "a folder"), (tmp_path / "file" / "below", "place to write")):
         with pytest.raises(MachineError, match=got):
             require_writable(path)
-    require_writable(None, tmp_path / "new" / "out.tif")
-    assert not list((tmp_path / "new").iterdir())
+    require_writable(None, tmp_path / "new" / "below" / "out.tif")
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]

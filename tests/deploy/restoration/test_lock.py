@@ -137,6 +137,20 @@ def test_it_is_given_back_after_an_error(tmp_path: Path) -> None:
     assert not list(tmp_path.iterdir())
 
 
+def test_new_folders_above_go_with_it_unless_something_was_written_there(tmp_path: Path) -> None:
+    out = tmp_path / "new" / "below" / "out"
+    with pytest.raises(ZeroDivisionError), only_run(out, out.with_name(".out.part")):
+        raise ZeroDivisionError
+    assert list(tmp_path.iterdir()) == []
+    (tmp_path / "new").mkdir()  # empty, but not ours
+    with only_run(out, out.with_name(".out.part")):
+        pass
+    assert [path.name for path in tmp_path.rglob("*")] == ["new"]
+    with only_run(out, out.with_name(".out.part")):
+        out.touch()
+    assert [path.name for path in tmp_path.rglob("*")] == ["new", "below", "out"]
+
+
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows removes no file that is open: nothing can come between")
 def test_a_run_that_ends_just_then_takes_no_lock_along(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Between opening the file and locking it, the run that held it ends: the lock must be on the new file."""
