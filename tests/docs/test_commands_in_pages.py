@@ -4,6 +4,7 @@ import re
 import shlex
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 import typer
@@ -37,6 +38,14 @@ def words_of(line: str) -> list[str]:
     return words[: ends[0]] if ends else words
 
 
+def context_of(line: str) -> Any:
+    """What the command line makes of a whole command: Click's context, with the value of each parameter."""
+    group = get_command(app)
+    assert isinstance(group, TyperGroup)
+    name, *words = words_of(line)
+    return group.commands[name].make_context(name, words)
+
+
 def refusal(line: str) -> str:
     """What the command line says against it; nothing where it is read."""
     group = get_command(app)
@@ -49,7 +58,7 @@ def refusal(line: str) -> str:
     if not words:
         return ""  # a command's name, within a sentence
     try:
-        group.commands[name].make_context(name, words)
+        context_of(line)
     except typer.Exit:
         return ""
     except UsageError as error:

@@ -3,7 +3,7 @@
 Of a page's fences these count, in order:
 
 - any with a title, as ```toml title="my-sensor.toml": a file, written as it stands;
-- ```bash: commands, a line each, of `beers-deploy` or `python`, run without a shell (so also on Windows);
+- ```bash: commands, a line each, of the programs known here (`PROGRAMS`), run without a shell (so also on Windows);
 - ```text: what the commands before it print. Each of its lines must come, in this order; `...` stands for anything,
   blanks and rules of tables have any length, and a number must be within 2 %, for processors differ.
 
@@ -24,7 +24,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
-PROGRAMS = {"beers-deploy": [sys.executable, "-c", "from deploy.cli import app; app()"], "python": [sys.executable]}
+PYTHON = [sys.executable]
+PROGRAMS = {
+    "beers-deploy": [*PYTHON, "-c", "from deploy.cli import app; app()"],
+    "python": PYTHON,
+    "python3": PYTHON,
+    "rio": [*PYTHON, "-c", "from rasterio.rio.main import main_group; main_group()"],
+}
 PART = re.compile(r'^```(\w+)(?: title="([^"]+)")?\n(.*?)^```$|^<!-- test: (.+?) -->$', re.MULTILINE | re.DOTALL)
 NUMBER = re.compile(r"(?<![\w.])-?\d[\d,]*(?:\.\d+)?(?:e[-+]?\d+)?")
 RELATIVE = 0.02
@@ -89,14 +95,18 @@ class Walk:
     def _run_all(self, block: str) -> None:
         expected, self._code, self._last = self._code, 0, ""
         for command in block.replace("\\\n", " ").splitlines():
-            done = self._run(command)
+            done = self.run(command)
             if done.returncode != expected:
                 raise PageError(f"{command}\nended with {done.returncode}, not {expected}:\n{done.stdout}")
             self.printed[command] = done.stdout
             self._last += done.stdout
 
-    def _run(self, command: str) -> subprocess.CompletedProcess[str]:
-        """One command with its substitutions; both streams as a terminal shows them."""
+    def run(self, command: str) -> subprocess.CompletedProcess[str]:
+        """One command with its substitutions; both streams as a terminal shows them.
+
+        Raises:
+            PageError: of a program that is not known here.
+        """
         short = command
         for pair in self.shorter:
             self.shorter[pair] |= pair[0] in short

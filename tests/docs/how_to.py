@@ -1,0 +1,124 @@
+"""The commands of the how-to pages: where they stand, what makes them short, what they need and what they write.
+
+A command stands in a fence of a shell, in an indented block, in a cell of a table, or as code within a sentence. The
+commands of one block are one sitting: each uses what those before it wrote. Within a sentence `beers-deploy check` is
+the name of a command, and no command; in a table, where a reader copies it, it is one.
+"""
+
+import json
+import re
+import shlex
+from collections.abc import Iterator
+from contextlib import suppress
+from pathlib import Path
+
+from docs.make.options import FOLDER, PATHS
+from tests.deploy.test_outputs import INSIDE
+from tests.deploy.test_outputs import NEVER_WRITTEN_INTO as KEPT
+from tests.docs.test_commands_in_pages import NAME, context_of
+from tests.docs.walk import ROOT
+
+PAGES = sorted((ROOT / "docs" / "how-to").glob("*.md"))
+PROGRAMS = {NAME, "python", "python3", "pip", "pytest", "rio", "apt-get", "xdputil"}
+SHELLS = {"console", "bash", "sh"}
+FENCE = re.compile(r"^```(\w*)[^\n]*\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+INDENTED = re.compile(r"(?:^ {4}\S.*\n?)+", re.MULTILINE)
+
+STUDY = "python -m tests.docs.small_study"
+
+Sitting = tuple[str, ...]
+
+LEFT_OUT = {
+    "pip install 'beers-deploy[gdal]'": "fetches from a registry",
+    "pip install 'beers-deploy[dask]' rioxarray": "fetches from a registry",
+    "apt-get install gdal-bin python3-qgis": "changes the system",
+    "pytest tests/deploy/restoration/test_other_readers.py": "is a part of the suite",
+    "xdputil query": "is a program of the board",
+    "xdputil benchmark core.xmodel 3": "is a program of the board",
+    "beers-deploy gate FLOAT INT8": "is a form: the page's own commands fill it in",
+}
+"""Commands that are not run, and why."""
+
+EXITS = {"beers-deploy check traditional": 1}
+"""Commands that end with another code than 0: their page says so, behind them."""
+
+SHORTER = {
+    r"(--variant) convbeers-s --tile 640": r"\1 convbeers-xs --tile 64",
+    r"--provider Vitis\S+ --option \S+": "--provider CPUExecutionProvider --tile 64",
+    r"--frames 300": "--frames 4",
+    r"(beers-deploy quantize)": r"\1 --patches 8 --patch 64",
+    r"(beers-deploy gate)": r"\1 --patches 4",
+    r"--finetune 250": "--finetune 1",
+    r"--size 13600x9016": "--size 320x256",
+    r"(beers-deploy bench)(?!.*(--size|resnet))": r"\1 --size 320x256",
+    r"(characterise\.py .*convbeers-s)\.safetensors": r"\1.safetensors --sensors 1",
+    r"raw1\.tif:412,300,28,34": "raw1.tif:114,82,28,34",
+    r"raw1\.tif:440,330,34,28": "raw1.tif:140,114,34,28",
+    r"(formats\.py)": r"\1 --size 320x256",
+    r"IMAGE OUT": "raw.tif restored.tif",
+    r"(beers-deploy detect)$": r"\1 --drawn 2 --methods degraded",
+    r"(beers-deploy detect) (--images)": r"\1 --methods degraded \2",
+    r"beers-deploy (tradeoff|evaluate)": rf"{STUDY} \1",
+    r"(tradeoff)": r"\1 --images aerial --calibration aerial --networks narrow.safetensors --cache ../study",
+    r"(tradeoff .*)--out": r"\1--size 1500x1200 --out",
+    r"(beers-deploy train)": r"\1 --variant convbeers-xs --steps 2 --batch 2 --patch 24 --validate-every 0",
+    r"(stress float\.onnx int8\.onnx)$": r"\1 --size 32 --cases night,snow",
+    r"--bit-flips": "--bit-flips --draws 1",
+}
+"""Patterns in a command, and what stands there instead so that a test takes seconds."""
+
+NEEDED = {
+    r"\.jp2|\.vrt|\.XML|--cog|bands\.tif|formats\.py": "rasterio",
+    r"--stac": "pystac",
+    r"rio cogeo": "rio_cogeo",
+    r"--workers": "distributed",
+    r"beers-deploy detect|--labelled": "pycocotools",
+}
+"""Patterns in a command, and the package of an extra without which it is refused."""
+
+
+def sittings(text: str) -> Iterator[Sitting]:
+    """The commands of a page, block by block; one within a sentence or a table is a sitting of its own."""
+    text = re.sub(r"\\\n\s*", "", text)
+    blocks = [body for language, body in FENCE.findall(text) if language in SHELLS]
+    prose = FENCE.sub("", text)
+    blocks += [block for block in INDENTED.findall(prose) if not _is_json(block)]
+    yield from (tuple(line.strip().removeprefix("$ ") for line in block.splitlines()) for block in blocks)
+    for line in prose.splitlines():
+        if not line.startswith("    "):
+            yield from ((code,) for code in re.findall(r"`([^`]+)`", line) if _is_command(code, line))
+
+
+def _is_command(code: str, line: str) -> bool:
+    words = code.split()
+    named = words[0] == NAME and len(words) == 2 and not line.startswith("|")
+    return words[0] in PROGRAMS and len(words) > 1 and not named
+
+
+def _is_json(block: str) -> bool:
+    with suppress(ValueError):
+        json.loads(block)
+        return True
+    return False
+
+
+def shortened(command: str) -> str:
+    """The command as it is run."""
+    for pattern, short in SHORTER.items():
+        command = re.sub(pattern, short, command)
+    return command
+
+
+def packages(sitting: Sitting) -> set[str]:
+    """Packages of extras that a sitting needs."""
+    return {package for pattern, package in NEEDED.items() if re.search(pattern, "\n".join(sitting))}
+
+
+def outputs(command: str) -> list[Path]:
+    """Files that a command is said to write, relative to its folder."""
+    command = command.replace(STUDY, NAME)
+    if not command.startswith(NAME):
+        return [Path(name) for name in re.findall(r"--out (\S+)", command)]
+    name, given = shlex.split(command)[1], context_of(command).params
+    named = [(key, kind) for key, kind in PATHS[name].written.items() if given[key] and (name, key) not in KEPT]
+    return [given[key] / INSIDE[name] if kind == FOLDER else given[key] for key, kind in named]

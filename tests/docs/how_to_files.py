@@ -1,0 +1,116 @@
+"""The files that the how-to pages name, small: made by the program itself where it can make them."""
+
+import re
+import shutil
+from importlib.util import find_spec
+from pathlib import Path
+
+import numpy as np
+import tifffile
+import torch
+from PIL import Image
+
+from examples.networks import build, to_onnx
+from model.convbeers import ConvBEERS, initialise
+from model.io.weights import save_network
+from model.shipped import SHIPPED
+from model.variants import Variant
+from profiles.toml import HERE as PROFILES
+from quant.onnx_file import save_onnx
+from tests.deploy.detection.folders import Object, dior
+from tests.deploy.detection.networks import detector, raw
+from tests.deploy.test_characterise import acquisition
+from tests.docs.walk import ROOT, Walk
+
+HOW_TO = ROOT / "docs" / "how-to"
+SITES, SCENE_PX = 6, 820
+"""As `benchmarks/characterise.py` needs them."""
+FEW, FEW_PX = 2, 480
+MADE = """
+beers-deploy simulate scene.png --sensor pleiades-degraded --out made
+beers-deploy export --checkpoint narrow.safetensors --out float.onnx
+beers-deploy quantize float.onnx --patches 8 --patch 64 --out int8.onnx --board core.onnx
+beers-deploy gate float.onnx int8.onnx --patches 4 --json gate-main.json
+beers-deploy evaluate --pairs made --methods float.onnx --json old.json
+python -m examples.samples ffdnet --images aerial --count 8 --out samples.npz
+"""
+
+
+def prepare(folder: Path) -> None:
+    """Put them into a folder."""
+    copied_files(folder)
+    scenes(folder)
+    networks(folder)
+    labelled_pictures(folder)
+    if find_spec("rasterio"):
+        other_formats(folder)
+    walk = Walk(folder)
+    for command in MADE.split("\n")[1:-1]:
+        done = walk.run(command)
+        assert done.returncode == 0, f"{command}\n{done.stdout}"
+    shutil.copy(folder / "old.json", folder / "new.json")
+    shutil.copy(folder / "float.onnx", folder / "mine.onnx")
+    shutil.copy(next((folder / "made" / "degraded").glob("*.tif")), folder / "raw.tif")
+    tifffile.imwrite(folder / "share.tif", tifffile.imread(folder / "raw.tif").astype(np.float32) / 4095)
+
+
+def copied_files(folder: Path) -> None:
+    """Those of this project, and those that the pages show."""
+    shutil.copytree(ROOT / "benchmarks", folder / "benchmarks", ignore=shutil.ignore_patterns("__pycache__"))
+    shutil.copy(HOW_TO / "board" / "measure.py", folder)
+    shutil.copy(PROFILES / "sensors" / "pleiades-degraded.toml", folder / "my-sensor.toml")
+    shutil.copy(SHIPPED / "convbeers-s.safetensors", folder)
+    (folder / "gate.toml").write_text(shown("gate.md", r"```toml\n(# gate\.toml\n.*?)```"), encoding="utf-8")
+    (folder / "board.json").write_text(shown("board.md", r"^    (\[\{.*\}\])$"), encoding="utf-8")
+
+
+def shown(page: str, pattern: str) -> str:
+    """The one part of a page that a pattern finds."""
+    (part,) = re.findall(pattern, (HOW_TO / page).read_text(encoding="utf-8"), re.DOTALL | re.MULTILINE)
+    return str(part)
+
+
+def scenes(folder: Path) -> None:
+    """Photographs of roofs and yards, drawn; and two raw images of a sensor, a checkerboard in the first."""
+    for name in ("aerial", "aerial-train"):
+        (folder / name).mkdir()
+    for site in range(SITES):
+        random = np.random.default_rng(site)
+        scene = np.full((SCENE_PX, SCENE_PX), 90, np.uint8)
+        for _ in range(60):
+            top, left, height, width = random.integers((0, 0, 20, 20), (800, 800, 160, 160))
+            scene[top : top + height, left : left + width] = random.integers(40, 230)
+        Image.fromarray(scene).save(folder / "aerial-train" / f"site{site}.png")
+        if site < FEW:
+            Image.fromarray(scene[:FEW_PX, :FEW_PX]).save(folder / "aerial" / f"site{site}.png")
+    shutil.copy(folder / "aerial" / "site0.png", folder / "scene.png")
+    for number in (1, 2):
+        tifffile.imwrite(folder / f"raw{number}.tif", acquisition(number - 1, board=number == 1))
+
+
+def networks(folder: Path) -> None:
+    """Weights of a narrow network, two networks of other kinds, and a detector that always sees the same."""
+    narrow = ConvBEERS(Variant(blocks=1, features=4))
+    initialise(narrow, torch.Generator().manual_seed(0))
+    save_network(folder / "narrow.safetensors", narrow, {"degraded": "pleiades-degraded"})
+    for file, name in (("network.onnx", "ffdnet"), ("resnet50.onnx", "classifier")):
+        network = build(name, torch.Generator().manual_seed(0))
+        save_onnx(to_onnx(name, network), folder / file)
+    detector(folder / "yolo11n.onnx", raw((30, 20, 20, 10, 0.1, 0.9)))
+
+
+def labelled_pictures(folder: Path) -> None:
+    """DIOR's tree, of two images."""
+    boxes: list[Object] = [("ship", 4, 4, 20, 12), ("storagetank", 30, 10, 50, 30)]
+    dior(folder / "DIOR", {"test": {"00001": boxes, "00002": boxes[:1]}})
+
+
+def other_formats(folder: Path) -> None:
+    """What GDAL reads."""
+    from tests.deploy.restoration import images
+
+    pixels = images.digital_numbers(bands=1)
+    images.write_jp2(folder / "raw.jp2", pixels, NBITS=12)
+    images.write_vrt(folder / "mosaic.vrt", pixels)
+    images.write_dimap(folder / "DIM_product.XML", pixels)
+    images.write_tiff(folder / "bands.tif", images.digital_numbers())
