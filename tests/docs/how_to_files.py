@@ -32,7 +32,7 @@ beers-deploy export --checkpoint narrow.safetensors --out float.onnx
 beers-deploy quantize float.onnx --patches 8 --patch 64 --out int8.onnx --board core.onnx
 beers-deploy gate float.onnx int8.onnx --patches 4 --json gate-main.json
 beers-deploy evaluate --pairs made --methods float.onnx --json old.json
-python -m examples.samples ffdnet --images aerial --count 8 --out samples.npz
+python -m examples.samples ffdnet --images aerial --count 2 --out samples.npz
 """
 
 
