@@ -44,6 +44,20 @@ def test_a_network_at_half_resolution_passes(name: str, coarse: Subject) -> None
     assert any(o.measures for o in outcomes if o.stage != "INT8 reference")
 
 
+@pytest.mark.parametrize("variant", ["convbeers-half", "convbeers-half-xs"])
+def test_the_shipped_networks_at_half_resolution_are_calm(variant: str) -> None:
+    """A checkerboard is four even planes to them: trained without such, the larger answered it with black."""
+    subject = open_subject(None, None, variant)
+    checks = [BY_NAME[name] for name in ("checkerboard", "Siemens star", "SNR 3")]
+    outcomes = run_battery(subject, checks, ["float32", "INT8"], side_px=96)
+    assert not [(o.stage, o.verdict, o.reason) for o in outcomes if o.failed]
+    board = np.indices((96, 96)).sum(axis=0) % 2 * float(FULL_DN)
+    assert subject.int8 is not None
+    for network in (subject.float32, subject.int8):
+        moved = network.restore(board) - board
+        assert abs(float(moved[30:-30, 30:-30].mean())) < 0.01 * FULL_DN
+
+
 @pytest.mark.parametrize("name", ["full scale", "hot pixel", "night", "NaN pixels", "1 x 1"])
 def test_the_traditional_chain_passes(name: str, subject: Subject) -> None:
     case = BY_NAME[name]
