@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from rich.console import Console
+from rich.measure import Measurement
 from rich.table import Table
 from rich.text import Text
 
@@ -97,12 +98,16 @@ PIPE_WIDTH = 200
 def print_rows(title: str, rows: Iterable[Row], console: Console | None = None) -> None:
     """Print the rows of one table, reasons for missing figures below it.
 
-    One line a row; or, where there are more figures than rows, one line a figure.
+    One line a row; or, where there are more figures than rows, one line a figure. Where a terminal is too narrow for
+    either, one line a figure of each row: no number is ever cut or broken.
     """
     rows = list(rows)
     console = console or default_console()
     keys = list(dict.fromkeys(key for row in rows for key in row.figures))
     table = by_figure(rows, keys) if len(keys) > len(rows) else by_row(rows, keys)
+    # Measured on a wide console: on its own a table's least width never exceeds the console's.
+    if Measurement.get(console, console.options.update(width=PIPE_WIDTH), table).minimum > console.width:
+        table = one_by_one(rows)
     table.title, table.title_justify = plain(title), "left"
     console.print(table)
     if keys:
@@ -149,6 +154,18 @@ def by_figure(rows: list[Row], keys: list[str]) -> Table:
         table.add_row(plain(key), plain(unit_of(key, rows)), mode, *figures)
     for word in words_of(rows):
         table.add_row(plain(word), "", "", *(plain(row.text.get(word, "")) for row in rows))
+    return table
+
+
+def one_by_one(rows: list[Row]) -> Table:
+    """One line a figure, row after row: the narrowest table."""
+    table = Table("", "", "", "unit")
+    table.columns[1].overflow = table.columns[2].overflow = "fold"
+    for row in rows:
+        figures = [(plain(key), cell(figure, ""), plain(figure.unit)) for key, figure in row.figures.items()]
+        words = [(plain(word), plain(text), plain("")) for word, text in row.text.items()]
+        for number, line in enumerate([*figures, *words]):
+            table.add_row(plain("" if number else row.name), *line, end_section=number + 1 == len(figures + words))
     return table
 
 

@@ -46,6 +46,17 @@ def test_every_figure_of_a_wide_row_is_read_at_80_columns() -> None:
         assert any(f"figure {k} " in line and "measured" in line and f" {k + 0.5:g} " in line for line in lines)
 
 
+@pytest.mark.parametrize("width", [70, 80, 120, 200])
+@pytest.mark.parametrize("count", [3, 9])
+def test_no_number_of_many_rows_is_cut_or_broken(width: int, count: int) -> None:
+    figures = {f"figure {k}": predicted(913_456, "px", (503_456, 1_660_123), "m") for k in range(8)}
+    rows = [Row("t", f"vck190 C32B{k}, tiles of 640", figures, {"range": "outside"}) for k in range(count)]
+    text = shown(rows, width)
+    assert "\u2026" not in text
+    assert text.count("913,000 ") == text.count("1,660,000]") == 8 * count
+    assert all(text.count(f"C32B{k}") == 1 for k in range(count))
+
+
 def test_a_missing_figure_is_a_dash_with_its_reason_once() -> None:
     rows = [Row("t", "one", {"power": unavailable("W", "no counter")})] * 2
     text = shown(rows, 80)
