@@ -13,6 +13,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import closing, contextmanager
 from functools import partial
 from itertools import count
+from math import prod
 from pathlib import Path
 
 import numpy as np
@@ -50,6 +51,8 @@ from quant.reading.external import network_sha256
 
 RUNS_UNTIL_STEADY = 2
 """Of each tile in work at a time: then a runtime takes no more memory."""
+MANY = 0.05
+"""Share of an image above its full scale that no scene has, but a wrong full scale."""
 ARITHMETIC = "arithmetic on the plan of tiles"
 
 Rows = Callable[[Sequence[Span], Tick], Generator[RestoredRow, None, None]]
@@ -133,7 +136,9 @@ def _restore(image: Path, out: Path, options: Options, say: Say) -> Row:
     time_s = time.perf_counter() - started
     if checkpoint.clipped:
         above = f"{checkpoint.clipped} pixels above full scale"
-        say(f"{above}, {scale.value:g} ({scale.source}), were clipped to it")
+        share = checkpoint.clipped / prod(raster.shape)
+        doubt = f": {share:.0%} of the image; is that its full scale?" if share > MANY else ""
+        say(f"{above}, {scale.value:g} ({scale.source}), were clipped to it{doubt}")
     figures["clipped pixels"] = measured(checkpoint.clipped, "1", "pixels of the image above its full scale")
     return run_row(image.name, plan, done_rows, time_s, runtime, options, figures, scale)
 

@@ -124,6 +124,9 @@ def test_values_above_a_stated_full_scale_are_clipped_counted_and_told(model: Pa
     np.testing.assert_array_equal(clipped, expected)
     assert row.figures["clipped pixels"].value == 0
     assert not any("clipped" in each for each in said)
+    _, _, said = run(tmp_path, noise(10), Options(model, 23, full_scale=255))
+    (told,) = (each for each in said if "were clipped" in each)
+    assert told.endswith("% of the image; is that its full scale?")
 
 
 def test_missing_pixels_are_not_above(model: Path, tmp_path: Path) -> None:
