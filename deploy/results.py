@@ -133,8 +133,8 @@ def by_row(rows: list[Row], keys: list[str]) -> Table:
     words = words_of(rows)
     for key in keys:
         mode = common_mode(key, rows)
-        unit = f"{unit_of(key, rows)}, {mode}" if mode else unit_of(key, rows)
-        table.add_column(plain(f"{key}\n({unit})"), justify="right")
+        about = ", ".join(filter(None, (unit_of(key, rows), mode)))
+        table.add_column(plain(f"{key}\n({about})" if about else key), justify="right")
     for word in words:
         table.add_column(plain(word), overflow="fold")
     for row in rows:
@@ -175,8 +175,9 @@ def words_of(rows: list[Row]) -> list[str]:
 
 
 def unit_of(key: str, rows: list[Row]) -> str:
-    """The unit of a column: that of its first figure."""
-    return next(row.figures[key].unit for row in rows if key in row.figures)
+    """The unit of a column: that of all its figures; empty where they differ, as those of a comparison."""
+    units = {row.figures[key].unit for row in rows if key in row.figures}
+    return units.pop() if len(units) == 1 else ""
 
 
 def common_mode(key: str, rows: list[Row]) -> str:

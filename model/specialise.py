@@ -79,7 +79,8 @@ def sensor_vector(sensor: Sensor) -> SensorVector:
         inside = min(max(value, low), high)
         if inside != value:
             outside.append(
-                f"{name} {value:.3g} is outside {low:g} to {high:g}, the network is specialised for {inside:g}"
+                f"{name} {value:.3g} is outside {low:g} to {high:g}, the network is specialised for {inside:g} "
+                "and may restore worse than blind"
             )
         entries.append(2 * math.log(inside / low) / math.log(high / low) - 1)
     lower, higher = sorted((values["mtf_across"], values["mtf_along"]))
