@@ -1,31 +1,59 @@
 """Makes the shipped INT8 files anew: each network for the default sensor and a blind one, the default one for more.
 
     python docs/make/int8.py [convbeers-s ...]
+    python docs/make/int8.py convbeers-half --finetune aerial/
 
-The same bytes that a user's cache would hold: calibrated on drawn scenes. Minutes a file.
+The same bytes that a user's cache would hold: calibrated on drawn scenes. With --finetune the file of the default
+sensor is calibrated on a folder of photographs, and its whole numbers are trained on them. Minutes a file.
 """
 
+import argparse
 import shutil
-import sys
 from pathlib import Path
 
-from deploy.networks import int8_file
+from deploy.networks import MADE_FROM, PATCH_PX, PATCHES, SEED, float_file, int8_file
+from model.progress import steps
 from model.shipped import INT8, SENSOR, SHIPPED, VARIANT, shipped_names
 from profiles.sensor_file import BLIND, load_sensor
+from quant.calibration import Calibration
+from quant.onnx_file import load_onnx, metadata, save_onnx
+from quant.passes.tune import Tuning
+from quant.quantise import quantise_model, ticks
 
 SENSORS = (SENSOR, BLIND)
 DETECTION = ("dior-medium", "dior-high")
 """What `detect` runs on with nothing given, by the default network alone."""
+STEPS = 250
 
 
 def main() -> None:
     """Make them one by one."""
-    for name in sys.argv[1:] or shipped_names():
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("names", nargs="*", default=shipped_names())
+    parser.add_argument("--finetune", type=Path, metavar="IMAGES", help="photographs to train the whole numbers on")
+    arguments = parser.parse_args()
+    for name in arguments.names:
         for sensor in (*SENSORS, *(DETECTION if name == VARIANT else ())):
             shipped = SHIPPED / f"{name}{INT8}-{sensor}.onnx"
             shipped.unlink(missing_ok=True)
             shutil.copyfile(int8_file(Path(name), load_sensor(sensor), print), shipped)
             print(shipped.name, flush=True)
+        if arguments.finetune:
+            finetune(name, arguments.finetune)
+
+
+def finetune(name: str, images: Path) -> None:
+    """Put a trained file in the place of that of the default sensor."""
+    shipped = SHIPPED / f"{name}{INT8}-{SENSOR}.onnx"
+    network, calibration = (
+        load_onnx(float_file(Path(name), load_sensor(SENSOR))),
+        Calibration(SENSOR, images, PATCHES, PATCH_PX, SEED),
+    )
+    about = calibration.about | {MADE_FROM: metadata(load_onnx(shipped))[MADE_FROM]}
+    tuning = Tuning(calibration.for_tuning.pairs, STEPS)
+    with steps(f"training {shipped.name}", ticks(network, PATCHES) + STEPS) as bar:
+        made = quantise_model(network, calibration.drawn, about, bar.advance, tuning=tuning)
+    save_onnx(made.host, shipped)
 
 
 if __name__ == "__main__":
