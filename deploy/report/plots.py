@@ -259,7 +259,11 @@ class Panel:
 
 
 CURVES_PX = (960, 370)
-CURVES_FRAME = {"left": 0.065, "right": 0.985, "top": 0.89, "bottom": 0.22, "wspace": 0.12}
+CURVES_FRAME = {"left": 0.065, "right": 0.985, "wspace": 0.12}
+ABOVE_PX, BELOW_PX, TITLE_PX, LEGEND_PX = 40, 81, 37, 6
+"""Of panels: room above and below; and from below how high the axis' title and the legend stand."""
+LEGEND_NAMES, LEGEND_ROW_PX = 4, 22
+"""In a row of the legend, at most, and how high a row is."""
 
 
 def curves_svg(panels: Sequence[Panel], x_title: str, y_title: str, *, logarithmic: bool = True) -> str:
@@ -274,9 +278,13 @@ def curves_svg(panels: Sequence[Panel], x_title: str, y_title: str, *, logarithm
     Returns:
         An SVG file, light or dark as its reader's screen is.
     """
+    rows = math.ceil(len({curve.name for panel in panels for curve in panel.curves}) / LEGEND_NAMES)
+    width_px, more_px = CURVES_PX[0], (rows - 1) * LEGEND_ROW_PX
+    height_px = CURVES_PX[1] + more_px
+    frame = CURVES_FRAME | {"top": 1 - ABOVE_PX / height_px, "bottom": (BELOW_PX + more_px) / height_px}
     with look():
-        figure = new_figure(*CURVES_PX)
-        all_axes = figure.subplots(1, len(panels), sharey=True, squeeze=False, gridspec_kw=CURVES_FRAME)[0]
+        figure = new_figure(width_px, height_px)
+        all_axes = figure.subplots(1, len(panels), sharey=True, squeeze=False, gridspec_kw=frame)[0]
         named = {}
         for axes, panel in zip(all_axes, panels, strict=True):
             axes.set(xscale="log" if logarithmic else "linear", title=panel.title)
@@ -287,9 +295,10 @@ def curves_svg(panels: Sequence[Panel], x_title: str, y_title: str, *, logarithm
                 named[curve.name] = axes.plot(*zip(*curve.points, strict=True), **style, ms=5, lw=2, gid="curve")[0]
             set_ticks(axes.xaxis, 5)
         set_ticks(all_axes[0].yaxis, 8)
-        figure.supxlabel(x_title, size=FONT_PX, color=LIGHT["soft"], y=0.1)
+        figure.supxlabel(x_title, size=FONT_PX, color=LIGHT["soft"], y=(TITLE_PX + more_px) / height_px)
         figure.supylabel(y_title, size=FONT_PX, color=LIGHT["soft"])
-        figure.legend(named.values(), named, ncols=len(named), loc="lower center", bbox_to_anchor=(0.5, 0.015))
+        columns, at = math.ceil(len(named) / rows), (0.5, LEGEND_PX / height_px)
+        figure.legend(named.values(), named, ncols=columns, loc="lower center", bbox_to_anchor=at)
         return svg_of(figure, f"{y_title} against {x_title}", alone=True)
 
 
