@@ -164,8 +164,9 @@ def one_by_one(rows: list[Row]) -> Table:
     for row in rows:
         figures = [(plain(key), cell(figure, ""), plain(figure.unit)) for key, figure in row.figures.items()]
         words = [(plain(word), plain(text), plain("")) for word, text in row.text.items()]
-        for number, line in enumerate([*figures, *words]):
-            table.add_row(plain("" if number else row.name), *line, end_section=number + 1 == len(figures + words))
+        table.add_section()
+        for number, line in enumerate([*figures, *words] or [()]):
+            table.add_row(plain("" if number else row.name), *line)
     return table
 
 

@@ -80,10 +80,9 @@ def origins(
     profile: SensorProfile, scene: SceneCall | None, add: Collection[str] = (), forbid: Collection[str] = ()
 ) -> dict[str, str]:
     """Of each effect of `calling_for`'s profile where it comes from; of one that it lost, who leaves it out."""
-    found = dict.fromkeys(("mtf", "noise", *profile.effects), f"sensor {profile.name}")
+    found = dict.fromkeys(add, "--with")  # what is stated wins over it
+    found |= dict.fromkeys(("mtf", "noise", *profile.effects), f"sensor {profile.name}")
     if scene:
         found |= dict.fromkeys(scene.effects, f"scene {scene.name}")
-    found |= dict.fromkeys(set(add) - set(found), "--with")
-    if scene:
         found |= dict.fromkeys(scene.without, f"left out by scene {scene.name}")
     return found | dict.fromkeys(forbid, "left out by --without")

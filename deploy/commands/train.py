@@ -101,12 +101,9 @@ def train(
         raise OptionError("--optimiser", expected="adam or adamw", got=repr(optimiser), remedy="pick one")
     if precision not in (None, *get_args(Precision)):
         raise OptionError("--precision", expected="float32 or bfloat16", got=repr(precision), remedy="pick one")
-    if pairs is not None and (images is not None or drawn):
-        remedy = "leave one out"
-        raise OptionError("--pairs", expected="no --images or --drawn beside it", got="both", remedy=remedy)
-    if pairs is not None and rough:
-        got, remedy = "both", "leave one out: stored pairs are taken as they are"
-        raise OptionError("--pairs", expected="no --rough beside it", got=got, remedy=remedy)
+    if pairs is not None and (images is not None or drawn or rough):
+        expected, remedy = "no --images, --drawn or --rough beside it", "leave one out"
+        raise OptionError("--pairs", expected=expected, got="both", remedy=remedy)
     if conditioned and (pairs is not None or teacher is not None):
         remedy = "leave one out: stored pairs do not say what sensor each had, and a teacher knows one"
         raise OptionError("--conditioned", expected="no --pairs or --teacher beside it", got="both", remedy=remedy)

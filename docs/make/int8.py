@@ -45,10 +45,8 @@ def main() -> None:
 def finetune(name: str, images: Path) -> None:
     """Put a trained file in the place of that of the default sensor."""
     shipped = SHIPPED / f"{name}{INT8}-{SENSOR}.onnx"
-    network, calibration = (
-        load_onnx(float_file(Path(name), load_sensor(SENSOR))),
-        Calibration(SENSOR, images, PATCHES, PATCH_PX, SEED),
-    )
+    network = load_onnx(float_file(Path(name), load_sensor(SENSOR)))
+    calibration = Calibration(SENSOR, images, PATCHES, PATCH_PX, SEED)
     about = calibration.about | {MADE_FROM: metadata(load_onnx(shipped))[MADE_FROM]}
     tuning = Tuning(calibration.for_tuning.pairs, STEPS)
     with steps(f"training {shipped.name}", ticks(network, PATCHES) + STEPS) as bar:
