@@ -260,7 +260,7 @@ class Panel:
 
 CURVES_PX = (960, 370)
 CURVES_FRAME = {"left": 0.065, "right": 0.985, "wspace": 0.12}
-ABOVE_PX, BELOW_PX, TITLE_PX, LEGEND_PX = 40, 81, 37, 6
+ABOVE_PX, BELOW_PX, X_TITLE_PX, LEGEND_PX = 40, 81, 37, 6
 """Of panels: room above and below; and from below how high the axis' title and the legend stand."""
 LEGEND_NAMES, LEGEND_ROW_PX = 4, 22
 """In a row of the legend, at most, and how high a row is."""
@@ -295,7 +295,7 @@ def curves_svg(panels: Sequence[Panel], x_title: str, y_title: str, *, logarithm
                 named[curve.name] = axes.plot(*zip(*curve.points, strict=True), **style, ms=5, lw=2, gid="curve")[0]
             set_ticks(axes.xaxis, 5)
         set_ticks(all_axes[0].yaxis, 8)
-        figure.supxlabel(x_title, size=FONT_PX, color=LIGHT["soft"], y=(TITLE_PX + more_px) / height_px)
+        figure.supxlabel(x_title, size=FONT_PX, color=LIGHT["soft"], y=(X_TITLE_PX + more_px) / height_px)
         figure.supylabel(y_title, size=FONT_PX, color=LIGHT["soft"])
         columns, at = math.ceil(len(named) / rows), (0.5, LEGEND_PX / height_px)
         figure.legend(named.values(), named, ncols=columns, loc="lower center", bbox_to_anchor=at)
