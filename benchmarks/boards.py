@@ -34,7 +34,6 @@ from profiles.sensor_file import REFERENCE
 from profiles.target import board_names
 from quant.calibration import draw_patches
 from quant.core import target_shifts
-from quant.encodings import as_on_board
 from quant.onnx_file import load_onnx
 from quant.quantise import quantise_model
 
@@ -51,7 +50,7 @@ def files(images: Path | None, patches: int, variants: list[str]) -> None:
             made = quantise_model(model, drawn, {"target": name}, lambda: None, shifts=target_shifts(target)).host
             found = integers(made)
             first = first or found
-            refused = len(place(network_of(as_on_board(made), 640), dpu_of(target)).failed)
+            refused = len(place(network_of(made, 640), dpu_of(target)).failed)
             print(
                 f"{variant:14} {name:8} {time.perf_counter() - start:5.0f} s, nodes refused {refused}, "
                 f"{found[:12]}, {'as' if found == first else 'NOT as'} the first board's, "

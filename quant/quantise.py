@@ -29,7 +29,17 @@ from quant.graph import (
 )
 from quant.graph.tail import Tail
 from quant.onnx_file import fixed_tile_px, metadata
-from quant.passes.equalise import LEVELLING, Costs, Trial, channel_ranges, equalise, first_guess, search, search_steps
+from quant.passes.equalise import (
+    LEVELLING,
+    Costs,
+    Trial,
+    channel_ranges,
+    equalise,
+    first_guess,
+    search,
+    search_steps,
+    with_room,
+)
 from quant.passes.fit_weights import fit_weights, input_moments
 from quant.passes.level import Chain, chain_ranges, level
 from quant.passes.stream import (
@@ -117,20 +127,26 @@ class _Plan:
     def shares(self) -> bool:
         return bool(self.streams) and (self.passes.shared_residual_scale or self.passes.equalise)
 
+    def stream_step(self, frac_bits: Mapping[str, int]) -> float:
+        return 2.0 ** -self.stream_frac_bits(frac_bits)
+
     def stream_frac_bits(self, frac_bits: Mapping[str, int]) -> int:
         return STREAM_FRAC_BITS if self.passes.equalise else common_frac_bits(self.streams, frac_bits)
 
-    def rounded(self, graph: Graph, frac_bits: Mapping[str, int]) -> Graph:
-        """The graph that is rounded: with the half-LSB pair and two gains where wanted."""
-        if self.passes.half_lsb_pair and self.shares:
-            graph = half_lsb_pair(graph, 2.0 ** -self.stream_frac_bits(frac_bits))
+    def paired(self, graph: Graph, frac_bits: Mapping[str, int]) -> Graph:
+        """The graph with the half-LSB pair where that is wanted and possible; else itself."""
+        wanted = self.passes.half_lsb_pair and self.shares
+        return half_lsb_pair(graph, self.stream_step(frac_bits)) if wanted else graph
+
+    def ended(self, graph: Graph) -> Graph:
+        """The graph with windows or two gains where they are wanted."""
         if self.ends.offsets:
             return windowed(graph, np.array(self.ends.offsets))
         return two_gains(graph) if self.ends.gains == 2 else graph
 
-    def core(self, graph: Graph, frac_bits: Mapping[str, int]) -> IntCore:
-        """The integer core of a graph whose tensors have these least-squares scales, the passes applied."""
-        chosen, final = dict(frac_bits), self.rounded(graph, frac_bits)
+    def core(self, final: Graph, frac_bits: Mapping[str, int]) -> IntCore:
+        """The integer core of a graph, paired and ended, whose tensors have these least-squares scales."""
+        chosen = dict(frac_bits)
         if self.shares:
             found = streams(final)
             chosen = share_stream_scale(found, frac_bits, self.stream_frac_bits(frac_bits))
@@ -182,7 +198,11 @@ def quantise_model(
         graph = _equalised(plan, frac_bits, images, tick)
     elif passes.equalise and plan.chain.tensors:
         graph = _levelled(plan, frac_bits, images, tick)
-    final, core = plan.rounded(graph, frac_bits), plan.core(graph, frac_bits)
+    paired = plan.paired(graph, frac_bits)
+    if paired is not graph:
+        paired = with_room(paired, plan.stream_step(frac_bits), images, tick, plan.ends)
+    final = plan.ended(paired)
+    core = plan.core(final, frac_bits)
     if passes.fit_weights:
         core = fit_weights(final, core, input_moments(final, images, tick, plan.ends), shifts)
     core = replace(core, ends=replace(core.ends, tail=plan.tail))
@@ -226,7 +246,12 @@ def _equalised(plan: _Plan, frac_bits: dict[str, int], images: Remade[np.ndarray
 def _trial(plan: _Plan, frac_bits: dict[str, int], images: Remade[np.ndarray]) -> Trial:
     """What a graph costs once it is rounded, on crops of the images."""
     targets = search_targets(plan.full, plan.ends, images)
-    return lambda tried: crop_costs(host_model(plan.core(tried, frac_bits), {}), targets)
+
+    def costs_of(tried: Graph) -> Costs:
+        final = plan.ended(plan.paired(tried, frac_bits))
+        return crop_costs(host_model(plan.core(final, frac_bits), {}), targets)
+
+    return costs_of
 
 
 def _levelled(plan: _Plan, frac_bits: dict[str, int], images: Remade[np.ndarray], tick: Callable[[], None]) -> Graph:
@@ -240,7 +265,8 @@ def _levelled(plan: _Plan, frac_bits: dict[str, int], images: Remade[np.ndarray]
 def ticks(model: onnx.ModelProto, patches: int, passes: Passes = ALL) -> int:
     """How often `quantise_model` will call `tick`."""
     plan = _plan(model, passes)
-    passings = 2 + passes.fit_weights + plan.takes_windows
+    pairs = passes.half_lsb_pair and plan.shares and half_lsb_pair(plan.graph, 1.0) is not plan.graph
+    passings = 2 + passes.fit_weights + plan.takes_windows + pairs
     if passes.equalise and plan.chain.tensors:
         return (passings + 1) * patches + plan.chain.steps
     if not (passes.equalise and plan.streams):

@@ -67,13 +67,12 @@ def _network(path: Path, dpu: "Dpu", tile: int | None, picture: Path | None, jso
     from deploy.dpu.checker.table import legality, network_rows, summary
     from deploy.dpu.reading import network_of, own_tile_px
     from deploy.results import Document, print_rows
-    from quant.encodings import as_on_board
     from quant.graph import refusal
     from quant.onnx_file import load_onnx
 
     model = load_onnx(path, to_run=False)
     tile_px = tile or own_tile_px(model) or TILE_PX
-    placement = place(network_of(as_on_board(model), tile_px, str(path)), dpu)
+    placement = place(network_of(model, tile_px, str(path)), dpu)
     title = f"{path.name} on {dpu.target.name} {dpu.name}, tile {tile_px}"
     rows = network_rows(placement, dpu, tile_px)
     print_rows(title, [row for row in rows if row.table == "nodes"])

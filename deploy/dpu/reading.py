@@ -57,7 +57,7 @@ def read_network(path: Path, tile_px: int | None = 640) -> Network:
     Raises:
         ModelError: not an ONNX file, or not a network of images.
     """
-    return network_of(as_on_board(load_onnx(path, to_run=False)), tile_px, str(path))
+    return network_of(load_onnx(path, to_run=False), tile_px, str(path))
 
 
 def own_tile_px(model: onnx.ModelProto) -> int | None:
@@ -79,7 +79,8 @@ def _place_px(model: onnx.ModelProto) -> int:
 
 
 def network_of(model: onnx.ModelProto, tile_px: int | None, where: str = "ONNX model") -> Network:
-    """As `read_network`, of a model in memory."""
+    """As `read_network`, of a model in memory; a host's file is read as the board gets it."""
+    model = as_on_board(model)
     if not model.graph.node:
         remedy = "give a file written by 'beers-deploy export' or 'beers-deploy quantize'"
         raise ModelError(where, expected="a network", got="an ONNX file without nodes", remedy=remedy)

@@ -31,7 +31,6 @@ from profiles.errors import BeersError, ModelError, OptionError
 from profiles.sensor import SensorProfile
 from profiles.sensor_file import reference_for
 from quant.calibration import Patches, draw_patches
-from quant.encodings import as_on_board
 from quant.free import free_ticks, quantise_free
 from quant.onnx_file import is_quantised, load_onnx, metadata, save_onnx
 from quant.passes.equalise import search_steps
@@ -133,7 +132,7 @@ def is_papers(model: onnx.ModelProto) -> bool:
 
 def operations_per_px(model: onnx.ModelProto) -> int:
     """Operations of the convolutions for each pixel of the image, a product and its sum counting as two."""
-    operations = network_of(as_on_board(model), COUNTED_PX).operations
+    operations = network_of(model, COUNTED_PX).operations
     return sum(op.operations for op in operations) // COUNTED_PX**2
 
 

@@ -1,10 +1,10 @@
 """Makes the shipped INT8 files anew: each network for the default sensor and a blind one, the default one for more.
 
     python docs/make/int8.py [convbeers-s ...]
-    python docs/make/int8.py convbeers-half --finetune aerial/
+    python docs/make/int8.py convbeers-half --finetune aerial/ [--steps 250]
 
-The same bytes that a user's cache would hold: calibrated on drawn scenes. With --finetune the file of the default
-sensor is calibrated on a folder of photographs, and its whole numbers are trained on them. Minutes a file.
+The same bytes that a user's cache would hold: calibrated on drawn scenes. With --finetune the whole numbers of the
+default sensor's file are trained on a folder of photographs. Minutes a file.
 """
 
 import argparse
@@ -31,6 +31,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("names", nargs="*", default=shipped_names())
     parser.add_argument("--finetune", type=Path, metavar="IMAGES", help="photographs to train the whole numbers on")
+    parser.add_argument("--steps", type=int, default=STEPS, help="of that training")
     arguments = parser.parse_args()
     for name in arguments.names:
         for sensor in (*SENSORS, *(DETECTION if name == VARIANT else ())):
@@ -39,17 +40,17 @@ def main() -> None:
             shutil.copyfile(int8_file(Path(name), load_sensor(sensor), print), shipped)
             print(shipped.name, flush=True)
         if arguments.finetune:
-            finetune(name, arguments.finetune)
+            finetune(name, arguments.finetune, arguments.steps)
 
 
-def finetune(name: str, images: Path) -> None:
+def finetune(name: str, images: Path, count: int) -> None:
     """Put a trained file in the place of that of the default sensor."""
     shipped = SHIPPED / f"{name}{INT8}-{SENSOR}.onnx"
     network = load_onnx(float_file(Path(name), load_sensor(SENSOR)))
-    calibration = Calibration(SENSOR, images, PATCHES, PATCH_PX, SEED)
+    calibration, photographs = (Calibration(SENSOR, place, PATCHES, PATCH_PX, SEED) for place in (None, images))
     about = calibration.about | {MADE_FROM: metadata(load_onnx(shipped))[MADE_FROM]}
-    tuning = Tuning(calibration.for_tuning.pairs, STEPS)
-    with steps(f"training {shipped.name}", ticks(network, PATCHES) + STEPS) as bar:
+    tuning = Tuning(photographs.for_tuning.pairs, count)
+    with steps(f"training {shipped.name}", ticks(network, PATCHES) + count) as bar:
         made = quantise_model(network, calibration.drawn, about, bar.advance, tuning=tuning)
     save_onnx(made.host, shipped)
 

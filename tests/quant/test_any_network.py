@@ -155,8 +155,8 @@ def test_a_description_of_something_else_is_one_sentence(change: Callable[[dict[
 @pytest.mark.parametrize("name", NETWORKS)
 def test_the_core_is_legal_on_the_dpu(name: str) -> None:
     dpu = load_dpu("vck190", None)
-    on_board = as_on_board(quantised(name).host)
-    assert legality(place(network_of(on_board, NETWORKS[name].side_px or 64), dpu)).passed
+    for file in (quantised(name).host, quantised(name).board):
+        assert legality(place(network_of(file, NETWORKS[name].side_px or 64), dpu)).passed
 
 
 TILED = [name for name in NETWORKS if name != "classifier"]

@@ -23,11 +23,23 @@ from quant.graph import (
     read_planes,
     split,
 )
-from quant.passes.equalise import FIRST_CROPS, Costs, channel_ranges, equalise, first_guess, search, search_steps
+from quant.passes.equalise import (
+    FIRST_CROPS,
+    ROOM,
+    Costs,
+    channel_ranges,
+    channel_sizes,
+    equalise,
+    first_guess,
+    search,
+    search_steps,
+    with_room,
+)
 from quant.passes.stream import (
     STREAM_FRAC_BITS,
     Stream,
     common_frac_bits,
+    half_lsb_pair,
     share_stream_scale,
     streams,
     two_gains,
@@ -85,6 +97,30 @@ def test_a_dead_channel_is_not_blown_up(graph: Graph, patches: Patches) -> None:
         equalise(graph, stream_of(graph), dead), stream_of(graph), [patches.pairs[0][0]], lambda: None
     )
     assert ranges[3] >= 1e-4 * ranges.max()
+
+
+def largest(graph: Graph, images: list[np.ndarray]) -> np.ndarray:
+    """(C,) of the last sum."""
+    sizes = channel_sizes(graph, [graph[-2].output], images, lambda: None, quantile=1.0)
+    return np.asarray(np.max([found for (found,) in sizes], axis=0))
+
+
+@pytest.mark.parametrize("loud", [0.1, 3.0, 40.0])
+def test_the_last_sum_has_room_for_the_largest_values(graph: Graph, patches: Patches, loud: float) -> None:
+    images = [image for image, _ in patches.pairs]
+    step = 2.0**-STREAM_FRAC_BITS
+    ranges = channel_ranges(graph, stream_of(graph), images, lambda: None)
+    paired = half_lsb_pair(equalise(graph, stream_of(graph), first_guess(ranges, 0.5, loud)), step)
+    roomy = with_room(paired, step, images, lambda: None)
+    np.testing.assert_allclose(correction(roomy), correction(paired), atol=1e-5)
+    before, after = largest(paired, images), largest(roomy, images)
+    assert (after * ROOM <= 127 * step * (1 + 1e-5)).all()
+    assert (after <= before * (1 + 1e-5)).all()
+    for name in sorted(stream_of(graph) & {name for op in roomy for name in op.inputs}):  # the blocks keep their step
+        first, second = ([op for op in each if op.output == name] for each in (paired, roomy))
+        assert all(a is b or np.array_equal(a.weight, b.weight) for a, b in zip(first, second, strict=True))  # type: ignore[attr-defined]
+    if loud < 1:
+        np.testing.assert_allclose(after, before, rtol=1e-5)
 
 
 CROPS = 5

@@ -1,0 +1,246 @@
+"""Families of networks that a DPU could like, each trained with equal effort: what they restore, and predicted time.
+
+    python benchmarks/families.py --images aerial/ --out families/ [--families 4x64@2,u48@2] [--steps 1000]
+
+Each is trained from scratch for one sensor, which it is not told, on as many patches as any other, and judged on the
+sites that training keeps apart: PSNR in float32 and in INT8 (calibrated on drawn scenes), and predicted seconds of a
+swath of 13600 x 9016 with exact seams on a VCK190, each with its best tile and configuration. Weights go to the
+folder; a network whose weights lie there is not trained again.
+
+Names: BLOCKSxFEATURES as the paper's blocks, uFEATURES a U-Net of two levels, dBLOCKSxFEATURES blocks of a widening
+1 x 1, a depthwise 5 x 5 and a narrowing 1 x 1 convolution, kBLOCKSxFEATURES blocks of 5 x 5 convolutions; @SCALE: at
+1 / SCALE of the resolution. What a family is worth in the end, longer training tells: `beers-deploy train`.
+"""
+
+import argparse
+import io
+import math
+import re
+import time
+import warnings
+from collections.abc import Callable, Iterable
+from itertools import islice, product
+from pathlib import Path
+
+import numpy as np
+import onnx
+import torch
+from safetensors.torch import load_file, save_file
+from torch import Tensor, nn
+from torch.nn.functional import pixel_shuffle, pixel_unshuffle
+
+from deploy.bench.tables import PAPER_SIZE, Swath, parse_size, swath_latency
+from deploy.dpu.board import load_dpu
+from deploy.tradeoff.board import predict_model
+from model.io.images import list_images, site_of
+from model.metrics.fidelity import psnr_db
+from model.processor import bfloat16_speed, processor_name
+from model.progress import steps
+from model.simulator.sampling import read_scene
+from model.training.losses import LossWeights, RestorationLoss
+from model.training.patches import PatchRecipe, PatchSource
+from profiles import load_sensor
+from quant.calibration import Calibration, Patches, draw_patches
+from quant.quantise import quantise_model
+from quant.session import open_any_size
+from quant.tiling.walk import receptive_radius_px
+
+FAMILIES = "4x64@2,8x48@2,2x32@2,u48@2,u64@2,d8x64@2,d8x96@2,k2x32@2,k3x48@2,u32,8x32"
+NAME = re.compile(r"(?P<kind>[udk]?)(?:(?P<blocks>\d+)x)?(?P<features>\d+)(?:@(?P<scale>\d+))?")
+CORRECTIONS = ("second", "project", "tail", "end")
+"""What is added to something else starts small, so that a network starts near the identity."""
+SENSOR, REFERENCE = "pleiades-degraded", "pleiades-reference"
+BATCH, PATCH_PX, RATE = 16, 64, 5e-4
+HELD_OUT_EVERY = 4
+"""Of so many sites one is not trained on."""
+HELD_OUT = 64
+"""Patches of 128 x 128 that all are judged by."""
+CONFIGURATIONS, TILES_PX = ("C32B6", "C64B5"), (128, 176, 256, 320, 640)
+LOSS = RestorationLoss(LossWeights(lpips=0.0, fft=0.0))
+
+
+class Restoring(nn.Module):
+    """Image plus correction, (N, 1, H, W) to the same: a head, a body between maps of equal size, a tail.
+
+    Where it is `narrow`, the body is computed in bfloat16.
+    """
+
+    def __init__(self, features: int, scale: int, body: nn.Module) -> None:
+        super().__init__()
+        self.scale, self.body, self.narrow = scale, body, False
+        self.head, self.tail = conv(scale**2, features), conv(features, scale**2)
+
+    def forward(self, image: Tensor) -> Tensor:
+        """Restore images."""
+        shallow = self.head(pixel_unshuffle(image, self.scale) if self.scale > 1 else image)
+        with torch.autocast("cpu", dtype=torch.bfloat16, enabled=self.narrow):
+            deep = self.body(shallow)
+        correction: Tensor = self.tail(shallow + (deep.float() if self.narrow else deep))
+        return image + (pixel_shuffle(correction, self.scale) if self.scale > 1 else correction)
+
+
+class Block(nn.Module):
+    """x + conv(relu(conv(x)))."""
+
+    def __init__(self, features: int, kernel: int = 3) -> None:
+        super().__init__()
+        self.first, self.second = (conv(features, features, kernel) for _ in range(2))
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(N, F, H, W) to the same."""
+        correction: Tensor = self.second(torch.relu(self.first(x)))
+        return x + correction
+
+
+class Depthwise(nn.Module):
+    """x + a narrowing of what is filtered channel by channel, twice as wide as x."""
+
+    def __init__(self, features: int) -> None:
+        super().__init__()
+        self.expand, self.project = conv(features, 2 * features, 1), conv(2 * features, features, 1)
+        self.depthwise = nn.Conv2d(2 * features, 2 * features, 5, padding=2, groups=2 * features)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(N, F, H, W) to the same."""
+        correction: Tensor = self.project(torch.relu(self.depthwise(torch.relu(self.expand(x)))))
+        return x + correction
+
+
+class Levels(nn.Module):
+    """A block, two more at half the resolution with twice the features, and a block; the skip is added."""
+
+    def __init__(self, features: int) -> None:
+        super().__init__()
+        self.before, self.after = Block(features), Block(features)
+        self.down = nn.Conv2d(features, 2 * features, 3, stride=2, padding=1)
+        self.deep = nn.Sequential(*(Block(2 * features) for _ in range(2)))
+        self.up, self.end = nn.ConvTranspose2d(2 * features, features, 2, stride=2), conv(features, features)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(N, F, H, W) of even sides to the same."""
+        shallow = self.before(x)
+        deep = self.up(self.deep(torch.relu(self.down(shallow))))
+        correction: Tensor = self.end(self.after(shallow + deep))
+        return correction
+
+
+def conv(inputs: int, outputs: int, kernel: int = 3) -> nn.Conv2d:
+    """A convolution that keeps the size."""
+    return nn.Conv2d(inputs, outputs, kernel, padding=kernel // 2)
+
+
+def build(name: str, generator: torch.Generator) -> Restoring:
+    """The network of that name, with weights drawn from the generator."""
+    found = NAME.fullmatch(name)
+    if found is None:
+        raise SystemExit(f"expected names such as {FAMILIES}, got {name!r}")
+    blocks, features, scale = (int(found[part] or 1) for part in ("blocks", "features", "scale"))
+    kinds: dict[str, Callable[[], Iterable[nn.Module]]] = {
+        "": lambda: [*(Block(features) for _ in range(blocks)), conv(features, features)],
+        "k": lambda: [*(Block(features, 5) for _ in range(blocks)), conv(features, features)],
+        "d": lambda: [*(Depthwise(features) for _ in range(blocks)), conv(features, features)],
+        "u": lambda: [Levels(features)],
+    }
+    network = Restoring(features, scale, nn.Sequential(*kinds[found["kind"]]()))
+    for path, module in network.named_modules():
+        if isinstance(module, nn.Conv2d | nn.ConvTranspose2d):
+            small = 0.1 if path.endswith((*CORRECTIONS, f"body.{blocks}")) else 1.0
+            fan_in = module.weight[0].numel() if isinstance(module, nn.Conv2d) else module.in_channels
+            with torch.no_grad():
+                module.weight.normal_(0.0, small * (2 / fan_in) ** 0.5, generator=generator)
+                module.bias.zero_()  # type: ignore[union-attr]
+    return network
+
+
+def trained(name: str, source: PatchSource, count: int, path: Path) -> Restoring:
+    """The network after so many steps by Adam, L1, the rate falling to 0 as a half cosine; kept in `path`."""
+    network = build(name, torch.Generator().manual_seed(0))
+    if path.exists():
+        network.load_state_dict(load_file(path))
+        return network.eval()
+    optimiser = torch.optim.Adam(network.parameters(), RATE)
+    falling = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, count)
+    network.narrow, begun = bfloat16_speed() > 1, time.process_time()
+    with steps(f"training {name}", count) as bar:
+        for degraded, reference in islice(source.batches(), count):
+            loss, _ = LOSS(network(degraded), reference)
+            optimiser.zero_grad(set_to_none=True)
+            loss.backward()  # type: ignore[no-untyped-call]
+            nn.utils.clip_grad_norm_(network.parameters(), 0.1)
+            optimiser.step()
+            falling.step()
+            bar.advance()
+    print(f"{name}: trained in {time.process_time() - begun:.0f} s of processor time", flush=True)
+    save_file(network.state_dict(), path)
+    network.narrow = False
+    return network.eval()
+
+
+def exported(network: Restoring) -> onnx.ModelProto:
+    """As ONNX, `input` to `output`, batch, height and width free."""
+    axes = {0: "batch", 2: "height", 3: "width"}
+    names = {"input_names": ["input"], "output_names": ["output"], "dynamic_axes": {"input": axes, "output": axes}}
+    file = io.BytesIO()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DeprecationWarning)
+        torch.onnx.export(network, (torch.zeros(1, 1, 64, 64),), file, dynamo=False, opset_version=17, **names)  # type: ignore[arg-type]
+    return onnx.load_model_from_string(file.getvalue())
+
+
+def psnrs_db(model: onnx.ModelProto, patches: Patches) -> np.ndarray:
+    """PSNR of each patch, dB over full scale."""
+    session, found = open_any_size(model), []
+    for degraded, reference in patches.pairs:
+        (restored,) = session.run(None, {session.get_inputs()[0].name: degraded})
+        found.append(psnr_db(restored[0, 0].clip(0, 1), reference[0, 0], 1.0))
+    return np.array(found)
+
+
+def swath_cell(model: onnx.ModelProto) -> str:
+    """Predicted seconds of a swath, with interval, tile and configuration, where they are least."""
+    width_px, height_px = parse_size(PAPER_SIZE)
+    found = []
+    for configuration, tile_px in product(CONFIGURATIONS, TILES_PX):
+        dpu, radius_px = load_dpu("vck190", configuration), receptive_radius_px(model)
+        if 2 * radius_px >= tile_px:
+            continue
+        prediction = predict_model(model, dpu, tile_px)
+        swath = Swath(width_px, height_px, tile_px, radius_px)
+        latency = swath_latency(prediction, math.ceil(swath.tiles / prediction.batch))
+        low, high = latency.interval or (math.nan, math.nan)
+        found.append((latency.value, f"{latency.value:.3g} [{low:.3g}, {high:.3g}] ({tile_px}, {configuration})"))
+    return min(found)[1]
+
+
+def main() -> None:
+    """Print a row a family."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--images", type=Path, required=True)
+    parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--families", default=FAMILIES)
+    parser.add_argument("--steps", type=int, default=1000, help=f"of {BATCH} patches")
+    arguments = parser.parse_args()
+    arguments.out.mkdir(parents=True, exist_ok=True)
+    sensors = load_sensor(SENSOR), load_sensor(REFERENCE)
+    scenes = [read_scene(file, sensors[1].nominal()) for file in list_images(arguments.images)]
+    apart = sorted({site_of(scene.name) for scene in scenes})[::HELD_OUT_EVERY]
+    held = [scene for scene in scenes if site_of(scene.name) in apart]
+    kept = [scene for scene in scenes if site_of(scene.name) not in apart]
+    judging = draw_patches(held, *sensors, HELD_OUT, 1)
+    source = PatchSource(kept, PatchRecipe(*sensors, patch_px=PATCH_PX), BATCH, 0)
+    drawn = Calibration(SENSOR, None, 64, 128, 0).drawn
+    print(f"{processor_name()}, {arguments.steps * BATCH} patches each, judged by {HELD_OUT} of {len(apart)} sites")
+    heads = "family", "1000 parameters", "halo, px", "float32 dB", "INT8 dB", "s a swath, best tile"
+    print("|", " | ".join(heads), "|\n" + "|---" * len(heads) + "|")
+    for name in arguments.families.split(","):
+        network = trained(name, source, arguments.steps, arguments.out / f"{name}.safetensors")
+        model = exported(network)
+        made = quantise_model(model, drawn, {}, lambda: None).host
+        scores = [f"{psnrs_db(each, judging).mean():.2f}" for each in (model, made)]
+        weights = sum(parameter.numel() for parameter in network.parameters()) / 1e3
+        cells = [name, f"{weights:.0f}", str(receptive_radius_px(made)), *scores, swath_cell(made)]
+        print("|", " | ".join(cells), "|", flush=True)
+
+
+if __name__ == "__main__":
+    main()
