@@ -32,6 +32,7 @@ from torch.nn.functional import pixel_shuffle, pixel_unshuffle
 from deploy.bench.tables import PAPER_SIZE, Swath, parse_size, swath_latency
 from deploy.dpu.board import load_dpu
 from deploy.tradeoff.board import predict_model
+from model.convbeers import ResidualBlock
 from model.io.images import list_images, site_of
 from model.metrics.fidelity import psnr_db
 from model.processor import bfloat16_speed, processor_name
@@ -79,17 +80,11 @@ class Restoring(nn.Module):
         return image + (pixel_shuffle(correction, self.scale) if self.scale > 1 else correction)
 
 
-class Block(nn.Module):
-    """x + conv(relu(conv(x)))."""
-
-    def __init__(self, features: int, kernel: int = 3) -> None:
-        super().__init__()
-        self.first, self.second = (conv(features, features, kernel) for _ in range(2))
-
-    def forward(self, x: Tensor) -> Tensor:
-        """(N, F, H, W) to the same."""
-        correction: Tensor = self.second(torch.relu(self.first(x)))
-        return x + correction
+def wide_block(features: int) -> ResidualBlock:
+    """A residual block of 5 x 5 convolutions."""
+    block = ResidualBlock(features)
+    block.first, block.second = (conv(features, features, 5) for _ in range(2))
+    return block
 
 
 class Depthwise(nn.Module):
@@ -111,9 +106,9 @@ class Levels(nn.Module):
 
     def __init__(self, features: int) -> None:
         super().__init__()
-        self.before, self.after = Block(features), Block(features)
+        self.before, self.after = ResidualBlock(features), ResidualBlock(features)
         self.down = nn.Conv2d(features, 2 * features, 3, stride=2, padding=1)
-        self.deep = nn.Sequential(*(Block(2 * features) for _ in range(2)))
+        self.deep = nn.Sequential(*(ResidualBlock(2 * features) for _ in range(2)))
         self.up, self.end = nn.ConvTranspose2d(2 * features, features, 2, stride=2), conv(features, features)
 
     def forward(self, x: Tensor) -> Tensor:
@@ -136,8 +131,8 @@ def build(name: str, generator: torch.Generator) -> Restoring:
         raise SystemExit(f"expected names such as {FAMILIES}, got {name!r}")
     blocks, features, scale = (int(found[part] or 1) for part in ("blocks", "features", "scale"))
     kinds: dict[str, Callable[[], Iterable[nn.Module]]] = {
-        "": lambda: [*(Block(features) for _ in range(blocks)), conv(features, features)],
-        "k": lambda: [*(Block(features, 5) for _ in range(blocks)), conv(features, features)],
+        "": lambda: [*(ResidualBlock(features) for _ in range(blocks)), conv(features, features)],
+        "k": lambda: [*(wide_block(features) for _ in range(blocks)), conv(features, features)],
         "d": lambda: [*(Depthwise(features) for _ in range(blocks)), conv(features, features)],
         "u": lambda: [Levels(features)],
     }
