@@ -198,16 +198,18 @@ def quantise_model(
         graph = _equalised(plan, frac_bits, images, tick)
     elif passes.equalise and plan.chain.tensors:
         graph = _levelled(plan, frac_bits, images, tick)
-    paired = plan.paired(graph, frac_bits)
+    paired, last_sum = plan.paired(graph, frac_bits), frozenset[str]()
     if paired is not graph:
         paired = with_room(paired, plan.stream_step(frac_bits), images, tick, plan.ends)
+        last_sum = frozenset(paired[-2].inputs)
     final = plan.ended(paired)
     core = plan.core(final, frac_bits)
     if passes.fit_weights:
         core = fit_weights(final, core, input_moments(final, images, tick, plan.ends), shifts)
     core = replace(core, ends=replace(core.ends, tail=plan.tail))
     if tuning:
-        core = tune(core, final, plan.full, tuning, tick)
+        # Patches that hold few roofs would train the last sum's room away.
+        core = tune(core, final, plan.full, tuning, tick, still=last_sum)
     about = {**metadata(model), "precision": "int8 legal", "calibration_sha256": patches.digest, **about}
     about["passes"] = ", ".join(name for name, on in asdict(passes).items() if on)
     if tuning:

@@ -5,7 +5,7 @@ identity, and clipping as what it is (the straight-through estimator, Bengio et 
 which holds them exactly up to 2^24.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
 from types import MappingProxyType
 
@@ -52,18 +52,22 @@ class TrainableCore(torch.nn.Module):
     They may lie between whole numbers while they are trained; forwards the nearest whole numbers count.
     """
 
-    def __init__(self, core: IntCore, origins: Sequence[Conv]) -> None:
+    def __init__(self, core: IntCore, origins: Sequence[Conv], still: Collection[str] = ()) -> None:
         """Parameters where the float numbers lie, as near as they round to the core's whole ones.
 
         Args:
             core: in whole numbers.
             origins: the float convolution that each of the core's was rounded from, in their order.
+            still: the tensors whose convolutions stay as they are.
         """
         super().__init__()
         self._core = core
         both = list(zip(core.convolutions, origins, strict=True))
         self.weights = torch.nn.ParameterList(_begin(a.weight, b.weight, a.weight_frac_bits) for a, b in both)
         self.biases = torch.nn.ParameterList(_begin(a.bias, b.bias, a.bias_frac_bits) for a, b in both)
+        for op, *numbers in zip(core.convolutions, self.weights, self.biases, strict=True):
+            for parameter in numbers:
+                parameter.requires_grad_(op.output not in still)
 
     def core(self) -> IntCore:
         """The core with its weights and biases as they stand, in whole numbers."""

@@ -7,7 +7,7 @@ shifts stay, so the core stays as legal as it was.
 """
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -28,7 +28,8 @@ JUDGEMENTS = 20
 BATCH_PIXELS = 4 * 128**2
 """Of the planes that one step looks at."""
 BORDER_PX = 8
-"""Not looked at in a result of at least four times as many a side: there a patch ends, and its image goes on."""
+"""Not held against a reference in a result of at least four times as many a side: there a patch ends, and its image
+goes on. The float network has the same border."""
 
 
 @dataclass(frozen=True)
@@ -66,11 +67,20 @@ class Sample:
 
     def error(self, correction: Tensor) -> Tensor:
         """The mean squared errors of a correction, added up and weighted."""
-        wanted = [self.floats] if self.reference is None else [self.floats, self.reference]
-        return self.weight * sum((_mean_square(correction, each) for each in wanted), start=torch.zeros(()))
+        error = (correction - self.floats).square().mean()
+        if self.reference is not None:
+            error = error + _inner_error(correction, self.reference)
+        return self.weight * error
 
 
-def tune(core: IntCore, rounded: Graph, full: Graph, tuning: Tuning, tick: Callable[[], None]) -> IntCore:
+def tune(
+    core: IntCore,
+    rounded: Graph,
+    full: Graph,
+    tuning: Tuning,
+    tick: Callable[[], None],
+    still: Collection[str] = (),
+) -> IntCore:
     """The core with the numbers that erred least on pairs that they were not trained on.
 
     Args:
@@ -79,6 +89,7 @@ def tune(core: IntCore, rounded: Graph, full: Graph, tuning: Tuning, tick: Calla
         full: the float network that reads all planes.
         tuning: on what, how long, how fast.
         tick: called once a step.
+        still: the tensors whose convolutions are not trained.
 
     Raises:
         ModelError: NaN or infinity in the float network.
@@ -87,7 +98,7 @@ def tune(core: IntCore, rounded: Graph, full: Graph, tuning: Tuning, tick: Calla
     samples = list(_samples(core.ends, full, tuning.pairs))
     held = samples[HELD_OUT_EVERY - 1 :: HELD_OUT_EVERY] or samples
     seen = [sample for k, sample in enumerate(samples) if (k + 1) % HELD_OUT_EVERY] or samples
-    trainable = TrainableCore(core, [op for op in rounded if isinstance(op, Conv)])
+    trainable = TrainableCore(core, [op for op in rounded if isinstance(op, Conv)], still)
     least, kept, every = _cost(trainable, held), core, max(tuning.steps // JUDGEMENTS, 1)
     for step in _descend(trainable, seen, tuning):
         tick()
@@ -113,14 +124,15 @@ def _samples(ends: Ends, full: Graph, pairs: Remade[Pair]) -> Iterator[Sample]:
             remedy = "give references of the size that the network makes"
             raise ImageError("reference", expected=f"one of {made}", got=given, remedy=remedy)
         wanted = torch.from_numpy(ends.correction_of(image, reference))
-        yield Sample(planes, result, wanted, 1 / max(float(_mean_square(result, wanted)), LEAST_ERROR))
+        yield Sample(planes, result, wanted, 1 / max(float(_inner_error(result, wanted)), LEAST_ERROR))
 
 
 LEAST_ERROR = 1e-9
 """Mean squared, of full scale: below it, by 90 dB, a float network is as good as perfect."""
 
 
-def _mean_square(result: Tensor, wanted: Tensor) -> Tensor:
+def _inner_error(result: Tensor, wanted: Tensor) -> Tensor:
+    """Mean squared, but for a border that no network could restore."""
     border_px = BORDER_PX if min(result.shape[2:]) >= 4 * BORDER_PX else 0
     height, width = result.shape[2:]
     inner = (result - wanted)[..., border_px : height - border_px, border_px : width - border_px]

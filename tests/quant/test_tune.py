@@ -16,7 +16,7 @@ from quant.ends import Ends
 from quant.graph import Conv, Shuffle, correction_graph, read_planes
 from quant.integer import merged_correction, run_core
 from quant.integer.trainable import TrainableCore
-from quant.passes.tune import Tuning, tune
+from quant.passes.tune import BORDER_PX, Sample, Tuning, tune
 from quant.quantise import Quantised, quantise_model
 
 
@@ -111,6 +111,23 @@ def test_the_same_seed_gives_the_same_numbers_and_a_step_is_a_tick(
         return bytes(model.host.SerializeToString())
 
     assert made(1) == made(1)
+
+
+def test_the_last_sum_keeps_the_room_it_was_given(float_onnx: onnx.ModelProto, patches: Patches) -> None:
+    plain = quantise_model(float_onnx, patches, {}, lambda: None)
+    tuned = quantise_model(float_onnx, patches, {}, lambda: None, tuning=Tuning(patches.pairs, 3, rate=0.3))
+    both = list(zip(plain.core.convolutions, tuned.core.convolutions, strict=True))
+    same = {one.output for one, other in both if np.array_equal(one.weight, other.weight)}
+    assert same == set(plain.core.ops[-2].inputs)
+
+
+@pytest.mark.parametrize(("side", "looked_at"), [(4 * BORDER_PX, False), (4 * BORDER_PX - 1, True)])
+def test_the_border_is_the_float_network_s_where_the_reference_cannot_know(side: int, looked_at: bool) -> None:
+    inner = torch.rand((1, 1, side, side + 9), generator=torch.Generator().manual_seed(1))
+    edge = inner.clone()
+    edge[..., 0, :] += 1
+    assert (float(Sample(inner, inner, edge, 1.0).error(inner)) > 0) is looked_at
+    assert float(Sample(inner, edge, inner, 1.0).error(inner)) > 0
 
 
 def test_slopes_pass_roundings_and_stop_where_int8_ends(quantised: Quantised, patches: Patches) -> None:
