@@ -12,7 +12,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 from xml.etree import ElementTree as ET
 
 import onnx
@@ -31,13 +31,14 @@ from profiles import load_sensor, load_target
 from profiles.errors import BeersError, MachineError, OptionError, printable
 from profiles.figures import Row
 from profiles.toml import read_json, unreadable
-from quant.calibration import Patches, unseen_patches
 from quant.checks import Check
 from quant.gate import GateResult, Limits, compare, judge, judge_saturation, verdict_row
 from quant.onnx_file import fixed_tile_px, load_onnx, require_quantised
-from quant.samples import samples_of
 from quant.session import open_any_size
 from quant.structure import saturated_shares, structure_checks
+
+if TYPE_CHECKING:
+    from quant.calibration import Patches
 
 PATCHES = ("sensor", "images", "patches", "seed", "data")
 """The arguments that say what INT8 and float are compared on."""
@@ -115,8 +116,12 @@ def run_gate(request: Request) -> Outcome:
     return Outcome(result, shares, tuple(checks))
 
 
-def _unseen(request: Request, model: onnx.ModelProto) -> tuple[Patches, bool]:
+def _unseen(request: Request, model: onnx.ModelProto) -> "tuple[Patches, bool]":
     """What the two are compared on, and whether it is simulated."""
+    # These take torch, seconds; what is wrong with the options or the files has been said by now.
+    from quant.calibration import unseen_patches
+    from quant.samples import samples_of
+
     own = samples_of(model, request.data)
     if own is None:
         sensor = load_sensor(request.sensor)

@@ -5,7 +5,7 @@ import sys
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import onnxruntime as ort
@@ -14,9 +14,11 @@ from model.metrics.fidelity import psnr_db
 from profiles.errors import OptionError
 from profiles.figures import Figure, Row, measured, unavailable
 from profiles.toml import read_toml_text, unreadable
-from quant.calibration import Pair
 from quant.checks import Check
 from quant.session import result_of
+
+if TYPE_CHECKING:
+    from quant.calibration import Pair
 
 
 @dataclass(frozen=True)
@@ -57,7 +59,7 @@ class GateResult:
 def compare(
     float_session: ort.InferenceSession,
     int8_session: ort.InferenceSession,
-    pairs: Iterable[Pair],
+    pairs: "Iterable[Pair]",
     simulated: bool = True,
 ) -> GateResult:
     """Run both networks on (degraded, reference) pairs of (1, C, H, W) in [0, 1]; outputs clipped as a file would.

@@ -1,22 +1,41 @@
-"""Machines are shared: no property test is judged by its time. Real images lie beside the repository, or nowhere."""
+"""Machines are shared: no property test is judged by its time. Real images lie beside the repository, or nowhere.
+
+What many tests need and no test changes is made once a process: the tree of commands and the drawn scenes.
+"""
 
 import atexit
 import os
 import shutil
+import sys
 import tempfile
+from functools import cache, lru_cache
 from pathlib import Path
 
+# Before any test is imported, and so before torch is: the suite runs in several processes, a core each.
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
 import pytest
+import typer.main
+import typer.testing
 from hypothesis import settings
 
-# Before any test is imported: what is made for a sensor goes into no user's cache.
+# What is made for a sensor goes into no user's cache.
 os.environ["BEERS_DEPLOY_CACHE"] = tempfile.mkdtemp(prefix="beers-deploy-tests-")
 atexit.register(shutil.rmtree, os.environ["BEERS_DEPLOY_CACHE"], ignore_errors=True)
 
 settings.register_profile("project", deadline=None)
 settings.load_profile("project")
 
+typer.testing._get_command = cache(typer.main.get_command)
+
 SHARED_DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
+
+
+@pytest.fixture(scope="session", autouse=True)
+def scenes_drawn_once() -> None:
+    """Keep the drawn scenes, where a test's imports reach them: an emulated processor is spared torch."""
+    if drawing := sys.modules.get("model.simulator.procedural"):
+        drawing.draw_scenes = lru_cache(maxsize=4)(drawing.draw_scenes)  # type: ignore[attr-defined]
 
 
 @pytest.fixture(scope="session")

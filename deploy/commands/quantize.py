@@ -67,25 +67,28 @@ def quantize(
     """
     from deploy.export import float_model
     from deploy.networks import float_file
-    from deploy.quantise import Wanted, quantise_free_file, quantise_legal_file
     from deploy.results import Document, print_rows
     from model.io.files import require_writable
     from profiles import load_sensor, load_target
     from profiles.errors import OptionError
-    from quant.calibration import Calibration
-    from quant.quantise import passes_without
-    from quant.samples import samples_of
 
     if regime is Regime.free and (board or ablate or report or without or finetune):
         remedy = "leave it out, or take --regime legal"
         expected = "no --board, --ablate, --report, --without or --finetune"
         raise OptionError("--regime free", expected=expected, got="one", remedy=remedy)
-    passes = passes_without(without or [])
     page, figures = (report / "report.html", report / "report.json") if report else (None, None)
     read = (model, images, data, *map(Path, (target, sensor)))
     require_writable(out, board, json, page, figures, inputs=read)
     model = float_file(model, load_sensor(sensor), partial(say, err=True))
     network, board_target = float_model(model), load_target(target)
+
+    # These take torch, seconds: what is wrong with the options or the files has been said by now.
+    from deploy.quantise import Wanted, quantise_free_file, quantise_legal_file
+    from quant.calibration import Calibration
+    from quant.quantise import passes_without
+    from quant.samples import samples_of
+
+    passes = passes_without(without or [])
     calibration = samples_of(network, data) or Calibration(sensor, images, patches, patch, seed)
     if regime is Regime.free:
         rows = quantise_free_file(network, calibration, out, say, print_rows)

@@ -118,6 +118,7 @@ def test_the_traditional_chain_is_judged_and_stays_on_the_cpu(tmp_path: Path) ->
         run("traditional", "--picture", "g.svg")
 
 
+@pytest.mark.slow
 def test_the_page_of_operators_is_fresh() -> None:
     root = Path(__file__).resolve().parents[2]
     code = "import sys; from docs.make.operators import document; sys.stdout.write(document())"

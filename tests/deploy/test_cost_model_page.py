@@ -1,7 +1,10 @@
+import pytest
+
 from deploy.dpu.cost.published import boards
 from docs.make import cost_model
 
 
+@pytest.mark.slow
 def test_the_page_and_the_profiles_are_fresh() -> None:
     """Run `python docs/make/cost_model.py` if this fails."""
     for board in boards():

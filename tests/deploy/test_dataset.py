@@ -44,6 +44,7 @@ def bytes_of(folder: Path) -> dict[str, bytes]:
     return {str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
 
 
+@pytest.mark.slow
 def test_the_bytes_do_not_depend_on_the_workers(scene: Path, tmp_path: Path) -> None:
     for workers in (1, 2):
         write_dataset(small(scene), tmp_path / str(workers), workers, resume=False, tick=lambda _: None)
@@ -74,6 +75,7 @@ def test_the_manifest_tells_where_each_patch_comes_from(scene: Path, tmp_path: P
         assert any(d["effect"] == "mtf" for d in line["degraded"]["plan"]["decisions"])
 
 
+@pytest.mark.slow
 def test_a_killed_dataset_is_resumed_to_the_same_bytes(scene: Path, tmp_path: Path) -> None:
     options = [str(scene), "--oversampling", "2", "--patch", "8", "--workers", "1"]
     whole, killed = (tmp_path / name for name in ("whole", "killed"))
@@ -149,6 +151,7 @@ def scheduler() -> Iterator[str]:
         yield local.scheduler_address
 
 
+@pytest.mark.slow
 def test_a_scheduler_s_workers_give_the_same_bytes(scene: Path, scheduler: str, tmp_path: Path) -> None:
     recipe = DatasetRecipe((scene, scene), VARIABLE, REFERENCE, oversampling=2, patch_px=12)
     assert len(plan_windows(recipe)) > 2 * CHUNK
@@ -166,6 +169,7 @@ def test_a_scheduler_s_workers_give_the_same_bytes(scene: Path, scheduler: str, 
     assert sum(done) == len(plan_windows(recipe))
 
 
+@pytest.mark.slow
 def test_a_dataset_begun_here_is_finished_by_a_scheduler_s_workers(
     scene: Path, scheduler: str, tmp_path: Path
 ) -> None:

@@ -8,6 +8,7 @@ import pytest
 import tifffile
 from typer.testing import CliRunner
 
+from deploy import demo
 from deploy.cli import app
 from deploy.demo import load_sensors, read_input
 from deploy.results import SCHEMA_PATH
@@ -17,7 +18,13 @@ from profiles.toml import HERE
 from quant.onnx_file import metadata
 
 
-def test_the_demo_takes_a_raw_image_through_the_whole_chain(tmp_path: Path) -> None:
+@pytest.mark.slow
+def test_the_demo_takes_a_raw_image_through_the_whole_chain(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """On few patches: .ci/run's first stage has all."""
+    for name in ("CALIBRATION_PATCHES", "GATE_PATCHES"):
+        monkeypatch.setattr(demo, name, 2)
     raw = tmp_path / "raw.tif"
     tifffile.imwrite(raw, np.random.default_rng(0).integers(300, 1500, (120, 150)).astype(np.uint16))
     text = (HERE / "sensors" / "pleiades-degraded.toml").read_text()
@@ -45,6 +52,7 @@ def test_the_demo_takes_a_raw_image_through_the_whole_chain(tmp_path: Path) -> N
     assert "the smallest DPU that takes 60 s or less" in page
 
 
+@pytest.mark.slow
 def test_the_reference_has_the_gain_of_the_sensor_named(tmp_path: Path) -> None:
     """Else every pixel of the scene would be off by the ratio of the gains, and the PSNR would say so."""
     text = (HERE / "sensors" / "pleiades-degraded.toml").read_text()

@@ -36,7 +36,7 @@ SENSORS = load_sensor("pleiades-degraded"), load_sensor("pleiades-reference")
 
 @pytest.fixture(scope="module")
 def reference_model() -> onnx.ModelProto:
-    return float_model(shipped_pair()[0])
+    return float_model(shipped_pair("convbeers-xs")[0])
 
 
 @pytest.fixture(scope="module")
@@ -48,7 +48,7 @@ def failed(
     reference_model: onnx.ModelProto, unseen: Patches, folder: Path, spoil: Callable[[onnx.ModelProto], None]
 ) -> set[str]:
     """The names of the checks that a spoilt copy of the shipped file fails."""
-    model = onnx.load(shipped_pair()[1])
+    model = onnx.load(shipped_pair("convbeers-xs")[1])
     spoil(model)
     save_onnx(model, folder / "spoilt.onnx")
     result = compare(open_session(reference_model), open_session(model), unseen.pairs)
@@ -87,8 +87,8 @@ def drop_a_relu(model: onnx.ModelProto) -> None:
 
 
 def give_a_float_scale(model: onnx.ModelProto) -> None:
-    node(model, "body.4.first").input[6] = own_constant(model, "odd_scale", np.array(0.0043, np.float32))
-    node(model, "body.4.second").input[1] = "odd_scale"
+    node(model, "body.2.first").input[6] = own_constant(model, "odd_scale", np.array(0.0043, np.float32))
+    node(model, "body.2.second").input[1] = "odd_scale"
 
 
 def clip_an_activation(model: onnx.ModelProto) -> None:
@@ -267,7 +267,7 @@ def test_bad_input_is_told_where_a_job_looks(tmp_path: Path) -> None:
     paths = {"junit": tmp_path / "junit", "summary": tmp_path / "summary", "outputs": tmp_path / "new" / "outputs"}
     paths["summary"].write_text("before\n")
     wanted = [text for name, path in paths.items() for text in (f"--{name}", str(path))]
-    pair = [str(tmp_path / "<none>.onnx"), str(shipped_pair()[1])]
+    pair = [str(tmp_path / "<none>.onnx"), str(shipped_pair("convbeers-xs")[1])]
     done = CliRunner().invoke(app, ["gate", *pair, *wanted])
     assert done.exit_code == 2
     told = done.stderr.removeprefix("beers-deploy: ").strip()
@@ -350,8 +350,8 @@ def as_nodes(model: onnx.ModelProto) -> onnx.ModelProto:
 
 
 def test_constants_may_be_nodes() -> None:
-    sound, other = onnx.load(shipped_pair()[1]), as_nodes(onnx.load(shipped_pair()[1]))
-    assert count_relus(other) == count_relus(sound) == Relus(8, 0)
+    sound, other = onnx.load(shipped_pair("convbeers-xs")[1]), as_nodes(onnx.load(shipped_pair("convbeers-xs")[1]))
+    assert count_relus(other) == count_relus(sound) == Relus(4, 0)
     assert [t.name for t in rounded_tensors(other)] == [t.name for t in rounded_tensors(sound)]
     assert read_core(other).frac_bits == read_core(sound).frac_bits
 
@@ -420,7 +420,7 @@ def test_a_free_file_is_judged_without_the_rules_of_a_dpu(
 def test_two_networks_of_one_kind_are_refused(reference_model: onnx.ModelProto, tmp_path: Path) -> None:
     path = tmp_path / "float.onnx"
     save_onnx(reference_model, path)
-    for pair, expected in (([path, path], "an INT8"), ([shipped_pair()[1]] * 2, "a float")):
+    for pair, expected in (([path, path], "an INT8"), ([shipped_pair("convbeers-xs")[1]] * 2, "a float")):
         done = CliRunner().invoke(app, ["gate", *map(str, pair)])
         assert done.exit_code == 2
         assert f"expected {expected} network" in " ".join(done.output.split())
@@ -455,7 +455,7 @@ def test_a_usage_error_is_told_over_nothing_else_that_is_named(how: list[str], t
 def test_samples_without_references_tell_no_loss_and_cannot_keep_a_limit_on_it(tmp_path: Path) -> None:
     samples, limits = tmp_path / "samples.npy", tmp_path / "limits.toml"
     np.save(samples, np.random.default_rng(0).uniform(0.1, 0.9, (2, 1, 40, 40)).astype(np.float32))
-    command = ["gate", *map(str, shipped_pair()), "--data", str(samples), "--max-mae", "0.5"]
+    command = ["gate", *map(str, shipped_pair("convbeers-xs")), "--data", str(samples), "--max-mae", "0.5"]
     plain = CliRunner().invoke(app, command)
     assert plain.exit_code == 0
     assert "gate passed" in plain.output

@@ -12,6 +12,8 @@ from typer.testing import CliRunner
 
 from deploy.cli import app
 
+pytestmark = pytest.mark.slow
+
 NOTEBOOK = Path(__file__).parents[2] / "docs" / "tutorials" / "jp2-to-cog.ipynb"
 CELLS: list[dict[str, Any]] = json.loads(NOTEBOOK.read_text(encoding="utf-8"))["cells"]
 MOST_BYTES = 100_000

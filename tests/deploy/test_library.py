@@ -103,6 +103,7 @@ def test_nothing_is_read_before_it_is_asked_for_and_no_more_than_that(da: Any, m
     assert read == [(0, 0)]
 
 
+@pytest.mark.slow
 def test_two_processes_compute_the_same(da: Any, model: Path) -> None:
     distributed = pytest.importorskip("distributed")
     pixels = noise(150, 120)

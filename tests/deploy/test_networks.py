@@ -72,6 +72,7 @@ def test_the_same_numbers_are_the_same_sensor_and_others_are_not(conditioned: Pa
     assert files[2].read_bytes() != files[0].read_bytes()
 
 
+@pytest.mark.slow
 def test_int8_is_made_once_and_shows_progress(
     conditioned: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -112,7 +113,7 @@ def test_a_name_that_is_none_is_told_the_names_that_there_are(own_cache: Path) -
 def test_blind_is_the_middle_of_a_range_of_sensors() -> None:
     blind = load_sensor(BLIND)
     assert (blind.name, numbers_of(blind)) == (BLIND, numbers_of(load_sensor(BLIND_PROFILE)))
-    floating = [load_onnx(shipped_pair("convbeers-xs", name)[0]) for name in (BLIND, BLIND_PROFILE)]
+    floating = [load_onnx(float_file(Path("convbeers-xs"), load_sensor(name))) for name in (BLIND, BLIND_PROFILE)]
     weights = [[tensor.raw_data for tensor in model.graph.initializer] for model in floating]
     assert weights[0] == weights[1]
 

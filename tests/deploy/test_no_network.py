@@ -11,7 +11,6 @@ import signal
 import socket
 import subprocess
 import sys
-from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
@@ -24,6 +23,8 @@ from model.convbeers import ConvBEERS, initialise
 from model.io.weights import save_network
 from model.variants import Variant
 from tests.deploy.sealed import SOCKET_CALL
+
+pytestmark = pytest.mark.slow
 
 runner = CliRunner()
 
@@ -84,12 +85,6 @@ def test_the_chain_opens_no_socket(tmp_path: Path, no_sockets: list[tuple[object
     assert no_sockets == []
 
 
-def test_an_attempt_would_be_seen(no_sockets: list[tuple[object, ...]]) -> None:
-    with pytest.raises(OSError, match="no network"):
-        socket.create_connection(("localhost", 1))
-    assert no_sockets
-
-
 def alone(home: Path, *arguments: object) -> subprocess.CompletedProcess[str]:
     """Python where a user would start it: no variable is set that makes libraries hold their tongues in CI."""
     inherited = {name: os.environ[name] for name in ("PATH", "SYSTEMROOT") if name in os.environ}
@@ -124,15 +119,3 @@ def test_a_native_attempt_would_end_the_process(tmp_path: Path) -> None:
     assert alone(tmp_path, "-c", begin + "socket.socketpair()").returncode == 0
     for family in ("AF_INET", "AF_INET6"):
         assert alone(tmp_path, "-c", begin + f"socket.socket(socket.{family})").returncode == -signal.SIGSYS
-
-
-def test_an_identifier_would_be_seen(tmp_path: Path) -> None:
-    if tuple(map(int, version("onnxruntime").split(".")[:2])) < (1, 29):
-        pytest.skip("this onnxruntime keeps none anywhere")
-    alone(tmp_path, "-c", "import onnxruntime")
-    if not kept(tmp_path):
-        pytest.skip("this build of onnxruntime keeps none")
-    silent = tmp_path / "silent"
-    silent.mkdir()
-    alone(silent, "-c", "import quant, onnxruntime")
-    assert kept(silent) == []

@@ -48,6 +48,7 @@ def float_file(path: Path) -> str:
     return str(path)
 
 
+@pytest.mark.slow
 def test_the_free_regime_writes_a_file_of_its_own_kind(tmp_path: Path) -> None:
     free = ["quantize", float_file(tmp_path / "f.onnx"), "--regime", "free", "--patches", "2", "--patch", "64"]
     out = tmp_path / "free.onnx"
@@ -87,6 +88,7 @@ def test_a_pass_can_be_left_out(tmp_path: Path) -> None:
     assert "half-lsb-pair" in unknown.output
 
 
+@pytest.mark.slow
 def test_a_network_fixed_to_one_tile_is_quantised_reported_and_gated(tmp_path: Path) -> None:
     network = ConvBEERS(Variant(1, 4))
     initialise(network, torch.Generator().manual_seed(0))
@@ -102,6 +104,7 @@ def test_a_network_fixed_to_one_tile_is_quantised_reported_and_gated(tmp_path: P
     assert fixed_tile_px(load_onnx(paths[1])) == 80
 
 
+@pytest.mark.slow
 def test_quantize_reports_layers_and_passes(tmp_path: Path) -> None:
     float_file(tmp_path / "f.onnx")
     dn = procedural_scene(640, 700, np.random.default_rng(0)).radiance.numpy() * 4095 / 400

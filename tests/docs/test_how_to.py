@@ -1,15 +1,17 @@
 """Every command of the how-to pages, run on small files: it ends as the page says, and what it names is written."""
 
-import re
 import shutil
 import tempfile
 from pathlib import Path
 
 import pytest
 
-from tests.docs.how_to import EXITS, LEFT_OUT, NEEDED, PAGES, SHORTER, Sitting, outputs, packages, shortened, sittings
+from tests.deploy.tradeoff.small import small_studies
+from tests.docs.how_to import EXITS, LEFT_OUT, PAGES, Sitting, outputs, packages, shortened, sittings
 from tests.docs.how_to_files import prepare
 from tests.docs.walk import Walk
+
+pytestmark = pytest.mark.slow
 
 FOUND = {page.stem: [*sittings(page.read_text(encoding="utf-8"))] for page in PAGES}
 EVERY = {command for found in FOUND.values() for sitting in found for command in sitting}
@@ -35,7 +37,7 @@ def test_it_runs_and_writes_what_it_names(sitting: Sitting, files: Path) -> None
     for package in packages(sitting):
         pytest.importorskip(package, reason=f"no {package}")
     # Beside the folders of the others, where studies share what they measured.
-    with tempfile.TemporaryDirectory(dir=files.parent) as folder:
+    with tempfile.TemporaryDirectory(dir=files.parent) as folder, small_studies():
         walk = Walk(Path(shutil.copytree(files, folder, dirs_exist_ok=True)))
         for command in sitting:
             run(walk, command)
@@ -54,47 +56,6 @@ def run(walk: Walk, command: str) -> None:
         assert "is a valid cloud optimized GeoTIFF" in done.stdout
 
 
-def test_what_is_left_out_and_what_makes_short_is_still_of_use() -> None:
-    run = "\n".join(command for sitting in RUN.values() for command in sitting)
-    assert set(LEFT_OUT) <= EVERY
-    assert [pattern for pattern in [*SHORTER, *NEEDED] if not re.search(pattern, run, re.MULTILINE)] == []
-
-
 def test_a_page_says_where_a_command_does_not_end_with_0() -> None:
     text = "\n".join(page.read_text(encoding="utf-8") for page in PAGES)
     assert [command for command, code in EXITS.items() if f"`{command}` (exits with {code}" not in text] == []
-
-
-PAGE = r"""
-    beers-deploy check a.onnx
-    python3 b.py --out \
-        c.json
-
-`beers-deploy gate` is a name, `beers-deploy info c.tif` is not, and `vai_c_xir` is another's.
-
-| wish | command |
-|---|---|
-| all | `beers-deploy detect`; `beers-deploy check traditional` |
-
-    [{"model": "core.onnx"}]
-
-```console
-$ rio info d.tif
-pip install e
-```
-
-```yaml
-    beers-deploy bench
-```
-"""
-
-
-def test_commands_are_found_in_each_way_of_writing_them() -> None:
-    assert [*sittings(PAGE)] == [
-        ("rio info d.tif", "pip install e"),
-        ("beers-deploy check a.onnx", "python3 b.py --out c.json"),
-        ("beers-deploy info c.tif",),
-        ("beers-deploy detect",),
-        ("beers-deploy check traditional",),
-    ]
-    assert len(EVERY) > 60

@@ -6,7 +6,10 @@ from pathlib import Path
 import pytest
 import tifffile
 
+from tests.deploy.tradeoff.small import small_studies
 from tests.docs.walk import ROOT, Walk
+
+pytestmark = pytest.mark.slow
 
 FOLDER = ROOT / "docs" / "tutorials"
 PAGES = sorted({path.stem for path in FOLDER.glob("*.md")} - {"index"})
@@ -66,7 +69,8 @@ def test_gate_in_ci(tmp_path: Path) -> None:
 
 
 def test_accuracy_and_time(tmp_path: Path) -> None:
-    walked("accuracy-and-time", tmp_path)
+    with small_studies():
+        walked("accuracy-and-time", tmp_path)
     files = {"tradeoff.html", "tradeoff.svg", "tradeoff.png", "points.csv", "tradeoff.json", "cache"}
     assert {path.name for path in (tmp_path / "study").iterdir()} == files
     assert "For board latency at most 5 s take convbeers-xs INT8" in (tmp_path / "study" / "tradeoff.html").read_text(

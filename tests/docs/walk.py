@@ -3,7 +3,8 @@
 Of a page's fences these count, in order:
 
 - any with a title, as ```toml title="my-sensor.toml": a file, written as it stands;
-- ```bash: commands, a line each, of the programs known here (`PROGRAMS`), run without a shell (so also on Windows);
+- ```bash: commands, a line each, of the programs known here (`PROGRAMS`), run without a shell (so also on Windows),
+  ours within this process: what it has imported is not imported again for each command;
 - ```text: what the commands before it print. Each of its lines must come, in this order; `...` stands for anything,
   blanks and rules of tables have any length, and a number must be within 2 %, for processors differ.
 
@@ -20,13 +21,19 @@ import re
 import shlex
 import subprocess
 import sys
+from contextlib import chdir
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from typer.testing import CliRunner
+
+from deploy.cli import app
+
 ROOT = Path(__file__).resolve().parents[2]
 PYTHON = [sys.executable]
+OURS = "beers-deploy"
 PROGRAMS = {
-    "beers-deploy": [*PYTHON, "-c", "from deploy.cli import app; app()"],
+    OURS: [],
     "python": PYTHON,
     "python3": PYTHON,
     "rio": [*PYTHON, "-c", "from rasterio.rio.main import main_group; main_group()"],
@@ -34,6 +41,14 @@ PROGRAMS = {
 PART = re.compile(r'^```(\w+)(?: title="([^"]+)")?\n(.*?)^```$|^<!-- test: (.+?) -->$', re.MULTILINE | re.DOTALL)
 NUMBER = re.compile(r"(?<![\w.])-?\d[\d,]*(?:\.\d+)?(?:e[-+]?\d+)?")
 RELATIVE = 0.02
+
+
+@dataclass(frozen=True)
+class Done:
+    """A command that ended: its code, and both streams as a terminal shows them."""
+
+    returncode: int
+    stdout: str
 
 
 class PageError(AssertionError):
@@ -101,8 +116,8 @@ class Walk:
             self.printed[command] = done.stdout
             self._last += done.stdout
 
-    def run(self, command: str) -> subprocess.CompletedProcess[str]:
-        """One command with its substitutions; both streams as a terminal shows them.
+    def run(self, command: str) -> Done:
+        """One command with its substitutions.
 
         Raises:
             PageError: of a program that is not known here.
@@ -114,15 +129,28 @@ class Walk:
         words = shlex.split(short)
         if not words or words[0] not in PROGRAMS:
             raise PageError(f"{command}\nis no command of {' or '.join(PROGRAMS)}")
-        return subprocess.run(
+        return self._ours(words[1:]) if words[0] == OURS else self._started(words)
+
+    def _ours(self, words: list[str]) -> Done:
+        with chdir(self.folder):
+            result = CliRunner().invoke(app, words, prog_name=OURS, env=environment(self.folder))
+        if result.exception is not None and not isinstance(result.exception, SystemExit):
+            raise PageError(f"{words} ended with a traceback") from result.exception
+        return Done(result.exit_code, result.output)
+
+    def _started(self, words: list[str]) -> Done:
+        kept = {name: os.environ[name] for name in ("SYSTEMROOT", "TEMP", "BEERS_DEPLOY_CACHE") if name in os.environ}
+        ours = {"PYTHONPATH": str(ROOT), "PYTHONUNBUFFERED": "1", "PYTHONUTF8": "1", "OMP_NUM_THREADS": "1"}
+        done = subprocess.run(
             [*PROGRAMS[words[0]], *words[1:]],
             cwd=self.folder,
-            env=environment(self.folder),
+            env=kept | ours | environment(self.folder),
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
             encoding="utf-8",
             check=False,
         )
+        return Done(done.returncode, done.stdout)
 
     def _compare(self, shown: str) -> None:
         lines, vary, self._vary = iter(plain(self._last)), self._vary, False
@@ -132,10 +160,8 @@ class Walk:
 
 
 def environment(folder: Path) -> dict[str, str]:
-    """What a command sees: this tree, a home of its own, one thread, and no other program."""
-    kept = {name: os.environ[name] for name in ("SYSTEMROOT", "TEMP", "BEERS_DEPLOY_CACHE") if name in os.environ}
-    ours = {"PYTHONPATH": str(ROOT), "PYTHONUNBUFFERED": "1", "PYTHONUTF8": "1", "OMP_NUM_THREADS": "1"}
-    return kept | ours | {"PATH": "", "HOME": str(folder), "USERPROFILE": str(folder)}
+    """A home of its own, and no other program."""
+    return {"PATH": "", "HOME": str(folder), "USERPROFILE": str(folder)}
 
 
 def plain(text: str) -> list[str]:

@@ -71,6 +71,7 @@ def test_it_begins_with_the_core_s_own_numbers(quantised: Quantised) -> None:
         np.testing.assert_array_equal(one.bias, other.bias)
 
 
+@pytest.mark.slow
 def test_without_references_it_comes_back_towards_the_float_network(
     quantised: Quantised, float_onnx: onnx.ModelProto, patches: Patches, unseen: Patches
 ) -> None:
@@ -97,6 +98,7 @@ def test_a_reference_of_another_size_is_one_sentence(
         trained(quantised, quantised.core, float_onnx, Tuning(short, 1))
 
 
+@pytest.mark.slow
 def test_the_same_seed_gives_the_same_numbers_and_a_step_is_a_tick(
     float_onnx: onnx.ModelProto, patches: Patches
 ) -> None:
@@ -113,6 +115,7 @@ def test_the_same_seed_gives_the_same_numbers_and_a_step_is_a_tick(
     assert made(1) == made(1)
 
 
+@pytest.mark.slow
 def test_the_last_sum_keeps_the_room_it_was_given(float_onnx: onnx.ModelProto, patches: Patches) -> None:
     plain = quantise_model(float_onnx, patches, {}, lambda: None)
     tuned = quantise_model(float_onnx, patches, {}, lambda: None, tuning=Tuning(patches.pairs, 3, rate=0.3))
@@ -156,6 +159,7 @@ def test_the_correction_of_a_result_makes_it(backs: list[tuple[int, bool]], adds
     np.testing.assert_allclose(found, result, atol=2e-7)
 
 
+@pytest.mark.slow
 def test_training_on_references_pays_on_others(
     quantised: Quantised, float_onnx: onnx.ModelProto, patches: Patches, unseen: Patches
 ) -> None:

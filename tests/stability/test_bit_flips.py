@@ -27,6 +27,8 @@ from quant.graph import Activation
 from quant.integer import SOUND
 from tests.stability.makers import DOCS, load_maker
 
+pytestmark = pytest.mark.slow
+
 SVG = "{http://www.w3.org/2000/svg}"
 CURVES = f".//{SVG}g[@class='curve']"
 REQUEST = FlipRequest("pleiades-degraded", None, "vck190", draws=2, size_px=48, seed=3)

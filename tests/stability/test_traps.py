@@ -47,11 +47,6 @@ def test_every_trap_has_a_test_and_every_test_is_there() -> None:
     assert missing_tests(rows) == []
 
 
-def test_a_row_without_a_test_and_a_test_that_is_gone_are_found() -> None:
-    page = "| 1 | a | b |\n| 2 | a | `tests/stability/test_traps.py::test_gone` |"
-    assert missing_tests(trap_rows(page)) == ["1 has no test", "tests/stability/test_traps.py::test_gone"]
-
-
 @pytest.mark.parametrize(("mtf_nyquist", "diagonal"), [(0.07, 0.0179), (0.25, 0.108), (0.001, 4.4e-5)])
 def test_trap_2_the_diagonal_is_no_product_of_the_axes(mtf_nyquist: float, diagonal: float) -> None:
     half = torch.tensor(0.5, dtype=torch.float64)

@@ -54,6 +54,7 @@ def test_all_boards_stand_in_one_table_with_their_processors_and_the_papers_rows
     assert sum(name.startswith("paper") for name in names(found.rows)) == 2
 
 
+@pytest.mark.slow
 def test_the_papers_rows_stand_beside_its_own_board_alone(network: Path) -> None:
     found = bench_board(network, asked("kv260"), 0.0)
     assert not any(name.startswith("paper") for name in names(found.rows))
@@ -112,6 +113,7 @@ def test_one_configuration_or_runs_beside_all_boards_are_refused(network: Path, 
         bench_board(network, asked("all", measured=tmp_path / "runs.json"), 0.0)
 
 
+@pytest.mark.slow
 def test_a_stated_task_of_the_host_is_that_of_every_row(classifier: Path, network: Path) -> None:
     found = bench_board(classifier, asked("all", size=None, host_task="softmax"), 0.0)
     frames = [row for row in found.rows if row.table == "frames"]

@@ -14,6 +14,8 @@ from deploy.detection.rows import PAPER_TABLE, paper_rows
 from deploy.results import SCHEMA_PATH
 from tests.deploy.detection.folders import Object, dior, labelled, text, xml
 
+pytestmark = pytest.mark.slow
+
 
 def run(*arguments: object) -> Result:
     return CliRunner().invoke(app, ["detect", *map(str, arguments)])

@@ -23,6 +23,8 @@ from model.simulator.detector import Draw
 from profiles import load_sensor
 from profiles.sensor_file import reference_for
 
+pytestmark = pytest.mark.slow
+
 KNOWN = class_map(CLASSES, CLASSES)
 
 

@@ -54,6 +54,7 @@ def test_it_was_made_by_the_recipe_that_stands_here() -> None:
     assert metadata(load_onnx(DETECTOR_INT8))["recipe"] == metadata(load_onnx(DETECTOR))["recipe"]
 
 
+@pytest.mark.slow
 def test_it_finds_most_of_what_it_never_saw() -> None:
     assert scores(int8=False).ap50 > 0.75
 

@@ -35,9 +35,9 @@ def test_a_layer_as_large_as_its_map_is_also_one_pixel_of_all_its_values(tmp_pat
         ((10, 8, 20, 20), 20, set()),  # larger than any kernel, 3200 values
         ((10, 8, 20, 20), 21, {"conv kernel", "conv window"}),  # the same kernel, but a result of four pixels
         ((10, 11, 20, 20), 20, {"conv kernel", "conv window"}),  # 4400 values
-        ((14472, 2048, 1, 1), 1, set()),  # in four parts
-        ((14472, 2048, 1, 1), 2, {"conv channels"}),
-        ((4096, 512, 7, 7), 7, set()),  # VGG's first: fits as it is, and not laid flat
+        ((14472, 16, 1, 1), 1, set()),  # in four parts
+        ((14472, 16, 1, 1), 2, {"conv channels"}),
+        ((64, 512, 7, 7), 7, set()),  # as VGG's first of 4096: fits as it is, and not laid flat
     ],
 )
 def test_a_fully_connected_layer_is_taken_in_any_form_that_fits(

@@ -48,6 +48,7 @@ def test_left_out_networks_are_predicted_as_well_as_the_docs_say() -> None:
     assert rank_correlation(cases, errors) >= 0.95
 
 
+@pytest.mark.slow
 def test_intervals_of_families_left_out_hold_what_was_published() -> None:
     inside, families = coverage(nested("vck190").rows)
     assert inside >= 0.85

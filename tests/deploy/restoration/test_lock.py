@@ -45,6 +45,7 @@ def restore(image: Path, out: Path, resume: bool = False) -> None:
     restore_file(image, out, Options(shipped_pair(sensor=BLIND)[1], TILE_PX, resume=resume), lambda _: None)
 
 
+@pytest.mark.slow
 def test_a_second_run_is_refused_and_the_first_one_unharmed(image: Path, tmp_path: Path) -> None:
     out = tmp_path / "out.tif"
     with begin(image, out) as first:

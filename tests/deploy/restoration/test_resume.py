@@ -22,6 +22,8 @@ from deploy.restoration.options import Compression, Options
 from deploy.restoration.run import restore_file
 from profiles.errors import MachineError, OptionError
 
+pytestmark = pytest.mark.slow
+
 KILLS = int(os.environ.get("BEERS_KILLS", "2"))
 ENTRY = "from deploy.cli import app; app()"
 TILE_PX = 64

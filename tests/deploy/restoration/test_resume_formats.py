@@ -13,6 +13,8 @@ from deploy.restoration.run import restore_file
 from tests.deploy.restoration import images
 from tests.deploy.restoration.test_resume import ENTRY
 
+pytestmark = pytest.mark.slow
+
 TILE_PX = 16
 
 

@@ -35,6 +35,8 @@ from quant.session import open_session, run
 from quant.tiling.walk import tiling_of
 from tests.quant.tiling.small_networks import espcn, float_unet, four_bands
 
+pytestmark = pytest.mark.slow
+
 pytest.importorskip("distributed", reason="the extra 'dask' is not installed")
 
 ENTRY = "from deploy.cli import app; app()"

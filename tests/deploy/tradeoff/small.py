@@ -1,4 +1,4 @@
-"""Real studies of next to nothing: few patches and targets, one quality of the chain, one peer."""
+"""Real studies of next to nothing: few patches, targets and sensors, one quality of the chain, one peer."""
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -8,7 +8,7 @@ import pytest
 
 from deploy.tradeoff import measurements, methods, selection
 from deploy.tradeoff.host_time import Times
-from model.evaluation import targets
+from model.evaluation import sweep, targets
 from model.evaluation.methods import Restore
 
 
@@ -19,6 +19,8 @@ def small_studies() -> Iterator[None]:
         for module, name, value in (
             (targets, "ANGLES_DEG", (5.0, 8.0)),
             (targets, "REPEATS", 1),
+            (sweep, "SHARPNESS", (0.07, 0.05, 0.03)),  # those that are also known wrongly
+            (sweep, "NOISE", ((30.0, 80.0),)),
             (methods, "PATCHES", 2),
             (methods, "PATCH_PX", 32),
             (selection, "QUALITIES", ("fast",)),

@@ -105,6 +105,7 @@ def test_published_pairs_disagree_by_some_tens_of_percent() -> None:
     assert 0.1 < pair_error("vck190") < 0.5
 
 
+@pytest.mark.slow
 def test_tiles_stay_on_chip_up_to_where_the_memory_traffic_jumps(model: onnx.ModelProto) -> None:
     """32 features of 1 MiB: 181 x 181 pixels, so 176 in steps of 16."""
     dpu = load_dpu("vck190")

@@ -38,6 +38,8 @@ from tests.deploy.detection.drawn import NAMES, drawn_images
 from tests.deploy.detection.folders import labelled
 from tests.deploy.tradeoff.small import small_studies
 
+pytestmark = pytest.mark.slow
+
 SITES = 6
 CLASSES = {"Motor-Car": "vehicle", "Storage tank": "tank"}
 

@@ -58,6 +58,7 @@ def test_chains_and_peers_are_float_and_off_the_dpu() -> None:
     assert not any(point.configuration for point in points)
 
 
+@pytest.mark.slow
 def test_the_shipped_family_makes_some_forty_to_seventy_points() -> None:
     """More would not be measured in 45 minutes, fewer would leave an axis out."""
     networks = find_networks(studied_names())

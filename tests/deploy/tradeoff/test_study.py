@@ -30,6 +30,8 @@ from quant.onnx_file import GraphWriter, image_info, load_onnx, make_model, save
 from tests.deploy.dpu.graphs import Sketch
 from tests.deploy.tradeoff.small import small_studies
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:

@@ -74,6 +74,7 @@ def test_the_wrong_sensor_costs_decibels(pair: Pair, told: Sensor) -> None:
     assert wrong < right - 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("mtf", "snr", "floor_db"), [(0.07, (50, 110), 46.6), (0.03, (15, 50), 41.0)])
 def test_both_orders_reach_the_measured_quality(
     mtf: float, snr: tuple[float, float], floor_db: float, camera: Tensor

@@ -308,6 +308,7 @@ class Together:
             yield torch.cat([one[0], other[0]]), torch.cat([one[1], other[1]])
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform == "win32", reason="torch for Windows lacks the libuv that torchrun asks for")
 def test_two_workers_do_the_steps_of_one_with_a_batch_twice_as_large(tmp_path: Path) -> None:
     script = tmp_path / "worker.py"
