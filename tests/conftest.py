@@ -26,7 +26,7 @@ atexit.register(shutil.rmtree, os.environ["BEERS_DEPLOY_CACHE"], ignore_errors=T
 settings.register_profile("project", deadline=None)
 settings.load_profile("project")
 
-typer.testing._get_command = cache(typer.main.get_command)
+typer.testing._get_command = cache(typer.main.get_command)  # type: ignore[attr-defined]
 
 SHARED_DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 

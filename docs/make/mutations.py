@@ -106,7 +106,8 @@ def failures(copy: Path, *selection: str) -> Failures:
         SystemExit: they could not be run, or ran somebody else's code.
     """
     report = copy / "report.xml"
-    options = ["-n", "0", "-p", "no:cacheprovider", "--tb=no", "--hypothesis-seed=0", f"--junitxml={report}", *selection]
+    options = ["-n", "0", "-p", "no:cacheprovider", "--tb=no", "--hypothesis-seed=0"]
+    options += [f"--junitxml={report}", *selection]
     environment = {**os.environ, "PYTHONPATH": str(copy), "PYTHONDONTWRITEBYTECODE": "1"}
     named = {name.partition("::")[0] for mutation in MUTATIONS for name in mutation.tests}
     files = [f"{SUITE}/{name}" for name in sorted({PROBE_FILE, *named})]
