@@ -77,14 +77,13 @@ def _acquire_plainly(radiance: Tensor, sensor: Sensor, number: int, role: str) -
 @lru_cache
 def _responses(height: int, width: int, mtf_nyquist: float, sigma_px: float, length_px: float) -> list[Tensor]:
     """One transfer function for each blur that is not neutral."""
-    fy = torch.fft.fftfreq(height, 1 / RATIO)[:, None]
-    fx = torch.fft.rfftfreq(width, 1 / RATIO)[None]
+    fy, fx = np.fft.fftfreq(height, 1 / RATIO)[:, None], np.fft.rfftfreq(width, 1 / RATIO)[None]
     responses = [mtf(fx, fy, mtf_nyquist)]
     if sigma_px:
-        responses.append(gaussian_response(torch.hypot(fx, fy), sigma_px))
+        responses.append(gaussian_response(np.hypot(fx, fy), sigma_px))
     if length_px:
         responses.append(smear_response(fy, length_px))
-    return responses
+    return [torch.from_numpy(response).float() for response in responses]
 
 
 def _apply(image: Tensor, name: str, sensor: Sensor, draw: Draw, role: str) -> Tensor:

@@ -114,7 +114,7 @@ def _signal_float64(image: np.ndarray, sensor: Sensor) -> np.ndarray:
     radiance = _radiance(image, sensor).double()
     height, width = radiance.shape
     fy, fx = (torch.fft.fftfreq(side, dtype=torch.float64) for side in (height, width))
-    response = mtf(RATIO * fx[None, :], RATIO * fy[:, None], sensor.mtf_axes)
+    response = torch.from_numpy(mtf(RATIO * fx[None, :], RATIO * fy[:, None], sensor.mtf_axes))
     shift = torch.exp(1j * torch.pi * (RATIO - 1) * fy)[:, None] * torch.exp(1j * torch.pi * (RATIO - 1) * fx)
     blurred = torch.fft.ifft2(torch.fft.fft2(radiance) * response * shift).real
     return np.asarray(blurred[::RATIO, ::RATIO].numpy() * sensor.gain_dn_per_radiance)

@@ -2,14 +2,19 @@
 
 import math
 from functools import lru_cache
+from typing import TYPE_CHECKING
 
-import torch
-from torch import Tensor
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 from profiles.effects import AntiAlias, Smear
 from profiles.errors import OptionError
 from profiles.response import PointSpread, Response
 from profiles.sensor import MTF_NYQUIST_MAX, Sensor, mtf_limit
+
+if TYPE_CHECKING:
+    import torch
+    from torch import Tensor
 
 NYQUIST = 0.5
 """Cycles per target pixel."""
@@ -44,7 +49,7 @@ Blur = float | tuple[float, float] | Response
 and vertical; or the whole of it, by a table or a point-spread function."""
 
 
-def mtf(fx: Tensor, fy: Tensor, blur: Blur, antialias_sigma_px: float = 0.0) -> Tensor:
+def mtf(fx: ArrayLike, fy: ArrayLike, blur: Blur, antialias_sigma_px: float = 0.0) -> NDArray[np.inexact]:
     """MTF(fx, fy) = exp(-gamma * sqrt(fx^2 + fy^2)) * sinc(fx) * sinc(fy) * G(fx, fy) (paper, section 3.3).
 
     With a second MTF, along the track, gamma * sqrt(fx^2 + fy^2) becomes sqrt((gamma_x fx)^2 + (gamma_y fy)^2): each
@@ -64,42 +69,55 @@ def mtf(fx: Tensor, fy: Tensor, blur: Blur, antialias_sigma_px: float = 0.0) -> 
     Raises:
         OptionError: a contrast that no blur leaves, or an anti-alias filter beside a whole response.
     """
+    fx, fy = np.asarray(fx, np.float64), np.asarray(fy, np.float64)
     if isinstance(blur, Response):
         return _whole_response(fx, fy, blur, antialias_sigma_px)
     across, along = blur if isinstance(blur, tuple) else (blur, blur)
     gamma_x, gamma_y = (gamma_from_mtf(value, antialias_sigma_px) for value in (across, along))
-    radius = torch.hypot(fx, fy)
+    radius = np.hypot(fx, fy)
     # gamma * radius where it can be: hypot(gamma fx, gamma fy) rounds otherwise, and one gamma is the usual case
-    optics = torch.exp(-gamma_x * radius if gamma_x == gamma_y else -torch.hypot(gamma_x * fx, gamma_y * fy))
-    response = optics * torch.sinc(fx) * torch.sinc(fy)
+    optics = np.exp(-gamma_x * radius if gamma_x == gamma_y else -np.hypot(gamma_x * fx, gamma_y * fy))
+    response = np.asarray(optics * np.sinc(fx) * np.sinc(fy))
     return response * gaussian_response(radius, antialias_sigma_px) if antialias_sigma_px else response
 
 
-def _whole_response(fx: Tensor, fy: Tensor, response: Response, antialias_sigma_px: float) -> Tensor:
+def _whole_response(
+    fx: NDArray[np.float64], fy: NDArray[np.float64], response: Response, antialias_sigma_px: float
+) -> NDArray[np.inexact]:
     if antialias_sigma_px:
         expected, got = "none beside a whole response", f"one of {antialias_sigma_px:g} px beside the {response}"
         raise OptionError("anti-alias filter", expected=expected, got=got, remedy="leave it out: it is part of that")
-    return torch.from_numpy(response.at(fx.cpu().numpy(), fy.cpu().numpy())).to(fx.device)
+    return np.asarray(response.at(fx, fy))
 
 
-def gaussian_response(frequency: Tensor, sigma_px: float) -> Tensor:
+def gaussian_response(frequency: ArrayLike, sigma_px: float) -> NDArray[np.float64]:
     """exp(-2 pi^2 sigma^2 f^2), the transform of a Gaussian filter, at frequencies of any shape; 1 for sigma 0."""
-    return torch.exp(-2 * (math.pi * sigma_px * frequency) ** 2)
+    return np.asarray(np.exp(-2 * (math.pi * sigma_px * np.asarray(frequency, np.float64)) ** 2))
 
 
-def smear_response(fy: Tensor, length_px: float) -> Tensor:
+def smear_response(fy: ArrayLike, length_px: float) -> NDArray[np.float64]:
     """sinc(length * fy), for fy of any shape: uniform motion along the track during an exposure; 1 for length 0."""
-    return torch.sinc(length_px * fy)
+    return np.asarray(np.sinc(length_px * np.asarray(fy, np.float64)))
+
+
+def sensor_mtf(fx: ArrayLike, fy: ArrayLike, sensor: Sensor) -> NDArray[np.inexact]:
+    """What a sensor's blur and smear leave of each frequency, fx (1, W) and fy (H, 1) as in `mtf`: (H, W)."""
+    antialias_sigma_px, smear_px = _filter_and_smear(sensor)
+    found = mtf(fx, fy, sensor.blur, antialias_sigma_px)
+    return found * smear_response(fy, smear_px) if smear_px else found
+
+
+def _filter_and_smear(sensor: Sensor) -> tuple[float, float]:
+    antialias, smear = sensor.effects.get("antialias"), sensor.effects.get("smear")
+    sigma_px = antialias.sigma_px if isinstance(antialias, AntiAlias) else 0.0
+    return sigma_px, smear.length_px if isinstance(smear, Smear) else 0.0
 
 
 def sensor_transfer(
-    height: int, width: int, oversampling: int, sensor: Sensor, device: torch.device | None = None
-) -> Tensor:
+    height: int, width: int, oversampling: int, sensor: Sensor, device: "torch.device | None" = None
+) -> "Tensor":
     """All the linear, shift-invariant effects of a sensor as one transfer function (H, W // 2 + 1)."""
-    antialias, smear = sensor.effects.get("antialias"), sensor.effects.get("smear")
-    sigma_px = antialias.sigma_px if isinstance(antialias, AntiAlias) else 0.0
-    length_px = smear.length_px if isinstance(smear, Smear) else 0.0
-    return transfer_function(height, width, oversampling, sensor.blur, sigma_px, length_px, device)
+    return transfer_function(height, width, oversampling, sensor.blur, *_filter_and_smear(sensor), device)
 
 
 @lru_cache(maxsize=64)
@@ -110,21 +128,23 @@ def transfer_function(
     blur: Blur,
     antialias_sigma_px: float = 0.0,
     smear_px: float = 0.0,
-    device: torch.device | None = None,
-) -> Tensor:
+    device: "torch.device | None" = None,
+) -> "Tensor":
     """MTF and smear on the half spectrum of a scene: (H, W // 2 + 1) float32, ready to multiply an rfft2.
 
     `height` and `width` are in scene pixels, `oversampling` of which make one target pixel. Complex64 for a
     point-spread function, which may be lopsided or lie aslant.
     """
+    import torch
+
     aslant = isinstance(blur, PointSpread)
-    vertical = torch.fft.fftfreq if aslant else torch.fft.rfftfreq
-    fy = vertical(height, 1 / oversampling, dtype=torch.float64, device=device)
-    fx = torch.fft.rfftfreq(width, 1 / oversampling, dtype=torch.float64, device=device)
+    vertical = np.fft.fftfreq if aslant else np.fft.rfftfreq
+    fy, fx = vertical(height, 1 / oversampling), np.fft.rfftfreq(width, 1 / oversampling)
     found = mtf(fx[None, :], fy[:, None], blur, antialias_sigma_px)
     if smear_px:
         found = found * smear_response(fy[:, None], smear_px)
     if aslant:
-        return found.to(torch.complex64)
-    upper = found.float()
-    return torch.cat([upper, upper[1 : (height + 1) // 2].flip(0)])  # even in fy: the rows below are the same
+        return torch.from_numpy(found.astype(np.complex64)).to(device)
+    upper = found.astype(np.float32)
+    whole = np.concatenate([upper, upper[1 : (height + 1) // 2][::-1]])  # even in fy: the rows below are the same
+    return torch.from_numpy(whole).to(device)

@@ -14,6 +14,7 @@ from dataclasses import asdict, dataclass
 from functools import lru_cache
 from typing import Literal
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -83,12 +84,11 @@ def blurred_range(stats: SceneStats, ringing: float) -> tuple[float, float]:
 @lru_cache(maxsize=256)
 def smear_moments(height: int, oversampling: int, length_px: float) -> tuple[float, float]:
     """Of the smear's kernel less a unit pulse: half its absolute sum, and its absolute first moment in pixels."""
-    fy = torch.fft.fftfreq(height, 1 / oversampling, dtype=torch.float64)
-    kernel = torch.fft.ifft(smear_response(fy, length_px)).real
+    fy = np.fft.fftfreq(height, 1 / oversampling)
+    kernel = np.fft.ifft(smear_response(fy, length_px)).real
     kernel[0] -= 1
-    distance = torch.arange(height, dtype=torch.float64)
-    distance = torch.minimum(distance, height - distance)
-    return float(kernel.abs().sum()) / 2, float((kernel.abs() * distance).sum())
+    distance = np.minimum(np.arange(height), height - np.arange(height))
+    return float(np.abs(kernel).sum()) / 2, float((np.abs(kernel) * distance).sum())
 
 
 def blur_bound_dn(stats: SceneStats, ringing: float, gain: float) -> float:

@@ -7,9 +7,12 @@ borders reach no further.
 from collections.abc import Iterable, Iterator
 from functools import partial
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
+from model.bank import restoring_gain
 from model.simulator.mtf import NYQUIST, Blur, mtf
 from model.traditional.rows import Rows, fill_with_local_means, map_tiles, mirrored
 from profiles.errors import OptionError
@@ -82,8 +85,8 @@ def compensation_kernel(blur_from: Blur, blur_to: Blur, epsilon: float, radius_p
     # Sampled this finely, the slow tail folds back onto the filter little.
     side = 8 * radius_px
     gain = compensation_gain(side, side, blur_from, blur_to, epsilon)
-    whole = torch.fft.irfft2(gain, s=(side, side)).roll((radius_px, radius_px), (0, 1))
-    kernel: Tensor = whole[: 2 * radius_px + 1, : 2 * radius_px + 1].clone()
+    whole = np.roll(np.fft.irfft2(gain, (side, side)), (radius_px, radius_px), (0, 1))
+    kernel = torch.from_numpy(whole[: 2 * radius_px + 1, : 2 * radius_px + 1].copy())
     window = torch.hann_window(2 * radius_px + 3, periodic=False, dtype=torch.float64)[1:-1]
     # Smooth, so that what it adds lies at frequencies near 0 alone.
     hill = window[:, None] * window
@@ -91,7 +94,7 @@ def compensation_kernel(blur_from: Blur, blur_to: Blur, epsilon: float, radius_p
     return kernel
 
 
-def compensation_gain(height: int, width: int, blur_from: Blur, blur_to: Blur, epsilon: float) -> Tensor:
+def compensation_gain(height: int, width: int, blur_from: Blur, blur_to: Blur, epsilon: float) -> NDArray[np.inexact]:
     """G = T H* / (|H|^2 + epsilon r^2) on the half spectrum, (height, width // 2 + 1) float64.
 
     Complex128 where H or T is that of a point-spread function, H* its conjugate. H is the MTF to undo, T the one to
@@ -108,12 +111,9 @@ def compensation_gain(height: int, width: int, blur_from: Blur, blur_to: Blur, e
     """
     if not 0 <= epsilon < float("inf"):
         raise OptionError("epsilon", expected="0 or more", got=repr(epsilon), remedy="a few thousandths are usual")
-    fy = torch.fft.fftfreq(height, dtype=torch.float64)[:, None]
-    fx = torch.fft.rfftfreq(width, dtype=torch.float64)[None, :]
-    blur, target = mtf(fx, fy, blur_from), mtf(fx, fy, blur_to)
-    r_squared = (fx.square() + fy.square()) / NYQUIST**2
-    gain: Tensor = target * blur.conj() / (blur.abs().square() + epsilon * r_squared)
-    return gain
+    fy, fx = np.fft.fftfreq(height)[:, None], np.fft.rfftfreq(width)[None, :]
+    r_squared = (fx**2 + fy**2) / NYQUIST**2
+    return restoring_gain(mtf(fx, fy, blur_from), mtf(fx, fy, blur_to), r_squared, epsilon)
 
 
 def fast_length(size: int) -> int:

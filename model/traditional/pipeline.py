@@ -10,6 +10,7 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from typing import Literal
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -129,7 +130,7 @@ def _blur_text(sensor: Sensor) -> str:
 def describe(chain: Chain) -> list[str]:
     """The steps that `restore_traditional` would take, one line each, with their numbers."""
     sensor, chosen, epsilon = with_rounding_noise(chain.degraded), quality_named(chain.quality), chain.regularisation
-    gain = float(compensation_gain(64, 64, chain.degraded.blur, chain.reference.blur, epsilon).abs().max())
+    gain = np.abs(compensation_gain(64, 64, chain.degraded.blur, chain.reference.blur, epsilon)).max()
     coloured = ", its covariance that of the filtered noise" if chain.order == "deconvolve-first" else ""
     denoise = [
         f"stabilise noise of variance {sensor.alpha:.4g} L + {sensor.beta:.4g}, L in W/m2/sr/um, rounding counted",

@@ -19,9 +19,7 @@ from quant.onnx_file import metadata
 
 
 @pytest.mark.slow
-def test_the_demo_takes_a_raw_image_through_the_whole_chain(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_demo_takes_a_raw_image_through_the_whole_chain(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """On few patches: .ci/run's first stage has all."""
     for name in ("CALIBRATION_PATCHES", "GATE_PATCHES"):
         monkeypatch.setattr(demo, name, 2)

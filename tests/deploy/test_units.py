@@ -96,7 +96,7 @@ def rounding_db(psnr_db: np.ndarray, bits: int, pixels: int) -> np.ndarray:
     steps = np.hypot(1 / 4095, 1 / (2**bits - 1)) / np.sqrt(12)
     fx, fy = torch.fft.fftfreq(64)[None], torch.fft.fftfreq(64)[:, None]
     ratio = mtf(fx, fy, (0.25, 0.25)) / mtf(fx, fy, (0.07, 0.07))
-    share = steps * np.sqrt(float(ratio.square().mean()) + 2) / 10 ** (-psnr_db / 20)
+    share = steps * np.sqrt(float(np.square(ratio).mean()) + 2) / 10 ** (-psnr_db / 20)
     return np.asarray(10 * np.log10(1 + share**2 + 2 * 4 * share / np.sqrt(pixels / 25)))
 
 

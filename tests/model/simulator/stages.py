@@ -73,8 +73,8 @@ def formula_point(blur: Blur, per_px: int, side_px: int, odd: bool) -> PointSpre
     """The formula's own point-spread function, by inverse transform; of an even side the middle is no sample's."""
     side = per_px * side_px + odd
     f = torch.fft.fftfreq(side, 1 / per_px, dtype=torch.float64)
-    samples = torch.fft.fftshift(torch.fft.ifft2(mtf(f[None], f[:, None], blur)).real)
-    return point_spread(samples.numpy(), per_px)
+    samples = np.fft.fftshift(np.fft.ifft2(mtf(f[None], f[:, None], blur)).real)
+    return point_spread(samples, per_px)
 
 
 def gaussian_pixel(sigma_x: float, sigma_y: float, per_px: int, side: int) -> PointSpread:

@@ -187,7 +187,7 @@ def test_smear_over_whole_scene_pixels_is_their_mean() -> None:
     y = torch.arange(side, dtype=torch.float64) / side
     wave = 100 + 30 * torch.cos(2 * math.pi * 3 * y) + 10 * torch.sin(2 * math.pi * 5 * y)
     frequency = torch.fft.rfftfreq(side, 1 / ratio, dtype=torch.float64)
-    smeared = torch.fft.irfft(torch.fft.rfft(wave) * smear_response(frequency, 2.0), n=side)
+    smeared = torch.fft.irfft(torch.fft.rfft(wave) * torch.from_numpy(smear_response(frequency, 2.0)), n=side)
     weights = [0.5, *[1.0] * 7, 0.5]
     mean = sum((w * torch.roll(wave, k - 4) for k, w in enumerate(weights)), torch.zeros_like(wave)) / 8
     np.testing.assert_allclose(smeared.numpy(), mean.numpy(), atol=0.1)

@@ -33,8 +33,8 @@ def one_after_the_other(
     shift = 2j * math.pi * (ratio - 1) / 2 / ratio
     image = radiance.double()
     for response in (
-        mtf(fx, fy, mtf_nyquist, sigma),
-        smear_response(fy, smear),
+        torch.from_numpy(mtf(fx, fy, mtf_nyquist, sigma)),
+        torch.from_numpy(smear_response(fy, smear)),
         torch.exp(shift * fy) * torch.exp(shift * fx),
     ):
         image = torch.fft.irfft2(torch.fft.rfft2(image) * response, s=(height, width))

@@ -1,7 +1,7 @@
 import math
 
+import numpy as np
 import pytest
-import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -13,8 +13,7 @@ TWO_OVER_PI = 2 / math.pi
 
 @given(st.floats(1e-4, TWO_OVER_PI))
 def test_the_contrast_at_nyquist_is_the_one_asked_for(mtf_nyquist: float) -> None:
-    at_nyquist = mtf(torch.tensor(0.5, dtype=torch.float64), torch.tensor(0.0, dtype=torch.float64), mtf_nyquist)
-    assert float(at_nyquist) == pytest.approx(mtf_nyquist, rel=1e-9)
+    assert float(mtf(0.5, 0.0, mtf_nyquist)) == pytest.approx(mtf_nyquist, rel=1e-9)
 
 
 @given(st.floats(1e-4, 0.6), st.floats(1e-4, 0.03))
@@ -35,35 +34,32 @@ def test_an_amplifying_blur_is_refused(impossible: float) -> None:
 
 
 def test_the_diagonal_is_darker_than_the_axis() -> None:
-    half = torch.tensor(0.5, dtype=torch.float64)
-    assert float(mtf(half, half, 0.07)) == pytest.approx(0.0179, abs=1e-4)
+    assert float(mtf(0.5, 0.5, 0.07)) == pytest.approx(0.0179, abs=1e-4)
 
 
 def test_the_sinc_keeps_its_sign_beyond_the_first_zero() -> None:
-    f = torch.tensor([0.9, 1.1, 1.9, 2.1], dtype=torch.float64)
-    assert torch.sign(mtf(f, torch.zeros(1, dtype=torch.float64), 0.25)).tolist() == [1, -1, -1, 1]
+    assert np.sign(mtf([0.9, 1.1, 1.9, 2.1], 0.0, 0.25)).tolist() == [1, -1, -1, 1]
 
 
 def test_the_mean_passes_unchanged() -> None:
     assert float(transfer_function(30, 42, 3, 0.07)[0, 0]) == 1.0
 
 
-def grid(height: int, width: int) -> tuple[torch.Tensor, torch.Tensor]:
-    fy, fx = (torch.fft.fftfreq(side, 1 / 3, dtype=torch.float64) for side in (height, width))
+def grid(height: int, width: int) -> tuple[np.ndarray, np.ndarray]:
+    fy, fx = (np.fft.fftfreq(side, 1 / 3) for side in (height, width))
     return fx[None, :], fy[:, None]
 
 
 @given(st.floats(1e-3, 0.5), st.floats(1e-3, 0.5), st.sampled_from([0.0, 0.2]))
 def test_each_axis_keeps_the_contrast_stated_for_it(across: float, along: float, sigma_px: float) -> None:
-    half, zero = torch.tensor(0.5, dtype=torch.float64), torch.tensor(0.0, dtype=torch.float64)
-    assert float(mtf(half, zero, (across, along), sigma_px)) == pytest.approx(across, rel=1e-9)
-    assert float(mtf(zero, half, (across, along), sigma_px)) == pytest.approx(along, rel=1e-9)
+    assert float(mtf(0.5, 0.0, (across, along), sigma_px)) == pytest.approx(across, rel=1e-9)
+    assert float(mtf(0.0, 0.5, (across, along), sigma_px)) == pytest.approx(along, rel=1e-9)
 
 
 @given(st.floats(1e-4, 0.5), st.integers(2, 31), st.integers(2, 31))
 def test_two_equal_axes_are_one_to_the_last_bit(mtf_nyquist: float, height: int, width: int) -> None:
     fx, fy = grid(height, width)
-    assert torch.equal(mtf(fx, fy, (mtf_nyquist, mtf_nyquist)), mtf(fx, fy, mtf_nyquist))
+    assert np.array_equal(mtf(fx, fy, (mtf_nyquist, mtf_nyquist)), mtf(fx, fy, mtf_nyquist))
 
 
 @given(st.floats(0.01, 0.5), st.integers(2, 31), st.integers(2, 31))
@@ -71,14 +67,14 @@ def test_the_formula_of_two_axes_meets_that_of_one(mtf_nyquist: float, height: i
     """Axes that differ in the last digits take the other branch: no step lies between the two."""
     fx, fy = grid(height, width)
     near = mtf(fx, fy, (mtf_nyquist, mtf_nyquist * (1 + 1e-12)))
-    torch.testing.assert_close(near, mtf(fx, fy, mtf_nyquist), rtol=1e-10, atol=1e-14)
+    np.testing.assert_allclose(near, mtf(fx, fy, mtf_nyquist), rtol=1e-10, atol=1e-14)
 
 
 def test_turning_the_axes_turns_the_response() -> None:
     fx, fy = grid(13, 21)
     turned = mtf(fy.T, fx.T, (0.05, 0.12))
-    torch.testing.assert_close(turned.T, mtf(fx, fy, (0.12, 0.05)), rtol=1e-12, atol=0)
-    assert not torch.allclose(mtf(fx, fy, (0.12, 0.05)), mtf(fx, fy, (0.05, 0.12)), rtol=1e-3, atol=1e-3)
+    np.testing.assert_allclose(turned.T, mtf(fx, fy, (0.12, 0.05)), rtol=1e-12, atol=0)
+    assert not np.allclose(mtf(fx, fy, (0.12, 0.05)), mtf(fx, fy, (0.05, 0.12)), rtol=1e-3, atol=1e-3)
 
 
 @pytest.mark.parametrize("axes", [(0.07, 0.0), (0.7, 0.07), (0.07, math.nan)])

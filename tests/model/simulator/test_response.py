@@ -85,7 +85,7 @@ def test_a_table_of_the_formula_is_the_formula(contrasts: tuple[float, float], s
         torch.linspace(-2, 2, 47, dtype=torch.float64)[:, None],
     )
     table = stages.formula_table(*contrasts, steps)
-    torch.testing.assert_close(mtf(fx, fy, table), mtf(fx, fy, contrasts), rtol=1e-9, atol=1e-14)
+    np.testing.assert_allclose(mtf(fx, fy, table), mtf(fx, fy, contrasts), rtol=1e-9, atol=1e-14)
 
 
 def test_the_optics_of_one_table_are_round() -> None:
@@ -93,9 +93,9 @@ def test_the_optics_of_one_table_are_round() -> None:
     table = replace(MEASURED, along=MEASURED.across)
     radius, zero = torch.linspace(0.01, 0.9, 40, dtype=torch.float64)[None], torch.zeros(1, 1, dtype=torch.float64)
     fx, fy = 0.8 * radius, 0.6 * radius
-    aslant = torch.stack([mtf(fx[:, k : k + 1], fy[:, k : k + 1], table).flatten() for k in range(40)]).T
-    optics = mtf(radius, zero, table) / torch.sinc(radius)
-    torch.testing.assert_close(aslant / torch.sinc(fx) / torch.sinc(fy), optics, rtol=1e-9, atol=1e-12)
+    aslant = np.stack([mtf(fx[:, k : k + 1], fy[:, k : k + 1], table).ravel() for k in range(40)], 1)
+    optics = mtf(radius, zero, table) / np.sinc(radius)
+    np.testing.assert_allclose(aslant / np.sinc(fx) / np.sinc(fy), optics, rtol=1e-9, atol=1e-12)
 
 
 @pytest.mark.parametrize("side", [64, 75])

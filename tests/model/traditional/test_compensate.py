@@ -25,8 +25,8 @@ def texture(height: int, width: int) -> torch.Tensor:
 def test_gain_is_one_at_dc_and_finite_everywhere(mtf_from: float, mtf_to: float, epsilon: float) -> None:
     gain = compensation_gain(26, 35, mtf_from, mtf_to, epsilon)
     assert float(gain[0, 0]) == 1
-    assert bool(torch.isfinite(gain).all())
-    assert bool((gain >= 0).all())
+    assert np.isfinite(gain).all()
+    assert (gain >= 0).all()
 
 
 def test_without_regularisation_it_is_the_ratio_of_the_mtfs() -> None:
@@ -46,8 +46,8 @@ def test_without_regularisation_a_point_spread_is_undone_whole() -> None:
     fx, fy = torch.fft.rfftfreq(34, dtype=torch.float64)[None], torch.fft.fftfreq(26, dtype=torch.float64)[:, None]
     blur, target = mtf(fx, fy, lopsided_point()), mtf(fx, fy, 0.25)
     undone = compensation_gain(26, 34, lopsided_point(), 0.25, epsilon=0) * blur
-    assert float(blur.imag.abs().max()) > 0.02
-    torch.testing.assert_close(undone, target.to(undone.dtype), rtol=1e-9, atol=1e-12)
+    assert np.abs(blur.imag).max() > 0.02
+    np.testing.assert_allclose(undone, target, rtol=1e-9, atol=1e-12)
 
 
 def test_regularisation_holds_the_noise_of_a_weak_mtf_down() -> None:
@@ -83,7 +83,7 @@ def test_the_kernel_keeps_the_gain_off_dc(mtf_from: float) -> None:
     padded = torch.zeros(512, 512, dtype=torch.float64)
     padded[:129, :129] = kernel
     gain = torch.fft.rfft2(padded.roll((-64, -64), (0, 1)))
-    wanted = compensation_gain(512, 512, mtf_from, 0.25, EPSILON)
+    wanted = torch.from_numpy(compensation_gain(512, 512, mtf_from, 0.25, EPSILON))
     assert float(gain.imag.abs().max()) < 1e-9
     error = (gain.real / wanted - 1).abs()
     assert float(error[8:240, 8:240].max()) < 2e-3

@@ -180,7 +180,7 @@ def test_the_chain_undoes_each_axis_by_its_own_blur(camera: Tensor) -> None:
 def formula_point(blur: tuple[float, float], per_px: int = 2, side_px: int = 129) -> PointSpread:
     """The point-spread function that belongs to two contrasts at Nyquist, on an odd number of samples."""
     f = torch.fft.fftfreq(per_px * side_px + 1, 1 / per_px, dtype=torch.float64)
-    samples = torch.fft.fftshift(torch.fft.ifft2(mtf(f[None], f[:, None], blur)).real).numpy()
+    samples = np.fft.fftshift(np.fft.ifft2(mtf(f[None], f[:, None], blur)).real)
     return PointSpread(len(f), len(f), per_px, packed(samples))
 
 

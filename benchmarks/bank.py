@@ -1,0 +1,256 @@
+"""A plain body behind the bank of its sensor's filters: trained, and judged on sites that training keeps apart.
+
+    python benchmarks/bank.py --images aerial/ --body 8x32 --steps 12000 --out body.safetensors
+    python benchmarks/bank.py --images aerial/ --body 4x16 --steps 1500 --variation skip=image --out other.safetensors
+
+BODY is BLOCKSxFEATURES[@SCALE] as in `families.py`. Every patch has a sensor of its own, drawn over the ranges that
+shipped networks know; the target is the reference without noise. OUT holds weights, running average and optimiser:
+the same command goes on where it was stopped. A line a judgement: step, processor minutes, mean PSNR, PSNR of each
+sensor.
+
+Variations, for paired short trainings: skip=image adds the correction to the image and not to the analytic
+restoration; loss=l1 or loss=unit (L1 in units of g) in place of the logarithm of the squared error.
+"""
+
+import argparse
+import json
+import math
+import time
+from collections.abc import Mapping
+from dataclasses import replace
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+from torch.nn.functional import conv2d, pad, pixel_shuffle, pixel_unshuffle
+
+from benchmarks.families import NAME
+from model.bank import FILTERS, SIDE_PX, Bank, bank_of
+from model.conditioning import SensorFamily, vector_tensor
+from model.convbeers import ResidualBlock, conv3x3
+from model.io.images import list_images
+from model.io.tensors import read_tensors, write_tensors
+from model.simulator.acquire import LEAST_SIDE_PX, acquire, fitting_oversampling
+from model.simulator.detector import Draw
+from model.simulator.sampling import Scene, crop_divisible, read_scene, scene_spectrum
+from model.specialise import RANGES
+from model.training.losses import log_mse
+from model.training.patches import PatchRecipe, PatchSource
+from model.training.validation import split_by_site
+from profiles import load_sensor
+from profiles.constant import Constant
+from profiles.sensor import Sensor, noise_from_snr
+
+REFERENCE = load_sensor("pleiades-reference")
+NOMINAL = load_sensor("pleiades-degraded").nominal()
+NOISELESS = {
+    name: Constant(snr, "assumed", "the target of training has no noise")
+    for name, snr in (("snr_0", 1e4), ("snr_1", 2e4))
+}
+NOISE_FREE = replace(REFERENCE, **NOISELESS)  # type: ignore[arg-type]
+CLIP = 8.0
+"""Planes are held to this: what two int8 planes of a later INT8 file can hold."""
+RATE, WARM_STEPS, BATCH, PATCH_PX, EMA = 1e-3, 100, 8, 96, 0.999
+JUDGED_PX = 160
+SENSORS = {
+    "7 %, 50 / 110": (0.07, 0.07, 50, 110),
+    "3 %, 50 / 110": (0.03, 0.03, 50, 110),
+    "10 %, 50 / 110": (0.10, 0.10, 50, 110),
+    "2 %, 50 / 110": (0.02, 0.02, 50, 110),
+    "7 %, 18 / 50": (0.07, 0.07, 18, 50),
+    "7 %, 90 / 190": (0.07, 0.07, 90, 190),
+    "3 %, 110 / 220": (0.03, 0.03, 110, 220),
+    "15 %, 110 / 220": (0.15, 0.15, 110, 220),
+    "1.5 %, 9 / 35": (0.015, 0.015, 9, 35),
+    "8 and 4 %, 60 / 130": (0.08, 0.04, 60, 130),
+}
+"""MTF across and along, SNR at 25 and 100 W/m2/sr/um."""
+
+
+@lru_cache(maxsize=4096)
+def bank_of_vector(*entries: float) -> Bank:
+    """The bank of the sensor that a sensor vector tells of."""
+    across, along, _, sigma = (
+        low * (high / low) ** ((entry + 1) / 2) for entry, (low, high) in zip(entries, RANGES.values(), strict=True)
+    )
+    full_scale = NOMINAL.max_dn / NOMINAL.gain_dn_per_radiance
+    beta = (sigma * full_scale) ** 2 - 1 / (12 * NOMINAL.gain_dn_per_radiance**2)
+    sensor = replace(NOMINAL, mtf_nyquist=across, mtf_nyquist_along=along, alpha=0.0, beta=beta)
+    return bank_of(sensor, REFERENCE.nominal())
+
+
+class Banked(nn.Module):
+    """The body, told its sensor by the bank and by the bias of its head."""
+
+    def __init__(self, blocks: int, features: int, scale: int, skip_image: bool, generator: torch.Generator) -> None:
+        super().__init__()
+        self.scale, self.skip_image = scale, skip_image
+        self.head = conv3x3((1 + FILTERS) * scale**2, features)
+        self.body = nn.Sequential(*(ResidualBlock(features) for _ in range(blocks)))
+        self.body_end, self.tail = conv3x3(features, features), conv3x3(features, scale**2)
+        self.bias = nn.Linear(len(RANGES), features, bias=False)
+        nn.init.zeros_(self.bias.weight)
+        for name, layer in self.named_modules():
+            if isinstance(layer, nn.Conv2d):
+                small = 0.1 if name.endswith(("second", "body_end", "tail")) else 1.0
+                small /= scale if name == "tail" else 1
+                layer.weight.data.normal_(0, small * (2 / (9 * layer.in_channels)) ** 0.5, generator=generator)
+                layer.bias.data.zero_()  # type: ignore[union-attr]
+
+    def forward(self, image: Tensor, vectors: Tensor) -> Tensor:
+        """Images (N, 1, H, W) over full scale and their sensors' vectors (N, 4) to (N, 1, H, W)."""
+        banks = [bank_of_vector(*vector.tolist()) for vector in vectors]
+        kernels = torch.tensor(np.stack([[*bank.planes, bank.analytic] for bank in banks]), dtype=torch.float32)
+        unit = torch.tensor([bank.unit for bank in banks], dtype=torch.float32)[:, None, None, None]
+        filtered = each_by_its_own(image, kernels)
+        planes, analytic = filtered[:, :FILTERS].clamp(-CLIP, CLIP), filtered[:, FILTERS:]
+        read = torch.cat([image, planes], 1)
+        read = pixel_unshuffle(read, self.scale) if self.scale > 1 else read
+        shallow = (self.head(read) + self.bias(vectors)[:, :, None, None]).contiguous(
+            memory_format=torch.channels_last
+        )
+        with torch.autocast("cpu", dtype=torch.bfloat16, enabled=self.training):
+            deep = self.body_end(self.body(shallow))
+        correction = self.tail(shallow + deep.float())
+        correction = pixel_shuffle(correction, self.scale) if self.scale > 1 else correction
+        base = image if self.skip_image else image + analytic
+        restored: Tensor = base + unit * correction
+        return restored
+
+
+def each_by_its_own(image: Tensor, kernels: Tensor) -> Tensor:
+    """Image n of (N, 1, H, W), mirrored at its borders, by kernels n of (N, K, 7, 7): (N, K, H, W)."""
+    count, radius = len(image), SIDE_PX // 2
+    wide = pad(image, [radius] * 4, mode="reflect")
+    made = conv2d(wide.transpose(0, 1), kernels.flatten(0, 1)[:, None], groups=count)
+    return made.view(count, -1, *image.shape[-2:])
+
+
+def judged_pairs(scenes: list[Scene]) -> dict[str, list[tuple[Tensor, Tensor, Tensor]]]:
+    """For each sensor the (degraded, reference, vector) of every scene, the same in every run."""
+    found: dict[str, list[tuple[Tensor, Tensor, Tensor]]] = {}
+    for row, (name, (across, along, *snr)) in enumerate(SENSORS.items()):
+        alpha, beta = noise_from_snr(25, snr[0], 100, snr[1])
+        sensor = replace(NOMINAL, mtf_nyquist=across, mtf_nyquist_along=along, alpha=alpha, beta=beta)
+        found[name] = [_pair(scene, sensor, Draw(0, 100 * row + k)) for k, scene in enumerate(scenes)]
+    return found
+
+
+def _pair(scene: Scene, sensor: Sensor, draw: Draw) -> tuple[Tensor, Tensor, Tensor]:
+    ratio = fitting_oversampling(scene.radiance, (4, 3, 2, 1), LEAST_SIDE_PX) or 1
+    radiance = crop_divisible(scene.radiance, ratio)
+    spectrum, width = scene_spectrum(radiance), radiance.shape[-1]
+    sensors = {"degraded": sensor, "reference": NOISE_FREE.nominal()}
+    both = [acquire(spectrum, width, each, ratio, draw, role) for role, each in sensors.items()]
+    height, width = (min(side, JUDGED_PX) // 2 * 2 for side in both[0].shape)
+    degraded, reference = (image[None, None, :height, :width] / sensor.max_dn for image in both)
+    return degraded, reference, vector_tensor(sensor)[None]
+
+
+def judge(network: Banked, pairs: Mapping[str, list[tuple[Tensor, Tensor, Tensor]]]) -> dict[str, float]:
+    """Mean PSNR in dB over full scale of each sensor's images."""
+    network.eval()
+    with torch.inference_mode():
+        found = {
+            name: [
+                float((network(degraded, vector).clamp(0, 1) - reference).square().mean())
+                for degraded, reference, vector in each
+            ]
+            for name, each in pairs.items()
+        }
+    network.train()
+    return {name: float(np.mean([-10 * math.log10(mse) for mse in each])) for name, each in found.items()}
+
+
+def loss_of(kind: str, restored: Tensor, reference: Tensor, vectors: Tensor) -> Tensor:
+    """The loss of a batch (N, 1, P, P): psnr, l1 or unit."""
+    if kind == "psnr":
+        return 0.01 * log_mse(restored, reference)
+    units = [bank_of_vector(*vector.tolist()).unit if kind == "unit" else 1.0 for vector in vectors]
+    return ((restored - reference) / torch.tensor(units)[:, None, None, None]).abs().mean()
+
+
+class Training:
+    """A network, its running average and its optimiser at a step, kept in a file."""
+
+    def __init__(self, path: Path, network: Banked, average: Banked, steps: int) -> None:
+        self.path, self.network, self.average, self.steps = path, network, average, steps
+        self.optimiser, self.step, self.spent_s = torch.optim.Adam(network.parameters(), lr=RATE), 0, 0.0
+        average.load_state_dict(network.state_dict())
+        if path.exists():
+            self._read()
+
+    def _read(self) -> None:
+        arrays, header = read_tensors(self.path)
+        tensors = {name: torch.from_numpy(array) for name, array in arrays.items()}
+        self.step, self.spent_s = int(str(header["step"])), float(str(header["spent_s"]))
+        for part, module in (("network.", self.network), ("average.", self.average)):
+            module.load_state_dict({name: tensors[part + name] for name in module.state_dict()})
+        for name, parameter in self.network.named_parameters():
+            moments = {key: tensors[f"{key}.{name}"] for key in ("exp_avg", "exp_avg_sq")}
+            self.optimiser.state[parameter] = {"step": torch.tensor(float(self.step)), **moments}
+
+    def save(self) -> None:
+        """Write all that going on needs."""
+        found = {f"network.{name}": value for name, value in self.network.state_dict().items()}
+        found |= {f"average.{name}": value for name, value in self.average.state_dict().items()}
+        for name, parameter in self.network.named_parameters():
+            state = self.optimiser.state[parameter]
+            found |= {f"{key}.{name}": state[key] for key in ("exp_avg", "exp_avg_sq")}
+        header = {"step": self.step, "steps": self.steps, "spent_s": self.spent_s}
+        write_tensors(self.path, {name: value.detach().numpy() for name, value in found.items()}, header)
+
+    def advance(self, batch: tuple[Tensor, ...], kind: str) -> None:
+        """One step on a batch of (degraded, reference, vectors)."""
+        degraded, reference, vectors = batch
+        cosine = 0.5 * (1 + math.cos(math.pi * self.step / self.steps))
+        self.optimiser.param_groups[0]["lr"] = RATE * min(1, (self.step + 1) / WARM_STEPS) * (0.99 * cosine + 0.01)
+        loss = loss_of(kind, self.network(degraded, vectors), reference, vectors)
+        self.optimiser.zero_grad(set_to_none=True)
+        loss.backward()  # type: ignore[no-untyped-call]
+        nn.utils.clip_grad_norm_(self.network.parameters(), 1.0)
+        self.optimiser.step()
+        self.step += 1
+        decay = min(EMA, (1 + self.step) / (10 + self.step))
+        for kept, value in zip(self.average.parameters(), self.network.parameters(), strict=True):
+            kept.data.lerp_(value.data, 1 - decay)
+
+
+def main() -> None:
+    """Train, and judge every so many steps."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--images", type=Path, required=True)
+    parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--body", default="8x32")
+    parser.add_argument("--steps", type=int, default=12000)
+    parser.add_argument("--every", type=int, default=500, help="steps between judgements")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--variation", action="append", default=[], help="skip=image, loss=l1, loss=unit")
+    asked = parser.parse_args()
+    variations = dict(each.split("=") for each in asked.variation)
+    named = NAME.fullmatch(asked.body)
+    if named is None or not named["blocks"]:
+        parser.error(f"--body {asked.body}: expected BLOCKSxFEATURES or BLOCKSxFEATURES@SCALE")
+    torch.set_num_threads(1)
+    shape = int(named["blocks"]), int(named["features"]), int(named["scale"] or 1), variations.get("skip") == "image"
+    network, average = (Banked(*shape, torch.Generator().manual_seed(asked.seed)) for _ in range(2))
+    scenes = [read_scene(path, NOISE_FREE.nominal()) for path in list_images(asked.images)]
+    kept, held = split_by_site([scene.name for scene in scenes])
+    recipe = PatchRecipe(load_sensor("pleiades-degraded"), NOISE_FREE, PATCH_PX, family=SensorFamily(NOMINAL))
+    source, pairs = PatchSource([scenes[k] for k in kept], recipe, BATCH, asked.seed), None
+    training = Training(asked.out, network, average, asked.steps)
+    before_s, batches = training.spent_s - time.process_time(), source.batches(training.step)
+    pairs = judged_pairs([scenes[k] for k in held])
+    while training.step < asked.steps:
+        training.advance(next(batches), variations.get("loss", "psnr"))
+        if training.step % asked.every == 0 or training.step == asked.steps:
+            found, training.spent_s = judge(average, pairs), before_s + time.process_time()
+            training.save()
+            mean = float(np.mean(list(found.values())))
+            print(training.step, f"{training.spent_s / 60:.1f}", f"{mean:.3f}", json.dumps(found), flush=True)
+
+
+if __name__ == "__main__":
+    main()

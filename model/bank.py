@@ -1,0 +1,109 @@
+"""What a sensor's blur and noise ask for, in closed form: the filters of a network's first layer.
+
+Of a sensor: H(f) its transfer, sigma its noise over full scale at a quarter of full scale, rounding counted. Of the
+reference: T(f). r = |f| / f_Nyquist. Four restorations, each more cautious than the one before, and what lies between
+them and the image itself, cut to 7 x 7:
+
+    W_k = T conj(H) / (|H|^2 + eps_k r^2),   eps_k = 1.32 sigma 4^(k-1),   k = 0..3,   W_4 = 1
+    D_k = W_k - W_(k+1), of sum 0,           n_k = ||D_k||, the noise that D_k makes of white noise of 1
+    u_k = D_k x / (20 sigma n_k)             four planes in units of the sensor's own noise, of order 1 on edges
+    y_0 = x + (D_1 + D_2 + D_3) x            the analytic restoration W_1 x
+    g   = 20 sigma ||D_1 + D_2 + D_3||       the unit of what a network adds to it
+
+A network that reads x and u and gives `y_0 + g * body` is the same for every sensor. (Wiener filters in front of a
+network: Dong, Roth and Schiele, NeurIPS 2020.) This is NumPy alone, so that a restoration begins without torch.
+"""
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from model.simulator.mtf import NYQUIST, sensor_mtf
+from profiles.sensor import Sensor
+
+FILTERS, SIDE_PX = 4, 7
+"""7 x 7 holds 98.6 to 99.95 % of a filter's energy, and is the largest square that the window of a DPU takes."""
+
+GRID = 64
+"""Frequencies along an axis. Finer ones move no tap by more than 3e-4 of a filter's largest."""
+
+EPSILON_PER_SIGMA, STEP = 1.32, 4.0
+"""Regularisation at Nyquist of W_1, over sigma, and from each filter to the next."""
+
+UNIT = 20.0
+"""Standard deviations of noise that make a plane's 1."""
+
+
+@dataclass(frozen=True)
+class Bank:
+    """The filters of one sensor.
+
+    Attributes:
+        details: D_k, (4, 7, 7) float64, each of sum 0.
+        sigma: noise over full scale at a quarter of full scale.
+    """
+
+    details: NDArray[np.float64]
+    sigma: float
+
+    @cached_property
+    def units(self) -> NDArray[np.float64]:
+        """20 sigma n_k, (4,): the share of full scale that is 1 in plane k."""
+        return np.asarray(UNIT * self.sigma * np.sqrt(np.square(self.details).sum((1, 2))))
+
+    @property
+    def planes(self) -> NDArray[np.float64]:
+        """The kernels of u_k, (4, 7, 7)."""
+        return self.details / self.units[:, None, None]
+
+    @property
+    def analytic(self) -> NDArray[np.float64]:
+        """D_1 + D_2 + D_3, (7, 7): what the analytic restoration adds to the image."""
+        return np.asarray(self.details[1:].sum(0))
+
+    @property
+    def unit(self) -> float:
+        """The share g of full scale that is 1 in what a network adds."""
+        return UNIT * self.sigma * float(np.linalg.norm(self.analytic))
+
+
+def bank_of(sensor: Sensor, reference: Sensor) -> Bank:
+    """The filters from what `sensor` sees to what `reference` would have seen; rounding alone is noise enough."""
+    sigma = noise_over_full_scale(sensor)
+    fy, fx = np.fft.fftfreq(GRID)[:, None], np.fft.fftfreq(GRID)[None, :]
+    blur, target = sensor_mtf(fx, fy, sensor), sensor_mtf(fx, fy, reference)
+    r_squared = (fx**2 + fy**2) / NYQUIST**2
+    epsilons = [EPSILON_PER_SIGMA * sigma * STEP ** (k - 1) for k in range(FILTERS)]
+    gains = [restoring_gain(blur, target, r_squared, epsilon) for epsilon in epsilons]
+    falling = np.stack([*gains, np.ones_like(blur)])
+    return Bank(np.stack([_cut(gain) for gain in falling[:-1] - falling[1:]]), sigma)
+
+
+def noise_over_full_scale(sensor: Sensor) -> float:
+    """Standard deviation of noise at a quarter of full scale, that of rounding counted, over full scale."""
+    full_scale = sensor.max_dn / sensor.gain_dn_per_radiance
+    rounding = 1 / (12 * sensor.gain_dn_per_radiance**2)
+    return math.sqrt(sensor.noise_sigma(full_scale / 4) ** 2 + rounding) / full_scale
+
+
+def restoring_gain(
+    blur: NDArray[np.inexact], target: ArrayLike, r_squared: ArrayLike, epsilon: float
+) -> NDArray[np.inexact]:
+    """T conj(H) / (|H|^2 + epsilon r^2), of arrays of one shape: from a blur H to a target T.
+
+    Weighted by r^2, epsilon leaves the gain at frequency 0 at exactly 1; a constant one would darken the image.
+    """
+    return np.asarray(target * np.conj(blur) / (np.abs(blur) ** 2 + epsilon * np.asarray(r_squared)))
+
+
+def _cut(gain: NDArray[np.inexact]) -> NDArray[np.float64]:
+    """The middle 7 x 7 of the filter with this gain (64, 64), its sum taken off as a smooth hill: sum 0."""
+    radius = SIDE_PX // 2
+    whole = np.roll(np.fft.ifft2(gain).real, (radius, radius), (0, 1))
+    kernel = whole[:SIDE_PX, :SIDE_PX]
+    window = np.hanning(SIDE_PX + 2)[1:-1]
+    hill = np.outer(window, window)
+    return np.asarray(kernel - kernel.sum() * hill / hill.sum())

@@ -1,0 +1,107 @@
+"""The bank of a sensor: what its kernels keep and what its planes mean, for sensors of any blur and noise."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from model.bank import EPSILON_PER_SIGMA, FILTERS, SIDE_PX, UNIT, Bank, bank_of, noise_over_full_scale
+from model.simulator.mtf import sensor_mtf
+from model.traditional.compensate import compensation_kernel
+from profiles import load_sensor
+from profiles.effects import Smear
+from profiles.response import MtfTable, PointSpread, packed
+from profiles.sensor import Sensor
+
+REFERENCE = load_sensor("pleiades-reference").nominal()
+NOMINAL = load_sensor("pleiades-degraded").nominal()
+CONTRAST = st.floats(0.015, 0.15)
+
+
+def sensor(across: float, along: float, snr: float = 110.0) -> Sensor:
+    """Of noise that does not grow with the light, with that SNR at a quarter of full scale."""
+    return replace(NOMINAL, mtf_nyquist=across, mtf_nyquist_along=along, alpha=0.0, beta=(100 / snr) ** 2)
+
+
+def point_spread(values: np.ndarray) -> Sensor:
+    height, width = values.shape
+    point = PointSpread(height, width, 2, packed(values))
+    across, along = point.at_nyquist
+    return replace(NOMINAL, mtf_nyquist=across, mtf_nyquist_along=along, response=point)
+
+
+def lopsided() -> np.ndarray:
+    """A hill with a second one to its lower right, 17 rows by 19 columns, two samples to a pixel."""
+    y, x = np.mgrid[-8:9, -9:10] / 2
+    return np.asarray(np.exp(-(x**2 + y**2)) + 0.4 * np.exp(-((x - 1.2) ** 2 + (y - 0.7) ** 2)))
+
+
+@settings(max_examples=40)
+@given(CONTRAST, CONTRAST, st.floats(35, 220))
+def test_details_have_sum_0_and_noise_makes_planes_of_one_size(across: float, along: float, snr: float) -> None:
+    bank = bank_of(sensor(across, along, snr), REFERENCE)
+    assert bank.details.shape == (FILTERS, SIDE_PX, SIDE_PX)
+    assert np.abs(bank.details.sum((1, 2))).max() < 1e-12  # so every restoration, and the image beside it, is 1 at DC
+    noise = bank.sigma * np.sqrt(np.square(bank.planes).sum((1, 2)))
+    np.testing.assert_allclose(noise, 1 / UNIT, rtol=1e-12)
+    assert bank.unit == pytest.approx(UNIT * bank.sigma * np.linalg.norm(bank.analytic))
+
+
+@settings(max_examples=20)
+@given(CONTRAST, CONTRAST, st.floats(35, 220))
+def test_a_sensor_whose_axes_change_places_has_its_kernels_transposed(
+    across: float, along: float, snr: float
+) -> None:
+    upright, turned = (bank_of(sensor(*axes, snr), REFERENCE) for axes in ((across, along), (along, across)))
+    np.testing.assert_allclose(turned.details.transpose(0, 2, 1), upright.details, atol=1e-12)
+    assert turned.unit == pytest.approx(upright.unit)
+
+
+def test_a_lopsided_point_spread_transposed_has_its_kernels_transposed() -> None:
+    upright, turned = (bank_of(point_spread(values), REFERENCE) for values in (lopsided(), lopsided().T))
+    np.testing.assert_allclose(turned.details.transpose(0, 2, 1), upright.details, atol=1e-6)
+    assert np.abs(upright.details - upright.details[:, ::-1, ::-1]).max() > 0.01  # it does lean
+
+
+def test_a_table_of_the_formula_gives_the_formulas_kernels() -> None:
+    frequency = np.linspace(0, 0.5, 6)
+    contrast = tuple(float(sensor_mtf(f, 0.0, NOMINAL)) for f in frequency)
+    table = MtfTable(tuple(frequency.tolist()), contrast, contrast)
+    made = replace(NOMINAL, mtf_nyquist=table.at_nyquist[0], response=table)
+    np.testing.assert_allclose(bank_of(made, REFERENCE).details, bank_of(NOMINAL, REFERENCE).details, atol=1e-9)
+
+
+def test_smear_is_undone_along_the_track_alone() -> None:
+    plain, smeared = (bank_of(each, REFERENCE) for each in (NOMINAL, replace(NOMINAL, effects={"smear": Smear(0.9)})))
+    down, across = (np.abs(smeared.analytic.sum(axis) - plain.analytic.sum(axis)).max() for axis in (1, 0))
+    assert down > 10 * across
+
+
+@pytest.mark.parametrize("contrast", [0.02, 0.07, 0.12])
+def test_the_analytic_restoration_is_that_of_the_traditional_chain_cut_small(contrast: float) -> None:
+    made = sensor(contrast, contrast)
+    whole = compensation_kernel(contrast, REFERENCE.blur, EPSILON_PER_SIGMA * noise_over_full_scale(made)).numpy()
+    middle, radius = len(whole) // 2, SIDE_PX // 2
+    near = whole[middle - radius : middle + radius + 1, middle - radius : middle + radius + 1].copy()
+    near[radius, radius] -= 1
+    lost = np.square(bank_of(made, REFERENCE).analytic - near).sum() / np.square(near).sum()
+    assert lost < 0.015
+
+
+def gain(bank: Bank, image: np.ndarray) -> float:
+    return float((bank.analytic * image).sum())
+
+
+def test_without_noise_but_that_of_rounding_it_stays_finite() -> None:
+    silent = bank_of(replace(NOMINAL, alpha=0.0, beta=0.0), REFERENCE)
+    assert silent.sigma == pytest.approx(1 / (12**0.5 * 4095))
+    assert np.isfinite(silent.planes).all()
+
+
+def test_more_noise_asks_for_less_sharpening() -> None:
+    row = np.tile([-1.0, 1.0], 4)[:SIDE_PX][None].repeat(SIDE_PX, 0)  # Nyquist across, -1 in the middle
+    gains = [abs(gain(bank_of(sensor(0.07, 0.07, snr), REFERENCE), row)) for snr in (220, 110, 35)]
+    assert gains == sorted(gains, reverse=True)
+    assert gains[0] > 2 * gains[2]
