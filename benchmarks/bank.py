@@ -5,8 +5,9 @@
 
 BODY is BLOCKSxFEATURES[@SCALE] as in `families.py`. Every patch has a sensor of its own, drawn over the ranges that
 shipped networks know; the target is the reference without noise. OUT holds weights, running average and optimiser:
-the same command goes on where it was stopped. A line a judgement: step, processor minutes, mean PSNR, PSNR of each
-sensor.
+the same command goes on where it was stopped, on whatever device (`--device cuda --batch 64 --rate 2e-3 --minutes 9`
+for a graphics card that is lent by the quarter of an hour). A line a judgement: step, minutes, mean PSNR, PSNR of
+each sensor.
 
 Variations, for paired short trainings: skip=image adds the correction to the image and not to the analytic
 restoration; loss=l1 or loss=unit (L1 in units of g) in place of the logarithm of the squared error.
@@ -52,7 +53,7 @@ NOISELESS = {
 NOISE_FREE = replace(REFERENCE, **NOISELESS)  # type: ignore[arg-type]
 CLIP = 8.0
 """Planes are held to this: what two int8 planes of a later INT8 file can hold."""
-RATE, WARM_STEPS, BATCH, PATCH_PX, EMA = 1e-3, 100, 8, 96, 0.999
+WARM_STEPS, PATCH_PX, EMA = 100, 96, 0.999
 JUDGED_PX = 160
 SENSORS = {
     "7 %, 50 / 110": (0.07, 0.07, 50, 110),
@@ -102,8 +103,8 @@ class Banked(nn.Module):
     def forward(self, image: Tensor, vectors: Tensor) -> Tensor:
         """Images (N, 1, H, W) over full scale and their sensors' vectors (N, 4) to (N, 1, H, W)."""
         banks = [bank_of_vector(*vector.tolist()) for vector in vectors]
-        kernels = torch.tensor(np.stack([[*bank.planes, bank.analytic] for bank in banks]), dtype=torch.float32)
-        unit = torch.tensor([bank.unit for bank in banks], dtype=torch.float32)[:, None, None, None]
+        kernels = torch.from_numpy(np.stack([[*bank.planes, bank.analytic] for bank in banks])).to(image)
+        unit = image.new_tensor([bank.unit for bank in banks])[:, None, None, None]
         filtered = each_by_its_own(image, kernels)
         planes, analytic = filtered[:, :FILTERS].clamp(-CLIP, CLIP), filtered[:, FILTERS:]
         read = torch.cat([image, planes], 1)
@@ -111,7 +112,7 @@ class Banked(nn.Module):
         shallow = (self.head(read) + self.bias(vectors)[:, :, None, None]).contiguous(
             memory_format=torch.channels_last
         )
-        with torch.autocast("cpu", dtype=torch.bfloat16, enabled=self.training):
+        with torch.autocast(image.device.type, dtype=torch.bfloat16, enabled=self.training):
             deep = self.body_end(self.body(shallow))
         correction = self.tail(shallow + deep.float())
         correction = pixel_shuffle(correction, self.scale) if self.scale > 1 else correction
@@ -151,12 +152,13 @@ def _pair(scene: Scene, sensor: Sensor, draw: Draw) -> tuple[Tensor, Tensor, Ten
 
 def judge(network: Banked, pairs: Mapping[str, list[tuple[Tensor, Tensor, Tensor]]]) -> dict[str, float]:
     """Mean PSNR in dB over full scale of each sensor's images."""
+    device = next(network.parameters()).device
     network.eval()
     with torch.inference_mode():
         found = {
             name: [
                 float((network(degraded, vector).clamp(0, 1) - reference).square().mean())
-                for degraded, reference, vector in each
+                for degraded, reference, vector in ([part.to(device) for part in pair] for pair in each)
             ]
             for name, each in pairs.items()
         }
@@ -169,15 +171,15 @@ def loss_of(kind: str, restored: Tensor, reference: Tensor, vectors: Tensor) -> 
     if kind == "psnr":
         return 0.01 * log_mse(restored, reference)
     units = [bank_of_vector(*vector.tolist()).unit if kind == "unit" else 1.0 for vector in vectors]
-    return ((restored - reference) / torch.tensor(units)[:, None, None, None]).abs().mean()
+    return ((restored - reference) / restored.new_tensor(units)[:, None, None, None]).abs().mean()
 
 
 class Training:
     """A network, its running average and its optimiser at a step, kept in a file."""
 
-    def __init__(self, path: Path, network: Banked, average: Banked, steps: int) -> None:
-        self.path, self.network, self.average, self.steps = path, network, average, steps
-        self.optimiser, self.step, self.spent_s = torch.optim.Adam(network.parameters(), lr=RATE), 0, 0.0
+    def __init__(self, path: Path, network: Banked, average: Banked, steps: int, rate: float) -> None:
+        self.path, self.network, self.average, self.steps, self.rate = path, network, average, steps, rate
+        self.optimiser, self.step, self.spent_s = torch.optim.Adam(network.parameters()), 0, 0.0
         average.load_state_dict(network.state_dict())
         if path.exists():
             self._read()
@@ -189,7 +191,7 @@ class Training:
         for part, module in (("network.", self.network), ("average.", self.average)):
             module.load_state_dict({name: tensors[part + name] for name in module.state_dict()})
         for name, parameter in self.network.named_parameters():
-            moments = {key: tensors[f"{key}.{name}"] for key in ("exp_avg", "exp_avg_sq")}
+            moments = {key: tensors[f"{key}.{name}"].to(parameter.device) for key in ("exp_avg", "exp_avg_sq")}
             self.optimiser.state[parameter] = {"step": torch.tensor(float(self.step)), **moments}
 
     def save(self) -> None:
@@ -200,13 +202,15 @@ class Training:
             state = self.optimiser.state[parameter]
             found |= {f"{key}.{name}": state[key] for key in ("exp_avg", "exp_avg_sq")}
         header = {"step": self.step, "steps": self.steps, "spent_s": self.spent_s}
-        write_tensors(self.path, {name: value.detach().numpy() for name, value in found.items()}, header)
+        write_tensors(self.path, {name: value.detach().cpu().numpy() for name, value in found.items()}, header)
 
     def advance(self, batch: tuple[Tensor, ...], kind: str) -> None:
         """One step on a batch of (degraded, reference, vectors)."""
         degraded, reference, vectors = batch
         cosine = 0.5 * (1 + math.cos(math.pi * self.step / self.steps))
-        self.optimiser.param_groups[0]["lr"] = RATE * min(1, (self.step + 1) / WARM_STEPS) * (0.99 * cosine + 0.01)
+        self.optimiser.param_groups[0]["lr"] = (
+            self.rate * min(1, (self.step + 1) / WARM_STEPS) * (0.99 * cosine + 0.01)
+        )
         loss = loss_of(kind, self.network(degraded, vectors), reference, vectors)
         self.optimiser.zero_grad(set_to_none=True)
         loss.backward()  # type: ignore[no-untyped-call]
@@ -227,6 +231,10 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=12000)
     parser.add_argument("--every", type=int, default=500, help="steps between judgements")
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--batch", type=int, default=8)
+    parser.add_argument("--rate", type=float, default=1e-3, help="the highest learning rate")
+    parser.add_argument("--device", default="cpu")
+    parser.add_argument("--minutes", type=float, default=math.inf, help="stop after so many by the clock")
     parser.add_argument("--variation", action="append", default=[], help="skip=image, loss=l1, loss=unit")
     asked = parser.parse_args()
     variations = dict(each.split("=") for each in asked.variation)
@@ -239,17 +247,22 @@ def main() -> None:
     scenes = [read_scene(path, NOISE_FREE.nominal()) for path in list_images(asked.images)]
     kept, held = split_by_site([scene.name for scene in scenes])
     recipe = PatchRecipe(load_sensor("pleiades-degraded"), NOISE_FREE, PATCH_PX, family=SensorFamily(NOMINAL))
-    source, pairs = PatchSource([scenes[k] for k in kept], recipe, BATCH, asked.seed), None
-    training = Training(asked.out, network, average, asked.steps)
-    before_s, batches = training.spent_s - time.process_time(), source.batches(training.step)
-    pairs = judged_pairs([scenes[k] for k in held])
+    device = torch.device(asked.device)
+    source = PatchSource([scenes[k] for k in kept], recipe, asked.batch, asked.seed, device=device)
+    training = Training(asked.out, network.to(device), average.to(device), asked.steps, asked.rate)
+    before_s, end_s = training.spent_s - time.monotonic(), time.monotonic() + 60 * asked.minutes
+    batches, pairs = source.batches(training.step), judged_pairs([scenes[k] for k in held])
     while training.step < asked.steps:
-        training.advance(next(batches), variations.get("loss", "psnr"))
-        if training.step % asked.every == 0 or training.step == asked.steps:
-            found, training.spent_s = judge(average, pairs), before_s + time.process_time()
+        degraded, reference, vectors = next(batches)
+        training.advance((degraded, reference, vectors.to(device)), variations.get("loss", "psnr"))
+        ends = training.step == asked.steps or time.monotonic() > end_s
+        if training.step % asked.every == 0 or ends:
+            found, training.spent_s = judge(average, pairs), before_s + time.monotonic()
             training.save()
             mean = float(np.mean(list(found.values())))
             print(training.step, f"{training.spent_s / 60:.1f}", f"{mean:.3f}", json.dumps(found), flush=True)
+        if ends:
+            return
 
 
 if __name__ == "__main__":

@@ -4,7 +4,7 @@ Of a page's fences these count, in order:
 
 - any with a title, as ```toml title="my-sensor.toml": a file, written as it stands;
 - ```bash: commands, a line each, of the programs known here (`PROGRAMS`), run without a shell (so also on Windows),
-  ours within this process: what it has imported is not imported again for each command;
+  ours within this process, where all is imported already, but for the first time that each command comes up;
 - ```text: what the commands before it print. Each of its lines must come, in this order; `...` stands for anything,
   blanks and rules of tables have any length, and a number must be within 2 %, for processors differ.
 
@@ -33,7 +33,7 @@ ROOT = Path(__file__).resolve().parents[2]
 PYTHON = [sys.executable]
 OURS = "beers-deploy"
 PROGRAMS = {
-    OURS: [],
+    OURS: [*PYTHON, "-c", "from deploy.cli import app; app()"],
     "python": PYTHON,
     "python3": PYTHON,
     "rio": [*PYTHON, "-c", "from rasterio.rio.main import main_group; main_group()"],
@@ -41,6 +41,8 @@ PROGRAMS = {
 PART = re.compile(r'^```(\w+)(?: title="([^"]+)")?\n(.*?)^```$|^<!-- test: (.+?) -->$', re.MULTILINE | re.DOTALL)
 NUMBER = re.compile(r"(?<![\w.])-?\d[\d,]*(?:\.\d+)?(?:e[-+]?\d+)?")
 RELATIVE = 0.02
+STARTED = {"tradeoff"}
+"""Commands that have been started as a shell starts them; a study is small in this process alone."""
 
 
 @dataclass(frozen=True)
@@ -129,9 +131,12 @@ class Walk:
         words = shlex.split(short)
         if not words or words[0] not in PROGRAMS:
             raise PageError(f"{command}\nis no command of {' or '.join(PROGRAMS)}")
-        return self._ours(words[1:]) if words[0] == OURS else self._started(words)
+        if words[0] == OURS and STARTED.issuperset(words[1:2]):
+            return self._within(words[1:])
+        STARTED.update(words[1:2] if words[0] == OURS else ())
+        return self._started(words)
 
-    def _ours(self, words: list[str]) -> Done:
+    def _within(self, words: list[str]) -> Done:
         with chdir(self.folder):
             result = CliRunner().invoke(app, words, prog_name=OURS, env=environment(self.folder))
         if result.exception is not None and not isinstance(result.exception, SystemExit):
