@@ -52,7 +52,7 @@ NOISELESS = {
 }
 NOISE_FREE = replace(REFERENCE, **NOISELESS)  # type: ignore[arg-type]
 CLIP = 8.0
-"""Planes are held to this: what two int8 planes of a later INT8 file can hold."""
+"""Planes and the analytic restoration are held to so many units: what int8 of a sixteenth of a unit holds."""
 WARM_STEPS, PATCH_PX, EMA = 100, 96, 0.999
 JUDGED_PX = 160
 SENSORS = {
@@ -103,11 +103,10 @@ class Banked(nn.Module):
     def forward(self, image: Tensor, vectors: Tensor) -> Tensor:
         """Images (N, 1, H, W) over full scale and their sensors' vectors (N, 4) to (N, 1, H, W)."""
         banks = [bank_of_vector(*vector.tolist()) for vector in vectors]
-        kernels = torch.from_numpy(np.stack([[*bank.planes, bank.analytic] for bank in banks])).to(image)
+        kernels = torch.from_numpy(np.stack([[*bank.planes, bank.analytic / bank.unit] for bank in banks])).to(image)
         unit = image.new_tensor([bank.unit for bank in banks])[:, None, None, None]
-        filtered = each_by_its_own(image, kernels)
-        planes, analytic = filtered[:, :FILTERS].clamp(-CLIP, CLIP), filtered[:, FILTERS:]
-        read = torch.cat([image, planes], 1)
+        filtered = each_by_its_own(image, kernels).clamp(-CLIP, CLIP)
+        read = torch.cat([image, filtered[:, :FILTERS]], 1)
         read = pixel_unshuffle(read, self.scale) if self.scale > 1 else read
         shallow = (self.head(read) + self.bias(vectors)[:, :, None, None]).contiguous(
             memory_format=torch.channels_last
@@ -116,8 +115,8 @@ class Banked(nn.Module):
             deep = self.body_end(self.body(shallow))
         correction = self.tail(shallow + deep.float())
         correction = pixel_shuffle(correction, self.scale) if self.scale > 1 else correction
-        base = image if self.skip_image else image + analytic
-        restored: Tensor = base + unit * correction
+        analytic = 0 if self.skip_image else filtered[:, FILTERS:]
+        restored: Tensor = image + unit * (analytic + correction)
         return restored
 
 
