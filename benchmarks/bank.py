@@ -11,6 +11,12 @@ each sensor.
 
 Variations, for paired short trainings: skip=image adds the correction to the image and not to the analytic
 restoration; loss=l1 or loss=unit (L1 in units of g) in place of the logarithm of the squared error.
+
+`benchmarks/weights/bank-8x32.safetensors` is such a run, 5000 steps into 12 000: copied to OUT, it goes on.
+
+Measured, 4x16, 1500 steps, one seed, mean PSNR of ten sensors on six images of four sites that were kept apart:
+skip=image, loss=unit 41.51 dB; loss=unit 41.95; as it stands 42.26. With planes and unit divided by the noise at the
+local brightness 41.86 instead of 41.95; with the image stabilised (Anscombe) before the filters 39.66.
 """
 
 import argparse
