@@ -17,11 +17,8 @@ import numpy as np
 import onnx
 import onnxruntime as ort
 
-from deploy.export import to_onnx
 from deploy.networks import shipped_pair
-from model.io.weights import load_network
 from model.processor import decided, int8_adds_exactly, processor_name
-from model.shipped import SHIPPED
 from quant.kernels import filled, made_exact
 from quant.onnx_file import load_onnx
 from quant.session import open_session, run
@@ -41,11 +38,10 @@ def main() -> None:
     print(f"{processor_name()}, onnxruntime {ort.__version__}; int8: {decided()['int8 on onnxruntime']}")
     image = np.random.default_rng(0).random((1, 1, arguments.tile, arguments.tile), dtype=np.float32)
     for variant in arguments.variant:
-        integer = load_onnx(shipped_pair(variant)[1])
+        floating, integer = (load_onnx(path) for path in shipped_pair(variant))
         print_ways(variant, integer)
-        network, _ = load_network(SHIPPED / f"{variant}.safetensors")
         for threads in arguments.threads:
-            print_times(variant, to_onnx(network, {}), integer, image, threads, arguments.turns)
+            print_times(variant, floating, integer, image, threads, arguments.turns)
 
 
 def print_ways(variant: str, integer: onnx.ModelProto) -> None:

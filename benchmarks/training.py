@@ -26,7 +26,7 @@ from model.simulator.procedural import procedural_scene
 from model.training.checkpoint import TrainingRecipe
 from model.training.losses import LossWeights, RestorationLoss
 from model.training.patches import PatchRecipe, PatchSource
-from model.training.precision import Precision, in_precision
+from model.training.precision import MixedPrecision, Precision
 from model.training.trainer import Trainer
 from model.variants import VARIANTS
 from profiles import load_sensor
@@ -71,7 +71,7 @@ def rate(steps: int, work: Callable[[], None]) -> float:
 
 def bare_loop(trainer: Trainer, batches: list[tuple[Tensor, ...]]) -> None:
     """What anybody would write: forward, loss, backward, step."""
-    forward, loss = in_precision(trainer.network, trainer.precision), RestorationLoss(LOSS)
+    forward, loss = MixedPrecision(trainer.network, trainer.precision), RestorationLoss(LOSS)
     optimiser = torch.optim.Adam(trainer.network.parameters(), lr=1e-4)
     for degraded, reference in batches:
         degraded = degraded.to(memory_format=torch.channels_last)

@@ -16,12 +16,11 @@ from deploy.bench.tables import Swath, predict_file, predicted_rows, published_r
 from deploy.dpu.board import Dpu, load_dpu
 from deploy.dpu.checker.placement import Placement, place
 from deploy.dpu.reading import read_network
-from deploy.export import require_parity, weights_for
+from deploy.export import require_parity, torch_network
 from deploy.methods import network_method
 from deploy.networks import Say, float_file
 from deploy.report.page import Picture, Report, Table
 from deploy.restoration.options import TILE_PX
-from model.convbeers import plain_network
 from model.evaluation.methods import Restore
 from model.evaluation.scores import fidelity_row
 from model.io.files import whole_file
@@ -243,8 +242,8 @@ def quantise_and_gate(out: Path, seed: int, sensors: Sensors, say: Say) -> tuple
     """Specialise the shipped network, quantise on drawn scenes, compare; the gate's row and the INT8 model."""
     model = load_onnx(float_file(Path(VARIANT), sensors.degraded, say))
     save_onnx(model, out / "float.onnx")
-    weights, _ = weights_for(shipped_weights(VARIANT), sensors.degraded.nominal())
-    difference = require_parity(plain_network(weights.tensors, weights.variant), out / "float.onnx", 97)
+    network = torch_network(shipped_weights(VARIANT), sensors.degraded.nominal())
+    difference = require_parity(network, out / "float.onnx", 97)
     scenes = load_scenes(None, sensors.reference.nominal(), seed)
     patches = draw_patches(scenes, sensors.degraded, sensors.reference, CALIBRATION_PATCHES, seed)
     result = quantise_model(model, patches, {"calibration_sensor": sensors.degraded.name}, lambda: None)

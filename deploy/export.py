@@ -10,28 +10,54 @@ import numpy as np
 import onnx
 
 from deploy import __version__
-from model.io.tensors import Arrays, Weights, read_conditioned, read_plain
+from model.bank import FILTERS, in_places, network_bank
+from model.io.tensors import BANKED, Arrays, Weights, kind_of, read_banked, read_conditioned, read_plain
 from model.specialise import sensor_vector, specialised
 from profiles.errors import ModelError, OptionError
-from profiles.sensor import Sensor
+from profiles.sensor import Sensor, SensorProfile
 from quant.onnx_file import GraphWriter, image_info, load_onnx, make_model
 from quant.session import open_session, run
 
 if TYPE_CHECKING:
-    from model.convbeers import ConvBEERS
+    from model.convbeers import ConvBEERS, OfOneSensor
 
 MAX_DIFFERENCE = 1e-5
 """Of full scale: a twentieth of a digital number, above what float32 summation order explains."""
 
 
+def float_for(
+    path: Path, name: str, sensor: SensorProfile, tile_px: int | None = None
+) -> tuple[onnx.ModelProto, tuple[str, ...]]:
+    """A network that is conditioned on its sensor as an ONNX model for the middle of a profile.
+
+    Args:
+        path: of its weights.
+        name: that it is listed under.
+        sensor: whose images it is to restore.
+        tile_px: as in `to_onnx`.
+
+    Returns:
+        The model, and a sentence for each value of the sensor outside the range that was trained.
+
+    Raises:
+        ModelError: no conditioned network's weights.
+    """
+    known, vector = sensor.nominal(), sensor_vector(sensor.nominal())
+    if kind_of(path) == BANKED:
+        found = read_banked(path)
+        return banked_to_onnx(found, known, about(name, found.recipe, sensor.name), tile_px), vector.outside
+    weights, outside = weights_for(path, known)
+    return to_onnx(weights, about(name, weights.recipe, sensor.name), tile_px), outside
+
+
 def weights_for(path: Path, sensor: Sensor) -> tuple[Weights, tuple[str, ...]]:
-    """The weights of a conditioned network specialised to a sensor.
+    """The weights of a network whose every layer knows its sensor, specialised to one.
 
     Returns:
         Those of a plain network, and a sentence for each value of the sensor outside the range that was trained.
 
     Raises:
-        ModelError: no conditioned network's weights.
+        ModelError: no such network's weights.
     """
     found, vector = read_conditioned(path), sensor_vector(sensor)
     tensors = specialised(found.tensors, found.variant, vector)
@@ -45,21 +71,81 @@ def to_onnx(network: "Weights | ConvBEERS", about: dict[str, str], tile_px: int 
         OptionError: a tile that is no multiple of the network's scale.
     """
     scale = network.variant.scale
-    if tile_px is not None and tile_px % scale:
-        remedy = "choose another, or leave it out"
-        raise OptionError("--tile", expected=f"a multiple of {scale} px", got=f"{tile_px} px", remedy=remedy)
+    _require_tile(tile_px, scale)
     writer = GraphWriter()
     for name, value in _arrays(network).items():
         writer.constant(name, value)
-    stream = head = _conv(writer, "head", _moved(writer, "SpaceToDepth", "unshuffled", "image", scale))
-    for k in range(network.variant.blocks):
+    deep = _deep(writer, network.variant.blocks, _moved(writer, "SpaceToDepth", "unshuffled", "image", scale))
+    return _ended(writer, _conv(writer, "tail", deep), scale, about, tile_px)
+
+
+def banked_to_onnx(
+    weights: Weights, sensor: Sensor, about: dict[str, str], tile_px: int | None = None
+) -> onnx.ModelProto:
+    """A network behind the bank of a sensor as an ONNX model: its filters are the first convolution.
+
+    That convolution gives the image, the planes and the analytic restoration; the last one reads what the body gives
+    and, at one tap, the analytic restoration. The image's borders are mirrored in front.
+
+    Args:
+        weights: of a `BankedConvBEERS`.
+        sensor: whose images are restored.
+        about: metadata.
+        tile_px: side of a fixed square image, or None for any number and size.
+
+    Raises:
+        OptionError: a tile that is no multiple of the network's scale.
+    """
+    variant, bank = weights.variant, network_bank(sensor)
+    scale, pixels = variant.scale, variant.pixels
+    _require_tile(tile_px, scale)
+    vector = np.array(sensor_vector(sensor).values, np.float32)
+    tensors = dict(weights.tensors)
+    unread = np.zeros((variant.features, pixels, 3, 3), np.float32)
+    tensors["head.weight"] = np.concatenate([tensors["head.weight"], unread], 1)
+    tensors["head.bias"] = tensors["head.bias"] + tensors.pop("bias.weight") @ vector
+    analytic = np.zeros((pixels, (2 + FILTERS) * pixels, 3, 3), np.float32)
+    analytic[range(pixels), range(-pixels, 0), 1, 1] = 1
+    tensors["tail.weight"] = np.concatenate([tensors["tail.weight"], analytic], 1) * np.float32(bank.unit)
+    tensors["tail.bias"] = tensors["tail.bias"] * np.float32(bank.unit)
+    tensors["bank.weight"] = in_places(bank.kernels, scale).astype(np.float32)
+    tensors["bank.bias"] = np.repeat(np.array([-0.5, *[0] * (1 + FILTERS)], np.float32), pixels)
+    writer = GraphWriter()
+    for name, value in tensors.items():
+        writer.constant(name, value)
+    side = tensors["bank.weight"].shape[-1]
+    around = [0, 0, *[side // 2 * scale] * 2]
+    mirrored = writer.node(
+        "Pad", "mirrored", ["image", writer.constant("around", np.array(2 * around))], mode="reflect"
+    )
+    read = _moved(writer, "SpaceToDepth", "unshuffled", mirrored, scale)
+    planes = writer.node("Conv", "bank", [read, "bank.weight", "bank.bias"], pads=[0] * 4, kernel_shape=[side, side])
+    deep = writer.node("Concat", "deep", [_deep(writer, variant.blocks, planes), planes], axis=1)
+    return _ended(writer, _conv(writer, "tail", deep), scale, about, tile_px)
+
+
+def _deep(writer: GraphWriter, blocks: int, source: str) -> str:
+    """Head, blocks and the end of the body."""
+    stream = head = _conv(writer, "head", source)
+    for k in range(blocks):
         inner = writer.node("Relu", f"body.{k}.relu", [_conv(writer, f"body.{k}.first", stream)])
         stream = writer.node("Add", f"body.{k}.add", [stream, _conv(writer, f"body.{k}.second", inner)])
-    deep = writer.node("Add", "body_end.add", [head, _conv(writer, "body_end", stream)])
-    correction = _moved(writer, "DepthToSpace", "shuffled", _conv(writer, "tail", deep), scale)
-    writer.node("Add", "restored", ["image", correction])
+    return writer.node("Add", "body_end.add", [head, _conv(writer, "body_end", stream)])
+
+
+def _ended(
+    writer: GraphWriter, correction: str, scale: int, about: dict[str, str], tile_px: int | None
+) -> onnx.ModelProto:
+    """The model that adds a correction to the image."""
+    writer.node("Add", "restored", ["image", _moved(writer, "DepthToSpace", "shuffled", correction, scale)])
     graph = writer.graph("convbeers", [image_info("image", 1, tile_px)], [image_info("restored", 1, tile_px)])
     return make_model(graph, {"beers_deploy_version": __version__, "precision": "float32", **about})
+
+
+def _require_tile(tile_px: int | None, scale: int) -> None:
+    if tile_px is not None and tile_px % scale:
+        remedy = "choose another, or leave it out"
+        raise OptionError("--tile", expected=f"a multiple of {scale} px", got=f"{tile_px} px", remedy=remedy)
 
 
 def _arrays(network: "Weights | ConvBEERS") -> Arrays:
@@ -68,7 +154,7 @@ def _arrays(network: "Weights | ConvBEERS") -> Arrays:
     return {name: value.numpy() for name, value in network.state_dict().items()}
 
 
-def parity(network: "ConvBEERS", model: Path | onnx.ModelProto, side_px: int) -> float:
+def parity(network: "ConvBEERS | OfOneSensor", model: Path | onnx.ModelProto, side_px: int) -> float:
     """Largest absolute difference between torch and onnxruntime on one random image, in [0, 1] of full scale.
 
     The image's side is the next multiple of the network's scale.
@@ -90,7 +176,7 @@ def parity(network: "ConvBEERS", model: Path | onnx.ModelProto, side_px: int) ->
     return difference
 
 
-def require_parity(network: "ConvBEERS", model: Path | onnx.ModelProto, side_px: int) -> float:
+def require_parity(network: "ConvBEERS | OfOneSensor", model: Path | onnx.ModelProto, side_px: int) -> float:
     """As `parity`, and small.
 
     Raises:
@@ -133,3 +219,24 @@ def about(variant: str, recipe: dict[str, object], sensor: str | None = None) ->
         "sensor": sensor if sensor is not None else str(recipe.get("degraded", "")),
         "reference": str(recipe.get("reference", "")),
     }
+
+
+def torch_network(path: Path, sensor: Sensor | None = None) -> "ConvBEERS | OfOneSensor":
+    """The network of torch that an exported one must compute as: of weights, for a sensor where they need one.
+
+    Raises:
+        ModelError: no such weights.
+    """
+    import torch
+
+    from model.convbeers import OfOneSensor, banked_network, plain_network
+
+    if sensor is None:
+        weights = read_plain(path)
+    elif kind_of(path) == BANKED:
+        found = read_banked(path)
+        vector = torch.tensor(sensor_vector(sensor).values)
+        return OfOneSensor(banked_network(found.tensors, found.variant), vector, network_bank(sensor))
+    else:
+        weights, _ = weights_for(path, sensor)
+    return plain_network(weights.tensors, weights.variant)

@@ -16,22 +16,30 @@ import onnx
 import platformdirs
 
 from deploy.cache import code_digest, digest_of
-from deploy.export import about, to_onnx, weights_for
+from deploy.export import float_for
+from model.bank import REFERENCE, bank_of_vector, network_bank
 from model.io.files import require_writable, sha256
-from model.io.tensors import is_conditioned
+from model.io.tensors import BANKED, is_conditioned, kind_of, read_banked
 from model.progress import steps
 from model.shipped import INT8, SENSOR, SHIPPED, VARIANT, shipped_names, shipped_weights
-from model.specialise import sensor_vector
+from model.specialise import RANGES, sensor_vector
 from profiles.errors import ModelError
 from profiles.sensor import SensorProfile, numbers_of
 from profiles.sensor_file import load_sensor
-from quant.onnx_file import is_quantised, load_onnx, metadata, save_onnx
+from profiles.toml import unreadable
+from quant.banked.family import FAMILY, required_family, with_delta
+from quant.core import SHIFTS, Shifts
+from quant.encodings import host_model
+from quant.onnx_file import fixed_tile_px, is_quantised, load_onnx, metadata, save_onnx
 
-MAKING = {"float32": ("deploy.export",), "int8": ("quant.quantise", "quant.calibration")}
+MAKING = {"float32": ("deploy.export",), "int8": ("quant.quantise", "quant.calibration", "quant.banked.calibrate")}
 """The modules that make a file of each precision: with other code they are made anew."""
 
 MADE_FROM = "made_from"
 """In the metadata of a file: a digest of weights and sensor."""
+
+WEIGHTS = "weights_sha256"
+"""In the metadata of an INT8 network behind a bank: the SHA-256 of its float weights."""
 
 PATCHES, PATCH_PX, SEED = 64, 128, 0
 """Of calibration, on drawn scenes: what `quantize` takes where nothing else is asked for."""
@@ -146,10 +154,10 @@ def shipped_pair(name: str = VARIANT, sensor: str = SENSOR, say: Say = silent) -
 
 def specialised_model(network: Conditioned, sensor: SensorProfile, say: Say) -> onnx.ModelProto:
     """A conditioned network in float32 for one sensor, as ONNX."""
-    weights, outside = weights_for(network.weights, sensor.nominal())
+    model, outside = float_for(network.weights, network.name, sensor)
     for sentence in outside:
         say(f"warning: {sentence}")
-    return to_onnx(weights, about(network.name, weights.recipe, sensor.name))
+    return model
 
 
 def other_precision(model: onnx.ModelProto) -> onnx.ModelProto | None:
@@ -183,10 +191,103 @@ def _kept(network: Conditioned, sensor: SensorProfile, precision: str, say: Say)
     path = cache_folder() / f"{stem}-{known}-{digest[:12]}.onnx"
     if not path.is_file():
         require_writable(path)
-        model = specialised_model(network, sensor, silent)
-        made = _in_int8(model, sensor, {MADE_FROM: made_from}) if precision == "int8" else model
-        save_onnx(made, path)
+        save_onnx(_made(network, sensor, precision, {MADE_FROM: made_from}), path)
     return path
+
+
+def _made(network: Conditioned, sensor: SensorProfile, precision: str, more: dict[str, str]) -> onnx.ModelProto:
+    if precision == "int8" and kind_of(network.weights) == BANKED:
+        return told_int8(load_onnx(_family_file(network)), sensor, more)
+    model = specialised_model(network, sensor, silent)
+    return _in_int8(model, sensor, more) if precision == "int8" else model
+
+
+def told_int8(
+    model: onnx.ModelProto, sensor: SensorProfile, more: dict[str, str], say: Say = silent
+) -> onnx.ModelProto:
+    """An INT8 network behind a bank told another sensor: its filters, unit and head's bias written anew.
+
+    Args:
+        model: of whatever sensor.
+        sensor: of which the middle is taken.
+        more: metadata to add.
+        say: is told what of the sensor lies outside the range that was trained.
+
+    Raises:
+        ModelError: no such file.
+    """
+    family, known = required_family(model), sensor.nominal()
+    vector = sensor_vector(known)
+    for sentence in vector.outside:
+        say(f"warning: {sentence}")
+    core = family.for_sensor(network_bank(known), vector.values)
+    return host_model(core, {**metadata(model), "sensor": sensor.name, **more}, fixed_tile_px(model))
+
+
+def told_by_delta(model: onnx.ModelProto, delta: Path) -> onnx.ModelProto:
+    """An INT8 network behind a bank told the sensor of a delta, a file that `export --delta` wrote.
+
+    Raises:
+        ModelError: no such network, no delta, or one of another network.
+    """
+    try:
+        packed = delta.read_bytes()
+    except OSError as error:
+        remedy = "give a file that 'export --delta' wrote"
+        raise ModelError(
+            str(delta), expected="a delta", got=unreadable(delta) or str(error), remedy=remedy
+        ) from error
+    core, name = with_delta(required_family(model).core, packed)
+    return host_model(core, {**metadata(model), "sensor": name}, fixed_tile_px(model))
+
+
+def _family_file(network: Conditioned) -> Path:
+    """The INT8 file of a network behind a bank, shipped, or made once of a user's own weights."""
+    shipped = SHIPPED / f"{network.name}{INT8}.onnx"
+    weights = sha256(network.weights)
+    if shipped.is_file() and metadata(load_onnx(shipped)).get(WEIGHTS) == weights:
+        return shipped
+    path = cache_folder() / f"{network.name}{INT8}-{weights[:12]}-{code_digest(*MAKING['int8'])[:12]}.onnx"
+    if not path.is_file():
+        require_writable(path)
+        save_onnx(family_model(network, None), path)
+    return path
+
+
+def behind_bank(given: Path) -> Conditioned | None:
+    """The network behind the bank of its sensor that is meant, a file's or a shipped one; None for any other.
+
+    Raises:
+        ModelError: weights that cannot be read.
+    """
+    found = conditioned(given)
+    return found if found and kind_of(found.weights) == BANKED else None
+
+
+def family_model(
+    network: Conditioned, images: Path | None, seed: int = SEED, shifts: Shifts = SHIFTS
+) -> onnx.ModelProto:
+    """The INT8 file of a network behind a bank, for the middle of the family; any sensor can be told to it.
+
+    Args:
+        network: of weights that 'train --conditioned' wrote.
+        images: folder of scenes that the family sees while it is calibrated; None draws some.
+        seed: of the patches.
+        shifts: the windows of the target.
+
+    Raises:
+        ModelError: other weights.
+    """
+    from model.simulator.procedural import load_scenes  # torch, which what is kept already does not need
+    from quant.banked.calibrate import family_images, family_ticks, quantise_family
+
+    weights = read_banked(network.weights)
+    scenes = load_scenes(images, load_sensor(REFERENCE).nominal(), seed)
+    with steps(f"calibrating {network.name} over the family of sensors", family_ticks(weights)) as bar:
+        seen = family_images(scenes, weights.variant.scale, seed)
+        family = quantise_family(weights, bank_of_vector((0.0,) * len(RANGES)), seen, bar.advance, shifts)
+    said = {"variant": network.name, "reference": REFERENCE, "precision": "int8 legal", "calibration_seed": str(seed)}
+    return host_model(family.core, {**said, FAMILY: family.to_words(), WEIGHTS: sha256(network.weights)})
 
 
 def _in_int8(model: onnx.ModelProto, sensor: SensorProfile, more: dict[str, str]) -> onnx.ModelProto:

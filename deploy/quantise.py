@@ -10,18 +10,21 @@ from pathlib import Path
 
 import onnx
 
+from deploy.networks import Conditioned, family_model, specialised_model, told_int8
 from deploy.report.page import Report, write_report
 from deploy.report.sensitivity_page import sensitivity_page
 from model.progress import steps
+from profiles import load_sensor
 from profiles.errors import OptionError
 from profiles.figures import Row
 from profiles.target import TargetProfile, board_names
 from quant.calibration import Calibration, Patches
 from quant.core import Shifts, target_shifts
+from quant.encodings import board_model, read_core
 from quant.free import free_ticks, quantise_free
 from quant.gate import compare, gate_row
 from quant.integer import integer_rows
-from quant.onnx_file import save_onnx
+from quant.onnx_file import metadata, save_onnx
 from quant.passes.tune import Tuning
 from quant.quantise import Passes, Quantised, ablation_rows, ablations, quantise_model, ticks
 from quant.samples import OwnSamples
@@ -102,6 +105,46 @@ def quantise_legal_file(
     show("tie rounding", [rounding])
     rows = [*layers, rounding, *(_ablated(model, calibration, shifts, show) if wanted.ablate else [])]
     return _with_sensitivity(model, result, calibration, rows, wanted.page, say) if wanted.page else rows
+
+
+def quantise_banked_file(
+    network: Conditioned,
+    calibration: Calibration,
+    target: TargetProfile,
+    out: Path,
+    board: Path | None,
+    say: Say,
+    show: Show,
+) -> list[Row]:
+    """Write the INT8 file of a network behind a bank, told a sensor; show each integer layer on its patches.
+
+    Args:
+        network: of weights that 'train --conditioned' wrote.
+        calibration: scenes and seed of the family's patches, and the sensor that is told.
+        target: whose rules to obey.
+        out: the host's file.
+        board: the board's, or None.
+        say: tells what was written.
+        show: shows the tables.
+
+    Raises:
+        OptionError: a target without a DPU.
+        ModelError: other weights.
+    """
+    sensor, made = load_sensor(calibration.sensor), {"target": target.name}
+    family = family_model(network, calibration.images, calibration.seed, _shifts_of(target))
+    host = told_int8(family, sensor, made)
+    core = read_core(host)
+    save_onnx(host, out)
+    say(f"wrote {out}: {len(core.ops)} integer operations, for {sensor.name}; any sensor in range can be told to it")
+    if board is not None:
+        save_onnx(board_model(core, metadata(host)), board)
+        say(f"wrote {board}: the same numbers in the board's encoding")
+    model, patches = specialised_model(network, sensor, say), calibration.drawn.degraded
+    layers, rounding = integer_rows(model, core, host, patches)
+    show("integer layers", layers)
+    show("tie rounding", [rounding])
+    return [*layers, rounding]
 
 
 def _shifts_of(target: TargetProfile) -> Shifts:

@@ -1,10 +1,11 @@
 """The science: what is computed on images, and the networks. It imports `profiles` and nothing else of ours.
 
-- `convbeers`: the network; `conditioning`: the one whose sensor is known to it, folded into a plain one;
+- `convbeers`: the network, plain and behind the bank of a sensor's filters (`bank`); `conditioning`: the one whose
+  sensor is known to every layer, folded into a plain one; `weights`: networks of torch on disk;
 - `simulator`: from a scene's radiance to digital numbers; `traditional`: the pipeline that a network has to beat;
 - `dataset`: pairs on disk; `training`: runs that make weights;
 - `metrics`: what a restored image is worth; `evaluation`: methods compared on the same pairs;
-- `io`: images and weights on disk; `shipped`: where our weights lie; `processor`: what this machine's kernels do;
+- `io`: images and tensors on disk; `shipped`: where our weights lie; `processor`: what this machine's kernels do;
 - `progress`: what long work shows, and how Ctrl-C stops it.
 
 It offers no names of its own, so that finding a file or reading an image loads no torch.

@@ -15,14 +15,21 @@ network: Dong, Roth and Schiele, NeurIPS 2020.) This is NumPy alone, so that a r
 """
 
 import math
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import product
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from model.simulator.mtf import NYQUIST, sensor_mtf
+from model.specialise import RANGES
+from profiles import load_sensor
 from profiles.sensor import Sensor
+
+REFERENCE = "pleiades-reference"
+"""The profile of what networks are trained to restore."""
 
 FILTERS, SIDE_PX = 4, 7
 """7 x 7 holds 98.6 to 99.95 % of a filter's energy, and is the largest square that the window of a DPU takes."""
@@ -65,6 +72,13 @@ class Bank:
         return np.asarray(self.details[1:].sum(0))
 
     @property
+    def kernels(self) -> NDArray[np.float64]:
+        """What a network reads of the image: itself, the four planes, (W_1 - 1) x / g: (6, 7, 7)."""
+        itself = np.zeros((1, SIDE_PX, SIDE_PX))
+        itself[0, SIDE_PX // 2, SIDE_PX // 2] = 1
+        return np.concatenate([itself, self.planes, self.analytic[None] / self.unit])
+
+    @property
     def unit(self) -> float:
         """The share g of full scale that is 1 in what a network adds."""
         return UNIT * self.sigma * float(np.linalg.norm(self.analytic))
@@ -72,7 +86,25 @@ class Bank:
 
 def bank_of(sensor: Sensor, reference: Sensor) -> Bank:
     """The filters from what `sensor` sees to what `reference` would have seen; rounding alone is noise enough."""
-    sigma = noise_over_full_scale(sensor)
+    return _bank(sensor, reference, noise_over_full_scale(sensor))
+
+
+def network_bank(sensor: Sensor) -> Bank:
+    """The filters in front of a network: noise outside the range that was trained counts as the nearest end of it."""
+    sigma = min(max(noise_over_full_scale(sensor), RANGES["sigma_bright"][0]), RANGES["sigma_bright"][1])
+    return _bank(sensor, load_sensor(REFERENCE).nominal(), sigma)
+
+
+def bank_of_vector(vector: Sequence[float]) -> Bank:
+    """As `network_bank`, of the sensor that a sensor vector (4,) tells of."""
+    reference = load_sensor(REFERENCE).nominal()
+    ends = zip(vector, RANGES.values(), strict=True)
+    across, along, _, sigma = (low * (high / low) ** ((entry + 1) / 2) for entry, (low, high) in ends)
+    axes = replace(reference, mtf_nyquist=across, mtf_nyquist_along=along, effects={}, response=None)
+    return _bank(axes, reference, sigma)
+
+
+def _bank(sensor: Sensor, reference: Sensor, sigma: float) -> Bank:
     fy, fx = np.fft.fftfreq(GRID)[:, None], np.fft.fftfreq(GRID)[None, :]
     blur, target = sensor_mtf(fx, fy, sensor), sensor_mtf(fx, fy, reference)
     r_squared = (fx**2 + fy**2) / NYQUIST**2
@@ -80,6 +112,21 @@ def bank_of(sensor: Sensor, reference: Sensor) -> Bank:
     gains = [restoring_gain(blur, target, r_squared, epsilon) for epsilon in epsilons]
     falling = np.stack([*gains, np.ones_like(blur)])
     return Bank(np.stack([_cut(gain) for gain in falling[:-1] - falling[1:]]), sigma)
+
+
+def in_places(kernels: NDArray[np.float64], scale: int) -> NDArray[np.float64]:
+    """Kernels (K, 7, 7) as the convolution that makes their planes where S x S pixels are the channels of one place.
+
+    Returns:
+        (K S^2, S^2, k, k), k places wide: 7 at scale 1, 5 at scale 2. The channels are ordered as a pixel unshuffle
+        of the planes, and of the image, orders them.
+    """
+    reach, middle = -(-(SIDE_PX // 2) // scale), SIDE_PX // 2
+    found = np.zeros((len(kernels), scale, scale, scale, scale, 2 * reach + 1, 2 * reach + 1))
+    for row, column, down, right in product(range(scale), range(scale), range(SIDE_PX), range(SIDE_PX)):
+        (place_y, y), (place_x, x) = divmod(row + down - middle, scale), divmod(column + right - middle, scale)
+        found[:, row, column, y, x, place_y + reach, place_x + reach] = kernels[:, down, right]
+    return found.reshape(len(kernels) * scale**2, scale**2, 2 * reach + 1, 2 * reach + 1)
 
 
 def noise_over_full_scale(sensor: Sensor) -> float:

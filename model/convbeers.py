@@ -7,16 +7,25 @@ behind its tail (pixel unshuffle and shuffle; Shi et al., CVPR 2016). The host d
 1 / S of the resolution.
 
 Every convolution is 3 x 3 with stride 1 and zero padding 1. 16 blocks of 64 features make 1.2 M parameters.
+
+Behind the bank of its sensor (`model.bank`) the same body is one network for every sensor in range:
+
+    restored = x + g (w + body([x - 1/2, u])),   w = (W_1 - 1) x / g
+
+What a sensor changes are the filters that make u and w and the unit g, known in closed form, and the bias of the
+head, which is linear in the sensor vector.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from functools import lru_cache
 
 import numpy as np
 import torch
 from torch import Tensor, nn
-from torch.nn.functional import pixel_shuffle, pixel_unshuffle
+from torch.nn.functional import conv2d, pad, pixel_shuffle, pixel_unshuffle
 
-from model.variants import Variant
+from model.bank import FILTERS, SIDE_PX, Bank, bank_of_vector
+from model.variants import BANK_PLANES, SENSOR_VALUES, Variant
 
 
 def conv3x3(inputs: int, outputs: int) -> nn.Conv2d:
@@ -49,10 +58,12 @@ class ConvBEERS(nn.Module):
         self.body_end = conv3x3(variant.features, variant.features)
         self.tail = conv3x3(variant.features, variant.pixels)
 
-    def forward(self, image: Tensor) -> Tensor:
-        """Image plus correction, (N, 1, H, W)."""
+    def forward(self, image: Tensor, bfloat16: bool = False) -> Tensor:
+        """Image plus correction, (N, 1, H, W); `bfloat16` is for the blocks alone."""
         shallow = self.entered(image)
-        return image + self.left(shallow + self.body_end(self.body(shallow)))
+        with torch.autocast(image.device.type, dtype=torch.bfloat16, enabled=bfloat16):
+            deep = self.body_end(self.body(shallow))
+        return image + self.left(shallow + deep.float())
 
     def entered(self, image: Tensor) -> Tensor:
         """Image (N, 1, H, W) through the head: (N, F, H / S, W / S)."""
@@ -64,7 +75,94 @@ class ConvBEERS(nn.Module):
         return pixel_shuffle(self.tail(deep), self.variant.scale)
 
 
-def initialise(network: ConvBEERS, generator: torch.Generator) -> None:
+CLIP = 8.0
+"""Planes and the analytic restoration are held to so many units in training: what int8 of a sixteenth holds. Values
+beyond are rare enough that a network alone costs nothing without the limit (measured: 0.000 dB on ten sensors)."""
+
+
+class BankedConvBEERS(nn.Module):
+    """Images (N, 1, H, W) in [0, 1] of full scale and sensor vectors (N, 4) to (N, 1, H, W), not clipped."""
+
+    def __init__(self, variant: Variant) -> None:
+        super().__init__()
+        self.variant = variant
+        self.head = conv3x3(BANK_PLANES * variant.pixels, variant.features)
+        self.body = nn.Sequential(*(ResidualBlock(variant.features) for _ in range(variant.blocks)))
+        self.body_end = conv3x3(variant.features, variant.features)
+        self.tail = conv3x3(variant.features, variant.pixels)
+        self.bias = nn.Linear(SENSOR_VALUES, variant.features, bias=False)
+        nn.init.zeros_(self.bias.weight)
+
+    def forward(
+        self, image: Tensor, vectors: Tensor, banks: Sequence[Bank] | None = None, bfloat16: bool = False
+    ) -> Tensor:
+        """Restore each image as its own sensor asks for.
+
+        Args:
+            image: (N, 1, H, W).
+            vectors: (N, 4).
+            banks: of each sensor; None makes them of the vectors.
+            bfloat16: for the blocks alone.
+        """
+        banks = banks or [_bank(*vector.tolist()) for vector in vectors]
+        kernels = np.stack([[*bank.planes, bank.analytic / bank.unit] for bank in banks])
+        filtered = each_by_its_own(image, torch.from_numpy(kernels).to(image))
+        filtered = filtered.clamp(-CLIP, CLIP) if self.training else filtered
+        read = pixel_unshuffle(torch.cat([image - 0.5, filtered[:, :FILTERS]], 1), self.variant.scale)
+        shallow = (self.head(read) + self.bias(vectors)[:, :, None, None]).contiguous(
+            memory_format=torch.channels_last
+        )
+        with torch.autocast(image.device.type, dtype=torch.bfloat16, enabled=bfloat16):
+            deep = self.body_end(self.body(shallow))
+        correction = pixel_shuffle(self.tail(shallow + deep.float()), self.variant.scale)
+        unit = image.new_tensor([bank.unit for bank in banks])[:, None, None, None]
+        restored: Tensor = image + unit * (filtered[:, FILTERS:] + correction)
+        return restored
+
+
+class OfOneSensor(nn.Module):
+    """A network behind a bank, told one sensor: (N, 1, H, W) in [0, 1] of full scale to the same.
+
+    Args:
+        network: whose weights it shares.
+        vector: of the sensor, (4,).
+        bank: of the sensor; None makes it of the vector.
+    """
+
+    def __init__(self, network: BankedConvBEERS, vector: Tensor, bank: Bank | None = None) -> None:
+        super().__init__()
+        self.network, self.vector, self.bank, self.variant = network, vector, bank, network.variant
+
+    def forward(self, image: Tensor) -> Tensor:
+        """(N, 1, H, W) to the same."""
+        banks = [self.bank] * len(image) if self.bank else None
+        restored: Tensor = self.network(image, self.vector.expand(len(image), -1), banks)
+        return restored
+
+
+Network = ConvBEERS | BankedConvBEERS
+"""What can be trained and kept: a plain network, or one for every sensor in range."""
+
+
+def told(network: Network, vector: Tensor) -> ConvBEERS | OfOneSensor:
+    """A network that takes images alone: one behind a bank told the sensor of a vector (4,), a plain one as it is."""
+    return OfOneSensor(network, vector) if isinstance(network, BankedConvBEERS) else network
+
+
+@lru_cache(maxsize=4096)
+def _bank(*vector: float) -> Bank:
+    return bank_of_vector(vector)
+
+
+def each_by_its_own(image: Tensor, kernels: Tensor) -> Tensor:
+    """Image n of (N, 1, H, W), mirrored at its borders, by kernels n of (N, K, 7, 7): (N, K, H, W)."""
+    count, radius = len(image), SIDE_PX // 2
+    wide = pad(image, [radius] * 4, mode="reflect")
+    made = conv2d(wide.transpose(0, 1), kernels.flatten(0, 1)[:, None], groups=count)
+    return made.view(count, -1, *image.shape[-2:])
+
+
+def initialise(network: Network, generator: torch.Generator) -> None:
     """Start as (nearly) the identity: He-normal weights, residual branches and correction scaled down.
 
     Without batch normalisation the stream's variance would otherwise double at each block. The tail is scaled down
@@ -79,6 +177,13 @@ def initialise(network: ConvBEERS, generator: torch.Generator) -> None:
                 module.weight.normal_(0.0, scale * (2 / fan_in) ** 0.5, generator=generator)
                 if module.bias is not None:
                     module.bias.zero_()
+
+
+def banked_network(weights: Mapping[str, np.ndarray], variant: Variant) -> BankedConvBEERS:
+    """As `plain_network`, of a network behind a bank."""
+    network = BankedConvBEERS(variant)
+    network.load_state_dict({name: torch.from_numpy(np.array(value)) for name, value in weights.items()})
+    return network.eval()
 
 
 def plain_network(weights: Mapping[str, np.ndarray], variant: Variant) -> ConvBEERS:

@@ -9,6 +9,9 @@ from dataclasses import dataclass
 
 from profiles.errors import OptionError
 
+BANK_PLANES, SENSOR_VALUES = 5, 4
+"""What a head behind a bank reads: the image and four planes of each pixel, and the numbers of a sensor vector."""
+
 
 @dataclass(frozen=True)
 class Variant:
@@ -49,6 +52,12 @@ class Variant:
         for name, (outputs, inputs) in self.convolutions.items():
             found |= {f"{name}.weight": (outputs, inputs, 3, 3), f"{name}.bias": (outputs,)}
         return found
+
+    @property
+    def banked_shapes(self) -> dict[str, tuple[int, ...]]:
+        """As `shapes`, behind a bank of four filters: its head reads their planes, and is told a sensor vector."""
+        head = self.features, BANK_PLANES * self.pixels, 3, 3
+        return {**self.shapes, "head.weight": head, "bias.weight": (self.features, SENSOR_VALUES)}
 
 
 VARIANTS = {

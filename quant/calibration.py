@@ -15,6 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from model.conditioning import SensorFamily
 from model.simulator.acquire import MARGIN_PX, acquire
 from model.simulator.detector import Draw
 from model.simulator.mtf import transfer_function
@@ -101,7 +102,8 @@ def draw_views(
     room = np.array([_room_px(*place) for place in places])
     drawn = generator.choice(len(places), VIEW_CANDIDATES * count, p=room / room.sum())
     grounds = [_ground(places[k], recipe, generator) for k in drawn]
-    sensors = [recipe.degraded.draw(generator) for _ in range(VIEW_CANDIDATES * count)]
+    seen_by = recipe.family or recipe.degraded
+    sensors = [seen_by.draw(generator) for _ in range(VIEW_CANDIDATES * count)]
     dark = recipe.degraded.radiance_0.low
     spread = zip(
         stratified(grounds, lambda ground: ground.brightness, count, generator),
@@ -214,14 +216,24 @@ def draw_patches(
     count: int,
     seed: int,
     patch_px: int = PATCH_PX,
+    family: SensorFamily | None = None,
 ) -> Patches:
     """Patches by sensor profile and seed, spread over the profile's ranges and over brightness.
+
+    Args:
+        scenes: that are seen.
+        degraded: the sensors that see them, unless a family does.
+        reference: the sensor of the wanted images.
+        count: of patches.
+        seed: of everything that is drawn.
+        patch_px: side of a patch.
+        family: of sensors with the gain and bits of `degraded`.
 
     Raises:
         ImageError: no scene holds a patch.
         ProfileError: the two profiles differ in gain, bits or offset.
     """
-    recipe = PatchRecipe(degraded, reference, patch_px=patch_px)
+    recipe = PatchRecipe(degraded, reference, patch_px=patch_px, family=family)
     views = draw_views(scenes, recipe, count, Draw(seed).generator("views"))
 
     def pair(number: int) -> Pair:
@@ -246,7 +258,8 @@ def _simulate(ground: Ground, sensors: dict[str, Sensor], draw: Draw) -> list[np
         for role, sensor in sensors.items()
     ]
     transfer_function.cache_clear()  # no two patches share one, and each is megabytes
-    turned = turn(torch.stack(images)[:, None], draw.generator("turn"))
+    mirrors, quarters = sensors[DEGRADED].symmetry
+    turned = turn(torch.stack(images)[:, None], draw.generator("turn"), quarters, mirrors)
     return [np.ascontiguousarray(image[None]) for image in turned.numpy()]
 
 

@@ -9,7 +9,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from onnx import TensorProto, helper
 
+from model.bank import SIDE_PX
 from model.io.images import MAX_DN
+from quant.banked.filters import ANALYTIC_COPIES, BITS, MIDDLE_DN, PART, STEP_DN, UNITS, split_planes
 from quant.graph import (
     COARSE_MAX,
     CORRECTION,
@@ -30,6 +32,7 @@ from quant.onnx_file import GraphWriter
 ZERO = 128
 """Around which uint8 stands for int8 in the host's file."""
 GAIN = 8
+BORDER_PX = SIDE_PX // 2
 FINE_MAX = 126
 """The largest size at which the fine channel is believed: one below int8's end."""
 
@@ -48,6 +51,10 @@ class Ends:
         flat: whether the result is (N, K).
         softmax: whether it is made probabilities, along the channels.
         tail: what else is done to the result, such as decoding boxes.
+        banked: whether the core begins with the bank of a sensor (`quant.banked`): the image's borders are mirrored,
+            the planes are the bank's, and the analytic restoration comes in copies behind the correction's gains.
+        unit: the share of full scale that is 1 in the core's result.
+        direct: whether the image is planes already, whole multiples of 1/128: what follows a bank by itself.
         gains: 2 where the correction's channels come twice, fine and coarse by `GAIN`.
         outputs: channels of the correction, gains and windows not counted.
         offsets: what each window has taken off each channel, (windows, outputs): the channels come coarse
@@ -66,6 +73,14 @@ class Ends:
     outputs: int = 1
     offsets: tuple[tuple[float, ...], ...] = ()
     tail: Tail | None = None
+    banked: bool = False
+    unit: float = 1.0
+    direct: bool = False
+
+    @property
+    def mirrored_px(self) -> int:
+        """Pixels by which the image's borders are mirrored in front of the planes."""
+        return -(-BORDER_PX // self.place_px) * self.place_px if self.banked else 0
 
     @property
     def image_channels(self) -> int:
@@ -84,9 +99,13 @@ class Ends:
 
     def split(self, image: np.ndarray) -> np.ndarray:
         """An image (N, C, H, W) in [0, 1] to the core's planes, int8."""
+        if self.direct:
+            return np.clip(np.rint(image * 2.0**BITS), -128, 127).astype(np.int8)
+        if self.mirrored_px:
+            image = np.pad(image, ((0, 0), (0, 0), *[(self.mirrored_px,) * 2] * 2), "reflect")
         for shuffle in self.front:
             image = shuffle(image)
-        return split(image, self.planes)
+        return split_planes(image) if self.banked else split(image, self.planes)
 
     def merge(self, correction: np.ndarray, scale: float) -> np.ndarray:
         """One correction (N, C, H, W) from its gains or windows: (N, copies C, H, W) multiples of `scale`."""
@@ -94,8 +113,14 @@ class Ends:
             return self._of_windows(correction, scale)
         if self.gains == 1:
             return correction
-        fine, coarse = np.split(correction, 2, axis=1)
-        return np.where(np.abs(fine) <= (FINE_MAX + 0.5) * scale, fine, coarse * np.float32(GAIN))
+        fine, coarse, *analytic = np.split(correction, self.copies, axis=1)
+        limit = np.float32((FINE_MAX + 0.5) * scale)
+        value = np.where(np.abs(fine) <= limit, fine, coarse * np.float32(GAIN))
+        return value + np.sum(analytic, 0) * np.float32(self.analytic_gain(scale)) if analytic else value
+
+    def analytic_gain(self, scale: float) -> float:
+        """What the sum of the analytic copies is multiplied with, where one step is said to be `scale`."""
+        return 1 / (UNITS * ANALYTIC_COPIES * scale)
 
     def whole(self, correction: np.ndarray) -> np.ndarray:
         """One correction from all its copies in float, which rounding has not touched: (N, C, H, W)."""
@@ -119,7 +144,7 @@ class Ends:
     @property
     def copies(self) -> int:
         """How often the core writes each channel of its result."""
-        return 1 + len(self.offsets) if self.offsets else self.gains
+        return 1 + len(self.offsets) if self.offsets else self.gains + ANALYTIC_COPIES * self.banked
 
     def restored(self, image: np.ndarray, correction: np.ndarray, scale: float) -> np.ndarray:
         """What the host makes of an image (N, C, H, W) and the core's result."""
@@ -127,6 +152,7 @@ class Ends:
 
     def finished(self, image: np.ndarray, result: np.ndarray) -> np.ndarray:
         """As `restored`, of a correction that is one already."""
+        result = result * np.float32(self.unit) if self.unit != 1 else result
         for shuffle in self.back:
             result = shuffle(result)
         if self.softmax:
@@ -151,7 +177,7 @@ class Ends:
         result = result - image if self.adds_image else result
         for shuffle in reversed(self.back):
             result = shuffle.inverse(result)
-        return np.ascontiguousarray(result)
+        return np.ascontiguousarray(result / np.float32(self.unit))
 
     def clipped(self, result: np.ndarray) -> np.ndarray:
         """A float network's result as the host would clip its own: to [0, 1] where the image is added."""
@@ -189,22 +215,37 @@ class HostWriter(GraphWriter):
 
 def write_front(w: HostWriter, ends: Ends) -> None:
     """Write the host's nodes in front of the core, image to uint8 planes: `Ends.split` as operators."""
+    if ends.direct:
+        w.node("Mul", "host_front.scale", [IMAGE, w.scalar("units", 2.0**BITS)])
+        w.node("Round", "host_front.planes", ["host_front.scale"])
+        _write_uint8(w)
+        return
     image, channels = IMAGE, ends.image_channels
+    if ends.mirrored_px:
+        around = w.constant("mirrored_px", np.array([0, 0, ends.mirrored_px, ends.mirrored_px] * 2))
+        image = w.node("Pad", "host_front.mirrored", [image, around], mode="reflect")
     for k, shuffle in enumerate(ends.front):
         write_shuffle(w, shuffle, image, f"host_front.shuffled_{k}", channels)
         image, channels = f"host_front.shuffled_{k}", channels * shuffle.block**2
+    step, part = (STEP_DN, PART) if ends.banked else (STEP, QUARTER)
     w.node("Mul", "host_front.scale", [image, w.scalar("max_dn", MAX_DN)])
     w.node("Round", "host_front.round", ["host_front.scale"])
-    w.node("Clip", "host_front.dn", ["host_front.round", w.scalar("zero", 0), w.scalar("max_dn", MAX_DN)])
-    w.node("Mul", "host_front.steps", ["host_front.dn", w.scalar("one_step", 1 / STEP)])
+    dn = w.node("Clip", "host_front.dn", ["host_front.round", w.scalar("zero", 0), w.scalar("max_dn", MAX_DN)])
+    if ends.banked:
+        dn = w.node("Sub", "host_front.centred", [dn, w.scalar("middle", MIDDLE_DN)])
+    w.node("Mul", "host_front.steps", [dn, w.scalar("one_step", 1 / step)])
     w.node("Round", "host_front.whole_steps", ["host_front.steps"])
     w.node("Min", "host_front.coarse", ["host_front.whole_steps", w.scalar("coarse_max", COARSE_MAX)])
-    w.node("Mul", "host_front.coarse_dn", ["host_front.coarse", w.scalar("step", STEP)])
-    w.node("Sub", "host_front.remainder", ["host_front.dn", "host_front.coarse_dn"])
-    w.node("Mul", "host_front.quarters", ["host_front.remainder", w.scalar("one_quarter", 1 / QUARTER)])
+    w.node("Mul", "host_front.coarse_dn", ["host_front.coarse", w.scalar("step", step)])
+    w.node("Sub", "host_front.remainder", [dn, "host_front.coarse_dn"])
+    w.node("Mul", "host_front.quarters", ["host_front.remainder", w.scalar("one_quarter", 1 / part)])
     w.node("Round", "host_front.quarter", ["host_front.quarters"])
     planes = ["host_front.coarse", "host_front.remainder", "host_front.quarter"]
     w.node("Concat", "host_front.planes", planes, axis=1)
+    _write_uint8(w)
+
+
+def _write_uint8(w: HostWriter) -> None:
     w.node("Add", "host_front.offset", ["host_front.planes", w.scalar("offset", ZERO)])
     w.node("Cast", PLANES, ["host_front.offset"], to=TensorProto.UINT8)
 
@@ -218,18 +259,12 @@ def write_back(w: HostWriter, ends: Ends, feeds: list[str], scale: float) -> Non
         feeds: the core's result with its scale and its zero point, as names.
         scale: the value of one unit of it.
     """
-    result = "host_back.correction"
-    if ends.copies == 1:
-        w.node("DequantizeLinear", result, feeds)
-    elif ends.offsets:
-        w.node("DequantizeLinear", "host_back.all", feeds)
-        _write_windows(w, ends, scale)
-    else:
-        w.node("DequantizeLinear", "host_back.both", feeds)
-        _write_merge(w, ends.outputs, scale)
+    result = _write_one(w, ends, feeds, scale)
     for k, shuffle in enumerate(ends.back):
         write_shuffle(w, shuffle, result, f"host_back.shuffled_{k}")
         result = f"host_back.shuffled_{k}"
+    if ends.unit != 1:
+        result = w.node("Mul", "host_back.in_units", [result, w.scalar("unit", ends.unit)])
     if ends.softmax:
         result = w.node("Softmax", "host_back.probabilities", [result], axis=1)
     if ends.adds_image:
@@ -244,6 +279,19 @@ def write_back(w: HostWriter, ends: Ends, feeds: list[str], scale: float) -> Non
         ends.tail.write(w, result)
     else:
         w.node("Flatten" if ends.flat else "Identity", "restored", [result], name="host_back.result")
+
+
+def _write_one(w: HostWriter, ends: Ends, feeds: list[str], scale: float) -> str:
+    """Write the nodes that make one correction of the core's result; its name."""
+    if ends.copies == 1:
+        w.node("DequantizeLinear", "host_back.correction", feeds)
+    elif ends.offsets:
+        w.node("DequantizeLinear", "host_back.all", feeds)
+        _write_windows(w, ends, scale)
+    else:
+        w.node("DequantizeLinear", "host_back.both", feeds)
+        _write_merge(w, ends, scale)
+    return "host_back.correction"
 
 
 def _write_windows(w: HostWriter, ends: Ends, scale: float) -> None:
@@ -262,14 +310,19 @@ def _write_windows(w: HostWriter, ends: Ends, scale: float) -> None:
         value = w.node("Where", result, [f"{name}.inside", f"{name}.value", value])
 
 
-def _write_merge(w: HostWriter, channels: int, scale: float) -> None:
+def _write_merge(w: HostWriter, ends: Ends, scale: float) -> None:
     """Write the nodes that make one correction of two gains: `Ends.merge` as operators."""
-    each = w.constant("one_each" if channels == 1 else "channels_each", np.array([channels, channels]))
-    w.nodes.append(
-        helper.make_node("Split", ["host_back.both", each], ["host_back.fine", "host_back.coarse"], axis=1)
-    )
+    each = w.constant("one_each" if ends.outputs == 1 else "channels_each", np.full(ends.copies, ends.outputs))
+    analytic = [f"host_back.analytic_{k}" for k in range(ends.copies - 2)]
+    names = ["host_back.fine", "host_back.coarse", *analytic]
+    w.nodes.append(helper.make_node("Split", ["host_back.both", each], names, axis=1))
     w.nodes[-1].name = "host_back.split"
     w.node("Mul", "host_back.wide", ["host_back.coarse", w.scalar("gain", GAIN)])
     w.node("Abs", "host_back.size", ["host_back.fine"])
     w.node("LessOrEqual", "host_back.fits", ["host_back.size", w.scalar("fine_max", (FINE_MAX + 0.5) * scale)])
-    w.node("Where", "host_back.correction", ["host_back.fits", "host_back.fine", "host_back.wide"])
+    chosen = "host_back.chosen" if analytic else "host_back.correction"
+    w.node("Where", chosen, ["host_back.fits", "host_back.fine", "host_back.wide"])
+    if analytic:
+        w.node("Sum", "host_back.analytic", analytic)
+        w.node("Mul", "host_back.added", ["host_back.analytic", w.scalar("analytic_gain", ends.analytic_gain(scale))])
+        w.node("Add", "host_back.correction", [chosen, "host_back.added"])

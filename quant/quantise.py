@@ -96,7 +96,7 @@ class Quantised:
 
 
 @dataclass(frozen=True)
-class _Plan:
+class Plan:
     """What is to be quantised: the graph that reads the planes wanted, and that of all; the host's part; streams.
 
     `chain` is what is levelled where there is no stream. What is calibrated and searched is the map in front of the
@@ -114,10 +114,12 @@ class _Plan:
 
     @property
     def takes_windows(self) -> bool:
+        """Whether the result comes in windows: where nothing is added to it, and a convolution writes it."""
         room = self.ends.outputs <= MAX_CHANNELS // 2
-        return self.passes.dual_gain and not self.ends.adds_image and takes_gains(self.graph) and room
+        alone = self.ends.gains == 1 and not self.ends.adds_image
+        return self.passes.dual_gain and alone and takes_gains(self.graph) and room
 
-    def with_windows(self, frac_bits: int, low: np.ndarray, high: np.ndarray) -> "_Plan":
+    def with_windows(self, frac_bits: int, low: np.ndarray, high: np.ndarray) -> "Plan":
         """The result in windows from low to high (C,), finer by GAIN than its own scale of so many bits."""
         offsets = window_offsets(low, high, 2.0 ** -(frac_bits + FINER))
         found = tuple(tuple(float(each) for each in window) for window in offsets)
@@ -125,12 +127,15 @@ class _Plan:
 
     @property
     def shares(self) -> bool:
+        """Whether its streams have one scale."""
         return bool(self.streams) and (self.passes.shared_residual_scale or self.passes.equalise)
 
     def stream_step(self, frac_bits: Mapping[str, int]) -> float:
+        """The value of one unit of the streams' tensors."""
         return 2.0 ** -self.stream_frac_bits(frac_bits)
 
     def stream_frac_bits(self, frac_bits: Mapping[str, int]) -> int:
+        """The streams' fractional bits, where the tensors' own are these."""
         return STREAM_FRAC_BITS if self.passes.equalise else common_frac_bits(self.streams, frac_bits)
 
     def paired(self, graph: Graph, frac_bits: Mapping[str, int]) -> Graph:
@@ -160,7 +165,7 @@ class _Plan:
         return build_core(final, chosen, self.shifts, self.ends)
 
 
-def _plan(model: onnx.ModelProto, passes: Passes, shifts: Shifts = SHIFTS) -> _Plan:
+def _plan(model: onnx.ModelProto, passes: Passes, shifts: Shifts = SHIFTS) -> Plan:
     network = read_network(model)
     full = read_planes(network.graph)
     gains = 2 if passes.dual_gain and network.adds_image and takes_gains(full) else 1
@@ -169,7 +174,7 @@ def _plan(model: onnx.ModelProto, passes: Passes, shifts: Shifts = SHIFTS) -> _P
     widths = channels_of(graph, {PLANES: ends.planes * ends.channels})
     alone = [] if found else lone_tensors(graph)
     chain = Chain(tuple(alone), tuple(widths[name] for name in alone))
-    return _Plan(graph, full, ends, found, chain, network.tail, passes, shifts)
+    return Plan(graph, full, ends, found, chain, network.tail, passes, shifts)
 
 
 def quantise_model(
@@ -190,7 +195,45 @@ def quantise_model(
         ModelError: an operation that the DPU does not compute, or weights of no sensible size.
     """
     plan = _plan(model, passes, shifts)
-    graph, images = plan.graph, patches.degraded
+    core, final, last_sum = rounded(plan, patches.degraded, tick)
+    core = replace(core, ends=replace(core.ends, tail=plan.tail))
+    if tuning:
+        # Patches that hold few roofs would train the last sum's room away.
+        core = tune(core, final, plan.full, tuning, tick, still=last_sum)
+    about = {**metadata(model), "precision": "int8 legal", "calibration_sha256": patches.digest, **about}
+    about["passes"] = ", ".join(name for name, on in asdict(passes).items() if on)
+    if tuning:
+        about["finetune"] = f"{tuning.steps} steps on {len(tuning.pairs)} patches"
+    tile_px = fixed_tile_px(model)
+    return Quantised(
+        host_model(core, about, tile_px), board_model(core, about, tile_px), core, relu_count(plan.graph), final
+    )
+
+
+def rounded(
+    plan: Plan, images: Remade[np.ndarray], tick: Callable[[], None]
+) -> tuple[IntCore, Graph, frozenset[str]]:
+    """A plan's graph in whole numbers, the float graph that was rounded, and the tensors of its last sum."""
+    made = prepared(plan, images, tick)
+    core = made.plan.core(made.graph, made.frac_bits)
+    if plan.passes.fit_weights:
+        core = fit_weights(made.graph, core, input_moments(made.graph, images, tick, plan.ends), plan.shifts)
+    return core, made.graph, made.last_sum
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """A float graph as it will be rounded, the least-squares scales of its tensors, and its last sum's tensors."""
+
+    plan: Plan
+    graph: Graph
+    frac_bits: Mapping[str, int]
+    last_sum: frozenset[str]
+
+
+def prepared(plan: Plan, images: Remade[np.ndarray], tick: Callable[[], None]) -> Prepared:
+    """The plan's float graph equalised, paired and ended, so that rounding it costs little."""
+    graph, passes = plan.graph, plan.passes
     frac_bits = choose_frac_bits(graph, images, tick, passes.least_squares, plan.ends)
     if plan.takes_windows:
         plan = plan.with_windows(frac_bits[CORRECTION], *_result_range(plan, images, tick))
@@ -202,25 +245,10 @@ def quantise_model(
     if paired is not graph:
         paired = with_room(paired, plan.stream_step(frac_bits), images, tick, plan.ends)
         last_sum = frozenset(paired[-2].inputs)
-    final = plan.ended(paired)
-    core = plan.core(final, frac_bits)
-    if passes.fit_weights:
-        core = fit_weights(final, core, input_moments(final, images, tick, plan.ends), shifts)
-    core = replace(core, ends=replace(core.ends, tail=plan.tail))
-    if tuning:
-        # Patches that hold few roofs would train the last sum's room away.
-        core = tune(core, final, plan.full, tuning, tick, still=last_sum)
-    about = {**metadata(model), "precision": "int8 legal", "calibration_sha256": patches.digest, **about}
-    about["passes"] = ", ".join(name for name, on in asdict(passes).items() if on)
-    if tuning:
-        about["finetune"] = f"{tuning.steps} steps on {len(tuning.pairs)} patches"
-    tile_px = fixed_tile_px(model)
-    return Quantised(
-        host_model(core, about, tile_px), board_model(core, about, tile_px), core, relu_count(graph), final
-    )
+    return Prepared(plan, plan.ended(paired), frac_bits, last_sum)
 
 
-def _result_range(plan: _Plan, images: Remade[np.ndarray], tick: Callable[[], None]) -> tuple[np.ndarray, np.ndarray]:
+def _result_range(plan: Plan, images: Remade[np.ndarray], tick: Callable[[], None]) -> tuple[np.ndarray, np.ndarray]:
     """The smallest and the largest value (C,) of each channel of the float network's result."""
     session = open_session(graph_to_onnx(plan.full, [CORRECTION], plan.ends.planes * plan.ends.channels))
     low, high = np.array(np.inf), np.array(-np.inf)
@@ -231,7 +259,7 @@ def _result_range(plan: _Plan, images: Remade[np.ndarray], tick: Callable[[], No
     return low, high
 
 
-def _equalised(plan: _Plan, frac_bits: dict[str, int], images: Remade[np.ndarray], tick: Callable[[], None]) -> Graph:
+def _equalised(plan: Plan, frac_bits: dict[str, int], images: Remade[np.ndarray], tick: Callable[[], None]) -> Graph:
     """Stream after stream, the others levelled by a first guess until their turn comes."""
     graph, ranges, trial = plan.graph, {}, _trial(plan, frac_bits, images)
     for stream in plan.streams:
@@ -245,7 +273,7 @@ def _equalised(plan: _Plan, frac_bits: dict[str, int], images: Remade[np.ndarray
     return graph
 
 
-def _trial(plan: _Plan, frac_bits: dict[str, int], images: Remade[np.ndarray]) -> Trial:
+def _trial(plan: Plan, frac_bits: dict[str, int], images: Remade[np.ndarray]) -> Trial:
     """What a graph costs once it is rounded, on crops of the images."""
     targets = search_targets(plan.full, plan.ends, images)
 
@@ -256,7 +284,7 @@ def _trial(plan: _Plan, frac_bits: dict[str, int], images: Remade[np.ndarray]) -
     return costs_of
 
 
-def _levelled(plan: _Plan, frac_bits: dict[str, int], images: Remade[np.ndarray], tick: Callable[[], None]) -> Graph:
+def _levelled(plan: Plan, frac_bits: dict[str, int], images: Remade[np.ndarray], tick: Callable[[], None]) -> Graph:
     """The network without a stream, every tensor levelled."""
     chain, trial = plan.chain, _trial(plan, frac_bits, images)
     ranges = chain_ranges(plan.graph, chain, images, tick, plan.ends)
@@ -266,7 +294,12 @@ def _levelled(plan: _Plan, frac_bits: dict[str, int], images: Remade[np.ndarray]
 
 def ticks(model: onnx.ModelProto, patches: int, passes: Passes = ALL) -> int:
     """How often `quantise_model` will call `tick`."""
-    plan = _plan(model, passes)
+    return plan_ticks(_plan(model, passes), patches)
+
+
+def plan_ticks(plan: Plan, patches: int) -> int:
+    """As `ticks`, of a plan."""
+    passes = plan.passes
     pairs = passes.half_lsb_pair and plan.shares and half_lsb_pair(plan.graph, 1.0) is not plan.graph
     passings = 2 + passes.fit_weights + plan.takes_windows + pairs
     if passes.equalise and plan.chain.tensors:

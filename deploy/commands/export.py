@@ -16,7 +16,11 @@ def export(
     out: Annotated[Path, typer.Option(help="ONNX file to write.")],
     variant: Annotated[str, typer.Option(help="Shipped weights of this name.")] = VARIANT,
     checkpoint: Annotated[
-        Path | None, typer.Option(help="Your own weights instead (.safetensors), or a shipped network's name.")
+        Path | None,
+        typer.Option(
+            help="Your own weights instead (.safetensors), a shipped network's name, or an INT8 file that 'quantize' "
+            "made of weights of 'train --conditioned'."
+        ),
     ] = None,
     sensor: Annotated[
         str | None,
@@ -25,16 +29,26 @@ def export(
     tile: Annotated[
         int | None, typer.Option(min=16, max=8192, help="Fix the input to one tile of this side, 640 for a board.")
     ] = None,
+    delta: Annotated[
+        Path | None,
+        typer.Option(help="Of an INT8 file: also write what the sensor changes in it, some hundred bytes."),
+    ] = None,
+    apply: Annotated[
+        Path | None, typer.Option(help="Of an INT8 file: tell it the sensor of this delta, in place of --sensor.")
+    ] = None,
 ) -> None:
     """Write the network as ONNX, any height and width unless --tile fixes them, and check it against torch.
 
     Weights that are conditioned on their sensor, as all shipped ones are, become the network for one, at no cost when
     it runs: of a profile with ranges, for the middle of each. A value outside the range that was trained is taken as
     the nearest end of it, with a warning.
+
+    An INT8 file of a network behind a bank (--checkpoint FILE.onnx) is told another sensor without being calibrated
+    anew. What the sensor changes can be sent by itself: --delta writes it, and --apply makes the file of any sensor
+    that sensor's, to the byte.
     """
-    from deploy.export import about, require_parity, to_onnx, weights_for
+    from deploy.export import about, float_for, require_parity, to_onnx, torch_network
     from deploy.networks import weights_file
-    from model.convbeers import plain_network
     from model.io.files import require_writable
     from model.io.tensors import is_conditioned, read_plain
     from model.shipped import shipped_weights
@@ -45,20 +59,47 @@ def export(
     if checkpoint is not None:
         refuse(context, ["variant"], expected="no --checkpoint beside it", got="both", remedy="leave one out")
     path = weights_file(checkpoint) if checkpoint else shipped_weights(variant)
-    require_writable(out, inputs=(path, Path(sensor) if sensor else None))
-    if is_conditioned(path):
-        known = load_sensor(sensor or SENSOR)
-        weights, outside = weights_for(path, known.nominal())
+    require_writable(out, delta, inputs=(path, apply, Path(sensor) if sensor else None))
+    if path.suffix == ".onnx":
+        _export_int8(path, out, sensor, delta, apply)
+        return
+    if delta or apply:
+        expected, remedy = "an INT8 file that can be told its sensor", "give one with --checkpoint, or leave it out"
+        raise ModelError("--delta, --apply", expected=expected, got=str(path), remedy=remedy)
+    known = load_sensor(sensor or SENSOR) if is_conditioned(path) else None
+    if known is not None:
+        model, outside = float_for(path, path.stem, known, tile)
         for sentence in outside:
             say(f"warning: {sentence}", err=True)
-        said = about(path.stem, weights.recipe, known.name)
     elif sensor is not None:
         expected, remedy = "weights of 'train --conditioned'", "leave --sensor out, or give such weights"
         raise ModelError(str(path), expected=expected, got="those of a plain network", remedy=remedy)
     else:
         weights = read_plain(path)
-        said = about(path.stem, weights.recipe)
-    model = to_onnx(weights, said, tile)
-    difference = require_parity(plain_network(weights.tensors, weights.variant), model, tile or 97)
+        model = to_onnx(weights, about(path.stem, weights.recipe), tile)
+    difference = require_parity(torch_network(path, known.nominal() if known else None), model, tile or 97)
     save_onnx(model, out)
     say(f"wrote {out}: largest difference from torch {difference:.2g} of full scale (measured)")
+
+
+def _export_int8(path: Path, out: Path, sensor: str | None, delta: Path | None, apply: Path | None) -> None:
+    """Write an INT8 file told a sensor, or the sensor of a delta."""
+    from deploy.networks import told_by_delta, told_int8
+    from model.io.files import whole_file
+    from profiles import load_sensor
+    from profiles.errors import OptionError
+    from quant.banked.family import delta_of_file
+    from quant.onnx_file import load_onnx, save_onnx
+
+    if apply is not None and (sensor or delta):
+        remedy = "leave one out: the delta brings its sensor"
+        raise OptionError("--apply", expected="no --sensor or --delta beside it", got="one", remedy=remedy)
+    model = load_onnx(path)
+    made = told_by_delta(model, apply) if apply else told_int8(model, load_sensor(sensor or SENSOR), {}, say)
+    save_onnx(made, out)
+    say(f"wrote {out}")
+    if delta is not None:
+        packed = delta_of_file(made)
+        with whole_file(delta) as temporary:
+            temporary.write_bytes(packed)
+        say(f"wrote {delta}: {len(packed)} bytes")

@@ -66,7 +66,7 @@ def quantize(
     Prints each integer layer: bits of its accumulator, seen and proven, and the share of saturated results.
     """
     from deploy.export import float_model
-    from deploy.networks import float_file
+    from deploy.networks import behind_bank, float_file
     from deploy.results import Document, print_rows
     from model.io.files import require_writable
     from profiles import load_sensor, load_target
@@ -79,18 +79,26 @@ def quantize(
     page, figures = (report / "report.html", report / "report.json") if report else (None, None)
     read = (model, images, data, *map(Path, (target, sensor)))
     require_writable(out, board, json, page, figures, inputs=read)
-    model = float_file(model, load_sensor(sensor), partial(say, err=True))
-    network, board_target = float_model(model), load_target(target)
+    known, board_target, banked = load_sensor(sensor), load_target(target), behind_bank(model)
+    if banked and (regime is Regime.free or ablate or report or without or finetune or data):
+        remedy = "leave it out: such a network is calibrated over the whole family of sensors at once"
+        expected = "no --regime free, --ablate, --report, --without, --finetune or --data"
+        raise OptionError("a network behind a bank", expected=expected, got="one", remedy=remedy)
+    model = float_file(model, known, partial(say, err=True))
+    network = float_model(model)
 
     # These take torch, seconds: what is wrong with the options or the files has been said by now.
-    from deploy.quantise import Wanted, quantise_free_file, quantise_legal_file
+    from deploy.quantise import Wanted, quantise_banked_file, quantise_free_file, quantise_legal_file
     from quant.calibration import Calibration
     from quant.quantise import passes_without
     from quant.samples import samples_of
 
     passes = passes_without(without or [])
-    calibration = samples_of(network, data) or Calibration(sensor, images, patches, patch, seed)
-    if regime is Regime.free:
+    simulated = Calibration(sensor, images, patches, patch, seed)
+    calibration = samples_of(network, data) or simulated
+    if banked:
+        rows = quantise_banked_file(banked, simulated, board_target, out, board, say, print_rows)
+    elif regime is Regime.free:
         rows = quantise_free_file(network, calibration, out, say, print_rows)
     else:
         wanted = Wanted(board, ablate, page, finetune)

@@ -80,7 +80,8 @@ def train(
     The loss is the paper's: 1.0 L1 + 0.5 LPIPS + 0.1 L1 of spectra; without weights for LPIPS that term is left out,
     which is said and kept in the recipe. Pairs bring sensor, reference and full scale in a recipe.json: others are
     refused. A twentieth of the images, whole sites, is held out for validation. Several GPUs: start it with torchrun.
-    With --conditioned the weights become the network of any sensor in range, as the shipped ones do.
+    With --conditioned the weights become the network of any sensor in range: it sees the image through the sensor's
+    own filters. --start and --teacher then take such weights, and plain ones without.
     """
     from typing import get_args
 
@@ -104,9 +105,9 @@ def train(
     if pairs is not None and (images is not None or drawn or rough):
         expected, remedy = "no --images, --drawn or --rough beside it", "leave one out"
         raise OptionError("--pairs", expected=expected, got="both", remedy=remedy)
-    if conditioned and (pairs is not None or teacher is not None):
-        remedy = "leave one out: stored pairs do not say what sensor each had, and a teacher knows one"
-        raise OptionError("--conditioned", expected="no --pairs or --teacher beside it", got="both", remedy=remedy)
+    if conditioned and pairs is not None:
+        remedy = "leave one out: stored pairs do not say what sensor each had"
+        raise OptionError("--conditioned", expected="no --pairs beside it", got="both", remedy=remedy)
     _refuse_unused(context)
     stored = [pairs, *(pairs / role for role in ("degraded", "reference"))] if pairs else [images]
     start, teacher = (weights_file(path) if path else None for path in (start, teacher))

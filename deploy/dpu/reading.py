@@ -16,7 +16,7 @@ from onnx import TensorProto, helper, numpy_helper
 from deploy.dpu.graph import Kind, Network, Operation, Shape, Window, out_shape, padding
 from deploy.dpu.integers import Integers
 from profiles.errors import ModelError
-from quant.encodings import PLACE_PX, as_on_board
+from quant.encodings import MIRRORED_PX, PLACE_PX, as_on_board
 from quant.onnx_file import load_onnx, metadata
 from quant.tiling.spelled_out import with_shuffles
 from quant.untrusted import contradictions
@@ -63,7 +63,8 @@ def read_network(path: Path, tile_px: int | None = 640) -> Network:
 def own_tile_px(model: onnx.ModelProto) -> int | None:
     """The side of the tile that a network is fixed to, in pixels of the image; None where it takes any."""
     dims = model.graph.input[0].type.tensor_type.shape.dim
-    return max((d.dim_value for d in dims[2:]), default=0) * _place_px(model) or None
+    side = max((d.dim_value for d in dims[2:]), default=0)
+    return side * _place_px(model) - 2 * _mirrored_px(model) if side else None
 
 
 def _place_px(model: onnx.ModelProto) -> int:
@@ -76,6 +77,18 @@ def _place_px(model: onnx.ModelProto) -> int:
     if not 1 <= side_px <= PLACE_MAX_PX:
         raise ValueError(f"{PLACE_PX} {side_px}")
     return side_px
+
+
+def _mirrored_px(model: onnx.ModelProto) -> int:
+    """By how many pixels a board's planes reach beyond the image on each side.
+
+    Raises:
+        ValueError: no such number.
+    """
+    mirrored_px = int(metadata(model).get(MIRRORED_PX, "0"))
+    if not 0 <= mirrored_px <= PLACE_MAX_PX:
+        raise ValueError(f"{MIRRORED_PX} {mirrored_px}")
+    return mirrored_px
 
 
 def network_of(model: onnx.ModelProto, tile_px: int | None, where: str = "ONNX model") -> Network:
@@ -97,7 +110,8 @@ class _Reader:
         self.constants: dict[str, TensorProto] = {t.name: t for t in graph.initializer}
         self.constants |= {n.output[0]: t for n in graph.node for t in _constant(n)}
         images = (i for i in graph.input if i.name not in self.constants)
-        self.inputs = {i.name: _input_shape(i, tile_px, _place_px(model), where) for i in images}
+        places = _place_px(model), _mirrored_px(model)
+        self.inputs = {i.name: _input_shape(i, tile_px, places, where) for i in images}
         self.outputs = tuple(o.name for o in graph.output)
         self.shapes: dict[str, Shape | None] = dict(self.inputs)
         self.kinds: dict[str, Kind] = {}
@@ -226,7 +240,7 @@ def _count(tensor: TensorProto) -> int:
     return count
 
 
-def _input_shape(info: onnx.ValueInfoProto, tile_px: int | None, place_px: int, where: str) -> Shape:
+def _input_shape(info: onnx.ValueInfoProto, tile_px: int | None, places: tuple[int, int], where: str) -> Shape:
     """(C, tile, tile) of an input (N, C, H, W), in places; without a tile (C, H, W) as the file states them.
 
     Raises:
@@ -241,7 +255,8 @@ def _input_shape(info: onnx.ValueInfoProto, tile_px: int | None, place_px: int, 
         if not all(sizes[2:]):
             raise ModelError(where, expected="an input of a stated size", got="any size", remedy="pass --tile")
         return sizes[1], sizes[2], sizes[3]
-    side, beyond = divmod(tile_px, place_px)
+    place_px, mirrored_px = places
+    side, beyond = divmod(tile_px + 2 * mirrored_px, place_px)
     if beyond:
         expected, remedy = f"a tile of a multiple of {place_px} px", "choose another --tile"
         raise ModelError(where, expected=expected, got=f"{tile_px} px", remedy=remedy)
@@ -250,7 +265,12 @@ def _input_shape(info: onnx.ValueInfoProto, tile_px: int | None, place_px: int, 
         raise ModelError(
             where,
             expected=f"an input that takes {tile_px} x {tile_px} pixels",
-            got=f"one fixed to {sizes[3] * place_px or 'any'} x {sizes[2] * place_px or 'any'}",
-            remedy=f"pass --tile {min(fixed) * place_px}, or export it with free sizes",
+            got=f"one fixed to {_side_px(sizes[3], places)} x {_side_px(sizes[2], places)}",
+            remedy=f"pass --tile {_side_px(min(fixed), places)}, or export it with free sizes",
         )
     return (sizes[1], side, side)
+
+
+def _side_px(size: int, places: tuple[int, int]) -> int | str:
+    """A side of the image, from that of an input of such places; any where the file states none."""
+    return size * places[0] - 2 * places[1] if size else "any"

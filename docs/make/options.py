@@ -173,7 +173,6 @@ REFUSED = {
     ],
     "train": [
         Refused(("images", "drawn", "conditioned", "rough"), "--pairs PAIRS"),
-        Refused(("teacher",), "--conditioned"),
         Refused(("validate_every",), without="--images"),
         Refused(("distil",), without="--teacher"),
         Refused(("lpips",), "--lpips-weight 0"),

@@ -2,7 +2,7 @@
 
 - `images`: pixels of TIFF, PNG and JPEG files, and which value is full scale; `tiff`: untrusted TIFF pages;
 - `files`: outputs that are written whole, and never over an input;
-- `weights`: networks as safetensors. To be imported by itself: alone here it needs torch.
+- `tensors`: weights as safetensors.
 """
 
 from model.io.files import require_writable, sha256, whole_file, write_text

@@ -21,7 +21,8 @@ from profiles.errors import ModelError
 from profiles.toml import parse_json, unreadable
 
 CONDITIONED = "conditioned on its sensor"
-"""The kind of weights, in the header, that need a sensor before they are a network; plain ones state no kind."""
+BANKED = "behind the bank of its sensor"
+"""The kinds of weights, in the header, that need a sensor before they are a network; plain ones state no kind."""
 
 FAULTS = (AttributeError, LookupError, TypeError, ValueError, OverflowError, RuntimeError)
 """What reading a header or filling a network may raise on a file that is not ours."""
@@ -63,11 +64,11 @@ def read_tensors(path: Path) -> tuple[dict[str, np.ndarray], dict[str, object]]:
         raise ModelError(str(path), expected="safetensors weights", got=got, remedy=remedy) from error
 
 
-def write_weights(path: Path, weights: Weights, conditioned: bool) -> None:
-    """Write a network's weights, its variant and recipe; of a conditioned one its kind and the ranges it knows."""
+def write_weights(path: Path, weights: Weights, banked: bool) -> None:
+    """Write a network's weights, its variant and recipe; of one behind a bank its kind and the ranges it knows."""
     header: dict[str, object] = {"variant": asdict(weights.variant), "recipe": weights.recipe}
-    if conditioned:
-        header |= {"kind": CONDITIONED, "ranges": dict(RANGES)}
+    if banked:
+        header |= {"kind": BANKED, "ranges": dict(RANGES)}
     write_tensors(path, weights.tensors, header)
 
 
@@ -78,7 +79,7 @@ def read_plain(path: Path) -> Weights:
         ModelError: not our weights, weights of another shape, or of a conditioned network.
     """
     tensors, header = read_tensors(path)
-    if header.get("kind") == CONDITIONED:
+    if header.get("kind") in (CONDITIONED, BANKED):
         remedy = "name the sensor: beers-deploy export --checkpoint FILE --sensor NAME"
         got = "one that is conditioned on its sensor"
         raise ModelError(str(path), expected="the weights of a plain network", got=got, remedy=remedy)
@@ -111,13 +112,43 @@ def read_conditioned(path: Path) -> Weights:
     return Weights(tensors, variant, _recipe(header))
 
 
-def is_conditioned(path: Path) -> bool:
-    """Whether a weights file holds a network that is conditioned on its sensor.
+def read_banked(path: Path) -> Weights:
+    """The weights of a network behind the bank of its sensor.
+
+    Raises:
+        ModelError: not such weights, or of other ranges of sensors than this version's.
+    """
+    tensors, header = read_tensors(path)
+    try:
+        if header.get("kind") != BANKED:
+            raise ValueError("a network that is told no sensor")
+        if header.get("ranges") != {name: list(ends) for name, ends in RANGES.items()}:
+            raise ValueError("other ranges of sensors than this version's")
+        variant = _variant(header)
+        _check_count(tensors, variant, 4 * variant.blocks + 7)
+        _check_like(tensors, variant.banked_shapes)
+    except FAULTS as error:
+        raise _not_weights(path, "weights that 'train --conditioned' wrote", error) from error
+    return Weights(tensors, variant, _recipe(header))
+
+
+def kind_of(path: Path) -> str | None:
+    """What a weights file says that it holds: `CONDITIONED`, `BANKED`, or None where it is a plain network.
 
     Raises:
         ModelError: missing or not safetensors.
     """
-    return read_tensors(path)[1].get("kind") == CONDITIONED
+    said = read_tensors(path)[1].get("kind")
+    return said if said in (CONDITIONED, BANKED) else None
+
+
+def is_conditioned(path: Path) -> bool:
+    """Whether a weights file holds a network that must be told its sensor, of either kind.
+
+    Raises:
+        ModelError: missing or not safetensors.
+    """
+    return kind_of(path) is not None
 
 
 def all_finite(tensors: Arrays) -> bool:

@@ -8,12 +8,12 @@ from typing import Literal, cast, get_args
 import torch
 from torch import Tensor
 
-from model.conditioning import ConditionedConvBEERS, Network
+from model.convbeers import Network
 from model.io.tensors import all_finite, read_tensors, write_tensors
-from model.io.weights import arrays, load_conditioned, load_network, save_network
 from model.training.guards import Guards, require_finite_output
 from model.training.losses import PAPER, LossWeights
 from model.training.precision import Precision
+from model.weights import arrays, load_network, save_network
 from profiles.errors import ModelError, OptionError
 
 Optimiser = Literal["adam", "adamw"]
@@ -143,7 +143,7 @@ def finish(network: Network, path: Path, recipe: dict[str, object]) -> Network:
         raise ModelError(str(path), expected="finite weights", got="NaN or infinity", remedy=remedy)
     require_finite_output(network, str(path))
     save_network(path, network, recipe)
-    return load_conditioned(path)[0] if isinstance(network, ConditionedConvBEERS) else load_network(path)[0]
+    return load_network(path)[0]
 
 
 def _check_parts(tensors: dict[str, Tensor], network: Network, steps: int) -> None:

@@ -1,22 +1,23 @@
 """A larger network that begins where a smaller one stands: wider, deeper or coarser, with the same outputs."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from itertools import product
+from typing import TypeVar
 
 import torch
 from torch import Tensor
 
-from model.conditioning import ConditionedConvBEERS, initialise_coefficients
-from model.convbeers import ConvBEERS, initialise
-from model.specialise import DIRECTIONS
+from model.convbeers import Network, initialise
 from model.variants import Variant
 from profiles.errors import ModelError
 
-_LAST = "4"
-"""Of the coefficients' layers, the linear one whose outputs they are, DIRECTIONS for each convolution."""
+N = TypeVar("N", bound=Network)
+
+TOLD = "bias.weight"
+"""What a network behind a bank makes of a sensor vector."""
 
 
-def grow(network: ConvBEERS, variant: Variant, generator: torch.Generator) -> ConvBEERS:
+def grow(network: N, variant: Variant, generator: torch.Generator) -> N:
     """A network of `variant` with the outputs of `network`, up to rounding; the same size is copied.
 
     Features are copied, and their weights shared out among the copies (Net2Net, Chen et al. 2016). Added blocks lie
@@ -27,32 +28,14 @@ def grow(network: ConvBEERS, variant: Variant, generator: torch.Generator) -> Co
         ModelError: fewer blocks, a finer scale, or features that are no multiple.
     """
     sources = _sources(network.variant, variant)
-    large = ConvBEERS(variant)
+    large = type(network)(variant)
     initialise(large, generator)
     weights = large.state_dict()
     for name, source in sources.items():
         if source is None and name.endswith("second"):
             weights[f"{name}.weight"].zero_()
-    large.load_state_dict(weights | _copied(network.state_dict(), sources, (network.variant, variant), generator))
-    return large
-
-
-def grow_conditioned(
-    network: ConditionedConvBEERS, variant: Variant, generator: torch.Generator
-) -> ConditionedConvBEERS:
-    """As `grow`, for every sensor: added convolutions have coefficients of their own, whose directions are zero.
-
-    Raises:
-        ModelError: see `grow`.
-    """
-    sources = _sources(network.variant, variant)
-    large = ConditionedConvBEERS(variant)
-    initialise_coefficients(large, generator)
-    large.base.load_state_dict(grow(network.base, variant, generator).state_dict())
-    for old, new in zip(network.directions, large.directions, strict=True):
-        copied = _copied(old.state_dict(), sources, (network.variant, variant), generator)
-        new.load_state_dict(new.state_dict() | copied)  # an added one is zero, as drawn
-    large.coefficients.load_state_dict(_coefficients(network, large, sources))
+    scales = variant.scale // network.variant.scale
+    large.load_state_dict(weights | _copied(network.state_dict(), weights, sources, scales, generator))
     return large
 
 
@@ -75,21 +58,28 @@ def _sources(small: Variant, large: Variant) -> dict[str, str | None]:
 
 
 def _copied(
-    tensors: Mapping[str, Tensor],
+    small: Mapping[str, Tensor],
+    large: Mapping[str, Tensor],
     sources: Mapping[str, str | None],
-    variants: tuple[Variant, Variant],
+    factor: int,
     generator: torch.Generator,
 ) -> dict[str, Tensor]:
-    """The weights and biases that come from the small network's `tensors`, by the large one's names."""
-    found, (small, variant) = dict[str, Tensor](), variants
-    factor = variant.scale // small.scale
+    """The weights and biases that come from the small network's, by the large one's names and of its shapes."""
+    found = dict[str, Tensor]()
     for name, source in sources.items():
         if source is not None:
-            weight, channels = _coarser(tensors[f"{source}.weight"], factor), variant.convolutions[name]
-            bias = tensors[f"{source}.bias"].repeat_interleave(factor**2)
-            found[f"{name}.weight"] = _widened(weight, channels, generator)
-            found[f"{name}.bias"] = bias.repeat(channels[0] // len(bias))
+            weight, bias = f"{name}.weight", f"{name}.bias"
+            found[weight] = _widened(_coarser(small[f"{source}.weight"], factor), large[weight].shape, generator)
+            found[bias] = _repeated(small[f"{source}.bias"], large[bias].shape, factor)
+    if TOLD in large:
+        found[TOLD] = _repeated(small[TOLD], large[TOLD].shape, factor)
     return found
+
+
+def _repeated(rows: Tensor, shape: Sequence[int], factor: int) -> Tensor:
+    """A row for each feature, (F, ...), to those of the large network."""
+    coarse = rows.repeat_interleave(factor**2, 0)
+    return coarse.repeat(shape[0] // len(coarse), *[1] * (rows.ndim - 1))
 
 
 def _coarser(weight: Tensor, factor: int) -> Tensor:
@@ -106,27 +96,10 @@ def _coarser(weight: Tensor, factor: int) -> Tensor:
     return coarse.reshape(outputs * factor**2, inputs * factor**2, 3, 3)
 
 
-def _widened(weight: Tensor, channels: tuple[int, int], generator: torch.Generator) -> Tensor:
-    """(O, I, kh, kw) to `channels`: copies along both, divided among the copies of an input."""
+def _widened(weight: Tensor, channels: Sequence[int], generator: torch.Generator) -> Tensor:
+    """(O, I, kh, kw) to as many `channels`: copies along both, divided among the copies of an input."""
     copies_out, copies_in = channels[0] // weight.shape[0], channels[1] // weight.shape[1]
     shares = torch.rand(channels[0], copies_in, weight.shape[1], 1, 1, generator=generator) + 0.5
     shares = shares / shares.sum(1, keepdim=True)
     spread = weight.repeat(copies_out, 1, 1, 1).unsqueeze(1) * shares
-    return spread.reshape(*channels, *weight.shape[2:])
-
-
-def _coefficients(
-    small: ConditionedConvBEERS, large: ConditionedConvBEERS, sources: Mapping[str, str | None]
-) -> dict[str, Tensor]:
-    """What computes the coefficients: the small network's, with the large one's own rows for added convolutions."""
-    found = dict(small.coefficients.state_dict())
-    rows = {name: number for number, name in enumerate(small.variant.convolutions)}
-    for part in ("weight", "bias"):
-        key = f"{_LAST}.{part}"
-        old = found[key].unflatten(0, (-1, DIRECTIONS))
-        new = large.coefficients.state_dict()[key].unflatten(0, (-1, DIRECTIONS)).clone()
-        for number, source in enumerate(sources.values()):
-            if source is not None:
-                new[number] = old[rows[source]]
-        found[key] = new.flatten(0, 1)
-    return found
+    return spread.reshape(channels[0], channels[1], *weight.shape[2:])

@@ -4,7 +4,7 @@ import math
 
 import torch
 
-from model.conditioning import ConditionedConvBEERS, Network, fold
+from model.convbeers import Network, told
 from model.specialise import RANGES
 from profiles.errors import ModelError
 
@@ -69,7 +69,7 @@ def require_finite_output(network: Network, where: str, remedy: str = "lower the
     """Refuse a network that makes NaN or infinity of an image in [0, 1]: its weights may be finite all the same.
 
     Args:
-        network: on the CPU; a conditioned one is specialised to the middle of every range.
+        network: on the CPU; a conditioned one is told the middle of every range.
         where: what to name in the message.
         remedy: what to do about it.
 
@@ -78,9 +78,9 @@ def require_finite_output(network: Network, where: str, remedy: str = "lower the
     """
     side_px = network.variant.scale * TEST_PLACES
     image = torch.rand((1, 1, side_px, side_px), generator=torch.Generator().manual_seed(0))
-    plain = fold(network, torch.zeros(len(RANGES))) if isinstance(network, ConditionedConvBEERS) else network
+    images = torch.cat([torch.zeros_like(image), image, torch.ones_like(image)])
     with torch.inference_mode():
-        restored = plain(torch.cat([torch.zeros_like(image), image, torch.ones_like(image)]))
+        restored = told(network, torch.zeros(len(RANGES)))(images)
     if not bool(torch.isfinite(restored).all()):
         raise ModelError(where, expected="finite pixels of a test image", got="NaN or infinity", remedy=remedy)
 

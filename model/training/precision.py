@@ -8,8 +8,7 @@ from typing import Literal
 import torch
 from torch import Tensor, nn
 
-from model.conditioning import ConditionedConvBEERS, Network, each_through
-from model.convbeers import ConvBEERS
+from model.convbeers import Network
 from model.processor import bfloat16_speed
 from model.training.workers import Worker
 
@@ -43,37 +42,16 @@ def choose_precision(
 
 
 class MixedPrecision(nn.Module):
-    """A network with its body in the run's precision, (N, 1, H, W) in [0, 1] to the same.
+    """A network with its blocks in the run's precision; what it takes and gives is the network's own.
 
-    Head, tail and the global add stay float32 in any case: 8 bits of mantissa would round a 12-bit image.
+    Head, tail and what is added stay float32 in any case: 8 bits of mantissa would round a 12-bit image.
     """
 
-    def __init__(self, network: ConvBEERS, precision: Precision) -> None:
+    def __init__(self, network: Network, precision: Precision) -> None:
         super().__init__()
         self.network, self.precision = network, precision
 
-    def forward(self, image: Tensor) -> Tensor:
-        """(N, 1, H, W) to the same."""
-        shallow = self.network.entered(image)
-        with torch.autocast(image.device.type, dtype=torch.bfloat16, enabled=self.precision == "bfloat16"):
-            deep = self.network.body_end(self.network.body(shallow))
-        return image + self.network.left(shallow + deep.float())
-
-
-class ConditionedMixedPrecision(nn.Module):
-    """As `MixedPrecision`, each image with the weights for its own sensor; these are mixed in float32."""
-
-    def __init__(self, network: ConditionedConvBEERS, precision: Precision) -> None:
-        super().__init__()
-        self.network, self.plain = network, MixedPrecision(network.base, precision)
-
-    def forward(self, image: Tensor, vectors: Tensor) -> Tensor:
-        """(N, 1, H, W) and sensor vectors (N, 4) to (N, 1, H, W)."""
-        return each_through(self.plain, "network.", self.network.weights(vectors), image)
-
-
-def in_precision(network: Network, precision: Precision) -> nn.Module:
-    """The network as it is trained."""
-    if isinstance(network, ConditionedConvBEERS):
-        return ConditionedMixedPrecision(network, precision)
-    return MixedPrecision(network, precision)
+    def forward(self, *given: Tensor) -> Tensor:
+        """Images (N, 1, H, W), and sensor vectors (N, 4) of a network that is told them, to (N, 1, H, W)."""
+        restored: Tensor = self.network(*given, bfloat16=self.precision == "bfloat16")
+        return restored

@@ -15,29 +15,29 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from model.conditioning import Network, fold, vector_tensor
-from model.convbeers import ConvBEERS
+from model.convbeers import BankedConvBEERS, ConvBEERS, Network, plain_network
 from model.io.files import whole_file
 from model.io.images import list_images
 from model.io.pictures import Stretch, busiest_windows, grid, strip_row
-from model.io.tensors import is_conditioned
-from model.io.weights import N, load_conditioned, load_network
+from model.io.tensors import CONDITIONED, kind_of, read_conditioned
 from model.metrics.backbones import find_backbone, not_found
 from model.metrics.perceptual import Lpips
 from model.progress import Steps, steps
 from model.simulator.procedural import draw_scenes
 from model.simulator.sampling import Scene, read_scene
+from model.specialise import sensor_vector, specialised
 from model.training.checkpoint import TrainingRecipe, finish
-from model.training.grow import grow, grow_conditioned
+from model.training.grow import grow
 from model.training.guards import require_finite_output
 from model.training.losses import RestorationLoss
 from model.training.patches import PatchRecipe, PatchSource, StoredPairs, pair_files
 from model.training.precision import Precision
-from model.training.trainer import Progress, Schedule, Source, Trainer, new_network
+from model.training.trainer import Progress, Schedule, Source, Trainer
 from model.training.validation import Validation, split_by_site
 from model.training.workers import Worker
 from model.variants import Variant, variant_named
-from profiles.errors import OptionError
+from model.weights import load_network
+from profiles.errors import ModelError, OptionError
 
 STEP = re.compile(r"[0-9]{1,18}(?=,)")
 """What a line of a log begins with."""
@@ -98,7 +98,7 @@ def train(run: Run, resume: bool, worker: Worker, say: Callable[[str], None]) ->
             that are no multiple of the network's scale.
         KeyboardInterrupt: stopped; a checkpoint was written.
     """
-    teacher = _plain(run, run.teacher) if run.teacher else None
+    teacher = _given(run, run.teacher) if run.teacher else None
     require_whole_places(run, [variant_named(run.variant), *([teacher.variant] if teacher else [])])
     loss, said = loss_of(run)
     if said and worker.first:
@@ -152,25 +152,26 @@ def start_weights(run: Run) -> Mapping[str, Tensor] | None:
     if run.start is None:
         return None
     variant, generator = variant_named(run.variant), torch.Generator().manual_seed(run.recipe.seed)
-    if run.patches.family is None:
-        return grow(_plain(run, run.start), variant, generator).state_dict()
-    if is_conditioned(run.start):
-        return grow_conditioned(_sound(load_conditioned, run.start), variant, generator).state_dict()
-    network = new_network(variant, generator, conditioned=True)
-    base = grow(_sound(load_network, run.start), variant, generator).state_dict()
-    return network.state_dict() | {f"base.{name}": weight for name, weight in base.items()}
+    return grow(_given(run, run.start), variant, generator).state_dict()
 
 
-def _plain(run: Run, path: Path) -> ConvBEERS:
-    """A plain network from its file; a conditioned one for the middle of the run's sensor profile."""
-    if not is_conditioned(path):
-        return _sound(load_network, path)
-    return fold(_sound(load_conditioned, path), vector_tensor(run.patches.degraded.nominal()))
+def _given(run: Run, path: Path) -> Network:
+    """A network from its file, of the kind that the run trains; refused where it gives NaN, as every step would.
 
-
-def _sound(load: Callable[[Path], tuple[N, object]], path: Path) -> N:
-    """A network from its file, refused where it gives NaN: a run would skip every step that it has a part in."""
-    network = load(path)[0]
+    Raises:
+        ModelError: no such weights, or of the other kind.
+    """
+    if kind_of(path) == CONDITIONED and run.patches.family is None:  # every layer of it: plain for one sensor
+        found = read_conditioned(path)
+        vector = sensor_vector(run.patches.degraded.nominal())
+        network: Network = plain_network(specialised(found.tensors, found.variant, vector), found.variant)
+    else:
+        network = load_network(path)[0]
+    wanted = ConvBEERS if run.patches.family is None else BankedConvBEERS
+    if not isinstance(network, wanted):
+        kinds = {ConvBEERS: "a plain network's", BankedConvBEERS: "those that 'train --conditioned' wrote"}
+        remedy = "give others, or train with --conditioned" if wanted is ConvBEERS else "give others"
+        raise ModelError(str(path), expected=f"weights: {kinds[wanted]}", got=kinds[type(network)], remedy=remedy)
     require_finite_output(network, str(path), "give another network")
     return network
 

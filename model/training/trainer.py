@@ -12,13 +12,12 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
-from model.conditioning import ConditionedConvBEERS, Network, initialise_coefficients
-from model.convbeers import ConvBEERS, initialise
+from model.convbeers import BankedConvBEERS, ConvBEERS, Network, initialise
 from model.progress import held_back
 from model.training.checkpoint import TrainingRecipe, read_checkpoint, write_checkpoint
 from model.training.guards import Guards
 from model.training.losses import RestorationLoss
-from model.training.precision import MixedPrecision, Precision, choose_precision, in_precision
+from model.training.precision import MixedPrecision, Precision, choose_precision
 from model.training.workers import Worker
 from model.variants import Variant
 from profiles.errors import OptionError
@@ -67,7 +66,7 @@ class Trainer:
         worker: this process among those of the run.
         device: where the steps are computed.
         start: weights to go on from, as `state_dict`; None draws new ones.
-        teacher: a network whose outputs the recipe's `distil` weighs.
+        teacher: a network of the same kind whose outputs the recipe's `distil` weighs.
         precision: what the body is computed in; None measures what is faster here.
         conditioned: whether the network is given the sensor of each patch.
 
@@ -83,7 +82,7 @@ class Trainer:
         worker: Worker | None = None,
         device: str = "cpu",
         start: Mapping[str, Tensor] | None = None,
-        teacher: ConvBEERS | None = None,
+        teacher: Network | None = None,
         precision: Precision | None = None,
         conditioned: bool = False,
     ) -> None:
@@ -102,7 +101,7 @@ class Trainer:
 
     def _compute_in(self, precision: Precision) -> None:
         self.precision: Precision = precision
-        self.forward = self.worker.wrap(in_precision(self.network, precision))
+        self.forward = self.worker.wrap(MixedPrecision(self.network, precision))
         self.teacher = MixedPrecision(self._teacher, precision) if self._teacher is not None else None
 
     def run(self, source: Source, checkpoint: Path, schedule: Schedule) -> None:
@@ -166,7 +165,7 @@ class Trainer:
         if self.teacher is None:
             return total, terms
         with torch.no_grad():
-            wanted = self.teacher(degraded)
+            wanted = self.teacher(degraded, *vectors)
         distance = (restored - wanted).abs().mean()
         return total + self.recipe.distil * distance, {**terms, "teacher": distance.detach()}
 
@@ -244,13 +243,8 @@ def require_loss(loss: RestorationLoss, distil: float) -> None:
 
 def new_network(variant: Variant, generator: torch.Generator, conditioned: bool) -> Network:
     """A network that nothing was trained into yet."""
-    if not conditioned:
-        plain = ConvBEERS(variant)
-        initialise(plain, generator)
-        return plain
-    network = ConditionedConvBEERS(variant)
-    initialise(network.base, generator)
-    initialise_coefficients(network, generator)
+    network = BankedConvBEERS(variant) if conditioned else ConvBEERS(variant)
+    initialise(network, generator)
     return network
 
 

@@ -8,7 +8,8 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from model.conditioning import ConditionedConvBEERS, Network, SensorFamily, fold, vector_tensor
+from model.conditioning import SensorFamily, vector_tensor
+from model.convbeers import Network, told
 from model.io.images import site_of
 from model.metrics.fidelity import psnr_db, ssim
 from model.simulator.acquire import LEAST_SIDE_PX, fitting_oversampling, simulate_pair
@@ -76,12 +77,12 @@ class Validation:
     def restore(self, network: Network) -> list[np.ndarray]:
         """Each degraded image through the network in float32, (H, W), clipped to [0, 1].
 
-        A conditioned network is specialised to the sensor that acquired the image. An image whose sides are no
+        A conditioned network is told the sensor that acquired the image. An image whose sides are no
         multiples of the network's scale is extended by copies of its last row and column, as in a restoration.
         """
         restored = []
         for (degraded, _), vector in zip(self.pairs, self.vectors, strict=True):
-            plain = fold(network, vector) if isinstance(network, ConditionedConvBEERS) else network
+            plain = told(network, vector)
             height, width = degraded.shape[-2:]
             lack = (-size % plain.variant.scale for size in (width, height))
             extended = pad(degraded, [each for side in lack for each in (0, side)], mode="replicate")

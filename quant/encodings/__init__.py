@@ -5,8 +5,17 @@ itself as QDQ ONNX, with int8 bias and power-of-two scales. Reading a host file 
 """
 
 from quant.encodings.board import as_on_board, board_model
-from quant.encodings.description import PLACE_PX
+from quant.encodings.description import MIRRORED_PX, PLACE_PX
 from quant.encodings.host import MICROSOFT, host_model
 from quant.encodings.reading import encoding_faults, read_core
 
-__all__ = ["MICROSOFT", "PLACE_PX", "as_on_board", "board_model", "encoding_faults", "host_model", "read_core"]
+__all__ = [
+    "MICROSOFT",
+    "MIRRORED_PX",
+    "PLACE_PX",
+    "as_on_board",
+    "board_model",
+    "encoding_faults",
+    "host_model",
+    "read_core",
+]

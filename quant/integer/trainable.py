@@ -113,8 +113,9 @@ def merged(ends: Ends, correction: Tensor, scale: float) -> Tensor:
         return correction
     limit = (FINE_MAX + 0.5) * scale
     if not ends.offsets:
-        fine, coarse = correction.chunk(2, dim=1)
-        return torch.where(fine.abs() <= limit, fine, coarse * GAIN)
+        fine, coarse, *analytic = correction.chunk(ends.copies, dim=1)
+        value = torch.where(fine.abs() <= limit, fine, coarse * GAIN)
+        return value + torch.stack(analytic).sum(0) * ends.analytic_gain(scale) if analytic else value
     coarse, *windows = correction.chunk(ends.copies, dim=1)
     value = coarse * GAIN
     for window, offset in zip(windows, ends.offsets, strict=True):

@@ -6,10 +6,9 @@ import pytest
 import torch
 
 from deploy.export import to_onnx
-from model.conditioning import ConditionedConvBEERS, initialise_coefficients
-from model.convbeers import ConvBEERS, initialise
-from model.io.weights import save_network
+from model.convbeers import BankedConvBEERS, ConvBEERS, initialise
 from model.variants import Variant
+from model.weights import save_network
 from quant.onnx_file import save_onnx
 
 
@@ -29,10 +28,8 @@ def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture
 def conditioned(tmp_path: Path) -> Path:
     """Weights of a small conditioned network, as `train --conditioned` leaves them."""
-    network, generator = ConditionedConvBEERS(Variant(blocks=2, features=8)), torch.Generator().manual_seed(0)
-    initialise(network.base, generator)
-    initialise_coefficients(network, generator)
-    for parameter in network.directions.parameters():
-        torch.nn.init.normal_(parameter, 0.0, 0.05, generator)
+    network, generator = BankedConvBEERS(Variant(blocks=2, features=8)), torch.Generator().manual_seed(0)
+    initialise(network, generator)
+    torch.nn.init.normal_(network.bias.weight, 0.0, 0.05, generator)
     save_network(tmp_path / "conditioned.safetensors", network, {"degraded": "many"})
     return tmp_path / "conditioned.safetensors"

@@ -7,18 +7,20 @@ import torch
 from typer.testing import CliRunner, Result
 
 from deploy.cli import app
-from deploy.export import parity, require_parity, to_onnx, weights_for
+from deploy.export import banked_to_onnx, parity, require_parity, to_onnx, weights_for
 from model.conditioning import vector_tensor
-from model.convbeers import ConvBEERS, initialise, plain_network
-from model.io.weights import load_conditioned, save_network
+from model.convbeers import BankedConvBEERS, ConvBEERS, initialise, plain_network
+from model.io.tensors import Weights
 from model.shipped import shipped_weights
 from model.training.grow import grow
 from model.variants import VARIANTS, Variant
+from model.weights import load_network, save_network
 from profiles import load_sensor
 from profiles.errors import ModelError, OptionError
 from profiles.toml import HERE
 from quant.onnx_file import fixed_tile_px, metadata, save_onnx
 from quant.session import open_session, run
+from quant.tiling.walk import tiling_of
 
 
 @pytest.fixture(scope="module")
@@ -44,6 +46,24 @@ def test_they_agree_at_a_lower_resolution_and_a_tile_is_whole_places(scale: int)
     assert parity(coarse, to_onnx(coarse, {}, 12 * scale), 12 * scale) < 1e-6
     with pytest.raises(OptionError, match=f"--tile: expected a multiple of {scale} px, got 41 px"):
         to_onnx(coarse, {}, 41)
+
+
+@pytest.mark.parametrize(("scale", "rows", "columns"), [(1, 37, 29), (2, 38, 46)])
+def test_a_network_behind_a_bank_is_exported_for_one_sensor(scale: int, rows: int, columns: int) -> None:
+    """Its filters, unit and head's bias are constants then; tiled, with mirrored borders, it gives the same."""
+    banked, sensor = BankedConvBEERS(Variant(1, 8, scale)), load_sensor("pleiades-degraded").nominal()
+    initialise(banked, torch.Generator().manual_seed(0))
+    torch.nn.init.normal_(banked.bias.weight, 0, 0.1, torch.Generator().manual_seed(1))
+    weights = Weights({name: value.numpy() for name, value in banked.state_dict().items()}, banked.variant, {})
+    model = banked_to_onnx(weights, sensor, {})
+    image = np.random.default_rng(1).random((2, 1, rows, columns), dtype=np.float32) * 0.02 + 0.4
+    vectors = vector_tensor(sensor).expand(2, -1)
+    with torch.inference_mode():
+        expected = banked(torch.from_numpy(image), vectors).numpy()
+    np.testing.assert_allclose(run(open_session(model), image), expected, atol=2e-6)
+    tiling = tiling_of(model)
+    assert tiling.lattice_px == scale
+    assert tiling.halo_px == banked.variant.radius_px + (3 if scale == 1 else 4)
 
 
 def test_the_shipped_network_at_half_resolution_restores_the_same_image() -> None:
@@ -112,7 +132,7 @@ def test_conditioned_weights_become_the_sensors(conditioned: Path, sensor: str, 
     result = export("--checkpoint", str(conditioned), "--sensor", sensor, "--out", str(path))
     assert result.exit_code == 0, result.output
     assert "warning" not in result.output
-    unfolded, vector = load_conditioned(conditioned)[0], vector_tensor(load_sensor(sensor).nominal())
+    unfolded, vector = load_network(conditioned)[0], vector_tensor(load_sensor(sensor).nominal())
     image = np.random.default_rng(1).random((1, 1, 27, 35), dtype=np.float32)
     with torch.inference_mode():
         expected = unfolded(torch.from_numpy(image), vector[None]).numpy()

@@ -25,6 +25,7 @@ from deploy.networks import (
     network_file,
     once,
     shipped_pair,
+    told_int8,
 )
 from model.io.files import sha256
 from model.shipped import INT8, SENSOR, SHIPPED, shipped_names, shipped_weights
@@ -32,6 +33,7 @@ from profiles.errors import ModelError, ProfileError
 from profiles.sensor import numbers_of
 from profiles.sensor_file import BLIND, BLIND_PROFILE, load_sensor
 from profiles.toml import HERE
+from quant.banked import calibrate
 from quant.onnx_file import is_quantised, load_onnx, metadata
 
 KNOWN = load_sensor(SENSOR)
@@ -72,22 +74,33 @@ def test_the_same_numbers_are_the_same_sensor_and_others_are_not(conditioned: Pa
     assert files[2].read_bytes() != files[0].read_bytes()
 
 
-@pytest.mark.slow
-def test_int8_is_made_once_and_shows_progress(
-    conditioned: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+def test_int8_is_calibrated_once_and_then_told_any_sensor(
+    conditioned: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(networks, "PATCHES", 2)
+    monkeypatch.setattr(calibrate, "PATCHES", 3)
+    monkeypatch.setattr(calibrate, "QUIET_PATCHES", 1)
     made = int8_file(conditioned, KNOWN)
     assert is_quantised(load_onnx(made))
-    assert metadata(load_onnx(made))[MADE_FROM]
-    assert f"making INT8 for {SENSOR}, once" in capsys.readouterr().err
+    assert "calibrating conditioned over the family of sensors" in capsys.readouterr().err
 
     def never(*_: Any) -> None:
         raise AssertionError("made again")
 
-    monkeypatch.setattr(networks, "_in_int8", never)
+    monkeypatch.setattr(networks, "family_model", never)
     assert int8_file(conditioned, KNOWN) == made
-    assert float_file(conditioned, KNOWN) != made
+    sensor = load_sensor(str(own_sensor(tmp_path, "value = 0.07", "value = 0.05")))
+    other = load_onnx(int8_file(conditioned, sensor))
+    assert (metadata(load_onnx(made))["sensor"], metadata(other)["sensor"]) == (SENSOR, sensor.name)
+    again = told_int8(other, KNOWN, {MADE_FROM: metadata(load_onnx(made))[MADE_FROM]})
+    (tmp_path / "base.onnx").write_bytes(made.read_bytes())
+    words = ["export", "--checkpoint", str(tmp_path / "base.onnx"), "--out"]
+    mine = [*words, str(tmp_path / "mine.onnx"), "--sensor", str(tmp_path / "mine.toml"), "--delta", "mine.delta"]
+    monkeypatch.chdir(tmp_path)
+    assert CliRunner().invoke(app, mine).exit_code == 0
+    assert CliRunner().invoke(app, [*words, "applied.onnx", "--apply", "mine.delta"]).exit_code == 0
+    assert (tmp_path / "applied.onnx").read_bytes() == (tmp_path / "mine.onnx").read_bytes()
+    assert (tmp_path / "mine.delta").stat().st_size < 2000
+    assert again.SerializeToString(deterministic=True) == load_onnx(made).SerializeToString(deterministic=True)
 
 
 @pytest.mark.parametrize("name", shipped_names())

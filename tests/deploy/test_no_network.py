@@ -20,8 +20,8 @@ from typer.testing import CliRunner
 
 from deploy.cli import app
 from model.convbeers import ConvBEERS, initialise
-from model.io.weights import save_network
 from model.variants import Variant
+from model.weights import save_network
 from tests.deploy.sealed import SOCKET_CALL
 
 pytestmark = pytest.mark.slow

@@ -12,14 +12,15 @@ from typer.testing import CliRunner
 
 from deploy.cli import app
 from deploy.export import weights_for
-from model.conditioning import fold
-from model.io.tensors import read_tensors, write_weights
-from model.io.weights import load_conditioned, load_network
+from model.convbeers import BankedConvBEERS, initialise, plain_network, told
+from model.io.tensors import read_tensors
 from model.shipped import shipped_weights
 from model.simulator.procedural import procedural_scene
 from model.training import run as training
 from model.training.patches import StoredPairs
 from model.training.run import Log
+from model.variants import VARIANTS
+from model.weights import load_network, save_network
 from profiles import load_sensor
 from profiles.toml import profile_path
 
@@ -72,8 +73,8 @@ def test_a_finished_run_resumes_to_the_same_weights(images: Path, tmp_path: Path
     assert all(torch.equal(first[name], again[name]) for name in first)
 
 
-def test_a_conditioned_run_starts_from_plain_weights_and_resumes_to_the_same(images: Path, tmp_path: Path) -> None:
-    options = ["--conditioned", "--start", str(plain_weights(tmp_path)), "--validate-every", "2"]
+def test_a_conditioned_run_goes_on_from_others_and_resumes_to_the_same(images: Path, tmp_path: Path) -> None:
+    options = ["--conditioned", "--start", str(banked_weights(tmp_path)), "--validate-every", "2"]
     run(images, tmp_path / "a", *options)
     path = tmp_path / "a" / "convbeers-xs.safetensors"
     tensors, header = read_tensors(path)
@@ -82,46 +83,34 @@ def test_a_conditioned_run_starts_from_plain_weights_and_resumes_to_the_same(ima
     assert header == again_header
     assert all(np.array_equal(tensor, again[name]) for name, tensor in tensors.items())
     assert [row["step"] for row in rows(tmp_path / "a" / "validation.csv")] == ["2", "4"]
-    recipe = load_conditioned(path)[1]
+    recipe = load_network(path)[1]
     assert recipe["degraded"] == "drawn over the ranges"
     assert recipe["held_out"] == ["coast_1.png"]
 
 
-def plain_weights(folder: Path) -> Path:
-    """The shipped network for one sensor, as a plain one."""
-    weights, _ = weights_for(shipped_weights("convbeers-xs"), load_sensor("pleiades-degraded").nominal())
-    write_weights(folder / "plain.safetensors", weights, conditioned=False)
-    return folder / "plain.safetensors"
+def banked_weights(folder: Path) -> Path:
+    """Of a small network behind a bank, that give something else for each sensor."""
+    network = BankedConvBEERS(VARIANTS["convbeers-xs"])
+    initialise(network, torch.Generator().manual_seed(0))
+    torch.nn.init.normal_(network.bias.weight, 0.0, 0.1, torch.Generator().manual_seed(1))
+    save_network(folder / "start.safetensors", network, {})
+    return folder / "start.safetensors"
 
 
-def test_a_conditioned_run_that_learns_nothing_is_what_it_started_from(images: Path, tmp_path: Path) -> None:
-    start = plain_weights(tmp_path)
-    options = ["--conditioned", "--learning-rate", "0", "--validate-every", "0", "--start"]
-    run(images, tmp_path / "a", *options, str(start), steps=1)
-    path, plain = tmp_path / "a" / "convbeers-xs.safetensors", load_network(start)[0]
-    image, trained = torch.rand(1, 1, 27, 33, generator=torch.Generator().manual_seed(0)), load_conditioned(path)[0]
-    vector = torch.tensor([-1.0, 0.3, 0.5, 1.0])
+def restored(path: Path, image: torch.Tensor, vector: torch.Tensor) -> torch.Tensor:
     with torch.inference_mode():
-        torch.testing.assert_close(fold(trained, vector)(image), plain(image), rtol=0, atol=1e-6)
-    run(images, tmp_path / "b", *options, str(path), steps=1)
-    again = load_conditioned(tmp_path / "b" / path.name)[0].state_dict()
-    assert all(torch.allclose(value, again[name]) for name, value in trained.state_dict().items())
+        found: torch.Tensor = told(load_network(path)[0], vector)(image)
+    return found
 
 
 def test_a_run_at_half_resolution_starts_from_a_network_at_full_resolution(images: Path, tmp_path: Path) -> None:
-    options = ["--variant", "convbeers-half", "--conditioned", "--validate-every", "2", "--start", "convbeers-xs"]
+    start = banked_weights(tmp_path)
+    options = ["--variant", "convbeers-half", "--conditioned", "--validate-every", "2", "--start", str(start)]
     run(images, tmp_path / "still", *options, "--learning-rate", "0", steps=1)
-    weights, start = (
-        tmp_path / "still" / "convbeers-half.safetensors",
-        load_conditioned(shipped_weights("convbeers-xs")),
-    )
-    image, vector = (
-        torch.rand(1, 1, 26, 34, generator=torch.Generator().manual_seed(0)),
-        torch.tensor([0.3, 0, -1, 1]),
-    )
-    with torch.inference_mode():
-        grown, small = (fold(each[0], vector)(image) for each in (load_conditioned(weights), start))
-    torch.testing.assert_close(grown, small, rtol=0, atol=1e-5)
+    weights = tmp_path / "still" / "convbeers-half.safetensors"
+    image = torch.rand(1, 1, 26, 34, generator=torch.Generator().manual_seed(0))
+    vector = torch.tensor([0.3, 0, -1, 1])
+    torch.testing.assert_close(restored(weights, image, vector), restored(start, image, vector), rtol=0, atol=1e-5)
     run(images, tmp_path / "a", *options)
     assert [row["step"] for row in rows(tmp_path / "a" / "validation.csv")] == ["2", "4"]
     first = weights_of(tmp_path / "a" / weights.name)
@@ -129,8 +118,17 @@ def test_a_run_at_half_resolution_starts_from_a_network_at_full_resolution(image
     assert all(torch.equal(value, first[name]) for name, value in weights_of(tmp_path / "a" / weights.name).items())
 
 
+def test_a_run_takes_weights_and_a_teacher_of_its_own_kind(images: Path, tmp_path: Path) -> None:
+    run(images, tmp_path / "a", "--conditioned", "--teacher", str(banked_weights(tmp_path)), steps=1)
+    for option in ("--start", "--teacher"):
+        options = ["--images", str(images), "--out", str(tmp_path / "b"), "--steps", "1"]
+        result = CliRunner().invoke(app, ["train", *options, option, str(tmp_path / "start.safetensors")])
+        assert result.exit_code == 2
+        assert "expected weights: a plain network's" in " ".join(result.output.split())
+
+
 def weights_of(path: Path) -> dict[str, torch.Tensor]:
-    return load_conditioned(path)[0].state_dict()
+    return dict(load_network(path)[0].state_dict())
 
 
 def test_a_patch_must_be_whole_places_of_the_teacher_too(images: Path, tmp_path: Path) -> None:
@@ -146,7 +144,8 @@ def test_a_plain_run_starts_from_the_shipped_network_for_its_sensor(images: Path
     options = ["--sensor", "pleiades-degraded", "--learning-rate", "0", "--validate-every", "0"]
     run(images, tmp_path / "a", *options, "--start", "convbeers-xs", steps=1)
     trained = load_network(tmp_path / "a" / "convbeers-xs.safetensors")[0]
-    start = load_network(plain_weights(tmp_path))[0]
+    weights, _ = weights_for(shipped_weights("convbeers-xs"), load_sensor("pleiades-degraded").nominal())
+    start = plain_network(weights.tensors, weights.variant)
     assert all(torch.allclose(value, start.state_dict()[name]) for name, value in trained.state_dict().items())
 
 
@@ -163,7 +162,6 @@ def test_a_plain_run_starts_from_the_shipped_network_for_its_sensor(images: Path
         (["--drawn", "1", "--device", "cuda"], "CUDA"),
         (["--resume", "--drawn", "1"], "no such file"),
         (["--conditioned", "--pairs", "here"], "do not say what sensor"),
-        (["--conditioned", "--drawn", "1", "--teacher", "here"], "teacher knows one"),
         (["--drawn", "1", "--learning-rate", "inf"], "learning rate: expected a finite number"),
         (["--drawn", "1", "--fft-weight", "inf"], "weight of fft in the loss: expected a finite number"),
         (

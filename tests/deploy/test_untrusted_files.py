@@ -24,9 +24,9 @@ from model.dataset import _read_summary
 from model.io.images import read_pixels
 from model.io.tensors import read_tensors as read_weights
 from model.io.tensors import write_tensors
-from model.io.weights import arrays, load_network
 from model.metrics.backbones import read_tensors
 from model.training.run import Log
+from model.weights import arrays, load_network
 from profiles.errors import BeersError, ModelError, OptionError, ProfileError
 from profiles.figures import Row, measured
 from profiles.toml import HERE, read_json, read_toml_text

@@ -12,9 +12,9 @@ from PIL import Image
 
 from examples.networks import build, to_onnx
 from model.convbeers import ConvBEERS, initialise
-from model.io.weights import save_network
 from model.shipped import SHIPPED
 from model.variants import Variant
+from model.weights import save_network
 from profiles.toml import HERE as PROFILES
 from quant.onnx_file import save_onnx
 from tests.deploy.detection.folders import Object, dior

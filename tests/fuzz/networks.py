@@ -11,12 +11,11 @@ import torch
 from deploy.dpu.board import load_dpu
 from deploy.dpu.checker.placement import place
 from deploy.dpu.reading import read_network
-from model.conditioning import ConditionedConvBEERS
-from model.convbeers import ConvBEERS
-from model.io.weights import save_network
+from model.convbeers import BankedConvBEERS, ConvBEERS
 from model.training.checkpoint import TrainingRecipe, read_checkpoint, write_checkpoint
 from model.training.guards import Guards
 from model.variants import Variant
+from model.weights import save_network
 from profiles.errors import BeersError
 from quant.encodings import encoding_faults
 from quant.graph import correction_graph
@@ -123,5 +122,5 @@ def weights_seeds(folder: Path) -> list[bytes]:
 
 def told_seeds(folder: Path) -> list[bytes]:
     """The weights of a network that is told its sensor."""
-    network = ConditionedConvBEERS(SMALL)
+    network = BankedConvBEERS(SMALL)
     return [written(partial(save_network, network=network, recipe={"degraded": "x"}), folder / "w.safetensors")]

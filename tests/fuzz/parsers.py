@@ -29,9 +29,9 @@ from deploy.tradeoff.host_time import Times
 from model.dataset import _read_summary
 from model.evaluation.pairs import read_pairs_recipe
 from model.io.images import read_pixels
-from model.io.weights import load_conditioned, load_network
 from model.metrics.backbones import read_tensors
 from model.training.run import Log
+from model.weights import load_network
 from profiles import load_sensor, load_target
 from profiles.figures import Figure, Row, measured, predicted, unavailable
 from profiles.response_file import read_response
@@ -276,7 +276,7 @@ PARSERS: tuple[Parser, ...] = (
     Parser("dataset manifest", ".jsonl", manifest_seeds, _read_summary, of_json),
     Parser("training log", ".csv", lambda _: [b"step,loss\n10,0.5\n20,0.25\n"], log_lines, share=0.5),
     Parser("weights", ".safetensors", weights_seeds, load_network, of_safetensors),
-    Parser("told weights", ".safetensors", told_seeds, load_conditioned, of_safetensors),
+    Parser("told weights", ".safetensors", told_seeds, load_network, of_safetensors),
     Parser("checkpoint", ".safetensors", checkpoint_seeds, go_on, of_safetensors),
     Parser("backbone npz", ".npz", partial(backbone_seeds, packed=True), lambda p: read_tensors(p, ["a", "b"])),
     Parser("labels of VOC", ".xml", partial(label_seeds, make=voc, suffix=".xml"), read_beside),

@@ -4,11 +4,24 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from torch.nn.functional import conv2d, pixel_unshuffle
 
-from model.bank import EPSILON_PER_SIGMA, FILTERS, SIDE_PX, UNIT, Bank, bank_of, noise_over_full_scale
+from model.bank import (
+    EPSILON_PER_SIGMA,
+    FILTERS,
+    SIDE_PX,
+    UNIT,
+    Bank,
+    bank_of,
+    bank_of_vector,
+    in_places,
+    noise_over_full_scale,
+)
 from model.simulator.mtf import sensor_mtf
+from model.specialise import sensor_vector
 from model.traditional.compensate import compensation_kernel
 from profiles import load_sensor
 from profiles.effects import Smear
@@ -105,3 +118,24 @@ def test_more_noise_asks_for_less_sharpening() -> None:
     gains = [abs(gain(bank_of(sensor(0.07, 0.07, snr), REFERENCE), row)) for snr in (220, 110, 35)]
     assert gains == sorted(gains, reverse=True)
     assert gains[0] > 2 * gains[2]
+
+
+@pytest.mark.parametrize("scale", [1, 2, 3])
+def test_in_places_of_pixels_the_filters_give_the_same(scale: int) -> None:
+    kernels = bank_of(sensor(0.08, 0.05), REFERENCE).kernels
+    image = torch.rand(1, 1, 10 * scale, 12 * scale, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    places = torch.from_numpy(in_places(kernels, scale))
+    around = places.shape[-1] // 2
+    planes = conv2d(image, torch.from_numpy(kernels)[:, None], padding=SIDE_PX // 2)
+    found = conv2d(pixel_unshuffle(image, scale), places)
+    wanted = pixel_unshuffle(planes, scale)[..., around:-around, around:-around]
+    torch.testing.assert_close(found, wanted, rtol=0, atol=1e-12)
+
+
+@settings(max_examples=20)
+@given(CONTRAST, CONTRAST, st.floats(36, 219))
+def test_a_sensor_vector_tells_the_bank_of_its_sensor(across: float, along: float, snr: float) -> None:
+    made = sensor(across, along, snr)
+    told, own = bank_of_vector(sensor_vector(made).values), bank_of(made, REFERENCE)
+    assert told.sigma == pytest.approx(own.sigma)
+    np.testing.assert_allclose(told.details, own.details, atol=1e-9)

@@ -1,24 +1,15 @@
-"""What a network knows of its sensor, and that folding changes nothing."""
+"""The sensors that a network is trained on, and what it is told of each."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
-from model.conditioning import (
-    ConditionedConvBEERS,
-    SensorFamily,
-    fold,
-    initialise_coefficients,
-    transposed,
-    vector_tensor,
-)
-from model.convbeers import initialise
-from model.specialise import DIRECTIONS, RANGES, sensor_values, sensor_vector
-from model.variants import Variant
+from model.conditioning import SensorFamily, transposed, vector_tensor
+from model.specialise import RANGES, sensor_values, sensor_vector
 from profiles import load_sensor
 from profiles.effects import Smear
 from profiles.sensor import Sensor, noise_from_snr
@@ -27,75 +18,8 @@ NOMINAL = load_sensor("pleiades-degraded").nominal()
 FAMILY = SensorFamily(NOMINAL)
 
 
-def trained(seed: int = 0) -> ConditionedConvBEERS:
-    """A network whose directions do something, as training leaves it."""
-    generator = torch.Generator().manual_seed(seed)
-    network = ConditionedConvBEERS(Variant(blocks=2, features=5))
-    initialise(network.base, generator)
-    initialise_coefficients(network, generator)
-    with torch.no_grad():
-        for parameter in network.directions.parameters():
-            parameter.normal_(0.0, 0.05, generator=generator)
-    return network.eval()
-
-
 def drawn(seed: int) -> Sensor:
     return FAMILY.draw(np.random.default_rng(seed))
-
-
-@settings(max_examples=60)
-@given(st.integers(0, 2**20), st.integers(1, 41), st.integers(1, 37))
-def test_the_folded_network_computes_what_the_unfolded_one_does(seed: int, height: int, width: int) -> None:
-    network, vector = trained(seed % 3), vector_tensor(drawn(seed))
-    image = torch.rand(1, 1, height, width, generator=torch.Generator().manual_seed(seed))
-    with torch.inference_mode():
-        unfolded, folded = network(image, vector[None]), fold(network, vector)(image)
-    assert float((unfolded - folded).abs().max()) <= 1e-6
-
-
-def test_each_image_of_a_batch_meets_its_own_sensor() -> None:
-    network, vectors = trained(), torch.stack([vector_tensor(drawn(seed)) for seed in range(3)])
-    images = torch.rand(3, 1, 13, 17, generator=torch.Generator().manual_seed(0))
-    with torch.inference_mode():
-        together = network(images, vectors)
-        for number in range(3):
-            alone = fold(network, vectors[number])(images[number : number + 1])
-            assert float((together[number] - alone).abs().max()) <= 1e-6
-            other = fold(network, vectors[number - 1])(images[number : number + 1])
-            assert float((together[number] - other).abs().max()) > 1e-4
-
-
-def test_folding_takes_no_part_of_the_network_along() -> None:
-    network, vector = trained(), vector_tensor(NOMINAL)
-    image, folded = torch.rand(1, 1, 9, 14), fold(network, vector)
-    with torch.no_grad():
-        before = folded(image)
-        for parameter in network.parameters():
-            parameter.zero_()
-        assert torch.equal(folded(image), before)
-
-
-def test_before_training_the_network_is_its_base_whatever_the_sensor() -> None:
-    network = trained()
-    for parameter in network.directions.parameters():
-        torch.nn.init.zeros_(parameter)
-    image = torch.rand(2, 1, 11, 15)
-    vectors = torch.stack([vector_tensor(drawn(seed)) for seed in (1, 2)])
-    with torch.inference_mode():
-        torch.testing.assert_close(network(image, vectors), network.base(image), rtol=0, atol=1e-6)
-
-
-def test_training_can_leave_the_base_at_once() -> None:
-    """The coefficients differ from sensor to sensor before the first step: a direction has a gradient to follow."""
-    network = ConditionedConvBEERS(Variant(1, 4))
-    initialise(network.base, torch.Generator().manual_seed(0))
-    initialise_coefficients(network, torch.Generator().manual_seed(1))
-    vectors = torch.stack([vector_tensor(drawn(seed)) for seed in range(6)])
-    assert float(network.coefficients(vectors).detach().std(0).mean()) > 0.1
-    network(torch.rand(6, 1, 9, 9), vectors).abs().sum().backward()
-    gradients = [p.grad for direction in network.directions for p in direction.parameters()]
-    assert len(gradients) == DIRECTIONS * 2 * network.layers
-    assert all(gradient is not None and float(gradient.abs().max()) > 0 for gradient in gradients)
 
 
 def test_the_values_of_a_sensor_known_by_hand() -> None:

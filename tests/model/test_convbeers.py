@@ -1,7 +1,9 @@
 import pytest
 import torch
+from torch.nn.functional import conv2d, pad
 
-from model.convbeers import ConvBEERS, initialise
+from model.bank import bank_of_vector
+from model.convbeers import BankedConvBEERS, ConvBEERS, initialise, told
 from model.variants import VARIANTS, Variant
 
 
@@ -77,3 +79,35 @@ def test_at_half_resolution_a_shift_by_a_place_shifts_the_result_and_a_pixel_doe
     ]
     assert apart[0] < 1e-6
     assert apart[1] > 1e-4
+
+
+def banked(scale: int = 1) -> BankedConvBEERS:
+    """A network behind a bank that says something else of each sensor."""
+    generator = torch.Generator().manual_seed(0)
+    network = BankedConvBEERS(Variant(2, 5, scale))
+    initialise(network, generator)
+    torch.nn.init.normal_(network.bias.weight, 0.0, 0.3, generator)
+    return network.eval()
+
+
+VECTORS = torch.tensor([[-0.9, -0.8, 0.3, 0.2], [0.5, 0.1, -0.7, -0.6], [0.0, 0.9, 0.8, 0.9]])
+
+
+def test_each_image_of_a_batch_meets_its_own_sensor() -> None:
+    network, images = banked(), torch.rand(3, 1, 13, 17, generator=torch.Generator().manual_seed(0))
+    with torch.inference_mode():
+        together = network(images, VECTORS)
+        for number in range(3):
+            alone, other = (told(network, VECTORS[k])(images[number : number + 1])[0] for k in (number, number - 1))
+            assert float((together[number] - alone).abs().max()) <= 1e-6
+            assert float((together[number] - other).abs().max()) > 1e-3
+
+
+@pytest.mark.parametrize("scale", [1, 2])
+def test_a_body_that_adds_nothing_leaves_the_analytic_restoration(scale: int) -> None:
+    network, image = banked(scale), 0.4 + 0.002 * torch.rand(1, 1, 26, 22, generator=torch.Generator().manual_seed(0))
+    torch.nn.init.zeros_(network.tail.weight)
+    kernel = torch.from_numpy(bank_of_vector(VECTORS[1].tolist()).analytic).float()[None, None]
+    wanted = image + conv2d(pad(image, [3] * 4, mode="reflect"), kernel)
+    with torch.inference_mode():
+        torch.testing.assert_close(network(image, VECTORS[1:2]), wanted, rtol=0, atol=1e-6)

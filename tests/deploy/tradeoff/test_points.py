@@ -12,9 +12,9 @@ from deploy.tradeoff.methods import Network, find_networks, is_papers, operation
 from deploy.tradeoff.points import EXACT, LEGAL, PRECISIONS, Board, Variant, network_points, other_points, tiles_px
 from deploy.tradeoff.selection import board_of, configurations_for, precisions_of
 from model.convbeers import ConvBEERS
-from model.io.weights import save_network
 from model.shipped import shipped_names, shipped_weights, studied_names
 from model.variants import Variant as Shape
+from model.weights import save_network
 from profiles import load_target
 from profiles.errors import ModelError, OptionError
 

@@ -16,7 +16,6 @@ from torch import Tensor
 from model.conditioning import SensorFamily
 from model.convbeers import ConvBEERS
 from model.io.tensors import read_tensors
-from model.io.weights import load_network
 from model.progress import held_back
 from model.simulator.procedural import procedural_scene
 from model.simulator.sampling import Scene
@@ -27,6 +26,7 @@ from model.training.patches import PatchRecipe, PatchSource
 from model.training.trainer import Progress, Schedule, Trainer
 from model.training.workers import Worker
 from model.variants import Variant
+from model.weights import load_network
 from profiles import load_sensor
 from profiles.errors import ModelError
 
@@ -86,13 +86,13 @@ def test_a_conditioned_network_killed_and_resumed_equals_the_unbroken_one_in_eve
         assert all(np.array_equal(tensor, others[name]) for name, tensor in tensors.items())
 
 
-def test_a_conditioned_run_moves_base_directions_and_coefficients(tmp_path: Path) -> None:
+def test_a_conditioned_run_moves_every_part_and_what_it_makes_of_a_sensor(tmp_path: Path) -> None:
     before, after = Trainer(VARIANT, TrainingRecipe(steps=8), conditioned=True), train_conditioned(tmp_path)
     moved = {
         name.split(".")[0]: not torch.equal(value, after.network.state_dict()[name])
         for name, value in before.network.state_dict().items()
     }
-    assert moved == {"base": True, "directions": True, "coefficients": True}
+    assert moved == dict.fromkeys(("head", "body", "body_end", "tail", "bias"), True)
 
 
 def test_plain_and_conditioned_checkpoints_are_not_taken_for_one_another(tmp_path: Path) -> None:

@@ -1,0 +1,12 @@
+from .acquire import Pair as Pair
+from .acquire import simulate_pair as simulate_pair
+from .detector import Draw as Draw
+from .detector import to_dn as to_dn
+from .detector import to_radiance as to_radiance
+from .mtf import sensor_transfer as sensor_transfer
+from .plan import Plan as Plan
+from .plan import make_plan as make_plan
+from .procedural import procedural_scene as procedural_scene
+from .sampling import Scene as Scene
+from .sampling import read_scene as read_scene
+from .sampling import resample as resample

@@ -1,0 +1,204 @@
+"""A network behind a bank calibrated over the family of sensors, and put into whole numbers once for all of them.
+
+The body reads the bank's results of many sensors' images, rounded as the core will round them; planes of a sensor's
+values stand for what its head's bias will be told.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from model.bank import FILTERS, REFERENCE, Bank, network_bank
+from model.conditioning import SensorFamily
+from model.io.tensors import Weights
+from model.simulator.sampling import Scene
+from model.specialise import sensor_vector
+from model.variants import SENSOR_VALUES
+from profiles import load_sensor
+from quant.banked.family import BANK, Family, bank_layer
+from quant.banked.filters import ANALYTIC_COPIES, BITS, COPIES, UNITS, channels, spread_over_a_step, whole_bank
+from quant.calibration import PATCH_PX, Remade, draw_patches
+from quant.core import SHIFTS, IntConv, IntCore, Shifts, quantise_bias
+from quant.ends import Ends
+from quant.graph import CORRECTION, PLANES, Activation, Add, Concat, Conv, Graph, Op, Shuffle, Window, same
+from quant.graph.network import renamed
+from quant.integer.arithmetic import convolve
+from quant.passes.fit_weights import Moments, fit_weights, input_moments
+from quant.passes.level import Chain
+from quant.passes.stream import streams
+from quant.quantise import ALL, Plan, plan_ticks, prepared
+
+LIKE = "pleiades-degraded"
+"""The profile that gives gain and bits; what is computed is over full scale."""
+
+ANALYTIC, BODY = "analytic", "body.correction"
+"""The results that lie side by side: the analytic restoration, and the body's correction of it."""
+
+
+def _assembled(body: IntCore, bank: Bank, scale: int, shifts: Shifts) -> IntCore:
+    """The whole core: a body that reads a bank's results as `PLANES`, behind it, beside the analytic restoration."""
+    result = body.frac_bits[CORRECTION]
+    named = (renamed(op, {PLANES: BANK, CORRECTION: BODY}) for op in body.ops)
+    joined = Concat("joined", (BODY, ANALYTIC), CORRECTION)
+    frac_bits = dict(body.frac_bits) | {BANK: BITS, BODY: result, ANALYTIC: result}
+    ends = replace(front_ends(scale), gains=2, outputs=scale**2, unit=float(np.float32(bank.unit)))
+    ops = (bank_layer(bank, scale, shifts), *named, _analytic(scale, result, shifts), joined)
+    return IntCore(ops, frac_bits, ends)
+
+
+def _analytic(scale: int, result: int, shifts: Shifts) -> IntConv:
+    """The mean of the bank's copies of the analytic restoration, rounded at other places of a step each time.
+
+    Its results are said to have as many fractional bits as the correction's, `result`, beside which they lie.
+    """
+    pixels, copies, inputs = scale**2, COPIES[scale][2], len(channels(scale))
+    shift, rows = int(np.floor(np.log2(127 * copies))), range(pixels)
+    weight = np.zeros((ANALYTIC_COPIES, pixels, inputs, pixels, 1, 1), np.int8)
+    for k, share in enumerate(_spread(2**shift, copies)):
+        weight[:, rows, inputs - copies + k, rows] = share
+    offsets = np.repeat(np.array(spread_over_a_step(ANALYTIC_COPIES)), pixels)
+    bias = quantise_bias(offsets * 2.0**-result, shift + result, shifts)
+    whole = weight.reshape(ANALYTIC_COPIES * pixels, -1, 1, 1)
+    return IntConv("analytic", BANK, ANALYTIC, whole, shift + result - BITS, *bias)
+
+
+def _spread(total: int, parts: int) -> list[int]:
+    """So many whole numbers, as alike as can be, of that sum."""
+    return [total * (k + 1) // parts - total * k // parts for k in range(parts)]
+
+
+def body_graph(weights: Weights) -> Graph:
+    """The float body, from a bank's results and four planes of a sensor's values to the correction in units."""
+    variant, tensors = weights.variant, weights.tensors
+    graph: list[Op] = [_head(weights)]
+
+    def conv(name: str, source: str, output: str, activation: Activation = Activation.none) -> None:
+        weight, bias = tensors[f"{name}.weight"], tensors[f"{name}.bias"]
+        graph.append(Conv(name, source, output, weight, bias, activation, window=same(weight)))
+
+    stream = "head"
+    for k in range(variant.blocks):
+        conv(f"body.{k}.first", stream, f"body.{k}.relu", Activation.relu)
+        conv(f"body.{k}.second", f"body.{k}.relu", f"body.{k}.second")
+        graph.append(Add(f"body.{k}.add", (stream, f"body.{k}.second"), f"body.{k}.add"))
+        stream = f"body.{k}.add"
+    conv("body_end", stream, "body_end")
+    graph.append(Add("deep", ("head", "body_end"), "deep"))
+    conv("tail", "deep", CORRECTION)
+    return tuple(graph)
+
+
+def _head(weights: Weights) -> Conv:
+    """The head on a bank's results, all copies of each, and on the planes of a sensor's values at its middle tap."""
+    variant = weights.variant
+    given = weights.tensors["head.weight"].reshape(variant.features, 1 + FILTERS, variant.pixels, 3, 3)
+    counts, units = COPIES[variant.scale], 2.0**BITS / UNITS
+    copies = [(0, counts[0], 1.0), *((1 + k, counts[1], units) for k in range(FILTERS))]
+    read = [given[:, kernel] * (unit / count) for kernel, count, unit in copies for _ in range(count)]
+    unread = np.zeros((variant.features, counts[2] * variant.pixels, 3, 3))
+    told = np.zeros((variant.features, SENSOR_VALUES, 3, 3))
+    told[:, :, 1, 1] = 2 * weights.tensors["bias.weight"]  # of planes that hold half of each value
+    weight = np.concatenate([*read, unread, told], 1).astype(np.float32)
+    return Conv("head", PLANES, "head", weight, weights.tensors["head.bias"], window=same(weight))
+
+
+def front_ends(scale: int) -> Ends:
+    """What the host does around a network of that scale behind a bank."""
+    if scale == 1:
+        return Ends(banked=True)
+    front, back = (Shuffle(name, "", "", scale, up, False) for name, up in (("unshuffle", False), ("shuffle", True)))
+    return Ends(scale**2, front=(front,), back=(back,), banked=True)
+
+
+def bank_results(image: np.ndarray, bank: Bank, vector: Sequence[float], scale: int) -> np.ndarray:
+    """What the body of a family is calibrated on, of an image (1, 1, H, W) in [0, 1]: (1, C, H / S, W / S) float32.
+
+    The bank's results over 128, and planes of the halves of a sensor's values.
+    """
+    whole = whole_bank(bank, scale)
+    sums = convolve(front_ends(scale).split(image), whole.weight, Window())
+    results = np.floor(sums / 2.0**whole.frac_bits + whole.offsets[:, None, None] + 0.5).clip(-128, 127)
+    told = np.ones((1, SENSOR_VALUES, *results.shape[2:])) * np.asarray(vector)[:, None, None] / 2
+    return np.concatenate([results / 2.0**BITS, told], 1).astype(np.float32)
+
+
+def quantise_family(
+    weights: Weights, bank: Bank, images: Remade[np.ndarray], tick: Callable[[], None], shifts: Shifts = SHIFTS
+) -> Family:
+    """A network behind a bank in whole numbers, for the middle of the family.
+
+    Args:
+        weights: of a `BankedConvBEERS`.
+        bank: of the middle of the family.
+        images: of `bank_results`, of sensors from all over the family.
+        tick: called once per image and pass, and step of a search.
+        shifts: the windows of the target.
+    """
+    plan, scale = _plan(weights, shifts), weights.variant.scale
+    made, ends = prepared(plan, images, tick), plan.ends
+    moments = input_moments(made.graph, images, tick, ends)
+    told = {op.name: op for op in made.graph if isinstance(op, Conv) and op.input == PLANES}
+    plain = tuple(_without_values(op) if isinstance(op, Conv) and op.name in told else op for op in made.graph)
+    moments |= {name: _moments_without_values(moments[name]) for name in told}
+    body = fit_weights(plain, made.plan.core(plain, made.frac_bits), moments, shifts)
+    middle = {op.name: op.float_bias for op in body.convolutions}
+    # The planes of a sensor's values hold half of each.
+    values = {name: op.weight[:, -SENSOR_VALUES:, 1, 1] / 2 for name, op in told.items()}
+    biases = {name: np.concatenate([middle[name][:, None], values[name]], 1) for name in told}
+    return Family(_assembled(body, bank, scale, shifts), biases, shifts)
+
+
+def family_ticks(weights: Weights) -> int:
+    """How often `quantise_family` will call `tick` for the images of `family_images`."""
+    return plan_ticks(_plan(weights, SHIFTS), PATCHES + QUIET_PATCHES)
+
+
+def _plan(weights: Weights, shifts: Shifts) -> Plan:
+    """What is to be quantised: the body, from a bank's results."""
+    graph, scale = body_graph(weights), weights.variant.scale
+    width = len(channels(scale)) * scale**2 + SENSOR_VALUES
+    ends = Ends(width, 1, adds_image=False, gains=2, outputs=scale**2, direct=True)
+    return Plan(graph, graph, ends, streams(graph), Chain((), ()), None, ALL, shifts)
+
+
+PATCHES, QUIET_PATCHES, QUIET_SNR = 48, 32, (150.0, 220.0)
+"""Of calibration: over the whole family, and of its quietest sensors besides. In units of their noise edges are the
+strongest there: without these patches a sensor of SNR 220 lost 0.35 dB to clipping, with them 0.02."""
+
+
+def family_images(scenes: list[Scene], scale: int, seed: int, patch_px: int = PATCH_PX) -> Remade[np.ndarray]:
+    """What a family is calibrated on: scenes as sensors from all over it see them, behind the bank of each.
+
+    Args:
+        scenes: that are seen.
+        scale: of the network.
+        seed: of everything that is drawn.
+        patch_px: side of a patch.
+
+    Raises:
+        ImageError: no scene holds a patch.
+    """
+    like, reference = load_sensor(LIKE), load_sensor(REFERENCE)
+    families = (PATCHES, SensorFamily(like.nominal())), (QUIET_PATCHES, SensorFamily(like.nominal(), QUIET_SNR))
+    drawn = [
+        draw_patches(scenes, like, reference, count, seed + number, patch_px, family)
+        for number, (count, family) in enumerate(families)
+    ]
+    places = [(patches, number) for patches in drawn for number in range(len(patches.views))]
+
+    def results(place: int) -> np.ndarray:
+        patches, number = places[place]
+        sensor = patches.views[number].degraded
+        return bank_results(patches.degraded[number], network_bank(sensor), sensor_vector(sensor).values, scale)
+
+    return Remade(results, len(places))
+
+
+def _without_values(op: Conv) -> Conv:
+    return replace(op, weight=op.weight[:, :-SENSOR_VALUES])
+
+
+def _moments_without_values(moments: Moments) -> Moments:
+    kept = slice(0, len(moments.total) - SENSOR_VALUES * 9)
+    return Moments(moments.products[kept, kept], moments.total[kept], moments.count)

@@ -1,0 +1,175 @@
+"""INT8 once for every sensor: a body behind a bank is calibrated over the family of sensors, and told its own later.
+
+    planes -> bank 7 x 7 (the sensor's) -> head, blocks, end, tail -> correction, fine and coarse
+                                        -> analytic restoration, in four copies
+
+All scales are one for the family. A sensor's filters, its unit and the bias of its head are written in milliseconds;
+the host adds both results, times the unit, to the image.
+"""
+
+import base64
+import json
+import zlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import onnx
+
+from model.bank import Bank
+from model.variants import SENSOR_VALUES
+from profiles.errors import ModelError
+from quant.banked.filters import BITS, whole_bank
+from quant.core import SHIFTS, IntConv, IntCore, Shifts, quantise_bias
+from quant.encodings import read_core
+from quant.graph import PLANES, Op
+from quant.onnx_file import metadata
+from quant.untrusted import contradictions
+
+FAMILY = "family"
+"""In the metadata of an INT8 file: what tells it another sensor."""
+
+BANK = "bank"
+"""The tensor between a sensor's filters and what is the same for all."""
+
+
+@dataclass(frozen=True)
+class Family:
+    """A network behind a bank in whole numbers, for the middle of the family, and what tells it another sensor.
+
+    Attributes:
+        core: it begins with the bank.
+        biases: of the convolutions that read the bank, by name: (O, 5), their biases for the middle of the family,
+            and what each of a sensor's values adds.
+        shifts: the windows of the target.
+    """
+
+    core: IntCore
+    biases: Mapping[str, np.ndarray]
+    shifts: Shifts = SHIFTS
+
+    def for_sensor(self, bank: Bank, vector: Sequence[float]) -> IntCore:
+        """The core for one sensor, of its bank and its sensor vector (4,)."""
+        ops = tuple(self._told(op, bank, vector) for op in self.core.ops)
+        return replace(self.core, ops=ops, ends=replace(self.core.ends, unit=float(np.float32(bank.unit))))
+
+    def _told(self, op: IntConv | Op, bank: Bank, vector: Sequence[float]) -> IntConv | Op:
+        if isinstance(op, IntConv) and op.input == PLANES:
+            return bank_layer(bank, self.core.ends.place_px, self.shifts)
+        if not (isinstance(op, IntConv) and op.name in self.biases):
+            return op
+        bias = self.biases[op.name] @ np.array([1.0, *vector])
+        whole, bits = quantise_bias(bias, op.weight_frac_bits + BITS, self.shifts)
+        return replace(op, bias=whole, bias_frac_bits=bits)
+
+    def to_words(self) -> str:
+        """The biases as JSON, for a file's metadata."""
+        return json.dumps({name: values.tolist() for name, values in self.biases.items()})
+
+
+def family_of(model: onnx.ModelProto) -> Family | None:
+    """What an INT8 file of a network behind a bank says of other sensors; None of any other file.
+
+    Raises:
+        ModelError: words that contradict the file.
+    """
+    words = metadata(model).get(FAMILY)
+    if words is None:
+        return None
+    with contradictions("INT8 model"):
+        core, said = read_core(model), json.loads(words)
+        biases = {str(name): np.array(values, np.float64) for name, values in said.items()}
+        read = {op.name: len(op.bias) for op in core.convolutions if op.name in biases}
+        if {name: values.shape for name, values in biases.items()} != {
+            n: (o, 1 + SENSOR_VALUES) for n, o in read.items()
+        }:
+            raise ValueError("biases that are not its convolutions'")
+        return Family(core, biases)
+
+
+def required_family(model: onnx.ModelProto) -> Family:
+    """As `family_of`, of a file that must be such a network's.
+
+    Raises:
+        ModelError: it is another, or contradicts itself.
+    """
+    family = family_of(model)
+    if family is None:
+        remedy = "make one with 'beers-deploy quantize' of weights that 'train --conditioned' wrote"
+        raise ModelError("INT8 model", expected="one that can be told its sensor", got="another", remedy=remedy)
+    return family
+
+
+def bank_layer(bank: Bank, scale: int, shifts: Shifts) -> IntConv:
+    """The first convolution of a network of that scale, for one sensor."""
+    whole = whole_bank(bank, scale)
+    bias = quantise_bias(whole.offsets * 2.0**-BITS, whole.frac_bits + BITS, shifts)
+    return IntConv("bank", PLANES, BANK, whole.weight, whole.frac_bits, *bias)
+
+
+def delta_of_file(model: onnx.ModelProto) -> bytes:
+    """What its sensor has changed in an INT8 file of a network behind a bank: `with_delta` changes it in another's.
+
+    Raises:
+        ModelError: no such file.
+    """
+    family = required_family(model)
+    core = family.core
+    ops = {
+        op.name: {
+            "weight": _text(op.weight) if op.input == PLANES else None,
+            "weight_frac_bits": op.weight_frac_bits,
+            "bias": _text(op.bias),
+            "bias_frac_bits": op.bias_frac_bits,
+        }
+        for op in core.convolutions
+        if op.input == PLANES or op.name in family.biases
+    }
+    said = {"sensor": metadata(model).get("sensor", ""), "unit": core.ends.unit, "ops": ops}
+    return zlib.compress(json.dumps(said, separators=(",", ":")).encode(), 9)
+
+
+def with_delta(core: IntCore, delta: bytes) -> tuple[IntCore, str]:
+    """A core of the network that a delta was made for, told the delta's sensor; and the name of that.
+
+    Raises:
+        ModelError: no delta, or one of another network.
+    """
+    try:
+        said = json.loads(zlib.decompressobj().decompress(delta, LARGEST_DELTA))
+        told = {str(name): dict(values) for name, values in said["ops"].items()}
+        ops = tuple(_patched(op, told.pop(op.name)) if op.name in told else op for op in core.ops)
+        if told:
+            raise ValueError(f"{', '.join(told)}, which the network lacks")
+        return replace(core, ops=ops, ends=replace(core.ends, unit=float(said["unit"]))), str(said["sensor"])
+    except (zlib.error, AttributeError, LookupError, RecursionError, TypeError, ValueError) as error:
+        remedy = "give a file that 'export --delta' wrote for the same network"
+        got = " ".join(str(error).split())[:80]
+        raise ModelError("delta", expected="one of this network", got=got, remedy=remedy) from error
+
+
+LARGEST_DELTA = 1 << 20
+"""Bytes that one is unpacked to."""
+
+
+def _patched(op: IntConv | Op, said: dict[str, Any]) -> IntConv | Op:
+    """A convolution with other integers of the same shapes.
+
+    Raises:
+        ValueError: other shapes.
+    """
+    if not isinstance(op, IntConv):
+        raise ValueError(f"{op.name} in the delta, which has no weights")
+    weight = op.weight if said["weight"] is None else _int8(said["weight"]).reshape(op.weight.shape)
+    bias, bits = _int8(said["bias"]).reshape(op.bias.shape), (int(said[f"{k}_frac_bits"]) for k in ("weight", "bias"))
+    weight_bits, bias_bits = bits
+    return replace(op, weight=weight, weight_frac_bits=weight_bits, bias=bias, bias_frac_bits=bias_bits)
+
+
+def _text(values: np.ndarray) -> str:
+    return base64.b64encode(values.astype(np.int8).tobytes()).decode()
+
+
+def _int8(text: str) -> np.ndarray:
+    return np.frombuffer(base64.b64decode(text, validate=True), np.int8)

@@ -1,0 +1,152 @@
+"""The bank of a sensor in whole numbers: the first convolution of an INT8 network, written from the sensor alone.
+
+The image enters in three planes: steps of 16 digital numbers about the middle, what they leave, and half of that for
+finer weights. A filter's weights are rounded so that they sum to exactly 0 in each plane, for flat ground must leave
+nothing, and so that their errors lie where natural images hold little.
+
+What the filters give is int8 in steps of a sixteenth of a unit. Each comes several times, rounded at other places of
+a step: together the copies hold what one cannot. The image itself comes in steps of 32, about the middle.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from model.bank import FILTERS, SIDE_PX, Bank, in_places
+from model.io.images import MAX_DN
+
+STEP_DN, MIDDLE_DN, PART = 16, 2048, 2
+"""Of the planes: the coarse one's step and its zero, and by what the third divides the remainder."""
+
+PLANES_PER_CHANNEL = 3
+UNITS = 16
+"""Steps of a result that are one unit: 127 of them hold eight units, as in training."""
+
+IMAGE_STEP_DN = 32
+
+BITS = 7
+"""Fractional bits that a result is said to have: int8 then stands for -1 to 1, eight units or half of full scale."""
+
+ANALYTIC_COPIES = 4
+"""Of the analytic restoration, in a network's result."""
+
+LARGEST = 112
+"""Of a weight before it is rounded: what sums and copies make up for still fits int8."""
+
+COPIES = {1: (1, 2, 7), 2: (1, 1, 3)}
+"""By a network's scale, of the image, of each plane, and of the analytic restoration: 16 channels, 32 at scale 2."""
+
+REACH_PX = 30.0
+"""Neighbouring pixels of natural images are alike: their correlation falls to 1 / e within so many pixels."""
+
+
+@dataclass(frozen=True)
+class WholeBank:
+    """The first convolution, (O, 3 S^2, k, k) int8 with so many fractional bits, and what each channel adds.
+
+    Attributes:
+        weight: of the planes of an image, all coarse ones first.
+        frac_bits: a sum of products is shifted by so many bits to become int8.
+        offsets: (O,) what each channel adds before it is rounded, in steps.
+    """
+
+    weight: NDArray[np.int8]
+    frac_bits: int
+    offsets: NDArray[np.float64]
+
+
+def split_planes(image: np.ndarray) -> np.ndarray:
+    """(N, C, H, W) float32 in [0, 1] to the planes (N, 3 C, H, W) int8."""
+    dn = np.clip(np.rint(image * np.float32(MAX_DN)), 0, MAX_DN) - MIDDLE_DN
+    coarse = np.minimum(np.rint(dn / STEP_DN), 127)
+    remainder = dn - STEP_DN * coarse
+    return np.concatenate([coarse, remainder, np.rint(remainder / PART)], axis=1).astype(np.int8)
+
+
+def channels(scale: int) -> list[tuple[int, float]]:
+    """Of each output, before pixels become channels: which of the bank's kernels it is, and its offset in steps."""
+    counts = COPIES[scale]
+    copies = [counts[0], *[counts[1]] * FILTERS, counts[2]]
+    return [(kernel, offset) for kernel, count in enumerate(copies) for offset in spread_over_a_step(count)]
+
+
+def spread_over_a_step(count: int) -> list[float]:
+    """What so many copies add before they are rounded, in steps; the mean is 0."""
+    return [(k + 0.5) / count - 0.5 for k in range(count)]
+
+
+def whole_bank(bank: Bank, scale: int) -> WholeBank:
+    """The whole numbers of a bank, for a network of that scale."""
+    wanted = bank.kernels * (UNITS / MAX_DN)  # steps for one digital number
+    wanted[0] *= MAX_DN / UNITS / IMAGE_STEP_DN
+    frac_bits = int(np.floor(np.log2(LARGEST / np.abs(STEP_DN * wanted).max())))
+    kernels, offsets = zip(*channels(scale), strict=True)
+    exact = _copies(wanted * 2.0**frac_bits, kernels)
+    planes = [in_places(exact[:, plane].astype(np.float64), scale) for plane in range(PLANES_PER_CHANNEL)]
+    return WholeBank(np.concatenate(planes, 1).astype(np.int8), frac_bits, np.repeat(offsets, scale**2))
+
+
+def _copies(wanted: NDArray[np.float64], kernels: Sequence[int]) -> NDArray[np.int64]:
+    """Weights (O, 3, 7, 7): each further copy of a kernel makes up for what rounding has left of those before it."""
+    left, found = np.zeros_like(wanted), list[NDArray[np.int64]]()
+    for kernel in kernels:
+        whole = _in_three(wanted[kernel] + left[kernel]) if kernel else _of_image(wanted[0])
+        found.append(whole)
+        left[kernel] += wanted[kernel] - _response(whole)
+    return np.stack(found)
+
+
+def _response(whole: NDArray[np.int64]) -> NDArray[np.float64]:
+    """What weights (3, 7, 7) of the planes multiply a digital number with: (7, 7)."""
+    return np.asarray(whole[0] / STEP_DN)
+
+
+def _of_image(kernel: NDArray[np.float64]) -> NDArray[np.int64]:
+    """The image in its own steps, from the coarse plane alone: (3, 7, 7)."""
+    none = np.zeros(kernel.shape, np.int64)
+    return np.stack([np.rint(STEP_DN * kernel).astype(np.int64), none, none])
+
+
+def _in_three(kernel: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Weights (3, 7, 7) of the three planes for a kernel (7, 7) of sum 0 that multiplies digital numbers."""
+    coarse = shaped(STEP_DN * kernel.ravel())
+    fine = shaped(PART * kernel.ravel())  # in parts of the remainder's weights
+    odd = np.flatnonzero(fine % PART)  # an even number of them, for their sum is 0
+    parts = np.zeros_like(fine)
+    parts[odd[::2]], parts[odd[1::2]] = 1, -1
+    found = np.stack([coarse, (fine - parts) // PART, parts])
+    return found.reshape(PLANES_PER_CHANNEL, *kernel.shape)
+
+
+def shaped(wanted: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Whole numbers (49,) of sum 0 near the wanted ones, whose errors natural images hardly show.
+
+    From the nearest with the largest remainders given up, one is raised and another lowered while that lowers
+    e^T C e, C the covariance of natural images.
+    """
+    whole = np.rint(wanted)
+    while (excess := int(whole.sum())) != 0:
+        error = (whole - wanted) * np.sign(excess)
+        whole[np.argsort(-error)[: abs(excess)]] -= np.sign(excess)
+    slope, curve = COVARIANCE @ (whole - wanted), np.diag(COVARIANCE)
+    pair = curve[:, None] + curve[None, :] - 2 * COVARIANCE
+    while True:
+        change = 2 * (slope[:, None] - slope[None, :]) + pair  # raise the row's, lower the column's
+        np.fill_diagonal(change, 0)
+        up, down = np.unravel_index(np.argmin(change), change.shape)
+        if change[up, down] > -1e-9:
+            return np.asarray(whole.astype(np.int64))
+        whole[up] += 1
+        whole[down] -= 1
+        slope += COVARIANCE[up] - COVARIANCE[down]
+
+
+def _covariance() -> NDArray[np.float64]:
+    places = np.indices((SIDE_PX, SIDE_PX)).reshape(2, -1).T
+    distance = np.linalg.norm(places[:, None] - places[None, :], axis=-1)
+    return np.asarray(np.exp(-distance / REACH_PX))
+
+
+COVARIANCE = _covariance()

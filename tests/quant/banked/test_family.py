@@ -1,0 +1,172 @@
+"""INT8 once for a family of sensors: near the float network for each, and alike but for what a sensor changes."""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from deploy.dpu.board import load_dpu
+from deploy.dpu.checker.placement import place
+from deploy.dpu.reading import network_of
+from model.bank import Bank, bank_of_vector
+from model.convbeers import BankedConvBEERS, initialise
+from model.io.tensors import Weights
+from model.variants import Variant
+from profiles.errors import ModelError
+from quant.banked.calibrate import bank_results, quantise_family
+from quant.banked.family import FAMILY, Family, delta_of_file, family_of, required_family, with_delta
+from quant.banked.filters import COPIES
+from quant.calibration import Remade
+from quant.core import IntConv, IntCore, shift_faults
+from quant.encodings import board_model, encoding_faults, host_model, read_core
+from quant.integer.reference import merged_correction, run_core
+from quant.session import open_session, run
+from quant.tiling.walk import tiling_of
+from tests.quant.banked.test_filters import textured
+
+SENSORS = [(0.2, 0.1, -0.3, -0.2), (-0.9, -0.8, 0.4, 0.5), (0.6, 0.3, 0.8, 0.9), (-0.2, -0.4, -0.7, -0.9)]
+
+
+def bank(vector: tuple[float, ...]) -> Bank:
+    return bank_of_vector(vector)
+
+
+def network(scale: int) -> BankedConvBEERS:
+    made = BankedConvBEERS(Variant(2, 8, scale))
+    generator = torch.Generator().manual_seed(scale)
+    initialise(made, generator)
+    with torch.no_grad():
+        for parameter in made.parameters():
+            parameter.add_(0.04 * torch.randn(parameter.shape, generator=generator))
+    return made.eval()
+
+
+@pytest.fixture(scope="module", params=[1, 2])
+def pair(request: pytest.FixtureRequest) -> tuple[BankedConvBEERS, Family]:
+    made, scale = network(request.param), int(request.param)
+    weights = Weights({name: value.numpy() for name, value in made.state_dict().items()}, made.variant, {})
+    images = [bank_results(textured(64, 64, k), bank(each), each, scale) for k, each in enumerate(SENSORS)]
+    middle = bank((0.0, 0.0, 0.0, 0.0))
+    return made, quantise_family(weights, middle, Remade(images.__getitem__, len(images)), lambda: None)
+
+
+def core_of(family: Family, vector: tuple[float, ...]) -> IntCore:
+    return family.for_sensor(bank(vector), vector)
+
+
+@pytest.mark.parametrize("vector", SENSORS)
+def test_int8_is_near_the_float_network_for_every_sensor(
+    pair: tuple[BankedConvBEERS, Family], vector: tuple[float, ...]
+) -> None:
+    made, family = pair
+    image = 0.3 + 0.3 * textured(46, 58, 9)  # within eight units of the quietest sensor, where int8 ends
+    with torch.inference_mode():
+        wanted = made(torch.from_numpy(image), torch.tensor([vector])).clamp(0, 1).numpy()
+    found = run(open_session(host_model(core_of(family, vector), {})), image)
+    unit = bank(vector).unit
+    assert np.sqrt(np.square(found - wanted).mean()) < 0.05 * unit
+    assert np.sqrt(np.square(image - wanted).mean()) > 0.1 * unit
+
+
+def test_the_file_is_what_its_integers_ask_for_and_the_reference_gives_the_same(
+    pair: tuple[BankedConvBEERS, Family],
+) -> None:
+    core, image = core_of(pair[1], SENSORS[0]), textured(30, 34, 5)
+    file = host_model(core, {"precision": "int8 legal"})
+    assert encoding_faults(file) == []
+    again = read_core(file)
+    tensors, _ = run_core(again, again.ends.split(image), half_even=True)
+    mine = again.ends.finished(image, merged_correction(again, tensors))
+    np.testing.assert_allclose(mine, run(open_session(file), image), atol=1e-7)
+
+
+def test_a_sensor_changes_the_first_layer_the_heads_bias_and_the_unit_alone(
+    pair: tuple[BankedConvBEERS, Family],
+) -> None:
+    first, second = (core_of(pair[1], vector) for vector in SENSORS[:2])
+    assert first.frac_bits == second.frac_bits
+    assert first.ends.unit != second.ends.unit
+    changed = []
+    for one, other in zip(first.ops, second.ops, strict=True):
+        if isinstance(one, IntConv) and isinstance(other, IntConv):
+            changed += [one.name] * (not np.array_equal(one.bias, other.bias))
+            same = np.array_equal(one.weight, other.weight)
+            assert same == (one.name != "bank")
+    assert {name.removesuffix(".twice") for name in changed} - {"bank"} == {"head"}
+
+
+def test_the_file_of_any_sensor_can_be_told_another(pair: tuple[BankedConvBEERS, Family]) -> None:
+    family = pair[1]
+    first, second = (host_model(core_of(family, each), {FAMILY: family.to_words()}) for each in SENSORS[:2])
+    again = family_of(first)
+    assert again is not None
+    found = host_model(core_of(again, SENSORS[1]), {FAMILY: again.to_words()})
+    assert found.SerializeToString(deterministic=True) == second.SerializeToString(deterministic=True)
+
+
+def test_a_delta_makes_any_sensors_file_that_sensors_to_the_byte(pair: tuple[BankedConvBEERS, Family]) -> None:
+    family = pair[1]
+    first, second = (
+        host_model(core_of(family, each), {FAMILY: family.to_words(), "sensor": str(k)})
+        for k, each in enumerate(SENSORS[:2])
+    )
+    delta = delta_of_file(second)
+    assert len(delta) < 3000
+    core, name = with_delta(required_family(first).core, delta)
+    found = host_model(core, {FAMILY: family.to_words(), "sensor": name})
+    assert found.SerializeToString(deterministic=True) == second.SerializeToString(deterministic=True)
+
+
+@pytest.mark.parametrize("change", [lambda d: d[:-9], lambda d: d[:0], lambda d: b"x" + d, lambda d: d[:40] + d[41:]])
+def test_a_damaged_delta_is_one_sentence(
+    pair: tuple[BankedConvBEERS, Family], change: Callable[[bytes], bytes]
+) -> None:
+    file = host_model(core_of(pair[1], SENSORS[1]), {FAMILY: pair[1].to_words()})
+    with pytest.raises(ModelError, match="export --delta"):
+        with_delta(required_family(file).core, change(delta_of_file(file)))
+
+
+def test_a_delta_of_another_network_is_refused(pair: tuple[BankedConvBEERS, Family]) -> None:
+    file = host_model(core_of(pair[1], SENSORS[1]), {FAMILY: pair[1].to_words()})
+    other = replace(required_family(file).core, ops=required_family(file).core.ops[1:])
+    with pytest.raises(ModelError, match="which the network lacks"):
+        with_delta(other, delta_of_file(file))
+
+
+def test_words_of_another_network_are_refused(pair: tuple[BankedConvBEERS, Family]) -> None:
+    core = core_of(pair[1], SENSORS[0])
+    assert family_of(host_model(core, {})) is None
+    for words in ("[]", '{"head": [[0, 0, 0, 0, 0]]}', '{"other": []}', "{"):
+        with pytest.raises(ModelError, match="INT8 model"):
+            family_of(host_model(core, {FAMILY: words}))
+
+
+def test_tiles_give_the_whole_images_result(pair: tuple[BankedConvBEERS, Family]) -> None:
+    """Mirrored borders reach no farther inside than the halo."""
+    file, image = host_model(core_of(pair[1], SENSORS[1]), {}), textured(96, 80, 6)
+    session, tiling = open_session(file), tiling_of(file)
+    whole, halo = run(session, image), tiling.halo_px
+    assert tiling.lattice_px == pair[0].variant.scale
+    for top, left in ((0, 0), (32, 24), (64, 48)):
+        bottom, right = top + 32, left + 32
+        above, before = max(top - halo, 0), max(left - halo, 0)
+        tile = run(session, np.ascontiguousarray(image[..., above : bottom + halo, before : right + halo]))
+        kept = tile[..., top - above : bottom - above, left - before : right - before]
+        np.testing.assert_array_equal(kept, whole[..., top:bottom, left:right])
+
+
+def test_the_dpu_runs_all_of_it(pair: tuple[BankedConvBEERS, Family]) -> None:
+    core = core_of(pair[1], SENSORS[2])
+    assert shift_faults(core) == []
+    board = board_model(core, {}, 64)
+    placed = place(network_of(board, 64), load_dpu("vck190", "C32B6"))
+    assert [node.op.name for node in placed.nodes if node.broken] == []
+    size = board.graph.input[0].type.tensor_type.shape.dim[2].dim_value
+    assert size == (70 if core.ends.place_px == 1 else 36)
+
+
+def test_the_first_layer_writes_whole_groups_of_sixteen_channels() -> None:
+    for scale, (images, planes, analytic) in COPIES.items():
+        assert (images + 4 * planes + analytic) * scale**2 in (16, 32)

@@ -1,0 +1,106 @@
+"""A sensor's bank in whole numbers: flat ground leaves nothing, and together the copies say what the filters do."""
+
+import numpy as np
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from model.bank import FILTERS, SIDE_PX, Bank, bank_of_vector
+from model.io.images import MAX_DN
+from quant.banked.filters import (
+    COPIES,
+    IMAGE_STEP_DN,
+    MIDDLE_DN,
+    PART,
+    STEP_DN,
+    UNITS,
+    channels,
+    split_planes,
+    whole_bank,
+)
+from quant.graph import Window
+from quant.integer.arithmetic import convolve
+
+VECTOR = st.tuples(*[st.floats(-1, 1)] * 4)
+
+
+def bank(vector: tuple[float, ...]) -> Bank:
+    return bank_of_vector(vector)
+
+
+def sums(image: np.ndarray, own: Bank) -> np.ndarray:
+    """What the first convolution makes of an image (1, 1, H, W), in steps, before anything is rounded or added."""
+    whole = whole_bank(own, 1)
+    return convolve(split_planes(image), whole.weight, Window()) / 2.0**whole.frac_bits
+
+
+def textured(rows: int, columns: int, seed: int = 0) -> np.ndarray:
+    """Ground as a sensor sees it, from a twentieth to nearly all of full scale: (1, 1, rows, columns) float32."""
+    generator = np.random.default_rng(seed)
+    fy, fx = np.fft.fftfreq(rows)[:, None], np.fft.rfftfreq(columns)[None, :]
+    frequency = np.hypot(fy, fx)
+    falling = np.fft.rfft2(generator.standard_normal((rows, columns))) * np.exp(-5 * frequency) / (frequency + 0.02)
+    ground = np.asarray(np.fft.irfft2(falling, (rows, columns)))
+    return np.asarray((0.05 + 0.9 * (ground - ground.min()) / np.ptp(ground))[None, None], np.float32)
+
+
+@settings(max_examples=25)
+@given(st.integers(0, MAX_DN))
+def test_the_planes_hold_every_number(dn: int) -> None:
+    coarse, remainder, part = split_planes(np.full((1, 1, 1, 1), dn / MAX_DN, np.float32))[0, :, 0, 0].astype(int)
+    assert MIDDLE_DN + STEP_DN * coarse + remainder == dn
+    assert abs(PART * part - remainder) <= PART / 2
+
+
+@settings(max_examples=15)
+@given(VECTOR, st.integers(0, MAX_DN))
+def test_flat_ground_leaves_nothing_but_its_own_brightness(vector: tuple[float, ...], dn: int) -> None:
+    flat = np.full((1, 1, SIDE_PX, SIDE_PX), dn / MAX_DN, np.float32)
+    found = sums(flat, bank(vector))[0, :, 0, 0]
+    np.testing.assert_array_equal(found[COPIES[1][0] :], 0)
+    assert abs(found[0] - (dn - MIDDLE_DN) / IMAGE_STEP_DN) <= 0.5
+
+
+@settings(max_examples=15)
+@given(VECTOR)
+def test_the_weights_are_int8_and_near_the_filters(vector: tuple[float, ...]) -> None:
+    own, whole = bank(vector), whole_bank(bank(vector), 1)
+    assert 50 < np.abs(whole.weight.astype(int)).max() < 127  # no finer scale would hold them, and none is cut off
+    for channel, (kernel, _) in enumerate(channels(1)):
+        wanted = own.kernels[kernel] * (UNITS / MAX_DN if kernel else 1 / IMAGE_STEP_DN) * 2.0**whole.frac_bits
+        coarse, fine, part = whole.weight[channel].astype(float)
+        assert np.abs(coarse / STEP_DN - wanted).max() < 5 / STEP_DN
+        assert kernel == 0 or np.abs(fine + part / PART - wanted).max() < 5 / PART
+
+
+@settings(max_examples=8)
+@given(VECTOR)
+def test_the_mean_of_the_copies_is_what_the_filter_gives(vector: tuple[float, ...]) -> None:
+    """To a fraction of a step on ground of all scales, so that rounding the weights costs less than the result's."""
+    own, image = bank(vector), textured(90, 101)
+    centred = np.lib.stride_tricks.sliding_window_view(image[0, 0].astype(np.float64), (SIDE_PX, SIDE_PX))
+    found, read = sums(image, own)[0], [kernel for kernel, _ in channels(1)]
+    for kernel in range(1, 2 + FILTERS):
+        wanted = UNITS * np.einsum("ijkl,kl->ij", centred, own.kernels[kernel])
+        mean = found[[place for place, each in enumerate(read) if each == kernel]].mean(0)
+        assert np.sqrt(np.square(mean - wanted).mean()) < 0.3 + 0.05 * np.sqrt(np.square(wanted).mean())
+
+
+def test_copies_are_rounded_at_places_spread_over_a_step() -> None:
+    for scale, counts in COPIES.items():
+        offsets = [offset for kernel, offset in channels(scale) if kernel == 1 + FILTERS]
+        assert len(offsets) == counts[2]
+        np.testing.assert_allclose(np.diff(offsets), 1 / counts[2])
+        assert sum(offsets) == 0
+
+
+def test_at_half_resolution_the_same_filters_meet_the_same_pixels() -> None:
+    own, image = bank((0.3, -0.4, 0.1, 0.2)), textured(32, 36)
+    fine, coarse = whole_bank(own, 1), whole_bank(own, 2)
+    assert fine.frac_bits == coarse.frac_bits
+    planes = split_planes(image)
+    blocks = planes.reshape(1, 3, 16, 2, 18, 2).transpose(0, 1, 3, 5, 2, 4).reshape(1, 12, 16, 18)
+    found = convolve(blocks, coarse.weight, Window())  # of places 2 .. 13
+    first = [[kernel for kernel, _ in channels(scale)].index(1) for scale in (1, 2)]
+    wanted = convolve(planes, fine.weight, Window())[0, first[0], 1:-1, 1:-1]
+    mine = found[0].reshape(-1, 2, 2, *found.shape[2:])[first[1]].transpose(2, 0, 3, 1).reshape(wanted.shape)
+    np.testing.assert_array_equal(mine, wanted)
