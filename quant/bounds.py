@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from quant.banked.filters import PLANE_ENDS
 from quant.core import INT8_MAX, INT8_MIN, IntConv, IntCore
 from quant.graph import (
     COARSE_MAX,
@@ -214,6 +215,9 @@ def correction_bound(core: IntCore, gain: int) -> float:
 
 def _planes(core: IntCore) -> Range:
     count, channels = core.ends.planes, core.ends.channels
+    if core.ends.banked:
+        low, high = (np.array(ends) for ends in PLANE_ENDS)
+        return low.repeat(channels), high.repeat(channels)
     return PLANE_LOW[:count].repeat(channels), PLANE_HIGH[:count].repeat(channels)
 
 

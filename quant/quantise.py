@@ -214,25 +214,6 @@ def rounded(
     plan: Plan, images: Remade[np.ndarray], tick: Callable[[], None]
 ) -> tuple[IntCore, Graph, frozenset[str]]:
     """A plan's graph in whole numbers, the float graph that was rounded, and the tensors of its last sum."""
-    made = prepared(plan, images, tick)
-    core = made.plan.core(made.graph, made.frac_bits)
-    if plan.passes.fit_weights:
-        core = fit_weights(made.graph, core, input_moments(made.graph, images, tick, plan.ends), plan.shifts)
-    return core, made.graph, made.last_sum
-
-
-@dataclass(frozen=True)
-class Prepared:
-    """A float graph as it will be rounded, the least-squares scales of its tensors, and its last sum's tensors."""
-
-    plan: Plan
-    graph: Graph
-    frac_bits: Mapping[str, int]
-    last_sum: frozenset[str]
-
-
-def prepared(plan: Plan, images: Remade[np.ndarray], tick: Callable[[], None]) -> Prepared:
-    """The plan's float graph equalised, paired and ended, so that rounding it costs little."""
     graph, passes = plan.graph, plan.passes
     frac_bits = choose_frac_bits(graph, images, tick, passes.least_squares, plan.ends)
     if plan.takes_windows:
@@ -245,7 +226,11 @@ def prepared(plan: Plan, images: Remade[np.ndarray], tick: Callable[[], None]) -
     if paired is not graph:
         paired = with_room(paired, plan.stream_step(frac_bits), images, tick, plan.ends)
         last_sum = frozenset(paired[-2].inputs)
-    return Prepared(plan, plan.ended(paired), frac_bits, last_sum)
+    final = plan.ended(paired)
+    core = plan.core(final, frac_bits)
+    if passes.fit_weights:
+        core = fit_weights(final, core, input_moments(final, images, tick, plan.ends), plan.shifts)
+    return core, final, last_sum
 
 
 def _result_range(plan: Plan, images: Remade[np.ndarray], tick: Callable[[], None]) -> tuple[np.ndarray, np.ndarray]:

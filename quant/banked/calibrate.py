@@ -18,16 +18,16 @@ from model.variants import SENSOR_VALUES
 from profiles import load_sensor
 from quant.banked.family import BANK, Family, bank_layer
 from quant.banked.filters import ANALYTIC_COPIES, BITS, COPIES, UNITS, channels, spread_over_a_step, whole_bank
-from quant.calibration import PATCH_PX, Remade, draw_patches
+from quant.calibration import PATCH_PX, Pair, Patches, Remade, draw_patches
 from quant.core import SHIFTS, IntConv, IntCore, Shifts, quantise_bias
 from quant.ends import Ends
 from quant.graph import CORRECTION, PLANES, Activation, Add, Concat, Conv, Graph, Op, Shuffle, Window, same
 from quant.graph.network import renamed
 from quant.integer.arithmetic import convolve
-from quant.passes.fit_weights import Moments, fit_weights, input_moments
 from quant.passes.level import Chain
 from quant.passes.stream import streams
-from quant.quantise import ALL, Plan, plan_ticks, prepared
+from quant.passes.tune import Tuning, tune
+from quant.quantise import ALL, Plan, plan_ticks, rounded
 
 LIKE = "pleiades-degraded"
 """The profile that gives gain and bits; what is computed is over full scale."""
@@ -124,7 +124,12 @@ def bank_results(image: np.ndarray, bank: Bank, vector: Sequence[float], scale: 
 
 
 def quantise_family(
-    weights: Weights, bank: Bank, images: Remade[np.ndarray], tick: Callable[[], None], shifts: Shifts = SHIFTS
+    weights: Weights,
+    bank: Bank,
+    images: Remade[np.ndarray],
+    tick: Callable[[], None],
+    shifts: Shifts = SHIFTS,
+    tuning: Tuning | None = None,
 ) -> Family:
     """A network behind a bank in whole numbers, for the middle of the family.
 
@@ -132,21 +137,33 @@ def quantise_family(
         weights: of a `BankedConvBEERS`.
         bank: of the middle of the family.
         images: of `bank_results`, of sensors from all over the family.
-        tick: called once per image and pass, and step of a search.
+        tick: called once per image and pass, and step of a search or of the tuning.
         shifts: the windows of the target.
+        tuning: trains the whole numbers at last, on pairs of `family_pairs`.
     """
-    plan, scale = _plan(weights, shifts), weights.variant.scale
-    made, ends = prepared(plan, images, tick), plan.ends
-    moments = input_moments(made.graph, images, tick, ends)
-    told = {op.name: op for op in made.graph if isinstance(op, Conv) and op.input == PLANES}
-    plain = tuple(_without_values(op) if isinstance(op, Conv) and op.name in told else op for op in made.graph)
-    moments |= {name: _moments_without_values(moments[name]) for name in told}
-    body = fit_weights(plain, made.plan.core(plain, made.frac_bits), moments, shifts)
-    middle = {op.name: op.float_bias for op in body.convolutions}
+    plan = _plan(weights, shifts)
+    body, rounded_from, last_sum = rounded(plan, images, tick)
+    if tuning:
+        body = tune(body, rounded_from, plan.full, tuning, tick, still=last_sum)
+    told = {op.name: op for op in body.convolutions if op.input == PLANES}
     # The planes of a sensor's values hold half of each.
-    values = {name: op.weight[:, -SENSOR_VALUES:, 1, 1] / 2 for name, op in told.items()}
-    biases = {name: np.concatenate([middle[name][:, None], values[name]], 1) for name in told}
-    return Family(_assembled(body, bank, scale, shifts), biases, shifts)
+    values = {
+        name: op.weight[:, -SENSOR_VALUES:, 1, 1] * 2.0 ** -(op.weight_frac_bits + 1) for name, op in told.items()
+    }
+    biases = {name: np.concatenate([op.float_bias[:, None], values[name]], 1) for name, op in told.items()}
+    ops = tuple(_without_values(op) if op.name in told else op for op in body.ops)
+    return Family(_assembled(replace(body, ops=ops), bank, weights.variant.scale, shifts), biases, shifts)
+
+
+def _biases(op: IntConv) -> np.ndarray:
+    """What a convolution adds, and for each of a sensor's values: the planes of these hold half of each. (O, 5)."""
+    values = op.weight[:, -SENSOR_VALUES:, 1, 1] * 2.0 ** -(op.weight_frac_bits + 1)
+    return np.concatenate([op.float_bias[:, None], values], 1)
+
+
+def _without_values(op: IntConv | Op) -> IntConv | Op:
+    assert isinstance(op, IntConv)  # noqa: S101
+    return replace(op, weight=op.weight[:, :-SENSOR_VALUES])
 
 
 def family_ticks(weights: Weights) -> int:
@@ -179,13 +196,7 @@ def family_images(scenes: list[Scene], scale: int, seed: int, patch_px: int = PA
     Raises:
         ImageError: no scene holds a patch.
     """
-    like, reference = load_sensor(LIKE), load_sensor(REFERENCE)
-    families = (PATCHES, SensorFamily(like.nominal())), (QUIET_PATCHES, SensorFamily(like.nominal(), QUIET_SNR))
-    drawn = [
-        draw_patches(scenes, like, reference, count, seed + number, patch_px, family)
-        for number, (count, family) in enumerate(families)
-    ]
-    places = [(patches, number) for patches in drawn for number in range(len(patches.views))]
+    places = _drawn(scenes, seed, PATCHES, QUIET_PATCHES, patch_px)
 
     def results(place: int) -> np.ndarray:
         patches, number = places[place]
@@ -195,10 +206,39 @@ def family_images(scenes: list[Scene], scale: int, seed: int, patch_px: int = PA
     return Remade(results, len(places))
 
 
-def _without_values(op: Conv) -> Conv:
-    return replace(op, weight=op.weight[:, :-SENSOR_VALUES])
+def family_pairs(scenes: list[Scene], scale: int, seed: int, patch_px: int = PATCH_PX) -> Remade[Pair]:
+    """What a family's whole numbers are trained on: as `family_images`, with the corrections that would restore all.
+
+    Args:
+        scenes: that are seen.
+        scale: of the network.
+        seed: of everything that is drawn; another than calibration's.
+        patch_px: side of a patch.
+
+    Raises:
+        ImageError: no scene holds a patch.
+    """
+    places, ends = _drawn(scenes, seed, 3 * PATCHES, 3 * QUIET_PATCHES, patch_px), front_ends(scale)
+    copies, pixels = COPIES[scale][2], scale**2
+
+    def pair(place: int) -> Pair:
+        patches, number = places[place]
+        sensor, (image, reference) = patches.views[number].degraded, patches.pairs[number]
+        bank = network_bank(sensor)
+        results = bank_results(image, bank, sensor_vector(sensor).values, scale)
+        analytic = results[:, -SENSOR_VALUES - copies * pixels : -SENSOR_VALUES] * (2.0**BITS / UNITS)
+        wanted = replace(ends, unit=bank.unit).correction_of(image, reference)
+        return results, wanted - analytic.reshape(1, copies, pixels, *results.shape[2:]).mean(1)
+
+    return Remade(pair, len(places))
 
 
-def _moments_without_values(moments: Moments) -> Moments:
-    kept = slice(0, len(moments.total) - SENSOR_VALUES * 9)
-    return Moments(moments.products[kept, kept], moments.total[kept], moments.count)
+def _drawn(scenes: list[Scene], seed: int, count: int, quiet: int, patch_px: int) -> list[tuple[Patches, int]]:
+    """Patches of the family, and of its quietest sensors: those that each is one of, and its number among them."""
+    like, reference = load_sensor(LIKE), load_sensor(REFERENCE)
+    families = (count, SensorFamily(like.nominal())), (quiet, SensorFamily(like.nominal(), QUIET_SNR))
+    drawn = [
+        draw_patches(scenes, like, reference, wanted, seed + number, patch_px, family)
+        for number, (wanted, family) in enumerate(families)
+    ]
+    return [(patches, number) for patches in drawn for number in range(len(patches.views))]

@@ -21,6 +21,9 @@ STEP_DN, MIDDLE_DN, PART = 16, 2048, 2
 """Of the planes: the coarse one's step and its zero, and by what the third divides the remainder."""
 
 PLANES_PER_CHANNEL = 3
+PLANE_ENDS = (-128, -8, -4), (127, 15, 8)
+"""The smallest and the largest number of each: at full scale the coarse plane is at its end, and more remains."""
+
 UNITS = 16
 """Steps of a result that are one unit: 127 of them hold eight units, as in training."""
 

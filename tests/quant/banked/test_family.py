@@ -10,14 +10,17 @@ import torch
 from deploy.dpu.board import load_dpu
 from deploy.dpu.checker.placement import place
 from deploy.dpu.reading import network_of
-from model.bank import Bank, bank_of_vector
+from model.bank import Bank, bank_of_vector, network_bank
 from model.convbeers import BankedConvBEERS, initialise
 from model.io.tensors import Weights
+from model.simulator.procedural import procedural_scene
 from model.variants import Variant
 from profiles.errors import ModelError
+from quant.banked import calibrate
 from quant.banked.calibrate import bank_results, quantise_family
 from quant.banked.family import FAMILY, Family, delta_of_file, family_of, required_family, with_delta
 from quant.banked.filters import COPIES
+from quant.bounds import layer_bounds
 from quant.calibration import Remade
 from quant.core import IntConv, IntCore, shift_faults
 from quant.encodings import board_model, encoding_faults, host_model, read_core
@@ -106,6 +109,24 @@ def test_the_file_of_any_sensor_can_be_told_another(pair: tuple[BankedConvBEERS,
     assert found.SerializeToString(deterministic=True) == second.SerializeToString(deterministic=True)
 
 
+@pytest.mark.parametrize("scale", [1, 2])
+def test_the_corrections_that_are_trained_on_restore_the_reference(scale: int) -> None:
+    scene = procedural_scene(420, 440, np.random.default_rng(3))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(calibrate, "PATCHES", 1)
+        patch.setattr(calibrate, "QUIET_PATCHES", 1)
+        pairs = calibrate.family_pairs([scene], scale, 5, 48)
+        places = calibrate._drawn([scene], 5, 3, 3, 48)
+    assert len(pairs) == len(places) == 6
+    for (results, wanted), (patches, number) in zip(pairs, places, strict=True):
+        image, meant = patches.pairs[number]
+        unit = network_bank(patches.views[number].degraded).unit
+        copies, pixels = COPIES[scale][2], scale**2
+        analytic = results[:, -4 - copies * pixels : -4].reshape(1, copies, pixels, *wanted.shape[2:]).mean(1) * 8
+        restored = replace(calibrate.front_ends(scale), unit=unit).finished(image, analytic + wanted)
+        np.testing.assert_allclose(restored, meant, atol=1e-5)
+
+
 def test_a_delta_makes_any_sensors_file_that_sensors_to_the_byte(pair: tuple[BankedConvBEERS, Family]) -> None:
     family = pair[1]
     first, second = (
@@ -155,6 +176,18 @@ def test_tiles_give_the_whole_images_result(pair: tuple[BankedConvBEERS, Family]
         tile = run(session, np.ascontiguousarray(image[..., above : bottom + halo, before : right + halo]))
         kept = tile[..., top - above : bottom - above, left - before : right - before]
         np.testing.assert_array_equal(kept, whole[..., top:bottom, left:right])
+
+
+def test_no_image_leaves_the_bounds_that_are_proven(pair: tuple[BankedConvBEERS, Family]) -> None:
+    core = core_of(pair[1], SENSORS[3])
+    bounds = {bound.name: bound for bound in layer_bounds(core)}
+    checkerboard = (np.indices((24, 28)).sum(0) % 2).astype(np.float32)[None, None]
+    for image in (checkerboard, textured(24, 28, 4), np.ones_like(checkerboard)):
+        tensors, reports = run_core(core, core.ends.split(image))
+        for op, report in zip(core.ops, reports, strict=True):
+            assert report.peak_bits <= bounds[op.name].bits + 1e-9
+            assert np.clip(bounds[op.name].low, -128, 127) <= tensors[op.output].min()
+            assert tensors[op.output].max() <= np.clip(bounds[op.name].high, -128, 127)
 
 
 def test_the_dpu_runs_all_of_it(pair: tuple[BankedConvBEERS, Family]) -> None:

@@ -1,7 +1,7 @@
 """A sensor's bank in whole numbers: flat ground leaves nothing, and together the copies say what the filters do."""
 
 import numpy as np
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from model.bank import FILTERS, SIDE_PX, Bank, bank_of_vector
@@ -11,6 +11,7 @@ from quant.banked.filters import (
     IMAGE_STEP_DN,
     MIDDLE_DN,
     PART,
+    PLANE_ENDS,
     STEP_DN,
     UNITS,
     channels,
@@ -44,9 +45,14 @@ def textured(rows: int, columns: int, seed: int = 0) -> np.ndarray:
 
 
 @settings(max_examples=25)
+@example(0)
+@example(MAX_DN)
 @given(st.integers(0, MAX_DN))
 def test_the_planes_hold_every_number(dn: int) -> None:
-    coarse, remainder, part = split_planes(np.full((1, 1, 1, 1), dn / MAX_DN, np.float32))[0, :, 0, 0].astype(int)
+    found = split_planes(np.full((1, 1, 1, 1), dn / MAX_DN, np.float32))[0, :, 0, 0].astype(int)
+    coarse, remainder, part = found
+    assert (found >= PLANE_ENDS[0]).all()
+    assert (found <= PLANE_ENDS[1]).all()
     assert MIDDLE_DN + STEP_DN * coarse + remainder == dn
     assert abs(PART * part - remainder) <= PART / 2
 
