@@ -265,7 +265,7 @@ def behind_bank(given: Path) -> Conditioned | None:
 
 
 def family_model(
-    network: Conditioned, images: Path | None = None, seed: int = SEED, shifts: Shifts = SHIFTS, finetune: int = 0
+    network: Conditioned, images: Path | None = None, seed: int = SEED, shifts: Shifts = SHIFTS
 ) -> onnx.ModelProto:
     """The INT8 file of a network behind a bank, for the middle of the family; any sensor can be told to it.
 
@@ -274,24 +274,19 @@ def family_model(
         images: folder of scenes that the family sees while it is calibrated; None draws some.
         seed: of the patches.
         shifts: the windows of the target.
-        finetune: steps that train the whole numbers at last.
 
     Raises:
         ModelError: other weights.
     """
     from model.simulator.procedural import load_scenes  # torch, which what is kept already does not need
-    from quant.banked.calibrate import family_images, family_pairs, family_ticks, quantise_family
-    from quant.calibration import TUNING_SEED
-    from quant.passes.tune import Tuning
+    from quant.banked.calibrate import family_images, family_ticks, quantise_family
 
     weights = read_banked(network.weights)
     scenes, scale = load_scenes(images, load_sensor(REFERENCE).nominal(), seed), weights.variant.scale
-    tuning = Tuning(family_pairs(scenes, scale, seed + TUNING_SEED), finetune) if finetune else None
-    with steps(f"calibrating {network.name} over the family of sensors", family_ticks(weights) + finetune) as bar:
+    with steps(f"calibrating {network.name} over the family of sensors", family_ticks(weights)) as bar:
         seen, middle = family_images(scenes, scale, seed), bank_of_vector((0.0,) * len(RANGES))
-        family = quantise_family(weights, middle, seen, bar.advance, shifts, tuning)
+        family = quantise_family(weights, middle, seen, bar.advance, shifts)
     said = {"variant": network.name, "reference": REFERENCE, "precision": "int8 legal", "calibration_seed": str(seed)}
-    said |= {"finetune": f"{finetune} steps on {len(tuning.pairs)} patches"} if tuning else {}
     return host_model(family.core, {**said, FAMILY: family.to_words(), WEIGHTS: sha256(network.weights)})
 
 

@@ -112,7 +112,7 @@ def quantise_banked_file(
     calibration: Calibration,
     target: TargetProfile,
     out: Path,
-    wanted: Wanted,
+    board: Path | None,
     say: Say,
     show: Show,
 ) -> list[Row]:
@@ -123,7 +123,7 @@ def quantise_banked_file(
         calibration: scenes and seed of the family's patches, and the sensor that is told.
         target: whose rules to obey.
         out: the host's file.
-        wanted: what else is.
+        board: the board's, or None.
         say: tells what was written.
         show: shows the tables.
 
@@ -132,14 +132,14 @@ def quantise_banked_file(
         ModelError: other weights.
     """
     sensor, made = load_sensor(calibration.sensor), {"target": target.name}
-    family = family_model(network, calibration.images, calibration.seed, _shifts_of(target), wanted.finetune)
+    family = family_model(network, calibration.images, calibration.seed, _shifts_of(target))
     host = told_int8(family, sensor, made)
     core = read_core(host)
     save_onnx(host, out)
     say(f"wrote {out}: {len(core.ops)} integer operations, for {sensor.name}; any sensor in range can be told to it")
-    if wanted.board is not None:
-        save_onnx(board_model(core, metadata(host)), wanted.board)
-        say(f"wrote {wanted.board}: the same numbers in the board's encoding")
+    if board is not None:
+        save_onnx(board_model(core, metadata(host)), board)
+        say(f"wrote {board}: the same numbers in the board's encoding")
     model, patches = specialised_model(network, sensor, say), calibration.drawn.degraded
     layers, rounding = integer_rows(model, core, host, patches)
     show("integer layers", layers)

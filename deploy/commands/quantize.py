@@ -80,9 +80,9 @@ def quantize(
     read = (model, images, data, *map(Path, (target, sensor)))
     require_writable(out, board, json, page, figures, inputs=read)
     known, board_target, banked = load_sensor(sensor), load_target(target), behind_bank(model)
-    if banked and (regime is Regime.free or ablate or report or without or data):
+    if banked and (regime is Regime.free or ablate or report or without or finetune or data):
         remedy = "leave it out: such a network is calibrated over the whole family of sensors at once"
-        expected = "no --regime free, --ablate, --report, --without or --data"
+        expected = "no --regime free, --ablate, --report, --without, --finetune or --data"
         raise OptionError("a network behind a bank", expected=expected, got="one", remedy=remedy)
     model = float_file(model, known, partial(say, err=True))
     network = float_model(model)
@@ -96,12 +96,12 @@ def quantize(
     passes = passes_without(without or [])
     simulated = Calibration(sensor, images, patches, patch, seed)
     calibration = samples_of(network, data) or simulated
-    wanted = Wanted(board, ablate, page, finetune)
     if banked:
-        rows = quantise_banked_file(banked, simulated, board_target, out, wanted, say, print_rows)
+        rows = quantise_banked_file(banked, simulated, board_target, out, board, say, print_rows)
     elif regime is Regime.free:
         rows = quantise_free_file(network, calibration, out, say, print_rows)
     else:
+        wanted = Wanted(board, ablate, page, finetune)
         rows = quantise_legal_file(network, calibration, board_target, passes, out, wanted, say, print_rows)
     arguments = {"target": target, "sensor": sensor, "images": images, "patches": patches, "patch": patch}
     arguments |= {"data": data}

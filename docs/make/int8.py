@@ -1,17 +1,17 @@
-"""Makes the shipped INT8 files anew: each network for the default sensor and a blind one, the default one for more.
+"""Makes the shipped INT8 files anew: of a network behind a bank one for all sensors, of others one for each sensor.
 
     python docs/make/int8.py [convbeers-s ...]
     python docs/make/int8.py convbeers-half --finetune aerial/ [--steps 250]
 
 The same bytes that a user's cache would hold: calibrated on drawn scenes. With --finetune the whole numbers of the
-default sensor's file are trained on a folder of photographs. Minutes a file.
+default sensor's file are trained on a folder of photographs, unless it is behind a bank. Minutes a file.
 """
 
 import argparse
 import shutil
 from pathlib import Path
 
-from deploy.networks import MADE_FROM, PATCH_PX, PATCHES, SEED, float_file, int8_file
+from deploy.networks import MADE_FROM, PATCH_PX, PATCHES, SEED, behind_bank, family_model, float_file, int8_file
 from model.progress import steps
 from model.shipped import INT8, SENSOR, SHIPPED, VARIANT, shipped_names
 from profiles.sensor_file import BLIND, load_sensor
@@ -34,13 +34,23 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=STEPS, help="of that training")
     arguments = parser.parse_args()
     for name in arguments.names:
-        for sensor in (*SENSORS, *(DETECTION if name == VARIANT else ())):
-            shipped = SHIPPED / f"{name}{INT8}-{sensor}.onnx"
-            shipped.unlink(missing_ok=True)
-            shutil.copyfile(int8_file(Path(name), load_sensor(sensor), print), shipped)
+        if network := behind_bank(Path(name)):
+            shipped = SHIPPED / f"{name}{INT8}.onnx"
+            save_onnx(family_model(network), shipped)
             print(shipped.name, flush=True)
-        if arguments.finetune:
-            finetune(name, arguments.finetune, arguments.steps)
+        else:
+            of_each_sensor(name, arguments.finetune, arguments.steps)
+
+
+def of_each_sensor(name: str, images: Path | None, count: int) -> None:
+    """The files of a network whose every layer knows its sensor."""
+    for sensor in (*SENSORS, *(DETECTION if name == VARIANT else ())):
+        shipped = SHIPPED / f"{name}{INT8}-{sensor}.onnx"
+        shipped.unlink(missing_ok=True)
+        shutil.copyfile(int8_file(Path(name), load_sensor(sensor), print), shipped)
+        print(shipped.name, flush=True)
+    if images:
+        finetune(name, images, count)
 
 
 def finetune(name: str, images: Path, count: int) -> None:

@@ -18,7 +18,7 @@ from model.variants import SENSOR_VALUES
 from profiles import load_sensor
 from quant.banked.family import BANK, Family, bank_layer
 from quant.banked.filters import ANALYTIC_COPIES, BITS, COPIES, UNITS, channels, spread_over_a_step, whole_bank
-from quant.calibration import PATCH_PX, Pair, Patches, Remade, draw_patches
+from quant.calibration import PATCH_PX, Remade, draw_patches
 from quant.core import SHIFTS, IntConv, IntCore, Shifts, quantise_bias
 from quant.ends import Ends
 from quant.graph import CORRECTION, PLANES, Activation, Add, Concat, Conv, Graph, Op, Shuffle, Window, same
@@ -26,7 +26,6 @@ from quant.graph.network import renamed
 from quant.integer.arithmetic import convolve
 from quant.passes.level import Chain
 from quant.passes.stream import streams
-from quant.passes.tune import Tuning, tune
 from quant.quantise import ALL, Plan, plan_ticks, rounded
 
 LIKE = "pleiades-degraded"
@@ -129,7 +128,6 @@ def quantise_family(
     images: Remade[np.ndarray],
     tick: Callable[[], None],
     shifts: Shifts = SHIFTS,
-    tuning: Tuning | None = None,
 ) -> Family:
     """A network behind a bank in whole numbers, for the middle of the family.
 
@@ -137,14 +135,10 @@ def quantise_family(
         weights: of a `BankedConvBEERS`.
         bank: of the middle of the family.
         images: of `bank_results`, of sensors from all over the family.
-        tick: called once per image and pass, and step of a search or of the tuning.
+        tick: called once per image and pass, and step of a search.
         shifts: the windows of the target.
-        tuning: trains the whole numbers at last, on pairs of `family_pairs`.
     """
-    plan = _plan(weights, shifts)
-    body, rounded_from, last_sum = rounded(plan, images, tick)
-    if tuning:
-        body = tune(body, rounded_from, plan.full, tuning, tick, still=last_sum)
+    body, *_ = rounded(_plan(weights, shifts), images, tick)
     told = {op.name: op for op in body.convolutions if op.input == PLANES}
     # The planes of a sensor's values hold half of each.
     values = {
@@ -196,7 +190,13 @@ def family_images(scenes: list[Scene], scale: int, seed: int, patch_px: int = PA
     Raises:
         ImageError: no scene holds a patch.
     """
-    places = _drawn(scenes, seed, PATCHES, QUIET_PATCHES, patch_px)
+    like, reference = load_sensor(LIKE), load_sensor(REFERENCE)
+    families = (PATCHES, SensorFamily(like.nominal())), (QUIET_PATCHES, SensorFamily(like.nominal(), QUIET_SNR))
+    drawn = [
+        draw_patches(scenes, like, reference, count, seed + number, patch_px, family)
+        for number, (count, family) in enumerate(families)
+    ]
+    places = [(patches, number) for patches in drawn for number in range(len(patches.views))]
 
     def results(place: int) -> np.ndarray:
         patches, number = places[place]
@@ -204,41 +204,3 @@ def family_images(scenes: list[Scene], scale: int, seed: int, patch_px: int = PA
         return bank_results(patches.degraded[number], network_bank(sensor), sensor_vector(sensor).values, scale)
 
     return Remade(results, len(places))
-
-
-def family_pairs(scenes: list[Scene], scale: int, seed: int, patch_px: int = PATCH_PX) -> Remade[Pair]:
-    """What a family's whole numbers are trained on: as `family_images`, with the corrections that would restore all.
-
-    Args:
-        scenes: that are seen.
-        scale: of the network.
-        seed: of everything that is drawn; another than calibration's.
-        patch_px: side of a patch.
-
-    Raises:
-        ImageError: no scene holds a patch.
-    """
-    places, ends = _drawn(scenes, seed, 3 * PATCHES, 3 * QUIET_PATCHES, patch_px), front_ends(scale)
-    copies, pixels = COPIES[scale][2], scale**2
-
-    def pair(place: int) -> Pair:
-        patches, number = places[place]
-        sensor, (image, reference) = patches.views[number].degraded, patches.pairs[number]
-        bank = network_bank(sensor)
-        results = bank_results(image, bank, sensor_vector(sensor).values, scale)
-        analytic = results[:, -SENSOR_VALUES - copies * pixels : -SENSOR_VALUES] * (2.0**BITS / UNITS)
-        wanted = replace(ends, unit=bank.unit).correction_of(image, reference)
-        return results, wanted - analytic.reshape(1, copies, pixels, *results.shape[2:]).mean(1)
-
-    return Remade(pair, len(places))
-
-
-def _drawn(scenes: list[Scene], seed: int, count: int, quiet: int, patch_px: int) -> list[tuple[Patches, int]]:
-    """Patches of the family, and of its quietest sensors: those that each is one of, and its number among them."""
-    like, reference = load_sensor(LIKE), load_sensor(REFERENCE)
-    families = (count, SensorFamily(like.nominal())), (quiet, SensorFamily(like.nominal(), QUIET_SNR))
-    drawn = [
-        draw_patches(scenes, like, reference, wanted, seed + number, patch_px, family)
-        for number, (wanted, family) in enumerate(families)
-    ]
-    return [(patches, number) for patches in drawn for number in range(len(patches.views))]

@@ -7,12 +7,10 @@ All scales are one for the family. A sensor's filters, its unit and the bias of 
 the host adds both results, times the unit, to the image.
 """
 
-import base64
 import json
 import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 import onnx
@@ -111,23 +109,22 @@ def bank_layer(bank: Bank, scale: int, shifts: Shifts) -> IntConv:
 def delta_of_file(model: onnx.ModelProto) -> bytes:
     """What its sensor has changed in an INT8 file of a network behind a bank: `with_delta` changes it in another's.
 
+    A line of JSON and the int8 numbers of each convolution that it names, in their order, all of it compressed.
+
     Raises:
         ModelError: no such file.
     """
     family = required_family(model)
-    core = family.core
-    ops = {
-        op.name: {
-            "weight": _text(op.weight) if op.input == PLANES else None,
-            "weight_frac_bits": op.weight_frac_bits,
-            "bias": _text(op.bias),
-            "bias_frac_bits": op.bias_frac_bits,
-        }
-        for op in core.convolutions
-        if op.input == PLANES or op.name in family.biases
-    }
-    said = {"sensor": metadata(model).get("sensor", ""), "unit": core.ends.unit, "ops": ops}
-    return zlib.compress(json.dumps(said, separators=(",", ":")).encode(), 9)
+    told = [op for op in family.core.convolutions if op.input == PLANES or op.name in family.biases]
+    bits = {op.name: [op.weight_frac_bits, op.bias_frac_bits] for op in told}
+    said = {"sensor": metadata(model).get("sensor", ""), "unit": family.core.ends.unit, "bits": bits}
+    numbers = b"".join(values.astype(np.int8).tobytes() for op in told for values in _numbers(op))
+    return zlib.compress(json.dumps(said, separators=(",", ":")).encode() + b"\n" + numbers, 9)
+
+
+def _numbers(op: IntConv) -> list[np.ndarray]:
+    """What a sensor changes in a convolution that it changes: of the bank all of it, of others the bias."""
+    return [op.weight, op.bias] if op.input == PLANES else [op.bias]
 
 
 def with_delta(core: IntCore, delta: bytes) -> tuple[IntCore, str]:
@@ -137,15 +134,21 @@ def with_delta(core: IntCore, delta: bytes) -> tuple[IntCore, str]:
         ModelError: no delta, or one of another network.
     """
     try:
-        said = json.loads(zlib.decompressobj().decompress(delta, LARGEST_DELTA))
-        told = {str(name): dict(values) for name, values in said["ops"].items()}
-        ops = tuple(_patched(op, told.pop(op.name)) if op.name in told else op for op in core.ops)
-        if told:
-            raise ValueError(f"{', '.join(told)}, which the network lacks")
-        return replace(core, ops=ops, ends=replace(core.ends, unit=float(said["unit"]))), str(said["sensor"])
+        line, _, numbers = zlib.decompressobj().decompress(delta, LARGEST_DELTA).partition(b"\n")
+        said = json.loads(line)
+        left, ops = np.frombuffer(numbers, np.int8), list[IntConv | Op]()
+        known = {op.name: op for op in core.convolutions}
+        told = {known[name].name: tuple(map(int, bits)) for name, bits in said["bits"].items()}
+        for op in core.ops:
+            if isinstance(op, IntConv) and op.name in told:
+                op, left = _patched(op, told[op.name], left)
+            ops.append(op)
+        if len(left):
+            raise ValueError(f"{len(left)} bytes too many")
+        return replace(core, ops=tuple(ops), ends=replace(core.ends, unit=float(said["unit"]))), str(said["sensor"])
     except (zlib.error, AttributeError, LookupError, RecursionError, TypeError, ValueError) as error:
         remedy = "give a file that 'export --delta' wrote for the same network"
-        got = " ".join(str(error).split())[:80]
+        got = " ".join(f"{type(error).__name__}: {error}".split())[:80]
         raise ModelError("delta", expected="one of this network", got=got, remedy=remedy) from error
 
 
@@ -153,23 +156,16 @@ LARGEST_DELTA = 1 << 20
 """Bytes that one is unpacked to."""
 
 
-def _patched(op: IntConv | Op, said: dict[str, Any]) -> IntConv | Op:
-    """A convolution with other integers of the same shapes.
+def _patched(op: IntConv, bits: tuple[int, ...], left: np.ndarray) -> tuple[IntConv, np.ndarray]:
+    """A convolution with the first of these numbers in the place of its own, and the numbers after them.
 
     Raises:
-        ValueError: other shapes.
+        ValueError: too few.
     """
-    if not isinstance(op, IntConv):
-        raise ValueError(f"{op.name} in the delta, which has no weights")
-    weight = op.weight if said["weight"] is None else _int8(said["weight"]).reshape(op.weight.shape)
-    bias, bits = _int8(said["bias"]).reshape(op.bias.shape), (int(said[f"{k}_frac_bits"]) for k in ("weight", "bias"))
+    found = list[np.ndarray]()
+    for values in _numbers(op):
+        found.append(left[: values.size].reshape(values.shape))
+        left = left[values.size :]
     weight_bits, bias_bits = bits
-    return replace(op, weight=weight, weight_frac_bits=weight_bits, bias=bias, bias_frac_bits=bias_bits)
-
-
-def _text(values: np.ndarray) -> str:
-    return base64.b64encode(values.astype(np.int8).tobytes()).decode()
-
-
-def _int8(text: str) -> np.ndarray:
-    return np.frombuffer(base64.b64decode(text, validate=True), np.int8)
+    weight = found[0] if len(found) > 1 else op.weight
+    return replace(op, weight=weight, bias=found[-1], weight_frac_bits=weight_bits, bias_frac_bits=bias_bits), left

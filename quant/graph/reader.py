@@ -143,6 +143,10 @@ class _Reader:
             return
         if node.op_type not in READERS:
             remedy = "replace it by one that the DPU computes, or cut the network in front of it"
+            if node.op_type == "Pad":
+                remedy = (
+                    "pad in the convolution; a network behind a bank is quantised from its weights (.safetensors)"
+                )
             raise refused_graph("operations that a DPU computes", f"{node.op_type} {node.name}", remedy)
         op = READERS[node.op_type](self, node)
         if op is not None:

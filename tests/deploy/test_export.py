@@ -7,6 +7,9 @@ import torch
 from typer.testing import CliRunner, Result
 
 from deploy.cli import app
+from deploy.dpu.board import load_dpu
+from deploy.dpu.checker.placement import place
+from deploy.dpu.reading import network_of
 from deploy.export import banked_to_onnx, parity, require_parity, to_onnx, weights_for
 from model.conditioning import vector_tensor
 from model.convbeers import BankedConvBEERS, ConvBEERS, initialise, plain_network
@@ -61,6 +64,8 @@ def test_a_network_behind_a_bank_is_exported_for_one_sensor(scale: int, rows: in
     with torch.inference_mode():
         expected = banked(torch.from_numpy(image), vectors).numpy()
     np.testing.assert_allclose(run(open_session(model), image), expected, atol=2e-6)
+    placed = place(network_of(model, 64), load_dpu("vck190", "C32B6"))
+    assert [node.op.name for node in placed.nodes if node.broken] == []
     tiling = tiling_of(model)
     assert tiling.lattice_px == scale
     assert tiling.halo_px == banked.variant.radius_px + (3 if scale == 1 else 4)
