@@ -31,7 +31,7 @@ def export(
     ] = None,
     delta: Annotated[
         Path | None,
-        typer.Option(help="Of an INT8 file: also write what the sensor changes in it, some hundred bytes."),
+        typer.Option(help="Of an INT8 file: also write what the sensor changes in it, 1 to 2 kB."),
     ] = None,
     apply: Annotated[
         Path | None, typer.Option(help="Of an INT8 file: tell it the sensor of this delta, in place of --sensor.")

@@ -4,7 +4,7 @@ The image enters in three planes: steps of 16 digital numbers about the middle, 
 finer weights. A filter's weights are rounded so that they sum to exactly 0 in each plane, for flat ground must leave
 nothing, and so that their errors lie where natural images hold little.
 
-What the filters give is int8 in steps of a sixteenth of a unit. Each comes several times, rounded at other places of
+What the filters give is int8 in steps of 1/24 of a unit. Each comes several times, rounded at other places of
 a step: together the copies hold what one cannot. The image itself comes in steps of 32, about the middle.
 """
 
@@ -24,13 +24,14 @@ PLANES_PER_CHANNEL = 3
 PLANE_ENDS = (-128, -8, -4), (127, 15, 8)
 """The smallest and the largest number of each: at full scale the coarse plane is at its end, and more remains."""
 
-UNITS = 16
-"""Steps of a result that are one unit: 127 of them hold eight units, as in training."""
+UNITS = 24
+"""Steps of a result that are one unit: 127 of them hold 5.3 units. Sixteen hold all that training saw, but their
+coarser steps cost more than what 24 clip."""
 
 IMAGE_STEP_DN = 32
 
 BITS = 7
-"""Fractional bits that a result is said to have: int8 then stands for -1 to 1, eight units or half of full scale."""
+"""Fractional bits that a result is said to have: int8 then stands for -1 to 1, 5.3 units or half of full scale."""
 
 ANALYTIC_COPIES = 4
 """Of the analytic restoration, in a network's result."""
@@ -38,8 +39,8 @@ ANALYTIC_COPIES = 4
 LARGEST = 112
 """Of a weight before it is rounded: what sums and copies make up for still fits int8."""
 
-COPIES = {1: (1, 2, 7), 2: (1, 1, 3)}
-"""By a network's scale, of the image, of each plane, and of the analytic restoration: 16 channels, 32 at scale 2."""
+COPIES = (1, 2, 7)
+"""Of the image, of each plane, and of the analytic restoration: 16 channels for each pixel of a place."""
 
 REACH_PX = 30.0
 """Neighbouring pixels of natural images are alike: their correlation falls to 1 / e within so many pixels."""
@@ -68,10 +69,9 @@ def split_planes(image: np.ndarray) -> np.ndarray:
     return np.concatenate([coarse, remainder, np.rint(remainder / PART)], axis=1).astype(np.int8)
 
 
-def channels(scale: int) -> list[tuple[int, float]]:
+def channels() -> list[tuple[int, float]]:
     """Of each output, before pixels become channels: which of the bank's kernels it is, and its offset in steps."""
-    counts = COPIES[scale]
-    copies = [counts[0], *[counts[1]] * FILTERS, counts[2]]
+    copies = [COPIES[0], *[COPIES[1]] * FILTERS, COPIES[2]]
     return [(kernel, offset) for kernel, count in enumerate(copies) for offset in spread_over_a_step(count)]
 
 
@@ -85,7 +85,7 @@ def whole_bank(bank: Bank, scale: int) -> WholeBank:
     wanted = bank.kernels * (UNITS / MAX_DN)  # steps for one digital number
     wanted[0] *= MAX_DN / UNITS / IMAGE_STEP_DN
     frac_bits = int(np.floor(np.log2(LARGEST / np.abs(STEP_DN * wanted).max())))
-    kernels, offsets = zip(*channels(scale), strict=True)
+    kernels, offsets = zip(*channels(), strict=True)
     exact = _copies(wanted * 2.0**frac_bits, kernels)
     planes = [in_places(exact[:, plane].astype(np.float64), scale) for plane in range(PLANES_PER_CHANNEL)]
     return WholeBank(np.concatenate(planes, 1).astype(np.int8), frac_bits, np.repeat(offsets, scale**2))

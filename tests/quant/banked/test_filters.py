@@ -1,6 +1,7 @@
 """A sensor's bank in whole numbers: flat ground leaves nothing, and together the copies say what the filters do."""
 
 import numpy as np
+import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
@@ -62,7 +63,7 @@ def test_the_planes_hold_every_number(dn: int) -> None:
 def test_flat_ground_leaves_nothing_but_its_own_brightness(vector: tuple[float, ...], dn: int) -> None:
     flat = np.full((1, 1, SIDE_PX, SIDE_PX), dn / MAX_DN, np.float32)
     found = sums(flat, bank(vector))[0, :, 0, 0]
-    np.testing.assert_array_equal(found[COPIES[1][0] :], 0)
+    np.testing.assert_array_equal(found[COPIES[0] :], 0)
     assert abs(found[0] - (dn - MIDDLE_DN) / IMAGE_STEP_DN) <= 0.5
 
 
@@ -71,7 +72,7 @@ def test_flat_ground_leaves_nothing_but_its_own_brightness(vector: tuple[float, 
 def test_the_weights_are_int8_and_near_the_filters(vector: tuple[float, ...]) -> None:
     own, whole = bank(vector), whole_bank(bank(vector), 1)
     assert 50 < np.abs(whole.weight.astype(int)).max() < 127  # no finer scale would hold them, and none is cut off
-    for channel, (kernel, _) in enumerate(channels(1)):
+    for channel, (kernel, _) in enumerate(channels()):
         wanted = own.kernels[kernel] * (UNITS / MAX_DN if kernel else 1 / IMAGE_STEP_DN) * 2.0**whole.frac_bits
         coarse, fine, part = whole.weight[channel].astype(float)
         assert np.abs(coarse / STEP_DN - wanted).max() < 5 / STEP_DN
@@ -84,7 +85,7 @@ def test_the_mean_of_the_copies_is_what_the_filter_gives(vector: tuple[float, ..
     """To a fraction of a step on ground of all scales, so that rounding the weights costs less than the result's."""
     own, image = bank(vector), textured(90, 101)
     centred = np.lib.stride_tricks.sliding_window_view(image[0, 0].astype(np.float64), (SIDE_PX, SIDE_PX))
-    found, read = sums(image, own)[0], [kernel for kernel, _ in channels(1)]
+    found, read = sums(image, own)[0], [kernel for kernel, _ in channels()]
     for kernel in range(1, 2 + FILTERS):
         wanted = UNITS * np.einsum("ijkl,kl->ij", centred, own.kernels[kernel])
         mean = found[[place for place, each in enumerate(read) if each == kernel]].mean(0)
@@ -92,11 +93,10 @@ def test_the_mean_of_the_copies_is_what_the_filter_gives(vector: tuple[float, ..
 
 
 def test_copies_are_rounded_at_places_spread_over_a_step() -> None:
-    for scale, counts in COPIES.items():
-        offsets = [offset for kernel, offset in channels(scale) if kernel == 1 + FILTERS]
-        assert len(offsets) == counts[2]
-        np.testing.assert_allclose(np.diff(offsets), 1 / counts[2])
-        assert sum(offsets) == 0
+    offsets = [offset for kernel, offset in channels() if kernel == 1 + FILTERS]
+    assert len(offsets) == COPIES[2]
+    np.testing.assert_allclose(np.diff(offsets), 1 / COPIES[2])
+    assert sum(offsets) == pytest.approx(0)
 
 
 def test_at_half_resolution_the_same_filters_meet_the_same_pixels() -> None:
@@ -106,7 +106,7 @@ def test_at_half_resolution_the_same_filters_meet_the_same_pixels() -> None:
     planes = split_planes(image)
     blocks = planes.reshape(1, 3, 16, 2, 18, 2).transpose(0, 1, 3, 5, 2, 4).reshape(1, 12, 16, 18)
     found = convolve(blocks, coarse.weight, Window())  # of places 2 .. 13
-    first = [[kernel for kernel, _ in channels(scale)].index(1) for scale in (1, 2)]
-    wanted = convolve(planes, fine.weight, Window())[0, first[0], 1:-1, 1:-1]
-    mine = found[0].reshape(-1, 2, 2, *found.shape[2:])[first[1]].transpose(2, 0, 3, 1).reshape(wanted.shape)
+    first = [kernel for kernel, _ in channels()].index(1)
+    wanted = convolve(planes, fine.weight, Window())[0, first, 1:-1, 1:-1]
+    mine = found[0].reshape(-1, 2, 2, *found.shape[2:])[first].transpose(2, 0, 3, 1).reshape(wanted.shape)
     np.testing.assert_array_equal(mine, wanted)
