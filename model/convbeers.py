@@ -75,9 +75,9 @@ class ConvBEERS(nn.Module):
         return pixel_shuffle(self.tail(deep), self.variant.scale)
 
 
-CLIP = 8.0
-"""Planes and the analytic restoration are held to so many units in training: what int8 of a sixteenth holds. Values
-beyond are rare enough that a network alone costs nothing without the limit (measured: 0.000 dB on ten sensors)."""
+CLIP = 127 / 24
+"""Planes and the analytic restoration are held to so many units in training: what int8 in steps of 1/24 holds. A
+network alone has no such limit; values beyond are rare."""
 
 
 class BankedConvBEERS(nn.Module):
