@@ -58,14 +58,15 @@ def export(
 
     if checkpoint is not None:
         refuse(context, ["variant"], expected="no --checkpoint beside it", got="both", remedy="leave one out")
+    if checkpoint is None or checkpoint.suffix != ".onnx":
+        remedy = "give one that 'quantize' made of weights of 'train --conditioned', or leave it out"
+        got = str(checkpoint) if checkpoint else "none"
+        refuse(context, ["delta", "apply"], expected="--checkpoint with an INT8 file", got=got, remedy=remedy)
     path = weights_file(checkpoint) if checkpoint else shipped_weights(variant)
     require_writable(out, delta, inputs=(path, apply, Path(sensor) if sensor else None))
     if path.suffix == ".onnx":
         _export_int8(path, out, sensor, delta, apply)
         return
-    if delta or apply:
-        expected, remedy = "an INT8 file that can be told its sensor", "give one with --checkpoint, or leave it out"
-        raise ModelError("--delta, --apply", expected=expected, got=str(path), remedy=remedy)
     known = load_sensor(sensor or SENSOR) if is_conditioned(path) else None
     if known is not None:
         model, outside = float_for(path, path.stem, known, tile)

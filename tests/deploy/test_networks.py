@@ -74,6 +74,7 @@ def test_the_same_numbers_are_the_same_sensor_and_others_are_not(conditioned: Pa
     assert files[2].read_bytes() != files[0].read_bytes()
 
 
+@pytest.mark.slow
 def test_int8_is_calibrated_once_and_then_told_any_sensor(
     conditioned: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
