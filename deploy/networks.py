@@ -3,7 +3,8 @@
 A shipped network is one set of weights for every sensor in range. NAME is that network in float32 and NAME-int8 in
 INT8, each for one sensor. Both are ONNX files, made when they are first asked for and kept in a cache by what they
 depend on: weights, the sensor's numbers, and for INT8 the code that makes it. For the shipped sensor profiles the
-INT8 files are shipped too: the very bytes that would be made.
+INT8 files are shipped too: the very bytes that would be made. A network behind the bank of its sensor is calibrated
+once for all sensors; its INT8 file is then told each.
 """
 
 import os

@@ -58,12 +58,12 @@ def export(
 
     if checkpoint is not None:
         refuse(context, ["variant"], expected="no --checkpoint beside it", got="both", remedy="leave one out")
+    path = weights_file(checkpoint) if checkpoint else shipped_weights(variant)
+    require_writable(out, delta, inputs=(path, apply, Path(sensor) if sensor else None))
     if checkpoint is None or checkpoint.suffix != ".onnx":
         remedy = "give one that 'quantize' made of weights of 'train --conditioned', or leave it out"
         got = str(checkpoint) if checkpoint else "none"
         refuse(context, ["delta", "apply"], expected="--checkpoint with an INT8 file", got=got, remedy=remedy)
-    path = weights_file(checkpoint) if checkpoint else shipped_weights(variant)
-    require_writable(out, delta, inputs=(path, apply, Path(sensor) if sensor else None))
     if path.suffix == ".onnx":
         _export_int8(path, out, sensor, delta, apply)
         return
