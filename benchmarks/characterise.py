@@ -21,8 +21,8 @@ import torch
 from torch import Tensor
 
 from deploy.characterise import Box, Characterised, Request, Snr, characterise, measured_noise, profile_toml, snr_at
-from model.conditioning import SensorFamily, vector_tensor
-from model.convbeers import Network, told
+from deploy.export import torch_network
+from model.conditioning import SensorFamily
 from model.evaluation.pairs import simulate_pairs
 from model.evaluation.scores import fidelity_db
 from model.evaluation.sweep import Fixed
@@ -33,7 +33,6 @@ from model.simulator.acquire import acquire, fitting_oversampling
 from model.simulator.detector import Draw, to_uint16
 from model.simulator.sampling import Scene, crop_divisible, read_scene, scene_spectrum
 from model.specialise import LEAST_ALONG
-from model.weights import load_network
 from profiles import load_sensor
 from profiles.errors import ImageError
 from profiles.sensor import Sensor
@@ -55,15 +54,17 @@ def main() -> None:
     scenes = [read_scene(path, LIKE) for path in list_images(arguments.images)]
     scenes = [scene for scene in scenes if fitting_oversampling(scene.radiance, [RATIO], LEAST_SIDE_PX)]
     ways = {name: Findings() for name in ("photographs alone", "one with a checkerboard", "two boxes on it")}
-    lost, network = list[float](), load_network(arguments.weights)[0] if arguments.weights else None
+    lost = list[float]()
     generator = np.random.default_rng(arguments.seed)
     for number in range(arguments.sensors):
         sensor = draw(generator)
         chosen = [scenes[i] for i in generator.permutation(len(scenes))[:SCENES]]
         with tempfile.TemporaryDirectory() as folder:
             found = look(ways, sensor, chosen, number, Path(folder))
-            if network is not None and found is not None:
-                lost.append(psnr_lost(network, chosen[0], sensor, as_read(found, Path(folder) / "found.toml")))
+            if arguments.weights is not None and found is not None:
+                lost.append(
+                    psnr_lost(arguments.weights, chosen[0], sensor, as_read(found, Path(folder) / "found.toml"))
+                )
     print("| figure | images | found | error, median | mean, signed | worst | in the 95 % interval |")
     print("|---|---|---|---|---|---|---|")
     for name, findings in ways.items():
@@ -98,14 +99,14 @@ def as_read(found: Characterised, path: Path) -> Sensor:
     return load_sensor(str(path)).nominal()
 
 
-def psnr_lost(network: Network, scene: Scene, sensor: Sensor, found: Sensor) -> float:
+def psnr_lost(weights: Path, scene: Scene, sensor: Sensor, found: Sensor) -> float:
     """By a network that knows the sensor that was found, beside the same that knows the true one, in dB."""
     (pair,), _ = simulate_pairs([scene], Fixed(sensor), Fixed(REFERENCE.in_units_of(sensor)), 0)
     image = torch.from_numpy(pair.degraded.astype(np.float32) / sensor.max_dn)[None, None]
     scores = []
     for known in (sensor, found):
         with torch.inference_mode():
-            restored = told(network, vector_tensor(known))(image)[0, 0] * sensor.max_dn
+            restored = torch_network(weights, known)(image)[0, 0] * sensor.max_dn
         scores.append(fidelity_db(restored.round().clamp(0, sensor.max_dn).numpy(), pair.reference, pair.degraded))
     return scores[0] - scores[1]
 
