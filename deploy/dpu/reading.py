@@ -68,27 +68,25 @@ def own_tile_px(model: onnx.ModelProto) -> int | None:
 
 
 def _place_px(model: onnx.ModelProto) -> int:
-    """The side in pixels of what one place of the input stands for: more than 1 of a board's file alone.
-
-    Raises:
-        ValueError: no such side.
-    """
-    side_px = int(metadata(model).get(PLACE_PX, "1"))
-    if not 1 <= side_px <= PLACE_MAX_PX:
-        raise ValueError(f"{PLACE_PX} {side_px}")
-    return side_px
+    """The side in pixels of what one place of the input stands for: more than 1 of a board's file alone."""
+    return _said_px(model, PLACE_PX, 1)
 
 
 def _mirrored_px(model: onnx.ModelProto) -> int:
-    """By how many pixels a board's planes reach beyond the image on each side.
+    """By how many pixels a board's planes reach beyond the image on each side."""
+    return _said_px(model, MIRRORED_PX, 0)
+
+
+def _said_px(model: onnx.ModelProto, key: str, least: int) -> int:
+    """What a board's file says of its planes, in pixels; the least where it says nothing.
 
     Raises:
         ValueError: no such number.
     """
-    mirrored_px = int(metadata(model).get(MIRRORED_PX, "0"))
-    if not 0 <= mirrored_px <= PLACE_MAX_PX:
-        raise ValueError(f"{MIRRORED_PX} {mirrored_px}")
-    return mirrored_px
+    said_px = int(metadata(model).get(key, str(least)))
+    if not least <= said_px <= PLACE_MAX_PX:
+        raise ValueError(f"{key} {said_px}")
+    return said_px
 
 
 def network_of(model: onnx.ModelProto, tile_px: int | None, where: str = "ONNX model") -> Network:

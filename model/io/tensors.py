@@ -5,7 +5,7 @@ of sensors that it was trained for.
 """
 
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -93,23 +93,18 @@ def read_plain(path: Path) -> Weights:
 
 
 def read_conditioned(path: Path) -> Weights:
-    """The weights of a network that is conditioned on its sensor.
+    """The weights of a network that is conditioned on its sensor in every layer.
 
     Raises:
         ModelError: not such weights, or of other ranges of sensors than this version's.
     """
-    tensors, header = read_tensors(path)
-    try:
-        if header.get("kind") != CONDITIONED:
-            raise ValueError("a network that cannot be specialised to a sensor")
-        if header.get("ranges") != {name: list(ends) for name, ends in RANGES.items()}:
-            raise ValueError("other ranges of sensors than this version's")
-        variant = _variant(header)
-        _check_count(tensors, variant, (1 + DIRECTIONS) * (4 * variant.blocks + 6) + 2 * len(LINEAR))
-        _check_like(tensors, conditioned_shapes(variant))
-    except FAULTS as error:
-        raise _not_weights(path, "weights that 'train --conditioned' wrote", error) from error
-    return Weights(tensors, variant, _recipe(header))
+
+    def parts(variant: Variant) -> int:
+        return (1 + DIRECTIONS) * (4 * variant.blocks + 6) + 2 * len(LINEAR)
+
+    return _read_told(
+        path, CONDITIONED, "a network that cannot be specialised to a sensor", parts, conditioned_shapes
+    )
 
 
 def read_banked(path: Path) -> Weights:
@@ -118,15 +113,40 @@ def read_banked(path: Path) -> Weights:
     Raises:
         ModelError: not such weights, or of other ranges of sensors than this version's.
     """
+
+    def parts(variant: Variant) -> int:
+        return 4 * variant.blocks + 7
+
+    return _read_told(path, BANKED, "a network that is told no sensor", parts, lambda variant: variant.banked_shapes)
+
+
+Shapes = Mapping[str, tuple[int, ...]]
+
+
+def _read_told(
+    path: Path, kind: str, other: str, count: Callable[[Variant], int], shapes: Callable[[Variant], Shapes]
+) -> Weights:
+    """The weights of a network of a kind that is told its sensor.
+
+    Args:
+        path: of the file.
+        kind: that it must state.
+        other: what a file of another kind holds.
+        count: of the tensors that such a network has; asked before their shapes are listed.
+        shapes: of these, by name.
+
+    Raises:
+        ModelError: not such weights, or of other ranges of sensors than this version's.
+    """
     tensors, header = read_tensors(path)
     try:
-        if header.get("kind") != BANKED:
-            raise ValueError("a network that is told no sensor")
+        if header.get("kind") != kind:
+            raise ValueError(other)
         if header.get("ranges") != {name: list(ends) for name, ends in RANGES.items()}:
             raise ValueError("other ranges of sensors than this version's")
         variant = _variant(header)
-        _check_count(tensors, variant, 4 * variant.blocks + 7)
-        _check_like(tensors, variant.banked_shapes)
+        _check_count(tensors, variant, count(variant))
+        _check_like(tensors, shapes(variant))
     except FAULTS as error:
         raise _not_weights(path, "weights that 'train --conditioned' wrote", error) from error
     return Weights(tensors, variant, _recipe(header))
