@@ -1,9 +1,9 @@
 """What boards change: the INT8 files made for each, and how far off the time of one thread is.
 
-    python benchmarks/boards.py files --images aerial-train/ --patches 64
+    python benchmarks/boards.py files --images aerial-train/
     python benchmarks/boards.py one-thread
 
-`files` quantises every shipped network once for each board, on the same patches, checks each file on its board and
+`files` calibrates every shipped network once for each board, on the same patches, checks each file on its board and
 says whether the integers are those of the first board, and those of the shipped file. `one-thread` fits the published
 rates of each board without one family after the other, and compares what it then says of a single thread with what is
 published; structure and widths are those of the board's [cost], which the family was not kept from.
@@ -26,28 +26,22 @@ from deploy.dpu.cost.latency import WIDTHS
 from deploy.dpu.cost.published import boards, published_cases
 from deploy.dpu.cost.validation import regimes_of
 from deploy.dpu.reading import network_of
-from deploy.networks import float_file, int8_file, silent
-from model.shipped import SENSOR, shipped_names
-from model.simulator.procedural import load_scenes
-from profiles import load_sensor, load_target
-from profiles.sensor_file import REFERENCE
+from deploy.networks import Conditioned, family_model
+from model.shipped import INT8, SHIPPED, shipped_names, shipped_weights
+from profiles import load_target
 from profiles.target import board_names
-from quant.calibration import draw_patches
 from quant.core import target_shifts
 from quant.onnx_file import load_onnx
-from quant.quantise import quantise_model
 
 
-def files(images: Path | None, patches: int, variants: list[str]) -> None:
+def files(images: Path | None, variants: list[str]) -> None:
     """A line a network and board."""
-    sensor, reference = load_sensor(SENSOR), load_sensor(REFERENCE)
-    drawn = draw_patches(load_scenes(images, reference.nominal(), 0), sensor, reference, patches, 0)
     for variant in variants:
-        model = load_onnx(float_file(Path(variant), sensor, silent))
-        shipped, first = integers(load_onnx(int8_file(Path(variant), sensor, silent))), ""
+        network, first = Conditioned(variant, shipped_weights(variant)), ""
+        shipped = integers(load_onnx(SHIPPED / f"{variant}{INT8}.onnx"))
         for name in board_names():
             start, target = time.perf_counter(), load_target(name)
-            made = quantise_model(model, drawn, {"target": name}, lambda: None, shifts=target_shifts(target)).host
+            made = family_model(network, images, shifts=target_shifts(target))
             found = integers(made)
             first = first or found
             refused = len(place(network_of(made, 640), dpu_of(target)).failed)
@@ -116,11 +110,10 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
     parser.add_argument("what", choices=("files", "one-thread"))
     parser.add_argument("--images", type=Path, help="folder of scenes; drawn ones if none")
-    parser.add_argument("--patches", type=int, default=64, help="of 128 x 128 to calibrate on")
     parser.add_argument("--variants", nargs="+", default=shipped_names())
     given = parser.parse_args()
     if given.what == "files":
-        files(given.images, given.patches, given.variants)
+        files(given.images, given.variants)
     else:
         one_thread()
 

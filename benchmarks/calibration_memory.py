@@ -1,6 +1,6 @@
 """Peak memory and time of `quantize` for few and many patches, and for large ones: each in a process of its own.
 
-    python benchmarks/calibration_memory.py --images aerial/
+    python benchmarks/calibration_memory.py --float mine.onnx --images aerial/
 
 Memory is the largest resident set that the system counted for the process: the interpreter, torch and onnxruntime are
 in it (measured alone in the first line), and so are the scenes, which stay in memory whatever is drawn from them.
@@ -35,14 +35,13 @@ def measure(command: list[str]) -> tuple[float, float, float]:
 def main() -> None:
     """Measure each case and print a line for it."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
-    parser.add_argument("--variant", default="convbeers-s", help="shipped weights of this name")
+    parser.add_argument("--float", type=Path, required=True, help="a float network for one sensor")
     parser.add_argument("--images", type=Path, help="folder of scenes; drawn ones if none")
     arguments = parser.parse_args()
     scenes = ["--images", str(arguments.images)] if arguments.images else []
     print(f"{'imports alone':24s} {measure(IMPORTS)[0]:7.0f} MB")
     with tempfile.TemporaryDirectory() as folder:
-        network, int8 = (str(Path(folder) / name) for name in ("float.onnx", "int8.onnx"))
-        subprocess.run([*COMMAND, "export", "--variant", arguments.variant, "--out", network], check=True)  # noqa: S603
+        network, int8 = str(arguments.float), str(Path(folder) / "int8.onnx")
         for patches, side in CASES:
             drawn = ["--sensor", "pleiades-variable", "--patches", str(patches), "--patch", str(side), *scenes]
             peak, seconds, computing = measure([*COMMAND, "quantize", network, "--out", int8, *drawn])

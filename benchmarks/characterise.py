@@ -4,7 +4,7 @@
 
 Each sensor sees six of the folder's photographs; then with a checkerboard laid into one of them (60 m a side at
 0.5 m, two by two fields, as calibration sites have), searched for and pointed at. MTF 2 to 12 %, along the track down
-to 0.4 of that across; noise as networks are trained for (`model.conditioning.SensorFamily`). With weights, a network
+to 0.4 of that across; noise as networks are trained for (`model.family.SensorFamily`). With weights, a network
 told the profile that was written restores one of the photographs, beside the same network told the truth.
 """
 
@@ -22,17 +22,16 @@ from torch import Tensor
 
 from deploy.characterise import Box, Characterised, Request, Snr, characterise, measured_noise, profile_toml, snr_at
 from deploy.export import torch_network
-from model.conditioning import SensorFamily
 from model.evaluation.pairs import simulate_pairs
 from model.evaluation.scores import fidelity_db
 from model.evaluation.sweep import Fixed
+from model.family import LEAST_ALONG, SensorFamily
 from model.io.images import list_images
 from model.metrics.edge_blur import AxisMtf
 from model.metrics.edges import slanted_edge
 from model.simulator.acquire import acquire, fitting_oversampling
 from model.simulator.detector import Draw, to_uint16
 from model.simulator.sampling import Scene, crop_divisible, read_scene, scene_spectrum
-from model.specialise import LEAST_ALONG
 from profiles import load_sensor
 from profiles.errors import ImageError
 from profiles.sensor import Sensor

@@ -23,7 +23,7 @@ from quant.kernels import filled, made_exact
 from quant.onnx_file import load_onnx
 from quant.session import open_session, run
 
-VARIANTS = ("convbeers-xs", "convbeers-s", "convbeers-m", "convbeers")
+VARIANTS = ("convbeers-xs", "convbeers-s", "convbeers")
 
 
 def main() -> None:

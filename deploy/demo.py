@@ -1,6 +1,6 @@
 """The whole chain on one image, step by step, ending with a report: what `beers-deploy demo` does.
 
-image -> export -> quantise -> gate -> check -> traditional and INT8 restoration -> predicted bench -> report
+image -> export -> gate -> check -> traditional and INT8 restoration -> predicted bench -> report
 """
 
 from collections.abc import Callable
@@ -18,7 +18,7 @@ from deploy.dpu.checker.placement import Placement, place
 from deploy.dpu.reading import read_network
 from deploy.export import require_parity, torch_network
 from deploy.methods import network_method
-from deploy.networks import Say, float_file
+from deploy.networks import Conditioned, Say, warn_outside
 from deploy.report.page import Picture, Report, Table
 from deploy.restoration.options import TILE_PX
 from model.evaluation.methods import Restore
@@ -39,9 +39,9 @@ from profiles.figures import Row, measured
 from profiles.sensor_file import reference_for
 from profiles.target import DEFAULT_TARGET, board_names
 from quant.calibration import HELD_OUT_SEED, draw_patches
+from quant.encodings import board_model, read_core
 from quant.gate import compare, gate_row
-from quant.onnx_file import load_onnx, save_onnx
-from quant.quantise import quantise_model
+from quant.onnx_file import metadata, save_onnx
 from quant.session import open_session
 from quant.tiling.walk import receptive_radius_px
 
@@ -146,7 +146,7 @@ def comparison(images: dict[str, np.ndarray], out: Path) -> list[Picture]:
 BITS = 12
 """Of a digital number, to the networks' files."""
 SIDE_PX = 640
-CALIBRATION_PATCHES, GATE_PATCHES = 24, 12
+GATE_PATCHES = 12
 FILES = ("report.html", "float.onnx", "int8.onnx", "core.onnx", "restored.tif", "before-after.png")
 """What a run leaves in its folder."""
 
@@ -216,8 +216,8 @@ def run_demo(
     say("reading the image")
     sensors = load_sensors(sensor)
     given = read_input(image, seed, sensors, full_scale)
-    say("exporting, quantising and gating")
-    gate, int8, exact = quantise_and_gate(out, seed, sensors, say)
+    say("telling the shipped network the sensor, and gating its INT8")
+    gate, int8, exact = tell_and_gate(out, seed, sensors, say)
     say("checking every operator against the DPU")
     dpu = load_dpu(DEFAULT_TARGET)
     placement = place(read_network(out / "int8.onnx", TILE_PX), dpu)
@@ -238,23 +238,21 @@ def run_demo(
     return Demo(rows, demo_report(shape, pictures, bench, swath, boards, quality, gates, placement))
 
 
-def quantise_and_gate(out: Path, seed: int, sensors: Sensors, say: Say) -> tuple[Row, onnx.ModelProto, Row]:
-    """Specialise the shipped network, quantise on drawn scenes, compare; the gate's row and the INT8 model."""
-    model = load_onnx(float_file(Path(VARIANT), sensors.degraded, say))
-    save_onnx(model, out / "float.onnx")
+def tell_and_gate(out: Path, seed: int, sensors: Sensors, say: Say) -> tuple[Row, onnx.ModelProto, Row]:
+    """Tell the shipped network the sensor, in float32 and in INT8; the gate's row and the INT8 model."""
+    shipped = Conditioned(VARIANT, shipped_weights(VARIANT))
+    warn_outside(sensors.degraded, say)
+    floating, int8 = (shipped.model(sensors.degraded, int8) for int8 in (False, True))
+    for name, model in (("float", floating), ("int8", int8), ("core", board_model(read_core(int8), metadata(int8)))):
+        save_onnx(model, out / f"{name}.onnx")
     network = torch_network(shipped_weights(VARIANT), sensors.degraded.nominal())
-    difference = require_parity(network, out / "float.onnx", 97)
-    scenes = load_scenes(None, sensors.reference.nominal(), seed)
-    patches = draw_patches(scenes, sensors.degraded, sensors.reference, CALIBRATION_PATCHES, seed)
-    result = quantise_model(model, patches, {"calibration_sensor": sensors.degraded.name}, lambda: None)
-    save_onnx(result.host, out / "int8.onnx")
-    save_onnx(result.board, out / "core.onnx")
+    difference = require_parity(network, floating, 97)
     unseen = load_scenes(None, sensors.reference.nominal(), seed + HELD_OUT_SEED)
     held_out = draw_patches(unseen, sensors.degraded, sensors.reference, GATE_PATCHES, seed + HELD_OUT_SEED)
-    verdict = compare(open_session(model), open_session(result.host), held_out.pairs)
+    verdict = compare(open_session(floating), open_session(int8), held_out.pairs)
     source = "one random image of 97 x 97"
     exact = Row("gate", "ONNX against torch", {"max": measured(difference, "of full scale", source)})
-    return gate_row(verdict), result.host, exact
+    return gate_row(verdict), int8, exact
 
 
 def bench_rows(model: Path, dn: np.ndarray, dpu: Dpu, halo_px: int, sensors: Sensors) -> tuple[list[Row], list[Row]]:

@@ -1,18 +1,18 @@
 """ConvBEERS as ONNX: `image` (N, 1, H, W) in [0, 1] to `restored`, written node by node under readable names.
 
-Also how any float network is had as ONNX: from an ONNX file or from weights, which may be specialised to a sensor.
+Also how any float network is had as ONNX: from an ONNX file or from weights, which may need to be told a sensor.
 """
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 import onnx
 
 from deploy import __version__
-from model.bank import FILTERS, in_places, network_bank
-from model.io.tensors import BANKED, Arrays, Weights, kind_of, read_banked, read_conditioned, read_plain
-from model.specialise import sensor_vector, specialised
+from model.bank import FILTERS, LARGEST, in_places, network_bank
+from model.family import sensor_vector
+from model.io.tensors import Arrays, Weights, read_conditioned, read_plain
 from profiles.errors import ModelError, OptionError
 from profiles.sensor import Sensor, SensorProfile
 from quant.onnx_file import GraphWriter, image_info, load_onnx, make_model
@@ -25,10 +25,8 @@ MAX_DIFFERENCE = 1e-5
 """Of full scale: a twentieth of a digital number, above what float32 summation order explains."""
 
 
-def float_for(
-    path: Path, name: str, sensor: SensorProfile, tile_px: int | None = None
-) -> tuple[onnx.ModelProto, tuple[str, ...]]:
-    """A network that is conditioned on its sensor as an ONNX model for the middle of a profile.
+def float_for(path: Path, name: str, sensor: SensorProfile, tile_px: int | None = None) -> onnx.ModelProto:
+    """A network that is told its sensor as an ONNX model for the middle of a profile.
 
     Args:
         path: of its weights.
@@ -36,32 +34,11 @@ def float_for(
         sensor: whose images it is to restore.
         tile_px: as in `to_onnx`.
 
-    Returns:
-        The model, and a sentence for each value of the sensor outside the range that was trained.
-
-    Raises:
-        ModelError: no conditioned network's weights.
-    """
-    known, vector = sensor.nominal(), sensor_vector(sensor.nominal())
-    if kind_of(path) == BANKED:
-        found = read_banked(path)
-        return banked_to_onnx(found, known, about(name, found.recipe, sensor.name), tile_px), vector.outside
-    weights, outside = weights_for(path, known)
-    return to_onnx(weights, about(name, weights.recipe, sensor.name), tile_px), outside
-
-
-def weights_for(path: Path, sensor: Sensor) -> tuple[Weights, tuple[str, ...]]:
-    """The weights of a network whose every layer knows its sensor, specialised to one.
-
-    Returns:
-        Those of a plain network, and a sentence for each value of the sensor outside the range that was trained.
-
     Raises:
         ModelError: no such network's weights.
     """
-    found, vector = read_conditioned(path), sensor_vector(sensor)
-    tensors = specialised(found.tensors, found.variant, vector)
-    return Weights(tensors, found.variant, found.recipe), vector.outside
+    found = read_conditioned(path)
+    return banked_to_onnx(found, sensor.nominal(), about(name, found.recipe, sensor.name), tile_px)
 
 
 def to_onnx(network: "Weights | ConvBEERS", about: dict[str, str], tile_px: int | None = None) -> onnx.ModelProto:
@@ -114,12 +91,12 @@ def banked_to_onnx(
     for name, value in tensors.items():
         writer.constant(name, value)
     side = tensors["bank.weight"].shape[-1]
-    around = [0, 0, *[side // 2 * scale] * 2]
-    mirrored = writer.node(
-        "Pad", "mirrored", ["image", writer.constant("around", np.array(2 * around))], mode="reflect"
-    )
-    read = _moved(writer, "SpaceToDepth", "unshuffled", mirrored, scale)
-    planes = writer.node("Conv", "bank", [read, "bank.weight", "bank.bias"], pads=[0] * 4, kernel_shape=[side, side])
+    around = writer.constant("around", np.array([0, 0, *[side // 2 * scale] * 2] * 2))
+    widened = writer.node("Pad", "widened", ["image", around], mode="reflect")
+    read = _moved(writer, "SpaceToDepth", "unshuffled", widened, scale)
+    found = writer.node("Conv", "bank", [read, "bank.weight", "bank.bias"], pads=[0] * 4, kernel_shape=[side, side])
+    ends = [writer.constant(name, np.array(end, np.float32)) for name, end in (("low", -LARGEST), ("high", LARGEST))]
+    planes = writer.node("Clip", "planes", [found, *ends])
     deep = writer.node("Concat", "deep", [_deep(writer, variant.blocks, planes), planes], axis=1)
     return _ended(writer, _conv(writer, "tail", deep), scale, about, tile_px)
 
@@ -213,7 +190,7 @@ def float_model(path: Path) -> onnx.ModelProto:
 
 
 def about(variant: str, recipe: dict[str, object], sensor: str | None = None) -> dict[str, str]:
-    """What an exported file says of itself; `sensor` is the name of the one that it was specialised to."""
+    """What an exported file says of itself; `sensor` is the name of the one that it was told."""
     return {
         "variant": variant,
         "sensor": sensor if sensor is not None else str(recipe.get("degraded", "")),
@@ -227,16 +204,9 @@ def torch_network(path: Path, sensor: Sensor | None = None) -> "ConvBEERS | OfOn
     Raises:
         ModelError: no such weights.
     """
-    import torch
+    from model.convbeers import BankedConvBEERS, OfOneSensor, network_of, vector_tensor
 
-    from model.convbeers import OfOneSensor, banked_network, plain_network
-
-    if sensor is None:
-        weights = read_plain(path)
-    elif kind_of(path) == BANKED:
-        found = read_banked(path)
-        vector = torch.tensor(sensor_vector(sensor).values)
-        return OfOneSensor(banked_network(found.tensors, found.variant), vector, network_bank(sensor))
-    else:
-        weights, _ = weights_for(path, sensor)
-    return plain_network(weights.tensors, weights.variant)
+    network = network_of(read_plain(path) if sensor is None else read_conditioned(path))
+    if sensor is not None and isinstance(network, BankedConvBEERS):
+        return OfOneSensor(network, vector_tensor(sensor), network_bank(sensor))
+    return cast("ConvBEERS", network)  # what `read_plain` read

@@ -135,7 +135,7 @@ def _unseen(request: Request, model: onnx.ModelProto) -> "tuple[Patches, bool]":
 def files_or_shipped(
     float_path: Path | None, int8_path: Path | None, variant: str | None, sensor: str = SENSOR, say: Say = silent
 ) -> tuple[Path, Path]:
-    """The two files given, or a shipped network in both precisions where neither is, specialised to the sensor.
+    """The two files given, or a shipped network in both precisions where neither is, told the sensor.
 
     Raises:
         OptionError: one file without the other, which have nothing to do with each other; files and a variant.

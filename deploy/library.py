@@ -61,7 +61,7 @@ def restore(
             onnxruntime; not 'auto' for arrays of Dask.
         threads: of the runtime; 0 takes every core, or one for each of Dask's own threads.
         nodata: the value of missing pixels, besides NaN; a DataArray's own `_FillValue` if None.
-        sensor: that a shipped network is specialised to: a profile's name, a .toml file, or 'blind' where it is not
+        sensor: that a shipped network is told: a profile's name, a .toml file, or 'blind' where it is not
             known. INT8 for a sensor of your own takes minutes once, and is kept.
 
     Returns:

@@ -7,14 +7,7 @@ import numpy as np
 import onnx
 
 from deploy.export import float_model
-from deploy.networks import (
-    Say,
-    conditioned,
-    int8_file,
-    network_file,
-    silent,
-    specialised_model,
-)
+from deploy.networks import Say, conditioned, network_file, silent, warn_outside
 from deploy.restoration.engine import restore_dn
 from deploy.restoration.options import TILE_PX, Runtime
 from deploy.restoration.plan import make_plan
@@ -36,7 +29,7 @@ from profiles.errors import OptionError
 from profiles.sensor import Sensor, SensorProfile
 from profiles.sensor_file import BLIND as NOT_KNOWN
 from profiles.sensor_file import BLIND_PROFILE, load_sensor
-from quant.onnx_file import load_onnx, metadata
+from quant.onnx_file import metadata
 from quant.tiling.walk import tiling_of
 
 EXPECTED = (
@@ -81,16 +74,15 @@ def method_named(name: str, degraded: SensorProfile, reference: SensorProfile, s
 
 
 def _specialise(name: str, like: SensorProfile, say: Say) -> Specialise | None:
-    """A conditioned network specialised to any sensor in the grid of a profile; None of a network that is plain."""
+    """A conditioned network told any sensor in the grid of a profile; None of a network that is plain."""
     found = conditioned(Path(name))
     if found is None:
         return None
 
     def specialise(sensor: Sensor) -> Restore:
         known = profile_of(sensor, like)
-        if name.endswith(INT8):  # minutes, so it is kept; float32 is made in a moment
-            return network_method(load_onnx(int8_file(Path(name), known, say)), sensor.max_dn)
-        return network_method(specialised_model(found, known, say), sensor.max_dn)
+        warn_outside(known, say)
+        return network_method(found.model(known, name.endswith(INT8)), sensor.max_dn)
 
     return specialise
 

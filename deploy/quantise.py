@@ -10,7 +10,7 @@ from pathlib import Path
 
 import onnx
 
-from deploy.networks import Conditioned, family_model, specialised_model, told_int8
+from deploy.networks import Conditioned, family_model, told_int8
 from deploy.report.page import Report, write_report
 from deploy.report.sensitivity_page import sensitivity_page
 from model.progress import steps
@@ -133,14 +133,14 @@ def quantise_banked_file(
     """
     sensor, made = load_sensor(calibration.sensor), {"target": target.name}
     family = family_model(network, calibration.images, calibration.seed, _shifts_of(target))
-    host = told_int8(family, sensor, made)
+    host = told_int8(family, sensor, made, say)
     core = read_core(host)
     save_onnx(host, out)
     say(f"wrote {out}: {len(core.ops)} integer operations, for {sensor.name}; any sensor in range can be told to it")
     if board is not None:
         save_onnx(board_model(core, metadata(host)), board)
         say(f"wrote {board}: the same numbers in the board's encoding")
-    model, patches = specialised_model(network, sensor, say), calibration.drawn.degraded
+    model, patches = network.model(sensor, int8=False), calibration.drawn.degraded
     layers, rounding = integer_rows(model, core, host, patches)
     show("integer layers", layers)
     show("tie rounding", [rounding])

@@ -19,11 +19,11 @@ from torch.nn import functional
 
 from examples.networks import NETWORKS, build, to_onnx
 from examples.samples import Batch, batches_of, positive, reported
+from model.convbeers import arrays
 from model.io.files import require_writable, whole_file
 from model.io.tensors import write_tensors
 from model.metrics.fidelity import psnr_db
 from model.progress import steps
-from model.weights import arrays
 from profiles.errors import OptionError
 
 JUDGED = 16

@@ -1,7 +1,7 @@
 """The science: what is computed on images, and the networks. It imports `profiles` and nothing else of ours.
 
-- `convbeers`: the network, plain and behind the bank of a sensor's filters (`bank`); `conditioning`: the one whose
-  sensor is known to every layer, folded into a plain one; `weights`: networks of torch on disk;
+- `convbeers`: the network, plain and behind the bank of a sensor's filters (`bank`); `family`: the sensors that the
+  latter is trained on, and what it is told of each;
 - `simulator`: from a scene's radiance to digital numbers; `traditional`: the pipeline that a network has to beat;
 - `dataset`: pairs on disk; `training`: runs that make weights;
 - `metrics`: what a restored image is worth; `evaluation`: methods compared on the same pairs;

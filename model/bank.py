@@ -23,8 +23,8 @@ from itertools import product
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from model.family import RANGES
 from model.simulator.mtf import NYQUIST, sensor_mtf
-from model.specialise import RANGES
 from profiles import load_sensor
 from profiles.sensor import Sensor
 
@@ -42,6 +42,14 @@ EPSILON_PER_SIGMA, STEP = 1.32, 4.0
 
 UNIT = 20.0
 """Standard deviations of noise that make a plane's 1."""
+
+UNIT_STEPS = 24
+"""In which int8 holds a unit: sixteen would hold all that training saw, but their coarser steps cost more than what
+24 clip."""
+
+LARGEST = 127 / UNIT_STEPS
+"""Planes and the analytic restoration are held to so many units: few edges leave more, and what no sensor makes, such
+as checkerboards, must not."""
 
 
 @dataclass(frozen=True)

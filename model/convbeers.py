@@ -18,14 +18,18 @@ head, which is linear in the sensor vector.
 
 from collections.abc import Mapping, Sequence
 from functools import lru_cache
+from pathlib import Path
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 from torch.nn.functional import conv2d, pad, pixel_shuffle, pixel_unshuffle
 
-from model.bank import FILTERS, SIDE_PX, Bank, bank_of_vector
+from model.bank import FILTERS, LARGEST, SIDE_PX, Bank, bank_of_vector
+from model.family import sensor_vector
+from model.io.tensors import Weights, read_weights, write_weights
 from model.variants import BANK_PLANES, SENSOR_VALUES, Variant
+from profiles.sensor import Sensor
 
 
 def conv3x3(inputs: int, outputs: int) -> nn.Conv2d:
@@ -75,11 +79,6 @@ class ConvBEERS(nn.Module):
         return pixel_shuffle(self.tail(deep), self.variant.scale)
 
 
-CLIP = 127 / 24
-"""Planes and the analytic restoration are held to so many units in training: what int8 in steps of 1/24 holds. A
-network alone has no such limit; values beyond are rare."""
-
-
 class BankedConvBEERS(nn.Module):
     """Images (N, 1, H, W) in [0, 1] of full scale and sensor vectors (N, 4) to (N, 1, H, W), not clipped."""
 
@@ -106,8 +105,7 @@ class BankedConvBEERS(nn.Module):
         """
         banks = banks or [_bank(*vector.tolist()) for vector in vectors]
         kernels = np.stack([[*bank.planes, bank.analytic / bank.unit] for bank in banks])
-        filtered = each_by_its_own(image, torch.from_numpy(kernels).to(image))
-        filtered = filtered.clamp(-CLIP, CLIP) if self.training else filtered
+        filtered = each_by_its_own(image, torch.from_numpy(kernels).to(image)).clamp(-LARGEST, LARGEST)
         read = pixel_unshuffle(torch.cat([image - 0.5, filtered[:, :FILTERS]], 1), self.variant.scale)
         shallow = (self.head(read) + self.bias(vectors)[:, :, None, None]).contiguous(
             memory_format=torch.channels_last
@@ -179,15 +177,34 @@ def initialise(network: Network, generator: torch.Generator) -> None:
                     module.bias.zero_()
 
 
-def banked_network(weights: Mapping[str, np.ndarray], variant: Variant) -> BankedConvBEERS:
-    """As `plain_network`, of a network behind a bank."""
-    network = BankedConvBEERS(variant)
-    network.load_state_dict({name: torch.from_numpy(np.array(value)) for name, value in weights.items()})
+def vector_tensor(sensor: Sensor) -> Tensor:
+    """The sensor vector (4,) float32, clamped to the ranges."""
+    return torch.tensor(sensor_vector(sensor).values)
+
+
+def arrays(tensors: Mapping[str, Tensor]) -> dict[str, np.ndarray]:
+    """Tensors of any shape as arrays."""
+    return {name: tensor.detach().cpu().numpy() for name, tensor in tensors.items()}
+
+
+def network_of(weights: Weights) -> Network:
+    """A network of those weights, plain or behind a bank, in evaluation mode, on the CPU."""
+    network = (BankedConvBEERS if weights.conditioned else ConvBEERS)(weights.variant)
+    network.load_state_dict({name: torch.from_numpy(np.array(value)) for name, value in weights.tensors.items()})
     return network.eval()
 
 
-def plain_network(weights: Mapping[str, np.ndarray], variant: Variant) -> ConvBEERS:
-    """A network with those weights, by name and of any shape each, in evaluation mode, on the CPU."""
-    network = ConvBEERS(variant)
-    network.load_state_dict({name: torch.from_numpy(np.array(value)) for name, value in weights.items()})
-    return network.eval()
+def save_network(path: Path, network: Network, recipe: Mapping[str, object]) -> None:
+    """Write a network's weights, its variant and the recipe that made them."""
+    conditioned = isinstance(network, BankedConvBEERS)
+    write_weights(path, Weights(arrays(network.state_dict()), network.variant, dict(recipe), conditioned))
+
+
+def load_network(path: Path) -> tuple[Network, dict[str, object]]:
+    """Read a network in evaluation mode, plain or behind a bank, and its recipe.
+
+    Raises:
+        ModelError: not our weights, of another shape, or for other ranges of sensors than this version's.
+    """
+    found = read_weights(path)
+    return network_of(found), found.recipe

@@ -15,18 +15,13 @@ INT8 = "-int8"
 """Behind a network's name: that network in INT8."""
 
 SENSOR = "pleiades-degraded"
-"""The sensor profile of a command that names none: the same for all, so that a network is judged where it was
-calibrated. (`train` alone defaults to a range of sensors, and `restore` to a sensor that is not known.)"""
+"""The sensor profile of a command that names none: the same for all. (`train` alone defaults to a range of
+sensors, and `restore` to a sensor that is not known.)"""
 
 
 def shipped_names() -> list[str]:
     """The names of the shipped networks: each the weights of one network for every sensor in range."""
     return sorted(path.stem for path in SHIPPED.glob("*.safetensors"))
-
-
-def studied_names() -> list[str]:
-    """Those that a study compares where none is named: all but `convbeers-m`, slower than `-s` and no better."""
-    return [name for name in shipped_names() if name != "convbeers-m"]
 
 
 def shipped_weights(name: str) -> Path:

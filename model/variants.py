@@ -62,7 +62,6 @@ class Variant:
 
 VARIANTS = {
     "convbeers": Variant(blocks=16, features=64),  # the paper's
-    "convbeers-m": Variant(blocks=16, features=32),
     "convbeers-s": Variant(blocks=8, features=32),
     "convbeers-xs": Variant(blocks=4, features=16),
     "convbeers-half": Variant(blocks=4, features=64, scale=2),

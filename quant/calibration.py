@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from model.conditioning import SensorFamily
+from model.family import SensorFamily
 from model.simulator.acquire import MARGIN_PX, acquire
 from model.simulator.detector import Draw
 from model.simulator.mtf import transfer_function

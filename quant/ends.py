@@ -9,9 +9,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from onnx import TensorProto, helper
 
-from model.bank import SIDE_PX
+from model.bank import SIDE_PX, UNIT_STEPS
 from model.io.images import MAX_DN
-from quant.banked.filters import ANALYTIC_COPIES, BITS, MIDDLE_DN, PART, STEP_DN, UNITS, split_planes
+from quant.banked.filters import ANALYTIC_COPIES, BITS, MIDDLE_DN, PART, STEP_DN, split_planes
 from quant.graph import (
     COARSE_MAX,
     CORRECTION,
@@ -78,7 +78,7 @@ class Ends:
     direct: bool = False
 
     @property
-    def mirrored_px(self) -> int:
+    def border_px(self) -> int:
         """Pixels by which the image's borders are mirrored in front of the planes."""
         return -(-BORDER_PX // self.place_px) * self.place_px if self.banked else 0
 
@@ -101,14 +101,14 @@ class Ends:
         """An image (N, C, H, W) in [0, 1] to the core's planes, int8."""
         if self.direct:
             return np.clip(np.rint(image * 2.0**BITS), -128, 127).astype(np.int8)
-        if self.mirrored_px:
-            image = np.pad(image, ((0, 0), (0, 0), *[(self.mirrored_px,) * 2] * 2), "reflect")
+        if self.border_px:
+            image = np.pad(image, ((0, 0), (0, 0), *[(self.border_px,) * 2] * 2), "reflect")
         for shuffle in self.front:
             image = shuffle(image)
         return split_planes(image) if self.banked else split(image, self.planes)
 
     def merge(self, correction: np.ndarray, scale: float) -> np.ndarray:
-        """One correction (N, C, H, W) from its gains or windows: (N, copies C, H, W) multiples of `scale`."""
+        """One correction (N, C, H, W) of full scale from its gains or windows: (N, copies C, H, W) of `scale`."""
         if self.offsets:
             return self._of_windows(correction, scale)
         if self.gains == 1:
@@ -116,11 +116,14 @@ class Ends:
         fine, coarse, *analytic = np.split(correction, self.copies, axis=1)
         limit = np.float32((FINE_MAX + 0.5) * scale)
         value = np.where(np.abs(fine) <= limit, fine, coarse * np.float32(GAIN))
-        return value + np.sum(analytic, 0) * np.float32(self.analytic_gain(scale)) if analytic else value
+        if not analytic:
+            return value
+        units = value + np.sum(analytic, 0) * np.float32(self.analytic_gain(scale))
+        return np.asarray(units * np.float32(self.unit))
 
     def analytic_gain(self, scale: float) -> float:
         """What the sum of the analytic copies is multiplied with, where one step is said to be `scale`."""
-        return 1 / (UNITS * ANALYTIC_COPIES * scale)
+        return 1 / (UNIT_STEPS * ANALYTIC_COPIES * scale)
 
     def whole(self, correction: np.ndarray) -> np.ndarray:
         """One correction from all its copies in float, which rounding has not touched: (N, C, H, W)."""
@@ -152,7 +155,6 @@ class Ends:
 
     def finished(self, image: np.ndarray, result: np.ndarray) -> np.ndarray:
         """As `restored`, of a correction that is one already."""
-        result = result * np.float32(self.unit) if self.unit != 1 else result
         for shuffle in self.back:
             result = shuffle(result)
         if self.softmax:
@@ -177,7 +179,7 @@ class Ends:
         result = result - image if self.adds_image else result
         for shuffle in reversed(self.back):
             result = shuffle.inverse(result)
-        return np.ascontiguousarray(result / np.float32(self.unit))
+        return np.ascontiguousarray(result)
 
     def clipped(self, result: np.ndarray) -> np.ndarray:
         """A float network's result as the host would clip its own: to [0, 1] where the image is added."""
@@ -221,9 +223,9 @@ def write_front(w: HostWriter, ends: Ends) -> None:
         _write_uint8(w)
         return
     image, channels = IMAGE, ends.image_channels
-    if ends.mirrored_px:
-        around = w.constant("mirrored_px", np.array([0, 0, ends.mirrored_px, ends.mirrored_px] * 2))
-        image = w.node("Pad", "host_front.mirrored", [image, around], mode="reflect")
+    if ends.border_px:
+        around = w.constant("border_px", np.array([0, 0, ends.border_px, ends.border_px] * 2))
+        image = w.node("Pad", "host_front.widened", [image, around], mode="reflect")
     for k, shuffle in enumerate(ends.front):
         write_shuffle(w, shuffle, image, f"host_front.shuffled_{k}", channels)
         image, channels = f"host_front.shuffled_{k}", channels * shuffle.block**2
@@ -240,7 +242,8 @@ def write_front(w: HostWriter, ends: Ends) -> None:
     w.node("Sub", "host_front.remainder", [dn, "host_front.coarse_dn"])
     w.node("Mul", "host_front.quarters", ["host_front.remainder", w.scalar("one_quarter", 1 / part)])
     w.node("Round", "host_front.quarter", ["host_front.quarters"])
-    planes = ["host_front.coarse", "host_front.remainder", "host_front.quarter"]
+    coarse = ["host_front.coarse"] * (2 if ends.banked else 1)
+    planes = [*coarse, "host_front.remainder", "host_front.quarter"]
     w.node("Concat", "host_front.planes", planes, axis=1)
     _write_uint8(w)
 

@@ -99,8 +99,9 @@ class Quantised:
 class Plan:
     """What is to be quantised: the graph that reads the planes wanted, and that of all; the host's part; streams.
 
-    `chain` is what is levelled where there is no stream. What is calibrated and searched is the map in front of the
-    network's `tail`, which is put behind it in the end: values of boxes that no object has would outweigh all others.
+    `chain` is what is levelled besides the streams, or where there are none. What is calibrated and searched is the
+    map in front of the network's `tail`, which is put behind it in the end: values of boxes that no object has would
+    outweigh all others.
     """
 
     graph: Graph
@@ -155,7 +156,7 @@ class Plan:
         if self.shares:
             found = streams(final)
             chosen = share_stream_scale(found, frac_bits, self.stream_frac_bits(frac_bits))
-        elif self.passes.equalise:
+        if self.passes.equalise:
             chosen |= dict.fromkeys(self.chain.tensors, STREAM_FRAC_BITS)
         if self.ends.offsets:
             chosen[CORRECTION] += FINER
@@ -218,10 +219,8 @@ def rounded(
     frac_bits = choose_frac_bits(graph, images, tick, passes.least_squares, plan.ends)
     if plan.takes_windows:
         plan = plan.with_windows(frac_bits[CORRECTION], *_result_range(plan, images, tick))
-    if passes.equalise and plan.streams:
-        graph = _equalised(plan, frac_bits, images, tick)
-    elif passes.equalise and plan.chain.tensors:
-        graph = _levelled(plan, frac_bits, images, tick)
+    if passes.equalise:
+        graph = _balanced(plan, frac_bits, images, tick)
     paired, last_sum = plan.paired(graph, frac_bits), frozenset[str]()
     if paired is not graph:
         paired = with_room(paired, plan.stream_step(frac_bits), images, tick, plan.ends)
@@ -244,9 +243,21 @@ def _result_range(plan: Plan, images: Remade[np.ndarray], tick: Callable[[], Non
     return low, high
 
 
-def _equalised(plan: Plan, frac_bits: dict[str, int], images: Remade[np.ndarray], tick: Callable[[], None]) -> Graph:
+def _balanced(plan: Plan, frac_bits: dict[str, int], images: Remade[np.ndarray], tick: Callable[[], None]) -> Graph:
+    """The plan's graph, its streams equalised and then its chain levelled."""
+    graph = plan.chain.scaled(plan.graph, plan.chain.unscaled(frac_bits))
+    if plan.streams:
+        graph = _equalised(graph, plan, _trial(plan, frac_bits, images), images, tick)
+    if plan.chain.tensors:
+        ranges = chain_ranges(graph, plan.chain, images, tick, plan.ends)
+        unchanged, trial = np.ones(len(ranges)), _trial(plan, frac_bits, images)
+        graph = plan.chain.scaled(graph, level(graph, plan.chain, ranges, unchanged, trial, tick))
+    return graph
+
+
+def _equalised(graph: Graph, plan: Plan, trial: Trial, images: Remade[np.ndarray], tick: Callable[[], None]) -> Graph:
     """Stream after stream, the others levelled by a first guess until their turn comes."""
-    graph, ranges, trial = plan.graph, {}, _trial(plan, frac_bits, images)
+    ranges = {}
     for stream in plan.streams:
         ranges[stream] = channel_ranges(plan.graph, stream, images, tick, plan.ends)
     for stream in plan.streams[1:]:
@@ -269,14 +280,6 @@ def _trial(plan: Plan, frac_bits: dict[str, int], images: Remade[np.ndarray]) ->
     return costs_of
 
 
-def _levelled(plan: Plan, frac_bits: dict[str, int], images: Remade[np.ndarray], tick: Callable[[], None]) -> Graph:
-    """The network without a stream, every tensor levelled."""
-    chain, trial = plan.chain, _trial(plan, frac_bits, images)
-    ranges = chain_ranges(plan.graph, chain, images, tick, plan.ends)
-    factors = level(plan.graph, chain, ranges, chain.unscaled(frac_bits), trial, tick)
-    return chain.scaled(plan.graph, factors)
-
-
 def ticks(model: onnx.ModelProto, patches: int, passes: Passes = ALL) -> int:
     """How often `quantise_model` will call `tick`."""
     return plan_ticks(_plan(model, passes), patches)
@@ -287,13 +290,12 @@ def plan_ticks(plan: Plan, patches: int) -> int:
     passes = plan.passes
     pairs = passes.half_lsb_pair and plan.shares and half_lsb_pair(plan.graph, 1.0) is not plan.graph
     passings = 2 + passes.fit_weights + plan.takes_windows + pairs
-    if passes.equalise and plan.chain.tensors:
-        return (passings + 1) * patches + plan.chain.steps
-    if not (passes.equalise and plan.streams):
+    if not passes.equalise:
         return passings * patches
     widths = channels_of(plan.graph, {PLANES: plan.ends.planes * plan.ends.channels})
     steps = sum(search_steps(widths[min(stream)]) for stream in plan.streams)
-    return (passings + len(plan.streams)) * patches + steps
+    levelled = bool(plan.chain.tensors)
+    return (passings + len(plan.streams) + levelled) * patches + steps + levelled * plan.chain.steps
 
 
 Targets = list[tuple[np.ndarray, np.ndarray]]

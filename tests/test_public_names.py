@@ -32,7 +32,7 @@ SURFACE = {
         "save_onnx tiling_of unseen_patches"
     ),
     "deploy": (
-        "Document float_model load_dpu method_named place predict read_network restore run_gate to_onnx weights_for"
+        "Document float_for float_model load_dpu method_named place predict read_network restore run_gate to_onnx"
     ),
 }
 LIGHT = ("profiles", "model", "model.io", "model.metrics", "quant", "deploy")

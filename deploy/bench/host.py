@@ -21,7 +21,7 @@ from deploy.bench.board_cpu import board_cpu_row, chain_time, kind_rows
 from deploy.bench.profile import interleaved, node_rows, profile, timed
 from deploy.bench.rates import Rates, measured_rates
 from deploy.bench.tables import TABLE, Swath, efficiency
-from deploy.dpu.reading import network_of
+from deploy.dpu.reading import inputs_of
 from deploy.host_state import Watch, memory_rise, watched
 from deploy.networks import other_precision
 from model.processor import require_cores
@@ -78,8 +78,8 @@ def tile_feed(model: onnx.ModelProto, tile_px: int, where: str = "ONNX model") -
     Raises:
         ModelError: inputs that are no images, or fixed to another tile.
     """
-    inputs = network_of(model, tile_px, where).inputs
-    return {name: np.full((1, *shape), 0.25, np.float32) for name, shape in inputs.items()}
+    shapes = inputs_of(model, tile_px, where)
+    return {name: np.full((1, *shape), 0.25, np.float32) for name, shape in shapes.items()}
 
 
 def timed_rows(runs: Sequence[Timed], tile_px: int, conditions: Mapping[str, Figure]) -> list[Row]:

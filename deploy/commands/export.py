@@ -1,5 +1,6 @@
 """`beers-deploy export`: weights to a float ONNX file, and proof that both compute the same."""
 
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -18,16 +19,19 @@ def export(
     checkpoint: Annotated[
         Path | None,
         typer.Option(
-            help="Your own weights instead (.safetensors), a shipped network's name, or an INT8 file that 'quantize' "
-            "made of weights of 'train --conditioned'."
+            help="Your own weights instead (.safetensors), a shipped name, also with -int8, or an INT8 file that "
+            "'quantize' made of weights of 'train --conditioned'."
         ),
     ] = None,
     sensor: Annotated[
         str | None,
-        typer.Option(help=f"Specialise to this: a profile's name, your .toml file, or blind; {SENSOR} if none."),
+        typer.Option(help=f"What the network is told: a profile, your .toml file, or blind; {SENSOR} if none."),
     ] = None,
     tile: Annotated[
         int | None, typer.Option(min=16, max=8192, help="Fix the input to one tile of this side, 640 for a board.")
+    ] = None,
+    board: Annotated[
+        Path | None, typer.Option(help="Of an INT8 file: also write its integers in the board's encoding.")
     ] = None,
     delta: Annotated[
         Path | None,
@@ -48,7 +52,7 @@ def export(
     that sensor's, to the byte.
     """
     from deploy.export import about, float_for, require_parity, to_onnx, torch_network
-    from deploy.networks import weights_file
+    from deploy.networks import warn_outside, weights_file
     from model.io.files import require_writable
     from model.io.tensors import is_conditioned, read_plain
     from model.shipped import shipped_weights
@@ -59,19 +63,18 @@ def export(
     if checkpoint is not None:
         refuse(context, ["variant"], expected="no --checkpoint beside it", got="both", remedy="leave one out")
     path = weights_file(checkpoint) if checkpoint else shipped_weights(variant)
-    require_writable(out, delta, inputs=(path, apply, Path(sensor) if sensor else None))
-    if checkpoint is None or checkpoint.suffix != ".onnx":
+    require_writable(out, board, delta, inputs=(path, apply, Path(sensor) if sensor else None))
+    if path.suffix != ".onnx":
         remedy = "give one that 'quantize' made of weights of 'train --conditioned', or leave it out"
         got = str(checkpoint) if checkpoint else "none"
-        refuse(context, ["delta", "apply"], expected="--checkpoint with an INT8 file", got=got, remedy=remedy)
+        refuse(context, ["board", "delta", "apply"], expected="an INT8 --checkpoint", got=got, remedy=remedy)
     if path.suffix == ".onnx":
-        _export_int8(path, out, sensor, delta, apply)
+        _export_int8(path, out, sensor, tile, board, delta, apply)
         return
     known = load_sensor(sensor or SENSOR) if is_conditioned(path) else None
     if known is not None:
-        model, outside = float_for(path, path.stem, known, tile)
-        for sentence in outside:
-            say(f"warning: {sentence}", err=True)
+        warn_outside(known, partial(say, err=True))
+        model = float_for(path, path.stem, known, tile)
     elif sensor is not None:
         expected, remedy = "weights of 'train --conditioned'", "leave --sensor out, or give such weights"
         raise ModelError(str(path), expected=expected, got="those of a plain network", remedy=remedy)
@@ -83,22 +86,52 @@ def export(
     say(f"wrote {out}: largest difference from torch {difference:.2g} of full scale (measured)")
 
 
-def _export_int8(path: Path, out: Path, sensor: str | None, delta: Path | None, apply: Path | None) -> None:
-    """Write an INT8 file told a sensor, or the sensor of a delta."""
+def _export_int8(
+    path: Path,
+    out: Path,
+    sensor: str | None,
+    tile_px: int | None,
+    board: Path | None,
+    delta: Path | None,
+    apply: Path | None,
+) -> None:
+    """Write an INT8 file told a sensor, or the sensor of a delta.
+
+    Args:
+        path: of any sensor's file.
+        out: the host's.
+        sensor: that is told; the default one if None.
+        tile_px: side of an image that the files are fixed to; None leaves them as they are.
+        board: the same integers in the board's encoding, or None.
+        delta: what the sensor changes, or None.
+        apply: a delta that is told in place of a sensor, or None.
+
+    Raises:
+        OptionError: a delta and a sensor.
+        ModelError: no such INT8 file, or a delta of another.
+    """
     from deploy.networks import told_by_delta, told_int8
     from model.io.files import whole_file
     from profiles import load_sensor
     from profiles.errors import OptionError
     from quant.banked.family import delta_of_file
-    from quant.onnx_file import load_onnx, save_onnx
+    from quant.encodings import board_model, host_model, read_core
+    from quant.onnx_file import fixed_tile_px, load_onnx, metadata, save_onnx
 
     if apply is not None and (sensor or delta):
         remedy = "leave one out: the delta brings its sensor"
         raise OptionError("--apply", expected="no --sensor or --delta beside it", got="one", remedy=remedy)
     model = load_onnx(path)
-    made = told_by_delta(model, apply) if apply else told_int8(model, load_sensor(sensor or SENSOR), {}, say)
-    save_onnx(made, out)
+    if apply is not None:
+        made = told_by_delta(model, apply)
+    else:
+        made = told_int8(model, load_sensor(sensor or SENSOR), say=partial(say, err=True))
+    core, about, side_px = read_core(made), metadata(made), tile_px or fixed_tile_px(made)
+    save_onnx(host_model(core, about, side_px), out)
     say(f"wrote {out}")
+    if board is not None:
+        save_onnx(board_model(core, about, side_px), board)
+        say(f"wrote {board}: the same numbers in the board's encoding")
     if delta is not None:
         packed = delta_of_file(made)
         with whole_file(delta) as temporary:

@@ -70,7 +70,7 @@ def gate(
         str, typer.Option(help=f"Board whose rules the INT8 file must keep: {BOARDS}.")
     ] = DEFAULT_TARGET,
     sensor: Annotated[
-        str, typer.Option(help="Profile of the test patches, and what a shipped network is specialised to.")
+        str, typer.Option(help="Profile of the test patches, and what a shipped network is told.")
     ] = SENSOR,
     images: Annotated[Path | None, typer.Option(help="Folder of scenes; drawn ones if none.")] = None,
     data: Annotated[

@@ -24,7 +24,7 @@ class Regime(StrEnum):
 
 def quantize(
     model: Annotated[
-        Path, typer.Argument(help="Float ONNX or weights, or a shipped network's name, then specialised to --sensor.")
+        Path, typer.Argument(help="Float ONNX or weights, or a shipped network's name, then told --sensor.")
     ],
     out: Annotated[Path, typer.Option(help="INT8 ONNX for the host, runs on stock onnxruntime.")],
     target: Annotated[str, typer.Option(help=f"Whose rules to obey: {BOARDS}.")] = DEFAULT_TARGET,
@@ -66,7 +66,7 @@ def quantize(
     Prints each integer layer: bits of its accumulator, seen and proven, and the share of saturated results.
     """
     from deploy.export import float_model
-    from deploy.networks import behind_bank, float_file
+    from deploy.networks import conditioned, float_file
     from deploy.results import Document, print_rows
     from model.io.files import require_writable
     from profiles import load_sensor, load_target
@@ -79,7 +79,7 @@ def quantize(
     page, figures = (report / "report.html", report / "report.json") if report else (None, None)
     read = (model, images, data, *map(Path, (target, sensor)))
     require_writable(out, board, json, page, figures, inputs=read)
-    known, board_target, banked = load_sensor(sensor), load_target(target), behind_bank(model)
+    known, board_target, banked = load_sensor(sensor), load_target(target), conditioned(model)
     if banked and (regime is Regime.free or ablate or report or without or finetune or data):
         remedy = "leave it out: such a network is calibrated over the whole family of sensors at once"
         expected = "no --regime free, --ablate, --report, --without, --finetune or --data"

@@ -33,7 +33,7 @@ def restore(
     sensor: Annotated[
         str | None,
         typer.Option(
-            help="The sensor of IN, a profile's name or your .toml file, to which a shipped network is specialised; "
+            help="The sensor of IN, a profile's name or your .toml file, which a shipped network is told; "
             "B0=a.toml,B1=b.toml for each band; blind if none."
         ),
     ] = None,
@@ -78,9 +78,8 @@ def restore(
 
     The image is read and written by rows, so memory does not grow with its height. Bands are restored one by one.
     OUT has the scale of IN: 8-bit pixels with --full-scale 255 come out as 0..255, floats with 1 as 0..1.
-    A shipped network is specialised to --sensor at no cost: NAME is float32 and ready at once, NAME-int8 for a sensor
-    of your own is made once, in minutes, and kept. Without --sensor it is taken to be in the middle of what
-    it may be.
+    A shipped network is told --sensor in a moment, in float32 (NAME) and in INT8 (NAME-int8). Without --sensor it is
+    taken to be in the middle of what it may be.
     With --method traditional the image is stabilised, denoised and sharpened as its --sensor asks, in strips of rows:
     one band, about a minute a megapixel on two cores, not resumable.
     JPEG 2000, NITF and HFA files, VRT mosaics and DIMAP indexes need the extra 'gdal'.

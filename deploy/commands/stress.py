@@ -47,7 +47,7 @@ def stress(
     ] = 6,
     sensor: Annotated[
         str,
-        typer.Option(help="What a shipped network is specialised to; with --bit-flips also what sees the patches."),
+        typer.Option(help="What a shipped network is told; with --bit-flips also what sees the patches."),
     ] = SENSOR,
     images: Annotated[
         Path | None,

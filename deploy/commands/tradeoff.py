@@ -37,7 +37,7 @@ def tradeoff(
     ] = None,
     networks: Annotated[
         str | None,
-        typer.Option(help="Shipped names and ONNX or safetensors files, with commas; all but convbeers-m if none."),
+        typer.Option(help="Shipped names and ONNX or safetensors files, with commas; all shipped ones if none."),
     ] = None,
     network: Annotated[
         list[Path] | None,
@@ -100,7 +100,7 @@ def tradeoff(
     from deploy.tradeoff.run import run_study
     from deploy.tradeoff.selection import Request
     from model.io.files import require_writable
-    from model.shipped import studied_names
+    from model.shipped import shipped_names
     from profiles.sensor_file import REFERENCE, load_sensor, reference_beside
 
     figures, kept = out / "tradeoff.json", cache or out / "cache"
@@ -108,7 +108,7 @@ def tradeoff(
     if labelled is None:
         _refuse_unlabelled(context, *demands)
     own = tuple(map(str, network or ()))
-    names = (*(networks.split(",") if networks is not None else studied_names()), *own)
+    names = (*(networks.split(",") if networks is not None else shipped_names()), *own)
     aim = reference or REFERENCE
     boards = parse_targets(target)
     tree = labelled.rglob("*") if labelled else ()

@@ -86,8 +86,8 @@ def train(
     from typing import get_args
 
     from deploy.networks import weights_file
-    from model.conditioning import SensorFamily
     from model.evaluation.pairs import profiles_for, read_pairs_recipe
+    from model.family import SensorFamily
     from model.io.files import require_writable
     from model.training.checkpoint import Optimiser, TrainingRecipe
     from model.training.losses import LossWeights

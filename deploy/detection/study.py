@@ -239,7 +239,7 @@ def rows_of(sensors: Sensors, names: Sequence[str], say: Say) -> dict[str, Metho
 
 
 def network_digest(name: str, degraded: SensorProfile) -> str:
-    """SHA-256 of the file of a method that is a network, specialised as `method_named` does; nothing of others."""
+    """SHA-256 of the file of a method that is a network, told as `method_named` tells it; nothing of others."""
     network, _, other = name.partition(AT)
     path = Path(network)
     if conditioned(path) is not None:

@@ -10,13 +10,15 @@ from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import onnx
 from onnx import TensorProto, helper, numpy_helper
 
 from deploy.dpu.graph import Kind, Network, Operation, Shape, Window, out_shape, padding
 from deploy.dpu.integers import Integers
+from model.bank import LARGEST
 from profiles.errors import ModelError
-from quant.encodings import MIRRORED_PX, PLACE_PX, as_on_board
+from quant.encodings import BORDER_PX, PLACE_PX, as_on_board
 from quant.onnx_file import load_onnx, metadata
 from quant.tiling.spelled_out import with_shuffles
 from quant.untrusted import contradictions
@@ -45,6 +47,9 @@ KINDS |= dict.fromkeys(("MaxPool", "AveragePool", "GlobalAveragePool", "GlobalMa
 KINDS |= dict.fromkeys(("QLinearAveragePool", "QLinearGlobalAveragePool"), "pool")
 
 
+BANK_ENDS = [float(np.float32(-LARGEST)), float(np.float32(LARGEST))]
+"""Of the planes of a float network behind a bank."""
+
 PLACE_MAX_PX = 64
 """Beyond what any network rearranges: a place of more pixels is a damaged file."""
 
@@ -64,7 +69,7 @@ def own_tile_px(model: onnx.ModelProto) -> int | None:
     """The side of the tile that a network is fixed to, in pixels of the image; None where it takes any."""
     dims = model.graph.input[0].type.tensor_type.shape.dim
     side = max((d.dim_value for d in dims[2:]), default=0)
-    return side * _place_px(model) - 2 * _mirrored_px(model) if side else None
+    return side * _place_px(model) - 2 * _border_px(model) if side else None
 
 
 def _place_px(model: onnx.ModelProto) -> int:
@@ -72,9 +77,9 @@ def _place_px(model: onnx.ModelProto) -> int:
     return _said_px(model, PLACE_PX, 1)
 
 
-def _mirrored_px(model: onnx.ModelProto) -> int:
+def _border_px(model: onnx.ModelProto) -> int:
     """By how many pixels a board's planes reach beyond the image on each side."""
-    return _said_px(model, MIRRORED_PX, 0)
+    return _said_px(model, BORDER_PX, 0)
 
 
 def _said_px(model: onnx.ModelProto, key: str, least: int) -> int:
@@ -99,6 +104,17 @@ def network_of(model: onnx.ModelProto, tile_px: int | None, where: str = "ONNX m
         return _Reader(with_shuffles(model), tile_px, where).network()
 
 
+def inputs_of(model: onnx.ModelProto, tile_px: int | None, where: str = "ONNX model") -> dict[str, Shape]:
+    """The inputs of a file as it stands, by name: (C, H, W) in places, for a tile or as the file states them.
+
+    Raises:
+        ModelError: inputs that are no images, or fixed to another tile.
+    """
+    held = {t.name for t in model.graph.initializer} | {n.output[0] for n in model.graph.node if _constant(n)}
+    places = _place_px(model), _border_px(model)
+    return {i.name: _input_shape(i, tile_px, places, where) for i in model.graph.input if i.name not in held}
+
+
 class _Reader:
     """Walks the nodes once, in their topological order, carrying shapes and number formats along."""
 
@@ -107,9 +123,7 @@ class _Reader:
         self.nodes = list(graph.node)
         self.constants: dict[str, TensorProto] = {t.name: t for t in graph.initializer}
         self.constants |= {n.output[0]: t for n in graph.node for t in _constant(n)}
-        images = (i for i in graph.input if i.name not in self.constants)
-        places = _place_px(model), _mirrored_px(model)
-        self.inputs = {i.name: _input_shape(i, tile_px, places, where) for i in images}
+        self.inputs = inputs_of(model, tile_px, where)
         self.outputs = tuple(o.name for o in graph.output)
         self.shapes: dict[str, Shape | None] = dict(self.inputs)
         self.kinds: dict[str, Kind] = {}
@@ -159,12 +173,12 @@ class _Reader:
         return self.constants.get(self.integers.resolve(name))
 
     def _is_activation(self, node: onnx.NodeProto) -> bool:
-        """max(q, zero point), the ReLU of integers; and Clip from 0 to 6, which is ReLU6."""
+        """max(q, zero point), the ReLU of integers; Clip from 0 to 6, ReLU6; and a bank's, where int8 saturates."""
         constants = [self.constants[name] for name in node.input[1:] if name in self.constants]
         if node.op_type == "Max":
             return self.integers.is_integer(node) and len(constants) == len(node.input) - 1 == 1
         limits = [float(numpy_helper.to_array(t).ravel()[0]) for t in constants if _count(t) == 1]
-        return node.op_type == "Clip" and limits == [0.0, 6.0]
+        return node.op_type == "Clip" and limits in ([0.0, 6.0], BANK_ENDS)
 
     def _constant_shape(self, node: onnx.NodeProto, op: Operation) -> tuple[int, ...] | None:
         """Shape of the constant operand of an element-wise operator."""
@@ -253,8 +267,8 @@ def _input_shape(info: onnx.ValueInfoProto, tile_px: int | None, places: tuple[i
         if not all(sizes[2:]):
             raise ModelError(where, expected="an input of a stated size", got="any size", remedy="pass --tile")
         return sizes[1], sizes[2], sizes[3]
-    place_px, mirrored_px = places
-    side, beyond = divmod(tile_px + 2 * mirrored_px, place_px)
+    place_px, border_px = places
+    side, beyond = divmod(tile_px + 2 * border_px, place_px)
     if beyond:
         expected, remedy = f"a tile of a multiple of {place_px} px", "choose another --tile"
         raise ModelError(where, expected=expected, got=f"{tile_px} px", remedy=remedy)

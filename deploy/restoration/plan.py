@@ -31,7 +31,7 @@ class Span:
     keep_stop: int
 
 
-def plan_side(size_px: int, tile_px: int, halo_px: int, lattice_px: int = 1) -> list[Span]:
+def plan_side(size_px: int, tile_px: int, halo_px: int, lattice_px: int = 1, least_px: int = 1) -> list[Span]:
     """The spans along one side of `size_px` pixels, each of `tile_px`, or one of all where that is less.
 
     Args:
@@ -39,6 +39,7 @@ def plan_side(size_px: int, tile_px: int, halo_px: int, lattice_px: int = 1) -> 
         tile_px: side of a tile; rounded down to the lattice.
         halo_px: a multiple of the lattice.
         lattice_px: spans begin at its multiples, and read to one.
+        least_px: that a span reads, beyond the image where that has fewer.
 
     Raises:
         OptionError: a tile with no room between its two halos.
@@ -51,7 +52,7 @@ def plan_side(size_px: int, tile_px: int, halo_px: int, lattice_px: int = 1) -> 
             got=f"{tile_px} px",
             remedy="take larger tiles or a smaller halo",
         )
-    whole_px = _up(size_px, lattice_px)
+    whole_px = _up(max(size_px, least_px), lattice_px)
     return list(_spans(size_px, whole_px, min(tile_px // lattice_px * lattice_px, whole_px), halo_px))
 
 
@@ -219,7 +220,7 @@ def make_plan(shape: tuple[int, ...], tile_px: int, halo_px: int, tiling: Tiling
     def side(size_px: int) -> tuple[Span, ...]:
         lattice_px = tiling.lattice_px
         longest_px = even_side_px(size_px, tile_px, halo_px, lattice_px) if tiling.fixed_px is None else tile_px
-        return tuple(plan_side(size_px, longest_px, halo_px, lattice_px))
+        return tuple(plan_side(size_px, longest_px, halo_px, lattice_px, tiling.least_px))
 
     return Plan(bands, height_px, width_px, tile_px, halo_px, tiling, side(height_px), side(width_px))
 

@@ -54,7 +54,7 @@ class Network:
 
     def extended(self, image: np.ndarray) -> np.ndarray:
         """An image (N, 1, H, W) with copies of its last row and column, up to what the network takes whole."""
-        lack = [-side % self.tiling.lattice_px for side in image.shape[2:]]
+        lack = [self.tiling.whole_px(side) - side for side in image.shape[2:]]
         return np.pad(image, ((0, 0), (0, 0), (0, lack[0]), (0, lack[1])), mode="edge")
 
     def infer(self, threads: int = 1) -> Infer:
@@ -105,7 +105,7 @@ class Subject:
 def open_subject(
     float_path: Path | None, int8_path: Path | None, variant: str, sensor: str = SENSOR, say: Say = silent
 ) -> Subject:
-    """The files given, or a shipped network in both precisions where neither is, specialised to the sensor.
+    """The files given, or a shipped network in both precisions where neither is, told the sensor.
 
     Raises:
         ModelError: no such file or variant, the two swapped, or a network that cannot be tiled.

@@ -3,6 +3,7 @@
 INT8 files that a study lacks are made on patches of the sensor that the float network was trained for.
 """
 
+from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
@@ -72,7 +73,7 @@ OWN = "--network"
 def find_networks(
     names: Iterable[str], sensor: str = SENSOR, say: Say = silent, own: Sequence[str] = ()
 ) -> list[Network]:
-    """Networks by shipped name or file, each once; conditioned ones specialised to the sensor.
+    """Networks by shipped name or file, each once; conditioned ones told the sensor.
 
     Args:
         names: shipped ones and files.
@@ -107,7 +108,7 @@ def _network(name: str, sensor: SensorProfile, say: Say, option: str) -> Network
     if tiling.fixed_px is not None:
         got, remedy = f"{name} for one tile size", "export it without --tile"
         raise OptionError(option, expected="networks for images of any size", got=got, remedy=remedy)
-    if replace(tiling, lattice_px=1) != Tiling(tiling.halo_px) or HALO_STEP_PX % tiling.lattice_px:
+    if replace(tiling, lattice_px=1, least_px=1) != Tiling(tiling.halo_px) or HALO_STEP_PX % tiling.lattice_px:
         expected = (
             f"networks of one band, of which halos and tiles of all multiples of {HALO_STEP_PX} px are compared"
         )
@@ -120,9 +121,10 @@ def _network(name: str, sensor: SensorProfile, say: Say, option: str) -> Network
 
 
 def shape_of(model: onnx.ModelProto) -> tuple[int, int]:
-    """Residual blocks and features of a ConvBEERS, from its convolutions: head, two a block, body's end, tail."""
+    """Residual blocks and features of a ConvBEERS, by its convolutions of all features: two a block, and the end."""
     weights = conv_weights(model)
-    return (len(weights) - 3) // 2, weights[0][0] if weights else 0
+    features = Counter(weight[0] for weight in weights).most_common(1)[0][0] if weights else 0
+    return sum(weight[0] == weight[1] == features for weight in weights) // 2, features
 
 
 def is_papers(model: onnx.ModelProto) -> bool:

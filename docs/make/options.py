@@ -45,7 +45,7 @@ PATHS = {
     "characterise": Paths({"out": FILE, "json": FILE}, ("images",)),
     "simulate": Paths({"out": FOLDER}, ("scenes",), ("sensor", "reference", "scene")),
     "train": Paths({"out": FOLDER}, ("images", "pairs", "lpips", "start", "teacher"), ("sensor", "reference")),
-    "export": Paths({"out": FILE, "delta": FILE}, ("checkpoint", "apply"), ("sensor",)),
+    "export": Paths({"out": FILE, "board": FILE, "delta": FILE}, ("checkpoint", "apply"), ("sensor",)),
     "quantize": Paths(
         {"out": FILE, "board": FILE, "report": FOLDER, "json": FILE},
         ("model", "images", "data"),
@@ -177,7 +177,10 @@ REFUSED = {
         Refused(("distil",), without="--teacher"),
         Refused(("lpips",), "--lpips-weight 0"),
     ],
-    "export": [Refused(("variant",), "--checkpoint WEIGHTS"), Refused(("delta", "apply"), without="--checkpoint")],
+    "export": [
+        Refused(("variant",), "--checkpoint WEIGHTS"),
+        Refused(("board", "delta", "apply"), without="--checkpoint"),
+    ],
     "quantize": [Refused(("board", "ablate", "report", "without", "finetune"), "--regime free")],
     "gate": [Refused(("variant",), "FLOAT INT8")],
     "check": [Refused(("picture", "tile"), "traditional")],

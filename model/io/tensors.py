@@ -1,11 +1,11 @@
 """Weights as safetensors: named arrays and a JSON header, read and written without torch, and validated as read.
 
-A file of ours states its variant and the recipe that made it; a conditioned network's also its kind, and the ranges
-of sensors that it was trained for.
+A file of ours states its variant and the recipe that made it; where the network is told its sensor also its kind, and
+the ranges of sensors that it was trained for.
 """
 
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -14,15 +14,14 @@ import numpy as np
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save_file
 
+from model.family import RANGES
 from model.io.files import whole_file
-from model.specialise import DIRECTIONS, LINEAR, RANGES, conditioned_shapes
 from model.variants import Variant
 from profiles.errors import ModelError
 from profiles.toml import parse_json, unreadable
 
-CONDITIONED = "conditioned on its sensor"
 BANKED = "behind the bank of its sensor"
-"""The kinds of weights, in the header, that need a sensor before they are a network; plain ones state no kind."""
+"""The kind, in the header, of weights that need a sensor before they are a network; plain ones state none."""
 
 FAULTS = (AttributeError, LookupError, TypeError, ValueError, OverflowError, RuntimeError)
 """What reading a header or filling a network may raise on a file that is not ours."""
@@ -33,11 +32,19 @@ Arrays = Mapping[str, np.ndarray]
 
 @dataclass(frozen=True)
 class Weights:
-    """What a file of weights holds: arrays by name, the variant that they make, and the recipe that made them."""
+    """What a file of weights holds.
+
+    Attributes:
+        tensors: arrays by name.
+        variant: the network that they make.
+        recipe: what made them.
+        conditioned: whether the network is told its sensor, and stands behind the bank of it.
+    """
 
     tensors: Arrays
     variant: Variant
     recipe: dict[str, object]
+    conditioned: bool = False
 
 
 def write_tensors(path: Path, tensors: Arrays, header: Mapping[str, object]) -> None:
@@ -64,111 +71,65 @@ def read_tensors(path: Path) -> tuple[dict[str, np.ndarray], dict[str, object]]:
         raise ModelError(str(path), expected="safetensors weights", got=got, remedy=remedy) from error
 
 
-def write_weights(path: Path, weights: Weights, banked: bool) -> None:
-    """Write a network's weights, its variant and recipe; of one behind a bank its kind and the ranges it knows."""
+def write_weights(path: Path, weights: Weights) -> None:
+    """Write a network's weights, its variant and recipe; of one that is told its sensor the ranges it knows, too."""
     header: dict[str, object] = {"variant": asdict(weights.variant), "recipe": weights.recipe}
-    if banked:
+    if weights.conditioned:
         header |= {"kind": BANKED, "ranges": dict(RANGES)}
     write_tensors(path, weights.tensors, header)
+
+
+def read_weights(path: Path) -> Weights:
+    """The weights of a network, plain or told its sensor.
+
+    Raises:
+        ModelError: not our weights, of another shape, or of other ranges of sensors than this version's.
+    """
+    tensors, header = read_tensors(path)
+    try:
+        conditioned = _told(header)
+        variant = _variant(header)
+        _check_count(tensors, variant, 4 * variant.blocks + (7 if conditioned else 6))
+        _check_like(tensors, variant.banked_shapes if conditioned else variant.shapes)
+    except FAULTS as error:
+        raise _not_weights(path, "the weights of a ConvBEERS", error) from error
+    return Weights(tensors, variant, _recipe(header), conditioned)
 
 
 def read_plain(path: Path) -> Weights:
     """The weights of a plain network.
 
     Raises:
-        ModelError: not our weights, weights of another shape, or of a conditioned network.
+        ModelError: not our weights, weights of another shape, or of a network that is told its sensor.
     """
-    tensors, header = read_tensors(path)
-    if header.get("kind") in (CONDITIONED, BANKED):
+    found = read_weights(path)
+    if found.conditioned:
         remedy = "name the sensor: beers-deploy export --checkpoint FILE --sensor NAME"
         got = "one that is conditioned on its sensor"
         raise ModelError(str(path), expected="the weights of a plain network", got=got, remedy=remedy)
-    try:
-        variant = _variant(header)
-        _check_count(tensors, variant, 4 * variant.blocks + 6)
-        _check_like(tensors, variant.shapes)
-    except FAULTS as error:
-        raise _not_weights(path, "the weights of a ConvBEERS", error) from error
-    return Weights(tensors, variant, _recipe(header))
+    return found
 
 
 def read_conditioned(path: Path) -> Weights:
-    """The weights of a network that is conditioned on its sensor in every layer.
+    """The weights of a network that is told its sensor.
 
     Raises:
         ModelError: not such weights, or of other ranges of sensors than this version's.
     """
-
-    def parts(variant: Variant) -> int:
-        return (1 + DIRECTIONS) * (4 * variant.blocks + 6) + 2 * len(LINEAR)
-
-    return _read_told(
-        path, CONDITIONED, "a network that cannot be specialised to a sensor", parts, conditioned_shapes
-    )
-
-
-def read_banked(path: Path) -> Weights:
-    """The weights of a network behind the bank of its sensor.
-
-    Raises:
-        ModelError: not such weights, or of other ranges of sensors than this version's.
-    """
-
-    def parts(variant: Variant) -> int:
-        return 4 * variant.blocks + 7
-
-    return _read_told(path, BANKED, "a network that is told no sensor", parts, lambda variant: variant.banked_shapes)
-
-
-Shapes = Mapping[str, tuple[int, ...]]
-
-
-def _read_told(
-    path: Path, kind: str, other: str, count: Callable[[Variant], int], shapes: Callable[[Variant], Shapes]
-) -> Weights:
-    """The weights of a network of a kind that is told its sensor.
-
-    Args:
-        path: of the file.
-        kind: that it must state.
-        other: what a file of another kind holds.
-        count: of the tensors that such a network has; asked before their shapes are listed.
-        shapes: of these, by name.
-
-    Raises:
-        ModelError: not such weights, or of other ranges of sensors than this version's.
-    """
-    tensors, header = read_tensors(path)
-    try:
-        if header.get("kind") != kind:
-            raise ValueError(other)
-        if header.get("ranges") != {name: list(ends) for name, ends in RANGES.items()}:
-            raise ValueError("other ranges of sensors than this version's")
-        variant = _variant(header)
-        _check_count(tensors, variant, count(variant))
-        _check_like(tensors, shapes(variant))
-    except FAULTS as error:
+    found = read_weights(path)
+    if not found.conditioned:
+        error = ValueError("a network that is told no sensor")
         raise _not_weights(path, "weights that 'train --conditioned' wrote", error) from error
-    return Weights(tensors, variant, _recipe(header))
-
-
-def kind_of(path: Path) -> str | None:
-    """What a weights file says that it holds: `CONDITIONED`, `BANKED`, or None where it is a plain network.
-
-    Raises:
-        ModelError: missing or not safetensors.
-    """
-    said = read_tensors(path)[1].get("kind")
-    return said if said in (CONDITIONED, BANKED) else None
+    return found
 
 
 def is_conditioned(path: Path) -> bool:
-    """Whether a weights file holds a network that must be told its sensor, of either kind.
+    """Whether a weights file states that it holds a network that must be told its sensor.
 
     Raises:
         ModelError: missing or not safetensors.
     """
-    return kind_of(path) is not None
+    return read_tensors(path)[1].get("kind") is not None
 
 
 def all_finite(tensors: Arrays) -> bool:
@@ -184,6 +145,20 @@ def _not_weights(path: Path, expected: str, error: Exception) -> ModelError:
 def _recipe(header: Mapping[str, object]) -> dict[str, object]:
     recipe = header.get("recipe", {})
     return recipe if isinstance(recipe, dict) else {}
+
+
+def _told(header: Mapping[str, object]) -> bool:
+    """Whether the network is told its sensor.
+
+    Raises:
+        ValueError: another kind, or other ranges of sensors than this version's.
+    """
+    kind = header.get("kind")
+    if kind not in (None, BANKED):
+        raise ValueError(f"weights {kind}: those of another version")
+    if kind and header.get("ranges") != {name: list(ends) for name, ends in RANGES.items()}:
+        raise ValueError("other ranges of sensors than this version's")
+    return kind is not None
 
 
 def _variant(header: Mapping[str, Any]) -> Variant:

@@ -8,12 +8,11 @@ from typing import Literal, cast, get_args
 import torch
 from torch import Tensor
 
-from model.convbeers import Network
+from model.convbeers import Network, arrays, load_network, save_network
 from model.io.tensors import all_finite, read_tensors, write_tensors
 from model.training.guards import Guards, require_finite_output
 from model.training.losses import PAPER, LossWeights
 from model.training.precision import Precision
-from model.weights import arrays, load_network, save_network
 from profiles.errors import ModelError, OptionError
 
 Optimiser = Literal["adam", "adamw"]

@@ -5,7 +5,7 @@ import math
 import torch
 
 from model.convbeers import Network, told
-from model.specialise import RANGES
+from model.family import RANGES
 from profiles.errors import ModelError
 
 MAX_BAD_STEPS = 10

@@ -13,7 +13,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from model.conditioning import SensorFamily, transposed, vector_tensor
+from model.convbeers import vector_tensor
+from model.family import SensorFamily
 from model.io.images import list_images, read_pixels, remedy_outside, settled_scale
 from model.simulator.acquire import acquire
 from model.simulator.detector import Draw
@@ -146,6 +147,11 @@ def visit(scene: Visited, recipe: PatchRecipe, generator: np.random.Generator) -
     quarter, mirrored = draw_turn(generator, quarters or recipe.family is not None, mirrors)
     vector = vector_tensor(sensor)
     return turned(patches, quarter, mirrored), transposed(vector) if quarter % 2 else vector
+
+
+def transposed(vector: Tensor) -> Tensor:
+    """The sensor vector (..., 4) of an image whose rows and columns have changed places: (..., 4)."""
+    return vector[..., [1, 0, 2, 3]]
 
 
 def _acquire_pair(

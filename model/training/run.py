@@ -15,17 +15,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from model.convbeers import BankedConvBEERS, ConvBEERS, Network, plain_network
+from model.convbeers import BankedConvBEERS, ConvBEERS, Network, load_network
 from model.io.files import whole_file
 from model.io.images import list_images
 from model.io.pictures import Stretch, busiest_windows, grid, strip_row
-from model.io.tensors import CONDITIONED, kind_of, read_conditioned
 from model.metrics.backbones import find_backbone, not_found
 from model.metrics.perceptual import Lpips
 from model.progress import Steps, steps
 from model.simulator.procedural import draw_scenes
 from model.simulator.sampling import Scene, read_scene
-from model.specialise import sensor_vector, specialised
 from model.training.checkpoint import TrainingRecipe, finish
 from model.training.grow import grow
 from model.training.guards import require_finite_output
@@ -36,7 +34,6 @@ from model.training.trainer import Progress, Schedule, Source, Trainer
 from model.training.validation import Validation, split_by_site
 from model.training.workers import Worker
 from model.variants import Variant, variant_named
-from model.weights import load_network
 from profiles.errors import ModelError, OptionError
 
 STEP = re.compile(r"[0-9]{1,18}(?=,)")
@@ -161,12 +158,7 @@ def _given(run: Run, path: Path) -> Network:
     Raises:
         ModelError: no such weights, or of the other kind.
     """
-    if kind_of(path) == CONDITIONED and run.patches.family is None:  # every layer of it: plain for one sensor
-        found = read_conditioned(path)
-        vector = sensor_vector(run.patches.degraded.nominal())
-        network: Network = plain_network(specialised(found.tensors, found.variant, vector), found.variant)
-    else:
-        network = load_network(path)[0]
+    network, _ = load_network(path)
     wanted = ConvBEERS if run.patches.family is None else BankedConvBEERS
     if not isinstance(network, wanted):
         kinds = {ConvBEERS: "a plain network's", BankedConvBEERS: "those that 'train --conditioned' wrote"}

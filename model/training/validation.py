@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from model.conditioning import SensorFamily, vector_tensor
-from model.convbeers import Network, told
+from model.convbeers import Network, told, vector_tensor
+from model.family import SensorFamily
 from model.io.images import site_of
 from model.metrics.fidelity import psnr_db, ssim
 from model.simulator.acquire import LEAST_SIDE_PX, fitting_oversampling, simulate_pair

@@ -9,15 +9,22 @@ from dataclasses import replace
 
 import numpy as np
 
-from model.bank import FILTERS, REFERENCE, Bank, network_bank
-from model.conditioning import SensorFamily
+from model.bank import FILTERS, REFERENCE, UNIT_STEPS, Bank, network_bank
+from model.family import SensorFamily, sensor_vector
 from model.io.tensors import Weights
 from model.simulator.sampling import Scene
-from model.specialise import sensor_vector
 from model.variants import SENSOR_VALUES
 from profiles import load_sensor
 from quant.banked.family import BANK, Family, bank_layer
-from quant.banked.filters import ANALYTIC_COPIES, BITS, COPIES, UNITS, channels, spread_over_a_step, whole_bank
+from quant.banked.filters import (
+    ANALYTIC_COPIES,
+    BITS,
+    COPIES,
+    PLANES_PER_CHANNEL,
+    channels,
+    spread_over_a_step,
+    whole_bank,
+)
 from quant.calibration import PATCH_PX, Remade, draw_patches
 from quant.core import SHIFTS, IntConv, IntCore, Shifts, quantise_bias
 from quant.ends import Ends
@@ -25,7 +32,7 @@ from quant.graph import CORRECTION, PLANES, Activation, Add, Concat, Conv, Graph
 from quant.graph.network import renamed
 from quant.integer.arithmetic import convolve
 from quant.passes.level import Chain
-from quant.passes.stream import streams
+from quant.passes.stream import lone_tensors, streams
 from quant.quantise import ALL, Plan, plan_ticks, rounded
 
 LIKE = "pleiades-degraded"
@@ -95,7 +102,7 @@ def _head(weights: Weights) -> Conv:
     """The head on a bank's results, all copies of each, and on the planes of a sensor's values at its middle tap."""
     variant = weights.variant
     given = weights.tensors["head.weight"].reshape(variant.features, 1 + FILTERS, variant.pixels, 3, 3)
-    counts, units = COPIES, 2.0**BITS / UNITS
+    counts, units = COPIES, 2.0**BITS / UNIT_STEPS
     copies = [(0, counts[0], 1.0), *((1 + k, counts[1], units) for k in range(FILTERS))]
     read = [given[:, kernel] * (unit / count) for kernel, count, unit in copies for _ in range(count)]
     unread = np.zeros((variant.features, counts[2] * variant.pixels, 3, 3))
@@ -108,9 +115,9 @@ def _head(weights: Weights) -> Conv:
 def front_ends(scale: int) -> Ends:
     """What the host does around a network of that scale behind a bank."""
     if scale == 1:
-        return Ends(banked=True)
+        return Ends(1, PLANES_PER_CHANNEL, banked=True)
     front, back = (Shuffle(name, "", "", scale, up, False) for name, up in (("unshuffle", False), ("shuffle", True)))
-    return Ends(scale**2, front=(front,), back=(back,), banked=True)
+    return Ends(scale**2, PLANES_PER_CHANNEL, front=(front,), back=(back,), banked=True)
 
 
 def bank_results(image: np.ndarray, bank: Bank, vector: Sequence[float], scale: int) -> np.ndarray:
@@ -143,11 +150,7 @@ def quantise_family(
     """
     body, *_ = rounded(_plan(weights, shifts), images, tick)
     told = {op.name: op for op in body.convolutions if op.input == PLANES}
-    # The planes of a sensor's values hold half of each.
-    values = {
-        name: op.weight[:, -SENSOR_VALUES:, 1, 1] * 2.0 ** -(op.weight_frac_bits + 1) for name, op in told.items()
-    }
-    biases = {name: np.concatenate([op.float_bias[:, None], values[name]], 1) for name, op in told.items()}
+    biases = {name: _biases(op) for name, op in told.items()}
     ops = tuple(_without_values(op) if op.name in told else op for op in body.ops)
     return Family(_assembled(replace(body, ops=ops), bank, weights.variant.scale, shifts), biases, shifts)
 
@@ -173,7 +176,9 @@ def _plan(weights: Weights, shifts: Shifts) -> Plan:
     graph, scale = body_graph(weights), weights.variant.scale
     width = len(channels()) * scale**2 + SENSOR_VALUES
     ends = Ends(width, 1, adds_image=False, gains=2, outputs=scale**2, direct=True)
-    return Plan(graph, graph, ends, streams(graph), Chain((), ()), None, PASSES, shifts)
+    inner = tuple(lone_tensors(graph))
+    chain = Chain(inner, (weights.variant.features,) * len(inner), by_channel=False)
+    return Plan(graph, graph, ends, streams(graph), chain, None, PASSES, shifts)
 
 
 PATCHES, QUIET_PATCHES, QUIET_SNR = 48, 32, (150.0, 220.0)

@@ -1,8 +1,9 @@
 """The bank of a sensor in whole numbers: the first convolution of an INT8 network, written from the sensor alone.
 
-The image enters in three planes: steps of 16 digital numbers about the middle, what they leave, and half of that for
-finer weights. A filter's weights are rounded so that they sum to exactly 0 in each plane, for flat ground must leave
-nothing, and so that their errors lie where natural images hold little.
+The image enters in four planes: steps of 16 digital numbers about the middle, twice, what they leave, and half of
+that for finer weights. The first two share a filter's weights, which may be twice as large so: half the rounding.
+Weights are rounded so that they sum to exactly 0, for flat ground must leave nothing, and so that their errors lie
+where natural images hold little.
 
 What the filters give is int8 in steps of 1/24 of a unit. Each comes several times, rounded at other places of
 a step: together the copies hold what one cannot. The image itself comes in steps of 32, about the middle.
@@ -14,19 +15,15 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from model.bank import FILTERS, SIDE_PX, Bank, in_places
+from model.bank import FILTERS, SIDE_PX, UNIT_STEPS, Bank, in_places
 from model.io.images import MAX_DN
 
 STEP_DN, MIDDLE_DN, PART = 16, 2048, 2
-"""Of the planes: the coarse one's step and its zero, and by what the third divides the remainder."""
+"""Of the planes: the coarse ones' step and their zero, and by what the last divides the remainder."""
 
-PLANES_PER_CHANNEL = 3
-PLANE_ENDS = (-128, -8, -4), (127, 15, 8)
-"""The smallest and the largest number of each: at full scale the coarse plane is at its end, and more remains."""
-
-UNITS = 24
-"""Steps of a result that are one unit: 127 of them hold 5.3 units. Sixteen hold all that training saw, but their
-coarser steps cost more than what 24 clip."""
+PLANES_PER_CHANNEL = 4
+PLANE_ENDS = (-128, -128, -8, -4), (127, 127, 15, 8)
+"""The smallest and the largest number of each: at full scale the coarse ones are at their end, and more remains."""
 
 IMAGE_STEP_DN = 32
 
@@ -36,8 +33,8 @@ BITS = 7
 ANALYTIC_COPIES = 4
 """Of the analytic restoration, in a network's result."""
 
-LARGEST = 112
-"""Of a weight before it is rounded: what sums and copies make up for still fits int8."""
+LARGEST = 2 * 124
+"""Of two coarse weights before they are rounded: what sums and copies make up for still fits int8."""
 
 COPIES = (1, 2, 7)
 """Of the image, of each plane, and of the analytic restoration: 16 channels for each pixel of a place."""
@@ -48,10 +45,10 @@ REACH_PX = 30.0
 
 @dataclass(frozen=True)
 class WholeBank:
-    """The first convolution, (O, 3 S^2, k, k) int8 with so many fractional bits, and what each channel adds.
+    """The first convolution, (O, 4 S^2, k, k) int8 with so many fractional bits, and what each channel adds.
 
     Attributes:
-        weight: of the planes of an image, all coarse ones first.
+        weight: of the planes of an image, one kind behind the other.
         frac_bits: a sum of products is shifted by so many bits to become int8.
         offsets: (O,) what each channel adds before it is rounded, in steps.
     """
@@ -62,11 +59,11 @@ class WholeBank:
 
 
 def split_planes(image: np.ndarray) -> np.ndarray:
-    """(N, C, H, W) float32 in [0, 1] to the planes (N, 3 C, H, W) int8."""
+    """(N, C, H, W) float32 in [0, 1] to the planes (N, 4 C, H, W) int8."""
     dn = np.clip(np.rint(image * np.float32(MAX_DN)), 0, MAX_DN) - MIDDLE_DN
     coarse = np.minimum(np.rint(dn / STEP_DN), 127)
     remainder = dn - STEP_DN * coarse
-    return np.concatenate([coarse, remainder, np.rint(remainder / PART)], axis=1).astype(np.int8)
+    return np.concatenate([coarse, coarse, remainder, np.rint(remainder / PART)], axis=1).astype(np.int8)
 
 
 def channels() -> list[tuple[int, float]]:
@@ -82,8 +79,8 @@ def spread_over_a_step(count: int) -> list[float]:
 
 def whole_bank(bank: Bank, scale: int) -> WholeBank:
     """The whole numbers of a bank, for a network of that scale."""
-    wanted = bank.kernels * (UNITS / MAX_DN)  # steps for one digital number
-    wanted[0] *= MAX_DN / UNITS / IMAGE_STEP_DN
+    wanted = bank.kernels * (UNIT_STEPS / MAX_DN)  # steps for one digital number
+    wanted[0] *= MAX_DN / UNIT_STEPS / IMAGE_STEP_DN
     frac_bits = int(np.floor(np.log2(LARGEST / np.abs(STEP_DN * wanted).max())))
     kernels, offsets = zip(*channels(), strict=True)
     exact = _copies(wanted * 2.0**frac_bits, kernels)
@@ -92,34 +89,39 @@ def whole_bank(bank: Bank, scale: int) -> WholeBank:
 
 
 def _copies(wanted: NDArray[np.float64], kernels: Sequence[int]) -> NDArray[np.int64]:
-    """Weights (O, 3, 7, 7): each further copy of a kernel makes up for what rounding has left of those before it."""
+    """Weights (O, 4, 7, 7): each further copy of a kernel makes up for what rounding has left of those before it."""
     left, found = np.zeros_like(wanted), list[NDArray[np.int64]]()
     for kernel in kernels:
-        whole = _in_three(wanted[kernel] + left[kernel]) if kernel else _of_image(wanted[0])
+        whole = _in_four(wanted[kernel] + left[kernel]) if kernel else _of_image(wanted[0])
         found.append(whole)
         left[kernel] += wanted[kernel] - _response(whole)
     return np.stack(found)
 
 
 def _response(whole: NDArray[np.int64]) -> NDArray[np.float64]:
-    """What weights (3, 7, 7) of the planes multiply a digital number with: (7, 7)."""
-    return np.asarray(whole[0] / STEP_DN)
+    """What weights (4, 7, 7) of the planes multiply a digital number with: (7, 7)."""
+    return np.asarray((whole[0] + whole[1]) / STEP_DN)
 
 
 def _of_image(kernel: NDArray[np.float64]) -> NDArray[np.int64]:
-    """The image in its own steps, from the coarse plane alone: (3, 7, 7)."""
+    """The image in its own steps, from the coarse planes alone: (4, 7, 7)."""
     none = np.zeros(kernel.shape, np.int64)
-    return np.stack([np.rint(STEP_DN * kernel).astype(np.int64), none, none])
+    return np.stack([*_shared(np.rint(STEP_DN * kernel).astype(np.int64)), none, none])
 
 
-def _in_three(kernel: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Weights (3, 7, 7) of the three planes for a kernel (7, 7) of sum 0 that multiplies digital numbers."""
+def _shared(whole: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Two halves of each."""
+    return whole // 2, whole - whole // 2
+
+
+def _in_four(kernel: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Weights (4, 7, 7) of the four planes for a kernel (7, 7) of sum 0 that multiplies digital numbers."""
     coarse = shaped(STEP_DN * kernel.ravel())
     fine = shaped(PART * kernel.ravel())  # in parts of the remainder's weights
     odd = np.flatnonzero(fine % PART)  # an even number of them, for their sum is 0
     parts = np.zeros_like(fine)
     parts[odd[::2]], parts[odd[1::2]] = 1, -1
-    found = np.stack([coarse, (fine - parts) // PART, parts])
+    found = np.stack([*_shared(coarse), (fine - parts) // PART, parts])
     return found.reshape(PLANES_PER_CHANNEL, *kernel.shape)
 
 

@@ -5,13 +5,13 @@ itself as QDQ ONNX, with int8 bias and power-of-two scales. Reading a host file 
 """
 
 from quant.encodings.board import as_on_board, board_model
-from quant.encodings.description import MIRRORED_PX, PLACE_PX
+from quant.encodings.description import BORDER_PX, PLACE_PX
 from quant.encodings.host import MICROSOFT, host_model
 from quant.encodings.reading import encoding_faults, read_core
 
 __all__ = [
+    "BORDER_PX",
     "MICROSOFT",
-    "MIRRORED_PX",
     "PLACE_PX",
     "as_on_board",
     "board_model",

@@ -4,7 +4,7 @@ import numpy as np
 import onnx
 
 from quant.core import IntConv, IntCore
-from quant.encodings.description import KEY, MIRRORED_PX, PLACE_PX, described_core
+from quant.encodings.description import BORDER_PX, KEY, PLACE_PX, described_core
 from quant.graph import CORRECTION, PLANES, Conv
 from quant.graph.writer import onnx_weight, write_float
 from quant.onnx_file import GraphWriter, constants, fixed_tile_px, image_info, make_model, metadata
@@ -29,15 +29,16 @@ def board_model(core: IntCore, about: dict[str, str], tile_px: int | None = None
             write_float(writer, op, feeds, output)
         writer.quantised(op.output, output, core.frac_bits[op.output])
     ends = core.ends
-    read_px = tile_px and (tile_px + 2 * ends.mirrored_px) // ends.place_px
+    read_px = tile_px and (tile_px + 2 * ends.border_px) // ends.place_px
     size = image_info(PLANES, ends.planes * ends.channels, read_px)
     result = image_info(CORRECTION, ends.copies * ends.outputs, tile_px and tile_px // ends.correction_px)
     if not ends.adds_image:  # of another size than the image, perhaps
         for side, name in zip(result.type.tensor_type.shape.dim[2:], ("rows", "columns"), strict=True):
             side.dim_param = name
     places = {PLACE_PX: str(ends.place_px)} if ends.place_px > 1 else {}
-    places |= {MIRRORED_PX: str(ends.mirrored_px)} if ends.mirrored_px else {}
-    return make_model(writer.graph("convbeers-core", [size], [result]), about | places)
+    places |= {BORDER_PX: str(ends.border_px)} if ends.border_px else {}
+    said = {key: words for key, words in about.items() if key != KEY}  # it is the core itself
+    return make_model(writer.graph("convbeers-core", [size], [result]), said | places)
 
 
 def as_on_board(model: onnx.ModelProto) -> onnx.ModelProto:

@@ -20,7 +20,7 @@ KEY = "core"
 PLACE_PX = "place_px"
 """In the metadata of a board's file: the side in pixels of the square of the image that is one place of its planes;
 1 where nothing is said."""
-MIRRORED_PX = "mirrored_px"
+BORDER_PX = "border_px"
 """Likewise: by how many pixels the planes reach beyond the image on each side; 0 where nothing is said."""
 LARGEST = 1 << 16
 """Channels, windows, strides and factors of whatever a DPU runs are smaller still."""

@@ -1,9 +1,10 @@
-"""Level the channels of a network without a residual stream, tensor by tensor, at no cost in the network.
+"""Level the channels of tensors between two convolutions, one tensor after the other, at no cost in the network.
 
 Between two convolutions each channel may be scaled by a factor of its own, as `quant.passes.equalise` does with a
 stream: then one scale suits all channels, and because a factor is any number, the tensor's own scale and that of the
-weights that read it are no longer bound to powers of two. Networks with a stream are left alone: there the stream is
-what counts, and levelling the rest too made none better.
+weights that read it are no longer bound to powers of two. Where there is a stream it is what counts, and levelling
+the rest too made no network better that is made for one sensor. Behind a bank it does: one file serves sensors of
+little noise and of much, and what lies inside a block is then small in most channels.
 
 All tensors are levelled together first, for what the worst of them errs hides the others; then one after the other
 from the last, for what is rounded late reaches the result.
@@ -61,11 +62,13 @@ class Channels:
 class Chain:
     """Tensors that may be levelled, in the graph's order, and how many channels each has.
 
-    Factors and ranges of all of them are one array (sum of the channels,), tensor behind tensor.
+    Factors and ranges of all of them are one array (sum of the channels,), tensor behind tensor. Beside a stream
+    `by_channel` is off: trying each channel buys nothing there, nor each tensor of a wide network.
     """
 
     tensors: tuple[str, ...]
     widths: tuple[int, ...]
+    by_channel: bool = True
 
     @property
     def parts(self) -> list[slice]:
@@ -75,13 +78,19 @@ class Chain:
 
     @property
     def stepped(self) -> bool:
-        """Whether there are few enough channels to try each."""
-        return sum(self.widths) <= MOST_CHANNELS
+        """Whether each channel is tried: where that is wanted, and there are few enough."""
+        return self.by_channel and sum(self.widths) <= MOST_CHANNELS
+
+    @property
+    def one_by_one(self) -> bool:
+        """Whether each tensor is tried, once all were together."""
+        return self.by_channel or sum(self.widths) <= MOST_CHANNELS
 
     @property
     def steps(self) -> int:
         """How often `level` ticks."""
-        return len(LEVELLING) * len(HEADROOM) + len(self.widths) + self.stepped * len(STEPS) * sum(self.widths)
+        tensors = self.one_by_one * len(self.widths)
+        return len(LEVELLING) * len(HEADROOM) + tensors + self.stepped * len(STEPS) * sum(self.widths)
 
     def scaled(self, graph: Graph, factors: np.ndarray) -> Graph:
         """The same network with each channel scaled by its factor."""
@@ -123,7 +132,7 @@ def level(
     for shape in product(LEVELLING, HEADROOM):
         best = _better(np.concatenate([channels.guess(*shape) for channels in known]), costs_of, best)
         tick()
-    for channels, part in reversed(list(zip(known, chain.parts, strict=True))):
+    for channels, part in reversed(list(zip(known, chain.parts, strict=True))) if chain.one_by_one else ():
         best = _one_tensor(channels, part, costs_of, best)
         tick()
         if chain.stepped:

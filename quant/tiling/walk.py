@@ -1,7 +1,8 @@
 """How a network's image may be cut into tiles that give the whole image's result, bit for bit.
 
 The contract, of `tiling_of`: cut tiles at multiples of `lattice_px`; read each with `halo_px` around what is kept of
-it, less only where the image ends; extend the image at the bottom and right to a multiple of `lattice_px` first.
+it, less only where the image ends; extend the image at the bottom and right to a multiple of `lattice_px` first, and
+to `least_px`.
 Then a kept pixel is computed from the same numbers in the same places as in the whole image, the zeros that layers
 pad with included, and the output is `scale` times the image's size. (A runtime's float sums are the same too where
 it adds in one order: onnxruntime changes that for maps of fewer than some 80 pixels a thread, see
@@ -41,6 +42,7 @@ class Tiling:
         channels_in: bands that the network reads together.
         channels_out: bands that it gives.
         fixed_px: the tile side that the network is fixed to; None where it takes any size.
+        least_px: the shortest side that it takes: one pixel more than what it mirrors at a border.
     """
 
     halo_px: int
@@ -49,6 +51,11 @@ class Tiling:
     channels_in: int = 1
     channels_out: int = 1
     fixed_px: int | None = None
+    least_px: int = 1
+
+    def whole_px(self, side_px: int) -> int:
+        """What a side of an image is extended to, at the bottom and right."""
+        return -(-max(side_px, self.least_px) // self.lattice_px) * self.lattice_px
 
     @property
     def words(self) -> str:
@@ -85,7 +92,8 @@ def tiling_of(model: onnx.ModelProto) -> Tiling:
         if fixed_px is not None and fixed_px % lattice_px:
             raise refused(f"tiles of a multiple of {lattice_px} pixels a side", f"a network fixed to {fixed_px}")
         halo_px = -(-radius_px // lattice_px) * lattice_px
-        return Tiling(halo_px, lattice_px, rows.scale, channels_in, channels_out, fixed_px)
+        least_px = max(rows.least_px, columns.least_px)
+        return Tiling(halo_px, lattice_px, rows.scale, channels_in, channels_out, fixed_px, least_px)
 
 
 def _channels(model: onnx.ModelProto) -> tuple[int, int]:
@@ -117,6 +125,7 @@ class _Walk:
 
     def __init__(self, model: onnx.ModelProto, side: int) -> None:
         self._at = Side(side, Constants(model))
+        self.least_px = 1
         self._reach = {value.name: IMAGE for value in model.graph.input if value.name not in self._at.constants}
         seen = [self._visit(node) for node in model.graph.node]
         end = self._reach.get(model.graph.output[0].name)
@@ -139,6 +148,9 @@ class _Walk:
             require(node, node.input[0] in self._reach and len(parts) == 1, "steered by the image")
             require(node, len([name for name in node.output if name]) == 1, "which tells places")
             reach = parts[0].behind(STEPS[node.op_type](node, given, self._at, parts[0]))
+            if given.get("mode") == b"reflect":
+                pads = self._at.constants.numbers(node, 1, given.get("pads", ()))
+                self.least_px = max(self.least_px, math.ceil((1 + max(pads)) / parts[0].per_px))
         else:
             self._require_pointwise(node, given)
             reach = joined(node, parts)

@@ -6,9 +6,8 @@ import pytest
 import torch
 
 from deploy.export import to_onnx
-from model.convbeers import BankedConvBEERS, ConvBEERS, initialise
+from model.convbeers import BankedConvBEERS, ConvBEERS, initialise, save_network
 from model.variants import Variant
-from model.weights import save_network
 from quant.onnx_file import save_onnx
 
 

@@ -10,14 +10,12 @@ from deploy.cli import app
 from deploy.dpu.board import load_dpu
 from deploy.dpu.checker.placement import place
 from deploy.dpu.reading import network_of
-from deploy.export import banked_to_onnx, parity, require_parity, to_onnx, weights_for
-from model.conditioning import vector_tensor
-from model.convbeers import BankedConvBEERS, ConvBEERS, initialise, plain_network
+from deploy.export import banked_to_onnx, parity, require_parity, to_onnx
+from model.convbeers import BankedConvBEERS, ConvBEERS, arrays, initialise, load_network, save_network, vector_tensor
 from model.io.tensors import Weights
 from model.shipped import shipped_weights
 from model.training.grow import grow
 from model.variants import VARIANTS, Variant
-from model.weights import load_network, save_network
 from profiles import load_sensor
 from profiles.errors import ModelError, OptionError
 from profiles.toml import HERE
@@ -57,8 +55,7 @@ def test_a_network_behind_a_bank_is_exported_for_one_sensor(scale: int, rows: in
     banked, sensor = BankedConvBEERS(Variant(1, 8, scale)), load_sensor("pleiades-degraded").nominal()
     initialise(banked, torch.Generator().manual_seed(0))
     torch.nn.init.normal_(banked.bias.weight, 0, 0.1, torch.Generator().manual_seed(1))
-    weights = Weights({name: value.numpy() for name, value in banked.state_dict().items()}, banked.variant, {})
-    model = banked_to_onnx(weights, sensor, {})
+    model = banked_to_onnx(Weights(arrays(banked.state_dict()), banked.variant, {}), sensor, {})
     image = np.random.default_rng(1).random((2, 1, rows, columns), dtype=np.float32) * 0.02 + 0.4
     vectors = vector_tensor(sensor).expand(2, -1)
     with torch.inference_mode():
@@ -73,11 +70,11 @@ def test_a_network_behind_a_bank_is_exported_for_one_sensor(scale: int, rows: in
 
 def test_the_shipped_network_at_half_resolution_restores_the_same_image() -> None:
     """Rearranged on both sides: in torch's order of the channels and in ONNX's."""
-    weights, _ = weights_for(shipped_weights("convbeers-xs"), load_sensor("pleiades-degraded").nominal())
-    small = plain_network(weights.tensors, weights.variant)
-    coarse = grow(small, VARIANTS["convbeers-half"], torch.Generator().manual_seed(0)).eval()
+    small, sensor = load_network(shipped_weights("convbeers-xs"))[0], load_sensor("pleiades-degraded").nominal()
+    coarse = grow(small, VARIANTS["convbeers-half"], torch.Generator().manual_seed(0))
+    both = [Weights(arrays(network.state_dict()), network.variant, {}) for network in (small, coarse)]
     image = np.random.default_rng(1).random((1, 1, 34, 50), dtype=np.float32)
-    expected, found = (run(open_session(to_onnx(network, {})), image) for network in (small, coarse))
+    expected, found = (run(open_session(banked_to_onnx(weights, sensor, {})), image) for weights in both)
     np.testing.assert_allclose(found, expected, atol=2e-6)
 
 
@@ -160,7 +157,7 @@ def test_a_users_own_sensor_and_what_lies_outside_the_ranges_is_said(conditioned
     mine.write_text(text.replace("[noise]", "mtf_nyquist_along = 0.004\n[noise]"))
     result = export("--checkpoint", str(conditioned), "--sensor", str(mine), "--out", str(tmp_path / "x.onnx"))
     assert result.exit_code == 0, result.output
-    assert "warning: mtf_along 0.004 is outside 0.015 to 0.15, the network is specialised for 0.015" in " ".join(
+    assert "warning: mtf_along 0.004 is outside 0.015 to 0.15, the network is told 0.015" in " ".join(
         result.stderr.split()
     )
 

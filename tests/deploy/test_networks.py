@@ -1,11 +1,10 @@
-"""Shipped networks by sensor: made once, kept by what they depend on, and shipped as they would be made."""
+"""Shipped networks by sensor: told each, in float32 and in INT8."""
 
 import re
 import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import onnx
@@ -13,13 +12,9 @@ import pytest
 import tifffile
 from typer.testing import CliRunner
 
-from deploy import networks
-from deploy.cache import digest_of
 from deploy.cli import app
 from deploy.networks import (
-    CACHE_VARIABLE,
-    MADE_FROM,
-    cache_folder,
+    WEIGHTS,
     float_file,
     int8_file,
     network_file,
@@ -34,15 +29,9 @@ from profiles.sensor import numbers_of
 from profiles.sensor_file import BLIND, BLIND_PROFILE, load_sensor
 from profiles.toml import HERE
 from quant.banked import calibrate
-from quant.onnx_file import is_quantised, load_onnx, metadata
+from quant.onnx_file import load_onnx, metadata
 
 KNOWN = load_sensor(SENSOR)
-
-
-@pytest.fixture(autouse=True)
-def own_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path / "cache"))
-    return tmp_path / "cache"
 
 
 def own_sensor(folder: Path, old: str = "", new: str = "", name: str = "mine.toml") -> Path:
@@ -52,14 +41,12 @@ def own_sensor(folder: Path, old: str = "", new: str = "", name: str = "mine.tom
     return path
 
 
-def test_a_float_network_is_made_once_for_a_sensor(conditioned: Path, own_cache: Path) -> None:
+def test_a_network_is_written_once_for_a_sensor(conditioned: Path) -> None:
     first = float_file(conditioned, KNOWN)
     written = first.stat().st_mtime_ns
-    assert first.parent == own_cache == cache_folder()
     assert float_file(conditioned, KNOWN) == first
     assert first.stat().st_mtime_ns == written
     assert metadata(onnx.load(first))["sensor"] == SENSOR
-    assert len(list(own_cache.iterdir())) == 1
 
 
 def test_the_same_numbers_are_the_same_sensor_and_others_are_not(conditioned: Path, tmp_path: Path) -> None:
@@ -76,52 +63,45 @@ def test_the_same_numbers_are_the_same_sensor_and_others_are_not(conditioned: Pa
 
 @pytest.mark.slow
 def test_int8_is_calibrated_once_and_then_told_any_sensor(
-    conditioned: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    conditioned: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(calibrate, "PATCHES", 3)
     monkeypatch.setattr(calibrate, "QUIET_PATCHES", 1)
-    made = int8_file(conditioned, KNOWN)
-    assert is_quantised(load_onnx(made))
-    assert "calibrating conditioned over the family of sensors" in capsys.readouterr().err
-
-    def never(*_: Any) -> None:
-        raise AssertionError("made again")
-
-    monkeypatch.setattr(networks, "family_model", never)
-    assert int8_file(conditioned, KNOWN) == made
-    sensor = load_sensor(str(own_sensor(tmp_path, "value = 0.07", "value = 0.05")))
-    other = load_onnx(int8_file(conditioned, sensor))
-    assert (metadata(load_onnx(made))["sensor"], metadata(other)["sensor"]) == (SENSOR, sensor.name)
-    again = told_int8(other, KNOWN, {MADE_FROM: metadata(load_onnx(made))[MADE_FROM]})
-    (tmp_path / "base.onnx").write_bytes(made.read_bytes())
-    words = ["export", "--checkpoint", str(tmp_path / "base.onnx"), "--out"]
-    mine = [*words, str(tmp_path / "mine.onnx"), "--sensor", str(tmp_path / "mine.toml"), "--delta", "mine.delta"]
     monkeypatch.chdir(tmp_path)
-    assert CliRunner().invoke(app, mine).exit_code == 0
-    assert CliRunner().invoke(app, [*words, "applied.onnx", "--apply", "mine.delta"]).exit_code == 0
-    assert (tmp_path / "applied.onnx").read_bytes() == (tmp_path / "mine.onnx").read_bytes()
-    assert (tmp_path / "mine.delta").stat().st_size < 2000
-    assert again.SerializeToString(deterministic=True) == load_onnx(made).SerializeToString(deterministic=True)
+    invoke = CliRunner().invoke
+    made = invoke(app, ["quantize", str(conditioned), "--sensor", SENSOR, "--patches", "1", "--out", "base.onnx"])
+    assert made.exit_code == 0, made.output
+    base, sensor = load_onnx(Path("base.onnx")), own_sensor(tmp_path, "value = 0.07", "value = 0.05")
+    words = ["export", "--checkpoint", "base.onnx", "--out"]
+    mine = [*words, "mine.onnx", "--sensor", str(sensor), "--delta", "mine.delta"]
+    assert invoke(app, mine).exit_code == 0
+    assert invoke(app, [*words, "applied.onnx", "--apply", "mine.delta"]).exit_code == 0
+    assert Path("applied.onnx").read_bytes() == Path("mine.onnx").read_bytes()
+    assert Path("mine.delta").stat().st_size < 3000
+    other = load_onnx(Path("mine.onnx"))
+    assert (metadata(base)["sensor"], metadata(other)["sensor"]) == (SENSOR, load_sensor(str(sensor)).name)
+    again = told_int8(other, KNOWN)
+    assert again.SerializeToString(deterministic=True) == base.SerializeToString(deterministic=True)
+
+
+def test_weights_of_ones_own_are_calibrated_by_quantize_alone(conditioned: Path) -> None:
+    with pytest.raises(ModelError, match=r"expected an INT8 network, got float weights; .*beers-deploy quantize"):
+        int8_file(conditioned, KNOWN)
 
 
 @pytest.mark.parametrize("name", shipped_names())
-@pytest.mark.parametrize("sensor", [SENSOR, BLIND])
-def test_the_shipped_int8_files_are_of_these_weights_and_sensors(name: str, sensor: str, own_cache: Path) -> None:
-    """Other weights, or other numbers in a profile, need other files: docs/make/int8.py makes them."""
-    int8 = SHIPPED / f"{name}{INT8}-{sensor}.onnx"
-    said = metadata(load_onnx(int8))
-    sources = {"weights": sha256(shipped_weights(name)), "sensor": numbers_of(load_sensor(sensor))}
-    assert said[MADE_FROM] == digest_of(sources)
-    assert (said["variant"], said["sensor"]) == (name, sensor)
-    assert int8_file(Path(name), load_sensor(sensor)) == int8
-    assert not own_cache.exists()
+def test_the_shipped_int8_files_are_of_these_weights(name: str) -> None:
+    """Other weights need other files: docs/make/int8.py makes them."""
+    said = metadata(load_onnx(SHIPPED / f"{name}{INT8}.onnx"))
+    assert said[WEIGHTS] == sha256(shipped_weights(name))
+    assert said["variant"] == name
+    assert metadata(load_onnx(int8_file(Path(name), KNOWN)))["sensor"] == SENSOR
 
 
-def test_a_name_that_is_none_is_told_the_names_that_there_are(own_cache: Path) -> None:
+def test_a_name_that_is_none_is_told_the_names_that_there_are() -> None:
     for name in ("convbeers-z", "convbeers-z-int8"):
         with pytest.raises(ModelError, match=r"shipped network \(convbeers, convbeers-half, .*convbeers-xs"):
             network_file(Path(name), load_sensor(SENSOR))
-    assert not own_cache.exists()
 
 
 def test_blind_is_the_middle_of_a_range_of_sensors() -> None:
@@ -141,27 +121,20 @@ def test_what_lies_outside_is_said_each_time(conditioned: Path, tmp_path: Path) 
     assert all(re.match("warning: mtf_(across|along) 0.004 is outside 0.015 to 0.15", sentence) for sentence in said)
 
 
-def test_what_cannot_be_had_is_one_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_cannot_be_had_is_one_sentence(tmp_path: Path) -> None:
     with pytest.raises(ProfileError, match="hubble"):
         load_sensor("hubble")
     with pytest.raises(ModelError, match="no such file"):
         network_file(tmp_path / "none.safetensors", KNOWN)
-    (tmp_path / "file").touch()
-    monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path / "file"))
-    tifffile.imwrite(tmp_path / "in.tif", np.full((20, 30), 900, np.uint16))
-    words = ["restore", str(tmp_path / "in.tif"), str(tmp_path / "out.tif"), "--model", "convbeers-xs"]
-    done = CliRunner().invoke(app, words)
-    assert done.exit_code == 2
-    assert "place to write" in " ".join(done.output.split())
-    assert not (tmp_path / "out.tif").exists()
 
 
-def test_restoring_for_a_sensor_needs_no_torch_and_is_what_the_sensor_makes_of_it(tmp_path: Path) -> None:
-    """In float32 at once: weights are specialised without what training needs."""
+@pytest.mark.parametrize("name", ["convbeers-xs", "convbeers-xs-int8"])
+def test_restoring_for_a_sensor_needs_no_torch_and_is_what_the_sensor_makes_of_it(name: str, tmp_path: Path) -> None:
+    """At once: filters are written without what training needs."""
     dn = np.random.default_rng(0).integers(200, 1800, (37, 41)).astype(np.uint16)
     tifffile.imwrite(tmp_path / "in.tif", dn)
     sensor = own_sensor(tmp_path, "value = 0.07", "value = 0.05")
-    words = ["restore", str(tmp_path / "in.tif"), "out.tif", "--model", "convbeers-xs", "--sensor", str(sensor)]
+    words = ["restore", str(tmp_path / "in.tif"), "out.tif", "--model", name, "--sensor", str(sensor)]
     call = f"app({words!r}, standalone_mode=False)"
     code = f"import sys; from deploy.cli import app; {call}; print('torch' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=True)
@@ -182,9 +155,9 @@ def test_a_network_that_is_made_already_takes_no_sensor(tmp_path: Path) -> None:
     assert not (tmp_path / "out.tif").exists()
 
 
-def test_a_sensors_name_cannot_leave_the_cache(conditioned: Path, own_cache: Path) -> None:
+def test_a_sensors_name_cannot_leave_the_folder(conditioned: Path) -> None:
     odd = replace(KNOWN, name="../../x y/" + 99 * "z")
-    assert float_file(conditioned, odd).parent == own_cache
+    assert float_file(conditioned, odd).parent == float_file(conditioned, KNOWN).parent
 
 
 def test_what_several_networks_have_to_say_is_said_once() -> None:

@@ -19,9 +19,8 @@ import tifffile
 from typer.testing import CliRunner
 
 from deploy.cli import app
-from model.convbeers import ConvBEERS, initialise
+from model.convbeers import ConvBEERS, initialise, save_network
 from model.variants import Variant
-from model.weights import save_network
 from tests.deploy.sealed import SOCKET_CALL
 
 pytestmark = pytest.mark.slow

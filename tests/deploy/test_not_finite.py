@@ -14,9 +14,8 @@ from typer.testing import CliRunner
 from deploy.cli import app
 from deploy.export import to_onnx
 from deploy.networks import shipped_pair
-from model.convbeers import ConvBEERS
+from model.convbeers import ConvBEERS, save_network
 from model.variants import VARIANTS
-from model.weights import save_network
 from profiles.errors import ModelError
 from quant.gate import compare
 from quant.onnx_file import load_onnx, parse_onnx, save_onnx

@@ -76,3 +76,13 @@ def test_export_takes_the_name(tmp_path: Path) -> None:
     result = CliRunner().invoke(app, ["export", "--checkpoint", "convbeers-xs", "--out", str(tmp_path / "net.onnx")])
     assert result.exit_code == 0, result.output
     assert metadata(load_onnx(tmp_path / "net.onnx"))["variant"] == "convbeers-xs"
+
+
+def test_export_writes_a_shipped_networks_integers_for_the_host_and_the_board(tmp_path: Path) -> None:
+    host, board = str(tmp_path / "int8.onnx"), str(tmp_path / "core.onnx")
+    words = ["export", "--checkpoint", "convbeers-half-xs-int8", "--sensor", "blind", "--tile", "64", "--out", host]
+    assert CliRunner().invoke(app, [*words, "--board", board]).exit_code == 0
+    assert metadata(load_onnx(Path(host)))["sensor"] == "blind"
+    for path in (host, board):
+        result = CliRunner().invoke(app, ["check", path])
+        assert result.exit_code == 0, result.output

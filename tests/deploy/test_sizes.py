@@ -11,7 +11,7 @@ from PIL import Image
 from typer.testing import CliRunner
 
 from deploy.cli import app
-from deploy.export import to_onnx, weights_for
+from deploy.export import float_for
 from deploy.restoration.options import Options
 from deploy.restoration.plan import plan_for
 from model.metrics.edges import find_edge
@@ -35,7 +35,7 @@ def plan_of_restore(folder: Path) -> str:
 
 
 def fixed_tile(_: Path) -> str:
-    model = to_onnx(weights_for(shipped_weights(VARIANT), load_sensor(SENSOR).nominal())[0], {}, 64)
+    model = float_for(shipped_weights(VARIANT), VARIANT, load_sensor(SENSOR), 64)
     return said(lambda: plan_for(model, (1, ROWS, COLUMNS), Options(Path(), 64)))
 
 

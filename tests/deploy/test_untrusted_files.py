@@ -20,13 +20,13 @@ from deploy.gate import PATCHES, baseline_mae
 from deploy.restoration.output import Checkpoint, part_folder
 from deploy.results import Document
 from deploy.tradeoff.host_time import Times
+from model.convbeers import arrays, load_network
 from model.dataset import _read_summary
 from model.io.images import read_pixels
 from model.io.tensors import read_tensors as read_weights
 from model.io.tensors import write_tensors
 from model.metrics.backbones import read_tensors
 from model.training.run import Log
-from model.weights import arrays, load_network
 from profiles.errors import BeersError, ModelError, OptionError, ProfileError
 from profiles.figures import Row, measured
 from profiles.toml import HERE, read_json, read_toml_text

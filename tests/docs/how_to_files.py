@@ -11,10 +11,9 @@ import torch
 from PIL import Image
 
 from examples.networks import build, to_onnx
-from model.convbeers import ConvBEERS, initialise
+from model.convbeers import ConvBEERS, initialise, save_network
 from model.shipped import SHIPPED
 from model.variants import Variant
-from model.weights import save_network
 from profiles.toml import HERE as PROFILES
 from quant.onnx_file import save_onnx
 from tests.deploy.detection.folders import Object, dior

@@ -11,11 +11,10 @@ import torch
 from deploy.dpu.board import load_dpu
 from deploy.dpu.checker.placement import place
 from deploy.dpu.reading import read_network
-from model.convbeers import BankedConvBEERS, ConvBEERS
+from model.convbeers import BankedConvBEERS, ConvBEERS, save_network
 from model.training.checkpoint import TrainingRecipe, read_checkpoint, write_checkpoint
 from model.training.guards import Guards
 from model.variants import Variant
-from model.weights import save_network
 from profiles.errors import BeersError
 from quant.encodings import encoding_faults
 from quant.graph import correction_graph

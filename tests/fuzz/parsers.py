@@ -26,12 +26,12 @@ from deploy.restoration.output import Checkpoint, part_folder
 from deploy.results import Document, by_row, cell
 from deploy.tradeoff.accuracy import Scores
 from deploy.tradeoff.host_time import Times
+from model.convbeers import load_network
 from model.dataset import _read_summary
 from model.evaluation.pairs import read_pairs_recipe
 from model.io.images import read_pixels
 from model.metrics.backbones import read_tensors
 from model.training.run import Log
-from model.weights import load_network
 from profiles import load_sensor, load_target
 from profiles.figures import Figure, Row, measured, predicted, unavailable
 from profiles.response_file import read_response

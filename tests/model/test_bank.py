@@ -20,8 +20,8 @@ from model.bank import (
     in_places,
     noise_over_full_scale,
 )
+from model.family import sensor_vector
 from model.simulator.mtf import sensor_mtf
-from model.specialise import sensor_vector
 from model.traditional.compensate import compensation_kernel
 from profiles import load_sensor
 from profiles.effects import Smear

@@ -6,19 +6,17 @@ import pytest
 import torch
 from safetensors.torch import save_file
 
-from model.convbeers import BankedConvBEERS, ConvBEERS, initialise
+from model.convbeers import BankedConvBEERS, ConvBEERS, arrays, initialise, load_network, save_network
+from model.family import RANGES
 from model.io.tensors import (
     is_conditioned,
-    read_banked,
     read_conditioned,
     read_plain,
     read_tensors,
     write_tensors,
 )
 from model.shipped import SHIPPED, shipped_names, shipped_weights
-from model.specialise import RANGES
 from model.variants import VARIANTS, Variant, variant_named
-from model.weights import arrays, load_network, save_network
 from profiles.errors import MachineError, ModelError, OptionError
 
 
@@ -170,7 +168,7 @@ def test_conditioned_and_plain_weights_are_not_taken_for_one_another(tmp_path: P
     with pytest.raises(ModelError, match="--sensor"):
         read_plain(tmp_path / "conditioned.safetensors")
     with pytest.raises(ModelError, match="told no sensor"):
-        read_banked(tmp_path / "plain.safetensors")
+        read_conditioned(tmp_path / "plain.safetensors")
 
 
 @pytest.mark.parametrize(
@@ -181,6 +179,7 @@ def test_conditioned_and_plain_weights_are_not_taken_for_one_another(tmp_path: P
         ({"variant": {"blocks": 1, "features": 5}}, "shape"),
         ({"variant": {"blocks": 10**9, "features": 4}}, "tensors"),
         ({"variant": None}, "weights"),
+        ({"kind": "conditioned on its sensor"}, "another version"),
     ],
 )
 def test_conditioned_weights_need_their_header(change: dict[str, object], words: str, tmp_path: Path) -> None:

@@ -12,7 +12,6 @@ from deploy.library import restore
 from deploy.networks import shipped_pair
 from model.shipped import SENSOR
 from quant.encodings import read_core
-from quant.graph import split
 from quant.integer import merged_correction, run_core
 from quant.onnx_file import load_onnx
 
@@ -31,7 +30,7 @@ def by_reference(dn: np.ndarray, name: str) -> np.ndarray:
     """What whole numbers alone make of digital numbers (H, W)."""
     core = read_core(load_onnx(shipped_pair(name)[1]))
     image = (dn.astype(np.float32) / MAX_DN)[None, None]
-    tensors, _ = run_core(core, split(image), half_even=True)
+    tensors, _ = run_core(core, core.ends.split(image), half_even=True)
     restored = np.clip(image + merged_correction(core, tensors), 0, 1)[0, 0] * MAX_DN
     return np.asarray(np.rint(restored), np.uint16)
 

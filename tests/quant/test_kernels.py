@@ -18,7 +18,6 @@ from deploy.networks import shipped_pair
 from model.processor import int8_adds_exactly
 from profiles.errors import ModelError
 from quant.encodings import read_core
-from quant.graph import split
 from quant.integer import merged_correction, run_core
 from quant.kernels import INT16_MAX, INT16_MIN, Way, cannot_saturate, made_exact
 from quant.onnx_file import load_onnx
@@ -167,7 +166,7 @@ def test_shipped_networks_are_those_of_the_integer_reference(path: Path, optimis
     core = read_core(model)
     drawn = generator.random((1, 1, 37, 53)), generator.integers(0, 2, (1, 1, 24, 41))
     for image in (each.astype(np.float32) for each in drawn):
-        tensors, _ = run_core(core, split(image), half_even=True)
+        tensors, _ = run_core(core, core.ends.split(image), half_even=True)
         wanted = np.clip(image + merged_correction(core, tensors), 0, 1)
         assert np.array_equal(run(open_session(model, 1, optimise, exact=True), image), wanted)
 

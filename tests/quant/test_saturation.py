@@ -9,7 +9,7 @@ from onnx import helper, numpy_helper
 
 from deploy.networks import shipped_pair
 from quant.encodings import read_core
-from quant.graph import CORRECTION, split
+from quant.graph import CORRECTION
 from quant.integer import run_core
 from quant.onnx_file import image_info, load_onnx, make_model
 from quant.structure import rounded_tensors, saturated_shares
@@ -76,7 +76,7 @@ def test_the_shipped_file_saturates_as_the_integer_reference_says() -> None:
     harsh = np.where(IMAGE > 0.5, 1.0, 0.0).astype(np.float32)  # every edge as strong as can be
     shares = saturated_shares(model, [harsh])
     core = read_core(model)
-    _, reports = run_core(core, split(harsh), half_even=True)
+    _, reports = run_core(core, core.ends.split(harsh), half_even=True)
     outputs = {op.name: op.output for op in core.ops}
     expected = {outputs[r.name]: r.saturated for r in reports if outputs[r.name] != CORRECTION}
     plain = {name: share for name, share in shares.items() if name in expected}

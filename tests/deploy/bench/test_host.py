@@ -47,10 +47,8 @@ def value(row: Row, key: str) -> float:
 def test_float_and_int8_are_interleaved_and_nodes_add_up() -> None:
     rows = host_rows(shipped_pair()[1], QUICK, 48, threads=1)
     host = [row for row in rows if row.table == "host"]
-    assert [row.name for row in host[:2]] == [
-        "convbeers-s-int8-pleiades-degraded, 48 x 48",
-        "float32 of the same shape, 48 x 48",
-    ]
+    assert host[0].name.startswith("convbeers-s-int8-pleiades-degraded-")
+    assert host[1].name == "float32 of the same shape, 48 x 48"
     for row in host[:2]:
         assert value(row, "p50") <= value(row, "p90")
         assert 0 <= value(row, "CPU load") <= 100

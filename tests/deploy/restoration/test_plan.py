@@ -43,6 +43,10 @@ def test_an_even_side_needs_as_many_tiles_and_none_shorter_does(size: int, tile_
         assert len(plan_side(size, side - 1, halo_px)) > count
 
 
+def test_a_span_reads_as_many_pixels_as_a_network_needs() -> None:
+    assert [(span.start, span.stop, span.keep_stop) for span in plan_side(1, 20, 4, 2, least_px=5)] == [(0, 6, 1)]
+
+
 def test_a_tile_without_room_between_its_halos_is_refused() -> None:
     with pytest.raises(OptionError, match="halo of 20"):
         plan_side(100, 40, 20)

@@ -20,6 +20,7 @@ from deploy.tradeoff.board import (
 )
 from profiles import load_target
 from profiles.errors import ModelError
+from quant.encodings import board_model, read_core
 from quant.onnx_file import load_onnx
 
 SWATH, BOARD = Swath(2600, 1900), load_target("vck190")
@@ -125,9 +126,8 @@ def test_more_banks_keep_larger_tiles(model: onnx.ModelProto) -> None:
 
 
 def test_a_network_that_the_dpu_cannot_run_is_refused(model: onnx.ModelProto) -> None:
-    spoilt = onnx.ModelProto()
-    spoilt.CopyFrom(model)
-    relu = next(node for node in spoilt.graph.node if node.op_type == "Max")
+    spoilt = board_model(read_core(model), {})
+    relu = next(node for node in spoilt.graph.node if node.op_type == "Relu")
     relu.op_type = "Pow"
     with pytest.raises(ModelError):
         kept_tiles_px(spoilt, load_dpu("vck190"), 16, 640)

@@ -28,11 +28,10 @@ from deploy.tradeoff.detection import Request as DetectionRequest
 from deploy.tradeoff.points import MAP50
 from deploy.tradeoff.run import StudyRun, run_study
 from deploy.tradeoff.selection import Request
-from model.convbeers import ConvBEERS, initialise
+from model.convbeers import ConvBEERS, initialise, save_network
 from model.shipped import DETECTOR
 from model.simulator.procedural import procedural_scene
 from model.variants import Variant
-from model.weights import save_network
 from profiles.figures import Figure
 from tests.deploy.detection.drawn import NAMES, drawn_images
 from tests.deploy.detection.folders import labelled

@@ -11,10 +11,9 @@ from deploy.networks import shipped_pair
 from deploy.tradeoff.methods import Network, find_networks, is_papers, operations_per_px, shape_of
 from deploy.tradeoff.points import EXACT, LEGAL, PRECISIONS, Board, Variant, network_points, other_points, tiles_px
 from deploy.tradeoff.selection import board_of, configurations_for, precisions_of
-from model.convbeers import ConvBEERS
-from model.shipped import shipped_names, shipped_weights, studied_names
+from model.convbeers import ConvBEERS, save_network
+from model.shipped import shipped_names, shipped_weights
 from model.variants import Variant as Shape
-from model.weights import save_network
 from profiles import load_target
 from profiles.errors import ModelError, OptionError
 
@@ -61,7 +60,7 @@ def test_chains_and_peers_are_float_and_off_the_dpu() -> None:
 @pytest.mark.slow
 def test_the_shipped_family_makes_some_forty_to_seventy_points() -> None:
     """More would not be measured in 45 minutes, fewer would leave an axis out."""
-    networks = find_networks(studied_names())
+    networks = find_networks(shipped_names())
     swath = Swath(13600, 9016)
     points = [
         p

@@ -21,10 +21,9 @@ from deploy.export import float_model
 from deploy.tradeoff import measurements
 from deploy.tradeoff.run import StudyRun, run_study
 from deploy.tradeoff.selection import Request
-from model.convbeers import ConvBEERS, initialise
+from model.convbeers import ConvBEERS, initialise, save_network
 from model.simulator.procedural import procedural_scene
 from model.variants import Variant
-from model.weights import save_network
 from profiles.figures import Row
 from quant.onnx_file import GraphWriter, image_info, load_onnx, make_model, save_onnx
 from tests.deploy.dpu.graphs import Sketch

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from model.conditioning import SensorFamily
+from model.family import SensorFamily
 from model.io.tiff import write_tiff
 from model.simulator.procedural import procedural_scene
 from model.simulator.sampling import Scene

@@ -13,8 +13,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from model.conditioning import SensorFamily
-from model.convbeers import ConvBEERS
+from model.convbeers import ConvBEERS, load_network
+from model.family import SensorFamily
 from model.io.tensors import read_tensors
 from model.progress import held_back
 from model.simulator.procedural import procedural_scene
@@ -26,7 +26,6 @@ from model.training.patches import PatchRecipe, PatchSource
 from model.training.trainer import Progress, Schedule, Trainer
 from model.training.workers import Worker
 from model.variants import Variant
-from model.weights import load_network
 from profiles import load_sensor
 from profiles.errors import ModelError
 

@@ -8,8 +8,9 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from model.conditioning import SensorFamily, transposed, vector_tensor
-from model.specialise import RANGES, sensor_values, sensor_vector
+from model.convbeers import vector_tensor
+from model.family import RANGES, SensorFamily, sensor_values, sensor_vector
+from model.training.patches import transposed
 from profiles import load_sensor
 from profiles.effects import Smear
 from profiles.sensor import Sensor, noise_from_snr

@@ -1,0 +1,113 @@
+"""The sensors that a network for every sensor is trained on, and what it is told of each.
+
+The network sees images over full scale, so a sensor's noise is stated over full scale too, at 1/16 and at 1/4 of it:
+that is at 25 and at 100 W/m2/sr/um where full scale is 400. This is NumPy alone, so that a restoration begins without
+torch.
+"""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from profiles.effects import Smear
+from profiles.sensor import Sensor
+
+RANGES: Mapping[str, tuple[float, float]] = {
+    "mtf_across": (0.015, 0.15),
+    "mtf_along": (0.015, 0.15),
+    "sigma_dark": (0.00056, 0.0072),
+    "sigma_bright": (0.0011, 0.0072),
+}
+"""What a network can know of its sensor, in this order: MTF at Nyquist across (horizontal) and along the track
+(vertical), and the noise's standard deviation over full scale at 1/16 and at 1/4 of it. The logarithm of each, -1 to
+1 from end to end, is the sensor vector."""
+
+LEAST_ALONG = 0.4
+"""The lower MTF of the two axes over the higher one: the least that is trained on."""
+
+ROUNDING = 1e-9
+"""What a ratio may miss its end by."""
+
+SNR_BRIGHT = (35.0, 220.0)
+"""Of the sensors trained on, at 1/4 of full scale."""
+
+EDGE = 0.05
+"""Draws reach this share of a range beyond its ends and are brought back: no draws from outside train the ends."""
+
+
+@dataclass(frozen=True)
+class SensorVector:
+    """What a network for every sensor is told of one.
+
+    Attributes:
+        values: four of them as in `RANGES`, each in [-1, 1].
+        outside: a sentence for each value that lies outside its range, and was moved to the nearest end of it; and
+            one for axes that differ more than any sensor did in training.
+    """
+
+    values: tuple[float, ...]
+    outside: tuple[str, ...]
+
+
+def sensor_values(sensor: Sensor) -> dict[str, float]:
+    """The four values of `RANGES`, smear and rounding noise counted."""
+    full_scale = sensor.max_dn / sensor.gain_dn_per_radiance
+    rounding = 1 / (12 * sensor.gain_dn_per_radiance**2)
+    smear = sensor.effects.get("smear")
+    # A network knows no smear of its own: what that leaves of the contrast along the track is counted there.
+    kept = abs(float(np.sinc(0.5 * smear.length_px))) if isinstance(smear, Smear) else 1.0
+    sigmas = [math.sqrt(sensor.noise_sigma(full_scale / part) ** 2 + rounding) / full_scale for part in (16, 4)]
+    across, along = sensor.mtf_axes
+    return dict(zip(RANGES, (across, along * kept, *sigmas), strict=True))
+
+
+def sensor_vector(sensor: Sensor) -> SensorVector:
+    """The sensor vector, clamped to the ranges."""
+    values, entries, outside = sensor_values(sensor), list[float](), list[str]()
+    for (name, value), (low, high) in zip(values.items(), RANGES.values(), strict=True):
+        inside = min(max(value, low), high)
+        if inside != value:
+            outside.append(
+                f"{name} {value:.3g} is outside {low:g} to {high:g}, the network is told {inside:g} "
+                "and may restore worse than blind"
+            )
+        entries.append(2 * math.log(inside / low) / math.log(high / low) - 1)
+    lower, higher = sorted((values["mtf_across"], values["mtf_along"]))
+    if lower < (1 - ROUNDING) * LEAST_ALONG * higher:
+        outside.append(
+            f"the lower MTF is {lower / higher:.2g} of the other axis'; {LEAST_ALONG:g} and more was trained"
+        )
+    return SensorVector(tuple(entries), tuple(outside))
+
+
+@dataclass(frozen=True)
+class SensorFamily:
+    """The sensors that a network is trained on: every number log-uniform over its range.
+
+    Attributes:
+        like: gives gain and bits; its MTF and noise do not matter.
+        snr_bright: at 1/4 of full scale; at 1/16 all that physics allows for it.
+    """
+
+    like: Sensor
+    snr_bright: tuple[float, float] = SNR_BRIGHT
+
+    def draw(self, generator: np.random.Generator) -> Sensor:
+        """One sensor. The MTF along the track is more often near that across than far below it."""
+        mtf = _log_uniform(generator, *RANGES["mtf_across"])
+        # The square draws more sensors with axes that are nearly alike, as real ones have.
+        along = max(mtf * LEAST_ALONG ** float(generator.uniform() ** 2), RANGES["mtf_along"][0])
+        full_scale = self.like.max_dn / self.like.gain_dn_per_radiance
+        sigma = full_scale / 4 / _log_uniform(generator, *self.snr_bright)
+        # Variance alpha L + beta: all of it in alpha halves sigma at a quarter of the radiance, all in beta keeps it.
+        dark = sigma * _log_uniform(generator, 0.5, 1.0)
+        alpha = max(sigma**2 - dark**2, 0.0) / (full_scale * 3 / 16)
+        beta = max(dark**2 - alpha * full_scale / 16, 0.0)
+        return Sensor(mtf, alpha, beta, self.like.gain_dn_per_radiance, self.like.bits, {}, along, full_scale / 4)
+
+
+def _log_uniform(generator: np.random.Generator, low: float, high: float) -> float:
+    share = min(max(float(generator.uniform(-EDGE, 1 + EDGE)), 0.0), 1.0)
+    return min(low * math.exp(share * math.log(high / low)), high)
