@@ -9,16 +9,21 @@ from xml.etree import ElementTree as ET
 
 import onnx
 import pytest
+import torch
 from onnx import numpy_helper
 from typer.testing import CliRunner
 
 from deploy.cli import app
+from deploy.export import to_onnx
 from deploy.networks import shipped_pair
+from model.convbeers import ConvBEERS, initialise
 from model.shipped import SENSOR
+from model.variants import Variant
+from quant.onnx_file import save_onnx
 from tests.deploy.workflow_steps import ACTION, BASH, KEPT, ROOT, Runner, read_yaml
 
 WORKFLOW = ROOT / ".github" / "workflows" / "int8-gate.yml"
-OURS = "Export a shipped network"
+OURS = "Train a small network"
 
 pytestmark = [
     pytest.mark.slow,
@@ -28,7 +33,7 @@ pytestmark = [
 
 @pytest.fixture(scope="module")
 def networks(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with a sound pair, the same with one bias doubled, and a baseline of the sound one."""
+    """A folder with a sound pair, the same with one bias doubled, and in plain/ a network of one sensor alone."""
     folder = tmp_path_factory.mktemp("networks")
     done = CliRunner().invoke(app, ["export", "--variant", "convbeers-xs", "--out", str(folder / "float.onnx")])
     assert done.exit_code == 0, done.output
@@ -38,6 +43,9 @@ def networks(tmp_path_factory: pytest.TempPathFactory) -> Path:
     bias = next(tensor for tensor in model.graph.initializer if tensor.name == name)
     bias.CopyFrom(numpy_helper.from_array(2 * numpy_helper.to_array(bias), name))
     onnx.save(model, folder / "broken.onnx")
+    plain = ConvBEERS(Variant(blocks=1, features=8))
+    initialise(plain, torch.Generator().manual_seed(0))
+    save_onnx(to_onnx(plain, {}), folder / "plain" / "float.onnx")
     return folder
 
 
@@ -105,7 +113,7 @@ def test_a_missing_float_network_is_red_in_one_sentence(
 
 
 def test_without_an_int8_network_it_quantises_for_the_same_sensor(runner: Runner, networks: Path) -> None:
-    take(runner, networks, "float.onnx")
+    take(runner, networks / "plain", "float.onnx")
     sensor = runner.folder / "mine.toml"
     shutil.copy(ROOT / "profiles" / "sensors" / f"{SENSOR}.toml", sensor)
     outputs = runner.run_action({"float": "models/float.onnx", "sensor": "mine.toml", "max-mae": "0.001"})
@@ -164,7 +172,7 @@ def steps_of_workflow() -> list[dict[str, object]]:
 
 
 def test_the_workflow_is_green_with_one(runner: Runner, networks: Path) -> None:
-    take(runner, networks, "float.onnx")
+    take(runner, networks / "plain", "float.onnx")
     runner.run_steps([step for step in steps_of_workflow() if step.get("name") != OURS], {})
     assert not runner.red, runner.stderr
     assert runner.outputs["steps.gate.outputs.verdict"] == "passed"

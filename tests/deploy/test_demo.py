@@ -21,8 +21,7 @@ from quant.onnx_file import metadata
 @pytest.mark.slow
 def test_the_demo_takes_a_raw_image_through_the_whole_chain(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """On few patches: .ci/run's first stage has all."""
-    for name in ("CALIBRATION_PATCHES", "GATE_PATCHES"):
-        monkeypatch.setattr(demo, name, 2)
+    monkeypatch.setattr(demo, "GATE_PATCHES", 2)
     raw = tmp_path / "raw.tif"
     tifffile.imwrite(raw, np.random.default_rng(0).integers(300, 1500, (120, 150)).astype(np.uint16))
     text = (HERE / "sensors" / "pleiades-degraded.toml").read_text()
@@ -38,7 +37,7 @@ def test_the_demo_takes_a_raw_image_through_the_whole_chain(tmp_path: Path, monk
     document = json.loads(figures.read_text())
     jsonschema.validate(document, json.loads(SCHEMA_PATH.read_text()))
     assert document["arguments"]["sensor"] == str(mine)
-    assert metadata(onnx.load(out / "int8.onnx"))["calibration_sensor"] == "mine"
+    assert metadata(onnx.load(out / "int8.onnx"))["sensor"] == "mine"
     modes = {figure["mode"] for row in document["rows"] for figure in row["figures"].values()}
     assert {"measured", "predicted", "published"} <= modes
     page = (out / "report.html").read_text()

@@ -113,7 +113,7 @@ def test_tiles_stay_on_chip_up_to_where_the_memory_traffic_jumps(model: onnx.Mod
     found = kept_tiles_px(model, dpu, 16, 640)
     assert found[-1] == 176
     streamed = {side: predict_model(model, dpu, side).streamed_bytes / side**2 for side in range(16, 641, 16)}
-    assert found == [side for side in list(streamed)[:-1] if streamed[side + 16] > 1.01 * streamed[side]]
+    assert found == [side for side in list(streamed)[:-1] if streamed[side + 16] > 1.05 * streamed[side]]
 
 
 def test_more_banks_keep_larger_tiles(model: onnx.ModelProto) -> None:
