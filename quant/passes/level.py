@@ -36,6 +36,9 @@ LEVELLING = (0.0, 0.25, 0.5, 1.0)
 HEADROOM = (0.8, 1.0, 1.25, 1.6, 2.2)
 """First guesses tried, as in `quant.passes.equalise`; a range here is the largest of all tiles, so more may be
 clipped."""
+FEW_TENSORS = 4
+"""Of a chain beside a stream, to be tried one by one."""
+
 EVERY, CLEARLY = 8, 1.1
 """A guess is tried on one of so many crops first, and dropped where it costs so much more there."""
 
@@ -63,7 +66,7 @@ class Chain:
     """Tensors that may be levelled, in the graph's order, and how many channels each has.
 
     Factors and ranges of all of them are one array (sum of the channels,), tensor behind tensor. Beside a stream
-    `by_channel` is off: trying each channel buys nothing there, nor each tensor of a wide network.
+    `by_channel` is off: trying each channel buys nothing there, nor each tensor of a deep network.
     """
 
     tensors: tuple[str, ...]
@@ -84,7 +87,7 @@ class Chain:
     @property
     def one_by_one(self) -> bool:
         """Whether each tensor is tried, once all were together."""
-        return self.by_channel or sum(self.widths) <= MOST_CHANNELS
+        return self.by_channel or len(self.tensors) <= FEW_TENSORS
 
     @property
     def steps(self) -> int:
