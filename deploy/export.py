@@ -48,7 +48,7 @@ def to_onnx(network: "Weights | ConvBEERS", about: dict[str, str], tile_px: int 
         OptionError: a tile that is no multiple of the network's scale.
     """
     scale = network.variant.scale
-    _require_tile(tile_px, scale)
+    require_tile(tile_px, scale)
     writer = GraphWriter()
     for name, value in _arrays(network).items():
         writer.constant(name, value)
@@ -75,7 +75,7 @@ def banked_to_onnx(
     """
     variant, bank = weights.variant, network_bank(sensor)
     scale, pixels = variant.scale, variant.pixels
-    _require_tile(tile_px, scale)
+    require_tile(tile_px, scale)
     vector = np.array(sensor_vector(sensor).values, np.float32)
     tensors = dict(weights.tensors)
     unread = np.zeros((variant.features, pixels, 3, 3), np.float32)
@@ -119,7 +119,12 @@ def _ended(
     return make_model(graph, {"beers_deploy_version": __version__, "precision": "float32", **about})
 
 
-def _require_tile(tile_px: int | None, scale: int) -> None:
+def require_tile(tile_px: int | None, scale: int) -> None:
+    """Refuse a side that a network at 1 / `scale` of the resolution cannot rearrange.
+
+    Raises:
+        OptionError: such a side.
+    """
     if tile_px is not None and tile_px % scale:
         remedy = "choose another, or leave it out"
         raise OptionError("--tile", expected=f"a multiple of {scale} px", got=f"{tile_px} px", remedy=remedy)

@@ -246,12 +246,13 @@ def _result_range(plan: Plan, images: Remade[np.ndarray], tick: Callable[[], Non
 def _balanced(plan: Plan, frac_bits: dict[str, int], images: Remade[np.ndarray], tick: Callable[[], None]) -> Graph:
     """The plan's graph, its streams equalised and then its chain levelled."""
     graph = plan.chain.scaled(plan.graph, plan.chain.unscaled(frac_bits))
-    if plan.streams:
-        graph = _equalised(graph, plan, _trial(plan, frac_bits, images), images, tick)
+    if not (plan.streams or plan.chain.tensors):
+        return graph
+    trial = _trial(plan, frac_bits, images)
+    graph = _equalised(graph, plan, trial, images, tick) if plan.streams else graph
     if plan.chain.tensors:
         ranges = chain_ranges(graph, plan.chain, images, tick, plan.ends)
-        unchanged, trial = np.ones(len(ranges)), _trial(plan, frac_bits, images)
-        graph = plan.chain.scaled(graph, level(graph, plan.chain, ranges, unchanged, trial, tick))
+        graph = plan.chain.scaled(graph, level(graph, plan.chain, ranges, np.ones(len(ranges)), trial, tick))
     return graph
 
 

@@ -35,7 +35,7 @@ def export(
     ] = None,
     delta: Annotated[
         Path | None,
-        typer.Option(help="Of an INT8 file: also write what the sensor changes in it, 1 to 2 kB."),
+        typer.Option(help="Of an INT8 file: also write what the sensor changes in it, 1 to 3 kB."),
     ] = None,
     apply: Annotated[
         Path | None, typer.Option(help="Of an INT8 file: tell it the sensor of this delta, in place of --sensor.")
@@ -107,9 +107,10 @@ def _export_int8(
         apply: a delta that is told in place of a sensor, or None.
 
     Raises:
-        OptionError: a delta and a sensor.
+        OptionError: a delta and a sensor, or a tile that is no multiple of the network's scale.
         ModelError: no such INT8 file, or a delta of another.
     """
+    from deploy.export import require_tile
     from deploy.networks import told_by_delta, told_int8
     from model.io.files import whole_file
     from profiles import load_sensor
@@ -127,6 +128,7 @@ def _export_int8(
     else:
         made = told_int8(model, load_sensor(sensor or SENSOR), say=partial(say, err=True))
     core, about, side_px = read_core(made), metadata(made), tile_px or fixed_tile_px(made)
+    require_tile(side_px, core.ends.place_px)
     save_onnx(host_model(core, about, side_px), out)
     say(f"wrote {out}")
     if board is not None:

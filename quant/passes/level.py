@@ -135,7 +135,9 @@ def level(
     for shape in product(LEVELLING, HEADROOM):
         best = _better(np.concatenate([channels.guess(*shape) for channels in known]), costs_of, best)
         tick()
-    for channels, part in reversed(list(zip(known, chain.parts, strict=True))) if chain.one_by_one else ():
+    if not chain.one_by_one:
+        return best.factors
+    for channels, part in reversed(list(zip(known, chain.parts, strict=True))):
         best = _one_tensor(channels, part, costs_of, best)
         tick()
         if chain.stepped:

@@ -86,3 +86,11 @@ def test_export_writes_a_shipped_networks_integers_for_the_host_and_the_board(tm
     for path in (host, board):
         result = CliRunner().invoke(app, ["check", path])
         assert result.exit_code == 0, result.output
+
+
+def test_a_tile_that_a_network_cannot_rearrange_is_refused(tmp_path: Path) -> None:
+    words = ["export", "--checkpoint", "convbeers-half-xs-int8", "--tile", "65", "--out", str(tmp_path / "x.onnx")]
+    result = CliRunner().invoke(app, words)
+    assert result.exit_code == 2
+    assert "--tile: expected a multiple of 2 px, got 65 px" in " ".join(result.output.split())
+    assert not (tmp_path / "x.onnx").exists()
