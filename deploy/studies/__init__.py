@@ -1,0 +1,1 @@
+"""Studies of what the verbs do: nothing outside this package and its commands imports it."""
