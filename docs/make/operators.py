@@ -149,7 +149,8 @@ def _traditional() -> Iterator[str]:
     yield "## The traditional chain\n"
     chains = {name: judge_traditional(dpu) for name, dpu in DPUS.items()}
     for names, text in _alike({name: verdict(steps) for name, steps in chains.items()}):
-        yield f"On {names.replace('all', 'all boards')}: {text}. Operator by operator: `beers-deploy check traditional`."
+        where = names.replace("all", "all boards")
+        yield f"On {where}: {text}. Operator by operator: `beers-deploy check traditional`."
 
 
 if __name__ == "__main__":

@@ -3,8 +3,8 @@
     beers-deploy evaluate --images aerial-test/ --sweep ... --json evaluation.json
     python docs/make/results.py evaluation.json
 
-A table lies between `<!-- NAME -->` and `<!-- end -->`, NAME being that of the document's table; what the document
-does not hold stays as it is.
+A table lies between `<!-- NAME -->` and `<!-- end -->`, NAME being that of the document's table. The heading of the
+table on the page says which of the document's columns are shown; what the document does not hold stays as it is.
 """
 
 import re
@@ -48,7 +48,8 @@ def filled(tables: Mapping[str, list[Row]], found: re.Match[str]) -> str:
     name = found["name"]
     if name not in tables:
         return found[0]
-    made = mean_table(tables[name]) if name == "mean" else plain_table(tables[name])
+    wanted = [cell.strip() for cell in found["table"].split("\n")[0].strip("| ").split("|")]
+    made = mean_table(tables[name]) if name == "mean" else plain_table(tables[name], wanted)
     return f"{found[1]}{made}{found[4]}"
 
 
@@ -63,9 +64,9 @@ def mean_table(rows: Iterable[Row]) -> str:
     )
 
 
-def plain_table(rows: list[Row]) -> str:
-    """A row a line, a column for each figure that any has; intervals of differences alone."""
-    keys = list(dict.fromkeys(key for row in rows for key in row["figures"]))
+def plain_table(rows: list[Row], wanted: list[str]) -> str:
+    """A row a line, a column for each figure that the page wants; intervals of differences alone."""
+    keys = list(dict.fromkeys(key for row in rows for key in row["figures"] if key in wanted))
     differences = "gain" in rows[0]["table"] or "lost" in rows[0]["table"]
     cells = ([shown(row["figures"].get(key), differences) for key in keys] for row in rows)
     return markdown(["", *keys], [[row["name"], *line] for row, line in zip(rows, cells, strict=True)])
