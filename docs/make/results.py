@@ -49,16 +49,16 @@ def filled(tables: Mapping[str, list[Row]], found: re.Match[str]) -> str:
     if name not in tables:
         return found[0]
     wanted = [cell.strip() for cell in found["table"].split("\n")[0].strip("| ").split("|")]
-    made = mean_table(tables[name]) if name == "mean" else plain_table(tables[name], wanted)
+    made = mean_table(tables[name], wanted) if name == "mean" else plain_table(tables[name], wanted)
     return f"{found[1]}{made}{found[4]}"
 
 
-def mean_table(rows: Iterable[Row]) -> str:
-    """Methods down, what the page speaks of across; the paper's rows stand elsewhere."""
+def mean_table(rows: Iterable[Row], wanted: list[str]) -> str:
+    """Methods down, what the page wants across; the paper's rows stand elsewhere."""
     ours = [row for row in rows if not row["name"].startswith("paper")]
-    keys = ["PSNR", "PSNR gain", "PSNR, reference without noise", "SSIM", "LPIPS-squeeze", "MTF at Nyquist"]
-    keys += [key for key in ours[0]["figures"] if key.startswith("SNR")]
-    head = ["method", "sensor", *(f"{key} {unit(ours, key)}".replace(" ratio", "") for key in keys)]
+    titles = {key: f"{key} {unit(ours, key)}".replace(" ratio", "") for row in ours for key in row["figures"]}
+    keys = [key for title in wanted for key in titles if titles[key] == title]
+    head = ["method", "sensor", *(titles[key] for key in keys)]
     return markdown(
         head, [[r["name"], r["text"]["sensor"], *(shown(r["figures"].get(k)) for k in keys)] for r in ours]
     )
