@@ -3,8 +3,8 @@
     beers-deploy evaluate --images aerial-test/ --sweep ... --json evaluation.json
     python docs/make/results.py evaluation.json
 
-A table lies between `<!-- NAME -->` and `<!-- end -->`, NAME being that of the document's table; what the document
-does not hold stays as it is.
+A table lies between `<!-- NAME -->` and `<!-- end -->`, NAME being that of the document's table. The heading of the
+table on the page says which of the document's columns are shown; what the document does not hold stays as it is.
 """
 
 import re
@@ -48,24 +48,25 @@ def filled(tables: Mapping[str, list[Row]], found: re.Match[str]) -> str:
     name = found["name"]
     if name not in tables:
         return found[0]
-    made = mean_table(tables[name]) if name == "mean" else plain_table(tables[name])
+    wanted = [cell.strip() for cell in found["table"].split("\n")[0].strip("| ").split("|")]
+    made = mean_table(tables[name], wanted) if name == "mean" else plain_table(tables[name], wanted)
     return f"{found[1]}{made}{found[4]}"
 
 
-def mean_table(rows: Iterable[Row]) -> str:
-    """Methods down, what the page speaks of across; the paper's rows stand elsewhere."""
+def mean_table(rows: Iterable[Row], wanted: list[str]) -> str:
+    """Methods down, what the page wants across; the paper's rows stand elsewhere."""
     ours = [row for row in rows if not row["name"].startswith("paper")]
-    keys = ["PSNR", "PSNR gain", "PSNR, reference without noise", "SSIM", "LPIPS-squeeze", "MTF at Nyquist"]
-    keys += [key for key in ours[0]["figures"] if key.startswith("SNR")]
-    head = ["method", "sensor", *(f"{key} {unit(ours, key)}".replace(" ratio", "") for key in keys)]
+    titles = {key: f"{key} {unit(ours, key)}".replace(" ratio", "") for row in ours for key in row["figures"]}
+    keys = [key for title in wanted for key in titles if titles[key] == title]
+    head = ["method", "sensor", *(titles[key] for key in keys)]
     return markdown(
         head, [[r["name"], r["text"]["sensor"], *(shown(r["figures"].get(k)) for k in keys)] for r in ours]
     )
 
 
-def plain_table(rows: list[Row]) -> str:
-    """A row a line, a column for each figure that any has; intervals of differences alone."""
-    keys = list(dict.fromkeys(key for row in rows for key in row["figures"]))
+def plain_table(rows: list[Row], wanted: list[str]) -> str:
+    """A row a line, a column for each figure that the page wants; intervals of differences alone."""
+    keys = list(dict.fromkeys(key for row in rows for key in row["figures"] if key in wanted))
     differences = "gain" in rows[0]["table"] or "lost" in rows[0]["table"]
     cells = ([shown(row["figures"].get(key), differences) for key in keys] for row in rows)
     return markdown(["", *keys], [[row["name"], *line] for row, line in zip(rows, cells, strict=True)])
