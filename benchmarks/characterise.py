@@ -20,15 +20,23 @@ import tifffile
 import torch
 from torch import Tensor
 
-from deploy.characterise import Box, Characterised, Request, Snr, characterise, measured_noise, profile_toml, snr_at
 from deploy.export import torch_network
-from model.evaluation.pairs import simulate_pairs
-from model.evaluation.scores import fidelity_db
-from model.evaluation.sweep import Fixed
+from deploy.studies.characterise import (
+    Box,
+    Characterised,
+    Snr,
+    characterise,
+    measured_noise,
+    profile_toml,
+    snr_at,
+)
+from deploy.studies.evaluation.pairs import simulate_pairs
+from deploy.studies.evaluation.sweep import Fixed
 from model.family import LEAST_ALONG, SensorFamily
 from model.io.images import list_images
 from model.metrics.edge_blur import AxisMtf
-from model.metrics.edges import slanted_edge
+from model.metrics.fidelity import fidelity_db
+from model.metrics.slanted_edge import slanted_edge
 from model.simulator.acquire import acquire, fitting_oversampling
 from model.simulator.detector import Draw, to_uint16
 from model.simulator.sampling import Scene, crop_divisible, read_scene, scene_spectrum
@@ -153,11 +161,10 @@ class Findings:
     def look(self, sensor: Sensor, paths: tuple[Path, ...], boxes: tuple[Box, ...] = ()) -> Characterised | None:
         """Characterise one sensor; where its edges are refused, its noise alone."""
         self.asked += 2
-        request = Request(paths, boxes, sensor.bits, sensor.gain_dn_per_radiance)
         found = None
         snrs: Sequence[Snr] = ()
         try:
-            found = characterise(request)
+            found = characterise(paths, boxes, bits=sensor.bits, gain=sensor.gain_dn_per_radiance)
         except ImageError:
             try:
                 noise = measured_noise(paths, sensor.max_dn)

@@ -31,11 +31,13 @@ from torch.nn.functional import pixel_shuffle, pixel_unshuffle
 
 from deploy.bench.tables import PAPER_SIZE, Swath, parse_size, swath_latency
 from deploy.dpu.board import load_dpu
-from deploy.tradeoff.board import predict_model
+from deploy.dpu.checker.placement import place
+from deploy.dpu.cost.latency import predict
+from deploy.dpu.reading import network_of
 from model.convbeers import ResidualBlock
 from model.io.images import list_images, site_of
 from model.metrics.fidelity import psnr_db
-from model.processor import bfloat16_speed, processor_name
+from model.processor import processor_name
 from model.progress import steps
 from model.simulator.sampling import read_scene
 from model.training.losses import LossWeights, RestorationLoss
@@ -155,7 +157,7 @@ def trained(name: str, source: PatchSource, count: int, path: Path) -> Restoring
         return network.eval()
     optimiser = torch.optim.Adam(network.parameters(), RATE)
     falling = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, count)
-    network.narrow, begun = bfloat16_speed() > 1, time.process_time()
+    network.narrow, begun = False, time.process_time()
     with steps(f"training {name}", count) as bar:
         for degraded, reference in islice(source.batches(), count):
             loss, _ = LOSS(network(degraded), reference)
@@ -199,7 +201,7 @@ def swath_cell(model: onnx.ModelProto) -> str:
         dpu, radius_px = load_dpu("vck190", configuration), receptive_radius_px(model)
         if 2 * radius_px >= tile_px:
             continue
-        prediction = predict_model(model, dpu, tile_px)
+        prediction = predict(place(network_of(model, tile_px), dpu), dpu)
         swath = Swath(width_px, height_px, tile_px, radius_px)
         latency = swath_latency(prediction, math.ceil(swath.tiles / prediction.batch))
         low, high = latency.interval or (math.nan, math.nan)
@@ -230,7 +232,7 @@ def main() -> None:
     for name in arguments.families.split(","):
         network = trained(name, source, arguments.steps, arguments.out / f"{name}.safetensors")
         model = exported(network)
-        made = quantise_model(model, drawn, {}, lambda: None).host
+        made = quantise_model(model, drawn, {}).host
         scores = [f"{psnrs_db(each, judging).mean():.2f}" for each in (model, made)]
         weights = sum(parameter.numel() for parameter in network.parameters()) / 1e3
         cells = [name, f"{weights:.0f}", str(receptive_radius_px(made)), *scores, swath_cell(made)]

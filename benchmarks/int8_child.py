@@ -46,9 +46,9 @@ def ours(way: str, network: Path, images: np.ndarray, out: Path) -> None:
     patches = Patches([], Remade(lambda k: (image(k), image(k)), count), Remade(image, count))
     model = onnx.load(network)
     if way == "free":
-        onnx.save(quantise_free(model, patches, {}, lambda: None), out)
+        onnx.save(quantise_free(model, patches, {}), out)
     else:
-        onnx.save(quantise_model(model, patches, {}, lambda: None).host, out)
+        onnx.save(quantise_model(model, patches, {}).host, out)
 
 
 def onnxruntimes(way: str, network: Path, inputs: np.ndarray, out: Path) -> None:

@@ -2,13 +2,14 @@
 
     python benchmarks/shapes.py [--shapes 4x16,8x32,4x64@2] [--boards vck190:C32B3,vck190:C32B6] [--tile 640]
 
-Random weights, quantised without a search: predicted time does not depend on numbers. A swath of 13600 x 9016 is cut
-into whole tiles with exact seams. What a shape is worth only training tells: `beers-deploy train`, then `evaluate`.
+Random weights, quantised without a long search: predicted time does not depend on numbers. A swath of 13600 x 9016 is
+cut into whole tiles with exact seams. What a shape is worth only training tells (`beers-deploy train`, `evaluate`).
 """
 
 import argparse
 import math
 import re
+from unittest.mock import patch
 
 import numpy as np
 import onnx
@@ -16,18 +17,19 @@ import torch
 
 from deploy.bench.tables import PAPER_SIZE, Swath, parse_size, swath_latency
 from deploy.dpu.board import Dpu, load_dpu
+from deploy.dpu.checker.placement import place
+from deploy.dpu.cost.latency import predict
+from deploy.dpu.reading import network_of
 from deploy.export import to_onnx
-from deploy.tradeoff.board import predict_model
 from model.convbeers import ConvBEERS, initialise
 from model.variants import Variant
 from quant.calibration import Patches, Remade
-from quant.quantise import Passes, quantise_model
+from quant.quantise import quantise_model
 from quant.tiling.walk import receptive_radius_px
 
 SHAPES = "4x16,8x32,16x32,16x64,2x32@2,4x32@2,8x32@2,4x48@2,8x48@2,3x64@2,4x64@2,2x64@4,4x96@4,4x128@4"
 SHAPE = re.compile(r"(\d+)x(\d+)(?:@(\d+))?")
 SIDE_PX = 48
-QUICK = Passes(equalise=False, fit_weights=False)
 
 
 def main() -> None:
@@ -64,12 +66,13 @@ def int8(variant: Variant) -> onnx.ModelProto:
     initialise(network, torch.Generator().manual_seed(0))
     seen = np.random.default_rng(0).random((1, 1, SIDE_PX, SIDE_PX), dtype=np.float32)
     patches = Patches([], Remade(lambda _: (seen, seen), 1), Remade(lambda _: seen, 1))
-    return quantise_model(to_onnx(network.eval(), {}), patches, {}, lambda: None, QUICK).host
+    with patch("quant.passes.equalise.MOST_CHANNELS", 0):  # no channel is tried by itself
+        return quantise_model(to_onnx(network.eval(), {}), patches, {}).host
 
 
 def cells_of(model: onnx.ModelProto, dpu: Dpu, tile_px: int) -> tuple[str, str]:
     """Frames a second and seconds a swath, each as its interval and the middle."""
-    prediction = predict_model(model, dpu, tile_px)
+    prediction = predict(place(network_of(model, tile_px), dpu), dpu)
     width_px, height_px = parse_size(PAPER_SIZE)
     swath = Swath(width_px, height_px, tile_px, receptive_radius_px(model))
     latency = swath_latency(prediction, math.ceil(swath.tiles / prediction.batch))

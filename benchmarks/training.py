@@ -21,13 +21,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from deploy.tradeoff.measurements import machine
+from model.processor import processor_name
 from model.simulator.procedural import procedural_scene
 from model.training.checkpoint import TrainingRecipe
 from model.training.losses import LossWeights, RestorationLoss
 from model.training.patches import PatchRecipe, PatchSource
-from model.training.precision import MixedPrecision, Precision
-from model.training.trainer import Trainer
+from model.training.trainer import MixedPrecision, Precision, Trainer
 from model.variants import VARIANTS
 from profiles import load_sensor
 
@@ -54,12 +53,11 @@ def main() -> None:
         for _, (name, trainer) in product(range(TURNS + 1), trainers.items()):
             bare[name].append(rate(steps, partial(bare_loop, Trainer(variant, recipe, precision=name), made)))
             whole[name].append(rate(steps, partial(run, trainer, batches, steps, Path(folder) / "c")))
-    print(f"{arguments.variant} on {machine()}, {torch.get_num_threads()} threads")
+    print(f"{arguments.variant} on {processor_name()}, {torch.get_num_threads()} threads")
     for name in trainers:
         ratio = median(ours / theirs for ours, theirs in zip(whole[name][1:], bare[name][1:], strict=True))
         rates = f"bare loop {median(bare[name][1:]):.1f} patches/s, training run {median(whole[name][1:]):.1f}"
         print(f"{name}: {rates}, ratio {ratio:.2f}")  # the first turn warms up
-    print(f"train computes in {Trainer(variant, recipe).precision} here")
 
 
 def rate(steps: int, work: Callable[[], None]) -> float:

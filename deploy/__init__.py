@@ -2,12 +2,12 @@
 
 - `commands`, reached from `cli`: a file a verb, which parses options, calls one function and prints;
 - `restoration`: images of any size through a network or the traditional chain; `library` does it for arrays;
-- `dpu`: the checker of operators, the cost model and the published networks that it is fitted on;
+- `dpu`: the checker of operators and the cost model;
 - `export`, `quantise`, `gate`, `compare`: a network as a file, in INT8, judged, and two runs' figures side by side;
-- `bench`, `tradeoff`, `stress`, `demo`: how fast, at what price, how sturdy, and all of it in minutes;
-- `methods`: restorations by name, which `evaluate` compares;
+- `bench`: how fast, and at what price;
+- `studies`: what the verbs are worth: `evaluation`, `characterise`, `stress`, `detection`, `tradeoff`, `demo`;
 - `results` and `report`: figures as tables, JSON and HTML;
-- `cluster`, `dataset_workers`: the workers of Dask.
+- `cluster`: the workers of a Dask scheduler.
 
 What is offered here is loaded when it is asked for.
 """

@@ -7,7 +7,6 @@ from .export import float_model as float_model
 from .export import to_onnx as to_onnx
 from .gate import run_gate as run_gate
 from .library import restore as restore
-from .methods import method_named as method_named
 from .results import Document as Document
 
 __version__: str

@@ -103,10 +103,9 @@ def _installation() -> Iterator[str]:
     from importlib.metadata import version as version_of
 
     from deploy.results import host
-    from model.processor import bfloat16_speed, int8_adds_exactly
+    from model.processor import int8_adds_exactly
 
     int8_adds_exactly()
-    bfloat16_speed()
     for key, value in host().items():
         shown = value if isinstance(value, dict) else {key: value}
         yield from (f"{name.replace('_', ' ')}: {each}" for name, each in shown.items())
@@ -141,6 +140,5 @@ COMMANDS: dict[str, tuple[Callable[..., None], str]] = {
     "tradeoff": (tradeoff.tradeoff, tradeoff.EXAMPLE),
     "compare": (compare.compare, compare.EXAMPLE),
 }
-CLASSES = {"gate": gate.GateCommand}
 for name, (function, text) in COMMANDS.items():
-    app.command(name, cls=CLASSES.get(name), epilog=example(text))(function)
+    app.command(name, epilog=example(text))(function)

@@ -8,8 +8,7 @@ Looked at, in this order:
 3. The INT8 file: the DPU's rules, its ReLUs, its encoding, the same bits with onnxruntime's optimisations as without.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -22,13 +21,13 @@ from deploy.dpu.checker.placement import place
 from deploy.dpu.checker.table import legality
 from deploy.dpu.reading import read_network
 from deploy.export import float_model
-from deploy.networks import Say, float_file, int8_file, shipped_pair, silent
+from deploy.networks import float_file, int8_file, shipped_pair
 from deploy.restoration.options import TILE_PX
 from deploy.results import Document
-from model.io.files import require_regular, require_writable, write_text
+from model.progress import Log, no_log
 from model.shipped import SENSOR, VARIANT
 from profiles import load_sensor, load_target
-from profiles.errors import BeersError, MachineError, OptionError, printable
+from profiles.errors import OptionError, printable
 from profiles.figures import Row
 from profiles.toml import read_json, unreadable
 from quant.checks import Check
@@ -133,7 +132,7 @@ def _unseen(request: Request, model: onnx.ModelProto) -> "tuple[Patches, bool]":
 
 
 def files_or_shipped(
-    float_path: Path | None, int8_path: Path | None, variant: str | None, sensor: str = SENSOR, say: Say = silent
+    float_path: Path | None, int8_path: Path | None, variant: str | None, sensor: str = SENSOR, log: Log = no_log
 ) -> tuple[Path, Path]:
     """The two files given, or a shipped network in both precisions where neither is, told the sensor.
 
@@ -143,7 +142,7 @@ def files_or_shipped(
         ProfileError: no such sensor.
     """
     if float_path is None:
-        return shipped_pair(variant or VARIANT, sensor, say)
+        return shipped_pair(variant or VARIANT, sensor, log)
     if int8_path is None:
         remedy = "give its INT8 file too, or none of both for a shipped pair"
         raise OptionError("INT8", expected=f"the INT8 network of {float_path.name}", got="none", remedy=remedy)
@@ -151,7 +150,7 @@ def files_or_shipped(
         expected, remedy = "it without files", "leave it out, or the files"
         raise OptionError("--variant", expected=expected, got=float_path.name, remedy=remedy)
     known = load_sensor(sensor)
-    return float_file(float_path, known, say), int8_file(int8_path, known, say)
+    return float_file(float_path, known, log), int8_file(int8_path, known, log)
 
 
 def baseline_mae(path: Path, arguments: Mapping[str, Any]) -> float:
@@ -210,108 +209,14 @@ def sentence(checks: Sequence[Check], passed: str) -> str:
     return f"FAILED, {len(failed)} of {len(checks)} checks: {'; '.join(failed)}"
 
 
-def markdown(title: str, checks: Sequence[Check]) -> str:
-    """The verdict as a table for a job's summary page."""
-    verdict = "passed" if all(check.passed for check in checks) else "FAILED"
-    lines = [f"## {title}: {verdict}", "", "| check | found | allowed | |", "|---|---|---|---|"]
-    for check in checks:
-        cells = check.name, check.found.replace("|", "\\|"), check.allowed, "ok" if check.passed else "**failed**"
-        lines.append(f"| {' | '.join(cells)} |")
-    return _escaped("\n".join(lines))
-
-
-def junit(title: str, checks: Sequence[Check]) -> str:
+def junit_text(title: str, checks: Sequence[Check]) -> str:
     """The verdict as JUnit XML: a test case a check."""
-    suite = _suite(title, tests=len(checks), failures=sum(not check.passed for check in checks))
+    failures = sum(not check.passed for check in checks)
+    counts = {"tests": str(len(checks)), "failures": str(failures), "errors": "0"}
+    suite = ET.Element("testsuite", name=printable(title), attrib=counts)
     for check in checks:
         case = ET.SubElement(suite, "testcase", classname=printable(title), name=check.name)
         if not check.passed:
             text = f"found {check.found}, allowed {check.allowed}"
             ET.SubElement(case, "failure", message=text).text = text
     return ET.tostring(suite, encoding="unicode") + "\n"
-
-
-def junit_error(title: str, error: BeersError) -> str:
-    """JUnit XML of what could not be judged: one test case, an error with the sentence that says why."""
-    suite = _suite(title, tests=1, errors=1)
-    case = ET.SubElement(suite, "testcase", classname=printable(title), name="input")
-    ET.SubElement(case, "error", message=str(error), type=type(error).__name__).text = str(error)
-    return ET.tostring(suite, encoding="unicode") + "\n"
-
-
-@dataclass(frozen=True)
-class Reports:
-    """The files in which a CI job wants a verdict; None for those that it does not want.
-
-    Attributes:
-        summary: Markdown, added to what other steps wrote there, as to $GITHUB_STEP_SUMMARY.
-        junit: JUnit XML, written anew.
-        outputs: lines NAME=VALUE, added to what stands there, as to $GITHUB_OUTPUT.
-    """
-
-    summary: Path | None
-    junit: Path | None
-    outputs: Path | None
-
-    def write(self, title: str, checks: Sequence[Check], figures: Mapping[str, float]) -> None:
-        """Write what is wanted; `figures` are the outputs beside the verdict.
-
-        Raises:
-            MachineError: a file cannot be written.
-        """
-        verdict = "passed" if all(check.passed for check in checks) else "failed"
-        _append(self.summary, f"\n{markdown(title, checks)}")
-        _append(self.outputs, "".join(f"{name}={value:.6g}\n" for name, value in figures.items()))
-        _append(self.outputs, f"verdict={verdict}\n")
-        if self.junit is not None:
-            write_text(self.junit, junit(title, checks))
-
-    @contextmanager
-    def of_bad_input(self, title: str) -> Iterator[None]:
-        """Tell bad input in these files too, then let it end the command.
-
-        Raises:
-            MachineError: a file cannot be written.
-        """
-        try:
-            require_writable(self.summary, self.junit, self.outputs)
-            yield
-        except BeersError as error:
-            self._tell(title, error)
-            raise
-
-    def _tell(self, title: str, error: BeersError) -> None:
-        """Each file by itself: one that cannot be written must hide neither what was wrong nor the others."""
-        with suppress(MachineError):
-            _append(self.summary, f"\n## {title}: not judged\n\n{_escaped(str(error))}")
-        with suppress(MachineError):
-            _append(self.outputs, "verdict=error\n")
-        if self.junit is not None:
-            with suppress(MachineError):
-                write_text(self.junit, junit_error(title, error))
-
-
-def _suite(title: str, **counts: int) -> ET.Element:
-    numbers = {"tests": 0, "failures": 0, "errors": 0, **counts}
-    return ET.Element(
-        "testsuite", name=printable(title), attrib={name: str(count) for name, count in numbers.items()}
-    )
-
-
-def _escaped(text: str) -> str:
-    """Markdown in which a name of another's file opens no tag."""
-    return text.replace("<", "&lt;") + "\n"
-
-
-def _append(path: Path | None, text: str) -> None:
-    """Add to what other steps of a job wrote."""
-    if path is None:
-        return
-    require_regular(path)
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with path.open("a", encoding="utf-8", newline="\n") as stream:
-            stream.write(text)
-    except OSError as error:
-        got, remedy = error.strerror or str(error), "choose another path"
-        raise MachineError(str(path), expected="a file to add to", got=got, remedy=remedy) from error

@@ -5,21 +5,18 @@ The pixels are those that the command `restore` writes of the same image.
 
 import warnings
 from dataclasses import dataclass
-from functools import lru_cache
 from importlib import import_module
 from pathlib import Path
-from threading import Lock
 from typing import Any, TypeVar
 
 import numpy as np
 
-from deploy.networks import network_file, silent
-from deploy.restoration.choice import settled
+from deploy.networks import network_file
 from deploy.restoration.engine import NAME, Restorer, checked_strip, restore_array
-from deploy.restoration.options import Options, Runtime
+from deploy.restoration.options import TILE_PX, Options, Runtime
 from deploy.restoration.plan import Plan, Span, plan_for
 from deploy.restoration.run import scale_of
-from deploy.restoration.runtime import Infer, Packed, open_packed, open_runtime, pack, tiles_at_once
+from deploy.restoration.runtime import Packed, open_packed, open_runtime, pack, tiles_at_once
 from deploy.restoration.source import ArraySource, Raster, require_numbers, usable_nodata
 from model.io.images import settled_scale
 from profiles.errors import ImageError, OptionError
@@ -35,7 +32,7 @@ def restore(
     image: Image,
     model: Path | str | None = None,
     *,
-    tile_px: int | None = None,
+    tile_px: int = TILE_PX,
     halo: int | str = "exact",
     full_scale: float | None = None,
     runtime: str = "onnxruntime",
@@ -52,13 +49,12 @@ def restore(
             computed on a cluster that has this package; an xarray.DataArray keeps coordinates and attributes.
         model: ONNX file, float or INT8, or the name of a shipped network, in INT8 with -int8 behind it;
             convbeers-s-int8 if None.
-        tile_px: longest side of a tile; 640 if None, or what `runtime` "auto" measures.
+        tile_px: longest side of a tile.
         halo: 'exact', or pixels of context around a tile.
         full_scale: the pixel value that is 1.0 to the network. None is 4095 (12 bits) for integers of more than 8
             bits and for floats of digital numbers; 8-bit pixels, and floats that all lie in about 0..1, are refused
             without it. Floats of Dask are judged tile by tile when they are computed.
-        runtime: 'onnxruntime', 'openvino', or 'auto' for what is measured to be fastest here and gives the pixels of
-            onnxruntime; not 'auto' for arrays of Dask.
+        runtime: 'onnxruntime' or 'openvino'.
         threads: of the runtime; 0 takes every core, or one for each of Dask's own threads.
         nodata: the value of missing pixels, besides NaN; a DataArray's own `_FillValue` if None.
         sensor: that a shipped network is told: a profile's name, a .toml file, or 'blind' where it is not
@@ -124,9 +120,8 @@ def _between(places: np.ndarray, count: int) -> np.ndarray | None:
 
 def _restore_now(bands: np.ndarray, raster: Raster, options: Options) -> np.ndarray:
     network, source = load_onnx(options.model), ArraySource(bands, raster)
-    options, _ = settled(network, raster.shape, options, silent)
     plan = plan_for(network, raster.shape, options)
-    at_once = options.lanes or tiles_at_once(options.threads, plan.tiles)
+    at_once = tiles_at_once(options.threads, plan.tiles)
     infer, _ = open_runtime(options.runtime, network, options.threads, at_once)
     full_scale = scale_of(source, plan, options, NAME).value
     restorer = Restorer(raster, infer, full_scale, plan.tiling, NAME)
@@ -157,10 +152,6 @@ def _runtime(name: str) -> Runtime:
         raise OptionError("runtime", expected=expected, got=repr(name), remedy="choose one") from error
 
 
-NETWORKS_KEPT = 2
-_opening = Lock()
-
-
 @dataclass(frozen=True)
 class Task:
     """What all tiles of a lazy array share: facts of the image and a network, as they are sent to Dask's workers."""
@@ -178,18 +169,13 @@ class Task:
         """
         largest = (self.raster.largest(part) for part in (window,))
         full_scale = settled_scale(NAME, self.raster.dtype, largest, self.full_scale)
-        with _opening:
-            infer = _kept(self.network)
-        return Restorer(self.raster, infer, full_scale, self.tiling, NAME)
+        return Restorer(self.raster, open_packed(self.network), full_scale, self.tiling, NAME)
 
 
 def restore_lazily(bands: Any, raster: Raster, options: Options) -> Any:
     """A lazy (bands, H, W) array of Dask; errors in options and model come at once, in pixels when it is computed."""
     da: Any = import_module("dask.array")
     delayed: Any = import_module("dask").delayed
-    if options.runtime is Runtime.auto:
-        got, remedy = "'auto'", "name one: its workers may have other processors"
-        raise OptionError("runtime", expected="onnxruntime or openvino for an array of Dask", got=got, remedy=remedy)
     network = load_onnx(options.model)
     plan = plan_for(network, raster.shape, options)
     settled_scale(NAME, raster.dtype, (), options.full_scale)  # what the type alone decides comes at once
@@ -224,8 +210,3 @@ def _around(span: Span, raster: Raster, plan: Plan) -> slice:
     """What a tile reads along one side: its window, and what missing pixels may be filled from."""
     margin_px = raster.fill_margin_px(plan.radius_px)
     return slice(max(span.start - margin_px, 0), span.stop + margin_px)
-
-
-@lru_cache(maxsize=NETWORKS_KEPT)
-def _kept(network: Packed) -> Infer:
-    return open_packed(network)[0]

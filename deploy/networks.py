@@ -5,24 +5,23 @@ and NAME-int8 in INT8, each told one sensor: its filters, written in millisecond
 is needed it lies in a folder of this process, which goes with it.
 """
 
-import os
+import hashlib
+import json
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import onnx
-import platformdirs
 
-from deploy.cache import digest_of
 from deploy.export import float_for
 from model.bank import REFERENCE, bank_of_vector, network_bank
 from model.family import RANGES, sensor_vector
 from model.io.files import sha256
 from model.io.tensors import is_conditioned, read_conditioned
-from model.progress import steps
+from model.progress import Log, no_log, progress
 from model.shipped import INT8, SENSOR, SHIPPED, VARIANT, shipped_names, shipped_weights
 from profiles.errors import ModelError
 from profiles.sensor import SensorProfile, numbers_of
@@ -38,27 +37,6 @@ WEIGHTS = "weights_sha256"
 
 SEED = 0
 """Of calibration, on drawn scenes: what `quantize` takes where nothing else is asked for."""
-
-CACHE_VARIABLE = "BEERS_DEPLOY_CACHE"
-
-Say = Callable[[str], None]
-"""Tells a sentence as the work goes on."""
-
-
-def silent(_: str) -> None:
-    """Tell nobody."""
-
-
-def once(say: Say) -> Say:
-    """Tells each sentence the first time alone: several networks of one sensor have the same to say."""
-    told = set[str]()
-
-    def tell(sentence: str) -> None:
-        if sentence not in told:
-            told.add(sentence)
-            say(sentence)
-
-    return tell
 
 
 @dataclass(frozen=True)
@@ -110,13 +88,13 @@ def _is_shipped(given: Path) -> bool:
     return named and not given.exists()
 
 
-def network_file(given: Path | None, sensor: SensorProfile, say: Say = silent) -> Path:
+def network_file(given: Path | None, sensor: SensorProfile, log: Log = no_log) -> Path:
     """The file of a network: the one given, or a conditioned network's for the sensor, INT8 where its name says so.
 
     Args:
         given: a file, or a shipped name where no such file lies; None is the default network in INT8.
         sensor: what a conditioned network is told: the middle of each of its ranges.
-        say: is told what of the sensor lies outside the range that was trained.
+        log: is told what of the sensor lies outside the range that was trained.
 
     Raises:
         ModelError: weights that cannot be read, or a name that is neither a file's nor a shipped network's.
@@ -125,30 +103,30 @@ def network_file(given: Path | None, sensor: SensorProfile, say: Say = silent) -
         expected = f"a file, or a shipped network ({', '.join(shipped_names())}, each also with {INT8})"
         raise ModelError(str(given), expected=expected, got="neither", remedy="correct the name, or the path")
     int8 = given is None or given.name.endswith(INT8)
-    return int8_file(given, sensor, say) if int8 else float_file(given, sensor, say)
+    return int8_file(given, sensor, log) if int8 else float_file(given, sensor, log)
 
 
-def float_file(given: Path | None, sensor: SensorProfile, say: Say = silent) -> Path:
+def float_file(given: Path | None, sensor: SensorProfile, log: Log = no_log) -> Path:
     """As `network_file`, a conditioned network always in float32.
 
     Raises:
         ModelError: weights that cannot be read.
     """
     found = conditioned(given)
-    return _written(found, sensor, False, say) if found else given or Path()
+    return _written(found, sensor, False, log) if found else given or Path()
 
 
-def int8_file(given: Path | None, sensor: SensorProfile, say: Say = silent) -> Path:
+def int8_file(given: Path | None, sensor: SensorProfile, log: Log = no_log) -> Path:
     """As `network_file`, a conditioned network always in INT8.
 
     Raises:
         ModelError: weights that cannot be read, or that are not calibrated yet.
     """
     found = conditioned(given)
-    return _written(found, sensor, True, say) if found else given or Path()
+    return _written(found, sensor, True, log) if found else given or Path()
 
 
-def shipped_pair(name: str = VARIANT, sensor: str = SENSOR, say: Say = silent) -> tuple[Path, Path]:
+def shipped_pair(name: str = VARIANT, sensor: str = SENSOR, log: Log = no_log) -> tuple[Path, Path]:
     """A shipped network in float32 and in INT8, told a sensor.
 
     Raises:
@@ -156,13 +134,13 @@ def shipped_pair(name: str = VARIANT, sensor: str = SENSOR, say: Say = silent) -
         ProfileError: no such sensor.
     """
     known, given = load_sensor(sensor), Path(shipped_weights(name).stem)
-    return float_file(given, known, say), int8_file(given, known, say)
+    return float_file(given, known, log), int8_file(given, known, log)
 
 
-def warn_outside(sensor: SensorProfile, say: Say) -> None:
+def warn_outside(sensor: SensorProfile, log: Log) -> None:
     """Tell what of a sensor lies outside the range that was trained."""
     for sentence in sensor_vector(sensor.nominal()).outside:
-        say(f"warning: {sentence}")
+        log(f"warning: {sentence}")
 
 
 def other_precision(model: onnx.ModelProto) -> onnx.ModelProto | None:
@@ -177,31 +155,25 @@ def other_precision(model: onnx.ModelProto) -> onnx.ModelProto | None:
     return load_onnx(find(Path(variant), load_sensor(SENSOR)))
 
 
-def cache_folder() -> Path:
-    """Where what was measured on this machine is kept: the user's cache, or what the environment names instead."""
-    own = os.environ.get(CACHE_VARIABLE)
-    return Path(own) if own else platformdirs.user_cache_path("beers-deploy")
-
-
 @cache
 def _folder() -> TemporaryDirectory[str]:
     """Where the files of this process lie."""
     return TemporaryDirectory(prefix="beers-deploy-", ignore_cleanup_errors=True)
 
 
-def _written(network: Conditioned, sensor: SensorProfile, int8: bool, say: Say) -> Path:
-    warn_outside(sensor, say)
+def _written(network: Conditioned, sensor: SensorProfile, int8: bool, log: Log) -> Path:
+    warn_outside(sensor, log)
     stem = network.name + (INT8 if int8 else "")
     known = re.sub(r"[^\w.-]+", "-", sensor.name)[:40]
-    digest = digest_of({"weights": sha256(network.weights), "sensor": numbers_of(sensor)})
-    path = Path(_folder().name) / f"{stem}-{known}-{digest[:12]}.onnx"
+    told = json.dumps([sha256(network.weights), numbers_of(sensor)], sort_keys=True, default=str)
+    path = Path(_folder().name) / f"{stem}-{known}-{hashlib.sha256(told.encode()).hexdigest()[:12]}.onnx"
     if not path.is_file():
         save_onnx(network.model(sensor, int8), path)
     return path
 
 
 def told_int8(
-    model: onnx.ModelProto, sensor: SensorProfile, more: Mapping[str, str] | None = None, say: Say = silent
+    model: onnx.ModelProto, sensor: SensorProfile, more: Mapping[str, str] | None = None, log: Log = no_log
 ) -> onnx.ModelProto:
     """An INT8 network behind a bank told another sensor: its filters, unit and head's bias written anew.
 
@@ -209,12 +181,12 @@ def told_int8(
         model: of whatever sensor.
         sensor: of which the middle is taken.
         more: metadata to add.
-        say: is told what of the sensor lies outside the range that was trained.
+        log: is told what of the sensor lies outside the range that was trained.
 
     Raises:
         ModelError: no such file.
     """
-    warn_outside(sensor, say)
+    warn_outside(sensor, log)
     known = sensor.nominal()
     core = required_family(model).for_sensor(network_bank(known), sensor_vector(known).values)
     return host_model(core, {**metadata(model), "sensor": sensor.name, **(more or {})}, fixed_tile_px(model))
@@ -252,12 +224,12 @@ def family_model(
         ModelError: other weights.
     """
     from model.simulator.procedural import load_scenes  # torch, which a restoration does not need
-    from quant.banked.calibrate import family_images, family_ticks, quantise_family
+    from quant.banked.calibrate import family_images, quantise_family
 
     weights = read_conditioned(network.weights)
     scenes, scale = load_scenes(images, load_sensor(REFERENCE).nominal(), seed), weights.variant.scale
-    with steps(f"calibrating {network.name} over the family of sensors", family_ticks(weights)) as bar:
+    with progress(f"calibrating {network.name} over the family of sensors") as log:
         seen, middle = family_images(scenes, scale, seed), bank_of_vector((0.0,) * len(RANGES))
-        family = quantise_family(weights, middle, seen, bar.advance, shifts)
+        family = quantise_family(weights, middle, seen, shifts, log)
     said = {"variant": network.name, "reference": REFERENCE, "precision": "int8 legal", "calibration_seed": str(seed)}
     return host_model(family.core, {**said, FAMILY: family.to_words(), WEIGHTS: sha256(network.weights)})

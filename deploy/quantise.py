@@ -1,11 +1,9 @@
 """One float network quantised: the files, the tables and the report that the command `quantize` leaves.
 
-Layer by layer in whole numbers, what each pass buys on patches that it has not seen, and which layers and patches
-err.
+Layer by layer in whole numbers, and which layers and patches err.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 
 import onnx
@@ -13,61 +11,49 @@ import onnx
 from deploy.networks import Conditioned, family_model, told_int8
 from deploy.report.page import Report, write_report
 from deploy.report.sensitivity_page import sensitivity_page
-from model.progress import steps
+from model.progress import Log, progress
 from profiles import load_sensor
 from profiles.errors import OptionError
 from profiles.figures import Row
 from profiles.target import TargetProfile, board_names
 from quant.calibration import Calibration, Patches
-from quant.core import Shifts, target_shifts
+from quant.core import IntCore, Shifts, target_shifts
 from quant.encodings import board_model, read_core
-from quant.free import free_ticks, quantise_free
+from quant.free import quantise_free
 from quant.gate import compare, gate_row
 from quant.integer import integer_rows
 from quant.onnx_file import metadata, save_onnx
 from quant.passes.tune import Tuning
-from quant.quantise import Passes, Quantised, ablation_rows, ablations, quantise_model, ticks
+from quant.quantise import Quantised, quantise_model
 from quant.samples import OwnSamples
 from quant.sensitivity import WORST, headline, layer_error_rows, sizes_row, spread_of, worst_row
-from quant.session import LAYER_PATCHES, open_any_size
+from quant.session import open_any_size
 
 
 def sensitivity_report(
-    model: onnx.ModelProto, result: Quantised, held_out: Patches, more: list[Row], tick: Callable[[], None]
+    model: onnx.ModelProto, result: Quantised, held_out: Patches, more: list[Row]
 ) -> tuple[list[Row], Report]:
     """Where INT8 errs on patches that calibration did not see: the rows, and the page with those of `more` after."""
     sessions = open_any_size(model), open_any_size(result.host)
     gate, spread = compare(*sessions, held_out.pairs), spread_of(*sessions, held_out.degraded)
     worst = spread.worst(WORST)
-    layers = layer_error_rows(result, held_out, tick)
+    layers = layer_error_rows(result, held_out)
     rows = [gate_row(gate), *layers, *(worst_row(k, held_out, spread) for k in worst), sizes_row(spread)]
     return rows, sensitivity_page(headline(gate, layers), [*rows, *more], spread, held_out, sessions, worst)
 
 
 Source = Calibration | OwnSamples
 """Where patches come from: simulated ones, or a user's own."""
-Say = Callable[[str], None]
-"""Tells a sentence as the work goes on."""
 Show = Callable[[str, list[Row]], None]
 """Shows a table under its title as soon as it is made."""
 
 
-@dataclass(frozen=True)
-class Wanted:
-    """What a run is to write and to show besides the INT8 file, and for how many steps to train its numbers."""
-
-    board: Path | None
-    ablate: bool
-    page: Path | None
-    finetune: int = 0
-
-
-def quantise_free_file(model: onnx.ModelProto, calibration: Source, out: Path, say: Say, show: Show) -> list[Row]:
+def quantise_free_file(model: onnx.ModelProto, calibration: Source, out: Path, log: Log, show: Show) -> list[Row]:
     """Write the INT8 file without the DPU's rules, and compare it with the float network."""
-    with steps("calibrating", free_ticks(model, calibration.patches)) as bar:
-        made = quantise_free(model, calibration.drawn, calibration.about, bar.advance)
+    with progress("calibrating") as step:
+        made = quantise_free(model, calibration.drawn, calibration.about, step)
     save_onnx(made, out)
-    say(f"wrote {out}: float scales, for boards that are not the DPU")
+    log(f"wrote {out}: float scales, for boards that are not the DPU")
     sessions, simulated = (open_any_size(model), open_any_size(made)), isinstance(calibration, Calibration)
     row = gate_row(compare(*sessions, calibration.unseen.pairs, simulated))
     show("float against INT8, on patches that calibration did not see", [row])
@@ -78,33 +64,42 @@ def quantise_legal_file(
     model: onnx.ModelProto,
     calibration: Source,
     target: TargetProfile,
-    passes: Passes,
     out: Path,
-    wanted: Wanted,
-    say: Say,
+    log: Log,
     show: Show,
+    *,
+    board: Path | None = None,
+    page: Path | None = None,
+    finetune: int = 0,
 ) -> list[Row]:
-    """Write the INT8 file under the target's rules and whatever else is wanted; show each integer layer.
+    """Write the INT8 file under the target's rules; show each integer layer.
+
+    Args:
+        model: the float network.
+        calibration: where its patches come from.
+        target: whose rules to obey.
+        out: the host's file.
+        log: is told what was written.
+        show: shows the tables.
+        board: the board's file, or None.
+        page: of the errors of layers and patches, or None.
+        finetune: for how many steps the whole numbers are trained.
 
     Raises:
         OptionError: a target without a DPU.
     """
     shifts = _shifts_of(target)
-    tuning = Tuning(calibration.for_tuning.pairs, wanted.finetune) if wanted.finetune else None
-    with steps("calibrating", ticks(model, calibration.patches, passes) + wanted.finetune) as bar:
+    tuning = Tuning(calibration.for_tuning.pairs, finetune) if finetune else None
+    with progress("calibrating") as step:
         about = {**calibration.about, "target": target.name}
-        result = quantise_model(model, calibration.drawn, about, bar.advance, passes, shifts, tuning)
+        result = quantise_model(model, calibration.drawn, about, shifts, tuning, log=step)
     save_onnx(result.host, out)
-    say(f"wrote {out}: {len(result.core.ops)} integer operations, {result.relus} ReLUs kept")
-    if wanted.board is not None:
-        save_onnx(result.board, wanted.board)
-        say(f"wrote {wanted.board}: the same numbers in the board's encoding")
-    images = calibration.drawn.degraded
-    layers, rounding = integer_rows(model, result.core, result.host, images)
-    show("integer layers", layers)
-    show("tie rounding", [rounding])
-    rows = [*layers, rounding, *(_ablated(model, calibration, shifts, show) if wanted.ablate else [])]
-    return _with_sensitivity(model, result, calibration, rows, wanted.page, say) if wanted.page else rows
+    log(f"wrote {out}: {len(result.core.ops)} integer operations, {result.relus} ReLUs kept")
+    if board is not None:
+        save_onnx(result.board, board)
+        log(f"wrote {board}: the same numbers in the board's encoding")
+    rows = _layers(model, result.core, result.host, calibration.drawn, show)
+    return _with_sensitivity(model, result, calibration, rows, page, log) if page else rows
 
 
 def quantise_banked_file(
@@ -113,7 +108,7 @@ def quantise_banked_file(
     target: TargetProfile,
     out: Path,
     board: Path | None,
-    say: Say,
+    log: Log,
     show: Show,
 ) -> list[Row]:
     """Write the INT8 file of a network behind a bank, told a sensor; show each integer layer on its patches.
@@ -124,7 +119,7 @@ def quantise_banked_file(
         target: whose rules to obey.
         out: the host's file.
         board: the board's, or None.
-        say: tells what was written.
+        log: is told what was written.
         show: shows the tables.
 
     Raises:
@@ -133,15 +128,19 @@ def quantise_banked_file(
     """
     sensor, made = load_sensor(calibration.sensor), {"target": target.name}
     family = family_model(network, calibration.images, calibration.seed, _shifts_of(target))
-    host = told_int8(family, sensor, made, say)
+    host = told_int8(family, sensor, made, log)
     core = read_core(host)
     save_onnx(host, out)
-    say(f"wrote {out}: {len(core.ops)} integer operations, for {sensor.name}; any sensor in range can be told to it")
+    log(f"wrote {out}: {len(core.ops)} integer operations, for {sensor.name}; any sensor in range can be told to it")
     if board is not None:
         save_onnx(board_model(core, metadata(host)), board)
-        say(f"wrote {board}: the same numbers in the board's encoding")
-    model, patches = network.model(sensor, int8=False), calibration.drawn.degraded
-    layers, rounding = integer_rows(model, core, host, patches)
+        log(f"wrote {board}: the same numbers in the board's encoding")
+    return _layers(network.model(sensor, int8=False), core, host, calibration.drawn, show)
+
+
+def _layers(model: onnx.ModelProto, core: IntCore, host: onnx.ModelProto, patches: Patches, show: Show) -> list[Row]:
+    """Each integer layer, and what rounding ties up or to even makes of the result: shown, and returned."""
+    layers, rounding = integer_rows(model, core, host, patches.degraded)
     show("integer layers", layers)
     show("tie rounding", [rounding])
     return [*layers, rounding]
@@ -155,18 +154,10 @@ def _shifts_of(target: TargetProfile) -> Shifts:
     return target_shifts(target)
 
 
-def _ablated(model: onnx.ModelProto, calibration: Source, shifts: Shifts, show: Show) -> list[Row]:
-    with steps("ablating", len(ablations())) as bar:
-        rows = ablation_rows(model, calibration.drawn, calibration.unseen, bar.advance, shifts)
-    show("what each pass buys, on patches that calibration did not see", rows)
-    return rows
-
-
 def _with_sensitivity(
-    model: onnx.ModelProto, result: Quantised, calibration: Source, rows: list[Row], page: Path, say: Say
+    model: onnx.ModelProto, result: Quantised, calibration: Source, rows: list[Row], page: Path, log: Log
 ) -> list[Row]:
-    with steps("attributing errors", LAYER_PATCHES) as bar:
-        found, written = sensitivity_report(model, result, calibration.unseen, rows, bar.advance)
+    found, written = sensitivity_report(model, result, calibration.unseen, rows)
     write_report(written, page)
-    say(f"wrote {page}: {written.headline}")
+    log(f"wrote {page}: {written.headline}")
     return [*found, *rows]

@@ -1,19 +1,22 @@
 """Datasets of simulated pairs: 12-bit TIFF patches and a manifest, in parallel, resumable, the same bytes always.
 
-A patch's pixels depend on the recipe and its number alone, not on who makes it: processes here, or a cluster's.
+A patch's pixels depend on the recipe and its number alone, not on the process that makes it.
 """
 
 import json
 import multiprocessing
 import shutil
 import sys
-from collections.abc import Callable, Iterator
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from collections import deque
+from collections.abc import Callable, Generator, Iterator
+from concurrent.futures import Executor, Future, ProcessPoolExecutor
+from contextlib import ExitStack, closing
 from dataclasses import asdict, dataclass, replace
 from itertools import groupby
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
+import numpy as np
 import torch
 
 from model.io.files import sha256, whole_file, write_text
@@ -118,34 +121,43 @@ def load(recipe: DatasetRecipe, index: int) -> Scene:
     return Scene(scene.name, radiance)
 
 
-def make_patches(recipe: DatasetRecipe, windows: list[Window], out: Path) -> list[Line]:
-    """Simulate and write some patches of one scene; returns their lines of the manifest."""
+class Patch(NamedTuple):
+    """A pair of images (H, W) uint16, and its line of the manifest."""
+
+    degraded: np.ndarray
+    reference: np.ndarray
+    line: Line
+
+
+def make_patches(recipe: DatasetRecipe, windows: list[Window]) -> list[Patch]:
+    """Simulate some patches of one scene, with one thread.
+
+    Raises:
+        ImageError: no such scene where this runs.
+    """
     torch.set_num_threads(1)
     radiance = load(recipe, windows[0].scene).radiance
-    return [_make_patch(recipe, window, radiance, out) for window in windows]
+    return [_make_patch(recipe, window, radiance) for window in windows]
 
 
-def _make_patch(recipe: DatasetRecipe, window: Window, radiance: torch.Tensor, out: Path) -> Line:
+def _make_patch(recipe: DatasetRecipe, window: Window, radiance: torch.Tensor) -> Patch:
     bottom, right = window.top + window.height, window.left + window.width
     part = prepare_scene(radiance[window.top : bottom, window.left : right], recipe.oversampling)
     draw = Draw(recipe.seed, window.number)
     line: Line = {"number": window.number, "name": window.name, "seed": recipe.seed}
     line |= {"source": window.name.split("-", 1)[1], "top_px": window.top, "left_px": window.left}
+    images = []
     for role, profile in (("degraded", recipe.degraded), ("reference", recipe.reference)):
         sensor, rejected = profile.draw_counted(draw.generator(f"sensor-{role}"))
         plan = make_plan(sensor, part.stats, recipe.tolerance_dn)
-        dn = simulate_planned(part, sensor, draw, plan, role)
-        write_tiff(out / role / f"{window.name}.tif", to_uint16(dn))
+        images.append(to_uint16(simulate_planned(part, sensor, draw, plan, role)))
         drawn = asdict(replace(sensor, response=None))  # a response is the same for all: the recipe keeps it
         line[role] = {"sensor": drawn, "rejected_snr_pairs": rejected, "plan": plan.to_json()}
-    return line
+    return Patch(images[0], images[1], line)
 
-
-Make = Callable[[DatasetRecipe, dict[Path, list[Window]], Path], Iterator[tuple[Path, list[Line]]]]
-"""Makes and writes the patches of each part into a folder; yields the part's path and its lines."""
 
 CHUNK = 32
-"""Patches a worker makes before it reports: short enough to lose little to a kill."""
+"""Patches of one call: few enough to lose little to a kill."""
 MOST_PROCESSES = 61 if sys.platform == "win32" else 1 << 16
 """Windows waits for no more at once, and Python refuses a larger pool."""
 
@@ -156,24 +168,24 @@ def write_dataset(
     workers: int,
     resume: bool,
     tick: Callable[[int], None],
-    make: Make | None = None,
+    pool: Executor | None = None,
 ) -> dict[str, float]:
     """Write a dataset of 12-bit TIFF patches and its manifest.
 
     Args:
         recipe: what decides the pixels.
         out: the dataset's folder.
-        workers: processes that make patches here.
+        workers: processes here that make patches, or calls that the pool runs at once.
         resume: whether to go on with a dataset that the folder holds in part.
         tick: is told how many further patches are done.
-        make: makes them elsewhere instead, as the workers of a cluster do.
+        pool: makes them instead of processes here; only this process writes.
 
     Returns:
         patches, and the share of drawn SNR pairs that were impossible and drawn again.
 
     Raises:
         OptionError: the folder holds another dataset, or this one without `resume`.
-        MachineError: the cluster fails.
+        ImageError: a scene that cannot be read.
     """
     _check_folder(recipe, out, resume)
     if (out / "manifest.jsonl").exists():  # nothing was left to do
@@ -186,10 +198,15 @@ def write_dataset(
     parts = {out / "parts" / f"{chunk[0].number:08d}.jsonl": chunk for chunk in chunks}
     tick(sum(len(chunk) for path, chunk in parts.items() if path.exists()))
     waiting = {path: chunk for path, chunk in parts.items() if not path.exists()}
-    made = make(recipe, waiting, out) if make else _run(recipe, waiting, out, workers)
-    for path, lines in made:
-        write_text(path, "".join(json.dumps(line, sort_keys=True) + "\n" for line in lines))
-        tick(len(lines))
+    with ExitStack() as stack:
+        if pool is None and workers > 1 and len(waiting) > 1:
+            pool = stack.enter_context(_processes(workers))
+        for path, patches in stack.enter_context(closing(_made(recipe, waiting, workers, pool))):
+            for patch in patches:
+                for role, dn in (("degraded", patch.degraded), ("reference", patch.reference)):
+                    write_tiff(out / role / f"{patch.line['name']}.tif", dn)
+            write_text(path, "".join(json.dumps(patch.line, sort_keys=True) + "\n" for patch in patches))
+            tick(len(patches))
     with whole_file(out / "manifest.jsonl") as manifest:
         manifest.write_bytes(b"".join(path.read_bytes() for path in parts))
         summary = _read_summary(manifest)
@@ -197,22 +214,31 @@ def write_dataset(
     return summary
 
 
-def _run(
-    recipe: DatasetRecipe, waiting: dict[Path, list[Window]], out: Path, workers: int
-) -> Iterator[tuple[Path, list[Line]]]:
-    if workers == 1 or len(waiting) < 2:
-        for path, chunk in waiting.items():
-            yield path, make_patches(recipe, chunk, out)
-        return
+def _processes(workers: int) -> ProcessPoolExecutor:
     # spawn: a forked copy of torch's thread pools can hang
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(min(workers, MOST_PROCESSES), mp_context=context) as pool:
-        jobs = {pool.submit(make_patches, recipe, chunk, out): path for path, chunk in waiting.items()}
-        try:
-            for job in as_completed(jobs):
-                yield jobs[job], job.result()
-        finally:
-            pool.shutdown(cancel_futures=True)
+    return ProcessPoolExecutor(min(workers, MOST_PROCESSES), mp_context=multiprocessing.get_context("spawn"))
+
+
+def _made(
+    recipe: DatasetRecipe, waiting: dict[Path, list[Window]], workers: int, pool: Executor | None
+) -> Generator[tuple[Path, list[Patch]], None, None]:
+    """The patches of each part, in order; two calls for each worker are under way."""
+    if pool is None:
+        for path, chunk in waiting.items():
+            yield path, make_patches(recipe, chunk)
+        return
+    calls: deque[tuple[Path, Future[list[Patch]]]] = deque()
+    try:
+        for path, chunk in waiting.items():
+            calls.append((path, pool.submit(make_patches, recipe, chunk)))
+            if len(calls) > 2 * workers:
+                path, call = calls.popleft()
+                yield path, call.result()
+        for path, call in calls:
+            yield path, call.result()
+    finally:
+        for _, call in calls:
+            call.cancel()
 
 
 def _check_folder(recipe: DatasetRecipe, out: Path, resume: bool) -> None:

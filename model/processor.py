@@ -9,7 +9,6 @@ import os
 import platform
 import subprocess
 import sys
-import time
 from collections.abc import Callable
 from functools import lru_cache
 from pathlib import Path
@@ -25,9 +24,6 @@ ACTIVATION, WEIGHT = 255, 127
 """Two neighbouring products of these make 64 770: twice what int16 holds."""
 RESULT = 200
 """What the sum of a whole window becomes in 8 bits."""
-
-FEWEST_ROUNDS, ASKING_S = 3, 0.1
-"""Of a timed question: its first round sets up, and others may meet a busy machine."""
 
 _decided: dict[str, str] = {}
 
@@ -89,36 +85,6 @@ def _largest_convolution() -> bytes:
     graph = helper.make_graph([node], "largest", ends[:1], ends[1:], constants)
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
     return bytes(model.SerializeToString())
-
-
-@lru_cache(maxsize=1)
-def bfloat16_speed() -> float:
-    """How many times as fast as float32 torch's convolutions are in bfloat16 here, forward and backward.
-
-    Above 1 where the processor has units for bfloat16; where they are emulated, about 0.1.
-    """
-    import torch
-
-    convolution = torch.nn.Conv2d(32, 32, 3, padding=1).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-    images = torch.ones(4, 32, 48, 48).to(memory_format=torch.channels_last).requires_grad_()
-
-    def time_s(in_bfloat16: bool) -> float:
-        begun = time.perf_counter()
-        with torch.autocast("cpu", dtype=torch.bfloat16, enabled=in_bfloat16):
-            result = convolution(images)
-        result.float().sum().backward()
-        return time.perf_counter() - begun
-
-    threads, begun, rounds = torch.get_num_threads(), time.perf_counter(), list[tuple[float, float]]()
-    torch.set_num_threads(1)  # threads that wait for a core which others use would be timed instead
-    try:  # interleaved, so that what else the machine does falls on both
-        while len(rounds) < FEWEST_ROUNDS or time.perf_counter() - begun < ASKING_S:
-            rounds.append((time_s(in_bfloat16=False), time_s(in_bfloat16=True)))
-    finally:
-        torch.set_num_threads(threads)
-    ratio = min(float32_s for float32_s, _ in rounds) / min(bfloat16_s for _, bfloat16_s in rounds)
-    _decided["bfloat16"] = f"convolutions at {ratio:.2g} times the speed of float32"
-    return ratio
 
 
 COMM, CPUINFO = Path("/proc/self/comm"), Path("/proc/cpuinfo")

@@ -1,6 +1,7 @@
 """Long work: its progress is shown, and Ctrl-C waits for a good moment.
 
-Progress is a rich bar on a terminal, plain lines elsewhere, always on standard error. An interrupt arrives between
+`steps` is a bar for work whose length is known, `progress` names one step after the other where it is not. On a
+terminal both are rich's, elsewhere plain lines, always on standard error. An interrupt arrives between
 two steps, never within one: a half-made update cannot be resumed.
 """
 
@@ -8,14 +9,41 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import FrameType
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    SpinnerColumn,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
+
+Log = Callable[[str], None]
+"""Is told a sentence, or the name of a step, as the work goes on."""
 
 LINE_EVERY_S = 5.0
+
+
+def no_log(_: str) -> None:
+    """Tell nobody."""
+
+
+def once(log: Log) -> Log:
+    """Tells each sentence the first time alone: several networks of one sensor have the same to say."""
+    told = set[str]()
+
+    def tell(sentence: str) -> None:
+        if sentence not in told:
+            told.add(sentence)
+            log(sentence)
+
+    return tell
 
 
 class Steps:
@@ -45,6 +73,22 @@ def steps(label: str, total: int) -> Iterator[Steps]:
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
         yield Steps(label, total, bar)
+
+
+@contextmanager
+def progress(label: str) -> Iterator[Log]:
+    """Show the name of each step that is begun while the block runs, and on a terminal the time since it began."""
+    if not sys.stderr.isatty():
+
+        def line(step: str) -> None:
+            sys.stderr.write(f"{label}: {step}\n")
+
+        yield line
+        return
+    columns = (SpinnerColumn(), TextColumn("{task.description}"), TimeElapsedColumn())
+    with Progress(*columns, console=Console(stderr=True), transient=True) as shown:
+        task = shown.add_task(label, total=None)
+        yield lambda step: shown.update(task, description=f"{label}: {step}")
 
 
 class Interrupt:

@@ -6,7 +6,7 @@ for onnxruntime, the board's for its own flow
 - `quantise` does it in one call; `free` goes without the DPU's rules;
 - `session` runs networks on onnxruntime, `kernels` in ways that add exactly on this processor;
 - `integer` is the core's arithmetic in whole numbers, `bounds` proves what holds for any input;
-- `gate`, `structure` and `checks` judge an INT8 file, `sensitivity` says which layers err, `faults` flips bits;
+- `gate`, `structure` and `checks` judge an INT8 file, `sensitivity` says which layers err;
 - `tiling` says how an image may be cut for a network: lattice, halo and scale; `samples` are a user's own;
 - `reading` folds what exporters leave in a float file, `untrusted` looks at files before they are used.
 

@@ -13,7 +13,6 @@ from .gate import compare as compare
 from .gate import judge as judge
 from .onnx_file import load_onnx as load_onnx
 from .onnx_file import save_onnx as save_onnx
-from .quantise import Passes as Passes
 from .quantise import Quantised as Quantised
 from .quantise import quantise_model as quantise_model
 from .session import open_session as open_session

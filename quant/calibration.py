@@ -263,20 +263,13 @@ def _simulate(ground: Ground, sensors: dict[str, Sensor], draw: Draw) -> list[np
     return [np.ascontiguousarray(image[None]) for image in turned.numpy()]
 
 
-def choose_frac_bits(
-    graph: Graph,
-    images: Iterable[np.ndarray],
-    tick: Callable[[], None],
-    least_squares: bool = True,
-    ends: Ends = ONE_CHANNEL,
-) -> dict[str, int]:
+def choose_frac_bits(graph: Graph, images: Iterable[np.ndarray], ends: Ends = ONE_CHANNEL) -> dict[str, int]:
     """Least-squares scale of every tensor of a plane-reading graph over images (1, C, H, W) in [0, 1].
 
     Tensors that must share a scale (`quant.graph.tied`) get that of least error in all of them together.
 
     Two passes, so images that can be passed over twice: the largest values, then the squared errors of the scales
-    around them. `tick` is called once per
-    image and pass. Without `least_squares` the scales are those that clip nothing.
+    around them.
     """
     names, halo_px = tensors(graph), halo_of(graph)
     session = open_session(graph_to_onnx(graph, names, ends.planes * ends.channels))
@@ -286,7 +279,6 @@ def choose_frac_bits(
     def values() -> Iterator[list[np.ndarray]]:
         for image in images:
             yield from tensor_values(session, names, image, halo_px, ends)
-            tick()
 
     def together(of_each: np.ndarray, join: Callable[..., np.ndarray]) -> np.ndarray:
         return np.stack([join(of_each[groups == group], axis=0) for group in groups])
@@ -298,7 +290,7 @@ def choose_frac_bits(
     errors = np.zeros((len(names), CANDIDATES))
     for results in values():
         errors += [_errors(r[0], f) for r, f in zip(results, first, strict=True)]
-    moves = np.argmin(together(errors, np.sum), axis=1) if least_squares else np.zeros(len(names), int)
+    moves = np.argmin(together(errors, np.sum), axis=1)
     best = {name: f + int(move) for name, f, move in zip(names, first, moves, strict=True)}
     return {PLANES: PLANES_FRAC_BITS, **best}
 

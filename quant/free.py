@@ -4,12 +4,13 @@ Activations uint8 with float scales, weights int8 with a scale of each output ch
 written with the host file's integer kernels. What stays is the residual stream of 8 bits.
 """
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
 import onnx
 
+from model.progress import Log, no_log
 from quant.calibration import Patches
 from quant.core import INT8_MAX
 from quant.encodings import MICROSOFT
@@ -23,17 +24,16 @@ from quant.graph import (
     Add,
     Conv,
     Graph,
-    correction_graph,
     graph_to_onnx,
     plain_network,
     read_planes,
     tensors,
 )
 from quant.onnx_file import fixed_tile_px, image_info, make_model, metadata
-from quant.passes.equalise import Costs, channel_ranges, equalise, search, search_steps
+from quant.passes.equalise import Costs, channel_ranges, equalise, search
 from quant.passes.fit_weights import Moments, fit, input_moments
-from quant.passes.stream import STREAM_FRAC_BITS, half_lsb_pair, streams, two_gains
-from quant.quantise import Targets, crop_costs, search_targets
+from quant.passes.stream import half_lsb_pair, streams, two_gains
+from quant.quantise import STREAM_STEP, Targets, crop_costs, search_targets
 from quant.session import halo_of, open_session, tensor_values
 
 BINS = 4096
@@ -55,7 +55,6 @@ def tensor_scales(
     graph: Graph,
     levels: Mapping[str, int],
     images: Iterable[np.ndarray],
-    tick: Callable[[], None],
     ends: Ends = ONE_CHANNEL,
 ) -> dict[str, float]:
     """The least-squares scale of each named tensor of a plane-reading graph.
@@ -64,7 +63,6 @@ def tensor_scales(
         graph: that reads the planes.
         levels: names, and the largest whole number that the size of a value may take: 255, or 127 beside a sign.
         images: (1, 1, H, W) float32 in [0, 1], passed over twice; one is in memory at a time.
-        tick: called once per image and pass.
         ends: of the network.
     """
     names, halo_px = list(levels), halo_of(graph)
@@ -74,7 +72,6 @@ def tensor_scales(
         for image in images:
             for results in tensor_values(session, names, image, halo_px, ends):
                 yield [np.abs(r) for r in results]
-            tick()
 
     largest = np.zeros(len(names))
     for results in sizes():
@@ -192,13 +189,12 @@ def _scale(w: HostWriter, scale: Scale) -> list[str]:
 
 
 UINT8_MAX = 255
-STREAM_STEP = 2.0**-STREAM_FRAC_BITS
 FINER = 2
 """The fine gain's unit is so much finer than what suits all corrections: the coarse one is there for the large."""
 
 
 def quantise_free(
-    model: onnx.ModelProto, patches: Patches, about: dict[str, str], tick: Callable[[], None]
+    model: onnx.ModelProto, patches: Patches, about: dict[str, str], log: Log = no_log
 ) -> onnx.ModelProto:
     """Quantise a float ConvBEERS to uint8 activations and int8 weights, with float scales, of weights per channel.
 
@@ -210,37 +206,30 @@ def quantise_free(
     """
     network = plain_network(model)
     graph, ends = read_planes(network.graph), ends_of(network)
-    scales = _scales(graph, patches, tick, ends)
+    log("scale of each tensor")
+    scales = _scales(graph, patches, ends)
     for stream in streams(graph):
-        ranges = channel_ranges(graph, stream, patches.degraded, tick, ends)
+        log("equalising the channels of the residual stream")
+        ranges = channel_ranges(graph, stream, patches.degraded, ends)
         targets = search_targets(graph, ends, patches.degraded)
 
         def trial(tried: Graph, targets: Targets = targets) -> Costs:
             return crop_costs(_written(tried, scales, {}, ends), targets)
 
-        factors = search(graph, stream, ranges, trial, tick)
+        factors = search(graph, stream, ranges, trial)
         graph = equalise(graph, stream, factors)
     about = {**metadata(model), "precision": "int8 free", "calibration_sha256": patches.digest, **about}
-    moments = input_moments(_fine(graph), patches.degraded, tick, ends)
+    log("rounding of the weights")
+    moments = input_moments(_fine(graph), patches.degraded, ends)
     return _written(graph, scales, about, ends, fixed_tile_px(model), moments)
 
 
-def free_ticks(model: onnx.ModelProto, patches: int) -> int:
-    """How often `quantise_free` will call `tick`."""
-    graph = read_planes(correction_graph(model))
-    if not streams(graph):
-        return 3 * patches
-    first = graph[0]
-    assert isinstance(first, Conv)  # noqa: S101 - correction_graph has seen to it
-    return 4 * patches + search_steps(len(first.weight))
-
-
-def _scales(graph: Graph, patches: Patches, tick: Callable[[], None], ends: Ends) -> dict[str, Scale]:
+def _scales(graph: Graph, patches: Patches, ends: Ends) -> dict[str, Scale]:
     """Least-squares scales of what is not the stream; that has any, because `equalise` scales its channels to it."""
     in_streams = {name for stream in streams(graph) for name in stream}
     convs = [op for op in graph if isinstance(op, Conv) and op.output not in in_streams]
     levels = {op.output: UINT8_MAX if (op.activation is Activation.relu) else INT8_MAX for op in convs}
-    units = tensor_scales(graph, levels, patches.degraded, tick, ends)
+    units = tensor_scales(graph, levels, patches.degraded, ends)
     units[CORRECTION] /= FINER
     found = {
         op.output: Scale(units[op.output], 0) if (op.activation is Activation.relu) else Scale(units[op.output])

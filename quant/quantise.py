@@ -1,26 +1,23 @@
 """Static INT8 in one call: float ONNX and calibration patches in, the two encodings of the integer core out."""
 
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import onnx
 
-from profiles.errors import OptionError
-from profiles.figures import Row
+from model.progress import Log, no_log
 from quant.calibration import Patches, Remade, choose_frac_bits
 from quant.core import SHIFTS, IntCore, Shifts, build_core
 from quant.encodings import board_model, host_model
 from quant.ends import GAIN, Ends, ends_of
-from quant.gate import compare, gate_row
 from quant.graph import (
     CORRECTION,
     PLANES,
     Graph,
     channels_of,
-    coarse_plane_only,
     graph_to_onnx,
     read_network,
     read_planes,
@@ -37,7 +34,6 @@ from quant.passes.equalise import (
     equalise,
     first_guess,
     search,
-    search_steps,
     with_room,
 )
 from quant.passes.fit_weights import fit_weights, input_moments
@@ -46,7 +42,6 @@ from quant.passes.stream import (
     MAX_CHANNELS,
     STREAM_FRAC_BITS,
     Stream,
-    common_frac_bits,
     half_lsb_pair,
     lone_tensors,
     share_stream_scale,
@@ -57,31 +52,22 @@ from quant.passes.stream import (
     windowed,
 )
 from quant.passes.tune import Tuning, tune
-from quant.session import TILE_PX, crops, halo_of, open_any_size, open_session, result_of, tensor_values
+from quant.session import TILE_PX, crops, halo_of, open_session, result_of, tensor_values
 
 SEARCH_CROPS = 16
 """What the equalisation is searched on, a quarter of them with the strongest edges: there int8 clips."""
 MOST_CROPS = 64
 
 
+STREAM_STEP = 2.0**-STREAM_FRAC_BITS
+"""The value of one unit of the streams' tensors."""
+
 FINER = GAIN.bit_length() - 1
 """Fractional bits by which a window is finer than the result's own scale."""
 
 
-@dataclass(frozen=True)
-class Passes:
-    """What is done beyond rounding each tensor: see `quant.passes`, `quant.graph` and `quant.core`."""
-
-    fine_planes: bool = True
-    least_squares: bool = True
-    shared_residual_scale: bool = True
-    equalise: bool = True
-    half_lsb_pair: bool = True
-    fit_weights: bool = True
-    dual_gain: bool = True
-
-
-ALL = Passes()
+PASSES = "fine_planes, least_squares, shared_residual_scale, equalise, half_lsb_pair, fit_weights, dual_gain"
+"""What a file says was done beyond rounding each tensor: see `quant.passes`, `quant.graph` and `quant.core`."""
 
 
 @dataclass(frozen=True)
@@ -97,28 +83,26 @@ class Quantised:
 
 @dataclass(frozen=True)
 class Plan:
-    """What is to be quantised: the graph that reads the planes wanted, and that of all; the host's part; streams.
+    """What is to be quantised: the graph that reads the planes; the host's part; streams.
 
     `chain` is what is levelled besides the streams, or where there are none. What is calibrated and searched is the
     map in front of the network's `tail`, which is put behind it in the end: values of boxes that no object has would
-    outweigh all others.
+    outweigh all others. `pairs` is whether the last sum of a stream is computed as a half-LSB pair.
     """
 
     graph: Graph
-    full: Graph
     ends: Ends
     streams: list[Stream]
     chain: Chain
     tail: Tail | None
-    passes: Passes
     shifts: Shifts
+    pairs: bool = True
 
     @property
     def takes_windows(self) -> bool:
         """Whether the result comes in windows: where nothing is added to it, and a convolution writes it."""
         room = self.ends.outputs <= MAX_CHANNELS // 2
-        alone = self.ends.gains == 1 and not self.ends.adds_image
-        return self.passes.dual_gain and alone and takes_gains(self.graph) and room
+        return self.ends.gains == 1 and not self.ends.adds_image and takes_gains(self.graph) and room
 
     def with_windows(self, frac_bits: int, low: np.ndarray, high: np.ndarray) -> "Plan":
         """The result in windows from low to high (C,), finer by GAIN than its own scale of so many bits."""
@@ -126,38 +110,20 @@ class Plan:
         found = tuple(tuple(float(each) for each in window) for window in offsets)
         return replace(self, ends=replace(self.ends, offsets=found))
 
-    @property
-    def shares(self) -> bool:
-        """Whether its streams have one scale."""
-        return bool(self.streams) and (self.passes.shared_residual_scale or self.passes.equalise)
-
-    def stream_step(self, frac_bits: Mapping[str, int]) -> float:
-        """The value of one unit of the streams' tensors."""
-        return 2.0 ** -self.stream_frac_bits(frac_bits)
-
-    def stream_frac_bits(self, frac_bits: Mapping[str, int]) -> int:
-        """The streams' fractional bits, where the tensors' own are these."""
-        return STREAM_FRAC_BITS if self.passes.equalise else common_frac_bits(self.streams, frac_bits)
-
-    def paired(self, graph: Graph, frac_bits: Mapping[str, int]) -> Graph:
+    def paired(self, graph: Graph) -> Graph:
         """The graph with the half-LSB pair where that is wanted and possible; else itself."""
-        wanted = self.passes.half_lsb_pair and self.shares
-        return half_lsb_pair(graph, self.stream_step(frac_bits)) if wanted else graph
+        return half_lsb_pair(graph, STREAM_STEP) if self.pairs and self.streams else graph
 
     def ended(self, graph: Graph) -> Graph:
-        """The graph with windows or two gains where they are wanted."""
+        """The graph with windows or two gains where the result has them."""
         if self.ends.offsets:
             return windowed(graph, np.array(self.ends.offsets))
         return two_gains(graph) if self.ends.gains == 2 else graph
 
     def core(self, final: Graph, frac_bits: Mapping[str, int]) -> IntCore:
         """The integer core of a graph, paired and ended, whose tensors have these least-squares scales."""
-        chosen = dict(frac_bits)
-        if self.shares:
-            found = streams(final)
-            chosen = share_stream_scale(found, frac_bits, self.stream_frac_bits(frac_bits))
-        if self.passes.equalise:
-            chosen |= dict.fromkeys(self.chain.tensors, STREAM_FRAC_BITS)
+        chosen = share_stream_scale(streams(final), frac_bits) if self.streams else dict(frac_bits)
+        chosen |= dict.fromkeys(self.chain.tensors, STREAM_FRAC_BITS)
         if self.ends.offsets:
             chosen[CORRECTION] += FINER
         elif self.ends.gains == 2:
@@ -166,43 +132,49 @@ class Plan:
         return build_core(final, chosen, self.shifts, self.ends)
 
 
-def _plan(model: onnx.ModelProto, passes: Passes, shifts: Shifts = SHIFTS) -> Plan:
+def _plan(model: onnx.ModelProto, shifts: Shifts, pairs: bool) -> Plan:
     network = read_network(model)
-    full = read_planes(network.graph)
-    gains = 2 if passes.dual_gain and network.adds_image and takes_gains(full) else 1
-    graph = full if passes.fine_planes else coarse_plane_only(full)
-    ends, found = ends_of(network, gains), streams(graph)
+    graph = read_planes(network.graph)
+    ends, found = ends_of(network, 2 if network.adds_image and takes_gains(graph) else 1), streams(graph)
     widths = channels_of(graph, {PLANES: ends.planes * ends.channels})
     alone = [] if found else lone_tensors(graph)
     chain = Chain(tuple(alone), tuple(widths[name] for name in alone))
-    return Plan(graph, full, ends, found, chain, network.tail, passes, shifts)
+    return Plan(graph, ends, found, chain, network.tail, shifts, pairs)
 
 
 def quantise_model(
     model: onnx.ModelProto,
     patches: Patches,
     about: dict[str, str],
-    tick: Callable[[], None],
-    passes: Passes = ALL,
     shifts: Shifts = SHIFTS,
     tuning: Tuning | None = None,
+    pairs: bool = True,
+    log: Log = no_log,
 ) -> Quantised:
     """Quantise a float network under the DPU's rules: int8, symmetric, per tensor, power-of-two scales.
 
-    The global add, where there is one, stays on the host, in 12 bits: only the correction is computed in int8. The
-    rest is `passes`. `shifts` are the windows of the target. With `tuning` the whole numbers are trained at last.
+    The global add, where there is one, stays on the host, in 12 bits: only the correction is computed in int8.
+
+    Args:
+        model: the float network.
+        patches: that it is calibrated on.
+        about: metadata of the files.
+        shifts: the windows of the target.
+        tuning: on what, how long and how fast the whole numbers are trained at last; None leaves them.
+        pairs: whether the residual stream's last sum is computed as a half-LSB pair.
+        log: is told each step.
 
     Raises:
         ModelError: an operation that the DPU does not compute, or weights of no sensible size.
     """
-    plan = _plan(model, passes, shifts)
-    core, final, last_sum = rounded(plan, patches.degraded, tick)
+    plan = _plan(model, shifts, pairs)
+    core, final, last_sum = rounded(plan, patches.degraded, log)
     core = replace(core, ends=replace(core.ends, tail=plan.tail))
     if tuning:
         # Patches that hold few roofs would train the last sum's room away.
-        core = tune(core, final, plan.full, tuning, tick, still=last_sum)
+        core = tune(core, final, plan.graph, tuning, still=last_sum, log=log)
     about = {**metadata(model), "precision": "int8 legal", "calibration_sha256": patches.digest, **about}
-    about["passes"] = ", ".join(name for name, on in asdict(passes).items() if on)
+    about["passes"] = PASSES
     if tuning:
         about["finetune"] = f"{tuning.steps} steps on {len(tuning.pairs)} patches"
     tile_px = fixed_tile_px(model)
@@ -211,92 +183,69 @@ def quantise_model(
     )
 
 
-def rounded(
-    plan: Plan, images: Remade[np.ndarray], tick: Callable[[], None]
-) -> tuple[IntCore, Graph, frozenset[str]]:
+def rounded(plan: Plan, images: Remade[np.ndarray], log: Log = no_log) -> tuple[IntCore, Graph, frozenset[str]]:
     """A plan's graph in whole numbers, the float graph that was rounded, and the tensors of its last sum."""
-    graph, passes = plan.graph, plan.passes
-    frac_bits = choose_frac_bits(graph, images, tick, passes.least_squares, plan.ends)
+    log("scale of each tensor")
+    frac_bits = choose_frac_bits(plan.graph, images, plan.ends)
     if plan.takes_windows:
-        plan = plan.with_windows(frac_bits[CORRECTION], *_result_range(plan, images, tick))
-    if passes.equalise:
-        graph = _balanced(plan, frac_bits, images, tick)
-    paired, last_sum = plan.paired(graph, frac_bits), frozenset[str]()
+        plan = plan.with_windows(frac_bits[CORRECTION], *_result_range(plan, images))
+    graph = _balanced(plan, frac_bits, images, log)
+    paired, last_sum = plan.paired(graph), frozenset[str]()
     if paired is not graph:
-        paired = with_room(paired, plan.stream_step(frac_bits), images, tick, plan.ends)
+        paired = with_room(paired, STREAM_STEP, images, plan.ends)
         last_sum = frozenset(paired[-2].inputs)
     final = plan.ended(paired)
-    core = plan.core(final, frac_bits)
-    if passes.fit_weights:
-        core = fit_weights(final, core, input_moments(final, images, tick, plan.ends), plan.shifts)
-    return core, final, last_sum
+    log("rounding of the weights")
+    moments = input_moments(final, images, plan.ends)
+    return fit_weights(final, plan.core(final, frac_bits), moments, plan.shifts), final, last_sum
 
 
-def _result_range(plan: Plan, images: Remade[np.ndarray], tick: Callable[[], None]) -> tuple[np.ndarray, np.ndarray]:
+def _result_range(plan: Plan, images: Remade[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
     """The smallest and the largest value (C,) of each channel of the float network's result."""
-    session = open_session(graph_to_onnx(plan.full, [CORRECTION], plan.ends.planes * plan.ends.channels))
+    session = open_session(graph_to_onnx(plan.graph, [CORRECTION], plan.ends.planes * plan.ends.channels))
     low, high = np.array(np.inf), np.array(-np.inf)
     for image in images:
-        for (result,) in tensor_values(session, [CORRECTION], image, halo_of(plan.full), plan.ends):
+        for (result,) in tensor_values(session, [CORRECTION], image, halo_of(plan.graph), plan.ends):
             low, high = np.minimum(low, result[0].min((1, 2))), np.maximum(high, result[0].max((1, 2)))
-        tick()
     return low, high
 
 
-def _balanced(plan: Plan, frac_bits: dict[str, int], images: Remade[np.ndarray], tick: Callable[[], None]) -> Graph:
+def _balanced(plan: Plan, frac_bits: dict[str, int], images: Remade[np.ndarray], log: Log) -> Graph:
     """The plan's graph, its streams equalised and then its chain levelled."""
     graph = plan.chain.scaled(plan.graph, plan.chain.unscaled(frac_bits))
     if not (plan.streams or plan.chain.tensors):
         return graph
     trial = _trial(plan, frac_bits, images)
-    graph = _equalised(graph, plan, trial, images, tick) if plan.streams else graph
+    graph = _equalised(graph, plan, trial, images, log) if plan.streams else graph
     if plan.chain.tensors:
-        ranges = chain_ranges(graph, plan.chain, images, tick, plan.ends)
-        graph = plan.chain.scaled(graph, level(graph, plan.chain, ranges, np.ones(len(ranges)), trial, tick))
+        log(f"equalising the channels of {len(plan.chain.tensors)} tensors")
+        ranges = chain_ranges(graph, plan.chain, images, plan.ends)
+        graph = plan.chain.scaled(graph, level(graph, plan.chain, ranges, np.ones(len(ranges)), trial))
     return graph
 
 
-def _equalised(graph: Graph, plan: Plan, trial: Trial, images: Remade[np.ndarray], tick: Callable[[], None]) -> Graph:
+def _equalised(graph: Graph, plan: Plan, trial: Trial, images: Remade[np.ndarray], log: Log) -> Graph:
     """Stream after stream, the others levelled by a first guess until their turn comes."""
-    ranges = {}
-    for stream in plan.streams:
-        ranges[stream] = channel_ranges(plan.graph, stream, images, tick, plan.ends)
+    ranges = {stream: channel_ranges(plan.graph, stream, images, plan.ends) for stream in plan.streams}
     for stream in plan.streams[1:]:
         graph = equalise(graph, stream, first_guess(ranges[stream], LEVELLING[0], 1.0))
     for number, stream in enumerate(plan.streams):
+        log(f"equalising the channels of residual stream {number + 1} of {len(plan.streams)}")
         if number:
             graph = equalise(graph, stream, 1 / first_guess(ranges[stream], LEVELLING[0], 1.0))
-        graph = equalise(graph, stream, search(graph, stream, ranges[stream], trial, tick))
+        graph = equalise(graph, stream, search(graph, stream, ranges[stream], trial))
     return graph
 
 
 def _trial(plan: Plan, frac_bits: dict[str, int], images: Remade[np.ndarray]) -> Trial:
     """What a graph costs once it is rounded, on crops of the images."""
-    targets = search_targets(plan.full, plan.ends, images)
+    targets = search_targets(plan.graph, plan.ends, images)
 
     def costs_of(tried: Graph) -> Costs:
-        final = plan.ended(plan.paired(tried, frac_bits))
+        final = plan.ended(plan.paired(tried))
         return crop_costs(host_model(plan.core(final, frac_bits), {}), targets)
 
     return costs_of
-
-
-def ticks(model: onnx.ModelProto, patches: int, passes: Passes = ALL) -> int:
-    """How often `quantise_model` will call `tick`."""
-    return plan_ticks(_plan(model, passes), patches)
-
-
-def plan_ticks(plan: Plan, patches: int) -> int:
-    """As `ticks`, of a plan."""
-    passes = plan.passes
-    pairs = passes.half_lsb_pair and plan.shares and half_lsb_pair(plan.graph, 1.0) is not plan.graph
-    passings = 2 + passes.fit_weights + plan.takes_windows + pairs
-    if not passes.equalise:
-        return passings * patches
-    widths = channels_of(plan.graph, {PLANES: plan.ends.planes * plan.ends.channels})
-    steps = sum(search_steps(widths[min(stream)]) for stream in plan.streams)
-    levelled = bool(plan.chain.tensors)
-    return (passings + len(plan.streams) + levelled) * patches + steps + levelled * plan.chain.steps
 
 
 Targets = list[tuple[np.ndarray, np.ndarray]]
@@ -351,40 +300,3 @@ def crop_costs(model: onnx.ModelProto, targets: Targets) -> Costs:
             return np.array(list(cores.map(cost, range(len(targets)) if crops is None else crops)))
 
     return of
-
-
-def ablation_rows(
-    model: onnx.ModelProto, calibration: Patches, held_out: Patches, tick: Callable[[], None], shifts: Shifts = SHIFTS
-) -> list[Row]:
-    """The gate's figures with all passes, with each one left out, and with none."""
-    session, rows = open_any_size(model), []
-    for name, passes in ablations().items():
-        made = quantise_model(model, calibration, {}, lambda: None, passes, shifts)
-        row = gate_row(compare(session, open_any_size(made.host), held_out.pairs))
-        rows.append(Row("ablation", name, row.figures))
-        tick()
-    return rows
-
-
-def ablations() -> dict[str, Passes]:
-    """All passes, all but one, none; without a shared residual scale there is nothing to equalise."""
-    names = [field.name for field in fields(Passes)]
-    found = {"all passes": ALL}
-    for name in names:
-        left_out = {name: False, "equalise": False} if name == "shared_residual_scale" else {name: False}
-        found[f"without {name.replace('_', ' ')}"] = replace(ALL, **left_out)
-    return {**found, "none": Passes(**dict.fromkeys(names, False))}
-
-
-def passes_without(names: list[str]) -> Passes:
-    """All passes but these.
-
-    Raises:
-        OptionError: no pass of that name.
-    """
-    known = [field.name for field in fields(Passes)]
-    for name in names:
-        if name.replace("-", "_") not in known:
-            expected = ", ".join(known).replace("_", "-")
-            raise OptionError("--without", expected=expected, got=repr(name), remedy="name one of these")
-    return replace(ALL, **{name.replace("-", "_"): False for name in names})

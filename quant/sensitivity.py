@@ -6,7 +6,7 @@ already lost is not held against it.
 """
 
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -93,16 +93,13 @@ class LayerError:
     network: Loss
 
 
-def layer_errors(
-    graph: Graph, core: IntCore, crops: Iterable[np.ndarray], tick: Callable[[], None]
-) -> tuple[list[LayerError], Loss]:
+def layer_errors(graph: Graph, core: IntCore, crops: Iterable[np.ndarray]) -> tuple[list[LayerError], Loss]:
     """What each layer of a network loses, and what all lose together, over crops (1, 1, H, W) in [0, 1].
 
     Args:
         graph: plane-reading, in float: what the core was rounded from.
         core: the same operations in whole numbers.
         crops: each passes through the network once for every layer.
-        tick: called after each crop.
     """
     twins = tuple(_twin(op, whole) for op, whole in zip(graph, core.ops, strict=True) if isinstance(whole, IntConv))
     names, width = tensors((*graph, *twins)), core.ends.planes * core.ends.channels
@@ -127,7 +124,6 @@ def layer_errors(
             layer.alone.add(result, meant)
             layer.network.add(found, restored, offset)
         together.add(result_of(int8, crop), restored, offset)
-        tick()
     return layers, together
 
 
@@ -212,10 +208,10 @@ def spread_of(
     return Spread(counts, np.array(mae), np.array(largest))
 
 
-def layer_error_rows(result: Quantised, patches: Patches, tick: Callable[[], None]) -> list[Row]:
+def layer_error_rows(result: Quantised, patches: Patches) -> list[Row]:
     """Every layer in int8 by itself, and all of them."""
     seen = few_crops(patches.degraded, result.host)
-    layers, together = layer_errors(result.graph, result.core, seen, tick)
+    layers, together = layer_errors(result.graph, result.core, seen)
     source = f"{len(seen)} simulated patches, all other layers in float"
     whole = sum(layer.network.squared for layer in layers)
     rows = []

@@ -3,11 +3,8 @@
 What many tests need and no test changes is made once a process: the tree of commands and the drawn scenes.
 """
 
-import atexit
 import os
-import shutil
 import sys
-import tempfile
 from functools import cache, lru_cache
 from pathlib import Path
 
@@ -18,10 +15,6 @@ import pytest
 import typer.main
 import typer.testing
 from hypothesis import settings
-
-# What is made for a sensor goes into no user's cache.
-os.environ["BEERS_DEPLOY_CACHE"] = tempfile.mkdtemp(prefix="beers-deploy-tests-")
-atexit.register(shutil.rmtree, os.environ["BEERS_DEPLOY_CACHE"], ignore_errors=True)
 
 settings.register_profile("project", deadline=None)
 settings.load_profile("project")

@@ -12,10 +12,6 @@ SURFACE = {
         "BeersError Figure Row SceneCall Sensor SensorProfile TargetProfile load_scene_call load_sensor "
         "load_target scene_names sensor_names target_names"
     ),
-    "model.evaluation": (
-        "Evaluation Instruments Method NamedPair evaluate_methods load_pairs perceptual_distances read_pairs "
-        "simulate_pairs"
-    ),
     "model.io": (
         "list_images open_tiff read_pixels require_writable settled_scale sha256 site_of whole_file write_text"
     ),
@@ -27,13 +23,11 @@ SURFACE = {
     "model.traditional": "Chain Noise PEERS QUALITIES destabilise restore_strips restore_traditional stabilise",
     "model.training": "PatchRecipe RestorationLoss Run TrainingRecipe train",
     "quant": (
-        "Calibration GateResult IntCore Limits Passes Patches Quantised Tiling board_model compare draw_patches "
+        "Calibration GateResult IntCore Limits Patches Quantised Tiling board_model compare draw_patches "
         "host_model judge load_onnx open_session quantise_free quantise_model read_core receptive_radius_px run "
         "save_onnx tiling_of unseen_patches"
     ),
-    "deploy": (
-        "Document float_for float_model load_dpu method_named place predict read_network restore run_gate to_onnx"
-    ),
+    "deploy": ("Document float_for float_model load_dpu place predict read_network restore run_gate to_onnx"),
 }
 LIGHT = ("profiles", "model", "model.io", "model.metrics", "quant", "deploy")
 """Looked at by commands that need no torch."""

@@ -1,13 +1,11 @@
-"""What this machine takes: the traditional pipeline on an image, and networks' times for a tile.
+"""What networks take on this machine for a tile.
 
 Networks are timed interleaved, so that whatever else runs here meets them alike; load, clock
 and memory stand beside what was measured.
 """
 
-import math
 import statistics
-import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -15,24 +13,14 @@ from pathlib import Path
 import numpy as np
 import onnx
 import psutil
-import torch
 
-from deploy.bench.board_cpu import board_cpu_row, chain_time, kind_rows
-from deploy.bench.profile import interleaved, node_rows, profile, timed
-from deploy.bench.rates import Rates, measured_rates
-from deploy.bench.tables import TABLE, Swath, efficiency
+from deploy.bench.timing import interleaved, node_rows, profile, timed
 from deploy.dpu.reading import inputs_of
 from deploy.host_state import Watch, memory_rise, watched
 from deploy.networks import other_precision
 from model.processor import require_cores
-from model.simulator.acquire import MARGIN_PX, simulate_pair
-from model.simulator.detector import Draw
-from model.simulator.procedural import procedural_scene
-from model.traditional.pipeline import Chain, quality_named, restore_traditional
-from model.traditional.rows import one_thread_per_operation
-from model.traditional.work import chain_work
-from profiles import SensorProfile, TargetProfile
-from profiles.figures import Figure, Row, measured, predicted, unavailable
+from profiles import TargetProfile
+from profiles.figures import Figure, Row, measured, unavailable
 from quant.onnx_file import is_quantised, load_onnx
 from quant.session import open_session, require_finite
 
@@ -118,96 +106,6 @@ def _mean_power(run: Timed) -> Figure:
     return measured(energy_j / sum(run.times_s), "W", run.powers[0].source)
 
 
-CROP_PX = 256
-CROPS = 3
-QUALITY = quality_named("standard")
-"""What `Chain` takes when nothing is said."""
-
-
-@dataclass(frozen=True)
-class Sensors:
-    """The sensor that acquired an image and the one to imitate."""
-
-    degraded: SensorProfile
-    reference: SensorProfile
-
-
-def drawn_acquisition(swath: Swath, sensors: Sensors, seed: int = 0) -> np.ndarray:
-    """Digital numbers of a drawn scene, as large as the swath but no larger than the crops need."""
-    height = min(swath.height_px, CROP_PX)
-    width = min(swath.width_px, CROPS * CROP_PX)
-    ratio = int(sensors.degraded.oversampling.low)
-    height, width = ((side + 2 * MARGIN_PX) * ratio for side in (height, width))
-    scene = procedural_scene(height, width, np.random.default_rng(seed))
-    pair = simulate_pair(scene.radiance, sensors.degraded.nominal(), sensors.reference.nominal(), ratio, Draw(seed))
-    return pair.degraded.numpy()
-
-
-def traditional_rows(
-    dn: np.ndarray, swath: Swath, sensors: Sensors, boards: Sequence[TargetProfile], budget_s: float = 60.0
-) -> tuple[list[Row], list[Row]]:
-    """The traditional pipeline on (H, W) digital numbers, here and scaled to the boards' processors; work by kind.
-
-    Crops are timed first, one small run for warm-up left out. When `dn` is the whole swath and its estimate lies
-    within `budget_s`, it is run whole and its time is measured; else the swath's is predicted from the crops', with
-    the fastest and the slowest crop as its interval. The board's is scaled from their median CPU time on one core.
-    """
-    threads = torch.get_num_threads()
-    with watched() as watch:
-        latency, power = _chain_latency(dn, swath, sensors, budget_s, f"here, {threads} threads")
-    rates, work = measured_rates(), chain_work(swath.height_px, swath.width_px, QUALITY)
-    cpu_s_per_px, explained = _one_core(list(_crops(dn)), sensors, rates)
-    time = chain_time((cpu_s_per_px * swath.pixels,) * 2, work, rates, explained)
-    counted = "time of the work counted by kind over CPU time, one core, median of the crops"
-    figures = {
-        "latency": latency,
-        "throughput": _rate(swath.frames, latency),
-        "power": power,
-        "efficiency": efficiency(swath.pixels, latency, power),
-        "explained by kinds": measured(100 * explained, "%", counted),
-        **_conditions(watch, threads),
-    }
-    here = Row(TABLE, "traditional pipeline on this CPU", figures)
-    there = [board_cpu_row(time, swath, board, rates) for board in boards]
-    return [here, *there], kind_rows(time, work, boards[0], rates)
-
-
-def _one_core(crops: Sequence[np.ndarray], sensors: Sensors, rates: Rates) -> tuple[float, float]:
-    """CPU time of one core for a pixel, in s, and the share of it that the counted work explains.
-
-    Of the median crop. With several threads on a busy machine their waiting for one another is CPU time too.
-    """
-    with one_thread_per_operation():
-        cpu_s = [_wall_and_cpu_s(crop, sensors)[1] for crop in crops]
-    height, width = crops[0].shape
-    counted_s = math.fsum(rates.times_s(chain_work(height, width, QUALITY)).values())
-    median_s = statistics.median(cpu_s)
-    return median_s / crops[0].size, counted_s / median_s
-
-
-def _chain_latency(
-    dn: np.ndarray, swath: Swath, sensors: Sensors, budget_s: float, place: str
-) -> tuple[Figure, Figure]:
-    """Of the chain on the swath: latency, and the processor's power."""
-    crops = list(_crops(dn))
-    _restore(crops[0][:32, :32], sensors)
-    times_s, _, power = timed(lambda: [_wall_and_cpu_s(crop, sensors)[0] for crop in crops])
-    wall_s = [t * swath.pixels / crop.size for t, crop in zip(times_s, crops, strict=True)]
-    estimate_s = statistics.median(wall_s)
-    if dn.size == swath.pixels and estimate_s <= budget_s:
-        _, elapsed_s, power = timed(lambda: _restore(dn, sensors))
-        return measured(elapsed_s, "s", f"the whole image, {place}"), power
-    source = f"by proportion from {len(crops)} crops of {crops[0].shape[1]} x {crops[0].shape[0]}, {place}"
-    return predicted(estimate_s, "s", (min(wall_s), max(wall_s)), source), power
-
-
-def _wall_and_cpu_s(dn: np.ndarray, sensors: Sensors) -> tuple[float, float]:
-    """What the chain takes on the wall's clock, and of all this process's cores together."""
-    wall, cpu = time.perf_counter(), time.process_time()
-    _restore(dn, sensors)
-    return time.perf_counter() - wall, time.process_time() - cpu
-
-
 def host_rows(model: Path, target: TargetProfile, tile_px: int, threads: int = 0) -> list[Row]:
     """A network's time for one tile through onnxruntime, float32 and INT8 interleaved, and its nodes' times.
 
@@ -226,36 +124,15 @@ def host_rows(model: Path, target: TargetProfile, tile_px: int, threads: int = 0
     min_time_s, min_runs = target.value("measurement", "min_time_s"), int(target.value("measurement", "min_runs"))
     with watched() as watch:
         time_networks(runs, tile_px, threads, min_time_s, min_runs)
-    conditions = _conditions(watch, threads or psutil.cpu_count(logical=False) or 1)
+    conditions = conditions_of(watch, threads or psutil.cpu_count(logical=False) or 1)
     nodes, total_ms = profile(given, tile_feed(given, tile_px), threads)
     return [*timed_rows(runs, tile_px, conditions), *node_rows(nodes, total_ms)]
 
 
-def _conditions(watch: Watch, threads: int) -> dict[str, Figure]:
+def conditions_of(watch: Watch, threads: int) -> dict[str, Figure]:
+    """Under what conditions something was measured."""
     return {
         "threads": measured(threads, "thread", "of the runtime"),
         "CPU load": watch.load,
         "clock": watch.clock,
     }
-
-
-def _rate(frames: float, latency: Figure) -> Figure:
-    """Frames a second, of the latency's own mode."""
-    time_s = latency.value or 0.0
-    if latency.interval is None:
-        return measured(frames / time_s, "frame/s", latency.source)
-    low, high = latency.interval
-    return predicted(frames / time_s, "frame/s", (frames / high, frames / low), latency.source)
-
-
-def _crops(dn: np.ndarray) -> Iterator[np.ndarray]:
-    """Square crops along the image's diagonal, or the image where it is no larger."""
-    height, width = (min(CROP_PX, side) for side in dn.shape)
-    for k in range(CROPS):
-        top, left = ((side - crop) * k // (CROPS - 1) for side, crop in zip(dn.shape, (height, width), strict=True))
-        yield dn[top : top + height, left : left + width]
-
-
-def _restore(dn: np.ndarray, sensors: Sensors) -> torch.Tensor:
-    image = torch.from_numpy(np.ascontiguousarray(dn, dtype=np.float32))
-    return restore_traditional(image, Chain(sensors.degraded.nominal(), sensors.reference.nominal()))

@@ -1,18 +1,17 @@
-"""The rows of the bench: a network on the DPU (predicted), the traditional pipeline (measured here), the paper's.
+"""What the bench shows and need not measure.
 
-One network on several configurations of the DPU, in tiles of several sizes; the traditional pipeline on the board's
-own processor is in `board_cpu`.
+A network on the DPU and the traditional pipeline on the board's own processor, both predicted, and the paper's
+figures.
 """
 
 import math
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 from deploy.dpu.board import Dpu
 from deploy.dpu.checker.placement import place
-from deploy.dpu.cost.host import Task
 from deploy.dpu.cost.latency import (
     LayerCost,
     Prediction,
@@ -20,15 +19,18 @@ from deploy.dpu.cost.latency import (
     dpu_power,
     energy_source,
     layer_energy_j,
-    paper_frames,
     predict,
-    whole_tiles,
 )
+from deploy.dpu.cost.model import Interval, Task, between
 from deploy.dpu.reading import read_network
+from deploy.restoration.plan import plan_side
+from profiles import TargetProfile
 from profiles.errors import OptionError
 from profiles.figures import Figure, Row, number, predicted, published, unavailable
 
 TABLE, LAYERS = "bench", "layers"
+CHAIN = "chain_s_per_mpx"
+"""In a target's [cpu]: time of the traditional pipeline for 10^6 pixels on all cores."""
 COST_SOURCE = "cost model fitted on published networks, docs/explanation/cost-model.md"
 ARITHMETIC = "arithmetic of the tile grid"
 PAPER = "ConvBEERS paper, table of the VCK190 benchmark, 13600 x 9016"
@@ -53,13 +55,21 @@ class Swath:
 
     @property
     def frames(self) -> float:
-        """Tiles as the paper counts: a fraction, without halo."""
-        return paper_frames(self.width_px, self.height_px, self.tile_px)
+        """Tiles as the paper counts: pixels of the image over pixels of a tile, a fraction, without halo.
+
+        13600 x 9016 at 640 is 299.4; at the published 7.2 frames a second that is the published 42 s.
+        """
+        return self.pixels / self.tile_px**2
 
     @property
     def tiles(self) -> int:
-        """Whole tiles of the grid."""
-        return whole_tiles(self.width_px, self.height_px, self.tile_px, self.halo_px)
+        """Whole tiles of the grid, the last row and column moved inward: 384 of the paper's swath, halo 35.
+
+        Raises:
+            OptionError: a tile with no room between its two halos.
+        """
+        rows, columns = (plan_side(side, self.tile_px, self.halo_px) for side in (self.height_px, self.width_px))
+        return len(rows) * len(columns)
 
     def work_factor(self, tiles: float) -> float:
         """Pixels computed over pixels of the image."""
@@ -137,22 +147,27 @@ def energy(latency: Figure, power: Figure) -> Figure:
     """Energy of the swath, in J: time and power, and their ends."""
     if power.value is None or latency.value is None:
         return unavailable("J", power.reason or latency.reason)
-    (fast_s, slow_s), (low_w, high_w) = (f.interval or (f.value or 0.0, f.value or 0.0) for f in (latency, power))
-    value = (latency.value or 0.0) * (power.value or 0.0)
-    return predicted(value, "J", (fast_s * low_w, slow_s * high_w), f"{latency.source}; {power.source}")
+    (fast_s, slow_s), (low_w, high_w) = _ends(latency), _ends(power)
+    ends = fast_s * low_w, slow_s * high_w
+    return predicted(latency.value * power.value, "J", ends, f"{latency.source}; {power.source}")
 
 
 def efficiency(pixels: int, latency: Figure, power: Figure) -> Figure:
     """Pixels a second and watt; its interval pairs the slowest run with the highest power and the reverse."""
     unit = "px/s/W"
     if power.value is None or latency.value is None:
-        return Figure(None, unit, "unavailable", reason=power.reason or latency.reason)
+        return unavailable(unit, power.reason or latency.reason)
     value = pixels / latency.value / power.value
     if "predicted" not in (latency.mode, power.mode):
         return Figure(value, unit, latency.mode, f"{latency.source}; {power.source}")
-    times, watts = (f.interval or (f.value or 0.0, f.value or 0.0) for f in (latency, power))
-    interval = (pixels / times[1] / watts[1], pixels / times[0] / watts[0])
+    (fast_s, slow_s), (low_w, high_w) = _ends(latency), _ends(power)
+    interval = (pixels / slow_s / high_w, pixels / fast_s / low_w)
     return predicted(value, unit, interval, f"{latency.source}; {power.source}")
+
+
+def _ends(figure: Figure) -> Interval:
+    """The interval, or the value twice where it has none."""
+    return figure.interval or (figure.value or 0.0, figure.value or 0.0)
 
 
 def published_rows() -> list[Row]:
@@ -166,6 +181,40 @@ def published_rows() -> list[Row]:
         Row(TABLE, name, {k: published(v, units[k], PAPER) for k, v in zip(units, values, strict=True)})
         for name, values in runs.items()
     ]
+
+
+def processor_row(swath: Swath, board: TargetProfile) -> Row:
+    """The traditional pipeline on the board's own processor, from the time of 10^6 pixels that its file states."""
+    cpu, mpx, power = board.tables.get("cpu", {}), swath.pixels / 1e6, _processor_power(board)
+    constant, cores = cpu.get(CHAIN), f", {cpu['cores']} cores" if "cores" in cpu else ""
+    name = f"traditional pipeline on the processor of {board.name}{cores}"
+    if constant is None:
+        missing = f"the target states no [cpu] {CHAIN}"
+        return Row(TABLE, name, {"latency": unavailable("s", missing), "power": power})
+    low_s, high_s = mpx * constant.low, mpx * constant.high
+    latency = predicted(between((low_s, high_s)), "s", (low_s, high_s), constant.source)
+    figures = {
+        "latency": latency,
+        "throughput": chain_rate(swath, latency),
+        "power": power,
+        "efficiency": efficiency(swath.pixels, latency, power),
+    }
+    return Row(TABLE, name, figures)
+
+
+def chain_rate(swath: Swath, latency: Figure) -> Figure:
+    """Tiles a second, as the paper counts them, of a predicted latency of the swath."""
+    low_s, high_s = latency.interval or (0.0, 0.0)
+    rate = swath.frames / (latency.value or math.inf)
+    return predicted(rate, "frame/s", (swath.frames / high_s, swath.frames / low_s), latency.source)
+
+
+def _processor_power(board: TargetProfile) -> Figure:
+    """Of the board while its processor runs the pipeline, where it is published."""
+    constant = board.tables.get("power", {}).get("cpu_run_w")
+    if constant is None:
+        return unavailable("W", "no power of a run on this board's processor is published")
+    return published(constant.low, "W", constant.source)
 
 
 def layer_rows(prediction: Prediction, dpu: Dpu) -> list[Row]:
@@ -259,21 +308,20 @@ def within_words(rows: Sequence[Row], boards: Sequence[Dpu], within_s: float) ->
         boards: as given there.
         within_s: what the swath may take.
     """
-    each = len(rows) // len(boards)
-    latencies = [(boards[k // each], row, row.figures["latency"]) for k, row in enumerate(rows)]
-    found: dict[str, str] = {}
-    for how, end in (("by the whole interval", 1), ("by the prediction", None), ("at best", 0)):
-        fits = [(dpu, row) for dpu, row, time in latencies if _end(time, end) <= within_s]
+    each, found = len(rows) // len(boards), dict[str, str]()
+    placed = [(boards[k // each].peak_ops_per_s, row) for k, row in enumerate(rows)]
+    ends: dict[str, Callable[[Figure], float | None]] = {
+        "by the whole interval": lambda latency: _ends(latency)[1],
+        "by the prediction": lambda latency: latency.value,
+        "at best": lambda latency: _ends(latency)[0],
+    }
+    for how, end in ends.items():
+        fits = [(peak, row) for peak, row in placed if (end(row.figures["latency"]) or math.inf) <= within_s]
         if fits:
-            dpu, row = min(fits, key=lambda fit: fit[0].peak_ops_per_s)
-            found.setdefault(f"{row.name} ({dpu.peak_ops_per_s / 1e12:.3g} TOPS)", how)
+            peak, row = min(fits, key=lambda fit: fit[0])
+            found.setdefault(f"{row.name} ({peak / 1e12:.3g} TOPS)", how)
     words = "; ".join(f"{how} {name}" for name, how in found.items()) or "none of these"
     return f"the smallest DPU that takes {within_s:g} s or less: {words}"
-
-
-def _end(figure: Figure, end: int | None) -> float:
-    value = figure.value if end is None or figure.interval is None else figure.interval[end]
-    return math.inf if value is None else value
 
 
 def frame_row(prediction: Prediction, dpu: Dpu) -> Row:

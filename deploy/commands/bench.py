@@ -3,7 +3,7 @@
 from enum import StrEnum
 from functools import partial
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -11,10 +11,27 @@ from deploy.commands.shared import refuse, say
 from model.shipped import SENSOR
 from profiles.target import DEFAULT_TARGET, MODEL_SUFFIX, board_names
 
+if TYPE_CHECKING:
+    import numpy as np
+
+    from deploy.bench.tables import Swath
+    from profiles.figures import Row
+
 EXAMPLE = "bench --target vck190-model --size 13600x9016 --config C32B3"
 
 PAPER_SIZE = "13600x9016"  # as in deploy.bench.tables, which is imported late
-BOARD_ONLY = ("image", "full_scale", "size", "halo", "config", "host_task", "measured", "budget", "within", "layers")
+BOARD_ONLY = (
+    "image",
+    "full_scale",
+    "size",
+    "halo",
+    "config",
+    "host_task",
+    "measured",
+    "no_traditional",
+    "within",
+    "layers",
+)
 HOST_ONLY = ("threads",)
 BOARD, HOSTS = f"{DEFAULT_TARGET}{MODEL_SUFFIX}", ("host", "host-cpu")
 BOARDS = ", ".join(board_names())
@@ -24,7 +41,7 @@ NO_PROXY = "Time on this CPU is no proxy for the DPU: here INT8 may even run slo
 
 
 class HostTask(StrEnum):
-    """What the host does with a network's results; the names are those of `deploy.dpu.cost.host`."""
+    """What the host does with a network's results; the names are those of `deploy.dpu.cost.model`."""
 
     copy = "copy"
     argmax = "argmax"
@@ -68,26 +85,24 @@ def bench(
         ),
     ] = None,
     measured: Annotated[
-        Path | None, typer.Option(help="JSON list of your board's runs: the cost model is refitted to them first.")
+        Path | None, typer.Option(help="JSON list of your board's runs: the cost model is corrected by them first.")
     ] = None,
-    budget: Annotated[
-        float, typer.Option(min=0, help="Seconds that the traditional pipeline may take to be run on a whole image.")
-    ] = 60.0,
+    no_traditional: Annotated[
+        bool,
+        typer.Option("--no-traditional", help="Do not measure the traditional pipeline on this processor."),
+    ] = False,
     within: Annotated[
         float | None,
         typer.Option(min=0, help="Seconds that the swath may take: which is the smallest DPU that meets them?"),
     ] = None,
-    layers: Annotated[
-        bool, typer.Option("--layers", help="Show where the time goes: each layer, and the pipeline's kinds of work.")
-    ] = False,
+    layers: Annotated[bool, typer.Option("--layers", help="Show where the time goes, layer by layer.")] = False,
     threads: Annotated[int, typer.Option(min=0, help="Threads of the host's runtime; 0 takes every core.")] = 0,
     json: Annotated[Path | None, typer.Option(help="Write the figures here.")] = None,
 ) -> None:
-    """Compare a network on the DPU with the traditional pipeline on this CPU and with the paper's figures."""
-    from deploy.bench.board import BoardRequest, bench_board
-    from deploy.bench.host import host_rows
+    """Compare a network on the DPU with the traditional pipeline and with the paper's figures."""
+    from deploy.bench.board import bench_board
     from deploy.bench.tables import parse_tiles
-    from deploy.dpu.cost.host import TASKS
+    from deploy.dpu.cost.model import TASKS
     from deploy.networks import int8_file
     from deploy.results import Document, print_rows
     from model.io.files import require_writable
@@ -99,19 +114,35 @@ def bench(
     path = int8_file(model, load_sensor(sensor), partial(say, err=True))
     require_writable(json, inputs=(path, image, measured, Path(target)))
     if here:
+        from deploy.bench.host import host_rows
+
         rows = host_rows(path, load_target("host-cpu"), _single(tiles), threads)
         for table, part in by_table(rows).items():
             print_rows(f"{path.name} on this machine: {table}", part)
         say(NO_PROXY)
     else:
         task = next((name for name in TASKS if name == host_task), None)
-        asked = BoardRequest(board, image, full_scale, size, tiles, halo, config, measured, within, task)
-        found = bench_board(path, asked, budget)
-        rows = found.rows
+        found = bench_board(
+            path,
+            board,
+            image=image,
+            full_scale=full_scale,
+            size=size,
+            tiles_px=tiles,
+            halo=halo,
+            config=config,
+            measured=measured,
+            within_s=within,
+            host_task=task,
+        )
         for title, part in (*(found.layers if layers else []), *found.shown):
             print_rows(title, part)
         for note in (*found.notes, PREDICTED, *([LAYERS] if found.layers and not layers else [])):
             say(note)
+        rows = found.rows
+        if not no_traditional and found.swath is not None:
+            rows = [*rows, _traditional_row(found.dn, found.swath)]
+            print_rows("the traditional pipeline, measured on crops here", rows[-1:])
     arguments = {
         "target": target,
         "sensor": sensor,
@@ -126,6 +157,16 @@ def bench(
     }
     inputs = tuple(file for file in (path, image, measured) if file)
     Document("bench", arguments, inputs, tuple(rows)).write(json)
+
+
+def _traditional_row(dn: "np.ndarray | None", swath: "Swath") -> "Row":
+    """Measured here: seconds, and torch is loaded for it; so it comes when all predictions have been shown."""
+    from deploy.bench.traditional import drawn_acquisition, measure_chain
+    from profiles import load_sensor
+    from profiles.sensor_file import REFERENCE
+
+    sensors = load_sensor(SENSOR), load_sensor(REFERENCE)
+    return measure_chain(drawn_acquisition(swath, *sensors) if dn is None else dn, *sensors).row(swath)
 
 
 def _refuse_unused(context: typer.Context, here: bool) -> None:

@@ -31,15 +31,14 @@ def characterise(
     The MTF needs straight edges between even areas: a target, a large roof, an apron. The noise needs raw pixels:
     what was denoised, sharpened or resampled is refused.
     """
-    from deploy.characterise import Request, positive, profile_toml, read_box
-    from deploy.characterise import characterise as measure
     from deploy.results import Document, print_rows
+    from deploy.studies.characterise import characterise as measure
+    from deploy.studies.characterise import profile_toml, read_box
     from model.io.files import require_writable, write_text
 
     require_writable(out, json, inputs=images)
-    known = positive("--gain", gain), positive("--gsd", gsd)
     boxes = tuple(read_box(text, images) for text in edge or ())
-    found = measure(Request(tuple(images), boxes, bits, *known))
+    found = measure(images, boxes, bits=bits, gain=gain, gsd_m=gsd)
     rows = found.rows()
     print_rows(f"sensor of {len(images)} image{'' if len(images) == 1 else 's'}", rows)
     write_text(out, profile_toml(found))

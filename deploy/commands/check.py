@@ -6,25 +6,22 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from deploy.commands.shared import BOARDS, refuse, say
+from deploy.commands.shared import BOARDS, say
 from profiles.target import DEFAULT_TARGET
 
 if TYPE_CHECKING:
     from deploy.dpu.board import Dpu
 
 EXAMPLE = "check network.onnx --target zcu102 --config B4096"
-TRADITIONAL = Path("traditional")
 TILE_PX = 640
 
 
 def check(
-    context: typer.Context,
     model: Annotated[
         Path | None,
         typer.Argument(
             metavar="[MODEL]",
-            help="ONNX network: float, INT8 or board core, anyone's; 'traditional' for the operators of that chain; "
-            "the shipped INT8 one if none.",
+            help="ONNX network: float, INT8 or board core, anyone's; the shipped INT8 one if none.",
         ),
     ] = None,
     target: Annotated[str, typer.Option(help=f"Profile of a board with a DPU: {BOARDS}.")] = DEFAULT_TARGET,
@@ -48,15 +45,10 @@ def check(
     from model.shipped import SENSOR
     from profiles import load_sensor
 
-    if model == TRADITIONAL:
-        remedy = "leave the option out, or give a network"
-        refuse(context, ["picture", "tile"], expected="none with 'traditional'", got="one", remedy=remedy)
     require_picture(picture)
-    chain = model == TRADITIONAL
-    path = None if chain else int8_file(model, load_sensor(SENSOR), partial(say, err=True))
+    path = int8_file(model, load_sensor(SENSOR), partial(say, err=True))
     require_writable(picture, json, inputs=(path, Path(target)))
-    dpu = load_dpu(target, config)
-    if not (_traditional(dpu, json) if path is None else _network(path, dpu, tile, picture, json)):
+    if not _network(path, load_dpu(target, config), tile, picture, json):
         raise typer.Exit(1)
 
 
@@ -83,18 +75,3 @@ def _network(path: Path, dpu: "Dpu", tile: int | None, picture: Path | None, jso
     for line in summary(placement, dpu, tile_px, refusal(model) if placement.note else ""):
         say(line)
     return not placement.failed
-
-
-def _traditional(dpu: "Dpu", json: Path | None) -> bool:
-    """Judge the operators of the traditional chain; whether the DPU could run them all."""
-    from deploy.dpu.checker.table import step_legality, step_rows
-    from deploy.dpu.checker.traditional import judge_traditional, verdict
-    from deploy.results import Document, print_rows
-
-    steps = judge_traditional(dpu)
-    rows = [row for step in steps for row in step_rows(step)]
-    print_rows(f"the traditional chain on {dpu.target.name} {dpu.name}", rows)
-    arguments, checks = {"target": dpu.target.name, "config": dpu.name}, (step_legality(steps),)
-    Document("check", arguments, (), tuple(rows), checks).write(json)
-    say(verdict(steps))
-    return not any(step.broken for step in steps)

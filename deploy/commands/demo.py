@@ -26,20 +26,21 @@ def demo(
     json: Annotated[Path | None, typer.Option(help="Write the figures here.")] = None,
 ) -> None:
     """Simulate, quantise, gate, check, restore and predict, on a drawn scene or your image; ends with report.html."""
-    from deploy.demo import FILES, run_demo
     from deploy.report.page import write_report
     from deploy.results import Document, print_rows
+    from deploy.studies.demo import FILES, run_demo
     from model.io.files import require_writable
     from profiles.errors import OptionError
 
     if full_scale is not None and image is None:
         raise OptionError("--full-scale", expected="--image beside it", got="none", remedy="leave it out")
     require_writable(*(out / name for name in FILES), json, inputs=(image, Path(sensor)))
-    result = run_demo(image, out, seed, lambda step: say(step, err=True), full_scale, sensor)
-    write_report(result.report, out / "report.html")
-    for table in result.report.tables:
+    report = run_demo(image, out, seed, lambda step: say(step, err=True), full_scale, sensor)
+    write_report(report, out / "report.html")
+    for table in report.tables:
         print_rows(table.title, table.rows)
-    say(result.report.headline)
+    say(report.headline)
     say(f"report: {out / 'report.html'}")
     arguments = {"image": image, "full_scale": full_scale, "sensor": sensor, "out": out, "seed": seed}
-    Document("demo", arguments, tuple([image] if image else []), result.rows).write(json)
+    rows = tuple(row for table in report.tables for row in table.rows)
+    Document("demo", arguments, tuple([image] if image else []), rows).write(json)

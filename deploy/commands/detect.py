@@ -1,5 +1,6 @@
 """`beers-deploy detect`: what restoration buys a detector."""
 
+from collections.abc import Sequence
 from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -10,10 +11,11 @@ from deploy.commands.shared import refuse, say
 from model.processor import SEEDS
 
 if TYPE_CHECKING:
-    from deploy.detection.run import DetectionRun
+    from deploy.studies.detection.study import Comparison
 
 EXAMPLE = "detect --images DIOR/ --split test --detector yolo11n.onnx --sensor dior-medium --out detection/"
 SENSORS = "dior-medium,dior-high"
+REPORT = "report.html"
 METHODS = "traditional,convbeers-s,convbeers-s-int8"
 DRAWN = 24
 
@@ -21,7 +23,7 @@ DRAWN = 24
 def detect(
     context: typer.Context,
     images: Annotated[
-        Path | None, typer.Option(help="Folder of labelled pictures, DIOR's among them; drawn scenes if none.")
+        Path | None, typer.Option(help="Folder of labelled pictures, DIOR's among them; synthetic scenes if none.")
     ] = None,
     labels: Annotated[
         Path | None, typer.Option(help="Folder of their labels (VOC, YOLO) or COCO's .json; beside them if none.")
@@ -45,27 +47,24 @@ def detect(
     classes: Annotated[
         str | None, typer.Option(help="Labelled classes under the detector's names: car=vehicle,minibus=vehicle.")
     ] = None,
-    drawn: Annotated[int, typer.Option(min=2, max=10_000, help="Scenes to draw, without --images.")] = DRAWN,
-    retrain: Annotated[
-        bool, typer.Option("--retrain", help="Train the embedded detector for each row anew, as the paper does.")
-    ] = False,
-    out: Annotated[
-        Path, typer.Option(help="Folder for report.html and a cache of what was found: a stopped run goes on.")
-    ] = Path("detection"),
+    drawn: Annotated[int, typer.Option(min=2, max=10_000, help="Synthetic scenes, without --images.")] = DRAWN,
+    out: Annotated[Path, typer.Option(help="Folder for report.html.")] = Path("detection"),
     seed: Annotated[int, typer.Option(min=0, max=SEEDS, help="Seed of every random draw.")] = 0,
     json: Annotated[Path | None, typer.Option(help="Write the figures here.")] = None,
 ) -> None:
     """Show a detector the same scenes as the reference sees them, degraded and restored, and score what it finds.
 
     Average precision, precision and recall with intervals over sites, and the share of the loss that restoration
-    regains. The detector is fixed, as one in service is. With --retrain it is trained for each row on that row's own
-    pictures, three times from other seeds: the paper's protocol, another question.
+    regains. The detector is fixed, as one in service is.
     """
-    from deploy.cache import Cache
-    from deploy.detection.classes import parse_classes
-    from deploy.detection.run import REPORT, DetectionRequest, run_detection
     from deploy.results import Document
+    from deploy.studies.detection.average_precision import sites_note
+    from deploy.studies.detection.detector import open_detector, parse_classes
+    from deploy.studies.detection.page import write_page
+    from deploy.studies.detection.study import labelled_scenes, run_study, synthetic_scenes
+    from deploy.studies.detection.tables import detection_rows, headline, paper_rows
     from model.io.files import require_writable
+    from model.shipped import DETECTOR
 
     _refuse_unused(context)
     names = list(dict.fromkeys(["degraded", *(name.strip() for name in methods.split(","))]))
@@ -74,36 +73,39 @@ def detect(
     named = [Path(name) for name in (*sensors, *names, reference) if name]
     read = (images, labels, detector, *chain.from_iterable(trees), *named)
     require_writable(out / REPORT, json, inputs=read, folders=(out,))
+    opened = open_detector(detector or DETECTOR, size_px=size)
     known = {} if classes is None else parse_classes(classes)
-    request = DetectionRequest(
-        images, labels, split, detector, sensors, reference, names, size, known, drawn, retrain, seed
-    )
-    found = run_detection(request, Cache(out / "cache"), say)
-    show(found)
-    say(f"wrote {found.write(out)}")
-    arguments: dict[str, object] = {"images": images, "labels": labels, "split": split, "detector": detector}
-    arguments |= {"sensor": sensor, "reference": reference, "methods": methods, "size": size, "classes": classes}
-    arguments |= {"drawn": drawn, "retrain": retrain, "out": out, "seed": seed}
-    Document("detect", arguments, (request.detector_file, *found.pictures), found.rows).write(json)
+    if images is None:
+        scenes, notes = synthetic_scenes(drawn, seed, opened.names, known)
+    else:
+        scenes, notes = labelled_scenes(opened.names, known, images, labels, split)
+    compared = run_study(opened, scenes, sensors, names, reference=reference, seed=seed, say=say)
+    notes = [note for note in (opened.flag, sites_note(compared[0].sites), *notes) if note]
+    show(compared)
+    for sentence in (*notes, headline(compared)):
+        say(sentence)
+    write_page(compared, notes, out / REPORT)
+    say(f"wrote {out / REPORT}")
+    rows = (*(row for found in compared for row in detection_rows(found)), *paper_rows())
+    pictures = [scene.path for scene in scenes if scene.path is not None]
+    arguments = {name: value for name, value in context.params.items() if name != "json"}
+    Document("detect", arguments, (detector or DETECTOR, *pictures), rows).write(json)
 
 
 def _refuse_unused(context: typer.Context) -> None:
-    """Refuse what only pictures have, or only drawn scenes; only of these are some left to train on."""
-    remedy = "leave it out"
+    """Refuse what only pictures have, or only synthetic scenes."""
     if context.params["images"] is None:
-        refuse(context, ["labels", "split"], expected="--images beside it", got="none", remedy=remedy)
+        refuse(context, ["labels", "split"], expected="--images beside it", got="none", remedy="leave it out")
     else:
-        refuse(context, ["drawn", "retrain"], expected="drawn scenes", got="--images beside it", remedy=remedy)
-    if context.params["detector"] is not None:
-        refuse(context, ["retrain"], expected="the embedded detector", got="--detector beside it", remedy=remedy)
+        refuse(context, ["drawn"], expected="synthetic scenes", got="--images beside it", remedy="leave it out")
 
 
-def show(found: "DetectionRun") -> None:
-    """The tables that answer the question, the paper's, and what a reader must know."""
+def show(compared: "Sequence[Comparison]") -> None:
+    """The tables that answer the question, and the paper's."""
     from deploy.results import print_rows
+    from deploy.studies.detection.tables import detection_rows, main_table, paper_rows
     from profiles.figures import by_table
 
-    for table, rows in by_table(found.shown).items():
+    mains = [row for each in compared for row in detection_rows(each) if row.table == main_table(each.name)]
+    for table, rows in by_table([*mains, *paper_rows()]).items():
         print_rows(table, rows)
-    for sentence in (*found.notes, found.headline):
-        say(sentence)

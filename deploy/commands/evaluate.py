@@ -47,9 +47,8 @@ def evaluate(
     figures; so do shipped networks, unless their name ends with
     @blind or with @ and another sensor.
     """
-    from deploy.evaluate import EvaluationRequest, run_evaluation
     from deploy.results import Document, print_rows
-    from model.evaluation.run import input_files
+    from deploy.studies.evaluation.run import input_files, run_evaluation
     from model.io.files import require_writable
     from profiles.errors import OptionError
     from profiles.figures import by_table
@@ -61,9 +60,19 @@ def evaluate(
     folders = [pairs, *(pairs / role for role in ("degraded", "reference"))] if pairs else [images]
     read = (*folders, lpips, *(Path(name) for name in (sensor, reference, *names) if name))
     require_writable(out / "report.html" if out else None, json, inputs=read, folders=(out,))
-    found = run_evaluation(EvaluationRequest(names, images, pairs, sensor, reference, lpips, sweep, seed), say)
-    print_rows(found.title, found.result.mean)
-    for table, rows in by_table((*found.result.sites, *found.swept)).items():
+    found = run_evaluation(
+        names,
+        images=images,
+        pairs=pairs,
+        sensor=sensor,
+        reference=reference,
+        lpips=lpips,
+        sweep=sweep,
+        seed=seed,
+        say=say,
+    )
+    print_rows(found.title, found.mean)
+    for table, rows in by_table((*found.sites, *found.swept)).items():
         print_rows(table, rows)
     for note in found.notes:
         say(note)
@@ -73,4 +82,4 @@ def evaluate(
     arguments: dict[str, object] = {"images": images, "pairs": pairs, "sensor": sensor or degraded}
     arguments |= {"reference": wanted, "methods": methods, "lpips": lpips, "out": out, "sweep": sweep, "seed": seed}
     inputs = input_files(names, images, pairs, lpips)
-    Document("evaluate", arguments, inputs, (*found.result.rows, *found.swept)).write(json)
+    Document("evaluate", arguments, inputs, found.rows).write(json)

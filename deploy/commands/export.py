@@ -126,7 +126,7 @@ def _export_int8(
     if apply is not None:
         made = told_by_delta(model, apply)
     else:
-        made = told_int8(model, load_sensor(sensor or SENSOR), say=partial(say, err=True))
+        made = told_int8(model, load_sensor(sensor or SENSOR), log=partial(say, err=True))
     core, about, side_px = read_core(made), metadata(made), tile_px or fixed_tile_px(made)
     require_tile(side_px, core.ends.place_px)
     save_onnx(host_model(core, about, side_px), out)

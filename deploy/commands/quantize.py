@@ -40,14 +40,9 @@ def quantize(
     ] = None,
     patches: Annotated[int, typer.Option(min=1, max=100_000, help="Calibration patches.")] = 64,
     patch: Annotated[int, typer.Option(min=32, max=2048, help="Side of a calibration patch in pixels.")] = 128,
-    ablate: Annotated[bool, typer.Option("--ablate", help="Show what each pass buys, on other patches.")] = False,
     report: Annotated[
         Path | None,
         typer.Option(help="Folder for report.html and report.json: which layers and patches err, and how."),
-    ] = None,
-    without: Annotated[
-        list[str] | None,
-        typer.Option(help="Leave out a pass that --ablate lists, as half-lsb-pair; may be repeated."),
     ] = None,
     finetune: Annotated[
         int,
@@ -72,28 +67,26 @@ def quantize(
     from profiles import load_sensor, load_target
     from profiles.errors import OptionError
 
-    if regime is Regime.free and (board or ablate or report or without or finetune):
+    if regime is Regime.free and (board or report or finetune):
         remedy = "leave it out, or take --regime legal"
-        expected = "no --board, --ablate, --report, --without or --finetune"
+        expected = "no --board, --report or --finetune"
         raise OptionError("--regime free", expected=expected, got="one", remedy=remedy)
     page, figures = (report / "report.html", report / "report.json") if report else (None, None)
     read = (model, images, data, *map(Path, (target, sensor)))
     require_writable(out, board, json, page, figures, inputs=read)
     known, board_target, banked = load_sensor(sensor), load_target(target), conditioned(model)
-    if banked and (regime is Regime.free or ablate or report or without or finetune or data):
+    if banked and (regime is Regime.free or report or finetune or data):
         remedy = "leave it out: such a network is calibrated over the whole family of sensors at once"
-        expected = "no --regime free, --ablate, --report, --without, --finetune or --data"
+        expected = "no --regime free, --report, --finetune or --data"
         raise OptionError("a network behind a bank", expected=expected, got="one", remedy=remedy)
     model = float_file(model, known, partial(say, err=True))
     network = float_model(model)
 
     # These take torch, seconds: what is wrong with the options or the files has been said by now.
-    from deploy.quantise import Wanted, quantise_banked_file, quantise_free_file, quantise_legal_file
+    from deploy.quantise import quantise_banked_file, quantise_free_file, quantise_legal_file
     from quant.calibration import Calibration
-    from quant.quantise import passes_without
     from quant.samples import samples_of
 
-    passes = passes_without(without or [])
     simulated = Calibration(sensor, images, patches, patch, seed)
     calibration = samples_of(network, data) or simulated
     if banked:
@@ -101,11 +94,12 @@ def quantize(
     elif regime is Regime.free:
         rows = quantise_free_file(network, calibration, out, say, print_rows)
     else:
-        wanted = Wanted(board, ablate, page, finetune)
-        rows = quantise_legal_file(network, calibration, board_target, passes, out, wanted, say, print_rows)
+        rows = quantise_legal_file(
+            network, calibration, board_target, out, say, print_rows, board=board, page=page, finetune=finetune
+        )
     arguments = {"target": target, "sensor": sensor, "images": images, "patches": patches, "patch": patch}
     arguments |= {"data": data}
-    arguments |= {"regime": regime.value, "without": ", ".join(without or []), "finetune": finetune, "seed": seed}
+    arguments |= {"regime": regime.value, "finetune": finetune, "seed": seed}
     document = Document("quantize", arguments, (model, out), tuple(rows))
     for path in (figures, json):
         document.write(path)

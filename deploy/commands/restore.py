@@ -8,10 +8,10 @@ from typing import Annotated
 import typer
 
 from deploy.commands.shared import refuse, say
-from deploy.restoration.options import Compression, Options, Runtime
+from deploy.restoration.options import TILE_PX, Compression, Options, Runtime
 
 EXAMPLE = "restore raw.tif restored.tif"
-NETWORK_ONLY = ("model", "tile", "halo", "resume", "runtime", "threads", "workers", "scheduler", "cog", "stac")
+NETWORK_ONLY = ("model", "tile", "halo", "resume", "runtime", "threads", "scheduler", "cog", "stac")
 """Options of which the traditional chain takes none."""
 
 
@@ -37,10 +37,7 @@ def restore(
             "B0=a.toml,B1=b.toml for each band; blind if none."
         ),
     ] = None,
-    tile: Annotated[
-        int | None,
-        typer.Option(min=16, help="Longest side of a tile in pixels; 640 if none, unless --runtime is auto."),
-    ] = None,
+    tile: Annotated[int, typer.Option(min=16, help="Longest side of a tile in pixels.")] = TILE_PX,
     halo: Annotated[str, typer.Option(help="Context around a tile: 'exact' (no seams) or pixels.")] = "exact",
     full_scale: Annotated[
         float | None,
@@ -49,20 +46,16 @@ def restore(
             "8-bit and 0..1 pixels need it."
         ),
     ] = None,
-    runtime: Annotated[
-        Runtime, typer.Option(help="What runs the network; auto measures runtimes, tiles and lanes once, for speed.")
-    ] = Runtime.onnxruntime,
-    threads: Annotated[int, typer.Option(min=0, help="Threads; 0 takes every core, or what falls to a worker.")] = 0,
+    runtime: Annotated[Runtime, typer.Option(help="What runs the network.")] = Runtime.onnxruntime,
+    threads: Annotated[
+        int, typer.Option(min=0, help="Threads; 0 takes every core, or one for each thread of a scheduler's workers.")
+    ] = 0,
     compression: Annotated[Compression, typer.Option(help="Of the output, lossless.")] = Compression.zlib,
     memory: Annotated[
-        float | None,
-        typer.Option(min=0, help="Budget in GB, --workers included; of a scheduler's, each. What is free if none."),
+        float | None, typer.Option(min=0, help="Budget of this process in GB; what is free if none.")
     ] = None,
-    workers: Annotated[
-        int, typer.Option(min=0, help="Processes of this machine that restore, by Dask; 0: none but this one.")
-    ] = 0,
     scheduler: Annotated[
-        str | None, typer.Option(help="Dask scheduler whose workers restore, such as tcp://host:8786.")
+        str | None, typer.Option(help="Dask scheduler whose workers run the network, such as tcp://host:8786.")
     ] = None,
     cog: Annotated[
         bool, typer.Option("--cog", help="Write OUT as a Cloud-Optimised GeoTIFF: tiles, overviews, what was done.")
@@ -83,14 +76,12 @@ def restore(
     With --method traditional the image is stabilised, denoised and sharpened as its --sensor asks, in strips of rows:
     one band, about a minute a megapixel on two cores, not resumable.
     JPEG 2000, NITF and HFA files, VRT mosaics and DIMAP indexes need the extra 'gdal'.
-    --runtime auto changes no pixel: it takes what is fastest here among what gives onnxruntime's bytes, and keeps it.
     Georeference, RPCs and missing pixels (NaN, or the nodata value) are kept. Until OUT is finished its rows lie in
-    .OUT.part beside it. Workers change no pixel: where they are of one processor and the same versions, the bytes are
-    those of one process. Those of a scheduler must find IN under its path; only this process writes.
+    .OUT.part beside it. With --scheduler this process reads and writes, and sends tiles to the workers: where they
+    are of one processor and the same versions, the bytes are those of a run without.
     """
     from deploy.networks import conditioned, network_file
     from deploy.restoration.bands import parse_sensors
-    from deploy.restoration.index_files import index_files
     from deploy.restoration.run import restore_file
     from deploy.restoration.stac import require_stac, write_item
     from deploy.results import Document, print_rows
@@ -102,7 +93,7 @@ def restore(
     budget_bytes = max(int(memory * 1e9), 1) if memory else None
     sensors = parse_sensors(sensor or BLIND)
     profiles = (Path(each) for each in sensors.values()) if sensor else ()
-    require_writable(out, json, stac, inputs=(image, *index_files(image, trust_index), model, *profiles))
+    require_writable(out, json, stac, inputs=(image, model, *profiles))
     if method is Method.traditional:
         expected, remedy = "none with --method traditional", "leave it out"
         refuse(context, NETWORK_ONLY, expected=expected, got="one", remedy=remedy)
@@ -135,14 +126,13 @@ def restore(
         compression,
         budget_bytes,
         resume,
-        workers,
         scheduler,
         trust_index,
         min(bits) if sensor else None,
         cog,
         {} if "" in paths else paths,
     )
-    row = restore_file(image, out, options, say)
+    row = restore_file(image, out, options, say, (json, stac))
     if stac is not None:
         write_item(out, stac)
     print_rows(f"wrote {out}", [row])
@@ -154,7 +144,7 @@ def restore(
         "runtime": runtime,
         "threads": threads,
     }
-    arguments |= {"workers": workers, "scheduler": scheduler}
+    arguments |= {"scheduler": scheduler}
     Document("restore", arguments, (*paths.values(), image), (row,)).write(json)
 
 
@@ -179,7 +169,7 @@ def _by_the_chain(
         raise OptionError("--sensor", expected="the sensor that acquired IN", got="none", remedy=remedy)
     degraded = load_sensor(sensor)
     request = Request(degraded, reference_for(degraded), full_scale, compression, memory_bytes, trust_index)
-    row = restore_file_traditionally(image, out, request)
+    row = restore_file_traditionally(image, out, request, (json,))
     print_rows(f"wrote {out}", [row])
     arguments = {"method": "traditional", "sensor": sensor, "full_scale": full_scale}
     Document("restore", arguments, (image,), (row,)).write(json)

@@ -73,16 +73,15 @@ def simulate(
 ) -> None:
     """Write degraded/NAME.tif and reference/NAME.tif for each scene or patch; the same bytes for the same seed.
 
-    The workers of a scheduler must find the scenes under their paths; only this process writes.
+    The workers of a scheduler must find the same scenes under the same paths; only this process writes.
     """
     import math
     import os
-    from functools import partial
 
-    from deploy.cluster import check_choice
-    from deploy.dataset_workers import spread_patches
+    from deploy.cluster import open_cluster
     from model.dataset import DatasetRecipe, plan_windows, write_dataset
     from model.io.files import require_writable
+    from model.processor import require_cores
     from model.progress import steps
     from profiles import load_sensor
     from profiles.errors import OptionError
@@ -92,7 +91,9 @@ def simulate(
     if out is None:
         expected, remedy = "--out beside it", "leave it out, or give a folder"
         refuse(context, ["workers", "scheduler", "resume"], expected=expected, got="none", remedy=remedy)
-    check_choice(workers, scheduler)
+    if scheduler is not None:
+        refuse(context, ["workers"], expected="none beside --scheduler", got="some", remedy="leave one of them out")
+    require_cores("--workers", workers)
     if out is not None:
         read = (*(scenes or ()), *(Path(name) for name in (sensor, reference, scene) if name))
         folders = [out / name for name in ("degraded", "reference", "parts")]
@@ -122,9 +123,9 @@ def simulate(
         _explain(recipe, origins(own, call, add or (), forbid or ()))
     if out is None:
         return
-    with steps("simulating", len(plan_windows(recipe))) as bar:
-        make = partial(spread_patches, scheduler=scheduler) if scheduler else None
-        summary = write_dataset(recipe, out, workers or os.cpu_count() or 1, resume, bar.advance, make)
+    with open_cluster(scheduler) as cluster, steps("simulating", len(plan_windows(recipe))) as bar:
+        count, pool = (cluster.slots, cluster.pool) if cluster else (workers or os.cpu_count() or 1, None)
+        summary = write_dataset(recipe, out, count, resume, bar.advance, pool)
     rejected = f"; {summary['rejected_share']:.1%} of the drawn SNR pairs were impossible and drawn again"
     pairs = f"{summary['patches']:.0f} pair{'' if summary['patches'] == 1 else 's'}"
     say(f"wrote {pairs} to {out}" + (rejected if summary["rejected_share"] else ""))

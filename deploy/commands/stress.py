@@ -1,4 +1,4 @@
-"""`beers-deploy stress`: hard cases against a network and everything around it. Exit code 1 when something fails."""
+"""`beers-deploy stress`: hard cases and bit flips against a network. Exit code 1 when something fails."""
 
 from functools import partial
 from pathlib import Path
@@ -12,8 +12,8 @@ from model.shipped import SENSOR, VARIANT
 from profiles.target import DEFAULT_TARGET
 
 if TYPE_CHECKING:
-    from deploy.stress.flip_study import FlipRequest
-    from deploy.stress.subject import Subject
+    from deploy.studies.stress.bit_flips import FlipRequest
+    from deploy.studies.stress.networks import Subject
 
 EXAMPLE = "stress float.onnx int8.onnx --out stability.md"
 
@@ -61,28 +61,27 @@ def stress(
     ] = None,
     json: Annotated[Path | None, typer.Option(help="Write the figures here.")] = None,
 ) -> None:
-    """Run hard cases through simulator, traditional chain, network, INT8, tiling, metrics and losses.
+    """Run hard cases through a network in float32, in INT8, in whole numbers alone and in tiles.
 
-    Prints what holds, the worst measures, the known limitations met, and what is proven for every image. With
+    Prints what holds, the worst measures, the known limitations met, and which sums are proven not to overflow. With
     --bit-flips: what bit flips in weights, shifts, maps and the image cost, what guards buy back, and what
     these cost on the board.
     """
     from deploy.results import Document, print_rows
-    from deploy.stress.battery import STAGES, chosen, run_battery
-    from deploy.stress.cases import CASES
-    from deploy.stress.flip_study import FlipRequest
-    from deploy.stress.rows import (
+    from deploy.studies.stress.battery import (
         battery_rows,
-        bound_rows,
+        chosen,
         finding_rows,
         layer_rows,
         limitation_rows,
-        markdown,
         overflow_proven,
-        proof_rows,
-        title,
+        run_battery,
+        worst_rows,
     )
-    from deploy.stress.subject import open_subject
+    from deploy.studies.stress.bit_flips import FlipRequest
+    from deploy.studies.stress.cases import CASES
+    from deploy.studies.stress.networks import STAGES, open_subject
+    from deploy.studies.stress.tables import markdown, title
     from model.io.files import require_writable, write_text
     from model.progress import steps
     from profiles.figures import by_table
@@ -101,24 +100,23 @@ def stress(
     subject = open_subject(*files, sensor, tell)
     selected = [case for case in CASES if case.name in names]
     with steps("stressing", len(selected) * len(wanted)) as bar:
-        outcomes = run_battery(subject, selected, wanted, seed, bar.advance, size)
-    tables = (battery_rows(outcomes), bound_rows(outcomes), limitation_rows(outcomes))
-    shown = [row for table in (*tables, proof_rows(subject, outcomes), layer_rows(subject)) for row in table]
+        results = run_battery(subject, selected, wanted, seed, bar.advance, size)
+    shown = [*battery_rows(results), *worst_rows(results), *limitation_rows(results), *layer_rows(subject)]
     for table, rows in by_table(shown).items():
         print_rows(title(table), rows)
     arguments = {"variant": variant, "sensor": sensor, "cases": cases, "stages": stages, "size": size, "seed": seed}
-    Document("stress", arguments, subject.paths, (*shown, *finding_rows(outcomes))).write(json)
+    Document("stress", arguments, subject.paths, (*shown, *finding_rows(results))).write(json)
     if out is not None:
         write_text(out, markdown(shown))
-    for reason in dict.fromkeys(outcome.reason for outcome in outcomes if outcome.reason):
+    for reason in dict.fromkeys(result.reason for result in results if result.reason):
         say(f"not looked at: {reason}")
-    failed = [outcome for outcome in outcomes if outcome.failed]
-    for outcome in failed:
-        say(f"FAILED {outcome.case.name}, {outcome.stage}: {outcome.verdict.removeprefix('FAILED: ')}")
+    failed = [result for result in results if result.failed]
+    for result in failed:
+        say(f"FAILED {result.case.name}, {result.stage}: {result.verdict.removeprefix('FAILED: ')}")
     safe = overflow_proven(subject)
     if not safe:
         say("FAILED: an int32 accumulator might overflow, see the integer layers")
-    say(f"stress {'passed' if not failed and safe else 'FAILED'}: {len(outcomes)} looks, {len(failed)} failed")
+    say(f"stress {'passed' if not failed and safe else 'FAILED'}: {len(results)} looks, {len(failed)} failed")
     if failed or not safe:
         raise typer.Exit(1)
 
@@ -143,14 +141,14 @@ def _flip_bits(
     from dataclasses import asdict
 
     from deploy.results import Document, print_rows
-    from deploy.stress.flip_study import flip_curves_svg, flip_rows, ticks
-    from deploy.stress.rows import markdown, title
+    from deploy.studies.stress.bit_flips import flip_curves_svg, flip_rows, ticks
+    from deploy.studies.stress.tables import markdown, title
     from model.io.files import write_text
     from model.progress import steps
     from profiles.figures import by_table
 
     out, picture, json = wanted
-    with steps("turning bits over", ticks(subject, request)) as bar:
+    with steps("turning bits over", ticks(request)) as bar:
         rows = flip_rows(subject, request, bar.advance)
     for table, found in by_table(rows).items():
         print_rows(title(table), found)

@@ -1,5 +1,6 @@
 """`beers-deploy train`: make a network's weights from images and two sensor profiles."""
 
+from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
 
@@ -11,6 +12,13 @@ from model.processor import SEEDS
 EXAMPLE = "train --variant convbeers-s --images aerial/ --out runs/s --steps 20000"
 RANGE = "pleiades-variable"
 """The sensors of a network that is for no single one."""
+
+
+class Precision(StrEnum):
+    """The number format of a step's convolutions."""
+
+    float32 = "float32"
+    bfloat16 = "bfloat16"
 
 
 def train(
@@ -71,8 +79,8 @@ def train(
     seed: Annotated[int, typer.Option(min=0, max=SEEDS, help="Seed of weights and patches.")] = 0,
     device: Annotated[str, typer.Option(help="cpu, or cuda.")] = "cpu",
     precision: Annotated[
-        str | None, typer.Option(help="float32 or bfloat16; by default what is faster on this processor.")
-    ] = None,
+        Precision, typer.Option(help="Of the body's convolutions; bfloat16 is faster where there are units for it.")
+    ] = Precision.float32,
     resume: Annotated[bool, typer.Option("--resume", help="Go on from the run's checkpoint.")] = False,
 ) -> None:
     """Train a network on pairs simulated on the fly, or stored; resumable, the same weights for the same seed.
@@ -86,13 +94,12 @@ def train(
     from typing import get_args
 
     from deploy.networks import weights_file
-    from model.evaluation.pairs import profiles_for, read_pairs_recipe
     from model.family import SensorFamily
     from model.io.files import require_writable
+    from model.recipe import profiles_for, read_pairs_recipe
     from model.training.checkpoint import Optimiser, TrainingRecipe
     from model.training.losses import LossWeights
     from model.training.patches import PatchRecipe
-    from model.training.precision import Precision
     from model.training.run import FILES, Run, weights_name
     from model.training.run import train as run_training
     from model.training.workers import joined
@@ -100,8 +107,6 @@ def train(
 
     if optimiser not in get_args(Optimiser):
         raise OptionError("--optimiser", expected="adam or adamw", got=repr(optimiser), remedy="pick one")
-    if precision not in (None, *get_args(Precision)):
-        raise OptionError("--precision", expected="float32 or bfloat16", got=repr(precision), remedy="pick one")
     if pairs is not None and (images is not None or drawn or rough):
         expected, remedy = "no --images, --drawn or --rough beside it", "leave one out"
         raise OptionError("--pairs", expected=expected, got="both", remedy=remedy)
@@ -140,7 +145,7 @@ def train(
         validate_every,
         tensorboard,
         device,
-        precision,  # type: ignore[arg-type]
+        precision.value,
     )
     with joined(device) as worker:
         run_training(run, resume, worker, say)

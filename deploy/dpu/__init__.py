@@ -2,5 +2,5 @@
 
 - `board`: a configuration with its constants; `graph`: a network as the DPU sees it;
 - `reading`: an ONNX file becomes such a graph; `integers`: its numbers;
-- `checker`: rules and placement; `cost`: time and power; `zoo`: published networks that the cost model is fitted on.
+- `checker`: rules and placement; `cost`: time and power.
 """

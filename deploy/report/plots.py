@@ -1,8 +1,7 @@
-"""Plots by matplotlib, in one look: as SVG, light or dark as the reader's screen is, and as PNG.
+"""Plots by matplotlib in one look, as SVG files that are light or dark as the reader's screen is.
 
 Figures are drawn in the colours LIGHT and measured in pixels, 72 of them an inch, so that matplotlib's points are
-pixels too. In an SVG each colour becomes a variable that a style sheet sets for light and for dark screens; its
-attributes replace matplotlib's inline styles, which a page's content security policy forbids.
+pixels too. In the SVG each colour becomes a variable that a style sheet sets for light and for dark screens.
 """
 
 import base64
@@ -13,7 +12,6 @@ import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import cache
 from typing import TYPE_CHECKING
 from xml.etree import ElementTree as ET
 
@@ -33,13 +31,13 @@ PX_PER_INCH = 72
 FONT_PX, TITLE_PX = 13, 15
 
 LIGHT = {
-    "ink": "#1b1f24", "soft": "#5b6470", "line": "#d5dae0", "page": "#ffffff", "reached": "#eef4f8",
+    "ink": "#1b1f24", "soft": "#5b6470", "line": "#d5dae0", "page": "#ffffff",
     "mark0": "#0072b2", "mark1": "#d55e00", "mark2": "#008a64", "mark3": "#b4558d", "mark4": "#a87000",
 }  # fmt: skip
 """Colours by what they are for; the marks' are Okabe and Ito's, darkened where white would swallow them."""
 
 DARK = {
-    "ink": "#e7eaee", "soft": "#9aa4b0", "line": "#39414b", "page": "#14171b", "reached": "#1a2129",
+    "ink": "#e7eaee", "soft": "#9aa4b0", "line": "#39414b", "page": "#14171b",
     "mark0": "#56b4e9", "mark1": "#e8711a", "mark2": "#1fb88a", "mark3": "#cc79a7", "mark4": "#e69f00",
 }  # fmt: skip
 SERIES = ("mark0", "mark1", "mark2", "mark3", "mark4", "ink")
@@ -91,18 +89,6 @@ def new_figure(width_px: float, height_px: float) -> "Figure":
     return Figure(figsize=(width_px / PX_PER_INCH, height_px / PX_PER_INCH), dpi=PX_PER_INCH)
 
 
-@cache
-def text_width(text: str, size_px: float = FONT_PX) -> float:
-    """Width of a line in pixels, in matplotlib's own font: wider than those that a browser takes in its place."""
-    from matplotlib.font_manager import FontProperties
-    from matplotlib.textpath import text_to_path
-
-    with look():
-        width, _, _ = text_to_path.get_text_width_height_descent(text, FontProperties(size=size_px), ismath=False)
-    wide = sum(ord(letter) > 0x2E7F for letter in text)  # letters that the font lacks and that fill a square
-    return float(width) + 0.5 * wide * size_px
-
-
 SUBDIVISIONS = ((1.0, 1.5, 2.0, 3.0, 5.0, 7.0), (1.0, 2.0, 5.0), (1.0, 3.0), (1.0,))
 LEAST_TICKS = 3
 
@@ -128,50 +114,45 @@ def round_values(low: float, high: float, most: int, *, logarithmic: bool) -> li
     return values
 
 
-def svg_of(
-    figure: "Figure",
-    name: str,
-    titles: Mapping[str, str] | None = None,
-    *,
-    linked: bool = False,
-    alone: bool = False,
-    stretched: bool = False,
-) -> Markup:
-    """A figure as an SVG element.
+SVG, XLINK = "http://www.w3.org/2000/svg", "http://www.w3.org/1999/xlink"
+
+
+def svg_of(figure: "Figure", name: str, titles: Mapping[str, str] | None = None) -> Markup:
+    """A figure as an SVG file, light or dark as its reader's screen is.
 
     Args:
-        figure: drawn within `look`.
+        figure: drawn within `look`, in colours of LIGHT.
         name: what a screen reader calls it.
         titles: what appears when the pointer rests on the artists of a group id (`set_gid`).
-        linked: whether each of those artists leads to the element of the page that has its group id.
-        alone: as a file with its own style sheet; else for a page that has it.
-        stretched: whether it fills whatever room the page gives it, out of proportion.
     """
-    root = ET.fromstring(_saved(figure))  # noqa: S314 - our own
-    _inline(root)
-    width, height = root.get("viewBox", "").split()[2:]
-    root.attrib = {"class": "plot", "viewBox": f"0 0 {width} {height}", "role": "group", "aria-label": name}
-    if alone:
-        root.attrib |= {"xmlns": "http://www.w3.org/2000/svg", "width": width, "height": height}
-        style = ET.Element("style")
-        style.text = plot_style()
-        root.insert(0, style)
-    if stretched:
-        root.set("preserveAspectRatio", "none")
-    for group in root.iter("g"):
-        title = (titles or {}).get(group.get("class", ""))
-        if title is not None:
-            _explain(group, title, linked=linked)
-    return Markup(ET.tostring(root, encoding="unicode"))  # noqa: S704 - ElementTree escapes
-
-
-def _saved(figure: "Figure") -> str:
-    """What matplotlib writes, without name spaces."""
     stream = io.BytesIO()
     with look():
         figure.savefig(stream, format="svg", metadata=dict.fromkeys(("Date", "Creator", "Format", "Type")))
-    text = re.sub(r' xmlns(:\w+)?="[^"]*"', "", stream.getvalue().decode().replace("xlink:href", "href"))
-    return printable(text)
+    ET.register_namespace("", SVG)
+    ET.register_namespace("xlink", XLINK)
+    text = re.sub(r' transform="rotate\(-0 [^"]*"', "", printable(stream.getvalue().decode()))
+    for key, colour in LIGHT.items():
+        text = text.replace(colour, f"var(--{key})")
+    root = ET.fromstring(text)  # noqa: S314 - our own
+    width, height = root.get("viewBox", "").split()[2:]
+    root.attrib |= {"width": width, "height": height, "role": "group", "aria-label": name}
+    style = ET.Element(f"{{{SVG}}}style")
+    style.text = plot_style()
+    root.insert(0, style)
+    for group in root.iter(f"{{{SVG}}}g"):
+        _name(group, titles or {})
+    return Markup(ET.tostring(root, encoding="unicode"))  # noqa: S704 - ElementTree escapes
+
+
+def _name(group: ET.Element, titles: Mapping[str, str]) -> None:
+    """A class for a group id of ours (matplotlib's own have a _), and its title."""
+    kind = group.attrib.pop("id", "_")
+    if "_" not in kind:
+        group.set("class", "dot" if kind in titles else kind)
+    if kind in titles:
+        words = ET.Element(f"{{{SVG}}}title")
+        words.text = printable(titles[kind])
+        group.insert(0, words)
 
 
 def printable(text: str) -> str:
@@ -179,62 +160,15 @@ def printable(text: str) -> str:
     return re.sub("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]", "\ufffd", text)
 
 
-def _inline(root: ET.Element) -> None:
-    """Give each use of a marker its path, and leave out definitions: nothing refers to another element by its id."""
-    shapes = {f"#{path.get('id')}": path for path in root.iterfind(".//defs/path")}
-    for parent in list(root.iter()):
-        for child in list(parent):
-            if child.tag == "defs":
-                parent.remove(child)
-            elif child.tag == "use":
-                x, y = (child.attrib.pop(key) for key in "xy")
-                child.tag = "path"
-                child.attrib |= {
-                    "d": shapes[child.attrib.pop("href")].get("d", ""),
-                    "transform": f"translate({x} {y})",
-                }
-    for element in root.iter():
-        _plain(element)
-
-
-def _plain(element: ET.Element) -> None:
-    """Attributes for styles, a class for a group id of ours, variables for colours, and two decimals."""
-    names = {colour: name for name, colour in LIGHT.items()}
-    given = element.attrib
-    styles = (part.split(":") for part in given.pop("style", "").split(";") if part)
-    given |= {key.strip(): value.strip() for key, value in styles if key.strip() != "font-family"}
-    given.pop("clip-path", None)
-    group = given.pop("id", "_")
-    if "_" not in group:  # matplotlib's own ids have it
-        given["class"] = group
-    if given.get("transform", "").startswith("rotate(-0 "):
-        del given["transform"]
-    for key in given.keys() & {"fill", "stroke"}:
-        given[key] = f"var(--{names[given[key]]})" if given[key] in names else given[key]
-    for key in given.keys() & {"d", "x", "y", "transform"}:
-        given[key] = re.sub(r"-?\d+\.\d+", lambda found: f"{float(found[0]):.2f}", " ".join(given[key].split()))
-
-
-def _explain(group: ET.Element, title: str, *, linked: bool) -> None:
-    """Make a group one that shows a title, and where wanted a link to what has its id."""
-    if linked:
-        group.tag = "a"
-        group.attrib |= {"href": f"#{group.get('class')}", "tabindex": "-1"}
-    group.set("class", "dot")
-    words = ET.Element("title")
-    words.text = printable(title)
-    group.insert(0, words)
-
-
-def plot_style() -> Markup:
-    """The style sheet of plots: their colours, light and dark, and their letters."""
+def plot_style() -> str:
+    """The style sheet of plots: their colours, light and dark."""
     light, dark = (" ".join(f"--{name}: {colour};" for name, colour in colours.items()) for colours in (LIGHT, DARK))
-    return Markup(  # noqa: S704 - no foreign words
-        f":root {{ {light} }}\n@media screen and (prefers-color-scheme: dark) {{ :root {{ {dark} }} }}\n"
-        '.plot text { font-family: Arial, Helvetica, "Liberation Sans", sans-serif; pointer-events: none; }\n'
-        ".plot .label text { paint-order: stroke; stroke: var(--page); stroke-width: 3px; stroke-linejoin: round; }\n"
-        ".plot a.dot:hover path { stroke: var(--ink); }\n"
-    )
+    return f":root {{ {light} }}\n@media screen and (prefers-color-scheme: dark) {{ :root {{ {dark} }} }}\n"
+
+
+def data_url(svg: str) -> str:
+    """An SVG file as a data: address."""
+    return "data:image/svg+xml;base64," + base64.b64encode(svg.encode()).decode()
 
 
 Points = tuple[tuple[float, float], ...]
@@ -299,7 +233,7 @@ def curves_svg(panels: Sequence[Panel], x_title: str, y_title: str, *, logarithm
         figure.supylabel(y_title, size=FONT_PX, color=LIGHT["soft"])
         columns, at = math.ceil(len(named) / rows), (0.5, LEGEND_PX / height_px)
         figure.legend(named.values(), named, ncols=columns, loc="lower center", bbox_to_anchor=at)
-        return svg_of(figure, f"{y_title} against {x_title}", alone=True)
+        return svg_of(figure, f"{y_title} against {x_title}")
 
 
 HISTOGRAM_PX = (358, 240)
@@ -329,8 +263,7 @@ def histogram_url(spread: "Spread") -> str:
         axes.yaxis.set_ticks([10.0**-d for d in rows], labels=[f"{100 * 10.0**-d:.{max(d - 2, 0)}f} %" for d in rows])
         axes.yaxis.set_ticks([], minor=True)
         axes.grid(visible=False, axis="x")
-        svg = svg_of(figure, "Share of the pixels by the difference of INT8 from float", alone=True)
-    return "data:image/svg+xml;base64," + base64.b64encode(svg.encode()).decode()
+        return data_url(svg_of(figure, "Share of the pixels by the difference of INT8 from float"))
 
 
 def bins(spread: "Spread") -> tuple[np.ndarray, np.ndarray, int]:

@@ -9,9 +9,8 @@ An image passes, in this order:
     bands        a sensor, and so a network, for each band
     plan         how it is cut into tiles, and the memory that takes
     radiometry   which pixel value is full scale, and who says so
-    runtime      the network, on onnxruntime or OpenVINO
+    runtime      the network, on onnxruntime or OpenVINO, here or by the workers of a Dask scheduler
     engine       the one tile loop, for files and arrays: `restore_rows`, `restore_array`, `restore_dn`
-    workers      the same rows by the workers of a Dask cluster
     output       finished rows in a checkpoint, the lock, the TIFF
     cog          the finished TIFF cloud-optimised, by GDAL; `stac` its item for a catalogue
     run          all of this for one file: `restore_file`

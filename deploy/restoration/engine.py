@@ -7,7 +7,7 @@ order: the next strip is read ahead, and several tiles are in work at a time. `r
 
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -24,11 +24,6 @@ from quant.untrusted import times
 
 NAME = "image"
 """What messages call an image that came without a file."""
-
-Say = Callable[[str], None]
-"""Tells the user something."""
-Tick = Callable[[int], None]
-"""Told how many tiles are done since; stops the run where somebody asked to."""
 
 
 class Tile(NamedTuple):
@@ -297,7 +292,7 @@ def restore_rows(
             for k, row in enumerate(rows):
                 strip = coming.pop().result()
                 coming += [reader.submit(restorer.read, source, nxt.start, nxt.stop) for nxt in rows[k + 1 : k + 2]]
-                begun.append((row, _tiles(strip, row, plan, restorer, pool.map)))
+                begun.append((row, _tiles(strip, row, plan, restorer, pool)))
                 if len(begun) > 1:
                     yield _joined(*begun.popleft(), plan, restorer, tick)
             while begun:
@@ -306,20 +301,9 @@ def restore_rows(
             pool.shutdown(cancel_futures=True)  # or the tiles of two rows would still be restored after an error
 
 
-def restore_row(strip: Strip, row: Span, plan: Plan, restorer: Restorer, tick: Callable[[], None]) -> RestoredRow:
-    """Restore one row of tiles, tile by tile in this thread; `tick` is called once a tile.
-
-    Raises:
-        ImageError: the network gives NaN or infinity.
-    """
-    return _joined(row, _tiles(strip, row, plan, restorer, map), plan, restorer, tick)
-
-
-def _tiles(
-    strip: Strip, row: Span, plan: Plan, restorer: Restorer, mapped: Callable[..., Iterator[Tile]]
-) -> Iterator[Tile]:
-    """The tiles of one row, in the order of `_places`; `mapped` says who restores them."""
-    return mapped(lambda place: restorer.tile(strip, place[0], row, place[1]), _places(plan))
+def _tiles(strip: Strip, row: Span, plan: Plan, restorer: Restorer, pool: Executor) -> Iterator[Tile]:
+    """The tiles of one row, in the order of `_places`."""
+    return pool.map(lambda place: restorer.tile(strip, place[0], row, place[1]), _places(plan))
 
 
 def _joined(

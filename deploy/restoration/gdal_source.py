@@ -64,7 +64,8 @@ def open_gdal(path: Path, trusted: bool = False) -> Iterator["GdalSource"]:
         MachineError: rasterio is not installed.
     """
     rasterio = _rasterio(path)
-    tiles = [file for file in index_files(path, trusted) if not is_index(file)]
+    files = path, *index_files(path, trusted)
+    tiles = [file for file in files[1:] if not is_index(file)]
     environment = ENVIRONMENT if trusted else ENVIRONMENT | OFFLINE
     with _damage_in_a_sentence(path), rasterio.Env(**environment):
         dataset = rasterio.open(path.resolve(), driver=GDAL_DRIVERS[path.suffix.lower()])
@@ -73,7 +74,7 @@ def open_gdal(path: Path, trusted: bool = False) -> Iterator["GdalSource"]:
             with rasterio.open(tiles[0]) as tile:
                 block_px = max(block_px, _block_px(tile))
     with dataset:
-        yield GdalSource(path, dataset, block_px, environment)
+        yield GdalSource(files, dataset, block_px, environment)
 
 
 def _block_px(dataset: Any) -> int:
@@ -126,10 +127,10 @@ def _log_in_any_bytes() -> Iterator[None]:
 class GdalSource:
     """An image that GDAL has opened; one thread reads at a time."""
 
-    def __init__(self, path: Path, dataset: Any, block_px: int, environment: dict[str, str]) -> None:
-        self._path, self._dataset, self._environment = path, dataset, environment
-        with _damage_in_a_sentence(path):
-            self.raster = _raster(path, dataset)
+    def __init__(self, files: tuple[Path, ...], dataset: Any, block_px: int, environment: dict[str, str]) -> None:
+        self.files, self._path, self._dataset, self._environment = files, files[0], dataset, environment
+        with _damage_in_a_sentence(self._path):
+            self.raster = _raster(self._path, dataset)
         self._block_px = block_px
 
     def read(self, start: int, stop: int) -> np.ndarray:

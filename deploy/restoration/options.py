@@ -16,7 +16,6 @@ class Runtime(StrEnum):
 
     onnxruntime = "onnxruntime"
     openvino = "openvino"
-    auto = "auto"  # what is fastest here, and gives onnxruntime's bytes: deploy.restoration.choice
 
 
 class Compression(StrEnum):
@@ -39,25 +38,23 @@ class Options:
 
     Attributes:
         model: the network's file.
-        tile_px: longest side of a tile; None leaves it to `runtime` where that is auto, and else is TILE_PX.
+        tile_px: longest side of a tile.
         halo: 'exact', or pixels of context around a tile.
         full_scale: the pixel value that is 1.0 to the network; None leaves it to deploy.restoration.radiometry.
         runtime: what runs the network.
-        threads: of the runtime; 0 takes every core, or a worker's share of them.
+        threads: of the runtime; 0 takes every core, or one for each call that a scheduler's workers run at once.
         compression: of the output.
-        memory_bytes: budget of the process with its workers here, or of each worker elsewhere; None is what is free.
+        memory_bytes: budget of this process; None is what is free.
         resume: go on with a stopped run.
-        workers: processes of this machine that restore; 0 is this process alone.
-        scheduler: address of a Dask scheduler whose workers restore.
+        scheduler: address of a Dask scheduler whose workers run the network; None runs it here.
         bands: networks of single bands by their names, each for its own sensor; empty where `model` is for all.
         cog: whether the output is a Cloud-Optimised GeoTIFF.
         sensor_bits: bits per pixel of the sensor, where the user named its profile.
-        lanes: tiles in work at a time; None leaves it to the number of cores.
         trust_index: whether a VRT or DIMAP may name tiles outside its folder, at URLs too.
     """
 
     model: Path
-    tile_px: int | None = None
+    tile_px: int = TILE_PX
     halo: str = "exact"
     full_scale: float | None = None
     runtime: Runtime = Runtime.onnxruntime
@@ -65,18 +62,11 @@ class Options:
     compression: Compression = Compression.zlib
     memory_bytes: int | None = None
     resume: bool = False
-    workers: int = 0
     scheduler: str | None = None
     trust_index: bool = False
     sensor_bits: int | None = None
     cog: bool = False
     bands: Mapping[str, Path] = field(default_factory=dict)
-    lanes: int | None = None
-
-    @property
-    def is_spread(self) -> bool:
-        """Whether other processes than this one restore."""
-        return bool(self.workers or self.scheduler)
 
 
 def parse_halo(text: str, radius_px: int) -> int:

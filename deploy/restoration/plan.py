@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import onnx
 import psutil
 
-from deploy.restoration.options import TILE_PX, Options, parse_halo
+from deploy.restoration.options import Options, parse_halo
 from deploy.restoration.source import Source
 from profiles.errors import MachineError, ModelError, OptionError, sizes
 from quant.tiling.walk import Tiling, tiling_of
@@ -183,10 +183,9 @@ def plan_for(network: onnx.ModelProto, shape: tuple[int, int, int], options: Opt
         OptionError: options that do not go together.
     """
     tiling = tiling_of(network)
-    tile_px = options.tile_px or TILE_PX
     if tiling.fixed_px is not None:
-        require_fixed_tile(tiling.fixed_px, tile_px, shape[1:])
-    return make_plan(shape, tile_px, parse_halo(options.halo, tiling.halo_px), tiling)
+        require_fixed_tile(tiling.fixed_px, options.tile_px, shape[1:])
+    return make_plan(shape, options.tile_px, parse_halo(options.halo, tiling.halo_px), tiling)
 
 
 def require_fixed_tile(fixed_px: int, tile_px: int, size: tuple[int, int]) -> None:
@@ -260,26 +259,25 @@ def restored_bytes(source: Source, plan: Plan) -> int:
     return plan.tile_shape[0] * plan.scale * bands * width_px * source.raster.out_dtype.itemsize
 
 
-def check_memory(rows: int, budget_bytes: int | None, bulky: bool, share: int = 1) -> int:
+def check_memory(rows: int, budget_bytes: int | None, bulky: bool) -> int:
     """The process's peak memory in bytes: what it holds now, and the rows to come.
 
     Args:
         rows: bytes that rows of the image will take.
         budget_bytes: None allows what is free.
         bulky: most of them for the sake of an image in large strips.
-        share: how many processes share the budget.
 
     Raises:
         MachineError: it does not fit.
     """
     held = psutil.Process().memory_info().rss
-    allowed = budget_bytes // share if budget_bytes else psutil.virtual_memory().available // share + held
+    allowed = budget_bytes or psutil.virtual_memory().available + held
     if held + rows <= allowed:
         return held + rows
     limit, before, rows_size = sizes(allowed, held, rows)
     remedy = "rewrite the image in tiles (gdal_translate -co TILED=YES)" if bulky else "take a smaller --tile"
     raise MachineError(
-        "--memory" + (f", one of {share} processes" if share > 1 else ""),
+        "--memory",
         expected=f"a run within {limit}",
         got=f"{before} before and {rows_size} for rows of the image",
         remedy=f"{remedy} or give it more" if held < allowed else f"give it more than {before}",

@@ -1,6 +1,6 @@
 """One image file restored into another: what the command `restore` does with a network.
 
-open -> settle runtime auto -> plan -> full scale -> open the network -> rows that a checkpoint lacks -> the TIFF
+open -> plan -> full scale -> open the network, here or on a cluster -> rows that a checkpoint lacks -> the TIFF
 -> figures
 
 One row is written while the next is made. Whatever stops a run, the output is the old one or the new one; finished
@@ -8,24 +8,22 @@ rows stay in the checkpoint where a later run can go on.
 """
 
 import time
-from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import closing, contextmanager
 from functools import partial
-from itertools import count
 from math import prod
 from pathlib import Path
 
 import numpy as np
+import onnx
 
-from deploy.cluster import check_choice
+from deploy.cluster import Cluster, open_cluster
 from deploy.host_state import peak_memory
 from deploy.restoration.bands import in_order, require_alike
-from deploy.restoration.choice import require_one_process, settled
 from deploy.restoration.cog import disk_bytes, require_cog, what_was_done, write_cog
-from deploy.restoration.engine import RestoredRow, Restorer, Say, Tick, restore_rows
+from deploy.restoration.engine import RestoredRow, Restorer, restore_rows
 from deploy.restoration.georeference import enlarged_tags
-from deploy.restoration.index_files import index_files
 from deploy.restoration.options import Compression, Options
 from deploy.restoration.output import (
     Checkpoint,
@@ -37,14 +35,13 @@ from deploy.restoration.output import (
 )
 from deploy.restoration.plan import Plan, Span, check_memory, is_bulky, plan_for, rows_bytes
 from deploy.restoration.radiometry import FullScale, full_scale_of
-from deploy.restoration.runtime import open_runtime, tiles_at_once
+from deploy.restoration.runtime import Infer, infer_on, open_runtime, pack, tiles_at_once
 from deploy.restoration.source import Source, fingerprint, open_source
-from deploy.restoration.workers import make_work, rows_of_workers
 from model.io.files import require_writable
 from model.io.images import require_image_file
 from model.processor import require_cores
-from model.progress import held_back, steps
-from profiles.errors import BeersError, ImageError, MachineError, OptionError
+from model.progress import Log, held_back, steps
+from profiles.errors import BeersError, ImageError, MachineError
 from profiles.figures import Figure, Row, measured, predicted, unavailable
 from quant.onnx_file import load_onnx
 from quant.reading.external import network_sha256
@@ -55,11 +52,8 @@ MANY = 0.05
 """Share of an image above its full scale that no scene has, but a wrong full scale."""
 ARITHMETIC = "arithmetic on the plan of tiles"
 
-Rows = Callable[[Sequence[Span], Tick], Generator[RestoredRow, None, None]]
-"""Restores rows of tiles in order, here or by workers."""
 
-
-def restore_file(image: Path, out: Path, options: Options, say: Say) -> Row:
+def restore_file(image: Path, out: Path, options: Options, log: Log, beside: Sequence[Path | None] = ()) -> Row:
     """Restore `image` into the TIFF `out`, and return the run's figures.
 
     Args:
@@ -67,7 +61,8 @@ def restore_file(image: Path, out: Path, options: Options, say: Say) -> Row:
         out: a TIFF of the type `Raster.out_dtype`, in the scale of the image; larger by the network's
             factor where it has one, and in its place on Earth.
         options: what the user chose.
-        say: told the plan, the memory, and how to go on after a stop.
+        log: is told the plan, the memory, and how to go on after a stop.
+        beside: other files that the caller will write: they must be none that the image is read from.
 
     Raises:
         ImageError: no such image, damaged, all missing, or values outside 0 to full scale; nothing is left behind.
@@ -76,13 +71,8 @@ def restore_file(image: Path, out: Path, options: Options, say: Say) -> Row:
         MachineError: another run on `out`; memory, disk, a package or lost workers: finished rows stay for `resume`.
         KeyboardInterrupt: stopped; rows already finished stay for `resume`.
     """
-    check_choice(options.workers, options.scheduler)
-    require_one_process(options)
-    if options.bands and options.is_spread:
-        got, remedy = "one for each band", "leave --workers and --scheduler out"
-        raise OptionError("--sensor", expected="one sensor for workers", got=got, remedy=remedy)
     require_image_file(image)
-    require_writable(out, inputs=(image, *index_files(image, options.trust_index), options.model))
+    require_writable(out, inputs=(image, options.model))
     if options.scheduler is None:
         require_cores("--threads", options.threads)
     require_tiff_name(out)
@@ -91,40 +81,31 @@ def restore_file(image: Path, out: Path, options: Options, say: Say) -> Row:
     else:
         require_codec(options.compression)
     with only_run(out, part_folder(out)):
-        return _restore(image, out, options, say)
+        return _restore(image, out, options, log, beside)
 
 
-def _restore(image: Path, out: Path, options: Options, say: Say) -> Row:
+def _restore(image: Path, out: Path, options: Options, log: Log, beside: Sequence[Path | None]) -> Row:
     started = time.perf_counter()
-    with open_source(image, options.trust_index) as source:
+    with open_source(image, options.trust_index) as source, open_cluster(options.scheduler) as cluster:
+        require_writable(out, *beside, inputs=source.files)
         raster = source.raster
         paths = in_order(options.bands, raster) if options.bands else [options.model]
-        network, *others = networks = [load_onnx(path) for path in paths]
+        networks = [load_onnx(path) for path in paths]
         require_alike(networks)
-        options, chosen = settled(network, raster.shape, options, say)
-        plan = plan_for(network, raster.shape, options)
-        say(plan.sentence)
-        if not options.is_spread:
-            check_memory(rows_bytes(source, plan), options.memory_bytes, is_bulky(source, plan))
+        plan = plan_for(networks[0], raster.shape, options)
+        log(plan.sentence)
+        check_memory(rows_bytes(source, plan), options.memory_bytes, is_bulky(source, plan))
         scale = scale_of(source, plan, options, str(image))
-        at_once = options.lanes or tiles_at_once(options.threads, plan.tiles)
-        infer, runtime = open_runtime(options.runtime, network, options.threads, at_once)
-        more = tuple(open_runtime(options.runtime, other, options.threads, at_once)[0] for other in others)
-        restorer = Restorer(raster, infer, scale.value, plan.tiling, str(image), not scale.assumed, more)
-        figures = {**chosen, **seam_figures(source, plan, restorer)}
+        opened, at_once, runtime = _opened(networks, plan, options, cluster)
+        restorer = Restorer(raster, opened[0], scale.value, plan.tiling, str(image), not scale.assumed, opened[1:])
+        figures = seam_figures(source, plan, restorer)
         # Another version of the runtime might give other bits: rows of one are not finished by another.
         digests = ", ".join(network_sha256(path) for path in paths)
-        job = _job(image, digests, plan, runtime, scale.value)
+        job = _job(image, source, digests, plan, runtime, scale.value)
         cog_bytes = disk_bytes(plan.out_shape, raster.out_dtype.itemsize) if options.cog else 0
         checkpoint = Checkpoint(out, plan.out_shape, raster.out_dtype, job, options.resume, cog_bytes)
         done_rows = checkpoint.rows // plan.scale
-        if options.is_spread:
-            work, peaks_gb = make_work(image, plan, network, runtime, options, scale), list[float]()
-            finish_rows(checkpoint, plan, str(image), say, partial(rows_of_workers, work, source, say, peaks_gb))
-            figures |= worker_figures(peaks_gb)
-        else:
-            here = partial(_rows_here, source, plan, restorer, at_once, options.memory_bytes, say)
-            finish_rows(checkpoint, plan, str(image), say, here)
+        _finish_rows(checkpoint, source, plan, restorer, at_once, options.memory_bytes, log)
     with held_back():  # a stop now would save nothing
         tags = enlarged_tags(raster.tags, plan.scale)
         if options.cog:
@@ -138,9 +119,27 @@ def _restore(image: Path, out: Path, options: Options, say: Say) -> Row:
         above = f"{checkpoint.clipped} pixels above full scale"
         share = checkpoint.clipped / prod(raster.shape)
         doubt = f": {share:.0%} of the image; is that its full scale?" if share > MANY else ""
-        say(f"{above}, {scale.value:g} ({scale.source}), were clipped to it{doubt}")
+        log(f"{above}, {scale.value:g} ({scale.source}), were clipped to it{doubt}")
     figures["clipped pixels"] = measured(checkpoint.clipped, "1", "pixels of the image above its full scale")
     return run_row(image.name, plan, done_rows, time_s, runtime, options, figures, scale)
+
+
+def _opened(
+    networks: Sequence[onnx.ModelProto], plan: Plan, options: Options, cluster: Cluster | None
+) -> tuple[tuple[Infer, ...], int, str]:
+    """The networks ready to run, how many tiles are in work at a time, and the runtime's name and version.
+
+    A cluster is given two tiles for each call that it runs at once, of the two rows of tiles that are in work.
+    """
+    threads = 1 if cluster else options.threads
+    at_once = tiles_at_once(threads, plan.tiles)
+    opened = [open_runtime(options.runtime, network, threads, at_once) for network in networks]
+    infers, runtime = tuple(infer for infer, _ in opened), opened[0][1]
+    if cluster:
+        at_once = max(min(2 * cluster.slots, 2 * plan.row_tiles), 1)
+        packed = (pack(network, options.runtime, options.threads or 1) for network in networks)
+        infers = tuple(infer_on(cluster, each) for each in packed)
+    return infers, at_once, runtime
 
 
 def scale_of(source: Source, plan: Plan, options: Options, name: str) -> FullScale:
@@ -154,10 +153,10 @@ def scale_of(source: Source, plan: Plan, options: Options, name: str) -> FullSca
     return full_scale_of(name, source.raster, largest, options.full_scale, options.sensor_bits)
 
 
-def _job(image: Path, model: str, plan: Plan, runtime: str, full_scale: float) -> dict[str, object]:
+def _job(image: Path, source: Source, model: str, plan: Plan, runtime: str, full_scale: float) -> dict[str, object]:
     """All that decides the pixels, as the journal keeps it; who computes, on how many machines, is no part of it."""
     return {
-        "image": [*fingerprint(image), image.stat().st_mtime_ns],
+        "image": [*fingerprint(source.files), image.stat().st_mtime_ns],
         "model": model,
         "tile_px": plan.tile_px,
         "halo_px": plan.halo_px,
@@ -166,8 +165,25 @@ def _job(image: Path, model: str, plan: Plan, runtime: str, full_scale: float) -
     }
 
 
-def finish_rows(checkpoint: Checkpoint, plan: Plan, name: str, say: Say, restored: Rows) -> None:
+def _finish_rows(
+    checkpoint: Checkpoint,
+    source: Source,
+    plan: Plan,
+    restorer: Restorer,
+    at_once: int,
+    budget_bytes: int | None,
+    log: Log,
+) -> None:
     """Restore the rows that a checkpoint lacks, and keep each in it while the next is made.
+
+    Args:
+        checkpoint: with the rows that are finished.
+        source: the image.
+        plan: of its tiles.
+        restorer: of them.
+        at_once: tiles in work at a time.
+        budget_bytes: of memory; None allows what is free.
+        log: is told the memory, and how to go on after a stop.
 
     Raises:
         ImageError: unreadable rows, values out of range, or no known pixel at all; the rows are thrown away.
@@ -175,30 +191,33 @@ def finish_rows(checkpoint: Checkpoint, plan: Plan, name: str, say: Say, restore
         KeyboardInterrupt: stopped; finished rows stay.
     """
     rows = [row for row in plan.rows if row.keep_start * plan.scale >= checkpoint.rows]
-    tiles = len(rows) * plan.row_tiles
-    with _kept_for_resuming(checkpoint, say), steps("restoring", tiles) as bar, held_back() as interrupt:
+    tiles, steady = len(rows) * plan.row_tiles, min(RUNS_UNTIL_STEADY * at_once, len(rows) * plan.row_tiles)
+    with _kept_for_resuming(checkpoint, log), steps("restoring", tiles) as bar, held_back() as interrupt:
 
-        def tick(done: int) -> None:
-            if done:
-                bar.advance(done)
+        def tick() -> None:
+            bar.advance()
+            if bar.done == steady:
+                needed = rows_bytes(source, plan, begun=True)
+                most = check_memory(needed, budget_bytes, is_bulky(source, plan))
+                log(f"memory: about {most / 1e9:.2f} GB (measured after the first tiles, and the rows to come)")
             if interrupt.asked:
                 raise KeyboardInterrupt
 
         if rows:
-            with closing(restored(rows, tick)) as finished:
+            with closing(restore_rows(source, plan, restorer, rows, tick, at_once)) as finished:
                 _write_behind(finished, checkpoint)
         if not checkpoint.known:
             got, remedy = "NaN or nodata everywhere", "check that it is the right file"
-            raise ImageError(name, expected="some pixels with values", got=got, remedy=remedy)
+            raise ImageError(restorer.name, expected="some pixels with values", got=got, remedy=remedy)
 
 
 @contextmanager
-def _kept_for_resuming(checkpoint: Checkpoint, say: Say) -> Iterator[None]:
+def _kept_for_resuming(checkpoint: Checkpoint, log: Log) -> Iterator[None]:
     """Finished rows outlive a stop and a full disk, not an image or a network that no later run could finish."""
     try:
         yield
     except KeyboardInterrupt:
-        say(f"stopped at row {checkpoint.rows} of {checkpoint.shape[1]}; the same command with --resume goes on")
+        log(f"stopped at row {checkpoint.rows} of {checkpoint.shape[1]}; the same command with --resume goes on")
         raise
     except BeersError as error:
         if not checkpoint.rows or not isinstance(error, MachineError):
@@ -216,33 +235,6 @@ def _write_behind(restored: Iterable[RestoredRow], checkpoint: Checkpoint) -> No
             writing = writer.submit(checkpoint.append, row)
         if writing is not None:
             writing.result()
-
-
-def _rows_here(
-    source: Source,
-    plan: Plan,
-    restorer: Restorer,
-    at_once: int,
-    budget_bytes: int | None,
-    say: Say,
-    rows: Sequence[Span],
-    tick: Tick,
-) -> Generator[RestoredRow, None, None]:
-    """Rows restored in this process, `at_once` tiles at a time; once the first tiles are done, memory is looked at.
-
-    Raises:
-        MachineError: the rows to come do not fit into memory.
-    """
-    tiles, steady = count(1), min(RUNS_UNTIL_STEADY * at_once, len(rows) * plan.row_tiles)
-
-    def done() -> None:
-        if next(tiles) == steady:
-            needed = rows_bytes(source, plan, begun=True)
-            most = check_memory(needed, budget_bytes, is_bulky(source, plan))
-            say(f"memory: about {most / 1e9:.2f} GB (measured after the first tiles, and the rows to come)")
-        tick(1)
-
-    return restore_rows(source, plan, restorer, rows, done, at_once)
 
 
 # The figures of a run.
@@ -285,14 +277,6 @@ def _widened(span: Span, radius_px: int, size_px: int) -> Span:
     return Span(start, stop, span.keep_start, span.keep_stop)
 
 
-def worker_figures(peaks_gb: Sequence[float]) -> dict[str, Figure]:
-    """The memory of the worker that took most, of what each told with every row."""
-    if not any(peaks_gb):
-        return {"worker peak memory": unavailable("GB", "no row was left, or their system counts no peak memory")}
-    how = "resident memory of the largest worker, highest since it began"
-    return {"worker peak memory": measured(max(peaks_gb), "GB", how)}
-
-
 def run_row(
     name: str,
     plan: Plan,
@@ -314,7 +298,7 @@ def run_row(
         "peak memory": peak_memory(),
         **more,
     }
-    workers = {"workers": options.scheduler or str(options.workers)} if options.is_spread else {}
+    workers = {"workers": options.scheduler} if options.scheduler else {}
     scales = {"full scale": f"{scale.value:g}", "full scale from": scale.source}
     text = {"halo": plan.halo_words, **scales, "runtime": runtime, **workers}
     return Row("restore", name, figures, text)

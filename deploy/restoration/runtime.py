@@ -1,6 +1,5 @@
 """What runs a network: onnxruntime by default, OpenVINO as an option, with the same int8 numbers."""
 
-import hashlib
 import os
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -15,6 +14,7 @@ import onnx
 import onnxruntime as ort
 from onnx import helper, numpy_helper
 
+from deploy.cluster import Cluster
 from deploy.restoration.options import Runtime
 from model.processor import asked, require_cores
 from profiles.errors import MachineError, ModelError
@@ -128,14 +128,9 @@ AT_ONCE = 4
 
 
 def tiles_at_once(threads: int, tiles: int) -> int:
-    """How many tiles are usually best restored at a time; 0 threads takes every core."""
-    return max(lanes_for(threads, tiles))
-
-
-def lanes_for(threads: int, tiles: int) -> list[int]:
-    """How many tiles can be restored at a time such that each has as many threads; 0 threads takes every core."""
+    """How many tiles are restored at a time, such that each has as many threads; 0 threads takes every core."""
     cores = threads or os.cpu_count() or 1
-    return [count for count in range(1, AT_ONCE + 1) if cores % count == 0 and count <= max(tiles, 1)]
+    return max(count for count in range(1, AT_ONCE + 1) if cores % count == 0 and count <= max(tiles, 1))
 
 
 def open_runtime(runtime: Runtime, model: onnx.ModelProto, threads: int, at_once: int = 1) -> tuple[Infer, str]:
@@ -166,27 +161,38 @@ def session_threads(threads: int, at_once: int) -> int:
 
 @dataclass(frozen=True)
 class Packed:
-    """A network on its way to another process: an ONNX file's bytes, their digest, and how it is to be run."""
+    """A network on its way to another process: an ONNX file's bytes, and how it is to be run."""
 
     content: bytes
-    digest: str
     runtime: Runtime
     threads: int
 
 
 def pack(model: onnx.ModelProto, runtime: Runtime, threads: int) -> Packed:
     """A network with how it is to be run, as bytes that another process can open."""
-    content = model.SerializeToString()
-    return Packed(content, hashlib.sha256(content).hexdigest(), runtime, threads)
+    return Packed(model.SerializeToString(), runtime, threads)
 
 
-def open_packed(packed: Packed) -> tuple[Infer, str]:
-    """A network that arrived from another process, ready to run, and the runtime's name and version.
+NETWORKS_KEPT = 8
+_opening = Lock()
 
-    Raises:
-        ModelError: not as it was sent.
-    """
-    if hashlib.sha256(packed.content).hexdigest() != packed.digest:
-        got, remedy = "others", "check the connection between the machines"
-        raise ModelError("network", expected=f"bytes of digest {packed.digest[:12]}", got=got, remedy=remedy)
-    return open_runtime(packed.runtime, parse_onnx(packed.content, "network"), packed.threads)
+
+def open_packed(packed: Packed) -> Infer:
+    """A network that arrived from another process, opened once in this one."""
+    with _opening:  # or each thread would open its own
+        return _opened(packed)
+
+
+@lru_cache(maxsize=NETWORKS_KEPT)
+def _opened(packed: Packed) -> Infer:
+    return open_runtime(packed.runtime, parse_onnx(packed.content, "network"), packed.threads)[0]
+
+
+def infer_on(cluster: Cluster, packed: Packed) -> Infer:
+    """A network that is run by the workers of a cluster: each call sends a tile and waits for its result."""
+    shared = cluster.share(packed)
+    return lambda image: cluster.result(cluster.pool.submit(_infer, shared, image))
+
+
+def _infer(packed: Packed, image: np.ndarray) -> np.ndarray:
+    return open_packed(packed)(image)

@@ -5,7 +5,7 @@ whatever else, and arrays, lie in memory.
 """
 
 import hashlib
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,7 +14,6 @@ from typing import Any, Protocol
 import numpy as np
 import tifffile
 
-from deploy.restoration.index_files import index_files
 from model.io.files import TIFF_SUFFIXES
 from model.io.images import damage_in_a_sentence, read_pixels, require_image_file
 from model.io.tiff import check_page, open_tiff
@@ -169,9 +168,15 @@ DIGEST_BYTES = 1 << 16
 
 
 class Source(Protocol):
-    """An image that gives its rows: a `raster` of facts, and pixels as they are asked for."""
+    """An image that gives its rows: a `raster` of facts, and pixels as they are asked for.
+
+    Attributes:
+        raster: the facts.
+        files: that it is read from: its own, and the tiles that an index names; none for an array.
+    """
 
     raster: Raster
+    files: tuple[Path, ...]
 
     def read(self, start: int, stop: int) -> np.ndarray:
         """Rows `start` to `stop` (excluded) of every band, (bands, rows, width), as stored."""
@@ -180,10 +185,10 @@ class Source(Protocol):
         """Memory that reading so many rows at a time takes, besides the rows themselves."""
 
 
-def fingerprint(image: Path) -> tuple[int, str]:
-    """A file's size in bytes, and the SHA-256 of its two ends: quick at any size; an index with its tiles."""
+def fingerprint(files: Iterable[Path]) -> tuple[int, str]:
+    """The files' size in bytes, and the SHA-256 of the two ends of each: quick at any size."""
     digest, size_bytes = hashlib.sha256(), 0
-    for file in (image, *index_files(image, trusted=True)):
+    for file in files:
         size_bytes += file.stat().st_size
         digest.update(_ends(file))
     return size_bytes, digest.hexdigest()
@@ -249,14 +254,14 @@ def whole_source(path: Path) -> "ArraySource":
     dtype = require_numbers(str(path), pixels.dtype)
     bands = pixels[None] if pixels.ndim == 2 else np.moveaxis(pixels, 2, 0)
     count, height_px, width_px = bands.shape
-    return ArraySource(bands, Raster(count, height_px, width_px, dtype))
+    return ArraySource(bands, Raster(count, height_px, width_px, dtype), (path,))
 
 
 class ArraySource:
     """An image in memory: `pixels` (bands, height, width), of which rows are views."""
 
-    def __init__(self, pixels: np.ndarray, raster: Raster) -> None:
-        self._pixels, self.raster = pixels, raster
+    def __init__(self, pixels: np.ndarray, raster: Raster, files: tuple[Path, ...] = ()) -> None:
+        self._pixels, self.raster, self.files = pixels, raster, files
 
     def read(self, start: int, stop: int) -> np.ndarray:
         """Rows `start` to `stop` (excluded) of every band, (bands, rows, width), not copied."""
@@ -272,6 +277,7 @@ class TiffSource:
 
     def __init__(self, path: Path, page: tifffile.TiffPage) -> None:
         self._path, self._page = path, page
+        self.files: tuple[Path, ...] = (path,)
         self.raster = page_raster(str(path), page)
         self._planes, _, height_px, width_px, self._samples = page.shaped
         self._segment_px = min(page.tilelength if page.is_tiled else page.rowsperstrip, height_px)

@@ -6,7 +6,7 @@ scale of the input.
 """
 
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,7 +16,6 @@ from torch import Tensor
 
 from deploy.host_state import peak_memory
 from deploy.restoration.engine import RestoredRow, as_stored, checked_strip
-from deploy.restoration.index_files import index_files
 from deploy.restoration.options import Compression
 from deploy.restoration.output import (
     Checkpoint,
@@ -70,8 +69,8 @@ class Request:
         return Chain(self.sensor.nominal(), self.reference.in_units_of(self.sensor).nominal())
 
 
-def restore_file_traditionally(image: Path, out: Path, request: Request) -> Row:
-    """Restore the mono image `image` into the TIFF `out`, and return the run's figures.
+def restore_file_traditionally(image: Path, out: Path, request: Request, beside: Sequence[Path | None] = ()) -> Row:
+    """As `deploy.restoration.run.restore_file`, of a mono image and by the traditional chain.
 
     Raises:
         ImageError: no such image, damaged, of several bands, all missing, of a scale left open, or values outside 0
@@ -81,16 +80,17 @@ def restore_file_traditionally(image: Path, out: Path, request: Request) -> Row:
         KeyboardInterrupt: stopped; nothing is left behind.
     """
     require_image_file(image)
-    require_writable(out, inputs=(image, *index_files(image, request.trust_index)))
+    require_writable(out, inputs=(image,))
     require_tiff_name(out)
     require_codec(request.compression)
     with only_run(out, part_folder(out)):
-        return _restore(image, out, request)
+        return _restore(image, out, request, beside)
 
 
-def _restore(image: Path, out: Path, request: Request) -> Row:
+def _restore(image: Path, out: Path, request: Request, beside: Sequence[Path | None]) -> Row:
     started, chain = time.perf_counter(), request.chain()
     with open_source(image, request.trust_index) as source:
+        require_writable(out, *beside, inputs=source.files)
         raster = source.raster
         _require_one_band(raster, image)
         needed = FIXED_BYTES + BYTES_PER_COLUMN * raster.width_px + source.held_bytes(STRIP_PX)
@@ -98,7 +98,7 @@ def _restore(image: Path, out: Path, request: Request) -> Row:
         largest = (raster.largest(source.read(*rows)) for rows in _strips(raster.height_px))
         bits = int(chain.degraded.max_dn).bit_length()
         scale = full_scale_of(str(image), raster, largest, request.full_scale, bits)
-        job = {"image": list(fingerprint(image)), "method": "traditional"}
+        job = {"image": list(fingerprint(source.files)), "method": "traditional"}
         checkpoint = Checkpoint(out, raster.shape, raster.out_dtype, job, resume=False)
         try:
             _fill(checkpoint, source, chain, scale.value, str(image))

@@ -14,7 +14,6 @@ PACKAGES = {
     "profiles": "Sensors, scenes, boards and figures",
     "model.simulator": "Acquire images",
     "model.traditional": "The traditional chain",
-    "model.evaluation": "Compare methods",
     "model.metrics": "What a restored image is worth",
     "model.training": "Train",
     "model.io": "Images and files",

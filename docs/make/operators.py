@@ -13,7 +13,6 @@ from deploy.dpu.checker.finding import Rule
 from deploy.dpu.checker.operators import NUMBERS, RULES, SHIFTS, SIZES, applies, rule_name, rule_text
 from deploy.dpu.checker.other_rules import INSTEAD
 from deploy.dpu.checker.table import REMARKS
-from deploy.dpu.checker.traditional import judge_traditional, verdict
 from deploy.dpu.cost.latency import dpu_power
 from deploy.dpu.graph import Kind
 from deploy.dpu.reading import KINDS
@@ -54,7 +53,7 @@ def document() -> str:
     parts += _rules("Remarks, which break no rule", REMARKS)
     parts += ["## What to use instead\n"]
     parts += [f"- {names}: {remedy}" for names, remedy in _alike(dict(sorted(INSTEAD.items())))]
-    return "\n".join([*parts, "", *_traditional(), ""])
+    return "\n".join([*parts, ""])
 
 
 FIGURES: dict[str, Callable[[Dpu], str]] = {
@@ -142,14 +141,6 @@ def _alike(texts: Mapping[str, str]) -> Iterator[tuple[str, str]]:
         boards.setdefault(text, []).append(name)
     for text, names in boards.items():
         yield "all" if len(names) == len(DPUS) else ", ".join(names), text
-
-
-def _traditional() -> Iterator[str]:
-    yield "## The traditional chain\n"
-    chains = {name: judge_traditional(dpu) for name, dpu in DPUS.items()}
-    for names, text in _alike({name: verdict(steps) for name, steps in chains.items()}):
-        where = names.replace("all", "all boards")
-        yield f"On {where}: {text}. Operator by operator: `beers-deploy check traditional`."
 
 
 if __name__ == "__main__":

@@ -20,8 +20,6 @@ from model.processor import SEEDS
 
 TARGET = Path(__file__).parents[1] / "reference" / "options.md"
 FILE, FOLDER = "file", "folder"
-ADDED = {("gate", "summary"), ("gate", "outputs")}
-"""Outputs that a run adds to, as other steps of a CI job do."""
 
 
 @dataclass(frozen=True)
@@ -52,7 +50,7 @@ PATHS = {
         ("sensor", "target"),
     ),
     "gate": Paths(
-        {"summary": FILE, "junit": FILE, "outputs": FILE, "json": FILE},
+        {"junit": FILE, "json": FILE},
         ("float_model", "int8_model", "config", "baseline", "images", "data"),
         ("sensor", "target"),
     ),
@@ -68,7 +66,7 @@ PATHS = {
     ),
     "stress": Paths({"out": FILE, "json": FILE}, ("float_model", "int8_model", "images"), ("sensor", "target")),
     "tradeoff": Paths(
-        {"out": FOLDER, "cache": FOLDER, "json": FILE},
+        {"out": FOLDER, "json": FILE},
         ("images", "lpips", "calibration", "labelled", "detector", "network"),
         ("sensor", "reference", "networks", "target"),
     ),
@@ -113,7 +111,6 @@ UNITS = {
 
 WORDS = {
     "add": "an effect's name",
-    "against": "a method of the study",
     "budget": "limits such as latency<=20s",
     "cases": "names of cases, with commas",
     "classes": "pairs such as car=vehicle, with commas",
@@ -128,7 +125,6 @@ WORDS = {
     "need": "limits such as psnr>=44",
     "networks": "names, with commas",
     "optimiser": "adam or adamw",
-    "precision": "float32 or bfloat16",
     "preset": "a data set's name",
     "reference": "a profile's name",
     "scene": "a scene's name",
@@ -140,7 +136,6 @@ WORDS = {
     "target": "a board's name",
     "tile": "px, several with commas",
     "variant": "a network's name",
-    "without": "a pass's name",
 }
 """Of what is read as text."""
 
@@ -181,12 +176,22 @@ REFUSED = {
         Refused(("variant",), "--checkpoint WEIGHTS"),
         Refused(("board", "delta", "apply"), without="--checkpoint"),
     ],
-    "quantize": [Refused(("board", "ablate", "report", "without", "finetune"), "--regime free")],
+    "quantize": [Refused(("board", "report", "finetune"), "--regime free")],
     "gate": [Refused(("variant",), "FLOAT INT8")],
-    "check": [Refused(("picture", "tile"), "traditional")],
     "bench": [
         Refused(
-            ("image", "full_scale", "size", "halo", "config", "host_task", "measured", "budget", "within", "layers"),
+            (
+                "image",
+                "full_scale",
+                "size",
+                "halo",
+                "config",
+                "host_task",
+                "measured",
+                "no_traditional",
+                "within",
+                "layers",
+            ),
             "--target host",
         ),
         Refused(("threads",), without="--target host"),
@@ -195,19 +200,16 @@ REFUSED = {
     ],
     "restore": [
         Refused(
-            ("model", "tile", "halo", "runtime", "threads", "workers", "scheduler", "cog", "stac", "resume"),
+            ("model", "tile", "halo", "runtime", "threads", "scheduler", "cog", "stac", "resume"),
             "--method traditional",
         ),
         Refused(("method",), without="--sensor"),
         Refused(("stac",), without="--cog"),
-        Refused(("workers",), SCHEDULER),
-        Refused(("workers", "scheduler"), "--runtime auto"),
     ],
     "evaluate": [Refused(("images", "sweep"), "--pairs PAIRS")],
     "detect": [
         Refused(("labels", "split"), without="--images"),
-        Refused(("drawn", "retrain"), "--images IMAGES"),
-        Refused(("retrain",), "--detector DETECTOR"),
+        Refused(("drawn",), "--images IMAGES"),
     ],
     "tradeoff": [Refused(("detector", "classes"), without="--labelled")],
     "stress": [
@@ -252,7 +254,7 @@ class Parameter:
         """What becomes of a path."""
         paths = PATHS[self.command]
         if self.name in paths.written:
-            whole = "added to" if (self.command, self.name) in ADDED else "written whole or not at all"
+            whole = "written whole or not at all"
             return f"filled with files, each {whole}" if paths.written[self.name] == FOLDER else whole
         return "read" if self.name in (*paths.read, *paths.also_read) else ""
 

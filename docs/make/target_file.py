@@ -110,6 +110,7 @@ KEYS: dict[str, dict[str, tuple[str, str]]] = {
         "width_small_maps": ("1", "the same for small maps"),
         "width_large_maps": ("1", "the same for large maps"),
         "width_outside": ("1", "the same for a network beyond those fitted"),
+        "pair_width": ("1", "the same for ln of the ratio of two networks' rates"),
         "fitted_map_bytes": ("B", "range of the fitted networks"),
         "fitted_operations": ("operations", "range of the fitted networks"),
     },
@@ -119,6 +120,7 @@ KEYS: dict[str, dict[str, tuple[str, str]]] = {
         "product_flops_per_cycle": ("1/cycle", "float32 operations in matrix products, a core"),
         "moved_bytes_per_s": ("B/s", "that a core moves"),
         "decoding_mips_per_ghz": ("MIPS/GHz", "of 7-zip, by which plain code is scaled"),
+        "chain_s_per_mpx": ("s/Mpx", "of the traditional pipeline on all cores, for 10^6 pixels"),
     },
 }
 """Unit and meaning of every key, by its table."""

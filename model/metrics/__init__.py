@@ -1,10 +1,9 @@
 """Instruments: what an image is worth beside its reference, and what it shows by itself.
 
 - with a reference: `fidelity` (PSNR, SSIM), `perceptual` (LPIPS and DISTS, over the networks of `backbones`);
-- from the image alone: `sharpness` (MTF of a slanted edge, which `edges` finds and draws) and `noise_level` (SNR),
-  which refuse (`refusal`) rather than guess;
+- from an image of a target: `slanted_edge` (MTF of an edge drawn at a known angle);
 - from raw images of a sensor, for its profile: `edge_blur` (MTF by many short edges) and `noise_line` (the noise
-  under texture), which refuse as well;
+  under texture); they refuse (`refusal`) rather than guess;
 - `bootstrap` says how far a mean over images can be trusted.
 
 Offered here is what needs no torch, for the gate and the reports; the instruments are imported from their modules.

@@ -7,9 +7,6 @@ import numpy as np
 DRAWS, LEVEL = 4000, 0.95
 WORDS = "95 % bootstrap interval over sites"
 
-NORMAL_90 = 1.6449
-"""Standard deviations on each side of a normal variable's mean that hold 90 % of its values."""
-
 LEAST_SITES = 5
 """Of fewer sites no interval is shown: drawn with replacement, they vary far less than others of their kind would."""
 

@@ -1,6 +1,6 @@
 """The blur of an instrument from short straight edges, fitted by the curve that a sensor profile states.
 
-`sharpness` measures a whole MTF curve across one long edge. Here a profile's own curve is fitted instead,
+`slanted_edge` measures a whole MTF curve across one long edge. Here a profile's own curve is fitted instead,
 MTF(f) = exp(-gamma f) sinc(f) (`simulator.mtf`): one number an edge, for which 17 x 17 pixels are enough. All edges
 together tell how much steeper the curve falls, by a Gaussian part exp(-shape f^2).
 
@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
+from scipy.special import stdtrit
 
 from model.metrics.refusal import Refusal
 from profiles.sensor import MTF_NYQUIST_MAX
@@ -278,9 +279,6 @@ FLOOR = 0.05
 """Least standard error of gamma: what the fit is off on edges along the grid (measured), 2.5 % of the MTF."""
 LONE_ERROR = 0.1
 """Scatter of gamma between edges where only one is known."""
-NORMAL_95 = 1.96
-
-
 SHAPED_EDGES = 40
 """As many tell the shape."""
 WORST = 1e12
@@ -324,7 +322,9 @@ def combine(own: Sequence[EdgeBlur], others: Sequence[EdgeBlur]) -> AxisMtf:
     weights /= weights.sum()
     value = float(weights @ logs)
     error = math.sqrt(float(weights @ ((logs - value) ** 2 + errors**2)))
-    reach = _student_95(len(own)) * math.hypot(error, FLOOR / 2, OTHER_SHAPES * (logs[0] - value))
+    # A lone edge has its scatter assumed.
+    quantile = float(stdtrit(len(own) - 1 or math.inf, 0.975))
+    reach = quantile * math.hypot(error, FLOOR / 2, OTHER_SHAPES * (logs[0] - value))
     low, centre, high, nearest = (
         MTF_NYQUIST_MAX * math.exp(x) for x in (value - reach, value, value + reach, logs[0])
     )
@@ -358,11 +358,3 @@ def _centre(values: np.ndarray, errors: np.ndarray) -> tuple[float, float]:
     between = max(float(v.var(ddof=1)) - float((e**2).mean()), 0.0) if v.size > 1 else LONE_ERROR**2
     weights = 1 / (e**2 + between)
     return float((weights * v).sum() / weights.sum()), float(weights.sum() ** -0.5)
-
-
-def _student_95(count: int) -> float:
-    """Student's quantile to second order, for `count` values; a lone one has its scatter assumed."""
-    if count == 1:
-        return NORMAL_95
-    z, degrees = NORMAL_95, count - 1
-    return z + (z**3 + z) / (4 * degrees) + (5 * z**5 + 16 * z**3 + 3 * z) / (96 * degrees**2)

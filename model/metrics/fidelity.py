@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 
+from model.io.images import MAX_DN
 from profiles.errors import ImageError
 
 SSIM_SIGMA_PX, SSIM_RADIUS_PX = 1.5, 5
@@ -52,3 +53,9 @@ def ssim(image: np.ndarray, reference: np.ndarray, data_range: float) -> float:
     window = {"gaussian_weights": True, "sigma": SSIM_SIGMA_PX, "use_sample_covariance": False}
     with np.errstate(invalid="ignore"):
         return float(structural_similarity(*pixels, data_range=data_range, **window))
+
+
+def fidelity_db(dn: np.ndarray, reference: np.ndarray, degraded: np.ndarray, max_dn: int = MAX_DN) -> float:
+    """PSNR over full scale without the pixels that clipped in the input or the reference: their truth is unknown."""
+    sound = (reference < max_dn) & (degraded < max_dn)
+    return psnr_db(dn[sound], reference[sound], max_dn) if sound.any() else psnr_db(dn, reference, max_dn)

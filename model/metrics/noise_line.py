@@ -1,7 +1,7 @@
 """The noise line of an instrument, variance = alpha L + beta, from blurred images of anything.
 
-`noise_level` wants homogeneous areas, which natural scenes of a few hundred pixels do not have. Here the blur helps:
-it leaves next to no texture in the corners of the spectrum, beyond 0.55 cycles per pixel, and noise is white.
+Natural scenes of a few hundred pixels have no homogeneous areas. The blur helps: it leaves next to no texture in the
+corners of the spectrum, beyond 0.55 cycles per pixel, and noise is white.
 
 1. Cut blocks; the energy of a block's waves up to 0.2 cycles per pixel is its structure, that beyond 0.55 its noise.
 2. Keep the blocks of little structure. Noise does not choose: the two bands share no wave.
@@ -14,6 +14,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.optimize import nnls
 
 from model.metrics.refusal import Refusal
 
@@ -206,24 +207,10 @@ def _fitted(blocks: Blocks, weights: np.ndarray, band: str = "fine") -> np.ndarr
     for _ in range(4):
         noise = np.maximum(fit[0] * blocks.mean + fit[1], ROUNDING) if fit.any() else size
         terms = np.stack([blocks.mean, np.ones(seen.size), np.maximum(blocks.structure - noise, 0)], axis=1)
-        fit = _not_negative(terms, seen, weights / size**2)
+        root = np.sqrt(weights) / size
+        fit, _ = nnls(terms * root[:, None], seen * root)
         size = np.maximum(terms @ fit, 0.3 * ROUNDING)
     return fit
-
-
-def _not_negative(terms: np.ndarray, seen: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Weighted least squares of three terms without negative factors: the best of the subsets that have none."""
-    normal, right = (terms.T * weights) @ terms, (terms.T * weights) @ seen
-    best, least = np.zeros(3), math.inf
-    for chosen in ([0, 1, 2], [0, 1], [0, 2], [1, 2], [0], [1], [2]):
-        part = np.zeros(3)
-        part[chosen] = np.linalg.lstsq(normal[np.ix_(chosen, chosen)], right[chosen], rcond=None)[0]
-        cost = float(part @ normal @ part - 2 * part @ right)
-        if (part >= 0).all() and cost < least:
-            best, least = part, cost
-            if len(chosen) == 3:
-                break
-    return best
 
 
 def _weights(part: np.ndarray, parts: np.ndarray, generator: np.random.Generator) -> np.ndarray:

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 Status = Literal[
-    "angle", "contrast", "clipped", "few-rows", "no-convergence", "not-finite", "few-windows", "range", "no-noise"
+    "contrast", "clipped", "few-rows", "no-convergence", "not-finite", "few-windows", "range", "no-noise"
 ]
 
 

@@ -3,7 +3,7 @@
 import math
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Literal, cast, get_args
+from typing import Literal
 
 import torch
 from torch import Tensor
@@ -12,7 +12,6 @@ from model.convbeers import Network, arrays, load_network, save_network
 from model.io.tensors import all_finite, read_tensors, write_tensors
 from model.training.guards import Guards, require_finite_output
 from model.training.losses import PAPER, LossWeights
-from model.training.precision import Precision
 from profiles.errors import ModelError, OptionError
 
 Optimiser = Literal["adam", "adamw"]
@@ -80,15 +79,14 @@ def write_checkpoint(
     recipe: TrainingRecipe,
     step: int,
     guards: Guards,
-    precision: Precision,
 ) -> None:
-    """Write weights, running average and Adam's moments, any shape each, with step, recipe, guards and precision."""
+    """Write weights, running average and Adam's moments, any shape each, with step, recipe and guards."""
     tensors = {f"network.{k}": v for k, v in network.state_dict().items()}
     tensors |= {f"average.{k}": v for k, v in average.items()}
     for name, parameter in network.named_parameters():
         for moment, value in optimiser.state.get(parameter, {}).items():
             tensors[f"moment.{name}.{moment}"] = value
-    header = {"step": step, "guards": guards.to_json(), "recipe": asdict(recipe), "precision": precision}
+    header = {"step": step, "guards": guards.to_json(), "recipe": asdict(recipe)}
     write_tensors(path, arrays(tensors), header)
 
 
@@ -98,8 +96,8 @@ def read_checkpoint(
     average: dict[str, Tensor],
     optimiser: torch.optim.Optimizer,
     recipe: TrainingRecipe,
-) -> tuple[int, Guards, Precision]:
-    """Fill network, average (any shape each) and optimiser from a checkpoint; return its step, guards and precision.
+) -> tuple[int, Guards]:
+    """Fill network, average (any shape each) and optimiser from a checkpoint; return its step and guards.
 
     Raises:
         ModelError: not a checkpoint, or one of another recipe or network.
@@ -115,9 +113,6 @@ def read_checkpoint(
         step = int(str(header["step"]))
         if not 0 <= step <= recipe.steps:
             raise ValueError(f"step {step} of {recipe.steps}")
-        precision = header["precision"]
-        if precision not in get_args(Precision):
-            raise ValueError(f"precision {precision!r}")
     except (AttributeError, LookupError, TypeError, ValueError, OverflowError) as error:
         got = " ".join(str(error).split())[:120]
         remedy = "choose the variant it was begun with"
@@ -128,7 +123,7 @@ def read_checkpoint(
     for name, parameter in network.named_parameters():
         moments = _part(tensors, f"moment.{name}.")
         optimiser.state[parameter] = {k: _placed(k, v, parameter) for k, v in moments.items()}
-    return step, guards, cast(Precision, precision)
+    return step, guards
 
 
 def finish(network: Network, path: Path, recipe: dict[str, object]) -> Network:

@@ -29,8 +29,7 @@ from model.training.grow import grow
 from model.training.guards import require_finite_output
 from model.training.losses import RestorationLoss
 from model.training.patches import PatchRecipe, PatchSource, StoredPairs, pair_files
-from model.training.precision import Precision
-from model.training.trainer import Progress, Schedule, Source, Trainer
+from model.training.trainer import Precision, Progress, Schedule, Source, Trainer
 from model.training.validation import Validation, split_by_site
 from model.training.workers import Worker
 from model.variants import Variant, variant_named
@@ -65,7 +64,7 @@ class Run:
     validate_steps: int = 1000
     tensorboard: bool = False
     device: str = "cpu"
-    precision: Precision | None = None
+    precision: Precision = "float32"
 
     @property
     def checkpoint(self) -> Path:

@@ -7,17 +7,16 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Protocol
+from typing import Literal, Protocol
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from model.convbeers import BankedConvBEERS, ConvBEERS, Network, initialise
 from model.progress import held_back
 from model.training.checkpoint import TrainingRecipe, read_checkpoint, write_checkpoint
 from model.training.guards import Guards
 from model.training.losses import RestorationLoss
-from model.training.precision import MixedPrecision, Precision, choose_precision
 from model.training.workers import Worker
 from model.variants import Variant
 from profiles.errors import OptionError
@@ -32,6 +31,26 @@ class Source(Protocol):
         For a conditioned network, (degraded, reference, sensor vectors (N, 4)).
         """
         ...
+
+
+Precision = Literal["float32", "bfloat16"]
+"""The number format of a step's convolutions."""
+
+
+class MixedPrecision(nn.Module):
+    """A network with its blocks in the run's precision; what it takes and gives is the network's own.
+
+    Head, tail and what is added stay float32 in any case: 8 bits of mantissa would round a 12-bit image.
+    """
+
+    def __init__(self, network: Network, precision: Precision) -> None:
+        super().__init__()
+        self.network, self.precision = network, precision
+
+    def forward(self, *given: Tensor) -> Tensor:
+        """Images (N, 1, H, W), and sensor vectors (N, 4) of a network that is told them, to (N, 1, H, W)."""
+        restored: Tensor = self.network(*given, bfloat16=self.precision == "bfloat16")
+        return restored
 
 
 @dataclass(frozen=True)
@@ -67,7 +86,7 @@ class Trainer:
         device: where the steps are computed.
         start: weights to go on from, as `state_dict`; None draws new ones.
         teacher: a network of the same kind whose outputs the recipe's `distil` weighs.
-        precision: what the body is computed in; None measures what is faster here.
+        precision: what the body is computed in; it is the machine's, and a resumed run may take another.
         conditioned: whether the network is given the sensor of each patch.
 
     Raises:
@@ -83,7 +102,7 @@ class Trainer:
         device: str = "cpu",
         start: Mapping[str, Tensor] | None = None,
         teacher: Network | None = None,
-        precision: Precision | None = None,
+        precision: Precision = "float32",
         conditioned: bool = False,
     ) -> None:
         self.recipe, self.worker = recipe, worker or Worker()
@@ -94,15 +113,11 @@ class Trainer:
         if start is not None:
             self.network.load_state_dict(dict(start))
         self.network.to(self.device).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-        self._wanted, self._teacher = precision, teacher.to(self.device) if teacher is not None else None
-        self._compute_in(choose_precision(precision, None, self.worker, self.device))
+        self.precision = precision
+        self.forward = self.worker.wrap(MixedPrecision(self.network, precision))
+        self.teacher = MixedPrecision(teacher.to(self.device), precision) if teacher is not None else None
         self.average = {k: v.detach().clone() for k, v in self.network.state_dict().items()}
         self.optimiser = _optimiser(self.network, recipe)
-
-    def _compute_in(self, precision: Precision) -> None:
-        self.precision: Precision = precision
-        self.forward = self.worker.wrap(MixedPrecision(self.network, precision))
-        self.teacher = MixedPrecision(self._teacher, precision) if self._teacher is not None else None
 
     def run(self, source: Source, checkpoint: Path, schedule: Schedule) -> None:
         """Train to the last step. Ctrl-C leaves a checkpoint of the last whole step.
@@ -185,7 +200,7 @@ class Trainer:
         """Write all that an exact resume needs; of several workers, the first does."""
         if self.worker.first:
             parts = self.network, self.average, self.optimiser, self.recipe, self.step, self.guards
-            write_checkpoint(path, *parts, self.precision)
+            write_checkpoint(path, *parts)
 
     def resume(self, path: Path) -> None:
         """Go on from a checkpoint of the same recipe, begun on this processor or another.
@@ -194,8 +209,7 @@ class Trainer:
             ModelError: not a checkpoint, or one of another recipe.
         """
         parts = self.network, self.average, self.optimiser, self.recipe
-        self.step, self.guards, begun = read_checkpoint(path, *parts)
-        self._compute_in(choose_precision(self._wanted, begun, self.worker, self.device))
+        self.step, self.guards = read_checkpoint(path, *parts)
 
 
 class Meter:

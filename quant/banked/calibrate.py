@@ -4,7 +4,7 @@ The body reads the bank's results of many sensors' images, rounded as the core w
 values stand for what its head's bias will be told.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -12,6 +12,7 @@ import numpy as np
 from model.bank import FILTERS, REFERENCE, UNIT_STEPS, Bank, network_bank
 from model.family import SensorFamily, sensor_vector
 from model.io.tensors import Weights
+from model.progress import Log, no_log
 from model.simulator.sampling import Scene
 from model.variants import SENSOR_VALUES
 from profiles import load_sensor
@@ -33,13 +34,10 @@ from quant.graph.network import renamed
 from quant.integer.arithmetic import convolve
 from quant.passes.level import Chain
 from quant.passes.stream import lone_tensors, streams
-from quant.quantise import ALL, Plan, plan_ticks, rounded
+from quant.quantise import Plan, rounded
 
 LIKE = "pleiades-degraded"
 """The profile that gives gain and bits; what is computed is over full scale."""
-
-PASSES = replace(ALL, half_lsb_pair=False)
-"""A pair in the last sum costs 10 to 18 % of the time, and bought 0.007 dB at most: what limits lies elsewhere."""
 
 ANALYTIC, BODY = "analytic", "body.correction"
 """The results that lie side by side: the analytic restoration, and the body's correction of it."""
@@ -136,8 +134,8 @@ def quantise_family(
     weights: Weights,
     bank: Bank,
     images: Remade[np.ndarray],
-    tick: Callable[[], None],
     shifts: Shifts = SHIFTS,
+    log: Log = no_log,
 ) -> Family:
     """A network behind a bank in whole numbers, for the middle of the family.
 
@@ -145,10 +143,10 @@ def quantise_family(
         weights: of a `BankedConvBEERS`.
         bank: of the middle of the family.
         images: of `bank_results`, of sensors from all over the family.
-        tick: called once per image and pass, and step of a search.
         shifts: the windows of the target.
+        log: is told each step.
     """
-    body, *_ = rounded(_plan(weights, shifts), images, tick)
+    body, *_ = rounded(_plan(weights, shifts), images, log)
     told = {op.name: op for op in body.convolutions if op.input == PLANES}
     biases = {name: _biases(op) for name, op in told.items()}
     ops = tuple(_without_values(op) if op.name in told else op for op in body.ops)
@@ -166,11 +164,6 @@ def _without_values(op: IntConv | Op) -> IntConv | Op:
     return replace(op, weight=op.weight[:, :-SENSOR_VALUES])
 
 
-def family_ticks(weights: Weights) -> int:
-    """How often `quantise_family` will call `tick` for the images of `family_images`."""
-    return plan_ticks(_plan(weights, SHIFTS), PATCHES + QUIET_PATCHES)
-
-
 def _plan(weights: Weights, shifts: Shifts) -> Plan:
     """What is to be quantised: the body, from a bank's results."""
     graph, scale = body_graph(weights), weights.variant.scale
@@ -178,7 +171,8 @@ def _plan(weights: Weights, shifts: Shifts) -> Plan:
     ends = Ends(width, 1, adds_image=False, gains=2, outputs=scale**2, direct=True)
     inner = tuple(lone_tensors(graph))
     chain = Chain(inner, (weights.variant.features,) * len(inner), by_channel=False)
-    return Plan(graph, graph, ends, streams(graph), chain, None, PASSES, shifts)
+    # A pair in the last sum costs 10 to 18 % of the time, and bought 0.007 dB at most: what limits lies elsewhere.
+    return Plan(graph, ends, streams(graph), chain, None, shifts, pairs=False)
 
 
 PATCHES, QUIET_PATCHES, QUIET_SNR = 48, 32, (150.0, 220.0)

@@ -40,7 +40,6 @@ from quant.graph.planes import (
     PLANES_FRAC_BITS,
     QUARTER,
     STEP,
-    coarse_plane_only,
     read_planes,
     split,
 )
@@ -50,7 +49,7 @@ from quant.graph.writer import graph_to_onnx
 __all__ = [
     "COARSE_MAX", "CORRECTION", "COUNT", "IMAGE", "PLANES", "PLANES_FRAC_BITS", "QUARTER", "STEP", "Activation",
     "Add", "AveragePool", "Concat", "Conv", "Graph", "MaxPool", "Mul", "Network", "Op", "Pointwise", "Resize",
-    "Shuffle", "Window", "channels_of", "check_network", "coarse_plane_only", "correction_graph",
+    "Shuffle", "Window", "channels_of", "check_network", "correction_graph",
     "graph_to_onnx", "image_channels", "is_plain", "plain_network", "read_network", "read_planes", "refusal",
     "refused_graph", "relu_count", "same", "split", "tensors", "tied", "ties_scales",
 ]  # fmt: skip

@@ -49,14 +49,3 @@ def dense(op: Conv) -> Conv:
     channels = np.arange(op.groups)
     weight[channels, channels] = op.weight[:, 0]
     return replace(op, weight=weight, groups=1)
-
-
-def coarse_plane_only(graph: Graph) -> Graph:
-    """A plane-reading graph that does not look at the remainder: 7 bits of the image, to show what the others buy."""
-    return tuple(_coarse_only(op) if isinstance(op, Conv) and op.input == PLANES else op for op in graph)
-
-
-def _coarse_only(op: Conv) -> Conv:
-    weight = op.weight.copy()
-    weight[:, op.weight.shape[1] // COUNT :] = 0
-    return replace(op, weight=weight)

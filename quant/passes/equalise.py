@@ -63,15 +63,11 @@ def _scaled(op: Conv, factors: np.ndarray, stream: Stream) -> Conv:
 
 
 def channel_ranges(
-    graph: Graph,
-    stream: Stream,
-    images: Iterable[np.ndarray],
-    tick: Callable[[], None],
-    ends: Ends = ONE_CHANNEL,
+    graph: Graph, stream: Stream, images: Iterable[np.ndarray], ends: Ends = ONE_CHANNEL
 ) -> np.ndarray:
     """(C,) range of each stream channel over images (1, C', H, W), the widest of all the stream's tensors."""
     total, count = np.zeros(1), 0
-    for sizes in channel_sizes(graph, sorted(stream), images, tick, ends):
+    for sizes in channel_sizes(graph, sorted(stream), images, ends):
         total, count = total + np.stack(sizes), count + 1
     return above_dead(np.asarray(total / max(count, 1)).max(axis=0))
 
@@ -80,7 +76,6 @@ def channel_sizes(
     graph: Graph,
     names: list[str],
     images: Iterable[np.ndarray],
-    tick: Callable[[], None],
     ends: Ends = ONE_CHANNEL,
     quantile: float = QUANTILE,
 ) -> Iterator[list[np.ndarray]]:
@@ -90,12 +85,9 @@ def channel_sizes(
     for image in images:
         for results in tensor_values(session, names, image, halo_px, ends):
             yield [np.quantile(np.abs(r[0]).reshape(r.shape[1], -1), quantile, axis=1) for r in results]
-        tick()
 
 
-def with_room(
-    graph: Graph, step: float, images: Iterable[np.ndarray], tick: Callable[[], None], ends: Ends = ONE_CHANNEL
-) -> Graph:
+def with_room(graph: Graph, step: float, images: Iterable[np.ndarray], ends: Ends = ONE_CHANNEL) -> Graph:
     """The same network with room in its last sum, which no block reads, for the brightest roofs.
 
     The search that equalises clips what is rare on the patches that it looks at. In the stream that is right, for a
@@ -105,12 +97,11 @@ def with_room(
         graph: that ends with the sum of a half-LSB pair and a convolution.
         step: the value of one unit of the sum.
         images: (1, C', H, W) that tell how large its values are.
-        tick: called once an image.
         ends: what the host does to the images.
     """
     add = graph[-2]
     last, largest = frozenset((*add.inputs, add.output)), np.zeros(1)
-    for sizes in channel_sizes(graph, sorted(last), images, tick, ends, quantile=1.0):
+    for sizes in channel_sizes(graph, sorted(last), images, ends, quantile=1.0):
         largest = np.maximum(largest, np.max(sizes, axis=0))
     limit = INT8_MAX * step
     return equalise(graph, last, limit / np.maximum(ROOM * largest, limit))
@@ -128,22 +119,19 @@ def first_guess(ranges: np.ndarray, levelling: float, headroom: float) -> np.nda
     return np.asarray(factors * headroom * limit / (ranges * factors).max())
 
 
-def search(graph: Graph, stream: Stream, ranges: np.ndarray, trial: Trial, tick: Callable[[], None]) -> np.ndarray:
+def search(graph: Graph, stream: Stream, ranges: np.ndarray, trial: Trial) -> np.ndarray:
     """The factors of least error: the best first guess, then channel by channel."""
     best = None
     for levelling, headroom in product(LEVELLING, HEADROOM):
         guess = first_guess(ranges, levelling, headroom)
         best = race(trial(equalise(graph, stream, guess)), guess, best)
-        tick()
     assert best is not None  # noqa: S101
     if len(ranges) > MOST_CHANNELS:
         return best.factors
-    return stepped(lambda factors: trial(equalise(graph, stream, factors)), range(len(ranges)), best, tick).factors
+    return stepped(lambda factors: trial(equalise(graph, stream, factors)), range(len(ranges)), best).factors
 
 
-def stepped(
-    costs_of: Callable[[np.ndarray], Costs], channels: Iterable[int], best: "Best", tick: Callable[[], None]
-) -> "Best":
+def stepped(costs_of: Callable[[np.ndarray], Costs], channels: Iterable[int], best: "Best") -> "Best":
     """The best factors once each of these channels has been tried larger and smaller."""
     for step in STEPS:
         for channel in channels:
@@ -154,7 +142,6 @@ def stepped(
                 if winner is not best:
                     best = winner
                     break  # the other way leads back
-            tick()
     return best
 
 
@@ -180,8 +167,3 @@ def race(costs_of: Costs, factors: np.ndarray, best: Best | None) -> Best:
         if costs.sum() >= best.costs[order[:seen]].sum() * (1 + margin):
             return best
     return Best(factors, costs)
-
-
-def search_steps(channels: int) -> int:
-    """How often `search` ticks."""
-    return len(LEVELLING) * len(HEADROOM) + (len(STEPS) * channels if channels <= MOST_CHANNELS else 0)

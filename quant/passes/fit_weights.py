@@ -7,7 +7,7 @@ Frantar et al. 2023). From the nearest numbers on, weight after weight takes the
 until none does. What the mean is off by then goes into the bias.
 """
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -49,12 +49,10 @@ class Moments:
         return np.asarray(covariance + floor * np.eye(len(covariance)))
 
 
-def input_moments(
-    graph: Graph, images: Iterable[np.ndarray], tick: Callable[[], None], ends: Ends = ONE_CHANNEL
-) -> dict[str, Moments]:
+def input_moments(graph: Graph, images: Iterable[np.ndarray], ends: Ends = ONE_CHANNEL) -> dict[str, Moments]:
     """The moments of every convolution of a plane-reading graph, by its name, over images (1, C, H, W) in [0, 1].
 
-    The values are those of the float network. `tick` is called once an image.
+    The values are those of the float network.
     """
     convs = [op for op in graph if isinstance(op, Conv) and fits(op)]
     found = {op.name: _nothing(op) for op in convs}
@@ -66,7 +64,6 @@ def input_moments(
             read = {PLANES: planes_of(crop, ends), **dict(zip(names, values, strict=True))}
             for op in convs:
                 found[op.name].add(_windows(read[op.input], op))
-        tick()
     return found
 
 

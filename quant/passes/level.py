@@ -20,7 +20,6 @@ from quant.ends import ONE_CHANNEL, Ends
 from quant.graph import Conv, Graph
 from quant.passes.equalise import (
     MOST_CHANNELS,
-    STEPS,
     Best,
     Costs,
     Trial,
@@ -89,12 +88,6 @@ class Chain:
         """Whether each tensor is tried, once all were together."""
         return self.by_channel or len(self.tensors) <= FEW_TENSORS
 
-    @property
-    def steps(self) -> int:
-        """How often `level` ticks."""
-        tensors = self.one_by_one * len(self.widths)
-        return len(LEVELLING) * len(HEADROOM) + tensors + self.stepped * len(STEPS) * sum(self.widths)
-
     def scaled(self, graph: Graph, factors: np.ndarray) -> Graph:
         """The same network with each channel scaled by its factor."""
         for name, part in zip(self.tensors, self.parts, strict=True):
@@ -107,23 +100,15 @@ class Chain:
         return np.repeat(own, self.widths)
 
 
-def chain_ranges(
-    graph: Graph,
-    chain: Chain,
-    images: Iterable[np.ndarray],
-    tick: Callable[[], None],
-    ends: Ends = ONE_CHANNEL,
-) -> np.ndarray:
+def chain_ranges(graph: Graph, chain: Chain, images: Iterable[np.ndarray], ends: Ends = ONE_CHANNEL) -> np.ndarray:
     """The range of every channel over images (1, C, H, W), that of the tile where it is widest."""
     widest = [np.zeros(width) for width in chain.widths]
-    for sizes in channel_sizes(graph, list(chain.tensors), images, tick, ends):
+    for sizes in channel_sizes(graph, list(chain.tensors), images, ends):
         widest = [np.maximum(most, size) for most, size in zip(widest, sizes, strict=True)]
     return np.concatenate([above_dead(ranges) for ranges in widest])
 
 
-def level(
-    graph: Graph, chain: Chain, ranges: np.ndarray, start: np.ndarray, trial: Trial, tick: Callable[[], None]
-) -> np.ndarray:
+def level(graph: Graph, chain: Chain, ranges: np.ndarray, start: np.ndarray, trial: Trial) -> np.ndarray:
     """The factors of least error that were found, never more than that of `start`."""
     written = {op.output: np.abs(op.weight).max((1, 2, 3)) for op in graph if isinstance(op, Conv)}
     known = [Channels(ranges[part], written[name]) for name, part in zip(chain.tensors, chain.parts, strict=True)]
@@ -134,14 +119,12 @@ def level(
     best = Best(start, costs_of(start)(None))
     for shape in product(LEVELLING, HEADROOM):
         best = _better(np.concatenate([channels.guess(*shape) for channels in known]), costs_of, best)
-        tick()
     if not chain.one_by_one:
         return best.factors
     for channels, part in reversed(list(zip(known, chain.parts, strict=True))):
         best = _one_tensor(channels, part, costs_of, best)
-        tick()
         if chain.stepped:
-            best = stepped(costs_of, range(part.start, part.stop), best, tick)
+            best = stepped(costs_of, range(part.start, part.stop), best)
     return best.factors
 
 

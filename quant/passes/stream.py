@@ -49,14 +49,9 @@ def _passes_factors(graph: Graph, stream: Stream) -> bool:
     return known and homogeneous and not stream & {PLANES, CORRECTION}
 
 
-def share_stream_scale(streams: Iterable[Stream], frac_bits: Mapping[str, int], shared: int) -> dict[str, int]:
+def share_stream_scale(streams: Iterable[Stream], frac_bits: Mapping[str, int]) -> dict[str, int]:
     """The scales with one for all streams."""
-    return {**frac_bits, **{name: shared for stream in streams for name in stream}}
-
-
-def common_frac_bits(streams: Iterable[Stream], frac_bits: Mapping[str, int]) -> int:
-    """The coarsest least-squares scale on the streams: what those that are not equalised take."""
-    return min((frac_bits[name] for stream in streams for name in stream), default=STREAM_FRAC_BITS)
+    return {**frac_bits, **{name: STREAM_FRAC_BITS for stream in streams for name in stream}}
 
 
 OFFSETS = np.array([-0.25, 0.25])

@@ -7,12 +7,13 @@ shifts stay, so the core stays as legal as it was.
 """
 
 import math
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 
 import numpy as np
 import torch
 
+from model.progress import Log, no_log
 from profiles.errors import ImageError
 from quant.calibration import Pair, Remade
 from quant.core import IntCore
@@ -78,8 +79,8 @@ def tune(
     rounded: Graph,
     full: Graph,
     tuning: Tuning,
-    tick: Callable[[], None],
     still: Collection[str] = (),
+    log: Log = no_log,
 ) -> IntCore:
     """The core with the numbers that erred least on pairs that they were not trained on.
 
@@ -88,8 +89,8 @@ def tune(
         rounded: the float operations that it was rounded from.
         full: the float network that reads all planes.
         tuning: on what, how long, how fast.
-        tick: called once a step.
         still: the tensors whose convolutions are not trained.
+        log: is told now and then how many steps are done.
 
     Raises:
         ModelError: NaN or infinity in the float network.
@@ -101,9 +102,9 @@ def tune(
     trainable = TrainableCore(core, [op for op in rounded if isinstance(op, Conv)], still)
     least, kept, every = _cost(trainable, held), core, max(tuning.steps // JUDGEMENTS, 1)
     for step in _descend(trainable, seen, tuning):
-        tick()
         if step % every and step < tuning.steps:
             continue
+        log(f"fine-tuning, step {step} of {tuning.steps}")
         cost = _cost(trainable, held)
         if cost < least:
             least, kept = cost, trainable.core()

@@ -73,13 +73,11 @@ def test_the_document_holds_the_verdict(tmp_path: Path) -> None:
     path = sketch.save(tmp_path / "bad.onnx", sketch.conv(sketch.node("Sigmoid", sketch.conv("image"))))
     bad = verdict(tmp_path / "bad.json", str(path))
     sound = verdict(tmp_path / "sound.json", str(float_convbeers(tmp_path / "n.onnx", 2, 8)))
-    chain = verdict(tmp_path / "chain.json", "traditional")
-    assert [found[0] for found in (bad, sound, chain)] == ["failed", "passed", "failed"]
+    assert [found[0] for found in (bad, sound)] == ["failed", "passed"]
     limit = {"limit": 0, "bound": "at most"}
     nodes = {"name": "nodes the DPU refuses", "unit": "node", **limit}
     assert nodes.items() | {"value": 1, "passed": False}.items() <= bad[1].items()
     assert nodes.items() | {"value": 0, "passed": True, "detail": ""}.items() <= sound[1].items()
-    assert (chain[1]["unit"], chain[1]["value"] > 10) == ("step", True)
 
 
 def verdict(path: Path, model: str) -> tuple[str, dict[str, Any]]:
@@ -107,15 +105,6 @@ def test_a_picture_is_drawn(tmp_path: Path) -> None:
     assert (tmp_path / "g.svg").read_text().startswith("<svg")
     with pytest.raises(OptionError, match="--picture"):
         run(model, "--picture", str(tmp_path / "g.jpg"))
-
-
-def test_the_traditional_chain_is_judged_and_stays_on_the_cpu(tmp_path: Path) -> None:
-    code, output = run("traditional", "--json", str(tmp_path / "t.json"))
-    assert (code, "stays on the CPU" in output) == (1, True)
-    operators = {row["text"]["operator"] for row in tables(tmp_path / "t.json")["nodes"]}
-    assert operators >= {"DFT", "TopK", "Gather", "Cholesky"}
-    with pytest.raises(OptionError, match="--picture"):
-        run("traditional", "--picture", "g.svg")
 
 
 @pytest.mark.slow

@@ -4,7 +4,6 @@ import sys
 import time
 from collections.abc import Iterator
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -14,12 +13,12 @@ from PIL import Image
 from typer.testing import CliRunner
 
 from deploy.cli import app
-from deploy.cluster import local_cluster
-from deploy.dataset_workers import spread_patches
+from deploy.cluster import open_cluster
 from model.dataset import CHUNK, DatasetRecipe, make_patches, plan_windows, write_dataset
 from profiles import load_sensor
 from profiles.errors import ImageError, OptionError
 from profiles.scene_call import calling_for, load_scene_call, origins, scene_names, typical_effects
+from tests.deploy.two_workers import local_cluster
 
 
 @pytest.fixture
@@ -54,10 +53,9 @@ def test_the_bytes_do_not_depend_on_the_workers(scene: Path, tmp_path: Path) -> 
 def test_any_patch_can_be_made_again_alone(scene: Path, tmp_path: Path) -> None:
     write_dataset(small(scene), tmp_path / "all", 1, resume=False, tick=lambda _: None)
     window = plan_windows(small(scene))[7]
-    make_patches(small(scene), [window], tmp_path / "one")
-    for role in ("degraded", "reference"):
-        name = f"{role}/{window.name}.tif"
-        assert (tmp_path / "one" / name).read_bytes() == (tmp_path / "all" / name).read_bytes()
+    (patch,) = make_patches(small(scene), [window])
+    for role, dn in (("degraded", patch.degraded), ("reference", patch.reference)):
+        np.testing.assert_array_equal(dn, tifffile.imread(tmp_path / "all" / role / f"{window.name}.tif"))
 
 
 def test_the_manifest_tells_where_each_patch_comes_from(scene: Path, tmp_path: Path) -> None:
@@ -148,7 +146,7 @@ def scheduler() -> Iterator[str]:
     """The address of a scheduler with two workers."""
     pytest.importorskip("distributed", reason="the extra 'dask' is not installed")
     with local_cluster(2) as local:
-        yield local.scheduler_address
+        yield str(local.scheduler_address)
 
 
 @pytest.mark.slow
@@ -157,14 +155,9 @@ def test_a_scheduler_s_workers_give_the_same_bytes(scene: Path, scheduler: str, 
     assert len(plan_windows(recipe)) > 2 * CHUNK
     write_dataset(recipe, tmp_path / "here", 1, resume=False, tick=silent)
     done: list[int] = []
-    write_dataset(
-        recipe,
-        tmp_path / "there",
-        1,
-        resume=False,
-        tick=done.append,
-        make=partial(spread_patches, scheduler=scheduler),
-    )
+    with open_cluster(scheduler) as cluster:
+        assert cluster
+        write_dataset(recipe, tmp_path / "there", cluster.slots, False, done.append, cluster.pool)
     assert bytes_of(tmp_path / "there") == bytes_of(tmp_path / "here")
     assert sum(done) == len(plan_windows(recipe))
 
@@ -177,37 +170,28 @@ def test_a_dataset_begun_here_is_finished_by_a_scheduler_s_workers(
         if patches:
             raise KeyboardInterrupt
 
-    recipe = DatasetRecipe((scene, scene), VARIABLE, REFERENCE, oversampling=2, patch_px=12)
+    options = [str(scene), "--oversampling", "2", "--patch", "8"]
+    recipe = DatasetRecipe((scene,), load_sensor("pleiades-degraded"), REFERENCE, oversampling=2, patch_px=8)
     with pytest.raises(KeyboardInterrupt):
         write_dataset(recipe, tmp_path / "d", 1, resume=False, tick=stop)
-    done: list[int] = []
-    write_dataset(
-        recipe, tmp_path / "d", 1, resume=True, tick=done.append, make=partial(spread_patches, scheduler=scheduler)
+    done = CliRunner().invoke(
+        app, ["simulate", *options, "--out", str(tmp_path / "d"), "--resume", "--scheduler", scheduler]
     )
-    assert done[0] >= CHUNK
+    assert done.exit_code == 0, done.output
     write_dataset(recipe, tmp_path / "whole", 1, resume=False, tick=silent)
     assert bytes_of(tmp_path / "d") == bytes_of(tmp_path / "whole")
 
 
-def test_a_scene_that_a_worker_does_not_find_is_one_sentence(
-    scene: Path, scheduler: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("deploy.dataset_workers.sha256", lambda path: f"digest of another {path.name}")
-    with pytest.raises(ImageError, match=r"another file of that name.*shared folder"):
-        write_dataset(
-            small(scene),
-            tmp_path / "d",
-            1,
-            resume=False,
-            tick=silent,
-            make=partial(spread_patches, scheduler=scheduler),
-        )
-    assert not list(tmp_path.rglob("*.tif"))
+def test_a_scene_that_cannot_be_read_there_is_one_sentence(scene: Path) -> None:
+    recipe, windows = small(scene), plan_windows(small(scene))
+    scene.unlink()
+    with pytest.raises(ImageError, match="no such file"):
+        make_patches(recipe, windows[:1])
 
 
 def test_workers_and_a_scheduler_do_not_go_together(scene: Path, tmp_path: Path) -> None:
     options = ["simulate", str(scene), "--out", str(tmp_path / "d"), "--workers", "2", "--scheduler", "host:8786"]
     result = CliRunner().invoke(app, options)
     assert result.exit_code == 2
-    assert "leave out --workers" in result.stderr
+    assert "--workers: expected none beside --scheduler" in result.stderr
     assert not (tmp_path / "d").exists()

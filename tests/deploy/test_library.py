@@ -11,7 +11,6 @@ import tifffile
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from deploy.cluster import local_cluster
 from deploy.library import restore
 from deploy.networks import shipped_pair
 from deploy.restoration.options import Options
@@ -19,6 +18,7 @@ from deploy.restoration.run import restore_file
 from profiles.errors import ImageError, ModelError, OptionError
 from profiles.sensor_file import BLIND
 from quant.onnx_file import save_onnx
+from tests.deploy.two_workers import local_cluster
 from tests.quant.tiling.small_networks import espcn
 
 SHAPES = [(61, 83), (17, 130), (1, 40), (29, 29), (3, 5), (3, 41, 35), (1, 50, 20)]

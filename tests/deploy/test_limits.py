@@ -29,7 +29,6 @@ def test_threads_and_processes_are_at_most_the_cores(cores: int, monkeypatch: py
     [
         ["bench", "--target", "host", "--threads", "100000"],
         ["restore", "raw.tif", "out.tif", "--threads", "100000"],
-        ["restore", "raw.tif", "out.tif", "--workers", "100000"],
         ["simulate", "--out", "pairs", "--workers", "100000"],
     ],
 )

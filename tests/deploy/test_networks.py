@@ -18,11 +18,11 @@ from deploy.networks import (
     float_file,
     int8_file,
     network_file,
-    once,
     shipped_pair,
     told_int8,
 )
 from model.io.files import sha256
+from model.progress import once
 from model.shipped import INT8, SENSOR, SHIPPED, shipped_names, shipped_weights
 from profiles.errors import ModelError, ProfileError
 from profiles.sensor import numbers_of

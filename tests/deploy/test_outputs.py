@@ -73,8 +73,6 @@ CASES = {
     for name, paths in PATHS.items()
 }
 WRITERS = [(name, option) for name, case in CASES.items() for option in case.written]
-NEVER_WRITTEN_INTO = {("tradeoff", "cache")}
-"""Names there are digests: they meet no file of a user."""
 
 
 def parameters(command: str) -> dict[str, Any]:
@@ -192,7 +190,7 @@ STANDS: dict[str, tuple[Callable[[Path], object], str]] = {
 
 
 @pytest.mark.parametrize("what", STANDS)
-@pytest.mark.parametrize(("name", "option"), [pair for pair in WRITERS if pair not in NEVER_WRITTEN_INTO])
+@pytest.mark.parametrize(("name", "option"), WRITERS)
 def test_only_a_regular_file_is_written_over(name: str, option: str, what: str, tmp_path: Path) -> None:
     value, file = output_at(name, option, tmp_path)
     file.parent.mkdir(parents=True, exist_ok=True)
@@ -210,11 +208,7 @@ def test_an_output_folder_is_a_folder(name: str, option: str, make: Callable[[Pa
     refused(given(name, tmp_path, **{option: tmp_path / "place"}), tmp_path, "place")
 
 
-TOLD = {("gate", name) for name in ("summary", "junit", "outputs")}
-"""There the gate tells bad input."""
-
-
-@pytest.mark.parametrize(("name", "option"), [pair for pair in WRITERS if pair not in TOLD], ids=str)
+@pytest.mark.parametrize(("name", "option"), WRITERS, ids=str)
 def test_what_is_refused_for_its_input_leaves_no_new_folder(name: str, option: str, tmp_path: Path) -> None:
     source = kept(tmp_path / f"source{CASES[name].suffix}")
     value, _ = output_at(name, option, tmp_path / "new" / "below")
@@ -226,9 +220,8 @@ def test_what_is_refused_for_its_input_leaves_no_new_folder(name: str, option: s
 
 def inputs_met() -> Iterator[tuple[str, str, str]]:
     for name, option in WRITERS:
-        if (name, option) not in NEVER_WRITTEN_INTO:
-            for source in (*CASES[name].read, *CASES[name].also_read):
-                yield name, option, source
+        for source in (*CASES[name].read, *CASES[name].also_read):
+            yield name, option, source
 
 
 @pytest.mark.parametrize("how", ["itself", "symbolic link", "hard link"])
@@ -280,12 +273,7 @@ def test_pictures_do_not_go_where_images_are_read(command: str, tmp_path: Path) 
     refused([command, *wanted[command]], tmp_path, "the folder of an input")
 
 
-PAIRS = [
-    (name, one, other)
-    for name, case in CASES.items()
-    for one, other in combinations(case.written, 2)
-    if not {(name, one), (name, other)} & NEVER_WRITTEN_INTO
-]
+PAIRS = [(name, one, other) for name, case in CASES.items() for one, other in combinations(case.written, 2)]
 
 
 @pytest.mark.parametrize(("name", "one", "other"), PAIRS)
@@ -321,13 +309,6 @@ def test_the_curves_of_bit_flips_are_an_output_too(tmp_path: Path) -> None:
     core = kept(tmp_path / "curves.svg")
     command = ["stress", "--bit-flips", str(core), str(core), "--out", str(tmp_path / "curves.md")]
     refused(command, tmp_path, "curves.svg", "an input of this run")
-
-
-def test_bad_input_is_not_told_over_an_input(tmp_path: Path) -> None:
-    """The gate tells bad input in its reports: not where one of them is the bad input."""
-    network = kept(tmp_path / "float.onnx")
-    for option in ("--summary", "--outputs", "--junit"):
-        refused(["gate", str(network), str(network), option, str(network)], tmp_path, "an input of this run")
 
 
 def test_a_socket_is_no_output(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

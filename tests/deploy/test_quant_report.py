@@ -1,4 +1,4 @@
-"""What `quantize` reports: layers in whole numbers, and what each pass buys."""
+"""What `quantize` reports: layers in whole numbers, and where they err."""
 
 import base64
 import json
@@ -15,7 +15,7 @@ from typer.testing import CliRunner
 
 from deploy.cli import app
 from deploy.export import to_onnx
-from deploy.report.plots import FONT_PX, MOST_BARS, bins, histogram_url, text_width
+from deploy.report.plots import FONT_PX, MOST_BARS, bins, histogram_url
 from deploy.results import SCHEMA_PATH
 from model.convbeers import ConvBEERS, initialise
 from model.io.images import MAX_DN
@@ -26,19 +26,11 @@ from profiles import load_sensor
 from profiles.sensor_file import reference_for
 from quant.calibration import draw_patches
 from quant.onnx_file import fixed_tile_px, load_onnx, metadata, save_onnx
-from quant.quantise import ALL, Passes, ablations
 from quant.sensitivity import Spread, kind_of_error, worst_row
+from tests.deploy.report.svg import style_of, text_width
 
 PHONE_PX = 358
 """A window of 390 pixels less the page's margins."""
-
-
-def test_every_pass_is_left_out_once() -> None:
-    found = ablations()
-    assert found["all passes"] == ALL
-    assert found["none"] == Passes(*[False] * 7)
-    assert len(found) == 9
-    assert not found["without shared residual scale"].equalise
 
 
 def float_file(path: Path) -> str:
@@ -56,36 +48,11 @@ def test_the_free_regime_writes_a_file_of_its_own_kind(tmp_path: Path) -> None:
     assert result.exit_code == 0, result.output
     assert metadata(load_onnx(out))["precision"] == "int8 free"
     jsonschema.validate(json.loads((tmp_path / "q.json").read_text()), json.loads(SCHEMA_PATH.read_text()))
-    for option in (["--ablate"], ["--board", str(tmp_path / "b.onnx")], ["--report", str(tmp_path / "r")]):
+    for option in (["--finetune", "1"], ["--board", str(tmp_path / "b.onnx")], ["--report", str(tmp_path / "r")]):
         refused = CliRunner().invoke(app, [*free, "--out", str(tmp_path / "no.onnx"), *option])
         assert refused.exit_code == 2
         assert "--regime legal" in " ".join(refused.output.split())
     assert not (tmp_path / "no.onnx").exists()
-
-
-def test_a_pass_can_be_left_out(tmp_path: Path) -> None:
-    out = tmp_path / "i.onnx"
-    options = [
-        "--out",
-        str(out),
-        "--patches",
-        "2",
-        "--patch",
-        "64",
-        "--without",
-        "half-lsb-pair",
-        "--without",
-        "equalise",
-    ]
-    result = CliRunner().invoke(app, ["quantize", float_file(tmp_path / "f.onnx"), *options])
-    assert result.exit_code == 0, result.output
-    assert (
-        metadata(load_onnx(out))["passes"]
-        == "fine_planes, least_squares, shared_residual_scale, fit_weights, dual_gain"
-    )
-    unknown = CliRunner().invoke(app, ["quantize", str(tmp_path / "f.onnx"), "--out", str(out), "--without", "magic"])
-    assert unknown.exit_code == 2
-    assert "half-lsb-pair" in unknown.output
 
 
 @pytest.mark.slow
@@ -105,11 +72,11 @@ def test_a_network_fixed_to_one_tile_is_quantised_reported_and_gated(tmp_path: P
 
 
 @pytest.mark.slow
-def test_quantize_reports_layers_and_passes(tmp_path: Path) -> None:
+def test_quantize_reports_layers(tmp_path: Path) -> None:
     float_file(tmp_path / "f.onnx")
     dn = procedural_scene(640, 700, np.random.default_rng(0)).radiance.numpy() * 4095 / 400
     write_tiff(tmp_path / "scenes" / "drawn.tif", np.rint(dn).astype(np.uint16))
-    options = ["--out", str(tmp_path / "i.onnx"), "--patches", "4", "--ablate", "--json", str(tmp_path / "q.json")]
+    options = ["--out", str(tmp_path / "i.onnx"), "--patches", "4", "--json", str(tmp_path / "q.json")]
     options += ["--patch", "96", "--report", str(tmp_path / "r"), "--images", str(tmp_path / "scenes")]
     result = CliRunner().invoke(app, ["quantize", str(tmp_path / "f.onnx"), *options])
     assert result.exit_code == 0, result.output
@@ -117,7 +84,6 @@ def test_quantize_reports_layers_and_passes(tmp_path: Path) -> None:
     jsonschema.validate(document, json.loads(SCHEMA_PATH.read_text()))
     tables = [row["table"] for row in document["rows"]]
     assert tables.count("integer layers") == 8
-    assert tables.count("ablation") == 9
     for row in document["rows"]:
         if row["table"] == "integer layers":
             figures = row["figures"]
@@ -158,7 +124,7 @@ def test_the_histogram_is_a_picture_for_light_and_dark() -> None:
     picture = base64.b64decode(url.removeprefix("data:image/svg+xml;base64,")).decode()
     root = ET.fromstring(picture)  # noqa: S314 - our own picture
     assert root.tag.endswith("svg")
-    assert picture.count('fill="var(--mark2)"') > 20
+    assert picture.count("fill: var(--mark2)") > 20
     assert "prefers-color-scheme: dark" in picture
 
 
@@ -175,7 +141,7 @@ def test_labels_of_the_histogram_can_be_read_on_the_narrowest_page(farthest: int
     for text in (each for each in root.iter() if each.tag.endswith("text")):
         if text.get("transform"):  # upright
             continue
-        wide, x, anchor = text_width(text.text or ""), float(text.get("x") or 0), text.get("text-anchor")
+        wide, x, anchor = text_width(text.text or ""), float(text.get("x") or 0), style_of(text).get("text-anchor")
         left = x - wide if anchor == "end" else x - wide / 2
         assert left >= 0
         assert left + wide <= width

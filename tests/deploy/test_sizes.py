@@ -14,9 +14,6 @@ from deploy.cli import app
 from deploy.export import float_for
 from deploy.restoration.options import Options
 from deploy.restoration.plan import plan_for
-from model.metrics.edges import find_edge
-from model.metrics.refusal import Refusal
-from model.metrics.sharpness import edge_mtf
 from model.shipped import SENSOR, VARIANT, shipped_weights
 from model.simulator.acquire import crop_margin
 from model.simulator.sampling import check_divisible
@@ -52,11 +49,6 @@ def said(work: Callable[[], object]) -> str:
     return str(caught.value)
 
 
-def refusal(found: object) -> str:
-    assert isinstance(found, Refusal)
-    return found.reason
-
-
 SENTENCES: list[Callable[[Path], str]] = [
     plan_of_restore,
     fixed_tile,
@@ -71,9 +63,3 @@ def test_a_sentence_names_the_width_first(sentence: Callable[[Path], str], tmp_p
     text = sentence(tmp_path)
     assert f"{COLUMNS} x {ROWS}" in text
     assert f"{ROWS} x {COLUMNS}" not in text
-
-
-def test_a_refused_edge_names_the_width_first() -> None:
-    small = np.zeros((10, 12), np.float32)
-    for found in (find_edge(small), edge_mtf(small, None)):
-        assert "12 x 10 pixels" in refusal(found)

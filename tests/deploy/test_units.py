@@ -9,10 +9,11 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from deploy.methods import method_named
+from deploy.studies.evaluation.methods import method_named
+from deploy.studies.evaluation.pairs import simulate_pairs
+from deploy.studies.evaluation.scores import Instruments
 from model.dataset import DatasetRecipe
-from model.evaluation.pairs import simulate_pairs
-from model.evaluation.scores import Instruments, fidelity_db
+from model.metrics.fidelity import fidelity_db
 from model.simulator.mtf import mtf
 from model.simulator.procedural import procedural_scene
 from model.training.patches import PatchRecipe

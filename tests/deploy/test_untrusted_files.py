@@ -12,14 +12,13 @@ import tifffile
 import torch
 from typer.testing import CliRunner
 
-from deploy.cache import Cache, digest_of
 from deploy.cli import app
 from deploy.dpu.board import load_dpu
-from deploy.dpu.cost.runs import refit
+from deploy.dpu.cost.own_runs import read_own_runs
 from deploy.gate import PATCHES, baseline_mae
 from deploy.restoration.output import Checkpoint, part_folder
 from deploy.results import Document
-from deploy.tradeoff.host_time import Times
+from deploy.studies.tradeoff.measure import Measurements
 from model.convbeers import arrays, load_network
 from model.dataset import _read_summary
 from model.io.images import read_pixels
@@ -33,6 +32,7 @@ from profiles.toml import HERE, read_json, read_toml_text
 from quant.checks import Check
 from quant.gate import read_limits
 from quant.onnx_file import load_onnx
+from tests.deploy.dpu.graphs import integer_convbeers
 from tests.fuzz.networks import checkpoint_seeds, go_on, weights_seeds
 from tests.fuzz.parsers import JOB, SHAPE
 
@@ -78,17 +78,18 @@ def test_a_limit_may_be_infinite(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     "run",
-    [{"fps": 1e-300}, {"tile_px": 10**300}, {"tile_px": 1 << 20}, {"fps": float("inf")}, {"network": "\ud800"}],
+    [{"fps": 1e-300}, {"tile_px": 10**300}, {"tile_px": 1 << 20}, {"fps": float("inf")}, {"network": "resnet-50"}],
 )
 def test_runs_of_a_board_beyond_reason_are_refused(run: dict[str, object], tmp_path: Path) -> None:
-    sound = {"network": "resnet-50", "configuration": "C32B3", "tile_px": 640, "fps": 95.0}
+    integer_convbeers(tmp_path / "core.onnx", 1, 2)
+    sound = {"model": "core.onnx", "configuration": "C32B3", "tile_px": 64, "fps": 95.0}
     path = tmp_path / "runs.json"
     path.write_text(json.dumps([sound]))
-    refit(path, load_dpu("vck190"))
+    read_own_runs(path, load_dpu("vck190"))
     for runs in ([{**sound, **run}], [sound] * 1001):
         path.write_text(json.dumps(runs))
         with pytest.raises(OptionError):
-            refit(path, load_dpu("vck190"))
+            read_own_runs(path, load_dpu("vck190"))
 
 
 @pytest.mark.parametrize(
@@ -213,14 +214,12 @@ def test_a_manifest_that_is_none_is_refused(line: str, tmp_path: Path) -> None:
         _read_summary(tmp_path / "manifest.jsonl")
 
 
-@pytest.mark.parametrize("pixels", ["Infinity", "NaN", "9" * 5000, "[" * 100_000])
-def test_a_damaged_measurement_is_measured_again(pixels: str, tmp_path: Path) -> None:
-    cache, value = Cache(tmp_path), {"session": "1", "wall_s": [1.0], "cpu_s": [1.0], "pixels": 7}
-    stored = json.dumps({"value": value, "sha256": digest_of(value)})
-    cache.path("times", {}).write_text(stored)
-    assert cache.find("times", {}, Times) is not None
-    cache.path("times", {}).write_text(stored.replace("7", pixels, 1))
-    assert cache.find("times", {}, Times) is None
+@pytest.mark.parametrize("text", ["", "[]", "3", "{}", "[" * 100_000, '{"measurements": 3}', '{"measurements": NaN}'])
+def test_measurements_that_are_none_are_refused(text: str, tmp_path: Path) -> None:
+    path = tmp_path / "measurements.json"
+    path.write_text(text)
+    with pytest.raises(OptionError, match="remove it"):
+        Measurements.open(path)
 
 
 def test_a_log_with_strange_lines_is_gone_on_with(tmp_path: Path) -> None:

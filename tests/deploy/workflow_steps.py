@@ -8,6 +8,7 @@ that install.
 import os
 import re
 import subprocess
+import sys
 import sysconfig
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -86,6 +87,7 @@ class Runner:
         assert given.keys() <= inputs.keys()
         inputs.update(given)
         context = {f"inputs.{name}": text for name, text in inputs.items()} | {"github.action_path": str(ROOT)}
+        context["steps.python.outputs.python-path"] = sys.executable  # of a step that is left out
         own = Runner(self.folder)  # its steps have ids of their own
         own.run_steps(action["runs"]["steps"], context)
         self.red, self.stderr = own.red, own.stderr

@@ -14,7 +14,6 @@ from pathlib import Path
 
 from docs.make.options import FOLDER, PATHS
 from tests.deploy.test_outputs import INSIDE
-from tests.deploy.test_outputs import NEVER_WRITTEN_INTO as KEPT
 from tests.docs.test_commands_in_pages import NAME, context_of
 from tests.docs.walk import ROOT
 
@@ -38,9 +37,6 @@ LEFT_OUT = {
 }
 """Commands that are not run, and why."""
 
-EXITS = {"beers-deploy check traditional": 1}
-"""Commands that end with another code than 0: their page says so, behind them."""
-
 SHORTER = {
     r"(--variant) convbeers-s --tile 640": r"\1 convbeers-xs --tile 64",
     r"--provider Vitis\S+ --option \S+": "--provider CPUExecutionProvider --tile 64",
@@ -55,7 +51,7 @@ SHORTER = {
     r"IMAGE OUT": "raw.tif restored.tif",
     r"(beers-deploy detect)$": r"\1 --drawn 2 --methods degraded",
     r"(beers-deploy detect) (--images)": r"\1 --methods degraded \2",
-    r"(tradeoff)": r"\1 --images aerial --calibration aerial --networks narrow.safetensors --cache ../study",
+    r"(tradeoff)": r"\1 --images aerial --calibration aerial --networks narrow.safetensors",
     r"(tradeoff .*)--out": r"\1--size 1500x1200 --out",
     r"(beers-deploy train)": r"\1 --variant convbeers-xs --steps 2 --batch 2 --patch 24 --validate-every 0",
     r"(stress float\.onnx int8\.onnx)$": r"\1 --size 32 --cases night,snow",
@@ -67,8 +63,6 @@ NEEDED = {
     r"\.jp2|\.vrt|\.XML|--cog|bands\.tif|formats\.py": "rasterio",
     r"--stac": "pystac",
     r"rio cogeo": "rio_cogeo",
-    r"--workers": "distributed",
-    r"beers-deploy detect|--labelled": "pycocotools",
 }
 """Patterns in a command, and the package of an extra without which it is refused."""
 
@@ -115,5 +109,5 @@ def outputs(command: str) -> list[Path]:
     if not command.startswith(NAME):
         return [Path(name) for name in re.findall(r"--out (\S+)", command)]
     name, given = shlex.split(command)[1], context_of(command).params
-    named = [(key, kind) for key, kind in PATHS[name].written.items() if given[key] and (name, key) not in KEPT]
+    named = [(key, kind) for key, kind in PATHS[name].written.items() if given[key]]
     return [given[key] / INSIDE[name] if kind == FOLDER else given[key] for key, kind in named]

@@ -16,9 +16,9 @@ from model.shipped import SHIPPED
 from model.variants import Variant
 from profiles.toml import HERE as PROFILES
 from quant.onnx_file import save_onnx
-from tests.deploy.detection.folders import Object, dior
-from tests.deploy.detection.networks import detector, raw
-from tests.deploy.test_characterise import acquisition
+from tests.deploy.studies.detection.folders import Object, dior
+from tests.deploy.studies.detection.networks import detector, raw
+from tests.deploy.studies.test_characterise import acquisition
 from tests.docs.walk import ROOT, Walk
 
 HOW_TO = ROOT / "docs" / "how-to"

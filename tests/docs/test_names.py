@@ -16,7 +16,7 @@ ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"
 PATH = re.compile(r"(?<![\w/.-])docs/[\w./-]*\w\.(?:md|py|toml|svg|png|ipynb)\b")
 LINK = re.compile(r"\]\((?!https?:|data:|#)([^)#\s]+)")
-TERMS = ("halo", "told sensor", "DPU", "MTF", "residual stream", "encoding", "gate", "swath", "haze", "dominated")
+TERMS = ("halo", "told sensor", "DPU", "MTF", "residual stream", "encoding", "gate", "swath", "haze", "front")
 
 
 def tracked() -> list[Path]:

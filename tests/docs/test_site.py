@@ -19,7 +19,7 @@ from urllib.parse import urlsplit
 
 import pytest
 
-from tests.deploy.tradeoff.browser import browser
+from tests.deploy.browser import browser
 
 Run = Callable[..., Any]
 

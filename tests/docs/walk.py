@@ -144,7 +144,7 @@ class Walk:
         return Done(result.exit_code, result.output)
 
     def _started(self, words: list[str]) -> Done:
-        kept = {name: os.environ[name] for name in ("SYSTEMROOT", "TEMP", "BEERS_DEPLOY_CACHE") if name in os.environ}
+        kept = {name: os.environ[name] for name in ("SYSTEMROOT", "TEMP") if name in os.environ}
         ours = {"PYTHONPATH": str(ROOT), "PYTHONUNBUFFERED": "1", "PYTHONUTF8": "1", "OMP_NUM_THREADS": "1"}
         done = subprocess.run(
             [*PROGRAMS[words[0]], *words[1:]],

@@ -8,11 +8,10 @@ from tempfile import TemporaryDirectory
 import numpy as np
 from PIL import Image
 
-from deploy.detection.annotations import read_labelled
-from deploy.detection.detectors import open_detector
-from deploy.detection.text_labels import yolo_names
-from tests.deploy.detection.folders import OBJECTS, SIZE_PX
-from tests.deploy.detection.networks import detector, final, raw
+from deploy.studies.detection.detector import open_detector
+from deploy.studies.detection.labels import read_labelled, yolo_names
+from tests.deploy.studies.detection.folders import OBJECTS, SIZE_PX
+from tests.deploy.studies.detection.networks import detector, final, raw
 
 GREY = np.full((*SIZE_PX, 3), 90, np.uint8)
 

@@ -97,7 +97,7 @@ def _checkpoint(path: Path, steps: int) -> None:
         network(torch.ones(1, 1, 5, 5)).sum().backward()
         optimiser.step()
     average = {k: v.detach().clone() for k, v in network.state_dict().items()}
-    write_checkpoint(path, network, average, optimiser, RECIPE, steps, Guards(), "float32")
+    write_checkpoint(path, network, average, optimiser, RECIPE, steps, Guards())
 
 
 def _fresh() -> tuple[ConvBEERS, torch.optim.Optimizer]:

@@ -12,34 +12,32 @@ from tempfile import TemporaryDirectory
 import numpy as np
 import tifffile
 
-from deploy.cache import Cache, Keepable
 from deploy.compare import change_rows, compare, read_document
 from deploy.dpu.board import load_dpu
 from deploy.dpu.checker.placement import place
-from deploy.dpu.cost.layers import Layers
-from deploy.dpu.cost.runs import refit
+from deploy.dpu.cost.model import Layers
+from deploy.dpu.cost.own_runs import read_own_runs
 from deploy.dpu.cost.work import count_work
 from deploy.dpu.graph import Network
 from deploy.dpu.reading import read_network
 from deploy.gate import PATCHES, baseline_mae
 from deploy.restoration.output import Checkpoint, part_folder
 from deploy.results import Document, by_row, cell
-from deploy.tradeoff.accuracy import Scores
-from deploy.tradeoff.host_time import Times
+from deploy.studies.tradeoff.measure import Measurements
 from model.convbeers import load_network
 from model.dataset import _read_summary
-from model.evaluation.pairs import read_pairs_recipe
 from model.io.images import read_pixels
 from model.metrics.backbones import read_tensors
+from model.recipe import read_pairs_recipe
 from model.training.run import Log
 from profiles import load_sensor, load_target
-from profiles.figures import Figure, Row, measured, predicted, unavailable
+from profiles.figures import Row, measured, predicted, unavailable
 from profiles.response_file import read_response
 from profiles.scene_call import load_scene_call
 from quant.checks import Check
 from quant.gate import read_limits
-from tests.deploy.detection.folders import coco, dota, voc, yolo
 from tests.deploy.dpu.graphs import integer_convbeers
+from tests.deploy.studies.detection.folders import coco, dota, voc, yolo
 from tests.fuzz.detection import detect, detector_seeds, label_seeds, names_seeds, read_beside, read_names
 from tests.fuzz.mutation import Mutate, of_json, of_onnx, of_png, of_safetensors, of_tiff, of_xml
 from tests.fuzz.networks import (
@@ -160,23 +158,16 @@ def read_results(path: Path) -> None:
         cell(change.before, "")
 
 
-def cache_seeds(folder: Path) -> list[bytes]:
-    """Both kinds of kept measurements."""
-    cache = Cache(folder)
-    scores = Scores(({"PSNR": 30.0, "LPIPS": None},), {"edge": Figure(0.2, "", "measured", "here")})
-    kept: dict[str, Keepable] = {"scores": scores, "times": Times("1", (0.1, 0.2), (0.1, 0.2), 65536)}
-    for kind, value in kept.items():
-        cache.keep(kind, {}, value)
-    return [cache.path(kind, {}).read_bytes() for kind in kept]
+def measurement_seeds(folder: Path) -> list[bytes]:
+    """What a study keeps."""
+    kept = Measurements(folder / "measurements.json")
+    kept.make("a", lambda: [{"PSNR": 30.0, "LPIPS": None}])
+    return [kept.path.read_bytes()]
 
 
-def find_kept(path: Path) -> None:
-    """A damaged measurement is none; the digest is left out, so that the values themselves are met."""
-    with TemporaryDirectory() as name:
-        cache = Cache(Path(name))
-        for kind, what in (("scores", Scores), ("times", Times)):
-            shutil.copy(path, cache.path(kind, {}))
-            cache.find(kind, {}, what)
+def open_measurements(path: Path) -> None:
+    """What a study goes on with."""
+    Measurements.open(path)
 
 
 def journal_seeds(_: Path) -> list[bytes]:
@@ -206,11 +197,11 @@ def backbone_seeds(_: Path, packed: bool) -> list[bytes]:
     return [stream.getvalue()]
 
 
-def runs_seeds(_: Path) -> list[bytes]:
+def runs_seeds(folder: Path) -> list[bytes]:
     """A board's own measurements."""
-    run = {"network": "resnet-50", "configuration": "C32B3", "tile_px": 640, "fps": 95.0}
-    model = {"model": "core.onnx", "tile_px": 64, "fps": 9.5, "power_w": 30}
-    return [json.dumps(runs).encode() for runs in ([run], [run, {**run, "fps": 5}], [run, model])]
+    model = str(integer_convbeers(folder / "core.onnx", 1, 2))
+    run = {"model": model, "configuration": "C32B3", "tile_px": 64, "fps": 95.0}
+    return [json.dumps(runs).encode() for runs in ([run], [run, {**run, "fps": 5, "power_w": 30}])]
 
 
 def manifest_seeds(_: Path) -> list[bytes]:
@@ -270,8 +261,8 @@ PARSERS: tuple[Parser, ...] = (
     Parser("gate limits TOML", ".toml", lambda _: LIMITS, lambda p: read_limits(p, None)),
     Parser("results JSON", ".json", document_seeds, read_results, of_json),
     Parser("gate baseline JSON", ".json", document_seeds, lambda p: baseline_mae(p, GATED), of_json),
-    Parser("board's runs JSON", ".json", runs_seeds, lambda p: refit(p, load_dpu("vck190")), of_json, 0.3),
-    Parser("kept measurements", ".json", cache_seeds, find_kept, of_json),
+    Parser("board's runs JSON", ".json", runs_seeds, lambda p: read_own_runs(p, load_dpu("vck190")), of_json, 0.3),
+    Parser("kept measurements", ".json", measurement_seeds, open_measurements, of_json),
     Parser("journal of a run", ".json", journal_seeds, resume, of_json, 0.5),
     Parser("dataset manifest", ".jsonl", manifest_seeds, _read_summary, of_json),
     Parser("training log", ".csv", lambda _: [b"step,loss\n10,0.5\n20,0.25\n"], log_lines, share=0.5),

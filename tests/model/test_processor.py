@@ -12,7 +12,7 @@ import pytest
 from onnx import TensorProto, helper, numpy_helper
 
 from model import processor
-from model.processor import bfloat16_speed, decided, int8_adds_exactly, processor_name
+from model.processor import decided, int8_adds_exactly, processor_name
 
 
 def convolved(image: np.ndarray, weight: np.ndarray, scale: float) -> np.ndarray:
@@ -43,14 +43,7 @@ def test_the_answer_holds_for_convolutions() -> None:
 
 def test_what_was_asked_is_told_in_words() -> None:
     int8_adds_exactly()
-    bfloat16_speed()
-    assert {"int8 on onnxruntime", "bfloat16"} <= set(decided())
-    assert "times the speed of float32" in decided()["bfloat16"]
-
-
-def test_the_speed_of_bfloat16_is_measured_once_a_process() -> None:
-    """Two answers could differ on a busy machine, and one run must not mix them."""
-    assert bfloat16_speed() == bfloat16_speed() > 0
+    assert "int8 on onnxruntime" in decided()
 
 
 NOWHERE = Path("no such file")

@@ -9,8 +9,9 @@ import pytest
 import tifffile
 from PIL import Image
 
+from deploy.studies.evaluation.pairs import oversamplings_of, read_pairs
 from model.dataset import DatasetRecipe, write_dataset
-from model.evaluation.pairs import oversamplings_of, profiles_for, read_pairs, read_pairs_recipe
+from model.recipe import profiles_for, read_pairs_recipe
 from profiles import load_sensor
 from profiles.errors import OptionError, ProfileError
 from profiles.sensor import same_instrument

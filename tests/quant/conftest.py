@@ -47,4 +47,4 @@ def unseen() -> Patches:
 
 @pytest.fixture(scope="session")
 def quantised(float_onnx: onnx.ModelProto, patches: Patches) -> Quantised:
-    return quantise_model(float_onnx, patches, {"seed": "5"}, tick=lambda: None)
+    return quantise_model(float_onnx, patches, {"seed": "5"})

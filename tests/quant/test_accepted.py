@@ -92,11 +92,7 @@ def test_a_layer_that_never_fires_costs_nothing(
     dead = spoilt(dead, "body.0.second.bias", lambda bias: bias + 0.05)
 
     def mae(model: onnx.ModelProto) -> float:
-        made = (
-            quantise_free(model, patches, {}, lambda: None)
-            if regime == "free"
-            else quantise_model(model, patches, {}, lambda: None).host
-        )
+        made = quantise_free(model, patches, {}) if regime == "free" else quantise_model(model, patches, {}).host
         return compare(open_session(model), open_session(made), unseen.pairs).mae
 
     assert mae(dead) < 1.5 * mae(float_onnx)
@@ -107,7 +103,7 @@ def test_a_branch_of_tiny_values_stays_legal(share: float, float_onnx: onnx.Mode
     """An add moves the branch to the stream's scale long after its weights were given one of their own."""
     tiny = spoilt(float_onnx, "body.0.second.weight", lambda weight: weight * share)
     tiny = spoilt(tiny, "body.0.second.bias", lambda bias: bias * share)
-    assert shift_faults(quantise_model(tiny, patches, {}, lambda: None).core) == []
+    assert shift_faults(quantise_model(tiny, patches, {}).core) == []
 
 
 def test_sizes_beyond_all_shifts_are_refused(graph: Graph) -> None:

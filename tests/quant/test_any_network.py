@@ -3,7 +3,6 @@
 import json
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import replace
 from functools import cache
 from typing import Any
 
@@ -27,12 +26,12 @@ from quant.graph import Conv, correction_graph
 from quant.integer import agreement, merged_correction, run_core
 from quant.integer.trainable import TrainableCore
 from quant.onnx_file import GraphWriter, image_info, make_model
-from quant.quantise import ALL, Quantised, quantise_model, ticks
+from quant.quantise import Quantised, quantise_model
 from quant.reading.folding import simplest
 from quant.session import open_any_size, open_session, result_of
 from quant.tiling.walk import tiling_of
+from tests.quant.quick import quickly
 
-WITHOUT_SEARCH = replace(ALL, equalise=False)
 SIDE_PX = 48
 
 
@@ -57,10 +56,7 @@ def float_network(name: str) -> onnx.ModelProto:
 def quantised(name: str) -> Quantised:
     seen = images(name)
     patches = Patches([], Remade(lambda k: (seen[k], seen[k]), len(seen)), Remade(lambda k: seen[k], len(seen)))
-    ticked: list[int] = []
-    made = quantise_model(float_network(name), patches, {}, lambda: ticked.append(1), WITHOUT_SEARCH)
-    assert len(ticked) == ticks(float_network(name), len(seen), WITHOUT_SEARCH)
-    return made
+    return quickly(float_network(name), patches)
 
 
 @pytest.mark.parametrize("name", NETWORKS)
@@ -187,12 +183,14 @@ def one_convolution(weight: float, bias: float) -> onnx.ModelProto:
 
 
 @pytest.mark.parametrize(("weight", "bias"), [(1.0, 0.0), (-0.7, 0.93), (0.4, -0.31)])
-def test_windows_make_a_result_finer_than_8_bits(weight: float, bias: float) -> None:
+def test_windows_make_a_result_finer_than_8_bits(weight: float, bias: float, monkeypatch: pytest.MonkeyPatch) -> None:
     seen = images("ffdnet")
     patches = Patches([], Remade(lambda k: (seen[k], seen[k]), len(seen)), Remade(lambda k: seen[k], len(seen)))
     model, errors = one_convolution(weight, bias), []
-    for passes in (ALL, replace(ALL, dual_gain=False)):
-        made = quantise_model(model, patches, {}, lambda: None, passes)
+    for dual in (True, False):
+        if not dual:
+            monkeypatch.setattr("quant.quantise.takes_gains", lambda _: False)
+        made = quantise_model(model, patches, {})
         wanted = result_of(open_session(model), seen[0])
         errors.append(float(np.abs(result_of(open_session(made.host), seen[0]) - wanted).mean()))
         assert encoding_faults(made.host) == []

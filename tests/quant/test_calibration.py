@@ -151,10 +151,11 @@ def test_no_run_sees_more_than_a_piece_with_its_halo(graph: Graph) -> None:
         assert max(values.base.shape[2] for values in piece if values.base is not None) <= side
 
 
-def test_positions_of_a_large_image_are_those_of_its_whole(graph: Graph) -> None:
+def test_positions_of_a_large_image_are_those_of_its_whole(graph: Graph, monkeypatch: pytest.MonkeyPatch) -> None:
     """In pieces or at once: found here by hand from whole tensors."""
     whole = image(TILE_PX + 21, 50)
-    frac_bits = choose_frac_bits(graph, [whole], lambda: None, least_squares=False)
+    monkeypatch.setattr("quant.calibration._errors", lambda *_: np.zeros(1))  # the scale that clips nothing
+    frac_bits = choose_frac_bits(graph, [whole])
     names = tensors(graph)
     values = open_session(graph_to_onnx(graph, names)).run(names, {PLANES: planes_of(whole)})
     for name, tensor in zip(names, values, strict=True):

@@ -12,7 +12,7 @@ from onnx import numpy_helper
 from model.simulator.procedural import procedural_scene
 from profiles import load_sensor
 from quant.calibration import Patches, draw_patches
-from quant.free import BINS, Scale, best_scale, free_model, free_ticks, quantise_free, round_weight, tensor_scales
+from quant.free import BINS, Scale, best_scale, free_model, quantise_free, round_weight, tensor_scales
 from quant.gate import compare
 from quant.graph import (
     CORRECTION,
@@ -45,13 +45,8 @@ def image(height: int, width: int, seed: int = 0) -> np.ndarray:
 
 
 @pytest.fixture(scope="module")
-def ticked() -> list[int]:
-    return []
-
-
-@pytest.fixture(scope="module")
-def free(float_onnx: onnx.ModelProto, patches: Patches, ticked: list[int]) -> onnx.ModelProto:
-    return quantise_free(float_onnx, patches, {"seed": "5"}, tick=lambda: ticked.append(1))
+def free(float_onnx: onnx.ModelProto, patches: Patches) -> onnx.ModelProto:
+    return quantise_free(float_onnx, patches, {"seed": "5"})
 
 
 def drawn(count: int, patch_px: int) -> Patches:
@@ -162,16 +157,9 @@ def test_the_file_says_what_it_is(free: onnx.ModelProto, patches: Patches) -> No
     assert [output.name for output in free.graph.output] == ["restored"]
 
 
-def test_it_ticks_as_often_as_it_says(
-    float_onnx: onnx.ModelProto, free: onnx.ModelProto, patches: Patches, ticked: list[int]
-) -> None:
-    assert free.graph.node
-    assert len(ticked) == free_ticks(float_onnx, len(patches.pairs))
-
-
 def test_the_same_patches_give_the_same_bytes(float_onnx: onnx.ModelProto, tmp_path: Path) -> None:
     for name in ("once", "again"):
-        save_onnx(quantise_free(float_onnx, drawn(2, 32), {"seed": "5"}, tick=lambda: None), tmp_path / name)
+        save_onnx(quantise_free(float_onnx, drawn(2, 32), {"seed": "5"}), tmp_path / name)
     assert (tmp_path / "once").read_bytes() == (tmp_path / "again").read_bytes()
 
 
@@ -233,13 +221,11 @@ def test_two_copies_hold_half_an_lsb(value: float) -> None:
 def test_the_half_lsb_pair_lose_less(float_onnx: onnx.ModelProto, patches: Patches, unseen: Patches) -> None:
     step, graph = 2.0**-8, read_planes(correction_graph(float_onnx))
     (stream,) = streams(graph)
-    graph = equalise(
-        graph, stream, first_guess(channel_ranges(graph, stream, patches.degraded, lambda: None), 0.5, 0.8)
-    )
+    graph = equalise(graph, stream, first_guess(channel_ranges(graph, stream, patches.degraded), 0.5, 0.8))
     levels = {op.output: 255 for op in graph if isinstance(op, Conv) and op.activation is Activation.relu} | {
         CORRECTION: 127
     }
-    units = tensor_scales(graph, levels, patches.degraded, lambda: None)
+    units = tensor_scales(graph, levels, patches.degraded)
     scales = {name: Scale(unit, 0 if levels[name] == 255 else 128) for name, unit in units.items()}
     scales[PLANES] = Scale(2.0**-PLANES_FRAC_BITS)
 
@@ -254,7 +240,7 @@ def test_the_half_lsb_pair_lose_less(float_onnx: onnx.ModelProto, patches: Patch
 def test_at_half_resolution_the_pixels_of_a_place_find_their_way_back(patches: Patches, unseen: Patches) -> None:
     """The same ends as in the legal regime around other numbers: a channel in another's place would be far off."""
     model = half_resolution()
-    made = quantise_free(model, patches, {}, tick=lambda: None)
+    made = quantise_free(model, patches, {})
     assert {"SpaceToDepth", "DepthToSpace"} < {node.op_type for node in made.graph.node}
     in_float, in_int8 = open_session(model), open_session(made)
     found = compare(in_float, in_int8, unseen.pairs).mae

@@ -1,7 +1,5 @@
 """Levelling a network without a stream: the float network stays, the search only gains, most on unequal channels."""
 
-from dataclasses import replace
-
 import numpy as np
 import onnx
 import pytest
@@ -16,7 +14,7 @@ from quant.passes import level
 from quant.passes.equalise import MOST_CHANNELS, Costs
 from quant.passes.level import Chain, chain_ranges
 from quant.passes.stream import STREAM_FRAC_BITS, lone_tensors
-from quant.quantise import ALL, Passes, quantise_model, ticks
+from quant.quantise import quantise_model
 from quant.reading.folding import simplest
 from quant.session import open_session, planes_of
 
@@ -85,18 +83,15 @@ class Bowl:
 
 
 @pytest.mark.parametrize("most", [MOST_CHANNELS, 10])
-def test_the_search_ticks_as_told_and_never_ends_above_its_start(most: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_search_never_ends_above_its_start(most: int, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(level, "MOST_CHANNELS", most)
     _, graph, ends, chain = read("espcn")
-    ranges, ticked = chain_ranges(graph, chain, images(), lambda: None, ends), list[int]()
+    ranges = chain_ranges(graph, chain, images(), ends)
     trial = Bowl(graph)
     for start in (np.ones(sum(chain.widths)), np.concatenate([trial.lowest, np.ones(chain.widths[1])])):
-        ticked.clear()
-        found = level.level(graph, chain, ranges, start, trial, lambda: ticked.append(1))
+        found = level.level(graph, chain, ranges, start, trial)
         before, after = (trial(chain.scaled(graph, each))(None).sum() for each in (start, found))
         assert after <= before
-        assert len(ticked) == chain.steps
-    assert chain.steps < 100 or most > 10
 
 
 def test_the_start_leaves_each_tensor_the_scale_it_has() -> None:
@@ -119,10 +114,10 @@ def test_unequal_channels_err_half_as_much_once_they_are_levelled(monkeypatch: p
     model, seen = simplest(to_onnx("dncnn", network), "dncnn"), images()
     patches = Patches([], Remade(lambda k: (seen[k], seen[k]), len(seen)), Remade(lambda k: seen[k], len(seen)))
 
-    def mae(passes: Passes) -> float:
-        ticked: list[int] = []
-        made = quantise_model(model, patches, {}, lambda: ticked.append(1), passes)
-        assert len(ticked) == ticks(model, len(seen), passes)
+    def mae() -> float:
+        made = quantise_model(model, patches, {})
         return compare(open_session(model), open_session(made.host), patches.pairs, simulated=False).mae
 
-    assert mae(ALL) < 0.5 * mae(replace(ALL, equalise=False))
+    levelled = mae()
+    monkeypatch.setattr("quant.quantise.level", lambda _graph, _chain, _ranges, start, _trial: start)
+    assert levelled < 0.5 * mae()

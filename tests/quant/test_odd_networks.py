@@ -133,7 +133,7 @@ def test_near_float_equal_to_the_reference_and_without_faults(
     rows, columns = np.mgrid[:48, :36] / 40
     seen = [(0.4 + 0.3 * np.sin(7 * rows + k) * np.cos(5 * columns)).astype(np.float32)[None, None] for k in range(3)]
     patches = Patches([], Remade(lambda k: (seen[k], seen[k]), 3), Remade(lambda k: seen[k], 3))
-    made = quantise_model(model, patches, {}, lambda: None)
+    made = quantise_model(model, patches, {})
     wanted = made.core.ends.clipped(result_of(open_session(model), seen[1]))
     found = result_of(open_session(made.host), seen[1])
     assert np.abs(found - wanted).mean() < 0.06 * wanted.std()

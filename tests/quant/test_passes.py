@@ -1,7 +1,5 @@
 """The passes: each leaves the float network as it was, and does to the integer one what it says."""
 
-from dataclasses import fields, replace
-
 import numpy as np
 import onnx
 import pytest
@@ -17,7 +15,6 @@ from quant.graph import (
     Add,
     Conv,
     Graph,
-    coarse_plane_only,
     correction_graph,
     graph_to_onnx,
     read_planes,
@@ -32,28 +29,22 @@ from quant.passes.equalise import (
     equalise,
     first_guess,
     search,
-    search_steps,
     with_room,
 )
 from quant.passes.stream import (
     STREAM_FRAC_BITS,
     Stream,
-    common_frac_bits,
     half_lsb_pair,
-    share_stream_scale,
     streams,
     two_gains,
 )
-from quant.quantise import ALL, Passes, Quantised, quantise_model, ticks
+from quant.quantise import Quantised, quantise_model
 from quant.session import open_session
 
 
 def stream_of(graph: Graph) -> Stream:
     (stream,) = streams(graph)
     return stream
-
-
-NONE = Passes(**{field.name: False for field in fields(Passes)})
 
 
 @pytest.fixture(scope="module")
@@ -82,26 +73,24 @@ def test_scaling_the_writers_alone_would_change_it(graph: Graph) -> None:
 
 def test_ranges_are_levelled_to_the_stream_s_own(graph: Graph, patches: Patches) -> None:
     images = [image for image, _ in patches.pairs]
-    ranges = channel_ranges(graph, stream_of(graph), images, lambda: None)
+    ranges = channel_ranges(graph, stream_of(graph), images)
     assert ranges.shape == (8,)
     factors = first_guess(ranges, 1.0, 1.0)
     np.testing.assert_allclose(ranges * factors, 127 * 2.0**-STREAM_FRAC_BITS)
-    again = channel_ranges(equalise(graph, stream_of(graph), factors), stream_of(graph), images, lambda: None)
+    again = channel_ranges(equalise(graph, stream_of(graph), factors), stream_of(graph), images)
     np.testing.assert_allclose(again, ranges * factors, rtol=1e-4)
 
 
 def test_a_dead_channel_is_not_blown_up(graph: Graph, patches: Patches) -> None:
     dead = np.ones(8)
     dead[3] = 1e-12
-    ranges = channel_ranges(
-        equalise(graph, stream_of(graph), dead), stream_of(graph), [patches.pairs[0][0]], lambda: None
-    )
+    ranges = channel_ranges(equalise(graph, stream_of(graph), dead), stream_of(graph), [patches.pairs[0][0]])
     assert ranges[3] >= 1e-4 * ranges.max()
 
 
 def largest(graph: Graph, images: list[np.ndarray]) -> np.ndarray:
     """(C,) of the last sum."""
-    sizes = channel_sizes(graph, [graph[-2].output], images, lambda: None, quantile=1.0)
+    sizes = channel_sizes(graph, [graph[-2].output], images, quantile=1.0)
     return np.asarray(np.max([found for (found,) in sizes], axis=0))
 
 
@@ -109,9 +98,9 @@ def largest(graph: Graph, images: list[np.ndarray]) -> np.ndarray:
 def test_the_last_sum_has_room_for_the_largest_values(graph: Graph, patches: Patches, loud: float) -> None:
     images = [image for image, _ in patches.pairs]
     step = 2.0**-STREAM_FRAC_BITS
-    ranges = channel_ranges(graph, stream_of(graph), images, lambda: None)
+    ranges = channel_ranges(graph, stream_of(graph), images)
     paired = half_lsb_pair(equalise(graph, stream_of(graph), first_guess(ranges, 0.5, loud)), step)
-    roomy = with_room(paired, step, images, lambda: None)
+    roomy = with_room(paired, step, images)
     np.testing.assert_allclose(correction(roomy), correction(paired), atol=1e-5)
     before, after = largest(paired, images), largest(roomy, images)
     assert (after * ROOM <= 127 * step * (1 + 1e-5)).all()
@@ -149,9 +138,7 @@ def searched(graph: Graph, weights: np.ndarray) -> tuple[list[float], float, lis
 
         return of
 
-    ticked: list[int] = []
-    factors = search(graph, stream_of(graph), RANGES, trial, lambda: ticked.append(1))
-    assert len(ticked) == search_steps(8)
+    factors = search(graph, stream_of(graph), RANGES, trial)
     guesses = [first_guess(RANGES, g, h) for g in (0.5, 0.75, 1.0) for h in (0.64, 0.8, 1.0, 1.25)]
     ends = [float(costs(equalise(graph, stream_of(graph), each)).sum()) for each in (*guesses, factors)]
     return ends[:-1], ends[-1], runs
@@ -190,20 +177,6 @@ def test_a_shared_residual_scale_adds_without_rounding(quantised: Quantised) -> 
         assert shifts == {"shift_read": 0, "shift_write": 0}
 
 
-def test_without_it_adds_round(float_onnx: onnx.ModelProto, patches: Patches) -> None:
-    free = quantise_model(float_onnx, patches, {}, lambda: None, replace(NONE, least_squares=True))
-    adds = [op for op in free.core.ops if isinstance(op, Add)]
-    shifts = [v for op in adds for _, v, _ in op_shifts(op, free.core.frac_bits, SHIFTS)]
-    assert any(shifts)
-
-
-def test_the_common_scale_is_the_coarsest_of_the_stream(graph: Graph) -> None:
-    stream = stream_of(graph)
-    frac_bits = {name: 7 + k for k, name in enumerate(sorted(stream))} | {CORRECTION: 3}
-    assert common_frac_bits([stream], frac_bits) == 7
-    assert share_stream_scale([stream], frac_bits, 7) == dict.fromkeys(stream, 7) | {CORRECTION: 3}
-
-
 def test_the_second_gain_is_the_same_correction_coarser(graph: Graph) -> None:
     both = correction(two_gains(graph))
     assert both.shape[1] == 2
@@ -221,33 +194,23 @@ def test_the_fine_gain_is_believed_until_its_end() -> None:
     assert Ends().merge(one, scale) is one
 
 
-def test_the_coarse_plane_alone_sees_seven_bits(graph: Graph) -> None:
-    alone = coarse_plane_only(graph)
-    first = alone[0]
-    assert isinstance(first, Conv)
-    assert not first.weight[:, 1].any()
-    assert first.weight[:, 0].any()
-
-
-def test_all_passes_lose_far_less_than_none(float_onnx: onnx.ModelProto, patches: Patches) -> None:
-    def mae(passes: Passes) -> float:
-        made = quantise_model(float_onnx, patches, {}, lambda: None, passes)
+def test_all_passes_lose_far_less_than_none(
+    float_onnx: onnx.ModelProto, patches: Patches, quantised: Quantised, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def mae(made: Quantised) -> float:
         return compare(open_session(float_onnx), open_session(made.host), patches.pairs).mae
 
-    assert mae(ALL) < 0.5 * mae(NONE)
-
-
-def test_progress_counts_to_its_end(float_onnx: onnx.ModelProto, patches: Patches) -> None:
-    for passes in (ALL, NONE):
-        ticked: list[int] = []
-        quantise_model(float_onnx, patches, {}, lambda: ticked.append(1), passes)  # noqa: B023
-        assert len(ticked) == ticks(float_onnx, len(patches.pairs), passes)
-
-
-def test_the_correction_has_one_channel_without_the_second_gain(
-    float_onnx: onnx.ModelProto, patches: Patches
-) -> None:
-    made = quantise_model(float_onnx, patches, {}, lambda: None, replace(ALL, dual_gain=False))
-    last = made.core.ops[-1]
+    monkeypatch.setattr("quant.quantise.takes_gains", lambda _: False)
+    monkeypatch.setattr("quant.quantise.search", lambda _g, _s, ranges, _trial: first_guess(ranges, 0.0, 1.0))
+    monkeypatch.setattr("quant.quantise.fit_weights", lambda _graph, core, *_: core)
+    rounded = quantise_model(float_onnx, patches, {}, pairs=False)
+    last = rounded.core.ops[-1]
     assert isinstance(last, IntConv)
     assert len(last.weight) == 1
+    assert mae(quantised) < 0.5 * mae(rounded)
+
+
+def test_each_step_is_told(float_onnx: onnx.ModelProto, patches: Patches) -> None:
+    told: list[str] = []
+    quantise_model(float_onnx, patches, {}, log=told.append)
+    assert [step.split(" ")[0] for step in told] == ["scale", "equalising", "rounding"]

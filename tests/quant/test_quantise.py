@@ -104,7 +104,7 @@ def test_a_nan_never_passes_the_gate(float_onnx: onnx.ModelProto, quantised: Qua
 def test_the_same_patches_give_the_same_bytes(
     float_onnx: onnx.ModelProto, quantised: Quantised, patches: Patches, tmp_path: Path
 ) -> None:
-    again = quantise_model(float_onnx, patches, {"seed": "5"}, tick=lambda: None)
+    again = quantise_model(float_onnx, patches, {"seed": "5"})
     save_onnx(again.host, tmp_path / "again.onnx")
     save_onnx(quantised.host, tmp_path / "once.onnx")
     assert (tmp_path / "again.onnx").read_bytes() == (tmp_path / "once.onnx").read_bytes()

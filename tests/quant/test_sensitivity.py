@@ -10,9 +10,10 @@ from model.io.images import MAX_DN
 from quant.calibration import Patches
 from quant.core import IntConv
 from quant.graph import Add
-from quant.quantise import ALL, Quantised, quantise_model
+from quant.quantise import Quantised
 from quant.sensitivity import LayerError, Loss, layer_errors, spread_of
 from quant.session import open_session, run
+from tests.quant.quick import quickly
 
 
 @pytest.fixture(scope="module")
@@ -22,7 +23,7 @@ def crops(patches: Patches) -> list[np.ndarray]:
 
 @pytest.fixture(scope="module")
 def attributed(quantised: Quantised, crops: list[np.ndarray]) -> tuple[list[LayerError], Loss]:
-    return layer_errors(quantised.graph, quantised.core, crops, lambda: None)
+    return layer_errors(quantised.graph, quantised.core, crops)
 
 
 def test_together_they_lose_what_the_int8_file_loses(
@@ -57,17 +58,18 @@ def test_a_spoilt_layer_is_found(quantised: Quantised, crops: list[np.ndarray]) 
     spoilt = ops[at]
     assert isinstance(spoilt, IntConv)
     ops[at] = replace(spoilt, weight=-spoilt.weight)
-    layers, _ = layer_errors(quantised.graph, replace(quantised.core, ops=tuple(ops)), crops, lambda: None)
+    layers, _ = layer_errors(quantised.graph, replace(quantised.core, ops=tuple(ops)), crops)
     assert min(layers, key=lambda layer: layer.alone.sqnr_db).name == "body.1.second"
     assert layers[at].alone.sqnr_db < 0
     assert all(layer.alone.sqnr_db > 10 for layer in layers if layer.name != "body.1.second")
 
 
 def test_one_gain_is_attributed_as_two_are(
-    float_onnx: onnx.ModelProto, patches: Patches, crops: list[np.ndarray]
+    float_onnx: onnx.ModelProto, patches: Patches, crops: list[np.ndarray], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    made = quantise_model(float_onnx, patches, {}, lambda: None, replace(ALL, equalise=False, dual_gain=False))
-    layers, _ = layer_errors(made.graph, made.core, crops, lambda: None)
+    monkeypatch.setattr("quant.quantise.takes_gains", lambda _: False)
+    made = quickly(float_onnx, patches)
+    layers, _ = layer_errors(made.graph, made.core, crops)
     tail = layers[-1]
     assert tail.alone.sqnr_db == pytest.approx(tail.network.sqnr_db, abs=1)
 

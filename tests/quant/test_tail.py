@@ -2,7 +2,6 @@
 
 import base64
 from collections.abc import Callable
-from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -11,12 +10,12 @@ import pytest
 import torch
 from onnx import TensorProto, helper
 
+from benchmarks.detector.export import detector_to_onnx
+from benchmarks.detector.network import DetectorNetwork, initialise
 from deploy.dpu.board import load_dpu
 from deploy.dpu.checker.placement import place
 from deploy.dpu.checker.table import legality
 from deploy.dpu.reading import network_of
-from model.detection.export import detector_to_onnx
-from model.detection.network import DetectorNetwork, initialise
 from profiles.errors import ModelError
 from quant.calibration import Patches, Remade
 from quant.encodings import as_on_board, encoding_faults, read_core
@@ -25,9 +24,10 @@ from quant.graph import CORRECTION, read_network
 from quant.graph.tail import Tail
 from quant.integer import agreement, integer_rows
 from quant.onnx_file import GraphWriter, image_info, make_model
-from quant.quantise import ALL, Quantised, quantise_model
+from quant.quantise import Quantised
 from quant.reading.folding import simplest
 from quant.session import open_session, result_of
+from tests.quant.quick import quickly
 
 SIDE_PX = 160
 
@@ -54,7 +54,7 @@ def samples() -> Patches:
 
 @cache
 def quantised() -> Quantised:
-    return quantise_model(detector(), samples(), {}, lambda: None, replace(ALL, equalise=False))
+    return quickly(detector(), samples())
 
 
 def test_the_tail_begins_behind_the_last_convolution() -> None:

@@ -1,7 +1,6 @@
 """A small network with real structure, quantised, and the stress subject that it makes."""
 
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,15 +9,16 @@ import pytest
 import torch
 
 from deploy.export import to_onnx
-from deploy.stress.checks import torch_threads
-from deploy.stress.subject import Subject, open_subject
+from deploy.studies.stress.checks import torch_threads
+from deploy.studies.stress.networks import Subject, open_subject
 from model.convbeers import ConvBEERS, initialise
 from model.simulator.procedural import procedural_scene
 from model.variants import Variant
 from profiles import load_sensor
 from quant.calibration import draw_patches
 from quant.onnx_file import save_onnx
-from quant.quantise import ALL, Quantised, quantise_model
+from quant.quantise import Quantised
+from tests.quant.quick import quickly
 
 
 @pytest.fixture(autouse=True)
@@ -55,8 +55,7 @@ def quickly_quantised(float_onnx: onnx.ModelProto) -> Quantised:
     scene = procedural_scene(700, 700, np.random.default_rng(1))
     sensors = load_sensor("pleiades-degraded"), load_sensor("pleiades-reference")
     patches = draw_patches([scene], *sensors, count=2, seed=5)
-    quick = replace(ALL, equalise=False, fit_weights=False)
-    return quantise_model(float_onnx, patches, {}, tick=lambda: None, passes=quick)
+    return quickly(float_onnx, patches)
 
 
 @pytest.fixture(scope="session")

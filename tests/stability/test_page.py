@@ -4,9 +4,9 @@ from types import ModuleType
 
 import pytest
 
-from deploy.stress.battery import STAGES
-from deploy.stress.cases import CASES
-from deploy.stress.rows import markdown
+from deploy.studies.stress.cases import CASES
+from deploy.studies.stress.networks import STAGES
+from deploy.studies.stress.tables import markdown
 from profiles.figures import Row, by_table, measured, predicted, unavailable
 from tests.stability.makers import DOCS, load_maker
 

@@ -64,7 +64,7 @@ def draw(placement: Placement, title: str) -> Markup:
         _edges(axes, nodes, tops)
         for row, (y, node) in enumerate(zip(tops, nodes, strict=True)):
             _node(axes, y, node, f"node-{row}")
-        return svg_of(figure, title, {f"node-{k}": _name(node) for k, node in enumerate(nodes)}, alone=True)
+        return svg_of(figure, title, {f"node-{k}": _name(node) for k, node in enumerate(nodes)})
 
 
 def _name(node: PlacedNode) -> str:

@@ -1,12 +1,10 @@
 """The checker's findings as rows of results and as a few lines."""
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable
 
 from deploy.dpu.board import Dpu
-from deploy.dpu.checker.operators import Broken
 from deploy.dpu.checker.placement import Cut, PlacedNode, Placement
-from deploy.dpu.checker.traditional import Step
 from profiles.figures import Figure, Row, predicted, unavailable
 from quant.checks import Check
 
@@ -114,31 +112,12 @@ def summary(placement: Placement, dpu: Dpu, tile_px: int, refusal: str = "") -> 
     return lines
 
 
-def step_legality(steps: Sequence[Step]) -> Check:
-    """The verdict on the traditional chain: how many of its steps the DPU refuses."""
-    broken = [step for step in steps if step.broken]
-    first = f"{broken[0].purpose}: {broken[0].broken[0].finding.reason}" if broken else ""
-    return Check("steps the DPU refuses", len(broken), 0, "step", detail=first)
-
-
-def step_rows(step: Step) -> list[Row]:
-    """One row for a step of the traditional chain that keeps the rules, one for each rule that another breaks."""
-    words = {"operator": step.op.op_type, "device": "CPU" if step.broken else "DPU"}
-    return _rows(step.purpose, words, step.broken)
-
-
 def _node_rows(node: PlacedNode) -> list[Row]:
     words = {"operator": node.op.op_type, "part": node.part, "device": node.device}
-    return _rows(node.op.name, words, node.broken)
-
-
-def _rows(name: str, words: Mapping[str, str], broken: tuple[Broken, ...]) -> list[Row]:
-    if not broken:
-        return [Row("nodes", name, {}, words)]
-    return [
-        Row("nodes", name, {}, {**words, "rule": b.text, "reason": b.finding.reason, "remedy": b.finding.remedy})
-        for b in broken
-    ]
+    if not node.broken:
+        return [Row("nodes", node.op.name, {}, words)]
+    broken = [{"rule": b.text, "reason": b.finding.reason, "remedy": b.finding.remedy} for b in node.broken]
+    return [Row("nodes", node.op.name, {}, {**words, **why}) for why in broken]
 
 
 def _subgraph_rows(placement: Placement) -> list[Row]:

@@ -1,6 +1,9 @@
-"""How long a network takes on a DPU, at what power, and how the constants behind that are fitted.
+"""How long a network takes on a DPU, and at what power.
 
-- `work`: what each layer computes and moves; `layers`, `host`: how long that takes; `latency`: the prediction;
-- `constants`: what stands in a target's [cost];
-- `fit`: the constants from the rates in `published`; `validation`: errors on families left out; `runs`: a user's own.
+- `work`: what each layer computes and moves, counted from shapes;
+- `model`: the constants of a target's [cost], and the times of layers, host and processor that follow;
+- `latency`: the prediction with its interval, power;
+- `own_runs`: the constants corrected by runs of a user's own board.
+
+The constants are fitted by `benchmarks/cost_model`.
 """

@@ -1,13 +1,12 @@
-"""How long a network takes on the DPU, layer by layer, and how far off that may be.
+"""How long a network takes on the DPU, layer by layer, how far off that may be, and at what power.
 
-Counts come from `work.py`, the formula from `layers.py` and `host.py`, constants and errors from the target's [cost],
-where `docs/make/cost_model.py` writes what `fit.py` and `validation.py` find on published networks. None of them is
-ConvBEERS: the paper's own figure is what the model is compared with, never what it is made from.
+Counts come from `work`, the formula from `model`, constants and widths from the target's [cost], where
+`benchmarks/cost_model` writes what it finds on published networks. None of them is ConvBEERS: the paper's own figure
+is what the model is compared with, never what it is made from.
 
 The interval is FPS e^-width to FPS e^width, so wide that nine of ten families of networks, each left out of the fit
-once, lie inside; what widths made without a family hold of it is in docs/explanation/cost-model.md. It has one
-width where the host sets the rate, one for small maps, one for large ones, and the widest where a network lies beyond
-all of them.
+once, lie inside. It has one width where the host sets the rate, one for small maps, one for large ones, and the
+widest where a network lies beyond all that were fitted (docs/explanation/cost-model.md).
 """
 
 import math
@@ -17,13 +16,22 @@ from functools import cached_property
 
 from deploy.dpu.board import Dpu
 from deploy.dpu.checker.placement import Placement
-from deploy.dpu.cost.constants import Constants, Regime, Structure, regime_of
-from deploy.dpu.cost.host import Task, frame_rate, placed_work, task_of
-from deploy.dpu.cost.layers import Layers
-from deploy.dpu.cost.processor import between, processor_s
+from deploy.dpu.cost.model import (
+    Constants,
+    Interval,
+    Layers,
+    Regime,
+    Structure,
+    Task,
+    between,
+    frame_rate,
+    placed_work,
+    refused_interval_s,
+    regime_of,
+    task_of,
+)
 from deploy.dpu.cost.work import Work, count_work, largest_map_bytes
 from deploy.dpu.graph import Operation
-from deploy.restoration.plan import plan_side
 from profiles.errors import ModelError
 from profiles.figures import Figure, predicted, unavailable
 
@@ -86,7 +94,7 @@ class Prediction:
     outside: tuple[str, ...] = ()
     note: str = ""
     refused: tuple[str, ...] = ()
-    refused_s: tuple[float, float] = (0.0, 0.0)
+    refused_s: Interval = (0.0, 0.0)
 
     @cached_property
     def batch_time_s(self) -> float:
@@ -99,13 +107,13 @@ class Prediction:
         return self.rate(self.batch_time_s, self.host_s)
 
     @property
-    def fps_interval(self) -> tuple[float, float]:
+    def fps_interval(self) -> Interval:
         """Least and most images a second: the host at its slowest and at its fastest, and the width."""
         fast, slow = (self.rate(self.batch_time_s, host_s) for host_s in self._host_ends_s)
         return slow / self.spread, fast * self.spread
 
     @property
-    def host_interval_s(self) -> tuple[float, float]:
+    def host_interval_s(self) -> Interval:
         """Least and most of `host_s`."""
         low_s, high_s = self._host_ends_s
         return low_s / self.spread, high_s * self.spread
@@ -119,7 +127,7 @@ class Prediction:
         return self._latency_s(self.host_s)
 
     @property
-    def latency_interval_s(self) -> tuple[float, float]:
+    def latency_interval_s(self) -> Interval:
         """Least and most of `latency_s`."""
         low_s, high_s = map(self._latency_s, self._host_ends_s)
         return low_s / self.spread, high_s * self.spread
@@ -133,7 +141,7 @@ class Prediction:
         return math.exp(self.width)
 
     @property
-    def _host_ends_s(self) -> tuple[float, float]:
+    def _host_ends_s(self) -> Interval:
         """With the refused nodes at their least and at their most."""
         rest_s = self.host_s - between(self.refused_s)
         return rest_s + self.refused_s[0], rest_s + self.refused_s[1]
@@ -175,9 +183,12 @@ def predict(placement: Placement, dpu: Dpu, task: Task | None = None) -> Predict
         remedy = "give a network with convolutions"
         raise ModelError("cost model", expected="work for the DPU", got="no convolution", remedy=remedy)
     columns = Layers.of(works, dpu)
-    layers = _layer_costs(works, columns, constants, structure)
+    compute_s, memory_s = columns.compute_s(constants), columns.memory_s(constants, structure)
+    times_s = columns.time_s(constants, structure)
+    parts = zip(works, compute_s.tolist(), memory_s.tolist(), times_s.tolist(), strict=True)
+    layers = tuple(LayerCost(*part) for part in parts)
     refused = [node.op for node in placement.failed]
-    cores, refused_s = dpu.whole("cpu", "cores"), processor_s(refused, dpu)
+    cores, refused_s = dpu.whole("cpu", "cores"), refused_interval_s(refused, dpu)
     task = task or task_of(placement)
     host_s = float(placed_work(placement, task) @ constants.host_s_per_unit) / cores + between(refused_s)
     dpu_s = math.fsum([*(layer.time_s for layer in layers), constants.batch_s]) / dpu.batch
@@ -205,17 +216,6 @@ def predict(placement: Placement, dpu: Dpu, task: Task | None = None) -> Predict
     )
 
 
-def _layer_costs(
-    works: Sequence[Work], layers: Layers, constants: Constants, structure: Structure
-) -> tuple[LayerCost, ...]:
-    columns = (
-        layers.compute_s(constants),
-        layers.memory_s(constants, structure),
-        layers.time_s(constants, structure),
-    )
-    return tuple(LayerCost(*row) for row in zip(works, *(c.tolist() for c in columns), strict=True))
-
-
 WIDTHS = {
     "host": "width_host",
     "small maps": "width_small_maps",
@@ -231,38 +231,14 @@ ROUNDED = 1e-3
 
 def _outside(core: Sequence[Operation], map_bytes: float, dpu: Dpu) -> tuple[str, ...]:
     """What of a network lies beyond the fitted ones, each with the end of the range that it passes."""
-    values = {
-        "map_bytes": ("largest map", map_bytes / 1e6, 1e-6, " MB"),
-        "operations": ("work", sum(op.operations for op in core) / 1e9, 1e-9, " GOP"),
-    }
+    operations = sum(op.operations for op in core)
+    values = {"map_bytes": ("largest map", map_bytes, 1e-6, "MB"), "operations": ("work", operations, 1e-9, "GOP")}
     found = []
     for key, (name, value, scale, unit) in values.items():
-        most = scale * dpu.limit("cost", f"fitted_{key}").high
+        most = dpu.limit("cost", f"fitted_{key}").high
         if value > most * (1 + ROUNDED):
-            found.append(f"{name} {value:.3g}{unit} (fitted up to {most:.3g})")
+            found.append(f"{name} {scale * value:.3g} {unit} (fitted up to {scale * most:.3g})")
     return tuple(found)
-
-
-def paper_frames(width_px: int, height_px: int, tile_px: int) -> float:
-    """Pixels of the image over pixels of a tile: a fraction, with no halo (paper, table of the VCK190 benchmark).
-
-    13600 x 9016 at 640 is 299.4; at the published 7.2 frames a second that is the published 42 s.
-    """
-    return width_px * height_px / tile_px**2
-
-
-def tile_count(size_px: int, tile_px: int, halo_px: int) -> int:
-    """Tiles along one side, ceil((size - 2 halo) / (tile - 2 halo)): the outer tiles need no halo outside.
-
-    Raises:
-        OptionError: a tile with no room between its two halos.
-    """
-    return len(plan_side(size_px, tile_px, halo_px))
-
-
-def whole_tiles(width_px: int, height_px: int, tile_px: int, halo_px: int) -> int:
-    """Tiles of the grid, the last row and column moved inward: 384 for 13600 x 9016 at 640 with a halo of 35."""
-    return tile_count(width_px, tile_px, halo_px) * tile_count(height_px, tile_px, halo_px)
 
 
 def dpu_power(dpu: Dpu) -> Figure:
@@ -274,7 +250,7 @@ def dpu_power(dpu: Dpu) -> Figure:
     return predicted(anchor.low, "W", (assumed.low, assumed.high), source)
 
 
-def layer_energy_j(layer: LayerCost, dpu: Dpu) -> tuple[float, float]:
+def layer_energy_j(layer: LayerCost, dpu: Dpu) -> Interval:
     """Least and most energy of a layer for one image, its share of the batch's weights included."""
     work = layer.work
     moved = work.load_map_bytes + work.store_map_bytes + work.weight_bytes / dpu.batch
@@ -283,10 +259,10 @@ def layer_energy_j(layer: LayerCost, dpu: Dpu) -> tuple[float, float]:
     return products * product.low + moved * byte.low, products * product.high + moved * byte.high
 
 
-def image_energy_j(prediction: Prediction, dpu: Dpu) -> tuple[float, float]:
+def image_energy_j(prediction: Prediction, dpu: Dpu) -> Interval:
     """Least and most energy of all layers for one image."""
-    ends = [layer_energy_j(layer, dpu) for layer in prediction.layers]
-    return sum(low for low, _ in ends), sum(high for _, high in ends)
+    low_j, high_j = zip(*(layer_energy_j(layer, dpu) for layer in prediction.layers), strict=True)
+    return sum(low_j), sum(high_j)
 
 
 def counted_power(prediction: Prediction, dpu: Dpu) -> Figure:

@@ -1,4 +1,4 @@
-"""Measured on this machine: networks interleaved, their nodes, load and memory, and the chain."""
+"""Measured on this machine: networks interleaved, their nodes, load and memory."""
 
 import math
 import time
@@ -10,30 +10,19 @@ import numpy as np
 import onnx
 import pytest
 
-from deploy.bench.host import (
-    Sensors,
-    Timed,
-    drawn_acquisition,
-    host_rows,
-    time_networks,
-    timed_rows,
-    traditional_rows,
-)
-from deploy.bench.profile import node_rows, profile
-from deploy.bench.tables import Swath
+from deploy.bench.host import Timed, host_rows, time_networks, timed_rows
+from deploy.bench.timing import node_rows, profile
 from deploy.export import float_model
 from deploy.host_state import memory_rise, watched
 from deploy.networks import other_precision, shipped_pair
-from model.traditional.work import UNITS
-from profiles import load_sensor, load_target
+from profiles import load_target
 from profiles.constant import Constant
 from profiles.errors import ModelError
 from profiles.figures import Row
 from quant.onnx_file import is_quantised, load_onnx
 from tests.deploy.dpu.graphs import Sketch, float_convbeers, integer_convbeers
 
-SENSORS = Sensors(load_sensor("pleiades-degraded"), load_sensor("pleiades-reference"))
-BOARD, HOST = load_target("vck190"), load_target("host-cpu")
+HOST = load_target("host-cpu")
 SHORT = {"min_time_s": Constant(0.05, "stated", "test"), "min_runs": Constant(3, "stated", "test")}
 QUICK = replace(HOST, tables={**HOST.tables, "measurement": SHORT})
 
@@ -123,15 +112,3 @@ def test_load_and_clock_are_figures_or_reasons() -> None:
         sum(range(3_000_000))
     assert watch.load.mode == "measured"
     assert watch.clock.value is not None or watch.clock.reason
-
-
-def test_the_chain_says_under_what_conditions_it_ran() -> None:
-    swath = Swath(61, 47)
-    (here, board), kinds = traditional_rows(drawn_acquisition(swath, SENSORS), swath, SENSORS, [BOARD])
-    assert {"threads", "CPU load", "clock", "explained by kinds"} <= set(here.figures)
-    assert here.figures["latency"].mode == "measured"
-    assert board.figures["latency"].mode == "predicted"
-    assert board.table == here.table
-    assert [row.name for row in kinds] == [f"{kind}, {unit}" for kind, unit in UNITS.items()]
-    shares = math.fsum(value(row, "share") for row in kinds)
-    assert shares == pytest.approx(min(value(here, "explained by kinds"), 100))

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Sequence
 
-from deploy.bench.profile import interleaved
+from deploy.bench.timing import interleaved
 
 
 def test_calls_run_round_by_round_until_there_are_enough() -> None:

@@ -48,7 +48,7 @@ def quantised(spread: float) -> Quantised:
     scene = procedural_scene(400, 400, np.random.default_rng(1))
     sensors = load_sensor("pleiades-degraded"), load_sensor("pleiades-reference")
     patches = draw_patches([scene], *sensors, count=2, seed=5)
-    return quantise_model(to_onnx(network.eval(), {}), patches, {}, tick=lambda: None)
+    return quantise_model(to_onnx(network.eval(), {}), patches, {})
 
 
 def own_file() -> onnx.ModelProto:

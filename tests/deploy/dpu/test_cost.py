@@ -1,21 +1,15 @@
 import math
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from deploy.bench.tables import PAPER_TILE_PX, predict_file
 from deploy.dpu.board import load_dpu
 from deploy.dpu.checker.placement import place
-from deploy.dpu.cost.constants import Constants, Structure
-from deploy.dpu.cost.fit import Cases
-from deploy.dpu.cost.latency import WIDTHS, Prediction, predict
-from deploy.dpu.cost.published import network_case, published_cases
-from deploy.dpu.cost.validation import regimes_of
-from deploy.dpu.cost.work import count_work
-from deploy.dpu.graph import Network
-from deploy.dpu.zoo.builder import Builder
-from deploy.dpu.zoo.networks import NETWORKS, convbeers, network
+from deploy.dpu.cost.latency import Prediction
+from deploy.dpu.cost.model import LARGE_MAP_BYTES, regime_of
+from deploy.dpu.cost.work import Work, count_work
+from deploy.dpu.reading import read_network
 from profiles.errors import ModelError
 from tests.deploy.dpu.graphs import Sketch, board_convbeers, float_convbeers, integer_convbeers
 
@@ -40,12 +34,6 @@ def test_the_papers_network(papers_prediction: Prediction) -> None:
     wide, image = 64 * 640 * 640, 640 * 640
     moves = image + wide + 32 * 2 * wide + 16 * wide + 2 * wide + wide + wide + image
     assert papers_prediction.streamed_bytes == moves
-
-
-def test_the_builder_writes_down_what_the_file_holds(papers_prediction: Prediction) -> None:
-    built = predict(place(convbeers(), DPU), DPU)
-    assert built.batch_time_s == papers_prediction.batch_time_s
-    assert (built.operations, built.host_s) == (papers_prediction.operations, papers_prediction.host_s)
 
 
 def test_the_interval_holds_the_published_figure(papers_prediction: Prediction) -> None:
@@ -115,61 +103,66 @@ def test_first_layers_gather_their_window(tmp_path: Path, board: str, taken_in: 
     assert head.array_operations == 2 * 3 * taken_in * 32 * 96 * 96
 
 
-def moved(network: Network) -> int:
+def works_of(sketch: Sketch, result: str, path: Path, side_px: int) -> tuple[Work, ...]:
+    """The work of a network that ends in `result`."""
+    return count_work(place(read_network(sketch.save(path, result), side_px), DPU).core, DPU)
+
+
+def moved(works: tuple[Work, ...]) -> int:
     """Map bytes that an image moves."""
-    works = count_work(network.operations, DPU)
     return sum(work.load_map_bytes + work.store_map_bytes for work in works)
 
 
-def test_what_three_branches_read_passes_through_memory() -> None:
+def test_what_three_branches_read_passes_through_memory(tmp_path: Path) -> None:
     """A module of three branches: its input read thrice, each branch written for the concat; of two branches: not."""
     found = {}
     for branches in (2, 3):
-        b = Builder(32, 32, 16)
-        stem = b.conv(b.image, 16)
-        ends = [b.conv(stem, 16, 1) for _ in range(branches)]
-        joined = b.conv(b.concat(ends[0], *ends[1:]), 8, 1)
-        found[branches] = moved(b.written(joined).network) / (16 * 32 * 32)
+        s = Sketch(16)
+        stem = s.conv("image", (16, 16, 3, 3))
+        joined = s.node("Concat", *(s.conv(stem, (16, 16, 1, 1)) for _ in range(branches)), axis=1)
+        works = works_of(s, s.conv(joined, (8, 16 * branches, 1, 1)), tmp_path / "n.onnx", 32)
+        found[branches] = moved(works) / (16 * 32 * 32)
     image, result = 1, 0.5
-    assert found[2] == image + 2 + result
-    assert found[3] == image + 1 + 3 + 3 + result
+    assert found == {2: image + 2 + result, 3: image + 1 + 3 + 3 + result}
 
 
-def test_an_add_that_reads_what_its_convolution_read_reads_it_once() -> None:
+def test_an_add_that_reads_what_its_convolution_read_reads_it_once(tmp_path: Path) -> None:
     """Its operand is on the chip while the convolution runs; behind two convolutions it is not."""
-    extra = {}
+    extra, wide = {}, (32, 32, 3, 3)
     for convs in (1, 2):
         sums = []
         for added in (False, True):
-            b = Builder(256, 256, 32)
-            x = first = b.conv(b.image, 32)
+            s = Sketch(32)
+            x = first = s.conv("image", wide)
             for _ in range(convs):
-                x = b.conv(x, 32)
-            sums.append(moved(b.written(b.conv(b.add(x, first) if added else x, 8, 1)).network))
+                x = s.conv(x, wide)
+            last = s.conv(s.node("Add", x, first) if added else x, (8, 32, 1, 1))
+            sums.append(moved(works_of(s, last, tmp_path / "n.onnx", 256)))
         extra[convs] = sums[1] - sums[0]
     assert extra == {1: 0, 2: 32 * 256 * 256}
 
 
 @pytest.mark.parametrize("block", [2, 4])
-def test_a_pixel_shuffle_is_no_more_than_where_results_go(block: int) -> None:
+def test_a_pixel_shuffle_is_no_more_than_where_results_go(tmp_path: Path, block: int) -> None:
     sums = []
-    for shuffled in (False, True):
-        b = Builder(256, 256, 3)
-        x = b.conv(b.image, 3 * block**2)
-        x = b.shuffle(x, block) if shuffled else x
-        net = b.written(b.conv(x, x.channels, 1)).network
-        sums.append(moved(net) - net.operations[-1].out_bytes)
-        assert len(count_work(net.operations, DPU)) == 2
+    for shuffled, channels in ((False, 3 * block**2), (True, 3)):
+        s = Sketch(3)
+        x = s.conv("image", (3 * block**2, 3, 3, 3))
+        x = s.node("DepthToSpace", x, blocksize=block) if shuffled else x
+        works = works_of(s, s.conv(x, (channels, channels, 1, 1)), tmp_path / "n.onnx", 256)
+        assert len(works) == 2
+        sums.append(moved(works))
     assert sums[0] == sums[1]
 
 
-def test_a_transposed_convolution_runs_over_the_zeros_between_its_pixels() -> None:
-    b = Builder(64, 64, 32)
-    grown, plain = b.transposed(b.image, 32, 2, 2), Builder(128, 128, 32)
+def test_a_transposed_convolution_runs_over_the_zeros_between_its_pixels(tmp_path: Path) -> None:
+    grown, plain = Sketch(32), Sketch(32)
     works = [
-        count_work(net.operations, DPU)[0]
-        for net in (b.written(grown).network, plain.written(plain.conv(plain.image, 32, 2)).network)
+        works_of(grown, grown.node("ConvTranspose", "image", grown.weight(32, 32, 2, 2), strides=[2, 2]), path, 64)[0]
+        for path in (tmp_path / "n.onnx",)
     ]
+    result = plain.conv("image", (32, 32, 2, 2), pads=[0, 0, 1, 1])
+    works += works_of(plain, result, tmp_path / "p.onnx", 128)
     assert works[0].array_operations == works[1].array_operations == 4 * works[0].operations
 
 
@@ -222,46 +215,20 @@ def test_a_network_without_convolutions_has_no_prediction(tmp_path: Path) -> Non
         predict_file(path, DPU)
 
 
-@pytest.mark.parametrize("board", ["vck190", "vek280"])
-def test_the_largest_of_the_fitted_networks_is_not_outside(board: str) -> None:
-    """[cost] keeps four digits of the ends; RCAN has the largest map that the DPU bounds."""
-    dpu = load_dpu(board)
-    largest = place(network("rcan"), dpu)
-    assert predict(largest, dpu).outside == ()
-    assert predict(place(convbeers(1280), dpu), dpu).outside
-
-
-@pytest.mark.parametrize("board", ["vck190", "zcu102", "zcu104", "kv260", "vek280"])
-def test_published_rates_of_one_thread_lie_inside_the_intervals(board: str) -> None:
-    """With the widths of rates with several threads, and the host's task as it is timed."""
-    dpu = load_dpu(board)
-    cases, constants = published_cases(board, Structure.of(dpu)), Constants.of(dpu)
-    errors = cases.residuals(cases.times(constants))[len(cases.rows) :]
-    widths = np.array([dpu.value("cost", WIDTHS[kind]) for kind in regimes_of(cases, constants)])
-    known = ~np.isnan(cases.observed_single)
-    assert known.sum() > 30
-    assert (np.abs(errors) <= widths)[known].mean() >= 0.9
-
-
-@pytest.mark.parametrize(("board", "name"), [("vck190", "resnet-50"), ("zcu102", "rcan"), ("vek280", "erfnet")])
-def test_latency_is_what_is_fitted_to_rates_of_one_thread(board: str, name: str) -> None:
-    """A core's batch in its latency: the fit's own sum, of a network whose results the host reads whole."""
-    dpu = load_dpu(board)
-    case = Cases((network_case(name, dpu, (1.0,)),), Structure.of(dpu))
-    times = case.times(Constants.of(dpu))
-    found = predict(place(network(name), dpu), dpu, NETWORKS[name].host)
-    assert found.handlers / found.latency_s == pytest.approx(1 / float(times.alone_s[0] + times.host_s[0]))
-    assert found.fps == pytest.approx(math.exp(float(case.predicted(times)[0])))
-
-
-def test_a_task_that_is_stated_takes_the_place_of_what_the_file_tells() -> None:
-    """Heads that are read and no more, or ranked: SSD's file is the same."""
-    dpu = load_dpu("vck190")
-    placement = place(network("ssd-resnet-34"), dpu)
-    read, ranked = predict(placement, dpu), predict(placement, dpu, "sort")
+def test_a_task_that_is_stated_takes_the_place_of_what_the_file_tells(tmp_path: Path) -> None:
+    """Heads that are read and no more, or ranked: the file is the same."""
+    sketch = Sketch(8)
+    path = sketch.save(tmp_path / "h.onnx", sketch.conv("image", (80, 8, 3, 3)))
+    read, ranked = predict_file(path, DPU, 96), predict_file(path, DPU, 96, "sort")
     assert (read.task, ranked.task) == ("copy", "sort")
     assert ranked.host_s > read.host_s
     assert ranked.batch_time_s == read.batch_time_s
+
+
+def test_regimes() -> None:
+    assert regime_of(host_bound=True, map_bytes=1e9) == "host"
+    assert regime_of(host_bound=False, map_bytes=LARGE_MAP_BYTES) == "small maps"
+    assert regime_of(host_bound=False, map_bytes=LARGE_MAP_BYTES + 1) == "large maps"
 
 
 def test_latency_is_that_of_one_core_and_one_thread(tmp_path: Path) -> None:

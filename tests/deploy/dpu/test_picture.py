@@ -9,9 +9,9 @@ from deploy.dpu.board import load_dpu
 from deploy.dpu.checker.picture import FILLS, draw, require_picture, write_picture
 from deploy.dpu.checker.placement import Placement, place
 from deploy.dpu.reading import read_network
-from deploy.report.plots import text_width
 from profiles.errors import OptionError
 from tests.deploy.dpu.graphs import Sketch, float_convbeers
+from tests.deploy.report.svg import style_of, text_width
 
 SVG = "{http://www.w3.org/2000/svg}"
 
@@ -35,7 +35,7 @@ def test_every_node_is_drawn_in_its_devices_colour_and_says_which(tmp_path: Path
     devices = [node.device for node in placement.nodes]
     assert devices == ["DPU", "CPU", "DPU"]
     assert labels == devices
-    assert [box.get("fill") for box in boxes] == [FILLS[device] for device in devices]
+    assert [style_of(box)["fill"] for box in boxes] == [FILLS[device] for device in devices]
     assert [group.findtext(f"{SVG}title") for group in root.iter(f"{SVG}g") if group.get("class") == "dot"] == [
         f"{node.op.op_type}  {node.op.name}" for node in placement.nodes
     ]

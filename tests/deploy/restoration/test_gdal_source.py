@@ -116,14 +116,6 @@ def test_missing_pixels_stay_missing(model: Path, tmp_path: Path) -> None:
     np.testing.assert_array_equal(tifffile.imread(tmp_path / "vrt.tif"), results[0])
 
 
-def test_workers_read_it_too(model: Path, tmp_path: Path) -> None:
-    pytest.importorskip("distributed")
-    image = images.write_vrt(tmp_path / "a.vrt", images.digital_numbers())
-    restore_file(image, tmp_path / "one.tif", Options(model, tile_px=64), lambda _: None)
-    restore_file(image, tmp_path / "two.tif", Options(model, tile_px=64, workers=1), lambda _: None)
-    assert (tmp_path / "one.tif").read_bytes() == (tmp_path / "two.tif").read_bytes()
-
-
 def test_the_cache_is_counted_with_the_blocks_of_a_mosaic_s_tiles(tmp_path: Path) -> None:
     pixels, rows = images.digital_numbers(), 1 << 20
     one = images.write_jp2(tmp_path / "a.jp2", pixels)
@@ -191,9 +183,10 @@ def test_a_tile_is_no_output(model: Path, tmp_path: Path) -> None:
 
 def test_a_changed_tile_makes_another_image(tmp_path: Path) -> None:
     image = images.write_vrt(tmp_path / "a.vrt", images.digital_numbers())
-    before = fingerprint(image)
+    with open_source(image) as source:
+        before = fingerprint(source.files)
     images.write_jp2(tmp_path / "R64C80.jp2", np.zeros((2, images.HEIGHT - 64, images.WIDTH - 80), np.uint16))
-    assert fingerprint(image) != before
+    assert fingerprint(source.files) != before
 
 
 def test_bytes_that_are_no_text_print_no_traceback(

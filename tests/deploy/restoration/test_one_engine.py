@@ -3,31 +3,26 @@
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
 import tifffile
 
-from deploy import demo, methods
-from deploy.cache import Cache
-from deploy.demo import INT8
+from deploy import library
 from deploy.library import restore
 from deploy.networks import shipped_pair
+from deploy.restoration import function
 from deploy.restoration.engine import restore_dn, restore_floats
 from deploy.restoration.options import Options, Runtime
 from deploy.restoration.plan import plan_for
 from deploy.restoration.run import restore_file
 from deploy.restoration.runtime import open_runtime
-from deploy.stress.subject import Network
-from deploy.tradeoff import run as tradeoff
-from deploy.tradeoff.accuracy import cut_in_four
-from deploy.tradeoff.methods import CalibrationScenes, MethodStore, find_networks
-from deploy.tradeoff.points import Point, Variant
+from deploy.studies.evaluation.methods import method_named
+from deploy.studies.stress.networks import Network
+from deploy.studies.tradeoff.measure import restore_in_tiles
+from deploy.studies.tradeoff.points import FLOAT, INT8, Variant
 from profiles import load_sensor
 from quant.onnx_file import load_onnx
-from quant.tiling.walk import receptive_radius_px
 
 Restored = Callable[[np.ndarray], np.ndarray]
 
@@ -40,8 +35,8 @@ SMALL_HALOS_PX = {"float": 2, "int8": 8}
 
 @pytest.fixture(params=TILES_PX)
 def precision(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
-    """Of the network; evaluate, demo and the trade-off's scores take tiles so small that the image has many."""
-    monkeypatch.setattr(methods, "TILE_PX", TILES_PX[request.param])
+    """Of the network; evaluate and the trade-off's scores take tiles so small that the image has many."""
+    monkeypatch.setattr(function, "TILE_PX", TILES_PX[request.param])
     return str(request.param)
 
 
@@ -69,36 +64,18 @@ def by_engine(dn: np.ndarray, options: Options) -> np.ndarray:
     return restore_dn(dn, infer, plan_for(network, (1, *ODD), options))
 
 
-def opened_by_tradeoff(path: Path, folder: Path) -> tuple[MethodStore, Variant]:
-    """The network as a variant of a study."""
-    (network,) = find_networks([str(path)])
-    store = MethodStore(
-        {network.name: network}, SENSOR, REFERENCE, CalibrationScenes(None, SENSOR.name, 0), Cache(folder)
-    )
-    return store, Variant(network.name, "network", "float32" if network.float_file else "INT8 legal")
+def by_tradeoff(path: Path, precision: str, halo_px: int) -> Restored:
+    """As a study scores an operating point whose halo is smaller than the network's radius."""
+    variant = Variant(path.stem, FLOAT if precision == "float" else INT8, str(path), path)
+    return restore_in_tiles(variant, TILES_PX[precision], halo_px, 4095)
 
 
-def crop_of_tradeoff(dn: np.ndarray, path: Path, tile_px: int, halo: str, folder: Path) -> np.ndarray:
-    """As a study shows an operating point."""
-    store, variant = opened_by_tradeoff(path, folder)
-    measurements: Any = SimpleNamespace(store=store)
-    pair: Any = SimpleNamespace(degraded=dn)
-    point: Any = SimpleNamespace(point=Point(variant, tile_px, halo))
-    return tradeoff._restored(point, pair, measurements)
-
-
-def exact_ways(path: Path, tile_px: int, folder: Path) -> dict[str, Restored]:
+def exact_ways(path: Path, tile_px: int) -> dict[str, Restored]:
     """Every way from digital numbers (H, W) float32 to whole restored ones whose seams are exact."""
     network = load_onnx(path)
-    infer, _ = open_runtime(Runtime.onnxruntime, network, threads=0)
-    store, variant = opened_by_tradeoff(path, folder)
-    sensors: Any = SimpleNamespace(degraded=SENSOR, reference=REFERENCE)
     return {
-        "evaluate": methods.method_named(str(path), SENSOR, REFERENCE).restore,
-        "demo": demo._methods(network, sensors)[INT8],
-        "tradeoff's scores": store.open(variant).restore,
-        "tradeoff's seams": cut_in_four(infer, receptive_radius_px(network)),
-        "tradeoff's crops": partial(crop_of_tradeoff, path=path, tile_px=tile_px, halo="exact", folder=folder),
+        "evaluate and tradeoff": method_named(str(path), SENSOR, REFERENCE).restore,
+        "the library and the demo": lambda dn: np.rint(library.restore(dn, path, tile_px=tile_px, full_scale=4095)),
         "stress": lambda dn: np.rint(Network(network).restore(dn, tile_px=tile_px)),
         "the array": partial(by_engine, options=Options(path, tile_px)),
     }
@@ -111,7 +88,7 @@ def test_with_exact_seams_every_command_gives_the_pixels_of_restore(
     expected = by_command(pixels, tmp_path, Options(path, tile_px))
     assert (expected != pixels).mean() > 0.5
     np.testing.assert_array_equal(restore(pixels, path, tile_px=tile_px), expected)
-    for name, way in exact_ways(path, tile_px, tmp_path).items():
+    for name, way in exact_ways(path, tile_px).items():
         np.testing.assert_array_equal(way(pixels.astype(np.float32)), expected, err_msg=name)
 
 
@@ -122,7 +99,7 @@ def test_with_a_halo_below_the_radius_they_have_the_same_seams(precision: str, p
     assert (expected != by_command(pixels, tmp_path, Options(path, tile_px))).any()
     dn = pixels.astype(np.float32)
     np.testing.assert_array_equal(restore(pixels, path, tile_px=tile_px, halo=halo_px), expected)
-    np.testing.assert_array_equal(crop_of_tradeoff(dn, path, tile_px, str(halo_px), tmp_path), expected)
+    np.testing.assert_array_equal(by_tradeoff(path, precision, halo_px)(dn), expected)
     np.testing.assert_array_equal(by_engine(dn, options), expected)
 
 
@@ -140,7 +117,7 @@ def test_a_sensor_of_other_bits_has_its_own_full_scale(bits: int, model: Path, t
     dn = np.random.default_rng(3).integers(0, max_dn + 1, ODD).astype(np.uint16)
     network = load_onnx(model)
     expected = by_command(dn, tmp_path, Options(model, 23, full_scale=max_dn))
-    evaluated = methods.network_method(network, max_dn)(dn.astype(np.float32))
+    evaluated = function.network_method(network, max_dn)(dn.astype(np.float32))
     np.testing.assert_array_equal(evaluated, expected)
     infer, _ = open_runtime(Runtime.onnxruntime, network, threads=0)
     plan = plan_for(network, (1, *ODD), Options(model, 23))

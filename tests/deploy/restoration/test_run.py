@@ -120,20 +120,13 @@ def test_8_bit_pixels_come_back_in_their_scale(model: Path, tmp_path: Path) -> N
     np.testing.assert_array_equal(restored, np.rint(restore_window(eight, infer, 255)).astype(np.uint16))
 
 
-@pytest.mark.parametrize("workers", [0, 1])
-def test_floats_of_about_0_to_1_are_refused_until_their_scale_is_named(
-    workers: int, model: Path, tmp_path: Path
-) -> None:
-    if workers:
-        pytest.importorskip("distributed")
+def test_floats_of_about_0_to_1_are_refused_until_their_scale_is_named(model: Path, tmp_path: Path) -> None:
     shares = (noise(61, 37) / 4095).astype(np.float32)
     shares[5:9] = np.nan
-    refused(
-        tmp_path, shares, Options(model, tile_px=23, workers=workers), ImageError, "floats of at most 1", "--full"
-    )
-    refused(tmp_path, shares * 1.9, Options(model, tile_px=23, workers=workers), ImageError, "--full-scale")
+    refused(tmp_path, shares, Options(model, tile_px=23), ImageError, "floats of at most 1", "--full")
+    refused(tmp_path, shares * 1.9, Options(model, tile_px=23), ImageError, "--full-scale")
     (tmp_path / "out.tif").unlink()
-    restored, _ = restore(tmp_path, shares, Options(model, tile_px=23, full_scale=1, workers=workers))
+    restored, _ = restore(tmp_path, shares, Options(model, tile_px=23, full_scale=1))
     assert 0 < np.nanmean(restored) < np.nanmax(restored) <= 1
 
 

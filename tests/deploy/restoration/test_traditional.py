@@ -120,7 +120,7 @@ def test_the_command_needs_a_sensor_and_no_option_of_a_network(tmp_path: Path) -
         ([*chain, "--sensor", "hubble"], "hubble"),
         ([*named, "--tile", "64"], "--tile: expected none with --method traditional"),
         ([*named, "--resume"], "--resume: expected none"),
-        ([*named, "--workers", "2"], "--workers: expected none"),
+        ([*named, "--scheduler", "host:8786"], "--scheduler: expected none"),
     ):
         result = CliRunner().invoke(app, arguments)
         assert result.exit_code == 2

@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from model.metrics.edge_blur import FOUND, HALF_PX, POINTED_AT, EdgeBlur, combine, find_blurs, fit_blur
-from model.metrics.edges import slanted_edge
 from model.metrics.refusal import Refusal
+from model.metrics.slanted_edge import slanted_edge
 from model.simulator.mtf import Blur, gamma_from_mtf, transfer_function
 from model.simulator.procedural import procedural_scene
 from model.simulator.sampling import sample, scene_spectrum

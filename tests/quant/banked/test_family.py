@@ -50,7 +50,7 @@ def pair(request: pytest.FixtureRequest) -> tuple[BankedConvBEERS, Family]:
     weights = Weights({name: value.numpy() for name, value in made.state_dict().items()}, made.variant, {})
     images = [bank_results(textured(64, 64, k), bank(each), each, scale) for k, each in enumerate(SENSORS)]
     middle = bank((0.0, 0.0, 0.0, 0.0))
-    return made, quantise_family(weights, middle, Remade(images.__getitem__, len(images)), lambda: None)
+    return made, quantise_family(weights, middle, Remade(images.__getitem__, len(images)))
 
 
 def core_of(family: Family, vector: tuple[float, ...]) -> IntCore:

@@ -17,7 +17,8 @@ from model.convbeers import ConvBEERS, initialise
 from model.variants import Variant
 from quant.calibration import Patches, Remade
 from quant.onnx_file import image_info, make_model
-from quant.quantise import Passes, Quantised, quantise_model
+from quant.quantise import Quantised
+from tests.quant.quick import quickly
 
 
 def constant(name: str, *shape: int) -> onnx.TensorProto:
@@ -341,7 +342,7 @@ def quantised_half_resolution() -> Quantised:
     """The same in legal INT8, for the host and for the board."""
     seen = np.random.default_rng(5).random((2, 1, 1, 48, 48), dtype=np.float32)
     patches = Patches([], Remade(lambda k: (seen[k], seen[k]), 2), Remade(lambda k: seen[k], 2))
-    return quantise_model(half_resolution(), patches, {}, lambda: None, Passes(equalise=False))
+    return quickly(half_resolution(), patches)
 
 
 def int8_half_resolution() -> onnx.ModelProto:

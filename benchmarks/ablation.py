@@ -1,0 +1,64 @@
+"""What each pass of the legal quantisation buys: the gate's figures with all of them, and with each one left out.
+
+    python benchmarks/ablation.py NETWORK.onnx [--sensor pleiades-degraded] [--images DIR] [--patches 64] [--seed 0]
+
+A pass is left out by what stands in its place here; patches are those of `quantize`, and the figures those of `gate`
+on patches that calibration did not see.
+"""
+
+import argparse
+from collections.abc import Iterator
+from contextlib import AbstractContextManager, nullcontext
+from pathlib import Path
+from unittest.mock import patch
+
+import numpy as np
+
+from deploy.export import float_model
+from deploy.networks import float_file
+from profiles import load_sensor
+from quant.calibration import PATCH_PX, Calibration
+from quant.gate import compare
+from quant.passes.equalise import first_guess
+from quant.quantise import quantise_model
+from quant.session import open_any_size
+
+ALL, PAIR = "all passes", "without half-LSB pair"
+
+
+def ablations() -> Iterator[tuple[str, AbstractContextManager[object]]]:
+    """Each ablation, and what leaves the pass out while it is entered."""
+    yield ALL, nullcontext()
+    yield PAIR, nullcontext()  # an argument of quantise_model
+    yield "without dual-range output", patch("quant.quantise.takes_gains", lambda _graph: False)
+    yield "without fitted weights", patch("quant.quantise.fit_weights", lambda _graph, core, *_: core)
+    yield "without least-squares scales", patch("quant.calibration._errors", lambda *_: np.zeros(1))
+    yield (
+        "without equalising",  # one factor for all channels, with which the largest range fits
+        patch("quant.quantise.search", lambda _graph, _stream, ranges, _trial: first_guess(ranges, 0.0, 1.0)),
+    )
+
+
+def main() -> None:
+    """Print a row an ablation."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("network", type=Path)
+    parser.add_argument("--sensor", default="pleiades-degraded")
+    parser.add_argument("--images", type=Path)
+    parser.add_argument("--patches", type=int, default=64)
+    parser.add_argument("--patch", type=int, default=PATCH_PX)
+    parser.add_argument("--seed", type=int, default=0)
+    given = parser.parse_args()
+    model = float_model(float_file(given.network, load_sensor(given.sensor)))
+    calibration = Calibration(given.sensor, given.images, given.patches, given.patch, given.seed)
+    session, unseen = open_any_size(model), calibration.unseen.pairs
+    print("| passes | MAE | PSNR drop, dB |\n|---|---|---|")
+    for name, left_out in ablations():
+        with left_out:
+            made = quantise_model(model, calibration.drawn, {}, pairs=name != PAIR)
+        found = compare(session, open_any_size(made.host), unseen)
+        print(f"| {name} | {found.mae:.3g} | {found.drop_db:.3f} |", flush=True)
+
+
+if __name__ == "__main__":
+    main()

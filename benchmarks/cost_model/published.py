@@ -1,0 +1,127 @@
+"""The published networks and their published rates, as cases for the fit.
+
+Layers stand in the `.net` files under `zoo/` (see `notation`), rates in `zoo/published.csv`: tables of AMD's model
+zoo (github.com/Xilinx/Vitis-AI), each row with the release and the line, row or record that prints it. A rate
+contains the host: images lie decoded in memory, then each thread runs mean and scale, DPU and post-processing for a
+batch (src/vai_library/benchmark). How many threads `fps` took is not stated; `fps_single` took one.
+
+What a host does follows from the post-processing in src/vai_library/xnnpp/src:
+
+- softmax: exponentials of every class, then the best few (classification.cpp, ultrafast_postimp.cpp);
+- argmax: the largest channel of every pixel (segmentation.cpp);
+- sort: scores above a threshold, their boxes, then non-maximum suppression. YOLO reads one score a box and skips the
+  rest (yolov3.cpp, yolovx.cpp), SSD every score of every class (tfssd_detector.cpp), DenseBox and RetinaFace every
+  score (facedetect.cpp, retinaface_detector.cpp); the boxes of the few that pass are not counted;
+- image: every value becomes a pixel of an image (rcan.cpp, medicalsegcell_imp.cpp);
+- copy: every value is read once, little else (reid.cpp, facequality.cpp).
+
+A row of the tables is left out: ResNet-152 on the KV260 in release 2.0 repeats the rates of ResNet-101. Where a table
+prints another number of operations for the same rates, the `.net` file says so.
+"""
+
+import csv
+import math
+from collections import defaultdict
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+
+from benchmarks.cost_model.builder import Builder, Written
+from benchmarks.cost_model.notation import read_library
+from deploy.dpu.board import Dpu, load_dpu
+from deploy.dpu.cost.model import Array, Layers, host_work
+from deploy.dpu.cost.work import count_work, largest_map_bytes
+from deploy.dpu.graph import Network
+
+ZOO = Path(__file__).parent / "zoo"
+LIBRARY = read_library(sorted(ZOO.glob("*.net")))
+NETWORKS = LIBRARY.networks
+
+
+@dataclass(frozen=True)
+class Case:
+    """A network on a configuration with its rates.
+
+    Attributes:
+        network: its name.
+        family: networks of one family resemble one another.
+        configuration: of the DPU.
+        layers: what its layers take.
+        host: units of the host's work for one image (7,), see `host_work`.
+        host_cores: of the board's processor.
+        fps: rates with several threads, one or more.
+        fps_single: rates with one thread, perhaps none.
+        map_bytes: its largest result.
+    """
+
+    network: str
+    family: str
+    configuration: str
+    layers: Layers
+    host: Array
+    host_cores: int
+    fps: tuple[float, ...]
+    fps_single: tuple[float, ...]
+    map_bytes: int
+
+
+@cache
+def written(name: str) -> Written:
+    """One of NETWORKS, written down once."""
+    return LIBRARY.write(name)
+
+
+@cache
+def published_rates() -> list[dict[str, str]]:
+    """The rows of `published.csv`."""
+    with (ZOO / "published.csv").open(encoding="utf-8", newline="") as file:
+        return list(csv.DictReader(file))
+
+
+@cache
+def boards() -> tuple[str, ...]:
+    """Boards with published rates."""
+    return tuple(dict.fromkeys(rate["board"] for rate in published_rates()))
+
+
+@cache
+def published_cases(board: str) -> tuple[Case, ...]:
+    """The published rates of a board, one case a network and configuration."""
+    found = defaultdict(list)
+    for rate in published_rates():
+        if rate["board"] == board:
+            found[rate["network"], rate["configuration"]].append(rate)
+    return tuple(
+        network_case(
+            name,
+            load_dpu(board, configuration),
+            tuple(float(rate["fps"]) for rate in rates),
+            tuple(float(rate["fps_single"]) for rate in rates if rate["fps_single"]),
+        )
+        for (name, configuration), rates in found.items()
+    )
+
+
+def network_case(name: str, dpu: Dpu, fps: tuple[float, ...], fps_single: tuple[float, ...] = ()) -> Case:
+    """One of NETWORKS on a configuration, with its rates."""
+    net, entry = written(name).network, NETWORKS[name]
+    sizes = {op.output: op.out_bytes for op in net.operations}
+    taken = sum(math.prod(shape) for shape in net.inputs.values())
+    read = sum(written(name).read_bytes.values())
+    host = host_work(taken, sum(sizes[result] for result in net.outputs), read, entry.host)
+    layers = Layers.of(count_work(net.operations, dpu), dpu)
+    cores, largest = dpu.whole("cpu", "cores"), largest_map_bytes(net.operations)
+    return Case(name, entry.family, dpu.name, layers, host, cores, fps, fps_single, largest)
+
+
+def convbeers(side: int = 640, blocks: int = 16, features: int = 64) -> Network:
+    """ConvBEERS as its paper describes it: head, residual blocks, body's end, tail, global add.
+
+    It is in no fit, only predicted.
+    """
+    b = Builder(side, side, 1)
+    stream = head = b.conv(b.image, features)
+    for _ in range(blocks):
+        stream = b.add(b.conv(b.conv(stream, features), features), stream)
+    deep = b.add(b.conv(stream, features), head)
+    return b.written(b.add(b.conv(deep, 1), b.image)).network

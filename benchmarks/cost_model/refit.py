@@ -1,0 +1,147 @@
+"""Refit the cost model: `python -m benchmarks.cost_model.refit` writes [cost] of every board with published rates.
+
+It prints what a family that the fit has not seen is off by, on each board: the table of
+docs/explanation/cost-model.md. `--check` writes nothing and says whether the profiles hold what the fit finds.
+"""
+
+import argparse
+import re
+import sys
+from collections.abc import Iterable, Iterator
+from dataclasses import asdict
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks.cost_model.fit import fit, rounded
+from benchmarks.cost_model.published import boards, written
+from benchmarks.cost_model.validation import (
+    Nested,
+    by_network,
+    coverage,
+    nested,
+    one_thread,
+    outside_width,
+    pair_width,
+    rank_correlation,
+    transferred,
+)
+from deploy.dpu.cost.latency import WIDTHS
+
+TARGETS = Path(__file__).parents[2] / "profiles" / "targets"
+HEADER = "[cost] # written by benchmarks/cost_model/refit.py; the formula: deploy/dpu/cost/model.py"
+CHOSEN = "the choice of least error on families left out: benchmarks/cost_model/validation.py"
+STRUCTURE = {"serial": ("assumed", "the middle of 0 to 1: the published rates do not tell")}
+FITTED = "fit to the published rates of {rows} networks and configurations, benchmarks/cost_model/zoo/published.csv"
+
+
+def with_cost(profile: str, board: str) -> str:
+    """The profile's text with its [cost] fitted anew."""
+    lines = [HEADER]
+    lines += [
+        f'{key} = {{ value = {value}, status = "{status}", source = "{source}" }}'
+        for key, value, status, source in cost_table(board)
+    ]
+    block = "\n".join(lines) + "\n"
+    return re.sub(r"^\[cost].*?\n(?=\n|\Z)", lambda _: block, profile, flags=re.DOTALL | re.MULTILINE)
+
+
+def cost_table(board: str) -> Iterator[tuple[str, str, str, str]]:
+    """Key, value, status and source of each constant of a board's [cost]."""
+    found = nested(board)
+    source = FITTED.format(rows=len(found.cases.rows))
+    for key, value in asdict(rounded(fit(found.cases))).items():
+        yield key, f"{value:.4g}", "inferred", source
+    for key, value in asdict(found.cases.structure).items():
+        yield key, f"{value:g}", *STRUCTURE.get(key, ("inferred", CHOSEN))
+    families = len(set(found.cases.families))
+    left_out = f"|ln(predicted / published)| that nine of ten families keep to, from {families}, each left out once"
+    for kind, width in found.widths.items():
+        yield WIDTHS[kind], f"{width:.3f}", "inferred", f"{left_out}; {kind}"
+    widest = max(*found.widths.values(), outside_width(found.cases))
+    far = "the widest, or the error of networks with the largest maps, predicted from those with a quarter"
+    yield WIDTHS["outside"], f"{widest:.3f}", "inferred", far
+    pairs = (
+        "|ln of the ratio of two rates, predicted / published| that nine of ten pairs of a family's networks keep to"
+    )
+    yield "pair_width", f"{pair_width(board):.3f}", "inferred", f"{pairs}, each network left out once"
+    for key, (low, high) in fitted_ranges(found).items():
+        range_of = "range of the fitted networks that the DPU bounds"
+        yield f"fitted_{key}", f"[{low:.4g}, {high:.4g}]", "inferred", range_of
+
+
+def fitted_ranges(found: Nested) -> dict[str, tuple[float, float]]:
+    """Ranges of the networks that the DPU bounds: the others tell nothing of it."""
+    bound = {row.network for row in found.rows if row.regime != "host"}
+    maps = [row.map_bytes for row in found.cases.rows if row.network in bound]
+    works = [sum(op.operations for op in written(name).network.operations) for name in bound]
+    return {"map_bytes": (min(maps), max(maps)), "operations": (min(works), max(works))}
+
+
+def accuracy() -> Iterator[tuple[object, ...]]:
+    """A row a board: errors of networks whose family was left out, and what the intervals held."""
+    yield (
+        "board",
+        "networks",
+        "families",
+        "rates",
+        "median",
+        "mean",
+        "largest",
+        "Spearman",
+        "rates inside",
+        "families",
+    )
+    for board in boards():
+        found = nested(board)
+        off = by_network((row.network for row in found.rows), (row.rates for row in found.rows))
+        held, whole = coverage(found.rows)
+        counts = len(off), len(set(found.cases.families)), sum(len(row.rates) for row in found.rows)
+        yield board, *counts, *_spread(off), f"{rank_correlation(found):.3f}", _percent(held), _percent(whole)
+
+
+def others() -> Iterator[tuple[object, ...]]:
+    """Rates of one thread, and boards predicted with the ZCU102's constants."""
+    yield "what", "networks", "median", "mean", "largest"
+    for board in boards():
+        off = by_network(*one_thread(board))
+        yield f"{board}, one thread", len(off), *_spread(off)
+    for board in ("zcu104", "kv260"):
+        off = by_network(*transferred("zcu102", board))
+        yield f"{board}, the ZCU102's constants", len(off), *_spread(off)
+
+
+def _spread(off: np.ndarray) -> list[str]:
+    return [_percent(float(value)) for value in (np.median(off), off.mean(), off.max())]
+
+
+def _percent(share: float) -> str:
+    return f"{100 * share:.1f} %" if share < 0.2 else f"{100 * share:.0f} %"
+
+
+def table(rows: Iterable[Iterable[object]]) -> str:
+    """A Markdown table, its head first."""
+    head, *lines = [list(map(str, row)) for row in rows]
+    return "\n".join(f"| {' | '.join(line)} |" for line in (head, ["---"] * len(head), *lines)) + "\n"
+
+
+def main() -> int:
+    """Write or check [cost] of all boards; 1 where `--check` finds another."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
+    parser.add_argument("--check", action="store_true", help="write nothing, and say which profile differs")
+    check, stale = parser.parse_args().check, []
+    for board in boards():
+        path = TARGETS / f"{board}.toml"
+        text = path.read_text(encoding="utf-8")
+        new = with_cost(text, board)
+        stale += [board] if new != text else []
+        if not check:
+            path.write_text(new, encoding="utf-8", newline="\n")
+    print(f"{'not as fitted' if check else 'rewritten'}: {', '.join(stale) or 'none'}\n")
+    print(table(accuracy()))
+    print(table(others()))
+    return int(check and bool(stale))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

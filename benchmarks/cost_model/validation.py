@@ -1,0 +1,260 @@
+"""How wrong the cost model is about networks that its fit has not seen, and the intervals that follow.
+
+Networks of one family resemble one another, so a family is left out as a whole. What is chosen and what is judged
+are kept apart by two rounds (nested cross-validation): for each family left out, the structure is chosen, and the
+width of the interval made, from errors on others of the families that remain. The structure is one for all boards.
+`nested` is what the errors of the documents and the widths of [cost] come from.
+"""
+
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache
+from itertools import combinations, product
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import binom, spearmanr
+
+from benchmarks.cost_model.fit import Cases, fit
+from benchmarks.cost_model.published import boards, published_cases
+from deploy.dpu.cost.model import REGIMES, Array, Constants, Regime, Structure, regime_of
+
+STRUCTURES = tuple(Structure(*values) for values in product((0.5,), (2.0, 4.0), (0.0, 1.0)))
+"""What the cross-validation chooses from; the rates do not tell how much is hidden, so `serial` is assumed."""
+FOLDS = 5
+SHARE = 0.9
+"""Of left-out families that the intervals hold."""
+CONFIDENCE = 0.75
+"""That they do: of some thirty families the luck of who is among them moves a mere quantile by several."""
+SHRINK = 3
+"""A regime's typical error counts this many families of all regimes' typical error besides its own."""
+
+Widths = Mapping[Regime, float]
+"""Half the width of an interval, in ln(FPS), by regime."""
+
+
+@dataclass(frozen=True)
+class LeftOut:
+    """What was found of a network on a configuration, its family left out.
+
+    Attributes:
+        network: its name.
+        family: its family.
+        configuration: of the DPU.
+        regime: by the prediction.
+        error: ln(predicted / observed), the observed rate being the geometric mean.
+        rates: ln(predicted / rate) of each published rate.
+        width: half that of the interval that was predicted, in ln(FPS).
+    """
+
+    network: str
+    family: str
+    configuration: str
+    regime: Regime
+    error: float
+    rates: Array
+    width: float
+
+    @property
+    def held(self) -> float:
+        """Share of the published rates inside the interval."""
+        return float(np.mean(np.abs(self.rates) <= self.width))
+
+
+@dataclass(frozen=True)
+class Nested:
+    """The outcome for a board: all networks left out in turn, the structure of all boards, the widths that follow."""
+
+    rows: Sequence[LeftOut]
+    cases: Cases
+    widths: Widths
+
+
+@cache
+def nested(board: str) -> Nested:
+    """Leave each family out; choose a structure and make widths from the others alone; predict what was left out."""
+    found = [row for name in _trial(board, STRUCTURES[0]).names for row in _trial(board, chosen(name)).left_out(name)]
+    cases, by_case = _trial(board, chosen()).cases, {(row.network, row.configuration): row for row in found}
+    rows = [by_case[row.network, row.configuration] for row in cases.rows]
+    errors = np.array([row.error for row in rows])
+    return Nested(rows, cases, widths_of(errors, cases, [row.regime for row in rows]))
+
+
+@cache
+def chosen(left_out: str = "", unseen_board: str = "") -> Structure:
+    """The structure of the least mean error over boards, of all families and boards but those named."""
+    known = [board for board in boards() if board != unseen_board]
+    scores = [np.mean([_trial(board, structure).score(left_out) for board in known]) for structure in STRUCTURES]
+    return STRUCTURES[int(np.argmin(scores))]
+
+
+@cache
+def _trial(board: str, structure: Structure) -> "Trial":
+    return Trial(Cases(published_cases(board), structure))
+
+
+class Trial:
+    """A structure under trial: its cases and their families; fits begin near that of all rows."""
+
+    def __init__(self, cases: Cases) -> None:
+        self.cases = cases
+        self.names = sorted(set(cases.families))
+        self.near = fit(cases)
+        self._fits: dict[frozenset[str], Constants] = {}
+
+    def fit_without(self, unseen: Iterable[str]) -> Constants:
+        """The constants that the other families give."""
+        key = frozenset(unseen) & frozenset(self.names)
+        if key not in self._fits:
+            self._fits[key] = fit(self.cases.only(~np.isin(self.cases.families, list(key))), near=self.near)
+        return self._fits[key]
+
+    def left_out(self, name: str) -> list[LeftOut]:
+        """A family, predicted without it, in intervals whose widths were made without it."""
+        widths = widths_of(*self.inner(name))
+        tested, constants = self.cases.only(self.cases.families == name), self.fit_without({name})
+        errors, regimes = tested.errors(constants), regimes_of(tested, constants)
+        return [
+            LeftOut(row.network, row.family, row.configuration, kind, float(error), rates, widths[kind])
+            for row, kind, error, rates in zip(tested.rows, regimes, errors, tested.rate_errors(errors), strict=True)
+        ]
+
+    def inner(self, left_out: str) -> tuple[Array, Cases, list[Regime]]:
+        """Errors and regimes of all families but one, which no fit sees, by folds of the others."""
+        kept = self.cases.only(self.cases.families != left_out)
+        errors, regimes = np.zeros(len(kept.rows)), np.zeros(len(kept.rows), dtype=object)
+        for fold in range(FOLDS):
+            tested = self.names[fold::FOLDS]
+            mine, constants = np.isin(kept.families, tested), self.fit_without({*tested, left_out})
+            errors[mine] = kept.only(mine).errors(constants)
+            regimes[mine] = regimes_of(kept.only(mine), constants)
+        return errors, kept, list(regimes)
+
+    def score(self, left_out: str) -> float:
+        """Mean over families of the mean error, all but one."""
+        errors, kept, _ = self.inner(left_out)
+        return family_mean(np.abs(errors), kept.families)
+
+
+def widths_of(errors: Array, cases: Cases, regimes: Sequence[Regime]) -> Widths:
+    """Widths that SHARE of the families lie inside with every rate of all their networks.
+
+    What counts of a case is its rate that lies farthest off. A regime's scale is the mean over families of its mean
+    (drawn to that of all regimes); a family's score is its largest error over scale; the widths are the scales times
+    the score that SHARE of all families keep to.
+    """
+    families, kinds = cases.families, np.array(regimes)
+    sizes = np.array([np.abs(rates).max() for rates in cases.rate_errors(errors)])
+    overall, scales = family_mean(sizes, families), dict[Regime, float]()
+    for kind in REGIMES:
+        mine = kinds == kind
+        count = len(set(families[mine]))
+        own = count * family_mean(sizes[mine], families[mine]) if count else 0.0
+        scales[kind] = (own + SHRINK * overall) / (count + SHRINK)
+    score = family_quantile(sizes / np.array([scales[kind] for kind in regimes]), families)
+    return {kind: scale * score for kind, scale in scales.items()}
+
+
+def regimes_of(cases: Cases, constants: Constants) -> list[Regime]:
+    """What sets each case's rate, by prediction."""
+    times = cases.times(constants)
+    bound = times.host_s / cases.host_cores > times.dpu_s
+    return [regime_of(bool(b), row.map_bytes) for b, row in zip(bound, cases.rows, strict=True)]
+
+
+def family_mean(sizes: Array, families: NDArray[np.str_]) -> float:
+    """Mean over families of the mean."""
+    return float(np.mean([sizes[families == name].mean() for name in dict.fromkeys(families)]))
+
+
+def family_quantile(errors: Array, families: NDArray[np.str_]) -> float:
+    """The size of error that SHARE of all families keep to with every one of theirs, at CONFIDENCE."""
+    largest = sorted(np.abs(errors)[families == name].max() for name in set(families))
+    return float(largest[tolerance_rank(len(largest)) - 1])
+
+
+def tolerance_rank(count: int) -> int:
+    """Which of `count` scores, sorted, SHARE of all families stay below, at CONFIDENCE; or the last.
+
+    The k-th of n does if fewer than k of n draws fall among that share: at a binomial probability (S. S. Wilks, 1941,
+    doi:10.1214/aoms/1177731788).
+    """
+    return min(int(binom.ppf(CONFIDENCE, count, SHARE)) + 1, count)
+
+
+def pair_width(board: str) -> float:
+    """What ln of the ratio of two published rates was off by, at most, in SHARE of pairs of one family.
+
+    Each network predicted without itself; only rates that the DPU bounds.
+    """
+    trial = _trial(board, chosen())
+    cases, names = trial.cases, np.array([row.network for row in trial.cases.rows])
+    errors = np.zeros(len(names))
+    for name in dict.fromkeys(names):
+        errors[names == name] = cases.only(names == name).errors(fit(cases.only(names != name), near=trial.near))
+    kinds = regimes_of(cases, trial.near)
+    kept = [(row, e) for row, e, kind in zip(cases.rows, errors, kinds, strict=True) if kind != "host"]
+    apart = [
+        abs(x - y) for (a, x), (b, y) in combinations(kept, 2) if a.family == b.family and a.network != b.network
+    ]
+    return float(np.quantile(apart, SHARE))
+
+
+def outside_width(cases: Cases, share: float = 0.25) -> float:
+    """The error of the networks with the largest maps, predicted from the others.
+
+    The largest: above `share` of the largest map of a network that the DPU bounds. Only such are predicted.
+    """
+    bound = np.array([kind != "host" for kind in regimes_of(cases, fit(cases))])
+    sizes = np.array([row.map_bytes for row in cases.rows])
+    large = bound & (sizes > share * sizes[bound].max())
+    tested = cases.only(large)
+    return family_quantile(tested.errors(fit(cases.only(~large))), tested.families)
+
+
+def by_network(names: Iterable[str], errors: Iterable[Array]) -> Array:
+    """Mean |predicted / published - 1| of each network, over its configurations and rates."""
+    found: dict[str, list[float]] = {}
+    for name, each in zip(names, errors, strict=True):
+        found.setdefault(name, []).extend(np.abs(np.expm1(each)).tolist())
+    return np.array([np.mean(values) for values in found.values()])
+
+
+def coverage(rows: Sequence[LeftOut]) -> tuple[float, float]:
+    """Share of published rates inside their intervals, each network weighing the same; share of families whole."""
+    counts = Counter(row.network for row in rows)
+    networks = sum(row.held / counts[row.network] for row in rows) / len(counts)
+    families = {row.family for row in rows}
+    return networks, float(np.mean([all(row.held == 1 for row in rows if row.family == name) for name in families]))
+
+
+def rank_correlation(found: Nested) -> float:
+    """Spearman's: does the model put networks in the right order."""
+    errors = np.array([row.error for row in found.rows])
+    return float(spearmanr(found.cases.observed, found.cases.observed + errors).statistic)
+
+
+def one_thread(board: str) -> tuple[list[str], list[Array]]:
+    """Names and ln(predicted / published) of rates with one thread, each family left out."""
+    trial = _trial(board, chosen())
+    names, errors = [], []
+    for family in trial.names:
+        tested = trial.cases.only(trial.cases.families == family)
+        single = tested.residuals(trial.fit_without({family}))[len(tested.rows) :]
+        for row, error in zip(tested.rows, single, strict=True):
+            if row.fps_single:
+                names.append(row.network)
+                errors.append(np.array([error]))
+    return names, errors
+
+
+def transferred(source: str, target: str) -> tuple[list[str], list[Array]]:
+    """Names and errors of a board's cases with constants fitted to another's rates, without the family of each."""
+    structure = chosen(unseen_board=target)
+    wanted, trial = Cases(published_cases(target), structure), _trial(source, structure)
+    errors = np.zeros(len(wanted.rows))
+    for name in dict.fromkeys(wanted.families):
+        mine = wanted.families == name
+        errors[mine] = wanted.only(mine).errors(trial.fit_without({name}))
+    return [row.network for row in wanted.rows], [np.array([error]) for error in errors]

@@ -1,0 +1,257 @@
+"""The formula of the cost model, and its constants, which stand in a target's [cost].
+
+compute = array operations / (peak array_efficiency) + lane steps / (lanes lane_efficiency)
+memory  = longer of (weights + maps) / port and cores (weights + batch handlers maps) / (DDR memory_efficiency)
+layer   = longer of the two + serial shorter of the two + layer_s
+batch   = sum of layers + batch_s
+host    = host_image_s + bytes in / rate + bytes out / rate + values of the task / its rate
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from typing import Literal, Self, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from deploy.dpu.board import Dpu
+from deploy.dpu.checker.placement import Placement
+from deploy.dpu.cost.work import Work
+from deploy.dpu.graph import Operation
+
+Array = NDArray[np.float64]
+Interval = tuple[float, float]
+
+
+@dataclass(frozen=True)
+class Constants:
+    """What is fitted. Hardware is never among it, so a board may be predicted with another's of the same kind.
+
+    The first six are the DPU's. Rates of the host are those of one of its cores; a value is one number of a result.
+    """
+
+    array_efficiency: float
+    """Share of the array's peak that a full layer reaches."""
+    lane_efficiency: float
+    """Pools, depthwise convolutions and adds, against the lanes that the file states."""
+    port_bytes_per_cycle: float
+    """What one batch handler moves in a cycle of the programmable logic."""
+    memory_efficiency: float
+    """Share of the memory's peak that all cores together reach."""
+    layer_s: float
+    """Start of a layer."""
+    batch_s: float
+    """Start of a batch."""
+    host_image_s: float
+    """What the host does for any image."""
+    host_in_bytes_per_s: float
+    """Scaling the image and handing it over."""
+    host_out_bytes_per_s: float
+    """Taking the results back."""
+    argmax_values_per_s: float
+    softmax_values_per_s: float
+    sort_values_per_s: float
+    image_values_per_s: float
+
+    @classmethod
+    def of(cls, dpu: Dpu) -> Self:
+        """Those of a target profile."""
+        return cls(*(dpu.value("cost", name) for name in NAMES))
+
+    @property
+    def host_s_per_unit(self) -> Array:
+        """Time of an image, of a byte in, of a byte out and of a value of each task, (7,)."""
+        values = np.array([getattr(self, name) for name in NAMES[DPU_CONSTANTS:]])
+        return np.concatenate([values[:1], 1 / values[1:]])
+
+    def faster(self, dpu: float, host: float) -> Self:
+        """The constants of a board whose DPU and host are that many times as fast."""
+        factors = DPU_CONSTANTS * [dpu] + (len(NAMES) - DPU_CONSTANTS) * [host]
+        values = [getattr(self, name) for name in NAMES]
+        return type(self)(
+            *(v / f if name in TIMES else v * f for name, v, f in zip(NAMES, values, factors, strict=True))
+        )
+
+
+DPU_CONSTANTS = 6
+NAMES = tuple(field.name for field in fields(Constants))
+TIMES = ("layer_s", "batch_s", "host_image_s")
+"""Constants that shrink as a board gets faster; the others are rates."""
+
+
+@dataclass(frozen=True)
+class Structure:
+    """Which of the formula's variants a board follows, chosen by cross-validation."""
+
+    serial: float
+    """Share of the shorter of compute and memory that is not hidden behind the longer."""
+    crowding: float
+    """Exponent q of (dpu^q + host^q)^(1/q): 2 where the two get in each other's way, large where they do not."""
+    bursts: float
+    """1 where weights, which lie in one piece, cross the memory at its peak; 0 where no faster than maps."""
+
+    @classmethod
+    def of(cls, dpu: Dpu) -> Self:
+        """That of a target profile."""
+        return cls(*(dpu.value("cost", field.name) for field in fields(cls)))
+
+
+@dataclass(frozen=True)
+class Layers:
+    """Layers as arrays (n,), each with the DPU that runs it; maps are those of one image."""
+
+    array_s: Array  # at the array's peak
+    lane_s: Array  # with every lane busy
+    weight_bytes: Array
+    map_bytes: Array
+    launched: Array  # 1, or 0 for what is fused or only moves no data
+    pl_clock_hz: Array
+    memory_bytes_per_s: Array
+    handlers: Array  # batch handlers of a core
+    cores: Array
+
+    @classmethod
+    def of(cls, works: Sequence[Work], dpu: Dpu) -> Self:
+        """The layers of one network."""
+        columns = [
+            (
+                w.array_operations / dpu.engine_ops_per_s,
+                w.lane_steps / dpu.lane_steps_per_s,
+                w.weight_bytes,
+                w.load_map_bytes + w.store_map_bytes,
+                w.launched,
+            )
+            for w in works
+        ]
+        clock_hz, memory = dpu.value("array", "pl_clock_hz"), dpu.limit("memory", "ddr_bytes_per_s").high
+        board = (clock_hz, memory, dpu.batch // dpu.cores, dpu.cores)
+        return cls(*np.array([(*row, *board) for row in columns], dtype=np.float64).reshape(-1, 9).T)
+
+    def compute_s(self, constants: Constants) -> Array:
+        """Time of the array and of the engines beside it, (n,): all batch handlers work at once."""
+        return self.array_s / constants.array_efficiency + self.lane_s / constants.lane_efficiency
+
+    def memory_s(self, constants: Constants, structure: Structure, *, alone: bool = False) -> Array:
+        """Time of the transfers, for a batch of every core or, `alone`, of one core (n,)."""
+        port = constants.port_bytes_per_cycle * self.pl_clock_hz
+        maps_rate = constants.memory_efficiency * self.memory_bytes_per_s
+        weights_rate = self.memory_bytes_per_s if structure.bursts else maps_rate
+        shared_s = self.weight_bytes / weights_rate + self.handlers * self.map_bytes / maps_rate
+        return np.maximum((self.weight_bytes + self.map_bytes) / port, (1.0 if alone else self.cores) * shared_s)
+
+    def time_s(self, constants: Constants, structure: Structure, *, alone: bool = False) -> Array:
+        """Time of each layer, for a batch (n,)."""
+        compute, memory = self.compute_s(constants), self.memory_s(constants, structure, alone=alone)
+        busy: Array = np.maximum(compute, memory) + structure.serial * np.minimum(compute, memory)
+        return busy + constants.layer_s * self.launched
+
+
+Regime = Literal["host", "small maps", "large maps"]
+"""What sets the rate: the host; or the DPU, on maps of at most LARGE_MAP_BYTES, or with larger ones."""
+REGIMES: tuple[Regime, ...] = get_args(Regime)
+LARGE_MAP_BYTES = 2 << 20
+
+
+def regime_of(host_bound: bool, map_bytes: float) -> Regime:
+    """The regime of a network, from its largest result."""
+    if host_bound:
+        return "host"
+    return "large maps" if map_bytes > LARGE_MAP_BYTES else "small maps"
+
+
+def frame_rate(dpu_s: float, host_s: float, crowding: float) -> float:
+    """Images a second, from the time that the DPU and the host's cores take for one image."""
+    longer, shorter = max(dpu_s, host_s), min(dpu_s, host_s)
+    return float(1 / (longer * (1 + (shorter / longer) ** crowding) ** (1 / crowding)))
+
+
+Task = Literal["copy", "argmax", "softmax", "sort", "image"]
+"""What the host does with the results: reads them and no more (copy); finds the best of classes (argmax, softmax);
+ranks boxes or key points (sort); makes pixels of them (image)."""
+TASKS = get_args(Task)
+
+OPERATORS: dict[str, Task] = {
+    "ArgMax": "argmax",
+    "Softmax": "softmax",
+    "NonMaxSuppression": "sort",
+    "TopK": "sort",
+}
+"""What tells the task in a file."""
+
+BANDS = 4
+"""Most that an image has: red, green, blue and transparency or infrared."""
+
+
+def host_work(bytes_in: float, bytes_out: float, values: float, task: Task) -> Array:
+    """Units of the host's work for one image, (7,): 1, bytes in, bytes out, values of each task but copying.
+
+    An image needs no other reading of its bytes than becoming pixels.
+    """
+    taken = 0.0 if task == "image" else bytes_out
+    return np.array([1.0, bytes_in, taken, *(values * (task == name) for name in TASKS[1:])])
+
+
+def placed_work(placement: Placement, task: Task) -> Array:
+    """Units of the host's work for a network of a file, (7,): the task takes every value of the results."""
+    onto, back = _crossing_bytes(placement)
+    return host_work(onto, back, back, task)
+
+
+def task_of(placement: Placement) -> Task:
+    """What a file tells of the host; one result of few bands, no smaller than the image, becomes an image."""
+    behind = [node.op.op_type for node in placement.nodes if node.part == "host-back"]
+    found = next((OPERATORS[name] for name in behind if name in OPERATORS), None)
+    onto, back = _crossing_bytes(placement)
+    return found or ("image" if back >= onto and _gives_an_image(placement) else "copy")
+
+
+def _crossing_bytes(placement: Placement) -> tuple[int, int]:
+    """Bytes of one image that the host hands to the DPU, and takes back."""
+    onto = sum(cut.size_bytes or 0 for cut in placement.cuts if cut.onto_dpu)
+    return onto, sum(cut.size_bytes or 0 for cut in placement.cuts if not cut.onto_dpu)
+
+
+def _gives_an_image(placement: Placement) -> bool:
+    read = {name for node in placement.nodes for name in node.op.inputs}
+    shapes = [node.op.out_shape for node in placement.nodes if read.isdisjoint(node.op.outputs)]
+    return len(shapes) == 1 and shapes[0] is not None and shapes[0][0] <= BANDS
+
+
+FLOAT_BYTES = 4
+"""The vendor's operators on the CPU work on float32 (Vitis-AI 3.0, xcompiler: fix2float in front of them)."""
+INSTRUCTIONS = 20.0
+"""Of plain code for a value of a result: four loads, their weights, their sum and its address (assumed)."""
+PRODUCT_INSTRUCTIONS = 2.0
+"""Of plain code for an operation: two loads, a product with its sum and a step of the loop count as two (assumed)."""
+
+
+def refused_interval_s(operations: Sequence[Operation], dpu: Dpu) -> Interval:
+    """Time that the board's processor takes for operations that the DPU refuses: one image, all cores, in s.
+
+    None of it is fitted: no published rate tells such work apart. The least is what the processor's published rates
+    allow, products as a good library does them and every number moved once; the most is plain code, number by number.
+    """
+    if not operations:
+        return 0.0, 0.0
+    times, cores = [_core_s(op, dpu) for op in operations], dpu.whole("cpu", "cores")
+    return math.fsum(low for low, _ in times) / cores, math.fsum(high for _, high in times) / cores
+
+
+def between(interval: Interval) -> float:
+    """The geometric mean: the ends are factors apart."""
+    return math.sqrt(interval[0] * interval[1])
+
+
+def _core_s(op: Operation, dpu: Dpu) -> Interval:
+    """One operation on one core."""
+    clock, products, moved, decoding = (
+        dpu.limit("cpu", key)
+        for key in ("clock_ghz", "product_flops_per_cycle", "moved_bytes_per_s", "decoding_mips_per_ghz")
+    )
+    values = op.out_bytes + sum(math.prod(shape) for shape in op.in_shapes if shape is not None)
+    floats = FLOAT_BYTES * (values + op.weight_bytes)
+    least_s = max(op.operations / (1e9 * clock.high * products.high), floats / moved.high)
+    instructions = INSTRUCTIONS * op.out_bytes + PRODUCT_INSTRUCTIONS * op.operations
+    most_s = instructions / (1e6 * decoding.low * clock.low) + floats / moved.low
+    return least_s, most_s

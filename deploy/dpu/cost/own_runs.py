@@ -1,0 +1,126 @@
+"""Runs of a user's own board: `bench --measured board.json` corrects the cost model by two factors.
+
+The DPU's factor is the geometric mean of given over predicted rates of the runs that the DPU bounds, the host's that
+of the others: so many times as fast they are. A part that no run is bound by keeps its constants, and the interval
+stays that of the published networks.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from statistics import geometric_mean
+
+from deploy.dpu.board import Dpu
+from deploy.dpu.checker.placement import Placement, place
+from deploy.dpu.cost.latency import Prediction, predict
+from deploy.dpu.cost.model import NAMES, Constants
+from deploy.dpu.reading import read_network
+from profiles.constant import Constant
+from profiles.errors import OptionError
+from profiles.figures import Row, predicted, published
+from profiles.toml import read_json
+
+EXAMPLE = 'write [{"model": "core.onnx", "configuration": "C32B3", "tile_px": 640, "fps": 9.5}]'
+RUNS, TILE_PX, FPS = 1000, (16, 1 << 16), (1e-9, 1e9)
+"""Most runs; least and most of a tile's side and of a rate."""
+KEYS = {"model", "configuration", "tile_px", "fps", "power_w"}
+
+
+@dataclass(frozen=True)
+class Run:
+    """One entry of the file: a network placed on a configuration, the rate given for it and the one predicted."""
+
+    name: str
+    placement: Placement
+    dpu: Dpu
+    fps: float
+    predicted: Prediction
+
+
+@dataclass(frozen=True)
+class OwnRuns:
+    """How many times as fast as predicted the DPU and the host are, by the geometric mean of the runs."""
+
+    source: str
+    runs: Sequence[Run]
+    dpu_factor: float
+    host_factor: float
+
+    def applied(self, dpu: Dpu) -> Dpu:
+        """The board with the corrected constants."""
+        constants = Constants.of(dpu).faster(self.dpu_factor, self.host_factor)
+        cost = {name: Constant(getattr(constants, name), "inferred", self.source) for name in NAMES}
+        tables = {**dpu.target.tables, "cost": {**dpu.target.tables["cost"], **cost}}
+        return replace(dpu, target=replace(dpu.target, tables=tables))
+
+    def factor_rows(self) -> list[Row]:
+        """The two factors."""
+        factors = {"DPU": self.dpu_factor, "host": self.host_factor}
+        return [
+            Row("correction", name, {"given / predicted": predicted(value, "x", (value, value), self.source)})
+            for name, value in factors.items()
+        ]
+
+    def run_rows(self) -> list[Row]:
+        """The rate given for each run, and what was predicted before and after the correction."""
+        return [self._run_row(run) for run in self.runs]
+
+    def _run_row(self, run: Run) -> Row:
+        after = predict(run.placement, self.applied(run.dpu))
+        figures = {"given": published(run.fps, "frame/s", self.source)}
+        for key, prediction in {"shipped": run.predicted, "corrected": after}.items():
+            off = 100 * (prediction.fps / run.fps - 1)
+            figures[key] = predicted(prediction.fps, "frame/s", prediction.fps_interval, f"cost model, {key}")
+            figures[f"{key} is off by"] = predicted(off, "%", (off, off), "arithmetic")
+        return Row("runs", f"{run.name}, {run.dpu.name}", figures, {"bound": run.predicted.regime})
+
+
+def read_own_runs(path: Path, dpu: Dpu) -> OwnRuns:
+    """Compare the runs in a file with what is predicted of them on `dpu`'s board.
+
+    Raises:
+        OptionError: not such a file, or a run that cannot be understood.
+        ModelError: a model that does not run whole on the DPU.
+        ProfileError: a configuration that the target does not have, or a target without cost constants.
+    """
+    runs = [_run(entry, path, f"{path.name}, run {index + 1}", dpu) for index, entry in enumerate(_read(path))]
+    ratios: dict[bool, list[float]] = {True: [], False: []}
+    for run in runs:
+        ratios[run.predicted.regime == "host"].append(run.fps / run.predicted.fps)
+    host, on_dpu = (geometric_mean(ratios[kind]) if ratios[kind] else 1.0 for kind in (True, False))
+    return OwnRuns(f"geometric mean of {len(runs)} runs in {path.name}", runs, on_dpu, host)
+
+
+def _read(path: Path) -> Sequence[Mapping[str, object]]:
+    try:
+        runs = read_json(path)
+    except OSError as error:
+        got = error.strerror or str(error)
+        raise OptionError(str(path), expected="a readable file", got=got, remedy="check the path") from error
+    except ValueError as error:
+        raise OptionError(str(path), expected="JSON", got=str(error), remedy="correct the file") from error
+    if not isinstance(runs, list) or not 0 < len(runs) <= RUNS or not all(isinstance(run, dict) for run in runs):
+        expected, got = f"a list of 1 to {RUNS} runs", type(runs).__name__
+        raise OptionError(str(path), expected=expected, got=got, remedy=EXAMPLE)
+    return runs
+
+
+def _run(entry: Mapping[str, object], path: Path, where: str, board: Dpu) -> Run:
+    if "model" not in entry or set(entry) - KEYS:
+        expected = "model, configuration, tile_px, fps"
+        raise OptionError(where, expected=expected, got=str(sorted(entry)), remedy=EXAMPLE)
+    fps = _number(entry.get("fps"), "fps", FPS, where)
+    tile_px = _number(entry.get("tile_px", 640), "tile_px", TILE_PX, where)
+    if tile_px != int(tile_px):
+        raise OptionError(where, expected="tile_px in whole pixels", got=str(tile_px), remedy=EXAMPLE)
+    dpu = Dpu(board.target, *board.target.configuration(str(entry.get("configuration", "")) or None))
+    model = path.parent / str(entry["model"])
+    placement = place(read_network(model, int(tile_px)), dpu)
+    return Run(f"{model.stem}, tiles of {tile_px:g}", placement, dpu, fps, predict(placement, dpu))
+
+
+def _number(value: object, key: str, ends: tuple[float, float], where: str) -> float:
+    if isinstance(value, bool) or not isinstance(value, int | float) or not ends[0] <= value <= ends[1]:
+        expected = f"{key} of {ends[0]:g} to {ends[1]:g}"
+        raise OptionError(where, expected=expected, got=repr(value), remedy=EXAMPLE)
+    return float(value)

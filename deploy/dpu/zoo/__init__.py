@@ -1,1 +1,0 @@
-"""Published networks as text, without weights, and their published rates: what the cost model is fitted on."""

@@ -1,0 +1,32 @@
+"""A network as a function of an image's digital numbers, restored as the command `restore` does."""
+
+from collections.abc import Callable
+
+import numpy as np
+import onnx
+
+from deploy.restoration.engine import restore_dn
+from deploy.restoration.options import TILE_PX, Runtime
+from deploy.restoration.plan import make_plan
+from deploy.restoration.runtime import Infer, open_runtime
+from quant.tiling.walk import tiling_of
+
+Restore = Callable[[np.ndarray], np.ndarray]
+"""Degraded digital numbers (H, W) float32 to restored ones."""
+
+
+def network_method(model: onnx.ModelProto, max_dn: int) -> Restore:
+    """A network as a method: digital numbers of 0 to `max_dn` become whole ones, as `restore` writes them."""
+    infer, _ = open_runtime(Runtime.onnxruntime, model, threads=0)
+    return restoring(infer, model, max_dn)
+
+
+def restoring(infer: Infer, model: onnx.ModelProto, max_dn: int) -> Restore:
+    """As `network_method`, of a network that is open already; tiles are the default ones, or those it is fixed to."""
+    tiling = tiling_of(model)
+
+    def restore(dn: np.ndarray) -> np.ndarray:
+        plan = make_plan((1, *dn.shape), tiling.fixed_px or TILE_PX, tiling.halo_px, tiling)
+        return restore_dn(dn, infer, plan, max_dn)
+
+    return restore

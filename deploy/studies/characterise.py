@@ -1,0 +1,376 @@
+"""A sensor profile from raw images of the sensor's own: what `characterise` does between options and TOML.
+
+What pixels tell is measured, with intervals: blur by straight edges, noise by the corners of the spectrum. The rest
+(gain, ground sampling distance, and bits unless pixels are clipped at full scale) is asked for or assumed.
+"""
+
+import json
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from model.io.images import read_pixels
+from model.metrics.edge_blur import HALF_PX, MIN_FOUND, POINTED_AT, AxisMtf, EdgeBlur, combine, find_blurs, fit_blur
+from model.metrics.noise_line import NoiseModel, cut_blocks, fit_noise_model, join
+from model.metrics.refusal import Refusal
+from profiles.errors import ImageError, OptionError, printable
+from profiles.figures import Figure, Row, measured, unavailable
+from profiles.sensor import snr_0_bounds
+
+FULL_SCALE_RADIANCE = 400.0
+"""W/m2/sr/um, where no gain is given."""
+PARTS = (16, 4)
+"""Of full scale: the radiances at which SNRs are stated, as those that a network is told of."""
+GSD_M, OVERSAMPLING, SEED = 0.5, 4, 0
+TILE_PX, BOX_PX = 1024, 2 * HALF_PX + 1
+MAX_DN = 65535
+CLIPPED_PIXELS, PILE = 10, 4
+"""Pixels at one value, 2^n - 1, and how many times as many as just below: what shows that it is full scale."""
+MARGIN = 1e-5
+"""Of an SNR, by which it stays off the bounds of physics: decimals are rounded."""
+
+
+@dataclass(frozen=True)
+class Box:
+    """A part of an image with one edge across it."""
+
+    image: Path
+    left: int
+    top: int
+    width: int
+    height: int
+
+    def cut(self, pixels: np.ndarray) -> np.ndarray:
+        """The part of its pixels (H, W).
+
+        Raises:
+            OptionError: outside the image, or too small for an edge.
+        """
+        height, width = pixels.shape
+        small = min(self.width, self.height) < BOX_PX
+        if small or self.left + self.width > width or self.top + self.height > height:
+            got = str(self)
+            expected = f"a box of {BOX_PX} x {BOX_PX} pixels or more inside its {width} x {height}"
+            raise OptionError("--edge", expected=expected, got=got, remedy="X,Y is the upper left pixel, from 0")
+        return pixels[self.top : self.top + self.height, self.left : self.left + self.width]
+
+    def __str__(self) -> str:
+        return f"{self.image}:{self.left},{self.top},{self.width},{self.height}"
+
+
+def read_box(text: str, images: Sequence[Path]) -> Box:
+    """The box that FILE:X,Y,WIDTH,HEIGHT names, FILE being one of the images.
+
+    Raises:
+        OptionError: written otherwise, or of another image.
+    """
+    name, _, numbers = text.rpartition(":")
+    places = numbers.split(",")
+    if len(places) != 4 or not all(place.isascii() and place.isdigit() and len(place) < 9 for place in places):
+        expected, remedy = "FILE:X,Y,WIDTH,HEIGHT in whole pixels", "write raw.tif:1200,340,60,60"
+        raise OptionError("--edge", expected=expected, got=repr(text), remedy=remedy)
+    image = next((path for path in images if path == Path(name)), None)
+    if image is None:
+        remedy = "name it as the argument does"
+        raise OptionError("--edge", expected="one of the images that are given", got=repr(name), remedy=remedy)
+    return Box(image, *(int(place) for place in places))
+
+
+@dataclass(frozen=True)
+class Snr:
+    """The SNR at one radiance, in W/m2/sr/um, with its 95 % interval (its end may be infinite)."""
+
+    radiance: float
+    value: float
+    interval: tuple[float, float]
+    extrapolated: bool
+
+
+@dataclass(frozen=True)
+class Characterised:
+    """What was found.
+
+    Attributes:
+        images: that were looked at.
+        stated: what the user said of bits, gain in DN per W/m2/sr/um and gsd_m; None of what was not said.
+        bits: of a digital number.
+        gain: DN per W/m2/sr/um, stated or assumed.
+        across: MTF across the track; None where no edge shows it.
+        along: that along it.
+        snrs: at two radiances.
+        noise: the line that they lie on.
+    """
+
+    images: Sequence[Path]
+    stated: Mapping[str, float | None]
+    bits: int
+    gain: float
+    across: AxisMtf | None
+    along: AxisMtf | None
+    snrs: tuple[Snr, Snr]
+    noise: NoiseModel
+
+    def rows(self) -> list[Row]:
+        """The figures, as commands report them."""
+        axes = {"MTF across at Nyquist": self.across, "MTF along at Nyquist": self.along}
+        figures = {name: _mtf_figure(axis) for name, axis in axes.items()}
+        for snr in self.snrs:
+            source = f"{self.noise.blocks} blocks of 16 x 16" + (", extrapolated" if snr.extrapolated else "")
+            figures[f"SNR at {snr.radiance:g} W/m2/sr/um"] = measured(snr.value, "ratio", source, snr.interval)
+        return [Row("sensor", "measured sensor", figures)]
+
+
+def _mtf_figure(axis: AxisMtf | None) -> Figure:
+    if axis is None:
+        return unavailable("%", "no edge across this axis; the other axis' figure is written for both")
+    low, high = axis.interval
+    return measured(100 * axis.mtf_nyquist, "%", f"{axis.edges} edges", (100 * low, 100 * high))
+
+
+def characterise(
+    images: Sequence[Path],
+    boxes: Sequence[Box] = (),
+    *,
+    bits: int | None = None,
+    gain: float | None = None,
+    gsd_m: float | None = None,
+) -> Characterised:
+    """Measure a sensor on its own images.
+
+    Args:
+        images: raw ones of one sensor at one setting.
+        boxes: edges to use; none searches for them.
+        bits: of a digital number; None where clipped pixels must tell.
+        gain: DN per W/m2/sr/um; None assumes 400 W/m2/sr/um at full scale.
+        gsd_m: ground sampling distance; None assumes one.
+
+    Raises:
+        ImageError: images that are not raw, or that do not hold what is needed; the message says what that is.
+        OptionError: an option that contradicts the pixels.
+    """
+    for option, value in (("--gain", gain), ("--gsd", gsd_m)):
+        if value is not None and not 0 < value < math.inf:
+            raise OptionError(option, expected="a finite number above 0", got=f"{value:g}", remedy="correct it")
+    if len({path.resolve() for path in images}) < len(images):
+        got, remedy = "one of them twice", "give each once: a second look at the same pixels knows nothing new"
+        raise OptionError("images", expected="different images", got=got, remedy=remedy)
+    stated = {"bits": bits, "gain": gain, "gsd_m": gsd_m}
+    bits = _settled_bits(bits, [_digitised(path) for path in images])
+    clipped_at = 2**bits - 1
+    noise = measured_noise(images, clipped_at)
+    across, along = _axes(images, boxes, noise, clipped_at)
+    gain = gain or clipped_at / FULL_SCALE_RADIANCE
+    low, high = (snr_at(noise, clipped_at / part, gain) for part in PARTS)
+    return Characterised(images, stated, bits, gain, across, along, (low, high), noise)
+
+
+def read_raw(path: Path) -> np.ndarray:
+    """Digital numbers (H, W) of one band, integers of any width.
+
+    Raises:
+        ImageError: several bands, fractions, or values below 0.
+    """
+    pixels = read_pixels(path)
+    if pixels.ndim != 2:
+        got, remedy = f"{pixels.shape[2]} bands", "extract one band; each has a sensor of its own"
+        raise ImageError(str(path), expected="one band", got=got, remedy=remedy)
+    if (pixels.dtype.kind == "f" and (pixels != np.rint(pixels)).any()) or pixels.min() < 0 or pixels.max() > MAX_DN:
+        got = f"{pixels.dtype} from {float(pixels.min()):.4g} to {float(pixels.max()):.4g}"
+        remedy = "give the raw image: what was resampled, calibrated or scaled has lost its noise"
+        raise ImageError(str(path), expected=f"whole digital numbers from 0 to {MAX_DN}", got=got, remedy=remedy)
+    return pixels
+
+
+def _tiles(pixels: np.ndarray) -> Iterator[np.ndarray]:
+    """Parts of an image of up to 1024 x 1024 pixels, float64."""
+    for top in range(0, pixels.shape[0], TILE_PX):
+        for left in range(0, pixels.shape[1], TILE_PX):
+            yield pixels[top : top + TILE_PX, left : left + TILE_PX].astype(np.float64)
+
+
+Digitised = tuple[int, bool, bool]
+"""The largest digital number of an image, whether its pixels pile up there, and whether 8 bits store it."""
+
+
+def _digitised(path: Path) -> Digitised:
+    pixels = read_raw(path)
+    largest = int(pixels.max())
+    whole = pixels.astype(np.int64, copy=False).ravel()
+    step = int(np.gcd.reduce(whole - whole.min()))
+    if step > 1:
+        remedy = f"divide it by {step}: {step - 1} of {step} values never occur, so they are no digital numbers"
+        raise ImageError(str(path), expected="digital numbers in steps of 1", got=f"steps of {step}", remedy=remedy)
+    count, below = (int((pixels == value).sum()) for value in (largest, largest - 1))
+    return largest, count >= max(CLIPPED_PIXELS, PILE * below), pixels.dtype.itemsize == 1
+
+
+def _settled_bits(stated: int | None, images: Sequence[Digitised]) -> int:
+    """The bits that were given, or those that pixels clipped at full scale show."""
+    largest, clipped, narrow = max(images)
+    if stated is not None:
+        if largest > 2**stated - 1:
+            expected = f"digital numbers up to {2**stated - 1}"
+            remedy = "give the bits of the raw image"
+            raise OptionError("--bits", expected=expected, got=f"{largest}", remedy=remedy)
+        return stated
+    bits = largest.bit_length()
+    if narrow or largest != 2**bits - 1 or not clipped:
+        got = f"values up to {largest}" + (" in 8 bits" if narrow else "")
+        expected = "--bits beside images that are not clipped at full scale"
+        raise OptionError("bits", expected=expected, got=got, remedy="give the digitiser's, such as --bits 12")
+    return bits
+
+
+def snr_at(noise: NoiseModel, dn: float, gain: float) -> Snr:
+    """The SNR at a digital number, the rounding not in it."""
+    variance = noise.at(dn)
+    low, value, high = (
+        dn / math.sqrt(v) if v > 0 else math.inf for v in (variance.interval[1], variance.value, variance.interval[0])
+    )
+    return Snr(dn / gain, value, (low, high), variance.extrapolated)
+
+
+REMEDIES = {
+    "few-windows": "give more raw images of plain ground, neither restored nor resampled",
+    "range": "give images of dark and of bright ground",
+    "no-noise": "give the image before restoring or resampling; noise below the rounding cannot be measured",
+}
+
+
+def measured_noise(images: Sequence[Path], clipped_at: int) -> NoiseModel:
+    """The noise in the digital numbers of images that clip at a value.
+
+    Raises:
+        ImageError: it cannot be known.
+    """
+    blocks = [cut_blocks(tile, clipped_at) for path in images for tile in _tiles(read_raw(path))]
+    noise = fit_noise_model(join(blocks), np.random.default_rng(SEED))
+    if isinstance(noise, Refusal):
+        expected, remedy = "blurred, raw ground with white noise, from dark to bright", REMEDIES[noise.status]
+        raise ImageError(f"noise of {_named(images)}", expected=expected, got=noise.reason, remedy=remedy)
+    return noise
+
+
+def _named(images: Sequence[Path]) -> str:
+    more = f" and {len(images) - 1} more" if len(images) > 1 else ""
+    return f"{images[0].name}{more}"
+
+
+def _axes(
+    images: Sequence[Path], boxes: Sequence[Box], noise: NoiseModel, clipped_at: float
+) -> tuple[AxisMtf | None, AxisMtf | None]:
+    """MTF across (edges near the vertical) and along the track, at least one of them."""
+    upright, lying = _pointed_at(boxes, noise, clipped_at)
+    for tile in (tile for path in images if not boxes for tile in _tiles(read_raw(path))):
+        upright += find_blurs(tile, noise.total, clipped_at)
+        lying += find_blurs(tile.T, noise.total, clipped_at)
+    least = 1 if boxes else MIN_FOUND
+    across = combine(upright, lying) if len(upright) >= least else None
+    along = combine(lying, upright) if len(lying) >= least else None
+    if across is None and along is None:
+        raise ImageError(
+            f"edges of {_named(images)}",
+            expected=f"{MIN_FOUND} straight edges between even areas, 17 pixels long and 8 to both sides, or more",
+            got=f"{len(upright)} near the vertical and {len(lying)} near the horizontal",
+            remedy="point at one as --edge FILE:X,Y,WIDTH,HEIGHT, or image a target, a large roof or an apron",
+        )
+    return across, along
+
+
+def _pointed_at(boxes: Sequence[Box], noise: NoiseModel, clipped_at: float) -> tuple[list[EdgeBlur], list[EdgeBlur]]:
+    """The edges in the boxes: those near the vertical, and those near the horizontal."""
+    found: tuple[list[EdgeBlur], list[EdgeBlur]] = ([], [])
+    for box in boxes:
+        region = box.cut(read_raw(box.image)).astype(np.float64)
+        lies = _rise(region.T) > _rise(region)
+        clipped = bool(((region <= 0) | (region >= clipped_at)).any())
+        refusal = Refusal("clipped", "clipped pixels")
+        edge = refusal if clipped else fit_blur(region.T if lies else region, noise.total, POINTED_AT)
+        if isinstance(edge, Refusal):
+            expected, remedy = "one straight edge, from side to side", "box another, or tighter"
+            raise ImageError(f"--edge {box}", expected=expected, got=edge.reason, remedy=remedy)
+        found[lies].append(edge)
+    return found
+
+
+def _rise(region: np.ndarray) -> float:
+    """How much brighter one side is than the other, along the rows."""
+    first, *_, last = np.array_split(region, 3, axis=1)
+    return abs(float(last.mean() - first.mean())) if first.size and last.size else 0.0
+
+
+def profile_toml(found: Characterised) -> str:
+    """The profile as its TOML file, intervals and doubts as comments."""
+    images, stated = _named(found.images), found.stated
+    source = "given as --bits" if stated["bits"] else f"pixels clipped at {2**found.bits - 1} in {images}"
+    ratio = f"full scale {2**found.bits - 1} DN = {FULL_SCALE_RADIANCE:g} W/m2/sr/um; give --gain"
+    doubt = "# pixels do not tell the gain; to a network only noise over full scale matters, which is measured"
+    lines = [
+        f"description = {_text(f'Measured on {images}.')}",
+        "",
+        "[grid]",
+        _given("gsd_m", stated["gsd_m"], GSD_M, "no pixel depends on it; give --gsd"),
+        _constant("oversampling", f"{OVERSAMPLING}", "assumed", "for simulations alone: scene pixels a pixel"),
+        "",
+        "[mtf]",
+        *_mtf_lines(found, images),
+        "",
+        *_noise_lines(found, images),
+        "",
+        "[digitiser]",
+        _constant("bits", str(found.bits), "stated" if stated["bits"] else "measured", source),
+        *([doubt] if stated["gain"] is None else []),
+        _given("gain_dn_per_radiance", stated["gain"], found.gain, ratio),
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def _mtf_lines(found: Characterised, images: str) -> Iterator[str]:
+    both = found.across or found.along
+    assert both is not None  # noqa: S101 - `characterise` has refused that
+    if found.across is None or found.along is None:
+        seen, missing = ("along", "across") if found.across is None else ("across", "along")
+        yield f"# measured {seen} the track alone: no edge shows the MTF {missing} it"
+    yield from _axis_lines("mtf_nyquist", both, images)
+    if found.across and found.along:
+        yield from _axis_lines("mtf_nyquist_along", found.along, images)
+
+
+def _axis_lines(key: str, axis: AxisMtf, images: str) -> Iterator[str]:
+    low, high = axis.interval
+    edges = f"{axis.edges} edge{'' if axis.edges == 1 else 's'}"
+    yield f"# 95 % interval {low:.3g} to {high:.3g}, {edges}"
+    if not low <= axis.nearest <= high:
+        yield f"# the curve is not the profile's, whose nearest one has {axis.nearest:.3g}"
+    yield _constant(key, f"{axis.mtf_nyquist:.4g}", "measured", f"{edges} in {images}")
+
+
+def _noise_lines(found: Characterised, images: str) -> Iterator[str]:
+    dark, bright = (dn / found.gain for dn in found.noise.measured_dn)
+    yield "[noise] # SNR is the linear ratio L / sigma; the rounding to whole DN is not in it, and 0 DN is dark"
+    yield f"# measured on {found.noise.blocks} blocks of 16 x 16, from {dark:.3g} to {bright:.3g} W/m2/sr/um"
+    low, high = found.snrs
+    bounds = snr_0_bounds(low.radiance, high.radiance, high.value)
+    inside = min(max(low.value, bounds[0] * (1 + MARGIN)), bounds[1] * (1 - MARGIN))
+    for number, (snr, value, part) in enumerate(zip(found.snrs, (inside, high.value), PARTS, strict=True)):
+        yield _constant(f"radiance_{number}", f"{snr.radiance:.10g}", "inferred", f"1/{part} of full scale")
+        beyond = "; extrapolated" if snr.extrapolated else ""
+        yield f"# 95 % interval {snr.interval[0]:.3g} to {snr.interval[1]:.3g}{beyond}"
+        yield _constant(f"snr_{number}", f"{value:.8g}", "measured", f"{found.noise.blocks} blocks of {images}")
+
+
+def _given(key: str, given: float | None, otherwise: float, why: str) -> str:
+    status, source = ("assumed", why) if given is None else ("stated", "given on the command line")
+    return _constant(key, f"{otherwise if given is None else given:.10g}", status, source)
+
+
+def _constant(key: str, value: str, status: str, source: str) -> str:
+    return f'{key} = {{ value = {value}, status = "{status}", source = {_text(source)} }}'
+
+
+def _text(words: str) -> str:
+    """A TOML string: JSON's are, as long as every character can be printed."""
+    return json.dumps(printable(words), ensure_ascii=False)

@@ -1,0 +1,240 @@
+"""The whole chain on one image, ending with a report: simulate, export, gate, check, restore, bench.
+
+Each step is the verb's own function; here their rows are joined.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from deploy.bench.tables import (
+    Swath,
+    predict_file,
+    predicted_rows,
+    processor_row,
+    published_rows,
+    sweep_rows,
+    within_words,
+)
+from deploy.bench.traditional import measure_chain
+from deploy.dpu.board import load_dpu
+from deploy.dpu.checker.placement import Placement, place
+from deploy.dpu.reading import read_network
+from deploy.gate import Request, run_gate
+from deploy.library import restore
+from deploy.networks import Conditioned, warn_outside
+from deploy.report.page import Picture, Report, Table
+from deploy.restoration.options import TILE_PX
+from model.io.files import whole_file
+from model.io.images import MAX_DN, read_acquisition, read_pixels
+from model.io.pictures import busiest_windows, picture_url, stretch_of, strip
+from model.io.tiff import write_tiff
+from model.metrics.fidelity import fidelity_db, ssim
+from model.progress import Log
+from model.shipped import SENSOR, VARIANT, shipped_weights
+from model.simulator.acquire import MARGIN_PX, Pair, simulate_pair
+from model.simulator.detector import Draw
+from model.simulator.procedural import procedural_scene
+from model.simulator.sampling import read_scene
+from model.traditional.pipeline import Chain, restore_traditional
+from profiles import SensorProfile, load_sensor
+from profiles.errors import OptionError
+from profiles.figures import Row, measured
+from profiles.sensor_file import reference_for
+from profiles.target import DEFAULT_TARGET, board_names
+from quant.encodings import board_model, read_core
+from quant.gate import Limits
+from quant.onnx_file import load_onnx, metadata, save_onnx
+from quant.tiling.walk import receptive_radius_px
+
+BITS, SIDE_PX, GATE_PATCHES = 12, 640, 12
+CROP_PX, ZOOM, LARGEST_PX = 110, 3, 1280
+SWATH_PX = (13600, 9016)
+"""Width and height of the paper's swath."""
+WITHIN_S = 60.0
+"""What a swath may take, for the smallest board to be named."""
+FILES = ("report.html", "float.onnx", "int8.onnx", "core.onnx", "restored.tif", "before-after.png")
+"""What a run leaves in its folder; core.onnx is the network in the board's encoding."""
+INPUT, TRADITIONAL, INT8, REFERENCE = "degraded input", "traditional", f"{VARIANT}, INT8", "reference"
+
+SWATH_CAPTION = (
+    "The traditional pipeline is measured on crops of this image and scaled; the paper's rows are what it printed "
+    "for another network (16 blocks of 64 features) on its own hardware."
+)
+GATE_CAPTION = (
+    "On simulated patches that calibration did not see; the INT8 network obeys the DPU's power-of-two rules."
+)
+NOTES = (
+    "Nothing here has run on a board: the DPU's figures come from a cost model fitted on published networks.",
+    "The power of the DPU run is an assumption anchored at the paper's single figure, with a range.",
+    "INT8 time on this CPU is no proxy for the DPU.",
+)
+
+
+@dataclass(frozen=True)
+class Sensors:
+    """The sensor that acquired an image and the one to imitate."""
+
+    degraded: SensorProfile
+    reference: SensorProfile
+
+
+@dataclass(frozen=True)
+class Input:
+    """The degraded image, (H, W) digital numbers, and the truth where it is known."""
+
+    degraded: np.ndarray
+    pair: Pair | None
+
+
+def run_demo(
+    image: Path | None, out: Path, seed: int, say: Log, full_scale: float | None = None, sensor: str = SENSOR
+) -> Report:
+    """Run the chain, write its files into a folder, and return the report.
+
+    Args:
+        image: a raw acquisition or a photograph; a synthetic scene if None.
+        out: the folder.
+        seed: of every random draw.
+        say: is told each step.
+        full_scale: pixel value of a raw image that is full scale.
+        sensor: of the raw image, or to simulate: a profile's name or file.
+    """
+    say("reading the image")
+    sensors = load_sensors(sensor)
+    given = read_input(image, seed, sensors, full_scale)
+    say("telling the shipped network the sensor, and gating its INT8")
+    write_networks(out, sensors, say)
+    float_file, int8_file = out / "float.onnx", out / "int8.onnx"
+    gate = run_gate(
+        Request(float_file, int8_file, Limits(), None, DEFAULT_TARGET, sensor, None, GATE_PATCHES, seed)
+    ).row
+    say("checking every operator against the DPU")
+    placement = place(read_network(int8_file, TILE_PX), load_dpu(DEFAULT_TARGET))
+    say("restoring: traditional pipeline and INT8 network")
+    chain = Chain(sensors.degraded.nominal(), sensors.reference.nominal())
+    images = {
+        INPUT: given.degraded,
+        TRADITIONAL: restore_traditional(torch.from_numpy(given.degraded), chain).numpy(),
+        INT8: np.rint(restore(given.degraded, int8_file, full_scale=MAX_DN)),
+    }
+    write_tiff(out / "restored.tif", images[INT8].astype(np.uint16))
+    quality = []
+    if given.pair is not None:
+        reference = given.pair.reference.numpy()
+        quality = [_fidelity(name, dn, reference, given.degraded) for name, dn in images.items()]
+        images[REFERENCE] = reference
+    say("measuring the traditional pipeline, predicting the board")
+    bench = bench_tables(int8_file, given.degraded, sensors)
+    tables = [*bench, *([Table("Quality on this image, over 4095 DN", quality)] if quality else [])]
+    tables.append(Table("What quantisation changes", [gate], GATE_CAPTION))
+    sentence = headline(bench[0].rows, quality, placement)
+    return Report("From training to board, on one image", sentence, tables, pictures_of(images, out), NOTES)
+
+
+def load_sensors(name: str = SENSOR) -> Sensors:
+    """The sensor that the demo simulates, and the one it imitates.
+
+    Raises:
+        OptionError: a sensor of other than 12 bits.
+        ProfileError: no such sensor.
+    """
+    degraded = load_sensor(name)
+    if degraded.nominal().bits != BITS:
+        got, remedy = f"{degraded.nominal().bits} bits", "use 'restore', with --full-scale or --method traditional"
+        raise OptionError("--sensor", expected=f"a sensor of {BITS} bits", got=got, remedy=remedy)
+    return Sensors(degraded, reference_for(degraded))
+
+
+def read_input(image: Path | None, seed: int, sensors: Sensors, full_scale: float | None = None) -> Input:
+    """A synthetic scene, a photograph as a scene (8 bits), or a raw acquisition (mono, up to 12 bits).
+
+    With the pixel value that is its `full_scale`, any image is a raw acquisition.
+    """
+    ratio = int(sensors.degraded.oversampling.low)
+    if image is None:
+        side = (SIDE_PX + 2 * MARGIN_PX) * ratio
+        scene = procedural_scene(side, side, np.random.default_rng(seed))
+    elif full_scale is None and read_pixels(image).dtype == np.uint8:
+        scene = read_scene(image, sensors.reference.nominal())
+    else:
+        return Input(read_acquisition(image, full_scale, None), None)
+    pair = simulate_pair(scene.radiance, sensors.degraded.nominal(), sensors.reference.nominal(), ratio, Draw(seed))
+    return Input(pair.degraded.numpy(), pair)
+
+
+def write_networks(out: Path, sensors: Sensors, say: Log) -> None:
+    """Write the shipped network, told the sensor: in float32, in INT8, and the INT8 core for the board."""
+    shipped = Conditioned(VARIANT, shipped_weights(VARIANT))
+    warn_outside(sensors.degraded, say)
+    floating, int8 = (shipped.model(sensors.degraded, int8) for int8 in (False, True))
+    for name, model in (("float", floating), ("int8", int8), ("core", board_model(read_core(int8), metadata(int8)))):
+        save_onnx(model, out / f"{name}.onnx")
+
+
+def _fidelity(name: str, dn: np.ndarray, reference: np.ndarray, degraded: np.ndarray) -> Row:
+    source = "simulated pair"
+    figures = {
+        "PSNR": measured(fidelity_db(dn, reference, degraded), "dB", source),
+        "SSIM": measured(ssim(dn, reference, MAX_DN), "ratio", source),
+    }
+    return Row("quality", name, figures)
+
+
+def bench_tables(model: Path, dn: np.ndarray, sensors: Sensors) -> list[Table]:
+    """Speed for this image, for the swath of the paper beside its rows, and for that swath on every board."""
+    dpu, halo_px = load_dpu(DEFAULT_TARGET), receptive_radius_px(load_onnx(model))
+    chain = measure_chain(dn, sensors.degraded, sensors.reference)
+    prediction, rows = predict_file(model, dpu), []
+    for width, height in ((dn.shape[1], dn.shape[0]), SWATH_PX):
+        swath = Swath(width, height, TILE_PX, halo_px)
+        network = predicted_rows(VARIANT, prediction, swath, dpu)
+        rows.append([chain.row(swath), processor_row(swath, dpu.target), *network])
+    dpus = [load_dpu(name) for name in board_names()]
+    boards = sweep_rows(model, swath, dpus, [TILE_PX])
+    within = within_words(boards, dpus, WITHIN_S)
+    words = f"The same INT8 file on each board's default configuration. Of these, {within}."
+    title = "A swath of {} x {}, beside the paper's figures".format(*SWATH_PX)
+    return [
+        Table(f"Time and power for this image, {dn.shape[1]} x {dn.shape[0]}", rows[0]),
+        Table(title, [_in_table(row, "swath") for row in (*rows[1], *published_rows())], SWATH_CAPTION),
+        Table("The same swath on each board, predicted", [_in_table(row, "boards") for row in boards], words),
+    ]
+
+
+def _in_table(row: Row, table: str) -> Row:
+    return Row(table, row.name, row.figures, row.text)
+
+
+def pictures_of(images: dict[str, np.ndarray], out: Path) -> list[Picture]:
+    """Crops of several (H, W) images side by side, also written as before-after.png, and the INT8 result whole."""
+    side, stretch = min(CROP_PX, *images[INPUT].shape), stretch_of(images[INPUT])
+    windows = busiest_windows(images[INPUT], side)
+    crops = strip(images, windows, side, ZOOM, stretch)
+    with whole_file(out / "before-after.png") as temporary:
+        crops.save(temporary, "PNG", optimize=True)
+    where = " and ".join(f"row {top}, column {left}" for top, left in windows)
+    caption = f"{side} pixels a side from {where}, enlarged {ZOOM} times."
+    whole = picture_url(stretch.to_bytes(images[INT8])[:LARGEST_PX, :LARGEST_PX])
+    return [
+        Picture("The same crops, before and after", picture_url(np.asarray(crops)), caption),
+        Picture(f"Restored by {INT8}", whole, "The network's output, same grey scale as above."),
+    ]
+
+
+def headline(bench: Sequence[Row], quality: Sequence[Row], placement: Placement) -> str:
+    """One sentence: does it fit, how fast, at what quality."""
+    latency = next(row for row in bench if "whole tiles" in row.name).figures["latency"]
+    cpu, whole = bench[0].figures["latency"], placement.dpu_subgraphs == 1 and not placement.failed
+    fits = "fits" if whole else "does not fit"
+    text = (
+        f"{VARIANT} in INT8 {fits} the DPU whole: predicted {latency} s for this image on a {DEFAULT_TARGET.upper()}"
+    )
+    text += f", against {cpu} s {cpu.mode} for the traditional pipeline on this CPU"
+    if quality:
+        before, after = quality[0].figures["PSNR"], quality[-1].figures["PSNR"]
+        text += f"; PSNR rises from {before} to {after} dB (measured)"
+    return f"{text}."

@@ -1,0 +1,278 @@
+"""Average precision, precision and recall, by class and by size, with a bootstrap over sites.
+
+Boxes are matched once, in pixels of the scene. Every figure is then a sum over images, each times its weight: with
+weights of 1 the average precision is that of pycocotools, the reference code of the COCO evaluation; with the counts
+of a bootstrap draw it is that of the images drawn (Everingham et al., IJCV 111, 2015, section 3.5). A mean average
+precision is no mean over images, so each draw is scored anew.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from deploy.studies.detection.boxes import Boxes, areas, joined, shared_areas
+from model.metrics.bootstrap import LEAST_SITES, LEVEL
+
+OVERLAPS = np.linspace(0.5, 0.95, 10)
+"""Intersection over union from which a box counts as found: ten levels, as COCO has them."""
+RECALLS = np.linspace(0.0, 1.0, 101)
+"""Where COCO reads precision off, to average it."""
+CONFIDENCES = np.linspace(0.0, 1.0, 1001)
+"""Where precision and recall are read off: a detection counts up to the confidence that is its score."""
+SIZES_PX = {
+    "all": (0.0, math.inf),
+    "under 16 px": (0.0, 16.0),
+    "16 to 32 px": (16.0, 32.0),
+    "32 px up": (32.0, math.inf),
+}
+"""Root of a box's area, in px of the scene: from the first up to below the second."""
+ALL = 0
+DRAWS = 1000
+FEW_SITES = 10
+"""Below it the percentiles of a bootstrap are too narrow to be trusted, and it is said."""
+
+Figures = Mapping[str, np.ndarray]
+"""The figures of a row by name, (1 + draws,) each: on all images, then on each draw; NaN where there is no object."""
+
+
+@dataclass(frozen=True)
+class Hits:
+    """Every detection on a set of images, the best scored first, and which of them found an object.
+
+    Attributes:
+        images: (D,) int64, the image of each detection.
+        classes: (D,) int64.
+        scores: (D,) float64, falling.
+        hits: (S, 10, D) bool, whether it found an object, by `SIZES_PX` and `OVERLAPS`.
+        ignored: (S, 10, D) bool, whether it counts neither way.
+        objects: (S, C, I) int64, the objects to be found, by size, class and image.
+    """
+
+    images: np.ndarray
+    classes: np.ndarray
+    scores: np.ndarray
+    hits: np.ndarray
+    ignored: np.ndarray
+    objects: np.ndarray
+
+
+def find_hits(truths: Sequence[Boxes], found: Sequence[Boxes], classes: int) -> Hits:
+    """Match what was found with what is labelled, once for all figures, by the rules of the COCO evaluation.
+
+    The best scored detection is matched first, with the free object of its class that it overlaps most. What lies in
+    an ignored box counts neither way; nor do objects of another size, and detections of one that found none. Every
+    detection counts, where COCO takes the best 100 of a class: aerial images hold more objects than photographs do.
+
+    Args:
+        truths: labelled boxes of each image; images without any belong to them: what is found there is false.
+        found: what was found on each image, in the same px, of the same classes.
+        classes: how many there are.
+    """
+    boxes, image = joined(found)
+    order = np.argsort(-boxes.scores, kind="stable")
+    hits, ignored = (
+        np.concatenate(parts, axis=-1)[..., order] for parts in zip(*map(_matched, truths, found), strict=True)
+    )
+    objects = np.zeros((len(SIZES_PX), classes, len(truths)), np.int64)
+    for number, truth in enumerate(truths):
+        for size, passed in enumerate(truth.ignored | _of_other_size(truth)):
+            objects[size, :, number] = np.bincount(truth.classes[~passed], minlength=classes)
+    return Hits(image[order], boxes.classes[order], boxes.scores[order], hits, ignored, objects)
+
+
+def _of_other_size(boxes: Boxes) -> np.ndarray:
+    """(S, N) whether boxes lie outside each of `SIZES_PX`."""
+    sides = np.sqrt(areas(boxes.corners))
+    return np.array([(sides < low) | (sides >= high) for low, high in SIZES_PX.values()])
+
+
+def _matched(truth: Boxes, found: Boxes) -> tuple[np.ndarray, np.ndarray]:
+    """Which detections of an image found an object, and which count neither way, (S, 10, N) each."""
+    passed = np.repeat((truth.ignored | _of_other_size(truth))[:, None], len(OVERLAPS), axis=1)
+    ignored = np.repeat(_of_other_size(found)[:, None], len(OVERLAPS), axis=1)
+    hits, taken, overlaps = np.zeros_like(ignored), np.zeros_like(passed), _overlaps(found, truth)
+    for one in np.argsort(-found.scores, kind="stable"):
+        if overlaps[one].max(initial=0) < OVERLAPS[0]:
+            continue
+        free = (overlaps[one] >= OVERLAPS[:, None]) & ~(taken & ~truth.ignored)
+        wanted = np.where((free & ~passed).any(axis=-1, keepdims=True), free & ~passed, free)
+        best = len(truth) - 1 - np.where(wanted, overlaps[one], -1.0)[..., ::-1].argmax(axis=-1)[..., None]
+        any_free = free.any(axis=-1)
+        passed_over = np.take_along_axis(passed, best, axis=-1)[..., 0]
+        hits[..., one] = any_free & ~passed_over
+        ignored[..., one] = np.where(any_free, passed_over, ignored[..., one])
+        np.put_along_axis(taken, best, np.take_along_axis(taken, best, axis=-1) | any_free[..., None], axis=-1)
+    return hits, ignored
+
+
+def _overlaps(found: Boxes, truth: Boxes) -> np.ndarray:
+    """(N, M) overlaps with objects of the same class; with an ignored one, the share of the detection in it."""
+    shared = shared_areas(found.corners, truth.corners)
+    own, other = areas(found.corners)[:, None], areas(truth.corners)[None, :]
+    whole = np.where(truth.ignored[None, :], own, own + other - shared)
+    same = (found.classes[:, None] == truth.classes[None, :]) & (whole > 0)
+    return np.asarray(np.divide(shared, whole, out=np.zeros_like(shared), where=same))
+
+
+def site_weights(sites: Sequence[str], seed: int, draws: int = DRAWS) -> np.ndarray:
+    """How often each image counts, (1 + draws, I): once, then as often as each draw with replacement has its site."""
+    names, site = np.unique(np.array(sites), return_inverse=True)
+    shares = np.full(len(names), 1 / len(names))
+    counts = np.random.default_rng(seed).multinomial(len(names), shares, size=draws)
+    return np.vstack([np.ones(len(sites), np.int64), counts[:, site]])
+
+
+def interval(values: np.ndarray, sites: int) -> tuple[float, float] | None:
+    """The interval at 95 % of a figure, or of a difference of two: percentiles of its draws.
+
+    Args:
+        values: (1 + draws,) on all images, then on each draw.
+        sites: how many different ones; of fewer than `LEAST_SITES` none could be trusted.
+    """
+    known = values[1:][~np.isnan(values[1:])]
+    if np.isnan(values[0]) or sites < LEAST_SITES or not len(known):
+        return None
+    low, high = np.percentile(known, (50 * (1 - LEVEL), 50 * (1 + LEVEL)))
+    return float(low), float(high)
+
+
+def sites_note(sites: int) -> str:
+    """What a reader must know of intervals over so many sites, in a sentence; empty where there is nothing to say."""
+    if sites < LEAST_SITES:
+        return f"no interval over sites is shown: of {sites}, fewer than {LEAST_SITES}, none could be trusted"
+    return f"Only {sites} sites: the intervals are too narrow to be trusted." if sites < FEW_SITES else ""
+
+
+def score_rows(
+    rows: Mapping[str, Hits], names: Sequence[str], weights: np.ndarray
+) -> tuple[dict[str, Figures], float]:
+    """Every figure of every row, and the confidence at which `precision` and `recall` are read in all of them.
+
+    Args:
+        rows: of the same images; the confidence is that of the best F1 of the first one on all images.
+        names: of the classes.
+        weights: (W, I), how often each image counts, as `site_weights` gives it.
+    """
+    confidence = float(_best(_confidence_curves(next(iter(rows.values())), weights[:1]))[0])
+    return {row: score(hits, names, weights, confidence) for row, hits in rows.items()}, confidence
+
+
+def score(hits: Hits, names: Sequence[str], weights: np.ndarray, confidence: float = math.nan) -> Figures:
+    """Every figure of a row, (W,) each.
+
+    Args:
+        hits: of the row.
+        names: of the classes.
+        weights: (W, I) whole numbers, how often each image counts.
+        confidence: where `precision` and `recall` are read; `own precision` and `own recall` are read at
+            `own confidence`, that of the row's best F1.
+    """
+    by_class = np.array([_average_precisions(hits, kind, weights) for kind in range(len(names))])
+    curves = _confidence_curves(hits, weights)
+    own = _best(curves)
+    fixed = np.full(len(weights), confidence)
+    return {
+        "mAP50": mean_known(by_class[..., 0]),
+        "mAP50-95": mean_known(by_class.mean(axis=-1)),
+        "precision": _read_at(curves[0], fixed),
+        "recall": _read_at(curves[1], fixed),
+        "own confidence": own,
+        "own precision": _read_at(curves[0], own),
+        "own recall": _read_at(curves[1], own),
+        **{f"mAP50 of {name}": values for name, values in zip(names, by_class[..., 0], strict=True)},
+        **{f"mAP50 {name}": map50(hits, weights, size) for size, name in enumerate(SIZES_PX) if size != ALL},
+    }
+
+
+def map50(hits: Hits, weights: np.ndarray, size: int = ALL) -> np.ndarray:
+    """Average precision at an overlap of one half alone, mean over classes, (W,); arguments as of `score`."""
+    kinds = range(hits.objects.shape[1])
+    return mean_known(np.array([_average_precisions(hits, kind, weights, size, levels=1)[:, 0] for kind in kinds]))
+
+
+def mean_known(values: np.ndarray) -> np.ndarray:
+    """Mean over the first axis of those that are there; NaN of none."""
+    known = ~np.isnan(values)
+    count = known.sum(axis=0)
+    total = np.where(known, values, 0.0).sum(axis=0)
+    return np.asarray(np.divide(total, count, out=np.full(total.shape, np.nan), where=count > 0))
+
+
+def _average_precisions(
+    hits: Hits, kind: int, weights: np.ndarray, size: int = ALL, levels: int = len(OVERLAPS)
+) -> np.ndarray:
+    """(W, levels) of a class at the first of `OVERLAPS`, NaN where it has no object."""
+    return np.asarray(precisions(hits, kind, weights, size, levels).mean(axis=-1))
+
+
+def precisions(hits: Hits, kind: int, weights: np.ndarray, size: int = ALL, levels: int = 1) -> np.ndarray:
+    """Precision of a class at each of `RECALLS`, (W, levels, 101): the best at that recall or more (COCO).
+
+    Args:
+        hits: of a row.
+        kind: number of the class.
+        weights: (W, I) how often each image counts.
+        size: number of a range of `SIZES_PX`.
+        levels: how many of `OVERLAPS`, from the first.
+
+    Returns:
+        NaN where the class has no object.
+    """
+    mine = np.flatnonzero(hits.classes == kind)
+    images, totals = hits.images[mine], weights @ hits.objects[size, kind]
+    found = np.full((len(weights), levels, len(RECALLS)), np.nan)
+    places = []
+    for level in range(levels):
+        hit, passed = (np.flatnonzero(flags[size, level, mine]) for flags in (hits.hits, hits.ignored))
+        places.append((hit, passed, np.searchsorted(passed, hit)))
+    for draw in np.flatnonzero(totals):
+        each = weights[draw, images]
+        so_far = np.cumsum(each)
+        for level, (hit, passed, passed_before) in enumerate(places):
+            # Precision peaks at hits alone, so a draw has to look at nothing else.
+            true = np.cumsum(each[hit])
+            counted = so_far[hit] - np.concatenate([[0], np.cumsum(each[passed])])[passed_before]
+            precision = np.divide(true, counted, out=np.zeros(len(true)), where=counted > 0)
+            best = np.append(np.maximum.accumulate(precision[::-1])[::-1], 0.0)  # beyond the last hit there is none
+            found[draw, level] = best[np.searchsorted(true / totals[draw], RECALLS)]
+    return found
+
+
+def _confidence_curves(hits: Hits, weights: np.ndarray) -> np.ndarray:
+    """Precision, recall and F1 at an overlap of half, (3, W, 1001): means over the classes that have an object.
+
+    Precision is 1 of a class of which nothing is found, as Ultralytics has it.
+    """
+    total, known = np.zeros((3, len(weights), len(CONFIDENCES))), np.zeros(len(weights))
+    levels = np.searchsorted(CONFIDENCES, hits.scores, side="right") - 1
+    for kind, objects in enumerate(hits.objects[ALL]):
+        counts = weights @ objects
+        mine = hits.classes == kind
+        hit, counted = (np.flatnonzero(flags & mine) for flags in (hits.hits[ALL, 0], ~hits.ignored[ALL, 0]))
+        steps = [(levels[which], hits.images[which]) for which in (hit, counted)]
+        for draw in np.flatnonzero(counts):
+            true, found = (
+                np.bincount(level, weights[draw, image], len(CONFIDENCES))[::-1].cumsum()[::-1]
+                for level, image in steps
+            )
+            precision = np.divide(true, found, out=np.ones(len(CONFIDENCES)), where=found > 0)
+            recall = true / counts[draw]
+            both = precision + recall
+            f1 = np.divide(2 * precision * recall, both, out=np.zeros_like(both), where=both > 0)
+            total[:, draw] += precision, recall, f1
+        known += counts > 0
+    none = np.full(total.shape, np.nan)
+    return np.asarray(np.divide(total, known[:, None], out=none, where=known[:, None] > 0))
+
+
+def _best(curves: np.ndarray) -> np.ndarray:
+    """(W,) the confidence of the largest F1, the lowest one of several; NaN where nothing is labelled."""
+    return np.where(np.isnan(curves[2]).any(axis=-1), np.nan, CONFIDENCES[np.argmax(curves[2], axis=-1)])
+
+
+def _read_at(curve: np.ndarray, confidences: np.ndarray) -> np.ndarray:
+    """(W,) what stands in each row of a curve (W, 1001) at its confidence; NaN at a NaN."""
+    level = np.searchsorted(CONFIDENCES, np.nan_to_num(confidences) - 1e-9)
+    return np.where(np.isnan(confidences), np.nan, curve[np.arange(len(curve)), level])

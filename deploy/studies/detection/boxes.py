@@ -1,0 +1,177 @@
+"""Boxes on an image: how much two overlap, which of several on one object stays, and how they follow an image's size.
+
+Coordinates are continuous pixels: pixel i covers [i, i + 1), so a box around the first pixel is 0, 0, 1, 1. Readers
+bring every other convention to this one (`labels`).
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+from skimage.transform import resize
+
+from profiles.errors import OptionError
+
+LEAST_VISIBLE = 0.3
+"""Share of a box inside the image below which finding it counts neither for nor against a detector."""
+PADDING, OVERLAP, MOST, CANDIDATES = 114 / 255, 0.7, 300, 30_000
+"""As Ultralytics validates: the grey around an image, the overlap above which the lower scored of two boxes goes, the
+boxes kept of an image, and those looked at, best scores first."""
+
+
+@dataclass(frozen=True)
+class Boxes:
+    """Boxes of one image.
+
+    Attributes:
+        corners: (N, 4) float64: left, top, right and bottom in px.
+        classes: (N,) int64 into a tuple of names that is kept elsewhere.
+        scores: (N,) float64 confidence in 0 to 1; 1 of what is labelled.
+        ignored: (N,) bool: what is found inside such a box counts neither for nor against a detector.
+    """
+
+    corners: np.ndarray
+    classes: np.ndarray
+    scores: np.ndarray
+    ignored: np.ndarray
+
+    @classmethod
+    def of(
+        cls,
+        corners: ArrayLike,
+        classes: ArrayLike,
+        scores: ArrayLike | None = None,
+        ignored: ArrayLike | None = None,
+    ) -> "Boxes":
+        """Boxes of any array-like; without scores they are labelled ones, and none is ignored unless it is said."""
+        found = np.asarray(corners, np.float64).reshape(-1, 4)
+        count = len(found)
+        return cls(
+            found,
+            np.asarray(classes, np.int64).reshape(count),
+            np.ones(count) if scores is None else np.asarray(scores, np.float64).reshape(count),
+            np.zeros(count, bool) if ignored is None else np.asarray(ignored, bool).reshape(count),
+        )
+
+    @classmethod
+    def none(cls) -> "Boxes":
+        """No box."""
+        return cls.of(np.empty((0, 4)), np.empty(0))
+
+    def __len__(self) -> int:
+        return len(self.corners)
+
+    def __getitem__(self, which: np.ndarray | slice) -> "Boxes":
+        """The boxes that a mask, indices or a slice choose."""
+        return Boxes(self.corners[which], self.classes[which], self.scores[which], self.ignored[which])
+
+    def at(self, corners: np.ndarray) -> "Boxes":
+        """The same boxes at other corners, (N, 4) px."""
+        return Boxes.of(corners, self.classes, self.scores, self.ignored)
+
+    def renamed(self, classes: np.ndarray) -> "Boxes":
+        """Boxes whose class c becomes `classes[c]`; those of a class that becomes -1 are left out."""
+        new = np.asarray(classes, np.int64)[self.classes]
+        return Boxes(self.corners, new, self.scores, self.ignored)[new >= 0]
+
+    def clipped(self, height_px: float, width_px: float) -> "Boxes":
+        """The parts inside an image: what lies outside whole is left out, what is mostly outside is ignored."""
+        limits = np.array([width_px, height_px, width_px, height_px])
+        inside = self.at(np.clip(self.corners, 0, limits))
+        known, whole = areas(inside.corners), areas(self.corners)
+        ignored = self.ignored | (known < LEAST_VISIBLE * whole)
+        return Boxes(inside.corners, self.classes, self.scores, ignored)[known > 0]
+
+
+def joined(several: Sequence[Boxes]) -> tuple[Boxes, np.ndarray]:
+    """Boxes of several images in one, and the number of each one's image, (N,) int64."""
+    parts = ("corners", "classes", "scores", "ignored")
+    whole = Boxes(*(np.concatenate([getattr(one, part) for one in (Boxes.none(), *several)]) for part in parts))
+    return whole, np.repeat(np.arange(len(several)), [len(one) for one in several])
+
+
+def areas(corners: np.ndarray) -> np.ndarray:
+    """(N,) areas in px2 of (N, 4) corners; 0 where a right or lower edge lies before its opposite."""
+    return np.asarray(np.prod(np.maximum(corners[:, 2:] - corners[:, :2], 0), axis=1))
+
+
+def shared_areas(one: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """(N, M) px2 that each of (N, 4) boxes has in common with each of (M, 4)."""
+    low = np.maximum(one[:, None, :2], other[None, :, :2])
+    high = np.minimum(one[:, None, 2:], other[None, :, 2:])
+    return np.asarray(np.prod(np.maximum(high - low, 0), axis=2))
+
+
+def iou(one: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """(N, M) intersections over unions, 0 to 1, of (N, 4) and (M, 4) corners; 0 of two boxes without area."""
+    shared = shared_areas(one, other)
+    union = areas(one)[:, None] + areas(other)[None, :] - shared
+    return np.asarray(np.divide(shared, union, out=np.zeros_like(shared), where=union > 0))
+
+
+def suppress(found: Boxes, overlap: float = OVERLAP, most: int = MOST) -> Boxes:
+    """Non-maximum suppression within each class: of boxes that overlap more than `overlap` the best scored stays.
+
+    Args:
+        found: as a detector gives them.
+        overlap: intersection over union, 0 to 1.
+        most: boxes kept of the image, the best scored.
+
+    Returns:
+        What stays, best score first.
+    """
+    left, kept = np.argsort(-found.scores, kind="stable")[:CANDIDATES], list[int]()
+    while len(left) and len(kept) < most:
+        best, left = int(left[0]), left[1:]
+        kept.append(best)
+        crowded = found.classes[left] == found.classes[best]
+        crowded[crowded] = iou(found.corners[best][None], found.corners[left[crowded]])[0] > overlap
+        left = left[~crowded]
+    return found[np.array(kept, np.int64)]
+
+
+class Letterbox:
+    """How an image of any size goes into a detector's square input: enlarged or shrunk alike, centred, padded grey.
+
+    Shrinking samples bilinearly without a filter in front, as Ultralytics does when it trains and runs.
+
+    Args:
+        height_px: of the image.
+        width_px: of the image.
+        size_px: side of the input.
+
+    Raises:
+        OptionError: an image so narrow that nothing of it would be left.
+    """
+
+    def __init__(self, height_px: int, width_px: int, size_px: int) -> None:
+        share = min(size_px / height_px, size_px / width_px)
+        self._size_px, self._inner = size_px, (round(height_px * share), round(width_px * share))
+        if min(self._inner) < 1:
+            expected = f"an image that keeps a pixel in a detector's input of {size_px} px"
+            raise OptionError(
+                "image", expected=expected, got=f"{height_px} x {width_px} px", remedy="cut it into squares"
+            )
+        height, width = self._inner
+        self._top, self._left = (size_px - height) // 2, (size_px - width) // 2
+        # By axis, for the sides are rounded to whole pixels: one gain for both would be off by up to half a pixel.
+        self._gain = np.tile([width / width_px, height / height_px], 2)
+        self._shift = np.tile([self._left, self._top], 2)
+
+    def image(self, rgb: np.ndarray) -> np.ndarray:
+        """The input, (3, size_px, size_px) float32, of an image (height_px, width_px, 3) in 0 to 1."""
+        same = self._inner == rgb.shape[:2]
+        fitted = rgb if same else resize(rgb, self._inner, order=1, mode="edge", anti_aliasing=False)
+        padded = np.full((self._size_px, self._size_px, 3), PADDING, np.float32)
+        height, width = self._inner
+        padded[self._top : self._top + height, self._left : self._left + width] = fitted
+        return np.ascontiguousarray(padded.transpose(2, 0, 1))
+
+    def to_input(self, corners: np.ndarray) -> np.ndarray:
+        """(N, 4) corners on the image as px of the input."""
+        return np.asarray(corners * self._gain + self._shift)
+
+    def to_image(self, corners: np.ndarray) -> np.ndarray:
+        """(N, 4) corners in px of the input as px of the image."""
+        return np.asarray((corners - self._shift) / self._gain)

@@ -1,0 +1,266 @@
+"""Detectors as Ultralytics exports them to ONNX: what a file says of itself, and boxes by onnxruntime on the CPU.
+
+Two layouts are read (docs.ultralytics.com/integrations/onnx, and files of its 8.4.190): raw, 1 x (4 + classes) x
+anchors, centre, size and a score of each class; and final, 1 x N x 6, corners, score and class, of `nms=True` or of a
+network that needs no suppression. Both take RGB in 0 to 1 on a grey letterbox, and answer in px of the input.
+"""
+
+import ast
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import onnx
+
+from deploy.studies.detection.boxes import MOST, Boxes, Letterbox, suppress
+from model.processor import require_cores
+from profiles.errors import ModelError, OptionError
+from quant.onnx_file import constants, fixed_tile_px, load_onnx, metadata
+from quant.session import open_session
+
+LEAST_SCORE = 1e-3
+"""Below it a detection is none, as Ultralytics validates: average precision needs the doubtful ones."""
+CUT = 0.01
+"""A file that drops detections only below this confidence loses next to nothing of its average precision."""
+LITERAL = 1 << 16
+"""Characters of a Python literal in the metadata; the names of 1 200 classes take half of it."""
+ROUNDING = 1e-3
+"""By how much a score may pass 0 or 1."""
+REMEDY = "export it by Ultralytics for detection, with format='onnx'"
+OPTION = "--classes"
+
+Layout = Literal["raw", "final"]
+
+
+@dataclass(frozen=True)
+class Detector:
+    """A detector ready to run.
+
+    Attributes:
+        names: of its classes, in its order.
+        size_px: side of its square input.
+        layout: of its output: raw, or final boxes.
+        flag: why its average precision comes out too low, in a sentence; empty where nothing is cut.
+    """
+
+    names: tuple[str, ...]
+    size_px: int
+    layout: Layout
+    flag: str
+    _run: Callable[[np.ndarray], np.ndarray]
+
+    def detect(self, rgb: np.ndarray) -> Boxes:
+        """What it finds on an image (H, W, 3) float32 in 0 to 1, the best scored first, 300 boxes at most.
+
+        Returns:
+            Boxes in px of the image, cut at its borders.
+
+        Raises:
+            OptionError: an image too narrow for the input.
+            ModelError: it does not run, or answers no scores in 0 to 1.
+        """
+        height, width = rgb.shape[:2]
+        box = Letterbox(height, width, self.size_px)
+        found = self.decoded(self._run(box.image(rgb)[None]))
+        inside = found.at(box.to_image(found.corners)).clipped(height, width)
+        return Boxes.of(inside.corners, inside.classes, inside.scores)
+
+    def decoded(self, output: np.ndarray) -> Boxes:
+        """Boxes in px of the input, suppressed, of an answer (1, 4 + classes, anchors) raw, or (1, N, 6) final.
+
+        Raises:
+            ModelError: of another size, scores outside 0 to 1, or values that are not finite.
+        """
+        axis, size = (1, 4 + len(self.names)) if self.layout == "raw" else (2, 6)
+        if output.ndim != 3 or len(output) != 1 or output.shape[axis] != size:
+            raise _unsound("an answer of the sizes that its file states", " x ".join(map(str, output.shape)))
+        if not np.isfinite(output).all():
+            raise _unsound("finite boxes and scores", "NaN or infinity")
+        scores = output[:, 4:] if self.layout == "raw" else output[:, :, 4]
+        if scores.min(initial=0) < -ROUNDING or scores.max(initial=0) > 1 + ROUNDING:
+            raise _unsound("scores in 0 to 1", "others: logits or an objectness perhaps")
+        if self.layout == "raw":
+            return suppress(_raw(output[0]))
+        found = _final(output[0], len(self.names))
+        return found[np.argsort(-found.scores, kind="stable")[:MOST]]
+
+
+def open_detector(path: Path, threads: int = 0, size_px: int | None = None) -> Detector:
+    """Open a detector's file.
+
+    Args:
+        path: an ONNX file.
+        threads: of onnxruntime; 0 takes a thread a core.
+        size_px: side of the input; None takes the one that the file is fixed to or was trained for.
+
+    Raises:
+        ModelError: a file that is not to be trusted, or of another layout.
+        OptionError: another size than the file is fixed to, or more threads than cores.
+    """
+    require_cores("--threads", threads)
+    model = load_onnx(path)
+    about = {key: _literal(value) for key, value in metadata(model).items()}
+    names = _names(about.get("names"), path)
+    layout = _layout(model, about, len(names), path)
+    size = _size_px(fixed_tile_px(model), about, size_px, path)
+    return Detector(names, size, layout, _flag(model), _runner(model, threads, path))
+
+
+def _runner(model: onnx.ModelProto, threads: int, path: Path) -> Callable[[np.ndarray], np.ndarray]:
+    session = open_session(model, threads)
+    name = session.get_inputs()[0].name
+
+    def run(image: np.ndarray) -> np.ndarray:
+        try:
+            return np.asarray(session.run(None, {name: image})[0])
+        except Exception as error:  # onnxruntime raises a class of its own for each status code
+            got, remedy = " ".join(str(error).split())[:160], "export it again, for one size of image"
+            raise ModelError(str(path), expected="a detector that runs", got=got, remedy=remedy) from error
+
+    return run
+
+
+def _literal(text: str) -> Any:
+    """What a value of the metadata stands for, where it is a Python literal; else the text."""
+    try:
+        return ast.literal_eval(text) if len(text) <= LITERAL else text
+    except (MemoryError, RecursionError, SyntaxError, TypeError, ValueError):
+        return text
+
+
+def _names(found: Any, path: Path) -> tuple[str, ...]:
+    names = [found.get(number) for number in range(len(found))] if isinstance(found, dict) else found
+    if not isinstance(names, list) or not names or not all(isinstance(name, str) and letters(name) for name in names):
+        expected = "the names of its classes in its metadata, {0: 'ship', ...}"
+        raise _unread(path, expected, "none" if found is None else repr(found)[:80])
+    return tuple(names)
+
+
+def _layout(model: onnx.ModelProto, about: dict[str, Any], classes: int, path: Path) -> Layout:
+    """Which of the two layouts, by task, shapes and what made it."""
+    task, channels = about.get("task", "detect"), _sizes(model.graph.input[0])[1:2]
+    outputs = [_sizes(value) for value in model.graph.output]
+    # RT-DETR answers as the final layout does, but for 2 classes.
+    other = "rtdetr" in letters(f"{about.get('head', '')}{about.get('description', '')}")
+    shape = outputs[0] if len(outputs) == 1 and len(outputs[0]) == 3 and not other else [-1]
+    if task == "detect" and channels == [3] and shape[0] in (0, 1):
+        if shape[1] == 4 + classes:
+            return "raw"
+        if shape[2] == 6:
+            return "final"
+    read = f"for RGB, 1 x {4 + classes} x anchors for {classes} classes (raw) or 1 x N x 6 (nms=True or end2end)"
+    shapes = ", ".join(" x ".join(map(str, sizes)) for sizes in outputs)
+    got = f"task {task}, {' '.join(map(str, channels))} channels, output {shapes}{', of RT-DETR' if other else ''}"
+    raise _unread(path, f"a detector's output as Ultralytics exports it {read}", got)
+
+
+def _sizes(value: onnx.ValueInfoProto) -> list[int]:
+    """Sizes that a file states of an input or output; 0 where it leaves one open."""
+    return [dimension.dim_value for dimension in value.type.tensor_type.shape.dim]
+
+
+def _size_px(fixed: int | None, about: dict[str, Any], asked: int | None, path: Path) -> int:
+    if fixed and asked not in (None, fixed):
+        expected, remedy = f"{fixed}, which {path.name} is fixed to", f"export it for {asked} px, or leave --size out"
+        raise OptionError("--size", expected=expected, got=f"{asked}", remedy=remedy)
+    stated, stride = about.get("imgsz"), about.get("stride")
+    sides = set(stated) if isinstance(stated, list) else {stated}
+    size = fixed or asked or (sides.pop() if len(sides) == 1 else None)
+    step = stride if isinstance(stride, int) and stride > 0 and not fixed else 1
+    if not isinstance(size, int) or size < step or size % step:
+        expected = f"a side of the detector's input in px, a multiple of its stride of {step}"
+        raise OptionError("--size", expected=expected, got=f"{size}", remedy="say it")
+    return size
+
+
+def _flag(model: onnx.ModelProto) -> str:
+    """What suppression inside the file costs; the confidence it cuts at stands nowhere but in its graph."""
+    if not any(node.op_type == "NonMaxSuppression" for node in model.graph.node):
+        return ""
+    known, compared = constants(model), (node.input for node in model.graph.node if node.op_type == "Greater")
+    limits = [known[name].max() for names in compared for name in names if name in known and known[name].size]
+    if limits and max(limits) <= CUT:
+        return ""
+    where = f"confidence {max(limits):.3g}" if limits else "an unknown confidence"
+    effect = f"The detector's own suppression drops what lies below {where}, so average precision is too low"
+    return f"{effect}: export it without nms, or with conf=0.001."
+
+
+def _raw(output: np.ndarray) -> Boxes:
+    """Every pair of an anchor and a class whose score counts; px of the input."""
+    classes, anchors = np.nonzero(output[4:] > LEAST_SCORE)
+    middle, half = output[:2, anchors].T.astype(np.float64), output[2:4, anchors].T.astype(np.float64) / 2
+    return Boxes.of(np.hstack([middle - half, middle + half]), classes, output[4 + classes, anchors])
+
+
+def _final(output: np.ndarray, classes: int) -> Boxes:
+    """Rows with a score that counts: the rest pads the list with zeros."""
+    rows = output[output[:, 4] > LEAST_SCORE]
+    if not np.isin(rows[:, 5], np.arange(classes)).all():
+        raise _unsound(f"classes from 0 to {classes - 1} in its sixth column", "others")
+    return Boxes.of(rows[:, :4], rows[:, 5].astype(np.int64), rows[:, 4])
+
+
+def _unsound(expected: str, got: str) -> ModelError:
+    return ModelError("detector", expected=expected, got=got, remedy=REMEDY)
+
+
+def _unread(path: Path, expected: str, got: str) -> ModelError:
+    return ModelError(str(path), expected=expected, got=got, remedy=REMEDY)
+
+
+def letters(name: str) -> str:
+    """The letters and digits of a class's name, without case: tools spell the same ones differently."""
+    return "".join(c for c in name.casefold() if c.isalnum())
+
+
+def parse_classes(text: str) -> dict[str, str]:
+    """Read LABELLED=DETECTOR,...: which class of the detector a labelled class is.
+
+    Raises:
+        OptionError: another text, or a class given twice.
+    """
+    pairs = [[part.strip() for part in entry.split("=")] for entry in text.split(",") if entry.strip()]
+    sound = pairs and all(len(pair) == 2 and all(map(letters, pair)) for pair in pairs)
+    if not sound or len({letters(pair[0]) for pair in pairs}) < len(pairs):
+        expected, remedy = "LABELLED=DETECTOR,..., each labelled class once", "write car=vehicle,minibus=vehicle"
+        raise OptionError(OPTION, expected=expected, got=repr(text), remedy=remedy)
+    return dict(pairs)
+
+
+def class_numbers(labelled: Sequence[str], detector: Sequence[str], given: Mapping[str, str]) -> np.ndarray:
+    """For each labelled class its number among the detector's: of the one given, else of the one of the same letters.
+
+    Args:
+        labelled: names in the order of the labels' numbers.
+        detector: names in the order of the detector's.
+        given: detector's names by labelled ones, as `parse_classes` reads them.
+
+    Returns:
+        (L,) int64, -1 for a class that the detector does not know; as `Boxes.renamed` takes it.
+
+    Raises:
+        OptionError: a name given that is none, two classes of a detector with the same letters, or none in common.
+    """
+    number = {letters(name): i for i, name in enumerate(detector)}
+    if len(number) < len(detector):
+        expected, got = "classes told apart by their letters", "two classes of the same letters"
+        raise OptionError("detector", expected=expected, got=got, remedy="export one whose classes differ")
+    _require_known("the labelled", given, labelled)
+    _require_known("the detector's", given.values(), detector)
+    asked = {letters(name): known for name, known in given.items()}
+    numbers = np.array([number.get(letters(asked.get(letters(name), name)), -1) for name in labelled], np.int64)
+    if not (numbers >= 0).any():
+        expected = f"a labelled class that the detector knows ({', '.join(detector)})"
+        remedy = f"say which is which: {OPTION} LABELLED=DETECTOR"
+        raise OptionError("classes", expected=expected, got=", ".join(labelled) or "none", remedy=remedy)
+    return numbers
+
+
+def _require_known(whose: str, asked: Iterable[str], names: Sequence[str]) -> None:
+    for name in asked:
+        if letters(name) not in map(letters, names):
+            expected = f"one of {whose} classes ({', '.join(names)})"
+            raise OptionError(OPTION, expected=expected, got=repr(name), remedy="correct the name")

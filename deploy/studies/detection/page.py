@@ -1,0 +1,157 @@
+"""The page of a detection study: precision by recall, crops with boxes, and the tables."""
+
+import base64
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from PIL import Image, ImageDraw
+
+from deploy.report.page import Picture, Report, Table, write_report
+from deploy.report.plots import SERIES, Curve, Panel, curves_svg
+from deploy.studies.detection.average_precision import RECALLS, Hits, mean_known, precisions
+from deploy.studies.detection.boxes import Boxes, iou
+from deploy.studies.detection.study import REFERENCE, Comparison
+from deploy.studies.detection.tables import (
+    BY_SIZE,
+    MAIN,
+    PAPER_NOTES,
+    detection_rows,
+    headline,
+    paper_rows,
+)
+from deploy.studies.evaluation.methods import DEGRADED
+from model.io.pictures import grid, picture_url
+from profiles.figures import Row, by_table
+
+CROP_PX, ZOOM, PICTURES = 88, 3, 4
+OVERLAP = 0.5
+FOUND, MISSED, FALSE = "#2fd39b", "#ff5a36", "#ffd21f"
+"""Colours of boxes."""
+
+CAPTIONS = {
+    MAIN: "Precision and recall at the confidence of the reference's best F1, the one a deployed detector is set to. "
+    "Gains and losses are of mAP50, on the same images; where their interval holds 0, there is none.",
+    BY_SIZE: "Root of a box's area, in pixels of the scene.",
+}
+NOTES = (
+    "mAP50: average precision at an overlap of half, mean over classes; mAP50-95: mean over 0.5 to 0.95 (COCO).",
+    "Share of loss regained: gain over what degradation took; unavailable where that loss cannot be told from 0.",
+    "The detector is fixed, and was trained for none of the degraded or restored images.",
+    "It is shown one panchromatic band in all three, under one stretch for all rows of a scene.",
+)
+
+
+def write_page(compared: Sequence[Comparison], notes: Sequence[str], path: Path) -> None:
+    """Write the page of a study, whole or not at all; the comparisons are of one set of scenes."""
+    rows: list[Row] = [*(row for found in compared for row in detection_rows(found)), *paper_rows()]
+    tables = [Table(name, each, CAPTIONS.get(name.split(",")[0], "")) for name, each in by_table(rows).items()]
+    truths = [each.scene.truth for each in compared[0].scenes]
+    objects = sum(int((~truth.ignored).sum()) for truth in truths)
+    title = f"What restoration buys a detector: {objects} objects on {len(truths)} images"
+    pictures = [curves(compared), *crops(compared)]
+    said = (*notes, *NOTES, *PAPER_NOTES)
+    write_report(Report(title, headline(compared), tables, pictures, said), path)
+
+
+def curves(compared: Sequence[Comparison]) -> Picture:
+    """Precision by recall at an overlap of one half, means over classes: a panel a sensor."""
+    panels = [
+        Panel(
+            found.name,
+            [
+                Curve(row, number % len(SERIES), row == REFERENCE, _points(hits))
+                for number, (row, hits) in enumerate(found.hits.items())
+            ],
+        )
+        for found in compared
+    ]
+    svg = curves_svg(panels, "recall", "precision", logarithmic=False)
+    address = "data:image/svg+xml;base64," + base64.b64encode(svg.encode()).decode()
+    return Picture("Precision by recall", address, "At an overlap of 0.5, mean over the classes that are labelled.")
+
+
+def _points(hits: Hits) -> tuple[tuple[float, float], ...]:
+    _, classes, images = hits.objects.shape
+    once = np.ones((1, images), np.int64)
+    values = mean_known(np.array([precisions(hits, kind, once)[0, 0] for kind in range(classes)]))
+    return tuple(zip(RECALLS.tolist(), values.tolist(), strict=True))
+
+
+def crops(compared: Sequence[Comparison]) -> list[Picture]:
+    """The same crops of the scenes that lose most objects: a row a sensor and a column a method."""
+    lost = [sum(int(_lost(found, number).sum()) for found in compared) for number in range(len(compared[0].scenes))]
+    chosen = np.argsort(-np.array(lost), kind="stable")[:PICTURES]
+    return [_picture(compared, int(number)) for number in chosen]
+
+
+def _lost(found: Comparison, number: int) -> np.ndarray:
+    """(M,) objects of a scene that are found on the reference and not on degraded images."""
+    return np.asarray(_found(found, REFERENCE, number)[1] & ~_found(found, DEGRADED, number)[1])
+
+
+def _found(found: Comparison, row: str, number: int) -> tuple[np.ndarray, np.ndarray]:
+    return objects_found(found.scenes[number].scene.truth, found.boxes[row][number], found.confidence)
+
+
+def objects_found(truth: Boxes, boxes: Boxes, confidence: float) -> tuple[np.ndarray, np.ndarray]:
+    """Which boxes (N,) that reach a confidence found an object that they overlap by half, and which objects (M,)."""
+    hits, found = np.zeros(len(boxes), bool), np.zeros(len(truth), bool)
+    overlaps = iou(boxes.corners, truth.corners) * (boxes.classes[:, None] == truth.classes[None, :])
+    for one in np.argsort(-boxes.scores, kind="stable"):
+        free = np.where(found, 0.0, overlaps[one])
+        if boxes.scores[one] >= confidence and len(free) and free.max() >= OVERLAP:
+            hits[one] = found[int(free.argmax())] = True
+    return hits, found
+
+
+def _picture(compared: Sequence[Comparison], number: int) -> Picture:
+    middle = _middle(compared[0], number)
+    rows = [[_cell(found, row, number, middle) for row in found.methods] for found in compared]
+    caption = (
+        f"Rows: {' and '.join(found.name for found in compared)}. {CROP_PX} pixels of the sensor a side, enlarged "
+        f"{ZOOM} times, one display for all. Boxes at the confidence of the table: green found, red missed, "
+        "yellow false."
+    )
+    image = np.asarray(grid(list(compared[0].methods), rows, 1))
+    return Picture(f"{compared[0].scenes[number].scene.name}: what is found", picture_url(image), caption)
+
+
+def _middle(found: Comparison, number: int) -> np.ndarray:
+    """(2,) x and y in scene pixels of the object, a lost one if there is any, with most such near it."""
+    truth, lost = found.scenes[number].scene.truth, _lost(found, number)
+    shown = truth.corners[lost] if lost.any() else truth.corners
+    if not len(shown):
+        return np.zeros(2)
+    middles = (shown[:, :2] + shown[:, 2:]) / 2
+    near = np.abs(middles[:, None] - middles[None]).max(-1) < CROP_PX * found.sensors.oversampling / 2
+    return np.asarray(middles[int(near.sum(axis=1).argmax())])
+
+
+def _cell(found: Comparison, row: str, number: int, middle: np.ndarray) -> np.ndarray:
+    """An enlarged crop around a place of the scene, what is missed, falsely found and found drawn over it."""
+    scene, ratio, boxes = found.scenes[number], found.sensors.oversampling, found.boxes[row][number]
+    truth, (hits, objects) = scene.scene.truth, _found(found, row, number)
+    crop, corner = cropped(scene.shown(found.methods[row]), middle / ratio)
+    picture = Image.fromarray(crop).resize((CROP_PX * ZOOM, CROP_PX * ZOOM), Image.Resampling.NEAREST)
+    draw = ImageDraw.Draw(picture)
+    shown = (
+        (truth.corners[~objects & ~truth.ignored], MISSED),
+        (boxes.corners[(boxes.scores >= found.confidence) & ~hits], FALSE),
+        (boxes.corners[hits], FOUND),
+    )
+    for corners, colour in shown:
+        for x1, y1, x2, y2 in (corners / ratio - np.tile(corner, 2)) * ZOOM:
+            draw.rectangle((x1, y1, max(x2 - 1, x1), max(y2 - 1, y1)), outline=colour, width=2)
+    return np.asarray(picture)
+
+
+def cropped(rgb: np.ndarray, middle: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """A square of an image in 8 bits around x and y, moved inside it, black beyond it; and its left and top."""
+    height, width, _ = rgb.shape
+    corner = np.clip(middle - CROP_PX / 2, 0, np.maximum(np.array([width, height]) - CROP_PX, 0)).astype(int)
+    left, top = corner
+    inside = rgb[top : top + CROP_PX, left : left + CROP_PX]
+    whole = np.zeros((CROP_PX, CROP_PX, 3), np.uint8)
+    whole[: inside.shape[0], : inside.shape[1]] = np.rint(255 * inside)
+    return whole, corner

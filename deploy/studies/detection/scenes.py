@@ -1,0 +1,420 @@
+"""Synthetic scenes with known objects: vehicles, ships, aircraft and tanks on plots of ground between streets.
+
+The world is that of the simulator's procedural scene, its radiances and its texture, drawn at 0.25 m a pixel and
+turned as a whole: of three scene pixels a sensor makes one of 0.75 m, in which a car is 6 pixels long. Objects are
+polygons in metres around (0, 0), the nose along x, sized as common types: cars of 3.8 to 5.2 m, lorries and buses to
+14 m, ships of 9 to 70 m, aircraft of 12 to 38 m span, tanks of 5 to 15 m radius.
+"""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from PIL import Image, ImageDraw
+
+from deploy.studies.detection.boxes import Boxes
+from model.simulator.drawing import (
+    ASPHALT,
+    CONCRETE,
+    GRASS,
+    SHADOW,
+    SOIL,
+    WATER,
+    WHITE,
+    Point,
+    rectangle,
+    shift,
+    texture,
+    tree,
+    turn,
+)
+
+CLASSES = ("vehicle", "ship", "aircraft", "tank")
+VEHICLE, SHIP, AIRCRAFT, TANK = range(len(CLASSES))
+
+SCENE_GSD_M = 0.25
+"""Ground that a scene pixel covers."""
+GAP_PX = 3
+"""Scene pixels that stay free around an object and its shadow."""
+TRIES = 4
+"""Times that a place is looked for before an object is left out."""
+PLOT_M, STREET_M, KERB_M = 96.0, 9.0, 2.0
+PAINTS = [18.0, 60.0, 110.0, 190.0, 280.0]
+"""Radiances of vehicles, black to white: those of the procedural scene."""
+
+Part = tuple[list[Point], float]
+"""A polygon in metres and its radiance; of several the first is the lowest."""
+
+
+def synthetic_scene(generator: np.random.Generator, height_px: int, width_px: int) -> tuple[np.ndarray, Boxes]:
+    """Draw a scene of that many pixels of 0.25 m, the same for the same generator state.
+
+    Returns:
+        Radiance (H, W) float32 in W/m2/sr/um, and the boxes of its objects, of `CLASSES`: exactly their pixels, their
+        shadows left out. Every object lies whole within the scene, touches no other, and nothing covers it.
+    """
+    canvas = Canvas(height_px, width_px, generator)
+    angle, (x, y) = float(generator.uniform(-0.5, 0.5)), generator.uniform(-0.5, 0.5, 2) * PLOT_M
+    world, reach = turn(x, y, angle), canvas.reach_m + PLOT_M
+    places = (np.arange(math.ceil(2 * reach / PLOT_M)) + 0.5) * PLOT_M - reach
+    plots = [Plot(canvas, *world(u, v), angle, (PLOT_M - STREET_M) / 2 - KERB_M) for v in places for u in places]
+    streets = [(world(p + PLOT_M / 2, 0), angle + math.pi / 2) for p in places]
+    streets += [(world(0, p + PLOT_M / 2), angle) for p in places]
+    strips = [Plot(canvas, *centre, turned, reach) for centre, turned in streets]
+    for strip in strips:
+        _street(strip)
+    for plot in plots:
+        _KINDS[int(generator.integers(len(_KINDS)))](plot)
+    for strip in strips:
+        _traffic(strip)
+    return canvas.textured(), Boxes.of(canvas.corners, canvas.classes)
+
+
+class Canvas:
+    """A scene being drawn, in metres around its centre: the radiance, and the objects on it."""
+
+    def __init__(self, height_px: int, width_px: int, generator: np.random.Generator) -> None:
+        self.generator = generator
+        self.corners: list[tuple[int, int, int, int]] = []
+        self.classes: list[int] = []
+        self._size = width_px, height_px
+        self._image, self._shown = Image.new("F", self._size, GRASS), Image.new("I", self._size, 0)
+        self._draw, self._draw_shown = ImageDraw.Draw(self._image), ImageDraw.Draw(self._shown)
+
+    @property
+    def reach_m(self) -> float:
+        """Half the diagonal: how far from the centre there is something to draw."""
+        return math.hypot(*self._size) * SCENE_GSD_M / 2
+
+    def textured(self) -> np.ndarray:
+        """The radiance (H, W) float32 with the ground's texture."""
+        width, height = self._size
+        return np.asarray(np.asarray(self._image) * texture(height, width, self.generator), np.float32)
+
+    def area(self, points: Sequence[Point], radiance: float) -> None:
+        """Fill a polygon of the ground."""
+        self._draw.polygon([self._pixel(point) for point in points], fill=radiance)
+
+    def line(self, points: Sequence[Point], radiance: float, width_m: float) -> None:
+        """Draw a line on the ground."""
+        width_px = max(round(width_m / SCENE_GSD_M), 1)
+        self._draw.line([self._pixel(point) for point in points], fill=radiance, width=width_px)
+
+    def tree(self, point: Point, radius_m: float) -> None:
+        """Draw a tree, unless an object stands there."""
+        x, y = self._pixel(point)
+        radius = radius_m / SCENE_GSD_M
+        if self._is_free((x - 2 * radius, y - 2 * radius, x + 2 * radius, y + 2 * radius)):
+            tree(self._draw, x, y, radius, self.generator)
+
+    def put(self, kind: int, parts: list[Part], place: Callable[[float, float], Point], height_m: float) -> bool:
+        """Put an object where it lies whole within the scene and clear of others; says whether it found room.
+
+        Args:
+            kind: its class.
+            parts: polygons around (0, 0), the lowest first.
+            place: from there to metres on the canvas.
+            height_m: of the object, as far as its shadow is shifted right and down.
+        """
+        polygons = [([self._pixel(place(*point)) for point in polygon], paint) for polygon, paint in parts]
+        points, shadow_px = np.array([point for polygon, _ in polygons for point in polygon]), height_m / SCENE_GSD_M
+        area = (*(points.min(0) - GAP_PX), *(points.max(0) + GAP_PX + shadow_px))
+        inside = min(area[:2]) >= 0 and area[2] < self._size[0] and area[3] < self._size[1]
+        if not inside or not self._is_free(area):
+            return False
+        for polygon, _ in polygons:
+            self._draw.polygon([shift(point, shadow_px) for point in polygon], fill=SHADOW)
+        self.classes.append(kind)
+        for polygon, paint in polygons:
+            self._draw.polygon(polygon, fill=paint)
+            self._draw_shown.polygon(polygon, fill=len(self.classes))
+        self.corners.append(self._corners_within(area))
+        return True
+
+    def _pixel(self, point: Point) -> Point:
+        return point[0] / SCENE_GSD_M + self._size[0] / 2, point[1] / SCENE_GSD_M + self._size[1] / 2
+
+    def _is_free(self, area: tuple[float, ...]) -> bool:
+        return int(self._shown.crop(_whole(area)).getextrema()[1]) == 0  # type: ignore[arg-type]
+
+    def _corners_within(self, area: tuple[float, ...]) -> tuple[int, int, int, int]:
+        """Of the pixels that the last object has coloured: Pillow's polygons, not their corners, are the truth."""
+        left, top, *_ = whole = _whole(area)
+        shown = np.asarray(self._shown.crop(whole)) == len(self.classes)
+        rows, columns = np.flatnonzero(shown.any(1)), np.flatnonzero(shown.any(0))
+        return left + int(columns[0]), top + int(rows[0]), left + int(columns[-1]) + 1, top + int(rows[-1]) + 1
+
+
+def _whole(area: tuple[float, ...]) -> tuple[int, int, int, int]:
+    left, top, right, bottom = map(math.floor, area)
+    return left, top, right, bottom
+
+
+@dataclass(frozen=True)
+class Plot:
+    """A square of ground, in metres around its centre, turned by `angle` against the canvas."""
+
+    canvas: Canvas
+    x: float
+    y: float
+    angle: float
+    half_m: float
+
+    @property
+    def random(self) -> np.random.Generator:
+        """The canvas's own generator."""
+        return self.canvas.generator
+
+    def rectangle(self, x: float, y: float, width: float, height: float, radiance: float) -> None:
+        """Fill a rectangle of the plot from its corner (x, y)."""
+        corners = [(x, y), (x + width, y), (x + width, y + height), (x, y + height)]
+        self.canvas.area([self.place(*corner) for corner in corners], radiance)
+
+    def pad(self, radiance: float) -> None:
+        """Fill the whole plot."""
+        self.rectangle(-self.half_m, -self.half_m, 2 * self.half_m, 2 * self.half_m, radiance)
+
+    def line(self, start: Point, end: Point, radiance: float, width_m: float) -> None:
+        """Draw a line on the plot."""
+        self.canvas.line([self.place(*start), self.place(*end)], radiance, width_m)
+
+    def tree(self, x: float, y: float) -> None:
+        """Draw a tree of 1.5 to 3.5 m radius."""
+        self.canvas.tree(self.place(x, y), float(self.random.uniform(1.5, 3.5)))
+
+    def put(self, kind: int, parts: list[Part], x: float, y: float, turned: float, height_m: float) -> bool:
+        """Put an object at (x, y), turned against the plot; one that does not fit into the plot is left out."""
+        own = turn(x, y, turned)
+        points = np.array([own(*point) for polygon, _ in parts for point in polygon])
+        if np.abs(points).max() > self.half_m:
+            return False
+        return self.canvas.put(kind, parts, lambda u, v: self.place(*own(u, v)), height_m)
+
+    def scatter(self, count: int, put: Callable[[float, float], bool]) -> None:
+        """Put several objects somewhere on the plot, each where it finds room."""
+        for _ in range(count):
+            any(put(*self.random.uniform(-self.half_m, self.half_m, 2)) for _ in range(TRIES))
+
+    def place(self, x: float, y: float) -> Point:
+        """Metres of the plot to metres of the canvas."""
+        return turn(self.x, self.y, self.angle)(x, y)
+
+
+def vehicle(generator: np.random.Generator) -> list[Part]:
+    """A car, or with 1 in 5 a lorry or bus: the body and, of cars, the windscreen."""
+    paint = float(generator.choice(PAINTS))
+    if generator.random() < 0.2:
+        return [(rectangle(generator.uniform(4, 7), 1.25), paint), (_band(3.0, 3.5, 1.2), 0.5 * paint)]
+    return [
+        (rectangle(generator.uniform(1.9, 2.6), generator.uniform(0.85, 1.0)), paint),
+        (_band(0.4, 1.1, 0.8), 20.0),
+    ]
+
+
+def ship(generator: np.random.Generator) -> list[Part]:
+    """A hull with a bow, its hatches or a long deck, and the bridge astern."""
+    half = 0.5 * math.exp(generator.uniform(math.log(9), math.log(70)))
+    wide, hull = half / generator.uniform(3, 5), float(generator.uniform(50, 160))
+    outline = [
+        (-half, -0.8 * wide),
+        (-0.9 * half, -wide),
+        (0.5 * half, -wide),
+        (0.8 * half, -0.6 * wide),
+        (half, 0.0),
+    ]
+    parts = [(outline + [(x, -y) for x, y in reversed(outline[:-1])], hull)]
+    edges = np.linspace(-0.45, 0.55, int(generator.integers(2, 6))) * half
+    for start, end in pairwise(edges):
+        parts.append((_band(start + 0.04 * half, end, 0.7 * wide), hull * float(generator.uniform(0.4, 1.6))))
+    return [*parts, (_band(-0.85 * half, -0.55 * half, 0.75 * wide), float(generator.uniform(170, 260)))]
+
+
+def aircraft(generator: np.random.Generator) -> list[Part]:
+    """Swept wings, tailplane, engines and, on top, the fuselage."""
+    half, paint = 0.5 * math.exp(generator.uniform(math.log(12), math.log(38))), float(generator.uniform(170, 270))
+    long, sweep = half * generator.uniform(0.9, 1.15), half * generator.uniform(0.15, 0.6)
+    thick, chord = 0.11 * half, 0.32 * half
+    fuselage = [(-long, 0.0), (-0.7 * long, thick), (0.8 * long, thick), (long, 0.0)]
+    parts = [
+        (_swept(0.25 * long, half, chord, sweep), 0.9 * paint),
+        (_swept(-0.75 * long, 0.38 * half, 0.5 * chord, 0.4 * sweep), 0.9 * paint),
+    ]
+    for side in (-0.35 * half, 0.35 * half):
+        engine = _band(0.1 * long, 0.1 * long + 0.8 * chord, 0.06 * half)
+        parts.append(([(x, y + side) for x, y in engine], 0.6 * paint))
+    return [*parts, (fuselage + [(x, -y) for x, y in reversed(fuselage[1:-1])], paint)]
+
+
+def tank(radius_m: float, generator: np.random.Generator) -> list[Part]:
+    """A round tank with a rim and a roof a little darker or brighter, the stair's hatch on it."""
+    paint, angle = float(generator.uniform(110, 250)), float(generator.uniform(0, math.tau))
+    hatch = 0.6 * radius_m * math.cos(angle), 0.6 * radius_m * math.sin(angle)
+    return [
+        (_disc(0.0, 0.0, radius_m), paint),
+        (_disc(0.0, 0.0, 0.88 * radius_m), paint * float(generator.uniform(0.75, 1.1))),
+        (_disc(*hatch, 0.12 * radius_m), 0.6 * paint),
+    ]
+
+
+def _swept(front: float, half_span: float, chord: float, sweep: float) -> list[Point]:
+    """A wing from tip to tip: its leading edge at x = front in the middle, `sweep` further back at the tips."""
+    tip = front - sweep
+    return [
+        (front, 0.0), (tip, half_span), (tip - 0.35 * chord, half_span), (front - chord, 0.0),
+        (tip - 0.35 * chord, -half_span), (tip, -half_span),
+    ]  # fmt: skip
+
+
+def _band(start: float, end: float, half_wide: float) -> list[Point]:
+    return [(start, -half_wide), (end, -half_wide), (end, half_wide), (start, half_wide)]
+
+
+def _disc(x: float, y: float, radius: float, corners: int = 32) -> list[Point]:
+    angles = np.arange(corners) * math.tau / corners
+    return [(x + radius * math.cos(a), y + radius * math.sin(a)) for a in angles]
+
+
+def _street(strip: Plot) -> None:
+    """Asphalt between pavements, dashes in the middle."""
+    reach = strip.half_m
+    strip.rectangle(-reach, -STREET_M / 2 - KERB_M, 2 * reach, STREET_M + 2 * KERB_M, CONCRETE * 0.8)
+    strip.rectangle(-reach, -STREET_M / 2, 2 * reach, STREET_M, ASPHALT)
+    for u in np.arange(-reach, reach, 8.0):
+        strip.line((u, 0.0), (u + 3.4, 0.0), WHITE * 0.7, 0.3)
+
+
+def _traffic(strip: Plot) -> None:
+    for u in strip.random.uniform(-strip.half_m, strip.half_m, int(strip.half_m / 12)):
+        side = float(strip.random.choice([-1, 1]))
+        turned = float(strip.random.normal(0, 0.03)) + (math.pi if side > 0 else 0.0)
+        strip.put(VEHICLE, vehicle(strip.random), float(u), side * 2.3, turned, 0.8)
+
+
+def _harbour(plot: Plot) -> None:
+    """Water, a quay along one side, a pier, and ships beside them or under way."""
+    plot.pad(WATER)
+    half = plot.half_m
+    plot.rectangle(-half, -half, 2 * half, 7.0, CONCRETE)
+    pier = float(plot.random.uniform(-0.4, 0.4)) * half
+    plot.rectangle(pier, -half, 4.0, float(plot.random.uniform(0.4, 1.3)) * half, CONCRETE * 0.8)
+    for _ in range(int(plot.random.integers(0, 6))):
+        plot.put(VEHICLE, vehicle(plot.random), float(plot.random.uniform(-half, half)), 3.5 - half, 0.0, 0.8)
+
+    def sail(x: float, y: float) -> bool:
+        moored, anywhere = plot.random.choice([0, math.pi / 2]), plot.random.uniform(0, math.tau)
+        parts, turned = ship(plot.random), float(plot.random.choice([moored, anywhere]))
+        hull = np.array([turn(x, y, turned)(*point) for point in parts[0][0]])
+        return _is_afloat(hull, plot, pier) and plot.put(SHIP, parts, x, y, turned, 1.5)
+
+    plot.scatter(int(plot.random.integers(3, 14)), sail)
+
+
+def _is_afloat(hull: np.ndarray, plot: Plot, pier: float) -> bool:
+    """Whether a hull (N, 2), in metres of the plot, clears the quay and the pier."""
+    clear_of_pier = hull[:, 0].max() < pier or hull[:, 0].min() > pier + 4
+    return bool(hull[:, 1].min() > 7 - plot.half_m and clear_of_pier)
+
+
+def _apron(plot: Plot) -> None:
+    """Concrete slabs, a taxi line, aircraft parked at any angle, and what serves them."""
+    plot.pad(CONCRETE * float(plot.random.uniform(0.6, 1.0)))
+    half = plot.half_m
+    for position in np.arange(-half, half, 7.5):
+        plot.line((position, -half), (position, half), CONCRETE * 0.65, 0.25)
+        plot.line((-half, position), (half, position), CONCRETE * 0.65, 0.25)
+    bend = float(plot.random.uniform(-0.5, 0.5)) * half
+    plot.line((-half, bend), (half, bend), WHITE * 0.8, 0.3)
+    plot.scatter(
+        int(plot.random.integers(1, 8)),
+        lambda x, y: plot.put(AIRCRAFT, aircraft(plot.random), x, y, float(plot.random.uniform(0, math.tau)), 2.5),
+    )
+    _scatter_vehicles(plot, 5)
+
+
+def _tank_farm(plot: Plot) -> None:
+    """Gravel, bunds around each tank, and tanks of one or two sizes."""
+    plot.pad(SOIL * float(plot.random.uniform(0.8, 1.3)))
+    radius = float(plot.random.uniform(5, 15))
+    step = 2.9 * radius + 3
+    count = int(2 * plot.half_m / step)
+    start = -step * (count - 1) / 2
+    for row in range(count):
+        for column in range(count):
+            x, y = start + step * column, start + step * row
+            for side in (-0.48 * step, 0.48 * step):
+                plot.line((x + side, y - 0.48 * step), (x + side, y + 0.48 * step), CONCRETE, 0.8)
+                plot.line((x - 0.48 * step, y + side), (x + 0.48 * step, y + side), CONCRETE, 0.8)
+            if plot.random.random() < 0.75:
+                own = radius * float(plot.random.choice([1.0, 1.0, 0.6]))
+                plot.put(TANK, tank(own, plot.random), x, y, 0.0, 0.35 * own)
+    _scatter_vehicles(plot, 3)
+
+
+def _car_park(plot: Plot) -> None:
+    """Rows of stalls between lanes, some 60 % taken, a few trees in between."""
+    plot.pad(ASPHALT * float(plot.random.uniform(0.9, 1.6)))
+    half, taken = plot.half_m, float(plot.random.uniform(0.2, 0.9))
+    for y in np.arange(6.0 - half, half - 4, 13.0):
+        for x in np.arange(3.0 - half, half - 3, 2.9):
+            plot.line((x - 1.45, y - 2.6), (x - 1.45, y + 2.6), WHITE * 0.6, 0.25)
+            if plot.random.random() < taken:
+                turned = math.pi / 2 * float(plot.random.choice([-1, 1])) + float(plot.random.normal(0, 0.03))
+                plot.put(VEHICLE, vehicle(plot.random), float(x), float(y), turned, 0.8)
+        if plot.random.random() < 0.5:
+            plot.tree(float(plot.random.uniform(-half, half)), float(y) + 6)
+
+
+def _houses(plot: Plot) -> None:
+    """Gable roofs and flat halls in gardens, trees, a car here and there."""
+    half = plot.half_m
+    for y in np.arange(14.0 - half, half - 8, 24.0):
+        for x in np.arange(12.0 - half, half - 8, 20.0):
+            long, wide = plot.random.uniform(9, 16), plot.random.uniform(7, 11)
+            _house(plot, float(x - long / 2), float(y - wide / 2), float(long), float(wide))
+            plot.tree(float(x + plot.random.uniform(-9, 9)), float(y + 11))
+    _scatter_drives(plot)
+
+
+def _house(plot: Plot, x: float, y: float, long: float, wide: float) -> None:
+    """A roof, one slope in the sun, and its shadow."""
+    bright, shade = float(plot.random.uniform(60, 200)), 2.2
+    corners = [(x, y), (x + long, y), (x + long, y + wide), (x, y + wide)]
+    plot.canvas.area([(px + shade, py + shade) for px, py in (plot.place(*c) for c in corners)], SHADOW)
+    plot.rectangle(x, y, long, wide / 2, bright)
+    plot.rectangle(x, y + wide / 2, long, wide / 2, bright * float(plot.random.choice([0.55, 1.0])))
+
+
+def _scatter_drives(plot: Plot) -> None:
+    """Cars in the gaps between the houses' rows."""
+    for y in np.arange(26.0 - plot.half_m, plot.half_m - 4, 24.0):
+        for x in plot.random.uniform(-plot.half_m, plot.half_m, 3):
+            plot.rectangle(float(x) - 3.5, float(y) - 1.6, 7.0, 3.2, CONCRETE * 0.7)
+            plot.put(VEHICLE, vehicle(plot.random), float(x), float(y), 0.0, 0.8)
+
+
+def _scatter_vehicles(plot: Plot, most: int) -> None:
+    plot.scatter(
+        int(plot.random.integers(0, most + 1)),
+        lambda x, y: plot.put(VEHICLE, vehicle(plot.random), x, y, float(plot.random.uniform(0, math.tau)), 0.8),
+    )
+
+
+def _field(plot: Plot) -> None:
+    """Crop rows, and the trees of a hedge."""
+    base, half = float(plot.random.choice([38, 55, 70, 88])), plot.half_m
+    plot.pad(base)
+    for x in np.arange(-half, half, float(plot.random.uniform(0.8, 2.5))):
+        plot.line((float(x), -half), (float(x), half), base * 0.85, 0.4)
+    for y in plot.random.uniform(-half, half, 12):
+        plot.tree(half - 4, float(y))
+
+
+def _forest(plot: Plot) -> None:
+    """Trees, crown at crown."""
+    for x, y in plot.random.uniform(-plot.half_m, plot.half_m, (260, 2)):
+        plot.tree(float(x), float(y))
+
+
+_KINDS = (_harbour, _harbour, _apron, _apron, _tank_farm, _car_park, _houses, _field, _forest)

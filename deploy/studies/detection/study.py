@@ -1,0 +1,285 @@
+"""What a fixed detector finds on the same scenes: as the reference sensor sees them, degraded, and restored.
+
+scene -> acquisition, whole -> restoration -> one display for all rows, stretched as the reference asks -> detector ->
+boxes back on the scene -> average precision.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property, partial
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from deploy.studies.detection.average_precision import Figures, Hits, find_hits, score_rows, site_weights
+from deploy.studies.detection.boxes import Boxes
+from deploy.studies.detection.detector import Detector, class_numbers
+from deploy.studies.detection.labels import read_labelled
+from deploy.studies.detection.scenes import CLASSES, synthetic_scene
+from deploy.studies.evaluation.methods import DEGRADED, Method, method_named
+from model.io.pictures import Stretch, stretch_of
+from model.progress import Log, no_log, once, steps
+from model.simulator.acquire import acquire_padded
+from model.simulator.detector import Draw
+from model.simulator.sampling import read_scene
+from profiles.sensor import Sensor, SensorProfile
+from profiles.sensor_file import load_sensor, reference_beside
+
+REFERENCE = "reference"
+"""The row of the scenes as the reference sensor sees them."""
+
+SIDE_PX = 768
+"""Of a synthetic scene: 256 pixels a side of a sensor that makes one of three, the input of the embedded detector."""
+
+
+@dataclass(frozen=True)
+class LabelledScene:
+    """A scene, and the objects in it that the detector knows.
+
+    Attributes:
+        name: of the file, or of the synthetic scene.
+        site: where it lies; scenes of one site are alike.
+        truth: labelled boxes in scene pixels, of the detector's classes.
+        path: of the file; None of a synthetic scene.
+        radiance: the scene (H, W) in W/m2/sr/um; a picture's white stands for the full scale of the sensor given.
+    """
+
+    name: str
+    site: str
+    truth: Boxes
+    path: Path | None
+    radiance: Callable[[Sensor], Tensor]
+
+
+@dataclass(frozen=True)
+class SensorPair:
+    """The sensor that degrades, and the one that is aimed at, in its units."""
+
+    degraded: SensorProfile
+    reference: SensorProfile
+
+    @property
+    def oversampling(self) -> int:
+        """Scene pixels per pixel."""
+        return int(self.degraded.oversampling.low)
+
+
+@dataclass(frozen=True)
+class AcquiredScene:
+    """A scene in front of two sensors; nothing is acquired before it is asked for.
+
+    Attributes:
+        scene: what they see.
+        sensors: that acquire it.
+        draw: of the noise, and of the sensors within their profiles.
+    """
+
+    scene: LabelledScene
+    sensors: SensorPair
+    draw: Draw
+
+    @cached_property
+    def reference(self) -> np.ndarray:
+        """Digital numbers (h, w) of the reference sensor."""
+        return self._acquired(self.sensors.reference, REFERENCE)
+
+    @cached_property
+    def degraded(self) -> np.ndarray:
+        """Digital numbers (h, w) of the degraded one."""
+        return self._acquired(self.sensors.degraded, DEGRADED)
+
+    @cached_property
+    def display(self) -> Stretch:
+        """How every row's image of this scene is shown."""
+        return stretch_of(self.reference)
+
+    def shown(self, method: Method | None) -> np.ndarray:
+        """What a detector is given, (h, w, 3) float32 in 0 to 1: restored by a method; the reference for None."""
+        return self.display.to_srgb(self.reference if method is None else method.restore(self.degraded))
+
+    def boxes(self, detector: Detector, method: Method | None) -> Boxes:
+        """What a detector finds on it, in scene pixels; arguments as of `shown`."""
+        found = detector.detect(self.shown(method))
+        return found.at(found.corners * self.sensors.oversampling)
+
+    def _acquired(self, profile: SensorProfile, role: str) -> np.ndarray:
+        sensor, radiance = profile.draw(self.draw.generator("sensor")), self.scene.radiance(profile.nominal())
+        return acquire_padded(radiance, sensor, self.sensors.oversampling, self.draw, role).numpy()
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """What was found under one pair of sensors.
+
+    Attributes:
+        sensors: as they are stated.
+        methods: by the names of the rows; None is the reference, which is first.
+        scenes: in front of the sensors.
+        boxes: that were found on each scene, by row.
+        hits: which of them found an object, by row.
+        figures: by row.
+        confidence: where precision and recall are read in every row.
+        names: of the classes.
+    """
+
+    sensors: SensorPair
+    methods: Mapping[str, Method | None]
+    scenes: Sequence[AcquiredScene]
+    boxes: Mapping[str, Sequence[Boxes]]
+    hits: Mapping[str, Hits]
+    figures: Mapping[str, Figures]
+    confidence: float
+    names: Sequence[str]
+
+    @property
+    def name(self) -> str:
+        """Of the sensor that degrades."""
+        return self.sensors.degraded.name
+
+    @property
+    def sites(self) -> int:
+        """How many different ones there are."""
+        return len({each.scene.site for each in self.scenes})
+
+
+def run_study(
+    detector: Detector,
+    scenes: Sequence[LabelledScene],
+    sensors: Sequence[str],
+    methods: Sequence[str],
+    *,
+    reference: str | None = None,
+    seed: int = 0,
+    say: Log = no_log,
+) -> list[Comparison]:
+    """Show a detector the same scenes as the reference sees them, degraded and restored, under each sensor.
+
+    Args:
+        detector: that is shown the pictures.
+        scenes: labelled.
+        sensors: profiles of degraded images, by name or file.
+        methods: names of the rows besides the reference, the degraded images among them.
+        reference: profile of the reference images; None for the default one.
+        seed: of every random draw.
+        say: is told what a user should know on the way.
+
+    Raises:
+        BeersError: a name, a profile or a picture that cannot be used.
+    """
+    told = once(say)
+    pairs = [_pair(name, reference, told) for name in sensors]
+    rows = [{name: method_named(name, pair.degraded, pair.reference, told) for name in methods} for pair in pairs]
+    return [compare(detector, scenes, *each, seed) for each in zip(pairs, rows, strict=True)]
+
+
+def _pair(name: str, reference: str | None, say: Log) -> SensorPair:
+    degraded = load_sensor(name)
+    return SensorPair(degraded, reference_beside(degraded, reference, say))
+
+
+def compare(
+    detector: Detector,
+    scenes: Sequence[LabelledScene],
+    sensors: SensorPair,
+    methods: Mapping[str, Method | None],
+    seed: int,
+) -> Comparison:
+    """Show a detector every scene in every row, and score what it finds.
+
+    Args:
+        detector: that is shown the pictures.
+        scenes: labelled.
+        sensors: that acquire them.
+        methods: by row; the reference becomes the first one.
+        seed: of acquisitions and intervals.
+    """
+    rows = {REFERENCE: None, **methods}
+    boxes: dict[str, list[Boxes]] = {row: [] for row in rows}
+    with steps(f"detecting, {sensors.degraded.name}", len(scenes) * len(rows)) as bar:
+        for each in acquired(scenes, sensors, seed):  # let go of after its rows: thousands would fill the memory
+            for row, method in rows.items():
+                boxes[row].append(each.boxes(detector, method))
+                bar.advance(1, row)
+    names, truths, sites = detector.names, [scene.truth for scene in scenes], [scene.site for scene in scenes]
+    hits = {row: find_hits(truths, found, len(names)) for row, found in boxes.items()}
+    scores = score_rows(hits, names, site_weights(sites, seed))
+    return Comparison(sensors, rows, list(acquired(scenes, sensors, seed)), boxes, hits, *scores, names)
+
+
+def acquired(scenes: Sequence[LabelledScene], sensors: SensorPair, seed: int) -> "map[AcquiredScene]":
+    """Every scene in front of the sensors, the noise drawn by the seed and the scene's number."""
+    return map(lambda number, scene: AcquiredScene(scene, sensors, Draw(seed, number)), range(len(scenes)), scenes)
+
+
+def synthetic_scenes(
+    count: int, seed: int, names: Sequence[str], given: Mapping[str, str]
+) -> tuple[list[LabelledScene], list[str]]:
+    """The first synthetic scenes of a seed, each a site of its own, and sentences on what they are.
+
+    Args:
+        count: how many; the same scenes however many there are.
+        seed: other for other scenes.
+        names: of the classes that the detector knows.
+        given: of them by synthetic ones, where letters do not match.
+    """
+    numbers = class_numbers(CLASSES, names, given)
+    scenes = []
+    with steps("drawing scenes", count) as bar:
+        for number in range(count):
+            scenes.append(synthetic_labelled(number, seed, numbers))
+            bar.advance()
+    note = f"The {count} scenes are synthetic, each a site of its own: no photographs."
+    return scenes, [note, *left_out(CLASSES, numbers)]
+
+
+def synthetic_labelled(number: int, seed: int, classes: np.ndarray) -> LabelledScene:
+    """The synthetic scene of a number; no two numbers or seeds share a generator.
+
+    Args:
+        number: of the scene.
+        seed: other for other scenes of the same numbers.
+        classes: the synthetic classes as the detector's, as `class_numbers` gives them.
+    """
+    radiance, truth = synthetic_scene(np.random.default_rng([seed, number]), SIDE_PX, SIDE_PX)
+    light, name = torch.from_numpy(radiance), f"synthetic {number}"
+    return LabelledScene(name, name, truth.renamed(classes), None, lambda _: light)
+
+
+def labelled_scenes(
+    names: Sequence[str],
+    given: Mapping[str, str],
+    images: Path,
+    labels: Path | None = None,
+    split: str | None = None,
+) -> tuple[list[LabelledScene], list[str]]:
+    """The labelled pictures of a folder as scenes, read when they are looked at, and sentences on what is left out.
+
+    Args:
+        names: of the classes that the detector knows.
+        given: of them by labelled ones, where letters do not match.
+        images: as `read_labelled` takes it.
+        labels: where they lie, if not beside the pictures.
+        split: which part of a tree.
+
+    Raises:
+        BeersError: pictures or labels that cannot be used, or not one class in common.
+    """
+    labelled = read_labelled(images, labels, split)
+    numbers = class_numbers(labelled.names, names, given)
+    scenes = [
+        LabelledScene(each.path.name, each.site, each.truth.renamed(numbers), each.path, partial(_read, each.path))
+        for each in labelled.images
+    ]
+    return scenes, [*labelled.notes, *left_out(labelled.names, numbers)]
+
+
+def left_out(labelled: Sequence[str], numbers: np.ndarray) -> list[str]:
+    """A sentence on the labelled classes that the detector does not know, where there are such."""
+    names = ", ".join(name for name, number in zip(labelled, numbers, strict=True) if number < 0)
+    return [f"Not known to the detector and left out: {names}. What it finds there counts as false."] if names else []
+
+
+def _read(path: Path, sensor: Sensor) -> Tensor:
+    return read_scene(path, sensor).radiance

@@ -1,0 +1,161 @@
+"""What a detection study found as rows of figures, with the paper's beside."""
+
+from collections.abc import Mapping, Sequence
+from math import isnan
+
+import numpy as np
+
+from deploy.studies.detection.average_precision import DRAWS, SIZES_PX, interval, sites_note
+from deploy.studies.detection.study import REFERENCE, Comparison
+from deploy.studies.evaluation.methods import DEGRADED
+from model.metrics.bootstrap import LEAST_SITES
+from profiles.figures import Figure, Row, measured, published, unavailable
+
+PERCENT, POINTS = "%", "points"
+"""Units: a share, and a difference of two shares."""
+
+MAIN, OWN, BY_CLASS, BY_SIZE = "detection", "each at its own best confidence", "mAP50 by class", "mAP50 by size"
+"""What the names of the tables begin with; the sensor's follows."""
+
+NO_OBJECT = "no object to be found"
+NO_LOSS = "no loss that can be told from 0: the interval of reference less degraded holds it"
+
+GAIN, LOSS, REGAINED = "gain over degraded", "loss to reference", "share of loss regained"
+
+
+def detection_rows(found: Comparison) -> list[Row]:
+    """The tables of one sensor: the answer, each row at its own confidence, by class and by size."""
+    labelled = [name for name in found.names if not isnan(found.figures[REFERENCE][f"mAP50 of {name}"][0])]
+    by_class = {name: f"mAP50 of {name}" for name in labelled}
+    by_size = {name: f"mAP50 {name}" for name in list(SIZES_PX)[1:]}
+    return [
+        *(_main_row(found, row) for row in found.methods),
+        *(_own_row(found, row) for row in found.methods),
+        *(Row(f"{BY_CLASS}, {found.name}", row, _values(found, row, by_class)) for row in found.methods),
+        *(Row(f"{BY_SIZE}, {found.name}", row, _values(found, row, by_size)) for row in found.methods),
+    ]
+
+
+def main_table(sensor: str) -> str:
+    """The name of the table that answers the question for a sensor."""
+    return f"{MAIN}, {sensor}"
+
+
+def _main_row(found: Comparison, row: str) -> Row:
+    """Precision and recall at one confidence for all rows; gains and losses in mAP50, paired by draw."""
+    figures = _values(found, row, {name: name for name in ("mAP50", "mAP50-95", "precision", "recall")})
+    reference, degraded, own = (found.figures[name]["mAP50"] for name in (REFERENCE, DEGRADED, row))
+    method = found.methods[row]
+    words = {"sensor": method.sensor_known} if method else {}
+    if row != REFERENCE:
+        figures[LOSS] = _figure(found, reference - own, POINTS)
+    if row not in (REFERENCE, DEGRADED):
+        figures[GAIN] = _figure(found, own - degraded, POINTS)
+        figures[REGAINED] = _regained(found, own - degraded, reference - degraded)
+        words["against degraded"] = verdict(own - degraded, found.sites)
+    return Row(main_table(found.name), row, figures, words)
+
+
+def verdict(difference: np.ndarray, sites: int) -> str:
+    """What a paired difference (1 + draws,) over so many sites says: one whose interval holds 0 is none."""
+    ends = interval(difference, sites)
+    if ends is None:
+        return "not known: no interval"
+    if ends[0] <= 0 <= ends[1]:
+        return "no difference: the interval holds 0"
+    return "a gain" if difference[0] > 0 else "a loss"
+
+
+def _regained(found: Comparison, gain: np.ndarray, loss: np.ndarray) -> Figure:
+    """The share of a loss that a gain makes good; unavailable where the loss cannot be told from 0."""
+    if found.sites < LEAST_SITES:
+        return unavailable(PERCENT, sites_note(found.sites))
+    if verdict(loss, found.sites) not in ("a gain", "a loss"):
+        return unavailable(PERCENT, NO_LOSS)
+    return _figure(found, np.divide(gain, loss, out=np.full(gain.shape, np.nan), where=loss != 0))
+
+
+def _own_row(found: Comparison, row: str) -> Row:
+    figures = _values(found, row, {"precision": "own precision", "recall": "own recall"})
+    own = float(found.figures[row]["own confidence"][0])
+    known = unavailable("ratio", NO_OBJECT) if isnan(own) else measured(own, "ratio", "largest mean F1")
+    return Row(f"{OWN}, {found.name}", row, {**figures, "confidence": known})
+
+
+def _values(found: Comparison, row: str, keys: Mapping[str, str]) -> dict[str, Figure]:
+    """Figures of a row by the names that are shown."""
+    return {shown: _figure(found, found.figures[row][key]) for shown, key in keys.items()}
+
+
+def _figure(found: Comparison, values: np.ndarray, unit: str = PERCENT) -> Figure:
+    return share_figure(values, len(found.scenes), found.sites, unit)
+
+
+def share_figure(values: np.ndarray, images: int, sites: int, unit: str = PERCENT) -> Figure:
+    """A share of 0 to 1, or a difference of shares, times 100; with its interval where there are sites enough.
+
+    Args:
+        values: (1 + draws,) on all images, then on each draw.
+        images: how many.
+        sites: how many different ones they show.
+        unit: percent or points.
+    """
+    if isnan(values[0]):
+        return unavailable(unit, NO_OBJECT)
+    source, ends = f"{images} images of {sites} sites", interval(values, sites)
+    if ends is None:
+        return measured(100 * float(values[0]), unit, source)
+    source = f"{source}, 95 % bootstrap interval over sites ({DRAWS} draws)"
+    return measured(100 * float(values[0]), unit, source, (100 * ends[0], 100 * ends[1]))
+
+
+PAPER_TABLE = "the paper's detection"
+SOURCE = "ConvBEERS paper, table on DIOR"
+DIFFERS = "one YOLOv11n retrained for each row; DIOR, a split of its own"
+PAPER = {
+    "paper: reference": (75.90, 54.10, 86.60, 69.30),
+    "paper: degraded, medium": (73.33, 51.5, 85.00, 66.93),
+    "paper: restored, medium": (75.52, 53.88, 87.47, 68.32),
+    "paper: degraded, high": (67.30, 46.29, 63.80, 60.70),
+    "paper: restored, high": (72.37, 50.57, 85.03, 66.36),
+}
+"""mAP50, what it calls mAP90, precision and recall, in %."""
+
+
+def paper_rows() -> list[Row]:
+    """The paper's table as printed, with what differs."""
+    keys = ("mAP50", "mAP90 (sic)", "precision", "recall")
+    return [
+        Row(
+            PAPER_TABLE,
+            name,
+            {key: published(value, PERCENT, SOURCE) for key, value in zip(keys, values, strict=True)},
+            {"what differs": DIFFERS},
+        )
+        for name, values in PAPER.items()
+    ]
+
+
+PAPER_NOTES = (
+    "The paper retrains its detector for each row; here one detector is shown all of them: another question.",
+    "The paper's split of DIOR is its own, of one run each, and no interval is given.",
+    "mAP90 (sic): the paper does not define it. At 0.69 to 0.71 of mAP50 in all rows it is likely mAP50-95.",
+    "The paper's precision of 63.80 is doubtful: F1 is 5.1 points below mAP50 there, elsewhere 1.1 to 2.2 above.",
+)
+
+
+def headline(compared: Sequence[Comparison]) -> str:
+    """A sentence a sensor: what was lost, and what the last of the methods brought back."""
+    return " ".join(_sentence(found) for found in compared)
+
+
+def _sentence(found: Comparison) -> str:
+    rows = {row.name: row for row in detection_rows(found) if row.table == main_table(found.name)}
+    text = f"{found.name}: mAP50 is {rows[REFERENCE].figures['mAP50']} % on reference images"
+    text += f" and {rows[DEGRADED].figures[LOSS]} points less on degraded ones"
+    last = list(rows.values())[-1]
+    if GAIN in last.figures:
+        share = last.figures[REGAINED]
+        text += f"; {last.name} changes it by {last.figures[GAIN]} points ({last.text['against degraded']}"
+        text += f", {share} % of the loss regained)" if share.value is not None else ")"
+    return f"{text} (measured)."

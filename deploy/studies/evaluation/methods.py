@@ -1,0 +1,169 @@
+"""The methods that can be compared, by name, and what each of them knows of the sensor.
+
+They are the input itself, the traditional pipeline in both orders and three qualities, other libraries' ways, and
+networks.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import onnx
+import torch
+
+from deploy.export import float_model
+from deploy.networks import conditioned, network_file, warn_outside
+from deploy.restoration.function import Restore, network_method
+from model.progress import Log, no_log
+from model.shipped import INT8, shipped_names
+from model.traditional.peers import PEERS
+from model.traditional.pipeline import Chain, Order, restore_traditional
+from model.traditional.settings import QUALITIES
+from profiles.constant import Constant
+from profiles.errors import OptionError
+from profiles.sensor import Sensor, SensorProfile
+from profiles.sensor_file import BLIND as NOT_KNOWN
+from profiles.sensor_file import BLIND_PROFILE, load_sensor
+from quant.onnx_file import metadata
+
+Specialise = Callable[[Sensor], Restore]
+"""A sensor to the restoration of images that it acquired."""
+
+DEGRADED, TRADITIONAL, DECONVOLVE_FIRST = "degraded", "traditional", "deconvolve-first"
+
+ORDERS: dict[str, Order] = {TRADITIONAL: "denoise-first", DECONVOLVE_FIRST: "deconvolve-first"}
+STANDARD = "standard"
+CHAINS: dict[str, tuple[str, Order]] = {
+    **{f"{name}-{quality}": (quality, order) for name, order in ORDERS.items() for quality in QUALITIES},
+    **{name: (STANDARD, order) for name, order in ORDERS.items()},
+}
+"""Quality and order of each traditional chain, by name."""
+
+KNOWN, BLIND = "known", "blind"
+"""What a method knows of the sensor."""
+
+
+@dataclass(frozen=True)
+class Method:
+    """A restoration with the name it is listed under, and what it knows of the sensor.
+
+    Attributes:
+        name: in tables.
+        restore: what it does.
+        sensor_known: what it knows of the sensor when it does so, in words.
+        specialise: how it restores when it knows another sensor; None where what it does depends on none.
+    """
+
+    name: str
+    restore: Restore
+    sensor_known: str
+    specialise: Specialise | None = None
+
+    def knowing(self, sensor: Sensor) -> "Method":
+        """This method with that sensor known; itself where what it does depends on none."""
+        if self.specialise is None:
+            return self
+        return replace(self, restore=self.specialise(sensor), sensor_known=KNOWN)
+
+
+def method_without_network(name: str, degraded: Sensor, reference: Sensor) -> Method | None:
+    """The input itself, or a traditional chain or a peer of it, which know both sensors; None for any other name.
+
+    Raises:
+        MachineError: a peer whose library is not installed.
+    """
+    if name == DEGRADED:
+        return Method(name, lambda dn: dn, "the input itself")
+    specialise = _pipeline_specialise(name, reference)
+    return None if specialise is None else Method(name, specialise(degraded), KNOWN, specialise)
+
+
+def _pipeline_specialise(name: str, reference: Sensor) -> Specialise | None:
+    """How a chain or a peer of that name restores for a sensor, to the reference in that sensor's units."""
+    if name not in (*CHAINS, *PEERS):
+        return None
+    quality, order = CHAINS.get(name, (STANDARD, "denoise-first"))
+    run = PEERS.get(name, restore_traditional)
+
+    def specialise(sensor: Sensor) -> Restore:
+        chain = Chain(sensor, reference.in_units_of(sensor), quality, order)
+        return lambda dn: run(torch.from_numpy(dn), chain).numpy()
+
+    return specialise
+
+
+EXPECTED = (
+    f"degraded, {TRADITIONAL}, {DECONVOLVE_FIRST} (each also with -fast or -best), {', '.join(PEERS)}, "
+    f"a shipped network ({', '.join(shipped_names())}, each also with -int8, and with @SENSOR or @blind to know "
+    "another), or an ONNX or safetensors file"
+)
+
+DRAWN = "drawn"
+"""What a sensor is called that no profile states."""
+
+AT = "@"
+"""Between a network's name and the sensor that it is to know in the place of the images' own."""
+
+
+def method_named(name: str, degraded: SensorProfile, reference: SensorProfile, log: Log = no_log) -> Method:
+    """The method of that name; the traditional ones know both sensors, a shipped network the degraded one.
+
+    Args:
+        name: as in EXPECTED.
+        degraded: the sensor of the images.
+        reference: the one that is aimed at.
+        log: is told what of the sensor lies outside the range that a network was trained for.
+
+    Raises:
+        OptionError: no such method.
+        ModelError: a file that is no network.
+        ProfileError: no such sensor behind an @.
+        MachineError: a peer whose library is not installed.
+    """
+    plain = method_without_network(name, degraded.nominal(), reference.nominal())
+    if plain is not None:
+        return plain
+    network, _, other = name.partition(AT)
+    if not _is_network(network):
+        raise OptionError("--methods", expected=EXPECTED, got=repr(name), remedy="correct that name")
+    sensor = load_sensor(other) if other else degraded
+    model = float_model(network_file(Path(network), sensor, log))
+    known = knowledge_of(model, degraded.name)
+    specialise = None if other else _network_specialise(network, degraded, log)
+    return Method(name, network_method(model, degraded.nominal().max_dn), known, specialise)
+
+
+def _network_specialise(name: str, like: SensorProfile, log: Log) -> Specialise | None:
+    """A conditioned network told any sensor in the grid of a profile; None of a network that is plain."""
+    found = conditioned(Path(name))
+    if found is None:
+        return None
+
+    def specialise(sensor: Sensor) -> Restore:
+        known = profile_of(sensor, like)
+        warn_outside(known, log)
+        return network_method(found.model(known, name.endswith(INT8)), sensor.max_dn)
+
+    return specialise
+
+
+def _is_network(name: str) -> bool:
+    return Path(name).suffix in (".onnx", ".safetensors") or name.removesuffix(INT8) in shipped_names()
+
+
+def knowledge_of(model: onnx.ModelProto, sensor_name: str) -> str:
+    """What a network knows of the sensor of that name: it, nothing, or another one."""
+    own = metadata(model).get("sensor", "")
+    if own in ("", NOT_KNOWN, BLIND_PROFILE):
+        return BLIND
+    return KNOWN if own == sensor_name else f"another: {own}"
+
+
+def profile_of(sensor: Sensor, like: SensorProfile) -> SensorProfile:
+    """A profile of which every draw is that sensor, in the grid of another profile."""
+    across, along = sensor.mtf_axes
+    numbers = {"mtf_nyquist": across, "mtf_nyquist_along": along, "alpha": sensor.alpha, "beta": sensor.beta}
+    numbers |= {"gain_dn_per_radiance": sensor.gain_dn_per_radiance, "bits": float(sensor.bits)}
+    constants = {name: Constant(value, "assumed", "a sensor drawn") for name, value in numbers.items()}
+    noise = {"snr_0": None, "snr_1": None}
+    return replace(like, name=DRAWN, **constants, **noise, response=sensor.response)  # type: ignore[arg-type]

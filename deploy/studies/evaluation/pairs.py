@@ -1,0 +1,153 @@
+"""Pairs of a degraded and a reference image: simulated from scenes, or read from a folder that `simulate` wrote."""
+
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+
+from model.io.images import MAX_DN, read_acquisition, site_of
+from model.recipe import PairsRecipe
+from model.simulator.acquire import (
+    LEAST_SIDE_PX,
+    MARGIN_PX,
+    NOISE,
+    acquire,
+    fitting_oversampling,
+    prepare_scene,
+)
+from model.simulator.detector import Draw
+from model.simulator.sampling import Scene
+from model.training.patches import pair_files
+from profiles.errors import ImageError
+from profiles.sensor import Sensor, SensorProfile
+
+OVERSAMPLINGS = (4, 2)
+
+
+class SensorSource(Protocol):
+    """What gives a sensor for each scene: a profile, or always the same one."""
+
+    def draw(self, generator: np.random.Generator, /) -> Sensor:
+        """One sensor."""
+        ...
+
+
+@dataclass(frozen=True)
+class NamedPair:
+    """Two acquisitions of one scene, (H, W) float32 digital numbers of the same units, and the scene's name.
+
+    Attributes:
+        place: its site, where one is known by more than the name.
+        oversampling: scene pixels per pixel, where the pair was simulated here.
+        noise_free: the reference without noise and rounding, (H, W) float32, where the pair was simulated here.
+    """
+
+    name: str
+    degraded: np.ndarray
+    reference: np.ndarray
+    place: str | None = None
+    oversampling: int | None = None
+    noise_free: np.ndarray | None = None
+
+    @property
+    def site(self) -> str:
+        """The place that is known; else the name without what tells frames of one site apart."""
+        return self.place or site_of(self.name)
+
+
+def simulate_pairs(
+    scenes: list[Scene],
+    degraded: SensorSource,
+    reference: SensorSource,
+    seed: int,
+    oversamplings: Sequence[int] = OVERSAMPLINGS,
+) -> tuple[list[NamedPair], list[str]]:
+    """Simulate a pair of each scene, at the first of the oversamplings that leaves enough of it.
+
+    Returns:
+        The pairs, and the names of scenes too small to use.
+
+    Raises:
+        ImageError: all are too small.
+    """
+    pairs, small = [], []
+    for number, scene in enumerate(scenes):
+        ratio = fitting_oversampling(scene.radiance, oversamplings, LEAST_SIDE_PX)
+        if ratio is None:
+            small.append(scene.name)
+            continue
+        draw = Draw(seed, number)
+        drawn = [profile.draw(draw.generator("sensor")) for profile in (degraded, reference)]
+        pairs.append(_simulated(scene, drawn[0], drawn[1], ratio, draw))
+    if not pairs:
+        least = oversamplings[-1] * (2 * MARGIN_PX + LEAST_SIDE_PX)
+        raise ImageError(
+            "images",
+            expected=f"scenes of {least} pixels a side or more",
+            got=f"{len(small)} smaller ones",
+            remedy="give larger images",
+        )
+    return pairs, small
+
+
+def _simulated(scene: Scene, degraded: Sensor, reference: Sensor, ratio: int, draw: Draw) -> NamedPair:
+    """Three acquisitions of one scene: the pair, and the reference once more without its noise."""
+    prepared = prepare_scene(scene.radiance, ratio)
+    spectrum, width = prepared.spectrum, prepared.radiance.shape[-1]
+    seen, meant, clean = (
+        acquire(spectrum, width, sensor, ratio, draw, role, skip=skip).numpy()
+        for sensor, role, skip in (
+            (degraded, "degraded", ()),
+            (reference, "reference", ()),
+            (reference, "reference", NOISE),
+        )
+    )
+    return NamedPair(scene.name, seen, meant, oversampling=ratio, noise_free=clean)
+
+
+def oversamplings_of(profile: SensorProfile) -> tuple[int, ...]:
+    """The profile's oversampling, though no more than 4, and 2 for scenes too small for it.
+
+    At more than 4 little would be left of a photograph, and the blur is sampled finely enough at 4.
+    """
+    own = int(profile.oversampling.low)
+    return tuple(dict.fromkeys(min(own, ratio) for ratio in OVERSAMPLINGS))
+
+
+def oversampling_note(pairs: Sequence[NamedPair], profile: SensorProfile) -> str:
+    """A sentence where pairs were simulated at another oversampling than the profile's; else nothing."""
+    own = int(profile.oversampling.low)
+    counts = Counter(pair.oversampling for pair in pairs if pair.oversampling is not None)
+    if not set(counts) - {own}:
+        return ""
+    used = " and ".join(f"{ratio} ({count} of {len(pairs)} images)" for ratio, count in sorted(counts.items())[::-1])
+    return (
+        f"scene pixels per pixel: {used}, where {profile.name} states {own}; at most {OVERSAMPLINGS[0]} are taken, "
+        f"and {OVERSAMPLINGS[1]} of small images ('simulate' keeps the profile's)"
+    )
+
+
+def read_pairs(folder: Path, max_dn: int = MAX_DN, recipe: PairsRecipe | None = None) -> list[NamedPair]:
+    """Read FOLDER/degraded/NAME.tif beside FOLDER/reference/NAME.tif, mono images of 0 to max_dn.
+
+    With the recipe beside them, the sites are those of the scenes that it names.
+
+    Raises:
+        ImageError: a folder is missing, a name has no partner, or two images differ in size.
+    """
+    return list(_read_pairs(folder, max_dn, recipe))
+
+
+def _read_pairs(folder: Path, max_dn: int, recipe: PairsRecipe | None) -> Iterator[NamedPair]:
+    for degraded, reference in pair_files(folder):
+        seen, meant = (read_acquisition(path, max_dn=max_dn) for path in (degraded, reference))
+        pair = NamedPair(degraded.stem, seen, meant, recipe.site(degraded.stem) if recipe else None)
+        if pair.degraded.shape != pair.reference.shape:
+            sizes = " and ".join(f"{a.shape[1]} x {a.shape[0]}" for a in (pair.degraded, pair.reference))
+            raise ImageError(
+                f"pair {pair.name}", expected="two images of one size", got=sizes, remedy="crop them alike"
+            )
+        yield pair

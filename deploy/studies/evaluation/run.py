@@ -1,0 +1,153 @@
+"""An evaluation from names and folders to rows and a report: what `beers-deploy evaluate` does behind its options."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from deploy.report.page import write_report
+from deploy.studies.evaluation.methods import Method, method_named
+from deploy.studies.evaluation.page import evaluation_report, pictures
+from deploy.studies.evaluation.pairs import (
+    NamedPair,
+    oversampling_note,
+    oversamplings_of,
+    read_pairs,
+    simulate_pairs,
+)
+from deploy.studies.evaluation.scores import Instruments, paper_rows, perceptual_distances, score, site_rows
+from deploy.studies.evaluation.sweep import sweep_tables
+from deploy.studies.evaluation.targets import acquire_targets, target_figures
+from model.io.images import list_images
+from model.metrics.bootstrap import LEAST_SITES
+from model.progress import once, steps
+from model.recipe import PairsRecipe, profiles_for, read_pairs_recipe
+from model.simulator.procedural import load_scenes
+from profiles.figures import Row
+from profiles.sensor import SensorProfile
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """What an evaluation found.
+
+    Attributes:
+        sensors: profiles of the degraded and of the reference images.
+        methods: as they were run.
+        pairs: that they were run on.
+        mean: a row a method, and the paper's.
+        sites: a row a site.
+        images: a row a method and image.
+        swept: rows of the sweep, where one was asked for.
+        small: names of scenes that were too small to use.
+    """
+
+    sensors: tuple[SensorProfile, SensorProfile]
+    methods: Sequence[Method]
+    pairs: Sequence[NamedPair]
+    mean: Sequence[Row]
+    sites: Sequence[Row]
+    images: Sequence[Row]
+    swept: Sequence[Row]
+    small: Sequence[str]
+
+    @property
+    def rows(self) -> tuple[Row, ...]:
+        """All rows: means, sites, images, the sweep."""
+        return (*self.mean, *self.sites, *self.images, *self.swept)
+
+    @property
+    def title(self) -> str:
+        """The two sensors, and how many images."""
+        degraded, reference = self.sensors
+        return f"{degraded.name} -> {reference.name}, {len(self.pairs)} image{'' if len(self.pairs) == 1 else 's'}"
+
+    @property
+    def sampling(self) -> str:
+        """A sentence where pairs were simulated at another oversampling than the profile's; else nothing."""
+        return oversampling_note(self.pairs, self.sensors[0])
+
+    @property
+    def notes(self) -> list[str]:
+        """What a reader of the tables must know."""
+        sites = len({pair.site for pair in self.pairs})
+        few = f"no interval over sites is shown: of {sites}, fewer than {LEAST_SITES}, none could be trusted"
+        left_out = f"left out, too small: {', '.join(self.small)}"
+        said = ((few, sites < LEAST_SITES), (self.sampling, bool(self.sampling)), (left_out, bool(self.small)))
+        return [note for note, holds in said if holds]
+
+    def write(self, out: Path) -> Path:
+        """Write report.html and the strips of pictures into a folder; returns the report's path."""
+        strips, page = pictures(self.pairs, self.methods, out), out / "report.html"
+        tables = self.mean, self.sites, self.swept
+        write_report(evaluation_report(self.title, *tables, strips, self.sampling), page)
+        return page
+
+
+def load_pairs(
+    images: Path | None,
+    pairs: Path | None,
+    degraded: SensorProfile,
+    reference: SensorProfile,
+    seed: int,
+    recipe: PairsRecipe | None = None,
+) -> tuple[list[NamedPair], list[str]]:
+    """Pairs from a folder of pairs, from a folder of scenes, or from drawn scenes; and scenes too small to use."""
+    if pairs is not None:
+        return read_pairs(pairs, degraded.nominal().max_dn, recipe), []
+    scenes = load_scenes(images, reference.nominal(), seed)
+    return simulate_pairs(scenes, degraded, reference, seed, oversamplings_of(degraded))
+
+
+def input_files(
+    methods: Sequence[str], images: Path | None, pairs: Path | None, lpips: Path | None
+) -> tuple[Path, ...]:
+    """The files that an evaluation's figures rest on: models, scenes or pairs, weights of LPIPS."""
+    named = [path for path in (*map(Path, methods), *([lpips] if lpips else [])) if path.is_file()]
+    folders = [images] if images else [pairs / role for role in ("degraded", "reference")] if pairs else []
+    return (*named, *(path for folder in folders for path in list_images(folder)))
+
+
+def run_evaluation(
+    names: Sequence[str],
+    *,
+    images: Path | None = None,
+    pairs: Path | None = None,
+    sensor: str | None = None,
+    reference: str | None = None,
+    lpips: Path | None = None,
+    sweep: bool = False,
+    seed: int = 0,
+    say: Callable[[str], None],
+) -> Evaluation:
+    """Score every method on the same pairs and targets.
+
+    Args:
+        names: of the methods, the degraded input first.
+        images: folder of scenes to simulate pairs from; None for drawn ones.
+        pairs: folder of pairs instead.
+        sensor: profile of the degraded images, by name or file; None for the pairs' own, or the default one.
+        reference: profile of the reference images, likewise.
+        lpips: weights of SqueezeNet 1.1, or a folder of backbones; None asks the environment.
+        sweep: whether other blurs, noises and gains are looked at too.
+        seed: of every random draw.
+        say: is told where a reference profile is taken in other units than it states.
+
+    Raises:
+        BeersError: a name, a file or a folder that is not what it should be.
+    """
+    recipe = read_pairs_recipe(pairs) if pairs is not None else None
+    sensors = profiles_for(sensor, reference, recipe, say)
+    degraded = sensors[0].nominal()
+    told = once(say)
+    methods = [method_named(name, *sensors, told) for name in names]
+    instruments = Instruments(perceptual_distances(lpips), degraded.max_dn)
+    loaded, small = load_pairs(images, pairs, *sensors, seed, recipe)
+    mean, rows = [], list[Row]()
+    targets = acquire_targets(degraded, seed)
+    for method in methods:
+        with steps(method.name, len(loaded)) as bar:
+            scored, *each = score(method, loaded, instruments, seed, bar.advance)
+        mean.append(replace(scored, figures={**scored.figures, **target_figures(method, targets)}))
+        rows += each
+    swept = sweep_tables(methods, images, *sensors, seed) if sweep else ()
+    return Evaluation(sensors, methods, loaded, [*mean, *paper_rows()], site_rows(rows), rows, swept, small)

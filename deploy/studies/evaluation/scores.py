@@ -1,0 +1,187 @@
+"""Scores of one method on the pairs, as rows: an image each, and the mean with its interval."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from deploy.studies.evaluation.methods import Method
+from deploy.studies.evaluation.pairs import NamedPair
+from deploy.studies.evaluation.targets import RADIANCES, snr_name
+from model.io.images import MAX_DN
+from model.metrics.backbones import find_backbone, not_found
+from model.metrics.bootstrap import site_interval
+from model.metrics.fidelity import fidelity_db, ssim
+from model.metrics.perceptual import Dists, Lpips
+from profiles.figures import Figure, Row, measured, published, unavailable
+
+Perceptual = Callable[[np.ndarray, np.ndarray], float]
+"""Distance of two images (H, W) in [0, 1] of full scale."""
+
+
+def perceptual_distances(place: Path | None) -> dict[str, Perceptual | str]:
+    """LPIPS-squeeze or the reason why not, and LPIPS-alex, LPIPS-vgg and DISTS where their backbones are found.
+
+    Args:
+        place: a file with SqueezeNet 1.1, or a folder with any of the backbones; None asks the environment.
+
+    Raises:
+        ModelError: a file that is missing or holds something else.
+    """
+    found: dict[str, Perceptual | str] = {"LPIPS-squeeze": not_found("squeeze")}
+    for network in ("squeeze", "alex", "vgg"):
+        if network != "squeeze" and place is not None and not place.is_dir():
+            break
+        file = find_backbone(network, place)
+        if file is None:
+            continue
+        found[f"LPIPS-{network}"] = _distance(Lpips.load(network, file))
+        if network == "vgg":
+            found["DISTS"] = _distance(Dists.load(file))
+    return found
+
+
+def _distance(metric: Lpips | Dists) -> Perceptual:
+    def distance(image: np.ndarray, reference: np.ndarray) -> float:
+        both = [torch.from_numpy(np.asarray(a, np.float32))[None, None] for a in (image, reference)]
+        with torch.inference_mode():
+            return float(metric(*both))
+
+    return distance
+
+
+DISTANCE = "distance"
+NOISE_FREE = "PSNR, reference without noise"
+UNITS = {"PSNR": "dB", "PSNR gain": "dB", NOISE_FREE: "dB", "SSIM": "ratio"}
+READ = "pairs read from files hold no reference without noise"
+IDENTICAL = "infinite: identical to the reference"
+
+
+@dataclass(frozen=True)
+class Instruments:
+    """What images are measured with.
+
+    Attributes:
+        perceptual: distances by name besides PSNR and SSIM, each or the reason why not.
+        max_dn: the digital number that is full scale.
+    """
+
+    perceptual: Mapping[str, Perceptual | str]
+    max_dn: int = MAX_DN
+
+    def score(self, dn: np.ndarray, reference: np.ndarray, degraded: np.ndarray) -> dict[str, float | None]:
+        """The figures of one restored image, (H, W) digital numbers each."""
+        psnr, before = (fidelity_db(image, reference, degraded, self.max_dn) for image in (dn, degraded))
+        scores: dict[str, float | None] = {"PSNR": psnr, "PSNR gain": psnr - before if psnr != before else 0.0}
+        scores["SSIM"] = ssim(dn, reference, self.max_dn)
+        for name, distance in self.perceptual.items():
+            both = dn / self.max_dn, reference / self.max_dn
+            scores[name] = None if isinstance(distance, str) else distance(*both)
+        return scores
+
+    def score_pair(self, dn: np.ndarray, pair: NamedPair) -> dict[str, float | None]:
+        """The figures of one restored image of a pair, and its PSNR against the reference without noise."""
+        clean = pair.noise_free
+        psnr = None if clean is None else fidelity_db(dn, clean, pair.degraded, self.max_dn)
+        scores = self.score(dn, pair.reference, pair.degraded)
+        return {"PSNR": scores["PSNR"], NOISE_FREE: psnr, **scores}
+
+    def figure(
+        self, key: str, value: float | None, source: str, interval: tuple[float, float] | None = None
+    ) -> Figure:
+        """A score as a figure; unavailable with the reason where there is none."""
+        unit = UNITS.get(key, DISTANCE)
+        if value is None:
+            return unavailable(unit, READ if key == NOISE_FREE else str(self.perceptual[key]))
+        return measured(value, unit, source, interval) if np.isfinite(value) else unavailable(unit, IDENTICAL)
+
+
+def score(
+    method: Method, pairs: Sequence[NamedPair], instruments: Instruments, seed: int, tick: Callable[[], None]
+) -> list[Row]:
+    """The mean row of a method, then one row an image."""
+    rows, scores = [], []
+    for pair in pairs:
+        values = instruments.score_pair(method.restore(pair.degraded), pair)
+        figures = {key: instruments.figure(key, value, "one pair") for key, value in values.items()}
+        rows.append(Row("images", f"{method.name}: {pair.name}", figures, {"site": pair.site}))
+        scores.append(values)
+        tick()
+    return [mean_row(method, scores, [pair.site for pair in pairs], instruments, seed), *rows]
+
+
+def mean_row(
+    method: Method,
+    scores: Sequence[dict[str, float | None]],
+    sites: Sequence[str],
+    instruments: Instruments,
+    seed: int,
+) -> Row:
+    """The mean of each score over the images that have it, with the bootstrap interval."""
+    figures = {}
+    for key in scores[0]:
+        usable = [
+            (v, site) for s, site in zip(scores, sites, strict=True) if (v := s[key]) is not None and np.isfinite(v)
+        ]
+        if not usable:
+            figures[key] = instruments.figure(key, scores[0][key], "")
+            continue
+        values, places = zip(*usable, strict=True)
+        interval, words = site_interval(values, places, np.random.default_rng(seed))
+        source = f"mean of {len(values)} pairs from {len(set(places))} sites, {words}"
+        figures[key] = instruments.figure(key, float(np.mean(values)), source, interval)
+    return Row("mean", method.name, figures, {"sensor": method.sensor_known})
+
+
+def site_rows(rows: Sequence[Row]) -> list[Row]:
+    """PSNR, SSIM and what other scores there are, by site: a row a site, a column a method."""
+    images = [row for row in rows if row.table == "images"]
+    keys = [key for key in images[0].figures if key != "PSNR gain" and any(row.figures[key].value for row in images)]
+    sites = list(dict.fromkeys(row.text["site"] for row in images))
+    return [
+        _site_row(key, site, [row for row in images if row.text["site"] == site]) for key in keys for site in sites
+    ]
+
+
+def _site_row(key: str, site: str, images: Sequence[Row]) -> Row:
+    figures: dict[str, Figure] = {}
+    for method in dict.fromkeys(row.name.split(": ")[0] for row in images):
+        here = [row.figures[key] for row in images if row.name.startswith(f"{method}: ")]
+        values = [figure.value for figure in here if figure.value is not None]
+        source = f"mean {key} of {len(values)} pairs"
+        figures[method] = measured(float(np.mean(values)), here[0].unit, source) if values else here[0]
+    return Row(f"{key} by site", site, figures, {"images": str(len(here))})
+
+
+SOURCE = "ConvBEERS paper, table on its simulated test set"
+NOTE = "another test set: does not compare"
+
+
+def paper_rows() -> list[Row]:
+    """The paper's traditional pipeline and its network."""
+    return [
+        _row("paper: traditional", 20.6, 0.843, (0.216, 0.220), None, (65.33, 138.51)),
+        _row("paper: ConvBEERS", 27.5, 0.932, (0.068, 0.077), 20.0, (66.27, 156.07)),
+    ]
+
+
+def _row(
+    name: str,
+    psnr: float,
+    ssim: float,
+    distances: tuple[float, float],
+    mtf: float | None,
+    snr: tuple[float, float],
+) -> Row:
+    sharpness = unavailable("%", "the paper: did not converge") if mtf is None else published(mtf, "%", SOURCE)
+    figures = {
+        "PSNR": published(psnr, "dB", SOURCE),
+        "SSIM": published(ssim, "ratio", SOURCE),
+        "LPIPS, network not stated": published(distances[0], "distance", SOURCE),
+        "DISTS": published(distances[1], "distance", SOURCE),
+        "MTF at Nyquist": sharpness,
+        **{snr_name(r): published(value, "ratio", SOURCE) for r, value in zip(RADIANCES, snr, strict=True)},
+    }
+    return Row("mean", name, figures, {"sensor": NOTE})

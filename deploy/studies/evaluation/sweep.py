@@ -1,0 +1,270 @@
+"""The sweep: the same methods under sensors of other blur, noise and gain, each known as it is, or known wrongly.
+
+Its tables: PSNR, MTF, the gain over the traditional pipeline, and what a wrongly known sensor costs.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from deploy.studies.evaluation.methods import DEGRADED, TRADITIONAL, Method, method_without_network
+from deploy.studies.evaluation.pairs import NamedPair, oversamplings_of, simulate_pairs
+from deploy.studies.evaluation.scores import NOISE_FREE
+from deploy.studies.evaluation.targets import acquire_targets, mtf_figure, restored_mtfs
+from model.io.images import site_of
+from model.metrics.bootstrap import site_interval
+from model.metrics.fidelity import fidelity_db
+from model.progress import steps
+from model.simulator.procedural import load_scenes
+from model.simulator.sampling import Scene
+from profiles.figures import Figure, Row, measured
+from profiles.sensor import Sensor, SensorProfile, noise_from_snr
+
+NOMINAL = "nominal"
+SHARPNESS = (0.10, 0.07, 0.05, 0.03, 0.02)
+NOISE = ((15.0, 50.0), (25.0, 55.0), (30.0, 80.0), (70.0, 150.0), (90.0, 190.0))
+"""SNR at 25 and 100 W/m2/sr/um; the nominal 50 / 110 is in every sweep."""
+
+Sensors = dict[str, Sensor]
+"""By the name of their row."""
+
+
+def conditions(nominal: Sensor, profile: SensorProfile) -> Sensors:
+    """The nominal sensor; other MTFs, both axes alike or not; other SNRs; both at once; and one with another gain."""
+    low, worst = _noisy(nominal, profile, 25, 55), _noisy(nominal, profile, 15, 50)
+    return {
+        NOMINAL: nominal,
+        **{f"MTF {mtf:.0%}": _sharp(nominal, mtf) for mtf in SHARPNESS},
+        "MTF 12% across, 5% along": replace(_sharp(nominal, 0.12), mtf_nyquist_along=0.05),
+        **{f"SNR {a:g} / {b:g}": _noisy(nominal, profile, a, b) for a, b in NOISE},
+        **{f"MTF {mtf:.0%}, SNR 25 / 55": _sharp(low, mtf) for mtf in (0.05, 0.03)},
+        "MTF 3%, SNR 15 / 50": _sharp(worst, 0.03),
+        "MTF 10%, gain x 0.7": replace(
+            _sharp(nominal, 0.10), gain_dn_per_radiance=0.7 * nominal.gain_dn_per_radiance
+        ),
+    }
+
+
+def suppositions(nominal: Sensor, profile: SensorProfile) -> dict[str, Sensors]:
+    """Sensors known wrongly: by the name of the condition that holds, what is supposed in its place."""
+    mtf = {value: {f"MTF {value:.0%}": _sharp(nominal, value)} for value in (0.05, 0.07, 0.10)}
+    # SNR is radiance over sigma: with k times as much of it, the variance is k^2 times smaller.
+    thirds = {
+        f"SNR x {k:.2f}": replace(nominal, alpha=nominal.alpha / k**2, beta=nominal.beta / k**2)
+        for k in (4 / 3, 2 / 3)
+    }
+    return {
+        "MTF 7%": mtf[0.05] | mtf[0.10],
+        "MTF 5%": mtf[0.07],
+        "MTF 3%": mtf[0.07],
+        "SNR 30 / 80": {"SNR 50 / 110": _noisy(nominal, profile, 50, 110)},
+        NOMINAL: thirds,
+    }
+
+
+def _sharp(sensor: Sensor, mtf: float) -> Sensor:
+    """The sensor with the formula's MTF, that at Nyquist on both axes."""
+    return replace(sensor, mtf_nyquist=mtf, mtf_nyquist_along=None, response=None)
+
+
+def _noisy(sensor: Sensor, profile: SensorProfile, snr_0: float, snr_1: float) -> Sensor:
+    alpha, beta = noise_from_snr(profile.radiance_0.low, snr_0, profile.radiance_1.low, snr_1)
+    return replace(sensor, alpha=alpha, beta=beta)
+
+
+@dataclass(frozen=True)
+class Fixed:
+    """A sensor in the place of a profile: every draw gives it."""
+
+    sensor: Sensor
+
+    def draw(self, _generator: np.random.Generator) -> Sensor:
+        """The same sensor for every draw."""
+        return self.sensor
+
+
+Trial = tuple[str, Sensor, Method]
+"""The name of the sensor that is supposed, that sensor, and the method that supposes it."""
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """Methods and the conditions that they are tried under.
+
+    Attributes:
+        networks: run with each condition's sensor known where they can know it, else as they are.
+        scenes: that every sensor acquires.
+        profile: of the sensor that the conditions depart from.
+        reference: profile of the sensor that is aimed at.
+        seed: of every random draw.
+    """
+
+    networks: Sequence[Method]
+    scenes: Sequence[Scene]
+    profile: SensorProfile
+    reference: SensorProfile
+    seed: int
+
+    @property
+    def conditions(self) -> Sensors:
+        """Every sensor that acquires the scenes."""
+        return conditions(self.profile.nominal(), self.profile)
+
+    @property
+    def size(self) -> int:
+        """How many trials there are."""
+        return sum(len(self.trials(*condition)) for condition in self.conditions.items())
+
+    def trials(self, name: str, sensor: Sensor) -> list[Trial]:
+        """What is run under a condition."""
+        nominal, reference = self.profile.nominal(), self.reference.nominal()
+        plain = [method_without_network(each, nominal, reference) for each in (DEGRADED, TRADITIONAL)]
+        methods = [*(method for method in plain if method is not None), *self.networks]
+        units = replace(nominal, gain_dn_per_radiance=sensor.gain_dn_per_radiance)
+        drifted = [] if name == NOMINAL else [(NOMINAL, units, methods[1])]
+        able = [method for method in methods if method.specialise is not None]
+        supposed = suppositions(nominal, self.profile).get(name, {})
+        wrong = [(each, other, method) for each, other in supposed.items() for method in able]
+        return [*((name, sensor, method) for method in methods), *drifted, *wrong]
+
+    def run(self, tick: Callable[[str], None]) -> "Found":
+        """Try every method under every condition; `tick` is told what was done."""
+        psnr, mtf, pairs = dict[Key, np.ndarray](), dict[Key, Figure](), list[NamedPair]()
+        for name, sensor in self.conditions.items():
+            pairs, targets = self._pairs(sensor), acquire_targets(sensor, self.seed)
+            for supposed, other, method in self.trials(name, sensor):
+                key, knowing = (name, supposed, method.name), method.knowing(other)
+                psnr[key] = _psnr_db(knowing, pairs, sensor.max_dn)
+                if supposed in (name, NOMINAL):
+                    mtf[key] = mtf_figure(restored_mtfs(knowing, targets))
+                tick(f"{name}: {method.name}")
+        return Found(psnr, mtf, [pair.site for pair in pairs], self.seed)
+
+    def _pairs(self, sensor: Sensor) -> list[NamedPair]:
+        target, ratios = self.reference.nominal().in_units_of(sensor), oversamplings_of(self.profile)
+        return simulate_pairs(list(self.scenes), Fixed(sensor), Fixed(target), self.seed, ratios)[0]
+
+
+def _psnr_db(method: Method, pairs: Sequence[NamedPair], max_dn: int) -> np.ndarray:
+    """(2, N): each image against the reference, and against the reference without noise."""
+    found = []
+    for pair in pairs:
+        dn = method.restore(pair.degraded)
+        wanted = (pair.reference, pair.noise_free)
+        found.append([fidelity_db(dn, image, pair.degraded, max_dn) for image in wanted if image is not None])
+    return np.array(found).T
+
+
+NOMINAL_KNOWN = "traditional, nominal sensor known"
+TRUTH_KNOWN = "traditional, true sensor known"
+
+Key = tuple[str, str, str]
+"""Names: of the condition that holds, of the sensor that the method supposes, and of the method."""
+
+
+@dataclass(frozen=True)
+class Found:
+    """What a sweep measured, trial by trial.
+
+    Attributes:
+        psnr: in dB, (2, N): each image against the reference, and against the reference without noise.
+        mtf: after restoration, where the sensor is known as it is, and of the chain that supposes the nominal one.
+        sites: of the images, (N,).
+        seed: of the bootstrap.
+    """
+
+    psnr: Mapping[Key, np.ndarray]
+    mtf: Mapping[Key, Figure]
+    sites: Sequence[str]
+    seed: int
+
+    @property
+    def conditions(self) -> list[str]:
+        """Names of the sensors that acquired the scenes."""
+        return list(dict.fromkeys(truth for truth, _, _ in self.psnr))
+
+    @property
+    def networks(self) -> list[str]:
+        """Names of the methods that are neither the input nor the chain."""
+        return [name for name in dict.fromkeys(name for *_, name in self.psnr) if name not in (DEGRADED, TRADITIONAL)]
+
+    @property
+    def rows(self) -> list[Row]:
+        """Every table, a row a condition; and of the gains a row a network over all conditions."""
+        psnr = {key: self._mean(values[0]) for key, values in self.psnr.items()}
+        clean = {key: self._mean(values[1]) for key, values in self.psnr.items()}
+        tables = (("sweep, PSNR", psnr), (f"sweep, {NOISE_FREE}", clean), ("sweep, MTF at Nyquist", self.mtf))
+        conditions = [row for table, figures in tables for row in self._conditions(table, figures)]
+        return [*conditions, *self._gains(), *self._wrong()]
+
+    def _conditions(self, table: str, figures: Mapping[Key, Figure]) -> list[Row]:
+        """The input, the chain that knows the truth, the one that knows the nominal sensor, and each network."""
+        return [
+            Row(table, truth, {shown: figures[key] for shown, key in self._columns(truth).items()})
+            for truth in self.conditions
+        ]
+
+    def _columns(self, truth: str) -> dict[str, Key]:
+        chains = {TRUTH_KNOWN: (truth, truth, TRADITIONAL), NOMINAL_KNOWN: (truth, NOMINAL, TRADITIONAL)}
+        networks = {name: (truth, truth, name) for name in self.networks}
+        return {DEGRADED: (truth, truth, DEGRADED), **chains, **networks}
+
+    def _gains(self) -> list[Row]:
+        """How far each network is ahead of the chain that knows the truth: by condition, then over all of them."""
+        gains = {name: {truth: self._gain(truth, name) for truth in self.conditions} for name in self.networks}
+        rows = [
+            Row("sweep, gain over the chain", truth, {name: self._mean(gains[name][truth]) for name in gains})
+            for truth in self.conditions
+        ]
+        return [*rows, *(self._over_all(*each) for each in gains.items())] if gains else []
+
+    def _gain(self, truth: str, network: str) -> np.ndarray:
+        return np.asarray(self.psnr[truth, truth, network][0] - self.psnr[truth, truth, TRADITIONAL][0])
+
+    def _over_all(self, network: str, gains: Mapping[str, np.ndarray]) -> Row:
+        least = min(gains, key=lambda truth: float(gains[truth].mean()))
+        mean = self._mean(np.mean(list(gains.values()), axis=0))
+        figures = {f"mean of {len(gains)} conditions": mean, "least": self._mean(gains[least])}
+        return Row("sweep, gain over the chain, all conditions", network, figures, {"least at": least})
+
+    def _wrong(self) -> list[Row]:
+        """PSNR where each method supposes another sensor than the true one, and what it loses by that."""
+        names: dict[tuple[str, str], list[str]] = {}
+        for truth, supposed, name in self.psnr:
+            if supposed not in (truth, NOMINAL):
+                names.setdefault((truth, supposed), []).append(name)
+        psnr, lost = [], []
+        for (truth, supposed), methods in names.items():
+            wrong = {name: self.psnr[truth, supposed, name][0] for name in methods}
+            cost = {name: self.psnr[truth, truth, name][0] - values for name, values in wrong.items()}
+            shown = f"{truth}, supposed {supposed}"
+            psnr.append(Row("sweep, sensor known wrongly", shown, self._means(wrong)))
+            lost.append(Row("sweep, lost by a sensor known wrongly", shown, self._means(cost)))
+        return [*psnr, *lost]
+
+    def _means(self, values: Mapping[str, np.ndarray]) -> dict[str, Figure]:
+        return {name: self._mean(each) for name, each in values.items()}
+
+    def _mean(self, values: np.ndarray) -> Figure:
+        """The mean of (N,) dB, an image each: of differences on the same images the interval is a paired one."""
+        interval, words = site_interval(values.tolist(), self.sites, np.random.default_rng(self.seed))
+        return measured(float(values.mean()), "dB", f"mean of {len(values)} pairs, {words}", interval)
+
+
+def sweep_tables(
+    methods: Sequence[Method],
+    images: Path | None,
+    degraded: SensorProfile,
+    reference: SensorProfile,
+    seed: int,
+) -> tuple[Row, ...]:
+    """The tables of a sweep of the networks among the methods, on one scene of each site."""
+    scenes = load_scenes(images, reference.nominal(), seed)
+    first = {site_of(scene.name): scene for scene in reversed(scenes)}
+    sensors = degraded.nominal(), reference.nominal()
+    networks = [method for method in methods if method_without_network(method.name, *sensors) is None]
+    sweep = Sweep(networks, list(first.values()), degraded, reference, seed)
+    with steps("sweep", sweep.size) as bar:
+        return tuple(sweep.run(lambda note: bar.advance(1, note)).rows)

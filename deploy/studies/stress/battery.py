@@ -1,0 +1,205 @@
+"""Every case through every stage: what was measured, what it is judged to be, and the tables of both."""
+
+import math
+import zlib
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from deploy.studies.stress.cases import CASES, SIDE_PX, Case
+from deploy.studies.stress.checks import Limitation, Measure, limitation_of, torch_threads
+from deploy.studies.stress.networks import STAGES, Subject
+from profiles.errors import BeersError, OptionError
+from profiles.figures import Figure, Row, measured, predicted, unavailable
+from quant.bounds import layer_bounds
+from quant.integer import INT32_BITS
+
+
+@dataclass(frozen=True)
+class StageResult:
+    """One case at one stage: the worst of each check over its images, or why the stage was not looked at."""
+
+    case: Case
+    stage: str
+    measures: tuple[Measure, ...]
+    reason: str = ""
+
+    @property
+    def limitations(self) -> list[Limitation]:
+        """The known limitations that explain what does not hold."""
+        found = [limitation_of(self.stage, self.case.name, m) for m in self.measures if not m.holds]
+        return list(dict.fromkeys(limit for limit in found if limit is not None))
+
+    @property
+    def failed(self) -> list[Measure]:
+        """What does not hold, and no limitation explains."""
+        return [m for m in self.measures if not m.holds and limitation_of(self.stage, self.case.name, m) is None]
+
+    @property
+    def verdict(self) -> str:
+        """In a word or two."""
+        if self.failed:
+            return "FAILED: " + ", ".join(measure.check for measure in self.failed)
+        if self.limitations:
+            return "limit: " + ", ".join(limit.name for limit in self.limitations)
+        return "ok" if self.measures else "-"
+
+
+def run_battery(
+    subject: Subject,
+    cases: Sequence[Case] = CASES,
+    stages: Sequence[str] = tuple(STAGES),
+    seed: int = 0,
+    tick: Callable[[], None] = lambda: None,
+    side_px: int = SIDE_PX,
+) -> list[StageResult]:
+    """Look at every case at every stage.
+
+    Args:
+        subject: the networks.
+        cases: what they restore.
+        stages: names of STAGES.
+        seed: of the images.
+        tick: called once for each case at each stage.
+        side_px: of images whose case has no size of its own.
+    """
+    results, reasons = [], {stage: _cannot_be_looked_at(subject, stage) for stage in stages}
+    with torch_threads(1):  # on images this small a second thread only waits
+        for case in cases:
+            # Seeded by its name: a case draws the same images whichever others are asked for.
+            images = case.draw(side_px, np.random.default_rng([seed, zlib.crc32(case.name.encode())]))
+            for stage in stages:
+                measures = [] if reasons[stage] else _measures(subject, case, stage, images)
+                results.append(StageResult(case, stage, tuple(worst(measures)), reasons[stage]))
+                tick()
+    return results
+
+
+NEEDED: dict[str, Callable[[Subject], object]] = {"INT8": lambda s: s.quantised, "INT8 reference": lambda s: s.core}
+
+
+def _cannot_be_looked_at(subject: Subject, stage: str) -> str:
+    """Why a stage has nothing to look at; empty where it has."""
+    try:
+        if stage in NEEDED:
+            NEEDED[stage](subject)
+    except BeersError as error:
+        return str(error)
+    return ""
+
+
+def _measures(subject: Subject, case: Case, stage: str, images: Iterable[np.ndarray]) -> list[Measure]:
+    try:
+        return [measure for image in images for measure in STAGES[stage](subject, case, image)]
+    except BeersError as error:  # a network that refuses a sound image has failed
+        return [Measure(f"refused: {error}", 1, 0, "runs")]
+
+
+def worst(measures: Iterable[Measure]) -> list[Measure]:
+    """Of each check the measure that is largest beside what is allowed; NaN is the worst."""
+    found: dict[str, Measure] = {}
+    for measure in measures:
+        before = found.get(measure.check)
+        if before is None or _excess(measure) > _excess(before):
+            found[measure.check] = measure
+    return list(found.values())
+
+
+def _excess(measure: Measure) -> float:
+    return math.inf if math.isnan(measure.value) else measure.value - measure.allowed
+
+
+def chosen(names: str | None, known: Iterable[str], option: str) -> list[str]:
+    """The names in a list with commas; all where none is given.
+
+    Raises:
+        OptionError: an unknown one.
+    """
+    every = list(known)
+    wanted = every if names is None else [name.strip() for name in names.split(",")]
+    for name in wanted:
+        if name not in every:
+            expected = f"some of {', '.join(every)}"
+            raise OptionError(option, expected=expected, got=repr(name), remedy="separate them by commas")
+    return wanted
+
+
+SOURCE = "stress: worst over the images of the case"
+INTERVALS = "proven for every image: interval arithmetic on the file's own weights"
+
+
+def battery_rows(results: Iterable[StageResult]) -> list[Row]:
+    """A row a case, a word a stage."""
+    verdicts: dict[str, dict[str, str]] = {}
+    for result in results:
+        verdicts.setdefault(result.case.name, {})[result.stage] = result.verdict
+    return [Row("battery", name, {}, stages) for name, stages in verdicts.items()]
+
+
+def worst_rows(results: Iterable[StageResult]) -> list[Row]:
+    """A row for each check of each stage: its worst value over all cases."""
+    found: dict[str, list[tuple[Measure, str]]] = {}
+    for result in results:
+        for measure in result.measures:
+            found.setdefault(f"{result.stage}: {measure.check}", []).append((measure, result.case.name))
+    rows = []
+    for name, seen in found.items():
+        (largest,) = worst(measure for measure, _ in seen)
+        case = next(case for measure, case in seen if measure is largest)
+        text = {"allowed": f"{largest.allowed:.4g} {largest.unit}", "worst case": case}
+        text["verdict"] = "holds" if largest.holds else "does not hold"
+        rows.append(Row("worst", name, {"worst": _figure(largest)}, text))
+    return rows
+
+
+def limitation_rows(results: Iterable[StageResult]) -> list[Row]:
+    """A row for each known limitation that was met, with its largest size."""
+    rows: dict[str, Row] = {}
+    for result in results:
+        for measure in result.measures:
+            limit = None if measure.holds else limitation_of(result.stage, result.case.name, measure)
+            if limit is None:
+                continue
+            name = f"{limit.name} ({result.stage}, {measure.check})"
+            if name not in rows or measure.value > (rows[name].figures["largest"].value or 0):
+                text = {"in": result.case.name, "fails beyond": f"{limit.ceiling:g}", "means": limit.meaning}
+                rows[name] = Row("limitations", name, {"largest": _figure(measure)}, text)
+    return list(rows.values())
+
+
+def finding_rows(results: Iterable[StageResult]) -> list[Row]:
+    """Every figure of every case at every stage, for the document."""
+    return [
+        Row(
+            "findings",
+            f"{result.case.name}, {result.stage}",
+            {measure.check: _figure(measure) for measure in result.measures},
+            {"verdict": result.verdict, **({"why": result.reason} if result.reason else {})},
+        )
+        for result in results
+    ]
+
+
+def _figure(measure: Measure) -> Figure:
+    if not math.isfinite(measure.value):
+        return unavailable(measure.unit, f"{measure.check} is not finite")
+    return measured(measure.value, measure.unit, SOURCE)
+
+
+def overflow_proven(subject: Subject) -> bool:
+    """Whether no accumulator of the INT8 file can overflow; True where there is no core to look at."""
+    return all(row.text["can it overflow int32"] == "no" for row in layer_rows(subject))
+
+
+def layer_rows(subject: Subject) -> list[Row]:
+    """Each integer layer: bits that its accumulator needs at most, and whether it might saturate."""
+    if _cannot_be_looked_at(subject, "INT8 reference"):
+        return []
+    rows = []
+    for bound in layer_bounds(subject.core):
+        bits = predicted(bound.bits, "bits", (bound.bits, bound.bits), INTERVALS)
+        overflows = "no" if bound.bits < INT32_BITS else "YES"
+        text = {"can it overflow int32": overflows, "can it saturate int8": "perhaps" if bound.saturates else "never"}
+        rows.append(Row("integer layers", bound.name, {"accumulator": bits}, text))
+    return rows

@@ -1,0 +1,207 @@
+"""The hard cases: images (H, W) float32 in digital numbers of 12 bits that an instrument meets, or a fault makes.
+
+The same generator draws the same images.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from model.simulator.mtf import transfer_function
+
+FULL_DN = 4095
+SIDE_PX = 96
+DRAWN_MTF = 0.25
+"""At Nyquist, of the drawn ground: what a sharp sensor shows of it."""
+
+Draw = Callable[[int, np.random.Generator], list[np.ndarray]]
+"""Images for a side in pixels; their order tells nothing."""
+
+
+def flat(*levels: float) -> Draw:
+    """Constant images (side, side) of these shares of full scale."""
+    return lambda side, _: [_filled(side, level * FULL_DN) for level in levels]
+
+
+def steps(side: int, _: np.random.Generator) -> list[np.ndarray]:
+    """Steps from black to full scale, upright, lying and slanted: three images (side, side)."""
+    row, column = np.mgrid[:side, :side]
+    return [_two(column >= side // 2), _two(row >= side // 2), _two(column + 0.2 * row >= 0.6 * side)]
+
+
+def checkerboard(side: int, _: np.random.Generator) -> list[np.ndarray]:
+    """Black and full scale in turn, which is Nyquist along both axes: one image (side, side)."""
+    row, column = np.mgrid[:side, :side]
+    return [_two((row + column) % 2 == 1)]
+
+
+def hot_pixel(side: int, _: np.random.Generator) -> list[np.ndarray]:
+    """One pixel at full scale on a dark ground: one image (side, side)."""
+    image = _filled(side, 200)
+    image[side // 2, side // 2] = FULL_DN
+    return [image]
+
+
+def dead_lines(side: int, generator: np.random.Generator) -> list[np.ndarray]:
+    """A column and a row at 0 in a drawn ground: one image (side, side)."""
+    image = ground(side, generator)
+    image[:, side // 3], image[side // 2] = 0, 0
+    return [image]
+
+
+def glint(side: int, generator: np.random.Generator) -> list[np.ndarray]:
+    """Dark water with sparks beyond full scale, clipped: one image (side, side)."""
+    image = 150 + 10 * generator.standard_normal((side, side))
+    sparks = generator.random((side, side)) > 0.97
+    image[sparks] += generator.exponential(6000, int(sparks.sum()))
+    return [_digital(image)]
+
+
+def snow(side: int, generator: np.random.Generator) -> list[np.ndarray]:
+    """99 % of the pixels at full scale, the rest in shadow: one image (side, side)."""
+    image = _filled(side, FULL_DN)
+    shadow = generator.random((side, side)) < 0.01
+    image[shadow] = generator.uniform(500, 3500, int(shadow.sum()))
+    return [_digital(image)]
+
+
+def night(side: int, generator: np.random.Generator) -> list[np.ndarray]:
+    """Whole numbers of 1 to 20 DN: one image (side, side)."""
+    return [generator.integers(1, 21, (side, side)).astype(np.float32)]
+
+
+def ramps(side: int, _: np.random.Generator) -> list[np.ndarray]:
+    """12 bits from left to right, (side, side), and every number once, (64, 64)."""
+    across = np.tile(np.linspace(0, FULL_DN, side), (side, 1))
+    return [_digital(across), np.arange(4096, dtype=np.float32).reshape(64, 64)]
+
+
+def star(side: int, _: np.random.Generator) -> list[np.ndarray]:
+    """A Siemens star of 36 spokes, its middle finer than the pixels: one image (side, side)."""
+    row, column = np.mgrid[:side, :side] - (side - 1) / 2
+    return [_two(np.sin(18 * np.arctan2(row, column)) > 0)]
+
+
+def noisy(side: int, generator: np.random.Generator) -> list[np.ndarray]:
+    """A drawn ground at a signal-to-noise ratio of 3: one image (side, side)."""
+    clean = ground(side, generator)
+    return [_digital(clean * (1 + generator.standard_normal(clean.shape) / 3))]
+
+
+def clean(side: int, generator: np.random.Generator) -> list[np.ndarray]:
+    """A drawn ground without any noise: one image (side, side)."""
+    return [ground(side, generator)]
+
+
+def through(mtf_nyquist: float) -> Draw:
+    """A drawn ground seen through such an MTF, without noise."""
+    return lambda side, generator: [ground(side, generator, mtf_nyquist)]
+
+
+def stripes(side: int, generator: np.random.Generator) -> list[np.ndarray]:
+    """A drawn ground that lacks every seventh column and a row (NaN): one image (side, side)."""
+    image = ground(side, generator)
+    image[:, 3::7], image[side // 4] = np.nan, np.nan
+    return [image]
+
+
+def scattered(value: float) -> Draw:
+    """One pixel in fifty of a drawn ground is this value."""
+
+    def draw(side: int, generator: np.random.Generator) -> list[np.ndarray]:
+        image = ground(side, generator)
+        image[generator.random(image.shape) < 0.02] = value
+        return [image]
+
+    return draw
+
+
+def sized(*shapes: tuple[int, int]) -> Draw:
+    """Parts of one drawn ground of these shapes, whatever the side."""
+
+    def draw(_: int, generator: np.random.Generator) -> list[np.ndarray]:
+        whole = ground(max(max(shape) for shape in shapes), generator)
+        return [whole[: shape[0], : shape[1]].copy() for shape in shapes]
+
+    return draw
+
+
+def narrow(_: int, __: np.random.Generator) -> list[np.ndarray]:
+    """A row (1, 97) and a column (97, 1) of half of full scale."""
+    row = np.full((1, 97), FULL_DN // 2, np.float32)
+    return [row, row.T.copy()]
+
+
+def ground(side: int, generator: np.random.Generator, mtf_nyquist: float = DRAWN_MTF) -> np.ndarray:
+    """Rectangles of all sizes and brightnesses, seen through an MTF: (side, side), whole numbers of 0 to 4095."""
+    image = _filled(side, generator.uniform(800, 1600))
+    for _ in range(40):
+        top, left = generator.integers(0, side, 2)
+        height, width = generator.integers(1, max(side // 3, 2), 2)
+        image[top : top + height, left : left + width] = generator.uniform(100, 4000)
+    spectrum = torch.fft.rfft2(torch.from_numpy(image)) * transfer_function(side, side, 1, mtf_nyquist)
+    return _digital(torch.fft.irfft2(spectrum, s=(side, side)).numpy())
+
+
+def _filled(side: int, dn: float) -> np.ndarray:
+    return np.full((side, side), np.rint(dn), np.float32)
+
+
+def _two(bright: np.ndarray) -> np.ndarray:
+    return np.where(bright, np.float32(FULL_DN), np.float32(0))
+
+
+def _digital(image: np.ndarray) -> np.ndarray:
+    return np.asarray(np.clip(np.rint(image), 0, FULL_DN), np.float32)
+
+
+@dataclass(frozen=True)
+class Case:
+    """One kind of hard image.
+
+    Attributes:
+        name: short, as in the tables.
+        draw: makes its
+        pixels: "sound", or what is wrong with them: "missing" (NaN), "infinite", "beyond" 12 bits.
+        flat: every pixel of an image is the same: the mean must be kept, there is nothing to restore.
+        mtf_nyquist: of the sensor that acquired it; None for the profile's own.
+        large: only what must hold of one run is looked at.
+    """
+
+    name: str
+    draw: Draw
+    pixels: str = "sound"
+    flat: bool = False
+    mtf_nyquist: float | None = None
+    large: bool = False
+
+
+CASES = (
+    Case("black", flat(0.0), flat=True),
+    Case("full scale", flat(1.0), flat=True),
+    Case("deciles", flat(*(k / 10 for k in range(1, 10))), flat=True),
+    Case("steps", steps),
+    Case("checkerboard", checkerboard),
+    Case("hot pixel", hot_pixel),
+    Case("dead column and row", dead_lines),
+    Case("glint", glint),
+    Case("snow", snow),
+    Case("night", night),
+    Case("ramps", ramps),
+    Case("Siemens star", star),
+    Case("SNR 3", noisy),
+    Case("no noise", clean),
+    Case("MTF 0.1 %", through(0.001), mtf_nyquist=0.001),
+    Case("MTF 60 %", through(0.6), mtf_nyquist=0.6),
+    Case("nodata stripes", stripes, pixels="missing"),
+    Case("NaN pixels", scattered(np.nan), pixels="missing"),
+    Case("infinite pixels", scattered(np.inf), pixels="infinite"),
+    Case("beyond 12 bits", scattered(60_000), pixels="beyond"),
+    Case("1 x 1", sized((1, 1))),
+    Case("1 x N", sized((1, 97), (97, 1))),
+    Case("flat 1 x N", narrow, flat=True),
+    Case("35 x 35", sized((35, 35))),
+    Case("641 x 640", sized((640, 641)), large=True),
+)

@@ -1,0 +1,204 @@
+"""What is measured on a hard case, and when it holds."""
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from skimage.morphology import dilation, erosion
+
+from deploy.studies.stress.cases import FULL_DN
+from profiles.errors import BeersError
+
+FLAT_DN = 0.01 * FULL_DN
+"""One per cent of full scale: what the mean may move by, and what does not count as ringing."""
+
+RINGING_PERCENT = 100.0
+"""No more than the contrast around it."""
+
+Work = Callable[[np.ndarray], np.ndarray]
+"""An image (H, W) in DN to another."""
+
+
+@dataclass(frozen=True)
+class Measure:
+    """One figure of one image; it holds where it is at most what is allowed. NaN never holds."""
+
+    check: str
+    value: float
+    allowed: float
+    unit: str = "DN"
+
+    @property
+    def holds(self) -> bool:
+        """Whether the value is within what is allowed."""
+        return self.value <= self.allowed
+
+
+def not_finite(*images: np.ndarray) -> Measure:
+    """How many pixels of images of any shape are NaN or infinite."""
+    return Measure("not finite", float(sum((~np.isfinite(image)).sum() for image in images)), 0, "px")
+
+
+def out_of_range(image: np.ndarray) -> Measure:
+    """How many known pixels of an image (H, W) lie outside 0 to 4095 DN."""
+    return Measure("out of range", float(((image < 0) | (image > FULL_DN)).sum()), 0, "px")
+
+
+def differing(check: str, image: np.ndarray, other: np.ndarray) -> Measure:
+    """How many pixels of two images (H, W) are not the same, bit for bit; NaN is the same as NaN."""
+    same = (image == other) | (np.isnan(image) & np.isnan(other))
+    return Measure(check, float((~same).sum()), 0, "px")
+
+
+def mean_shift(image: np.ndarray, source: np.ndarray, allowed: float = FLAT_DN) -> Measure:
+    """By how much the mean of an image (H, W) moved from its source's, in DN."""
+    shift = float(np.mean(image, dtype=np.float64) - np.mean(source, dtype=np.float64))
+    return Measure("mean moved", abs(shift), allowed)
+
+
+def ringing(image: np.ndarray, source: np.ndarray, radius_px: int, allowed: float) -> Measure:
+    """How far pixels (H, W) leave the range of the source's pixels within the radius, over the contrast there.
+
+    One per cent of full scale does not count, and contrast is ten per cent at least: flat ground has none.
+    """
+    low, high = local_range(source, radius_px)
+    # Rounding and noise leave the range by a little on any ground.
+    beyond = np.maximum(np.maximum(image - high, low - image) - FLAT_DN, 0)
+    share = beyond / np.maximum(high - low, 10 * FLAT_DN)
+    return Measure("ringing", 100 * float(share.max()), allowed, "% of contrast")
+
+
+def local_range(image: np.ndarray, radius_px: int) -> tuple[np.ndarray, np.ndarray]:
+    """The smallest and the largest pixel (H, W) within the radius along both axes, the image (H, W) ending there."""
+    square = np.ones((2 * radius_px + 1, 2 * radius_px + 1))
+    return erosion(image, square), dilation(image, square)
+
+
+def gain(work: Work, source: np.ndarray, result: np.ndarray, generator: np.random.Generator) -> float:
+    """Largest change of a pixel (H, W), in DN, for a change of 1 DN: of one pixel, and of all by random signs."""
+    one = np.zeros(source.shape, np.float32)
+    one[source.shape[0] // 2, source.shape[1] // 2] = 1
+    signs = generator.choice(np.array([-1, 1], np.float32), source.shape)
+    return max(change(work, source, result, nudge) for nudge in (one, signs))
+
+
+def change(work: Work, source: np.ndarray, result: np.ndarray, nudge: np.ndarray) -> float:
+    """Largest change of any pixel (H, W), in DN, for a nudge (H, W) of -1, 0 or 1 DN."""
+    return float(np.abs(work(_nudged(source, nudge)) - result).max())
+
+
+def _nudged(source: np.ndarray, nudge: np.ndarray) -> np.ndarray:
+    """The source and a change of 1 DN, turned round where it would leave the converter's range."""
+    wanted = source + nudge
+    return np.asarray(np.where((wanted < 0) | (wanted > FULL_DN), source - nudge, wanted), np.float32)
+
+
+def refused(work: Callable[[], object]) -> Measure:
+    """Count 1 where work went through for which one sentence was due, else 0."""
+    try:
+        work()
+    except BeersError:
+        return Measure("not refused", 0, 0, "runs")
+    return Measure("not refused", 1, 0, "runs")
+
+
+def inside(image: np.ndarray, margin_px: int) -> np.ndarray:
+    """An image (H, W) without so many pixels on each side; the whole where nothing would be left."""
+    if min(image.shape) <= 2 * margin_px + 1:
+        return image
+    return image[margin_px : image.shape[0] - margin_px, margin_px : image.shape[1] - margin_px]
+
+
+def fidelity(image: np.ndarray, result: np.ndarray, radius_px: int, flat: bool) -> list[Measure]:
+    """What a restoration (H, W) may not do to contrast and, on flat ground, to brightness."""
+    inner = inside(result, radius_px)
+    measures = [ringing(inner, inside(image, radius_px), radius_px, RINGING_PERCENT)]
+    if flat:
+        # All that is lost at the border of flat ground is the padding's doing.
+        border = Measure("border", float(np.abs(result - image).max()), 2 * FLAT_DN)
+        measures += [mean_shift(inner, image), border]
+    return measures
+
+
+@contextmanager
+def torch_threads(count: int) -> Iterator[None]:
+    """Hold torch to so many threads for a while."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(count)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
+@dataclass(frozen=True)
+class Limitation:
+    """One thing that does not hold; beyond its ceiling it is a failure like any other.
+
+    Attributes:
+        name: as in the tables.
+        stages: where it is known.
+        checks: what does not hold.
+        cases: of which hard cases; none for all.
+        ceiling: the largest value of such a check that it explains.
+        meaning: to a user, in a sentence.
+    """
+
+    name: str
+    stages: tuple[str, ...]
+    checks: tuple[str, ...]
+    cases: tuple[str, ...]
+    ceiling: float
+    meaning: str
+
+
+NETWORKS = ("float32", "INT8")
+
+LIMITATIONS: tuple[Limitation, ...] = (
+    Limitation(
+        "narrow images",
+        NETWORKS,
+        ("ringing", "mean moved", "border"),
+        ("1 x 1", "1 x N", "flat 1 x N"),
+        1000,
+        "Of an image narrower than the receptive radius every pixel has padding in reach: brightness is not kept.",
+    ),
+    Limitation(
+        "border",
+        NETWORKS,
+        ("border",),
+        (),
+        500,
+        "At the image's border zero padding looks like a black edge to the network; within its receptive radius "
+        "bright flat ground is off, in INT8 more, which clips the correction that float makes there.",
+    ),
+    Limitation(
+        "clipped corrections",
+        ("INT8",),
+        ("mean error against float",),
+        (),
+        410,
+        "int8 holds corrections of about half of full scale at most; where float makes larger ones, on full contrast "
+        "between single pixels, INT8 sharpens less.",
+    ),
+    Limitation(
+        "isolated pixels",
+        NETWORKS,
+        ("ringing",),
+        ("snow", "glint", "hot pixel", "SNR 3"),
+        200,
+        "A single pixel unlike all around it is taken for a blurred point and driven beyond its value, to black or "
+        "full scale at most.",
+    ),
+)
+
+
+def limitation_of(stage: str, case: str, measure: Measure) -> Limitation | None:
+    """The limitation that explains a measure which does not hold, or None."""
+    for limit in LIMITATIONS:
+        known = stage in limit.stages and measure.check in limit.checks and (not limit.cases or case in limit.cases)
+        if known and measure.value <= limit.ceiling:
+            return limit
+    return None

@@ -1,0 +1,303 @@
+"""The pair of networks under test, opened once, and what each stage of the battery looks at on a hard case."""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property, partial
+from pathlib import Path
+
+import numpy as np
+import onnx
+import onnxruntime as ort
+import torch
+from torch import Tensor
+from torch.nn.functional import conv2d, pixel_shuffle, pixel_unshuffle
+
+from deploy.export import float_model
+from deploy.networks import float_file, int8_file, shipped_pair
+from deploy.restoration.engine import restore_floats
+from deploy.restoration.plan import make_plan
+from deploy.restoration.runtime import Infer
+from deploy.studies.stress.cases import FULL_DN, Case
+from deploy.studies.stress.checks import (
+    FLAT_DN,
+    Measure,
+    change,
+    differing,
+    fidelity,
+    gain,
+    not_finite,
+    out_of_range,
+    refused,
+)
+from model.progress import Log, no_log
+from model.shipped import SENSOR
+from profiles import load_sensor
+from profiles.errors import BeersError, ModelError
+from quant.bounds import saturable
+from quant.core import IntCore
+from quant.encodings import read_core
+from quant.graph import CORRECTION, IMAGE, Activation, Add, Conv, Graph, correction_graph, image_channels
+from quant.integer import LayerReport, merged_correction, run_core
+from quant.onnx_file import any_size, load_onnx, require_quantised
+from quant.session import open_session, run
+from quant.tiling.walk import Tiling, tiling_of
+
+WHOLE_PX = 4096
+"""A tile that no case fills."""
+
+
+@dataclass(frozen=True)
+class Network:
+    """A network's file: how it runs, and how far it sees."""
+
+    model: onnx.ModelProto
+
+    @cached_property
+    def tiling(self) -> Tiling:
+        """How it meets an image of any size."""
+        return tiling_of(any_size(self.model))
+
+    @property
+    def radius_px(self) -> int:
+        """How far from a pixel its result depends on."""
+        return self.tiling.halo_px
+
+    def extended(self, image: np.ndarray) -> np.ndarray:
+        """An image (N, 1, H, W) with copies of its last row and column, up to what the network takes whole."""
+        lack = [self.tiling.whole_px(side) - side for side in image.shape[2:]]
+        return np.pad(image, ((0, 0), (0, 0), (0, lack[0]), (0, lack[1])), mode="edge")
+
+    def infer(self, threads: int = 1) -> Infer:
+        """The network ready to run on so many threads, opened once for each number of them."""
+        if threads not in self._opened:
+            self._opened[threads] = open_session(any_size(self.model), threads)
+        return partial(run, self._opened[threads])
+
+    def restore(self, image: np.ndarray, threads: int = 1, tile_px: int = WHOLE_PX) -> np.ndarray:
+        """As `restore` restores digital numbers (H, W) float: tiled, missing pixels kept, clipped, not rounded.
+
+        Raises:
+            ImageError: numbers outside 0 to full scale, or a network that gives NaN.
+        """
+        return restore(self.infer(threads), image, self.tiling, tile_px)
+
+    @cached_property
+    def _opened(self) -> dict[int, ort.InferenceSession]:
+        return {}
+
+
+@dataclass(frozen=True)
+class Subject:
+    """The pair of networks under test.
+
+    Attributes:
+        float32: the float one.
+        int8: the INT8 one, or None.
+        paths: the files they came from.
+    """
+
+    float32: Network
+    int8: Network | None
+    paths: tuple[Path, ...]
+
+    @cached_property
+    def graph(self) -> Graph | None:
+        """The float network as convolutions and additions alone; None of any other."""
+        try:
+            return correction_graph(self.float32.model)
+        except BeersError:
+            return None
+
+    @cached_property
+    def core(self) -> IntCore:
+        """The whole numbers of the INT8 file.
+
+        Raises:
+            ModelError: no file, or one whose numbers cannot be told.
+        """
+        return read_core(self.quantised.model)
+
+    @property
+    def quantised(self) -> Network:
+        """The INT8 network.
+
+        Raises:
+            ModelError: there is none.
+        """
+        if self.int8 is None:
+            remedy = "give it as the second argument"
+            raise ModelError("INT8 network", expected="a file", got="none", remedy=remedy)
+        return self.int8
+
+
+def open_subject(
+    float_path: Path | None, int8_path: Path | None, variant: str, sensor: str = SENSOR, say: Log = no_log
+) -> Subject:
+    """The files given, or a shipped network in both precisions where neither is, told the sensor.
+
+    Raises:
+        ModelError: no such file or variant, the two swapped, or a network that cannot be tiled.
+    """
+    if float_path is None:
+        float_path, int8_path = shipped_pair(variant, sensor, say)
+    known = load_sensor(sensor)
+    float_path = float_file(float_path, known, say)
+    int8_path = int8_file(int8_path, known, say) if int8_path else None
+    float32 = Network(float_model(float_path))
+    int8 = None if int8_path is None else Network(load_onnx(int8_path))
+    for path, network, wanted in ((float_path, float32, False), (int8_path, int8, True)):
+        if path is not None and network is not None:
+            require_quantised(network.model, path, wanted)
+            _ = network.radius_px  # refuses what cannot be tiled before anything runs
+    paths = (float_path,) if int8_path is None else (float_path, int8_path)
+    return Subject(float32, int8, paths)
+
+
+def restore(infer: Infer, image: np.ndarray, tiling: Tiling, tile_px: int = WHOLE_PX) -> np.ndarray:
+    """The command's own way from digital numbers (H, W) to restored ones, float32, not rounded, with exact seams.
+
+    Raises:
+        ImageError: numbers outside 0 to full scale, or a network that gives NaN.
+    """
+    return restore_floats(image, infer, make_plan((1, *image.shape), tile_px, tiling.halo_px, tiling), FULL_DN)
+
+
+def in_float64(graph: Graph, image: np.ndarray) -> np.ndarray:
+    """The image (N, 1, H, W) plus the graph's correction, computed in float64."""
+    with torch.inference_mode():
+        pixels = _as(image, torch.float64)
+        return np.asarray((pixels + _correction(graph, pixels)).numpy())
+
+
+def steepest_signs(graph: Graph, image: np.ndarray) -> np.ndarray:
+    """The change (H, W) of -1, 0 or 1 that moves the middle pixel most, to first order: its gradient's signs."""
+    pixels = _as(image, torch.float32)[None, None].requires_grad_()
+    restored = pixels + _correction(graph, pixels)
+    (gradient,) = torch.autograd.grad(restored[0, 0, image.shape[0] // 2, image.shape[1] // 2], pixels)
+    return np.asarray(gradient[0, 0].sign().numpy())
+
+
+def _correction(graph: Graph, image: Tensor) -> Tensor:
+    place_px = math.isqrt(image_channels(graph))
+    tensors = {IMAGE: pixel_unshuffle(image, place_px)}
+    for op in graph:
+        if isinstance(op, Add):
+            tensors[op.output] = tensors[op.inputs[0]] + tensors[op.inputs[1]]
+            continue
+        assert isinstance(op, Conv)  # noqa: S101 - correction_graph has seen to it
+        weight, bias = (_as(values, image.dtype) for values in (op.weight, op.bias))
+        result = conv2d(tensors[op.input], weight, bias, padding=op.window.pads[0])
+        tensors[op.output] = torch.relu(result) if op.activation is Activation.relu else result
+    return pixel_shuffle(tensors[CORRECTION], place_px)
+
+
+def _as(values: np.ndarray, dtype: torch.dtype) -> Tensor:
+    return torch.from_numpy(np.ascontiguousarray(values)).to(dtype)
+
+
+GAIN_DN, STEEPEST_DN, FLOAT32_DN = 16.0, 64.0, 0.05
+INT8_GAIN_DN = 128.0
+"""A change of 1 DN can move a rounding in every layer, and a pixel from the fine gain to the coarse one."""
+ROUNDING_DN = 128.0
+"""What the DPU's tie rounding (half up) may change: one unit in any layer, carried on."""
+MORE_THREADS, CROP_PX = 2, 48
+CORES_PX, LARGE_CORE_PX = (16, 29), 250
+"""What a tile keeps beside its two halos."""
+
+
+def float32(subject: Subject, case: Case, image: np.ndarray) -> list[Measure]:
+    """The float network in float32, and against float64 where it is plain convolutions, on an image (H, W) in DN."""
+    network, graph = subject.float32, subject.graph
+    measures = restoration(network, case, image, GAIN_DN)
+    if case.pixels == "sound" and not case.large and graph is not None:
+        whole = network.extended(_fractions(image))
+        error = FULL_DN * float(np.abs(network.infer()(whole) - in_float64(graph, whole)).max())
+        signs = steepest_signs(graph, whole[0, 0])[: image.shape[0], : image.shape[1]]
+        steepest = change(network.restore, image, network.restore(image), signs)
+        measures.append(Measure("error against float64", error, FLOAT32_DN))
+        measures.append(Measure("gain, steepest", steepest, STEEPEST_DN, "DN per DN"))
+    return measures
+
+
+def int8(subject: Subject, case: Case, image: np.ndarray) -> list[Measure]:
+    """The INT8 network by onnxruntime's integer kernels, on an image (H, W) in DN."""
+    network = subject.quantised
+    measures = restoration(network, case, image, INT8_GAIN_DN)
+    if case.pixels == "sound" and not case.large:
+        apart = np.abs(network.restore(image) - subject.float32.restore(image))
+        measures.append(Measure("mean error against float", float(apart.mean()), FLAT_DN))
+    return measures
+
+
+def restoration(network: Network, case: Case, image: np.ndarray, gain_dn: float) -> list[Measure]:
+    """What must hold of any network on an image (H, W) in DN, by whatever it is run."""
+    if case.pixels in ("infinite", "beyond"):
+        return [refused(lambda: network.restore(image))]
+    result = network.restore(image)
+    known = ~np.isnan(image)
+    measures = [not_finite(result[known]), out_of_range(result)]
+    if case.large:
+        return measures
+    measures.append(differing("runs differ", result, network.restore(image)))
+    measures.append(differing("threads differ", result, network.restore(image, MORE_THREADS)))
+    if case.pixels == "missing":
+        return [*measures, differing("missing moved", result[~known], image[~known])]
+    largest = gain(network.restore, image, result, np.random.default_rng(0))
+    measures += fidelity(image, result, network.radius_px, case.flat)
+    return [*measures, Measure("gain", largest, gain_dn, "DN per DN")]
+
+
+def reference(subject: Subject, case: Case, image: np.ndarray) -> list[Measure]:
+    """The INT8 network in whole numbers alone, on 48 x 48 pixels of larger images (H, W)."""
+    core, network = subject.core, subject.quantised
+    if case.pixels != "sound":
+        return []
+    crop = network.extended(_fractions(image[:CROP_PX, :CROP_PX]))
+    planes = core.ends.split(crop)
+    (even, reports), (up, _) = run_core(core, planes, half_even=True), run_core(core, planes)
+    by_rule, on_board = (_restored(core, crop, tensors) for tensors in (even, up))
+    # A peak above its proof would mean that the proof is wrong, not the network.
+    over = max(report.peak_bits - report.proven_bits for report in reports)
+    return [
+        not_finite(by_rule),
+        differing("runtime differs", by_rule, network.infer()(crop)[0, 0]),
+        Measure("DPU's tie rounding", FULL_DN * float(np.abs(on_board - by_rule).max()), ROUNDING_DN),
+        Measure("accumulator beyond its proof", over, 0, "bits"),
+        _unproven(core, reports),
+    ]
+
+
+def _restored(core: IntCore, image: np.ndarray, tensors: dict[str, np.ndarray]) -> np.ndarray:
+    return np.asarray(core.ends.finished(image, merged_correction(core, tensors))[0, 0])
+
+
+def _unproven(core: IntCore, reports: list[LayerReport]) -> Measure:
+    """Layers that saturate although the proof says they cannot."""
+    can = saturable(core)
+    ends = [report.name for report in reports if report.saturated > 0 and not can[report.name]]
+    return Measure("saturation not reported", len(ends), 0, "layers")
+
+
+def _fractions(image: np.ndarray) -> np.ndarray:
+    return (np.asarray(image, np.float32) / np.float32(FULL_DN))[None, None]
+
+
+def tiling(subject: Subject, case: Case, image: np.ndarray) -> list[Measure]:
+    """Both networks, tiled by several plans, against the whole image (H, W); plans refuse unsound pixels."""
+    networks = [("float32", subject.float32), ("INT8", subject.int8)]
+    return [m for name, network in networks if network for m in _plans(network, name, case, image)]
+
+
+def _plans(network: Network, name: str, case: Case, image: np.ndarray) -> list[Measure]:
+    cores = (LARGE_CORE_PX,) if case.large else CORES_PX
+    tiles = [2 * network.radius_px + core for core in cores]
+    if case.pixels in ("infinite", "beyond"):
+        return [refused(partial(network.restore, image, tile_px=tile)) for tile in tiles]
+    whole = network.restore(image)
+    return [differing(f"{name} plans differ", network.restore(image, tile_px=tile), whole) for tile in tiles]
+
+
+Stage = Callable[[Subject, Case, np.ndarray], list[Measure]]
+
+STAGES: dict[str, Stage] = {"float32": float32, "INT8": int8, "INT8 reference": reference, "tiling": tiling}

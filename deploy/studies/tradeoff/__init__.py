@@ -1,0 +1,1 @@
+"""What accuracy costs in time: operating points measured on the same images, and which of them to take."""

@@ -1,0 +1,243 @@
+"""What is measured of each variant, once, on the same images; kept in one JSON file from one run to the next.
+
+A measurement is kept under the SHA-256 of what it depends on: the inputs and the version of this tool.
+"""
+
+import hashlib
+import json
+import platform
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property, partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import psutil
+
+from deploy import __version__
+from deploy.bench.tables import Swath
+from deploy.bench.timing import interleaved, timed
+from deploy.bench.traditional import drawn_acquisition
+from deploy.export import float_model
+from deploy.restoration.engine import restore_dn
+from deploy.restoration.function import Restore
+from deploy.restoration.options import Runtime
+from deploy.restoration.plan import make_plan
+from deploy.restoration.runtime import open_runtime
+from deploy.studies.evaluation.methods import Method
+from deploy.studies.evaluation.pairs import NamedPair
+from deploy.studies.evaluation.scores import Instruments, mean_row
+from deploy.studies.tradeoff.points import HALO_STEP_PX, Point, Variant, model_of, tiling_of_file
+from model.io.files import sha256, write_text
+from model.io.images import list_images
+from model.processor import processor_name
+from model.simulator.procedural import load_scenes
+from profiles import load_sensor, sensor_names
+from profiles.errors import OptionError
+from profiles.figures import Figure, measured
+from profiles.sensor import SensorProfile
+from profiles.sensor_file import reference_for
+from quant.calibration import draw_patches
+from quant.onnx_file import metadata, save_onnx
+from quant.quantise import quantise_model
+from quant.reading.external import network_sha256
+
+Scores = Mapping[str, float | None]
+"""Figures of one image by name; None where an instrument is not there."""
+
+SEAM_ERROR = "seam error"
+
+
+def key_of(**about: object) -> str:
+    """SHA-256 of what a measurement depends on, this tool's version among it."""
+    text = json.dumps({"version": __version__, **about}, sort_keys=True, default=str)
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+@dataclass
+class Measurements:
+    """Measurements of a study in one file, written anew after each: a run that was stopped goes on.
+
+    Attributes:
+        path: of the file.
+        kept: by key.
+    """
+
+    path: Path
+    kept: dict[str, Any] = field(default_factory=dict)
+
+    @classmethod
+    def open(cls, path: Path) -> "Measurements":
+        """Those of a file, or none yet.
+
+        Raises:
+            OptionError: a file that holds something else.
+        """
+        if not path.exists():
+            return cls(path)
+        try:
+            kept = json.loads(path.read_text(encoding="utf-8"))["measurements"]
+            return cls(path, dict(kept))
+        except (OSError, ValueError, LookupError, TypeError, RecursionError) as error:
+            expected, remedy = "measurements that this command kept", "remove it: they are made anew"
+            raise OptionError(str(path), expected=expected, got="another file", remedy=remedy) from error
+
+    def make(self, key: str, measure: Callable[[], Any]) -> Any:
+        """What was measured under a key; measured now, and written, where there is nothing."""
+        if key not in self.kept:
+            self.kept[key] = measure()
+            write_text(self.path, json.dumps({"version": __version__, "measurements": self.kept}) + "\n")
+        return self.kept[key]
+
+
+@dataclass(frozen=True)
+class Benchmark:
+    """What all variants are measured on.
+
+    Attributes:
+        pairs: held-out images, degraded and reference.
+        degraded: sensor of the degraded images.
+        reference: sensor of the reference images.
+        instruments: PSNR, SSIM and LPIPS.
+        weights: digest of the weights of LPIPS; empty without.
+        seed: of the bootstrap.
+    """
+
+    pairs: Sequence[NamedPair]
+    degraded: SensorProfile
+    reference: SensorProfile
+    instruments: Instruments
+    weights: str
+    seed: int
+
+    @cached_property
+    def digest(self) -> str:
+        """Of everything that scores depend on besides the method."""
+        images = [image for pair in self.pairs for image in (pair.degraded, pair.reference)]
+        names = [(pair.name, pair.site) for pair in self.pairs]
+        return key_of(pixels=[pixels_sha256(image) for image in images], names=names, weights=self.weights)
+
+    @property
+    def sites(self) -> list[str]:
+        """The site of each pair."""
+        return [pair.site for pair in self.pairs]
+
+    def depends(self, variant: Variant) -> str:
+        """Digest of what a variant's pictures depend on."""
+        if variant.file is not None:
+            return network_sha256(variant.file)
+        return key_of(method=variant.source, sensors=[self.degraded, self.reference])
+
+    def score(self, restore: Restore) -> list[dict[str, float | None]]:
+        """Scores of every pair."""
+        return [self.instruments.score(restore(p.degraded), p.reference, p.degraded) for p in self.pairs]
+
+    def score_in_tiles(self, variant: Variant, exact: Restore, point: Point) -> list[dict[str, float | None]]:
+        """Scores of every pair restored in a point's tiles, and how far its seams are from exact ones, in DN."""
+        max_dn, found = self.degraded.nominal().max_dn, []
+        cut = restore_in_tiles(variant, point.tile_px, point.halo_px or 0, max_dn)
+        for pair in self.pairs:
+            restored = cut(pair.degraded)
+            error = np.abs(np.asarray(restored, np.float64) - exact(pair.degraded)).mean()
+            scores = self.instruments.score(restored, pair.reference, pair.degraded)
+            found.append({**scores, SEAM_ERROR: float(error)})
+        return found
+
+    def means(self, images: Sequence[Scores]) -> dict[str, Figure]:
+        """Means over the images, with bootstrap intervals over whole sites."""
+        plain = [{key: each[key] for key in each if key not in ("PSNR gain", SEAM_ERROR)} for each in images]
+        unnamed = Method("", lambda dn: dn, "")
+        found = dict(mean_row(unnamed, plain, self.sites, self.instruments, self.seed).figures)
+        if SEAM_ERROR in images[0]:
+            errors = [each[SEAM_ERROR] or 0.0 for each in images]
+            source = f"mean difference from exact seams, {len(errors)} images in these tiles"
+            found[SEAM_ERROR] = measured(float(np.mean(errors)), "DN", source)
+        return found
+
+
+def restore_in_tiles(variant: Variant, tile_px: int, halo_px: int, max_dn: int) -> Restore:
+    """A network in such tiles; an image that is no larger than a tile is cut in two along each side."""
+    file = variant.file or Path()
+    infer, _ = open_runtime(Runtime.onnxruntime, model_of(file), threads=0)
+    tiling = tiling_of_file(file)
+
+    def restore(dn: np.ndarray) -> np.ndarray:
+        half_px = HALO_STEP_PX * -(-(min(dn.shape) // 2) // HALO_STEP_PX) + 2 * halo_px
+        plan = make_plan((1, *dn.shape), min(tile_px, half_px), halo_px, tiling)
+        return restore_dn(dn, infer, plan, max_dn)
+
+    return restore
+
+
+def pixels_sha256(image: np.ndarray) -> str:
+    """SHA-256 of an image's shape, type and pixels."""
+    digest = hashlib.sha256(f"{image.shape} {image.dtype}".encode())
+    digest.update(np.ascontiguousarray(image).tobytes())
+    return digest.hexdigest()
+
+
+TILE_PX, ROUNDS = 256, 9
+
+
+def host_times(restores: Iterable[Restore], tile: np.ndarray) -> list[list[float]]:
+    """Seconds that each method takes for a tile on this machine, interleaved, after one run for warm-up."""
+    calls = [partial(restore, tile) for restore in restores]
+    for call in calls:
+        call()
+    rounds = interleaved(calls, lambda call: timed(call)[1], lambda found: len(found[0]) >= ROUNDS)
+    return [list(times) for times in rounds]
+
+
+def host_tile(benchmark: Benchmark) -> np.ndarray:
+    """What host times are taken on: a drawn scene as the sensor sees it."""
+    return drawn_acquisition(Swath(TILE_PX, TILE_PX), benchmark.degraded, benchmark.reference, benchmark.seed)
+
+
+def host_figures(times_s: Sequence[float], pixels: int) -> dict[str, Figure]:
+    """Median and 90th percentile for a million pixels, in s."""
+    source = f"{len(times_s)} runs of a tile of {TILE_PX} x {TILE_PX}, interleaved with the other methods"
+    values = np.asarray(times_s) * 1e6 / pixels
+    return {f"host p{p}": measured(float(np.percentile(values, p)), "s/Mpx", source) for p in (50, 90)}
+
+
+def machine() -> str:
+    """What host times hold for: the processor and its cores."""
+    return f"{platform.machine()} {processor_name() or platform.processor()} x {psutil.cpu_count()}"
+
+
+PATCHES, PATCH_PX = 32, 96
+"""Calibration of a network that comes without INT8: fewer and smaller patches than `quantize` takes."""
+
+
+def make_int8(file: Path, folder: Path, scenes: Path | None, sensor: str, seed: int) -> Path:
+    """Quantise a float network on simulated patches as `quantize` does, and keep the file.
+
+    Args:
+        file: ONNX or safetensors.
+        folder: where the INT8 file is kept.
+        scenes: folder of images to calibrate on; drawn ones if None.
+        sensor: of the patches, where the network names none that is known.
+        seed: of every random draw.
+
+    Raises:
+        ModelError: a network that the quantiser does not take.
+        ImageError: no scene holds a patch.
+    """
+    model = float_model(file)
+    said = metadata(model).get("sensor", "")
+    known = load_sensor(said if said in sensor_names() else sensor)
+    seen = [sha256(path) for path in list_images(scenes)] if scenes else []
+    key = key_of(network=network_sha256(file), scenes=seen, sensor=known, seed=seed, size=[PATCHES, PATCH_PX])
+    path = folder / f"{file.stem}-int8-{key[:16]}.onnx"
+    if not path.is_file():
+        patches = _patches(known, scenes, seed)
+        about = {"calibration_sensor": known.name, "calibration_seed": str(seed)}
+        save_onnx(quantise_model(model, patches, about).host, path)
+    return path
+
+
+def _patches(degraded: SensorProfile, scenes: Path | None, seed: int) -> Any:
+    reference = reference_for(degraded)
+    loaded = load_scenes(scenes, reference.nominal(), seed)
+    return draw_patches(loaded, degraded, reference, PATCHES, seed, PATCH_PX)

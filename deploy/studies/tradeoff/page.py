@@ -1,0 +1,171 @@
+"""The page of a study: the recommended line, the plot with its front, and every point in a table that sorts."""
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from markupsafe import Markup
+
+from deploy.report.page import Picture, Report, Table, write_report
+from deploy.report.plots import LIGHT, SERIES, data_url, look, new_figure, set_ticks, svg_of
+from deploy.studies.tradeoff.pareto import Measured
+from deploy.studies.tradeoff.run import Study
+from model.io.files import write_text
+from model.traditional.peers import PEERS
+from profiles.figures import Figure, Row
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+FILES = ("tradeoff.html", "tradeoff.svg")
+
+SIZE_PX, TEXT_PX = (560, 520), 15
+"""Of the plot: wide enough for a desk, and its words large enough on a telephone, where it is scaled down."""
+FRONT_PX2, OTHERS_PX2 = 90, 34
+"""Areas of marks."""
+NEAR_PX = 16
+"""Marks no farther apart share a label."""
+PALE = 0.45
+MARKERS = ("o", "s", "D", "^", "v", "P", "X")
+CHAINS, LIBRARIES = "traditional chains", "other libraries"
+PSNR = "PSNR"
+SHOWN_WORDS = ("board", "configuration", "tile", "halo", "sensor")
+
+FRONT_CAPTION = (
+    "No point of the first board is both cheaper and better than one of these. A gain is the difference in PSNR on "
+    "the same images from the next cheaper point, a ratio the cost over that of the same point."
+)
+POINTS_CAPTION = (
+    "Press a heading to sort by it, again to reverse. A swath on a board is predicted; images and times on this "
+    "machine are measured."
+)
+PLOT_CAPTION = (
+    "Numbers are those of the front's table; the line is the front, small marks lie below it. Upright bars: 95 % "
+    "interval of the difference in PSNR from the next cheaper point of the front. Bars across: interval of the cost."
+)
+
+
+def write_study(study: Study, out: Path) -> None:
+    """Write the page and its plot into a folder.
+
+    Raises:
+        MachineError: a file cannot be written.
+    """
+    svg = plot_svg(study)
+    write_text(out / "tradeoff.svg", svg)
+    write_report(report_of(study, svg), out / "tradeoff.html")
+
+
+def report_of(study: Study, svg: str) -> Report:
+    """The page in reading order."""
+    picture = Picture(f"{PSNR} against {study.cost}", data_url(svg), PLOT_CAPTION)
+    tables = [
+        Table("The front, from cheap to dear", study.front_rows, FRONT_CAPTION),
+        Table(f"All {len(study.points)} points", [_shown(point) for point in study.points], POINTS_CAPTION),
+    ]
+    line = study.recommendation.line
+    return Report(
+        "What accuracy costs in time", f"{line[0].upper()}{line[1:]}.", tables, [picture], study.notes, sorts=True
+    )
+
+
+def _shown(point: Measured) -> Row:
+    """A point's row with the words that a reader sorts by."""
+    return Row("points", point.name, point.figures, {key: point.text.get(key, "") for key in SHOWN_WORDS})
+
+
+def plot_svg(study: Study) -> Markup:
+    """Every point of the first board that has a cost and a PSNR; those of the front large, with their numbers."""
+    from matplotlib import rc_context
+
+    front = list(study.front)
+    points = [point for point in study.points if _placed(point, study.cost) and _on_first_board(point, study)]
+    with look(), rc_context({"font.size": TEXT_PX}):
+        figure = new_figure(*SIZE_PX)
+        axes = figure.add_subplot(xscale="log", xlabel=_label(study, study.cost), ylabel=_label(study, PSNR))
+        for name, colour, marker, members in series(points):
+            _scatter(axes, study.cost, members, front, name=name, colour=colour, marker=marker)
+        _draw_front(axes, study, front)
+        axes.margins(0.1)
+        if points:
+            set_ticks(axes.xaxis, 6)
+            set_ticks(axes.yaxis, 8)
+            figure.legend(loc="lower center", ncols=2)
+        rows = -(-len(axes.get_legend_handles_labels()[1]) // 2)
+        figure.subplots_adjust(left=0.13, right=0.97, top=0.97, bottom=0.13 + 0.045 * rows)
+        _draw_numbers(axes, study)
+        return svg_of(figure, f"{PSNR} against {study.cost}; numbers as in the table of the front")
+
+
+def _placed(point: Measured, cost: str) -> bool:
+    return point.value(cost) is not None and point.value(PSNR) is not None
+
+
+def _on_first_board(point: Measured, study: Study) -> bool:
+    return point.text["board"] in (study.board, "this machine")
+
+
+def series(points: Sequence[Measured]) -> Iterator[tuple[str, str, str, list[Measured]]]:
+    """Points that look alike: name, colour and marker of each network, of the chains, and of other libraries."""
+    groups: dict[str, list[Measured]] = {}
+    for point in points:
+        groups.setdefault(_group(point), []).append(point)
+    for number, (name, members) in enumerate(groups.items()):
+        yield name, LIGHT[SERIES[number % len(SERIES)]], MARKERS[number % len(MARKERS)], members
+
+
+def _group(point: Measured) -> str:
+    if point.point is not None and point.point.variant.file is not None:
+        return point.text["method"]
+    return LIBRARIES if point.text["method"] in PEERS else CHAINS
+
+
+def _scatter(
+    axes: "Axes", cost: str, members: list[Measured], front: list[Measured], *, name: str, colour: str, marker: str
+) -> None:
+    """One series, its points of the front last so that they lie on top."""
+    for large in (False, True):
+        shown = [point for point in members if (point in front) == large]
+        size, alpha = (FRONT_PX2, 1.0) if large else (OTHERS_PX2, PALE)
+        x, y = ([point.value(key) or 0.0 for point in shown] for key in (cost, PSNR))
+        axes.scatter(x, y, s=size, c=colour, marker=marker, alpha=alpha, linewidths=0, zorder=2 + large)
+    axes.scatter([], [], s=FRONT_PX2, c=colour, marker=marker, label=name, linewidths=0)
+
+
+def _draw_front(axes: "Axes", study: Study, front: Sequence[Measured]) -> None:
+    """The line of the front, and the intervals of its members."""
+    x, y = ([point.value(key) or 0.0 for point in front] for key in (study.cost, PSNR))
+    axes.step(x, y, where="post", color=LIGHT["soft"], lw=1, zorder=1)
+    for point, row in zip(front, study.front_rows, strict=True):
+        at = point.value(study.cost) or 0.0, point.value(PSNR) or 0.0
+        low, high = _ends(point.figures[study.cost])
+        axes.plot([low, high], [at[1]] * 2, color=LIGHT["line"], lw=2, zorder=0)
+        gain = row.figures.get("PSNR gain")
+        if gain is not None and gain.interval is not None:
+            before = at[1] - (gain.value or 0.0)
+            axes.plot([at[0]] * 2, [before + end for end in gain.interval], color=LIGHT["soft"], lw=1.5, zorder=1)
+
+
+def _draw_numbers(axes: "Axes", study: Study) -> None:
+    """The members' numbers beside their marks; one label for neighbours whose marks lie on one another."""
+    groups: list[tuple[int, int, np.ndarray]] = []
+    for number, point in enumerate(study.front, 1):
+        at = axes.transData.transform((point.value(study.cost) or 0.0, point.value(PSNR) or 0.0))
+        if groups and np.hypot(*(at - groups[-1][2])) < NEAR_PX:
+            groups[-1] = (groups[-1][0], number, groups[-1][2])
+        else:
+            groups.append((number, number, at))
+    for first, last, at in groups:
+        words = str(first) if first == last else f"{first}\u2013{last}"
+        axes.annotate(words, (at[0], at[1]), (-4, 7), "figure pixels", "offset points", ha="right", weight="bold")
+
+
+def _ends(figure: Figure) -> tuple[float, float]:
+    return figure.interval or (figure.value or 0.0, figure.value or 0.0)
+
+
+def _label(study: Study, key: str) -> str:
+    figure = next((point.figures[key] for point in study.points if key in point.figures), None)
+    where = f" on {study.board}" if key.startswith("board") else ""
+    return f"{key}{where}, {figure.unit}" if figure else key

@@ -1,0 +1,177 @@
+"""The Pareto front of quality against cost, and whether one point is better than another.
+
+Two points are compared on the same images: by the bootstrap interval, over whole sites, of the mean difference of
+their scores. Their own intervals show how images differ, which the points share.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from itertools import pairwise
+
+import numpy as np
+
+from deploy.studies.tradeoff.measure import Scores
+from deploy.studies.tradeoff.points import Point
+from model.metrics.bootstrap import site_interval
+from profiles import TargetProfile
+from profiles.figures import Figure, Mode, Row, measured, predicted, unavailable
+
+Interval = tuple[float, float]
+
+COSTS = ("board latency", "board energy", "host p50")
+HIGHER_IS_BETTER = {"PSNR": True, "SSIM": True, "LPIPS-squeeze": False}
+
+ALIKE_DB = 0.05
+"""Where the sites are too few for an interval, PSNR within this is not told apart."""
+
+SIGNIFICANT, NOT_SIGNIFICANT, TOO_FEW = "significant", "not significant", "too few sites to tell"
+
+
+@dataclass(frozen=True, eq=False)
+class Measured:
+    """A point with all its figures.
+
+    Attributes:
+        name: of the point; of a published run, as it is printed.
+        figures: by name; unavailable ones with the reason.
+        text: words beside them.
+        point: None of a published run.
+        images: scores of each image, in the order of the pairs; empty where there are none.
+    """
+
+    name: str
+    figures: Mapping[str, Figure]
+    text: Mapping[str, str]
+    point: Point | None = None
+    images: Sequence[Scores] = field(default=(), repr=False)
+
+    def value(self, key: str) -> float | None:
+        """A figure's value where it can be compared: a published one was found on other images."""
+        figure = self.figures.get(key)
+        return figure.value if figure is not None and figure.mode != "published" else None
+
+    def cost(self, key: str) -> float:
+        """The value of a cost; endless where it has none."""
+        value = self.value(key)
+        return math.inf if value is None else value
+
+    @property
+    def row(self) -> Row:
+        """For tables."""
+        return Row("points", self.name, self.figures, self.text)
+
+
+def pareto_front(points: Sequence[Measured], cost: str, quality: str = "PSNR") -> list[Measured]:
+    """The points than which none is both cheaper and better, by value, from cheap to dear."""
+    sign = 1 if HIGHER_IS_BETTER[quality] else -1
+    known = [point for point in points if None not in (point.value(cost), point.value(quality))]
+    front: list[Measured] = []
+    best = -math.inf
+    for point in sorted(known, key=lambda p: (p.cost(cost), -sign * (p.value(quality) or 0.0))):
+        if sign * (point.value(quality) or 0.0) > best:
+            front.append(point)
+            best = sign * (point.value(quality) or 0.0)
+    return front
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Compares points by their scores on the same images.
+
+    Attributes:
+        sites: of the images, in their order.
+        seed: of the bootstrap.
+    """
+
+    sites: Sequence[str]
+    seed: int
+
+    def difference(self, a: Measured, b: Measured, key: str = "PSNR") -> Figure:
+        """A quality of `a` less that of `b`, with the interval of the paired difference; none below five sites."""
+        first, second = a.value(key), b.value(key)
+        if first is None or second is None or not a.images or not b.images:
+            return unavailable(a.figures[key].unit, f"no {key} of both on the same images")
+        differences = [(x[key] or 0.0) - (y[key] or 0.0) for x, y in zip(a.images, b.images, strict=True)]
+        if not any(differences):  # the same pictures, on however few sites
+            return measured(0.0, a.figures[key].unit, "the same pictures", (0.0, 0.0))
+        interval, words = site_interval(differences, self.sites, np.random.default_rng(self.seed))
+        source = f"{key} less that of {b.name} on the same images, {words}"
+        return measured(first - second, a.figures[key].unit, source, interval)
+
+    def significantly_better(self, a: Measured, b: Measured, key: str = "PSNR") -> bool:
+        """Whether the whole interval of the difference says so; by value, beyond ALIKE_DB, where there is none."""
+        found = self.difference(a, b, key)
+        if found.value is None:
+            return False
+        sign = 1 if HIGHER_IS_BETTER[key] else -1
+        if found.interval is None:
+            return sign * found.value > (ALIKE_DB if key == "PSNR" else 0.0)
+        return min(sign * end for end in found.interval) > 0
+
+    def verdict(self, a: Measured, b: Measured) -> str:
+        """Of a difference in PSNR, in words: not significant where its interval holds 0."""
+        found = self.difference(a, b)
+        if found.interval is None:
+            return TOO_FEW
+        low, high = found.interval
+        return NOT_SIGNIFICANT if low <= 0 <= high else SIGNIFICANT
+
+
+def cost_ratio(a: Measured, b: Measured, cost: str) -> Figure:
+    """How many times the cost of `b` that `a` has, with an interval.
+
+    Two predictions of one board share most of their error: the interval of a ratio of latencies is the board's
+    `pair_width`, and nothing where only the count of tiles differs.
+    """
+    mode: Mode = "measured" if cost.startswith("host") else "predicted"
+    value = a.cost(cost) / b.cost(cost)
+    if mode == "measured":
+        return measured(value, "x", f"{cost} over that of {b.name}, medians of interleaved runs")
+    low, high = _ratio_interval(a, b, cost, value)
+    return predicted(value, "x", (low, high), f"{cost} over that of {b.name}")
+
+
+def _ratio_interval(a: Measured, b: Measured, cost: str, value: float) -> Interval:
+    first, second = a.point, b.point
+    if first and second and first.dpu and second.dpu and first.board == second.board:
+        if _differ_in_tiles_alone(first, second):
+            return value, value
+        width = pair_width(first.dpu.target)
+        if cost == "board latency" and width is not None:
+            return value * math.exp(-width), value * math.exp(width)
+    (a_low, a_high), (b_low, b_high) = (_ends(each.figures[cost]) for each in (a, b))
+    return a_low / b_high, a_high / b_low
+
+
+def _differ_in_tiles_alone(a: Point, b: Point) -> bool:
+    """Whether only the count of tiles differs: the same network, configuration and tile."""
+    same_dpu = a.dpu is not None and b.dpu is not None and a.dpu.name == b.dpu.name
+    return same_dpu and a.variant == b.variant and a.tile_px == b.tile_px
+
+
+def pair_width(target: TargetProfile) -> float | None:
+    """Half the width, in ln, of the interval of a ratio of two latencies; None where the target states none."""
+    stated = target.tables.get("cost", {}).get("pair_width")
+    return stated.low if stated is not None else None
+
+
+def _ends(figure: Figure) -> Interval:
+    return figure.interval or (figure.value or 0.0, figure.value or 0.0)
+
+
+def front_rows(front: Sequence[Measured], cost: str, compare: Comparison) -> list[Row]:
+    """A front's members by number, each with its difference from the next cheaper one."""
+    table = f"front of PSNR against {cost}"
+    keys = dict.fromkeys(("PSNR", cost, *(["board energy"] if cost.startswith("board") else [])))
+    rows = []
+    for number, (cheaper, each) in enumerate(pairwise([None, *front]), 1):
+        assert each is not None  # noqa: S101 - only the first of the pairs is None
+        figures = {key: each.figures[key] for key in keys if key in each.figures}
+        verdict = "cheapest"
+        if cheaper is not None:
+            figures["PSNR gain"] = compare.difference(each, cheaper)
+            figures[f"{cost} ratio"] = cost_ratio(each, cheaper, cost)
+            verdict = compare.verdict(each, cheaper)
+        rows.append(Row(table, f"{number}. {each.name}", figures, {"gain over the next cheaper": verdict}))
+    return rows

@@ -1,0 +1,324 @@
+"""One study: variants, what is measured of each, points with their figures, a front and a recommendation."""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from deploy.bench.tables import PAPER_SIZE, PAPER_TARGET, Swath, parse_size, published_rows
+from deploy.dpu.cost.model import Constants
+from deploy.studies.evaluation.methods import Method, method_named
+from deploy.studies.evaluation.pairs import oversampling_note
+from deploy.studies.evaluation.run import load_pairs
+from deploy.studies.evaluation.scores import Instruments, perceptual_distances
+from deploy.studies.tradeoff.advice import MAP50, Constraint, Recommendation, chosen_cost, recommend
+from deploy.studies.tradeoff.boards import CHAIN, board_figures
+from deploy.studies.tradeoff.measure import (
+    TILE_PX,
+    Benchmark,
+    Measurements,
+    Scores,
+    host_figures,
+    host_tile,
+    host_times,
+    key_of,
+    machine,
+    make_int8,
+    pixels_sha256,
+)
+from deploy.studies.tradeoff.pareto import Comparison, Measured, front_rows, pareto_front
+from deploy.studies.tradeoff.points import (
+    FLOAT,
+    Point,
+    Variant,
+    configurations,
+    network_points,
+    network_variants,
+)
+from model.io.files import IMAGE_SUFFIXES, sha256
+from model.io.images import list_images
+from model.metrics.backbones import find_backbone
+from model.metrics.bootstrap import LEAST_SITES
+from model.progress import steps
+from model.traditional.peers import PEERS
+from model.traditional.settings import QUALITIES
+from profiles import TargetProfile, load_sensor, load_target
+from profiles.errors import MachineError
+from profiles.figures import Figure, Row, unavailable
+from profiles.sensor import SensorProfile
+from profiles.sensor_file import reference_for
+
+if TYPE_CHECKING:
+    from deploy.studies.tradeoff.labelled import Labelled
+
+LPIPS = "LPIPS-squeeze"
+
+
+@dataclass(frozen=True)
+class Study:
+    """What a study found.
+
+    Attributes:
+        board: the first one, which the front and the recommendation are about.
+        points: all of them, in the order networks, chains, other libraries, the paper's runs.
+        front: those of the first board on the Pareto front, from cheap to dear.
+        front_rows: the same by number, each with its difference from the next cheaper one.
+        cost: the figure that the front is against.
+        recommendation: what to take.
+        notes: what a reader must know.
+    """
+
+    board: str
+    points: Sequence[Measured]
+    front: Sequence[Measured]
+    front_rows: Sequence[Row]
+    cost: str
+    recommendation: Recommendation
+    notes: Sequence[str]
+
+    @property
+    def rows(self) -> tuple[Row, ...]:
+        """For the document."""
+        return (self.recommendation.row, *self.front_rows, *(point.row for point in self.points))
+
+
+def run_study(
+    networks: Sequence[str],
+    out: Path,
+    *,
+    images: Path | None = None,
+    sensor: str,
+    reference: str,
+    targets: Sequence[str],
+    size_px: tuple[int, int],
+    budget: Sequence[Constraint] = (),
+    need: Sequence[Constraint] = (),
+    lpips: Path | None = None,
+    calibration: Path | None = None,
+    labelled: Path | None = None,
+    detector: Path | None = None,
+    classes: str | None = None,
+    seed: int = 0,
+    log: Callable[[str], None] = lambda _: None,
+) -> Study:
+    """Measure each variant on the images, predict each point on the boards, and weigh them.
+
+    Args:
+        networks: shipped names and files.
+        out: folder of the measurements, which a later run goes on with.
+        images: folder of scenes; drawn ones if None.
+        sensor: profile of the degraded images.
+        reference: profile of the reference images.
+        targets: boards, the first of which the front and the recommendation are about.
+        size_px: width and height of the swath.
+        budget: what can be afforded.
+        need: what must be reached.
+        lpips: weights of SqueezeNet 1.1, or a folder of backbones.
+        calibration: folder of scenes to quantise the user's networks on; drawn ones if None.
+        labelled: folder of labelled images for a detector, whose mAP50 is then a figure of each point.
+        detector: ONNX file; the embedded one if None.
+        classes: labelled classes under the detector's names.
+        seed: of every random draw.
+        log: is told what a user should know on the way.
+
+    Raises:
+        BeersError: a network, an image, a profile or weights that cannot be used.
+    """
+    swath, boards = Swath(*size_px), [load_target(target) for target in targets]
+    for board in boards:
+        Constants.of(configurations(board)[0])  # a board without them is refused before anything is measured
+    degraded, kept = load_sensor(sensor), Measurements.open(out / "measurements.json")
+    quantise = partial(make_int8, folder=out / "int8", scenes=calibration, sensor=sensor, seed=seed)
+    variants = network_variants(networks, degraded, quantise, log)
+    points = [point for variant in variants for point in network_points(variant, boards, swath)]
+    benchmark, said = _benchmark(images, degraded, reference_for(degraded, reference), lpips, seed)
+    scenes = _labelled(labelled, detector, classes, benchmark)
+    measured = _measured([*points, *_others(boards)], benchmark, scenes, kept, swath, log)
+    if boards[0].name == PAPER_TARGET and size_px == parse_size(PAPER_SIZE):
+        measured += _published()
+    notes = (*_notes(benchmark, boards[0].name), *(scenes.notes if scenes else ()), *said)
+    return _weighed(measured, boards[0], Comparison(benchmark.sites, seed), budget, need, notes)
+
+
+def _weighed(
+    points: Sequence[Measured],
+    board: TargetProfile,
+    compare: Comparison,
+    budget: Sequence[Constraint],
+    need: Sequence[Constraint],
+    notes: Sequence[str],
+) -> Study:
+    """The front and the recommendation, of the points of one board."""
+    here = [each for each in points if each.point and each.point.board in (None, board)]
+    cost = chosen_cost(here, budget)
+    front = pareto_front(here, cost)
+    recommended = recommend(here, budget, need, compare)
+    return Study(board.name, points, front, front_rows(front, cost, compare), cost, recommended, notes)
+
+
+def _benchmark(
+    images: Path | None, degraded: SensorProfile, reference: SensorProfile, lpips: Path | None, seed: int
+) -> tuple[Benchmark, list[str]]:
+    """What all variants are measured on, and what a reader must know of the images."""
+    pairs, small = load_pairs(images, None, degraded, reference, seed)
+    distances = {LPIPS: perceptual_distances(lpips)[LPIPS]}
+    backbone, instruments = find_backbone("squeeze", lpips), Instruments(distances, degraded.nominal().max_dn)
+    weights = sha256(backbone) if backbone else ""
+    said = [oversampling_note(pairs, degraded), f"left out, too small: {', '.join(small)}" if small else ""]
+    notes = [f"{note[0].upper()}{note[1:]}." for note in said if note]
+    return Benchmark(pairs, degraded, reference, instruments, weights, seed), notes
+
+
+def _others(boards: Sequence[TargetProfile]) -> list[Point]:
+    """The traditional chains on each board's processor, and other libraries' methods on this machine."""
+    chains = [Variant(f"traditional-{quality}", FLOAT, f"traditional-{quality}") for quality in QUALITIES]
+    points = [Point(chain, board) for chain in chains for board in boards]
+    return points + [Point(Variant(peer, FLOAT, peer)) for peer in PEERS]
+
+
+def _labelled(
+    images: Path | None, detector: Path | None, classes: str | None, benchmark: Benchmark
+) -> "Labelled | None":
+    if images is None:
+        return None
+    from deploy.studies.tradeoff.labelled import Labelled  # the detection study, for those who ask for it
+
+    return Labelled.open(images, detector, classes, benchmark)
+
+
+def _measured(
+    points: Sequence[Point],
+    benchmark: Benchmark,
+    labelled: "Labelled | None",
+    kept: Measurements,
+    swath: Swath,
+    log: Callable[[str], None],
+) -> list[Measured]:
+    """Every point with its figures; a method whose library is not installed is left out."""
+    methods = _methods([point.variant for point in points], benchmark, log)
+    there = [point for point in points if point.variant in methods]
+    images: dict[str, list[dict[str, float | None]]] = {}
+    found: dict[Variant, Figure] = {}
+    with steps("tradeoff", len(there) + 1) as bar:
+        for point in there:
+            method = methods[point.variant]
+            bar.advance(0, f"measuring {point.name}")
+            images[point.name] = _scores(point, method, benchmark, kept)
+            if labelled is not None and point.variant not in found:
+                key = key_of(map50=benchmark.depends(point.variant), labelled=labelled.digest)
+                found[point.variant] = labelled.figure(kept.make(key, partial(labelled.measure, method)))
+            bar.advance(1, point.name)
+        host = _host(methods, benchmark, kept)
+        bar.advance(1, "timed on this machine")
+    return [_point(each, methods[each.variant], images[each.name], benchmark, found, host, swath) for each in there]
+
+
+def _point(
+    point: Point,
+    method: Method,
+    images: Sequence[Scores],
+    benchmark: Benchmark,
+    found: Mapping[Variant, Figure],
+    host: Mapping[Variant, Mapping[str, Figure]],
+    swath: Swath,
+) -> Measured:
+    """A point with all its figures, in the order in which tables show them."""
+    pictures = {**benchmark.means(images), **_detected(point, found)}
+    figures = {**pictures, **host[point.variant], **board_figures(point, swath, _slower(point, host))}
+    return Measured(point.name, figures, _text(point, method), point, images)
+
+
+def _detected(point: Point, found: Mapping[Variant, Figure]) -> dict[str, Figure]:
+    """mAP50 where labelled images are given; with exact halos alone, for how often a seam cuts an object differs."""
+    if not found:
+        return {}
+    reason = "measured with exact halos alone"
+    return {MAP50: found[point.variant] if point.halo_px is None else unavailable("%", reason)}
+
+
+def _methods(variants: Sequence[Variant], benchmark: Benchmark, log: Callable[[str], None]) -> dict[Variant, Method]:
+    found: dict[Variant, Method] = {}
+    for variant in dict.fromkeys(variants):
+        try:
+            found[variant] = method_named(variant.source, benchmark.degraded, benchmark.reference)
+        except MachineError as error:
+            log(f"{variant.name} is left out: {error}")
+    return found
+
+
+def _scores(point: Point, method: Method, benchmark: Benchmark, kept: Measurements) -> list[dict[str, float | None]]:
+    """Scores of each image: those of the variant, or with seams where the halo is too small for exact ones."""
+    about = {"scores": benchmark.depends(point.variant), "images": benchmark.digest}
+    if point.halo_px is None:
+        return list(kept.make(key_of(**about), lambda: benchmark.score(method.restore)))
+    key = key_of(**about, tile_px=point.tile_px, halo_px=point.halo_px)
+    return list(kept.make(key, lambda: benchmark.score_in_tiles(point.variant, method.restore, point)))
+
+
+def _host(
+    methods: Mapping[Variant, Method], benchmark: Benchmark, kept: Measurements
+) -> dict[Variant, dict[str, Figure]]:
+    """What each variant takes on this machine, all timed together."""
+    tile = host_tile(benchmark)
+    names = [benchmark.depends(variant) for variant in methods]
+    key = key_of(times=names, tile=pixels_sha256(tile), side=TILE_PX, machine=machine())
+    times = kept.make(key, lambda: host_times([method.restore for method in methods.values()], tile))
+    return {variant: host_figures(each, tile.size) for variant, each in zip(methods, times, strict=True)}
+
+
+def _slower(point: Point, host: Mapping[Variant, Mapping[str, Figure]]) -> float | None:
+    """How many times as long a chain takes here as the one whose time on a board is stated; None of other methods."""
+    if point.board is None or point.dpu is not None:
+        return None
+    medians = {variant.method: figures["host p50"].value or 1.0 for variant, figures in host.items()}
+    return medians[point.variant.method] / medians.get(CHAIN, medians[point.variant.method])
+
+
+def _text(point: Point, method: Method) -> dict[str, str]:
+    return {
+        "board": point.board.name if point.board else "this machine",
+        "configuration": point.dpu.name if point.dpu else "none",
+        "tile": str(point.tile_px) if point.dpu else "none",
+        "halo": ("exact" if point.halo_px is None else str(point.halo_px)) if point.dpu else "none",
+        "method": point.variant.method,
+        "precision": point.variant.precision,
+        "sensor": method.sensor_known,
+    }
+
+
+def _published() -> list[Measured]:
+    """The paper's two runs as printed; its images are others."""
+    words = {"board": PAPER_TARGET}
+    return [Measured(r.name, {f"board {key}": f for key, f in r.figures.items()}, words) for r in published_rows()]
+
+
+def _notes(benchmark: Benchmark, board: str) -> Iterator[str]:
+    sites = len(set(benchmark.sites))
+    yield f"No board was used: figures of {board} are predicted, but for the paper's, which are published."
+    yield f"PSNR is the mean over {len(benchmark.pairs)} images of {sites} sites; clipped pixels are left out."
+    yield (
+        "Gains are differences on the same images from the next cheaper point of the front, with 95 % bootstrap "
+        "intervals over whole sites; one whose interval holds 0 is not significant."
+    )
+    if sites < LEAST_SITES:
+        yield f"Of {sites} sites, fewer than {LEAST_SITES}, no interval is shown: none could be trusted."
+    yield "Exact halos give the same pictures in tiles of any size; smaller ones were measured in the point's tiles."
+    yield "The chains know both sensors; what a network knows of them stands beside it."
+
+
+def input_files(
+    networks: Sequence[str],
+    images: Path | None,
+    calibration: Path | None,
+    lpips: Path | None,
+    labelled: Path | None,
+    detector: Path | None,
+) -> tuple[Path, ...]:
+    """The files that the figures rest on, besides shipped ones; arguments as of `run_study`."""
+    named = [path for path in map(Path, networks) if path.is_file()]
+    folders = [folder for folder in (images, calibration) if folder]
+    tree = sorted(labelled.rglob("*")) if labelled else []
+    pictures = [path for path in tree if path.suffix.lower() in IMAGE_SUFFIXES]
+    single = [path for path in (find_backbone("squeeze", lpips), detector) if path]
+    return (*named, *(path for folder in folders for path in list_images(folder)), *single, *pictures)

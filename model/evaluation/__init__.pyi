@@ -1,9 +1,0 @@
-from .methods import Method as Method
-from .pairs import NamedPair as NamedPair
-from .pairs import read_pairs as read_pairs
-from .pairs import simulate_pairs as simulate_pairs
-from .run import Evaluation as Evaluation
-from .run import evaluate_methods as evaluate_methods
-from .run import load_pairs as load_pairs
-from .scores import Instruments as Instruments
-from .scores import perceptual_distances as perceptual_distances

@@ -1,0 +1,83 @@
+"""The recipe that `simulate` leaves beside a folder of pairs: the sensors that made them, and the scenes they saw."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from model.io.images import site_of
+from model.shipped import SENSOR
+from profiles.errors import OptionError
+from profiles.sensor import SensorProfile, same_instrument
+from profiles.sensor_file import load_sensor, reference_beside, sensor_from_json
+from profiles.toml import read_json
+
+
+@dataclass(frozen=True)
+class PairsRecipe:
+    """The sensors that made a folder of pairs, and the scenes that they saw.
+
+    Attributes:
+        degraded: profile of the degraded images.
+        reference: profile of the reference images.
+        scenes: file names in their order; None for a drawn scene.
+    """
+
+    degraded: SensorProfile
+    reference: SensorProfile
+    scenes: tuple[str | None, ...]
+
+    def site(self, stem: str) -> str:
+        """The site of the pair NUMBER-SCENE or NUMBER-SCENE-PATCH: two frames of a site, or two patches, are one.
+
+        A drawn scene is a site of its own.
+        """
+        number = stem.split("-", 1)[0]
+        known = number.isdecimal() and int(number) < len(self.scenes)
+        scene = self.scenes[int(number)] if known else stem
+        return f"{number}-drawn" if scene is None else site_of(scene)
+
+
+def read_pairs_recipe(folder: Path) -> PairsRecipe | None:
+    """The recipe beside a folder's pairs; None where there is none.
+
+    Raises:
+        OptionError: a recipe that is none of ours.
+        ProfileError: a sensor in it that cannot be.
+    """
+    path = folder / "recipe.json"
+    if not path.exists():
+        return None
+    try:
+        raw: Any = read_json(path)
+        scenes = tuple(str(s["name"]) if "sha256" in s else None for s in raw["scenes"])
+        sensors = {role: dict(raw[role]) for role in ("degraded", "reference")}
+    except (LookupError, OSError, TypeError, ValueError) as error:
+        remedy = "make the pairs anew, or remove it and say --sensor"
+        raise OptionError(str(path), expected="a dataset's recipe", got="another file", remedy=remedy) from error
+    profiles = {role: sensor_from_json(f"{path} {role}", raw) for role, raw in sensors.items()}
+    return PairsRecipe(profiles["degraded"], profiles["reference"], scenes)
+
+
+def profiles_for(
+    sensor: str | None, reference: str | None, recipe: PairsRecipe | None, say: Callable[[str], None]
+) -> tuple[SensorProfile, SensorProfile]:
+    """The profiles of degraded and reference images: the recipe's where there is one, else those named.
+
+    Raises:
+        OptionError: a name that contradicts the recipe.
+        ProfileError: no such profile, or a faulty one.
+    """
+    if recipe is None:
+        degraded = load_sensor(sensor or SENSOR)
+        return degraded, reference_beside(degraded, reference, say)
+    named = sensor and load_sensor(sensor), reference and load_sensor(reference).in_units_of(recipe.degraded)
+    _require_made_by("--sensor", named[0] or None, recipe.degraded)
+    _require_made_by("--reference", named[1] or None, recipe.reference)
+    return recipe.degraded, recipe.reference
+
+
+def _require_made_by(option: str, named: SensorProfile | None, made: SensorProfile) -> None:
+    if named is not None and not same_instrument(named, made):
+        expected = f"the sensor that made the pairs, {made.name} with the numbers in recipe.json"
+        raise OptionError(option, expected=expected, got=f"{named.name} with other numbers", remedy="leave it out")

@@ -1,0 +1,121 @@
+"""The profiles hold what the scripts find, and the published networks are what they are called."""
+
+import math
+
+import pytest
+
+from benchmarks.cost_model.builder import Builder
+from benchmarks.cost_model.chain_rates import Rates
+from benchmarks.cost_model.chain_time import BOUND_BY, HEIGHT_PX, WIDTH_PX, s_per_mpx
+from benchmarks.cost_model.chain_work import UNITS, chain_work
+from benchmarks.cost_model.fit import Cases, fit, rounded
+from benchmarks.cost_model.published import (
+    NETWORKS,
+    boards,
+    convbeers,
+    network_case,
+    published_cases,
+    published_rates,
+    written,
+)
+from benchmarks.cost_model.validation import SHARE, tolerance_rank
+from deploy.dpu.board import load_dpu
+from deploy.dpu.checker.placement import place
+from deploy.dpu.cost.latency import predict
+from deploy.dpu.cost.model import Constants, Structure
+from model.traditional.settings import QUALITIES
+from profiles import load_target
+from profiles.target import board_names
+
+# Parameters without biases and batch norms, from the papers or their repositories.
+WEIGHTS = {"resnet-18": 11.68e6, "vgg-16": 138.34e6, "inception v3": 23.80e6, "yolo v5 n": 1.86e6}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("board", boards())
+def test_the_profile_holds_what_the_fit_finds(board: str) -> None:
+    dpu = load_dpu(board)
+    assert rounded(fit(Cases(published_cases(board), Structure.of(dpu)))) == Constants.of(dpu)
+
+
+@pytest.mark.slow
+def test_every_network_is_the_published_one_and_passes_the_rules_of_its_boards() -> None:
+    """AMD compiled them for these boards: a rule that refuses one is wrong, or it is written down wrongly."""
+    for name, entry in NETWORKS.items():
+        net = written(name).network
+        assert sum(op.operations for op in net.operations) == pytest.approx(entry.operations, rel=0.05), name
+        if name in WEIGHTS:
+            assert sum(op.weight_bytes for op in net.operations) == pytest.approx(WEIGHTS[name], rel=0.01), name
+        read = {tensor for op in net.operations for tensor in op.inputs} | set(net.outputs)
+        assert [op.name for op in net.operations if op.output not in read] == [], name
+        for board in {rate["board"] for rate in published_rates() if rate["network"] == name}:
+            assert [node.op.name for node in place(net, load_dpu(board)).failed] == [], (name, board)
+
+
+@pytest.mark.parametrize(("board", "name"), [("vck190", "resnet-50"), ("zcu102", "rcan"), ("vek280", "erfnet")])
+def test_the_fit_and_the_prediction_are_one_formula(board: str, name: str) -> None:
+    dpu = load_dpu(board)
+    case = Cases((network_case(name, dpu, (1.0,)),), Structure.of(dpu))
+    times = case.times(Constants.of(dpu))
+    found = predict(place(written(name).network, dpu), dpu, NETWORKS[name].host)
+    assert found.handlers / found.latency_s == pytest.approx(1 / float(times.alone_s[0] + times.host_s[0]))
+    assert found.fps == pytest.approx(math.exp(float(case.predicted(times)[0])))
+
+
+def test_the_fitted_range_ends_with_the_largest_network() -> None:
+    dpu = load_dpu("vck190")
+    assert predict(place(written("rcan").network, dpu), dpu).outside == ()
+    assert predict(place(convbeers(1280), dpu), dpu).outside
+
+
+def test_the_papers_network_is_in_no_fit() -> None:
+    assert not [name for name in NETWORKS if "beers" in name]
+    assert not [row for row in published_cases("vck190") if 7.2 in row.fps]
+
+
+@pytest.mark.parametrize("count", [3, 14, 30, 57])
+def test_the_rank_of_a_tolerance_is_the_least_that_is_sure_enough(count: int) -> None:
+    def sure(rank: int) -> float:
+        """That fewer than `rank` of the draws fall among SHARE."""
+        return math.fsum(math.comb(count, k) * SHARE**k * (1 - SHARE) ** (count - k) for k in range(rank))
+
+    rank = tolerance_rank(count)
+    assert sure(rank) >= 0.75 or rank == count
+    assert sure(rank - 1) < 0.75
+
+
+def test_shapes_that_do_not_fit_are_refused() -> None:
+    b = Builder(8, 8, 4)
+    with pytest.raises(ValueError, match="shapes differ"):
+        b.add(b.conv(b.image, 8), b.image)
+
+
+# Of one core of a Zen 4 server, and the pipeline's CPU time on it for 256 x 256.
+MEASURED = Rates(
+    {
+        "box sums": 4.71e10,
+        "group products": 3.38e10,
+        "factorisations": 2.84e9,
+        "selection": 8.21e7,
+        "transforms": 1.44e10,
+        "passes": 4.68e10,
+        "strided": 5.24e9,
+        "gathers": 9.74e9,
+        "calls": 4.27e5,
+    },
+    {"products": 9.00e10, "integers": 4.70e9, "memory": 4.68e10},
+)
+MEASURED_S, MEASURED_PX = 0.470, 256
+
+
+@pytest.mark.parametrize("board", board_names())
+def test_the_stored_time_of_the_pipeline_is_what_the_model_says(board: str) -> None:
+    """Of rates measured on another day: within a fifth at each end."""
+    target, quality = load_target(board), QUALITIES["standard"]
+    explained = math.fsum(MEASURED.times_s(chain_work(MEASURED_PX, MEASURED_PX, quality)).values()) / MEASURED_S
+    times_s = MEASURED.times_s(chain_work(HEIGHT_PX, WIDTH_PX, quality))
+    shares = {kind: explained * time_s / math.fsum(times_s.values()) for kind, time_s in times_s.items()}
+    assert set(shares) == set(UNITS) == set(BOUND_BY)
+    ends = s_per_mpx(1e6 * MEASURED_S / MEASURED_PX**2, shares, MEASURED, target)
+    stored = target.constant("cpu", "chain_s_per_mpx")
+    assert ends == pytest.approx((stored.low, stored.high), rel=0.2)

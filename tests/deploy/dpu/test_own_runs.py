@@ -1,0 +1,72 @@
+"""Runs of an owner's board correct the cost model by one factor for the DPU and one for the host."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from deploy.bench.tables import predict_file
+from deploy.dpu.board import load_dpu
+from deploy.dpu.cost.own_runs import OwnRuns, read_own_runs
+from profiles.errors import OptionError
+from tests.deploy.dpu.graphs import Sketch, integer_convbeers
+
+DPU = load_dpu("vck190")
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A network that the DPU bounds, and one that the host bounds."""
+    path = tmp_path_factory.mktemp("runs")
+    integer_convbeers(path / "deep.onnx", 4, 64)
+    sketch = Sketch(8)
+    sketch.save(path / "flat.onnx", sketch.conv("image", (1, 8, 1, 1)))
+    return path
+
+
+def runs_of(folder: Path, **times_as_fast: float) -> OwnRuns:
+    """A run of each network named, so many times as fast as predicted."""
+    runs = [
+        {"model": f"{name}.onnx", "tile_px": 320, "fps": factor * predict_file(folder / f"{name}.onnx", DPU, 320).fps}
+        for name, factor in times_as_fast.items()
+    ]
+    (folder / "board.json").write_text(json.dumps(runs))
+    return read_own_runs(folder / "board.json", DPU)
+
+
+def test_each_part_is_corrected_by_the_runs_that_it_bounds(folder: Path) -> None:
+    found = runs_of(folder, deep=0.5, flat=2.0)
+    assert (found.dpu_factor, found.host_factor) == pytest.approx((0.5, 2.0))
+    for row in found.run_rows():
+        before, after = (abs(row.figures[f"{key} is off by"].value or 0) for key in ("shipped", "corrected"))
+        assert after < 0.1 * before
+
+
+def test_a_part_without_runs_keeps_its_constants(folder: Path) -> None:
+    found = runs_of(folder, deep=0.5)
+    assert found.host_factor == 1.0
+    before, after = (predict_file(folder / "deep.onnx", dpu, 320) for dpu in (DPU, found.applied(DPU)))
+    assert after.batch_time_s == pytest.approx(2 * before.batch_time_s)
+    assert after.host_s == pytest.approx(before.host_s)
+    assert after.width == before.width
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "{",
+        "[]",
+        "3",
+        '[{"fps": 3}]',
+        '[{"model": "deep.onnx", "fps": 0}]',
+        '[{"model": "deep.onnx", "fps": true}]',
+        '[{"network": "resnet-50", "fps": 3}]',
+        '[{"model": "deep.onnx", "fps": 3, "tile_px": 8}]',
+        '[{"model": "deep.onnx", "fps": 3, "tile_px": 64.5}]',
+        '[{"model": "deep.onnx", "fps": 3, "speed": 8}]',
+    ],
+)
+def test_bad_runs_are_refused(folder: Path, text: str) -> None:
+    (folder / "board.json").write_text(text)
+    with pytest.raises(OptionError, match=r"board\.json"):
+        read_own_runs(folder / "board.json", DPU)

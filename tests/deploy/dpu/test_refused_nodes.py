@@ -1,0 +1,152 @@
+"""What the DPU refuses at a network's ends, and what that costs."""
+
+import math
+from pathlib import Path
+
+import numpy as np
+import onnx
+import pytest
+from onnx import helper
+
+from deploy.bench.tables import host_words, predict_file
+from deploy.dpu.board import load_dpu
+from deploy.dpu.checker.placement import place
+from deploy.dpu.cost.latency import Prediction
+from deploy.dpu.cost.model import between, refused_interval_s
+from deploy.dpu.reading import read_network
+from profiles.errors import ModelError
+from tests.deploy.dpu.graphs import IntegerSketch, Sketch
+
+DPU = load_dpu("vck190")
+
+
+def segmenter(path: Path, where: str, scale: float = 8.0, behind: str = "") -> Path:
+    """Scores of 19 classes at an eighth of the size, enlarged."""
+    sketch = Sketch(3)
+    deep = sketch.conv("image", (32, 3, 3, 3), strides=[8, 8])
+    scores = sketch.conv(deep, (19, 32, 1, 1))
+    sizes = sketch.constant(np.array([1, 1, scale, scale], np.float32))
+    last = sketch.node("Resize", scores, "", sizes, mode="linear", coordinate_transformation_mode=where)
+    return sketch.save(path, sketch.node(behind, last) if behind else last)
+
+
+def predicted(path: Path) -> Prediction:
+    return predict_file(path, DPU, 128)
+
+
+def test_what_the_dpu_enlarges_costs_the_processor_nothing(tmp_path: Path) -> None:
+    """UG1414: eight times with corners in place, not with half pixels."""
+    on_dpu, on_cpu = (predicted(segmenter(tmp_path / f"{w}.onnx", w)) for w in ("asymmetric", "half_pixel"))
+    assert (on_dpu.refused, on_dpu.refused_s) == ((), (0.0, 0.0))
+    assert len(on_cpu.refused) == 1
+    assert 0 < on_cpu.refused_s[0] < on_cpu.refused_s[1]
+    assert on_cpu.fps_interval[0] < on_dpu.fps_interval[0]
+    assert on_cpu.host_interval_s[1] > on_cpu.refused_s[1]
+
+
+def test_what_follows_the_processor_stays_with_it(tmp_path: Path) -> None:
+    path = segmenter(tmp_path / "n.onnx", "half_pixel", behind="GlobalMaxPool")
+    placement = place(read_network(path, 128), DPU)
+    assert [node.device for node in placement.nodes] == ["DPU", "DPU", "CPU", "host"]
+    assert [cut.onto_dpu for cut in placement.cuts] == [True, False]
+
+
+def test_a_refused_node_in_front_is_the_processors_too(tmp_path: Path) -> None:
+    sketch = Sketch(8)
+    path = sketch.save(tmp_path / "n.onnx", sketch.conv(sketch.node("Softmax", "image", axis=1)))
+    assert predict_file(path, DPU, 20).refused == (sketch.nodes[0].name,)
+
+
+def test_between_two_convolutions_of_the_dpu_there_is_no_prediction(tmp_path: Path) -> None:
+    sketch = Sketch(8)
+    skip = sketch.conv("image")
+    summed = sketch.node("Add", skip, sketch.node("Softmax", skip, axis=1))
+    path = sketch.save(tmp_path / "n.onnx", sketch.conv(summed))
+    with pytest.raises(ModelError, match="softmax"):
+        predict_file(path, DPU, 20)
+
+
+def test_numbers_that_the_dpu_refuses_are_no_work_for_the_processor(tmp_path: Path) -> None:
+    sketch = IntegerSketch()
+    first = sketch.qconv(sketch.quantised("image"), (4, 1, 3, 3))
+    last = sketch.qconv(first, (4, 4, 3, 3), weight_scale=0.3)
+    path = sketch.save(tmp_path / "n.onnx", sketch.node("DequantizeLinear", last, *sketch.numbers))
+    with pytest.raises(ModelError, match="check"):
+        predict_file(path, DPU, 20)
+
+
+@pytest.mark.parametrize("board", ["vck190", "zcu102", "kv260"])
+def test_time_is_in_proportion_to_the_work_and_lies_between_peak_and_plain_code(tmp_path: Path, board: str) -> None:
+    dpu = load_dpu(board)
+    ops = [read_network(segmenter(tmp_path / f"{px}.onnx", "half_pixel"), px).operations[-1] for px in (128, 256)]
+    (low, high), larger = (refused_interval_s([op], dpu) for op in ops)
+    assert larger == pytest.approx((4 * low, 4 * high))
+    assert refused_interval_s(ops[:1] * 3, dpu) == pytest.approx((3 * low, 3 * high))
+    clock, cores = dpu.limit("cpu", "clock_ghz"), dpu.whole("cpu", "cores")
+    written = 4 * ops[0].out_bytes
+    assert low * cores > written / dpu.limit("cpu", "moved_bytes_per_s").high
+    assert high * cores > ops[0].out_bytes / (1e9 * clock.low)
+    assert low < between((low, high)) < high
+    assert refused_interval_s([], dpu) == (0.0, 0.0)
+
+
+def test_what_it_runs_is_said_with_its_time(tmp_path: Path) -> None:
+    found = predicted(segmenter(tmp_path / "n.onnx", "half_pixel"))
+    _, said = host_words(found, DPU)
+    assert "vck190" in said
+    assert found.refused[0] in said
+    assert len(host_words(predicted(segmenter(tmp_path / "d.onnx", "asymmetric")), DPU)) == 1
+
+
+def heads(path: Path, *ends: str) -> Path:
+    """Two maps of 255 channels, a half and a quarter of the size, the image's pixels first moved to channels."""
+    sketch = Sketch(3)
+    apart = sketch.node("SpaceToDepth", "image", blocksize=2)
+    half = sketch.conv(apart, (16, 12, 3, 3))
+    quarter = sketch.conv(half, (32, 16, 3, 3), strides=[2, 2])
+    results = [sketch.conv(half, (255, 16, 1, 1)), sketch.conv(quarter, (255, 32, 1, 1))]
+    for end in ends:
+        results = [sketch.node(end, result) for result in results]
+    return sketch.save(path, *results)
+
+
+@pytest.mark.parametrize("ends", [(), ("Sigmoid",)])
+def test_several_heads_are_copied_and_are_no_image(tmp_path: Path, ends: tuple[str, ...]) -> None:
+    path = heads(tmp_path / "h.onnx", *ends)
+    placement = place(read_network(path, 64), DPU)
+    assert placement.failed == ()
+    assert sum(cut.size_bytes or 0 for cut in placement.cuts if not cut.onto_dpu) == 255 * (32**2 + 16**2)
+    found = predict_file(path, DPU, 64)
+    assert (found.task, found.refused) == ("copy", ())
+
+
+def test_pixels_spelled_out_are_moved_as_the_operator_moves_them(tmp_path: Path) -> None:
+    """torch writes pixel_unshuffle as Reshape, Transpose, Reshape."""
+    plain, spelled = heads(tmp_path / "h.onnx"), onnx.load(heads(tmp_path / "s.onnx"))
+    sizes = {"apart": [1, 3, 32, 2, 32, 2], "together": [1, 12, 32, 32]}
+    spelled.graph.initializer.extend(
+        helper.make_tensor(name, onnx.TensorProto.INT64, [len(v)], v) for name, v in sizes.items()
+    )
+    moved = spelled.graph.node[0].output[0]
+    row = [
+        helper.make_node("Reshape", ["image", "apart"], ["six"], "six"),
+        helper.make_node("Transpose", ["six"], ["turned"], "turned", perm=[0, 1, 3, 5, 2, 4]),
+        helper.make_node("Reshape", ["turned", "together"], [moved], "moved"),
+    ]
+    nodes = [*row, *list(spelled.graph.node)[1:]]
+    del spelled.graph.node[:]
+    spelled.graph.node.extend(nodes)
+    for side in spelled.graph.input[0].type.tensor_type.shape.dim[2:]:
+        side.dim_value = 64
+    onnx.save(spelled, tmp_path / "s.onnx")
+    one, other = (predict_file(path, DPU, 64) for path in (plain, tmp_path / "s.onnx"))
+    assert math.isclose(one.fps, other.fps)
+    assert other.refused == ()
+
+
+def test_results_of_few_bands_become_an_image_and_scores_do_not(tmp_path: Path) -> None:
+    for channels, block, task in ((12, 2, "image"), (76, 2, "copy")):
+        sketch = Sketch(3)
+        last = sketch.node("DepthToSpace", sketch.conv("image", (channels, 3, 3, 3)), blocksize=block)
+        path = sketch.save(tmp_path / f"{channels}.onnx", last)
+        assert predict_file(path, DPU, 64).task == task

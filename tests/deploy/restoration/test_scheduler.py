@@ -1,0 +1,241 @@
+"""Tiles run by the workers of a Dask scheduler: the bytes of a run without, whatever becomes of the workers."""
+
+import os
+import signal
+import sys
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnx
+import pytest
+import tifffile
+
+from deploy import cluster
+from deploy.cluster import open_cluster
+from deploy.networks import shipped_pair
+from deploy.restoration.engine import Restorer, Tile
+from deploy.restoration.options import Options, Runtime
+from deploy.restoration.run import restore_file
+from profiles.errors import ImageError, MachineError
+from quant.onnx_file import load_onnx, save_onnx
+from quant.session import open_session, run
+from quant.tiling.walk import tiling_of
+from tests.deploy.two_workers import local_cluster
+from tests.quant.tiling.small_networks import espcn, float_unet, four_bands
+
+pytestmark = pytest.mark.slow
+
+pytest.importorskip("distributed", reason="the extra 'dask' is not installed")
+
+TILE_PX = 64
+
+
+@pytest.fixture(scope="module")
+def local() -> Iterator[Any]:
+    with local_cluster() as found:
+        yield found
+
+
+@pytest.fixture
+def scheduler(local: Any) -> str:
+    return str(local.scheduler_address)
+
+
+@pytest.fixture
+def image(tmp_path: Path) -> Path:
+    tifffile.imwrite(tmp_path / "in.tif", noise(900, 260), tile=(16, 16))
+    return tmp_path / "in.tif"
+
+
+def noise(*shape: int) -> np.ndarray:
+    return np.random.default_rng(1).integers(1, 4096, shape).astype(np.uint16)
+
+
+def silent(_: str) -> None:
+    """Says nothing."""
+
+
+def both(folder: Path, options: Options, scheduler: str) -> tuple[bytes, bytes]:
+    """The bytes of one process, and those of two workers."""
+    one, two = folder / "one.tif", folder / "two.tif"
+    restore_file(folder / "in.tif", one, options, silent)
+    row = restore_file(folder / "in.tif", two, replace(options, scheduler=scheduler), silent)
+    assert row.text["workers"] == scheduler
+    assert sorted(p.name for p in folder.iterdir()) == ["in.tif", "one.tif", "two.tif"]
+    return one.read_bytes(), two.read_bytes()
+
+
+@pytest.mark.parametrize("halo", ["exact", "2"])
+@pytest.mark.parametrize("shape", [(61, 83), (150, 20), (3, 5)])
+def test_two_workers_give_the_bytes_of_one_process(
+    shape: tuple[int, int], halo: str, model: Path, scheduler: str, tmp_path: Path
+) -> None:
+    tifffile.imwrite(tmp_path / "in.tif", noise(*shape))
+    one, two = both(tmp_path, Options(model, tile_px=23, halo=halo), scheduler)
+    assert two == one
+
+
+def test_and_with_int8(scheduler: str, tmp_path: Path) -> None:
+    tifffile.imwrite(tmp_path / "in.tif", noise(171, 97))
+    one, two = both(tmp_path, Options(shipped_pair()[1], tile_px=TILE_PX), scheduler)
+    assert two == one
+
+
+def test_and_with_a_network_for_each_band(
+    model: Path, scheduler: str, tmp_path: Path, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    tifffile.imwrite(tmp_path / "in.tif", noise(2, 91, 73), photometric="minisblack", planarconfig="separate")
+    other = load_onnx(model)
+    other.graph.initializer[0].raw_data = bytes(len(other.graph.initializer[0].raw_data))
+    save_onnx(other, other_path := tmp_path_factory.mktemp("networks") / "other.onnx")
+    options = Options(model, tile_px=48, bands={"a": model, "b": other_path})
+    one, two = both(tmp_path, options, scheduler)
+    assert two == one
+    assert (tifffile.imread(tmp_path / "one.tif")[0] != tifffile.imread(tmp_path / "one.tif")[1]).any()
+
+
+def test_and_with_missing_pixels_and_some_above_full_scale(model: Path, scheduler: str, tmp_path: Path) -> None:
+    pixels = noise(90, 70)
+    pixels[20:50, 10:30] = 7
+    tifffile.imwrite(tmp_path / "in.tif", pixels, extratags=[(42113, "s", 0, "7", True)])
+    one, two = both(tmp_path, Options(model, tile_px=23, full_scale=3000), scheduler)
+    assert two == one
+
+
+@pytest.mark.parametrize("make", [float_unet, espcn, four_bands])
+def test_and_with_users_networks(make: Callable[[], onnx.ModelProto], scheduler: str, tmp_path: Path) -> None:
+    """With strides, a larger result, and several bands."""
+    (tmp_path / "in").mkdir()
+    save_onnx(make(), tmp_path / "network.onnx")
+    bands = tiling_of(load_onnx(tmp_path / "network.onnx")).channels_in
+    tifffile.imwrite(tmp_path / "in" / "in.tif", noise(bands, 91, 73), photometric="minisblack")
+    one, two = both(tmp_path / "in", Options(tmp_path / "network.onnx", tile_px=48), scheduler)
+    assert two == one
+
+
+def test_and_on_openvino(model: Path, scheduler: str, tmp_path: Path) -> None:
+    pytest.importorskip("openvino")
+    tifffile.imwrite(tmp_path / "in.tif", noise(61, 83))
+    one, two = both(tmp_path, Options(model, tile_px=30, runtime=Runtime.openvino), scheduler)
+    assert two == one
+
+
+@pytest.mark.parametrize("int8", [False, True])
+def test_the_number_of_threads_changes_no_bit(int8: bool, model: Path) -> None:
+    window = np.random.default_rng(0).random((1, 1, 131, 97), dtype=np.float32)
+    network = load_onnx(shipped_pair()[1] if int8 else model)
+    one, *others = (run(open_session(network, threads), window) for threads in (1, 2, 3, 5))
+    for other in others:
+        np.testing.assert_array_equal(other, one)
+
+
+def test_a_run_begun_here_is_finished_by_workers(
+    image: Path, model: Path, scheduler: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    options, out = Options(model, TILE_PX), tmp_path / "out.tif"
+    restore_file(image, tmp_path / "expected.tif", options, silent)
+    count, tile = iter(range(10**6)), Restorer.tile
+
+    def stopping(self: Restorer, *rest: object) -> Tile:
+        if next(count) == 40:
+            raise KeyboardInterrupt
+        return tile(self, *rest)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(Restorer, "tile", stopping)
+    with pytest.raises(KeyboardInterrupt):
+        restore_file(image, out, options, silent)
+    restore_file(image, out, replace(options, resume=True, scheduler=scheduler), silent)
+    assert out.read_bytes() == (tmp_path / "expected.tif").read_bytes()
+
+
+def test_what_is_refused_without_workers_is_refused_with_them(
+    image: Path, model: Path, scheduler: str, tmp_path: Path
+) -> None:
+    tifffile.imwrite(image, np.zeros((90, 70), np.float32) * np.nan)
+    with pytest.raises(ImageError, match="NaN"):
+        restore_file(image, tmp_path / "out.tif", Options(model, TILE_PX, scheduler=scheduler), silent)
+    assert [p.name for p in tmp_path.iterdir()] == ["in.tif"]
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no such signal")
+def test_a_worker_that_is_killed_changes_nothing(
+    image: Path, model: Path, local: Any, scheduler: str, tmp_path: Path
+) -> None:
+    options, killed = Options(model, TILE_PX), []
+    restore_file(image, tmp_path / "expected.tif", options, silent)
+
+    def kill(text: str) -> None:
+        if text.startswith("memory:"):  # the first tiles are done
+            killed.append(local.workers[0].pid)
+            os.kill(killed[0], signal.SIGKILL)
+
+    restore_file(image, tmp_path / "out.tif", replace(options, scheduler=scheduler), kill)
+    assert killed
+    assert (tmp_path / "out.tif").read_bytes() == (tmp_path / "expected.tif").read_bytes()
+
+
+def call(
+    scheduler: str, function: Callable[..., object], *arguments: object, meanwhile: Callable[[], object] = tuple
+) -> None:
+    """Wait for what a call on a cluster returns, once something else was done."""
+    with open_cluster(scheduler) as there:
+        assert there
+        running = there.pool.submit(function, *arguments)
+        meanwhile()
+        there.result(running)
+
+
+def test_a_call_that_kills_its_workers_is_one_sentence(scheduler: str) -> None:
+    with pytest.raises(MachineError, match=r"died over one call.*--resume"):
+        call(scheduler, os._exit, 1)
+
+
+def test_a_scheduler_that_goes_away_is_one_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(cluster, "ANSWER_S", 1)
+    with local_cluster(1) as local, pytest.raises(MachineError, match="no connection to their scheduler"):
+        call(local.scheduler_address, time.sleep, 60, meanwhile=local.close)
+
+
+def test_a_scheduler_whose_workers_left_is_one_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("POLL_S", "WORKERLESS_S"):
+        monkeypatch.setattr(cluster, name, 0.2)
+    with local_cluster(1) as local, pytest.raises(MachineError, match=r"none for 0.2 s.*--resume"):
+        call(local.scheduler_address, time.sleep, 60, meanwhile=lambda: local.scale(0))
+
+
+def test_nobody_at_the_address_is_one_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(cluster, "ANSWER_S", 0.5)
+    for address in ("tcp://127.0.0.1:1", "foo://a:1"):
+        with pytest.raises(MachineError, match=f"{address}: expected an answer"), open_cluster(address):
+            pass
+
+
+def test_a_scheduler_without_workers_is_one_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(cluster, "JOIN_S", 0.5)
+    with (
+        local_cluster(0) as local,
+        pytest.raises(MachineError, match="dask worker"),
+        open_cluster(local.scheduler_address),
+    ):
+        pass
+
+
+def test_a_worker_of_another_version_is_refused() -> None:
+    class Client:
+        def run(self, _function: object, package: str, on_error: str) -> dict[str, str]:
+            assert on_error == "return"
+            return {"tcp://worker": "0.0" if package == "numpy" else version(package)}
+
+    with pytest.raises(MachineError, match=r"worker tcp://worker: expected numpy \d.*got 0.0.*the same versions"):
+        cluster._require_same_versions(Client())
+
+
+def test_a_missing_dask_is_one_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    with pytest.raises(MachineError, match=r"pip install 'beers-deploy\[dask\]'"), open_cluster("host:8786"):
+        pass

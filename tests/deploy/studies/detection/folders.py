@@ -1,0 +1,133 @@
+"""Small labelled folders, laid out as others publish theirs, all of the same two images."""
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from deploy.studies.detection.scenes import CLASSES
+from deploy.studies.detection.study import synthetic_labelled
+from profiles import load_sensor
+
+Object = tuple[str, float, float, float, float]
+"""A name, then left, top, right and bottom in continuous px."""
+
+SIZE_PX = (40, 60)
+OBJECTS: dict[str, list[Object]] = {
+    "00001": [("ship", 2, 3, 12, 9), ("Expressway-Service-area", 20, 10, 60, 40)],
+    "00002": [("ship", 0, 0, 10, 20)],
+}
+DIOR = [
+    "airplane", "airport", "baseballfield", "basketballcourt", "bridge", "chimney", "dam",
+    "Expressway-Service-area", "Expressway-toll-station", "golffield", "groundtrackfield", "harbor",
+    "overpass", "ship", "stadium", "storagetank", "tenniscourt", "trainstation", "vehicle", "windmill",
+]  # fmt: skip
+SPELT = ("Motor-Car", "SHIP", "aircraft", "Storage tank")
+"""Of the drawn classes, as a folder spells them."""
+
+
+def image(path: Path, size_px: tuple[int, int] = SIZE_PX) -> Path:
+    """An image file of any kind."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    Image.fromarray(np.full((*size_px, 3), 90, np.uint8)).save(path)
+    return path
+
+
+def text(path: Path, content: str) -> Path:
+    """A text file, in folders that need not be there."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(content, encoding="utf-8")
+    return path
+
+
+def xml(objects: Sequence[Object], size_px: tuple[int, int] = SIZE_PX) -> str:
+    """Pascal VOC: corners count pixels from 1."""
+    entries = "".join(
+        f"<object><name>{name}</name><difficult>0</difficult><bndbox><xmin>{x1 + 1:g}</xmin><ymin>{y1 + 1:g}</ymin>"
+        f"<xmax>{x2:g}</xmax><ymax>{y2:g}</ymax></bndbox></object>"
+        for name, x1, y1, x2, y2 in objects
+    )
+    height, width = size_px
+    size = f"<size><width>{width}</width><height>{height}</height><depth>3</depth></size>"
+    return f"<annotation>{size}{entries}</annotation>"
+
+
+def voc(folder: Path) -> Path:
+    """Images and their XML beside them."""
+    for stem, objects in OBJECTS.items():
+        image(folder / f"{stem}.png")
+        text(folder / f"{stem}.xml", xml(objects))
+    return folder
+
+
+def dior(folder: Path, objects: dict[str, dict[str, list[Object]]]) -> Path:
+    """DIOR as published, oriented boxes beside the upright ones; images by split, then by name."""
+    for split, images in objects.items():
+        inner = "JPEGImages-test" if split == "test" else "JPEGImages-trainval"
+        for stem, boxes in images.items():
+            image(folder / inner / f"{stem}.jpg")
+            text(folder / "Annotations" / "Horizontal Bounding Boxes" / f"{stem}.xml", xml(boxes))
+            oriented = xml(boxes).replace("bndbox", "robndbox")
+            text(folder / "Annotations" / "Oriented Bounding Boxes" / f"{stem}.xml", oriented)
+        text(folder / "ImageSets" / "Main" / f"{split}.txt", "\n".join(images) + "\n")
+    return folder
+
+
+def coco(folder: Path) -> Path:
+    """One file of JSON beside the images; its ids are in an order of their own."""
+    names = sorted({box[0] for boxes in OBJECTS.values() for box in boxes})
+    content: dict[str, list[dict[str, object]]] = {"images": [], "annotations": [], "categories": []}
+    content["categories"] = [{"id": 7 + i, "name": name} for i, name in enumerate(names)]
+    for number, (stem, objects) in enumerate(sorted(OBJECTS.items(), reverse=True)):
+        image(folder / f"{stem}.png")
+        entry = {"id": number, "file_name": f"{stem}.png", "height": SIZE_PX[0], "width": SIZE_PX[1]}
+        content["images"].append(entry)
+        for name, x1, y1, x2, y2 in objects:
+            row = {"id": len(content["annotations"]), "image_id": number, "bbox": [x1, y1, x2 - x1, y2 - y1]}
+            content["annotations"].append(row | {"category_id": 7 + names.index(name), "iscrowd": 0})
+    text(folder / "labels.json", json.dumps(content))
+    return folder
+
+
+def yolo(folder: Path) -> Path:
+    """Ultralytics' folders and data.yaml."""
+    names, (height, width) = ["Expressway-Service-area", "ship"], SIZE_PX
+    for stem, objects in OBJECTS.items():
+        image(folder / "images" / "val" / f"{stem}.png")
+        lines = [
+            f"{names.index(name)} {(x1 + x2) / 2 / width} {(y1 + y2) / 2 / height} "
+            f"{(x2 - x1) / width} {(y2 - y1) / height}"
+            for name, x1, y1, x2, y2 in objects
+        ]
+        text(folder / "labels" / "val" / f"{stem}.txt", "\n".join(lines) + "\n")
+    text(folder / "data.yaml", "val: images/val\nnames:\n  0: Expressway-Service-area\n  1: ship\n")
+    return folder
+
+
+def dota(folder: Path) -> Path:
+    """DOTA's folders; of each box the four corners, clockwise."""
+    for stem, objects in OBJECTS.items():
+        image(folder / "images" / f"{stem}.png")
+        lines = [f"{x1} {y1} {x2} {y1} {x2} {y2} {x1} {y2} {name} 0" for name, x1, y1, x2, y2 in objects]
+        text(folder / "labelTxt" / f"{stem}.txt", "imagesource:GoogleEarth\ngsd:0.15\n" + "\n".join(lines) + "\n")
+    return folder
+
+
+def labelled(folder: Path, count: int) -> Path:
+    """Drawn scenes as pictures in sRGB with VOC labels beside them."""
+    full_scale = load_sensor("pleiades-reference").nominal()
+    folder.mkdir()
+    for number in range(count):
+        one = synthetic_labelled(number, 0, np.arange(len(CLASSES)))
+        light = np.clip(one.radiance(full_scale).numpy() / (4095 / full_scale.gain_dn_per_radiance), 0, 1)
+        code = np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
+        Image.fromarray(np.repeat(np.rint(255 * code)[..., None], 3, 2).astype(np.uint8)).save(
+            folder / f"s{number}x.png"
+        )
+        boxes: list[Object] = [
+            (SPELT[c], *corners.tolist()) for c, corners in zip(one.truth.classes, one.truth.corners, strict=True)
+        ]
+        text(folder / f"s{number}x.xml", xml(boxes, (768, 768)))
+    return folder

@@ -1,0 +1,227 @@
+"""Scores of boxes are those of pycocotools, whatever the weights; intervals say no more than the sites allow."""
+
+import io
+from collections.abc import Sequence
+from contextlib import redirect_stdout
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from pycocotools.coco import COCO
+from pycocotools.cocoeval import COCOeval
+
+from deploy.studies.detection.average_precision import (
+    SIZES_PX,
+    Hits,
+    find_hits,
+    interval,
+    map50,
+    mean_known,
+    precisions,
+    score,
+    score_rows,
+    site_weights,
+    sites_note,
+)
+from deploy.studies.detection.boxes import Boxes
+
+NAMES = ("ship", "tank", "vehicle")
+SEEDS = st.integers(0, 2**32 - 1)
+ONE = np.array([[10.0, 10.0, 20.0, 20.0]])
+
+Pairs = list[tuple[Boxes, Boxes]]
+"""What is labelled on each image, and what was found."""
+
+
+def drawn(rng: np.random.Generator, count: int, ties: bool = False, ignored: float = 0.2) -> Pairs:
+    """Objects of all sizes: some found well, some badly or as another class, and false ones beside.
+
+    With `ties` scores are of ten values; else no two are alike.
+    """
+    pairs = []
+    for _ in range(count):
+        truth = boxes(rng, int(rng.integers(0, 7)))
+        again = rng.integers(0, max(len(truth), 1), int(rng.integers(0, 12)) if len(truth) else 0)
+        near = truth.corners[again] + rng.normal(0, 1.5, (len(again), 4))
+        near[:, 2:] = np.maximum(near[:, 2:], near[:, :2] + 1)
+        named = np.where(rng.random(len(again)) < 0.8, truth.classes[again], rng.integers(0, 3, len(again)))
+        false = boxes(rng, int(rng.integers(0, 6)))
+        corners, classes = np.vstack([near, false.corners]), np.concatenate([named, false.classes])
+        passed = Boxes.of(truth.corners, truth.classes, ignored=rng.random(len(truth)) < ignored)
+        pairs.append((passed, Boxes.of(corners, classes, rng.random(len(corners)).round(1 if ties else 12))))
+    return pairs
+
+
+def boxes(rng: np.random.Generator, count: int) -> Boxes:
+    low = rng.uniform(0, 100, (count, 2))
+    return Boxes.of(np.hstack([low, low + rng.uniform(4, 60, (count, 2))]), rng.integers(0, 3, count))
+
+
+def hits_of(pairs: Pairs, classes: int = len(NAMES)) -> Hits:
+    return find_hits([truth for truth, _ in pairs], [found for _, found in pairs], classes)
+
+
+def scored(pairs: Pairs, names: Sequence[str] = ("ship",), confidence: float = np.nan) -> dict[str, float]:
+    figures = score(hits_of(pairs, len(names)), names, np.ones((1, len(pairs)), np.int64), confidence)
+    return {name: float(values[0]) for name, values in figures.items()}
+
+
+def by_pycocotools(pairs: Pairs, size: str = "all") -> np.ndarray:
+    """Average precision by class and overlap, (3, 10), NaN where a class has no object: all of it by the library."""
+    with redirect_stdout(io.StringIO()):
+        evaluation = COCOeval(_table([t for t, _ in pairs]), _table([f for _, f in pairs]), "bbox")
+        evaluation.params.maxDets = [1000]
+        low, high = SIZES_PX[size]
+        evaluation.params.areaRng, evaluation.params.areaRngLbl = [[low**2, high**2]], [size]
+        evaluation.evaluate()
+        evaluation.accumulate()
+    found = evaluation.eval["precision"][:, :, :, 0, 0].mean(axis=1).T  # overlap, recall, class
+    return np.where(found < 0, np.nan, found)
+
+
+def _table(images: Sequence[Boxes]) -> COCO:
+    rows: list[dict[str, object]] = []
+    for number, each in enumerate(images):
+        for (left, top, right, bottom), kind, value, crowd in zip(*vars(each).values(), strict=True):
+            box = [left, top, right - left, bottom - top]
+            row = {"id": len(rows) + 1, "image_id": number, "category_id": int(kind), "bbox": box}
+            rows.append(row | {"area": box[2] * box[3], "score": float(value), "iscrowd": int(crowd)})
+    table = COCO()
+    numbers = {"images": [{"id": i} for i in range(len(images))], "categories": [{"id": c} for c in range(3)]}
+    table.dataset = {**numbers, "annotations": rows}
+    table.createIndex()
+    return table
+
+
+@settings(max_examples=60)
+@given(SEEDS, st.integers(1, 8), st.booleans(), st.sampled_from(list(SIZES_PX)))
+def test_average_precision_is_that_of_pycocotools(seed: int, count: int, ties: bool, size: str) -> None:
+    pairs = drawn(np.random.default_rng(seed), count, ties)
+    weights, number = np.ones((1, count), np.int64), list(SIZES_PX).index(size)
+    ours = [precisions(hits_of(pairs), kind, weights, number, 10)[0].mean(axis=-1) for kind in range(len(NAMES))]
+    np.testing.assert_allclose(ours, by_pycocotools(pairs, size), rtol=0, atol=1e-12)
+
+
+@settings(max_examples=30)
+@given(SEEDS, st.lists(st.integers(0, 4), min_size=2, max_size=6))
+def test_a_weight_is_as_good_as_so_many_copies(seed: int, weights: list[int]) -> None:
+    pairs = drawn(np.random.default_rng(seed), len(weights))
+    copies = [pair for pair, weight in zip(pairs, weights, strict=True) for _ in range(weight)]
+    found = score(hits_of(pairs), NAMES, np.array([weights]), 0.5)
+    if not copies:
+        assert np.isnan(found["mAP50"])
+        return
+    expected = by_pycocotools(copies)
+    np.testing.assert_allclose(found["mAP50"], mean_known(expected[:, :1]), rtol=0, atol=1e-12)
+    np.testing.assert_allclose(found["mAP50-95"], mean_known(expected.mean(axis=1))[None], rtol=0, atol=1e-12)
+    for name, value in scored(copies, NAMES, 0.5).items():
+        np.testing.assert_allclose(found[name][0], value, rtol=0, atol=1e-12, err_msg=name)
+
+
+@settings(max_examples=30)
+@given(SEEDS, st.sampled_from([0.0, 0.137, 0.5, 0.9, 1.0]))
+def test_precision_and_recall_are_those_of_what_is_left_at_a_confidence(seed: int, confidence: float) -> None:
+    pairs = drawn(np.random.default_rng(seed), 5)
+    figures = scored(pairs, NAMES, confidence)
+    left = hits_of([(truth, found[found.scores >= confidence]) for truth, found in pairs])
+    precision, recall = [], []
+    for kind, objects in enumerate(left.objects[0].sum(axis=1)):
+        if objects:
+            mine = left.classes == kind
+            true, counted = left.hits[0, 0, mine].sum(), (~left.ignored[0, 0, mine]).sum()
+            precision.append(true / counted if counted else 1.0)
+            recall.append(true / objects)
+    expected = (np.mean(precision), np.mean(recall)) if recall else (np.nan, np.nan)
+    np.testing.assert_allclose((figures["precision"], figures["recall"]), expected, rtol=0, atol=1e-12)
+
+
+def test_perfect_boxes_score_one_and_none_score_nothing() -> None:
+    pairs = drawn(np.random.default_rng(3), 20, ignored=0.0)
+    perfect = scored([(truth, truth) for truth, _ in pairs], NAMES, 0.5)
+    assert {value for name, value in perfect.items() if name != "own confidence"} == {1.0}
+    nothing = scored([(truth, Boxes.none()) for truth, _ in pairs], NAMES, 0.5)
+    assert {name: value for name, value in nothing.items() if value} == {"precision": 1.0, "own precision": 1.0}
+
+
+def test_what_is_found_on_an_unlabelled_image_is_false() -> None:
+    labelled, empty = (Boxes.of(ONE, [0]), Boxes.of(ONE, [0], [0.5])), (Boxes.none(), Boxes.of(ONE, [0], [0.9]))
+    assert scored([labelled])["mAP50-95"] == scored([labelled, (empty[0], Boxes.none())])["mAP50-95"] == 1.0
+    assert scored([labelled, empty])["mAP50"] == 0.5
+    assert np.isnan(scored([empty])["mAP50"])
+
+
+def test_what_lies_in_an_ignored_box_counts_neither_way() -> None:
+    truth = Boxes.of(np.vstack([ONE, ONE + 50]), [0, 0], ignored=[False, True])
+    within = Boxes.of(np.vstack([ONE, ONE + 50, ONE + 51]), [0, 0, 0], [0.5, 0.9, 0.8])
+    false = Boxes.of(np.vstack([ONE, ONE + 80]), [0, 0], [0.5, 0.9])
+    assert [scored([(truth, found)])["mAP50"] for found in (within, within[:1], false)] == [1.0, 1.0, 0.5]
+
+
+def test_sizes_are_told_apart_by_the_root_of_the_area() -> None:
+    sides = (15.99, 16.0, 31.99, 32.0)
+    found = Boxes.of([[0, 100.0 * i, side, 100.0 * i + side] for i, side in enumerate(sides)], [0] * 4)
+    assert hits_of([(found, found)], 1).objects.sum(axis=(1, 2)).tolist() == [4, 1, 2, 1]
+
+
+def test_own_confidence_is_that_of_the_best_mean_f1() -> None:
+    corners = np.vstack([ONE, ONE + 30, ONE + 60])
+    pair = Boxes.of(corners[:2], [0, 0]), Boxes.of(corners, [0, 0, 0], [0.9, 0.6, 0.3])
+    found = scored([pair], confidence=0.7)
+    assert found["own confidence"] == pytest.approx(0.301)  # the false one no longer counts
+    assert (found["own precision"], found["own recall"]) == (1.0, 1.0)
+    assert (found["precision"], found["recall"]) == (1.0, 0.5)
+
+
+def test_every_row_is_read_at_the_first_one_s_confidence() -> None:
+    pairs = drawn(np.random.default_rng(7), 10)
+    halved = [(truth, Boxes.of(found.corners, found.classes, found.scores / 2)) for truth, found in pairs]
+    rows = {"reference": hits_of(pairs), "halved": hits_of(halved)}
+    figures, confidence = score_rows(rows, NAMES, site_weights(list("abcdefghij"), 0, 5))
+    assert confidence == scored(pairs, NAMES)["own confidence"]
+    assert figures["halved"]["recall"][0] == scored(halved, NAMES, confidence)["recall"]
+    assert figures["halved"]["recall"][0] != figures["halved"]["own recall"][0]
+
+
+def row(shares: Sequence[float], objects: int = 10) -> Hits:
+    """An image an entry, of `objects` objects of which that share is found, and nothing false."""
+    truth = Boxes.of([[50.0 * i, 0, 50.0 * i + 30, 30] for i in range(objects)], np.zeros(objects))
+    return hits_of([(truth, truth[: round(share * objects)]) for share in shares], 1)
+
+
+def test_a_draw_takes_whole_sites_and_a_seed_gives_the_same_draws() -> None:
+    weights = site_weights(["a", "a", "b", "c"], 5, 200)
+    assert weights[0].tolist() == [1, 1, 1, 1]
+    assert (weights[:, 0] == weights[:, 1]).all()
+    assert (weights[1:, 1:].sum(axis=1) == 3).all()
+    np.testing.assert_array_equal(weights, site_weights(["a", "a", "b", "c"], 5, 200))
+    assert not np.array_equal(weights, site_weights(["a", "a", "b", "c"], 6, 200))
+
+
+def test_pairing_tells_what_two_intervals_do_not() -> None:
+    sites = np.linspace(0.1, 0.8, 12)
+    weights = site_weights([str(number) for number in range(12)], 0, 200)
+    better, worse = (map50(row(list(shares)), weights) for shares in (sites + 0.1, sites))
+    ends, others, paired = interval(better, 12), interval(worse, 12), interval(better - worse, 12)
+    assert ends is not None
+    assert others is not None
+    assert paired is not None
+    assert others[1] > ends[0]
+    assert paired[0] > 0
+
+
+def test_a_class_that_no_site_of_a_draw_holds_drops_out() -> None:
+    pairs = [(Boxes.of(ONE, [0]), Boxes.of(ONE, [0]))] * 3 + [(Boxes.of(ONE, [1]), Boxes.none())] * 2
+    figures = score(hits_of(pairs, 2), ("ship", "tank"), site_weights(list("abcde"), 0, 400))
+    assert set(figures["mAP50"]) == {0.0, 0.5, 1.0}
+    assert 0 < np.isnan(figures["mAP50 of tank"]).sum() < 400
+    assert interval(figures["mAP50 of tank"], 5) == (0.0, 0.0)
+
+
+def test_below_five_sites_there_is_no_interval_and_below_ten_it_is_said_to_be_narrow() -> None:
+    values = np.linspace(0.2, 0.4, 50)
+    assert interval(values, 4) is None
+    assert interval(values, 5) is not None
+    assert "of 4, fewer than 5" in sites_note(4)
+    assert "Only 9 sites" in sites_note(9)
+    assert sites_note(10) == ""

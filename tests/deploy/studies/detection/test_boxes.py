@@ -1,0 +1,95 @@
+"""Overlaps, suppression and the letterbox, at any size."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from deploy.studies.detection.boxes import Boxes, Letterbox, areas, iou, suppress
+from profiles.errors import OptionError
+
+SIDES = st.integers(1, 97)
+
+
+def drawn(rng: np.random.Generator, count: int) -> np.ndarray:
+    low = rng.uniform(0, 50, (count, 2))
+    return np.hstack([low, low + rng.uniform(1, 30, (count, 2))])
+
+
+@given(st.integers(0, 2**32 - 1))
+def test_an_overlap_is_that_of_the_pixels_they_cover(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    low, side = rng.integers(0, 10, (2, 2)), rng.integers(1, 10, (2, 2))
+    corners = np.hstack([low, low + side]).astype(float)
+    masks = np.zeros((2, 20, 20), bool)
+    for mask, (left, top, right, bottom) in zip(masks, corners.astype(int), strict=True):
+        mask[top:bottom, left:right] = True
+    expected = (masks[0] & masks[1]).sum() / (masks[0] | masks[1]).sum()
+    assert iou(corners[:1], corners[1:])[0, 0] == pytest.approx(expected)
+    assert areas(corners) == pytest.approx(masks.sum(axis=(1, 2)))
+
+
+@settings(max_examples=60)
+@given(st.integers(0, 2**32 - 1), st.sampled_from([0.3, 0.7]))
+def test_suppression_leaves_the_best_of_each_cluster(seed: int, overlap: float) -> None:
+    rng = np.random.default_rng(seed)
+    found = Boxes.of(drawn(rng, 40), rng.integers(0, 2, 40), rng.random(40))
+    kept = suppress(found, overlap)
+    assert (np.diff(kept.scores) <= 0).all()
+    same = kept.classes[:, None] == kept.classes[None, :]
+    assert (iou(kept.corners, kept.corners)[same & ~np.eye(len(kept), dtype=bool)] <= overlap).all()
+    dropped = found[~np.isin(found.scores, kept.scores)]
+    assert len(dropped) + len(kept) == 40
+    better = (iou(dropped.corners, kept.corners) > overlap) & (dropped.scores[:, None] < kept.scores[None, :])
+    assert (better & (dropped.classes[:, None] == kept.classes[None, :])).any(axis=1).all()
+
+
+def test_suppression_keeps_the_best_and_no_more_than_asked() -> None:
+    apart = Boxes.of([[10.0 * i, 0, 10.0 * i + 5, 5] for i in range(20)], [0] * 20, np.linspace(0.1, 0.9, 20))
+    assert suppress(apart, most=3).scores.tolist() == apart.scores[::-1][:3].tolist()
+    assert len(suppress(Boxes.none())) == 0
+
+
+@settings(max_examples=80)
+@given(SIDES, SIDES, st.integers(3, 8))
+def test_the_letterbox_takes_a_box_there_and_back(height: int, width: int, eighths: int) -> None:
+    height, width, size = 7 * height + 5, 7 * width + 6, 32 * eighths + 1
+    box, corners = Letterbox(height, width, size), np.array([[0, 0, width, height], [1.25, 2.5, width / 3, height]])
+    there = box.to_input(corners)
+    assert np.abs(box.to_image(there) - corners).max() < 0.01
+    assert there.min() >= -1e-9
+    assert there.max() <= size + 1e-9
+
+
+@settings(max_examples=25)
+@given(SIDES, SIDES, st.integers(3, 8))
+def test_pixels_go_where_the_letterbox_takes_their_box(height: int, width: int, eighths: int) -> None:
+    """Of an image whose pixels say where they are."""
+    height, width, size = 3 * height + 40, 3 * width + 41, 32 * eighths + 1
+    y, x = np.mgrid[0:height, 0:width] + 0.5
+    image = np.stack([x / width, y / height, np.full(x.shape, 0.5)], axis=2).astype(np.float32)
+    box = Letterbox(height, width, size)
+    found = box.image(image)
+    assert found.shape == (3, size, size)
+    assert found.dtype == np.float32
+    left, top, right, bottom = box.to_input(np.array([[0, 0, width, height]]))[0].astype(int)
+    inside = np.zeros((size, size), bool)
+    inside[top + 2 : bottom - 2, left + 2 : right - 2] = True  # at the border it can only repeat the last pixel
+    rows, columns = np.nonzero(inside)
+    middles = np.stack([columns, rows, columns, rows], axis=1) + 0.5
+    on_scene = box.to_image(middles)
+    assert np.abs(found[0][inside] * width - on_scene[:, 0]).max() < 0.01
+    assert np.abs(found[1][inside] * height - on_scene[:, 1]).max() < 0.01
+
+
+def test_an_image_of_which_nothing_would_be_left_is_refused() -> None:
+    with pytest.raises(OptionError, match="expected an image that keeps a pixel"):
+        Letterbox(3, 5000, 256)
+
+
+def test_what_is_mostly_outside_is_ignored_and_what_is_outside_is_none() -> None:
+    corners = np.array([[-8, 0, 2, 10], [-5, 0, 5, 10], [-20, 0, -10, 10], [95, 95, 120, 105], [10, 10, 20, 20]])
+    found = Boxes.of(corners, range(5), ignored=[False, False, False, False, True]).clipped(100, 100)
+    assert found.classes.tolist() == [0, 1, 3, 4]
+    assert found.ignored.tolist() == [True, False, True, True]
+    assert found.corners[:2].tolist() == [[0, 0, 2, 10], [0, 0, 5, 10]]

@@ -1,0 +1,159 @@
+"""Files of both layouts give the boxes that they answer, on the image; any other file is refused by one sentence."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from deploy.studies.detection.detector import class_numbers, open_detector, parse_classes
+from profiles.errors import BeersError, ModelError, OptionError
+from tests.deploy.studies.detection.networks import NAMES, detector, final, raw
+
+IMAGE = np.full((32, 64, 3), 0.5, np.float32)
+"""In an input of 64 px it stays of its size, 16 px of grey above it and below."""
+
+
+def test_the_raw_layout_gives_the_boxes_of_every_class_that_scores(tmp_path: Path) -> None:
+    answer = raw((20, 30, 10, 8, 0.9, 0.2), (21, 30, 10, 8, 0.8, 0.0), (50, 40, 6, 6, 0.0, 0.0005))
+    found = open_detector(detector(tmp_path / "a.onnx", answer), 1).detect(IMAGE)
+    assert found.corners.tolist() == [[15, 10, 25, 18], [15, 10, 25, 18]]
+    assert found.classes.tolist() == [0, 1]
+    np.testing.assert_allclose(found.scores, [0.9, 0.2], atol=1e-6)
+
+
+def test_the_final_layout_gives_its_rows_and_not_its_padding(tmp_path: Path) -> None:
+    answer = final((15, 26, 25, 34, 0.2, 1), (15, 26, 25, 34, 0.9, 0), (16, 26, 26, 34, 0.6, 0))
+    opened = open_detector(detector(tmp_path / "a.onnx", answer, end2end=True), 1)
+    found = opened.detect(IMAGE)
+    assert found.corners.tolist() == [[15, 10, 25, 18], [16, 10, 26, 18], [15, 10, 25, 18]]
+    assert found.classes.tolist() == [0, 0, 1]
+    assert (opened.names, opened.size_px, opened.layout, opened.flag) == (tuple(NAMES.values()), 64, "final", "")
+
+
+def test_boxes_come_back_to_an_image_of_any_size(tmp_path: Path) -> None:
+    opened = open_detector(detector(tmp_path / "a.onnx", raw((32, 32, 16, 8, 0.9, 0))), 1)
+    found = opened.detect(np.zeros((100, 200, 3), np.float32))
+    assert found.corners[0].tolist() == [75, 37.5, 125, 62.5]
+    assert not found.ignored.any()
+
+
+def test_suppression_inside_the_file_is_flagged_with_its_confidence(tmp_path: Path) -> None:
+    answer = final((15, 26, 25, 34, 0.9, 0))
+    flagged = open_detector(detector(tmp_path / "a.onnx", answer, cut=0.25, args={"nms": True}), 1)
+    assert "drops what lies below confidence 0.25" in flagged.flag
+    assert len(flagged.detect(IMAGE)) == 1
+    low = open_detector(detector(tmp_path / "b.onnx", answer, cut=0.001, args={"nms": True}), 1)
+    assert low.flag == ""
+
+
+def test_the_size_is_the_file_s_or_the_one_asked_for(tmp_path: Path) -> None:
+    answer = raw((32, 32, 16, 8, 0.9, 0))
+    fixed, free = detector(tmp_path / "a.onnx", answer), detector(tmp_path / "b.onnx", answer, size_px="side")
+    assert [open_detector(fixed, 1, asked).size_px for asked in (None, 64)] == [64, 64]
+    assert [open_detector(free, 1, asked).size_px for asked in (None, 128)] == [64, 128]
+    with pytest.raises(OptionError, match=r"--size: expected 64, which a.onnx is fixed to, got 128"):
+        open_detector(fixed, 1, 128)
+    with pytest.raises(OptionError, match="a multiple of its stride of 32, got 100"):
+        open_detector(free, 1, 100)
+    unsaid = detector(tmp_path / "c.onnx", answer, size_px="side", imgsz=None)
+    with pytest.raises(OptionError, match="a multiple of its stride of 32, got None; say it"):
+        open_detector(unsaid, 1)
+
+
+@pytest.mark.parametrize(
+    ("answer", "given", "sentence"),
+    [
+        (raw((1, 1, 1, 1, 0.5, 0)), {"names": None}, "the names of its classes in its metadata"),
+        (raw((1, 1, 1, 1, 0.5, 0)), {"names": {1: "ship"}}, "the names of its classes"),
+        (raw((1, 1, 1, 1, 0.5, 0)), {"names": "__import__('os')"}, "the names of its classes"),
+        (raw((1, 1, 1, 1, 0.5, 0)), {"names": "(" * 9000}, "the names of its classes"),
+        (raw((1, 1, 1, 1, 0.5, 0)), {"task": "segment"}, "task segment, "),
+        (raw((1, 1, 1, 1, 0.5, 0)), {"channels": 1}, r"for RGB, 1 x 6 x anchors .* got task detect, 1 channels"),
+        (raw((1, 1, 1, 1, 0.5, 0)), {"outputs": 3}, r"output 1 x 6 x 20, 1 x 6 x 20, 1 x 6 x 20"),
+        (final(), {"head": "RTDETRDecoder"}, "output 1 x 300 x 6, of RT-DETR"),
+        (np.zeros((1, 20, 7)), {}, r"1 x 6 x anchors for 2 classes \(raw\) or 1 x N x 6 .* output 1 x 20 x 7"),
+        (np.zeros((1, 20, 6, 1)), {}, "output 1 x 20 x 6 x 1"),
+        (np.zeros((4, 300, 6)), {}, "output 4 x 300 x 6"),
+    ],
+)
+def test_another_layout_is_refused_by_what_is_read(
+    answer: np.ndarray, given: dict[str, Any], sentence: str, tmp_path: Path
+) -> None:
+    with pytest.raises(ModelError, match=sentence):
+        open_detector(detector(tmp_path / "a.onnx", answer, **given), 1)
+
+
+@pytest.mark.parametrize(
+    ("answer", "sentence"),
+    [
+        (raw((1, 1, 1, 1, 3.5, 0)), "scores in 0 to 1, got others"),
+        (raw((1, 1, 1, 1, -3.5, 0)), "scores in 0 to 1, got others"),
+        (final((1, 1, 2, 2, 40.0, 1)), "scores in 0 to 1, got others"),
+        (final((1, 1, 2, 2, 0.5, 2)), "classes from 0 to 1 in its sixth column"),
+        (final((1, 1, 2, 2, 0.5, 0.5)), "classes from 0 to 1 in its sixth column"),
+    ],
+)
+def test_an_answer_that_is_no_detection_is_refused(answer: np.ndarray, sentence: str, tmp_path: Path) -> None:
+    opened = open_detector(detector(tmp_path / "a.onnx", answer), 1)
+    with pytest.raises(ModelError, match=sentence):
+        opened.detect(IMAGE)
+
+
+def test_values_that_are_not_finite_are_refused(tmp_path: Path) -> None:
+    opened = open_detector(detector(tmp_path / "a.onnx", raw((1, 1, 1, 1, 0.5, 0))), 1)
+    for value in (np.nan, np.inf):
+        with pytest.raises(ModelError, match="got NaN or infinity"):
+            opened.decoded(raw((value, 1, 1, 1, 0.5, 0)))
+
+
+@pytest.mark.parametrize("answer", [np.zeros((1, 7, 20)), np.zeros((2, 6, 20)), np.zeros((6, 20)), np.zeros(0)])
+def test_an_answer_of_other_sizes_than_stated_is_refused(answer: np.ndarray, tmp_path: Path) -> None:
+    opened = open_detector(detector(tmp_path / "a.onnx", raw((1, 1, 1, 1, 0.5, 0))), 1)
+    with pytest.raises(ModelError, match="an answer of the sizes that its file states"):
+        opened.decoded(answer)
+
+
+def test_what_is_no_detector_s_file_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "a.onnx").write_bytes(b"no network")
+    for path in (tmp_path / "a.onnx", tmp_path / "none.onnx", tmp_path):
+        with pytest.raises(BeersError):
+            open_detector(path, 1)
+
+
+def test_no_more_than_300_boxes_are_given(tmp_path: Path) -> None:
+    rows = [(8.0 * (i % 8), 8.0 * (i // 8 % 8), 1.0, 1.0, 0.1 + 0.001 * i, 0.0) for i in range(64)]
+    spread = raw(*[(x + i * 1.2, y, w, h, s, c) for i in range(6) for x, y, w, h, s, c in rows], anchors=400)
+    opened = open_detector(detector(tmp_path / "a.onnx", spread), 1)
+    assert len(opened.decoded(spread)) == 300
+    many = final(*[(1, 1, 2, 2, 0.5, 0)] * 400, count=400)
+    assert len(open_detector(detector(tmp_path / "b.onnx", many), 1).decoded(many)) == 300
+
+
+def test_a_class_is_found_by_its_letters_or_by_what_the_user_says() -> None:
+    labelled, detector = ("car", "Storage-Tank", "minibus", "Tree"), ("ship", "vehicle", "storagetank")
+    assert class_numbers(labelled, detector, {"car": "Vehicle"}).tolist() == [1, 2, -1, -1]
+    given = parse_classes(" car = vehicle, Mini-Bus=vehicle ")
+    assert class_numbers(("car", "minibus"), ("vehicle",), given).tolist() == [0, 0]
+
+
+@pytest.mark.parametrize("text", ["", "car", "car=", "=ship", "car=a=b", "car=a,CAR=b", "-=ship"])
+def test_another_text_is_refused(text: str) -> None:
+    with pytest.raises(OptionError, match="--classes"):
+        parse_classes(text)
+
+
+@pytest.mark.parametrize(
+    ("labelled", "detector", "given", "sentence"),
+    [
+        (("Tree",), ("ship", "tank"), {}, r"a labelled class that the detector knows \(ship, tank\), got Tree; say"),
+        (("car",), ("ship",), {"van": "ship"}, r"one of the labelled classes \(car\), got 'van'"),
+        (("car",), ("ship",), {"car": "boat"}, r"one of the detector's classes \(ship\), got 'boat'"),
+        (("ship",), ("Ship", "ship"), {}, "classes told apart by their letters"),
+    ],
+)
+def test_classes_that_cannot_be_matched_are_refused(
+    labelled: tuple[str, ...], detector: tuple[str, ...], given: dict[str, str], sentence: str
+) -> None:
+    with pytest.raises(OptionError, match=sentence):
+        class_numbers(labelled, detector, given)

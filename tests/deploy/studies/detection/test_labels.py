@@ -1,0 +1,271 @@
+"""Every layout gives the same boxes of the same labels; what none of them is, is refused by one sentence."""
+
+import json
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from deploy.studies.detection.detector import class_numbers
+from deploy.studies.detection.labels import LabelledSet, read_labelled, yolo_names
+from profiles.errors import BeersError, ImageError, MachineError, OptionError
+from tests.deploy.studies.detection.folders import DIOR, OBJECTS, coco, dior, dota, image, text, voc, xml, yolo
+
+LAYOUTS: dict[str, Callable[[Path], Path]] = {"voc": voc, "coco": coco, "yolo": yolo, "dota": dota}
+LAYOUTS["dior"] = lambda folder: dior(folder, {"test": OBJECTS})
+
+SHIP = xml([("ship", 2, 3, 12, 9)])
+LAUGHS = '<?xml version="1.0"?><!DOCTYPE lolz [<!ENTITY a "ha">' + "".join(
+    f'<!ENTITY {b} "{f"&{a};" * 10}">' for a, b in zip("abcdefghi", "bcdefghij", strict=True)
+)
+
+
+def boxes_of(found: LabelledSet) -> dict[str, list[tuple[object, ...]]]:
+    return {
+        one.path.stem: [
+            (found.names[c], *corners.round(9))
+            for c, corners in zip(one.truth.classes, one.truth.corners, strict=True)
+        ]
+        for one in found.images
+    }
+
+
+def refused(folder: Path, sentence: str) -> None:
+    with pytest.raises(OptionError, match=sentence) as error:
+        read_labelled(folder)
+    assert str(error.value).isprintable()
+    assert len(str(error.value)) < 500 + len(str(folder))
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_every_layout_says_the_same_of_the_same_boxes(layout: str, tmp_path: Path) -> None:
+    found = read_labelled(LAYOUTS[layout](tmp_path))
+    assert found.names == ("Expressway-Service-area", "ship")
+    assert boxes_of(found) == OBJECTS
+    assert [one.site for one in found.images] == ["00001", "00002"]
+    assert not any(one.truth.ignored.any() for one in found.images)
+    assert all("DOTA" in note for note in found.notes)
+
+
+@pytest.mark.parametrize("layout", ["voc", "yolo", "coco"])
+def test_labels_may_lie_elsewhere(layout: str, tmp_path: Path) -> None:
+    folder = LAYOUTS[layout](tmp_path / "made")
+    elsewhere = tmp_path / "elsewhere"
+    elsewhere.mkdir()
+    for path in folder.rglob({"voc": "*.xml", "yolo": "*.txt", "coco": "*.json"}[layout]):
+        path.rename(elsewhere / path.name)
+    images = folder / "images" / "val" if layout == "yolo" else folder
+    if layout == "yolo":
+        text(elsewhere / "classes.txt", "Expressway-Service-area\nship\n")
+    labels = elsewhere / "labels.json" if layout == "coco" else elsewhere
+    assert boxes_of(read_labelled(images, labels)) == OBJECTS
+
+
+def test_dior_is_read_by_split_with_its_twenty_classes(tmp_path: Path) -> None:
+    of_all = {f"{i + 1:05}": [(name, 1.0, 2.0, 20.0, 30.0)] for i, name in enumerate(DIOR)}
+    splits = {"train": {"00099": [("ship", 1.0, 1.0, 9.0, 9.0)]}, "val": {"00098": [("dam", 1.0, 1.0, 9.0, 9.0)]}}
+    folder = dior(tmp_path, {**splits, "test": of_all})
+    found = read_labelled(folder)
+    assert boxes_of(found) == of_all
+    assert boxes_of(read_labelled(folder, split="val")) == splits["val"]
+    # As mmrotate and TorchGeo spell and order them.
+    detector = sorted(name.lower().replace("-", " ") for name in DIOR)
+    numbers = class_numbers(found.names, detector, {})
+    assert [detector[i] for i in numbers] == [name.lower().replace("-", " ") for name in found.names]
+
+
+def test_a_split_that_is_not_there_is_named_with_those_that_are(tmp_path: Path) -> None:
+    folder = dior(tmp_path, {"test": OBJECTS})
+    with pytest.raises(OptionError, match=r"one of its splits \(test\), got 'trainval'"):
+        read_labelled(folder, split="trainval")
+    with pytest.raises(OptionError, match="images of the split 'test'"):
+        read_labelled(voc(tmp_path / "plain"), split="test")
+    text(folder / "ImageSets" / "Main" / "test.txt", "00001\n00777\n")
+    refused(folder, "1 of 2 missing, the first '00777'")
+    with pytest.raises(OptionError, match=r"upright boxes .* give the folder 'Horizontal Bounding Boxes'"):
+        read_labelled(folder / "JPEGImages-test", folder / "Annotations" / "Oriented Bounding Boxes")
+
+
+def test_the_four_photographs_are_read_with_their_boxes(shared_data: Path) -> None:
+    folder = shared_data / "detection"
+    if not folder.is_dir():
+        pytest.skip("no folder shared/data/detection beside the repository")
+    found = read_labelled(folder)
+    classes = np.concatenate([one.truth.classes for one in found.images])
+    assert [int((classes == found.names.index(name)).sum()) for name in ("car", "minibus", "Tree")] == [108, 3, 61]
+    assert found.images[0].truth.corners[0].tolist() == [160.0, 97.0, 182.0, 138.0]
+    assert found.notes == ()
+
+
+def test_dota_s_oriented_boxes_are_enclosed_and_its_difficult_ones_ignored(tmp_path: Path) -> None:
+    image(tmp_path / "images" / "P0001.png")
+    lines = "imagesource:GoogleEarth\ngsd:null\n10 0 20 10 10 20 0 10 large-vehicle 1\n30 5 35 5 35 9 30 9 ship 0\n"
+    text(tmp_path / "labelTxt" / "P0001.txt", lines)
+    found = read_labelled(tmp_path)
+    assert boxes_of(found)["P0001"] == [("large-vehicle", 0, 0, 20, 20), ("ship", 30, 5, 35, 9)]
+    assert found.images[0].truth.ignored.tolist() == [True, False]
+
+
+def test_without_labels_a_yolo_image_shows_nothing_and_a_voc_image_is_refused(tmp_path: Path) -> None:
+    folder = yolo(tmp_path / "yolo")
+    image(folder / "images" / "val" / "00003.png")
+    found = read_labelled(folder)
+    assert boxes_of(found)["00003"] == []
+    assert found.notes == ("Images without a labelled object, all found there is false: 1 of 3.",)
+    image(voc(tmp_path / "voc") / "00003.png")
+    refused(tmp_path / "voc", r"a file of labels for every image, got 1 of 3 missing, the first 00003\.xml")
+
+
+def test_boxes_outside_or_without_area_are_left_out_and_told(tmp_path: Path) -> None:
+    image(tmp_path / "a.png")
+    text(tmp_path / "a.xml", xml([("ship", 5, 5, 9, 9), ("ship", 70, 5, 90, 9), ("ship", 9, 9, 9, 20)]))
+    found = read_labelled(tmp_path)
+    assert boxes_of(found)["a"] == [("ship", 5, 5, 9, 9)]
+    assert found.notes == ("Boxes left out, without area inside their image: 2, the first in a.xml.",)
+
+
+def test_labels_of_an_image_of_another_size_are_refused(tmp_path: Path) -> None:
+    image(voc(tmp_path) / "00002.png", (80, 120))
+    refused(tmp_path, "labels of an image of 80 x 120 px, got 40 x 60 px")
+
+
+@pytest.mark.parametrize(
+    ("make", "sentence"),
+    [
+        (lambda folder: image(folder / "a.png"), "labels as VOC .* got none beside the images"),
+        (lambda folder: text(image(folder / "a.png").with_name("b.xml"), xml([])), "got none named as one of"),
+        (lambda folder: text(image(folder / "a.png").with_name("a.xml"), xml([])), "got none on 1 images"),
+        (lambda folder: folder, "a folder of images, got no image in it"),
+        (
+            lambda folder: text(text(coco(folder) / "b.json", "{}"), "{}"),
+            "one file of labels, got 2; name it: --labels",
+        ),
+    ],
+)
+def test_a_folder_without_labelled_images_is_refused(
+    make: Callable[[Path], object], sentence: str, tmp_path: Path
+) -> None:
+    make(tmp_path)
+    with pytest.raises((OptionError, ImageError), match=sentence):
+        read_labelled(tmp_path)
+
+
+def test_a_missing_folder_or_file_of_labels_is_refused(tmp_path: Path) -> None:
+    folder = voc(tmp_path)
+    for given, sentence in ((tmp_path / "none", "got no such folder"), (folder / "00001.xml", "got another file")):
+        with pytest.raises(BeersError, match=sentence):
+            read_labelled(folder, given)
+
+
+@pytest.mark.parametrize(
+    ("content", "sentence"),
+    [
+        (LAUGHS + "]><annotation>&j;</annotation>", "a document type"),
+        ((LAUGHS + "]><annotation>&j;</annotation>").encode("utf-16"), "a document type"),
+        (SHIP.replace("<annotation>", '<!DOCTYPE a SYSTEM "file:///etc/passwd"><annotation>', 1), "a document type"),
+        (SHIP.replace("<xmin>3</xmin>", ""), "a 'ship' without xmin"),
+        (SHIP.replace("<xmax>12", "<xmax>nan"), "numbers as corners of a 'ship', got '3 4 nan 9'"),
+        (SHIP.replace("<name>ship</name>", "<name> </name>"), "a name for every object"),
+        (SHIP.replace("<width>60", "<width>six"), "numbers as size"),
+        (SHIP[:-20], "expected plain XML"),
+        ("<kml></kml>", "Pascal VOC, an 'annotation', got <kml>"),
+        ('<?xml version="1.0" encoding="klingon"?>' + SHIP, "expected plain XML"),
+    ],
+)
+def test_a_faulty_voc_file_is_refused_by_a_sentence(content: str | bytes, sentence: str, tmp_path: Path) -> None:
+    image(tmp_path / "a.png")
+    (tmp_path / "a.xml").write_bytes(content if isinstance(content, bytes) else content.encode())
+    refused(tmp_path, sentence)
+
+
+def test_a_huge_file_is_refused_before_it_is_read(tmp_path: Path) -> None:
+    image(tmp_path / "a.png")
+    with (tmp_path / "a.xml").open("wb") as stream:
+        stream.truncate(1 << 40)
+    refused(tmp_path, "more than 8388608 bytes")
+
+
+@pytest.mark.parametrize(
+    ("make", "name", "content", "sentence"),
+    [
+        (yolo, "labels/val/00001.txt", "0 0.5 0.5 0.1", "YOLO's 'class cx cy w h'"),
+        (yolo, "labels/val/00001.txt", "0 30 20 10 10", "coordinates as shares of the image, 0 to 1"),
+        (yolo, "labels/val/00001.txt", "2 0.5 0.5 0.1 0.1", "a class from 0 to 1, of which there is a name, got 2"),
+        (yolo, "labels/val/00001.txt", "0.5 0.5 0.5 0.1 0.1", "a class from 0 to 1"),
+        (yolo, "labels/val/00001.txt", "ship 0.5 0.5 0.1 0.1", "numbers as class and coordinates"),
+        (yolo, "data.yaml", "names: {0: ship, 2: tank}", "names: a list, or a table by number from 0"),
+        (yolo, "data.yaml", "names: [ship", "expected YAML"),
+        (yolo, "data.yaml", "names: !!python/object/apply:os.system [true]", "expected YAML"),
+        (yolo, "data.yaml", "a: &a [x, x]\nb: &b [*a, *a]\nnames: [*b, *b]", "names: a list, or a table"),
+        (yolo, "data.yaml", "path: here", "data.yaml or classes.txt with the names"),
+        (yolo, "data.yaml", "[" * 5000, "expected YAML"),
+        (yolo, "data.yaml", "names: [" + "ab, " * 20000 + "]", "more than 65536 bytes"),
+        (dota, "labelTxt/00002.txt", "1 2 3 4 5 6 7 ship 0", "numbers as coordinates"),
+        (dota, "labelTxt/00002.txt", "a b c d e f g h ship 0", "numbers as coordinates"),
+        (dota, "labelTxt/00002.txt", "1 2 3 4 5 6 7 8 ship 9", "DOTA's eight coordinates"),
+    ],
+)
+def test_a_faulty_text_is_refused_by_a_sentence(
+    make: Callable[[Path], Path], name: str, content: str, sentence: str, tmp_path: Path
+) -> None:
+    text(make(tmp_path) / name, content)
+    refused(tmp_path, sentence)
+
+
+def test_an_outline_of_yolo_is_enclosed(tmp_path: Path) -> None:
+    folder = yolo(tmp_path)
+    text(folder / "labels" / "val" / "00001.txt", "1 0.5 0 0.75 0.5 0.5 1 0.25 0.5\n")
+    assert read_labelled(folder).images[0].truth.corners.tolist() == [[15, 0, 45, 40]]
+
+
+def test_names_stand_in_a_list_a_table_or_lines(tmp_path: Path) -> None:
+    text(tmp_path / "a" / "data.yaml", "names: [ship, tank]")
+    text(tmp_path / "b" / "data.yml", "names: {1: tank, 0: ship}")
+    text(tmp_path / "c" / "classes.txt", "ship\ntank\n")
+    assert {yolo_names([tmp_path / name]) for name in "abc"} == {("ship", "tank")}
+    assert yolo_names([tmp_path / "none", tmp_path / "c"]) == ("ship", "tank")
+
+
+def test_without_pyyaml_it_is_said_how_to_do_without(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "yaml", None)
+    with pytest.raises(MachineError, match=r"beers-deploy\[detect\]', or write classes.txt"):
+        read_labelled(yolo(tmp_path))
+
+
+@pytest.mark.parametrize(
+    ("damage", "sentence"),
+    [
+        ({"images": None}, "no list 'images'"),
+        ({"annotations": [5]}, "no list 'annotations'"),
+        ({"annotations": [{"image_id": 9, "category_id": 7, "bbox": [0, 0, 1, 1]}]}, "an entry that breaks it"),
+        ({"annotations": [{"image_id": [], "category_id": 7, "bbox": [0, 0, 1, 1]}]}, "an entry that breaks it"),
+        ({"categories": [{"id": 7, "name": 5}]}, "an entry that breaks it"),
+        ({"images": [{"id": 0, "file_name": "../../etc/passwd"}]}, "its images in .* got none of 1"),
+        ({"images": [{"id": 0, "file_name": "/etc/passwd"}]}, "its images in .* got none of 1"),
+    ],
+)
+def test_a_faulty_coco_file_is_refused_by_a_sentence(
+    damage: dict[str, object], sentence: str, tmp_path: Path
+) -> None:
+    path = coco(tmp_path) / "labels.json"
+    content = json.loads(path.read_text()) | damage
+    if damage.get("images"):
+        content["annotations"] = []
+    path.write_text(json.dumps(content))
+    refused(tmp_path, sentence)
+
+
+def test_what_coco_lists_and_the_folder_lacks_is_told_and_a_crowd_need_not_be_found(tmp_path: Path) -> None:
+    path = coco(tmp_path) / "labels.json"
+    content = json.loads(path.read_text())
+    content["annotations"][-1]["iscrowd"] = 1
+    path.write_text(json.dumps(content))
+    (tmp_path / "00002.png").unlink()
+    found = read_labelled(tmp_path)
+    assert [one.path.stem for one in found.images] == ["00001"]
+    assert found.notes == (
+        "1 of 2 images in labels.json are not in the folder.",
+        "Boxes that count neither way, difficult, a crowd or visible by less than 30 %: 1.",
+    )

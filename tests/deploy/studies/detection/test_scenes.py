@@ -1,0 +1,74 @@
+"""Synthetic scenes: the boxes are the objects' own pixels, the sizes are those of real ones, the seed decides all."""
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from deploy.studies.detection.boxes import Boxes
+from deploy.studies.detection.scenes import (
+    CLASSES,
+    SCENE_GSD_M,
+    Canvas,
+    Part,
+    aircraft,
+    ship,
+    synthetic_scene,
+    tank,
+    vehicle,
+)
+from model.simulator.drawing import turn
+
+SHAPES: list[Callable[[np.random.Generator], list[Part]]] = [vehicle, ship, aircraft, lambda g: tank(9.0, g)]
+Scene = tuple[np.ndarray, Boxes]
+LONGEST_M = {"vehicle": 14.2, "ship": 71, "aircraft": 46, "tank": 31}
+
+
+@pytest.fixture(scope="module")
+def scenes() -> list[Scene]:
+    return [synthetic_scene(np.random.default_rng(seed), 600, 701) for seed in range(12)]
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.sampled_from(range(4)), st.floats(0, math.tau), st.integers(0, 2**32))
+def test_a_box_is_the_pixels_that_the_object_changed(kind: int, angle: float, seed: int) -> None:
+    canvas = Canvas(400, 420, np.random.default_rng(seed))
+    before = np.array(canvas._image)
+    placed = canvas.put(kind, SHAPES[kind](canvas.generator), turn(1.3, -2.1, angle), 0.0)
+    assert placed
+    rows, columns = np.nonzero(np.array(canvas._image) != before)
+    assert canvas.corners == [(columns.min(), rows.min(), columns.max() + 1, rows.max() + 1)]
+
+
+def test_nothing_is_put_over_the_border_or_on_another_object() -> None:
+    canvas = Canvas(400, 400, np.random.default_rng(0))
+    parts = tank(9.0, canvas.generator)
+    assert canvas.put(3, parts, turn(0, 0, 0), 3.0)
+    assert not canvas.put(3, parts, turn(18.2, 0, 0), 3.0)
+    assert not canvas.put(3, parts, turn(45, 0, 0), 3.0)
+    assert len(canvas.corners) == len(canvas.classes) == 1
+
+
+def test_every_object_lies_within_and_has_the_size_of_its_kind(scenes: list[Scene]) -> None:
+    for radiance, truth in scenes:
+        assert radiance.shape == (600, 701)
+        assert radiance.dtype == np.float32
+        assert radiance.min() > 0
+        assert radiance.max() < 500
+        assert (truth.corners[:, :2] >= 0).all()
+        assert (truth.corners[:, 2:] <= (701, 600)).all()
+        sides_m = (truth.corners[:, 2:] - truth.corners[:, :2]) * SCENE_GSD_M
+        assert (sides_m.max(1) >= 1.5).all()
+        for kind, name in enumerate(CLASSES):
+            assert sides_m[truth.classes == kind].max(initial=0) <= LONGEST_M[name] + 2 * SCENE_GSD_M
+    assert np.all(sum(np.bincount(truth.classes, minlength=len(CLASSES)) for _, truth in scenes) >= 10)
+
+
+def test_the_seed_decides_all() -> None:
+    one, same, other = (synthetic_scene(np.random.default_rng(seed), 300, 300) for seed in (4, 4, 5))
+    np.testing.assert_array_equal(one[0], same[0])
+    np.testing.assert_array_equal(one[1].corners, same[1].corners)
+    assert one[0].tobytes() != other[0].tobytes()

@@ -1,0 +1,135 @@
+"""A study with a detector that finds what is bright: where its boxes lie, what follows of it, and what is shown."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from deploy.studies.detection.average_precision import find_hits, score_rows, site_weights
+from deploy.studies.detection.boxes import Boxes, iou
+from deploy.studies.detection.detector import Detector
+from deploy.studies.detection.page import crops, curves, objects_found
+from deploy.studies.detection.study import REFERENCE, AcquiredScene, Comparison, LabelledScene, SensorPair, acquired
+from deploy.studies.detection.tables import GAIN, LOSS, NO_LOSS, REGAINED, detection_rows, headline, main_table
+from deploy.studies.evaluation.methods import Method
+from model.simulator.detector import Draw
+from profiles import load_sensor
+from profiles.constant import Constant
+from profiles.figures import Row
+from profiles.sensor_file import reference_for
+
+GROUND, SHIP = 20.0, 250.0
+"""Radiances in W/m2/sr/um."""
+NAMES = ("ship", "tank")
+
+
+def sensors(name: str = "dior-medium", ratio: int = 3) -> SensorPair:
+    degraded = replace(load_sensor(name), oversampling=Constant(ratio, "assumed", "a test"))
+    return SensorPair(degraded, reference_for(degraded))
+
+
+def scene(corners: tuple[int, int, int, int], height: int = 150, width: int = 210, name: str = "a") -> LabelledScene:
+    radiance, (x1, y1, x2, y2) = torch.full((height, width), GROUND), corners
+    radiance[y1:y2, x1:x2] = SHIP
+    return LabelledScene(name, name, Boxes.of([corners], [0]), None, lambda _: radiance)
+
+
+def bright(image: np.ndarray) -> np.ndarray:
+    """The box around what is bright in an input, in the raw layout."""
+    rows, columns = np.nonzero(image[0, 0] > 0.75)
+    answer = np.zeros((1, 6, 1), np.float32)
+    if len(rows):
+        left, top, right, bottom = columns.min(), rows.min(), columns.max() + 1, rows.max() + 1
+        answer[0, :5, 0] = (left + right) / 2, (top + bottom) / 2, right - left, bottom - top, 0.9
+    return answer
+
+
+@pytest.mark.parametrize("ratio", [2, 3, 4])
+@pytest.mark.parametrize("corners", [(24, 36, 84, 72), (60, 12, 96, 120), (131, 85, 190, 133)])
+def test_boxes_come_back_to_where_the_object_lies(ratio: int, corners: tuple[int, int, int, int]) -> None:
+    seen = AcquiredScene(scene(corners, 149, 211), sensors(ratio=ratio), Draw(0))
+    found = seen.boxes(Detector(NAMES, 128, "raw", "", bright), None)
+    assert iou(found.corners, np.array([corners], float))[0, 0] > 0.75
+    middle = (found.corners[0, :2] + found.corners[0, 2:]) / 2
+    np.testing.assert_allclose(middle, (np.array(corners[:2]) + corners[2:]) / 2, atol=0.6 * ratio)
+
+
+def test_all_rows_are_shown_under_the_stretch_of_the_reference() -> None:
+    seen = AcquiredScene(scene((60, 60, 110, 100)), sensors("dior-high"), Draw(0))
+    assert seen.degraded.shape == seen.reference.shape == (50, 70)
+    np.testing.assert_array_equal(seen.shown(None), seen.display.to_srgb(seen.reference))
+    assert seen.display.black == pytest.approx(np.percentile(seen.reference, 0.5))
+
+
+def handmade(sites: int = 12, **found: int) -> Comparison:
+    """Sites of one ship each, of which each row finds so many, and all surely."""
+    scenes, pair = [scene((30, 30, 90, 80), name=str(number)) for number in range(sites)], sensors("dior-high")
+    truths = [each.truth for each in scenes]
+    boxes = {
+        row: [truth if k < count else Boxes.none() for k, truth in enumerate(truths)] for row, count in found.items()
+    }
+    hits = {row: find_hits(truths, each, len(NAMES)) for row, each in boxes.items()}
+    figures, confidence = score_rows(hits, NAMES, site_weights([each.site for each in scenes], 0, 200))
+    methods = {row: None if row == REFERENCE else Method(row, lambda dn: dn, "known") for row in found}
+    return Comparison(pair, methods, list(acquired(scenes, pair, 0)), boxes, hits, figures, confidence, NAMES)
+
+
+def rows_of(found: Comparison, table: str = main_table("dior-high")) -> dict[str, Row]:
+    return {row.name: row for row in detection_rows(found) if row.table == table}
+
+
+def test_a_loss_and_what_is_regained_of_it() -> None:
+    found = handmade(reference=12, degraded=3, traditional=9)
+    rows = rows_of(found)
+    ap = {name: row.figures["mAP50"].value for name, row in rows.items()}
+    assert ap == pytest.approx({"reference": 100, "degraded": 100 * 26 / 101, "traditional": 100 * 76 / 101})
+    last = rows["traditional"]
+    assert last.figures[GAIN].value == pytest.approx(5000 / 101)
+    assert last.figures[REGAINED].value == pytest.approx(100 * 50 / 75)
+    assert last.text["against degraded"] == "a gain"
+    assert "a gain" in headline([found])
+    assert LOSS not in rows[REFERENCE].figures
+    assert GAIN not in rows["degraded"].figures
+    lost = rows_of(handmade(reference=12, degraded=9, traditional=3))["traditional"]
+    assert lost.text["against degraded"] == "a loss"
+
+
+def test_without_a_loss_no_share_of_it_is_stated() -> None:
+    found = handmade(reference=12, degraded=12, traditional=12)
+    rows = rows_of(found)
+    assert rows["degraded"].figures[LOSS].interval == (0.0, 0.0)
+    assert rows["traditional"].figures[REGAINED].reason == NO_LOSS
+    assert rows["traditional"].text["against degraded"].startswith("no difference")
+
+
+def test_a_few_sites_bear_no_interval_and_no_verdict() -> None:
+    row = rows_of(handmade(4, reference=4, degraded=0, traditional=4))["traditional"]
+    assert all(figure.interval is None for figure in row.figures.values())
+    assert row.text["against degraded"].startswith("not known")
+    assert "of 4, fewer than 5" in row.figures[REGAINED].reason
+
+
+def test_every_figure_is_measured_or_says_why_not() -> None:
+    found = handmade(reference=12, degraded=3, traditional=9)
+    for row in detection_rows(found):
+        for name, figure in row.figures.items():
+            assert (figure.mode == "measured" and figure.source) or figure.reason, name
+    assert set(rows_of(found, "mAP50 by class, dior-high")[REFERENCE].figures) == {"ship"}  # no tank is labelled
+    by_size = rows_of(found, "mAP50 by size, dior-high")["degraded"].figures
+    assert [figure.mode for figure in by_size.values()] == ["unavailable", "unavailable", "measured"]
+
+
+def test_each_object_is_found_once_by_the_surest_box_of_its_class() -> None:
+    truth = Boxes.of([[0, 0, 10, 10], [20, 0, 30, 10], [40, 0, 50, 10]], [0, 0, 1])
+    corners = [[1, 0, 11, 10], [0, 0, 10, 10], [20, 0, 30, 10], [40, 0, 50, 10], [20, 0, 30, 10]]
+    hits, found = objects_found(truth, Boxes.of(corners, [0, 0, 1, 1, 0], [0.5, 0.9, 0.9, 0.8, 0.1]), 0.3)
+    assert hits.tolist() == [False, True, False, True, False]  # doubled, found, another class, found, unsure
+    assert found.tolist() == [True, False, True]
+
+
+def test_pictures_show_the_scenes_that_lose_most() -> None:
+    found = handmade(reference=12, degraded=3)
+    pictures = [curves([found]), *crops([found])]
+    assert [picture.source.split(";")[0] for picture in pictures] == ["data:image/svg+xml", *["data:image/png"] * 4]
+    assert [picture.title[0] for picture in pictures[1:]] == ["3", "4", "5", "6"]

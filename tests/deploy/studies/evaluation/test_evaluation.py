@@ -1,0 +1,305 @@
+"""Pairs, methods, scores and targets of an evaluation."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import jsonschema
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from deploy.cli import app
+from deploy.results import SCHEMA_PATH, missing
+from deploy.studies.evaluation import targets as targets_module
+from deploy.studies.evaluation.methods import Method, method_named
+from deploy.studies.evaluation.page import chosen_pairs, evaluation_report, strip_of
+from deploy.studies.evaluation.pairs import NamedPair, oversampling_note, oversamplings_of, read_pairs, simulate_pairs
+from deploy.studies.evaluation.scores import NOISE_FREE, READ, Instruments, paper_rows, score, site_rows
+from deploy.studies.evaluation.targets import acquire_targets, flat_figure, mtf_figure, snr_name, target_figures
+from model.io.tiff import write_tiff
+from model.metrics.fidelity import fidelity_db
+from model.metrics.refusal import Refusal
+from model.simulator.acquire import simulate_pair
+from model.simulator.detector import Draw
+from model.simulator.procedural import procedural_scene
+from profiles import load_sensor
+from profiles.constant import Constant
+from profiles.errors import ImageError, OptionError
+from profiles.figures import Row, by_table, measured
+
+DEGRADED, REFERENCE = load_sensor("pleiades-degraded"), load_sensor("pleiades-reference")
+SENSORS = DEGRADED.nominal(), REFERENCE.nominal()
+PLAIN = Instruments({"LPIPS-squeeze": "no weights"})
+
+
+def pair(name: str = "site_1.tif", seed: int = 0, noise_dn: float = 20) -> NamedPair:
+    generator = np.random.default_rng(seed)
+    reference = generator.integers(100, 3000, (37, 45)).astype(np.float32)
+    noisy = reference + generator.normal(0, noise_dn, reference.shape)
+    return NamedPair(name, np.clip(np.rint(noisy), 0, 4095).astype(np.float32), reference)
+
+
+def write_pairs(folder: Path, pairs: list[NamedPair]) -> Path:
+    for each in pairs:
+        for role in ("degraded", "reference"):
+            write_tiff(folder / role / each.name, getattr(each, role).astype(np.uint16))
+    return folder
+
+
+IDENTITY = Method("degraded", lambda dn: dn, "blind")
+
+
+@pytest.mark.parametrize(
+    ("name", "site"),
+    [
+        ("brighton_forest_lakeshore_0034.jpg", "brighton_forest_lakeshore"),
+        ("dry_rangeland_track_5dded5bc_23.jpg", "dry_rangeland_track"),
+        ("agung1_tropical_slope.jpg", "agung1_tropical_slope"),
+        ("zoo_mosaic_50cm.png", "zoo_mosaic_50cm"),
+        ("0001-drawn-00012.tif", "0001-drawn-00012"),
+        ("_12.tif", "_12.tif"),
+    ],
+)
+def test_frames_of_one_site_are_told_by_their_names(name: str, site: str) -> None:
+    assert replace(pair(), name=name).site == site
+
+
+def test_pairs_come_back_from_a_folder(tmp_path: Path) -> None:
+    written = [pair("a_1.tif", 1), pair("b_2.tif", 2)]
+    read = read_pairs(write_pairs(tmp_path, written))
+    assert [each.name for each in read] == ["a_1", "b_2"]
+    for one, other in zip(read, written, strict=True):
+        assert np.array_equal(one.degraded, other.degraded)
+        assert np.array_equal(one.reference, other.reference)
+
+
+def test_a_pair_without_a_partner_or_of_two_sizes_is_refused(tmp_path: Path) -> None:
+    write_pairs(tmp_path, [pair("a.tif"), pair("b.tif")])
+    write_tiff(tmp_path / "reference" / "b.tif", np.ones((9, 9), np.uint16))
+    with pytest.raises(ImageError, match=r"45 x 37 and 9 x 9"):
+        read_pairs(tmp_path)
+    (tmp_path / "reference" / "b.tif").unlink()
+    with pytest.raises(ImageError, match=r"'b' in one of them"):
+        read_pairs(tmp_path)
+    with pytest.raises(ImageError, match="no such folder"):
+        read_pairs(tmp_path / "degraded")
+
+
+def test_scenes_too_small_are_named_and_all_too_small_is_refused() -> None:
+    large, small = (procedural_scene(side, side, np.random.default_rng(0)) for side in (400, 200))
+    pairs, left_out = simulate_pairs([large, replace(small, name="small")], DEGRADED, REFERENCE, 0)
+    assert len(pairs) == 1
+    assert left_out == ["small"]
+    assert pairs[0].degraded.shape == pairs[0].reference.shape
+    with pytest.raises(ImageError, match="224 pixels"):
+        simulate_pairs([small], DEGRADED, REFERENCE, 0)
+
+
+@pytest.mark.parametrize(
+    ("own", "sides", "words"),
+    [
+        (2, (300, 700), ""),
+        (4, (700, 700), ""),
+        (4, (300, 700), "4 (1 of 2 images) and 2 (1 of 2 images), where pleiades-degraded states 4"),
+        (5, (700, 700), "4 (2 of 2 images), where pleiades-degraded states 5; at most 4 are taken"),
+    ],
+)
+def test_another_oversampling_than_the_profiles_is_said(own: int, sides: tuple[int, int], words: str) -> None:
+    profile = replace(DEGRADED, oversampling=Constant(own, "stated", "a test"))
+    scenes = [procedural_scene(side, side, np.random.default_rng(0)) for side in sides]
+    pairs, _ = simulate_pairs(scenes, profile, REFERENCE, 0, oversamplings_of(profile))
+    said = oversampling_note(pairs, profile)
+    assert words in said
+    assert bool(words) == bool(said)
+
+
+@pytest.mark.parametrize("name", ["magic", "traditional-superb", "convbeers-huge", ""])
+def test_an_unknown_method_is_refused(name: str) -> None:
+    with pytest.raises(OptionError, match=r"--methods|variant"):
+        method_named(name, DEGRADED, REFERENCE)
+
+
+def test_what_a_network_knows_of_the_sensor_is_no_secret() -> None:
+    """A shipped network knows the images' sensor unless its name says another."""
+    known = {
+        name: method_named(name, DEGRADED, REFERENCE).sensor_known
+        for name in (
+            "convbeers-xs",
+            "convbeers-xs-int8",
+            "convbeers-xs@blind",
+            "convbeers-xs@dior-medium",
+            "traditional",
+        )
+    }
+    assert known == {
+        "convbeers-xs": "known",
+        "convbeers-xs-int8": "known",
+        "convbeers-xs@blind": "blind",
+        "convbeers-xs@dior-medium": "another: dior-medium",
+        "traditional": "known",
+    }
+
+
+def test_a_shipped_network_restores_as_it_knows_the_sensor() -> None:
+    """Specialised to the sensor that is given, and to no other where its name says one."""
+    dn = np.random.default_rng(0).uniform(300, 900, (47, 53)).astype(np.float32)
+    blurred = replace(DEGRADED.nominal(), mtf_nyquist=0.03)
+    method = method_named("convbeers-xs", DEGRADED, REFERENCE)
+    assert method.specialise is not None
+    np.testing.assert_allclose(method.specialise(DEGRADED.nominal())(dn), method.restore(dn), rtol=0, atol=1)
+    assert np.abs(method.specialise(blurred)(dn) - method.restore(dn)).max() > 5
+    assert method_named("convbeers-xs@blind", DEGRADED, REFERENCE).specialise is None
+
+
+def test_clipped_pixels_do_not_count() -> None:
+    """Trap 17: above full scale the truth is unknown, in the reference as in the input."""
+    one = pair()
+    reference, degraded = one.reference.copy(), one.degraded.copy()
+    reference[3:9, 5:11], degraded[20:25, 5:11] = 4095, 4095
+    restored = degraded.copy()
+    before = fidelity_db(restored, reference, degraded)
+    restored[3:9, 5:11], restored[20:25, 5:11] = 100, 100
+    assert fidelity_db(restored, reference, degraded) == before
+    restored[30, 30] += 500
+    assert fidelity_db(restored, reference, degraded) < before
+
+
+def test_an_image_that_is_all_clipped_still_has_a_figure() -> None:
+    white = np.full((12, 13), 4095, np.float32)
+    assert fidelity_db(white - 1, white, white) == pytest.approx(20 * np.log10(4095))
+
+
+def test_the_degraded_input_gains_nothing_and_missing_figures_have_a_reason() -> None:
+    mean, *images = score(IDENTITY, [pair(f"{'abcde'[s]}.tif", seed=s) for s in range(5)], PLAIN, 0, lambda: None)
+    assert mean.figures["PSNR gain"].value == 0
+    assert len(images) == 5
+    assert mean.figures["LPIPS-squeeze"].reason == "no weights"
+    assert missing([mean, *images]) == [f"- {NOISE_FREE}: {READ}", "- LPIPS-squeeze: no weights"]
+    interval = mean.figures["PSNR"].interval
+    assert interval is not None
+    assert interval[0] <= (mean.figures["PSNR"].value or 0) <= interval[1]
+    assert NOISE_FREE not in {row.table.removesuffix(" by site") for row in site_rows(images)}
+    few, *_ = score(IDENTITY, [pair(f"{'abcd'[s]}.tif", seed=s) for s in range(4)], PLAIN, 0, lambda: None)
+    assert few.figures["PSNR"].interval is None
+    assert "no interval: 4 sites, fewer than 5" in few.figures["PSNR"].source
+
+
+def test_identical_images_are_no_number() -> None:
+    perfect = replace(pair(), degraded=pair().reference)
+    mean, image = score(IDENTITY, [perfect], PLAIN, 0, lambda: None)
+    assert mean.figures["PSNR"].value is None
+    assert "identical" in image.figures["PSNR"].reason
+
+
+def test_the_reference_without_noise_is_the_same_acquisition_otherwise() -> None:
+    """What is left between the two is the reference sensor's noise and rounding; the pair's bytes are as ever."""
+    scene = procedural_scene(700, 760, np.random.default_rng(3))
+    (one,), _ = simulate_pairs([scene], DEGRADED, REFERENCE, 7)
+    same = simulate_pair(scene.radiance, *SENSORS, 4, Draw(7))
+    assert np.array_equal(one.degraded, same.degraded.numpy())
+    assert np.array_equal(one.reference, same.reference.numpy())
+    assert one.noise_free is not None
+    noise, sensor = one.reference - one.noise_free, SENSORS[1]
+    light = np.clip(one.noise_free / sensor.gain_dn_per_radiance, 0, None)
+    variance = (sensor.alpha * light + sensor.beta) * sensor.gain_dn_per_radiance**2 + 1 / 12
+    sound = one.reference < sensor.max_dn
+    assert float((noise**2 / variance)[sound].mean()) == pytest.approx(1, abs=0.05)
+    assert abs(float(noise[sound].mean())) < 3 * float(np.sqrt(variance.mean() / noise.size))
+
+
+def test_noise_of_the_reference_is_no_error_of_a_method_that_leaves_it_out() -> None:
+    scene = procedural_scene(700, 760, np.random.default_rng(3))
+    (one,), _ = simulate_pairs([scene], DEGRADED, REFERENCE, 7)
+    clean = one.noise_free
+    assert clean is not None
+    oracle = Method("oracle", lambda _: clean + np.float32(2), "known")
+    mean, image = score(oracle, [one], PLAIN, 0, lambda: None)
+    assert f"{NOISE_FREE} by site" in by_table(site_rows([image]))
+    noise_free = mean.figures[NOISE_FREE].value or 0
+    assert noise_free == pytest.approx(20 * np.log10(4095 / 2), abs=1e-3)
+    assert noise_free > (mean.figures["PSNR"].value or 0) + 5
+
+
+def test_sites_are_means_of_their_images() -> None:
+    pairs = [pair("a_1.tif", 1, 10), pair("a_2.tif", 2, 40), pair("b_1.tif", 3, 20)]
+    _, *images = score(IDENTITY, pairs, PLAIN, 0, lambda: None)
+    rows = site_rows(images)
+    assert list(by_table(rows)) == ["PSNR by site", "SSIM by site"]
+    first, second = rows[:2]
+    levels = [row.figures["PSNR"].value or 0 for row in images]
+    assert (first.name, second.name) == ("a", "b")
+    assert first.figures["degraded"].value == pytest.approx(sum(levels[:2]) / 2)
+    assert second.figures["degraded"].value == pytest.approx(levels[2])
+    assert (first.text["images"], second.text["images"]) == ("2", "1")
+
+
+def test_targets_measure_the_sensor_and_what_a_chain_makes_of_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(targets_module, "REPEATS", 1)
+    targets = acquire_targets(SENSORS[0], 0)
+    assert len(targets.edges) == 4
+    before = target_figures(IDENTITY, targets)
+    assert before["MTF at Nyquist"].value == pytest.approx(7, abs=0.7)
+    assert snr_name(25) == "SNR at 25 W/m2/sr/um"
+    assert before[snr_name(25)].value == pytest.approx(50, rel=0.05)
+    assert before[snr_name(100)].value == pytest.approx(110, rel=0.05)
+    after = target_figures(method_named("traditional-fast", DEGRADED, REFERENCE), targets)
+    assert (after["MTF at Nyquist"].value or 0) > 12
+    assert (after[snr_name(25)].value or 0) > 200
+
+
+def test_refused_edges_and_silent_fields_are_unavailable() -> None:
+    refused = mtf_figure([Refusal("contrast", "a step of 3 in noise of 2")] * 3)
+    assert refused.value is None
+    assert refused.reason == "3 of 3 edges refused: a step of 3 in noise of 2"
+    assert flat_figure(np.full((9, 9), 100.0)).value is None
+
+
+def test_strips_hold_every_method_and_black_below_the_reference() -> None:
+    one = pair()
+    strip, white = strip_of(one, [IDENTITY, Method("zero", np.zeros_like, "blind")])
+    side = 37 * 2
+    assert strip.shape == (22 + 2 * (side + 4), 3 * (side + 4) - 4)
+    assert white > 1
+    assert strip[22 + side + 4 : 22 + side + 4 + side, 2 * (side + 4) :].max() == 0
+    assert strip[22 + side + 4 : 22 + side + 4 + side, :side].max() == 255
+
+
+def test_one_pair_a_site_is_shown() -> None:
+    pairs = [pair(f"{site}_{k}.tif") for site in "abcdef" for k in range(2)]
+    assert [each.name for each in chosen_pairs(pairs)] == ["a_0.tif", "b_0.tif", "c_0.tif", "d_0.tif"]
+
+
+def test_tables_of_a_sweep_keep_their_words_on_the_page() -> None:
+    mean, *_ = score(IDENTITY, [pair()], PLAIN, 0, lambda: None)
+    swept = Row("sweep, MTF at Nyquist", "nominal", {"degraded": measured(7, "%", "edges")})
+    report = evaluation_report("a test", [mean], [], [swept], [])
+    assert [table.title for table in report.tables] == ["Means over all pairs", "Sweep, MTF at Nyquist"]
+
+
+def test_the_papers_rows_are_published() -> None:
+    figures = [figure for row in paper_rows() for figure in row.figures.values()]
+    assert {figure.mode for figure in figures} == {"published", "unavailable"}
+
+
+def test_the_command_on_a_folder_of_pairs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(targets_module, "REPEATS", 1)
+    folder = write_pairs(tmp_path / "pairs", [pair("a_1.tif", 1), pair("b_1.tif", 2)])
+    arguments = [
+        "evaluate",
+        "--pairs",
+        str(folder),
+        "--methods",
+        "traditional-fast",
+        "--json",
+        str(tmp_path / "e.json"),
+    ]
+    result = CliRunner().invoke(app, [*arguments, "--out", str(tmp_path / "out")])
+    assert result.exit_code == 0, result.output
+    document = json.loads((tmp_path / "e.json").read_text())
+    jsonschema.validate(document, json.loads(SCHEMA_PATH.read_text()))
+    assert [each["name"] for each in document["inputs"]] == ["a_1.tif", "b_1.tif"] * 2
+    names = [row["name"] for row in document["rows"] if row["table"] == "mean"]
+    assert names == ["degraded", "traditional-fast", "paper: traditional", "paper: ConvBEERS"]
+    assert (tmp_path / "out" / "report.html").read_text().count("data:image/png") == 2
+    assert sorted(p.name for p in (tmp_path / "out").iterdir()) == ["a.png", "b.png", "report.html"]

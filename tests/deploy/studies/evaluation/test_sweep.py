@@ -1,0 +1,195 @@
+"""Conditions of a sweep: who is told which sensor, and what a chain loses when it is told the wrong one."""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+
+from deploy.restoration.function import Restore
+from deploy.studies.evaluation import sweep as module
+from deploy.studies.evaluation import targets as targets_module
+from deploy.studies.evaluation.methods import BLIND, Method
+from deploy.studies.evaluation.sweep import (
+    NOMINAL_KNOWN,
+    TRUTH_KNOWN,
+    Fixed,
+    Found,
+    Key,
+    Sweep,
+    conditions,
+    suppositions,
+)
+from model.simulator.procedural import procedural_scene
+from profiles import SensorProfile, load_sensor
+from profiles.figures import Row, by_table, unavailable
+from profiles.sensor import Sensor
+
+PROFILE, REFERENCE = load_sensor("pleiades-degraded"), load_sensor("pleiades-reference")
+NOMINAL = PROFILE.nominal()
+DRIFTED = replace(NOMINAL, mtf_nyquist=0.03)
+DIM = replace(NOMINAL, gain_dn_per_radiance=0.7 * NOMINAL.gain_dn_per_radiance)
+
+WRONG = "MTF 3%, supposed MTF 7%"
+WRONGLY = "sweep, sensor known wrongly", "sweep, lost by a sensor known wrongly"
+
+
+def test_every_condition_is_a_sensor_that_can_be() -> None:
+    found = conditions(NOMINAL, PROFILE)
+    assert found["nominal"] == NOMINAL
+    assert len(found) == 16
+    for sensor in found.values():
+        assert all(0 < mtf < 0.6 for mtf in sensor.mtf_axes)
+        assert min(sensor.alpha, sensor.beta) >= 0
+
+
+def test_what_is_supposed_wrongly_is_another_sensor_than_the_one_of_a_condition() -> None:
+    sensors = conditions(NOMINAL, PROFILE)
+    for truth, supposed in suppositions(NOMINAL, PROFILE).items():
+        assert sensors[truth] not in supposed.values()
+    more, less = suppositions(NOMINAL, PROFILE)["nominal"].values()
+    for radiance in (25, 100):
+        sigma = NOMINAL.noise_sigma(radiance)
+        assert (sigma / more.noise_sigma(radiance), sigma / less.noise_sigma(radiance)) == pytest.approx(
+            (4 / 3, 2 / 3)
+        )
+
+
+def test_a_fixed_sensor_is_what_every_draw_gives() -> None:
+    assert Fixed(NOMINAL).draw(np.random.default_rng(0)) is NOMINAL
+
+
+def half(dn: np.ndarray) -> np.ndarray:
+    return dn / 2
+
+
+@dataclass(frozen=True)
+class Swept:
+    """One sweep under three conditions: its rows, its ticks, and the sensors that the able network was given."""
+
+    tables: dict[str, dict[str, Row]]
+    ticks: list[str]
+    given: list[Sensor]
+    size: int
+
+
+@pytest.fixture(scope="module")
+def swept() -> Iterator[Swept]:
+    given: list[Sensor] = []
+
+    def specialise(sensor: Sensor) -> Restore:
+        given.append(sensor)
+        return lambda dn: dn + np.float32(1000 * sensor.mtf_nyquist)
+
+    able = Method("able", half, BLIND, specialise)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(targets_module, "REPEATS", 1)
+        patch.setattr(targets_module, "ANGLES_DEG", (5.0, 8.0))
+        patch.setattr(targets_module, "SIDE_PX", 100)
+        patch.setattr(module, "conditions", few)
+        scene = procedural_scene(500, 560, np.random.default_rng(5))
+        sweep, ticks = Sweep([Method("half", half, BLIND), able], [scene], PROFILE, REFERENCE, 0), list[str]()
+        rows = sweep.run(ticks.append).rows
+        tables = {table: {row.name: row for row in rows} for table, rows in by_table(rows).items()}
+        yield Swept(tables, ticks, given, sweep.size)
+
+
+def few(_nominal: Sensor, _profile: SensorProfile) -> dict[str, Sensor]:
+    return {"nominal": NOMINAL, "MTF 3%": DRIFTED, "dim": DIM}
+
+
+def psnr(swept: Swept, condition: str) -> Callable[[str], float]:
+    return lambda method: swept.tables["sweep, PSNR"][condition].figures[method].value or 0.0
+
+
+def test_every_trial_ticks_and_says_what_it_was(swept: Swept) -> None:
+    assert len(swept.ticks) == swept.size
+    assert swept.ticks[:2] == ["nominal: degraded", "nominal: traditional"]
+
+
+def test_a_network_that_can_know_the_sensor_knows_that_of_each_condition(swept: Swept) -> None:
+    """Then those that are supposed in its place; it never restores as it does by itself."""
+    wrong = suppositions(NOMINAL, PROFILE)
+    supposed = [list(wrong[name].values()) for name in ("nominal", "MTF 3%")]
+    assert swept.given == [NOMINAL, *supposed[0], DRIFTED, *supposed[1], DIM]
+    at = psnr(swept, "nominal")
+    assert at("half") < at("able") - 3
+
+
+def test_the_truth_pays_where_the_sensor_has_drifted(swept: Swept) -> None:
+    nominal, drifted = psnr(swept, "nominal"), psnr(swept, "MTF 3%")
+    assert nominal(TRUTH_KNOWN) == nominal(NOMINAL_KNOWN)
+    assert drifted(TRUTH_KNOWN) > drifted(NOMINAL_KNOWN) + 1
+    assert nominal("half") < nominal("degraded") - 5
+
+
+def test_another_gain_is_told_to_the_chains_and_kept(swept: Swept) -> None:
+    """The reference has the gain of the input, so brightness is no error of a method that knows no gains."""
+    nominal, dim = psnr(swept, "nominal"), psnr(swept, "dim")
+    assert dim(NOMINAL_KNOWN) == dim(TRUTH_KNOWN)
+    assert dim("degraded") == pytest.approx(nominal("degraded") + 3.1, abs=0.5)
+
+
+def test_what_a_wrong_sensor_costs_is_counted_from_the_truth_known(swept: Swept) -> None:
+    wrong, lost = (swept.tables[name] for name in WRONGLY)
+    assert list(wrong) == list(lost) == ["nominal, supposed SNR x 1.33", "nominal, supposed SNR x 0.67", WRONG]
+    for method, known in (("traditional", TRUTH_KNOWN), ("able", "able")):
+        row, cost = wrong[WRONG].figures[method].value or 0, lost[WRONG].figures[method].value or 0
+        assert cost == pytest.approx(psnr(swept, "MTF 3%")(known) - row)
+    assert (lost[WRONG].figures["traditional"].value or 0) > 1
+    assert list(wrong[WRONG].figures) == ["traditional", "able"]
+
+
+SITES = ["a", "b", "c", "d", "e", "f"]
+
+
+def known() -> Found:
+    """Sites differ by 20 dB, the network's lead over the chain by nothing under one condition, a little under two."""
+    site = np.linspace(30, 50, len(SITES))
+    lead = {"nominal": np.full(6, 0.75), "MTF 3%": np.linspace(0.1, 0.5, 6)}
+    psnr: dict[Key, np.ndarray] = {}
+    for truth, ahead in lead.items():
+        levels = {"degraded": site - 8, "traditional": site, "net": site + ahead}
+        psnr |= {(truth, truth, name): np.stack([level, level + 1]) for name, level in levels.items()}
+    psnr["MTF 3%", "nominal", "traditional"] = np.stack([site - 2, site - 2])
+    psnr["MTF 3%", "MTF 7%", "net"] = np.stack([site - 1, site - 1])
+    return Found(psnr, dict.fromkeys(psnr, unavailable("%", "no edges here")), SITES, 0)
+
+
+def tables() -> dict[str, list[Row]]:
+    return by_table(known().rows)
+
+
+def test_the_interval_of_a_gain_is_that_of_differences_on_the_same_images() -> None:
+    nominal, blurred = (row.figures["net"] for row in tables()["sweep, gain over the chain"])
+    assert nominal.value == pytest.approx(0.75)
+    assert nominal.interval == pytest.approx((0.75, 0.75))
+    assert blurred.interval is not None
+    assert 0.1 <= blurred.interval[0] < (blurred.value or 0) < blurred.interval[1] <= 0.5
+
+
+def test_over_all_conditions_mean_and_least_gain_are_named() -> None:
+    (row,) = tables()["sweep, gain over the chain, all conditions"]
+    assert row.name == "net"
+    assert row.figures["mean of 2 conditions"].value == pytest.approx((0.75 + 0.3) / 2)
+    assert row.figures["least"].value == pytest.approx(0.3)
+    assert row.text == {"least at": "MTF 3%"}
+
+
+def test_the_reference_without_noise_has_a_table_of_its_own() -> None:
+    noisy, clean = (tables()[f"sweep, PSNR{end}"][0].figures for end in ("", ", reference without noise"))
+    assert (clean["net"].value or 0) - (noisy["net"].value or 0) == pytest.approx(1)
+
+
+def test_what_a_wrongly_known_sensor_costs_is_on_the_same_images() -> None:
+    (row,) = tables()["sweep, lost by a sensor known wrongly"]
+    assert row.name == "MTF 3%, supposed MTF 7%"
+    assert row.figures["net"].value == pytest.approx(1.3)
+    assert row.figures["net"].interval is not None
+    assert row.figures["net"].interval[1] - row.figures["net"].interval[0] < 0.5
+
+
+def test_without_networks_there_are_no_gains() -> None:
+    one = known()
+    chain = {key: values for key, values in one.psnr.items() if key[2] != "net"}
+    assert not [row for row in Found(chain, one.mtf, SITES, 0).rows if "gain" in row.table]

@@ -1,0 +1,227 @@
+import json
+import math
+import tomllib
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tifffile
+import torch
+from jsonschema import validate
+from typer.testing import CliRunner
+
+from deploy.cli import app
+from deploy.results import SCHEMA_PATH
+from deploy.studies.characterise import Box, characterise, profile_toml, read_box
+from model.metrics.slanted_edge import slanted_edge
+from model.simulator.acquire import acquire
+from model.simulator.detector import Draw, to_uint16
+from model.simulator.procedural import procedural_scene
+from model.simulator.sampling import scene_spectrum
+from profiles import load_sensor
+from profiles.errors import BeersError, OptionError
+from profiles.sensor import Sensor, noise_from_snr
+
+RATIO, SIDE, GAIN, BOARD_PX = 4, 1280, 10.2375, 100
+SNRS = (50.0, 110.0)
+SENSOR = Sensor(0.09, *noise_from_snr(25, SNRS[0], 100, SNRS[1]), GAIN, 12, {}, 0.05)
+
+
+def landscape(seed: int, board: bool) -> torch.Tensor:
+    """A drawn scene without its own calibration site; a leaning checkerboard of 100 x 100 pixels in it or none."""
+    radiance = procedural_scene(SIDE, SIDE, np.random.default_rng(seed)).radiance.clone()
+    radiance[:420] = radiance[420:840]
+    if board:
+        upright = slanted_edge(BOARD_PX, RATIO, 7, (-1, 1))
+        start = (SIDE - upright.shape[0]) // 2
+        part = slice(start, start + upright.shape[0])
+        radiance[part, part] = 95 + 65 * upright * slanted_edge(BOARD_PX, RATIO, -7, (-1, 1)).T
+    return radiance
+
+
+def acquisition(seed: int, board: bool) -> np.ndarray:
+    return to_uint16(acquire(scene_spectrum(landscape(seed, board)), SIDE, SENSOR, RATIO, Draw(seed), "degraded"))
+
+
+@pytest.fixture(scope="module")
+def raw(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """Two raw images of one sensor, the checkerboard in the first."""
+    folder = tmp_path_factory.mktemp("raw")
+    paths = folder / "board.tif", folder / "plain.tif"
+    for seed, path in enumerate(paths):
+        tifffile.imwrite(path, acquisition(seed, board=seed == 0))
+    return paths
+
+
+def run(*words: object) -> tuple[int, str]:
+    done = CliRunner().invoke(app, ["characterise", *map(str, words)])
+    assert done.exception is None or isinstance(done.exception, SystemExit)
+    return done.exit_code, " ".join(done.output.split())
+
+
+def test_the_profile_is_that_of_the_sensor(raw: tuple[Path, Path], tmp_path: Path) -> None:
+    out, figures = tmp_path / "mine.toml", tmp_path / "mine.json"
+    code, said = run(*raw, "--bits", 12, "--gain", GAIN, "--gsd", 0.7, "--out", out, "--json", figures)
+    assert code == 0, said
+    profile = load_sensor(str(out))
+    sensor = profile.nominal()
+    assert sensor.mtf_axes == pytest.approx(SENSOR.mtf_axes, rel=0.1)
+    for radiance, snr in zip((25, 100), SNRS, strict=True):
+        assert radiance / sensor.noise_sigma(radiance) == pytest.approx(snr, rel=0.1)
+    assert (sensor.bits, sensor.gain_dn_per_radiance, profile.gsd_m.low) == (12, GAIN, 0.7)
+    assert {profile.mtf_nyquist.status, profile.snr_pair[0].status} == {"measured"}
+    assert {profile.gain_dn_per_radiance.status, profile.bits.status, profile.gsd_m.status} == {"stated"}
+    assert run(*raw, "--bits", 12, "--gain", GAIN, "--gsd", 0.7, "--out", tmp_path / "again.toml")[0] == 0
+    assert (tmp_path / "again.toml").read_bytes() == out.read_bytes()
+    document = json.loads(figures.read_text(encoding="utf-8"))
+    validate(document, json.loads(SCHEMA_PATH.read_text(encoding="utf-8")))
+    shown = document["rows"][0]["figures"]
+    truths = (9.0, 5.0, *SNRS)
+    assert {figure["mode"] for figure in shown.values()} == {"measured"}
+    intervals = [figure["interval"] for figure in shown.values()]
+    assert sum(low <= true <= high for (low, high), true in zip(intervals, truths, strict=True)) >= 3
+    text = out.read_text(encoding="utf-8")
+    assert text.count("# 95 % interval") == len(truths)
+    assert f"# 95 % interval {intervals[2][0]:.3g} to {intervals[2][1]:.3g}" in text
+
+
+def test_without_a_gain_the_noise_over_full_scale_stands(raw: tuple[Path, Path]) -> None:
+    """To a network only that matters: any gain leaves it."""
+    stated = characterise(raw, bits=12, gain=3.0)
+    assumed = characterise(raw, bits=12)
+    assert assumed.gain == pytest.approx(4095 / 400)
+    for one, other in zip(stated.snrs, assumed.snrs, strict=True):
+        assert one.value == pytest.approx(other.value)
+        assert one.radiance * 3.0 == pytest.approx(other.radiance * assumed.gain)
+    written = tomllib.loads(profile_toml(assumed))
+    assert written["digitiser"]["gain_dn_per_radiance"]["status"] == "assumed"
+    assert written["noise"]["radiance_1"]["value"] == pytest.approx(100)
+
+
+def edge_box(raw: tuple[Path, Path]) -> Box:
+    """The upper half of the board's upright edge, in an image that has lost 32 pixels a side."""
+    middle = SIDE // RATIO // 2 - 32
+    return Box(raw[0], middle - 11, middle - 38, 30, 28)
+
+
+def test_a_box_gives_one_axis_for_both(raw: tuple[Path, Path]) -> None:
+    found = characterise(raw, (edge_box(raw),), bits=12)
+    assert found.along is None
+    assert found.across is not None
+    assert found.across.edges == 1
+    low, high = found.across.interval
+    assert low <= 0.09 <= high < 1.5 * low
+    text = profile_toml(found)
+    assert "mtf_nyquist_along" not in text
+    assert "# measured across the track alone" in text
+    assert found.rows()[0].figures["MTF along at Nyquist"].mode == "unavailable"
+
+
+def test_images_without_an_edge_are_refused(raw: tuple[Path, Path], tmp_path: Path) -> None:
+    code, said = run(raw[1], "--bits", 12, "--out", tmp_path / "mine.toml")
+    assert (code, list(tmp_path.iterdir())) == (2, [])
+    assert "expected 3 straight edges" in said
+    assert "--edge FILE:X,Y,WIDTH,HEIGHT" in said
+
+
+@pytest.mark.parametrize(
+    ("box", "words"),
+    [
+        ("board.tif", "FILE:X,Y,WIDTH,HEIGHT"),
+        ("board.tif:1,2,3", "FILE:X,Y,WIDTH,HEIGHT"),
+        ("board.tif:1,2,-3,4", "FILE:X,Y,WIDTH,HEIGHT"),
+        ("other.tif:1,2,30,40", "one of the images"),
+    ],
+)
+def test_a_box_written_wrongly_is_refused(box: str, words: str) -> None:
+    with pytest.raises(OptionError, match=words):
+        read_box(box, [Path("board.tif")])
+
+
+@pytest.mark.parametrize(
+    ("box", "words"),
+    [("0,0,9999,20", "or more inside"), ("9,9,0,0", "or more inside"), ("2,2,30,40", "one straight edge")],
+)
+def test_a_box_that_holds_no_edge_is_refused(raw: tuple[Path, Path], tmp_path: Path, box: str, words: str) -> None:
+    code, said = run(*raw, "--bits", 12, "--edge", f"{raw[0]}:{box}", "--out", tmp_path / "mine.toml")
+    assert (code, list(tmp_path.iterdir())) == (2, [])
+    assert words in said
+
+
+def tiff(folder: Path, pixels: np.ndarray) -> Path:
+    tifffile.imwrite(folder / "raw.tif", pixels, photometric="rgb" if pixels.ndim == 3 else "minisblack")
+    return folder / "raw.tif"
+
+
+FLAT = np.random.default_rng(0).normal(1000, 20, (200, 200))
+WRONG: dict[str, tuple[np.ndarray, tuple[str, ...], str]] = {
+    "8-bit": (np.clip(FLAT / 8, 0, 255).astype(np.uint8), (), "in 8 bits; give the digitiser's"),
+    "bands": (np.full((64, 64, 3), 7, np.uint16), ("--bits", "12"), "one band"),
+    "fractions": (FLAT.astype(np.float32), ("--bits", "12"), "whole digital numbers"),
+    "negative": (FLAT.astype(np.int16) - 2000, ("--bits", "12"), "from 0 to 65535"),
+    "wide": (FLAT.astype(np.uint32) * 70, ("--bits", "16"), "from 0 to 65535"),
+    "nan": (np.where(FLAT > 1060, np.nan, 7).astype(np.float32), ("--bits", "12"), "finite pixels"),
+    "steps": (FLAT.astype(np.uint16) * 16, ("--bits", "16"), "divide it by 16"),
+    "open bits": (FLAT.astype(np.uint16), (), "such as --bits 12"),
+    "wrong bits": (FLAT.astype(np.uint16), ("--bits", "8"), "up to 255"),
+    "gain": (FLAT.astype(np.uint16), ("--bits", "12", "--gain", "0"), "above 0"),
+    "no noise": (np.full((200, 200), 1000, np.uint16), ("--bits", "12"), "noise"),
+    "one level": (FLAT.astype(np.uint16), ("--bits", "12"), "too narrow"),
+    "saturated": (np.full((200, 200), 4095, np.uint16), ("--bits", "12"), "unclipped"),
+    "nodata": (np.zeros((200, 200), np.uint16), ("--bits", "12"), "unclipped"),
+}
+
+
+@pytest.mark.parametrize("case", WRONG)
+def test_wrong_input_is_one_sentence(case: str, tmp_path: Path) -> None:
+    pixels, options, words = WRONG[case]
+    image = tiff(tmp_path, pixels)
+    code, said = run(image, *options, "--out", tmp_path / "mine.toml", "--json", tmp_path / "mine.json")
+    assert (code, [p.name for p in tmp_path.iterdir()]) == (2, ["raw.tif"])
+    assert words in said
+    assert said.startswith("beers-deploy: ")
+
+
+def test_an_empty_file_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "raw.tif").write_bytes(b"")
+    code, said = run(tmp_path / "raw.tif", "--out", tmp_path / "mine.toml")
+    assert (code, "empty" in said) == (2, True)
+
+
+def test_one_image_twice_is_refused(raw: tuple[Path, Path], tmp_path: Path) -> None:
+    """Its blocks would count twice, and the intervals would shrink for nothing."""
+    code, said = run(raw[0], raw[0], "--bits", 12, "--out", tmp_path / "mine.toml")
+    assert (code, "twice" in said) == (2, True)
+
+
+def test_pixels_clipped_at_full_scale_tell_the_bits(raw: tuple[Path, Path], tmp_path: Path) -> None:
+    pixels = tifffile.imread(raw[0]).copy()
+    pixels[:4, :4] = 4095
+    image = tiff(tmp_path, pixels)
+    found = characterise((image, raw[1]))
+    assert found.bits == 12
+    assert tomllib.loads(profile_toml(found))["digitiser"]["bits"]["status"] == "measured"
+    pixels[:4, :4] = 4000
+    with pytest.raises(BeersError, match="bits"):
+        characterise((tiff(tmp_path, pixels), raw[1]))
+
+
+def test_names_cannot_break_the_profile(raw: tuple[Path, Path], tmp_path: Path) -> None:
+    odd = tmp_path / 'a "quoted" \x7f\u202e name.tif'
+    odd.write_bytes(raw[0].read_bytes())
+    text = profile_toml(characterise((odd, raw[1]), bits=12))
+    assert "\x7f" not in text
+    assert "quoted" in tomllib.loads(text)["description"]
+
+
+def test_the_noise_of_a_bound_is_a_profile_that_loads(raw: tuple[Path, Path], tmp_path: Path) -> None:
+    """All noise in beta, or in alpha: decimals must not put the SNR beyond what physics allows."""
+    found = characterise(raw, bits=12)
+    full_scale = 4095 / found.gain
+    for dark in (math.sqrt(1 / 4), 1 / 4):
+        bright = replace(found.snrs[1], radiance=full_scale / 4, value=100 / 3)
+        low = replace(found.snrs[0], radiance=full_scale / 16, value=dark * 100 / 3)
+        (tmp_path / "mine.toml").write_text(profile_toml(replace(found, snrs=(low, bright))), encoding="utf-8")
+        sensor = load_sensor(str(tmp_path / "mine.toml")).nominal()
+        assert min(sensor.alpha, sensor.beta) >= 0

@@ -1,0 +1,62 @@
+import json
+from pathlib import Path
+
+import jsonschema
+import numpy as np
+import onnx
+import pytest
+import tifffile
+from typer.testing import CliRunner
+
+from deploy.cli import app
+from deploy.results import SCHEMA_PATH
+from deploy.studies import demo
+from deploy.studies.demo import load_sensors, read_input
+from profiles.errors import OptionError
+from profiles.target import board_names
+from profiles.toml import HERE
+from quant.onnx_file import metadata
+
+
+@pytest.mark.slow
+def test_the_demo_takes_a_raw_image_through_the_whole_chain(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """On few patches: .ci/run's first stage has all."""
+    monkeypatch.setattr(demo, "GATE_PATCHES", 2)
+    raw = tmp_path / "raw.tif"
+    tifffile.imwrite(raw, np.random.default_rng(0).integers(300, 1500, (120, 150)).astype(np.uint16))
+    text = (HERE / "sensors" / "pleiades-degraded.toml").read_text()
+    mine = tmp_path / "mine.toml"
+    mine.write_text(text.replace("10.2375", "10.0"))
+    out, figures = tmp_path / "out", tmp_path / "figures.json"
+    options = ["--image", str(raw), "--out", str(out), "--json", str(figures), "--sensor", str(mine)]
+    result = CliRunner().invoke(app, ["demo", *options])
+    assert result.exit_code == 0, result.output
+    made = {path.name for path in out.iterdir()}
+    assert made == {"report.html", "float.onnx", "int8.onnx", "core.onnx", "restored.tif", "before-after.png"}
+    assert tifffile.imread(out / "restored.tif").shape == (120, 150)
+    document = json.loads(figures.read_text())
+    jsonschema.validate(document, json.loads(SCHEMA_PATH.read_text()))
+    assert document["arguments"]["sensor"] == str(mine)
+    assert metadata(onnx.load(out / "int8.onnx"))["sensor"] == "mine"
+    modes = {figure["mode"] for row in document["rows"] for figure in row["figures"].values()}
+    assert {"measured", "predicted", "published"} <= modes
+    page = (out / "report.html").read_text()
+    assert "fits the DPU whole" in page
+    boards = {row["name"].split()[0]: row["figures"] for row in document["rows"] if row["table"] == "boards"}
+    assert list(boards) == board_names()
+    assert boards["zcu104"]["power"]["mode"] == "unavailable"
+    assert "no power of zcu104 under its DPU is published" in page
+    assert "the smallest DPU that takes 60 s or less" in page
+
+
+@pytest.mark.slow
+def test_the_reference_has_the_gain_of_the_sensor_named(tmp_path: Path) -> None:
+    """Else every pixel of the scene would be off by the ratio of the gains, and the PSNR would say so."""
+    text = (HERE / "sensors" / "pleiades-degraded.toml").read_text()
+    (tmp_path / "mine.toml").write_text(text.replace("10.2375", "5.0"))
+    pair = read_input(None, 0, load_sensors(str(tmp_path / "mine.toml"))).pair
+    assert pair is not None
+    assert abs(float(pair.degraded.mean() / pair.reference.mean()) - 1) < 0.01
+    (tmp_path / "wide.toml").write_text(text.replace("bits = { value = 12", "bits = { value = 14"))
+    with pytest.raises(OptionError, match="--sensor: expected a sensor of 12 bits, got 14 bits"):
+        load_sensors(str(tmp_path / "wide.toml"))

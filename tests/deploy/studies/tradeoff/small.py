@@ -1,0 +1,29 @@
+"""Real studies of next to nothing: few patches, one chain, no other library, and a clock that stands still."""
+
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+
+import numpy as np
+import pytest
+
+from deploy.restoration.function import Restore
+from deploy.studies.tradeoff import measure, run
+
+
+@contextmanager
+def small_studies() -> Iterator[None]:
+    """Less of everything."""
+    with pytest.MonkeyPatch.context() as patch:
+        for module, name, value in (
+            (measure, "PATCHES", 2),
+            (measure, "PATCH_PX", 32),
+            (run, "QUALITIES", ("fast",)),
+            (run, "PEERS", ()),
+            (run, "host_times", _steady),
+        ):
+            patch.setattr(module, name, value)
+        yield
+
+
+def _steady(restores: Iterable[Restore], _tile: np.ndarray) -> list[list[float]]:
+    return [[0.1, 0.2, 0.1] for _ in restores]

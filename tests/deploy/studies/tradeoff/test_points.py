@@ -1,0 +1,162 @@
+"""Which operating points a study looks at."""
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import onnx
+import pytest
+import torch
+
+from deploy.bench.tables import PAPER_TILE_PX, Swath, swath_latency
+from deploy.export import to_onnx
+from deploy.studies.tradeoff.boards import UNITS, board_figures
+from deploy.studies.tradeoff.points import (
+    FLOAT,
+    HALOS_PX,
+    INT8,
+    TILE_STEP_PX,
+    Point,
+    Variant,
+    fastest_tile_px,
+    network_points,
+    network_variants,
+    parse_targets,
+    predict_tile,
+    radius_px,
+)
+from model.convbeers import ConvBEERS, initialise
+from model.variants import Variant as Shape
+from profiles import load_sensor, load_target
+from profiles.constant import Constant
+from profiles.errors import ModelError, OptionError
+from profiles.target import board_names
+from quant.onnx_file import save_onnx
+from tests.deploy.dpu.graphs import integer_convbeers
+from tests.deploy.studies.tradeoff.made import DPU
+
+WHOLE = Swath(13600, 9016)
+SENSOR = load_sensor("pleiades-degraded")
+
+
+@pytest.fixture(scope="module")
+def variant(tmp_path_factory: pytest.TempPathFactory) -> Variant:
+    """An INT8 network of four blocks of 16."""
+    path = integer_convbeers(tmp_path_factory.mktemp("net") / "net.onnx", 4, 16)
+    return Variant("net", INT8, str(path), path)
+
+
+def refused(_: Path) -> Path:
+    raise ModelError("net", expected="convolutions", got="a sigmoid", remedy="leave it out")
+
+
+def float_file(path: Path) -> Path:
+    network = ConvBEERS(Shape(1, 2))
+    initialise(network, torch.Generator().manual_seed(0))
+    save_onnx(to_onnx(network.eval(), {}), path)
+    return path
+
+
+def test_all_boards_are_the_shipped_ones_the_default_first() -> None:
+    assert parse_targets("all")[0] == "vck190"
+    assert sorted(parse_targets("all")) == sorted(board_names())
+    assert parse_targets("zcu102, vck190") == ("zcu102", "vck190")
+    for text in ("", "vck190,", "vck190,vck190"):
+        with pytest.raises(OptionError, match="boards, each once"):
+            parse_targets(text)
+
+
+def test_shipped_networks_come_in_both_precisions_with_the_sensors_profile() -> None:
+    found = network_variants(["convbeers-xs", "convbeers-xs"], SENSOR, refused, lambda _: None)
+    assert [variant.name for variant in found] == ["convbeers-xs float32", "convbeers-xs INT8"]
+    assert all(variant.file and variant.file.is_file() for variant in found)
+
+
+def test_an_own_network_is_quantised_and_one_that_cannot_be_stays_float(tmp_path: Path) -> None:
+    path, said = float_file(tmp_path / "net.onnx"), list[str]()
+    found = network_variants([str(path)], SENSOR, lambda file: file, said.append)
+    assert [variant.precision for variant in found] == [FLOAT, INT8]
+    found = network_variants([str(path)], SENSOR, refused, said.append)
+    assert [variant.precision for variant in found] == [FLOAT]
+    assert "compared in float32 alone: net: expected convolutions, got a sigmoid" in said[0]
+
+
+def test_an_int8_file_is_taken_as_it_is(variant: Variant) -> None:
+    found = network_variants([variant.source], SENSOR, refused, lambda _: None)
+    assert [each.precision for each in found] == [INT8]
+
+
+def test_other_names_and_two_files_of_one_name_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(OptionError, match="a shipped network"):
+        network_variants(["convbeers-xl"], SENSOR, refused, lambda _: None)
+    (tmp_path / "other").mkdir()
+    paths = [str(float_file(folder / "net.onnx")) for folder in (tmp_path, tmp_path / "other")]
+    with pytest.raises(OptionError, match="names that differ"):
+        network_variants(paths, SENSOR, lambda file: file, lambda _: None)
+
+
+def test_a_network_of_one_tile_size_is_refused(tmp_path: Path) -> None:
+    model = onnx.load(float_file(tmp_path / "net.onnx"))
+    for side in (2, 3):
+        model.graph.input[0].type.tensor_type.shape.dim[side].dim_value = 64
+    onnx.save(model, tmp_path / "fixed.onnx")
+    with pytest.raises(OptionError, match="fixed to one tile size"):
+        network_variants([str(tmp_path / "fixed.onnx")], SENSOR, refused, lambda _: None)
+
+
+def test_the_fastest_tile_is_a_multiple_of_the_step_and_no_other_is_faster(variant: Variant) -> None:
+    found, radius = fastest_tile_px(variant, DPU, WHOLE), radius_px(variant)
+    assert found % TILE_STEP_PX == 0
+    assert 2 * radius < found <= PAPER_TILE_PX
+
+    def seconds(side: int) -> float:
+        swath, prediction = replace(WHOLE, tile_px=side, halo_px=radius), predict_tile(variant, side, DPU)
+        return swath_latency(prediction, math.ceil(swath.tiles / prediction.batch)).value or 0.0
+
+    assert seconds(found) == min(seconds(side) for side in range(2 * radius + TILE_STEP_PX, 641, 1) if side % 16 == 0)
+
+
+def test_int8_is_looked_at_on_every_configuration_and_on_the_first_board_in_more_tiles(variant: Variant) -> None:
+    boards = [load_target("vck190"), load_target("zcu102")]
+    points = network_points(variant, boards, WHOLE)
+    assert len({point.name for point in points}) == len(points)
+    for board in boards:
+        here = [point for point in points if point.board == board]
+        assert {point.dpu.name for point in here if point.dpu} == set(board.configurations)
+    halos = {point.halo_px for point in points if point.board == boards[0]}
+    assert halos == {None, *(halo for halo in HALOS_PX if halo < radius_px(variant))}
+    assert {point.halo_px for point in points if point.board == boards[1]} == {None}
+    assert PAPER_TILE_PX in {point.tile_px for point in points}
+
+
+def test_float_and_what_a_board_refuses_have_no_board_and_the_reason(variant: Variant) -> None:
+    board = load_target("vck190")
+    (point,) = network_points(replace(variant, precision=FLOAT), [board], WHOLE)
+    assert point.board is None
+    figures = board_figures(point, WHOLE)
+    assert {figure.reason for figure in figures.values()} == {"the DPU takes INT8 alone"}
+
+
+def test_a_smaller_halo_takes_less_time_and_figures_follow_from_the_latency(variant: Variant) -> None:
+    def at(halo_px: int | None) -> dict[str, float]:
+        figures = board_figures(Point(variant, DPU.target, DPU, 128, halo_px), WHOLE)
+        assert {key: figure.unit for key, figure in figures.items()} == UNITS
+        return {key: figure.value or 0.0 for key, figure in figures.items()}
+
+    exact, none = at(None), at(0)
+    assert none["board latency"] < exact["board latency"]
+    assert exact["board energy"] == pytest.approx(exact["board latency"] * exact["board power"])
+    assert exact["board throughput"] == pytest.approx(WHOLE.pixels / 640**2 / exact["board latency"])
+    assert exact["board efficiency"] == pytest.approx(WHOLE.pixels / exact["board energy"])
+
+
+def test_a_chain_on_a_boards_processor_takes_what_the_target_states_by_the_ratio_measured_here() -> None:
+    chain = Variant("traditional-best", FLOAT, "traditional-best")
+    stated = Constant((10.0, 40.0), "inferred", "a test")
+    tables = {**DPU.target.tables, "cpu": {**DPU.target.tables["cpu"], "chain_s_per_mpx": stated}}
+    board, swath = replace(DPU.target, tables=tables), Swath(1000, 2000)
+    latency = board_figures(Point(chain, board), swath, slower=3.0)["board latency"]
+    assert latency.value == pytest.approx(2 * 3 * 20)
+    assert latency.interval == pytest.approx((60, 240))
+    bare = replace(DPU.target, tables={"cpu": {}})
+    assert board_figures(Point(chain, bare), swath, slower=3.0)["board latency"].mode == "unavailable"

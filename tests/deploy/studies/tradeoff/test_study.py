@@ -1,0 +1,259 @@
+"""A whole study of a tiny network: unbroken, stopped and resumed, and by its command."""
+
+import json
+import shutil
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import jsonschema
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from typer.testing import CliRunner
+
+from deploy.cli import app
+from deploy.restoration.function import Restore
+from deploy.results import SCHEMA_PATH
+from deploy.studies.evaluation.methods import Method, method_named
+from deploy.studies.evaluation.pairs import NamedPair
+from deploy.studies.evaluation.run import load_pairs
+from deploy.studies.evaluation.scores import Instruments
+from deploy.studies.tradeoff import run
+from deploy.studies.tradeoff.advice import parse_constraints
+from deploy.studies.tradeoff.labelled import Labelled
+from deploy.studies.tradeoff.measure import SEAM_ERROR, Benchmark, Measurements, make_int8
+from deploy.studies.tradeoff.pareto import TOO_FEW
+from deploy.studies.tradeoff.run import Study, run_study
+from model.convbeers import ConvBEERS, initialise, save_network
+from model.simulator.procedural import procedural_scene
+from model.variants import Variant
+from profiles import load_sensor
+from profiles.figures import measured
+from profiles.sensor_file import reference_for
+from tests.deploy.studies.tradeoff.small import small_studies
+
+pytestmark = pytest.mark.slow
+
+SITES = 2
+SENSOR = "pleiades-degraded"
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A network, two scenes to judge on and one to calibrate on."""
+    folder = tmp_path_factory.mktemp("tiny")
+    network = ConvBEERS(Variant(1, 2))
+    initialise(network, torch.Generator().manual_seed(3))
+    save_network(folder / "narrow.safetensors", network, {"degraded": SENSOR})
+    for number in range(SITES + 1):
+        scene = procedural_scene(300, 340, np.random.default_rng(number)).radiance.numpy()
+        place = folder / ("images" if number < SITES else "calibration") / f"site{'abc'[number]}.png"
+        place.parent.mkdir(exist_ok=True)
+        Image.fromarray(np.clip(scene, 0, 255).astype(np.uint8)).save(place)
+    return folder
+
+
+@pytest.fixture(scope="module", autouse=True)
+def small() -> Iterator[None]:
+    with small_studies():
+        yield
+
+
+def studied(folder: Path, out: Path, **options: Any) -> Study:
+    given = {"images": folder / "images", "calibration": folder / "calibration", "sensor": SENSOR}
+    given |= {"reference": "pleiades-reference", "targets": ("vck190",), "size_px": (1500, 1200)}
+    return run_study([str(folder / "narrow.safetensors")], out, **{**given, **options})
+
+
+@pytest.fixture(scope="module")
+def study(folder: Path, small: None, tmp_path_factory: pytest.TempPathFactory) -> tuple[Study, Path]:  # noqa: ARG001
+    """An unbroken run, and where its measurements lie."""
+    out = tmp_path_factory.mktemp("study")
+    return studied(folder, out), out
+
+
+def test_every_figure_is_a_number_or_has_a_reason(study: tuple[Study, Path]) -> None:
+    points = study[0].points
+    assert len({point.name for point in points}) == len(points) > 12
+    for point in points:
+        for key, figure in point.figures.items():
+            assert figure.unit, key
+            assert figure.source if figure.value is not None else figure.reason
+    on_board = next(point for point in points if point.text["configuration"] == "C32B3")
+    assert {key for key, figure in on_board.figures.items() if figure.value is None} == {"LPIPS-squeeze"}
+    assert {point.text["sensor"] for point in points} == {"known"}
+
+
+def test_exact_halos_give_one_picture_and_smaller_ones_show_seams(study: tuple[Study, Path]) -> None:
+    points = [point for point in study[0].points if "INT8" in point.name]
+    exact = {point.value("PSNR") for point in points if point.text["halo"] == "exact"}
+    (cut,) = [point for point in points if point.text["halo"] == "0"]
+    assert len(exact) == 1
+    assert cut.value("PSNR") not in exact
+    assert (cut.value(SEAM_ERROR) or 0.0) > 0
+    assert all(SEAM_ERROR not in point.figures for point in points if point.text["halo"] == "exact")
+
+
+def test_the_scores_are_those_of_the_method_that_evaluate_takes(folder: Path, study: tuple[Study, Path]) -> None:
+    degraded = load_sensor(SENSOR)
+    reference = reference_for(degraded)
+    restore = method_named(str(folder / "narrow.safetensors"), degraded, reference).restore
+    pairs, _ = load_pairs(folder / "images", None, degraded, reference, 0)
+    instruments = Instruments({})
+    expected = [instruments.score(restore(p.degraded), p.reference, p.degraded)["PSNR"] for p in pairs]
+    found = next(point for point in study[0].points if point.name == "narrow float32")
+    assert [image["PSNR"] for image in found.images] == expected
+
+
+def test_two_sites_give_no_interval_and_it_is_said(study: tuple[Study, Path]) -> None:
+    found = study[0]
+    assert all(point.figures["PSNR"].interval is None for point in found.points)
+    assert {row.text["gain over the next cheaper"] for row in found.front_rows} <= {"cheapest", TOO_FEW}
+    notes = " ".join(found.notes)
+    assert "Of 2 sites, fewer than 5, no interval is shown" in notes
+    assert "Scene pixels per pixel: 2 (2 of 2 images), where pleiades-degraded states 5" in notes
+
+
+def test_a_stopped_run_goes_on_and_says_the_same(
+    folder: Path, study: tuple[Study, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole, out = study
+    kept = json.loads((out / "measurements.json").read_text())
+    left = dict(list(kept["measurements"].items())[:2])
+    (tmp_path / "measurements.json").write_text(json.dumps({**kept, "measurements": left}))
+    counts, score = list[int](), Benchmark.score
+
+    def counted(benchmark: Benchmark, restore: Restore) -> list[dict[str, float | None]]:
+        counts.append(1)
+        return score(benchmark, restore)
+
+    monkeypatch.setattr(Benchmark, "score", counted)
+    again = studied(folder, tmp_path)
+    assert [point.row for point in again.points] == [point.row for point in whole.points]
+    assert json.loads((tmp_path / "measurements.json").read_text()) == kept
+    assert len(counts) == 1
+    studied(folder, tmp_path)
+    assert len(counts) == 1
+
+
+def test_an_interrupt_leaves_what_was_measured(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def stop(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Benchmark, "score_in_tiles", stop)
+    with pytest.raises(KeyboardInterrupt):
+        studied(folder, tmp_path)
+    assert len(Measurements.open(tmp_path / "measurements.json").kept) == 2  # both precisions
+
+
+def test_a_measurement_depends_on_its_inputs() -> None:
+    degraded = load_sensor(SENSOR)
+    sensors = degraded, reference_for(degraded)
+    pair = NamedPair("scene", np.zeros((9, 9), np.float32), np.ones((9, 9), np.float32))
+    bench = Benchmark([pair], *sensors, Instruments({}), "", 0)
+    others = [
+        Benchmark([replace(pair, degraded=pair.degraded + 1)], *sensors, Instruments({}), "", 0),
+        Benchmark([replace(pair, name="other")], *sensors, Instruments({}), "", 0),
+        Benchmark([pair], *sensors, Instruments({}), "weights", 0),
+    ]
+    assert len({bench.digest, *(other.digest for other in others)}) == 4
+
+
+def test_an_int8_file_is_made_once(folder: Path, tmp_path: Path) -> None:
+    def made() -> Path:
+        return make_int8(folder / "narrow.safetensors", tmp_path, folder / "calibration", SENSOR, 0)
+
+    path = made()
+    changed = path.stat().st_mtime_ns
+    assert made() == path
+    assert path.stat().st_mtime_ns == changed
+
+
+def test_other_boards_are_rows_and_the_front_is_of_the_first(folder: Path, study: tuple[Study, Path]) -> None:
+    found = studied(
+        folder, study[1], targets=("vck190", "zcu102"), budget=parse_constraints("--budget", "latency<=9")
+    )
+    assert {point.text["board"] for point in found.points} >= {"vck190", "zcu102", "this machine"}
+    assert {point.text["board"] for point in found.front} == {"vck190"}
+    assert found.recommendation.point is not None
+    assert found.recommendation.point.text["board"] == "vck190"
+    one = next(point for point in found.points if point.text["board"] == "zcu102" and "INT8" in point.name)
+    assert one.value("PSNR") in {point.value("PSNR") for point in found.points if point.text["board"] == "vck190"}
+
+
+def test_the_papers_runs_stand_beside_its_own_swath_and_compare_with_nothing(
+    folder: Path, study: tuple[Study, Path]
+) -> None:
+    found = studied(folder, study[1], size_px=(13600, 9016))
+    printed = [point for point in found.points if point.point is None]
+    assert sorted(point.figures["board latency"].value or 0 for point in printed) == [42, 1724]
+    assert all(point.value("board latency") is None for point in printed)
+    assert not any(point.point is None for point in study[0].points)
+
+
+def test_labelled_pictures_add_map50_beside_exact_halos(
+    folder: Path, study: tuple[Study, Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Made:
+        digest, notes = "d", ("labels",)
+
+        def measure(self, _: object) -> dict[str, object]:
+            return {"value": 0.5, "interval": None}
+
+        def figure(self, stored: dict[str, float]) -> object:
+            return measured(100 * stored["value"], "%", "made up")
+
+    monkeypatch.setattr(run, "_labelled", lambda *_: Made())
+    found = studied(folder, study[1], labelled=folder, need=parse_constraints("--need", "map50>=40"))
+    values = {point.text["halo"]: point.figures["mAP50"] for point in found.points if "INT8" in point.name}
+    assert values["exact"].value == 50
+    assert values["0"].reason == "measured with exact halos alone"
+    assert "mAP50 50 % (measured)" in found.recommendation.line
+    assert "labels" in found.notes
+
+
+def test_a_detector_is_shown_what_each_method_restored(folder: Path, tmp_path: Path) -> None:
+    pytest.importorskip("pycocotools")
+    for number in range(2):
+        shutil.copy(folder / "images" / f"site{'ab'[number]}.png", tmp_path / f"scene{number}.png")
+    images = [{"id": k, "file_name": f"scene{k}.png", "width": 340, "height": 300} for k in range(2)]
+    boxes = [{"id": k + 1, "image_id": k, "category_id": 1, "bbox": [40, 40, 30, 20]} for k in range(2)]
+    labels = {"images": images, "annotations": boxes, "categories": [{"id": 1, "name": "vehicle"}]}
+    (tmp_path / "labels.json").write_text(json.dumps(labels))
+    degraded = load_sensor("dior-medium")
+    benchmark = Benchmark([], degraded, reference_for(degraded), Instruments({}), "", 0)
+    looked = Labelled.open(tmp_path, None, None, benchmark)
+    figure = looked.figure(looked.measure(Method("as it is", lambda dn: dn, "")))
+    assert figure.unit == "%"
+    assert 0 <= (figure.value or 0.0) <= 100
+    assert figure.interval is None
+
+
+@pytest.mark.parametrize(("budget", "code"), [("latency<=20s", 0), ("latency<=0.001s", 1)])
+def test_the_command_recommends_in_one_line_and_writes_its_files(
+    folder: Path, study: tuple[Study, Path], budget: str, code: int
+) -> None:
+    out = study[1]
+    named = f"--networks {folder}/narrow.safetensors --images {folder}/images --calibration {folder}/calibration"
+    command = f"tradeoff {named} --size 1500x1200 --out {out}"
+    result = CliRunner().invoke(app, [*command.split(), "--budget", budget])
+    assert result.exit_code == code, result.output
+    lines = [line for line in result.stdout.splitlines() if "recommend" in line]
+    assert len(lines) == 1
+    assert lines[0].startswith(f"{'nothing to recommend' if code else 'recommended'} for board latency <= ")
+    names = {"tradeoff.html", "tradeoff.svg", "tradeoff.json", "measurements.json", "int8"}
+    assert {path.name for path in out.iterdir()} == names
+    document = json.loads((out / "tradeoff.json").read_text())
+    jsonschema.validate(document, json.loads(SCHEMA_PATH.read_text()))
+    assert document["rows"][0]["text"]["line"] == lines[0]
+    assert lines[0][1:40] in (out / "tradeoff.html").read_text().replace("&lt;", "<")
+
+
+@pytest.mark.parametrize("options", ["--detector d.onnx", "--classes car=vehicle", "--need map50>=40"])
+def test_what_only_labelled_pictures_have_is_refused_without_them(options: str, tmp_path: Path) -> None:
+    result = CliRunner().invoke(app, ["tradeoff", "--out", str(tmp_path), *options.split()])
+    assert result.exit_code == 2
+    assert "--labelled beside it" in result.output

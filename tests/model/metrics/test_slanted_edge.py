@@ -1,0 +1,134 @@
+import math
+from functools import lru_cache
+
+import numpy as np
+import pytest
+import torch
+
+from model.metrics.refusal import Refusal
+from model.metrics.slanted_edge import FREQUENCIES, EdgeMtf, edge_mtf, slanted_edge
+from model.simulator.detector import Draw, detect
+from model.simulator.mtf import mtf, sensor_transfer, transfer_function
+from model.simulator.sampling import sample, scene_spectrum
+from profiles.sensor import Sensor, noise_from_snr
+
+RATIO, SCENE_PX, SIDE_PX, GAIN, ANGLE_DEG = 5, 240, 80, 10.2375, 8.0
+ALPHA, BETA = noise_from_snr(25, 50, 100, 110)
+MTFS, ANGLES = (0.03, 0.07, 0.25), (2.0, 5.0, 8.0, 11.0, 15.0)
+MIDDLE = slice((SCENE_PX - SIDE_PX) // 2, (SCENE_PX + SIDE_PX) // 2)
+
+
+@lru_cache
+def clean(mtf_nyquist: float, angle_deg: float) -> torch.Tensor:
+    """The middle of a simulated edge, where the second edge at the wrapped border no longer counts."""
+    side = SCENE_PX * RATIO
+    transfer = transfer_function(side, side, RATIO, mtf_nyquist)
+    image = sample(scene_spectrum(slanted_edge(SCENE_PX, RATIO, angle_deg)), transfer, side, RATIO)
+    return image[MIDDLE, MIDDLE]
+
+
+def noisy(mtf_nyquist: float, angle_deg: float, seed: int) -> np.ndarray:
+    sensor = Sensor(mtf_nyquist, ALPHA, BETA, GAIN, 12)
+    return detect(clean(mtf_nyquist, angle_deg), sensor, Draw(seed), "degraded").numpy()
+
+
+def measured(image: np.ndarray, angle_deg: float = ANGLE_DEG) -> float:
+    result = edge_mtf(image, angle_deg, saturated=4095)
+    assert isinstance(result, EdgeMtf), result
+    return result.mtf_nyquist
+
+
+def refused(image: np.ndarray, saturated: float = math.inf) -> str:
+    result = edge_mtf(image, ANGLE_DEG, saturated)
+    assert isinstance(result, Refusal)
+    assert result.reason
+    return result.status
+
+
+def gaussian_edge(angle_deg: float, sigma_px: float, shape: tuple[int, int] = (80, 80)) -> np.ndarray:
+    """An edge that owes nothing to the simulator: the error function along the normal, 0.13 px off the middle."""
+    angle = math.radians(angle_deg)
+    y, x = (np.arange(size) - (size - 1) / 2 + 0.13 for size in shape)
+    distance = x[None, :] * math.cos(angle) + y[:, None] * math.sin(angle)
+    erf = torch.erf(torch.from_numpy(distance / (sigma_px * math.sqrt(2)))).numpy()
+    return np.asarray(400 + 800 * (1 + erf))
+
+
+@pytest.mark.parametrize("angle_deg", ANGLES)
+@pytest.mark.parametrize("mtf_nyquist", MTFS)
+def test_a_clean_edge_gives_the_simulated_mtf(mtf_nyquist: float, angle_deg: float) -> None:
+    result = edge_mtf(clean(mtf_nyquist, angle_deg).numpy(), angle_deg)
+    assert isinstance(result, EdgeMtf)
+    assert result.mtf_nyquist == pytest.approx(mtf_nyquist, abs=0.002)
+    angle, f = math.radians(angle_deg), torch.from_numpy(FREQUENCIES)
+    expected = mtf(f * math.cos(angle), f * math.sin(angle), mtf_nyquist)
+    np.testing.assert_allclose(result.mtf, expected, atol=0.006)
+
+
+@pytest.mark.parametrize("angle_deg", [2.0, 15.0])
+@pytest.mark.parametrize(("mtf_nyquist", "bias"), [(0.03, 0.003), (0.07, 0.003), (0.25, 0.005)])
+def test_noise_does_not_bias(mtf_nyquist: float, bias: float, angle_deg: float) -> None:
+    results = [measured(noisy(mtf_nyquist, angle_deg, seed), angle_deg) for seed in range(50)]
+    assert np.mean(results) == pytest.approx(mtf_nyquist, abs=bias)
+    assert abs(np.mean(results) - (mtf_nyquist + 0.015)) > bias  # another MTF would fail
+
+
+@pytest.mark.parametrize("angle_deg", [5.0, 11.0])
+def test_a_sensor_of_two_axes_is_measured_at_both(angle_deg: float) -> None:
+    """Edges upright and lying, acquired by one sensor: 12 % across the track, 5 % along it."""
+    sensor, side = Sensor(0.12, 0.0, 0.0, GAIN, 12, {}, 0.05), SCENE_PX * RATIO
+    transfer, upright = sensor_transfer(side, side, RATIO, sensor), slanted_edge(SCENE_PX, RATIO, angle_deg)
+    across, along = (
+        sample(scene_spectrum(scene), transfer, side, RATIO)[MIDDLE, MIDDLE].numpy() * GAIN
+        for scene in (upright, upright.T.contiguous())
+    )
+    assert [measured(across, angle_deg), measured(along.T, angle_deg)] == pytest.approx([0.12, 0.05], abs=0.005)
+
+
+@pytest.mark.parametrize("angle_deg", [3.0, 5.0, 11.31, 14.04])
+@pytest.mark.parametrize("sigma_px", [0.4, 0.53, 0.8])
+def test_a_gaussian_edge_gives_its_mtf_wherever_it_lies(sigma_px: float, angle_deg: float) -> None:
+    """Also where 1 / 4 of a pixel a row leaves bins one-sided, and where a restoration has moved its image."""
+    expected = math.exp(-2 * (math.pi * sigma_px * 0.5) ** 2)
+    image = gaussian_edge(angle_deg, sigma_px, (80, 84))
+    for moved in (image[:, 2:-2], image[:, 1:-3], image[:, 3:-1]):
+        assert measured(moved, angle_deg) == pytest.approx(expected, abs=0.002)
+
+
+def test_sharpening_shows_as_much_as_it_does() -> None:
+    """A filter of 3 taps across: gain 1 + b (1 - cos(2 pi f)) / 2, so 1 + b at Nyquist."""
+    boost, before, after = 2.0, [], []
+    for seed in range(20):
+        image = noisy(0.07, ANGLE_DEG, seed).astype(np.float64)
+        turned = (image[:, :-2] + image[:, 2:]) / 2 - image[:, 1:-1]
+        before.append(measured(image))
+        after.append(measured(image[:, 1:-1] - boost / 2 * turned))
+    assert np.mean(after) == pytest.approx((1 + boost) * np.mean(before), rel=0.02)
+
+
+def test_the_unit_does_not_matter() -> None:
+    image = noisy(0.25, ANGLE_DEG, 0).astype(np.float64)
+    assert measured(image / 4095) == pytest.approx(measured(image), abs=1e-9)
+
+
+def test_what_cannot_be_measured_is_refused() -> None:
+    edge = gaussian_edge(ANGLE_DEG, 0.6)
+    generator = np.random.default_rng(0)
+    assert refused(edge + 170 * generator.standard_normal(edge.shape)) == "contrast"
+    assert refused(np.full((80, 80), 700.0)) == "no-convergence"
+    assert refused(edge[:, ::-1]) == "no-convergence"
+    assert refused(np.roll(edge, 8, axis=1)) == "no-convergence"
+    assert refused(edge, saturated=1990) == "clipped"
+    assert refused(np.maximum(edge - 410, 0.0)) == "clipped"
+    for bad in (math.nan, math.inf):
+        edge[3, 4] = bad
+        assert refused(edge) == "not-finite"
+
+
+def test_the_target_has_its_two_radiances_and_its_edge_in_the_middle() -> None:
+    scene = slanted_edge(40, 3, 8.0, (50.0, 90.0))
+    assert scene.shape == (120, 120)
+    assert scene.dtype == torch.float32
+    assert float(scene[:, 0].mean()) == 50
+    assert float(scene[:, -1].mean()) == 90
+    assert float(scene.double().mean()) == pytest.approx(70, abs=1e-3)
