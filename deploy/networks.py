@@ -165,7 +165,7 @@ def _written(network: Conditioned, sensor: SensorProfile, int8: bool, log: Log) 
     warn_outside(sensor, log)
     stem = network.name + (INT8 if int8 else "")
     known = re.sub(r"[^\w.-]+", "-", sensor.name)[:40]
-    told = json.dumps([sha256(network.weights), numbers_of(sensor)], sort_keys=True, default=str)
+    told = json.dumps({"weights": sha256(network.weights), "sensor": numbers_of(sensor)}, sort_keys=True, default=str)
     path = Path(_folder().name) / f"{stem}-{known}-{hashlib.sha256(told.encode()).hexdigest()[:12]}.onnx"
     if not path.is_file():
         save_onnx(network.model(sensor, int8), path)

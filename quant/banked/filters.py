@@ -39,6 +39,9 @@ LARGEST = 2 * 124
 COPIES = (1, 2, 7)
 """Of the image, of each plane, and of the analytic restoration: 16 channels for each pixel of a place."""
 
+GRID_BITS = 16
+"""Fractional bits of what weights are fitted with: weights below 2^8, a covariance of at most 1, 49 products."""
+
 REACH_PX = 30.0
 """Neighbouring pixels of natural images are alike: their correlation falls to 1 / e within so many pixels."""
 
@@ -129,19 +132,20 @@ def shaped(wanted: NDArray[np.float64]) -> NDArray[np.int64]:
     """Whole numbers (49,) of sum 0 near the wanted ones, whose errors natural images hardly show.
 
     From the nearest with the largest remainders given up, one is raised and another lowered while that lowers
-    e^T C e, C the covariance of natural images.
+    e^T C e, C the covariance of natural images. All sums are exact, so that every processor finds the same numbers.
     """
+    wanted = _on_grid(wanted)
     whole = np.rint(wanted)
     while (excess := int(whole.sum())) != 0:
         error = (whole - wanted) * np.sign(excess)
-        whole[np.argsort(-error)[: abs(excess)]] -= np.sign(excess)
+        whole[np.argsort(-error, kind="stable")[: abs(excess)]] -= np.sign(excess)
     slope, curve = COVARIANCE @ (whole - wanted), np.diag(COVARIANCE)
     pair = curve[:, None] + curve[None, :] - 2 * COVARIANCE
     while True:
         change = 2 * (slope[:, None] - slope[None, :]) + pair  # raise the row's, lower the column's
         np.fill_diagonal(change, 0)
         up, down = np.unravel_index(np.argmin(change), change.shape)
-        if change[up, down] > -1e-9:
+        if change[up, down] >= 0:
             return np.asarray(whole.astype(np.int64))
         whole[up] += 1
         whole[down] -= 1
@@ -151,7 +155,12 @@ def shaped(wanted: NDArray[np.float64]) -> NDArray[np.int64]:
 def _covariance() -> NDArray[np.float64]:
     places = np.indices((SIDE_PX, SIDE_PX)).reshape(2, -1).T
     distance = np.linalg.norm(places[:, None] - places[None, :], axis=-1)
-    return np.asarray(np.exp(-distance / REACH_PX))
+    return _on_grid(np.exp(-distance / REACH_PX))
+
+
+def _on_grid(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Rounded to so few bits that no sum of products of 49 is rounded again, in whatever order it is taken."""
+    return np.asarray(np.rint(np.ldexp(values, GRID_BITS)) / 2**GRID_BITS)
 
 
 COVARIANCE = _covariance()
