@@ -34,7 +34,7 @@ def _section(name: str) -> Iterator[str]:
     command = get_command(app).commands[name]  # type: ignore[attr-defined]
     yield f"## {name}\n\n{command.help}\n\n    beers-deploy {COMMANDS[name][1]}\n"
     yield "| option | takes | default | what it does |\n|---|---|---|---|"
-    kinds = {each.name: each.kind for each in parameters(name)}
+    kinds = {each.name: each.kind.removeprefix("flag") for each in parameters(name)}
     yield from (_line(each, kinds[each.name]) for each in command.params if each.name in kinds)
     yield f"\nRefused: {refused}.\n" if (refused := refusals(name)) else ""
 
