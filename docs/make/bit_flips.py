@@ -27,31 +27,31 @@ figures follow from the seed.
 
 ![PSNR against bit flips in a megabit, for weights, shifts, feature maps and the image](../assets/bit-flips.svg)
 
-A particle flips a bit in a memory: a single-event upset. Bit flips are injected into four kinds of memory, one at a
-time: int8 weights and bias, six-bit shifts of each operation, int8 feature maps between the operation that writes
-them and those that read them, 12-bit pixels. The DPU's arithmetic then runs in whole numbers (`quant/integer/`). Not
-injected into: instructions, addresses, accumulators, read shifts of adds and the processor's own memory.
+A particle can flip a bit in a memory (a single-event upset). Bit flips are injected into four kinds of memory, one at
+a time: int8 weights and bias, six-bit shifts of each operation, int8 feature maps between the operation that writes
+them and those that read them, and 12-bit pixels. The DPU's arithmetic then runs in integers (`quant/integer/`).
+Instructions, addresses, accumulators, read shifts of adds and the processor's own memory get no flips.
 
 Guards:
 
 - **ReLU6** in place of ReLU where calibration stays below 96 units. The DPU fuses it.
 - **Limit of the correction**: the next power of two above what calibration reaches, on the host.
-- **Scrubbing**: CRC-32 of each convolution's weights, before each tile; what differs is loaded again.
-- **Triple modular redundancy** of the shifts: three copies, each with flips of its own, of which two must agree, bit
-  by bit.
+- **Scrubbing**: CRC-32 of each convolution's weights before each tile; weights that differ are loaded again.
+- **Triple modular redundancy** of the shifts: three copies, each with its own flips, of which two must agree, bit by
+  bit.
 
-The copy that weights are loaded from, and the checksums, are taken to be sound.
+The copy from which weights are loaded, and the checksums, are assumed to be intact.
 
 ## What is found
 
 """
 
-FINDINGS = """- Weights: a bit may cost nothing or 20 dB. CRC-32 finds every injection here, and after scrubbing the
-  network is the fault-free one.
-- Shifts are few and seldom hit, but one of them wrong costs 10 dB in the mean and above 20 dB at worst; triple
-  modular redundancy corrects all but two flips of the same bit, which are met at 10 000 in a megabit.
-- Feature maps and pixels: clamping buys 0.6 to 1.2 dB at 100 bits in a megabit of maps, as much of pixels, and next
-  to nothing below: what is already int8 is bounded. Who expects such rates needs memory with error correction.
+FINDINGS = """- Weights: one bit may cost nothing or 20 dB. CRC-32 finds every injection here, and scrubbing restores
+  the fault-free network.
+- Shifts are few and seldom hit, but a wrong one costs 10 dB in the mean and above 20 dB at worst. Triple modular
+  redundancy corrects everything except two flips of the same bit, which occur at 10 000 in a megabit.
+- Feature maps and pixels: clamping gains 0.6 to 1.2 dB at 100 bits in a megabit of maps, as much for pixels, and next
+  to nothing below, because int8 values are bounded already. At such rates memory with error correction is needed.
 """
 
 

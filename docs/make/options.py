@@ -1,12 +1,9 @@
-"""Write docs/reference/options.md, an audit of every option of every command: `python docs/make/options.py`.
+"""What every option of every command takes and what it is refused with, for docs/make/commands.py.
 
-Types and ranges are read from the commands; what they do not say of themselves stands in the tables below. A test
-keeps the page fresh, gives every command each pair of options that it is said to refuse, and fails for an option that
-the tables do not know.
+Types and ranges are read from the commands. The tables below hold what the commands do not say themselves. Tests give
+every command each combination of options that it is said to refuse, and fail for an option that is in no table.
 """
 
-import sys
-from collections.abc import Iterator
 from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
@@ -18,7 +15,6 @@ from typer.main import get_command
 from deploy.cli import COMMANDS, app
 from model.processor import SEEDS
 
-TARGET = Path(__file__).parents[1] / "reference" / "options.md"
 FILE, FOLDER = "file", "folder"
 
 
@@ -77,27 +73,27 @@ UNITS = {
     "batch": "patches",
     "bits": "bit",
     "budget": "s",
-    "distil": "a weight",
+    "distil": "weight",
     "drawn": "scenes",
     "draws": "draws",
-    "fft_weight": "a weight",
+    "fft_weight": "weight",
     "finetune": "steps",
     "gain": "DN per W/m2/sr/um, above 0",
     "gsd": "m, above 0",
     "full_scale": "pixel value above 0",
-    "l1_weight": "a weight",
-    "l2_weight": "a weight",
-    "learning_rate": "a step",
-    "lpips_weight": "a weight",
+    "l1_weight": "weight",
+    "l2_weight": "weight",
+    "learning_rate": "per step",
+    "lpips_weight": "weight",
     "max_mae": "of full scale",
     "memory": "GB",
-    "oversampling": "scene pixels a pixel",
+    "oversampling": "scene pixels per pixel",
     "patch": "px",
     "patches": "patches",
-    "radiance_weight": "a weight",
-    "psnr_weight": "a weight",
-    "rough": "of the patches",
-    "seed": "no unit",
+    "radiance_weight": "weight",
+    "psnr_weight": "weight",
+    "rough": "of patches",
+    "seed": "",
     "size": "px",
     "steps": "steps",
     "threads": "threads, at most the cores",
@@ -110,32 +106,32 @@ UNITS = {
 """Of numbers."""
 
 WORDS = {
-    "add": "an effect's name",
+    "add": "effect",
     "budget": "limits such as latency<=20s",
-    "cases": "names of cases, with commas",
-    "classes": "pairs such as car=vehicle, with commas",
-    "config": "C32B1 to C64B5",
-    "device": "cpu or cuda",
+    "cases": "names with commas",
+    "classes": "pairs such as car=vehicle",
+    "config": "configuration",
+    "device": "cpu, cuda",
     "edge": "FILE:X,Y,WIDTH,HEIGHT in px",
-    "fail_on": "a change such as PSNR<-0.05",
-    "forbid": "an effect's name",
+    "fail_on": "change such as PSNR<-0.05",
+    "forbid": "effect",
     "halo": "exact, or whole px from 0",
-    "methods": "names, with commas",
-    "name": "a profile's name",
+    "methods": "names with commas",
+    "name": "profile",
     "need": "limits such as psnr>=44",
-    "networks": "names, with commas",
-    "optimiser": "adam or adamw",
-    "preset": "a data set's name",
-    "reference": "a profile's name",
-    "scene": "a scene's name",
-    "scheduler": "an address such as tcp://host:8786",
-    "sensor": "a profile's name",
-    "size": "width x height in px, such as 13600x9016",
-    "split": "the name of a list of pictures",
-    "stages": "names of stages, with commas",
-    "target": "a board's name",
+    "networks": "names with commas",
+    "optimiser": "adam, adamw",
+    "preset": "data set",
+    "reference": "profile",
+    "scene": "scene",
+    "scheduler": "address",
+    "sensor": "profile",
+    "size": "width x height in px",
+    "split": "name of a list",
+    "stages": "names with commas",
+    "target": "board",
     "tile": "px, several with commas",
-    "variant": "a network's name",
+    "variant": "network",
 }
 """Of what is read as text."""
 
@@ -244,24 +240,11 @@ class Parameter:
         if self.hint is bool:
             return "flag"
         if self.hint in (int, float):
-            return f"{'whole number' if self.hint is int else 'number'}{_range(self.info)}, {UNITS[self.name]}"
+            number, unit = "integer" if self.hint is int else "number", UNITS[self.name]
+            return f"{number}{_range(self.info)}{', ' if unit else ''}{unit}"
         if issubclass(self.hint, StrEnum):
-            return " or ".join(self.hint)
-        return WORDS[self.name] + (", or a file" if self.name in paths.also_read else "")
-
-    @property
-    def fate(self) -> str:
-        """What becomes of a path."""
-        paths = PATHS[self.command]
-        if self.name in paths.written:
-            whole = "written whole or not at all"
-            return f"filled with files, each {whole}" if paths.written[self.name] == FOLDER else whole
-        return "read" if self.name in (*paths.read, *paths.also_read) else ""
-
-    @property
-    def refused(self) -> str:
-        """Where the command refuses it."""
-        return "; ".join(str(case) for case in REFUSED.get(self.command, ()) if self.name in case.options)
+            return ", ".join(self.hint)
+        return WORDS[self.name] + (" or file" if self.name in paths.also_read else "")
 
 
 def parameters(command: str) -> list[Parameter]:
@@ -291,28 +274,8 @@ def _range(info: Any) -> str:
     return f" from {low}" if high is None else f", {low} to {'2^62' if high == SEEDS else high}"
 
 
-def _lines() -> Iterator[str]:
-    everything = [each for command in COMMANDS for each in parameters(command)]
-    outputs = sum(each.kind.startswith("output") for each in everything)
-    combinations = sum(len(case.options) for cases in REFUSED.values() for case in cases)
-    yield "# Every option: what it takes, what it must not stand beside, what becomes of its path\n"
-    yield "Generated by `python docs/make/options.py`; what each option does: [commands](commands.md).\n"
-    yield f"{len(COMMANDS)} commands, {len(everything)} arguments and options, {outputs} of them outputs;"
-    yield f"{combinations} combinations are refused, with exit code 2 and nothing written.\n"
-    yield "An output is a regular file or a new name: no input, no other output, no link, pipe or device, and no file"
-    yield "that is shipped. `--sensor` and `--reference` beside `--pairs` must be those that made the pairs.\n"
-    for command in COMMANDS:
-        yield f"## {command}\n\n| option | takes | refused | its path |\n|---|---|---|---|"
-        for each in parameters(command):
-            yield f"| `{each.label}` | {each.kind} | {each.refused} | {each.fate} |"
-        yield ""
-
-
-def page() -> str:
-    """The page as Markdown."""
-    return "\n".join(_lines())
-
-
-if __name__ == "__main__":
-    TARGET.write_text(page(), encoding="utf-8", newline="\n")
-    sys.stdout.write(f"wrote {TARGET}\n")
+def refusals(command: str) -> str:
+    """The combinations of options that a command refuses, as one sentence; empty where there are none."""
+    labels = {each.name: f"`{each.label}`" for each in parameters(command)}
+    cases = (f"{', '.join(labels[name] for name in case.options)} {case}" for case in REFUSED.get(command, ()))
+    return "; ".join(cases)

@@ -21,91 +21,91 @@ PADDED = {
     "pad_end": ("px", "zeros below and to the right"),
 }
 SIZES = {
-    "input_channel_parallel": ("channels", "taken in at a time"),
-    "pixel_parallel": ("px", "computed at a time: rows, or all where columns are not counted apart"),
-    "feature_map_bytes": ("B", "one group of the banks that hold maps on chip"),
-    "weight_bytes": ("B", "the banks that hold weights on chip"),
-    "weight_banks": ("banks", "of weights"),
-    "channels_per_cycle": ("channels", "that pools, depthwise convolutions and adds take a cycle"),
-    "pixels_per_cycle": ("px", "that they take a cycle"),
+    "input_channel_parallel": ("channels", "input channels read at a time"),
+    "pixel_parallel": ("px", "pixels computed at a time, or their rows where `column_parallel` is above 1"),
+    "feature_map_bytes": ("B", "size of one group of on-chip banks for maps"),
+    "weight_bytes": ("B", "size of the on-chip banks for weights"),
+    "weight_banks": ("banks", "banks for weights"),
+    "channels_per_cycle": ("channels", "channels per cycle of pools, depthwise convolutions and adds"),
+    "pixels_per_cycle": ("px", "their pixels per cycle"),
 }
-"""Keys that a configuration may state for itself too."""
+"""Keys that a configuration may also state for itself, with another value than the board's."""
 
 KEYS: dict[str, dict[str, tuple[str, str]]] = {
     BUILD: {
         "cores": ("cores", "compute units, each with its own weights"),
-        "batch_handlers": ("handlers", "images that a core runs at once, with the same weights"),
+        "batch_handlers": ("handlers", "images that a core computes at once, with the same weights"),
         "cpb": ("channels", "output channels that a batch handler computes at a time"),
         "aie_cores": ("cores", "AI engines"),
-        "peak_tops": ("10^12/s", "int8 operations of all cores together, a multiply-accumulate being two"),
-        **{key: (unit, f"{meaning}, where the build differs") for key, (unit, meaning) in SIZES.items()},
+        "peak_tops": ("10^12/s", "int8 operations of all cores together; a multiply-accumulate counts as two"),
+        **SIZES,
     },
     "array": {
         **{key: SIZES[key] for key in ("input_channel_parallel", "pixel_parallel")},
         "column_parallel": ("px", "columns computed at a time"),
-        "input_groups": ("groups", "of input channels that are taken in together"),
-        "channel_groups": ("groups", "at most, of `input_channel_parallel` channels: the most channels of a layer"),
+        "input_groups": ("groups", "groups of input channels read together"),
+        "channel_groups": ("groups", "most groups of `input_channel_parallel` channels in a layer"),
         "pl_clock_hz": ("Hz", "clock of the programmable logic"),
         "aie_clock_hz": ("Hz", "clock of the AI engines"),
     },
     "memory": {
         **{key: SIZES[key] for key in ("feature_map_bytes", "weight_bytes", "weight_banks")},
-        "feature_map_groups": ("groups", "of feature-map banks"),
-        "weight_bank_depth": ("words", "of a bank of weights"),
-        "ddr_bytes_per_s": ("B/s", "peak of the board's memory"),
+        "feature_map_groups": ("groups", "groups of banks for maps"),
+        "weight_bank_depth": ("words", "depth of a bank for weights"),
+        "ddr_bytes_per_s": ("B/s", "peak rate of the board's memory"),
     },
     "conv": {
         **WINDOW,
-        "weight_bias_depth": ("words", "of a bank of weights that the bias takes"),
-        "window_max": ("1", "kernel area x ceil(input channels / `window_channels`), at most"),
+        "weight_bias_depth": ("words", "depth that the bias takes in a bank for weights"),
+        "window_max": ("1", "largest kernel area x ceil(input channels / `window_channels`)"),
         "window_channels": ("channels", "see `window_max`"),
-        "area_max": ("px", "kernel height x width, at most"),
+        "area_max": ("px", "largest kernel height x width"),
     },
-    "depthwise": {**WINDOW, **PADDED, "window_max": ("1", "what a kernel takes of a bank of weights, at most")},
+    "depthwise": {**WINDOW, **PADDED, "window_max": ("1", "largest share of a bank for weights that a kernel takes")},
     "transposed": {
-        "kernel_per_stride": ("1", "kernel / stride, rounded either way"),
-        "output_padding": ("px", "at most"),
+        "kernel_per_stride": ("1", "kernel / stride, rounded down and up"),
+        "output_padding": ("px", "largest output padding"),
     },
     "pool": {**WINDOW, **PADDED},
-    "leaky_relu": {"alpha": ("1", "the one slope that the DPU knows")},
+    "leaky_relu": {"alpha": ("1", "the only slope that the DPU supports")},
     "elementwise": {key: SIZES[key] for key in ("channels_per_cycle", "pixels_per_cycle")},
     "resize": {
-        "bilinear_scale": ("1", "bilinear enlargement; powers of two"),
+        "bilinear_scale": ("1", "bilinear enlargement, in powers of two"),
         "half_pixel_scale": ("1", "the same with half-pixel centres"),
     },
-    "argmax": {"channels_max": ("channels", "at most; 0 is none")},
+    "argmax": {"channels_max": ("channels", "most channels; 0 means that ArgMax is refused")},
     "numbers": {
-        "shift_cut": ("bit", "from a layer's accumulator to its output"),
-        "shift_bias_max": ("bit", "from a bias to the accumulator, at most"),
-        "shift_read": ("bit", "between the inputs of an add"),
-        "shift_write": ("bit", "from an add to its output"),
+        "shift_cut": ("bit", "shift from a layer's accumulator to its output"),
+        "shift_bias_max": ("bit", "largest shift from a bias to the accumulator"),
+        "shift_read": ("bit", "shift between the inputs of an add"),
+        "shift_write": ("bit", "shift from an add to its output"),
         "accumulator_bits": ("bit", "width of the accumulator"),
     },
     "power": {
-        "product_j": ("J", "a multiply-accumulate, for the cross-check"),
-        "memory_byte_j": ("J", "a byte through the memory, for the cross-check"),
-        "dpu_run_w": ("W", "the board while the DPU runs; never taken from a base"),
-        "dpu_range_w": ("W", "interval of that figure; never taken from a base"),
-        "cpu_run_w": ("W", "the board while its processor runs the traditional chain; never taken from a base"),
+        "product_j": ("J", "energy of a multiply-accumulate, for the cross-check"),
+        "memory_byte_j": ("J", "energy of a byte through the memory, for the cross-check"),
+        "dpu_run_w": ("W", "power of the board while the DPU runs"),
+        "dpu_range_w": ("W", "interval of that power"),
+        "cpu_run_w": ("W", "power of the board while its processor runs the traditional chain"),
     },
-    "tile": {"memory_bytes": ("B", "of the board, which maps must fit")},
+    "tile": {"memory_bytes": ("B", "memory of the board, into which maps must fit")},
     "cost": {
-        "array_efficiency": ("1", "of the peak, reached by convolutions; fitted"),
-        "lane_efficiency": ("1", "of `channels_per_cycle` x `pixels_per_cycle`, reached; fitted"),
-        "port_bytes_per_cycle": ("B/cycle", "between a core and the memory; fitted"),
-        "memory_efficiency": ("1", "of `ddr_bytes_per_s`, reached by maps; fitted"),
-        "layer_s": ("s", "added to each layer; fitted"),
-        "batch_s": ("s", "added to each batch; fitted"),
-        "host_image_s": ("s", "of the host for an image; fitted"),
-        "host_in_bytes_per_s": ("B/s", "that the host hands in; fitted"),
-        "host_out_bytes_per_s": ("B/s", "that it takes out; fitted"),
-        "argmax_values_per_s": ("1/s", "of that task of the host; fitted"),
+        "array_efficiency": ("1", "share of the peak that convolutions reach; fitted"),
+        "lane_efficiency": ("1", "share of `channels_per_cycle` x `pixels_per_cycle` that is reached; fitted"),
+        "port_bytes_per_cycle": ("B/cycle", "rate between a core and the memory; fitted"),
+        "memory_efficiency": ("1", "share of `ddr_bytes_per_s` that maps reach; fitted"),
+        "layer_s": ("s", "time added to each layer; fitted"),
+        "batch_s": ("s", "time added to each batch; fitted"),
+        "host_image_s": ("s", "time of the host for an image; fitted"),
+        "host_in_bytes_per_s": ("B/s", "rate of input from the host; fitted"),
+        "host_out_bytes_per_s": ("B/s", "rate of output to the host; fitted"),
+        "argmax_values_per_s": ("1/s", "rate of this task on the host; fitted"),
         "softmax_values_per_s": ("1/s", "likewise"),
-        "sort_values_per_s": ("1/s", "likewise: boxes and key points"),
-        "image_values_per_s": ("1/s", "likewise: an image"),
+        "sort_values_per_s": ("1/s", "likewise, for boxes and key points"),
+        "image_values_per_s": ("1/s", "likewise, for an image"),
         "serial": ("1", "share of the shorter of computing and moving that is not hidden; assumed"),
         "crowding": ("1", "how sharply the slower of DPU and host sets the rate; chosen by cross-validation"),
-        "bursts": ("0 or 1", "whether weights cross the memory at its peak; chosen by cross-validation"),
+        "bursts": ("0 or 1", "1 if weights cross the memory at its peak rate; chosen by cross-validation"),
         "width_host": ("1", "half width of the interval of ln(FPS) where the host sets the rate"),
         "width_small_maps": ("1", "the same for small maps"),
         "width_large_maps": ("1", "the same for large maps"),
@@ -115,12 +115,12 @@ KEYS: dict[str, dict[str, tuple[str, str]]] = {
         "fitted_operations": ("operations", "range of the fitted networks"),
     },
     "cpu": {
-        "cores": ("cores", "of the board's processor"),
-        "clock_ghz": ("GHz", "its clock"),
-        "product_flops_per_cycle": ("1/cycle", "float32 operations in matrix products, a core"),
-        "moved_bytes_per_s": ("B/s", "that a core moves"),
-        "decoding_mips_per_ghz": ("MIPS/GHz", "of 7-zip, by which plain code is scaled"),
-        "chain_s_per_mpx": ("s/Mpx", "of the traditional pipeline on all cores, for 10^6 pixels"),
+        "cores": ("cores", "cores of the board's processor"),
+        "clock_ghz": ("GHz", "clock of the processor"),
+        "product_flops_per_cycle": ("1/cycle", "float32 operations of a core in matrix products"),
+        "moved_bytes_per_s": ("B/s", "bytes that a core moves"),
+        "decoding_mips_per_ghz": ("MIPS/GHz", "7-zip's rating, by which plain code is scaled"),
+        "chain_s_per_mpx": ("s/Mpx", "time of the traditional pipeline for 10^6 pixels on all cores"),
     },
 }
 """Unit and meaning of every key, by its table."""
@@ -128,18 +128,18 @@ KEYS: dict[str, dict[str, tuple[str, str]]] = {
 OPENING = """# A board's file
 
 Generated by `python docs/make/target_file.py` from the files of the shipped boards. `beers-deploy profiles vck190`
-shows one with every source; `beers-deploy profiles zcu102 --toml` prints a file to start from;
-`--target my-board.toml` takes yours. [Boards](boards.md) has a whole one.
+shows one with every source, `beers-deploy profiles zcu102 --toml` prints a file to start from, and
+`--target my-board.toml` takes yours. [Boards](boards.md) has an example.
 
-Each constant is `{ value = ..., status = "...", source = "..." }`, a range `value = [low, high]`; a bare number is
-yours ("stated"). Statuses: published, measured, inferred, assumed, stated. A rule of the DPU holds where the file has
-the constants that it names: leave out what your DPU does not limit.
+Each constant is `{ value = ..., status = "...", source = "..." }`, a range is `value = [low, high]`, and a bare
+number has the status "stated". The statuses are published, measured, inferred, assumed and stated. A rule of the DPU
+applies where the file has the constants that the rule names, so leave out what your DPU does not limit.
 
 | key at the top | what it is |
 |---|---|
-| `base` | the name of a shipped board: what the file does not state is that board's, measured power excepted |
-| `description` | one sentence; needed |
-| `default_configuration` | the build that is taken where `--config` names none |
+| `base` | a shipped board that supplies what the file does not state, except the watts of `[power]` |
+| `description` | one sentence; required |
+| `default_configuration` | the configuration that is used where `--config` names none |
 """
 
 
@@ -176,15 +176,18 @@ def document() -> str:
 
 
 def _constants() -> Iterator[str]:
-    yield "## Constants\n\n| key | unit | at least | among shipped boards | what it is |\n|---|---|---|---|---|"
+    yield "## Constants\n"
+    yield f"A configuration may state these keys of other tables with its own value: {_names((*SIZES,))}.\n"
+    yield "| key | unit | at least | among shipped boards | what it is |\n|---|---|---|---|---|"
     found = shipped()
-    yield from (line(table, key, found[table][key]) for table, keys in KEYS.items() for key in keys)
+    shown = ((table, key) for table, keys in KEYS.items() for key in keys if table != BUILD or key not in SIZES)
+    yield from (line(table, key, found[table][key]) for table, key in shown)
 
 
 def _words() -> Iterator[str]:
     yield "\n## Words\n"
-    yield f"`[activations]`: what is fused behind each of {_names(PLACES)}, a list out of {_names(FUSED)}."
-    yield f"\n`[documents]`: the manuals that findings cite, as text: {_names(DOCUMENTS)}."
+    yield f"`[activations]` has a list for each of {_names(PLACES)}: what is fused behind it, out of {_names(FUSED)}."
+    yield f"\n`[documents]` names the manuals that findings cite: {_names(DOCUMENTS)}."
 
 
 def _names(names: frozenset[str] | tuple[str, ...]) -> str:
