@@ -51,7 +51,7 @@ PATHS = {
         ("sensor", "target"),
     ),
     "check": Paths({"picture": FILE, "json": FILE}, ("model",), ("target",)),
-    "bench": Paths({"json": FILE}, ("model", "image", "measured"), ("target",)),
+    "bench": Paths({"json": FILE}, ("model", "image", "measured"), ("sensor", "target")),
     "info": Paths({"json": FILE}, ("image", "model"), ("sensor", "target")),
     "restore": Paths({"out": FILE, "json": FILE, "stac": FILE}, ("image", "model"), ("sensor",)),
     "evaluate": Paths(

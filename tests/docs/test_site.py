@@ -127,12 +127,12 @@ def run(site: Path, tmp_path: Path) -> Run:
 
     def answer(script: str, *, dark: bool = False) -> Any:
         told: Queue[Any] = Queue()
-        handler = partial(Server, script, told, directory=str(site))
+        handler, browse = partial(Server, script, told, directory=str(site)), command(tmp_path, dark=dark)
         with ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
             thread = Thread(target=server.serve_forever)
             thread.start()
             address = f"http://127.0.0.1:{server.server_address[1]}/harness"
-            started = subprocess.Popen([*command(tmp_path, dark=dark), address], stderr=subprocess.DEVNULL)
+            started = subprocess.Popen([*browse, address], stderr=subprocess.DEVNULL)
             try:
                 report = told.get(timeout=TIMEOUT_S)
             finally:
