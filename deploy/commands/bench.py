@@ -111,8 +111,8 @@ def bench(
 
     tiles, here, board = parse_tiles(tile), target in HOSTS, target.removesuffix(MODEL_SUFFIX)
     _refuse_unused(context, here)
+    require_writable(json, inputs=(model, image, measured, Path(target), Path(sensor)))
     path = int8_file(model, load_sensor(sensor), partial(say, err=True))
-    require_writable(json, inputs=(path, image, measured, Path(target), Path(sensor)))
     if here:
         from deploy.bench.host import host_rows
 
