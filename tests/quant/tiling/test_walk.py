@@ -10,28 +10,25 @@ import onnxruntime as ort
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from onnx import TensorProto, helper, numpy_helper
+from onnx import TensorProto, helper
 
 from profiles.errors import ModelError
 from quant.tiling.walk import Tiling, receptive_radius_px, tiling_of
 from tests.quant.tiling.small_networks import (
-    Operator,
+    Row,
     constant,
     float_unet,
     graph,
-    in_row,
     int8_unet,
     networks,
-    op,
+    real,
     taps,
     whole,
-)  # fmt: skip
+)
 
 
-def one(
-    kind: str, *constants: onnx.TensorProto | None, bands: tuple[int, int] = (1, 1), **attributes: Any
-) -> onnx.ModelProto:
-    return in_row(op(kind, *constants, **attributes), bands=bands)
+def one(kind: str, *others: onnx.TensorProto | str, **attributes: Any) -> onnx.ModelProto:
+    return Row().add(kind, *others, **attributes).model()
 
 
 def conv(rows: int = 3, columns: int = 3, **attributes: Any) -> onnx.ModelProto:
@@ -43,19 +40,24 @@ def transposed(side: int, stride: int, **attributes: Any) -> onnx.ModelProto:
 
 
 def resized(mode: str, where: str, factor: float, **attributes: Any) -> onnx.ModelProto:
-    scales = numpy_helper.from_array(np.array([1, 1, factor, factor], np.float32), "scales")
-    return in_row(op("Resize", None, scales, mode=mode, coordinate_transformation_mode=where, **attributes))
+    scales = real(1, 1, factor, factor)
+    return one("Resize", "", scales, mode=mode, coordinate_transformation_mode=where, **attributes)
 
 
-def pad(before: int, behind: int, mode: str) -> Operator:
-    return op("Pad", whole("pads", 0, 0, before, before, 0, 0, behind, behind), mode=mode)
+def looking(pads: list[int]) -> Row:
+    """A window that looks further to one side."""
+    return Row().add("Conv", taps("w", 1, 1, 3, 3), pads=pads)
 
 
-def cut(begin: tuple[int, int], end: int, step: int = 1) -> Operator:
-    return op("Slice", whole("from", *begin), whole("to", end, end), whole("axes", 2, 3), whole("steps", step, step))
+def pad(before: int, behind: int) -> onnx.TensorProto:
+    return whole("pads", 0, 0, before, before, 0, 0, behind, behind)
 
 
-WINDOW, FAR = taps("w", 1, 1, 3, 3), 1 << 62
+def cut(begin: tuple[int, int], end: int, step: int = 1) -> list[onnx.TensorProto]:
+    return [whole("from", *begin), whole("to", end, end), whole("axes", 2, 3), whole("steps", step, step)]
+
+
+FAR = 1 << 62
 EXACT = {
     "3 x 3": (conv(pads=[1] * 4), Tiling(1)),
     "5 x 3": (conv(5, 3, pads=[2, 1, 2, 1]), Tiling(2)),
@@ -66,13 +68,16 @@ EXACT = {
     "pool": (one("MaxPool", kernel_shape=[5, 5], pads=[2] * 4), Tiling(2)),
     "mean": (one("AveragePool", kernel_shape=[3, 3], pads=[1] * 4), Tiling(1)),
     "gain": (one("Mul", taps("gain", 1, 1, 1)), Tiling(0)),
-    "padded before": (in_row(pad(3, 3, "edge"), op("Conv", taps("w", 1, 1, 7, 7))), Tiling(3)),
+    "padded before": (
+        Row().add("Pad", pad(3, 3), mode="edge").add("Conv", taps("w", 1, 1, 7, 7)).model(),
+        Tiling(3),
+    ),
     "looks ahead, mirrored and moved": (
-        in_row(op("Conv", WINDOW, pads=[0, 0, 2, 2]), pad(1, 0, "reflect"), cut((0, 0), -1)),
+        looking([0, 0, 2, 2]).add("Pad", pad(1, 0), mode="reflect").add("Slice", *cut((0, 0), -1)).model(),
         Tiling(3, least_px=2),  # a mirror needs pixels
     ),
     "looks back, copied and moved": (
-        in_row(op("Conv", WINDOW, pads=[2, 2, 0, 0]), pad(0, 1, "edge"), cut((1, 1), FAR)),
+        looking([2, 2, 0, 0]).add("Pad", pad(0, 1), mode="edge").add("Slice", *cut((1, 1), FAR)).model(),
         Tiling(2),
     ),
     "strided pool": (one("MaxPool", kernel_shape=[2, 2], strides=[2, 2]), Tiling(0, 2, Fraction(1, 2))),
@@ -80,20 +85,20 @@ EXACT = {
     "odd pool": (one("MaxPool", kernel_shape=[3, 3], strides=[3, 3], ceil_mode=1), Tiling(0, 3, Fraction(1, 3))),
     "transposed": (transposed(4, 2, pads=[1] * 4), Tiling(1, 1, Fraction(2))),
     "transposed with gaps": (transposed(2, 3, output_padding=[1, 1]), Tiling(0, 1, Fraction(3))),
-    "shuffle": (in_row(op("DepthToSpace", blocksize=2), bands=(4, 1)), Tiling(0, 1, Fraction(2), 4, 1)),
-    "unshuffle": (in_row(op("SpaceToDepth", blocksize=2), bands=(1, 4)), Tiling(0, 2, Fraction(1, 2), 1, 4)),
+    "shuffle": (Row().add("DepthToSpace", blocksize=2).model((4, 1)), Tiling(0, 1, Fraction(2), 4, 1)),
+    "unshuffle": (Row().add("SpaceToDepth", blocksize=2).model((1, 4)), Tiling(0, 2, Fraction(1, 2), 1, 4)),
     "nearest": (resized("nearest", "asymmetric", 3, nearest_mode="floor"), Tiling(0, 1, Fraction(3))),
     "nearest, half": (resized("nearest", "half_pixel", 2), Tiling(0, 1, Fraction(2))),
     "linear": (resized("linear", "half_pixel", 2), Tiling(1, 1, Fraction(2))),
     "linear down": (resized("linear", "half_pixel", 0.5), Tiling(0, 2, Fraction(1, 2))),
     "transposed with a dilation, then windows": (
-        in_row(
-            op("ConvTranspose", taps("far", 1, 1, 2, 2), strides=[2, 2], dilations=[3, 3], pads=[1] * 4),
-            op("MaxPool", kernel_shape=[2, 2], pads=[0, 0, 1, 1]),
-        ),
+        Row()
+        .add("ConvTranspose", taps("far", 1, 1, 2, 2), strides=[2, 2], dilations=[3, 3], pads=[1] * 4)
+        .add("MaxPool", kernel_shape=[2, 2], pads=[0, 0, 1, 1])
+        .model(),
         Tiling(1, 1, Fraction(2)),
     ),
-    "every second": (in_row(cut((1, 0), FAR, 2)), Tiling(0, 2, Fraction(1, 2))),
+    "every second": (one("Slice", *cut((1, 0), FAR, 2)), Tiling(0, 2, Fraction(1, 2))),
     "float U-Net": (float_unet(), Tiling(6, 2)),
     "INT8 U-Net": (int8_unet(), Tiling(8, 4)),
 }
@@ -125,19 +130,16 @@ ELSEWHERE = {
     ),
     "Flatten, fully connected": one("Flatten"),
     "Softmax, along other sides than the channels": one("Softmax", axis=3),
-    "Concat, along other sides": graph([helper.make_node("Concat", ["image", "image"], ["restored"], axis=2)]),
-    "Concat, of tensors of unequal sizes": graph(
-        [
-            helper.make_node("MaxPool", ["image"], ["half"], kernel_shape=[2, 2], strides=[2, 2]),
-            helper.make_node("Concat", ["image", "half"], ["restored"], axis=1),
-        ],
-        bands=(1, 2),
-    ),
+    "Concat, along other sides": one("Concat", "image", axis=2),
+    "Concat, of tensors of unequal sizes": Row()
+    .add("MaxPool", kernel_shape=[2, 2], strides=[2, 2])
+    .add("Concat", "image", axis=1)
+    .model((1, 2)),
     "Resize, by 1 x 1 x 1.5 x 1.5": resized("nearest", "asymmetric", 1.5),
     "Resize, by 3, of weights that depend on the place": resized("linear", "half_pixel", 3),
     "Resize, of coordinates align_corners, which depend on the size": resized("linear", "align_corners", 2),
-    "Resize, to a size that is fixed": one("Resize", None, None, whole("sizes", 1, 1, 40, 40)),
-    "Slice, which cuts at a place that is fixed": in_row(cut((0, 0), 40)),
+    "Resize, to a size that is fixed": one("Resize", "", "", whole("sizes", 1, 1, 40, 40)),
+    "Slice, which cuts at a place that is fixed": one("Slice", *cut((0, 0), 40)),
     "Add, with a constant that differs from pixel to pixel": one("Add", constant("map", 1, 1, 40, 40)),
     "Mul, with a constant that differs": one("Mul", constant("ramp", 40)),
     "MaxPool, which tells places": graph(
@@ -149,7 +151,10 @@ ELSEWHERE = {
     "MaxPool, of no stride": one("MaxPool", kernel_shape=[2, 2], strides=[-2, -2]),
     "got -2 pixels a side": conv(),
     "as many pixels of output along both sides, got 1/2 and 1": one("MaxPool", kernel_shape=[2, 1], strides=[2, 1]),
-    "got a period of 4096": in_row(*[op("MaxPool", kernel_shape=[2, 2], strides=[64, 64])] * 2),
+    "got a period of 4096": Row()
+    .add("MaxPool", kernel_shape=[2, 2], strides=[64, 64])
+    .add("MaxPool", kernel_shape=[2, 2], strides=[64, 64])
+    .model(),
 }
 
 
