@@ -19,8 +19,8 @@ from deploy.dpu.integers import Integers
 from model.bank import LARGEST
 from profiles.errors import ModelError
 from quant.encodings import BORDER_PX, PLACE_PX, as_on_board
+from quant.graph.trials import with_shuffles
 from quant.onnx_file import load_onnx, metadata
-from quant.tiling.spelled_out import with_shuffles
 from quant.untrusted import contradictions
 
 KINDS: dict[str, Kind] = {

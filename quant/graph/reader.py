@@ -32,7 +32,7 @@ from quant.graph.operations import (
     Window,
 )
 from quant.graph.tail import without_tail
-from quant.graph.trials import makes_blocks, spelled_shuffle
+from quant.graph.trials import MOVES, makes_blocks, spelled_shuffle
 from quant.onnx_file import constants
 from quant.untrusted import contradictions, times
 
@@ -65,9 +65,6 @@ def _channels_in(model: onnx.ModelProto) -> int:
     if len(sizes) != 4:
         raise refused_graph("an input of (N, C, H, W)", f"{len(sizes)} sizes")
     return int(sizes[1].dim_value) or 1
-
-
-MOVES = ("Reshape", "Transpose", "Squeeze", "Unsqueeze")
 
 
 @dataclass(frozen=True)
@@ -319,7 +316,7 @@ class _Reader:
             self.chains[node.output[0]] = chain
             return None
         protos, channels = [each.proto for each in chain], self._width(chain[0].input[0])
-        found = spelled_shuffle(protos, node.name, channels, self.values, self.model)
+        found = spelled_shuffle(protos, node.name, channels, self.model)
         self._require(found is not None, chain[0], "Reshape and Transpose that spell a pixel shuffle", "another")
         return found
 

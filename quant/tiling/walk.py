@@ -8,10 +8,10 @@ pad with included, and the output is `scale` times the image's size. (A runtime'
 it adds in one order: onnxruntime changes that for maps of fewer than some 80 pixels a thread, see
 docs/explanation/tiling.md.)
 
-It is found by a walk along the graph, once for the rows and once for the columns. For each tensor it carries how
-many pixels it has for one of the image (a fraction behind a pool or a stride), and for each of its pixels within one
-period of the lattice the first and the last image pixel that it depends on. To these belongs the pixel's own place:
-a tile ends there too, and the layers behind pad at its end.
+It is found by a walk along the graph and back, once for the rows and once for the columns. On the way there each
+tensor is given how many pixels it has for one of the image, a fraction behind a pool or a stride: the lattice is the
+least common multiple of the denominators. On the way back it is given which of its pixels one cell of the lattice
+reads. The halo reaches to the farthest one's own place: a tile ends there too, and the layers behind pad at its end.
 
 Refused, with the node's name, is what does not do the same at every period of the lattice, from near pixels alone:
 ranges and means over the image, fully connected layers, sizes that are fixed, enlargements whose weights depend on
@@ -21,13 +21,13 @@ the place by rounding (a third has no exact float), and constants that differ fr
 import math
 from dataclasses import dataclass
 from fractions import Fraction
-from typing import Any
 
+import numpy as np
 import onnx
 
-from quant.onnx_file import fixed_tile_px
-from quant.tiling.reach import IMAGE, STEPS, Constants, Reach, Side, joined, refused, require
-from quant.tiling.spelled_out import with_shuffles
+from quant.graph.trials import MOVES, with_shuffles
+from quant.onnx_file import constants, fixed_tile_px
+from quant.tiling.steps import STEPS, Along, Step, refused
 from quant.untrusted import contradictions
 
 
@@ -82,8 +82,8 @@ def tiling_of(model: onnx.ModelProto) -> Tiling:
         ModelError: a network that cannot be tiled; the sentence names the node.
     """
     with contradictions("tiled model"):
-        plain = with_shuffles(model)
-        rows, columns = (_Walk(plain, side) for side in (ROWS, COLUMNS))
+        plain, held = with_shuffles(model), constants(model)
+        rows, columns = (_Walk(plain, held, side) for side in (0, 1))
         (channels_in, channels_out), fixed_px = _channels(model), fixed_tile_px(model)
         lattice_px = math.lcm(rows.lattice_px, columns.lattice_px)
         radius_px = max(rows.radius_px, columns.radius_px)
@@ -102,13 +102,12 @@ def _channels(model: onnx.ModelProto) -> tuple[int, int]:
     images = [value for value in model.graph.input if value.name not in held]
     if len(images) != 1 or len(model.graph.output) != 1:
         raise refused("one image in and one out", f"{len(images)} in and {len(model.graph.output)} out")
-    counts = [_channel_count(images[0]), _channel_count(model.graph.output[0])]
-    if not all(counts):
-        counts[1] = counts[1] or _channel_count(onnx.shape_inference.infer_shapes(model).graph.output[0])
-    if not counts[0]:
+    channels_in, channels_out = _channel_count(images[0]), _channel_count(model.graph.output[0])
+    if not channels_in:
         raise refused("an image (N, C, H, W) of a stated number of channels", "none stated")
+    channels_out = channels_out or _channel_count(onnx.shape_inference.infer_shapes(model).graph.output[0])
     # Where neither file nor inference tells, as with a runtime's own operators, what comes out is judged as it comes.
-    return counts[0], counts[1] or counts[0]
+    return channels_in, channels_out or channels_in
 
 
 def _channel_count(value: onnx.ValueInfoProto) -> int:
@@ -117,58 +116,110 @@ def _channel_count(value: onnx.ValueInfoProto) -> int:
     return sizes[1].dim_value if len(sizes) == 4 else 0
 
 
-ROWS, COLUMNS = 0, 1
+PERIOD = 1024
+"""Most pixels of a lattice, and of a tensor's within one: networks of use stay far below."""
+
+
+@dataclass(frozen=True)
+class _Grid:
+    """A tensor's pixels along one side: so many for one of the image, and so many beyond, or short of, that share.
+
+    They are beyond it where something padded, until windows use them up or they are cut off.
+    """
+
+    per_px: Fraction
+    extra: int
+
+    def in_cell(self, lattice_px: int) -> int:
+        """Its share of a cell of the lattice."""
+        return int(self.per_px * lattice_px)
+
+    def reach_px(self, first: int, last: int, lattice_px: int) -> int:
+        """How far beyond the lattice's first cell a tile must reach to have these pixels."""
+        end_px = math.ceil((last - self.extra + 1) / self.per_px)
+        return max(-math.floor(first / self.per_px), end_px - lattice_px)
 
 
 class _Walk:
-    """Follows the image along one side, from node to node."""
+    """Follows the image along one side, from node to node, and back what a cell of the lattice reads.
 
-    def __init__(self, model: onnx.ModelProto, side: int) -> None:
-        self._at = Side(side, Constants(model))
+    Raises:
+        ModelError: a node that cannot be tiled, or a result of another size than a share of the image's.
+    """
+
+    def __init__(self, model: onnx.ModelProto, held: dict[str, np.ndarray], side: int) -> None:
+        self._side, self._values, self._shapes = side, held, {name: value.shape for name, value in held.items()}
+        self._grids = {value.name: _Grid(Fraction(1), 0) for value in model.graph.input if value.name not in held}
+        self._steps: list[tuple[onnx.NodeProto, Step]] = []
         self.least_px = 1
-        self._reach = {value.name: IMAGE for value in model.graph.input if value.name not in self._at.constants}
-        seen = [self._visit(node) for node in model.graph.node]
-        end = self._reach.get(model.graph.output[0].name)
-        if end is None:
+        for node in model.graph.node:
+            self._visit(node)
+        output = model.graph.output[0].name
+        if output not in self._grids:
             raise refused("an output that depends on the image", "one of constants alone")
-        if end.extra:
-            raise refused("an output of the image's size or a multiple", f"{end.extra:+d} pixels a side")
-        self.scale = end.per_px
-        self.lattice_px = math.lcm(1, *(reach.lattice_px for reach in seen if reach))
-        # Of every tensor, not the output's alone: mirrored borders read as far inside as they reach outside.
-        self.radius_px = max((reach.radius_px for reach in seen if reach), default=0)
+        self.scale, extra = self._grids[output].per_px, self._grids[output].extra
+        if extra:
+            raise refused("an output of the image's size or a multiple", f"{extra:+d} pixels a side")
+        self.lattice_px = math.lcm(*(grid.per_px.denominator for grid in self._grids.values()))
+        period = max(self.lattice_px, *(grid.in_cell(self.lattice_px) for grid in self._grids.values()))
+        if period > PERIOD:
+            raise refused(f"a network that repeats within {PERIOD} pixels", f"a period of {period}")
+        self.radius_px = self._radius_px(output)
 
-    def _visit(self, node: onnx.NodeProto) -> Reach | None:
-        parts = [self._reach[name] for name in node.input if name in self._reach]
-        if not parts:
-            self._at.constants.note(node)
-            return None
+    def _visit(self, node: onnx.NodeProto) -> None:
+        read = [self._grids[name] for name in node.input if name in self._grids]
         given = {a.name: onnx.helper.get_attribute_value(a) for a in node.attribute}
-        if node.op_type in STEPS:
-            require(node, node.input[0] in self._reach and len(parts) == 1, "steered by the image")
-            require(node, len([name for name in node.output if name]) == 1, "which tells places")
-            reach = parts[0].behind(STEPS[node.op_type](node, given, self._at, parts[0]))
-            if given.get("mode") == b"reflect":
-                pads = self._at.constants.numbers(node, 1, given.get("pads", ()))
-                self.least_px = max(self.least_px, math.ceil((1 + max(pads)) / parts[0].per_px))
-        else:
-            self._require_pointwise(node, given)
-            reach = joined(node, parts)
-        self._reach.update(dict.fromkeys(node.output, reach))
-        return reach
+        at = Along(node, given, self._side, read[0].extra if read else 0, self._values, self._shapes)
+        if read:
+            step = self._step(at, read)
+            at.require(step.growth > 0, "of no stride")
+            self._steps.append((node, step))
+            self._grids.update(dict.fromkeys(node.output, _Grid(read[0].per_px * step.growth, step.extra)))
+            if step.mirrored:
+                self.least_px = max(self.least_px, math.ceil((1 + step.mirrored) / read[0].per_px))
+        elif node.op_type != "Constant":  # such as weights dequantised in a board file
+            at.require(node.op_type in KEEPING, "of constants alone: fold them")
+            self._shapes[node.output[0]] = self._shapes[node.input[0]]
 
-    def _require_pointwise(self, node: onnx.NodeProto, given: dict[str, Any]) -> None:
-        if node.op_type in OVER_CHANNELS:
-            require(node, given.get("axis", 0) in (1, -3), "along other sides than the channels")
-        elif node.op_type in PER_CHANNEL:
-            require(node, given.get("axis", 1) in (1, -3), "along other sides than the channels")
-        elif node.op_type == "Gather":  # an activation as a table
-            table = self._at.constants.shape(node.input[0])
-            require(node, len(table) == 1 and given.get("axis", 0) == 0, "which moves pixels")
-        else:
-            require(node, node.op_type in POINTWISE, WHY.get(node.op_type, "of which it is not known"))
-            flat = all(set(self._at.constants.shape(name)[-2:]) <= {1} for name in node.input)
-            require(node, flat, "with a constant that differs from pixel to pixel")
+    def _step(self, at: Along, read: list[_Grid]) -> Step:
+        if at.node.op_type in STEPS:
+            at.require(at.node.input[0] in self._grids and len(read) == 1, "steered by the image")
+            at.require(len([name for name in at.node.output if name]) == 1, "which tells places")
+            return STEPS[at.node.op_type](at)
+        _require_pointwise(at)
+        at.require(len(set(read)) == 1, "of tensors of unequal sizes")
+        return Step(Fraction(1), at.extra)
+
+    def _radius_px(self, output: str) -> int:
+        """How far beyond a cell of the lattice lies what its result depends on."""
+        read = {output: (0, self._grids[output].in_cell(self.lattice_px) - 1)}
+        for node, step in reversed(self._steps):
+            wanted = [read[name] for name in node.output if name in read]
+            for name in (name for name in node.input if wanted and name in self._grids):
+                size = self._grids[name].in_cell(self.lattice_px) + self._grids[name].extra
+                ends = step.reads(*_hull(wanted), size)
+                read[name] = _hull([ends, read.get(name, ends)])
+        return max(self._grids[name].reach_px(*ends, self.lattice_px) for name, ends in read.items())
+
+
+def _hull(ranges: list[tuple[int, int]]) -> tuple[int, int]:
+    return min(first for first, _ in ranges), max(last for _, last in ranges)
+
+
+def _require_pointwise(at: Along) -> None:
+    kind = at.node.op_type
+    if kind in AXES:
+        at.require(at.given.get("axis", AXES[kind]) in (1, -3), "along other sides than the channels")
+    elif kind == "Gather":  # an activation as a table
+        table = at.shapes.get(at.node.input[0], ())
+        at.require(len(table) == 1 and at.given.get("axis", 0) == 0, "which moves pixels")
+    else:
+        why = next(
+            (why for why, marks in WHY.items() if any(mark in kind for mark in marks)), "of which it is not known"
+        )
+        at.require(kind in POINTWISE, why)
+        flat = all(set(at.shapes.get(name, ())[-2:]) <= {1} for name in at.node.input)
+        at.require(flat, "with a constant that differs from pixel to pixel")
 
 
 POINTWISE = {
@@ -178,20 +229,16 @@ POINTWISE = {
     "QLinearMul", "QLinearSigmoid", "Reciprocal", "Relu", "Round", "Selu", "Sigmoid", "Sign", "Softplus", "Softsign",
     "Sqrt", "Sub", "Sum", "Tanh", "ThresholdedRelu", "Where", "Xor",
 }  # fmt: skip
-PER_CHANNEL = {"BatchNormalization", "DequantizeLinear", "QuantizeLinear"}
-"""Point-wise, with vectors of one number a channel."""
-OVER_CHANNELS = {"Concat", "QLinearConcat", "Softmax", "Split"}
-"""Point-wise where they work along the channels."""
-
+AXES = {
+    **dict.fromkeys(("BatchNormalization", "DequantizeLinear", "QuantizeLinear"), 1),
+    **dict.fromkeys(("Concat", "QLinearConcat", "Softmax", "Split"), 0),
+}
+"""Point-wise where they work along the channels, or have one number for each, and the axis where none is stated."""
+KEEPING = {"BatchNormalization", "Cast", "DequantizeLinear", "Identity", "QuantizeLinear"}
+"""What leaves the shape of constants as it is."""
 WHY = {
-    **dict.fromkeys(
-        (
-            "DynamicQuantizeLinear", "GlobalAveragePool", "GlobalMaxPool", "GroupNormalization",
-            "InstanceNormalization", "LayerNormalization", "QLinearGlobalAveragePool", "ReduceMax", "ReduceMean",
-            "ReduceSum", "Shape",
-        ),
-        "which looks at the whole image",
-    ),
-    **dict.fromkeys(("Flatten", "Gemm", "MatMul", "QGemm", "QLinearMatMul"), "fully connected"),
-    **dict.fromkeys(("Reshape", "Squeeze", "Transpose", "Unsqueeze"), "which moves pixels"),
-}  # fmt: skip
+    "which looks at the whole image": ("Dynamic", "Global", "Normalization", "Reduce", "Shape"),
+    "fully connected": ("Flatten", "Gemm", "MatMul"),
+    "which moves pixels": MOVES,
+}
+"""What is refused, by parts of its name."""

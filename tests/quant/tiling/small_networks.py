@@ -1,7 +1,6 @@
 """Small networks as users bring them: strides, pools, transposed convolutions, shuffles, enlargements, joins."""
 
 import math
-from dataclasses import dataclass, field
 from fractions import Fraction
 from functools import cache
 from typing import Any
@@ -31,6 +30,17 @@ def whole(name: str, *values: int) -> onnx.TensorProto:
     return numpy_helper.from_array(np.array(values, np.int64), name)
 
 
+def taps(name: str, *shape: int) -> onnx.TensorProto:
+    """Weights of small whole numbers, whose sums are exact in any order."""
+    values = np.random.default_rng(list(name.encode())).choice([-2, -1, 1, 2, 3], shape)
+    return numpy_helper.from_array(values.astype(np.float32), name)
+
+
+def real(*values: float) -> onnx.TensorProto:
+    """Numbers, or one by itself."""
+    return numpy_helper.from_array(np.array(values if len(values) > 1 else values[0], np.float32), "real")
+
+
 def graph(
     nodes: list[onnx.NodeProto], *constants: onnx.TensorProto, bands: tuple[int, int] = (1, 1)
 ) -> onnx.ModelProto:
@@ -40,47 +50,71 @@ def graph(
     return model
 
 
+class Row:
+    """A network written operator by operator, each of which reads what the last one made of the image."""
+
+    def __init__(self) -> None:
+        self.nodes: list[onnx.NodeProto] = []
+        self.weights: list[onnx.TensorProto] = []
+        self.tensor = "image"
+
+    def add(self, kind: str, *others: onnx.TensorProto | str, **attributes: Any) -> "Row":
+        """One more, and what it reads behind the last result: constants, and tensors by name."""
+        feeds, name = [self.tensor], f"t{len(self.nodes)}"
+        for other in others:
+            feeds.append(other if isinstance(other, str) else f"{name}.{len(feeds)}")
+            if not isinstance(other, str):
+                self.weights.append(numpy_helper.from_array(numpy_helper.to_array(other), feeds[-1]))
+        self.nodes.append(helper.make_node(kind, feeds, [name], **attributes))
+        self.tensor = name
+        return self
+
+    def model(self, bands: tuple[int, int] = (1, 1)) -> onnx.ModelProto:
+        self.nodes[-1].output[0] = "restored"
+        return graph(self.nodes, *self.weights, bands=bands)
+
+
 def float_unet() -> onnx.ModelProto:
     """Convolution, pool, convolution, transposed convolution, beside the first, convolution."""
-    return graph(
-        [
-            helper.make_node("Conv", ["image", "first"], ["a"], pads=[1] * 4),
-            helper.make_node("MaxPool", ["a"], ["half"], kernel_shape=[2, 2], strides=[2, 2]),
-            helper.make_node("Conv", ["half", "middle"], ["b"], pads=[1] * 4),
-            helper.make_node("ConvTranspose", ["b", "up"], ["c"], strides=[2, 2]),
-            helper.make_node("Concat", ["a", "c"], ["both"], axis=1),
-            helper.make_node("Conv", ["both", "last"], ["restored"], pads=[1] * 4),
-        ],
-        constant("first", 2, 1, 3, 3),
-        constant("middle", 2, 2, 3, 3),
-        constant("up", 2, 2, 2, 2),
-        constant("last", 1, 4, 3, 3),
-    )
+    row = Row().add("Conv", constant("first", 2, 1, 3, 3), pads=[1] * 4)
+    first = row.tensor
+    row.add("MaxPool", kernel_shape=[2, 2], strides=[2, 2]).add("Conv", constant("middle", 2, 2, 3, 3), pads=[1] * 4)
+    row.add("ConvTranspose", constant("up", 2, 2, 2, 2), strides=[2, 2]).add("Concat", first, axis=1)
+    return row.add("Conv", constant("last", 1, 4, 3, 3), pads=[1] * 4).model()
 
 
 UNIT = ["unit", "zero"]
 MICROSOFT = "com.microsoft"
 
 
+def int8_conv(source: str, weight: str, result: str, stride: int = 1) -> onnx.NodeProto:
+    feeds = [source, *UNIT, weight, "fine", "none", *UNIT]
+    return helper.make_node("QLinearConv", feeds, [result], name=result, pads=[1] * 4, strides=[stride] * 2)
+
+
+def int8_graph(nodes: list[onnx.NodeProto], unit: float, **weights: tuple[int, ...]) -> onnx.ModelProto:
+    """A network in whole numbers: `unit` is what 1 stands for, `weights` are the shapes of those."""
+    numbers = {
+        "unit": np.float32(unit),
+        "coarse": np.float32(16),
+        "fine": np.float32(2**-6),
+        "zero": np.uint8(128),
+        "none": np.int8(0),
+        "four": np.array([1, 1, 4, 4], np.float32),
+        "table": np.random.default_rng(3).permutation(256).astype(np.uint8),
+    }
+    for name, shape in weights.items():
+        numbers[name] = np.random.default_rng(list(name.encode())).integers(-60, 61, shape).astype(np.int8)
+    return graph(nodes, *(numpy_helper.from_array(np.asarray(value), name) for name, value in numbers.items()))
+
+
 def int8_unet() -> onnx.ModelProto:
-    """The same in whole numbers, with the activations that an INT8 file may have."""
-
-    def conv(source: str, weight: str, result: str, **attributes: Any) -> onnx.NodeProto:
-        feeds = [source, *UNIT, weight, "fine", "none", *UNIT]
-        return helper.make_node("QLinearConv", feeds, [result], name=result, **attributes)
-
-    def weight(name: str, *shape: int) -> onnx.TensorProto:
-        values = np.random.default_rng(len(name)).integers(-50, 51, shape)
-        return numpy_helper.from_array(values.astype(np.int8), name)
-
-    def number(name: str, value: Any) -> onnx.TensorProto:
-        return numpy_helper.from_array(np.array(value), name)
-
+    """In whole numbers, with the activations that an INT8 file may have, on a lattice of 4."""
     nodes = [
         helper.make_node("QuantizeLinear", ["image", "coarse", "zero"], ["q"]),
-        conv("q", "first", "a", pads=[1] * 4),
+        int8_conv("q", "first", "a"),
         helper.make_node("QLinearLeakyRelu", ["a", *UNIT, *UNIT], ["leaky"], domain=MICROSOFT, alpha=0.1),
-        conv("leaky", "down", "half", pads=[1] * 4, strides=[2, 2]),
+        int8_conv("leaky", "down", "half", 2),
         helper.make_node("Cast", ["half"], ["places"], to=TensorProto.INT32),
         helper.make_node("Gather", ["table", "places"], ["bent"]),
         helper.make_node(
@@ -92,131 +126,94 @@ def int8_unet() -> onnx.ModelProto:
         helper.make_node(
             "QLinearConcat", [*UNIT, "gated", *UNIT, "q", *UNIT], ["both"], domain=MICROSOFT, axis=1
         ),
-        conv("both", "last", "end", pads=[1] * 4),
+        int8_conv("both", "last", "end"),
         helper.make_node("DequantizeLinear", ["end", *UNIT], ["restored"]),
     ]  # fmt: skip
-    return graph(
-        nodes,
-        number("coarse", np.float32(16)),
-        number("unit", np.float32(0.5)),
-        number("fine", np.float32(2**-6)),
-        number("zero", np.uint8(128)),
-        number("none", np.int8(0)),
-        number("table", np.random.default_rng(3).permutation(256).astype(np.uint8)),
-        number("four", np.array([1, 1, 4, 4], np.float32)),
-        weight("first", 2, 1, 3, 3),
-        weight("down", 2, 2, 3, 3),
-        weight("last", 1, 3, 3, 3),
-    )
+    return int8_graph(nodes, 0.5, first=(2, 1, 3, 3), down=(2, 2, 3, 3), last=(1, 3, 3, 3))
 
 
-@dataclass
-class Builder:
-    """A random network, written node by node; every tensor has `at` pixels for one of the image."""
+class Builder(Row):
+    """A random network; every tensor has `at` pixels for one of the image."""
 
-    draw: Any
-    nodes: list[onnx.NodeProto] = field(default_factory=list)
-    weights: list[onnx.TensorProto] = field(default_factory=list)
-    tensor: str = "image"
-    channels: int = 1
-    at: Fraction = Fraction(1)
-    skips: dict[Fraction, tuple[str, int]] = field(default_factory=dict)
+    def __init__(self, draw: Any) -> None:
+        super().__init__()
+        self.draw, self.channels, self.at = draw, 1, Fraction(1)
+        self.skips: dict[Fraction, tuple[str, int]] = {}
 
-    def node(self, kind: str, *feeds: str, **attributes: Any) -> None:
-        name = f"t{len(self.nodes)}"
-        self.nodes.append(helper.make_node(kind, [*feeds] or [self.tensor], [name], name=name, **attributes))
-        self.tensor = name
+    def number(self, least: int, most: int) -> int:
+        return int(self.draw(st.integers(least, most)))
 
-    def weight(self, *shape: int) -> str:
-        name = f"w{len(self.weights)}"
-        seed = np.random.default_rng(len(self.weights))
-        values = seed.choice([-2, -1, 1, 2, 3], shape)
-        self.weights.append(numpy_helper.from_array(values.astype(np.float32), name))
-        return name
+    def pads(self, total: int) -> list[int]:
+        before = [self.number(0, total) for _ in range(2)]
+        return [*before, *(total - pad for pad in before)]
+
+    def convolve(self, kernel: int, channels: int = 2, **window: Any) -> None:
+        self.add("Conv", taps(f"{len(self.nodes)}", channels, self.channels, kernel, kernel), **window)
+        self.channels = channels
 
     def conv(self, stride: int = 1) -> None:
-        kernel, dilation = self.draw(st.integers(1, 4)), self.draw(st.integers(1, 2))
+        kernel, dilation = self.number(1, 4), self.number(1, 2)
         extent = (kernel - 1) * dilation + 1
-        total = self.draw(st.integers(max(extent - stride, 0), max(extent - 1, 0)))
-        before = [self.draw(st.integers(0, total)) for _ in range(2)]
-        pads = [*before, *(total - pad for pad in before)]
-        weight = self.weight(2, self.channels, kernel, kernel)
-        self.node("Conv", self.tensor, weight, strides=[stride] * 2, dilations=[dilation] * 2, pads=pads)
-        self.channels = 2
+        pads = self.pads(self.number(max(extent - stride, 0), extent - 1))
+        self.convolve(kernel, strides=[stride] * 2, dilations=[dilation] * 2, pads=pads)
         self.at /= stride
 
     def strided(self) -> None:
-        self.conv(self.draw(st.sampled_from([2, 3])))
+        self.conv(self.number(2, 3))
 
     def pool(self) -> None:
-        extent, before = self.draw(st.sampled_from([2, 4])), self.draw(st.integers(0, 2))
-        before = min(before, extent - 2)
-        pads = [before, before, extent - 2 - before, extent - 2 - before]
-        if self.draw(st.booleans()):
-            self.node("MaxPool", kernel_shape=[extent] * 2, strides=[2, 2], pads=pads)
-        else:
-            self.node("AveragePool", kernel_shape=[extent] * 2, strides=[2, 2], pads=pads, count_include_pad=1)
+        extent, kind = self.number(2, 4), self.draw(st.sampled_from(["MaxPool", "AveragePool"]))
+        counted = {"count_include_pad": 1} if kind == "AveragePool" else {}
+        self.add(kind, kernel_shape=[extent] * 2, strides=[2, 2], pads=self.pads(extent - 2), **counted)
         self.at /= 2
 
     def padded(self) -> None:
-        mode = self.draw(st.sampled_from(["constant", "edge", "reflect"]))
-        name = f"p{len(self.nodes)}"
-        self.weights.append(whole(name, 0, 0, 1, 1, 0, 0, 1, 1))
-        self.node("Pad", self.tensor, name, mode=mode)
-        self.node("Conv", self.tensor, self.weight(2, self.channels, 3, 3))
-        self.channels = 2
+        """By itself, then used up by a window; or moved, cut off on the one side that was not padded."""
+        mode, before, behind = self.draw(st.sampled_from(["constant", "edge", "reflect"])), *self.pads(2)[::2]
+        self.add("Pad", whole("pads", 0, 0, before, before, 0, 0, behind, behind), mode=mode)
+        if before == behind or self.draw(st.booleans()):
+            self.convolve(3)
+        else:
+            self.add(
+                "Slice", whole("from", behind, behind), whole("to", *[-before or 1 << 62] * 2), whole("axes", 2, 3)
+            )
 
     def transposed(self) -> None:
-        kernel = self.draw(st.integers(1, 4))
-        cut = max(kernel - 2, 0)
-        before = self.draw(st.integers(0, cut))
-        pads, behind = [before, before, cut - before, cut - before], max(2 - kernel, 0)
-        weight = self.weight(self.channels, 2, kernel, kernel)
-        self.node("ConvTranspose", self.tensor, weight, strides=[2, 2], pads=pads, output_padding=[behind] * 2)
+        kernel = self.number(1, 4)
+        window = {"pads": self.pads(max(kernel - 2, 0)), "output_padding": [max(2 - kernel, 0)] * 2}
+        weight = taps(f"{len(self.nodes)}", self.channels, 2, kernel, kernel)
+        self.add("ConvTranspose", weight, strides=[2, 2], **window)
         self.channels = 2
         self.at *= 2
 
     def shuffle(self) -> None:
-        self.node("Conv", self.tensor, self.weight(4, self.channels, 1, 1))
-        self.node("DepthToSpace", blocksize=2, mode="CRD")
+        self.convolve(1, 4)
+        self.add("DepthToSpace", blocksize=2, mode="CRD")
         self.channels = 1
         self.at *= 2
 
     def unshuffle(self) -> None:
-        self.node("SpaceToDepth", blocksize=2)
+        self.add("SpaceToDepth", blocksize=2)
         self.channels *= 4
         self.at /= 2
 
     def resize(self) -> None:
         mode = self.draw(st.sampled_from(["nearest", "linear"]))
-        coordinates = self.draw(st.sampled_from(["asymmetric", "half_pixel", "pytorch_half_pixel"]))
-        name = f"s{len(self.nodes)}"
-        self.weights.append(numpy_helper.from_array(np.array([1, 1, 2, 2], np.float32), name))
-        self.node("Resize", self.tensor, "", name, mode=mode, coordinate_transformation_mode=coordinates)
+        where = self.draw(st.sampled_from(["asymmetric", "half_pixel", "pytorch_half_pixel"]))
+        self.add("Resize", "", real(1, 1, 2, 2), mode=mode, coordinate_transformation_mode=where)
         self.at *= 2
 
     def join(self) -> None:
         """Beside an earlier tensor of the same size, where there is one."""
         if self.at in self.skips:
             name, channels = self.skips[self.at]
-            self.node("Concat", self.tensor, name, axis=1)
+            self.add("Concat", name, axis=1)
             self.channels += channels
         self.skips[self.at] = self.tensor, self.channels
 
     def small(self) -> None:
         """Back to small whole numbers: their sums are exact in any order, which a runtime chooses by the size."""
-        self.node("Mul", self.tensor, "eighth")
-        self.node("Floor")
-        self.node("Clip", self.tensor, "low", "high")
-
-    def model(self) -> onnx.ModelProto:
-        self.weights += [
-            numpy_helper.from_array(np.array(value, np.float32), name)
-            for name, value in (("eighth", 0.125), ("low", -255), ("high", 255))
-        ]
-        self.node("Identity")
-        self.nodes[-1].output[0] = "restored"
-        return graph(self.nodes, *self.weights, bands=(1, self.channels))
+        self.add("Mul", real(0.125)).add("Floor").add("Clip", real(-255), real(255))
 
 
 @st.composite
@@ -232,74 +229,41 @@ def networks(draw: Any) -> onnx.ModelProto:
         if builder.channels <= 16 and not (grows and builder.at >= 2):
             part(builder)
             builder.small()
-    return builder.model()
+    return builder.add("Identity").model((1, builder.channels))
 
 
 def espcn() -> onnx.ModelProto:
     """Twice the size by a pixel shuffle."""
-    return graph(
-        [
-            helper.make_node("Conv", ["image", "in"], ["a"], pads=[2] * 4),
-            helper.make_node("Relu", ["a"], ["b"]),
-            helper.make_node("Conv", ["b", "out"], ["c"], pads=[1] * 4),
-            helper.make_node("DepthToSpace", ["c"], ["restored"], blocksize=2, mode="CRD"),
-        ],
-        constant("in", 8, 1, 5, 5),
-        constant("out", 4, 8, 3, 3),
+    row = Row().add("Conv", constant("in", 8, 1, 5, 5), pads=[2] * 4).add("Relu")
+    return (
+        row.add("Conv", constant("out", 4, 8, 3, 3), pads=[1] * 4)
+        .add("DepthToSpace", blocksize=2, mode="CRD")
+        .model()
     )
 
 
 def four_bands(bands_out: int = 4) -> onnx.ModelProto:
     """Bands that are restored together, or made into others."""
-    return graph(
-        [
-            helper.make_node("Conv", ["image", "in"], ["a"], pads=[1] * 4),
-            helper.make_node("Relu", ["a"], ["b"]),
-            helper.make_node("Conv", ["b", "out"], ["restored"], pads=[1] * 4),
-        ],
-        constant("in", 8, 4, 3, 3),
-        constant("out", bands_out, 8, 3, 3),
-        bands=(4, bands_out),
-    )
+    row = Row().add("Conv", constant("in", 8, 4, 3, 3), pads=[1] * 4).add("Relu")
+    return row.add("Conv", constant("out", bands_out, 8, 3, 3), pads=[1] * 4).model((4, bands_out))
 
 
 def ffdnet() -> onnx.ModelProto:
     """Half the size inside, by a pixel unshuffle in front and a shuffle behind."""
-    return graph(
-        [
-            helper.make_node("SpaceToDepth", ["image"], ["half"], blocksize=2),
-            helper.make_node("Conv", ["half", "in"], ["a"], pads=[1] * 4),
-            helper.make_node("Clip", ["a", "none", "six"], ["b"]),
-            helper.make_node("Conv", ["b", "out"], ["c"], pads=[2] * 4, dilations=[2, 2]),
-            helper.make_node("DepthToSpace", ["c"], ["restored"], blocksize=2),
-        ],
-        constant("in", 8, 4, 3, 3),
-        constant("out", 4, 8, 3, 3),
-        numpy_helper.from_array(np.array(0, np.float32), "none"),
-        numpy_helper.from_array(np.array(6, np.float32), "six"),
-    )
+    row = Row().add("SpaceToDepth", blocksize=2).add("Conv", constant("in", 8, 4, 3, 3), pads=[1] * 4)
+    row.add("Clip", real(0), real(6)).add("Conv", constant("out", 4, 8, 3, 3), pads=[2] * 4, dilations=[2, 2])
+    return row.add("DepthToSpace", blocksize=2).model()
 
 
 def plain_int8_unet() -> onnx.ModelProto:
     """In whole numbers and operators of ONNX itself, on a lattice of 8."""
-    codes = ["unit", "zero"]
 
     def conv(source: str, weight: str, result: str, stride: int = 1) -> list[onnx.NodeProto]:
-        feeds = [source, *codes, weight, "fine", "none", *codes]
-        return [
-            helper.make_node("QLinearConv", feeds, [f"{result}.sum"], pads=[1] * 4, strides=[stride] * 2),
-            helper.make_node("Max", [f"{result}.sum", "zero"], [result]),
-        ]
-
-    def weight(name: str, *shape: int) -> onnx.TensorProto:
-        values = np.random.default_rng(list(name.encode())).integers(-60, 61, shape)
-        return numpy_helper.from_array(values.astype(np.int8), name)
-
-    def number(name: str, value: Any) -> onnx.TensorProto:
-        return numpy_helper.from_array(np.array(value), name)
+        relu = helper.make_node("Max", [f"{result}.sum", "zero"], [result])
+        return [int8_conv(source, weight, f"{result}.sum", stride), relu]
 
     nodes = [
-        helper.make_node("QuantizeLinear", ["image", *codes], ["q"]),
+        helper.make_node("QuantizeLinear", ["image", *UNIT], ["q"]),
         *conv("q", "first", "a"),
         helper.make_node("MaxPool", ["a"], ["half"], kernel_shape=[2, 2], strides=[2, 2]),
         *conv("half", "second", "b", 2),
@@ -311,20 +275,10 @@ def plain_int8_unet() -> onnx.ModelProto:
         ),
         helper.make_node("Concat", ["wide", "a"], ["both"], axis=1),
         *conv("both", "last", "end"),
-        helper.make_node("DequantizeLinear", ["end", *codes], ["restored"]),
+        helper.make_node("DequantizeLinear", ["end", *UNIT], ["restored"]),
     ]  # fmt: skip
-    return graph(
-        nodes,
-        number("unit", np.float32(2**-7)),
-        number("fine", np.float32(2**-6)),
-        number("zero", np.uint8(128)),
-        number("none", np.int8(0)),
-        number("four", np.array([1, 1, 4, 4], np.float32)),
-        weight("first", 2, 1, 3, 3),
-        weight("second", 4, 2, 3, 3),
-        weight("third", 8, 4, 3, 3),
-        weight("last", 1, 4, 3, 3),
-    )
+    weights = {"first": (2, 1, 3, 3), "second": (4, 2, 3, 3), "third": (8, 4, 3, 3), "last": (1, 4, 3, 3)}
+    return int8_graph(nodes, 2**-7, **weights)
 
 
 def half_resolution() -> onnx.ModelProto:

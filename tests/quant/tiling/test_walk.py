@@ -10,31 +10,166 @@ import onnxruntime as ort
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from onnx import TensorProto, helper, numpy_helper
+from onnx import TensorProto, helper
 
 from profiles.errors import ModelError
 from quant.tiling.walk import Tiling, receptive_radius_px, tiling_of
-from tests.quant.tiling.small_networks import constant, float_unet, graph, int8_unet, networks, whole
+from tests.quant.tiling.small_networks import (
+    Row,
+    constant,
+    float_unet,
+    graph,
+    int8_unet,
+    networks,
+    real,
+    taps,
+    whole,
+)
 
 
-def one(
-    kind: str, *constants: onnx.TensorProto, bands: tuple[int, int] = (1, 1), **attributes: Any
-) -> onnx.ModelProto:
-    feeds = ["image", *(c.name for c in constants)]
-    return graph([helper.make_node(kind, feeds, ["restored"], **attributes)], *constants, bands=bands)
+def one(kind: str, *others: onnx.TensorProto | str, **attributes: Any) -> onnx.ModelProto:
+    return Row().add(kind, *others, **attributes).model()
 
 
-def resized(mode: str, coordinates: str, factor: float, **attributes: Any) -> onnx.ModelProto:
-    scales = numpy_helper.from_array(np.array([1, 1, factor, factor], np.float32), "scales")
-    node = helper.make_node(
-        "Resize",
-        ["image", "", "scales"],
-        ["restored"],
-        mode=mode,
-        coordinate_transformation_mode=coordinates,
-        **attributes,
+def conv(rows: int = 3, columns: int = 3, **attributes: Any) -> onnx.ModelProto:
+    return one("Conv", taps("w", 1, 1, rows, columns), **attributes)
+
+
+def transposed(side: int, stride: int, **attributes: Any) -> onnx.ModelProto:
+    return one("ConvTranspose", taps("w", 1, 1, side, side), strides=[stride] * 2, **attributes)
+
+
+def resized(mode: str, where: str, factor: float, **attributes: Any) -> onnx.ModelProto:
+    scales = real(1, 1, factor, factor)
+    return one("Resize", "", scales, mode=mode, coordinate_transformation_mode=where, **attributes)
+
+
+def looking(pads: list[int]) -> Row:
+    """A window that looks further to one side."""
+    return Row().add("Conv", taps("w", 1, 1, 3, 3), pads=pads)
+
+
+def pad(before: int, behind: int) -> onnx.TensorProto:
+    return whole("pads", 0, 0, before, before, 0, 0, behind, behind)
+
+
+def cut(begin: tuple[int, int], end: int, step: int = 1) -> list[onnx.TensorProto]:
+    return [whole("from", *begin), whole("to", end, end), whole("axes", 2, 3), whole("steps", step, step)]
+
+
+FAR = 1 << 62
+EXACT = {
+    "3 x 3": (conv(pads=[1] * 4), Tiling(1)),
+    "5 x 3": (conv(5, 3, pads=[2, 1, 2, 1]), Tiling(2)),
+    "dilated": (conv(pads=[4] * 4, dilations=[4, 4]), Tiling(4)),
+    "one-sided": (conv(pads=[2, 0, 0, 2]), Tiling(2)),
+    "same": (conv(4, 4, auto_pad="SAME_UPPER"), Tiling(2)),
+    "same, strided": (conv(4, 4, auto_pad="SAME_LOWER", strides=[3, 3]), Tiling(3, 3, Fraction(1, 3))),
+    "pool": (one("MaxPool", kernel_shape=[5, 5], pads=[2] * 4), Tiling(2)),
+    "mean": (one("AveragePool", kernel_shape=[3, 3], pads=[1] * 4), Tiling(1)),
+    "gain": (one("Mul", taps("gain", 1, 1, 1)), Tiling(0)),
+    "padded before": (
+        Row().add("Pad", pad(3, 3), mode="edge").add("Conv", taps("w", 1, 1, 7, 7)).model(),
+        Tiling(3),
+    ),
+    "looks ahead, mirrored and moved": (
+        looking([0, 0, 2, 2]).add("Pad", pad(1, 0), mode="reflect").add("Slice", *cut((0, 0), -1)).model(),
+        Tiling(3, least_px=2),  # a mirror needs pixels
+    ),
+    "looks back, copied and moved": (
+        looking([2, 2, 0, 0]).add("Pad", pad(0, 1), mode="edge").add("Slice", *cut((1, 1), FAR)).model(),
+        Tiling(2),
+    ),
+    "strided pool": (one("MaxPool", kernel_shape=[2, 2], strides=[2, 2]), Tiling(0, 2, Fraction(1, 2))),
+    "strided": (conv(pads=[1] * 4, strides=[2, 2]), Tiling(2, 2, Fraction(1, 2))),
+    "odd pool": (one("MaxPool", kernel_shape=[3, 3], strides=[3, 3], ceil_mode=1), Tiling(0, 3, Fraction(1, 3))),
+    "transposed": (transposed(4, 2, pads=[1] * 4), Tiling(1, 1, Fraction(2))),
+    "transposed with gaps": (transposed(2, 3, output_padding=[1, 1]), Tiling(0, 1, Fraction(3))),
+    "shuffle": (Row().add("DepthToSpace", blocksize=2).model((4, 1)), Tiling(0, 1, Fraction(2), 4, 1)),
+    "unshuffle": (Row().add("SpaceToDepth", blocksize=2).model((1, 4)), Tiling(0, 2, Fraction(1, 2), 1, 4)),
+    "nearest": (resized("nearest", "asymmetric", 3, nearest_mode="floor"), Tiling(0, 1, Fraction(3))),
+    "nearest, half": (resized("nearest", "half_pixel", 2), Tiling(0, 1, Fraction(2))),
+    "linear": (resized("linear", "half_pixel", 2), Tiling(1, 1, Fraction(2))),
+    "linear down": (resized("linear", "half_pixel", 0.5), Tiling(0, 2, Fraction(1, 2))),
+    "transposed with a dilation, then windows": (
+        Row()
+        .add("ConvTranspose", taps("far", 1, 1, 2, 2), strides=[2, 2], dilations=[3, 3], pads=[1] * 4)
+        .add("MaxPool", kernel_shape=[2, 2], pads=[0, 0, 1, 1])
+        .model(),
+        Tiling(1, 1, Fraction(2)),
+    ),
+    "every second": (one("Slice", *cut((1, 0), FAR, 2)), Tiling(0, 2, Fraction(1, 2))),
+    "float U-Net": (float_unet(), Tiling(6, 2)),
+    "INT8 U-Net": (int8_unet(), Tiling(8, 4)),
+}
+
+
+@pytest.mark.parametrize("name", EXACT)
+def test_tiled_is_whole_and_no_smaller_halo_does(name: str) -> None:
+    model, tiling = EXACT[name]
+    assert tiling_of(model) == tiling
+    cells = (2, 5) if "U-Net" in name else (1, 3)
+    check_tiles(model, (25, 38), cells)
+    if tiling.halo_px:
+        with pytest.raises(AssertionError, match="Mismatched"):
+            check_tiles(model, (25, 38), cells, short_px=tiling.lattice_px)
+
+
+HEAD = helper.make_node("GlobalAveragePool", ["image"], ["restored"], name="head/pool")
+ELSEWHERE = {
+    "got GlobalAveragePool head/pool, which looks at the whole image": graph([HEAD]),
+    "InstanceNormalization, which looks at the whole image": one(
+        "InstanceNormalization", constant("scale", 1), constant("bias", 1)
+    ),
+    "ReduceMean, which looks at the whole image": one("ReduceMean", axes=[2, 3]),
+    "DynamicQuantizeLinear, which looks at the whole image": graph(
+        [
+            helper.make_node("DynamicQuantizeLinear", ["image"], ["q", "s", "z"]),
+            helper.make_node("DequantizeLinear", ["q", "s", "z"], ["restored"]),
+        ]
+    ),
+    "Flatten, fully connected": one("Flatten"),
+    "Softmax, along other sides than the channels": one("Softmax", axis=3),
+    "Concat, along other sides": one("Concat", "image", axis=2),
+    "Concat, of tensors of unequal sizes": Row()
+    .add("MaxPool", kernel_shape=[2, 2], strides=[2, 2])
+    .add("Concat", "image", axis=1)
+    .model((1, 2)),
+    "Resize, by 1 x 1 x 1.5 x 1.5": resized("nearest", "asymmetric", 1.5),
+    "Resize, by 3, of weights that depend on the place": resized("linear", "half_pixel", 3),
+    "Resize, of coordinates align_corners, which depend on the size": resized("linear", "align_corners", 2),
+    "Resize, to a size that is fixed": one("Resize", "", "", whole("sizes", 1, 1, 40, 40)),
+    "Slice, which cuts at a place that is fixed": one("Slice", *cut((0, 0), 40)),
+    "Add, with a constant that differs from pixel to pixel": one("Add", constant("map", 1, 1, 40, 40)),
+    "Mul, with a constant that differs": one("Mul", constant("ramp", 40)),
+    "MaxPool, which tells places": graph(
+        [
+            helper.make_node("MaxPool", ["image"], ["max", "places"], kernel_shape=[3, 3], pads=[1] * 4),
+            helper.make_node("Cast", ["places"], ["restored"], to=TensorProto.FLOAT),
+        ]
+    ),
+    "MaxPool, of no stride": one("MaxPool", kernel_shape=[2, 2], strides=[-2, -2]),
+    "got -2 pixels a side": conv(),
+    "as many pixels of output along both sides, got 1/2 and 1": one("MaxPool", kernel_shape=[2, 1], strides=[2, 1]),
+    "got a period of 4096": Row()
+    .add("MaxPool", kernel_shape=[2, 2], strides=[64, 64])
+    .add("MaxPool", kernel_shape=[2, 2], strides=[64, 64])
+    .model(),
+}
+
+
+@pytest.mark.parametrize("sentence", ELSEWHERE)
+def test_what_depends_on_the_place_or_the_whole_image_is_refused(sentence: str) -> None:
+    with pytest.raises(ModelError, match=sentence):
+        tiling_of(ELSEWHERE[sentence])
+
+
+def test_constants_in_the_graph_are_followed() -> None:
+    weight = helper.make_node("Constant", [], ["w"], value=constant("w", 1, 1, 7, 7))
+    assert (
+        receptive_radius_px(graph([weight, helper.make_node("Conv", ["image", "w"], ["restored"], pads=[3] * 4)]))
+        == 3
     )
-    return graph([node], scales)
 
 
 def session_of(model: onnx.ModelProto) -> ort.InferenceSession:
@@ -42,166 +177,6 @@ def session_of(model: onnx.ModelProto) -> ort.InferenceSession:
     options.intra_op_num_threads = 1
     options.log_severity_level = 4
     return ort.InferenceSession(model.SerializeToString(), options, providers=["CPUExecutionProvider"])
-
-
-LOCAL = {
-    "3 x 3": (one("Conv", constant("w", 1, 1, 3, 3), pads=[1] * 4), 1),
-    "5 x 3": (one("Conv", constant("w", 1, 1, 5, 3), pads=[2, 1, 2, 1]), 2),
-    "dilated": (one("Conv", constant("w", 1, 1, 3, 3), pads=[4] * 4, dilations=[4, 4]), 4),
-    "one-sided": (one("Conv", constant("w", 1, 1, 3, 3), pads=[2, 0, 0, 2]), 2),
-    "same": (one("Conv", constant("w", 1, 1, 4, 4), auto_pad="SAME_UPPER"), 2),
-    "pool": (one("MaxPool", kernel_shape=[5, 5], pads=[2] * 4), 2),
-    "mean": (one("AveragePool", kernel_shape=[3, 3], pads=[1] * 4), 1),
-    "gain": (one("Mul", constant("gain", 1, 1, 1)), 0),
-    "padded before": (
-        graph(
-            [
-                helper.make_node("Pad", ["image", "pads"], ["wide"], mode="reflect"),
-                helper.make_node("Conv", ["wide", "w"], ["restored"]),
-            ],
-            whole("pads", 0, 0, 3, 3, 0, 0, 3, 3),
-            constant("w", 1, 1, 7, 7),
-        ),
-        3,
-    ),
-}
-
-
-@pytest.mark.parametrize("name", LOCAL)
-def test_no_pixel_depends_on_one_beyond_the_radius(name: str) -> None:
-    model, radius_px = LOCAL[name]
-    assert tiling_of(model) == Tiling(radius_px, least_px=4 if "before" in name else 1)  # a mirror needs pixels
-    image = np.zeros((2, 1, 21, 23), np.float32)
-    image[1, 0, 10, 11] = 9
-    still, moved = session_of(model).run(None, {"image": image})[0][:, 0]
-    rows, columns = np.nonzero(still != moved)
-    assert max(np.abs(rows - 10).max(), np.abs(columns - 11).max()) == radius_px
-
-
-STRIDED = {
-    "pool": (one("MaxPool", kernel_shape=[2, 2], strides=[2, 2]), Tiling(0, 2, Fraction(1, 2))),
-    "conv": (
-        one("Conv", constant("w", 1, 1, 3, 3), pads=[1] * 4, strides=[2, 2]),
-        Tiling(2, 2, Fraction(1, 2)),
-    ),
-    "odd pool": (
-        one("MaxPool", kernel_shape=[3, 3], strides=[3, 3], ceil_mode=1),
-        Tiling(0, 3, Fraction(1, 3)),
-    ),
-    "transposed": (
-        one("ConvTranspose", constant("w", 1, 1, 4, 4), strides=[2, 2], pads=[1] * 4),
-        Tiling(1, 1, Fraction(2)),
-    ),
-    "transposed with gaps": (
-        one("ConvTranspose", constant("w", 1, 1, 2, 2), strides=[3, 3], output_padding=[1, 1]),
-        Tiling(0, 1, Fraction(3)),
-    ),
-    "shuffle": (one("DepthToSpace", blocksize=2, bands=(4, 1)), Tiling(0, 1, Fraction(2), 4, 1)),
-    "unshuffle": (one("SpaceToDepth", blocksize=2, bands=(1, 4)), Tiling(0, 2, Fraction(1, 2), 1, 4)),
-    "nearest": (resized("nearest", "asymmetric", 3, nearest_mode="floor"), Tiling(0, 1, Fraction(3))),
-    "nearest, half": (resized("nearest", "half_pixel", 2), Tiling(0, 1, Fraction(2))),
-    "linear": (resized("linear", "half_pixel", 2), Tiling(1, 1, Fraction(2))),
-    "linear down": (resized("linear", "half_pixel", 0.5), Tiling(0, 2, Fraction(1, 2))),
-    "transposed with a dilation, then windows": (
-        graph(
-            [
-                helper.make_node(
-                    "ConvTranspose", ["image", "far"], ["wide"], strides=[2, 2], dilations=[3, 3], pads=[1] * 4
-                ),
-                helper.make_node("MaxPool", ["wide"], ["restored"], kernel_shape=[2, 2], pads=[0, 0, 1, 1]),
-            ],
-            constant("far", 1, 1, 2, 2),
-        ),
-        Tiling(1, 1, Fraction(2)),
-    ),
-    "every second": (
-        graph(
-            [helper.make_node("Slice", ["image", "from", "to", "axes", "steps"], ["restored"])],
-            whole("from", 1, 0),
-            whole("to", 1 << 62, 1 << 62),
-            whole("axes", 2, 3),
-            whole("steps", 2, 2),
-        ),
-        Tiling(0, 2, Fraction(1, 2)),
-    ),
-}
-
-
-@pytest.mark.parametrize("name", STRIDED)
-def test_strides_and_enlargements_have_a_lattice_and_a_scale(name: str) -> None:
-    model, tiling = STRIDED[name]
-    assert tiling_of(model) == tiling
-    check_tiles(model, (13, 22))
-
-
-ELSEWHERE = {
-    "GlobalAveragePool": one("GlobalAveragePool"),
-    "InstanceNormalization": one("InstanceNormalization", constant("scale", 1), constant("bias", 1)),
-    "Softmax": one("Softmax", axis=3),
-    "ReduceMean": one("ReduceMean", axes=[2, 3]),
-    "Flatten": one("Flatten"),
-    "Resize by one and a half": resized("nearest", "asymmetric", 1.5),
-    "Resize by three, linear": resized("linear", "half_pixel", 3),
-    "Resize of coordinates that depend on the size": resized("linear", "align_corners", 2),
-    "Resize to a fixed size": graph(
-        [helper.make_node("Resize", ["image", "", "", "sizes"], ["restored"])], whole("sizes", 1, 1, 40, 40)
-    ),
-    "Slice at a fixed place": graph(
-        [helper.make_node("Slice", ["image", "from", "to", "axes"], ["restored"])],
-        whole("from", 0),
-        whole("to", 40),
-        whole("axes", 2),
-    ),
-    "DynamicQuantizeLinear": graph(
-        [
-            helper.make_node("DynamicQuantizeLinear", ["image"], ["q", "s", "z"]),
-            helper.make_node("DequantizeLinear", ["q", "s", "z"], ["restored"]),
-        ]
-    ),
-    "Add of a map": one("Add", constant("map", 1, 1, 40, 40)),
-    "Mul along the rows": one("Mul", constant("ramp", 40)),
-    "Concat of rows": graph([helper.make_node("Concat", ["image", "image"], ["restored"], axis=2)]),
-    "Concat of unequal sizes": graph(
-        [
-            helper.make_node("MaxPool", ["image"], ["half"], kernel_shape=[2, 2], strides=[2, 2]),
-            helper.make_node("Concat", ["image", "half"], ["restored"], axis=1),
-        ],
-        bands=(1, 2),
-    ),
-    "MaxPool's places": graph(
-        [
-            helper.make_node("MaxPool", ["image"], ["max", "places"], kernel_shape=[3, 3], pads=[1] * 4),
-            helper.make_node("Cast", ["places"], ["restored"], to=TensorProto.FLOAT),
-        ]
-    ),
-    "-2 pixels a side": one("Conv", constant("w", 1, 1, 3, 3)),
-    "1/2 and 1": one("MaxPool", kernel_shape=[2, 1], strides=[2, 1]),
-    "a period of": graph(
-        [
-            helper.make_node("MaxPool", ["image"], ["small"], kernel_shape=[2, 2], strides=[64, 64]),
-            helper.make_node("MaxPool", ["small"], ["restored"], kernel_shape=[2, 2], strides=[64, 64]),
-        ]
-    ),
-}
-
-
-@pytest.mark.parametrize("name", ELSEWHERE)
-def test_what_depends_on_the_place_or_the_whole_image_is_refused(name: str) -> None:
-    plain = name[0] in "-1a"
-    with pytest.raises(ModelError, match=name if plain else name.split()[0].removesuffix("'s")):
-        tiling_of(ELSEWHERE[name])
-
-
-def test_a_refusal_names_the_node() -> None:
-    node = helper.make_node("GlobalAveragePool", ["image"], ["restored"], name="head/pool")
-    with pytest.raises(ModelError, match="got GlobalAveragePool head/pool, which looks at the whole image"):
-        tiling_of(graph([node]))
-
-
-def test_constants_in_the_graph_are_followed() -> None:
-    weight = helper.make_node("Constant", [], ["w"], value=constant("w", 1, 1, 7, 7))
-    conv = helper.make_node("Conv", ["image", "w"], ["restored"], pads=[3] * 4)
-    assert receptive_radius_px(graph([weight, conv])) == 3
 
 
 def spans(size_px: int, kept_px: int, halo_px: int) -> list[tuple[int, int, int, int]]:
@@ -249,15 +224,3 @@ def check_tiles(
 def test_random_networks_are_tiled_as_a_whole(model: onnx.ModelProto, height: int, width: int) -> None:
     lattice_px = tiling_of(model).lattice_px
     check_tiles(model, (height + 2 * lattice_px, width + lattice_px))
-
-
-UNETS = {"float": (float_unet(), Tiling(6, 2)), "int8": (int8_unet(), Tiling(8, 4))}
-
-
-@pytest.mark.parametrize("name", UNETS)
-def test_unets_are_tiled_as_a_whole_and_no_smaller_halo_does(name: str) -> None:
-    model, tiling = UNETS[name]
-    assert tiling_of(model) == tiling
-    check_tiles(model, (45, 38), (2, 5))
-    with pytest.raises(AssertionError, match="Mismatched"):
-        check_tiles(model, (45, 38), (2, 5), short_px=tiling.lattice_px)
