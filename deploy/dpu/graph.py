@@ -1,7 +1,7 @@
 """A network as the DPU sees it: a short list of operations, whatever encoding its ONNX file is written in."""
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -122,10 +122,6 @@ class Network:
     inputs: Mapping[str, Shape]
     outputs: tuple[str, ...]
     quantised: bool
-
-    def consumers(self, tensor: str) -> Iterator[Operation]:
-        """The operations that read a tensor."""
-        return (op for op in self.operations if tensor in op.inputs)
 
 
 def _pixels(name: str, shape: Shape | None) -> int:
