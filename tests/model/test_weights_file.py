@@ -80,6 +80,9 @@ def test_a_truncated_file_is_refused(tmp_path: Path) -> None:
     [
         {"blocks": 1, "features": 5},
         {"blocks": 2, "features": 4},
+        {"blocks": 10**9, "features": 4},
+        {"blocks": 10**400, "features": 4},
+        {"blocks": 1, "features": 10**6},
         {"blocks": -3, "features": 4},
         {"blocks": 1},
         {"blocks": "many", "features": 4},
@@ -93,7 +96,7 @@ def test_a_truncated_file_is_refused(tmp_path: Path) -> None:
 )
 def test_a_header_that_does_not_fit_the_tensors_is_refused(variant: object, tmp_path: Path) -> None:
     write_tensors(tmp_path / "w.safetensors", arrays(network().state_dict()), {"variant": variant})
-    with pytest.raises(ModelError, match=r"weights of a ConvBEERS|number Infinity") as caught:
+    with pytest.raises(ModelError, match=r"weights of a ConvBEERS|number") as caught:
         load_network(tmp_path / "w.safetensors")
     assert "\n" not in str(caught.value)
 
