@@ -18,10 +18,10 @@ from model.training.grow import grow
 from model.variants import VARIANTS, Variant
 from profiles import load_sensor
 from profiles.errors import ModelError, OptionError
-from profiles.toml import HERE
 from quant.onnx_file import fixed_tile_px, metadata, save_onnx
 from quant.session import open_session, run
 from quant.tiling.walk import tiling_of
+from tests.profiles.own_sensor import own_sensor
 
 
 @pytest.fixture(scope="module")
@@ -152,9 +152,7 @@ def test_another_sensor_makes_another_file_and_the_same_one_the_same_bytes(condi
 
 
 def test_a_users_own_sensor_and_what_lies_outside_the_ranges_is_said(conditioned: Path, tmp_path: Path) -> None:
-    text = (HERE / "sensors" / "pleiades-degraded.toml").read_text()
-    mine = tmp_path / "mine.toml"
-    mine.write_text(text.replace("[noise]", "mtf_nyquist_along = 0.004\n[noise]"))
+    mine = own_sensor(tmp_path, ("[noise]", "mtf_nyquist_along = 0.004\n[noise]"))
     result = export("--checkpoint", str(conditioned), "--sensor", str(mine), "--out", str(tmp_path / "x.onnx"))
     assert result.exit_code == 0, result.output
     assert "warning: mtf_along 0.004 is outside 0.015 to 0.15, the network is told 0.015" in " ".join(

@@ -27,18 +27,11 @@ from model.shipped import INT8, SENSOR, SHIPPED, shipped_names, shipped_weights
 from profiles.errors import ModelError, ProfileError
 from profiles.sensor import numbers_of
 from profiles.sensor_file import BLIND, BLIND_PROFILE, load_sensor
-from profiles.toml import HERE
 from quant.banked import calibrate
 from quant.onnx_file import load_onnx, metadata
+from tests.profiles.own_sensor import own_sensor
 
 KNOWN = load_sensor(SENSOR)
-
-
-def own_sensor(folder: Path, old: str = "", new: str = "", name: str = "mine.toml") -> Path:
-    """The default sensor as a user's own file, a text in it replaced."""
-    path = folder / name
-    path.write_text((HERE / "sensors" / f"{SENSOR}.toml").read_text(encoding="utf-8").replace(old, new))
-    return path
 
 
 def test_a_network_is_written_once_for_a_sensor(conditioned: Path) -> None:
@@ -54,7 +47,7 @@ def test_the_same_numbers_are_the_same_sensor_and_others_are_not(conditioned: Pa
     files = []
     for folder, old, new in (("a", "", ""), ("b", "Raw", "My raw"), ("c", "value = 0.07", "value = 0.08")):
         (tmp_path / folder).mkdir()
-        sensor = load_sensor(str(own_sensor(tmp_path / folder, old, new)))
+        sensor = load_sensor(str(own_sensor(tmp_path / folder, (old, new))))
         files.append(float_file(conditioned, sensor))
     assert files[0] == files[1]
     assert files[2] != files[0]
@@ -71,7 +64,7 @@ def test_int8_is_calibrated_once_and_then_told_any_sensor(
     invoke = CliRunner().invoke
     made = invoke(app, ["quantize", str(conditioned), "--sensor", SENSOR, "--patches", "1", "--out", "base.onnx"])
     assert made.exit_code == 0, made.output
-    base, sensor = load_onnx(Path("base.onnx")), own_sensor(tmp_path, "value = 0.07", "value = 0.05")
+    base, sensor = load_onnx(Path("base.onnx")), own_sensor(tmp_path, ("value = 0.07", "value = 0.05"))
     words = ["export", "--checkpoint", "base.onnx", "--out"]
     mine = [*words, "mine.onnx", "--sensor", str(sensor), "--delta", "mine.delta"]
     assert invoke(app, mine).exit_code == 0
@@ -114,7 +107,7 @@ def test_blind_is_the_middle_of_a_range_of_sensors() -> None:
 
 def test_what_lies_outside_is_said_each_time(conditioned: Path, tmp_path: Path) -> None:
     said = list[str]()
-    sensor = load_sensor(str(own_sensor(tmp_path, "value = 0.07", "value = 0.004")))
+    sensor = load_sensor(str(own_sensor(tmp_path, ("value = 0.07", "value = 0.004"))))
     for _ in range(2):
         float_file(conditioned, sensor, said.append)
     assert len(said) == 4
@@ -133,7 +126,7 @@ def test_restoring_for_a_sensor_needs_no_torch_and_is_what_the_sensor_makes_of_i
     """At once: filters are written without what training needs."""
     dn = np.random.default_rng(0).integers(200, 1800, (37, 41)).astype(np.uint16)
     tifffile.imwrite(tmp_path / "in.tif", dn)
-    sensor = own_sensor(tmp_path, "value = 0.07", "value = 0.05")
+    sensor = own_sensor(tmp_path, ("value = 0.07", "value = 0.05"))
     words = ["restore", str(tmp_path / "in.tif"), "out.tif", "--model", name, "--sensor", str(sensor)]
     call = f"app({words!r}, standalone_mode=False)"
     code = f"import sys; from deploy.cli import app; {call}; print('torch' in sys.modules)"

@@ -18,7 +18,7 @@ from model.training import run as training
 from model.training.patches import StoredPairs
 from model.training.run import Log
 from model.variants import VARIANTS
-from profiles.toml import profile_path
+from tests.profiles.own_sensor import own_sensor
 
 SIDE = 420
 
@@ -178,11 +178,8 @@ def test_pairs_bring_their_sensor_and_its_full_scale(
     images: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Of 14 bits, and of another MTF along the track than across it."""
-    text = profile_path("sensors", "pleiades-degraded").read_text(encoding="utf-8")
-    own = tmp_path / "own.toml"
     along = 'mtf_nyquist_along = { value = 0.05, status = "measured", source = "a test" }'
-    text = text.replace("bits = { value = 12", "bits = { value = 14").replace("[mtf]", f"[mtf]\n{along}")
-    own.write_text(text, encoding="utf-8")
+    own = own_sensor(tmp_path, ("bits = { value = 12", "bits = { value = 14"), ("[mtf]", f"[mtf]\n{along}"))
     scene = next(images.glob("*.png"))
     simulated = CliRunner().invoke(
         app, ["simulate", str(scene), "--sensor", str(own), "--out", str(tmp_path / "pairs"), "--workers", "1"]
@@ -204,7 +201,7 @@ def test_pairs_bring_their_sensor_and_its_full_scale(
     monkeypatch.setattr(training, "StoredPairs", kept)
     result = CliRunner().invoke(app, ["train", *options])
     assert result.exit_code == 0, result.output
-    assert load_network(tmp_path / "r" / "convbeers-xs.safetensors")[1]["degraded"] == "own"
+    assert load_network(tmp_path / "r" / "convbeers-xs.safetensors")[1]["degraded"] == "mine"
     assert (made[0].max_dn, made[0].quarters) == (16383, False)
 
 

@@ -53,6 +53,7 @@ from tests.fuzz.networks import (
     weights_seeds,
 )
 from tests.fuzz.pictures import gdal_seeds, image_of, read_rows, read_with_tiles, tiff_seeds, written
+from tests.profiles.own_sensor import SHIPPED
 
 ROOT = Path(__file__).parents[2]
 JOB: dict[str, object] = {"image": [1, "a", 2], "model": "b", "tile_px": 64, "halo_px": 4, "full_scale": 4095.0}
@@ -86,8 +87,7 @@ def _files(folder: str) -> list[bytes]:
 
 def described_seeds(_: Path) -> list[bytes]:
     """A sensor with a tabulated MTF, alpha and beta."""
-    text = (ROOT / "profiles" / "sensors" / "pleiades-degraded.toml").read_text(encoding="utf-8")
-    head, rest = text.split("[mtf]")
+    head, rest = SHIPPED.split("[mtf]")
     mtf = "frequency = [0, 0.25, 0.5]\nacross = [1, 0.5, 0.12]\nalong = [1, 0.4, 0.1]"
     noise = "alpha = 0.01\nbeta = [0.1, 0.2]"
     return [f"{head}[mtf]\n{mtf}\n\n[noise]\n{noise}\n\n[digitiser]{rest.split('[digitiser]')[1]}".encode()]

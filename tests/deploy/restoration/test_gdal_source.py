@@ -57,11 +57,12 @@ def test_the_place_on_earth_is_kept(name: str, model: Path, tmp_path: Path) -> N
         assert after.crs == before.crs == rasterio.CRS.from_epsg(32631)
 
 
-def test_polynomials_bits_and_gains_of_a_dimap_are_kept(model: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize("cog", [False, True])
+def test_polynomials_bits_and_gains_of_a_dimap_are_kept(cog: bool, model: Path, tmp_path: Path) -> None:
     image = images.write_dimap(tmp_path / "DIM.XML", images.digital_numbers(10), bits=10)
     with open_source(image) as source:
         assert source.raster.bits == 10
-    restore_file(image, tmp_path / "out.tif", Options(model), lambda _: None)
+    restore_file(image, tmp_path / "out.tif", Options(model, cog=cog), lambda _: None)
     with rasterio.open(image) as before, rasterio.open(tmp_path / "out.tif") as after:
         kept, stated = after.rpcs.to_dict(), before.rpcs.to_dict()
         for key in stated.keys() - {"err_bias", "err_rand"}:
