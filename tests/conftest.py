@@ -19,7 +19,7 @@ from hypothesis import settings
 settings.register_profile("project", deadline=None)
 settings.load_profile("project")
 
-typer.testing._get_command = cache(typer.main.get_command)  # type: ignore[attr-defined]
+typer.main.get_command = typer.testing._get_command = cache(typer.main.get_command)  # type: ignore[attr-defined]
 
 SHARED_DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 

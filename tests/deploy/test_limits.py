@@ -7,7 +7,8 @@ import pytest
 from typer.testing import CliRunner
 
 from deploy.bench.tables import MOST_TILE_PX, parse_tiles
-from deploy.cli import app
+from deploy.cli import COMMANDS, app
+from docs.make.options import parameters
 from model.processor import require_cores
 from profiles.errors import OptionError
 
@@ -41,25 +42,10 @@ def test_a_command_says_how_many(command: list[str], tmp_path: Path, monkeypatch
     assert [path.name for path in tmp_path.iterdir()] == ["raw.tif"]
 
 
-@pytest.mark.parametrize(
-    ("command", "option"),
-    [
-        ("check", "--tile"),
-        ("export", "--tile"),
-        ("gate", "--patches"),
-        ("gate", "--seed"),
-        ("quantize", "--patch"),
-        ("quantize", "--patches"),
-        ("simulate", "--oversampling"),
-        ("simulate", "--patch"),
-        ("stress", "--draws"),
-        ("stress", "--size"),
-        ("train", "--batch"),
-        ("train", "--drawn"),
-        ("train", "--patch"),
-        ("train", "--seed"),
-    ],
-)
+BOUNDED = [(name, each.label) for name in COMMANDS for each in parameters(name) if each.hint is int and each.info.max]
+
+
+@pytest.mark.parametrize(("command", "option"), BOUNDED)
 def test_a_huge_number_is_refused_at_once(command: str, option: str) -> None:
     done = CliRunner().invoke(app, [command, option, HUGE])
     assert done.exit_code == 2
