@@ -11,6 +11,7 @@ from model.simulator.procedural import procedural_scene
 from model.variants import Variant
 from profiles import load_sensor
 from quant.calibration import Patches, draw_patches
+from quant.graph import Graph, correction_graph, read_planes
 from quant.quantise import Quantised, quantise_model
 
 
@@ -31,18 +32,25 @@ def float_onnx(network: ConvBEERS) -> onnx.ModelProto:
 
 
 @pytest.fixture(scope="session")
+def graph(float_onnx: onnx.ModelProto) -> Graph:
+    return read_planes(correction_graph(float_onnx))
+
+
+def drawn(scene: int, seed: int) -> Patches:
+    ground = procedural_scene(900, 960, np.random.default_rng(scene))
+    sensors = load_sensor("pleiades-degraded"), load_sensor("pleiades-reference")
+    return draw_patches([ground], *sensors, count=6, seed=seed, patch_px=80)
+
+
+@pytest.fixture(scope="session")
 def patches() -> Patches:
-    scene = procedural_scene(900, 960, np.random.default_rng(1))
-    return draw_patches([scene], load_sensor("pleiades-degraded"), load_sensor("pleiades-reference"), count=6, seed=5)
+    return drawn(1, 5)
 
 
 @pytest.fixture(scope="session")
 def unseen() -> Patches:
     """Of another scene than calibration's."""
-    scene = procedural_scene(900, 960, np.random.default_rng(77))
-    return draw_patches(
-        [scene], load_sensor("pleiades-degraded"), load_sensor("pleiades-reference"), count=6, seed=78
-    )
+    return drawn(77, 78)
 
 
 @pytest.fixture(scope="session")

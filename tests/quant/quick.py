@@ -1,15 +1,42 @@
-"""Quantising in a moment: one guess in the place of the search that equalises channels."""
+"""What tests of quantising begin with: an image, patches of images, a copy to be spoilt, a search in a moment."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 from unittest.mock import patch
 
+import numpy as np
 import onnx
 
-from quant.calibration import Patches
+from quant.calibration import Patches, Remade
 from quant.quantise import Quantised, quantise_model
 
 
-def quickly(model: onnx.ModelProto, patches: Patches) -> Quantised:
+def image(height: int = 37, width: int = 53, seed: int = 0) -> np.ndarray:
+    """Noise of digital numbers of 12 bits, (1, 1, height, width) float32 in [0, 1]."""
+    dn = np.random.default_rng(seed).integers(0, 4096, (1, 1, height, width))
+    return dn.astype(np.float32) / np.float32(4095)
+
+
+def patches_of(seen: list[np.ndarray]) -> Patches:
+    """These images, each its own reference."""
+    return Patches([], Remade(lambda k: (seen[k], seen[k]), len(seen)), Remade(lambda k: seen[k], len(seen)))
+
+
+def copied(model: onnx.ModelProto) -> onnx.ModelProto:
+    copy = onnx.ModelProto()
+    copy.CopyFrom(model)
+    return copy
+
+
+@contextmanager
+def one_guess() -> Iterator[None]:
+    """One guess in the place of the search that equalises channels."""
     guess: dict[str, Any] = {"LEVELLING": (0.5,), "HEADROOM": (1.0,)}
     with patch.multiple("quant.passes.equalise", STEPS=(), **guess), patch.multiple("quant.passes.level", **guess):
-        return quantise_model(model, patches, {})
+        yield
+
+
+def quickly(model: onnx.ModelProto, patches: Patches, **more: Any) -> Quantised:
+    with one_guess():
+        return quantise_model(model, patches, {}, **more)

@@ -3,7 +3,6 @@
 from pathlib import Path
 
 import numpy as np
-import onnx
 import pytest
 from onnx import numpy_helper
 
@@ -13,6 +12,7 @@ from quant.graph import split
 from quant.integer import agreement, merged_correction, run_core
 from quant.onnx_file import load_onnx
 from quant.quantise import Quantised
+from tests.quant.quick import copied
 
 IMAGE = np.random.default_rng(4).random((2, 1, 35, 41), dtype=np.float32)
 
@@ -34,8 +34,7 @@ def test_every_layer_of_a_shipped_file_is_equal(path: Path) -> None:
 
 
 def test_a_layer_that_computes_something_else_is_found(quantised: Quantised) -> None:
-    spoilt = onnx.ModelProto()
-    spoilt.CopyFrom(quantised.host)
+    spoilt = copied(quantised.host)
     bias = next(t for t in spoilt.graph.initializer if t.name == "body.0.second.bias")
     bias.CopyFrom(numpy_helper.from_array(numpy_helper.to_array(bias) * 2 + 900, bias.name))
     layers = agreement(quantised.core, spoilt, IMAGE).layers
