@@ -107,15 +107,6 @@ def test_a_picture_is_drawn(tmp_path: Path) -> None:
         run(model, "--picture", str(tmp_path / "g.jpg"))
 
 
-@pytest.mark.slow
-def test_the_page_of_operators_is_fresh() -> None:
-    root = Path(__file__).resolve().parents[2]
-    code = "import sys; from docs.make.operators import document; sys.stdout.write(document())"
-    done = subprocess.run([sys.executable, "-c", code], cwd=root, capture_output=True, text=True, check=True)
-    page = (root / "docs" / "reference" / "operators.md").read_text()
-    assert done.stdout == page, "run python docs/make/operators.py"
-
-
 def test_of_a_float_file_check_says_what_quantize_would(tmp_path: Path) -> None:
     """Both give the same reason, so that nobody passes one to be refused by the other."""
     taken, refused = float_convbeers(tmp_path / "taken.onnx", 1, 8), tmp_path / "refused.onnx"

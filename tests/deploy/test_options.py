@@ -7,7 +7,7 @@ import pytest
 from typer.testing import CliRunner
 
 from deploy.cli import COMMANDS, app
-from docs.make.options import PATHS, REFUSED, TARGET, UNITS, WORDS, Parameter, Refused, page, parameters
+from docs.make.options import PATHS, REFUSED, UNITS, WORDS, Parameter, Refused, parameters
 
 CASES = [(name, option, case) for name, cases in REFUSED.items() for case in cases for option in case.options]
 GIVEN = {
@@ -22,10 +22,6 @@ GIVEN = {
     "variant": "convbeers-xs",
 }
 """Of texts, where any other would be refused for itself."""
-
-
-def test_the_audit_is_fresh() -> None:
-    assert TARGET.read_text(encoding="utf-8") == page(), "run python docs/make/options.py"
 
 
 @pytest.mark.parametrize("name", COMMANDS)

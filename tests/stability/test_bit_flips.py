@@ -3,7 +3,6 @@
 import json
 from itertools import pairwise
 from pathlib import Path
-from types import ModuleType
 from xml.etree import ElementTree as ET
 
 import numpy as np
@@ -31,11 +30,11 @@ from deploy.studies.stress.bit_flips import (
 )
 from deploy.studies.stress.faults import Guards, as_stored, checksums, map_channels
 from deploy.studies.stress.networks import Subject, open_subject
+from docs.make import bit_flips as maker
 from profiles.figures import Row
 from quant.core import IntConv
 from quant.graph import Activation
 from quant.integer import SOUND
-from tests.stability.makers import DOCS, load_maker
 
 pytestmark = pytest.mark.slow
 
@@ -155,14 +154,9 @@ def test_wrong_arguments(
     assert said in result.output
 
 
-@pytest.fixture(scope="module")
-def maker() -> ModuleType:
-    return load_maker("bit_flips")
-
-
-def test_the_page_is_fresh(maker: ModuleType) -> None:
+def test_the_page_is_fresh() -> None:
     """Prices need no injections; the measured rows are counted."""
-    page = (DOCS / "explanation" / "bit-flips.md").read_text(encoding="utf-8")
+    page = (maker.DOCS / "explanation" / "bit-flips.md").read_text(encoding="utf-8")
     assert page.startswith(maker.OPENING + maker.FINDINGS)
     dpu = load_dpu("vck190", None)
     for variant in maker.VARIANTS:
