@@ -37,3 +37,16 @@ def shared_data() -> Path:
     if not SHARED_DATA.is_dir():
         pytest.skip("no folder shared/data beside the repository: no real images to test on")
     return SHARED_DATA
+
+
+@pytest.fixture(scope="session")
+def scenes(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with one small drawn scene: to draw those that a command takes of itself is most of its time."""
+    import numpy as np
+    import tifffile
+
+    from model.simulator.procedural import procedural_scene
+
+    folder = tmp_path_factory.mktemp("scenes")
+    tifffile.imwrite(folder / "drawn.tif", procedural_scene(900, 900, np.random.default_rng(77)).radiance.numpy())
+    return folder

@@ -10,7 +10,6 @@ from xml.etree import ElementTree as ET
 import onnx
 import pytest
 import torch
-from onnx import numpy_helper
 from typer.testing import CliRunner
 
 from deploy.cli import app
@@ -21,6 +20,7 @@ from model.shipped import SENSOR
 from model.variants import Variant
 from quant.onnx_file import save_onnx
 from tests.deploy.workflow_steps import ACTION, BASH, KEPT, ROOT, Runner, read_yaml
+from tests.quant.quick import changed
 
 WORKFLOW = ROOT / ".github" / "workflows" / "int8-gate.yml"
 OURS = "Train a small network"
@@ -40,9 +40,7 @@ def networks(tmp_path_factory: pytest.TempPathFactory) -> Path:
     shutil.copy(shipped_pair("convbeers-xs")[1], folder / "int8.onnx")
     model = onnx.load(folder / "int8.onnx")
     name = next(node.input[8] for node in model.graph.node if node.op_type == "QLinearConv")
-    bias = next(tensor for tensor in model.graph.initializer if tensor.name == name)
-    bias.CopyFrom(numpy_helper.from_array(2 * numpy_helper.to_array(bias), name))
-    onnx.save(model, folder / "broken.onnx")
+    onnx.save(changed(model, name, lambda bias: 2 * bias), folder / "broken.onnx")
     plain = ConvBEERS(Variant(blocks=1, features=8))
     initialise(plain, torch.Generator().manual_seed(0))
     save_onnx(to_onnx(plain, {}), folder / "plain" / "float.onnx")

@@ -31,6 +31,7 @@ from quant.gate import Limits, compare, judge, judge_saturation, read_limits
 from quant.onnx_file import image_info, load_onnx, save_onnx
 from quant.session import open_session
 from quant.structure import Relus, count_relus, rounded_tensors, saturated_shares
+from tests.quant.quick import change, changed, one_guess
 
 Spoil = Callable[[onnx.ModelProto], None]
 
@@ -44,7 +45,7 @@ def reference_model() -> onnx.ModelProto:
 
 @pytest.fixture(scope="module")
 def unseen() -> Patches:
-    return draw_patches([procedural_scene(900, 900, np.random.default_rng(77))], *SENSORS, 4, 7)
+    return draw_patches([procedural_scene(900, 900, np.random.default_rng(77))], *SENSORS, 2, 7)
 
 
 def failed(reference_model: onnx.ModelProto, unseen: Patches, folder: Path, spoil: Spoil) -> set[str]:
@@ -59,12 +60,6 @@ def failed(reference_model: onnx.ModelProto, unseen: Patches, folder: Path, spoi
     return {check.name for check in checks if not check.passed}
 
 
-def constant(model: onnx.ModelProto, name: str, change: Callable[[np.ndarray], np.ndarray]) -> None:
-    tensor = next(t for t in model.graph.initializer if t.name == name)
-    value = numpy_helper.to_array(tensor)
-    tensor.CopyFrom(numpy_helper.from_array(change(value).astype(value.dtype), name))
-
-
 def node(model: onnx.ModelProto, name: str) -> onnx.NodeProto:
     found: onnx.NodeProto = next(n for n in model.graph.node if n.name == name)
     return found
@@ -73,10 +68,6 @@ def node(model: onnx.ModelProto, name: str) -> onnx.NodeProto:
 def own_constant(model: onnx.ModelProto, name: str, value: np.ndarray) -> str:
     model.graph.initializer.append(numpy_helper.from_array(value, name))
     return name
-
-
-def nothing(_model: onnx.ModelProto) -> None:
-    """Leave the file as it is."""
 
 
 def drop_a_relu(model: onnx.ModelProto) -> None:
@@ -101,11 +92,11 @@ def clip_an_activation(model: onnx.ModelProto) -> None:
 
 
 def shift_a_bias(model: onnx.ModelProto) -> None:
-    constant(model, "body.2.first.bias", lambda bias: bias * 4)
+    change(model, "body.2.first.bias", lambda bias: bias * 4)
 
 
 def swap_the_planes(model: onnx.ModelProto) -> None:
-    constant(model, "bank.weight", lambda weight: weight[:, [0, 2, 1, 3]])
+    change(model, "bank.weight", lambda weight: weight[:, [0, 2, 1, 3]])
 
 
 def raise_a_floor(model: onnx.ModelProto) -> None:
@@ -113,7 +104,7 @@ def raise_a_floor(model: onnx.ModelProto) -> None:
 
 
 def change_the_host(name: str, value: float) -> Spoil:
-    return lambda model: constant(model, name, lambda _: np.array(value))
+    return lambda model: change(model, name, lambda _: np.array(value))
 
 
 def read_at_another_scale(model: onnx.ModelProto) -> None:
@@ -122,35 +113,29 @@ def read_at_another_scale(model: onnx.ModelProto) -> None:
 
 
 def test_the_shipped_file_passes(reference_model: onnx.ModelProto, unseen: Patches, tmp_path: Path) -> None:
-    assert failed(reference_model, unseen, tmp_path, nothing) == set()
+    assert failed(reference_model, unseen, tmp_path, lambda _: None) == set()
 
 
 @pytest.mark.parametrize(
-    ("spoil", "check"),
+    ("spoil", "checks"),
     [
-        (drop_a_relu, "ReLUs lost or added"),
-        (give_a_float_scale, "faults of the encoding"),
-        (clip_an_activation, "MAE"),
-        (clip_an_activation, "saturated results"),
-        (shift_a_bias, "MAE"),
-        (swap_the_planes, "MAE"),
+        (drop_a_relu, {"ReLUs lost or added"}),
+        (give_a_float_scale, {"faults of the encoding"}),
+        (clip_an_activation, {"MAE", "saturated results"}),
+        (shift_a_bias, {"MAE"}),
+        (swap_the_planes, {"MAE"}),
         # What hardly shows in pixels is seen in the file.
-        (raise_a_floor, "ReLUs lost or added"),
-        (raise_a_floor, "faults of the encoding"),
-        (read_at_another_scale, "faults of the encoding"),
-        (change_the_host("gain", 4), "faults of the encoding"),
-        (change_the_host("max_dn", 4096), "faults of the encoding"),
-        (change_the_host("fine_max", 0.25), "faults of the encoding"),
+        (raise_a_floor, {"ReLUs lost or added", "faults of the encoding"}),
+        (read_at_another_scale, {"faults of the encoding"}),
+        (change_the_host("gain", 4), {"faults of the encoding"}),
+        (change_the_host("max_dn", 4096), {"faults of the encoding"}),
+        (change_the_host("fine_max", 0.25), {"faults of the encoding"}),
     ],
 )
 def test_a_spoilt_file_is_stopped(
-    spoil: Spoil,
-    check: str,
-    reference_model: onnx.ModelProto,
-    unseen: Patches,
-    tmp_path: Path,
+    spoil: Spoil, checks: set[str], reference_model: onnx.ModelProto, unseen: Patches, tmp_path: Path
 ) -> None:
-    assert check in failed(reference_model, unseen, tmp_path, spoil)
+    assert checks <= failed(reference_model, unseen, tmp_path, spoil)
 
 
 def test_limits_come_from_a_file(tmp_path: Path) -> None:
@@ -258,21 +243,20 @@ ROOT = Path(__file__).resolve().parents[2]
 ASKED = {"sensor": "pleiades-degraded", "images": None, "patches": 2, "seed": 0}
 
 
-def test_a_baseline_holds_the_mae(tmp_path: Path) -> None:
-    runner, first = CliRunner(), tmp_path / "first.json"
-    done = runner.invoke(app, ["gate", "--patches", "2", "--json", str(first), "--junit", str(tmp_path / "j.xml")])
+def test_a_baseline_holds_the_mae(scenes: Path, tmp_path: Path) -> None:
+    runner, first, second = CliRunner(), tmp_path / "first.json", tmp_path / "again.json"
+    command = ["gate", "--images", str(scenes), "--patches", "2"]
+    done = runner.invoke(app, [*command, "--json", str(first), "--junit", str(tmp_path / "j.xml")])
     assert done.exit_code == 0, done.output
     assert json.loads(first.read_text())["verdict"] == "passed"
-    before = baseline_mae(first, ASKED)
+    before = baseline_mae(first, {**ASKED, "images": scenes})
     assert ET.parse(tmp_path / "j.xml").getroot().get("failures") == "0"  # noqa: S314
     first.write_text(first.read_text().replace(str(before), str(before / 2)))
-    again = runner.invoke(
-        app, ["gate", "--patches", "2", "--baseline", str(first), "--json", str(tmp_path / "again.json")]
-    )
+    again = runner.invoke(app, [*command, "--baseline", str(first), "--json", str(second)])
     assert again.exit_code == 1
     last = again.output.splitlines()[-1]
     assert last.startswith(f"gate FAILED, 1 of 6 checks: MAE against the baseline {before:.4g} of full scale")
-    only_the_baseline_fails(json.loads((tmp_path / "again.json").read_text()), before)
+    only_the_baseline_fails(json.loads(second.read_text()), before)
 
 
 def only_the_baseline_fails(document: Any, mae: float) -> None:
@@ -325,9 +309,7 @@ def test_a_baseline_shows_a_wrong_bias_in_any_layer(fault: str, unseen: Patches)
     names = [name for name in found if name not in ("bank.bias", "analytic.bias")]
     assert len(names) == 11
     for name in names:
-        model = onnx.ModelProto()
-        model.CopyFrom(sound)
-        constant(model, name, lambda bias: bias * (2 if fault == "twice the bias" else 0))
+        model = changed(sound, name, lambda bias: bias * (2 if fault == "twice the bias" else 0))
         checks = judge(compare(session, open_session(model), unseen.pairs), Limits(), before)
         assert not all(check.passed for check in checks), name
 
@@ -369,7 +351,8 @@ def test_results_that_are_never_below_zero_need_no_relu() -> None:
 
 def test_a_free_file_is_judged_without_the_rules_of_a_dpu(model: Path, unseen: Patches, tmp_path: Path) -> None:
     path, reference_model = tmp_path / "free.onnx", load_onnx(model)
-    save_onnx(quantise_free(reference_model, unseen, {}), path)
+    with one_guess():
+        save_onnx(quantise_free(reference_model, unseen, {}), path)
     checks = file_checks(reference_model, path, onnx.load(path), "host-cpu")
     assert [(c.name, c.passed) for c in checks] == [
         ("ReLUs lost or added", True),

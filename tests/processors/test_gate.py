@@ -2,25 +2,13 @@
 
 from pathlib import Path
 
-import numpy as np
 import pytest
-import tifffile
 from onnx import numpy_helper
 from typer.testing import CliRunner
 
 from deploy.cli import app
 from deploy.networks import shipped_pair
-from model.simulator.procedural import procedural_scene
 from quant.onnx_file import load_onnx, save_onnx
-
-
-@pytest.fixture(scope="module")
-def scenes(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with one small drawn scene: to draw the gate's own takes most of its time."""
-    folder = tmp_path_factory.mktemp("scenes")
-    radiance = procedural_scene(900, 900, np.random.default_rng(77)).radiance.numpy()
-    tifffile.imwrite(folder / "drawn.tif", radiance)
-    return folder
 
 
 def gate(scenes: Path, *pair: str) -> tuple[int, str]:

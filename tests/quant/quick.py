@@ -1,12 +1,14 @@
 """What tests of quantising begin with: an image, patches of images, a copy to be spoilt, a search in a moment."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 from unittest.mock import patch
 
 import numpy as np
 import onnx
+from onnx import numpy_helper
+from onnxruntime.quantization import CalibrationDataReader
 
 from quant.calibration import Patches, Remade
 from quant.quantise import Quantised, quantise_model
@@ -29,6 +31,20 @@ def copied(model: onnx.ModelProto) -> onnx.ModelProto:
     return copy
 
 
+def change(model: onnx.ModelProto, name: str, by: Callable[[np.ndarray], np.ndarray]) -> None:
+    """Give a weight or a bias another value of its own type."""
+    tensor = next(t for t in model.graph.initializer if t.name == name)
+    value = numpy_helper.to_array(tensor)
+    tensor.CopyFrom(numpy_helper.from_array(np.asarray(by(value.copy()), value.dtype), name))
+
+
+def changed(model: onnx.ModelProto, name: str, by: Callable[[np.ndarray], np.ndarray]) -> onnx.ModelProto:
+    """A copy with one weight or bias changed."""
+    copy = copied(model)
+    change(copy, name, by)
+    return copy
+
+
 @contextmanager
 def one_guess() -> Iterator[None]:
     """One guess in the place of the search that equalises channels."""
@@ -40,3 +56,13 @@ def one_guess() -> Iterator[None]:
 def quickly(model: onnx.ModelProto, patches: Patches, **more: Any) -> Quantised:
     with one_guess():
         return quantise_model(model, patches, {}, **more)
+
+
+class Calibration(CalibrationDataReader):  # type: ignore[misc]  # onnxruntime has no types
+    """Images for somebody else's quantiser."""
+
+    def __init__(self, images: list[np.ndarray]) -> None:
+        self._images = iter(images)
+
+    def get_next(self) -> dict[str, np.ndarray] | None:
+        return next(({"image": image} for image in self._images), None)

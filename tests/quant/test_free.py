@@ -32,7 +32,7 @@ from quant.passes.equalise import channel_ranges, equalise, first_guess
 from quant.passes.stream import OFFSETS, half_lsb_pair, streams, two_gains
 from quant.quantise import Quantised
 from quant.session import open_session, planes_of, run
-from tests.quant.quick import copied, image, one_guess
+from tests.quant.quick import changed, copied, image, one_guess
 from tests.quant.tiling.small_networks import half_resolution
 
 SIZES = [(37, 53), (16, 91), (5, 3)]
@@ -127,10 +127,7 @@ def test_free_scales_lose_less_than_legal_ones_on_patches_not_seen(
 
 
 def test_a_wrong_scale_loses_more(float_onnx: onnx.ModelProto, free: onnx.ModelProto, unseen: Patches) -> None:
-    broken = copied(free)
-    for tensor in broken.graph.initializer:
-        if tensor.name == "head.weight_scale":
-            tensor.CopyFrom(numpy_helper.from_array(numpy_helper.to_array(tensor) * np.float32(1.1), tensor.name))
+    broken = changed(free, "head.weight_scale", lambda scale: scale * np.float32(1.1))
     sound, worse = (compare(open_session(float_onnx), open_session(m), unseen.pairs) for m in (free, broken))
     assert worse.mae > 1.3 * sound.mae
 

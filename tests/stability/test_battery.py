@@ -8,7 +8,6 @@ import numpy as np
 import onnx
 import pytest
 from jsonschema import validate
-from onnx import numpy_helper
 from typer.testing import CliRunner
 
 from deploy.cli import app
@@ -20,6 +19,7 @@ from deploy.studies.stress.networks import STAGES, Subject, open_subject, restor
 from profiles.errors import ModelError
 from quant.onnx_file import save_onnx
 from quant.tiling.walk import Tiling
+from tests.quant.quick import changed
 
 BY_NAME = {case.name: case for case in CASES}
 SIDE_PX = 32
@@ -68,15 +68,6 @@ def shipped() -> Subject:
     return open_subject(None, None, "convbeers-xs")
 
 
-def spoilt(model: onnx.ModelProto, name: str, change: Callable[[np.ndarray], np.ndarray]) -> onnx.ModelProto:
-    copy = onnx.ModelProto()
-    copy.CopyFrom(model)
-    tensor = next(t for t in copy.graph.initializer if t.name == name)
-    value = numpy_helper.to_array(tensor)
-    tensor.CopyFrom(numpy_helper.from_array(np.asarray(change(value.copy()), value.dtype), name))
-    return copy
-
-
 def one_nan(weight: np.ndarray) -> np.ndarray:
     weight.ravel()[4] = np.nan
     return weight
@@ -100,19 +91,19 @@ def test_a_broken_float_network_fails(
     float_onnx: onnx.ModelProto,
     tmp_path: Path,
 ) -> None:
-    save_onnx(spoilt(float_onnx, name, change), tmp_path / "broken.onnx")
+    save_onnx(changed(float_onnx, name, change), tmp_path / "broken.onnx")
     (result,) = look(open_subject(tmp_path / "broken.onnx", None, ""), [case], ("float32",))
     assert any(measure.check.startswith(check) for measure in result.failed), result.verdict
 
 
 def test_a_network_with_a_nan_among_its_weights_is_not_opened(float_onnx: onnx.ModelProto, tmp_path: Path) -> None:
-    save_onnx(spoilt(float_onnx, "body.0.second.weight", one_nan), tmp_path / "broken.onnx")
+    save_onnx(changed(float_onnx, "body.0.second.weight", one_nan), tmp_path / "broken.onnx")
     with pytest.raises(ModelError, match=r"1 NaN or infinite in body\.0\.second\.weight"):
         open_subject(tmp_path / "broken.onnx", None, "")
 
 
 def test_a_broken_int8_network_fails(pair: list[Path], tmp_path: Path) -> None:
-    broken = spoilt(onnx.load(pair[1]), "tail.bias", lambda bias: bias + 10_000_000)
+    broken = changed(onnx.load(pair[1]), "tail.bias", lambda bias: bias + 10_000_000)
     save_onnx(broken, tmp_path / "broken.onnx")
     results = look(open_subject(pair[0], tmp_path / "broken.onnx", ""), ["deciles"], ("INT8",))
     assert {"mean moved"} <= {measure.check for measure in results[0].failed}
@@ -175,7 +166,7 @@ def test_the_command_writes_its_figures_and_fails_by_exit_code(pair: list[Path],
     tables = {row["table"] for row in document["rows"]}
     assert {"battery", "worst", "integer layers", "findings"} <= tables
     assert "## Integer layers" in (tmp_path / "s.md").read_text()
-    broken = spoilt(onnx.load(pair[0]), "tail.weight", lambda weight: 3000 * weight)
+    broken = changed(onnx.load(pair[0]), "tail.weight", lambda weight: 3000 * weight)
     save_onnx(broken, tmp_path / "broken.onnx")
     failed = CliRunner().invoke(app, ["stress", str(tmp_path / "broken.onnx"), *few])
     assert failed.exit_code == 1

@@ -27,6 +27,7 @@ from profiles import load_sensor
 from quant.calibration import draw_patches
 from quant.quantise import Quantised, quantise_model
 from tests.deploy.dpu.graphs import IntegerSketch
+from tests.quant.quick import changed, copied
 
 DPU = load_dpu("vck190")
 HALF = Scale((0.5,), (0,), "int8")
@@ -53,9 +54,7 @@ def quantised(spread: float) -> Quantised:
 
 def own_file() -> onnx.ModelProto:
     """The host's, to be spoilt."""
-    model = onnx.ModelProto()
-    model.CopyFrom(quantised(0.1).host)
-    return model
+    return copied(quantised(0.1).host)
 
 
 def kept(values: list[int]) -> bool:
@@ -115,9 +114,7 @@ def test_a_bias_with_one_more_on_a_value_is_refused() -> None:
     shifted = [name for name in named if not (values[name] % 2).any()]
     assert len(shifted) > len(named) // 2
     for name in shifted:
-        model, more = own_file(), values[name].copy()
-        more[0] += 1
-        next(t for t in model.graph.initializer if t.name == name).CopyFrom(numpy_helper.from_array(more, name))
+        model = changed(own_file(), name, lambda bias: bias + (np.arange(len(bias)) == 0))
         assert rules(model) == {"int32 bias"}, name
 
 

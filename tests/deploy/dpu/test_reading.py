@@ -3,7 +3,6 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
-import onnx
 import pytest
 from onnx import numpy_helper
 
@@ -15,6 +14,7 @@ from profiles.errors import ModelError
 from quant.encodings import PLACE_PX, board_model
 from quant.onnx_file import save_onnx
 from tests.deploy.dpu.graphs import Sketch, board_convbeers, float_convbeers, integer_convbeers
+from tests.quant.quick import copied
 from tests.quant.tiling.small_networks import quantised_half_resolution
 
 
@@ -153,8 +153,7 @@ def test_a_core_at_half_resolution_that_is_fixed_to_a_tile_is_fixed_to_half_of_i
 
 @pytest.mark.parametrize("said", ["0", "-2", "half", "1000000"])
 def test_places_that_cannot_be_are_refused(said: str, tmp_path: Path) -> None:
-    model = onnx.ModelProto()
-    model.CopyFrom(quantised_half_resolution().board)
+    model = copied(quantised_half_resolution().board)
     next(each for each in model.metadata_props if each.key == PLACE_PX).value = said
     save_onnx(model, tmp_path / "half.onnx")
     with pytest.raises(ModelError, match="contradict"):

@@ -58,12 +58,12 @@ def test_it_is_valid_and_holds_the_same(compression: Compression, model: Path, t
 
 
 def test_it_says_what_was_done(tmp_path: Path) -> None:
-    int8 = shipped_pair()[1]
+    int8 = shipped_pair("convbeers-xs")[1]
     _, cog = both(tmp_path, images.digital_numbers(), Options(int8, tile_px=64))
     with rasterio.open(cog) as file:
         said = file.tags()
     assert said["RESTORED_NETWORK_SHA256"] == sha256(int8)
-    assert said["RESTORED_NETWORK"] == "convbeers-s"
+    assert said["RESTORED_NETWORK"] == "convbeers-xs"
     assert said["RESTORED_SENSOR"] == "pleiades-degraded"
     assert said["RESTORED_FULL_SCALE"] == "4095 (assumed: 12 bits)"
     assert said["RESTORED_BY"].startswith("beers-deploy ")
