@@ -9,17 +9,16 @@ from xml.etree import ElementTree as ET
 
 import onnx
 import pytest
-import torch
 from typer.testing import CliRunner
 
 from deploy.cli import app
 from deploy.export import to_onnx
 from deploy.networks import shipped_pair
-from model.convbeers import ConvBEERS, initialise
 from model.shipped import SENSOR
 from model.variants import Variant
 from quant.onnx_file import save_onnx
 from tests.deploy.workflow_steps import ACTION, BASH, KEPT, ROOT, Runner, read_yaml
+from tests.model.networks import plain
 from tests.quant.quick import changed
 
 WORKFLOW = ROOT / ".github" / "workflows" / "int8-gate.yml"
@@ -41,9 +40,7 @@ def networks(tmp_path_factory: pytest.TempPathFactory) -> Path:
     model = onnx.load(folder / "int8.onnx")
     name = next(node.input[8] for node in model.graph.node if node.op_type == "QLinearConv")
     onnx.save(changed(model, name, lambda bias: 2 * bias), folder / "broken.onnx")
-    plain = ConvBEERS(Variant(blocks=1, features=8))
-    initialise(plain, torch.Generator().manual_seed(0))
-    save_onnx(to_onnx(plain, {}), folder / "plain" / "float.onnx")
+    save_onnx(to_onnx(plain(Variant(blocks=1, features=8)), {}), folder / "plain" / "float.onnx")
     return folder
 
 

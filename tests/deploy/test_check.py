@@ -1,21 +1,19 @@
 """The command check: its document, its picture, the traditional chain, and the page made from the rules."""
 
-import json
 import subprocess
 import sys
 from pathlib import Path
 from typing import Any
 
-import jsonschema
 import onnx
 import pytest
 import typer
 from typer.testing import CliRunner
 
 from deploy.commands.check import check
-from deploy.results import SCHEMA_PATH
 from profiles.errors import BeersError, ModelError, OptionError
 from quant.graph import read_network
+from tests.deploy.documents import valid
 from tests.deploy.dpu.graphs import Sketch, board_convbeers, float_convbeers, integer_convbeers
 
 
@@ -29,10 +27,8 @@ def run(*arguments: str) -> tuple[int, str]:
 
 
 def tables(path: Path) -> dict[str, list[dict[str, Any]]]:
-    content = json.loads(path.read_text(encoding="utf-8"))
-    jsonschema.validate(content, json.loads(SCHEMA_PATH.read_text()))
     found: dict[str, list[dict[str, Any]]] = {}
-    for row in content["rows"]:
+    for row in valid(path)["rows"]:
         found.setdefault(row["table"], []).append(row)
     return found
 
@@ -83,8 +79,7 @@ def test_the_document_holds_the_verdict(tmp_path: Path) -> None:
 def verdict(path: Path, model: str) -> tuple[str, dict[str, Any]]:
     """The verdict in the document, and its one check."""
     run(model, "--json", str(path))
-    content = json.loads(path.read_text())
-    jsonschema.validate(content, json.loads(SCHEMA_PATH.read_text()))
+    content = valid(path)
     (check,) = content["checks"]
     return content["verdict"], check
 

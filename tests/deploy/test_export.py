@@ -11,7 +11,7 @@ from deploy.dpu.board import load_dpu
 from deploy.dpu.checker.placement import place
 from deploy.dpu.reading import network_of
 from deploy.export import banked_to_onnx, parity, require_parity, to_onnx
-from model.convbeers import BankedConvBEERS, ConvBEERS, arrays, initialise, load_network, save_network, vector_tensor
+from model.convbeers import ConvBEERS, arrays, load_network, save_network, vector_tensor
 from model.io.tensors import Weights
 from model.shipped import shipped_weights
 from model.training.grow import grow
@@ -21,14 +21,13 @@ from profiles.errors import ModelError, OptionError
 from quant.onnx_file import fixed_tile_px, metadata, save_onnx
 from quant.session import open_session, run
 from quant.tiling.walk import tiling_of
+from tests.model.networks import behind_a_bank, plain
 from tests.profiles.own_sensor import own_sensor
 
 
 @pytest.fixture(scope="module")
 def network() -> ConvBEERS:
-    network = ConvBEERS(Variant(blocks=2, features=8))
-    initialise(network, torch.Generator().manual_seed(0))
-    return network.eval()
+    return plain(Variant(blocks=2, features=8))
 
 
 @pytest.mark.parametrize("tile_px", [None, 40])
@@ -41,9 +40,8 @@ def test_torch_and_onnxruntime_agree(network: ConvBEERS, tile_px: int | None, tm
 
 @pytest.mark.parametrize("scale", [2, 3])
 def test_they_agree_at_a_lower_resolution_and_a_tile_is_whole_places(scale: int) -> None:
-    coarse = ConvBEERS(Variant(1, 8, scale))
-    initialise(coarse, torch.Generator().manual_seed(0))
-    assert parity(coarse.eval(), to_onnx(coarse, {}), 32) < 1e-6
+    coarse = plain(Variant(1, 8, scale))
+    assert parity(coarse, to_onnx(coarse, {}), 32) < 1e-6
     assert parity(coarse, to_onnx(coarse, {}, 12 * scale), 12 * scale) < 1e-6
     with pytest.raises(OptionError, match=f"--tile: expected a multiple of {scale} px, got 41 px"):
         to_onnx(coarse, {}, 41)
@@ -52,9 +50,7 @@ def test_they_agree_at_a_lower_resolution_and_a_tile_is_whole_places(scale: int)
 @pytest.mark.parametrize(("scale", "rows", "columns"), [(1, 37, 29), (2, 38, 46)])
 def test_a_network_behind_a_bank_is_exported_for_one_sensor(scale: int, rows: int, columns: int) -> None:
     """Its filters, unit and head's bias are constants then; tiled, with mirrored borders, it gives the same."""
-    banked, sensor = BankedConvBEERS(Variant(1, 8, scale)), load_sensor("pleiades-degraded").nominal()
-    initialise(banked, torch.Generator().manual_seed(0))
-    torch.nn.init.normal_(banked.bias.weight, 0, 0.1, torch.Generator().manual_seed(1))
+    banked, sensor = behind_a_bank(Variant(1, 8, scale), 0.1), load_sensor("pleiades-degraded").nominal()
     model = banked_to_onnx(Weights(arrays(banked.state_dict()), banked.variant, {}), sensor, {})
     image = np.random.default_rng(1).random((2, 1, rows, columns), dtype=np.float32) * 0.02 + 0.4
     vectors = vector_tensor(sensor).expand(2, -1)
@@ -81,9 +77,7 @@ def test_the_shipped_network_at_half_resolution_restores_the_same_image() -> Non
 def test_parity_notices_other_weights(network: ConvBEERS, tmp_path: Path) -> None:
     path = tmp_path / "float.onnx"
     save_onnx(to_onnx(network, {}), path)
-    other = ConvBEERS(network.variant)
-    initialise(other, torch.Generator().manual_seed(1))
-    assert parity(other.eval(), path, 33) > 1e-4
+    assert parity(plain(network.variant, seed=1), path, 33) > 1e-4
 
 
 def overflowing(network: ConvBEERS) -> ConvBEERS:
@@ -108,10 +102,8 @@ def test_a_network_that_gives_nan_is_not_exported(network: ConvBEERS, tmp_path: 
 
 
 def test_an_export_that_computes_something_else_is_refused(network: ConvBEERS) -> None:
-    other = ConvBEERS(network.variant)
-    initialise(other, torch.Generator().manual_seed(1))
     with pytest.raises(ModelError, match="report it"):
-        require_parity(other.eval(), to_onnx(network, {}), 33)
+        require_parity(plain(network.variant, seed=1), to_onnx(network, {}), 33)
 
 
 def test_the_file_names_its_variant(network: ConvBEERS) -> None:

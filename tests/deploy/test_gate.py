@@ -18,12 +18,10 @@ from deploy.export import float_model
 from deploy.gate import baseline_mae, file_checks, junit_text, sentence
 from deploy.networks import shipped_pair
 from deploy.results import Document
-from model.simulator.procedural import procedural_scene
-from profiles import load_sensor
 from profiles.errors import OptionError
 from profiles.figures import Row, measured
 from profiles.sensor_file import BLIND
-from quant.calibration import Patches, draw_patches
+from quant.calibration import Patches
 from quant.checks import Bound, Check
 from quant.encodings import read_core
 from quant.free import quantise_free
@@ -31,11 +29,9 @@ from quant.gate import Limits, compare, judge, judge_saturation, read_limits
 from quant.onnx_file import image_info, load_onnx, save_onnx
 from quant.session import open_session
 from quant.structure import Relus, count_relus, rounded_tensors, saturated_shares
-from tests.quant.quick import change, changed, one_guess
+from tests.quant.quick import change, changed, drawn, one_guess
 
 Spoil = Callable[[onnx.ModelProto], None]
-
-SENSORS = load_sensor("pleiades-degraded"), load_sensor("pleiades-reference")
 
 
 @pytest.fixture(scope="module")
@@ -45,7 +41,7 @@ def reference_model() -> onnx.ModelProto:
 
 @pytest.fixture(scope="module")
 def unseen() -> Patches:
-    return draw_patches([procedural_scene(900, 900, np.random.default_rng(77))], *SENSORS, 2, 7)
+    return drawn(2, seed=7, scene=77)
 
 
 def failed(reference_model: onnx.ModelProto, unseen: Patches, folder: Path, spoil: Spoil) -> set[str]:

@@ -11,13 +11,14 @@ from PIL import Image
 from typer.testing import CliRunner
 
 from deploy.cli import app
-from model.convbeers import BankedConvBEERS, initialise, load_network, save_network, told
+from model.convbeers import load_network, save_network, told
 from model.io.tensors import read_tensors
 from model.simulator.procedural import procedural_scene
 from model.training import run as training
 from model.training.patches import StoredPairs
 from model.training.run import Log
 from model.variants import VARIANTS
+from tests.model.networks import behind_a_bank
 from tests.profiles.own_sensor import own_sensor
 
 SIDE = 420
@@ -86,10 +87,7 @@ def test_a_conditioned_run_goes_on_from_others_and_resumes_to_the_same(images: P
 
 def banked_weights(folder: Path) -> Path:
     """Of a small network behind a bank, that give something else for each sensor."""
-    network = BankedConvBEERS(VARIANTS["convbeers-xs"])
-    initialise(network, torch.Generator().manual_seed(0))
-    torch.nn.init.normal_(network.bias.weight, 0.0, 0.1, torch.Generator().manual_seed(1))
-    save_network(folder / "start.safetensors", network, {})
+    save_network(folder / "start.safetensors", behind_a_bank(VARIANTS["convbeers-xs"], 0.1), {})
     return folder / "start.safetensors"
 
 

@@ -10,7 +10,9 @@ import onnx
 from onnx import numpy_helper
 from onnxruntime.quantization import CalibrationDataReader
 
-from quant.calibration import Patches, Remade
+from model.simulator.procedural import procedural_scene
+from profiles import load_sensor
+from quant.calibration import Patches, Remade, draw_patches
 from quant.quantise import Quantised, quantise_model
 
 
@@ -23,6 +25,13 @@ def image(height: int = 37, width: int = 53, seed: int = 0) -> np.ndarray:
 def patches_of(seen: list[np.ndarray]) -> Patches:
     """These images, each its own reference."""
     return Patches([], Remade(lambda k: (seen[k], seen[k]), len(seen)), Remade(lambda k: seen[k], len(seen)))
+
+
+def drawn(count: int, seed: int, scene: int = 1, patch_px: int = 128) -> Patches:
+    """Of one drawn scene, through the usual sensors."""
+    ground = procedural_scene(900, 960, np.random.default_rng(scene))
+    sensors = load_sensor("pleiades-degraded"), load_sensor("pleiades-reference")
+    return draw_patches([ground], *sensors, count, seed, patch_px=patch_px)
 
 
 def copied(model: onnx.ModelProto) -> onnx.ModelProto:

@@ -1,17 +1,14 @@
 """The battery passes what is sound, and stops what is broken."""
 
-import json
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import onnx
 import pytest
-from jsonschema import validate
 from typer.testing import CliRunner
 
 from deploy.cli import app
-from deploy.results import SCHEMA_PATH
 from deploy.studies.stress.battery import StageResult, run_battery, worst
 from deploy.studies.stress.cases import CASES, FULL_DN, Case
 from deploy.studies.stress.checks import LIMITATIONS, Measure, differing, local_range, ringing
@@ -19,6 +16,7 @@ from deploy.studies.stress.networks import STAGES, Subject, open_subject, restor
 from profiles.errors import ModelError
 from quant.onnx_file import save_onnx
 from quant.tiling.walk import Tiling
+from tests.deploy.documents import valid
 from tests.quant.quick import changed
 
 BY_NAME = {case.name: case for case in CASES}
@@ -161,8 +159,7 @@ def test_the_command_writes_its_figures_and_fails_by_exit_code(pair: list[Path],
     files = ["--json", str(tmp_path / "s.json"), "--out", str(tmp_path / "s.md")]
     done = CliRunner().invoke(app, ["stress", str(pair[0]), str(pair[1]), *few, *files])
     assert done.exit_code == 0, done.output
-    document = json.loads((tmp_path / "s.json").read_text())
-    validate(document, json.loads(SCHEMA_PATH.read_text()))
+    document = valid(tmp_path / "s.json")
     tables = {row["table"] for row in document["rows"]}
     assert {"battery", "worst", "integer layers", "findings"} <= tables
     assert "## Integer layers" in (tmp_path / "s.md").read_text()

@@ -1,8 +1,6 @@
-import json
 import math
 from pathlib import Path
 
-import jsonschema
 import numpy as np
 import pytest
 import tifffile
@@ -24,9 +22,9 @@ from deploy.bench.tables import (
 from deploy.commands.bench import bench
 from deploy.commands.check import check
 from deploy.dpu.board import load_dpu
-from deploy.results import SCHEMA_PATH
 from profiles.errors import BeersError, ImageError, OptionError, ProfileError
 from profiles.figures import Row, measured, predicted, unavailable
+from tests.deploy.documents import valid
 from tests.deploy.dpu.graphs import float_convbeers, integer_convbeers
 
 DPU = load_dpu("vck190")
@@ -41,12 +39,6 @@ def run(command: str, *arguments: str) -> tuple[int, str]:
     if isinstance(result.exception, BeersError):
         raise result.exception
     return result.exit_code, result.output
-
-
-def document(path: Path) -> dict[str, list[dict[str, object]]]:
-    content = json.loads(path.read_text(encoding="utf-8"))
-    jsonschema.validate(content, json.loads(SCHEMA_PATH.read_text()))
-    return dict(content)
 
 
 def value(row: Row, key: str) -> float:
@@ -113,7 +105,7 @@ def test_bench_writes_a_valid_document(tmp_path: Path) -> None:
     model = integer_convbeers(tmp_path / "net.onnx", 1, 8)
     code, _ = run("bench", str(model), "--image", str(image), "--tile", "32", "--json", str(out))
     assert code == 0
-    written = document(out)
+    written = valid(out)
     assert [entry["name"] for entry in written["inputs"]] == ["net.onnx", "raw.tif"]
     names = [str(row["name"]) for row in written["rows"]]
     assert sum(name.startswith("paper, 13600 x 9016:") for name in names) == 2
@@ -128,7 +120,7 @@ def test_layers_are_shown_when_asked_for_and_written_always(tmp_path: Path) -> N
     assert ("LdFM" in brief, "LdFM" in full) == (False, True)
     assert ("--layers" in brief, "--layers" in full) == (True, False)
     assert full.index("LdFM") < full.index("throughput")
-    assert {"bench", "layers"} <= {row["table"] for row in document(out)["rows"]}
+    assert {"bench", "layers"} <= {row["table"] for row in valid(out)["rows"]}
 
 
 def test_layer_rows_have_the_columns_of_vaitrace(tmp_path: Path) -> None:
@@ -156,7 +148,7 @@ def test_all_configurations_are_swept(tmp_path: Path) -> None:
     model, out = integer_convbeers(tmp_path / "net.onnx", 1, 8), tmp_path / "out.json"
     options = ("--size", "41x33", "--tile", "64,32", "--config", "all", "--no-traditional", "--json", str(out))
     assert run("bench", str(model), *options)[0] == 0
-    swept = [str(row["name"]) for row in document(out)["rows"] if row["table"] == "sweep"]
+    swept = [str(row["name"]) for row in valid(out)["rows"] if row["table"] == "sweep"]
     assert swept == [f"vck190 {name}, tiles of {tile}" for name in DPU.target.configurations for tile in (64, 32)]
 
 
@@ -176,7 +168,7 @@ def test_bench_on_this_machine(tmp_path: Path) -> None:
     code, output = run("bench", str(model), "--target", "host", "--tile", "32", "--json", str(out))
     assert code == 0
     assert "no proxy" in output
-    row, *_ = document(out)["rows"]
+    row, *_ = valid(out)["rows"]
     assert isinstance(row["figures"], dict)
     assert row["figures"]["p50"]["value"] <= row["figures"]["p90"]["value"]
 
