@@ -141,8 +141,8 @@ def test_the_offset_lifts_every_pixel() -> None:
 @pytest.mark.parametrize("name", ["dsnu", "striping", "offset"])
 def test_the_noise_is_the_same_whether_a_pattern_is_applied_or_not(name: str) -> None:
     """What is added in DN is then all that differs, and it is the same in every row."""
-    radiance, effects = scene(93, 111), {"dsnu": Dsnu(3.0), "striping": Striping(2.0), "offset": Offset(64.0)}
-    sensor = stages.plain_sensor(**effects)
+    radiance = scene(93, 111)
+    sensor = stages.plain_sensor(dsnu=Dsnu(3.0), striping=Striping(2.0), offset=Offset(64.0))
     whole = stages.before_digitising(radiance, sensor, 3, Draw(5))
     added = whole - stages.before_digitising(radiance, sensor, 3, Draw(5), {name})
     np.testing.assert_allclose(added.numpy(), added[:1].expand_as(added).numpy(), atol=1e-3)
