@@ -9,14 +9,13 @@ from xml.etree import ElementTree as ET
 
 import onnx
 import pytest
-from typer.testing import CliRunner
 
-from deploy.cli import app
 from deploy.export import to_onnx
 from deploy.networks import shipped_pair
 from model.shipped import SENSOR
 from model.variants import Variant
 from quant.onnx_file import save_onnx
+from tests.deploy.command_line import done
 from tests.deploy.workflow_steps import ACTION, BASH, KEPT, ROOT, Runner, read_yaml
 from tests.model.networks import plain
 from tests.quant.quick import changed
@@ -34,8 +33,7 @@ pytestmark = [
 def networks(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with a sound pair, the same with one bias doubled, and in plain/ a network of one sensor alone."""
     folder = tmp_path_factory.mktemp("networks")
-    done = CliRunner().invoke(app, ["export", "--variant", "convbeers-xs", "--out", str(folder / "float.onnx")])
-    assert done.exit_code == 0, done.output
+    done("export", "--variant", "convbeers-xs", "--out", folder / "float.onnx")
     shutil.copy(shipped_pair("convbeers-xs")[1], folder / "int8.onnx")
     model = onnx.load(folder / "int8.onnx")
     name = next(node.input[8] for node in model.graph.node if node.op_type == "QLinearConv")

@@ -11,9 +11,7 @@ import numpy as np
 import onnx
 import pytest
 from onnx import numpy_helper
-from typer.testing import CliRunner
 
-from deploy.cli import app
 from deploy.export import float_model
 from deploy.gate import baseline_mae, file_checks, junit_text, sentence
 from deploy.networks import shipped_pair
@@ -29,6 +27,7 @@ from quant.gate import Limits, compare, judge, judge_saturation, read_limits
 from quant.onnx_file import image_info, load_onnx, save_onnx
 from quant.session import open_session
 from quant.structure import Relus, count_relus, rounded_tensors, saturated_shares
+from tests.deploy.command_line import done, refused
 from tests.quant.quick import change, changed, drawn, one_guess
 
 Spoil = Callable[[onnx.ModelProto], None]
@@ -227,12 +226,9 @@ def test_the_number_decides(value: float, limit: float, bound: Bound, passed: bo
 
 def test_one_file_alone_is_no_pair(tmp_path: Path) -> None:
     (tmp_path / "float.onnx").touch()
-    done = CliRunner().invoke(app, ["gate", str(tmp_path / "float.onnx")])
-    assert done.exit_code == 2
-    assert "expected the INT8 network of float.onnx" in " ".join(done.output.split())
-    done = CliRunner().invoke(app, ["gate", *map(str, shipped_pair("convbeers-xs")), "--variant", "convbeers-s"])
-    assert done.exit_code == 2
-    assert "--variant: expected it without files" in " ".join(done.output.split())
+    assert "expected the INT8 network of float.onnx" in refused("gate", tmp_path / "float.onnx")
+    said = refused("gate", *shipped_pair("convbeers-xs"), "--variant", "convbeers-s")
+    assert "--variant: expected it without files" in said
 
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -240,18 +236,15 @@ ASKED = {"sensor": "pleiades-degraded", "images": None, "patches": 2, "seed": 0}
 
 
 def test_a_baseline_holds_the_mae(scenes: Path, tmp_path: Path) -> None:
-    runner, first, second = CliRunner(), tmp_path / "first.json", tmp_path / "again.json"
-    command = ["gate", "--images", str(scenes), "--patches", "2"]
-    done = runner.invoke(app, [*command, "--json", str(first), "--junit", str(tmp_path / "j.xml")])
-    assert done.exit_code == 0, done.output
+    first, second = tmp_path / "first.json", tmp_path / "again.json"
+    command = ["gate", "--images", scenes, "--patches", 2]
+    done(*command, "--json", first, "--junit", tmp_path / "j.xml")
     assert json.loads(first.read_text())["verdict"] == "passed"
     before = baseline_mae(first, {**ASKED, "images": scenes})
     assert ET.parse(tmp_path / "j.xml").getroot().get("failures") == "0"  # noqa: S314
     first.write_text(first.read_text().replace(str(before), str(before / 2)))
-    again = runner.invoke(app, [*command, "--baseline", str(first), "--json", str(second)])
-    assert again.exit_code == 1
-    last = again.output.splitlines()[-1]
-    assert last.startswith(f"gate FAILED, 1 of 6 checks: MAE against the baseline {before:.4g} of full scale")
+    said = done(*command, "--baseline", first, "--json", second, code=1).splitlines()[-1]
+    assert said.startswith(f"gate FAILED, 1 of 6 checks: MAE against the baseline {before:.4g} of full scale")
     only_the_baseline_fails(json.loads(second.read_text()), before)
 
 
@@ -362,20 +355,15 @@ def test_two_networks_of_one_kind_are_refused(reference_model: onnx.ModelProto, 
     path = tmp_path / "float.onnx"
     save_onnx(reference_model, path)
     for pair, expected in (([path, path], "an INT8"), ([shipped_pair("convbeers-xs")[1]] * 2, "a float")):
-        done = CliRunner().invoke(app, ["gate", *map(str, pair)])
-        assert done.exit_code == 2
-        assert f"expected {expected} network" in " ".join(done.output.split())
+        assert f"expected {expected} network" in refused("gate", *pair)
 
 
 def test_samples_without_references_tell_no_loss_and_cannot_keep_a_limit_on_it(tmp_path: Path) -> None:
     samples, limits = tmp_path / "samples.npy", tmp_path / "limits.toml"
     np.save(samples, np.random.default_rng(0).uniform(0.1, 0.9, (2, 1, 40, 40)).astype(np.float32))
-    command = ["gate", *map(str, shipped_pair("convbeers-xs")), "--data", str(samples), "--max-mae", "0.5"]
-    plain = CliRunner().invoke(app, command)
-    assert plain.exit_code == 0
-    assert "gate passed" in plain.output
-    assert "nan" not in plain.output.lower()
+    command = ["gate", *shipped_pair("convbeers-xs"), "--data", samples, "--max-mae", "0.5"]
+    said = done(*command)
+    assert "gate passed" in said
+    assert "nan" not in said.lower()
     limits.write_text("psnr_drop_db = 0.25\n", encoding="utf-8")
-    asked = CliRunner().invoke(app, [*command, "--config", str(limits)])
-    assert asked.exit_code == 2
-    assert "references for psnr_drop_db, got images alone" in asked.output
+    assert "references for psnr_drop_db, got images alone" in refused(*command, "--config", limits)

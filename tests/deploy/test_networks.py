@@ -10,9 +10,7 @@ import numpy as np
 import onnx
 import pytest
 import tifffile
-from typer.testing import CliRunner
 
-from deploy.cli import app
 from deploy.gate import files_or_shipped
 from deploy.networks import (
     WEIGHTS,
@@ -31,6 +29,7 @@ from profiles.sensor import numbers_of
 from profiles.sensor_file import BLIND, BLIND_PROFILE, load_sensor
 from quant.banked import calibrate
 from quant.onnx_file import load_onnx, metadata
+from tests.deploy.command_line import done, refused
 from tests.profiles.own_sensor import own_sensor
 
 KNOWN = load_sensor(SENSOR)
@@ -63,14 +62,12 @@ def test_int8_is_calibrated_once_and_then_told_any_sensor(
     monkeypatch.setattr(calibrate, "PATCHES", 3)
     monkeypatch.setattr(calibrate, "QUIET_PATCHES", 1)
     monkeypatch.chdir(tmp_path)
-    invoke = CliRunner().invoke
-    made = invoke(app, ["quantize", str(conditioned), "--sensor", SENSOR, "--patches", "1", "--out", "base.onnx"])
-    assert made.exit_code == 0, made.output
+    done("quantize", conditioned, "--sensor", SENSOR, "--patches", "1", "--out", "base.onnx")
     base, sensor = load_onnx(Path("base.onnx")), own_sensor(tmp_path, ("value = 0.07", "value = 0.05"))
     words = ["export", "--checkpoint", "base.onnx", "--out"]
     mine = [*words, "mine.onnx", "--sensor", str(sensor), "--delta", "mine.delta"]
-    assert invoke(app, mine).exit_code == 0
-    assert invoke(app, [*words, "applied.onnx", "--apply", "mine.delta"]).exit_code == 0
+    done(*mine)
+    done(*words, "applied.onnx", "--apply", "mine.delta")
     assert Path("applied.onnx").read_bytes() == Path("mine.onnx").read_bytes()
     assert Path("mine.delta").stat().st_size < 3000
     other = load_onnx(Path("mine.onnx"))
@@ -132,10 +129,10 @@ def test_restoring_for_a_sensor_needs_no_torch_and_is_what_the_sensor_makes_of_i
     words = ["restore", str(tmp_path / "in.tif"), "out.tif", "--model", name, "--sensor", str(sensor)]
     call = f"app({words!r}, standalone_mode=False)"
     code = f"import sys; from deploy.cli import app; {call}; print({{'torch', 'skimage'}} & set(sys.modules))"
-    done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=True)
-    assert done.stdout.splitlines()[-1] == "set()"
+    ran = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=True)
+    assert ran.stdout.splitlines()[-1] == "set()"
     other = [*words[:2], str(tmp_path / "other.tif"), *words[3:5], "--sensor", SENSOR]
-    assert CliRunner().invoke(app, other).exit_code == 0
+    done(*other)
     restored = [tifffile.imread(tmp_path / name).astype(int) for name in ("out.tif", "other.tif")]
     assert np.abs(restored[0] - restored[1]).max() > 5
 
@@ -144,9 +141,7 @@ def test_a_network_that_is_made_already_takes_no_sensor(tmp_path: Path) -> None:
     tifffile.imwrite(tmp_path / "in.tif", np.full((20, 30), 900, np.uint16))
     mine = shipped_pair("convbeers-xs")[0]
     words = ["restore", str(tmp_path / "in.tif"), str(tmp_path / "out.tif"), "--model", str(mine), "--sensor", SENSOR]
-    done = CliRunner().invoke(app, words)
-    assert done.exit_code == 2
-    assert "leave --sensor out" in " ".join(done.output.split())
+    assert "leave --sensor out" in refused(*words)
     assert not (tmp_path / "out.tif").exists()
 
 
@@ -188,16 +183,12 @@ def test_commands_take_the_name(tmp_path: Path) -> None:
     tifffile.imwrite(tmp_path / "in.tif", np.random.default_rng(0).integers(200, 1800, (37, 41)).astype(np.uint16))
     for model in ("convbeers-xs-int8", str(shipped_pair("convbeers-xs", "blind")[1])):
         out = tmp_path / f"{len(model)}.tif"
-        result = CliRunner().invoke(app, ["restore", str(tmp_path / "in.tif"), str(out), "--model", model])
-        assert result.exit_code == 0, result.output
-        assert ("network: convbeers-xs-int8, told no sensor" in result.output) == (model == "convbeers-xs-int8")
+        said = done("restore", tmp_path / "in.tif", out, "--model", model)
+        assert ("network: convbeers-xs-int8, told no sensor" in said) == (model == "convbeers-xs-int8")
     first, second = (tifffile.imread(path) for path in tmp_path.glob("*.tif") if path.name != "in.tif")
     np.testing.assert_array_equal(first, second)
-    result = CliRunner().invoke(
-        app, ["restore", str(tmp_path / "in.tif"), str(tmp_path / "x.tif"), "--model", "huge"]
-    )
-    assert result.exit_code == 2
-    assert "a shipped network (convbeers, convbeers-half" in " ".join(result.output.split())
+    said = refused("restore", tmp_path / "in.tif", tmp_path / "x.tif", "--model", "huge")
+    assert "a shipped network (convbeers, convbeers-half" in said
 
 
 @pytest.mark.parametrize(
@@ -208,9 +199,7 @@ def test_commands_take_the_name(tmp_path: Path) -> None:
     ],
 )
 def test_judges_take_the_name(command: list[str]) -> None:
-    result = CliRunner().invoke(app, command)
-    assert result.exit_code == 0, result.output
-    assert f"{command[0]} passed" in result.output
+    assert f"{command[0]} passed" in done(*command)
 
 
 def test_the_gate_takes_the_names() -> None:
@@ -219,24 +208,20 @@ def test_the_gate_takes_the_names() -> None:
 
 
 def test_export_takes_the_name(tmp_path: Path) -> None:
-    result = CliRunner().invoke(app, ["export", "--checkpoint", "convbeers-xs", "--out", str(tmp_path / "net.onnx")])
-    assert result.exit_code == 0, result.output
+    done("export", "--checkpoint", "convbeers-xs", "--out", tmp_path / "net.onnx")
     assert metadata(load_onnx(tmp_path / "net.onnx"))["variant"] == "convbeers-xs"
 
 
 def test_export_writes_a_shipped_networks_integers_for_the_host_and_the_board(tmp_path: Path) -> None:
     host, board = str(tmp_path / "int8.onnx"), str(tmp_path / "core.onnx")
     words = ["export", "--checkpoint", "convbeers-half-xs-int8", "--sensor", "blind", "--tile", "64", "--out", host]
-    assert CliRunner().invoke(app, [*words, "--board", board]).exit_code == 0
+    done(*words, "--board", board)
     assert metadata(load_onnx(Path(host)))["sensor"] == "blind"
     for path in (host, board):
-        result = CliRunner().invoke(app, ["check", path])
-        assert result.exit_code == 0, result.output
+        done("check", path)
 
 
 def test_a_tile_that_a_network_cannot_rearrange_is_refused(tmp_path: Path) -> None:
     words = ["export", "--checkpoint", "convbeers-half-xs-int8", "--tile", "65", "--out", str(tmp_path / "x.onnx")]
-    result = CliRunner().invoke(app, words)
-    assert result.exit_code == 2
-    assert "--tile: expected a multiple of 2 px, got 65 px" in " ".join(result.output.split())
+    assert "--tile: expected a multiple of 2 px, got 65 px" in refused(*words)
     assert not (tmp_path / "x.onnx").exists()

@@ -9,9 +9,7 @@ from xml.etree import ElementTree as ET
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
-from deploy.cli import app
 from deploy.export import to_onnx
 from deploy.report.plots import FONT_PX, MOST_BARS, bins, histogram_url
 from model.io.images import MAX_DN
@@ -23,6 +21,7 @@ from profiles.sensor_file import reference_for
 from quant.calibration import draw_patches
 from quant.onnx_file import fixed_tile_px, load_onnx, metadata, save_onnx
 from quant.sensitivity import Spread, kind_of_error, worst_row
+from tests.deploy.command_line import done, refused
 from tests.deploy.documents import valid
 from tests.deploy.report.svg import style_of, text_width
 from tests.model.networks import plain
@@ -40,14 +39,11 @@ def float_file(path: Path) -> str:
 def test_the_free_regime_writes_a_file_of_its_own_kind(tmp_path: Path) -> None:
     free = ["quantize", float_file(tmp_path / "f.onnx"), "--regime", "free", "--patches", "2", "--patch", "64"]
     out = tmp_path / "free.onnx"
-    result = CliRunner().invoke(app, [*free, "--out", str(out), "--json", str(tmp_path / "q.json")])
-    assert result.exit_code == 0, result.output
+    done(*free, "--out", out, "--json", tmp_path / "q.json")
     assert metadata(load_onnx(out))["precision"] == "int8 free"
     valid(tmp_path / "q.json")
     for option in (["--finetune", "1"], ["--board", str(tmp_path / "b.onnx")], ["--report", str(tmp_path / "r")]):
-        refused = CliRunner().invoke(app, [*free, "--out", str(tmp_path / "no.onnx"), *option])
-        assert refused.exit_code == 2
-        assert "--regime legal" in " ".join(refused.output.split())
+        assert "--regime legal" in refused(*free, "--out", tmp_path / "no.onnx", *option)
     assert not (tmp_path / "no.onnx").exists()
 
 
@@ -60,8 +56,7 @@ def test_a_network_fixed_to_one_tile_is_quantised_reported_and_gated(tmp_path: P
         ["quantize", str(paths[0]), *options],
         ["gate", *map(str, paths), "--patches", "3", "--max-mae", "1"],
     ):
-        result = CliRunner().invoke(app, arguments)
-        assert result.exit_code == 0, result.output
+        done(*arguments)
     assert fixed_tile_px(load_onnx(paths[1])) == 80
 
 
@@ -72,8 +67,7 @@ def test_quantize_reports_layers(tmp_path: Path) -> None:
     write_tiff(tmp_path / "scenes" / "drawn.tif", np.rint(dn).astype(np.uint16))
     options = ["--out", str(tmp_path / "i.onnx"), "--patches", "4", "--json", str(tmp_path / "q.json")]
     options += ["--patch", "96", "--report", str(tmp_path / "r"), "--images", str(tmp_path / "scenes")]
-    result = CliRunner().invoke(app, ["quantize", str(tmp_path / "f.onnx"), *options])
-    assert result.exit_code == 0, result.output
+    done("quantize", tmp_path / "f.onnx", *options)
     document = valid(tmp_path / "q.json")
     tables = [row["table"] for row in document["rows"]]
     assert tables.count("integer layers") == 8

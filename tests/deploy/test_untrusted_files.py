@@ -30,6 +30,7 @@ from profiles.figures import Row, measured
 from profiles.toml import HERE, read_json, read_toml_text
 from quant.checks import Check
 from quant.onnx_file import load_onnx
+from tests.deploy.command_line import refused
 from tests.fuzz.networks import checkpoint_seeds, go_on
 from tests.fuzz.parsers import JOB, SHAPE
 
@@ -201,10 +202,9 @@ def test_what_stands_in_place_of_a_file_is_named(
     monkeypatch.chdir(tmp_path)
     path = tmp_path / name
     path.mkdir() if what == "folder" else path.write_text(POINTER)
-    done = runner.invoke(app, [word.format(path) for word in command])
-    assert done.exit_code == 2
-    assert name in done.stderr
-    assert ("got a folder" if what == "folder" else "'git lfs pull'") in done.stderr
+    said = refused(*(word.format(path) for word in command))
+    assert name in said
+    assert ("got a folder" if what == "folder" else "'git lfs pull'") in said
 
 
 def test_a_mark_at_the_beginning_of_a_text_is_no_part_of_it(tmp_path: Path) -> None:
@@ -217,7 +217,6 @@ def test_a_mark_at_the_beginning_of_a_text_is_no_part_of_it(tmp_path: Path) -> N
 @pytest.mark.parametrize("name", ["out.png", "out.jpg", "out", "out.tif.gz"])
 def test_no_tiff_is_written_under_another_name(name: str, tmp_path: Path) -> None:
     tifffile.imwrite(tmp_path / "raw.tif", np.full((20, 20), 500, np.uint16))
-    done = runner.invoke(app, ["restore", str(tmp_path / "raw.tif"), str(tmp_path / name)])
-    assert done.exit_code == 2
-    assert f"expected a TIFF's name, such as restored.tif, got {name}" in done.stderr
+    said = refused("restore", tmp_path / "raw.tif", tmp_path / name)
+    assert f"expected a TIFF's name, such as restored.tif, got {name}" in said
     assert not (tmp_path / name).exists()

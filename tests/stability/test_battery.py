@@ -16,6 +16,7 @@ from deploy.studies.stress.networks import STAGES, Subject, open_subject, restor
 from profiles.errors import ModelError
 from quant.onnx_file import save_onnx
 from quant.tiling.walk import Tiling
+from tests.deploy.command_line import done, refused
 from tests.deploy.documents import valid
 from tests.quant.quick import changed
 
@@ -157,8 +158,7 @@ def test_cases_are_drawn_from_their_seed_and_say_what_is_wrong_with_them(case: C
 def test_the_command_writes_its_figures_and_fails_by_exit_code(pair: list[Path], tmp_path: Path) -> None:
     few = ["--cases", "night,NaN pixels", "--stages", "float32,INT8,tiling", "--size", "24"]
     files = ["--json", str(tmp_path / "s.json"), "--out", str(tmp_path / "s.md")]
-    done = CliRunner().invoke(app, ["stress", str(pair[0]), str(pair[1]), *few, *files])
-    assert done.exit_code == 0, done.output
+    done("stress", pair[0], pair[1], *few, *files)
     document = valid(tmp_path / "s.json")
     tables = {row["table"] for row in document["rows"]}
     assert {"battery", "worst", "integer layers", "findings"} <= tables
@@ -184,6 +184,4 @@ def test_the_command_writes_its_figures_and_fails_by_exit_code(pair: list[Path],
 )
 def test_bad_input_is_one_sentence(arguments: list[str], words: str, pair: list[Path]) -> None:
     files = dict(zip(("FLOAT", "INT8"), map(str, pair), strict=True))
-    result = CliRunner().invoke(app, ["stress", *(files.get(text, text) for text in arguments)])
-    assert result.exit_code == 2
-    assert words in result.output
+    assert words in refused("stress", *(files.get(text, text) for text in arguments))

@@ -7,13 +7,12 @@ import numpy as np
 import pytest
 import tifffile
 import torch
-from typer.testing import CliRunner
 
-from deploy.cli import app
 from deploy.restoration.traditional import Request, restore_file_traditionally
 from model.traditional.pipeline import restore_traditional
 from profiles import load_sensor
 from profiles.errors import ImageError, MachineError
+from tests.deploy.command_line import done, refused
 from tests.profiles.own_sensor import own_sensor
 
 SHAPE = (151, 67)
@@ -112,13 +111,8 @@ def test_the_command_needs_a_sensor_and_no_option_of_a_network(tmp_path: Path) -
         ([*named, "--resume"], "--resume: expected none"),
         ([*named, "--scheduler", "host:8786"], "--scheduler: expected none"),
     ):
-        result = CliRunner().invoke(app, arguments)
-        assert result.exit_code == 2
-        assert words in " ".join(result.output.split())
+        assert words in refused(*arguments)
         assert not out.exists()
-    result = CliRunner().invoke(
-        app, [*chain, "--sensor", str(other_sensor(tmp_path)), "--json", str(tmp_path / "a.json")]
-    )
-    assert result.exit_code == 0, result.output
+    done(*chain, "--sensor", other_sensor(tmp_path), "--json", tmp_path / "a.json")
     assert tifffile.imread(out).shape == SHAPE
     assert '"sensor": "mine"' in (tmp_path / "a.json").read_text()
