@@ -19,7 +19,7 @@ from hypothesis import settings
 settings.register_profile("project", deadline=None)
 settings.load_profile("project")
 
-typer.testing._get_command = cache(typer.main.get_command)  # type: ignore[attr-defined]
+typer.main.get_command = typer.testing._get_command = cache(typer.main.get_command)  # type: ignore[attr-defined]
 
 SHARED_DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 
@@ -37,3 +37,16 @@ def shared_data() -> Path:
     if not SHARED_DATA.is_dir():
         pytest.skip("no folder shared/data beside the repository: no real images to test on")
     return SHARED_DATA
+
+
+@pytest.fixture(scope="session")
+def scenes(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with one small drawn scene: to draw those that a command takes of itself is most of its time."""
+    import numpy as np
+    import tifffile
+
+    from model.simulator.procedural import procedural_scene
+
+    folder = tmp_path_factory.mktemp("scenes")
+    tifffile.imwrite(folder / "drawn.tif", procedural_scene(900, 900, np.random.default_rng(77)).radiance.numpy())
+    return folder

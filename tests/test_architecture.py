@@ -1,15 +1,18 @@
 """What docs/explanation/architecture.md says of the packages, held against the code."""
 
 import ast
+from functools import cache
 from graphlib import TopologicalSorter
-from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
+
+from docs.make import architecture
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGES = ("profiles", "model", "quant", "deploy")
 MOST_MODULES = 18
 
 
+@cache
 def modules() -> dict[str, Path]:
     """Every module of ours by its name; a package goes by its own."""
     files = [path for package in PACKAGES for path in (ROOT / package).rglob("*.py")]
@@ -17,7 +20,8 @@ def modules() -> dict[str, Path]:
     return dict(zip(names, files, strict=True))
 
 
-def imported(path: Path, known: dict[str, Path]) -> set[str]:
+@cache
+def imported(path: Path) -> set[str]:
     """What a module imports of ours as it is loaded; not what its functions import when they run."""
     found: set[str] = set()
     for node in ast.parse(path.read_text(encoding="utf-8")).body:
@@ -25,20 +29,19 @@ def imported(path: Path, known: dict[str, Path]) -> set[str]:
             found |= {f"{node.module}.{alias.name}" for alias in node.names} | {node.module}
         elif isinstance(node, ast.Import):
             found |= {alias.name for alias in node.names}
+    known = modules()
     return {name for name in found if name in known and known[name].name != "__init__.py"}
 
 
 def test_no_module_imports_itself_by_a_detour() -> None:
-    known = modules()
-    order = TopologicalSorter({name: imported(path, known) for name, path in known.items()})
-    assert len(list(order.static_order())) == len(known)  # a circle raises, and names its modules
+    order = TopologicalSorter({name: imported(path) for name, path in modules().items()})
+    assert len(list(order.static_order())) == len(modules())  # a circle raises, and names its modules
 
 
 def test_a_file_imports_only_from_packages_before_its_own() -> None:
-    known = modules()
-    for name, path in known.items():
+    for name, path in modules().items():
         own = PACKAGES.index(name.split(".")[0])
-        assert {PACKAGES.index(each.split(".")[0]) for each in imported(path, known)} <= set(range(own + 1)), name
+        assert {PACKAGES.index(each.split(".")[0]) for each in imported(path)} <= set(range(own + 1)), name
 
 
 def test_packages_stay_small_enough_to_look_through_and_say_what_is_inside() -> None:
@@ -58,13 +61,8 @@ def test_the_page_names_files_that_are_there() -> None:
 
 def test_the_picture_is_drawn_from_the_imports_of_today() -> None:
     """Else run python docs/make/architecture.py."""
-    specification = spec_from_file_location("architecture", ROOT / "docs" / "make" / "architecture.py")
-    assert specification is not None
-    assert specification.loader is not None
-    script = module_from_spec(specification)
-    specification.loader.exec_module(script)
     page = (ROOT / "docs" / "explanation" / "architecture.md").read_text(encoding="utf-8")
-    assert script.page(page) == page
+    assert architecture.page(page) == page
 
 
 def listed(docstring: str) -> set[str]:

@@ -9,18 +9,16 @@ from xml.etree import ElementTree as ET
 
 import onnx
 import pytest
-import torch
-from onnx import numpy_helper
-from typer.testing import CliRunner
 
-from deploy.cli import app
 from deploy.export import to_onnx
 from deploy.networks import shipped_pair
-from model.convbeers import ConvBEERS, initialise
 from model.shipped import SENSOR
 from model.variants import Variant
 from quant.onnx_file import save_onnx
+from tests.deploy.command_line import done
 from tests.deploy.workflow_steps import ACTION, BASH, KEPT, ROOT, Runner, read_yaml
+from tests.model.networks import plain
+from tests.quant.quick import changed
 
 WORKFLOW = ROOT / ".github" / "workflows" / "int8-gate.yml"
 OURS = "Train a small network"
@@ -35,17 +33,12 @@ pytestmark = [
 def networks(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with a sound pair, the same with one bias doubled, and in plain/ a network of one sensor alone."""
     folder = tmp_path_factory.mktemp("networks")
-    done = CliRunner().invoke(app, ["export", "--variant", "convbeers-xs", "--out", str(folder / "float.onnx")])
-    assert done.exit_code == 0, done.output
+    done("export", "--variant", "convbeers-xs", "--out", folder / "float.onnx")
     shutil.copy(shipped_pair("convbeers-xs")[1], folder / "int8.onnx")
     model = onnx.load(folder / "int8.onnx")
     name = next(node.input[8] for node in model.graph.node if node.op_type == "QLinearConv")
-    bias = next(tensor for tensor in model.graph.initializer if tensor.name == name)
-    bias.CopyFrom(numpy_helper.from_array(2 * numpy_helper.to_array(bias), name))
-    onnx.save(model, folder / "broken.onnx")
-    plain = ConvBEERS(Variant(blocks=1, features=8))
-    initialise(plain, torch.Generator().manual_seed(0))
-    save_onnx(to_onnx(plain, {}), folder / "plain" / "float.onnx")
+    onnx.save(changed(model, name, lambda bias: 2 * bias), folder / "broken.onnx")
+    save_onnx(to_onnx(plain(Variant(blocks=1, features=8)), {}), folder / "plain" / "float.onnx")
     return folder
 
 

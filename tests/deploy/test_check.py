@@ -1,46 +1,32 @@
 """The command check: its document, its picture, the traditional chain, and the page made from the rules."""
 
-import json
 import subprocess
 import sys
 from pathlib import Path
 from typing import Any
 
-import jsonschema
 import onnx
 import pytest
-import typer
-from typer.testing import CliRunner
 
-from deploy.commands.check import check
-from deploy.results import SCHEMA_PATH
-from profiles.errors import BeersError, ModelError, OptionError
+from profiles.errors import ModelError
 from quant.graph import read_network
+from tests.deploy.command_line import done, refused
+from tests.deploy.documents import valid
 from tests.deploy.dpu.graphs import Sketch, board_convbeers, float_convbeers, integer_convbeers
 
 
-def run(*arguments: str) -> tuple[int, str]:
-    app = typer.Typer()
-    app.command()(check)
-    result = CliRunner().invoke(app, arguments)
-    if isinstance(result.exception, BeersError):
-        raise result.exception
-    return result.exit_code, result.output
-
-
 def tables(path: Path) -> dict[str, list[dict[str, Any]]]:
-    content = json.loads(path.read_text(encoding="utf-8"))
-    jsonschema.validate(content, json.loads(SCHEMA_PATH.read_text()))
     found: dict[str, list[dict[str, Any]]] = {}
-    for row in content["rows"]:
+    for row in valid(path)["rows"]:
         found.setdefault(row["table"], []).append(row)
     return found
 
 
 def test_convbeers_passes_whole_in_every_encoding(tmp_path: Path) -> None:
     for make in (float_convbeers, integer_convbeers, board_convbeers):
-        code, output = run(str(make(tmp_path / "n.onnx", 16, 64)))
-        assert (code, "DPU subgraphs: 1" in output, "check passed" in output) == (0, True, True)
+        output = done("check", make(tmp_path / "n.onnx", 16, 64))
+        assert "DPU subgraphs: 1" in output
+        assert "check passed" in output
 
 
 def test_a_network_of_one_tile_is_checked_at_that(tmp_path: Path) -> None:
@@ -49,18 +35,15 @@ def test_a_network_of_one_tile_is_checked_at_that(tmp_path: Path) -> None:
         for side in value.type.tensor_type.shape.dim[2:]:
             side.dim_value = 96
     onnx.save(model, tmp_path / "fixed.onnx")
-    code, output = run(str(tmp_path / "fixed.onnx"))
-    assert (code, "tile 96" in output) == (0, True)
-    with pytest.raises(BeersError, match="--tile 96"):
-        run(str(tmp_path / "fixed.onnx"), "--tile", "640")
+    assert "tile 96" in done("check", tmp_path / "fixed.onnx")
+    assert "--tile 96" in refused("check", tmp_path / "fixed.onnx", "--tile", 640)
 
 
 def test_the_document_holds_subgraphs_cuts_and_remarks(tmp_path: Path) -> None:
     sketch = Sketch(8)
     path = sketch.save(tmp_path / "bad.onnx", sketch.conv(sketch.node("Sigmoid", sketch.conv("image"))))
-    code, output = run(str(path), "--tile", "96", "--json", str(tmp_path / "o.json"))
+    output = done("check", path, "--tile", 96, "--json", tmp_path / "o.json", code=1)
     found = tables(tmp_path / "o.json")
-    assert code == 1
     assert [row["text"]["device"] for row in found["subgraphs"]] == ["DPU", "CPU", "DPU"]
     assert [row["figures"]["size"]["value"] for row in found["cuts"]] == [8 * 96 * 96] * 4
     assert {row["name"] for row in found["remarks"]} == {"fix2float", "subgraphs"}
@@ -71,8 +54,8 @@ def test_the_document_holds_subgraphs_cuts_and_remarks(tmp_path: Path) -> None:
 def test_the_document_holds_the_verdict(tmp_path: Path) -> None:
     sketch = Sketch(8)
     path = sketch.save(tmp_path / "bad.onnx", sketch.conv(sketch.node("Sigmoid", sketch.conv("image"))))
-    bad = verdict(tmp_path / "bad.json", str(path))
-    sound = verdict(tmp_path / "sound.json", str(float_convbeers(tmp_path / "n.onnx", 2, 8)))
+    bad = verdict(tmp_path / "bad.json", path, code=1)
+    sound = verdict(tmp_path / "sound.json", float_convbeers(tmp_path / "n.onnx", 2, 8))
     assert [found[0] for found in (bad, sound)] == ["failed", "passed"]
     limit = {"limit": 0, "bound": "at most"}
     nodes = {"name": "nodes the DPU refuses", "unit": "node", **limit}
@@ -80,11 +63,10 @@ def test_the_document_holds_the_verdict(tmp_path: Path) -> None:
     assert nodes.items() | {"value": 0, "passed": True, "detail": ""}.items() <= sound[1].items()
 
 
-def verdict(path: Path, model: str) -> tuple[str, dict[str, Any]]:
+def verdict(path: Path, model: Path, code: int = 0) -> tuple[str, dict[str, Any]]:
     """The verdict in the document, and its one check."""
-    run(model, "--json", str(path))
-    content = json.loads(path.read_text())
-    jsonschema.validate(content, json.loads(SCHEMA_PATH.read_text()))
+    done("check", model, "--json", path, code=code)
+    content = valid(path)
     (check,) = content["checks"]
     return content["verdict"], check
 
@@ -93,48 +75,38 @@ def test_a_size_that_is_not_known_is_no_zero(tmp_path: Path) -> None:
     sketch = Sketch(4)
     odd = sketch.node("Mystery", sketch.conv("image", (4, 4, 3, 3)), domain="com.microsoft")
     path = sketch.save(tmp_path / "m.onnx", sketch.conv(odd, (4, 4, 3, 3)))
-    _, output = run(str(path), "--json", str(tmp_path / "o.json"))
+    output = done("check", path, "--json", tmp_path / "o.json", code=1)
     modes = [row["figures"]["size"]["mode"] for row in tables(tmp_path / "o.json")["cuts"]]
     assert modes.count("unavailable") == 2
     assert "a size unknown" in output
 
 
 def test_a_picture_is_drawn(tmp_path: Path) -> None:
-    model = str(integer_convbeers(tmp_path / "n.onnx", 1, 8))
-    assert run(model, "--picture", str(tmp_path / "g.svg"))[0] == 0
+    model = integer_convbeers(tmp_path / "n.onnx", 1, 8)
+    done("check", model, "--picture", tmp_path / "g.svg")
     assert (tmp_path / "g.svg").read_text().startswith("<svg")
-    with pytest.raises(OptionError, match="--picture"):
-        run(model, "--picture", str(tmp_path / "g.jpg"))
-
-
-@pytest.mark.slow
-def test_the_page_of_operators_is_fresh() -> None:
-    root = Path(__file__).resolve().parents[2]
-    code = "import sys; from docs.make.operators import document; sys.stdout.write(document())"
-    done = subprocess.run([sys.executable, "-c", code], cwd=root, capture_output=True, text=True, check=True)
-    page = (root / "docs" / "reference" / "operators.md").read_text()
-    assert done.stdout == page, "run python docs/make/operators.py"
+    assert "--picture" in refused("check", model, "--picture", tmp_path / "g.jpg")
 
 
 def test_of_a_float_file_check_says_what_quantize_would(tmp_path: Path) -> None:
     """Both give the same reason, so that nobody passes one to be refused by the other."""
-    taken, refused = float_convbeers(tmp_path / "taken.onnx", 1, 8), tmp_path / "refused.onnx"
+    taken, other = float_convbeers(tmp_path / "taken.onnx", 1, 8), tmp_path / "other.onnx"
     model = onnx.load(taken)
     model.graph.node[-1].op_type = "Div"  # the global add
-    onnx.save(model, refused)
-    assert "'quantize' takes it" in run(str(taken))[1]
+    onnx.save(model, other)
+    assert "'quantize' takes it" in done("check", taken)
     with pytest.raises(ModelError) as error:
         read_network(model)
-    said = " ".join(run(str(refused))[1].split())
+    said = " ".join(done("check", other).split())
     assert f"'quantize' does not take it: expected {error.value.expected}, got {error.value.got}" in said
 
 
 def test_of_an_int8_file_nothing_is_said_of_quantising(tmp_path: Path) -> None:
-    assert "'quantize'" not in run(str(integer_convbeers(tmp_path / "int8.onnx", 1, 8)))[1]
+    assert "'quantize'" not in done("check", integer_convbeers(tmp_path / "int8.onnx", 1, 8))
 
 
 def test_a_check_and_its_picture_need_no_torch(tmp_path: Path) -> None:
     call = f"app(['check', '--picture', {str(tmp_path / 'graph.png')!r}], standalone_mode=False)"
     code = f"import sys; from deploy.cli import app; {call}; print({{'torch', 'skimage'}} & set(sys.modules))"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.splitlines()[-1] == "set()"
+    ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert ran.stdout.splitlines()[-1] == "set()"

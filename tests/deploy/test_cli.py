@@ -1,30 +1,25 @@
 """The command line as a user meets it: help, exit codes, one sentence for each fault, nothing half-written."""
 
-import json
 import os
 import subprocess
 import sys
 from pathlib import Path
 
-import jsonschema
 import numpy as np
-import onnx
 import pytest
 import tifffile
-from onnx import numpy_helper
 from PIL import Image
 from typer.core import TyperGroup
 from typer.main import get_command
 from typer.testing import CliRunner
 
 from deploy.cli import COMMANDS, app
-from deploy.networks import shipped_pair
-from deploy.results import SCHEMA_PATH
 from deploy.studies.demo import load_sensors, read_input
 from model.io.images import read_acquisition
 from model.shipped import SENSOR
 from profiles.errors import ImageError
-from profiles.toml import profile_path
+from tests.deploy.command_line import done, refused
+from tests.profiles.own_sensor import SHIPPED, edited, own_sensor
 
 runner = CliRunner()
 
@@ -49,10 +44,9 @@ def fails(arguments: list[str], *words: str) -> None:
 
 @pytest.mark.parametrize("name", COMMANDS)
 def test_every_command_has_help_with_an_example(name: str) -> None:
-    result = runner.invoke(app, [name, "--help"])
-    assert result.exit_code == 0
-    assert f"beers-deploy {name}" in " ".join(result.output.split())
-    assert "Example" in result.output
+    said = done(name, "--help")
+    assert f"beers-deploy {name}" in " ".join(said.split())
+    assert "Example" in said
 
 
 def test_what_is_told_no_sensor_takes_the_same_one() -> None:
@@ -68,16 +62,8 @@ def test_what_is_told_no_sensor_takes_the_same_one() -> None:
 def test_help_imports_nothing_heavy() -> None:
     heavy = ("torch", "onnxruntime", "onnx", "skimage", "scipy")
     code = f"import sys; import deploy.cli; print([m for m in {heavy} if m in sys.modules])"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == "[]"
-
-
-def test_the_command_reference_is_fresh() -> None:
-    root = Path(__file__).parents[2]
-    code = "import sys; from docs.make.commands import reference; sys.stdout.write(reference())"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=root)
-    page = (root / "docs" / "reference" / "commands.md").read_text()
-    assert done.stdout == page, "run python docs/make/commands.py"
+    ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert ran.stdout.strip() == "[]"
 
 
 def test_version() -> None:
@@ -87,16 +73,13 @@ def test_version() -> None:
 
 def test_the_version_in_full_says_what_the_kernels_were_asked() -> None:
     for order in (["--version", "--verbose"], ["--verbose", "--version"]):
-        result = runner.invoke(app, order)
-        assert result.exit_code == 0
-        lines = dict(line.split(": ", 1) for line in result.output.splitlines()[1:])
+        lines = dict(line.split(": ", 1) for line in done(*order).splitlines()[1:])
         assert {"system", "machine", "int8 on onnxruntime", "onnxruntime", "torch", "openvino"} <= set(lines)
 
 
 def test_restore_writes_a_whole_twelve_bit_image(tmp_path: Path) -> None:
     image, out = acquisition(tmp_path / "raw.tif"), tmp_path / "made" / "restored.tif"
-    result = runner.invoke(app, ["restore", str(image), str(out)])
-    assert result.exit_code == 0, result.output
+    done("restore", image, out)
     restored = tifffile.imread(out)
     assert restored.dtype == np.uint16
     assert restored.shape == (37, 61)
@@ -104,48 +87,25 @@ def test_restore_writes_a_whole_twelve_bit_image(tmp_path: Path) -> None:
     assert [p.name for p in out.parent.iterdir()] == ["restored.tif"]
 
 
-def test_tile_size_changes_no_pixel(tmp_path: Path) -> None:
-    image = acquisition(tmp_path / "raw.tif", 83, 97)
-    for tile in ("640", "48"):
-        arguments = ["restore", str(image), str(tmp_path / f"{tile}.tif"), "--tile", tile]
-        assert runner.invoke(app, arguments).exit_code == 0
-    np.testing.assert_array_equal(tifffile.imread(tmp_path / "48.tif"), tifffile.imread(tmp_path / "640.tif"))
-
-
 def test_a_name_that_the_terminal_cannot_show_ends_no_run(tmp_path: Path) -> None:
     image = acquisition(tmp_path / "\u6771\u4eac.tif", 40, 50)
     command = [sys.executable, "-c", "from deploy.cli import app; app()", "restore", image, tmp_path / "out.tif"]
     environment = {**os.environ, "PYTHONIOENCODING": "cp1252"}  # as pipes have it on Windows
-    done = subprocess.run(
+    ran = subprocess.run(
         list(map(str, command)), env=environment, capture_output=True, encoding="cp1252", check=False
     )
-    assert done.returncode == 0, done.stderr
-    assert "\\u6771\\u4eac" in done.stdout
+    assert ran.returncode == 0, ran.stderr
+    assert "\\u6771\\u4eac" in ran.stdout
     assert tifffile.imread(tmp_path / "out.tif").shape == (40, 50)
 
 
-def bad_images(folder: Path) -> dict[str, Path]:
-    (folder / "empty.tif").write_bytes(b"")
-    (folder / "text.tif").write_text("no image at all")
-    tifffile.imwrite(folder / "nan.tif", np.full((20, 20), np.nan, np.float32))
-    tifffile.imwrite(folder / "bright.tif", np.full((20, 20), 60000, np.uint16))
-    return {path.stem: path for path in folder.iterdir()} | {"missing": folder / "missing.tif"}
-
-
 @pytest.mark.parametrize(
-    ("name", "word"),
-    [
-        ("empty", "empty file"),
-        ("text", "readable TIFF"),
-        ("nan", "NaN"),
-        ("bright", "60000"),
-        ("missing", "no such file"),
-    ],
+    ("content", "word"), [(b"", "empty file"), (b"text", "readable TIFF"), (None, "no such file")]
 )
-def test_restore_refuses_what_is_no_acquisition(name: str, word: str, tmp_path: Path) -> None:
-    folder = tmp_path / "in"
-    folder.mkdir()
-    fails(["restore", str(bad_images(folder)[name]), str(tmp_path / "out.tif")], word)
+def test_restore_refuses_what_is_no_image(content: bytes | None, word: str, tmp_path: Path) -> None:
+    if content is not None:
+        (tmp_path / "raw.tif").write_bytes(content)
+    fails(["restore", str(tmp_path / "raw.tif"), str(tmp_path / "out.tif")], word)
     assert not (tmp_path / "out.tif").exists()
 
 
@@ -154,8 +114,7 @@ def test_a_photograph_is_no_raw_image_until_its_scale_is_named(tmp_path: Path) -
     Image.fromarray(np.random.default_rng(0).integers(0, 256, (40, 50, 3), np.uint8)).save(picture)
     fails(["restore", str(picture), str(out)], "--full-scale")
     assert not out.exists()
-    result = runner.invoke(app, ["restore", str(picture), str(out), "--full-scale", "255"])
-    assert result.exit_code == 0, result.output
+    done("restore", picture, out, "--full-scale", "255")
     restored = tifffile.imread(out)
     assert restored.dtype == np.uint8
     assert restored.shape == (3, 40, 50)
@@ -185,11 +144,6 @@ def test_an_acquisition_of_another_scale_is_read_as_digital_numbers(tmp_path: Pa
 
 def test_a_full_scale_without_an_image_is_refused() -> None:
     fails(["demo", "--full-scale", "255"], "--image")
-
-
-def test_unwritable_output_is_one_sentence(tmp_path: Path) -> None:
-    image = acquisition(tmp_path / "raw.tif")
-    fails(["restore", str(image), str(image / "below-a-file.tif")], "raw.tif")
 
 
 @pytest.mark.parametrize(
@@ -223,66 +177,30 @@ def test_garbage_models_are_refused(tmp_path: Path) -> None:
 
 def test_rules_need_a_board_that_has_them(tmp_path: Path) -> None:
     paths = [str(tmp_path / name) for name in ("float.onnx", "int8.onnx")]
-    assert runner.invoke(app, ["export", "--variant", "convbeers-xs", "--out", paths[0]]).exit_code == 0
+    done("export", "--variant", "convbeers-xs", "--out", paths[0])
     fails(["quantize", paths[0], "--target", "host-cpu", "--out", paths[1]], "--target", "--regime free")
     assert not Path(paths[1]).exists()
 
 
-def test_the_gate_passes_the_shipped_network_and_stops_a_broken_one(tmp_path: Path) -> None:
-    figures = tmp_path / "gate.json"
-    sound = runner.invoke(app, ["gate", "--patches", "4", "--json", str(figures)])
-    assert sound.exit_code == 0, sound.output
-    jsonschema.validate(json.loads(figures.read_text()), json.loads(SCHEMA_PATH.read_text()))
-    weights = tmp_path / "float.onnx"
-    assert runner.invoke(app, ["export", "--out", str(weights)]).exit_code == 0
-    broken = runner.invoke(app, ["gate", str(weights), str(broken_copy(tmp_path)), "--patches", "4"])
-    assert broken.exit_code == 1
-    assert "FAILED" in broken.output
-
-
-def broken_copy(folder: Path) -> Path:
-    """The shipped INT8 network with one convolution's weights turned upside down."""
-    model = onnx.load(shipped_pair()[1])
-    tensor = next(t for t in model.graph.initializer if t.name == "body.3.first.weight")
-    tensor.CopyFrom(numpy_helper.from_array(numpy_helper.to_array(tensor)[:, :, ::-1].copy(), tensor.name))
-    onnx.save(model, folder / "broken.onnx")
-    return folder / "broken.onnx"
-
-
-def test_swapped_models_are_noticed(tmp_path: Path) -> None:
-    weights = tmp_path / "float.onnx"
-    assert runner.invoke(app, ["export", "--out", str(weights)]).exit_code == 0
-    fails(["gate", str(shipped_pair()[1]), str(weights)], "first")
-
-
-@pytest.mark.parametrize("name", ["snow", "vck190", "pleiades-variable"])
-def test_scenes_targets_and_sensors_can_be_shown(name: str) -> None:
-    result = runner.invoke(app, ["profiles", name])
-    assert result.exit_code == 0
-    assert "source" in result.output
-
-
-def test_profiles_show_every_source() -> None:
-    assert "pleiades-degraded" in runner.invoke(app, ["profiles"]).output
-    shown = runner.invoke(app, ["profiles", "pleiades-degraded"]).output
+def test_profiles_show_scenes_targets_and_sensors_with_every_source() -> None:
+    for name in ("snow", "vck190", "pleiades-variable"):
+        assert "source" in done("profiles", name)
+    assert "pleiades-degraded" in done("profiles")
+    shown = done("profiles", "pleiades-degraded")
     assert "gain_dn_per_radiance" in shown
     assert "assumed" in shown
 
 
 def test_a_description_is_shown_and_not_obeyed(tmp_path: Path) -> None:
-    text = (profile_path("sensors", "pleiades-degraded")).read_text()
-    first = next(line for line in text.splitlines() if line.startswith("description"))
-    own = tmp_path / "own.toml"
-    own.write_text(text.replace(first, 'description = "a \\u001b]0;title\\u0007 \\u001b[31mred"') + "# \x9b31m\n")
+    first = next(line for line in SHIPPED.splitlines() if line.startswith("description"))
+    text = edited((first, 'description = "a \\u001b]0;title\\u0007 \\u001b[31mred"')) + "# \x9b31m\n"
+    own = own_sensor(tmp_path, text=text)
     for more in ([], ["--toml"]):
-        output = runner.invoke(app, ["profiles", str(own), *more]).output
+        output = done("profiles", own, *more)
         assert set("\x1b\x07\x9b").isdisjoint(output)
         assert "31m" in output
-    refused = runner.invoke(app, ["restore", "raw.tif", "\x1b[31m.png"])
-    assert "\x1b" not in refused.output
-    simulated = runner.invoke(app, ["simulate", "--explain", "--sensor", str(own)])
-    assert simulated.exit_code == 0, simulated.output
-    assert "\x1b" not in simulated.output
+    assert "\x1b" not in refused("restore", "raw.tif", "\x1b[31m.png")
+    assert "\x1b" not in done("simulate", "--explain", "--sensor", own)
 
 
 def test_simulated_pairs_are_the_same_bytes_for_the_same_seed(tmp_path: Path) -> None:
@@ -290,7 +208,7 @@ def test_simulated_pairs_are_the_same_bytes_for_the_same_seed(tmp_path: Path) ->
     pixels = np.random.default_rng(0).integers(0, 255, (500, 560, 3))
     Image.fromarray(pixels.astype(np.uint8)).save(scene)
     for run in ("a", "b"):
-        assert runner.invoke(app, ["simulate", str(scene), "--out", str(tmp_path / run)]).exit_code == 0
+        done("simulate", scene, "--out", tmp_path / run)
     for role in ("degraded", "reference"):
         (first,), (again,) = (list((tmp_path / run / role).iterdir()) for run in ("a", "b"))
         assert first.name == again.name == "0000-scene.tif"

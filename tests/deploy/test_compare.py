@@ -3,13 +3,12 @@
 from pathlib import Path
 
 import pytest
-from typer.testing import CliRunner
 
-from deploy.cli import app
 from deploy.compare import compare, parse_limit, read_document
 from deploy.results import Document
 from profiles.figures import Figure, Row, measured, predicted, unavailable
 from quant.checks import Check
+from tests.deploy.command_line import done, refused
 
 
 def document(path: Path, psnr: float = 46.5, mae: float = 0.0006, more: tuple[Row, ...] = ()) -> Path:
@@ -23,16 +22,9 @@ def document(path: Path, psnr: float = 46.5, mae: float = 0.0006, more: tuple[Ro
     return path
 
 
-def run(*arguments: object) -> tuple[int, str]:
-    result = CliRunner().invoke(app, ["compare", *map(str, arguments)])
-    assert "Traceback" not in result.output
-    return result.exit_code, " ".join(result.output.split())
-
-
 def test_the_same_document_has_not_changed(tmp_path: Path) -> None:
     one = document(tmp_path / "a.json")
-    code, output = run(one, one, "--fail-on", "PSNR<0", "--fail-on", "MAE>0%")
-    assert code == 0
+    output = done("compare", one, one, "--fail-on", "PSNR<0", "--fail-on", "MAE>0%")
     assert "3 figures in both, 0 changed, 0 gone, 0 new" in output
 
 
@@ -50,8 +42,7 @@ def test_the_same_document_has_not_changed(tmp_path: Path) -> None:
 )
 def test_a_limit_knows_its_direction_and_its_unit(limit: str, code: int, tmp_path: Path) -> None:
     before, after = document(tmp_path / "a.json"), document(tmp_path / "b.json", psnr=46.4, mae=0.00066)
-    found, output = run(before, after, "--fail-on", limit)
-    assert found == code
+    output = done("compare", before, after, "--fail-on", limit, code=code)
     assert "2 changed" in output
     assert ("FAILED gate / network" in output) == bool(code)
 
@@ -59,10 +50,9 @@ def test_a_limit_knows_its_direction_and_its_unit(limit: str, code: int, tmp_pat
 def test_figures_that_come_and_go_are_counted_and_a_watched_one_that_goes_fails(tmp_path: Path) -> None:
     extra = Row("gate", "other", {"SSIM": measured(0.99, "ratio", "pairs"), "LPIPS": unavailable("distance", "none")})
     with_more, without = document(tmp_path / "a.json", more=(extra,)), document(tmp_path / "b.json")
-    assert run(with_more, without) == (0, run(with_more, without)[1])
-    assert "2 gone, 0 new" in run(with_more, without)[1]
-    assert "0 gone, 2 new" in run(without, with_more)[1]
-    assert run(with_more, without, "--fail-on", "SSIM<-1")[0] == 1
+    assert "2 gone, 0 new" in done("compare", with_more, without)
+    assert "0 gone, 2 new" in done("compare", without, with_more)
+    done("compare", with_more, without, "--fail-on", "SSIM<-1", code=1)
 
 
 def test_from_nothing_any_rise_is_endless() -> None:
@@ -79,7 +69,7 @@ def as_row(value: float) -> dict[str, object]:
 
 def test_a_written_comparison_is_a_document_again(tmp_path: Path) -> None:
     before, after = document(tmp_path / "a.json"), document(tmp_path / "b.json", psnr=40)
-    assert run(before, after, "--json", tmp_path / "c.json")[0] == 0
+    done("compare", before, after, "--json", tmp_path / "c.json")
     assert read_document(tmp_path / "c.json")["command"] == "compare"
 
 
@@ -90,35 +80,27 @@ def test_a_written_comparison_is_a_document_again(tmp_path: Path) -> None:
 def test_what_is_no_document_gets_one_sentence(content: str | None, words: str, tmp_path: Path) -> None:
     if content is not None:
         (tmp_path / "x.json").write_text(content)
-    code, output = run(document(tmp_path / "a.json"), tmp_path / "x.json")
-    assert code == 2
-    assert words in output
+    assert words in refused("compare", document(tmp_path / "a.json"), tmp_path / "x.json")
 
 
 def test_a_watched_figure_that_can_no_longer_be_had_fails(tmp_path: Path) -> None:
-    rows = [
-        {"LPIPS": figure} for figure in (measured(0.01, "distance", "pairs"), unavailable("distance", "no weights"))
-    ]
-    names = ("a.json", "b.json")
-    for name, figures in zip(names, rows, strict=True):
-        Document(
-            "gate", {}, (), (Row("gate", "network", figures),), (Check("MAE", 0.0006, 0.0007, "of full scale"),)
-        ).write(tmp_path / name)
-    paths = [tmp_path / name for name in names]
-    assert run(*paths, "--fail-on", "LPIPS>1")[0] == 1
-    assert run(*reversed(paths), "--fail-on", "LPIPS>1")[0] == 0
+    had, gone = (
+        document(tmp_path / name, more=(Row("gate", "other", {"LPIPS": figure}),))
+        for name, figure in (
+            ("a.json", measured(0.01, "distance", "pairs")),
+            ("b.json", unavailable("distance", "no weights")),
+        )
+    )
+    done("compare", had, gone, "--fail-on", "LPIPS>1", code=1)
+    done("compare", gone, had, "--fail-on", "LPIPS>1")
 
 
 def test_a_limit_on_a_figure_that_is_not_there_is_refused(tmp_path: Path) -> None:
     one = document(tmp_path / "a.json")
-    code, output = run(one, one, "--fail-on", "PSMR<0")
-    assert code == 2
-    assert "MAE, PSNR, latency" in output
+    assert "MAE, PSNR, latency" in refused("compare", one, one, "--fail-on", "PSMR<0")
 
 
 @pytest.mark.parametrize("text", ["PSNR", "PSNR=3", ">3", "PSNR<lots"])
 def test_what_is_no_limit_gets_one_sentence(text: str, tmp_path: Path) -> None:
     one = document(tmp_path / "a.json")
-    code, output = run(one, one, "--fail-on", text)
-    assert code == 2
-    assert "NAME>CHANGE" in output
+    assert "NAME>CHANGE" in refused("compare", one, one, "--fail-on", text)

@@ -10,14 +10,13 @@ import numpy as np
 import pytest
 import tifffile
 from PIL import Image
-from typer.testing import CliRunner
 
-from deploy.cli import app
 from deploy.cluster import open_cluster
 from model.dataset import CHUNK, DatasetRecipe, make_patches, plan_windows, write_dataset
 from profiles import load_sensor
 from profiles.errors import ImageError, OptionError
 from profiles.scene_call import calling_for, load_scene_call, origins, scene_names, typical_effects
+from tests.deploy.command_line import done, refused
 from tests.deploy.two_workers import local_cluster
 
 
@@ -174,10 +173,7 @@ def test_a_dataset_begun_here_is_finished_by_a_scheduler_s_workers(
     recipe = DatasetRecipe((scene,), load_sensor("pleiades-degraded"), REFERENCE, oversampling=2, patch_px=8)
     with pytest.raises(KeyboardInterrupt):
         write_dataset(recipe, tmp_path / "d", 1, resume=False, tick=stop)
-    done = CliRunner().invoke(
-        app, ["simulate", *options, "--out", str(tmp_path / "d"), "--resume", "--scheduler", scheduler]
-    )
-    assert done.exit_code == 0, done.output
+    done("simulate", *options, "--out", tmp_path / "d", "--resume", "--scheduler", scheduler)
     write_dataset(recipe, tmp_path / "whole", 1, resume=False, tick=silent)
     assert bytes_of(tmp_path / "d") == bytes_of(tmp_path / "whole")
 
@@ -191,7 +187,5 @@ def test_a_scene_that_cannot_be_read_there_is_one_sentence(scene: Path) -> None:
 
 def test_workers_and_a_scheduler_do_not_go_together(scene: Path, tmp_path: Path) -> None:
     options = ["simulate", str(scene), "--out", str(tmp_path / "d"), "--workers", "2", "--scheduler", "host:8786"]
-    result = CliRunner().invoke(app, options)
-    assert result.exit_code == 2
-    assert "--workers: expected none beside --scheduler" in result.stderr
+    assert "--workers: expected none beside --scheduler" in refused(*options)
     assert not (tmp_path / "d").exists()

@@ -4,31 +4,29 @@ import numpy as np
 import onnx
 import pytest
 import torch
-from typer.testing import CliRunner, Result
 
-from deploy.cli import app
 from deploy.dpu.board import load_dpu
 from deploy.dpu.checker.placement import place
 from deploy.dpu.reading import network_of
 from deploy.export import banked_to_onnx, parity, require_parity, to_onnx
-from model.convbeers import BankedConvBEERS, ConvBEERS, arrays, initialise, load_network, save_network, vector_tensor
+from model.convbeers import ConvBEERS, arrays, load_network, save_network, vector_tensor
 from model.io.tensors import Weights
 from model.shipped import shipped_weights
 from model.training.grow import grow
 from model.variants import VARIANTS, Variant
 from profiles import load_sensor
 from profiles.errors import ModelError, OptionError
-from profiles.toml import HERE
 from quant.onnx_file import fixed_tile_px, metadata, save_onnx
 from quant.session import open_session, run
 from quant.tiling.walk import tiling_of
+from tests.deploy.command_line import done, refused
+from tests.model.networks import behind_a_bank, plain
+from tests.profiles.own_sensor import own_sensor
 
 
 @pytest.fixture(scope="module")
 def network() -> ConvBEERS:
-    network = ConvBEERS(Variant(blocks=2, features=8))
-    initialise(network, torch.Generator().manual_seed(0))
-    return network.eval()
+    return plain(Variant(blocks=2, features=8))
 
 
 @pytest.mark.parametrize("tile_px", [None, 40])
@@ -41,9 +39,8 @@ def test_torch_and_onnxruntime_agree(network: ConvBEERS, tile_px: int | None, tm
 
 @pytest.mark.parametrize("scale", [2, 3])
 def test_they_agree_at_a_lower_resolution_and_a_tile_is_whole_places(scale: int) -> None:
-    coarse = ConvBEERS(Variant(1, 8, scale))
-    initialise(coarse, torch.Generator().manual_seed(0))
-    assert parity(coarse.eval(), to_onnx(coarse, {}), 32) < 1e-6
+    coarse = plain(Variant(1, 8, scale))
+    assert parity(coarse, to_onnx(coarse, {}), 32) < 1e-6
     assert parity(coarse, to_onnx(coarse, {}, 12 * scale), 12 * scale) < 1e-6
     with pytest.raises(OptionError, match=f"--tile: expected a multiple of {scale} px, got 41 px"):
         to_onnx(coarse, {}, 41)
@@ -52,9 +49,7 @@ def test_they_agree_at_a_lower_resolution_and_a_tile_is_whole_places(scale: int)
 @pytest.mark.parametrize(("scale", "rows", "columns"), [(1, 37, 29), (2, 38, 46)])
 def test_a_network_behind_a_bank_is_exported_for_one_sensor(scale: int, rows: int, columns: int) -> None:
     """Its filters, unit and head's bias are constants then; tiled, with mirrored borders, it gives the same."""
-    banked, sensor = BankedConvBEERS(Variant(1, 8, scale)), load_sensor("pleiades-degraded").nominal()
-    initialise(banked, torch.Generator().manual_seed(0))
-    torch.nn.init.normal_(banked.bias.weight, 0, 0.1, torch.Generator().manual_seed(1))
+    banked, sensor = behind_a_bank(Variant(1, 8, scale), 0.1), load_sensor("pleiades-degraded").nominal()
     model = banked_to_onnx(Weights(arrays(banked.state_dict()), banked.variant, {}), sensor, {})
     image = np.random.default_rng(1).random((2, 1, rows, columns), dtype=np.float32) * 0.02 + 0.4
     vectors = vector_tensor(sensor).expand(2, -1)
@@ -81,9 +76,7 @@ def test_the_shipped_network_at_half_resolution_restores_the_same_image() -> Non
 def test_parity_notices_other_weights(network: ConvBEERS, tmp_path: Path) -> None:
     path = tmp_path / "float.onnx"
     save_onnx(to_onnx(network, {}), path)
-    other = ConvBEERS(network.variant)
-    initialise(other, torch.Generator().manual_seed(1))
-    assert parity(other.eval(), path, 33) > 1e-4
+    assert parity(plain(network.variant, seed=1), path, 33) > 1e-4
 
 
 def overflowing(network: ConvBEERS) -> ConvBEERS:
@@ -96,22 +89,19 @@ def overflowing(network: ConvBEERS) -> ConvBEERS:
 def test_a_network_that_gives_nan_is_not_exported(network: ConvBEERS, tmp_path: Path) -> None:
     weights, out = tmp_path / "run.safetensors", tmp_path / "float.onnx"
     save_network(weights, overflowing(network), {})
-    result = export("--checkpoint", str(weights), "--out", str(out))
-    assert result.exit_code == 2
-    assert "expected finite pixels" in " ".join(result.output.split())
-    assert "largest difference" not in result.output
+    said = refused("export", "--checkpoint", weights, "--out", out)
+    assert "expected finite pixels" in said
+    assert "largest difference" not in said
     assert not out.exists()
     with pytest.raises(ModelError, match="finite pixels"):
         parity(overflowing(network), to_onnx(overflowing(network), {}), 33)
     save_network(weights, network, {})
-    assert export("--checkpoint", str(weights), "--out", str(out)).exit_code == 0
+    done("export", "--checkpoint", weights, "--out", out)
 
 
 def test_an_export_that_computes_something_else_is_refused(network: ConvBEERS) -> None:
-    other = ConvBEERS(network.variant)
-    initialise(other, torch.Generator().manual_seed(1))
     with pytest.raises(ModelError, match="report it"):
-        require_parity(other.eval(), to_onnx(network, {}), 33)
+        require_parity(plain(network.variant, seed=1), to_onnx(network, {}), 33)
 
 
 def test_the_file_names_its_variant(network: ConvBEERS) -> None:
@@ -124,16 +114,10 @@ def test_a_relu_stands_behind_every_first_convolution(network: ConvBEERS) -> Non
     assert kinds.count("Add") == network.variant.blocks + 2
 
 
-def export(*options: str) -> Result:
-    return CliRunner().invoke(app, ["export", *options])
-
-
 @pytest.mark.parametrize("sensor", ["pleiades-degraded", "pleiades-variable"])
 def test_conditioned_weights_become_the_sensors(conditioned: Path, sensor: str, tmp_path: Path) -> None:
     path = tmp_path / "x.onnx"
-    result = export("--checkpoint", str(conditioned), "--sensor", sensor, "--out", str(path))
-    assert result.exit_code == 0, result.output
-    assert "warning" not in result.output
+    assert "warning" not in done("export", "--checkpoint", conditioned, "--sensor", sensor, "--out", path)
     unfolded, vector = load_network(conditioned)[0], vector_tensor(load_sensor(sensor).nominal())
     image = np.random.default_rng(1).random((1, 1, 27, 35), dtype=np.float32)
     with torch.inference_mode():
@@ -145,34 +129,27 @@ def test_conditioned_weights_become_the_sensors(conditioned: Path, sensor: str, 
 def test_another_sensor_makes_another_file_and_the_same_one_the_same_bytes(conditioned: Path, tmp_path: Path) -> None:
     files = [tmp_path / f"{number}.onnx" for number in range(3)]
     for file, sensor in zip(files, ("pleiades-degraded", "pleiades-degraded", "pleiades-variable"), strict=True):
-        assert export("--checkpoint", str(conditioned), "--sensor", sensor, "--out", str(file)).exit_code == 0
+        done("export", "--checkpoint", conditioned, "--sensor", sensor, "--out", file)
     same, again, other = (file.read_bytes() for file in files)
     assert same == again
     assert same != other
 
 
 def test_a_users_own_sensor_and_what_lies_outside_the_ranges_is_said(conditioned: Path, tmp_path: Path) -> None:
-    text = (HERE / "sensors" / "pleiades-degraded.toml").read_text()
-    mine = tmp_path / "mine.toml"
-    mine.write_text(text.replace("[noise]", "mtf_nyquist_along = 0.004\n[noise]"))
-    result = export("--checkpoint", str(conditioned), "--sensor", str(mine), "--out", str(tmp_path / "x.onnx"))
-    assert result.exit_code == 0, result.output
-    assert "warning: mtf_along 0.004 is outside 0.015 to 0.15, the network is told 0.015" in " ".join(
-        result.stderr.split()
-    )
+    mine = own_sensor(tmp_path, ("[noise]", "mtf_nyquist_along = 0.004\n[noise]"))
+    said = done("export", "--checkpoint", conditioned, "--sensor", mine, "--out", tmp_path / "x.onnx")
+    warning = "warning: mtf_along 0.004 is outside 0.015 to 0.15, the network is told 0.015"
+    assert warning in " ".join(said.split())
 
 
 def test_plain_weights_take_no_sensor_and_conditioned_ones_the_default(
     network: ConvBEERS, conditioned: Path, tmp_path: Path
 ) -> None:
-    plain, out = tmp_path / "plain.safetensors", tmp_path / "x.onnx"
-    save_network(plain, network, {})
-    useless = export("--checkpoint", str(plain), "--sensor", "pleiades-degraded", "--out", str(out))
-    unknown = export("--checkpoint", str(conditioned), "--sensor", "hubble", "--out", str(out))
-    for result, words in ((useless, "train --conditioned"), (unknown, "hubble")):
-        assert result.exit_code == 2
-        assert words in " ".join(result.output.split())
-        assert "Traceback" not in result.output
+    plain_weights, out = tmp_path / "plain.safetensors", tmp_path / "x.onnx"
+    save_network(plain_weights, network, {})
+    useless = refused("export", "--checkpoint", plain_weights, "--sensor", "pleiades-degraded", "--out", out)
+    assert "train --conditioned" in useless
+    assert "hubble" in refused("export", "--checkpoint", conditioned, "--sensor", "hubble", "--out", out)
     assert not out.exists()
-    assert export("--checkpoint", str(conditioned), "--out", str(out)).exit_code == 0
+    done("export", "--checkpoint", conditioned, "--out", out)
     assert metadata(onnx.load(out))["sensor"] == "pleiades-degraded"

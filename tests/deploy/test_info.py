@@ -8,9 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import tifffile
-from typer.testing import CliRunner
 
-from deploy.cli import app
 from deploy.info import InfoRequest, info_row
 from deploy.networks import shipped_pair
 from deploy.restoration.options import Options
@@ -18,6 +16,7 @@ from deploy.restoration.run import restore_file
 from deploy.restoration.source import TiffSource
 from profiles import load_target
 from profiles.figures import Row
+from tests.deploy.command_line import done
 
 TAGS = [
     (33550, "d", 3, (0.5, 0.25, 0.0), True),
@@ -94,9 +93,7 @@ def test_it_reads_none_of_a_file_of_ten_gigabytes(model: Path, tmp_path: Path) -
     image = tifffile.memmap(tmp_path / "big.tif", shape=(73_000, 73_000), dtype="uint16", bigtiff=True)
     del image
     out = tmp_path / "a.json"
-    arguments = ["info", str(tmp_path / "big.tif"), "--model", str(model), "--json", str(out)]
-    done = CliRunner().invoke(app, arguments)
-    assert done.exit_code == 0, done.output
+    done("info", tmp_path / "big.tif", "--model", model, "--json", out)
     (row,) = json.loads(out.read_text())["rows"]
     assert row["figures"]["width"]["value"] == 73_000
     assert [each["name"] for each in json.loads(out.read_text())["inputs"]] == [model.name]
@@ -105,6 +102,4 @@ def test_it_reads_none_of_a_file_of_ten_gigabytes(model: Path, tmp_path: Path) -
 def test_no_image_is_one_sentence(tmp_path: Path) -> None:
     (tmp_path / "a.tif").write_text("no image")
     for name in ("a.tif", "missing.tif"):
-        done = CliRunner().invoke(app, ["info", str(tmp_path / name)])
-        assert done.exit_code == 2
-        assert done.stderr.count("\n") == 1
+        assert done("info", tmp_path / name, code=2).count("\n") == 1

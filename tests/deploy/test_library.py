@@ -18,6 +18,7 @@ from deploy.restoration.run import restore_file
 from profiles.errors import ImageError, ModelError, OptionError
 from profiles.sensor_file import BLIND
 from quant.onnx_file import save_onnx
+from tests.deploy.restoration.runs import noise
 from tests.deploy.two_workers import local_cluster
 from tests.quant.tiling.small_networks import espcn
 
@@ -27,10 +28,6 @@ SHAPES = [(61, 83), (17, 130), (1, 40), (29, 29), (3, 5), (3, 41, 35), (1, 50, 2
 @pytest.fixture(scope="module")
 def da() -> Any:
     return pytest.importorskip("dask.array", reason="the extra 'dask' is not installed")
-
-
-def noise(*shape: int) -> np.ndarray:
-    return np.random.default_rng(1).integers(1, 4096, shape).astype(np.uint16)
 
 
 def of_file(folder: Path, pixels: np.ndarray, options: Options, nodata: float | None = None) -> np.ndarray:

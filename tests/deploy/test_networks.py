@@ -1,4 +1,4 @@
-"""Shipped networks by sensor: told each, in float32 and in INT8."""
+"""Shipped networks by name, wherever one is taken, and by sensor: told each, in float32 and in INT8."""
 
 import re
 import subprocess
@@ -10,9 +10,8 @@ import numpy as np
 import onnx
 import pytest
 import tifffile
-from typer.testing import CliRunner
 
-from deploy.cli import app
+from deploy.gate import files_or_shipped
 from deploy.networks import (
     WEIGHTS,
     float_file,
@@ -20,25 +19,20 @@ from deploy.networks import (
     network_file,
     shipped_pair,
     told_int8,
+    weights_file,
 )
 from model.io.files import sha256
 from model.progress import once
-from model.shipped import INT8, SENSOR, SHIPPED, shipped_names, shipped_weights
+from model.shipped import INT8, SENSOR, SHIPPED, VARIANT, shipped_names, shipped_weights
 from profiles.errors import ModelError, ProfileError
 from profiles.sensor import numbers_of
 from profiles.sensor_file import BLIND, BLIND_PROFILE, load_sensor
-from profiles.toml import HERE
 from quant.banked import calibrate
 from quant.onnx_file import load_onnx, metadata
+from tests.deploy.command_line import done, refused
+from tests.profiles.own_sensor import own_sensor
 
 KNOWN = load_sensor(SENSOR)
-
-
-def own_sensor(folder: Path, old: str = "", new: str = "", name: str = "mine.toml") -> Path:
-    """The default sensor as a user's own file, a text in it replaced."""
-    path = folder / name
-    path.write_text((HERE / "sensors" / f"{SENSOR}.toml").read_text(encoding="utf-8").replace(old, new))
-    return path
 
 
 def test_a_network_is_written_once_for_a_sensor(conditioned: Path) -> None:
@@ -54,7 +48,7 @@ def test_the_same_numbers_are_the_same_sensor_and_others_are_not(conditioned: Pa
     files = []
     for folder, old, new in (("a", "", ""), ("b", "Raw", "My raw"), ("c", "value = 0.07", "value = 0.08")):
         (tmp_path / folder).mkdir()
-        sensor = load_sensor(str(own_sensor(tmp_path / folder, old, new)))
+        sensor = load_sensor(str(own_sensor(tmp_path / folder, (old, new))))
         files.append(float_file(conditioned, sensor))
     assert files[0] == files[1]
     assert files[2] != files[0]
@@ -68,14 +62,12 @@ def test_int8_is_calibrated_once_and_then_told_any_sensor(
     monkeypatch.setattr(calibrate, "PATCHES", 3)
     monkeypatch.setattr(calibrate, "QUIET_PATCHES", 1)
     monkeypatch.chdir(tmp_path)
-    invoke = CliRunner().invoke
-    made = invoke(app, ["quantize", str(conditioned), "--sensor", SENSOR, "--patches", "1", "--out", "base.onnx"])
-    assert made.exit_code == 0, made.output
-    base, sensor = load_onnx(Path("base.onnx")), own_sensor(tmp_path, "value = 0.07", "value = 0.05")
+    done("quantize", conditioned, "--sensor", SENSOR, "--patches", "1", "--out", "base.onnx")
+    base, sensor = load_onnx(Path("base.onnx")), own_sensor(tmp_path, ("value = 0.07", "value = 0.05"))
     words = ["export", "--checkpoint", "base.onnx", "--out"]
     mine = [*words, "mine.onnx", "--sensor", str(sensor), "--delta", "mine.delta"]
-    assert invoke(app, mine).exit_code == 0
-    assert invoke(app, [*words, "applied.onnx", "--apply", "mine.delta"]).exit_code == 0
+    done(*mine)
+    done(*words, "applied.onnx", "--apply", "mine.delta")
     assert Path("applied.onnx").read_bytes() == Path("mine.onnx").read_bytes()
     assert Path("mine.delta").stat().st_size < 3000
     other = load_onnx(Path("mine.onnx"))
@@ -114,7 +106,7 @@ def test_blind_is_the_middle_of_a_range_of_sensors() -> None:
 
 def test_what_lies_outside_is_said_each_time(conditioned: Path, tmp_path: Path) -> None:
     said = list[str]()
-    sensor = load_sensor(str(own_sensor(tmp_path, "value = 0.07", "value = 0.004")))
+    sensor = load_sensor(str(own_sensor(tmp_path, ("value = 0.07", "value = 0.004"))))
     for _ in range(2):
         float_file(conditioned, sensor, said.append)
     assert len(said) == 4
@@ -133,14 +125,14 @@ def test_restoring_for_a_sensor_needs_no_torch_and_is_what_the_sensor_makes_of_i
     """At once: filters are written without what training needs."""
     dn = np.random.default_rng(0).integers(200, 1800, (37, 41)).astype(np.uint16)
     tifffile.imwrite(tmp_path / "in.tif", dn)
-    sensor = own_sensor(tmp_path, "value = 0.07", "value = 0.05")
+    sensor = own_sensor(tmp_path, ("value = 0.07", "value = 0.05"))
     words = ["restore", str(tmp_path / "in.tif"), "out.tif", "--model", name, "--sensor", str(sensor)]
     call = f"app({words!r}, standalone_mode=False)"
-    code = f"import sys; from deploy.cli import app; {call}; print('torch' in sys.modules)"
-    done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=True)
-    assert done.stdout.splitlines()[-1] == "False"
+    code = f"import sys; from deploy.cli import app; {call}; print({{'torch', 'skimage'}} & set(sys.modules))"
+    ran = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=True)
+    assert ran.stdout.splitlines()[-1] == "set()"
     other = [*words[:2], str(tmp_path / "other.tif"), *words[3:5], "--sensor", SENSOR]
-    assert CliRunner().invoke(app, other).exit_code == 0
+    done(*other)
     restored = [tifffile.imread(tmp_path / name).astype(int) for name in ("out.tif", "other.tif")]
     assert np.abs(restored[0] - restored[1]).max() > 5
 
@@ -149,9 +141,7 @@ def test_a_network_that_is_made_already_takes_no_sensor(tmp_path: Path) -> None:
     tifffile.imwrite(tmp_path / "in.tif", np.full((20, 30), 900, np.uint16))
     mine = shipped_pair("convbeers-xs")[0]
     words = ["restore", str(tmp_path / "in.tif"), str(tmp_path / "out.tif"), "--model", str(mine), "--sensor", SENSOR]
-    done = CliRunner().invoke(app, words)
-    assert done.exit_code == 2
-    assert "leave --sensor out" in " ".join(done.output.split())
+    assert "leave --sensor out" in refused(*words)
     assert not (tmp_path / "out.tif").exists()
 
 
@@ -166,3 +156,72 @@ def test_what_several_networks_have_to_say_is_said_once() -> None:
     for sentence in ("a", "b", "a", "b", "c"):
         tell(sentence)
     assert said == ["a", "b", "c"]
+
+
+@pytest.mark.parametrize("name", ["convbeers-xs", "convbeers-s"])
+def test_a_name_is_the_shipped_network(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    floating, int8 = shipped_pair(name)
+    assert int8_file(Path(name), KNOWN) == int8_file(Path(f"{name}-int8"), KNOWN) == int8
+    assert network_file(Path(name), KNOWN) == float_file(Path(f"{name}-int8"), KNOWN) == floating
+    assert network_file(Path(f"{name}-int8"), KNOWN) == int8
+    assert weights_file(Path(name)) == shipped_weights(name)
+    monkeypatch.chdir(tmp_path)
+    Path(name).write_bytes(b"mine")  # a file of that name is what was meant
+    assert int8_file(Path(name), KNOWN) == float_file(Path(name), KNOWN) == weights_file(Path(name)) == Path(name)
+
+
+@pytest.mark.parametrize("given", ["none", "none.onnx", "folder/convbeers-s"])
+def test_anything_else_stays_a_path(given: str) -> None:
+    assert int8_file(Path(given), KNOWN) == float_file(Path(given), KNOWN) == weights_file(Path(given)) == Path(given)
+
+
+def test_nothing_given_is_the_default() -> None:
+    assert network_file(None, KNOWN) == int8_file(None, KNOWN) == int8_file(Path(VARIANT), KNOWN)
+
+
+def test_commands_take_the_name(tmp_path: Path) -> None:
+    tifffile.imwrite(tmp_path / "in.tif", np.random.default_rng(0).integers(200, 1800, (37, 41)).astype(np.uint16))
+    for model in ("convbeers-xs-int8", str(shipped_pair("convbeers-xs", "blind")[1])):
+        out = tmp_path / f"{len(model)}.tif"
+        said = done("restore", tmp_path / "in.tif", out, "--model", model)
+        assert ("network: convbeers-xs-int8, told no sensor" in said) == (model == "convbeers-xs-int8")
+    first, second = (tifffile.imread(path) for path in tmp_path.glob("*.tif") if path.name != "in.tif")
+    np.testing.assert_array_equal(first, second)
+    said = refused("restore", tmp_path / "in.tif", tmp_path / "x.tif", "--model", "huge")
+    assert "a shipped network (convbeers, convbeers-half" in said
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        ["check", "convbeers-xs", "--tile", "64"],
+        ["stress", "convbeers-xs", "convbeers-xs-int8", "--cases", "1 x 1", "--stages", "INT8"],
+    ],
+)
+def test_judges_take_the_name(command: list[str]) -> None:
+    assert f"{command[0]} passed" in done(*command)
+
+
+def test_the_gate_takes_the_names() -> None:
+    for int8 in ("convbeers-xs", "convbeers-xs-int8"):
+        assert files_or_shipped(Path("convbeers-xs"), Path(int8), None) == shipped_pair("convbeers-xs")
+
+
+def test_export_takes_the_name(tmp_path: Path) -> None:
+    done("export", "--checkpoint", "convbeers-xs", "--out", tmp_path / "net.onnx")
+    assert metadata(load_onnx(tmp_path / "net.onnx"))["variant"] == "convbeers-xs"
+
+
+def test_export_writes_a_shipped_networks_integers_for_the_host_and_the_board(tmp_path: Path) -> None:
+    host, board = str(tmp_path / "int8.onnx"), str(tmp_path / "core.onnx")
+    words = ["export", "--checkpoint", "convbeers-half-xs-int8", "--sensor", "blind", "--tile", "64", "--out", host]
+    done(*words, "--board", board)
+    assert metadata(load_onnx(Path(host)))["sensor"] == "blind"
+    for path in (host, board):
+        done("check", path)
+
+
+def test_a_tile_that_a_network_cannot_rearrange_is_refused(tmp_path: Path) -> None:
+    words = ["export", "--checkpoint", "convbeers-half-xs-int8", "--tile", "65", "--out", str(tmp_path / "x.onnx")]
+    assert "--tile: expected a multiple of 2 px, got 65 px" in refused(*words)
+    assert not (tmp_path / "x.onnx").exists()

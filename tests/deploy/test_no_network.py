@@ -19,9 +19,10 @@ import tifffile
 from typer.testing import CliRunner
 
 from deploy.cli import app
-from model.convbeers import ConvBEERS, initialise, save_network
+from model.convbeers import save_network
 from model.variants import Variant
 from tests.deploy.sealed import SOCKET_CALL
+from tests.model.networks import plain
 
 pytestmark = pytest.mark.slow
 
@@ -54,12 +55,8 @@ def done(*arguments: object) -> None:
 
 
 def test_the_chain_opens_no_socket(tmp_path: Path, no_sockets: list[tuple[object, ...]]) -> None:
-    import torch
-
-    network = ConvBEERS(Variant(1, 4))
-    initialise(network, torch.Generator().manual_seed(0))
     weights, scenes = tmp_path / "w.safetensors", tmp_path / "scenes"
-    save_network(weights, network, {"degraded": "pleiades-degraded"})
+    save_network(weights, plain(Variant(1, 4)), {"degraded": "pleiades-degraded"})
     scenes.mkdir()
     rng = np.random.default_rng(0)
     tifffile.imwrite(scenes / "a.tif", rng.integers(200, 1800, (700, 700)).astype(np.uint16))

@@ -105,14 +105,14 @@ def test_no_command_takes_such_weights(tmp_path: Path, command: str) -> None:
 @pytest.mark.parametrize(
     "command",
     [
-        "quantize {0} --out {1}/int8.onnx --patches 1",
-        "quantize {0} --out {1}/int8.onnx --patches 1 --regime free",
+        "quantize {0} --out {1}/int8.onnx --images {2} --patches 1",
+        "quantize {0} --out {1}/int8.onnx --images {2} --patches 1 --regime free",
         "bench {0} --target host --tile 64 --json {1}/b.json",
         "restore {1}/raw.tif {1}/out.tif --model {0}",
     ],
 )
-def test_a_network_whose_sums_overflow_is_refused_where_it_runs(tmp_path: Path, command: str) -> None:
-    said = spoken(command, written(tmp_path, overflowing, ".onnx"))
+def test_a_network_whose_sums_overflow_is_refused_where_it_runs(tmp_path: Path, command: str, scenes: Path) -> None:
+    said = spoken(command.replace("{2}", str(scenes)), written(tmp_path, overflowing, ".onnx"))
     assert "NaN" in said
     assert "finite" in said
 
@@ -122,8 +122,10 @@ def test_weights_whose_sums_overflow_are_neither_exported_nor_trained_from(tmp_p
     assert "finite" in spoken(command, written(tmp_path, overflowing, ".safetensors"))
 
 
-def test_the_gate_fails_a_network_whose_sums_overflow(tmp_path: Path) -> None:
-    said = spoken(f"gate {{0}} {INT8} --patches 1", written(tmp_path, overflowing, ".onnx"), exit_code=1)
+def test_the_gate_fails_a_network_whose_sums_overflow(tmp_path: Path, scenes: Path) -> None:
+    said = spoken(
+        f"gate {{0}} {INT8} --images {scenes} --patches 1", written(tmp_path, overflowing, ".onnx"), exit_code=1
+    )
     assert "gate FAILED" in said
     assert "MAE nan" in said
 

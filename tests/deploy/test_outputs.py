@@ -6,9 +6,8 @@ docs/make/options.py says of every path that a command takes whether it is read 
 import os
 import socket
 import stat
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
-from itertools import combinations
+from collections.abc import Callable, Iterable, Iterator
+from itertools import combinations, cycle
 from pathlib import Path
 from typing import Any, get_type_hints
 
@@ -18,38 +17,8 @@ from typer.main import get_command
 from typer.testing import CliRunner
 
 from deploy.cli import COMMANDS, app
-from docs.make.options import FILE, FOLDER, PATHS, Paths
+from docs.make.options import FILE, PATHS
 from model.io import files
-
-
-@dataclass(frozen=True)
-class Case:
-    """How a command's paths are tried.
-
-    Attributes:
-        paths: which are read, and which written.
-        inside: a file that the command writes into its output folders.
-        suffix: of every name, where the command asks for one.
-        more: arguments without which the command does not write.
-    """
-
-    paths: Paths
-    inside: str = ""
-    suffix: str = ".tif"
-    more: tuple[str, ...] = ()
-
-    @property
-    def written(self) -> dict[str, str]:
-        return self.paths.written
-
-    @property
-    def read(self) -> tuple[str, ...]:
-        return self.paths.read
-
-    @property
-    def also_read(self) -> tuple[str, ...]:
-        return self.paths.also_read
-
 
 INSIDE = {
     "demo": "int8.onnx",
@@ -60,19 +29,29 @@ INSIDE = {
     "detect": "report.html",
     "tradeoff": "tradeoff.html",
 }
+"""A file that a command writes into its output folders."""
 SUFFIXES = {"check": ".svg", "compare": ".json"}
+"""Of every name, where a command asks for one."""
 MORE = {"stress": ("--bit-flips",)}
+"""Arguments without which a command does not write."""
 BESIDE = {
     ("restore", "sensor"): ("--method", "traditional"),
     ("detect", "labels"): ("--images", "pictures"),
     ("tradeoff", "detector"): ("--labelled", "pictures"),
 }
 """What an option is refused without."""
-CASES = {
-    name: Case(paths, INSIDE.get(name, ""), SUFFIXES.get(name, ".tif"), MORE.get(name, ()))
-    for name, paths in PATHS.items()
-}
-WRITERS = [(name, option) for name, case in CASES.items() for option in case.written]
+WRITERS = [(name, option) for name, paths in PATHS.items() for option in paths.written]
+FILES = [(name, option) for name, option in WRITERS if PATHS[name].written[option] == FILE]
+FOLDERS = [pair for pair in WRITERS if pair not in FILES]
+
+
+def in_turn(cases: Iterable[tuple[str, ...]], ways: Iterable[object]) -> list[tuple[object, ...]]:
+    """Each case one way, each way in its turn: one function looks at the outputs of all commands."""
+    return [(*case, way) for case, way in zip(cases, cycle(ways), strict=False)]
+
+
+def suffix_of(name: str) -> str:
+    return SUFFIXES.get(name, ".tif")
 
 
 def parameters(command: str) -> dict[str, Any]:
@@ -85,13 +64,13 @@ def parameters(command: str) -> dict[str, Any]:
 def test_every_path_of_a_command_is_known_to_be_read_or_written(name: str) -> None:
     hints = get_type_hints(COMMANDS[name][0]).items()
     paths = {option for option, hint in hints if "Path" in str(hint)}
-    assert paths == {*CASES[name].written, *CASES[name].read}
-    assert set(CASES[name].also_read) <= set(parameters(name))
+    assert paths == {*PATHS[name].written, *PATHS[name].read}
+    assert set(PATHS[name].also_read) <= set(parameters(name))
 
 
 def arguments(name: str, values: dict[str, Path]) -> list[str]:
     """The command with these values; arguments that it cannot do without get files that exist."""
-    case, options, positional = CASES[name], [], []
+    options, positional = list[str](), list[str]()
     for key, parameter in parameters(name).items():
         value = values.get(key)
         if parameter.param_type_name == "argument":
@@ -99,19 +78,19 @@ def arguments(name: str, values: dict[str, Path]) -> list[str]:
         elif value is not None:
             options += [parameter.opts[0], str(value)]
     more = [word for option in values for word in BESIDE.get((name, option), ())]
-    return [name, *positional, *options, *case.more, *more]
+    return [name, *positional, *options, *MORE.get(name, ()), *more]
 
 
 def given(name: str, folder: Path, **values: Path) -> list[str]:
     """As `arguments`: an input for each argument, an output for each that must be given, unless told otherwise."""
-    case, whole = CASES[name], dict(values)
+    paths, whole = PATHS[name], dict(values)
     for key, parameter in parameters(name).items():
         if key in whole:
             continue
-        if parameter.param_type_name == "argument" and key in case.read:
-            whole[key] = kept(folder / f"input-{key}{case.suffix}")
-        elif key in case.written and parameter.required:
-            whole[key] = folder / f"output-{key}{case.suffix}"
+        if parameter.param_type_name == "argument" and key in paths.read:
+            whole[key] = kept(folder / f"input-{key}{suffix_of(name)}")
+        elif key in paths.written and parameter.required:
+            whole[key] = folder / f"output-{key}{suffix_of(name)}"
     return arguments(name, whole)
 
 
@@ -123,11 +102,10 @@ def kept(path: Path) -> Path:
 
 def output_at(name: str, option: str, folder: Path) -> tuple[Path, Path]:
     """An option's value, and the file that the command will write for it."""
-    case = CASES[name]
-    if case.written[option] == FILE:
-        path = folder / f"place-{option}{case.suffix}"
+    if (name, option) in FILES:
+        path = folder / f"place-{option}{suffix_of(name)}"
         return path, path
-    return folder / f"place-{option}", folder / f"place-{option}" / case.inside
+    return folder / f"place-{option}", folder / f"place-{option}" / INSIDE[name]
 
 
 def state(folder: Path) -> dict[str, bytes | str]:
@@ -189,8 +167,7 @@ STANDS: dict[str, tuple[Callable[[Path], object], str]] = {
 }
 
 
-@pytest.mark.parametrize("what", STANDS)
-@pytest.mark.parametrize(("name", "option"), WRITERS)
+@pytest.mark.parametrize(("name", "option", "what"), in_turn(WRITERS, STANDS))
 def test_only_a_regular_file_is_written_over(name: str, option: str, what: str, tmp_path: Path) -> None:
     value, file = output_at(name, option, tmp_path)
     file.parent.mkdir(parents=True, exist_ok=True)
@@ -199,10 +176,7 @@ def test_only_a_regular_file_is_written_over(name: str, option: str, what: str, 
     refused(given(name, tmp_path, **{option: value}), tmp_path, str(file), word)
 
 
-@pytest.mark.parametrize(
-    ("name", "option"), [pair for pair in WRITERS if CASES[pair[0]].written[pair[1]] == FOLDER], ids=str
-)
-@pytest.mark.parametrize("make", [kept, pipe, device, dangling])
+@pytest.mark.parametrize(("name", "option", "make"), in_turn(FOLDERS, [kept, pipe, device, dangling]))
 def test_an_output_folder_is_a_folder(name: str, option: str, make: Callable[[Path], object], tmp_path: Path) -> None:
     make(tmp_path / "place")
     refused(given(name, tmp_path, **{option: tmp_path / "place"}), tmp_path, "place")
@@ -210,9 +184,9 @@ def test_an_output_folder_is_a_folder(name: str, option: str, make: Callable[[Pa
 
 @pytest.mark.parametrize(("name", "option"), WRITERS, ids=str)
 def test_what_is_refused_for_its_input_leaves_no_new_folder(name: str, option: str, tmp_path: Path) -> None:
-    source = kept(tmp_path / f"source{CASES[name].suffix}")
+    source = kept(tmp_path / f"source{suffix_of(name)}")
     value, _ = output_at(name, option, tmp_path / "new" / "below")
-    command = given(name, tmp_path, **{option: value, CASES[name].read[0]: source})
+    command = given(name, tmp_path, **{option: value, PATHS[name].read[0]: source})
     before = state(tmp_path)
     assert CliRunner().invoke(app, command).exit_code == 2, command
     assert state(tmp_path) == before, command
@@ -220,16 +194,17 @@ def test_what_is_refused_for_its_input_leaves_no_new_folder(name: str, option: s
 
 def inputs_met() -> Iterator[tuple[str, str, str]]:
     for name, option in WRITERS:
-        for source in (*CASES[name].read, *CASES[name].also_read):
+        for source in (*PATHS[name].read, *PATHS[name].also_read):
             yield name, option, source
 
 
-@pytest.mark.parametrize("how", ["itself", "symbolic link", "hard link"])
-@pytest.mark.parametrize(("name", "option", "source"), list(inputs_met()))
+@pytest.mark.parametrize(
+    ("name", "option", "source", "how"), in_turn(inputs_met(), ["itself", "symbolic link", "hard link"])
+)
 def test_no_output_is_an_input(name: str, option: str, source: str, how: str, tmp_path: Path) -> None:
     value, file = output_at(name, option, tmp_path)
     file.parent.mkdir(parents=True, exist_ok=True)
-    source_path = kept(file if how == "itself" else tmp_path / f"source{CASES[name].suffix}")
+    source_path = kept(file if how == "itself" else tmp_path / f"source{suffix_of(name)}")
     if how == "symbolic link":
         file.symlink_to(source_path)
     elif how == "hard link":
@@ -241,13 +216,13 @@ def test_no_output_is_an_input(name: str, option: str, source: str, how: str, tm
 FOLDERS_READ = [
     (name, option, source)
     for name, option, source in inputs_met()
-    if source in ("images", "pairs", "calibration") and CASES[name].written[option] == FILE
+    if source in ("images", "pairs", "calibration") and (name, option) in FILES
 ]
 
 
 @pytest.mark.parametrize(("name", "option", "source"), FOLDERS_READ)
 def test_no_output_is_a_file_of_an_input_folder(name: str, option: str, source: str, tmp_path: Path) -> None:
-    scene = kept(tmp_path / "scenes" / ("scene.tif" if CASES[name].suffix == ".json" else "scene.png"))
+    scene = kept(tmp_path / "scenes" / ("scene.tif" if suffix_of(name) == ".json" else "scene.png"))
     if source == "pairs":
         scene = kept(tmp_path / "scenes" / "reference" / "scene.tif")
     command = given(name, tmp_path, **{option: scene, source: tmp_path / "scenes"})
@@ -273,29 +248,27 @@ def test_pictures_do_not_go_where_images_are_read(command: str, tmp_path: Path) 
     refused([command, *wanted[command]], tmp_path, "the folder of an input")
 
 
-PAIRS = [(name, one, other) for name, case in CASES.items() for one, other in combinations(case.written, 2)]
+PAIRS = [(name, one, other) for name, paths in PATHS.items() for one, other in combinations(paths.written, 2)]
 
 
 @pytest.mark.parametrize(("name", "one", "other"), PAIRS)
 def test_no_two_outputs_are_one(name: str, one: str, other: str, tmp_path: Path) -> None:
     value, file = output_at(name, one, tmp_path)
-    if CASES[name].written[other] == FOLDER:
+    if (name, other) in FOLDERS:
         (value, file), (one, other) = output_at(name, other, tmp_path), (other, one)
     words = str(tmp_path), "another output"
     refused(given(name, tmp_path, **{one: value, other: file}), tmp_path, *words)
     (tmp_path / "detour").mkdir(exist_ok=True)
     around = tmp_path / "detour" / ".." / file.relative_to(tmp_path)
     refused(given(name, tmp_path, **{one: value, other: around}), tmp_path, *words)
-    refused(given(name, tmp_path, **{one: value, other: file / f"below{CASES[name].suffix}"}), tmp_path, *words)
+    refused(given(name, tmp_path, **{one: value, other: file / f"below{suffix_of(name)}"}), tmp_path, *words)
 
 
-@pytest.mark.parametrize(
-    ("name", "option"), [pair for pair in WRITERS if CASES[pair[0]].written[pair[1]] == FILE], ids=str
-)
+@pytest.mark.parametrize(("name", "option"), FILES, ids=str)
 def test_no_output_is_shipped(name: str, option: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A network that a run reads by its name, or where it is given none."""
     monkeypatch.setattr(files, "SHIPPED", tmp_path / "weights")
-    value = kept(tmp_path / "weights" / f"kept{CASES[name].suffix}")
+    value = kept(tmp_path / "weights" / f"kept{suffix_of(name)}")
     refused(given(name, tmp_path, **{option: value}), tmp_path, str(value), "a file of this installation")
 
 

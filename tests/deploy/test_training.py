@@ -8,17 +8,17 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
-from typer.testing import CliRunner
 
-from deploy.cli import app
-from model.convbeers import BankedConvBEERS, initialise, load_network, save_network, told
+from model.convbeers import load_network, save_network, told
 from model.io.tensors import read_tensors
 from model.simulator.procedural import procedural_scene
 from model.training import run as training
 from model.training.patches import StoredPairs
 from model.training.run import Log
 from model.variants import VARIANTS
-from profiles.toml import profile_path
+from tests.deploy.command_line import done, refused
+from tests.model.networks import behind_a_bank
+from tests.profiles.own_sensor import own_sensor
 
 SIDE = 420
 
@@ -35,9 +35,7 @@ def images(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def run(images: Path, out: Path, *more: str, steps: int = 4) -> str:
     options = ["--variant", "convbeers-xs", "--steps", str(steps), "--batch", "2", "--patch", "32"]
-    result = CliRunner().invoke(app, ["train", "--images", str(images), "--out", str(out), *options, *more])
-    assert result.exit_code == 0, result.output
-    return result.output
+    return done("train", "--images", images, "--out", out, *options, *more)
 
 
 def rows(path: Path) -> list[dict[str, str]]:
@@ -86,10 +84,7 @@ def test_a_conditioned_run_goes_on_from_others_and_resumes_to_the_same(images: P
 
 def banked_weights(folder: Path) -> Path:
     """Of a small network behind a bank, that give something else for each sensor."""
-    network = BankedConvBEERS(VARIANTS["convbeers-xs"])
-    initialise(network, torch.Generator().manual_seed(0))
-    torch.nn.init.normal_(network.bias.weight, 0.0, 0.1, torch.Generator().manual_seed(1))
-    save_network(folder / "start.safetensors", network, {})
+    save_network(folder / "start.safetensors", behind_a_bank(VARIANTS["convbeers-xs"], 0.1), {})
     return folder / "start.safetensors"
 
 
@@ -118,9 +113,8 @@ def test_a_run_takes_weights_and_a_teacher_of_its_own_kind(images: Path, tmp_pat
     run(images, tmp_path / "a", "--conditioned", "--teacher", str(banked_weights(tmp_path)), steps=1)
     for option in ("--start", "--teacher"):
         options = ["--images", str(images), "--out", str(tmp_path / "b"), "--steps", "1"]
-        result = CliRunner().invoke(app, ["train", *options, option, str(tmp_path / "start.safetensors")])
-        assert result.exit_code == 2
-        assert "expected weights: a plain network's" in " ".join(result.output.split())
+        said = refused("train", *options, option, tmp_path / "start.safetensors")
+        assert "expected weights: a plain network's" in said
 
 
 def weights_of(path: Path) -> dict[str, torch.Tensor]:
@@ -130,9 +124,7 @@ def weights_of(path: Path) -> dict[str, torch.Tensor]:
 def test_a_patch_must_be_whole_places_of_the_teacher_too(images: Path, tmp_path: Path) -> None:
     run(images, tmp_path / "a", "--variant", "convbeers-half", "--validate-every", "0", steps=1)
     teacher = ["--teacher", str(tmp_path / "a" / "convbeers-half.safetensors"), "--patch", "33", "--steps", "1"]
-    result = CliRunner().invoke(app, ["train", "--images", str(images), "--out", str(tmp_path / "b"), *teacher])
-    assert result.exit_code == 2
-    assert "a multiple of 2 px" in " ".join(result.output.split())
+    assert "a multiple of 2 px" in refused("train", "--images", images, "--out", tmp_path / "b", *teacher)
     assert not (tmp_path / "b").exists()
 
 
@@ -168,32 +160,22 @@ def test_a_patch_must_be_whole_places_of_the_teacher_too(images: Path, tmp_path:
 def test_wrong_options_get_one_sentence(options: list[str], words: str, tmp_path: Path) -> None:
     if "cuda" in options and torch.cuda.is_available():
         pytest.skip("a CUDA device is here")
-    result = CliRunner().invoke(app, ["train", "--out", str(tmp_path / "r"), "--steps", "1", *options])
-    assert result.exit_code == 2
-    assert words in " ".join(result.output.split())
-    assert "Traceback" not in result.output
+    assert words in refused("train", "--out", tmp_path / "r", "--steps", "1", *options)
 
 
 def test_pairs_bring_their_sensor_and_its_full_scale(
     images: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Of 14 bits, and of another MTF along the track than across it."""
-    text = profile_path("sensors", "pleiades-degraded").read_text(encoding="utf-8")
-    own = tmp_path / "own.toml"
     along = 'mtf_nyquist_along = { value = 0.05, status = "measured", source = "a test" }'
-    text = text.replace("bits = { value = 12", "bits = { value = 14").replace("[mtf]", f"[mtf]\n{along}")
-    own.write_text(text, encoding="utf-8")
+    own = own_sensor(tmp_path, ("bits = { value = 12", "bits = { value = 14"), ("[mtf]", f"[mtf]\n{along}"))
     scene = next(images.glob("*.png"))
-    simulated = CliRunner().invoke(
-        app, ["simulate", str(scene), "--sensor", str(own), "--out", str(tmp_path / "pairs"), "--workers", "1"]
-    )
-    assert simulated.exit_code == 0, simulated.output
+    done("simulate", scene, "--sensor", own, "--out", tmp_path / "pairs", "--workers", "1")
     options = ["--pairs", str(tmp_path / "pairs"), "--variant", "convbeers-xs", "--steps", "1", "--batch", "1"]
     options += ["--patch", "17", "--out", str(tmp_path / "r")]
     for contradiction in (["--sensor", "pleiades-degraded"], ["--reference", "dior-medium"]):
-        result = CliRunner().invoke(app, ["train", *options, *contradiction])
-        assert result.exit_code == 2
-        assert f"{contradiction[0]}: expected the sensor that made the pairs" in result.output
+        said = refused("train", *options, *contradiction)
+        assert f"{contradiction[0]}: expected the sensor that made the pairs" in said
         assert not list(tmp_path.glob("r/*"))
     made = list[StoredPairs]()
 
@@ -202,18 +184,15 @@ def test_pairs_bring_their_sensor_and_its_full_scale(
         return made[0]
 
     monkeypatch.setattr(training, "StoredPairs", kept)
-    result = CliRunner().invoke(app, ["train", *options])
-    assert result.exit_code == 0, result.output
-    assert load_network(tmp_path / "r" / "convbeers-xs.safetensors")[1]["degraded"] == "own"
+    done("train", *options)
+    assert load_network(tmp_path / "r" / "convbeers-xs.safetensors")[1]["degraded"] == "mine"
     assert (made[0].max_dn, made[0].quarters) == (16383, False)
 
 
 def test_a_loss_of_nothing_but_lpips_needs_its_weights(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("BEERS_LPIPS_WEIGHTS", raising=False)
     options = ["--drawn", "1", "--l1-weight", "0", "--fft-weight", "0", "--steps", "1"]
-    result = CliRunner().invoke(app, ["train", "--out", str(tmp_path / "r"), *options])
-    assert result.exit_code == 2
-    assert "lacks its weights" in " ".join(result.output.split())
+    assert "lacks its weights" in refused("train", "--out", tmp_path / "r", *options)
 
 
 @pytest.mark.parametrize("validate_every", ["0", "2"])
@@ -221,39 +200,27 @@ def test_a_loss_of_nothing_but_lpips_needs_its_weights(tmp_path: Path, monkeypat
 def test_a_run_that_ends_in_nan_leaves_no_weights(
     conditioned: bool, validate_every: str, images: Path, tmp_path: Path
 ) -> None:
-    more = [
-        "--learning-rate",
-        "1e30",
-        "--validate-every",
-        validate_every,
-        *(["--conditioned"] if conditioned else []),
-    ]
+    more = ["--learning-rate", "1e30", "--validate-every", validate_every, *["--conditioned"] * conditioned]
     options = ["--variant", "convbeers-xs", "--steps", "2", "--batch", "2", "--patch", "32", *more]
-    result = CliRunner().invoke(app, ["train", "--images", str(images), "--out", str(tmp_path / "r"), *options])
-    assert result.exit_code == 2, result.output
-    assert "lower the learning rate" in " ".join(result.output.split())
-    assert "wrote" not in result.output
+    said = refused("train", "--images", images, "--out", tmp_path / "r", *options)
+    assert "lower the learning rate" in said
+    assert "wrote" not in said
     assert not list((tmp_path / "r").glob("convbeers*"))
 
 
 def test_a_run_in_the_way_is_not_overwritten(images: Path, tmp_path: Path) -> None:
     run(images, tmp_path / "a", steps=1)
     options = ["--out", str(tmp_path / "a"), "--variant", "convbeers-xs", "--steps", "1"]
-    result = CliRunner().invoke(app, ["train", "--images", str(images), *options])
-    assert result.exit_code == 2
-    assert "--resume" in result.output
+    assert "--resume" in refused("train", "--images", images, *options)
 
 
 def test_a_larger_network_starts_where_a_smaller_one_stopped(images: Path, tmp_path: Path) -> None:
     run(images, tmp_path / "narrow", steps=3)
     narrow = tmp_path / "narrow" / "convbeers-xs.safetensors"
-    large = ["--start", str(narrow), "--variant", "convbeers-s", "--steps", "1"]
-    grown = CliRunner().invoke(app, ["train", "--images", str(images), "--out", str(tmp_path / "large"), *large])
-    assert grown.exit_code == 0, grown.output
+    large = ["--start", str(narrow), "--variant", "convbeers-s", "--validate-every", "0"]
+    run(images, tmp_path / "large", *large, steps=1)
     small = ["--start", str(tmp_path / "large" / "convbeers-s.safetensors"), "--variant", "convbeers-xs"]
-    result = CliRunner().invoke(app, ["train", "--images", str(images), "--out", str(tmp_path / "small"), *small])
-    assert result.exit_code == 2
-    assert "8 blocks of 32 features" in " ".join(result.output.split())
+    assert "8 blocks of 32 features" in refused("train", "--images", images, "--out", tmp_path / "small", *small)
     again = run(images, tmp_path / "again", "--start", str(narrow), "--learning-rate", "0", "--validate-every", "0")
     assert "wrote" in again
     weights = (load_network(path)[0].state_dict() for path in (narrow, tmp_path / "again" / narrow.name))

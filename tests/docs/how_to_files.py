@@ -11,7 +11,7 @@ import torch
 from PIL import Image
 
 from examples.networks import build, to_onnx
-from model.convbeers import ConvBEERS, initialise, save_network
+from model.convbeers import save_network
 from model.shipped import SHIPPED
 from model.variants import Variant
 from profiles.toml import HERE as PROFILES
@@ -20,6 +20,7 @@ from tests.deploy.studies.detection.folders import Object, dior
 from tests.deploy.studies.detection.networks import detector, raw
 from tests.deploy.studies.test_characterise import acquisition
 from tests.docs.walk import ROOT, Walk
+from tests.model.networks import plain
 
 HOW_TO = ROOT / "docs" / "how-to"
 SITES, SCENE_PX = 6, 820
@@ -89,9 +90,7 @@ def scenes(folder: Path) -> None:
 
 def networks(folder: Path) -> None:
     """Weights of a narrow network, two networks of other kinds, and a detector that always sees the same."""
-    narrow = ConvBEERS(Variant(blocks=1, features=4))
-    initialise(narrow, torch.Generator().manual_seed(0))
-    save_network(folder / "narrow.safetensors", narrow, {"degraded": "pleiades-degraded"})
+    save_network(folder / "narrow.safetensors", plain(Variant(1, 4)), {"degraded": "pleiades-degraded"})
     for file, name in (("network.onnx", "ffdnet"), ("resnet50.onnx", "classifier")):
         network = build(name, torch.Generator().manual_seed(0))
         save_onnx(to_onnx(name, network), folder / file)

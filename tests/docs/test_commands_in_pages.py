@@ -70,20 +70,3 @@ def refusal(line: str) -> str:
 def test_every_command_of_a_page_is_read_by_the_command_line(page: Path) -> None:
     found = [] if page.name == GENERATED_FROM_IT else [*commands(page.read_text(encoding="utf-8"))]
     assert [said for said in map(refusal, found) if said] == []
-
-
-def test_pages_have_commands_in_each_way_of_writing_them() -> None:
-    whole = [line for page in PAGES for line in commands(page.read_text(encoding="utf-8"))]
-    assert len(whole) > 80
-    assert [
-        *commands(f"    {NAME} check a.onnx\nsee `{NAME} info b.tif`\n```bash\n{NAME} bench \\\n  --size 2x2\n```")
-    ] == [
-        f"{NAME} check a.onnx",
-        f"{NAME} info b.tif",
-        f"{NAME} bench --size 2x2",
-    ]
-
-
-@pytest.mark.parametrize("line", ["bench --no-such-option", "no-such-command", "check --tile many", "gate a b c d"])
-def test_a_wrong_command_is_refused(line: str) -> None:
-    assert refusal(f"{NAME} {line}")

@@ -3,12 +3,14 @@
 import re
 import subprocess
 import tomllib
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from deploy.cli import COMMANDS
-from docs.make import api, target_file
+from docs.make import api, commands, operators, options, target_file
 from profiles.effects import TABLES
 from profiles.scene_call import load_scene_call, scene_names
 
@@ -46,10 +48,19 @@ def test_links_outside_of_the_site_lead_somewhere(name: str) -> None:
     assert [target for target in targets if not (page.parent / target).exists()] == []
 
 
-def test_generated_pages_are_fresh() -> None:
-    """Else run python docs/make/api.py, python docs/make/target_file.py."""
-    for maker in (api, target_file):
-        assert maker.TARGET.read_text(encoding="utf-8") == maker.document(), f"run python {maker.__file__}"
+@pytest.mark.parametrize(
+    ("maker", "document"),
+    [
+        (api, api.document),
+        (commands, commands.reference),
+        (operators, operators.document),
+        (options, options.page),
+        (target_file, target_file.document),
+    ],
+    ids=lambda each: each.__name__,
+)
+def test_a_generated_page_is_fresh(maker: Any, document: Callable[[], str]) -> None:
+    assert maker.TARGET.read_text(encoding="utf-8") == document(), f"run python {maker.__file__}"
 
 
 def test_a_boards_keys_are_those_that_have_a_meaning() -> None:

@@ -6,6 +6,7 @@ import xml.etree.ElementTree as ET
 import zlib
 from collections.abc import Callable, Sequence
 from copy import deepcopy
+from typing import Any, TypeVar
 
 import numpy as np
 import onnx
@@ -13,28 +14,11 @@ from google.protobuf.message import DecodeError, Message
 
 Rng = np.random.Generator
 Mutate = Callable[[bytes, Rng], bytes]
+T = TypeVar("T")
 
 NUMBERS = (
-    0,
-    1,
-    -1,
-    2,
-    7,
-    8,
-    127,
-    128,
-    255,
-    256,
-    1000,
-    32767,
-    65535,
-    65536,
-    10**6,
-    2**31 - 1,
-    2**31,
-    2**32 - 1,
-    2**62,
-)
+    0, 1, -1, 2, 7, 8, 127, 128, 255, 256, 1000, 32767, 65535, 65536, 10**6, 2**31 - 1, 2**31, 2**32 - 1, 2**62,
+)  # fmt: skip
 TEXTS = (
     "", "a", "\0", "\n", "../../x", "/etc/passwd", "1e999", "NaN", "\ud800", "é", "a" * 5000, "9" * 5000, "%s%n",
     "com.microsoft", "If", "Loop", "Conv", "image",
@@ -44,6 +28,11 @@ TOKENS = (
     b"\0", b"\n", b'"', b"[", b"]", b"{", b"}", b"=", b".", b",", b"-", b"inf", b"nan", b"1e999", b"0x" + b"f" * 600,
     b"9" * 5000, b"[" * 400, b"{\"a\":" * 400, b"a." * 90, b"\xff\xff\xff\xff", b"\\ud800", b"true", b"null", b"'''",
 )  # fmt: skip
+
+
+def pick(options: Sequence[T], rng: Rng) -> T:
+    """One of several, each as likely."""
+    return options[int(rng.integers(len(options)))]
 
 
 def damaged(content: bytes, others: Sequence[bytes], meaning: Mutate | None, rng: Rng) -> bytes:
@@ -60,12 +49,12 @@ def of_bytes(content: bytes, others: Sequence[bytes], rng: Rng) -> bytes:
     """Flip, overwrite, insert, cut out, repeat or cut off bytes, or take some from another file."""
     a, b = sorted(int(rng.integers(0, len(content) + 1)) for _ in range(2))
     b = min(b, a + int(2 ** rng.uniform(0, 10)))
-    other = others[int(rng.integers(len(others)))]
+    other = pick(others, rng)
     c = int(rng.integers(0, len(other) + 1))
-    number = NUMBERS[int(rng.integers(len(NUMBERS)))]
+    number = pick(NUMBERS, rng)
     order, width = ("<>"[int(rng.integers(2))], int(rng.integers(4)))
     packed = struct.pack(f"{order}{'BHIQ'[width]}", number % 2 ** (8 << width))
-    token = TOKENS[int(rng.integers(len(TOKENS)))]
+    token = pick(TOKENS, rng)
     flipped = bytes([content[a] ^ (1 << int(rng.integers(8)))]) if a < len(content) else b""
     choices = (
         content[:a] + flipped + content[a + 1 :],
@@ -78,7 +67,7 @@ def of_bytes(content: bytes, others: Sequence[bytes], rng: Rng) -> bytes:
         content[:a] + other[c : c + b - a] + content[b:],
         content[:a],
     )
-    return choices[int(rng.integers(len(choices)))]
+    return pick(choices, rng)
 
 
 def of_json(content: bytes, rng: Rng) -> bytes:
@@ -98,9 +87,9 @@ def of_xml(content: bytes, rng: Rng) -> bytes:
     pairs = [(parent, child) for parent in root.iter() for child in parent]
     if not pairs:
         return content
-    (parent, child), (_, other) = (pairs[int(rng.integers(len(pairs)))] for _ in range(2))
+    (parent, child), (_, other) = (pick(pairs, rng) for _ in range(2))
     texts = (*map(str, NUMBERS), *TEXTS, *PATHS, other.text or "")
-    text, kind = texts[int(rng.integers(len(texts)))], rng.random()
+    text, kind = pick(texts, rng), rng.random()
     if kind < 0.1:
         parent.remove(child)
     elif kind < 0.2:
@@ -108,7 +97,7 @@ def of_xml(content: bytes, rng: Rng) -> bytes:
     elif kind < 0.3:
         child.tag = other.tag
     elif child.attrib and kind < 0.65:
-        child.set(sorted(child.attrib)[int(rng.integers(len(child.attrib)))], text)
+        child.set(pick(sorted(child.attrib), rng), text)
     else:
         child.text = text
     return bytes(ET.tostring(root))
@@ -122,7 +111,7 @@ def of_safetensors(content: bytes, rng: Rng) -> bytes:
         try:
             tree = json.loads(header)
             inner = tree["__metadata__"]
-            key = sorted(inner)[int(rng.integers(len(inner)))]
+            key = pick(sorted(inner), rng)
             inner[key] = of_json(inner[key].encode(), rng).decode()
             header = json.dumps(tree).encode()
         except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
@@ -142,7 +131,7 @@ def of_png(content: bytes, rng: Rng) -> bytes:
     place = int(rng.integers(len(chunks)))
     chunks[place] = of_bytes(chunks[place], chunks, rng)
     if rng.random() < 0.1:
-        chunks.insert(place, chunks[int(rng.integers(len(chunks)))])
+        chunks.insert(place, pick(chunks, rng))
     packed = (len(c[4:]).to_bytes(4) + c + zlib.crc32(c).to_bytes(4) for c in chunks if len(c) >= 4)
     return content[:8] + b"".join(packed)
 
@@ -157,12 +146,11 @@ def of_tiff(content: bytes, rng: Rng) -> bytes:
         return content
     at = start + 2 + 12 * int(rng.integers(count))
     field, width = ((0, 2), (2, 2), (4, 4), (8, 4))[int(rng.choice(4, p=(0.1, 0.1, 0.2, 0.6)))]
-    number = NUMBERS[int(rng.integers(len(NUMBERS)))] if rng.random() < 0.7 else int(rng.integers(70_000))
+    number = pick(NUMBERS, rng) if rng.random() < 0.7 else int(rng.integers(70_000))
     value = (number % 2 ** (8 * width)).to_bytes(width, "little")
     if field == 0 and rng.random() < 0.5:
-        value = int(rng.choice((256, 257, 258, 259, 277, 278, 284, 317, 322, 323, 330, 339, 50838))).to_bytes(
-            2, "little"
-        )
+        tags = (256, 257, 258, 259, 277, 278, 284, 317, 322, 323, 330, 339, 50838)
+        value = int(rng.choice(tags)).to_bytes(2, "little")
     return b"".join((content[: at + field], value, content[at + field + width :]))
 
 
@@ -181,15 +169,11 @@ def _field(message: Message, rng: Rng) -> None:
     """Walk down at random, and change what is met at the end."""
     fields = [pair for pair in message.ListFields() if rng.random() < 0.8]
     if not fields or rng.random() < 0.05:
-        everything = message.DESCRIPTOR.fields
-        _set(message, everything[int(rng.integers(len(everything)))], rng)
+        _set(message, pick(message.DESCRIPTOR.fields, rng), rng)
         return
-    descriptor, value = fields[int(rng.integers(len(fields)))]
+    descriptor, value = pick(fields, rng)
     if not descriptor.is_repeated:
-        if isinstance(value, Message):
-            _field(value, rng)
-        else:
-            _set(message, descriptor, rng)
+        _field(value, rng) if isinstance(value, Message) else _set(message, descriptor, rng)
         return
     place, kind = int(rng.integers(len(value))), rng.random()
     if kind < 0.1:
@@ -202,66 +186,43 @@ def _field(message: Message, rng: Rng) -> None:
         value[place] = _like(value[place], rng)
 
 
-def _set(message: Message, descriptor: object, rng: Rng) -> None:
+def _set(message: Message, descriptor: Any, rng: Rng) -> None:
     """A field that was there or not; groups of fields are left empty but present."""
-    name, kind = descriptor.name, descriptor.cpp_type  # type: ignore[attr-defined]
-    if descriptor.is_repeated or kind == 10:  # type: ignore[attr-defined]  # 10: a message
-        value = getattr(message, name)
-        if kind == 10:
-            value.add() if descriptor.is_repeated else value.SetInParent()  # type: ignore[attr-defined]
-        return
-    old = getattr(message, name)
-    setattr(message, name, int(rng.integers(0, 30)) if kind == 8 else _like(old, rng))  # 8: an enumeration
+    old = getattr(message, descriptor.name)
+    if descriptor.cpp_type == descriptor.CPPTYPE_MESSAGE:
+        old.add() if descriptor.is_repeated else old.SetInParent()
+    elif not descriptor.is_repeated:
+        is_enum = descriptor.cpp_type == descriptor.CPPTYPE_ENUM
+        setattr(message, descriptor.name, int(rng.integers(0, 30)) if is_enum else _like(old, rng))
 
 
 def _like(value: object, rng: Rng) -> object:
     if isinstance(value, int):
-        return int(NUMBERS[int(rng.integers(len(NUMBERS)))])
+        return pick(NUMBERS, rng)
     if isinstance(value, float):
         return float(rng.choice((0.0, -1.0, 1e38, np.inf, np.nan, 1e-40)))
-    text = TEXTS[int(rng.integers(len(TEXTS)))]
-    if isinstance(value, bytes):
-        return of_bytes(value, [value], rng)
-    return text.encode("utf-8", "ignore").decode()
+    text = pick(TEXTS, rng)
+    return of_bytes(value, [value], rng) if isinstance(value, bytes) else text.encode("utf-8", "ignore").decode()
 
 
 def _tree(value: object, rng: Rng) -> object:
     """A document with one value changed, dropped, repeated or wrapped up."""
-    if isinstance(value, dict) and value and rng.random() < 0.85:
-        key = list(value)[int(rng.integers(len(value)))]
-        kind = rng.random()
+    if not isinstance(value, dict | list) or not value or rng.random() >= 0.85:
+        return _leaf(value, rng)
+    if isinstance(value, dict):
+        key, kind = pick(list(value), rng), rng.random()
         if kind < 0.1:
             return {name: inner for name, inner in value.items() if name != key}
-        if kind < 0.2:
-            return {**value, TEXTS[int(rng.integers(len(TEXTS)))]: value[key]}
-        return {**value, key: _tree(value[key], rng)}
-    if isinstance(value, list) and value and rng.random() < 0.85:
-        place = int(rng.integers(len(value)))
-        kind = rng.random()
-        if kind < 0.2:
-            return value[:place] + value[place + 1 :] if kind < 0.1 else value + value[place:]
-        return [*value[:place], _tree(value[place], rng), *value[place + 1 :]]
-    return _leaf(value, rng)
+        return {**value, **({pick(TEXTS, rng): value[key]} if kind < 0.2 else {key: _tree(value[key], rng)})}
+    place, kind = int(rng.integers(len(value))), rng.random()
+    if kind < 0.2:
+        return value[:place] + value[place + 1 :] if kind < 0.1 else value + value[place:]
+    return [*value[:place], _tree(value[place], rng), *value[place + 1 :]]
 
 
 def _leaf(value: object, rng: Rng) -> object:
-    nested: object = value
+    """Something else than a value, or the value within lists."""
     for _ in range(int(rng.choice((1, 40, 400)))):
-        nested = [nested]
-    others: tuple[object, ...] = (
-        None,
-        True,
-        [],
-        {},
-        "",
-        -1,
-        0,
-        1e308,
-        float("nan"),
-        float("inf"),
-        10**400,
-        2**63,
-        nested,
-    )
-    texts = TEXTS[int(rng.integers(len(TEXTS)))]
-    return (*others, texts)[int(rng.integers(len(others) + 1))]
+        value = [value]
+    infinite = (1e308, float("nan"), float("inf"), 10**400, 2**63)
+    return pick((None, True, [], {}, "", -1, 0, *infinite, value, pick(TEXTS, rng)), rng)

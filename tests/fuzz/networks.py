@@ -58,14 +58,8 @@ def look_at_onnx(path: Path) -> None:
 def understand_onnx(path: Path) -> None:
     """What `quantize`, `restore` and `gate` ask of a network before they run it."""
     model = load_onnx(path)
-    for question in (
-        fixed_tile_px,
-        receptive_radius_px,
-        correction_graph,
-        count_relus,
-        encoding_faults,
-        rounded_tensors,
-    ):
+    questions = fixed_tile_px, receptive_radius_px, correction_graph, count_relus, encoding_faults, rounded_tensors
+    for question in questions:
         _asked(question, model)
 
 

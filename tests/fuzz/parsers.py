@@ -53,6 +53,7 @@ from tests.fuzz.networks import (
     weights_seeds,
 )
 from tests.fuzz.pictures import gdal_seeds, image_of, read_rows, read_with_tiles, tiff_seeds, written
+from tests.profiles.own_sensor import SHIPPED
 
 ROOT = Path(__file__).parents[2]
 JOB: dict[str, object] = {"image": [1, "a", 2], "model": "b", "tile_px": 64, "halo_px": 4, "full_scale": 4095.0}
@@ -69,7 +70,7 @@ class Parser:
         seeds: makes small valid files, given a folder to work in.
         parse: reads a file, and touches what it says.
         meaning: damage that knows the format; None where bytes are all there is.
-        share: of a campaign's executions; dear parsers have less.
+        share: of the executions; dear parsers have less.
     """
 
     name: str
@@ -80,18 +81,15 @@ class Parser:
     share: float = 1.0
 
 
-def _files(*folders: str) -> list[bytes]:
-    return [path.read_bytes() for folder in folders for path in sorted((ROOT / "profiles" / folder).glob("*.toml"))]
+def _files(folder: str) -> list[bytes]:
+    return [path.read_bytes() for path in sorted((ROOT / "profiles" / folder).glob("*.toml"))]
 
 
 def described_seeds(_: Path) -> list[bytes]:
     """A sensor with a tabulated MTF, alpha and beta."""
-    text = (ROOT / "profiles" / "sensors" / "pleiades-degraded.toml").read_text(encoding="utf-8")
-    head, rest = text.split("[mtf]")
-    mtf, noise = (
-        "frequency = [0, 0.25, 0.5]\nacross = [1, 0.5, 0.12]\nalong = [1, 0.4, 0.1]",
-        "alpha = 0.01\nbeta = [0.1, 0.2]",
-    )
+    head, rest = SHIPPED.split("[mtf]")
+    mtf = "frequency = [0, 0.25, 0.5]\nacross = [1, 0.5, 0.12]\nalong = [1, 0.4, 0.1]"
+    noise = "alpha = 0.01\nbeta = [0.1, 0.2]"
     return [f"{head}[mtf]\n{mtf}\n\n[noise]\n{noise}\n\n[digitiser]{rest.split('[digitiser]')[1]}".encode()]
 
 
@@ -114,16 +112,12 @@ def recipe_seeds(folder: Path) -> list[bytes]:
     path = folder / "a.toml"
     path.write_bytes(described_seeds(folder)[0])
     profile = load_sensor(str(path))
-    point, *_ = read_response("a test", {"psf": _saved_point(folder), "psf_samples_per_px": 4}, folder)
+    (folder / "point.npy").write_bytes(point_seeds(folder, ".npy")[0])
+    point, *_ = read_response("a test", {"psf": "point.npy", "psf_samples_per_px": 4}, folder)
     across, along = (replace(profile.mtf_nyquist, value=value) for value in point.at_nyquist)
     other = replace(profile, response=point, mtf_nyquist=across, mtf_nyquist_along=along)
     recipe = {"scenes": [{"name": "a", "sha256": "b"}], "degraded": asdict(profile), "reference": asdict(other)}
     return [json.dumps(recipe).encode()]
-
-
-def _saved_point(folder: Path) -> str:
-    (folder / "point.npy").write_bytes(point_seeds(folder, ".npy")[0])
-    return "point.npy"
 
 
 def read_recipe(path: Path) -> None:
@@ -163,11 +157,6 @@ def measurement_seeds(folder: Path) -> list[bytes]:
     kept = Measurements(folder / "measurements.json")
     kept.make("a", lambda: [{"PSNR": 30.0, "LPIPS": None}])
     return [kept.path.read_bytes()]
-
-
-def open_measurements(path: Path) -> None:
-    """What a study goes on with."""
-    Measurements.open(path)
 
 
 def journal_seeds(_: Path) -> list[bytes]:
@@ -225,32 +214,26 @@ def _network() -> Network:
 
 LIMITS = [b"mae = 0.0007\np999 = 0.01\n", b"psnr_drop_db = 0.05\nmae_growth = 1.1\nmin_psnr_float_int8_db = 60\n"]
 
-GDAL = (
-    ("VRT", "a.vrt", of_xml),
-    ("DIMAP", "DIM.XML", of_xml),
-    ("JPEG 2000", "a.jp2", None),
-    ("NITF", "a.ntf", None),
-    ("HFA", "a.img", None),
-)
+GDAL = {"VRT": "a.vrt", "DIMAP": "DIM.XML", "JPEG 2000": "a.jp2", "NITF": "a.ntf", "HFA": "a.img"}
+XML = ("VRT", "DIMAP")
+
+
+def of_gdal(kind: str, name: str) -> Parser:
+    """What GDAL reads, with the tiles that an index names beside it."""
+    seeds, read = partial(gdal_seeds, name=name), partial(read_with_tiles, name=name)
+    return Parser(kind, Path(name).suffix.lower(), seeds, read, of_xml if kind in XML else None)
+
+
 PARSERS: tuple[Parser, ...] = (
     Parser("ONNX, looked at", ".onnx", onnx_seeds, look_at_onnx, of_onnx),
     Parser("ONNX, folded", ".onnx", exported_seeds, look_at_onnx, of_onnx),
-    Parser("ONNX, understood", ".onnx", onnx_seeds, understand_onnx, of_onnx, 2.0),
+    Parser("ONNX, understood", ".onnx", onnx_seeds, understand_onnx, of_onnx),
     Parser("ONNX, run", ".onnx", onnx_seeds, run_onnx, of_onnx, 0.3),
-    Parser("TIFF, whole", ".tif", tiff_seeds, read_pixels, of_tiff, 2.0),
-    Parser("TIFF, by rows", ".tif", tiff_seeds, read_rows, of_tiff, 2.0),
+    Parser("TIFF, whole", ".tif", tiff_seeds, read_pixels, of_tiff),
+    Parser("TIFF, by rows", ".tif", tiff_seeds, read_rows, of_tiff),
     Parser("PNG", ".png", lambda _: [image_of({"format": "PNG"})], read_pixels, of_png),
     Parser("JPEG", ".jpg", lambda _: [image_of({"format": "JPEG"})], read_pixels),
-    *(
-        Parser(
-            kind,
-            Path(name).suffix.lower(),
-            partial(gdal_seeds, name=name),
-            partial(read_with_tiles, name=name),
-            meaning,
-        )
-        for kind, name, meaning in GDAL
-    ),
+    *(of_gdal(kind, name) for kind, name in GDAL.items()),
     Parser("sensor TOML", ".toml", lambda _: _files("sensors"), lambda p: load_sensor(str(p)).nominal()),
     Parser("sensor TOML, MTF table", ".toml", described_seeds, lambda p: load_sensor(str(p)).nominal()),
     Parser("point spread, TIFF", ".tif", partial(point_seeds, suffix=".tif"), read_point, of_tiff),
@@ -262,7 +245,7 @@ PARSERS: tuple[Parser, ...] = (
     Parser("results JSON", ".json", document_seeds, read_results, of_json),
     Parser("gate baseline JSON", ".json", document_seeds, lambda p: baseline_mae(p, GATED), of_json),
     Parser("board's runs JSON", ".json", runs_seeds, lambda p: read_own_runs(p, load_dpu("vck190")), of_json, 0.3),
-    Parser("kept measurements", ".json", measurement_seeds, open_measurements, of_json),
+    Parser("kept measurements", ".json", measurement_seeds, Measurements.open, of_json),
     Parser("journal of a run", ".json", journal_seeds, resume, of_json, 0.5),
     Parser("dataset manifest", ".jsonl", manifest_seeds, _read_summary, of_json),
     Parser("training log", ".csv", lambda _: [b"step,loss\n10,0.5\n20,0.25\n"], log_lines, share=0.5),

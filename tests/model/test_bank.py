@@ -14,19 +14,17 @@ from model.bank import (
     FILTERS,
     SIDE_PX,
     UNIT,
-    Bank,
     bank_of,
     bank_of_vector,
     in_places,
     noise_over_full_scale,
 )
 from model.family import sensor_vector
-from model.simulator.mtf import sensor_mtf
 from model.traditional.compensate import compensation_kernel
 from profiles import load_sensor
 from profiles.effects import Smear
-from profiles.response import MtfTable, PointSpread, packed
 from profiles.sensor import Sensor
+from tests.model.simulator.stages import point_spread, with_response
 
 REFERENCE = load_sensor("pleiades-reference").nominal()
 NOMINAL = load_sensor("pleiades-degraded").nominal()
@@ -36,13 +34,6 @@ CONTRAST = st.floats(0.015, 0.15)
 def sensor(across: float, along: float, snr: float = 110.0) -> Sensor:
     """Of noise that does not grow with the light, with that SNR at a quarter of full scale."""
     return replace(NOMINAL, mtf_nyquist=across, mtf_nyquist_along=along, alpha=0.0, beta=(100 / snr) ** 2)
-
-
-def point_spread(values: np.ndarray) -> Sensor:
-    height, width = values.shape
-    point = PointSpread(height, width, 2, packed(values))
-    across, along = point.at_nyquist
-    return replace(NOMINAL, mtf_nyquist=across, mtf_nyquist_along=along, response=point)
 
 
 def lopsided() -> np.ndarray:
@@ -73,17 +64,11 @@ def test_a_sensor_whose_axes_change_places_has_its_kernels_transposed(
 
 
 def test_a_lopsided_point_spread_transposed_has_its_kernels_transposed() -> None:
-    upright, turned = (bank_of(point_spread(values), REFERENCE) for values in (lopsided(), lopsided().T))
+    upright, turned = (
+        bank_of(with_response(NOMINAL, point_spread(values, 2)), REFERENCE) for values in (lopsided(), lopsided().T)
+    )
     np.testing.assert_allclose(turned.details.transpose(0, 2, 1), upright.details, atol=1e-6)
     assert np.abs(upright.details - upright.details[:, ::-1, ::-1]).max() > 0.01  # it does lean
-
-
-def test_a_table_of_the_formula_gives_the_formulas_kernels() -> None:
-    frequency = np.linspace(0, 0.5, 6)
-    contrast = tuple(float(sensor_mtf(f, 0.0, NOMINAL)) for f in frequency)
-    table = MtfTable(tuple(frequency.tolist()), contrast, contrast)
-    made = replace(NOMINAL, mtf_nyquist=table.at_nyquist[0], response=table)
-    np.testing.assert_allclose(bank_of(made, REFERENCE).details, bank_of(NOMINAL, REFERENCE).details, atol=1e-9)
 
 
 def test_smear_is_undone_along_the_track_alone() -> None:
@@ -103,10 +88,6 @@ def test_the_analytic_restoration_is_that_of_the_traditional_chain_cut_small(con
     assert lost < 0.015
 
 
-def gain(bank: Bank, image: np.ndarray) -> float:
-    return float((bank.analytic * image).sum())
-
-
 def test_without_noise_but_that_of_rounding_it_stays_finite() -> None:
     silent = bank_of(replace(NOMINAL, alpha=0.0, beta=0.0), REFERENCE)
     assert silent.sigma == pytest.approx(1 / (12**0.5 * 4095))
@@ -115,7 +96,7 @@ def test_without_noise_but_that_of_rounding_it_stays_finite() -> None:
 
 def test_more_noise_asks_for_less_sharpening() -> None:
     row = np.tile([-1.0, 1.0], 4)[:SIDE_PX][None].repeat(SIDE_PX, 0)  # Nyquist across, -1 in the middle
-    gains = [abs(gain(bank_of(sensor(0.07, 0.07, snr), REFERENCE), row)) for snr in (220, 110, 35)]
+    gains = [abs((bank_of(sensor(0.07, 0.07, snr), REFERENCE).analytic * row).sum()) for snr in (220, 110, 35)]
     assert gains == sorted(gains, reverse=True)
     assert gains[0] > 2 * gains[2]
 

@@ -3,14 +3,9 @@ import torch
 from torch.nn.functional import conv2d, pad
 
 from model.bank import bank_of_vector
-from model.convbeers import BankedConvBEERS, ConvBEERS, initialise, told
+from model.convbeers import ConvBEERS, told
 from model.variants import VARIANTS, Variant
-
-
-def build(variant: Variant, seed: int = 0) -> ConvBEERS:
-    network = ConvBEERS(variant)
-    initialise(network, torch.Generator().manual_seed(seed))
-    return network.eval()
+from tests.model.networks import behind_a_bank, plain
 
 
 @pytest.mark.parametrize(("name", "parameters"), [("convbeers", 1_219_841), ("convbeers-s", 157_825)])
@@ -24,7 +19,7 @@ def test_the_radius_is_how_far_a_gradient_reaches(blocks: int, scale: int) -> No
     variant = Variant(blocks=blocks, features=4, scale=scale)
     side, middle = 4 * scale * variant.radius_px + scale, 2 * scale * variant.radius_px
     image = torch.rand(1, 1, side, side, generator=torch.Generator().manual_seed(1)).requires_grad_()
-    network = build(variant)
+    network = plain(variant)
     for module in network.modules():
         if isinstance(module, torch.nn.Conv2d) and module.bias is not None:
             torch.nn.init.constant_(module.bias, 0.5)  # keep the ReLUs open
@@ -39,7 +34,7 @@ def test_the_radius_is_how_far_a_gradient_reaches(blocks: int, scale: int) -> No
 def test_a_new_network_is_nearly_the_identity(name: str) -> None:
     scale = VARIANTS[name].scale
     image = torch.rand(1, 1, 37 * scale, 53 * scale, generator=torch.Generator().manual_seed(1))
-    difference = (build(VARIANTS[name])(image) - image).detach()
+    difference = (plain(VARIANTS[name])(image) - image).detach()
     assert bool(torch.isfinite(difference).all())
     assert float(difference.std()) < 0.1
 
@@ -47,7 +42,7 @@ def test_a_new_network_is_nearly_the_identity(name: str) -> None:
 def test_without_the_scaling_it_would_be_far_from_it() -> None:
     """Each block would double the stream's variance: the more blocks, the worse."""
     image = torch.rand(1, 1, 37, 53, generator=torch.Generator().manual_seed(1))
-    network = build(VARIANTS["convbeers"])
+    network = plain(VARIANTS["convbeers"])
     for name, parameter in network.named_parameters():
         if name.endswith(("second.weight", "body_end.weight", "tail.weight")):
             parameter.data.mul_(10)
@@ -55,14 +50,14 @@ def test_without_the_scaling_it_would_be_far_from_it() -> None:
 
 
 def test_the_same_seed_gives_the_same_network() -> None:
-    first, again, other = (list(build(Variant(2, 4), seed).parameters()) for seed in (0, 0, 1))
+    first, again, other = (list(plain(Variant(2, 4), seed).parameters()) for seed in (0, 0, 1))
     assert all(map(torch.equal, first, again))
     assert not all(map(torch.equal, first, other))
 
 
 @pytest.mark.parametrize("scale", [1, 2])
 def test_any_size_keeps_its_shape(scale: int) -> None:
-    network = build(Variant(1, 4, scale))
+    network = plain(Variant(1, 4, scale))
     for number, rows, columns in ((1, 1, 1), (2, 13, 21), (1, 1, 40)):
         shape = (number, 1, rows * scale, columns * scale)
         assert network(torch.zeros(shape)).shape == shape
@@ -70,7 +65,7 @@ def test_any_size_keeps_its_shape(scale: int) -> None:
 
 def test_at_half_resolution_a_shift_by_a_place_shifts_the_result_and_a_pixel_does_not() -> None:
     """The four pixels of a place are channels of their own: the lattice, by which tiles are cut, is 2."""
-    network, side = build(Variant(1, 4, 2)), 32
+    network, side = plain(Variant(1, 4, 2)), 32
     image = torch.rand(1, 1, side, side, generator=torch.Generator().manual_seed(1))
     inner, whole = slice(12, -12), network(image)
     apart = [
@@ -81,20 +76,14 @@ def test_at_half_resolution_a_shift_by_a_place_shifts_the_result_and_a_pixel_doe
     assert apart[1] > 1e-4
 
 
-def banked(scale: int = 1) -> BankedConvBEERS:
-    """A network behind a bank that says something else of each sensor."""
-    generator = torch.Generator().manual_seed(0)
-    network = BankedConvBEERS(Variant(2, 5, scale))
-    initialise(network, generator)
-    torch.nn.init.normal_(network.bias.weight, 0.0, 0.3, generator)
-    return network.eval()
-
-
 VECTORS = torch.tensor([[-0.9, -0.8, 0.3, 0.2], [0.5, 0.1, -0.7, -0.6], [0.0, 0.9, 0.8, 0.9]])
 
 
 def test_each_image_of_a_batch_meets_its_own_sensor() -> None:
-    network, images = banked(), torch.rand(3, 1, 13, 17, generator=torch.Generator().manual_seed(0))
+    network, images = (
+        behind_a_bank(Variant(2, 5), 0.3),
+        torch.rand(3, 1, 13, 17, generator=torch.Generator().manual_seed(0)),
+    )
     with torch.inference_mode():
         together = network(images, VECTORS)
         for number in range(3):
@@ -105,7 +94,8 @@ def test_each_image_of_a_batch_meets_its_own_sensor() -> None:
 
 @pytest.mark.parametrize("scale", [1, 2])
 def test_a_body_that_adds_nothing_leaves_the_analytic_restoration(scale: int) -> None:
-    network, image = banked(scale), 0.4 + 0.002 * torch.rand(1, 1, 26, 22, generator=torch.Generator().manual_seed(0))
+    network = behind_a_bank(Variant(2, 5, scale), 0.3)
+    image = 0.4 + 0.002 * torch.rand(1, 1, 26, 22, generator=torch.Generator().manual_seed(0))
     torch.nn.init.zeros_(network.tail.weight)
     kernel = torch.from_numpy(bank_of_vector(VECTORS[1].tolist()).analytic).float()[None, None]
     wanted = image + conv2d(pad(image, [3] * 4, mode="reflect"), kernel)

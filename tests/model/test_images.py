@@ -9,7 +9,7 @@ import tifffile
 import torch
 from PIL import Image
 
-from model.io.files import require_writable, whole_file
+from model.io.files import whole_file
 from model.io.images import image_size_px, list_images, read_pixels
 from model.simulator.sampling import read_scene
 from profiles import load_sensor
@@ -158,11 +158,6 @@ def test_a_gigantic_header_allocates_nothing(name: str, side: int, tmp_path: Pat
         tracemalloc.stop()
 
 
-def test_the_headers_made_here_are_read_when_they_are_honest(tmp_path: Path) -> None:
-    tiff_header(tmp_path / "small.tif", 2, 1)
-    assert read_pixels(tmp_path / "small.tif").shape == (1, 2)
-
-
 def test_nothing_half_written_is_left(tmp_path: Path) -> None:
     (tmp_path / "out.txt").write_text("old")
 
@@ -175,12 +170,3 @@ def test_nothing_half_written_is_left(tmp_path: Path) -> None:
         breaks()
     assert [p.name for p in tmp_path.iterdir()] == ["out.txt"]
     assert (tmp_path / "out.txt").read_text() == "old"
-
-
-def test_outputs_that_cannot_be_written_are_found_early(tmp_path: Path) -> None:
-    (tmp_path / "file").touch()
-    for path, got in ((tmp_path, "a folder"), (tmp_path / "file" / "below", "place to write")):
-        with pytest.raises(MachineError, match=got):
-            require_writable(path)
-    require_writable(None, tmp_path / "new" / "below" / "out.tif")
-    assert [path.name for path in tmp_path.iterdir()] == ["file"]

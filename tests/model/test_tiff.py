@@ -55,13 +55,6 @@ def rows(path: Path) -> np.ndarray:
         return source.read(0, source.raster.height_px)
 
 
-def test_the_files_made_here_are_read_when_they_are_honest(tmp_path: Path) -> None:
-    for compression, data in ((1, GREY.tobytes()), (8, zlib.compress(GREY.tobytes()))):
-        path = tiff(tmp_path / "a.tif", data, compression=compression)
-        np.testing.assert_array_equal(read_pixels(path), GREY)
-        np.testing.assert_array_equal(rows(path)[0], GREY)
-
-
 def test_bytes_that_unpack_to_more_than_their_place_are_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

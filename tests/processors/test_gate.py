@@ -2,38 +2,22 @@
 
 from pathlib import Path
 
-import numpy as np
 import pytest
-import tifffile
 from onnx import numpy_helper
-from typer.testing import CliRunner
 
-from deploy.cli import app
 from deploy.networks import shipped_pair
-from model.simulator.procedural import procedural_scene
 from quant.onnx_file import load_onnx, save_onnx
+from tests.deploy.command_line import done
 
 
-@pytest.fixture(scope="module")
-def scenes(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with one small drawn scene: to draw the gate's own takes most of its time."""
-    folder = tmp_path_factory.mktemp("scenes")
-    radiance = procedural_scene(900, 900, np.random.default_rng(77)).radiance.numpy()
-    tifffile.imwrite(folder / "drawn.tif", radiance)
-    return folder
-
-
-def gate(scenes: Path, *pair: str) -> tuple[int, str]:
-    """The command's exit code and words on one patch of 128 x 128: emulated float networks take seconds for each."""
-    done = CliRunner().invoke(app, ["gate", *pair, "--images", str(scenes), "--patches", "1"])
-    return done.exit_code, done.output
+def gate(scenes: Path, *pair: object, code: int = 0) -> str:
+    """The command's words on one patch of 128 x 128: emulated float networks take seconds for each."""
+    return done("gate", *pair, "--images", scenes, "--patches", 1, code=code)
 
 
 @pytest.mark.parametrize("name", ["convbeers-xs", "convbeers-s"])
 def test_a_shipped_pair_passes(name: str, scenes: Path) -> None:
-    code, said = gate(scenes, "--variant", name)
-    assert code == 0, said
-    assert "gate passed" in said
+    assert "gate passed" in gate(scenes, "--variant", name)
 
 
 def test_a_broken_one_fails(scenes: Path, tmp_path: Path) -> None:
@@ -42,6 +26,4 @@ def test_a_broken_one_fails(scenes: Path, tmp_path: Path) -> None:
     weight = next(t for t in model.graph.initializer if t.name == "tail.weight")
     weight.CopyFrom(numpy_helper.from_array(-numpy_helper.to_array(weight), weight.name))
     save_onnx(model, tmp_path / "broken.onnx")
-    code, said = gate(scenes, str(float_path), str(tmp_path / "broken.onnx"))
-    assert code == 1, said
-    assert "FAILED MAE" in said
+    assert "FAILED MAE" in gate(scenes, float_path, tmp_path / "broken.onnx", code=1)

@@ -5,15 +5,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 import tifffile
-from typer.testing import CliRunner
 
-from deploy.cli import app
 from deploy.library import restore
 from deploy.networks import shipped_pair
 from model.shipped import SENSOR
 from quant.encodings import read_core
 from quant.integer import merged_correction, run_core
 from quant.onnx_file import load_onnx
+from tests.deploy.command_line import done
 
 MAX_DN = np.float32(4095)
 
@@ -47,7 +46,5 @@ def test_an_array_becomes_what_the_integer_reference_says(name: str) -> None:
 def test_the_command_writes_the_same_pixels(tmp_path: Path) -> None:
     dn = raw(70, 41)
     tifffile.imwrite(tmp_path / "raw.tif", dn)
-    asked = ["restore", str(tmp_path / "raw.tif"), str(tmp_path / "restored.tif"), "--tile", "64", "--sensor", SENSOR]
-    done = CliRunner().invoke(app, asked)
-    assert done.exit_code == 0, done.output
+    done("restore", tmp_path / "raw.tif", tmp_path / "restored.tif", "--tile", 64, "--sensor", SENSOR)
     np.testing.assert_array_equal(tifffile.imread(tmp_path / "restored.tif"), by_reference(dn, "convbeers-s"))

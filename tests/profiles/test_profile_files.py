@@ -10,27 +10,15 @@ from hypothesis import strategies as st
 from profiles import load_sensor, load_target
 from profiles.errors import ProfileError
 from profiles.sensor import TABLES, noise_from_snr, snr_0_bounds
-from profiles.toml import HERE
+from tests.profiles.own_sensor import SHIPPED, own_sensor
 
-SHIPPED = (HERE / "sensors" / "pleiades-degraded.toml").read_text()
 KEYS = [(table, key) for table, ways in TABLES.items() for key in ways[0].required]
 
 
-def sensor_file(folder: Path, text: str) -> str:
-    path = folder / "mine.toml"
-    path.write_text(text)
-    return str(path)
-
-
-def edited(old: str, new: str) -> str:
-    assert old in SHIPPED
-    return SHIPPED.replace(old, new)
-
-
-def refusal(path: str) -> ProfileError:
+def refusal(path: Path) -> ProfileError:
     """The error, after checking that it is one whole sentence."""
     with pytest.raises(ProfileError) as caught:
-        load_sensor(path)
+        load_sensor(str(path))
     error = caught.value
     assert str(error) == f"{error.where}: expected {error.expected}, got {error.got}; {error.remedy}."
     assert all(part.strip() for part in (error.where, error.expected, error.got, error.remedy))
@@ -40,13 +28,13 @@ def refusal(path: str) -> ProfileError:
 
 
 def test_the_file_that_is_edited_here_is_sound(tmp_path: Path) -> None:
-    assert load_sensor(sensor_file(tmp_path, SHIPPED)).mtf_nyquist.value == 0.07
+    assert load_sensor(str(own_sensor(tmp_path))).mtf_nyquist.value == 0.07
 
 
 @pytest.mark.parametrize(("table", "key"), KEYS)
 def test_a_missing_key_is_named_with_its_table(table: str, key: str, tmp_path: Path) -> None:
     kept = [line for line in SHIPPED.splitlines() if not line.startswith(f"{key} =")]
-    error = refusal(sensor_file(tmp_path, "\n".join(kept)))
+    error = refusal(own_sensor(tmp_path, text="\n".join(kept)))
     assert f"[{table}]" in error.where
     assert repr(key) in error.expected
 
@@ -55,19 +43,19 @@ def test_a_missing_key_is_named_with_its_table(table: str, key: str, tmp_path: P
 def test_a_missing_table_is_named(table: str, tmp_path: Path) -> None:
     head, _, rest = SHIPPED.partition(f"[{table}]")
     following = rest[rest.index("\n[") :] if "\n[" in rest else ""
-    assert repr(table) in refusal(sensor_file(tmp_path, head + following)).expected
+    assert repr(table) in refusal(own_sensor(tmp_path, text=head + following)).expected
 
 
 @pytest.mark.parametrize(
     "value", ["-1", "-0.07", "nan", "inf", "true", "[]", "[0.01, 0.02, 0.03]", '"7 %"', "1" * 400]
 )
 def test_an_mtf_that_is_no_contrast_is_refused(value: str, tmp_path: Path) -> None:
-    assert "mtf_nyquist" in refusal(sensor_file(tmp_path, edited("value = 0.07", f"value = {value}"))).where
+    assert "mtf_nyquist" in refusal(own_sensor(tmp_path, ("value = 0.07", f"value = {value}"))).where
 
 
 def test_text_that_is_not_unicode_is_refused(tmp_path: Path) -> None:
     (tmp_path / "mine.toml").write_bytes(b"description = '\xff\xfe'")
-    assert refusal(str(tmp_path / "mine.toml")).expected == "TOML text"
+    assert refusal(tmp_path / "mine.toml").expected == "TOML text"
 
 
 @pytest.mark.parametrize(
@@ -82,7 +70,7 @@ def test_text_that_is_not_unicode_is_refused(tmp_path: Path) -> None:
 def test_a_range_is_drawn_from_or_refused(old: str, new: str, tmp_path: Path) -> None:
     """Never accepted and then quietly cut to its lower end."""
     try:
-        profile = load_sensor(sensor_file(tmp_path, edited(old, new)))
+        profile = load_sensor(str(own_sensor(tmp_path, (old, new))))
     except ProfileError:
         return
     drawn = [profile.draw(np.random.default_rng(seed)) for seed in range(8)]
@@ -95,8 +83,8 @@ def test_a_range_is_drawn_from_or_refused(old: str, new: str, tmp_path: Path) ->
 def test_what_loads_can_be_drawn_at_the_very_bounds(snr_0: float, snr_1: float, tmp_path: Path) -> None:
     """There alpha or beta is 0, and rounding may leave it a hair below."""
     assert snr_0 in snr_0_bounds(25, 100, snr_1)
-    text = edited("value = 50,", f"value = {snr_0},").replace("value = 110,", f"value = {snr_1},")
-    sensor = load_sensor(sensor_file(tmp_path, text)).draw(np.random.default_rng(0))
+    path = own_sensor(tmp_path, ("value = 50,", f"value = {snr_0},"), ("value = 110,", f"value = {snr_1},"))
+    sensor = load_sensor(str(path)).draw(np.random.default_rng(0))
     assert sensor.alpha >= 0
     assert sensor.beta >= 0
     assert 25 / sensor.noise_sigma(25) == pytest.approx(snr_0)
@@ -125,7 +113,7 @@ def test_noise_reproduces_any_two_points(radiance_0: float, factor: float, snr_0
 )
 def test_a_wrong_target_gets_one_sentence(text: str, words: tuple[str, ...], tmp_path: Path) -> None:
     with pytest.raises(ProfileError) as caught:
-        load_target(sensor_file(tmp_path, text))
+        load_target(str(own_sensor(tmp_path, text=text)))
     for word in ("mine", "expected", "got", *words):
         assert word in str(caught.value)
 

@@ -20,10 +20,9 @@ from profiles.errors import ProfileError
 from profiles.response import MtfTable, PointSpread, centroid, packed, unpacked
 from profiles.sensor import same_instrument
 from profiles.sensor_file import sensor_from_json
-from profiles.toml import HERE
+from tests.profiles.own_sensor import SHIPPED, own_sensor
 from tests.profiles.test_profile_files import refusal
 
-SHIPPED = (HERE / "sensors" / "pleiades-degraded.toml").read_text(encoding="utf-8")
 TABLE = "frequency = [0, 0.25, 0.5]\nacross = [1, 0.5, 0.12]\nalong = [1, 0.4, 0.05]"
 PSF = 'psf = "psf.npy"\npsf_samples_per_px = 4'
 
@@ -36,19 +35,17 @@ def lopsided(rows: int = 33, columns: int = 44) -> np.ndarray:
     return samples
 
 
-def sensor_file(folder: Path, mtf: str, noise: str | None = None) -> str:
+def sensor_file(folder: Path, mtf: str, noise: str | None = None) -> Path:
     """The nominal sensor with another [mtf], and another [noise] where one is given."""
     text = re.sub(r"\[mtf\].*?(?=\n\[)", lambda _: f"[mtf]\n{mtf}\n", SHIPPED, flags=re.DOTALL)
     if noise is not None:
         text = re.sub(r"\[noise\].*?(?=\n\[)", lambda _: f"[noise]\n{noise}\n", text, flags=re.DOTALL)
-    path = folder / "mine.toml"
-    path.write_text(text, encoding="utf-8")
-    return str(path)
+    return own_sensor(folder, text=text)
 
 
 def with_psf(folder: Path, samples: np.ndarray, mtf: str = PSF) -> SensorProfile:
     np.save(folder / "psf.npy", samples)
-    return load_sensor(sensor_file(folder, mtf))
+    return load_sensor(str(sensor_file(folder, mtf)))
 
 
 def formula(frequency: np.ndarray, contrast: float) -> np.ndarray:
@@ -56,14 +53,14 @@ def formula(frequency: np.ndarray, contrast: float) -> np.ndarray:
 
 
 def test_a_table_says_what_stands_in_it(tmp_path: Path) -> None:
-    profile = load_sensor(sensor_file(tmp_path, TABLE))
+    profile = load_sensor(str(sensor_file(tmp_path, TABLE)))
     sensor, f = profile.nominal(), np.array([[0.0, 0.25, 0.5]])
     assert isinstance(sensor.response, MtfTable)
     assert sensor.response.at(f, np.zeros((1, 1)))[0] == pytest.approx([1, 0.5, 0.12])
     assert sensor.response.at(np.zeros((1, 1)), f.T)[:, 0] == pytest.approx([1, 0.4, 0.05])
     assert sensor.mtf_axes == pytest.approx((0.12, 0.05))
     assert sensor == profile.draw(np.random.default_rng(3))
-    one_axis = load_sensor(sensor_file(tmp_path, TABLE.rsplit("\n", 1)[0]))
+    one_axis = load_sensor(str(sensor_file(tmp_path, TABLE.rsplit("\n", 1)[0])))
     assert one_axis.mtf_nyquist_along is None
     assert one_axis.nominal().mtf_axes == pytest.approx((0.12, 0.12))
 
@@ -132,7 +129,7 @@ def test_npy_and_tiff_are_the_same_instrument(dtype: str, tmp_path: Path) -> Non
     samples = np.rint(lopsided() * 4000).astype(dtype)
     (tmp_path / "tiff").mkdir()
     tifffile.imwrite(tmp_path / "tiff" / "psf.tif", samples, byteorder=">" if dtype[0] == ">" else "<")
-    other = load_sensor(sensor_file(tmp_path / "tiff", PSF.replace("npy", "tif")))
+    other = load_sensor(str(sensor_file(tmp_path / "tiff", PSF.replace("npy", "tif"))))
     assert same_instrument(with_psf(tmp_path, samples), other)
 
 
@@ -140,7 +137,7 @@ def test_npy_and_tiff_are_the_same_instrument(dtype: str, tmp_path: Path) -> Non
 @pytest.mark.parametrize("noise", [None, "alpha = 0.0077\nbeta = [0.05, 0.07]"])
 def test_a_profile_comes_back_from_json_without_its_file(mtf: str, noise: str | None, tmp_path: Path) -> None:
     np.save(tmp_path / "psf.npy", lopsided())
-    profile = load_sensor(sensor_file(tmp_path, mtf, noise))
+    profile = load_sensor(str(sensor_file(tmp_path, mtf, noise)))
     (tmp_path / "psf.npy").unlink()
     back = sensor_from_json("a test", json.loads(json.dumps(asdict(profile))))
     assert back == profile
@@ -160,7 +157,7 @@ def test_a_recipe_with_other_samples_is_refused(key: str, value: object, tmp_pat
 
 
 def test_another_contrast_beside_a_response_is_refused(tmp_path: Path) -> None:
-    sensor = load_sensor(sensor_file(tmp_path, TABLE)).nominal()
+    sensor = load_sensor(str(sensor_file(tmp_path, TABLE))).nominal()
     with pytest.raises(ValueError, match="beside a response"):
         replace(sensor, mtf_nyquist=0.2)
     assert replace(sensor, mtf_nyquist=0.2, mtf_nyquist_along=None, response=None).mtf_axes == (0.2, 0.2)
@@ -274,10 +271,12 @@ def test_a_tiff_whose_pages_lead_in_a_circle_is_refused_at_once(tmp_path: Path) 
 def test_alpha_and_beta_are_the_noise_itself(tmp_path: Path) -> None:
     plain = load_sensor("pleiades-degraded")
     alpha, beta = plain.nominal().alpha, plain.nominal().beta
-    profile = load_sensor(sensor_file(tmp_path, "mtf_nyquist = 0.07", f"alpha = {alpha}\nbeta = {beta}"))
+    profile = load_sensor(str(sensor_file(tmp_path, "mtf_nyquist = 0.07", f"alpha = {alpha}\nbeta = {beta}")))
     assert profile.nominal() == plain.nominal()
     assert (profile.radiance_0.low, profile.radiance_1.low) == (25, 100)  # of the shipped full scale, 400
-    ranged = load_sensor(sensor_file(tmp_path, "mtf_nyquist = 0.07", "alpha = [0.1, 0.2]\nbeta = 0\nradiance_1 = 60"))
+    ranged = load_sensor(
+        str(sensor_file(tmp_path, "mtf_nyquist = 0.07", "alpha = [0.1, 0.2]\nbeta = 0\nradiance_1 = 60"))
+    )
     drawn = [ranged.draw_counted(np.random.default_rng(seed)) for seed in range(20)]
     assert all(0.1 <= sensor.alpha <= 0.2 and sensor.beta == rejected == 0 for sensor, rejected in drawn)
     assert len({sensor.alpha for sensor, _ in drawn}) == 20
@@ -305,7 +304,7 @@ def test_a_wrong_noise_gets_one_sentence(noise: str, words: tuple[str, ...], tmp
 
 def test_profiles_print_the_response_and_its_source(tmp_path: Path) -> None:
     def shown(mtf: str, *more: str) -> str:
-        run = CliRunner(env={"COLUMNS": "400"}).invoke(app, ["profiles", sensor_file(tmp_path, mtf), *more])
+        run = CliRunner(env={"COLUMNS": "400"}).invoke(app, ["profiles", str(sensor_file(tmp_path, mtf)), *more])
         assert run.exit_code == 0
         return run.output
 

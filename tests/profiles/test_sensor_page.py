@@ -12,7 +12,6 @@ import pytest
 import tifffile
 from typer.core import TyperGroup
 from typer.main import get_command
-from typer.testing import CliRunner
 
 from deploy.cli import app
 from profiles.constant import Status, read_constant
@@ -20,6 +19,7 @@ from profiles.effects import LIMITS
 from profiles.effects import TABLES as EFFECTS
 from profiles.sensor import MTF_NYQUIST_MAX, TABLES, same_instrument, table_keys
 from profiles.sensor_file import SINGLE, load_sensor, read_sensor, sensor_names
+from tests.deploy.command_line import done
 
 PAGE = (Path(__file__).parents[2] / "docs" / "reference" / "sensor-profile.md").read_text(encoding="utf-8")
 ROWS = dict(re.findall(r"^\| `(\[\w+\] \w+)` \|(.*)\|$", PAGE, re.MULTILINE))
@@ -77,12 +77,11 @@ def test_each_other_way_of_the_page_fits_into_the_example(
 
 def test_profiles_print_the_file_to_start_from(tmp_path: Path) -> None:
     for name in (*sensor_names(), "snow", "vck190"):
-        printed = CliRunner().invoke(app, ["profiles", name, "--toml"])
-        (tmp_path / "mine.toml").write_text(printed.output, encoding="utf-8")
-        assert CliRunner().invoke(app, ["profiles", str(tmp_path / "mine.toml"), "--toml"]).output == printed.output
-    for name in sensor_names():
-        (tmp_path / "mine.toml").write_text(CliRunner().invoke(app, ["profiles", name, "--toml"]).output)
-        assert same_instrument(load_sensor(str(tmp_path / "mine.toml")), load_sensor(name))
+        printed = done("profiles", name, "--toml")
+        (tmp_path / "mine.toml").write_text(printed, encoding="utf-8")
+        assert done("profiles", tmp_path / "mine.toml", "--toml") == printed
+        if name in sensor_names():
+            assert same_instrument(load_sensor(str(tmp_path / "mine.toml")), load_sensor(name))
 
 
 def test_the_pages_commands_are_understood_and_use_what_was_written_before() -> None:

@@ -12,6 +12,7 @@ from profiles import load_target, target_names
 from profiles.errors import BeersError, ProfileError
 from profiles.target import board_names
 from profiles.toml import HERE
+from tests.deploy.command_line import done, refused
 
 PAGE = (HERE.parent / "docs" / "reference" / "boards.md").read_text(encoding="utf-8")
 (EXAMPLE,) = re.findall(r"```toml\n(.*?)```", PAGE, re.DOTALL)
@@ -66,9 +67,7 @@ def test_the_zcu104_is_the_zcu102_but_for_cores_clock_and_memory() -> None:
 
 
 def test_check_takes_the_pages_board(tmp_path: Path) -> None:
-    done = CliRunner().invoke(app, ["check", "--tile", "64", "--target", written(tmp_path, EXAMPLE)])
-    assert done.exit_code == 0, done.output
-    assert "B2304" in done.output
+    assert "B2304" in done("check", "--tile", "64", "--target", written(tmp_path, EXAMPLE))
 
 
 @pytest.mark.parametrize(
@@ -96,11 +95,10 @@ def test_a_wrong_board_gets_one_sentence(old: str, new: str, words: tuple[str, .
 
 def test_a_misspelt_constant_does_not_silence_its_rule(tmp_path: Path) -> None:
     text = (HERE / "targets" / "vek280.toml").read_text(encoding="utf-8").replace("\narea_max =", "\narea_mox =")
-    done = CliRunner().invoke(app, ["check", "--tile", "64", "--target", written(tmp_path, text)])
-    assert done.exit_code == 2
-    assert "[conv]" in done.stderr
-    assert "'area_mox'" in done.stderr
-    assert done.stderr.count("\n") == 1
+    said = done("check", "--tile", "64", "--target", written(tmp_path, text), code=2)
+    assert "[conv]" in said
+    assert "'area_mox'" in said
+    assert said.count("\n") == 1
 
 
 def test_a_board_without_a_base_names_its_documents(tmp_path: Path) -> None:
@@ -113,12 +111,8 @@ def test_a_board_without_a_base_names_its_documents(tmp_path: Path) -> None:
 def test_without_cost_constants_what_predicts_refuses_and_the_rest_works(tmp_path: Path) -> None:
     text = (HERE / "targets" / "vck190.toml").read_text(encoding="utf-8")
     path = written(tmp_path, re.sub(r"\n\[cost].*?\n\n", "\n", text, flags=re.DOTALL))
-    run = CliRunner().invoke
-    assert run(app, ["check", "--tile", "64", "--target", path]).exit_code == 0
-    done = run(app, ["stress", "--bit-flips", "--target", path, "--size", "32"])
-    assert done.exit_code == 2
-    assert "no cost constants yet" in done.output + done.stderr
-    assert done.stderr.count("\n") == 1
+    done("check", "--tile", "64", "--target", path)
+    assert "no cost constants yet" in refused("stress", "--bit-flips", "--target", path, "--size", "32")
 
 
 def test_a_target_without_a_dpu_is_told_the_boards() -> None:
@@ -129,9 +123,8 @@ def test_a_target_without_a_dpu_is_told_the_boards() -> None:
 @pytest.mark.parametrize("name", board_names())
 def test_check_takes_every_board_and_its_model(name: str) -> None:
     for target in (name, f"{name}-model"):
-        done = CliRunner().invoke(app, ["check", "--tile", "64", "--target", target])
-        assert done.exit_code == 0, done.output
-        assert f"on {name} {load_dpu(name).name}" in " ".join(done.output.split())
+        said = done("check", "--tile", "64", "--target", target)
+        assert f"on {name} {load_dpu(name).name}" in " ".join(said.split())
 
 
 @pytest.mark.parametrize("command", ["check", "quantize", "gate", "stress"])

@@ -1,28 +1,27 @@
 """A small network with real structure, its ONNX graph, and patches from a drawn scene."""
 
-import numpy as np
 import onnx
 import pytest
 import torch
 
 from deploy.export import to_onnx
-from model.convbeers import ConvBEERS, initialise
-from model.simulator.procedural import procedural_scene
+from model.convbeers import ConvBEERS
 from model.variants import Variant
-from profiles import load_sensor
-from quant.calibration import Patches, draw_patches
+from quant.calibration import Patches
+from quant.graph import Graph, correction_graph, read_planes
 from quant.quantise import Quantised, quantise_model
+from tests.model.networks import plain
+from tests.quant.quick import drawn
 
 
 @pytest.fixture(scope="session")
 def network() -> ConvBEERS:
-    network = ConvBEERS(Variant(blocks=2, features=8))
-    initialise(network, torch.Generator().manual_seed(3))
+    network = plain(Variant(blocks=2, features=8), seed=3)
     with torch.no_grad():
         for name, value in network.named_parameters():
             if name.endswith("bias"):
                 value.normal_(0, 0.02, generator=torch.Generator().manual_seed(len(name)))
-    return network.eval()
+    return network
 
 
 @pytest.fixture(scope="session")
@@ -31,18 +30,19 @@ def float_onnx(network: ConvBEERS) -> onnx.ModelProto:
 
 
 @pytest.fixture(scope="session")
+def graph(float_onnx: onnx.ModelProto) -> Graph:
+    return read_planes(correction_graph(float_onnx))
+
+
+@pytest.fixture(scope="session")
 def patches() -> Patches:
-    scene = procedural_scene(900, 960, np.random.default_rng(1))
-    return draw_patches([scene], load_sensor("pleiades-degraded"), load_sensor("pleiades-reference"), count=6, seed=5)
+    return drawn(6, seed=5, patch_px=80)
 
 
 @pytest.fixture(scope="session")
 def unseen() -> Patches:
     """Of another scene than calibration's."""
-    scene = procedural_scene(900, 960, np.random.default_rng(77))
-    return draw_patches(
-        [scene], load_sensor("pleiades-degraded"), load_sensor("pleiades-reference"), count=6, seed=78
-    )
+    return drawn(6, seed=78, scene=77, patch_px=80)
 
 
 @pytest.fixture(scope="session")

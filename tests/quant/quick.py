@@ -1,15 +1,77 @@
-"""Quantising in a moment: one guess in the place of the search that equalises channels."""
+"""What tests of quantising begin with: an image, patches of images, a copy to be spoilt, a search in a moment."""
 
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any
 from unittest.mock import patch
 
+import numpy as np
 import onnx
+from onnx import numpy_helper
+from onnxruntime.quantization import CalibrationDataReader
 
-from quant.calibration import Patches
+from model.simulator.procedural import procedural_scene
+from profiles import load_sensor
+from quant.calibration import Patches, Remade, draw_patches
 from quant.quantise import Quantised, quantise_model
 
 
-def quickly(model: onnx.ModelProto, patches: Patches) -> Quantised:
+def image(height: int = 37, width: int = 53, seed: int = 0) -> np.ndarray:
+    """Noise of digital numbers of 12 bits, (1, 1, height, width) float32 in [0, 1]."""
+    dn = np.random.default_rng(seed).integers(0, 4096, (1, 1, height, width))
+    return dn.astype(np.float32) / np.float32(4095)
+
+
+def patches_of(seen: list[np.ndarray]) -> Patches:
+    """These images, each its own reference."""
+    return Patches([], Remade(lambda k: (seen[k], seen[k]), len(seen)), Remade(lambda k: seen[k], len(seen)))
+
+
+def drawn(count: int, seed: int, scene: int = 1, patch_px: int = 128) -> Patches:
+    """Of one drawn scene, through the usual sensors."""
+    ground = procedural_scene(900, 960, np.random.default_rng(scene))
+    sensors = load_sensor("pleiades-degraded"), load_sensor("pleiades-reference")
+    return draw_patches([ground], *sensors, count, seed, patch_px=patch_px)
+
+
+def copied(model: onnx.ModelProto) -> onnx.ModelProto:
+    copy = onnx.ModelProto()
+    copy.CopyFrom(model)
+    return copy
+
+
+def change(model: onnx.ModelProto, name: str, by: Callable[[np.ndarray], np.ndarray]) -> None:
+    """Give a weight or a bias another value of its own type."""
+    tensor = next(t for t in model.graph.initializer if t.name == name)
+    value = numpy_helper.to_array(tensor)
+    tensor.CopyFrom(numpy_helper.from_array(np.asarray(by(value.copy()), value.dtype), name))
+
+
+def changed(model: onnx.ModelProto, name: str, by: Callable[[np.ndarray], np.ndarray]) -> onnx.ModelProto:
+    """A copy with one weight or bias changed."""
+    copy = copied(model)
+    change(copy, name, by)
+    return copy
+
+
+@contextmanager
+def one_guess() -> Iterator[None]:
+    """One guess in the place of the search that equalises channels."""
     guess: dict[str, Any] = {"LEVELLING": (0.5,), "HEADROOM": (1.0,)}
     with patch.multiple("quant.passes.equalise", STEPS=(), **guess), patch.multiple("quant.passes.level", **guess):
-        return quantise_model(model, patches, {})
+        yield
+
+
+def quickly(model: onnx.ModelProto, patches: Patches, **more: Any) -> Quantised:
+    with one_guess():
+        return quantise_model(model, patches, {}, **more)
+
+
+class Calibration(CalibrationDataReader):  # type: ignore[misc]  # onnxruntime has no types
+    """Images for somebody else's quantiser."""
+
+    def __init__(self, images: list[np.ndarray]) -> None:
+        self._images = iter(images)
+
+    def get_next(self) -> dict[str, np.ndarray] | None:
+        return next(({"image": image} for image in self._images), None)

@@ -18,7 +18,6 @@ from deploy.dpu.reading import network_of
 from examples.networks import NETWORKS, build, to_onnx
 from profiles.errors import ModelError
 from quant.bounds import layer_bounds
-from quant.calibration import Patches, Remade
 from quant.core import INT8_MAX, INT8_MIN
 from quant.encodings import as_on_board, encoding_faults, read_core
 from quant.encodings.description import KEY
@@ -30,7 +29,7 @@ from quant.quantise import Quantised, quantise_model
 from quant.reading.folding import simplest
 from quant.session import open_any_size, open_session, result_of
 from quant.tiling.walk import tiling_of
-from tests.quant.quick import quickly
+from tests.quant.quick import copied, patches_of, quickly
 
 SIDE_PX = 48
 
@@ -54,9 +53,7 @@ def float_network(name: str) -> onnx.ModelProto:
 
 @cache
 def quantised(name: str) -> Quantised:
-    seen = images(name)
-    patches = Patches([], Remade(lambda k: (seen[k], seen[k]), len(seen)), Remade(lambda k: seen[k], len(seen)))
-    return quickly(float_network(name), patches)
+    return quickly(float_network(name), patches_of(images(name)))
 
 
 @pytest.mark.parametrize("name", NETWORKS)
@@ -116,8 +113,7 @@ def test_a_file_is_read_back_as_the_core_it_was_written_from(name: str) -> None:
 
 
 def test_a_weight_that_is_not_what_the_file_says_is_a_fault() -> None:
-    spoilt = onnx.ModelProto()
-    spoilt.CopyFrom(quantised("unet").host)
+    spoilt = copied(quantised("unet").host)
     node = next(each for each in spoilt.graph.node if each.op_type == "ConvInteger")
     node.attribute[0].ints[0] += 1
     assert encoding_faults(spoilt) == [f"node {node.name}"]
@@ -136,8 +132,7 @@ def test_a_weight_that_is_not_what_the_file_says_is_a_fault() -> None:
     ],
 )
 def test_a_description_of_something_else_is_one_sentence(change: Callable[[dict[str, Any]], object]) -> None:
-    spoilt = onnx.ModelProto()
-    spoilt.CopyFrom(quantised("unet").host)
+    spoilt = copied(quantised("unet").host)
     entry = next(each for each in spoilt.metadata_props if each.key == KEY)
     said = json.loads(entry.value)
     change(said)
@@ -185,7 +180,7 @@ def one_convolution(weight: float, bias: float) -> onnx.ModelProto:
 @pytest.mark.parametrize(("weight", "bias"), [(1.0, 0.0), (-0.7, 0.93), (0.4, -0.31)])
 def test_windows_make_a_result_finer_than_8_bits(weight: float, bias: float, monkeypatch: pytest.MonkeyPatch) -> None:
     seen = images("ffdnet")
-    patches = Patches([], Remade(lambda k: (seen[k], seen[k]), len(seen)), Remade(lambda k: seen[k], len(seen)))
+    patches = patches_of(seen)
     model, errors = one_convolution(weight, bias), []
     for dual in (True, False):
         if not dual:

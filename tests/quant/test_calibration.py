@@ -4,7 +4,6 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
-import onnx
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -15,8 +14,9 @@ from profiles import load_sensor
 from profiles.errors import ImageError
 from profiles.response import MtfTable
 from quant.calibration import Patches, choose_frac_bits, draw_patches, stratified
-from quant.graph import PLANES, Graph, correction_graph, graph_to_onnx, read_planes, tensors
+from quant.graph import PLANES, Graph, graph_to_onnx, tensors
 from quant.session import TILE_PX, crops, halo_of, open_session, planes_of, tensor_values
+from tests.quant.quick import image
 
 VARIABLE, REFERENCE = load_sensor("pleiades-variable"), load_sensor("pleiades-reference")
 
@@ -29,16 +29,6 @@ def scenes() -> list[Scene]:
 @pytest.fixture(scope="module")
 def drawn(scenes: list[Scene]) -> Patches:
     return draw_patches(scenes, VARIABLE, REFERENCE, count=12, seed=3, patch_px=40)
-
-
-@pytest.fixture(scope="module")
-def graph(float_onnx: onnx.ModelProto) -> Graph:
-    return read_planes(correction_graph(float_onnx))
-
-
-def image(height: int, width: int) -> np.ndarray:
-    dn = np.random.default_rng(height).integers(0, 4096, (1, 1, height, width))
-    return dn.astype(np.float32) / np.float32(4095)
 
 
 def test_patches_are_the_same_however_they_are_asked_for(drawn: Patches) -> None:

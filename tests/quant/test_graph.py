@@ -10,6 +10,7 @@ from profiles.errors import ModelError
 from quant.graph import CORRECTION, IMAGE, Add, Conv, Resize, correction_graph, read_network, relu_count
 from quant.onnx_file import GraphWriter, image_info, make_model
 from quant.session import open_session, result_of
+from tests.quant.quick import copied
 
 
 def test_the_global_add_is_left_to_the_host(float_onnx: onnx.ModelProto) -> None:
@@ -33,8 +34,7 @@ def test_other_operators_are_refused_by_name(kind: str) -> None:
 
 
 def test_a_network_without_a_global_add_is_refused(float_onnx: onnx.ModelProto) -> None:
-    model = onnx.ModelProto()
-    model.CopyFrom(float_onnx)
+    model = copied(float_onnx)
     model.graph.node.pop()
     model.graph.output[0].name = "tail"
     with pytest.raises(ModelError, match="global add"):
@@ -42,8 +42,7 @@ def test_a_network_without_a_global_add_is_refused(float_onnx: onnx.ModelProto) 
 
 
 def test_a_strided_convolution_is_refused(float_onnx: onnx.ModelProto) -> None:
-    model = onnx.ModelProto()
-    model.CopyFrom(float_onnx)
+    model = copied(float_onnx)
     model.graph.node[0].attribute.append(helper.make_attribute("strides", [2, 2]))
     with pytest.raises(ModelError, match="stride 1, ReLU and adds, got head"):
         correction_graph(model)

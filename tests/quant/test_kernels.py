@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from onnx import TensorProto, helper, numpy_helper
-from onnxruntime.quantization import CalibrationDataReader, QuantFormat, QuantType, quantize_static
+from onnxruntime.quantization import QuantFormat, QuantType, quantize_static
 
 from deploy.networks import shipped_pair
 from model.processor import int8_adds_exactly
@@ -22,6 +22,7 @@ from quant.integer import merged_correction, run_core
 from quant.kernels import INT16_MAX, INT16_MIN, Way, cannot_saturate, made_exact
 from quant.onnx_file import load_onnx
 from quant.session import open_session, run
+from tests.quant.quick import Calibration
 
 SHAPES = [(1, 1, 1), (3, 5, 3), (4, 6, 1), (16, 16, 3), (5, 33, 3), (32, 8, 2), (17, 32, 3)]
 """(outputs, inputs, kernel) of convolutions: odd ones straddle what a kernel takes at a time."""
@@ -216,18 +217,6 @@ def test_weights_that_are_computed_are_refused_in_a_sentence() -> None:
         open_session(model, exact=True)
 
 
-class Calibration(CalibrationDataReader):  # type: ignore[misc]  # onnxruntime has no types
-    """A few images of noise for somebody else's quantiser."""
-
-    def __init__(self) -> None:
-        generator = np.random.default_rng(4)
-        self._images = iter([generator.random((1, 1, 24, 24), dtype=np.float32) for _ in range(4)])
-
-    def get_next(self) -> dict[str, np.ndarray] | None:
-        image = next(self._images, None)
-        return None if image is None else {"image": image}
-
-
 @pytest.mark.parametrize("activations", [QuantType.QUInt8, QuantType.QInt8])
 @pytest.mark.parametrize("per_channel", [False, True])
 @pytest.mark.parametrize("form", [QuantFormat.QOperator, QuantFormat.QDQ])
@@ -241,8 +230,9 @@ def test_files_of_other_makers_give_the_same_numbers_in_these_ways(
         "activation_type": activations,
         "weight_type": QuantType.QInt8,
     }
+    noise = list(np.random.default_rng(4).random((4, 1, 1, 24, 24), dtype=np.float32))
     onnx.save_model(float_onnx, tmp_path / "float.onnx")
-    quantize_static(tmp_path / "float.onnx", tmp_path / "theirs.onnx", Calibration(), **options)
+    quantize_static(tmp_path / "float.onnx", tmp_path / "theirs.onnx", Calibration(noise), **options)
     theirs = load_onnx(tmp_path / "theirs.onnx")
     assert set(made_exact(theirs)[1].values()) & {Way.unsigned, Way.converted}
     image = np.random.default_rng(1).integers(0, 2, (1, 1, 31, 45)).astype(np.float32)

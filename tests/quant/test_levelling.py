@@ -6,7 +6,6 @@ import pytest
 import torch
 
 from examples.networks import build, to_onnx
-from quant.calibration import Patches, Remade
 from quant.ends import Ends, ends_of
 from quant.gate import compare
 from quant.graph import CORRECTION, PLANES, Conv, Graph, channels_of, graph_to_onnx, read_network, read_planes
@@ -14,9 +13,9 @@ from quant.passes import level
 from quant.passes.equalise import MOST_CHANNELS, Costs
 from quant.passes.level import Chain, chain_ranges
 from quant.passes.stream import STREAM_FRAC_BITS, lone_tensors
-from quant.quantise import quantise_model
 from quant.reading.folding import simplest
 from quant.session import open_session, planes_of
+from tests.quant.quick import patches_of, quickly
 
 
 def read(name: str) -> tuple[onnx.ModelProto, Graph, Ends, Chain]:
@@ -112,10 +111,10 @@ def test_unequal_channels_err_half_as_much_once_they_are_levelled(monkeypatch: p
             norm.bias.mul_(factors)  # type: ignore[union-attr]
             conv.weight.div_(factors[:, None, None])
     model, seen = simplest(to_onnx("dncnn", network), "dncnn"), images()
-    patches = Patches([], Remade(lambda k: (seen[k], seen[k]), len(seen)), Remade(lambda k: seen[k], len(seen)))
+    patches = patches_of(seen)
 
     def mae() -> float:
-        made = quantise_model(model, patches, {})
+        made = quickly(model, patches)
         return compare(open_session(model), open_session(made.host), patches.pairs, simulated=False).mae
 
     levelled = mae()

@@ -9,13 +9,13 @@ import pytest
 from onnx import TensorProto, helper
 
 from profiles.errors import ModelError
-from quant.calibration import Patches, Remade
 from quant.graph import read_network
 from quant.integer import agreement
 from quant.onnx_file import GraphWriter, make_model
 from quant.quantise import quantise_model
 from quant.session import open_session, result_of
 from quant.structure import saturated_shares, structure_checks
+from tests.quant.quick import patches_of
 
 SLOPE = 26 / 256
 
@@ -132,7 +132,7 @@ def test_near_float_equal_to_the_reference_and_without_faults(
     model = make(Sketch())
     rows, columns = np.mgrid[:48, :36] / 40
     seen = [(0.4 + 0.3 * np.sin(7 * rows + k) * np.cos(5 * columns)).astype(np.float32)[None, None] for k in range(3)]
-    patches = Patches([], Remade(lambda k: (seen[k], seen[k]), 3), Remade(lambda k: seen[k], 3))
+    patches = patches_of(seen)
     made = quantise_model(model, patches, {})
     wanted = made.core.ends.clipped(result_of(open_session(model), seen[1]))
     found = result_of(open_session(made.host), seen[1])

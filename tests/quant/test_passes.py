@@ -15,9 +15,7 @@ from quant.graph import (
     Add,
     Conv,
     Graph,
-    correction_graph,
     graph_to_onnx,
-    read_planes,
     split,
 )
 from quant.passes.equalise import (
@@ -40,16 +38,12 @@ from quant.passes.stream import (
 )
 from quant.quantise import Quantised, quantise_model
 from quant.session import open_session
+from tests.quant.quick import quickly
 
 
 def stream_of(graph: Graph) -> Stream:
     (stream,) = streams(graph)
     return stream
-
-
-@pytest.fixture(scope="module")
-def graph(float_onnx: onnx.ModelProto) -> Graph:
-    return read_planes(correction_graph(float_onnx))
 
 
 def correction(graph: Graph, seed: int = 0) -> np.ndarray:
@@ -207,10 +201,10 @@ def test_all_passes_lose_far_less_than_none(
     last = rounded.core.ops[-1]
     assert isinstance(last, IntConv)
     assert len(last.weight) == 1
-    assert mae(quantised) < 0.5 * mae(rounded)
+    assert mae(quantised) < 0.6 * mae(rounded)
 
 
 def test_each_step_is_told(float_onnx: onnx.ModelProto, patches: Patches) -> None:
     told: list[str] = []
-    quantise_model(float_onnx, patches, {}, log=told.append)
+    quickly(float_onnx, patches, log=told.append)
     assert [step.split(" ")[0] for step in told] == ["scale", "equalising", "rounding"]

@@ -17,7 +17,6 @@ from deploy.dpu.checker.placement import place
 from deploy.dpu.checker.table import legality
 from deploy.dpu.reading import network_of
 from profiles.errors import ModelError
-from quant.calibration import Patches, Remade
 from quant.encodings import as_on_board, encoding_faults, read_core
 from quant.encodings.description import KEY
 from quant.graph import CORRECTION, read_network
@@ -27,7 +26,7 @@ from quant.onnx_file import GraphWriter, image_info, make_model
 from quant.quantise import Quantised
 from quant.reading.folding import simplest
 from quant.session import open_session, result_of
-from tests.quant.quick import quickly
+from tests.quant.quick import copied, patches_of, quickly
 
 SIDE_PX = 160
 
@@ -47,14 +46,9 @@ def images(count: int = 3) -> list[np.ndarray]:
     return list(np.kron(blocks, np.ones((8, 8), np.float32)))
 
 
-def samples() -> Patches:
-    seen = images()
-    return Patches([], Remade(lambda k: (seen[k], seen[k]), len(seen)), Remade(lambda k: seen[k], len(seen)))
-
-
 @cache
 def quantised() -> Quantised:
-    return quickly(detector(), samples())
+    return quickly(detector(), patches_of(images()))
 
 
 def test_the_tail_begins_behind_the_last_convolution() -> None:
@@ -113,8 +107,7 @@ def test_the_core_and_the_float_file_are_legal_on_the_dpu(target: str) -> None:
 
 
 def test_a_tail_that_was_changed_is_a_fault() -> None:
-    spoilt = onnx.ModelProto()
-    spoilt.CopyFrom(quantised().host)
+    spoilt = copied(quantised().host)
     node = next(each for each in spoilt.graph.node if each.op_type == "Exp")
     node.op_type = "Sqrt"
     assert encoding_faults(spoilt) == [f"node {node.name}"]
@@ -128,8 +121,7 @@ def graph_text(kind: str) -> str:
 
 @pytest.mark.parametrize("text", [graph_text("Loop"), graph_text("Conv"), "bm8gZ3JhcGg=", "not base64"])
 def test_a_description_with_another_tail_is_one_sentence(text: str) -> None:
-    spoilt = onnx.ModelProto()
-    spoilt.CopyFrom(quantised().host)
+    spoilt = copied(quantised().host)
     ends, entry = quantised().core.ends, next(each for each in spoilt.metadata_props if each.key == KEY)
     assert ends.tail is not None
     entry.value = entry.value.replace(ends.tail.text, text)

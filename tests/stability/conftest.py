@@ -3,7 +3,6 @@
 from collections.abc import Iterator
 from pathlib import Path
 
-import numpy as np
 import onnx
 import pytest
 import torch
@@ -11,14 +10,12 @@ import torch
 from deploy.export import to_onnx
 from deploy.studies.stress.checks import torch_threads
 from deploy.studies.stress.networks import Subject, open_subject
-from model.convbeers import ConvBEERS, initialise
-from model.simulator.procedural import procedural_scene
+from model.convbeers import ConvBEERS
 from model.variants import Variant
-from profiles import load_sensor
-from quant.calibration import draw_patches
 from quant.onnx_file import save_onnx
 from quant.quantise import Quantised
-from tests.quant.quick import quickly
+from tests.model.networks import plain
+from tests.quant.quick import drawn, quickly
 
 
 @pytest.fixture(autouse=True)
@@ -34,11 +31,10 @@ def network() -> ConvBEERS:
 
 
 def small_network(variant: Variant) -> ConvBEERS:
-    made = ConvBEERS(variant)
-    initialise(made, torch.Generator().manual_seed(3))
+    made = plain(variant, seed=3)
     with torch.no_grad():
         made.tail.weight.mul_(0.03)  # a trained network keeps flat ground; a new one nearly does
-    return made.eval()
+    return made
 
 
 @pytest.fixture(scope="session")
@@ -52,10 +48,7 @@ def quantised(float_onnx: onnx.ModelProto) -> Quantised:
 
 
 def quickly_quantised(float_onnx: onnx.ModelProto) -> Quantised:
-    scene = procedural_scene(700, 700, np.random.default_rng(1))
-    sensors = load_sensor("pleiades-degraded"), load_sensor("pleiades-reference")
-    patches = draw_patches([scene], *sensors, count=2, seed=5)
-    return quickly(float_onnx, patches)
+    return quickly(float_onnx, drawn(2, seed=5))
 
 
 @pytest.fixture(scope="session")

@@ -1,18 +1,14 @@
 """The battery passes what is sound, and stops what is broken."""
 
-import json
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import onnx
 import pytest
-from jsonschema import validate
-from onnx import numpy_helper
 from typer.testing import CliRunner
 
 from deploy.cli import app
-from deploy.results import SCHEMA_PATH
 from deploy.studies.stress.battery import StageResult, run_battery, worst
 from deploy.studies.stress.cases import CASES, FULL_DN, Case
 from deploy.studies.stress.checks import LIMITATIONS, Measure, differing, local_range, ringing
@@ -20,6 +16,9 @@ from deploy.studies.stress.networks import STAGES, Subject, open_subject, restor
 from profiles.errors import ModelError
 from quant.onnx_file import save_onnx
 from quant.tiling.walk import Tiling
+from tests.deploy.command_line import done, refused
+from tests.deploy.documents import valid
+from tests.quant.quick import changed
 
 BY_NAME = {case.name: case for case in CASES}
 SIDE_PX = 32
@@ -68,15 +67,6 @@ def shipped() -> Subject:
     return open_subject(None, None, "convbeers-xs")
 
 
-def spoilt(model: onnx.ModelProto, name: str, change: Callable[[np.ndarray], np.ndarray]) -> onnx.ModelProto:
-    copy = onnx.ModelProto()
-    copy.CopyFrom(model)
-    tensor = next(t for t in copy.graph.initializer if t.name == name)
-    value = numpy_helper.to_array(tensor)
-    tensor.CopyFrom(numpy_helper.from_array(np.asarray(change(value.copy()), value.dtype), name))
-    return copy
-
-
 def one_nan(weight: np.ndarray) -> np.ndarray:
     weight.ravel()[4] = np.nan
     return weight
@@ -100,19 +90,19 @@ def test_a_broken_float_network_fails(
     float_onnx: onnx.ModelProto,
     tmp_path: Path,
 ) -> None:
-    save_onnx(spoilt(float_onnx, name, change), tmp_path / "broken.onnx")
+    save_onnx(changed(float_onnx, name, change), tmp_path / "broken.onnx")
     (result,) = look(open_subject(tmp_path / "broken.onnx", None, ""), [case], ("float32",))
     assert any(measure.check.startswith(check) for measure in result.failed), result.verdict
 
 
 def test_a_network_with_a_nan_among_its_weights_is_not_opened(float_onnx: onnx.ModelProto, tmp_path: Path) -> None:
-    save_onnx(spoilt(float_onnx, "body.0.second.weight", one_nan), tmp_path / "broken.onnx")
+    save_onnx(changed(float_onnx, "body.0.second.weight", one_nan), tmp_path / "broken.onnx")
     with pytest.raises(ModelError, match=r"1 NaN or infinite in body\.0\.second\.weight"):
         open_subject(tmp_path / "broken.onnx", None, "")
 
 
 def test_a_broken_int8_network_fails(pair: list[Path], tmp_path: Path) -> None:
-    broken = spoilt(onnx.load(pair[1]), "tail.bias", lambda bias: bias + 10_000_000)
+    broken = changed(onnx.load(pair[1]), "tail.bias", lambda bias: bias + 10_000_000)
     save_onnx(broken, tmp_path / "broken.onnx")
     results = look(open_subject(pair[0], tmp_path / "broken.onnx", ""), ["deciles"], ("INT8",))
     assert {"mean moved"} <= {measure.check for measure in results[0].failed}
@@ -168,14 +158,12 @@ def test_cases_are_drawn_from_their_seed_and_say_what_is_wrong_with_them(case: C
 def test_the_command_writes_its_figures_and_fails_by_exit_code(pair: list[Path], tmp_path: Path) -> None:
     few = ["--cases", "night,NaN pixels", "--stages", "float32,INT8,tiling", "--size", "24"]
     files = ["--json", str(tmp_path / "s.json"), "--out", str(tmp_path / "s.md")]
-    done = CliRunner().invoke(app, ["stress", str(pair[0]), str(pair[1]), *few, *files])
-    assert done.exit_code == 0, done.output
-    document = json.loads((tmp_path / "s.json").read_text())
-    validate(document, json.loads(SCHEMA_PATH.read_text()))
+    done("stress", pair[0], pair[1], *few, *files)
+    document = valid(tmp_path / "s.json")
     tables = {row["table"] for row in document["rows"]}
     assert {"battery", "worst", "integer layers", "findings"} <= tables
     assert "## Integer layers" in (tmp_path / "s.md").read_text()
-    broken = spoilt(onnx.load(pair[0]), "tail.weight", lambda weight: 3000 * weight)
+    broken = changed(onnx.load(pair[0]), "tail.weight", lambda weight: 3000 * weight)
     save_onnx(broken, tmp_path / "broken.onnx")
     failed = CliRunner().invoke(app, ["stress", str(tmp_path / "broken.onnx"), *few])
     assert failed.exit_code == 1
@@ -196,6 +184,4 @@ def test_the_command_writes_its_figures_and_fails_by_exit_code(pair: list[Path],
 )
 def test_bad_input_is_one_sentence(arguments: list[str], words: str, pair: list[Path]) -> None:
     files = dict(zip(("FLOAT", "INT8"), map(str, pair), strict=True))
-    result = CliRunner().invoke(app, ["stress", *(files.get(text, text) for text in arguments)])
-    assert result.exit_code == 2
-    assert words in result.output
+    assert words in refused("stress", *(files.get(text, text) for text in arguments))

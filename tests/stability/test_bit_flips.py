@@ -3,15 +3,12 @@
 import json
 from itertools import pairwise
 from pathlib import Path
-from types import ModuleType
 from xml.etree import ElementTree as ET
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 from deploy.bench.tables import predict_file
-from deploy.cli import app
 from deploy.dpu.board import load_dpu
 from deploy.networks import shipped_pair
 from deploy.restoration.options import TILE_PX
@@ -31,11 +28,12 @@ from deploy.studies.stress.bit_flips import (
 )
 from deploy.studies.stress.faults import Guards, as_stored, checksums, map_channels
 from deploy.studies.stress.networks import Subject, open_subject
+from docs.make import bit_flips as maker
 from profiles.figures import Row
 from quant.core import IntConv
 from quant.graph import Activation
 from quant.integer import SOUND
-from tests.stability.makers import DOCS, load_maker
+from tests.deploy.command_line import done, refused
 
 pytestmark = pytest.mark.slow
 
@@ -122,8 +120,7 @@ def test_all_guards_cost_under_two_per_cent_on_the_board(variant: str) -> None:
 def test_the_command(pair: list[Path], tmp_path: Path) -> None:
     files = ["--json", str(tmp_path / "f.json"), "--out", str(tmp_path / "f.md")]
     few = ["--bit-flips", "--draws", "1", "--size", "32"]
-    done = CliRunner().invoke(app, ["stress", *map(str, pair), *few, *files])
-    assert done.exit_code == 0, done.output
+    done("stress", *pair, *few, *files)
     document = json.loads((tmp_path / "f.json").read_text(encoding="utf-8"))
     assert {row["table"] for row in document["rows"]} == {"bit flips", "guards"}
     page = (tmp_path / "f.md").read_text(encoding="utf-8")
@@ -150,19 +147,12 @@ def test_wrong_arguments(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     files = {"FLOAT": str(pair[0]), "INT8": str(pair[1])}
-    result = CliRunner().invoke(app, ["stress", *(files.get(text, text) for text in arguments)])
-    assert result.exit_code == 2, result.output
-    assert said in result.output
+    assert said in refused("stress", *(files.get(text, text) for text in arguments))
 
 
-@pytest.fixture(scope="module")
-def maker() -> ModuleType:
-    return load_maker("bit_flips")
-
-
-def test_the_page_is_fresh(maker: ModuleType) -> None:
+def test_the_page_is_fresh() -> None:
     """Prices need no injections; the measured rows are counted."""
-    page = (DOCS / "explanation" / "bit-flips.md").read_text(encoding="utf-8")
+    page = (maker.DOCS / "explanation" / "bit-flips.md").read_text(encoding="utf-8")
     assert page.startswith(maker.OPENING + maker.FINDINGS)
     dpu = load_dpu("vck190", None)
     for variant in maker.VARIANTS:

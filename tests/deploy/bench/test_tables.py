@@ -1,13 +1,9 @@
-import json
 import math
 from pathlib import Path
 
-import jsonschema
 import numpy as np
 import pytest
 import tifffile
-import typer
-from typer.testing import CliRunner
 
 from deploy.bench.board import TRAFFIC
 from deploy.bench.tables import (
@@ -21,32 +17,14 @@ from deploy.bench.tables import (
     published_rows,
     sweep_rows,
 )
-from deploy.commands.bench import bench
-from deploy.commands.check import check
 from deploy.dpu.board import load_dpu
-from deploy.results import SCHEMA_PATH
-from profiles.errors import BeersError, ImageError, OptionError, ProfileError
+from profiles.errors import OptionError
 from profiles.figures import Row, measured, predicted, unavailable
+from tests.deploy.command_line import done, refused
+from tests.deploy.documents import valid
 from tests.deploy.dpu.graphs import float_convbeers, integer_convbeers
 
 DPU = load_dpu("vck190")
-
-
-def run(command: str, *arguments: str) -> tuple[int, str]:
-    """Run one command as the command line does; errors pass through."""
-    app = typer.Typer()
-    app.command("check")(check)
-    app.command("bench")(bench)
-    result = CliRunner().invoke(app, [command, *arguments])
-    if isinstance(result.exception, BeersError):
-        raise result.exception
-    return result.exit_code, result.output
-
-
-def document(path: Path) -> dict[str, list[dict[str, object]]]:
-    content = json.loads(path.read_text(encoding="utf-8"))
-    jsonschema.validate(content, json.loads(SCHEMA_PATH.read_text()))
-    return dict(content)
 
 
 def value(row: Row, key: str) -> float:
@@ -111,9 +89,8 @@ def test_bench_writes_a_valid_document(tmp_path: Path) -> None:
     image, out = tmp_path / "raw.tif", tmp_path / "out.json"
     tifffile.imwrite(image, np.random.default_rng(0).integers(300, 900, (51, 63), dtype=np.uint16))
     model = integer_convbeers(tmp_path / "net.onnx", 1, 8)
-    code, _ = run("bench", str(model), "--image", str(image), "--tile", "32", "--json", str(out))
-    assert code == 0
-    written = document(out)
+    done("bench", model, "--image", image, "--tile", 32, "--json", out)
+    written = valid(out)
     assert [entry["name"] for entry in written["inputs"]] == ["net.onnx", "raw.tif"]
     names = [str(row["name"]) for row in written["rows"]]
     assert sum(name.startswith("paper, 13600 x 9016:") for name in names) == 2
@@ -122,13 +99,13 @@ def test_bench_writes_a_valid_document(tmp_path: Path) -> None:
 
 
 def test_layers_are_shown_when_asked_for_and_written_always(tmp_path: Path) -> None:
-    model, out = str(integer_convbeers(tmp_path / "net.onnx", 1, 8)), tmp_path / "out.json"
-    options = ("--size", "41x33", "--tile", "32", "--no-traditional", "--json", str(out))
-    (_, brief), (_, full) = run("bench", model, *options), run("bench", model, *options, "--layers")
+    model, out = integer_convbeers(tmp_path / "net.onnx", 1, 8), tmp_path / "out.json"
+    command = ("bench", model, "--size", "41x33", "--tile", 32, "--no-traditional", "--json", out)
+    brief, full = done(*command), done(*command, "--layers")
     assert ("LdFM" in brief, "LdFM" in full) == (False, True)
     assert ("--layers" in brief, "--layers" in full) == (True, False)
     assert full.index("LdFM") < full.index("throughput")
-    assert {"bench", "layers"} <= {row["table"] for row in document(out)["rows"]}
+    assert {"bench", "layers"} <= {row["table"] for row in valid(out)["rows"]}
 
 
 def test_layer_rows_have_the_columns_of_vaitrace(tmp_path: Path) -> None:
@@ -154,9 +131,10 @@ def test_small_tiles_keep_maps_on_chip_and_cost_work(tmp_path: Path) -> None:
 
 def test_all_configurations_are_swept(tmp_path: Path) -> None:
     model, out = integer_convbeers(tmp_path / "net.onnx", 1, 8), tmp_path / "out.json"
-    options = ("--size", "41x33", "--tile", "64,32", "--config", "all", "--no-traditional", "--json", str(out))
-    assert run("bench", str(model), *options)[0] == 0
-    swept = [str(row["name"]) for row in document(out)["rows"] if row["table"] == "sweep"]
+    done(
+        *("bench", model, "--size", "41x33", "--tile", "64,32", "--config", "all", "--no-traditional", "--json", out)
+    )
+    swept = [str(row["name"]) for row in valid(out)["rows"] if row["table"] == "sweep"]
     assert swept == [f"vck190 {name}, tiles of {tile}" for name in DPU.target.configurations for tile in (64, 32)]
 
 
@@ -167,53 +145,67 @@ def test_bad_tiles_are_refused(text: str) -> None:
 
 
 def test_the_host_takes_one_tile_size(tmp_path: Path) -> None:
-    with pytest.raises(OptionError, match="--target host"):
-        run("bench", str(integer_convbeers(tmp_path / "net.onnx", 1, 8)), "--target", "host", "--tile", "64,32")
+    model = integer_convbeers(tmp_path / "net.onnx", 1, 8)
+    assert "--target host" in refused("bench", model, "--target", "host", "--tile", "64,32")
 
 
 def test_bench_on_this_machine(tmp_path: Path) -> None:
     model, out = integer_convbeers(tmp_path / "net.onnx", 1, 8), tmp_path / "host.json"
-    code, output = run("bench", str(model), "--target", "host", "--tile", "32", "--json", str(out))
-    assert code == 0
-    assert "no proxy" in output
-    row, *_ = document(out)["rows"]
+    assert "no proxy" in done("bench", model, "--target", "host", "--tile", 32, "--json", out)
+    row, *_ = valid(out)["rows"]
     assert isinstance(row["figures"], dict)
     assert row["figures"]["p50"]["value"] <= row["figures"]["p90"]["value"]
 
 
 def test_bad_options_are_refused(tmp_path: Path) -> None:
-    model = str(integer_convbeers(tmp_path / "net.onnx", 1, 8))
-    with pytest.raises(ProfileError, match="--config"):
-        run("bench", model, "--config", "C1B1")
-    with pytest.raises(OptionError, match="--tile"):
-        run("bench", model, "--tile", "16", "--halo", "8")
-    colour = tmp_path / "rgb.tif"
-    tifffile.imwrite(colour, np.zeros((8, 9, 3), np.uint8), photometric="rgb")
-    with pytest.raises(ImageError, match="one band"):
-        run("bench", model, "--image", str(colour))
-    mono = tmp_path / "mono.tif"
-    tifffile.imwrite(mono, np.zeros((8, 9), np.uint16))
-    with pytest.raises(OptionError, match="--size"):
-        run("bench", model, "--image", str(mono), "--size", "3x4")
-    with pytest.raises(OptionError, match="--full-scale"):
-        run("bench", model, "--full-scale", "255")
-    tifffile.imwrite(mono, np.full((8, 9), 0.5, np.float32))
-    with pytest.raises(ImageError, match=r"0\.5; .*--full-scale"):
-        run("bench", model, "--image", str(mono))
+    model = integer_convbeers(tmp_path / "net.onnx", 1, 8)
+    tifffile.imwrite(tmp_path / "colour.tif", np.zeros((8, 9, 3), np.uint8), photometric="rgb")
+    tifffile.imwrite(tmp_path / "mono.tif", np.zeros((8, 9), np.uint16))
+    tifffile.imwrite(tmp_path / "half.tif", np.full((8, 9), 0.5, np.float32))
+    for options, said in (
+        ("--config C1B1", "--config"),
+        ("--tile 16 --halo 8", "--tile"),
+        ("--image colour.tif", "one band"),
+        ("--image mono.tif --size 3x4", "--size"),
+        ("--full-scale 255", "--full-scale"),
+        ("--image half.tif", "0.5; "),
+        ("--target kv261", "kv261"),
+    ):
+        words = [tmp_path / word if word.endswith(".tif") else word for word in options.split()]
+        assert said in refused("bench", model, *words)
 
 
 def test_a_board_is_named_with_or_without_its_model(tmp_path: Path) -> None:
     """As `check` and `profiles` name it, and as a model of it."""
-    model = str(integer_convbeers(tmp_path / "net.onnx", 1, 8))
+    model = integer_convbeers(tmp_path / "net.onnx", 1, 8)
     tables = []
     for name in ("vck190-model", "vck190"):
-        code, output = run("bench", model, "--target", name, "--size", "600x400", "--tile", "64", "--no-traditional")
-        assert code == 0
+        output = done("bench", model, "--target", name, "--size", "600x400", "--tile", 64, "--no-traditional")
         tables.append([line for line in output.splitlines() if "C32B3" in line])
     assert tables[0] == tables[1] != []
-    assert run("check", model, "--target", "vck190-model") == run("check", model, "--target", "vck190")
+    assert done("check", model, "--target", "vck190-model") == done("check", model, "--target", "vck190")
 
 
-def test_a_target_that_nobody_modelled_is_one_sentence(tmp_path: Path) -> None:
-    with pytest.raises(ProfileError, match="kv261"):
-        run("bench", str(integer_convbeers(tmp_path / "net.onnx", 1, 8)), "--target", "kv261")
+def test_the_paper_counts_fractions() -> None:
+    frames = Swath(13600, 9016).frames
+    assert frames == pytest.approx(299.36, abs=0.01)
+    assert frames / 7.2 == pytest.approx(42, abs=0.5)
+
+
+@pytest.mark.parametrize(
+    ("halo_px", "tiles"),
+    [(0, 330), (11, 330), (12, 345), (20, 345), (21, 368), (25, 368), (26, 384), (35, 384), (38, 384)],
+)
+def test_whole_tiles_of_the_published_swath(halo_px: int, tiles: int) -> None:
+    assert Swath(13600, 9016, 640, halo_px).tiles == tiles
+
+
+@pytest.mark.parametrize(("size_px", "halo_px"), [(641, 0), (1000, 7), (13, 3), (9016, 35), (640, 100)])
+def test_one_side_is_the_formula(size_px: int, halo_px: int) -> None:
+    formula = max(1, -(-(size_px - 2 * halo_px) // (640 - 2 * halo_px)))
+    assert Swath(size_px, size_px, 640, halo_px).tiles == formula**2
+
+
+def test_a_halo_that_leaves_nothing_is_refused() -> None:
+    with pytest.raises(OptionError, match="--tile"):
+        _ = Swath(1000, 1000, 64, 32).tiles

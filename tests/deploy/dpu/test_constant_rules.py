@@ -19,14 +19,12 @@ from deploy.dpu.graph import Operation, Scale
 from deploy.dpu.reading import network_of, read_network
 from deploy.export import to_onnx
 from deploy.networks import shipped_pair
-from model.convbeers import ConvBEERS, initialise
 from model.shipped import shipped_names
-from model.simulator.procedural import procedural_scene
 from model.variants import Variant
-from profiles import load_sensor
-from quant.calibration import draw_patches
 from quant.quantise import Quantised, quantise_model
 from tests.deploy.dpu.graphs import IntegerSketch
+from tests.model.networks import plain
+from tests.quant.quick import changed, copied, drawn
 
 DPU = load_dpu("vck190")
 HALF = Scale((0.5,), (0,), "int8")
@@ -39,23 +37,17 @@ def rules(model: onnx.ModelProto) -> set[str]:
 @cache
 def quantised(spread: float) -> Quantised:
     """A small network of random weights, its biases so large."""
-    network, generator = ConvBEERS(Variant(blocks=1, features=4)), torch.Generator().manual_seed(7)
-    initialise(network, generator)
+    network, generator = plain(Variant(blocks=1, features=4), seed=7), torch.Generator().manual_seed(7)
     with torch.no_grad():
         for name, value in network.named_parameters():
             if name.endswith("bias"):
                 value.normal_(0, spread, generator=generator)
-    scene = procedural_scene(400, 400, np.random.default_rng(1))
-    sensors = load_sensor("pleiades-degraded"), load_sensor("pleiades-reference")
-    patches = draw_patches([scene], *sensors, count=2, seed=5)
-    return quantise_model(to_onnx(network.eval(), {}), patches, {})
+    return quantise_model(to_onnx(network, {}), drawn(2, seed=5), {})
 
 
 def own_file() -> onnx.ModelProto:
     """The host's, to be spoilt."""
-    model = onnx.ModelProto()
-    model.CopyFrom(quantised(0.1).host)
-    return model
+    return copied(quantised(0.1).host)
 
 
 def kept(values: list[int]) -> bool:
@@ -115,9 +107,7 @@ def test_a_bias_with_one_more_on_a_value_is_refused() -> None:
     shifted = [name for name in named if not (values[name] % 2).any()]
     assert len(shifted) > len(named) // 2
     for name in shifted:
-        model, more = own_file(), values[name].copy()
-        more[0] += 1
-        next(t for t in model.graph.initializer if t.name == name).CopyFrom(numpy_helper.from_array(more, name))
+        model = changed(own_file(), name, lambda bias: bias + (np.arange(len(bias)) == 0))
         assert rules(model) == {"int32 bias"}, name
 
 

@@ -8,8 +8,11 @@ import numpy as np
 import pytest
 
 from deploy.dpu.board import load_dpu
+from deploy.dpu.checker import number_rules
+from deploy.dpu.checker.finding import Rule
 from deploy.dpu.checker.number_rules import AGAIN, MOVE
 from deploy.dpu.checker.placement import place
+from deploy.dpu.graph import Operation, Scale
 from deploy.dpu.reading import read_network
 from tests.deploy.dpu.graphs import QdqSketch
 
@@ -58,9 +61,12 @@ CASES: dict[str, tuple[Draw, Draw]] = {
     "power of two": (conv(weight=-math.log2(0.01)), conv(weight=7)),
     "int8 bias": (conv(bias_kind=np.int32, bias=14), conv(bias=14)),
     "shift cut": (conv(weight=17, bias=9), conv(weight=16, bias=9)),
+    "shift cut: to the finer": (conv(weight=0, output=8), conv(weight=0, output=7)),
     "shift bias": (conv(bias=-3), conv(bias=-2)),
+    "shift bias: to the finer": (conv(bias=24), conv(bias=23)),
     "shift read": (added(-2, 14, -2), added(-2, 13, -2)),
     "shift write": (added(7, 7, 23), added(7, 7, 22)),
+    "shift write: to the coarser": (added(7, 7, -9), added(7, 7, -8)),
     "same scale": (pooled(6), pooled(7)),
     "power of two: of an addend": (combined("Add", np.int8, -math.log2(0.01)), combined("Add", np.int8)),
     "shift read: of an addend": (combined("Add", np.int8, 23), combined("Add", np.int8, 22)),
@@ -114,3 +120,31 @@ def test_weights_that_other_nodes_compute_are_refused(tmp_path: Path) -> None:
         return s.pair(s.node("Conv", x, s.pair(s.weight(4, 4, 3, 3)), kernel_shape=[3, 3], pads=[1] * 4))
 
     assert AGAIN in remedies(tmp_path / "n.onnx", draw)["int8 constants"]
+
+
+def test_only_a_bias_may_be_int32() -> None:
+    for role, kept in (("bias", True), ("input 0", False), ("output", False)):
+        op = Operation(
+            "op", "Conv", "conv", ("in",), ("out",), integer=True, scales={role: Scale((0.5,), (0,), "int32")}
+        )
+        assert (number_rules.symmetric(op, DPU) is None) == kept
+
+
+@pytest.mark.parametrize(
+    ("rule", "scale", "kept"),
+    [
+        (number_rules.symmetric, Scale((0.5,), (128,), "uint8"), True),
+        (number_rules.symmetric, Scale((0.5,), (0,), "uint8"), False),
+        (number_rules.symmetric, Scale((0.5,), (3,), "int8"), False),
+        (number_rules.symmetric, Scale((0.5,), (0,), "int16"), False),
+        (number_rules.per_tensor, Scale((0.5, 0.25), (0, 0), "int8"), False),
+        (number_rules.power_of_two, Scale((0.5,), (0,), "int8"), True),
+        (number_rules.power_of_two, Scale((0.3,), (0,), "int8"), False),
+        (number_rules.power_of_two, Scale((0.0,), (0,), "int8"), False),
+        (number_rules.power_of_two, Scale((float("inf"),), (0,), "int8"), False),
+        (number_rules.power_of_two, Scale((float("nan"),), (0,), "int8"), False),
+    ],
+)
+def test_formats(rule: Rule, scale: Scale, kept: bool) -> None:
+    op = Operation("op", "Conv", "conv", ("in",), ("out",), integer=True, scales={"weight": scale})
+    assert (rule(op, DPU) is None) == kept

@@ -6,7 +6,6 @@ from deploy.dpu.board import Dpu, load_dpu
 from deploy.dpu.checker.operators import all_rules, applies, rule_name, rule_text
 from deploy.dpu.checker.placement import place
 from deploy.dpu.reading import read_network
-from profiles.errors import OptionError, ProfileError
 from tests.deploy.dpu.draws import (
     TILE_PX,
     Draw,
@@ -198,24 +197,6 @@ def test_legal_integers_pass(tmp_path: Path) -> None:
     assert broken_rules(integer_convbeers(tmp_path / "i.onnx", 1, 8)) == []
 
 
-def test_free_scales_are_refused(tmp_path: Path) -> None:
-    assert set(broken_rules(integer_convbeers(tmp_path / "i.onnx", 1, 8, weight_scale=0.01))) == {"power of two"}
-
-
-@pytest.mark.parametrize(("rule", "weight_scale"), [("shift cut", 2.0), ("shift cut", 2.0**-20)])
-def test_shifts_out_of_reach_are_refused(tmp_path: Path, rule: str, weight_scale: float) -> None:
-    assert set(broken_rules(integer_convbeers(tmp_path / "i.onnx", 1, 8, weight_scale))) == {rule}
-
-
-def test_asymmetric_integers_are_refused(tmp_path: Path) -> None:
-    sketch = IntegerSketch(zero=3)
-    path = sketch.save(
-        tmp_path / "z.onnx",
-        sketch.node("DequantizeLinear", sketch.qconv(sketch.quantised("image"), (4, 1, 3, 3)), *sketch.numbers),
-    )
-    assert broken_rules(path) == ["symmetric"]
-
-
 def test_a_float_convolution_in_a_quantised_file_is_refused(tmp_path: Path) -> None:
     sketch = IntegerSketch()
     first = sketch.qconv(sketch.quantised("image"), (4, 1, 3, 3))
@@ -237,12 +218,3 @@ def test_findings_name_the_numbers_and_a_remedy(tmp_path: Path) -> None:
     (broken,) = place(read_network(path, TILE_PX), DPU).nodes[0].broken
     assert broken.finding.reason == "kernel (1 x 17) is not in the DPU's range 1 to 16"
     assert "at most 16" in broken.finding.remedy
-
-
-def test_unknown_configuration_and_target() -> None:
-    with pytest.raises(ProfileError, match="C32B3"):
-        load_dpu("vck190", "C99B9")
-    with pytest.raises(ProfileError, match="vck190"):
-        load_dpu("vck9000")
-    with pytest.raises(OptionError, match="with a DPU"):
-        load_dpu("host-cpu")

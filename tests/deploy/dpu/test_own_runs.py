@@ -12,6 +12,7 @@ from profiles.errors import OptionError
 from tests.deploy.dpu.graphs import Sketch, integer_convbeers
 
 DPU = load_dpu("vck190")
+RUN = '{"model": "deep.onnx", "fps": 3}'
 
 
 @pytest.fixture(scope="module")
@@ -64,6 +65,11 @@ def test_a_part_without_runs_keeps_its_constants(folder: Path) -> None:
         '[{"model": "deep.onnx", "fps": 3, "tile_px": 8}]',
         '[{"model": "deep.onnx", "fps": 3, "tile_px": 64.5}]',
         '[{"model": "deep.onnx", "fps": 3, "speed": 8}]',
+        '[{"model": "deep.onnx", "fps": 1e-300}]',
+        '[{"model": "deep.onnx", "fps": 1e999}]',
+        '[{"model": "deep.onnx", "fps": 3, "tile_px": 1048576}]',
+        f'[{{"model": "deep.onnx", "fps": 3, "tile_px": {10**300}}}]',
+        f"[{', '.join(1001 * [RUN])}]",
     ],
 )
 def test_bad_runs_are_refused(folder: Path, text: str) -> None:

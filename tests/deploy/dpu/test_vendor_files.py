@@ -7,12 +7,13 @@ import numpy as np
 import onnx
 import pytest
 from onnx import numpy_helper
-from onnxruntime.quantization import CalibrationDataReader, QuantFormat, QuantType, quantize_static
+from onnxruntime.quantization import QuantFormat, QuantType, quantize_static
 
 from deploy.dpu.board import load_dpu
 from deploy.dpu.checker.placement import Placement, place
 from deploy.dpu.reading import read_network
 from tests.deploy.dpu.graphs import Sketch
+from tests.quant.quick import Calibration
 
 DPU = load_dpu("vck190")
 TILE_PX = 34
@@ -26,14 +27,6 @@ class RandomSketch(Sketch):
 
     def biased(self, source: str, *shape: int) -> str:
         return self.node("Conv", source, self.weight(*shape), self.weight(shape[0]), pads=[1] * 4)
-
-
-class Images(CalibrationDataReader):  # type: ignore[misc]
-    def __init__(self) -> None:
-        self._images = iter(np.random.default_rng(k).random((1, 1, TILE_PX, TILE_PX), np.float32) for k in range(2))
-
-    def get_next(self) -> dict[str, np.ndarray] | None:
-        return next(({"image": image} for image in self._images), None)
 
 
 def float_file(path: Path) -> Path:
@@ -50,8 +43,10 @@ def quantised(
     path: Path, form: QuantFormat, kind: QuantType, per_channel: bool = False, symmetric: bool = False
 ) -> Path:
     options = {"ActivationSymmetric": symmetric}
-    given = {"quant_format": form, "activation_type": kind, "per_channel": per_channel, "extra_options": options}
-    quantize_static(float_file(path.with_name("f.onnx")), path, Images(), weight_type=QuantType.QInt8, **given)
+    kinds = {"activation_type": kind, "weight_type": QuantType.QInt8}
+    given = {"quant_format": form, "per_channel": per_channel, "extra_options": options, **kinds}
+    noise = list(np.random.default_rng(0).random((2, 1, 1, TILE_PX, TILE_PX), np.float32))
+    quantize_static(float_file(path.with_name("f.onnx")), path, Calibration(noise), **given)
     return path
 
 

@@ -12,15 +12,15 @@ import tifffile
 from onnx import helper
 
 from deploy.library import restore
-from deploy.restoration.engine import Restorer
 from deploy.restoration.georeference import enlarged_tags
 from deploy.restoration.options import Options
 from deploy.restoration.plan import make_plan
 from deploy.restoration.run import restore_file
-from profiles.errors import MachineError, ModelError, OptionError
+from profiles.errors import ModelError, OptionError
 from quant.onnx_file import load_onnx, save_onnx
 from quant.session import open_session, tensors_of
 from quant.tiling.walk import Tiling, tiling_of
+from tests.deploy.restoration.runs import stopped_after
 from tests.quant.tiling.small_networks import (
     espcn,
     ffdnet,
@@ -138,25 +138,13 @@ def test_a_lazy_array_gives_the_same(path: Path) -> None:
     np.testing.assert_array_equal(lazy.compute(scheduler="synchronous"), expected)
 
 
-def test_a_run_that_was_stopped_is_resumed_to_the_same_bytes(
-    path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_run_that_was_stopped_is_resumed_to_the_same_bytes(path: Path, tmp_path: Path) -> None:
     options = Options(path, 56, threads=1)
     by_file(noise(path), tmp_path, options)
-    expected, left = (tmp_path / "out.tif").read_bytes(), iter(range(4))
-    tile: Any = Restorer.tile
-
-    def stopping(*arguments: Any) -> Any:
-        if next(left, None) is None:
-            raise MachineError("machine", expected="power", got="none", remedy="wait")
-        return tile(*arguments)
-
-    monkeypatch.setattr(Restorer, "tile", stopping)
-    with pytest.raises(MachineError):
+    expected = (tmp_path / "out.tif").read_bytes()
+    with stopped_after(4):
         restore_file(tmp_path / "in.tif", tmp_path / "out.tif", options, lambda _: None)
-    monkeypatch.undo()
-    said: list[str] = []
-    row = restore_file(tmp_path / "in.tif", tmp_path / "out.tif", replace(options, resume=True), said.append)
+    row = restore_file(tmp_path / "in.tif", tmp_path / "out.tif", replace(options, resume=True), lambda _: None)
     assert (tmp_path / "out.tif").read_bytes() == expected
     assert row.figures["tiles"].value
 

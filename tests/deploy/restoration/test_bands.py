@@ -5,12 +5,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import tifffile
-from typer.testing import CliRunner
 
-from deploy.cli import app
 from deploy.restoration.bands import band_names, parse_sensors
 from deploy.restoration.source import Raster, open_source
 from profiles.errors import OptionError
+from tests.deploy.command_line import done, refused
 from tests.deploy.restoration import images
 
 FIRST, SECOND = "pleiades-degraded", "blind"
@@ -19,9 +18,8 @@ FIRST, SECOND = "pleiades-degraded", "blind"
 def restored(image: Path, sensor: str, *more: str) -> tuple[np.ndarray, str]:
     out = image.with_name("out.tif")
     words = ["restore", str(image), str(out), "--model", "convbeers-xs", "--sensor", sensor, *more]
-    done = CliRunner().invoke(app, words)
-    assert done.exit_code == 0, done.output
-    return tifffile.imread(out), done.output
+    said = done(*words)
+    return tifffile.imread(out), said
 
 
 @pytest.mark.parametrize("names", [("B0", "B1"), ("B1", "B0")])
@@ -66,9 +64,7 @@ def test_a_cog_names_the_sensors_in_the_order_of_the_bands(tmp_path: Path) -> No
 def test_what_does_not_fit_is_refused(sensor: str, words: str, tmp_path: Path) -> None:
     image = images.write_tiff(tmp_path / "in.tif", images.digital_numbers())
     arguments = ["restore", str(image), str(tmp_path / "out.tif"), "--model", "convbeers-xs", "--sensor", sensor]
-    done = CliRunner().invoke(app, arguments)
-    assert done.exit_code == 2, done.output
-    assert words in done.stderr
+    assert words in refused(*arguments)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["in.tif"]
 
 

@@ -58,24 +58,18 @@ def test_it_is_valid_and_holds_the_same(compression: Compression, model: Path, t
 
 
 def test_it_says_what_was_done(tmp_path: Path) -> None:
-    int8 = shipped_pair()[1]
+    int8 = shipped_pair("convbeers-xs")[1]
     _, cog = both(tmp_path, images.digital_numbers(), Options(int8, tile_px=64))
     with rasterio.open(cog) as file:
         said = file.tags()
     assert said["RESTORED_NETWORK_SHA256"] == sha256(int8)
-    assert said["RESTORED_NETWORK"] == "convbeers-s"
+    assert said["RESTORED_NETWORK"] == "convbeers-xs"
     assert said["RESTORED_SENSOR"] == "pleiades-degraded"
     assert said["RESTORED_FULL_SCALE"] == "4095 (assumed: 12 bits)"
     assert said["RESTORED_BY"].startswith("beers-deploy ")
 
 
-def test_polynomials_and_missing_pixels_are_kept(model: Path, tmp_path: Path) -> None:
-    index = images.write_dimap(tmp_path / "DIM.XML", images.digital_numbers())
-    restore_file(index, tmp_path / "out.tif", Options(model, tile_px=64, cog=True), lambda _: None)
-    with rasterio.open(index) as before, rasterio.open(tmp_path / "out.tif") as after:
-        kept, stated = after.rpcs.to_dict(), before.rpcs.to_dict()
-        for key in stated.keys() - {"err_bias", "err_rand"}:
-            np.testing.assert_allclose(kept[key], stated[key], rtol=0, atol=1e-9)
+def test_missing_pixels_are_kept(model: Path, tmp_path: Path) -> None:
     pixels = np.maximum(images.digital_numbers(), 1)
     pixels[:, 30:60, 20:90] = 0
     image = images.write_tiff(tmp_path / "in.tif", pixels, nodata=0)

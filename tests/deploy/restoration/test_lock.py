@@ -7,7 +7,6 @@ import threading
 import time
 from pathlib import Path
 
-import numpy as np
 import psutil
 import pytest
 import tifffile
@@ -19,25 +18,21 @@ from deploy.restoration.output import only_run
 from deploy.restoration.run import restore_file
 from profiles.errors import MachineError
 from profiles.sensor_file import BLIND
+from tests.deploy.restoration.runs import begin, noise, until
 
-ENTRY = "from deploy.cli import app; app()"
 TILE_PX = 64
 
 
 @pytest.fixture
 def image(tmp_path: Path) -> Path:
-    pixels = np.random.default_rng(1).integers(0, 4096, (700, 400)).astype(np.uint16)
-    tifffile.imwrite(tmp_path / "in.tif", pixels)
+    tifffile.imwrite(tmp_path / "in.tif", noise(700, 400))
     return tmp_path / "in.tif"
 
 
-def begin(image: Path, out: Path) -> subprocess.Popen[str]:
+def begun(image: Path, out: Path) -> subprocess.Popen[str]:
     """A run in the middle of its rows."""
-    arguments = ["restore", image, out, "--tile", TILE_PX, "--threads", 1]
-    command = [sys.executable, "-c", ENTRY, *map(str, arguments)]
-    running = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
-    assert running.stdout is not None
-    assert any("memory" in line for line in running.stdout)
+    running = begin(image, out, "--tile", TILE_PX)
+    assert until(running, "memory")
     return running
 
 
@@ -48,7 +43,7 @@ def restore(image: Path, out: Path, resume: bool = False) -> None:
 @pytest.mark.slow
 def test_a_second_run_is_refused_and_the_first_one_unharmed(image: Path, tmp_path: Path) -> None:
     out = tmp_path / "out.tif"
-    with begin(image, out) as first:
+    with begun(image, out) as first:
         for resume in (False, True):
             with pytest.raises(MachineError, match=r"out.tif: expected no other run"):
                 restore(image, out, resume)
@@ -62,7 +57,7 @@ def test_a_second_run_is_refused_and_the_first_one_unharmed(image: Path, tmp_pat
 
 def test_a_killed_run_stands_in_nobody_s_way(image: Path, tmp_path: Path) -> None:
     out = tmp_path / "out.tif"
-    with begin(image, out) as running:
+    with begun(image, out) as running:
         running.kill()
     assert (tmp_path / ".out.tif.part" / output.NAME).is_file()
     restore(image, out, resume=True)

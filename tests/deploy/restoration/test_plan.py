@@ -1,16 +1,9 @@
-from functools import partial
-from pathlib import Path
-
-import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from deploy.restoration.engine import restore_dn
 from deploy.restoration.plan import even_side_px, make_plan, plan_side
 from profiles.errors import OptionError
-from quant.onnx_file import load_onnx
-from quant.session import open_session, run
 from quant.tiling.walk import Tiling
 
 RADIUS_PX = 5
@@ -50,18 +43,3 @@ def test_a_span_reads_as_many_pixels_as_a_network_needs() -> None:
 def test_a_tile_without_room_between_its_halos_is_refused() -> None:
     with pytest.raises(OptionError, match="halo of 20"):
         plan_side(100, 40, 20)
-
-
-@pytest.mark.parametrize(("height", "width"), [(61, 83), (17, 130), (1, 40), (40, 1), (29, 29)])
-def test_tiled_equals_whole_bit_for_bit(model: Path, height: int, width: int) -> None:
-    infer = partial(run, open_session(load_onnx(model)))
-    dn = np.random.default_rng(1).integers(0, 4096, (height, width)).astype(np.float32)
-    tiled, whole = (make_plan((1, height, width), tile_px, RADIUS_PX, TILING) for tile_px in (23, 256))
-    np.testing.assert_array_equal(restore_dn(dn, infer, tiled), restore_dn(dn, infer, whole))
-
-
-def test_a_smaller_halo_shows_seams(model: Path) -> None:
-    infer = partial(run, open_session(load_onnx(model)))
-    dn = np.random.default_rng(1).integers(0, 4096, (61, 83)).astype(np.float32)
-    tiled, whole = make_plan((1, 61, 83), 23, RADIUS_PX - 3, TILING), make_plan((1, 61, 83), 256, 0, TILING)
-    assert (restore_dn(dn, infer, tiled) != restore_dn(dn, infer, whole)).any()

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -148,13 +149,10 @@ def test_the_count_outlives_a_stop(model: Path, tmp_path: Path, monkeypatch: pyt
     pixels[2, :] = 3000
     options = Options(model, 23, full_scale=1023)
 
-    def stopped(*_: object) -> None:
-        raise KeyboardInterrupt
-
-    with monkeypatch.context() as patch:
-        patch.setattr("deploy.restoration.run.write_output", stopped)
-        with pytest.raises(KeyboardInterrupt):
-            run(tmp_path, pixels, options)
+    monkeypatch.setattr("deploy.restoration.run.write_output", Mock(side_effect=KeyboardInterrupt))
+    with pytest.raises(KeyboardInterrupt):
+        run(tmp_path, pixels, options)
+    monkeypatch.undo()
     row = restore_file(tmp_path / "in.tif", tmp_path / "out.tif", replace(options, resume=True), lambda _: None)
     assert row.figures["clipped pixels"].value == SHAPE[1]
 

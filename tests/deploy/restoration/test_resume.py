@@ -6,33 +6,30 @@ BEERS_KILLS=50 kills as many runs; the suite kills a few.
 import errno
 import os
 import signal
-import subprocess
 import sys
 import time
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import tifffile
 
-from deploy.restoration.engine import Restorer, Tile
 from deploy.restoration.options import Compression, Options
 from deploy.restoration.run import restore_file
 from profiles.errors import MachineError, OptionError
+from tests.deploy.restoration.runs import begin, noise, stop_after, stopped_after, until
 
 pytestmark = pytest.mark.slow
 
 KILLS = int(os.environ.get("BEERS_KILLS", "2"))
-ENTRY = "from deploy.cli import app; app()"
 TILE_PX = 64
 
 
 @pytest.fixture
 def image(tmp_path: Path) -> Path:
-    pixels = np.random.default_rng(1).integers(0, 4096, (900, 260)).astype(np.uint16)
-    tifffile.imwrite(tmp_path / "in.tif", pixels, tile=(16, 16))
+    tifffile.imwrite(tmp_path / "in.tif", noise(900, 260), tile=(16, 16))
     return tmp_path / "in.tif"
 
 
@@ -43,16 +40,8 @@ def expected(image: Path, model: Path, tmp_path: Path) -> bytes:
     return (tmp_path / "expected.tif").read_bytes()
 
 
-def begin(image: Path, out: Path, model: Path) -> subprocess.Popen[str]:
-    arguments = ["restore", image, out, "--model", model, "--tile", TILE_PX, "--threads", 1, "--resume"]
-    command = [sys.executable, "-c", ENTRY, *map(str, arguments)]
-    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
-
-
-def until(running: subprocess.Popen[str], word: str) -> None:
-    """Wait until it says so, or is done."""
-    assert running.stdout is not None
-    any(word in line for line in running.stdout)
+def asked(model: Path) -> list[object]:
+    return ["--model", model, "--tile", TILE_PX, "--resume"]
 
 
 def test_killed_at_random_moments_it_is_resumed_to_the_same_bytes(
@@ -62,14 +51,14 @@ def test_killed_at_random_moments_it_is_resumed_to_the_same_bytes(
     out.write_bytes(b"old")
     finished = 0
     for _ in range(KILLS):
-        running = begin(image, out, model)
+        running = begin(image, out, *asked(model))
         until(running, rng.choice(["plan", "memory", "memory"]))
         time.sleep(rng.uniform(0, 0.8))
         running.kill()
         running.communicate()
         finished += running.returncode == 0
         assert out.read_bytes() in (b"old", expected)
-    last = begin(image, out, model)
+    last = begin(image, out, *asked(model))
     said, _ = last.communicate(timeout=120)
     assert last.returncode == 0, said
     assert out.read_bytes() == expected
@@ -78,7 +67,7 @@ def test_killed_at_random_moments_it_is_resumed_to_the_same_bytes(
 
 @pytest.mark.skipif(sys.platform == "win32", reason="no other process can send Ctrl-C on Windows")
 def test_ctrl_c_says_how_to_go_on(image: Path, model: Path, expected: bytes, tmp_path: Path) -> None:
-    running = begin(image, tmp_path / "out.tif", model)
+    running = begin(image, tmp_path / "out.tif", *asked(model))
     until(running, "memory")
     running.send_signal(signal.SIGINT)
     said, _ = running.communicate(timeout=60)
@@ -91,27 +80,12 @@ def test_ctrl_c_says_how_to_go_on(image: Path, model: Path, expected: bytes, tmp
     assert (tmp_path / "out.tif").read_bytes() == expected
 
 
-def stop_after(tiles: int, monkeypatch: pytest.MonkeyPatch, error: BaseException) -> Callable[[], None]:
-    """Raise an error in the network after so many tiles; the result lets it pass again."""
-    count, tile = iter(range(10**6)), Restorer.tile
-
-    def stopping(self: Restorer, *rest: object) -> Tile:
-        if next(count) == tiles:
-            raise error
-        return tile(self, *rest)  # type: ignore[arg-type]
-
-    monkeypatch.setattr(Restorer, "tile", stopping)
-    return monkeypatch.undo
-
-
 def test_finished_rows_are_not_restored_again(
     image: Path, model: Path, expected: bytes, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     out, options = tmp_path / "out.tif", Options(model, TILE_PX)
-    go_on = stop_after(50, monkeypatch, KeyboardInterrupt())
-    with pytest.raises(KeyboardInterrupt):
+    with stopped_after(50):
         restore_file(image, out, options, lambda _: None)
-    go_on()
     with pytest.raises(OptionError, match="--resume"):
         restore_file(image, out, replace(options, halo="3", resume=True), lambda _: None)
     seen: list[str] = []
@@ -120,13 +94,9 @@ def test_finished_rows_are_not_restored_again(
     assert out.read_bytes() == expected
 
 
-def test_another_image_of_the_same_name_is_not_mixed_in(
-    image: Path, model: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    go_on = stop_after(50, monkeypatch, KeyboardInterrupt())
-    with pytest.raises(KeyboardInterrupt):
+def test_another_image_of_the_same_name_is_not_mixed_in(image: Path, model: Path, tmp_path: Path) -> None:
+    with stopped_after(50):
         restore_file(image, tmp_path / "out.tif", Options(model, TILE_PX), lambda _: None)
-    go_on()
     tifffile.imwrite(image, np.zeros((900, 260), np.uint16), tile=(16, 16))
     with pytest.raises(OptionError, match="the image"):
         restore_file(image, tmp_path / "out.tif", Options(model, TILE_PX, resume=True), lambda _: None)
@@ -142,13 +112,14 @@ def test_a_full_disk_is_one_sentence_and_loses_no_finished_row(
     out, options, count, sync = tmp_path / "out.tif", Options(model, TILE_PX), iter(range(10**6)), os.fsync
 
     def full(handle: int) -> None:
-        if next(count) == calls:
+        if next(count) == calls or calls == 1000:
             raise OSError(errno.ENOSPC, "No space left on device")
         sync(handle)
 
-    monkeypatch.setattr(os, "fsync", full)
     if calls == 1000:
-        monkeypatch.setattr("deploy.restoration.output._tiles", full_now)
+        monkeypatch.setattr("deploy.restoration.output._tiles", full)
+    else:
+        monkeypatch.setattr(os, "fsync", full)
     out.write_bytes(b"old")
     with pytest.raises(MachineError, match=r"No space left.*--resume"):
         restore_file(image, out, replace(options, compression=Compression.none), lambda _: None)
@@ -158,17 +129,10 @@ def test_a_full_disk_is_one_sentence_and_loses_no_finished_row(
     assert out.read_bytes() == expected
 
 
-def full_now(*_: object) -> None:
-    raise OSError(errno.ENOSPC, "No space left on device")
-
-
 def test_a_swath_that_the_disk_cannot_hold_is_refused_first(
     image: Path, model: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    class Usage:
-        free = 1000
-
-    monkeypatch.setattr("deploy.restoration.output.shutil.disk_usage", lambda _: Usage)
+    monkeypatch.setattr("shutil.disk_usage", lambda _: SimpleNamespace(free=1000))
     with pytest.raises(MachineError, match="free"):
         restore_file(image, tmp_path / "out.tif", Options(model, TILE_PX), lambda _: None)
     assert [p.name for p in tmp_path.iterdir()] == ["in.tif"]

@@ -1,7 +1,5 @@
 """A run killed on an image that GDAL reads, or while its COG is written, is resumed to the same bytes."""
 
-import subprocess
-import sys
 import time
 from pathlib import Path
 
@@ -11,17 +9,11 @@ from deploy.restoration.options import Options
 from deploy.restoration.output import part_folder
 from deploy.restoration.run import restore_file
 from tests.deploy.restoration import images
-from tests.deploy.restoration.test_resume import ENTRY
+from tests.deploy.restoration.runs import begin
 
 pytestmark = pytest.mark.slow
 
 TILE_PX = 16
-
-
-def begin(image: Path, out: Path, model: Path) -> subprocess.Popen[str]:
-    arguments = ["restore", image, out, "--model", model, "--tile", TILE_PX, "--threads", 1, "--cog", "--resume"]
-    command = [sys.executable, "-c", ENTRY, *map(str, arguments)]
-    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
 
 
 @pytest.mark.parametrize("name", ["a.jp2", "a.vrt", "DIM.XML"])
@@ -35,7 +27,7 @@ def test_killed_among_its_rows_and_at_its_cog_it_is_resumed_to_the_same_bytes(
     out.write_bytes(b"old")
     killed = []
     for sign in ("journal.json", "out.tif"):  # some rows are finished; all are, and the TIFF is begun
-        running = begin(image, out, model)
+        running = begin(image, out, "--model", model, "--tile", TILE_PX, "--cog", "--resume")
         while running.poll() is None and not (part_folder(out) / sign).exists():
             time.sleep(0.001)
         running.kill()
@@ -44,7 +36,7 @@ def test_killed_among_its_rows_and_at_its_cog_it_is_resumed_to_the_same_bytes(
         assert running.returncode <= 0, said
         assert out.read_bytes() in (b"old", expected.read_bytes())
     assert killed[0]
-    last = begin(image, out, model)
+    last = begin(image, out, "--model", model, "--tile", TILE_PX, "--cog", "--resume")
     said, _ = last.communicate(timeout=120)
     assert last.returncode == 0, said
     assert out.read_bytes() == expected.read_bytes()

@@ -7,7 +7,6 @@ from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
-import onnx
 import pytest
 import tifffile
 
@@ -17,18 +16,14 @@ from deploy.restoration import runtime
 from deploy.restoration.engine import fill_from_nearest, restore_window
 from deploy.restoration.options import Compression, Options, Runtime
 from deploy.restoration.runtime import Infer, open_runtime
-from profiles.errors import BeersError, ImageError, MachineError, ModelError, OptionError
+from profiles.errors import BeersError, ImageError, MachineError, OptionError
 from profiles.figures import Row
-from quant.onnx_file import load_onnx, save_onnx
+from quant.onnx_file import load_onnx
 from quant.session import open_session, run
-from quant.tiling.walk import receptive_radius_px
+from tests.deploy.restoration.runs import noise
 
 RADIUS_PX = 5
 SHAPES = [(61, 83), (17, 130), (1, 40), (40, 1), (29, 29), (3, 5)]
-
-
-def noise(*shape: int, seed: int = 1) -> np.ndarray:
-    return np.random.default_rng(seed).integers(1, 4095, shape).astype(np.uint16)
 
 
 def restore(folder: Path, pixels: np.ndarray, options: Options, **written: Any) -> tuple[np.ndarray, Row]:
@@ -56,13 +51,6 @@ def test_tiled_equals_whole_bit_for_bit(shape: tuple[int, int], model: Path, tmp
     np.testing.assert_array_equal(floats, whole_image(model, pixels))
 
 
-@pytest.mark.parametrize("shape", [(131, 97), (20, 150)])
-def test_int8_tiled_equals_whole_bit_for_bit(shape: tuple[int, int], tmp_path: Path) -> None:
-    restored, _ = restore(tmp_path, noise(*shape), Options(shipped_pair()[1], tile_px=64))
-    expected = np.rint(whole_image(shipped_pair()[1], noise(*shape))).astype(np.uint16)
-    np.testing.assert_array_equal(restored, expected)
-
-
 def test_one_pixel_less_than_the_radius_shows_seams_and_says_so(model: Path, tmp_path: Path) -> None:
     pixels = noise(61, 83).astype(np.float32)
     restored, row = restore(tmp_path, pixels, Options(model, tile_px=23, halo=str(RADIUS_PX - 1)))
@@ -72,13 +60,6 @@ def test_one_pixel_less_than_the_radius_shows_seams_and_says_so(model: Path, tmp
     assert mean.value is not None
     assert largest.value > mean.value > 0
     assert largest.mode == "measured"
-
-
-def test_int8_shows_seams_at_one_pixel_less_than_the_radius(tmp_path: Path) -> None:
-    radius_px = receptive_radius_px(load_onnx(shipped_pair()[1]))
-    pixels = noise(180, 200)
-    restored, _ = restore(tmp_path, pixels, Options(shipped_pair()[1], tile_px=64, halo=str(radius_px - 1)))
-    assert (restored != np.rint(whole_image(shipped_pair()[1], pixels))).any()
 
 
 def test_the_seam_error_is_that_of_the_tile_in_the_middle(model: Path, tmp_path: Path) -> None:
@@ -107,17 +88,6 @@ def test_full_scale_is_what_the_network_sees_as_one(model: Path, tmp_path: Path)
     assert np.abs(fourteen / 4 - twelve.astype(float)).max() <= 0.625
     unit, _ = restore(tmp_path, (pixels / 4095).astype(np.float32), Options(model, tile_px=23, full_scale=1))
     assert np.abs(unit * 4095 - twelve.astype(float)).max() <= 0.51
-
-
-def test_8_bit_pixels_come_back_in_their_scale(model: Path, tmp_path: Path) -> None:
-    eight = np.random.default_rng(3).integers(0, 256, (40, 31)).astype(np.uint8)
-    refused(tmp_path, eight, Options(model, tile_px=23), ImageError, "8-bit pixels", "--full-scale")
-    (tmp_path / "out.tif").unlink()
-    restored, row = restore(tmp_path, eight, Options(model, tile_px=23, full_scale=255))
-    assert restored.max() <= 255
-    assert row.text["full scale"] == "255"
-    infer = partial(run, open_session(load_onnx(model)))
-    np.testing.assert_array_equal(restored, np.rint(restore_window(eight, infer, 255)).astype(np.uint16))
 
 
 def test_floats_of_about_0_to_1_are_refused_until_their_scale_is_named(model: Path, tmp_path: Path) -> None:
@@ -229,15 +199,6 @@ def test_options_that_cannot_be_are_refused(model: Path, tmp_path: Path) -> None
         (replace(sound, full_scale=0.5), "--full-scale"),
     ):
         refused(tmp_path, noise(40, 40), options, OptionError, word)
-
-
-def test_a_network_whose_sums_overflow_is_refused(model: Path, tmp_path: Path) -> None:
-    broken = load_onnx(model)
-    weights = next(t for t in broken.graph.initializer if t.name == "head.weight")
-    value = onnx.numpy_helper.to_array(weights) * np.float32(1e38)
-    weights.CopyFrom(onnx.numpy_helper.from_array(value, weights.name))
-    onnx.save(broken, tmp_path.parent / "broken.onnx")
-    refused(tmp_path, noise(40, 40), Options(tmp_path.parent / "broken.onnx"), ImageError, "finite")
 
 
 def test_a_budget_that_does_not_suffice_is_refused_before_the_run(
@@ -358,12 +319,3 @@ def test_a_missing_openvino_is_one_sentence(model: Path, monkeypatch: pytest.Mon
     monkeypatch.setitem(__import__("sys").modules, "openvino", None)
     with pytest.raises(MachineError, match=r"pip install 'beers-deploy\[openvino\]'"):
         open_runtime(Runtime.openvino, load_onnx(model), 1)
-
-
-def test_models_that_cannot_be_tiled_are_refused(model: Path, tmp_path: Path) -> None:
-    whole = load_onnx(model)
-    whole.graph.node[-1].output[0] = "local"
-    whole.graph.node.append(onnx.helper.make_node("InstanceNormalization", ["local", "one", "one"], ["restored"]))
-    whole.graph.initializer.append(onnx.numpy_helper.from_array(np.ones(1, np.float32), "one"))
-    save_onnx(whole, tmp_path.parent / "norm.onnx")
-    refused(tmp_path, noise(40, 40), Options(tmp_path.parent / "norm.onnx"), ModelError, "InstanceNormalization")

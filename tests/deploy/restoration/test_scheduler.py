@@ -18,13 +18,12 @@ import tifffile
 from deploy import cluster
 from deploy.cluster import open_cluster
 from deploy.networks import shipped_pair
-from deploy.restoration.engine import Restorer, Tile
 from deploy.restoration.options import Options, Runtime
 from deploy.restoration.run import restore_file
 from profiles.errors import ImageError, MachineError
 from quant.onnx_file import load_onnx, save_onnx
-from quant.session import open_session, run
 from quant.tiling.walk import tiling_of
+from tests.deploy.restoration.runs import noise, stopped_after
 from tests.deploy.two_workers import local_cluster
 from tests.quant.tiling.small_networks import espcn, float_unet, four_bands
 
@@ -50,10 +49,6 @@ def scheduler(local: Any) -> str:
 def image(tmp_path: Path) -> Path:
     tifffile.imwrite(tmp_path / "in.tif", noise(900, 260), tile=(16, 16))
     return tmp_path / "in.tif"
-
-
-def noise(*shape: int) -> np.ndarray:
-    return np.random.default_rng(1).integers(1, 4096, shape).astype(np.uint16)
 
 
 def silent(_: str) -> None:
@@ -125,29 +120,10 @@ def test_and_on_openvino(model: Path, scheduler: str, tmp_path: Path) -> None:
     assert two == one
 
 
-@pytest.mark.parametrize("int8", [False, True])
-def test_the_number_of_threads_changes_no_bit(int8: bool, model: Path) -> None:
-    window = np.random.default_rng(0).random((1, 1, 131, 97), dtype=np.float32)
-    network = load_onnx(shipped_pair()[1] if int8 else model)
-    one, *others = (run(open_session(network, threads), window) for threads in (1, 2, 3, 5))
-    for other in others:
-        np.testing.assert_array_equal(other, one)
-
-
-def test_a_run_begun_here_is_finished_by_workers(
-    image: Path, model: Path, scheduler: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_run_begun_here_is_finished_by_workers(image: Path, model: Path, scheduler: str, tmp_path: Path) -> None:
     options, out = Options(model, TILE_PX), tmp_path / "out.tif"
     restore_file(image, tmp_path / "expected.tif", options, silent)
-    count, tile = iter(range(10**6)), Restorer.tile
-
-    def stopping(self: Restorer, *rest: object) -> Tile:
-        if next(count) == 40:
-            raise KeyboardInterrupt
-        return tile(self, *rest)  # type: ignore[arg-type]
-
-    monkeypatch.setattr(Restorer, "tile", stopping)
-    with pytest.raises(KeyboardInterrupt):
+    with stopped_after(40):
         restore_file(image, out, options, silent)
     restore_file(image, out, replace(options, resume=True, scheduler=scheduler), silent)
     assert out.read_bytes() == (tmp_path / "expected.tif").read_bytes()

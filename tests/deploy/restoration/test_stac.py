@@ -1,13 +1,13 @@
 """STAC items: valid by the core schema, on the place of the image, with what was done."""
 
 import json
+import sys
 from pathlib import Path
 from typing import Any
 
 import pytest
-from typer.testing import CliRunner
 
-from deploy.cli import app
+from tests.deploy.command_line import done, refused
 from tests.deploy.restoration import images
 
 pystac: Any = pytest.importorskip("pystac")
@@ -16,9 +16,7 @@ rasterio: Any = images.rasterio
 
 def restored(image: Path, item: Path, model: Path) -> dict[str, Any]:
     out = image.with_name("out.tif")
-    words = ["restore", str(image), str(out), "--model", str(model), "--cog", "--stac", str(item)]
-    done = CliRunner().invoke(app, words)
-    assert done.exit_code == 0, done.output
+    done("restore", image, out, "--model", model, "--cog", "--stac", item)
     found: dict[str, Any] = json.loads(item.read_text())
     return found
 
@@ -50,18 +48,8 @@ def test_it_goes_with_a_cog_and_needs_its_package(
     model: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     image = images.write_tiff(tmp_path / "in.tif", images.digital_numbers())
-    words = [
-        "restore",
-        str(image),
-        str(tmp_path / "out.tif"),
-        "--model",
-        str(model),
-        "--stac",
-        str(tmp_path / "i.json"),
-    ]
-    monkeypatch.setitem(__import__("sys").modules, "pystac", None)
+    words = "restore", image, tmp_path / "out.tif", "--model", model, "--stac", tmp_path / "i.json"
+    monkeypatch.setitem(sys.modules, "pystac", None)
     for more, sentence in (([], "--stac: expected --cog"), (["--cog"], "beers-deploy[gdal]")):
-        done = CliRunner().invoke(app, [*words, *more])
-        assert done.exit_code == 2
-        assert sentence in done.stderr
+        assert sentence in refused(*words, *more)
         assert sorted(path.name for path in tmp_path.iterdir()) == ["in.tif"]

@@ -7,14 +7,13 @@ import numpy as np
 import pytest
 import tifffile
 import torch
-from typer.testing import CliRunner
 
-from deploy.cli import app
 from deploy.restoration.traditional import Request, restore_file_traditionally
 from model.traditional.pipeline import restore_traditional
 from profiles import load_sensor
 from profiles.errors import ImageError, MachineError
-from profiles.toml import HERE
+from tests.deploy.command_line import done, refused
+from tests.profiles.own_sensor import own_sensor
 
 SHAPE = (151, 67)
 
@@ -39,19 +38,9 @@ def of_file(folder: Path, pixels: np.ndarray, asked: Request, **written: object)
     return tifffile.imread(folder / "out.tif")
 
 
-def own_sensor(folder: Path) -> Path:
-    """A sensor of another gain, 14 bits and a blur of its own."""
-    text = (HERE / "sensors" / "pleiades-degraded.toml").read_text()
-    lines = []
-    for line in text.splitlines():
-        if line.startswith("bits"):
-            line = line.replace("12", "14")
-        if line.startswith("gain_dn_per_radiance"):
-            line = line.replace("10.2375", "40.0")
-        lines.append(line)
-    path = folder / "mine.toml"
-    path.write_text("\n".join(lines))
-    return path
+def other_sensor(folder: Path) -> Path:
+    """Of another gain, and of 14 bits."""
+    return own_sensor(folder, ("bits = { value = 12", "bits = { value = 14"), ("value = 10.2375", "value = 40.0"))
 
 
 def test_a_file_gives_the_pixels_of_the_array(tmp_path: Path) -> None:
@@ -76,7 +65,7 @@ def test_missing_pixels_stay(tmp_path: Path) -> None:
 
 
 def test_the_output_has_the_scale_of_the_input_whatever_the_gain(tmp_path: Path) -> None:
-    mine = replace(request(), sensor=load_sensor(str(own_sensor(tmp_path))))
+    mine = replace(request(), sensor=load_sensor(str(other_sensor(tmp_path))))
     (tmp_path / "files").mkdir()
     flat = np.full(SHAPE, 8000, np.uint16)
     restored = of_file(tmp_path / "files", flat, mine)
@@ -122,13 +111,8 @@ def test_the_command_needs_a_sensor_and_no_option_of_a_network(tmp_path: Path) -
         ([*named, "--resume"], "--resume: expected none"),
         ([*named, "--scheduler", "host:8786"], "--scheduler: expected none"),
     ):
-        result = CliRunner().invoke(app, arguments)
-        assert result.exit_code == 2
-        assert words in " ".join(result.output.split())
+        assert words in refused(*arguments)
         assert not out.exists()
-    result = CliRunner().invoke(
-        app, [*chain, "--sensor", str(own_sensor(tmp_path)), "--json", str(tmp_path / "a.json")]
-    )
-    assert result.exit_code == 0, result.output
+    done(*chain, "--sensor", other_sensor(tmp_path), "--json", tmp_path / "a.json")
     assert tifffile.imread(out).shape == SHAPE
     assert '"sensor": "mine"' in (tmp_path / "a.json").read_text()

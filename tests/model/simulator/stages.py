@@ -95,6 +95,20 @@ def lopsided_point(per_px: int = 4, rows: int = 37, columns: int = 48) -> PointS
     return point_spread(core + 0.2 * tail - 0.02 * np.exp(-((np.hypot(x, y) - 2.5) ** 2)), per_px)
 
 
+def blob(side: int, sigma: float) -> Tensor:
+    """A Gaussian centred in an even-sided square, between its four middle pixels."""
+    x = torch.arange(side, dtype=torch.float64) - (side - 1) / 2
+    line = torch.exp(-0.5 * (x / sigma) ** 2)
+    return (line[:, None] * line).float()
+
+
+def centroid(image: Tensor) -> tuple[float, float]:
+    """(row, column) from the middle of the image, in its own pixels."""
+    image = image.double()
+    rows, columns = (torch.arange(n, dtype=torch.float64) - (n - 1) / 2 for n in image.shape)
+    return float((image.sum(1) * rows).sum() / image.sum()), float((image.sum(0) * columns).sum() / image.sum())
+
+
 def slanted_edge(side: int, ratio: int, slope: float) -> tuple[Tensor, Tensor]:
     """A scene with an edge that moves `slope` target pixels a row, and each target pixel's distance from it."""
     y, x = (torch.arange(side * ratio, dtype=torch.float64) + 0.5 for _ in range(2))

@@ -1,8 +1,6 @@
 """One fused pass computes what the effects would, one after the other, at full resolution."""
 
-import importlib.util
 import math
-from pathlib import Path
 
 import pytest
 import torch
@@ -13,12 +11,7 @@ from model.simulator.detector import add_haze
 from model.simulator.mtf import mtf, smear_response, transfer_function
 from model.simulator.sampling import sample, scene_spectrum
 from profiles.effects import Haze
-
-spec = importlib.util.spec_from_file_location("stages", Path(__file__).parent / "stages.py")
-assert spec is not None
-assert spec.loader is not None
-stages = importlib.util.module_from_spec(spec)
-spec.loader.exec_module(stages)
+from tests.model.simulator import stages
 
 GAIN = 10.2375
 
@@ -75,16 +68,3 @@ def test_haze_after_sampling_equals_haze_before_the_blur(ratio: int) -> None:
     fused = add_haze(sample(scene_spectrum(radiance), transfer, radiance.shape[1], ratio), haze)
     expected = one_after_the_other(add_haze(radiance.double(), haze), ratio, 0.07, 0.2, 1.5)
     assert float((fused - expected).abs().max()) * GAIN < 0.02
-
-
-@pytest.mark.parametrize("smear", [0.0, 0.7, 2.0])
-@pytest.mark.parametrize("ratio", range(1, 9))
-def test_neither_blur_nor_smear_shifts_a_blob(ratio: int, smear: float) -> None:
-    side = 32 * ratio
-    x = torch.arange(side, dtype=torch.float64) - (side - 1) / 2
-    line = torch.exp(-0.5 * (x / (2.5 * ratio)) ** 2)
-    transfer = transfer_function(side, side, ratio, 0.1, 0.2, smear)
-    image = sample(scene_spectrum((line[:, None] * line).float()), transfer, side, ratio).double()
-    middle = torch.arange(32, dtype=torch.float64) - 15.5
-    for axis in (0, 1):
-        assert abs(float((image.sum(1 - axis) * middle).sum() / image.sum())) < 0.01

@@ -1,10 +1,8 @@
 """The plan's promise: no skipped effect would have changed a pixel by more than its bound."""
 
-import importlib.util
 import json
 import os
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 import torch
@@ -19,12 +17,7 @@ from model.simulator.sampling import crop_divisible
 from profiles.effects import AntiAlias, Defects, Dsnu, Effect, FullWell, Haze, Offset, Prnu, Smear, Striping
 from profiles.response import MtfTable
 from profiles.sensor import Sensor
-
-spec = importlib.util.spec_from_file_location("stages", Path(__file__).parent / "stages.py")
-assert spec is not None
-assert spec.loader is not None
-stages = importlib.util.module_from_spec(spec)
-spec.loader.exec_module(stages)
+from tests.model.simulator import stages
 
 EXAMPLES = int(os.environ.get("BEERS_PLAN_EXAMPLES", "60"))
 """Thousands by hand: BEERS_PLAN_EXAMPLES=5000 pytest tests/model/simulator/test_plan.py."""

@@ -8,26 +8,13 @@ from hypothesis import strategies as st
 from model.simulator.mtf import transfer_function
 from model.simulator.sampling import crop_divisible, sample, scene_spectrum
 from profiles.errors import OptionError
+from tests.model.simulator.stages import blob, centroid
 
 RATIOS = list(range(1, 9))
 
 
 def scene(height: int, width: int, seed: int = 0) -> torch.Tensor:
     return 20 + 100 * torch.rand(height, width, generator=torch.Generator().manual_seed(seed))
-
-
-def blob(side: int, sigma: float) -> torch.Tensor:
-    """A Gaussian centred in an even-sided square, between its four middle pixels."""
-    x = torch.arange(side, dtype=torch.float64) - (side - 1) / 2
-    line = torch.exp(-0.5 * (x / sigma) ** 2)
-    return (line[:, None] * line).float()
-
-
-def centroid(image: torch.Tensor) -> tuple[float, float]:
-    """(row, column) from the middle of the image, in its own pixels."""
-    image = image.double()
-    rows, columns = (torch.arange(n, dtype=torch.float64) - (n - 1) / 2 for n in image.shape)
-    return float((image.sum(1) * rows).sum() / image.sum()), float((image.sum(0) * columns).sum() / image.sum())
 
 
 @pytest.mark.parametrize(("rows", "columns"), [(13, 8), (13, 21), (2, 1)])
@@ -43,10 +30,12 @@ def test_folding_equals_blurring_then_picking(ratio: int, rows: int, columns: in
     torch.testing.assert_close(result.double(), expected, rtol=0, atol=5e-4)
 
 
+@pytest.mark.parametrize("smear", [0.0, 0.7, 2.0])
 @pytest.mark.parametrize("ratio", RATIOS)
-def test_nothing_is_shifted(ratio: int) -> None:
+def test_nothing_is_shifted(ratio: int, smear: float) -> None:
     side = 32 * ratio
-    result = sample(scene_spectrum(blob(side, 3.0 * ratio)), transfer_function(side, side, ratio, 0.1), side, ratio)
+    transfer = transfer_function(side, side, ratio, 0.1, 0.2, smear)
+    result = sample(scene_spectrum(blob(side, 3.0 * ratio)), transfer, side, ratio)
     assert max(map(abs, centroid(result))) < 1e-3
 
 

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from model.simulator.acquire import Pair, simulate_pair
 from model.simulator.detector import Draw
-from model.simulator.mtf import mtf, transfer_function
+from model.simulator.mtf import transfer_function
 from model.simulator.sampling import sample, scene_spectrum
 from model.traditional import pipeline
 from model.traditional.compensate import compensate
@@ -27,8 +27,9 @@ from model.traditional.pipeline import (
 from model.traditional.rows import mirrored
 from profiles import load_sensor
 from profiles.errors import OptionError
-from profiles.response import MtfTable, PointSpread, Response, packed
+from profiles.response import PointSpread
 from profiles.sensor import Sensor, noise_from_snr
+from tests.model.simulator.stages import formula_point, formula_table, point_spread, with_response
 
 DEGRADED = load_sensor("pleiades-degraded").nominal()
 REFERENCE = load_sensor("pleiades-reference").nominal()
@@ -36,10 +37,14 @@ ORDERS: tuple[Order, ...] = get_args(Order)
 NOISE_FREE = replace(REFERENCE, alpha=0.0, beta=0.0)
 
 
+def seen_by(camera: Tensor, sensor: Sensor, reference: Sensor = NOISE_FREE) -> Pair:
+    """A photograph of up to 200 W/m2/sr/um, 139 x 145 pixels within the margin, its reference without noise."""
+    return simulate_pair(camera[64:267, 128:337] * (200 / 255), sensor, reference, 1, Draw(seed=1))
+
+
 @pytest.fixture(scope="module")
 def pair(camera: Tensor) -> Pair:
-    """A photograph of up to 200 W/m2/sr/um, 139 x 145 pixels within the margin, its reference without noise."""
-    return simulate_pair(camera[64:267, 128:337] * (200 / 255), DEGRADED, NOISE_FREE, 1, Draw(seed=1))
+    return seen_by(camera, DEGRADED)
 
 
 def psnr_db(image: Tensor, truth: Tensor) -> float:
@@ -48,30 +53,29 @@ def psnr_db(image: Tensor, truth: Tensor) -> float:
     return float(10 * torch.log10(DEGRADED.max_dn**2 / difference.square().mean()))
 
 
+def restored_db(pair: Pair, chain: Chain) -> float:
+    return psnr_db(restore_traditional(pair.degraded, chain), pair.reference)
+
+
 def test_the_chain_gains_many_decibels_over_the_degraded_image(pair: Pair) -> None:
     restored = restore_traditional(pair.degraded, Chain(DEGRADED, REFERENCE))
     assert restored.shape == pair.degraded.shape
     assert restored.dtype == torch.float32
     assert psnr_db(restored, pair.reference) > psnr_db(pair.degraded, pair.reference) + 12
+    assert float(restored.mean() / pair.degraded.mean()) == pytest.approx(1, abs=2e-3)
 
 
 def test_each_half_of_the_chain_is_needed(pair: Pair) -> None:
-    whole = psnr_db(restore_traditional(pair.degraded, Chain(DEGRADED, REFERENCE)), pair.reference)
-    denoised = psnr_db(
-        restore_traditional(pair.degraded, Chain(DEGRADED, replace(REFERENCE, mtf_nyquist=0.07))), pair.reference
-    )
-    sharpened = psnr_db(compensate(pair.degraded, 0.07, 0.25, 3e-3), pair.reference)
-    assert denoised < whole - 3
-    assert sharpened < whole - 3
+    whole = restored_db(pair, Chain(DEGRADED, REFERENCE))
+    assert restored_db(pair, Chain(DEGRADED, replace(REFERENCE, mtf_nyquist=0.07))) < whole - 3  # denoised alone
+    assert psnr_db(compensate(pair.degraded, 0.07, 0.25, 3e-3), pair.reference) < whole - 3
 
 
 @pytest.mark.parametrize(
     "told", [replace(DEGRADED, mtf_nyquist=0.04), replace(DEGRADED, mtf_nyquist=0.15), replace(DEGRADED, alpha=0.5)]
 )
 def test_the_wrong_sensor_costs_decibels(pair: Pair, told: Sensor) -> None:
-    right = psnr_db(restore_traditional(pair.degraded, Chain(DEGRADED, REFERENCE)), pair.reference)
-    wrong = psnr_db(restore_traditional(pair.degraded, Chain(told, REFERENCE)), pair.reference)
-    assert wrong < right - 1
+    assert restored_db(pair, Chain(told, REFERENCE)) < restored_db(pair, Chain(DEGRADED, REFERENCE)) - 1
 
 
 @pytest.mark.slow
@@ -122,18 +126,13 @@ def test_strips_change_no_bit(order: Order, pair: Pair) -> None:
 
 def test_without_the_colour_deconvolving_first_loses_decibels(pair: Pair, monkeypatch: pytest.MonkeyPatch) -> None:
     chain = Chain(DEGRADED, REFERENCE, order="deconvolve-first", epsilon=0.0)
-    told = psnr_db(restore_traditional(pair.degraded, chain), pair.reference)
+    told = restored_db(pair, chain)
 
     def as_white(kernel: Tensor, sigma: float) -> Noise:
         return Noise(coloured_by(kernel, sigma).sigma)
 
     monkeypatch.setattr(pipeline, "coloured_by", as_white)
-    assert psnr_db(restore_traditional(pair.degraded, chain), pair.reference) < told - 0.5
-
-
-def test_the_brightness_is_kept(pair: Pair) -> None:
-    restored = restore_traditional(pair.degraded, Chain(DEGRADED, REFERENCE))
-    assert float(restored.mean() / pair.degraded.mean()) == pytest.approx(1, abs=2e-3)
+    assert restored_db(pair, chain) < told - 0.5
 
 
 def test_the_gain_of_each_sensor_is_its_own(pair: Pair) -> None:
@@ -169,60 +168,39 @@ def test_it_says_what_it_does() -> None:
 def test_the_chain_undoes_each_axis_by_its_own_blur(camera: Tensor) -> None:
     sensor = replace(DEGRADED, mtf_nyquist=0.12, mtf_nyquist_along=0.04)
     turned, one = replace(sensor, mtf_nyquist=0.04, mtf_nyquist_along=0.12), replace(sensor, mtf_nyquist_along=None)
-    seen = simulate_pair(camera[64:267, 128:337] * (200 / 255), sensor, NOISE_FREE, 1, Draw(seed=1))
-    right, *wrong = (
-        psnr_db(restore_traditional(seen.degraded, Chain(told, REFERENCE)), seen.reference)
-        for told in (sensor, turned, one)
-    )
+    seen = seen_by(camera, sensor)
+    right, *wrong = (restored_db(seen, Chain(told, REFERENCE)) for told in (sensor, turned, one))
     assert right > max(wrong) + 1
-
-
-def formula_point(blur: tuple[float, float], per_px: int = 2, side_px: int = 129) -> PointSpread:
-    """The point-spread function that belongs to two contrasts at Nyquist, on an odd number of samples."""
-    f = torch.fft.fftfreq(per_px * side_px + 1, 1 / per_px, dtype=torch.float64)
-    samples = np.fft.fftshift(np.fft.ifft2(mtf(f[None], f[:, None], blur)).real)
-    return PointSpread(len(f), len(f), per_px, packed(samples))
 
 
 def leaning_disc() -> PointSpread:
     """A disc of defocus, brighter to one side."""
     y, x = np.mgrid[-16:17, -16:17] / 8
     disc = np.hypot(y, x) < 0.85
-    return PointSpread(33, 33, 8.0, packed(disc + 2.0 * (disc & (x + y > 0.4))))
-
-
-def with_response(response: Response) -> Sensor:
-    across, along = response.at_nyquist
-    return replace(DEGRADED, mtf_nyquist=across, mtf_nyquist_along=along, response=response)
+    return point_spread(disc + 2.0 * (disc & (x + y > 0.4)), 8.0)
 
 
 def test_the_chain_restores_a_point_spread_as_the_formula_it_was_made_of(camera: Tensor) -> None:
     formula = replace(DEGRADED, mtf_nyquist=0.12, mtf_nyquist_along=0.05)
-    point = with_response(formula_point(formula.mtf_axes))
-    radiance = camera[64:267, 128:337] * (200 / 255)
-    found = []
-    for sensor in (formula, point):
-        seen = simulate_pair(radiance, sensor, NOISE_FREE, 1, Draw(seed=1))
-        found.append(psnr_db(restore_traditional(seen.degraded, Chain(sensor, REFERENCE)), seen.reference))
+    point = with_response(DEGRADED, formula_point(formula.mtf_axes, 2, 129, odd=True))
+    found = [restored_db(seen_by(camera, sensor), Chain(sensor, REFERENCE)) for sensor in (formula, point)]
     assert found[1] == pytest.approx(found[0], abs=0.05)
 
 
 @pytest.mark.parametrize("order", ORDERS)
 def test_the_whole_response_restores_what_two_numbers_cannot(order: Order, camera: Tensor) -> None:
     """The formula with the two contrasts of a leaning disc is another blur."""
-    sensor = with_response(leaning_disc())
-    seen = simulate_pair(camera[64:267, 128:337] * (200 / 255), sensor, NOISE_FREE, 1, Draw(seed=1))
-    right, wrong = (
-        psnr_db(restore_traditional(seen.degraded, Chain(told, REFERENCE, order=order)), seen.reference)
-        for told in (sensor, replace(sensor, response=None))
-    )
+    sensor = with_response(DEGRADED, leaning_disc())
+    seen = seen_by(camera, sensor)
+    told = sensor, replace(sensor, response=None)
+    right, wrong = (restored_db(seen, Chain(each, REFERENCE, order=order)) for each in told)
     assert right > wrong + 1
 
 
 @pytest.mark.parametrize("name", ["wiener", "nl-means"])
 def test_peers_undo_the_whole_response(name: str, camera: Tensor) -> None:
-    sensor = with_response(leaning_disc())
-    seen = simulate_pair(camera[64:227, 128:291] * (200 / 255), sensor, NOISE_FREE, 1, Draw(seed=1))
+    sensor = with_response(DEGRADED, leaning_disc())
+    seen = seen_by(camera, sensor)
     right, wrong = (
         psnr_db(PEERS[name](seen.degraded, Chain(told, REFERENCE)), seen.reference)
         for told in (sensor, replace(sensor, response=None))
@@ -230,21 +208,12 @@ def test_peers_undo_the_whole_response(name: str, camera: Tensor) -> None:
     assert right > wrong + 1
 
 
-def test_a_table_of_the_formula_gives_the_formulas_filter() -> None:
-    f = torch.linspace(0, 0.5, 6, dtype=torch.float64)
-    contrast = tuple(mtf(f, torch.zeros(()), 0.07).tolist())
-    table = with_response(MtfTable(tuple(f.tolist()), contrast, contrast))
-    kernels = [Chain(sensor, REFERENCE, epsilon=3e-3).kernel() for sensor in (table, DEGRADED)]
-    torch.testing.assert_close(*kernels, rtol=0, atol=1e-12)
-    assert "MTF table of 6 frequencies" in " ".join(describe(Chain(table, REFERENCE)))
-
-
 @pytest.mark.parametrize("bits", [8, 10, 14])
 def test_any_bits_are_restored(bits: int, camera: Tensor) -> None:
     """Rounding to 8 bits counts as noise, and costs a decibel; 14 bits are as good as 12."""
     gain = (2**bits - 1) / 400
     degraded, reference = (replace(s, bits=bits, gain_dn_per_radiance=gain) for s in (DEGRADED, NOISE_FREE))
-    seen = simulate_pair(camera[64:267, 128:337] * (200 / 255), degraded, reference, 1, Draw(seed=1))
+    seen = seen_by(camera, degraded, reference)
     restored = restore_traditional(seen.degraded, Chain(degraded, reference))
     before, after = (
         psnr_db(dn * (4095 / (2**bits - 1)), seen.reference * (4095 / (2**bits - 1)))
@@ -261,9 +230,11 @@ def test_a_turned_sensor_gives_the_turned_filter() -> None:
     assert torch.equal(same.kernel(), Chain(DEGRADED, REFERENCE, epsilon=3e-3).kernel())
 
 
-def test_it_names_both_axes() -> None:
+def test_it_names_both_axes_and_a_table() -> None:
     said = describe(Chain(replace(DEGRADED, mtf_nyquist_along=0.05), REFERENCE))
     assert any("0.07 across and 0.05 along the track to 0.25" in line for line in said)
+    table = with_response(DEGRADED, formula_table(0.07, 0.07))
+    assert "MTF table of 6 frequencies" in " ".join(describe(Chain(table, REFERENCE)))
 
 
 def test_an_unknown_quality_is_refused() -> None:

@@ -3,15 +3,15 @@
 import pytest
 import torch
 
-from model.convbeers import BankedConvBEERS, ConvBEERS, initialise
+from model.convbeers import BankedConvBEERS, ConvBEERS
 from model.training.grow import grow
 from model.variants import Variant
 from profiles.errors import ModelError
+from tests.model.networks import plain
 
 
 def network(features: int) -> ConvBEERS:
-    made = ConvBEERS(Variant(blocks=2, features=features))
-    initialise(made, torch.Generator().manual_seed(1))
+    made = plain(Variant(blocks=2, features=features), seed=1)
     with torch.no_grad():
         for parameter in made.parameters():
             parameter.add_(0.05 * torch.randn(parameter.shape, generator=torch.Generator().manual_seed(2)))

@@ -12,20 +12,13 @@ from model.family import SensorFamily
 from model.io.tiff import write_tiff
 from model.simulator.procedural import procedural_scene
 from model.simulator.sampling import Scene
-from model.training.patches import PatchRecipe, PatchSource, StoredPairs, cut, draw_turn, pair_files, turn
+from model.training.patches import PatchSource, StoredPairs, cut, draw_turn, pair_files, turn
 from model.training.workers import Worker
 from profiles import load_sensor
 from profiles.errors import ImageError
 from profiles.response import MtfTable, PointSpread, packed
 from profiles.sensor import Sensor
-
-
-def source(
-    scene: Scene | None = None, seed: int = 0, patch_px: int = 32, worker: Worker | None = None
-) -> PatchSource:
-    scene = scene or procedural_scene(420, 480, np.random.default_rng(2))
-    profiles = load_sensor("pleiades-variable"), load_sensor("pleiades-reference")
-    return PatchSource([scene], PatchRecipe(*profiles, patch_px=patch_px), batch=3, seed=seed, worker=worker)
+from tests.model.training.sources import small_scene, source
 
 
 def test_the_same_seed_gives_the_same_batches_from_anywhere() -> None:
@@ -66,9 +59,7 @@ def test_a_turned_patch_comes_with_the_sensor_as_it_lies() -> None:
 
 
 def test_conditioned_patches_come_with_vectors_of_many_sensors_and_the_same_again() -> None:
-    recipe = replace(source().recipe, family=SensorFamily(load_sensor("pleiades-degraded").nominal()))
-    scene = procedural_scene(420, 480, np.random.default_rng(2))
-    first, again = ([*islice(PatchSource([scene], recipe, 3, 0).batches(k), 20 - k)] for k in (0, 17))
+    first, again = ([*islice(source(conditioned=True).batches(k), 20 - k)] for k in (0, 17))
     vectors = torch.cat([batch[2] for batch in first])
     assert vectors.shape == (60, 4)
     assert float(vectors.std(0).min()) > 0.3
@@ -127,9 +118,7 @@ def test_the_pair_shows_the_same_ground() -> None:
 
 
 def test_rough_patches_are_a_share_of_strong_contrast_left_as_it_is() -> None:
-    profiles = load_sensor("pleiades-variable"), load_sensor("pleiades-reference")
-    recipe = PatchRecipe(*profiles, patch_px=32, rough=0.25)
-    scene = procedural_scene(420, 480, np.random.default_rng(2))
+    recipe, scene = replace(source().recipe, rough=0.25), small_scene()
     made, again = (PatchSource([scene], recipe, batch=4, seed=0).batches() for _ in range(2))
     batches = [next(made) for _ in range(PatchSource.SHARD_BATCHES)]
     assert all(torch.equal(a, b) for pair in batches[:2] for a, b in zip(pair, next(again), strict=True))
@@ -156,7 +145,7 @@ def test_cut_takes_whole_patches_and_turn_keeps_pairs_together() -> None:
     image = torch.arange(2 * 30 * 41).reshape(2, 30, 41)
     rng = np.random.default_rng(0)
     patches = cut(image, 8, rng)
-    assert patches.shape == (3 * 5 if patches.shape[0] == 15 else patches.shape[0], 2, 8, 8)
+    assert patches.shape[1:] == (2, 8, 8)
     turned = turn(patches, rng)
     assert torch.equal(turned[:, 1] - turned[:, 0], torch.full_like(turned[:, 0], 30 * 41))
 

@@ -3,17 +3,14 @@
 from pathlib import Path
 from typing import get_args
 
-import numpy as np
 import pytest
 import torch
 
 from model.convbeers import ConvBEERS
-from model.simulator.procedural import procedural_scene
 from model.training.checkpoint import TrainingRecipe
-from model.training.patches import PatchRecipe, PatchSource
 from model.training.trainer import MixedPrecision, Precision, Progress, Schedule, Trainer
 from model.variants import Variant
-from profiles import load_sensor
+from tests.model.training.sources import source
 
 VARIANT = Variant(blocks=1, features=4)
 
@@ -25,12 +22,6 @@ def test_in_float32_the_network_is_the_plain_one_and_in_bfloat16_its_body_is_rou
     rounded = MixedPrecision(network, "bfloat16")(image)
     assert not torch.equal(rounded, plain)
     assert torch.allclose(rounded, plain, atol=0.02)
-
-
-def source() -> PatchSource:
-    scene = procedural_scene(420, 480, np.random.default_rng(2))
-    profiles = load_sensor("pleiades-variable"), load_sensor("pleiades-reference")
-    return PatchSource([scene], PatchRecipe(*profiles, patch_px=32), batch=3, seed=0)
 
 
 @pytest.mark.parametrize("first", get_args(Precision))

@@ -3,10 +3,9 @@ import signal
 import subprocess
 import sys
 from collections.abc import Iterator
-from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
-from typing import get_args
+from typing import Any, get_args
 
 import numpy as np
 import pytest
@@ -14,79 +13,41 @@ import torch
 from torch import Tensor
 
 from model.convbeers import ConvBEERS, load_network
-from model.family import SensorFamily
 from model.io.tensors import read_tensors
 from model.progress import held_back
-from model.simulator.procedural import procedural_scene
 from model.simulator.sampling import Scene
 from model.training.checkpoint import Optimiser, TrainingRecipe, finish
 from model.training.guards import MAX_BAD_STEPS, WINDOW_STEPS, Guards
 from model.training.losses import LossWeights
-from model.training.patches import PatchRecipe, PatchSource
+from model.training.patches import PatchSource
 from model.training.trainer import Progress, Schedule, Trainer
 from model.training.workers import Worker
 from model.variants import Variant
-from profiles import load_sensor
 from profiles.errors import ModelError
+from tests.model.training.sources import small_scene, source
 
 VARIANT = Variant(blocks=1, features=4)
 
 
-def source(scene: Scene | None = None, seed: int = 0, patch_px: int = 32) -> PatchSource:
-    scene = scene or procedural_scene(420, 480, np.random.default_rng(2))
-    profiles = load_sensor("pleiades-variable"), load_sensor("pleiades-reference")
-    return PatchSource([scene], PatchRecipe(*profiles, patch_px=patch_px), batch=3, seed=seed)
-
-
-def train(folder: Path, steps: int, *, resume: bool = False, kill_at: int | None = None) -> Trainer:
+def train(
+    folder: Path, steps: int = 8, *, conditioned: bool = False, resume: bool = False, kill_at: int = 0
+) -> Trainer:
     """Run to the end, or until a kill that leaves the checkpoint of the step before."""
 
     def report(progress: Progress) -> None:
         if progress.step == kill_at:
             raise KeyboardInterrupt
 
-    trainer = Trainer(VARIANT, TrainingRecipe(steps=steps, batch=3, warm_up_steps=2))
+    trainer = Trainer(VARIANT, TrainingRecipe(steps=steps, batch=3, warm_up_steps=2), conditioned=conditioned)
     checkpoint = folder / "checkpoint.safetensors"
     if resume:
         trainer.resume(checkpoint)
-    trainer.run(source(), checkpoint, Schedule(1, 0.0, report=report))
+    trainer.run(source(conditioned=conditioned), checkpoint, Schedule(1, 0.0, report=report))
     return trainer
-
-
-def train_conditioned(folder: Path, *, resume: bool = False, kill_at: int | None = None) -> Trainer:
-    def report(progress: Progress) -> None:
-        if progress.step == kill_at:
-            raise KeyboardInterrupt
-
-    trainer = Trainer(VARIANT, TrainingRecipe(steps=8, batch=3, warm_up_steps=2), conditioned=True)
-    checkpoint = folder / "checkpoint.safetensors"
-    if resume:
-        trainer.resume(checkpoint)
-    trainer.run(conditioned_source(), checkpoint, Schedule(1, 0.0, report=report))
-    return trainer
-
-
-def conditioned_source() -> PatchSource:
-    recipe = replace(source().recipe, family=SensorFamily(load_sensor("pleiades-degraded").nominal()))
-    return PatchSource([procedural_scene(420, 480, np.random.default_rng(2))], recipe, batch=3, seed=0)
-
-
-def test_a_conditioned_network_killed_and_resumed_equals_the_unbroken_one_in_every_bit(tmp_path: Path) -> None:
-    unbroken = train_conditioned(tmp_path / "a")
-    with pytest.raises(KeyboardInterrupt):
-        train_conditioned(tmp_path / "b", kill_at=5)
-    resumed = train_conditioned(tmp_path / "b", resume=True)
-    for trainer, folder in ((unbroken, "a"), (resumed, "b")):
-        finish(trainer.averaged(), tmp_path / folder / "weights.safetensors", {"steps": 8})
-    for name in ("weights.safetensors", "checkpoint.safetensors"):
-        (tensors, header), (others, other_header) = (read_tensors(tmp_path / folder / name) for folder in "ab")
-        assert header == other_header
-        assert tensors.keys() == others.keys()
-        assert all(np.array_equal(tensor, others[name]) for name, tensor in tensors.items())
 
 
 def test_a_conditioned_run_moves_every_part_and_what_it_makes_of_a_sensor(tmp_path: Path) -> None:
-    before, after = Trainer(VARIANT, TrainingRecipe(steps=8), conditioned=True), train_conditioned(tmp_path)
+    before, after = Trainer(VARIANT, TrainingRecipe(steps=8), conditioned=True), train(tmp_path, conditioned=True)
     moved = {
         name.split(".")[0]: not torch.equal(value, after.network.state_dict()[name])
         for name, value in before.network.state_dict().items()
@@ -96,27 +57,30 @@ def test_a_conditioned_run_moves_every_part_and_what_it_makes_of_a_sensor(tmp_pa
 
 def test_plain_and_conditioned_checkpoints_are_not_taken_for_one_another(tmp_path: Path) -> None:
     recipe = TrainingRecipe(steps=8, batch=3, warm_up_steps=2)
-    train(tmp_path / "plain", 8)
-    train_conditioned(tmp_path / "conditioned")
-    for written, conditioned in (("plain", True), ("conditioned", False)):
+    for conditioned in (False, True):
+        train(tmp_path, conditioned=conditioned)
         with pytest.raises(ModelError, match="checkpoint of this network"):
-            Trainer(VARIANT, recipe, conditioned=conditioned).resume(tmp_path / written / "checkpoint.safetensors")
+            Trainer(VARIANT, recipe, conditioned=not conditioned).resume(tmp_path / "checkpoint.safetensors")
 
 
-@pytest.mark.parametrize("kill_at", [2, 5, 8])
-def test_killed_and_resumed_equals_unbroken(kill_at: int, tmp_path: Path) -> None:
-    unbroken = train(tmp_path / "a", 8)
+@pytest.mark.parametrize(("conditioned", "kill_at"), [(False, 2), (False, 5), (False, 8), (True, 5)])
+def test_killed_and_resumed_equals_unbroken_in_every_bit(conditioned: bool, kill_at: int, tmp_path: Path) -> None:
+    unbroken = train(tmp_path / "a", conditioned=conditioned)
     with pytest.raises(KeyboardInterrupt):
-        train(tmp_path / "b", 8, kill_at=kill_at)
-    resumed = train(tmp_path / "b", 8, resume=True)
-    for name, value in unbroken.network.state_dict().items():
-        assert torch.equal(value, resumed.network.state_dict()[name])
-        assert torch.equal(unbroken.average[name], resumed.average[name])
+        train(tmp_path / "b", conditioned=conditioned, kill_at=kill_at)
+    resumed = train(tmp_path / "b", conditioned=conditioned, resume=True)
+    for trainer, folder in ((unbroken, "a"), (resumed, "b")):
+        finish(trainer.averaged(), tmp_path / folder / "weights.safetensors", {"steps": 8})
+    for name in ("weights.safetensors", "checkpoint.safetensors"):
+        (tensors, header), (others, other_header) = (read_tensors(tmp_path / folder / name) for folder in "ab")
+        assert header == other_header
+        assert tensors.keys() == others.keys()
+        assert all(np.array_equal(tensor, others[name]) for name, tensor in tensors.items())
 
 
 def test_a_resumed_run_goes_on_where_the_killed_one_was_saved(tmp_path: Path) -> None:
     with pytest.raises(KeyboardInterrupt):
-        train(tmp_path, 8, kill_at=5)
+        train(tmp_path, kill_at=5)
     later = Trainer(VARIANT, TrainingRecipe(steps=8, batch=3, warm_up_steps=2))
     later.resume(tmp_path / "checkpoint.safetensors")
     assert later.step == 4
@@ -149,7 +113,7 @@ class Poisoned(PatchSource):
 
 
 def poisoned(bad: frozenset[int] | None = None) -> Poisoned:
-    made = Poisoned([procedural_scene(420, 480, np.random.default_rng(2))], source().recipe, 3, 0)
+    made = Poisoned([small_scene()], source().recipe, 3, 0)
     made.bad = bad
     return made
 
@@ -204,7 +168,7 @@ def test_ctrl_c_finishes_the_step_and_leaves_a_checkpoint_of_it(number: int, tmp
     with pytest.raises(KeyboardInterrupt):
         trainer.run(source(), tmp_path / "checkpoint.safetensors", Schedule(1, report=report))
     assert trainer.step == 4
-    resumed, unbroken = train(tmp_path, 8, resume=True), train(tmp_path / "b", 8)
+    resumed, unbroken = train(tmp_path, resume=True), train(tmp_path / "b")
     assert all(map(torch.equal, copies(resumed), copies(unbroken)))
 
 
@@ -283,26 +247,24 @@ WORKER = """
 import sys
 from pathlib import Path
 import torch
-sys.path.insert(0, sys.argv[2])
-from test_trainer import VARIANT, Schedule, Trainer, TrainingRecipe, worker_source
+from tests.model.training.sources import source
+from model.training.checkpoint import TrainingRecipe
+from model.training.trainer import Schedule, Trainer
+from model.variants import Variant
 from model.training.workers import joined
 torch.set_num_threads(1)
 with joined("cpu") as worker:
-    trainer = Trainer(VARIANT, TrainingRecipe(steps=3, batch=3, warm_up_steps=1), worker=worker, precision="float32")
-    trainer.run(worker_source(worker), Path(sys.argv[1]), Schedule())
+    recipe = TrainingRecipe(steps=3, batch=3, warm_up_steps=1)
+    trainer = Trainer(Variant(blocks=1, features=4), recipe, worker=worker, precision="float32")
+    trainer.run(source(worker=worker), Path(sys.argv[1]), Schedule())
 """
-
-
-def worker_source(worker: Worker) -> PatchSource:
-    scene = procedural_scene(420, 480, np.random.default_rng(2))
-    return PatchSource([scene], source().recipe, batch=3, seed=0, worker=worker)
 
 
 class Together:
     """The batches of two workers as one."""
 
     def batches(self, first: int = 0) -> Iterator[tuple[Tensor, Tensor]]:
-        each = [worker_source(Worker(rank, 2)).batches(first) for rank in range(2)]
+        each = [source(worker=Worker(rank, 2)).batches(first) for rank in range(2)]
         for one, other in zip(*each, strict=True):
             yield torch.cat([one[0], other[0]]), torch.cat([one[1], other[1]])
 
@@ -313,16 +275,9 @@ def test_two_workers_do_the_steps_of_one_with_a_batch_twice_as_large(tmp_path: P
     script = tmp_path / "worker.py"
     script.write_text(WORKER)
     command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node=2"]
-    here = Path(__file__).parent
-    environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(here.parents[2])}
-    result = subprocess.run(
-        [*command, str(script), str(tmp_path / "two"), str(here)],
-        env=environment,
-        capture_output=True,
-        text=True,
-        timeout=240,
-        check=False,
-    )
+    environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(Path(__file__).parents[3])}
+    told: dict[str, Any] = {"env": environment, "capture_output": True, "text": True, "timeout": 240, "check": False}
+    result = subprocess.run([*command, str(script), str(tmp_path / "two")], **told)
     assert result.returncode == 0, result.stderr[-2000:]
     recipe = TrainingRecipe(steps=3, batch=3, warm_up_steps=1)
     alone, two = (Trainer(VARIANT, recipe, precision="float32") for _ in range(2))

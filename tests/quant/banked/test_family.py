@@ -10,7 +10,7 @@ import torch
 from deploy.dpu.board import load_dpu
 from deploy.dpu.checker.placement import place
 from deploy.dpu.reading import network_of
-from model.bank import Bank, bank_of_vector
+from model.bank import bank_of_vector
 from model.convbeers import BankedConvBEERS, initialise
 from model.io.tensors import Weights
 from model.variants import Variant
@@ -30,10 +30,6 @@ from tests.quant.banked.test_filters import textured
 SENSORS = [(0.2, 0.1, -0.3, -0.2), (-0.9, -0.8, 0.4, 0.5), (0.6, 0.3, 0.8, 0.9), (-0.2, -0.4, -0.7, -0.9)]
 
 
-def bank(vector: tuple[float, ...]) -> Bank:
-    return bank_of_vector(vector)
-
-
 def network(scale: int) -> BankedConvBEERS:
     made = BankedConvBEERS(Variant(2, 8, scale))
     generator = torch.Generator().manual_seed(scale)
@@ -48,13 +44,13 @@ def network(scale: int) -> BankedConvBEERS:
 def pair(request: pytest.FixtureRequest) -> tuple[BankedConvBEERS, Family]:
     made, scale = network(request.param), int(request.param)
     weights = Weights({name: value.numpy() for name, value in made.state_dict().items()}, made.variant, {})
-    images = [bank_results(textured(64, 64, k), bank(each), each, scale) for k, each in enumerate(SENSORS)]
-    middle = bank((0.0, 0.0, 0.0, 0.0))
+    images = [bank_results(textured(48, 48, k), bank_of_vector(each), each, scale) for k, each in enumerate(SENSORS)]
+    middle = bank_of_vector((0.0, 0.0, 0.0, 0.0))
     return made, quantise_family(weights, middle, Remade(images.__getitem__, len(images)))
 
 
 def core_of(family: Family, vector: tuple[float, ...]) -> IntCore:
-    return family.for_sensor(bank(vector), vector)
+    return family.for_sensor(bank_of_vector(vector), vector)
 
 
 @pytest.mark.parametrize("vector", SENSORS)
@@ -66,7 +62,7 @@ def test_int8_is_near_the_float_network_for_every_sensor(
     with torch.inference_mode():
         wanted = made(torch.from_numpy(image), torch.tensor([vector])).clamp(0, 1).numpy()
     found = run(open_session(host_model(core_of(family, vector), {})), image)
-    unit = bank(vector).unit
+    unit = bank_of_vector(vector).unit
     assert np.sqrt(np.square(found - wanted).mean()) < 0.05 * unit
     assert np.sqrt(np.square(image - wanted).mean()) > 0.1 * unit
 

@@ -24,10 +24,6 @@ from quant.integer.arithmetic import convolve
 VECTOR = st.tuples(*[st.floats(-1, 1)] * 4)
 
 
-def bank(vector: tuple[float, ...]) -> Bank:
-    return bank_of_vector(vector)
-
-
 def sums(image: np.ndarray, own: Bank) -> np.ndarray:
     """What the first convolution makes of an image (1, 1, H, W), in steps, before anything is rounded or added."""
     whole = whole_bank(own, 1)
@@ -62,7 +58,7 @@ def test_the_planes_hold_every_number(dn: int) -> None:
 @given(VECTOR, st.integers(0, MAX_DN))
 def test_flat_ground_leaves_nothing_but_its_own_brightness(vector: tuple[float, ...], dn: int) -> None:
     flat = np.full((1, 1, SIDE_PX, SIDE_PX), dn / MAX_DN, np.float32)
-    found = sums(flat, bank(vector))[0, :, 0, 0]
+    found = sums(flat, bank_of_vector(vector))[0, :, 0, 0]
     np.testing.assert_array_equal(found[COPIES[0] :], 0)
     assert abs(found[0] - (dn - MIDDLE_DN) / IMAGE_STEP_DN) <= 0.5
 
@@ -70,7 +66,7 @@ def test_flat_ground_leaves_nothing_but_its_own_brightness(vector: tuple[float, 
 @settings(max_examples=15)
 @given(VECTOR)
 def test_the_weights_are_int8_and_near_the_filters(vector: tuple[float, ...]) -> None:
-    own, whole = bank(vector), whole_bank(bank(vector), 1)
+    own, whole = bank_of_vector(vector), whole_bank(bank_of_vector(vector), 1)
     coarse_pair = whole.weight[:, :2].astype(int)
     assert 62 <= np.abs(coarse_pair).max() < 127  # no finer scale would hold them, and none is cut off
     assert np.ptp(coarse_pair, axis=1).max() <= 1
@@ -85,7 +81,7 @@ def test_the_weights_are_int8_and_near_the_filters(vector: tuple[float, ...]) ->
 @given(VECTOR)
 def test_the_mean_of_the_copies_is_what_the_filter_gives(vector: tuple[float, ...]) -> None:
     """To a fraction of a step on ground of all scales, so that rounding the weights costs less than the result's."""
-    own, image = bank(vector), textured(90, 101)
+    own, image = bank_of_vector(vector), textured(90, 101)
     centred = np.lib.stride_tricks.sliding_window_view(image[0, 0].astype(np.float64), (SIDE_PX, SIDE_PX))
     found, read = sums(image, own)[0], [kernel for kernel, _ in channels()]
     for kernel in range(1, 2 + FILTERS):
@@ -102,7 +98,7 @@ def test_copies_are_rounded_at_places_spread_over_a_step() -> None:
 
 
 def test_at_half_resolution_the_same_filters_meet_the_same_pixels() -> None:
-    own, image = bank((0.3, -0.4, 0.1, 0.2)), textured(32, 36)
+    own, image = bank_of_vector((0.3, -0.4, 0.1, 0.2)), textured(32, 36)
     fine, coarse = whole_bank(own, 1), whole_bank(own, 2)
     assert fine.frac_bits == coarse.frac_bits
     planes = split_planes(image)

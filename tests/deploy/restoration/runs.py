@@ -1,0 +1,52 @@
+"""Runs of `restore` in a process of their own, runs that are stopped, and an image to restore."""
+
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from deploy.restoration.engine import Restorer, Tile
+
+
+def noise(*shape: int, seed: int = 1) -> np.ndarray:
+    """Digital numbers of 12 bits, uint16, none of them 0."""
+    return np.random.default_rng(seed).integers(1, 4096, shape).astype(np.uint16)
+
+
+def begin(image: Path, out: Path, *options: object) -> subprocess.Popen[str]:
+    """Start a run on one thread."""
+    command = [sys.executable, "-c", "from deploy.cli import app; app()", "restore", image, out, "--threads", 1]
+    return subprocess.Popen(
+        list(map(str, [*command, *options])), stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+    )
+
+
+def until(running: subprocess.Popen[str], word: str) -> bool:
+    """Wait until a run says so, or is done; whether it said so."""
+    assert running.stdout is not None
+    return any(word in line for line in running.stdout)
+
+
+def stop_after(tiles: int, patch: pytest.MonkeyPatch, error: BaseException) -> None:
+    """Raise an error in the engine after so many tiles."""
+    count, tile = iter(range(10**6)), Restorer.tile
+
+    def stopping(self: Restorer, *rest: object) -> Tile:
+        if next(count) == tiles:
+            raise error
+        return tile(self, *rest)  # type: ignore[arg-type]
+
+    patch.setattr(Restorer, "tile", stopping)
+
+
+@contextmanager
+def stopped_after(tiles: int) -> Iterator[None]:
+    """What runs here ends after so many tiles, as by Ctrl-C."""
+    with pytest.MonkeyPatch.context() as patch:
+        stop_after(tiles, patch, KeyboardInterrupt())
+        with pytest.raises(KeyboardInterrupt):
+            yield

@@ -1,0 +1,20 @@
+"""Small networks of random weights, ready to compute."""
+
+import torch
+
+from model.convbeers import BankedConvBEERS, ConvBEERS, initialise
+from model.variants import Variant
+
+
+def plain(variant: Variant, seed: int = 0) -> ConvBEERS:
+    network = ConvBEERS(variant)
+    initialise(network, torch.Generator().manual_seed(seed))
+    return network.eval()
+
+
+def behind_a_bank(variant: Variant, spread: float) -> BankedConvBEERS:
+    """Told each sensor by biases of that standard deviation."""
+    network, generator = BankedConvBEERS(variant), torch.Generator().manual_seed(0)
+    initialise(network, generator)
+    torch.nn.init.normal_(network.bias.weight, 0.0, spread, generator)
+    return network.eval()

@@ -1,0 +1,33 @@
+"""Patches of a small drawn scene, for tests of what trains on them."""
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+
+from model.family import SensorFamily
+from model.simulator.procedural import procedural_scene
+from model.simulator.sampling import Scene
+from model.training.patches import PatchRecipe, PatchSource
+from model.training.workers import Worker
+from profiles import load_sensor
+
+
+@cache
+def small_scene() -> Scene:
+    return procedural_scene(420, 480, np.random.default_rng(2))
+
+
+def source(
+    scene: Scene | None = None,
+    seed: int = 0,
+    patch_px: int = 32,
+    worker: Worker | None = None,
+    *,
+    conditioned: bool = False,
+) -> PatchSource:
+    """Batches of three, of one variable sensor or of a family of sensors."""
+    recipe = PatchRecipe(load_sensor("pleiades-variable"), load_sensor("pleiades-reference"), patch_px=patch_px)
+    if conditioned:
+        recipe = replace(recipe, family=SensorFamily(load_sensor("pleiades-degraded").nominal()))
+    return PatchSource([scene or small_scene()], recipe, batch=3, seed=seed, worker=worker)
