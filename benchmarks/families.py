@@ -46,7 +46,7 @@ from profiles import load_sensor
 from quant.calibration import Calibration, Patches, draw_patches
 from quant.quantise import quantise_model
 from quant.session import open_any_size
-from quant.tiling.walk import receptive_radius_px
+from quant.tiling.walk import tiling_of
 
 FAMILIES = "4x64@2,8x48@2,2x32@2,u48@2,u64@2,d8x64@2,d8x96@2,k2x32@2,k3x48@2,u32,8x32"
 NAME = re.compile(r"(?P<kind>[udk]?)(?:(?P<blocks>\d+)x)?(?P<features>\d+)(?:@(?P<scale>\d+))?")
@@ -198,7 +198,7 @@ def swath_cell(model: onnx.ModelProto) -> str:
     width_px, height_px = parse_size(PAPER_SIZE)
     found = []
     for configuration, tile_px in product(CONFIGURATIONS, TILES_PX):
-        dpu, radius_px = load_dpu("vck190", configuration), receptive_radius_px(model)
+        dpu, radius_px = load_dpu("vck190", configuration), tiling_of(model).halo_px
         if 2 * radius_px >= tile_px:
             continue
         prediction = predict(place(network_of(model, tile_px), dpu), dpu)
@@ -235,7 +235,7 @@ def main() -> None:
         made = quantise_model(model, drawn, {}).host
         scores = [f"{psnrs_db(each, judging).mean():.2f}" for each in (model, made)]
         weights = sum(parameter.numel() for parameter in network.parameters()) / 1e3
-        cells = [name, f"{weights:.0f}", str(receptive_radius_px(made)), *scores, swath_cell(made)]
+        cells = [name, f"{weights:.0f}", str(tiling_of(made).halo_px), *scores, swath_cell(made)]
         print("|", " | ".join(cells), "|", flush=True)
 
 

@@ -25,7 +25,7 @@ from model.convbeers import ConvBEERS, initialise
 from model.variants import Variant
 from quant.calibration import Patches, Remade
 from quant.quantise import quantise_model
-from quant.tiling.walk import receptive_radius_px
+from quant.tiling.walk import tiling_of
 
 SHAPES = "4x16,8x32,16x32,16x64,2x32@2,4x32@2,8x32@2,4x48@2,8x48@2,3x64@2,4x64@2,2x64@4,4x96@4,4x128@4"
 SHAPE = re.compile(r"(\d+)x(\d+)(?:@(\d+))?")
@@ -48,7 +48,7 @@ def main() -> None:
         model = int8(variant)
         products = sum(9 * a * b for a, b in variant.convolutions.values()) / variant.pixels
         cells = [cell for dpu in boards for cell in cells_of(model, dpu, arguments.tile)]
-        print(f"| {text} | {products / 1e3:.0f} | {receptive_radius_px(model)} |", " | ".join(cells), "|", flush=True)
+        print(f"| {text} | {products / 1e3:.0f} | {tiling_of(model).halo_px} |", " | ".join(cells), "|", flush=True)
 
 
 def parse_shape(text: str) -> Variant:
@@ -74,7 +74,7 @@ def cells_of(model: onnx.ModelProto, dpu: Dpu, tile_px: int) -> tuple[str, str]:
     """Frames a second and seconds a swath, each as its interval and the middle."""
     prediction = predict(place(network_of(model, tile_px), dpu), dpu)
     width_px, height_px = parse_size(PAPER_SIZE)
-    swath = Swath(width_px, height_px, tile_px, receptive_radius_px(model))
+    swath = Swath(width_px, height_px, tile_px, tiling_of(model).halo_px)
     latency = swath_latency(prediction, math.ceil(swath.tiles / prediction.batch))
     low, high = latency.interval or (math.nan, math.nan)
     slow, fast = prediction.fps_interval

@@ -22,7 +22,7 @@ from deploy.restoration.engine import restore_window
 from deploy.restoration.options import TILE_PX, Options
 from deploy.restoration.run import restore_file
 from deploy.restoration.runtime import open_runtime
-from quant.tiling.walk import receptive_radius_px
+from quant.tiling.walk import tiling_of
 
 HERE = Path(__file__).parent
 CHILD = HERE / "monai_child.py"
@@ -41,7 +41,7 @@ class Task:
     @property
     def halo_px(self) -> int:
         """Of the engine, and of the peers."""
-        return receptive_radius_px(onnx.load(self.options.model))
+        return tiling_of(onnx.load(self.options.model)).halo_px
 
     def out(self, way: str) -> Path:
         """Where a way writes."""

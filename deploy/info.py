@@ -5,7 +5,6 @@ Time here is predicted only from tiles that were timed; time on the board is the
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
 from time import perf_counter
@@ -35,30 +34,20 @@ RUNS = 3
 UNPLACED = "none"
 
 
-@dataclass(frozen=True)
-class InfoRequest:
-    """What a user wants to know of an image.
+def info_row(image: Path, options: Options, target: TargetProfile, measure: bool = False) -> Row:
+    """The facts of an image and of its restoration.
 
-    Attributes:
+    Args:
+        image: its file.
         options: as a restoration would be given them.
         target: the board whose time is predicted.
         measure: whether tiles are timed here.
-    """
-
-    options: Options
-    target: TargetProfile
-    measure: bool = False
-
-
-def info_row(image: Path, request: InfoRequest) -> Row:
-    """The facts of an image and of its restoration.
 
     Raises:
         ImageError: no such image, damaged, or one that cannot be followed.
         ModelError: a network that cannot be tiled.
         OptionError: options that do not go together.
     """
-    options = request.options
     network = load_onnx(options.model)
     with open_source(image, options.trust_index) as source:
         raster = source.raster
@@ -69,8 +58,8 @@ def info_row(image: Path, request: InfoRequest) -> Row:
         "bands": measured(raster.bands, "1", HEADER),
         "tiles": predicted(plan.tiles, "1", (plan.tiles, plan.tiles), ARITHMETIC),
         "work factor": predicted(plan.work_factor, "1", (plan.work_factor, plan.work_factor), ARITHMETIC),
-        "time here": time_here(network, plan, options) if request.measure else _not_measured(),
-        f"time on {request.target.name}": time_on_board(options.model, plan, request.target),
+        "time here": time_here(network, plan, options) if measure else _not_measured(),
+        f"time on {target.name}": time_on_board(options.model, plan, target),
     }
     text = {"pixels": str(raster.dtype), **scale_words(image.name, raster, options), **place_words(raster)}
     nodata = "none" if raster.nodata is None else f"{raster.nodata:g}"

@@ -18,5 +18,4 @@ from .quantise import quantise_model as quantise_model
 from .session import open_session as open_session
 from .session import run as run
 from .tiling.walk import Tiling as Tiling
-from .tiling.walk import receptive_radius_px as receptive_radius_px
 from .tiling.walk import tiling_of as tiling_of

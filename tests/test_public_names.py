@@ -24,7 +24,7 @@ SURFACE = {
     "model.training": "PatchRecipe RestorationLoss Run TrainingRecipe train",
     "quant": (
         "Calibration GateResult IntCore Limits Patches Quantised Tiling board_model compare draw_patches "
-        "host_model judge load_onnx open_session quantise_free quantise_model read_core receptive_radius_px run "
+        "host_model judge load_onnx open_session quantise_free quantise_model read_core run "
         "save_onnx tiling_of unseen_patches"
     ),
     "deploy": ("Document float_for float_model load_dpu place predict read_network restore run_gate to_onnx"),

@@ -39,7 +39,7 @@ from profiles.errors import ModelError, OptionError
 from profiles.figures import Row
 from profiles.target import board_names
 from quant.onnx_file import load_onnx
-from quant.tiling.walk import receptive_radius_px, tiling_of
+from quant.tiling.walk import tiling_of
 
 TRAFFIC = "LdFM, StFM: feature maps loaded and stored, an image; LdWB: weights and biases loaded, a batch"
 ALL = "all"
@@ -117,7 +117,7 @@ def bench_board(
         return _frames(model, network, boards, corrected, error, host_task)
     dn = read_acquisition(image, full_scale, None) if image else None
     width_px, height_px = (dn.shape[1], dn.shape[0]) if dn is not None else parse_size(size or PAPER_SIZE)
-    radius_px = receptive_radius_px(network) if halo == "exact" else 0
+    radius_px = tiling_of(network).halo_px if halo == "exact" else 0
     swath = Swath(width_px, height_px, tiles_px[0], parse_halo(halo, radius_px))
     targets = list({dpu.target.name: dpu.target for dpu in boards}.values())
     papers = published_rows() if any(each.name == PAPER_TARGET for each in targets) else []

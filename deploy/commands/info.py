@@ -39,7 +39,7 @@ def info(
     Size, type, full scale and who states it, place on Earth, missing pixels; the plan of `restore` with its defaults.
     No pixel is read but of PNG, JPEG and TIFFs of several pages. Time here is unavailable without --measure.
     """
-    from deploy.info import InfoRequest, info_row
+    from deploy.info import info_row
     from deploy.networks import network_file
     from deploy.restoration.index_files import index_files
     from deploy.results import Document, print_rows
@@ -53,7 +53,7 @@ def info(
     path = network_file(model, known, partial(say, err=True))
     bits = int(known.bits.low) if sensor else None
     options = Options(path, tile, full_scale=full_scale, trust_index=trust_index, sensor_bits=bits)
-    row = info_row(image, InfoRequest(options, load_target(target), measure))
+    row = info_row(image, options, load_target(target), measure)
     print_rows(str(image), [row])
     arguments = {"sensor": sensor or BLIND, "tile": tile, "full_scale": full_scale, "target": target}
     # No digest of FILE: it would be read whole.

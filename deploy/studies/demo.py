@@ -48,7 +48,7 @@ from profiles.target import DEFAULT_TARGET, board_names
 from quant.encodings import board_model, read_core
 from quant.gate import Limits
 from quant.onnx_file import load_onnx, metadata, save_onnx
-from quant.tiling.walk import receptive_radius_px
+from quant.tiling.walk import tiling_of
 
 BITS, SIDE_PX, GATE_PATCHES = 12, 640, 12
 CROP_PX, ZOOM, LARGEST_PX = 110, 3, 1280
@@ -186,7 +186,7 @@ def _fidelity(name: str, dn: np.ndarray, reference: np.ndarray, degraded: np.nda
 
 def bench_tables(model: Path, dn: np.ndarray, sensors: Sensors) -> list[Table]:
     """Speed for this image, for the swath of the paper beside its rows, and for that swath on every board."""
-    dpu, halo_px = load_dpu(DEFAULT_TARGET), receptive_radius_px(load_onnx(model))
+    dpu, halo_px = load_dpu(DEFAULT_TARGET), tiling_of(load_onnx(model)).halo_px
     chain = measure_chain(dn, sensors.degraded, sensors.reference)
     prediction, rows = predict_file(model, dpu), []
     for width, height in ((dn.shape[1], dn.shape[0]), SWATH_PX):

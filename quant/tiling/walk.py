@@ -66,15 +66,6 @@ class Tiling:
         )
 
 
-def receptive_radius_px(model: onnx.ModelProto) -> int:
-    """The farthest input pixel that an output pixel depends on, in pixels, rounded up to the network's lattice.
-
-    Raises:
-        ModelError: a network that cannot be tiled.
-    """
-    return tiling_of(model).halo_px
-
-
 def tiling_of(model: onnx.ModelProto) -> Tiling:
     """How an image may be tiled for a network, float or INT8.
 

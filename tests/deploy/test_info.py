@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import tifffile
 
-from deploy.info import InfoRequest, info_row
+from deploy.info import info_row
 from deploy.networks import shipped_pair
 from deploy.restoration.options import Options
 from deploy.restoration.run import restore_file
@@ -28,7 +28,7 @@ TAGS = [
 
 
 def about(image: Path, options: Options, measure: bool = False) -> Row:
-    return info_row(image, InfoRequest(options, load_target("vck190"), measure))
+    return info_row(image, options, load_target("vck190"), measure)
 
 
 def test_it_says_what_the_header_says(model: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

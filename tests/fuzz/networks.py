@@ -21,7 +21,6 @@ from quant.graph import correction_graph
 from quant.onnx_file import fixed_tile_px, load_onnx
 from quant.session import open_any_size, open_session, run
 from quant.structure import count_relus, rounded_tensors, saturated_shares
-from quant.tiling.walk import receptive_radius_px
 from tests.deploy.dpu.graphs import board_convbeers, float_convbeers, integer_convbeers
 from tests.fuzz.pictures import written
 from tests.quant.reading.networks import CASES, made
@@ -58,7 +57,7 @@ def look_at_onnx(path: Path) -> None:
 def understand_onnx(path: Path) -> None:
     """What `quantize`, `restore` and `gate` ask of a network before they run it."""
     model = load_onnx(path)
-    questions = fixed_tile_px, receptive_radius_px, correction_graph, count_relus, encoding_faults, rounded_tensors
+    questions = fixed_tile_px, tiling_of, correction_graph, count_relus, encoding_faults, rounded_tensors
     for question in questions:
         _asked(question, model)
 

@@ -12,7 +12,7 @@ from quant.graph import correction_graph, read_planes
 from quant.onnx_file import metadata
 from quant.quantise import Quantised, quantise_model
 from quant.session import open_session
-from quant.tiling.walk import receptive_radius_px
+from quant.tiling.walk import tiling_of
 
 
 def test_scales_are_powers_of_two_and_numbers_are_int8(quantised: Quantised) -> None:
@@ -71,4 +71,4 @@ def test_the_file_says_what_it_was_calibrated_on(quantised: Quantised, patches: 
 @pytest.mark.parametrize("encoding", ["float", "host", "board"])
 def test_the_radius_is_read_from_the_graph(encoding: str, float_onnx: onnx.ModelProto, quantised: Quantised) -> None:
     model = {"float": float_onnx, "host": quantised.host, "board": quantised.board}[encoding]
-    assert receptive_radius_px(model) == 7
+    assert tiling_of(model).halo_px == 7

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from onnx import TensorProto, helper
 
 from profiles.errors import ModelError
-from quant.tiling.walk import Tiling, receptive_radius_px, tiling_of
+from quant.tiling.walk import Tiling, tiling_of
 from tests.quant.tiling.small_networks import (
     Row,
     constant,
@@ -167,8 +167,7 @@ def test_what_depends_on_the_place_or_the_whole_image_is_refused(sentence: str) 
 def test_constants_in_the_graph_are_followed() -> None:
     weight = helper.make_node("Constant", [], ["w"], value=constant("w", 1, 1, 7, 7))
     assert (
-        receptive_radius_px(graph([weight, helper.make_node("Conv", ["image", "w"], ["restored"], pads=[3] * 4)]))
-        == 3
+        tiling_of(graph([weight, helper.make_node("Conv", ["image", "w"], ["restored"], pads=[3] * 4)])).halo_px == 3
     )
 
 
