@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from deploy.cli import COMMANDS
-from docs.make import api, commands, operators, options, target_file
+from docs.make import api, commands, operators, target_file
 from profiles.effects import TABLES
 from profiles.scene_call import load_scene_call, scene_names
 
@@ -54,7 +54,6 @@ def test_links_outside_of_the_site_lead_somewhere(name: str) -> None:
         (api, api.document),
         (commands, commands.reference),
         (operators, operators.document),
-        (options, options.page),
         (target_file, target_file.document),
     ],
     ids=lambda each: each.__name__,

@@ -21,6 +21,7 @@ from quant.graph import correction_graph
 from quant.onnx_file import fixed_tile_px, load_onnx
 from quant.session import open_any_size, open_session, run
 from quant.structure import count_relus, rounded_tensors, saturated_shares
+from quant.tiling.walk import tiling_of
 from tests.deploy.dpu.graphs import board_convbeers, float_convbeers, integer_convbeers
 from tests.fuzz.pictures import written
 from tests.quant.reading.networks import CASES, made
