@@ -1,10 +1,10 @@
-"""What this machine did while something was measured: load and clock of its CPUs, and the memory that it took."""
+"""What this machine did while something was measured: load of its CPUs, and the memory that it took."""
 
 import sys
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 import psutil
@@ -16,25 +16,9 @@ STATUS = Path("/proc/self/status")
 """Linux's own counts of this process."""
 
 
-@dataclass
-class Watch:
-    """Filled in when the watched block ends."""
-
-    load: Figure = field(default_factory=lambda: unavailable("%", "not measured"))
-    clock: Figure = field(default_factory=lambda: unavailable("GHz", "not measured"))
-
-
-@contextmanager
-def watched() -> Iterator[Watch]:
-    """Load of all CPUs, other processes included, and their clock, over a block of work."""
-    watch, before, first_ghz = Watch(), psutil.cpu_times(), _clock_ghz()
-    yield watch
-    watch.load = _load(before, psutil.cpu_times())
-    clocks = [ghz for ghz in (first_ghz, _clock_ghz()) if ghz]
-    if clocks:
-        watch.clock = measured(sum(clocks) / len(clocks), "GHz", "mean of all CPUs at start and end")
-    else:
-        watch.clock = unavailable("GHz", "this system does not tell the clock of the moment")
+def cpu_load() -> Figure:
+    """Load of all CPUs since the last call in this process, other processes included."""
+    return measured(psutil.cpu_percent(), "%", "all CPUs over the same window, other processes included")
 
 
 def peak_memory() -> Figure:
@@ -91,20 +75,3 @@ def memory_rise() -> Iterator[Memory]:
         sample()
         done.set()
         sampler.join()
-
-
-def _load(before: tuple[float, ...], after: tuple[float, ...]) -> Figure:
-    """Share of CPU time that was not idle, from two readings of psutil.cpu_times()."""
-    spent = {name: b - a for name, a, b in zip(type(before)._fields, before, after, strict=True)}  # type: ignore[attr-defined]
-    total = sum(value for name, value in spent.items() if not name.startswith("guest"))  # guests are counted in user
-    if total <= 0:
-        return unavailable("%", "too short for the system's clock of CPU time")
-    idle = spent["idle"] + spent.get("iowait", 0.0)
-    return measured(100 * (1 - idle / total), "%", "all CPUs over the same window, other processes included")
-
-
-def _clock_ghz() -> float | None:
-    if sys.platform != "linux":  # elsewhere psutil knows the nominal clock alone
-        return None
-    frequency = psutil.cpu_freq()
-    return frequency.current / 1e3 if frequency and frequency.current else None

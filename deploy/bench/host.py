@@ -16,7 +16,7 @@ import psutil
 
 from deploy.bench.timing import interleaved, node_rows, profile, timed
 from deploy.dpu.reading import inputs_of
-from deploy.host_state import Watch, memory_rise, watched
+from deploy.host_state import cpu_load, memory_rise
 from deploy.networks import other_precision
 from model.processor import require_cores
 from profiles import TargetProfile
@@ -122,17 +122,13 @@ def host_rows(model: Path, target: TargetProfile, tile_px: int, threads: int = 0
     if other is not None:
         runs.append(Timed(f"{'INT8' if is_quantised(other) else 'float32'} of the same shape", other))
     min_time_s, min_runs = target.value("measurement", "min_time_s"), int(target.value("measurement", "min_runs"))
-    with watched() as watch:
-        time_networks(runs, tile_px, threads, min_time_s, min_runs)
-    conditions = conditions_of(watch, threads or psutil.cpu_count(logical=False) or 1)
+    cpu_load()
+    time_networks(runs, tile_px, threads, min_time_s, min_runs)
+    conditions = conditions_of(threads or psutil.cpu_count(logical=False) or 1)
     nodes, total_ms = profile(given, tile_feed(given, tile_px), threads)
     return [*timed_rows(runs, tile_px, conditions), *node_rows(nodes, total_ms)]
 
 
-def conditions_of(watch: Watch, threads: int) -> dict[str, Figure]:
-    """Under what conditions something was measured."""
-    return {
-        "threads": measured(threads, "thread", "of the runtime"),
-        "CPU load": watch.load,
-        "clock": watch.clock,
-    }
+def conditions_of(threads: int) -> dict[str, Figure]:
+    """Under what conditions something was measured since the last call of `cpu_load`."""
+    return {"threads": measured(threads, "thread", "of the runtime"), "CPU load": cpu_load()}

@@ -11,7 +11,7 @@ import torch
 from deploy.bench.host import conditions_of
 from deploy.bench.tables import TABLE, Swath, chain_rate, efficiency
 from deploy.bench.timing import timed
-from deploy.host_state import watched
+from deploy.host_state import cpu_load
 from model.simulator.acquire import MARGIN_PX, simulate_pair
 from model.simulator.detector import Draw
 from model.simulator.procedural import procedural_scene
@@ -60,11 +60,11 @@ def measure_chain(dn: np.ndarray, degraded: SensorProfile, reference: SensorProf
     chain = Chain(degraded.nominal(), reference.nominal())
     crops = [torch.from_numpy(np.ascontiguousarray(crop, dtype=np.float32)) for crop in _crops(dn)]
     restore_traditional(crops[0][:32, :32], chain)
-    with watched() as watch:
-        times_s, _, power = timed(lambda: [_time_s(crop, chain) for crop in crops])
+    cpu_load()
+    times_s, _, power = timed(lambda: [_time_s(crop, chain) for crop in crops])
     per_mpx = [1e6 * time_s / crop.numel() for time_s, crop in zip(times_s, crops, strict=True)]
     height, width = crops[0].shape
-    return ChainTime(per_mpx, power, conditions_of(watch, torch.get_num_threads()), f"{width} x {height} pixels")
+    return ChainTime(per_mpx, power, conditions_of(torch.get_num_threads()), f"{width} x {height} pixels")
 
 
 def _time_s(dn: torch.Tensor, chain: Chain) -> float:
