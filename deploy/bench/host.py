@@ -16,7 +16,7 @@ import psutil
 
 from deploy.bench.timing import interleaved, node_rows, profile, timed
 from deploy.dpu.reading import inputs_of
-from deploy.host_state import cpu_load, memory_rise
+from deploy.host_state import cpu_load, resident_bytes
 from deploy.networks import other_precision
 from model.processor import require_cores
 from profiles import TargetProfile
@@ -33,7 +33,7 @@ class Timed:
     model: onnx.ModelProto
     times_s: list[float] = field(default_factory=list)
     powers: list[Figure] = field(default_factory=list)
-    rise_bytes: int = 0
+    held_bytes: int = 0
 
 
 def time_networks(runs: Sequence[Timed], tile_px: int, threads: int, min_time_s: float, min_runs: int) -> None:
@@ -45,10 +45,10 @@ def time_networks(runs: Sequence[Timed], tile_px: int, threads: int, min_time_s:
     calls = []
     for run in runs:
         feed = tile_feed(run.model, tile_px, run.name)
-        with memory_rise() as memory:
-            session = open_session(run.model, threads)
-            require_finite(session.run(None, feed), run.name)  # warm-up, not counted
-        run.rise_bytes = memory.rise_bytes
+        before_bytes = resident_bytes()
+        session = open_session(run.model, threads)
+        require_finite(session.run(None, feed), run.name)  # warm-up, not counted
+        run.held_bytes = resident_bytes() - before_bytes
         calls.append(partial(session.run, None, feed))
 
     def enough(found: Sequence[Sequence[tuple[float, Figure]]]) -> bool:
@@ -79,13 +79,13 @@ def timed_rows(runs: Sequence[Timed], tile_px: int, conditions: Mapping[str, Fig
 def _row(run: Timed, tile_px: int, conditions: Mapping[str, Figure]) -> Row:
     times_ms, total_s = 1e3 * np.array(run.times_s), sum(run.times_s)
     source = f"{len(run.times_s)} runs in {total_s:.1f} s after one for warm-up, loading left out"
-    memory = "highest rise of resident memory while the file was opened and run once, sampled every 2 ms"
+    memory = "rise of resident memory once the file was opened and had run once"
     figures = {
         "p50": measured(float(np.percentile(times_ms, 50)), "ms/tile", source),
         "p90": measured(float(np.percentile(times_ms, 90)), "ms/tile", source),
         "throughput": measured(len(run.times_s) / total_s, "frame/s", source),
         "power": _mean_power(run),
-        "peak memory": measured(run.rise_bytes / 1e6, "MB", memory),
+        "memory": measured(run.held_bytes / 1e6, "MB", memory),
     }
     return Row("host", f"{run.name}, {tile_px} x {tile_px}", {**figures, **conditions})
 
