@@ -21,8 +21,8 @@ from torch import Tensor
 
 from model.metrics.refusal import Refusal
 
-WINDOW_PX, PLATEAU_PX = 10, 5
-"""Half width of the Hamming window around the edge, and what must lie beyond it on either side of every row."""
+WINDOW_PX = 10
+"""Half width of the Hamming window around the edge."""
 BINS_PER_PX = 4
 HALF = WINDOW_PX * BINS_PER_PX + 1
 """Bins on each side: one more than the window, for the derivative."""
