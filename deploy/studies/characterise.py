@@ -6,6 +6,7 @@ What pixels tell is measured, with intervals: blur by straight edges, noise by t
 
 import json
 import math
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -67,16 +68,15 @@ def read_box(text: str, images: Sequence[Path]) -> Box:
     Raises:
         OptionError: written otherwise, or of another image.
     """
-    name, _, numbers = text.rpartition(":")
-    places = numbers.split(",")
-    if len(places) != 4 or not all(place.isascii() and place.isdigit() and len(place) < 9 for place in places):
+    parts = re.fullmatch(r"(.*):(\d{1,8}),(\d{1,8}),(\d{1,8}),(\d{1,8})", text, re.ASCII)
+    if parts is None:
         expected, remedy = "FILE:X,Y,WIDTH,HEIGHT in whole pixels", "write raw.tif:1200,340,60,60"
         raise OptionError("--edge", expected=expected, got=repr(text), remedy=remedy)
-    image = next((path for path in images if path == Path(name)), None)
-    if image is None:
+    name, *places = parts.groups()
+    if Path(name) not in images:
         remedy = "name it as the argument does"
         raise OptionError("--edge", expected="one of the images that are given", got=repr(name), remedy=remedy)
-    return Box(image, *(int(place) for place in places))
+    return Box(Path(name), *map(int, places))
 
 
 @dataclass(frozen=True)
@@ -158,7 +158,7 @@ def characterise(
         got, remedy = "one of them twice", "give each once: a second look at the same pixels knows nothing new"
         raise OptionError("images", expected="different images", got=got, remedy=remedy)
     stated = {"bits": bits, "gain": gain, "gsd_m": gsd_m}
-    bits = _settled_bits(bits, [_digitised(path) for path in images])
+    bits = _settled_bits(bits, images)
     clipped_at = 2**bits - 1
     noise = measured_noise(images, clipped_at)
     across, along = _axes(images, boxes, noise, clipped_at)
@@ -184,44 +184,39 @@ def read_raw(path: Path) -> np.ndarray:
     return pixels
 
 
-def _tiles(pixels: np.ndarray) -> Iterator[np.ndarray]:
-    """Parts of an image of up to 1024 x 1024 pixels, float64."""
-    for top in range(0, pixels.shape[0], TILE_PX):
-        for left in range(0, pixels.shape[1], TILE_PX):
-            yield pixels[top : top + TILE_PX, left : left + TILE_PX].astype(np.float64)
+def _tiles(images: Sequence[Path]) -> Iterator[np.ndarray]:
+    """Parts of images of up to 1024 x 1024 pixels, float64."""
+    for pixels in map(read_raw, images):
+        for top in range(0, pixels.shape[0], TILE_PX):
+            for left in range(0, pixels.shape[1], TILE_PX):
+                yield pixels[top : top + TILE_PX, left : left + TILE_PX].astype(np.float64)
 
 
-Digitised = tuple[int, bool, bool]
-"""The largest digital number of an image, whether its pixels pile up there, and whether 8 bits store it."""
+def _settled_bits(stated: int | None, images: Sequence[Path]) -> int:
+    """The bits that were given, or those that pixels clipped at full scale show."""
+    largest, full_scale = max(_brightest(path) for path in images)
+    bits = largest.bit_length() if stated is None else stated
+    if stated is None and not full_scale:
+        expected = "--bits beside images that are not clipped at full scale, or are stored in 8 bits"
+        remedy = "give the digitiser's, such as --bits 12"
+        raise OptionError("bits", expected=expected, got=f"values up to {largest}", remedy=remedy)
+    if largest > 2**bits - 1:
+        expected, remedy = f"digital numbers up to {2**bits - 1}", "give the bits of the raw image"
+        raise OptionError("--bits", expected=expected, got=f"{largest}", remedy=remedy)
+    return bits
 
 
-def _digitised(path: Path) -> Digitised:
+def _brightest(path: Path) -> tuple[int, bool]:
+    """The largest digital number of an image, and whether pixels pile up there as at a full scale alone."""
     pixels = read_raw(path)
-    largest = int(pixels.max())
-    whole = pixels.astype(np.int64, copy=False).ravel()
+    largest, whole = int(pixels.max()), pixels.astype(np.int64, copy=False).ravel()
     step = int(np.gcd.reduce(whole - whole.min()))
     if step > 1:
         remedy = f"divide it by {step}: {step - 1} of {step} values never occur, so they are no digital numbers"
         raise ImageError(str(path), expected="digital numbers in steps of 1", got=f"steps of {step}", remedy=remedy)
-    count, below = (int((pixels == value).sum()) for value in (largest, largest - 1))
-    return largest, count >= max(CLIPPED_PIXELS, PILE * below), pixels.dtype.itemsize == 1
-
-
-def _settled_bits(stated: int | None, images: Sequence[Digitised]) -> int:
-    """The bits that were given, or those that pixels clipped at full scale show."""
-    largest, clipped, narrow = max(images)
-    if stated is not None:
-        if largest > 2**stated - 1:
-            expected = f"digital numbers up to {2**stated - 1}"
-            remedy = "give the bits of the raw image"
-            raise OptionError("--bits", expected=expected, got=f"{largest}", remedy=remedy)
-        return stated
-    bits = largest.bit_length()
-    if narrow or largest != 2**bits - 1 or not clipped:
-        got = f"values up to {largest}" + (" in 8 bits" if narrow else "")
-        expected = "--bits beside images that are not clipped at full scale"
-        raise OptionError("bits", expected=expected, got=got, remedy="give the digitiser's, such as --bits 12")
-    return bits
+    count, below = (int((whole == value).sum()) for value in (largest, largest - 1))
+    piled = count >= max(CLIPPED_PIXELS, PILE * below) and pixels.dtype.itemsize > 1
+    return largest, piled and largest == 2 ** largest.bit_length() - 1
 
 
 def snr_at(noise: NoiseModel, dn: float, gain: float) -> Snr:
@@ -246,7 +241,7 @@ def measured_noise(images: Sequence[Path], clipped_at: int) -> NoiseModel:
     Raises:
         ImageError: it cannot be known.
     """
-    blocks = [cut_blocks(tile, clipped_at) for path in images for tile in _tiles(read_raw(path))]
+    blocks = [cut_blocks(tile, clipped_at) for tile in _tiles(images)]
     noise = fit_noise_model(join(blocks), np.random.default_rng(SEED))
     if isinstance(noise, Refusal):
         expected, remedy = "blurred, raw ground with white noise, from dark to bright", REMEDIES[noise.status]
@@ -264,7 +259,7 @@ def _axes(
 ) -> tuple[AxisMtf | None, AxisMtf | None]:
     """MTF across (edges near the vertical) and along the track, at least one of them."""
     upright, lying = _pointed_at(boxes, noise, clipped_at)
-    for tile in (tile for path in images if not boxes for tile in _tiles(read_raw(path))):
+    for tile in () if boxes else _tiles(images):
         upright += find_blurs(tile, noise.total, clipped_at)
         lying += find_blurs(tile.T, noise.total, clipped_at)
     least = 1 if boxes else MIN_FOUND
@@ -299,7 +294,7 @@ def _pointed_at(boxes: Sequence[Box], noise: NoiseModel, clipped_at: float) -> t
 def _rise(region: np.ndarray) -> float:
     """How much brighter one side is than the other, along the rows."""
     first, *_, last = np.array_split(region, 3, axis=1)
-    return abs(float(last.mean() - first.mean())) if first.size and last.size else 0.0
+    return abs(float(last.mean() - first.mean()))
 
 
 def profile_toml(found: Characterised) -> str:

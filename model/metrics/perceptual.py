@@ -166,4 +166,3 @@ def _check_pair(label: str, backbone: Backbone, image: Tensor, reference: Tensor
         expected = f"two images (N, 1, H, W) of at least {smallest} pixels a side"
         got = f"{tuple(image.shape)} and {tuple(reference.shape)}"
         raise ImageError(label, expected=expected, got=got, remedy="give larger images, grey and of one shape")
-

@@ -102,7 +102,10 @@ def open_detector(path: Path, threads: int = 0, size_px: int | None = None) -> D
     require_cores("--threads", threads)
     model = load_onnx(path)
     about = {key: _literal(value) for key, value in metadata(model).items()}
-    names = _names(about.get("names"), path)
+    names = class_names(about.get("names"))
+    if not names:
+        stated = repr(about["names"])[:80] if "names" in about else "none"
+        raise _unread(path, "the names of its classes in its metadata, {0: 'ship', ...}", stated)
     layout = _layout(model, about, len(names), path)
     size = _size_px(fixed_tile_px(model), about, size_px, path)
     return Detector(names, size, layout, _flag(model), _runner(model, threads, path))
@@ -130,21 +133,11 @@ def _literal(text: str) -> Any:
         return text
 
 
-def _names(found: Any, path: Path) -> tuple[str, ...]:
-    names = [found.get(number) for number in range(len(found))] if isinstance(found, dict) else found
-    if not isinstance(names, list) or not names or not all(isinstance(name, str) and letters(name) for name in names):
-        expected = "the names of its classes in its metadata, {0: 'ship', ...}"
-        raise _unread(path, expected, "none" if found is None else repr(found)[:80])
-    return tuple(names)
-
-
 def _layout(model: onnx.ModelProto, about: dict[str, Any], classes: int, path: Path) -> Layout:
     """Which of the two layouts, by task, shapes and what made it."""
     task, channels = about.get("task", "detect"), _sizes(model.graph.input[0])[1:2]
     outputs = [_sizes(value) for value in model.graph.output]
-    # RT-DETR answers as the final layout does, but for 2 classes.
-    other = "rtdetr" in letters(f"{about.get('head', '')}{about.get('description', '')}")
-    shape = outputs[0] if len(outputs) == 1 and len(outputs[0]) == 3 and not other else [-1]
+    shape = outputs[0] if len(outputs) == 1 and len(outputs[0]) == 3 else [-1]
     if task == "detect" and channels == [3] and shape[0] in (0, 1):
         if shape[1] == 4 + classes:
             return "raw"
@@ -152,7 +145,7 @@ def _layout(model: onnx.ModelProto, about: dict[str, Any], classes: int, path: P
             return "final"
     read = f"for RGB, 1 x {4 + classes} x anchors for {classes} classes (raw) or 1 x N x 6 (nms=True or end2end)"
     shapes = ", ".join(" x ".join(map(str, sizes)) for sizes in outputs)
-    got = f"task {task}, {' '.join(map(str, channels))} channels, output {shapes}{', of RT-DETR' if other else ''}"
+    got = f"task {task}, {' '.join(map(str, channels))} channels, output {shapes}"
     raise _unread(path, f"a detector's output as Ultralytics exports it {read}", got)
 
 
@@ -214,6 +207,14 @@ def _unread(path: Path, expected: str, got: str) -> ModelError:
 def letters(name: str) -> str:
     """The letters and digits of a class's name, without case: tools spell the same ones differently."""
     return "".join(c for c in name.casefold() if c.isalnum())
+
+
+def class_names(found: Any) -> tuple[str, ...]:
+    """Names of classes from a list, or a table by number from 0; none where what was found is something else."""
+    names = [found.get(number) for number in range(len(found))] if isinstance(found, dict) else found
+    if not isinstance(names, list) or not all(isinstance(name, str) and letters(name) for name in names):
+        return ()
+    return tuple(str(name).strip() for name in names)
 
 
 def parse_classes(text: str) -> dict[str, str]:

@@ -71,7 +71,6 @@ def test_the_size_is_the_file_s_or_the_one_asked_for(tmp_path: Path) -> None:
         (raw((1, 1, 1, 1, 0.5, 0)), {"task": "segment"}, "task segment, "),
         (raw((1, 1, 1, 1, 0.5, 0)), {"channels": 1}, r"for RGB, 1 x 6 x anchors .* got task detect, 1 channels"),
         (raw((1, 1, 1, 1, 0.5, 0)), {"outputs": 3}, r"output 1 x 6 x 20, 1 x 6 x 20, 1 x 6 x 20"),
-        (final(), {"head": "RTDETRDecoder"}, "output 1 x 300 x 6, of RT-DETR"),
         (np.zeros((1, 20, 7)), {}, r"1 x 6 x anchors for 2 classes \(raw\) or 1 x N x 6 .* output 1 x 20 x 7"),
         (np.zeros((1, 20, 6, 1)), {}, "output 1 x 20 x 6 x 1"),
         (np.zeros((4, 300, 6)), {}, "output 4 x 300 x 6"),
