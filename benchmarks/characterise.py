@@ -31,7 +31,6 @@ from deploy.studies.characterise import (
     snr_at,
 )
 from deploy.studies.evaluation.pairs import simulate_pairs
-from deploy.studies.evaluation.sweep import Fixed
 from model.family import LEAST_ALONG, SensorFamily
 from model.io.images import list_images
 from model.metrics.edge_blur import AxisMtf
@@ -108,7 +107,7 @@ def as_read(found: Characterised, path: Path) -> Sensor:
 
 def psnr_lost(weights: Path, scene: Scene, sensor: Sensor, found: Sensor) -> float:
     """By a network that knows the sensor that was found, beside the same that knows the true one, in dB."""
-    (pair,), _ = simulate_pairs([scene], Fixed(sensor), Fixed(REFERENCE.in_units_of(sensor)), 0)
+    (pair,), _ = simulate_pairs([scene], sensor, REFERENCE.in_units_of(sensor), 0)
     image = torch.from_numpy(pair.degraded.astype(np.float32) / sensor.max_dn)[None, None]
     scores = []
     for known in (sensor, found):

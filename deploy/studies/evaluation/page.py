@@ -71,8 +71,7 @@ def evaluation_report(
     tables = [Table("Means over all pairs", mean, MEAN_CAPTION)]
     tables += [Table(name, rows, SITES_CAPTION) for name, rows in by_table(sites).items()]
     tables += [Table(f"{name[0].upper()}{name[1:]}", rows, SWEEP_CAPTION) for name, rows in by_table(swept).items()]
-    notes = (*NOTES, f"{sampled[0].upper()}{sampled[1:]}.") if sampled else NOTES
-    return Report(title, headline(mean), tables, pictures, notes)
+    return Report(title, headline(mean), tables, pictures, (*NOTES, *([sampled] if sampled else [])))
 
 
 MEAN_CAPTION = (

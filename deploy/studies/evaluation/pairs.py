@@ -4,7 +4,6 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
 
 import numpy as np
 
@@ -25,14 +24,6 @@ from profiles.errors import ImageError
 from profiles.sensor import Sensor, SensorProfile
 
 OVERSAMPLINGS = (4, 2)
-
-
-class SensorSource(Protocol):
-    """What gives a sensor for each scene: a profile, or always the same one."""
-
-    def draw(self, generator: np.random.Generator, /) -> Sensor:
-        """One sensor."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -60,12 +51,19 @@ class NamedPair:
 
 def simulate_pairs(
     scenes: list[Scene],
-    degraded: SensorSource,
-    reference: SensorSource,
+    degraded: SensorProfile | Sensor,
+    reference: SensorProfile | Sensor,
     seed: int,
     oversamplings: Sequence[int] = OVERSAMPLINGS,
 ) -> tuple[list[NamedPair], list[str]]:
     """Simulate a pair of each scene, at the first of the oversamplings that leaves enough of it.
+
+    Args:
+        scenes: what is seen.
+        degraded: the same sensor for all scenes, or a profile that one is drawn from for each.
+        reference: likewise.
+        seed: of every random draw.
+        oversamplings: scene pixels per pixel.
 
     Returns:
         The pairs, and the names of scenes too small to use.
@@ -80,8 +78,11 @@ def simulate_pairs(
             small.append(scene.name)
             continue
         draw = Draw(seed, number)
-        drawn = [profile.draw(draw.generator("sensor")) for profile in (degraded, reference)]
-        pairs.append(_simulated(scene, drawn[0], drawn[1], ratio, draw))
+        seen, meant = (
+            each if isinstance(each, Sensor) else each.draw(draw.generator("sensor"))
+            for each in (degraded, reference)
+        )
+        pairs.append(_simulated(scene, seen, meant, ratio, draw))
     if not pairs:
         least = oversamplings[-1] * (2 * MARGIN_PX + LEAST_SIDE_PX)
         raise ImageError(
@@ -125,8 +126,8 @@ def oversampling_note(pairs: Sequence[NamedPair], profile: SensorProfile) -> str
         return ""
     used = " and ".join(f"{ratio} ({count} of {len(pairs)} images)" for ratio, count in sorted(counts.items())[::-1])
     return (
-        f"scene pixels per pixel: {used}, where {profile.name} states {own}; at most {OVERSAMPLINGS[0]} are taken, "
-        f"and {OVERSAMPLINGS[1]} of small images ('simulate' keeps the profile's)"
+        f"Scene pixels per pixel: {used}, where {profile.name} states {own}; at most {OVERSAMPLINGS[0]} are taken, "
+        f"and {OVERSAMPLINGS[1]} of small images ('simulate' keeps the profile's)."
     )
 
 

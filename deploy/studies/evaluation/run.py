@@ -18,8 +18,8 @@ from deploy.studies.evaluation.scores import Instruments, paper_rows, perceptual
 from deploy.studies.evaluation.sweep import sweep_tables
 from deploy.studies.evaluation.targets import acquire_targets, target_figures
 from model.io.images import list_images
-from model.metrics.bootstrap import LEAST_SITES
-from model.progress import once, steps
+from model.metrics.bootstrap import too_few
+from model.progress import once
 from model.recipe import PairsRecipe, profiles_for, read_pairs_recipe
 from model.simulator.procedural import load_scenes
 from profiles.figures import Row
@@ -70,10 +70,8 @@ class Evaluation:
     def notes(self) -> list[str]:
         """What a reader of the tables must know."""
         sites = len({pair.site for pair in self.pairs})
-        few = f"no interval over sites is shown: of {sites}, fewer than {LEAST_SITES}, none could be trusted"
-        left_out = f"left out, too small: {', '.join(self.small)}"
-        said = ((few, sites < LEAST_SITES), (self.sampling, bool(self.sampling)), (left_out, bool(self.small)))
-        return [note for note, holds in said if holds]
+        left_out = f"Left out, too small: {', '.join(self.small)}." if self.small else ""
+        return [note for note in (too_few(sites), self.sampling, left_out) if note]
 
     def write(self, out: Path) -> Path:
         """Write report.html and the strips of pictures into a folder; returns the report's path."""
@@ -145,8 +143,7 @@ def run_evaluation(
     mean, rows = [], list[Row]()
     targets = acquire_targets(degraded, seed)
     for method in methods:
-        with steps(method.name, len(loaded)) as bar:
-            scored, *each = score(method, loaded, instruments, seed, bar.advance)
+        scored, *each = score(method, loaded, instruments, seed)
         mean.append(replace(scored, figures={**scored.figures, **target_figures(method, targets)}))
         rows += each
     swept = sweep_tables(methods, images, *sensors, seed) if sweep else ()

@@ -15,6 +15,7 @@ from model.metrics.backbones import find_backbone, not_found
 from model.metrics.bootstrap import site_interval
 from model.metrics.fidelity import fidelity_db, ssim
 from model.metrics.perceptual import Dists, Lpips
+from model.progress import steps
 from profiles.figures import Figure, Row, measured, published, unavailable
 
 Perceptual = Callable[[np.ndarray, np.ndarray], float]
@@ -31,15 +32,12 @@ def perceptual_distances(place: Path | None) -> dict[str, Perceptual | str]:
         ModelError: a file that is missing or holds something else.
     """
     found: dict[str, Perceptual | str] = {"LPIPS-squeeze": not_found("squeeze")}
-    for network in ("squeeze", "alex", "vgg"):
-        if network != "squeeze" and place is not None and not place.is_dir():
-            break
-        file = find_backbone(network, place)
-        if file is None:
-            continue
-        found[f"LPIPS-{network}"] = _distance(Lpips.load(network, file))
-        if network == "vgg":
-            found["DISTS"] = _distance(Dists.load(file))
+    networks = ("squeeze", "alex", "vgg") if place is None or place.is_dir() else ("squeeze",)
+    for network in networks:
+        if file := find_backbone(network, place):
+            found[f"LPIPS-{network}"] = _distance(Lpips.load(network, file))
+            if network == "vgg":
+                found["DISTS"] = _distance(Dists.load(file))
     return found
 
 
@@ -98,17 +96,16 @@ class Instruments:
         return measured(value, unit, source, interval) if np.isfinite(value) else unavailable(unit, IDENTICAL)
 
 
-def score(
-    method: Method, pairs: Sequence[NamedPair], instruments: Instruments, seed: int, tick: Callable[[], None]
-) -> list[Row]:
+def score(method: Method, pairs: Sequence[NamedPair], instruments: Instruments, seed: int) -> list[Row]:
     """The mean row of a method, then one row an image."""
     rows, scores = [], []
-    for pair in pairs:
-        values = instruments.score_pair(method.restore(pair.degraded), pair)
-        figures = {key: instruments.figure(key, value, "one pair") for key, value in values.items()}
-        rows.append(Row("images", f"{method.name}: {pair.name}", figures, {"site": pair.site}))
-        scores.append(values)
-        tick()
+    with steps(method.name, len(pairs)) as bar:
+        for pair in pairs:
+            values = instruments.score_pair(method.restore(pair.degraded), pair)
+            figures = {key: instruments.figure(key, value, "one pair") for key, value in values.items()}
+            rows.append(Row("images", f"{method.name}: {pair.name}", figures, {"site": pair.site}))
+            scores.append(values)
+            bar.advance()
     return [mean_row(method, scores, [pair.site for pair in pairs], instruments, seed), *rows]
 
 

@@ -3,7 +3,7 @@
 Its tables: PSNR, MTF, the gain over the traditional pipeline, and what a wrongly known sensor costs.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -74,17 +74,6 @@ def _noisy(sensor: Sensor, profile: SensorProfile, snr_0: float, snr_1: float) -
     return replace(sensor, alpha=alpha, beta=beta)
 
 
-@dataclass(frozen=True)
-class Fixed:
-    """A sensor in the place of a profile: every draw gives it."""
-
-    sensor: Sensor
-
-    def draw(self, _generator: np.random.Generator) -> Sensor:
-        """The same sensor for every draw."""
-        return self.sensor
-
-
 Trial = tuple[str, Sensor, Method]
 """The name of the sensor that is supposed, that sensor, and the method that supposes it."""
 
@@ -107,16 +96,6 @@ class Sweep:
     reference: SensorProfile
     seed: int
 
-    @property
-    def conditions(self) -> Sensors:
-        """Every sensor that acquires the scenes."""
-        return conditions(self.profile.nominal(), self.profile)
-
-    @property
-    def size(self) -> int:
-        """How many trials there are."""
-        return sum(len(self.trials(*condition)) for condition in self.conditions.items())
-
     def trials(self, name: str, sensor: Sensor) -> list[Trial]:
         """What is run under a condition."""
         nominal, reference = self.profile.nominal(), self.reference.nominal()
@@ -129,22 +108,25 @@ class Sweep:
         wrong = [(each, other, method) for each, other in supposed.items() for method in able]
         return [*((name, sensor, method) for method in methods), *drifted, *wrong]
 
-    def run(self, tick: Callable[[str], None]) -> "Found":
-        """Try every method under every condition; `tick` is told what was done."""
+    def run(self) -> "Found":
+        """Try every method under every condition."""
         psnr, mtf, pairs = dict[Key, np.ndarray](), dict[Key, Figure](), list[NamedPair]()
-        for name, sensor in self.conditions.items():
-            pairs, targets = self._pairs(sensor), acquire_targets(sensor, self.seed)
-            for supposed, other, method in self.trials(name, sensor):
-                key, knowing = (name, supposed, method.name), method.knowing(other)
-                psnr[key] = _psnr_db(knowing, pairs, sensor.max_dn)
-                if supposed in (name, NOMINAL):
-                    mtf[key] = mtf_figure(restored_mtfs(knowing, targets))
-                tick(f"{name}: {method.name}")
+        sensors = conditions(self.profile.nominal(), self.profile)
+        trials = {name: self.trials(name, sensor) for name, sensor in sensors.items()}
+        with steps("sweep", sum(map(len, trials.values()))) as bar:
+            for name, sensor in sensors.items():
+                pairs, targets = self._pairs(sensor), acquire_targets(sensor, self.seed)
+                for supposed, other, method in trials[name]:
+                    key, knowing = (name, supposed, method.name), method.knowing(other)
+                    psnr[key] = _psnr_db(knowing, pairs, sensor.max_dn)
+                    if supposed in (name, NOMINAL):
+                        mtf[key] = mtf_figure(restored_mtfs(knowing, targets))
+                    bar.advance(1, f"{name}: {method.name}")
         return Found(psnr, mtf, [pair.site for pair in pairs], self.seed)
 
     def _pairs(self, sensor: Sensor) -> list[NamedPair]:
         target, ratios = self.reference.nominal().in_units_of(sensor), oversamplings_of(self.profile)
-        return simulate_pairs(list(self.scenes), Fixed(sensor), Fixed(target), self.seed, ratios)[0]
+        return simulate_pairs(list(self.scenes), sensor, target, self.seed, ratios)[0]
 
 
 def _psnr_db(method: Method, pairs: Sequence[NamedPair], max_dn: int) -> np.ndarray:
@@ -265,6 +247,4 @@ def sweep_tables(
     first = {site_of(scene.name): scene for scene in reversed(scenes)}
     sensors = degraded.nominal(), reference.nominal()
     networks = [method for method in methods if method_without_network(method.name, *sensors) is None]
-    sweep = Sweep(networks, list(first.values()), degraded, reference, seed)
-    with steps("sweep", sweep.size) as bar:
-        return tuple(sweep.run(lambda note: bar.advance(1, note)).rows)
+    return tuple(Sweep(networks, list(first.values()), degraded, reference, seed).run().rows)

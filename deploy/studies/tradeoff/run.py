@@ -39,7 +39,7 @@ from deploy.studies.tradeoff.points import (
 from model.io.files import IMAGE_SUFFIXES, sha256
 from model.io.images import list_images
 from model.metrics.backbones import find_backbone
-from model.metrics.bootstrap import LEAST_SITES
+from model.metrics.bootstrap import too_few
 from model.progress import steps
 from model.traditional.peers import PEERS
 from model.traditional.settings import QUALITIES
@@ -165,9 +165,8 @@ def _benchmark(
     distances = {LPIPS: perceptual_distances(lpips)[LPIPS]}
     backbone, instruments = find_backbone("squeeze", lpips), Instruments(distances, degraded.nominal().max_dn)
     weights = sha256(backbone) if backbone else ""
-    said = [oversampling_note(pairs, degraded), f"left out, too small: {', '.join(small)}" if small else ""]
-    notes = [f"{note[0].upper()}{note[1:]}." for note in said if note]
-    return Benchmark(pairs, degraded, reference, instruments, weights, seed), notes
+    notes = [oversampling_note(pairs, degraded), f"Left out, too small: {', '.join(small)}." if small else ""]
+    return Benchmark(pairs, degraded, reference, instruments, weights, seed), [note for note in notes if note]
 
 
 def _others(boards: Sequence[TargetProfile]) -> list[Point]:
@@ -301,8 +300,8 @@ def _notes(benchmark: Benchmark, board: str) -> Iterator[str]:
         "Gains are differences on the same images from the next cheaper point of the front, with 95 % bootstrap "
         "intervals over whole sites; one whose interval holds 0 is not significant."
     )
-    if sites < LEAST_SITES:
-        yield f"Of {sites} sites, fewer than {LEAST_SITES}, no interval is shown: none could be trusted."
+    if too_few(sites):
+        yield too_few(sites)
     yield "Exact halos give the same pictures in tiles of any size; smaller ones were measured in the point's tiles."
     yield "The chains know both sensors; what a network knows of them stands beside it."
 

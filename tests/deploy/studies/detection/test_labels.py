@@ -84,7 +84,7 @@ def test_a_split_that_is_not_there_is_named_with_those_that_are(tmp_path: Path) 
         read_labelled(voc(tmp_path / "plain"), split="test")
     text(folder / "ImageSets" / "Main" / "test.txt", "00001\n00777\n")
     refused(folder, "1 of 2 missing, the first '00777'")
-    with pytest.raises(OptionError, match="numbers as xmin, ymin, xmax, ymax of a .* got 'none none none none'"):
+    with pytest.raises(OptionError, match=r"numbers as xmin, ymin, xmax, ymax of a .* got 'none none none none'"):
         read_labelled(folder / "JPEGImages-test", folder / "Annotations" / "Oriented Bounding Boxes")
 
 

@@ -11,7 +11,7 @@ from deploy.studies.detection.boxes import Boxes, iou
 from deploy.studies.detection.detector import Detector
 from deploy.studies.detection.page import crops, curves, objects_found
 from deploy.studies.detection.study import REFERENCE, AcquiredScene, Comparison, LabelledScene, SensorPair, acquired
-from deploy.studies.detection.tables import GAIN, LOSS, NO_LOSS, REGAINED, detection_rows, headline, main_table
+from deploy.studies.detection.tables import GAIN, LOSS, NO_LOSS, REGAINED, detection_rows, headline
 from deploy.studies.evaluation.methods import Method
 from model.simulator.detector import Draw
 from profiles import load_sensor
@@ -75,7 +75,7 @@ def handmade(sites: int = 12, **found: int) -> Comparison:
     return Comparison(pair, methods, list(acquired(scenes, pair, 0)), boxes, hits, figures, confidence, NAMES)
 
 
-def rows_of(found: Comparison, table: str = main_table("dior-high")) -> dict[str, Row]:
+def rows_of(found: Comparison, table: str = "detection, dior-high") -> dict[str, Row]:
     return {row.name: row for row in detection_rows(found) if row.table == table}
 
 

@@ -171,7 +171,7 @@ def test_an_image_that_is_all_clipped_still_has_a_figure() -> None:
 
 
 def test_the_degraded_input_gains_nothing_and_missing_figures_have_a_reason() -> None:
-    mean, *images = score(IDENTITY, [pair(f"{'abcde'[s]}.tif", seed=s) for s in range(5)], PLAIN, 0, lambda: None)
+    mean, *images = score(IDENTITY, [pair(f"{'abcde'[s]}.tif", seed=s) for s in range(5)], PLAIN, 0)
     assert mean.figures["PSNR gain"].value == 0
     assert len(images) == 5
     assert mean.figures["LPIPS-squeeze"].reason == "no weights"
@@ -180,14 +180,14 @@ def test_the_degraded_input_gains_nothing_and_missing_figures_have_a_reason() ->
     assert interval is not None
     assert interval[0] <= (mean.figures["PSNR"].value or 0) <= interval[1]
     assert NOISE_FREE not in {row.table.removesuffix(" by site") for row in site_rows(images)}
-    few, *_ = score(IDENTITY, [pair(f"{'abcd'[s]}.tif", seed=s) for s in range(4)], PLAIN, 0, lambda: None)
+    few, *_ = score(IDENTITY, [pair(f"{'abcd'[s]}.tif", seed=s) for s in range(4)], PLAIN, 0)
     assert few.figures["PSNR"].interval is None
     assert "no interval: 4 sites, fewer than 5" in few.figures["PSNR"].source
 
 
 def test_identical_images_are_no_number() -> None:
     perfect = replace(pair(), degraded=pair().reference)
-    mean, image = score(IDENTITY, [perfect], PLAIN, 0, lambda: None)
+    mean, image = score(IDENTITY, [perfect], PLAIN, 0)
     assert mean.figures["PSNR"].value is None
     assert "identical" in image.figures["PSNR"].reason
 
@@ -214,7 +214,7 @@ def test_noise_of_the_reference_is_no_error_of_a_method_that_leaves_it_out() -> 
     clean = one.noise_free
     assert clean is not None
     oracle = Method("oracle", lambda _: clean + np.float32(2), "known")
-    mean, image = score(oracle, [one], PLAIN, 0, lambda: None)
+    mean, image = score(oracle, [one], PLAIN, 0)
     assert f"{NOISE_FREE} by site" in by_table(site_rows([image]))
     noise_free = mean.figures[NOISE_FREE].value or 0
     assert noise_free == pytest.approx(20 * np.log10(4095 / 2), abs=1e-3)
@@ -223,7 +223,7 @@ def test_noise_of_the_reference_is_no_error_of_a_method_that_leaves_it_out() -> 
 
 def test_sites_are_means_of_their_images() -> None:
     pairs = [pair("a_1.tif", 1, 10), pair("a_2.tif", 2, 40), pair("b_1.tif", 3, 20)]
-    _, *images = score(IDENTITY, pairs, PLAIN, 0, lambda: None)
+    _, *images = score(IDENTITY, pairs, PLAIN, 0)
     rows = site_rows(images)
     assert list(by_table(rows)) == ["PSNR by site", "SSIM by site"]
     first, second = rows[:2]
@@ -271,7 +271,7 @@ def test_one_pair_a_site_is_shown() -> None:
 
 
 def test_tables_of_a_sweep_keep_their_words_on_the_page() -> None:
-    mean, *_ = score(IDENTITY, [pair()], PLAIN, 0, lambda: None)
+    mean, *_ = score(IDENTITY, [pair()], PLAIN, 0)
     swept = Row("sweep, MTF at Nyquist", "nominal", {"degraded": measured(7, "%", "edges")})
     report = evaluation_report("a test", [mean], [], [swept], [])
     assert [table.title for table in report.tables] == ["Means over all pairs", "Sweep, MTF at Nyquist"]

@@ -113,7 +113,7 @@ def test_two_sites_give_no_interval_and_it_is_said(study: tuple[Study, Path]) ->
     assert all(point.figures["PSNR"].interval is None for point in found.points)
     assert {row.text["gain over the next cheaper"] for row in found.front_rows} <= {"cheapest", TOO_FEW}
     notes = " ".join(found.notes)
-    assert "Of 2 sites, fewer than 5, no interval is shown" in notes
+    assert "No interval over sites is shown: of 2, fewer than 5" in notes
     assert "Scene pixels per pixel: 2 (2 of 2 images), where pleiades-degraded states 5" in notes
 
 
