@@ -17,7 +17,6 @@ from deploy.networks import shipped_pair
 from deploy.restoration.options import TILE_PX
 from deploy.studies.stress.bit_flips import (
     MEMORIES,
-    RATES,
     FaultTarget,
     FlipRequest,
     Injected,
@@ -26,7 +25,6 @@ from deploy.studies.stress.bit_flips import (
     make_target,
     name_of,
     price_rows,
-    rates_of,
     restored,
 )
 from deploy.studies.stress.faults import Guards, as_stored, checksums, map_channels
@@ -64,14 +62,14 @@ def db(row: Row, guards: str) -> float:
 def test_flips_cost_more_the_more_there_are(rows: dict[str, Row]) -> None:
     clean = db(rows["none"], "no guard")
     for memory in ("weights", "maps", "image"):
-        found = [db(rows[name_of(memory, rate)], "no guard") for rate in RATES]
+        found = [db(rows[name_of(memory, rate)], "no guard") for rate in MEMORIES[memory].rates]
         assert found[0] == pytest.approx(clean, abs=0.2)
         assert found[-1] < clean - 0.1
     assert db(rows[name_of("shifts", 10_000)], "no guard") <= clean
 
 
 def test_scrubbing_and_majority_bring_the_fault_free_network_back(rows: dict[str, Row]) -> None:
-    for rate in RATES:
+    for rate in MEMORIES["weights"].rates:
         assert db(rows[name_of("weights", rate)], "all guards") == db(rows["none"], "all guards")
     assert db(rows[name_of("shifts", 1000)], "all guards") == db(rows["none"], "all guards")
 
@@ -87,7 +85,7 @@ def test_the_same_seed_flips_the_same_bits(target: FaultTarget, rows: dict[str, 
 def test_an_injection_leaves_the_target_alone(memory: str, target: FaultTarget) -> None:
     image = target.pairs[0][0]
     before, fault_free = image.copy(), restored(target, Injected(target.core, SOUND, image, 0))
-    injected = MEMORIES[memory](target, image, 50_000, np.random.default_rng(0))
+    injected = MEMORIES[memory].inject(target, image, 50_000, np.random.default_rng(0))
     assert injected.flips > 0
     assert not np.array_equal(restored(target, injected), fault_free)
     np.testing.assert_array_equal(restored(target, injected), restored(target, injected))
@@ -101,7 +99,7 @@ def test_at_half_resolution_maps_have_a_bit_for_each_channel_of_each_place(coars
     sound = restored(target, Injected(target.core, SOUND, target.pairs[0][0], 0))
     assert sound.shape == image.shape
     assert np.abs(sound - image).max() > 0
-    every = MEMORIES["maps"](target, image, 1e6, np.random.default_rng(0))
+    every = MEMORIES["maps"].inject(target, image, 1e6, np.random.default_rng(0))
     assert every.flips == 8 * image.size // 4 * sum(map_channels(target.core).values())
     assert (restored(target, every) != sound).mean() > 0.5
 
@@ -169,8 +167,8 @@ def test_the_page_is_fresh(maker: ModuleType) -> None:
         target = make_target(open_subject(None, None, variant), maker.REQUEST)
         rows = price_rows(target, predict_file(shipped_pair(variant)[1], dpu, TILE_PX), dpu)
         assert all(line in page for line in maker.price_lines({variant: rows}))
-    for memory in MEMORIES:
-        assert page.count(f"\n| {memory}, ") == len(rates_of(memory))
+    for name, memory in MEMORIES.items():
+        assert page.count(f"\n| {name}, ") == len(memory.rates)
 
 
 def test_curves_go_from_left_to_right(rows: dict[str, Row]) -> None:

@@ -10,6 +10,7 @@ import numpy as np
 from deploy.studies.stress.cases import CASES, SIDE_PX, Case
 from deploy.studies.stress.checks import Limitation, Measure, limitation_of, torch_threads
 from deploy.studies.stress.networks import STAGES, Subject
+from model.progress import steps
 from profiles.errors import BeersError, OptionError
 from profiles.figures import Figure, Row, measured, predicted, unavailable
 from quant.bounds import layer_bounds
@@ -51,7 +52,6 @@ def run_battery(
     cases: Sequence[Case] = CASES,
     stages: Sequence[str] = tuple(STAGES),
     seed: int = 0,
-    tick: Callable[[], None] = lambda: None,
     side_px: int = SIDE_PX,
 ) -> list[StageResult]:
     """Look at every case at every stage.
@@ -61,18 +61,18 @@ def run_battery(
         cases: what they restore.
         stages: names of STAGES.
         seed: of the images.
-        tick: called once for each case at each stage.
         side_px: of images whose case has no size of its own.
     """
     results, reasons = [], {stage: _cannot_be_looked_at(subject, stage) for stage in stages}
-    with torch_threads(1):  # on images this small a second thread only waits
+    # On images this small a second thread only waits.
+    with torch_threads(1), steps("stressing", len(cases) * len(stages)) as bar:
         for case in cases:
             # Seeded by its name: a case draws the same images whichever others are asked for.
             images = case.draw(side_px, np.random.default_rng([seed, zlib.crc32(case.name.encode())]))
             for stage in stages:
                 measures = [] if reasons[stage] else _measures(subject, case, stage, images)
                 results.append(StageResult(case, stage, tuple(worst(measures)), reasons[stage]))
-                tick()
+                bar.advance(1, f"{case.name}, {stage}")
     return results
 
 

@@ -43,6 +43,7 @@ from deploy.studies.stress.faults import (
 from deploy.studies.stress.networks import Subject
 from model.io.images import MAX_DN
 from model.metrics.fidelity import psnr_db
+from model.progress import steps
 from profiles.figures import Figure, Row, measured, predicted
 from quant.calibration import HELD_OUT_SEED, Calibration
 from quant.core import IntCore
@@ -73,7 +74,7 @@ class FlipRequest:
     seed: int
 
 
-def flip_rows(subject: Subject, request: FlipRequest, tick: Callable[[], None] = lambda: None) -> list[Row]:
+def flip_rows(subject: Subject, request: FlipRequest) -> list[Row]:
     """The rows of the whole study: quality against flips, and what guards cost.
 
     Raises:
@@ -85,13 +86,7 @@ def flip_rows(subject: Subject, request: FlipRequest, tick: Callable[[], None] =
     prediction = predict_file(subject.paths[-1], dpu, TILE_PX)
     dpu.limit("cpu", "clock_ghz")  # and so is a board that cannot price the guards
     target = make_target(subject, request)
-    curves = curve_rows(target, request.draws, request.seed, tick)
-    return [*curves, *price_rows(target, prediction, dpu)]
-
-
-def ticks(request: FlipRequest) -> int:
-    """How often `flip_rows` reports progress."""
-    return sum(len(rates_of(memory)) * draws_of(memory, request.draws) for memory in MEMORIES)
+    return [*curve_rows(target, request.draws, request.seed), *price_rows(target, prediction, dpu)]
 
 
 @dataclass(frozen=True)
@@ -192,27 +187,31 @@ def _flip_copy(target: FaultTarget, per_megabit: float, generator: np.random.Gen
     return flip_shifts(target.shifts, flips, generator)
 
 
-Inject = Callable[[FaultTarget, np.ndarray, float, np.random.Generator], Injected]
-MEMORIES: dict[str, Inject] = {"weights": _weights, "shifts": _shifts, "maps": _maps, "image": _image}
-CORRECTABLE = ("weights", "shifts")
+@dataclass(frozen=True)
+class Memory:
+    """One kind of memory, and how faults are injected into it.
+
+    Attributes:
+        inject: an injection at a rate.
+        rates: bit flips in a megabit, of 10^6, that are tried.
+        times: so many times the draws asked for, where few of them flip a bit; those that do not cost nothing.
+        kept: whether it lives longer than a tile, so that scrubbing has something to compare it with.
+    """
+
+    inject: Callable[[FaultTarget, np.ndarray, float, np.random.Generator], Injected]
+    rates: tuple[float, ...] = (0.1, 1.0, 10.0, 100.0, 1000.0)
+    times: int = 1
+    kept: bool = False
+
+
+MEMORIES = {
+    "weights": Memory(_weights, kept=True),
+    # There are too few shifts to be hit at rates that matter elsewhere.
+    "shifts": Memory(_shifts, (10.0, 100.0, 1000.0, 10_000.0), 10, kept=True),
+    "maps": Memory(_maps),
+    "image": Memory(_image, times=5),
+}
 SETS = ("no guard", "clamped", "all guards")
-
-RATES = (0.1, 1.0, 10.0, 100.0, 1000.0)
-"""Bit flips in a megabit, of 10^6."""
-RATES_OF = {"shifts": (10.0, 100.0, 1000.0, 10_000.0)}
-"""There are too few shifts to be hit at rates that matter elsewhere."""
-DRAWS_OF = {"shifts": 10, "image": 5}
-"""So many times the draws, where few of them flip a bit; those that do not cost nothing."""
-
-
-def draws_of(memory: str, draws: int) -> int:
-    """How many injections into a kind of memory there are at each rate, `draws` being those asked for."""
-    return draws * DRAWS_OF.get(memory, 1)
-
-
-def rates_of(memory: str) -> tuple[float, ...]:
-    """The rates of injection for a kind of memory, bit flips in a megabit."""
-    return RATES_OF.get(memory, RATES)
 
 
 def name_of(memory: str, rate: float) -> str:
@@ -224,17 +223,18 @@ Quality = tuple[float, float, float]
 """PSNR in dB with each set of guards."""
 
 
-def curve_rows(target: FaultTarget, draws: int, seed: int, tick: Callable[[], None] = lambda: None) -> list[Row]:
+def curve_rows(target: FaultTarget, draws: int, seed: int) -> list[Row]:
     """A row without flips, and one for every kind of memory and rate."""
     clean = [_clean_db(target, number) for number in range(len(target.pairs))]
     rows = [_curve_row("none", [(0, quality) for quality in clean], "patches")]
-    for memory in MEMORIES:
-        for rate in rates_of(memory):
-            found = []
-            for draw in range(draws_of(memory, draws)):
-                found.append(_drawn(target, memory, rate, draw, seed, clean[draw % len(clean)]))
-                tick()
-            rows.append(_curve_row(name_of(memory, rate), found, "draws"))
+    with steps("turning bits over", sum(len(m.rates) * m.times * draws for m in MEMORIES.values())) as bar:
+        for name, memory in MEMORIES.items():
+            for rate in memory.rates:
+                found = []
+                for draw in range(memory.times * draws):
+                    found.append(_drawn(target, name, rate, draw, seed, clean[draw % len(clean)]))
+                    bar.advance()
+                rows.append(_curve_row(name_of(name, rate), found, "draws"))
     return rows
 
 
@@ -245,20 +245,17 @@ def _clean_db(target: FaultTarget, number: int) -> Quality:
     return bare, clamped, clamped
 
 
-def _drawn(
-    target: FaultTarget, memory: str, rate: float, draw: int, seed: int, clean: Quality
-) -> tuple[int, Quality]:
-    """The bits that one injection flipped, and what is left of the quality."""
-    image, reference = target.pairs[draw % len(target.pairs)]
+def _drawn(target: FaultTarget, name: str, rate: float, draw: int, seed: int, clean: Quality) -> tuple[int, Quality]:
+    """The bits that one injection into a memory flipped, and what is left of the quality."""
+    (image, reference), memory = target.pairs[draw % len(target.pairs)], MEMORIES[name]
     # Keyed by what is drawn, so that a draw is the same whatever else runs.
-    generator = np.random.default_rng([seed, draw, list(MEMORIES).index(memory), rates_of(memory).index(rate)])
-    injected = MEMORIES[memory](target, image, rate, generator)
+    generator = np.random.default_rng([seed, draw, list(MEMORIES).index(name), memory.rates.index(rate)])
+    injected = memory.inject(target, image, rate, generator)
     # No flip, no change: the fault-free figures stand, at no cost.
     if injected.flips == 0:
         return 0, clean
     bare, clamped = (_quality_db(target, injected, reference, c) for c in (False, True))
-    # Maps and pixels live for one tile: scrubbing has nothing to compare them with.
-    if memory not in CORRECTABLE:
+    if not memory.kept:
         return injected.flips, (bare, clamped, clamped)
     corrected = _corrected(target, injected, rate, generator)
     whole = clean[1] if _is_sound(target, corrected) else _quality_db(target, corrected, reference, clamped=True)
@@ -351,7 +348,8 @@ def _curves(networks: Mapping[str, Sequence[Row]], memory: str) -> list[Curve]:
     for colour, (name, rows) in enumerate(networks.items()):
         by_name = {row.name: row.figures for row in rows if row.table == "bit flips"}
         for guards in ("all guards", "no guard"):
-            values = ((rate, by_name[name_of(memory, rate)][guards].value) for rate in rates_of(memory))
+            rates = MEMORIES[memory].rates
+            values = ((rate, by_name[name_of(memory, rate)][guards].value) for rate in rates)
             points = tuple((rate, value) for rate, value in values if value is not None)
             curves.append(Curve(f"{name}, {guards}", colour, guards == "no guard", points))
     return curves
