@@ -51,14 +51,6 @@ def test_what_lacks_a_figure_or_was_published_is_not_on_the_front() -> None:
     assert [point.name for point in found] == ["1"]
 
 
-def test_less_of_a_distance_is_better() -> None:
-    points = [
-        Measured(name, {COST: measured(cost, "s", ""), "LPIPS-squeeze": measured(value, "distance", "")}, {})
-        for name, cost, value in (("near", 2, 0.1), ("far", 1, 0.2), ("beaten", 3, 0.15))
-    ]
-    assert [point.name for point in pareto_front(points, COST, "LPIPS-squeeze")] == ["far", "near"]
-
-
 def test_differences_are_paired_and_reach_less_far_than_the_sites_differ() -> None:
     small, medium = made("small", 45.0, 2.0), made("medium", 45.5, 4.0)
     found = COMPARE.difference(medium, small)
