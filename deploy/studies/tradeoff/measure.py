@@ -133,10 +133,9 @@ class Benchmark:
         """Scores of every pair."""
         return [self.instruments.score(restore(p.degraded), p.reference, p.degraded) for p in self.pairs]
 
-    def score_in_tiles(self, variant: Variant, exact: Restore, point: Point) -> list[dict[str, float | None]]:
+    def score_in_tiles(self, point: Point, exact: Restore) -> list[dict[str, float | None]]:
         """Scores of every pair restored in a point's tiles, and how far its seams are from exact ones, in DN."""
-        max_dn, found = self.degraded.nominal().max_dn, []
-        cut = restore_in_tiles(variant, point.tile_px, point.halo_px or 0, max_dn)
+        cut, found = restore_in_tiles(point, self.degraded.nominal().max_dn), []
         for pair in self.pairs:
             restored = cut(pair.degraded)
             error = np.abs(np.asarray(restored, np.float64) - exact(pair.degraded)).mean()
@@ -156,15 +155,14 @@ class Benchmark:
         return found
 
 
-def restore_in_tiles(variant: Variant, tile_px: int, halo_px: int, max_dn: int) -> Restore:
-    """A network in such tiles; an image that is no larger than a tile is cut in two along each side."""
-    file = variant.file or Path()
+def restore_in_tiles(point: Point, max_dn: int) -> Restore:
+    """A network in a point's tiles; an image that is no larger than a tile is cut in two along each side."""
+    file, halo_px = point.variant.file or Path(), point.halo_px or 0
     infer, _ = open_runtime(Runtime.onnxruntime, model_of(file), threads=0)
-    tiling = tiling_of_file(file)
 
     def restore(dn: np.ndarray) -> np.ndarray:
         half_px = HALO_STEP_PX * -(-(min(dn.shape) // 2) // HALO_STEP_PX) + 2 * halo_px
-        plan = make_plan((1, *dn.shape), min(tile_px, half_px), halo_px, tiling)
+        plan = make_plan((1, *dn.shape), min(point.tile_px, half_px), halo_px, tiling_of_file(file))
         return restore_dn(dn, infer, plan, max_dn)
 
     return restore
@@ -231,13 +229,9 @@ def make_int8(file: Path, folder: Path, scenes: Path | None, sensor: str, seed: 
     key = key_of(network=network_sha256(file), scenes=seen, sensor=known, seed=seed, size=[PATCHES, PATCH_PX])
     path = folder / f"{file.stem}-int8-{key[:16]}.onnx"
     if not path.is_file():
-        patches = _patches(known, scenes, seed)
+        reference = reference_for(known)
+        loaded = load_scenes(scenes, reference.nominal(), seed)
+        patches = draw_patches(loaded, known, reference, PATCHES, seed, PATCH_PX)
         about = {"calibration_sensor": known.name, "calibration_seed": str(seed)}
         save_onnx(quantise_model(model, patches, about).host, path)
     return path
-
-
-def _patches(degraded: SensorProfile, scenes: Path | None, seed: int) -> Any:
-    reference = reference_for(degraded)
-    loaded = load_scenes(scenes, reference.nominal(), seed)
-    return draw_patches(loaded, degraded, reference, PATCHES, seed, PATCH_PX)

@@ -4,7 +4,6 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from deploy.bench.tables import PAPER_SIZE, PAPER_TARGET, Swath, parse_size, published_rows
 from deploy.dpu.cost.model import Constants
@@ -14,6 +13,7 @@ from deploy.studies.evaluation.run import load_pairs
 from deploy.studies.evaluation.scores import Instruments, perceptual_distances
 from deploy.studies.tradeoff.advice import MAP50, Constraint, Recommendation, chosen_cost, recommend
 from deploy.studies.tradeoff.boards import CHAIN, board_figures
+from deploy.studies.tradeoff.labelled import Labelled
 from deploy.studies.tradeoff.measure import (
     TILE_PX,
     Benchmark,
@@ -48,9 +48,6 @@ from profiles.errors import MachineError
 from profiles.figures import Figure, Row, unavailable
 from profiles.sensor import SensorProfile
 from profiles.sensor_file import reference_for
-
-if TYPE_CHECKING:
-    from deploy.studies.tradeoff.labelled import Labelled
 
 LPIPS = "LPIPS-squeeze"
 
@@ -133,7 +130,7 @@ def run_study(
     variants = network_variants(networks, degraded, quantise, log)
     points = [point for variant in variants for point in network_points(variant, boards, swath)]
     benchmark, said = _benchmark(images, degraded, reference_for(degraded, reference), lpips, seed)
-    scenes = _labelled(labelled, detector, classes, benchmark)
+    scenes = Labelled.open(labelled, detector, classes, benchmark) if labelled else None
     measured = _measured([*points, *_others(boards)], benchmark, scenes, kept, swath, log)
     if boards[0].name == PAPER_TARGET and size_px == parse_size(PAPER_SIZE):
         measured += _published()
@@ -176,20 +173,10 @@ def _others(boards: Sequence[TargetProfile]) -> list[Point]:
     return points + [Point(Variant(peer, FLOAT, peer)) for peer in PEERS]
 
 
-def _labelled(
-    images: Path | None, detector: Path | None, classes: str | None, benchmark: Benchmark
-) -> "Labelled | None":
-    if images is None:
-        return None
-    from deploy.studies.tradeoff.labelled import Labelled  # the detection study, for those who ask for it
-
-    return Labelled.open(images, detector, classes, benchmark)
-
-
 def _measured(
     points: Sequence[Point],
     benchmark: Benchmark,
-    labelled: "Labelled | None",
+    labelled: Labelled | None,
     kept: Measurements,
     swath: Swath,
     log: Callable[[str], None],
@@ -223,17 +210,12 @@ def _point(
     swath: Swath,
 ) -> Measured:
     """A point with all its figures, in the order in which tables show them."""
-    pictures = {**benchmark.means(images), **_detected(point, found)}
-    figures = {**pictures, **host[point.variant], **board_figures(point, swath, _slower(point, host))}
+    figures = benchmark.means(images)
+    if found:  # how often a seam cuts an object is not known
+        with_seams = unavailable("%", "measured with exact halos alone")
+        figures[MAP50] = found[point.variant] if point.halo_px is None else with_seams
+    figures |= {**host[point.variant], **board_figures(point, swath, _slower(point, host))}
     return Measured(point.name, figures, _text(point, method), point, images)
-
-
-def _detected(point: Point, found: Mapping[Variant, Figure]) -> dict[str, Figure]:
-    """mAP50 where labelled images are given; with exact halos alone, for how often a seam cuts an object differs."""
-    if not found:
-        return {}
-    reason = "measured with exact halos alone"
-    return {MAP50: found[point.variant] if point.halo_px is None else unavailable("%", reason)}
 
 
 def _methods(variants: Sequence[Variant], benchmark: Benchmark, log: Callable[[str], None]) -> dict[Variant, Method]:
@@ -252,7 +234,7 @@ def _scores(point: Point, method: Method, benchmark: Benchmark, kept: Measuremen
     if point.halo_px is None:
         return list(kept.make(key_of(**about), lambda: benchmark.score(method.restore)))
     key = key_of(**about, tile_px=point.tile_px, halo_px=point.halo_px)
-    return list(kept.make(key, lambda: benchmark.score_in_tiles(point.variant, method.restore, point)))
+    return list(kept.make(key, lambda: benchmark.score_in_tiles(point, method.restore)))
 
 
 def _host(

@@ -21,7 +21,6 @@ from deploy.studies.evaluation.methods import Method, method_named
 from deploy.studies.evaluation.pairs import NamedPair
 from deploy.studies.evaluation.run import load_pairs
 from deploy.studies.evaluation.scores import Instruments
-from deploy.studies.tradeoff import run
 from deploy.studies.tradeoff.advice import parse_constraints
 from deploy.studies.tradeoff.labelled import Labelled
 from deploy.studies.tradeoff.measure import SEAM_ERROR, Benchmark, Measurements, make_int8
@@ -206,7 +205,7 @@ def test_labelled_pictures_add_map50_beside_exact_halos(
         def figure(self, stored: dict[str, float]) -> object:
             return measured(100 * stored["value"], "%", "made up")
 
-    monkeypatch.setattr(run, "_labelled", lambda *_: Made())
+    monkeypatch.setattr(Labelled, "open", lambda *_: Made())
     found = studied(folder, study[1], labelled=folder, need=parse_constraints("--need", "map50>=40"))
     values = {point.text["halo"]: point.figures["mAP50"] for point in found.points if "INT8" in point.name}
     assert values["exact"].value == 50
