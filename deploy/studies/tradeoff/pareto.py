@@ -6,7 +6,7 @@ their scores. Their own intervals show how images differ, which the points share
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 
 import numpy as np
@@ -14,8 +14,7 @@ import numpy as np
 from deploy.studies.tradeoff.measure import Scores
 from deploy.studies.tradeoff.points import Point
 from model.metrics.bootstrap import site_interval
-from profiles import TargetProfile
-from profiles.figures import Figure, Mode, Row, measured, predicted, unavailable
+from profiles.figures import Figure, Row, measured, predicted
 
 Interval = tuple[float, float]
 
@@ -96,8 +95,6 @@ class Comparison:
 
     def difference(self, a: Measured, b: Measured) -> Figure:
         """The PSNR of `a` less that of `b`, with the interval of the paired difference; none below five sites."""
-        if not a.images or not b.images:
-            return unavailable("dB", "no PSNR of both on the same images")
         pairs = zip(a.images, b.images, strict=True)
         differences = [(x[PSNR] or 0.0) - (y[PSNR] or 0.0) for x, y in pairs]
         if not any(differences):  # the same pictures, on however few sites
@@ -123,41 +120,27 @@ class Comparison:
 
 
 def cost_ratio(a: Measured, b: Measured, cost: str) -> Figure:
-    """How many times the cost of `b` that `a` has, with an interval.
+    """How many times the cost of `b` that `a` has on the same board, with an interval.
 
     Two predictions of one board share most of their error: the interval of a ratio of latencies is the board's
     `pair_width`, and nothing where only the count of tiles differs.
     """
-    mode: Mode = "measured" if cost.startswith("host") else "predicted"
-    value = a.cost(cost) / b.cost(cost)
-    if mode == "measured":
-        return measured(value, "x", f"{cost} over that of {b.name}, medians of interleaved runs")
-    low, high = _ratio_interval(a, b, cost, value)
-    return predicted(value, "x", (low, high), f"{cost} over that of {b.name}")
+    value, source = a.cost(cost) / b.cost(cost), f"{cost} over that of {b.name}"
+    if cost.startswith("host"):
+        return measured(value, "x", f"{source}, medians of interleaved runs")
+    return predicted(value, "x", _ratio_interval(a, b, cost, value), source)
 
 
 def _ratio_interval(a: Measured, b: Measured, cost: str, value: float) -> Interval:
     first, second = a.point, b.point
-    if first and second and first.dpu and second.dpu and first.board == second.board:
-        if _differ_in_tiles_alone(first, second):
+    if first and second and first.dpu and second.dpu:
+        if replace(first, halo_px=second.halo_px) == second:
             return value, value
-        width = pair_width(first.dpu.target)
+        width = first.dpu.target.tables["cost"].get("pair_width")
         if cost == "board latency" and width is not None:
-            return value * math.exp(-width), value * math.exp(width)
+            return value * math.exp(-width.low), value * math.exp(width.low)
     (a_low, a_high), (b_low, b_high) = (ends(each.figures[cost]) for each in (a, b))
     return a_low / b_high, a_high / b_low
-
-
-def _differ_in_tiles_alone(a: Point, b: Point) -> bool:
-    """Whether only the count of tiles differs: the same network, configuration and tile."""
-    same_dpu = a.dpu is not None and b.dpu is not None and a.dpu.name == b.dpu.name
-    return same_dpu and a.variant == b.variant and a.tile_px == b.tile_px
-
-
-def pair_width(target: TargetProfile) -> float | None:
-    """Half the width, in ln, of the interval of a ratio of two latencies; None where the target states none."""
-    stated = target.tables.get("cost", {}).get("pair_width")
-    return stated.low if stated is not None else None
 
 
 def ends(figure: Figure) -> Interval:

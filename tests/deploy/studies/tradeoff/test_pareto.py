@@ -15,7 +15,6 @@ from deploy.studies.tradeoff.pareto import (
     Measured,
     cost_ratio,
     front_rows,
-    pair_width,
     pareto_front,
 )
 from profiles.constant import Constant
@@ -94,7 +93,6 @@ def test_a_ratio_of_latencies_on_a_board_has_the_width_of_pairs() -> None:
     found = cost_ratio(other, one, COST)
     assert found.value == pytest.approx(3)
     assert found.interval == pytest.approx((3 / math.exp(0.2), 3 * math.exp(0.2)))
-    assert pair_width(target) == 0.2
 
 
 def test_tiles_of_one_network_differ_by_their_count_alone() -> None:
