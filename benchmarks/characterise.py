@@ -22,6 +22,7 @@ from torch import Tensor
 
 from deploy.export import torch_network
 from deploy.studies.characterise import (
+    AXES,
     Box,
     Characterised,
     Snr,
@@ -172,7 +173,7 @@ class Findings:
                 print(f"- {error}")
         else:
             snrs = found.snrs
-            for axis, true in zip((found.across, found.along), sensor.mtf_axes, strict=True):
+            for axis, true in zip(map(found.axes.get, AXES), sensor.mtf_axes, strict=True):
                 self.mtf += [judged(axis.mtf_nyquist, axis.interval, true)] if isinstance(axis, AxisMtf) else []
         for snr in snrs:
             self.snr.append(judged(snr.value, snr.interval, snr.radiance / sensor.noise_sigma(snr.radiance)))

@@ -26,6 +26,7 @@ FULL_SCALE_RADIANCE = 400.0
 PARTS = (16, 4)
 """Of full scale: the radiances at which SNRs are stated, as those that a network is told of."""
 GSD_M, OVERSAMPLING, SEED = 0.5, 4, 0
+AXES = ("across", "along")
 TILE_PX, BOX_PX = 1024, 2 * HALF_PX + 1
 MAX_DN = 65535
 CLIPPED_PIXELS, PILE = 10, 4
@@ -98,8 +99,7 @@ class Characterised:
         stated: what the user said of bits, gain in DN per W/m2/sr/um and gsd_m; None of what was not said.
         bits: of a digital number.
         gain: DN per W/m2/sr/um, stated or assumed.
-        across: MTF across the track; None where no edge shows it.
-        along: that along it.
+        axes: MTF "across" and "along" the track; an axis that no edge shows is left out.
         snrs: at two radiances.
         noise: the line that they lie on.
     """
@@ -108,15 +108,13 @@ class Characterised:
     stated: Mapping[str, float | None]
     bits: int
     gain: float
-    across: AxisMtf | None
-    along: AxisMtf | None
+    axes: Mapping[str, AxisMtf]
     snrs: tuple[Snr, Snr]
     noise: NoiseModel
 
     def rows(self) -> list[Row]:
         """The figures, as commands report them."""
-        axes = {"MTF across at Nyquist": self.across, "MTF along at Nyquist": self.along}
-        figures = {name: _mtf_figure(axis) for name, axis in axes.items()}
+        figures = {f"MTF {name} at Nyquist": _mtf_figure(self.axes.get(name)) for name in AXES}
         for snr in self.snrs:
             source = f"{self.noise.blocks} blocks of 16 x 16" + (", extrapolated" if snr.extrapolated else "")
             figures[f"SNR at {snr.radiance:g} W/m2/sr/um"] = measured(snr.value, "ratio", source, snr.interval)
@@ -161,10 +159,10 @@ def characterise(
     bits = _settled_bits(bits, images)
     clipped_at = 2**bits - 1
     noise = measured_noise(images, clipped_at)
-    across, along = _axes(images, boxes, noise, clipped_at)
+    axes = _axes(images, boxes, noise, clipped_at)
     gain = gain or clipped_at / FULL_SCALE_RADIANCE
     low, high = (snr_at(noise, clipped_at / part, gain) for part in PARTS)
-    return Characterised(images, stated, bits, gain, across, along, (low, high), noise)
+    return Characterised(images, stated, bits, gain, axes, (low, high), noise)
 
 
 def read_raw(path: Path) -> np.ndarray:
@@ -254,25 +252,22 @@ def _named(images: Sequence[Path]) -> str:
     return f"{images[0].name}{more}"
 
 
-def _axes(
-    images: Sequence[Path], boxes: Sequence[Box], noise: NoiseModel, clipped_at: float
-) -> tuple[AxisMtf | None, AxisMtf | None]:
+def _axes(images: Sequence[Path], boxes: Sequence[Box], noise: NoiseModel, clipped_at: float) -> dict[str, AxisMtf]:
     """MTF across (edges near the vertical) and along the track, at least one of them."""
     upright, lying = _pointed_at(boxes, noise, clipped_at)
     for tile in () if boxes else _tiles(images):
         upright += find_blurs(tile, noise.total, clipped_at)
         lying += find_blurs(tile.T, noise.total, clipped_at)
-    least = 1 if boxes else MIN_FOUND
-    across = combine(upright, lying) if len(upright) >= least else None
-    along = combine(lying, upright) if len(lying) >= least else None
-    if across is None and along is None:
+    least, edges = 1 if boxes else MIN_FOUND, zip(AXES, (upright, lying), (lying, upright), strict=True)
+    axes = {name: combine(own, others) for name, own, others in edges if len(own) >= least}
+    if not axes:
         raise ImageError(
             f"edges of {_named(images)}",
             expected=f"{MIN_FOUND} straight edges between even areas, 17 pixels long and 8 to both sides, or more",
             got=f"{len(upright)} near the vertical and {len(lying)} near the horizontal",
             remedy="point at one as --edge FILE:X,Y,WIDTH,HEIGHT, or image a target, a large roof or an apron",
         )
-    return across, along
+    return axes
 
 
 def _pointed_at(boxes: Sequence[Box], noise: NoiseModel, clipped_at: float) -> tuple[list[EdgeBlur], list[EdgeBlur]]:
@@ -281,9 +276,9 @@ def _pointed_at(boxes: Sequence[Box], noise: NoiseModel, clipped_at: float) -> t
     for box in boxes:
         region = box.cut(read_raw(box.image)).astype(np.float64)
         lies = _rise(region.T) > _rise(region)
-        clipped = bool(((region <= 0) | (region >= clipped_at)).any())
-        refusal = Refusal("clipped", "clipped pixels")
-        edge = refusal if clipped else fit_blur(region.T if lies else region, noise.total, POINTED_AT)
+        edge = fit_blur(region.T if lies else region, noise.total, POINTED_AT)
+        if region.min() <= 0 or region.max() >= clipped_at:
+            edge = Refusal("clipped", "clipped pixels")
         if isinstance(edge, Refusal):
             expected, remedy = "one straight edge, from side to side", "box another, or tighter"
             raise ImageError(f"--edge {box}", expected=expected, got=edge.reason, remedy=remedy)
@@ -324,14 +319,11 @@ def profile_toml(found: Characterised) -> str:
 
 
 def _mtf_lines(found: Characterised, images: str) -> Iterator[str]:
-    both = found.across or found.along
-    assert both is not None  # noqa: S101 - `characterise` has refused that
-    if found.across is None or found.along is None:
-        seen, missing = ("along", "across") if found.across is None else ("across", "along")
+    if len(found.axes) == 1:
+        seen, missing = sorted(AXES, key=lambda name: name not in found.axes)
         yield f"# measured {seen} the track alone: no edge shows the MTF {missing} it"
-    yield from _axis_lines("mtf_nyquist", both, images)
-    if found.across and found.along:
-        yield from _axis_lines("mtf_nyquist_along", found.along, images)
+    for key, axis in zip(("mtf_nyquist", "mtf_nyquist_along"), found.axes.values(), strict=False):
+        yield from _axis_lines(key, axis, images)
 
 
 def _axis_lines(key: str, axis: AxisMtf, images: str) -> Iterator[str]:

@@ -107,10 +107,9 @@ def edge_box(raw: tuple[Path, Path]) -> Box:
 
 def test_a_box_gives_one_axis_for_both(raw: tuple[Path, Path]) -> None:
     found = characterise(raw, (edge_box(raw),), bits=12)
-    assert found.along is None
-    assert found.across is not None
-    assert found.across.edges == 1
-    low, high = found.across.interval
+    assert list(found.axes) == ["across"]
+    assert found.axes["across"].edges == 1
+    low, high = found.axes["across"].interval
     assert low <= 0.09 <= high < 1.5 * low
     text = profile_toml(found)
     assert "mtf_nyquist_along" not in text
