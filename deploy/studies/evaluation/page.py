@@ -6,9 +6,10 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from deploy.report.page import Picture, Report, Table
+from deploy.report.page import Picture, Report, Table, write_report
 from deploy.studies.evaluation.methods import Method
 from deploy.studies.evaluation.pairs import NamedPair
+from deploy.studies.evaluation.run import Evaluation
 from model.io.files import whole_file
 from model.io.pictures import busiest_windows, error_row, grid, picture_url, stretch_of, strip_row
 from profiles.figures import Row, by_table
@@ -59,19 +60,21 @@ def pictures(pairs: Sequence[NamedPair], methods: Sequence[Method], out: Path) -
     return made
 
 
-def evaluation_report(
-    title: str,
-    mean: Sequence[Row],
-    sites: Sequence[Row],
-    swept: Sequence[Row],
-    pictures: Sequence[Picture],
-    sampled: str = "",
-) -> Report:
-    """The page: pictures, means, sites, and the sweep where there was one; `sampled` is one more note."""
-    tables = [Table("Means over all pairs", mean, MEAN_CAPTION)]
-    tables += [Table(name, rows, SITES_CAPTION) for name, rows in by_table(sites).items()]
-    tables += [Table(f"{name[0].upper()}{name[1:]}", rows, SWEEP_CAPTION) for name, rows in by_table(swept).items()]
-    return Report(title, headline(mean), tables, pictures, (*NOTES, *([sampled] if sampled else [])))
+def write_page(found: Evaluation, out: Path) -> Path:
+    """Write report.html and the strips of pictures into a folder; returns the report's path."""
+    report = evaluation_report(found, pictures(found.pairs, found.methods, out))
+    write_report(report, out / "report.html")
+    return out / "report.html"
+
+
+def evaluation_report(found: Evaluation, strips: Sequence[Picture]) -> Report:
+    """The page: pictures, means, sites, and the sweep where there was one."""
+    tables = [Table("Means over all pairs", found.mean, MEAN_CAPTION)]
+    tables += [Table(name, rows, SITES_CAPTION) for name, rows in by_table(found.sites).items()]
+    swept = by_table(found.swept).items()
+    tables += [Table(f"{name[0].upper()}{name[1:]}", rows, SWEEP_CAPTION) for name, rows in swept]
+    sampled = [found.sampling] if found.sampling else []
+    return Report(found.title, headline(found.mean), tables, strips, (*NOTES, *sampled))
 
 
 MEAN_CAPTION = (

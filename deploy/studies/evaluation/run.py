@@ -4,9 +4,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from deploy.report.page import write_report
 from deploy.studies.evaluation.methods import Method, method_named
-from deploy.studies.evaluation.page import evaluation_report, pictures
 from deploy.studies.evaluation.pairs import (
     NamedPair,
     oversampling_note,
@@ -72,13 +70,6 @@ class Evaluation:
         sites = len({pair.site for pair in self.pairs})
         left_out = f"Left out, too small: {', '.join(self.small)}." if self.small else ""
         return [note for note in (too_few(sites), self.sampling, left_out) if note]
-
-    def write(self, out: Path) -> Path:
-        """Write report.html and the strips of pictures into a folder; returns the report's path."""
-        strips, page = pictures(self.pairs, self.methods, out), out / "report.html"
-        tables = self.mean, self.sites, self.swept
-        write_report(evaluation_report(self.title, *tables, strips, self.sampling), page)
-        return page
 
 
 def load_pairs(

@@ -15,6 +15,7 @@ from deploy.studies.evaluation import targets as targets_module
 from deploy.studies.evaluation.methods import Method, method_named
 from deploy.studies.evaluation.page import chosen_pairs, evaluation_report, strip_of
 from deploy.studies.evaluation.pairs import NamedPair, oversampling_note, oversamplings_of, read_pairs, simulate_pairs
+from deploy.studies.evaluation.run import Evaluation
 from deploy.studies.evaluation.scores import NOISE_FREE, READ, Instruments, paper_rows, score, site_rows
 from deploy.studies.evaluation.targets import acquire_targets, flat_figure, mtf_figure, snr_name, target_figures
 from model.io.tiff import write_tiff
@@ -273,7 +274,7 @@ def test_one_pair_a_site_is_shown() -> None:
 def test_tables_of_a_sweep_keep_their_words_on_the_page() -> None:
     mean, *_ = score(IDENTITY, [pair()], PLAIN, 0)
     swept = Row("sweep, MTF at Nyquist", "nominal", {"degraded": measured(7, "%", "edges")})
-    report = evaluation_report("a test", [mean], [], [swept], [])
+    report = evaluation_report(Evaluation((DEGRADED, REFERENCE), [], [], [mean], [], [], [swept], []), [])
     assert [table.title for table in report.tables] == ["Means over all pairs", "Sweep, MTF at Nyquist"]
 
 
