@@ -129,6 +129,14 @@ class Benchmark:
             return network_sha256(variant.file)
         return key_of(method=variant.source, sensors=[self.degraded, self.reference])
 
+    def scores(self, point: Point, exact: Restore, kept: Measurements) -> list[dict[str, float | None]]:
+        """Scores of each image: those of the variant, or with seams where the halo is too small for exact ones."""
+        about = {"scores": self.depends(point.variant), "images": self.digest}
+        if point.halo_px is None:
+            return list(kept.make(key_of(**about), lambda: self.score(exact)))
+        key = key_of(**about, tile_px=point.tile_px, halo_px=point.halo_px)
+        return list(kept.make(key, lambda: self.score_in_tiles(point, exact)))
+
     def score(self, restore: Restore) -> list[dict[str, float | None]]:
         """Scores of every pair."""
         return [self.instruments.score(restore(p.degraded), p.reference, p.degraded) for p in self.pairs]
@@ -178,6 +186,19 @@ def pixels_sha256(image: np.ndarray) -> str:
 TILE_PX, ROUNDS = 256, 9
 
 
+def measure_host(
+    methods: Mapping[Variant, Method], benchmark: Benchmark, kept: Measurements
+) -> dict[Variant, dict[str, Figure]]:
+    """What each variant takes on this machine, all timed together on a drawn scene as the sensor sees it."""
+    swath = Swath(TILE_PX, TILE_PX)
+    tile = drawn_acquisition(swath, benchmark.degraded, benchmark.reference, benchmark.seed)
+    names = [benchmark.depends(variant) for variant in methods]
+    machine = f"{platform.machine()} {processor_name() or platform.processor()} x {psutil.cpu_count()}"
+    key = key_of(times=names, tile=pixels_sha256(tile), side=TILE_PX, machine=machine)
+    times = kept.make(key, lambda: host_times([method.restore for method in methods.values()], tile))
+    return {variant: host_figures(each, tile.size) for variant, each in zip(methods, times, strict=True)}
+
+
 def host_times(restores: Iterable[Restore], tile: np.ndarray) -> list[list[float]]:
     """Seconds that each method takes for a tile on this machine, interleaved, after one run for warm-up."""
     calls = [partial(restore, tile) for restore in restores]
@@ -187,21 +208,11 @@ def host_times(restores: Iterable[Restore], tile: np.ndarray) -> list[list[float
     return [list(times) for times in rounds]
 
 
-def host_tile(benchmark: Benchmark) -> np.ndarray:
-    """What host times are taken on: a drawn scene as the sensor sees it."""
-    return drawn_acquisition(Swath(TILE_PX, TILE_PX), benchmark.degraded, benchmark.reference, benchmark.seed)
-
-
 def host_figures(times_s: Sequence[float], pixels: int) -> dict[str, Figure]:
     """Median and 90th percentile for a million pixels, in s."""
     source = f"{len(times_s)} runs of a tile of {TILE_PX} x {TILE_PX}, interleaved with the other methods"
     values = np.asarray(times_s) * 1e6 / pixels
     return {f"host p{p}": measured(float(np.percentile(values, p)), "s/Mpx", source) for p in (50, 90)}
-
-
-def machine() -> str:
-    """What host times hold for: the processor and its cores."""
-    return f"{platform.machine()} {processor_name() or platform.processor()} x {psutil.cpu_count()}"
 
 
 PATCHES, PATCH_PX = 32, 96

@@ -14,19 +14,7 @@ from deploy.studies.evaluation.scores import Instruments, perceptual_distances
 from deploy.studies.tradeoff.advice import MAP50, Constraint, Recommendation, chosen_cost, recommend
 from deploy.studies.tradeoff.boards import CHAIN, board_figures
 from deploy.studies.tradeoff.labelled import Labelled
-from deploy.studies.tradeoff.measure import (
-    TILE_PX,
-    Benchmark,
-    Measurements,
-    Scores,
-    host_figures,
-    host_tile,
-    host_times,
-    key_of,
-    machine,
-    make_int8,
-    pixels_sha256,
-)
+from deploy.studies.tradeoff.measure import Benchmark, Measurements, Scores, key_of, make_int8, measure_host
 from deploy.studies.tradeoff.pareto import Comparison, Measured, front_rows, pareto_front
 from deploy.studies.tradeoff.points import (
     FLOAT,
@@ -190,12 +178,12 @@ def _measured(
         for point in there:
             method = methods[point.variant]
             bar.advance(0, f"measuring {point.name}")
-            images[point.name] = _scores(point, method, benchmark, kept)
+            images[point.name] = benchmark.scores(point, method.restore, kept)
             if labelled is not None and point.variant not in found:
                 key = key_of(map50=benchmark.depends(point.variant), labelled=labelled.digest)
                 found[point.variant] = labelled.figure(kept.make(key, partial(labelled.measure, method)))
             bar.advance(1, point.name)
-        host = _host(methods, benchmark, kept)
+        host = measure_host(methods, benchmark, kept)
         bar.advance(1, "timed on this machine")
     return [_point(each, methods[each.variant], images[each.name], benchmark, found, host, swath) for each in there]
 
@@ -226,26 +214,6 @@ def _methods(variants: Sequence[Variant], benchmark: Benchmark, log: Callable[[s
         except MachineError as error:
             log(f"{variant.name} is left out: {error}")
     return found
-
-
-def _scores(point: Point, method: Method, benchmark: Benchmark, kept: Measurements) -> list[dict[str, float | None]]:
-    """Scores of each image: those of the variant, or with seams where the halo is too small for exact ones."""
-    about = {"scores": benchmark.depends(point.variant), "images": benchmark.digest}
-    if point.halo_px is None:
-        return list(kept.make(key_of(**about), lambda: benchmark.score(method.restore)))
-    key = key_of(**about, tile_px=point.tile_px, halo_px=point.halo_px)
-    return list(kept.make(key, lambda: benchmark.score_in_tiles(point, method.restore)))
-
-
-def _host(
-    methods: Mapping[Variant, Method], benchmark: Benchmark, kept: Measurements
-) -> dict[Variant, dict[str, Figure]]:
-    """What each variant takes on this machine, all timed together."""
-    tile = host_tile(benchmark)
-    names = [benchmark.depends(variant) for variant in methods]
-    key = key_of(times=names, tile=pixels_sha256(tile), side=TILE_PX, machine=machine())
-    times = kept.make(key, lambda: host_times([method.restore for method in methods.values()], tile))
-    return {variant: host_figures(each, tile.size) for variant, each in zip(methods, times, strict=True)}
 
 
 def _slower(point: Point, host: Mapping[Variant, Mapping[str, Figure]]) -> float | None:
