@@ -98,12 +98,10 @@ def _measures(subject: Subject, case: Case, stage: str, images: Iterable[np.ndar
 
 def worst(measures: Iterable[Measure]) -> list[Measure]:
     """Of each check the measure that is largest beside what is allowed; NaN is the worst."""
-    found: dict[str, Measure] = {}
+    found: dict[str, list[Measure]] = {}
     for measure in measures:
-        before = found.get(measure.check)
-        if before is None or _excess(measure) > _excess(before):
-            found[measure.check] = measure
-    return list(found.values())
+        found.setdefault(measure.check, []).append(measure)
+    return [max(each, key=_excess) for each in found.values()]
 
 
 def _excess(measure: Measure) -> float:
@@ -145,8 +143,7 @@ def worst_rows(results: Iterable[StageResult]) -> list[Row]:
             found.setdefault(f"{result.stage}: {measure.check}", []).append((measure, result.case.name))
     rows = []
     for name, seen in found.items():
-        (largest,) = worst(measure for measure, _ in seen)
-        case = next(case for measure, case in seen if measure is largest)
+        largest, case = max(seen, key=lambda each: _excess(each[0]))
         text = {"allowed": f"{largest.allowed:.4g} {largest.unit}", "worst case": case}
         text["verdict"] = "holds" if largest.holds else "does not hold"
         rows.append(Row("worst", name, {"worst": _figure(largest)}, text))
@@ -159,10 +156,8 @@ def limitation_rows(results: Iterable[StageResult]) -> list[Row]:
     for result in results:
         for measure in result.measures:
             limit = None if measure.holds else limitation_of(result.stage, result.case.name, measure)
-            if limit is None:
-                continue
-            name = f"{limit.name} ({result.stage}, {measure.check})"
-            if name not in rows or measure.value > (rows[name].figures["largest"].value or 0):
+            name = f"{limit.name} ({result.stage}, {measure.check})" if limit else ""
+            if limit and (name not in rows or measure.value > (rows[name].figures["largest"].value or 0)):
                 text = {"in": result.case.name, "fails beyond": f"{limit.ceiling:g}", "means": limit.meaning}
                 rows[name] = Row("limitations", name, {"largest": _figure(measure)}, text)
     return list(rows.values())

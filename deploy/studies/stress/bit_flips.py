@@ -5,9 +5,8 @@ then runs in whole numbers.
 """
 
 import statistics
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
-from functools import cached_property
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from math import exp
 from pathlib import Path
 
@@ -21,34 +20,25 @@ from deploy.report.plots import Curve, Panel, curves_svg
 from deploy.restoration.options import TILE_PX
 from deploy.studies.stress.faults import (
     INT8_BITS,
-    PIXEL_BITS,
-    SHIFT_BITS,
+    MEMORIES,
     Guards,
-    Shifts,
+    Injected,
     as_stored,
-    bits_apart,
-    checksums,
-    flip_bits,
-    flip_count,
-    flip_shifts,
-    flip_weights,
-    guarded,
+    corrected,
+    is_sound,
     learn_guards,
-    map_channels,
-    scrubbed,
+    restored,
     shifts_of,
-    voted,
     weight_bits,
 )
 from deploy.studies.stress.networks import Subject
-from model.io.images import MAX_DN
 from model.metrics.fidelity import psnr_db
 from model.progress import steps
 from profiles.figures import Figure, Row, measured, predicted
 from quant.calibration import HELD_OUT_SEED, Calibration
 from quant.core import IntCore
 from quant.graph import Activation
-from quant.integer import SOUND, Faults, merged_correction, run_core
+from quant.integer import SOUND
 
 CALIBRATION_PATCHES = 16
 
@@ -103,11 +93,6 @@ class FaultTarget:
     guards: Guards
     pairs: Sequence[tuple[np.ndarray, np.ndarray]]
 
-    @cached_property
-    def shifts(self) -> Shifts:
-        """The shifts of every operation, free of faults."""
-        return shifts_of(self.core)
-
 
 def make_target(subject: Subject, request: FlipRequest) -> FaultTarget:
     """The core as the board stores it, guards that calibration patches teach, and other patches to try it on."""
@@ -120,97 +105,10 @@ def make_target(subject: Subject, request: FlipRequest) -> FaultTarget:
     return FaultTarget(core, guards, list(tried.pairs))
 
 
-@dataclass(frozen=True)
-class Injected:
-    """A network and an image after an injection.
-
-    Attributes:
-        core: with the weights as they are now.
-        faults: what else is wrong.
-        image: (1, 1, H, W), as it is now.
-        flips: how many bits were flipped.
-    """
-
-    core: IntCore
-    faults: Faults
-    image: np.ndarray
-    flips: int
-
-
-def restored(target: FaultTarget, injected: Injected, clamped: bool = False) -> np.ndarray:
-    """The restored image (1, 1, H, W) in [0, 1]; `clamped` turns the ReLU6 and the limit of the correction on."""
-    faults = guarded(injected.faults, target.guards) if clamped else injected.faults
-    tensors, _ = run_core(injected.core, injected.core.ends.split(injected.image), faults=faults)
-    correction = merged_correction(injected.core, tensors)
-    correction = target.guards.limit(correction) if clamped else correction
-    return np.asarray(injected.core.ends.finished(injected.image, correction), np.float32)
-
-
 def _quality_db(target: FaultTarget, injected: Injected, reference: np.ndarray, clamped: bool) -> float:
-    return psnr_db(restored(target, injected, clamped), reference, 1.0)
+    return psnr_db(restored(injected, target.guards if clamped else None), reference, 1.0)
 
 
-def _weights(target: FaultTarget, image: np.ndarray, per_megabit: float, generator: np.random.Generator) -> Injected:
-    flips = flip_count(weight_bits(target.core), per_megabit, generator)
-    return Injected(flip_weights(target.core, flips, generator), SOUND, image, flips)
-
-
-def _shifts(target: FaultTarget, image: np.ndarray, per_megabit: float, generator: np.random.Generator) -> Injected:
-    wrong = _flip_copy(target, per_megabit, generator)
-    return Injected(target.core, Faults(wrong), image, bits_apart(wrong, target.shifts))
-
-
-def _maps(target: FaultTarget, image: np.ndarray, per_megabit: float, generator: np.random.Generator) -> Injected:
-    """Faults enter every tensor once, between the operation that writes it and those that read it."""
-    places, channels = image[0, 0].size // target.core.ends.place_px**2, map_channels(target.core)
-    counts = {name: flip_count(INT8_BITS * places * n, per_megabit, generator) for name, n in channels.items()}
-    seed = int(generator.integers(2**63))
-    # The same bits whenever it runs, clamped or not.
-    seeds = {name: [seed, number] for number, name in enumerate(counts)}
-
-    def touch(name: str, tensor: np.ndarray) -> np.ndarray:
-        if not counts.get(name):
-            return tensor
-        return flip_bits(tensor, counts[name], np.random.default_rng(seeds[name]))
-
-    return Injected(target.core, Faults({}, touch), image, sum(counts.values()))
-
-
-def _image(target: FaultTarget, image: np.ndarray, per_megabit: float, generator: np.random.Generator) -> Injected:
-    flips = flip_count(PIXEL_BITS * image.size, per_megabit, generator)
-    dn = flip_bits(np.rint(image * MAX_DN).astype(np.uint16), flips, generator, PIXEL_BITS)
-    return Injected(target.core, SOUND, (dn / np.float32(MAX_DN)).astype(np.float32), flips)
-
-
-def _flip_copy(target: FaultTarget, per_megabit: float, generator: np.random.Generator) -> Shifts:
-    flips = flip_count(SHIFT_BITS * len(target.shifts), per_megabit, generator)
-    return flip_shifts(target.shifts, flips, generator)
-
-
-@dataclass(frozen=True)
-class Memory:
-    """One kind of memory, and how faults are injected into it.
-
-    Attributes:
-        inject: an injection at a rate.
-        rates: bit flips in a megabit, of 10^6, that are tried.
-        times: so many times the draws asked for, where few of them flip a bit; those that do not cost nothing.
-        kept: whether it lives longer than a tile, so that scrubbing has something to compare it with.
-    """
-
-    inject: Callable[[FaultTarget, np.ndarray, float, np.random.Generator], Injected]
-    rates: tuple[float, ...] = (0.1, 1.0, 10.0, 100.0, 1000.0)
-    times: int = 1
-    kept: bool = False
-
-
-MEMORIES = {
-    "weights": Memory(_weights, kept=True),
-    # There are too few shifts to be hit at rates that matter elsewhere.
-    "shifts": Memory(_shifts, (10.0, 100.0, 1000.0, 10_000.0), 10, kept=True),
-    "maps": Memory(_maps),
-    "image": Memory(_image, times=5),
-}
 SETS = ("no guard", "clamped", "all guards")
 
 
@@ -250,37 +148,17 @@ def _drawn(target: FaultTarget, name: str, rate: float, draw: int, seed: int, cl
     (image, reference), memory = target.pairs[draw % len(target.pairs)], MEMORIES[name]
     # Keyed by what is drawn, so that a draw is the same whatever else runs.
     generator = np.random.default_rng([seed, draw, list(MEMORIES).index(name), memory.rates.index(rate)])
-    injected = memory.inject(target, image, rate, generator)
+    injected = memory.inject(target.core, image, rate, generator)
     # No flip, no change: the fault-free figures stand, at no cost.
     if injected.flips == 0:
         return 0, clean
     bare, clamped = (_quality_db(target, injected, reference, c) for c in (False, True))
     if not memory.kept:
         return injected.flips, (bare, clamped, clamped)
-    corrected = _corrected(target, injected, rate, generator)
-    whole = clean[1] if _is_sound(target, corrected) else _quality_db(target, corrected, reference, clamped=True)
+    left = corrected(injected, target.core, target.guards, rate, generator)
+    sound = is_sound(left, target.core, target.guards)
+    whole = clean[1] if sound else _quality_db(target, left, reference, clamped=True)
     return injected.flips, (bare, clamped, whole)
-
-
-def _corrected(
-    target: FaultTarget, injected: Injected, per_megabit: float, generator: np.random.Generator
-) -> Injected:
-    """The network as scrubbing and triple modular redundancy leave it before the next image.
-
-    The other two copies of the shifts suffer flips at the same rate, each on its own.
-    """
-    core = scrubbed(injected.core, target.core, target.guards.checksums)
-    # The copy that the injection hit is the first of the three.
-    first = {**target.shifts, **injected.faults.shifts}
-    second, third = (_flip_copy(target, per_megabit, generator) for _ in range(2))
-    shifts = voted((first, second, third)) if injected.faults.shifts else {}
-    return replace(injected, core=core, faults=replace(injected.faults, shifts=shifts))
-
-
-def _is_sound(target: FaultTarget, injected: Injected) -> bool:
-    """Whether no fault is left in weights and shifts."""
-    meant = {**target.shifts, **injected.faults.shifts} == target.shifts
-    return meant and checksums(injected.core) == target.guards.checksums
 
 
 def _curve_row(name: str, draws: Sequence[tuple[int, Quality]], kind: str) -> Row:
@@ -311,7 +189,7 @@ def price_rows(target: FaultTarget, prediction: Prediction, dpu: Dpu) -> list[Ro
     clock_hz = 1e9 * dpu.limit("cpu", "clock_ghz").low
     limit_s = INSTRUCTIONS * target.core.ends.gains * TILE_PX**2 / AT_ONCE / clock_hz
     scrubbing_s = weight_bits(target.core) / INT8_BITS / rate
-    copies_s = 3 * len(target.shifts) / rate
+    copies_s = 3 * len(shifts_of(target.core)) / rate
     spread = exp(dpu.value("cost", "width_outside"))
     guards = {
         f"ReLU6 at {len(target.guards.relu6)} of {relus} ReLUs": (0.0, FUSED),
