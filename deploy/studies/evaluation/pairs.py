@@ -1,7 +1,7 @@
 """Pairs of a degraded and a reference image: simulated from scenes, or read from a folder that `simulate` wrote."""
 
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -97,15 +97,12 @@ def simulate_pairs(
 def _simulated(scene: Scene, degraded: Sensor, reference: Sensor, ratio: int, draw: Draw) -> NamedPair:
     """Three acquisitions of one scene: the pair, and the reference once more without its noise."""
     prepared = prepare_scene(scene.radiance, ratio)
-    spectrum, width = prepared.spectrum, prepared.radiance.shape[-1]
-    seen, meant, clean = (
-        acquire(spectrum, width, sensor, ratio, draw, role, skip=skip).numpy()
-        for sensor, role, skip in (
-            (degraded, "degraded", ()),
-            (reference, "reference", ()),
-            (reference, "reference", NOISE),
-        )
-    )
+
+    def by(sensor: Sensor, role: str, skip: Collection[str] = ()) -> np.ndarray:
+        width = prepared.radiance.shape[-1]
+        return acquire(prepared.spectrum, width, sensor, ratio, draw, role, skip=skip).numpy()
+
+    seen, meant, clean = by(degraded, "degraded"), by(reference, "reference"), by(reference, "reference", NOISE)
     return NamedPair(scene.name, seen, meant, oversampling=ratio, noise_free=clean)
 
 

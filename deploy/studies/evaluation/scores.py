@@ -154,31 +154,28 @@ def _site_row(key: str, site: str, images: Sequence[Row]) -> Row:
 
 SOURCE = "ConvBEERS paper, table on its simulated test set"
 NOTE = "another test set: does not compare"
+PAPER_UNITS = {
+    "PSNR": "dB",
+    "SSIM": "ratio",
+    "LPIPS, network not stated": DISTANCE,
+    "DISTS": DISTANCE,
+    "MTF at Nyquist": "%",
+    **{snr_name(radiance): "ratio" for radiance in RADIANCES},
+}
+PAPER = {
+    "paper: traditional": (20.6, 0.843, 0.216, 0.220, None, 65.33, 138.51),
+    "paper: ConvBEERS": (27.5, 0.932, 0.068, 0.077, 20.0, 66.27, 156.07),
+}
+"""The paper's traditional pipeline, whose MTF did not converge, and its network."""
 
 
 def paper_rows() -> list[Row]:
-    """The paper's traditional pipeline and its network."""
-    return [
-        _row("paper: traditional", 20.6, 0.843, (0.216, 0.220), None, (65.33, 138.51)),
-        _row("paper: ConvBEERS", 27.5, 0.932, (0.068, 0.077), 20.0, (66.27, 156.07)),
-    ]
-
-
-def _row(
-    name: str,
-    psnr: float,
-    ssim: float,
-    distances: tuple[float, float],
-    mtf: float | None,
-    snr: tuple[float, float],
-) -> Row:
-    sharpness = unavailable("%", "the paper: did not converge") if mtf is None else published(mtf, "%", SOURCE)
-    figures = {
-        "PSNR": published(psnr, "dB", SOURCE),
-        "SSIM": published(ssim, "ratio", SOURCE),
-        "LPIPS, network not stated": published(distances[0], "distance", SOURCE),
-        "DISTS": published(distances[1], "distance", SOURCE),
-        "MTF at Nyquist": sharpness,
-        **{snr_name(r): published(value, "ratio", SOURCE) for r, value in zip(RADIANCES, snr, strict=True)},
-    }
-    return Row("mean", name, figures, {"sensor": NOTE})
+    """The paper's two rows as printed."""
+    rows = []
+    for name, values in PAPER.items():
+        figures = {
+            key: unavailable(unit, "the paper: did not converge") if value is None else published(value, unit, SOURCE)
+            for (key, unit), value in zip(PAPER_UNITS.items(), values, strict=True)
+        }
+        rows.append(Row("mean", name, figures, {"sensor": NOTE}))
+    return rows

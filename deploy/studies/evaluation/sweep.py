@@ -22,7 +22,8 @@ from model.simulator.sampling import Scene
 from profiles.figures import Figure, Row, measured
 from profiles.sensor import Sensor, SensorProfile, noise_from_snr
 
-NOMINAL = "nominal"
+NOMINAL, PLAIN = "nominal", (DEGRADED, TRADITIONAL)
+"""The condition that the others depart from, and the methods besides networks."""
 SHARPNESS = (0.10, 0.07, 0.05, 0.03, 0.02)
 NOISE = ((15.0, 50.0), (25.0, 55.0), (30.0, 80.0), (70.0, 150.0), (90.0, 190.0))
 """SNR at 25 and 100 W/m2/sr/um; the nominal 50 / 110 is in every sweep."""
@@ -78,55 +79,45 @@ Trial = tuple[str, Sensor, Method]
 """The name of the sensor that is supposed, that sensor, and the method that supposes it."""
 
 
-@dataclass(frozen=True)
-class Sweep:
-    """Methods and the conditions that they are tried under.
+def run_sweep(
+    networks: Sequence[Method], scenes: Sequence[Scene], profile: SensorProfile, reference: SensorProfile, seed: int
+) -> "Found":
+    """Try every method under every condition.
 
-    Attributes:
+    Args:
         networks: run with each condition's sensor known where they can know it, else as they are.
         scenes: that every sensor acquires.
         profile: of the sensor that the conditions depart from.
         reference: profile of the sensor that is aimed at.
         seed: of every random draw.
     """
+    psnr, mtf, pairs = dict[Key, np.ndarray](), dict[Key, Figure](), list[NamedPair]()
+    nominal, aim, ratios = profile.nominal(), reference.nominal(), oversamplings_of(profile)
+    sensors, plain = conditions(nominal, profile), [method_without_network(n, nominal, aim) for n in PLAIN]
+    methods = [*(method for method in plain if method is not None), *networks]
+    trials = {name: _trials(name, sensor, methods, profile) for name, sensor in sensors.items()}
+    with steps("sweep", sum(map(len, trials.values()))) as bar:
+        for name, sensor in sensors.items():
+            pairs, _ = simulate_pairs(list(scenes), sensor, aim.in_units_of(sensor), seed, ratios)
+            targets = acquire_targets(sensor, seed)
+            for supposed, other, method in trials[name]:
+                key, knowing = (name, supposed, method.name), method.knowing(other)
+                psnr[key] = _psnr_db(knowing, pairs, sensor.max_dn)
+                if supposed in (name, NOMINAL):
+                    mtf[key] = mtf_figure(restored_mtfs(knowing, targets))
+                bar.advance(1, f"{name}: {method.name}")
+    return Found(psnr, mtf, [pair.site for pair in pairs], seed)
 
-    networks: Sequence[Method]
-    scenes: Sequence[Scene]
-    profile: SensorProfile
-    reference: SensorProfile
-    seed: int
 
-    def trials(self, name: str, sensor: Sensor) -> list[Trial]:
-        """What is run under a condition."""
-        nominal, reference = self.profile.nominal(), self.reference.nominal()
-        plain = [method_without_network(each, nominal, reference) for each in (DEGRADED, TRADITIONAL)]
-        methods = [*(method for method in plain if method is not None), *self.networks]
-        units = replace(nominal, gain_dn_per_radiance=sensor.gain_dn_per_radiance)
-        drifted = [] if name == NOMINAL else [(NOMINAL, units, methods[1])]
-        able = [method for method in methods if method.specialise is not None]
-        supposed = suppositions(nominal, self.profile).get(name, {})
-        wrong = [(each, other, method) for each, other in supposed.items() for method in able]
-        return [*((name, sensor, method) for method in methods), *drifted, *wrong]
-
-    def run(self) -> "Found":
-        """Try every method under every condition."""
-        psnr, mtf, pairs = dict[Key, np.ndarray](), dict[Key, Figure](), list[NamedPair]()
-        sensors = conditions(self.profile.nominal(), self.profile)
-        trials = {name: self.trials(name, sensor) for name, sensor in sensors.items()}
-        with steps("sweep", sum(map(len, trials.values()))) as bar:
-            for name, sensor in sensors.items():
-                pairs, targets = self._pairs(sensor), acquire_targets(sensor, self.seed)
-                for supposed, other, method in trials[name]:
-                    key, knowing = (name, supposed, method.name), method.knowing(other)
-                    psnr[key] = _psnr_db(knowing, pairs, sensor.max_dn)
-                    if supposed in (name, NOMINAL):
-                        mtf[key] = mtf_figure(restored_mtfs(knowing, targets))
-                    bar.advance(1, f"{name}: {method.name}")
-        return Found(psnr, mtf, [pair.site for pair in pairs], self.seed)
-
-    def _pairs(self, sensor: Sensor) -> list[NamedPair]:
-        target, ratios = self.reference.nominal().in_units_of(sensor), oversamplings_of(self.profile)
-        return simulate_pairs(list(self.scenes), sensor, target, self.seed, ratios)[0]
+def _trials(name: str, sensor: Sensor, methods: Sequence[Method], profile: SensorProfile) -> list[Trial]:
+    """What is run under a condition; the second of the methods is the chain."""
+    nominal = profile.nominal()
+    units = replace(nominal, gain_dn_per_radiance=sensor.gain_dn_per_radiance)
+    drifted = [] if name == NOMINAL else [(NOMINAL, units, methods[1])]
+    able = [method for method in methods if method.specialise is not None]
+    supposed = suppositions(nominal, profile).get(name, {})
+    wrong = [(each, other, method) for each, other in supposed.items() for method in able]
+    return [*((name, sensor, method) for method in methods), *drifted, *wrong]
 
 
 def _psnr_db(method: Method, pairs: Sequence[NamedPair], max_dn: int) -> np.ndarray:
@@ -213,13 +204,10 @@ class Found:
 
     def _wrong(self) -> list[Row]:
         """PSNR where each method supposes another sensor than the true one, and what it loses by that."""
-        names: dict[tuple[str, str], list[str]] = {}
-        for truth, supposed, name in self.psnr:
-            if supposed not in (truth, NOMINAL):
-                names.setdefault((truth, supposed), []).append(name)
+        pairs = dict.fromkeys(key[:2] for key in self.psnr if key[1] not in (key[0], NOMINAL))
         psnr, lost = [], []
-        for (truth, supposed), methods in names.items():
-            wrong = {name: self.psnr[truth, supposed, name][0] for name in methods}
+        for truth, supposed in pairs:
+            wrong = {key[2]: values[0] for key, values in self.psnr.items() if key[:2] == (truth, supposed)}
             cost = {name: self.psnr[truth, truth, name][0] - values for name, values in wrong.items()}
             shown = f"{truth}, supposed {supposed}"
             psnr.append(Row("sweep, sensor known wrongly", shown, self._means(wrong)))
@@ -247,4 +235,4 @@ def sweep_tables(
     first = {site_of(scene.name): scene for scene in reversed(scenes)}
     sensors = degraded.nominal(), reference.nominal()
     networks = [method for method in methods if method_without_network(method.name, *sensors) is None]
-    return tuple(Sweep(networks, list(first.values()), degraded, reference, seed).run().rows)
+    return tuple(run_sweep(networks, list(first.values()), degraded, reference, seed).rows)

@@ -15,8 +15,8 @@ from deploy.studies.evaluation.sweep import (
     TRUTH_KNOWN,
     Found,
     Key,
-    Sweep,
     conditions,
+    run_sweep,
     suppositions,
 )
 from model.simulator.procedural import procedural_scene
@@ -81,7 +81,7 @@ def swept() -> Iterator[Swept]:
         patch.setattr(targets_module, "SIDE_PX", 100)
         patch.setattr(module, "conditions", few)
         scene = procedural_scene(500, 560, np.random.default_rng(5))
-        rows = Sweep([Method("half", half, BLIND), able], [scene], PROFILE, REFERENCE, 0).run().rows
+        rows = run_sweep([Method("half", half, BLIND), able], [scene], PROFILE, REFERENCE, 0).rows
         tables = {table: {row.name: row for row in rows} for table, rows in by_table(rows).items()}
         yield Swept(tables, given)
 
