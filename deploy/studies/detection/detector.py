@@ -134,7 +134,7 @@ def _literal(text: str) -> Any:
 
 
 def _layout(model: onnx.ModelProto, about: dict[str, Any], classes: int, path: Path) -> Layout:
-    """Which of the two layouts, by task, shapes and what made it."""
+    """Which of the two layouts, by task and shapes."""
     task, channels = about.get("task", "detect"), _sizes(model.graph.input[0])[1:2]
     outputs = [_sizes(value) for value in model.graph.output]
     shape = outputs[0] if len(outputs) == 1 and len(outputs[0]) == 3 else [-1]
@@ -158,12 +158,12 @@ def _size_px(fixed: int | None, about: dict[str, Any], asked: int | None, path: 
     if fixed and asked not in (None, fixed):
         expected, remedy = f"{fixed}, which {path.name} is fixed to", f"export it for {asked} px, or leave --size out"
         raise OptionError("--size", expected=expected, got=f"{asked}", remedy=remedy)
-    stated, stride = about.get("imgsz"), about.get("stride")
-    sides = set(stated) if isinstance(stated, list) else {stated}
-    size = fixed or asked or (sides.pop() if len(sides) == 1 else None)
-    step = stride if isinstance(stride, int) and stride > 0 and not fixed else 1
-    if not isinstance(size, int) or size < step or size % step:
-        expected = f"a side of the detector's input in px, a multiple of its stride of {step}"
+    stated = about.get("imgsz")
+    if isinstance(stated, list) and len(stated) == 2 and stated[0] == stated[1]:
+        stated = stated[0]
+    size = fixed or asked or stated
+    if not isinstance(size, int) or size < 1:
+        expected = "the side of the detector's square input in px"
         raise OptionError("--size", expected=expected, got=f"{size}", remedy="say it")
     return size
 

@@ -54,11 +54,11 @@ def test_the_size_is_the_file_s_or_the_one_asked_for(tmp_path: Path) -> None:
     assert [open_detector(free, 1, asked).size_px for asked in (None, 128)] == [64, 128]
     with pytest.raises(OptionError, match=r"--size: expected 64, which a.onnx is fixed to, got 128"):
         open_detector(fixed, 1, 128)
-    with pytest.raises(OptionError, match="a multiple of its stride of 32, got 100"):
-        open_detector(free, 1, 100)
-    unsaid = detector(tmp_path / "c.onnx", answer, size_px="side", imgsz=None)
-    with pytest.raises(OptionError, match="a multiple of its stride of 32, got None; say it"):
-        open_detector(unsaid, 1)
+    sizes: list[object] = [None, [64, 96], [[], []], "wide"]
+    for stated in sizes:
+        unsaid = detector(tmp_path / "c.onnx", answer, size_px="side", imgsz=stated)
+        with pytest.raises(OptionError, match=r"the side of the detector's square input in px, got .*; say it"):
+            open_detector(unsaid, 1)
 
 
 @pytest.mark.parametrize(
