@@ -117,14 +117,11 @@ def test_another_gain_is_told_to_the_chains_and_kept(swept: Swept) -> None:
     assert dim("degraded") == pytest.approx(nominal("degraded") + 3.1, abs=0.5)
 
 
-def test_what_a_wrong_sensor_costs_is_counted_from_the_truth_known(swept: Swept) -> None:
+def test_a_wrong_sensor_costs_the_methods_that_can_know_one(swept: Swept) -> None:
     wrong, lost = (swept.tables[name] for name in WRONGLY)
     assert list(wrong) == list(lost) == ["nominal, supposed SNR x 1.33", "nominal, supposed SNR x 0.67", WRONG]
-    for method, known in (("traditional", TRUTH_KNOWN), ("able", "able")):
-        row, cost = wrong[WRONG].figures[method].value or 0, lost[WRONG].figures[method].value or 0
-        assert cost == pytest.approx(psnr(swept, "MTF 3%")(known) - row)
-    assert (lost[WRONG].figures["traditional"].value or 0) > 1
     assert list(wrong[WRONG].figures) == ["traditional", "able"]
+    assert (lost[WRONG].figures["traditional"].value or 0) > 1
 
 
 SITES = ["a", "b", "c", "d", "e", "f"]
