@@ -17,7 +17,7 @@ from torch import Tensor
 from deploy.studies.evaluation.methods import Method
 from model.io.images import MAX_DN
 from model.metrics.refusal import Refusal
-from model.metrics.slanted_edge import EdgeMtf, edge_mtf, slanted_edge
+from model.metrics.slanted_edge import edge_mtf, slanted_edge
 from model.simulator.acquire import acquire
 from model.simulator.detector import Draw
 from model.simulator.sampling import scene_spectrum
@@ -79,7 +79,7 @@ def target_figures(method: Method, targets: Targets) -> dict[str, Figure]:
     return figures
 
 
-def restored_mtfs(method: Method, targets: Targets) -> list[EdgeMtf | Refusal]:
+def restored_mtfs(method: Method, targets: Targets) -> list[float | Refusal]:
     """What the instrument says of each restored edge."""
     restored = (_middle(method.restore(edge)) for edge in targets.edges)
     angles = cycle(ANGLES_DEG)
@@ -91,9 +91,9 @@ def _middle(image: np.ndarray) -> np.ndarray:
     return image[top : top + EDGE_PX, left : left + EDGE_PX]
 
 
-def mtf_figure(found: Sequence[EdgeMtf | Refusal]) -> Figure:
+def mtf_figure(found: Sequence[float | Refusal]) -> Figure:
     """The mean over the edges with its 90 % interval; unavailable where most edges were refused."""
-    values = [100 * each.mtf_nyquist for each in found if isinstance(each, EdgeMtf)]
+    values = [100 * each for each in found if not isinstance(each, Refusal)]
     refused = [each for each in found if isinstance(each, Refusal)]
     if len(values) < max(len(refused), 2):
         return unavailable("%", f"{len(refused)} of {len(found)} edges refused: {refused[0].reason}")
