@@ -73,8 +73,7 @@ def evaluation_report(found: Evaluation, strips: Sequence[Picture]) -> Report:
     tables += [Table(name, rows, SITES_CAPTION) for name, rows in by_table(found.sites).items()]
     swept = by_table(found.swept).items()
     tables += [Table(f"{name[0].upper()}{name[1:]}", rows, SWEEP_CAPTION) for name, rows in swept]
-    sampled = [found.sampling] if found.sampling else []
-    return Report(found.title, headline(found.mean), tables, strips, (*NOTES, *sampled))
+    return Report(found.title, headline(found.mean), tables, strips, (*NOTES, *found.said))
 
 
 MEAN_CAPTION = (

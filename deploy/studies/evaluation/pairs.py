@@ -1,7 +1,7 @@
 """Pairs of a degraded and a reference image: simulated from scenes, or read from a folder that `simulate` wrote."""
 
 from collections import Counter
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -18,6 +18,7 @@ from model.simulator.acquire import (
     prepare_scene,
 )
 from model.simulator.detector import Draw
+from model.simulator.procedural import load_scenes
 from model.simulator.sampling import Scene
 from model.training.patches import pair_files
 from profiles.errors import ImageError
@@ -47,6 +48,23 @@ class NamedPair:
     def site(self) -> str:
         """The place that is known; else the name without what tells frames of one site apart."""
         return self.place or site_of(self.name)
+
+
+def pairs_of_scenes(
+    images: Path | None, degraded: SensorProfile, reference: SensorProfile, seed: int
+) -> tuple[list[NamedPair], list[str]]:
+    """Pairs of the scenes of a folder, or of drawn ones, and what a reader must know of them.
+
+    Args:
+        images: the folder; drawn scenes if None.
+        degraded: profile of the degraded images.
+        reference: profile of the reference images.
+        seed: of every random draw.
+    """
+    scenes = load_scenes(images, reference.nominal(), seed)
+    pairs, small = simulate_pairs(scenes, degraded, reference, seed, oversamplings_of(degraded))
+    left_out = f"Left out, too small: {', '.join(small)}." if small else ""
+    return pairs, [note for note in (oversampling_note(pairs, degraded), left_out) if note]
 
 
 def simulate_pairs(
@@ -136,16 +154,13 @@ def read_pairs(folder: Path, max_dn: int = MAX_DN, recipe: PairsRecipe | None = 
     Raises:
         ImageError: a folder is missing, a name has no partner, or two images differ in size.
     """
-    return list(_read_pairs(folder, max_dn, recipe))
-
-
-def _read_pairs(folder: Path, max_dn: int, recipe: PairsRecipe | None) -> Iterator[NamedPair]:
+    pairs = []
     for degraded, reference in pair_files(folder):
         seen, meant = (read_acquisition(path, max_dn=max_dn) for path in (degraded, reference))
-        pair = NamedPair(degraded.stem, seen, meant, recipe.site(degraded.stem) if recipe else None)
-        if pair.degraded.shape != pair.reference.shape:
-            sizes = " and ".join(f"{a.shape[1]} x {a.shape[0]}" for a in (pair.degraded, pair.reference))
-            raise ImageError(
-                f"pair {pair.name}", expected="two images of one size", got=sizes, remedy="crop them alike"
-            )
-        yield pair
+        if seen.shape != meant.shape:
+            sizes = " and ".join(f"{a.shape[1]} x {a.shape[0]}" for a in (seen, meant))
+            expected, remedy = "two images of one size", "crop them alike"
+            raise ImageError(f"pair {degraded.stem}", expected=expected, got=sizes, remedy=remedy)
+        place = recipe.site(degraded.stem) if recipe else None
+        pairs.append(NamedPair(degraded.stem, seen, meant, place))
+    return pairs

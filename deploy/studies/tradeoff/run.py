@@ -8,8 +8,7 @@ from pathlib import Path
 from deploy.bench.tables import PAPER_SIZE, PAPER_TARGET, Swath, parse_size, published_rows
 from deploy.dpu.cost.model import Constants
 from deploy.studies.evaluation.methods import Method, method_named
-from deploy.studies.evaluation.pairs import oversampling_note
-from deploy.studies.evaluation.run import load_pairs
+from deploy.studies.evaluation.pairs import pairs_of_scenes
 from deploy.studies.evaluation.scores import Instruments, perceptual_distances
 from deploy.studies.tradeoff.advice import MAP50, Constraint, Recommendation, chosen_cost, recommend
 from deploy.studies.tradeoff.boards import CHAIN, board_figures
@@ -146,12 +145,11 @@ def _benchmark(
     images: Path | None, degraded: SensorProfile, reference: SensorProfile, lpips: Path | None, seed: int
 ) -> tuple[Benchmark, list[str]]:
     """What all variants are measured on, and what a reader must know of the images."""
-    pairs, small = load_pairs(images, None, degraded, reference, seed)
+    pairs, said = pairs_of_scenes(images, degraded, reference, seed)
     distances = {LPIPS: perceptual_distances(lpips)[LPIPS]}
     backbone, instruments = find_backbone("squeeze", lpips), Instruments(distances, degraded.nominal().max_dn)
     weights = sha256(backbone) if backbone else ""
-    notes = [oversampling_note(pairs, degraded), f"Left out, too small: {', '.join(small)}." if small else ""]
-    return Benchmark(pairs, degraded, reference, instruments, weights, seed), [note for note in notes if note]
+    return Benchmark(pairs, degraded, reference, instruments, weights, seed), said
 
 
 def _others(boards: Sequence[TargetProfile]) -> list[Point]:

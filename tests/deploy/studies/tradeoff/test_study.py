@@ -18,8 +18,7 @@ from deploy.cli import app
 from deploy.restoration.function import Restore
 from deploy.results import SCHEMA_PATH
 from deploy.studies.evaluation.methods import Method, method_named
-from deploy.studies.evaluation.pairs import NamedPair
-from deploy.studies.evaluation.run import load_pairs
+from deploy.studies.evaluation.pairs import NamedPair, pairs_of_scenes
 from deploy.studies.evaluation.scores import Instruments
 from deploy.studies.tradeoff.advice import parse_constraints
 from deploy.studies.tradeoff.labelled import Labelled
@@ -100,7 +99,7 @@ def test_the_scores_are_those_of_the_method_that_evaluate_takes(folder: Path, st
     degraded = load_sensor(SENSOR)
     reference = reference_for(degraded)
     restore = method_named(str(folder / "narrow.safetensors"), degraded, reference).restore
-    pairs, _ = load_pairs(folder / "images", None, degraded, reference, 0)
+    pairs, _ = pairs_of_scenes(folder / "images", degraded, reference, 0)
     instruments = Instruments({})
     expected = [instruments.score(restore(p.degraded), p.reference, p.degraded)["PSNR"] for p in pairs]
     found = next(point for point in study[0].points if point.name == "narrow float32")
