@@ -23,7 +23,7 @@ from deploy.restoration.index_files import NoDoctype
 from deploy.studies.detection.boxes import Boxes, areas
 from deploy.studies.detection.detector import class_names, letters
 from model.io.files import IMAGE_SUFFIXES
-from model.io.images import image_size_px, list_images, site_of
+from model.io.images import image_size_px, list_images
 from profiles.errors import MachineError, OptionError
 from profiles.toml import read_json, read_whole
 
@@ -45,12 +45,10 @@ class LabelledImage:
     Attributes:
         path: of the image.
         truth: labelled boxes, in px of the image; classes are numbers into the set's names.
-        site: images of one site share it.
     """
 
     path: Path
     truth: Boxes
-    site: str
 
 
 @dataclass(frozen=True)
@@ -168,7 +166,7 @@ def _labelled_set(files: Sequence[_File], notes: Sequence[str] = ()) -> Labelled
         whole = Boxes.of([box.corners for box in one.boxes], classes, ignored=ignored)
         inside = whole[areas(whole.corners) > 0].clipped(*_size_px(one))
         lost += [one.source.name] * (len(whole) - len(inside))
-        images.append(LabelledImage(one.image, inside, site_of(one.image.name)))
+        images.append(LabelledImage(one.image, inside))
     if not any(len(image.truth) for image in images):
         got = f"none on {len(images)} images"
         raise OptionError("labels", expected="one object at least", got=got, remedy="check the labels")

@@ -19,6 +19,7 @@ from deploy.studies.detection.detector import Detector, class_numbers
 from deploy.studies.detection.labels import read_labelled
 from deploy.studies.detection.scenes import CLASSES, synthetic_scene
 from deploy.studies.evaluation.methods import DEGRADED, Method, method_named
+from model.io.images import site_of
 from model.io.pictures import Stretch, stretch_of
 from model.progress import Log, no_log, once, steps
 from model.simulator.acquire import acquire_padded
@@ -268,9 +269,9 @@ def labelled_scenes(
     """
     labelled = read_labelled(images, labels, split)
     numbers = class_numbers(labelled.names, names, given)
+    paths = [(each.path, each.truth.renamed(numbers)) for each in labelled.images]
     scenes = [
-        LabelledScene(each.path.name, each.site, each.truth.renamed(numbers), each.path, partial(_read, each.path))
-        for each in labelled.images
+        LabelledScene(path.name, site_of(path.name), boxes, path, partial(_read, path)) for path, boxes in paths
     ]
     return scenes, [*labelled.notes, *left_out(labelled.names, numbers)]
 

@@ -74,12 +74,6 @@ def method_without_network(name: str, degraded: Sensor, reference: Sensor) -> Me
     """
     if name == DEGRADED:
         return Method(name, lambda dn: dn, "the input itself")
-    specialise = _pipeline_specialise(name, reference)
-    return None if specialise is None else Method(name, specialise(degraded), KNOWN, specialise)
-
-
-def _pipeline_specialise(name: str, reference: Sensor) -> Specialise | None:
-    """How a chain or a peer of that name restores for a sensor, to the reference in that sensor's units."""
     if name not in (*CHAINS, *PEERS):
         return None
     quality, order = CHAINS.get(name, (STANDARD, "denoise-first"))
@@ -89,7 +83,7 @@ def _pipeline_specialise(name: str, reference: Sensor) -> Specialise | None:
         chain = Chain(sensor, reference.in_units_of(sensor), quality, order)
         return lambda dn: run(torch.from_numpy(dn), chain).numpy()
 
-    return specialise
+    return Method(name, specialise(degraded), KNOWN, specialise)
 
 
 EXPECTED = (
