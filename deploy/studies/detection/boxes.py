@@ -38,11 +38,7 @@ class Boxes:
 
     @classmethod
     def of(
-        cls,
-        corners: ArrayLike,
-        classes: ArrayLike,
-        scores: ArrayLike | None = None,
-        ignored: ArrayLike | None = None,
+        cls, corners: ArrayLike, classes: ArrayLike, scores: ArrayLike | None = None, ignored: ArrayLike | None = None
     ) -> "Boxes":
         """Boxes of any array-like; without scores they are labelled ones, and none is ignored unless it is said."""
         found = np.asarray(corners, np.float64).reshape(-1, 4)

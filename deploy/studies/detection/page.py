@@ -11,14 +11,7 @@ from deploy.report.plots import SERIES, Curve, Panel, curves_svg, data_url
 from deploy.studies.detection.average_precision import RECALLS, Hits, mean_known, precisions
 from deploy.studies.detection.boxes import Boxes, iou
 from deploy.studies.detection.study import REFERENCE, Comparison
-from deploy.studies.detection.tables import (
-    BY_SIZE,
-    MAIN,
-    PAPER_NOTES,
-    detection_rows,
-    headline,
-    paper_rows,
-)
+from deploy.studies.detection.tables import BY_SIZE, MAIN, PAPER_NOTES, detection_rows, headline, paper_rows
 from deploy.studies.evaluation.methods import DEGRADED
 from model.io.pictures import grid, picture_url
 from profiles.figures import Row, by_table

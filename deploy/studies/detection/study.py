@@ -249,11 +249,7 @@ def synthetic_labelled(number: int, seed: int, classes: np.ndarray) -> LabelledS
 
 
 def labelled_scenes(
-    names: Sequence[str],
-    given: Mapping[str, str],
-    images: Path,
-    labels: Path | None = None,
-    split: str | None = None,
+    names: Sequence[str], given: Mapping[str, str], images: Path, labels: Path | None = None, split: str | None = None
 ) -> tuple[list[LabelledScene], list[str]]:
     """The labelled pictures of a folder as scenes, read when they are looked at, and sentences on what is left out.
 

@@ -9,14 +9,7 @@ import numpy as np
 
 from model.io.images import MAX_DN, read_acquisition, site_of
 from model.recipe import PairsRecipe
-from model.simulator.acquire import (
-    LEAST_SIDE_PX,
-    MARGIN_PX,
-    NOISE,
-    acquire,
-    fitting_oversampling,
-    prepare_scene,
-)
+from model.simulator.acquire import LEAST_SIDE_PX, MARGIN_PX, NOISE, acquire, fitting_oversampling, prepare_scene
 from model.simulator.detector import Draw
 from model.simulator.procedural import load_scenes
 from model.simulator.sampling import Scene

@@ -224,11 +224,7 @@ class Found:
 
 
 def sweep_tables(
-    methods: Sequence[Method],
-    images: Path | None,
-    degraded: SensorProfile,
-    reference: SensorProfile,
-    seed: int,
+    methods: Sequence[Method], images: Path | None, degraded: SensorProfile, reference: SensorProfile, seed: int
 ) -> tuple[Row, ...]:
     """The tables of a sweep of the networks among the methods, on one scene of each site."""
     scenes = load_scenes(images, reference.nominal(), seed)

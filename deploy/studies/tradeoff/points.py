@@ -112,10 +112,7 @@ def parse_targets(text: str) -> tuple[str, ...]:
 
 
 def network_variants(
-    names: Iterable[str],
-    sensor: SensorProfile,
-    make_int8: Callable[[Path], Path],
-    log: Callable[[str], None],
+    names: Iterable[str], sensor: SensorProfile, make_int8: Callable[[Path], Path], log: Callable[[str], None]
 ) -> list[Variant]:
     """Networks in float32 and INT8; shipped ones with the sensor's profile, INT8 files as they are.
 

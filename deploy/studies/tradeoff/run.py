@@ -15,14 +15,7 @@ from deploy.studies.tradeoff.boards import CHAIN, board_figures
 from deploy.studies.tradeoff.labelled import Labelled
 from deploy.studies.tradeoff.measure import Benchmark, Measurements, Scores, key_of, make_int8, measure_host
 from deploy.studies.tradeoff.pareto import Comparison, Measured, front_rows, pareto_front
-from deploy.studies.tradeoff.points import (
-    FLOAT,
-    Point,
-    Variant,
-    configurations,
-    network_points,
-    network_variants,
-)
+from deploy.studies.tradeoff.points import FLOAT, Point, Variant, configurations, network_points, network_variants
 from model.io.files import IMAGE_SUFFIXES, sha256
 from model.io.images import list_images
 from model.metrics.backbones import find_backbone
