@@ -51,13 +51,14 @@ class Box:
         Raises:
             OptionError: outside the image, or too small for an edge.
         """
-        height, width = pixels.shape
-        small = min(self.width, self.height) < BOX_PX
-        if small or self.left + self.width > width or self.top + self.height > height:
-            got = str(self)
+        part = pixels[self.top : self.top + self.height, self.left : self.left + self.width]
+        if part.shape != (self.height, self.width) or min(part.shape) < BOX_PX:
+            height, width = pixels.shape
             expected = f"a box of {BOX_PX} x {BOX_PX} pixels or more inside its {width} x {height}"
-            raise OptionError("--edge", expected=expected, got=got, remedy="X,Y is the upper left pixel, from 0")
-        return pixels[self.top : self.top + self.height, self.left : self.left + self.width]
+            raise OptionError(
+                "--edge", expected=expected, got=str(self), remedy="X,Y is the upper left pixel, from 0"
+            )
+        return part
 
     def __str__(self) -> str:
         return f"{self.image}:{self.left},{self.top},{self.width},{self.height}"

@@ -32,17 +32,13 @@ def strip_of(pair: NamedPair, methods: Sequence[Method]) -> tuple[np.ndarray, fl
     """
     images = {method.name: method.restore(pair.degraded) for method in methods}
     side = min(CROP_PX, *pair.degraded.shape)
-    window = busiest_windows(pair.reference, side)[0]
-    crops = {name: _crop(image, window, side) for name, image in {**images, "reference": pair.reference}.items()}
+    top, left = busiest_windows(pair.reference, side)[0]
+    whole = {**images, "reference": pair.reference}
+    crops = {name: image[top : top + side, left : left + side] for name, image in whole.items()}
     errors = {name: np.abs(crop - crops["reference"]) for name, crop in crops.items()}
     white = max(float(np.percentile(errors[methods[0].name], 99)), 1.0)
     rows = [strip_row(crops.values(), stretch_of(crops["reference"])), error_row(errors.values(), white)]
     return np.asarray(grid(list(crops), rows, ZOOM)), white
-
-
-def _crop(image: np.ndarray, window: tuple[int, int], side: int) -> np.ndarray:
-    top, left = window
-    return image[top : top + side, left : left + side]
 
 
 def pictures(pairs: Sequence[NamedPair], methods: Sequence[Method], out: Path) -> list[Picture]:

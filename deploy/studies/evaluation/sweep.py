@@ -169,29 +169,25 @@ class Found:
         psnr = {key: self._mean(values[0]) for key, values in self.psnr.items()}
         clean = {key: self._mean(values[1]) for key, values in self.psnr.items()}
         tables = (("sweep, PSNR", psnr), (f"sweep, {NOISE_FREE}", clean), ("sweep, MTF at Nyquist", self.mtf))
-        conditions = [row for table, figures in tables for row in self._conditions(table, figures)]
-        return [*conditions, *self._gains(), *self._wrong()]
-
-    def _conditions(self, table: str, figures: Mapping[Key, Figure]) -> list[Row]:
-        """The input, the chain that knows the truth, the one that knows the nominal sensor, and each network."""
-        return [
+        conditions = [
             Row(table, truth, {shown: figures[key] for shown, key in self._columns(truth).items()})
+            for table, figures in tables
             for truth in self.conditions
         ]
+        return [*conditions, *self._gains(), *self._wrong()]
 
     def _columns(self, truth: str) -> dict[str, Key]:
+        """The input, the chain that knows the truth, the one that knows the nominal sensor, and each network."""
         chains = {TRUTH_KNOWN: (truth, truth, TRADITIONAL), NOMINAL_KNOWN: (truth, NOMINAL, TRADITIONAL)}
         networks = {name: (truth, truth, name) for name in self.networks}
         return {DEGRADED: (truth, truth, DEGRADED), **chains, **networks}
 
     def _gains(self) -> list[Row]:
         """How far each network is ahead of the chain that knows the truth: by condition, then over all of them."""
-        gains = {name: {truth: self._gain(truth, name) for truth in self.conditions} for name in self.networks}
-        rows = [
-            Row("sweep, gain over the chain", truth, {name: self._mean(gains[name][truth]) for name in gains})
-            for truth in self.conditions
-        ]
-        return [*rows, *(self._over_all(*each) for each in gains.items())] if gains else []
+        gains = {truth: {name: self._gain(truth, name) for name in self.networks} for truth in self.conditions}
+        rows = [Row("sweep, gain over the chain", truth, self._means(each)) for truth, each in gains.items()]
+        over_all = [self._over_all(n, {truth: each[n] for truth, each in gains.items()}) for n in self.networks]
+        return [*rows, *over_all] if over_all else []
 
     def _gain(self, truth: str, network: str) -> np.ndarray:
         return np.asarray(self.psnr[truth, truth, network][0] - self.psnr[truth, truth, TRADITIONAL][0])

@@ -166,7 +166,6 @@ class Case:
         draw: makes its
         pixels: "sound", or what is wrong with them: "missing" (NaN), "infinite", "beyond" 12 bits.
         flat: every pixel of an image is the same: the mean must be kept, there is nothing to restore.
-        mtf_nyquist: of the sensor that acquired it; None for the profile's own.
         large: only what must hold of one run is looked at.
     """
 
@@ -174,7 +173,6 @@ class Case:
     draw: Draw
     pixels: str = "sound"
     flat: bool = False
-    mtf_nyquist: float | None = None
     large: bool = False
 
 
@@ -193,8 +191,8 @@ CASES = (
     Case("Siemens star", star),
     Case("SNR 3", noisy),
     Case("no noise", clean),
-    Case("MTF 0.1 %", through(0.001), mtf_nyquist=0.001),
-    Case("MTF 60 %", through(0.6), mtf_nyquist=0.6),
+    Case("MTF 0.1 %", through(0.001)),
+    Case("MTF 60 %", through(0.6)),
     Case("nodata stripes", stripes, pixels="missing"),
     Case("NaN pixels", scattered(np.nan), pixels="missing"),
     Case("infinite pixels", scattered(np.inf), pixels="infinite"),

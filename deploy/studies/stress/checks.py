@@ -36,9 +36,9 @@ class Measure:
         return self.value <= self.allowed
 
 
-def not_finite(*images: np.ndarray) -> Measure:
-    """How many pixels of images of any shape are NaN or infinite."""
-    return Measure("not finite", float(sum((~np.isfinite(image)).sum() for image in images)), 0, "px")
+def not_finite(pixels: np.ndarray) -> Measure:
+    """How many pixels, of any shape, are NaN or infinite."""
+    return Measure("not finite", float((~np.isfinite(pixels)).sum()), 0, "px")
 
 
 def out_of_range(image: np.ndarray) -> Measure:
@@ -50,12 +50,6 @@ def differing(check: str, image: np.ndarray, other: np.ndarray) -> Measure:
     """How many pixels of two images (H, W) are not the same, bit for bit; NaN is the same as NaN."""
     same = (image == other) | (np.isnan(image) & np.isnan(other))
     return Measure(check, float((~same).sum()), 0, "px")
-
-
-def mean_shift(image: np.ndarray, source: np.ndarray, allowed: float = FLAT_DN) -> Measure:
-    """By how much the mean of an image (H, W) moved from its source's, in DN."""
-    shift = float(np.mean(image, dtype=np.float64) - np.mean(source, dtype=np.float64))
-    return Measure("mean moved", abs(shift), allowed)
 
 
 def ringing(image: np.ndarray, source: np.ndarray, radius_px: int, allowed: float) -> Measure:
@@ -118,7 +112,8 @@ def fidelity(image: np.ndarray, result: np.ndarray, radius_px: int, flat: bool) 
     if flat:
         # All that is lost at the border of flat ground is the padding's doing.
         border = Measure("border", float(np.abs(result - image).max()), 2 * FLAT_DN)
-        measures += [mean_shift(inner, image), border]
+        moved = abs(float(np.mean(inner, dtype=np.float64) - np.mean(image, dtype=np.float64)))
+        measures += [Measure("mean moved", moved, FLAT_DN), border]
     return measures
 
 
