@@ -172,7 +172,7 @@ def run_study(
     told = once(say)
     pairs = [_pair(name, reference, told) for name in sensors]
     rows = [{name: method_named(name, pair.degraded, pair.reference, told) for name in methods} for pair in pairs]
-    return [compare(detector, scenes, *each, seed) for each in zip(pairs, rows, strict=True)]
+    return [_compared(detector, scenes, *each, seed) for each in zip(pairs, rows, strict=True)]
 
 
 def _pair(name: str, reference: str | None, say: Log) -> SensorPair:
@@ -180,22 +180,10 @@ def _pair(name: str, reference: str | None, say: Log) -> SensorPair:
     return SensorPair(degraded, reference_beside(degraded, reference, say))
 
 
-def compare(
-    detector: Detector,
-    scenes: Sequence[LabelledScene],
-    sensors: SensorPair,
-    methods: Mapping[str, Method | None],
-    seed: int,
+def _compared(
+    detector: Detector, scenes: Sequence[LabelledScene], sensors: SensorPair, methods: Mapping[str, Method], seed: int
 ) -> Comparison:
-    """Show a detector every scene in every row, and score what it finds.
-
-    Args:
-        detector: that is shown the pictures.
-        scenes: labelled.
-        sensors: that acquire them.
-        methods: by row; the reference becomes the first one.
-        seed: of acquisitions and intervals.
-    """
+    """Show a detector every scene in every row, the reference first, and score what it finds."""
     rows = {REFERENCE: None, **methods}
     boxes: dict[str, list[Boxes]] = {row: [] for row in rows}
     with steps(f"detecting, {sensors.degraded.name}", len(scenes) * len(rows)) as bar:

@@ -30,6 +30,7 @@ class Evaluation:
         images: a row a method and image.
         swept: rows of the sweep, where one was asked for.
         said: what a reader must know of the pairs.
+        inputs: the files that the figures rest on: models, weights of LPIPS, scenes or pairs.
     """
 
     sensors: tuple[SensorProfile, SensorProfile]
@@ -40,6 +41,7 @@ class Evaluation:
     images: Sequence[Row]
     swept: Sequence[Row]
     said: Sequence[str]
+    inputs: Sequence[Path]
 
     @property
     def rows(self) -> tuple[Row, ...]:
@@ -57,15 +59,6 @@ class Evaluation:
         """What a reader of the tables must know."""
         few = too_few(len({pair.site for pair in self.pairs}))
         return [few, *self.said] if few else list(self.said)
-
-
-def input_files(
-    methods: Sequence[str], images: Path | None, pairs: Path | None, lpips: Path | None
-) -> tuple[Path, ...]:
-    """The files that an evaluation's figures rest on: models, scenes or pairs, weights of LPIPS."""
-    named = [path for path in (*map(Path, methods), *([lpips] if lpips else [])) if path.is_file()]
-    folders = [images] if images else [pairs / role for role in ("degraded", "reference")] if pairs else []
-    return (*named, *(path for folder in folders for path in list_images(folder)))
 
 
 def run_evaluation(
@@ -106,6 +99,9 @@ def run_evaluation(
         loaded, said = pairs_of_scenes(images, *sensors, seed)
     else:
         loaded, said = read_pairs(pairs, degraded.max_dn, recipe), []
+    named = [path for path in (*map(Path, names), *([lpips] if lpips else [])) if path.is_file()]
+    folders = [images] if images else [pairs / role for role in ("degraded", "reference")] if pairs else []
+    inputs = [*named, *(path for folder in folders for path in list_images(folder))]
     mean, rows = [], list[Row]()
     targets = acquire_targets(degraded, seed)
     for method in methods:
@@ -113,4 +109,4 @@ def run_evaluation(
         mean.append(replace(scored, figures={**scored.figures, **target_figures(method, targets)}))
         rows += each
     swept = sweep_tables(methods, images, *sensors, seed) if sweep else ()
-    return Evaluation(sensors, methods, loaded, [*mean, *paper_rows()], site_rows(rows), rows, swept, said)
+    return Evaluation(sensors, methods, loaded, [*mean, *paper_rows()], site_rows(rows), rows, swept, said, inputs)

@@ -69,22 +69,18 @@ class Instruments:
     perceptual: Mapping[str, Perceptual | str]
     max_dn: int = MAX_DN
 
-    def score(self, dn: np.ndarray, reference: np.ndarray, degraded: np.ndarray) -> dict[str, float | None]:
-        """The figures of one restored image, (H, W) digital numbers each."""
-        psnr, before = (fidelity_db(image, reference, degraded, self.max_dn) for image in (dn, degraded))
-        scores: dict[str, float | None] = {"PSNR": psnr, "PSNR gain": psnr - before if psnr != before else 0.0}
-        scores["SSIM"] = ssim(dn, reference, self.max_dn)
+    def score(self, dn: np.ndarray, pair: NamedPair) -> dict[str, float | None]:
+        """The figures of one restored image of a pair, (H, W) digital numbers."""
+        clean, unclipped = pair.noise_free, (pair.degraded, self.max_dn)
+        psnr, before = (fidelity_db(image, pair.reference, *unclipped) for image in (dn, pair.degraded))
+        scores: dict[str, float | None] = {"PSNR": psnr}
+        scores[NOISE_FREE] = None if clean is None else fidelity_db(dn, clean, *unclipped)
+        scores["PSNR gain"] = psnr - before if psnr != before else 0.0
+        scores["SSIM"] = ssim(dn, pair.reference, self.max_dn)
         for name, distance in self.perceptual.items():
-            both = dn / self.max_dn, reference / self.max_dn
+            both = dn / self.max_dn, pair.reference / self.max_dn
             scores[name] = None if isinstance(distance, str) else distance(*both)
         return scores
-
-    def score_pair(self, dn: np.ndarray, pair: NamedPair) -> dict[str, float | None]:
-        """The figures of one restored image of a pair, and its PSNR against the reference without noise."""
-        clean = pair.noise_free
-        psnr = None if clean is None else fidelity_db(dn, clean, pair.degraded, self.max_dn)
-        scores = self.score(dn, pair.reference, pair.degraded)
-        return {"PSNR": scores["PSNR"], NOISE_FREE: psnr, **scores}
 
     def figure(
         self, key: str, value: float | None, source: str, interval: tuple[float, float] | None = None
@@ -101,7 +97,7 @@ def score(method: Method, pairs: Sequence[NamedPair], instruments: Instruments, 
     rows, scores = [], []
     with steps(method.name, len(pairs)) as bar:
         for pair in pairs:
-            values = instruments.score_pair(method.restore(pair.degraded), pair)
+            values = instruments.score(method.restore(pair.degraded), pair)
             figures = {key: instruments.figure(key, value, "one pair") for key, value in values.items()}
             rows.append(Row("images", f"{method.name}: {pair.name}", figures, {"site": pair.site}))
             scores.append(values)

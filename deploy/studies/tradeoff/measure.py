@@ -27,7 +27,7 @@ from deploy.restoration.plan import make_plan
 from deploy.restoration.runtime import open_runtime
 from deploy.studies.evaluation.methods import Method
 from deploy.studies.evaluation.pairs import NamedPair
-from deploy.studies.evaluation.scores import Instruments, mean_row
+from deploy.studies.evaluation.scores import NOISE_FREE, Instruments, mean_row
 from deploy.studies.tradeoff.points import HALO_STEP_PX, Point, Variant, model_of, tiling_of_file
 from model.io.files import sha256, write_text
 from model.io.images import list_images
@@ -47,6 +47,8 @@ Scores = Mapping[str, float | None]
 """Figures of one image by name; None where an instrument is not there."""
 
 SEAM_ERROR = "seam error"
+NOT_SHOWN = ("PSNR gain", NOISE_FREE, SEAM_ERROR)
+"""Of the scores of an image, in the means of a point."""
 
 
 def key_of(**about: object) -> str:
@@ -139,7 +141,7 @@ class Benchmark:
 
     def score(self, restore: Restore) -> list[dict[str, float | None]]:
         """Scores of every pair."""
-        return [self.instruments.score(restore(p.degraded), p.reference, p.degraded) for p in self.pairs]
+        return [self.instruments.score(restore(pair.degraded), pair) for pair in self.pairs]
 
     def score_in_tiles(self, point: Point, exact: Restore) -> list[dict[str, float | None]]:
         """Scores of every pair restored in a point's tiles, and how far its seams are from exact ones, in DN."""
@@ -147,13 +149,12 @@ class Benchmark:
         for pair in self.pairs:
             restored = cut(pair.degraded)
             error = np.abs(np.asarray(restored, np.float64) - exact(pair.degraded)).mean()
-            scores = self.instruments.score(restored, pair.reference, pair.degraded)
-            found.append({**scores, SEAM_ERROR: float(error)})
+            found.append({**self.instruments.score(restored, pair), SEAM_ERROR: float(error)})
         return found
 
     def means(self, images: Sequence[Scores]) -> dict[str, Figure]:
         """Means over the images, with bootstrap intervals over whole sites."""
-        plain = [{key: each[key] for key in each if key not in ("PSNR gain", SEAM_ERROR)} for each in images]
+        plain = [{key: each[key] for key in each if key not in NOT_SHOWN} for each in images]
         unnamed = Method("", lambda dn: dn, "")
         found = dict(mean_row(unnamed, plain, self.sites, self.instruments, self.seed).figures)
         if SEAM_ERROR in images[0]:

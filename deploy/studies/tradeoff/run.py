@@ -1,7 +1,7 @@
 """One study: variants, what is measured of each, points with their figures, a front and a recommendation."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
@@ -16,7 +16,7 @@ from deploy.studies.tradeoff.labelled import Labelled
 from deploy.studies.tradeoff.measure import Benchmark, Measurements, Scores, key_of, make_int8, measure_host
 from deploy.studies.tradeoff.pareto import Comparison, Measured, front_rows, pareto_front
 from deploy.studies.tradeoff.points import FLOAT, Point, Variant, configurations, network_points, network_variants
-from model.io.files import IMAGE_SUFFIXES, sha256
+from model.io.files import sha256
 from model.io.images import list_images
 from model.metrics.backbones import find_backbone
 from model.metrics.bootstrap import too_few
@@ -44,6 +44,7 @@ class Study:
         cost: the figure that the front is against.
         recommendation: what to take.
         notes: what a reader must know.
+        inputs: the files that the figures rest on, besides shipped ones.
     """
 
     board: str
@@ -53,6 +54,7 @@ class Study:
     cost: str
     recommendation: Recommendation
     notes: Sequence[str]
+    inputs: Sequence[Path] = ()
 
     @property
     def rows(self) -> tuple[Row, ...]:
@@ -115,7 +117,12 @@ def run_study(
     if boards[0].name == PAPER_TARGET and size_px == parse_size(PAPER_SIZE):
         measured += _published()
     notes = (*_notes(benchmark, boards[0].name), *(scenes.notes if scenes else ()), *said)
-    return _weighed(measured, boards[0], Comparison(benchmark.sites, seed), budget, need, notes)
+    study = _weighed(measured, boards[0], Comparison(benchmark.sites, seed), budget, need, notes)
+    named = [path for path in map(Path, networks) if path.is_file()]
+    listed = [path for folder in (images, calibration) if folder for path in list_images(folder)]
+    single = [path for path in (find_backbone("squeeze", lpips), detector) if path]
+    pictures = [scene.path for scene in scenes.scenes if scene.path] if scenes else []
+    return replace(study, inputs=[*named, *listed, *single, *pictures])
 
 
 def _weighed(
@@ -245,20 +252,3 @@ def _notes(benchmark: Benchmark, board: str) -> Iterator[str]:
         yield too_few(sites)
     yield "Exact halos give the same pictures in tiles of any size; smaller ones were measured in the point's tiles."
     yield "The chains know both sensors; what a network knows of them stands beside it."
-
-
-def input_files(
-    networks: Sequence[str],
-    images: Path | None,
-    calibration: Path | None,
-    lpips: Path | None,
-    labelled: Path | None,
-    detector: Path | None,
-) -> tuple[Path, ...]:
-    """The files that the figures rest on, besides shipped ones; arguments as of `run_study`."""
-    named = [path for path in map(Path, networks) if path.is_file()]
-    folders = [folder for folder in (images, calibration) if folder]
-    tree = sorted(labelled.rglob("*")) if labelled else []
-    pictures = [path for path in tree if path.suffix.lower() in IMAGE_SUFFIXES]
-    single = [path for path in (find_backbone("squeeze", lpips), detector) if path]
-    return (*named, *(path for folder in folders for path in list_images(folder)), *single, *pictures)

@@ -264,7 +264,7 @@ def test_one_pair_a_site_is_shown() -> None:
 def test_tables_of_a_sweep_keep_their_words_on_the_page() -> None:
     mean, *_ = score(IDENTITY, [pair()], PLAIN, 0)
     swept = Row("sweep, MTF at Nyquist", "nominal", {"degraded": measured(7, "%", "edges")})
-    report = evaluation_report(Evaluation((DEGRADED, REFERENCE), [], [], [mean], [], [], [swept], []), [])
+    report = evaluation_report(Evaluation((DEGRADED, REFERENCE), [], [], [mean], [], [], [swept], [], []), [])
     assert [table.title for table in report.tables] == ["Means over all pairs", "Sweep, MTF at Nyquist"]
 
 

@@ -101,7 +101,7 @@ def test_the_scores_are_those_of_the_method_that_evaluate_takes(folder: Path, st
     restore = method_named(str(folder / "narrow.safetensors"), degraded, reference).restore
     pairs, _ = pairs_of_scenes(folder / "images", degraded, reference, 0)
     instruments = Instruments({})
-    expected = [instruments.score(restore(p.degraded), p.reference, p.degraded)["PSNR"] for p in pairs]
+    expected = [instruments.score(restore(pair.degraded), pair)["PSNR"] for pair in pairs]
     found = next(point for point in study[0].points if point.name == "narrow float32")
     assert [image["PSNR"] for image in found.images] == expected
 
@@ -196,7 +196,7 @@ def test_labelled_pictures_add_map50_beside_exact_halos(
     folder: Path, study: tuple[Study, Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     class Made:
-        digest, notes = "d", ("labels",)
+        digest, notes, scenes = "d", ("labels",), ()
 
         def measure(self, _: object) -> dict[str, object]:
             return {"value": 0.5, "interval": None}
