@@ -50,11 +50,6 @@ class Boxes:
             np.zeros(count, bool) if ignored is None else np.asarray(ignored, bool).reshape(count),
         )
 
-    @classmethod
-    def none(cls) -> "Boxes":
-        """No box."""
-        return cls.of(np.empty((0, 4)), np.empty(0))
-
     def __len__(self) -> int:
         return len(self.corners)
 
@@ -83,7 +78,7 @@ class Boxes:
 def joined(several: Sequence[Boxes]) -> tuple[Boxes, np.ndarray]:
     """Boxes of several images in one, and the number of each one's image, (N,) int64."""
     parts = ("corners", "classes", "scores", "ignored")
-    whole = Boxes(*(np.concatenate([getattr(one, part) for one in (Boxes.none(), *several)]) for part in parts))
+    whole = Boxes(*(np.concatenate([getattr(one, part) for one in (Boxes.of([], []), *several)]) for part in parts))
     return whole, np.repeat(np.arange(len(several)), [len(one) for one in several])
 
 

@@ -67,7 +67,8 @@ def handmade(sites: int = 12, **found: int) -> Comparison:
     scenes, pair = [scene((30, 30, 90, 80), name=str(number)) for number in range(sites)], sensors("dior-high")
     truths = [each.truth for each in scenes]
     boxes = {
-        row: [truth if k < count else Boxes.none() for k, truth in enumerate(truths)] for row, count in found.items()
+        row: [truth if k < count else Boxes.of([], []) for k, truth in enumerate(truths)]
+        for row, count in found.items()
     }
     hits = {row: find_hits(truths, each, len(NAMES)) for row, each in boxes.items()}
     figures, confidence = score_rows(hits, NAMES, site_weights([each.site for each in scenes], 0, 200))
