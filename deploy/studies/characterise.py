@@ -227,13 +227,6 @@ def snr_at(noise: NoiseModel, dn: float, gain: float) -> Snr:
     return Snr(dn / gain, value, (low, high), variance.extrapolated)
 
 
-REMEDIES = {
-    "few-windows": "give more raw images of plain ground, neither restored nor resampled",
-    "range": "give images of dark and of bright ground",
-    "no-noise": "give the image before restoring or resampling; noise below the rounding cannot be measured",
-}
-
-
 def measured_noise(images: Sequence[Path], clipped_at: int) -> NoiseModel:
     """The noise in the digital numbers of images that clip at a value.
 
@@ -243,7 +236,8 @@ def measured_noise(images: Sequence[Path], clipped_at: int) -> NoiseModel:
     blocks = [cut_blocks(tile, clipped_at) for tile in _tiles(images)]
     noise = fit_noise_model(join(blocks), np.random.default_rng(SEED))
     if isinstance(noise, Refusal):
-        expected, remedy = "blurred, raw ground with white noise, from dark to bright", REMEDIES[noise.status]
+        expected = "blurred, raw ground with white noise, from dark to bright"
+        remedy = "give more raw images of plain ground, dark and bright, neither restored nor resampled"
         raise ImageError(f"noise of {_named(images)}", expected=expected, got=noise.reason, remedy=remedy)
     return noise
 
@@ -279,7 +273,7 @@ def _pointed_at(boxes: Sequence[Box], noise: NoiseModel, clipped_at: float) -> t
         lies = _rise(region.T) > _rise(region)
         edge = fit_blur(region.T if lies else region, noise.total, POINTED_AT)
         if region.min() <= 0 or region.max() >= clipped_at:
-            edge = Refusal("clipped", "clipped pixels")
+            edge = Refusal("clipped pixels")
         if isinstance(edge, Refusal):
             expected, remedy = "one straight edge, from side to side", "box another, or tighter"
             raise ImageError(f"--edge {box}", expected=expected, got=edge.reason, remedy=remedy)

@@ -139,8 +139,7 @@ def fit_blur(region: np.ndarray, noise: Noise, limits: Limits) -> EdgeBlur | Ref
         limits: what the edge must keep to.
 
     Returns:
-        The blur by the profile's curve, or, of an edge that no shape of the curve fits, why there is none:
-        "few-rows", "no-convergence", "contrast".
+        The blur by the profile's curve, or, of an edge that no shape of the curve fits, why there is none.
     """
     pixels = region / math.sqrt(float(noise(region).mean()))
     found = _fitted(pixels, limits)
@@ -159,7 +158,7 @@ def _fitted(pixels: np.ndarray, limits: Limits, shape: float = 0.0) -> EdgeBlur 
     for _ in range(PASSES):
         near = np.abs(x - line.place - line.slope * y) <= HALF_PX
         if near.sum() < 10 * HALF_PX:
-            return Refusal("few-rows", f"{int(near.sum())} pixels near the edge, {10 * HALF_PX} are needed")
+            return Refusal(f"{int(near.sum())} pixels near the edge, {10 * HALF_PX} are needed")
         terms, fitted = _linearised(line, x[near], y[near], pixels[near])
         left = pixels[near] - fitted
         covariance = np.linalg.pinv(terms.T @ terms)
@@ -168,7 +167,7 @@ def _fitted(pixels: np.ndarray, limits: Limits, shape: float = 0.0) -> EdgeBlur 
             break
         if moved < 1e-3:
             return _judged(line, pixels, float(np.ptp(fitted)), left, float(covariance[4, 4]), limits)
-    return Refusal("no-convergence", "no straight edge near to an axis")
+    return Refusal("no straight edge near to an axis")
 
 
 def _centroids(region: np.ndarray, rows: np.ndarray, columns: np.ndarray) -> _Line:
@@ -200,11 +199,11 @@ def _judged(
     misfit = math.sqrt(max(scatter - 1, 0.0)) / max(step, 1e-9)
     error = math.sqrt(variance * max(scatter, 1.0))
     if limits is not ANY and not LEAST_GAMMA * (not line.shape) <= line.gamma < LARGEST_GAMMA:
-        return Refusal("no-convergence", "sharper than a detector's pixel or softer than any profile: no plain edge")
+        return Refusal("sharper than a detector's pixel or softer than any profile: no plain edge")
     if misfit > limits.misfit:
-        return Refusal("no-convergence", f"{misfit:.1%} of the step fit no blurred edge, {limits.misfit:.1%} at most")
+        return Refusal(f"{misfit:.1%} of the step fit no blurred edge, {limits.misfit:.1%} at most")
     if step < limits.step_sigma or error > limits.error:
-        return Refusal("contrast", f"a step of {step:.3g} times the noise, {limits.step_sigma:g} are needed")
+        return Refusal(f"a step of {step:.3g} times the noise, {limits.step_sigma:g} are needed")
     return EdgeBlur(line.gamma, error, line.slope, pixels, chi2, count)
 
 

@@ -153,21 +153,21 @@ def fit_noise_model(blocks: Blocks, generator: np.random.Generator) -> NoiseMode
     """Fit the line to blocks of any number of images of one instrument.
 
     Returns:
-        The line, or why there is none: "few-windows", "range", "no-noise".
+        The line, or why there is none.
     """
     if blocks.mean.size < LEAST:
-        return Refusal("few-windows", f"{blocks.mean.size} blocks of 16 x 16 unclipped pixels, {LEAST} are needed")
+        return Refusal(f"{blocks.mean.size} blocks of 16 x 16 unclipped pixels, {LEAST} are needed")
     quietest = float(np.percentile(blocks.fine, QUIET_PERCENT))
     if quietest < ROUNDING + LEAST_NOISE:
         got = f"a variance of {quietest:.2g} DN^2 at the finest detail, where rounding alone makes {ROUNDING:.2g}"
-        return Refusal("no-noise", got)
+        return Refusal(got)
     used, fit = _choose(blocks)
     parts = np.unique(used.part)
     if used.mean.size < LEAST or parts.size < LEAST_PARTS:
-        return Refusal("few-windows", f"{used.mean.size} blocks without much texture, {LEAST} are needed")
+        return Refusal(f"{used.mean.size} blocks without much texture, {LEAST} are needed")
     dark, bright = (float(v) for v in np.percentile(used.mean, [EDGE_PERCENT, 100 - EDGE_PERCENT]))
     if bright - dark < MIN_RANGE * bright:
-        return Refusal("range", f"even areas from {dark:.4g} to {bright:.4g} DN only, too narrow for a line")
+        return Refusal(f"even areas from {dark:.4g} to {bright:.4g} DN only, too narrow for a line")
     draws = np.array([_fitted(used, _weights(used.part, parts, generator)) for _ in range(DRAWS)])
     leak = float(fit[2] * np.maximum(used.structure - used.noise(fit), 0).mean() / used.fine.mean())
     alpha, beta = _unrounded(fit)
@@ -228,11 +228,11 @@ def _unrounded(fit: np.ndarray) -> tuple[float, float]:
 def _doubtful(used: Blocks, model: NoiseModel) -> Refusal | None:
     """Texture that passes for noise, or noise that is not white; both would be told to a network as they stand."""
     if model.leak > MAX_LEAK:
-        return Refusal("few-windows", f"{model.leak:.0%} of the finest detail is texture, {MAX_LEAK:.0%} at most")
+        return Refusal(f"{model.leak:.0%} of the finest detail is texture, {MAX_LEAK:.0%} at most")
     place = (float(np.median(used.mean)), 1.0)
     fine = (model.alpha, model.beta) @ np.array(place)
     coarse = _fitted(used, np.ones(used.mean.size), "middle")[:2] @ place - ROUNDING
     scatter = float((model.draws @ place).std()) / fine
     if abs(coarse / fine - 1) > MAX_COLOUR + COLOUR_SCATTER * scatter:
-        return Refusal("few-windows", f"noise {coarse / fine:.2f} times as strong at middle frequencies: not white")
+        return Refusal(f"noise {coarse / fine:.2f} times as strong at middle frequencies: not white")
     return None

@@ -45,8 +45,7 @@ def edge_mtf(image: np.ndarray, angle_deg: float, saturated: float = math.inf) -
         saturated: the value at which pixels clip, in the image's unit. They also clip at 0.
 
     Returns:
-        Contrast kept at 0.5 cycles per pixel, below 0 by noise or where contrast is reversed; or why there is none:
-        "not-finite", "clipped", "no-convergence" or "contrast".
+        Contrast kept at 0.5 cycles per pixel, below 0 by noise or where contrast is reversed; or why there is none.
     """
     pixels = np.asarray(image, np.float64)
     distance = _unusable(pixels, saturated) or _distance(pixels, math.radians(angle_deg))
@@ -55,17 +54,17 @@ def edge_mtf(image: np.ndarray, angle_deg: float, saturated: float = math.inf) -
     plateaus = _fit_plateaus(pixels, distance)
     if not plateaus.step > MIN_CONTRAST_SIGMA * plateaus.sigma:
         seen = f"a step of {plateaus.step:.4g} in noise of {plateaus.sigma:.4g}"
-        return Refusal("contrast", f"{seen}, {MIN_CONTRAST_SIGMA} times are needed")
+        return Refusal(f"{seen}, {MIN_CONTRAST_SIGMA} times are needed")
     return _mtf(pixels, distance, plateaus)
 
 
 def _unusable(image: np.ndarray, saturated: float) -> Refusal | None:
     lost = ~np.isfinite(image)
     if lost.any():
-        return Refusal("not-finite", f"{int(lost.sum())} pixels are not finite")
+        return Refusal(f"{int(lost.sum())} pixels are not finite")
     clipped = float(((image <= 0) | (image >= saturated)).mean())
     if clipped > MAX_CLIPPED:
-        return Refusal("clipped", f"{clipped:.1%} of the pixels are clipped, {MAX_CLIPPED:.0%} at most")
+        return Refusal(f"{clipped:.1%} of the pixels are clipped, {MAX_CLIPPED:.0%} at most")
     return None
 
 
@@ -82,10 +81,10 @@ def _distance(image: np.ndarray, angle: float) -> np.ndarray | Refusal:
         weights = rise * _hamming(between - shift)
         total = float(weights.sum())
         if total <= 0:
-            return Refusal("no-convergence", "the image does not rise where its edge should be")
+            return Refusal("the image does not rise where its edge should be")
         shift += float((weights * (between - shift)).sum()) / total
         if abs(shift) > MAX_SHIFT_PX:
-            return Refusal("no-convergence", f"the edge lies more than {MAX_SHIFT_PX:g} px off its place")
+            return Refusal(f"the edge lies more than {MAX_SHIFT_PX:g} px off its place")
     return np.asarray((across - shift) * math.cos(angle))
 
 

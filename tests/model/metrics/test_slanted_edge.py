@@ -41,8 +41,7 @@ def measured(image: np.ndarray, angle_deg: float = ANGLE_DEG) -> float:
 def refused(image: np.ndarray, saturated: float = math.inf) -> str:
     result = edge_mtf(image, ANGLE_DEG, saturated)
     assert isinstance(result, Refusal)
-    assert result.reason
-    return result.status
+    return result.reason
 
 
 def gaussian_edge(angle_deg: float, sigma_px: float, shape: tuple[int, int] = (80, 80)) -> np.ndarray:
@@ -111,15 +110,15 @@ def test_the_unit_does_not_matter() -> None:
 def test_what_cannot_be_measured_is_refused() -> None:
     edge = gaussian_edge(ANGLE_DEG, 0.6)
     generator = np.random.default_rng(0)
-    assert refused(edge + 170 * generator.standard_normal(edge.shape)) == "contrast"
-    assert refused(np.full((80, 80), 700.0)) == "no-convergence"
-    assert refused(edge[:, ::-1]) == "no-convergence"
-    assert refused(np.roll(edge, 8, axis=1)) == "no-convergence"
-    assert refused(edge, saturated=1990) == "clipped"
-    assert refused(np.maximum(edge - 410, 0.0)) == "clipped"
+    assert "10 times are needed" in refused(edge + 170 * generator.standard_normal(edge.shape))
+    assert "does not rise" in refused(np.full((80, 80), 700.0))
+    assert "does not rise" in refused(edge[:, ::-1])
+    assert "off its place" in refused(np.roll(edge, 8, axis=1))
+    assert "are clipped" in refused(edge, saturated=1990)
+    assert "are clipped" in refused(np.maximum(edge - 410, 0.0))
     for bad in (math.nan, math.inf):
         edge[3, 4] = bad
-        assert refused(edge) == "not-finite"
+        assert "not finite" in refused(edge)
 
 
 def test_the_target_has_its_two_radiances_and_its_edge_in_the_middle() -> None:

@@ -240,7 +240,7 @@ def test_targets_measure_the_sensor_and_what_a_chain_makes_of_it(monkeypatch: py
 
 
 def test_refused_edges_and_silent_fields_are_unavailable() -> None:
-    refused = mtf_figure([Refusal("contrast", "a step of 3 in noise of 2")] * 3)
+    refused = mtf_figure([Refusal("a step of 3 in noise of 2")] * 3)
     assert refused.value is None
     assert refused.reason == "3 of 3 edges refused: a step of 3 in noise of 2"
     assert flat_figure(np.full((9, 9), 100.0)).value is None
