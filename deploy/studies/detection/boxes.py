@@ -5,7 +5,7 @@ bring every other convention to this one (`labels`).
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -57,10 +57,6 @@ class Boxes:
         """The boxes that a mask, indices or a slice choose."""
         return Boxes(self.corners[which], self.classes[which], self.scores[which], self.ignored[which])
 
-    def at(self, corners: np.ndarray) -> "Boxes":
-        """The same boxes at other corners, (N, 4) px."""
-        return Boxes.of(corners, self.classes, self.scores, self.ignored)
-
     def renamed(self, classes: np.ndarray) -> "Boxes":
         """Boxes whose class c becomes `classes[c]`; those of a class that becomes -1 are left out."""
         new = np.asarray(classes, np.int64)[self.classes]
@@ -69,10 +65,10 @@ class Boxes:
     def clipped(self, height_px: float, width_px: float) -> "Boxes":
         """The parts inside an image: what lies outside whole is left out, what is mostly outside is ignored."""
         limits = np.array([width_px, height_px, width_px, height_px])
-        inside = self.at(np.clip(self.corners, 0, limits))
-        known, whole = areas(inside.corners), areas(self.corners)
+        inside = np.clip(self.corners, 0, limits)
+        known, whole = areas(inside), areas(self.corners)
         ignored = self.ignored | (known < LEAST_VISIBLE * whole)
-        return Boxes(inside.corners, self.classes, self.scores, ignored)[known > 0]
+        return replace(self, corners=inside, ignored=ignored)[known > 0]
 
 
 def joined(several: Sequence[Boxes]) -> tuple[Boxes, np.ndarray]:

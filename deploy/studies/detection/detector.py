@@ -7,7 +7,7 @@ network that needs no suppression. Both take RGB in 0 to 1 on a grey letterbox, 
 
 import ast
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -64,7 +64,7 @@ class Detector:
         height, width = rgb.shape[:2]
         box = Letterbox(height, width, self.size_px)
         found = self.decoded(self._run(box.image(rgb)[None]))
-        inside = found.at(box.to_image(found.corners)).clipped(height, width)
+        inside = replace(found, corners=box.to_image(found.corners)).clipped(height, width)
         return Boxes.of(inside.corners, inside.classes, inside.scores)
 
     def decoded(self, output: np.ndarray) -> Boxes:

@@ -5,7 +5,7 @@ boxes back on the scene -> average precision.
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
 
@@ -103,7 +103,7 @@ class AcquiredScene:
     def boxes(self, detector: Detector, method: Method | None) -> Boxes:
         """What a detector finds on it, in scene pixels; arguments as of `shown`."""
         found = detector.detect(self.shown(method))
-        return found.at(found.corners * self.sensors.oversampling)
+        return replace(found, corners=found.corners * self.sensors.oversampling)
 
     def _acquired(self, profile: SensorProfile, role: str) -> np.ndarray:
         sensor, radiance = profile.draw(self.draw.generator("sensor")), self.scene.radiance(profile.nominal())

@@ -118,7 +118,8 @@ def method_named(name: str, degraded: SensorProfile, reference: SensorProfile, l
     if plain is not None:
         return plain
     network, _, other = name.partition(AT)
-    if not _is_network(network):
+    shipped = network.removesuffix(INT8) in shipped_names()
+    if not shipped and Path(network).suffix not in (".onnx", ".safetensors"):
         raise OptionError("--methods", expected=EXPECTED, got=repr(name), remedy="correct that name")
     sensor = load_sensor(other) if other else degraded
     model = float_model(network_file(Path(network), sensor, log))
@@ -139,10 +140,6 @@ def _network_specialise(name: str, like: SensorProfile, log: Log) -> Specialise 
         return network_method(found.model(known, name.endswith(INT8)), sensor.max_dn)
 
     return specialise
-
-
-def _is_network(name: str) -> bool:
-    return Path(name).suffix in (".onnx", ".safetensors") or name.removesuffix(INT8) in shipped_names()
 
 
 def knowledge_of(model: onnx.ModelProto, sensor_name: str) -> str:

@@ -80,13 +80,10 @@ def gain(work: Work, source: np.ndarray, result: np.ndarray, generator: np.rando
 
 def change(work: Work, source: np.ndarray, result: np.ndarray, nudge: np.ndarray) -> float:
     """Largest change of any pixel (H, W), in DN, for a nudge (H, W) of -1, 0 or 1 DN."""
-    return float(np.abs(work(_nudged(source, nudge)) - result).max())
-
-
-def _nudged(source: np.ndarray, nudge: np.ndarray) -> np.ndarray:
-    """The source and a change of 1 DN, turned round where it would leave the converter's range."""
     wanted = source + nudge
-    return np.asarray(np.where((wanted < 0) | (wanted > FULL_DN), source - nudge, wanted), np.float32)
+    # Turned round where it would leave the converter's range.
+    nudged = np.where((wanted < 0) | (wanted > FULL_DN), source - nudge, wanted)
+    return float(np.abs(work(np.asarray(nudged, np.float32)) - result).max())
 
 
 def refused(work: Callable[[], object]) -> Measure:
