@@ -29,16 +29,13 @@ def site_interval(
     count = len(set(sites))
     if count < LEAST_SITES:
         return None, f"no interval: {count} site{'s' if count > 1 else ''}, fewer than {LEAST_SITES}"
-    return _mean_interval(np.asarray(values, np.float64), np.asarray(sites), generator), WORDS
-
-
-def _mean_interval(numbers: np.ndarray, names: np.ndarray, generator: np.random.Generator) -> tuple[float, float]:
+    numbers, names = np.asarray(values, np.float64), np.asarray(sites)
     groups = [numbers[names == name] for name in np.unique(names)]
     sums, counts = (np.array([f(group) for group in groups]) for f in (np.sum, np.size))
     drawn = generator.integers(len(groups), size=(DRAWS, len(groups)))
     # Sums over counts and not a mean of means: a site of many images counts for them.
     means = sums[drawn].sum(1) / counts[drawn].sum(1)
-    return percentiles(means)
+    return percentiles(means), WORDS
 
 
 def percentiles(draws: np.ndarray) -> tuple[float, float]:

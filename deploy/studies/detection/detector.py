@@ -75,12 +75,12 @@ class Detector:
         """
         axis, size = (1, 4 + len(self.names)) if self.layout == "raw" else (2, 6)
         if output.ndim != 3 or len(output) != 1 or output.shape[axis] != size:
-            raise _unsound("an answer of the sizes that its file states", " x ".join(map(str, output.shape)))
+            raise _refused("an answer of the sizes that its file states", " x ".join(map(str, output.shape)))
         if not np.isfinite(output).all():
-            raise _unsound("finite boxes and scores", "NaN or infinity")
+            raise _refused("finite boxes and scores", "NaN or infinity")
         scores = output[:, 4:] if self.layout == "raw" else output[:, :, 4]
         if scores.min(initial=0) < -ROUNDING or scores.max(initial=0) > 1 + ROUNDING:
-            raise _unsound("scores in 0 to 1", "others: logits or an objectness perhaps")
+            raise _refused("scores in 0 to 1", "others: logits or an objectness perhaps")
         if self.layout == "raw":
             return suppress(_raw(output[0]))
         found = _final(output[0], len(self.names))
@@ -105,7 +105,7 @@ def open_detector(path: Path, threads: int = 0, size_px: int | None = None) -> D
     names = class_names(about.get("names"))
     if not names:
         stated = repr(about["names"])[:80] if "names" in about else "none"
-        raise _unread(path, "the names of its classes in its metadata, {0: 'ship', ...}", stated)
+        raise _refused("the names of its classes in its metadata, {0: 'ship', ...}", stated, path)
     layout = _layout(model, about, len(names), path)
     size = _size_px(fixed_tile_px(model), about, size_px, path)
     return Detector(names, size, layout, _flag(model), _runner(model, threads, path))
@@ -146,7 +146,7 @@ def _layout(model: onnx.ModelProto, about: dict[str, Any], classes: int, path: P
     read = f"for RGB, 1 x {4 + classes} x anchors for {classes} classes (raw) or 1 x N x 6 (nms=True or end2end)"
     shapes = ", ".join(" x ".join(map(str, sizes)) for sizes in outputs)
     got = f"task {task}, {' '.join(map(str, channels))} channels, output {shapes}"
-    raise _unread(path, f"a detector's output as Ultralytics exports it {read}", got)
+    raise _refused(f"a detector's output as Ultralytics exports it {read}", got, path)
 
 
 def _sizes(value: onnx.ValueInfoProto) -> list[int]:
@@ -192,15 +192,11 @@ def _final(output: np.ndarray, classes: int) -> Boxes:
     """Rows with a score that counts: the rest pads the list with zeros."""
     rows = output[output[:, 4] > LEAST_SCORE]
     if not np.isin(rows[:, 5], np.arange(classes)).all():
-        raise _unsound(f"classes from 0 to {classes - 1} in its sixth column", "others")
+        raise _refused(f"classes from 0 to {classes - 1} in its sixth column", "others")
     return Boxes.of(rows[:, :4], rows[:, 5].astype(np.int64), rows[:, 4])
 
 
-def _unsound(expected: str, got: str) -> ModelError:
-    return ModelError("detector", expected=expected, got=got, remedy=REMEDY)
-
-
-def _unread(path: Path, expected: str, got: str) -> ModelError:
+def _refused(expected: str, got: str, path: Path | str = "detector") -> ModelError:
     return ModelError(str(path), expected=expected, got=got, remedy=REMEDY)
 
 

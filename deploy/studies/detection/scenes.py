@@ -57,7 +57,8 @@ def synthetic_scene(generator: np.random.Generator, height_px: int, width_px: in
     """
     canvas = Canvas(height_px, width_px, generator)
     angle, (x, y) = generator.uniform(-0.5, 0.5), generator.uniform(-0.5, 0.5, 2) * PLOT_M
-    world, reach = turn(x, y, angle), canvas.reach_m + PLOT_M
+    # Half the diagonal: how far from the centre there is something to draw.
+    world, reach = turn(x, y, angle), math.hypot(width_px, height_px) * SCENE_GSD_M / 2 + PLOT_M
     places = (np.arange(math.ceil(2 * reach / PLOT_M)) + 0.5) * PLOT_M - reach
     plots = [Plot(canvas, *world(u, v), angle, (PLOT_M - STREET_M) / 2 - KERB_M) for v in places for u in places]
     streets = [(world(p + PLOT_M / 2, 0), angle + math.pi / 2) for p in places]
@@ -82,11 +83,6 @@ class Canvas:
         self._size = width_px, height_px
         self._image, self._shown = Image.new("F", self._size, GRASS), Image.new("I", self._size, 0)
         self._draw, self._draw_shown = ImageDraw.Draw(self._image), ImageDraw.Draw(self._shown)
-
-    @property
-    def reach_m(self) -> float:
-        """Half the diagonal: how far from the centre there is something to draw."""
-        return math.hypot(*self._size) * SCENE_GSD_M / 2
 
     def textured(self) -> np.ndarray:
         """The radiance (H, W) float32 with the ground's texture."""

@@ -92,12 +92,6 @@ EXPECTED = (
     "another), or an ONNX or safetensors file"
 )
 
-DRAWN = "drawn"
-"""What a sensor is called that no profile states."""
-
-AT = "@"
-"""Between a network's name and the sensor that it is to know in the place of the images' own."""
-
 
 def method_named(name: str, degraded: SensorProfile, reference: SensorProfile, log: Log = no_log) -> Method:
     """The method of that name; the traditional ones know both sensors, a shipped network the degraded one.
@@ -117,7 +111,7 @@ def method_named(name: str, degraded: SensorProfile, reference: SensorProfile, l
     plain = method_without_network(name, degraded.nominal(), reference.nominal())
     if plain is not None:
         return plain
-    network, _, other = name.partition(AT)
+    network, _, other = name.partition("@")
     shipped = network.removesuffix(INT8) in shipped_names()
     if not shipped and Path(network).suffix not in (".onnx", ".safetensors"):
         raise OptionError("--methods", expected=EXPECTED, got=repr(name), remedy="correct that name")
@@ -157,4 +151,4 @@ def profile_of(sensor: Sensor, like: SensorProfile) -> SensorProfile:
     numbers |= {"gain_dn_per_radiance": sensor.gain_dn_per_radiance, "bits": float(sensor.bits)}
     constants = {name: Constant(value, "assumed", "a sensor drawn") for name, value in numbers.items()}
     noise = {"snr_0": None, "snr_1": None}
-    return replace(like, name=DRAWN, **constants, **noise, response=sensor.response)  # type: ignore[arg-type]
+    return replace(like, name="drawn", **constants, **noise, response=sensor.response)  # type: ignore[arg-type]

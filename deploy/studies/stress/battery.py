@@ -12,7 +12,7 @@ from deploy.studies.stress.checks import Limitation, Measure, limitation_of, tor
 from deploy.studies.stress.networks import STAGES, Subject
 from model.progress import steps
 from profiles.errors import BeersError, OptionError
-from profiles.figures import Figure, Row, measured, predicted, unavailable
+from profiles.figures import Figure, Row, measured, predicted
 from quant.bounds import layer_bounds
 from quant.integer import INT32_BITS
 
@@ -177,8 +177,6 @@ def finding_rows(results: Iterable[StageResult]) -> list[Row]:
 
 
 def _figure(measure: Measure) -> Figure:
-    if not math.isfinite(measure.value):
-        return unavailable(measure.unit, f"{measure.check} is not finite")
     return measured(measure.value, measure.unit, SOURCE)
 
 

@@ -90,11 +90,6 @@ def noisy(side: int, generator: np.random.Generator) -> list[np.ndarray]:
     return [_digital(clean * (1 + generator.standard_normal(clean.shape) / 3))]
 
 
-def clean(side: int, generator: np.random.Generator) -> list[np.ndarray]:
-    """A drawn ground without any noise: one image (side, side)."""
-    return [ground(side, generator)]
-
-
 def through(mtf_nyquist: float) -> Draw:
     """A drawn ground seen through such an MTF, without noise."""
     return lambda side, generator: [ground(side, generator, mtf_nyquist)]
@@ -190,7 +185,7 @@ CASES = (
     Case("ramps", ramps),
     Case("Siemens star", star),
     Case("SNR 3", noisy),
-    Case("no noise", clean),
+    Case("no noise", through(DRAWN_MTF)),
     Case("MTF 0.1 %", through(0.001)),
     Case("MTF 60 %", through(0.6)),
     Case("nodata stripes", stripes, pixels="missing"),
