@@ -20,7 +20,7 @@ from safetensors import SafetensorError, safe_open
 from torch import Tensor, nn
 from torch.nn import functional
 
-from profiles.errors import ModelError, OptionError
+from profiles.errors import ModelError
 from profiles.toml import unreadable
 
 
@@ -38,18 +38,6 @@ BACKBONES: Mapping[str, BackboneSpec] = {
     "alex": BackboneSpec("alexnet", (1, 4, 7, 9, 11), min_side_px=31),
     "vgg": BackboneSpec("vgg16", (3, 8, 15, 22, 29), min_side_px=16),
 }
-
-
-def backbone_spec(network: str) -> BackboneSpec:
-    """The spec of "squeeze", "alex" or "vgg".
-
-    Raises:
-        OptionError: no such network.
-    """
-    if network not in BACKBONES:
-        expected = f"one of {', '.join(BACKBONES)}"
-        raise OptionError("perceptual network", expected=expected, got=repr(network), remedy="choose one of them")
-    return BACKBONES[network]
 
 
 class Fire(nn.Module):
@@ -84,14 +72,11 @@ class Backbone(nn.Module):
     Args:
         network: "squeeze", "alex" or "vgg".
         l2_pool: DISTS's pooling in the place of the max pooling.
-
-    Raises:
-        OptionError: no such network.
     """
 
     def __init__(self, network: str, *, l2_pool: bool = False) -> None:
         super().__init__()
-        self.network, self.spec = network, backbone_spec(network)
+        self.network, self.spec = network, BACKBONES[network]
         layers = {"squeeze": _squeezenet, "alex": _alexnet, "vgg": _vgg16}[network]()
         if l2_pool:
             layers = [L2Pool() if isinstance(layer, nn.MaxPool2d) else layer for layer in layers]
@@ -163,11 +148,8 @@ def find_backbone(network: str, place: Path | None = None) -> Path | None:
         place: a file, which is taken at its word, or a folder. Without it the environment variable
             BEERS_LPIPS_WEIGHTS is asked; it may name a file or a folder, and a file counts only for the network
             its name begins with.
-
-    Raises:
-        OptionError: no such network.
     """
-    stem = backbone_spec(network).file_stem
+    stem = BACKBONES[network].file_stem
     if place is not None and not place.is_dir():
         return place
     named = place or os.environ.get(WEIGHTS_VARIABLE)
@@ -179,7 +161,7 @@ def find_backbone(network: str, place: Path | None = None) -> Path | None:
 
 def not_found(network: str) -> str:
     """Why a metric is unavailable when `find_backbone` found nothing."""
-    names = " or ".join(f"{backbone_spec(network).file_stem}*{suffix}" for suffix in SUFFIXES)
+    names = " or ".join(f"{BACKBONES[network].file_stem}*{suffix}" for suffix in SUFFIXES)
     return f"weights not found: no {names}; set {WEIGHTS_VARIABLE} to the file or its folder"
 
 
@@ -192,7 +174,6 @@ def load_backbone(network: str, path: Path, *, l2_pool: bool = False) -> Backbon
         l2_pool: DISTS's pooling in the place of the max pooling.
 
     Raises:
-        OptionError: no such network.
         ModelError: missing, of a kind that is not read, or with a parameter missing, misshapen or not finite.
     """
     backbone = Backbone(network, l2_pool=l2_pool)

@@ -47,7 +47,6 @@ class Lpips(nn.Module):
             path: .safetensors or .npz, parameters named as in torchvision.
 
         Raises:
-            OptionError: no such network.
             ModelError: the file is missing, of a kind that is not read, or not that network.
         """
         backbone = load_backbone(network, path)

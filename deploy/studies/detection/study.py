@@ -170,14 +170,9 @@ def run_study(
         BeersError: a name, a profile or a picture that cannot be used.
     """
     told = once(say)
-    pairs = [_pair(name, reference, told) for name in sensors]
+    pairs = [SensorPair(each, reference_beside(each, reference, told)) for each in map(load_sensor, sensors)]
     rows = [{name: method_named(name, pair.degraded, pair.reference, told) for name in methods} for pair in pairs]
     return [_compared(detector, scenes, *each, seed) for each in zip(pairs, rows, strict=True)]
-
-
-def _pair(name: str, reference: str | None, say: Log) -> SensorPair:
-    degraded = load_sensor(name)
-    return SensorPair(degraded, reference_beside(degraded, reference, say))
 
 
 def _compared(

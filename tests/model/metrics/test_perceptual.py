@@ -13,7 +13,7 @@ from torch.nn.functional import conv2d, max_pool2d, pad
 
 from model.metrics.backbones import BACKBONES, WEIGHTS_VARIABLE, Backbone, find_backbone, not_found
 from model.metrics.perceptual import MIN_NORM, PUBLISHED, Dists, Lpips, _unit
-from profiles.errors import ImageError, ModelError, OptionError
+from profiles.errors import ImageError, ModelError
 
 Weights = dict[str, np.ndarray]
 Maps = list[Tensor]
@@ -334,11 +334,9 @@ def test_a_broken_file_is_refused(tmp_path: Path, suffix: str, content: bytes) -
         Lpips.load("squeeze", path)
 
 
-def test_a_missing_file_and_an_unknown_network_are_refused(tmp_path: Path) -> None:
+def test_a_missing_file_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ModelError, match="no such file"):
         Lpips.load("squeeze", tmp_path / "none.npz")
-    with pytest.raises(OptionError, match="squeeze, alex, vgg"):
-        Lpips.load("resnet", tmp_path / "none.npz")
 
 
 def test_where_a_backbone_is_looked_for(tmp_path: Path, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
