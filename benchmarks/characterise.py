@@ -22,6 +22,7 @@ from torch import Tensor
 
 from deploy.export import torch_network
 from deploy.studies.characterise import (
+    AXES,
     Box,
     Characterised,
     Snr,
@@ -31,7 +32,6 @@ from deploy.studies.characterise import (
     snr_at,
 )
 from deploy.studies.evaluation.pairs import simulate_pairs
-from deploy.studies.evaluation.sweep import Fixed
 from model.family import LEAST_ALONG, SensorFamily
 from model.io.images import list_images
 from model.metrics.edge_blur import AxisMtf
@@ -108,7 +108,7 @@ def as_read(found: Characterised, path: Path) -> Sensor:
 
 def psnr_lost(weights: Path, scene: Scene, sensor: Sensor, found: Sensor) -> float:
     """By a network that knows the sensor that was found, beside the same that knows the true one, in dB."""
-    (pair,), _ = simulate_pairs([scene], Fixed(sensor), Fixed(REFERENCE.in_units_of(sensor)), 0)
+    (pair,), _ = simulate_pairs([scene], sensor, REFERENCE.in_units_of(sensor), 0)
     image = torch.from_numpy(pair.degraded.astype(np.float32) / sensor.max_dn)[None, None]
     scores = []
     for known in (sensor, found):
@@ -173,7 +173,7 @@ class Findings:
                 print(f"- {error}")
         else:
             snrs = found.snrs
-            for axis, true in zip((found.across, found.along), sensor.mtf_axes, strict=True):
+            for axis, true in zip(map(found.axes.get, AXES), sensor.mtf_axes, strict=True):
                 self.mtf += [judged(axis.mtf_nyquist, axis.interval, true)] if isinstance(axis, AxisMtf) else []
         for snr in snrs:
             self.snr.append(judged(snr.value, snr.interval, snr.radiance / sensor.noise_sigma(snr.radiance)))

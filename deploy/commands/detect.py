@@ -103,9 +103,9 @@ def _refuse_unused(context: typer.Context) -> None:
 def show(compared: "Sequence[Comparison]") -> None:
     """The tables that answer the question, and the paper's."""
     from deploy.results import print_rows
-    from deploy.studies.detection.tables import detection_rows, main_table, paper_rows
+    from deploy.studies.detection.tables import main_rows, paper_rows
     from profiles.figures import by_table
 
-    mains = [row for each in compared for row in detection_rows(each) if row.table == main_table(each.name)]
+    mains = [row for each in compared for row in main_rows(each)]
     for table, rows in by_table([*mains, *paper_rows()]).items():
         print_rows(table, rows)

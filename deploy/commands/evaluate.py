@@ -48,7 +48,8 @@ def evaluate(
     @blind or with @ and another sensor.
     """
     from deploy.results import Document, print_rows
-    from deploy.studies.evaluation.run import input_files, run_evaluation
+    from deploy.studies.evaluation.page import write_page
+    from deploy.studies.evaluation.run import run_evaluation
     from model.io.files import require_writable
     from profiles.errors import OptionError
     from profiles.figures import by_table
@@ -77,9 +78,8 @@ def evaluate(
     for note in found.notes:
         say(note)
     if out is not None:
-        say(f"wrote {found.write(out)}")
+        say(f"wrote {write_page(found, out)}")
     degraded, wanted = (profile.name for profile in found.sensors)
     arguments: dict[str, object] = {"images": images, "pairs": pairs, "sensor": sensor or degraded}
     arguments |= {"reference": wanted, "methods": methods, "lpips": lpips, "out": out, "sweep": sweep, "seed": seed}
-    inputs = input_files(names, images, pairs, lpips)
-    Document("evaluate", arguments, inputs, found.rows).write(json)
+    Document("evaluate", arguments, tuple(found.inputs), found.rows).write(json)

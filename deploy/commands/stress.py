@@ -83,7 +83,6 @@ def stress(
     from deploy.studies.stress.networks import STAGES, open_subject
     from deploy.studies.stress.tables import markdown, title
     from model.io.files import require_writable, write_text
-    from model.progress import steps
     from profiles.figures import by_table
 
     _refuse_unused(context, float_model, bit_flips)
@@ -99,8 +98,7 @@ def stress(
     wanted = chosen(stages, STAGES, "--stages")
     subject = open_subject(*files, sensor, tell)
     selected = [case for case in CASES if case.name in names]
-    with steps("stressing", len(selected) * len(wanted)) as bar:
-        results = run_battery(subject, selected, wanted, seed, bar.advance, size)
+    results = run_battery(subject, selected, wanted, seed, size)
     shown = [*battery_rows(results), *worst_rows(results), *limitation_rows(results), *layer_rows(subject)]
     for table, rows in by_table(shown).items():
         print_rows(title(table), rows)
@@ -141,15 +139,13 @@ def _flip_bits(
     from dataclasses import asdict
 
     from deploy.results import Document, print_rows
-    from deploy.studies.stress.bit_flips import flip_curves_svg, flip_rows, ticks
+    from deploy.studies.stress.bit_flips import flip_curves_svg, flip_rows
     from deploy.studies.stress.tables import markdown, title
     from model.io.files import write_text
-    from model.progress import steps
     from profiles.figures import by_table
 
     out, picture, json = wanted
-    with steps("turning bits over", ticks(request)) as bar:
-        rows = flip_rows(subject, request, bar.advance)
+    rows = flip_rows(subject, request)
     for table, found in by_table(rows).items():
         print_rows(title(table), found)
     Document("stress", {"bit_flips": True, **asdict(request)}, subject.paths, tuple(rows)).write(json)

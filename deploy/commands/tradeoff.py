@@ -88,7 +88,7 @@ def tradeoff(
     from deploy.studies.tradeoff.advice import parse_constraints
     from deploy.studies.tradeoff.page import FILES, write_study
     from deploy.studies.tradeoff.points import parse_targets
-    from deploy.studies.tradeoff.run import input_files, run_study
+    from deploy.studies.tradeoff.run import run_study
     from model.io.files import require_writable
     from model.shipped import shipped_names
     from profiles.sensor_file import REFERENCE, load_sensor, reference_beside
@@ -131,8 +131,7 @@ def tradeoff(
     arguments |= {"target": target, "network": ",".join(own) or None}
     if labelled:
         arguments |= {"labelled": labelled, "detector": detector, "classes": classes}
-    inputs = input_files(names, images, calibration, lpips, labelled, detector)
-    document = Document("tradeoff", arguments, inputs, study.rows)
+    document = Document("tradeoff", arguments, tuple(study.inputs), study.rows)
     for path in (out / "tradeoff.json", json):
         document.write(path)
     say(f"wrote {out / FILES[0]}")

@@ -6,6 +6,7 @@ What pixels tell is measured, with intervals: blur by straight edges, noise by t
 
 import json
 import math
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,6 +26,7 @@ FULL_SCALE_RADIANCE = 400.0
 PARTS = (16, 4)
 """Of full scale: the radiances at which SNRs are stated, as those that a network is told of."""
 GSD_M, OVERSAMPLING, SEED = 0.5, 4, 0
+AXES = ("across", "along")
 TILE_PX, BOX_PX = 1024, 2 * HALF_PX + 1
 MAX_DN = 65535
 CLIPPED_PIXELS, PILE = 10, 4
@@ -49,13 +51,14 @@ class Box:
         Raises:
             OptionError: outside the image, or too small for an edge.
         """
-        height, width = pixels.shape
-        small = min(self.width, self.height) < BOX_PX
-        if small or self.left + self.width > width or self.top + self.height > height:
-            got = str(self)
+        part = pixels[self.top : self.top + self.height, self.left : self.left + self.width]
+        if part.shape != (self.height, self.width) or min(part.shape) < BOX_PX:
+            height, width = pixels.shape
             expected = f"a box of {BOX_PX} x {BOX_PX} pixels or more inside its {width} x {height}"
-            raise OptionError("--edge", expected=expected, got=got, remedy="X,Y is the upper left pixel, from 0")
-        return pixels[self.top : self.top + self.height, self.left : self.left + self.width]
+            raise OptionError(
+                "--edge", expected=expected, got=str(self), remedy="X,Y is the upper left pixel, from 0"
+            )
+        return part
 
     def __str__(self) -> str:
         return f"{self.image}:{self.left},{self.top},{self.width},{self.height}"
@@ -67,16 +70,15 @@ def read_box(text: str, images: Sequence[Path]) -> Box:
     Raises:
         OptionError: written otherwise, or of another image.
     """
-    name, _, numbers = text.rpartition(":")
-    places = numbers.split(",")
-    if len(places) != 4 or not all(place.isascii() and place.isdigit() and len(place) < 9 for place in places):
+    parts = re.fullmatch(r"(.*):(\d{1,8}),(\d{1,8}),(\d{1,8}),(\d{1,8})", text, re.ASCII)
+    if parts is None:
         expected, remedy = "FILE:X,Y,WIDTH,HEIGHT in whole pixels", "write raw.tif:1200,340,60,60"
         raise OptionError("--edge", expected=expected, got=repr(text), remedy=remedy)
-    image = next((path for path in images if path == Path(name)), None)
-    if image is None:
+    name, *places = parts.groups()
+    if Path(name) not in images:
         remedy = "name it as the argument does"
         raise OptionError("--edge", expected="one of the images that are given", got=repr(name), remedy=remedy)
-    return Box(image, *(int(place) for place in places))
+    return Box(Path(name), *map(int, places))
 
 
 @dataclass(frozen=True)
@@ -98,8 +100,7 @@ class Characterised:
         stated: what the user said of bits, gain in DN per W/m2/sr/um and gsd_m; None of what was not said.
         bits: of a digital number.
         gain: DN per W/m2/sr/um, stated or assumed.
-        across: MTF across the track; None where no edge shows it.
-        along: that along it.
+        axes: MTF "across" and "along" the track; an axis that no edge shows is left out.
         snrs: at two radiances.
         noise: the line that they lie on.
     """
@@ -108,15 +109,13 @@ class Characterised:
     stated: Mapping[str, float | None]
     bits: int
     gain: float
-    across: AxisMtf | None
-    along: AxisMtf | None
+    axes: Mapping[str, AxisMtf]
     snrs: tuple[Snr, Snr]
     noise: NoiseModel
 
     def rows(self) -> list[Row]:
         """The figures, as commands report them."""
-        axes = {"MTF across at Nyquist": self.across, "MTF along at Nyquist": self.along}
-        figures = {name: _mtf_figure(axis) for name, axis in axes.items()}
+        figures = {f"MTF {name} at Nyquist": _mtf_figure(self.axes.get(name)) for name in AXES}
         for snr in self.snrs:
             source = f"{self.noise.blocks} blocks of 16 x 16" + (", extrapolated" if snr.extrapolated else "")
             figures[f"SNR at {snr.radiance:g} W/m2/sr/um"] = measured(snr.value, "ratio", source, snr.interval)
@@ -158,13 +157,13 @@ def characterise(
         got, remedy = "one of them twice", "give each once: a second look at the same pixels knows nothing new"
         raise OptionError("images", expected="different images", got=got, remedy=remedy)
     stated = {"bits": bits, "gain": gain, "gsd_m": gsd_m}
-    bits = _settled_bits(bits, [_digitised(path) for path in images])
+    bits = _settled_bits(bits, images)
     clipped_at = 2**bits - 1
     noise = measured_noise(images, clipped_at)
-    across, along = _axes(images, boxes, noise, clipped_at)
+    axes = _axes(images, boxes, noise, clipped_at)
     gain = gain or clipped_at / FULL_SCALE_RADIANCE
     low, high = (snr_at(noise, clipped_at / part, gain) for part in PARTS)
-    return Characterised(images, stated, bits, gain, across, along, (low, high), noise)
+    return Characterised(images, stated, bits, gain, axes, (low, high), noise)
 
 
 def read_raw(path: Path) -> np.ndarray:
@@ -184,44 +183,39 @@ def read_raw(path: Path) -> np.ndarray:
     return pixels
 
 
-def _tiles(pixels: np.ndarray) -> Iterator[np.ndarray]:
-    """Parts of an image of up to 1024 x 1024 pixels, float64."""
-    for top in range(0, pixels.shape[0], TILE_PX):
-        for left in range(0, pixels.shape[1], TILE_PX):
-            yield pixels[top : top + TILE_PX, left : left + TILE_PX].astype(np.float64)
+def _tiles(images: Sequence[Path]) -> Iterator[np.ndarray]:
+    """Parts of images of up to 1024 x 1024 pixels, float64."""
+    for pixels in map(read_raw, images):
+        for top in range(0, pixels.shape[0], TILE_PX):
+            for left in range(0, pixels.shape[1], TILE_PX):
+                yield pixels[top : top + TILE_PX, left : left + TILE_PX].astype(np.float64)
 
 
-Digitised = tuple[int, bool, bool]
-"""The largest digital number of an image, whether its pixels pile up there, and whether 8 bits store it."""
+def _settled_bits(stated: int | None, images: Sequence[Path]) -> int:
+    """The bits that were given, or those that pixels clipped at full scale show."""
+    largest, full_scale = max(_brightest(path) for path in images)
+    bits = largest.bit_length() if stated is None else stated
+    if stated is None and not full_scale:
+        expected = "--bits beside images that are not clipped at full scale, or are stored in 8 bits"
+        remedy = "give the digitiser's, such as --bits 12"
+        raise OptionError("bits", expected=expected, got=f"values up to {largest}", remedy=remedy)
+    if largest > 2**bits - 1:
+        expected, remedy = f"digital numbers up to {2**bits - 1}", "give the bits of the raw image"
+        raise OptionError("--bits", expected=expected, got=f"{largest}", remedy=remedy)
+    return bits
 
 
-def _digitised(path: Path) -> Digitised:
+def _brightest(path: Path) -> tuple[int, bool]:
+    """The largest digital number of an image, and whether pixels pile up there as at a full scale alone."""
     pixels = read_raw(path)
-    largest = int(pixels.max())
-    whole = pixels.astype(np.int64, copy=False).ravel()
+    largest, whole = int(pixels.max()), pixels.astype(np.int64, copy=False).ravel()
     step = int(np.gcd.reduce(whole - whole.min()))
     if step > 1:
         remedy = f"divide it by {step}: {step - 1} of {step} values never occur, so they are no digital numbers"
         raise ImageError(str(path), expected="digital numbers in steps of 1", got=f"steps of {step}", remedy=remedy)
-    count, below = (int((pixels == value).sum()) for value in (largest, largest - 1))
-    return largest, count >= max(CLIPPED_PIXELS, PILE * below), pixels.dtype.itemsize == 1
-
-
-def _settled_bits(stated: int | None, images: Sequence[Digitised]) -> int:
-    """The bits that were given, or those that pixels clipped at full scale show."""
-    largest, clipped, narrow = max(images)
-    if stated is not None:
-        if largest > 2**stated - 1:
-            expected = f"digital numbers up to {2**stated - 1}"
-            remedy = "give the bits of the raw image"
-            raise OptionError("--bits", expected=expected, got=f"{largest}", remedy=remedy)
-        return stated
-    bits = largest.bit_length()
-    if narrow or largest != 2**bits - 1 or not clipped:
-        got = f"values up to {largest}" + (" in 8 bits" if narrow else "")
-        expected = "--bits beside images that are not clipped at full scale"
-        raise OptionError("bits", expected=expected, got=got, remedy="give the digitiser's, such as --bits 12")
-    return bits
+    count, below = (int((whole == value).sum()) for value in (largest, largest - 1))
+    piled = count >= max(CLIPPED_PIXELS, PILE * below) and pixels.dtype.itemsize > 1
+    return largest, piled and largest == 2 ** largest.bit_length() - 1
 
 
 def snr_at(noise: NoiseModel, dn: float, gain: float) -> Snr:
@@ -233,23 +227,17 @@ def snr_at(noise: NoiseModel, dn: float, gain: float) -> Snr:
     return Snr(dn / gain, value, (low, high), variance.extrapolated)
 
 
-REMEDIES = {
-    "few-windows": "give more raw images of plain ground, neither restored nor resampled",
-    "range": "give images of dark and of bright ground",
-    "no-noise": "give the image before restoring or resampling; noise below the rounding cannot be measured",
-}
-
-
 def measured_noise(images: Sequence[Path], clipped_at: int) -> NoiseModel:
     """The noise in the digital numbers of images that clip at a value.
 
     Raises:
         ImageError: it cannot be known.
     """
-    blocks = [cut_blocks(tile, clipped_at) for path in images for tile in _tiles(read_raw(path))]
+    blocks = [cut_blocks(tile, clipped_at) for tile in _tiles(images)]
     noise = fit_noise_model(join(blocks), np.random.default_rng(SEED))
     if isinstance(noise, Refusal):
-        expected, remedy = "blurred, raw ground with white noise, from dark to bright", REMEDIES[noise.status]
+        expected = "blurred, raw ground with white noise, from dark to bright"
+        remedy = "give more raw images of plain ground, dark and bright, neither restored nor resampled"
         raise ImageError(f"noise of {_named(images)}", expected=expected, got=noise.reason, remedy=remedy)
     return noise
 
@@ -259,25 +247,22 @@ def _named(images: Sequence[Path]) -> str:
     return f"{images[0].name}{more}"
 
 
-def _axes(
-    images: Sequence[Path], boxes: Sequence[Box], noise: NoiseModel, clipped_at: float
-) -> tuple[AxisMtf | None, AxisMtf | None]:
+def _axes(images: Sequence[Path], boxes: Sequence[Box], noise: NoiseModel, clipped_at: float) -> dict[str, AxisMtf]:
     """MTF across (edges near the vertical) and along the track, at least one of them."""
     upright, lying = _pointed_at(boxes, noise, clipped_at)
-    for tile in (tile for path in images if not boxes for tile in _tiles(read_raw(path))):
+    for tile in () if boxes else _tiles(images):
         upright += find_blurs(tile, noise.total, clipped_at)
         lying += find_blurs(tile.T, noise.total, clipped_at)
-    least = 1 if boxes else MIN_FOUND
-    across = combine(upright, lying) if len(upright) >= least else None
-    along = combine(lying, upright) if len(lying) >= least else None
-    if across is None and along is None:
+    least, edges = 1 if boxes else MIN_FOUND, zip(AXES, (upright, lying), (lying, upright), strict=True)
+    axes = {name: combine(own, others) for name, own, others in edges if len(own) >= least}
+    if not axes:
         raise ImageError(
             f"edges of {_named(images)}",
             expected=f"{MIN_FOUND} straight edges between even areas, 17 pixels long and 8 to both sides, or more",
             got=f"{len(upright)} near the vertical and {len(lying)} near the horizontal",
             remedy="point at one as --edge FILE:X,Y,WIDTH,HEIGHT, or image a target, a large roof or an apron",
         )
-    return across, along
+    return axes
 
 
 def _pointed_at(boxes: Sequence[Box], noise: NoiseModel, clipped_at: float) -> tuple[list[EdgeBlur], list[EdgeBlur]]:
@@ -286,9 +271,9 @@ def _pointed_at(boxes: Sequence[Box], noise: NoiseModel, clipped_at: float) -> t
     for box in boxes:
         region = box.cut(read_raw(box.image)).astype(np.float64)
         lies = _rise(region.T) > _rise(region)
-        clipped = bool(((region <= 0) | (region >= clipped_at)).any())
-        refusal = Refusal("clipped", "clipped pixels")
-        edge = refusal if clipped else fit_blur(region.T if lies else region, noise.total, POINTED_AT)
+        edge = fit_blur(region.T if lies else region, noise.total, POINTED_AT)
+        if region.min() <= 0 or region.max() >= clipped_at:
+            edge = Refusal("clipped pixels")
         if isinstance(edge, Refusal):
             expected, remedy = "one straight edge, from side to side", "box another, or tighter"
             raise ImageError(f"--edge {box}", expected=expected, got=edge.reason, remedy=remedy)
@@ -299,7 +284,7 @@ def _pointed_at(boxes: Sequence[Box], noise: NoiseModel, clipped_at: float) -> t
 def _rise(region: np.ndarray) -> float:
     """How much brighter one side is than the other, along the rows."""
     first, *_, last = np.array_split(region, 3, axis=1)
-    return abs(float(last.mean() - first.mean())) if first.size and last.size else 0.0
+    return abs(float(last.mean() - first.mean()))
 
 
 def profile_toml(found: Characterised) -> str:
@@ -329,14 +314,11 @@ def profile_toml(found: Characterised) -> str:
 
 
 def _mtf_lines(found: Characterised, images: str) -> Iterator[str]:
-    both = found.across or found.along
-    assert both is not None  # noqa: S101 - `characterise` has refused that
-    if found.across is None or found.along is None:
-        seen, missing = ("along", "across") if found.across is None else ("across", "along")
+    if len(found.axes) == 1:
+        seen, missing = sorted(AXES, key=lambda name: name not in found.axes)
         yield f"# measured {seen} the track alone: no edge shows the MTF {missing} it"
-    yield from _axis_lines("mtf_nyquist", both, images)
-    if found.across and found.along:
-        yield from _axis_lines("mtf_nyquist_along", found.along, images)
+    for key, axis in zip(("mtf_nyquist", "mtf_nyquist_along"), found.axes.values(), strict=False):
+        yield from _axis_lines(key, axis, images)
 
 
 def _axis_lines(key: str, axis: AxisMtf, images: str) -> Iterator[str]:

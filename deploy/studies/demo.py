@@ -4,7 +4,7 @@ Each step is the verb's own function; here their rows are joined.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -74,20 +74,8 @@ NOTES = (
 )
 
 
-@dataclass(frozen=True)
-class Sensors:
-    """The sensor that acquired an image and the one to imitate."""
-
-    degraded: SensorProfile
-    reference: SensorProfile
-
-
-@dataclass(frozen=True)
-class Input:
-    """The degraded image, (H, W) digital numbers, and the truth where it is known."""
-
-    degraded: np.ndarray
-    pair: Pair | None
+Sensors = tuple[SensorProfile, SensorProfile]
+"""The sensor that acquired an image and the one to imitate."""
 
 
 def run_demo(
@@ -105,9 +93,9 @@ def run_demo(
     """
     say("reading the image")
     sensors = load_sensors(sensor)
-    given = read_input(image, seed, sensors, full_scale)
+    degraded, pair = read_input(image, seed, sensors, full_scale)
     say("telling the shipped network the sensor, and gating its INT8")
-    write_networks(out, sensors, say)
+    write_networks(out, sensors[0], say)
     float_file, int8_file = out / "float.onnx", out / "int8.onnx"
     gate = run_gate(
         Request(float_file, int8_file, Limits(), None, DEFAULT_TARGET, sensor, None, GATE_PATCHES, seed)
@@ -115,20 +103,20 @@ def run_demo(
     say("checking every operator against the DPU")
     placement = place(read_network(int8_file, TILE_PX), load_dpu(DEFAULT_TARGET))
     say("restoring: traditional pipeline and INT8 network")
-    chain = Chain(sensors.degraded.nominal(), sensors.reference.nominal())
+    chain = Chain(sensors[0].nominal(), sensors[1].nominal())
     images = {
-        INPUT: given.degraded,
-        TRADITIONAL: restore_traditional(torch.from_numpy(given.degraded), chain).numpy(),
-        INT8: np.rint(restore(given.degraded, int8_file, full_scale=MAX_DN)),
+        INPUT: degraded,
+        TRADITIONAL: restore_traditional(torch.from_numpy(degraded), chain).numpy(),
+        INT8: np.rint(restore(degraded, int8_file, full_scale=MAX_DN)),
     }
     write_tiff(out / "restored.tif", images[INT8].astype(np.uint16))
     quality = []
-    if given.pair is not None:
-        reference = given.pair.reference.numpy()
-        quality = [_fidelity(name, dn, reference, given.degraded) for name, dn in images.items()]
+    if pair is not None:
+        reference = pair.reference.numpy()
+        quality = [_fidelity(name, dn, reference, degraded) for name, dn in images.items()]
         images[REFERENCE] = reference
     say("measuring the traditional pipeline, predicting the board")
-    bench = bench_tables(int8_file, given.degraded, sensors)
+    bench = bench_tables(int8_file, degraded, sensors)
     tables = [*bench, *([Table("Quality on this image, over 4095 DN", quality)] if quality else [])]
     tables.append(Table("What quantisation changes", [gate], GATE_CAPTION))
     sentence = headline(bench[0].rows, quality, placement)
@@ -146,31 +134,37 @@ def load_sensors(name: str = SENSOR) -> Sensors:
     if degraded.nominal().bits != BITS:
         got, remedy = f"{degraded.nominal().bits} bits", "use 'restore', with --full-scale or --method traditional"
         raise OptionError("--sensor", expected=f"a sensor of {BITS} bits", got=got, remedy=remedy)
-    return Sensors(degraded, reference_for(degraded))
+    return degraded, reference_for(degraded)
 
 
-def read_input(image: Path | None, seed: int, sensors: Sensors, full_scale: float | None = None) -> Input:
-    """A synthetic scene, a photograph as a scene (8 bits), or a raw acquisition (mono, up to 12 bits).
+def read_input(
+    image: Path | None, seed: int, sensors: Sensors, full_scale: float | None = None
+) -> tuple[np.ndarray, Pair | None]:
+    """The degraded image (H, W) in digital numbers, and the pair that it belongs to where it is simulated.
 
-    With the pixel value that is its `full_scale`, any image is a raw acquisition.
+    Args:
+        image: a photograph as a scene (8 bits) or a raw acquisition (mono, up to 12 bits); a synthetic scene if None.
+        seed: of every random draw.
+        sensors: that acquire a scene.
+        full_scale: pixel value that is full scale: with it any image is a raw acquisition.
     """
-    ratio = int(sensors.degraded.oversampling.low)
+    (degraded, reference), ratio = (profile.nominal() for profile in sensors), int(sensors[0].oversampling.low)
     if image is None:
         side = (SIDE_PX + 2 * MARGIN_PX) * ratio
         scene = procedural_scene(side, side, np.random.default_rng(seed))
     elif full_scale is None and read_pixels(image).dtype == np.uint8:
-        scene = read_scene(image, sensors.reference.nominal())
+        scene = read_scene(image, reference)
     else:
-        return Input(read_acquisition(image, full_scale, None), None)
-    pair = simulate_pair(scene.radiance, sensors.degraded.nominal(), sensors.reference.nominal(), ratio, Draw(seed))
-    return Input(pair.degraded.numpy(), pair)
+        return read_acquisition(image, full_scale, None), None
+    pair = simulate_pair(scene.radiance, degraded, reference, ratio, Draw(seed))
+    return pair.degraded.numpy(), pair
 
 
-def write_networks(out: Path, sensors: Sensors, say: Log) -> None:
+def write_networks(out: Path, sensor: SensorProfile, say: Log) -> None:
     """Write the shipped network, told the sensor: in float32, in INT8, and the INT8 core for the board."""
     shipped = Conditioned(VARIANT, shipped_weights(VARIANT))
-    warn_outside(sensors.degraded, say)
-    floating, int8 = (shipped.model(sensors.degraded, int8) for int8 in (False, True))
+    warn_outside(sensor, say)
+    floating, int8 = (shipped.model(sensor, int8) for int8 in (False, True))
     for name, model in (("float", floating), ("int8", int8), ("core", board_model(read_core(int8), metadata(int8)))):
         save_onnx(model, out / f"{name}.onnx")
 
@@ -187,7 +181,7 @@ def _fidelity(name: str, dn: np.ndarray, reference: np.ndarray, degraded: np.nda
 def bench_tables(model: Path, dn: np.ndarray, sensors: Sensors) -> list[Table]:
     """Speed for this image, for the swath of the paper beside its rows, and for that swath on every board."""
     dpu, halo_px = load_dpu(DEFAULT_TARGET), tiling_of(load_onnx(model)).halo_px
-    chain = measure_chain(dn, sensors.degraded, sensors.reference)
+    chain = measure_chain(dn, *sensors)
     prediction, rows = predict_file(model, dpu), []
     for width, height in ((dn.shape[1], dn.shape[0]), SWATH_PX):
         swath = Swath(width, height, TILE_PX, halo_px)
@@ -200,13 +194,9 @@ def bench_tables(model: Path, dn: np.ndarray, sensors: Sensors) -> list[Table]:
     title = "A swath of {} x {}, beside the paper's figures".format(*SWATH_PX)
     return [
         Table(f"Time and power for this image, {dn.shape[1]} x {dn.shape[0]}", rows[0]),
-        Table(title, [_in_table(row, "swath") for row in (*rows[1], *published_rows())], SWATH_CAPTION),
-        Table("The same swath on each board, predicted", [_in_table(row, "boards") for row in boards], words),
+        Table(title, [replace(row, table="swath") for row in (*rows[1], *published_rows())], SWATH_CAPTION),
+        Table("The same swath on each board, predicted", [replace(row, table="boards") for row in boards], words),
     ]
-
-
-def _in_table(row: Row, table: str) -> Row:
-    return Row(table, row.name, row.figures, row.text)
 
 
 def pictures_of(images: dict[str, np.ndarray], out: Path) -> list[Picture]:

@@ -7,10 +7,9 @@ import sys
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
-from deploy.studies.stress.bit_flips import SETS, FlipRequest, flip_curves_svg, flip_rows, ticks
+from deploy.studies.stress.bit_flips import SETS, FlipRequest, flip_curves_svg, flip_rows
 from deploy.studies.stress.networks import open_subject
 from model.io.files import write_text
-from model.progress import steps
 from profiles.figures import Row
 
 DOCS = Path(__file__).parents[1]
@@ -86,9 +85,7 @@ def table(networks: Mapping[str, Sequence[Row]]) -> Iterator[str]:
 
 def rows_of(variant: str) -> list[Row]:
     """The study of one shipped network."""
-    subject = open_subject(None, None, variant)
-    with steps(f"injecting bit flips into {variant}", ticks(REQUEST)) as bar:
-        return flip_rows(subject, REQUEST, bar.advance)
+    return flip_rows(open_subject(None, None, variant), REQUEST)
 
 
 if __name__ == "__main__":

@@ -14,7 +14,6 @@ from deploy.studies.stress.checks import LIMITATIONS
 from deploy.studies.stress.networks import STAGES, Subject, open_subject
 from deploy.studies.stress.tables import NOTES, table_lines
 from model.io.files import write_text
-from model.progress import steps
 from model.shipped import VARIANT
 
 TARGET = Path(__file__).parents[1] / "explanation" / "stability.md"
@@ -80,9 +79,7 @@ def limitation_lines() -> Iterator[str]:
 def main() -> None:
     """Run the battery on the shipped pair and write the page."""
     subject = open_subject(None, None, VARIANT)
-    with steps("stressing", len(CASES) * len(STAGES)) as bar:
-        results = run_battery(subject, tick=bar.advance)
-    write_text(TARGET, document(subject, results))
+    write_text(TARGET, document(subject, run_battery(subject)))
     sys.stdout.write(f"wrote {TARGET}\n")
 
 

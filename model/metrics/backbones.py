@@ -4,7 +4,6 @@ Written here because torchvision does not import beside the CPU build of torch. 
 (`find_backbone`): ImageNet weights are never shipped or fetched.
 """
 
-import math
 import os
 import struct
 import tokenize
@@ -21,7 +20,7 @@ from safetensors import SafetensorError, safe_open
 from torch import Tensor, nn
 from torch.nn import functional
 
-from profiles.errors import ModelError, OptionError
+from profiles.errors import ModelError
 from profiles.toml import unreadable
 
 
@@ -39,18 +38,6 @@ BACKBONES: Mapping[str, BackboneSpec] = {
     "alex": BackboneSpec("alexnet", (1, 4, 7, 9, 11), min_side_px=31),
     "vgg": BackboneSpec("vgg16", (3, 8, 15, 22, 29), min_side_px=16),
 }
-
-
-def backbone_spec(network: str) -> BackboneSpec:
-    """The spec of "squeeze", "alex" or "vgg".
-
-    Raises:
-        OptionError: no such network.
-    """
-    if network not in BACKBONES:
-        expected = f"one of {', '.join(BACKBONES)}"
-        raise OptionError("perceptual network", expected=expected, got=repr(network), remedy="choose one of them")
-    return BACKBONES[network]
 
 
 class Fire(nn.Module):
@@ -85,14 +72,11 @@ class Backbone(nn.Module):
     Args:
         network: "squeeze", "alex" or "vgg".
         l2_pool: DISTS's pooling in the place of the max pooling.
-
-    Raises:
-        OptionError: no such network.
     """
 
     def __init__(self, network: str, *, l2_pool: bool = False) -> None:
         super().__init__()
-        self.network, self.spec = network, backbone_spec(network)
+        self.network, self.spec = network, BACKBONES[network]
         layers = {"squeeze": _squeezenet, "alex": _alexnet, "vgg": _vgg16}[network]()
         if l2_pool:
             layers = [L2Pool() if isinstance(layer, nn.MaxPool2d) else layer for layer in layers]
@@ -144,16 +128,16 @@ def _vgg16() -> list[nn.Module]:
 
 WEIGHTS_VARIABLE = "BEERS_LPIPS_WEIGHTS"
 SUFFIXES = (".safetensors", ".npz")
-ARRAY_BYTES = 1 << 30
 DAMAGE = (
     SafetensorError, OSError, ValueError, TypeError, EOFError, RuntimeError, ArithmeticError, SyntaxError,
-    struct.error, tokenize.TokenError, zipfile.BadZipFile, zlib.error,
+    MemoryError, struct.error, tokenize.TokenError, zipfile.BadZipFile, zlib.error,
 )  # fmt: skip
 """What a damaged archive has been seen to end in."""
 CONVERT = (
     "convert it where you trust it: safetensors.torch.save_file(torch.load(FILE, weights_only=True), "
     "'NAME.safetensors')"
 )
+NAMED = "give the feature layers named as in torchvision (features.0.weight ...)"
 
 
 def find_backbone(network: str, place: Path | None = None) -> Path | None:
@@ -164,11 +148,8 @@ def find_backbone(network: str, place: Path | None = None) -> Path | None:
         place: a file, which is taken at its word, or a folder. Without it the environment variable
             BEERS_LPIPS_WEIGHTS is asked; it may name a file or a folder, and a file counts only for the network
             its name begins with.
-
-    Raises:
-        OptionError: no such network.
     """
-    stem = backbone_spec(network).file_stem
+    stem = BACKBONES[network].file_stem
     if place is not None and not place.is_dir():
         return place
     named = place or os.environ.get(WEIGHTS_VARIABLE)
@@ -180,21 +161,31 @@ def find_backbone(network: str, place: Path | None = None) -> Path | None:
 
 def not_found(network: str) -> str:
     """Why a metric is unavailable when `find_backbone` found nothing."""
-    names = " or ".join(f"{backbone_spec(network).file_stem}*{suffix}" for suffix in SUFFIXES)
+    names = " or ".join(f"{BACKBONES[network].file_stem}*{suffix}" for suffix in SUFFIXES)
     return f"weights not found: no {names}; set {WEIGHTS_VARIABLE} to the file or its folder"
 
 
-def load_weights(module: nn.Module, path: Path) -> None:
-    """Fill a module from a file that holds its parameters by name; whatever else the file holds is left aside.
+def load_backbone(network: str, path: Path, *, l2_pool: bool = False) -> Backbone:
+    """A backbone with its parameters from a file, by name; whatever else the file holds is left aside.
+
+    Args:
+        network: "squeeze", "alex" or "vgg".
+        path: .safetensors or .npz.
+        l2_pool: DISTS's pooling in the place of the max pooling.
 
     Raises:
         ModelError: missing, of a kind that is not read, or with a parameter missing, misshapen or not finite.
     """
-    wanted = module.state_dict()
+    backbone = Backbone(network, l2_pool=l2_pool)
+    wanted = backbone.state_dict()
     tensors = read_tensors(path, wanted)
     for name, tensor in tensors.items():
-        _check(path, name, tensor, wanted[name])
-    module.load_state_dict(tensors)
+        if tensor.shape != wanted[name].shape:
+            raise _error(path, f"{name} of shape {tuple(wanted[name].shape)}", f"{tuple(tensor.shape)}", NAMED)
+        if not bool(torch.isfinite(tensor).all()):
+            raise _error(path, f"finite values in {name}", "NaN or infinity", NAMED)
+    backbone.load_state_dict(tensors)
+    return backbone
 
 
 def read_tensors(path: Path, names: Iterable[str]) -> dict[str, Tensor]:
@@ -212,7 +203,7 @@ def read_tensors(path: Path, names: Iterable[str]) -> dict[str, Tensor]:
     try:
         return {name: _as_float32(tensor) for name, tensor in read(path, names).items()}
     except KeyError as error:
-        raise _error(path, f"a tensor named {error.args[0]}", "none of that name") from error
+        raise _error(path, f"a tensor named {error.args[0]}", "none of that name", NAMED) from error
     except DAMAGE as error:
         got = " ".join(str(error).split())[:120]
         raise _error(path, "arrays of floating-point numbers, none pickled", got, CONVERT) from error
@@ -226,10 +217,7 @@ def _as_float32(tensor: Tensor) -> Tensor:
 
 def _read_safetensors(path: Path, names: Iterable[str]) -> Mapping[str, Tensor]:
     with safe_open(path, framework="pt") as file:
-        held = set(file.keys())
-        for name in names:
-            if name not in held:
-                raise KeyError(name)
+        _require_held(names, file.keys())
         return {name: file.get_tensor(name).clone() for name in names}  # the library's own lie in the file
 
 
@@ -238,36 +226,17 @@ def _read_npz(path: Path, names: Iterable[str]) -> Mapping[str, Tensor]:
         file = np.load(raw, allow_pickle=False)
         if not isinstance(file, NpzFile):
             raise TypeError("a single array")
-        for name in names:
-            if name not in file:
-                raise KeyError(name)
-            _require_held(path, name)
+        _require_held(names, file.keys())
         return {name: torch.from_numpy(file[name]) for name in names}
 
 
-def _require_held(path: Path, name: str) -> None:
-    """An array is as large as its header says before any of it is read: the archive must hold as much.
-
-    Raises:
-        ValueError: it does not, or more than belongs to any backbone.
-    """
-    with zipfile.ZipFile(path) as archive, archive.open(f"{name}.npy") as stream:
-        held_bytes = archive.getinfo(f"{name}.npy").file_size
-        read = np.lib.format.read_array_header_1_0
-        if np.lib.format.read_magic(stream) != (1, 0):
-            read = np.lib.format.read_array_header_2_0
-        shape, _, dtype = read(stream)
-    if not math.prod(shape) * dtype.itemsize <= held_bytes <= ARRAY_BYTES:
-        raise ValueError(f"{name} of {shape} in {held_bytes} bytes")
+def _require_held(names: Iterable[str], held: Iterable[str]) -> None:
+    """KeyError of the first name that a file does not hold."""
+    there = set(held)
+    for name in names:
+        if name not in there:
+            raise KeyError(name)
 
 
-def _check(path: Path, name: str, tensor: Tensor, wanted: Tensor) -> None:
-    if tensor.shape != wanted.shape:
-        raise _error(path, f"{name} of shape {tuple(wanted.shape)}", f"{tuple(tensor.shape)}")
-    if not bool(torch.isfinite(tensor).all()):
-        raise _error(path, f"finite values in {name}", "NaN or infinity")
-
-
-def _error(path: Path, expected: str, got: str, remedy: str = "") -> ModelError:
-    remedy = remedy or "give the feature layers named as in torchvision (features.0.weight ...)"
+def _error(path: Path, expected: str, got: str, remedy: str) -> ModelError:
     return ModelError(str(path), expected=expected, got=got, remedy=remedy)

@@ -29,14 +29,23 @@ def site_interval(
     count = len(set(sites))
     if count < LEAST_SITES:
         return None, f"no interval: {count} site{'s' if count > 1 else ''}, fewer than {LEAST_SITES}"
-    return _mean_interval(np.asarray(values, np.float64), np.asarray(sites), generator), WORDS
-
-
-def _mean_interval(numbers: np.ndarray, names: np.ndarray, generator: np.random.Generator) -> tuple[float, float]:
+    numbers, names = np.asarray(values, np.float64), np.asarray(sites)
     groups = [numbers[names == name] for name in np.unique(names)]
     sums, counts = (np.array([f(group) for group in groups]) for f in (np.sum, np.size))
     drawn = generator.integers(len(groups), size=(DRAWS, len(groups)))
     # Sums over counts and not a mean of means: a site of many images counts for them.
     means = sums[drawn].sum(1) / counts[drawn].sum(1)
-    low, high = np.percentile(means, [50 * (1 - LEVEL), 50 * (1 + LEVEL)])
+    return percentiles(means), WORDS
+
+
+def percentiles(draws: np.ndarray) -> tuple[float, float]:
+    """The interval (95 %) of a figure: between percentiles of its draws (N,)."""
+    low, high = np.percentile(draws, [50 * (1 - LEVEL), 50 * (1 + LEVEL)])
     return float(low), float(high)
+
+
+def too_few(sites: int) -> str:
+    """A sentence on why no interval over so many sites is shown; empty where one is."""
+    if sites >= LEAST_SITES:
+        return ""
+    return f"No interval over sites is shown: of {sites}, fewer than {LEAST_SITES}, none could be trusted."

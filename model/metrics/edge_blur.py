@@ -15,7 +15,9 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
+from scipy.ndimage import correlate
 from scipy.special import stdtrit
+from scipy.stats import median_abs_deviation
 
 from model.metrics.refusal import Refusal
 from profiles.sensor import MTF_NYQUIST_MAX
@@ -48,8 +50,6 @@ class EdgeBlur:
         gamma: of MTF(f) = exp(-gamma f) sinc(f), f in cycles per pixel along the edge's normal.
         error: standard error of gamma.
         slope: pixels by which the edge leans each line; 0 runs along the grid.
-        step_sigma: difference of the plateaus over the noise of a pixel.
-        misfit: root mean square of what the noise does not explain, of the step.
         pixels: (H, W) that it was fitted to, over their noise.
         chi2: sum of squares that the fit leaves of those near the edge.
         count: how many these are, less the five numbers fitted.
@@ -58,8 +58,6 @@ class EdgeBlur:
     gamma: float
     error: float
     slope: float
-    step_sigma: float
-    misfit: float
     pixels: np.ndarray
     chi2: float
     count: int
@@ -70,8 +68,9 @@ class Limits:
     """What an edge must keep to count.
 
     Attributes:
-        step_sigma: least contrast. A fainter edge may hide in noise that it is none.
-        misfit: largest misfit.
+        step_sigma: least difference of the plateaus over the noise of a pixel. A fainter edge may hide in noise that
+            it is none.
+        misfit: largest root mean square of what the noise does not explain, of the step.
         error: largest standard error of gamma; 0.6 is a third of the MTF.
     """
 
@@ -140,8 +139,7 @@ def fit_blur(region: np.ndarray, noise: Noise, limits: Limits) -> EdgeBlur | Ref
         limits: what the edge must keep to.
 
     Returns:
-        The blur by the profile's curve, or, of an edge that no shape of the curve fits, why there is none:
-        "few-rows", "no-convergence", "contrast".
+        The blur by the profile's curve, or, of an edge that no shape of the curve fits, why there is none.
     """
     pixels = region / math.sqrt(float(noise(region).mean()))
     found = _fitted(pixels, limits)
@@ -160,7 +158,7 @@ def _fitted(pixels: np.ndarray, limits: Limits, shape: float = 0.0) -> EdgeBlur 
     for _ in range(PASSES):
         near = np.abs(x - line.place - line.slope * y) <= HALF_PX
         if near.sum() < 10 * HALF_PX:
-            return Refusal("few-rows", f"{int(near.sum())} pixels near the edge, {10 * HALF_PX} are needed")
+            return Refusal(f"{int(near.sum())} pixels near the edge, {10 * HALF_PX} are needed")
         terms, fitted = _linearised(line, x[near], y[near], pixels[near])
         left = pixels[near] - fitted
         covariance = np.linalg.pinv(terms.T @ terms)
@@ -169,7 +167,7 @@ def _fitted(pixels: np.ndarray, limits: Limits, shape: float = 0.0) -> EdgeBlur 
             break
         if moved < 1e-3:
             return _judged(line, pixels, float(np.ptp(fitted)), left, float(covariance[4, 4]), limits)
-    return Refusal("no-convergence", "no straight edge near to an axis")
+    return Refusal("no straight edge near to an axis")
 
 
 def _centroids(region: np.ndarray, rows: np.ndarray, columns: np.ndarray) -> _Line:
@@ -201,12 +199,12 @@ def _judged(
     misfit = math.sqrt(max(scatter - 1, 0.0)) / max(step, 1e-9)
     error = math.sqrt(variance * max(scatter, 1.0))
     if limits is not ANY and not LEAST_GAMMA * (not line.shape) <= line.gamma < LARGEST_GAMMA:
-        return Refusal("no-convergence", "sharper than a detector's pixel or softer than any profile: no plain edge")
+        return Refusal("sharper than a detector's pixel or softer than any profile: no plain edge")
     if misfit > limits.misfit:
-        return Refusal("no-convergence", f"{misfit:.1%} of the step fit no blurred edge, {limits.misfit:.1%} at most")
+        return Refusal(f"{misfit:.1%} of the step fit no blurred edge, {limits.misfit:.1%} at most")
     if step < limits.step_sigma or error > limits.error:
-        return Refusal("contrast", f"a step of {step:.3g} times the noise, {limits.step_sigma:g} are needed")
-    return EdgeBlur(line.gamma, error, line.slope, step, misfit, pixels, chi2, count)
+        return Refusal(f"a step of {step:.3g} times the noise, {limits.step_sigma:g} are needed")
+    return EdgeBlur(line.gamma, error, line.slope, pixels, chi2, count)
 
 
 MAX_CANDIDATES, MAX_FITS = 6000, 400
@@ -225,17 +223,14 @@ def find_blurs(image: np.ndarray, noise: Noise, clipped_at: float) -> list[EdgeB
         clipped_at: values from here on are clipped, and so are those from 0 down.
     """
     squares = _squares(image, noise)
-    sound = ((squares > 0) & (squares < clipped_at)).all((1, 2)) if len(squares) else np.zeros(0, bool)
-    smooth = squares[sound & _flat(squares, noise)][:MAX_FITS] if len(squares) else squares
+    sound = ((squares > 0) & (squares < clipped_at)).all((1, 2))
+    smooth = squares[sound & _flat(squares, noise)][:MAX_FITS]
     fits = (fit_blur(square, noise, FOUND) for square in smooth)
     return [fit for fit in fits if isinstance(fit, EdgeBlur)]
 
 
 def _squares(image: np.ndarray, noise: Noise) -> np.ndarray:
     """Squares (N, S, S) around the steepest places, S = 2 * HALF_PX + 1, no centre in another's middle."""
-    side = 2 * HALF_PX + 1
-    if min(image.shape) < side + 4:
-        return np.zeros((0, side, side))
     steep = _steepness(image, noise)
     order = np.argsort(steep, axis=None, kind="stable")[::-1]
     taken, centres = np.zeros(image.shape, bool), list[tuple[int, int]]()
@@ -253,16 +248,13 @@ def _squares(image: np.ndarray, noise: Noise) -> np.ndarray:
 
 def _steepness(image: np.ndarray, noise: Noise) -> np.ndarray:
     """Rise along the rows over its noise, (H, W): where it leads that down the columns, and a square has room."""
-    tall = np.apply_along_axis(np.convolve, 0, image, np.ones(5) / 5, mode="same")
-    wide = np.apply_along_axis(np.convolve, 1, image, np.ones(5) / 5, mode="same")
-    across, down = np.zeros(image.shape), np.zeros(image.shape)
-    across[:, 2:-2], down[2:-2] = tall[:, 4:] - tall[:, :-4], wide[4:] - wide[:-4]
-    steep = np.abs(across) / np.sqrt(2 / 5 * noise(image))
-    steep[np.abs(down) > np.abs(across)] = 0
-    room = np.zeros(image.shape, bool)
-    margin = HALF_PX + 2
-    room[margin:-margin, margin:-margin] = True
-    return np.where(room, steep, 0)
+    box, step = np.full((5, 1), 1 / 5), np.array([[-1.0, 0, 0, 0, 1]])
+    across, down = (np.abs(correlate(correlate(image, one), other)) for one, other in ((box, step), (box.T, step.T)))
+    steep = np.where(down > across, 0, across / np.sqrt(2 / 5 * noise(image)))
+    room = np.zeros_like(steep)
+    inside = (slice(HALF_PX + 2, -HALF_PX - 2),) * 2
+    room[inside] = steep[inside]
+    return room
 
 
 def _flat(squares: np.ndarray, noise: Noise) -> np.ndarray:
@@ -352,8 +344,8 @@ def _centre(values: np.ndarray, errors: np.ndarray) -> tuple[float, float]:
     """Weighted mean (N,) without what lies 3 robust deviations off the median, and its standard error."""
     if values.size == 1:
         return float(values[0]), math.hypot(float(errors[0]), LONE_ERROR)
-    off = np.abs(values - np.median(values))
-    kept = off <= 3 * np.maximum(1.4826 * np.median(off), errors)
+    off, scatter = np.abs(values - np.median(values)), median_abs_deviation(values, scale="normal")
+    kept = off <= 3 * np.maximum(scatter, errors)
     v, e = values[kept], errors[kept]
     between = max(float(v.var(ddof=1)) - float((e**2).mean()), 0.0) if v.size > 1 else LONE_ERROR**2
     weights = 1 / (e**2 + between)

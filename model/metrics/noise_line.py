@@ -12,8 +12,10 @@ corners of the spectrum, beyond 0.55 cycles per pixel, and noise is white.
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
+from scipy.fft import dctn
 from scipy.optimize import nnls
 
 from model.metrics.refusal import Refusal
@@ -42,8 +44,7 @@ EDGE_PERCENT = 2.0
 """Of the blocks lie below, and above, the radiances that are said to be measured."""
 
 
-@dataclass(frozen=True)
-class Blocks:
+class Blocks(NamedTuple):
     """N blocks of 16 x 16 pixels, less a plane each.
 
     Attributes:
@@ -62,16 +63,18 @@ class Blocks:
 
     def only(self, chosen: np.ndarray) -> "Blocks":
         """The blocks that `chosen`, bool or indices, picks."""
-        bands = (self.structure[chosen], self.middle[chosen], self.fine[chosen])
-        return Blocks(self.mean[chosen], *bands, self.part[chosen])
+        return Blocks(*(column[chosen] for column in self))
+
+    def noise(self, fit: np.ndarray) -> np.ndarray:
+        """Variance (N,) that a line (alpha, beta, ...) gives each block, that of rounding at least."""
+        return np.asarray(np.maximum(fit[0] * self.mean + fit[1], ROUNDING))
 
 
 def join(images: Sequence[Blocks]) -> Blocks:
     """The blocks of several images as one; their parts stay apart."""
     first = np.cumsum([0] + [int(b.part.max(initial=-1)) + 1 for b in images])
-    parts = [b.part + start for b, start in zip(images, first, strict=False)]
-    columns = ([b.mean for b in images], [b.structure for b in images], [b.middle for b in images])
-    return Blocks(*map(np.concatenate, (*columns, [b.fine for b in images], parts)))
+    apart = [b._replace(part=b.part + start) for b, start in zip(images, first, strict=False)]
+    return Blocks(*(np.concatenate(column) for column in zip(*apart, strict=True)))
 
 
 def cut_blocks(image: np.ndarray, clipped_at: float) -> Blocks:
@@ -98,9 +101,7 @@ def _energies(pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     flat = pixels - pixels.mean((1, 2), keepdims=True)
     slopes = [(flat.sum(axis) @ ramp) / (SIDE_PX * (ramp**2).sum()) for axis in (1, 2)]
     flat = flat - slopes[0][:, None, None] * ramp - slopes[1][:, None, None] * ramp[:, None]
-    waves = np.cos(np.pi * place[:, None] * (place + 0.5) / SIDE_PX) * math.sqrt(2 / SIDE_PX)
-    waves[0] /= math.sqrt(2)
-    return (waves @ flat @ waves.T) ** 2, np.hypot(place[:, None], place) / (2 * SIDE_PX)
+    return dctn(flat, axes=(1, 2), norm="ortho") ** 2, np.hypot(place[:, None], place) / (2 * SIDE_PX)
 
 
 @dataclass(frozen=True)
@@ -152,23 +153,23 @@ def fit_noise_model(blocks: Blocks, generator: np.random.Generator) -> NoiseMode
     """Fit the line to blocks of any number of images of one instrument.
 
     Returns:
-        The line, or why there is none: "few-windows", "range", "no-noise".
+        The line, or why there is none.
     """
     if blocks.mean.size < LEAST:
-        return Refusal("few-windows", f"{blocks.mean.size} blocks of 16 x 16 unclipped pixels, {LEAST} are needed")
+        return Refusal(f"{blocks.mean.size} blocks of 16 x 16 unclipped pixels, {LEAST} are needed")
     quietest = float(np.percentile(blocks.fine, QUIET_PERCENT))
     if quietest < ROUNDING + LEAST_NOISE:
         got = f"a variance of {quietest:.2g} DN^2 at the finest detail, where rounding alone makes {ROUNDING:.2g}"
-        return Refusal("no-noise", got)
+        return Refusal(got)
     used, fit = _choose(blocks)
     parts = np.unique(used.part)
     if used.mean.size < LEAST or parts.size < LEAST_PARTS:
-        return Refusal("few-windows", f"{used.mean.size} blocks without much texture, {LEAST} are needed")
+        return Refusal(f"{used.mean.size} blocks without much texture, {LEAST} are needed")
     dark, bright = (float(v) for v in np.percentile(used.mean, [EDGE_PERCENT, 100 - EDGE_PERCENT]))
     if bright - dark < MIN_RANGE * bright:
-        return Refusal("range", f"even areas from {dark:.4g} to {bright:.4g} DN only, too narrow for a line")
+        return Refusal(f"even areas from {dark:.4g} to {bright:.4g} DN only, too narrow for a line")
     draws = np.array([_fitted(used, _weights(used.part, parts, generator)) for _ in range(DRAWS)])
-    leak = float((fit[2] * _excess(used, fit)).mean() / used.fine.mean())
+    leak = float(fit[2] * np.maximum(used.structure - used.noise(fit), 0).mean() / used.fine.mean())
     alpha, beta = _unrounded(fit)
     shown = np.array([_unrounded(draw) for draw in draws])
     model = NoiseModel(alpha, beta, shown, used.mean.size, (dark, bright), leak)
@@ -195,7 +196,7 @@ def _quiet(blocks: Blocks, limit: float) -> tuple[Blocks, np.ndarray]:
         alike = np.abs(blocks.fine - expected) <= MAX_SCATTER * math.sqrt(2 / FINE_WAVES) * expected
         used = blocks.only(quiet & alike if (quiet & alike).sum() >= LEAST else quiet)
         fit = _fitted(used, np.ones(used.mean.size))
-        noise = np.maximum(fit[0] * blocks.mean + fit[1], ROUNDING)
+        noise = blocks.noise(fit)
         expected = noise + fit[2] * np.maximum(blocks.structure - noise, 0)
     return blocks.only((blocks.structure <= limit * noise) & alike), fit
 
@@ -205,7 +206,7 @@ def _fitted(blocks: Blocks, weights: np.ndarray, band: str = "fine") -> np.ndarr
     seen = getattr(blocks, band)
     size, fit = np.full(seen.size, max(float(weights @ seen / weights.sum()), ROUNDING)), np.zeros(3)
     for _ in range(4):
-        noise = np.maximum(fit[0] * blocks.mean + fit[1], ROUNDING) if fit.any() else size
+        noise = blocks.noise(fit) if fit.any() else size
         terms = np.stack([blocks.mean, np.ones(seen.size), np.maximum(blocks.structure - noise, 0)], axis=1)
         root = np.sqrt(weights) / size
         fit, _ = nnls(terms * root[:, None], seen * root)
@@ -219,10 +220,6 @@ def _weights(part: np.ndarray, parts: np.ndarray, generator: np.random.Generator
     return counts[np.searchsorted(parts, part)].astype(np.float64)
 
 
-def _excess(blocks: Blocks, fit: np.ndarray) -> np.ndarray:
-    return np.asarray(np.maximum(blocks.structure - np.maximum(fit[0] * blocks.mean + fit[1], ROUNDING), 0))
-
-
 def _unrounded(fit: np.ndarray) -> tuple[float, float]:
     """Alpha and beta of the instrument: the rounding's variance taken off, first of what does not grow."""
     return float(fit[0]), max(float(fit[1]) - ROUNDING, 0.0)
@@ -231,11 +228,11 @@ def _unrounded(fit: np.ndarray) -> tuple[float, float]:
 def _doubtful(used: Blocks, model: NoiseModel) -> Refusal | None:
     """Texture that passes for noise, or noise that is not white; both would be told to a network as they stand."""
     if model.leak > MAX_LEAK:
-        return Refusal("few-windows", f"{model.leak:.0%} of the finest detail is texture, {MAX_LEAK:.0%} at most")
+        return Refusal(f"{model.leak:.0%} of the finest detail is texture, {MAX_LEAK:.0%} at most")
     place = (float(np.median(used.mean)), 1.0)
     fine = (model.alpha, model.beta) @ np.array(place)
     coarse = _fitted(used, np.ones(used.mean.size), "middle")[:2] @ place - ROUNDING
     scatter = float((model.draws @ place).std()) / fine
     if abs(coarse / fine - 1) > MAX_COLOUR + COLOUR_SCATTER * scatter:
-        return Refusal("few-windows", f"noise {coarse / fine:.2f} times as strong at middle frequencies: not white")
+        return Refusal(f"noise {coarse / fine:.2f} times as strong at middle frequencies: not white")
     return None

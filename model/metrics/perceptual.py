@@ -12,7 +12,7 @@ from typing import Self
 import torch
 from torch import Tensor, nn
 
-from model.metrics.backbones import Backbone, load_weights, read_tensors
+from model.metrics.backbones import Backbone, load_backbone, read_tensors
 from profiles.errors import ImageError
 
 PUBLISHED = Path(__file__).parent / "weights"
@@ -47,10 +47,9 @@ class Lpips(nn.Module):
             path: .safetensors or .npz, parameters named as in torchvision.
 
         Raises:
-            OptionError: no such network.
             ModelError: the file is missing, of a kind that is not read, or not that network.
         """
-        backbone = _loaded(Backbone(network), path)
+        backbone = load_backbone(network, path)
         names = [f"lin{layer}" for layer in range(len(backbone.spec.taps))]
         heads = read_tensors(PUBLISHED / f"lpips-{network}.safetensors", names)
         return cls(backbone, [heads[name] for name in names])
@@ -100,7 +99,7 @@ class Dists(nn.Module):
         Raises:
             ModelError: the file is missing, of a kind that is not read, or no VGG16.
         """
-        backbone = _loaded(Backbone("vgg", l2_pool=True), path)
+        backbone = load_backbone("vgg", path, l2_pool=True)
         weights = read_tensors(PUBLISHED / "dists.safetensors", ["alpha", "beta"])
         return cls(backbone, weights["alpha"], weights["beta"])
 
@@ -166,8 +165,3 @@ def _check_pair(label: str, backbone: Backbone, image: Tensor, reference: Tensor
         expected = f"two images (N, 1, H, W) of at least {smallest} pixels a side"
         got = f"{tuple(image.shape)} and {tuple(reference.shape)}"
         raise ImageError(label, expected=expected, got=got, remedy="give larger images, grey and of one shape")
-
-
-def _loaded(backbone: Backbone, path: Path) -> Backbone:
-    load_weights(backbone, path)
-    return backbone

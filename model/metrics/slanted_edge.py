@@ -17,39 +17,25 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+from numpy.typing import ArrayLike
 from torch import Tensor
 
 from model.metrics.refusal import Refusal
 
-WINDOW_PX, PLATEAU_PX = 10, 5
-"""Half width of the Hamming window around the edge, and what must lie beyond it on either side of every row."""
+WINDOW_PX = 10
+"""Half width of the Hamming window around the edge."""
 BINS_PER_PX = 4
 HALF = WINDOW_PX * BINS_PER_PX + 1
 """Bins on each side: one more than the window, for the derivative."""
 MIN_CONTRAST_SIGMA, MAX_CLIPPED, MAX_SHIFT_PX = 10, 0.01, 2.0
 PASSES = 3
 
-FREQUENCIES = np.linspace(0, 1, 41)
+NYQUIST = 0.5
 """Cycles per pixel along the edge's normal."""
-NYQUIST = 20
-"""Index of 0.5 cycles per pixel."""
 
 
-@dataclass(frozen=True)
-class EdgeMtf:
-    """The MTF across one edge.
-
-    Attributes:
-        mtf_nyquist: contrast kept at 0.5 cycles per pixel; below 0 by noise or where contrast is reversed.
-        mtf: (41,) the whole curve, at FREQUENCIES.
-    """
-
-    mtf_nyquist: float
-    mtf: np.ndarray
-
-
-def edge_mtf(image: np.ndarray, angle_deg: float, saturated: float = math.inf) -> EdgeMtf | Refusal:
-    """Measure the MTF across an edge that runs through the middle of an image, dark on the left.
+def edge_mtf(image: np.ndarray, angle_deg: float, saturated: float = math.inf) -> float | Refusal:
+    """Measure the MTF at Nyquist across an edge that runs through the middle of an image, dark on the left.
 
     The figure is that along the edge's normal: a square detector keeps 0.6 % more at 15 degrees than along the axis.
 
@@ -59,7 +45,7 @@ def edge_mtf(image: np.ndarray, angle_deg: float, saturated: float = math.inf) -
         saturated: the value at which pixels clip, in the image's unit. They also clip at 0.
 
     Returns:
-        The MTF, or why there is none: "not-finite", "clipped", "no-convergence" or "contrast".
+        Contrast kept at 0.5 cycles per pixel, below 0 by noise or where contrast is reversed; or why there is none.
     """
     pixels = np.asarray(image, np.float64)
     distance = _unusable(pixels, saturated) or _distance(pixels, math.radians(angle_deg))
@@ -68,18 +54,17 @@ def edge_mtf(image: np.ndarray, angle_deg: float, saturated: float = math.inf) -
     plateaus = _fit_plateaus(pixels, distance)
     if not plateaus.step > MIN_CONTRAST_SIGMA * plateaus.sigma:
         seen = f"a step of {plateaus.step:.4g} in noise of {plateaus.sigma:.4g}"
-        return Refusal("contrast", f"{seen}, {MIN_CONTRAST_SIGMA} times are needed")
-    curve = _mtf(pixels, distance, plateaus)
-    return EdgeMtf(float(curve[NYQUIST]), curve)
+        return Refusal(f"{seen}, {MIN_CONTRAST_SIGMA} times are needed")
+    return _mtf(pixels, distance, plateaus)
 
 
 def _unusable(image: np.ndarray, saturated: float) -> Refusal | None:
     lost = ~np.isfinite(image)
     if lost.any():
-        return Refusal("not-finite", f"{int(lost.sum())} pixels are not finite")
+        return Refusal(f"{int(lost.sum())} pixels are not finite")
     clipped = float(((image <= 0) | (image >= saturated)).mean())
     if clipped > MAX_CLIPPED:
-        return Refusal("clipped", f"{clipped:.1%} of the pixels are clipped, {MAX_CLIPPED:.0%} at most")
+        return Refusal(f"{clipped:.1%} of the pixels are clipped, {MAX_CLIPPED:.0%} at most")
     return None
 
 
@@ -96,10 +81,10 @@ def _distance(image: np.ndarray, angle: float) -> np.ndarray | Refusal:
         weights = rise * _hamming(between - shift)
         total = float(weights.sum())
         if total <= 0:
-            return Refusal("no-convergence", "the image does not rise where its edge should be")
+            return Refusal("the image does not rise where its edge should be")
         shift += float((weights * (between - shift)).sum()) / total
         if abs(shift) > MAX_SHIFT_PX:
-            return Refusal("no-convergence", f"the edge lies more than {MAX_SHIFT_PX:g} px off its place")
+            return Refusal(f"the edge lies more than {MAX_SHIFT_PX:g} px off its place")
     return np.asarray((across - shift) * math.cos(angle))
 
 
@@ -132,8 +117,9 @@ class Plateaus:
     tail_px: float
     sigma: float
 
-    def transfer(self, frequencies: np.ndarray, softness_px: float) -> np.ndarray:
-        """MTF (F,) of an edge with these tails and a Gaussian of that standard deviation; frequencies (F,)."""
+    def transfer(self, frequencies: ArrayLike, softness_px: float) -> np.ndarray:
+        """MTF of an edge with these tails and a Gaussian of that standard deviation, of frequencies of any shape."""
+        frequencies = np.asarray(frequencies)
         gaussian = np.exp(-2 * (math.pi * softness_px * frequencies) ** 2)
         return np.asarray(np.exp(-2 * math.pi * self.tail_px * frequencies) * gaussian)
 
@@ -155,7 +141,7 @@ def _fit_plateaus(image: np.ndarray, distance: np.ndarray) -> Plateaus:
     return Plateaus(low, high - low, tail_px, sigma)
 
 
-def _mtf(image: np.ndarray, distance: np.ndarray, plateaus: Plateaus) -> np.ndarray:
+def _mtf(image: np.ndarray, distance: np.ndarray, plateaus: Plateaus) -> float:
     """The MTF of the model that comes closest to the edge, and that of what it leaves.
 
     Without the tails what is left is compact, so the window around it costs next to nothing. The model only has to
@@ -178,7 +164,7 @@ def _mtf(image: np.ndarray, distance: np.ndarray, plateaus: Plateaus) -> np.ndar
     shift = mean(place - bins)
     variance_px2 = float((mean((place - bins) ** 2) - shift**2).mean()) / BINS_PER_PX**2
     rest = _transform(variance_px2) @ _at_centres(left, shift) / plateaus.step
-    return np.asarray(plateaus.transfer(FREQUENCIES, softness_px) + rest)
+    return float(plateaus.transfer(NYQUIST, softness_px) + rest)
 
 
 def _at_centres(averages: np.ndarray, shift: np.ndarray) -> np.ndarray:
@@ -192,18 +178,16 @@ def _at_centres(averages: np.ndarray, shift: np.ndarray) -> np.ndarray:
 
 
 def _transform(variance_px2: float) -> np.ndarray:
-    """(F, B) what each bin adds to the transform: derivative, window and cosine, the losses undone.
+    """(B,) what each bin adds to the transform at Nyquist: derivative, window and cosine, the losses undone.
 
     `variance_px2` is that of the pixels' places within a bin: the blur that averaging adds.
     """
     place = np.arange(-HALF + 1, HALF) / BINS_PER_PX
-    wave = np.cos(2 * math.pi * FREQUENCIES[:, None] * place) * _hamming(place)
-    weights = np.zeros((FREQUENCIES.size, 2 * HALF + 1))
+    wave = np.cos(2 * math.pi * NYQUIST * place) * _hamming(place)
     # The derivative as a central difference, turned onto the weights so that it costs no pass of its own.
-    weights[:, 2:] += wave / 2
-    weights[:, :-2] -= wave / 2
-    averaging = np.exp(-2 * (math.pi * FREQUENCIES) ** 2 * variance_px2)
-    return np.asarray(weights / (averaging * np.sinc(2 * FREQUENCIES / BINS_PER_PX))[:, None])
+    weights = (np.pad(wave, (2, 0)) - np.pad(wave, (0, 2))) / 2
+    averaging = math.exp(-2 * (math.pi * NYQUIST) ** 2 * variance_px2)
+    return np.asarray(weights / (averaging * np.sinc(2 * NYQUIST / BINS_PER_PX)))
 
 
 def slanted_edge(

@@ -138,8 +138,8 @@ def test_an_acquisition_of_another_scale_is_read_as_digital_numbers(tmp_path: Pa
             )
         with pytest.raises(ImageError, match="values from 0"):
             read_acquisition(tmp_path / name, 0.5 if name == "share.tif" else 100)
-    assert read_input(tmp_path / "share.tif", 0, load_sensors(), 1).degraded.max() == 4095
-    assert read_input(tmp_path / "eight.tif", 0, load_sensors(), 255).pair is None  # a raw image, no scene
+    assert read_input(tmp_path / "share.tif", 0, load_sensors(), 1)[0].max() == 4095
+    assert read_input(tmp_path / "eight.tif", 0, load_sensors(), 255)[1] is None  # a raw image, no scene
 
 
 def test_a_full_scale_without_an_image_is_refused() -> None:

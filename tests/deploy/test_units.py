@@ -82,7 +82,7 @@ def evaluated(bits: int, dimmer: float, offset_dn: float) -> tuple[np.ndarray, i
     (pair,), _ = simulate_pairs([scene], degraded, reference, 0, (2,))
     methods = [method_named(name, degraded, reference) for name in METHODS]
     instruments = Instruments({}, degraded.nominal().max_dn)
-    scores = [instruments.score(m.restore(pair.degraded), pair.reference, pair.degraded) for m in methods]
+    scores = [instruments.score(method.restore(pair.degraded), pair) for method in methods]
     return np.array([each["PSNR"] for each in scores]), pair.degraded.size
 
 

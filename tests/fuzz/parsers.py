@@ -37,7 +37,7 @@ from profiles.scene_call import load_scene_call
 from quant.checks import Check
 from quant.gate import read_limits
 from tests.deploy.dpu.graphs import integer_convbeers
-from tests.deploy.studies.detection.folders import coco, dota, voc, yolo
+from tests.deploy.studies.detection.folders import coco, voc, yolo
 from tests.fuzz.detection import detect, detector_seeds, label_seeds, names_seeds, read_beside, read_names
 from tests.fuzz.mutation import Mutate, of_json, of_onnx, of_png, of_safetensors, of_tiff, of_xml
 from tests.fuzz.networks import (
@@ -256,7 +256,6 @@ PARSERS: tuple[Parser, ...] = (
     Parser("labels of VOC", ".xml", partial(label_seeds, make=voc, suffix=".xml"), read_beside),
     Parser("labels of COCO", ".json", partial(label_seeds, make=coco, suffix=".json"), read_beside, of_json),
     Parser("labels of YOLO", ".txt", partial(label_seeds, make=yolo, suffix=".txt"), read_beside),
-    Parser("labels of DOTA", ".txt", partial(label_seeds, make=dota, suffix=".txt"), read_beside),
     Parser("names of classes", ".yaml", names_seeds, read_names),
     Parser("detector", ".onnx", detector_seeds, detect, of_onnx, 0.5),
 )

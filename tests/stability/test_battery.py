@@ -9,10 +9,12 @@ import pytest
 from typer.testing import CliRunner
 
 from deploy.cli import app
+from deploy.restoration.engine import restore_floats
+from deploy.restoration.plan import make_plan
 from deploy.studies.stress.battery import StageResult, run_battery, worst
 from deploy.studies.stress.cases import CASES, FULL_DN, Case
 from deploy.studies.stress.checks import LIMITATIONS, Measure, differing, local_range, ringing
-from deploy.studies.stress.networks import STAGES, Subject, open_subject, restore
+from deploy.studies.stress.networks import STAGES, Subject, open_subject
 from profiles.errors import ModelError
 from quant.onnx_file import save_onnx
 from quant.tiling.walk import Tiling
@@ -110,11 +112,11 @@ def test_a_broken_int8_network_fails(pair: list[Path], tmp_path: Path) -> None:
 
 def test_a_halo_one_pixel_short_fails(subject: Subject) -> None:
     """Of the network's receptive radius: tile plans differ."""
-    image, radius_px = BY_NAME["no noise"].draw(48, np.random.default_rng(0))[0], subject.float32.radius_px
-    infer = subject.float32.infer()
-    whole = restore(infer, image, Tiling(radius_px))
-    for short, same in ((0, True), (1, False)):
-        tiled = restore(infer, image, Tiling(radius_px - short), tile_px=2 * radius_px + 9)
+    image, radius_px = BY_NAME["no noise"].draw(48, np.random.default_rng(0))[0], subject.float32.tiling.halo_px
+    whole = subject.float32.restore(image)
+    for halo_px, same in ((radius_px, True), (radius_px - 1, False)):
+        plan = make_plan((1, *image.shape), 2 * radius_px + 9, halo_px, Tiling(halo_px))
+        tiled = restore_floats(image, subject.float32.infer(), plan, FULL_DN)
         assert differing("plans differ", tiled, whole).holds == same
 
 

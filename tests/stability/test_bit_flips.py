@@ -13,20 +13,15 @@ from deploy.dpu.board import load_dpu
 from deploy.networks import shipped_pair
 from deploy.restoration.options import TILE_PX
 from deploy.studies.stress.bit_flips import (
-    MEMORIES,
-    RATES,
     FaultTarget,
     FlipRequest,
-    Injected,
     curve_rows,
     flip_curves_svg,
     make_target,
     name_of,
     price_rows,
-    rates_of,
-    restored,
 )
-from deploy.studies.stress.faults import Guards, as_stored, checksums, map_channels
+from deploy.studies.stress.faults import MEMORIES, Guards, Injected, as_stored, checksums, map_channels, restored
 from deploy.studies.stress.networks import Subject, open_subject
 from docs.make import bit_flips as maker
 from profiles.figures import Row
@@ -62,14 +57,14 @@ def db(row: Row, guards: str) -> float:
 def test_flips_cost_more_the_more_there_are(rows: dict[str, Row]) -> None:
     clean = db(rows["none"], "no guard")
     for memory in ("weights", "maps", "image"):
-        found = [db(rows[name_of(memory, rate)], "no guard") for rate in RATES]
+        found = [db(rows[name_of(memory, rate)], "no guard") for rate in MEMORIES[memory].rates]
         assert found[0] == pytest.approx(clean, abs=0.2)
         assert found[-1] < clean - 0.1
     assert db(rows[name_of("shifts", 10_000)], "no guard") <= clean
 
 
 def test_scrubbing_and_majority_bring_the_fault_free_network_back(rows: dict[str, Row]) -> None:
-    for rate in RATES:
+    for rate in MEMORIES["weights"].rates:
         assert db(rows[name_of("weights", rate)], "all guards") == db(rows["none"], "all guards")
     assert db(rows[name_of("shifts", 1000)], "all guards") == db(rows["none"], "all guards")
 
@@ -84,24 +79,24 @@ def test_the_same_seed_flips_the_same_bits(target: FaultTarget, rows: dict[str, 
 @pytest.mark.parametrize("memory", list(MEMORIES))
 def test_an_injection_leaves_the_target_alone(memory: str, target: FaultTarget) -> None:
     image = target.pairs[0][0]
-    before, fault_free = image.copy(), restored(target, Injected(target.core, SOUND, image, 0))
-    injected = MEMORIES[memory](target, image, 50_000, np.random.default_rng(0))
+    before, fault_free = image.copy(), restored(Injected(target.core, SOUND, image, 0))
+    injected = MEMORIES[memory].inject(target.core, image, 50_000, np.random.default_rng(0))
     assert injected.flips > 0
-    assert not np.array_equal(restored(target, injected), fault_free)
-    np.testing.assert_array_equal(restored(target, injected), restored(target, injected))
+    assert not np.array_equal(restored(injected), fault_free)
+    np.testing.assert_array_equal(restored(injected), restored(injected))
     np.testing.assert_array_equal(image, before)
-    np.testing.assert_array_equal(restored(target, Injected(target.core, SOUND, target.pairs[0][0], 0)), fault_free)
+    np.testing.assert_array_equal(restored(Injected(target.core, SOUND, target.pairs[0][0], 0)), fault_free)
 
 
 def test_at_half_resolution_maps_have_a_bit_for_each_channel_of_each_place(coarse: Subject) -> None:
     target = make_target(coarse, REQUEST)
     image, _ = target.pairs[0]
-    sound = restored(target, Injected(target.core, SOUND, target.pairs[0][0], 0))
+    sound = restored(Injected(target.core, SOUND, target.pairs[0][0], 0))
     assert sound.shape == image.shape
     assert np.abs(sound - image).max() > 0
-    every = MEMORIES["maps"](target, image, 1e6, np.random.default_rng(0))
+    every = MEMORIES["maps"].inject(target.core, image, 1e6, np.random.default_rng(0))
     assert every.flips == 8 * image.size // 4 * sum(map_channels(target.core).values())
-    assert (restored(target, every) != sound).mean() > 0.5
+    assert (restored(every) != sound).mean() > 0.5
 
 
 @pytest.mark.parametrize("variant", ["convbeers-xs", "convbeers-s", "convbeers"])
@@ -159,8 +154,8 @@ def test_the_page_is_fresh() -> None:
         target = make_target(open_subject(None, None, variant), maker.REQUEST)
         rows = price_rows(target, predict_file(shipped_pair(variant)[1], dpu, TILE_PX), dpu)
         assert all(line in page for line in maker.price_lines({variant: rows}))
-    for memory in MEMORIES:
-        assert page.count(f"\n| {memory}, ") == len(rates_of(memory))
+    for name, memory in MEMORIES.items():
+        assert page.count(f"\n| {name}, ") == len(memory.rates)
 
 
 def test_curves_go_from_left_to_right(rows: dict[str, Row]) -> None:

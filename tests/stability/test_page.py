@@ -4,7 +4,7 @@ from deploy.studies.stress.cases import CASES
 from deploy.studies.stress.networks import STAGES
 from deploy.studies.stress.tables import markdown
 from docs.make import stability as maker
-from profiles.figures import Row, by_table, measured, predicted, unavailable
+from profiles.figures import Row, measured, predicted, unavailable
 
 
 def test_the_page_is_fresh() -> None:
@@ -18,10 +18,11 @@ def test_the_page_is_fresh() -> None:
 
 def test_columns_say_unit_and_mode() -> None:
     rows = [
-        Row("t", "a|b", {"x": measured(1.5, "DN", "s"), "y": predicted(2e21, "DN", (2e21, 2e21), "proven for all")}),
-        Row("t", "c", {"x": unavailable("DN", "no reason"), "y": predicted(3, "DN", (3, 3), "proven for all")}),
+        Row("t", "a|b", {"x": measured(1.5, "DN", "s"), "y": predicted(2, "DN", (1, 3), "s")}),
+        Row("t", "c", {"x": unavailable("DN", "no reason"), "y": measured(3, "px", "s")}),
     ]
-    page = markdown([row for found in by_table(rows).values() for row in found])
-    assert "y (DN, proven)" in page
-    assert "| a/b | 1.5 DN, measured | 2e+21 |" in page
-    assert "unavailable: no reason" in page
+    page = markdown(rows)
+    assert "|  | x (DN, measured) | y |" in page
+    assert "| a/b | 1.5 | 2 [1, 3] DN predicted |" in page
+    assert "| c | - | 3 px measured |" in page
+    assert "- x: no reason" in page

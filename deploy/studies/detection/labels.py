@@ -1,4 +1,4 @@
-"""Labelled images: Pascal VOC (DIOR's folders among it), COCO, YOLO and DOTA.
+"""Labelled images: Pascal VOC (DIOR's folders among it), COCO and YOLO.
 
 Boxes are in continuous pixels of the image, pixel i covering [i, i + 1):
 
@@ -6,37 +6,36 @@ Boxes are in continuous pixels of the image, pixel i covering [i, i + 1):
   count pixels from 1 and belong to the box.
 - COCO, one JSON file (Lin et al., arXiv 1405.0312; cocodataset.org/#format-data): left, top, width, height in px.
 - YOLO, a text file an image (docs.ultralytics.com/datasets/detect): `class cx cy w h`, or `class x y x y x y ...` of
-  an outline, as shares of the image; names in data.yaml or classes.txt; an image without a file shows no object.
-- DOTA, a text file an image (captain-whu.github.io/DOTA/dataset.html): `x y x y x y x y category difficult` in px;
-  oriented boxes are enclosed in upright ones.
+  an outline, which an upright box encloses, as shares of the image; names in data.yaml or classes.txt; an image
+  without a file shows no object.
 """
 
 import math
 import xml.etree.ElementTree as ET
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from deploy.restoration.index_files import NoDoctype
 from deploy.studies.detection.boxes import Boxes, areas
-from deploy.studies.detection.detector import letters
+from deploy.studies.detection.detector import class_names, letters
 from model.io.files import IMAGE_SUFFIXES
-from model.io.images import image_size_px, list_images, site_of
+from model.io.images import image_size_px, list_images
 from profiles.errors import MachineError, OptionError
 from profiles.toml import read_json, read_whole
 
 SPLITS = ("test", "val", "valid", "train")
 """Where no split is asked for, the first that is there: what a detector was trained on comes last."""
-LAYOUTS = "labels as VOC (.xml), COCO (.json), YOLO or DOTA (.txt)"
+LAYOUTS = "labels as VOC (.xml), COCO (.json) or YOLO (.txt)"
 LABEL_BYTES, NAMES_BYTES = 1 << 23, 1 << 16
 """Limits of a file of labels (25 000 boxes of XML), and of data.yaml, of which PyYAML reads so much in 0.4 s."""
 SPAN = 1e-3
 """By how much a share of YOLO's may pass 0 or 1: tools write six digits or fewer."""
 HORIZONTAL = "Horizontal Bounding Boxes"
 CORNERS = ("xmin", "ymin", "xmax", "ymax")
-DOTA_HEADERS = ("imagesource:", "gsd:")
-COCO_LISTS = ("images", "annotations", "categories")
 
 
 @dataclass(frozen=True)
@@ -46,12 +45,10 @@ class LabelledImage:
     Attributes:
         path: of the image.
         truth: labelled boxes, in px of the image; classes are numbers into the set's names.
-        site: images of one site share it.
     """
 
     path: Path
     truth: Boxes
-    site: str
 
 
 @dataclass(frozen=True)
@@ -88,7 +85,7 @@ def read_labelled(images: Path, labels: Path | None = None, split: str | None = 
     """Labelled images of a folder.
 
     Args:
-        images: the folder of the images, or the top of a tree as VOC, DIOR, YOLO or DOTA have it.
+        images: the folder of the images, or the top of a tree as VOC, DIOR or YOLO have it.
         labels: a folder of label files, one an image, or COCO's JSON; None looks where each layout keeps them.
         split: which part of a tree; None takes `test` if there is one.
 
@@ -103,7 +100,7 @@ def read_labelled(images: Path, labels: Path | None = None, split: str | None = 
     where = labels or _labels_near(images, folder)
     if where.suffix.lower() == ".json":
         return _labelled_set(*_read_coco(where, folder))
-    return _labelled_set(*_read_each(list_images(folder), where, (where, where.parent, folder, images)))
+    return _labelled_set(_read_each(list_images(folder), where, (where, where.parent, folder, images)))
 
 
 def _image_folder(top: Path, split: str | None) -> Path:
@@ -122,9 +119,8 @@ def _image_folder(top: Path, split: str | None) -> Path:
 def _labels_near(top: Path, folder: Path) -> Path:
     """Where the labels of a folder's images lie: in the place of `images`, beside them, or in a file of JSON."""
     parts = folder.relative_to(top).parts
-    swapped = [top.joinpath(*(new if part == "images" else part for part in parts)) for new in ("labels", "labelTxt")]
-    folders = [path for path in swapped if path != folder]
-    for path in (*folders, folder, top / "labels", top / "labelTxt", top / "Annotations", top):
+    swapped = top.joinpath(*("labels" if part == "images" else part for part in parts))
+    for path in (swapped, folder, top / "labels", top / "Annotations", top):
         if _holds(path, (".xml", ".txt"), but="classes.txt"):
             return path
         found = sorted(path.glob("*.json"))
@@ -141,23 +137,22 @@ def _holds(folder: Path, suffixes: Iterable[str], but: str = "") -> bool:
     return folder.is_dir() and any(p.suffix.lower() in suffixes and p.name != but for p in folder.iterdir())
 
 
-def _read_each(images: Sequence[Path], where: Path, named_in: Sequence[Path]) -> tuple[list[_File], list[str]]:
-    """Labels of a file an image, and what is to be said of them."""
+def _read_each(images: Sequence[Path], where: Path, named_in: Sequence[Path]) -> list[_File]:
+    """Labels of a file an image, XML or text."""
     if not where.is_dir():
         raise _faulty(where, LAYOUTS, "another file" if where.exists() else "no such folder", "give a folder")
-    for suffix in (".xml", ".txt"):
-        pairs = [(image, where / f"{image.stem}{suffix}") for image in images]
-        there = [labels for _, labels in pairs if labels.exists()]
-        if there and suffix == ".txt" and not _are_dota(there):
-            names = yolo_names(named_in)
-            return [_read_yolo(*pair, names) for pair in pairs], []
-        if there:
-            if missing := [labels.name for _, labels in pairs if not labels.exists()]:
-                got = f"{len(missing)} of {len(pairs)} missing, the first {missing[0]}"
-                remedy = "leave those images out, or give them files without objects"
-                raise _faulty(where, "a file of labels for every image", got, remedy)
-            notes = [] if suffix == ".xml" else ["Oriented boxes of DOTA are enclosed in upright ones."]
-            return [(_read_voc if suffix == ".xml" else _read_dota)(*pair) for pair in pairs], notes
+    there = {path.name for path in where.iterdir()}
+    xml, text = ([(image, where / f"{image.stem}{suffix}") for image in images] for suffix in (".xml", ".txt"))
+    missing = [labels.name for _, labels in xml if labels.name not in there]
+    if not missing:
+        return [_read_voc(*pair) for pair in xml]
+    if len(missing) < len(xml):
+        got = f"{len(missing)} of {len(xml)} missing, the first {missing[0]}"
+        remedy = "leave those images out, or give them files without objects"
+        raise _faulty(where, "a file of labels for every image", got, remedy)
+    if any(labels.name in there for _, labels in text):
+        names = yolo_names(named_in)
+        return [_read_yolo(*pair, names) for pair in text]
     raise _faulty(where, LAYOUTS, f"none named as one of the {len(images)} images", "name each file as its image")
 
 
@@ -171,7 +166,7 @@ def _labelled_set(files: Sequence[_File], notes: Sequence[str] = ()) -> Labelled
         whole = Boxes.of([box.corners for box in one.boxes], classes, ignored=ignored)
         inside = whole[areas(whole.corners) > 0].clipped(*_size_px(one))
         lost += [one.source.name] * (len(whole) - len(inside))
-        images.append(LabelledImage(one.image, inside, site_of(one.image.name)))
+        images.append(LabelledImage(one.image, inside))
     if not any(len(image.truth) for image in images):
         got = f"none on {len(images)} images"
         raise OptionError("labels", expected="one object at least", got=got, remedy="check the labels")
@@ -234,50 +229,35 @@ def _voc_box(entry: ET.Element, path: Path) -> _Box:
     name = (entry.findtext("name") or "").strip()
     if not name:
         raise _faulty(path, "a name for every object", "none")
-    if entry.find("bndbox") is None and entry.find("robndbox") is not None:
-        raise _faulty(path, "upright boxes (bndbox)", "oriented ones", f"give the folder '{HORIZONTAL}'")
-    texts = [entry.findtext(f"bndbox/{corner}") for corner in CORNERS]
-    if None in texts:
-        missing = ", ".join(corner for corner, text in zip(CORNERS, texts, strict=True) if text is None)
-        raise _faulty(path, f"{', '.join(CORNERS)} of every object", f"a {name!r} without {missing}")
-    left, top, right, bottom = _numbers([str(text) for text in texts], path, f"corners of a {name!r}")
+    corners = [entry.findtext(f"bndbox/{corner}", "none") for corner in CORNERS]
+    left, top, right, bottom = _numbers(corners, path, f"{', '.join(CORNERS)} of a {name!r}")
     return _Box(name, (left - 1, top - 1, right, bottom), (entry.findtext("difficult") or "0").strip() == "1")
 
 
 def _read_coco(labels: Path, folder: Path) -> tuple[list[_File], list[str]]:
     """The labels of every image that is both listed and in the folder, and a sentence about those that are not."""
     try:
-        content = read_json(labels)
-    except (OSError, ValueError) as error:
-        got = getattr(error, "strerror", None) or " ".join(str(error).split())[:100]
-        raise _faulty(labels, "COCO's JSON", got, "give COCO's JSON file") from error
-    images, annotations, categories = (_coco_list(content, name, labels) for name in COCO_LISTS)
-    try:
-        names = {entry["id"]: _text(entry["name"]) for entry in categories}
-        boxes: dict[Any, list[_Box]] = {entry["id"]: [] for entry in images}
-        for entry in annotations:
-            left, top, width, height = (float(value) for value in entry["bbox"])
+        content: Any = read_json(labels)
+        names = {entry["id"]: _text(entry["name"]) for entry in content["categories"]}
+        boxes: dict[Any, list[_Box]] = {entry["id"]: [] for entry in content["images"]}
+        for entry in content["annotations"]:
+            left, top, width, height = map(float, entry["bbox"])
             corners = (left, top, left + width, top + height)
             boxes[entry["image_id"]].append(_Box(names[entry["category_id"]], corners, bool(entry.get("iscrowd", 0))))
         files = [
             _File(path, boxes[entry["id"]], labels, _stated_px(entry.get("height") or 0, entry.get("width") or 0))
-            for entry in images
+            for entry in content["images"]
             if (path := _inside(folder, _text(entry["file_name"]))) is not None
         ]
-    except (LookupError, TypeError, ValueError, OverflowError) as error:
-        got = f"an entry that breaks it ({type(error).__name__}: {' '.join(str(error).split())[:60]})"
-        raise _faulty(labels, "COCO's images, annotations and categories", got) from error
-    absent = len(images) - len(files)
+    except (OSError, LookupError, TypeError, ValueError, OverflowError) as error:
+        got = f"{type(error).__name__}: {' '.join(str(error).split())[:100]}"
+        remedy = "give COCO's JSON file"
+        raise _faulty(labels, "COCO's lists of images, annotations and categories", got, remedy) from error
+    listed = len(content["images"])
     if not files:
-        raise _faulty(labels, f"its images in {folder}", f"none of {absent}", "give the folder that holds them")
-    return files, [f"{absent} of {len(images)} images in {labels.name} are not in the folder."] if absent else []
-
-
-def _coco_list(content: Any, name: str, labels: Path) -> list[Mapping[str, Any]]:
-    entries = content.get(name) if isinstance(content, dict) else None
-    if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
-        raise _faulty(labels, "COCO's lists images, annotations and categories", f"no list {name!r}")
-    return entries
+        raise _faulty(labels, f"its images in {folder}", f"none of {listed}", "give the folder that holds them")
+    absent = listed - len(files)
+    return files, [f"{absent} of {listed} images in {labels.name} are not in the folder."] if absent else []
 
 
 def _stated_px(height: float, width: float) -> tuple[int, int] | None:
@@ -298,23 +278,6 @@ def _text(value: Any) -> str:
     return value.strip()
 
 
-def _are_dota(labels: Sequence[Path]) -> bool:
-    """Whether files are DOTA's and not YOLO's, by the first line of all: its ninth word is a name."""
-    words = next((line.split() for path in labels for line in _lines(path)), [])
-    return len(words) in (9, 10) and not words[8].lstrip("-").replace(".", "", 1).isdecimal()
-
-
-def _read_dota(image: Path, labels: Path) -> _File:
-    boxes = []
-    for line in _lines(labels):
-        words = line.split()
-        if len(words) not in (9, 10) or words[9:] not in ([], ["0"], ["1"], ["2"]):
-            raise _faulty(labels, "DOTA's eight coordinates, category and difficulty", repr(line[:80]))
-        corners = _enclosing(_numbers(words[:8], labels, "coordinates"))
-        boxes.append(_Box(words[8], corners, words[9:] in (["1"], ["2"])))
-    return _File(image, boxes, labels)
-
-
 def _read_yolo(image: Path, labels: Path, names: Sequence[str]) -> _File:
     """The labels of one image; no object where there is no file."""
     size_px = image_size_px(image)
@@ -333,12 +296,12 @@ def _yolo_box(line: str, path: Path, names: Sequence[str], size_px: tuple[int, i
     if min(shares) < -SPAN or max(shares) > 1 + SPAN:
         remedy = "divide pixels by the image's width and height"
         raise _faulty(path, "coordinates as shares of the image, 0 to 1", repr(line[:80]), remedy)
+    points = np.reshape(shares, (-1, 2)) * size_px[::-1]
     if len(shares) == 4:
-        x, y, width, height = shares
-        shares = [x - width / 2, y - height / 2, x + width / 2, y + height / 2]
-    left, top, right, bottom = _enclosing(shares)
-    rows, columns = size_px
-    return _Box(names[int(number)], (left * columns, top * rows, right * columns, bottom * rows))
+        middle, size = points
+        points = np.array([middle - size / 2, middle + size / 2])
+    (left, top), (right, bottom) = points.min(axis=0), points.max(axis=0)
+    return _Box(names[int(number)], (left, top, right, bottom))
 
 
 def yolo_names(folders: Sequence[Path]) -> tuple[str, ...]:
@@ -369,20 +332,17 @@ def _yaml_names(path: Path) -> tuple[str, ...]:
         content: Any = yaml.safe_load(_read_bytes(path, NAMES_BYTES))
     except (yaml.YAMLError, RecursionError, ValueError) as error:
         raise _faulty(path, "YAML", " ".join(str(error).split())[:100]) from error
-    names = content.get("names") if isinstance(content, dict) else None
-    if names is None:
+    if not isinstance(content, dict) or "names" not in content:
         return ()
-    if isinstance(names, dict) and sorted(names, key=str) == sorted(range(len(names)), key=str):
-        names = [names[number] for number in range(len(names))]
-    if not isinstance(names, list) or not names or not all(isinstance(name, str) and name.strip() for name in names):
+    names = class_names(content["names"])
+    if not names:
         raise _faulty(path, "names: a list, or a table by number from 0", "other names")
-    return tuple(name.strip() for name in names)
+    return names
 
 
 def _lines(path: Path) -> list[str]:
-    """Lines that hold something, without DOTA's headers."""
-    text = _read_bytes(path).decode("utf-8-sig", "replace")
-    return [line for line in text.splitlines() if line.strip() and not line.lower().startswith(DOTA_HEADERS)]
+    """Lines that hold something."""
+    return [line for line in _read_bytes(path).decode("utf-8-sig", "replace").splitlines() if line.strip()]
 
 
 def _read_bytes(path: Path, limit_bytes: int = LABEL_BYTES) -> bytes:
@@ -401,12 +361,6 @@ def _numbers(texts: Sequence[str], path: Path, what: str) -> list[float]:
     if not all(map(math.isfinite, found)):
         raise _faulty(path, f"numbers as {what}", repr(" ".join(texts))[:80])
     return found
-
-
-def _enclosing(points: Sequence[float]) -> tuple[float, float, float, float]:
-    """The upright box around the corners x, y, x, y, ... of a polygon."""
-    x, y = points[0::2], points[1::2]
-    return min(x), min(y), max(x), max(y)
 
 
 def _faulty(path: Path, expected: str, got: str, remedy: str = "correct the labels") -> OptionError:

@@ -1,6 +1,5 @@
 """The page of a detection study: precision by recall, crops with boxes, and the tables."""
 
-import base64
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -8,18 +7,11 @@ import numpy as np
 from PIL import Image, ImageDraw
 
 from deploy.report.page import Picture, Report, Table, write_report
-from deploy.report.plots import SERIES, Curve, Panel, curves_svg
+from deploy.report.plots import SERIES, Curve, Panel, curves_svg, data_url
 from deploy.studies.detection.average_precision import RECALLS, Hits, mean_known, precisions
 from deploy.studies.detection.boxes import Boxes, iou
 from deploy.studies.detection.study import REFERENCE, Comparison
-from deploy.studies.detection.tables import (
-    BY_SIZE,
-    MAIN,
-    PAPER_NOTES,
-    detection_rows,
-    headline,
-    paper_rows,
-)
+from deploy.studies.detection.tables import BY_SIZE, MAIN, PAPER_NOTES, detection_rows, headline, paper_rows
 from deploy.studies.evaluation.methods import DEGRADED
 from model.io.pictures import grid, picture_url
 from profiles.figures import Row, by_table
@@ -67,8 +59,9 @@ def curves(compared: Sequence[Comparison]) -> Picture:
         for found in compared
     ]
     svg = curves_svg(panels, "recall", "precision", logarithmic=False)
-    address = "data:image/svg+xml;base64," + base64.b64encode(svg.encode()).decode()
-    return Picture("Precision by recall", address, "At an overlap of 0.5, mean over the classes that are labelled.")
+    return Picture(
+        "Precision by recall", data_url(svg), "At an overlap of 0.5, mean over the classes that are labelled."
+    )
 
 
 def _points(hits: Hits) -> tuple[tuple[float, float], ...]:

@@ -56,8 +56,9 @@ def synthetic_scene(generator: np.random.Generator, height_px: int, width_px: in
         shadows left out. Every object lies whole within the scene, touches no other, and nothing covers it.
     """
     canvas = Canvas(height_px, width_px, generator)
-    angle, (x, y) = float(generator.uniform(-0.5, 0.5)), generator.uniform(-0.5, 0.5, 2) * PLOT_M
-    world, reach = turn(x, y, angle), canvas.reach_m + PLOT_M
+    angle, (x, y) = generator.uniform(-0.5, 0.5), generator.uniform(-0.5, 0.5, 2) * PLOT_M
+    # Half the diagonal: how far from the centre there is something to draw.
+    world, reach = turn(x, y, angle), math.hypot(width_px, height_px) * SCENE_GSD_M / 2 + PLOT_M
     places = (np.arange(math.ceil(2 * reach / PLOT_M)) + 0.5) * PLOT_M - reach
     plots = [Plot(canvas, *world(u, v), angle, (PLOT_M - STREET_M) / 2 - KERB_M) for v in places for u in places]
     streets = [(world(p + PLOT_M / 2, 0), angle + math.pi / 2) for p in places]
@@ -82,11 +83,6 @@ class Canvas:
         self._size = width_px, height_px
         self._image, self._shown = Image.new("F", self._size, GRASS), Image.new("I", self._size, 0)
         self._draw, self._draw_shown = ImageDraw.Draw(self._image), ImageDraw.Draw(self._shown)
-
-    @property
-    def reach_m(self) -> float:
-        """Half the diagonal: how far from the centre there is something to draw."""
-        return math.hypot(*self._size) * SCENE_GSD_M / 2
 
     def textured(self) -> np.ndarray:
         """The radiance (H, W) float32 with the ground's texture."""
@@ -182,7 +178,7 @@ class Plot:
 
     def tree(self, x: float, y: float) -> None:
         """Draw a tree of 1.5 to 3.5 m radius."""
-        self.canvas.tree(self.place(x, y), float(self.random.uniform(1.5, 3.5)))
+        self.canvas.tree(self.place(x, y), self.random.uniform(1.5, 3.5))
 
     def put(self, kind: int, parts: list[Part], x: float, y: float, turned: float, height_m: float) -> bool:
         """Put an object at (x, y), turned against the plot; one that does not fit into the plot is left out."""
@@ -204,19 +200,17 @@ class Plot:
 
 def vehicle(generator: np.random.Generator) -> list[Part]:
     """A car, or with 1 in 5 a lorry or bus: the body and, of cars, the windscreen."""
-    paint = float(generator.choice(PAINTS))
+    paint = generator.choice(PAINTS)
     if generator.random() < 0.2:
         return [(rectangle(generator.uniform(4, 7), 1.25), paint), (_band(3.0, 3.5, 1.2), 0.5 * paint)]
-    return [
-        (rectangle(generator.uniform(1.9, 2.6), generator.uniform(0.85, 1.0)), paint),
-        (_band(0.4, 1.1, 0.8), 20.0),
-    ]
+    body = rectangle(generator.uniform(1.9, 2.6), generator.uniform(0.85, 1.0))
+    return [(body, paint), (_band(0.4, 1.1, 0.8), 20.0)]
 
 
 def ship(generator: np.random.Generator) -> list[Part]:
     """A hull with a bow, its hatches or a long deck, and the bridge astern."""
     half = 0.5 * math.exp(generator.uniform(math.log(9), math.log(70)))
-    wide, hull = half / generator.uniform(3, 5), float(generator.uniform(50, 160))
+    wide, hull = half / generator.uniform(3, 5), generator.uniform(50, 160)
     outline = [
         (-half, -0.8 * wide),
         (-0.9 * half, -wide),
@@ -227,13 +221,13 @@ def ship(generator: np.random.Generator) -> list[Part]:
     parts = [(outline + [(x, -y) for x, y in reversed(outline[:-1])], hull)]
     edges = np.linspace(-0.45, 0.55, int(generator.integers(2, 6))) * half
     for start, end in pairwise(edges):
-        parts.append((_band(start + 0.04 * half, end, 0.7 * wide), hull * float(generator.uniform(0.4, 1.6))))
-    return [*parts, (_band(-0.85 * half, -0.55 * half, 0.75 * wide), float(generator.uniform(170, 260)))]
+        parts.append((_band(start + 0.04 * half, end, 0.7 * wide), hull * generator.uniform(0.4, 1.6)))
+    return [*parts, (_band(-0.85 * half, -0.55 * half, 0.75 * wide), generator.uniform(170, 260))]
 
 
 def aircraft(generator: np.random.Generator) -> list[Part]:
     """Swept wings, tailplane, engines and, on top, the fuselage."""
-    half, paint = 0.5 * math.exp(generator.uniform(math.log(12), math.log(38))), float(generator.uniform(170, 270))
+    half, paint = 0.5 * math.exp(generator.uniform(math.log(12), math.log(38))), generator.uniform(170, 270)
     long, sweep = half * generator.uniform(0.9, 1.15), half * generator.uniform(0.15, 0.6)
     thick, chord = 0.11 * half, 0.32 * half
     fuselage = [(-long, 0.0), (-0.7 * long, thick), (0.8 * long, thick), (long, 0.0)]
@@ -249,11 +243,11 @@ def aircraft(generator: np.random.Generator) -> list[Part]:
 
 def tank(radius_m: float, generator: np.random.Generator) -> list[Part]:
     """A round tank with a rim and a roof a little darker or brighter, the stair's hatch on it."""
-    paint, angle = float(generator.uniform(110, 250)), float(generator.uniform(0, math.tau))
+    paint, angle = generator.uniform(110, 250), generator.uniform(0, math.tau)
     hatch = 0.6 * radius_m * math.cos(angle), 0.6 * radius_m * math.sin(angle)
     return [
         (_disc(0.0, 0.0, radius_m), paint),
-        (_disc(0.0, 0.0, 0.88 * radius_m), paint * float(generator.uniform(0.75, 1.1))),
+        (_disc(0.0, 0.0, 0.88 * radius_m), paint * generator.uniform(0.75, 1.1)),
         (_disc(*hatch, 0.12 * radius_m), 0.6 * paint),
     ]
 
@@ -287,9 +281,9 @@ def _street(strip: Plot) -> None:
 
 def _traffic(strip: Plot) -> None:
     for u in strip.random.uniform(-strip.half_m, strip.half_m, int(strip.half_m / 12)):
-        side = float(strip.random.choice([-1, 1]))
-        turned = float(strip.random.normal(0, 0.03)) + (math.pi if side > 0 else 0.0)
-        strip.put(VEHICLE, vehicle(strip.random), float(u), side * 2.3, turned, 0.8)
+        side = strip.random.choice([-1, 1])
+        turned = strip.random.normal(0, 0.03) + (math.pi if side > 0 else 0.0)
+        strip.put(VEHICLE, vehicle(strip.random), u, side * 2.3, turned, 0.8)
 
 
 def _harbour(plot: Plot) -> None:
@@ -297,46 +291,39 @@ def _harbour(plot: Plot) -> None:
     plot.pad(WATER)
     half = plot.half_m
     plot.rectangle(-half, -half, 2 * half, 7.0, CONCRETE)
-    pier = float(plot.random.uniform(-0.4, 0.4)) * half
-    plot.rectangle(pier, -half, 4.0, float(plot.random.uniform(0.4, 1.3)) * half, CONCRETE * 0.8)
+    pier = plot.random.uniform(-0.4, 0.4) * half
+    plot.rectangle(pier, -half, 4.0, plot.random.uniform(0.4, 1.3) * half, CONCRETE * 0.8)
     for _ in range(int(plot.random.integers(0, 6))):
-        plot.put(VEHICLE, vehicle(plot.random), float(plot.random.uniform(-half, half)), 3.5 - half, 0.0, 0.8)
+        plot.put(VEHICLE, vehicle(plot.random), plot.random.uniform(-half, half), 3.5 - half, 0.0, 0.8)
 
     def sail(x: float, y: float) -> bool:
         moored, anywhere = plot.random.choice([0, math.pi / 2]), plot.random.uniform(0, math.tau)
-        parts, turned = ship(plot.random), float(plot.random.choice([moored, anywhere]))
+        parts, turned = ship(plot.random), plot.random.choice([moored, anywhere])
         hull = np.array([turn(x, y, turned)(*point) for point in parts[0][0]])
-        return _is_afloat(hull, plot, pier) and plot.put(SHIP, parts, x, y, turned, 1.5)
+        clear_of_pier = hull[:, 0].max() < pier or hull[:, 0].min() > pier + 4
+        clear = clear_of_pier and hull[:, 1].min() > 7 - plot.half_m
+        return bool(clear) and plot.put(SHIP, parts, x, y, turned, 1.5)
 
     plot.scatter(int(plot.random.integers(3, 14)), sail)
 
 
-def _is_afloat(hull: np.ndarray, plot: Plot, pier: float) -> bool:
-    """Whether a hull (N, 2), in metres of the plot, clears the quay and the pier."""
-    clear_of_pier = hull[:, 0].max() < pier or hull[:, 0].min() > pier + 4
-    return bool(hull[:, 1].min() > 7 - plot.half_m and clear_of_pier)
-
-
 def _apron(plot: Plot) -> None:
     """Concrete slabs, a taxi line, aircraft parked at any angle, and what serves them."""
-    plot.pad(CONCRETE * float(plot.random.uniform(0.6, 1.0)))
+    plot.pad(CONCRETE * plot.random.uniform(0.6, 1.0))
     half = plot.half_m
     for position in np.arange(-half, half, 7.5):
         plot.line((position, -half), (position, half), CONCRETE * 0.65, 0.25)
         plot.line((-half, position), (half, position), CONCRETE * 0.65, 0.25)
-    bend = float(plot.random.uniform(-0.5, 0.5)) * half
+    bend = plot.random.uniform(-0.5, 0.5) * half
     plot.line((-half, bend), (half, bend), WHITE * 0.8, 0.3)
-    plot.scatter(
-        int(plot.random.integers(1, 8)),
-        lambda x, y: plot.put(AIRCRAFT, aircraft(plot.random), x, y, float(plot.random.uniform(0, math.tau)), 2.5),
-    )
-    _scatter_vehicles(plot, 5)
+    _scatter(plot, AIRCRAFT, aircraft, (1, 7), 2.5)
+    _scatter(plot, VEHICLE, vehicle, (0, 5), 0.8)
 
 
 def _tank_farm(plot: Plot) -> None:
     """Gravel, bunds around each tank, and tanks of one or two sizes."""
-    plot.pad(SOIL * float(plot.random.uniform(0.8, 1.3)))
-    radius = float(plot.random.uniform(5, 15))
+    plot.pad(SOIL * plot.random.uniform(0.8, 1.3))
+    radius = plot.random.uniform(5, 15)
     step = 2.9 * radius + 3
     count = int(2 * plot.half_m / step)
     start = -step * (count - 1) / 2
@@ -347,74 +334,72 @@ def _tank_farm(plot: Plot) -> None:
                 plot.line((x + side, y - 0.48 * step), (x + side, y + 0.48 * step), CONCRETE, 0.8)
                 plot.line((x - 0.48 * step, y + side), (x + 0.48 * step, y + side), CONCRETE, 0.8)
             if plot.random.random() < 0.75:
-                own = radius * float(plot.random.choice([1.0, 1.0, 0.6]))
+                own = radius * plot.random.choice([1.0, 1.0, 0.6])
                 plot.put(TANK, tank(own, plot.random), x, y, 0.0, 0.35 * own)
-    _scatter_vehicles(plot, 3)
+    _scatter(plot, VEHICLE, vehicle, (0, 3), 0.8)
 
 
 def _car_park(plot: Plot) -> None:
     """Rows of stalls between lanes, some 60 % taken, a few trees in between."""
-    plot.pad(ASPHALT * float(plot.random.uniform(0.9, 1.6)))
-    half, taken = plot.half_m, float(plot.random.uniform(0.2, 0.9))
+    plot.pad(ASPHALT * plot.random.uniform(0.9, 1.6))
+    half, taken = plot.half_m, plot.random.uniform(0.2, 0.9)
     for y in np.arange(6.0 - half, half - 4, 13.0):
         for x in np.arange(3.0 - half, half - 3, 2.9):
             plot.line((x - 1.45, y - 2.6), (x - 1.45, y + 2.6), WHITE * 0.6, 0.25)
             if plot.random.random() < taken:
-                turned = math.pi / 2 * float(plot.random.choice([-1, 1])) + float(plot.random.normal(0, 0.03))
-                plot.put(VEHICLE, vehicle(plot.random), float(x), float(y), turned, 0.8)
+                turned = math.pi / 2 * plot.random.choice([-1, 1]) + plot.random.normal(0, 0.03)
+                plot.put(VEHICLE, vehicle(plot.random), x, y, turned, 0.8)
         if plot.random.random() < 0.5:
-            plot.tree(float(plot.random.uniform(-half, half)), float(y) + 6)
+            plot.tree(plot.random.uniform(-half, half), y + 6)
 
 
 def _houses(plot: Plot) -> None:
-    """Gable roofs and flat halls in gardens, trees, a car here and there."""
+    """Gable roofs and flat halls in gardens, trees, cars in the gaps between the rows of houses."""
     half = plot.half_m
     for y in np.arange(14.0 - half, half - 8, 24.0):
         for x in np.arange(12.0 - half, half - 8, 20.0):
             long, wide = plot.random.uniform(9, 16), plot.random.uniform(7, 11)
-            _house(plot, float(x - long / 2), float(y - wide / 2), float(long), float(wide))
-            plot.tree(float(x + plot.random.uniform(-9, 9)), float(y + 11))
-    _scatter_drives(plot)
+            _house(plot, x - long / 2, y - wide / 2, long, wide)
+            plot.tree(x + plot.random.uniform(-9, 9), y + 11)
+    for y in np.arange(26.0 - half, half - 4, 24.0):
+        for x in plot.random.uniform(-half, half, 3):
+            plot.rectangle(x - 3.5, y - 1.6, 7.0, 3.2, CONCRETE * 0.7)
+            plot.put(VEHICLE, vehicle(plot.random), x, y, 0.0, 0.8)
 
 
 def _house(plot: Plot, x: float, y: float, long: float, wide: float) -> None:
     """A roof, one slope in the sun, and its shadow."""
-    bright, shade = float(plot.random.uniform(60, 200)), 2.2
+    bright, shade = plot.random.uniform(60, 200), 2.2
     corners = [(x, y), (x + long, y), (x + long, y + wide), (x, y + wide)]
     plot.canvas.area([(px + shade, py + shade) for px, py in (plot.place(*c) for c in corners)], SHADOW)
     plot.rectangle(x, y, long, wide / 2, bright)
-    plot.rectangle(x, y + wide / 2, long, wide / 2, bright * float(plot.random.choice([0.55, 1.0])))
+    plot.rectangle(x, y + wide / 2, long, wide / 2, bright * plot.random.choice([0.55, 1.0]))
 
 
-def _scatter_drives(plot: Plot) -> None:
-    """Cars in the gaps between the houses' rows."""
-    for y in np.arange(26.0 - plot.half_m, plot.half_m - 4, 24.0):
-        for x in plot.random.uniform(-plot.half_m, plot.half_m, 3):
-            plot.rectangle(float(x) - 3.5, float(y) - 1.6, 7.0, 3.2, CONCRETE * 0.7)
-            plot.put(VEHICLE, vehicle(plot.random), float(x), float(y), 0.0, 0.8)
-
-
-def _scatter_vehicles(plot: Plot, most: int) -> None:
+def _scatter(
+    plot: Plot, kind: int, make: Callable[[np.random.Generator], list[Part]], counts: tuple[int, int], height_m: float
+) -> None:
+    """Some objects of a kind anywhere on a plot, turned anyhow; `counts` are the least and the most."""
     plot.scatter(
-        int(plot.random.integers(0, most + 1)),
-        lambda x, y: plot.put(VEHICLE, vehicle(plot.random), x, y, float(plot.random.uniform(0, math.tau)), 0.8),
+        int(plot.random.integers(*counts, endpoint=True)),
+        lambda x, y: plot.put(kind, make(plot.random), x, y, plot.random.uniform(0, math.tau), height_m),
     )
 
 
 def _field(plot: Plot) -> None:
     """Crop rows, and the trees of a hedge."""
-    base, half = float(plot.random.choice([38, 55, 70, 88])), plot.half_m
+    base, half = plot.random.choice([38, 55, 70, 88]), plot.half_m
     plot.pad(base)
-    for x in np.arange(-half, half, float(plot.random.uniform(0.8, 2.5))):
-        plot.line((float(x), -half), (float(x), half), base * 0.85, 0.4)
+    for x in np.arange(-half, half, plot.random.uniform(0.8, 2.5)):
+        plot.line((x, -half), (x, half), base * 0.85, 0.4)
     for y in plot.random.uniform(-half, half, 12):
-        plot.tree(half - 4, float(y))
+        plot.tree(half - 4, y)
 
 
 def _forest(plot: Plot) -> None:
     """Trees, crown at crown."""
     for x, y in plot.random.uniform(-plot.half_m, plot.half_m, (260, 2)):
-        plot.tree(float(x), float(y))
+        plot.tree(x, y)
 
 
 _KINDS = (_harbour, _harbour, _apron, _apron, _tank_farm, _car_park, _houses, _field, _forest)

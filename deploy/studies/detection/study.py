@@ -5,7 +5,7 @@ boxes back on the scene -> average precision.
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
 
@@ -19,6 +19,7 @@ from deploy.studies.detection.detector import Detector, class_numbers
 from deploy.studies.detection.labels import read_labelled
 from deploy.studies.detection.scenes import CLASSES, synthetic_scene
 from deploy.studies.evaluation.methods import DEGRADED, Method, method_named
+from model.io.images import site_of
 from model.io.pictures import Stretch, stretch_of
 from model.progress import Log, no_log, once, steps
 from model.simulator.acquire import acquire_padded
@@ -102,7 +103,7 @@ class AcquiredScene:
     def boxes(self, detector: Detector, method: Method | None) -> Boxes:
         """What a detector finds on it, in scene pixels; arguments as of `shown`."""
         found = detector.detect(self.shown(method))
-        return found.at(found.corners * self.sensors.oversampling)
+        return replace(found, corners=found.corners * self.sensors.oversampling)
 
     def _acquired(self, profile: SensorProfile, role: str) -> np.ndarray:
         sensor, radiance = profile.draw(self.draw.generator("sensor")), self.scene.radiance(profile.nominal())
@@ -169,32 +170,15 @@ def run_study(
         BeersError: a name, a profile or a picture that cannot be used.
     """
     told = once(say)
-    pairs = [_pair(name, reference, told) for name in sensors]
+    pairs = [SensorPair(each, reference_beside(each, reference, told)) for each in map(load_sensor, sensors)]
     rows = [{name: method_named(name, pair.degraded, pair.reference, told) for name in methods} for pair in pairs]
-    return [compare(detector, scenes, *each, seed) for each in zip(pairs, rows, strict=True)]
+    return [_compared(detector, scenes, *each, seed) for each in zip(pairs, rows, strict=True)]
 
 
-def _pair(name: str, reference: str | None, say: Log) -> SensorPair:
-    degraded = load_sensor(name)
-    return SensorPair(degraded, reference_beside(degraded, reference, say))
-
-
-def compare(
-    detector: Detector,
-    scenes: Sequence[LabelledScene],
-    sensors: SensorPair,
-    methods: Mapping[str, Method | None],
-    seed: int,
+def _compared(
+    detector: Detector, scenes: Sequence[LabelledScene], sensors: SensorPair, methods: Mapping[str, Method], seed: int
 ) -> Comparison:
-    """Show a detector every scene in every row, and score what it finds.
-
-    Args:
-        detector: that is shown the pictures.
-        scenes: labelled.
-        sensors: that acquire them.
-        methods: by row; the reference becomes the first one.
-        seed: of acquisitions and intervals.
-    """
+    """Show a detector every scene in every row, the reference first, and score what it finds."""
     rows = {REFERENCE: None, **methods}
     boxes: dict[str, list[Boxes]] = {row: [] for row in rows}
     with steps(f"detecting, {sensors.degraded.name}", len(scenes) * len(rows)) as bar:
@@ -248,11 +232,7 @@ def synthetic_labelled(number: int, seed: int, classes: np.ndarray) -> LabelledS
 
 
 def labelled_scenes(
-    names: Sequence[str],
-    given: Mapping[str, str],
-    images: Path,
-    labels: Path | None = None,
-    split: str | None = None,
+    names: Sequence[str], given: Mapping[str, str], images: Path, labels: Path | None = None, split: str | None = None
 ) -> tuple[list[LabelledScene], list[str]]:
     """The labelled pictures of a folder as scenes, read when they are looked at, and sentences on what is left out.
 
@@ -268,9 +248,9 @@ def labelled_scenes(
     """
     labelled = read_labelled(images, labels, split)
     numbers = class_numbers(labelled.names, names, given)
+    paths = [(each.path, each.truth.renamed(numbers)) for each in labelled.images]
     scenes = [
-        LabelledScene(each.path.name, each.site, each.truth.renamed(numbers), each.path, partial(_read, each.path))
-        for each in labelled.images
+        LabelledScene(path.name, site_of(path.name), boxes, path, partial(_read, path)) for path, boxes in paths
     ]
     return scenes, [*labelled.notes, *left_out(labelled.names, numbers)]
 

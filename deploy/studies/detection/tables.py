@@ -5,10 +5,10 @@ from math import isnan
 
 import numpy as np
 
-from deploy.studies.detection.average_precision import DRAWS, SIZES_PX, interval, sites_note
+from deploy.studies.detection.average_precision import DRAWS, SIZES_PX, interval
 from deploy.studies.detection.study import REFERENCE, Comparison
 from deploy.studies.evaluation.methods import DEGRADED
-from model.metrics.bootstrap import LEAST_SITES
+from model.metrics.bootstrap import too_few
 from profiles.figures import Figure, Row, measured, published, unavailable
 
 PERCENT, POINTS = "%", "points"
@@ -29,16 +29,16 @@ def detection_rows(found: Comparison) -> list[Row]:
     by_class = {name: f"mAP50 of {name}" for name in labelled}
     by_size = {name: f"mAP50 {name}" for name in list(SIZES_PX)[1:]}
     return [
-        *(_main_row(found, row) for row in found.methods),
+        *main_rows(found),
         *(_own_row(found, row) for row in found.methods),
         *(Row(f"{BY_CLASS}, {found.name}", row, _values(found, row, by_class)) for row in found.methods),
         *(Row(f"{BY_SIZE}, {found.name}", row, _values(found, row, by_size)) for row in found.methods),
     ]
 
 
-def main_table(sensor: str) -> str:
-    """The name of the table that answers the question for a sensor."""
-    return f"{MAIN}, {sensor}"
+def main_rows(found: Comparison) -> list[Row]:
+    """The table that answers the question."""
+    return [_main_row(found, row) for row in found.methods]
 
 
 def _main_row(found: Comparison, row: str) -> Row:
@@ -53,7 +53,7 @@ def _main_row(found: Comparison, row: str) -> Row:
         figures[GAIN] = _figure(found, own - degraded, POINTS)
         figures[REGAINED] = _regained(found, own - degraded, reference - degraded)
         words["against degraded"] = verdict(own - degraded, found.sites)
-    return Row(main_table(found.name), row, figures, words)
+    return Row(f"{MAIN}, {found.name}", row, figures, words)
 
 
 def verdict(difference: np.ndarray, sites: int) -> str:
@@ -68,8 +68,8 @@ def verdict(difference: np.ndarray, sites: int) -> str:
 
 def _regained(found: Comparison, gain: np.ndarray, loss: np.ndarray) -> Figure:
     """The share of a loss that a gain makes good; unavailable where the loss cannot be told from 0."""
-    if found.sites < LEAST_SITES:
-        return unavailable(PERCENT, sites_note(found.sites))
+    if too_few(found.sites):
+        return unavailable(PERCENT, too_few(found.sites))
     if verdict(loss, found.sites) not in ("a gain", "a loss"):
         return unavailable(PERCENT, NO_LOSS)
     return _figure(found, np.divide(gain, loss, out=np.full(gain.shape, np.nan), where=loss != 0))
@@ -88,21 +88,10 @@ def _values(found: Comparison, row: str, keys: Mapping[str, str]) -> dict[str, F
 
 
 def _figure(found: Comparison, values: np.ndarray, unit: str = PERCENT) -> Figure:
-    return share_figure(values, len(found.scenes), found.sites, unit)
-
-
-def share_figure(values: np.ndarray, images: int, sites: int, unit: str = PERCENT) -> Figure:
-    """A share of 0 to 1, or a difference of shares, times 100; with its interval where there are sites enough.
-
-    Args:
-        values: (1 + draws,) on all images, then on each draw.
-        images: how many.
-        sites: how many different ones they show.
-        unit: percent or points.
-    """
+    """A share of 0 to 1, or a difference of two, (1 + draws,), times 100; its interval where sites are enough."""
     if isnan(values[0]):
         return unavailable(unit, NO_OBJECT)
-    source, ends = f"{images} images of {sites} sites", interval(values, sites)
+    source, ends = f"{len(found.scenes)} images of {found.sites} sites", interval(values, found.sites)
     if ends is None:
         return measured(100 * float(values[0]), unit, source)
     source = f"{source}, 95 % bootstrap interval over sites ({DRAWS} draws)"
@@ -150,7 +139,7 @@ def headline(compared: Sequence[Comparison]) -> str:
 
 
 def _sentence(found: Comparison) -> str:
-    rows = {row.name: row for row in detection_rows(found) if row.table == main_table(found.name)}
+    rows = {row.name: row for row in main_rows(found)}
     text = f"{found.name}: mAP50 is {rows[REFERENCE].figures['mAP50']} % on reference images"
     text += f" and {rows[DEGRADED].figures[LOSS]} points less on degraded ones"
     last = list(rows.values())[-1]

@@ -74,12 +74,6 @@ def method_without_network(name: str, degraded: Sensor, reference: Sensor) -> Me
     """
     if name == DEGRADED:
         return Method(name, lambda dn: dn, "the input itself")
-    specialise = _pipeline_specialise(name, reference)
-    return None if specialise is None else Method(name, specialise(degraded), KNOWN, specialise)
-
-
-def _pipeline_specialise(name: str, reference: Sensor) -> Specialise | None:
-    """How a chain or a peer of that name restores for a sensor, to the reference in that sensor's units."""
     if name not in (*CHAINS, *PEERS):
         return None
     quality, order = CHAINS.get(name, (STANDARD, "denoise-first"))
@@ -89,7 +83,7 @@ def _pipeline_specialise(name: str, reference: Sensor) -> Specialise | None:
         chain = Chain(sensor, reference.in_units_of(sensor), quality, order)
         return lambda dn: run(torch.from_numpy(dn), chain).numpy()
 
-    return specialise
+    return Method(name, specialise(degraded), KNOWN, specialise)
 
 
 EXPECTED = (
@@ -97,12 +91,6 @@ EXPECTED = (
     f"a shipped network ({', '.join(shipped_names())}, each also with -int8, and with @SENSOR or @blind to know "
     "another), or an ONNX or safetensors file"
 )
-
-DRAWN = "drawn"
-"""What a sensor is called that no profile states."""
-
-AT = "@"
-"""Between a network's name and the sensor that it is to know in the place of the images' own."""
 
 
 def method_named(name: str, degraded: SensorProfile, reference: SensorProfile, log: Log = no_log) -> Method:
@@ -123,8 +111,9 @@ def method_named(name: str, degraded: SensorProfile, reference: SensorProfile, l
     plain = method_without_network(name, degraded.nominal(), reference.nominal())
     if plain is not None:
         return plain
-    network, _, other = name.partition(AT)
-    if not _is_network(network):
+    network, _, other = name.partition("@")
+    shipped = network.removesuffix(INT8) in shipped_names()
+    if not shipped and Path(network).suffix not in (".onnx", ".safetensors"):
         raise OptionError("--methods", expected=EXPECTED, got=repr(name), remedy="correct that name")
     sensor = load_sensor(other) if other else degraded
     model = float_model(network_file(Path(network), sensor, log))
@@ -147,10 +136,6 @@ def _network_specialise(name: str, like: SensorProfile, log: Log) -> Specialise 
     return specialise
 
 
-def _is_network(name: str) -> bool:
-    return Path(name).suffix in (".onnx", ".safetensors") or name.removesuffix(INT8) in shipped_names()
-
-
 def knowledge_of(model: onnx.ModelProto, sensor_name: str) -> str:
     """What a network knows of the sensor of that name: it, nothing, or another one."""
     own = metadata(model).get("sensor", "")
@@ -166,4 +151,4 @@ def profile_of(sensor: Sensor, like: SensorProfile) -> SensorProfile:
     numbers |= {"gain_dn_per_radiance": sensor.gain_dn_per_radiance, "bits": float(sensor.bits)}
     constants = {name: Constant(value, "assumed", "a sensor drawn") for name, value in numbers.items()}
     noise = {"snr_0": None, "snr_1": None}
-    return replace(like, name=DRAWN, **constants, **noise, response=sensor.response)  # type: ignore[arg-type]
+    return replace(like, name="drawn", **constants, **noise, response=sensor.response)  # type: ignore[arg-type]

@@ -6,9 +6,10 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from deploy.report.page import Picture, Report, Table
+from deploy.report.page import Picture, Report, Table, write_report
 from deploy.studies.evaluation.methods import Method
 from deploy.studies.evaluation.pairs import NamedPair
+from deploy.studies.evaluation.run import Evaluation
 from model.io.files import whole_file
 from model.io.pictures import busiest_windows, error_row, grid, picture_url, stretch_of, strip_row
 from profiles.figures import Row, by_table
@@ -31,17 +32,13 @@ def strip_of(pair: NamedPair, methods: Sequence[Method]) -> tuple[np.ndarray, fl
     """
     images = {method.name: method.restore(pair.degraded) for method in methods}
     side = min(CROP_PX, *pair.degraded.shape)
-    window = busiest_windows(pair.reference, side)[0]
-    crops = {name: _crop(image, window, side) for name, image in {**images, "reference": pair.reference}.items()}
+    top, left = busiest_windows(pair.reference, side)[0]
+    whole = {**images, "reference": pair.reference}
+    crops = {name: image[top : top + side, left : left + side] for name, image in whole.items()}
     errors = {name: np.abs(crop - crops["reference"]) for name, crop in crops.items()}
     white = max(float(np.percentile(errors[methods[0].name], 99)), 1.0)
     rows = [strip_row(crops.values(), stretch_of(crops["reference"])), error_row(errors.values(), white)]
     return np.asarray(grid(list(crops), rows, ZOOM)), white
-
-
-def _crop(image: np.ndarray, window: tuple[int, int], side: int) -> np.ndarray:
-    top, left = window
-    return image[top : top + side, left : left + side]
 
 
 def pictures(pairs: Sequence[NamedPair], methods: Sequence[Method], out: Path) -> list[Picture]:
@@ -59,20 +56,20 @@ def pictures(pairs: Sequence[NamedPair], methods: Sequence[Method], out: Path) -
     return made
 
 
-def evaluation_report(
-    title: str,
-    mean: Sequence[Row],
-    sites: Sequence[Row],
-    swept: Sequence[Row],
-    pictures: Sequence[Picture],
-    sampled: str = "",
-) -> Report:
-    """The page: pictures, means, sites, and the sweep where there was one; `sampled` is one more note."""
-    tables = [Table("Means over all pairs", mean, MEAN_CAPTION)]
-    tables += [Table(name, rows, SITES_CAPTION) for name, rows in by_table(sites).items()]
-    tables += [Table(f"{name[0].upper()}{name[1:]}", rows, SWEEP_CAPTION) for name, rows in by_table(swept).items()]
-    notes = (*NOTES, f"{sampled[0].upper()}{sampled[1:]}.") if sampled else NOTES
-    return Report(title, headline(mean), tables, pictures, notes)
+def write_page(found: Evaluation, out: Path) -> Path:
+    """Write report.html and the strips of pictures into a folder; returns the report's path."""
+    report = evaluation_report(found, pictures(found.pairs, found.methods, out))
+    write_report(report, out / "report.html")
+    return out / "report.html"
+
+
+def evaluation_report(found: Evaluation, strips: Sequence[Picture]) -> Report:
+    """The page: pictures, means, sites, and the sweep where there was one."""
+    tables = [Table("Means over all pairs", found.mean, MEAN_CAPTION)]
+    tables += [Table(name, rows, SITES_CAPTION) for name, rows in by_table(found.sites).items()]
+    swept = by_table(found.swept).items()
+    tables += [Table(f"{name[0].upper()}{name[1:]}", rows, SWEEP_CAPTION) for name, rows in swept]
+    return Report(found.title, headline(found.mean), tables, strips, (*NOTES, *found.said))
 
 
 MEAN_CAPTION = (

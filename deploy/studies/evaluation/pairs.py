@@ -1,38 +1,23 @@
 """Pairs of a degraded and a reference image: simulated from scenes, or read from a folder that `simulate` wrote."""
 
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
 
 import numpy as np
 
 from model.io.images import MAX_DN, read_acquisition, site_of
 from model.recipe import PairsRecipe
-from model.simulator.acquire import (
-    LEAST_SIDE_PX,
-    MARGIN_PX,
-    NOISE,
-    acquire,
-    fitting_oversampling,
-    prepare_scene,
-)
+from model.simulator.acquire import LEAST_SIDE_PX, MARGIN_PX, NOISE, acquire, fitting_oversampling, prepare_scene
 from model.simulator.detector import Draw
+from model.simulator.procedural import load_scenes
 from model.simulator.sampling import Scene
 from model.training.patches import pair_files
 from profiles.errors import ImageError
 from profiles.sensor import Sensor, SensorProfile
 
 OVERSAMPLINGS = (4, 2)
-
-
-class SensorSource(Protocol):
-    """What gives a sensor for each scene: a profile, or always the same one."""
-
-    def draw(self, generator: np.random.Generator, /) -> Sensor:
-        """One sensor."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -58,14 +43,38 @@ class NamedPair:
         return self.place or site_of(self.name)
 
 
+def pairs_of_scenes(
+    images: Path | None, degraded: SensorProfile, reference: SensorProfile, seed: int
+) -> tuple[list[NamedPair], list[str]]:
+    """Pairs of the scenes of a folder, or of drawn ones, and what a reader must know of them.
+
+    Args:
+        images: the folder; drawn scenes if None.
+        degraded: profile of the degraded images.
+        reference: profile of the reference images.
+        seed: of every random draw.
+    """
+    scenes = load_scenes(images, reference.nominal(), seed)
+    pairs, small = simulate_pairs(scenes, degraded, reference, seed, oversamplings_of(degraded))
+    left_out = f"Left out, too small: {', '.join(small)}." if small else ""
+    return pairs, [note for note in (oversampling_note(pairs, degraded), left_out) if note]
+
+
 def simulate_pairs(
     scenes: list[Scene],
-    degraded: SensorSource,
-    reference: SensorSource,
+    degraded: SensorProfile | Sensor,
+    reference: SensorProfile | Sensor,
     seed: int,
     oversamplings: Sequence[int] = OVERSAMPLINGS,
 ) -> tuple[list[NamedPair], list[str]]:
     """Simulate a pair of each scene, at the first of the oversamplings that leaves enough of it.
+
+    Args:
+        scenes: what is seen.
+        degraded: the same sensor for all scenes, or a profile that one is drawn from for each.
+        reference: likewise.
+        seed: of every random draw.
+        oversamplings: scene pixels per pixel.
 
     Returns:
         The pairs, and the names of scenes too small to use.
@@ -80,8 +89,11 @@ def simulate_pairs(
             small.append(scene.name)
             continue
         draw = Draw(seed, number)
-        drawn = [profile.draw(draw.generator("sensor")) for profile in (degraded, reference)]
-        pairs.append(_simulated(scene, drawn[0], drawn[1], ratio, draw))
+        seen, meant = (
+            each if isinstance(each, Sensor) else each.draw(draw.generator("sensor"))
+            for each in (degraded, reference)
+        )
+        pairs.append(_simulated(scene, seen, meant, ratio, draw))
     if not pairs:
         least = oversamplings[-1] * (2 * MARGIN_PX + LEAST_SIDE_PX)
         raise ImageError(
@@ -96,15 +108,12 @@ def simulate_pairs(
 def _simulated(scene: Scene, degraded: Sensor, reference: Sensor, ratio: int, draw: Draw) -> NamedPair:
     """Three acquisitions of one scene: the pair, and the reference once more without its noise."""
     prepared = prepare_scene(scene.radiance, ratio)
-    spectrum, width = prepared.spectrum, prepared.radiance.shape[-1]
-    seen, meant, clean = (
-        acquire(spectrum, width, sensor, ratio, draw, role, skip=skip).numpy()
-        for sensor, role, skip in (
-            (degraded, "degraded", ()),
-            (reference, "reference", ()),
-            (reference, "reference", NOISE),
-        )
-    )
+
+    def by(sensor: Sensor, role: str, skip: Collection[str] = ()) -> np.ndarray:
+        width = prepared.radiance.shape[-1]
+        return acquire(prepared.spectrum, width, sensor, ratio, draw, role, skip=skip).numpy()
+
+    seen, meant, clean = by(degraded, "degraded"), by(reference, "reference"), by(reference, "reference", NOISE)
     return NamedPair(scene.name, seen, meant, oversampling=ratio, noise_free=clean)
 
 
@@ -125,8 +134,8 @@ def oversampling_note(pairs: Sequence[NamedPair], profile: SensorProfile) -> str
         return ""
     used = " and ".join(f"{ratio} ({count} of {len(pairs)} images)" for ratio, count in sorted(counts.items())[::-1])
     return (
-        f"scene pixels per pixel: {used}, where {profile.name} states {own}; at most {OVERSAMPLINGS[0]} are taken, "
-        f"and {OVERSAMPLINGS[1]} of small images ('simulate' keeps the profile's)"
+        f"Scene pixels per pixel: {used}, where {profile.name} states {own}; at most {OVERSAMPLINGS[0]} are taken, "
+        f"and {OVERSAMPLINGS[1]} of small images ('simulate' keeps the profile's)."
     )
 
 
@@ -138,16 +147,13 @@ def read_pairs(folder: Path, max_dn: int = MAX_DN, recipe: PairsRecipe | None = 
     Raises:
         ImageError: a folder is missing, a name has no partner, or two images differ in size.
     """
-    return list(_read_pairs(folder, max_dn, recipe))
-
-
-def _read_pairs(folder: Path, max_dn: int, recipe: PairsRecipe | None) -> Iterator[NamedPair]:
+    pairs = []
     for degraded, reference in pair_files(folder):
         seen, meant = (read_acquisition(path, max_dn=max_dn) for path in (degraded, reference))
-        pair = NamedPair(degraded.stem, seen, meant, recipe.site(degraded.stem) if recipe else None)
-        if pair.degraded.shape != pair.reference.shape:
-            sizes = " and ".join(f"{a.shape[1]} x {a.shape[0]}" for a in (pair.degraded, pair.reference))
-            raise ImageError(
-                f"pair {pair.name}", expected="two images of one size", got=sizes, remedy="crop them alike"
-            )
-        yield pair
+        if seen.shape != meant.shape:
+            sizes = " and ".join(f"{a.shape[1]} x {a.shape[0]}" for a in (seen, meant))
+            expected, remedy = "two images of one size", "crop them alike"
+            raise ImageError(f"pair {degraded.stem}", expected=expected, got=sizes, remedy=remedy)
+        place = recipe.site(degraded.stem) if recipe else None
+        pairs.append(NamedPair(degraded.stem, seen, meant, place))
+    return pairs

@@ -4,24 +4,15 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from deploy.report.page import write_report
 from deploy.studies.evaluation.methods import Method, method_named
-from deploy.studies.evaluation.page import evaluation_report, pictures
-from deploy.studies.evaluation.pairs import (
-    NamedPair,
-    oversampling_note,
-    oversamplings_of,
-    read_pairs,
-    simulate_pairs,
-)
+from deploy.studies.evaluation.pairs import NamedPair, pairs_of_scenes, read_pairs
 from deploy.studies.evaluation.scores import Instruments, paper_rows, perceptual_distances, score, site_rows
 from deploy.studies.evaluation.sweep import sweep_tables
 from deploy.studies.evaluation.targets import acquire_targets, target_figures
 from model.io.images import list_images
-from model.metrics.bootstrap import LEAST_SITES
-from model.progress import once, steps
-from model.recipe import PairsRecipe, profiles_for, read_pairs_recipe
-from model.simulator.procedural import load_scenes
+from model.metrics.bootstrap import too_few
+from model.progress import once
+from model.recipe import profiles_for, read_pairs_recipe
 from profiles.figures import Row
 from profiles.sensor import SensorProfile
 
@@ -38,7 +29,8 @@ class Evaluation:
         sites: a row a site.
         images: a row a method and image.
         swept: rows of the sweep, where one was asked for.
-        small: names of scenes that were too small to use.
+        said: what a reader must know of the pairs.
+        inputs: the files that the figures rest on: models, weights of LPIPS, scenes or pairs.
     """
 
     sensors: tuple[SensorProfile, SensorProfile]
@@ -48,7 +40,8 @@ class Evaluation:
     sites: Sequence[Row]
     images: Sequence[Row]
     swept: Sequence[Row]
-    small: Sequence[str]
+    said: Sequence[str]
+    inputs: Sequence[Path]
 
     @property
     def rows(self) -> tuple[Row, ...]:
@@ -62,49 +55,10 @@ class Evaluation:
         return f"{degraded.name} -> {reference.name}, {len(self.pairs)} image{'' if len(self.pairs) == 1 else 's'}"
 
     @property
-    def sampling(self) -> str:
-        """A sentence where pairs were simulated at another oversampling than the profile's; else nothing."""
-        return oversampling_note(self.pairs, self.sensors[0])
-
-    @property
     def notes(self) -> list[str]:
         """What a reader of the tables must know."""
-        sites = len({pair.site for pair in self.pairs})
-        few = f"no interval over sites is shown: of {sites}, fewer than {LEAST_SITES}, none could be trusted"
-        left_out = f"left out, too small: {', '.join(self.small)}"
-        said = ((few, sites < LEAST_SITES), (self.sampling, bool(self.sampling)), (left_out, bool(self.small)))
-        return [note for note, holds in said if holds]
-
-    def write(self, out: Path) -> Path:
-        """Write report.html and the strips of pictures into a folder; returns the report's path."""
-        strips, page = pictures(self.pairs, self.methods, out), out / "report.html"
-        tables = self.mean, self.sites, self.swept
-        write_report(evaluation_report(self.title, *tables, strips, self.sampling), page)
-        return page
-
-
-def load_pairs(
-    images: Path | None,
-    pairs: Path | None,
-    degraded: SensorProfile,
-    reference: SensorProfile,
-    seed: int,
-    recipe: PairsRecipe | None = None,
-) -> tuple[list[NamedPair], list[str]]:
-    """Pairs from a folder of pairs, from a folder of scenes, or from drawn scenes; and scenes too small to use."""
-    if pairs is not None:
-        return read_pairs(pairs, degraded.nominal().max_dn, recipe), []
-    scenes = load_scenes(images, reference.nominal(), seed)
-    return simulate_pairs(scenes, degraded, reference, seed, oversamplings_of(degraded))
-
-
-def input_files(
-    methods: Sequence[str], images: Path | None, pairs: Path | None, lpips: Path | None
-) -> tuple[Path, ...]:
-    """The files that an evaluation's figures rest on: models, scenes or pairs, weights of LPIPS."""
-    named = [path for path in (*map(Path, methods), *([lpips] if lpips else [])) if path.is_file()]
-    folders = [images] if images else [pairs / role for role in ("degraded", "reference")] if pairs else []
-    return (*named, *(path for folder in folders for path in list_images(folder)))
+        few = too_few(len({pair.site for pair in self.pairs}))
+        return [few, *self.said] if few else list(self.said)
 
 
 def run_evaluation(
@@ -141,13 +95,18 @@ def run_evaluation(
     told = once(say)
     methods = [method_named(name, *sensors, told) for name in names]
     instruments = Instruments(perceptual_distances(lpips), degraded.max_dn)
-    loaded, small = load_pairs(images, pairs, *sensors, seed, recipe)
+    if pairs is None:
+        loaded, said = pairs_of_scenes(images, *sensors, seed)
+    else:
+        loaded, said = read_pairs(pairs, degraded.max_dn, recipe), []
+    named = [path for path in (*map(Path, names), *([lpips] if lpips else [])) if path.is_file()]
+    folders = [images] if images else [pairs / role for role in ("degraded", "reference")] if pairs else []
+    inputs = [*named, *(path for folder in folders for path in list_images(folder))]
     mean, rows = [], list[Row]()
     targets = acquire_targets(degraded, seed)
     for method in methods:
-        with steps(method.name, len(loaded)) as bar:
-            scored, *each = score(method, loaded, instruments, seed, bar.advance)
+        scored, *each = score(method, loaded, instruments, seed)
         mean.append(replace(scored, figures={**scored.figures, **target_figures(method, targets)}))
         rows += each
     swept = sweep_tables(methods, images, *sensors, seed) if sweep else ()
-    return Evaluation(sensors, methods, loaded, [*mean, *paper_rows()], site_rows(rows), rows, swept, small)
+    return Evaluation(sensors, methods, loaded, [*mean, *paper_rows()], site_rows(rows), rows, swept, said, inputs)

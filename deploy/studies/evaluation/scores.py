@@ -15,6 +15,7 @@ from model.metrics.backbones import find_backbone, not_found
 from model.metrics.bootstrap import site_interval
 from model.metrics.fidelity import fidelity_db, ssim
 from model.metrics.perceptual import Dists, Lpips
+from model.progress import steps
 from profiles.figures import Figure, Row, measured, published, unavailable
 
 Perceptual = Callable[[np.ndarray, np.ndarray], float]
@@ -31,15 +32,12 @@ def perceptual_distances(place: Path | None) -> dict[str, Perceptual | str]:
         ModelError: a file that is missing or holds something else.
     """
     found: dict[str, Perceptual | str] = {"LPIPS-squeeze": not_found("squeeze")}
-    for network in ("squeeze", "alex", "vgg"):
-        if network != "squeeze" and place is not None and not place.is_dir():
-            break
-        file = find_backbone(network, place)
-        if file is None:
-            continue
-        found[f"LPIPS-{network}"] = _distance(Lpips.load(network, file))
-        if network == "vgg":
-            found["DISTS"] = _distance(Dists.load(file))
+    networks = ("squeeze", "alex", "vgg") if place is None or place.is_dir() else ("squeeze",)
+    for network in networks:
+        if file := find_backbone(network, place):
+            found[f"LPIPS-{network}"] = _distance(Lpips.load(network, file))
+            if network == "vgg":
+                found["DISTS"] = _distance(Dists.load(file))
     return found
 
 
@@ -71,22 +69,18 @@ class Instruments:
     perceptual: Mapping[str, Perceptual | str]
     max_dn: int = MAX_DN
 
-    def score(self, dn: np.ndarray, reference: np.ndarray, degraded: np.ndarray) -> dict[str, float | None]:
-        """The figures of one restored image, (H, W) digital numbers each."""
-        psnr, before = (fidelity_db(image, reference, degraded, self.max_dn) for image in (dn, degraded))
-        scores: dict[str, float | None] = {"PSNR": psnr, "PSNR gain": psnr - before if psnr != before else 0.0}
-        scores["SSIM"] = ssim(dn, reference, self.max_dn)
+    def score(self, dn: np.ndarray, pair: NamedPair) -> dict[str, float | None]:
+        """The figures of one restored image of a pair, (H, W) digital numbers."""
+        clean, unclipped = pair.noise_free, (pair.degraded, self.max_dn)
+        psnr, before = (fidelity_db(image, pair.reference, *unclipped) for image in (dn, pair.degraded))
+        scores: dict[str, float | None] = {"PSNR": psnr}
+        scores[NOISE_FREE] = None if clean is None else fidelity_db(dn, clean, *unclipped)
+        scores["PSNR gain"] = psnr - before if psnr != before else 0.0
+        scores["SSIM"] = ssim(dn, pair.reference, self.max_dn)
         for name, distance in self.perceptual.items():
-            both = dn / self.max_dn, reference / self.max_dn
+            both = dn / self.max_dn, pair.reference / self.max_dn
             scores[name] = None if isinstance(distance, str) else distance(*both)
         return scores
-
-    def score_pair(self, dn: np.ndarray, pair: NamedPair) -> dict[str, float | None]:
-        """The figures of one restored image of a pair, and its PSNR against the reference without noise."""
-        clean = pair.noise_free
-        psnr = None if clean is None else fidelity_db(dn, clean, pair.degraded, self.max_dn)
-        scores = self.score(dn, pair.reference, pair.degraded)
-        return {"PSNR": scores["PSNR"], NOISE_FREE: psnr, **scores}
 
     def figure(
         self, key: str, value: float | None, source: str, interval: tuple[float, float] | None = None
@@ -98,17 +92,16 @@ class Instruments:
         return measured(value, unit, source, interval) if np.isfinite(value) else unavailable(unit, IDENTICAL)
 
 
-def score(
-    method: Method, pairs: Sequence[NamedPair], instruments: Instruments, seed: int, tick: Callable[[], None]
-) -> list[Row]:
+def score(method: Method, pairs: Sequence[NamedPair], instruments: Instruments, seed: int) -> list[Row]:
     """The mean row of a method, then one row an image."""
     rows, scores = [], []
-    for pair in pairs:
-        values = instruments.score_pair(method.restore(pair.degraded), pair)
-        figures = {key: instruments.figure(key, value, "one pair") for key, value in values.items()}
-        rows.append(Row("images", f"{method.name}: {pair.name}", figures, {"site": pair.site}))
-        scores.append(values)
-        tick()
+    with steps(method.name, len(pairs)) as bar:
+        for pair in pairs:
+            values = instruments.score(method.restore(pair.degraded), pair)
+            figures = {key: instruments.figure(key, value, "one pair") for key, value in values.items()}
+            rows.append(Row("images", f"{method.name}: {pair.name}", figures, {"site": pair.site}))
+            scores.append(values)
+            bar.advance()
     return [mean_row(method, scores, [pair.site for pair in pairs], instruments, seed), *rows]
 
 
@@ -157,31 +150,28 @@ def _site_row(key: str, site: str, images: Sequence[Row]) -> Row:
 
 SOURCE = "ConvBEERS paper, table on its simulated test set"
 NOTE = "another test set: does not compare"
+PAPER_UNITS = {
+    "PSNR": "dB",
+    "SSIM": "ratio",
+    "LPIPS, network not stated": DISTANCE,
+    "DISTS": DISTANCE,
+    "MTF at Nyquist": "%",
+    **{snr_name(radiance): "ratio" for radiance in RADIANCES},
+}
+PAPER = {
+    "paper: traditional": (20.6, 0.843, 0.216, 0.220, None, 65.33, 138.51),
+    "paper: ConvBEERS": (27.5, 0.932, 0.068, 0.077, 20.0, 66.27, 156.07),
+}
+"""The paper's traditional pipeline, whose MTF did not converge, and its network."""
 
 
 def paper_rows() -> list[Row]:
-    """The paper's traditional pipeline and its network."""
-    return [
-        _row("paper: traditional", 20.6, 0.843, (0.216, 0.220), None, (65.33, 138.51)),
-        _row("paper: ConvBEERS", 27.5, 0.932, (0.068, 0.077), 20.0, (66.27, 156.07)),
-    ]
-
-
-def _row(
-    name: str,
-    psnr: float,
-    ssim: float,
-    distances: tuple[float, float],
-    mtf: float | None,
-    snr: tuple[float, float],
-) -> Row:
-    sharpness = unavailable("%", "the paper: did not converge") if mtf is None else published(mtf, "%", SOURCE)
-    figures = {
-        "PSNR": published(psnr, "dB", SOURCE),
-        "SSIM": published(ssim, "ratio", SOURCE),
-        "LPIPS, network not stated": published(distances[0], "distance", SOURCE),
-        "DISTS": published(distances[1], "distance", SOURCE),
-        "MTF at Nyquist": sharpness,
-        **{snr_name(r): published(value, "ratio", SOURCE) for r, value in zip(RADIANCES, snr, strict=True)},
-    }
-    return Row("mean", name, figures, {"sensor": NOTE})
+    """The paper's two rows as printed."""
+    rows = []
+    for name, values in PAPER.items():
+        figures = {
+            key: unavailable(unit, "the paper: did not converge") if value is None else published(value, unit, SOURCE)
+            for (key, unit), value in zip(PAPER_UNITS.items(), values, strict=True)
+        }
+        rows.append(Row("mean", name, figures, {"sensor": NOTE}))
+    return rows

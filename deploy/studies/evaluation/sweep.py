@@ -3,7 +3,7 @@
 Its tables: PSNR, MTF, the gain over the traditional pipeline, and what a wrongly known sensor costs.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -22,7 +22,8 @@ from model.simulator.sampling import Scene
 from profiles.figures import Figure, Row, measured
 from profiles.sensor import Sensor, SensorProfile, noise_from_snr
 
-NOMINAL = "nominal"
+NOMINAL, PLAIN = "nominal", (DEGRADED, TRADITIONAL)
+"""The condition that the others depart from, and the methods besides networks."""
 SHARPNESS = (0.10, 0.07, 0.05, 0.03, 0.02)
 NOISE = ((15.0, 50.0), (25.0, 55.0), (30.0, 80.0), (70.0, 150.0), (90.0, 190.0))
 """SNR at 25 and 100 W/m2/sr/um; the nominal 50 / 110 is in every sweep."""
@@ -74,77 +75,49 @@ def _noisy(sensor: Sensor, profile: SensorProfile, snr_0: float, snr_1: float) -
     return replace(sensor, alpha=alpha, beta=beta)
 
 
-@dataclass(frozen=True)
-class Fixed:
-    """A sensor in the place of a profile: every draw gives it."""
-
-    sensor: Sensor
-
-    def draw(self, _generator: np.random.Generator) -> Sensor:
-        """The same sensor for every draw."""
-        return self.sensor
-
-
 Trial = tuple[str, Sensor, Method]
 """The name of the sensor that is supposed, that sensor, and the method that supposes it."""
 
 
-@dataclass(frozen=True)
-class Sweep:
-    """Methods and the conditions that they are tried under.
+def run_sweep(
+    networks: Sequence[Method], scenes: Sequence[Scene], profile: SensorProfile, reference: SensorProfile, seed: int
+) -> "Found":
+    """Try every method under every condition.
 
-    Attributes:
+    Args:
         networks: run with each condition's sensor known where they can know it, else as they are.
         scenes: that every sensor acquires.
         profile: of the sensor that the conditions depart from.
         reference: profile of the sensor that is aimed at.
         seed: of every random draw.
     """
-
-    networks: Sequence[Method]
-    scenes: Sequence[Scene]
-    profile: SensorProfile
-    reference: SensorProfile
-    seed: int
-
-    @property
-    def conditions(self) -> Sensors:
-        """Every sensor that acquires the scenes."""
-        return conditions(self.profile.nominal(), self.profile)
-
-    @property
-    def size(self) -> int:
-        """How many trials there are."""
-        return sum(len(self.trials(*condition)) for condition in self.conditions.items())
-
-    def trials(self, name: str, sensor: Sensor) -> list[Trial]:
-        """What is run under a condition."""
-        nominal, reference = self.profile.nominal(), self.reference.nominal()
-        plain = [method_without_network(each, nominal, reference) for each in (DEGRADED, TRADITIONAL)]
-        methods = [*(method for method in plain if method is not None), *self.networks]
-        units = replace(nominal, gain_dn_per_radiance=sensor.gain_dn_per_radiance)
-        drifted = [] if name == NOMINAL else [(NOMINAL, units, methods[1])]
-        able = [method for method in methods if method.specialise is not None]
-        supposed = suppositions(nominal, self.profile).get(name, {})
-        wrong = [(each, other, method) for each, other in supposed.items() for method in able]
-        return [*((name, sensor, method) for method in methods), *drifted, *wrong]
-
-    def run(self, tick: Callable[[str], None]) -> "Found":
-        """Try every method under every condition; `tick` is told what was done."""
-        psnr, mtf, pairs = dict[Key, np.ndarray](), dict[Key, Figure](), list[NamedPair]()
-        for name, sensor in self.conditions.items():
-            pairs, targets = self._pairs(sensor), acquire_targets(sensor, self.seed)
-            for supposed, other, method in self.trials(name, sensor):
+    psnr, mtf, pairs = dict[Key, np.ndarray](), dict[Key, Figure](), list[NamedPair]()
+    nominal, aim, ratios = profile.nominal(), reference.nominal(), oversamplings_of(profile)
+    sensors, plain = conditions(nominal, profile), [method_without_network(n, nominal, aim) for n in PLAIN]
+    methods = [*(method for method in plain if method is not None), *networks]
+    trials = {name: _trials(name, sensor, methods, profile) for name, sensor in sensors.items()}
+    with steps("sweep", sum(map(len, trials.values()))) as bar:
+        for name, sensor in sensors.items():
+            pairs, _ = simulate_pairs(list(scenes), sensor, aim.in_units_of(sensor), seed, ratios)
+            targets = acquire_targets(sensor, seed)
+            for supposed, other, method in trials[name]:
                 key, knowing = (name, supposed, method.name), method.knowing(other)
                 psnr[key] = _psnr_db(knowing, pairs, sensor.max_dn)
                 if supposed in (name, NOMINAL):
                     mtf[key] = mtf_figure(restored_mtfs(knowing, targets))
-                tick(f"{name}: {method.name}")
-        return Found(psnr, mtf, [pair.site for pair in pairs], self.seed)
+                bar.advance(1, f"{name}: {method.name}")
+    return Found(psnr, mtf, [pair.site for pair in pairs], seed)
 
-    def _pairs(self, sensor: Sensor) -> list[NamedPair]:
-        target, ratios = self.reference.nominal().in_units_of(sensor), oversamplings_of(self.profile)
-        return simulate_pairs(list(self.scenes), Fixed(sensor), Fixed(target), self.seed, ratios)[0]
+
+def _trials(name: str, sensor: Sensor, methods: Sequence[Method], profile: SensorProfile) -> list[Trial]:
+    """What is run under a condition; the second of the methods is the chain."""
+    nominal = profile.nominal()
+    units = replace(nominal, gain_dn_per_radiance=sensor.gain_dn_per_radiance)
+    drifted = [] if name == NOMINAL else [(NOMINAL, units, methods[1])]
+    able = [method for method in methods if method.specialise is not None]
+    supposed = suppositions(nominal, profile).get(name, {})
+    wrong = [(each, other, method) for each, other in supposed.items() for method in able]
+    return [*((name, sensor, method) for method in methods), *drifted, *wrong]
 
 
 def _psnr_db(method: Method, pairs: Sequence[NamedPair], max_dn: int) -> np.ndarray:
@@ -196,29 +169,25 @@ class Found:
         psnr = {key: self._mean(values[0]) for key, values in self.psnr.items()}
         clean = {key: self._mean(values[1]) for key, values in self.psnr.items()}
         tables = (("sweep, PSNR", psnr), (f"sweep, {NOISE_FREE}", clean), ("sweep, MTF at Nyquist", self.mtf))
-        conditions = [row for table, figures in tables for row in self._conditions(table, figures)]
-        return [*conditions, *self._gains(), *self._wrong()]
-
-    def _conditions(self, table: str, figures: Mapping[Key, Figure]) -> list[Row]:
-        """The input, the chain that knows the truth, the one that knows the nominal sensor, and each network."""
-        return [
+        conditions = [
             Row(table, truth, {shown: figures[key] for shown, key in self._columns(truth).items()})
+            for table, figures in tables
             for truth in self.conditions
         ]
+        return [*conditions, *self._gains(), *self._wrong()]
 
     def _columns(self, truth: str) -> dict[str, Key]:
+        """The input, the chain that knows the truth, the one that knows the nominal sensor, and each network."""
         chains = {TRUTH_KNOWN: (truth, truth, TRADITIONAL), NOMINAL_KNOWN: (truth, NOMINAL, TRADITIONAL)}
         networks = {name: (truth, truth, name) for name in self.networks}
         return {DEGRADED: (truth, truth, DEGRADED), **chains, **networks}
 
     def _gains(self) -> list[Row]:
         """How far each network is ahead of the chain that knows the truth: by condition, then over all of them."""
-        gains = {name: {truth: self._gain(truth, name) for truth in self.conditions} for name in self.networks}
-        rows = [
-            Row("sweep, gain over the chain", truth, {name: self._mean(gains[name][truth]) for name in gains})
-            for truth in self.conditions
-        ]
-        return [*rows, *(self._over_all(*each) for each in gains.items())] if gains else []
+        gains = {truth: {name: self._gain(truth, name) for name in self.networks} for truth in self.conditions}
+        rows = [Row("sweep, gain over the chain", truth, self._means(each)) for truth, each in gains.items()]
+        over_all = [self._over_all(n, {truth: each[n] for truth, each in gains.items()}) for n in self.networks]
+        return [*rows, *over_all] if over_all else []
 
     def _gain(self, truth: str, network: str) -> np.ndarray:
         return np.asarray(self.psnr[truth, truth, network][0] - self.psnr[truth, truth, TRADITIONAL][0])
@@ -231,13 +200,10 @@ class Found:
 
     def _wrong(self) -> list[Row]:
         """PSNR where each method supposes another sensor than the true one, and what it loses by that."""
-        names: dict[tuple[str, str], list[str]] = {}
-        for truth, supposed, name in self.psnr:
-            if supposed not in (truth, NOMINAL):
-                names.setdefault((truth, supposed), []).append(name)
+        pairs = dict.fromkeys(key[:2] for key in self.psnr if key[1] not in (key[0], NOMINAL))
         psnr, lost = [], []
-        for (truth, supposed), methods in names.items():
-            wrong = {name: self.psnr[truth, supposed, name][0] for name in methods}
+        for truth, supposed in pairs:
+            wrong = {key[2]: values[0] for key, values in self.psnr.items() if key[:2] == (truth, supposed)}
             cost = {name: self.psnr[truth, truth, name][0] - values for name, values in wrong.items()}
             shown = f"{truth}, supposed {supposed}"
             psnr.append(Row("sweep, sensor known wrongly", shown, self._means(wrong)))
@@ -254,17 +220,11 @@ class Found:
 
 
 def sweep_tables(
-    methods: Sequence[Method],
-    images: Path | None,
-    degraded: SensorProfile,
-    reference: SensorProfile,
-    seed: int,
+    methods: Sequence[Method], images: Path | None, degraded: SensorProfile, reference: SensorProfile, seed: int
 ) -> tuple[Row, ...]:
     """The tables of a sweep of the networks among the methods, on one scene of each site."""
     scenes = load_scenes(images, reference.nominal(), seed)
     first = {site_of(scene.name): scene for scene in reversed(scenes)}
     sensors = degraded.nominal(), reference.nominal()
     networks = [method for method in methods if method_without_network(method.name, *sensors) is None]
-    sweep = Sweep(networks, list(first.values()), degraded, reference, seed)
-    with steps("sweep", sweep.size) as bar:
-        return tuple(sweep.run(lambda note: bar.advance(1, note)).rows)
+    return tuple(run_sweep(networks, list(first.values()), degraded, reference, seed).rows)

@@ -7,7 +7,6 @@ otherwise. The noise in flat fields is what is left where nothing is to be seen.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import cycle
 
 import numpy as np
 import torch
@@ -17,7 +16,7 @@ from torch import Tensor
 from deploy.studies.evaluation.methods import Method
 from model.io.images import MAX_DN
 from model.metrics.refusal import Refusal
-from model.metrics.slanted_edge import EdgeMtf, edge_mtf, slanted_edge
+from model.metrics.slanted_edge import edge_mtf, slanted_edge
 from model.simulator.acquire import acquire
 from model.simulator.detector import Draw
 from model.simulator.sampling import scene_spectrum
@@ -33,16 +32,16 @@ RADIANCES = (25.0, 100.0)
 
 @dataclass(frozen=True)
 class Targets:
-    """Acquired targets: edges (H, W) digital numbers, flat fields with their radiance, and what the sensor adds.
+    """Acquired targets, (H, W) digital numbers, and what the sensor adds.
 
     Attributes:
-        edges: each with independent noise.
+        edges: angle in degrees, and the edge; each with independent noise.
         flats: radiance in W/m2/sr/um, and the field.
         max_dn: the digital number at which an edge is saturated.
         offset_dn: the digital number of the dark, no part of a signal.
     """
 
-    edges: Sequence[np.ndarray]
+    edges: Sequence[tuple[float, np.ndarray]]
     flats: Sequence[tuple[float, np.ndarray]]
     max_dn: int = MAX_DN
     offset_dn: float = 0.0
@@ -53,7 +52,7 @@ def acquire_targets(sensor: Sensor, seed: int) -> Targets:
     edges = []
     for number, angle_deg in enumerate(ANGLES_DEG * REPEATS):
         scene = slanted_edge(SIDE_PX, OVERSAMPLING, angle_deg)
-        edges.append(_acquire(scene, sensor, Draw(seed, number)))
+        edges.append((angle_deg, _acquire(scene, sensor, Draw(seed, number))))
     flats = []
     for number, radiance in enumerate(RADIANCES):
         scene = torch.full((FLAT_PX, FLAT_PX), radiance)
@@ -79,11 +78,9 @@ def target_figures(method: Method, targets: Targets) -> dict[str, Figure]:
     return figures
 
 
-def restored_mtfs(method: Method, targets: Targets) -> list[EdgeMtf | Refusal]:
+def restored_mtfs(method: Method, targets: Targets) -> list[float | Refusal]:
     """What the instrument says of each restored edge."""
-    restored = (_middle(method.restore(edge)) for edge in targets.edges)
-    angles = cycle(ANGLES_DEG)
-    return [edge_mtf(image, angle_deg, targets.max_dn) for image, angle_deg in zip(restored, angles, strict=False)]
+    return [edge_mtf(_middle(method.restore(edge)), angle, targets.max_dn) for angle, edge in targets.edges]
 
 
 def _middle(image: np.ndarray) -> np.ndarray:
@@ -91,9 +88,9 @@ def _middle(image: np.ndarray) -> np.ndarray:
     return image[top : top + EDGE_PX, left : left + EDGE_PX]
 
 
-def mtf_figure(found: Sequence[EdgeMtf | Refusal]) -> Figure:
+def mtf_figure(found: Sequence[float | Refusal]) -> Figure:
     """The mean over the edges with its 90 % interval; unavailable where most edges were refused."""
-    values = [100 * each.mtf_nyquist for each in found if isinstance(each, EdgeMtf)]
+    values = [100 * each for each in found if not isinstance(each, Refusal)]
     refused = [each for each in found if isinstance(each, Refusal)]
     if len(values) < max(len(refused), 2):
         return unavailable("%", f"{len(refused)} of {len(found)} edges refused: {refused[0].reason}")

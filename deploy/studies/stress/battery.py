@@ -10,8 +10,9 @@ import numpy as np
 from deploy.studies.stress.cases import CASES, SIDE_PX, Case
 from deploy.studies.stress.checks import Limitation, Measure, limitation_of, torch_threads
 from deploy.studies.stress.networks import STAGES, Subject
+from model.progress import steps
 from profiles.errors import BeersError, OptionError
-from profiles.figures import Figure, Row, measured, predicted, unavailable
+from profiles.figures import Figure, Row, measured, predicted
 from quant.bounds import layer_bounds
 from quant.integer import INT32_BITS
 
@@ -51,7 +52,6 @@ def run_battery(
     cases: Sequence[Case] = CASES,
     stages: Sequence[str] = tuple(STAGES),
     seed: int = 0,
-    tick: Callable[[], None] = lambda: None,
     side_px: int = SIDE_PX,
 ) -> list[StageResult]:
     """Look at every case at every stage.
@@ -61,18 +61,18 @@ def run_battery(
         cases: what they restore.
         stages: names of STAGES.
         seed: of the images.
-        tick: called once for each case at each stage.
         side_px: of images whose case has no size of its own.
     """
     results, reasons = [], {stage: _cannot_be_looked_at(subject, stage) for stage in stages}
-    with torch_threads(1):  # on images this small a second thread only waits
+    # On images this small a second thread only waits.
+    with torch_threads(1), steps("stressing", len(cases) * len(stages)) as bar:
         for case in cases:
             # Seeded by its name: a case draws the same images whichever others are asked for.
             images = case.draw(side_px, np.random.default_rng([seed, zlib.crc32(case.name.encode())]))
             for stage in stages:
                 measures = [] if reasons[stage] else _measures(subject, case, stage, images)
                 results.append(StageResult(case, stage, tuple(worst(measures)), reasons[stage]))
-                tick()
+                bar.advance(1, f"{case.name}, {stage}")
     return results
 
 
@@ -98,12 +98,10 @@ def _measures(subject: Subject, case: Case, stage: str, images: Iterable[np.ndar
 
 def worst(measures: Iterable[Measure]) -> list[Measure]:
     """Of each check the measure that is largest beside what is allowed; NaN is the worst."""
-    found: dict[str, Measure] = {}
+    found: dict[str, list[Measure]] = {}
     for measure in measures:
-        before = found.get(measure.check)
-        if before is None or _excess(measure) > _excess(before):
-            found[measure.check] = measure
-    return list(found.values())
+        found.setdefault(measure.check, []).append(measure)
+    return [max(each, key=_excess) for each in found.values()]
 
 
 def _excess(measure: Measure) -> float:
@@ -145,8 +143,7 @@ def worst_rows(results: Iterable[StageResult]) -> list[Row]:
             found.setdefault(f"{result.stage}: {measure.check}", []).append((measure, result.case.name))
     rows = []
     for name, seen in found.items():
-        (largest,) = worst(measure for measure, _ in seen)
-        case = next(case for measure, case in seen if measure is largest)
+        largest, case = max(seen, key=lambda each: _excess(each[0]))
         text = {"allowed": f"{largest.allowed:.4g} {largest.unit}", "worst case": case}
         text["verdict"] = "holds" if largest.holds else "does not hold"
         rows.append(Row("worst", name, {"worst": _figure(largest)}, text))
@@ -159,10 +156,8 @@ def limitation_rows(results: Iterable[StageResult]) -> list[Row]:
     for result in results:
         for measure in result.measures:
             limit = None if measure.holds else limitation_of(result.stage, result.case.name, measure)
-            if limit is None:
-                continue
-            name = f"{limit.name} ({result.stage}, {measure.check})"
-            if name not in rows or measure.value > (rows[name].figures["largest"].value or 0):
+            name = f"{limit.name} ({result.stage}, {measure.check})" if limit else ""
+            if limit and (name not in rows or measure.value > (rows[name].figures["largest"].value or 0)):
                 text = {"in": result.case.name, "fails beyond": f"{limit.ceiling:g}", "means": limit.meaning}
                 rows[name] = Row("limitations", name, {"largest": _figure(measure)}, text)
     return list(rows.values())
@@ -182,8 +177,6 @@ def finding_rows(results: Iterable[StageResult]) -> list[Row]:
 
 
 def _figure(measure: Measure) -> Figure:
-    if not math.isfinite(measure.value):
-        return unavailable(measure.unit, f"{measure.check} is not finite")
     return measured(measure.value, measure.unit, SOURCE)
 
 

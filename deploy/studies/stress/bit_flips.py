@@ -5,9 +5,8 @@ then runs in whole numbers.
 """
 
 import statistics
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
-from functools import cached_property
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from math import exp
 from pathlib import Path
 
@@ -21,33 +20,25 @@ from deploy.report.plots import Curve, Panel, curves_svg
 from deploy.restoration.options import TILE_PX
 from deploy.studies.stress.faults import (
     INT8_BITS,
-    PIXEL_BITS,
-    SHIFT_BITS,
+    MEMORIES,
     Guards,
-    Shifts,
+    Injected,
     as_stored,
-    bits_apart,
-    checksums,
-    flip_bits,
-    flip_count,
-    flip_shifts,
-    flip_weights,
-    guarded,
+    corrected,
+    is_sound,
     learn_guards,
-    map_channels,
-    scrubbed,
+    restored,
     shifts_of,
-    voted,
     weight_bits,
 )
 from deploy.studies.stress.networks import Subject
-from model.io.images import MAX_DN
 from model.metrics.fidelity import psnr_db
+from model.progress import steps
 from profiles.figures import Figure, Row, measured, predicted
 from quant.calibration import HELD_OUT_SEED, Calibration
 from quant.core import IntCore
 from quant.graph import Activation
-from quant.integer import SOUND, Faults, merged_correction, run_core
+from quant.integer import SOUND
 
 CALIBRATION_PATCHES = 16
 
@@ -73,7 +64,7 @@ class FlipRequest:
     seed: int
 
 
-def flip_rows(subject: Subject, request: FlipRequest, tick: Callable[[], None] = lambda: None) -> list[Row]:
+def flip_rows(subject: Subject, request: FlipRequest) -> list[Row]:
     """The rows of the whole study: quality against flips, and what guards cost.
 
     Raises:
@@ -85,13 +76,7 @@ def flip_rows(subject: Subject, request: FlipRequest, tick: Callable[[], None] =
     prediction = predict_file(subject.paths[-1], dpu, TILE_PX)
     dpu.limit("cpu", "clock_ghz")  # and so is a board that cannot price the guards
     target = make_target(subject, request)
-    curves = curve_rows(target, request.draws, request.seed, tick)
-    return [*curves, *price_rows(target, prediction, dpu)]
-
-
-def ticks(request: FlipRequest) -> int:
-    """How often `flip_rows` reports progress."""
-    return sum(len(rates_of(memory)) * draws_of(memory, request.draws) for memory in MEMORIES)
+    return [*curve_rows(target, request.draws, request.seed), *price_rows(target, prediction, dpu)]
 
 
 @dataclass(frozen=True)
@@ -108,11 +93,6 @@ class FaultTarget:
     guards: Guards
     pairs: Sequence[tuple[np.ndarray, np.ndarray]]
 
-    @cached_property
-    def shifts(self) -> Shifts:
-        """The shifts of every operation, free of faults."""
-        return shifts_of(self.core)
-
 
 def make_target(subject: Subject, request: FlipRequest) -> FaultTarget:
     """The core as the board stores it, guards that calibration patches teach, and other patches to try it on."""
@@ -125,94 +105,11 @@ def make_target(subject: Subject, request: FlipRequest) -> FaultTarget:
     return FaultTarget(core, guards, list(tried.pairs))
 
 
-@dataclass(frozen=True)
-class Injected:
-    """A network and an image after an injection.
-
-    Attributes:
-        core: with the weights as they are now.
-        faults: what else is wrong.
-        image: (1, 1, H, W), as it is now.
-        flips: how many bits were flipped.
-    """
-
-    core: IntCore
-    faults: Faults
-    image: np.ndarray
-    flips: int
-
-
-def restored(target: FaultTarget, injected: Injected, clamped: bool = False) -> np.ndarray:
-    """The restored image (1, 1, H, W) in [0, 1]; `clamped` turns the ReLU6 and the limit of the correction on."""
-    faults = guarded(injected.faults, target.guards) if clamped else injected.faults
-    tensors, _ = run_core(injected.core, injected.core.ends.split(injected.image), faults=faults)
-    correction = merged_correction(injected.core, tensors)
-    correction = target.guards.limit(correction) if clamped else correction
-    return np.asarray(injected.core.ends.finished(injected.image, correction), np.float32)
-
-
 def _quality_db(target: FaultTarget, injected: Injected, reference: np.ndarray, clamped: bool) -> float:
-    return psnr_db(restored(target, injected, clamped), reference, 1.0)
+    return psnr_db(restored(injected, target.guards if clamped else None), reference, 1.0)
 
 
-def _weights(target: FaultTarget, image: np.ndarray, per_megabit: float, generator: np.random.Generator) -> Injected:
-    flips = flip_count(weight_bits(target.core), per_megabit, generator)
-    return Injected(flip_weights(target.core, flips, generator), SOUND, image, flips)
-
-
-def _shifts(target: FaultTarget, image: np.ndarray, per_megabit: float, generator: np.random.Generator) -> Injected:
-    wrong = _flip_copy(target, per_megabit, generator)
-    return Injected(target.core, Faults(wrong), image, bits_apart(wrong, target.shifts))
-
-
-def _maps(target: FaultTarget, image: np.ndarray, per_megabit: float, generator: np.random.Generator) -> Injected:
-    """Faults enter every tensor once, between the operation that writes it and those that read it."""
-    places, channels = image[0, 0].size // target.core.ends.place_px**2, map_channels(target.core)
-    counts = {name: flip_count(INT8_BITS * places * n, per_megabit, generator) for name, n in channels.items()}
-    seed = int(generator.integers(2**63))
-    # The same bits whenever it runs, clamped or not.
-    seeds = {name: [seed, number] for number, name in enumerate(counts)}
-
-    def touch(name: str, tensor: np.ndarray) -> np.ndarray:
-        if not counts.get(name):
-            return tensor
-        return flip_bits(tensor, counts[name], np.random.default_rng(seeds[name]))
-
-    return Injected(target.core, Faults({}, touch), image, sum(counts.values()))
-
-
-def _image(target: FaultTarget, image: np.ndarray, per_megabit: float, generator: np.random.Generator) -> Injected:
-    flips = flip_count(PIXEL_BITS * image.size, per_megabit, generator)
-    dn = flip_bits(np.rint(image * MAX_DN).astype(np.uint16), flips, generator, PIXEL_BITS)
-    return Injected(target.core, SOUND, (dn / np.float32(MAX_DN)).astype(np.float32), flips)
-
-
-def _flip_copy(target: FaultTarget, per_megabit: float, generator: np.random.Generator) -> Shifts:
-    flips = flip_count(SHIFT_BITS * len(target.shifts), per_megabit, generator)
-    return flip_shifts(target.shifts, flips, generator)
-
-
-Inject = Callable[[FaultTarget, np.ndarray, float, np.random.Generator], Injected]
-MEMORIES: dict[str, Inject] = {"weights": _weights, "shifts": _shifts, "maps": _maps, "image": _image}
-CORRECTABLE = ("weights", "shifts")
 SETS = ("no guard", "clamped", "all guards")
-
-RATES = (0.1, 1.0, 10.0, 100.0, 1000.0)
-"""Bit flips in a megabit, of 10^6."""
-RATES_OF = {"shifts": (10.0, 100.0, 1000.0, 10_000.0)}
-"""There are too few shifts to be hit at rates that matter elsewhere."""
-DRAWS_OF = {"shifts": 10, "image": 5}
-"""So many times the draws, where few of them flip a bit; those that do not cost nothing."""
-
-
-def draws_of(memory: str, draws: int) -> int:
-    """How many injections into a kind of memory there are at each rate, `draws` being those asked for."""
-    return draws * DRAWS_OF.get(memory, 1)
-
-
-def rates_of(memory: str) -> tuple[float, ...]:
-    """The rates of injection for a kind of memory, bit flips in a megabit."""
-    return RATES_OF.get(memory, RATES)
 
 
 def name_of(memory: str, rate: float) -> str:
@@ -224,17 +121,18 @@ Quality = tuple[float, float, float]
 """PSNR in dB with each set of guards."""
 
 
-def curve_rows(target: FaultTarget, draws: int, seed: int, tick: Callable[[], None] = lambda: None) -> list[Row]:
+def curve_rows(target: FaultTarget, draws: int, seed: int) -> list[Row]:
     """A row without flips, and one for every kind of memory and rate."""
     clean = [_clean_db(target, number) for number in range(len(target.pairs))]
     rows = [_curve_row("none", [(0, quality) for quality in clean], "patches")]
-    for memory in MEMORIES:
-        for rate in rates_of(memory):
-            found = []
-            for draw in range(draws_of(memory, draws)):
-                found.append(_drawn(target, memory, rate, draw, seed, clean[draw % len(clean)]))
-                tick()
-            rows.append(_curve_row(name_of(memory, rate), found, "draws"))
+    with steps("turning bits over", sum(len(m.rates) * m.times * draws for m in MEMORIES.values())) as bar:
+        for name, memory in MEMORIES.items():
+            for rate in memory.rates:
+                found = []
+                for draw in range(memory.times * draws):
+                    found.append(_drawn(target, name, rate, draw, seed, clean[draw % len(clean)]))
+                    bar.advance()
+                rows.append(_curve_row(name_of(name, rate), found, "draws"))
     return rows
 
 
@@ -245,45 +143,22 @@ def _clean_db(target: FaultTarget, number: int) -> Quality:
     return bare, clamped, clamped
 
 
-def _drawn(
-    target: FaultTarget, memory: str, rate: float, draw: int, seed: int, clean: Quality
-) -> tuple[int, Quality]:
-    """The bits that one injection flipped, and what is left of the quality."""
-    image, reference = target.pairs[draw % len(target.pairs)]
+def _drawn(target: FaultTarget, name: str, rate: float, draw: int, seed: int, clean: Quality) -> tuple[int, Quality]:
+    """The bits that one injection into a memory flipped, and what is left of the quality."""
+    (image, reference), memory = target.pairs[draw % len(target.pairs)], MEMORIES[name]
     # Keyed by what is drawn, so that a draw is the same whatever else runs.
-    generator = np.random.default_rng([seed, draw, list(MEMORIES).index(memory), rates_of(memory).index(rate)])
-    injected = MEMORIES[memory](target, image, rate, generator)
+    generator = np.random.default_rng([seed, draw, list(MEMORIES).index(name), memory.rates.index(rate)])
+    injected = memory.inject(target.core, image, rate, generator)
     # No flip, no change: the fault-free figures stand, at no cost.
     if injected.flips == 0:
         return 0, clean
     bare, clamped = (_quality_db(target, injected, reference, c) for c in (False, True))
-    # Maps and pixels live for one tile: scrubbing has nothing to compare them with.
-    if memory not in CORRECTABLE:
+    if not memory.kept:
         return injected.flips, (bare, clamped, clamped)
-    corrected = _corrected(target, injected, rate, generator)
-    whole = clean[1] if _is_sound(target, corrected) else _quality_db(target, corrected, reference, clamped=True)
+    left = corrected(injected, target.core, target.guards, rate, generator)
+    sound = is_sound(left, target.core, target.guards)
+    whole = clean[1] if sound else _quality_db(target, left, reference, clamped=True)
     return injected.flips, (bare, clamped, whole)
-
-
-def _corrected(
-    target: FaultTarget, injected: Injected, per_megabit: float, generator: np.random.Generator
-) -> Injected:
-    """The network as scrubbing and triple modular redundancy leave it before the next image.
-
-    The other two copies of the shifts suffer flips at the same rate, each on its own.
-    """
-    core = scrubbed(injected.core, target.core, target.guards.checksums)
-    # The copy that the injection hit is the first of the three.
-    first = {**target.shifts, **injected.faults.shifts}
-    second, third = (_flip_copy(target, per_megabit, generator) for _ in range(2))
-    shifts = voted((first, second, third)) if injected.faults.shifts else {}
-    return replace(injected, core=core, faults=replace(injected.faults, shifts=shifts))
-
-
-def _is_sound(target: FaultTarget, injected: Injected) -> bool:
-    """Whether no fault is left in weights and shifts."""
-    meant = {**target.shifts, **injected.faults.shifts} == target.shifts
-    return meant and checksums(injected.core) == target.guards.checksums
 
 
 def _curve_row(name: str, draws: Sequence[tuple[int, Quality]], kind: str) -> Row:
@@ -314,7 +189,7 @@ def price_rows(target: FaultTarget, prediction: Prediction, dpu: Dpu) -> list[Ro
     clock_hz = 1e9 * dpu.limit("cpu", "clock_ghz").low
     limit_s = INSTRUCTIONS * target.core.ends.gains * TILE_PX**2 / AT_ONCE / clock_hz
     scrubbing_s = weight_bits(target.core) / INT8_BITS / rate
-    copies_s = 3 * len(target.shifts) / rate
+    copies_s = 3 * len(shifts_of(target.core)) / rate
     spread = exp(dpu.value("cost", "width_outside"))
     guards = {
         f"ReLU6 at {len(target.guards.relu6)} of {relus} ReLUs": (0.0, FUSED),
@@ -351,7 +226,8 @@ def _curves(networks: Mapping[str, Sequence[Row]], memory: str) -> list[Curve]:
     for colour, (name, rows) in enumerate(networks.items()):
         by_name = {row.name: row.figures for row in rows if row.table == "bit flips"}
         for guards in ("all guards", "no guard"):
-            values = ((rate, by_name[name_of(memory, rate)][guards].value) for rate in rates_of(memory))
+            rates = MEMORIES[memory].rates
+            values = ((rate, by_name[name_of(memory, rate)][guards].value) for rate in rates)
             points = tuple((rate, value) for rate, value in values if value is not None)
             curves.append(Curve(f"{name}, {guards}", colour, guards == "no guard", points))
     return curves

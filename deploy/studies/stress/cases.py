@@ -90,11 +90,6 @@ def noisy(side: int, generator: np.random.Generator) -> list[np.ndarray]:
     return [_digital(clean * (1 + generator.standard_normal(clean.shape) / 3))]
 
 
-def clean(side: int, generator: np.random.Generator) -> list[np.ndarray]:
-    """A drawn ground without any noise: one image (side, side)."""
-    return [ground(side, generator)]
-
-
 def through(mtf_nyquist: float) -> Draw:
     """A drawn ground seen through such an MTF, without noise."""
     return lambda side, generator: [ground(side, generator, mtf_nyquist)]
@@ -166,7 +161,6 @@ class Case:
         draw: makes its
         pixels: "sound", or what is wrong with them: "missing" (NaN), "infinite", "beyond" 12 bits.
         flat: every pixel of an image is the same: the mean must be kept, there is nothing to restore.
-        mtf_nyquist: of the sensor that acquired it; None for the profile's own.
         large: only what must hold of one run is looked at.
     """
 
@@ -174,7 +168,6 @@ class Case:
     draw: Draw
     pixels: str = "sound"
     flat: bool = False
-    mtf_nyquist: float | None = None
     large: bool = False
 
 
@@ -192,9 +185,9 @@ CASES = (
     Case("ramps", ramps),
     Case("Siemens star", star),
     Case("SNR 3", noisy),
-    Case("no noise", clean),
-    Case("MTF 0.1 %", through(0.001), mtf_nyquist=0.001),
-    Case("MTF 60 %", through(0.6), mtf_nyquist=0.6),
+    Case("no noise", through(DRAWN_MTF)),
+    Case("MTF 0.1 %", through(0.001)),
+    Case("MTF 60 %", through(0.6)),
     Case("nodata stripes", stripes, pixels="missing"),
     Case("NaN pixels", scattered(np.nan), pixels="missing"),
     Case("infinite pixels", scattered(np.inf), pixels="infinite"),

@@ -36,9 +36,9 @@ class Measure:
         return self.value <= self.allowed
 
 
-def not_finite(*images: np.ndarray) -> Measure:
-    """How many pixels of images of any shape are NaN or infinite."""
-    return Measure("not finite", float(sum((~np.isfinite(image)).sum() for image in images)), 0, "px")
+def not_finite(pixels: np.ndarray) -> Measure:
+    """How many pixels, of any shape, are NaN or infinite."""
+    return Measure("not finite", float((~np.isfinite(pixels)).sum()), 0, "px")
 
 
 def out_of_range(image: np.ndarray) -> Measure:
@@ -50,12 +50,6 @@ def differing(check: str, image: np.ndarray, other: np.ndarray) -> Measure:
     """How many pixels of two images (H, W) are not the same, bit for bit; NaN is the same as NaN."""
     same = (image == other) | (np.isnan(image) & np.isnan(other))
     return Measure(check, float((~same).sum()), 0, "px")
-
-
-def mean_shift(image: np.ndarray, source: np.ndarray, allowed: float = FLAT_DN) -> Measure:
-    """By how much the mean of an image (H, W) moved from its source's, in DN."""
-    shift = float(np.mean(image, dtype=np.float64) - np.mean(source, dtype=np.float64))
-    return Measure("mean moved", abs(shift), allowed)
 
 
 def ringing(image: np.ndarray, source: np.ndarray, radius_px: int, allowed: float) -> Measure:
@@ -86,13 +80,10 @@ def gain(work: Work, source: np.ndarray, result: np.ndarray, generator: np.rando
 
 def change(work: Work, source: np.ndarray, result: np.ndarray, nudge: np.ndarray) -> float:
     """Largest change of any pixel (H, W), in DN, for a nudge (H, W) of -1, 0 or 1 DN."""
-    return float(np.abs(work(_nudged(source, nudge)) - result).max())
-
-
-def _nudged(source: np.ndarray, nudge: np.ndarray) -> np.ndarray:
-    """The source and a change of 1 DN, turned round where it would leave the converter's range."""
     wanted = source + nudge
-    return np.asarray(np.where((wanted < 0) | (wanted > FULL_DN), source - nudge, wanted), np.float32)
+    # Turned round where it would leave the converter's range.
+    nudged = np.where((wanted < 0) | (wanted > FULL_DN), source - nudge, wanted)
+    return float(np.abs(work(np.asarray(nudged, np.float32)) - result).max())
 
 
 def refused(work: Callable[[], object]) -> Measure:
@@ -118,7 +109,8 @@ def fidelity(image: np.ndarray, result: np.ndarray, radius_px: int, flat: bool) 
     if flat:
         # All that is lost at the border of flat ground is the padding's doing.
         border = Measure("border", float(np.abs(result - image).max()), 2 * FLAT_DN)
-        measures += [mean_shift(inner, image), border]
+        moved = abs(float(np.mean(inner, dtype=np.float64) - np.mean(image, dtype=np.float64)))
+        measures += [Measure("mean moved", moved, FLAT_DN), border]
     return measures
 
 

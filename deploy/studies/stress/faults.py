@@ -4,8 +4,9 @@ The guards: ReLU6 in place of ReLU, a limit of the correction, scrubbing of the 
 modular redundancy of the shifts.
 """
 
+import math
 import zlib
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -14,7 +15,7 @@ from model.io.images import MAX_DN
 from profiles.errors import ModelError
 from quant.core import INT8_MAX, INT8_MIN, SHIFTS, IntConv, IntCore, op_shifts
 from quant.graph import PLANES, Activation, channels_of
-from quant.integer import Faults, merged_correction, run_core
+from quant.integer import SOUND, Faults, merged_correction, run_core
 
 MEGABIT = 1e6
 INT8_BITS, PIXEL_BITS, SHIFT_BITS = 8, 12, 6
@@ -76,16 +77,15 @@ def _refuse(got: str) -> ModelError:
 
 def weight_bits(core: IntCore) -> int:
     """How many bits all weights and bias take in memory."""
-    return INT8_BITS * sum(op.weight.size + op.bias.size for op in core.ops if isinstance(op, IntConv))
+    return INT8_BITS * sum(op.weight.size + op.bias.size for op in core.convolutions)
 
 
 def flip_weights(core: IntCore, count: int, generator: np.random.Generator) -> IntCore:
     """The core with `count` bits of its weights and bias flipped, wherever they fall."""
-    convs = [op for op in core.ops if isinstance(op, IntConv)]
-    sizes = np.array([op.weight.size + op.bias.size for op in convs])
+    sizes = np.array([op.weight.size + op.bias.size for op in core.convolutions])
     # How many of the bits fall into each layer, as if all were drawn from one memory without replacement.
     share = generator.multivariate_hypergeometric(sizes * INT8_BITS, count)
-    hit = {op.name: flip_conv(op, int(n), generator) for op, n in zip(convs, share, strict=True) if n}
+    hit = {op.name: flip_conv(op, int(n), generator) for op, n in zip(core.convolutions, share, strict=True) if n}
     return with_ops(core, hit)
 
 
@@ -122,8 +122,8 @@ def flip_shifts(shifts: Shifts, count: int, generator: np.random.Generator) -> S
     return dict(zip(shifts, raw.tolist(), strict=True))
 
 
-RELU6_UNITS = 96
-"""6 with 4 fractional bits; with 5 it would be 192, above int8."""
+RELU6_UNITS = (96, 48, 24, 12, 6, 3)
+"""6 with 4 to -1 fractional bits; with 5 it would be 192, above int8."""
 
 
 @dataclass(frozen=True)
@@ -152,26 +152,29 @@ class Guards:
 
 def learn_guards(core: IntCore, planes: Iterable[np.ndarray]) -> Guards:
     """Guards from what a fault-free core reaches on calibration patches, planes (N, 3, H, W) each."""
-    relus = {op.output: 0 for op in core.ops if isinstance(op, IntConv) and op.activation is Activation.relu}
+    relus = {op.output: 0 for op in core.convolutions if op.activation is Activation.relu}
     largest_dn = 0.0
     for each in planes:
         tensors, _ = run_core(core, each)
         relus = {name: max(peak, int(tensors[name].max())) for name, peak in relus.items()}
         largest_dn = max(largest_dn, MAX_DN * float(np.abs(merged_correction(core, tensors)).max()))
-    bounds = {name: _next_relu6(peak) for name, peak in relus.items() if peak <= RELU6_UNITS}
-    return Guards(bounds, _next_power(largest_dn), checksums(core))
+    bounds = {
+        name: min(bound for bound in RELU6_UNITS if bound >= peak)
+        for name, peak in relus.items()
+        if peak <= RELU6_UNITS[0]
+    }
+    return Guards(bounds, 2.0 ** math.ceil(math.log2(max(largest_dn, 1.0))), checksums(core))
 
 
 def checksums(core: IntCore) -> dict[str, int]:
     """CRC-32 of each convolution's weights and bias."""
-    return {op.name: _checksum(op) for op in core.ops if isinstance(op, IntConv)}
+    return {op.name: zlib.crc32(op.bias.tobytes(), zlib.crc32(op.weight.tobytes())) for op in core.convolutions}
 
 
 def scrubbed(core: IntCore, sound: IntCore, known: Mapping[str, int]) -> IntCore:
     """The core after scrubbing: every convolution whose checksum is not the known one comes from a sound copy."""
-    safe = {op.name: op for op in sound.ops if isinstance(op, IntConv)}
-    broken = {name: safe[name] for name, found in checksums(core).items() if found != known[name]}
-    return with_ops(core, broken)
+    wrong = {name for name, _ in checksums(core).items() - known.items()}
+    return with_ops(core, {op.name: op for op in sound.convolutions if op.name in wrong})
 
 
 def voted(copies: tuple[Shifts, Shifts, Shifts]) -> Shifts:
@@ -189,15 +192,117 @@ def guarded(faults: Faults, guards: Guards) -> Faults:
     return Faults(faults.shifts, touch)
 
 
-def _checksum(op: IntConv) -> int:
-    return zlib.crc32(op.bias.tobytes(), zlib.crc32(np.ascontiguousarray(op.weight).tobytes()))
+@dataclass(frozen=True)
+class Injected:
+    """A network and an image after an injection.
+
+    Attributes:
+        core: with the weights as they are now.
+        faults: what else is wrong.
+        image: (1, 1, H, W), as it is now.
+        flips: how many bits were flipped.
+    """
+
+    core: IntCore
+    faults: Faults
+    image: np.ndarray
+    flips: int
 
 
-def _next_relu6(peak: int) -> int:
-    """The smallest of 96, 48, 24, 12, 6 and 3 that is not below."""
-    return min(RELU6_UNITS >> k for k in range(6) if RELU6_UNITS >> k >= peak)
+def restored(injected: Injected, guards: Guards | None = None) -> np.ndarray:
+    """The restored image (1, 1, H, W) in [0, 1]; guards turn the ReLU6 and the limit of the correction on."""
+    faults = guarded(injected.faults, guards) if guards else injected.faults
+    tensors, _ = run_core(injected.core, injected.core.ends.split(injected.image), faults=faults)
+    correction = merged_correction(injected.core, tensors)
+    correction = guards.limit(correction) if guards else correction
+    return np.asarray(injected.core.ends.finished(injected.image, correction), np.float32)
 
 
-def _next_power(value: float) -> float:
-    """The smallest power of two that is not below, 1 at least."""
-    return float(2 ** int(np.ceil(np.log2(max(value, 1.0)))))
+def _weights(core: IntCore, image: np.ndarray, per_megabit: float, generator: np.random.Generator) -> Injected:
+    flips = flip_count(weight_bits(core), per_megabit, generator)
+    return Injected(flip_weights(core, flips, generator), SOUND, image, flips)
+
+
+def _shifts(core: IntCore, image: np.ndarray, per_megabit: float, generator: np.random.Generator) -> Injected:
+    wrong = _flip_copy(core, per_megabit, generator)
+    return Injected(core, Faults(wrong), image, bits_apart(wrong, shifts_of(core)))
+
+
+def _flip_copy(core: IntCore, per_megabit: float, generator: np.random.Generator) -> Shifts:
+    shifts = shifts_of(core)
+    return flip_shifts(shifts, flip_count(SHIFT_BITS * len(shifts), per_megabit, generator), generator)
+
+
+def _maps(core: IntCore, image: np.ndarray, per_megabit: float, generator: np.random.Generator) -> Injected:
+    """Faults enter every tensor once, between the operation that writes it and those that read it."""
+    places, channels = image[0, 0].size // core.ends.place_px**2, map_channels(core)
+    counts = {name: flip_count(INT8_BITS * places * n, per_megabit, generator) for name, n in channels.items()}
+    seed = int(generator.integers(2**63))
+    # The same bits whenever it runs, clamped or not.
+    seeds = {name: [seed, number] for number, name in enumerate(counts)}
+
+    def touch(name: str, tensor: np.ndarray) -> np.ndarray:
+        if not counts.get(name):
+            return tensor
+        return flip_bits(tensor, counts[name], np.random.default_rng(seeds[name]))
+
+    return Injected(core, Faults({}, touch), image, sum(counts.values()))
+
+
+def _image(core: IntCore, image: np.ndarray, per_megabit: float, generator: np.random.Generator) -> Injected:
+    flips = flip_count(PIXEL_BITS * image.size, per_megabit, generator)
+    dn = flip_bits(np.rint(image * MAX_DN).astype(np.uint16), flips, generator, PIXEL_BITS)
+    return Injected(core, SOUND, (dn / np.float32(MAX_DN)).astype(np.float32), flips)
+
+
+@dataclass(frozen=True)
+class Memory:
+    """One kind of memory, and how faults are injected into it.
+
+    Attributes:
+        inject: into a core as the board stores it and an image (1, 1, H, W), at a rate of flips in a megabit.
+        rates: bit flips in a megabit, of 10^6, that are tried.
+        times: so many times the draws asked for, where few of them flip a bit; those that do not cost nothing.
+        kept: whether it lives longer than a tile, so that scrubbing has something to compare it with.
+    """
+
+    inject: Callable[[IntCore, np.ndarray, float, np.random.Generator], Injected]
+    rates: tuple[float, ...] = (0.1, 1.0, 10.0, 100.0, 1000.0)
+    times: int = 1
+    kept: bool = False
+
+
+MEMORIES = {
+    "weights": Memory(_weights, kept=True),
+    # There are too few shifts to be hit at rates that matter elsewhere.
+    "shifts": Memory(_shifts, (10.0, 100.0, 1000.0, 10_000.0), 10, kept=True),
+    "maps": Memory(_maps),
+    "image": Memory(_image, times=5),
+}
+
+
+def corrected(
+    injected: Injected, sound: IntCore, guards: Guards, per_megabit: float, generator: np.random.Generator
+) -> Injected:
+    """The network as scrubbing and triple modular redundancy leave it before the next image.
+
+    The other two copies of the shifts suffer flips at the same rate, each on its own.
+
+    Args:
+        injected: whose shifts are the first of the three copies.
+        sound: the core without faults.
+        guards: with the checksums of its weights.
+        per_megabit: rate of flips in the other copies.
+        generator: draws which.
+    """
+    core = scrubbed(injected.core, sound, guards.checksums)
+    first = {**shifts_of(sound), **injected.faults.shifts}
+    second, third = (_flip_copy(sound, per_megabit, generator) for _ in range(2))
+    shifts = voted((first, second, third)) if injected.faults.shifts else {}
+    return replace(injected, core=core, faults=replace(injected.faults, shifts=shifts))
+
+
+def is_sound(injected: Injected, sound: IntCore, guards: Guards) -> bool:
+    """Whether no fault is left in weights and shifts."""
+    meant = shifts_of(sound)
+    return {**meant, **injected.faults.shifts} == meant and checksums(injected.core) == guards.checksums

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property, partial
 from pathlib import Path
 
@@ -52,16 +52,12 @@ class Network:
     """A network's file: how it runs, and how far it sees."""
 
     model: onnx.ModelProto
+    _opened: dict[int, ort.InferenceSession] = field(default_factory=dict, init=False, repr=False)
 
     @cached_property
     def tiling(self) -> Tiling:
         """How it meets an image of any size."""
         return tiling_of(any_size(self.model))
-
-    @property
-    def radius_px(self) -> int:
-        """How far from a pixel its result depends on."""
-        return self.tiling.halo_px
 
     def extended(self, image: np.ndarray) -> np.ndarray:
         """An image (N, 1, H, W) with copies of its last row and column, up to what the network takes whole."""
@@ -80,11 +76,8 @@ class Network:
         Raises:
             ImageError: numbers outside 0 to full scale, or a network that gives NaN.
         """
-        return restore(self.infer(threads), image, self.tiling, tile_px)
-
-    @cached_property
-    def _opened(self) -> dict[int, ort.InferenceSession]:
-        return {}
+        plan = make_plan((1, *image.shape), tile_px, self.tiling.halo_px, self.tiling)
+        return restore_floats(image, self.infer(threads), plan, FULL_DN)
 
 
 @dataclass(frozen=True)
@@ -149,36 +142,13 @@ def open_subject(
     for path, network, wanted in ((float_path, float32, False), (int8_path, int8, True)):
         if path is not None and network is not None:
             require_quantised(network.model, path, wanted)
-            _ = network.radius_px  # refuses what cannot be tiled before anything runs
+            _ = network.tiling  # refuses what cannot be tiled before anything runs
     paths = (float_path,) if int8_path is None else (float_path, int8_path)
     return Subject(float32, int8, paths)
 
 
-def restore(infer: Infer, image: np.ndarray, tiling: Tiling, tile_px: int = WHOLE_PX) -> np.ndarray:
-    """The command's own way from digital numbers (H, W) to restored ones, float32, not rounded, with exact seams.
-
-    Raises:
-        ImageError: numbers outside 0 to full scale, or a network that gives NaN.
-    """
-    return restore_floats(image, infer, make_plan((1, *image.shape), tile_px, tiling.halo_px, tiling), FULL_DN)
-
-
-def in_float64(graph: Graph, image: np.ndarray) -> np.ndarray:
-    """The image (N, 1, H, W) plus the graph's correction, computed in float64."""
-    with torch.inference_mode():
-        pixels = _as(image, torch.float64)
-        return np.asarray((pixels + _correction(graph, pixels)).numpy())
-
-
-def steepest_signs(graph: Graph, image: np.ndarray) -> np.ndarray:
-    """The change (H, W) of -1, 0 or 1 that moves the middle pixel most, to first order: its gradient's signs."""
-    pixels = _as(image, torch.float32)[None, None].requires_grad_()
-    restored = pixels + _correction(graph, pixels)
-    (gradient,) = torch.autograd.grad(restored[0, 0, image.shape[0] // 2, image.shape[1] // 2], pixels)
-    return np.asarray(gradient[0, 0].sign().numpy())
-
-
-def _correction(graph: Graph, image: Tensor) -> Tensor:
+def in_torch(graph: Graph, image: Tensor) -> Tensor:
+    """An image (N, 1, H, W) plus the graph's correction, computed in the image's precision."""
     place_px = math.isqrt(image_channels(graph))
     tensors = {IMAGE: pixel_unshuffle(image, place_px)}
     for op in graph:
@@ -186,14 +156,18 @@ def _correction(graph: Graph, image: Tensor) -> Tensor:
             tensors[op.output] = tensors[op.inputs[0]] + tensors[op.inputs[1]]
             continue
         assert isinstance(op, Conv)  # noqa: S101 - correction_graph has seen to it
-        weight, bias = (_as(values, image.dtype) for values in (op.weight, op.bias))
+        weight, bias = (torch.from_numpy(values).to(image.dtype) for values in (op.weight, op.bias))
         result = conv2d(tensors[op.input], weight, bias, padding=op.window.pads[0])
         tensors[op.output] = torch.relu(result) if op.activation is Activation.relu else result
-    return pixel_shuffle(tensors[CORRECTION], place_px)
+    return image + pixel_shuffle(tensors[CORRECTION], place_px)
 
 
-def _as(values: np.ndarray, dtype: torch.dtype) -> Tensor:
-    return torch.from_numpy(np.ascontiguousarray(values)).to(dtype)
+def steepest_signs(graph: Graph, image: np.ndarray) -> np.ndarray:
+    """The change (H, W) of -1, 0 or 1 that moves the middle pixel most, to first order: its gradient's signs."""
+    pixels = torch.from_numpy(image)[None, None].requires_grad_()
+    middle = in_torch(graph, pixels)[0, 0, image.shape[0] // 2, image.shape[1] // 2]
+    (gradient,) = torch.autograd.grad(middle, pixels)
+    return np.asarray(gradient[0, 0].sign().numpy())
 
 
 GAIN_DN, STEEPEST_DN, FLOAT32_DN = 16.0, 64.0, 0.05
@@ -212,7 +186,8 @@ def float32(subject: Subject, case: Case, image: np.ndarray) -> list[Measure]:
     measures = restoration(network, case, image, GAIN_DN)
     if case.pixels == "sound" and not case.large and graph is not None:
         whole = network.extended(_fractions(image))
-        error = FULL_DN * float(np.abs(network.infer()(whole) - in_float64(graph, whole)).max())
+        exact = in_torch(graph, torch.from_numpy(whole).double()).numpy()
+        error = FULL_DN * float(np.abs(network.infer()(whole) - exact).max())
         signs = steepest_signs(graph, whole[0, 0])[: image.shape[0], : image.shape[1]]
         steepest = change(network.restore, image, network.restore(image), signs)
         measures.append(Measure("error against float64", error, FLOAT32_DN))
@@ -244,7 +219,7 @@ def restoration(network: Network, case: Case, image: np.ndarray, gain_dn: float)
     if case.pixels == "missing":
         return [*measures, differing("missing moved", result[~known], image[~known])]
     largest = gain(network.restore, image, result, np.random.default_rng(0))
-    measures += fidelity(image, result, network.radius_px, case.flat)
+    measures += fidelity(image, result, network.tiling.halo_px, case.flat)
     return [*measures, Measure("gain", largest, gain_dn, "DN per DN")]
 
 
@@ -291,7 +266,7 @@ def tiling(subject: Subject, case: Case, image: np.ndarray) -> list[Measure]:
 
 def _plans(network: Network, name: str, case: Case, image: np.ndarray) -> list[Measure]:
     cores = (LARGE_CORE_PX,) if case.large else CORES_PX
-    tiles = [2 * network.radius_px + core for core in cores]
+    tiles = [2 * network.tiling.halo_px + core for core in cores]
     if case.pixels in ("infinite", "beyond"):
         return [refused(partial(network.restore, image, tile_px=tile)) for tile in tiles]
     whole = network.restore(image)

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 
+from deploy.results import common_mode, missing, unit_of, words_of
 from profiles.figures import Figure, Row, by_table
 
 TITLES = {
@@ -38,39 +39,24 @@ def markdown(rows: Sequence[Row]) -> str:
 
 
 def table_lines(rows: Sequence[Row]) -> list[str]:
-    """The lines of one table."""
-    keys = list(dict.fromkeys(key for row in rows for key in row.figures))
-    words = list(dict.fromkeys(word for row in rows for word in row.text))
-    lines = [_line(["", *(_head(key, rows) for key in keys), *words]), _line(["---"] * (1 + len(keys) + len(words)))]
-    for row in rows:
-        figures = [_cell(row.figures.get(key), alike=len(_kinds(key, rows)) == 1) for key in keys]
+    """The lines of one table; unit and mode stand in its head where they are those of a whole column."""
+    found = list(rows)
+    keys, words = list(dict.fromkeys(key for row in found for key in row.figures)), words_of(found)
+    common = {key: (unit_of(key, found), common_mode(key, found)) for key in keys}
+    abouts = {key: ", ".join(filter(None, both)) for key, both in common.items()}
+    lines = [_line(["", *(f"{key} ({about})" if about else key for key, about in abouts.items()), *words])]
+    lines.append(_line(["---"] * (1 + len(keys) + len(words))))
+    for row in found:
+        figures = [_cell(row.figures.get(key), *common[key]) for key in keys]
         lines.append(_line([row.name, *figures, *(row.text.get(word, "") for word in words)]))
-    return lines
+    reasons = missing(found)
+    return [*lines, *(["", *reasons] if reasons else [])]
 
 
-def _kinds(key: str, rows: Sequence[Row]) -> set[str]:
-    """Unit and mode of a column's figures; a bound that is proven says so."""
-    return {_kind(row.figures[key]) for row in rows if key in row.figures}
-
-
-def _kind(figure: Figure) -> str:
-    mode = "proven" if figure.source.startswith("proven") else figure.mode
-    return f"{figure.unit}, {mode}"
-
-
-def _head(key: str, rows: Sequence[Row]) -> str:
-    kinds = _kinds(key, rows)
-    return f"{key} ({kinds.pop()})" if len(kinds) == 1 else key
-
-
-def _cell(figure: Figure | None, alike: bool) -> str:
-    if figure is None:
-        return ""
-    if figure.value is None:
-        return f"unavailable: {figure.reason}"
-    size = abs(figure.value)
-    digits = f"{figure.value:.3g}" if size >= 1e6 or 0 < size < 1e-3 else str(figure)
-    return digits if alike else f"{digits} {_kind(figure)}"
+def _cell(figure: Figure | None, unit: str, mode: str) -> str:
+    if figure is None or figure.value is None:
+        return "" if figure is None else "-"
+    return " ".join([str(figure), *([] if unit else [figure.unit]), *([] if mode else [figure.mode])])
 
 
 def _line(cells: Sequence[str]) -> str:

@@ -5,7 +5,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from deploy.studies.tradeoff.pareto import COSTS, Comparison, Measured
+from deploy.studies.tradeoff.pareto import COSTS, PSNR, Comparison, Measured, ends, placed
 from profiles.errors import OptionError
 from profiles.figures import Figure, Row
 
@@ -52,7 +52,7 @@ class Constraint:
 
     def holds_throughout(self, figure: Figure) -> bool:
         """Whether the figure's whole interval keeps it."""
-        low, high = figure.interval or (figure.value or 0.0, figure.value or 0.0)
+        low, high = ends(figure)
         return high <= self.limit if self.at_most else low >= self.limit
 
 
@@ -117,17 +117,17 @@ def recommend(
         compare: tells which point is better.
     """
     constraints, cost = [*budget, *need], chosen_cost(points, budget)
-    ranked = [point for point in points if point.value("PSNR") is not None and point.value(cost) is not None]
+    ranked = placed(points, cost)
     kept = [point for point in ranked if not _violation(point, constraints)]
     limits = f" for {' and '.join(map(str, constraints))}" if constraints else ""
     if not kept:
         return Recommendation(None, _nearest(ranked, constraints, limits))
     cheapest_first = sorted(kept, key=lambda point: point.cost(cost))
-    best = max(cheapest_first, key=lambda point: point.value("PSNR") or 0.0)
+    best = max(cheapest_first, key=lambda point: point.psnr_db)
     taken = cheapest_first[0]
     if budget or not need:
         taken = next(point for point in cheapest_first if not compare.significantly_better(best, point))
-    line = f"recommended{limits}: {_words(taken, ['PSNR', cost, *(each.key for each in constraints)])}"
+    line = f"recommended{limits}: {_words(taken, [PSNR, cost, *(each.key for each in constraints)])}"
     return Recommendation(taken, line + _remarks(taken, best, constraints, compare, by_psnr=bool(budget or not need)))
 
 

@@ -1,6 +1,6 @@
 """What a detector finds on labelled images that a variant restored: mAP50, a quality beside PSNR.
 
-Only a study with `--labelled` imports this module: it is the one place that knows the detection study.
+It is the one place of the trade-off that knows the detection study.
 """
 
 from collections.abc import Mapping, Sequence

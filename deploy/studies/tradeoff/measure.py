@@ -27,7 +27,7 @@ from deploy.restoration.plan import make_plan
 from deploy.restoration.runtime import open_runtime
 from deploy.studies.evaluation.methods import Method
 from deploy.studies.evaluation.pairs import NamedPair
-from deploy.studies.evaluation.scores import Instruments, mean_row
+from deploy.studies.evaluation.scores import NOISE_FREE, Instruments, mean_row
 from deploy.studies.tradeoff.points import HALO_STEP_PX, Point, Variant, model_of, tiling_of_file
 from model.io.files import sha256, write_text
 from model.io.images import list_images
@@ -47,6 +47,8 @@ Scores = Mapping[str, float | None]
 """Figures of one image by name; None where an instrument is not there."""
 
 SEAM_ERROR = "seam error"
+NOT_SHOWN = ("PSNR gain", NOISE_FREE, SEAM_ERROR)
+"""Of the scores of an image, in the means of a point."""
 
 
 def key_of(**about: object) -> str:
@@ -129,24 +131,30 @@ class Benchmark:
             return network_sha256(variant.file)
         return key_of(method=variant.source, sensors=[self.degraded, self.reference])
 
+    def scores(self, point: Point, exact: Restore, kept: Measurements) -> list[dict[str, float | None]]:
+        """Scores of each image: those of the variant, or with seams where the halo is too small for exact ones."""
+        about = {"scores": self.depends(point.variant), "images": self.digest}
+        if point.halo_px is None:
+            return list(kept.make(key_of(**about), lambda: self.score(exact)))
+        key = key_of(**about, tile_px=point.tile_px, halo_px=point.halo_px)
+        return list(kept.make(key, lambda: self.score_in_tiles(point, exact)))
+
     def score(self, restore: Restore) -> list[dict[str, float | None]]:
         """Scores of every pair."""
-        return [self.instruments.score(restore(p.degraded), p.reference, p.degraded) for p in self.pairs]
+        return [self.instruments.score(restore(pair.degraded), pair) for pair in self.pairs]
 
-    def score_in_tiles(self, variant: Variant, exact: Restore, point: Point) -> list[dict[str, float | None]]:
+    def score_in_tiles(self, point: Point, exact: Restore) -> list[dict[str, float | None]]:
         """Scores of every pair restored in a point's tiles, and how far its seams are from exact ones, in DN."""
-        max_dn, found = self.degraded.nominal().max_dn, []
-        cut = restore_in_tiles(variant, point.tile_px, point.halo_px or 0, max_dn)
+        cut, found = restore_in_tiles(point, self.degraded.nominal().max_dn), []
         for pair in self.pairs:
             restored = cut(pair.degraded)
             error = np.abs(np.asarray(restored, np.float64) - exact(pair.degraded)).mean()
-            scores = self.instruments.score(restored, pair.reference, pair.degraded)
-            found.append({**scores, SEAM_ERROR: float(error)})
+            found.append({**self.instruments.score(restored, pair), SEAM_ERROR: float(error)})
         return found
 
     def means(self, images: Sequence[Scores]) -> dict[str, Figure]:
         """Means over the images, with bootstrap intervals over whole sites."""
-        plain = [{key: each[key] for key in each if key not in ("PSNR gain", SEAM_ERROR)} for each in images]
+        plain = [{key: each[key] for key in each if key not in NOT_SHOWN} for each in images]
         unnamed = Method("", lambda dn: dn, "")
         found = dict(mean_row(unnamed, plain, self.sites, self.instruments, self.seed).figures)
         if SEAM_ERROR in images[0]:
@@ -156,15 +164,14 @@ class Benchmark:
         return found
 
 
-def restore_in_tiles(variant: Variant, tile_px: int, halo_px: int, max_dn: int) -> Restore:
-    """A network in such tiles; an image that is no larger than a tile is cut in two along each side."""
-    file = variant.file or Path()
+def restore_in_tiles(point: Point, max_dn: int) -> Restore:
+    """A network in a point's tiles; an image that is no larger than a tile is cut in two along each side."""
+    file, halo_px = point.variant.file or Path(), point.halo_px or 0
     infer, _ = open_runtime(Runtime.onnxruntime, model_of(file), threads=0)
-    tiling = tiling_of_file(file)
 
     def restore(dn: np.ndarray) -> np.ndarray:
         half_px = HALO_STEP_PX * -(-(min(dn.shape) // 2) // HALO_STEP_PX) + 2 * halo_px
-        plan = make_plan((1, *dn.shape), min(tile_px, half_px), halo_px, tiling)
+        plan = make_plan((1, *dn.shape), min(point.tile_px, half_px), halo_px, tiling_of_file(file))
         return restore_dn(dn, infer, plan, max_dn)
 
     return restore
@@ -180,6 +187,19 @@ def pixels_sha256(image: np.ndarray) -> str:
 TILE_PX, ROUNDS = 256, 9
 
 
+def measure_host(
+    methods: Mapping[Variant, Method], benchmark: Benchmark, kept: Measurements
+) -> dict[Variant, dict[str, Figure]]:
+    """What each variant takes on this machine, all timed together on a drawn scene as the sensor sees it."""
+    swath = Swath(TILE_PX, TILE_PX)
+    tile = drawn_acquisition(swath, benchmark.degraded, benchmark.reference, benchmark.seed)
+    names = [benchmark.depends(variant) for variant in methods]
+    machine = f"{platform.machine()} {processor_name() or platform.processor()} x {psutil.cpu_count()}"
+    key = key_of(times=names, tile=pixels_sha256(tile), side=TILE_PX, machine=machine)
+    times = kept.make(key, lambda: host_times([method.restore for method in methods.values()], tile))
+    return {variant: host_figures(each, tile.size) for variant, each in zip(methods, times, strict=True)}
+
+
 def host_times(restores: Iterable[Restore], tile: np.ndarray) -> list[list[float]]:
     """Seconds that each method takes for a tile on this machine, interleaved, after one run for warm-up."""
     calls = [partial(restore, tile) for restore in restores]
@@ -189,21 +209,11 @@ def host_times(restores: Iterable[Restore], tile: np.ndarray) -> list[list[float
     return [list(times) for times in rounds]
 
 
-def host_tile(benchmark: Benchmark) -> np.ndarray:
-    """What host times are taken on: a drawn scene as the sensor sees it."""
-    return drawn_acquisition(Swath(TILE_PX, TILE_PX), benchmark.degraded, benchmark.reference, benchmark.seed)
-
-
 def host_figures(times_s: Sequence[float], pixels: int) -> dict[str, Figure]:
     """Median and 90th percentile for a million pixels, in s."""
     source = f"{len(times_s)} runs of a tile of {TILE_PX} x {TILE_PX}, interleaved with the other methods"
     values = np.asarray(times_s) * 1e6 / pixels
     return {f"host p{p}": measured(float(np.percentile(values, p)), "s/Mpx", source) for p in (50, 90)}
-
-
-def machine() -> str:
-    """What host times hold for: the processor and its cores."""
-    return f"{platform.machine()} {processor_name() or platform.processor()} x {psutil.cpu_count()}"
 
 
 PATCHES, PATCH_PX = 32, 96
@@ -231,13 +241,9 @@ def make_int8(file: Path, folder: Path, scenes: Path | None, sensor: str, seed: 
     key = key_of(network=network_sha256(file), scenes=seen, sensor=known, seed=seed, size=[PATCHES, PATCH_PX])
     path = folder / f"{file.stem}-int8-{key[:16]}.onnx"
     if not path.is_file():
-        patches = _patches(known, scenes, seed)
+        reference = reference_for(known)
+        loaded = load_scenes(scenes, reference.nominal(), seed)
+        patches = draw_patches(loaded, known, reference, PATCHES, seed, PATCH_PX)
         about = {"calibration_sensor": known.name, "calibration_seed": str(seed)}
         save_onnx(quantise_model(model, patches, about).host, path)
     return path
-
-
-def _patches(degraded: SensorProfile, scenes: Path | None, seed: int) -> Any:
-    reference = reference_for(degraded)
-    loaded = load_scenes(scenes, reference.nominal(), seed)
-    return draw_patches(loaded, degraded, reference, PATCHES, seed, PATCH_PX)

@@ -9,11 +9,11 @@ from markupsafe import Markup
 
 from deploy.report.page import Picture, Report, Table, write_report
 from deploy.report.plots import LIGHT, SERIES, data_url, look, new_figure, set_ticks, svg_of
-from deploy.studies.tradeoff.pareto import Measured
+from deploy.studies.tradeoff.pareto import PSNR, Measured, ends, placed
 from deploy.studies.tradeoff.run import Study
 from model.io.files import write_text
 from model.traditional.peers import PEERS
-from profiles.figures import Figure, Row
+from profiles.figures import Row
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -29,7 +29,6 @@ NEAR_PX = 16
 PALE = 0.45
 MARKERS = ("o", "s", "D", "^", "v", "P", "X")
 CHAINS, LIBRARIES = "traditional chains", "other libraries"
-PSNR = "PSNR"
 SHOWN_WORDS = ("board", "configuration", "tile", "halo", "sensor")
 
 FRONT_CAPTION = (
@@ -80,7 +79,8 @@ def plot_svg(study: Study) -> Markup:
     from matplotlib import rc_context
 
     front = list(study.front)
-    points = [point for point in study.points if _placed(point, study.cost) and _on_first_board(point, study)]
+    boards = (study.board, "this machine")
+    points = [point for point in placed(study.points, study.cost) if point.text["board"] in boards]
     with look(), rc_context({"font.size": TEXT_PX}):
         figure = new_figure(*SIZE_PX)
         axes = figure.add_subplot(xscale="log", xlabel=_label(study, study.cost), ylabel=_label(study, PSNR))
@@ -96,14 +96,6 @@ def plot_svg(study: Study) -> Markup:
         figure.subplots_adjust(left=0.13, right=0.97, top=0.97, bottom=0.13 + 0.045 * rows)
         _draw_numbers(axes, study)
         return svg_of(figure, f"{PSNR} against {study.cost}; numbers as in the table of the front")
-
-
-def _placed(point: Measured, cost: str) -> bool:
-    return point.value(cost) is not None and point.value(PSNR) is not None
-
-
-def _on_first_board(point: Measured, study: Study) -> bool:
-    return point.text["board"] in (study.board, "this machine")
 
 
 def series(points: Sequence[Measured]) -> Iterator[tuple[str, str, str, list[Measured]]]:
@@ -128,19 +120,18 @@ def _scatter(
     for large in (False, True):
         shown = [point for point in members if (point in front) == large]
         size, alpha = (FRONT_PX2, 1.0) if large else (OTHERS_PX2, PALE)
-        x, y = ([point.value(key) or 0.0 for point in shown] for key in (cost, PSNR))
+        x, y = [point.cost(cost) for point in shown], [point.psnr_db for point in shown]
         axes.scatter(x, y, s=size, c=colour, marker=marker, alpha=alpha, linewidths=0, zorder=2 + large)
     axes.scatter([], [], s=FRONT_PX2, c=colour, marker=marker, label=name, linewidths=0)
 
 
 def _draw_front(axes: "Axes", study: Study, front: Sequence[Measured]) -> None:
     """The line of the front, and the intervals of its members."""
-    x, y = ([point.value(key) or 0.0 for point in front] for key in (study.cost, PSNR))
+    x, y = [point.cost(study.cost) for point in front], [point.psnr_db for point in front]
     axes.step(x, y, where="post", color=LIGHT["soft"], lw=1, zorder=1)
     for point, row in zip(front, study.front_rows, strict=True):
-        at = point.value(study.cost) or 0.0, point.value(PSNR) or 0.0
-        low, high = _ends(point.figures[study.cost])
-        axes.plot([low, high], [at[1]] * 2, color=LIGHT["line"], lw=2, zorder=0)
+        at = point.cost(study.cost), point.psnr_db
+        axes.plot(ends(point.figures[study.cost]), [at[1]] * 2, color=LIGHT["line"], lw=2, zorder=0)
         gain = row.figures.get("PSNR gain")
         if gain is not None and gain.interval is not None:
             before = at[1] - (gain.value or 0.0)
@@ -151,7 +142,7 @@ def _draw_numbers(axes: "Axes", study: Study) -> None:
     """The members' numbers beside their marks; one label for neighbours whose marks lie on one another."""
     groups: list[tuple[int, int, np.ndarray]] = []
     for number, point in enumerate(study.front, 1):
-        at = axes.transData.transform((point.value(study.cost) or 0.0, point.value(PSNR) or 0.0))
+        at = axes.transData.transform((point.cost(study.cost), point.psnr_db))
         if groups and np.hypot(*(at - groups[-1][2])) < NEAR_PX:
             groups[-1] = (groups[-1][0], number, groups[-1][2])
         else:
@@ -159,10 +150,6 @@ def _draw_numbers(axes: "Axes", study: Study) -> None:
     for first, last, at in groups:
         words = str(first) if first == last else f"{first}\u2013{last}"
         axes.annotate(words, (at[0], at[1]), (-4, 7), "figure pixels", "offset points", ha="right", weight="bold")
-
-
-def _ends(figure: Figure) -> tuple[float, float]:
-    return figure.interval or (figure.value or 0.0, figure.value or 0.0)
 
 
 def _label(study: Study, key: str) -> str:

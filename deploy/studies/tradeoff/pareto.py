@@ -5,8 +5,8 @@ their scores. Their own intervals show how images differ, which the points share
 """
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 
 import numpy as np
@@ -14,13 +14,12 @@ import numpy as np
 from deploy.studies.tradeoff.measure import Scores
 from deploy.studies.tradeoff.points import Point
 from model.metrics.bootstrap import site_interval
-from profiles import TargetProfile
-from profiles.figures import Figure, Mode, Row, measured, predicted, unavailable
+from profiles.figures import Figure, Row, measured, predicted
 
 Interval = tuple[float, float]
 
 COSTS = ("board latency", "board energy", "host p50")
-HIGHER_IS_BETTER = {"PSNR": True, "SSIM": True, "LPIPS-squeeze": False}
+PSNR = "PSNR"
 
 ALIKE_DB = 0.05
 """Where the sites are too few for an interval, PSNR within this is not told apart."""
@@ -57,22 +56,29 @@ class Measured:
         return math.inf if value is None else value
 
     @property
+    def psnr_db(self) -> float:
+        """The value of PSNR; less than any where there is none to compare."""
+        value = self.value(PSNR)
+        return -math.inf if value is None else value
+
+    @property
     def row(self) -> Row:
         """For tables."""
         return Row("points", self.name, self.figures, self.text)
 
 
-def pareto_front(points: Sequence[Measured], cost: str, quality: str = "PSNR") -> list[Measured]:
-    """The points than which none is both cheaper and better, by value, from cheap to dear."""
-    sign = 1 if HIGHER_IS_BETTER[quality] else -1
-    known = [point for point in points if None not in (point.value(cost), point.value(quality))]
+def pareto_front(points: Sequence[Measured], cost: str) -> list[Measured]:
+    """The points than which none is both cheaper and of better PSNR, by value, from cheap to dear."""
     front: list[Measured] = []
-    best = -math.inf
-    for point in sorted(known, key=lambda p: (p.cost(cost), -sign * (p.value(quality) or 0.0))):
-        if sign * (point.value(quality) or 0.0) > best:
+    for point in sorted(placed(points, cost), key=lambda p: (p.cost(cost), -p.psnr_db)):
+        if not front or point.psnr_db > front[-1].psnr_db:
             front.append(point)
-            best = sign * (point.value(quality) or 0.0)
     return front
+
+
+def placed(points: Iterable[Measured], cost: str) -> list[Measured]:
+    """The points that have both a cost and a PSNR to compare."""
+    return [point for point in points if None not in (point.value(cost), point.value(PSNR))]
 
 
 @dataclass(frozen=True)
@@ -87,27 +93,22 @@ class Comparison:
     sites: Sequence[str]
     seed: int
 
-    def difference(self, a: Measured, b: Measured, key: str = "PSNR") -> Figure:
-        """A quality of `a` less that of `b`, with the interval of the paired difference; none below five sites."""
-        first, second = a.value(key), b.value(key)
-        if first is None or second is None or not a.images or not b.images:
-            return unavailable(a.figures[key].unit, f"no {key} of both on the same images")
-        differences = [(x[key] or 0.0) - (y[key] or 0.0) for x, y in zip(a.images, b.images, strict=True)]
+    def difference(self, a: Measured, b: Measured) -> Figure:
+        """The PSNR of `a` less that of `b`, with the interval of the paired difference; none below five sites."""
+        pairs = zip(a.images, b.images, strict=True)
+        differences = [(x[PSNR] or 0.0) - (y[PSNR] or 0.0) for x, y in pairs]
         if not any(differences):  # the same pictures, on however few sites
-            return measured(0.0, a.figures[key].unit, "the same pictures", (0.0, 0.0))
+            return measured(0.0, "dB", "the same pictures", (0.0, 0.0))
         interval, words = site_interval(differences, self.sites, np.random.default_rng(self.seed))
-        source = f"{key} less that of {b.name} on the same images, {words}"
-        return measured(first - second, a.figures[key].unit, source, interval)
+        source = f"PSNR less that of {b.name} on the same images, {words}"
+        return measured(a.psnr_db - b.psnr_db, "dB", source, interval)
 
-    def significantly_better(self, a: Measured, b: Measured, key: str = "PSNR") -> bool:
+    def significantly_better(self, a: Measured, b: Measured) -> bool:
         """Whether the whole interval of the difference says so; by value, beyond ALIKE_DB, where there is none."""
-        found = self.difference(a, b, key)
-        if found.value is None:
-            return False
-        sign = 1 if HIGHER_IS_BETTER[key] else -1
+        found = self.difference(a, b)
         if found.interval is None:
-            return sign * found.value > (ALIKE_DB if key == "PSNR" else 0.0)
-        return min(sign * end for end in found.interval) > 0
+            return (found.value or 0.0) > ALIKE_DB
+        return found.interval[0] > 0
 
     def verdict(self, a: Measured, b: Measured) -> str:
         """Of a difference in PSNR, in words: not significant where its interval holds 0."""
@@ -119,44 +120,31 @@ class Comparison:
 
 
 def cost_ratio(a: Measured, b: Measured, cost: str) -> Figure:
-    """How many times the cost of `b` that `a` has, with an interval.
+    """How many times the cost of `b` that `a` has on the same board, with an interval.
 
     Two predictions of one board share most of their error: the interval of a ratio of latencies is the board's
     `pair_width`, and nothing where only the count of tiles differs.
     """
-    mode: Mode = "measured" if cost.startswith("host") else "predicted"
-    value = a.cost(cost) / b.cost(cost)
-    if mode == "measured":
-        return measured(value, "x", f"{cost} over that of {b.name}, medians of interleaved runs")
-    low, high = _ratio_interval(a, b, cost, value)
-    return predicted(value, "x", (low, high), f"{cost} over that of {b.name}")
+    value, source = a.cost(cost) / b.cost(cost), f"{cost} over that of {b.name}"
+    if cost.startswith("host"):
+        return measured(value, "x", f"{source}, medians of interleaved runs")
+    return predicted(value, "x", _ratio_interval(a, b, cost, value), source)
 
 
 def _ratio_interval(a: Measured, b: Measured, cost: str, value: float) -> Interval:
     first, second = a.point, b.point
-    if first and second and first.dpu and second.dpu and first.board == second.board:
-        if _differ_in_tiles_alone(first, second):
+    if first and second and first.dpu and second.dpu:
+        if replace(first, halo_px=second.halo_px) == second:
             return value, value
-        width = pair_width(first.dpu.target)
+        width = first.dpu.target.tables["cost"].get("pair_width")
         if cost == "board latency" and width is not None:
-            return value * math.exp(-width), value * math.exp(width)
-    (a_low, a_high), (b_low, b_high) = (_ends(each.figures[cost]) for each in (a, b))
+            return value * math.exp(-width.low), value * math.exp(width.low)
+    (a_low, a_high), (b_low, b_high) = (ends(each.figures[cost]) for each in (a, b))
     return a_low / b_high, a_high / b_low
 
 
-def _differ_in_tiles_alone(a: Point, b: Point) -> bool:
-    """Whether only the count of tiles differs: the same network, configuration and tile."""
-    same_dpu = a.dpu is not None and b.dpu is not None and a.dpu.name == b.dpu.name
-    return same_dpu and a.variant == b.variant and a.tile_px == b.tile_px
-
-
-def pair_width(target: TargetProfile) -> float | None:
-    """Half the width, in ln, of the interval of a ratio of two latencies; None where the target states none."""
-    stated = target.tables.get("cost", {}).get("pair_width")
-    return stated.low if stated is not None else None
-
-
-def _ends(figure: Figure) -> Interval:
+def ends(figure: Figure) -> Interval:
+    """The interval, or the value twice where it has none."""
     return figure.interval or (figure.value or 0.0, figure.value or 0.0)
 
 

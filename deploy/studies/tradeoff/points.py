@@ -112,10 +112,7 @@ def parse_targets(text: str) -> tuple[str, ...]:
 
 
 def network_variants(
-    names: Iterable[str],
-    sensor: SensorProfile,
-    make_int8: Callable[[Path], Path],
-    log: Callable[[str], None],
+    names: Iterable[str], sensor: SensorProfile, make_int8: Callable[[Path], Path], log: Callable[[str], None]
 ) -> list[Variant]:
     """Networks in float32 and INT8; shipped ones with the sensor's profile, INT8 files as they are.
 
@@ -129,13 +126,13 @@ def network_variants(
         OptionError: neither a shipped name nor a file of a network, two of one name, or one that takes other tiles.
         ModelError: a file that is no network.
     """
-    found: dict[str, list[Variant]] = {}
-    for name in dict.fromkeys(each.strip() for each in names):
-        variants = list(_variants(name, sensor, make_int8, log))
-        if variants[0].method in found:
-            raise OptionError("--network", expected="names that differ", got=repr(name), remedy="rename one file")
-        found[variants[0].method] = variants
-    return [variant for variants in found.values() for variant in variants]
+    different = dict.fromkeys(each.strip() for each in names)
+    found = [variant for name in different for variant in _variants(name, sensor, make_int8, log)]
+    shown = [variant.name for variant in found]
+    if len(set(shown)) < len(shown):
+        twice = max(shown, key=shown.count)
+        raise OptionError("--network", expected="names that differ", got=f"two {twice!r}", remedy="rename one file")
+    return found
 
 
 def _variants(

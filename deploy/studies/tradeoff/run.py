@@ -1,45 +1,25 @@
 """One study: variants, what is measured of each, points with their figures, a front and a recommendation."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from deploy.bench.tables import PAPER_SIZE, PAPER_TARGET, Swath, parse_size, published_rows
 from deploy.dpu.cost.model import Constants
 from deploy.studies.evaluation.methods import Method, method_named
-from deploy.studies.evaluation.pairs import oversampling_note
-from deploy.studies.evaluation.run import load_pairs
+from deploy.studies.evaluation.pairs import pairs_of_scenes
 from deploy.studies.evaluation.scores import Instruments, perceptual_distances
 from deploy.studies.tradeoff.advice import MAP50, Constraint, Recommendation, chosen_cost, recommend
 from deploy.studies.tradeoff.boards import CHAIN, board_figures
-from deploy.studies.tradeoff.measure import (
-    TILE_PX,
-    Benchmark,
-    Measurements,
-    Scores,
-    host_figures,
-    host_tile,
-    host_times,
-    key_of,
-    machine,
-    make_int8,
-    pixels_sha256,
-)
+from deploy.studies.tradeoff.labelled import Labelled
+from deploy.studies.tradeoff.measure import Benchmark, Measurements, Scores, key_of, make_int8, measure_host
 from deploy.studies.tradeoff.pareto import Comparison, Measured, front_rows, pareto_front
-from deploy.studies.tradeoff.points import (
-    FLOAT,
-    Point,
-    Variant,
-    configurations,
-    network_points,
-    network_variants,
-)
-from model.io.files import IMAGE_SUFFIXES, sha256
+from deploy.studies.tradeoff.points import FLOAT, Point, Variant, configurations, network_points, network_variants
+from model.io.files import sha256
 from model.io.images import list_images
 from model.metrics.backbones import find_backbone
-from model.metrics.bootstrap import LEAST_SITES
+from model.metrics.bootstrap import too_few
 from model.progress import steps
 from model.traditional.peers import PEERS
 from model.traditional.settings import QUALITIES
@@ -48,9 +28,6 @@ from profiles.errors import MachineError
 from profiles.figures import Figure, Row, unavailable
 from profiles.sensor import SensorProfile
 from profiles.sensor_file import reference_for
-
-if TYPE_CHECKING:
-    from deploy.studies.tradeoff.labelled import Labelled
 
 LPIPS = "LPIPS-squeeze"
 
@@ -67,6 +44,7 @@ class Study:
         cost: the figure that the front is against.
         recommendation: what to take.
         notes: what a reader must know.
+        inputs: the files that the figures rest on, besides shipped ones.
     """
 
     board: str
@@ -76,6 +54,7 @@ class Study:
     cost: str
     recommendation: Recommendation
     notes: Sequence[str]
+    inputs: Sequence[Path] = ()
 
     @property
     def rows(self) -> tuple[Row, ...]:
@@ -133,12 +112,17 @@ def run_study(
     variants = network_variants(networks, degraded, quantise, log)
     points = [point for variant in variants for point in network_points(variant, boards, swath)]
     benchmark, said = _benchmark(images, degraded, reference_for(degraded, reference), lpips, seed)
-    scenes = _labelled(labelled, detector, classes, benchmark)
+    scenes = Labelled.open(labelled, detector, classes, benchmark) if labelled else None
     measured = _measured([*points, *_others(boards)], benchmark, scenes, kept, swath, log)
     if boards[0].name == PAPER_TARGET and size_px == parse_size(PAPER_SIZE):
         measured += _published()
     notes = (*_notes(benchmark, boards[0].name), *(scenes.notes if scenes else ()), *said)
-    return _weighed(measured, boards[0], Comparison(benchmark.sites, seed), budget, need, notes)
+    study = _weighed(measured, boards[0], Comparison(benchmark.sites, seed), budget, need, notes)
+    named = [path for path in map(Path, networks) if path.is_file()]
+    listed = [path for folder in (images, calibration) if folder for path in list_images(folder)]
+    single = [path for path in (find_backbone("squeeze", lpips), detector) if path]
+    pictures = [scene.path for scene in scenes.scenes if scene.path] if scenes else []
+    return replace(study, inputs=[*named, *listed, *single, *pictures])
 
 
 def _weighed(
@@ -161,13 +145,11 @@ def _benchmark(
     images: Path | None, degraded: SensorProfile, reference: SensorProfile, lpips: Path | None, seed: int
 ) -> tuple[Benchmark, list[str]]:
     """What all variants are measured on, and what a reader must know of the images."""
-    pairs, small = load_pairs(images, None, degraded, reference, seed)
+    pairs, said = pairs_of_scenes(images, degraded, reference, seed)
     distances = {LPIPS: perceptual_distances(lpips)[LPIPS]}
     backbone, instruments = find_backbone("squeeze", lpips), Instruments(distances, degraded.nominal().max_dn)
     weights = sha256(backbone) if backbone else ""
-    said = [oversampling_note(pairs, degraded), f"left out, too small: {', '.join(small)}" if small else ""]
-    notes = [f"{note[0].upper()}{note[1:]}." for note in said if note]
-    return Benchmark(pairs, degraded, reference, instruments, weights, seed), notes
+    return Benchmark(pairs, degraded, reference, instruments, weights, seed), said
 
 
 def _others(boards: Sequence[TargetProfile]) -> list[Point]:
@@ -177,20 +159,10 @@ def _others(boards: Sequence[TargetProfile]) -> list[Point]:
     return points + [Point(Variant(peer, FLOAT, peer)) for peer in PEERS]
 
 
-def _labelled(
-    images: Path | None, detector: Path | None, classes: str | None, benchmark: Benchmark
-) -> "Labelled | None":
-    if images is None:
-        return None
-    from deploy.studies.tradeoff.labelled import Labelled  # the detection study, for those who ask for it
-
-    return Labelled.open(images, detector, classes, benchmark)
-
-
 def _measured(
     points: Sequence[Point],
     benchmark: Benchmark,
-    labelled: "Labelled | None",
+    labelled: Labelled | None,
     kept: Measurements,
     swath: Swath,
     log: Callable[[str], None],
@@ -204,12 +176,12 @@ def _measured(
         for point in there:
             method = methods[point.variant]
             bar.advance(0, f"measuring {point.name}")
-            images[point.name] = _scores(point, method, benchmark, kept)
+            images[point.name] = benchmark.scores(point, method.restore, kept)
             if labelled is not None and point.variant not in found:
                 key = key_of(map50=benchmark.depends(point.variant), labelled=labelled.digest)
                 found[point.variant] = labelled.figure(kept.make(key, partial(labelled.measure, method)))
             bar.advance(1, point.name)
-        host = _host(methods, benchmark, kept)
+        host = measure_host(methods, benchmark, kept)
         bar.advance(1, "timed on this machine")
     return [_point(each, methods[each.variant], images[each.name], benchmark, found, host, swath) for each in there]
 
@@ -224,17 +196,12 @@ def _point(
     swath: Swath,
 ) -> Measured:
     """A point with all its figures, in the order in which tables show them."""
-    pictures = {**benchmark.means(images), **_detected(point, found)}
-    figures = {**pictures, **host[point.variant], **board_figures(point, swath, _slower(point, host))}
+    figures = benchmark.means(images)
+    if found:  # how often a seam cuts an object is not known
+        with_seams = unavailable("%", "measured with exact halos alone")
+        figures[MAP50] = found[point.variant] if point.halo_px is None else with_seams
+    figures |= {**host[point.variant], **board_figures(point, swath, _slower(point, host))}
     return Measured(point.name, figures, _text(point, method), point, images)
-
-
-def _detected(point: Point, found: Mapping[Variant, Figure]) -> dict[str, Figure]:
-    """mAP50 where labelled images are given; with exact halos alone, for how often a seam cuts an object differs."""
-    if not found:
-        return {}
-    reason = "measured with exact halos alone"
-    return {MAP50: found[point.variant] if point.halo_px is None else unavailable("%", reason)}
 
 
 def _methods(variants: Sequence[Variant], benchmark: Benchmark, log: Callable[[str], None]) -> dict[Variant, Method]:
@@ -245,26 +212,6 @@ def _methods(variants: Sequence[Variant], benchmark: Benchmark, log: Callable[[s
         except MachineError as error:
             log(f"{variant.name} is left out: {error}")
     return found
-
-
-def _scores(point: Point, method: Method, benchmark: Benchmark, kept: Measurements) -> list[dict[str, float | None]]:
-    """Scores of each image: those of the variant, or with seams where the halo is too small for exact ones."""
-    about = {"scores": benchmark.depends(point.variant), "images": benchmark.digest}
-    if point.halo_px is None:
-        return list(kept.make(key_of(**about), lambda: benchmark.score(method.restore)))
-    key = key_of(**about, tile_px=point.tile_px, halo_px=point.halo_px)
-    return list(kept.make(key, lambda: benchmark.score_in_tiles(point.variant, method.restore, point)))
-
-
-def _host(
-    methods: Mapping[Variant, Method], benchmark: Benchmark, kept: Measurements
-) -> dict[Variant, dict[str, Figure]]:
-    """What each variant takes on this machine, all timed together."""
-    tile = host_tile(benchmark)
-    names = [benchmark.depends(variant) for variant in methods]
-    key = key_of(times=names, tile=pixels_sha256(tile), side=TILE_PX, machine=machine())
-    times = kept.make(key, lambda: host_times([method.restore for method in methods.values()], tile))
-    return {variant: host_figures(each, tile.size) for variant, each in zip(methods, times, strict=True)}
 
 
 def _slower(point: Point, host: Mapping[Variant, Mapping[str, Figure]]) -> float | None:
@@ -301,24 +248,7 @@ def _notes(benchmark: Benchmark, board: str) -> Iterator[str]:
         "Gains are differences on the same images from the next cheaper point of the front, with 95 % bootstrap "
         "intervals over whole sites; one whose interval holds 0 is not significant."
     )
-    if sites < LEAST_SITES:
-        yield f"Of {sites} sites, fewer than {LEAST_SITES}, no interval is shown: none could be trusted."
+    if too_few(sites):
+        yield too_few(sites)
     yield "Exact halos give the same pictures in tiles of any size; smaller ones were measured in the point's tiles."
     yield "The chains know both sensors; what a network knows of them stands beside it."
-
-
-def input_files(
-    networks: Sequence[str],
-    images: Path | None,
-    calibration: Path | None,
-    lpips: Path | None,
-    labelled: Path | None,
-    detector: Path | None,
-) -> tuple[Path, ...]:
-    """The files that the figures rest on, besides shipped ones; arguments as of `run_study`."""
-    named = [path for path in map(Path, networks) if path.is_file()]
-    folders = [folder for folder in (images, calibration) if folder]
-    tree = sorted(labelled.rglob("*")) if labelled else []
-    pictures = [path for path in tree if path.suffix.lower() in IMAGE_SUFFIXES]
-    single = [path for path in (find_backbone("squeeze", lpips), detector) if path]
-    return (*named, *(path for folder in folders for path in list_images(folder)), *single, *pictures)

@@ -20,7 +20,7 @@ from deploy.restoration.runtime import open_runtime
 from deploy.studies.evaluation.methods import method_named
 from deploy.studies.stress.networks import Network
 from deploy.studies.tradeoff.measure import restore_in_tiles
-from deploy.studies.tradeoff.points import FLOAT, INT8, Variant
+from deploy.studies.tradeoff.points import FLOAT, INT8, Point, Variant
 from profiles import load_sensor
 from quant.onnx_file import load_onnx
 
@@ -67,7 +67,7 @@ def by_engine(dn: np.ndarray, options: Options) -> np.ndarray:
 def by_tradeoff(path: Path, precision: str, halo_px: int) -> Restored:
     """As a study scores an operating point whose halo is smaller than the network's radius."""
     variant = Variant(path.stem, FLOAT if precision == "float" else INT8, str(path), path)
-    return restore_in_tiles(variant, TILES_PX[precision], halo_px, 4095)
+    return restore_in_tiles(Point(variant, tile_px=TILES_PX[precision], halo_px=halo_px), 4095)
 
 
 def exact_ways(path: Path, tile_px: int) -> dict[str, Restored]:

@@ -107,10 +107,9 @@ def edge_box(raw: tuple[Path, Path]) -> Box:
 
 def test_a_box_gives_one_axis_for_both(raw: tuple[Path, Path]) -> None:
     found = characterise(raw, (edge_box(raw),), bits=12)
-    assert found.along is None
-    assert found.across is not None
-    assert found.across.edges == 1
-    low, high = found.across.interval
+    assert list(found.axes) == ["across"]
+    assert found.axes["across"].edges == 1
+    low, high = found.axes["across"].interval
     assert low <= 0.09 <= high < 1.5 * low
     text = profile_toml(found)
     assert "mtf_nyquist_along" not in text
@@ -156,7 +155,7 @@ def tiff(folder: Path, pixels: np.ndarray) -> Path:
 
 FLAT = np.random.default_rng(0).normal(1000, 20, (200, 200))
 WRONG: dict[str, tuple[np.ndarray, tuple[str, ...], str]] = {
-    "8-bit": (np.clip(FLAT / 8, 0, 255).astype(np.uint8), (), "in 8 bits; give the digitiser's"),
+    "8-bit": (np.clip(FLAT / 8, 0, 255).astype(np.uint8), (), "or are stored in 8 bits"),
     "bands": (np.full((64, 64, 3), 7, np.uint16), ("--bits", "12"), "one band"),
     "fractions": (FLAT.astype(np.float32), ("--bits", "12"), "whole digital numbers"),
     "negative": (FLAT.astype(np.int16) - 2000, ("--bits", "12"), "from 0 to 65535"),

@@ -54,7 +54,7 @@ def test_the_reference_has_the_gain_of_the_sensor_named(tmp_path: Path) -> None:
     """Else every pixel of the scene would be off by the ratio of the gains, and the PSNR would say so."""
     text = (HERE / "sensors" / "pleiades-degraded.toml").read_text()
     (tmp_path / "mine.toml").write_text(text.replace("10.2375", "5.0"))
-    pair = read_input(None, 0, load_sensors(str(tmp_path / "mine.toml"))).pair
+    pair = read_input(None, 0, load_sensors(str(tmp_path / "mine.toml")))[1]
     assert pair is not None
     assert abs(float(pair.degraded.mean() / pair.reference.mean()) - 1) < 0.01
     (tmp_path / "wide.toml").write_text(text.replace("bits = { value = 12", "bits = { value = 14"))

@@ -111,8 +111,7 @@ def refused(region: np.ndarray) -> str:
     region = region + SIGMA * np.random.default_rng(4).standard_normal(region.shape)
     found = fit_blur(region, noise, POINTED_AT)
     assert isinstance(found, Refusal), found
-    assert found.reason
-    return found.status
+    return found.reason
 
 
 def test_what_is_no_blurred_step_is_refused() -> None:
@@ -121,9 +120,13 @@ def test_what_is_no_blurred_step_is_refused() -> None:
     sharpened[:, 2:-2] += 1.5 * (2 * edge[:, 2:-2] - edge[:, :-4] - edge[:, 4:])
     column = np.arange(40) - 19.5
     flat = np.ones((40, 1))
-    assert refused(sharpened) == "no-convergence"
-    assert refused(flat * (900 + 600 * np.exp(-((column / 2) ** 2)))) == "no-convergence"  # a road
-    assert refused(flat * np.clip(1000 + 60 * column, 400, 1600)) == "no-convergence"  # a slope
-    assert refused(flat * np.where(column < 0, 1000.0, 1020.0)) in ("contrast", "no-convergence")
-    assert refused(np.full((40, 40), 1000.0)) in ("contrast", "no-convergence")
-    assert refused(edge[:2]) in ("few-rows", "contrast", "no-convergence")
+    others = {
+        "a road": flat * (900 + 600 * np.exp(-((column / 2) ** 2))),
+        "a slope": flat * np.clip(1000 + 60 * column, 400, 1600),
+        "a faint step": flat * np.where(column < 0, 1000.0, 1020.0),
+        "nothing": np.full((40, 40), 1000.0),
+        "sharpened": sharpened,
+    }
+    for name, region in others.items():
+        assert "no plain edge" in refused(region), name
+    assert "32 pixels near the edge" in refused(edge[:2])

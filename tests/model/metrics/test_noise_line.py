@@ -93,24 +93,23 @@ def test_clipped_pixels_are_left_out() -> None:
 def refused(image: np.ndarray) -> str:
     found = fitted(cut_blocks(image, MAX_DN))
     assert isinstance(found, Refusal), found
-    assert found.reason
-    return found.status
+    return found.reason
 
 
 def test_what_cannot_be_known_is_refused() -> None:
-    assert refused(np.rint(plain())) == "no-noise"
-    assert refused(noisy(0.1)) == "no-noise"
-    assert refused(noisy(5.0, plain(low=1000, high=1100))) == "range"
-    assert refused(noisy(5.0, plain((64, 64)))) == "few-windows"
-    assert refused(np.zeros((320, 320))) == "few-windows"
-    assert refused(np.zeros((3, 0))) == "few-windows"
+    assert "rounding alone makes" in refused(np.rint(plain()))
+    assert "rounding alone makes" in refused(noisy(0.1))
+    assert "too narrow" in refused(noisy(5.0, plain(low=1000, high=1100)))
+    assert "16 blocks" in refused(noisy(5.0, plain((64, 64))))
+    assert "0 blocks" in refused(np.zeros((320, 320)))
+    assert "0 blocks" in refused(np.zeros((3, 0)))
 
 
 def test_smoothed_noise_is_refused() -> None:
     """What a denoiser or a resampling leaves is weaker at the finest detail."""
     noise = 10 * np.random.default_rng(6).standard_normal((320, 320))
     smooth = (noise + np.roll(noise, 1, 0) + np.roll(noise, 1, 1) + np.roll(noise, (1, 1), (0, 1))) / 4
-    assert refused(plain() + smooth) == "few-windows"
+    assert "times as strong at middle frequencies" in refused(plain() + smooth)
 
 
 def test_texture_as_sharp_as_a_pixel_is_refused() -> None:
@@ -118,4 +117,4 @@ def test_texture_as_sharp_as_a_pixel_is_refused() -> None:
     rng = np.random.default_rng(8)
     radius = np.hypot(np.fft.fftfreq(512)[:, None], np.fft.rfftfreq(512)[None, :])
     waves = np.fft.irfft2(np.fft.rfft2(rng.standard_normal((512, 512))) / np.maximum(radius, 1 / 100), s=(512, 512))
-    assert refused(np.rint(plain((512, 512)) * np.exp(0.2 * waves / waves.std()))) == "few-windows"
+    assert "texture" in refused(np.rint(plain((512, 512)) * np.exp(0.2 * waves / waves.std())))

@@ -9,13 +9,15 @@ import torch
 from safetensors.numpy import load_file, save_file
 from skimage.filters import gaussian
 from torch import Tensor
+from torch.nn.functional import conv2d, max_pool2d, pad
 
 from model.metrics.backbones import BACKBONES, WEIGHTS_VARIABLE, Backbone, find_backbone, not_found
 from model.metrics.perceptual import MIN_NORM, PUBLISHED, Dists, Lpips, _unit
-from profiles.errors import ImageError, ModelError, OptionError
+from profiles.errors import ImageError, ModelError
 
 Weights = dict[str, np.ndarray]
-Maps = list[np.ndarray]
+Maps = list[Tensor]
+IMAGENET_MEAN, IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 STEMS = {"squeeze": "squeezenet1_1", "alex": "alexnet", "vgg": "vgg16"}
 
 
@@ -67,73 +69,49 @@ def as_batch(plane: np.ndarray) -> Tensor:
     return torch.from_numpy(plane).float()[None, None]
 
 
-# The same metrics once more, plainly, in numpy and float64; an image is (C, H, W).
+# The same metrics once more, plainly, in float64, layer by layer; an image is (1, C, H, W).
 
 
-def convolve(x: np.ndarray, weights: Weights, name: str, stride: int = 1, padding: int = 0) -> np.ndarray:
-    kernel, bias = (weights[f"{name}.{part}"].astype(np.float64) for part in ("weight", "bias"))
-    x = np.pad(x, ((0, 0), (padding, padding), (padding, padding)))
-    windows = np.lib.stride_tricks.sliding_window_view(x, kernel.shape[2:], axis=(1, 2))[:, ::stride, ::stride]
-    return np.asarray(np.tensordot(kernel, windows, axes=([1, 2, 3], [0, 3, 4])) + bias[:, None, None])
+def convolve(x: Tensor, weights: Weights, name: str, stride: int = 1, padding: int = 0) -> Tensor:
+    kernel, bias = (torch.from_numpy(weights[f"{name}.{part}"]).double() for part in ("weight", "bias"))
+    return conv2d(x, kernel, bias, stride, padding).relu()
 
 
-def relu(x: np.ndarray) -> np.ndarray:
-    return np.asarray(np.maximum(x, 0))
+def fire(x: Tensor, weights: Weights, name: str) -> Tensor:
+    squeezed = convolve(x, weights, f"{name}.squeeze")
+    return torch.cat([convolve(squeezed, weights, f"{name}.expand{n}x{n}", padding=n // 2) for n in (1, 3)], 1)
 
 
-def pooled(x: np.ndarray, size: int, ceil: bool = False) -> np.ndarray:
-    """Maximum over windows with stride 2; with `ceil` the last window may hang over the edge."""
-    rows, columns = (
-        range(0, length - size + 1 + (ceil and (length - size) % 2), 2) if length >= size else range(1)
-        for length in x.shape[1:]
-    )
-    return np.stack(
-        [np.stack([x[:, i : i + size, j : j + size].max(axis=(1, 2)) for j in columns], -1) for i in rows], 1
-    )
-
-
-def fire(x: np.ndarray, weights: Weights, name: str) -> np.ndarray:
-    squeezed = relu(convolve(x, weights, f"{name}.squeeze"))
-    parts = (convolve(squeezed, weights, f"{name}.expand{n}x{n}", padding=n // 2) for n in (1, 3))
-    return relu(np.concatenate(list(parts)))
-
-
-def squeeze_maps(x: np.ndarray, weights: Weights) -> Maps:
-    maps = [relu(convolve(x, weights, "features.0", stride=2))]
+def squeeze_maps(x: Tensor, weights: Weights) -> Maps:
+    maps = [convolve(x, weights, "features.0", stride=2)]
     for names in ("3 4", "6 7", "9", "10", "11", "12"):
-        x = pooled(maps[-1], 3, ceil=True) if names in ("3 4", "6 7", "9") else maps[-1]
+        x = max_pool2d(maps[-1], 3, 2, ceil_mode=True) if names in ("3 4", "6 7", "9") else maps[-1]
         for index in names.split():
             x = fire(x, weights, f"features.{index}")
         maps.append(x)
     return maps
 
 
-def alex_maps(x: np.ndarray, weights: Weights) -> Maps:
-    first = relu(convolve(x, weights, "features.0", stride=4, padding=2))
-    second = relu(convolve(pooled(first, 3), weights, "features.3", padding=2))
-    third = relu(convolve(pooled(second, 3), weights, "features.6", padding=1))
-    fourth = relu(convolve(third, weights, "features.8", padding=1))
-    return [first, second, third, fourth, relu(convolve(fourth, weights, "features.10", padding=1))]
+def alex_maps(x: Tensor, weights: Weights) -> Maps:
+    first = convolve(x, weights, "features.0", stride=4, padding=2)
+    second = convolve(max_pool2d(first, 3, 2), weights, "features.3", padding=2)
+    third = convolve(max_pool2d(second, 3, 2), weights, "features.6", padding=1)
+    fourth = convolve(third, weights, "features.8", padding=1)
+    return [first, second, third, fourth, convolve(fourth, weights, "features.10", padding=1)]
 
 
-def max_pooled_by_two(x: np.ndarray) -> np.ndarray:
-    return pooled(x, 2)
+def hanning_pooled(x: Tensor) -> Tensor:
+    window = torch.from_numpy(np.outer(*[np.hanning(5)[1:-1]] * 2))
+    cells = pad(x**2, (1, 1, 1, 1)).unfold(2, 3, 2).unfold(3, 3, 2)
+    return ((cells * window).sum((-2, -1)) / window.sum() + 1e-12).sqrt()
 
 
-def hanning_pooled(x: np.ndarray) -> np.ndarray:
-    window = np.hanning(5)[1:-1, None] * np.hanning(5)[None, 1:-1]
-    padded = np.pad(x**2, ((0, 0), (1, 1), (1, 1)))
-    rows, columns = (range(0, length, 2) for length in x.shape[1:])
-    cells = [[(padded[:, i : i + 3, j : j + 3] * window).sum((1, 2)) for j in columns] for i in rows]
-    return np.asarray(np.sqrt(np.moveaxis(np.array(cells), 2, 0) / window.sum() + 1e-12))
-
-
-def vgg_maps(x: np.ndarray, weights: Weights, pool: Callable[[np.ndarray], np.ndarray] = max_pooled_by_two) -> Maps:
+def vgg_maps(x: Tensor, weights: Weights, pool: Callable[[Tensor], Tensor] = lambda x: max_pool2d(x, 2)) -> Maps:
     maps: Maps = []
     for names in ("0 2", "5 7", "10 12 14", "17 19 21", "24 26 28"):
         x = pool(maps[-1]) if maps else x
         for index in names.split():
-            x = relu(convolve(x, weights, f"features.{index}", padding=1))
+            x = convolve(x, weights, f"features.{index}", padding=1)
         maps.append(x)
     return maps
 
@@ -144,8 +122,9 @@ def plain_lpips(network: str, image: np.ndarray, reference: np.ndarray) -> float
     maps = {"squeeze": squeeze_maps, "alex": alex_maps, "vgg": vgg_maps}[network]
     colours = [(2 * np.stack([a] * 3) - 1 - shift[:, None, None]) / scale[:, None, None] for a in (image, reference)]
     total = 0.0
-    for layer, maps_ab in enumerate(zip(*(maps(colour, weights) for colour in colours), strict=True)):
-        a, b = (m / (np.sqrt((m**2).sum(0)) + 1e-10) for m in maps_ab)
+    pairs = zip(*(maps(torch.from_numpy(colour)[None], weights) for colour in colours), strict=True)
+    for layer, both in enumerate(pairs):
+        a, b = (m.numpy()[0] / (np.sqrt((m.numpy()[0] ** 2).sum(0)) + 1e-10) for m in both)
         total += float(np.mean(np.tensordot(heads[f"lin{layer}"].astype(np.float64), (a - b) ** 2, axes=1)))
     return total
 
@@ -153,11 +132,13 @@ def plain_lpips(network: str, image: np.ndarray, reference: np.ndarray) -> float
 def plain_dists(image: np.ndarray, reference: np.ndarray) -> float:
     weights, published = made_up("vgg"), load_file(PUBLISHED / "dists.safetensors")
     alpha, beta = (published[name].astype(np.float64) for name in ("alpha", "beta"))
-    mean, std = np.array([0.485, 0.456, 0.406])[:, None, None], np.array([0.229, 0.224, 0.225])[:, None, None]
-    colours = [np.stack([a] * 3) for a in (image, reference)]
+    mean, std = (torch.tensor(x, dtype=torch.float64)[:, None, None] for x in (IMAGENET_MEAN, IMAGENET_STD))
+    colours = [torch.from_numpy(np.stack([a] * 3))[None] for a in (image, reference)]
     stages = [[c, *vgg_maps((c - mean) / std, weights, hanning_pooled)] for c in colours]
+    channels = [
+        (a, b) for stage in zip(*stages, strict=True) for a, b in zip(*(x.numpy()[0] for x in stage), strict=True)
+    ]
     similar = 0.0
-    channels = ((a, b) for stage in zip(*stages, strict=True) for a, b in zip(*stage, strict=True))
     for channel, (a, b) in enumerate(channels):
         means = (2 * a.mean() * b.mean() + 1e-6) / (a.mean() ** 2 + b.mean() ** 2 + 1e-6)
         covariance = np.mean((a - a.mean()) * (b - b.mean()))
@@ -183,6 +164,7 @@ def test_identical_images_are_0_with_no_gradient(metric: Lpips | Dists) -> None:
     image = reference.clone().requires_grad_()
     value = metric(image, reference)
     value.sum().backward()
+    assert not any(parameter.grad is not None for parameter in metric.parameters())
     assert value.tolist() == [0.0]
     assert image.grad is not None
     assert not image.grad.any()
@@ -209,28 +191,23 @@ def test_the_gradient_is_that_of_the_value(folder: Path) -> None:
         assert float((at.grad * step).sum()) == pytest.approx(change, rel=1e-3)
 
 
-def naive_unit(features: Tensor) -> Tensor:
-    return features / (features.square().sum(1, keepdim=True).sqrt() + 1e-10)
-
-
 def gradient_at(features: Tensor, unit: Callable[[Tensor], Tensor]) -> Tensor:
     at = features.clone().requires_grad_()
-    (unit(at) - 0.5).square().sum().backward()  # type: ignore[no-untyped-call]
-    assert at.grad is not None
-    return at.grad
+    return torch.autograd.grad((unit(at) - 0.5).square().sum(), at)[0]
 
 
 @pytest.mark.parametrize("size", [0.0, 1e-30, 1e-12, 1e-6, 1e-3, 1.0])
 def test_features_of_any_size_have_a_bounded_gradient(size: float) -> None:
-    gradient = gradient_at(torch.full((1, 4, 2, 2), size), _unit)
-    assert float(gradient.abs().max()) <= 2 / MIN_NORM
+    assert float(gradient_at(torch.full((1, 4, 2, 2), size), _unit).abs().max()) <= 2 / MIN_NORM
 
 
 def test_the_packages_own_arithmetic_fails_on_features_that_are_all_zero() -> None:
-    assert gradient_at(torch.zeros(1, 4, 2, 2), naive_unit).isnan().all()
+    def naive(features: Tensor) -> Tensor:
+        return features / (features.square().sum(1, keepdim=True).sqrt() + 1e-10)
+
+    assert gradient_at(torch.zeros(1, 4, 2, 2), naive).isnan().all()
     features = torch.from_numpy(np.random.default_rng(0).standard_normal((2, 8, 5, 5)))
-    assert torch.allclose(_unit(features), naive_unit(features), rtol=1e-8)
-    assert torch.allclose(gradient_at(features, _unit), gradient_at(features, naive_unit), rtol=1e-8)
+    assert torch.allclose(_unit(features), naive(features), rtol=1e-8)
 
 
 def test_dead_features_keep_the_gradient_finite(metric: Lpips | Dists) -> None:
@@ -253,11 +230,6 @@ def test_autocast_does_not_reach_inside(folder: Path) -> None:
     assert metric(image.bfloat16(), reference.bfloat16()).dtype == torch.float32
 
 
-def test_parameters_are_frozen(metric: Lpips | Dists) -> None:
-    assert not metric.training
-    assert not any(parameter.requires_grad for parameter in metric.parameters())
-
-
 @pytest.mark.parametrize(("network", "smallest"), [("squeeze", 17), ("alex", 31), ("vgg", 16), ("dists", 16)])
 def test_the_smallest_image(network: str, smallest: int, folder: Path) -> None:
     metric = load(network, folder)
@@ -271,12 +243,6 @@ def test_images_of_different_shapes_are_refused(metric: Lpips | Dists) -> None:
     for wrong in (image[0], image[..., 1:], image.expand(-1, 3, -1, -1)):
         with pytest.raises(ImageError, match="of one shape"):
             metric(wrong, wrong if wrong.shape == image[0].shape or wrong.shape[1] == 3 else reference)
-
-
-def test_labels_name_the_network(folder: Path) -> None:
-    assert [load(name, folder).label for name in (*STEMS, "dists")] == [
-        *("LPIPS-squeeze", "LPIPS-alex", "LPIPS-vgg", "DISTS")
-    ]
 
 
 @pytest.mark.parametrize(
@@ -368,11 +334,9 @@ def test_a_broken_file_is_refused(tmp_path: Path, suffix: str, content: bytes) -
         Lpips.load("squeeze", path)
 
 
-def test_a_missing_file_and_an_unknown_network_are_refused(tmp_path: Path) -> None:
+def test_a_missing_file_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ModelError, match="no such file"):
         Lpips.load("squeeze", tmp_path / "none.npz")
-    with pytest.raises(OptionError, match="squeeze, alex, vgg"):
-        Lpips.load("resnet", tmp_path / "none.npz")
 
 
 def test_where_a_backbone_is_looked_for(tmp_path: Path, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -413,10 +377,3 @@ def test_known_values_on_a_photograph(squeeze: Lpips) -> None:
     for sigma_px, published in ((0.5, 0.020), (1, 0.132), (2, 0.293), (4, 0.425)):
         blurred = gaussian(reference, sigma_px, mode="reflect")
         assert float(squeeze(as_batch(blurred), as_batch(reference))) == pytest.approx(published, abs=5.1e-4)
-
-
-@pytest.mark.parametrize("seed", range(3))
-def test_more_noise_is_further_away(squeeze: Lpips, seed: int) -> None:
-    values = [float(squeeze(*pair(96, 96, sigma, seed))) for sigma in (0, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2)]
-    assert values[0] == 0
-    assert values == sorted(values)

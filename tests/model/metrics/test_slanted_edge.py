@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from model.metrics.refusal import Refusal
-from model.metrics.slanted_edge import FREQUENCIES, EdgeMtf, edge_mtf, slanted_edge
+from model.metrics.slanted_edge import edge_mtf, slanted_edge
 from model.simulator.detector import Draw, detect
 from model.simulator.mtf import mtf, sensor_transfer, transfer_function
 from model.simulator.sampling import sample, scene_spectrum
@@ -34,15 +34,14 @@ def noisy(mtf_nyquist: float, angle_deg: float, seed: int) -> np.ndarray:
 
 def measured(image: np.ndarray, angle_deg: float = ANGLE_DEG) -> float:
     result = edge_mtf(image, angle_deg, saturated=4095)
-    assert isinstance(result, EdgeMtf), result
-    return result.mtf_nyquist
+    assert isinstance(result, float), result
+    return result
 
 
 def refused(image: np.ndarray, saturated: float = math.inf) -> str:
     result = edge_mtf(image, ANGLE_DEG, saturated)
     assert isinstance(result, Refusal)
-    assert result.reason
-    return result.status
+    return result.reason
 
 
 def gaussian_edge(angle_deg: float, sigma_px: float, shape: tuple[int, int] = (80, 80)) -> np.ndarray:
@@ -57,12 +56,9 @@ def gaussian_edge(angle_deg: float, sigma_px: float, shape: tuple[int, int] = (8
 @pytest.mark.parametrize("angle_deg", ANGLES)
 @pytest.mark.parametrize("mtf_nyquist", MTFS)
 def test_a_clean_edge_gives_the_simulated_mtf(mtf_nyquist: float, angle_deg: float) -> None:
-    result = edge_mtf(clean(mtf_nyquist, angle_deg).numpy(), angle_deg)
-    assert isinstance(result, EdgeMtf)
-    assert result.mtf_nyquist == pytest.approx(mtf_nyquist, abs=0.002)
-    angle, f = math.radians(angle_deg), torch.from_numpy(FREQUENCIES)
-    expected = mtf(f * math.cos(angle), f * math.sin(angle), mtf_nyquist)
-    np.testing.assert_allclose(result.mtf, expected, atol=0.006)
+    angle = math.radians(angle_deg)
+    expected = float(mtf(0.5 * math.cos(angle), 0.5 * math.sin(angle), mtf_nyquist))
+    assert measured(clean(mtf_nyquist, angle_deg).numpy(), angle_deg) == pytest.approx(expected, abs=0.002)
 
 
 @pytest.mark.parametrize("angle_deg", [2.0, 15.0])
@@ -114,15 +110,15 @@ def test_the_unit_does_not_matter() -> None:
 def test_what_cannot_be_measured_is_refused() -> None:
     edge = gaussian_edge(ANGLE_DEG, 0.6)
     generator = np.random.default_rng(0)
-    assert refused(edge + 170 * generator.standard_normal(edge.shape)) == "contrast"
-    assert refused(np.full((80, 80), 700.0)) == "no-convergence"
-    assert refused(edge[:, ::-1]) == "no-convergence"
-    assert refused(np.roll(edge, 8, axis=1)) == "no-convergence"
-    assert refused(edge, saturated=1990) == "clipped"
-    assert refused(np.maximum(edge - 410, 0.0)) == "clipped"
+    assert "10 times are needed" in refused(edge + 170 * generator.standard_normal(edge.shape))
+    assert "does not rise" in refused(np.full((80, 80), 700.0))
+    assert "does not rise" in refused(edge[:, ::-1])
+    assert "off its place" in refused(np.roll(edge, 8, axis=1))
+    assert "are clipped" in refused(edge, saturated=1990)
+    assert "are clipped" in refused(np.maximum(edge - 410, 0.0))
     for bad in (math.nan, math.inf):
         edge[3, 4] = bad
-        assert refused(edge) == "not-finite"
+        assert "not finite" in refused(edge)
 
 
 def test_the_target_has_its_two_radiances_and_its_edge_in_the_middle() -> None:

@@ -106,15 +106,6 @@ def yolo(folder: Path) -> Path:
     return folder
 
 
-def dota(folder: Path) -> Path:
-    """DOTA's folders; of each box the four corners, clockwise."""
-    for stem, objects in OBJECTS.items():
-        image(folder / "images" / f"{stem}.png")
-        lines = [f"{x1} {y1} {x2} {y1} {x2} {y2} {x1} {y2} {name} 0" for name, x1, y1, x2, y2 in objects]
-        text(folder / "labelTxt" / f"{stem}.txt", "imagesource:GoogleEarth\ngsd:0.15\n" + "\n".join(lines) + "\n")
-    return folder
-
-
 def labelled(folder: Path, count: int) -> Path:
     """Drawn scenes as pictures in sRGB with VOC labels beside them."""
     full_scale = load_sensor("pleiades-reference").nominal()

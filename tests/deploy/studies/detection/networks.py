@@ -3,10 +3,20 @@
 from pathlib import Path
 
 import numpy as np
-import onnx
-from onnx import TensorProto, helper, numpy_helper
+import onnx.parser
+from onnx import helper, numpy_helper
 
 NAMES = {0: "Storage Tank", 1: "ship"}
+SUPPRESSION = """
+        score = Add(scores, nothing)
+        kept = Greater(score, cut)
+        left = Where(kept, score, none)
+        indices = NonMaxSuppression(boxes, left, most)
+        index = Cast<to=1>(indices)
+        total = ReduceSum<keepdims=0>(index)
+        nil = Mul(total, none)
+        suppressed = Add(sum, nil)
+"""
 
 
 def detector(
@@ -31,38 +41,23 @@ def detector(
         about: metadata; None leaves one out.
     """
     given = {"names": NAMES, "task": "detect", "stride": 32, "imgsz": [64, 64], **about}
+    sizes, names = ",".join(map(str, answer.shape)), [f"output{i}" for i in range(outputs)]
+    last = "sum" if cut is None else "suppressed"
+    results = "".join(f"{name} = Identity({last})\n" for name in names)
+    model = onnx.parser.parse_model(f"""<ir_version: 8, opset_import: ["": 17]>
+        detector (float[1,{channels},{size_px},{size_px}] images)
+            => ({", ".join(f"float[{sizes}] {name}" for name in names)}) {{
+        mean = GlobalAveragePool(images)
+        level = ReduceMean<keepdims=0>(mean)
+        nothing = Mul(level, none)
+        sum = Add(answer, nothing)
+        {"" if cut is None else SUPPRESSION}
+        {results} }}""")
     constants = {"answer": answer.astype(np.float32), "none": np.zeros(1, np.float32)}
-    nodes = [
-        helper.make_node("GlobalAveragePool", ["images"], ["mean"]),
-        helper.make_node("ReduceMean", ["mean"], ["level"], keepdims=0),
-        helper.make_node("Mul", ["level", "none"], ["nothing"]),
-        helper.make_node("Add", ["answer", "nothing"], ["sum"]),
-    ]
-    last = "sum"
     if cut is not None:
-        boxes, scores = np.array([[[0, 0, 1, 1]]], np.float32), np.array([[[0.5]]], np.float32)
-        constants |= {"boxes": boxes, "scores": scores, "cut": np.array(cut, np.float32), "most": np.array([1])}
-        nodes += [
-            helper.make_node("Add", ["scores", "nothing"], ["score"]),
-            helper.make_node("Greater", ["score", "cut"], ["kept"]),
-            helper.make_node("Where", ["kept", "score", "none"], ["left"]),
-            helper.make_node("NonMaxSuppression", ["boxes", "left", "most"], ["indices"]),
-            helper.make_node("Cast", ["indices"], ["index"], to=TensorProto.FLOAT),
-            helper.make_node("ReduceSum", ["index"], ["total"], keepdims=0),
-            helper.make_node("Mul", ["total", "none"], ["nil"]),
-            helper.make_node("Add", ["sum", "nil"], ["suppressed"]),
-        ]
-        last = "suppressed"
-    names = [f"output{i}" for i in range(outputs)]
-    nodes += [helper.make_node("Identity", [last], [name]) for name in names]
-    graph = helper.make_graph(
-        nodes,
-        "detector",
-        [helper.make_tensor_value_info("images", TensorProto.FLOAT, [1, channels, size_px, size_px])],
-        [helper.make_tensor_value_info(name, TensorProto.FLOAT, list(answer.shape)) for name in names],
-        [numpy_helper.from_array(value, name) for name, value in constants.items()],
-    )
-    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
+        constants |= {"boxes": np.array([[[0, 0, 1, 1]]], np.float32), "scores": np.array([[[0.5]]], np.float32)}
+        constants |= {"cut": np.array(cut, np.float32), "most": np.array([1])}
+    model.graph.initializer.extend(numpy_helper.from_array(value, name) for name, value in constants.items())
     helper.set_model_props(model, {key: str(value) for key, value in given.items() if value is not None})
     onnx.save_model(model, path)
     return path

@@ -140,13 +140,13 @@ def test_perfect_boxes_score_one_and_none_score_nothing() -> None:
     pairs = drawn(np.random.default_rng(3), 20, ignored=0.0)
     perfect = scored([(truth, truth) for truth, _ in pairs], NAMES, 0.5)
     assert {value for name, value in perfect.items() if name != "own confidence"} == {1.0}
-    nothing = scored([(truth, Boxes.none()) for truth, _ in pairs], NAMES, 0.5)
+    nothing = scored([(truth, Boxes.of([], [])) for truth, _ in pairs], NAMES, 0.5)
     assert {name: value for name, value in nothing.items() if value} == {"precision": 1.0, "own precision": 1.0}
 
 
 def test_what_is_found_on_an_unlabelled_image_is_false() -> None:
-    labelled, empty = (Boxes.of(ONE, [0]), Boxes.of(ONE, [0], [0.5])), (Boxes.none(), Boxes.of(ONE, [0], [0.9]))
-    assert scored([labelled])["mAP50-95"] == scored([labelled, (empty[0], Boxes.none())])["mAP50-95"] == 1.0
+    labelled, empty = (Boxes.of(ONE, [0]), Boxes.of(ONE, [0], [0.5])), (Boxes.of([], []), Boxes.of(ONE, [0], [0.9]))
+    assert scored([labelled])["mAP50-95"] == scored([labelled, (empty[0], Boxes.of([], []))])["mAP50-95"] == 1.0
     assert scored([labelled, empty])["mAP50"] == 0.5
     assert np.isnan(scored([empty])["mAP50"])
 
@@ -211,7 +211,7 @@ def test_pairing_tells_what_two_intervals_do_not() -> None:
 
 
 def test_a_class_that_no_site_of_a_draw_holds_drops_out() -> None:
-    pairs = [(Boxes.of(ONE, [0]), Boxes.of(ONE, [0]))] * 3 + [(Boxes.of(ONE, [1]), Boxes.none())] * 2
+    pairs = [(Boxes.of(ONE, [0]), Boxes.of(ONE, [0]))] * 3 + [(Boxes.of(ONE, [1]), Boxes.of([], []))] * 2
     figures = score(hits_of(pairs, 2), ("ship", "tank"), site_weights(list("abcde"), 0, 400))
     assert set(figures["mAP50"]) == {0.0, 0.5, 1.0}
     assert 0 < np.isnan(figures["mAP50 of tank"]).sum() < 400

@@ -47,7 +47,7 @@ def test_suppression_leaves_the_best_of_each_cluster(seed: int, overlap: float) 
 def test_suppression_keeps_the_best_and_no_more_than_asked() -> None:
     apart = Boxes.of([[10.0 * i, 0, 10.0 * i + 5, 5] for i in range(20)], [0] * 20, np.linspace(0.1, 0.9, 20))
     assert suppress(apart, most=3).scores.tolist() == apart.scores[::-1][:3].tolist()
-    assert len(suppress(Boxes.none())) == 0
+    assert len(suppress(Boxes.of([], []))) == 0
 
 
 @settings(max_examples=80)

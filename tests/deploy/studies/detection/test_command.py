@@ -48,7 +48,7 @@ def test_synthetic_scenes_and_the_same_as_pictures_score_alike(tmp_path: Path) -
     assert list(tables[PAPER_TABLE]) == [row.name for row in paper_rows()]
     assert {"mAP50 by class, dior-medium", "mAP50 by size, dior-medium"} <= set(tables)
     page = (tmp_path / "a" / "report.html").read_text()
-    assert "no interval over sites is shown: of 2" in page
+    assert "No interval over sites is shown: of 2" in page
     assert page.count("data:image/png") == 2
 
 

@@ -11,7 +11,7 @@ from deploy.studies.detection.boxes import Boxes, iou
 from deploy.studies.detection.detector import Detector
 from deploy.studies.detection.page import crops, curves, objects_found
 from deploy.studies.detection.study import REFERENCE, AcquiredScene, Comparison, LabelledScene, SensorPair, acquired
-from deploy.studies.detection.tables import GAIN, LOSS, NO_LOSS, REGAINED, detection_rows, headline, main_table
+from deploy.studies.detection.tables import GAIN, LOSS, NO_LOSS, REGAINED, detection_rows, headline
 from deploy.studies.evaluation.methods import Method
 from model.simulator.detector import Draw
 from profiles import load_sensor
@@ -67,7 +67,8 @@ def handmade(sites: int = 12, **found: int) -> Comparison:
     scenes, pair = [scene((30, 30, 90, 80), name=str(number)) for number in range(sites)], sensors("dior-high")
     truths = [each.truth for each in scenes]
     boxes = {
-        row: [truth if k < count else Boxes.none() for k, truth in enumerate(truths)] for row, count in found.items()
+        row: [truth if k < count else Boxes.of([], []) for k, truth in enumerate(truths)]
+        for row, count in found.items()
     }
     hits = {row: find_hits(truths, each, len(NAMES)) for row, each in boxes.items()}
     figures, confidence = score_rows(hits, NAMES, site_weights([each.site for each in scenes], 0, 200))
@@ -75,7 +76,7 @@ def handmade(sites: int = 12, **found: int) -> Comparison:
     return Comparison(pair, methods, list(acquired(scenes, pair, 0)), boxes, hits, figures, confidence, NAMES)
 
 
-def rows_of(found: Comparison, table: str = main_table("dior-high")) -> dict[str, Row]:
+def rows_of(found: Comparison, table: str = "detection, dior-high") -> dict[str, Row]:
     return {row.name: row for row in detection_rows(found) if row.table == table}
 
 

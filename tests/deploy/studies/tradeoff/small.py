@@ -19,7 +19,7 @@ def small_studies() -> Iterator[None]:
             (measure, "PATCH_PX", 32),
             (run, "QUALITIES", ("fast",)),
             (run, "PEERS", ()),
-            (run, "host_times", _steady),
+            (measure, "host_times", _steady),
         ):
             patch.setattr(module, name, value)
         yield

@@ -15,7 +15,6 @@ from deploy.studies.tradeoff.pareto import (
     Measured,
     cost_ratio,
     front_rows,
-    pair_width,
     pareto_front,
 )
 from profiles.constant import Constant
@@ -49,14 +48,6 @@ def test_what_lacks_a_figure_or_was_published_is_not_on_the_front() -> None:
     lacking = Measured("float", {COST: unavailable("s", "no board"), "PSNR": measured(99, "dB", "")}, {})
     found = pareto_front([printed, lacking, at(1, 2, 3)], COST)
     assert [point.name for point in found] == ["1"]
-
-
-def test_less_of_a_distance_is_better() -> None:
-    points = [
-        Measured(name, {COST: measured(cost, "s", ""), "LPIPS-squeeze": measured(value, "distance", "")}, {})
-        for name, cost, value in (("near", 2, 0.1), ("far", 1, 0.2), ("beaten", 3, 0.15))
-    ]
-    assert [point.name for point in pareto_front(points, COST, "LPIPS-squeeze")] == ["far", "near"]
 
 
 def test_differences_are_paired_and_reach_less_far_than_the_sites_differ() -> None:
@@ -102,7 +93,6 @@ def test_a_ratio_of_latencies_on_a_board_has_the_width_of_pairs() -> None:
     found = cost_ratio(other, one, COST)
     assert found.value == pytest.approx(3)
     assert found.interval == pytest.approx((3 / math.exp(0.2), 3 * math.exp(0.2)))
-    assert pair_width(target) == 0.2
 
 
 def test_tiles_of_one_network_differ_by_their_count_alone() -> None:

@@ -18,10 +18,8 @@ from deploy.cli import app
 from deploy.restoration.function import Restore
 from deploy.results import SCHEMA_PATH
 from deploy.studies.evaluation.methods import Method, method_named
-from deploy.studies.evaluation.pairs import NamedPair
-from deploy.studies.evaluation.run import load_pairs
+from deploy.studies.evaluation.pairs import NamedPair, pairs_of_scenes
 from deploy.studies.evaluation.scores import Instruments
-from deploy.studies.tradeoff import run
 from deploy.studies.tradeoff.advice import parse_constraints
 from deploy.studies.tradeoff.labelled import Labelled
 from deploy.studies.tradeoff.measure import SEAM_ERROR, Benchmark, Measurements, make_int8
@@ -101,9 +99,9 @@ def test_the_scores_are_those_of_the_method_that_evaluate_takes(folder: Path, st
     degraded = load_sensor(SENSOR)
     reference = reference_for(degraded)
     restore = method_named(str(folder / "narrow.safetensors"), degraded, reference).restore
-    pairs, _ = load_pairs(folder / "images", None, degraded, reference, 0)
+    pairs, _ = pairs_of_scenes(folder / "images", degraded, reference, 0)
     instruments = Instruments({})
-    expected = [instruments.score(restore(p.degraded), p.reference, p.degraded)["PSNR"] for p in pairs]
+    expected = [instruments.score(restore(pair.degraded), pair)["PSNR"] for pair in pairs]
     found = next(point for point in study[0].points if point.name == "narrow float32")
     assert [image["PSNR"] for image in found.images] == expected
 
@@ -113,7 +111,7 @@ def test_two_sites_give_no_interval_and_it_is_said(study: tuple[Study, Path]) ->
     assert all(point.figures["PSNR"].interval is None for point in found.points)
     assert {row.text["gain over the next cheaper"] for row in found.front_rows} <= {"cheapest", TOO_FEW}
     notes = " ".join(found.notes)
-    assert "Of 2 sites, fewer than 5, no interval is shown" in notes
+    assert "No interval over sites is shown: of 2, fewer than 5" in notes
     assert "Scene pixels per pixel: 2 (2 of 2 images), where pleiades-degraded states 5" in notes
 
 
@@ -198,7 +196,7 @@ def test_labelled_pictures_add_map50_beside_exact_halos(
     folder: Path, study: tuple[Study, Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     class Made:
-        digest, notes = "d", ("labels",)
+        digest, notes, scenes = "d", ("labels",), ()
 
         def measure(self, _: object) -> dict[str, object]:
             return {"value": 0.5, "interval": None}
@@ -206,7 +204,7 @@ def test_labelled_pictures_add_map50_beside_exact_halos(
         def figure(self, stored: dict[str, float]) -> object:
             return measured(100 * stored["value"], "%", "made up")
 
-    monkeypatch.setattr(run, "_labelled", lambda *_: Made())
+    monkeypatch.setattr(Labelled, "open", lambda *_: Made())
     found = studied(folder, study[1], labelled=folder, need=parse_constraints("--need", "map50>=40"))
     values = {point.text["halo"]: point.figures["mAP50"] for point in found.points if "INT8" in point.name}
     assert values["exact"].value == 50
