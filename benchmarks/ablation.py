@@ -14,14 +14,14 @@ from unittest.mock import patch
 
 import numpy as np
 
-from deploy.export import float_model
-from deploy.networks import float_file
-from profiles import load_sensor
-from quant.calibration import PATCH_PX, Calibration
-from quant.gate import compare
-from quant.passes.equalise import first_guess
-from quant.quantise import quantise_model
-from quant.session import open_any_size
+from beers_deploy.export import float_model
+from beers_deploy.networks import float_file
+from beers_deploy.profiles import load_sensor
+from beers_deploy.quant.calibration import PATCH_PX, Calibration
+from beers_deploy.quant.gate import compare
+from beers_deploy.quant.passes.equalise import first_guess
+from beers_deploy.quant.quantise import quantise_model
+from beers_deploy.quant.session import open_any_size
 
 ALL, PAIR = "all passes", "without half-LSB pair"
 
@@ -30,12 +30,15 @@ def ablations() -> Iterator[tuple[str, AbstractContextManager[object]]]:
     """Each ablation, and what leaves the pass out while it is entered."""
     yield ALL, nullcontext()
     yield PAIR, nullcontext()  # an argument of quantise_model
-    yield "without dual-range output", patch("quant.quantise.takes_gains", lambda _graph: False)
-    yield "without fitted weights", patch("quant.quantise.fit_weights", lambda _graph, core, *_: core)
-    yield "without least-squares scales", patch("quant.calibration._errors", lambda *_: np.zeros(1))
+    yield "without dual-range output", patch("beers_deploy.quant.quantise.takes_gains", lambda _graph: False)
+    yield "without fitted weights", patch("beers_deploy.quant.quantise.fit_weights", lambda _graph, core, *_: core)
+    yield "without least-squares scales", patch("beers_deploy.quant.calibration._errors", lambda *_: np.zeros(1))
     yield (
         "without equalising",  # one factor for all channels, with which the largest range fits
-        patch("quant.quantise.search", lambda _graph, _stream, ranges, _trial: first_guess(ranges, 0.0, 1.0)),
+        patch(
+            "beers_deploy.quant.quantise.search",
+            lambda _graph, _stream, ranges, _trial: first_guess(ranges, 0.0, 1.0),
+        ),
     )
 
 

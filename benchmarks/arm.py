@@ -19,7 +19,7 @@ from pathlib import Path
 
 import numpy as np
 
-from deploy.networks import shipped_pair
+from beers_deploy.networks import shipped_pair
 
 PROJECT = Path(__file__).resolve().parents[1]
 PROCESSORS = ("cortex-a72", "neoverse-n1", "max")
@@ -73,7 +73,7 @@ def on_arm(root: Path, processor: str, *arguments: str) -> None:
 
 def restored(networks: list[Path], out: Path) -> None:
     """Write what `restore` makes of one image with each network, float32 of full scale 4095, by its file's name."""
-    from deploy.library import restore
+    from beers_deploy.library import restore
 
     generator = np.random.default_rng(4)
     y, x = np.mgrid[:83, :131]

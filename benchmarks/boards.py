@@ -11,15 +11,15 @@ from pathlib import Path
 
 import onnx
 
-from deploy.dpu.board import dpu_of
-from deploy.dpu.checker.placement import place
-from deploy.dpu.reading import network_of
-from deploy.networks import Conditioned, family_model
-from model.shipped import INT8, SHIPPED, shipped_names, shipped_weights
-from profiles import load_target
-from profiles.target import board_names
-from quant.core import target_shifts
-from quant.onnx_file import load_onnx
+from beers_deploy.dpu.board import dpu_of
+from beers_deploy.dpu.checker.placement import place
+from beers_deploy.dpu.reading import network_of
+from beers_deploy.model.shipped import INT8, SHIPPED, shipped_names, shipped_weights
+from beers_deploy.networks import Conditioned, family_model
+from beers_deploy.profiles import load_target
+from beers_deploy.profiles.target import board_names
+from beers_deploy.quant.core import target_shifts
+from beers_deploy.quant.onnx_file import load_onnx
 
 
 def files(images: Path | None, variants: list[str]) -> None:

@@ -20,8 +20,19 @@ import tifffile
 import torch
 from torch import Tensor
 
-from deploy.export import torch_network
-from deploy.studies.characterise import (
+from beers_deploy.export import torch_network
+from beers_deploy.model.family import LEAST_ALONG, SensorFamily
+from beers_deploy.model.io.images import list_images
+from beers_deploy.model.metrics.edge_blur import AxisMtf
+from beers_deploy.model.metrics.fidelity import fidelity_db
+from beers_deploy.model.metrics.slanted_edge import slanted_edge
+from beers_deploy.model.simulator.acquire import acquire, fitting_oversampling
+from beers_deploy.model.simulator.detector import Draw, to_uint16
+from beers_deploy.model.simulator.sampling import Scene, crop_divisible, read_scene, scene_spectrum
+from beers_deploy.profiles import load_sensor
+from beers_deploy.profiles.errors import ImageError
+from beers_deploy.profiles.sensor import Sensor
+from beers_deploy.studies.characterise import (
     AXES,
     Box,
     Characterised,
@@ -31,18 +42,7 @@ from deploy.studies.characterise import (
     profile_toml,
     snr_at,
 )
-from deploy.studies.evaluation.pairs import simulate_pairs
-from model.family import LEAST_ALONG, SensorFamily
-from model.io.images import list_images
-from model.metrics.edge_blur import AxisMtf
-from model.metrics.fidelity import fidelity_db
-from model.metrics.slanted_edge import slanted_edge
-from model.simulator.acquire import acquire, fitting_oversampling
-from model.simulator.detector import Draw, to_uint16
-from model.simulator.sampling import Scene, crop_divisible, read_scene, scene_spectrum
-from profiles import load_sensor
-from profiles.errors import ImageError
-from profiles.sensor import Sensor
+from beers_deploy.studies.evaluation.pairs import simulate_pairs
 
 LIKE, REFERENCE = (load_sensor(name).nominal() for name in ("pleiades-degraded", "pleiades-reference"))
 MTF_RANGE = (0.02, 0.12)

@@ -29,24 +29,24 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 from torch.nn.functional import pixel_shuffle, pixel_unshuffle
 
-from deploy.bench.tables import PAPER_SIZE, Swath, parse_size, swath_latency
-from deploy.dpu.board import load_dpu
-from deploy.dpu.checker.placement import place
-from deploy.dpu.cost.latency import predict
-from deploy.dpu.reading import network_of
-from model.convbeers import ResidualBlock
-from model.io.images import list_images, site_of
-from model.metrics.fidelity import psnr_db
-from model.processor import processor_name
-from model.progress import steps
-from model.simulator.sampling import read_scene
-from model.training.losses import LossWeights, RestorationLoss
-from model.training.patches import PatchRecipe, PatchSource
-from profiles import load_sensor
-from quant.calibration import Calibration, Patches, draw_patches
-from quant.quantise import quantise_model
-from quant.session import open_any_size
-from quant.tiling.walk import tiling_of
+from beers_deploy.bench.tables import PAPER_SIZE, Swath, parse_size, swath_latency
+from beers_deploy.dpu.board import load_dpu
+from beers_deploy.dpu.checker.placement import place
+from beers_deploy.dpu.cost.latency import predict
+from beers_deploy.dpu.reading import network_of
+from beers_deploy.model.convbeers import ResidualBlock
+from beers_deploy.model.io.images import list_images, site_of
+from beers_deploy.model.metrics.fidelity import psnr_db
+from beers_deploy.model.processor import processor_name
+from beers_deploy.model.progress import steps
+from beers_deploy.model.simulator.sampling import read_scene
+from beers_deploy.model.training.losses import LossWeights, RestorationLoss
+from beers_deploy.model.training.patches import PatchRecipe, PatchSource
+from beers_deploy.profiles import load_sensor
+from beers_deploy.quant.calibration import Calibration, Patches, draw_patches
+from beers_deploy.quant.quantise import quantise_model
+from beers_deploy.quant.session import open_any_size
+from beers_deploy.quant.tiling.walk import tiling_of
 
 FAMILIES = "4x64@2,8x48@2,2x32@2,u48@2,u64@2,d8x64@2,d8x96@2,k2x32@2,k3x48@2,u32,8x32"
 NAME = re.compile(r"(?P<kind>[udk]?)(?:(?P<blocks>\d+)x)?(?P<features>\d+)(?:@(?P<scale>\d+))?")

@@ -26,13 +26,13 @@ from rasterio.shutil import copy
 from rasterio.transform import from_origin
 from rasterio.windows import Window
 
-from deploy.bench.tables import parse_size
-from deploy.restoration.source import open_source
+from beers_deploy.bench.tables import parse_size
+from beers_deploy.restoration.source import open_source
 
 BLOCK_PX, STRIP_PX, TIFF = 1024, 640, "TIFF"
 COUNTED = """
 import resource, sys
-from deploy.cli import app
+from beers_deploy.cli import app
 try:
     app()
 finally:

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import onnx
 
-from quant.graph import PLANES, PLANES_FRAC_BITS
+from beers_deploy.quant.graph import PLANES, PLANES_FRAC_BITS
 
 STRIDE = 16
 """Patches that onnxruntime's calibration looks at together; with 64 at once the network of 16 x 64 takes 20 GB."""
@@ -35,9 +35,9 @@ def main() -> None:
 
 def ours(way: str, network: Path, images: np.ndarray, out: Path) -> None:
     """The host file of `quantize`, of these images (K, 1, H, W) in [0, 1]."""
-    from quant.calibration import Patches, Remade
-    from quant.free import quantise_free
-    from quant.quantise import quantise_model
+    from beers_deploy.quant.calibration import Patches, Remade
+    from beers_deploy.quant.free import quantise_free
+    from beers_deploy.quant.quantise import quantise_model
 
     def image(number: int) -> np.ndarray:
         return images[number : number + 1]

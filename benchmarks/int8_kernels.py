@@ -17,11 +17,11 @@ import numpy as np
 import onnx
 import onnxruntime as ort
 
-from deploy.networks import shipped_pair
-from model.processor import decided, int8_adds_exactly, processor_name
-from quant.kernels import filled, made_exact
-from quant.onnx_file import load_onnx
-from quant.session import open_session, run
+from beers_deploy.model.processor import decided, int8_adds_exactly, processor_name
+from beers_deploy.networks import shipped_pair
+from beers_deploy.quant.kernels import filled, made_exact
+from beers_deploy.quant.onnx_file import load_onnx
+from beers_deploy.quant.session import open_session, run
 
 VARIANTS = ("convbeers-xs", "convbeers-s", "convbeers")
 

@@ -30,17 +30,17 @@ from pathlib import Path
 import numpy as np
 import onnx
 
-from deploy.export import float_model as read_float
-from model.metrics.fidelity import psnr_db, ssim
-from model.shipped import shipped_weights
-from model.simulator.procedural import load_scenes
-from profiles import load_sensor
-from profiles.sensor_file import reference_for
-from quant.calibration import HELD_OUT_SEED, Pair, draw_patches
-from quant.ends import Ends, ends_of
-from quant.graph import CORRECTION, PLANES, graph_to_onnx, read_network, read_planes
-from quant.samples import samples_of
-from quant.session import open_session, planes_of, result_of
+from beers_deploy.export import float_model as read_float
+from beers_deploy.model.metrics.fidelity import psnr_db, ssim
+from beers_deploy.model.shipped import shipped_weights
+from beers_deploy.model.simulator.procedural import load_scenes
+from beers_deploy.profiles import load_sensor
+from beers_deploy.profiles.sensor_file import reference_for
+from beers_deploy.quant.calibration import HELD_OUT_SEED, Pair, draw_patches
+from beers_deploy.quant.ends import Ends, ends_of
+from beers_deploy.quant.graph import CORRECTION, PLANES, graph_to_onnx, read_network, read_planes
+from beers_deploy.quant.samples import samples_of
+from beers_deploy.quant.session import open_session, planes_of, result_of
 
 HERE = Path(__file__).parent
 QUARK = HERE / "quark_child.py"

@@ -16,10 +16,10 @@ import skimage.color
 import skimage.data
 import torch
 
-from model.metrics.fidelity import psnr_db
-from model.traditional.nl_bayes import nl_bayes
-from model.traditional.noise import Noise
-from model.traditional.settings import QUALITIES
+from beers_deploy.model.metrics.fidelity import psnr_db
+from beers_deploy.model.traditional.nl_bayes import nl_bayes
+from beers_deploy.model.traditional.noise import Noise
+from beers_deploy.model.traditional.settings import QUALITIES
 
 CPP = {
     ("camera", 10): (34.26, 0.95),

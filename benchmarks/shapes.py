@@ -15,17 +15,17 @@ import numpy as np
 import onnx
 import torch
 
-from deploy.bench.tables import PAPER_SIZE, Swath, parse_size, swath_latency
-from deploy.dpu.board import Dpu, load_dpu
-from deploy.dpu.checker.placement import place
-from deploy.dpu.cost.latency import predict
-from deploy.dpu.reading import network_of
-from deploy.export import to_onnx
-from model.convbeers import ConvBEERS, initialise
-from model.variants import Variant
-from quant.calibration import Patches, Remade
-from quant.quantise import quantise_model
-from quant.tiling.walk import tiling_of
+from beers_deploy.bench.tables import PAPER_SIZE, Swath, parse_size, swath_latency
+from beers_deploy.dpu.board import Dpu, load_dpu
+from beers_deploy.dpu.checker.placement import place
+from beers_deploy.dpu.cost.latency import predict
+from beers_deploy.dpu.reading import network_of
+from beers_deploy.export import to_onnx
+from beers_deploy.model.convbeers import ConvBEERS, initialise
+from beers_deploy.model.variants import Variant
+from beers_deploy.quant.calibration import Patches, Remade
+from beers_deploy.quant.quantise import quantise_model
+from beers_deploy.quant.tiling.walk import tiling_of
 
 SHAPES = "4x16,8x32,16x32,16x64,2x32@2,4x32@2,8x32@2,4x48@2,8x48@2,3x64@2,4x64@2,2x64@4,4x96@4,4x128@4"
 SHAPE = re.compile(r"(\d+)x(\d+)(?:@(\d+))?")
@@ -66,7 +66,7 @@ def int8(variant: Variant) -> onnx.ModelProto:
     initialise(network, torch.Generator().manual_seed(0))
     seen = np.random.default_rng(0).random((1, 1, SIDE_PX, SIDE_PX), dtype=np.float32)
     patches = Patches([], Remade(lambda _: (seen, seen), 1), Remade(lambda _: seen, 1))
-    with patch("quant.passes.equalise.MOST_CHANNELS", 0):  # no channel is tried by itself
+    with patch("beers_deploy.quant.passes.equalise.MOST_CHANNELS", 0):  # no channel is tried by itself
         return quantise_model(to_onnx(network.eval(), {}), patches, {}).host
 
 

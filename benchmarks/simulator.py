@@ -22,15 +22,22 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from model.simulator.acquire import prepare_scene, simulate_planned
-from model.simulator.detector import DN_EFFECTS, RADIANCE_EFFECTS, Draw, add_noise, apply_effect, digitise_dn
-from model.simulator.mtf import gaussian_response, mtf, smear_response
-from model.simulator.plan import make_plan
-from model.simulator.procedural import procedural_scene
-from profiles import load_sensor
-from profiles.effects import AntiAlias, Effect, Smear, middle_effect
-from profiles.scene_call import typical_effects
-from profiles.sensor import Sensor
+from beers_deploy.model.simulator.acquire import prepare_scene, simulate_planned
+from beers_deploy.model.simulator.detector import (
+    DN_EFFECTS,
+    RADIANCE_EFFECTS,
+    Draw,
+    add_noise,
+    apply_effect,
+    digitise_dn,
+)
+from beers_deploy.model.simulator.mtf import gaussian_response, mtf, smear_response
+from beers_deploy.model.simulator.plan import make_plan
+from beers_deploy.model.simulator.procedural import procedural_scene
+from beers_deploy.profiles import load_sensor
+from beers_deploy.profiles.effects import AntiAlias, Effect, Smear, middle_effect
+from beers_deploy.profiles.scene_call import typical_effects
+from beers_deploy.profiles.sensor import Sensor
 
 RATIO, PATCH_PX, MARGIN_PX, PROCESSES, TURNS = 5, 128, 32, 2, 5
 ROLES = ("degraded", "reference")

@@ -25,18 +25,18 @@ import onnx
 import tifffile
 import torch
 
-from deploy.bench.tables import parse_size
-from deploy.export import to_onnx
-from deploy.restoration.options import Options, Runtime
-from deploy.restoration.plan import make_plan
-from deploy.restoration.run import restore_file
-from deploy.restoration.runtime import open_runtime
-from model.convbeers import ConvBEERS, initialise
-from model.variants import VARIANTS, Variant
-from quant.tiling.walk import tiling_of
+from beers_deploy.bench.tables import parse_size
+from beers_deploy.export import to_onnx
+from beers_deploy.model.convbeers import ConvBEERS, initialise
+from beers_deploy.model.variants import VARIANTS, Variant
+from beers_deploy.quant.tiling.walk import tiling_of
+from beers_deploy.restoration.options import Options, Runtime
+from beers_deploy.restoration.plan import make_plan
+from beers_deploy.restoration.run import restore_file
+from beers_deploy.restoration.runtime import open_runtime
 
 TILE_PX = 640
-ENTRY = "from deploy.cli import app; app()"
+ENTRY = "from beers_deploy.cli import app; app()"
 
 
 def main() -> None:

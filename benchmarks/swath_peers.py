@@ -18,11 +18,11 @@ import numpy as np
 import onnx
 import tifffile
 
-from deploy.restoration.engine import restore_window
-from deploy.restoration.options import TILE_PX, Options
-from deploy.restoration.run import restore_file
-from deploy.restoration.runtime import open_runtime
-from quant.tiling.walk import tiling_of
+from beers_deploy.quant.tiling.walk import tiling_of
+from beers_deploy.restoration.engine import restore_window
+from beers_deploy.restoration.options import TILE_PX, Options
+from beers_deploy.restoration.run import restore_file
+from beers_deploy.restoration.runtime import open_runtime
 
 HERE = Path(__file__).parent
 CHILD = HERE / "monai_child.py"

@@ -21,14 +21,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from model.processor import processor_name
-from model.simulator.procedural import procedural_scene
-from model.training.checkpoint import TrainingRecipe
-from model.training.losses import LossWeights, RestorationLoss
-from model.training.patches import PatchRecipe, PatchSource
-from model.training.trainer import MixedPrecision, Precision, Trainer
-from model.variants import VARIANTS
-from profiles import load_sensor
+from beers_deploy.model.processor import processor_name
+from beers_deploy.model.simulator.procedural import procedural_scene
+from beers_deploy.model.training.checkpoint import TrainingRecipe
+from beers_deploy.model.training.losses import LossWeights, RestorationLoss
+from beers_deploy.model.training.patches import PatchRecipe, PatchSource
+from beers_deploy.model.training.trainer import MixedPrecision, Precision, Trainer
+from beers_deploy.model.variants import VARIANTS
+from beers_deploy.profiles import load_sensor
 
 BATCH, PATCH_PX, TURNS = 8, 96, 5
 LOSS = LossWeights(lpips=0.0)

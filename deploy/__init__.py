@@ -14,7 +14,7 @@ What is offered here is loaded when it is asked for.
 
 import lazy_loader
 
-import quant  # noqa: F401  # switches telemetry off before a module here loads a runtime
+import beers_deploy.quant  # noqa: F401  # switches telemetry off before a module here loads a runtime
 
 __version__ = "0.1.0"
 

@@ -8,15 +8,13 @@ Exit codes: 0 done, 1 a gate or check failed, 2 bad input (one sentence on stand
 import io
 import sys
 from collections.abc import Callable, Iterator
-from pathlib import Path
 from typing import Any
 
 import typer
 from typer.core import TyperGroup
 
-import model
-from deploy import __version__
-from deploy.commands import (
+from beers_deploy import __version__
+from beers_deploy.commands import (
     bench,
     characterise,
     check,
@@ -35,7 +33,7 @@ from deploy.commands import (
     tradeoff,
     train,
 )
-from profiles.errors import BeersError
+from beers_deploy.profiles.errors import BeersError
 
 
 class Group(TyperGroup):
@@ -81,15 +79,6 @@ def main(
 ) -> None:
     """Check the installation before any command runs."""
     _print_any_name()
-    here = Path(__file__).resolve().parents[1]
-    there = Path(str(model.__file__)).resolve().parents[1]
-    if here != there:
-        raise BeersError(
-            "installation",
-            expected=f"'model' beside 'deploy' in {here}",
-            got=f"another package of that name in {there}",
-            remedy="install beers-deploy in a virtual environment of its own",
-        )
     if version or context.invoked_subcommand is None:
         typer.echo(f"beers-deploy {__version__}" if version else context.get_help())
         for line in _installation() if version and verbose else ():
@@ -102,8 +91,8 @@ def _installation() -> Iterator[str]:
     from importlib.metadata import PackageNotFoundError
     from importlib.metadata import version as version_of
 
-    from deploy.results import host
-    from model.processor import int8_adds_exactly
+    from beers_deploy.model.processor import int8_adds_exactly
+    from beers_deploy.results import host
 
     int8_adds_exactly()
     for key, value in host().items():

@@ -9,7 +9,7 @@ from importlib import import_module
 from importlib.metadata import version
 from typing import Any, TypeVar
 
-from profiles.errors import MachineError
+from beers_deploy.profiles.errors import MachineError
 
 ANSWER_S, JOIN_S = 10, 30
 """How long a scheduler may take to answer, and a first worker to be there."""

@@ -8,10 +8,10 @@ from pathlib import Path
 
 from jsonschema import Draft202012Validator
 
-from deploy.results import SCHEMA_PATH
-from profiles.errors import OptionError
-from profiles.figures import Figure, Row
-from profiles.toml import read_json
+from beers_deploy.profiles.errors import OptionError
+from beers_deploy.profiles.figures import Figure, Row
+from beers_deploy.profiles.toml import read_json
+from beers_deploy.results import SCHEMA_PATH
 
 Place = tuple[str, str, str]
 """Table, row and name of a figure."""

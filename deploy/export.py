@@ -9,17 +9,17 @@ from typing import TYPE_CHECKING, cast
 import numpy as np
 import onnx
 
-from deploy import __version__
-from model.bank import FILTERS, LARGEST, in_places, network_bank
-from model.family import sensor_vector
-from model.io.tensors import Arrays, Weights, read_conditioned, read_plain
-from profiles.errors import ModelError, OptionError
-from profiles.sensor import Sensor, SensorProfile
-from quant.onnx_file import GraphWriter, image_info, load_onnx, make_model
-from quant.session import open_session, run
+from beers_deploy import __version__
+from beers_deploy.model.bank import FILTERS, LARGEST, in_places, network_bank
+from beers_deploy.model.family import sensor_vector
+from beers_deploy.model.io.tensors import Arrays, Weights, read_conditioned, read_plain
+from beers_deploy.profiles.errors import ModelError, OptionError
+from beers_deploy.profiles.sensor import Sensor, SensorProfile
+from beers_deploy.quant.onnx_file import GraphWriter, image_info, load_onnx, make_model
+from beers_deploy.quant.session import open_session, run
 
 if TYPE_CHECKING:
-    from model.convbeers import ConvBEERS, OfOneSensor
+    from beers_deploy.model.convbeers import ConvBEERS, OfOneSensor
 
 MAX_DIFFERENCE = 1e-5
 """Of full scale: a twentieth of a digital number, above what float32 summation order explains."""
@@ -209,7 +209,7 @@ def torch_network(path: Path, sensor: Sensor | None = None) -> "ConvBEERS | OfOn
     Raises:
         ModelError: no such weights.
     """
-    from model.convbeers import BankedConvBEERS, OfOneSensor, network_of, vector_tensor
+    from beers_deploy.model.convbeers import BankedConvBEERS, OfOneSensor, network_of, vector_tensor
 
     network = network_of(read_plain(path) if sensor is None else read_conditioned(path))
     if sensor is not None and isinstance(network, BankedConvBEERS):

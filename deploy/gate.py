@@ -16,28 +16,28 @@ from xml.etree import ElementTree as ET
 
 import onnx
 
-from deploy.dpu.board import load_dpu
-from deploy.dpu.checker.placement import place
-from deploy.dpu.checker.table import legality
-from deploy.dpu.reading import read_network
-from deploy.export import float_model
-from deploy.networks import float_file, int8_file, shipped_pair
-from deploy.restoration.options import TILE_PX
-from deploy.results import Document
-from model.progress import Log, no_log
-from model.shipped import SENSOR, VARIANT
-from profiles import load_sensor, load_target
-from profiles.errors import OptionError, printable
-from profiles.figures import Row
-from profiles.toml import read_json, unreadable
-from quant.checks import Check
-from quant.gate import GateResult, Limits, compare, judge, judge_saturation, verdict_row
-from quant.onnx_file import fixed_tile_px, load_onnx, require_quantised
-from quant.session import open_any_size
-from quant.structure import saturated_shares, structure_checks
+from beers_deploy.dpu.board import load_dpu
+from beers_deploy.dpu.checker.placement import place
+from beers_deploy.dpu.checker.table import legality
+from beers_deploy.dpu.reading import read_network
+from beers_deploy.export import float_model
+from beers_deploy.model.progress import Log, no_log
+from beers_deploy.model.shipped import SENSOR, VARIANT
+from beers_deploy.networks import float_file, int8_file, shipped_pair
+from beers_deploy.profiles import load_sensor, load_target
+from beers_deploy.profiles.errors import OptionError, printable
+from beers_deploy.profiles.figures import Row
+from beers_deploy.profiles.toml import read_json, unreadable
+from beers_deploy.quant.checks import Check
+from beers_deploy.quant.gate import GateResult, Limits, compare, judge, judge_saturation, verdict_row
+from beers_deploy.quant.onnx_file import fixed_tile_px, load_onnx, require_quantised
+from beers_deploy.quant.session import open_any_size
+from beers_deploy.quant.structure import saturated_shares, structure_checks
+from beers_deploy.restoration.options import TILE_PX
+from beers_deploy.results import Document
 
 if TYPE_CHECKING:
-    from quant.calibration import Patches
+    from beers_deploy.quant.calibration import Patches
 
 PATCHES = ("sensor", "images", "patches", "seed", "data")
 """The arguments that say what INT8 and float are compared on."""
@@ -118,8 +118,8 @@ def run_gate(request: Request) -> Outcome:
 def _unseen(request: Request, model: onnx.ModelProto) -> "tuple[Patches, bool]":
     """What the two are compared on, and whether it is simulated."""
     # These take torch, seconds; what is wrong with the options or the files has been said by now.
-    from quant.calibration import unseen_patches
-    from quant.samples import samples_of
+    from beers_deploy.quant.calibration import unseen_patches
+    from beers_deploy.quant.samples import samples_of
 
     own = samples_of(model, request.data)
     if own is None:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import psutil
 
-from profiles.figures import Figure, measured, unavailable
+from beers_deploy.profiles.figures import Figure, measured, unavailable
 
 STATUS = Path("/proc/self/status")
 """Linux's own counts of this process."""

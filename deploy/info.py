@@ -13,18 +13,18 @@ from typing import Any
 import numpy as np
 import onnx
 
-from deploy.bench.tables import predict_file, swath_latency
-from deploy.dpu.board import dpu_of
-from deploy.restoration.georeference import KEYS, PIXEL_SCALE, POLYNOMIALS, TIE_POINTS, TRANSFORMATION
-from deploy.restoration.options import Options
-from deploy.restoration.plan import Plan, plan_for
-from deploy.restoration.radiometry import full_scale_of
-from deploy.restoration.runtime import open_runtime, tiles_at_once
-from deploy.restoration.source import Raster, open_source
-from profiles.errors import BeersError, ImageError
-from profiles.figures import Figure, Row, measured, predicted, unavailable
-from profiles.target import TargetProfile
-from quant.onnx_file import load_onnx
+from beers_deploy.bench.tables import predict_file, swath_latency
+from beers_deploy.dpu.board import dpu_of
+from beers_deploy.profiles.errors import BeersError, ImageError
+from beers_deploy.profiles.figures import Figure, Row, measured, predicted, unavailable
+from beers_deploy.profiles.target import TargetProfile
+from beers_deploy.quant.onnx_file import load_onnx
+from beers_deploy.restoration.georeference import KEYS, PIXEL_SCALE, POLYNOMIALS, TIE_POINTS, TRANSFORMATION
+from beers_deploy.restoration.options import Options
+from beers_deploy.restoration.plan import Plan, plan_for
+from beers_deploy.restoration.radiometry import full_scale_of
+from beers_deploy.restoration.runtime import open_runtime, tiles_at_once
+from beers_deploy.restoration.source import Raster, open_source
 
 HEADER = "the file's own header"
 ARITHMETIC = "arithmetic on the plan of tiles"

@@ -1,4 +1,4 @@
-"""For notebooks: `from deploy.library import restore`, on arrays of numpy, Dask and xarray.
+"""For notebooks: `from beers_deploy.library import restore`, on arrays of numpy, Dask and xarray.
 
 The pixels are those that the command `restore` writes of the same image.
 """
@@ -11,18 +11,18 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from deploy.networks import network_file
-from deploy.restoration.engine import NAME, Restorer, checked_strip, restore_array
-from deploy.restoration.options import TILE_PX, Options, Runtime
-from deploy.restoration.plan import Plan, Span, plan_for
-from deploy.restoration.run import scale_of
-from deploy.restoration.runtime import Packed, open_packed, open_runtime, pack, tiles_at_once
-from deploy.restoration.source import ArraySource, Raster, require_numbers, usable_nodata
-from model.io.images import settled_scale
-from profiles.errors import ImageError, OptionError
-from profiles.sensor_file import BLIND, load_sensor
-from quant.onnx_file import load_onnx
-from quant.tiling.walk import Tiling
+from beers_deploy.model.io.images import settled_scale
+from beers_deploy.networks import network_file
+from beers_deploy.profiles.errors import ImageError, OptionError
+from beers_deploy.profiles.sensor_file import BLIND, load_sensor
+from beers_deploy.quant.onnx_file import load_onnx
+from beers_deploy.quant.tiling.walk import Tiling
+from beers_deploy.restoration.engine import NAME, Restorer, checked_strip, restore_array
+from beers_deploy.restoration.options import TILE_PX, Options, Runtime
+from beers_deploy.restoration.plan import Plan, Span, plan_for
+from beers_deploy.restoration.run import scale_of
+from beers_deploy.restoration.runtime import Packed, open_packed, open_runtime, pack, tiles_at_once
+from beers_deploy.restoration.source import ArraySource, Raster, require_numbers, usable_nodata
 
 Image = TypeVar("Image")
 """numpy.ndarray, dask.array.Array or xarray.DataArray."""

@@ -16,21 +16,21 @@ from tempfile import TemporaryDirectory
 
 import onnx
 
-from deploy.export import float_for
-from model.bank import REFERENCE, bank_of_vector, network_bank
-from model.family import RANGES, sensor_vector
-from model.io.files import sha256
-from model.io.tensors import is_conditioned, read_conditioned
-from model.progress import Log, no_log, progress
-from model.shipped import INT8, SENSOR, SHIPPED, VARIANT, shipped_names, shipped_weights
-from profiles.errors import ModelError
-from profiles.sensor import SensorProfile, numbers_of
-from profiles.sensor_file import load_sensor
-from profiles.toml import unreadable
-from quant.banked.family import FAMILY, required_family, with_delta
-from quant.core import SHIFTS, Shifts
-from quant.encodings import host_model
-from quant.onnx_file import fixed_tile_px, is_quantised, load_onnx, metadata, save_onnx
+from beers_deploy.export import float_for
+from beers_deploy.model.bank import REFERENCE, bank_of_vector, network_bank
+from beers_deploy.model.family import RANGES, sensor_vector
+from beers_deploy.model.io.files import sha256
+from beers_deploy.model.io.tensors import is_conditioned, read_conditioned
+from beers_deploy.model.progress import Log, no_log, progress
+from beers_deploy.model.shipped import INT8, SENSOR, SHIPPED, VARIANT, shipped_names, shipped_weights
+from beers_deploy.profiles.errors import ModelError
+from beers_deploy.profiles.sensor import SensorProfile, numbers_of
+from beers_deploy.profiles.sensor_file import load_sensor
+from beers_deploy.profiles.toml import unreadable
+from beers_deploy.quant.banked.family import FAMILY, required_family, with_delta
+from beers_deploy.quant.core import SHIFTS, Shifts
+from beers_deploy.quant.encodings import host_model
+from beers_deploy.quant.onnx_file import fixed_tile_px, is_quantised, load_onnx, metadata, save_onnx
 
 WEIGHTS = "weights_sha256"
 """In the metadata of an INT8 network behind a bank: the SHA-256 of its float weights."""
@@ -223,8 +223,8 @@ def family_model(
     Raises:
         ModelError: other weights.
     """
-    from model.simulator.procedural import load_scenes  # torch, which a restoration does not need
-    from quant.banked.calibrate import family_images, quantise_family
+    from beers_deploy.model.simulator.procedural import load_scenes  # torch, which a restoration does not need
+    from beers_deploy.quant.banked.calibrate import family_images, quantise_family
 
     weights = read_conditioned(network.weights)
     scenes, scale = load_scenes(images, load_sensor(REFERENCE).nominal(), seed), weights.variant.scale

@@ -8,26 +8,26 @@ from pathlib import Path
 
 import onnx
 
-from deploy.networks import Conditioned, family_model, told_int8
-from deploy.report.page import Report, write_report
-from deploy.report.sensitivity_page import sensitivity_page
-from model.progress import Log, progress
-from profiles import load_sensor
-from profiles.errors import OptionError
-from profiles.figures import Row
-from profiles.target import TargetProfile, board_names
-from quant.calibration import Calibration, Patches
-from quant.core import IntCore, Shifts, target_shifts
-from quant.encodings import board_model, read_core
-from quant.free import quantise_free
-from quant.gate import compare, gate_row
-from quant.integer import integer_rows
-from quant.onnx_file import metadata, save_onnx
-from quant.passes.tune import Tuning
-from quant.quantise import Quantised, quantise_model
-from quant.samples import OwnSamples
-from quant.sensitivity import WORST, headline, layer_error_rows, sizes_row, spread_of, worst_row
-from quant.session import open_any_size
+from beers_deploy.model.progress import Log, progress
+from beers_deploy.networks import Conditioned, family_model, told_int8
+from beers_deploy.profiles import load_sensor
+from beers_deploy.profiles.errors import OptionError
+from beers_deploy.profiles.figures import Row
+from beers_deploy.profiles.target import TargetProfile, board_names
+from beers_deploy.quant.calibration import Calibration, Patches
+from beers_deploy.quant.core import IntCore, Shifts, target_shifts
+from beers_deploy.quant.encodings import board_model, read_core
+from beers_deploy.quant.free import quantise_free
+from beers_deploy.quant.gate import compare, gate_row
+from beers_deploy.quant.integer import integer_rows
+from beers_deploy.quant.onnx_file import metadata, save_onnx
+from beers_deploy.quant.passes.tune import Tuning
+from beers_deploy.quant.quantise import Quantised, quantise_model
+from beers_deploy.quant.samples import OwnSamples
+from beers_deploy.quant.sensitivity import WORST, headline, layer_error_rows, sizes_row, spread_of, worst_row
+from beers_deploy.quant.session import open_any_size
+from beers_deploy.report.page import Report, write_report
+from beers_deploy.report.sensitivity_page import sensitivity_page
 
 
 def sensitivity_report(

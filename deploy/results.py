@@ -11,12 +11,12 @@ from rich.measure import Measurement
 from rich.table import Table
 from rich.text import Text
 
-from deploy import __version__
-from model.io.files import sha256, write_text
-from model.processor import decided, processor_name
-from profiles.errors import visible
-from profiles.figures import Figure, Row
-from quant.checks import Check
+from beers_deploy import __version__
+from beers_deploy.model.io.files import sha256, write_text
+from beers_deploy.model.processor import decided, processor_name
+from beers_deploy.profiles.errors import visible
+from beers_deploy.profiles.figures import Figure, Row
+from beers_deploy.quant.checks import Check
 
 SCHEMA_NAME, SCHEMA_VERSION = "beers-deploy/results", 2
 SCHEMA_PATH = Path(__file__).parent / "schema" / "results-2.json"

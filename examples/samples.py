@@ -20,15 +20,15 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from beers_deploy.model.io.files import require_writable, whole_file
+from beers_deploy.model.simulator.acquire import acquire
+from beers_deploy.model.simulator.detector import Draw
+from beers_deploy.model.simulator.procedural import load_scenes
+from beers_deploy.model.simulator.sampling import Scene
+from beers_deploy.model.training.patches import PatchRecipe, PatchSource, Visited, cut, prepare, turn
+from beers_deploy.profiles import load_sensor
+from beers_deploy.profiles.errors import BeersError, ImageError, OptionError
 from examples.networks import NETWORKS
-from model.io.files import require_writable, whole_file
-from model.simulator.acquire import acquire
-from model.simulator.detector import Draw
-from model.simulator.procedural import load_scenes
-from model.simulator.sampling import Scene
-from model.training.patches import PatchRecipe, PatchSource, Visited, cut, prepare, turn
-from profiles import load_sensor
-from profiles.errors import BeersError, ImageError, OptionError
 
 BATCH, PATCH_PX = 8, 64
 """Images of a batch, and their side."""

@@ -17,14 +17,14 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from beers_deploy.model.convbeers import arrays
+from beers_deploy.model.io.files import require_writable, whole_file
+from beers_deploy.model.io.tensors import write_tensors
+from beers_deploy.model.metrics.fidelity import psnr_db
+from beers_deploy.model.progress import steps
+from beers_deploy.profiles.errors import OptionError
 from examples.networks import NETWORKS, build, to_onnx
 from examples.samples import Batch, batches_of, positive, reported
-from model.convbeers import arrays
-from model.io.files import require_writable, whole_file
-from model.io.tensors import write_tensors
-from model.metrics.fidelity import psnr_db
-from model.progress import steps
-from profiles.errors import OptionError
 
 JUDGED = 16
 """Batches that a trained network is judged on."""

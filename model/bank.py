@@ -23,10 +23,10 @@ from itertools import product
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from model.family import RANGES
-from model.simulator.mtf import NYQUIST, sensor_mtf
-from profiles import load_sensor
-from profiles.sensor import Sensor
+from beers_deploy.model.family import RANGES
+from beers_deploy.model.simulator.mtf import NYQUIST, sensor_mtf
+from beers_deploy.profiles import load_sensor
+from beers_deploy.profiles.sensor import Sensor
 
 REFERENCE = "pleiades-reference"
 """The profile of what networks are trained to restore."""

@@ -25,11 +25,11 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import conv2d, pad, pixel_shuffle, pixel_unshuffle
 
-from model.bank import FILTERS, LARGEST, SIDE_PX, Bank, bank_of_vector
-from model.family import sensor_vector
-from model.io.tensors import Weights, read_weights, write_weights
-from model.variants import BANK_PLANES, SENSOR_VALUES, Variant
-from profiles.sensor import Sensor
+from beers_deploy.model.bank import FILTERS, LARGEST, SIDE_PX, Bank, bank_of_vector
+from beers_deploy.model.family import sensor_vector
+from beers_deploy.model.io.tensors import Weights, read_weights, write_weights
+from beers_deploy.model.variants import BANK_PLANES, SENSOR_VALUES, Variant
+from beers_deploy.profiles.sensor import Sensor
 
 
 def conv3x3(inputs: int, outputs: int) -> nn.Conv2d:

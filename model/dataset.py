@@ -19,16 +19,16 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 
-from model.io.files import sha256, whole_file, write_text
-from model.io.tiff import write_tiff
-from model.simulator.acquire import MARGIN_PX, prepare_scene, simulate_planned
-from model.simulator.detector import Draw, to_uint16
-from model.simulator.plan import TOLERANCE_DN, make_plan
-from model.simulator.procedural import procedural_scene
-from model.simulator.sampling import Scene, read_scene, resample
-from profiles.errors import ImageError, OptionError
-from profiles.sensor import SensorProfile, require_same_units
-from profiles.toml import parse_json
+from beers_deploy.model.io.files import sha256, whole_file, write_text
+from beers_deploy.model.io.tiff import write_tiff
+from beers_deploy.model.simulator.acquire import MARGIN_PX, prepare_scene, simulate_planned
+from beers_deploy.model.simulator.detector import Draw, to_uint16
+from beers_deploy.model.simulator.plan import TOLERANCE_DN, make_plan
+from beers_deploy.model.simulator.procedural import procedural_scene
+from beers_deploy.model.simulator.sampling import Scene, read_scene, resample
+from beers_deploy.profiles.errors import ImageError, OptionError
+from beers_deploy.profiles.sensor import SensorProfile, require_same_units
+from beers_deploy.profiles.toml import parse_json
 
 DRAWN_SIDE_PX = 3000
 Line = dict[str, object]

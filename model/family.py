@@ -11,8 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from profiles.effects import Smear
-from profiles.sensor import Sensor
+from beers_deploy.profiles.effects import Smear
+from beers_deploy.profiles.sensor import Sensor
 
 RANGES: Mapping[str, tuple[float, float]] = {
     "mtf_across": (0.015, 0.15),

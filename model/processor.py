@@ -14,7 +14,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from profiles.errors import OptionError
+from beers_deploy.profiles.errors import OptionError
 
 if TYPE_CHECKING:
     import numpy as np

@@ -5,12 +5,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from model.io.images import site_of
-from model.shipped import SENSOR
-from profiles.errors import OptionError
-from profiles.sensor import SensorProfile, same_instrument
-from profiles.sensor_file import load_sensor, reference_beside, sensor_from_json
-from profiles.toml import read_json
+from beers_deploy.model.io.images import site_of
+from beers_deploy.model.shipped import SENSOR
+from beers_deploy.profiles.errors import OptionError
+from beers_deploy.profiles.sensor import SensorProfile, same_instrument
+from beers_deploy.profiles.sensor_file import load_sensor, reference_beside, sensor_from_json
+from beers_deploy.profiles.toml import read_json
 
 
 @dataclass(frozen=True)

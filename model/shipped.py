@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from profiles.errors import ModelError
+from beers_deploy.profiles.errors import ModelError
 
 SHIPPED = Path(__file__).parent / "weights"
 

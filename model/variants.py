@@ -7,7 +7,7 @@ four channels, and so works at half resolution: its maps have a quarter of the p
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from profiles.errors import OptionError
+from beers_deploy.profiles.errors import OptionError
 
 BANK_PLANES, SENSOR_VALUES = 5, 4
 """What a head behind a bank reads: the image and four planes of each pixel, and the numbers of a sensor vector."""

@@ -7,12 +7,12 @@
 - `figures`: numbers with unit, mode and source; `errors`: what bad input becomes.
 """
 
-from profiles.errors import BeersError
-from profiles.figures import Figure, Row
-from profiles.scene_call import SceneCall, load_scene_call, scene_names
-from profiles.sensor import Sensor, SensorProfile
-from profiles.sensor_file import load_sensor, sensor_names
-from profiles.target import TargetProfile, load_target, target_names
+from beers_deploy.profiles.errors import BeersError
+from beers_deploy.profiles.figures import Figure, Row
+from beers_deploy.profiles.scene_call import SceneCall, load_scene_call, scene_names
+from beers_deploy.profiles.sensor import Sensor, SensorProfile
+from beers_deploy.profiles.sensor_file import load_sensor, sensor_names
+from beers_deploy.profiles.target import TargetProfile, load_target, target_names
 
 __all__ = [
     "BeersError",

@@ -5,7 +5,7 @@ from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from typing import Literal, get_args
 
-from profiles.errors import ProfileError
+from beers_deploy.profiles.errors import ProfileError
 
 Status = Literal["published", "inferred", "measured", "assumed", "stated"]
 """published: in a document; measured: on the instrument; inferred: computed from such; assumed: our choice; stated:

@@ -8,8 +8,8 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 
-from profiles.constant import Constant, check_keys, read_constant
-from profiles.errors import ProfileError
+from beers_deploy.profiles.constant import Constant, check_keys, read_constant
+from beers_deploy.profiles.errors import ProfileError
 
 
 @dataclass(frozen=True)

@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from profiles.constant import Constant, Status, check_keys, is_number, read_stated
-from profiles.errors import ProfileError
-from profiles.response import NYQUIST, MtfTable, PointSpread, Response, centroid, packed, unpacked
-from profiles.toml import unreadable
+from beers_deploy.profiles.constant import Constant, Status, check_keys, is_number, read_stated
+from beers_deploy.profiles.errors import ProfileError
+from beers_deploy.profiles.response import NYQUIST, MtfTable, PointSpread, Response, centroid, packed, unpacked
+from beers_deploy.profiles.toml import unreadable
 
 READING = 0.005
 """How far a table may lie above what the square detector leaves: half the last digit of two. The detector counts."""

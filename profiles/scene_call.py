@@ -3,11 +3,11 @@
 from collections.abc import Collection
 from dataclasses import dataclass, replace
 
-from profiles.constant import Constant, check_keys, read_constant
-from profiles.effects import TABLES, Table, read_effect
-from profiles.errors import OptionError, ProfileError
-from profiles.sensor import SensorProfile
-from profiles.toml import HERE, read_toml, shipped_names
+from beers_deploy.profiles.constant import Constant, check_keys, read_constant
+from beers_deploy.profiles.effects import TABLES, Table, read_effect
+from beers_deploy.profiles.errors import OptionError, ProfileError
+from beers_deploy.profiles.sensor import SensorProfile
+from beers_deploy.profiles.toml import HERE, read_toml, shipped_names
 
 
 @dataclass(frozen=True)

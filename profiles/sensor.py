@@ -9,11 +9,11 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from profiles.constant import Constant
-from profiles.effects import TABLES as EFFECT_TABLES
-from profiles.effects import Effect, Offset, Table, draw_effect, middle_effect
-from profiles.errors import ProfileError
-from profiles.response import PointSpread, Response
+from beers_deploy.profiles.constant import Constant
+from beers_deploy.profiles.effects import TABLES as EFFECT_TABLES
+from beers_deploy.profiles.effects import Effect, Offset, Table, draw_effect, middle_effect
+from beers_deploy.profiles.errors import ProfileError
+from beers_deploy.profiles.response import PointSpread, Response
 
 MTF_NYQUIST_MAX = 2 / math.pi
 """A perfect lens over a square detector: sinc(0.5). Nothing above it is a blur: its gamma would be negative."""

@@ -5,12 +5,12 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from profiles.constant import Constant, check_keys, read_constant
-from profiles.effects import TABLES as EFFECT_TABLES
-from profiles.effects import Table, read_effect
-from profiles.errors import ProfileError
-from profiles.response_file import axes_of, read_response, response_from_json
-from profiles.sensor import (
+from beers_deploy.profiles.constant import Constant, check_keys, read_constant
+from beers_deploy.profiles.effects import TABLES as EFFECT_TABLES
+from beers_deploy.profiles.effects import Table, read_effect
+from beers_deploy.profiles.errors import ProfileError
+from beers_deploy.profiles.response_file import axes_of, read_response, response_from_json
+from beers_deploy.profiles.sensor import (
     MTF_NYQUIST_MAX,
     OFFSET,
     RESPONSE,
@@ -22,7 +22,7 @@ from profiles.sensor import (
     snr_0_bounds,
     table_keys,
 )
-from profiles.toml import profile_path, read_toml, shipped_names
+from beers_deploy.profiles.toml import profile_path, read_toml, shipped_names
 
 REFERENCE = "pleiades-reference"
 """The shipped profile of the image that restoration aims at, unless another is named."""

@@ -8,9 +8,9 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from profiles.constant import Constant, Words, check_keys, read_constant, read_words
-from profiles.errors import ProfileError
-from profiles.toml import profile_path, read_toml, shipped_names
+from beers_deploy.profiles.constant import Constant, Words, check_keys, read_constant, read_words
+from beers_deploy.profiles.errors import ProfileError
+from beers_deploy.profiles.toml import profile_path, read_toml, shipped_names
 
 DEFAULT_TARGET = "vck190"
 """The board of the paper: what a command takes where no board is named."""

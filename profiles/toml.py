@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
 
-from profiles.errors import ProfileError
+from beers_deploy.profiles.errors import ProfileError
 
 TOML_BYTES = 1 << 16
 """The largest shipped profile takes a fifth of it."""

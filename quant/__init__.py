@@ -15,7 +15,7 @@ What is offered here is loaded when it is asked for.
 
 import lazy_loader
 
-from quant.telemetry import switch_off_telemetry
+from beers_deploy.quant.telemetry import switch_off_telemetry
 
 switch_off_telemetry()  # here, because a runtime's first import anywhere in this package is too late
 

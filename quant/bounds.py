@@ -5,9 +5,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from quant.banked.filters import PLANE_ENDS
-from quant.core import INT8_MAX, INT8_MIN, IntConv, IntCore
-from quant.graph import (
+from beers_deploy.quant.banked.filters import PLANE_ENDS
+from beers_deploy.quant.core import INT8_MAX, INT8_MIN, IntConv, IntCore
+from beers_deploy.quant.graph import (
     COARSE_MAX,
     PLANES,
     QUARTER,
@@ -20,7 +20,7 @@ from quant.graph import (
     Pointwise,
     Shuffle,
 )
-from quant.integer.arithmetic import activated, activation_table, mean_factor
+from beers_deploy.quant.integer.arithmetic import activated, activation_table, mean_factor
 
 PLANE_LOW = np.array([0, -STEP // 2, -STEP // 2 // QUARTER])
 PLANE_HIGH = np.array([COARSE_MAX, STEP - 1, STEP // QUARTER])

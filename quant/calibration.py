@@ -15,21 +15,21 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from model.family import SensorFamily
-from model.simulator.acquire import MARGIN_PX, acquire
-from model.simulator.detector import Draw
-from model.simulator.mtf import transfer_function
-from model.simulator.procedural import load_scenes
-from model.simulator.sampling import Scene, scene_spectrum
-from model.training.patches import PatchRecipe, turn
-from profiles import load_sensor
-from profiles.errors import ImageError
-from profiles.sensor import Sensor, SensorProfile
-from profiles.sensor_file import reference_for
-from quant.core import CANDIDATES, squared_errors, unclipped_frac_bits
-from quant.ends import ONE_CHANNEL, Ends
-from quant.graph import PLANES, PLANES_FRAC_BITS, Graph, graph_to_onnx, tensors, tied
-from quant.session import halo_of, open_session, tensor_values
+from beers_deploy.model.family import SensorFamily
+from beers_deploy.model.simulator.acquire import MARGIN_PX, acquire
+from beers_deploy.model.simulator.detector import Draw
+from beers_deploy.model.simulator.mtf import transfer_function
+from beers_deploy.model.simulator.procedural import load_scenes
+from beers_deploy.model.simulator.sampling import Scene, scene_spectrum
+from beers_deploy.model.training.patches import PatchRecipe, turn
+from beers_deploy.profiles import load_sensor
+from beers_deploy.profiles.errors import ImageError
+from beers_deploy.profiles.sensor import Sensor, SensorProfile
+from beers_deploy.profiles.sensor_file import reference_for
+from beers_deploy.quant.core import CANDIDATES, squared_errors, unclipped_frac_bits
+from beers_deploy.quant.ends import ONE_CHANNEL, Ends
+from beers_deploy.quant.graph import PLANES, PLANES_FRAC_BITS, Graph, graph_to_onnx, tensors, tied
+from beers_deploy.quant.session import halo_of, open_session, tensor_values
 
 VIEW_CANDIDATES = 8
 """Drawn for each that is wanted."""

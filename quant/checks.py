@@ -7,7 +7,7 @@ import math
 from dataclasses import dataclass
 from typing import Literal
 
-from profiles.errors import printable
+from beers_deploy.profiles.errors import printable
 
 Bound = Literal["at most", "at least"]
 

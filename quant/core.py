@@ -9,10 +9,10 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from profiles.errors import ModelError
-from profiles.target import TargetProfile
-from quant.ends import Ends
-from quant.graph import PLANES, Activation, Add, Conv, Graph, Mul, Op, Window, ties_scales
+from beers_deploy.profiles.errors import ModelError
+from beers_deploy.profiles.target import TargetProfile
+from beers_deploy.quant.ends import Ends
+from beers_deploy.quant.graph import PLANES, Activation, Add, Conv, Graph, Mul, Op, Window, ties_scales
 
 INT8_MIN, INT8_MAX = -128, 127
 CANDIDATES = 6

@@ -9,10 +9,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from onnx import TensorProto, helper
 
-from model.bank import SIDE_PX, UNIT_STEPS
-from model.io.images import MAX_DN
-from quant.banked.filters import ANALYTIC_COPIES, BITS, MIDDLE_DN, PART, STEP_DN, split_planes
-from quant.graph import (
+from beers_deploy.model.bank import SIDE_PX, UNIT_STEPS
+from beers_deploy.model.io.images import MAX_DN
+from beers_deploy.quant.banked.filters import ANALYTIC_COPIES, BITS, MIDDLE_DN, PART, STEP_DN, split_planes
+from beers_deploy.quant.graph import (
     COARSE_MAX,
     CORRECTION,
     COUNT,
@@ -25,9 +25,9 @@ from quant.graph import (
     channels_of,
     split,
 )
-from quant.graph.tail import Tail
-from quant.graph.writer import write_shuffle
-from quant.onnx_file import GraphWriter
+from beers_deploy.quant.graph.tail import Tail
+from beers_deploy.quant.graph.writer import write_shuffle
+from beers_deploy.quant.onnx_file import GraphWriter
 
 ZERO = 128
 """Around which uint8 stands for int8 in the host's file."""

@@ -10,12 +10,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 import onnx
 
-from model.progress import Log, no_log
-from quant.calibration import Patches
-from quant.core import INT8_MAX
-from quant.encodings import MICROSOFT
-from quant.ends import ONE_CHANNEL, ZERO, Ends, HostWriter, ends_of, write_back, write_front
-from quant.graph import (
+from beers_deploy.model.progress import Log, no_log
+from beers_deploy.quant.calibration import Patches
+from beers_deploy.quant.core import INT8_MAX
+from beers_deploy.quant.encodings import MICROSOFT
+from beers_deploy.quant.ends import ONE_CHANNEL, ZERO, Ends, HostWriter, ends_of, write_back, write_front
+from beers_deploy.quant.graph import (
     CORRECTION,
     IMAGE,
     PLANES,
@@ -29,12 +29,12 @@ from quant.graph import (
     read_planes,
     tensors,
 )
-from quant.onnx_file import fixed_tile_px, image_info, make_model, metadata
-from quant.passes.equalise import Costs, channel_ranges, equalise, search
-from quant.passes.fit_weights import Moments, fit, input_moments
-from quant.passes.stream import half_lsb_pair, streams, two_gains
-from quant.quantise import STREAM_STEP, Targets, crop_costs, search_targets
-from quant.session import halo_of, open_session, tensor_values
+from beers_deploy.quant.onnx_file import fixed_tile_px, image_info, make_model, metadata
+from beers_deploy.quant.passes.equalise import Costs, channel_ranges, equalise, search
+from beers_deploy.quant.passes.fit_weights import Moments, fit, input_moments
+from beers_deploy.quant.passes.stream import half_lsb_pair, streams, two_gains
+from beers_deploy.quant.quantise import STREAM_STEP, Targets, crop_costs, search_targets
+from beers_deploy.quant.session import halo_of, open_session, tensor_values
 
 BINS = 4096
 """Sixteen and more a step of an 8-bit number."""

@@ -10,15 +10,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import onnxruntime as ort
 
-from model.metrics.fidelity import psnr_db
-from profiles.errors import OptionError
-from profiles.figures import Figure, Row, measured, unavailable
-from profiles.toml import read_toml_text, unreadable
-from quant.checks import Check
-from quant.session import result_of
+from beers_deploy.model.metrics.fidelity import psnr_db
+from beers_deploy.profiles.errors import OptionError
+from beers_deploy.profiles.figures import Figure, Row, measured, unavailable
+from beers_deploy.profiles.toml import read_toml_text, unreadable
+from beers_deploy.quant.checks import Check
+from beers_deploy.quant.session import result_of
 
 if TYPE_CHECKING:
-    from quant.calibration import Pair
+    from beers_deploy.quant.calibration import Pair
 
 
 @dataclass(frozen=True)

@@ -23,8 +23,8 @@ import numpy as np
 import onnx
 from onnx import TensorProto, helper, numpy_helper
 
-from quant.onnx_file import constants
-from quant.untrusted import refused
+from beers_deploy.quant.onnx_file import constants
+from beers_deploy.quant.untrusted import refused
 
 INT16_MAX, INT16_MIN = 32767, -32768
 MIDDLE, UINT8_MAX = 128, 255

@@ -12,12 +12,12 @@ import onnx
 from google.protobuf.message import DecodeError
 from onnx import numpy_helper
 
-from model.io.files import whole_file
-from profiles.errors import ModelError
-from profiles.toml import read_whole, unreadable
-from quant.reading.external import take_in
-from quant.reading.folding import IR_VERSION, OPSET, simplest
-from quant.untrusted import FILE_BYTES, check_content, check_runnable
+from beers_deploy.model.io.files import whole_file
+from beers_deploy.profiles.errors import ModelError
+from beers_deploy.profiles.toml import read_whole, unreadable
+from beers_deploy.quant.reading.external import take_in
+from beers_deploy.quant.reading.folding import IR_VERSION, OPSET, simplest
+from beers_deploy.quant.untrusted import FILE_BYTES, check_content, check_runnable
 
 REMEDY = "give an ONNX file, as 'beers-deploy export', 'beers-deploy quantize' or PyTorch writes it"
 

@@ -8,12 +8,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 import onnx
 
-from model.progress import Log, no_log
-from quant.calibration import Patches, Remade, choose_frac_bits
-from quant.core import SHIFTS, IntCore, Shifts, build_core
-from quant.encodings import board_model, host_model
-from quant.ends import GAIN, Ends, ends_of
-from quant.graph import (
+from beers_deploy.model.progress import Log, no_log
+from beers_deploy.quant.calibration import Patches, Remade, choose_frac_bits
+from beers_deploy.quant.core import SHIFTS, IntCore, Shifts, build_core
+from beers_deploy.quant.encodings import board_model, host_model
+from beers_deploy.quant.ends import GAIN, Ends, ends_of
+from beers_deploy.quant.graph import (
     CORRECTION,
     PLANES,
     Graph,
@@ -24,9 +24,9 @@ from quant.graph import (
     relu_count,
     tensors,
 )
-from quant.graph.tail import Tail
-from quant.onnx_file import fixed_tile_px, metadata
-from quant.passes.equalise import (
+from beers_deploy.quant.graph.tail import Tail
+from beers_deploy.quant.onnx_file import fixed_tile_px, metadata
+from beers_deploy.quant.passes.equalise import (
     LEVELLING,
     Costs,
     Trial,
@@ -36,9 +36,9 @@ from quant.passes.equalise import (
     search,
     with_room,
 )
-from quant.passes.fit_weights import fit_weights, input_moments
-from quant.passes.level import Chain, chain_ranges, level
-from quant.passes.stream import (
+from beers_deploy.quant.passes.fit_weights import fit_weights, input_moments
+from beers_deploy.quant.passes.level import Chain, chain_ranges, level
+from beers_deploy.quant.passes.stream import (
     MAX_CHANNELS,
     STREAM_FRAC_BITS,
     Stream,
@@ -51,8 +51,8 @@ from quant.passes.stream import (
     window_offsets,
     windowed,
 )
-from quant.passes.tune import Tuning, tune
-from quant.session import TILE_PX, crops, halo_of, open_session, result_of, tensor_values
+from beers_deploy.quant.passes.tune import Tuning, tune
+from beers_deploy.quant.session import TILE_PX, crops, halo_of, open_session, result_of, tensor_values
 
 SEARCH_CROPS = 16
 """What the equalisation is searched on, a quarter of them with the strongest edges: there int8 clips."""

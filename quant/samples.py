@@ -14,14 +14,14 @@ from pathlib import Path
 import numpy as np
 import onnx
 
-from model.io.files import IMAGE_SUFFIXES
-from model.io.images import MAX_DN, read_pixels
-from profiles.errors import ImageError, ModelError, OptionError
-from profiles.toml import unreadable
-from quant.calibration import PATCH_PX, Pair, Patches, Remade
-from quant.onnx_file import fixed_tile_px
-from quant.tiling.walk import tiling_of
-from quant.untrusted import times
+from beers_deploy.model.io.files import IMAGE_SUFFIXES
+from beers_deploy.model.io.images import MAX_DN, read_pixels
+from beers_deploy.profiles.errors import ImageError, ModelError, OptionError
+from beers_deploy.profiles.toml import unreadable
+from beers_deploy.quant.calibration import PATCH_PX, Pair, Patches, Remade
+from beers_deploy.quant.onnx_file import fixed_tile_px
+from beers_deploy.quant.tiling.walk import tiling_of
+from beers_deploy.quant.untrusted import times
 
 HELD_OUT_EVERY = 4
 """One sample of so many is kept from calibration, to look at what INT8 changes."""

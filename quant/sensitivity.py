@@ -14,14 +14,14 @@ import onnx
 import onnxruntime as ort
 from onnx import TensorProto, helper
 
-from model.io.images import MAX_DN
-from profiles.figures import Figure, Row, measured, unavailable
-from profiles.sensor import Sensor
-from quant.calibration import Patches
-from quant.core import INT8_MAX, INT8_MIN, IntConv, IntCore
-from quant.encodings import host_model
-from quant.gate import GateResult
-from quant.graph import (
+from beers_deploy.model.io.images import MAX_DN
+from beers_deploy.profiles.figures import Figure, Row, measured, unavailable
+from beers_deploy.profiles.sensor import Sensor
+from beers_deploy.quant.calibration import Patches
+from beers_deploy.quant.core import INT8_MAX, INT8_MIN, IntConv, IntCore
+from beers_deploy.quant.encodings import host_model
+from beers_deploy.quant.gate import GateResult
+from beers_deploy.quant.graph import (
     CORRECTION,
     PLANES,
     Add,
@@ -34,8 +34,8 @@ from quant.graph import (
     tensors,
     ties_scales,
 )
-from quant.quantise import Quantised
-from quant.session import few_crops, halo_of, open_session, planes_of, result_of, run, tensor_values
+from beers_deploy.quant.quantise import Quantised
+from beers_deploy.quant.session import few_crops, halo_of, open_session, planes_of, result_of, run, tensor_values
 
 IN_INT8 = ".in_int8"
 """Behind the name of a tensor: as int8 weights and bias make it of float inputs, not yet rounded."""

@@ -11,13 +11,13 @@ import numpy as np
 import onnx
 import onnxruntime as ort
 
-from model.processor import int8_adds_exactly
-from profiles.errors import ModelError
-from quant.ends import ONE_CHANNEL, Ends
-from quant.graph import PLANES, PLANES_FRAC_BITS, Add, Concat, Conv, Graph, Mul, Op, Pointwise, same
-from quant.kernels import filled, is_integer, made_exact
-from quant.onnx_file import any_size, fixed_tile_px, load_onnx
-from quant.untrusted import contradictions, times
+from beers_deploy.model.processor import int8_adds_exactly
+from beers_deploy.profiles.errors import ModelError
+from beers_deploy.quant.ends import ONE_CHANNEL, Ends
+from beers_deploy.quant.graph import PLANES, PLANES_FRAC_BITS, Add, Concat, Conv, Graph, Mul, Op, Pointwise, same
+from beers_deploy.quant.kernels import filled, is_integer, made_exact
+from beers_deploy.quant.onnx_file import any_size, fixed_tile_px, load_onnx
+from beers_deploy.quant.untrusted import contradictions, times
 
 
 def open_session(

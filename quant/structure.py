@@ -12,15 +12,15 @@ from dataclasses import dataclass, field
 import numpy as np
 import onnx
 
-from profiles.errors import ModelError
-from quant.checks import Check
-from quant.encodings import encoding_faults, read_core
-from quant.ends import ZERO
-from quant.graph import CORRECTION
-from quant.onnx_file import any_size, constants, with_outputs
-from quant.session import open_any_size, open_session, result_of, tensors_of
-from quant.tiling.walk import tiling_of
-from quant.untrusted import contradictions
+from beers_deploy.profiles.errors import ModelError
+from beers_deploy.quant.checks import Check
+from beers_deploy.quant.encodings import encoding_faults, read_core
+from beers_deploy.quant.ends import ZERO
+from beers_deploy.quant.graph import CORRECTION
+from beers_deploy.quant.onnx_file import any_size, constants, with_outputs
+from beers_deploy.quant.session import open_any_size, open_session, result_of, tensors_of
+from beers_deploy.quant.tiling.walk import tiling_of
+from beers_deploy.quant.untrusted import contradictions
 
 ZERO_POINTS = {"QuantizeLinear": 2, "QLinearConv": 7, "QLinearAdd": 7, "QLinearMul": 7, "QLinearMatMul": 7}
 """ONNX's and onnxruntime's operators that round to 8 bits, of those that may run (`quant.untrusted`), and which input

@@ -8,8 +8,8 @@ import numpy as np
 import onnx
 from onnx import AttributeProto, NodeProto, TensorProto, numpy_helper
 
-from profiles.errors import ModelError
-from quant.reading.arithmetic import LIST_VALUES, computed
+from beers_deploy.profiles.errors import ModelError
+from beers_deploy.quant.reading.arithmetic import LIST_VALUES, computed
 
 FILE_BYTES = 1 << 30
 VALUES = 1 << 28

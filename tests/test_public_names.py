@@ -12,16 +12,16 @@ SURFACE = {
         "BeersError Figure Row SceneCall Sensor SensorProfile TargetProfile load_scene_call load_sensor "
         "load_target scene_names sensor_names target_names"
     ),
-    "model.io": (
+    "beers_deploy.model.io": (
         "list_images open_tiff read_pixels require_writable settled_scale sha256 site_of whole_file write_text"
     ),
-    "model.metrics": "Refusal psnr_db site_interval ssim",
-    "model.simulator": (
+    "beers_deploy.model.metrics": "Refusal psnr_db site_interval ssim",
+    "beers_deploy.model.simulator": (
         "Draw Pair Plan Scene make_plan procedural_scene read_scene resample sensor_transfer simulate_pair to_dn "
         "to_radiance"
     ),
-    "model.traditional": "Chain Noise PEERS QUALITIES destabilise restore_strips restore_traditional stabilise",
-    "model.training": "PatchRecipe RestorationLoss Run TrainingRecipe train",
+    "beers_deploy.model.traditional": "Chain Noise PEERS QUALITIES destabilise restore_strips restore_traditional stabilise",
+    "beers_deploy.model.training": "PatchRecipe RestorationLoss Run TrainingRecipe train",
     "quant": (
         "Calibration GateResult IntCore Limits Patches Quantised Tiling board_model compare draw_patches "
         "host_model judge load_onnx open_session quantise_free quantise_model read_core run "
@@ -29,7 +29,7 @@ SURFACE = {
     ),
     "deploy": ("Document float_for float_model load_dpu place predict read_network restore run_gate to_onnx"),
 }
-LIGHT = ("profiles", "model", "model.io", "model.metrics", "quant", "deploy")
+LIGHT = ("profiles", "model", "beers_deploy.model.io", "beers_deploy.model.metrics", "quant", "deploy")
 """Looked at by commands that need no torch."""
 
 
@@ -42,7 +42,7 @@ def test_a_package_offers_these_names_and_no_others(package: str) -> None:
 
 @pytest.mark.parametrize("package", SURFACE)
 def test_no_offered_name_hides_a_module(package: str) -> None:
-    """`from model.simulator import mtf` must mean the file, wherever it stands."""
+    """`from beers_deploy.model.simulator import mtf` must mean the file, wherever it stands."""
     assert not set(SURFACE[package].split()) & {
         module.name for module in iter_modules(import_module(package).__path__)
     }

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from types import MappingProxyType
 
-from deploy.dpu.graph import Kind, Network, Operation, Shape, Window
+from beers_deploy.dpu.graph import Kind, Network, Operation, Shape, Window
 
 Size = int | tuple[int, int]
 """One number for both sides, or (height, width)."""

@@ -14,9 +14,9 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
+from beers_deploy.model.traditional.nl_bayes import overlap_add, patch_matrix
+from beers_deploy.model.traditional.rows import one_thread_per_operation
 from benchmarks.cost_model.chain_work import FLOAT_BYTES, Work
-from model.traditional.nl_bayes import overlap_add, patch_matrix
-from model.traditional.rows import one_thread_per_operation
 
 ROUNDS = 25
 CLOCK = time.perf_counter if os.name == "nt" else time.thread_time

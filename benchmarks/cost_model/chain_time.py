@@ -15,16 +15,16 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 import torch
 
+from beers_deploy.bench.tables import Swath
+from beers_deploy.bench.traditional import CROP_PX, CROPS, drawn_acquisition
+from beers_deploy.model.shipped import SENSOR
+from beers_deploy.model.traditional.pipeline import Chain, quality_named, restore_traditional
+from beers_deploy.model.traditional.rows import one_thread_per_operation
+from beers_deploy.profiles import TargetProfile, load_sensor, load_target
+from beers_deploy.profiles.sensor_file import REFERENCE
+from beers_deploy.profiles.target import board_names
 from benchmarks.cost_model.chain_rates import Rates, measured_rates
 from benchmarks.cost_model.chain_work import chain_work
-from deploy.bench.tables import Swath
-from deploy.bench.traditional import CROP_PX, CROPS, drawn_acquisition
-from model.shipped import SENSOR
-from model.traditional.pipeline import Chain, quality_named, restore_traditional
-from model.traditional.rows import one_thread_per_operation
-from profiles import TargetProfile, load_sensor, load_target
-from profiles.sensor_file import REFERENCE
-from profiles.target import board_names
 
 WIDTH_PX, HEIGHT_PX = 13600, 9016
 QUALITY = "standard"

@@ -9,10 +9,10 @@ import math
 from collections import Counter
 from dataclasses import dataclass
 
-from model.traditional.compensate import BLOCK_PX, RADIUS_PX, fast_length
-from model.traditional.nl_bayes import reference_runs
-from model.traditional.pipeline import WORKING_SIGMA
-from model.traditional.settings import PassSettings, Quality, first_pass, second_pass
+from beers_deploy.model.traditional.compensate import BLOCK_PX, RADIUS_PX, fast_length
+from beers_deploy.model.traditional.nl_bayes import reference_runs
+from beers_deploy.model.traditional.pipeline import WORKING_SIGMA
+from beers_deploy.model.traditional.settings import PassSettings, Quality, first_pass, second_pass
 
 UNITS = {
     "box sums": "FLOP",

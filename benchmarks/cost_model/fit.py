@@ -19,8 +19,8 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from beers_deploy.dpu.cost.model import NAMES, Array, Constants, Layers, Structure
 from benchmarks.cost_model.published import Case
-from deploy.dpu.cost.model import NAMES, Array, Constants, Layers, Structure
 
 START = Constants(0.8, 1.0, 40, 0.6, 6e-6, 1e-4, 5e-5, 0.4e9, 0.8e9, 0.3e9, 30e6, 60e6, 0.8e9)
 """Where the fit begins: the right orders of magnitude."""

@@ -49,8 +49,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import get_args
 
+from beers_deploy.dpu.cost.model import Task
 from benchmarks.cost_model.builder import Builder, Size, Tensor, Written
-from deploy.dpu.cost.model import Task
 
 Value = Tensor | Size
 

@@ -26,12 +26,12 @@ from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 
+from beers_deploy.dpu.board import Dpu, load_dpu
+from beers_deploy.dpu.cost.model import Array, Layers, host_work
+from beers_deploy.dpu.cost.work import count_work, largest_map_bytes
+from beers_deploy.dpu.graph import Network
 from benchmarks.cost_model.builder import Builder, Written
 from benchmarks.cost_model.notation import read_library
-from deploy.dpu.board import Dpu, load_dpu
-from deploy.dpu.cost.model import Array, Layers, host_work
-from deploy.dpu.cost.work import count_work, largest_map_bytes
-from deploy.dpu.graph import Network
 
 ZOO = Path(__file__).parent / "zoo"
 LIBRARY = read_library(sorted(ZOO.glob("*.net")))

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
+from beers_deploy.dpu.cost.latency import WIDTHS
 from benchmarks.cost_model.fit import fit, rounded
 from benchmarks.cost_model.published import boards, written
 from benchmarks.cost_model.validation import (
@@ -26,7 +27,6 @@ from benchmarks.cost_model.validation import (
     rank_correlation,
     transferred,
 )
-from deploy.dpu.cost.latency import WIDTHS
 
 TARGETS = Path(__file__).parents[2] / "profiles" / "targets"
 HEADER = "[cost] # written by benchmarks/cost_model/refit.py; the formula: deploy/dpu/cost/model.py"

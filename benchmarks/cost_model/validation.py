@@ -16,9 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import binom, spearmanr
 
+from beers_deploy.dpu.cost.model import REGIMES, Array, Constants, Regime, Structure, regime_of
 from benchmarks.cost_model.fit import Cases, fit
 from benchmarks.cost_model.published import boards, published_cases
-from deploy.dpu.cost.model import REGIMES, Array, Constants, Regime, Structure, regime_of
 
 STRUCTURES = tuple(Structure(*values) for values in product((0.5,), (2.0, 4.0), (0.0, 1.0)))
 """What the cross-validation chooses from; the rates do not tell how much is hidden, so `serial` is assumed."""

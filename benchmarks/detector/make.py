@@ -14,19 +14,19 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from beers_deploy.model.progress import steps
+from beers_deploy.model.shipped import DETECTOR, DETECTOR_INT8
+from beers_deploy.profiles.sensor_file import REFERENCE, load_sensor
+from beers_deploy.quant.calibration import Patches, Remade
+from beers_deploy.quant.onnx_file import load_onnx, save_onnx
+from beers_deploy.quant.quantise import quantise_model
+from beers_deploy.studies.detection.average_precision import find_hits, interval, score_rows, site_weights
+from beers_deploy.studies.detection.boxes import Boxes
+from beers_deploy.studies.detection.detector import open_detector
+from beers_deploy.studies.detection.scenes import CLASSES
 from benchmarks.detector.export import detector_to_onnx
 from benchmarks.detector.pictures import Picture, drawn_pictures
 from benchmarks.detector.training import DetectorRecipe, train_detector
-from deploy.studies.detection.average_precision import find_hits, interval, score_rows, site_weights
-from deploy.studies.detection.boxes import Boxes
-from deploy.studies.detection.detector import open_detector
-from deploy.studies.detection.scenes import CLASSES
-from model.progress import steps
-from model.shipped import DETECTOR, DETECTOR_INT8
-from profiles.sensor_file import REFERENCE, load_sensor
-from quant.calibration import Patches, Remade
-from quant.onnx_file import load_onnx, save_onnx
-from quant.quantise import quantise_model
 
 SIDE_PX, OVERSAMPLING = 256, 3
 SEEN = 64

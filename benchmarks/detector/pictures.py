@@ -6,11 +6,11 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from deploy.studies.detection.scenes import synthetic_scene
-from model.io.pictures import stretch_of
-from model.simulator.acquire import acquire_padded
-from model.simulator.detector import Draw
-from profiles.sensor import Sensor
+from beers_deploy.model.io.pictures import stretch_of
+from beers_deploy.model.simulator.acquire import acquire_padded
+from beers_deploy.model.simulator.detector import Draw
+from beers_deploy.profiles.sensor import Sensor
+from beers_deploy.studies.detection.scenes import synthetic_scene
 
 STREAM = 0x64726177
 """Keeps the scenes of training apart from those that a study draws, whatever the seeds."""

@@ -14,15 +14,17 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.detector.export import detector_to_onnx
-from benchmarks.detector.pictures import Picture, picture_of
-from benchmarks.detector.training import DetectorRecipe, train_detector
-from deploy.results import Document, print_rows
-from deploy.studies.detection.average_precision import find_hits, score
-from deploy.studies.detection.boxes import Letterbox
-from deploy.studies.detection.detector import open_detector
-from deploy.studies.detection.scenes import CLASSES
-from deploy.studies.detection.study import (
+from beers_deploy.model.progress import steps
+from beers_deploy.model.simulator.detector import Draw
+from beers_deploy.profiles.figures import Figure, Row, measured, unavailable
+from beers_deploy.profiles.sensor_file import load_sensor, reference_for
+from beers_deploy.quant.onnx_file import save_onnx
+from beers_deploy.results import Document, print_rows
+from beers_deploy.studies.detection.average_precision import find_hits, score
+from beers_deploy.studies.detection.boxes import Letterbox
+from beers_deploy.studies.detection.detector import open_detector
+from beers_deploy.studies.detection.scenes import CLASSES
+from beers_deploy.studies.detection.study import (
     REFERENCE,
     AcquiredScene,
     LabelledScene,
@@ -31,13 +33,11 @@ from deploy.studies.detection.study import (
     synthetic_labelled,
     synthetic_scenes,
 )
-from deploy.studies.detection.tables import GAIN, PERCENT, POINTS, REGAINED
-from deploy.studies.evaluation.methods import DEGRADED, Method, method_named
-from model.progress import steps
-from model.simulator.detector import Draw
-from profiles.figures import Figure, Row, measured, unavailable
-from profiles.sensor_file import load_sensor, reference_for
-from quant.onnx_file import save_onnx
+from beers_deploy.studies.detection.tables import GAIN, PERCENT, POINTS, REGAINED
+from beers_deploy.studies.evaluation.methods import DEGRADED, Method, method_named
+from benchmarks.detector.export import detector_to_onnx
+from benchmarks.detector.pictures import Picture, picture_of
+from benchmarks.detector.training import DetectorRecipe, train_detector
 
 TABLE = "detector retrained for each row"
 SIDE_PX = 256

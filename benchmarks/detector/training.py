@@ -9,10 +9,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from beers_deploy.profiles.errors import ModelError
 from benchmarks.detector.network import STRIDE_PX, DetectorNetwork, initialise
 from benchmarks.detector.pictures import Picture
 from benchmarks.detector.targets import Targets, loss_of, targets_of
-from profiles.errors import ModelError
 
 
 @dataclass(frozen=True)

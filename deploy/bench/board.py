@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import onnx
 
-from deploy.bench.tables import (
+from beers_deploy.bench.tables import (
     PAPER_SIZE,
     PAPER_TARGET,
     PAPER_TILE_PX,
@@ -27,19 +27,19 @@ from deploy.bench.tables import (
     sweep_rows,
     within_words,
 )
-from deploy.dpu.board import Dpu, dpu_of
-from deploy.dpu.cost.latency import Prediction
-from deploy.dpu.cost.model import Task
-from deploy.dpu.cost.own_runs import read_own_runs
-from deploy.dpu.reading import own_tile_px
-from deploy.restoration.options import parse_halo
-from model.io.images import read_acquisition
-from profiles import load_target
-from profiles.errors import ModelError, OptionError
-from profiles.figures import Row
-from profiles.target import board_names
-from quant.onnx_file import load_onnx
-from quant.tiling.walk import tiling_of
+from beers_deploy.dpu.board import Dpu, dpu_of
+from beers_deploy.dpu.cost.latency import Prediction
+from beers_deploy.dpu.cost.model import Task
+from beers_deploy.dpu.cost.own_runs import read_own_runs
+from beers_deploy.dpu.reading import own_tile_px
+from beers_deploy.model.io.images import read_acquisition
+from beers_deploy.profiles import load_target
+from beers_deploy.profiles.errors import ModelError, OptionError
+from beers_deploy.profiles.figures import Row
+from beers_deploy.profiles.target import board_names
+from beers_deploy.quant.onnx_file import load_onnx
+from beers_deploy.quant.tiling.walk import tiling_of
+from beers_deploy.restoration.options import parse_halo
 
 TRAFFIC = "LdFM, StFM: feature maps loaded and stored, an image; LdWB: weights and biases loaded, a batch"
 ALL = "all"

@@ -14,15 +14,15 @@ import numpy as np
 import onnx
 import psutil
 
-from deploy.bench.timing import interleaved, node_rows, profile, timed
-from deploy.dpu.reading import inputs_of
-from deploy.host_state import cpu_load, resident_bytes
-from deploy.networks import other_precision
-from model.processor import require_cores
-from profiles import TargetProfile
-from profiles.figures import Figure, Row, measured, unavailable
-from quant.onnx_file import is_quantised, load_onnx
-from quant.session import open_session, require_finite
+from beers_deploy.bench.timing import interleaved, node_rows, profile, timed
+from beers_deploy.dpu.reading import inputs_of
+from beers_deploy.host_state import cpu_load, resident_bytes
+from beers_deploy.model.processor import require_cores
+from beers_deploy.networks import other_precision
+from beers_deploy.profiles import TargetProfile
+from beers_deploy.profiles.figures import Figure, Row, measured, unavailable
+from beers_deploy.quant.onnx_file import is_quantised, load_onnx
+from beers_deploy.quant.session import open_session, require_finite
 
 
 @dataclass

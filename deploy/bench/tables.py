@@ -10,9 +10,9 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from deploy.dpu.board import Dpu
-from deploy.dpu.checker.placement import place
-from deploy.dpu.cost.latency import (
+from beers_deploy.dpu.board import Dpu
+from beers_deploy.dpu.checker.placement import place
+from beers_deploy.dpu.cost.latency import (
     LayerCost,
     Prediction,
     counted_power,
@@ -21,12 +21,12 @@ from deploy.dpu.cost.latency import (
     layer_energy_j,
     predict,
 )
-from deploy.dpu.cost.model import Interval, Task, between
-from deploy.dpu.reading import read_network
-from deploy.restoration.plan import plan_side
-from profiles import TargetProfile
-from profiles.errors import OptionError
-from profiles.figures import Figure, Row, number, predicted, published, unavailable
+from beers_deploy.dpu.cost.model import Interval, Task, between
+from beers_deploy.dpu.reading import read_network
+from beers_deploy.profiles import TargetProfile
+from beers_deploy.profiles.errors import OptionError
+from beers_deploy.profiles.figures import Figure, Row, number, predicted, published, unavailable
+from beers_deploy.restoration.plan import plan_side
 
 TABLE, LAYERS = "bench", "layers"
 CHAIN = "chain_s_per_mpx"

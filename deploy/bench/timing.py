@@ -14,8 +14,8 @@ from typing import TypeVar
 import numpy as np
 import onnx
 
-from profiles.figures import Figure, Row, measured, unavailable
-from quant.session import open_session
+from beers_deploy.profiles.figures import Figure, Row, measured, unavailable
+from beers_deploy.quant.session import open_session
 
 RUNS = 5
 

@@ -8,16 +8,16 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from deploy.bench.host import conditions_of
-from deploy.bench.tables import TABLE, Swath, chain_rate, efficiency
-from deploy.bench.timing import timed
-from deploy.host_state import cpu_load
-from model.simulator.acquire import MARGIN_PX, simulate_pair
-from model.simulator.detector import Draw
-from model.simulator.procedural import procedural_scene
-from model.traditional.pipeline import Chain, restore_traditional
-from profiles import SensorProfile
-from profiles.figures import Figure, Row, measured, predicted
+from beers_deploy.bench.host import conditions_of
+from beers_deploy.bench.tables import TABLE, Swath, chain_rate, efficiency
+from beers_deploy.bench.timing import timed
+from beers_deploy.host_state import cpu_load
+from beers_deploy.model.simulator.acquire import MARGIN_PX, simulate_pair
+from beers_deploy.model.simulator.detector import Draw
+from beers_deploy.model.simulator.procedural import procedural_scene
+from beers_deploy.model.traditional.pipeline import Chain, restore_traditional
+from beers_deploy.profiles import SensorProfile
+from beers_deploy.profiles.figures import Figure, Row, measured, predicted
 
 CROP_PX, CROPS = 256, 3
 

@@ -7,15 +7,15 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from deploy.commands.shared import refuse, say
-from model.shipped import SENSOR
-from profiles.target import DEFAULT_TARGET, MODEL_SUFFIX, board_names
+from beers_deploy.commands.shared import refuse, say
+from beers_deploy.model.shipped import SENSOR
+from beers_deploy.profiles.target import DEFAULT_TARGET, MODEL_SUFFIX, board_names
 
 if TYPE_CHECKING:
     import numpy as np
 
-    from deploy.bench.tables import Swath
-    from profiles.figures import Row
+    from beers_deploy.bench.tables import Swath
+    from beers_deploy.profiles.figures import Row
 
 EXAMPLE = "bench --target vck190-model --size 13600x9016 --config C32B3"
 
@@ -100,21 +100,21 @@ def bench(
     json: Annotated[Path | None, typer.Option(help="Write the figures here.")] = None,
 ) -> None:
     """Compare a network on the DPU with the traditional pipeline and with the paper's figures."""
-    from deploy.bench.board import bench_board
-    from deploy.bench.tables import parse_tiles
-    from deploy.dpu.cost.model import TASKS
-    from deploy.networks import int8_file
-    from deploy.results import Document, print_rows
-    from model.io.files import require_writable
-    from profiles import load_sensor, load_target
-    from profiles.figures import by_table
+    from beers_deploy.bench.board import bench_board
+    from beers_deploy.bench.tables import parse_tiles
+    from beers_deploy.dpu.cost.model import TASKS
+    from beers_deploy.model.io.files import require_writable
+    from beers_deploy.networks import int8_file
+    from beers_deploy.profiles import load_sensor, load_target
+    from beers_deploy.profiles.figures import by_table
+    from beers_deploy.results import Document, print_rows
 
     tiles, here, board = parse_tiles(tile), target in HOSTS, target.removesuffix(MODEL_SUFFIX)
     _refuse_unused(context, here)
     require_writable(json, inputs=(model, image, measured, Path(target), Path(sensor)))
     path = int8_file(model, load_sensor(sensor), partial(say, err=True))
     if here:
-        from deploy.bench.host import host_rows
+        from beers_deploy.bench.host import host_rows
 
         rows = host_rows(path, load_target("host-cpu"), _single(tiles), threads)
         for table, part in by_table(rows).items():
@@ -161,9 +161,9 @@ def bench(
 
 def _traditional_row(dn: "np.ndarray | None", swath: "Swath") -> "Row":
     """Measured here: seconds, and torch is loaded for it; so it comes when all predictions have been shown."""
-    from deploy.bench.traditional import drawn_acquisition, measure_chain
-    from profiles import load_sensor
-    from profiles.sensor_file import REFERENCE
+    from beers_deploy.bench.traditional import drawn_acquisition, measure_chain
+    from beers_deploy.profiles import load_sensor
+    from beers_deploy.profiles.sensor_file import REFERENCE
 
     sensors = load_sensor(SENSOR), load_sensor(REFERENCE)
     return measure_chain(drawn_acquisition(swath, *sensors) if dn is None else dn, *sensors).row(swath)
@@ -181,7 +181,7 @@ def _refuse_unused(context: typer.Context, here: bool) -> None:
 
 
 def _single(tiles: list[int]) -> int:
-    from profiles.errors import OptionError
+    from beers_deploy.profiles.errors import OptionError
 
     if len(tiles) > 1:
         raise OptionError(

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from deploy.commands.shared import say
+from beers_deploy.commands.shared import say
 
 EXAMPLE = "characterise raw1.tif raw2.tif --bits 12 --out my-sensor.toml"
 
@@ -31,10 +31,10 @@ def characterise(
     The MTF needs straight edges between even areas: a target, a large roof, an apron. The noise needs raw pixels:
     what was denoised, sharpened or resampled is refused.
     """
-    from deploy.results import Document, print_rows
-    from deploy.studies.characterise import characterise as measure
-    from deploy.studies.characterise import profile_toml, read_box
-    from model.io.files import require_writable, write_text
+    from beers_deploy.model.io.files import require_writable, write_text
+    from beers_deploy.results import Document, print_rows
+    from beers_deploy.studies.characterise import characterise as measure
+    from beers_deploy.studies.characterise import profile_toml, read_box
 
     require_writable(out, json, inputs=images)
     boxes = tuple(read_box(text, images) for text in edge or ())

@@ -6,11 +6,11 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from deploy.commands.shared import BOARDS, say
-from profiles.target import DEFAULT_TARGET
+from beers_deploy.commands.shared import BOARDS, say
+from beers_deploy.profiles.target import DEFAULT_TARGET
 
 if TYPE_CHECKING:
-    from deploy.dpu.board import Dpu
+    from beers_deploy.dpu.board import Dpu
 
 EXAMPLE = "check network.onnx --target zcu102 --config B4096"
 TILE_PX = 640
@@ -38,12 +38,12 @@ def check(
     json: Annotated[Path | None, typer.Option(help="Write the findings here.")] = None,
 ) -> None:
     """Place every node of a network on the host, the DPU or the CPU; exit code 1 if the DPU cannot run its part."""
-    from deploy.dpu.board import load_dpu
-    from deploy.dpu.checker.picture import require_picture
-    from deploy.networks import int8_file
-    from model.io.files import require_writable
-    from model.shipped import SENSOR
-    from profiles import load_sensor
+    from beers_deploy.dpu.board import load_dpu
+    from beers_deploy.dpu.checker.picture import require_picture
+    from beers_deploy.model.io.files import require_writable
+    from beers_deploy.model.shipped import SENSOR
+    from beers_deploy.networks import int8_file
+    from beers_deploy.profiles import load_sensor
 
     require_picture(picture)
     path = int8_file(model, load_sensor(SENSOR), partial(say, err=True))
@@ -54,13 +54,13 @@ def check(
 
 def _network(path: Path, dpu: "Dpu", tile: int | None, picture: Path | None, json: Path | None) -> bool:
     """Judge a file; whether its core runs whole on the DPU."""
-    from deploy.dpu.checker.picture import write_picture
-    from deploy.dpu.checker.placement import place
-    from deploy.dpu.checker.table import legality, network_rows, summary
-    from deploy.dpu.reading import network_of, own_tile_px
-    from deploy.results import Document, print_rows
-    from quant.graph import refusal
-    from quant.onnx_file import load_onnx
+    from beers_deploy.dpu.checker.picture import write_picture
+    from beers_deploy.dpu.checker.placement import place
+    from beers_deploy.dpu.checker.table import legality, network_rows, summary
+    from beers_deploy.dpu.reading import network_of, own_tile_px
+    from beers_deploy.quant.graph import refusal
+    from beers_deploy.quant.onnx_file import load_onnx
+    from beers_deploy.results import Document, print_rows
 
     model = load_onnx(path, to_run=False)
     tile_px = tile or own_tile_px(model) or TILE_PX

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from deploy.commands.shared import say
+from beers_deploy.commands.shared import say
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -26,10 +26,10 @@ def compare(
 
     A figure named by --fail-on that the second document lacks fails too.
     """
-    from deploy.compare import broken, change_rows, parse_limit, read_document
-    from deploy.compare import compare as compare_documents
-    from deploy.results import Document, print_rows
-    from model.io.files import require_writable
+    from beers_deploy.compare import broken, change_rows, parse_limit, read_document
+    from beers_deploy.compare import compare as compare_documents
+    from beers_deploy.model.io.files import require_writable
+    from beers_deploy.results import Document, print_rows
 
     require_writable(json, inputs=(before, after))
     limits = [parse_limit(text) for text in fail_on or ()]

@@ -5,9 +5,9 @@ from typing import Annotated
 
 import typer
 
-from deploy.commands.shared import say
-from model.processor import SEEDS
-from model.shipped import SENSOR
+from beers_deploy.commands.shared import say
+from beers_deploy.model.processor import SEEDS
+from beers_deploy.model.shipped import SENSOR
 
 EXAMPLE = "demo --out demo"
 
@@ -26,11 +26,11 @@ def demo(
     json: Annotated[Path | None, typer.Option(help="Write the figures here.")] = None,
 ) -> None:
     """Simulate, quantise, gate, check, restore and predict, on a drawn scene or your image; ends with report.html."""
-    from deploy.report.page import write_report
-    from deploy.results import Document, print_rows
-    from deploy.studies.demo import FILES, run_demo
-    from model.io.files import require_writable
-    from profiles.errors import OptionError
+    from beers_deploy.model.io.files import require_writable
+    from beers_deploy.profiles.errors import OptionError
+    from beers_deploy.report.page import write_report
+    from beers_deploy.results import Document, print_rows
+    from beers_deploy.studies.demo import FILES, run_demo
 
     if full_scale is not None and image is None:
         raise OptionError("--full-scale", expected="--image beside it", got="none", remedy="leave it out")

@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from deploy.commands.shared import refuse, say
-from model.processor import SEEDS
+from beers_deploy.commands.shared import refuse, say
+from beers_deploy.model.processor import SEEDS
 
 if TYPE_CHECKING:
-    from deploy.studies.detection.study import Comparison
+    from beers_deploy.studies.detection.study import Comparison
 
 EXAMPLE = "detect --images DIOR/ --split test --detector yolo11n.onnx --sensor dior-medium --out detection/"
 SENSORS = "dior-medium,dior-high"
@@ -57,14 +57,14 @@ def detect(
     Average precision, precision and recall with intervals over sites, and the share of the loss that restoration
     regains. The detector is fixed, as one in service is.
     """
-    from deploy.results import Document
-    from deploy.studies.detection.average_precision import sites_note
-    from deploy.studies.detection.detector import open_detector, parse_classes
-    from deploy.studies.detection.page import write_page
-    from deploy.studies.detection.study import labelled_scenes, run_study, synthetic_scenes
-    from deploy.studies.detection.tables import detection_rows, headline, paper_rows
-    from model.io.files import require_writable
-    from model.shipped import DETECTOR
+    from beers_deploy.model.io.files import require_writable
+    from beers_deploy.model.shipped import DETECTOR
+    from beers_deploy.results import Document
+    from beers_deploy.studies.detection.average_precision import sites_note
+    from beers_deploy.studies.detection.detector import open_detector, parse_classes
+    from beers_deploy.studies.detection.page import write_page
+    from beers_deploy.studies.detection.study import labelled_scenes, run_study, synthetic_scenes
+    from beers_deploy.studies.detection.tables import detection_rows, headline, paper_rows
 
     _refuse_unused(context)
     names = list(dict.fromkeys(["degraded", *(name.strip() for name in methods.split(","))]))
@@ -102,9 +102,9 @@ def _refuse_unused(context: typer.Context) -> None:
 
 def show(compared: "Sequence[Comparison]") -> None:
     """The tables that answer the question, and the paper's."""
-    from deploy.results import print_rows
-    from deploy.studies.detection.tables import main_rows, paper_rows
-    from profiles.figures import by_table
+    from beers_deploy.profiles.figures import by_table
+    from beers_deploy.results import print_rows
+    from beers_deploy.studies.detection.tables import main_rows, paper_rows
 
     mains = [row for each in compared for row in main_rows(each)]
     for table, rows in by_table([*mains, *paper_rows()]).items():

@@ -5,9 +5,9 @@ from typing import Annotated
 
 import typer
 
-from deploy.commands.shared import say
-from model.processor import SEEDS
-from model.shipped import SENSOR
+from beers_deploy.commands.shared import say
+from beers_deploy.model.processor import SEEDS
+from beers_deploy.model.shipped import SENSOR
 
 EXAMPLE = "evaluate --images aerial/ --methods degraded,traditional,convbeers-s,convbeers-s-int8 --out report/"
 
@@ -47,12 +47,12 @@ def evaluate(
     figures; so do shipped networks, unless their name ends with
     @blind or with @ and another sensor.
     """
-    from deploy.results import Document, print_rows
-    from deploy.studies.evaluation.page import write_page
-    from deploy.studies.evaluation.run import run_evaluation
-    from model.io.files import require_writable
-    from profiles.errors import OptionError
-    from profiles.figures import by_table
+    from beers_deploy.model.io.files import require_writable
+    from beers_deploy.profiles.errors import OptionError
+    from beers_deploy.profiles.figures import by_table
+    from beers_deploy.results import Document, print_rows
+    from beers_deploy.studies.evaluation.page import write_page
+    from beers_deploy.studies.evaluation.run import run_evaluation
 
     if pairs is not None and (images is not None or sweep):
         expected = "no --images or --sweep beside it: pairs are as they are"

@@ -6,8 +6,8 @@ from typing import Annotated
 
 import typer
 
-from deploy.commands.shared import refuse, say
-from model.shipped import SENSOR, VARIANT
+from beers_deploy.commands.shared import refuse, say
+from beers_deploy.model.shipped import SENSOR, VARIANT
 
 EXAMPLE = "export --variant convbeers-s --out float.onnx"
 
@@ -51,14 +51,14 @@ def export(
     anew. What the sensor changes can be sent by itself: --delta writes it, and --apply makes the file of any sensor
     that sensor's, to the byte.
     """
-    from deploy.export import about, float_for, require_parity, to_onnx, torch_network
-    from deploy.networks import warn_outside, weights_file
-    from model.io.files import require_writable
-    from model.io.tensors import is_conditioned, read_plain
-    from model.shipped import shipped_weights
-    from profiles import load_sensor
-    from profiles.errors import ModelError
-    from quant.onnx_file import save_onnx
+    from beers_deploy.export import about, float_for, require_parity, to_onnx, torch_network
+    from beers_deploy.model.io.files import require_writable
+    from beers_deploy.model.io.tensors import is_conditioned, read_plain
+    from beers_deploy.model.shipped import shipped_weights
+    from beers_deploy.networks import warn_outside, weights_file
+    from beers_deploy.profiles import load_sensor
+    from beers_deploy.profiles.errors import ModelError
+    from beers_deploy.quant.onnx_file import save_onnx
 
     if checkpoint is not None:
         refuse(context, ["variant"], expected="no --checkpoint beside it", got="both", remedy="leave one out")
@@ -110,14 +110,14 @@ def _export_int8(
         OptionError: a delta and a sensor, or a tile that is no multiple of the network's scale.
         ModelError: no such INT8 file, or a delta of another.
     """
-    from deploy.export import require_tile
-    from deploy.networks import told_by_delta, told_int8
-    from model.io.files import whole_file
-    from profiles import load_sensor
-    from profiles.errors import OptionError
-    from quant.banked.family import delta_of_file
-    from quant.encodings import board_model, host_model, read_core
-    from quant.onnx_file import fixed_tile_px, load_onnx, metadata, save_onnx
+    from beers_deploy.export import require_tile
+    from beers_deploy.model.io.files import whole_file
+    from beers_deploy.networks import told_by_delta, told_int8
+    from beers_deploy.profiles import load_sensor
+    from beers_deploy.profiles.errors import OptionError
+    from beers_deploy.quant.banked.family import delta_of_file
+    from beers_deploy.quant.encodings import board_model, host_model, read_core
+    from beers_deploy.quant.onnx_file import fixed_tile_px, load_onnx, metadata, save_onnx
 
     if apply is not None and (sensor or delta):
         remedy = "leave one out: the delta brings its sensor"

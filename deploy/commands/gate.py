@@ -7,10 +7,10 @@ from typing import Annotated
 
 import typer
 
-from deploy.commands.shared import BOARDS, say
-from model.processor import SEEDS
-from model.shipped import SENSOR
-from profiles.target import DEFAULT_TARGET
+from beers_deploy.commands.shared import BOARDS, say
+from beers_deploy.model.processor import SEEDS
+from beers_deploy.model.shipped import SENSOR
+from beers_deploy.profiles.target import DEFAULT_TARGET
 
 EXAMPLE = "gate float.onnx int8.onnx --max-mae 0.0007"
 
@@ -52,10 +52,10 @@ def gate(
     Also checked: what saturates inside, the DPU's rules, that no ReLU was lost, and that onnxruntime's optimisations
     change no bit.
     """
-    from deploy.gate import Request, files_or_shipped, junit_text, run_gate, sentence
-    from deploy.results import print_rows
-    from model.io.files import require_writable, write_text
-    from quant.gate import read_limits
+    from beers_deploy.gate import Request, files_or_shipped, junit_text, run_gate, sentence
+    from beers_deploy.model.io.files import require_writable, write_text
+    from beers_deploy.quant.gate import read_limits
+    from beers_deploy.results import print_rows
 
     read = (float_model, int8_model, config, baseline, images, data, *map(Path, (target, sensor)))
     require_writable(json, junit, inputs=read)

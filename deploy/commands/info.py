@@ -6,9 +6,9 @@ from typing import Annotated
 
 import typer
 
-from deploy.commands.shared import say
-from deploy.restoration.options import TILE_PX, Options
-from profiles.target import DEFAULT_TARGET
+from beers_deploy.commands.shared import say
+from beers_deploy.profiles.target import DEFAULT_TARGET
+from beers_deploy.restoration.options import TILE_PX, Options
 
 EXAMPLE = "info raw.jp2"
 
@@ -39,13 +39,13 @@ def info(
     Size, type, full scale and who states it, place on Earth, missing pixels; the plan of `restore` with its defaults.
     No pixel is read but of PNG, JPEG and TIFFs of several pages. Time here is unavailable without --measure.
     """
-    from deploy.info import info_row
-    from deploy.networks import network_file
-    from deploy.restoration.index_files import index_files
-    from deploy.results import Document, print_rows
-    from model.io.files import require_writable
-    from profiles import load_sensor, load_target
-    from profiles.sensor_file import BLIND
+    from beers_deploy.info import info_row
+    from beers_deploy.model.io.files import require_writable
+    from beers_deploy.networks import network_file
+    from beers_deploy.profiles import load_sensor, load_target
+    from beers_deploy.profiles.sensor_file import BLIND
+    from beers_deploy.restoration.index_files import index_files
+    from beers_deploy.results import Document, print_rows
 
     tiles = index_files(image, trust_index)
     require_writable(json, inputs=(image, *tiles, model, Path(sensor) if sensor else None, Path(target)))

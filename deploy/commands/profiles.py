@@ -4,14 +4,14 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from deploy.commands.shared import say
+from beers_deploy.commands.shared import say
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from profiles import SensorProfile
-    from profiles.constant import Constant, Words
-    from profiles.effects import Table
+    from beers_deploy.profiles import SensorProfile
+    from beers_deploy.profiles.constant import Constant, Words
+    from beers_deploy.profiles.effects import Table
 
     Row = tuple[str, str, str, str]
 
@@ -33,9 +33,9 @@ def profiles(
         return
     from rich.table import Table
 
-    from deploy.results import default_console, plain
-    from profiles import load_sensor, load_target, sensor_names, target_names
-    from profiles.scene_call import load_scene_call, scene_names
+    from beers_deploy.profiles import load_sensor, load_target, sensor_names, target_names
+    from beers_deploy.profiles.scene_call import load_scene_call, scene_names
+    from beers_deploy.results import default_console, plain
 
     table = Table("name" if name is None else "constant", title_justify="left")
     if name is None:
@@ -59,11 +59,11 @@ def profiles(
 
 def _file_text(name: str | None) -> str:
     """The TOML of a profile that can be read as one."""
-    from model.shipped import SENSOR
-    from profiles import sensor_names
-    from profiles.errors import OptionError
-    from profiles.scene_call import scene_names
-    from profiles.toml import profile_path
+    from beers_deploy.model.shipped import SENSOR
+    from beers_deploy.profiles import sensor_names
+    from beers_deploy.profiles.errors import OptionError
+    from beers_deploy.profiles.scene_call import scene_names
+    from beers_deploy.profiles.toml import profile_path
 
     if name is None:
         remedy = f"name one, such as {SENSOR}"
@@ -75,10 +75,10 @@ def _file_text(name: str | None) -> str:
 
 def _shown(name: str) -> "tuple[str, list[Row]]":
     """Title and rows (constant, value, status, source) of a sensor, a scene or a target, tried in that order."""
-    from profiles import load_sensor, load_target, sensor_names, target_names
-    from profiles.errors import OptionError
-    from profiles.scene_call import load_scene_call, scene_names
-    from profiles.toml import read_toml
+    from beers_deploy.profiles import load_sensor, load_target, sensor_names, target_names
+    from beers_deploy.profiles.errors import OptionError
+    from beers_deploy.profiles.scene_call import load_scene_call, scene_names
+    from beers_deploy.profiles.toml import read_toml
 
     if name in sensor_names() or (name.endswith(".toml") and "mtf" in read_toml("sensors", name)[1]):
         sensor = load_sensor(name)
@@ -103,7 +103,7 @@ def _shown(name: str) -> "tuple[str, list[Row]]":
 
 
 def _sensor_rows(sensor: "SensorProfile") -> "list[Row]":
-    from profiles.sensor import TABLES, constant_keys
+    from beers_deploy.profiles.sensor import TABLES, constant_keys
 
     rows: list[Row] = []
     for table in TABLES:
@@ -115,7 +115,7 @@ def _sensor_rows(sensor: "SensorProfile") -> "list[Row]":
 
 def _response(sensor: "SensorProfile") -> "list[Row]":
     """A table's numbers, or what a point-spread function is made of."""
-    from profiles.response import MtfTable
+    from beers_deploy.profiles.response import MtfTable
 
     response, said = sensor.response, (sensor.mtf_nyquist.status, sensor.mtf_nyquist.source)
     if response is None:

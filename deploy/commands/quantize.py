@@ -7,10 +7,10 @@ from typing import Annotated
 
 import typer
 
-from deploy.commands.shared import BOARDS, say
-from model.processor import SEEDS
-from model.shipped import SENSOR
-from profiles.target import DEFAULT_TARGET
+from beers_deploy.commands.shared import BOARDS, say
+from beers_deploy.model.processor import SEEDS
+from beers_deploy.model.shipped import SENSOR
+from beers_deploy.profiles.target import DEFAULT_TARGET
 
 EXAMPLE = "quantize float.onnx --target zcu104 --sensor pleiades-degraded --out int8.onnx"
 
@@ -60,12 +60,12 @@ def quantize(
 
     Prints each integer layer: bits of its accumulator, seen and proven, and the share of saturated results.
     """
-    from deploy.export import float_model
-    from deploy.networks import conditioned, float_file
-    from deploy.results import Document, print_rows
-    from model.io.files import require_writable
-    from profiles import load_sensor, load_target
-    from profiles.errors import OptionError
+    from beers_deploy.export import float_model
+    from beers_deploy.model.io.files import require_writable
+    from beers_deploy.networks import conditioned, float_file
+    from beers_deploy.profiles import load_sensor, load_target
+    from beers_deploy.profiles.errors import OptionError
+    from beers_deploy.results import Document, print_rows
 
     if regime is Regime.free and (board or report or finetune):
         remedy = "leave it out, or take --regime legal"
@@ -83,9 +83,9 @@ def quantize(
     network = float_model(model)
 
     # These take torch, seconds: what is wrong with the options or the files has been said by now.
-    from deploy.quantise import quantise_banked_file, quantise_free_file, quantise_legal_file
-    from quant.calibration import Calibration
-    from quant.samples import samples_of
+    from beers_deploy.quant.calibration import Calibration
+    from beers_deploy.quant.samples import samples_of
+    from beers_deploy.quantise import quantise_banked_file, quantise_free_file, quantise_legal_file
 
     simulated = Calibration(sensor, images, patches, patch, seed)
     calibration = samples_of(network, data) or simulated

@@ -7,8 +7,8 @@ from typing import Annotated
 
 import typer
 
-from deploy.commands.shared import refuse, say
-from deploy.restoration.options import TILE_PX, Compression, Options, Runtime
+from beers_deploy.commands.shared import refuse, say
+from beers_deploy.restoration.options import TILE_PX, Compression, Options, Runtime
 
 EXAMPLE = "restore raw.tif restored.tif"
 NETWORK_ONLY = ("model", "tile", "halo", "resume", "runtime", "threads", "scheduler", "cog", "stac")
@@ -80,15 +80,15 @@ def restore(
     .OUT.part beside it. With --scheduler this process reads and writes, and sends tiles to the workers: where they
     are of one processor and the same versions, the bytes are those of a run without.
     """
-    from deploy.networks import conditioned, network_file
-    from deploy.restoration.bands import parse_sensors
-    from deploy.restoration.run import restore_file
-    from deploy.restoration.stac import require_stac, write_item
-    from deploy.results import Document, print_rows
-    from model.io.files import require_writable
-    from model.shipped import INT8
-    from profiles.errors import OptionError
-    from profiles.sensor_file import BLIND, load_sensor
+    from beers_deploy.model.io.files import require_writable
+    from beers_deploy.model.shipped import INT8
+    from beers_deploy.networks import conditioned, network_file
+    from beers_deploy.profiles.errors import OptionError
+    from beers_deploy.profiles.sensor_file import BLIND, load_sensor
+    from beers_deploy.restoration.bands import parse_sensors
+    from beers_deploy.restoration.run import restore_file
+    from beers_deploy.restoration.stac import require_stac, write_item
+    from beers_deploy.results import Document, print_rows
 
     budget_bytes = max(int(memory * 1e9), 1) if memory else None
     sensors = parse_sensors(sensor or BLIND)
@@ -158,11 +158,11 @@ def _by_the_chain(
     trust_index: bool,
     json: Path | None,
 ) -> None:
-    from deploy.restoration.traditional import Request, restore_file_traditionally
-    from deploy.results import Document, print_rows
-    from profiles import load_sensor
-    from profiles.errors import OptionError
-    from profiles.sensor_file import reference_for
+    from beers_deploy.profiles import load_sensor
+    from beers_deploy.profiles.errors import OptionError
+    from beers_deploy.profiles.sensor_file import reference_for
+    from beers_deploy.restoration.traditional import Request, restore_file_traditionally
+    from beers_deploy.results import Document, print_rows
 
     if sensor is None:
         remedy = "name a profile ('beers-deploy profiles' lists them) or give your .toml file"

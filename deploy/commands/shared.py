@@ -4,8 +4,8 @@ from collections.abc import Iterable
 
 import typer
 
-from profiles.errors import OptionError, visible
-from profiles.target import board_names
+from beers_deploy.profiles.errors import OptionError, visible
+from beers_deploy.profiles.target import board_names
 
 BOARDS = f"{', '.join(board_names())}, or your .toml file"
 """What --target takes, for its help."""

@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from deploy.commands.shared import refuse, say
-from model.processor import SEEDS
-from model.shipped import SENSOR
+from beers_deploy.commands.shared import refuse, say
+from beers_deploy.model.processor import SEEDS
+from beers_deploy.model.shipped import SENSOR
 
 if TYPE_CHECKING:
-    from model.simulator.plan import Plan
+    from beers_deploy.model.simulator.plan import Plan
 
 EXAMPLE = "simulate aerial.png --sensor pleiades-degraded --out pairs"
 
@@ -78,15 +78,15 @@ def simulate(
     import math
     import os
 
-    from deploy.cluster import open_cluster
-    from model.dataset import DatasetRecipe, plan_windows, write_dataset
-    from model.io.files import require_writable
-    from model.processor import require_cores
-    from model.progress import steps
-    from profiles import load_sensor
-    from profiles.errors import OptionError
-    from profiles.scene_call import calling_for, load_scene_call, origins
-    from profiles.sensor_file import reference_beside
+    from beers_deploy.cluster import open_cluster
+    from beers_deploy.model.dataset import DatasetRecipe, plan_windows, write_dataset
+    from beers_deploy.model.io.files import require_writable
+    from beers_deploy.model.processor import require_cores
+    from beers_deploy.model.progress import steps
+    from beers_deploy.profiles import load_sensor
+    from beers_deploy.profiles.errors import OptionError
+    from beers_deploy.profiles.scene_call import calling_for, load_scene_call, origins
+    from beers_deploy.profiles.sensor_file import reference_beside
 
     if out is None:
         expected, remedy = "--out beside it", "leave it out, or give a folder"
@@ -132,7 +132,7 @@ def simulate(
 
 
 def _preset(name: str | None) -> Preset:
-    from profiles.errors import OptionError
+    from beers_deploy.profiles.errors import OptionError
 
     if name is None:
         return PRESETS["paper-fixed"]
@@ -143,10 +143,10 @@ def _preset(name: str | None) -> Preset:
 
 def _explain(recipe: object, origins: Mapping[str, str]) -> None:
     """The plan of the first draw of the degraded sensor, for every scene."""
-    from model.dataset import DatasetRecipe, load
-    from model.simulator.acquire import prepare_scene
-    from model.simulator.detector import Draw
-    from model.simulator.plan import make_plan
+    from beers_deploy.model.dataset import DatasetRecipe, load
+    from beers_deploy.model.simulator.acquire import prepare_scene
+    from beers_deploy.model.simulator.detector import Draw
+    from beers_deploy.model.simulator.plan import make_plan
 
     assert isinstance(recipe, DatasetRecipe)  # noqa: S101 - imported late, for a quick --help
     for index in range(len(recipe.scenes)):
@@ -160,7 +160,7 @@ def _explain(recipe: object, origins: Mapping[str, str]) -> None:
 def _print_plan(title: str, plan: "Plan", origins: Mapping[str, str]) -> None:
     from rich.table import Table
 
-    from deploy.results import default_console, plain
+    from beers_deploy.results import default_console, plain
 
     table = Table("effect", "from", "decision", "why", "bound DN", "cost", title=plain(title), title_justify="left")
     for d in plan.decisions:

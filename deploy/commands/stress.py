@@ -6,14 +6,14 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from deploy.commands.shared import BOARDS, refuse, say
-from model.processor import SEEDS
-from model.shipped import SENSOR, VARIANT
-from profiles.target import DEFAULT_TARGET
+from beers_deploy.commands.shared import BOARDS, refuse, say
+from beers_deploy.model.processor import SEEDS
+from beers_deploy.model.shipped import SENSOR, VARIANT
+from beers_deploy.profiles.target import DEFAULT_TARGET
 
 if TYPE_CHECKING:
-    from deploy.studies.stress.bit_flips import FlipRequest
-    from deploy.studies.stress.networks import Subject
+    from beers_deploy.studies.stress.bit_flips import FlipRequest
+    from beers_deploy.studies.stress.networks import Subject
 
 EXAMPLE = "stress float.onnx int8.onnx --out stability.md"
 
@@ -67,8 +67,10 @@ def stress(
     --bit-flips: what bit flips in weights, shifts, maps and the image cost, what guards buy back, and what
     these cost on the board.
     """
-    from deploy.results import Document, print_rows
-    from deploy.studies.stress.battery import (
+    from beers_deploy.model.io.files import require_writable, write_text
+    from beers_deploy.profiles.figures import by_table
+    from beers_deploy.results import Document, print_rows
+    from beers_deploy.studies.stress.battery import (
         battery_rows,
         chosen,
         finding_rows,
@@ -78,12 +80,10 @@ def stress(
         run_battery,
         worst_rows,
     )
-    from deploy.studies.stress.bit_flips import FlipRequest
-    from deploy.studies.stress.cases import CASES
-    from deploy.studies.stress.networks import STAGES, open_subject
-    from deploy.studies.stress.tables import markdown, title
-    from model.io.files import require_writable, write_text
-    from profiles.figures import by_table
+    from beers_deploy.studies.stress.bit_flips import FlipRequest
+    from beers_deploy.studies.stress.cases import CASES
+    from beers_deploy.studies.stress.networks import STAGES, open_subject
+    from beers_deploy.studies.stress.tables import markdown, title
 
     _refuse_unused(context, float_model, bit_flips)
     picture = _picture_beside(out, json) if bit_flips else None
@@ -138,11 +138,11 @@ def _flip_bits(
     """Inject, print, and write what was asked for: tables, curves, figures."""
     from dataclasses import asdict
 
-    from deploy.results import Document, print_rows
-    from deploy.studies.stress.bit_flips import flip_curves_svg, flip_rows
-    from deploy.studies.stress.tables import markdown, title
-    from model.io.files import write_text
-    from profiles.figures import by_table
+    from beers_deploy.model.io.files import write_text
+    from beers_deploy.profiles.figures import by_table
+    from beers_deploy.results import Document, print_rows
+    from beers_deploy.studies.stress.bit_flips import flip_curves_svg, flip_rows
+    from beers_deploy.studies.stress.tables import markdown, title
 
     out, picture, json = wanted
     rows = flip_rows(subject, request)
@@ -156,7 +156,7 @@ def _flip_bits(
 
 def _picture_beside(out: Path | None, json: Path | None) -> Path | None:
     """Where the curves go: beside the tables, over nothing else that is written."""
-    from profiles.errors import OptionError
+    from beers_deploy.profiles.errors import OptionError
 
     if out is None:
         return None

@@ -6,15 +6,15 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from deploy.commands.shared import refuse, say
-from model.processor import SEEDS
-from model.shipped import SENSOR
-from profiles.target import DEFAULT_TARGET, board_names
+from beers_deploy.commands.shared import refuse, say
+from beers_deploy.model.processor import SEEDS
+from beers_deploy.model.shipped import SENSOR
+from beers_deploy.profiles.target import DEFAULT_TARGET, board_names
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from deploy.studies.tradeoff.advice import Constraint
+    from beers_deploy.studies.tradeoff.advice import Constraint
 
 EXAMPLE = "tradeoff --images aerial/ --out study/ --budget 'latency<=20s'"
 PAPER_SIZE = "13600x9016"
@@ -83,15 +83,15 @@ def tradeoff(
     Measurements are kept: a second run, or one that was stopped, measures only what is missing. Exit code 1 where no
     point keeps --budget and --need; the page is written all the same.
     """
-    from deploy.bench.tables import parse_size
-    from deploy.results import Document, print_rows
-    from deploy.studies.tradeoff.advice import parse_constraints
-    from deploy.studies.tradeoff.page import FILES, write_study
-    from deploy.studies.tradeoff.points import parse_targets
-    from deploy.studies.tradeoff.run import run_study
-    from model.io.files import require_writable
-    from model.shipped import shipped_names
-    from profiles.sensor_file import REFERENCE, load_sensor, reference_beside
+    from beers_deploy.bench.tables import parse_size
+    from beers_deploy.model.io.files import require_writable
+    from beers_deploy.model.shipped import shipped_names
+    from beers_deploy.profiles.sensor_file import REFERENCE, load_sensor, reference_beside
+    from beers_deploy.results import Document, print_rows
+    from beers_deploy.studies.tradeoff.advice import parse_constraints
+    from beers_deploy.studies.tradeoff.page import FILES, write_study
+    from beers_deploy.studies.tradeoff.points import parse_targets
+    from beers_deploy.studies.tradeoff.run import run_study
 
     log = partial(say, err=True)
     limits = {name: parse_constraints(f"--{name}", text) for name, text in (("budget", budget), ("need", need))}
@@ -141,7 +141,7 @@ def tradeoff(
 
 def _refuse_unlabelled(context: typer.Context, limits: "Mapping[str, Sequence[Constraint]]") -> None:
     """Refuse what only labelled pictures have: a detector, its classes, and limits on what it finds."""
-    from deploy.studies.tradeoff.advice import MAP50
+    from beers_deploy.studies.tradeoff.advice import MAP50
 
     named = [option for option, asked in limits.items() if any(each.key == MAP50 for each in asked)]
     remedy = "give labelled pictures, or leave it out"

@@ -6,8 +6,8 @@ from typing import Annotated
 
 import typer
 
-from deploy.commands.shared import refuse, say
-from model.processor import SEEDS
+from beers_deploy.commands.shared import refuse, say
+from beers_deploy.model.processor import SEEDS
 
 EXAMPLE = "train --variant convbeers-s --images aerial/ --out runs/s --steps 20000"
 RANGE = "pleiades-variable"
@@ -93,17 +93,17 @@ def train(
     """
     from typing import get_args
 
-    from deploy.networks import weights_file
-    from model.family import SensorFamily
-    from model.io.files import require_writable
-    from model.recipe import profiles_for, read_pairs_recipe
-    from model.training.checkpoint import Optimiser, TrainingRecipe
-    from model.training.losses import LossWeights
-    from model.training.patches import PatchRecipe
-    from model.training.run import FILES, Run, weights_name
-    from model.training.run import train as run_training
-    from model.training.workers import joined
-    from profiles.errors import OptionError
+    from beers_deploy.model.family import SensorFamily
+    from beers_deploy.model.io.files import require_writable
+    from beers_deploy.model.recipe import profiles_for, read_pairs_recipe
+    from beers_deploy.model.training.checkpoint import Optimiser, TrainingRecipe
+    from beers_deploy.model.training.losses import LossWeights
+    from beers_deploy.model.training.patches import PatchRecipe
+    from beers_deploy.model.training.run import FILES, Run, weights_name
+    from beers_deploy.model.training.run import train as run_training
+    from beers_deploy.model.training.workers import joined
+    from beers_deploy.networks import weights_file
+    from beers_deploy.profiles.errors import OptionError
 
     if optimiser not in get_args(Optimiser):
         raise OptionError("--optimiser", expected="adam or adamw", got=repr(optimiser), remedy="pick one")

@@ -3,10 +3,10 @@
 from dataclasses import dataclass
 from functools import cached_property
 
-from profiles import TargetProfile, load_target
-from profiles.constant import Constant
-from profiles.errors import OptionError, ProfileError
-from profiles.target import board_names
+from beers_deploy.profiles import TargetProfile, load_target
+from beers_deploy.profiles.constant import Constant
+from beers_deploy.profiles.errors import OptionError, ProfileError
+from beers_deploy.profiles.target import board_names
 
 SMALLEST, LARGEST = 1e-30, 1e30
 CONFIGURATION = {"cores": 1.0, "batch_handlers": 1.0, "cpb": 1.0, "peak_tops": SMALLEST}

@@ -9,7 +9,7 @@ import numpy as np
 import onnx
 from onnx import TensorProto, helper, shape_inference
 
-from profiles.errors import ModelError
+from beers_deploy.profiles.errors import ModelError
 
 Kind = Literal[
     "conv",

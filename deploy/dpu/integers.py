@@ -15,7 +15,7 @@ import numpy as np
 import onnx
 from onnx import TensorProto, numpy_helper
 
-from deploy.dpu.graph import Scale
+from beers_deploy.dpu.graph import Scale
 
 FORMATS: dict[str, dict[int, tuple[int, int]]] = {
     "QLinearConv": {0: (1, 2), 3: (4, 5), -1: (6, 7)},

@@ -14,14 +14,14 @@ import numpy as np
 import onnx
 from onnx import TensorProto, helper, numpy_helper
 
-from deploy.dpu.graph import Kind, Network, Operation, Shape, Window, out_shape, padding
-from deploy.dpu.integers import Integers
-from model.bank import LARGEST
-from profiles.errors import ModelError
-from quant.encodings import BORDER_PX, PLACE_PX, as_on_board
-from quant.graph.trials import with_shuffles
-from quant.onnx_file import load_onnx, metadata
-from quant.untrusted import contradictions
+from beers_deploy.dpu.graph import Kind, Network, Operation, Shape, Window, out_shape, padding
+from beers_deploy.dpu.integers import Integers
+from beers_deploy.model.bank import LARGEST
+from beers_deploy.profiles.errors import ModelError
+from beers_deploy.quant.encodings import BORDER_PX, PLACE_PX, as_on_board
+from beers_deploy.quant.graph.trials import with_shuffles
+from beers_deploy.quant.onnx_file import load_onnx, metadata
+from beers_deploy.quant.untrusted import contradictions
 
 KINDS: dict[str, Kind] = {
     "Conv": "conv",

@@ -8,10 +8,10 @@ from pathlib import Path
 
 import jinja2
 
-from deploy import __version__
-from deploy.results import missing, unit_of
-from model.io.files import write_text
-from profiles.figures import Figure, Row
+from beers_deploy import __version__
+from beers_deploy.model.io.files import write_text
+from beers_deploy.profiles.figures import Figure, Row
+from beers_deploy.results import missing, unit_of
 
 INTERVAL = re.compile(r"\[[^\[\]]*\]")
 

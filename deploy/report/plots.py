@@ -18,14 +18,14 @@ from xml.etree import ElementTree as ET
 import numpy as np
 from markupsafe import Markup
 
-from model.io.images import MAX_DN
-from profiles.figures import number
+from beers_deploy.model.io.images import MAX_DN
+from beers_deploy.profiles.figures import number
 
 if TYPE_CHECKING:
     from matplotlib.axis import Axis
     from matplotlib.figure import Figure
 
-    from quant.sensitivity import Spread  # which would load torch for a plot
+    from beers_deploy.quant.sensitivity import Spread  # which would load torch for a plot
 
 PX_PER_INCH = 72
 FONT_PX, TITLE_PX = 13, 15

@@ -5,14 +5,14 @@ from collections.abc import Sequence
 import numpy as np
 import onnxruntime as ort
 
-from deploy.report.page import Picture, Report, Table
-from deploy.report.plots import histogram_url
-from model.io.images import MAX_DN
-from model.io.pictures import error_row, grid, picture_url, stretch_of, strip_row
-from profiles.figures import Row, by_table
-from quant.calibration import Patches
-from quant.sensitivity import Spread
-from quant.session import run
+from beers_deploy.model.io.images import MAX_DN
+from beers_deploy.model.io.pictures import error_row, grid, picture_url, stretch_of, strip_row
+from beers_deploy.profiles.figures import Row, by_table
+from beers_deploy.quant.calibration import Patches
+from beers_deploy.quant.sensitivity import Spread
+from beers_deploy.quant.session import run
+from beers_deploy.report.page import Picture, Report, Table
+from beers_deploy.report.plots import histogram_url
 
 ZOOM = 2
 WHITE_SHARE = 0.999

@@ -9,10 +9,10 @@ from pathlib import Path
 
 import onnx
 
-from deploy.restoration.index_files import NoDoctype
-from deploy.restoration.source import Raster
-from profiles.errors import ModelError, OptionError
-from quant.tiling.walk import tiling_of
+from beers_deploy.profiles.errors import ModelError, OptionError
+from beers_deploy.quant.tiling.walk import tiling_of
+from beers_deploy.restoration.index_files import NoDoctype
+from beers_deploy.restoration.source import Raster
 
 METADATA_TAG = 42112
 """GDAL's own of a TIFF, where bands' names stand (https://gdal.org/en/stable/drivers/raster/gtiff.html)."""

@@ -13,12 +13,12 @@ from typing import Any
 
 import onnx
 
-from deploy.restoration.gdal_source import ENVIRONMENT, LEAST_CACHE_BYTES, OFFLINE
-from deploy.restoration.options import Compression
-from deploy.restoration.output import padded_px
-from deploy.restoration.radiometry import FullScale
-from profiles.errors import MachineError
-from quant.onnx_file import metadata
+from beers_deploy.profiles.errors import MachineError
+from beers_deploy.quant.onnx_file import metadata
+from beers_deploy.restoration.gdal_source import ENVIRONMENT, LEAST_CACHE_BYTES, OFFLINE
+from beers_deploy.restoration.options import Compression
+from beers_deploy.restoration.output import padded_px
+from beers_deploy.restoration.radiometry import FullScale
 
 CODECS = {
     Compression.none: "NONE",

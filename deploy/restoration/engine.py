@@ -13,14 +13,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from deploy.restoration.plan import Plan, Span
-from deploy.restoration.radiometry import require_room
-from deploy.restoration.runtime import Infer
-from deploy.restoration.source import ArraySource, Raster, Source
-from model.io.images import MAX_DN, remedy_outside
-from profiles.errors import ImageError, ModelError
-from quant.tiling.walk import Tiling
-from quant.untrusted import times
+from beers_deploy.model.io.images import MAX_DN, remedy_outside
+from beers_deploy.profiles.errors import ImageError, ModelError
+from beers_deploy.quant.tiling.walk import Tiling
+from beers_deploy.quant.untrusted import times
+from beers_deploy.restoration.plan import Plan, Span
+from beers_deploy.restoration.radiometry import require_room
+from beers_deploy.restoration.runtime import Infer
+from beers_deploy.restoration.source import ArraySource, Raster, Source
 
 NAME = "image"
 """What messages call an image that came without a file."""

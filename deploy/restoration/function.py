@@ -5,11 +5,11 @@ from collections.abc import Callable
 import numpy as np
 import onnx
 
-from deploy.restoration.engine import restore_dn
-from deploy.restoration.options import TILE_PX, Runtime
-from deploy.restoration.plan import make_plan
-from deploy.restoration.runtime import Infer, open_runtime
-from quant.tiling.walk import tiling_of
+from beers_deploy.quant.tiling.walk import tiling_of
+from beers_deploy.restoration.engine import restore_dn
+from beers_deploy.restoration.options import TILE_PX, Runtime
+from beers_deploy.restoration.plan import make_plan
+from beers_deploy.restoration.runtime import Infer, open_runtime
 
 Restore = Callable[[np.ndarray], np.ndarray]
 """Degraded digital numbers (H, W) float32 to restored ones."""

@@ -19,8 +19,9 @@ from typing import Any
 import numpy as np
 import tifffile
 
-from deploy.restoration.index_files import dimap_bits, index_files, is_index
-from deploy.restoration.source import (
+from beers_deploy.profiles.errors import BeersError, ImageError, MachineError
+from beers_deploy.restoration.index_files import dimap_bits, index_files, is_index
+from beers_deploy.restoration.source import (
     GDAL_DRIVERS,
     Raster,
     Tag,
@@ -29,7 +30,6 @@ from deploy.restoration.source import (
     require_size,
     usable_nodata,
 )
-from profiles.errors import BeersError, ImageError, MachineError
 
 LEAST_CACHE_BYTES = 1 << 26
 ENVIRONMENT = {

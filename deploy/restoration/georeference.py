@@ -7,7 +7,7 @@ polynomials, and GeoTIFF's where the raster is of points) move by the half pixel
 from collections.abc import Sequence
 from typing import Any
 
-from deploy.restoration.source import Tag
+from beers_deploy.restoration.source import Tag
 
 PIXEL_SCALE, TIE_POINTS, TRANSFORMATION, KEYS, POLYNOMIALS = 33550, 33922, 34264, 34735, 50844
 RASTER_TYPE, POINTS = 1025, 2

@@ -11,8 +11,8 @@ import xml.etree.ElementTree as ET
 from collections.abc import Iterator
 from pathlib import Path
 
-from profiles.errors import ImageError
-from profiles.toml import read_whole
+from beers_deploy.profiles.errors import ImageError
+from beers_deploy.profiles.toml import read_whole
 
 INDEX_SUFFIXES = {".vrt", ".xml"}
 INDEX_BYTES = 1 << 23

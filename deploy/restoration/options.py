@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 from pathlib import Path
 
-from profiles.errors import OptionError
+from beers_deploy.profiles.errors import OptionError
 
 TILE_PX = 640
 """Side of a tile unless somebody asks for another: what the paper's network was given on the board."""

@@ -21,12 +21,12 @@ import tifffile
 from filelock import BaseFileLock, FileLock, Timeout
 from isal import isal_zlib
 
-from deploy.restoration.engine import RestoredRow
-from deploy.restoration.options import Compression
-from deploy.restoration.source import BIG_TIFF_SUFFIXES, Tag
-from model.io.files import TIFF_SUFFIXES
-from profiles.errors import MachineError, OptionError, sizes
-from profiles.toml import read_json
+from beers_deploy.model.io.files import TIFF_SUFFIXES
+from beers_deploy.profiles.errors import MachineError, OptionError, sizes
+from beers_deploy.profiles.toml import read_json
+from beers_deploy.restoration.engine import RestoredRow
+from beers_deploy.restoration.options import Compression
+from beers_deploy.restoration.source import BIG_TIFF_SUFFIXES, Tag
 
 
 def part_folder(out: Path) -> Path:

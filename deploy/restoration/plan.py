@@ -12,10 +12,10 @@ from dataclasses import dataclass
 import onnx
 import psutil
 
-from deploy.restoration.options import Options, parse_halo
-from deploy.restoration.source import Source
-from profiles.errors import MachineError, ModelError, OptionError, sizes
-from quant.tiling.walk import Tiling, tiling_of
+from beers_deploy.profiles.errors import MachineError, ModelError, OptionError, sizes
+from beers_deploy.quant.tiling.walk import Tiling, tiling_of
+from beers_deploy.restoration.options import Options, parse_halo
+from beers_deploy.restoration.source import Source
 
 
 @dataclass(frozen=True)

@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from deploy.restoration.source import Raster
-from model.io.images import MAX_DN, settled_scale
-from profiles.errors import OptionError
+from beers_deploy.model.io.images import MAX_DN, settled_scale
+from beers_deploy.profiles.errors import OptionError
+from beers_deploy.restoration.source import Raster
 
 
 @dataclass(frozen=True)

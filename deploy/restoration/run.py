@@ -18,14 +18,22 @@ from pathlib import Path
 import numpy as np
 import onnx
 
-from deploy.cluster import Cluster, open_cluster
-from deploy.host_state import peak_memory
-from deploy.restoration.bands import in_order, require_alike
-from deploy.restoration.cog import disk_bytes, require_cog, what_was_done, write_cog
-from deploy.restoration.engine import RestoredRow, Restorer, restore_rows
-from deploy.restoration.georeference import enlarged_tags
-from deploy.restoration.options import Compression, Options
-from deploy.restoration.output import (
+from beers_deploy.cluster import Cluster, open_cluster
+from beers_deploy.host_state import peak_memory
+from beers_deploy.model.io.files import require_writable
+from beers_deploy.model.io.images import require_image_file
+from beers_deploy.model.processor import require_cores
+from beers_deploy.model.progress import Log, held_back, steps
+from beers_deploy.profiles.errors import BeersError, ImageError, MachineError
+from beers_deploy.profiles.figures import Figure, Row, measured, predicted, unavailable
+from beers_deploy.quant.onnx_file import load_onnx
+from beers_deploy.quant.reading.external import network_sha256
+from beers_deploy.restoration.bands import in_order, require_alike
+from beers_deploy.restoration.cog import disk_bytes, require_cog, what_was_done, write_cog
+from beers_deploy.restoration.engine import RestoredRow, Restorer, restore_rows
+from beers_deploy.restoration.georeference import enlarged_tags
+from beers_deploy.restoration.options import Compression, Options
+from beers_deploy.restoration.output import (
     Checkpoint,
     only_run,
     part_folder,
@@ -33,18 +41,10 @@ from deploy.restoration.output import (
     require_tiff_name,
     write_output,
 )
-from deploy.restoration.plan import Plan, Span, check_memory, is_bulky, plan_for, rows_bytes
-from deploy.restoration.radiometry import FullScale, full_scale_of
-from deploy.restoration.runtime import Infer, infer_on, open_runtime, pack, tiles_at_once
-from deploy.restoration.source import Source, fingerprint, open_source
-from model.io.files import require_writable
-from model.io.images import require_image_file
-from model.processor import require_cores
-from model.progress import Log, held_back, steps
-from profiles.errors import BeersError, ImageError, MachineError
-from profiles.figures import Figure, Row, measured, predicted, unavailable
-from quant.onnx_file import load_onnx
-from quant.reading.external import network_sha256
+from beers_deploy.restoration.plan import Plan, Span, check_memory, is_bulky, plan_for, rows_bytes
+from beers_deploy.restoration.radiometry import FullScale, full_scale_of
+from beers_deploy.restoration.runtime import Infer, infer_on, open_runtime, pack, tiles_at_once
+from beers_deploy.restoration.source import Source, fingerprint, open_source
 
 RUNS_UNTIL_STEADY = 2
 """Of each tile in work at a time: then a runtime takes no more memory."""

@@ -14,13 +14,13 @@ import onnx
 import onnxruntime as ort
 from onnx import helper, numpy_helper
 
-from deploy.cluster import Cluster
-from deploy.restoration.options import Runtime
-from model.processor import asked, require_cores
-from profiles.errors import MachineError, ModelError
-from quant.kernels import is_integer, made_exact
-from quant.onnx_file import parse_onnx
-from quant.session import open_session, tensors_of
+from beers_deploy.cluster import Cluster
+from beers_deploy.model.processor import asked, require_cores
+from beers_deploy.profiles.errors import MachineError, ModelError
+from beers_deploy.quant.kernels import is_integer, made_exact
+from beers_deploy.quant.onnx_file import parse_onnx
+from beers_deploy.quant.session import open_session, tensors_of
+from beers_deploy.restoration.options import Runtime
 
 Infer = Callable[[np.ndarray], np.ndarray]
 """A network ready to run: (1, C, h, w) float32 in [0, 1] to what it makes of it, of the shape that its file says."""

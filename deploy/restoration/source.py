@@ -14,10 +14,10 @@ from typing import Any, Protocol
 import numpy as np
 import tifffile
 
-from model.io.files import TIFF_SUFFIXES
-from model.io.images import damage_in_a_sentence, read_pixels, require_image_file
-from model.io.tiff import check_page, open_tiff
-from profiles.errors import ImageError
+from beers_deploy.model.io.files import TIFF_SUFFIXES
+from beers_deploy.model.io.images import damage_in_a_sentence, read_pixels, require_image_file
+from beers_deploy.model.io.tiff import check_page, open_tiff
+from beers_deploy.profiles.errors import ImageError
 
 NODATA_TAG = 42113
 CARRIED_TAGS = (33550, 33922, 34264, 34735, 34736, 34737, 42112, NODATA_TAG, 50844)
@@ -217,7 +217,7 @@ def open_source(path: Path, trusted: bool = False) -> Iterator[Source]:
     require_image_file(path)
     suffix = path.suffix.lower()
     if suffix in GDAL_DRIVERS:
-        from deploy.restoration.gdal_source import open_gdal  # of an optional package
+        from beers_deploy.restoration.gdal_source import open_gdal  # of an optional package
 
         with open_gdal(path, trusted) as source:
             yield source

@@ -12,9 +12,9 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from deploy.restoration.gdal_source import ENVIRONMENT, OFFLINE
-from model.io.files import write_text
-from profiles.errors import MachineError
+from beers_deploy.model.io.files import write_text
+from beers_deploy.profiles.errors import MachineError
+from beers_deploy.restoration.gdal_source import ENVIRONMENT, OFFLINE
 
 LONGITUDE_LATITUDE = "EPSG:4326"
 WHEN = "datetime is the time of the restoration: the image states no time of acquisition that is known here"

@@ -14,10 +14,17 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from deploy.host_state import peak_memory
-from deploy.restoration.engine import RestoredRow, as_stored, checked_strip
-from deploy.restoration.options import Compression
-from deploy.restoration.output import (
+from beers_deploy.host_state import peak_memory
+from beers_deploy.model.io.files import require_writable
+from beers_deploy.model.io.images import require_image_file
+from beers_deploy.model.progress import steps
+from beers_deploy.model.traditional.pipeline import Chain, restore_strips
+from beers_deploy.profiles.errors import ImageError
+from beers_deploy.profiles.figures import Row, measured
+from beers_deploy.profiles.sensor import SensorProfile
+from beers_deploy.restoration.engine import RestoredRow, as_stored, checked_strip
+from beers_deploy.restoration.options import Compression
+from beers_deploy.restoration.output import (
     Checkpoint,
     only_run,
     part_folder,
@@ -25,16 +32,9 @@ from deploy.restoration.output import (
     require_tiff_name,
     write_output,
 )
-from deploy.restoration.plan import Span, check_memory
-from deploy.restoration.radiometry import FullScale, full_scale_of
-from deploy.restoration.source import Raster, Source, fingerprint, open_source
-from model.io.files import require_writable
-from model.io.images import require_image_file
-from model.progress import steps
-from model.traditional.pipeline import Chain, restore_strips
-from profiles.errors import ImageError
-from profiles.figures import Row, measured
-from profiles.sensor import SensorProfile
+from beers_deploy.restoration.plan import Span, check_memory
+from beers_deploy.restoration.radiometry import FullScale, full_scale_of
+from beers_deploy.restoration.source import Raster, Source, fingerprint, open_source
 
 STRIP_PX = 128
 """Rows read at a time."""

@@ -13,13 +13,22 @@ from pathlib import Path
 
 import numpy as np
 
-from model.io.images import read_pixels
-from model.metrics.edge_blur import HALF_PX, MIN_FOUND, POINTED_AT, AxisMtf, EdgeBlur, combine, find_blurs, fit_blur
-from model.metrics.noise_line import NoiseModel, cut_blocks, fit_noise_model, join
-from model.metrics.refusal import Refusal
-from profiles.errors import ImageError, OptionError, printable
-from profiles.figures import Figure, Row, measured, unavailable
-from profiles.sensor import snr_0_bounds
+from beers_deploy.model.io.images import read_pixels
+from beers_deploy.model.metrics.edge_blur import (
+    HALF_PX,
+    MIN_FOUND,
+    POINTED_AT,
+    AxisMtf,
+    EdgeBlur,
+    combine,
+    find_blurs,
+    fit_blur,
+)
+from beers_deploy.model.metrics.noise_line import NoiseModel, cut_blocks, fit_noise_model, join
+from beers_deploy.model.metrics.refusal import Refusal
+from beers_deploy.profiles.errors import ImageError, OptionError, printable
+from beers_deploy.profiles.figures import Figure, Row, measured, unavailable
+from beers_deploy.profiles.sensor import snr_0_bounds
 
 FULL_SCALE_RADIANCE = 400.0
 """W/m2/sr/um, where no gain is given."""

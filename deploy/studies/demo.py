@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from deploy.bench.tables import (
+from beers_deploy.bench.tables import (
     Swath,
     predict_file,
     predicted_rows,
@@ -19,36 +19,36 @@ from deploy.bench.tables import (
     sweep_rows,
     within_words,
 )
-from deploy.bench.traditional import measure_chain
-from deploy.dpu.board import load_dpu
-from deploy.dpu.checker.placement import Placement, place
-from deploy.dpu.reading import read_network
-from deploy.gate import Request, run_gate
-from deploy.library import restore
-from deploy.networks import Conditioned, warn_outside
-from deploy.report.page import Picture, Report, Table
-from deploy.restoration.options import TILE_PX
-from model.io.files import whole_file
-from model.io.images import MAX_DN, read_acquisition, read_pixels
-from model.io.pictures import busiest_windows, picture_url, stretch_of, strip
-from model.io.tiff import write_tiff
-from model.metrics.fidelity import fidelity_db, ssim
-from model.progress import Log
-from model.shipped import SENSOR, VARIANT, shipped_weights
-from model.simulator.acquire import MARGIN_PX, Pair, simulate_pair
-from model.simulator.detector import Draw
-from model.simulator.procedural import procedural_scene
-from model.simulator.sampling import read_scene
-from model.traditional.pipeline import Chain, restore_traditional
-from profiles import SensorProfile, load_sensor
-from profiles.errors import OptionError
-from profiles.figures import Row, measured
-from profiles.sensor_file import reference_for
-from profiles.target import DEFAULT_TARGET, board_names
-from quant.encodings import board_model, read_core
-from quant.gate import Limits
-from quant.onnx_file import load_onnx, metadata, save_onnx
-from quant.tiling.walk import tiling_of
+from beers_deploy.bench.traditional import measure_chain
+from beers_deploy.dpu.board import load_dpu
+from beers_deploy.dpu.checker.placement import Placement, place
+from beers_deploy.dpu.reading import read_network
+from beers_deploy.gate import Request, run_gate
+from beers_deploy.library import restore
+from beers_deploy.model.io.files import whole_file
+from beers_deploy.model.io.images import MAX_DN, read_acquisition, read_pixels
+from beers_deploy.model.io.pictures import busiest_windows, picture_url, stretch_of, strip
+from beers_deploy.model.io.tiff import write_tiff
+from beers_deploy.model.metrics.fidelity import fidelity_db, ssim
+from beers_deploy.model.progress import Log
+from beers_deploy.model.shipped import SENSOR, VARIANT, shipped_weights
+from beers_deploy.model.simulator.acquire import MARGIN_PX, Pair, simulate_pair
+from beers_deploy.model.simulator.detector import Draw
+from beers_deploy.model.simulator.procedural import procedural_scene
+from beers_deploy.model.simulator.sampling import read_scene
+from beers_deploy.model.traditional.pipeline import Chain, restore_traditional
+from beers_deploy.networks import Conditioned, warn_outside
+from beers_deploy.profiles import SensorProfile, load_sensor
+from beers_deploy.profiles.errors import OptionError
+from beers_deploy.profiles.figures import Row, measured
+from beers_deploy.profiles.sensor_file import reference_for
+from beers_deploy.profiles.target import DEFAULT_TARGET, board_names
+from beers_deploy.quant.encodings import board_model, read_core
+from beers_deploy.quant.gate import Limits
+from beers_deploy.quant.onnx_file import load_onnx, metadata, save_onnx
+from beers_deploy.quant.tiling.walk import tiling_of
+from beers_deploy.report.page import Picture, Report, Table
+from beers_deploy.restoration.options import TILE_PX
 
 BITS, SIDE_PX, GATE_PATCHES = 12, 640, 12
 CROP_PX, ZOOM, LARGEST_PX = 110, 3, 1280

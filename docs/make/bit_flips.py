@@ -7,10 +7,10 @@ import sys
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
-from deploy.studies.stress.bit_flips import SETS, FlipRequest, flip_curves_svg, flip_rows
-from deploy.studies.stress.networks import open_subject
-from model.io.files import write_text
-from profiles.figures import Row
+from beers_deploy.model.io.files import write_text
+from beers_deploy.profiles.figures import Row
+from beers_deploy.studies.stress.bit_flips import SETS, FlipRequest, flip_curves_svg, flip_rows
+from beers_deploy.studies.stress.networks import open_subject
 
 DOCS = Path(__file__).parents[1]
 PAGE, PICTURE = DOCS / "explanation" / "bit-flips.md", DOCS / "assets" / "bit-flips.svg"

@@ -11,7 +11,7 @@ from typing import Any
 
 from typer.main import get_command
 
-from deploy.cli import COMMANDS, app
+from beers_deploy.cli import COMMANDS, app
 from docs.make.options import parameters, refusals
 
 TARGET = Path(__file__).parents[1] / "reference" / "commands.md"

@@ -12,15 +12,15 @@ import numpy as np
 from PIL import Image
 from torch import Tensor
 
-from model.io.pictures import Stretch, strip
-from model.simulator.acquire import MARGIN_PX, prepare_scene, simulate_planned
-from model.simulator.detector import Draw
-from model.simulator.plan import Plan, make_plan, scene_stats
-from model.simulator.procedural import procedural_scene
-from profiles import load_sensor
-from profiles.effects import TABLES, Effect, middle_effect
-from profiles.scene_call import SceneCall, calling_for, load_scene_call, scene_names, typical_effects
-from profiles.sensor import Sensor
+from beers_deploy.model.io.pictures import Stretch, strip
+from beers_deploy.model.simulator.acquire import MARGIN_PX, prepare_scene, simulate_planned
+from beers_deploy.model.simulator.detector import Draw
+from beers_deploy.model.simulator.plan import Plan, make_plan, scene_stats
+from beers_deploy.model.simulator.procedural import procedural_scene
+from beers_deploy.profiles import load_sensor
+from beers_deploy.profiles.effects import TABLES, Effect, middle_effect
+from beers_deploy.profiles.scene_call import SceneCall, calling_for, load_scene_call, scene_names, typical_effects
+from beers_deploy.profiles.sensor import Sensor
 
 DOCS = Path(__file__).parents[1]
 PAGE, PICTURE = DOCS / "explanation" / "effects.md", DOCS / "assets" / "effects.png"

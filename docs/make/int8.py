@@ -5,9 +5,9 @@ python docs/make/int8.py [convbeers-s ...]
 
 import argparse
 
-from deploy.networks import Conditioned, family_model
-from model.shipped import INT8, SHIPPED, shipped_names, shipped_weights
-from quant.onnx_file import save_onnx
+from beers_deploy.model.shipped import INT8, SHIPPED, shipped_names, shipped_weights
+from beers_deploy.networks import Conditioned, family_model
+from beers_deploy.quant.onnx_file import save_onnx
 
 
 def main() -> None:

@@ -18,7 +18,7 @@ from pathlib import Path
 from shutil import copyfile
 from xml.etree import ElementTree as ET
 
-from model.progress import steps
+from beers_deploy.model.progress import steps
 
 ROOT = Path(__file__).resolve().parents[2]
 LIST = ROOT / "docs" / "explanation" / "mutations.toml"

@@ -8,15 +8,15 @@ import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 
-from deploy.dpu.board import Dpu, load_dpu
-from deploy.dpu.checker.finding import Rule
-from deploy.dpu.checker.operators import NUMBERS, RULES, SHIFTS, SIZES, applies, rule_name, rule_text
-from deploy.dpu.checker.other_rules import INSTEAD
-from deploy.dpu.checker.table import REMARKS
-from deploy.dpu.cost.latency import dpu_power
-from deploy.dpu.graph import Kind
-from deploy.dpu.reading import KINDS
-from profiles.target import board_names
+from beers_deploy.dpu.board import Dpu, load_dpu
+from beers_deploy.dpu.checker.finding import Rule
+from beers_deploy.dpu.checker.operators import NUMBERS, RULES, SHIFTS, SIZES, applies, rule_name, rule_text
+from beers_deploy.dpu.checker.other_rules import INSTEAD
+from beers_deploy.dpu.checker.table import REMARKS
+from beers_deploy.dpu.cost.latency import dpu_power
+from beers_deploy.dpu.graph import Kind
+from beers_deploy.dpu.reading import KINDS
+from beers_deploy.profiles.target import board_names
 
 TARGET = Path(__file__).parents[1] / "reference" / "operators.md"
 DPUS = {name: load_dpu(name) for name in board_names()}

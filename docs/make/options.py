@@ -12,8 +12,8 @@ from typing import Any, get_args, get_origin, get_type_hints
 
 from typer.main import get_command
 
-from deploy.cli import COMMANDS, app
-from model.processor import SEEDS
+from beers_deploy.cli import COMMANDS, app
+from beers_deploy.model.processor import SEEDS
 
 FILE, FOLDER = "file", "folder"
 

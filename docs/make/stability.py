@@ -8,13 +8,13 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
-from deploy.studies.stress.battery import StageResult, battery_rows, layer_rows, run_battery, worst_rows
-from deploy.studies.stress.cases import CASES
-from deploy.studies.stress.checks import LIMITATIONS
-from deploy.studies.stress.networks import STAGES, Subject, open_subject
-from deploy.studies.stress.tables import NOTES, table_lines
-from model.io.files import write_text
-from model.shipped import VARIANT
+from beers_deploy.model.io.files import write_text
+from beers_deploy.model.shipped import VARIANT
+from beers_deploy.studies.stress.battery import StageResult, battery_rows, layer_rows, run_battery, worst_rows
+from beers_deploy.studies.stress.cases import CASES
+from beers_deploy.studies.stress.checks import LIMITATIONS
+from beers_deploy.studies.stress.networks import STAGES, Subject, open_subject
+from beers_deploy.studies.stress.tables import NOTES, table_lines
 
 TARGET = Path(__file__).parents[1] / "explanation" / "stability.md"
 OPENING = f"""# Stability

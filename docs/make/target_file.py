@@ -9,9 +9,9 @@ from collections import defaultdict
 from collections.abc import Iterator
 from pathlib import Path
 
-from deploy.dpu.board import CHOICES, CONFIGURATION, DIVISORS
-from profiles.constant import Constant
-from profiles.target import DOCUMENTS, FUSED, PLACES, board_names, load_target
+from beers_deploy.dpu.board import CHOICES, CONFIGURATION, DIVISORS
+from beers_deploy.profiles.constant import Constant
+from beers_deploy.profiles.target import DOCUMENTS, FUSED, PLACES, board_names, load_target
 
 TARGET = Path(__file__).parents[1] / "reference" / "target-file.md"
 BUILD = "configurations.NAME"

@@ -5,9 +5,9 @@
 - `tensors`: weights as safetensors.
 """
 
-from model.io.files import require_writable, sha256, whole_file, write_text
-from model.io.images import list_images, read_pixels, settled_scale, site_of
-from model.io.tiff import open_tiff
+from beers_deploy.model.io.files import require_writable, sha256, whole_file, write_text
+from beers_deploy.model.io.images import list_images, read_pixels, settled_scale, site_of
+from beers_deploy.model.io.tiff import open_tiff
 
 __all__ = [
     "list_images",

@@ -13,9 +13,9 @@ from contextlib import contextmanager, suppress
 from itertools import combinations
 from pathlib import Path
 
-from model.shipped import SHIPPED
-from profiles.errors import MachineError, OptionError
-from profiles.toml import HERE as PROFILES
+from beers_deploy.model.shipped import SHIPPED
+from beers_deploy.profiles.errors import MachineError, OptionError
+from beers_deploy.profiles.toml import HERE as PROFILES
 
 TIFF_SUFFIXES = {".tif", ".tiff"}
 IMAGE_SUFFIXES = TIFF_SUFFIXES | {".png", ".jpg", ".jpeg"}

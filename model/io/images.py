@@ -12,10 +12,10 @@ import numpy as np
 import psutil
 from PIL import Image
 
-from model.io.files import IMAGE_SUFFIXES, TIFF_SUFFIXES
-from model.io.tiff import check_page, open_tiff
-from profiles.errors import BeersError, ImageError, MachineError, OptionError, sizes
-from profiles.toml import read_whole, unreadable
+from beers_deploy.model.io.files import IMAGE_SUFFIXES, TIFF_SUFFIXES
+from beers_deploy.model.io.tiff import check_page, open_tiff
+from beers_deploy.profiles.errors import BeersError, ImageError, MachineError, OptionError, sizes
+from beers_deploy.profiles.toml import read_whole, unreadable
 
 MAX_DN = 4095
 """The largest digital number of 12 bits: full scale, unless a sensor says otherwise."""

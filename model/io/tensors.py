@@ -14,11 +14,11 @@ import numpy as np
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save_file
 
-from model.family import RANGES
-from model.io.files import whole_file
-from model.variants import Variant
-from profiles.errors import ModelError
-from profiles.toml import parse_json, unreadable
+from beers_deploy.model.family import RANGES
+from beers_deploy.model.io.files import whole_file
+from beers_deploy.model.variants import Variant
+from beers_deploy.profiles.errors import ModelError
+from beers_deploy.profiles.toml import parse_json, unreadable
 
 BANKED = "behind the bank of its sensor"
 """The kind, in the header, of weights that need a sensor before they are a network; plain ones state none."""

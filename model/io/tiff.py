@@ -20,8 +20,8 @@ import numpy as np
 import psutil
 import tifffile
 
-from model.io.files import whole_file
-from profiles.errors import ImageError, MachineError, sizes
+from beers_deploy.model.io.files import whole_file
+from beers_deploy.profiles.errors import ImageError, MachineError, sizes
 
 PLAIN: dict[str, Any] = dict.fromkeys(
     (

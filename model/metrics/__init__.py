@@ -9,8 +9,8 @@
 Offered here is what needs no torch, for the gate and the reports; the instruments are imported from their modules.
 """
 
-from model.metrics.bootstrap import site_interval
-from model.metrics.fidelity import psnr_db, ssim
-from model.metrics.refusal import Refusal
+from beers_deploy.model.metrics.bootstrap import site_interval
+from beers_deploy.model.metrics.fidelity import psnr_db, ssim
+from beers_deploy.model.metrics.refusal import Refusal
 
 __all__ = ["Refusal", "psnr_db", "site_interval", "ssim"]

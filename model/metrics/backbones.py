@@ -20,8 +20,8 @@ from safetensors import SafetensorError, safe_open
 from torch import Tensor, nn
 from torch.nn import functional
 
-from profiles.errors import ModelError
-from profiles.toml import unreadable
+from beers_deploy.profiles.errors import ModelError
+from beers_deploy.profiles.toml import unreadable
 
 
 @dataclass(frozen=True)

@@ -19,8 +19,8 @@ from scipy.ndimage import correlate
 from scipy.special import stdtrit
 from scipy.stats import median_abs_deviation
 
-from model.metrics.refusal import Refusal
-from profiles.sensor import MTF_NYQUIST_MAX
+from beers_deploy.model.metrics.refusal import Refusal
+from beers_deploy.profiles.sensor import MTF_NYQUIST_MAX
 
 HALF_PX = 8
 """Half the side of the square around a found edge, and how far from an edge pixels are fitted."""

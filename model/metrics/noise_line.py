@@ -18,7 +18,7 @@ import numpy as np
 from scipy.fft import dctn
 from scipy.optimize import nnls
 
-from model.metrics.refusal import Refusal
+from beers_deploy.model.metrics.refusal import Refusal
 
 SIDE_PX, PART_BLOCKS = 16, 4
 SLOW, MIDDLE, FINE = 0.2, 0.5, 0.55

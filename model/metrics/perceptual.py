@@ -12,8 +12,8 @@ from typing import Self
 import torch
 from torch import Tensor, nn
 
-from model.metrics.backbones import Backbone, load_backbone, read_tensors
-from profiles.errors import ImageError
+from beers_deploy.model.metrics.backbones import Backbone, load_backbone, read_tensors
+from beers_deploy.profiles.errors import ImageError
 
 PUBLISHED = Path(__file__).parent / "weights"
 IMAGENET_MEAN, IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)

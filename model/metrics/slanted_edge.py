@@ -20,7 +20,7 @@ import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
 
-from model.metrics.refusal import Refusal
+from beers_deploy.model.metrics.refusal import Refusal
 
 WINDOW_PX = 10
 """Half width of the Hamming window around the edge."""

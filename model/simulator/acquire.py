@@ -8,12 +8,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from model.simulator.detector import Draw, detect
-from model.simulator.mtf import sensor_transfer
-from model.simulator.plan import Plan, SceneStats, scene_stats
-from model.simulator.sampling import crop_divisible, sample, scene_spectrum
-from profiles.errors import ImageError
-from profiles.sensor import Sensor
+from beers_deploy.model.simulator.detector import Draw, detect
+from beers_deploy.model.simulator.mtf import sensor_transfer
+from beers_deploy.model.simulator.plan import Plan, SceneStats, scene_stats
+from beers_deploy.model.simulator.sampling import crop_divisible, sample, scene_spectrum
+from beers_deploy.profiles.errors import ImageError
+from beers_deploy.profiles.sensor import Sensor
 
 MARGIN_PX = 32
 """Target pixels cropped on each side: the FFT wraps around, and the PSF's tail is long (10.8 DN at 32)."""

@@ -14,8 +14,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from profiles.effects import Defects, Dsnu, Effect, FullWell, Haze, Offset, Prnu, Striping
-from profiles.sensor import Sensor
+from beers_deploy.profiles.effects import Defects, Dsnu, Effect, FullWell, Haze, Offset, Prnu, Striping
+from beers_deploy.profiles.sensor import Sensor
 
 NOISE_LIMIT = 6.0
 """Draws are clipped here (two in a billion), so that the effect of noise has a bound."""

@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from profiles.effects import AntiAlias, Smear
-from profiles.errors import OptionError
-from profiles.response import PointSpread, Response
-from profiles.sensor import MTF_NYQUIST_MAX, Sensor, mtf_limit
+from beers_deploy.profiles.effects import AntiAlias, Smear
+from beers_deploy.profiles.errors import OptionError
+from beers_deploy.profiles.response import PointSpread, Response
+from beers_deploy.profiles.sensor import MTF_NYQUIST_MAX, Sensor, mtf_limit
 
 if TYPE_CHECKING:
     import torch

@@ -18,10 +18,22 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from model.simulator.detector import DN_EFFECTS, NOISE_LIMIT, PATTERN_LIMIT, RADIANCE_EFFECTS
-from model.simulator.mtf import Blur, smear_response, transfer_function
-from profiles.effects import TABLES, AntiAlias, Defects, Dsnu, Effect, FullWell, Haze, Offset, Prnu, Smear, Striping
-from profiles.sensor import Sensor, mtf_limit
+from beers_deploy.model.simulator.detector import DN_EFFECTS, NOISE_LIMIT, PATTERN_LIMIT, RADIANCE_EFFECTS
+from beers_deploy.model.simulator.mtf import Blur, smear_response, transfer_function
+from beers_deploy.profiles.effects import (
+    TABLES,
+    AntiAlias,
+    Defects,
+    Dsnu,
+    Effect,
+    FullWell,
+    Haze,
+    Offset,
+    Prnu,
+    Smear,
+    Striping,
+)
+from beers_deploy.profiles.sensor import Sensor, mtf_limit
 
 
 @dataclass(frozen=True)

@@ -15,8 +15,8 @@ import numpy as np
 import torch
 from PIL import Image, ImageDraw
 
-from model.io.images import list_images
-from model.simulator.drawing import (
+from beers_deploy.model.io.images import list_images
+from beers_deploy.model.simulator.drawing import (
     ASPHALT,
     CONCRETE,
     GRASS,
@@ -33,8 +33,8 @@ from model.simulator.drawing import (
     tree,
     turn,
 )
-from model.simulator.sampling import Scene, read_scene
-from profiles.sensor import Sensor
+from beers_deploy.model.simulator.sampling import Scene, read_scene
+from beers_deploy.profiles.sensor import Sensor
 
 SCENES, SCENE_SIDE_PX = 3, 2400
 """Drawn where no folder of images is given."""

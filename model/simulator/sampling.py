@@ -10,9 +10,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from model.io.images import read_pixels
-from profiles.errors import ImageError, OptionError
-from profiles.sensor import Sensor
+from beers_deploy.model.io.images import read_pixels
+from beers_deploy.profiles.errors import ImageError, OptionError
+from beers_deploy.profiles.sensor import Sensor
 
 
 def scene_spectrum(radiance: Tensor) -> Tensor:

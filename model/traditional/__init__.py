@@ -10,10 +10,10 @@ Every step takes and gives strips of rows (`rows`), so a chain of any height run
 NaN marks missing pixels.
 """
 
-from model.traditional.noise import Noise, destabilise, stabilise
-from model.traditional.peers import PEERS
-from model.traditional.pipeline import Chain, restore_strips, restore_traditional
-from model.traditional.settings import QUALITIES
+from beers_deploy.model.traditional.noise import Noise, destabilise, stabilise
+from beers_deploy.model.traditional.peers import PEERS
+from beers_deploy.model.traditional.pipeline import Chain, restore_strips, restore_traditional
+from beers_deploy.model.traditional.settings import QUALITIES
 
 __all__ = [
     "PEERS",

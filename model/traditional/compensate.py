@@ -12,10 +12,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from model.bank import restoring_gain
-from model.simulator.mtf import NYQUIST, Blur, mtf
-from model.traditional.rows import Rows, fill_with_local_means, map_tiles, mirrored
-from profiles.errors import OptionError
+from beers_deploy.model.bank import restoring_gain
+from beers_deploy.model.simulator.mtf import NYQUIST, Blur, mtf
+from beers_deploy.model.traditional.rows import Rows, fill_with_local_means, map_tiles, mirrored
+from beers_deploy.profiles.errors import OptionError
 
 EPSILON_PER_PERCENT = 3.3e-3
 """Regularisation at Nyquist per per cent of noise at the brighter radiance that a profile states (100 W/m2/sr/um in

@@ -12,10 +12,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from model.traditional.noise import Noise
-from model.traditional.rows import Rows, map_tiles, mirrored
-from model.traditional.settings import QUALITIES, PassSettings, Quality, first_pass, second_pass
-from profiles.errors import ImageError
+from beers_deploy.model.traditional.noise import Noise
+from beers_deploy.model.traditional.rows import Rows, map_tiles, mirrored
+from beers_deploy.model.traditional.settings import QUALITIES, PassSettings, Quality, first_pass, second_pass
+from beers_deploy.profiles.errors import ImageError
 
 JITTER = 1e-3
 """Added to the diagonal of a noisy covariance, in units of sigma^2. Up to 1e-2 costs less than 0.01 dB (measured)."""

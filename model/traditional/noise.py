@@ -7,8 +7,8 @@ from math import isfinite
 import torch
 from torch import Tensor
 
-from profiles.errors import OptionError
-from profiles.sensor import Sensor
+from beers_deploy.profiles.errors import OptionError
+from beers_deploy.profiles.sensor import Sensor
 
 
 @dataclass(frozen=True)

@@ -10,12 +10,12 @@ import torch
 from skimage import restoration
 from torch import Tensor
 
-from model.simulator.detector import to_dn, to_radiance
-from model.simulator.mtf import transfer_function
-from model.traditional.compensate import filter_strips
-from model.traditional.noise import bias_radiance, destabilise, stabilise
-from model.traditional.pipeline import Chain, with_rounding_noise
-from model.traditional.rows import mirrored
+from beers_deploy.model.simulator.detector import to_dn, to_radiance
+from beers_deploy.model.simulator.mtf import transfer_function
+from beers_deploy.model.traditional.compensate import filter_strips
+from beers_deploy.model.traditional.noise import bias_radiance, destabilise, stabilise
+from beers_deploy.model.traditional.pipeline import Chain, with_rounding_noise
+from beers_deploy.model.traditional.rows import mirrored
 
 PAD_PX = 64
 WIENER_BALANCE, RICHARDSON_LUCY_STEPS = 0.01, 20

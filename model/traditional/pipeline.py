@@ -14,13 +14,18 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from model.simulator.detector import to_dn, to_radiance
-from model.traditional.compensate import EPSILON_PER_PERCENT, compensation_gain, compensation_kernel, filter_strips
-from model.traditional.nl_bayes import finite_or_missing, nl_bayes_strips
-from model.traditional.noise import Noise, bias_radiance, coloured_by, destabilise, stabilise
-from model.traditional.settings import QUALITIES, Quality
-from profiles.errors import OptionError
-from profiles.sensor import Sensor
+from beers_deploy.model.simulator.detector import to_dn, to_radiance
+from beers_deploy.model.traditional.compensate import (
+    EPSILON_PER_PERCENT,
+    compensation_gain,
+    compensation_kernel,
+    filter_strips,
+)
+from beers_deploy.model.traditional.nl_bayes import finite_or_missing, nl_bayes_strips
+from beers_deploy.model.traditional.noise import Noise, bias_radiance, coloured_by, destabilise, stabilise
+from beers_deploy.model.traditional.settings import QUALITIES, Quality
+from beers_deploy.profiles.errors import OptionError
+from beers_deploy.profiles.sensor import Sensor
 
 WORKING_SIGMA = 12.0
 """Noise level at which NL-Bayes runs: the stabilised image is scaled to it, where the published settings apply.

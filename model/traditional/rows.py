@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from profiles.errors import ImageError
+from beers_deploy.profiles.errors import ImageError
 
 
 class Rows:

@@ -8,11 +8,11 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from model.convbeers import Network, arrays, load_network, save_network
-from model.io.tensors import all_finite, read_tensors, write_tensors
-from model.training.guards import Guards, require_finite_output
-from model.training.losses import PAPER, LossWeights
-from profiles.errors import ModelError, OptionError
+from beers_deploy.model.convbeers import Network, arrays, load_network, save_network
+from beers_deploy.model.io.tensors import all_finite, read_tensors, write_tensors
+from beers_deploy.model.training.guards import Guards, require_finite_output
+from beers_deploy.model.training.losses import PAPER, LossWeights
+from beers_deploy.profiles.errors import ModelError, OptionError
 
 Optimiser = Literal["adam", "adamw"]
 

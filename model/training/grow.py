@@ -7,9 +7,9 @@ from typing import TypeVar
 import torch
 from torch import Tensor
 
-from model.convbeers import Network, initialise
-from model.variants import Variant
-from profiles.errors import ModelError
+from beers_deploy.model.convbeers import Network, initialise
+from beers_deploy.model.variants import Variant
+from beers_deploy.profiles.errors import ModelError
 
 N = TypeVar("N", bound=Network)
 

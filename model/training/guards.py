@@ -4,9 +4,9 @@ import math
 
 import torch
 
-from model.convbeers import Network, told
-from model.family import RANGES
-from profiles.errors import ModelError
+from beers_deploy.model.convbeers import Network, told
+from beers_deploy.model.family import RANGES
+from beers_deploy.profiles.errors import ModelError
 
 MAX_BAD_STEPS = 10
 WINDOW_STEPS = 200

@@ -13,15 +13,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from model.convbeers import vector_tensor
-from model.family import SensorFamily
-from model.io.images import list_images, read_pixels, remedy_outside, settled_scale
-from model.simulator.acquire import acquire
-from model.simulator.detector import Draw
-from model.simulator.sampling import Scene, crop_divisible, scene_spectrum
-from model.training.workers import Worker
-from profiles.errors import ImageError
-from profiles.sensor import Sensor, SensorProfile, require_same_units
+from beers_deploy.model.convbeers import vector_tensor
+from beers_deploy.model.family import SensorFamily
+from beers_deploy.model.io.images import list_images, read_pixels, remedy_outside, settled_scale
+from beers_deploy.model.simulator.acquire import acquire
+from beers_deploy.model.simulator.detector import Draw
+from beers_deploy.model.simulator.sampling import Scene, crop_divisible, scene_spectrum
+from beers_deploy.model.training.workers import Worker
+from beers_deploy.profiles.errors import ImageError
+from beers_deploy.profiles.sensor import Sensor, SensorProfile, require_same_units
 
 
 @dataclass(frozen=True)

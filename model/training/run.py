@@ -15,25 +15,25 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from model.convbeers import BankedConvBEERS, ConvBEERS, Network, load_network
-from model.io.files import whole_file
-from model.io.images import list_images
-from model.io.pictures import Stretch, busiest_windows, grid, strip_row
-from model.metrics.backbones import find_backbone, not_found
-from model.metrics.perceptual import Lpips
-from model.progress import Steps, steps
-from model.simulator.procedural import draw_scenes
-from model.simulator.sampling import Scene, read_scene
-from model.training.checkpoint import TrainingRecipe, finish
-from model.training.grow import grow
-from model.training.guards import require_finite_output
-from model.training.losses import RestorationLoss
-from model.training.patches import PatchRecipe, PatchSource, StoredPairs, pair_files
-from model.training.trainer import Precision, Progress, Schedule, Source, Trainer
-from model.training.validation import Validation, split_by_site
-from model.training.workers import Worker
-from model.variants import Variant, variant_named
-from profiles.errors import ModelError, OptionError
+from beers_deploy.model.convbeers import BankedConvBEERS, ConvBEERS, Network, load_network
+from beers_deploy.model.io.files import whole_file
+from beers_deploy.model.io.images import list_images
+from beers_deploy.model.io.pictures import Stretch, busiest_windows, grid, strip_row
+from beers_deploy.model.metrics.backbones import find_backbone, not_found
+from beers_deploy.model.metrics.perceptual import Lpips
+from beers_deploy.model.progress import Steps, steps
+from beers_deploy.model.simulator.procedural import draw_scenes
+from beers_deploy.model.simulator.sampling import Scene, read_scene
+from beers_deploy.model.training.checkpoint import TrainingRecipe, finish
+from beers_deploy.model.training.grow import grow
+from beers_deploy.model.training.guards import require_finite_output
+from beers_deploy.model.training.losses import RestorationLoss
+from beers_deploy.model.training.patches import PatchRecipe, PatchSource, StoredPairs, pair_files
+from beers_deploy.model.training.trainer import Precision, Progress, Schedule, Source, Trainer
+from beers_deploy.model.training.validation import Validation, split_by_site
+from beers_deploy.model.training.workers import Worker
+from beers_deploy.model.variants import Variant, variant_named
+from beers_deploy.profiles.errors import ModelError, OptionError
 
 STEP = re.compile(r"[0-9]{1,18}(?=,)")
 """What a line of a log begins with."""

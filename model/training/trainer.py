@@ -12,14 +12,14 @@ from typing import Literal, Protocol
 import torch
 from torch import Tensor, nn
 
-from model.convbeers import BankedConvBEERS, ConvBEERS, Network, initialise
-from model.progress import held_back
-from model.training.checkpoint import TrainingRecipe, read_checkpoint, write_checkpoint
-from model.training.guards import Guards
-from model.training.losses import RestorationLoss
-from model.training.workers import Worker
-from model.variants import Variant
-from profiles.errors import OptionError
+from beers_deploy.model.convbeers import BankedConvBEERS, ConvBEERS, Network, initialise
+from beers_deploy.model.progress import held_back
+from beers_deploy.model.training.checkpoint import TrainingRecipe, read_checkpoint, write_checkpoint
+from beers_deploy.model.training.guards import Guards
+from beers_deploy.model.training.losses import RestorationLoss
+from beers_deploy.model.training.workers import Worker
+from beers_deploy.model.variants import Variant
+from beers_deploy.profiles.errors import OptionError
 
 
 class Source(Protocol):

@@ -8,14 +8,14 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from model.convbeers import Network, told, vector_tensor
-from model.family import SensorFamily
-from model.io.images import site_of
-from model.metrics.fidelity import psnr_db, ssim
-from model.simulator.acquire import LEAST_SIDE_PX, fitting_oversampling, simulate_pair
-from model.simulator.detector import Draw
-from model.simulator.sampling import Scene
-from profiles.sensor import SensorProfile
+from beers_deploy.model.convbeers import Network, told, vector_tensor
+from beers_deploy.model.family import SensorFamily
+from beers_deploy.model.io.images import site_of
+from beers_deploy.model.metrics.fidelity import psnr_db, ssim
+from beers_deploy.model.simulator.acquire import LEAST_SIDE_PX, fitting_oversampling, simulate_pair
+from beers_deploy.model.simulator.detector import Draw
+from beers_deploy.model.simulator.sampling import Scene
+from beers_deploy.profiles.sensor import SensorProfile
 
 SHARE = 0.05
 """Of the images: sites are held out, the ones with the fewest images first, until so many are."""

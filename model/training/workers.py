@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from profiles.errors import MachineError
+from beers_deploy.profiles.errors import MachineError
 
 
 @dataclass(frozen=True)

@@ -9,15 +9,15 @@ from dataclasses import replace
 
 import numpy as np
 
-from model.bank import FILTERS, REFERENCE, UNIT_STEPS, Bank, network_bank
-from model.family import SensorFamily, sensor_vector
-from model.io.tensors import Weights
-from model.progress import Log, no_log
-from model.simulator.sampling import Scene
-from model.variants import SENSOR_VALUES
-from profiles import load_sensor
-from quant.banked.family import BANK, Family, bank_layer
-from quant.banked.filters import (
+from beers_deploy.model.bank import FILTERS, REFERENCE, UNIT_STEPS, Bank, network_bank
+from beers_deploy.model.family import SensorFamily, sensor_vector
+from beers_deploy.model.io.tensors import Weights
+from beers_deploy.model.progress import Log, no_log
+from beers_deploy.model.simulator.sampling import Scene
+from beers_deploy.model.variants import SENSOR_VALUES
+from beers_deploy.profiles import load_sensor
+from beers_deploy.quant.banked.family import BANK, Family, bank_layer
+from beers_deploy.quant.banked.filters import (
     ANALYTIC_COPIES,
     BITS,
     COPIES,
@@ -26,15 +26,27 @@ from quant.banked.filters import (
     spread_over_a_step,
     whole_bank,
 )
-from quant.calibration import PATCH_PX, Remade, draw_patches
-from quant.core import SHIFTS, IntConv, IntCore, Shifts, quantise_bias
-from quant.ends import Ends
-from quant.graph import CORRECTION, PLANES, Activation, Add, Concat, Conv, Graph, Op, Shuffle, Window, same
-from quant.graph.network import renamed
-from quant.integer.arithmetic import convolve
-from quant.passes.level import Chain
-from quant.passes.stream import lone_tensors, streams
-from quant.quantise import Plan, rounded
+from beers_deploy.quant.calibration import PATCH_PX, Remade, draw_patches
+from beers_deploy.quant.core import SHIFTS, IntConv, IntCore, Shifts, quantise_bias
+from beers_deploy.quant.ends import Ends
+from beers_deploy.quant.graph import (
+    CORRECTION,
+    PLANES,
+    Activation,
+    Add,
+    Concat,
+    Conv,
+    Graph,
+    Op,
+    Shuffle,
+    Window,
+    same,
+)
+from beers_deploy.quant.graph.network import renamed
+from beers_deploy.quant.integer.arithmetic import convolve
+from beers_deploy.quant.passes.level import Chain
+from beers_deploy.quant.passes.stream import lone_tensors, streams
+from beers_deploy.quant.quantise import Plan, rounded
 
 LIKE = "pleiades-degraded"
 """The profile that gives gain and bits; what is computed is over full scale."""

@@ -15,15 +15,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 import onnx
 
-from model.bank import Bank
-from model.variants import SENSOR_VALUES
-from profiles.errors import ModelError
-from quant.banked.filters import BITS, whole_bank
-from quant.core import SHIFTS, IntConv, IntCore, Shifts, quantise_bias
-from quant.encodings import read_core
-from quant.graph import PLANES, Op
-from quant.onnx_file import metadata
-from quant.untrusted import contradictions
+from beers_deploy.model.bank import Bank
+from beers_deploy.model.variants import SENSOR_VALUES
+from beers_deploy.profiles.errors import ModelError
+from beers_deploy.quant.banked.filters import BITS, whole_bank
+from beers_deploy.quant.core import SHIFTS, IntConv, IntCore, Shifts, quantise_bias
+from beers_deploy.quant.encodings import read_core
+from beers_deploy.quant.graph import PLANES, Op
+from beers_deploy.quant.onnx_file import metadata
+from beers_deploy.quant.untrusted import contradictions
 
 FAMILY = "family"
 """In the metadata of an INT8 file: what tells it another sensor."""

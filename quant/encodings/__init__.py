@@ -4,10 +4,10 @@ The host's file runs on stock onnxruntime by integer kernels, from image to rest
 itself as QDQ ONNX, with int8 bias and power-of-two scales. Reading a host file back gives numbers to reason about.
 """
 
-from quant.encodings.board import as_on_board, board_model
-from quant.encodings.description import BORDER_PX, PLACE_PX
-from quant.encodings.host import MICROSOFT, host_model
-from quant.encodings.reading import encoding_faults, read_core
+from beers_deploy.quant.encodings.board import as_on_board, board_model
+from beers_deploy.quant.encodings.description import BORDER_PX, PLACE_PX
+from beers_deploy.quant.encodings.host import MICROSOFT, host_model
+from beers_deploy.quant.encodings.reading import encoding_faults, read_core
 
 __all__ = [
     "BORDER_PX",

@@ -3,12 +3,12 @@
 import numpy as np
 import onnx
 
-from quant.core import IntConv, IntCore
-from quant.encodings.description import BORDER_PX, KEY, PLACE_PX, described_core
-from quant.graph import CORRECTION, PLANES, Conv
-from quant.graph.writer import onnx_weight, write_float
-from quant.onnx_file import GraphWriter, constants, fixed_tile_px, image_info, make_model, metadata
-from quant.untrusted import contradictions
+from beers_deploy.quant.core import IntConv, IntCore
+from beers_deploy.quant.encodings.description import BORDER_PX, KEY, PLACE_PX, described_core
+from beers_deploy.quant.graph import CORRECTION, PLANES, Conv
+from beers_deploy.quant.graph.writer import onnx_weight, write_float
+from beers_deploy.quant.onnx_file import GraphWriter, constants, fixed_tile_px, image_info, make_model, metadata
+from beers_deploy.quant.untrusted import contradictions
 
 
 def board_model(core: IntCore, about: dict[str, str], tile_px: int | None = None) -> onnx.ModelProto:

@@ -11,10 +11,22 @@ from typing import Any
 
 import numpy as np
 
-from quant.core import IntConv, IntCore
-from quant.ends import Ends
-from quant.graph import Activation, Add, AveragePool, Concat, MaxPool, Mul, Op, Pointwise, Resize, Shuffle, Window
-from quant.graph.tail import Tail
+from beers_deploy.quant.core import IntConv, IntCore
+from beers_deploy.quant.ends import Ends
+from beers_deploy.quant.graph import (
+    Activation,
+    Add,
+    AveragePool,
+    Concat,
+    MaxPool,
+    Mul,
+    Op,
+    Pointwise,
+    Resize,
+    Shuffle,
+    Window,
+)
+from beers_deploy.quant.graph.tail import Tail
 
 KEY = "core"
 PLACE_PX = "place_px"

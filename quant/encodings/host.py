@@ -12,10 +12,10 @@ import numpy as np
 import onnx
 from onnx import TensorProto
 
-from quant.core import INT8_MAX, INT8_MIN, IntConv, IntCore
-from quant.encodings.description import KEY, describe, phases
-from quant.ends import ZERO, Ends, HostWriter, write_back, write_front
-from quant.graph import (
+from beers_deploy.quant.core import INT8_MAX, INT8_MIN, IntConv, IntCore
+from beers_deploy.quant.encodings.description import KEY, describe, phases
+from beers_deploy.quant.ends import ZERO, Ends, HostWriter, write_back, write_front
+from beers_deploy.quant.graph import (
     CORRECTION,
     IMAGE,
     PLANES,
@@ -31,10 +31,10 @@ from quant.graph import (
     channels_of,
     is_plain,
 )
-from quant.graph.operations import LEAKY_SLOPE
-from quant.graph.writer import window_attributes, write_shuffle
-from quant.integer.arithmetic import activation_table, bilinear_weights, mean_factor, six_in_units
-from quant.onnx_file import image_info, make_model
+from beers_deploy.quant.graph.operations import LEAKY_SLOPE
+from beers_deploy.quant.graph.writer import window_attributes, write_shuffle
+from beers_deploy.quant.integer.arithmetic import activation_table, bilinear_weights, mean_factor, six_in_units
+from beers_deploy.quant.onnx_file import image_info, make_model
 
 MICROSOFT = "com.microsoft"
 

@@ -7,14 +7,14 @@ written again, so that any node or constant which differs from what the numbers 
 import numpy as np
 import onnx
 
-from profiles.errors import ModelError
-from quant.core import IntConv, IntCore
-from quant.encodings.description import KEY, described_core
-from quant.encodings.host import host_model
-from quant.ends import ZERO, Ends
-from quant.graph import CORRECTION, PLANES, Activation, Add, Op, Window
-from quant.onnx_file import constants, fixed_tile_px, metadata
-from quant.untrusted import contradictions
+from beers_deploy.profiles.errors import ModelError
+from beers_deploy.quant.core import IntConv, IntCore
+from beers_deploy.quant.encodings.description import KEY, described_core
+from beers_deploy.quant.encodings.host import host_model
+from beers_deploy.quant.ends import ZERO, Ends
+from beers_deploy.quant.graph import CORRECTION, PLANES, Activation, Add, Op, Window
+from beers_deploy.quant.onnx_file import constants, fixed_tile_px, metadata
+from beers_deploy.quant.untrusted import contradictions
 
 
 def read_core(model: onnx.ModelProto) -> IntCore:

@@ -8,8 +8,8 @@
 - `planes`: how 12 bits enter int8.
 """
 
-from quant.graph.network import Network, channels_of, check_network, refused_graph
-from quant.graph.operations import (
+from beers_deploy.quant.graph.network import Network, channels_of, check_network, refused_graph
+from beers_deploy.quant.graph.operations import (
     CORRECTION,
     IMAGE,
     Activation,
@@ -32,8 +32,8 @@ from quant.graph.operations import (
     tied,
     ties_scales,
 )
-from quant.graph.plain import correction_graph, image_channels, plain_network
-from quant.graph.planes import (
+from beers_deploy.quant.graph.plain import correction_graph, image_channels, plain_network
+from beers_deploy.quant.graph.planes import (
     COARSE_MAX,
     COUNT,
     PLANES,
@@ -43,8 +43,8 @@ from quant.graph.planes import (
     read_planes,
     split,
 )
-from quant.graph.reader import read_network, refusal
-from quant.graph.writer import graph_to_onnx
+from beers_deploy.quant.graph.reader import read_network, refusal
+from beers_deploy.quant.graph.writer import graph_to_onnx
 
 __all__ = [
     "COARSE_MAX", "CORRECTION", "COUNT", "IMAGE", "PLANES", "PLANES_FRAC_BITS", "QUARTER", "STEP", "Activation",

@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from profiles.errors import ModelError
-from quant.graph.operations import (
+from beers_deploy.profiles.errors import ModelError
+from beers_deploy.quant.graph.operations import (
     CORRECTION,
     IMAGE,
     Activation,
@@ -24,8 +24,8 @@ from quant.graph.operations import (
     Resize,
     Shuffle,
 )
-from quant.graph.planes import PLANES
-from quant.graph.tail import Tail
+from beers_deploy.quant.graph.planes import PLANES
+from beers_deploy.quant.graph.tail import Tail
 
 REMEDY = "see docs/reference/any-network.md for what 'quantize' takes; 'check' names what a DPU does not run"
 

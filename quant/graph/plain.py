@@ -6,9 +6,9 @@ at full resolution, or at a lower one, with the image's pixels rearranged into c
 
 import onnx
 
-from quant.graph.network import Network, refused_graph
-from quant.graph.operations import IMAGE, Add, Conv, Graph, is_plain
-from quant.graph.reader import read_network
+from beers_deploy.quant.graph.network import Network, refused_graph
+from beers_deploy.quant.graph.operations import IMAGE, Add, Conv, Graph, is_plain
+from beers_deploy.quant.graph.reader import read_network
 
 
 def plain_network(model: onnx.ModelProto) -> Network:

@@ -8,8 +8,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from model.io.images import MAX_DN
-from quant.graph.operations import IMAGE, Conv, Graph
+from beers_deploy.model.io.images import MAX_DN
+from beers_deploy.quant.graph.operations import IMAGE, Conv, Graph
 
 PLANES = "planes"
 STEP = 32

@@ -11,9 +11,18 @@ import numpy as np
 import onnx
 from onnx import helper
 
-from profiles.errors import ModelError
-from quant.graph.network import Network, channels_of, check_network, cut, named_apart, refused_graph, renamed, sized
-from quant.graph.operations import (
+from beers_deploy.profiles.errors import ModelError
+from beers_deploy.quant.graph.network import (
+    Network,
+    channels_of,
+    check_network,
+    cut,
+    named_apart,
+    refused_graph,
+    renamed,
+    sized,
+)
+from beers_deploy.quant.graph.operations import (
     CORRECTION,
     IMAGE,
     LEAKY_SLOPE,
@@ -31,10 +40,10 @@ from quant.graph.operations import (
     Shuffle,
     Window,
 )
-from quant.graph.tail import without_tail
-from quant.graph.trials import MOVES, makes_blocks, spelled_shuffle
-from quant.onnx_file import constants
-from quant.untrusted import contradictions, times
+from beers_deploy.quant.graph.tail import without_tail
+from beers_deploy.quant.graph.trials import MOVES, makes_blocks, spelled_shuffle
+from beers_deploy.quant.onnx_file import constants
+from beers_deploy.quant.untrusted import contradictions, times
 
 
 def read_network(model: onnx.ModelProto) -> Network:

@@ -15,9 +15,9 @@ from google.protobuf.message import DecodeError
 from onnx import GraphProto, ModelProto, NodeProto, TensorProto, helper
 from onnx.reference import ReferenceEvaluator
 
-from quant.graph.operations import CORRECTION
-from quant.onnx_file import GraphWriter
-from quant.reading.folding import IR_VERSION, OPSET
+from beers_deploy.quant.graph.operations import CORRECTION
+from beers_deploy.quant.onnx_file import GraphWriter
+from beers_deploy.quant.reading.folding import IR_VERSION, OPSET
 
 PLAIN = {
     "Add", "Clip", "Concat", "Div", "Exp", "Flatten", "Mul", "Pow", "Reshape", "Sigmoid", "Slice", "Softmax",

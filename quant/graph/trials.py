@@ -14,8 +14,8 @@ import onnx
 from onnx import helper, numpy_helper
 from onnx.reference import ReferenceEvaluator
 
-from quant.graph.operations import Shuffle
-from quant.onnx_file import constants
+from beers_deploy.quant.graph.operations import Shuffle
+from beers_deploy.quant.onnx_file import constants
 
 MOVES = ("Reshape", "Transpose", "Squeeze", "Unsqueeze")
 SIDES_PX = 24, 35

@@ -7,7 +7,7 @@ import numpy as np
 import onnx
 from onnx import TensorProto, helper
 
-from quant.graph.operations import (
+from beers_deploy.quant.graph.operations import (
     LEAKY_SLOPE,
     Activation,
     Add,
@@ -23,8 +23,8 @@ from quant.graph.operations import (
     Shuffle,
     Window,
 )
-from quant.graph.planes import PLANES
-from quant.onnx_file import GraphWriter, image_info, make_model
+from beers_deploy.quant.graph.planes import PLANES
+from beers_deploy.quant.onnx_file import GraphWriter, image_info, make_model
 
 
 def graph_to_onnx(graph: Graph, outputs: list[str], channels: int = 3) -> onnx.ModelProto:

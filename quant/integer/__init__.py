@@ -4,7 +4,7 @@
 - `arithmetic`: exact convolutions, maxima and means, and the DPU's fixed-point constants.
 """
 
-from quant.integer.reference import (
+from beers_deploy.quant.integer.reference import (
     INT32_BITS,
     SOUND,
     Agreement,

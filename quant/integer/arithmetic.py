@@ -6,8 +6,8 @@ from itertools import product
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
-from quant.core import INT8_MAX, INT8_MIN, IntConv
-from quant.graph import Activation, AveragePool, MaxPool, Pointwise, Window
+from beers_deploy.quant.core import INT8_MAX, INT8_MIN, IntConv
+from beers_deploy.quant.graph import Activation, AveragePool, MaxPool, Pointwise, Window
 
 FLOAT32_WHOLE_MAX = 2**24
 """Up to here float32 holds whole numbers exactly, and sums them in any order."""

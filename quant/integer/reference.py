@@ -13,13 +13,33 @@ from dataclasses import dataclass, field
 import numpy as np
 import onnx
 
-from profiles.figures import Figure, Row, measured, predicted
-from quant.core import INT8_MAX, INT8_MIN, IntConv, IntCore
-from quant.ends import ZERO
-from quant.graph import CORRECTION, PLANES, Add, AveragePool, Concat, MaxPool, Mul, Op, Pointwise, Resize, Shuffle
-from quant.integer.arithmetic import activated, activation_table, bound_of, convolve, enlarged, means, window_maxima
-from quant.onnx_file import any_size, with_outputs
-from quant.session import few_crops, open_any_size, open_session, result_of
+from beers_deploy.profiles.figures import Figure, Row, measured, predicted
+from beers_deploy.quant.core import INT8_MAX, INT8_MIN, IntConv, IntCore
+from beers_deploy.quant.ends import ZERO
+from beers_deploy.quant.graph import (
+    CORRECTION,
+    PLANES,
+    Add,
+    AveragePool,
+    Concat,
+    MaxPool,
+    Mul,
+    Op,
+    Pointwise,
+    Resize,
+    Shuffle,
+)
+from beers_deploy.quant.integer.arithmetic import (
+    activated,
+    activation_table,
+    bound_of,
+    convolve,
+    enlarged,
+    means,
+    window_maxima,
+)
+from beers_deploy.quant.onnx_file import any_size, with_outputs
+from beers_deploy.quant.session import few_crops, open_any_size, open_session, result_of
 
 INT32_BITS = 31
 """Of an accumulator, without the sign."""

@@ -13,9 +13,9 @@ import numpy as np
 import torch
 from torch.nn import functional
 
-from quant.core import INT8_MAX, INT8_MIN, IntConv, IntCore
-from quant.ends import FINE_MAX, GAIN, Ends
-from quant.graph import (
+from beers_deploy.quant.core import INT8_MAX, INT8_MIN, IntConv, IntCore
+from beers_deploy.quant.ends import FINE_MAX, GAIN, Ends
+from beers_deploy.quant.graph import (
     CORRECTION,
     PLANES,
     Activation,
@@ -30,8 +30,8 @@ from quant.graph import (
     Shuffle,
     Window,
 )
-from quant.graph.operations import LEAKY_SLOPE, SIXTH
-from quant.integer.arithmetic import SIX, activation_table, mean_factor
+from beers_deploy.quant.graph.operations import LEAKY_SLOPE, SIXTH
+from beers_deploy.quant.integer.arithmetic import SIX, activation_table, mean_factor
 
 Tensor = torch.Tensor
 

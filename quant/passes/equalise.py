@@ -13,11 +13,11 @@ from itertools import product
 
 import numpy as np
 
-from quant.core import INT8_MAX
-from quant.ends import ONE_CHANNEL, Ends
-from quant.graph import Conv, Graph, graph_to_onnx
-from quant.passes.stream import STREAM_FRAC_BITS, Stream
-from quant.session import halo_of, open_session, tensor_values
+from beers_deploy.quant.core import INT8_MAX
+from beers_deploy.quant.ends import ONE_CHANNEL, Ends
+from beers_deploy.quant.graph import Conv, Graph, graph_to_onnx
+from beers_deploy.quant.passes.stream import STREAM_FRAC_BITS, Stream
+from beers_deploy.quant.session import halo_of, open_session, tensor_values
 
 QUANTILE = 0.9999
 """A channel's range: the mean over tiles of this quantile of its sizes. The maximum would be ruled by outliers."""

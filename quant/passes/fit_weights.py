@@ -13,10 +13,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
-from quant.core import INT8_MAX, INT8_MIN, SHIFTS, IntConv, IntCore, Shifts, quantise_bias
-from quant.ends import ONE_CHANNEL, Ends
-from quant.graph import CORRECTION, PLANES, Conv, Graph, Op, graph_to_onnx, tensors
-from quant.session import crops, halo_of, open_session, planes_of, tensor_values
+from beers_deploy.quant.core import INT8_MAX, INT8_MIN, SHIFTS, IntConv, IntCore, Shifts, quantise_bias
+from beers_deploy.quant.ends import ONE_CHANNEL, Ends
+from beers_deploy.quant.graph import CORRECTION, PLANES, Conv, Graph, Op, graph_to_onnx, tensors
+from beers_deploy.quant.session import crops, halo_of, open_session, planes_of, tensor_values
 
 EVERY_PX = 4
 """Windows are taken so far apart in both directions: neighbours say nearly the same."""

@@ -16,9 +16,9 @@ from itertools import pairwise, product
 
 import numpy as np
 
-from quant.ends import ONE_CHANNEL, Ends
-from quant.graph import Conv, Graph
-from quant.passes.equalise import (
+from beers_deploy.quant.ends import ONE_CHANNEL, Ends
+from beers_deploy.quant.graph import Conv, Graph
+from beers_deploy.quant.passes.equalise import (
     MOST_CHANNELS,
     Best,
     Costs,
@@ -29,7 +29,7 @@ from quant.passes.equalise import (
     first_guess,
     stepped,
 )
-from quant.passes.stream import STREAM_FRAC_BITS
+from beers_deploy.quant.passes.stream import STREAM_FRAC_BITS
 
 LEVELLING = (0.0, 0.25, 0.5, 1.0)
 HEADROOM = (0.8, 1.0, 1.25, 1.6, 2.2)

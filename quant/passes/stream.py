@@ -11,9 +11,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from quant.ends import FINE_MAX, GAIN
-from quant.graph import CORRECTION, PLANES, Activation, Add, Conv, Graph
-from quant.graph.operations import united
+from beers_deploy.quant.ends import FINE_MAX, GAIN
+from beers_deploy.quant.graph import CORRECTION, PLANES, Activation, Add, Conv, Graph
+from beers_deploy.quant.graph.operations import united
 
 STREAM_FRAC_BITS = 8
 """Any would do: `equalise` scales the stream to it."""

@@ -13,15 +13,15 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from model.progress import Log, no_log
-from profiles.errors import ImageError
-from quant.calibration import Pair, Remade
-from quant.core import IntCore
-from quant.ends import Ends
-from quant.graph import CORRECTION, PLANES, Conv, Graph, graph_to_onnx
-from quant.integer.trainable import Tensor, TrainableCore
-from quant.session import open_session, planes_of, require_finite
-from quant.untrusted import times
+from beers_deploy.model.progress import Log, no_log
+from beers_deploy.profiles.errors import ImageError
+from beers_deploy.quant.calibration import Pair, Remade
+from beers_deploy.quant.core import IntCore
+from beers_deploy.quant.ends import Ends
+from beers_deploy.quant.graph import CORRECTION, PLANES, Conv, Graph, graph_to_onnx
+from beers_deploy.quant.integer.trainable import Tensor, TrainableCore
+from beers_deploy.quant.session import open_session, planes_of, require_finite
+from beers_deploy.quant.untrusted import times
 
 HELD_OUT_EVERY = 8
 """One pair of so many is not trained on, but judges what is kept."""

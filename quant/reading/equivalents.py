@@ -11,8 +11,8 @@ import numpy as np
 import onnx
 from onnx import NodeProto, TensorProto, helper
 
-from quant.reading.flat import Unflatten
-from quant.reading.nodes import Nodes, Shapes, attributes_of, shapes_of
+from beers_deploy.quant.reading.flat import Unflatten
+from beers_deploy.quant.reading.nodes import Nodes, Shapes, attributes_of, shapes_of
 
 ARITHMETIC = {"Add", "Div", "Mul", "Sub"}
 NORMALISATION = "BatchNormalization"

@@ -12,10 +12,10 @@ import onnx
 from google.protobuf.message import DecodeError
 from onnx import TensorProto
 
-from model.io.files import sha256
-from profiles.errors import ModelError
-from profiles.toml import read_whole, unreadable
-from quant.untrusted import FIELDS, FILE_BYTES, check_size, refused
+from beers_deploy.model.io.files import sha256
+from beers_deploy.profiles.errors import ModelError
+from beers_deploy.profiles.toml import read_whole, unreadable
+from beers_deploy.quant.untrusted import FIELDS, FILE_BYTES, check_size, refused
 
 
 def take_in(model: onnx.ModelProto, path: Path) -> None:

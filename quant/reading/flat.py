@@ -9,7 +9,7 @@ from math import prod
 import numpy as np
 from onnx import NodeProto, helper
 
-from quant.reading.nodes import Nodes, Shapes, attributes_of
+from beers_deploy.quant.reading.nodes import Nodes, Shapes, attributes_of
 
 POINTWISE = {"Clip", "Elu", "HardSigmoid", "HardSwish", "LeakyRelu", "Relu", "Sigmoid", "Tanh"}
 Map = tuple[int, int, int]

@@ -32,8 +32,8 @@ import onnxruntime as ort
 from onnx import TensorProto, numpy_helper, version_converter
 from onnx.shape_inference import InferenceError
 
-from quant.reading.equivalents import rewrite
-from quant.untrusted import contradictions, refused
+from beers_deploy.quant.reading.equivalents import rewrite
+from beers_deploy.quant.untrusted import contradictions, refused
 
 OPSET = 17
 IR_VERSION = 8

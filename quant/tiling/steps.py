@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 import onnx
 
-from profiles.errors import ModelError
-from quant.graph.trials import PLACES, ROUNDINGS
-from quant.untrusted import WINDOW_PX, times
+from beers_deploy.profiles.errors import ModelError
+from beers_deploy.quant.graph.trials import PLACES, ROUNDINGS
+from beers_deploy.quant.untrusted import WINDOW_PX, times
 
 
 @dataclass(frozen=True)

@@ -25,10 +25,10 @@ from fractions import Fraction
 import numpy as np
 import onnx
 
-from quant.graph.trials import MOVES, with_shuffles
-from quant.onnx_file import constants, fixed_tile_px
-from quant.tiling.steps import STEPS, Along, Step, refused
-from quant.untrusted import contradictions
+from beers_deploy.quant.graph.trials import MOVES, with_shuffles
+from beers_deploy.quant.onnx_file import constants, fixed_tile_px
+from beers_deploy.quant.tiling.steps import STEPS, Along, Step, refused
+from beers_deploy.quant.untrusted import contradictions
 
 
 @dataclass(frozen=True)

@@ -4,6 +4,13 @@ import math
 
 import pytest
 
+from beers_deploy.dpu.board import load_dpu
+from beers_deploy.dpu.checker.placement import place
+from beers_deploy.dpu.cost.latency import predict
+from beers_deploy.dpu.cost.model import Constants, Structure
+from beers_deploy.model.traditional.settings import QUALITIES
+from beers_deploy.profiles import load_target
+from beers_deploy.profiles.target import board_names
 from benchmarks.cost_model.builder import Builder
 from benchmarks.cost_model.chain_rates import Rates
 from benchmarks.cost_model.chain_time import BOUND_BY, HEIGHT_PX, WIDTH_PX, s_per_mpx
@@ -19,13 +26,6 @@ from benchmarks.cost_model.published import (
     written,
 )
 from benchmarks.cost_model.validation import SHARE, tolerance_rank
-from deploy.dpu.board import load_dpu
-from deploy.dpu.checker.placement import place
-from deploy.dpu.cost.latency import predict
-from deploy.dpu.cost.model import Constants, Structure
-from model.traditional.settings import QUALITIES
-from profiles import load_target
-from profiles.target import board_names
 
 # Parameters without biases and batch norms, from the papers or their repositories.
 WEIGHTS = {"resnet-18": 11.68e6, "vgg-16": 138.34e6, "inception v3": 23.80e6, "yolo v5 n": 1.86e6}

@@ -5,10 +5,10 @@ from pathlib import Path
 import pytest
 import torch
 
-from deploy.export import to_onnx
-from model.convbeers import save_network
-from model.variants import Variant
-from quant.onnx_file import save_onnx
+from beers_deploy.export import to_onnx
+from beers_deploy.model.convbeers import save_network
+from beers_deploy.model.variants import Variant
+from beers_deploy.quant.onnx_file import save_onnx
 from tests.model.networks import behind_a_bank, plain
 
 

@@ -6,7 +6,7 @@ from typing import Any
 
 import jsonschema
 
-from deploy.results import SCHEMA_PATH
+from beers_deploy.results import SCHEMA_PATH
 
 
 def valid(path: Path) -> dict[str, Any]:

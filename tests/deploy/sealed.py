@@ -52,6 +52,6 @@ def seal() -> None:
 
 if __name__ == "__main__":
     seal()
-    from deploy.cli import app
+    from beers_deploy.cli import app
 
     app(sys.argv[1:])

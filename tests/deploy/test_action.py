@@ -10,11 +10,11 @@ from xml.etree import ElementTree as ET
 import onnx
 import pytest
 
-from deploy.export import to_onnx
-from deploy.networks import shipped_pair
-from model.shipped import SENSOR
-from model.variants import Variant
-from quant.onnx_file import save_onnx
+from beers_deploy.export import to_onnx
+from beers_deploy.model.shipped import SENSOR
+from beers_deploy.model.variants import Variant
+from beers_deploy.networks import shipped_pair
+from beers_deploy.quant.onnx_file import save_onnx
 from tests.deploy.command_line import done
 from tests.deploy.workflow_steps import ACTION, BASH, KEPT, ROOT, Runner, read_yaml
 from tests.model.networks import plain

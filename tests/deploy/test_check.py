@@ -8,8 +8,8 @@ from typing import Any
 import onnx
 import pytest
 
-from profiles.errors import ModelError
-from quant.graph import read_network
+from beers_deploy.profiles.errors import ModelError
+from beers_deploy.quant.graph import read_network
 from tests.deploy.command_line import done, refused
 from tests.deploy.documents import valid
 from tests.deploy.dpu.graphs import Sketch, board_convbeers, float_convbeers, integer_convbeers
@@ -107,6 +107,6 @@ def test_of_an_int8_file_nothing_is_said_of_quantising(tmp_path: Path) -> None:
 
 def test_a_check_and_its_picture_need_no_torch(tmp_path: Path) -> None:
     call = f"app(['check', '--picture', {str(tmp_path / 'graph.png')!r}], standalone_mode=False)"
-    code = f"import sys; from deploy.cli import app; {call}; print({{'torch', 'skimage'}} & set(sys.modules))"
+    code = f"import sys; from beers_deploy.cli import app; {call}; print({{'torch', 'skimage'}} & set(sys.modules))"
     ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert ran.stdout.splitlines()[-1] == "set()"

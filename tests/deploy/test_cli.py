@@ -13,11 +13,11 @@ from typer.core import TyperGroup
 from typer.main import get_command
 from typer.testing import CliRunner
 
-from deploy.cli import COMMANDS, app
-from deploy.studies.demo import load_sensors, read_input
-from model.io.images import read_acquisition
-from model.shipped import SENSOR
-from profiles.errors import ImageError
+from beers_deploy.cli import COMMANDS, app
+from beers_deploy.model.io.images import read_acquisition
+from beers_deploy.model.shipped import SENSOR
+from beers_deploy.profiles.errors import ImageError
+from beers_deploy.studies.demo import load_sensors, read_input
 from tests.deploy.command_line import done, refused
 from tests.profiles.own_sensor import SHIPPED, edited, own_sensor
 
@@ -61,7 +61,7 @@ def test_what_is_told_no_sensor_takes_the_same_one() -> None:
 
 def test_help_imports_nothing_heavy() -> None:
     heavy = ("torch", "onnxruntime", "onnx", "skimage", "scipy")
-    code = f"import sys; import deploy.cli; print([m for m in {heavy} if m in sys.modules])"
+    code = f"import sys; import beers_deploy.cli; print([m for m in {heavy} if m in sys.modules])"
     ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert ran.stdout.strip() == "[]"
 
@@ -89,7 +89,14 @@ def test_restore_writes_a_whole_twelve_bit_image(tmp_path: Path) -> None:
 
 def test_a_name_that_the_terminal_cannot_show_ends_no_run(tmp_path: Path) -> None:
     image = acquisition(tmp_path / "\u6771\u4eac.tif", 40, 50)
-    command = [sys.executable, "-c", "from deploy.cli import app; app()", "restore", image, tmp_path / "out.tif"]
+    command = [
+        sys.executable,
+        "-c",
+        "from beers_deploy.cli import app; app()",
+        "restore",
+        image,
+        tmp_path / "out.tif",
+    ]
     environment = {**os.environ, "PYTHONIOENCODING": "cp1252"}  # as pipes have it on Windows
     ran = subprocess.run(
         list(map(str, command)), env=environment, capture_output=True, encoding="cp1252", check=False

@@ -4,10 +4,10 @@ from pathlib import Path
 
 import pytest
 
-from deploy.compare import compare, parse_limit, read_document
-from deploy.results import Document
-from profiles.figures import Figure, Row, measured, predicted, unavailable
-from quant.checks import Check
+from beers_deploy.compare import compare, parse_limit, read_document
+from beers_deploy.profiles.figures import Figure, Row, measured, predicted, unavailable
+from beers_deploy.quant.checks import Check
+from beers_deploy.results import Document
 from tests.deploy.command_line import done, refused
 
 

@@ -11,11 +11,11 @@ import pytest
 import tifffile
 from PIL import Image
 
-from deploy.cluster import open_cluster
-from model.dataset import CHUNK, DatasetRecipe, make_patches, plan_windows, write_dataset
-from profiles import load_sensor
-from profiles.errors import ImageError, OptionError
-from profiles.scene_call import calling_for, load_scene_call, origins, scene_names, typical_effects
+from beers_deploy.cluster import open_cluster
+from beers_deploy.model.dataset import CHUNK, DatasetRecipe, make_patches, plan_windows, write_dataset
+from beers_deploy.profiles import load_sensor
+from beers_deploy.profiles.errors import ImageError, OptionError
+from beers_deploy.profiles.scene_call import calling_for, load_scene_call, origins, scene_names, typical_effects
 from tests.deploy.command_line import done, refused
 from tests.deploy.two_workers import local_cluster
 
@@ -76,7 +76,7 @@ def test_the_manifest_tells_where_each_patch_comes_from(scene: Path, tmp_path: P
 def test_a_killed_dataset_is_resumed_to_the_same_bytes(scene: Path, tmp_path: Path) -> None:
     options = [str(scene), "--oversampling", "2", "--patch", "8", "--workers", "1"]
     whole, killed = (tmp_path / name for name in ("whole", "killed"))
-    command = [sys.executable, "-c", "from deploy.cli import app; app()", "simulate", *options, "--out"]
+    command = [sys.executable, "-c", "from beers_deploy.cli import app; app()", "simulate", *options, "--out"]
     subprocess.run([*command, str(whole)], check=True, capture_output=True)
     with subprocess.Popen([*command, str(killed)], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as run:
         while not list(killed.glob("parts/*.jsonl")) and run.poll() is None:

@@ -5,20 +5,20 @@ import onnx
 import pytest
 import torch
 
-from deploy.dpu.board import load_dpu
-from deploy.dpu.checker.placement import place
-from deploy.dpu.reading import network_of
-from deploy.export import banked_to_onnx, parity, require_parity, to_onnx
-from model.convbeers import ConvBEERS, arrays, load_network, save_network, vector_tensor
-from model.io.tensors import Weights
-from model.shipped import shipped_weights
-from model.training.grow import grow
-from model.variants import VARIANTS, Variant
-from profiles import load_sensor
-from profiles.errors import ModelError, OptionError
-from quant.onnx_file import fixed_tile_px, metadata, save_onnx
-from quant.session import open_session, run
-from quant.tiling.walk import tiling_of
+from beers_deploy.dpu.board import load_dpu
+from beers_deploy.dpu.checker.placement import place
+from beers_deploy.dpu.reading import network_of
+from beers_deploy.export import banked_to_onnx, parity, require_parity, to_onnx
+from beers_deploy.model.convbeers import ConvBEERS, arrays, load_network, save_network, vector_tensor
+from beers_deploy.model.io.tensors import Weights
+from beers_deploy.model.shipped import shipped_weights
+from beers_deploy.model.training.grow import grow
+from beers_deploy.model.variants import VARIANTS, Variant
+from beers_deploy.profiles import load_sensor
+from beers_deploy.profiles.errors import ModelError, OptionError
+from beers_deploy.quant.onnx_file import fixed_tile_px, metadata, save_onnx
+from beers_deploy.quant.session import open_session, run
+from beers_deploy.quant.tiling.walk import tiling_of
 from tests.deploy.command_line import done, refused
 from tests.model.networks import behind_a_bank, plain
 from tests.profiles.own_sensor import own_sensor

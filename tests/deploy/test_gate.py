@@ -12,21 +12,21 @@ import onnx
 import pytest
 from onnx import numpy_helper
 
-from deploy.export import float_model
-from deploy.gate import baseline_mae, file_checks, junit_text, sentence
-from deploy.networks import shipped_pair
-from deploy.results import Document
-from profiles.errors import OptionError
-from profiles.figures import Row, measured
-from profiles.sensor_file import BLIND
-from quant.calibration import Patches
-from quant.checks import Bound, Check
-from quant.encodings import read_core
-from quant.free import quantise_free
-from quant.gate import Limits, compare, judge, judge_saturation, read_limits
-from quant.onnx_file import image_info, load_onnx, save_onnx
-from quant.session import open_session
-from quant.structure import Relus, count_relus, rounded_tensors, saturated_shares
+from beers_deploy.export import float_model
+from beers_deploy.gate import baseline_mae, file_checks, junit_text, sentence
+from beers_deploy.networks import shipped_pair
+from beers_deploy.profiles.errors import OptionError
+from beers_deploy.profiles.figures import Row, measured
+from beers_deploy.profiles.sensor_file import BLIND
+from beers_deploy.quant.calibration import Patches
+from beers_deploy.quant.checks import Bound, Check
+from beers_deploy.quant.encodings import read_core
+from beers_deploy.quant.free import quantise_free
+from beers_deploy.quant.gate import Limits, compare, judge, judge_saturation, read_limits
+from beers_deploy.quant.onnx_file import image_info, load_onnx, save_onnx
+from beers_deploy.quant.session import open_session
+from beers_deploy.quant.structure import Relus, count_relus, rounded_tensors, saturated_shares
+from beers_deploy.results import Document
 from tests.deploy.command_line import done, refused
 from tests.quant.quick import change, changed, drawn, one_guess
 

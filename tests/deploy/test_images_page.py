@@ -6,8 +6,8 @@ PAGE = Path(__file__).parents[2] / "docs" / "how-to" / "images.md"
 
 
 def test_the_page_names_limits_as_they_are() -> None:
-    from deploy.restoration import cog, index_files
-    from deploy.restoration.source import GDAL_DRIVERS
+    from beers_deploy.restoration import cog, index_files
+    from beers_deploy.restoration.source import GDAL_DRIVERS
 
     page = PAGE.read_text(encoding="utf-8")
     assert f"{index_files.INDEX_BYTES >> 20} MiB" in page

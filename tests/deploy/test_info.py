@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 import tifffile
 
-from deploy.info import info_row
-from deploy.networks import shipped_pair
-from deploy.restoration.options import Options
-from deploy.restoration.run import restore_file
-from deploy.restoration.source import TiffSource
-from profiles import load_target
-from profiles.figures import Row
+from beers_deploy.info import info_row
+from beers_deploy.networks import shipped_pair
+from beers_deploy.profiles import load_target
+from beers_deploy.profiles.figures import Row
+from beers_deploy.restoration.options import Options
+from beers_deploy.restoration.run import restore_file
+from beers_deploy.restoration.source import TiffSource
 from tests.deploy.command_line import done
 
 TAGS = [

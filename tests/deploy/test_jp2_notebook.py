@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from deploy.cli import app
+from beers_deploy.cli import app
 
 pytestmark = pytest.mark.slow
 

@@ -11,13 +11,13 @@ import tifffile
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from deploy.library import restore
-from deploy.networks import shipped_pair
-from deploy.restoration.options import Options
-from deploy.restoration.run import restore_file
-from profiles.errors import ImageError, ModelError, OptionError
-from profiles.sensor_file import BLIND
-from quant.onnx_file import save_onnx
+from beers_deploy.library import restore
+from beers_deploy.networks import shipped_pair
+from beers_deploy.profiles.errors import ImageError, ModelError, OptionError
+from beers_deploy.profiles.sensor_file import BLIND
+from beers_deploy.quant.onnx_file import save_onnx
+from beers_deploy.restoration.options import Options
+from beers_deploy.restoration.run import restore_file
 from tests.deploy.restoration.runs import noise
 from tests.deploy.two_workers import local_cluster
 from tests.quant.tiling.small_networks import espcn
@@ -214,6 +214,6 @@ def test_options_and_models_are_refused_before_anything_is_computed(da: Any, mod
 
 def test_importing_it_brings_nothing_that_only_other_work_needs() -> None:
     names = ("torch", "dask", "distributed", "xarray", "matplotlib", "skimage")
-    code = f"import sys; from deploy.library import restore; print([m for m in {names} if m in sys.modules])"
+    code = f"import sys; from beers_deploy.library import restore; print([m for m in {names} if m in sys.modules])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"

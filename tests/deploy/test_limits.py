@@ -5,11 +5,11 @@ from pathlib import Path
 
 import pytest
 
-from deploy.bench.tables import MOST_TILE_PX, parse_tiles
-from deploy.cli import COMMANDS
+from beers_deploy.bench.tables import MOST_TILE_PX, parse_tiles
+from beers_deploy.cli import COMMANDS
+from beers_deploy.model.processor import require_cores
+from beers_deploy.profiles.errors import OptionError
 from docs.make.options import parameters
-from model.processor import require_cores
-from profiles.errors import OptionError
 from tests.deploy.command_line import refused
 
 HUGE = str(10**23)

@@ -11,8 +11,11 @@ import onnx
 import pytest
 import tifffile
 
-from deploy.gate import files_or_shipped
-from deploy.networks import (
+from beers_deploy.gate import files_or_shipped
+from beers_deploy.model.io.files import sha256
+from beers_deploy.model.progress import once
+from beers_deploy.model.shipped import INT8, SENSOR, SHIPPED, VARIANT, shipped_names, shipped_weights
+from beers_deploy.networks import (
     WEIGHTS,
     float_file,
     int8_file,
@@ -21,14 +24,11 @@ from deploy.networks import (
     told_int8,
     weights_file,
 )
-from model.io.files import sha256
-from model.progress import once
-from model.shipped import INT8, SENSOR, SHIPPED, VARIANT, shipped_names, shipped_weights
-from profiles.errors import ModelError, ProfileError
-from profiles.sensor import numbers_of
-from profiles.sensor_file import BLIND, BLIND_PROFILE, load_sensor
-from quant.banked import calibrate
-from quant.onnx_file import load_onnx, metadata
+from beers_deploy.profiles.errors import ModelError, ProfileError
+from beers_deploy.profiles.sensor import numbers_of
+from beers_deploy.profiles.sensor_file import BLIND, BLIND_PROFILE, load_sensor
+from beers_deploy.quant.banked import calibrate
+from beers_deploy.quant.onnx_file import load_onnx, metadata
 from tests.deploy.command_line import done, refused
 from tests.profiles.own_sensor import own_sensor
 
@@ -128,7 +128,7 @@ def test_restoring_for_a_sensor_needs_no_torch_and_is_what_the_sensor_makes_of_i
     sensor = own_sensor(tmp_path, ("value = 0.07", "value = 0.05"))
     words = ["restore", str(tmp_path / "in.tif"), "out.tif", "--model", name, "--sensor", str(sensor)]
     call = f"app({words!r}, standalone_mode=False)"
-    code = f"import sys; from deploy.cli import app; {call}; print({{'torch', 'skimage'}} & set(sys.modules))"
+    code = f"import sys; from beers_deploy.cli import app; {call}; print({{'torch', 'skimage'}} & set(sys.modules))"
     ran = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=True)
     assert ran.stdout.splitlines()[-1] == "set()"
     other = [*words[:2], str(tmp_path / "other.tif"), *words[3:5], "--sensor", SENSOR]

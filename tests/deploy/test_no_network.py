@@ -18,9 +18,9 @@ import pytest
 import tifffile
 from typer.testing import CliRunner
 
-from deploy.cli import app
-from model.convbeers import save_network
-from model.variants import Variant
+from beers_deploy.cli import app
+from beers_deploy.model.convbeers import save_network
+from beers_deploy.model.variants import Variant
 from tests.deploy.sealed import SOCKET_CALL
 from tests.model.networks import plain
 

@@ -11,15 +11,15 @@ import torch
 from onnx import helper, numpy_helper
 from typer.testing import CliRunner
 
-from deploy.cli import app
-from deploy.export import to_onnx
-from deploy.networks import shipped_pair
-from model.convbeers import ConvBEERS, save_network
-from model.variants import VARIANTS
-from profiles.errors import ModelError
-from quant.gate import compare
-from quant.onnx_file import load_onnx, parse_onnx, save_onnx
-from quant.session import open_session
+from beers_deploy.cli import app
+from beers_deploy.export import to_onnx
+from beers_deploy.model.convbeers import ConvBEERS, save_network
+from beers_deploy.model.variants import VARIANTS
+from beers_deploy.networks import shipped_pair
+from beers_deploy.profiles.errors import ModelError
+from beers_deploy.quant.gate import compare
+from beers_deploy.quant.onnx_file import load_onnx, parse_onnx, save_onnx
+from beers_deploy.quant.session import open_session
 
 VARIANT = "convbeers-xs"
 INT8 = str(shipped_pair(VARIANT)[1])

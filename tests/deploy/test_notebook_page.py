@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 import tifffile
 
-from deploy.networks import shipped_pair
-from deploy.restoration.options import Options
-from deploy.restoration.run import restore_file
+from beers_deploy.networks import shipped_pair
+from beers_deploy.restoration.options import Options
+from beers_deploy.restoration.run import restore_file
 
 PAGE = Path(__file__).parents[2] / "docs" / "how-to" / "notebook.md"
 

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from deploy.cli import COMMANDS, app
+from beers_deploy.cli import COMMANDS, app
 from docs.make.options import PATHS, REFUSED, UNITS, WORDS, Parameter, Refused, parameters
 
 CASES = [(name, option, case) for name, cases in REFUSED.items() for case in cases for option in case.options]

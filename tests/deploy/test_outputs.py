@@ -16,9 +16,9 @@ from typer.core import TyperGroup
 from typer.main import get_command
 from typer.testing import CliRunner
 
-from deploy.cli import COMMANDS, app
+from beers_deploy.cli import COMMANDS, app
+from beers_deploy.model.io import files
 from docs.make.options import FILE, PATHS
-from model.io import files
 
 INSIDE = {
     "demo": "int8.onnx",

@@ -10,17 +10,17 @@ from xml.etree import ElementTree as ET
 import numpy as np
 import pytest
 
-from deploy.export import to_onnx
-from deploy.report.plots import FONT_PX, MOST_BARS, bins, histogram_url
-from model.io.images import MAX_DN
-from model.io.tiff import write_tiff
-from model.simulator.procedural import procedural_scene
-from model.variants import Variant
-from profiles import load_sensor
-from profiles.sensor_file import reference_for
-from quant.calibration import draw_patches
-from quant.onnx_file import fixed_tile_px, load_onnx, metadata, save_onnx
-from quant.sensitivity import Spread, kind_of_error, worst_row
+from beers_deploy.export import to_onnx
+from beers_deploy.model.io.images import MAX_DN
+from beers_deploy.model.io.tiff import write_tiff
+from beers_deploy.model.simulator.procedural import procedural_scene
+from beers_deploy.model.variants import Variant
+from beers_deploy.profiles import load_sensor
+from beers_deploy.profiles.sensor_file import reference_for
+from beers_deploy.quant.calibration import draw_patches
+from beers_deploy.quant.onnx_file import fixed_tile_px, load_onnx, metadata, save_onnx
+from beers_deploy.quant.sensitivity import Spread, kind_of_error, worst_row
+from beers_deploy.report.plots import FONT_PX, MOST_BARS, bins, histogram_url
 from tests.deploy.command_line import done, refused
 from tests.deploy.documents import valid
 from tests.deploy.report.svg import style_of, text_width

@@ -3,9 +3,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from deploy.report.page import Picture, Report, Table, render
-from model.io.pictures import busiest_windows, picture_url, stretch_of, strip
-from profiles.figures import Row, measured, predicted, unavailable
+from beers_deploy.model.io.pictures import busiest_windows, picture_url, stretch_of, strip
+from beers_deploy.profiles.figures import Row, measured, predicted, unavailable
+from beers_deploy.report.page import Picture, Report, Table, render
 
 
 def report() -> Report:

@@ -6,11 +6,11 @@ from typing import Any
 import jsonschema
 import pytest
 
-from deploy.compare import read_document
-from deploy.results import SCHEMA_PATH, Document
-from profiles.figures import Figure, Row, measured, number, predicted, published, unavailable
-from quant.checks import Check
-from quant.gate import GateResult, Limits, gate_row, judge
+from beers_deploy.compare import read_document
+from beers_deploy.profiles.figures import Figure, Row, measured, number, predicted, published, unavailable
+from beers_deploy.quant.checks import Check
+from beers_deploy.quant.gate import GateResult, Limits, gate_row, judge
+from beers_deploy.results import SCHEMA_PATH, Document
 
 SCHEMA = json.loads(SCHEMA_PATH.read_text())
 

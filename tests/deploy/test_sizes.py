@@ -10,16 +10,16 @@ import torch
 from PIL import Image
 from typer.testing import CliRunner
 
-from deploy.cli import app
-from deploy.export import float_for
-from deploy.restoration.options import Options
-from deploy.restoration.plan import plan_for
-from model.shipped import SENSOR, VARIANT, shipped_weights
-from model.simulator.acquire import crop_margin
-from model.simulator.sampling import check_divisible
-from model.training.patches import StoredPairs, pair_files
-from profiles import load_sensor
-from profiles.errors import BeersError
+from beers_deploy.cli import app
+from beers_deploy.export import float_for
+from beers_deploy.model.shipped import SENSOR, VARIANT, shipped_weights
+from beers_deploy.model.simulator.acquire import crop_margin
+from beers_deploy.model.simulator.sampling import check_divisible
+from beers_deploy.model.training.patches import StoredPairs, pair_files
+from beers_deploy.profiles import load_sensor
+from beers_deploy.profiles.errors import BeersError
+from beers_deploy.restoration.options import Options
+from beers_deploy.restoration.plan import plan_for
 
 ROWS, COLUMNS = 37, 61
 IMAGE = np.random.default_rng(0).integers(200, 1800, (ROWS, COLUMNS)).astype(np.uint16)

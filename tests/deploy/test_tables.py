@@ -7,9 +7,9 @@ from hypothesis import strategies as st
 from rich.cells import cell_len
 from rich.console import Console
 
-from deploy.results import LEGEND, PIPE_WIDTH, default_console, print_rows
-from profiles.errors import visible
-from profiles.figures import DIGITS, Figure, Row, measured, number, predicted, published, unavailable
+from beers_deploy.profiles.errors import visible
+from beers_deploy.profiles.figures import DIGITS, Figure, Row, measured, number, predicted, published, unavailable
+from beers_deploy.results import LEGEND, PIPE_WIDTH, default_console, print_rows
 
 TALL = [
     Row("t", "one", {"latency": predicted(2, "s", (1, 3), "m"), "power": unavailable("W", "no [counter]")}),

@@ -9,13 +9,13 @@ import pytest
 import torch
 from PIL import Image
 
-from model.convbeers import load_network, save_network, told
-from model.io.tensors import read_tensors
-from model.simulator.procedural import procedural_scene
-from model.training import run as training
-from model.training.patches import StoredPairs
-from model.training.run import Log
-from model.variants import VARIANTS
+from beers_deploy.model.convbeers import load_network, save_network, told
+from beers_deploy.model.io.tensors import read_tensors
+from beers_deploy.model.simulator.procedural import procedural_scene
+from beers_deploy.model.training import run as training
+from beers_deploy.model.training.patches import StoredPairs
+from beers_deploy.model.training.run import Log
+from beers_deploy.model.variants import VARIANTS
 from tests.deploy.command_line import done, refused
 from tests.model.networks import behind_a_bank
 from tests.profiles.own_sensor import own_sensor

@@ -9,18 +9,18 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from deploy.studies.evaluation.methods import method_named
-from deploy.studies.evaluation.pairs import simulate_pairs
-from deploy.studies.evaluation.scores import Instruments
-from model.dataset import DatasetRecipe
-from model.metrics.fidelity import fidelity_db
-from model.simulator.mtf import mtf
-from model.simulator.procedural import procedural_scene
-from model.training.patches import PatchRecipe
-from profiles import SensorProfile, load_sensor
-from profiles.constant import Constant
-from profiles.errors import ProfileError
-from profiles.sensor_file import reference_beside, reference_for
+from beers_deploy.model.dataset import DatasetRecipe
+from beers_deploy.model.metrics.fidelity import fidelity_db
+from beers_deploy.model.simulator.mtf import mtf
+from beers_deploy.model.simulator.procedural import procedural_scene
+from beers_deploy.model.training.patches import PatchRecipe
+from beers_deploy.profiles import SensorProfile, load_sensor
+from beers_deploy.profiles.constant import Constant
+from beers_deploy.profiles.errors import ProfileError
+from beers_deploy.profiles.sensor_file import reference_beside, reference_for
+from beers_deploy.studies.evaluation.methods import method_named
+from beers_deploy.studies.evaluation.pairs import simulate_pairs
+from beers_deploy.studies.evaluation.scores import Instruments
 
 DEGRADED = load_sensor("pleiades-degraded")
 METHODS = ("degraded", "traditional-fast", "convbeers-xs")

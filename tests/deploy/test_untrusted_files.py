@@ -12,24 +12,24 @@ import tifffile
 import torch
 from typer.testing import CliRunner
 
-from deploy.cli import app
-from deploy.dpu.board import load_dpu
-from deploy.gate import PATCHES, baseline_mae
-from deploy.restoration.output import Checkpoint, part_folder
-from deploy.results import Document
-from deploy.studies.tradeoff.measure import Measurements
-from model.convbeers import arrays, load_network
-from model.dataset import _read_summary
-from model.io.images import read_pixels
-from model.io.tensors import read_tensors as read_weights
-from model.io.tensors import write_tensors
-from model.metrics.backbones import read_tensors
-from model.training.run import Log
-from profiles.errors import BeersError, ModelError, OptionError, ProfileError
-from profiles.figures import Row, measured
-from profiles.toml import HERE, read_json, read_toml_text
-from quant.checks import Check
-from quant.onnx_file import load_onnx
+from beers_deploy.cli import app
+from beers_deploy.dpu.board import load_dpu
+from beers_deploy.gate import PATCHES, baseline_mae
+from beers_deploy.model.convbeers import arrays, load_network
+from beers_deploy.model.dataset import _read_summary
+from beers_deploy.model.io.images import read_pixels
+from beers_deploy.model.io.tensors import read_tensors as read_weights
+from beers_deploy.model.io.tensors import write_tensors
+from beers_deploy.model.metrics.backbones import read_tensors
+from beers_deploy.model.training.run import Log
+from beers_deploy.profiles.errors import BeersError, ModelError, OptionError, ProfileError
+from beers_deploy.profiles.figures import Row, measured
+from beers_deploy.profiles.toml import HERE, read_json, read_toml_text
+from beers_deploy.quant.checks import Check
+from beers_deploy.quant.onnx_file import load_onnx
+from beers_deploy.restoration.output import Checkpoint, part_folder
+from beers_deploy.results import Document
+from beers_deploy.studies.tradeoff.measure import Measurements
 from tests.deploy.command_line import refused
 from tests.fuzz.networks import checkpoint_seeds, go_on
 from tests.fuzz.parsers import JOB, SHAPE

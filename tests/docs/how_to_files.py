@@ -10,12 +10,12 @@ import tifffile
 import torch
 from PIL import Image
 
+from beers_deploy.model.convbeers import save_network
+from beers_deploy.model.shipped import SHIPPED
+from beers_deploy.model.variants import Variant
+from beers_deploy.profiles.toml import HERE as PROFILES
+from beers_deploy.quant.onnx_file import save_onnx
 from examples.networks import build, to_onnx
-from model.convbeers import save_network
-from model.shipped import SHIPPED
-from model.variants import Variant
-from profiles.toml import HERE as PROFILES
-from quant.onnx_file import save_onnx
 from tests.deploy.studies.detection.folders import Object, dior
 from tests.deploy.studies.detection.networks import detector, raw
 from tests.deploy.studies.test_characterise import acquisition

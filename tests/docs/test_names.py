@@ -9,10 +9,10 @@ from typing import Any
 
 import pytest
 
-from deploy.cli import COMMANDS
+from beers_deploy.cli import COMMANDS
+from beers_deploy.profiles.effects import TABLES
+from beers_deploy.profiles.scene_call import load_scene_call, scene_names
 from docs.make import api, commands, operators, target_file
-from profiles.effects import TABLES
-from profiles.scene_call import load_scene_call, scene_names
 
 ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"

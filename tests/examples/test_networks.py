@@ -8,8 +8,8 @@ import pytest
 import torch
 from torch import nn
 
+from beers_deploy.quant.session import open_session
 from examples.networks import NETWORKS, build, to_onnx
-from quant.session import open_session
 
 MAX_DIFFERENCE = 1e-5
 

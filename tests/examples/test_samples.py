@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 import torch
 
+from beers_deploy.model.simulator.procedural import procedural_scene
+from beers_deploy.model.simulator.sampling import Scene
+from beers_deploy.profiles.errors import ImageError
+from beers_deploy.quant.samples import read_samples
 from examples.networks import NETWORKS, build
 from examples.samples import GAINS, batches, bright, main
 from examples.train_network import criterion
-from model.simulator.procedural import procedural_scene
-from model.simulator.sampling import Scene
-from profiles.errors import ImageError
-from quant.samples import read_samples
 
 
 @pytest.fixture(scope="module")

@@ -8,12 +8,12 @@ import onnx
 import pytest
 import torch
 
+from beers_deploy.model.io.tensors import read_tensors
+from beers_deploy.model.simulator.procedural import procedural_scene
+from beers_deploy.model.simulator.sampling import Scene
 from examples.networks import build, to_onnx
 from examples.samples import batches
 from examples.train_network import judge, main, train
-from model.io.tensors import read_tensors
-from model.simulator.procedural import procedural_scene
-from model.simulator.sampling import Scene
 
 
 @pytest.fixture(scope="module")

@@ -8,8 +8,8 @@ from tempfile import TemporaryDirectory
 import numpy as np
 from PIL import Image
 
-from deploy.studies.detection.detector import open_detector
-from deploy.studies.detection.labels import read_labelled, yolo_names
+from beers_deploy.studies.detection.detector import open_detector
+from beers_deploy.studies.detection.labels import read_labelled, yolo_names
 from tests.deploy.studies.detection.folders import OBJECTS, SIZE_PX
 from tests.deploy.studies.detection.networks import detector, final, raw
 

@@ -8,20 +8,20 @@ import numpy as np
 import onnx
 import torch
 
-from deploy.dpu.board import load_dpu
-from deploy.dpu.checker.placement import place
-from deploy.dpu.reading import read_network
-from model.convbeers import BankedConvBEERS, ConvBEERS, save_network
-from model.training.checkpoint import TrainingRecipe, read_checkpoint, write_checkpoint
-from model.training.guards import Guards
-from model.variants import Variant
-from profiles.errors import BeersError
-from quant.encodings import encoding_faults
-from quant.graph import correction_graph
-from quant.onnx_file import fixed_tile_px, load_onnx
-from quant.session import open_any_size, open_session, run
-from quant.structure import count_relus, rounded_tensors, saturated_shares
-from quant.tiling.walk import tiling_of
+from beers_deploy.dpu.board import load_dpu
+from beers_deploy.dpu.checker.placement import place
+from beers_deploy.dpu.reading import read_network
+from beers_deploy.model.convbeers import BankedConvBEERS, ConvBEERS, save_network
+from beers_deploy.model.training.checkpoint import TrainingRecipe, read_checkpoint, write_checkpoint
+from beers_deploy.model.training.guards import Guards
+from beers_deploy.model.variants import Variant
+from beers_deploy.profiles.errors import BeersError
+from beers_deploy.quant.encodings import encoding_faults
+from beers_deploy.quant.graph import correction_graph
+from beers_deploy.quant.onnx_file import fixed_tile_px, load_onnx
+from beers_deploy.quant.session import open_any_size, open_session, run
+from beers_deploy.quant.structure import count_relus, rounded_tensors, saturated_shares
+from beers_deploy.quant.tiling.walk import tiling_of
 from tests.deploy.dpu.graphs import board_convbeers, float_convbeers, integer_convbeers
 from tests.fuzz.pictures import written
 from tests.quant.reading.networks import CASES, made

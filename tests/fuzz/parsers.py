@@ -12,30 +12,30 @@ from tempfile import TemporaryDirectory
 import numpy as np
 import tifffile
 
-from deploy.compare import change_rows, compare, read_document
-from deploy.dpu.board import load_dpu
-from deploy.dpu.checker.placement import place
-from deploy.dpu.cost.model import Layers
-from deploy.dpu.cost.own_runs import read_own_runs
-from deploy.dpu.cost.work import count_work
-from deploy.dpu.graph import Network
-from deploy.dpu.reading import read_network
-from deploy.gate import PATCHES, baseline_mae
-from deploy.restoration.output import Checkpoint, part_folder
-from deploy.results import Document, by_row, cell
-from deploy.studies.tradeoff.measure import Measurements
-from model.convbeers import load_network
-from model.dataset import _read_summary
-from model.io.images import read_pixels
-from model.metrics.backbones import read_tensors
-from model.recipe import read_pairs_recipe
-from model.training.run import Log
-from profiles import load_sensor, load_target
-from profiles.figures import Row, measured, predicted, unavailable
-from profiles.response_file import read_response
-from profiles.scene_call import load_scene_call
-from quant.checks import Check
-from quant.gate import read_limits
+from beers_deploy.compare import change_rows, compare, read_document
+from beers_deploy.dpu.board import load_dpu
+from beers_deploy.dpu.checker.placement import place
+from beers_deploy.dpu.cost.model import Layers
+from beers_deploy.dpu.cost.own_runs import read_own_runs
+from beers_deploy.dpu.cost.work import count_work
+from beers_deploy.dpu.graph import Network
+from beers_deploy.dpu.reading import read_network
+from beers_deploy.gate import PATCHES, baseline_mae
+from beers_deploy.model.convbeers import load_network
+from beers_deploy.model.dataset import _read_summary
+from beers_deploy.model.io.images import read_pixels
+from beers_deploy.model.metrics.backbones import read_tensors
+from beers_deploy.model.recipe import read_pairs_recipe
+from beers_deploy.model.training.run import Log
+from beers_deploy.profiles import load_sensor, load_target
+from beers_deploy.profiles.figures import Row, measured, predicted, unavailable
+from beers_deploy.profiles.response_file import read_response
+from beers_deploy.profiles.scene_call import load_scene_call
+from beers_deploy.quant.checks import Check
+from beers_deploy.quant.gate import read_limits
+from beers_deploy.restoration.output import Checkpoint, part_folder
+from beers_deploy.results import Document, by_row, cell
+from beers_deploy.studies.tradeoff.measure import Measurements
 from tests.deploy.dpu.graphs import integer_convbeers
 from tests.deploy.studies.detection.folders import coco, voc, yolo
 from tests.fuzz.detection import detect, detector_seeds, label_seeds, names_seeds, read_beside, read_names

@@ -11,7 +11,7 @@ import numpy as np
 import tifffile
 from PIL import Image
 
-from deploy.restoration.source import open_source
+from beers_deploy.restoration.source import open_source
 
 
 def written(make: Callable[[Path], object], path: Path) -> bytes:

@@ -19,7 +19,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from profiles.errors import BeersError
+from beers_deploy.profiles.errors import BeersError
 from tests.fuzz.mutation import damaged
 from tests.fuzz.parsers import PARSERS, Parser
 

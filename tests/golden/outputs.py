@@ -18,13 +18,13 @@ import torch
 from onnx import numpy_helper
 from typer.testing import CliRunner
 
-from deploy.cli import app
-from deploy.export import to_onnx
+from beers_deploy.cli import app
+from beers_deploy.export import to_onnx
+from beers_deploy.model.convbeers import ConvBEERS, initialise
+from beers_deploy.model.variants import Variant
+from beers_deploy.quant.onnx_file import save_onnx
 from examples.networks import build
 from examples.networks import to_onnx as example_to_onnx
-from model.convbeers import ConvBEERS, initialise
-from model.variants import Variant
-from quant.onnx_file import save_onnx
 
 KEPT = Path(__file__).resolve().parent / "outputs"
 SHIPPED, PLAIN, OTHER = "convbeers-xs", "plain", "dncnn"

@@ -2,8 +2,8 @@
 
 import torch
 
-from model.convbeers import BankedConvBEERS, ConvBEERS, initialise
-from model.variants import Variant
+from beers_deploy.model.convbeers import BankedConvBEERS, ConvBEERS, initialise
+from beers_deploy.model.variants import Variant
 
 
 def plain(variant: Variant, seed: int = 0) -> ConvBEERS:

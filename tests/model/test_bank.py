@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch.nn.functional import conv2d, pixel_unshuffle
 
-from model.bank import (
+from beers_deploy.model.bank import (
     EPSILON_PER_SIGMA,
     FILTERS,
     SIDE_PX,
@@ -19,11 +19,11 @@ from model.bank import (
     in_places,
     noise_over_full_scale,
 )
-from model.family import sensor_vector
-from model.traditional.compensate import compensation_kernel
-from profiles import load_sensor
-from profiles.effects import Smear
-from profiles.sensor import Sensor
+from beers_deploy.model.family import sensor_vector
+from beers_deploy.model.traditional.compensate import compensation_kernel
+from beers_deploy.profiles import load_sensor
+from beers_deploy.profiles.effects import Smear
+from beers_deploy.profiles.sensor import Sensor
 from tests.model.simulator.stages import point_spread, with_response
 
 REFERENCE = load_sensor("pleiades-reference").nominal()

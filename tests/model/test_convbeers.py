@@ -2,9 +2,9 @@ import pytest
 import torch
 from torch.nn.functional import conv2d, pad
 
-from model.bank import bank_of_vector
-from model.convbeers import ConvBEERS, told
-from model.variants import VARIANTS, Variant
+from beers_deploy.model.bank import bank_of_vector
+from beers_deploy.model.convbeers import ConvBEERS, told
+from beers_deploy.model.variants import VARIANTS, Variant
 from tests.model.networks import behind_a_bank, plain
 
 

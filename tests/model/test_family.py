@@ -8,12 +8,12 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from model.convbeers import vector_tensor
-from model.family import RANGES, SensorFamily, sensor_values, sensor_vector
-from model.training.patches import transposed
-from profiles import load_sensor
-from profiles.effects import Smear
-from profiles.sensor import Sensor, noise_from_snr
+from beers_deploy.model.convbeers import vector_tensor
+from beers_deploy.model.family import RANGES, SensorFamily, sensor_values, sensor_vector
+from beers_deploy.model.training.patches import transposed
+from beers_deploy.profiles import load_sensor
+from beers_deploy.profiles.effects import Smear
+from beers_deploy.profiles.sensor import Sensor, noise_from_snr
 
 NOMINAL = load_sensor("pleiades-degraded").nominal()
 FAMILY = SensorFamily(NOMINAL)

@@ -3,8 +3,8 @@ from pathlib import Path
 
 import pytest
 
-from model.io.files import require_writable, write_text
-from profiles.errors import MachineError
+from beers_deploy.model.io.files import require_writable, write_text
+from beers_deploy.profiles.errors import MachineError
 
 
 @pytest.mark.parametrize("text", ["one\ntwo\n", "one\r\ntwo\r\n", "\u00b5m, \u6771\u4eac\n", ""])

@@ -9,11 +9,11 @@ import tifffile
 import torch
 from PIL import Image
 
-from model.io.files import whole_file
-from model.io.images import image_size_px, list_images, read_pixels
-from model.simulator.sampling import read_scene
-from profiles import load_sensor
-from profiles.errors import ImageError, MachineError
+from beers_deploy.model.io.files import whole_file
+from beers_deploy.model.io.images import image_size_px, list_images, read_pixels
+from beers_deploy.model.simulator.sampling import read_scene
+from beers_deploy.profiles import load_sensor
+from beers_deploy.profiles.errors import ImageError, MachineError
 
 SENSOR = load_sensor("pleiades-reference").nominal()
 

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from torch import Tensor
 
-from model.io.tensors import read_tensors, write_tensors
-from model.metrics import backbones
+from beers_deploy.model.io.tensors import read_tensors, write_tensors
+from beers_deploy.model.metrics import backbones
 
 LARGE = np.arange(20_000, dtype=np.float32).reshape(100, 200)
 TENSORS = {"small": np.arange(3, dtype=np.float32), "large": LARGE}

@@ -11,8 +11,8 @@ import onnxruntime as ort
 import pytest
 from onnx import TensorProto, helper, numpy_helper
 
-from model import processor
-from model.processor import decided, int8_adds_exactly, processor_name
+from beers_deploy.model import processor
+from beers_deploy.model.processor import decided, int8_adds_exactly, processor_name
 
 
 def convolved(image: np.ndarray, weight: np.ndarray, scale: float) -> np.ndarray:
@@ -90,7 +90,7 @@ def test_the_processor_beneath_an_emulated_one_lends_it_no_name(
     reason="no qemu-x86_64 (Debian's package qemu-user) on an x86-64 machine",
 )
 def test_under_a_real_emulator_there_is_no_name() -> None:
-    ask = "from model.processor import processor_name; print(processor_name())"
+    ask = "from beers_deploy.model.processor import processor_name; print(processor_name())"
     command = ["qemu-x86_64", "-cpu", "Nehalem", sys.executable, "-c", ask]
     assert subprocess.run(command, capture_output=True, text=True, check=True).stdout == "None\n"
 

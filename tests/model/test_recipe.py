@@ -9,13 +9,13 @@ import pytest
 import tifffile
 from PIL import Image
 
-from deploy.studies.evaluation.pairs import oversamplings_of, read_pairs
-from model.dataset import DatasetRecipe, write_dataset
-from model.recipe import profiles_for, read_pairs_recipe
-from profiles import load_sensor
-from profiles.errors import OptionError, ProfileError
-from profiles.sensor import same_instrument
-from profiles.sensor_file import reference_for, sensor_from_json, sensor_names
+from beers_deploy.model.dataset import DatasetRecipe, write_dataset
+from beers_deploy.model.recipe import profiles_for, read_pairs_recipe
+from beers_deploy.profiles import load_sensor
+from beers_deploy.profiles.errors import OptionError, ProfileError
+from beers_deploy.profiles.sensor import same_instrument
+from beers_deploy.profiles.sensor_file import reference_for, sensor_from_json, sensor_names
+from beers_deploy.studies.evaluation.pairs import oversamplings_of, read_pairs
 
 SEVERE = load_sensor("dior-high")
 

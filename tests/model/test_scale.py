@@ -5,8 +5,8 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
-from model.io.images import MAX_DN, UNIT_MAX, settled_scale
-from profiles.errors import BeersError, ImageError, OptionError
+from beers_deploy.model.io.images import MAX_DN, UNIT_MAX, settled_scale
+from beers_deploy.profiles.errors import BeersError, ImageError, OptionError
 
 
 def settled(kind: str, *largest: float, asked: float | None = None) -> float:

@@ -13,10 +13,10 @@ import pytest
 import tifffile
 from PIL import Image
 
-from deploy.restoration.source import open_source
-from model.io.images import read_pixels
-from model.io.tiff import jpeg_size_px
-from profiles.errors import BeersError, ImageError, MachineError
+from beers_deploy.model.io.images import read_pixels
+from beers_deploy.model.io.tiff import jpeg_size_px
+from beers_deploy.profiles.errors import BeersError, ImageError, MachineError
+from beers_deploy.restoration.source import open_source
 
 GREY = np.random.default_rng(0).integers(0, 250, (16, 16)).astype(np.uint8)
 
@@ -59,7 +59,7 @@ def test_bytes_that_unpack_to_more_than_their_place_are_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Where imagecodecs is missing: with it, the decoder is told the size."""
-    monkeypatch.setattr("model.io.tiff.find_spec", lambda _: None)
+    monkeypatch.setattr("beers_deploy.model.io.tiff.find_spec", lambda _: None)
     path = tiff(tmp_path / "bomb.tif", zlib.compress(bytes(50_000_000), 9), compression=8)
     refused(path, ImageError, "unpack to more")
 

@@ -6,18 +6,18 @@ import pytest
 import torch
 from safetensors.torch import save_file
 
-from model.convbeers import BankedConvBEERS, ConvBEERS, arrays, load_network, save_network
-from model.family import RANGES
-from model.io.tensors import (
+from beers_deploy.model.convbeers import BankedConvBEERS, ConvBEERS, arrays, load_network, save_network
+from beers_deploy.model.family import RANGES
+from beers_deploy.model.io.tensors import (
     is_conditioned,
     read_conditioned,
     read_plain,
     read_tensors,
     write_tensors,
 )
-from model.shipped import SHIPPED, shipped_names, shipped_weights
-from model.variants import VARIANTS, Variant, variant_named
-from profiles.errors import MachineError, ModelError, OptionError
+from beers_deploy.model.shipped import SHIPPED, shipped_names, shipped_weights
+from beers_deploy.model.variants import VARIANTS, Variant, variant_named
+from beers_deploy.profiles.errors import MachineError, ModelError, OptionError
 from tests.model.networks import plain
 
 

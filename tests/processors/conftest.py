@@ -9,10 +9,10 @@ import numpy as np
 import onnx
 import pytest
 
-from deploy.networks import shipped_pair
-from quant.core import INT8_MAX, INT8_MIN, IntConv, IntCore
-from quant.encodings import board_model, read_core
-from quant.onnx_file import load_onnx
+from beers_deploy.networks import shipped_pair
+from beers_deploy.quant.core import INT8_MAX, INT8_MIN, IntConv, IntCore
+from beers_deploy.quant.encodings import board_model, read_core
+from beers_deploy.quant.onnx_file import load_onnx
 
 
 @dataclass(frozen=True)

@@ -5,8 +5,8 @@ from pathlib import Path
 import pytest
 from onnx import numpy_helper
 
-from deploy.networks import shipped_pair
-from quant.onnx_file import load_onnx, save_onnx
+from beers_deploy.networks import shipped_pair
+from beers_deploy.quant.onnx_file import load_onnx, save_onnx
 from tests.deploy.command_line import done
 
 

@@ -5,11 +5,11 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from quant.core import INT8_MAX, INT8_MIN, IntConv, IntCore
-from quant.encodings import board_model, host_model
-from quant.graph import CORRECTION, PLANES, PLANES_FRAC_BITS, Activation, same, split
-from quant.integer import agreement, correction, merged_correction, run_core
-from quant.session import open_session, run
+from beers_deploy.quant.core import INT8_MAX, INT8_MIN, IntConv, IntCore
+from beers_deploy.quant.encodings import board_model, host_model
+from beers_deploy.quant.graph import CORRECTION, PLANES, PLANES_FRAC_BITS, Activation, same, split
+from beers_deploy.quant.integer import agreement, correction, merged_correction, run_core
+from beers_deploy.quant.session import open_session, run
 from tests.processors.conftest import Encodings
 
 Draw = Callable[[np.random.Generator, tuple[int, int]], np.ndarray]

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 import tifffile
 
-from deploy.library import restore
-from deploy.networks import shipped_pair
-from model.shipped import SENSOR
-from quant.encodings import read_core
-from quant.integer import merged_correction, run_core
-from quant.onnx_file import load_onnx
+from beers_deploy.library import restore
+from beers_deploy.model.shipped import SENSOR
+from beers_deploy.networks import shipped_pair
+from beers_deploy.quant.encodings import read_core
+from beers_deploy.quant.integer import merged_correction, run_core
+from beers_deploy.quant.onnx_file import load_onnx
 from tests.deploy.command_line import done
 
 MAX_DN = np.float32(4095)

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from profiles.errors import (
+from beers_deploy.profiles.errors import (
     BeersError,
     ImageError,
     MachineError,

@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from profiles import load_sensor, load_target
-from profiles.errors import ProfileError
-from profiles.sensor import TABLES, noise_from_snr, snr_0_bounds
+from beers_deploy.profiles import load_sensor, load_target
+from beers_deploy.profiles.errors import ProfileError
+from beers_deploy.profiles.sensor import TABLES, noise_from_snr, snr_0_bounds
 from tests.profiles.own_sensor import SHIPPED, own_sensor
 
 KEYS = [(table, key) for table, ways in TABLES.items() for key in ways[0].required]

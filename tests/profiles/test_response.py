@@ -14,12 +14,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from typer.testing import CliRunner
 
-from deploy.cli import app
-from profiles import SensorProfile, load_sensor
-from profiles.errors import ProfileError
-from profiles.response import MtfTable, PointSpread, centroid, packed, unpacked
-from profiles.sensor import same_instrument
-from profiles.sensor_file import sensor_from_json
+from beers_deploy.cli import app
+from beers_deploy.profiles import SensorProfile, load_sensor
+from beers_deploy.profiles.errors import ProfileError
+from beers_deploy.profiles.response import MtfTable, PointSpread, centroid, packed, unpacked
+from beers_deploy.profiles.sensor import same_instrument
+from beers_deploy.profiles.sensor_file import sensor_from_json
 from tests.profiles.own_sensor import SHIPPED, own_sensor
 from tests.profiles.test_profile_files import refusal
 

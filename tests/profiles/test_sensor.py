@@ -6,11 +6,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from profiles import load_sensor, load_target, sensor_names, target_names
-from profiles.effects import Smear
-from profiles.errors import ProfileError
-from profiles.sensor import TABLES, noise_from_snr, snr_0_bounds
-from profiles.toml import HERE
+from beers_deploy.profiles import load_sensor, load_target, sensor_names, target_names
+from beers_deploy.profiles.effects import Smear
+from beers_deploy.profiles.errors import ProfileError
+from beers_deploy.profiles.sensor import TABLES, noise_from_snr, snr_0_bounds
+from beers_deploy.profiles.toml import HERE
 from tests.profiles.own_sensor import own_sensor
 from tests.profiles.test_profile_files import refusal
 

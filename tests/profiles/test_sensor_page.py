@@ -13,12 +13,12 @@ import tifffile
 from typer.core import TyperGroup
 from typer.main import get_command
 
-from deploy.cli import app
-from profiles.constant import Status, read_constant
-from profiles.effects import LIMITS
-from profiles.effects import TABLES as EFFECTS
-from profiles.sensor import MTF_NYQUIST_MAX, TABLES, same_instrument, table_keys
-from profiles.sensor_file import SINGLE, load_sensor, read_sensor, sensor_names
+from beers_deploy.cli import app
+from beers_deploy.profiles.constant import Status, read_constant
+from beers_deploy.profiles.effects import LIMITS
+from beers_deploy.profiles.effects import TABLES as EFFECTS
+from beers_deploy.profiles.sensor import MTF_NYQUIST_MAX, TABLES, same_instrument, table_keys
+from beers_deploy.profiles.sensor_file import SINGLE, load_sensor, read_sensor, sensor_names
 from tests.deploy.command_line import done
 
 PAGE = (Path(__file__).parents[2] / "docs" / "reference" / "sensor-profile.md").read_text(encoding="utf-8")

@@ -6,12 +6,12 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from deploy.cli import app
-from deploy.dpu.board import load_dpu
-from profiles import load_target, target_names
-from profiles.errors import BeersError, ProfileError
-from profiles.target import board_names
-from profiles.toml import HERE
+from beers_deploy.cli import app
+from beers_deploy.dpu.board import load_dpu
+from beers_deploy.profiles import load_target, target_names
+from beers_deploy.profiles.errors import BeersError, ProfileError
+from beers_deploy.profiles.target import board_names
+from beers_deploy.profiles.toml import HERE
 from tests.deploy.command_line import done, refused
 
 PAGE = (HERE.parent / "docs" / "reference" / "boards.md").read_text(encoding="utf-8")

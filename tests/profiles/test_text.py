@@ -8,11 +8,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from profiles import load_sensor, load_target
-from profiles.errors import BeersError, OptionError, ProfileError
-from profiles.scene_call import load_scene_call
-from profiles.toml import DEPTH, JSON_BYTES, QUOTED, TOML_BYTES, parse_json, read_json, read_toml_text
-from quant.gate import read_limits
+from beers_deploy.profiles import load_sensor, load_target
+from beers_deploy.profiles.errors import BeersError, OptionError, ProfileError
+from beers_deploy.profiles.scene_call import load_scene_call
+from beers_deploy.profiles.toml import DEPTH, JSON_BYTES, QUOTED, TOML_BYTES, parse_json, read_json, read_toml_text
+from beers_deploy.quant.gate import read_limits
 
 BAD_TOML = {
     "nested arrays": "a = " + "[" * 20_000,

@@ -10,10 +10,10 @@ import onnx
 from onnx import numpy_helper
 from onnxruntime.quantization import CalibrationDataReader
 
-from model.simulator.procedural import procedural_scene
-from profiles import load_sensor
-from quant.calibration import Patches, Remade, draw_patches
-from quant.quantise import Quantised, quantise_model
+from beers_deploy.model.simulator.procedural import procedural_scene
+from beers_deploy.profiles import load_sensor
+from beers_deploy.quant.calibration import Patches, Remade, draw_patches
+from beers_deploy.quant.quantise import Quantised, quantise_model
 
 
 def image(height: int = 37, width: int = 53, seed: int = 0) -> np.ndarray:
@@ -58,7 +58,10 @@ def changed(model: onnx.ModelProto, name: str, by: Callable[[np.ndarray], np.nda
 def one_guess() -> Iterator[None]:
     """One guess in the place of the search that equalises channels."""
     guess: dict[str, Any] = {"LEVELLING": (0.5,), "HEADROOM": (1.0,)}
-    with patch.multiple("quant.passes.equalise", STEPS=(), **guess), patch.multiple("quant.passes.level", **guess):
+    with (
+        patch.multiple("beers_deploy.quant.passes.equalise", STEPS=(), **guess),
+        patch.multiple("beers_deploy.quant.passes.level", **guess),
+    ):
         yield
 
 

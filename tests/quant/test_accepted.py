@@ -7,14 +7,14 @@ import numpy as np
 import onnx
 import pytest
 
-from profiles.errors import ModelError
-from quant.calibration import Patches
-from quant.core import build_core, shift_faults
-from quant.free import quantise_free
-from quant.gate import compare
-from quant.graph import PLANES, Add, Conv, Graph, Network, check_network, correction_graph, read_planes
-from quant.quantise import quantise_model
-from quant.session import open_session
+from beers_deploy.profiles.errors import ModelError
+from beers_deploy.quant.calibration import Patches
+from beers_deploy.quant.core import build_core, shift_faults
+from beers_deploy.quant.free import quantise_free
+from beers_deploy.quant.gate import compare
+from beers_deploy.quant.graph import PLANES, Add, Conv, Graph, Network, check_network, correction_graph, read_planes
+from beers_deploy.quant.quantise import quantise_model
+from beers_deploy.quant.session import open_session
 from tests.quant.quick import changed, one_guess, quickly
 
 

@@ -5,12 +5,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from model.shipped import SHIPPED
-from quant.encodings import read_core
-from quant.graph import split
-from quant.integer import agreement, merged_correction, run_core
-from quant.onnx_file import load_onnx
-from quant.quantise import Quantised
+from beers_deploy.model.shipped import SHIPPED
+from beers_deploy.quant.encodings import read_core
+from beers_deploy.quant.graph import split
+from beers_deploy.quant.integer import agreement, merged_correction, run_core
+from beers_deploy.quant.onnx_file import load_onnx
+from beers_deploy.quant.quantise import Quantised
 from tests.quant.quick import changed
 
 IMAGE = np.random.default_rng(4).random((2, 1, 35, 41), dtype=np.float32)

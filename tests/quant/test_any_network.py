@@ -11,24 +11,24 @@ import onnx
 import pytest
 import torch
 
-from deploy.dpu.board import load_dpu
-from deploy.dpu.checker.placement import place
-from deploy.dpu.checker.table import legality
-from deploy.dpu.reading import network_of
+from beers_deploy.dpu.board import load_dpu
+from beers_deploy.dpu.checker.placement import place
+from beers_deploy.dpu.checker.table import legality
+from beers_deploy.dpu.reading import network_of
+from beers_deploy.profiles.errors import ModelError
+from beers_deploy.quant.bounds import layer_bounds
+from beers_deploy.quant.core import INT8_MAX, INT8_MIN
+from beers_deploy.quant.encodings import as_on_board, encoding_faults, read_core
+from beers_deploy.quant.encodings.description import KEY
+from beers_deploy.quant.graph import Conv, correction_graph
+from beers_deploy.quant.integer import agreement, merged_correction, run_core
+from beers_deploy.quant.integer.trainable import TrainableCore
+from beers_deploy.quant.onnx_file import GraphWriter, image_info, make_model
+from beers_deploy.quant.quantise import Quantised, quantise_model
+from beers_deploy.quant.reading.folding import simplest
+from beers_deploy.quant.session import open_any_size, open_session, result_of
+from beers_deploy.quant.tiling.walk import tiling_of
 from examples.networks import NETWORKS, build, to_onnx
-from profiles.errors import ModelError
-from quant.bounds import layer_bounds
-from quant.core import INT8_MAX, INT8_MIN
-from quant.encodings import as_on_board, encoding_faults, read_core
-from quant.encodings.description import KEY
-from quant.graph import Conv, correction_graph
-from quant.integer import agreement, merged_correction, run_core
-from quant.integer.trainable import TrainableCore
-from quant.onnx_file import GraphWriter, image_info, make_model
-from quant.quantise import Quantised, quantise_model
-from quant.reading.folding import simplest
-from quant.session import open_any_size, open_session, result_of
-from quant.tiling.walk import tiling_of
 from tests.quant.quick import copied, patches_of, quickly
 
 SIDE_PX = 48
@@ -184,7 +184,7 @@ def test_windows_make_a_result_finer_than_8_bits(weight: float, bias: float, mon
     model, errors = one_convolution(weight, bias), []
     for dual in (True, False):
         if not dual:
-            monkeypatch.setattr("quant.quantise.takes_gains", lambda _: False)
+            monkeypatch.setattr("beers_deploy.quant.quantise.takes_gains", lambda _: False)
         made = quantise_model(model, patches, {})
         wanted = result_of(open_session(model), seen[0])
         errors.append(float(np.abs(result_of(open_session(made.host), seen[0]) - wanted).mean()))

@@ -8,14 +8,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from model.simulator.procedural import procedural_scene
-from model.simulator.sampling import Scene
-from profiles import load_sensor
-from profiles.errors import ImageError
-from profiles.response import MtfTable
-from quant.calibration import Patches, choose_frac_bits, draw_patches, stratified
-from quant.graph import PLANES, Graph, graph_to_onnx, tensors
-from quant.session import TILE_PX, crops, halo_of, open_session, planes_of, tensor_values
+from beers_deploy.model.simulator.procedural import procedural_scene
+from beers_deploy.model.simulator.sampling import Scene
+from beers_deploy.profiles import load_sensor
+from beers_deploy.profiles.errors import ImageError
+from beers_deploy.profiles.response import MtfTable
+from beers_deploy.quant.calibration import Patches, choose_frac_bits, draw_patches, stratified
+from beers_deploy.quant.graph import PLANES, Graph, graph_to_onnx, tensors
+from beers_deploy.quant.session import TILE_PX, crops, halo_of, open_session, planes_of, tensor_values
 from tests.quant.quick import image
 
 VARIABLE, REFERENCE = load_sensor("pleiades-variable"), load_sensor("pleiades-reference")
@@ -144,7 +144,9 @@ def test_no_run_sees_more_than_a_piece_with_its_halo(graph: Graph) -> None:
 def test_positions_of_a_large_image_are_those_of_its_whole(graph: Graph, monkeypatch: pytest.MonkeyPatch) -> None:
     """In pieces or at once: found here by hand from whole tensors."""
     whole = image(TILE_PX + 21, 50)
-    monkeypatch.setattr("quant.calibration._errors", lambda *_: np.zeros(1))  # the scale that clips nothing
+    monkeypatch.setattr(
+        "beers_deploy.quant.calibration._errors", lambda *_: np.zeros(1)
+    )  # the scale that clips nothing
     frac_bits = choose_frac_bits(graph, [whole])
     names = tensors(graph)
     values = open_session(graph_to_onnx(graph, names)).run(names, {PLANES: planes_of(whole)})

@@ -7,9 +7,9 @@ import onnx
 import onnxruntime as ort
 import pytest
 
-from deploy.networks import shipped_pair
-from quant.kernels import FEWEST_OUTPUTS, filled
-from quant.onnx_file import load_onnx
+from beers_deploy.networks import shipped_pair
+from beers_deploy.quant.kernels import FEWEST_OUTPUTS, filled
+from beers_deploy.quant.onnx_file import load_onnx
 
 NETWORKS = [shipped_pair()[1], shipped_pair("convbeers-xs")[1]]
 

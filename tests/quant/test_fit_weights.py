@@ -7,12 +7,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
-from quant.calibration import Patches
-from quant.core import IntConv, IntCore
-from quant.gate import compare
-from quant.graph import Conv, Graph
-from quant.passes.fit_weights import Moments, descend, fit_weights, input_moments
-from quant.session import open_session, planes_of
+from beers_deploy.quant.calibration import Patches
+from beers_deploy.quant.core import IntConv, IntCore
+from beers_deploy.quant.gate import compare
+from beers_deploy.quant.graph import Conv, Graph
+from beers_deploy.quant.passes.fit_weights import Moments, descend, fit_weights, input_moments
+from beers_deploy.quant.session import open_session, planes_of
 from tests.quant.quick import quickly
 
 
@@ -70,7 +70,7 @@ def to_nearest(_graph: Graph, core: IntCore, *_: object) -> IntCore:
 def test_every_layer_errs_less_on_what_it_reads(
     float_onnx: onnx.ModelProto, patches: Patches, unseen: Patches, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("quant.quantise.fit_weights", to_nearest)
+    monkeypatch.setattr("beers_deploy.quant.quantise.fit_weights", to_nearest)
     nearest = quickly(float_onnx, patches)
     fitted = fit_weights(nearest.graph, nearest.core, input_moments(nearest.graph, patches.degraded))
     other = input_moments(nearest.graph, unseen.degraded)
@@ -90,6 +90,6 @@ def test_it_lowers_the_network_s_error_on_unseen_patches(
     session, errors = open_session(float_onnx), []
     for fits in (True, False):
         if not fits:
-            monkeypatch.setattr("quant.quantise.fit_weights", to_nearest)
+            monkeypatch.setattr("beers_deploy.quant.quantise.fit_weights", to_nearest)
         errors.append(compare(session, open_session(quickly(float_onnx, patches).host), unseen.pairs).mae)
     assert errors[0] < errors[1]

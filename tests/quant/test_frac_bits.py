@@ -3,9 +3,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from profiles import load_target
-from profiles.errors import ProfileError
-from quant.core import SHIFTS, best_frac_bits, quantise, target_shifts, unclipped_frac_bits
+from beers_deploy.profiles import load_target
+from beers_deploy.profiles.errors import ProfileError
+from beers_deploy.quant.core import SHIFTS, best_frac_bits, quantise, target_shifts, unclipped_frac_bits
 
 
 @given(st.floats(1e-6, 1e6))

@@ -6,10 +6,10 @@ import onnx
 import pytest
 from onnx import helper
 
-from profiles.errors import ModelError
-from quant.graph import CORRECTION, IMAGE, Add, Conv, Resize, correction_graph, read_network, relu_count
-from quant.onnx_file import GraphWriter, image_info, make_model
-from quant.session import open_session, result_of
+from beers_deploy.profiles.errors import ModelError
+from beers_deploy.quant.graph import CORRECTION, IMAGE, Add, Conv, Resize, correction_graph, read_network, relu_count
+from beers_deploy.quant.onnx_file import GraphWriter, image_info, make_model
+from beers_deploy.quant.session import open_session, result_of
 from tests.quant.quick import copied
 
 

@@ -14,14 +14,14 @@ from hypothesis import strategies as st
 from onnx import TensorProto, helper, numpy_helper
 from onnxruntime.quantization import QuantFormat, QuantType, quantize_static
 
-from deploy.networks import shipped_pair
-from model.processor import int8_adds_exactly
-from profiles.errors import ModelError
-from quant.encodings import read_core
-from quant.integer import merged_correction, run_core
-from quant.kernels import INT16_MAX, INT16_MIN, Way, cannot_saturate, made_exact
-from quant.onnx_file import load_onnx
-from quant.session import open_session, run
+from beers_deploy.model.processor import int8_adds_exactly
+from beers_deploy.networks import shipped_pair
+from beers_deploy.profiles.errors import ModelError
+from beers_deploy.quant.encodings import read_core
+from beers_deploy.quant.integer import merged_correction, run_core
+from beers_deploy.quant.kernels import INT16_MAX, INT16_MIN, Way, cannot_saturate, made_exact
+from beers_deploy.quant.onnx_file import load_onnx
+from beers_deploy.quant.session import open_session, run
 from tests.quant.quick import Calibration
 
 SHAPES = [(1, 1, 1), (3, 5, 3), (4, 6, 1), (16, 16, 3), (5, 33, 3), (32, 8, 2), (17, 32, 3)]

@@ -5,16 +5,25 @@ import onnx
 import pytest
 import torch
 
+from beers_deploy.quant.ends import Ends, ends_of
+from beers_deploy.quant.gate import compare
+from beers_deploy.quant.graph import (
+    CORRECTION,
+    PLANES,
+    Conv,
+    Graph,
+    channels_of,
+    graph_to_onnx,
+    read_network,
+    read_planes,
+)
+from beers_deploy.quant.passes import level
+from beers_deploy.quant.passes.equalise import MOST_CHANNELS, Costs
+from beers_deploy.quant.passes.level import Chain, chain_ranges
+from beers_deploy.quant.passes.stream import STREAM_FRAC_BITS, lone_tensors
+from beers_deploy.quant.reading.folding import simplest
+from beers_deploy.quant.session import open_session, planes_of
 from examples.networks import build, to_onnx
-from quant.ends import Ends, ends_of
-from quant.gate import compare
-from quant.graph import CORRECTION, PLANES, Conv, Graph, channels_of, graph_to_onnx, read_network, read_planes
-from quant.passes import level
-from quant.passes.equalise import MOST_CHANNELS, Costs
-from quant.passes.level import Chain, chain_ranges
-from quant.passes.stream import STREAM_FRAC_BITS, lone_tensors
-from quant.reading.folding import simplest
-from quant.session import open_session, planes_of
 from tests.quant.quick import patches_of, quickly
 
 
@@ -118,5 +127,5 @@ def test_unequal_channels_err_half_as_much_once_they_are_levelled(monkeypatch: p
         return compare(open_session(model), open_session(made.host), patches.pairs, simulated=False).mae
 
     levelled = mae()
-    monkeypatch.setattr("quant.quantise.level", lambda _graph, _chain, _ranges, start, _trial: start)
+    monkeypatch.setattr("beers_deploy.quant.quantise.level", lambda _graph, _chain, _ranges, start, _trial: start)
     assert levelled < 0.5 * mae()

@@ -8,13 +8,13 @@ import onnx
 import pytest
 from onnx import TensorProto, helper
 
-from profiles.errors import ModelError
-from quant.graph import read_network
-from quant.integer import agreement
-from quant.onnx_file import GraphWriter, make_model
-from quant.quantise import quantise_model
-from quant.session import open_session, result_of
-from quant.structure import saturated_shares, structure_checks
+from beers_deploy.profiles.errors import ModelError
+from beers_deploy.quant.graph import read_network
+from beers_deploy.quant.integer import agreement
+from beers_deploy.quant.onnx_file import GraphWriter, make_model
+from beers_deploy.quant.quantise import quantise_model
+from beers_deploy.quant.session import open_session, result_of
+from beers_deploy.quant.structure import saturated_shares, structure_checks
 from tests.quant.quick import patches_of
 
 SLOPE = 26 / 256

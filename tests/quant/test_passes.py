@@ -4,11 +4,11 @@ import numpy as np
 import onnx
 import pytest
 
-from quant.calibration import Patches
-from quant.core import SHIFTS, IntConv, op_shifts
-from quant.ends import FINE_MAX, GAIN, Ends
-from quant.gate import compare
-from quant.graph import (
+from beers_deploy.quant.calibration import Patches
+from beers_deploy.quant.core import SHIFTS, IntConv, op_shifts
+from beers_deploy.quant.ends import FINE_MAX, GAIN, Ends
+from beers_deploy.quant.gate import compare
+from beers_deploy.quant.graph import (
     CORRECTION,
     PLANES,
     PLANES_FRAC_BITS,
@@ -18,7 +18,7 @@ from quant.graph import (
     graph_to_onnx,
     split,
 )
-from quant.passes.equalise import (
+from beers_deploy.quant.passes.equalise import (
     FIRST_CROPS,
     ROOM,
     Costs,
@@ -29,15 +29,15 @@ from quant.passes.equalise import (
     search,
     with_room,
 )
-from quant.passes.stream import (
+from beers_deploy.quant.passes.stream import (
     STREAM_FRAC_BITS,
     Stream,
     half_lsb_pair,
     streams,
     two_gains,
 )
-from quant.quantise import Quantised, quantise_model
-from quant.session import open_session
+from beers_deploy.quant.quantise import Quantised, quantise_model
+from beers_deploy.quant.session import open_session
 from tests.quant.quick import quickly
 
 
@@ -144,7 +144,7 @@ def test_the_search_never_ends_above_its_best_guess(graph: Graph) -> None:
 
 
 def test_a_wide_stream_is_not_searched_channel_by_channel(graph: Graph, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("quant.passes.equalise.MOST_CHANNELS", 7)
+    monkeypatch.setattr("beers_deploy.quant.passes.equalise.MOST_CHANNELS", 7)
     guesses, found, runs = searched(graph, np.arange(1.0, CROPS + 1))
     assert found == min(guesses)
     assert len(runs) == len(guesses)
@@ -194,9 +194,11 @@ def test_all_passes_lose_far_less_than_none(
     def mae(made: Quantised) -> float:
         return compare(open_session(float_onnx), open_session(made.host), patches.pairs).mae
 
-    monkeypatch.setattr("quant.quantise.takes_gains", lambda _: False)
-    monkeypatch.setattr("quant.quantise.search", lambda _g, _s, ranges, _trial: first_guess(ranges, 0.0, 1.0))
-    monkeypatch.setattr("quant.quantise.fit_weights", lambda _graph, core, *_: core)
+    monkeypatch.setattr("beers_deploy.quant.quantise.takes_gains", lambda _: False)
+    monkeypatch.setattr(
+        "beers_deploy.quant.quantise.search", lambda _g, _s, ranges, _trial: first_guess(ranges, 0.0, 1.0)
+    )
+    monkeypatch.setattr("beers_deploy.quant.quantise.fit_weights", lambda _graph, core, *_: core)
     rounded = quantise_model(float_onnx, patches, {}, pairs=False)
     last = rounded.core.ops[-1]
     assert isinstance(last, IntConv)

@@ -1,7 +1,7 @@
 import numpy as np
 
-from model.io.images import MAX_DN
-from quant.graph import QUARTER, STEP, split
+from beers_deploy.model.io.images import MAX_DN
+from beers_deploy.quant.graph import QUARTER, STEP, split
 
 
 def test_no_digital_number_is_lost() -> None:

@@ -5,14 +5,14 @@ import onnx
 import pytest
 from onnx import numpy_helper
 
-from quant.calibration import Patches
-from quant.core import IntConv, build_core, shift_faults
-from quant.gate import compare
-from quant.graph import correction_graph, read_planes
-from quant.onnx_file import metadata
-from quant.quantise import Quantised, quantise_model
-from quant.session import open_session
-from quant.tiling.walk import tiling_of
+from beers_deploy.quant.calibration import Patches
+from beers_deploy.quant.core import IntConv, build_core, shift_faults
+from beers_deploy.quant.gate import compare
+from beers_deploy.quant.graph import correction_graph, read_planes
+from beers_deploy.quant.onnx_file import metadata
+from beers_deploy.quant.quantise import Quantised, quantise_model
+from beers_deploy.quant.session import open_session
+from beers_deploy.quant.tiling.walk import tiling_of
 
 
 def test_scales_are_powers_of_two_and_numbers_are_int8(quantised: Quantised) -> None:

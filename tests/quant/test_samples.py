@@ -9,9 +9,9 @@ import pytest
 import tifffile
 from onnx import TensorProto, helper
 
-from profiles.errors import ImageError, OptionError
-from quant.onnx_file import GraphWriter, image_info, make_model
-from quant.samples import read_samples, samples_of, split_samples
+from beers_deploy.profiles.errors import ImageError, OptionError
+from beers_deploy.quant.onnx_file import GraphWriter, image_info, make_model
+from beers_deploy.quant.samples import read_samples, samples_of, split_samples
 
 RAMP = np.linspace(0, 1, 3 * 2 * 150 * 137, dtype=np.float32).reshape(3, 2, 150, 137)
 

@@ -7,12 +7,12 @@ import onnx
 import pytest
 from onnx import helper, numpy_helper
 
-from deploy.networks import shipped_pair
-from quant.encodings import read_core
-from quant.graph import CORRECTION
-from quant.integer import run_core
-from quant.onnx_file import image_info, load_onnx, make_model
-from quant.structure import rounded_tensors, saturated_shares
+from beers_deploy.networks import shipped_pair
+from beers_deploy.quant.encodings import read_core
+from beers_deploy.quant.graph import CORRECTION
+from beers_deploy.quant.integer import run_core
+from beers_deploy.quant.onnx_file import image_info, load_onnx, make_model
+from beers_deploy.quant.structure import rounded_tensors, saturated_shares
 
 IMAGE = np.random.default_rng(3).random((2, 1, 37, 43), dtype=np.float32)
 Lost = Callable[[np.ndarray], np.ndarray]

@@ -6,13 +6,13 @@ import numpy as np
 import onnx
 import pytest
 
-from model.io.images import MAX_DN
-from quant.calibration import Patches
-from quant.core import IntConv
-from quant.graph import Add
-from quant.quantise import Quantised
-from quant.sensitivity import LayerError, Loss, layer_errors, spread_of
-from quant.session import open_session, run
+from beers_deploy.model.io.images import MAX_DN
+from beers_deploy.quant.calibration import Patches
+from beers_deploy.quant.core import IntConv
+from beers_deploy.quant.graph import Add
+from beers_deploy.quant.quantise import Quantised
+from beers_deploy.quant.sensitivity import LayerError, Loss, layer_errors, spread_of
+from beers_deploy.quant.session import open_session, run
 from tests.quant.quick import quickly
 
 
@@ -67,7 +67,7 @@ def test_a_spoilt_layer_is_found(quantised: Quantised, crops: list[np.ndarray]) 
 def test_one_gain_is_attributed_as_two_are(
     float_onnx: onnx.ModelProto, patches: Patches, crops: list[np.ndarray], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("quant.quantise.takes_gains", lambda _: False)
+    monkeypatch.setattr("beers_deploy.quant.quantise.takes_gains", lambda _: False)
     made = quickly(float_onnx, patches)
     layers, _ = layer_errors(made.graph, made.core, crops)
     tail = layers[-1]

@@ -5,8 +5,8 @@ import time
 import numpy as np
 import pytest
 
-from deploy.networks import shipped_pair
-from quant.session import open_session, run
+from beers_deploy.networks import shipped_pair
+from beers_deploy.quant.session import open_session, run
 
 IMAGE = np.full((1, 1, 96, 96), 0.5, np.float32)
 

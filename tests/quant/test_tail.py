@@ -10,22 +10,22 @@ import pytest
 import torch
 from onnx import TensorProto, helper
 
+from beers_deploy.dpu.board import load_dpu
+from beers_deploy.dpu.checker.placement import place
+from beers_deploy.dpu.checker.table import legality
+from beers_deploy.dpu.reading import network_of
+from beers_deploy.profiles.errors import ModelError
+from beers_deploy.quant.encodings import as_on_board, encoding_faults, read_core
+from beers_deploy.quant.encodings.description import KEY
+from beers_deploy.quant.graph import CORRECTION, read_network
+from beers_deploy.quant.graph.tail import Tail
+from beers_deploy.quant.integer import agreement, integer_rows
+from beers_deploy.quant.onnx_file import GraphWriter, image_info, make_model
+from beers_deploy.quant.quantise import Quantised
+from beers_deploy.quant.reading.folding import simplest
+from beers_deploy.quant.session import open_session, result_of
 from benchmarks.detector.export import detector_to_onnx
 from benchmarks.detector.network import DetectorNetwork, initialise
-from deploy.dpu.board import load_dpu
-from deploy.dpu.checker.placement import place
-from deploy.dpu.checker.table import legality
-from deploy.dpu.reading import network_of
-from profiles.errors import ModelError
-from quant.encodings import as_on_board, encoding_faults, read_core
-from quant.encodings.description import KEY
-from quant.graph import CORRECTION, read_network
-from quant.graph.tail import Tail
-from quant.integer import agreement, integer_rows
-from quant.onnx_file import GraphWriter, image_info, make_model
-from quant.quantise import Quantised
-from quant.reading.folding import simplest
-from quant.session import open_session, result_of
 from tests.quant.quick import copied, patches_of, quickly
 
 SIDE_PX = 160

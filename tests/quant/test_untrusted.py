@@ -9,13 +9,13 @@ import onnx
 import pytest
 from onnx import TensorProto, helper, numpy_helper
 
-from deploy.dpu.board import load_dpu
-from deploy.dpu.checker.placement import place
-from deploy.dpu.reading import read_network
-from profiles.errors import ModelError
-from quant.onnx_file import any_size, load_onnx, parse_onnx
-from quant.session import open_session, run
-from quant.untrusted import FILE_BYTES
+from beers_deploy.dpu.board import load_dpu
+from beers_deploy.dpu.checker.placement import place
+from beers_deploy.dpu.reading import read_network
+from beers_deploy.profiles.errors import ModelError
+from beers_deploy.quant.onnx_file import any_size, load_onnx, parse_onnx
+from beers_deploy.quant.session import open_session, run
+from beers_deploy.quant.untrusted import FILE_BYTES
 from tests.deploy.dpu.graphs import Sketch, board_convbeers, float_convbeers, integer_convbeers
 from tests.quant.reading.networks import node
 

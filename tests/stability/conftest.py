@@ -7,13 +7,13 @@ import onnx
 import pytest
 import torch
 
-from deploy.export import to_onnx
-from deploy.studies.stress.checks import torch_threads
-from deploy.studies.stress.networks import Subject, open_subject
-from model.convbeers import ConvBEERS
-from model.variants import Variant
-from quant.onnx_file import save_onnx
-from quant.quantise import Quantised
+from beers_deploy.export import to_onnx
+from beers_deploy.model.convbeers import ConvBEERS
+from beers_deploy.model.variants import Variant
+from beers_deploy.quant.onnx_file import save_onnx
+from beers_deploy.quant.quantise import Quantised
+from beers_deploy.studies.stress.checks import torch_threads
+from beers_deploy.studies.stress.networks import Subject, open_subject
 from tests.model.networks import plain
 from tests.quant.quick import drawn, quickly
 

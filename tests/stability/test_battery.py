@@ -8,16 +8,16 @@ import onnx
 import pytest
 from typer.testing import CliRunner
 
-from deploy.cli import app
-from deploy.restoration.engine import restore_floats
-from deploy.restoration.plan import make_plan
-from deploy.studies.stress.battery import StageResult, run_battery, worst
-from deploy.studies.stress.cases import CASES, FULL_DN, Case
-from deploy.studies.stress.checks import LIMITATIONS, Measure, differing, local_range, ringing
-from deploy.studies.stress.networks import STAGES, Subject, open_subject
-from profiles.errors import ModelError
-from quant.onnx_file import save_onnx
-from quant.tiling.walk import Tiling
+from beers_deploy.cli import app
+from beers_deploy.profiles.errors import ModelError
+from beers_deploy.quant.onnx_file import save_onnx
+from beers_deploy.quant.tiling.walk import Tiling
+from beers_deploy.restoration.engine import restore_floats
+from beers_deploy.restoration.plan import make_plan
+from beers_deploy.studies.stress.battery import StageResult, run_battery, worst
+from beers_deploy.studies.stress.cases import CASES, FULL_DN, Case
+from beers_deploy.studies.stress.checks import LIMITATIONS, Measure, differing, local_range, ringing
+from beers_deploy.studies.stress.networks import STAGES, Subject, open_subject
 from tests.deploy.command_line import done, refused
 from tests.deploy.documents import valid
 from tests.quant.quick import changed

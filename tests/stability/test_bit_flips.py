@@ -8,11 +8,15 @@ from xml.etree import ElementTree as ET
 import numpy as np
 import pytest
 
-from deploy.bench.tables import predict_file
-from deploy.dpu.board import load_dpu
-from deploy.networks import shipped_pair
-from deploy.restoration.options import TILE_PX
-from deploy.studies.stress.bit_flips import (
+from beers_deploy.bench.tables import predict_file
+from beers_deploy.dpu.board import load_dpu
+from beers_deploy.networks import shipped_pair
+from beers_deploy.profiles.figures import Row
+from beers_deploy.quant.core import IntConv
+from beers_deploy.quant.graph import Activation
+from beers_deploy.quant.integer import SOUND
+from beers_deploy.restoration.options import TILE_PX
+from beers_deploy.studies.stress.bit_flips import (
     FaultTarget,
     FlipRequest,
     curve_rows,
@@ -21,13 +25,17 @@ from deploy.studies.stress.bit_flips import (
     name_of,
     price_rows,
 )
-from deploy.studies.stress.faults import MEMORIES, Guards, Injected, as_stored, checksums, map_channels, restored
-from deploy.studies.stress.networks import Subject, open_subject
+from beers_deploy.studies.stress.faults import (
+    MEMORIES,
+    Guards,
+    Injected,
+    as_stored,
+    checksums,
+    map_channels,
+    restored,
+)
+from beers_deploy.studies.stress.networks import Subject, open_subject
 from docs.make import bit_flips as maker
-from profiles.figures import Row
-from quant.core import IntConv
-from quant.graph import Activation
-from quant.integer import SOUND
 from tests.deploy.command_line import done, refused
 
 pytestmark = pytest.mark.slow

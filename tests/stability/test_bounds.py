@@ -7,18 +7,18 @@ import numpy as np
 import onnx
 import pytest
 
-from deploy.studies.stress.networks import open_subject
-from model.shipped import SHIPPED
-from profiles.errors import ModelError
-from quant.bounds import layer_bounds
-from quant.core import IntConv
-from quant.encodings import read_core
-from quant.ends import Ends
-from quant.graph import CORRECTION, split
-from quant.integer import INT32_BITS, correction, run_core
-from quant.onnx_file import load_onnx
-from quant.quantise import Quantised
-from quant.session import open_session, run
+from beers_deploy.model.shipped import SHIPPED
+from beers_deploy.profiles.errors import ModelError
+from beers_deploy.quant.bounds import layer_bounds
+from beers_deploy.quant.core import IntConv
+from beers_deploy.quant.encodings import read_core
+from beers_deploy.quant.ends import Ends
+from beers_deploy.quant.graph import CORRECTION, split
+from beers_deploy.quant.integer import INT32_BITS, correction, run_core
+from beers_deploy.quant.onnx_file import load_onnx
+from beers_deploy.quant.quantise import Quantised
+from beers_deploy.quant.session import open_session, run
+from beers_deploy.studies.stress.networks import open_subject
 
 
 def images(seed: int, shape: tuple[int, int], binary: bool) -> np.ndarray:

@@ -8,16 +8,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.lib.stride_tricks import sliding_window_view
 
-from model.metrics.fidelity import SSIM_RADIUS_PX, SSIM_SIGMA_PX, ssim
-from model.simulator.mtf import NYQUIST, mtf
-from model.traditional.compensate import compensation_gain
-from quant.core import IntConv, IntCore
-from quant.encodings import board_model, host_model
-from quant.ends import Ends
-from quant.graph import CORRECTION, PLANES, PLANES_FRAC_BITS, split
-from quant.integer import correction
-from quant.quantise import Quantised
-from quant.session import open_session, run
+from beers_deploy.model.metrics.fidelity import SSIM_RADIUS_PX, SSIM_SIGMA_PX, ssim
+from beers_deploy.model.simulator.mtf import NYQUIST, mtf
+from beers_deploy.model.traditional.compensate import compensation_gain
+from beers_deploy.quant.core import IntConv, IntCore
+from beers_deploy.quant.encodings import board_model, host_model
+from beers_deploy.quant.ends import Ends
+from beers_deploy.quant.graph import CORRECTION, PLANES, PLANES_FRAC_BITS, split
+from beers_deploy.quant.integer import correction
+from beers_deploy.quant.quantise import Quantised
+from beers_deploy.quant.session import open_session, run
 
 
 def ssim_by_two_passes(image: np.ndarray, reference: np.ndarray, data_range: float) -> float:

@@ -7,7 +7,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from deploy.studies.stress.faults import (
+from beers_deploy.profiles.errors import ModelError
+from beers_deploy.quant.core import IntConv
+from beers_deploy.quant.graph import split
+from beers_deploy.quant.integer import run_core
+from beers_deploy.quant.quantise import Quantised
+from beers_deploy.studies.stress.faults import (
     SHIFT_BITS,
     as_stored,
     bits_apart,
@@ -19,11 +24,6 @@ from deploy.studies.stress.faults import (
     shifts_of,
     weight_bits,
 )
-from profiles.errors import ModelError
-from quant.core import IntConv
-from quant.graph import split
-from quant.integer import run_core
-from quant.quantise import Quantised
 
 KINDS = {"int8": (np.int8, 8), "maps": (np.int16, 8), "pixels": (np.uint16, 12), "shifts": (np.int16, 6)}
 

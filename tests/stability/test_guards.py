@@ -3,7 +3,12 @@
 import numpy as np
 import pytest
 
-from deploy.studies.stress.faults import (
+from beers_deploy.model.io.images import MAX_DN
+from beers_deploy.quant.core import IntConv, IntCore
+from beers_deploy.quant.graph import CORRECTION, PLANES, Activation, split
+from beers_deploy.quant.integer import SOUND, Faults, merged_correction, run_core
+from beers_deploy.quant.quantise import Quantised
+from beers_deploy.studies.stress.faults import (
     Guards,
     as_stored,
     checksums,
@@ -17,11 +22,6 @@ from deploy.studies.stress.faults import (
     voted,
     with_ops,
 )
-from model.io.images import MAX_DN
-from quant.core import IntConv, IntCore
-from quant.graph import CORRECTION, PLANES, Activation, split
-from quant.integer import SOUND, Faults, merged_correction, run_core
-from quant.quantise import Quantised
 
 
 def image(seed: int, height: int = 37, width: int = 53) -> np.ndarray:

@@ -1,10 +1,10 @@
 """docs/explanation/stability.md names every case, stage and limitation that the code knows."""
 
-from deploy.studies.stress.cases import CASES
-from deploy.studies.stress.networks import STAGES
-from deploy.studies.stress.tables import markdown
+from beers_deploy.profiles.figures import Row, measured, predicted, unavailable
+from beers_deploy.studies.stress.cases import CASES
+from beers_deploy.studies.stress.networks import STAGES
+from beers_deploy.studies.stress.tables import markdown
 from docs.make import stability as maker
-from profiles.figures import Row, measured, predicted, unavailable
 
 
 def test_the_page_is_fresh() -> None:

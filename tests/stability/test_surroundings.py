@@ -14,21 +14,21 @@ import tifffile
 import torch
 from torch import Tensor
 
-from deploy.studies.stress.cases import CASES, FULL_DN, Case
-from deploy.studies.stress.checks import FLAT_DN, gain, ringing, torch_threads
-from model.metrics.fidelity import MIN_SIDE_PX, psnr_db, ssim
-from model.shipped import SENSOR
-from model.simulator.acquire import acquire
-from model.simulator.detector import Draw
-from model.simulator.mtf import mtf, sensor_transfer
-from model.simulator.plan import ringing_of, scene_stats
-from model.simulator.sampling import read_scene, sample, scene_spectrum
-from model.traditional.pipeline import Chain, restore_strips, restore_traditional
-from model.training.losses import LossWeights, RestorationLoss
-from profiles import load_sensor
-from profiles.errors import BeersError, ImageError
-from profiles.sensor import Sensor
-from profiles.sensor_file import REFERENCE
+from beers_deploy.model.metrics.fidelity import MIN_SIDE_PX, psnr_db, ssim
+from beers_deploy.model.shipped import SENSOR
+from beers_deploy.model.simulator.acquire import acquire
+from beers_deploy.model.simulator.detector import Draw
+from beers_deploy.model.simulator.mtf import mtf, sensor_transfer
+from beers_deploy.model.simulator.plan import ringing_of, scene_stats
+from beers_deploy.model.simulator.sampling import read_scene, sample, scene_spectrum
+from beers_deploy.model.traditional.pipeline import Chain, restore_strips, restore_traditional
+from beers_deploy.model.training.losses import LossWeights, RestorationLoss
+from beers_deploy.profiles import load_sensor
+from beers_deploy.profiles.errors import BeersError, ImageError
+from beers_deploy.profiles.sensor import Sensor
+from beers_deploy.profiles.sensor_file import REFERENCE
+from beers_deploy.studies.stress.cases import CASES, FULL_DN, Case
+from beers_deploy.studies.stress.checks import FLAT_DN, gain, ringing, torch_threads
 
 RATIO, FLOAT32_DN, NOISE_DN = 2, 0.05, 5.0
 BY_NAME = {case.name: case for case in CASES}

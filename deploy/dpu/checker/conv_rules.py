@@ -2,9 +2,9 @@
 
 import math
 
-from deploy.dpu.board import Dpu
-from deploy.dpu.checker.finding import Finding, groups_of, outside, shown
-from deploy.dpu.graph import Operation
+from beers_deploy.dpu.board import Dpu
+from beers_deploy.dpu.checker.finding import Finding, groups_of, outside, shown
+from beers_deploy.dpu.graph import Operation
 
 # ruff: noqa: ARG001 - every rule takes the operation and the DPU
 

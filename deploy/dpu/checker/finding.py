@@ -3,9 +3,9 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from deploy.dpu.board import Dpu
-from deploy.dpu.graph import Operation
-from profiles.constant import Constant
+from beers_deploy.dpu.board import Dpu
+from beers_deploy.dpu.graph import Operation
+from beers_deploy.profiles.constant import Constant
 
 
 @dataclass(frozen=True)

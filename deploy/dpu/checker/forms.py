@@ -11,8 +11,8 @@ import math
 from collections.abc import Iterator
 from dataclasses import replace
 
-from deploy.dpu.board import Dpu
-from deploy.dpu.graph import Operation, Window
+from beers_deploy.dpu.board import Dpu
+from beers_deploy.dpu.graph import Operation, Window
 
 
 def forms(op: Operation, dpu: Dpu) -> Iterator[Operation]:

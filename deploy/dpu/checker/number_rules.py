@@ -5,9 +5,9 @@ n fractional bits stand for the scale 2^-n; shifts are differences of them.
 
 import numpy as np
 
-from deploy.dpu.board import Dpu
-from deploy.dpu.checker.finding import Finding, outside
-from deploy.dpu.graph import Operation, Scale
+from beers_deploy.dpu.board import Dpu
+from beers_deploy.dpu.checker.finding import Finding, outside
+from beers_deploy.dpu.graph import Operation, Scale
 
 # ruff: noqa: ARG001 - every rule takes the operation and the DPU
 

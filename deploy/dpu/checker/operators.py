@@ -11,12 +11,12 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cache
 
-from deploy.dpu.board import SIZED, Dpu
-from deploy.dpu.checker import conv_rules, number_rules, other_rules
-from deploy.dpu.checker.finding import Finding, Rule
-from deploy.dpu.checker.forms import forms
-from deploy.dpu.graph import Kind, Operation
-from profiles.constant import check_keys
+from beers_deploy.dpu.board import SIZED, Dpu
+from beers_deploy.dpu.checker import conv_rules, number_rules, other_rules
+from beers_deploy.dpu.checker.finding import Finding, Rule
+from beers_deploy.dpu.checker.forms import forms
+from beers_deploy.dpu.graph import Kind, Operation
+from beers_deploy.profiles.constant import check_keys
 
 CONV: tuple[Rule, ...] = (
     conv_rules.conv_kernel,

@@ -2,11 +2,11 @@
 
 import math
 
-from deploy.dpu.board import Dpu
-from deploy.dpu.checker.conv_rules import alu_padding
-from deploy.dpu.checker.finding import Finding, outside, shown
-from deploy.dpu.graph import CONVOLUTIONS, Operation
-from profiles.errors import sizes
+from beers_deploy.dpu.board import Dpu
+from beers_deploy.dpu.checker.conv_rules import alu_padding
+from beers_deploy.dpu.checker.finding import Finding, outside, shown
+from beers_deploy.dpu.graph import CONVOLUTIONS, Operation
+from beers_deploy.profiles.errors import sizes
 
 # ruff: noqa: ARG001 - every rule takes the operation and the DPU
 

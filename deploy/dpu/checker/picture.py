@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING
 
 from markupsafe import Markup
 
-from deploy.dpu.checker.placement import PlacedNode, Placement
-from deploy.report.plots import look, new_figure, svg_of
-from model.io.files import write_text
-from profiles.errors import OptionError
+from beers_deploy.dpu.checker.placement import PlacedNode, Placement
+from beers_deploy.model.io.files import write_text
+from beers_deploy.profiles.errors import OptionError
+from beers_deploy.report.plots import look, new_figure, svg_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

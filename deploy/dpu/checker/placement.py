@@ -14,9 +14,9 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
-from deploy.dpu.board import Dpu
-from deploy.dpu.checker.operators import Broken, judge, require_known
-from deploy.dpu.graph import CONVOLUTIONS, Network, Operation
+from beers_deploy.dpu.board import Dpu
+from beers_deploy.dpu.checker.operators import Broken, judge, require_known
+from beers_deploy.dpu.graph import CONVOLUTIONS, Network, Operation
 
 Part = Literal["host-front", "dpu-core", "host-back"]
 Device = Literal["host", "DPU", "CPU"]

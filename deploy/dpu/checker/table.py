@@ -3,10 +3,10 @@
 import math
 from collections.abc import Callable
 
-from deploy.dpu.board import Dpu
-from deploy.dpu.checker.placement import Cut, PlacedNode, Placement
-from profiles.figures import Figure, Row, predicted, unavailable
-from quant.checks import Check
+from beers_deploy.dpu.board import Dpu
+from beers_deploy.dpu.checker.placement import Cut, PlacedNode, Placement
+from beers_deploy.profiles.figures import Figure, Row, predicted, unavailable
+from beers_deploy.quant.checks import Check
 
 Remark = Callable[[Placement, Dpu, int], str | None]
 """Looks at a placed network, the DPU and the tile's side; None where there is nothing to say."""

@@ -14,9 +14,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
-from deploy.dpu.board import Dpu
-from deploy.dpu.checker.placement import Placement
-from deploy.dpu.cost.model import (
+from beers_deploy.dpu.board import Dpu
+from beers_deploy.dpu.checker.placement import Placement
+from beers_deploy.dpu.cost.model import (
     Constants,
     Interval,
     Layers,
@@ -30,10 +30,10 @@ from deploy.dpu.cost.model import (
     regime_of,
     task_of,
 )
-from deploy.dpu.cost.work import Work, count_work, largest_map_bytes
-from deploy.dpu.graph import Operation
-from profiles.errors import ModelError
-from profiles.figures import Figure, predicted, unavailable
+from beers_deploy.dpu.cost.work import Work, count_work, largest_map_bytes
+from beers_deploy.dpu.graph import Operation
+from beers_deploy.profiles.errors import ModelError
+from beers_deploy.profiles.figures import Figure, predicted, unavailable
 
 
 @dataclass(frozen=True)

@@ -15,10 +15,10 @@ from typing import Literal, Self, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from deploy.dpu.board import Dpu
-from deploy.dpu.checker.placement import Placement
-from deploy.dpu.cost.work import Work
-from deploy.dpu.graph import Operation
+from beers_deploy.dpu.board import Dpu
+from beers_deploy.dpu.checker.placement import Placement
+from beers_deploy.dpu.cost.work import Work
+from beers_deploy.dpu.graph import Operation
 
 Array = NDArray[np.float64]
 Interval = tuple[float, float]

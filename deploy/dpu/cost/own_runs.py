@@ -10,15 +10,15 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import geometric_mean
 
-from deploy.dpu.board import Dpu
-from deploy.dpu.checker.placement import Placement, place
-from deploy.dpu.cost.latency import Prediction, predict
-from deploy.dpu.cost.model import NAMES, Constants
-from deploy.dpu.reading import read_network
-from profiles.constant import Constant
-from profiles.errors import OptionError
-from profiles.figures import Row, predicted, published
-from profiles.toml import read_json
+from beers_deploy.dpu.board import Dpu
+from beers_deploy.dpu.checker.placement import Placement, place
+from beers_deploy.dpu.cost.latency import Prediction, predict
+from beers_deploy.dpu.cost.model import NAMES, Constants
+from beers_deploy.dpu.reading import read_network
+from beers_deploy.profiles.constant import Constant
+from beers_deploy.profiles.errors import OptionError
+from beers_deploy.profiles.figures import Row, predicted, published
+from beers_deploy.profiles.toml import read_json
 
 EXAMPLE = 'write [{"model": "core.onnx", "configuration": "C32B3", "tile_px": 640, "fps": 9.5}]'
 RUNS, TILE_PX, FPS = 1000, (16, 1 << 16), (1e-9, 1e9)

@@ -4,9 +4,9 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from deploy.dpu.board import Dpu
-from deploy.dpu.checker.finding import groups_of
-from deploy.dpu.graph import Operation, Shape
+from beers_deploy.dpu.board import Dpu
+from beers_deploy.dpu.checker.finding import groups_of
+from beers_deploy.dpu.graph import Operation, Shape
 
 FUSED = ("activation", "quantise", "dequantise", "pixel shuffle")
 """Kinds that cost nothing: done on the way out of the operation before; a pixel shuffle is where its results go."""

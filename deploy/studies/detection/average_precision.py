@@ -12,8 +12,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from deploy.studies.detection.boxes import Boxes, areas, joined, shared_areas
-from model.metrics.bootstrap import LEAST_SITES, percentiles, too_few
+from beers_deploy.model.metrics.bootstrap import LEAST_SITES, percentiles, too_few
+from beers_deploy.studies.detection.boxes import Boxes, areas, joined, shared_areas
 
 OVERLAPS = np.linspace(0.5, 0.95, 10)
 """Intersection over union from which a box counts as found: ten levels, as COCO has them."""

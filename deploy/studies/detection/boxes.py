@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from skimage.transform import resize
 
-from profiles.errors import OptionError
+from beers_deploy.profiles.errors import OptionError
 
 LEAST_VISIBLE = 0.3
 """Share of a box inside the image below which finding it counts neither for nor against a detector."""

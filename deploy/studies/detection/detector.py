@@ -14,11 +14,11 @@ from typing import Any, Literal
 import numpy as np
 import onnx
 
-from deploy.studies.detection.boxes import MOST, Boxes, Letterbox, suppress
-from model.processor import require_cores
-from profiles.errors import ModelError, OptionError
-from quant.onnx_file import constants, fixed_tile_px, load_onnx, metadata
-from quant.session import open_session
+from beers_deploy.model.processor import require_cores
+from beers_deploy.profiles.errors import ModelError, OptionError
+from beers_deploy.quant.onnx_file import constants, fixed_tile_px, load_onnx, metadata
+from beers_deploy.quant.session import open_session
+from beers_deploy.studies.detection.boxes import MOST, Boxes, Letterbox, suppress
 
 LEAST_SCORE = 1e-3
 """Below it a detection is none, as Ultralytics validates: average precision needs the doubtful ones."""

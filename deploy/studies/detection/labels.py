@@ -19,13 +19,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from deploy.restoration.index_files import NoDoctype
-from deploy.studies.detection.boxes import Boxes, areas
-from deploy.studies.detection.detector import class_names, letters
-from model.io.files import IMAGE_SUFFIXES
-from model.io.images import image_size_px, list_images
-from profiles.errors import MachineError, OptionError
-from profiles.toml import read_json, read_whole
+from beers_deploy.model.io.files import IMAGE_SUFFIXES
+from beers_deploy.model.io.images import image_size_px, list_images
+from beers_deploy.profiles.errors import MachineError, OptionError
+from beers_deploy.profiles.toml import read_json, read_whole
+from beers_deploy.restoration.index_files import NoDoctype
+from beers_deploy.studies.detection.boxes import Boxes, areas
+from beers_deploy.studies.detection.detector import class_names, letters
 
 SPLITS = ("test", "val", "valid", "train")
 """Where no split is asked for, the first that is there: what a detector was trained on comes last."""

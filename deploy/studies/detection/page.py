@@ -6,15 +6,15 @@ from pathlib import Path
 import numpy as np
 from PIL import Image, ImageDraw
 
-from deploy.report.page import Picture, Report, Table, write_report
-from deploy.report.plots import SERIES, Curve, Panel, curves_svg, data_url
-from deploy.studies.detection.average_precision import RECALLS, Hits, mean_known, precisions
-from deploy.studies.detection.boxes import Boxes, iou
-from deploy.studies.detection.study import REFERENCE, Comparison
-from deploy.studies.detection.tables import BY_SIZE, MAIN, PAPER_NOTES, detection_rows, headline, paper_rows
-from deploy.studies.evaluation.methods import DEGRADED
-from model.io.pictures import grid, picture_url
-from profiles.figures import Row, by_table
+from beers_deploy.model.io.pictures import grid, picture_url
+from beers_deploy.profiles.figures import Row, by_table
+from beers_deploy.report.page import Picture, Report, Table, write_report
+from beers_deploy.report.plots import SERIES, Curve, Panel, curves_svg, data_url
+from beers_deploy.studies.detection.average_precision import RECALLS, Hits, mean_known, precisions
+from beers_deploy.studies.detection.boxes import Boxes, iou
+from beers_deploy.studies.detection.study import REFERENCE, Comparison
+from beers_deploy.studies.detection.tables import BY_SIZE, MAIN, PAPER_NOTES, detection_rows, headline, paper_rows
+from beers_deploy.studies.evaluation.methods import DEGRADED
 
 CROP_PX, ZOOM, PICTURES = 88, 3, 4
 OVERLAP = 0.5

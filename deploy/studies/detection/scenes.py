@@ -14,8 +14,7 @@ from itertools import pairwise
 import numpy as np
 from PIL import Image, ImageDraw
 
-from deploy.studies.detection.boxes import Boxes
-from model.simulator.drawing import (
+from beers_deploy.model.simulator.drawing import (
     ASPHALT,
     CONCRETE,
     GRASS,
@@ -30,6 +29,7 @@ from model.simulator.drawing import (
     tree,
     turn,
 )
+from beers_deploy.studies.detection.boxes import Boxes
 
 CLASSES = ("vehicle", "ship", "aircraft", "tank")
 VEHICLE, SHIP, AIRCRAFT, TANK = range(len(CLASSES))

@@ -13,20 +13,20 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from deploy.studies.detection.average_precision import Figures, Hits, find_hits, score_rows, site_weights
-from deploy.studies.detection.boxes import Boxes
-from deploy.studies.detection.detector import Detector, class_numbers
-from deploy.studies.detection.labels import read_labelled
-from deploy.studies.detection.scenes import CLASSES, synthetic_scene
-from deploy.studies.evaluation.methods import DEGRADED, Method, method_named
-from model.io.images import site_of
-from model.io.pictures import Stretch, stretch_of
-from model.progress import Log, no_log, once, steps
-from model.simulator.acquire import acquire_padded
-from model.simulator.detector import Draw
-from model.simulator.sampling import read_scene
-from profiles.sensor import Sensor, SensorProfile
-from profiles.sensor_file import load_sensor, reference_beside
+from beers_deploy.model.io.images import site_of
+from beers_deploy.model.io.pictures import Stretch, stretch_of
+from beers_deploy.model.progress import Log, no_log, once, steps
+from beers_deploy.model.simulator.acquire import acquire_padded
+from beers_deploy.model.simulator.detector import Draw
+from beers_deploy.model.simulator.sampling import read_scene
+from beers_deploy.profiles.sensor import Sensor, SensorProfile
+from beers_deploy.profiles.sensor_file import load_sensor, reference_beside
+from beers_deploy.studies.detection.average_precision import Figures, Hits, find_hits, score_rows, site_weights
+from beers_deploy.studies.detection.boxes import Boxes
+from beers_deploy.studies.detection.detector import Detector, class_numbers
+from beers_deploy.studies.detection.labels import read_labelled
+from beers_deploy.studies.detection.scenes import CLASSES, synthetic_scene
+from beers_deploy.studies.evaluation.methods import DEGRADED, Method, method_named
 
 REFERENCE = "reference"
 """The row of the scenes as the reference sensor sees them."""

@@ -5,11 +5,11 @@ from math import isnan
 
 import numpy as np
 
-from deploy.studies.detection.average_precision import DRAWS, SIZES_PX, interval
-from deploy.studies.detection.study import REFERENCE, Comparison
-from deploy.studies.evaluation.methods import DEGRADED
-from model.metrics.bootstrap import too_few
-from profiles.figures import Figure, Row, measured, published, unavailable
+from beers_deploy.model.metrics.bootstrap import too_few
+from beers_deploy.profiles.figures import Figure, Row, measured, published, unavailable
+from beers_deploy.studies.detection.average_precision import DRAWS, SIZES_PX, interval
+from beers_deploy.studies.detection.study import REFERENCE, Comparison
+from beers_deploy.studies.evaluation.methods import DEGRADED
 
 PERCENT, POINTS = "%", "points"
 """Units: a share, and a difference of two shares."""

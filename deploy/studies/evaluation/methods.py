@@ -11,20 +11,20 @@ from pathlib import Path
 import onnx
 import torch
 
-from deploy.export import float_model
-from deploy.networks import conditioned, network_file, warn_outside
-from deploy.restoration.function import Restore, network_method
-from model.progress import Log, no_log
-from model.shipped import INT8, shipped_names
-from model.traditional.peers import PEERS
-from model.traditional.pipeline import Chain, Order, restore_traditional
-from model.traditional.settings import QUALITIES
-from profiles.constant import Constant
-from profiles.errors import OptionError
-from profiles.sensor import Sensor, SensorProfile
-from profiles.sensor_file import BLIND as NOT_KNOWN
-from profiles.sensor_file import BLIND_PROFILE, load_sensor
-from quant.onnx_file import metadata
+from beers_deploy.export import float_model
+from beers_deploy.model.progress import Log, no_log
+from beers_deploy.model.shipped import INT8, shipped_names
+from beers_deploy.model.traditional.peers import PEERS
+from beers_deploy.model.traditional.pipeline import Chain, Order, restore_traditional
+from beers_deploy.model.traditional.settings import QUALITIES
+from beers_deploy.networks import conditioned, network_file, warn_outside
+from beers_deploy.profiles.constant import Constant
+from beers_deploy.profiles.errors import OptionError
+from beers_deploy.profiles.sensor import Sensor, SensorProfile
+from beers_deploy.profiles.sensor_file import BLIND as NOT_KNOWN
+from beers_deploy.profiles.sensor_file import BLIND_PROFILE, load_sensor
+from beers_deploy.quant.onnx_file import metadata
+from beers_deploy.restoration.function import Restore, network_method
 
 Specialise = Callable[[Sensor], Restore]
 """A sensor to the restoration of images that it acquired."""

@@ -6,13 +6,13 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from deploy.report.page import Picture, Report, Table, write_report
-from deploy.studies.evaluation.methods import Method
-from deploy.studies.evaluation.pairs import NamedPair
-from deploy.studies.evaluation.run import Evaluation
-from model.io.files import whole_file
-from model.io.pictures import busiest_windows, error_row, grid, picture_url, stretch_of, strip_row
-from profiles.figures import Row, by_table
+from beers_deploy.model.io.files import whole_file
+from beers_deploy.model.io.pictures import busiest_windows, error_row, grid, picture_url, stretch_of, strip_row
+from beers_deploy.profiles.figures import Row, by_table
+from beers_deploy.report.page import Picture, Report, Table, write_report
+from beers_deploy.studies.evaluation.methods import Method
+from beers_deploy.studies.evaluation.pairs import NamedPair
+from beers_deploy.studies.evaluation.run import Evaluation
 
 SITES, CROP_PX, ZOOM = 4, 96, 2
 

@@ -7,15 +7,22 @@ from pathlib import Path
 
 import numpy as np
 
-from model.io.images import MAX_DN, read_acquisition, site_of
-from model.recipe import PairsRecipe
-from model.simulator.acquire import LEAST_SIDE_PX, MARGIN_PX, NOISE, acquire, fitting_oversampling, prepare_scene
-from model.simulator.detector import Draw
-from model.simulator.procedural import load_scenes
-from model.simulator.sampling import Scene
-from model.training.patches import pair_files
-from profiles.errors import ImageError
-from profiles.sensor import Sensor, SensorProfile
+from beers_deploy.model.io.images import MAX_DN, read_acquisition, site_of
+from beers_deploy.model.recipe import PairsRecipe
+from beers_deploy.model.simulator.acquire import (
+    LEAST_SIDE_PX,
+    MARGIN_PX,
+    NOISE,
+    acquire,
+    fitting_oversampling,
+    prepare_scene,
+)
+from beers_deploy.model.simulator.detector import Draw
+from beers_deploy.model.simulator.procedural import load_scenes
+from beers_deploy.model.simulator.sampling import Scene
+from beers_deploy.model.training.patches import pair_files
+from beers_deploy.profiles.errors import ImageError
+from beers_deploy.profiles.sensor import Sensor, SensorProfile
 
 OVERSAMPLINGS = (4, 2)
 

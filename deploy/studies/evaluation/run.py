@@ -4,17 +4,17 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from deploy.studies.evaluation.methods import Method, method_named
-from deploy.studies.evaluation.pairs import NamedPair, pairs_of_scenes, read_pairs
-from deploy.studies.evaluation.scores import Instruments, paper_rows, perceptual_distances, score, site_rows
-from deploy.studies.evaluation.sweep import sweep_tables
-from deploy.studies.evaluation.targets import acquire_targets, target_figures
-from model.io.images import list_images
-from model.metrics.bootstrap import too_few
-from model.progress import once
-from model.recipe import profiles_for, read_pairs_recipe
-from profiles.figures import Row
-from profiles.sensor import SensorProfile
+from beers_deploy.model.io.images import list_images
+from beers_deploy.model.metrics.bootstrap import too_few
+from beers_deploy.model.progress import once
+from beers_deploy.model.recipe import profiles_for, read_pairs_recipe
+from beers_deploy.profiles.figures import Row
+from beers_deploy.profiles.sensor import SensorProfile
+from beers_deploy.studies.evaluation.methods import Method, method_named
+from beers_deploy.studies.evaluation.pairs import NamedPair, pairs_of_scenes, read_pairs
+from beers_deploy.studies.evaluation.scores import Instruments, paper_rows, perceptual_distances, score, site_rows
+from beers_deploy.studies.evaluation.sweep import sweep_tables
+from beers_deploy.studies.evaluation.targets import acquire_targets, target_figures
 
 
 @dataclass(frozen=True)

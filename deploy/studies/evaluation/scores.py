@@ -7,16 +7,16 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from deploy.studies.evaluation.methods import Method
-from deploy.studies.evaluation.pairs import NamedPair
-from deploy.studies.evaluation.targets import RADIANCES, snr_name
-from model.io.images import MAX_DN
-from model.metrics.backbones import find_backbone, not_found
-from model.metrics.bootstrap import site_interval
-from model.metrics.fidelity import fidelity_db, ssim
-from model.metrics.perceptual import Dists, Lpips
-from model.progress import steps
-from profiles.figures import Figure, Row, measured, published, unavailable
+from beers_deploy.model.io.images import MAX_DN
+from beers_deploy.model.metrics.backbones import find_backbone, not_found
+from beers_deploy.model.metrics.bootstrap import site_interval
+from beers_deploy.model.metrics.fidelity import fidelity_db, ssim
+from beers_deploy.model.metrics.perceptual import Dists, Lpips
+from beers_deploy.model.progress import steps
+from beers_deploy.profiles.figures import Figure, Row, measured, published, unavailable
+from beers_deploy.studies.evaluation.methods import Method
+from beers_deploy.studies.evaluation.pairs import NamedPair
+from beers_deploy.studies.evaluation.targets import RADIANCES, snr_name
 
 Perceptual = Callable[[np.ndarray, np.ndarray], float]
 """Distance of two images (H, W) in [0, 1] of full scale."""

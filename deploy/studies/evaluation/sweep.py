@@ -9,18 +9,18 @@ from pathlib import Path
 
 import numpy as np
 
-from deploy.studies.evaluation.methods import DEGRADED, TRADITIONAL, Method, method_without_network
-from deploy.studies.evaluation.pairs import NamedPair, oversamplings_of, simulate_pairs
-from deploy.studies.evaluation.scores import NOISE_FREE
-from deploy.studies.evaluation.targets import acquire_targets, mtf_figure, restored_mtfs
-from model.io.images import site_of
-from model.metrics.bootstrap import site_interval
-from model.metrics.fidelity import fidelity_db
-from model.progress import steps
-from model.simulator.procedural import load_scenes
-from model.simulator.sampling import Scene
-from profiles.figures import Figure, Row, measured
-from profiles.sensor import Sensor, SensorProfile, noise_from_snr
+from beers_deploy.model.io.images import site_of
+from beers_deploy.model.metrics.bootstrap import site_interval
+from beers_deploy.model.metrics.fidelity import fidelity_db
+from beers_deploy.model.progress import steps
+from beers_deploy.model.simulator.procedural import load_scenes
+from beers_deploy.model.simulator.sampling import Scene
+from beers_deploy.profiles.figures import Figure, Row, measured
+from beers_deploy.profiles.sensor import Sensor, SensorProfile, noise_from_snr
+from beers_deploy.studies.evaluation.methods import DEGRADED, TRADITIONAL, Method, method_without_network
+from beers_deploy.studies.evaluation.pairs import NamedPair, oversamplings_of, simulate_pairs
+from beers_deploy.studies.evaluation.scores import NOISE_FREE
+from beers_deploy.studies.evaluation.targets import acquire_targets, mtf_figure, restored_mtfs
 
 NOMINAL, PLAIN = "nominal", (DEGRADED, TRADITIONAL)
 """The condition that the others depart from, and the methods besides networks."""

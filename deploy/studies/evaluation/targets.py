@@ -13,15 +13,15 @@ import torch
 from scipy.special import stdtrit
 from torch import Tensor
 
-from deploy.studies.evaluation.methods import Method
-from model.io.images import MAX_DN
-from model.metrics.refusal import Refusal
-from model.metrics.slanted_edge import edge_mtf, slanted_edge
-from model.simulator.acquire import acquire
-from model.simulator.detector import Draw
-from model.simulator.sampling import scene_spectrum
-from profiles.figures import Figure, measured, unavailable
-from profiles.sensor import Sensor
+from beers_deploy.model.io.images import MAX_DN
+from beers_deploy.model.metrics.refusal import Refusal
+from beers_deploy.model.metrics.slanted_edge import edge_mtf, slanted_edge
+from beers_deploy.model.simulator.acquire import acquire
+from beers_deploy.model.simulator.detector import Draw
+from beers_deploy.model.simulator.sampling import scene_spectrum
+from beers_deploy.profiles.figures import Figure, measured, unavailable
+from beers_deploy.profiles.sensor import Sensor
+from beers_deploy.studies.evaluation.methods import Method
 
 ANGLES_DEG = (3.0, 5.0, 8.0, 11.0)
 REPEATS = 3

@@ -7,14 +7,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from deploy.studies.stress.cases import CASES, SIDE_PX, Case
-from deploy.studies.stress.checks import Limitation, Measure, limitation_of, torch_threads
-from deploy.studies.stress.networks import STAGES, Subject
-from model.progress import steps
-from profiles.errors import BeersError, OptionError
-from profiles.figures import Figure, Row, measured, predicted
-from quant.bounds import layer_bounds
-from quant.integer import INT32_BITS
+from beers_deploy.model.progress import steps
+from beers_deploy.profiles.errors import BeersError, OptionError
+from beers_deploy.profiles.figures import Figure, Row, measured, predicted
+from beers_deploy.quant.bounds import layer_bounds
+from beers_deploy.quant.integer import INT32_BITS
+from beers_deploy.studies.stress.cases import CASES, SIDE_PX, Case
+from beers_deploy.studies.stress.checks import Limitation, Measure, limitation_of, torch_threads
+from beers_deploy.studies.stress.networks import STAGES, Subject
 
 
 @dataclass(frozen=True)

@@ -12,13 +12,20 @@ from pathlib import Path
 
 import numpy as np
 
-from deploy.bench.tables import predict_file
-from deploy.dpu.board import Dpu, load_dpu
-from deploy.dpu.cost.latency import Prediction
-from deploy.dpu.cost.model import Constants
-from deploy.report.plots import Curve, Panel, curves_svg
-from deploy.restoration.options import TILE_PX
-from deploy.studies.stress.faults import (
+from beers_deploy.bench.tables import predict_file
+from beers_deploy.dpu.board import Dpu, load_dpu
+from beers_deploy.dpu.cost.latency import Prediction
+from beers_deploy.dpu.cost.model import Constants
+from beers_deploy.model.metrics.fidelity import psnr_db
+from beers_deploy.model.progress import steps
+from beers_deploy.profiles.figures import Figure, Row, measured, predicted
+from beers_deploy.quant.calibration import HELD_OUT_SEED, Calibration
+from beers_deploy.quant.core import IntCore
+from beers_deploy.quant.graph import Activation
+from beers_deploy.quant.integer import SOUND
+from beers_deploy.report.plots import Curve, Panel, curves_svg
+from beers_deploy.restoration.options import TILE_PX
+from beers_deploy.studies.stress.faults import (
     INT8_BITS,
     MEMORIES,
     Guards,
@@ -31,14 +38,7 @@ from deploy.studies.stress.faults import (
     shifts_of,
     weight_bits,
 )
-from deploy.studies.stress.networks import Subject
-from model.metrics.fidelity import psnr_db
-from model.progress import steps
-from profiles.figures import Figure, Row, measured, predicted
-from quant.calibration import HELD_OUT_SEED, Calibration
-from quant.core import IntCore
-from quant.graph import Activation
-from quant.integer import SOUND
+from beers_deploy.studies.stress.networks import Subject
 
 CALIBRATION_PATCHES = 16
 

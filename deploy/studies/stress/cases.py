@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from model.simulator.mtf import transfer_function
+from beers_deploy.model.simulator.mtf import transfer_function
 
 FULL_DN = 4095
 SIDE_PX = 96

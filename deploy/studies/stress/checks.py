@@ -8,8 +8,8 @@ import numpy as np
 import torch
 from skimage.morphology import dilation, erosion
 
-from deploy.studies.stress.cases import FULL_DN
-from profiles.errors import BeersError
+from beers_deploy.profiles.errors import BeersError
+from beers_deploy.studies.stress.cases import FULL_DN
 
 FLAT_DN = 0.01 * FULL_DN
 """One per cent of full scale: what the mean may move by, and what does not count as ringing."""

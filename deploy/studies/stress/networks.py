@@ -13,13 +13,25 @@ import torch
 from torch import Tensor
 from torch.nn.functional import conv2d, pixel_shuffle, pixel_unshuffle
 
-from deploy.export import float_model
-from deploy.networks import float_file, int8_file, shipped_pair
-from deploy.restoration.engine import restore_floats
-from deploy.restoration.plan import make_plan
-from deploy.restoration.runtime import Infer
-from deploy.studies.stress.cases import FULL_DN, Case
-from deploy.studies.stress.checks import (
+from beers_deploy.export import float_model
+from beers_deploy.model.progress import Log, no_log
+from beers_deploy.model.shipped import SENSOR
+from beers_deploy.networks import float_file, int8_file, shipped_pair
+from beers_deploy.profiles import load_sensor
+from beers_deploy.profiles.errors import BeersError, ModelError
+from beers_deploy.quant.bounds import saturable
+from beers_deploy.quant.core import IntCore
+from beers_deploy.quant.encodings import read_core
+from beers_deploy.quant.graph import CORRECTION, IMAGE, Activation, Add, Conv, Graph, correction_graph, image_channels
+from beers_deploy.quant.integer import LayerReport, merged_correction, run_core
+from beers_deploy.quant.onnx_file import any_size, load_onnx, require_quantised
+from beers_deploy.quant.session import open_session, run
+from beers_deploy.quant.tiling.walk import Tiling, tiling_of
+from beers_deploy.restoration.engine import restore_floats
+from beers_deploy.restoration.plan import make_plan
+from beers_deploy.restoration.runtime import Infer
+from beers_deploy.studies.stress.cases import FULL_DN, Case
+from beers_deploy.studies.stress.checks import (
     FLAT_DN,
     Measure,
     change,
@@ -30,18 +42,6 @@ from deploy.studies.stress.checks import (
     out_of_range,
     refused,
 )
-from model.progress import Log, no_log
-from model.shipped import SENSOR
-from profiles import load_sensor
-from profiles.errors import BeersError, ModelError
-from quant.bounds import saturable
-from quant.core import IntCore
-from quant.encodings import read_core
-from quant.graph import CORRECTION, IMAGE, Activation, Add, Conv, Graph, correction_graph, image_channels
-from quant.integer import LayerReport, merged_correction, run_core
-from quant.onnx_file import any_size, load_onnx, require_quantised
-from quant.session import open_session, run
-from quant.tiling.walk import Tiling, tiling_of
 
 WHOLE_PX = 4096
 """A tile that no case fills."""

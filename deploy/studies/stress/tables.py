@@ -2,8 +2,8 @@
 
 from collections.abc import Sequence
 
-from deploy.results import common_mode, missing, unit_of, words_of
-from profiles.figures import Figure, Row, by_table
+from beers_deploy.profiles.figures import Figure, Row, by_table
+from beers_deploy.results import common_mode, missing, unit_of, words_of
 
 TITLES = {
     "battery": "Cases and stages",

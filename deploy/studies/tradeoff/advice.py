@@ -5,9 +5,9 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from deploy.studies.tradeoff.pareto import COSTS, PSNR, Comparison, Measured, ends, placed
-from profiles.errors import OptionError
-from profiles.figures import Figure, Row
+from beers_deploy.profiles.errors import OptionError
+from beers_deploy.profiles.figures import Figure, Row
+from beers_deploy.studies.tradeoff.pareto import COSTS, PSNR, Comparison, Measured, ends, placed
 
 MAP50 = "mAP50"
 NAMES = {

@@ -2,10 +2,10 @@
 
 import math
 
-from deploy.bench.tables import Swath, chain_rate, efficiency, energy, processor_row, swath_latency
-from deploy.dpu.cost.latency import dpu_power
-from deploy.studies.tradeoff.points import Point, predict_tile
-from profiles.figures import Figure, predicted, unavailable
+from beers_deploy.bench.tables import Swath, chain_rate, efficiency, energy, processor_row, swath_latency
+from beers_deploy.dpu.cost.latency import dpu_power
+from beers_deploy.profiles.figures import Figure, predicted, unavailable
+from beers_deploy.studies.tradeoff.points import Point, predict_tile
 
 UNITS = {
     "board latency": "s",

@@ -10,14 +10,14 @@ from typing import Any
 
 import numpy as np
 
-from deploy.studies.detection.average_precision import find_hits, interval, map50, site_weights
-from deploy.studies.detection.detector import Detector, open_detector, parse_classes
-from deploy.studies.detection.study import LabelledScene, SensorPair, acquired, labelled_scenes
-from deploy.studies.evaluation.methods import Method
-from deploy.studies.tradeoff.measure import Benchmark, key_of
-from model.io.files import sha256
-from model.shipped import DETECTOR
-from profiles.figures import Figure, measured, unavailable
+from beers_deploy.model.io.files import sha256
+from beers_deploy.model.shipped import DETECTOR
+from beers_deploy.profiles.figures import Figure, measured, unavailable
+from beers_deploy.studies.detection.average_precision import find_hits, interval, map50, site_weights
+from beers_deploy.studies.detection.detector import Detector, open_detector, parse_classes
+from beers_deploy.studies.detection.study import LabelledScene, SensorPair, acquired, labelled_scenes
+from beers_deploy.studies.evaluation.methods import Method
+from beers_deploy.studies.tradeoff.measure import Benchmark, key_of
 
 
 @dataclass(frozen=True)

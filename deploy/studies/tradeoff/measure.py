@@ -15,33 +15,33 @@ from typing import Any
 import numpy as np
 import psutil
 
-from deploy import __version__
-from deploy.bench.tables import Swath
-from deploy.bench.timing import interleaved, timed
-from deploy.bench.traditional import drawn_acquisition
-from deploy.export import float_model
-from deploy.restoration.engine import restore_dn
-from deploy.restoration.function import Restore
-from deploy.restoration.options import Runtime
-from deploy.restoration.plan import make_plan
-from deploy.restoration.runtime import open_runtime
-from deploy.studies.evaluation.methods import Method
-from deploy.studies.evaluation.pairs import NamedPair
-from deploy.studies.evaluation.scores import NOISE_FREE, Instruments, mean_row
-from deploy.studies.tradeoff.points import HALO_STEP_PX, Point, Variant, model_of, tiling_of_file
-from model.io.files import sha256, write_text
-from model.io.images import list_images
-from model.processor import processor_name
-from model.simulator.procedural import load_scenes
-from profiles import load_sensor, sensor_names
-from profiles.errors import OptionError
-from profiles.figures import Figure, measured
-from profiles.sensor import SensorProfile
-from profiles.sensor_file import reference_for
-from quant.calibration import draw_patches
-from quant.onnx_file import metadata, save_onnx
-from quant.quantise import quantise_model
-from quant.reading.external import network_sha256
+from beers_deploy import __version__
+from beers_deploy.bench.tables import Swath
+from beers_deploy.bench.timing import interleaved, timed
+from beers_deploy.bench.traditional import drawn_acquisition
+from beers_deploy.export import float_model
+from beers_deploy.model.io.files import sha256, write_text
+from beers_deploy.model.io.images import list_images
+from beers_deploy.model.processor import processor_name
+from beers_deploy.model.simulator.procedural import load_scenes
+from beers_deploy.profiles import load_sensor, sensor_names
+from beers_deploy.profiles.errors import OptionError
+from beers_deploy.profiles.figures import Figure, measured
+from beers_deploy.profiles.sensor import SensorProfile
+from beers_deploy.profiles.sensor_file import reference_for
+from beers_deploy.quant.calibration import draw_patches
+from beers_deploy.quant.onnx_file import metadata, save_onnx
+from beers_deploy.quant.quantise import quantise_model
+from beers_deploy.quant.reading.external import network_sha256
+from beers_deploy.restoration.engine import restore_dn
+from beers_deploy.restoration.function import Restore
+from beers_deploy.restoration.options import Runtime
+from beers_deploy.restoration.plan import make_plan
+from beers_deploy.restoration.runtime import open_runtime
+from beers_deploy.studies.evaluation.methods import Method
+from beers_deploy.studies.evaluation.pairs import NamedPair
+from beers_deploy.studies.evaluation.scores import NOISE_FREE, Instruments, mean_row
+from beers_deploy.studies.tradeoff.points import HALO_STEP_PX, Point, Variant, model_of, tiling_of_file
 
 Scores = Mapping[str, float | None]
 """Figures of one image by name; None where an instrument is not there."""

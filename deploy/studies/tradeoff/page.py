@@ -7,13 +7,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 from markupsafe import Markup
 
-from deploy.report.page import Picture, Report, Table, write_report
-from deploy.report.plots import LIGHT, SERIES, data_url, look, new_figure, set_ticks, svg_of
-from deploy.studies.tradeoff.pareto import PSNR, Measured, ends, placed
-from deploy.studies.tradeoff.run import Study
-from model.io.files import write_text
-from model.traditional.peers import PEERS
-from profiles.figures import Row
+from beers_deploy.model.io.files import write_text
+from beers_deploy.model.traditional.peers import PEERS
+from beers_deploy.profiles.figures import Row
+from beers_deploy.report.page import Picture, Report, Table, write_report
+from beers_deploy.report.plots import LIGHT, SERIES, data_url, look, new_figure, set_ticks, svg_of
+from beers_deploy.studies.tradeoff.pareto import PSNR, Measured, ends, placed
+from beers_deploy.studies.tradeoff.run import Study
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

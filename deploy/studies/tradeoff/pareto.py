@@ -11,10 +11,10 @@ from itertools import pairwise
 
 import numpy as np
 
-from deploy.studies.tradeoff.measure import Scores
-from deploy.studies.tradeoff.points import Point
-from model.metrics.bootstrap import site_interval
-from profiles.figures import Figure, Row, measured, predicted
+from beers_deploy.model.metrics.bootstrap import site_interval
+from beers_deploy.profiles.figures import Figure, Row, measured, predicted
+from beers_deploy.studies.tradeoff.measure import Scores
+from beers_deploy.studies.tradeoff.points import Point
 
 Interval = tuple[float, float]
 

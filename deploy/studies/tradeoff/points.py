@@ -13,21 +13,21 @@ from pathlib import Path
 
 import onnx
 
-from deploy.bench.tables import PAPER_TILE_PX, Swath, swath_latency
-from deploy.dpu.board import Dpu, dpu_of
-from deploy.dpu.checker.placement import place
-from deploy.dpu.cost.latency import Prediction, predict
-from deploy.dpu.graph import Network
-from deploy.dpu.reading import network_of
-from deploy.export import float_model
-from deploy.networks import float_file, int8_file
-from model.shipped import shipped_names
-from profiles import TargetProfile
-from profiles.errors import ModelError, OptionError
-from profiles.sensor import SensorProfile
-from profiles.target import DEFAULT_TARGET, board_names
-from quant.onnx_file import is_quantised, load_onnx
-from quant.tiling.walk import Tiling, tiling_of
+from beers_deploy.bench.tables import PAPER_TILE_PX, Swath, swath_latency
+from beers_deploy.dpu.board import Dpu, dpu_of
+from beers_deploy.dpu.checker.placement import place
+from beers_deploy.dpu.cost.latency import Prediction, predict
+from beers_deploy.dpu.graph import Network
+from beers_deploy.dpu.reading import network_of
+from beers_deploy.export import float_model
+from beers_deploy.model.shipped import shipped_names
+from beers_deploy.networks import float_file, int8_file
+from beers_deploy.profiles import TargetProfile
+from beers_deploy.profiles.errors import ModelError, OptionError
+from beers_deploy.profiles.sensor import SensorProfile
+from beers_deploy.profiles.target import DEFAULT_TARGET, board_names
+from beers_deploy.quant.onnx_file import is_quantised, load_onnx
+from beers_deploy.quant.tiling.walk import Tiling, tiling_of
 
 FLOAT, INT8 = "float32", "INT8"
 FLOAT_ON_DPU = "the DPU takes INT8 alone"

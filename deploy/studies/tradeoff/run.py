@@ -5,29 +5,36 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
-from deploy.bench.tables import PAPER_SIZE, PAPER_TARGET, Swath, parse_size, published_rows
-from deploy.dpu.cost.model import Constants
-from deploy.studies.evaluation.methods import Method, method_named
-from deploy.studies.evaluation.pairs import pairs_of_scenes
-from deploy.studies.evaluation.scores import Instruments, perceptual_distances
-from deploy.studies.tradeoff.advice import MAP50, Constraint, Recommendation, chosen_cost, recommend
-from deploy.studies.tradeoff.boards import CHAIN, board_figures
-from deploy.studies.tradeoff.labelled import Labelled
-from deploy.studies.tradeoff.measure import Benchmark, Measurements, Scores, key_of, make_int8, measure_host
-from deploy.studies.tradeoff.pareto import Comparison, Measured, front_rows, pareto_front
-from deploy.studies.tradeoff.points import FLOAT, Point, Variant, configurations, network_points, network_variants
-from model.io.files import sha256
-from model.io.images import list_images
-from model.metrics.backbones import find_backbone
-from model.metrics.bootstrap import too_few
-from model.progress import steps
-from model.traditional.peers import PEERS
-from model.traditional.settings import QUALITIES
-from profiles import TargetProfile, load_sensor, load_target
-from profiles.errors import MachineError
-from profiles.figures import Figure, Row, unavailable
-from profiles.sensor import SensorProfile
-from profiles.sensor_file import reference_for
+from beers_deploy.bench.tables import PAPER_SIZE, PAPER_TARGET, Swath, parse_size, published_rows
+from beers_deploy.dpu.cost.model import Constants
+from beers_deploy.model.io.files import sha256
+from beers_deploy.model.io.images import list_images
+from beers_deploy.model.metrics.backbones import find_backbone
+from beers_deploy.model.metrics.bootstrap import too_few
+from beers_deploy.model.progress import steps
+from beers_deploy.model.traditional.peers import PEERS
+from beers_deploy.model.traditional.settings import QUALITIES
+from beers_deploy.profiles import TargetProfile, load_sensor, load_target
+from beers_deploy.profiles.errors import MachineError
+from beers_deploy.profiles.figures import Figure, Row, unavailable
+from beers_deploy.profiles.sensor import SensorProfile
+from beers_deploy.profiles.sensor_file import reference_for
+from beers_deploy.studies.evaluation.methods import Method, method_named
+from beers_deploy.studies.evaluation.pairs import pairs_of_scenes
+from beers_deploy.studies.evaluation.scores import Instruments, perceptual_distances
+from beers_deploy.studies.tradeoff.advice import MAP50, Constraint, Recommendation, chosen_cost, recommend
+from beers_deploy.studies.tradeoff.boards import CHAIN, board_figures
+from beers_deploy.studies.tradeoff.labelled import Labelled
+from beers_deploy.studies.tradeoff.measure import Benchmark, Measurements, Scores, key_of, make_int8, measure_host
+from beers_deploy.studies.tradeoff.pareto import Comparison, Measured, front_rows, pareto_front
+from beers_deploy.studies.tradeoff.points import (
+    FLOAT,
+    Point,
+    Variant,
+    configurations,
+    network_points,
+    network_variants,
+)
 
 LPIPS = "LPIPS-squeeze"
 

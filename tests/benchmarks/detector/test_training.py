@@ -8,11 +8,11 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+from beers_deploy.profiles.sensor_file import load_sensor
 from benchmarks.detector.export import detector_to_onnx
 from benchmarks.detector.network import Decoding, DetectorNetwork
 from benchmarks.detector.pictures import Picture, drawn_picture, picture_of
 from benchmarks.detector.training import DetectorRecipe, train_detector, turned
-from profiles.sensor_file import load_sensor
 
 SIDE_PX = 64
 NAMES = ("bright", "dark")

@@ -9,15 +9,15 @@ import onnx
 import pytest
 import torch
 
-from deploy.bench.board import BoardBench, bench_board
-from deploy.bench.tables import Swath, frame_row, predict_file, sweep_rows, within_words
-from deploy.commands.bench import HostTask
-from deploy.dpu.board import load_dpu
-from deploy.dpu.cost.model import TASKS
+from beers_deploy.bench.board import BoardBench, bench_board
+from beers_deploy.bench.tables import Swath, frame_row, predict_file, sweep_rows, within_words
+from beers_deploy.commands.bench import HostTask
+from beers_deploy.dpu.board import load_dpu
+from beers_deploy.dpu.cost.model import TASKS
+from beers_deploy.profiles.errors import ModelError, OptionError
+from beers_deploy.profiles.figures import Row
+from beers_deploy.profiles.target import board_names
 from examples.networks import build, to_onnx
-from profiles.errors import ModelError, OptionError
-from profiles.figures import Row
-from profiles.target import board_names
 from tests.deploy.dpu.graphs import integer_convbeers
 
 

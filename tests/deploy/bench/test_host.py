@@ -9,16 +9,16 @@ import numpy as np
 import onnx
 import pytest
 
-from deploy.bench.host import Timed, host_rows, time_networks, timed_rows
-from deploy.bench.timing import node_rows, profile
-from deploy.export import float_model
-from deploy.host_state import cpu_load, resident_bytes
-from deploy.networks import other_precision, shipped_pair
-from profiles import load_target
-from profiles.constant import Constant
-from profiles.errors import ModelError
-from profiles.figures import Row
-from quant.onnx_file import is_quantised, load_onnx
+from beers_deploy.bench.host import Timed, host_rows, time_networks, timed_rows
+from beers_deploy.bench.timing import node_rows, profile
+from beers_deploy.export import float_model
+from beers_deploy.host_state import cpu_load, resident_bytes
+from beers_deploy.networks import other_precision, shipped_pair
+from beers_deploy.profiles import load_target
+from beers_deploy.profiles.constant import Constant
+from beers_deploy.profiles.errors import ModelError
+from beers_deploy.profiles.figures import Row
+from beers_deploy.quant.onnx_file import is_quantised, load_onnx
 from tests.deploy.dpu.graphs import Sketch, float_convbeers, integer_convbeers
 
 HOST = load_target("host-cpu")

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 import tifffile
 
-from deploy.bench.board import TRAFFIC
-from deploy.bench.tables import (
+from beers_deploy.bench.board import TRAFFIC
+from beers_deploy.bench.tables import (
     Swath,
     efficiency,
     layer_rows,
@@ -17,9 +17,9 @@ from deploy.bench.tables import (
     published_rows,
     sweep_rows,
 )
-from deploy.dpu.board import load_dpu
-from profiles.errors import OptionError
-from profiles.figures import Row, measured, predicted, unavailable
+from beers_deploy.dpu.board import load_dpu
+from beers_deploy.profiles.errors import OptionError
+from beers_deploy.profiles.figures import Row, measured, predicted, unavailable
 from tests.deploy.command_line import done, refused
 from tests.deploy.documents import valid
 from tests.deploy.dpu.graphs import float_convbeers, integer_convbeers

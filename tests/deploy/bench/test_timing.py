@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from deploy.bench.timing import interleaved, timed
+from beers_deploy.bench.timing import interleaved, timed
 
 counters = pytest.mark.skipif(sys.platform == "win32", reason="Linux's counters have names that Windows refuses")
 

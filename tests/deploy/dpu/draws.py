@@ -5,9 +5,9 @@ from pathlib import Path
 
 import numpy as np
 
-from deploy.dpu.board import Dpu
-from deploy.dpu.checker.placement import place
-from deploy.dpu.reading import read_network
+from beers_deploy.dpu.board import Dpu
+from beers_deploy.dpu.checker.placement import place
+from beers_deploy.dpu.reading import read_network
 from tests.deploy.dpu.graphs import Sketch, Value
 
 Draw = Callable[[Sketch, str], str]

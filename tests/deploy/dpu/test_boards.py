@@ -8,22 +8,22 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from deploy.bench.tables import efficiency, energy
-from deploy.dpu.board import load_dpu
-from deploy.dpu.checker.conv_rules import conv_area, conv_weight_bank
-from deploy.dpu.checker.operators import all_rules, applies, rule_name, rule_text
-from deploy.dpu.checker.placement import place
-from deploy.dpu.checker.table import REMARKS
-from deploy.dpu.cost.latency import dpu_power
-from deploy.dpu.graph import Operation, Window
-from deploy.dpu.reading import network_of, read_network
-from deploy.networks import shipped_pair
-from model.shipped import shipped_names
-from profiles import load_target
-from profiles.figures import predicted
-from profiles.target import DEFAULT_TARGET, board_names
-from quant.core import SHIFTS, target_shifts
-from quant.onnx_file import load_onnx
+from beers_deploy.bench.tables import efficiency, energy
+from beers_deploy.dpu.board import load_dpu
+from beers_deploy.dpu.checker.conv_rules import conv_area, conv_weight_bank
+from beers_deploy.dpu.checker.operators import all_rules, applies, rule_name, rule_text
+from beers_deploy.dpu.checker.placement import place
+from beers_deploy.dpu.checker.table import REMARKS
+from beers_deploy.dpu.cost.latency import dpu_power
+from beers_deploy.dpu.graph import Operation, Window
+from beers_deploy.dpu.reading import network_of, read_network
+from beers_deploy.model.shipped import shipped_names
+from beers_deploy.networks import shipped_pair
+from beers_deploy.profiles import load_target
+from beers_deploy.profiles.figures import predicted
+from beers_deploy.profiles.target import DEFAULT_TARGET, board_names
+from beers_deploy.quant.core import SHIFTS, target_shifts
+from beers_deploy.quant.onnx_file import load_onnx
 from tests.deploy.dpu.draws import Draw, behind_conv, behind_sum, between_convs, broken_rules, conv, node
 from tests.deploy.dpu.graphs import Sketch
 

@@ -12,16 +12,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 from onnx import numpy_helper
 
-from deploy.dpu.board import load_dpu
-from deploy.dpu.checker import number_rules
-from deploy.dpu.checker.placement import place
-from deploy.dpu.graph import Operation, Scale
-from deploy.dpu.reading import network_of, read_network
-from deploy.export import to_onnx
-from deploy.networks import shipped_pair
-from model.shipped import shipped_names
-from model.variants import Variant
-from quant.quantise import Quantised, quantise_model
+from beers_deploy.dpu.board import load_dpu
+from beers_deploy.dpu.checker import number_rules
+from beers_deploy.dpu.checker.placement import place
+from beers_deploy.dpu.graph import Operation, Scale
+from beers_deploy.dpu.reading import network_of, read_network
+from beers_deploy.export import to_onnx
+from beers_deploy.model.shipped import shipped_names
+from beers_deploy.model.variants import Variant
+from beers_deploy.networks import shipped_pair
+from beers_deploy.quant.quantise import Quantised, quantise_model
 from tests.deploy.dpu.graphs import IntegerSketch
 from tests.model.networks import plain
 from tests.quant.quick import changed, copied, drawn

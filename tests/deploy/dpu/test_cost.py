@@ -3,14 +3,14 @@ from pathlib import Path
 
 import pytest
 
-from deploy.bench.tables import PAPER_TILE_PX, predict_file
-from deploy.dpu.board import load_dpu
-from deploy.dpu.checker.placement import place
-from deploy.dpu.cost.latency import Prediction, counted_power, image_energy_j, layer_energy_j
-from deploy.dpu.cost.model import LARGE_MAP_BYTES, regime_of
-from deploy.dpu.cost.work import Work, count_work
-from deploy.dpu.reading import read_network
-from profiles.errors import ModelError
+from beers_deploy.bench.tables import PAPER_TILE_PX, predict_file
+from beers_deploy.dpu.board import load_dpu
+from beers_deploy.dpu.checker.placement import place
+from beers_deploy.dpu.cost.latency import Prediction, counted_power, image_energy_j, layer_energy_j
+from beers_deploy.dpu.cost.model import LARGE_MAP_BYTES, regime_of
+from beers_deploy.dpu.cost.work import Work, count_work
+from beers_deploy.dpu.reading import read_network
+from beers_deploy.profiles.errors import ModelError
 from tests.deploy.dpu.graphs import Sketch, board_convbeers, float_convbeers, integer_convbeers
 
 DPU = load_dpu("vck190")

@@ -2,11 +2,11 @@ from pathlib import Path
 
 import pytest
 
-from deploy.dpu.board import load_dpu
-from deploy.dpu.checker.forms import forms, fully_connected
-from deploy.dpu.checker.placement import PlacedNode, place
-from deploy.dpu.graph import Operation
-from deploy.dpu.reading import read_network
+from beers_deploy.dpu.board import load_dpu
+from beers_deploy.dpu.checker.forms import forms, fully_connected
+from beers_deploy.dpu.checker.placement import PlacedNode, place
+from beers_deploy.dpu.graph import Operation
+from beers_deploy.dpu.reading import read_network
 from tests.deploy.dpu.graphs import Sketch
 
 DPU = load_dpu("vck190")

@@ -7,13 +7,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from deploy.dpu.board import load_dpu
-from deploy.dpu.checker import number_rules
-from deploy.dpu.checker.finding import Rule
-from deploy.dpu.checker.number_rules import AGAIN, MOVE
-from deploy.dpu.checker.placement import place
-from deploy.dpu.graph import Operation, Scale
-from deploy.dpu.reading import read_network
+from beers_deploy.dpu.board import load_dpu
+from beers_deploy.dpu.checker import number_rules
+from beers_deploy.dpu.checker.finding import Rule
+from beers_deploy.dpu.checker.number_rules import AGAIN, MOVE
+from beers_deploy.dpu.checker.placement import place
+from beers_deploy.dpu.graph import Operation, Scale
+from beers_deploy.dpu.reading import read_network
 from tests.deploy.dpu.graphs import QdqSketch
 
 DPU = load_dpu("vck190")

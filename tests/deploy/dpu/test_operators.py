@@ -2,10 +2,10 @@ from pathlib import Path
 
 import pytest
 
-from deploy.dpu.board import Dpu, load_dpu
-from deploy.dpu.checker.operators import all_rules, applies, rule_name, rule_text
-from deploy.dpu.checker.placement import place
-from deploy.dpu.reading import read_network
+from beers_deploy.dpu.board import Dpu, load_dpu
+from beers_deploy.dpu.checker.operators import all_rules, applies, rule_name, rule_text
+from beers_deploy.dpu.checker.placement import place
+from beers_deploy.dpu.reading import read_network
 from tests.deploy.dpu.draws import (
     TILE_PX,
     Draw,

@@ -5,10 +5,10 @@ from pathlib import Path
 
 import pytest
 
-from deploy.bench.tables import predict_file
-from deploy.dpu.board import load_dpu
-from deploy.dpu.cost.own_runs import OwnRuns, read_own_runs
-from profiles.errors import OptionError
+from beers_deploy.bench.tables import predict_file
+from beers_deploy.dpu.board import load_dpu
+from beers_deploy.dpu.cost.own_runs import OwnRuns, read_own_runs
+from beers_deploy.profiles.errors import OptionError
 from tests.deploy.dpu.graphs import Sketch, integer_convbeers
 
 DPU = load_dpu("vck190")

@@ -5,11 +5,11 @@ from xml.etree import ElementTree as ET
 
 import pytest
 
-from deploy.dpu.board import load_dpu
-from deploy.dpu.checker.picture import FILLS, draw, require_picture, write_picture
-from deploy.dpu.checker.placement import Placement, place
-from deploy.dpu.reading import read_network
-from profiles.errors import OptionError
+from beers_deploy.dpu.board import load_dpu
+from beers_deploy.dpu.checker.picture import FILLS, draw, require_picture, write_picture
+from beers_deploy.dpu.checker.placement import Placement, place
+from beers_deploy.dpu.reading import read_network
+from beers_deploy.profiles.errors import OptionError
 from tests.deploy.dpu.graphs import Sketch, float_convbeers
 from tests.deploy.report.svg import style_of, text_width
 

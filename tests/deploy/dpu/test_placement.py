@@ -2,11 +2,11 @@ from pathlib import Path
 
 import onnx
 
-from deploy.dpu.board import load_dpu
-from deploy.dpu.checker.operators import rule_text
-from deploy.dpu.checker.placement import FLOAT_NOTE, Placement, place
-from deploy.dpu.checker.table import REMARKS, remarks_on
-from deploy.dpu.reading import read_network
+from beers_deploy.dpu.board import load_dpu
+from beers_deploy.dpu.checker.operators import rule_text
+from beers_deploy.dpu.checker.placement import FLOAT_NOTE, Placement, place
+from beers_deploy.dpu.checker.table import REMARKS, remarks_on
+from beers_deploy.dpu.reading import read_network
 from tests.deploy.dpu.graphs import IntegerSketch, Sketch, board_convbeers, float_convbeers, integer_convbeers
 
 DPU = load_dpu("vck190")

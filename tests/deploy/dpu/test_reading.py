@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from onnx import numpy_helper
 
-from deploy.dpu.board import load_dpu
-from deploy.dpu.checker.placement import place
-from deploy.dpu.graph import Operation
-from deploy.dpu.reading import own_tile_px, read_network
-from profiles.errors import ModelError
-from quant.encodings import PLACE_PX, board_model
-from quant.onnx_file import save_onnx
+from beers_deploy.dpu.board import load_dpu
+from beers_deploy.dpu.checker.placement import place
+from beers_deploy.dpu.graph import Operation
+from beers_deploy.dpu.reading import own_tile_px, read_network
+from beers_deploy.profiles.errors import ModelError
+from beers_deploy.quant.encodings import PLACE_PX, board_model
+from beers_deploy.quant.onnx_file import save_onnx
 from tests.deploy.dpu.graphs import Sketch, board_convbeers, float_convbeers, integer_convbeers
 from tests.quant.quick import copied
 from tests.quant.tiling.small_networks import quantised_half_resolution

@@ -8,13 +8,13 @@ import onnx
 import pytest
 from onnx import helper
 
-from deploy.bench.tables import host_words, predict_file
-from deploy.dpu.board import load_dpu
-from deploy.dpu.checker.placement import place
-from deploy.dpu.cost.latency import Prediction
-from deploy.dpu.cost.model import between, refused_interval_s
-from deploy.dpu.reading import read_network
-from profiles.errors import ModelError
+from beers_deploy.bench.tables import host_words, predict_file
+from beers_deploy.dpu.board import load_dpu
+from beers_deploy.dpu.checker.placement import place
+from beers_deploy.dpu.cost.latency import Prediction
+from beers_deploy.dpu.cost.model import between, refused_interval_s
+from beers_deploy.dpu.reading import read_network
+from beers_deploy.profiles.errors import ModelError
 from tests.deploy.dpu.graphs import IntegerSketch, Sketch
 
 DPU = load_dpu("vck190")

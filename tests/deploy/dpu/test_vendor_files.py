@@ -9,9 +9,9 @@ import pytest
 from onnx import numpy_helper
 from onnxruntime.quantization import QuantFormat, QuantType, quantize_static
 
-from deploy.dpu.board import load_dpu
-from deploy.dpu.checker.placement import Placement, place
-from deploy.dpu.reading import read_network
+from beers_deploy.dpu.board import load_dpu
+from beers_deploy.dpu.checker.placement import Placement, place
+from beers_deploy.dpu.reading import read_network
 from tests.deploy.dpu.graphs import Sketch
 from tests.quant.quick import Calibration
 

@@ -5,7 +5,7 @@ from xml.etree import ElementTree as ET
 from matplotlib.font_manager import FontProperties
 from matplotlib.textpath import text_to_path
 
-from deploy.report.plots import FONT_PX, look
+from beers_deploy.report.plots import FONT_PX, look
 
 
 def text_width(text: str, size_px: float = FONT_PX) -> float:

@@ -4,8 +4,8 @@ from html.parser import HTMLParser
 
 import pytest
 
-from deploy.report.page import WIDE, Report, Table, render
-from profiles.figures import Row, measured, unavailable
+from beers_deploy.profiles.figures import Row, measured, unavailable
+from beers_deploy.report.page import WIDE, Report, Table, render
 
 
 class Cells(HTMLParser):

@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from matplotlib import rc_context
 
-from deploy.report.plots import DARK, LIGHT, look, new_figure, round_values, set_ticks, svg_of
+from beers_deploy.report.plots import DARK, LIGHT, look, new_figure, round_values, set_ticks, svg_of
 
 
 @given(st.floats(-6, 6), st.floats(0.01, 12), st.integers(3, 16), st.booleans())

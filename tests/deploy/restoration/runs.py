@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from deploy.restoration.engine import Restorer, Tile
+from beers_deploy.restoration.engine import Restorer, Tile
 
 
 def noise(*shape: int, seed: int = 1) -> np.ndarray:
@@ -19,7 +19,7 @@ def noise(*shape: int, seed: int = 1) -> np.ndarray:
 
 def begin(image: Path, out: Path, *options: object) -> subprocess.Popen[str]:
     """Start a run on one thread."""
-    command = [sys.executable, "-c", "from deploy.cli import app; app()", "restore", image, out, "--threads", 1]
+    command = [sys.executable, "-c", "from beers_deploy.cli import app; app()", "restore", image, out, "--threads", 1]
     return subprocess.Popen(
         list(map(str, [*command, *options])), stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
     )

@@ -11,15 +11,15 @@ import pytest
 import tifffile
 from onnx import helper
 
-from deploy.library import restore
-from deploy.restoration.georeference import enlarged_tags
-from deploy.restoration.options import Options
-from deploy.restoration.plan import make_plan
-from deploy.restoration.run import restore_file
-from profiles.errors import ModelError, OptionError
-from quant.onnx_file import load_onnx, save_onnx
-from quant.session import open_session, tensors_of
-from quant.tiling.walk import Tiling, tiling_of
+from beers_deploy.library import restore
+from beers_deploy.profiles.errors import ModelError, OptionError
+from beers_deploy.quant.onnx_file import load_onnx, save_onnx
+from beers_deploy.quant.session import open_session, tensors_of
+from beers_deploy.quant.tiling.walk import Tiling, tiling_of
+from beers_deploy.restoration.georeference import enlarged_tags
+from beers_deploy.restoration.options import Options
+from beers_deploy.restoration.plan import make_plan
+from beers_deploy.restoration.run import restore_file
 from tests.deploy.restoration.runs import stopped_after
 from tests.quant.tiling.small_networks import (
     espcn,

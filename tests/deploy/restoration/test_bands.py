@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import tifffile
 
-from deploy.restoration.bands import band_names, parse_sensors
-from deploy.restoration.source import Raster, open_source
-from profiles.errors import OptionError
+from beers_deploy.profiles.errors import OptionError
+from beers_deploy.restoration.bands import band_names, parse_sensors
+from beers_deploy.restoration.source import Raster, open_source
 from tests.deploy.command_line import done, refused
 from tests.deploy.restoration import images
 

@@ -12,12 +12,12 @@ import pytest
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
-from deploy.networks import shipped_pair
-from deploy.restoration.cog import disk_bytes
-from deploy.restoration.options import Compression, Options
-from deploy.restoration.run import restore_file
-from model.io.files import sha256
-from profiles.errors import MachineError
+from beers_deploy.model.io.files import sha256
+from beers_deploy.networks import shipped_pair
+from beers_deploy.profiles.errors import MachineError
+from beers_deploy.restoration.cog import disk_bytes
+from beers_deploy.restoration.options import Compression, Options
+from beers_deploy.restoration.run import restore_file
 from tests.deploy.restoration import images
 
 rasterio: Any = images.rasterio
@@ -98,7 +98,7 @@ def test_a_run_stopped_while_it_is_written_goes_on(
             restore_file(image, tmp_path / "out.tif", options, lambda _: None)
     assert (tmp_path / "out.tif").read_bytes() == b"the old one"
     calls: list[str] = []
-    monkeypatch.setattr("deploy.restoration.engine.restore_window", lambda *_: calls.append("tile"))
+    monkeypatch.setattr("beers_deploy.restoration.engine.restore_window", lambda *_: calls.append("tile"))
     restore_file(image, tmp_path / "out.tif", replace(options, resume=True), lambda _: None)
     assert calls == []
     assert (tmp_path / "out.tif").read_bytes() == (tmp_path / "expected.tif").read_bytes()

@@ -9,12 +9,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from deploy.restoration.engine import Restorer, restore_rows
-from deploy.restoration.plan import Plan, make_plan
-from deploy.restoration.runtime import AT_ONCE, Infer, session_threads, tiles_at_once
-from deploy.restoration.source import ArraySource, Raster
-from profiles.errors import ImageError
-from quant.tiling.walk import Tiling
+from beers_deploy.profiles.errors import ImageError
+from beers_deploy.quant.tiling.walk import Tiling
+from beers_deploy.restoration.engine import Restorer, restore_rows
+from beers_deploy.restoration.plan import Plan, make_plan
+from beers_deploy.restoration.runtime import AT_ONCE, Infer, session_threads, tiles_at_once
+from beers_deploy.restoration.source import ArraySource, Raster
 
 SHAPE = (2, 75, 133)
 TILE_PX, RADIUS_PX = 32, 3

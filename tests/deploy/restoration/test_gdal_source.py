@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 import tifffile
 
-from deploy.restoration.gdal_source import LEAST_CACHE_BYTES, GdalSource
-from deploy.restoration.options import Options
-from deploy.restoration.run import restore_file
-from deploy.restoration.source import TiffSource, fingerprint, open_source
-from profiles.errors import BeersError, ImageError, MachineError
+from beers_deploy.profiles.errors import BeersError, ImageError, MachineError
+from beers_deploy.restoration.gdal_source import LEAST_CACHE_BYTES, GdalSource
+from beers_deploy.restoration.options import Options
+from beers_deploy.restoration.run import restore_file
+from beers_deploy.restoration.source import TiffSource, fingerprint, open_source
 from tests.deploy.command_line import refused
 from tests.deploy.restoration import images
 

@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from deploy.restoration import index_files as indexes
-from deploy.restoration.index_files import index_files
-from deploy.restoration.source import open_source
-from profiles.errors import ImageError
+from beers_deploy.profiles.errors import ImageError
+from beers_deploy.restoration import index_files as indexes
+from beers_deploy.restoration.index_files import index_files
+from beers_deploy.restoration.source import open_source
 from tests.deploy.restoration import images
 
 ONE = images.source("tile.tif", 1, 0, 0, 9, 9)

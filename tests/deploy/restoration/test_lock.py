@@ -11,13 +11,13 @@ import psutil
 import pytest
 import tifffile
 
-from deploy.networks import shipped_pair
-from deploy.restoration import output
-from deploy.restoration.options import Options
-from deploy.restoration.output import only_run
-from deploy.restoration.run import restore_file
-from profiles.errors import MachineError
-from profiles.sensor_file import BLIND
+from beers_deploy.networks import shipped_pair
+from beers_deploy.profiles.errors import MachineError
+from beers_deploy.profiles.sensor_file import BLIND
+from beers_deploy.restoration import output
+from beers_deploy.restoration.options import Options
+from beers_deploy.restoration.output import only_run
+from beers_deploy.restoration.run import restore_file
 from tests.deploy.restoration.runs import begin, noise, until
 
 TILE_PX = 64
@@ -69,7 +69,7 @@ def test_a_killed_process_loses_its_lock_and_a_stopped_one_does_not(tmp_path: Pa
     hold = f"""
 import time
 from pathlib import Path
-from deploy.restoration.output import only_run
+from beers_deploy.restoration.output import only_run
 with only_run(Path({str(out)!r}), Path({str(folder)!r})):
     print("held", flush=True)
     time.sleep(600)

@@ -8,21 +8,21 @@ import numpy as np
 import pytest
 import tifffile
 
-from deploy import library
-from deploy.library import restore
-from deploy.networks import shipped_pair
-from deploy.restoration import function
-from deploy.restoration.engine import restore_dn, restore_floats
-from deploy.restoration.options import Options, Runtime
-from deploy.restoration.plan import plan_for
-from deploy.restoration.run import restore_file
-from deploy.restoration.runtime import open_runtime
-from deploy.studies.evaluation.methods import method_named
-from deploy.studies.stress.networks import Network
-from deploy.studies.tradeoff.measure import restore_in_tiles
-from deploy.studies.tradeoff.points import FLOAT, INT8, Point, Variant
-from profiles import load_sensor
-from quant.onnx_file import load_onnx
+from beers_deploy import library
+from beers_deploy.library import restore
+from beers_deploy.networks import shipped_pair
+from beers_deploy.profiles import load_sensor
+from beers_deploy.quant.onnx_file import load_onnx
+from beers_deploy.restoration import function
+from beers_deploy.restoration.engine import restore_dn, restore_floats
+from beers_deploy.restoration.options import Options, Runtime
+from beers_deploy.restoration.plan import plan_for
+from beers_deploy.restoration.run import restore_file
+from beers_deploy.restoration.runtime import open_runtime
+from beers_deploy.studies.evaluation.methods import method_named
+from beers_deploy.studies.stress.networks import Network
+from beers_deploy.studies.tradeoff.measure import restore_in_tiles
+from beers_deploy.studies.tradeoff.points import FLOAT, INT8, Point, Variant
 
 Restored = Callable[[np.ndarray], np.ndarray]
 

@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from deploy.networks import shipped_pair
-from deploy.restoration.options import Options
-from deploy.restoration.run import restore_file
-from deploy.restoration.stac import write_item
-from profiles.sensor_file import BLIND
+from beers_deploy.networks import shipped_pair
+from beers_deploy.profiles.sensor_file import BLIND
+from beers_deploy.restoration.options import Options
+from beers_deploy.restoration.run import restore_file
+from beers_deploy.restoration.stac import write_item
 from tests.deploy.restoration import images
 
 ROOT = Path(__file__).parents[3]
@@ -153,7 +153,7 @@ def test_qgis_s_toolbox_restores(qgis: Path, tmp_path: Path) -> None:
     image = images.write_tiff(tmp_path / "raw.tif", images.digital_numbers(bands=1))
     program = tmp_path / "beers-deploy"
     program.write_text(
-        f'#!/bin/sh\nPYTHONPATH={ROOT} exec {sys.executable} -c "from deploy.cli import app; app()" "$@"\n'
+        f'#!/bin/sh\nPYTHONPATH={ROOT} exec {sys.executable} -c "from beers_deploy.cli import app; app()" "$@"\n'
     )
     program.chmod(0o755)
     script, outs = ROOT / "examples" / "qgis_restore.py", [tmp_path / "restored.tif", tmp_path / "restored.xyz"]

@@ -2,9 +2,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from deploy.restoration.plan import even_side_px, make_plan, plan_side
-from profiles.errors import OptionError
-from quant.tiling.walk import Tiling
+from beers_deploy.profiles.errors import OptionError
+from beers_deploy.quant.tiling.walk import Tiling
+from beers_deploy.restoration.plan import even_side_px, make_plan, plan_side
 
 RADIUS_PX = 5
 TILING = Tiling(RADIUS_PX)

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 import tifffile
 
-from deploy.restoration.options import Options
-from deploy.restoration.radiometry import FullScale, full_scale_of
-from deploy.restoration.run import restore_file
-from deploy.restoration.source import Raster, open_source
-from profiles.errors import ImageError, OptionError
-from profiles.figures import Row
+from beers_deploy.profiles.errors import ImageError, OptionError
+from beers_deploy.profiles.figures import Row
+from beers_deploy.restoration.options import Options
+from beers_deploy.restoration.radiometry import FullScale, full_scale_of
+from beers_deploy.restoration.run import restore_file
+from beers_deploy.restoration.source import Raster, open_source
 
 SHAPE = 61, 47
 
@@ -149,7 +149,7 @@ def test_the_count_outlives_a_stop(model: Path, tmp_path: Path, monkeypatch: pyt
     pixels[2, :] = 3000
     options = Options(model, 23, full_scale=1023)
 
-    monkeypatch.setattr("deploy.restoration.run.write_output", Mock(side_effect=KeyboardInterrupt))
+    monkeypatch.setattr("beers_deploy.restoration.run.write_output", Mock(side_effect=KeyboardInterrupt))
     with pytest.raises(KeyboardInterrupt):
         run(tmp_path, pixels, options)
     monkeypatch.undo()

@@ -16,9 +16,9 @@ import numpy as np
 import pytest
 import tifffile
 
-from deploy.restoration.options import Compression, Options
-from deploy.restoration.run import restore_file
-from profiles.errors import MachineError, OptionError
+from beers_deploy.profiles.errors import MachineError, OptionError
+from beers_deploy.restoration.options import Compression, Options
+from beers_deploy.restoration.run import restore_file
 from tests.deploy.restoration.runs import begin, noise, stop_after, stopped_after, until
 
 pytestmark = pytest.mark.slow
@@ -117,7 +117,7 @@ def test_a_full_disk_is_one_sentence_and_loses_no_finished_row(
         sync(handle)
 
     if calls == 1000:
-        monkeypatch.setattr("deploy.restoration.output._tiles", full)
+        monkeypatch.setattr("beers_deploy.restoration.output._tiles", full)
     else:
         monkeypatch.setattr(os, "fsync", full)
     out.write_bytes(b"old")

@@ -5,9 +5,9 @@ from pathlib import Path
 
 import pytest
 
-from deploy.restoration.options import Options
-from deploy.restoration.output import part_folder
-from deploy.restoration.run import restore_file
+from beers_deploy.restoration.options import Options
+from beers_deploy.restoration.output import part_folder
+from beers_deploy.restoration.run import restore_file
 from tests.deploy.restoration import images
 from tests.deploy.restoration.runs import begin
 

@@ -10,16 +10,16 @@ import numpy as np
 import pytest
 import tifffile
 
-from deploy.networks import shipped_pair
-from deploy.restoration import run as swath
-from deploy.restoration import runtime
-from deploy.restoration.engine import fill_from_nearest, restore_window
-from deploy.restoration.options import Compression, Options, Runtime
-from deploy.restoration.runtime import Infer, open_runtime
-from profiles.errors import BeersError, ImageError, MachineError, OptionError
-from profiles.figures import Row
-from quant.onnx_file import load_onnx
-from quant.session import open_session, run
+from beers_deploy.networks import shipped_pair
+from beers_deploy.profiles.errors import BeersError, ImageError, MachineError, OptionError
+from beers_deploy.profiles.figures import Row
+from beers_deploy.quant.onnx_file import load_onnx
+from beers_deploy.quant.session import open_session, run
+from beers_deploy.restoration import run as swath
+from beers_deploy.restoration import runtime
+from beers_deploy.restoration.engine import fill_from_nearest, restore_window
+from beers_deploy.restoration.options import Compression, Options, Runtime
+from beers_deploy.restoration.runtime import Infer, open_runtime
 from tests.deploy.restoration.runs import noise
 
 RADIUS_PX = 5
@@ -216,7 +216,7 @@ def test_a_budget_that_does_not_suffice_is_refused_before_the_run(
     tifffile.imwrite(tmp_path / "in.tif", noise(1000, 3000), compression="zlib", rowsperstrip=1000)
     # What a process of many tests holds moves by more than the rows of the image.
     memory = SimpleNamespace(memory_info=lambda: SimpleNamespace(rss=100_000_000))
-    monkeypatch.setattr("deploy.restoration.plan.psutil.Process", lambda: memory)
+    monkeypatch.setattr("beers_deploy.restoration.plan.psutil.Process", lambda: memory)
     options = Options(model, tile_px=64, memory_bytes=108_000_000)
     with pytest.raises(MachineError, match="TILED=YES"):
         swath.restore_file(tmp_path / "in.tif", tmp_path / "out.tif", options, lambda _: None)
@@ -263,7 +263,7 @@ def test_integers_are_packed_as_differences_and_gdal_reads_them(
 
 
 def test_large_outputs_are_big_tiffs(model: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("deploy.restoration.output.PLAIN_LIMIT_BYTES", 1000)
+    monkeypatch.setattr("beers_deploy.restoration.output.PLAIN_LIMIT_BYTES", 1000)
     restore(tmp_path, noise(40, 50), Options(model))
     with tifffile.TiffFile(tmp_path / "out.tif") as file:
         assert file.is_bigtiff
@@ -278,7 +278,7 @@ def test_a_tile_without_known_pixels_costs_no_inference(
         seen.append(window.shape)
         return restore_window(window, infer, full_scale)
 
-    monkeypatch.setattr("deploy.restoration.engine.restore_window", counting)
+    monkeypatch.setattr("beers_deploy.restoration.engine.restore_window", counting)
     pixels = noise(30, 300).astype(np.float32)
     pixels[:, 100:] = np.nan
     _, row = restore(tmp_path, pixels, Options(model, tile_px=30))

@@ -15,14 +15,14 @@ import onnx
 import pytest
 import tifffile
 
-from deploy import cluster
-from deploy.cluster import open_cluster
-from deploy.networks import shipped_pair
-from deploy.restoration.options import Options, Runtime
-from deploy.restoration.run import restore_file
-from profiles.errors import ImageError, MachineError
-from quant.onnx_file import load_onnx, save_onnx
-from quant.tiling.walk import tiling_of
+from beers_deploy import cluster
+from beers_deploy.cluster import open_cluster
+from beers_deploy.networks import shipped_pair
+from beers_deploy.profiles.errors import ImageError, MachineError
+from beers_deploy.quant.onnx_file import load_onnx, save_onnx
+from beers_deploy.quant.tiling.walk import tiling_of
+from beers_deploy.restoration.options import Options, Runtime
+from beers_deploy.restoration.run import restore_file
 from tests.deploy.restoration.runs import noise, stopped_after
 from tests.deploy.two_workers import local_cluster
 from tests.quant.tiling.small_networks import espcn, float_unet, four_bands

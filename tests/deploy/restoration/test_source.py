@@ -10,8 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
-from deploy.restoration.source import TiffSource, open_source
-from profiles.errors import BeersError, ImageError, MachineError
+from beers_deploy.profiles.errors import BeersError, ImageError, MachineError
+from beers_deploy.restoration.source import TiffSource, open_source
 
 STORAGES: dict[str, dict[str, Any]] = {
     "one strip": {},
@@ -122,7 +122,7 @@ def refused(path: Path, error: type[BeersError], word: str) -> None:
 @pytest.mark.parametrize("with_imagecodecs", [True, False])
 def test_damage_is_one_sentence(with_imagecodecs: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     if not with_imagecodecs:  # packed bytes are then looked through as the file is opened
-        monkeypatch.setattr("model.io.tiff.find_spec", lambda _: None)
+        monkeypatch.setattr("beers_deploy.model.io.tiff.find_spec", lambda _: None)
     whole = tmp_path / "whole.tif"
     tifffile.imwrite(whole, pixels_of("uint16"), tile=(16, 16), compression="zlib")
     content = whole.read_bytes()

@@ -8,10 +8,10 @@ import pytest
 import tifffile
 import torch
 
-from deploy.restoration.traditional import Request, restore_file_traditionally
-from model.traditional.pipeline import restore_traditional
-from profiles import load_sensor
-from profiles.errors import ImageError, MachineError
+from beers_deploy.model.traditional.pipeline import restore_traditional
+from beers_deploy.profiles import load_sensor
+from beers_deploy.profiles.errors import ImageError, MachineError
+from beers_deploy.restoration.traditional import Request, restore_file_traditionally
 from tests.deploy.command_line import done, refused
 from tests.profiles.own_sensor import own_sensor
 

@@ -11,17 +11,17 @@ import torch
 from jsonschema import validate
 from typer.testing import CliRunner
 
-from deploy.cli import app
-from deploy.results import SCHEMA_PATH
-from deploy.studies.characterise import Box, characterise, profile_toml, read_box
-from model.metrics.slanted_edge import slanted_edge
-from model.simulator.acquire import acquire
-from model.simulator.detector import Draw, to_uint16
-from model.simulator.procedural import procedural_scene
-from model.simulator.sampling import scene_spectrum
-from profiles import load_sensor
-from profiles.errors import BeersError, OptionError
-from profiles.sensor import Sensor, noise_from_snr
+from beers_deploy.cli import app
+from beers_deploy.model.metrics.slanted_edge import slanted_edge
+from beers_deploy.model.simulator.acquire import acquire
+from beers_deploy.model.simulator.detector import Draw, to_uint16
+from beers_deploy.model.simulator.procedural import procedural_scene
+from beers_deploy.model.simulator.sampling import scene_spectrum
+from beers_deploy.profiles import load_sensor
+from beers_deploy.profiles.errors import BeersError, OptionError
+from beers_deploy.profiles.sensor import Sensor, noise_from_snr
+from beers_deploy.results import SCHEMA_PATH
+from beers_deploy.studies.characterise import Box, characterise, profile_toml, read_box
 
 RATIO, SIDE, GAIN, BOARD_PX = 4, 1280, 10.2375, 100
 SNRS = (50.0, 110.0)

@@ -8,14 +8,14 @@ import pytest
 import tifffile
 from typer.testing import CliRunner
 
-from deploy.cli import app
-from deploy.results import SCHEMA_PATH
-from deploy.studies import demo
-from deploy.studies.demo import load_sensors, read_input
-from profiles.errors import OptionError
-from profiles.target import board_names
-from profiles.toml import HERE
-from quant.onnx_file import metadata
+from beers_deploy.cli import app
+from beers_deploy.profiles.errors import OptionError
+from beers_deploy.profiles.target import board_names
+from beers_deploy.profiles.toml import HERE
+from beers_deploy.quant.onnx_file import metadata
+from beers_deploy.results import SCHEMA_PATH
+from beers_deploy.studies import demo
+from beers_deploy.studies.demo import load_sensors, read_input
 
 
 @pytest.mark.slow

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from model.metrics.bootstrap import LEAST_SITES, site_interval
+from beers_deploy.model.metrics.bootstrap import LEAST_SITES, site_interval
 
 
 def interval(values: list[float], sites: list[str]) -> tuple[float, float]:

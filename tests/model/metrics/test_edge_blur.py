@@ -5,12 +5,12 @@ import numpy as np
 import pytest
 import torch
 
-from model.metrics.edge_blur import FOUND, HALF_PX, POINTED_AT, EdgeBlur, combine, find_blurs, fit_blur
-from model.metrics.refusal import Refusal
-from model.metrics.slanted_edge import slanted_edge
-from model.simulator.mtf import Blur, gamma_from_mtf, transfer_function
-from model.simulator.procedural import procedural_scene
-from model.simulator.sampling import sample, scene_spectrum
+from beers_deploy.model.metrics.edge_blur import FOUND, HALF_PX, POINTED_AT, EdgeBlur, combine, find_blurs, fit_blur
+from beers_deploy.model.metrics.refusal import Refusal
+from beers_deploy.model.metrics.slanted_edge import slanted_edge
+from beers_deploy.model.simulator.mtf import Blur, gamma_from_mtf, transfer_function
+from beers_deploy.model.simulator.procedural import procedural_scene
+from beers_deploy.model.simulator.sampling import sample, scene_spectrum
 
 RATIO, SIDE_PX, SIGMA = 4, 120, 6.0
 

@@ -7,8 +7,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
-from model.metrics.fidelity import psnr_db, ssim
-from profiles.errors import ImageError
+from beers_deploy.model.metrics.fidelity import psnr_db, ssim
+from beers_deploy.profiles.errors import ImageError
 
 
 def noisy_pair(seed: int, sigma_dn: float) -> tuple[np.ndarray, np.ndarray]:

@@ -5,13 +5,13 @@ import numpy as np
 import pytest
 import torch
 
-from model.metrics.noise_line import Blocks, NoiseModel, cut_blocks, fit_noise_model, join
-from model.metrics.refusal import Refusal
-from model.simulator.acquire import acquire
-from model.simulator.detector import Draw
-from model.simulator.procedural import procedural_scene
-from model.simulator.sampling import scene_spectrum
-from profiles.sensor import Sensor, noise_from_snr
+from beers_deploy.model.metrics.noise_line import Blocks, NoiseModel, cut_blocks, fit_noise_model, join
+from beers_deploy.model.metrics.refusal import Refusal
+from beers_deploy.model.simulator.acquire import acquire
+from beers_deploy.model.simulator.detector import Draw
+from beers_deploy.model.simulator.procedural import procedural_scene
+from beers_deploy.model.simulator.sampling import scene_spectrum
+from beers_deploy.profiles.sensor import Sensor, noise_from_snr
 
 RATIO, GAIN, MAX_DN = 4, 10.2375, 4095
 PAIRS = ((50.0, 110.0), (80.0, 170.0), (20.0, 45.0))

@@ -5,12 +5,12 @@ import numpy as np
 import pytest
 import torch
 
-from model.metrics.refusal import Refusal
-from model.metrics.slanted_edge import edge_mtf, slanted_edge
-from model.simulator.detector import Draw, detect
-from model.simulator.mtf import mtf, sensor_transfer, transfer_function
-from model.simulator.sampling import sample, scene_spectrum
-from profiles.sensor import Sensor, noise_from_snr
+from beers_deploy.model.metrics.refusal import Refusal
+from beers_deploy.model.metrics.slanted_edge import edge_mtf, slanted_edge
+from beers_deploy.model.simulator.detector import Draw, detect
+from beers_deploy.model.simulator.mtf import mtf, sensor_transfer, transfer_function
+from beers_deploy.model.simulator.sampling import sample, scene_spectrum
+from beers_deploy.profiles.sensor import Sensor, noise_from_snr
 
 RATIO, SCENE_PX, SIDE_PX, GAIN, ANGLE_DEG = 5, 240, 80, 10.2375, 8.0
 ALPHA, BETA = noise_from_snr(25, 50, 100, 110)

@@ -9,15 +9,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from model.simulator.acquire import without
-from model.simulator.detector import DN_EFFECTS, RADIANCE_EFFECTS, Draw, add_noise, apply_effect
-from model.simulator.mtf import Blur, mtf, sensor_transfer
-from model.simulator.sampling import sample, scene_spectrum
-from profiles import load_sensor
-from profiles.effects import Effect, middle_effect
-from profiles.response import MtfTable, PointSpread, Response, packed
-from profiles.scene_call import typical_effects
-from profiles.sensor import Sensor
+from beers_deploy.model.simulator.acquire import without
+from beers_deploy.model.simulator.detector import DN_EFFECTS, RADIANCE_EFFECTS, Draw, add_noise, apply_effect
+from beers_deploy.model.simulator.mtf import Blur, mtf, sensor_transfer
+from beers_deploy.model.simulator.sampling import sample, scene_spectrum
+from beers_deploy.profiles import load_sensor
+from beers_deploy.profiles.effects import Effect, middle_effect
+from beers_deploy.profiles.response import MtfTable, PointSpread, Response, packed
+from beers_deploy.profiles.scene_call import typical_effects
+from beers_deploy.profiles.sensor import Sensor
 
 TYPICAL: dict[str, Effect] = {name: middle_effect(name, table) for name, table in typical_effects().items()}
 

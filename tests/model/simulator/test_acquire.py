@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 import torch
 
-from model.simulator.acquire import MARGIN_PX, acquire, acquire_padded, simulate_pair
-from model.simulator.detector import Draw
-from model.simulator.procedural import procedural_scene
-from model.simulator.sampling import scene_spectrum
-from profiles import load_sensor
-from profiles.errors import ImageError
-from profiles.sensor import Sensor
+from beers_deploy.model.simulator.acquire import MARGIN_PX, acquire, acquire_padded, simulate_pair
+from beers_deploy.model.simulator.detector import Draw
+from beers_deploy.model.simulator.procedural import procedural_scene
+from beers_deploy.model.simulator.sampling import scene_spectrum
+from beers_deploy.profiles import load_sensor
+from beers_deploy.profiles.errors import ImageError
+from beers_deploy.profiles.sensor import Sensor
 
 DEGRADED, REFERENCE = (load_sensor(name).nominal() for name in ("pleiades-degraded", "pleiades-reference"))
 QUIET = Sensor(0.07, alpha=0.0, beta=0.0, gain_dn_per_radiance=10.0, bits=16)

@@ -6,13 +6,32 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from model.simulator.acquire import prepare_scene, simulate_planned
-from model.simulator.detector import Draw, add_defects, add_haze, apply_dsnu, apply_prnu, apply_striping, saturate
-from model.simulator.mtf import gamma_from_mtf, mtf, transfer_function
-from model.simulator.plan import TOLERANCE_DN, Plan, make_plan
-from model.simulator.sampling import sample, scene_spectrum
-from profiles.effects import AntiAlias, Defects, Dsnu, Effect, FullWell, Haze, Offset, Prnu, Smear, Striping
-from profiles.errors import OptionError
+from beers_deploy.model.simulator.acquire import prepare_scene, simulate_planned
+from beers_deploy.model.simulator.detector import (
+    Draw,
+    add_defects,
+    add_haze,
+    apply_dsnu,
+    apply_prnu,
+    apply_striping,
+    saturate,
+)
+from beers_deploy.model.simulator.mtf import gamma_from_mtf, mtf, transfer_function
+from beers_deploy.model.simulator.plan import TOLERANCE_DN, Plan, make_plan
+from beers_deploy.model.simulator.sampling import sample, scene_spectrum
+from beers_deploy.profiles.effects import (
+    AntiAlias,
+    Defects,
+    Dsnu,
+    Effect,
+    FullWell,
+    Haze,
+    Offset,
+    Prnu,
+    Smear,
+    Striping,
+)
+from beers_deploy.profiles.errors import OptionError
 from tests.model.simulator import stages
 
 NEUTRAL: dict[str, Effect] = {

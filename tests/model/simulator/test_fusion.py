@@ -7,10 +7,10 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from model.simulator.detector import add_haze
-from model.simulator.mtf import mtf, smear_response, transfer_function
-from model.simulator.sampling import sample, scene_spectrum
-from profiles.effects import Haze
+from beers_deploy.model.simulator.detector import add_haze
+from beers_deploy.model.simulator.mtf import mtf, smear_response, transfer_function
+from beers_deploy.model.simulator.sampling import sample, scene_spectrum
+from beers_deploy.profiles.effects import Haze
 from tests.model.simulator import stages
 
 GAIN = 10.2375

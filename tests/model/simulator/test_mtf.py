@@ -5,8 +5,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from model.simulator.mtf import gamma_from_mtf, mtf, transfer_function
-from profiles.errors import OptionError
+from beers_deploy.model.simulator.mtf import gamma_from_mtf, mtf, transfer_function
+from beers_deploy.profiles.errors import OptionError
 
 TWO_OVER_PI = 2 / math.pi
 

@@ -2,9 +2,9 @@ import numpy as np
 import pytest
 import torch
 
-from model.simulator.detector import Draw, add_noise, digitise, noise_sigma, to_radiance, to_uint16
-from profiles import load_sensor
-from profiles.sensor import Sensor
+from beers_deploy.model.simulator.detector import Draw, add_noise, digitise, noise_sigma, to_radiance, to_uint16
+from beers_deploy.profiles import load_sensor
+from beers_deploy.profiles.sensor import Sensor
 
 SENSOR = load_sensor("pleiades-degraded").nominal()
 

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 import torch
 
-from model.io.images import list_images
-from model.metrics.fidelity import psnr_db
-from model.simulator.acquire import Pair, simulate_pair
-from model.simulator.detector import Draw
-from model.simulator.sampling import Scene, read_scene
-from profiles import load_sensor
+from beers_deploy.model.io.images import list_images
+from beers_deploy.model.metrics.fidelity import psnr_db
+from beers_deploy.model.simulator.acquire import Pair, simulate_pair
+from beers_deploy.model.simulator.detector import Draw
+from beers_deploy.model.simulator.sampling import Scene, read_scene
+from beers_deploy.profiles import load_sensor
 
 DEGRADED, REFERENCE = (load_sensor(name).nominal() for name in ("pleiades-degraded", "pleiades-reference"))
 FOLDERS = ["aerial-test", "pleiades"]

@@ -9,14 +9,25 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from model.simulator import plan as plan_module
-from model.simulator.acquire import prepare_scene, simulate_planned, without
-from model.simulator.detector import Draw
-from model.simulator.plan import TOLERANCE_DN, Plan, effect_bounds, make_plan, ringing_of, scene_stats
-from model.simulator.sampling import crop_divisible
-from profiles.effects import AntiAlias, Defects, Dsnu, Effect, FullWell, Haze, Offset, Prnu, Smear, Striping
-from profiles.response import MtfTable
-from profiles.sensor import Sensor
+from beers_deploy.model.simulator import plan as plan_module
+from beers_deploy.model.simulator.acquire import prepare_scene, simulate_planned, without
+from beers_deploy.model.simulator.detector import Draw
+from beers_deploy.model.simulator.plan import TOLERANCE_DN, Plan, effect_bounds, make_plan, ringing_of, scene_stats
+from beers_deploy.model.simulator.sampling import crop_divisible
+from beers_deploy.profiles.effects import (
+    AntiAlias,
+    Defects,
+    Dsnu,
+    Effect,
+    FullWell,
+    Haze,
+    Offset,
+    Prnu,
+    Smear,
+    Striping,
+)
+from beers_deploy.profiles.response import MtfTable
+from beers_deploy.profiles.sensor import Sensor
 from tests.model.simulator import stages
 
 EXAMPLES = int(os.environ.get("BEERS_PLAN_EXAMPLES", "60"))
@@ -138,7 +149,7 @@ def test_a_bound_that_is_too_small_would_be_caught(wrong: str, monkeypatch: pyte
     tight: dict[str, Effect] = {"smear": Smear(2.0), "veil": Haze(0.5, 20.0), "offset": Offset(50.0)}
     sensor = stages.plain_sensor(**tight)
     sound = getattr(plan_module, wrong)
-    monkeypatch.setattr(f"model.simulator.plan.{wrong}", lambda *a: sound(*a) / 100)
+    monkeypatch.setattr(f"beers_deploy.model.simulator.plan.{wrong}", lambda *a: sound(*a) / 100)
     found = effect_bounds(sensor, scene_stats(radiance, 2))
     broken = [name for name, bound in found.items() if change(radiance, sensor, 2, name, 0) > bound + ROUNDING_DN]
     assert broken

@@ -3,7 +3,7 @@ import math
 import pytest
 import torch
 
-from model.simulator.sampling import resample
+from beers_deploy.model.simulator.sampling import resample
 
 
 def wave(height: int, width: int, cycles: tuple[int, int]) -> torch.Tensor:

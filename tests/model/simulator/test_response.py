@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 import torch
 
-from model.simulator.acquire import acquire
-from model.simulator.detector import Draw
-from model.simulator.mtf import mtf, sensor_transfer, transfer_function
-from model.simulator.sampling import sample, scene_spectrum
-from profiles.effects import AntiAlias, Smear
-from profiles.errors import OptionError
-from profiles.response import MtfTable, Response
+from beers_deploy.model.simulator.acquire import acquire
+from beers_deploy.model.simulator.detector import Draw
+from beers_deploy.model.simulator.mtf import mtf, sensor_transfer, transfer_function
+from beers_deploy.model.simulator.sampling import sample, scene_spectrum
+from beers_deploy.profiles.effects import AntiAlias, Smear
+from beers_deploy.profiles.errors import OptionError
+from beers_deploy.profiles.response import MtfTable, Response
 from tests.model.simulator import stages
 
 GAIN, UNEVEN = 10.2375, (0.12, 0.05)

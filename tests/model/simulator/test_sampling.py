@@ -5,9 +5,9 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from model.simulator.mtf import transfer_function
-from model.simulator.sampling import crop_divisible, sample, scene_spectrum
-from profiles.errors import OptionError
+from beers_deploy.model.simulator.mtf import transfer_function
+from beers_deploy.model.simulator.sampling import crop_divisible, sample, scene_spectrum
+from beers_deploy.profiles.errors import OptionError
 from tests.model.simulator.stages import blob, centroid
 
 RATIOS = list(range(1, 9))

@@ -4,13 +4,18 @@ import numpy as np
 import pytest
 import torch
 
-from model.simulator.mtf import mtf, transfer_function
-from model.simulator.sampling import sample, scene_spectrum
-from model.traditional import compensate as module
-from model.traditional.compensate import compensate, compensation_gain, compensation_kernel, filter_strips
-from model.traditional.rows import fill_with_local_means, mirrored
-from profiles.errors import OptionError
-from profiles.response import PointSpread, packed
+from beers_deploy.model.simulator.mtf import mtf, transfer_function
+from beers_deploy.model.simulator.sampling import sample, scene_spectrum
+from beers_deploy.model.traditional import compensate as module
+from beers_deploy.model.traditional.compensate import (
+    compensate,
+    compensation_gain,
+    compensation_kernel,
+    filter_strips,
+)
+from beers_deploy.model.traditional.rows import fill_with_local_means, mirrored
+from beers_deploy.profiles.errors import OptionError
+from beers_deploy.profiles.response import PointSpread, packed
 
 EPSILON = 3e-3
 

@@ -9,10 +9,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from model.traditional.nl_bayes import estimate_groups, nl_bayes, nl_bayes_strips
-from model.traditional.noise import Noise, coloured_by
-from model.traditional.settings import QUALITIES, first_pass, second_pass
-from profiles.errors import ImageError, OptionError
+from beers_deploy.model.traditional.nl_bayes import estimate_groups, nl_bayes, nl_bayes_strips
+from beers_deploy.model.traditional.noise import Noise, coloured_by
+from beers_deploy.model.traditional.settings import QUALITIES, first_pass, second_pass
+from beers_deploy.profiles.errors import ImageError, OptionError
 
 SIGMA = 12.0
 WHITE = Noise(SIGMA)
@@ -107,7 +107,7 @@ def test_an_offset_passes_through(camera: Tensor) -> None:
 def test_tiles_leave_no_trace(camera: Tensor, monkeypatch: pytest.MonkeyPatch) -> None:
     noisy = with_noise(camera[96:157, 160:235], SIGMA)
     whole = nl_bayes(noisy, WHITE)
-    monkeypatch.setattr("model.traditional.nl_bayes.TILE_REFERENCES", 7)
+    monkeypatch.setattr("beers_deploy.model.traditional.nl_bayes.TILE_REFERENCES", 7)
     torch.testing.assert_close(nl_bayes(noisy, WHITE), whole, rtol=0, atol=0.05)
 
 

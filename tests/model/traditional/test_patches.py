@@ -3,7 +3,7 @@
 import numpy as np
 import torch
 
-from model.traditional.nl_bayes import overlap_add, patch_matrix, window_distances, window_numbers
+from beers_deploy.model.traditional.nl_bayes import overlap_add, patch_matrix, window_distances, window_numbers
 
 
 def image(height: int, width: int) -> torch.Tensor:

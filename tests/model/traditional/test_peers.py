@@ -4,10 +4,10 @@ import pytest
 import torch
 from torch import Tensor
 
-from model.simulator.acquire import Pair
-from model.traditional.peers import PEERS
-from model.traditional.pipeline import Chain
-from profiles import load_sensor
+from beers_deploy.model.simulator.acquire import Pair
+from beers_deploy.model.traditional.peers import PEERS
+from beers_deploy.model.traditional.pipeline import Chain
+from beers_deploy.profiles import load_sensor
 from tests.model.traditional.test_pipeline import psnr_db, restored_db, seen_by
 
 CHAIN = Chain(load_sensor("pleiades-degraded").nominal(), load_sensor("pleiades-reference").nominal())

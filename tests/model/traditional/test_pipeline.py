@@ -8,15 +8,15 @@ import pytest
 import torch
 from torch import Tensor
 
-from model.simulator.acquire import Pair, simulate_pair
-from model.simulator.detector import Draw
-from model.simulator.mtf import transfer_function
-from model.simulator.sampling import sample, scene_spectrum
-from model.traditional import pipeline
-from model.traditional.compensate import compensate
-from model.traditional.noise import Noise, coloured_by
-from model.traditional.peers import PEERS
-from model.traditional.pipeline import (
+from beers_deploy.model.simulator.acquire import Pair, simulate_pair
+from beers_deploy.model.simulator.detector import Draw
+from beers_deploy.model.simulator.mtf import transfer_function
+from beers_deploy.model.simulator.sampling import sample, scene_spectrum
+from beers_deploy.model.traditional import pipeline
+from beers_deploy.model.traditional.compensate import compensate
+from beers_deploy.model.traditional.noise import Noise, coloured_by
+from beers_deploy.model.traditional.peers import PEERS
+from beers_deploy.model.traditional.pipeline import (
     Chain,
     Order,
     describe,
@@ -24,11 +24,11 @@ from model.traditional.pipeline import (
     restore_traditional,
     with_rounding_noise,
 )
-from model.traditional.rows import mirrored
-from profiles import load_sensor
-from profiles.errors import OptionError
-from profiles.response import PointSpread
-from profiles.sensor import Sensor, noise_from_snr
+from beers_deploy.model.traditional.rows import mirrored
+from beers_deploy.profiles import load_sensor
+from beers_deploy.profiles.errors import OptionError
+from beers_deploy.profiles.response import PointSpread
+from beers_deploy.profiles.sensor import Sensor, noise_from_snr
 from tests.model.simulator.stages import formula_point, formula_table, point_spread, with_response
 
 DEGRADED = load_sensor("pleiades-degraded").nominal()

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import torch
 
-from model.traditional.noise import bias_radiance, destabilise, stabilise
-from profiles.errors import OptionError
-from profiles.sensor import Sensor, noise_from_snr
+from beers_deploy.model.traditional.noise import bias_radiance, destabilise, stabilise
+from beers_deploy.profiles.errors import OptionError
+from beers_deploy.profiles.sensor import Sensor, noise_from_snr
 
 NOMINAL = Sensor(0.07, *noise_from_snr(25, 50, 100, 110), gain_dn_per_radiance=10.2375, bits=12)
 LIMITS = [

@@ -5,12 +5,12 @@ from functools import cache
 
 import numpy as np
 
-from model.family import SensorFamily
-from model.simulator.procedural import procedural_scene
-from model.simulator.sampling import Scene
-from model.training.patches import PatchRecipe, PatchSource
-from model.training.workers import Worker
-from profiles import load_sensor
+from beers_deploy.model.family import SensorFamily
+from beers_deploy.model.simulator.procedural import procedural_scene
+from beers_deploy.model.simulator.sampling import Scene
+from beers_deploy.model.training.patches import PatchRecipe, PatchSource
+from beers_deploy.model.training.workers import Worker
+from beers_deploy.profiles import load_sensor
 
 
 @cache

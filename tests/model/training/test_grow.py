@@ -3,10 +3,10 @@
 import pytest
 import torch
 
-from model.convbeers import BankedConvBEERS, ConvBEERS
-from model.training.grow import grow
-from model.variants import Variant
-from profiles.errors import ModelError
+from beers_deploy.model.convbeers import BankedConvBEERS, ConvBEERS
+from beers_deploy.model.training.grow import grow
+from beers_deploy.model.variants import Variant
+from beers_deploy.profiles.errors import ModelError
 from tests.model.networks import plain
 
 

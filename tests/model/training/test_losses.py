@@ -6,8 +6,8 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from model.metrics.perceptual import Lpips
-from model.training.losses import PAPER, LossWeights, RestorationLoss, fft_l1, log_mse, radiance_l1
+from beers_deploy.model.metrics.perceptual import Lpips
+from beers_deploy.model.training.losses import PAPER, LossWeights, RestorationLoss, fft_l1, log_mse, radiance_l1
 
 
 def images(side: int = 33, batch: int = 2, seed: int = 0) -> tuple[Tensor, Tensor]:

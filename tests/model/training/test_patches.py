@@ -8,16 +8,16 @@ import numpy as np
 import pytest
 import torch
 
-from model.family import SensorFamily
-from model.io.tiff import write_tiff
-from model.simulator.procedural import procedural_scene
-from model.simulator.sampling import Scene
-from model.training.patches import PatchSource, StoredPairs, cut, draw_turn, pair_files, turn
-from model.training.workers import Worker
-from profiles import load_sensor
-from profiles.errors import ImageError
-from profiles.response import MtfTable, PointSpread, packed
-from profiles.sensor import Sensor
+from beers_deploy.model.family import SensorFamily
+from beers_deploy.model.io.tiff import write_tiff
+from beers_deploy.model.simulator.procedural import procedural_scene
+from beers_deploy.model.simulator.sampling import Scene
+from beers_deploy.model.training.patches import PatchSource, StoredPairs, cut, draw_turn, pair_files, turn
+from beers_deploy.model.training.workers import Worker
+from beers_deploy.profiles import load_sensor
+from beers_deploy.profiles.errors import ImageError
+from beers_deploy.profiles.response import MtfTable, PointSpread, packed
+from beers_deploy.profiles.sensor import Sensor
 from tests.model.training.sources import small_scene, source
 
 

@@ -6,10 +6,10 @@ from typing import get_args
 import pytest
 import torch
 
-from model.convbeers import ConvBEERS
-from model.training.checkpoint import TrainingRecipe
-from model.training.trainer import MixedPrecision, Precision, Progress, Schedule, Trainer
-from model.variants import Variant
+from beers_deploy.model.convbeers import ConvBEERS
+from beers_deploy.model.training.checkpoint import TrainingRecipe
+from beers_deploy.model.training.trainer import MixedPrecision, Precision, Progress, Schedule, Trainer
+from beers_deploy.model.variants import Variant
 from tests.model.training.sources import source
 
 VARIANT = Variant(blocks=1, features=4)

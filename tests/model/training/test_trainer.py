@@ -12,18 +12,18 @@ import pytest
 import torch
 from torch import Tensor
 
-from model.convbeers import ConvBEERS, load_network
-from model.io.tensors import read_tensors
-from model.progress import held_back
-from model.simulator.sampling import Scene
-from model.training.checkpoint import Optimiser, TrainingRecipe, finish
-from model.training.guards import MAX_BAD_STEPS, WINDOW_STEPS, Guards
-from model.training.losses import LossWeights
-from model.training.patches import PatchSource
-from model.training.trainer import Progress, Schedule, Trainer
-from model.training.workers import Worker
-from model.variants import Variant
-from profiles.errors import ModelError
+from beers_deploy.model.convbeers import ConvBEERS, load_network
+from beers_deploy.model.io.tensors import read_tensors
+from beers_deploy.model.progress import held_back
+from beers_deploy.model.simulator.sampling import Scene
+from beers_deploy.model.training.checkpoint import Optimiser, TrainingRecipe, finish
+from beers_deploy.model.training.guards import MAX_BAD_STEPS, WINDOW_STEPS, Guards
+from beers_deploy.model.training.losses import LossWeights
+from beers_deploy.model.training.patches import PatchSource
+from beers_deploy.model.training.trainer import Progress, Schedule, Trainer
+from beers_deploy.model.training.workers import Worker
+from beers_deploy.model.variants import Variant
+from beers_deploy.profiles.errors import ModelError
 from tests.model.training.sources import small_scene, source
 
 VARIANT = Variant(blocks=1, features=4)
@@ -248,10 +248,10 @@ import sys
 from pathlib import Path
 import torch
 from tests.model.training.sources import source
-from model.training.checkpoint import TrainingRecipe
-from model.training.trainer import Schedule, Trainer
-from model.variants import Variant
-from model.training.workers import joined
+from beers_deploy.model.training.checkpoint import TrainingRecipe
+from beers_deploy.model.training.trainer import Schedule, Trainer
+from beers_deploy.model.variants import Variant
+from beers_deploy.model.training.workers import joined
 torch.set_num_threads(1)
 with joined("cpu") as worker:
     recipe = TrainingRecipe(steps=3, batch=3, warm_up_steps=1)

@@ -2,11 +2,11 @@
 
 import numpy as np
 
-from model.convbeers import ConvBEERS
-from model.simulator.procedural import procedural_scene
-from model.training.validation import Validation, split_by_site
-from model.variants import Variant
-from profiles import load_sensor
+from beers_deploy.model.convbeers import ConvBEERS
+from beers_deploy.model.simulator.procedural import procedural_scene
+from beers_deploy.model.training.validation import Validation, split_by_site
+from beers_deploy.model.variants import Variant
+from beers_deploy.profiles import load_sensor
 
 NAMES = [f"village_{k:03d}.jpg" for k in range(30)] + [f"forest_{k:03d}.jpg" for k in range(10)] + ["dunes.jpg"]
 EYES = load_sensor("pleiades-degraded"), load_sensor("pleiades-reference")

@@ -7,24 +7,24 @@ import numpy as np
 import pytest
 import torch
 
-from deploy.dpu.board import load_dpu
-from deploy.dpu.checker.placement import place
-from deploy.dpu.reading import network_of
-from model.bank import bank_of_vector
-from model.convbeers import BankedConvBEERS, initialise
-from model.io.tensors import Weights
-from model.variants import Variant
-from profiles.errors import ModelError
-from quant.banked.calibrate import bank_results, quantise_family
-from quant.banked.family import FAMILY, Family, delta_of_file, family_of, required_family, with_delta
-from quant.banked.filters import channels
-from quant.bounds import layer_bounds
-from quant.calibration import Remade
-from quant.core import IntConv, IntCore, shift_faults
-from quant.encodings import board_model, encoding_faults, host_model, read_core
-from quant.integer.reference import merged_correction, run_core
-from quant.session import open_session, run
-from quant.tiling.walk import tiling_of
+from beers_deploy.dpu.board import load_dpu
+from beers_deploy.dpu.checker.placement import place
+from beers_deploy.dpu.reading import network_of
+from beers_deploy.model.bank import bank_of_vector
+from beers_deploy.model.convbeers import BankedConvBEERS, initialise
+from beers_deploy.model.io.tensors import Weights
+from beers_deploy.model.variants import Variant
+from beers_deploy.profiles.errors import ModelError
+from beers_deploy.quant.banked.calibrate import bank_results, quantise_family
+from beers_deploy.quant.banked.family import FAMILY, Family, delta_of_file, family_of, required_family, with_delta
+from beers_deploy.quant.banked.filters import channels
+from beers_deploy.quant.bounds import layer_bounds
+from beers_deploy.quant.calibration import Remade
+from beers_deploy.quant.core import IntConv, IntCore, shift_faults
+from beers_deploy.quant.encodings import board_model, encoding_faults, host_model, read_core
+from beers_deploy.quant.integer.reference import merged_correction, run_core
+from beers_deploy.quant.session import open_session, run
+from beers_deploy.quant.tiling.walk import tiling_of
 from tests.quant.banked.test_filters import textured
 
 SENSORS = [(0.2, 0.1, -0.3, -0.2), (-0.9, -0.8, 0.4, 0.5), (0.6, 0.3, 0.8, 0.9), (-0.2, -0.4, -0.7, -0.9)]

@@ -5,9 +5,9 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from model.bank import FILTERS, SIDE_PX, UNIT_STEPS, Bank, bank_of_vector
-from model.io.images import MAX_DN
-from quant.banked.filters import (
+from beers_deploy.model.bank import FILTERS, SIDE_PX, UNIT_STEPS, Bank, bank_of_vector
+from beers_deploy.model.io.images import MAX_DN
+from beers_deploy.quant.banked.filters import (
     COPIES,
     IMAGE_STEP_DN,
     MIDDLE_DN,
@@ -18,8 +18,8 @@ from quant.banked.filters import (
     split_planes,
     whole_bank,
 )
-from quant.graph import Window
-from quant.integer.arithmetic import convolve
+from beers_deploy.quant.graph import Window
+from beers_deploy.quant.integer.arithmetic import convolve
 
 VECTOR = st.tuples(*[st.floats(-1, 1)] * 4)
 

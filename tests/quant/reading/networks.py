@@ -8,7 +8,7 @@ import numpy as np
 import onnx
 from onnx import NodeProto, TensorProto, helper, numpy_helper
 
-from quant.reading.folding import OPSET
+from beers_deploy.quant.reading.folding import OPSET
 
 CHANNELS = 4
 WEIGHTS: dict[str, tuple[int, ...]] = {

@@ -9,11 +9,11 @@ import onnx
 import pytest
 from onnx import TensorProto
 
-from model.io.files import sha256
-from profiles.errors import ModelError
-from quant.onnx_file import load_onnx
-from quant.reading.external import network_sha256, take_in
-from quant.session import open_session, run
+from beers_deploy.model.io.files import sha256
+from beers_deploy.profiles.errors import ModelError
+from beers_deploy.quant.onnx_file import load_onnx
+from beers_deploy.quant.reading.external import network_sha256, take_in
+from beers_deploy.quant.session import open_session, run
 from tests.deploy.dpu.graphs import float_convbeers
 
 IMAGE = np.full((1, 1, 12, 14), 0.25, np.float32)

@@ -9,14 +9,14 @@ import onnx
 import pytest
 from onnx import TensorProto, helper
 
-from deploy.export import to_onnx
-from deploy.networks import shipped_pair
-from model.convbeers import ConvBEERS
-from model.variants import Variant
-from profiles.errors import ModelError
-from quant.onnx_file import load_onnx, save_onnx
-from quant.reading.folding import HALVES, OPSET, simplest
-from quant.session import open_session, tensors_of
+from beers_deploy.export import to_onnx
+from beers_deploy.model.convbeers import ConvBEERS
+from beers_deploy.model.variants import Variant
+from beers_deploy.networks import shipped_pair
+from beers_deploy.profiles.errors import ModelError
+from beers_deploy.quant.onnx_file import load_onnx, save_onnx
+from beers_deploy.quant.reading.folding import HALVES, OPSET, simplest
+from beers_deploy.quant.session import open_session, tensors_of
 from tests.quant.reading.networks import CASES, CHANNELS, conv, made, node, normal
 
 

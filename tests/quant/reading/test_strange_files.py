@@ -9,13 +9,13 @@ import pytest
 from onnx import TensorProto, helper
 from typer.testing import CliRunner
 
-from deploy.cli import app
-from deploy.dpu.board import load_dpu
-from deploy.dpu.checker.placement import place
-from deploy.dpu.reading import read_network
-from profiles.errors import ModelError
-from quant.onnx_file import load_onnx
-from quant.session import open_session, tensors_of
+from beers_deploy.cli import app
+from beers_deploy.dpu.board import load_dpu
+from beers_deploy.dpu.checker.placement import place
+from beers_deploy.dpu.reading import read_network
+from beers_deploy.profiles.errors import ModelError
+from beers_deploy.quant.onnx_file import load_onnx
+from beers_deploy.quant.session import open_session, tensors_of
 from tests.quant.reading.networks import conv, made, node, normal
 
 LIGHT = sorted((Path(onnx.__file__).parent / "backend" / "test" / "data" / "light").glob("*.onnx"))

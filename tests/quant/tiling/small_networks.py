@@ -11,12 +11,12 @@ import torch
 from hypothesis import strategies as st
 from onnx import TensorProto, helper, numpy_helper
 
-from deploy.export import to_onnx
-from model.convbeers import ConvBEERS, initialise
-from model.variants import Variant
-from quant.calibration import Patches, Remade
-from quant.onnx_file import image_info, make_model
-from quant.quantise import Quantised
+from beers_deploy.export import to_onnx
+from beers_deploy.model.convbeers import ConvBEERS, initialise
+from beers_deploy.model.variants import Variant
+from beers_deploy.quant.calibration import Patches, Remade
+from beers_deploy.quant.onnx_file import image_info, make_model
+from beers_deploy.quant.quantise import Quantised
 from tests.quant.quick import quickly
 
 

@@ -9,9 +9,9 @@ import torch
 from onnx import helper
 from torch import nn
 
-from profiles.errors import ModelError
-from quant.graph.trials import with_shuffles
-from quant.tiling.walk import Tiling, tiling_of
+from beers_deploy.profiles.errors import ModelError
+from beers_deploy.quant.graph.trials import with_shuffles
+from beers_deploy.quant.tiling.walk import Tiling, tiling_of
 from tests.quant.tiling.small_networks import graph, whole
 
 

@@ -12,8 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from onnx import TensorProto, helper
 
-from profiles.errors import ModelError
-from quant.tiling.walk import Tiling, tiling_of
+from beers_deploy.profiles.errors import ModelError
+from beers_deploy.quant.tiling.walk import Tiling, tiling_of
 from tests.quant.tiling.small_networks import (
     Row,
     constant,

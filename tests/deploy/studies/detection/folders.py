@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from deploy.studies.detection.scenes import CLASSES
-from deploy.studies.detection.study import synthetic_labelled
-from profiles import load_sensor
+from beers_deploy.profiles import load_sensor
+from beers_deploy.studies.detection.scenes import CLASSES
+from beers_deploy.studies.detection.study import synthetic_labelled
 
 Object = tuple[str, float, float, float, float]
 """A name, then left, top, right and bottom in continuous px."""

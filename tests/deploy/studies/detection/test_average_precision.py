@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from pycocotools.coco import COCO
 from pycocotools.cocoeval import COCOeval
 
-from deploy.studies.detection.average_precision import (
+from beers_deploy.studies.detection.average_precision import (
     SIZES_PX,
     Hits,
     find_hits,
@@ -24,7 +24,7 @@ from deploy.studies.detection.average_precision import (
     site_weights,
     sites_note,
 )
-from deploy.studies.detection.boxes import Boxes
+from beers_deploy.studies.detection.boxes import Boxes
 
 NAMES = ("ship", "tank", "vehicle")
 SEEDS = st.integers(0, 2**32 - 1)

@@ -5,8 +5,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from deploy.studies.detection.boxes import Boxes, Letterbox, areas, iou, suppress
-from profiles.errors import OptionError
+from beers_deploy.profiles.errors import OptionError
+from beers_deploy.studies.detection.boxes import Boxes, Letterbox, areas, iou, suppress
 
 SIDES = st.integers(1, 97)
 

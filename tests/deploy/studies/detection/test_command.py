@@ -7,9 +7,9 @@ import jsonschema
 import pytest
 from typer.testing import CliRunner, Result
 
-from deploy.cli import app
-from deploy.results import SCHEMA_PATH
-from deploy.studies.detection.tables import PAPER_TABLE, paper_rows
+from beers_deploy.cli import app
+from beers_deploy.results import SCHEMA_PATH
+from beers_deploy.studies.detection.tables import PAPER_TABLE, paper_rows
 from tests.deploy.studies.detection.folders import Object, dior, labelled
 
 pytestmark = pytest.mark.slow

@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from deploy.studies.detection.detector import class_numbers, open_detector, parse_classes
-from profiles.errors import BeersError, ModelError, OptionError
+from beers_deploy.profiles.errors import BeersError, ModelError, OptionError
+from beers_deploy.studies.detection.detector import class_numbers, open_detector, parse_classes
 from tests.deploy.studies.detection.networks import NAMES, detector, final, raw
 
 IMAGE = np.full((32, 64, 3), 0.5, np.float32)

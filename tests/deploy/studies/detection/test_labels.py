@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from deploy.studies.detection.detector import class_numbers
-from deploy.studies.detection.labels import LabelledSet, read_labelled, yolo_names
-from profiles.errors import BeersError, ImageError, MachineError, OptionError
+from beers_deploy.profiles.errors import BeersError, ImageError, MachineError, OptionError
+from beers_deploy.studies.detection.detector import class_numbers
+from beers_deploy.studies.detection.labels import LabelledSet, read_labelled, yolo_names
 from tests.deploy.studies.detection.folders import DIOR, OBJECTS, coco, dior, image, text, voc, xml, yolo
 
 LAYOUTS: dict[str, Callable[[Path], Path]] = {"voc": voc, "coco": coco, "yolo": yolo}

@@ -8,8 +8,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from deploy.studies.detection.boxes import Boxes
-from deploy.studies.detection.scenes import (
+from beers_deploy.model.simulator.drawing import turn
+from beers_deploy.studies.detection.boxes import Boxes
+from beers_deploy.studies.detection.scenes import (
     CLASSES,
     SCENE_GSD_M,
     Canvas,
@@ -20,7 +21,6 @@ from deploy.studies.detection.scenes import (
     tank,
     vehicle,
 )
-from model.simulator.drawing import turn
 
 SHAPES: list[Callable[[np.random.Generator], list[Part]]] = [vehicle, ship, aircraft, lambda g: tank(9.0, g)]
 Scene = tuple[np.ndarray, Boxes]

@@ -6,21 +6,21 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from beers_deploy.dpu.board import load_dpu
+from beers_deploy.dpu.checker.placement import place
+from beers_deploy.dpu.checker.table import legality
+from beers_deploy.dpu.reading import read_network
+from beers_deploy.model.shipped import DETECTOR, DETECTOR_INT8
+from beers_deploy.profiles.sensor_file import REFERENCE, load_sensor
+from beers_deploy.profiles.target import board_names
+from beers_deploy.quant.encodings import encoding_faults
+from beers_deploy.quant.onnx_file import load_onnx, metadata
+from beers_deploy.studies.detection.average_precision import find_hits, map50
+from beers_deploy.studies.detection.boxes import Boxes
+from beers_deploy.studies.detection.detector import open_detector
+from beers_deploy.studies.detection.scenes import CLASSES
 from benchmarks.detector.pictures import Picture, drawn_picture
 from benchmarks.detector.training import DetectorRecipe
-from deploy.dpu.board import load_dpu
-from deploy.dpu.checker.placement import place
-from deploy.dpu.checker.table import legality
-from deploy.dpu.reading import read_network
-from deploy.studies.detection.average_precision import find_hits, map50
-from deploy.studies.detection.boxes import Boxes
-from deploy.studies.detection.detector import open_detector
-from deploy.studies.detection.scenes import CLASSES
-from model.shipped import DETECTOR, DETECTOR_INT8
-from profiles.sensor_file import REFERENCE, load_sensor
-from profiles.target import board_names
-from quant.encodings import encoding_faults
-from quant.onnx_file import load_onnx, metadata
 
 HELD_OUT_SEED = 7
 

@@ -6,18 +6,25 @@ import numpy as np
 import pytest
 import torch
 
-from deploy.studies.detection.average_precision import find_hits, score_rows, site_weights
-from deploy.studies.detection.boxes import Boxes, iou
-from deploy.studies.detection.detector import Detector
-from deploy.studies.detection.page import crops, curves, objects_found
-from deploy.studies.detection.study import REFERENCE, AcquiredScene, Comparison, LabelledScene, SensorPair, acquired
-from deploy.studies.detection.tables import GAIN, LOSS, NO_LOSS, REGAINED, detection_rows, headline
-from deploy.studies.evaluation.methods import Method
-from model.simulator.detector import Draw
-from profiles import load_sensor
-from profiles.constant import Constant
-from profiles.figures import Row
-from profiles.sensor_file import reference_for
+from beers_deploy.model.simulator.detector import Draw
+from beers_deploy.profiles import load_sensor
+from beers_deploy.profiles.constant import Constant
+from beers_deploy.profiles.figures import Row
+from beers_deploy.profiles.sensor_file import reference_for
+from beers_deploy.studies.detection.average_precision import find_hits, score_rows, site_weights
+from beers_deploy.studies.detection.boxes import Boxes, iou
+from beers_deploy.studies.detection.detector import Detector
+from beers_deploy.studies.detection.page import crops, curves, objects_found
+from beers_deploy.studies.detection.study import (
+    REFERENCE,
+    AcquiredScene,
+    Comparison,
+    LabelledScene,
+    SensorPair,
+    acquired,
+)
+from beers_deploy.studies.detection.tables import GAIN, LOSS, NO_LOSS, REGAINED, detection_rows, headline
+from beers_deploy.studies.evaluation.methods import Method
 
 GROUND, SHIP = 20.0, 250.0
 """Radiances in W/m2/sr/um."""

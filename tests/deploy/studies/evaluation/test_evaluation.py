@@ -9,25 +9,31 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from deploy.cli import app
-from deploy.results import SCHEMA_PATH, missing
-from deploy.studies.evaluation import targets as targets_module
-from deploy.studies.evaluation.methods import Method, method_named
-from deploy.studies.evaluation.page import chosen_pairs, evaluation_report, strip_of
-from deploy.studies.evaluation.pairs import NamedPair, oversampling_note, oversamplings_of, read_pairs, simulate_pairs
-from deploy.studies.evaluation.run import Evaluation
-from deploy.studies.evaluation.scores import NOISE_FREE, READ, Instruments, score, site_rows
-from deploy.studies.evaluation.targets import acquire_targets, flat_figure, mtf_figure, snr_name, target_figures
-from model.io.tiff import write_tiff
-from model.metrics.fidelity import fidelity_db
-from model.metrics.refusal import Refusal
-from model.simulator.acquire import simulate_pair
-from model.simulator.detector import Draw
-from model.simulator.procedural import procedural_scene
-from profiles import load_sensor
-from profiles.constant import Constant
-from profiles.errors import ImageError, OptionError
-from profiles.figures import Row, by_table, measured
+from beers_deploy.cli import app
+from beers_deploy.model.io.tiff import write_tiff
+from beers_deploy.model.metrics.fidelity import fidelity_db
+from beers_deploy.model.metrics.refusal import Refusal
+from beers_deploy.model.simulator.acquire import simulate_pair
+from beers_deploy.model.simulator.detector import Draw
+from beers_deploy.model.simulator.procedural import procedural_scene
+from beers_deploy.profiles import load_sensor
+from beers_deploy.profiles.constant import Constant
+from beers_deploy.profiles.errors import ImageError, OptionError
+from beers_deploy.profiles.figures import Row, by_table, measured
+from beers_deploy.results import SCHEMA_PATH, missing
+from beers_deploy.studies.evaluation import targets as targets_module
+from beers_deploy.studies.evaluation.methods import Method, method_named
+from beers_deploy.studies.evaluation.page import chosen_pairs, evaluation_report, strip_of
+from beers_deploy.studies.evaluation.pairs import (
+    NamedPair,
+    oversampling_note,
+    oversamplings_of,
+    read_pairs,
+    simulate_pairs,
+)
+from beers_deploy.studies.evaluation.run import Evaluation
+from beers_deploy.studies.evaluation.scores import NOISE_FREE, READ, Instruments, score, site_rows
+from beers_deploy.studies.evaluation.targets import acquire_targets, flat_figure, mtf_figure, snr_name, target_figures
 
 DEGRADED, REFERENCE = load_sensor("pleiades-degraded"), load_sensor("pleiades-reference")
 SENSORS = DEGRADED.nominal(), REFERENCE.nominal()

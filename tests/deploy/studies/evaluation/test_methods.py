@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from deploy.studies.evaluation.methods import BLIND, KNOWN, Method, method_without_network
-from profiles import load_sensor
+from beers_deploy.profiles import load_sensor
+from beers_deploy.studies.evaluation.methods import BLIND, KNOWN, Method, method_without_network
 
 DEGRADED, REFERENCE = load_sensor("pleiades-degraded").nominal(), load_sensor("pleiades-reference").nominal()
 OTHER = replace(DEGRADED, mtf_nyquist=0.03, gain_dn_per_radiance=0.7 * DEGRADED.gain_dn_per_radiance)

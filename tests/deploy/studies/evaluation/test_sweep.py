@@ -6,11 +6,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
-from deploy.restoration.function import Restore
-from deploy.studies.evaluation import sweep as module
-from deploy.studies.evaluation import targets as targets_module
-from deploy.studies.evaluation.methods import BLIND, Method
-from deploy.studies.evaluation.sweep import (
+from beers_deploy.model.simulator.procedural import procedural_scene
+from beers_deploy.profiles import SensorProfile, load_sensor
+from beers_deploy.profiles.figures import Row, by_table, unavailable
+from beers_deploy.profiles.sensor import Sensor
+from beers_deploy.restoration.function import Restore
+from beers_deploy.studies.evaluation import sweep as module
+from beers_deploy.studies.evaluation import targets as targets_module
+from beers_deploy.studies.evaluation.methods import BLIND, Method
+from beers_deploy.studies.evaluation.sweep import (
     NOMINAL_KNOWN,
     TRUTH_KNOWN,
     Found,
@@ -19,10 +23,6 @@ from deploy.studies.evaluation.sweep import (
     run_sweep,
     suppositions,
 )
-from model.simulator.procedural import procedural_scene
-from profiles import SensorProfile, load_sensor
-from profiles.figures import Row, by_table, unavailable
-from profiles.sensor import Sensor
 
 PROFILE, REFERENCE = load_sensor("pleiades-degraded"), load_sensor("pleiades-reference")
 NOMINAL = PROFILE.nominal()

@@ -5,10 +5,10 @@ from pathlib import Path
 
 import numpy as np
 
-from deploy.dpu.board import load_dpu
-from deploy.studies.tradeoff.pareto import Comparison, Measured
-from deploy.studies.tradeoff.points import INT8, Point, Variant
-from profiles.figures import measured, predicted
+from beers_deploy.dpu.board import load_dpu
+from beers_deploy.profiles.figures import measured, predicted
+from beers_deploy.studies.tradeoff.pareto import Comparison, Measured
+from beers_deploy.studies.tradeoff.points import INT8, Point, Variant
 
 SITES = ("a", "a", "b", "c", "d", "e")
 DIFFICULTY_DB = np.array([0.0, 1.0, -6.0, 5.0, -2.0, 2.0])

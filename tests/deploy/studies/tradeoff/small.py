@@ -6,8 +6,8 @@ from contextlib import contextmanager
 import numpy as np
 import pytest
 
-from deploy.restoration.function import Restore
-from deploy.studies.tradeoff import measure, run
+from beers_deploy.restoration.function import Restore
+from beers_deploy.studies.tradeoff import measure, run
 
 
 @contextmanager

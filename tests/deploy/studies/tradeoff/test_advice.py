@@ -7,10 +7,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from deploy.studies.tradeoff.advice import NAMES, Constraint, Recommendation, parse_constraints, recommend
-from deploy.studies.tradeoff.pareto import Comparison
-from profiles.errors import OptionError
-from profiles.figures import measured, published, unavailable
+from beers_deploy.profiles.errors import OptionError
+from beers_deploy.profiles.figures import measured, published, unavailable
+from beers_deploy.studies.tradeoff.advice import NAMES, Constraint, Recommendation, parse_constraints, recommend
+from beers_deploy.studies.tradeoff.pareto import Comparison
 from tests.deploy.studies.tradeoff.made import COMPARE, SITES, family, made
 
 

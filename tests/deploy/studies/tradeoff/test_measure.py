@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from deploy.studies.tradeoff.measure import ROUNDS, Measurements, host_figures, host_times, key_of
+from beers_deploy.studies.tradeoff.measure import ROUNDS, Measurements, host_figures, host_times, key_of
 
 
 def test_what_was_measured_is_kept_by_what_it_depends_on(tmp_path: Path) -> None:

@@ -7,12 +7,12 @@ from xml.etree import ElementTree as ET
 
 import pytest
 
-from deploy.report.page import render
-from deploy.report.plots import DARK, LIGHT
-from deploy.studies.tradeoff.advice import recommend
-from deploy.studies.tradeoff.page import SIZE_PX, plot_svg, report_of, series, write_study
-from deploy.studies.tradeoff.pareto import Measured, front_rows, pareto_front
-from deploy.studies.tradeoff.run import Study
+from beers_deploy.report.page import render
+from beers_deploy.report.plots import DARK, LIGHT
+from beers_deploy.studies.tradeoff.advice import recommend
+from beers_deploy.studies.tradeoff.page import SIZE_PX, plot_svg, report_of, series, write_study
+from beers_deploy.studies.tradeoff.pareto import Measured, front_rows, pareto_front
+from beers_deploy.studies.tradeoff.run import Study
 from tests.deploy.browser import seen
 from tests.deploy.studies.tradeoff.made import COMPARE, family
 

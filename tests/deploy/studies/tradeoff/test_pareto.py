@@ -7,7 +7,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from deploy.studies.tradeoff.pareto import (
+from beers_deploy.profiles.constant import Constant
+from beers_deploy.profiles.figures import measured, predicted, published, unavailable
+from beers_deploy.studies.tradeoff.pareto import (
     NOT_SIGNIFICANT,
     SIGNIFICANT,
     TOO_FEW,
@@ -17,8 +19,6 @@ from deploy.studies.tradeoff.pareto import (
     front_rows,
     pareto_front,
 )
-from profiles.constant import Constant
-from profiles.figures import measured, predicted, published, unavailable
 from tests.deploy.studies.tradeoff.made import COMPARE, DPU, family, made
 
 COST = "board latency"

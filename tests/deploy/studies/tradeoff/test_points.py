@@ -8,10 +8,17 @@ import onnx
 import pytest
 import torch
 
-from deploy.bench.tables import PAPER_TILE_PX, Swath, swath_latency
-from deploy.export import to_onnx
-from deploy.studies.tradeoff.boards import UNITS, board_figures
-from deploy.studies.tradeoff.points import (
+from beers_deploy.bench.tables import PAPER_TILE_PX, Swath, swath_latency
+from beers_deploy.export import to_onnx
+from beers_deploy.model.convbeers import ConvBEERS, initialise
+from beers_deploy.model.variants import Variant as Shape
+from beers_deploy.profiles import load_sensor, load_target
+from beers_deploy.profiles.constant import Constant
+from beers_deploy.profiles.errors import ModelError, OptionError
+from beers_deploy.profiles.target import board_names
+from beers_deploy.quant.onnx_file import save_onnx
+from beers_deploy.studies.tradeoff.boards import UNITS, board_figures
+from beers_deploy.studies.tradeoff.points import (
     FLOAT,
     HALOS_PX,
     INT8,
@@ -25,13 +32,6 @@ from deploy.studies.tradeoff.points import (
     predict_tile,
     radius_px,
 )
-from model.convbeers import ConvBEERS, initialise
-from model.variants import Variant as Shape
-from profiles import load_sensor, load_target
-from profiles.constant import Constant
-from profiles.errors import ModelError, OptionError
-from profiles.target import board_names
-from quant.onnx_file import save_onnx
 from tests.deploy.dpu.graphs import integer_convbeers
 from tests.deploy.studies.tradeoff.made import DPU
 

@@ -14,23 +14,23 @@ import torch
 from PIL import Image
 from typer.testing import CliRunner
 
-from deploy.cli import app
-from deploy.restoration.function import Restore
-from deploy.results import SCHEMA_PATH
-from deploy.studies.evaluation.methods import Method, method_named
-from deploy.studies.evaluation.pairs import NamedPair, pairs_of_scenes
-from deploy.studies.evaluation.scores import Instruments
-from deploy.studies.tradeoff.advice import parse_constraints
-from deploy.studies.tradeoff.labelled import Labelled
-from deploy.studies.tradeoff.measure import SEAM_ERROR, Benchmark, Measurements, make_int8
-from deploy.studies.tradeoff.pareto import TOO_FEW
-from deploy.studies.tradeoff.run import Study, run_study
-from model.convbeers import ConvBEERS, initialise, save_network
-from model.simulator.procedural import procedural_scene
-from model.variants import Variant
-from profiles import load_sensor
-from profiles.figures import measured
-from profiles.sensor_file import reference_for
+from beers_deploy.cli import app
+from beers_deploy.model.convbeers import ConvBEERS, initialise, save_network
+from beers_deploy.model.simulator.procedural import procedural_scene
+from beers_deploy.model.variants import Variant
+from beers_deploy.profiles import load_sensor
+from beers_deploy.profiles.figures import measured
+from beers_deploy.profiles.sensor_file import reference_for
+from beers_deploy.restoration.function import Restore
+from beers_deploy.results import SCHEMA_PATH
+from beers_deploy.studies.evaluation.methods import Method, method_named
+from beers_deploy.studies.evaluation.pairs import NamedPair, pairs_of_scenes
+from beers_deploy.studies.evaluation.scores import Instruments
+from beers_deploy.studies.tradeoff.advice import parse_constraints
+from beers_deploy.studies.tradeoff.labelled import Labelled
+from beers_deploy.studies.tradeoff.measure import SEAM_ERROR, Benchmark, Measurements, make_int8
+from beers_deploy.studies.tradeoff.pareto import TOO_FEW
+from beers_deploy.studies.tradeoff.run import Study, run_study
 from tests.deploy.studies.tradeoff.small import small_studies
 
 pytestmark = pytest.mark.slow
