@@ -56,6 +56,8 @@ def build(root: Path) -> None:
         platforms = [word for name in PLATFORMS for word in ("--platform", name)]
         options = ["--only-binary=:all:", "--python-version", "3.11", "--target", str(_site(root)), *platforms]
         _call([sys.executable, "-m", "pip", "install", "--quiet", *options, *names])
+    project = ["--no-deps", "--upgrade", "--target", str(_site(root)), str(PROJECT)]
+    _call([sys.executable, "-m", "pip", "install", "--quiet", *project])
     proc = root / "proc"
     if proc.is_symlink():  # to the host's, where debootstrap could not mount one
         proc.unlink()

@@ -8,7 +8,7 @@ from pkgutil import iter_modules
 import pytest
 
 SURFACE = {
-    "profiles": (
+    "beers_deploy.profiles": (
         "BeersError Figure Row SceneCall Sensor SensorProfile TargetProfile load_scene_call load_sensor "
         "load_target scene_names sensor_names target_names"
     ),
@@ -20,16 +20,22 @@ SURFACE = {
         "Draw Pair Plan Scene make_plan procedural_scene read_scene resample sensor_transfer simulate_pair to_dn "
         "to_radiance"
     ),
-    "beers_deploy.model.traditional": "Chain Noise PEERS QUALITIES destabilise restore_strips restore_traditional stabilise",
+    "beers_deploy.model.traditional": (
+        "Chain Noise PEERS QUALITIES destabilise restore_strips restore_traditional stabilise"
+    ),
     "beers_deploy.model.training": "PatchRecipe RestorationLoss Run TrainingRecipe train",
-    "quant": (
+    "beers_deploy.quant": (
         "Calibration GateResult IntCore Limits Patches Quantised Tiling board_model compare draw_patches "
         "host_model judge load_onnx open_session quantise_free quantise_model read_core run "
         "save_onnx tiling_of unseen_patches"
     ),
-    "deploy": ("Document float_for float_model load_dpu place predict read_network restore run_gate to_onnx"),
+    "beers_deploy": ("Document float_for float_model load_dpu place predict read_network restore run_gate to_onnx"),
 }
-LIGHT = ("profiles", "model", "beers_deploy.model.io", "beers_deploy.model.metrics", "quant", "deploy")
+LIGHT = tuple(
+    name
+    for name in SURFACE
+    if name.rpartition(".")[2] in {"beers_deploy", "profiles", "model", "io", "metrics", "quant"}
+)
 """Looked at by commands that need no torch."""
 
 

@@ -10,14 +10,14 @@ from pathlib import Path
 
 TARGET = Path(__file__).parents[1] / "reference" / "api.md"
 PACKAGES = {
-    "deploy": "Restore arrays, write and judge networks, predict a board",
-    "profiles": "Sensors, scenes, boards and figures",
+    "beers_deploy": "Restore arrays, write and judge networks, predict a board",
+    "beers_deploy.profiles": "Sensors, scenes, boards and figures",
     "beers_deploy.model.simulator": "Acquire images",
     "beers_deploy.model.traditional": "The traditional chain",
     "beers_deploy.model.metrics": "Image quality",
     "beers_deploy.model.training": "Train",
     "beers_deploy.model.io": "Images and files",
-    "quant": "INT8",
+    "beers_deploy.quant": "INT8",
 }
 OPENING = """# Python
 

@@ -10,6 +10,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGE = ROOT / "docs" / "explanation" / "architecture.md"
+INSTALLED = "beers_deploy"
 PACKAGES = ("deploy", "quant", "model", "profiles")
 WHOLE = ("quant", "profiles")
 """Drawn as one box each."""
@@ -34,8 +35,14 @@ def imports_of(path: Path, known: dict[str, Path]) -> set[str]:
     found: set[str] = set()
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
         if isinstance(node, ast.ImportFrom) and node.module:
-            found |= {f"{node.module}.{alias.name}" for alias in node.names} | {node.module}
+            found |= {in_folder(f"{node.module}.{alias.name}") for alias in node.names} | {in_folder(node.module)}
     return found & known.keys()
+
+
+def in_folder(module: str) -> str:
+    """Where a module of the installed package lies in the checkout: `beers_deploy` itself is deploy/."""
+    inner = module.removeprefix(f"{INSTALLED}.")
+    return inner if inner.partition(".")[0] in PACKAGES[1:] else f"{PACKAGES[0]}.{inner}"
 
 
 def arrows() -> dict[str, set[str]]:

@@ -27,11 +27,12 @@ SUITE = "tests/stability"
 PROBE_FILE = "test_copy.py"
 PROBE = """
 from pathlib import Path
-import deploy, model, profiles, quant
+import beers_deploy
+from beers_deploy import model, profiles, quant
 
 def test_the_copy_is_what_runs():
     here = Path(__file__).resolve().parents[2]
-    assert {Path(found.__file__).resolve().parents[1] for found in (deploy, model, profiles, quant)} == {here}
+    assert {Path(each.__file__).resolve().parents[1] for each in (beers_deploy, model, profiles, quant)} == {here}
 """
 
 Failures = Mapping[str, int]
@@ -83,6 +84,9 @@ def repository_copy() -> Iterator[Path]:
             if (ROOT / name).is_file():
                 (copy / name).parent.mkdir(parents=True, exist_ok=True)
                 copyfile(ROOT / name, copy / name)
+        for name in ("model", "profiles", "quant"):  # the installed package, as links
+            (copy / "deploy" / name).symlink_to(copy / name)
+        (copy / "beers_deploy").symlink_to(copy / "deploy")
         (copy / SUITE / PROBE_FILE).write_text(PROBE, encoding="utf-8")
         yield copy
 
