@@ -348,7 +348,7 @@ def restore_floats(dn: np.ndarray, infer: Infer, plan: Plan, max_dn: float = MAX
         ModelError: a network whose result has another size or more bands.
     """
     if plan.out_shape != (1, *dn.shape):
-        got, remedy = f"one of {times(plan.out_shape)}", "restore files with it, or arrays by deploy.library"
+        got, remedy = f"one of {times(plan.out_shape)}", "restore files with it, or arrays by beers_deploy.library"
         raise ModelError("ONNX model", expected=f"a result of {times(dn.shape)}", got=got, remedy=remedy)
     pixels = np.asarray(dn, np.float32)[None]
     _, height_px, width_px = pixels.shape
