@@ -4,10 +4,13 @@ python docs/make/int8.py [convbeers-s ...]
 """
 
 import argparse
+from pathlib import Path
 
-from beers_deploy.model.shipped import INT8, SHIPPED, shipped_names, shipped_weights
+from beers_deploy.model.shipped import INT8, shipped_names, shipped_weights
 from beers_deploy.networks import Conditioned, family_model
 from beers_deploy.quant.onnx_file import save_onnx
+
+WEIGHTS = Path(__file__).parents[2] / "model" / "weights"
 
 
 def main() -> None:
@@ -15,7 +18,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("names", nargs="*", default=shipped_names())
     for name in parser.parse_args().names:
-        shipped = SHIPPED / f"{name}{INT8}.onnx"
+        shipped = WEIGHTS / f"{name}{INT8}.onnx"
         save_onnx(family_model(Conditioned(name, shipped_weights(name))), shipped)
         print(shipped.name, flush=True)
 

@@ -14,7 +14,7 @@ from beers_deploy.profiles.target import board_names
 from beers_deploy.profiles.toml import HERE
 from tests.deploy.command_line import done, refused
 
-PAGE = (HERE.parent / "docs" / "reference" / "boards.md").read_text(encoding="utf-8")
+PAGE = (Path(__file__).parents[2] / "docs" / "reference" / "boards.md").read_text(encoding="utf-8")
 (EXAMPLE,) = re.findall(r"```toml\n(.*?)```", PAGE, re.DOTALL)
 
 

@@ -55,13 +55,10 @@ def test_the_dockerfile_keeps_its_promises() -> None:
 
 
 def test_every_folder_of_the_package_reaches_the_image() -> None:
-    packages = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]["packages"]["find"][
-        "include"
-    ]
     copies = [rest.split() for word, rest in instructions((ROOT / "Dockerfile").read_text()) if word == "COPY"]
     copied = {name for names in copies if not names[0].startswith("--") for name in names[:-1]}
     let_in = {line[1:] for line in (ROOT / ".dockerignore").read_text().splitlines() if line.startswith("!")}
-    assert {package.removesuffix("*") for package in packages} <= copied <= let_in
+    assert {"setup.py", "profiles", "model", "quant", "deploy"} <= copied <= let_in
     assert all((ROOT / name).exists() for name in copied)
 
 
