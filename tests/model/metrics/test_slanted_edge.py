@@ -102,11 +102,6 @@ def test_sharpening_shows_as_much_as_it_does() -> None:
     assert np.mean(after) == pytest.approx((1 + boost) * np.mean(before), rel=0.02)
 
 
-def test_the_unit_does_not_matter() -> None:
-    image = noisy(0.25, ANGLE_DEG, 0).astype(np.float64)
-    assert measured(image / 4095) == pytest.approx(measured(image), abs=1e-9)
-
-
 def test_what_cannot_be_measured_is_refused() -> None:
     edge = gaussian_edge(ANGLE_DEG, 0.6)
     generator = np.random.default_rng(0)

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
+from beers_deploy.model.io.pictures import Stretch
 from beers_deploy.profiles import load_sensor
 from beers_deploy.studies.detection.scenes import CLASSES
 from beers_deploy.studies.detection.study import synthetic_labelled
@@ -19,11 +20,6 @@ OBJECTS: dict[str, list[Object]] = {
     "00001": [("ship", 2, 3, 12, 9), ("Expressway-Service-area", 20, 10, 60, 40)],
     "00002": [("ship", 0, 0, 10, 20)],
 }
-DIOR = [
-    "airplane", "airport", "baseballfield", "basketballcourt", "bridge", "chimney", "dam",
-    "Expressway-Service-area", "Expressway-toll-station", "golffield", "groundtrackfield", "harbor",
-    "overpass", "ship", "stadium", "storagetank", "tenniscourt", "trainstation", "vehicle", "windmill",
-]  # fmt: skip
 SPELT = ("Motor-Car", "SHIP", "aircraft", "Storage tank")
 """Of the drawn classes, as a folder spells them."""
 
@@ -112,11 +108,8 @@ def labelled(folder: Path, count: int) -> Path:
     folder.mkdir()
     for number in range(count):
         one = synthetic_labelled(number, 0, np.arange(len(CLASSES)))
-        light = np.clip(one.radiance(full_scale).numpy() / (4095 / full_scale.gain_dn_per_radiance), 0, 1)
-        code = np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
-        Image.fromarray(np.repeat(np.rint(255 * code)[..., None], 3, 2).astype(np.uint8)).save(
-            folder / f"s{number}x.png"
-        )
+        shown = Stretch(0, 4095 / full_scale.gain_dn_per_radiance).to_srgb(one.radiance(full_scale).numpy())
+        Image.fromarray(np.rint(255 * shown).astype(np.uint8)).save(folder / f"s{number}x.png")
         boxes: list[Object] = [
             (SPELT[c], *corners.tolist()) for c, corners in zip(one.truth.classes, one.truth.corners, strict=True)
         ]

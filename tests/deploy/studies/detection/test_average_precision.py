@@ -16,7 +16,6 @@ from beers_deploy.studies.detection.average_precision import (
     Hits,
     find_hits,
     interval,
-    map50,
     mean_known,
     precisions,
     score,
@@ -144,20 +143,6 @@ def test_perfect_boxes_score_one_and_none_score_nothing() -> None:
     assert {name: value for name, value in nothing.items() if value} == {"precision": 1.0, "own precision": 1.0}
 
 
-def test_what_is_found_on_an_unlabelled_image_is_false() -> None:
-    labelled, empty = (Boxes.of(ONE, [0]), Boxes.of(ONE, [0], [0.5])), (Boxes.of([], []), Boxes.of(ONE, [0], [0.9]))
-    assert scored([labelled])["mAP50-95"] == scored([labelled, (empty[0], Boxes.of([], []))])["mAP50-95"] == 1.0
-    assert scored([labelled, empty])["mAP50"] == 0.5
-    assert np.isnan(scored([empty])["mAP50"])
-
-
-def test_what_lies_in_an_ignored_box_counts_neither_way() -> None:
-    truth = Boxes.of(np.vstack([ONE, ONE + 50]), [0, 0], ignored=[False, True])
-    within = Boxes.of(np.vstack([ONE, ONE + 50, ONE + 51]), [0, 0, 0], [0.5, 0.9, 0.8])
-    false = Boxes.of(np.vstack([ONE, ONE + 80]), [0, 0], [0.5, 0.9])
-    assert [scored([(truth, found)])["mAP50"] for found in (within, within[:1], false)] == [1.0, 1.0, 0.5]
-
-
 def test_sizes_are_told_apart_by_the_root_of_the_area() -> None:
     sides = (15.99, 16.0, 31.99, 32.0)
     found = Boxes.of([[0, 100.0 * i, side, 100.0 * i + side] for i, side in enumerate(sides)], [0] * 4)
@@ -183,12 +168,6 @@ def test_every_row_is_read_at_the_first_one_s_confidence() -> None:
     assert figures["halved"]["recall"][0] != figures["halved"]["own recall"][0]
 
 
-def row(shares: Sequence[float], objects: int = 10) -> Hits:
-    """An image an entry, of `objects` objects of which that share is found, and nothing false."""
-    truth = Boxes.of([[50.0 * i, 0, 50.0 * i + 30, 30] for i in range(objects)], np.zeros(objects))
-    return hits_of([(truth, truth[: round(share * objects)]) for share in shares], 1)
-
-
 def test_a_draw_takes_whole_sites_and_a_seed_gives_the_same_draws() -> None:
     weights = site_weights(["a", "a", "b", "c"], 5, 200)
     assert weights[0].tolist() == [1, 1, 1, 1]
@@ -196,18 +175,6 @@ def test_a_draw_takes_whole_sites_and_a_seed_gives_the_same_draws() -> None:
     assert (weights[1:, 1:].sum(axis=1) == 3).all()
     np.testing.assert_array_equal(weights, site_weights(["a", "a", "b", "c"], 5, 200))
     assert not np.array_equal(weights, site_weights(["a", "a", "b", "c"], 6, 200))
-
-
-def test_pairing_tells_what_two_intervals_do_not() -> None:
-    sites = np.linspace(0.1, 0.8, 12)
-    weights = site_weights([str(number) for number in range(12)], 0, 200)
-    better, worse = (map50(row(list(shares)), weights) for shares in (sites + 0.1, sites))
-    ends, others, paired = interval(better, 12), interval(worse, 12), interval(better - worse, 12)
-    assert ends is not None
-    assert others is not None
-    assert paired is not None
-    assert others[1] > ends[0]
-    assert paired[0] > 0
 
 
 def test_a_class_that_no_site_of_a_draw_holds_drops_out() -> None:

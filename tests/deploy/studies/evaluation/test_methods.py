@@ -35,7 +35,3 @@ def test_what_depends_on_no_sensor_stays_as_it_is() -> None:
 def test_who_knows_a_sensor_says_so() -> None:
     method = Method("net", np.sqrt, BLIND, lambda _: np.abs)
     assert (method.knowing(OTHER).sensor_known, method.sensor_known) == (KNOWN, BLIND)
-
-
-def test_any_other_name_is_none_of_these() -> None:
-    assert method_without_network("convbeers-s", DEGRADED, REFERENCE) is None

@@ -1,7 +1,7 @@
 """Conditions of a sweep: who is told which sensor, and what a chain loses when it is told the wrong one."""
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -54,20 +54,16 @@ def test_what_is_supposed_wrongly_is_another_sensor_than_the_one_of_a_condition(
         )
 
 
+Swept = tuple[dict[str, dict[str, Row]], list[Sensor]]
+
+
 def half(dn: np.ndarray) -> np.ndarray:
     return dn / 2
 
 
-@dataclass(frozen=True)
-class Swept:
-    """One sweep under three conditions: its rows, and the sensors that the able network was given."""
-
-    tables: dict[str, dict[str, Row]]
-    given: list[Sensor]
-
-
 @pytest.fixture(scope="module")
 def swept() -> Iterator[Swept]:
+    """One sweep under three conditions: its rows, and the sensors that the able network was given."""
     given: list[Sensor] = []
 
     def specialise(sensor: Sensor) -> Restore:
@@ -82,8 +78,7 @@ def swept() -> Iterator[Swept]:
         patch.setattr(module, "conditions", few)
         scene = procedural_scene(500, 560, np.random.default_rng(5))
         rows = run_sweep([Method("half", half, BLIND), able], [scene], PROFILE, REFERENCE, 0).rows
-        tables = {table: {row.name: row for row in rows} for table, rows in by_table(rows).items()}
-        yield Swept(tables, given)
+        yield {table: {row.name: row for row in rows} for table, rows in by_table(rows).items()}, given
 
 
 def few(_nominal: Sensor, _profile: SensorProfile) -> dict[str, Sensor]:
@@ -91,14 +86,14 @@ def few(_nominal: Sensor, _profile: SensorProfile) -> dict[str, Sensor]:
 
 
 def psnr(swept: Swept, condition: str) -> Callable[[str], float]:
-    return lambda method: swept.tables["sweep, PSNR"][condition].figures[method].value or 0.0
+    return lambda method: swept[0]["sweep, PSNR"][condition].figures[method].value or 0.0
 
 
 def test_a_network_that_can_know_the_sensor_knows_that_of_each_condition(swept: Swept) -> None:
     """Then those that are supposed in its place; it never restores as it does by itself."""
     wrong = suppositions(NOMINAL, PROFILE)
     supposed = [list(wrong[name].values()) for name in ("nominal", "MTF 3%")]
-    assert swept.given == [NOMINAL, *supposed[0], DRIFTED, *supposed[1], DIM]
+    assert swept[1] == [NOMINAL, *supposed[0], DRIFTED, *supposed[1], DIM]
     at = psnr(swept, "nominal")
     assert at("half") < at("able") - 3
 
@@ -118,7 +113,7 @@ def test_another_gain_is_told_to_the_chains_and_kept(swept: Swept) -> None:
 
 
 def test_a_wrong_sensor_costs_the_methods_that_can_know_one(swept: Swept) -> None:
-    wrong, lost = (swept.tables[name] for name in WRONGLY)
+    wrong, lost = (swept[0][name] for name in WRONGLY)
     assert list(wrong) == list(lost) == ["nominal, supposed SNR x 1.33", "nominal, supposed SNR x 0.67", WRONG]
     assert list(wrong[WRONG].figures) == ["traditional", "able"]
     assert (lost[WRONG].figures["traditional"].value or 0) > 1

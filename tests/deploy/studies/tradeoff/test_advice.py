@@ -10,13 +10,12 @@ from hypothesis import strategies as st
 from beers_deploy.profiles.errors import OptionError
 from beers_deploy.profiles.figures import measured, published, unavailable
 from beers_deploy.studies.tradeoff.advice import NAMES, Constraint, Recommendation, parse_constraints, recommend
-from beers_deploy.studies.tradeoff.pareto import Comparison
-from tests.deploy.studies.tradeoff.made import COMPARE, SITES, family, made
+from tests.deploy.studies.tradeoff.made import COMPARE, family
 
 
-def asked(budget: str | None = None, need: str | None = None, compare: Comparison = COMPARE) -> Recommendation:
+def asked(budget: str | None = None, need: str | None = None) -> Recommendation:
     limits = [parse_constraints(f"--{name}", text) for name, text in (("budget", budget), ("need", need))]
-    return recommend(family(), limits[0], limits[1], compare)
+    return recommend(family(), limits[0], limits[1], COMPARE)
 
 
 def taken(found: Recommendation) -> str | None:
@@ -65,9 +64,20 @@ def test_no_figure_keeps_no_limit_and_a_published_one_compares_with_none() -> No
     assert math.isinf(limit.violation(None))
 
 
-def test_within_a_budget_the_best_is_taken() -> None:
-    assert taken(asked("latency<=3s")) == "small"
-    assert taken(asked("latency<=3s,energy<=20J")) == "tiny"
+@pytest.mark.parametrize(
+    ("budget", "need", "name"),
+    [
+        ("latency<=3s", None, "small"),
+        ("latency<=3s,energy<=20J", None, "tiny"),
+        (None, "psnr>=44.4", "small"),
+        ("latency<=60s", "psnr>=45.4", "medium"),
+        (None, None, "medium"),
+    ],
+)
+def test_the_best_within_a_budget_is_taken_and_the_cheapest_for_a_need(
+    budget: str | None, need: str | None, name: str
+) -> None:
+    assert taken(asked(budget, need)) == name
 
 
 def test_what_is_not_significantly_better_is_not_paid_for() -> None:
@@ -75,15 +85,6 @@ def test_what_is_not_significantly_better_is_not_paid_for() -> None:
     assert taken(found) == "medium"
     assert "; large has 0.003 [" in found.line
     assert "dB more, not significant" in found.line
-
-
-def test_for_a_need_the_cheapest_is_taken() -> None:
-    assert taken(asked(need="psnr>=44.4")) == "small"
-    assert taken(asked("latency<=60s", "psnr>=45.4")) == "medium"
-
-
-def test_without_limits_the_cheapest_of_the_best_is_taken() -> None:
-    assert taken(asked()) == "medium"
 
 
 def test_the_line_has_value_interval_and_mode_and_says_what_only_the_value_keeps() -> None:
@@ -101,9 +102,3 @@ def test_where_nothing_keeps_the_limits_the_nearest_is_named() -> None:
         "nothing to recommend for board latency <= 0.1 s; nearest is tiny: board latency 0.6"
     )
     assert "no point has every figure" in asked("map50>=50").line
-
-
-def test_below_five_sites_the_cheapest_within_the_margin_is_taken() -> None:
-    few = Comparison(["a"] * len(SITES), 0)
-    points = [made("one", 45.0, 2.0), made("alike", 45.03, 3.0)]
-    assert taken(recommend(points, [], [], few)) == "one"

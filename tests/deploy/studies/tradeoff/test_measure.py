@@ -23,11 +23,6 @@ def test_what_was_measured_is_kept_by_what_it_depends_on(tmp_path: Path) -> None
     assert len(json.loads(path.read_text())["measurements"]) == 2
 
 
-def test_keys_know_no_order() -> None:
-    assert key_of(a=1, b=[2]) == key_of(b=[2], a=1)
-    assert key_of(a=1) != key_of(a=2)
-
-
 def test_methods_are_timed_in_turns_after_a_run_for_warm_up() -> None:
     order = list[str]()
 

@@ -58,12 +58,6 @@ def test_the_pages_plot_is_the_file_beside_it(tmp_path: Path) -> None:
     assert not re.search(r'(src|href)="(?!data:)', html), "nothing is asked of the network"
 
 
-def test_every_figure_says_its_mode() -> None:
-    rows = re.findall(r'<td class="(measured|predicted)".*?<small>(\w+)</small>', page())
-    assert rows
-    assert all(mode == said for mode, said in rows)
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("width_px", [1280, 390])
 def test_nothing_is_wider_than_the_window(width_px: int, tmp_path: Path) -> None:

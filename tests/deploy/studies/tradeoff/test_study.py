@@ -28,7 +28,7 @@ from beers_deploy.studies.evaluation.pairs import NamedPair, pairs_of_scenes
 from beers_deploy.studies.evaluation.scores import Instruments
 from beers_deploy.studies.tradeoff.advice import parse_constraints
 from beers_deploy.studies.tradeoff.labelled import Labelled
-from beers_deploy.studies.tradeoff.measure import SEAM_ERROR, Benchmark, Measurements, make_int8
+from beers_deploy.studies.tradeoff.measure import SEAM_ERROR, Benchmark, make_int8
 from beers_deploy.studies.tradeoff.pareto import TOO_FEW
 from beers_deploy.studies.tradeoff.run import Study, run_study
 from tests.deploy.studies.tradeoff.small import small_studies
@@ -135,16 +135,6 @@ def test_a_stopped_run_goes_on_and_says_the_same(
     assert len(counts) == 1
     studied(folder, tmp_path)
     assert len(counts) == 1
-
-
-def test_an_interrupt_leaves_what_was_measured(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def stop(*_: object) -> None:
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(Benchmark, "score_in_tiles", stop)
-    with pytest.raises(KeyboardInterrupt):
-        studied(folder, tmp_path)
-    assert len(Measurements.open(tmp_path / "measurements.json").kept) == 2  # both precisions
 
 
 def test_a_measurement_depends_on_its_inputs() -> None:
