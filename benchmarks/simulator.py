@@ -29,7 +29,7 @@ from beers_deploy.model.simulator.detector import (
     Draw,
     add_noise,
     apply_effect,
-    digitise_dn,
+    digitise,
 )
 from beers_deploy.model.simulator.mtf import gaussian_response, mtf, smear_response
 from beers_deploy.model.simulator.plan import make_plan
@@ -78,7 +78,7 @@ def _acquire_plainly(radiance: Tensor, sensor: Sensor, number: int, role: str) -
     for name in DN_EFFECTS:
         image = _apply(image, name, sensor, draw, role)
     sampled = image[RATIO // 2 :: RATIO, RATIO // 2 :: RATIO]
-    return digitise_dn(sampled[MARGIN_PX:-MARGIN_PX, MARGIN_PX:-MARGIN_PX], sensor)
+    return digitise(sampled[MARGIN_PX:-MARGIN_PX, MARGIN_PX:-MARGIN_PX], sensor)
 
 
 @lru_cache

@@ -25,7 +25,6 @@ def open_session(
     threads: int = 0,
     optimise: bool = True,
     exact: bool | None = None,
-    profile: Path | None = None,
 ) -> ort.InferenceSession:
     """Open a model on the CPU, such that its integers are added exactly whatever the processor (`quant.kernels`).
 
@@ -34,7 +33,6 @@ def open_session(
         threads: 0 takes every core.
         optimise: False runs the graph as written.
         exact: take the ways of a processor whose int8 kernels saturate; None asks the processor.
-        profile: write the runtime's own profile to files of this prefix.
 
     Raises:
         ModelError: a file that is not to be trusted, or onnxruntime refuses the model.
@@ -47,9 +45,6 @@ def open_session(
     options.add_session_config_entry("session.force_spinning_stop", "1")
     if not optimise:
         options.graph_optimization_level = ort.GraphOptimizationLevel.ORT_DISABLE_ALL
-    if profile is not None:
-        options.enable_profiling = True
-        options.profile_file_prefix = str(profile)
     known = model if isinstance(model, onnx.ModelProto) else load_onnx(model)
     name = "ONNX model" if isinstance(model, onnx.ModelProto) else str(model)
     with contradictions(name):

@@ -11,12 +11,13 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from itertools import combinations, product
+from typing import get_args
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import binom, spearmanr
 
-from beers_deploy.dpu.cost.model import REGIMES, Array, Constants, Regime, Structure, regime_of
+from beers_deploy.dpu.cost.model import Array, Constants, Regime, Structure, regime_of
 from benchmarks.cost_model.fit import Cases, fit
 from benchmarks.cost_model.published import boards, published_cases
 
@@ -147,7 +148,7 @@ def widths_of(errors: Array, cases: Cases, regimes: Sequence[Regime]) -> Widths:
     families, kinds = cases.families, np.array(regimes)
     sizes = np.array([np.abs(rates).max() for rates in cases.rate_errors(errors)])
     overall, scales = family_mean(sizes, families), dict[Regime, float]()
-    for kind in REGIMES:
+    for kind in get_args(Regime):
         mine = kinds == kind
         count = len(set(families[mine]))
         own = count * family_mean(sizes[mine], families[mine]) if count else 0.0

@@ -14,7 +14,7 @@ import numpy as np
 import onnx
 import psutil
 
-from beers_deploy.bench.timing import interleaved, node_rows, profile, timed
+from beers_deploy.bench.timing import interleaved, timed
 from beers_deploy.dpu.reading import inputs_of
 from beers_deploy.host_state import cpu_load, resident_bytes
 from beers_deploy.model.processor import require_cores
@@ -107,7 +107,7 @@ def _mean_power(run: Timed) -> Figure:
 
 
 def host_rows(model: Path, target: TargetProfile, tile_px: int, threads: int = 0) -> list[Row]:
-    """A network's time for one tile through onnxruntime, float32 and INT8 interleaved, and its nodes' times.
+    """A network's time for one tile through onnxruntime, float32 and INT8 interleaved.
 
     Each runs for the target's minimum time and count, one run for warm-up left out. Its pair in the other
     precision is the shipped network of the same variant; without one it runs alone.
@@ -125,8 +125,7 @@ def host_rows(model: Path, target: TargetProfile, tile_px: int, threads: int = 0
     cpu_load()
     time_networks(runs, tile_px, threads, min_time_s, min_runs)
     conditions = conditions_of(threads or psutil.cpu_count(logical=False) or 1)
-    nodes, total_ms = profile(given, tile_feed(given, tile_px), threads)
-    return [*timed_rows(runs, tile_px, conditions), *node_rows(nodes, total_ms)]
+    return timed_rows(runs, tile_px, conditions)
 
 
 def conditions_of(threads: int) -> dict[str, Figure]:

@@ -1,83 +1,14 @@
-"""How work is timed on this machine: a network node by node, a call with its power, several calls interleaved.
+"""How work is timed on this machine: a call with its power, several calls interleaved.
 
-Time by node is onnxruntime's profiler's, power that of RAPL's counters: never a guess from a data sheet.
+Power is that of RAPL's counters: never a guess from a data sheet.
 """
 
-import json
-import tempfile
 import time
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TypeVar
 
-import numpy as np
-import onnx
-
-from beers_deploy.profiles.figures import Figure, Row, measured, unavailable
-from beers_deploy.quant.session import open_session
-
-RUNS = 5
-
-
-@dataclass(frozen=True)
-class NodeTime:
-    """A node as the runtime fused it: its mean time of a run, in ms."""
-
-    name: str
-    operator: str
-    time_ms: float
-
-
-def profile(model: onnx.ModelProto, feed: dict[str, np.ndarray], threads: int = 0) -> tuple[list[NodeTime], float]:
-    """The nodes in the order in which they ran, and the whole run's mean time in ms, after one run for warm-up."""
-    with tempfile.TemporaryDirectory() as folder:
-        session = open_session(model, threads, profile=Path(folder) / "profile")
-        for _ in range(RUNS + 1):
-            session.run(None, feed)
-        events = json.loads(Path(session.end_profiling()).read_text(encoding="utf-8"))
-    return _means(events)
-
-
-def node_rows(nodes: Iterable[NodeTime], total_ms: float) -> list[Row]:
-    """One row a node, one for what the runtime does between them, and their sum."""
-    rows = [(node.name, node.time_ms, {"operator": node.operator}) for node in nodes]
-    rest_ms = total_ms - sum(time_ms for _, time_ms, _ in rows)
-    rows += [("between the nodes", rest_ms, {}), ("sum: one tile", total_ms, {})]
-    source = f"onnxruntime's profiler, mean of {RUNS} runs after one for warm-up; profiling itself takes a little"
-    return [
-        Row(
-            "host nodes",
-            name,
-            {
-                "time": measured(time_ms, "ms/tile", source),
-                "share": measured(100 * time_ms / total_ms, "%", source),
-            },
-            words,
-        )
-        for name, time_ms, words in rows
-    ]
-
-
-def _means(events: list[dict[str, object]]) -> tuple[list[NodeTime], float]:
-    """Mean times in ms of all runs but the first, from the profiler's events (times in microseconds)."""
-    runs = sorted(_number(e, "ts") for e in events if e.get("name") == "model_run")
-    kept = [e for e in events if _number(e, "ts") >= runs[1]]
-    total_us = sum(_number(e, "dur") for e in kept if e.get("name") == "model_run")
-    times: dict[tuple[str, str], float] = {}
-    for event in sorted(kept, key=lambda e: _number(e, "ts")):
-        name, about = str(event.get("name")), event.get("args")
-        if event.get("cat") == "Node" and name.endswith("_kernel_time") and isinstance(about, dict):
-            key = (name.removesuffix("_kernel_time"), str(about.get("op_name")))
-            times[key] = times.get(key, 0.0) + _number(event, "dur")
-    count = 1e3 * (len(runs) - 1)
-    return [NodeTime(*key, time_us / count) for key, time_us in times.items()], total_us / count
-
-
-def _number(event: dict[str, object], key: str) -> float:
-    value = event.get(key)
-    return float(value) if isinstance(value, int | float) else 0.0
-
+from beers_deploy.profiles.figures import Figure, measured, unavailable
 
 POWERCAP = Path("/sys/class/powercap")
 

@@ -9,13 +9,16 @@ import typer
 
 from beers_deploy.commands.shared import refuse, say
 from beers_deploy.model.shipped import SENSOR
+from beers_deploy.profiles import load_sensor, load_target
+from beers_deploy.profiles.errors import OptionError
+from beers_deploy.profiles.figures import Row, by_table
+from beers_deploy.profiles.sensor_file import REFERENCE
 from beers_deploy.profiles.target import DEFAULT_TARGET, MODEL_SUFFIX, board_names
 
 if TYPE_CHECKING:
     import numpy as np
 
     from beers_deploy.bench.tables import Swath
-    from beers_deploy.profiles.figures import Row
 
 EXAMPLE = "bench --target vck190-model --size 13600x9016 --config C32B3"
 
@@ -105,8 +108,6 @@ def bench(
     from beers_deploy.dpu.cost.model import TASKS
     from beers_deploy.model.io.files import require_writable
     from beers_deploy.networks import int8_file
-    from beers_deploy.profiles import load_sensor, load_target
-    from beers_deploy.profiles.figures import by_table
     from beers_deploy.results import Document, print_rows
 
     tiles, here, board = parse_tiles(tile), target in HOSTS, target.removesuffix(MODEL_SUFFIX)
@@ -162,8 +163,6 @@ def bench(
 def _traditional_row(dn: "np.ndarray | None", swath: "Swath") -> "Row":
     """Measured here: seconds, and torch is loaded for it; so it comes when all predictions have been shown."""
     from beers_deploy.bench.traditional import drawn_acquisition, measure_chain
-    from beers_deploy.profiles import load_sensor
-    from beers_deploy.profiles.sensor_file import REFERENCE
 
     sensors = load_sensor(SENSOR), load_sensor(REFERENCE)
     return measure_chain(drawn_acquisition(swath, *sensors) if dn is None else dn, *sensors).row(swath)
@@ -181,7 +180,6 @@ def _refuse_unused(context: typer.Context, here: bool) -> None:
 
 
 def _single(tiles: list[int]) -> int:
-    from beers_deploy.profiles.errors import OptionError
 
     if len(tiles) > 1:
         raise OptionError(

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from beers_deploy.commands.shared import BOARDS, say
+from beers_deploy.profiles import load_sensor
 from beers_deploy.profiles.target import DEFAULT_TARGET
 
 if TYPE_CHECKING:
@@ -43,7 +44,6 @@ def check(
     from beers_deploy.model.io.files import require_writable
     from beers_deploy.model.shipped import SENSOR
     from beers_deploy.networks import int8_file
-    from beers_deploy.profiles import load_sensor
 
     require_picture(picture)
     path = int8_file(model, load_sensor(SENSOR), partial(say, err=True))

@@ -8,6 +8,7 @@ import typer
 from beers_deploy.commands.shared import say
 from beers_deploy.model.processor import SEEDS
 from beers_deploy.model.shipped import SENSOR
+from beers_deploy.profiles.errors import OptionError
 
 EXAMPLE = "demo --out demo"
 
@@ -27,7 +28,6 @@ def demo(
 ) -> None:
     """Simulate, quantise, gate, check, restore and predict, on a drawn scene or your image; ends with report.html."""
     from beers_deploy.model.io.files import require_writable
-    from beers_deploy.profiles.errors import OptionError
     from beers_deploy.report.page import write_report
     from beers_deploy.results import Document, print_rows
     from beers_deploy.studies.demo import FILES, run_demo

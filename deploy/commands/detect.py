@@ -9,6 +9,7 @@ import typer
 
 from beers_deploy.commands.shared import refuse, say
 from beers_deploy.model.processor import SEEDS
+from beers_deploy.profiles.figures import by_table
 
 if TYPE_CHECKING:
     from beers_deploy.studies.detection.study import Comparison
@@ -102,7 +103,6 @@ def _refuse_unused(context: typer.Context) -> None:
 
 def show(compared: "Sequence[Comparison]") -> None:
     """The tables that answer the question, and the paper's."""
-    from beers_deploy.profiles.figures import by_table
     from beers_deploy.results import print_rows
     from beers_deploy.studies.detection.tables import main_rows, paper_rows
 

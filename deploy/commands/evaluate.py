@@ -8,6 +8,8 @@ import typer
 from beers_deploy.commands.shared import say
 from beers_deploy.model.processor import SEEDS
 from beers_deploy.model.shipped import SENSOR
+from beers_deploy.profiles.errors import OptionError
+from beers_deploy.profiles.figures import by_table
 
 EXAMPLE = "evaluate --images aerial/ --methods degraded,traditional,convbeers-s,convbeers-s-int8 --out report/"
 
@@ -48,8 +50,6 @@ def evaluate(
     @blind or with @ and another sensor.
     """
     from beers_deploy.model.io.files import require_writable
-    from beers_deploy.profiles.errors import OptionError
-    from beers_deploy.profiles.figures import by_table
     from beers_deploy.results import Document, print_rows
     from beers_deploy.studies.evaluation.page import write_page
     from beers_deploy.studies.evaluation.run import run_evaluation

@@ -8,6 +8,8 @@ import typer
 
 from beers_deploy.commands.shared import refuse, say
 from beers_deploy.model.shipped import SENSOR, VARIANT
+from beers_deploy.profiles import load_sensor
+from beers_deploy.profiles.errors import ModelError, OptionError
 
 EXAMPLE = "export --variant convbeers-s --out float.onnx"
 
@@ -56,8 +58,6 @@ def export(
     from beers_deploy.model.io.tensors import is_conditioned, read_plain
     from beers_deploy.model.shipped import shipped_weights
     from beers_deploy.networks import warn_outside, weights_file
-    from beers_deploy.profiles import load_sensor
-    from beers_deploy.profiles.errors import ModelError
     from beers_deploy.quant.onnx_file import save_onnx
 
     if checkpoint is not None:
@@ -113,8 +113,6 @@ def _export_int8(
     from beers_deploy.export import require_tile
     from beers_deploy.model.io.files import whole_file
     from beers_deploy.networks import told_by_delta, told_int8
-    from beers_deploy.profiles import load_sensor
-    from beers_deploy.profiles.errors import OptionError
     from beers_deploy.quant.banked.family import delta_of_file
     from beers_deploy.quant.encodings import board_model, host_model, read_core
     from beers_deploy.quant.onnx_file import fixed_tile_px, load_onnx, metadata, save_onnx

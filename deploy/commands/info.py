@@ -7,6 +7,8 @@ from typing import Annotated
 import typer
 
 from beers_deploy.commands.shared import say
+from beers_deploy.profiles import load_sensor, load_target
+from beers_deploy.profiles.sensor_file import BLIND
 from beers_deploy.profiles.target import DEFAULT_TARGET
 from beers_deploy.restoration.options import TILE_PX, Options
 
@@ -42,8 +44,6 @@ def info(
     from beers_deploy.info import info_row
     from beers_deploy.model.io.files import require_writable
     from beers_deploy.networks import network_file
-    from beers_deploy.profiles import load_sensor, load_target
-    from beers_deploy.profiles.sensor_file import BLIND
     from beers_deploy.restoration.index_files import index_files
     from beers_deploy.results import Document, print_rows
 

@@ -1,19 +1,22 @@
 """`beers-deploy profiles`: list the sensor, scene and target profiles, or show one with each constant's source."""
 
-from typing import TYPE_CHECKING, Annotated
+from collections.abc import Mapping
+from typing import Annotated
 
 import typer
 
 from beers_deploy.commands.shared import say
+from beers_deploy.model.shipped import SENSOR
+from beers_deploy.profiles import SensorProfile, load_sensor, load_target, sensor_names, target_names
+from beers_deploy.profiles.constant import Constant, Words
+from beers_deploy.profiles.effects import Table
+from beers_deploy.profiles.errors import OptionError
+from beers_deploy.profiles.response import MtfTable
+from beers_deploy.profiles.scene_call import load_scene_call, scene_names
+from beers_deploy.profiles.sensor import TABLES, constant_keys
+from beers_deploy.profiles.toml import profile_path, read_toml
 
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from beers_deploy.profiles import SensorProfile
-    from beers_deploy.profiles.constant import Constant, Words
-    from beers_deploy.profiles.effects import Table
-
-    Row = tuple[str, str, str, str]
+Row = tuple[str, ...]
 
 EXAMPLE = "profiles pleiades-degraded"
 
@@ -33,38 +36,23 @@ def profiles(
         return
     from rich.table import Table
 
-    from beers_deploy.profiles import load_sensor, load_target, sensor_names, target_names
-    from beers_deploy.profiles.scene_call import load_scene_call, scene_names
     from beers_deploy.results import default_console, plain
 
-    table = Table("name" if name is None else "constant", title_justify="left")
     if name is None:
-        table.add_column("kind")
-        table.add_column("what it is")
-        for sensor in sensor_names():
-            table.add_row(sensor, "sensor", plain(load_sensor(sensor).description))
-        for scene in scene_names():
-            table.add_row(scene, "scene", plain(load_scene_call(scene).description))
-        for target in target_names():
-            table.add_row(target, "target", plain(load_target(target).description))
+        table = Table("name", "kind", "what it is", title_justify="left")
+        rows: list[Row] = [(each, "sensor", load_sensor(each).description) for each in sensor_names()]
+        rows += [(each, "scene", load_scene_call(each).description) for each in scene_names()]
+        rows += [(each, "target", load_target(each).description) for each in target_names()]
     else:
-        for column in ("value", "status", "source"):
-            table.add_column(column)
         title, rows = _shown(name)
-        table.title = plain(title)
-        for row in rows:
-            table.add_row(*map(plain, row))
+        table = Table("constant", "value", "status", "source", title=plain(title), title_justify="left")
+    for row in rows:
+        table.add_row(*map(plain, row))
     default_console().print(table)
 
 
 def _file_text(name: str | None) -> str:
     """The TOML of a profile that can be read as one."""
-    from beers_deploy.model.shipped import SENSOR
-    from beers_deploy.profiles import sensor_names
-    from beers_deploy.profiles.errors import OptionError
-    from beers_deploy.profiles.scene_call import scene_names
-    from beers_deploy.profiles.toml import profile_path
-
     if name is None:
         remedy = f"name one, such as {SENSOR}"
         raise OptionError("--toml", expected="the name of a profile beside it", got="none", remedy=remedy)
@@ -73,13 +61,8 @@ def _file_text(name: str | None) -> str:
     return profile_path(kind, name).read_text(encoding="utf-8")
 
 
-def _shown(name: str) -> "tuple[str, list[Row]]":
+def _shown(name: str) -> tuple[str, list[Row]]:
     """Title and rows (constant, value, status, source) of a sensor, a scene or a target, tried in that order."""
-    from beers_deploy.profiles import load_sensor, load_target, sensor_names, target_names
-    from beers_deploy.profiles.errors import OptionError
-    from beers_deploy.profiles.scene_call import load_scene_call, scene_names
-    from beers_deploy.profiles.toml import read_toml
-
     if name in sensor_names() or (name.endswith(".toml") and "mtf" in read_toml("sensors", name)[1]):
         sensor = load_sensor(name)
         return f"{sensor.name}: {sensor.description}", _sensor_rows(sensor)
@@ -102,9 +85,7 @@ def _shown(name: str) -> "tuple[str, list[Row]]":
     )
 
 
-def _sensor_rows(sensor: "SensorProfile") -> "list[Row]":
-    from beers_deploy.profiles.sensor import TABLES, constant_keys
-
+def _sensor_rows(sensor: SensorProfile) -> list[Row]:
     rows: list[Row] = []
     for table in TABLES:
         given = [(f"{table}.{key}", getattr(sensor, key)) for key in constant_keys(table)]
@@ -113,10 +94,8 @@ def _sensor_rows(sensor: "SensorProfile") -> "list[Row]":
     return rows + _effects(sensor.effects)
 
 
-def _response(sensor: "SensorProfile") -> "list[Row]":
+def _response(sensor: SensorProfile) -> list[Row]:
     """A table's numbers, or what a point-spread function is made of."""
-    from beers_deploy.profiles.response import MtfTable
-
     response, said = sensor.response, (sensor.mtf_nyquist.status, sensor.mtf_nyquist.source)
     if response is None:
         return []
@@ -126,9 +105,9 @@ def _response(sensor: "SensorProfile") -> "list[Row]":
     return [(f"mtf.{key}", ", ".join(f"{v:g}" for v in values), *said) for key, values in columns.items()]
 
 
-def _effects(effects: "Mapping[str, Table]") -> "list[Row]":
+def _effects(effects: Mapping[str, Table]) -> list[Row]:
     return [_row(f"{name}.{key}", constant) for name, table in effects.items() for key, constant in table.items()]
 
 
-def _row(key: str, constant: "Constant | Words") -> "Row":
+def _row(key: str, constant: Constant | Words) -> Row:
     return key, str(constant), constant.status, constant.source

@@ -10,6 +10,8 @@ import typer
 from beers_deploy.commands.shared import BOARDS, say
 from beers_deploy.model.processor import SEEDS
 from beers_deploy.model.shipped import SENSOR
+from beers_deploy.profiles import load_sensor, load_target
+from beers_deploy.profiles.errors import OptionError
 from beers_deploy.profiles.target import DEFAULT_TARGET
 
 EXAMPLE = "quantize float.onnx --target zcu104 --sensor pleiades-degraded --out int8.onnx"
@@ -63,8 +65,6 @@ def quantize(
     from beers_deploy.export import float_model
     from beers_deploy.model.io.files import require_writable
     from beers_deploy.networks import conditioned, float_file
-    from beers_deploy.profiles import load_sensor, load_target
-    from beers_deploy.profiles.errors import OptionError
     from beers_deploy.results import Document, print_rows
 
     if regime is Regime.free and (board or report or finetune):

@@ -8,6 +8,9 @@ from typing import Annotated
 import typer
 
 from beers_deploy.commands.shared import refuse, say
+from beers_deploy.profiles import load_sensor
+from beers_deploy.profiles.errors import OptionError
+from beers_deploy.profiles.sensor_file import BLIND, reference_for
 from beers_deploy.restoration.options import TILE_PX, Compression, Options, Runtime
 
 EXAMPLE = "restore raw.tif restored.tif"
@@ -83,8 +86,6 @@ def restore(
     from beers_deploy.model.io.files import require_writable
     from beers_deploy.model.shipped import INT8
     from beers_deploy.networks import conditioned, network_file
-    from beers_deploy.profiles.errors import OptionError
-    from beers_deploy.profiles.sensor_file import BLIND, load_sensor
     from beers_deploy.restoration.bands import parse_sensors
     from beers_deploy.restoration.run import restore_file
     from beers_deploy.restoration.stac import require_stac, write_item
@@ -158,9 +159,6 @@ def _by_the_chain(
     trust_index: bool,
     json: Path | None,
 ) -> None:
-    from beers_deploy.profiles import load_sensor
-    from beers_deploy.profiles.errors import OptionError
-    from beers_deploy.profiles.sensor_file import reference_for
     from beers_deploy.restoration.traditional import Request, restore_file_traditionally
     from beers_deploy.results import Document, print_rows
 

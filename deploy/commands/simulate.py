@@ -10,6 +10,10 @@ import typer
 from beers_deploy.commands.shared import refuse, say
 from beers_deploy.model.processor import SEEDS
 from beers_deploy.model.shipped import SENSOR
+from beers_deploy.profiles import load_sensor
+from beers_deploy.profiles.errors import OptionError
+from beers_deploy.profiles.scene_call import calling_for, load_scene_call, origins
+from beers_deploy.profiles.sensor_file import reference_beside
 
 if TYPE_CHECKING:
     from beers_deploy.model.simulator.plan import Plan
@@ -83,10 +87,6 @@ def simulate(
     from beers_deploy.model.io.files import require_writable
     from beers_deploy.model.processor import require_cores
     from beers_deploy.model.progress import steps
-    from beers_deploy.profiles import load_sensor
-    from beers_deploy.profiles.errors import OptionError
-    from beers_deploy.profiles.scene_call import calling_for, load_scene_call, origins
-    from beers_deploy.profiles.sensor_file import reference_beside
 
     if out is None:
         expected, remedy = "--out beside it", "leave it out, or give a folder"
@@ -132,7 +132,6 @@ def simulate(
 
 
 def _preset(name: str | None) -> Preset:
-    from beers_deploy.profiles.errors import OptionError
 
     if name is None:
         return PRESETS["paper-fixed"]

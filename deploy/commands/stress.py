@@ -9,6 +9,8 @@ import typer
 from beers_deploy.commands.shared import BOARDS, refuse, say
 from beers_deploy.model.processor import SEEDS
 from beers_deploy.model.shipped import SENSOR, VARIANT
+from beers_deploy.profiles.errors import OptionError
+from beers_deploy.profiles.figures import by_table
 from beers_deploy.profiles.target import DEFAULT_TARGET
 
 if TYPE_CHECKING:
@@ -68,7 +70,6 @@ def stress(
     these cost on the board.
     """
     from beers_deploy.model.io.files import require_writable, write_text
-    from beers_deploy.profiles.figures import by_table
     from beers_deploy.results import Document, print_rows
     from beers_deploy.studies.stress.battery import (
         battery_rows,
@@ -139,7 +140,6 @@ def _flip_bits(
     from dataclasses import asdict
 
     from beers_deploy.model.io.files import write_text
-    from beers_deploy.profiles.figures import by_table
     from beers_deploy.results import Document, print_rows
     from beers_deploy.studies.stress.bit_flips import flip_curves_svg, flip_rows
     from beers_deploy.studies.stress.tables import markdown, title
@@ -156,8 +156,6 @@ def _flip_bits(
 
 def _picture_beside(out: Path | None, json: Path | None) -> Path | None:
     """Where the curves go: beside the tables, over nothing else that is written."""
-    from beers_deploy.profiles.errors import OptionError
-
     if out is None:
         return None
     picture = out.with_name(f"{out.stem}.svg")

@@ -9,6 +9,7 @@ import typer
 from beers_deploy.commands.shared import refuse, say
 from beers_deploy.model.processor import SEEDS
 from beers_deploy.model.shipped import SENSOR
+from beers_deploy.profiles.sensor_file import REFERENCE, load_sensor, reference_beside
 from beers_deploy.profiles.target import DEFAULT_TARGET, board_names
 
 if TYPE_CHECKING:
@@ -86,7 +87,6 @@ def tradeoff(
     from beers_deploy.bench.tables import parse_size
     from beers_deploy.model.io.files import require_writable
     from beers_deploy.model.shipped import shipped_names
-    from beers_deploy.profiles.sensor_file import REFERENCE, load_sensor, reference_beside
     from beers_deploy.results import Document, print_rows
     from beers_deploy.studies.tradeoff.advice import parse_constraints
     from beers_deploy.studies.tradeoff.page import FILES, write_study

@@ -8,6 +8,7 @@ import typer
 
 from beers_deploy.commands.shared import refuse, say
 from beers_deploy.model.processor import SEEDS
+from beers_deploy.profiles.errors import OptionError
 
 EXAMPLE = "train --variant convbeers-s --images aerial/ --out runs/s --steps 20000"
 RANGE = "pleiades-variable"
@@ -103,7 +104,6 @@ def train(
     from beers_deploy.model.training.run import train as run_training
     from beers_deploy.model.training.workers import joined
     from beers_deploy.networks import weights_file
-    from beers_deploy.profiles.errors import OptionError
 
     if optimiser not in get_args(Optimiser):
         raise OptionError("--optimiser", expected="adam or adamw", got=repr(optimiser), remedy="pick one")

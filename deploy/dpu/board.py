@@ -50,11 +50,6 @@ class Dpu:
         return self.cores * int(self.constants["batch_handlers"].low)
 
     @property
-    def weight_loads(self) -> int:
-        """How often the weights cross the memory for these images: the batch handlers of a core share them."""
-        return self.cores
-
-    @property
     def channels_max(self) -> int:
         """The most channels that an operator of the array can take."""
         return self.whole("array", "channel_groups") * self.input_parallel

@@ -110,12 +110,7 @@ def add_haze(radiance: Tensor, haze: Haze) -> Tensor:
     return radiance * haze.transmittance + haze.path_radiance
 
 
-def digitise(radiance: Tensor, sensor: Sensor) -> Tensor:
-    """DN = min(max(round(gain * L), 0), 2^bits - 1), as float32, L in W/m2/sr/um of any shape."""
-    return digitise_dn(radiance * sensor.gain_dn_per_radiance, sensor)
-
-
-def digitise_dn(dn: Tensor, sensor: Sensor) -> Tensor:
+def digitise(dn: Tensor, sensor: Sensor) -> Tensor:
     """Round digital numbers, of any shape, to whole ones and clip them to the converter's range.
 
     Rounding adds 1/12 DN^2 of variance. Clipping comes before any cast, so that nothing wraps around.
@@ -177,7 +172,7 @@ def detect(signal: Tensor, sensor: Sensor, draw: Draw, role: str, skip: Collecti
     if "noise" not in skip:
         signal = add_noise(signal, sensor, draw.generator(f"noise-{role}"))
     dn = apply(signal * sensor.gain_dn_per_radiance, DN_EFFECTS)
-    return dn.clamp(0, sensor.max_dn) if "digitising" in skip else digitise_dn(dn, sensor)
+    return dn.clamp(0, sensor.max_dn) if "digitising" in skip else digitise(dn, sensor)
 
 
 def apply_effect(

@@ -4,8 +4,8 @@
 2. `nl_bayes`: two-pass non-local Bayes denoising, with the published numbers of `settings`.
 3. `compensate`: regularised inverse filter, from the degraded sensor's MTF to the reference's.
 
-`pipeline` chains them, in this order or with 3 first; `work` counts what it computes; `peers` are restorations of
-scikit-image to compare it with.
+`pipeline` chains them, in this order or with 3 first; `peers` are restorations of scikit-image to compare
+it with.
 Every step takes and gives strips of rows (`rows`), so a chain of any height runs in the memory of some hundred rows;
 NaN marks missing pixels.
 """

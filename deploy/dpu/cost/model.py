@@ -149,7 +149,6 @@ class Layers:
 
 Regime = Literal["host", "small maps", "large maps"]
 """What sets the rate: the host; or the DPU, on maps of at most LARGE_MAP_BYTES, or with larger ones."""
-REGIMES: tuple[Regime, ...] = get_args(Regime)
 LARGE_MAP_BYTES = 2 << 20
 
 

@@ -7,6 +7,7 @@ from beers_deploy.profiles import load_sensor
 from beers_deploy.profiles.sensor import Sensor
 
 SENSOR = load_sensor("pleiades-degraded").nominal()
+GAIN = SENSOR.gain_dn_per_radiance
 
 
 @pytest.mark.parametrize("radiance", [2.0, 25.0, 60.0, 100.0, 300.0])
@@ -21,7 +22,7 @@ def test_the_variance_is_alpha_l_plus_beta(radiance: float) -> None:
 @pytest.mark.parametrize("radiance", [2.0, 25.0, 60.0, 100.0, 300.0])
 def test_digitising_adds_a_twelfth_of_a_unit_squared(radiance: float) -> None:
     image = torch.full((700, 701), radiance)
-    dn = digitise(add_noise(image, SENSOR, Draw(2).generator("noise")), SENSOR)
+    dn = digitise(add_noise(image, SENSOR, Draw(2).generator("noise")) * GAIN, SENSOR)
     expected = (SENSOR.alpha * radiance + SENSOR.beta) * SENSOR.gain_dn_per_radiance**2 + 1 / 12
     assert float(dn.double().var()) == pytest.approx(expected, rel=0.01)
 
@@ -42,14 +43,14 @@ def test_an_impossible_hand_made_sensor_gives_no_nan() -> None:
 
 
 def test_clipping_comes_before_the_cast() -> None:
-    dn = digitise(torch.tensor([[-5.0, 0.04, 399.99, 1e6]]), SENSOR)
+    dn = digitise(torch.tensor([[-5.0, 0.04, 399.99, 1e6]]) * GAIN, SENSOR)
     assert dn.tolist() == [[0.0, 0.0, 4095.0, 4095.0]]
     assert to_uint16(torch.tensor([-1.0, 70000.0])).tolist() == [0, 65535]
 
 
 def test_whole_numbers_survive_a_round_trip() -> None:
     dn = torch.arange(4096, dtype=torch.float32)
-    torch.testing.assert_close(digitise(to_radiance(dn, SENSOR), SENSOR), dn, rtol=0, atol=0)
+    torch.testing.assert_close(digitise(to_radiance(dn, SENSOR) * GAIN, SENSOR), dn, rtol=0, atol=0)
 
 
 def test_each_effect_has_its_own_draws() -> None:
