@@ -20,11 +20,20 @@ from tests.deploy.command_line import done, refused
 from tests.deploy.two_workers import local_cluster
 
 
-@pytest.fixture
-def scene(tmp_path: Path) -> Path:
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
     pixels = np.random.default_rng(0).integers(0, 255, (420, 610, 3)).astype(np.uint8)
-    Image.fromarray(pixels).save(tmp_path / "scene.png")
-    return tmp_path / "scene.png"
+    path = tmp_path_factory.mktemp("scene") / "scene.png"
+    Image.fromarray(pixels).save(path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def made(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The small dataset, to be read."""
+    folder = tmp_path_factory.mktemp("made") / "all"
+    write_dataset(small(scene), folder, 1, resume=False, tick=silent)
+    return folder
 
 
 VARIABLE, REFERENCE = load_sensor("pleiades-variable"), load_sensor("pleiades-reference")
@@ -45,20 +54,19 @@ def bytes_of(folder: Path) -> dict[str, bytes]:
 @pytest.mark.slow
 def test_the_bytes_do_not_depend_on_the_workers(scene: Path, tmp_path: Path) -> None:
     for workers in (1, 2):
-        write_dataset(small(scene), tmp_path / str(workers), workers, resume=False, tick=lambda _: None)
+        write_dataset(small(scene), tmp_path / str(workers), workers, resume=False, tick=silent)
     assert bytes_of(tmp_path / "1") == bytes_of(tmp_path / "2")
 
 
-def test_any_patch_can_be_made_again_alone(scene: Path, tmp_path: Path) -> None:
-    write_dataset(small(scene), tmp_path / "all", 1, resume=False, tick=lambda _: None)
+def test_any_patch_can_be_made_again_alone(scene: Path, made: Path) -> None:
     window = plan_windows(small(scene))[7]
     (patch,) = make_patches(small(scene), [window])
     for role, dn in (("degraded", patch.degraded), ("reference", patch.reference)):
-        np.testing.assert_array_equal(dn, tifffile.imread(tmp_path / "all" / role / f"{window.name}.tif"))
+        np.testing.assert_array_equal(dn, tifffile.imread(made / role / f"{window.name}.tif"))
 
 
 def test_the_manifest_tells_where_each_patch_comes_from(scene: Path, tmp_path: Path) -> None:
-    summary = write_dataset(small(scene), tmp_path / "d", 1, resume=False, tick=lambda _: None)
+    summary = write_dataset(small(scene), tmp_path / "d", 1, resume=False, tick=silent)
     lines = [json.loads(line) for line in (tmp_path / "d" / "manifest.jsonl").read_text().splitlines()]
     assert len(lines) == summary["patches"] == len(plan_windows(small(scene)))
     assert [line["number"] for line in lines] == list(range(len(lines)))
@@ -86,15 +94,14 @@ def test_a_killed_dataset_is_resumed_to_the_same_bytes(scene: Path, tmp_path: Pa
     assert bytes_of(killed) == bytes_of(whole)
 
 
-def test_another_dataset_in_the_folder_is_not_overwritten(scene: Path, tmp_path: Path) -> None:
-    write_dataset(small(scene), tmp_path / "d", 1, resume=False, tick=lambda _: None)
-    before = bytes_of(tmp_path / "d")
+def test_another_dataset_in_the_folder_is_not_overwritten(scene: Path, made: Path) -> None:
+    before = bytes_of(made)
     with pytest.raises(OptionError, match="add --resume"):
-        write_dataset(small(scene), tmp_path / "d", 1, resume=False, tick=lambda _: None)
+        write_dataset(small(scene), made, 1, resume=False, tick=silent)
     with pytest.raises(OptionError, match="another dataset"):
-        write_dataset(small(scene, patch_px=32), tmp_path / "d", 1, resume=True, tick=lambda _: None)
-    write_dataset(small(scene), tmp_path / "d", 1, resume=True, tick=lambda _: None)
-    assert bytes_of(tmp_path / "d") == before
+        write_dataset(small(scene, patch_px=32), made, 1, resume=True, tick=silent)
+    write_dataset(small(scene), made, 1, resume=True, tick=silent)
+    assert bytes_of(made) == before
 
 
 def test_a_scene_without_room_for_a_patch_is_refused(scene: Path) -> None:
@@ -178,11 +185,9 @@ def test_a_dataset_begun_here_is_finished_by_a_scheduler_s_workers(
     assert bytes_of(tmp_path / "d") == bytes_of(tmp_path / "whole")
 
 
-def test_a_scene_that_cannot_be_read_there_is_one_sentence(scene: Path) -> None:
-    recipe, windows = small(scene), plan_windows(small(scene))
-    scene.unlink()
+def test_a_scene_that_cannot_be_read_there_is_one_sentence(scene: Path, tmp_path: Path) -> None:
     with pytest.raises(ImageError, match="no such file"):
-        make_patches(recipe, windows[:1])
+        make_patches(small(tmp_path / "gone.png"), plan_windows(small(scene))[:1])
 
 
 def test_workers_and_a_scheduler_do_not_go_together(scene: Path, tmp_path: Path) -> None:

@@ -72,7 +72,7 @@ def test_missing_pixels_stay_as_in_a_file(kind: str, da: Any, model: Path, tmp_p
 
 
 @settings(max_examples=15, suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(st.integers(1, 70), st.integers(1, 70), st.integers(1, 50), st.integers(1, 50), st.booleans())
+@given(st.integers(1, 50), st.integers(1, 50), st.integers(2, 50), st.integers(2, 50), st.booleans())
 def test_a_dask_array_of_any_chunks_gives_the_same(
     da: Any, model: Path, height: int, width: int, down: int, across: int, planes: bool
 ) -> None:

@@ -32,8 +32,8 @@ INSIDE = {
 """A file that a command writes into its output folders."""
 SUFFIXES = {"check": ".svg", "compare": ".json"}
 """Of every name, where a command asks for one."""
-MORE = {"stress": ("--bit-flips",)}
-"""Arguments without which a command does not write."""
+MORE = {"stress": ("--bit-flips",), "tradeoff": ("--networks", "convbeers-xs")}
+"""Without which a command does not write, or computes for seconds before it looks at its images."""
 BESIDE = {
     ("restore", "sensor"): ("--method", "traditional"),
     ("detect", "labels"): ("--images", "pictures"),
@@ -78,7 +78,7 @@ def arguments(name: str, values: dict[str, Path]) -> list[str]:
         elif value is not None:
             options += [parameter.opts[0], str(value)]
     more = [word for option in values for word in BESIDE.get((name, option), ())]
-    return [name, *positional, *options, *MORE.get(name, ()), *more]
+    return [name, *MORE.get(name, ()), *positional, *options, *more]
 
 
 def given(name: str, folder: Path, **values: Path) -> list[str]:

@@ -51,7 +51,8 @@ def features_beside_the_image(w: Sketch) -> onnx.ModelProto:
 
 def pooled_image(w: Sketch) -> onnx.ModelProto:
     pooled = w.node("MaxPool", "p", ["in"], kernel_shape=[3, 3], pads=[1] * 4)
-    w.conv("out", w.node("Add", "s", [pooled, "in"]), (2, 1, 3, 3), pads=[1] * 4)
+    mean = w.node("AveragePool", "mean", ["in"], kernel_shape=[3, 3], pads=[1] * 4, count_include_pad=1)
+    w.conv("out", w.node("Add", "s", [pooled, mean]), (2, 1, 3, 3), pads=[1] * 4)
     return w.model(2)
 
 

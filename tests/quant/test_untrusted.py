@@ -146,6 +146,7 @@ def filled(to: str, by: str = "n") -> onnx.NodeProto:
             "Concat b of constants alone",
         ),
         ([constant("n", 9, 9), node("Expand", "n", "n")], "constants alone"),
+        ([constant("n", 9, 9), constant("i", 7), node("Gather", "n", "i")], "Gather y of constants alone"),
         ([node("RandomNormal", shape=[2**20, 2**20])], "values"),
         ([constant("n", 1, 1, 2**20, 2**20), node("Expand", "image", "n")], "Expand"),
         ([constant("n", 1, 1, 2000, 1), node("Tile", "image", "n")], "enlargements"),

@@ -44,9 +44,10 @@ def stop_after(tiles: int, patch: pytest.MonkeyPatch, error: BaseException) -> N
 
 
 @contextmanager
-def stopped_after(tiles: int) -> Iterator[None]:
-    """What runs here ends after so many tiles, as by Ctrl-C."""
+def stopped_after(tiles: int, error: BaseException | None = None) -> Iterator[None]:
+    """What runs here ends after so many tiles, as by Ctrl-C unless told an error."""
+    error = error or KeyboardInterrupt()
     with pytest.MonkeyPatch.context() as patch:
-        stop_after(tiles, patch, KeyboardInterrupt())
-        with pytest.raises(KeyboardInterrupt):
+        stop_after(tiles, patch, error)
+        with pytest.raises(type(error)):
             yield

@@ -12,7 +12,7 @@ import tifffile
 from onnx import helper
 
 from beers_deploy.library import restore
-from beers_deploy.profiles.errors import ModelError, OptionError
+from beers_deploy.profiles.errors import MachineError, ModelError, OptionError
 from beers_deploy.quant.onnx_file import load_onnx, save_onnx
 from beers_deploy.quant.session import open_session, tensors_of
 from beers_deploy.quant.tiling.walk import Tiling, tiling_of
@@ -142,7 +142,7 @@ def test_a_run_that_was_stopped_is_resumed_to_the_same_bytes(path: Path, tmp_pat
     options = Options(path, 56, threads=1)
     by_file(noise(path), tmp_path, options)
     expected = (tmp_path / "out.tif").read_bytes()
-    with stopped_after(4):
+    with stopped_after(4, MachineError("machine", expected="power", got="none", remedy="wait")):
         restore_file(tmp_path / "in.tif", tmp_path / "out.tif", options, lambda _: None)
     row = restore_file(tmp_path / "in.tif", tmp_path / "out.tif", replace(options, resume=True), lambda _: None)
     assert (tmp_path / "out.tif").read_bytes() == expected
