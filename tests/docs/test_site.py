@@ -1,6 +1,7 @@
 """The documentation's site, built strictly and looked at in a real browser; skipped where either is missing.
 
-`pip install -e '.[dev,docs]'` brings MkDocs. Every page is opened at the width of a desk and of a telephone.
+`pip install -e '.[dev,docs]' --config-settings editable_mode=strict` brings MkDocs. Every page is opened at the width
+of a desk and of a telephone.
 """
 
 import json
@@ -84,7 +85,7 @@ return report;
 @pytest.fixture(scope="module")
 def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     if find_spec("mkdocs") is None:
-        pytest.skip("no MkDocs here: pip install -e '.[docs]'")
+        pytest.skip("no MkDocs here: pip install -e '.[docs]' --config-settings editable_mode=strict")
     folder = tmp_path_factory.mktemp("site")
     command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--quiet", "--site-dir", str(folder)]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
