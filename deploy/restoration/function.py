@@ -9,20 +9,18 @@ from beers_deploy.quant.tiling.walk import tiling_of
 from beers_deploy.restoration.engine import restore_dn
 from beers_deploy.restoration.options import TILE_PX, Runtime
 from beers_deploy.restoration.plan import make_plan
-from beers_deploy.restoration.runtime import Infer, open_runtime
+from beers_deploy.restoration.runtime import open_runtime
 
 Restore = Callable[[np.ndarray], np.ndarray]
 """Degraded digital numbers (H, W) float32 to restored ones."""
 
 
 def network_method(model: onnx.ModelProto, max_dn: int) -> Restore:
-    """A network as a method: digital numbers of 0 to `max_dn` become whole ones, as `restore` writes them."""
+    """A network as a method: digital numbers of 0 to `max_dn` become whole ones, as `restore` writes them.
+
+    Tiles are the default ones, or those the network is fixed to.
+    """
     infer, _ = open_runtime(Runtime.onnxruntime, model, threads=0)
-    return restoring(infer, model, max_dn)
-
-
-def restoring(infer: Infer, model: onnx.ModelProto, max_dn: int) -> Restore:
-    """As `network_method`, of a network that is open already; tiles are the default ones, or those it is fixed to."""
     tiling = tiling_of(model)
 
     def restore(dn: np.ndarray) -> np.ndarray:

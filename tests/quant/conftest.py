@@ -36,7 +36,7 @@ def graph(float_onnx: onnx.ModelProto) -> Graph:
 
 @pytest.fixture(scope="session")
 def patches() -> Patches:
-    return drawn(6, seed=5, patch_px=80)
+    return drawn(6, seed=5, patch_px=128)
 
 
 @pytest.fixture(scope="session")
