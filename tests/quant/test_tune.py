@@ -94,7 +94,7 @@ def test_a_reference_of_another_size_is_one_sentence(
 ) -> None:
     seen, meant = patches.pairs[0]
     short = Remade(lambda _: (seen, meant[..., :-2]), 2)
-    with pytest.raises(ImageError, match=r"reference: expected one of 1 x 1 x 80 x 80, got 1 x 1 x 80 x 78"):
+    with pytest.raises(ImageError, match=r"reference: expected one of 1 x 1 x 128 x 128, got 1 x 1 x 128 x 126"):
         trained(quantised, quantised.core, float_onnx, Tuning(short, 1))
 
 

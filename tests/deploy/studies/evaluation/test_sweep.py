@@ -1,11 +1,16 @@
 """Conditions of a sweep: who is told which sensor, and what a chain loses when it is told the wrong one."""
 
+import json
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
+import tifffile
+from typer.testing import CliRunner
 
+from beers_deploy.cli import app
 from beers_deploy.model.simulator.procedural import procedural_scene
 from beers_deploy.profiles import SensorProfile, load_sensor
 from beers_deploy.profiles.figures import Row, by_table, unavailable
@@ -61,8 +66,19 @@ def half(dn: np.ndarray) -> np.ndarray:
     return dn / 2
 
 
+@pytest.fixture(scope="module", autouse=True)
+def quick() -> Iterator[None]:
+    """Three conditions, on targets that are small and seen once."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(targets_module, "REPEATS", 1)
+        patch.setattr(targets_module, "ANGLES_DEG", (5.0, 8.0))
+        patch.setattr(targets_module, "SIDE_PX", 100)
+        patch.setattr(module, "conditions", few)
+        yield
+
+
 @pytest.fixture(scope="module")
-def swept() -> Iterator[Swept]:
+def swept() -> Swept:
     """One sweep under three conditions: its rows, and the sensors that the able network was given."""
     given: list[Sensor] = []
 
@@ -71,14 +87,9 @@ def swept() -> Iterator[Swept]:
         return lambda dn: dn + np.float32(1000 * sensor.mtf_nyquist)
 
     able = Method("able", half, BLIND, specialise)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(targets_module, "REPEATS", 1)
-        patch.setattr(targets_module, "ANGLES_DEG", (5.0, 8.0))
-        patch.setattr(targets_module, "SIDE_PX", 100)
-        patch.setattr(module, "conditions", few)
-        scene = procedural_scene(500, 560, np.random.default_rng(5))
-        rows = run_sweep([Method("half", half, BLIND), able], [scene], PROFILE, REFERENCE, 0).rows
-        yield {table: {row.name: row for row in rows} for table, rows in by_table(rows).items()}, given
+    scene = procedural_scene(500, 560, np.random.default_rng(5))
+    rows = run_sweep([Method("half", half, BLIND), able], [scene], PROFILE, REFERENCE, 0).rows
+    return {table: {row.name: row for row in rows} for table, rows in by_table(rows).items()}, given
 
 
 def few(_nominal: Sensor, _profile: SensorProfile) -> dict[str, Sensor]:
@@ -172,3 +183,17 @@ def test_without_networks_there_are_no_gains() -> None:
     one = known()
     chain = {key: values for key, values in one.psnr.items() if key[2] != "net"}
     assert not [row for row in Found(chain, one.mtf, SITES, 0).rows if "gain" in row.table]
+
+
+def test_the_command_sweeps_the_networks_alone(tmp_path: Path) -> None:
+    scene = np.random.default_rng(0).integers(200, 1800, (500, 560)).astype(np.uint16)
+    tifffile.imwrite(tmp_path / "scene.tif", scene)
+    found = tmp_path / "found.json"
+    command = f"evaluate --images {tmp_path} --methods degraded,convbeers-xs --sweep --json {found}"
+    done = CliRunner().invoke(app, command.split())
+    assert done.exit_code == 0, done.output
+    rows = {
+        row["name"]: row["figures"] for row in json.loads(found.read_text())["rows"] if row["table"] == "sweep, PSNR"
+    }
+    assert {"nominal", "MTF 3%", "dim"} <= set(rows)
+    assert set(rows["nominal"]) >= {NOMINAL_KNOWN, TRUTH_KNOWN, "convbeers-xs"}
