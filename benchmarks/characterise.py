@@ -31,7 +31,7 @@ from beers_deploy.model.simulator.detector import Draw, to_uint16
 from beers_deploy.model.simulator.sampling import Scene, crop_divisible, read_scene, scene_spectrum
 from beers_deploy.profiles import load_sensor
 from beers_deploy.profiles.errors import ImageError
-from beers_deploy.profiles.sensor import Sensor
+from beers_deploy.profiles.sensor import Instrument
 from beers_deploy.studies.characterise import (
     AXES,
     Box,
@@ -82,7 +82,7 @@ def main() -> None:
 
 
 def look(
-    ways: dict[str, "Findings"], sensor: Sensor, scenes: Sequence[Scene], number: int, folder: Path
+    ways: dict[str, "Findings"], sensor: Instrument, scenes: Sequence[Scene], number: int, folder: Path
 ) -> Characterised | None:
     """Characterise one sensor in each way; what was found where the checkerboard had to be searched for."""
     alone, searched, pointed = ways.values()
@@ -100,13 +100,13 @@ def boxes_on_target(path: Path) -> tuple[Box, Box]:
     return upright, Box(path, width // 2 + 16, height // 2 - 10, 34, 28)
 
 
-def as_read(found: Characterised, path: Path) -> Sensor:
+def as_read(found: Characterised, path: Path) -> Instrument:
     """The sensor of the profile, written and read."""
     path.write_text(profile_toml(found), encoding="utf-8")
     return load_sensor(str(path)).nominal()
 
 
-def psnr_lost(weights: Path, scene: Scene, sensor: Sensor, found: Sensor) -> float:
+def psnr_lost(weights: Path, scene: Scene, sensor: Instrument, found: Instrument) -> float:
     """By a network that knows the sensor that was found, beside the same that knows the true one, in dB."""
     (pair,), _ = simulate_pairs([scene], sensor, REFERENCE.in_units_of(sensor), 0)
     image = torch.from_numpy(pair.degraded.astype(np.float32) / sensor.max_dn)[None, None]
@@ -118,7 +118,7 @@ def psnr_lost(weights: Path, scene: Scene, sensor: Sensor, found: Sensor) -> flo
     return scores[0] - scores[1]
 
 
-def draw(generator: np.random.Generator) -> Sensor:
+def draw(generator: np.random.Generator) -> Instrument:
     """A sensor with the family's noise and an MTF of 2 to 12 %."""
     mtf = math.exp(generator.uniform(*np.log(MTF_RANGE)))
     along = max(mtf * LEAST_ALONG ** float(generator.uniform() ** 2), MTF_RANGE[0])
@@ -126,7 +126,7 @@ def draw(generator: np.random.Generator) -> Sensor:
 
 
 def written(
-    scenes: Sequence[Scene], sensor: Sensor, number: int, folder: Path, target: int | None
+    scenes: Sequence[Scene], sensor: Instrument, number: int, folder: Path, target: int | None
 ) -> tuple[Path, ...]:
     """Acquisitions of the scenes as TIFF files, the checkerboard in the middle of one of them."""
     paths = []
@@ -158,7 +158,7 @@ class Findings:
     snr: list[tuple[float, bool]] = field(default_factory=list)
     asked: int = 0
 
-    def look(self, sensor: Sensor, paths: tuple[Path, ...], boxes: tuple[Box, ...] = ()) -> Characterised | None:
+    def look(self, sensor: Instrument, paths: tuple[Path, ...], boxes: tuple[Box, ...] = ()) -> Characterised | None:
         """Characterise one sensor; where its edges are refused, its noise alone."""
         self.asked += 2
         found = None

@@ -37,33 +37,33 @@ from beers_deploy.model.simulator.procedural import procedural_scene
 from beers_deploy.profiles import load_sensor
 from beers_deploy.profiles.effects import AntiAlias, Effect, Smear, middle_effect
 from beers_deploy.profiles.scene_call import typical_effects
-from beers_deploy.profiles.sensor import Sensor
+from beers_deploy.profiles.sensor import Instrument
 
 RATIO, PATCH_PX, MARGIN_PX, PROCESSES, TURNS = 5, 128, 32, 2, 5
 ROLES = ("degraded", "reference")
 ALL: dict[str, Effect] = {name: middle_effect(name, table) for name, table in typical_effects().items()}
 
 
-def sensors(effects: dict[str, Effect]) -> tuple[Sensor, Sensor]:
+def sensors(effects: dict[str, Effect]) -> tuple[Instrument, Instrument]:
     """The degraded and the reference sensor with these effects."""
     degraded, reference = (load_sensor(f"pleiades-{role}").nominal() for role in ROLES)
     return replace(degraded, effects=effects), replace(reference, effects=effects)
 
 
-def ours(radiance: Tensor, eyes: tuple[Sensor, Sensor], number: int) -> None:
+def ours(radiance: Tensor, eyes: tuple[Instrument, Instrument], number: int) -> None:
     """One transform of the scene, then for each sensor a plan and one fused pass."""
     scene = prepare_scene(radiance, RATIO)
     for sensor, role in zip(eyes, ROLES, strict=True):
         simulate_planned(scene, sensor, Draw(0, number), make_plan(sensor, scene.stats), role, MARGIN_PX)
 
 
-def one_by_one(radiance: Tensor, eyes: tuple[Sensor, Sensor], number: int) -> None:
+def one_by_one(radiance: Tensor, eyes: tuple[Instrument, Instrument], number: int) -> None:
     """Every effect of each sensor in turn."""
     for sensor, role in zip(eyes, ROLES, strict=True):
         _acquire_plainly(radiance, sensor, number, role)
 
 
-def _acquire_plainly(radiance: Tensor, sensor: Sensor, number: int, role: str) -> Tensor:
+def _acquire_plainly(radiance: Tensor, sensor: Instrument, number: int, role: str) -> Tensor:
     """Each effect by itself at full resolution, random ones included where they act on the scene's grid."""
     height, width = radiance.shape
     antialias, smear = sensor.effects.get("antialias"), sensor.effects.get("smear")
@@ -93,13 +93,13 @@ def _responses(height: int, width: int, mtf_nyquist: float, sigma_px: float, len
     return [torch.from_numpy(response).float() for response in responses]
 
 
-def _apply(image: Tensor, name: str, sensor: Sensor, draw: Draw, role: str) -> Tensor:
+def _apply(image: Tensor, name: str, sensor: Instrument, draw: Draw, role: str) -> Tensor:
     if name not in sensor.effects:
         return image
     return apply_effect(image, sensor.effects[name], sensor, lambda: draw.generator(f"{name}-{role}"))
 
 
-WAYS: dict[str, tuple[Callable[[Tensor, tuple[Sensor, Sensor], int], None], bool, bool]] = {
+WAYS: dict[str, tuple[Callable[[Tensor, tuple[Instrument, Instrument], int], None], bool, bool]] = {
     # name: (way, all effects called for, all effects made)
     "two effects: ours": (ours, False, False),
     "two effects: (a) one by one": (one_by_one, False, False),

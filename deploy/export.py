@@ -14,7 +14,7 @@ from beers_deploy.model.bank import FILTERS, LARGEST, in_places, network_bank
 from beers_deploy.model.family import sensor_vector
 from beers_deploy.model.io.tensors import Arrays, Weights, read_conditioned, read_plain
 from beers_deploy.profiles.errors import ModelError, OptionError
-from beers_deploy.profiles.sensor import Sensor, SensorProfile
+from beers_deploy.profiles.sensor import Instrument, Sensor
 from beers_deploy.quant.onnx_file import GraphWriter, image_info, load_onnx, make_model
 from beers_deploy.quant.session import open_session, run
 
@@ -25,7 +25,7 @@ MAX_DIFFERENCE = 1e-5
 """Of full scale: a twentieth of a digital number, above what float32 summation order explains."""
 
 
-def float_for(path: Path, name: str, sensor: SensorProfile, tile_px: int | None = None) -> onnx.ModelProto:
+def float_for(path: Path, name: str, sensor: Sensor, tile_px: int | None = None) -> onnx.ModelProto:
     """A network that is told its sensor as an ONNX model for the middle of a profile.
 
     Args:
@@ -57,7 +57,7 @@ def to_onnx(network: "Weights | ConvBEERS", about: dict[str, str], tile_px: int 
 
 
 def banked_to_onnx(
-    weights: Weights, sensor: Sensor, about: dict[str, str], tile_px: int | None = None
+    weights: Weights, sensor: Instrument, about: dict[str, str], tile_px: int | None = None
 ) -> onnx.ModelProto:
     """A network behind the bank of a sensor as an ONNX model: its filters are the first convolution.
 
@@ -203,7 +203,7 @@ def about(variant: str, recipe: dict[str, object], sensor: str | None = None) ->
     }
 
 
-def torch_network(path: Path, sensor: Sensor | None = None) -> "ConvBEERS | OfOneSensor":
+def torch_network(path: Path, sensor: Instrument | None = None) -> "ConvBEERS | OfOneSensor":
     """The network of torch that an exported one must compute as: of weights, for a sensor where they need one.
 
     Raises:

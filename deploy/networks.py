@@ -24,7 +24,7 @@ from beers_deploy.model.io.tensors import is_conditioned, read_conditioned
 from beers_deploy.model.progress import Log, no_log, progress
 from beers_deploy.model.shipped import INT8, SENSOR, SHIPPED, VARIANT, shipped_names, shipped_weights
 from beers_deploy.profiles.errors import ModelError
-from beers_deploy.profiles.sensor import SensorProfile, numbers_of
+from beers_deploy.profiles.sensor import Sensor, numbers_of
 from beers_deploy.profiles.sensor_file import load_sensor
 from beers_deploy.profiles.toml import unreadable
 from beers_deploy.quant.banked.family import FAMILY, required_family, with_delta
@@ -46,7 +46,7 @@ class Conditioned:
     name: str
     weights: Path
 
-    def model(self, sensor: SensorProfile, int8: bool) -> onnx.ModelProto:
+    def model(self, sensor: Sensor, int8: bool) -> onnx.ModelProto:
         """The network told a sensor, in float32 or in INT8.
 
         Raises:
@@ -88,7 +88,7 @@ def _is_shipped(given: Path) -> bool:
     return named and not given.exists()
 
 
-def network_file(given: Path | None, sensor: SensorProfile, log: Log = no_log) -> Path:
+def network_file(given: Path | None, sensor: Sensor, log: Log = no_log) -> Path:
     """The file of a network: the one given, or a conditioned network's for the sensor, INT8 where its name says so.
 
     Args:
@@ -106,7 +106,7 @@ def network_file(given: Path | None, sensor: SensorProfile, log: Log = no_log) -
     return int8_file(given, sensor, log) if int8 else float_file(given, sensor, log)
 
 
-def float_file(given: Path | None, sensor: SensorProfile, log: Log = no_log) -> Path:
+def float_file(given: Path | None, sensor: Sensor, log: Log = no_log) -> Path:
     """As `network_file`, a conditioned network always in float32.
 
     Raises:
@@ -116,7 +116,7 @@ def float_file(given: Path | None, sensor: SensorProfile, log: Log = no_log) -> 
     return _written(found, sensor, False, log) if found else given or Path()
 
 
-def int8_file(given: Path | None, sensor: SensorProfile, log: Log = no_log) -> Path:
+def int8_file(given: Path | None, sensor: Sensor, log: Log = no_log) -> Path:
     """As `network_file`, a conditioned network always in INT8.
 
     Raises:
@@ -137,7 +137,7 @@ def shipped_pair(name: str = VARIANT, sensor: str = SENSOR, log: Log = no_log) -
     return float_file(given, known, log), int8_file(given, known, log)
 
 
-def warn_outside(sensor: SensorProfile, log: Log) -> None:
+def warn_outside(sensor: Sensor, log: Log) -> None:
     """Tell what of a sensor lies outside the range that was trained."""
     for sentence in sensor_vector(sensor.nominal()).outside:
         log(f"warning: {sentence}")
@@ -161,7 +161,7 @@ def _folder() -> TemporaryDirectory[str]:
     return TemporaryDirectory(prefix="beers-deploy-", ignore_cleanup_errors=True)
 
 
-def _written(network: Conditioned, sensor: SensorProfile, int8: bool, log: Log) -> Path:
+def _written(network: Conditioned, sensor: Sensor, int8: bool, log: Log) -> Path:
     warn_outside(sensor, log)
     stem = network.name + (INT8 if int8 else "")
     known = re.sub(r"[^\w.-]+", "-", sensor.name)[:40]
@@ -173,7 +173,7 @@ def _written(network: Conditioned, sensor: SensorProfile, int8: bool, log: Log) 
 
 
 def told_int8(
-    model: onnx.ModelProto, sensor: SensorProfile, more: Mapping[str, str] | None = None, log: Log = no_log
+    model: onnx.ModelProto, sensor: Sensor, more: Mapping[str, str] | None = None, log: Log = no_log
 ) -> onnx.ModelProto:
     """An INT8 network behind a bank told another sensor: its filters, unit and head's bias written anew.
 

@@ -26,7 +26,7 @@ from numpy.typing import ArrayLike, NDArray
 from beers_deploy.model.family import RANGES
 from beers_deploy.model.simulator.mtf import NYQUIST, sensor_mtf
 from beers_deploy.profiles import load_sensor
-from beers_deploy.profiles.sensor import Sensor
+from beers_deploy.profiles.sensor import Instrument
 
 REFERENCE = "pleiades-reference"
 """The profile of what networks are trained to restore."""
@@ -92,12 +92,12 @@ class Bank:
         return UNIT * self.sigma * float(np.linalg.norm(self.analytic))
 
 
-def bank_of(sensor: Sensor, reference: Sensor) -> Bank:
+def bank_of(sensor: Instrument, reference: Instrument) -> Bank:
     """The filters from what `sensor` sees to what `reference` would have seen; rounding alone is noise enough."""
     return _bank(sensor, reference, noise_over_full_scale(sensor))
 
 
-def network_bank(sensor: Sensor) -> Bank:
+def network_bank(sensor: Instrument) -> Bank:
     """The filters in front of a network: noise outside the range that was trained counts as the nearest end of it."""
     sigma = min(max(noise_over_full_scale(sensor), RANGES["sigma_bright"][0]), RANGES["sigma_bright"][1])
     return _bank(sensor, load_sensor(REFERENCE).nominal(), sigma)
@@ -112,7 +112,7 @@ def bank_of_vector(vector: Sequence[float]) -> Bank:
     return _bank(axes, reference, sigma)
 
 
-def _bank(sensor: Sensor, reference: Sensor, sigma: float) -> Bank:
+def _bank(sensor: Instrument, reference: Instrument, sigma: float) -> Bank:
     fy, fx = np.fft.fftfreq(GRID)[:, None], np.fft.fftfreq(GRID)[None, :]
     blur, target = sensor_mtf(fx, fy, sensor), sensor_mtf(fx, fy, reference)
     r_squared = (fx**2 + fy**2) / NYQUIST**2
@@ -137,7 +137,7 @@ def in_places(kernels: NDArray[np.float64], scale: int) -> NDArray[np.float64]:
     return found.reshape(len(kernels) * scale**2, scale**2, 2 * reach + 1, 2 * reach + 1)
 
 
-def noise_over_full_scale(sensor: Sensor) -> float:
+def noise_over_full_scale(sensor: Instrument) -> float:
     """Standard deviation of noise at a quarter of full scale, that of rounding counted, over full scale."""
     full_scale = sensor.max_dn / sensor.gain_dn_per_radiance
     rounding = 1 / (12 * sensor.gain_dn_per_radiance**2)

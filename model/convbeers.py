@@ -29,7 +29,7 @@ from beers_deploy.model.bank import FILTERS, LARGEST, SIDE_PX, Bank, bank_of_vec
 from beers_deploy.model.family import sensor_vector
 from beers_deploy.model.io.tensors import Weights, read_weights, write_weights
 from beers_deploy.model.variants import BANK_PLANES, SENSOR_VALUES, Variant
-from beers_deploy.profiles.sensor import Sensor
+from beers_deploy.profiles.sensor import Instrument
 
 
 def conv3x3(inputs: int, outputs: int) -> nn.Conv2d:
@@ -177,7 +177,7 @@ def initialise(network: Network, generator: torch.Generator) -> None:
                     module.bias.zero_()
 
 
-def vector_tensor(sensor: Sensor) -> Tensor:
+def vector_tensor(sensor: Instrument) -> Tensor:
     """The sensor vector (4,) float32, clamped to the ranges."""
     return torch.tensor(sensor_vector(sensor).values)
 

@@ -27,7 +27,7 @@ from beers_deploy.model.simulator.plan import TOLERANCE_DN, make_plan
 from beers_deploy.model.simulator.procedural import procedural_scene
 from beers_deploy.model.simulator.sampling import Scene, read_scene, resample
 from beers_deploy.profiles.errors import ImageError, OptionError
-from beers_deploy.profiles.sensor import SensorProfile, require_same_units
+from beers_deploy.profiles.sensor import Sensor, require_same_units
 from beers_deploy.profiles.toml import parse_json
 
 DRAWN_SIDE_PX = 3000
@@ -40,8 +40,8 @@ class DatasetRecipe:
     """All that decides a dataset's pixels."""
 
     scenes: tuple[Path | None, ...]  # None: a drawn scene
-    degraded: SensorProfile
-    reference: SensorProfile
+    degraded: Sensor
+    reference: Sensor
     oversampling: int
     patch_px: int | None  # None: each scene whole
     radiance_scale: float = 1.0

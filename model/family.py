@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from beers_deploy.profiles.effects import Smear
-from beers_deploy.profiles.sensor import Sensor
+from beers_deploy.profiles.sensor import Instrument
 
 RANGES: Mapping[str, tuple[float, float]] = {
     "mtf_across": (0.015, 0.15),
@@ -51,7 +51,7 @@ class SensorVector:
     outside: tuple[str, ...]
 
 
-def sensor_values(sensor: Sensor) -> dict[str, float]:
+def sensor_values(sensor: Instrument) -> dict[str, float]:
     """The four values of `RANGES`, smear and rounding noise counted."""
     full_scale = sensor.max_dn / sensor.gain_dn_per_radiance
     rounding = 1 / (12 * sensor.gain_dn_per_radiance**2)
@@ -63,7 +63,7 @@ def sensor_values(sensor: Sensor) -> dict[str, float]:
     return dict(zip(RANGES, (across, along * kept, *sigmas), strict=True))
 
 
-def sensor_vector(sensor: Sensor) -> SensorVector:
+def sensor_vector(sensor: Instrument) -> SensorVector:
     """The sensor vector, clamped to the ranges."""
     values, entries, outside = sensor_values(sensor), list[float](), list[str]()
     for (name, value), (low, high) in zip(values.items(), RANGES.values(), strict=True):
@@ -91,10 +91,10 @@ class SensorFamily:
         snr_bright: at 1/4 of full scale; at 1/16 all that physics allows for it.
     """
 
-    like: Sensor
+    like: Instrument
     snr_bright: tuple[float, float] = SNR_BRIGHT
 
-    def draw(self, generator: np.random.Generator) -> Sensor:
+    def draw(self, generator: np.random.Generator) -> Instrument:
         """One sensor. The MTF along the track is more often near that across than far below it."""
         mtf = _log_uniform(generator, *RANGES["mtf_across"])
         # The square draws more sensors with axes that are nearly alike, as real ones have.
@@ -105,7 +105,7 @@ class SensorFamily:
         dark = sigma * _log_uniform(generator, 0.5, 1.0)
         alpha = max(sigma**2 - dark**2, 0.0) / (full_scale * 3 / 16)
         beta = max(dark**2 - alpha * full_scale / 16, 0.0)
-        return Sensor(mtf, alpha, beta, self.like.gain_dn_per_radiance, self.like.bits, {}, along, full_scale / 4)
+        return Instrument(mtf, alpha, beta, self.like.gain_dn_per_radiance, self.like.bits, {}, along, full_scale / 4)
 
 
 def _log_uniform(generator: np.random.Generator, low: float, high: float) -> float:

@@ -8,7 +8,7 @@ from typing import Any
 from beers_deploy.model.io.images import site_of
 from beers_deploy.model.shipped import SENSOR
 from beers_deploy.profiles.errors import OptionError
-from beers_deploy.profiles.sensor import SensorProfile, same_instrument
+from beers_deploy.profiles.sensor import Sensor, same_instrument
 from beers_deploy.profiles.sensor_file import load_sensor, reference_beside, sensor_from_json
 from beers_deploy.profiles.toml import read_json
 
@@ -23,8 +23,8 @@ class PairsRecipe:
         scenes: file names in their order; None for a drawn scene.
     """
 
-    degraded: SensorProfile
-    reference: SensorProfile
+    degraded: Sensor
+    reference: Sensor
     scenes: tuple[str | None, ...]
 
     def site(self, stem: str) -> str:
@@ -61,7 +61,7 @@ def read_pairs_recipe(folder: Path) -> PairsRecipe | None:
 
 def profiles_for(
     sensor: str | None, reference: str | None, recipe: PairsRecipe | None, say: Callable[[str], None]
-) -> tuple[SensorProfile, SensorProfile]:
+) -> tuple[Sensor, Sensor]:
     """The profiles of degraded and reference images: the recipe's where there is one, else those named.
 
     Raises:
@@ -77,7 +77,7 @@ def profiles_for(
     return recipe.degraded, recipe.reference
 
 
-def _require_made_by(option: str, named: SensorProfile | None, made: SensorProfile) -> None:
+def _require_made_by(option: str, named: Sensor | None, made: Sensor) -> None:
     if named is not None and not same_instrument(named, made):
         expected = f"the sensor that made the pairs, {made.name} with the numbers in recipe.json"
         raise OptionError(option, expected=expected, got=f"{named.name} with other numbers", remedy="leave it out")

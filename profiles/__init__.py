@@ -10,17 +10,17 @@
 from beers_deploy.profiles.errors import BeersError
 from beers_deploy.profiles.figures import Figure, Row
 from beers_deploy.profiles.scene_call import SceneCall, load_scene_call, scene_names
-from beers_deploy.profiles.sensor import Sensor, SensorProfile
+from beers_deploy.profiles.sensor import Instrument, Sensor
 from beers_deploy.profiles.sensor_file import load_sensor, sensor_names
 from beers_deploy.profiles.target import TargetProfile, load_target, target_names
 
 __all__ = [
     "BeersError",
     "Figure",
+    "Instrument",
     "Row",
     "SceneCall",
     "Sensor",
-    "SensorProfile",
     "TargetProfile",
     "load_scene_call",
     "load_sensor",

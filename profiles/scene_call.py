@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 from beers_deploy.profiles.constant import Constant, check_keys, read_constant
 from beers_deploy.profiles.effects import TABLES, Table, read_effect
 from beers_deploy.profiles.errors import OptionError, ProfileError
-from beers_deploy.profiles.sensor import SensorProfile
+from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.profiles.toml import HERE, read_toml, shipped_names
 
 
@@ -58,8 +58,8 @@ def typical_effects() -> dict[str, Table]:
 
 
 def calling_for(
-    profile: SensorProfile, scene: SceneCall | None, add: Collection[str] = (), forbid: Collection[str] = ()
-) -> SensorProfile:
+    profile: Sensor, scene: SceneCall | None, add: Collection[str] = (), forbid: Collection[str] = ()
+) -> Sensor:
     """The profile with a scene's effects and `add`, without `forbid`; stated values win over typical ones.
 
     Raises:
@@ -77,7 +77,7 @@ def calling_for(
 
 
 def origins(
-    profile: SensorProfile, scene: SceneCall | None, add: Collection[str] = (), forbid: Collection[str] = ()
+    profile: Sensor, scene: SceneCall | None, add: Collection[str] = (), forbid: Collection[str] = ()
 ) -> dict[str, str]:
     """Of each effect of `calling_for`'s profile where it comes from; of one that it lost, who leaves it out."""
     found = dict.fromkeys(add, "--with")  # what is stated wins over it

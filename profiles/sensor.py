@@ -1,6 +1,6 @@
 """Sensor profiles: the grid, the MTF, the noise and the digitiser of one instrument.
 
-A profile may state ranges (a family of sensors); `SensorProfile.draw` picks one physical `Sensor` from it.
+A profile may state ranges (a family of sensors); `Sensor.draw` picks one physical `Instrument` from it.
 """
 
 import math
@@ -28,7 +28,7 @@ ROUNDING = 1e-14
 
 
 @dataclass(frozen=True)
-class Sensor:
+class Instrument:
     """One instrument, every number settled.
 
     The noise variance is alpha * L + beta, L in W/m2/sr/um (paper, section 3.3, signal-dependent noise).
@@ -94,7 +94,7 @@ class Sensor:
         offset = self.effects.get(OFFSET)
         return offset.offset_dn if isinstance(offset, Offset) else 0.0
 
-    def in_units_of(self, other: "Sensor") -> "Sensor":
+    def in_units_of(self, other: "Instrument") -> "Instrument":
         """This sensor's blur and noise in the digital numbers of `other`: its gain, bits and offset."""
         effects = {name: effect for name, effect in self.effects.items() if name != OFFSET}
         effects |= {name: effect for name, effect in other.effects.items() if name == OFFSET}
@@ -106,7 +106,7 @@ class Sensor:
 
 
 @dataclass(frozen=True)
-class SensorProfile:
+class Sensor:
     """What one TOML file under `profiles/sensors/` states, each constant with its source.
 
     Its noise is stated by two SNRs, at `radiance_0` and `radiance_1`, or by `alpha` and `beta`. Its blur is that of a
@@ -136,7 +136,7 @@ class SensorProfile:
         offset = self.effects[OFFSET]["offset_dn"].low if OFFSET in self.effects else 0.0
         return self.gain_dn_per_radiance.low, self.bits.low, offset
 
-    def in_units_of(self, other: "SensorProfile") -> "SensorProfile":
+    def in_units_of(self, other: "Sensor") -> "Sensor":
         """This profile with the gain, bits and offset of `other`; itself where they are the same.
 
         Two acquisitions of one scene compare, pixel by pixel, only where a digital number means the same in both.
@@ -147,11 +147,11 @@ class SensorProfile:
         effects = {n: both[n] for n in EFFECT_TABLES if n in (other.effects if n == OFFSET else self.effects)}
         return replace(self, gain_dn_per_radiance=other.gain_dn_per_radiance, bits=other.bits, effects=effects)
 
-    def draw(self, generator: np.random.Generator) -> Sensor:
+    def draw(self, generator: np.random.Generator) -> Instrument:
         """Pick one sensor from the ranges: MTF uniform, SNR pair uniform over the physically valid pairs."""
         return self.draw_counted(generator)[0]
 
-    def draw_counted(self, generator: np.random.Generator) -> tuple[Sensor, int]:
+    def draw_counted(self, generator: np.random.Generator) -> tuple[Instrument, int]:
         """As `draw`, with the number of SNR pairs that were rejected as impossible."""
         mtf_nyquist = _uniform(generator, self.mtf_nyquist)
         (alpha, beta), rejected = self._draw_noise(generator)
@@ -172,7 +172,7 @@ class SensorProfile:
                 return (alpha, beta), rejected
         raise self.impossible_snr()
 
-    def nominal(self) -> Sensor:
+    def nominal(self) -> Instrument:
         """The middle of every range (the SNR at radiance_0 moved to the nearest physical value)."""
         alpha, beta = self._middle_noise()
         effects = {name: middle_effect(name, table) for name, table in self.effects.items()}
@@ -200,9 +200,9 @@ class SensorProfile:
 
     def _sensor(
         self, mtf: float, alpha: float, beta: float, effects: Mapping[str, Effect], mtf_along: float | None
-    ) -> Sensor:
+    ) -> Instrument:
         gain, bits, bright = self.gain_dn_per_radiance.low, int(self.bits.low), self.radiance_1.low
-        return Sensor(mtf, alpha, beta, gain, bits, effects, mtf_along, bright, self.response)
+        return Instrument(mtf, alpha, beta, gain, bits, effects, mtf_along, bright, self.response)
 
     def impossible_snr(self) -> ProfileError:
         """The error of SNRs that no alpha and beta can have, with the range that the first one must lie in."""
@@ -217,7 +217,7 @@ class SensorProfile:
         )
 
 
-def require_same_units(degraded: SensorProfile, reference: SensorProfile) -> None:
+def require_same_units(degraded: Sensor, reference: Sensor) -> None:
     """Refuse a reference that another digitiser made: its images differ from the degraded ones by a factor.
 
     Raises:
@@ -232,7 +232,7 @@ def require_same_units(degraded: SensorProfile, reference: SensorProfile) -> Non
         )
 
 
-def describe_units(profile: SensorProfile) -> str:
+def describe_units(profile: Sensor) -> str:
     """What a digital number of the profile means, in words."""
     gain, bits, offset_dn = profile.units
     return f"{gain:g} DN per W/m2/sr/um, {bits:g} bits" + (f", {offset_dn:g} DN of offset" if offset_dn else "")
@@ -305,7 +305,7 @@ TABLES: dict[str, tuple[Way, ...]] = {
 """Every table that a profile has, and the ways to fill it: exactly one of them."""
 
 RESPONSE = ("frequency", "across", "along", "psf", "psf_samples_per_px")
-"""Keys that make up the response; each other key of `TABLES` is a constant, and a field of `SensorProfile`."""
+"""Keys that make up the response; each other key of `TABLES` is a constant, and a field of `Sensor`."""
 
 
 def table_keys(table: str) -> tuple[str, ...]:
@@ -318,12 +318,12 @@ def constant_keys(table: str) -> tuple[str, ...]:
     return tuple(key for key in table_keys(table) if key not in RESPONSE)
 
 
-def same_instrument(one: SensorProfile, other: SensorProfile) -> bool:
+def same_instrument(one: Sensor, other: Sensor) -> bool:
     """Whether two profiles state the same numbers, whatever they are called and wherever the numbers come from."""
     return numbers_of(one) == numbers_of(other)
 
 
-def numbers_of(profile: SensorProfile) -> dict[str, object]:
+def numbers_of(profile: Sensor) -> dict[str, object]:
     """The low and high end of each constant by name: what of a profile decides what its images are like."""
     keys = [key for table in TABLES for key in constant_keys(table)]
     constants: dict[str, Constant | None] = {key: getattr(profile, key) for key in keys}

@@ -15,7 +15,7 @@ from beers_deploy.profiles.sensor import (
     OFFSET,
     RESPONSE,
     TABLES,
-    SensorProfile,
+    Sensor,
     constant_keys,
     describe_units,
     mtf_limit,
@@ -28,7 +28,7 @@ REFERENCE = "pleiades-reference"
 """The shipped profile of the image that restoration aims at, unless another is named."""
 
 
-def reference_for(degraded: SensorProfile, name: str = REFERENCE) -> SensorProfile:
+def reference_for(degraded: Sensor, name: str = REFERENCE) -> Sensor:
     """The profile called `name` in the digital numbers of `degraded`: what a restoration of its images is held to.
 
     Raises:
@@ -46,7 +46,7 @@ BLIND, BLIND_PROFILE = "blind", "pleiades-variable"
 """The name of a sensor that is not known, and the profile in whose ranges it then counts to be."""
 
 
-def load_sensor(name: str) -> SensorProfile:
+def load_sensor(name: str) -> Sensor:
     """Read a shipped sensor profile by name, or the user's own by the path of its .toml file; `blind` is one too.
 
     Raises:
@@ -57,7 +57,7 @@ def load_sensor(name: str) -> SensorProfile:
     return replace(found, name=BLIND) if name == BLIND else found
 
 
-def sensor_from_json(label: str, raw: Mapping[str, Any]) -> SensorProfile:
+def sensor_from_json(label: str, raw: Mapping[str, Any]) -> Sensor:
     """A profile from the plain values of its fields, as `dataclasses.asdict` and JSON leave them.
 
     Raises:
@@ -77,7 +77,7 @@ def sensor_from_json(label: str, raw: Mapping[str, Any]) -> SensorProfile:
     return replace(found, name=str(raw["name"]))
 
 
-def read_sensor(label: str, raw: Mapping[str, Any], folder: Path = Path()) -> SensorProfile:
+def read_sensor(label: str, raw: Mapping[str, Any], folder: Path = Path()) -> Sensor:
     """A profile from the tables of its file.
 
     Args:
@@ -107,7 +107,7 @@ def read_sensor(label: str, raw: Mapping[str, Any], folder: Path = Path()) -> Se
     name, description = label.removesuffix(".toml"), str(raw["description"])
     # Two radiances that only name where noise is spoken of, unless SNRs are stated there.
     values = {**_default_radiances(constants), **constants, **blur}
-    profile = SensorProfile(name=name, description=description, effects=effects, **values)
+    profile = Sensor(name=name, description=description, effects=effects, **values)
     _check_budget(label, profile)
     _check_snr(profile)
     return profile
@@ -213,7 +213,7 @@ def _default_radiances(constants: Mapping[str, Constant]) -> dict[str, Constant]
     return {"radiance_0": Constant(bright.low / 4, "inferred", "a quarter of radiance_1"), "radiance_1": bright}
 
 
-def _check_budget(label: str, profile: SensorProfile) -> None:
+def _check_budget(label: str, profile: Sensor) -> None:
     """The anti-alias filter alone must leave the MTF that the profile states."""
     if "antialias" not in profile.effects:
         return
@@ -234,7 +234,7 @@ def _check_budget(label: str, profile: SensorProfile) -> None:
             )
 
 
-def _check_snr(profile: SensorProfile) -> None:
+def _check_snr(profile: Sensor) -> None:
     """Some pair in the ranges must be physical: the bounds grow with snr_1, so its two ends decide."""
     if profile.snr_0 is None or profile.snr_1 is None:
         return
@@ -246,7 +246,7 @@ def _check_snr(profile: SensorProfile) -> None:
         raise profile.impossible_snr()
 
 
-def reference_beside(degraded: SensorProfile, name: str | None, say: Callable[[str], None]) -> SensorProfile:
+def reference_beside(degraded: Sensor, name: str | None, say: Callable[[str], None]) -> Sensor:
     """The reference profile that a user named, or the default one, in the digital numbers of `degraded`.
 
     One that was named, and states other ones, is converted in sight: `say` is told.

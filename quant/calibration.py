@@ -24,7 +24,7 @@ from beers_deploy.model.simulator.sampling import Scene, scene_spectrum
 from beers_deploy.model.training.patches import PatchRecipe, turn
 from beers_deploy.profiles import load_sensor
 from beers_deploy.profiles.errors import ImageError
-from beers_deploy.profiles.sensor import Sensor, SensorProfile
+from beers_deploy.profiles.sensor import Instrument, Sensor
 from beers_deploy.profiles.sensor_file import reference_for
 from beers_deploy.quant.core import CANDIDATES, squared_errors, unclipped_frac_bits
 from beers_deploy.quant.ends import ONE_CHANNEL, Ends
@@ -84,8 +84,8 @@ class View:
     """One patch: the ground, and the two sensors that see it."""
 
     ground: Ground
-    degraded: Sensor
-    reference: Sensor
+    degraded: Instrument
+    reference: Instrument
 
 
 def draw_views(
@@ -117,7 +117,7 @@ def draw_views(
     ]
 
 
-def _blurred_as(sensor: Sensor, other: Sensor) -> Sensor:
+def _blurred_as(sensor: Instrument, other: Instrument) -> Instrument:
     across, along = other.mtf_nyquist, other.mtf_nyquist_along
     return replace(sensor, mtf_nyquist=across, mtf_nyquist_along=along, response=other.response)
 
@@ -211,8 +211,8 @@ class Patches:
 
 def draw_patches(
     scenes: list[Scene],
-    degraded: SensorProfile,
-    reference: SensorProfile,
+    degraded: Sensor,
+    reference: Sensor,
     count: int,
     seed: int,
     patch_px: int = PATCH_PX,
@@ -249,7 +249,7 @@ def draw_patches(
     return Patches(views, Remade(pair, count), Remade(alone, count))
 
 
-def _simulate(ground: Ground, sensors: dict[str, Sensor], draw: Draw) -> list[np.ndarray]:
+def _simulate(ground: Ground, sensors: dict[str, Instrument], draw: Draw) -> list[np.ndarray]:
     """What each sensor, by its role, makes of the same ground: patches (1, 1, P, P)."""
     radiance = ground.radiance
     spectrum, width = scene_spectrum(radiance), radiance.shape[-1]
@@ -339,15 +339,15 @@ class Calibration:
         return load_scenes(self.images, self._reference.nominal(), self.seed)
 
     @cached_property
-    def _degraded(self) -> SensorProfile:
+    def _degraded(self) -> Sensor:
         return load_sensor(self.sensor)
 
     @cached_property
-    def _reference(self) -> SensorProfile:
+    def _reference(self) -> Sensor:
         return reference_for(self._degraded)
 
 
-def unseen_patches(degraded: SensorProfile, images: Path | None, patches: int, seed: int) -> Patches:
+def unseen_patches(degraded: Sensor, images: Path | None, patches: int, seed: int) -> Patches:
     """Patches of 128 x 128 that calibration with the same seed does not draw.
 
     Args:

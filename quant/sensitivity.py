@@ -16,7 +16,7 @@ from onnx import TensorProto, helper
 
 from beers_deploy.model.io.images import MAX_DN
 from beers_deploy.profiles.figures import Figure, Row, measured, unavailable
-from beers_deploy.profiles.sensor import Sensor
+from beers_deploy.profiles.sensor import Instrument
 from beers_deploy.quant.calibration import Patches
 from beers_deploy.quant.core import INT8_MAX, INT8_MIN, IntConv, IntCore
 from beers_deploy.quant.encodings import host_model
@@ -248,7 +248,7 @@ def worst_row(number: int, patches: Patches, spread: Spread) -> Row:
     return Row("worst patches", f"patch {number}", figures, words)
 
 
-def _mtf(sensor: Sensor) -> str:
+def _mtf(sensor: Instrument) -> str:
     """One value, or two where the sensor's axes differ: what the profile gave to this patch, measured nowhere."""
     across, along = (f"{100 * value:.3g} %" for value in sensor.mtf_axes)
     return across if across == along else f"{across} across the track, {along} along it"

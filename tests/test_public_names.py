@@ -9,7 +9,7 @@ import pytest
 
 SURFACE = {
     "beers_deploy.profiles": (
-        "BeersError Figure Row SceneCall Sensor SensorProfile TargetProfile load_scene_call load_sensor "
+        "BeersError Figure Instrument Row SceneCall Sensor TargetProfile load_scene_call load_sensor "
         "load_target scene_names sensor_names target_names"
     ),
     "beers_deploy.model.io": (

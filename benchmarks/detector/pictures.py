@@ -9,7 +9,7 @@ import torch
 from beers_deploy.model.io.pictures import stretch_of
 from beers_deploy.model.simulator.acquire import acquire_padded
 from beers_deploy.model.simulator.detector import Draw
-from beers_deploy.profiles.sensor import Sensor
+from beers_deploy.profiles.sensor import Instrument
 from beers_deploy.studies.detection.scenes import synthetic_scene
 
 STREAM = 0x64726177
@@ -36,7 +36,7 @@ def picture_of(rgb: np.ndarray, corners: np.ndarray, classes: np.ndarray) -> Pic
     return Picture(np.rint(255 * rgb).astype(np.uint8), corners, classes)
 
 
-def drawn_picture(sensor: Sensor, oversampling: int, side_px: int, seed: int, number: int) -> Picture:
+def drawn_picture(sensor: Instrument, oversampling: int, side_px: int, seed: int, number: int) -> Picture:
     """A synthetic scene of its own number, seen by one sensor: `side_px` target pixels a side.
 
     Args:
@@ -54,6 +54,6 @@ def drawn_picture(sensor: Sensor, oversampling: int, side_px: int, seed: int, nu
     return picture_of(rgb, truth.corners / oversampling, truth.classes)
 
 
-def drawn_pictures(sensor: Sensor, oversampling: int, side_px: int, seed: int, count: int) -> Iterator[Picture]:
+def drawn_pictures(sensor: Instrument, oversampling: int, side_px: int, seed: int, count: int) -> Iterator[Picture]:
     """That many drawn pictures, one after the other: a third of a second each."""
     return (drawn_picture(sensor, oversampling, side_px, seed, number) for number in range(count))

@@ -16,7 +16,7 @@ from beers_deploy.model.simulator.acquire import MARGIN_PX, simulate_pair
 from beers_deploy.model.simulator.detector import Draw
 from beers_deploy.model.simulator.procedural import procedural_scene
 from beers_deploy.model.traditional.pipeline import Chain, restore_traditional
-from beers_deploy.profiles import SensorProfile
+from beers_deploy.profiles import Sensor
 from beers_deploy.profiles.figures import Figure, Row, measured, predicted
 
 CROP_PX, CROPS = 256, 3
@@ -55,7 +55,7 @@ class ChainTime:
         return Row(TABLE, "traditional pipeline on this CPU", figures)
 
 
-def measure_chain(dn: np.ndarray, degraded: SensorProfile, reference: SensorProfile) -> ChainTime:
+def measure_chain(dn: np.ndarray, degraded: Sensor, reference: Sensor) -> ChainTime:
     """Time the pipeline on crops of (H, W) digital numbers, after one small run for warm-up."""
     chain = Chain(degraded.nominal(), reference.nominal())
     crops = [torch.from_numpy(np.ascontiguousarray(crop, dtype=np.float32)) for crop in _crops(dn)]
@@ -73,7 +73,7 @@ def _time_s(dn: torch.Tensor, chain: Chain) -> float:
     return time.perf_counter() - start_s
 
 
-def drawn_acquisition(swath: Swath, degraded: SensorProfile, reference: SensorProfile, seed: int = 0) -> np.ndarray:
+def drawn_acquisition(swath: Swath, degraded: Sensor, reference: Sensor, seed: int = 0) -> np.ndarray:
     """Digital numbers of a drawn scene, as large as the swath but no larger than the crops need."""
     ratio = int(degraded.oversampling.low)
     sides = min(swath.height_px, CROP_PX), min(swath.width_px, CROPS * CROP_PX)

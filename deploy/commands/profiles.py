@@ -7,7 +7,7 @@ import typer
 
 from beers_deploy.commands.shared import say
 from beers_deploy.model.shipped import SENSOR
-from beers_deploy.profiles import SensorProfile, load_sensor, load_target, sensor_names, target_names
+from beers_deploy.profiles import Sensor, load_sensor, load_target, sensor_names, target_names
 from beers_deploy.profiles.constant import Constant, Words
 from beers_deploy.profiles.effects import Table
 from beers_deploy.profiles.errors import OptionError
@@ -85,7 +85,7 @@ def _shown(name: str) -> tuple[str, list[Row]]:
     )
 
 
-def _sensor_rows(sensor: SensorProfile) -> list[Row]:
+def _sensor_rows(sensor: Sensor) -> list[Row]:
     rows: list[Row] = []
     for table in TABLES:
         given = [(f"{table}.{key}", getattr(sensor, key)) for key in constant_keys(table)]
@@ -94,7 +94,7 @@ def _sensor_rows(sensor: SensorProfile) -> list[Row]:
     return rows + _effects(sensor.effects)
 
 
-def _response(sensor: SensorProfile) -> list[Row]:
+def _response(sensor: Sensor) -> list[Row]:
     """A table's numbers, or what a point-spread function is made of."""
     response, said = sensor.response, (sensor.mtf_nyquist.status, sensor.mtf_nyquist.source)
     if response is None:

@@ -21,7 +21,7 @@ from beers_deploy.model.progress import steps
 from beers_deploy.model.traditional.pipeline import Chain, restore_strips
 from beers_deploy.profiles.errors import ImageError
 from beers_deploy.profiles.figures import Row, measured
-from beers_deploy.profiles.sensor import SensorProfile
+from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.restoration.engine import RestoredRow, as_stored, checked_strip
 from beers_deploy.restoration.options import Compression
 from beers_deploy.restoration.output import (
@@ -57,8 +57,8 @@ class Request:
         trust_index: whether a VRT or DIMAP may name tiles outside its folder, at URLs too.
     """
 
-    sensor: SensorProfile
-    reference: SensorProfile
+    sensor: Sensor
+    reference: Sensor
     full_scale: float | None = None
     compression: Compression = Compression.zlib
     memory_bytes: int | None = None

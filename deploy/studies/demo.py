@@ -38,7 +38,7 @@ from beers_deploy.model.simulator.procedural import procedural_scene
 from beers_deploy.model.simulator.sampling import read_scene
 from beers_deploy.model.traditional.pipeline import Chain, restore_traditional
 from beers_deploy.networks import Conditioned, warn_outside
-from beers_deploy.profiles import SensorProfile, load_sensor
+from beers_deploy.profiles import Sensor, load_sensor
 from beers_deploy.profiles.errors import OptionError
 from beers_deploy.profiles.figures import Row, measured
 from beers_deploy.profiles.sensor_file import reference_for
@@ -74,7 +74,7 @@ NOTES = (
 )
 
 
-Sensors = tuple[SensorProfile, SensorProfile]
+Sensors = tuple[Sensor, Sensor]
 """The sensor that acquired an image and the one to imitate."""
 
 
@@ -160,7 +160,7 @@ def read_input(
     return pair.degraded.numpy(), pair
 
 
-def write_networks(out: Path, sensor: SensorProfile, say: Log) -> None:
+def write_networks(out: Path, sensor: Sensor, say: Log) -> None:
     """Write the shipped network, told the sensor: in float32, in INT8, and the INT8 core for the board."""
     shipped = Conditioned(VARIANT, shipped_weights(VARIANT))
     warn_outside(sensor, say)

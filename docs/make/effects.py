@@ -20,7 +20,7 @@ from beers_deploy.model.simulator.procedural import procedural_scene
 from beers_deploy.profiles import load_sensor
 from beers_deploy.profiles.effects import TABLES, Effect, middle_effect
 from beers_deploy.profiles.scene_call import SceneCall, calling_for, load_scene_call, scene_names, typical_effects
-from beers_deploy.profiles.sensor import Sensor
+from beers_deploy.profiles.sensor import Instrument
 
 DOCS = Path(__file__).parents[1]
 PAGE, PICTURE = DOCS / "explanation" / "effects.md", DOCS / "assets" / "effects.png"
@@ -76,7 +76,7 @@ def main() -> None:
     sys.stdout.write(f"wrote {PICTURE} and {PAGE}\n")
 
 
-def plain() -> Sensor:
+def plain() -> Instrument:
     """A sensor with no optional effect."""
     return load_sensor("pleiades-degraded").nominal()
 

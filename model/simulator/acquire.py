@@ -13,7 +13,7 @@ from beers_deploy.model.simulator.mtf import sensor_transfer
 from beers_deploy.model.simulator.plan import Plan, SceneStats, scene_stats
 from beers_deploy.model.simulator.sampling import crop_divisible, sample, scene_spectrum
 from beers_deploy.profiles.errors import ImageError
-from beers_deploy.profiles.sensor import Sensor
+from beers_deploy.profiles.sensor import Instrument
 
 MARGIN_PX = 32
 """Target pixels cropped on each side: the FFT wraps around, and the PSF's tail is long (10.8 DN at 32)."""
@@ -58,7 +58,7 @@ def prepare_scene(radiance: Tensor, oversampling: int) -> PreparedScene:
 
 def simulate_planned(
     scene: PreparedScene,
-    sensor: Sensor,
+    sensor: Instrument,
     draw: Draw,
     plan: Plan,
     role: str = "degraded",
@@ -80,13 +80,18 @@ def simulate_planned(
     return detect(crop_margin(pixels, margin_px), sensor, draw, role, plan.skipped)
 
 
-def without(sensor: Sensor, skipped: Collection[str]) -> Sensor:
+def without(sensor: Instrument, skipped: Collection[str]) -> Instrument:
     """The sensor without some of its effects."""
     return replace(sensor, effects={k: v for k, v in sensor.effects.items() if k not in skipped})
 
 
 def simulate_pair(
-    radiance: Tensor, degraded: Sensor, reference: Sensor, oversampling: int, draw: Draw, margin_px: int = MARGIN_PX
+    radiance: Tensor,
+    degraded: Instrument,
+    reference: Instrument,
+    oversampling: int,
+    draw: Draw,
+    margin_px: int = MARGIN_PX,
 ) -> Pair:
     """Acquire a scene (..., H, W) in W/m2/sr/um twice, each acquisition with its own noise.
 
@@ -109,7 +114,7 @@ def simulate_pair(
 def acquire(
     spectrum: Tensor,
     width: int,
-    sensor: Sensor,
+    sensor: Instrument,
     oversampling: int,
     draw: Draw,
     role: str,
@@ -136,7 +141,7 @@ def acquire(
 
 
 def acquire_padded(
-    radiance: Tensor, sensor: Sensor, oversampling: int, draw: Draw, role: str, skip: Collection[str] = ()
+    radiance: Tensor, sensor: Instrument, oversampling: int, draw: Draw, role: str, skip: Collection[str] = ()
 ) -> Tensor:
     """Acquire a scene (H, W) whole: what the margin would cut off is a mirror image around it.
 

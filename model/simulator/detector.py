@@ -15,13 +15,13 @@ import torch
 from torch import Tensor
 
 from beers_deploy.profiles.effects import Defects, Dsnu, Effect, FullWell, Haze, Offset, Prnu, Striping
-from beers_deploy.profiles.sensor import Sensor
+from beers_deploy.profiles.sensor import Instrument
 
 NOISE_LIMIT = 6.0
 """Draws are clipped here (two in a billion), so that the effect of noise has a bound."""
 
 
-def noise_sigma(radiance: Tensor, sensor: Sensor) -> Tensor:
+def noise_sigma(radiance: Tensor, sensor: Instrument) -> Tensor:
     """sigma(L) = sqrt(alpha L + beta), in W/m2/sr/um, for radiances of any shape (paper, section 3.3).
 
     Ringing can push L below zero, where there is no light to be noisy about: L counts as 0 there. A negative
@@ -30,7 +30,7 @@ def noise_sigma(radiance: Tensor, sensor: Sensor) -> Tensor:
     return (sensor.alpha * radiance.clamp(min=0) + sensor.beta).clamp(min=0).sqrt()
 
 
-def add_noise(radiance: Tensor, sensor: Sensor, generator: np.random.Generator) -> Tensor:
+def add_noise(radiance: Tensor, sensor: Instrument, generator: np.random.Generator) -> Tensor:
     """L + sigma(L) * n, n standard normal and independent per pixel; any shape, which is kept, as is the device."""
     normal = generator.standard_normal(tuple(radiance.shape), dtype=np.float32)
     np.clip(normal, -NOISE_LIMIT, NOISE_LIMIT, out=normal)
@@ -110,7 +110,7 @@ def add_haze(radiance: Tensor, haze: Haze) -> Tensor:
     return radiance * haze.transmittance + haze.path_radiance
 
 
-def digitise(dn: Tensor, sensor: Sensor) -> Tensor:
+def digitise(dn: Tensor, sensor: Instrument) -> Tensor:
     """Round digital numbers, of any shape, to whole ones and clip them to the converter's range.
 
     Rounding adds 1/12 DN^2 of variance. Clipping comes before any cast, so that nothing wraps around.
@@ -118,12 +118,12 @@ def digitise(dn: Tensor, sensor: Sensor) -> Tensor:
     return dn.round().clamp(0, sensor.max_dn)
 
 
-def to_radiance(dn: Tensor, sensor: Sensor) -> Tensor:
+def to_radiance(dn: Tensor, sensor: Instrument) -> Tensor:
     """Radiance in W/m2/sr/um of digital numbers of any shape, the offset taken off."""
     return (dn - sensor.offset_dn) / sensor.gain_dn_per_radiance
 
 
-def to_dn(radiance: Tensor, sensor: Sensor) -> Tensor:
+def to_dn(radiance: Tensor, sensor: Instrument) -> Tensor:
     """Digital numbers of radiances of any shape: `to_radiance` backwards, clipped to the range and not rounded."""
     return (radiance * sensor.gain_dn_per_radiance + sensor.offset_dn).clamp(0, sensor.max_dn)
 
@@ -150,7 +150,7 @@ RADIANCE_EFFECTS = ("veil", "full_well", "prnu")
 DN_EFFECTS = ("dsnu", "striping", "offset", "defects")
 
 
-def detect(signal: Tensor, sensor: Sensor, draw: Draw, role: str, skip: Collection[str] = ()) -> Tensor:
+def detect(signal: Tensor, sensor: Instrument, draw: Draw, role: str, skip: Collection[str] = ()) -> Tensor:
     """Digital numbers of a blurred, sampled signal (..., H, W) in W/m2/sr/um: whole ones, unless told otherwise.
 
     Args:
@@ -176,7 +176,7 @@ def detect(signal: Tensor, sensor: Sensor, draw: Draw, role: str, skip: Collecti
 
 
 def apply_effect(
-    image: Tensor, effect: Effect, sensor: Sensor, generator: Callable[[], np.random.Generator]
+    image: Tensor, effect: Effect, sensor: Instrument, generator: Callable[[], np.random.Generator]
 ) -> Tensor:
     """Apply one effect of the target grid to an image (..., H, W); the generator is made only for those that draw."""
     match effect:

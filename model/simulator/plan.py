@@ -33,7 +33,7 @@ from beers_deploy.profiles.effects import (
     Smear,
     Striping,
 )
-from beers_deploy.profiles.sensor import Sensor, mtf_limit
+from beers_deploy.profiles.sensor import Instrument, mtf_limit
 
 
 @dataclass(frozen=True)
@@ -61,7 +61,7 @@ def scene_stats(radiance: Tensor, oversampling: int) -> SceneStats:
     return SceneStats(low, high, step, height, width, oversampling)
 
 
-def ringing_of(sensor: Sensor, stats: SceneStats) -> float:
+def ringing_of(sensor: Instrument, stats: SceneStats) -> float:
     """Sum of the absolute values of the blur's kernel on the scene's grid: 1 without ringing.
 
     A blurrier sensor is a sharper one followed by a positive kernel of sum 1, which cannot enlarge the sum: so the
@@ -122,7 +122,7 @@ def smear_bound_dn(smear: Smear, stats: SceneStats, ringing: float, gain: float)
     return gain * ringing * min(size * stats.span, moment * stats.step_along)
 
 
-def effect_bound_dn(effect: Effect, sensor: Sensor, low: float, high: float) -> float:
+def effect_bound_dn(effect: Effect, sensor: Instrument, low: float, high: float) -> float:
     """Largest change of any pixel by an effect of the target grid, for a signal between low and high radiance."""
     gain, brightest = sensor.gain_dn_per_radiance, max(abs(low), abs(high))
     match effect:
@@ -144,7 +144,7 @@ def effect_bound_dn(effect: Effect, sensor: Sensor, low: float, high: float) -> 
             return 0.0  # anti-alias and smear: the transfer function has bounds of its own
 
 
-def _defects_bound_dn(defects: Defects, sensor: Sensor, low: float, high: float) -> float:
+def _defects_bound_dn(defects: Defects, sensor: Instrument, low: float, high: float) -> float:
     """A pixel becomes 0 or full scale, whatever it was before: beyond the converter's range too."""
     if defects.dead_per_million + defects.hot_per_million == 0:
         return 0.0
@@ -152,12 +152,12 @@ def _defects_bound_dn(defects: Defects, sensor: Sensor, low: float, high: float)
     return max(max(abs(dn), abs(sensor.max_dn - dn)) for dn in ends)
 
 
-def noise_bound_dn(sensor: Sensor, high: float) -> float:
+def noise_bound_dn(sensor: Instrument, high: float) -> float:
     """Six standard deviations at the brightest pixel."""
     return sensor.gain_dn_per_radiance * NOISE_LIMIT * sensor.noise_sigma(max(high, 0.0))
 
 
-def behind(change_dn: float, sensor: Sensor, names: tuple[str, ...]) -> float:
+def behind(change_dn: float, sensor: Instrument, names: tuple[str, ...]) -> float:
     """What a change of the signal may become through the effects `names` that come after it and are applied.
 
     Spilling adds its share, PRNU its largest gain, and noise changes with the signal under it:
@@ -226,7 +226,7 @@ class Plan:
         return {"tolerance_dn": self.tolerance_dn, "decisions": [asdict(d) for d in self.decisions]}
 
 
-def make_plan(sensor: Sensor, stats: SceneStats, tolerance_dn: float = TOLERANCE_DN) -> Plan:
+def make_plan(sensor: Instrument, stats: SceneStats, tolerance_dn: float = TOLERANCE_DN) -> Plan:
     """Decide for every effect of a sensor on a scene of these statistics."""
     bounds = effect_bounds(sensor, stats)
     spent, hidden = 0.0, set()
@@ -239,7 +239,7 @@ def make_plan(sensor: Sensor, stats: SceneStats, tolerance_dn: float = TOLERANCE
     return Plan(decisions, tolerance_dn)
 
 
-def effect_bounds(sensor: Sensor, stats: SceneStats) -> dict[str, float]:
+def effect_bounds(sensor: Instrument, stats: SceneStats) -> dict[str, float]:
     """Largest change of any pixel by each effect that can be left out, in DN, through all that comes after it."""
     gain, ringing = sensor.gain_dn_per_radiance, ringing_of(sensor, stats)
     low, high = blurred_range(stats, ringing)
@@ -268,7 +268,9 @@ def _after(name: str) -> tuple[str, ...]:
     return ORDER[ORDER.index(name) + 1 :]
 
 
-def _decide(name: str, sensor: Sensor, bounds: dict[str, float], hidden: set[str], tolerance_dn: float) -> Decision:
+def _decide(
+    name: str, sensor: Instrument, bounds: dict[str, float], hidden: set[str], tolerance_dn: float
+) -> Decision:
     cost = COSTS[name]
     if name in ("sampling", "digitising"):
         return Decision(name, "applied", "every sensor has it", None, cost)

@@ -34,7 +34,7 @@ from beers_deploy.model.simulator.drawing import (
     turn,
 )
 from beers_deploy.model.simulator.sampling import Scene, read_scene
-from beers_deploy.profiles.sensor import Sensor
+from beers_deploy.profiles.sensor import Instrument
 
 SCENES, SCENE_SIDE_PX = 3, 2400
 """Drawn where no folder of images is given."""
@@ -193,7 +193,7 @@ def _star(draw: ImageDraw.ImageDraw, x: float, y: float, radius: float, sectors:
         draw.pieslice(around(x, y, radius), start, start + 180 / sectors, fill=ASPHALT)
 
 
-def load_scenes(folder: Path | None, sensor: Sensor, seed: int) -> list[Scene]:
+def load_scenes(folder: Path | None, sensor: Instrument, seed: int) -> list[Scene]:
     """The scenes of a folder of images, or drawn ones, other for every seed."""
     if folder is not None:
         return [read_scene(path, sensor) for path in list_images(folder)]

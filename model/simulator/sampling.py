@@ -12,7 +12,7 @@ from torch import Tensor
 
 from beers_deploy.model.io.images import read_pixels
 from beers_deploy.profiles.errors import ImageError, OptionError
-from beers_deploy.profiles.sensor import Sensor
+from beers_deploy.profiles.sensor import Instrument
 
 
 def scene_spectrum(radiance: Tensor) -> Tensor:
@@ -110,7 +110,7 @@ class Scene:
     radiance: Tensor
 
 
-def read_scene(path: Path, sensor: Sensor) -> Scene:
+def read_scene(path: Path, sensor: Instrument) -> Scene:
     """Read a scene from an image file.
 
     1. 8-bit RGB or mono: sRGB, linearised, the bands averaged (a panchromatic band weighs the visible evenly:

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from beers_deploy.profiles.errors import OptionError
-from beers_deploy.profiles.sensor import Sensor
+from beers_deploy.profiles.sensor import Instrument
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,7 @@ def coloured_by(kernel: Tensor, sigma: float, most_lag_px: int = 6) -> Noise:
     return Noise(sigma * float(energy.sqrt()), autocorrelation / energy)
 
 
-def stabilise(radiance: Tensor, sensor: Sensor) -> Tensor:
+def stabilise(radiance: Tensor, sensor: Instrument) -> Tensor:
     """f(L) = 2 L / (sqrt(alpha L + beta) + sqrt(beta)), which is 2 (sqrt(alpha L + beta) - sqrt(beta)) / alpha.
 
     Written without the difference, that vanishes in float32 for small alpha. f is monotone, with f' = 1 / sigma(L).
@@ -76,7 +76,7 @@ def stabilise(radiance: Tensor, sensor: Sensor) -> Tensor:
     return (2 * radiance / denominator).where(denominator != 0, 0.0)
 
 
-def destabilise(stable: Tensor, sensor: Sensor) -> Tensor:
+def destabilise(stable: Tensor, sensor: Instrument) -> Tensor:
     """L = t sqrt(beta) + alpha t^2 / 4, any shape: the inverse of `stabilise`; t sqrt(beta) below t = 0.
 
     The mean of noisy values t lies below f(mean L), f being concave: see `bias_radiance`.
@@ -85,7 +85,7 @@ def destabilise(stable: Tensor, sensor: Sensor) -> Tensor:
     return stable * math.sqrt(sensor.beta) + sensor.alpha / 4 * stable.clamp(min=0).square()
 
 
-def bias_radiance(sensor: Sensor) -> float:
+def bias_radiance(sensor: Instrument) -> float:
     """What averaging on the stabilised scale loses: alpha / 4, in W/m2/sr/um.
 
     To second order E[f(L + n)] = f(L) + f''(L) var / 2 = f(L) - alpha / (4 sigma(L)), and L moves by sigma(L) times
@@ -94,7 +94,7 @@ def bias_radiance(sensor: Sensor) -> float:
     return sensor.alpha / 4
 
 
-def _check(sensor: Sensor) -> None:
+def _check(sensor: Instrument) -> None:
     if min(sensor.alpha, sensor.beta) < 0 or sensor.alpha == sensor.beta == 0:
         raise OptionError(
             "noise of the sensor",

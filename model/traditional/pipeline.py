@@ -25,7 +25,7 @@ from beers_deploy.model.traditional.nl_bayes import finite_or_missing, nl_bayes_
 from beers_deploy.model.traditional.noise import Noise, bias_radiance, coloured_by, destabilise, stabilise
 from beers_deploy.model.traditional.settings import QUALITIES, Quality
 from beers_deploy.profiles.errors import OptionError
-from beers_deploy.profiles.sensor import Sensor
+from beers_deploy.profiles.sensor import Instrument
 
 WORKING_SIGMA = 12.0
 """Noise level at which NL-Bayes runs: the stabilised image is scaled to it, where the published settings apply.
@@ -47,8 +47,8 @@ class Chain:
         epsilon: regularisation of the MTF compensation; None lets the noise of `degraded` decide.
     """
 
-    degraded: Sensor
-    reference: Sensor
+    degraded: Instrument
+    reference: Instrument
     quality: str = "standard"
     order: Order = "denoise-first"
     epsilon: float | None = None
@@ -105,7 +105,7 @@ def _deconvolve_first(radiance: Iterable[Tensor], height: int, chain: Chain, qua
 
 
 def denoise_radiance(
-    radiance: Iterable[Tensor], height: int, sensor: Sensor, noise: Noise, quality: Quality
+    radiance: Iterable[Tensor], height: int, sensor: Instrument, noise: Noise, quality: Quality
 ) -> Iterator[Tensor]:
     """NL-Bayes on the stabilised scale: strips (any, W) in W/m2/sr/um, of variance alpha L + beta, to the same."""
     scale = noise.sigma
@@ -114,7 +114,7 @@ def denoise_radiance(
         yield destabilise(clean / scale, sensor) + bias_radiance(sensor)
 
 
-def with_rounding_noise(sensor: Sensor) -> Sensor:
+def with_rounding_noise(sensor: Instrument) -> Instrument:
     """The sensor with its converter's 1/12 DN^2 counted in beta: what its digital numbers really carry."""
     return replace(sensor, beta=sensor.beta + 1 / (12 * sensor.gain_dn_per_radiance**2))
 
@@ -126,7 +126,7 @@ def quality_named(name: str) -> Quality:
     return QUALITIES[name]
 
 
-def _blur_text(sensor: Sensor) -> str:
+def _blur_text(sensor: Instrument) -> str:
     across, along = sensor.mtf_axes
     axes = f"{across:.3g}" if across == along else f"{across:.3g} across and {along:.3g} along the track"
     return axes if sensor.response is None else f"{axes} ({sensor.response})"

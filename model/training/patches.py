@@ -21,7 +21,7 @@ from beers_deploy.model.simulator.detector import Draw
 from beers_deploy.model.simulator.sampling import Scene, crop_divisible, scene_spectrum
 from beers_deploy.model.training.workers import Worker
 from beers_deploy.profiles.errors import ImageError
-from beers_deploy.profiles.sensor import Sensor, SensorProfile, require_same_units
+from beers_deploy.profiles.sensor import Instrument, Sensor, require_same_units
 
 
 @dataclass(frozen=True)
@@ -39,8 +39,8 @@ class PatchRecipe:
         family: draws the sensors instead of `degraded`; each patch then comes with the vector of its sensor.
     """
 
-    degraded: SensorProfile
-    reference: SensorProfile
+    degraded: Sensor
+    reference: Sensor
     patch_px: int = 96
     oversamplings: tuple[int, ...] = (2, 3, 4, 5)
     exposures: tuple[float, float] = (0.5, 1.25)
@@ -156,14 +156,14 @@ def transposed(vector: Tensor) -> Tensor:
 
 def _acquire_pair(
     scene: Visited, recipe: PatchRecipe, ratio: int, generator: np.random.Generator
-) -> tuple[Tensor, Sensor]:
+) -> tuple[Tensor, Instrument]:
     """Degraded and reference, (2, H, W), and the sensor of the degraded one."""
     # Exposure is linear, so it scales the spectrum that is already there.
     spectrum = scene.spectrum * float(generator.uniform(*recipe.exposures))
     # One phase for both images of a pair: restoring must not shift anything.
     phase_y, phase_x = (float(v) for v in generator.uniform(-ratio / 2, ratio / 2, 2))
     draw = Draw(int(generator.integers(2**31)))
-    images, sensors = list[Tensor](), list[Sensor]()
+    images, sensors = list[Tensor](), list[Instrument]()
     for profile, role in ((recipe.family or recipe.degraded, "degraded"), (recipe.reference, "reference")):
         sensor = profile.draw(generator)
         dn = acquire(spectrum, scene.width, sensor, ratio, draw, role, (phase_y, phase_x), recipe.margin_px)

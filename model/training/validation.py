@@ -15,7 +15,7 @@ from beers_deploy.model.metrics.fidelity import psnr_db, ssim
 from beers_deploy.model.simulator.acquire import LEAST_SIDE_PX, fitting_oversampling, simulate_pair
 from beers_deploy.model.simulator.detector import Draw
 from beers_deploy.model.simulator.sampling import Scene
-from beers_deploy.profiles.sensor import SensorProfile
+from beers_deploy.profiles.sensor import Sensor
 
 SHARE = 0.05
 """Of the images: sites are held out, the ones with the fewest images first, until so many are."""
@@ -56,9 +56,7 @@ class Validation:
     Scenes too small to leave anything within the margin are left out.
     """
 
-    def __init__(
-        self, scenes: Sequence[Scene], degraded: SensorProfile | SensorFamily, reference: SensorProfile
-    ) -> None:
+    def __init__(self, scenes: Sequence[Scene], degraded: Sensor | SensorFamily, reference: Sensor) -> None:
         self.names, self.pairs, self.vectors = list[str](), list[tuple[Tensor, Tensor]](), list[Tensor]()
         for number, scene in enumerate(scenes):
             ratio = fitting_oversampling(scene.radiance, OVERSAMPLINGS, LEAST_SIDE_PX)

@@ -14,7 +14,7 @@ from beers_deploy.model.metrics.fidelity import fidelity_db
 from beers_deploy.model.simulator.mtf import mtf
 from beers_deploy.model.simulator.procedural import procedural_scene
 from beers_deploy.model.training.patches import PatchRecipe
-from beers_deploy.profiles import SensorProfile, load_sensor
+from beers_deploy.profiles import Sensor, load_sensor
 from beers_deploy.profiles.constant import Constant
 from beers_deploy.profiles.errors import ProfileError
 from beers_deploy.profiles.sensor_file import reference_beside, reference_for
@@ -27,7 +27,7 @@ METHODS = ("degraded", "traditional-fast", "convbeers-xs")
 SCENE = procedural_scene(330, 346, np.random.default_rng(3))
 
 
-def with_units(profile: SensorProfile, gain: float, bits: int, offset_dn: float = 0.0) -> SensorProfile:
+def with_units(profile: Sensor, gain: float, bits: int, offset_dn: float = 0.0) -> Sensor:
     def stated(value: float) -> Constant:
         return Constant(value, "stated", "a test")
 
@@ -35,7 +35,7 @@ def with_units(profile: SensorProfile, gain: float, bits: int, offset_dn: float 
     return replace(profile, gain_dn_per_radiance=stated(gain), bits=stated(bits), effects=effects)
 
 
-def psnr_db(degraded: SensorProfile, reference: SensorProfile) -> list[float]:
+def psnr_db(degraded: Sensor, reference: Sensor) -> list[float]:
     """Of each method, on one pair."""
     (pair,), _ = simulate_pairs([SCENE], degraded, reference, 0)
     methods = [method_named(name, degraded, reference) for name in METHODS]
@@ -61,7 +61,7 @@ def test_scaling_the_gain_and_the_bits_changes_no_psnr_and_no_ranking(
     assert np.argsort(found).tolist() == np.argsort(shipped).tolist()
 
 
-def rescaled(profile: SensorProfile, bits: int, dimmer: float, offset_dn: float) -> SensorProfile:
+def rescaled(profile: Sensor, bits: int, dimmer: float, offset_dn: float) -> Sensor:
     """Full scale, gain and offset grow alike with the bits; scenes are so many times dimmer, and the gain higher."""
     times = (2**bits - 1) / 4095
     darker, brighter = (

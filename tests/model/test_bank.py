@@ -23,7 +23,7 @@ from beers_deploy.model.family import sensor_vector
 from beers_deploy.model.traditional.compensate import compensation_kernel
 from beers_deploy.profiles import load_sensor
 from beers_deploy.profiles.effects import Smear
-from beers_deploy.profiles.sensor import Sensor
+from beers_deploy.profiles.sensor import Instrument
 from tests.model.simulator.stages import point_spread, with_response
 
 REFERENCE = load_sensor("pleiades-reference").nominal()
@@ -31,7 +31,7 @@ NOMINAL = load_sensor("pleiades-degraded").nominal()
 CONTRAST = st.floats(0.015, 0.15)
 
 
-def sensor(across: float, along: float, snr: float = 110.0) -> Sensor:
+def sensor(across: float, along: float, snr: float = 110.0) -> Instrument:
     """Of noise that does not grow with the light, with that SNR at a quarter of full scale."""
     return replace(NOMINAL, mtf_nyquist=across, mtf_nyquist_along=along, alpha=0.0, beta=(100 / snr) ** 2)
 

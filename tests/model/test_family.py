@@ -13,13 +13,13 @@ from beers_deploy.model.family import RANGES, SensorFamily, sensor_values, senso
 from beers_deploy.model.training.patches import transposed
 from beers_deploy.profiles import load_sensor
 from beers_deploy.profiles.effects import Smear
-from beers_deploy.profiles.sensor import Sensor, noise_from_snr
+from beers_deploy.profiles.sensor import Instrument, noise_from_snr
 
 NOMINAL = load_sensor("pleiades-degraded").nominal()
 FAMILY = SensorFamily(NOMINAL)
 
 
-def drawn(seed: int) -> Sensor:
+def drawn(seed: int) -> Instrument:
     return FAMILY.draw(np.random.default_rng(seed))
 
 
@@ -29,7 +29,7 @@ def test_the_values_of_a_sensor_known_by_hand() -> None:
     assert values["sigma_dark"] == pytest.approx(25 / 50 / 400, rel=2e-3)
     assert values["sigma_bright"] == pytest.approx(100 / 110 / 400, rel=1e-3)
     alpha, beta = noise_from_snr(25, 50, 100, 110)
-    assert values == sensor_values(Sensor(0.07, alpha, beta, NOMINAL.gain_dn_per_radiance, 12, {}, 0.07))
+    assert values == sensor_values(Instrument(0.07, alpha, beta, NOMINAL.gain_dn_per_radiance, 12, {}, 0.07))
 
 
 def test_the_ends_of_the_ranges_are_minus_one_and_one() -> None:
@@ -48,7 +48,7 @@ def test_the_ends_of_the_ranges_are_minus_one_and_one() -> None:
         (replace(NOMINAL, alpha=1.0), "sigma_bright"),
     ],
 )
-def test_what_lies_outside_is_moved_to_the_end_and_said(sensor: Sensor, name: str) -> None:
+def test_what_lies_outside_is_moved_to_the_end_and_said(sensor: Instrument, name: str) -> None:
     known = sensor_vector(sensor)
     assert max(map(abs, known.values)) == 1
     said = [sentence for sentence in known.outside if sentence.startswith(name)]

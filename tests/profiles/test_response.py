@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from typer.testing import CliRunner
 
 from beers_deploy.cli import app
-from beers_deploy.profiles import SensorProfile, load_sensor
+from beers_deploy.profiles import Sensor, load_sensor
 from beers_deploy.profiles.errors import ProfileError
 from beers_deploy.profiles.response import MtfTable, PointSpread, centroid, packed, unpacked
 from beers_deploy.profiles.sensor import same_instrument
@@ -43,7 +43,7 @@ def sensor_file(folder: Path, mtf: str, noise: str | None = None) -> Path:
     return own_sensor(folder, text=text)
 
 
-def with_psf(folder: Path, samples: np.ndarray, mtf: str = PSF) -> SensorProfile:
+def with_psf(folder: Path, samples: np.ndarray, mtf: str = PSF) -> Sensor:
     np.save(folder / "psf.npy", samples)
     return load_sensor(str(sensor_file(folder, mtf)))
 

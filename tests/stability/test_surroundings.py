@@ -25,7 +25,7 @@ from beers_deploy.model.traditional.pipeline import Chain, restore_strips, resto
 from beers_deploy.model.training.losses import LossWeights, RestorationLoss
 from beers_deploy.profiles import load_sensor
 from beers_deploy.profiles.errors import BeersError, ImageError
-from beers_deploy.profiles.sensor import Sensor
+from beers_deploy.profiles.sensor import Instrument
 from beers_deploy.profiles.sensor_file import REFERENCE
 from beers_deploy.studies.stress.cases import CASES, FULL_DN, Case
 from beers_deploy.studies.stress.checks import FLAT_DN, gain, ringing, torch_threads
@@ -44,19 +44,19 @@ def images(case: Case, side_px: int = 32) -> list[np.ndarray]:
     return case.draw(side_px, np.random.default_rng([0, zlib.crc32(case.name.encode())]))
 
 
-def sensor_of(case: Case) -> Sensor:
+def sensor_of(case: Case) -> Instrument:
     """The profile's sensor, with the case's own MTF."""
     sensor = load_sensor(SENSOR).nominal()
     return replace(sensor, mtf_nyquist={"MTF 0.1 %": 0.001, "MTF 60 %": 0.6}.get(case.name, sensor.mtf_nyquist))
 
 
-def radiance_of(image: np.ndarray, sensor: Sensor) -> Tensor:
+def radiance_of(image: np.ndarray, sensor: Instrument) -> Tensor:
     """Each pixel as RATIO x RATIO scene pixels, W/m2/sr/um."""
     fine = np.repeat(np.repeat(np.asarray(image, np.float32), RATIO, 0), RATIO, 1)
     return torch.from_numpy(fine / np.float32(sensor.gain_dn_per_radiance))
 
 
-def acquired(image: np.ndarray, sensor: Sensor) -> np.ndarray:
+def acquired(image: np.ndarray, sensor: Instrument) -> np.ndarray:
     radiance = radiance_of(image, sensor)
     spectrum = scene_spectrum(radiance)
     return acquire(spectrum, radiance.shape[-1], sensor, RATIO, Draw(0), "degraded", margin_px=0).numpy()
@@ -89,14 +89,14 @@ def test_the_signal_is_that_of_the_formulas(case: Case) -> None:
         assert change <= kernel + FLOAT32_DN
 
 
-def signal(image: np.ndarray, sensor: Sensor) -> np.ndarray:
+def signal(image: np.ndarray, sensor: Instrument) -> np.ndarray:
     radiance = radiance_of(image, sensor)
     height, width = radiance.shape
     sampled = sample(scene_spectrum(radiance), sensor_transfer(height, width, RATIO, sensor), width, RATIO)
     return np.asarray(sampled.numpy() * np.float32(sensor.gain_dn_per_radiance))
 
 
-def signal_by_formula(image: np.ndarray, sensor: Sensor) -> np.ndarray:
+def signal_by_formula(image: np.ndarray, sensor: Instrument) -> np.ndarray:
     """The whole transform in float64, then the samples between two scene pixels."""
     radiance = radiance_of(image, sensor).double()
     fy, fx = (torch.fft.fftfreq(side, dtype=torch.float64) for side in radiance.shape)

@@ -19,7 +19,7 @@ from beers_deploy.model.progress import Log, no_log, once, steps
 from beers_deploy.model.simulator.acquire import acquire_padded
 from beers_deploy.model.simulator.detector import Draw
 from beers_deploy.model.simulator.sampling import read_scene
-from beers_deploy.profiles.sensor import Sensor, SensorProfile
+from beers_deploy.profiles.sensor import Instrument, Sensor
 from beers_deploy.profiles.sensor_file import load_sensor, reference_beside
 from beers_deploy.studies.detection.average_precision import Figures, Hits, find_hits, score_rows, site_weights
 from beers_deploy.studies.detection.boxes import Boxes
@@ -51,15 +51,15 @@ class LabelledScene:
     site: str
     truth: Boxes
     path: Path | None
-    radiance: Callable[[Sensor], Tensor]
+    radiance: Callable[[Instrument], Tensor]
 
 
 @dataclass(frozen=True)
 class SensorPair:
     """The sensor that degrades, and the one that is aimed at, in its units."""
 
-    degraded: SensorProfile
-    reference: SensorProfile
+    degraded: Sensor
+    reference: Sensor
 
     @property
     def oversampling(self) -> int:
@@ -105,7 +105,7 @@ class AcquiredScene:
         found = detector.detect(self.shown(method))
         return replace(found, corners=found.corners * self.sensors.oversampling)
 
-    def _acquired(self, profile: SensorProfile, role: str) -> np.ndarray:
+    def _acquired(self, profile: Sensor, role: str) -> np.ndarray:
         sensor, radiance = profile.draw(self.draw.generator("sensor")), self.scene.radiance(profile.nominal())
         return acquire_padded(radiance, sensor, self.sensors.oversampling, self.draw, role).numpy()
 
@@ -261,5 +261,5 @@ def left_out(labelled: Sequence[str], numbers: np.ndarray) -> list[str]:
     return [f"Not known to the detector and left out: {names}. What it finds there counts as false."] if names else []
 
 
-def _read(path: Path, sensor: Sensor) -> Tensor:
+def _read(path: Path, sensor: Instrument) -> Tensor:
     return read_scene(path, sensor).radiance

@@ -20,13 +20,13 @@ from beers_deploy.model.traditional.settings import QUALITIES
 from beers_deploy.networks import conditioned, network_file, warn_outside
 from beers_deploy.profiles.constant import Constant
 from beers_deploy.profiles.errors import OptionError
-from beers_deploy.profiles.sensor import Sensor, SensorProfile
+from beers_deploy.profiles.sensor import Instrument, Sensor
 from beers_deploy.profiles.sensor_file import BLIND as NOT_KNOWN
 from beers_deploy.profiles.sensor_file import BLIND_PROFILE, load_sensor
 from beers_deploy.quant.onnx_file import metadata
 from beers_deploy.restoration.function import Restore, network_method
 
-Specialise = Callable[[Sensor], Restore]
+Specialise = Callable[[Instrument], Restore]
 """A sensor to the restoration of images that it acquired."""
 
 DEGRADED, TRADITIONAL, DECONVOLVE_FIRST = "degraded", "traditional", "deconvolve-first"
@@ -59,14 +59,14 @@ class Method:
     sensor_known: str
     specialise: Specialise | None = None
 
-    def knowing(self, sensor: Sensor) -> "Method":
+    def knowing(self, sensor: Instrument) -> "Method":
         """This method with that sensor known; itself where what it does depends on none."""
         if self.specialise is None:
             return self
         return replace(self, restore=self.specialise(sensor), sensor_known=KNOWN)
 
 
-def method_without_network(name: str, degraded: Sensor, reference: Sensor) -> Method | None:
+def method_without_network(name: str, degraded: Instrument, reference: Instrument) -> Method | None:
     """The input itself, or a traditional chain or a peer of it, which know both sensors; None for any other name.
 
     Raises:
@@ -79,7 +79,7 @@ def method_without_network(name: str, degraded: Sensor, reference: Sensor) -> Me
     quality, order = CHAINS.get(name, (STANDARD, "denoise-first"))
     run = PEERS.get(name, restore_traditional)
 
-    def specialise(sensor: Sensor) -> Restore:
+    def specialise(sensor: Instrument) -> Restore:
         chain = Chain(sensor, reference.in_units_of(sensor), quality, order)
         return lambda dn: run(torch.from_numpy(dn), chain).numpy()
 
@@ -93,7 +93,7 @@ EXPECTED = (
 )
 
 
-def method_named(name: str, degraded: SensorProfile, reference: SensorProfile, log: Log = no_log) -> Method:
+def method_named(name: str, degraded: Sensor, reference: Sensor, log: Log = no_log) -> Method:
     """The method of that name; the traditional ones know both sensors, a shipped network the degraded one.
 
     Args:
@@ -122,13 +122,13 @@ def method_named(name: str, degraded: SensorProfile, reference: SensorProfile, l
     return Method(name, network_method(model, degraded.nominal().max_dn), known, specialise)
 
 
-def _network_specialise(name: str, like: SensorProfile, log: Log) -> Specialise | None:
+def _network_specialise(name: str, like: Sensor, log: Log) -> Specialise | None:
     """A conditioned network told any sensor in the grid of a profile; None of a network that is plain."""
     found = conditioned(Path(name))
     if found is None:
         return None
 
-    def specialise(sensor: Sensor) -> Restore:
+    def specialise(sensor: Instrument) -> Restore:
         known = profile_of(sensor, like)
         warn_outside(known, log)
         return network_method(found.model(known, name.endswith(INT8)), sensor.max_dn)
@@ -144,7 +144,7 @@ def knowledge_of(model: onnx.ModelProto, sensor_name: str) -> str:
     return KNOWN if own == sensor_name else f"another: {own}"
 
 
-def profile_of(sensor: Sensor, like: SensorProfile) -> SensorProfile:
+def profile_of(sensor: Instrument, like: Sensor) -> Sensor:
     """A profile of which every draw is that sensor, in the grid of another profile."""
     across, along = sensor.mtf_axes
     numbers = {"mtf_nyquist": across, "mtf_nyquist_along": along, "alpha": sensor.alpha, "beta": sensor.beta}

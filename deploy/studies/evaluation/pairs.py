@@ -22,7 +22,7 @@ from beers_deploy.model.simulator.procedural import load_scenes
 from beers_deploy.model.simulator.sampling import Scene
 from beers_deploy.model.training.patches import pair_files
 from beers_deploy.profiles.errors import ImageError
-from beers_deploy.profiles.sensor import Sensor, SensorProfile
+from beers_deploy.profiles.sensor import Instrument, Sensor
 
 OVERSAMPLINGS = (4, 2)
 
@@ -51,7 +51,7 @@ class NamedPair:
 
 
 def pairs_of_scenes(
-    images: Path | None, degraded: SensorProfile, reference: SensorProfile, seed: int
+    images: Path | None, degraded: Sensor, reference: Sensor, seed: int
 ) -> tuple[list[NamedPair], list[str]]:
     """Pairs of the scenes of a folder, or of drawn ones, and what a reader must know of them.
 
@@ -69,8 +69,8 @@ def pairs_of_scenes(
 
 def simulate_pairs(
     scenes: list[Scene],
-    degraded: SensorProfile | Sensor,
-    reference: SensorProfile | Sensor,
+    degraded: Sensor | Instrument,
+    reference: Sensor | Instrument,
     seed: int,
     oversamplings: Sequence[int] = OVERSAMPLINGS,
 ) -> tuple[list[NamedPair], list[str]]:
@@ -97,7 +97,7 @@ def simulate_pairs(
             continue
         draw = Draw(seed, number)
         seen, meant = (
-            each if isinstance(each, Sensor) else each.draw(draw.generator("sensor"))
+            each if isinstance(each, Instrument) else each.draw(draw.generator("sensor"))
             for each in (degraded, reference)
         )
         pairs.append(_simulated(scene, seen, meant, ratio, draw))
@@ -112,11 +112,11 @@ def simulate_pairs(
     return pairs, small
 
 
-def _simulated(scene: Scene, degraded: Sensor, reference: Sensor, ratio: int, draw: Draw) -> NamedPair:
+def _simulated(scene: Scene, degraded: Instrument, reference: Instrument, ratio: int, draw: Draw) -> NamedPair:
     """Three acquisitions of one scene: the pair, and the reference once more without its noise."""
     prepared = prepare_scene(scene.radiance, ratio)
 
-    def by(sensor: Sensor, role: str, skip: Collection[str] = ()) -> np.ndarray:
+    def by(sensor: Instrument, role: str, skip: Collection[str] = ()) -> np.ndarray:
         width = prepared.radiance.shape[-1]
         return acquire(prepared.spectrum, width, sensor, ratio, draw, role, skip=skip).numpy()
 
@@ -124,7 +124,7 @@ def _simulated(scene: Scene, degraded: Sensor, reference: Sensor, ratio: int, dr
     return NamedPair(scene.name, seen, meant, oversampling=ratio, noise_free=clean)
 
 
-def oversamplings_of(profile: SensorProfile) -> tuple[int, ...]:
+def oversamplings_of(profile: Sensor) -> tuple[int, ...]:
     """The profile's oversampling, though no more than 4, and 2 for scenes too small for it.
 
     At more than 4 little would be left of a photograph, and the blur is sampled finely enough at 4.
@@ -133,7 +133,7 @@ def oversamplings_of(profile: SensorProfile) -> tuple[int, ...]:
     return tuple(dict.fromkeys(min(own, ratio) for ratio in OVERSAMPLINGS))
 
 
-def oversampling_note(pairs: Sequence[NamedPair], profile: SensorProfile) -> str:
+def oversampling_note(pairs: Sequence[NamedPair], profile: Sensor) -> str:
     """A sentence where pairs were simulated at another oversampling than the profile's; else nothing."""
     own = int(profile.oversampling.low)
     counts = Counter(pair.oversampling for pair in pairs if pair.oversampling is not None)

@@ -9,7 +9,7 @@ from beers_deploy.model.metrics.bootstrap import too_few
 from beers_deploy.model.progress import once
 from beers_deploy.model.recipe import profiles_for, read_pairs_recipe
 from beers_deploy.profiles.figures import Row
-from beers_deploy.profiles.sensor import SensorProfile
+from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.studies.evaluation.methods import Method, method_named
 from beers_deploy.studies.evaluation.pairs import NamedPair, pairs_of_scenes, read_pairs
 from beers_deploy.studies.evaluation.scores import Instruments, paper_rows, perceptual_distances, score, site_rows
@@ -33,7 +33,7 @@ class Evaluation:
         inputs: the files that the figures rest on: models, weights of LPIPS, scenes or pairs.
     """
 
-    sensors: tuple[SensorProfile, SensorProfile]
+    sensors: tuple[Sensor, Sensor]
     methods: Sequence[Method]
     pairs: Sequence[NamedPair]
     mean: Sequence[Row]

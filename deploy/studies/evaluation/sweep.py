@@ -16,7 +16,7 @@ from beers_deploy.model.progress import steps
 from beers_deploy.model.simulator.procedural import load_scenes
 from beers_deploy.model.simulator.sampling import Scene
 from beers_deploy.profiles.figures import Figure, Row, measured
-from beers_deploy.profiles.sensor import Sensor, SensorProfile, noise_from_snr
+from beers_deploy.profiles.sensor import Instrument, Sensor, noise_from_snr
 from beers_deploy.studies.evaluation.methods import DEGRADED, TRADITIONAL, Method, method_without_network
 from beers_deploy.studies.evaluation.pairs import NamedPair, oversamplings_of, simulate_pairs
 from beers_deploy.studies.evaluation.scores import NOISE_FREE
@@ -28,11 +28,11 @@ SHARPNESS = (0.10, 0.07, 0.05, 0.03, 0.02)
 NOISE = ((15.0, 50.0), (25.0, 55.0), (30.0, 80.0), (70.0, 150.0), (90.0, 190.0))
 """SNR at 25 and 100 W/m2/sr/um; the nominal 50 / 110 is in every sweep."""
 
-Sensors = dict[str, Sensor]
+Sensors = dict[str, Instrument]
 """By the name of their row."""
 
 
-def conditions(nominal: Sensor, profile: SensorProfile) -> Sensors:
+def conditions(nominal: Instrument, profile: Sensor) -> Sensors:
     """The nominal sensor; other MTFs, both axes alike or not; other SNRs; both at once; and one with another gain."""
     low, worst = _noisy(nominal, profile, 25, 55), _noisy(nominal, profile, 15, 50)
     return {
@@ -48,7 +48,7 @@ def conditions(nominal: Sensor, profile: SensorProfile) -> Sensors:
     }
 
 
-def suppositions(nominal: Sensor, profile: SensorProfile) -> dict[str, Sensors]:
+def suppositions(nominal: Instrument, profile: Sensor) -> dict[str, Sensors]:
     """Sensors known wrongly: by the name of the condition that holds, what is supposed in its place."""
     mtf = {value: {f"MTF {value:.0%}": _sharp(nominal, value)} for value in (0.05, 0.07, 0.10)}
     # SNR is radiance over sigma: with k times as much of it, the variance is k^2 times smaller.
@@ -65,22 +65,22 @@ def suppositions(nominal: Sensor, profile: SensorProfile) -> dict[str, Sensors]:
     }
 
 
-def _sharp(sensor: Sensor, mtf: float) -> Sensor:
+def _sharp(sensor: Instrument, mtf: float) -> Instrument:
     """The sensor with the formula's MTF, that at Nyquist on both axes."""
     return replace(sensor, mtf_nyquist=mtf, mtf_nyquist_along=None, response=None)
 
 
-def _noisy(sensor: Sensor, profile: SensorProfile, snr_0: float, snr_1: float) -> Sensor:
+def _noisy(sensor: Instrument, profile: Sensor, snr_0: float, snr_1: float) -> Instrument:
     alpha, beta = noise_from_snr(profile.radiance_0.low, snr_0, profile.radiance_1.low, snr_1)
     return replace(sensor, alpha=alpha, beta=beta)
 
 
-Trial = tuple[str, Sensor, Method]
+Trial = tuple[str, Instrument, Method]
 """The name of the sensor that is supposed, that sensor, and the method that supposes it."""
 
 
 def run_sweep(
-    networks: Sequence[Method], scenes: Sequence[Scene], profile: SensorProfile, reference: SensorProfile, seed: int
+    networks: Sequence[Method], scenes: Sequence[Scene], profile: Sensor, reference: Sensor, seed: int
 ) -> "Found":
     """Try every method under every condition.
 
@@ -109,7 +109,7 @@ def run_sweep(
     return Found(psnr, mtf, [pair.site for pair in pairs], seed)
 
 
-def _trials(name: str, sensor: Sensor, methods: Sequence[Method], profile: SensorProfile) -> list[Trial]:
+def _trials(name: str, sensor: Instrument, methods: Sequence[Method], profile: Sensor) -> list[Trial]:
     """What is run under a condition; the second of the methods is the chain."""
     nominal = profile.nominal()
     units = replace(nominal, gain_dn_per_radiance=sensor.gain_dn_per_radiance)
@@ -220,7 +220,7 @@ class Found:
 
 
 def sweep_tables(
-    methods: Sequence[Method], images: Path | None, degraded: SensorProfile, reference: SensorProfile, seed: int
+    methods: Sequence[Method], images: Path | None, degraded: Sensor, reference: Sensor, seed: int
 ) -> tuple[Row, ...]:
     """The tables of a sweep of the networks among the methods, on one scene of each site."""
     scenes = load_scenes(images, reference.nominal(), seed)

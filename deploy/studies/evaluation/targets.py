@@ -20,7 +20,7 @@ from beers_deploy.model.simulator.acquire import acquire
 from beers_deploy.model.simulator.detector import Draw
 from beers_deploy.model.simulator.sampling import scene_spectrum
 from beers_deploy.profiles.figures import Figure, measured, unavailable
-from beers_deploy.profiles.sensor import Sensor
+from beers_deploy.profiles.sensor import Instrument
 from beers_deploy.studies.evaluation.methods import Method
 
 ANGLES_DEG = (3.0, 5.0, 8.0, 11.0)
@@ -47,7 +47,7 @@ class Targets:
     offset_dn: float = 0.0
 
 
-def acquire_targets(sensor: Sensor, seed: int) -> Targets:
+def acquire_targets(sensor: Instrument, seed: int) -> Targets:
     """Edges at several angles with independent noise, and flat fields at 25 and 100 W/m2/sr/um."""
     edges = []
     for number, angle_deg in enumerate(ANGLES_DEG * REPEATS):
@@ -60,7 +60,7 @@ def acquire_targets(sensor: Sensor, seed: int) -> Targets:
     return Targets(edges, flats, sensor.max_dn, sensor.offset_dn)
 
 
-def _acquire(scene: Tensor, sensor: Sensor, draw: Draw, ratio: int = OVERSAMPLING) -> np.ndarray:
+def _acquire(scene: Tensor, sensor: Instrument, draw: Draw, ratio: int = OVERSAMPLING) -> np.ndarray:
     dn = acquire(scene_spectrum(scene), scene.shape[1], sensor, ratio, draw, "degraded", margin_px=0)
     return dn.numpy()
 

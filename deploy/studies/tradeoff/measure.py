@@ -27,7 +27,7 @@ from beers_deploy.model.simulator.procedural import load_scenes
 from beers_deploy.profiles import load_sensor, sensor_names
 from beers_deploy.profiles.errors import OptionError
 from beers_deploy.profiles.figures import Figure, measured
-from beers_deploy.profiles.sensor import SensorProfile
+from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.profiles.sensor_file import reference_for
 from beers_deploy.quant.calibration import draw_patches
 from beers_deploy.quant.onnx_file import metadata, save_onnx
@@ -107,8 +107,8 @@ class Benchmark:
     """
 
     pairs: Sequence[NamedPair]
-    degraded: SensorProfile
-    reference: SensorProfile
+    degraded: Sensor
+    reference: Sensor
     instruments: Instruments
     weights: str
     seed: int

@@ -24,7 +24,7 @@ from beers_deploy.model.shipped import shipped_names
 from beers_deploy.networks import float_file, int8_file
 from beers_deploy.profiles import TargetProfile
 from beers_deploy.profiles.errors import ModelError, OptionError
-from beers_deploy.profiles.sensor import SensorProfile
+from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.profiles.target import DEFAULT_TARGET, board_names
 from beers_deploy.quant.onnx_file import is_quantised, load_onnx
 from beers_deploy.quant.tiling.walk import Tiling, tiling_of
@@ -112,7 +112,7 @@ def parse_targets(text: str) -> tuple[str, ...]:
 
 
 def network_variants(
-    names: Iterable[str], sensor: SensorProfile, make_int8: Callable[[Path], Path], log: Callable[[str], None]
+    names: Iterable[str], sensor: Sensor, make_int8: Callable[[Path], Path], log: Callable[[str], None]
 ) -> list[Variant]:
     """Networks in float32 and INT8; shipped ones with the sensor's profile, INT8 files as they are.
 
@@ -136,7 +136,7 @@ def network_variants(
 
 
 def _variants(
-    name: str, sensor: SensorProfile, make_int8: Callable[[Path], Path], log: Callable[[str], None]
+    name: str, sensor: Sensor, make_int8: Callable[[Path], Path], log: Callable[[str], None]
 ) -> Iterator[Variant]:
     path = Path(name)
     if name not in shipped_names() and path.suffix not in (".onnx", ".safetensors"):

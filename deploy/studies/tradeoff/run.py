@@ -17,7 +17,7 @@ from beers_deploy.model.traditional.settings import QUALITIES
 from beers_deploy.profiles import TargetProfile, load_sensor, load_target
 from beers_deploy.profiles.errors import MachineError
 from beers_deploy.profiles.figures import Figure, Row, unavailable
-from beers_deploy.profiles.sensor import SensorProfile
+from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.profiles.sensor_file import reference_for
 from beers_deploy.studies.evaluation.methods import Method, method_named
 from beers_deploy.studies.evaluation.pairs import pairs_of_scenes
@@ -149,7 +149,7 @@ def _weighed(
 
 
 def _benchmark(
-    images: Path | None, degraded: SensorProfile, reference: SensorProfile, lpips: Path | None, seed: int
+    images: Path | None, degraded: Sensor, reference: Sensor, lpips: Path | None, seed: int
 ) -> tuple[Benchmark, list[str]]:
     """What all variants are measured on, and what a reader must know of the images."""
     pairs, said = pairs_of_scenes(images, degraded, reference, seed)

@@ -19,13 +19,13 @@ from beers_deploy.model.simulator.procedural import procedural_scene
 from beers_deploy.model.simulator.sampling import scene_spectrum
 from beers_deploy.profiles import load_sensor
 from beers_deploy.profiles.errors import BeersError, OptionError
-from beers_deploy.profiles.sensor import Sensor, noise_from_snr
+from beers_deploy.profiles.sensor import Instrument, noise_from_snr
 from beers_deploy.results import SCHEMA_PATH
 from beers_deploy.studies.characterise import Box, characterise, profile_toml, read_box
 
 RATIO, SIDE, GAIN, BOARD_PX = 4, 1280, 10.2375, 100
 SNRS = (50.0, 110.0)
-SENSOR = Sensor(0.09, *noise_from_snr(25, SNRS[0], 100, SNRS[1]), GAIN, 12, {}, 0.05)
+SENSOR = Instrument(0.09, *noise_from_snr(25, SNRS[0], 100, SNRS[1]), GAIN, 12, {}, 0.05)
 
 
 def landscape(seed: int, board: bool) -> torch.Tensor:

@@ -11,7 +11,7 @@ from beers_deploy.model.simulator.acquire import acquire
 from beers_deploy.model.simulator.detector import Draw
 from beers_deploy.model.simulator.procedural import procedural_scene
 from beers_deploy.model.simulator.sampling import scene_spectrum
-from beers_deploy.profiles.sensor import Sensor, noise_from_snr
+from beers_deploy.profiles.sensor import Instrument, noise_from_snr
 
 RATIO, GAIN, MAX_DN = 4, 10.2375, 4095
 PAIRS = ((50.0, 110.0), (80.0, 170.0), (20.0, 45.0))
@@ -27,7 +27,7 @@ def spectra() -> list[torch.Tensor]:
 
 def seen(pair: tuple[float, float], seed: int, mtf_nyquist: float = 0.07) -> Blocks:
     alpha, beta = noise_from_snr(RADIANCES[0], pair[0], RADIANCES[1], pair[1])
-    sensor = Sensor(mtf_nyquist, alpha, beta, GAIN, 12)
+    sensor = Instrument(mtf_nyquist, alpha, beta, GAIN, 12)
     images = [acquire(s, 1280, sensor, RATIO, Draw(seed, k), "degraded").numpy() for k, s in enumerate(spectra())]
     return join([cut_blocks(image, MAX_DN) for image in images])
 

@@ -10,7 +10,7 @@ from beers_deploy.model.metrics.slanted_edge import edge_mtf, slanted_edge
 from beers_deploy.model.simulator.detector import Draw, detect
 from beers_deploy.model.simulator.mtf import mtf, sensor_transfer, transfer_function
 from beers_deploy.model.simulator.sampling import sample, scene_spectrum
-from beers_deploy.profiles.sensor import Sensor, noise_from_snr
+from beers_deploy.profiles.sensor import Instrument, noise_from_snr
 
 RATIO, SCENE_PX, SIDE_PX, GAIN, ANGLE_DEG = 5, 240, 80, 10.2375, 8.0
 ALPHA, BETA = noise_from_snr(25, 50, 100, 110)
@@ -28,7 +28,7 @@ def clean(mtf_nyquist: float, angle_deg: float) -> torch.Tensor:
 
 
 def noisy(mtf_nyquist: float, angle_deg: float, seed: int) -> np.ndarray:
-    sensor = Sensor(mtf_nyquist, ALPHA, BETA, GAIN, 12)
+    sensor = Instrument(mtf_nyquist, ALPHA, BETA, GAIN, 12)
     return detect(clean(mtf_nyquist, angle_deg), sensor, Draw(seed), "degraded").numpy()
 
 
@@ -72,7 +72,7 @@ def test_noise_does_not_bias(mtf_nyquist: float, bias: float, angle_deg: float) 
 @pytest.mark.parametrize("angle_deg", [5.0, 11.0])
 def test_a_sensor_of_two_axes_is_measured_at_both(angle_deg: float) -> None:
     """Edges upright and lying, acquired by one sensor: 12 % across the track, 5 % along it."""
-    sensor, side = Sensor(0.12, 0.0, 0.0, GAIN, 12, {}, 0.05), SCENE_PX * RATIO
+    sensor, side = Instrument(0.12, 0.0, 0.0, GAIN, 12, {}, 0.05), SCENE_PX * RATIO
     transfer, upright = sensor_transfer(side, side, RATIO, sensor), slanted_edge(SCENE_PX, RATIO, angle_deg)
     across, along = (
         sample(scene_spectrum(scene), transfer, side, RATIO)[MIDDLE, MIDDLE].numpy() * GAIN

@@ -17,17 +17,19 @@ from beers_deploy.profiles import load_sensor
 from beers_deploy.profiles.effects import Effect, middle_effect
 from beers_deploy.profiles.response import MtfTable, PointSpread, Response, packed
 from beers_deploy.profiles.scene_call import typical_effects
-from beers_deploy.profiles.sensor import Sensor
+from beers_deploy.profiles.sensor import Instrument
 
 TYPICAL: dict[str, Effect] = {name: middle_effect(name, table) for name, table in typical_effects().items()}
 
 
-def plain_sensor(**effects: Effect) -> Sensor:
+def plain_sensor(**effects: Effect) -> Instrument:
     """The nominal degraded sensor with these effects."""
     return replace(load_sensor("pleiades-degraded").nominal(), effects=effects)
 
 
-def before_digitising(radiance: Tensor, sensor: Sensor, ratio: int, draw: Draw, skip: Collection[str] = ()) -> Tensor:
+def before_digitising(
+    radiance: Tensor, sensor: Instrument, ratio: int, draw: Draw, skip: Collection[str] = ()
+) -> Tensor:
     """What `simulate_planned` computes, up to the converter, so that no rounding hides a difference."""
     if "mtf" in skip:
         signal = torch.nn.functional.avg_pool2d(radiance[None, None], ratio)[0, 0]
@@ -45,13 +47,13 @@ def before_digitising(radiance: Tensor, sensor: Sensor, ratio: int, draw: Draw, 
     return dn
 
 
-def _apply(image: Tensor, name: str, sensor: Sensor, draw: Draw, skip: Collection[str]) -> Tensor:
+def _apply(image: Tensor, name: str, sensor: Instrument, draw: Draw, skip: Collection[str]) -> Tensor:
     if name in skip or name not in sensor.effects:
         return image
     return apply_effect(image, sensor.effects[name], sensor, partial(draw.generator, f"{name}-degraded"))
 
 
-def with_response(sensor: Sensor, response: Response) -> Sensor:
+def with_response(sensor: Instrument, response: Response) -> Instrument:
     """The sensor with another blur."""
     across, along = response.at_nyquist
     return replace(sensor, mtf_nyquist=across, mtf_nyquist_along=along, response=response)

@@ -10,10 +10,10 @@ from beers_deploy.model.simulator.procedural import procedural_scene
 from beers_deploy.model.simulator.sampling import scene_spectrum
 from beers_deploy.profiles import load_sensor
 from beers_deploy.profiles.errors import ImageError
-from beers_deploy.profiles.sensor import Sensor
+from beers_deploy.profiles.sensor import Instrument
 
 DEGRADED, REFERENCE = (load_sensor(name).nominal() for name in ("pleiades-degraded", "pleiades-reference"))
-QUIET = Sensor(0.07, alpha=0.0, beta=0.0, gain_dn_per_radiance=10.0, bits=16)
+QUIET = Instrument(0.07, alpha=0.0, beta=0.0, gain_dn_per_radiance=10.0, bits=16)
 
 
 @pytest.mark.parametrize("cycles_per_px", [0.1, 0.25, 0.4])
@@ -23,7 +23,7 @@ def test_a_sine_keeps_the_contrast_that_the_mtf_says(cycles_per_px: float, mtf_n
     x = (torch.arange(pixels * ratio) + 0.5) / ratio
     wave = 1000 + 500 * torch.cos(2 * math.pi * cycles_per_px * x)
     radiance = wave.expand(pixels * ratio, -1).contiguous()
-    sensor = Sensor(mtf_nyquist, 0.0, 0.0, 10.0, 16)
+    sensor = Instrument(mtf_nyquist, 0.0, 0.0, 10.0, 16)
     dn = acquire(scene_spectrum(radiance), radiance.shape[1], sensor, ratio, Draw(0), "degraded", margin_px=0)
     line = dn.double().mean(0) / 10
     bin_ = round(cycles_per_px * pixels)
@@ -38,7 +38,7 @@ def steepest_fall(ratio: int, mtf_nyquist: float) -> float:
     side = 96 * ratio
     step = torch.full((side, side), 50.0)
     step[:, side // 2 :] = 200.0
-    sensor = Sensor(mtf_nyquist, 0.0, 0.0, 10.0, 16)
+    sensor = Instrument(mtf_nyquist, 0.0, 0.0, 10.0, 16)
     line = acquire(scene_spectrum(step), side, sensor, ratio, Draw(0), "degraded", margin_px=16)[0]
     return float(-torch.diff(line).min())
 

@@ -4,7 +4,7 @@ import torch
 
 from beers_deploy.model.simulator.detector import Draw, add_noise, digitise, noise_sigma, to_radiance, to_uint16
 from beers_deploy.profiles import load_sensor
-from beers_deploy.profiles.sensor import Sensor
+from beers_deploy.profiles.sensor import Instrument
 
 SENSOR = load_sensor("pleiades-degraded").nominal()
 GAIN = SENSOR.gain_dn_per_radiance
@@ -38,7 +38,7 @@ def test_ringing_below_zero_is_harmless() -> None:
 
 
 def test_an_impossible_hand_made_sensor_gives_no_nan() -> None:
-    sensor = Sensor(0.07, alpha=-0.01, beta=0.5, gain_dn_per_radiance=10.0, bits=12)
+    sensor = Instrument(0.07, alpha=-0.01, beta=0.5, gain_dn_per_radiance=10.0, bits=12)
     assert float(noise_sigma(torch.tensor(300.0), sensor)) == 0
 
 

@@ -27,7 +27,7 @@ from beers_deploy.profiles.effects import (
     Striping,
 )
 from beers_deploy.profiles.response import MtfTable
-from beers_deploy.profiles.sensor import Sensor
+from beers_deploy.profiles.sensor import Instrument
 from tests.model.simulator import stages
 
 EXAMPLES = int(os.environ.get("BEERS_PLAN_EXAMPLES", "60"))
@@ -77,7 +77,7 @@ OPTIONAL: dict[str, st.SearchStrategy[Effect]] = {
 }
 effects = st.fixed_dictionaries({}, optional=OPTIONAL)
 formula_sensors = st.builds(
-    lambda m, a, b, e, along: Sensor(m, a, b, 10.2375, 12, e, along),
+    lambda m, a, b, e, along: Instrument(m, a, b, 10.2375, 12, e, along),
     st.floats(0.005, 0.3),
     st.sampled_from([0.0, 0.0077]),
     st.sampled_from([0.0, 1e-6, 0.058]),
@@ -102,7 +102,7 @@ sensors = st.one_of(
 )
 
 
-def change(radiance: torch.Tensor, sensor: Sensor, ratio: int, name: str, seed: int) -> float:
+def change(radiance: torch.Tensor, sensor: Instrument, ratio: int, name: str, seed: int) -> float:
     """Largest change of any pixel before digitising when one effect is left out."""
     skip = {name, "smear", "antialias"} if name == "mtf" else {name}
     radiance = crop_divisible(radiance, ratio)
@@ -112,7 +112,7 @@ def change(radiance: torch.Tensor, sensor: Sensor, ratio: int, name: str, seed: 
 
 @settings(max_examples=EXAMPLES)
 @given(scenes, sensors, st.sampled_from([1, 2, 3, 5]), st.integers(0, 99))
-def test_no_bound_is_ever_exceeded(radiance: torch.Tensor, sensor: Sensor, ratio: int, seed: int) -> None:
+def test_no_bound_is_ever_exceeded(radiance: torch.Tensor, sensor: Instrument, ratio: int, seed: int) -> None:
     stats = scene_stats(crop_divisible(radiance, ratio), ratio)
     for name, bound in effect_bounds(sensor, stats).items():
         assert change(radiance, sensor, ratio, name, seed) <= bound * (1 + 1e-4) + ROUNDING_DN, name
@@ -120,7 +120,9 @@ def test_no_bound_is_ever_exceeded(radiance: torch.Tensor, sensor: Sensor, ratio
 
 @settings(max_examples=EXAMPLES)
 @given(scenes, sensors, st.sampled_from([1, 2, 3, 5]), st.integers(0, 99))
-def test_the_plan_keeps_within_its_tolerance(radiance: torch.Tensor, sensor: Sensor, ratio: int, seed: int) -> None:
+def test_the_plan_keeps_within_its_tolerance(
+    radiance: torch.Tensor, sensor: Instrument, ratio: int, seed: int
+) -> None:
     scene = prepare_scene(radiance, ratio)
     radiance, plan = scene.radiance, make_plan(sensor, scene.stats)
     whole = stages.before_digitising(radiance, sensor, ratio, Draw(seed))
@@ -187,7 +189,7 @@ def test_the_bound_of_defects_holds_where_the_signal_is_above_full_scale() -> No
     assert change(radiance, sensor, 3, "defects", 0) <= bound + ROUNDING_DN
 
 
-def choices(radiance: torch.Tensor, sensor: Sensor) -> dict[str, str]:
+def choices(radiance: torch.Tensor, sensor: Instrument) -> dict[str, str]:
     return {d.effect: d.choice for d in make_plan(sensor, scene_stats(radiance, 2)).decisions}
 
 

@@ -28,7 +28,7 @@ from beers_deploy.model.traditional.rows import mirrored
 from beers_deploy.profiles import load_sensor
 from beers_deploy.profiles.errors import OptionError
 from beers_deploy.profiles.response import PointSpread
-from beers_deploy.profiles.sensor import Sensor, noise_from_snr
+from beers_deploy.profiles.sensor import Instrument, noise_from_snr
 from tests.model.simulator.stages import formula_point, formula_table, point_spread, with_response
 
 DEGRADED = load_sensor("pleiades-degraded").nominal()
@@ -37,7 +37,7 @@ ORDERS: tuple[Order, ...] = get_args(Order)
 NOISE_FREE = replace(REFERENCE, alpha=0.0, beta=0.0)
 
 
-def seen_by(camera: Tensor, sensor: Sensor, reference: Sensor = NOISE_FREE) -> Pair:
+def seen_by(camera: Tensor, sensor: Instrument, reference: Instrument = NOISE_FREE) -> Pair:
     """A photograph of up to 200 W/m2/sr/um, 139 x 145 pixels within the margin, its reference without noise."""
     return simulate_pair(camera[64:267, 128:337] * (200 / 255), sensor, reference, 1, Draw(seed=1))
 
@@ -74,7 +74,7 @@ def test_each_half_of_the_chain_is_needed(pair: Pair) -> None:
 @pytest.mark.parametrize(
     "told", [replace(DEGRADED, mtf_nyquist=0.04), replace(DEGRADED, mtf_nyquist=0.15), replace(DEGRADED, alpha=0.5)]
 )
-def test_the_wrong_sensor_costs_decibels(pair: Pair, told: Sensor) -> None:
+def test_the_wrong_sensor_costs_decibels(pair: Pair, told: Instrument) -> None:
     assert restored_db(pair, Chain(told, REFERENCE)) < restored_db(pair, Chain(DEGRADED, REFERENCE)) - 1
 
 
@@ -99,7 +99,7 @@ def test_both_orders_reach_the_measured_quality(
     assert second >= first - 0.1
 
 
-def blurred_pair(radiance: Tensor, sensor: Sensor) -> tuple[Tensor, Tensor]:
+def blurred_pair(radiance: Tensor, sensor: Instrument) -> tuple[Tensor, Tensor]:
     """Digital numbers through the sensor, and the radiance at 25 % MTF without noise."""
     rows = mirrored(-64, radiance.shape[0] + 64, radiance.shape[0])
     wide = radiance[rows][:, rows]
@@ -144,7 +144,7 @@ def test_the_gain_of_each_sensor_is_its_own(pair: Pair) -> None:
 
 @pytest.mark.parametrize("level", [0.0, 4095.0])
 @pytest.mark.parametrize("sensor", [DEGRADED, NOISE_FREE, load_sensor("pleiades-variable").nominal()])
-def test_a_black_and_a_saturated_image(level: float, sensor: Sensor) -> None:
+def test_a_black_and_a_saturated_image(level: float, sensor: Instrument) -> None:
     restored = restore_traditional(torch.full((13, 21), level), Chain(sensor, REFERENCE))
     torch.testing.assert_close(restored, torch.full((13, 21), level), rtol=0, atol=0.05)
 

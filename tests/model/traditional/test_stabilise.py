@@ -8,9 +8,9 @@ import torch
 
 from beers_deploy.model.traditional.noise import bias_radiance, destabilise, stabilise
 from beers_deploy.profiles.errors import OptionError
-from beers_deploy.profiles.sensor import Sensor, noise_from_snr
+from beers_deploy.profiles.sensor import Instrument, noise_from_snr
 
-NOMINAL = Sensor(0.07, *noise_from_snr(25, 50, 100, 110), gain_dn_per_radiance=10.2375, bits=12)
+NOMINAL = Instrument(0.07, *noise_from_snr(25, 50, 100, 110), gain_dn_per_radiance=10.2375, bits=12)
 LIMITS = [
     NOMINAL,
     replace(NOMINAL, beta=0.0),
@@ -20,7 +20,7 @@ LIMITS = [
 ]
 
 
-def noisy(radiance: float, sensor: Sensor, seed: int) -> torch.Tensor:
+def noisy(radiance: float, sensor: Instrument, seed: int) -> torch.Tensor:
     normal = np.random.default_rng(seed).standard_normal(200_003)
     return torch.from_numpy(radiance + sensor.noise_sigma(radiance) * normal)
 
@@ -35,7 +35,7 @@ def test_without_it_the_variance_follows_the_light() -> None:
 
 
 @pytest.mark.parametrize("sensor", LIMITS)
-def test_round_trip_in_float32(sensor: Sensor) -> None:
+def test_round_trip_in_float32(sensor: Instrument) -> None:
     radiance = torch.linspace(0, 400, 4097)
     there_and_back = destabilise(stabilise(radiance, sensor), sensor)
     torch.testing.assert_close(there_and_back, radiance, rtol=1e-5, atol=1e-6)

@@ -17,7 +17,7 @@ from beers_deploy.model.training.workers import Worker
 from beers_deploy.profiles import load_sensor
 from beers_deploy.profiles.errors import ImageError
 from beers_deploy.profiles.response import MtfTable, PointSpread, packed
-from beers_deploy.profiles.sensor import Sensor
+from beers_deploy.profiles.sensor import Instrument
 from tests.model.training.sources import small_scene, source
 
 
@@ -34,7 +34,7 @@ def test_the_same_seed_gives_the_same_batches_from_anywhere() -> None:
 class OneSensor(SensorFamily):
     """A family of one, sharp across the track and blurred along it."""
 
-    def draw(self, _generator: np.random.Generator) -> Sensor:
+    def draw(self, _generator: np.random.Generator) -> Instrument:
         return replace(self.like, mtf_nyquist=0.15, mtf_nyquist_along=0.03, alpha=0.0, beta=0.0)
 
 

@@ -12,9 +12,9 @@ from typer.testing import CliRunner
 
 from beers_deploy.cli import app
 from beers_deploy.model.simulator.procedural import procedural_scene
-from beers_deploy.profiles import SensorProfile, load_sensor
+from beers_deploy.profiles import Sensor, load_sensor
 from beers_deploy.profiles.figures import Row, by_table, unavailable
-from beers_deploy.profiles.sensor import Sensor
+from beers_deploy.profiles.sensor import Instrument
 from beers_deploy.restoration.function import Restore
 from beers_deploy.studies.evaluation import sweep as module
 from beers_deploy.studies.evaluation import targets as targets_module
@@ -59,7 +59,7 @@ def test_what_is_supposed_wrongly_is_another_sensor_than_the_one_of_a_condition(
         )
 
 
-Swept = tuple[dict[str, dict[str, Row]], list[Sensor]]
+Swept = tuple[dict[str, dict[str, Row]], list[Instrument]]
 
 
 def half(dn: np.ndarray) -> np.ndarray:
@@ -80,9 +80,9 @@ def quick() -> Iterator[None]:
 @pytest.fixture(scope="module")
 def swept() -> Swept:
     """One sweep under three conditions: its rows, and the sensors that the able network was given."""
-    given: list[Sensor] = []
+    given: list[Instrument] = []
 
-    def specialise(sensor: Sensor) -> Restore:
+    def specialise(sensor: Instrument) -> Restore:
         given.append(sensor)
         return lambda dn: dn + np.float32(1000 * sensor.mtf_nyquist)
 
@@ -92,7 +92,7 @@ def swept() -> Swept:
     return {table: {row.name: row for row in rows} for table, rows in by_table(rows).items()}, given
 
 
-def few(_nominal: Sensor, _profile: SensorProfile) -> dict[str, Sensor]:
+def few(_nominal: Instrument, _profile: Sensor) -> dict[str, Instrument]:
     return {"nominal": NOMINAL, "MTF 3%": DRIFTED, "dim": DIM}
 
 
