@@ -15,7 +15,7 @@ from unittest.mock import patch
 import numpy as np
 
 from beers_deploy.export import float_model
-from beers_deploy.networks import float_file
+from beers_deploy.network import float_file
 from beers_deploy.profiles import load_sensor
 from beers_deploy.quant.calibration import PATCH_PX, Calibration
 from beers_deploy.quant.gate import compare
@@ -53,7 +53,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     given = parser.parse_args()
     model = float_model(float_file(given.network, load_sensor(given.sensor)))
-    calibration = Calibration(given.sensor, given.images, given.patches, given.patch, given.seed)
+    calibration = Calibration(load_sensor(given.sensor), given.images, given.patches, given.patch, given.seed)
     session, unseen = open_any_size(model), calibration.unseen.pairs
     print("| passes | MAE | PSNR drop, dB |\n|---|---|---|")
     for name, left_out in ablations():

@@ -19,7 +19,7 @@ from pathlib import Path
 
 import numpy as np
 
-from beers_deploy.networks import shipped_pair
+from beers_deploy.network import shipped_pair
 
 PROJECT = Path(__file__).resolve().parents[1]
 PROCESSORS = ("cortex-a72", "neoverse-n1", "max")
@@ -81,7 +81,7 @@ def restored(networks: list[Path], out: Path) -> None:
     y, x = np.mgrid[:83, :131]
     dn = 2048 + 1500 * np.sin(y / 9) * np.cos(x / 7) + generator.normal(0, 600, y.shape) * (x > 65)
     image = np.rint(np.clip(dn, 0, 4095)).astype(np.float32)
-    np.savez(out, **{path.stem: restore(image, path, tile_px=64, threads=1) for path in networks})
+    np.savez(out, **{path.stem: restore(image, path, tile=64, threads=1) for path in networks})
 
 
 def networks() -> list[Path]:

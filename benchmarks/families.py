@@ -225,7 +225,7 @@ def main() -> None:
     kept = [scene for scene in scenes if site_of(scene.name) not in apart]
     judging = draw_patches(held, *sensors, HELD_OUT, 1)
     source = PatchSource(kept, PatchRecipe(*sensors, patch_px=PATCH_PX), BATCH, 0)
-    drawn = Calibration(SENSOR, None, 64, 128, 0).drawn
+    drawn = Calibration(load_sensor(SENSOR), None, 64, 128, 0).drawn
     print(f"{processor_name()}, {arguments.steps * BATCH} patches each, judged by {HELD_OUT} of {len(apart)} sites")
     heads = "family", "1000 parameters", "halo, px", "float32 dB", "INT8 dB", "s a swath, best tile"
     print("|", " | ".join(heads), "|\n" + "|---" * len(heads) + "|")

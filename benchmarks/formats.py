@@ -108,7 +108,7 @@ FORMATS: dict[str, tuple[str, Callable[[Path, np.ndarray], Path]]] = {
 def restored(image: Path, model: str, *more: str) -> tuple[float, float, str]:
     """Processor time in s, peak memory in GB, and a digest of the pixels."""
     out, figures = image.with_name("out.tif"), image.with_name("out.json")
-    words = ["restore", str(image), str(out), "--model", model, "--threads", "1", "--json", str(figures), *more]
+    words = ["restore", str(image), str(out), "--network", model, "--threads", "1", "--json", str(figures), *more]
     done = subprocess.run([sys.executable, "-c", COUNTED, *words], capture_output=True, text=True, check=True)  # noqa: S603
     row = json.loads(figures.read_text())["rows"][0]["figures"]
     digest = hashlib.sha256(tifffile.imread(out).tobytes()).hexdigest()[:12]

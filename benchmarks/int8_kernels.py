@@ -18,7 +18,7 @@ import onnx
 import onnxruntime as ort
 
 from beers_deploy.model.processor import decided, int8_adds_exactly, processor_name
-from beers_deploy.networks import shipped_pair
+from beers_deploy.network import shipped_pair
 from beers_deploy.quant.kernels import filled, made_exact
 from beers_deploy.quant.onnx_file import load_onnx
 from beers_deploy.quant.session import open_session, run

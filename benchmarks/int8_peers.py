@@ -209,7 +209,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--variant", default="convbeers-s", help="shipped weights of this name")
     parser.add_argument("--float", type=Path, help="another float network, .onnx or .safetensors")
-    parser.add_argument("--data", type=Path, help="samples to calibrate on, as 'quantize --data' takes them")
+    parser.add_argument("--samples", type=Path, help="samples to calibrate on, as 'quantize --samples' takes them")
     parser.add_argument("--held-out-data", type=Path, help="samples to judge on; those of --data if none")
     parser.add_argument("--images", type=Path, help="folder of scenes for calibration; drawn ones if none")
     parser.add_argument("--sensor", default="pleiades-variable", help="profile of the calibration patches")

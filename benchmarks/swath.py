@@ -142,7 +142,7 @@ def memory(folder: Path, model: Path, size: tuple[int, int], known_rows: int | N
     width, height = size
     image, figures = folder / "swath.tif", folder / "swath.json"
     write_swath(image, height, width, known_rows or height)
-    arguments = ["restore", image, folder / "swath-out.tif", "--model", model, "--json", figures]
+    arguments = ["restore", image, folder / "swath-out.tif", "--network", model, "--json", figures]
     subprocess.run([sys.executable, "-c", ENTRY, *map(str, arguments)], check=True)  # noqa: S603
     row = json.loads(figures.read_text(encoding="utf-8"))["rows"][0]["figures"]
     time_s, peak_gb = row["time"]["value"], row["peak memory"]["value"]

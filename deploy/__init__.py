@@ -1,15 +1,16 @@
-"""The machine: what a network needs from training to a board that flies, and the command line.
+"""`import beers_deploy as bd`: satellite image restoration from training to board, as a library.
 
-- `commands`, reached from `cli`: a file a verb, which parses options, calls one function and prints;
-- `restoration`: images of any size through a network or the traditional chain; `library` does it for arrays;
-- `dpu`: the checker of operators and the cost model;
-- `export`, `quantise`, `gate`, `compare`: a network as a file, in INT8, judged, and two runs' figures side by side;
-- `bench`: how fast, and at what price;
+Nouns are values: `Sensor`, `Network`, `Board`, `Pair`, `Table`. Verbs return values and write files only where they
+are told to: `simulate`, `restore`, `quantize`, `compare`, `gate`, `check`, `predict`, `evaluate`, `tradeoff` and
+`characterize`. `sensors`, `boards` and `networks` list what is shipped. What is offered is loaded when it is asked
+for. Inside:
+
+- `network`: a network as a value; `library`, `quantise`, `verdict`, `pairs`, `board`: a verb or two each;
+- `restoration`: images of any size through a network or the traditional chain;
+- `dpu` and `bench`: the checker of operators, the cost model, and what they say of a swath;
+- `results`, `frames`, `report`: figures as tables, JSON, DataFrames and pages; `differences` of two of them;
 - `studies`: what the verbs are worth: `evaluation`, `characterise`, `stress`, `detection`, `tradeoff`, `demo`;
-- `results` and `report`: figures as tables, JSON and HTML;
-- `cluster`: the workers of a Dask scheduler.
-
-What is offered here is loaded when it is asked for.
+- `cli` and `commands`: a file a command, which parses options, calls one function and prints.
 """
 
 import lazy_loader

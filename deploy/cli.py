@@ -2,13 +2,21 @@
 
     sensor profile -> simulate -> train -> export -> quantize -> gate -> check -> bench -> restore
 
-Exit codes: 0 done, 1 a gate or check failed, 2 bad input (one sentence on standard error, nothing half-written).
+Exit codes: 0 done, 1 a gate or check failed, 2 bad input (one sentence on standard error, nothing half-written), 70 a
+fault of this program, 130 interrupted.
 """
 
+import inspect
 import io
+import re
 import sys
+import traceback
+import warnings
 from collections.abc import Callable, Iterator
-from typing import Any
+from contextlib import nullcontext
+from functools import wraps
+from itertools import pairwise
+from typing import Annotated, Any
 
 import typer
 from typer.core import TyperGroup
@@ -18,9 +26,9 @@ from beers_deploy.commands import (
     bench,
     characterise,
     check,
-    compare,
     demo,
     detect,
+    diff,
     evaluate,
     export,
     gate,
@@ -33,28 +41,93 @@ from beers_deploy.commands import (
     tradeoff,
     train,
 )
-from beers_deploy.profiles.errors import BeersError
+from beers_deploy.commands.shared import results_to
+from beers_deploy.model.progress import reporting
+from beers_deploy.profiles.errors import BeersError, OutsideRangeWarning, visible
+
+CRASHED, INTERRUPTED = 70, 130
+"""Exit codes of a fault in this program (sysexits' EX_SOFTWARE), and of Ctrl-C."""
+
+Quiet = Annotated[bool, typer.Option("-q", "--quiet", help="Show no progress.")]
+Verbose = Annotated[bool, typer.Option("-v", "--verbose", help="Show where in the program an error arose.")]
 
 
 class Group(TyperGroup):
-    """Turns what a user can correct into one sentence and exit code 2."""
+    """Prints warnings as lines, and keeps standard output for results where they are asked for there."""
 
     def invoke(self, ctx: Any) -> Any:
         """Run the chosen command."""
-        try:
+        with warnings.catch_warnings(), results_to(sys.stdout) if _pipes_results(ctx) else nullcontext():
+            warnings.simplefilter("always", OutsideRangeWarning)
+            warnings.showwarning = _print_warning
             return super().invoke(ctx)
+
+
+def command(function: Callable[..., None]) -> Callable[..., None]:
+    """A command with the options that every one has, and one sentence for whatever ends it.
+
+    What a user can correct ends it with code 2, anything else with 70: a failed gate alone ends with 1.
+    """
+
+    @wraps(function)
+    def run(*given: Any, quiet: bool = False, verbose: bool = False, **named: Any) -> None:
+        try:
+            with reporting(False if quiet else None):
+                function(*given, **named)
+            return
+        except (typer.Exit, typer.Abort):
+            raise
         except BeersError as error:
-            message = str(error)
+            message, code = in_options(str(error), function), 2
         except MemoryError:
-            message = "memory: expected enough for this input, got none left; give a smaller image or tile."
+            message, code = "memory: expected enough for this input, got none left; give a smaller image or tile.", 2
+        except KeyboardInterrupt:
+            message, code = "interrupted", INTERRUPTED
+        except Exception as error:  # noqa: BLE001 - whatever it is must not look like a failed gate
+            message, code, verbose = f"a fault of this program, please report it: {error!r}", CRASHED, True
+        if verbose:
+            traceback.print_exc()
         typer.echo(f"beers-deploy: {message}", err=True)
-        raise typer.Exit(2)
+        raise typer.Exit(code)
+
+    signature, more = inspect.signature(function), {"quiet": Quiet, "verbose": Verbose}
+    kind = inspect.Parameter.KEYWORD_ONLY
+    extra = [inspect.Parameter(name, kind, default=False, annotation=hint) for name, hint in more.items()]
+    own = [*signature.parameters.values(), *extra]
+    run.__signature__ = signature.replace(parameters=own)  # type: ignore[attr-defined]
+    run.__annotations__ = {**function.__annotations__, **more}
+    return run
+
+
+def in_options(message: str, function: Callable[..., None]) -> str:
+    """A message of the library, whose parameters are named as a command's options.
+
+    Args:
+        message: begins with the parameter at fault, or names parameters in backquotes.
+        function: of the command.
+    """
+
+    def option(found: re.Match[str]) -> str:
+        named = found[1] in parameters and parameters[found[1]].default is not inspect.Parameter.empty
+        return f"--{found[1].replace('_', '-')}" if named else found[1]
+
+    parameters = inspect.signature(function).parameters
+    return re.sub(r"`(\w+)`", option, re.sub(r"^(\w+)(?=:)", option, message))
+
+
+def _pipes_results(context: typer.Context) -> bool:
+    """Whether the results are asked for on standard output: then all else goes to standard error."""
+    words = [*context._protected_args, *context.args]
+    return ("--json", "-") in pairwise(words) or "--json=-" in words
+
+
+def _print_warning(message: Warning | str, *_: object, **__: object) -> None:
+    typer.echo(visible(str(message)), err=True)
 
 
 app = typer.Typer(
     cls=Group,
     no_args_is_help=True,
-    add_completion=False,
     pretty_exceptions_enable=False,
     rich_markup_mode="rich",
     context_settings={"help_option_names": ["-h", "--help"]},
@@ -74,7 +147,7 @@ def main(
     context: typer.Context,
     version: bool = typer.Option(False, "--version", help="Print the version."),
     verbose: bool = typer.Option(
-        False, "--verbose", help="With --version: what it runs on, and what was asked of it."
+        False, "-v", "--verbose", help="With --version: what it runs on, and what was asked of it."
     ),
 ) -> None:
     """Check the installation before any command runs."""
@@ -110,24 +183,27 @@ def example(text: str) -> str:
     return f"Example:  [bold]beers-deploy {text}[/bold]"
 
 
-COMMANDS: dict[str, tuple[Callable[..., None], str]] = {
-    "demo": (demo.demo, demo.EXAMPLE),
-    "profiles": (profiles.profiles, profiles.EXAMPLE),
-    "characterise": (characterise.characterise, characterise.EXAMPLE),
-    "simulate": (simulate.simulate, simulate.EXAMPLE),
-    "train": (train.train, train.EXAMPLE),
-    "export": (export.export, export.EXAMPLE),
-    "quantize": (quantize.quantize, quantize.EXAMPLE),
-    "gate": (gate.gate, gate.EXAMPLE),
-    "check": (check.check, check.EXAMPLE),
-    "bench": (bench.bench, bench.EXAMPLE),
-    "info": (info.info, info.EXAMPLE),
-    "restore": (restore.restore, restore.EXAMPLE),
-    "evaluate": (evaluate.evaluate, evaluate.EXAMPLE),
-    "detect": (detect.detect, detect.EXAMPLE),
-    "stress": (stress.stress, stress.EXAMPLE),
-    "tradeoff": (tradeoff.tradeoff, tradeoff.EXAMPLE),
-    "compare": (compare.compare, compare.EXAMPLE),
+RESTORE, INT8, BOARDS, STUDY, TRAIN = "Restore", "Quantise and judge", "Boards", "Study", "Sensors and training"
+"""Panels of the help."""
+
+COMMANDS: dict[str, tuple[Callable[..., None], str, str]] = {
+    "restore": (restore.restore, restore.EXAMPLE, RESTORE),
+    "info": (info.info, info.EXAMPLE, RESTORE),
+    "demo": (demo.demo, demo.EXAMPLE, RESTORE),
+    "export": (export.export, export.EXAMPLE, INT8),
+    "quantize": (quantize.quantize, quantize.EXAMPLE, INT8),
+    "gate": (gate.gate, gate.EXAMPLE, INT8),
+    "diff": (diff.diff, diff.EXAMPLE, INT8),
+    "check": (check.check, check.EXAMPLE, BOARDS),
+    "bench": (bench.bench, bench.EXAMPLE, BOARDS),
+    "evaluate": (evaluate.evaluate, evaluate.EXAMPLE, STUDY),
+    "tradeoff": (tradeoff.tradeoff, tradeoff.EXAMPLE, STUDY),
+    "stress": (stress.stress, stress.EXAMPLE, STUDY),
+    "detect": (detect.detect, detect.EXAMPLE, STUDY),
+    "profiles": (profiles.profiles, profiles.EXAMPLE, TRAIN),
+    "characterise": (characterise.characterise, characterise.EXAMPLE, TRAIN),
+    "simulate": (simulate.simulate, simulate.EXAMPLE, TRAIN),
+    "train": (train.train, train.EXAMPLE, TRAIN),
 }
-for name, (function, text) in COMMANDS.items():
-    app.command(name, epilog=example(text))(function)
+for name, (function, text, panel) in COMMANDS.items():
+    app.command(name, epilog=example(text), rich_help_panel=panel)(command(function))

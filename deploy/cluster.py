@@ -9,7 +9,7 @@ from importlib import import_module
 from importlib.metadata import version
 from typing import Any, TypeVar
 
-from beers_deploy.profiles.errors import MachineError
+from beers_deploy.profiles.errors import MachineError, MissingExtraError
 
 ANSWER_S, JOIN_S = 10, 30
 """How long a scheduler may take to answer, and a first worker to be there."""
@@ -92,7 +92,7 @@ def open_cluster(scheduler: str | None) -> Iterator[Cluster | None]:
 
 
 def _lost(got: str, remedy: str) -> MachineError:
-    remedy = f"{remedy}, and go on with --resume"
+    remedy = f"{remedy}, and go on with `resume`"
     return MachineError("workers", expected="some that live to the end", got=got, remedy=remedy)
 
 
@@ -101,7 +101,7 @@ def _import_distributed() -> Any:
         return import_module("distributed")
     except ImportError as error:
         got, remedy = "no package distributed", "pip install 'beers-deploy[dask]'"
-        raise MachineError("--scheduler", expected="Dask installed", got=got, remedy=remedy) from error
+        raise MissingExtraError("scheduler", expected="Dask installed", got=got, remedy=remedy) from error
 
 
 def _connect(distributed: Any, address: str) -> Any:

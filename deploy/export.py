@@ -127,7 +127,7 @@ def require_tile(tile_px: int | None, scale: int) -> None:
     """
     if tile_px is not None and tile_px % scale:
         remedy = "choose another, or leave it out"
-        raise OptionError("--tile", expected=f"a multiple of {scale} px", got=f"{tile_px} px", remedy=remedy)
+        raise OptionError("tile", expected=f"a multiple of {scale} px", got=f"{tile_px} px", remedy=remedy)
 
 
 def _arrays(network: "Weights | ConvBEERS") -> Arrays:

@@ -69,12 +69,12 @@ def info_row(image: Path, options: Options, target: TargetProfile, measure: bool
 def scale_words(name: str, raster: Raster, options: Options) -> Mapping[str, str]:
     """Full scale, and from where; what is open is said."""
     if raster.dtype.kind == "f" and options.full_scale is None:
-        why = "the pixels decide when they are read: digital numbers if one is above 2, else --full-scale is needed"
+        why = "the pixels decide when they are read: digital numbers if one is above 2, else state the full scale"
         return {"full scale": "open", "full scale from": why}
     try:
         scale = full_scale_of(name, raster, (), options.full_scale, options.sensor_bits)
     except ImageError as error:
-        return {"full scale": "open", "full scale from": f"{error.got}; {error.remedy}"}
+        return {"full scale": "open", "full scale from": f"{error.got}; state the pixel value that is full scale"}
     return {"full scale": f"{scale.value:g}", "full scale from": scale.source}
 
 
@@ -97,7 +97,7 @@ def _code(keys: Any) -> str:
 
 
 def _not_measured() -> Figure:
-    return unavailable("s", "no tile was timed here: --measure times some")
+    return unavailable("s", "no tile was timed here: ask for it to be measured")
 
 
 def time_here(network: onnx.ModelProto, plan: Plan, options: Options) -> Figure:

@@ -1,96 +1,246 @@
-"""For notebooks: `from beers_deploy.library import restore`, on arrays of numpy, Dask and xarray.
+"""`restore` on arrays of NumPy, torch, Dask and xarray, and on files.
 
 The pixels are those that the command `restore` writes of the same image.
 """
 
-import warnings
-from dataclasses import dataclass
+import os
+from dataclasses import dataclass, replace
 from importlib import import_module
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Literal
 
 import numpy as np
 
 from beers_deploy.model.io.images import settled_scale
-from beers_deploy.networks import network_file
-from beers_deploy.profiles.errors import ImageError, OptionError
-from beers_deploy.profiles.sensor_file import BLIND, load_sensor
+from beers_deploy.model.progress import Progress, no_log, reporting
+from beers_deploy.model.shipped import INT8, VARIANT
+from beers_deploy.network import Network, NetworkLike, SensorLike
+from beers_deploy.profiles.errors import ImageError, OptionError, optional
+from beers_deploy.profiles.sensor import Sensor
+from beers_deploy.profiles.sensor_file import BLIND
 from beers_deploy.quant.onnx_file import load_onnx
 from beers_deploy.quant.tiling.walk import Tiling
-from beers_deploy.restoration.engine import NAME, Restorer, checked_strip, restore_array
+from beers_deploy.restoration.engine import NAME, Restorer, as_stored, checked_strip, restore_array
 from beers_deploy.restoration.options import TILE_PX, Options, Runtime
 from beers_deploy.restoration.plan import Plan, Span, plan_for
-from beers_deploy.restoration.run import scale_of
+from beers_deploy.restoration.radiometry import full_scale_of
+from beers_deploy.restoration.run import restore_file, scale_of
 from beers_deploy.restoration.runtime import Packed, open_packed, open_runtime, pack, tiles_at_once
 from beers_deploy.restoration.source import ArraySource, Raster, require_numbers, usable_nodata
+from beers_deploy.results import Table
 
-Image = TypeVar("Image")
-"""numpy.ndarray, dask.array.Array or xarray.DataArray."""
+NETWORK, TRADITIONAL = "network", "traditional"
 
 
 def restore(
-    image: Image,
-    model: Path | str | None = None,
+    image: Any,
+    network: NetworkLike | None = None,
     *,
-    tile_px: int = TILE_PX,
-    halo: int | str = "exact",
+    sensor: SensorLike = BLIND,
+    method: Literal["network", "traditional"] = "network",
+    quality: str = "standard",
     full_scale: float | None = None,
+    nodata: float | None = None,
+    tile: int = TILE_PX,
+    halo: int | str = "exact",
     runtime: str = "onnxruntime",
     threads: int = 0,
-    nodata: float | None = None,
-    sensor: str = BLIND,
-) -> Image:
-    """Restore an image of raw digital numbers, (H, W) or (bands, H, W).
+    out: str | os.PathLike[str] | None = None,
+    resume: bool = False,
+    cog: bool = False,
+    progress: Progress = None,
+) -> Any:
+    """Restore an image of raw digital numbers: an array, or a file into another.
 
     A network of one band restores bands one by one, another one those that it takes together.
 
     Args:
-        image: of numpy it is restored at once; of Dask the result is lazy, a chunk for each tile and band, and may be
-            computed on a cluster that has this package; an xarray.DataArray keeps coordinates and attributes.
-        model: ONNX file, float or INT8, or the name of a shipped network, in INT8 with -int8 behind it;
-            convbeers-s-int8 if None.
-        tile_px: longest side of a tile.
-        halo: 'exact', or pixels of context around a tile.
-        full_scale: the pixel value that is 1.0 to the network. None is 4095 (12 bits) for integers of more than 8
-            bits and for floats of digital numbers; 8-bit pixels, and floats that all lie in about 0..1, are refused
-            without it. Floats of Dask are judged tile by tile when they are computed.
-        runtime: 'onnxruntime' or 'openvino'.
-        threads: of the runtime; 0 takes every core, or one for each of Dask's own threads.
+        image: (H, W) or (bands, H, W). Of NumPy (masked or not) and torch it is restored at once; of Dask the result
+            is lazy, a chunk for each tile and band, and may be computed on a cluster that has this package; an
+            xarray.DataArray keeps coordinates and attributes, its bands in a dimension "band" wherever that stands.
+            Or the path of an image file, restored into `out`.
+        network: what `Network.load` takes; convbeers-s-int8 if None.
+        sensor: that a shipped network is told, or that the traditional pipeline knows: a `Sensor`, a name, a .toml
+            file, or "blind" where it is not known.
+        method: "network", or "traditional" for the denoising and deconvolution that networks are compared with.
+        quality: of the traditional pipeline on arrays: fast, standard or best.
+        full_scale: the pixel value that is 1.0 to the network. None is a DataArray's attribute of that name, or 4095
+            (12 bits) for integers of more than 8 bits and for floats of digital numbers; without it 8-bit pixels, and
+            floats that all lie in about 0..1, are refused. Floats of Dask are judged tile by tile when computed.
         nodata: the value of missing pixels, besides NaN; a DataArray's own `_FillValue` if None.
-        sensor: that a shipped network is told: a profile's name, a .toml file, or 'blind' where it is not
-            known. INT8 for a sensor of your own takes minutes once, and is kept.
+        tile: longest side of a tile in pixels.
+        halo: "exact", or pixels of context around a tile.
+        runtime: "onnxruntime" or "openvino".
+        threads: of the runtime; 0 takes every core, or one for each of Dask's own threads.
+        out: the TIFF that a file is restored into; files alone.
+        resume: go on with a run into `out` that was stopped.
+        cog: write `out` as a Cloud-Optimised GeoTIFF.
+        progress: a function that is told each step, False for silence, None for a bar or lines on standard error.
 
     Returns:
         The same kind and scale, uint8 of uint8, uint16 of other integers, float32 of floats; of the same shape,
-        unless the network makes more pixels or other bands. Missing pixels stay as they are.
+        unless the network makes more pixels or other bands. Missing pixels stay as they are. Of a file a table of the
+        run, with its `path` and `time_s`.
 
     Raises:
-        ImageError: no such array, pixels that leave the full scale open, or values outside 0 to full scale; of
+        ImageError: no such image, pixels that leave the full scale open, or values outside 0 to full scale; of
             Dask when it is computed.
         ModelError: a network that cannot be tiled or run.
         OptionError: options that do not go together.
         ProfileError: no such sensor.
-        MachineError: a missing package, or a cache that cannot be written.
+        MachineError: a missing package, memory, or a disk that cannot be written.
     """
-    network = network_file(Path(model) if model else None, load_sensor(sensor), warnings.warn)
-    options = Options(network, tile_px, str(halo), full_scale, _runtime(runtime), threads)
-    if hasattr(image, "coords") and hasattr(image, "dims"):  # an xarray.DataArray, without importing it
-        labelled: Any = image
-        missing = labelled.attrs.get("_FillValue") if nodata is None else nodata
-        restored: Image = _labelled(labelled, _restore(labelled.data, options, missing))
-        return restored
-    plain: Image = _restore(image, options, nodata)
-    return plain
+    known = Sensor.load(sensor)
+    job = Job(method, quality, known, nodata, _options(network, known, tile, halo, full_scale, runtime, threads))
+    with reporting(progress):
+        if isinstance(image, str | os.PathLike) or hasattr(image, "crs"):  # the latter of rasterio
+            path = Path(image if isinstance(image, str | os.PathLike) else image.name)
+            return _restore_path(path, replace(job.options, resume=resume, cog=cog), job, out)
+        if out is not None or resume or cog:
+            remedy = "give a path, or save the result yourself"
+            raise OptionError("out", expected="none beside an array", got=str(out), remedy=remedy)
+        return _restore_any(image, job)
 
 
-def _restore(image: Any, options: Options, nodata: float | None) -> Any:
-    bands = _bands_first(image)
-    raster = _raster(bands, nodata)
-    if hasattr(image, "__dask_graph__"):
-        restored = restore_lazily(bands, raster, options)
+@dataclass(frozen=True)
+class Job:
+    """How an array is restored, and the value of its missing pixels."""
+
+    method: str
+    quality: str
+    sensor: Sensor
+    nodata: float | None
+    options: Options
+
+
+@dataclass(frozen=True, repr=False, kw_only=True)
+class Run(Table):
+    """One file restored into another.
+
+    Attributes:
+        path: of the restored image.
+        time_s: from opening the image to the finished file.
+    """
+
+    path: Path
+    time_s: float
+
+
+def _options(
+    network: NetworkLike | None,
+    sensor: Sensor,
+    tile_px: int,
+    halo: int | str,
+    full_scale: float | None,
+    runtime: str,
+    threads: int,
+) -> Options:
+    found = Network.load(f"{VARIANT}{INT8}" if network is None else network, sensor=sensor)
+    bits = None if sensor.name == BLIND else int(sensor.bits.low)
+    return Options(found.file, tile_px, str(halo), full_scale, _runtime(runtime), threads, sensor_bits=bits)
+
+
+def _restore_path(image: Path, options: Options, job: Job, out: str | os.PathLike[str] | None) -> Run:
+    if out is None:
+        remedy = "name the TIFF to write, or read the image into an array"
+        raise OptionError("out", expected="a path beside an image file", got="none", remedy=remedy)
+    path = Path(out)
+    if job.method == TRADITIONAL:
+        from beers_deploy.restoration.traditional import Request, restore_file_traditionally  # it takes torch
+
+        request = Request(job.sensor, job.sensor.reference, options.full_scale)
+        row = restore_file_traditionally(image, path, request)
     else:
-        restored = _restore_now(bands, raster, options)
+        row = restore_file(image, path, options, no_log)
+    arguments = {"method": job.method, "sensor": job.sensor.name, "tile": options.tile_px, "halo": options.halo}
+    inputs, time_s = (options.model, image), row.figures["time"].value or 0.0
+    return Run("restore", arguments, inputs, (row,), path=path, time_s=time_s)
+
+
+def _restore_any(image: Any, job: Job) -> Any:
+    """An array of any kind, to the same kind."""
+    if hasattr(image, "coords") and hasattr(image, "dims"):  # of xarray, without importing it
+        return _restore_labelled(image, job)
+    if hasattr(image, "detach"):  # of torch
+        restored = _restore(image.detach().cpu().numpy(), job)
+        return import_module("torch").from_numpy(restored).to(image.device)
+    if np.ma.isMaskedArray(image):
+        return _restore_masked(image, job)
+    return _restore(image, job)
+
+
+def _restore_labelled(image: Any, job: Job) -> Any:
+    """An xarray.DataArray; bands may stand behind the rows and columns where their dimension says so."""
+    if hasattr(image, "data_vars"):
+        names = ", ".join(map(str, image.data_vars)) or "none"
+        remedy = "choose one of its variables"
+        raise ImageError(NAME, expected="an xarray.DataArray", got=f"a Dataset of {names}", remedy=remedy)
+    own = image.attrs.get("full_scale")
+    options = (
+        job.options if job.options.full_scale is not None or own is None else replace(job.options, full_scale=own)
+    )
+    missing = image.attrs.get("_FillValue") if job.nodata is None else job.nodata
+    dims, bands = image.dims, next((dim for dim in image.dims if dim in BAND_DIMS), None)
+    ordered = image if bands is None or image.ndim != 3 else image.transpose(bands, ...)
+    if image.ndim == 3 and bands is None and ordered.shape[-1] <= FEW < min(ordered.shape[:-1]):
+        raise _bands_last(ordered.shape, "name the dimension of the bands 'band'")
+    pixels = _restore(ordered.data, replace(job, options=options, nodata=missing))
+    restored = _labelled(ordered, pixels)
+    return restored if restored.ndim != len(dims) else restored.transpose(*dims)
+
+
+def _restore_masked(image: Any, job: Job) -> Any:
+    """A masked array; under the mask a value stands that no pixel has."""
+    held = np.ma.getdata(image)
+    if held.dtype.kind == "f":
+        marked, nodata = np.where(np.ma.getmaskarray(image), np.nan, held).astype(held.dtype), job.nodata
+    else:
+        top = int(np.iinfo(held.dtype).max)
+        nodata = next(value for value in range(top, -1, -1) if not (held == value).any())
+        marked = np.where(np.ma.getmaskarray(image), held.dtype.type(nodata), held)
+    restored = _restore(marked, replace(job, nodata=nodata))
+    mask = np.ma.getmaskarray(image)
+    if restored.shape != mask.shape:
+        return np.ma.masked_where(np.isnan(restored) if held.dtype.kind == "f" else restored == nodata, restored)
+    return np.ma.array(restored, mask=mask)
+
+
+def _restore(image: Any, job: Job) -> Any:
+    bands = _bands_first(image)
+    raster = _raster(bands, job.nodata)
+    lazy = hasattr(image, "__dask_graph__")
+    if job.method == TRADITIONAL:
+        if lazy:
+            remedy = "compute it first, or take a network"
+            raise OptionError("method", expected="network for a Dask array", got=job.method, remedy=remedy)
+        restored = _restore_traditionally(bands, raster, job)
+    elif job.method != NETWORK:
+        raise OptionError("method", expected=f"{NETWORK} or {TRADITIONAL}", got=repr(job.method), remedy="choose one")
+    elif lazy:
+        restored = restore_lazily(bands, raster, job.options)
+    else:
+        restored = _restore_now(bands, raster, job.options)
     return restored[0] if image.ndim == 2 and len(restored) == 1 else restored
+
+
+def _restore_traditionally(bands: np.ndarray, raster: Raster, job: Job) -> np.ndarray:
+    """Each band by the traditional pipeline; missing pixels stay as they are."""
+    torch = optional("torch", "method", "torch")
+    from beers_deploy.model.traditional.pipeline import Chain, restore_traditional
+
+    chain = Chain(job.sensor.nominal(), job.sensor.reference.nominal(), job.quality)
+    bits = int(chain.degraded.max_dn).bit_length()
+    largest = (raster.largest(band) for band in bands)
+    full_scale = full_scale_of(NAME, raster, largest, job.options.full_scale, bits).value
+    to_dn, restored = np.float32(chain.degraded.max_dn / full_scale), []
+    for band in bands:
+        strip = checked_strip(raster, 0, band[None], full_scale, NAME)
+        dn = band.astype(np.float32) * to_dn
+        missing = np.zeros(band.shape, bool) if strip.missing is None else strip.missing[0]
+        dn[missing] = np.nan
+        found = np.nan_to_num(restore_traditional(torch.from_numpy(dn), chain).numpy()) / to_dn
+        restored.append(np.where(missing, band.astype(raster.out_dtype), as_stored(raster, found, full_scale)))
+    return np.stack(restored)
 
 
 def _labelled(image: Any, pixels: Any) -> Any:
@@ -128,13 +278,25 @@ def _restore_now(bands: np.ndarray, raster: Raster, options: Options) -> np.ndar
     return restore_array(source, plan, restorer, at_once)
 
 
+BAND_DIMS = ("band", "bands", "channel", "wavelength")
+FEW = 4
+"""Bands of a photograph: a last axis of no more, behind two longer ones, holds bands and no columns."""
+
+
 def _bands_first(image: Any) -> Any:
-    shape = getattr(image, "shape", ())
-    if len(shape) not in (2, 3) or 0 in shape or any(side != side for side in shape) or np.ma.isMaskedArray(image):
-        got = "a masked array" if np.ma.isMaskedArray(image) else f"{type(image).__name__} of shape {shape}"
+    shape: tuple[int, ...] = getattr(image, "shape", ())
+    if len(shape) not in (2, 3) or 0 in shape or any(side != side for side in shape):
+        got = f"{type(image).__name__} of shape {shape}" if shape else type(image).__name__
         remedy = "give pixels as an array, missing ones as NaN or as nodata, sizes known"
         raise ImageError(NAME, expected="an array (H, W) or (bands, H, W)", got=got, remedy=remedy)
+    if len(shape) == 3 and shape[2] <= FEW < min(shape[:2]):
+        raise _bands_last(shape, "numpy.moveaxis(image, -1, 0) puts them first")
     return image if len(shape) == 3 else image[None]
+
+
+def _bands_last(shape: tuple[int, ...], remedy: str) -> ImageError:
+    got = f"shape {tuple(shape)}, which ends in bands"
+    return ImageError(NAME, expected="an array (bands, H, W)", got=got, remedy=remedy)
 
 
 def _raster(bands: Any, nodata: float | None) -> Raster:

@@ -1,163 +1,179 @@
-"""One float network quantised: the files, the tables and the report that the command `quantize` leaves.
+"""A float network quantised: what `quantize` makes of it, layer by layer in whole numbers, and where INT8 errs."""
 
-Layer by layer in whole numbers, and which layers and patches err.
-"""
-
-from collections.abc import Callable
+import os
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 import onnx
 
-from beers_deploy.model.progress import Log, progress
-from beers_deploy.networks import Conditioned, family_model, told_int8
-from beers_deploy.profiles import load_sensor
+from beers_deploy.dpu.board import BoardLike
+from beers_deploy.model.progress import Progress, reporting
+from beers_deploy.model.progress import progress as begun
+from beers_deploy.model.shipped import SENSOR
+from beers_deploy.network import (
+    Conditioned,
+    Network,
+    NetworkLike,
+    SensorLike,
+    conditioned,
+    family_model,
+    told_int8,
+)
 from beers_deploy.profiles.errors import OptionError
 from beers_deploy.profiles.figures import Row
-from beers_deploy.profiles.target import TargetProfile, board_names
-from beers_deploy.quant.calibration import Calibration, Patches
+from beers_deploy.profiles.sensor import Sensor
+from beers_deploy.profiles.target import DEFAULT_TARGET, TargetProfile, board_names
 from beers_deploy.quant.core import IntCore, Shifts, target_shifts
-from beers_deploy.quant.encodings import board_model, read_core
+from beers_deploy.quant.encodings import read_core
 from beers_deploy.quant.free import quantise_free
 from beers_deploy.quant.gate import compare, gate_row
 from beers_deploy.quant.integer import integer_rows
-from beers_deploy.quant.onnx_file import metadata, save_onnx
+from beers_deploy.quant.onnx_file import require_quantised
 from beers_deploy.quant.passes.tune import Tuning
-from beers_deploy.quant.quantise import Quantised, quantise_model
-from beers_deploy.quant.samples import OwnSamples
+from beers_deploy.quant.quantise import quantise_model
+from beers_deploy.quant.samples import OwnSamples, samples_of
 from beers_deploy.quant.sensitivity import WORST, headline, layer_error_rows, sizes_row, spread_of, worst_row
 from beers_deploy.quant.session import open_any_size
-from beers_deploy.report.page import Report, write_report
+from beers_deploy.report.page import Report
 from beers_deploy.report.sensitivity_page import sensitivity_page
 
+if TYPE_CHECKING:
+    from beers_deploy.quant.calibration import Calibration, Patches
 
-def sensitivity_report(
-    model: onnx.ModelProto, result: Quantised, held_out: Patches, more: list[Row]
-) -> tuple[list[Row], Report]:
-    """Where INT8 errs on patches that calibration did not see: the rows, and the page with those of `more` after."""
-    sessions = open_any_size(model), open_any_size(result.host)
-    gate, spread = compare(*sessions, held_out.pairs), spread_of(*sessions, held_out.degraded)
-    worst = spread.worst(WORST)
-    layers = layer_error_rows(result, held_out)
-    rows = [gate_row(gate), *layers, *(worst_row(k, held_out, spread) for k in worst), sizes_row(spread)]
-    return rows, sensitivity_page(headline(gate, layers), [*rows, *more], spread, held_out, sessions, worst)
-
-
-Source = Calibration | OwnSamples
+Source: TypeAlias = "Calibration | OwnSamples"
 """Where patches come from: simulated ones, or a user's own."""
-Show = Callable[[str, list[Row]], None]
-"""Shows a table under its title as soon as it is made."""
 
 
-def quantise_free_file(model: onnx.ModelProto, calibration: Source, out: Path, log: Log, show: Show) -> list[Row]:
-    """Write the INT8 file without the DPU's rules, and compare it with the float network."""
-    with progress("calibrating") as step:
-        made = quantise_free(model, calibration.drawn, calibration.about, step)
-    save_onnx(made, out)
-    log(f"wrote {out}: float scales, for boards that are not the DPU")
-    sessions, simulated = (open_any_size(model), open_any_size(made)), isinstance(calibration, Calibration)
-    row = gate_row(compare(*sessions, calibration.unseen.pairs, simulated))
-    show("float against INT8, on patches that calibration did not see", [row])
-    return [row]
-
-
-def quantise_legal_file(
-    model: onnx.ModelProto,
-    calibration: Source,
-    target: TargetProfile,
-    out: Path,
-    log: Log,
-    show: Show,
+def quantize(
+    network: NetworkLike,
+    samples: object = None,
     *,
-    board: Path | None = None,
-    page: Path | None = None,
+    board: BoardLike = DEFAULT_TARGET,
+    sensor: SensorLike = SENSOR,
+    regime: Literal["legal", "free"] = "legal",
+    images: Path | None = None,
+    patches: int = 64,
+    patch_px: int = 128,
     finetune: int = 0,
-) -> list[Row]:
-    """Write the INT8 file under the target's rules; show each integer layer.
+    seed: int = 0,
+    progress: Progress = None,
+) -> Network:
+    """Quantise a float network to static INT8.
 
     Args:
-        model: the float network.
-        calibration: where its patches come from.
-        target: whose rules to obey.
-        out: the host's file.
-        log: is told what was written.
-        show: shows the tables.
-        board: the board's file, or None.
-        page: of the errors of layers and patches, or None.
+        network: the float network. A shipped name, or weights that `train --conditioned` wrote, are calibrated over
+            the whole family of sensors and told `sensor`.
+        samples: what it is calibrated on: a file, a folder, a batch (N, C, H, W) in [0, 1], two batches (images,
+            references), or an iterable of these such as a DataLoader; None simulates patches.
+        board: whose rules to obey.
+        sensor: of the simulated patches.
+        regime: legal, under the board's rules, or free of them: float scales, a channel's own for weights.
+        images: folder of scenes for the simulated patches; None for drawn ones.
+        patches: how many are simulated.
+        patch_px: their side.
         finetune: for how many steps the whole numbers are trained.
+        seed: of the patches.
+        progress: a function that is told each step, False for silence, None for a bar or lines on standard error.
+
+    Returns:
+        The INT8 network: `origin` is the float one, `layers` says how wide each layer's sums are and what saturates.
 
     Raises:
-        OptionError: a target without a DPU.
+        ModelError: an operation that the DPU does not compute, or weights of no sensible size.
+        OptionError: a board without a DPU, samples that the network needs, or options that do not go together.
+        ImageError: samples that the network does not take.
+        ProfileError: no such board or sensor.
     """
+    target, known, banked = TargetProfile.load(board), Sensor.load(sensor), _conditioned(network)
+    _require_regime(regime)
+    if banked and (regime == "free" or finetune or samples is not None):
+        remedy = "leave it out: such a network is calibrated over the whole family of sensors at once"
+        expected = "no other regime, samples or fine-tuning"
+        raise OptionError("a network behind a bank", expected=expected, got="one", remedy=remedy)
+    origin = Network.load(network, sensor=known)
+    require_quantised(origin.model, origin.label, wanted=False)
+    own = samples_of(origin.model, samples)
+    with reporting(progress):
+        if banked:
+            simulated = _simulated(known, images, patches, patch_px, seed)
+            return replace(_banked(banked, simulated, known, target), origin=origin)
+        calibration: Source = own or _simulated(known, images, patches, patch_px, seed)
+        made = _free(origin, calibration) if regime == "free" else _legal(origin, calibration, target, finetune)
+    return replace(made, origin=origin)
+
+
+def _require_regime(regime: str) -> None:
+    if regime not in ("legal", "free"):
+        raise OptionError("regime", expected="legal or free", got=repr(regime), remedy="choose one")
+
+
+def _conditioned(network: NetworkLike) -> Conditioned | None:
+    return conditioned(Path(network)) if isinstance(network, str | os.PathLike) else None
+
+
+def _simulated(sensor: Sensor, images: Path | None, patches: int, patch_px: int, seed: int) -> "Calibration":
+    from beers_deploy.quant.calibration import Calibration  # it takes torch
+
+    return Calibration(sensor, images, patches, patch_px, seed)
+
+
+def _free(origin: Network, calibration: Source) -> Network:
+    with begun("calibrating") as step:
+        made = quantise_free(origin.model, calibration.drawn, calibration.about, step)
+    return Network(made, f"{origin.name}-int8")
+
+
+def _legal(origin: Network, calibration: Source, target: TargetProfile, finetune: int) -> Network:
     shifts = _shifts_of(target)
     tuning = Tuning(calibration.for_tuning.pairs, finetune) if finetune else None
-    with progress("calibrating") as step:
+    with begun("calibrating") as step:
         about = {**calibration.about, "target": target.name}
-        result = quantise_model(model, calibration.drawn, about, shifts, tuning, log=step)
-    save_onnx(result.host, out)
-    log(f"wrote {out}: {len(result.core.ops)} integer operations, {result.relus} ReLUs kept")
-    if board is not None:
-        save_onnx(result.board, board)
-        log(f"wrote {board}: the same numbers in the board's encoding")
-    rows = _layers(model, result.core, result.host, calibration.drawn, show)
-    return _with_sensitivity(model, result, calibration, rows, page, log) if page else rows
+        result = quantise_model(origin.model, calibration.drawn, about, shifts, tuning, log=step)
+    layers = _layers(origin.model, result.core, result.host, calibration.drawn)
+    return Network(result.host, f"{origin.name}-int8", layers=layers, quantised=result)
 
 
-def quantise_banked_file(
-    network: Conditioned,
-    calibration: Calibration,
-    target: TargetProfile,
-    out: Path,
-    board: Path | None,
-    log: Log,
-    show: Show,
-) -> list[Row]:
-    """Write the INT8 file of a network behind a bank, told a sensor; show each integer layer on its patches.
-
-    Args:
-        network: of weights that 'train --conditioned' wrote.
-        calibration: scenes and seed of the family's patches, and the sensor that is told.
-        target: whose rules to obey.
-        out: the host's file.
-        board: the board's, or None.
-        log: is told what was written.
-        show: shows the tables.
-
-    Raises:
-        OptionError: a target without a DPU.
-        ModelError: other weights.
-    """
-    sensor, made = load_sensor(calibration.sensor), {"target": target.name}
+def _banked(network: Conditioned, calibration: "Calibration", sensor: Sensor, target: TargetProfile) -> Network:
+    """A network behind a bank, told a sensor; each integer layer on its patches."""
     family = family_model(network, calibration.images, calibration.seed, _shifts_of(target))
-    host = told_int8(family, sensor, made, log)
-    core = read_core(host)
-    save_onnx(host, out)
-    log(f"wrote {out}: {len(core.ops)} integer operations, for {sensor.name}; any sensor in range can be told to it")
-    if board is not None:
-        save_onnx(board_model(core, metadata(host)), board)
-        log(f"wrote {board}: the same numbers in the board's encoding")
-    return _layers(network.model(sensor, int8=False), core, host, calibration.drawn, show)
+    host = told_int8(family, sensor, {"target": target.name})
+    layers = _layers(network.model(sensor, int8=False), read_core(host), host, calibration.drawn)
+    return Network(host, f"{network.name}-int8", layers=layers)
 
 
-def _layers(model: onnx.ModelProto, core: IntCore, host: onnx.ModelProto, patches: Patches, show: Show) -> list[Row]:
-    """Each integer layer, and what rounding ties up or to even makes of the result: shown, and returned."""
+def _layers(model: onnx.ModelProto, core: IntCore, host: onnx.ModelProto, patches: "Patches") -> tuple[Row, ...]:
+    """Each integer layer, and what rounding ties up or to even makes of the result."""
     layers, rounding = integer_rows(model, core, host, patches.degraded)
-    show("integer layers", layers)
-    show("tie rounding", [rounding])
-    return [*layers, rounding]
+    return (*layers, rounding)
 
 
 def _shifts_of(target: TargetProfile) -> Shifts:
     if not target.configurations:
         expected = f"a target with a DPU: {', '.join(board_names())}"
-        remedy = "choose another, or take --regime free"
-        raise OptionError("--target", expected=expected, got=repr(target.name), remedy=remedy)
+        remedy = "choose another, or the free regime"
+        raise OptionError("target", expected=expected, got=repr(target.name), remedy=remedy)
     return target_shifts(target)
 
 
-def _with_sensitivity(
-    model: onnx.ModelProto, result: Quantised, calibration: Source, rows: list[Row], page: Path, log: Log
-) -> list[Row]:
-    found, written = sensitivity_report(model, result, calibration.unseen, rows)
-    write_report(written, page)
-    log(f"wrote {page}: {written.headline}")
-    return [*found, *rows]
+def sensitivity_report(
+    network: Network, samples: object = None, more: Sequence[Row] = (), **drawn: Any
+) -> tuple[list[Row], Report]:
+    """Where INT8 errs on patches or samples that calibration did not see: the rows, and a page.
+
+    Args:
+        network: what `quantize` made in the regime "legal".
+        samples: as given there.
+        more: rows that the page shows behind.
+        drawn: sensor, images, patches, patch_px and seed as given there.
+    """
+    assert network.origin is not None and network.quantised is not None  # noqa: S101, PT018
+    model, result = network.origin.model, network.quantised
+    held_out = (samples_of(model, samples) or _simulated(**drawn)).unseen
+    sessions = open_any_size(model), open_any_size(result.host)
+    found, spread = compare(*sessions, held_out.pairs, samples is None), spread_of(*sessions, held_out.degraded)
+    worst = spread.worst(WORST)
+    layers = layer_error_rows(result, held_out)
+    rows = [gate_row(found), *layers, *(worst_row(k, held_out, spread) for k in worst), sizes_row(spread)]
+    return rows, sensitivity_page(headline(found, layers), [*rows, *more], spread, held_out, sessions, worst)

@@ -1,46 +1,77 @@
 """The one kind of document that commands write with --json: rows of figures that say where they come from."""
 
 import json
+import os
 import platform
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
+from html import escape
 from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
 
+from rich import table as rich_table
 from rich.console import Console
 from rich.measure import Measurement
-from rich.table import Table
 from rich.text import Text
 
 from beers_deploy import __version__
+from beers_deploy.frames import bars, html_table, tidy_frame, wide_frame
 from beers_deploy.model.io.files import sha256, write_text
 from beers_deploy.model.processor import decided, processor_name
-from beers_deploy.profiles.errors import visible
-from beers_deploy.profiles.figures import Figure, Row
+from beers_deploy.profiles.errors import printable, visible
+from beers_deploy.profiles.figures import Figure, Row, by_table
 from beers_deploy.quant.checks import Check
+
+if TYPE_CHECKING:
+    import pandas as pd
+    from matplotlib.axes import Axes
 
 SCHEMA_NAME, SCHEMA_VERSION = "beers-deploy/results", 2
 SCHEMA_PATH = Path(__file__).parent / "schema" / "results-2.json"
 
 
-@dataclass(frozen=True)
-class Document:
-    """What one run of a command found; of a command that judges, also its checks, which are its verdict."""
+class Input(NamedTuple):
+    """What a figure rests on, by its name and SHA-256: of a network in memory, which is no file."""
+
+    name: str
+    sha256: str
+
+
+def input_of(path: Path) -> Input:
+    """A file's name and digest."""
+    return Input(path.name, sha256(path))
+
+
+@dataclass(frozen=True, repr=False)
+class Table:
+    """The figures that one verb found, and where they come from: what `--json` writes and a notebook shows.
+
+    Attributes:
+        command: the verb.
+        arguments: what it was given.
+        inputs: files and networks that the figures rest on.
+        rows: the figures, each with its value, unit, mode, interval and source.
+        checks: of a verb that judges, its verdict.
+        notes: what a reader must know, a sentence each.
+    """
 
     command: str
     arguments: Mapping[str, object]
-    inputs: tuple[Path, ...]
+    inputs: tuple[Path | Input, ...]
     rows: tuple[Row, ...]
     checks: tuple[Check, ...] = ()
+    notes: tuple[str, ...] = ()
 
-    def to_json(self) -> dict[str, object]:
-        """The whole document as the schema wants it."""
+    def to_dict(self) -> dict[str, object]:
+        """The whole as the schema of results documents wants it."""
+        inputs = [each if isinstance(each, Input) else input_of(each) for each in self.inputs]
         return {
             "schema": SCHEMA_NAME,
             "schema_version": SCHEMA_VERSION,
             "tool_version": __version__,
             "command": self.command,
             "arguments": {key: _plain(value) for key, value in self.arguments.items()},
-            "inputs": [{"name": path.name, "sha256": sha256(path)} for path in self.inputs],
+            "inputs": [each._asdict() for each in inputs],
             "host": host(),
             **_verdict(self.checks),
             "rows": [
@@ -54,10 +85,54 @@ class Document:
             ],
         }
 
-    def write(self, path: Path | None) -> None:
-        """Write the document where --json asked for it; nowhere when it did not."""
-        if path is not None:
-            write_text(path, json.dumps(self.to_json(), indent=1) + "\n")
+    def save(self, path: str | os.PathLike[str]) -> Path:
+        """Write `to_dict` as a JSON file, whole or not at all."""
+        write_text(Path(path), json.dumps(self.to_dict(), indent=1) + "\n")
+        return Path(path)
+
+    def to_pandas(self, tidy: bool = False) -> "pd.DataFrame":
+        """The figures as a pandas DataFrame.
+
+        Args:
+            tidy: one line a figure with value, unit, mode, low, high and source. Otherwise one line a row, a column
+                for each figure and for the words beside them; `attrs["units"]` has the units.
+
+        Raises:
+            MissingExtraError: pandas is not installed.
+        """
+        return tidy_frame(self.rows) if tidy else wide_frame(self.rows)
+
+    def plot(self, figure: str | None = None, ax: "Axes | None" = None) -> "Axes":
+        """Bars of one figure of every row that has it, with its interval, coloured by mode.
+
+        Args:
+            figure: its name; the first that any row has if None.
+            ax: axes of matplotlib to draw on; new ones if None.
+
+        Raises:
+            MissingExtraError: matplotlib is not installed.
+            OptionError: no row has such a figure.
+        """
+        return bars(self.rows, figure, ax)
+
+    def __iter__(self) -> Iterator[Row]:
+        return iter(self.rows)
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+    def __bool__(self) -> bool:
+        return all(check.passed for check in self.checks)
+
+    def __repr__(self) -> str:
+        names = ", ".join(row.name for row in self.rows[:3]) + (", ..." if len(self.rows) > 3 else "")
+        return f"{type(self).__name__}({self.command}: {len(self.rows)} rows: {printable(names)})"
+
+    def _repr_html_(self) -> str:
+        """What a notebook shows: each table, the source of a figure as its tooltip."""
+        return "".join(html_table(name, rows) for name, rows in by_table(self.rows).items()) + "".join(
+            f"<p>{escape(note)}</p>" for note in self.notes
+        )
 
 
 def host() -> dict[str, object]:
@@ -127,9 +202,9 @@ def plain(text: str) -> Text:
     return Text(visible(text))
 
 
-def by_row(rows: list[Row], keys: list[str]) -> Table:
+def by_row(rows: list[Row], keys: list[str]) -> rich_table.Table:
     """One line a row; the units in the header, and the mode where it is that of the whole column."""
-    table = Table("")
+    table = rich_table.Table("")
     words = words_of(rows)
     for key in keys:
         mode = common_mode(key, rows)
@@ -143,9 +218,9 @@ def by_row(rows: list[Row], keys: list[str]) -> Table:
     return table
 
 
-def by_figure(rows: list[Row], keys: list[str]) -> Table:
+def by_figure(rows: list[Row], keys: list[str]) -> rich_table.Table:
     """One line a figure, the rows side by side; its mode in a column where it is that of them all."""
-    table = Table("", "unit", "mode")
+    table = rich_table.Table("", "unit", "mode")
     for row in rows:
         table.add_column(plain(row.name), justify="right", overflow="fold")
     for key in keys:
@@ -157,9 +232,9 @@ def by_figure(rows: list[Row], keys: list[str]) -> Table:
     return table
 
 
-def one_by_one(rows: list[Row]) -> Table:
+def one_by_one(rows: list[Row]) -> rich_table.Table:
     """One line a figure, row after row: the narrowest table."""
-    table = Table("", "", "", "unit")
+    table = rich_table.Table("", "", "", "unit")
     table.columns[1].overflow = table.columns[2].overflow = "fold"
     for row in rows:
         figures = [(plain(key), cell(figure, ""), plain(figure.unit)) for key, figure in row.figures.items()]

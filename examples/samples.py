@@ -4,7 +4,7 @@
 
 Those that restore get pairs of `pleiades-degraded` and its reference, of drawn scenes or of the photographs of a
 folder. The segmentation network finds what is bright in them, the classifier tells ten gratings apart. Writes a .npz
-file as `beers-deploy quantize --data` reads it: `image` (N, C, H, W) in [0, 1] and, for networks that restore,
+file as `beers-deploy quantize --samples` reads it: `image` (N, C, H, W) in [0, 1] and, for networks that restore,
 `reference`.
 """
 

@@ -249,8 +249,8 @@ def _check_folder(recipe: DatasetRecipe, out: Path, resume: bool) -> None:
     same = path.is_file() and path.read_bytes() == wanted.encode()
     got = "this dataset" if same else "another dataset"
     if got == "another dataset" or not resume:
-        remedy = "add --resume or choose another folder" if got == "this dataset" else "choose another folder"
-        raise OptionError("--out", expected="a folder without a dataset", got=got, remedy=remedy)
+        remedy = "add `resume` or choose another folder" if got == "this dataset" else "choose another folder"
+        raise OptionError("out", expected="a folder without a dataset", got=got, remedy=remedy)
 
 
 def _chunks(windows: list[Window]) -> Iterator[list[Window]]:
@@ -269,5 +269,5 @@ def _read_summary(path: Path) -> dict[str, float]:
         rejected = sum(int(line[role]["rejected_snr_pairs"]) for line in lines for role in ("degraded", "reference"))
         return {"patches": len(lines), "rejected_share": rejected / (rejected + 2 * len(lines))}
     except (ArithmeticError, LookupError, OSError, TypeError, ValueError) as error:
-        got, remedy = " ".join(str(error).split())[:120], "choose another --out"
+        got, remedy = " ".join(str(error).split())[:120], "choose another folder"
         raise OptionError(str(path), expected="a dataset's manifest", got=got, remedy=remedy) from error

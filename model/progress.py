@@ -11,23 +11,48 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from contextvars import ContextVar
+from dataclasses import dataclass
 from types import FrameType
 
+from rich import progress as rich_progress
 from rich.console import Console
-from rich.progress import (
-    BarColumn,
-    MofNCompleteColumn,
-    Progress,
-    SpinnerColumn,
-    TextColumn,
-    TimeElapsedColumn,
-    TimeRemainingColumn,
-)
 
 Log = Callable[[str], None]
 """Is told a sentence, or the name of a step, as the work goes on."""
 
 LINE_EVERY_S = 5.0
+
+
+@dataclass(frozen=True)
+class Step:
+    """How far a piece of work is: what is done, how many steps of it, and of how many (None where none can say)."""
+
+    what: str
+    done: int
+    total: int | None
+
+
+Progress = bool | Callable[[Step], None] | None
+"""How a caller wants to be told: a function, False for not at all, None or True for a bar or plain lines."""
+
+_sink: ContextVar[Progress] = ContextVar("progress", default=None)
+
+
+@contextmanager
+def reporting(wanted: Progress) -> Iterator[None]:
+    """Report the work of this block as a caller wants; None leaves it as it is."""
+    token = _sink.set(_sink.get() if wanted is None else wanted)
+    try:
+        yield
+    finally:
+        _sink.reset(token)
+
+
+def _shows_bars() -> bool:
+    """Whether there is a terminal or a notebook to draw on."""
+    console = Console(stderr=True)
+    return console.is_terminal or console.is_jupyter
 
 
 def no_log(_: str) -> None:
@@ -49,7 +74,7 @@ def once(log: Log) -> Log:
 class Steps:
     """Counts steps of one piece of work."""
 
-    def __init__(self, label: str, total: int, bar: Progress | None) -> None:
+    def __init__(self, label: str, total: int, bar: rich_progress.Progress | None) -> None:
         self.label, self.total, self.done, self._bar = label, total, 0, bar
         self._task = bar.add_task(label, total=total) if bar else None
         self._printed = time.monotonic()
@@ -57,38 +82,51 @@ class Steps:
     def advance(self, steps: int = 1, note: str = "") -> None:
         """Report that so many further steps are done."""
         self.done += steps
-        if self._bar is not None and self._task is not None:
-            self._bar.update(self._task, completed=self.done, description=f"{self.label} {note}".strip())
-        elif time.monotonic() - self._printed > LINE_EVERY_S or self.done >= self.total:
+        sink, shown = _sink.get(), f"{self.label} {note}".strip()
+        if callable(sink):
+            sink(Step(shown, self.done, self.total))
+        elif self._bar is not None and self._task is not None:
+            self._bar.update(self._task, completed=self.done, description=shown)
+        elif sink is not False and (time.monotonic() - self._printed > LINE_EVERY_S or self.done >= self.total):
             self._printed = time.monotonic()
-            sys.stderr.write(f"{self.label}: {self.done}/{self.total} {note}".rstrip() + "\n")
+            _line(f"{self.label}: {self.done}/{self.total} {note}".rstrip())
 
 
 @contextmanager
 def steps(label: str, total: int) -> Iterator[Steps]:
     """Show the progress of `total` steps while the block runs."""
-    if not sys.stderr.isatty():
+    if _sink.get() not in (None, True) or not _shows_bars():
         yield Steps(label, total, None)
         return
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
+    columns = (rich_progress.BarColumn(), rich_progress.MofNCompleteColumn(), rich_progress.TimeRemainingColumn())
+    with _bar(*columns) as bar:
         yield Steps(label, total, bar)
 
 
 @contextmanager
 def progress(label: str) -> Iterator[Log]:
     """Show the name of each step that is begun while the block runs, and on a terminal the time since it began."""
-    if not sys.stderr.isatty():
+    sink = _sink.get()
+    if callable(sink):
+        begun = iter(range(sys.maxsize))
+        yield lambda step: sink(Step(f"{label}: {step}", next(begun), None))
+    elif sink is False:
+        yield no_log
+    elif not _shows_bars():
+        yield lambda step: _line(f"{label}: {step}")
+    else:
+        with _bar(rich_progress.TimeElapsedColumn()) as shown:
+            task = shown.add_task(label, total=None)
+            yield lambda step: shown.update(task, description=f"{label}: {step}")
 
-        def line(step: str) -> None:
-            sys.stderr.write(f"{label}: {step}\n")
 
-        yield line
-        return
-    columns = (SpinnerColumn(), TextColumn("{task.description}"), TimeElapsedColumn())
-    with Progress(*columns, console=Console(stderr=True), transient=True) as shown:
-        task = shown.add_task(label, total=None)
-        yield lambda step: shown.update(task, description=f"{label}: {step}")
+def _line(text: str) -> None:
+    sys.stderr.write(f"{text}\n")
+
+
+def _bar(*columns: rich_progress.ProgressColumn) -> rich_progress.Progress:
+    words = rich_progress.TextColumn("{task.description}")
+    return rich_progress.Progress(words, *columns, console=Console(stderr=True), transient=True)
 
 
 class Interrupt:

@@ -1,5 +1,6 @@
 """The recipe that `simulate` leaves beside a folder of pairs: the sensors that made them, and the scenes they saw."""
 
+import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,8 +10,10 @@ from beers_deploy.model.io.images import site_of
 from beers_deploy.model.shipped import SENSOR
 from beers_deploy.profiles.errors import OptionError
 from beers_deploy.profiles.sensor import Sensor, same_instrument
-from beers_deploy.profiles.sensor_file import load_sensor, reference_beside, sensor_from_json
+from beers_deploy.profiles.sensor_file import reference_beside, sensor_from_json
 from beers_deploy.profiles.toml import read_json
+
+SensorLike = Sensor | str | os.PathLike[str]
 
 
 @dataclass(frozen=True)
@@ -53,14 +56,14 @@ def read_pairs_recipe(folder: Path) -> PairsRecipe | None:
         scenes = tuple(str(s["name"]) if "sha256" in s else None for s in raw["scenes"])
         sensors = {role: dict(raw[role]) for role in ("degraded", "reference")}
     except (LookupError, OSError, TypeError, ValueError) as error:
-        remedy = "make the pairs anew, or remove it and say --sensor"
+        remedy = "make the pairs anew, or remove it and give `sensor`"
         raise OptionError(str(path), expected="a dataset's recipe", got="another file", remedy=remedy) from error
     profiles = {role: sensor_from_json(f"{path} {role}", raw) for role, raw in sensors.items()}
     return PairsRecipe(profiles["degraded"], profiles["reference"], scenes)
 
 
 def profiles_for(
-    sensor: str | None, reference: str | None, recipe: PairsRecipe | None, say: Callable[[str], None]
+    sensor: SensorLike | None, reference: SensorLike | None, recipe: PairsRecipe | None, say: Callable[[str], None]
 ) -> tuple[Sensor, Sensor]:
     """The profiles of degraded and reference images: the recipe's where there is one, else those named.
 
@@ -69,11 +72,11 @@ def profiles_for(
         ProfileError: no such profile, or a faulty one.
     """
     if recipe is None:
-        degraded = load_sensor(sensor or SENSOR)
+        degraded = Sensor.load(sensor or SENSOR)
         return degraded, reference_beside(degraded, reference, say)
-    named = sensor and load_sensor(sensor), reference and load_sensor(reference).in_units_of(recipe.degraded)
-    _require_made_by("--sensor", named[0] or None, recipe.degraded)
-    _require_made_by("--reference", named[1] or None, recipe.reference)
+    named = sensor and Sensor.load(sensor), reference and Sensor.load(reference).in_units_of(recipe.degraded)
+    _require_made_by("sensor", named[0] or None, recipe.degraded)
+    _require_made_by("reference", named[1] or None, recipe.reference)
     return recipe.degraded, recipe.reference
 
 

@@ -31,7 +31,7 @@ def shipped_weights(name: str) -> Path:
         ModelError: none are shipped.
     """
     if name not in shipped_names():
-        remedy = "train them with 'beers-deploy train' and pass --checkpoint"
+        remedy = "give the file that 'beers-deploy train' wrote"
         expected = f"shipped weights ({', '.join(shipped_names())})"
         raise ModelError(f"weights {name}", expected=expected, got="none", remedy=remedy)
     return SHIPPED / f"{name}.safetensors"

@@ -4,13 +4,18 @@ BeersError              one sentence, no traceback, exit code 2
   ProfileError          a sensor or target profile
   ImageError            a scene or an acquisition
   ModelError            a weights or ONNX file
-  OptionError           a command-line value, or two that do not go together
-  MachineError          the host: memory, disk, a missing optional package
+  OptionError           a parameter's value, or two that do not go together
+  MachineError          the host: memory, disk
+    MissingExtraError        an optional package
+
+Each is also the built-in exception that a caller expects: ValueError, RuntimeError, ImportError.
 
 A gate that fails is no error: its command exits with 1.
 """
 
 from functools import partial
+from importlib import import_module
+from typing import Any
 
 LONGEST = 400
 """Characters of a file that a message shows at most."""
@@ -65,21 +70,47 @@ def _size(count_bytes: float, digits: int) -> str:
     return f"{count_bytes:.0f} bytes"
 
 
-class ProfileError(BeersError):
+class ProfileError(BeersError, ValueError):
     """A sensor or target profile that does not hold together."""
 
 
-class ImageError(BeersError):
+class ImageError(BeersError, ValueError):
     """An image that cannot be read, or whose pixels make no sense."""
 
 
-class ModelError(BeersError):
+class ModelError(BeersError, ValueError):
     """A weights or ONNX file that is not what the command needs."""
 
 
-class OptionError(BeersError):
-    """A command-line value that is out of range, or two that contradict each other."""
+class OptionError(BeersError, ValueError):
+    """A value of a parameter that is out of range, or two that contradict each other."""
 
 
-class MachineError(BeersError):
-    """Something this host lacks: memory, disk space, an optional package."""
+class MachineError(BeersError, RuntimeError):
+    """Something this host lacks: memory, disk space, workers."""
+
+
+class MissingExtraError(MachineError, ImportError):
+    """An optional package that is not installed, and the extra that brings it."""
+
+
+class OutsideRangeWarning(UserWarning):
+    """A sensor that lies outside the range that a network was trained for; the command line prints it as a line."""
+
+
+def optional(package: str, where: str, extra: str) -> Any:
+    """An optional package, imported.
+
+    Args:
+        package: its module.
+        where: the parameter or file that needs it.
+        extra: of beers-deploy that installs it.
+
+    Raises:
+        MissingExtraError: it is not installed.
+    """
+    try:
+        return import_module(package)
+    except ImportError as error:
+        remedy = f"pip install 'beers-deploy[{extra}]'"
+        raise MissingExtraError(where, expected=f"the package {package}", got="none", remedy=remedy) from error

@@ -192,8 +192,9 @@ def _trimmed(samples: Samples) -> Samples:
 def _unpacked_again(label: str, raw: Mapping[str, Any]) -> PointSpread:
     sides, text = (raw["height"], raw["width"]), raw["samples"]
     whole = all(isinstance(side, int) and 1 <= side <= KEPT_SIDE for side in sides) and isinstance(text, str)
+    per_px = _samples_per_px(f"{label} samples_per_px", raw["samples_per_px"])
     try:
-        point = PointSpread(*sides, _samples_per_px(f"{label} samples_per_px", raw["samples_per_px"]), text)
+        point = PointSpread(*sides, per_px, text)
         sound = whole and 0 < float(unpacked(point).sum()) < math.inf
     except (TypeError, ValueError):
         sound = False

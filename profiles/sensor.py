@@ -4,12 +4,16 @@ A profile may state ranges (a family of sensors); `Sensor.draw` picks one physic
 """
 
 import math
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
-from beers_deploy.profiles.constant import Constant
+from beers_deploy.profiles.constant import Constant, Number
 from beers_deploy.profiles.effects import TABLES as EFFECT_TABLES
 from beers_deploy.profiles.effects import Effect, Offset, Table, draw_effect, middle_effect
 from beers_deploy.profiles.errors import ProfileError
@@ -105,7 +109,7 @@ class Instrument:
         return math.sqrt(max(self.alpha * radiance + self.beta, 0.0))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Sensor:
     """What one TOML file under `profiles/sensors/` states, each constant with its source.
 
@@ -129,6 +133,64 @@ class Sensor:
     effects: Mapping[str, Table] = field(default_factory=dict)
     mtf_nyquist_along: Constant | None = None
     response: Response | None = None
+
+    @classmethod
+    def load(cls, sensor: "Sensor | str | os.PathLike[str]") -> "Sensor":
+        """A shipped sensor by its name, the user's own by the path of its .toml file, or the sensor given.
+
+        Raises:
+            ProfileError: unknown name, wrong or missing key, or numbers that no instrument can have.
+        """
+        from beers_deploy.profiles.sensor_file import load_sensor  # it reads what this file defines
+
+        return sensor if isinstance(sensor, Sensor) else load_sensor(os.fspath(sensor))
+
+    def save(self, path: str | os.PathLike[str]) -> Path:
+        """Write the profile as a TOML file that `load` reads; a point-spread function lies beside it as .npy."""
+        from beers_deploy.profiles.sensor_file import save_sensor
+
+        return save_sensor(self, Path(path))
+
+    def replace(self, **numbers: Number) -> "Sensor":
+        """This sensor with other numbers, each a value or a range (low, high).
+
+        Args:
+            numbers: by the names of the file's keys, such as mtf_nyquist=0.1 or snr_1=(90, 110).
+
+        Raises:
+            ProfileError: no such number, or one that no instrument can have.
+        """
+        from beers_deploy.profiles.sensor_file import with_numbers
+
+        return with_numbers(self, numbers)
+
+    @property
+    def reference(self) -> "Sensor":
+        """The shipped sensor that a restoration of this one's images aims at, in this one's digital numbers."""
+        from beers_deploy.profiles.sensor_file import reference_for
+
+        return reference_for(self)
+
+    def to_radiance(self, pixels: Any) -> Any:
+        """Digital numbers as radiance in W/m2/sr/um: an array of any kind, of the same kind and shape."""
+        gain, _, offset_dn = self.units
+        return (pixels - offset_dn) / gain
+
+    def to_dn(self, radiance: Any) -> Any:
+        """Radiance in W/m2/sr/um as digital numbers, neither rounded nor clipped; an array of any kind."""
+        gain, _, offset_dn = self.units
+        return radiance * gain + offset_dn
+
+    def noise(self, radiance: ArrayLike) -> NDArray[np.float64]:
+        """Standard deviation of the noise at some radiances, both in W/m2/sr/um, in the middle of each range."""
+        alpha, beta = self._middle_noise()
+        return np.sqrt(np.maximum(alpha * np.asarray(radiance, np.float64) + beta, 0.0))
+
+    def __repr__(self) -> str:
+        across, bits = self.mtf_nyquist, self.bits
+        noise = f"SNR {self.snr_1} at {self.radiance_1} W/m2/sr/um" if self.snr_1 else "noise by alpha and beta"
+        more = f", {', '.join(self.effects)}" if self.effects else ""
+        return f"Sensor({self.name!r}: {bits} bits, MTF {across} at Nyquist, {noise}{more})"
 
     @property
     def units(self) -> tuple[float, float, float]:

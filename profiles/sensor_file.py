@@ -1,14 +1,19 @@
 """Sensor profiles as TOML files: found by name, read, and refused where no instrument can be so."""
 
+import json
+import os
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from beers_deploy.profiles.constant import Constant, check_keys, read_constant
+import numpy as np
+
+from beers_deploy.profiles.constant import Constant, Number, check_keys, read_constant
 from beers_deploy.profiles.effects import TABLES as EFFECT_TABLES
 from beers_deploy.profiles.effects import Table, read_effect
 from beers_deploy.profiles.errors import ProfileError
+from beers_deploy.profiles.response import MtfTable, unpacked
 from beers_deploy.profiles.response_file import axes_of, read_response, response_from_json
 from beers_deploy.profiles.sensor import (
     MTF_NYQUIST_MAX,
@@ -55,6 +60,70 @@ def load_sensor(name: str) -> Sensor:
     shipped = BLIND_PROFILE if name == BLIND else name
     found = read_sensor(*read_toml("sensors", shipped), profile_path("sensors", shipped).parent)
     return replace(found, name=BLIND) if name == BLIND else found
+
+
+def with_numbers(sensor: Sensor, numbers: Mapping[str, Number]) -> Sensor:
+    """A sensor with other numbers; see `Sensor.replace`.
+
+    Raises:
+        ProfileError: no such number, or one that no instrument can have.
+    """
+    where, tables = f"sensor {sensor.name}", tables_of(sensor)
+    home = {key: table for table in TABLES for key in constant_keys(table)}
+    for key, value in numbers.items():
+        if key not in home:
+            expected, remedy = f"one of {', '.join(home)}", "correct the name"
+            raise ProfileError(where, expected=expected, got=repr(key), remedy=remedy)
+        tables[home[key]][key] = list(value) if isinstance(value, tuple) else value
+    for one, other in (({"alpha", "beta"}, {"snr_0", "snr_1"}), ({"snr_0", "snr_1"}, {"alpha", "beta"})):
+        if one & set(numbers):
+            tables["noise"] = {key: value for key, value in tables["noise"].items() if key not in other}
+    found = replace(read_sensor(where, {"description": sensor.description, **tables}), name=sensor.name)
+    keeps_blur = sensor.response is not None and not {"mtf_nyquist", "mtf_nyquist_along"} & set(numbers)
+    return replace(found, response=sensor.response) if keeps_blur else found
+
+
+def tables_of(sensor: Sensor) -> dict[str, dict[str, object]]:
+    """The tables of a sensor's file as plain values; of a response its contrasts at Nyquist alone."""
+    found: dict[str, dict[str, object]] = {}
+    for table in TABLES:
+        constants = {key: getattr(sensor, key) for key in constant_keys(table)}
+        found[table] = {key: _plain(constant) for key, constant in constants.items() if constant is not None}
+    for name, effect in sensor.effects.items():
+        found[name] = {key: _plain(constant) for key, constant in effect.items()}
+    return found
+
+
+def _plain(constant: Constant) -> dict[str, object]:
+    value = list(constant.value) if isinstance(constant.value, tuple) else constant.value
+    return {"value": value, "status": constant.status, "source": constant.source}
+
+
+def save_sensor(sensor: Sensor, path: Path) -> Path:
+    """Write a sensor as the TOML file that `load_sensor` reads, and a point-spread function beside it as .npy."""
+    tables, response = tables_of(sensor), sensor.response
+    if response is not None:
+        tables["mtf"] = {"frequency": list(response.frequency)} if isinstance(response, MtfTable) else {}
+        about = {"status": sensor.mtf_nyquist.status, "source": sensor.mtf_nyquist.source}
+        if isinstance(response, MtfTable):
+            tables["mtf"] |= {axis: {"value": list(getattr(response, axis)), **about} for axis in ("across", "along")}
+        else:
+            samples = path.with_name(f"{path.stem}-psf.npy")
+            np.save(samples, unpacked(response).astype(np.float32))
+            tables["mtf"] = {"psf": {"value": samples.name, **about}}
+            tables["mtf"] |= {"psf_samples_per_px": response.samples_per_px}
+    lines = [f"description = {_toml(sensor.description)}"]
+    for name, table in tables.items():
+        lines += ["", f"[{name}]", *(f"{key} = {_toml(value)}" for key, value in table.items())]
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    return path
+
+
+def _toml(value: object) -> str:
+    """A value in TOML's notation: of JSON's it differs in tables alone."""
+    if isinstance(value, dict):
+        return "{ " + ", ".join(f"{key} = {_toml(each)}" for key, each in value.items()) + " }"
+    return json.dumps(value, ensure_ascii=False)
 
 
 def sensor_from_json(label: str, raw: Mapping[str, Any]) -> Sensor:
@@ -246,7 +315,9 @@ def _check_snr(profile: Sensor) -> None:
         raise profile.impossible_snr()
 
 
-def reference_beside(degraded: Sensor, name: str | None, say: Callable[[str], None]) -> Sensor:
+def reference_beside(
+    degraded: Sensor, named: "Sensor | str | os.PathLike[str] | None", say: Callable[[str], None]
+) -> Sensor:
     """The reference profile that a user named, or the default one, in the digital numbers of `degraded`.
 
     One that was named, and states other ones, is converted in sight: `say` is told.
@@ -254,9 +325,9 @@ def reference_beside(degraded: Sensor, name: str | None, say: Callable[[str], No
     Raises:
         ProfileError: no such profile, or a faulty one.
     """
-    stated = load_sensor(name or REFERENCE)
+    stated = Sensor.load(named or REFERENCE)
     reference = stated.in_units_of(degraded)
-    if name is not None and reference is not stated:
+    if named is not None and reference is not stated:
         units = f"{describe_units(degraded)}, as {degraded.name} has them"
         say(f"note: the reference {stated.name} ({describe_units(stated)}) is taken at {units}")
     return reference

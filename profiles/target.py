@@ -4,9 +4,11 @@ A file may begin with `base = "zcu102"`: what it does not state is then that shi
 a known kind states its cores, clock and memory, and nothing else.
 """
 
+import os
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Self
 
 from beers_deploy.profiles.constant import Constant, Words, check_keys, read_constant, read_words
 from beers_deploy.profiles.errors import ProfileError
@@ -31,7 +33,7 @@ ABSENT = {"cost": ("no cost constants yet", "take those of a board with the same
 """What the lack of a whole table means, and the remedy."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class TargetProfile:
     """What one TOML file under `profiles/targets/` states, its base included.
 
@@ -47,6 +49,21 @@ class TargetProfile:
     tables: dict[str, dict[str, Constant]]
     activations: dict[str, Words] = field(default_factory=dict)
     documents: dict[str, str] = field(default_factory=dict)
+
+    @classmethod
+    def load(cls, board: "TargetProfile | str | os.PathLike[str]") -> Self:
+        """A shipped board by its name, the user's own by the path of its .toml file, or the board given.
+
+        Raises:
+            ProfileError: unknown name, or a table that is not made of constants.
+        """
+        if isinstance(board, cls):
+            return board
+        return cls(**vars(board if isinstance(board, TargetProfile) else load_target(os.fspath(board))))
+
+    def __repr__(self) -> str:
+        builds = f", {', '.join(self.configurations)}" if self.configurations else ""
+        return f"{type(self).__name__}({self.name!r}{builds})"
 
     def value(self, table: str, key: str) -> float:
         """The single value of a constant that states no range.
@@ -84,7 +101,7 @@ class TargetProfile:
                 f"target profile {self.name}",
                 expected=f"a configuration out of {', '.join(self.configurations) or 'none'}",
                 got=repr(name),
-                remedy="choose one of them with --config",
+                remedy="choose one of them as `dpu`",
             )
         return chosen, self.configurations[chosen]
 

@@ -22,7 +22,6 @@ from beers_deploy.model.simulator.mtf import transfer_function
 from beers_deploy.model.simulator.procedural import load_scenes
 from beers_deploy.model.simulator.sampling import Scene, scene_spectrum
 from beers_deploy.model.training.patches import PatchRecipe, turn
-from beers_deploy.profiles import load_sensor
 from beers_deploy.profiles.errors import ImageError
 from beers_deploy.profiles.sensor import Instrument, Sensor
 from beers_deploy.profiles.sensor_file import reference_for
@@ -305,7 +304,7 @@ def _errors(tensor: np.ndarray, first: int) -> np.ndarray:
 class Calibration:
     """Where a run's patches come from."""
 
-    sensor: str
+    sensor: Sensor
     images: Path | None
     patches: int
     patch_px: int
@@ -324,27 +323,23 @@ class Calibration:
     @property
     def unseen(self) -> Patches:
         """Patches of the same scenes, or of other drawn ones, that calibration does not see."""
-        return unseen_patches(self._degraded, self.images, HELD_OUT_PATCHES, self.seed)
+        return unseen_patches(self.sensor, self.images, HELD_OUT_PATCHES, self.seed)
 
     @property
     def about(self) -> dict[str, str]:
         """What the file says of it."""
-        return {"calibration_sensor": self._degraded.name, "calibration_seed": str(self.seed)}
+        return {"calibration_sensor": self.sensor.name, "calibration_seed": str(self.seed)}
 
     def _draw(self, count: int, seed: int) -> Patches:
-        return draw_patches(self._scenes, self._degraded, self._reference, count, seed, self.patch_px)
+        return draw_patches(self._scenes, self.sensor, self._reference, count, seed, self.patch_px)
 
     @cached_property
     def _scenes(self) -> list[Scene]:
         return load_scenes(self.images, self._reference.nominal(), self.seed)
 
     @cached_property
-    def _degraded(self) -> Sensor:
-        return load_sensor(self.sensor)
-
-    @cached_property
     def _reference(self) -> Sensor:
-        return reference_for(self._degraded)
+        return reference_for(self.sensor)
 
 
 def unseen_patches(degraded: Sensor, images: Path | None, patches: int, seed: int) -> Patches:

@@ -1,6 +1,7 @@
 """The float/INT8 gate: what INT8 changes, and the limits, by name, that say whether that is too much."""
 
 import math
+import os
 import sys
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, fields, replace
@@ -128,18 +129,30 @@ class Limits:
     mae_growth: float | None = 1.05
 
 
+def limits_of(given: "Limits | Mapping[str, float] | str | os.PathLike[str] | None") -> Limits:
+    """Limits by their names, of a TOML file such as `mae = 0.0007`, or the defaults for None.
+
+    Raises:
+        OptionError: no such limits, or not such a file.
+    """
+    if given is None:
+        return Limits()
+    if isinstance(given, Limits):
+        return given
+    return _named("limits", given) if isinstance(given, Mapping) else _parse(Path(given))
+
+
 def read_limits(path: Path | None, mae: float | None) -> Limits:
-    """The limits of a TOML file such as `mae = 0.0007`, or the defaults; `mae` overrides.
+    """As `limits_of`; `mae` overrides.
 
     Raises:
         OptionError: not such a file.
     """
-    limits = Limits() if path is None else _parse(path)
+    limits = limits_of(path)
     return limits if mae is None else replace(limits, mae=mae)
 
 
 def _parse(path: Path) -> Limits:
-    names = [field.name for field in fields(Limits)]
     try:
         raw = read_toml_text(path)
     except (OSError, ValueError) as error:
@@ -147,13 +160,18 @@ def _parse(path: Path) -> Limits:
         raise OptionError(
             str(path), expected="a TOML file of limits", got=got, remedy="write mae = 0.0007"
         ) from error
+    return _named(str(path), raw)
+
+
+def _named(where: str, raw: Mapping[str, object]) -> Limits:
+    names = [field.name for field in fields(Limits)]
     if not raw:
         expected = f"at least one of {', '.join(names)}"
-        raise OptionError(str(path), expected=expected, got="no limit", remedy="write mae = 0.0007")
+        raise OptionError(where, expected=expected, got="no limit", remedy="write mae = 0.0007")
     for name, value in raw.items():
         if name not in names or not _is_limit(value):
             expected = f"numbers above 0 named {', '.join(names)}"
-            raise OptionError(str(path), expected=expected, got=f"{name} = {value!r}", remedy="correct that line")
+            raise OptionError(where, expected=expected, got=f"{name} = {value!r}", remedy="correct that line")
     given: dict[str, Any] = {**dict.fromkeys(names), "mae_growth": Limits.mae_growth, **raw}
     return Limits(**given)
 

@@ -13,7 +13,7 @@ from google.protobuf.message import DecodeError
 from onnx import numpy_helper
 
 from beers_deploy.model.io.files import whole_file
-from beers_deploy.profiles.errors import ModelError
+from beers_deploy.profiles.errors import BeersError, ModelError
 from beers_deploy.profiles.toml import read_whole, unreadable
 from beers_deploy.quant.reading.external import take_in
 from beers_deploy.quant.reading.folding import IR_VERSION, OPSET, simplest
@@ -37,7 +37,7 @@ def load_onnx(path: Path, to_run: bool = True) -> onnx.ModelProto:
             `quant.untrusted`).
     """
     if path.suffix == ".safetensors":
-        remedy = "export it first: beers-deploy export --checkpoint FILE --out FILE.onnx"
+        remedy = "export it first: beers-deploy export --network FILE --out FILE.onnx"
         raise ModelError(str(path), expected="an ONNX file", got="safetensors weights", remedy=remedy)
     try:
         content = read_whole(path, FILE_BYTES)
@@ -45,6 +45,15 @@ def load_onnx(path: Path, to_run: bool = True) -> onnx.ModelProto:
         got = unreadable(path) or " ".join(str(error).split())[:120]
         raise ModelError(str(path), expected="an ONNX file", got=got, remedy=REMEDY) from error
     return _simplest(_parsed(content, str(path), to_run, path), str(path), to_run)
+
+
+def read_onnx(content: bytes, where: str) -> onnx.ModelProto:
+    """As `load_onnx`, of the bytes of a network that holds all its weights.
+
+    Raises:
+        ModelError: as there.
+    """
+    return _simplest(_parsed(content, where, True, None), where, True)
 
 
 def _simplest(model: onnx.ModelProto, where: str, to_run: bool) -> onnx.ModelProto:
@@ -79,6 +88,8 @@ def _parsed(content: bytes, where: str, to_run: bool, path: Path | None) -> onnx
             take_in(model, path)
         check_content(model, where)  # before the checker, which looks for files that weights are said to be in
         onnx.checker.check_model(model)
+    except BeersError:
+        raise
     except (DecodeError, onnx.checker.ValidationError, ValueError) as error:
         got = " ".join(str(error).split())[:120] or "other bytes"
         raise ModelError(where, expected="an ONNX file", got=got, remedy=REMEDY) from error
@@ -216,7 +227,7 @@ def is_quantised(model: onnx.ModelProto) -> bool:
     return any(mark in kind for kind in kinds for mark in ("qlinear", "quantizelinear", "integer"))
 
 
-def require_quantised(model: onnx.ModelProto, path: Path, wanted: bool) -> None:
+def require_quantised(model: onnx.ModelProto, name: str, wanted: bool) -> None:
     """Refuse the float network in the place of the INT8 one, and the other way round.
 
     Raises:
@@ -225,4 +236,4 @@ def require_quantised(model: onnx.ModelProto, path: Path, wanted: bool) -> None:
     if is_quantised(model) != wanted:
         expected, got = ("an INT8 network", "a float one") if wanted else ("a float network", "an INT8 one")
         remedy = "give the float model first, the INT8 model second"
-        raise ModelError(str(path), expected=expected, got=got, remedy=remedy)
+        raise ModelError(name, expected=expected, got=got, remedy=remedy)

@@ -5,11 +5,13 @@ Values are in [0, 1] of full scale: of pixels of 8 bits 255, of more 4095. A .np
 should give beside what it reads, as `image` and `reference`.
 """
 
+import os
 import zipfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import onnx
@@ -30,11 +32,15 @@ FULL_SCALE_8 = 255
 REMEDY = "see docs/reference/any-network.md for how samples are given"
 
 
-def read_samples(path: Path, channels: int, fixed_px: int | None, multiple_px: int = 1) -> Patches:
-    """The samples of a file or folder, cut to what the network takes: each (1, C, h, w) float32 in [0, 1].
+Named = tuple[str, np.ndarray, np.ndarray]
+"""A sample's name for messages, its image (C, H, W), and its reference, empty where there is none."""
+
+
+def read_samples(given: Path | Sequence[Named], channels: int, fixed_px: int | None, multiple_px: int = 1) -> Patches:
+    """The samples of a file, a folder or arrays, cut to what the network takes: each (1, C, h, w) float32 in [0, 1].
 
     Args:
-        path: the file or folder.
+        given: the file or folder, or the samples.
         channels: that the network reads.
         fixed_px: side of the image that the network is fixed to; None cuts large samples to patches.
         multiple_px: what sides must be multiples of; the rest is cut off.
@@ -44,12 +50,61 @@ def read_samples(path: Path, channels: int, fixed_px: int | None, multiple_px: i
     """
     pairs = [
         pair
-        for name, image, reference in _samples(path)
+        for name, image, reference in (_samples(given) if isinstance(given, Path) else given)
         for pair in _cut(_sound(name, image, channels), reference, name, fixed_px, multiple_px)
     ]
     if not pairs:
-        raise ImageError(str(path), expected="at least one sample", got="none", remedy=REMEDY)
+        where = str(given) if isinstance(given, Path) else IN_MEMORY
+        raise ImageError(where, expected="at least one sample", got="none", remedy=REMEDY)
     return _patches(pairs)
+
+
+IN_MEMORY = "samples"
+
+
+def samples_in(given: object) -> list[Named]:
+    """The samples in an array, in a pair of arrays (images, references), or in what gives such one after the other.
+
+    Args:
+        given: a batch (N, C, H, W), or one image (C, H, W), of NumPy or torch and in [0, 1]; a tuple of two; a
+            simulated pair, which knows its full scale; or an iterable of any of these, such as a DataLoader.
+
+    Raises:
+        ImageError: none of these.
+    """
+    if hasattr(given, "degraded") and hasattr(given, "reference"):
+        pair: Any = given
+        largest = np.float32(pair.sensor.max_dn)
+        images = [np.asarray(image, np.float32)[None] / largest for image in (pair.degraded, pair.reference)]
+        return [("pair", images[0], images[1])]
+    if hasattr(given, "ndim"):
+        return [(f"{IN_MEMORY}[{k}]", image, NO_REFERENCE) for k, image in enumerate(_batch(given))]
+    if isinstance(given, tuple) and len(given) == 2 and all(hasattr(each, "ndim") for each in given):
+        seen, meant = map(_batch, given)
+        if len(seen) != len(meant):
+            got = f"{len(seen)} images and {len(meant)} references"
+            raise ImageError(IN_MEMORY, expected="a reference for each image", got=got, remedy=REMEDY)
+        return [(f"{IN_MEMORY}[{k}]", *pair) for k, pair in enumerate(zip(seen, meant, strict=True))]
+    if not isinstance(given, Iterable):
+        got = type(given).__name__
+        raise ImageError(IN_MEMORY, expected="arrays (N, C, H, W), or a path", got=got, remedy=REMEDY)
+    items = (tuple(item) if isinstance(item, list) and len(item) == 2 else item for item in given)
+    items = (item[0] if isinstance(item, list | tuple) and len(item) == 1 else item for item in items)
+    return [
+        (f"{IN_MEMORY}[{k}]", *sample[1:]) for k, sample in enumerate(s for item in items for s in samples_in(item))
+    ]
+
+
+def _batch(array: Any) -> np.ndarray:
+    """One image or a batch of NumPy or torch as (N, C, H, W).
+
+    Raises:
+        ImageError: of another number of dimensions.
+    """
+    found = np.asarray(array.detach() if hasattr(array, "detach") else array)
+    if found.ndim not in (3, 4):
+        raise ImageError(IN_MEMORY, expected="a batch of (N, C, H, W)", got=times(found.shape), remedy=REMEDY)
+    return found if found.ndim == 4 else found[None]
 
 
 NO_REFERENCE = np.empty(0, np.float32)
@@ -68,7 +123,7 @@ def split_samples(samples: Patches) -> tuple[Patches, Patches]:
     return _patches([pair for k, pair in enumerate(pairs) if (k + 1) % HELD_OUT_EVERY]), _patches(held_out)
 
 
-def _samples(path: Path) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
+def _samples(path: Path) -> Iterator[Named]:
     """(name, image (C, H, W), reference)."""
     if path.is_dir():
         for file in sorted(path.iterdir()):
@@ -119,6 +174,8 @@ def _archive(path: Path) -> tuple[np.ndarray, np.ndarray]:
                 got = ", ".join(names) or "no array"
                 raise ImageError(str(path), expected="arrays named image and reference", got=got, remedy=REMEDY)
             return held[image], held["reference"] if "reference" in names else NO_REFERENCE
+    except ImageError:
+        raise
     except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
         raise ImageError(str(path), expected="a .npz file of numbers", got="another file", remedy=REMEDY) from error
 
@@ -173,7 +230,7 @@ def _cut(
 class OwnSamples:
     """Where a run's samples come from, in the place of `quant.calibration.Calibration`."""
 
-    path: Path
+    given: Path | Sequence[Named]
     channels: int
     fixed_px: int | None
     multiple_px: int
@@ -181,7 +238,7 @@ class OwnSamples:
     @cached_property
     def all(self) -> Patches:
         """Every sample."""
-        return read_samples(self.path, self.channels, self.fixed_px, self.multiple_px)
+        return read_samples(self.given, self.channels, self.fixed_px, self.multiple_px)
 
     @property
     def drawn(self) -> Patches:
@@ -206,26 +263,27 @@ class OwnSamples:
     @property
     def about(self) -> dict[str, str]:
         """What the file says of it."""
-        return {"calibration_data": self.path.name}
+        return {"calibration_data": self.given.name if isinstance(self.given, Path) else IN_MEMORY}
 
 
-def samples_of(model: onnx.ModelProto, path: Path | None) -> OwnSamples | None:
-    """A user's samples for a network; None where it takes simulated patches and no path is given.
+def samples_of(model: onnx.ModelProto, given: object) -> OwnSamples | None:
+    """A user's samples for a network, in a file, a folder or memory; None where none are and it takes simulated ones.
 
     Raises:
-        OptionError: no path, for a network that simulated patches do not suit.
+        OptionError: none given, for a network that simulated patches do not suit.
         ModelError: no network of images.
     """
     channels, fixed_px, multiple_px = _channels(model), fixed_tile_px(model), _multiple_px(model)
-    if path is not None:
-        return OwnSamples(path, channels, fixed_px, multiple_px or 1)
+    if given is not None:
+        found = Path(given) if isinstance(given, str | os.PathLike) else samples_in(given)
+        return OwnSamples(found, channels, fixed_px, multiple_px or 1)
     if channels != 1 or multiple_px is None or PATCH_PX % multiple_px:
         what = f"images of {fixed_px} x {fixed_px} pixels alone"
         if multiple_px is not None:
             what = f"{channels} channels" if channels != 1 else f"images of multiples of {multiple_px} pixels"
         expected = f"samples for a network of {what}: simulated patches are others"
         remedy = "give a .npy or .npz file of (N, C, H, W) in [0, 1], or a folder of images"
-        raise OptionError("--data", expected=expected, got="none", remedy=remedy)
+        raise OptionError("samples", expected=expected, got="none", remedy=remedy)
     return None
 
 

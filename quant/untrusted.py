@@ -8,7 +8,7 @@ import numpy as np
 import onnx
 from onnx import AttributeProto, NodeProto, TensorProto, numpy_helper
 
-from beers_deploy.profiles.errors import ModelError
+from beers_deploy.profiles.errors import BeersError, ModelError
 from beers_deploy.quant.reading.arithmetic import LIST_VALUES, computed
 
 FILE_BYTES = 1 << 30
@@ -57,6 +57,8 @@ def contradictions(where: str) -> Iterator[None]:
     """
     try:
         yield
+    except BeersError:
+        raise
     except (ArithmeticError, AttributeError, LookupError, RecursionError, TypeError, ValueError) as error:
         got = f"nodes that contradict it ({' '.join(str(error).split())[:80]})"
         remedy = "check the file with onnx.checker, and export it again"

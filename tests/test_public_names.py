@@ -29,7 +29,10 @@ SURFACE = {
         "host_model judge load_onnx open_session quantise_free quantise_model read_core run "
         "save_onnx tiling_of unseen_patches"
     ),
-    "beers_deploy": ("Document float_for float_model load_dpu place predict read_network restore run_gate to_onnx"),
+    "beers_deploy": (
+        "BeersError Board Limits Network Pair Sensor Table boards characterize check compare evaluate gate networks "
+        "predict quantize restore sensors simulate tradeoff"
+    ),
 }
 LIGHT = tuple(
     name

@@ -19,7 +19,7 @@ from beers_deploy.model.simulator.detector import Draw
 from beers_deploy.profiles.figures import Figure, Row, measured, unavailable
 from beers_deploy.profiles.sensor_file import load_sensor, reference_for
 from beers_deploy.quant.onnx_file import save_onnx
-from beers_deploy.results import Document, print_rows
+from beers_deploy.results import Table, print_rows
 from beers_deploy.studies.detection.average_precision import find_hits, score
 from beers_deploy.studies.detection.boxes import Letterbox
 from beers_deploy.studies.detection.detector import open_detector
@@ -90,7 +90,7 @@ def main() -> None:
     scored = {row.name: [row.scores(file, scenes, given.seed) for file in files[row.name]] for row in rows}
     made = retrained_rows(scored)
     print_rows(TABLE, made)
-    Document("retrain", vars(given), (), tuple(made)).write(given.folder / "figures.json")
+    Table("retrain", vars(given), (), tuple(made)).save(given.folder / "figures.json")
 
 
 def conditions(sensors: Sequence[str], method: str) -> list[Condition]:

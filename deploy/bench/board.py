@@ -4,8 +4,9 @@ One configuration and one tile size are predicted layer by layer; several are sw
 predicted by the frame.
 """
 
+import os
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -24,27 +25,102 @@ from beers_deploy.bench.tables import (
     predicted_rows,
     processor_row,
     published_rows,
+    swath_row,
     sweep_rows,
     within_words,
 )
-from beers_deploy.dpu.board import Dpu, dpu_of
+from beers_deploy.dpu.board import ALL, BoardLike, Dpu, boards_of, dpu_of
 from beers_deploy.dpu.cost.latency import Prediction
 from beers_deploy.dpu.cost.model import Task
 from beers_deploy.dpu.cost.own_runs import read_own_runs
 from beers_deploy.dpu.reading import own_tile_px
 from beers_deploy.model.io.images import read_acquisition
-from beers_deploy.profiles import load_target
+from beers_deploy.model.shipped import SENSOR
+from beers_deploy.network import Network, NetworkLike
 from beers_deploy.profiles.errors import ModelError, OptionError
 from beers_deploy.profiles.figures import Row
-from beers_deploy.profiles.target import board_names
+from beers_deploy.profiles.target import DEFAULT_TARGET
 from beers_deploy.quant.onnx_file import load_onnx
 from beers_deploy.quant.tiling.walk import tiling_of
 from beers_deploy.restoration.options import parse_halo
+from beers_deploy.results import Table
+
+FACE = {"throughput": "fps", "latency": "swath"}
+"""What `predict` calls the figures of its rows."""
+
+
+@dataclass(frozen=True, repr=False, kw_only=True)
+class Predicted(Table):
+    """A network's speed, power and energy on boards, each figure with its interval: a row a configuration.
+
+    Attributes:
+        layers: where the time goes, layer by layer, of one configuration; empty of several.
+    """
+
+    layers: Table
+
+
+def predict(
+    network: NetworkLike,
+    board: BoardLike | Sequence[BoardLike] = DEFAULT_TARGET,
+    *,
+    size: tuple[int, int] | str = PAPER_SIZE,
+    dpu: str | None = None,
+    tile: int = PAPER_TILE_PX,
+    halo: int | str = "exact",
+    host_task: Task | None = None,
+    measured: str | os.PathLike[str] | None = None,
+) -> Predicted:
+    """Predict a network on boards by the cost model; nothing is measured.
+
+    A network that cannot be tiled is predicted by the frame: then there is no swath, power nor energy of one.
+
+    Args:
+        network: float or INT8.
+        board: one, several, or "all" of the shipped ones.
+        size: (width, height) of the swath in pixels, or as text.
+        dpu: configuration of the DPU, "all" of the board's, or None for the board's own.
+        tile: side of a tile in pixels.
+        halo: context around a tile in pixels; "exact" leaves no seams.
+        host_task: what the host does with the results; None for what the file tells.
+        measured: runs of the user's own board as JSON, by which the cost model is corrected.
+
+    Raises:
+        ModelError: no network, or one that does not run on the DPU.
+        ProfileError: no such board or configuration.
+        OptionError: options that do not go together.
+    """
+    found = Network.load(network, sensor=SENSOR, to_run=False)
+    boards, corrected = _boards(board, dpu, None if measured is None else Path(measured))
+    width_px, height_px = parse_size(size) if isinstance(size, str) else size
+    predictions = [(each, predict_file(found.file, each, _tile_px(found, tile), host_task)) for each in boards]
+    try:
+        exact_px = found.tiling.halo_px
+    except ModelError:
+        rows = [frame_row(prediction, each) for each, prediction in predictions]
+    else:
+        swath = Swath(width_px, height_px, tile, parse_halo(str(halo), exact_px))
+        rows = [swath_row(prediction, swath, each) for each, prediction in predictions]
+    notes = [words for each, prediction in predictions for words in host_words(prediction, each)]
+    layers = layer_rows(predictions[0][1], boards[0]) if len(boards) == 1 else []
+    names = ", ".join(each.target.name for each in boards)
+    arguments: dict[str, object] = {"target": names, "dpu": dpu, "size": f"{width_px}x{height_px}", "tile": tile}
+    arguments |= {"halo": halo, "measured": measured, "host_task": host_task}
+    shown = [*(row for _, part in corrected for row in part), *map(_as_face, rows)]
+    about = ("predict", arguments, (found.input,))
+    return Predicted(*about, tuple(shown), notes=tuple(dict.fromkeys(notes)), layers=Table(*about, tuple(layers)))
+
+
+def _tile_px(network: Network, tile_px: int) -> int | None:
+    """The tile's side; None for a network that is fixed to one."""
+    return None if own_tile_px(network.model) else tile_px
+
+
+def _as_face(row: Row) -> Row:
+    return replace(row, figures={FACE.get(key, key): figure for key, figure in row.figures.items()})
+
 
 TRAFFIC = "LdFM, StFM: feature maps loaded and stored, an image; LdWB: weights and biases loaded, a batch"
-ALL = "all"
-"""Every board, or every configuration."""
-
 Tables = list[tuple[str, list[Row]]]
 """Rows by the title of their table."""
 
@@ -159,15 +235,17 @@ def _frames(
     return BoardBench([*corrected, (f"{model.name}, frames of {size}", rows)], [whole, *dict.fromkeys(said)], layers)
 
 
-def _boards(target: str, config: str | None, measured: Path | None) -> tuple[list[Dpu], Tables]:
+def _boards(
+    target: BoardLike | Sequence[BoardLike], config: str | None, measured: Path | None
+) -> tuple[list[Dpu], Tables]:
     """The configurations asked for; corrected by runs where they are given, and the tables that say so."""
     if target == ALL and config not in (None, ALL):
-        expected, remedy = "'all' or none beside --target all", "leave it out, or name the board"
-        raise OptionError("--config", expected=expected, got=repr(config), remedy=remedy)
+        expected, remedy = "'all' or none beside all boards", "leave it out, or name the board"
+        raise OptionError("dpu", expected=expected, got=repr(config), remedy=remedy)
     if target == ALL and measured is not None:
-        expected, remedy = "one board beside --measured", "name the board that the runs are of"
-        raise OptionError("--target", expected=expected, got=repr(target), remedy=remedy)
-    targets = map(load_target, board_names() if target == ALL else [target])
+        expected, remedy = "one board beside `measured`", "name the board that the runs are of"
+        raise OptionError("target", expected=expected, got=repr(target), remedy=remedy)
+    targets = boards_of(target)
     boards = [dpu_of(each, name) for each in targets for name in (each.configurations if config == ALL else [config])]
     if measured is None:
         return boards, []

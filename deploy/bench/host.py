@@ -18,7 +18,7 @@ from beers_deploy.bench.timing import interleaved, timed
 from beers_deploy.dpu.reading import inputs_of
 from beers_deploy.host_state import cpu_load, resident_bytes
 from beers_deploy.model.processor import require_cores
-from beers_deploy.networks import other_precision
+from beers_deploy.network import other_precision
 from beers_deploy.profiles import TargetProfile
 from beers_deploy.profiles.figures import Figure, Row, measured, unavailable
 from beers_deploy.quant.onnx_file import is_quantised, load_onnx
@@ -115,7 +115,7 @@ def host_rows(model: Path, target: TargetProfile, tile_px: int, threads: int = 0
     Raises:
         OptionError: more threads than cores.
     """
-    require_cores("--threads", threads)
+    require_cores("threads", threads)
     given = load_onnx(model)
     other = other_precision(given)
     runs = [Timed(model.stem, given)]

@@ -273,13 +273,14 @@ def sweep_rows(
 ) -> list[Row]:
     """A row a configuration and tile size, for whole tiles with the swath's halo."""
     return [
-        _row(predict_file(model, dpu, tile_px, task), replace(swath, tile_px=tile_px), dpu)
+        swath_row(predict_file(model, dpu, tile_px, task), replace(swath, tile_px=tile_px), dpu)
         for dpu in boards
         for tile_px in tiles_px
     ]
 
 
-def _row(prediction: Prediction, swath: Swath, dpu: Dpu) -> Row:
+def swath_row(prediction: Prediction, swath: Swath, dpu: Dpu) -> Row:
+    """A swath in whole tiles on one configuration."""
     latency, power = swath_latency(prediction, math.ceil(swath.tiles / prediction.batch)), dpu_power(dpu)
     figures = {
         "tiles": exact(swath.tiles, "tile", ARITHMETIC),
@@ -287,6 +288,7 @@ def _row(prediction: Prediction, swath: Swath, dpu: Dpu) -> Row:
         "latency": latency,
         "throughput": predicted(prediction.fps, "frame/s", prediction.fps_interval, COST_SOURCE),
         "power": power,
+        "energy": energy(latency, power),
         "efficiency": efficiency(swath.pixels, latency, power),
         "maps through memory": exact(prediction.streamed_bytes / 1e6, "MB/tile"),
         "layers on chip": exact(on_chip(prediction), "%"),
@@ -370,7 +372,7 @@ def parse_tiles(text: str) -> list[int]:
     if not all(part.isdecimal() and len(part) < 6 and 16 <= int(part) <= MOST_TILE_PX for part in parts):
         remedy = "write one size, or several as 640,256,128"
         raise OptionError(
-            "--tile", expected=f"tile sides of 16 to {MOST_TILE_PX} pixels", got=repr(text), remedy=remedy
+            "tile", expected=f"tile sides of 16 to {MOST_TILE_PX} pixels", got=repr(text), remedy=remedy
         )
     return [int(part) for part in parts]
 
@@ -384,5 +386,5 @@ def parse_size(text: str) -> tuple[int, int]:
     parts = text.lower().split("x")
     if len(parts) != 2 or not all(part.isdecimal() and int(part) > 0 for part in parts):
         remedy = f"write it as {PAPER_SIZE}"
-        raise OptionError("--size", expected="WIDTHxHEIGHT in pixels", got=repr(text), remedy=remedy)
+        raise OptionError("size", expected="WIDTHxHEIGHT in pixels", got=repr(text), remedy=remedy)
     return int(parts[0]), int(parts[1])

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from beers_deploy.commands.shared import refuse, say
+from beers_deploy.commands.shared import refuse, save, say
 from beers_deploy.model.shipped import SENSOR
 from beers_deploy.profiles import load_sensor, load_target
 from beers_deploy.profiles.errors import OptionError
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
     from beers_deploy.bench.tables import Swath
 
-EXAMPLE = "bench --target vck190-model --size 13600x9016 --config C32B3"
+EXAMPLE = "bench --target vck190-model --size 13600x9016 --dpu C32B3"
 
 PAPER_SIZE = "13600x9016"  # as in deploy.bench.tables, which is imported late
 BOARD_ONLY = (
@@ -28,7 +28,7 @@ BOARD_ONLY = (
     "full_scale",
     "size",
     "halo",
-    "config",
+    "dpu",
     "host_task",
     "measured",
     "no_traditional",
@@ -77,7 +77,7 @@ def bench(
     ] = None,
     tile: Annotated[str, typer.Option(help="Tile side in pixels; several with commas are swept.")] = "640",
     halo: Annotated[str, typer.Option(help="Context around a tile: 'exact' (no seams) or pixels.")] = "exact",
-    config: Annotated[
+    dpu: Annotated[
         str | None, typer.Option(help="DPU configuration, such as C32B3; 'all' sweeps the board's.")
     ] = None,
     host_task: Annotated[
@@ -107,8 +107,8 @@ def bench(
     from beers_deploy.bench.tables import parse_tiles
     from beers_deploy.dpu.cost.model import TASKS
     from beers_deploy.model.io.files import require_writable
-    from beers_deploy.networks import int8_file
-    from beers_deploy.results import Document, print_rows
+    from beers_deploy.network import int8_file
+    from beers_deploy.results import Table, print_rows
 
     tiles, here, board = parse_tiles(tile), target in HOSTS, target.removesuffix(MODEL_SUFFIX)
     _refuse_unused(context, here)
@@ -131,7 +131,7 @@ def bench(
             size=size,
             tiles_px=tiles,
             halo=halo,
-            config=config,
+            config=dpu,
             measured=measured,
             within_s=within,
             host_task=task,
@@ -151,13 +151,13 @@ def bench(
         "size": size,
         "tile": tile,
         "halo": halo,
-        "config": config,
+        "dpu": dpu,
         "host_task": host_task,
         "measured": measured.name if measured else None,
         "within": within,
     }
     inputs = tuple(file for file in (path, image, measured) if file)
-    Document("bench", arguments, inputs, tuple(rows)).write(json)
+    save(Table("bench", arguments, inputs, tuple(rows)), json)
 
 
 def _traditional_row(dn: "np.ndarray | None", swath: "Swath") -> "Row":

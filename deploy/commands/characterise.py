@@ -5,14 +5,14 @@ from typing import Annotated
 
 import typer
 
-from beers_deploy.commands.shared import say
+from beers_deploy.commands.shared import save, say
 
 EXAMPLE = "characterise raw1.tif raw2.tif --bits 12 --out my-sensor.toml"
 
 
 def characterise(
     images: Annotated[list[Path], typer.Argument(help="Raw images of one sensor: whole digital numbers, one band.")],
-    out: Annotated[Path, typer.Option(help="The sensor profile, a TOML file.")],
+    out: Annotated[Path, typer.Option("-o", "--out", help="The sensor profile, a TOML file.")],
     edge: Annotated[
         list[str] | None,
         typer.Option(metavar="FILE:X,Y,WIDTH,HEIGHT", help="A box with one straight edge; searched for if none."),
@@ -32,7 +32,7 @@ def characterise(
     what was denoised, sharpened or resampled is refused.
     """
     from beers_deploy.model.io.files import require_writable, write_text
-    from beers_deploy.results import Document, print_rows
+    from beers_deploy.results import Table, print_rows
     from beers_deploy.studies.characterise import characterise as measure
     from beers_deploy.studies.characterise import profile_toml, read_box
 
@@ -43,5 +43,5 @@ def characterise(
     print_rows(f"sensor of {len(images)} image{'' if len(images) == 1 else 's'}", rows)
     write_text(out, profile_toml(found))
     arguments = {"bits": bits, "gain": gain, "gsd": gsd, "edge": ", ".join(map(str, boxes)) or None}
-    Document("characterise", arguments, tuple(images), tuple(rows)).write(json)
+    save(Table("characterise", arguments, tuple(images), tuple(rows)), json)
     say(f"wrote {out}: beers-deploy profiles {out}")

@@ -1,20 +1,14 @@
 """`beers-deploy check`: can the DPU run this network? Each node, the rules it breaks, and what to change."""
 
-from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
-from beers_deploy.commands.shared import BOARDS, say
-from beers_deploy.profiles import load_sensor
+from beers_deploy.commands.shared import BOARDS, save, say
 from beers_deploy.profiles.target import DEFAULT_TARGET
 
-if TYPE_CHECKING:
-    from beers_deploy.dpu.board import Dpu
-
-EXAMPLE = "check network.onnx --target zcu102 --config B4096"
-TILE_PX = 640
+EXAMPLE = "check network.onnx --target zcu102 --dpu B4096"
 
 
 def check(
@@ -26,7 +20,7 @@ def check(
         ),
     ] = None,
     target: Annotated[str, typer.Option(help=f"Profile of a board with a DPU: {BOARDS}.")] = DEFAULT_TARGET,
-    config: Annotated[
+    dpu: Annotated[
         str | None, typer.Option(help="DPU configuration that the profile lists; the target's own if none.")
     ] = None,
     tile: Annotated[
@@ -39,39 +33,21 @@ def check(
     json: Annotated[Path | None, typer.Option(help="Write the findings here.")] = None,
 ) -> None:
     """Place every node of a network on the host, the DPU or the CPU; exit code 1 if the DPU cannot run its part."""
-    from beers_deploy.dpu.board import load_dpu
-    from beers_deploy.dpu.checker.picture import require_picture
+    from beers_deploy.dpu.checker.picture import require_picture, write_picture
+    from beers_deploy.dpu.checker.table import check as placed
     from beers_deploy.model.io.files import require_writable
-    from beers_deploy.model.shipped import SENSOR
-    from beers_deploy.networks import int8_file
+    from beers_deploy.model.shipped import VARIANT
+    from beers_deploy.network import in_int8
+    from beers_deploy.results import print_rows
 
     require_picture(picture)
-    path = int8_file(model, load_sensor(SENSOR), partial(say, err=True))
-    require_writable(picture, json, inputs=(path, Path(target)))
-    if not _network(path, load_dpu(target, config), tile, picture, json):
-        raise typer.Exit(1)
-
-
-def _network(path: Path, dpu: "Dpu", tile: int | None, picture: Path | None, json: Path | None) -> bool:
-    """Judge a file; whether its core runs whole on the DPU."""
-    from beers_deploy.dpu.checker.picture import write_picture
-    from beers_deploy.dpu.checker.placement import place
-    from beers_deploy.dpu.checker.table import legality, network_rows, summary
-    from beers_deploy.dpu.reading import network_of, own_tile_px
-    from beers_deploy.quant.graph import refusal
-    from beers_deploy.quant.onnx_file import load_onnx
-    from beers_deploy.results import Document, print_rows
-
-    model = load_onnx(path, to_run=False)
-    tile_px = tile or own_tile_px(model) or TILE_PX
-    placement = place(network_of(model, tile_px, str(path)), dpu)
-    title = f"{path.name} on {dpu.target.name} {dpu.name}, tile {tile_px}"
-    rows = network_rows(placement, dpu, tile_px)
-    print_rows(title, [row for row in rows if row.table == "nodes"])
+    require_writable(picture, json, inputs=(model, Path(target)))
+    found = placed(in_int8(model or Path(VARIANT)), target, dpu=dpu, tile=tile)
+    print_rows(found.title, [row for row in found.rows if row.table == "nodes"])
     if picture is not None:
-        write_picture(placement, title, picture)
-    arguments = {"target": dpu.target.name, "config": dpu.name, "tile": tile_px}
-    Document("check", arguments, (path,), tuple(rows), (legality(placement),)).write(json)
-    for line in summary(placement, dpu, tile_px, refusal(model) if placement.note else ""):
+        write_picture(found.placement, found.title, picture)
+    save(found, json)
+    for line in found.lines:
         say(line)
-    return not placement.failed
+    if not found:
+        raise typer.Exit(1)

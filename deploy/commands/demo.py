@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from beers_deploy.commands.shared import say
+from beers_deploy.commands.shared import save, say
 from beers_deploy.model.processor import SEEDS
 from beers_deploy.model.shipped import SENSOR
 from beers_deploy.profiles.errors import OptionError
@@ -22,14 +22,14 @@ def demo(
     sensor: Annotated[
         str, typer.Option(help="Of the raw image, or to simulate: a profile's name or your .toml file, 12 bits.")
     ] = SENSOR,
-    out: Annotated[Path, typer.Option(help="Folder for the report and the files made.")] = Path("demo"),
+    out: Annotated[Path, typer.Option("-o", "--out", help="Folder for report and files.")] = Path("demo"),
     seed: Annotated[int, typer.Option(min=0, max=SEEDS, help="Seed of every random draw.")] = 0,
     json: Annotated[Path | None, typer.Option(help="Write the figures here.")] = None,
 ) -> None:
     """Simulate, quantise, gate, check, restore and predict, on a drawn scene or your image; ends with report.html."""
     from beers_deploy.model.io.files import require_writable
     from beers_deploy.report.page import write_report
-    from beers_deploy.results import Document, print_rows
+    from beers_deploy.results import Table, print_rows
     from beers_deploy.studies.demo import FILES, run_demo
 
     if full_scale is not None and image is None:
@@ -43,4 +43,4 @@ def demo(
     say(f"report: {out / 'report.html'}")
     arguments = {"image": image, "full_scale": full_scale, "sensor": sensor, "out": out, "seed": seed}
     rows = tuple(row for table in report.tables for row in table.rows)
-    Document("demo", arguments, tuple([image] if image else []), rows).write(json)
+    save(Table("demo", arguments, tuple([image] if image else []), rows), json)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from beers_deploy.commands.shared import refuse, say
+from beers_deploy.commands.shared import refuse, save, say
 from beers_deploy.model.processor import SEEDS
 from beers_deploy.profiles.figures import by_table
 
@@ -41,7 +41,7 @@ def detect(
         typer.Option(help="Profile of the reference images, in the sensor's DN; pleiades-reference if none."),
     ] = None,
     methods: Annotated[str, typer.Option(help="Names, with commas; degraded is always a row.")] = METHODS,
-    size: Annotated[
+    side: Annotated[
         int | None,
         typer.Option(min=32, max=4096, help="Side of the detector's input, where its file leaves it open."),
     ] = None,
@@ -49,7 +49,7 @@ def detect(
         str | None, typer.Option(help="Labelled classes under the detector's names: car=vehicle,minibus=vehicle.")
     ] = None,
     drawn: Annotated[int, typer.Option(min=2, max=10_000, help="Synthetic scenes, without --images.")] = DRAWN,
-    out: Annotated[Path, typer.Option(help="Folder for report.html.")] = Path("detection"),
+    out: Annotated[Path, typer.Option("-o", "--out", help="Folder for report.html.")] = Path("detection"),
     seed: Annotated[int, typer.Option(min=0, max=SEEDS, help="Seed of every random draw.")] = 0,
     json: Annotated[Path | None, typer.Option(help="Write the figures here.")] = None,
 ) -> None:
@@ -60,7 +60,7 @@ def detect(
     """
     from beers_deploy.model.io.files import require_writable
     from beers_deploy.model.shipped import DETECTOR
-    from beers_deploy.results import Document
+    from beers_deploy.results import Table
     from beers_deploy.studies.detection.average_precision import sites_note
     from beers_deploy.studies.detection.detector import open_detector, parse_classes
     from beers_deploy.studies.detection.page import write_page
@@ -74,7 +74,7 @@ def detect(
     named = [Path(name) for name in (*sensors, *names, reference) if name]
     read = (images, labels, detector, *chain.from_iterable(trees), *named)
     require_writable(out / REPORT, json, inputs=read, folders=(out,))
-    opened = open_detector(detector or DETECTOR, size_px=size)
+    opened = open_detector(detector or DETECTOR, size_px=side)
     known = {} if classes is None else parse_classes(classes)
     if images is None:
         scenes, notes = synthetic_scenes(drawn, seed, opened.names, known)
@@ -90,7 +90,7 @@ def detect(
     rows = (*(row for found in compared for row in detection_rows(found)), *paper_rows())
     pictures = [scene.path for scene in scenes if scene.path is not None]
     arguments = {name: value for name, value in context.params.items() if name != "json"}
-    Document("detect", arguments, (detector or DETECTOR, *pictures), rows).write(json)
+    save(Table("detect", arguments, (detector or DETECTOR, *pictures), rows), json)
 
 
 def _refuse_unused(context: typer.Context) -> None:

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from beers_deploy.commands.shared import say
+from beers_deploy.commands.shared import save, say
 from beers_deploy.model.processor import SEEDS
 from beers_deploy.model.shipped import SENSOR
 from beers_deploy.profiles.errors import OptionError
@@ -35,7 +35,7 @@ def evaluate(
     lpips: Annotated[
         Path | None, typer.Option(help="Weights of SqueezeNet 1.1 for LPIPS-squeeze, or a folder of backbones.")
     ] = None,
-    out: Annotated[Path | None, typer.Option(help="Folder for report.html and picture strips.")] = None,
+    out: Annotated[Path | None, typer.Option("-o", "--out", help="Folder for report.html and pictures.")] = None,
     sweep: Annotated[
         bool, typer.Option("--sweep", help="Also under 16 sensors known as they are, and 7 known wrongly.")
     ] = False,
@@ -50,7 +50,7 @@ def evaluate(
     @blind or with @ and another sensor.
     """
     from beers_deploy.model.io.files import require_writable
-    from beers_deploy.results import Document, print_rows
+    from beers_deploy.results import Table, print_rows
     from beers_deploy.studies.evaluation.page import write_page
     from beers_deploy.studies.evaluation.run import run_evaluation
 
@@ -82,4 +82,4 @@ def evaluate(
     degraded, wanted = (profile.name for profile in found.sensors)
     arguments: dict[str, object] = {"images": images, "pairs": pairs, "sensor": sensor or degraded}
     arguments |= {"reference": wanted, "methods": methods, "lpips": lpips, "out": out, "sweep": sweep, "seed": seed}
-    Document("evaluate", arguments, tuple(found.inputs), found.rows).write(json)
+    save(Table("evaluate", arguments, tuple(found.inputs), found.rows), json)

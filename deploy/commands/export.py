@@ -11,20 +11,19 @@ from beers_deploy.model.shipped import SENSOR, VARIANT
 from beers_deploy.profiles import load_sensor
 from beers_deploy.profiles.errors import ModelError, OptionError
 
-EXAMPLE = "export --variant convbeers-s --out float.onnx"
+EXAMPLE = "export --network convbeers-s --out float.onnx"
 
 
 def export(
     context: typer.Context,
-    out: Annotated[Path, typer.Option(help="ONNX file to write.")],
-    variant: Annotated[str, typer.Option(help="Shipped weights of this name.")] = VARIANT,
-    checkpoint: Annotated[
-        Path | None,
+    out: Annotated[Path, typer.Option("-o", "--out", help="ONNX file to write.")],
+    network: Annotated[
+        Path,
         typer.Option(
-            help="Your own weights instead (.safetensors), a shipped name, also with -int8, or an INT8 file that "
-            "'quantize' made of weights of 'train --conditioned'."
+            help="A shipped name, also with -int8; your own weights (.safetensors); or an INT8 file that 'quantize' "
+            "made of weights of 'train --conditioned'."
         ),
-    ] = None,
+    ] = Path(VARIANT),
     sensor: Annotated[
         str | None,
         typer.Option(help=f"What the network is told: a profile, your .toml file, or blind; {SENSOR} if none."),
@@ -32,7 +31,7 @@ def export(
     tile: Annotated[
         int | None, typer.Option(min=16, max=8192, help="Fix the input to one tile of this side, 640 for a board.")
     ] = None,
-    board: Annotated[
+    board_file: Annotated[
         Path | None, typer.Option(help="Of an INT8 file: also write its integers in the board's encoding.")
     ] = None,
     delta: Annotated[
@@ -49,27 +48,24 @@ def export(
     it runs: of a profile with ranges, for the middle of each. A value outside the range that was trained is taken as
     the nearest end of it, with a warning.
 
-    An INT8 file of a network behind a bank (--checkpoint FILE.onnx) is told another sensor without being calibrated
+    An INT8 file of a network behind a bank (--network FILE.onnx) is told another sensor without being calibrated
     anew. What the sensor changes can be sent by itself: --delta writes it, and --apply makes the file of any sensor
     that sensor's, to the byte.
     """
     from beers_deploy.export import about, float_for, require_parity, to_onnx, torch_network
     from beers_deploy.model.io.files import require_writable
     from beers_deploy.model.io.tensors import is_conditioned, read_plain
-    from beers_deploy.model.shipped import shipped_weights
-    from beers_deploy.networks import warn_outside, weights_file
+    from beers_deploy.network import warn_outside, weights_file, weights_named
     from beers_deploy.quant.onnx_file import save_onnx
 
-    if checkpoint is not None:
-        refuse(context, ["variant"], expected="no --checkpoint beside it", got="both", remedy="leave one out")
-    path = weights_file(checkpoint) if checkpoint else shipped_weights(variant)
-    require_writable(out, board, delta, inputs=(path, apply, Path(sensor) if sensor else None))
+    path = weights_file(network) if network.suffix or network.exists() else weights_named(network)
+    require_writable(out, board_file, delta, inputs=(path, apply, Path(sensor) if sensor else None))
     if path.suffix != ".onnx":
         remedy = "give one that 'quantize' made of weights of 'train --conditioned', or leave it out"
-        got = str(checkpoint) if checkpoint else "none"
-        refuse(context, ["board", "delta", "apply"], expected="an INT8 --checkpoint", got=got, remedy=remedy)
+        asked = ["board_file", "delta", "apply"]
+        refuse(context, asked, expected="an INT8 --network", got=str(network), remedy=remedy)
     if path.suffix == ".onnx":
-        _export_int8(path, out, sensor, tile, board, delta, apply)
+        _export_int8(path, out, sensor, tile, board_file, delta, apply)
         return
     known = load_sensor(sensor or SENSOR) if is_conditioned(path) else None
     if known is not None:
@@ -112,7 +108,7 @@ def _export_int8(
     """
     from beers_deploy.export import require_tile
     from beers_deploy.model.io.files import whole_file
-    from beers_deploy.networks import told_by_delta, told_int8
+    from beers_deploy.network import told_by_delta, told_int8
     from beers_deploy.quant.banked.family import delta_of_file
     from beers_deploy.quant.encodings import board_model, host_model, read_core
     from beers_deploy.quant.onnx_file import fixed_tile_px, load_onnx, metadata, save_onnx

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from beers_deploy.commands.shared import say
+from beers_deploy.commands.shared import save, say
 from beers_deploy.profiles import load_sensor, load_target
 from beers_deploy.profiles.sensor_file import BLIND
 from beers_deploy.profiles.target import DEFAULT_TARGET
@@ -17,7 +17,7 @@ EXAMPLE = "info raw.jp2"
 
 def info(
     image: Annotated[Path, typer.Argument(metavar="FILE", help="Image, or the index of its tiles.")],
-    model: Annotated[
+    network: Annotated[
         Path | None, typer.Option(help="ONNX network, or a shipped one's name; convbeers-s-int8 if none.")
     ] = None,
     sensor: Annotated[
@@ -43,18 +43,18 @@ def info(
     """
     from beers_deploy.info import info_row
     from beers_deploy.model.io.files import require_writable
-    from beers_deploy.networks import network_file
+    from beers_deploy.network import network_file
     from beers_deploy.restoration.index_files import index_files
-    from beers_deploy.results import Document, print_rows
+    from beers_deploy.results import Table, print_rows
 
     tiles = index_files(image, trust_index)
-    require_writable(json, inputs=(image, *tiles, model, Path(sensor) if sensor else None, Path(target)))
+    require_writable(json, inputs=(image, *tiles, network, Path(sensor) if sensor else None, Path(target)))
     known = load_sensor(sensor or BLIND)
-    path = network_file(model, known, partial(say, err=True))
+    path = network_file(network, known, partial(say, err=True))
     bits = int(known.bits.low) if sensor else None
     options = Options(path, tile, full_scale=full_scale, trust_index=trust_index, sensor_bits=bits)
     row = info_row(image, options, load_target(target), measure)
     print_rows(str(image), [row])
     arguments = {"sensor": sensor or BLIND, "tile": tile, "full_scale": full_scale, "target": target}
     # No digest of FILE: it would be read whole.
-    Document("info", {**arguments, "file": image.name}, (path,), (row,)).write(json)
+    save(Table("info", {**arguments, "file": image.name}, (path,), (row,)), json)

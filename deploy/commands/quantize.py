@@ -1,17 +1,16 @@
 """`beers-deploy quantize`: float ONNX to static INT8 under the DPU's rules, or free of them."""
 
 from enum import StrEnum
-from functools import partial
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
-from beers_deploy.commands.shared import BOARDS, say
+from beers_deploy.commands.shared import BOARDS, save, say
 from beers_deploy.model.processor import SEEDS
 from beers_deploy.model.shipped import SENSOR
-from beers_deploy.profiles import load_sensor, load_target
 from beers_deploy.profiles.errors import OptionError
+from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.profiles.target import DEFAULT_TARGET
 
 EXAMPLE = "quantize float.onnx --target zcu104 --sensor pleiades-degraded --out int8.onnx"
@@ -24,19 +23,29 @@ class Regime(StrEnum):
     free = "free"
 
 
+TITLES = {
+    "integer layers": "integer layers",
+    "rounding": "tie rounding",
+    "gate": "float against INT8, on patches that calibration did not see",
+}
+"""Of the tables that are shown, by the rows' own."""
+
+
 def quantize(
     model: Annotated[
         Path, typer.Argument(help="Float ONNX or weights, or a shipped network's name, then told --sensor.")
     ],
-    out: Annotated[Path, typer.Option(help="INT8 ONNX for the host, runs on stock onnxruntime.")],
+    out: Annotated[Path, typer.Option("-o", "--out", help="INT8 ONNX for stock onnxruntime.")],
     target: Annotated[str, typer.Option(help=f"Whose rules to obey: {BOARDS}.")] = DEFAULT_TARGET,
     sensor: Annotated[str, typer.Option(help="Profile that calibration patches are drawn from.")] = SENSOR,
     regime: Annotated[
         Regime, typer.Option(help="legal: the DPU's rules; free: float scales, a channel's own for weights.")
     ] = Regime.legal,
-    board: Annotated[Path | None, typer.Option(help="Also write the DPU's core in the board's encoding.")] = None,
+    board_file: Annotated[
+        Path | None, typer.Option(help="Also write the DPU's core in the board's encoding.")
+    ] = None,
     images: Annotated[Path | None, typer.Option(help="Folder of scenes for calibration; drawn ones if none.")] = None,
-    data: Annotated[
+    samples: Annotated[
         Path | None,
         typer.Option(help="Your own samples in place of simulated patches: .npy or .npz (N, C, H, W), or a folder."),
     ] = None,
@@ -49,7 +58,7 @@ def quantize(
     finetune: Annotated[
         int,
         typer.Option(
-            min=0, max=100_000, help="Steps that train the INT8 numbers on --images or --data; some 250, minutes."
+            min=0, max=100_000, help="Steps that train the INT8 numbers on --images or --samples; some 250, minutes."
         ),
     ] = 0,
     seed: Annotated[int, typer.Option(min=0, max=SEEDS, help="Seed of the patches.")] = 0,
@@ -62,44 +71,51 @@ def quantize(
 
     Prints each integer layer: bits of its accumulator, seen and proven, and the share of saturated results.
     """
-    from beers_deploy.export import float_model
     from beers_deploy.model.io.files import require_writable
-    from beers_deploy.networks import conditioned, float_file
-    from beers_deploy.results import Document, print_rows
+    from beers_deploy.network import conditioned
+    from beers_deploy.profiles.figures import by_table
+    from beers_deploy.quant.encodings import read_core
+    from beers_deploy.quantise import quantize as quantised
+    from beers_deploy.quantise import sensitivity_report
+    from beers_deploy.report.page import write_report
+    from beers_deploy.results import Table, print_rows
+    from beers_deploy.verdict import compare
 
-    if regime is Regime.free and (board or report or finetune):
+    free = regime is Regime.free
+    if free and (board_file or report or finetune):
         remedy = "leave it out, or take --regime legal"
-        expected = "no --board, --report or --finetune"
+        expected = "no --board-file, --report or --finetune"
         raise OptionError("--regime free", expected=expected, got="one", remedy=remedy)
+    if report and conditioned(model):
+        expected, remedy = "a network that is calibrated by itself", "leave it out"
+        raise OptionError("--report", expected=expected, got="one behind a bank", remedy=remedy)
     page, figures = (report / "report.html", report / "report.json") if report else (None, None)
-    read = (model, images, data, *map(Path, (target, sensor)))
-    require_writable(out, board, json, page, figures, inputs=read)
-    known, board_target, banked = load_sensor(sensor), load_target(target), conditioned(model)
-    if banked and (regime is Regime.free or report or finetune or data):
-        remedy = "leave it out: such a network is calibrated over the whole family of sensors at once"
-        expected = "no --regime free, --report, --finetune or --data"
-        raise OptionError("a network behind a bank", expected=expected, got="one", remedy=remedy)
-    model = float_file(model, known, partial(say, err=True))
-    network = float_model(model)
-
-    # These take torch, seconds: what is wrong with the options or the files has been said by now.
-    from beers_deploy.quant.calibration import Calibration
-    from beers_deploy.quant.samples import samples_of
-    from beers_deploy.quantise import quantise_banked_file, quantise_free_file, quantise_legal_file
-
-    simulated = Calibration(sensor, images, patches, patch, seed)
-    calibration = samples_of(network, data) or simulated
-    if banked:
-        rows = quantise_banked_file(banked, simulated, board_target, out, board, say, print_rows)
-    elif regime is Regime.free:
-        rows = quantise_free_file(network, calibration, out, say, print_rows)
-    else:
-        rows = quantise_legal_file(
-            network, calibration, board_target, out, say, print_rows, board=board, page=page, finetune=finetune
-        )
+    read = (model, images, samples, *map(Path, (target, sensor)))
+    require_writable(out, board_file, json, page, figures, inputs=read)
+    known = Sensor.load(sensor)
+    drawn: dict[str, Any] = {"sensor": known, "images": images, "patches": patches, "seed": seed}
+    made = quantised(model, samples, board=target, regime=regime.value, patch_px=patch, finetune=finetune, **drawn)
+    made.save(out)
+    kept = f", {made.quantised.relus} ReLUs kept" if made.quantised else f", told {known.name}"
+    count = f"{len(read_core(made.model).ops)} integer operations{kept}" if not free else "float scales"
+    say(f"wrote {out}: {count}")
+    if board_file is not None:
+        made.core().save(board_file)
+        say(f"wrote {board_file}: the same numbers in the board's encoding")
+    rows = list(made.layers)
+    if free:
+        rows += compare(made, samples=samples, sensor=known, images=images, seed=seed).rows
+    for title, part in by_table(rows).items():
+        print_rows(TITLES[title], part)
+    if page is not None:
+        found, written = sensitivity_report(made, samples, rows, patch_px=patch, **drawn)
+        write_report(written, page)
+        say(f"wrote {page}: {written.headline}")
+        rows = [*found, *rows]
     arguments = {"target": target, "sensor": sensor, "images": images, "patches": patches, "patch": patch}
-    arguments |= {"data": data}
+    arguments |= {"samples": samples}
     arguments |= {"regime": regime.value, "finetune": finetune, "seed": seed}
-    document = Document("quantize", arguments, (model, out), tuple(rows))
+    origin = made.origin.input if made.origin else model
+    document = Table("quantize", arguments, (origin, out), tuple(rows))
     for path in (figures, json):
-        document.write(path)
+        save(document, path)

@@ -7,14 +7,14 @@ from typing import Annotated
 
 import typer
 
-from beers_deploy.commands.shared import refuse, say
+from beers_deploy.commands.shared import refuse, save, say
 from beers_deploy.profiles import load_sensor
 from beers_deploy.profiles.errors import OptionError
 from beers_deploy.profiles.sensor_file import BLIND, reference_for
 from beers_deploy.restoration.options import TILE_PX, Compression, Options, Runtime
 
 EXAMPLE = "restore raw.tif restored.tif"
-NETWORK_ONLY = ("model", "tile", "halo", "resume", "runtime", "threads", "scheduler", "cog", "stac")
+NETWORK_ONLY = ("network", "tile", "halo", "resume", "runtime", "threads", "scheduler", "cog", "stac")
 """Options of which the traditional chain takes none."""
 
 
@@ -29,7 +29,7 @@ def restore(
     context: typer.Context,
     image: Annotated[Path, typer.Argument(metavar="IN", help="Image: TIFF or what GDAL reads, of any size, or PNG.")],
     out: Annotated[Path, typer.Argument(metavar="OUT", help="TIFF to write, of the type of IN.")],
-    model: Annotated[
+    network: Annotated[
         Path | None, typer.Option(help="ONNX network, or a shipped one's name; convbeers-s-int8 if none.")
     ] = None,
     method: Annotated[Method, typer.Option(help="A network, or the traditional chain of --sensor.")] = Method.network,
@@ -85,16 +85,16 @@ def restore(
     """
     from beers_deploy.model.io.files import require_writable
     from beers_deploy.model.shipped import INT8
-    from beers_deploy.networks import conditioned, network_file
+    from beers_deploy.network import conditioned, network_file
     from beers_deploy.restoration.bands import parse_sensors
     from beers_deploy.restoration.run import restore_file
     from beers_deploy.restoration.stac import require_stac, write_item
-    from beers_deploy.results import Document, print_rows
+    from beers_deploy.results import Table, print_rows
 
     budget_bytes = max(int(memory * 1e9), 1) if memory else None
     sensors = parse_sensors(sensor or BLIND)
     profiles = (Path(each) for each in sensors.values()) if sensor else ()
-    require_writable(out, json, stac, inputs=(image, model, *profiles))
+    require_writable(out, json, stac, inputs=(image, network, *profiles))
     if method is Method.traditional:
         expected, remedy = "none with --method traditional", "leave it out"
         refuse(context, NETWORK_ONLY, expected=expected, got="one", remedy=remedy)
@@ -104,15 +104,15 @@ def restore(
         if not cog:
             raise OptionError("--stac", expected="--cog beside it", got="none", remedy="add it, or leave --stac out")
         require_stac()
-    if sensor is not None and conditioned(model) is None:
+    if sensor is not None and conditioned(network) is None:
         expected, remedy = "a shipped network, or weights of 'train --conditioned'", "leave --sensor out"
-        raise OptionError("--sensor", expected=expected, got=f"{model}, made for one already", remedy=remedy)
+        raise OptionError("--sensor", expected=expected, got=f"{network}, made for one already", remedy=remedy)
     known = {band: load_sensor(each) for band, each in sensors.items()}
-    if found := conditioned(model):
+    if found := conditioned(network):
         told = f"told {sensor}" if sensor else "told no sensor (blind): --sensor tells it yours, and restores better"
-        name = model.name if model else f"{found.name}{INT8}"
+        name = network.name if network else f"{found.name}{INT8}"
         say(f"network: {name}, {told}")
-    paths = {band: network_file(model, each, partial(say, err=True)) for band, each in known.items()}
+    paths = {band: network_file(network, each, partial(say, err=True)) for band, each in known.items()}
     path, bits = next(iter(paths.values())), {int(each.bits.low) for each in known.values()}
     if len(bits) > 1 and full_scale is None:
         remedy = "give --full-scale, or restore such bands apart"
@@ -146,7 +146,7 @@ def restore(
         "threads": threads,
     }
     arguments |= {"scheduler": scheduler}
-    Document("restore", arguments, (*paths.values(), image), (row,)).write(json)
+    save(Table("restore", arguments, (*paths.values(), image), (row,)), json)
 
 
 def _by_the_chain(
@@ -160,7 +160,7 @@ def _by_the_chain(
     json: Path | None,
 ) -> None:
     from beers_deploy.restoration.traditional import Request, restore_file_traditionally
-    from beers_deploy.results import Document, print_rows
+    from beers_deploy.results import Table, print_rows
 
     if sensor is None:
         remedy = "name a profile ('beers-deploy profiles' lists them) or give your .toml file"
@@ -170,4 +170,4 @@ def _by_the_chain(
     row = restore_file_traditionally(image, out, request, (json,))
     print_rows(f"wrote {out}", [row])
     arguments = {"method": "traditional", "sensor": sensor, "full_scale": full_scale}
-    Document("restore", arguments, (image,), (row,)).write(json)
+    save(Table("restore", arguments, (image,), (row,)), json)

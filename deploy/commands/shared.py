@@ -1,11 +1,20 @@
 """What all commands share: how they print besides tables, and how they refuse options that would do nothing."""
 
-from collections.abc import Iterable
+import json
+import sys
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager, redirect_stdout
+from contextvars import ContextVar
+from pathlib import Path
+from typing import TYPE_CHECKING, TextIO
 
 import typer
 
 from beers_deploy.profiles.errors import OptionError, visible
 from beers_deploy.profiles.target import board_names
+
+if TYPE_CHECKING:
+    from beers_deploy.results import Table
 
 BOARDS = f"{', '.join(board_names())}, or your .toml file"
 """What --target takes, for its help."""
@@ -29,6 +38,31 @@ def refuse(context: typer.Context, names: Iterable[str], *, expected: str, got: 
         source = context.get_parameter_source(name)
         if source is not None and source.name == "COMMANDLINE" and context.params[name]:
             raise OptionError(options[name], expected=expected, got=got, remedy=remedy)
+
+
+STDOUT = Path("-")
+"""What --json takes for standard output; tables and notes then go to standard error."""
+
+_results: ContextVar[TextIO | None] = ContextVar("results", default=None)
+
+
+@contextmanager
+def results_to(stream: TextIO) -> Iterator[None]:
+    """Keep a stream for results alone: what else is printed there goes to standard error."""
+    token = _results.set(stream)
+    try:
+        with redirect_stdout(sys.stderr):
+            yield
+    finally:
+        _results.reset(token)
+
+
+def save(table: "Table", path: Path | None) -> None:
+    """Write results where --json asked for them: to a file, to standard output for `-`, nowhere for None."""
+    if path == STDOUT:
+        (_results.get() or sys.stdout).write(json.dumps(table.to_dict(), indent=1) + "\n")
+    elif path is not None:
+        table.save(path)
 
 
 def say(text: str, err: bool = False) -> None:

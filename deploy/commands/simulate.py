@@ -46,7 +46,7 @@ def simulate(
     scenes: Annotated[
         list[Path] | None, typer.Argument(help="Images: 8-bit, 16-bit DN, float; drawn if none.")
     ] = None,
-    out: Annotated[Path | None, typer.Option(help="Folder of the dataset.")] = None,
+    out: Annotated[Path | None, typer.Option("-o", "--out", help="Folder of the dataset.")] = None,
     sensor: Annotated[str | None, typer.Option(help=f"Profile of the degraded images; {SENSOR} if none.")] = None,
     reference: Annotated[
         str | None,

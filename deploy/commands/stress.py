@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from beers_deploy.commands.shared import BOARDS, refuse, say
+from beers_deploy.commands.shared import BOARDS, refuse, save, say
 from beers_deploy.model.processor import SEEDS
-from beers_deploy.model.shipped import SENSOR, VARIANT
+from beers_deploy.model.shipped import SENSOR
 from beers_deploy.profiles.errors import OptionError
 from beers_deploy.profiles.figures import by_table
 from beers_deploy.profiles.target import DEFAULT_TARGET
@@ -28,15 +28,14 @@ def stress(
     context: typer.Context,
     float_model: Annotated[
         Path | None,
-        typer.Argument(metavar="[FLOAT]", help="Float ONNX or weights, or a shipped name; a shipped pair if none."),
+        typer.Argument(metavar="[FLOAT]", help="Float ONNX or weights; or a shipped name, convbeers-s if none."),
     ] = None,
     int8_model: Annotated[
-        Path | None, typer.Argument(metavar="[INT8]", help="Its INT8 ONNX, or a shipped name.")
+        Path | None, typer.Argument(metavar="[INT8]", help="Its INT8 ONNX; that of a shipped name if none.")
     ] = None,
-    variant: Annotated[str, typer.Option(help="Shipped pair of this name, where no file is given.")] = VARIANT,
     cases: Annotated[str | None, typer.Option(help="Only these cases, with commas: 'night,snow'.")] = None,
     stages: Annotated[str | None, typer.Option(help="Only these stages, with commas: 'float32,INT8'.")] = None,
-    size: Annotated[
+    side: Annotated[
         int, typer.Option(min=16, max=4096, help="Side in pixels, where a case has none of its own.")
     ] = 96,
     seed: Annotated[int, typer.Option(min=0, max=SEEDS, help="Seed of every random draw.")] = 0,
@@ -59,7 +58,8 @@ def stress(
         str, typer.Option(help=f"Board that prices the guards, with --bit-flips: {BOARDS}.")
     ] = DEFAULT_TARGET,
     out: Annotated[
-        Path | None, typer.Option(help="Write the tables here as Markdown; with --bit-flips the curves beside it.")
+        Path | None,
+        typer.Option("-o", "--out", help="Tables as Markdown; with --bit-flips the curves beside it."),
     ] = None,
     json: Annotated[Path | None, typer.Option(help="Write the figures here.")] = None,
 ) -> None:
@@ -70,7 +70,7 @@ def stress(
     these cost on the board.
     """
     from beers_deploy.model.io.files import require_writable, write_text
-    from beers_deploy.results import Document, print_rows
+    from beers_deploy.results import Table, print_rows
     from beers_deploy.studies.stress.battery import (
         battery_rows,
         chosen,
@@ -86,25 +86,25 @@ def stress(
     from beers_deploy.studies.stress.networks import STAGES, open_subject
     from beers_deploy.studies.stress.tables import markdown, title
 
-    _refuse_unused(context, float_model, bit_flips)
+    _refuse_unused(context, bit_flips)
     picture = _picture_beside(out, json) if bit_flips else None
     read = (float_model, int8_model, images, *map(Path, (sensor, target)))
     require_writable(out, json, picture, inputs=read)
-    files, tell = (float_model, int8_model, variant), partial(say, err=True)
+    files, tell = (float_model, int8_model), partial(say, err=True)
     if bit_flips:
-        request = FlipRequest(sensor, images, target, draws, size, seed)
+        request = FlipRequest(sensor, images, target, draws, side, seed)
         _flip_bits(open_subject(*files, sensor, tell), request, (out, picture, json))
         return
     names = chosen(cases, [case.name for case in CASES], "--cases")
     wanted = chosen(stages, STAGES, "--stages")
     subject = open_subject(*files, sensor, tell)
     selected = [case for case in CASES if case.name in names]
-    results = run_battery(subject, selected, wanted, seed, size)
+    results = run_battery(subject, selected, wanted, seed, side)
     shown = [*battery_rows(results), *worst_rows(results), *limitation_rows(results), *layer_rows(subject)]
     for table, rows in by_table(shown).items():
         print_rows(title(table), rows)
-    arguments = {"variant": variant, "sensor": sensor, "cases": cases, "stages": stages, "size": size, "seed": seed}
-    Document("stress", arguments, subject.paths, (*shown, *finding_rows(results))).write(json)
+    arguments = {"sensor": sensor, "cases": cases, "stages": stages, "side": side, "seed": seed}
+    save(Table("stress", arguments, subject.paths, (*shown, *finding_rows(results))), json)
     if out is not None:
         write_text(out, markdown(shown))
     for reason in dict.fromkeys(result.reason for result in results if result.reason):
@@ -120,11 +120,8 @@ def stress(
         raise typer.Exit(1)
 
 
-def _refuse_unused(context: typer.Context, float_model: Path | None, bit_flips: bool) -> None:
-    """Refuse a shipped variant beside a file, and the options of the other work of this command."""
-    if float_model is not None:
-        expected, remedy = "it without files", "leave it out, or the files"
-        refuse(context, ["variant"], expected=expected, got=float_model.name, remedy=remedy)
+def _refuse_unused(context: typer.Context, bit_flips: bool) -> None:
+    """Refuse the options of the other work of this command."""
     if bit_flips:
         remedy = "leave one of the two out"
         refuse(context, HARD_CASES_ONLY, expected="hard cases", got="--bit-flips", remedy=remedy)
@@ -140,7 +137,7 @@ def _flip_bits(
     from dataclasses import asdict
 
     from beers_deploy.model.io.files import write_text
-    from beers_deploy.results import Document, print_rows
+    from beers_deploy.results import Table, print_rows
     from beers_deploy.studies.stress.bit_flips import flip_curves_svg, flip_rows
     from beers_deploy.studies.stress.tables import markdown, title
 
@@ -148,7 +145,7 @@ def _flip_bits(
     rows = flip_rows(subject, request)
     for table, found in by_table(rows).items():
         print_rows(title(table), found)
-    Document("stress", {"bit_flips": True, **asdict(request)}, subject.paths, tuple(rows)).write(json)
+    save(Table("stress", {"bit_flips": True, **asdict(request)}, subject.paths, tuple(rows)), json)
     if out is not None and picture is not None:
         write_text(out, markdown(rows))
         write_text(picture, flip_curves_svg({subject.paths[-1].stem: rows}))

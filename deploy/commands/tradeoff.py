@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from beers_deploy.commands.shared import refuse, say
+from beers_deploy.commands.shared import refuse, save, say
 from beers_deploy.model.processor import SEEDS
 from beers_deploy.model.shipped import SENSOR
 from beers_deploy.profiles.sensor_file import REFERENCE, load_sensor, reference_beside
@@ -24,7 +24,7 @@ BOARDS = ", ".join(board_names())
 
 def tradeoff(
     context: typer.Context,
-    out: Annotated[Path, typer.Option(help="Folder for the page, tradeoff.json and the measurements.")],
+    out: Annotated[Path, typer.Option("-o", "--out", help="Folder of page, figures and measurements.")],
     images: Annotated[
         Path | None, typer.Option(help="Folder of held-out scenes to simulate from; drawn ones if none.")
     ] = None,
@@ -33,15 +33,11 @@ def tradeoff(
         str | None,
         typer.Option(help="Profile of the reference images, in the sensor's DN; pleiades-reference if none."),
     ] = None,
-    networks: Annotated[
-        str | None,
-        typer.Option(help="Shipped names and ONNX or safetensors files, with commas; all shipped ones if none."),
-    ] = None,
     network: Annotated[
-        list[Path] | None,
+        list[str] | None,
         typer.Option(
-            help="Your own network beside them: float ONNX or safetensors, quantised on the way, or an INT8 file as "
-            "it is; may be given again."
+            help="A shipped name, float ONNX or safetensors, quantised on the way, or an INT8 file as it is; may be "
+            "given again, and 'all' stands for the shipped ones, as if none is given."
         ),
     ] = None,
     budget: Annotated[
@@ -85,20 +81,20 @@ def tradeoff(
     point keeps --budget and --need; the page is written all the same.
     """
     from beers_deploy.bench.tables import parse_size
+    from beers_deploy.dpu.board import ALL
     from beers_deploy.model.io.files import require_writable
     from beers_deploy.model.shipped import shipped_names
-    from beers_deploy.results import Document, print_rows
+    from beers_deploy.results import Table, print_rows
     from beers_deploy.studies.tradeoff.advice import parse_constraints
     from beers_deploy.studies.tradeoff.page import FILES, write_study
     from beers_deploy.studies.tradeoff.points import parse_targets
     from beers_deploy.studies.tradeoff.run import run_study
 
     log = partial(say, err=True)
-    limits = {name: parse_constraints(f"--{name}", text) for name, text in (("budget", budget), ("need", need))}
+    limits = {name: parse_constraints(name, text) for name, text in (("budget", budget), ("need", need))}
     if labelled is None:
         _refuse_unlabelled(context, limits)
-    own = [str(path) for path in network or ()]
-    names = [*(networks.split(",") if networks is not None else shipped_names()), *own]
+    names = [name for each in network or [ALL] for name in (shipped_names() if each == ALL else [each])]
     aim, boards = reference or REFERENCE, parse_targets(target)
     tree = labelled.rglob("*") if labelled else ()
     read = (images, calibration, lpips, labelled, detector, *tree, *map(Path, (sensor, aim, *boards, *names)))
@@ -127,13 +123,13 @@ def tradeoff(
     print_rows(f"front of PSNR against {study.cost}", study.front_rows)
     say(study.recommendation.line)
     arguments: dict[str, object] = {"images": images, "sensor": sensor, "reference": aim, "size": size}
-    arguments |= {"networks": networks, "budget": budget, "need": need, "calibration": calibration, "seed": seed}
-    arguments |= {"target": target, "network": ",".join(own) or None}
+    arguments |= {"network": ",".join(names), "budget": budget, "need": need, "calibration": calibration}
+    arguments |= {"target": target, "seed": seed}
     if labelled:
         arguments |= {"labelled": labelled, "detector": detector, "classes": classes}
-    document = Document("tradeoff", arguments, tuple(study.inputs), study.rows)
+    document = Table("tradeoff", arguments, tuple(study.inputs), study.rows)
     for path in (out / "tradeoff.json", json):
-        document.write(path)
+        save(document, path)
     say(f"wrote {out / FILES[0]}")
     if study.recommendation.point is None:
         raise typer.Exit(1)

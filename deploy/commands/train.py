@@ -24,7 +24,7 @@ class Precision(StrEnum):
 
 def train(
     context: typer.Context,
-    out: Annotated[Path, typer.Option(help="Folder of the run: checkpoint, logs, pictures and weights.")],
+    out: Annotated[Path, typer.Option("-o", "--out", help="Folder of checkpoint, logs, pictures and weights.")],
     images: Annotated[
         Path | None, typer.Option(help="Folder of sharp aerial images (8-bit RGB, or 16-bit mono) to simulate from.")
     ] = None,
@@ -103,7 +103,7 @@ def train(
     from beers_deploy.model.training.run import FILES, Run, weights_name
     from beers_deploy.model.training.run import train as run_training
     from beers_deploy.model.training.workers import joined
-    from beers_deploy.networks import weights_file
+    from beers_deploy.network import weights_file
 
     if optimiser not in get_args(Optimiser):
         raise OptionError("--optimiser", expected="adam or adamw", got=repr(optimiser), remedy="pick one")

@@ -1,5 +1,7 @@
 """One build of the DPU: a target profile and a configuration of it."""
 
+import os
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -7,6 +9,26 @@ from beers_deploy.profiles import TargetProfile, load_target
 from beers_deploy.profiles.constant import Constant
 from beers_deploy.profiles.errors import OptionError, ProfileError
 from beers_deploy.profiles.target import board_names
+
+BoardLike = TargetProfile | str | os.PathLike[str]
+"""A board: what was read of it, its name, or the path of its .toml file."""
+
+ALL = "all"
+"""Every shipped board, or every configuration."""
+
+
+def boards_of(board: BoardLike | Sequence[BoardLike]) -> list[TargetProfile]:
+    """One board or several; "all" stands for the shipped ones with a DPU.
+
+    Raises:
+        ProfileError: no such board.
+    """
+    if board == ALL:
+        return [load_target(name) for name in board_names()]
+    if isinstance(board, str | os.PathLike | TargetProfile):
+        return [TargetProfile.load(board)]
+    return [TargetProfile.load(each) for each in board]
+
 
 SMALLEST, LARGEST = 1e-30, 1e30
 CONFIGURATION = {"cores": 1.0, "batch_handlers": 1.0, "cpb": 1.0, "peak_tops": SMALLEST}
@@ -115,7 +137,7 @@ def dpu_of(profile: TargetProfile, configuration: str | None = None) -> Dpu:
     """As `load_dpu`, of a target that has been read: of a user's file its name alone would not be found."""
     if not profile.configurations:
         expected = f"a target with a DPU: {', '.join(board_names())}"
-        raise OptionError("--target", expected=expected, got=repr(profile.name), remedy="choose another")
+        raise OptionError("target", expected=expected, got=repr(profile.name), remedy="choose another")
     name, constants = profile.configuration(configuration)
     for key, least in CONFIGURATION.items():
         _require(f"{profile.name} [configurations.{name}] {key}", constants.get(key), least)

@@ -265,12 +265,12 @@ def _input_shape(info: onnx.ValueInfoProto, tile_px: int | None, places: tuple[i
         )
     if tile_px is None:
         if not all(sizes[2:]):
-            raise ModelError(where, expected="an input of a stated size", got="any size", remedy="pass --tile")
+            raise ModelError(where, expected="an input of a stated size", got="any size", remedy="give `tile`")
         return sizes[1], sizes[2], sizes[3]
     place_px, border_px = places
     side, beyond = divmod(tile_px + 2 * border_px, place_px)
     if beyond:
-        expected, remedy = f"a tile of a multiple of {place_px} px", "choose another --tile"
+        expected, remedy = f"a tile of a multiple of {place_px} px", "choose another `tile`"
         raise ModelError(where, expected=expected, got=f"{tile_px} px", remedy=remedy)
     fixed = {size for size in sizes[2:] if size} - {side}
     if fixed:
@@ -278,7 +278,7 @@ def _input_shape(info: onnx.ValueInfoProto, tile_px: int | None, places: tuple[i
             where,
             expected=f"an input that takes {tile_px} x {tile_px} pixels",
             got=f"one fixed to {_side_px(sizes[3], places)} x {_side_px(sizes[2], places)}",
-            remedy=f"pass --tile {_side_px(min(fixed), places)}, or export it with free sizes",
+            remedy=f"give `tile` {_side_px(min(fixed), places)}, or export it with free sizes",
         )
     return (sizes[1], side, side)
 

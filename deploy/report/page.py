@@ -41,7 +41,7 @@ WIDE = 8
 
 
 @dataclass(frozen=True)
-class Table:
+class Section:
     """A table of the report, with a sentence on how to read it."""
 
     title: str
@@ -64,7 +64,7 @@ class Report:
 
     title: str
     headline: str
-    tables: Sequence[Table]
+    tables: Sequence[Section]
     pictures: Sequence[Picture]
     notes: Sequence[str]
     sorts: bool = False
@@ -82,7 +82,7 @@ def write_report(report: Report, path: Path) -> None:
     write_text(path, render(report))
 
 
-def _grid(table: Table, *, upright: bool) -> dict[str, object]:
+def _grid(table: Section, *, upright: bool) -> dict[str, object]:
     """Header and lines of a table; unless it stays upright, rows and columns change places where that fits better."""
     rows = list(table.rows)
     figures = list(dict.fromkeys(key for row in rows for key in row.figures))

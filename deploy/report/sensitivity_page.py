@@ -11,7 +11,7 @@ from beers_deploy.profiles.figures import Row, by_table
 from beers_deploy.quant.calibration import Patches
 from beers_deploy.quant.sensitivity import Spread
 from beers_deploy.quant.session import run
-from beers_deploy.report.page import Picture, Report, Table
+from beers_deploy.report.page import Picture, Report, Section
 from beers_deploy.report.plots import histogram_url
 
 ZOOM = 2
@@ -40,7 +40,7 @@ def sensitivity_page(
     white_dn = error_shown_white(spread)
     pictures = [Picture("Errors by size", histogram_url(spread), HISTOGRAM_CAPTION)]
     pictures += [worst_picture(number, patches.degraded[number], sessions, white_dn) for number in worst]
-    tables = [Table(name.capitalize(), found, CAPTIONS.get(name, "")) for name, found in by_table(rows).items()]
+    tables = [Section(name.capitalize(), found, CAPTIONS.get(name, "")) for name, found in by_table(rows).items()]
     return Report("Where INT8 errs", headline, tables, pictures, NOTES)
 
 

@@ -30,7 +30,7 @@ def parse_sensors(text: str) -> dict[str, str]:
     found = {name.strip(): profile.strip() for name, _, profile in pairs}
     if not all((*found, *found.values())) or len(found) < len(pairs):
         remedy = "name each band once"
-        raise OptionError("--sensor", expected="BAND=PROFILE,BAND=PROFILE", got=repr(text), remedy=remedy)
+        raise OptionError("sensor", expected="BAND=PROFILE,BAND=PROFILE", got=repr(text), remedy=remedy)
     return found
 
 
@@ -56,7 +56,7 @@ def in_order(given: Mapping[str, Path], raster: Raster) -> list[Path]:
     if len(given) != raster.bands or set(names) != set(given):
         expected = f"a sensor for each of {raster.bands} bands" + (f": {', '.join(names)}" if names else "")
         remedy = "name every band of the image; pansharpening is out of scope"
-        raise OptionError("--sensor", expected=expected, got=", ".join(given), remedy=remedy)
+        raise OptionError("sensor", expected=expected, got=", ".join(given), remedy=remedy)
     return [given[name] for name in names]
 
 
@@ -70,4 +70,4 @@ def require_alike(networks: Sequence[onnx.ModelProto]) -> None:
     if len(networks) > 1 and (len(set(map(repr, tilings))) > 1 or tilings[0].channels_in != 1):
         remedy = "give one network for all bands"
         got = "networks of several bands, or of different halos"
-        raise ModelError("--sensor", expected="networks of one band, alike but for weights", got=got, remedy=remedy)
+        raise ModelError("sensor", expected="networks of one band, alike but for weights", got=got, remedy=remedy)

@@ -13,7 +13,7 @@ from typing import Any
 
 import onnx
 
-from beers_deploy.profiles.errors import MachineError
+from beers_deploy.profiles.errors import MissingExtraError
 from beers_deploy.quant.onnx_file import metadata
 from beers_deploy.restoration.gdal_source import ENVIRONMENT, LEAST_CACHE_BYTES, OFFLINE
 from beers_deploy.restoration.options import Compression
@@ -33,13 +33,13 @@ def require_cog() -> None:
     """Find out before the run that rasterio is missing.
 
     Raises:
-        MachineError: it is not installed.
+        MissingExtraError: it is not installed.
     """
     try:
         import_module("rasterio")
     except ImportError as error:
         got, remedy = "no package rasterio", "pip install 'beers-deploy[gdal]'"
-        raise MachineError("--cog", expected="GDAL to write it", got=got, remedy=remedy) from error
+        raise MissingExtraError("cog", expected="GDAL to write it", got=got, remedy=remedy) from error
 
 
 def what_was_done(networks: Sequence[onnx.ModelProto], digests: str, scale: FullScale) -> dict[str, str]:

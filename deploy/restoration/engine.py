@@ -197,7 +197,7 @@ def checked_strip(
     # Where nothing is known, 0 is taken for both, which is inside.
     low, high = (float(extreme(pixels, where=known, initial=0)) for extreme in (np.min, np.max))
     if low < 0 or (high > full_scale and not (clips and np.isfinite(high))):
-        remedy = "give the sensor's highest number as --full-scale, or mark missing pixels as nodata"
+        remedy = "give the sensor's highest number as `full_scale`, or mark missing pixels as nodata"
         raise ImageError(
             f"{name}, rows {top} to {top + pixels.shape[1] - 1}",
             expected=f"digital numbers of 0 to {full_scale:g}",

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 import tifffile
 
-from beers_deploy.profiles.errors import BeersError, ImageError, MachineError
+from beers_deploy.profiles.errors import BeersError, ImageError, MissingExtraError
 from beers_deploy.restoration.index_files import dimap_bits, index_files, is_index
 from beers_deploy.restoration.source import (
     GDAL_DRIVERS,
@@ -48,7 +48,7 @@ def _rasterio(path: Path) -> Any:  # an optional package
         return import_module("rasterio")
     except ImportError as error:
         got, remedy = "no package rasterio", "pip install 'beers-deploy[gdal]', or convert it to TIFF"
-        raise MachineError(str(path), expected="GDAL to read it", got=got, remedy=remedy) from error
+        raise MissingExtraError(str(path), expected="GDAL to read it", got=got, remedy=remedy) from error
 
 
 @contextmanager
@@ -61,7 +61,7 @@ def open_gdal(path: Path, trusted: bool = False) -> Iterator["GdalSource"]:
 
     Raises:
         ImageError: damaged, an index that cannot be followed, or no image of numbers.
-        MachineError: rasterio is not installed.
+        MissingExtraError: rasterio is not installed.
     """
     rasterio = _rasterio(path)
     files = path, *index_files(path, trusted)

@@ -80,4 +80,4 @@ def parse_halo(text: str, radius_px: int) -> int:
     if text.isdecimal():
         return int(text)
     remedy = f"{radius_px} is exact for this network"
-    raise OptionError("--halo", expected="'exact' or a number of pixels", got=repr(text), remedy=remedy)
+    raise OptionError("halo", expected="'exact' or a number of pixels", got=repr(text), remedy=remedy)

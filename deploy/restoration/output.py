@@ -22,7 +22,7 @@ from filelock import BaseFileLock, FileLock, Timeout
 from isal import isal_zlib
 
 from beers_deploy.model.io.files import TIFF_SUFFIXES
-from beers_deploy.profiles.errors import MachineError, OptionError, sizes
+from beers_deploy.profiles.errors import MachineError, MissingExtraError, OptionError, sizes
 from beers_deploy.profiles.toml import read_json
 from beers_deploy.restoration.engine import RestoredRow
 from beers_deploy.restoration.options import Compression
@@ -118,7 +118,7 @@ class Checkpoint:
         try:
             yield
         except OSError as error:
-            remedy = f"correct that, and go on with --resume from row {self.rows} of {self.shape[1]}"
+            remedy = f"correct that, and go on with `resume` from row {self.rows} of {self.shape[1]}"
             got = error.strerror or str(error)
             raise MachineError(str(self.out), expected="a disk to write to", got=got, remedy=remedy) from error
 
@@ -133,10 +133,10 @@ class Checkpoint:
             if journal["job"] == self._job and sound:
                 return rows, known, clipped
         raise OptionError(
-            "--resume",
+            "resume",
             expected="the image, the model and the options of the run that was stopped",
             got=f"others, or a damaged {path}",
-            remedy="run it as before, or start afresh without --resume",
+            remedy="run it as before, or start afresh without `resume`",
         )
 
     def _write_journal(self) -> None:
@@ -209,7 +209,7 @@ def require_codec(compression: Compression) -> None:
         tifffile.imwrite(io.BytesIO(), np.zeros((16, 16), np.uint16), compression=compression.codec)
     except (ValueError, KeyError, ImportError) as error:
         got, remedy = " ".join(str(error).split()), "pip install 'beers-deploy[codecs]' or use zlib"
-        raise MachineError("--compression", expected="an installed codec", got=got, remedy=remedy) from error
+        raise MissingExtraError("compression", expected="an installed codec", got=got, remedy=remedy) from error
 
 
 PLAIN, COG = "out.tif", "cog.tif"

@@ -47,7 +47,7 @@ def plan_side(size_px: int, tile_px: int, halo_px: int, lattice_px: int = 1, lea
     if tile_px < 2 * halo_px + lattice_px or halo_px < 0:
         least = f", {2 * halo_px + lattice_px} px at least" if lattice_px > 1 else ""
         raise OptionError(
-            "--tile",
+            "tile",
             expected=f"more than twice the halo of {halo_px} px{least}",
             got=f"{tile_px} px",
             remedy="take larger tiles or a smaller halo",
@@ -196,10 +196,10 @@ def require_fixed_tile(fixed_px: int, tile_px: int, size: tuple[int, int]) -> No
     """
     if fixed_px != tile_px or min(size) < fixed_px:
         raise OptionError(
-            "--tile",
+            "tile",
             expected=f"{fixed_px}, the size the model is fixed to, and an image at least as large",
             got=f"tile {tile_px}, image {size[1]} x {size[0]}",
-            remedy="use a model exported without --tile",
+            remedy="take a network of free sizes",
         )
 
 
@@ -231,11 +231,11 @@ def _require_fit(bands: int, halo_px: int, tiling: Tiling) -> None:
         raise ModelError("tiled model", expected="a result of the image's size or a multiple", got=got, remedy=remedy)
     if tiling.channels_in not in (1, bands):
         expected = f"an image of {tiling.channels_in} bands, as the network takes them"
-        raise OptionError("--model", expected=expected, got=f"{bands}", remedy="choose bands, or another network")
+        raise OptionError("network", expected=expected, got=f"{bands}", remedy="choose bands, or another network")
     if halo_px % tiling.lattice_px:
         expected = f"a multiple of {tiling.lattice_px} px, after which the network's strides repeat"
         remedy = f"{tiling.halo_px} is exact for this network"
-        raise OptionError("--halo", expected=expected, got=f"{halo_px} px", remedy=remedy)
+        raise OptionError("halo", expected=expected, got=f"{halo_px} px", remedy=remedy)
 
 
 def rows_bytes(source: Source, plan: Plan, begun: bool = False) -> int:
@@ -275,9 +275,9 @@ def check_memory(rows: int, budget_bytes: int | None, bulky: bool) -> int:
     if held + rows <= allowed:
         return held + rows
     limit, before, rows_size = sizes(allowed, held, rows)
-    remedy = "rewrite the image in tiles (gdal_translate -co TILED=YES)" if bulky else "take a smaller --tile"
+    remedy = "rewrite the image in tiles (gdal_translate -co TILED=YES)" if bulky else "take a smaller `tile`"
     raise MachineError(
-        "--memory",
+        "memory",
         expected=f"a run within {limit}",
         got=f"{before} before and {rows_size} for rows of the image",
         remedy=f"{remedy} or give it more" if held < allowed else f"give it more than {before}",

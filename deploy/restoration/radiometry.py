@@ -43,14 +43,14 @@ def full_scale_of(
     if asked is not None:
         settled_scale(name, raster.dtype, largest, asked)
         require_room(raster, asked)
-        return FullScale(asked, "--full-scale")
+        return FullScale(asked, "asked for")
     if raster.bits is not None:
         return FullScale(2**raster.bits - 1, f"{raster.bits} bits, as the file states")
     if bits is None or not _holds(raster.dtype, bits):
         return FullScale(settled_scale(name, raster.dtype, largest), f"assumed: {MAX_DN.bit_length()} bits", True)
     usual = 2**bits - 1
     value = settled_scale(name, raster.dtype, largest, usual=usual) if raster.dtype.kind == "f" else usual
-    return FullScale(value, f"{bits} bits, of --sensor")
+    return FullScale(value, f"{bits} bits, of the sensor")
 
 
 def _holds(dtype: np.dtype[Any], bits: int) -> bool:
@@ -67,4 +67,4 @@ def require_room(raster: Raster, full_scale: float) -> None:
     kind = raster.out_dtype
     if kind.kind == "u" and full_scale > np.iinfo(kind).max:
         expected, remedy = f"at most {np.iinfo(kind).max} for {kind} pixels", "convert the image to uint16"
-        raise OptionError("--full-scale", expected=expected, got=f"{full_scale:g}", remedy=remedy)
+        raise OptionError("full_scale", expected=expected, got=f"{full_scale:g}", remedy=remedy)

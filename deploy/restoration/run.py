@@ -74,7 +74,7 @@ def restore_file(image: Path, out: Path, options: Options, log: Log, beside: Seq
     require_image_file(image)
     require_writable(out, inputs=(image, options.model))
     if options.scheduler is None:
-        require_cores("--threads", options.threads)
+        require_cores("threads", options.threads)
     require_tiff_name(out)
     if options.cog:
         require_cog()

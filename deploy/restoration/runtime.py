@@ -16,7 +16,7 @@ from onnx import helper, numpy_helper
 
 from beers_deploy.cluster import Cluster
 from beers_deploy.model.processor import asked, require_cores
-from beers_deploy.profiles.errors import MachineError, ModelError
+from beers_deploy.profiles.errors import MachineError, MissingExtraError, ModelError
 from beers_deploy.quant.kernels import is_integer, made_exact
 from beers_deploy.quant.onnx_file import parse_onnx
 from beers_deploy.quant.session import open_session, tensors_of
@@ -55,7 +55,7 @@ def open_openvino(
             network.reshape(list(shape))
             return core.compile_model(network, "CPU", options)
         except RuntimeError as error:
-            got, remedy = " ".join(str(error).split())[:160], "use --runtime onnxruntime"
+            got, remedy = " ".join(str(error).split())[:160], "take `runtime` onnxruntime"
             raise ModelError("ONNX model", expected="one that OpenVINO runs", got=got, remedy=remedy) from error
 
     compiling = Lock()
@@ -89,7 +89,7 @@ def _core() -> Any:  # openvino.Core, an optional package
         openvino = import_module("openvino")
     except ImportError as error:
         got, remedy = "no package openvino", "pip install 'beers-deploy[openvino]'"
-        raise MachineError("--runtime", expected="OpenVINO installed", got=got, remedy=remedy) from error
+        raise MissingExtraError("runtime", expected="OpenVINO installed", got=got, remedy=remedy) from error
     openvino.Type.f32.to_dtype()  # fills a table: two threads that are its first callers lock each other up (2026.4)
     return openvino.Core()
 
@@ -143,11 +143,11 @@ def open_runtime(runtime: Runtime, model: onnx.ModelProto, threads: int, at_once
         at_once: how many callers share the threads.
 
     Raises:
-        MachineError: the runtime is not installed.
+        MissingExtraError: the runtime is not installed.
         ModelError: it refuses the model.
         OptionError: more threads than cores.
     """
-    require_cores("--threads", threads)
+    require_cores("threads", threads)
     if runtime is Runtime.openvino:
         return open_openvino(model, threads, at_once=at_once)
     session = open_session(model, session_threads(threads, at_once))

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from beers_deploy.model.io.files import write_text
-from beers_deploy.profiles.errors import MachineError
+from beers_deploy.profiles.errors import MissingExtraError
 from beers_deploy.restoration.gdal_source import ENVIRONMENT, OFFLINE
 
 LONGITUDE_LATITUDE = "EPSG:4326"
@@ -24,14 +24,14 @@ def require_stac() -> None:
     """Find out before the run that a package is missing.
 
     Raises:
-        MachineError: rasterio or pystac is not installed.
+        MissingExtraError: rasterio or pystac is not installed.
     """
     for package in ("rasterio", "pystac"):
         try:
             import_module(package)
         except ImportError as error:
             got, remedy = f"no package {package}", "pip install 'beers-deploy[gdal]'"
-            raise MachineError("--stac", expected="a package that writes it", got=got, remedy=remedy) from error
+            raise MissingExtraError("stac", expected="a package that writes it", got=got, remedy=remedy) from error
 
 
 def write_item(image: Path, path: Path) -> None:

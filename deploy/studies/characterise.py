@@ -6,14 +6,18 @@ What pixels tell is measured, with intervals: blur by straight edges, noise by t
 
 import json
 import math
+import os
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
 
 import numpy as np
 
 from beers_deploy.model.io.images import read_pixels
+from beers_deploy.model.io.tiff import write_tiff
 from beers_deploy.model.metrics.edge_blur import (
     HALF_PX,
     MIN_FOUND,
@@ -26,9 +30,12 @@ from beers_deploy.model.metrics.edge_blur import (
 )
 from beers_deploy.model.metrics.noise_line import NoiseModel, cut_blocks, fit_noise_model, join
 from beers_deploy.model.metrics.refusal import Refusal
+from beers_deploy.model.progress import Progress, reporting
 from beers_deploy.profiles.errors import ImageError, OptionError, printable
 from beers_deploy.profiles.figures import Figure, Row, measured, unavailable
-from beers_deploy.profiles.sensor import snr_0_bounds
+from beers_deploy.profiles.sensor import Sensor, snr_0_bounds
+from beers_deploy.profiles.sensor_file import load_sensor
+from beers_deploy.results import Table, input_of
 
 FULL_SCALE_RADIANCE = 400.0
 """W/m2/sr/um, where no gain is given."""
@@ -64,9 +71,7 @@ class Box:
         if part.shape != (self.height, self.width) or min(part.shape) < BOX_PX:
             height, width = pixels.shape
             expected = f"a box of {BOX_PX} x {BOX_PX} pixels or more inside its {width} x {height}"
-            raise OptionError(
-                "--edge", expected=expected, got=str(self), remedy="X,Y is the upper left pixel, from 0"
-            )
+            raise OptionError("edge", expected=expected, got=str(self), remedy="X,Y is the upper left pixel, from 0")
         return part
 
     def __str__(self) -> str:
@@ -82,11 +87,11 @@ def read_box(text: str, images: Sequence[Path]) -> Box:
     parts = re.fullmatch(r"(.*):(\d{1,8}),(\d{1,8}),(\d{1,8}),(\d{1,8})", text, re.ASCII)
     if parts is None:
         expected, remedy = "FILE:X,Y,WIDTH,HEIGHT in whole pixels", "write raw.tif:1200,340,60,60"
-        raise OptionError("--edge", expected=expected, got=repr(text), remedy=remedy)
+        raise OptionError("edge", expected=expected, got=repr(text), remedy=remedy)
     name, *places = parts.groups()
     if Path(name) not in images:
         remedy = "name it as the argument does"
-        raise OptionError("--edge", expected="one of the images that are given", got=repr(name), remedy=remedy)
+        raise OptionError("edge", expected="one of the images that are given", got=repr(name), remedy=remedy)
     return Box(Path(name), *map(int, places))
 
 
@@ -159,7 +164,7 @@ def characterise(
         ImageError: images that are not raw, or that do not hold what is needed; the message says what that is.
         OptionError: an option that contradicts the pixels.
     """
-    for option, value in (("--gain", gain), ("--gsd", gsd_m)):
+    for option, value in (("gain", gain), ("gsd", gsd_m)):
         if value is not None and not 0 < value < math.inf:
             raise OptionError(option, expected="a finite number above 0", got=f"{value:g}", remedy="correct it")
     if len({path.resolve() for path in images}) < len(images):
@@ -173,6 +178,64 @@ def characterise(
     gain = gain or clipped_at / FULL_SCALE_RADIANCE
     low, high = (snr_at(noise, clipped_at / part, gain) for part in PARTS)
     return Characterised(images, stated, bits, gain, axes, (low, high), noise)
+
+
+class MeasuredSensor(Sensor):
+    """A sensor measured on its own images; `evidence` holds the figures with their intervals."""
+
+    evidence: Table | None = None
+
+
+def characterize(
+    images: Any,
+    *,
+    bits: int | None = None,
+    gain: float | None = None,
+    gsd_m: float | None = None,
+    edges: Sequence[str] = (),
+    progress: Progress = None,
+) -> MeasuredSensor:
+    """Measure MTF and noise of a sensor on its own raw images.
+
+    Args:
+        images: one or several, each a path or an array (H, W) of whole digital numbers, of one sensor at one setting.
+        bits: of a digital number; None where clipped pixels must tell.
+        gain: DN per W/m2/sr/um; None assumes 400 W/m2/sr/um at full scale.
+        gsd_m: ground sampling distance; None assumes one.
+        edges: boxes with one straight edge as FILE:X,Y,WIDTH,HEIGHT; none searches for edges.
+        progress: a function that is told each step, False for silence, None for a bar or lines on standard error.
+
+    Raises:
+        ImageError: images that are not raw, or that do not hold what is needed; the message says what that is.
+        OptionError: an option that contradicts the pixels.
+    """
+    several = images if isinstance(images, list | tuple) else [images]
+    with TemporaryDirectory(prefix="beers-deploy-") as folder, reporting(progress):
+        paths = [_as_file(image, Path(folder) / f"image{number}.tif") for number, image in enumerate(several)]
+        boxes = [read_box(text, paths) for text in edges]
+        found = characterise(paths, boxes, bits=bits, gain=gain, gsd_m=gsd_m)
+        profile = Path(folder) / "measured.toml"
+        profile.write_text(profile_toml(found), encoding="utf-8")
+        sensor = MeasuredSensor(**vars(load_sensor(str(profile))))
+        arguments = {"bits": bits, "gain": gain, "gsd": gsd_m, "edge": ", ".join(edges) or None}
+        evidence = Table("characterise", arguments, tuple(map(input_of, paths)), tuple(found.rows()))
+    object.__setattr__(sensor, "evidence", evidence)
+    return sensor
+
+
+def _as_file(image: Any, path: Path) -> Path:
+    """The path of an image file; an array is written to one."""
+    if isinstance(image, str | os.PathLike):
+        return Path(image)
+    pixels = np.asarray(getattr(image, "values", image))
+    if pixels.ndim == 3 and len(pixels) == 1:
+        pixels = pixels[0]
+    if pixels.ndim != 2 or pixels.dtype.kind not in "ui":
+        got = f"{pixels.dtype} of shape {pixels.shape}"
+        remedy = "give raw pixels of one band"
+        raise ImageError("images", expected="whole digital numbers (H, W)", got=got, remedy=remedy)
+    write_tiff(path, pixels.astype(np.uint16))
+    return path
 
 
 def read_raw(path: Path) -> np.ndarray:
@@ -205,12 +268,12 @@ def _settled_bits(stated: int | None, images: Sequence[Path]) -> int:
     largest, full_scale = max(_brightest(path) for path in images)
     bits = largest.bit_length() if stated is None else stated
     if stated is None and not full_scale:
-        expected = "--bits beside images that are not clipped at full scale, or are stored in 8 bits"
-        remedy = "give the digitiser's, such as --bits 12"
+        expected = "`bits` beside images that are not clipped at full scale, or are stored in 8 bits"
+        remedy = "give the digitiser's, such as 12"
         raise OptionError("bits", expected=expected, got=f"values up to {largest}", remedy=remedy)
     if largest > 2**bits - 1:
         expected, remedy = f"digital numbers up to {2**bits - 1}", "give the bits of the raw image"
-        raise OptionError("--bits", expected=expected, got=f"{largest}", remedy=remedy)
+        raise OptionError("bits", expected=expected, got=f"{largest}", remedy=remedy)
     return bits
 
 
@@ -269,7 +332,7 @@ def _axes(images: Sequence[Path], boxes: Sequence[Box], noise: NoiseModel, clipp
             f"edges of {_named(images)}",
             expected=f"{MIN_FOUND} straight edges between even areas, 17 pixels long and 8 to both sides, or more",
             got=f"{len(upright)} near the vertical and {len(lying)} near the horizontal",
-            remedy="point at one as --edge FILE:X,Y,WIDTH,HEIGHT, or image a target, a large roof or an apron",
+            remedy="point at one as `edge` FILE:X,Y,WIDTH,HEIGHT, or image a target, a large roof or an apron",
         )
     return axes
 
@@ -285,7 +348,7 @@ def _pointed_at(boxes: Sequence[Box], noise: NoiseModel, clipped_at: float) -> t
             edge = Refusal("clipped pixels")
         if isinstance(edge, Refusal):
             expected, remedy = "one straight edge, from side to side", "box another, or tighter"
-            raise ImageError(f"--edge {box}", expected=expected, got=edge.reason, remedy=remedy)
+            raise ImageError(f"edge {box}", expected=expected, got=edge.reason, remedy=remedy)
         found[lies].append(edge)
     return found
 
@@ -299,14 +362,14 @@ def _rise(region: np.ndarray) -> float:
 def profile_toml(found: Characterised) -> str:
     """The profile as its TOML file, intervals and doubts as comments."""
     images, stated = _named(found.images), found.stated
-    source = "given as --bits" if stated["bits"] else f"pixels clipped at {2**found.bits - 1} in {images}"
-    ratio = f"full scale {2**found.bits - 1} DN = {FULL_SCALE_RADIANCE:g} W/m2/sr/um; give --gain"
+    source = "given" if stated["bits"] else f"pixels clipped at {2**found.bits - 1} in {images}"
+    ratio = f"full scale {2**found.bits - 1} DN = {FULL_SCALE_RADIANCE:g} W/m2/sr/um; state the gain"
     doubt = "# pixels do not tell the gain; to a network only noise over full scale matters, which is measured"
     lines = [
         f"description = {_text(f'Measured on {images}.')}",
         "",
         "[grid]",
-        _given("gsd_m", stated["gsd_m"], GSD_M, "no pixel depends on it; give --gsd"),
+        _given("gsd_m", stated["gsd_m"], GSD_M, "no pixel depends on it; state it"),
         _constant("oversampling", f"{OVERSAMPLING}", "assumed", "for simulations alone: scene pixels a pixel"),
         "",
         "[mtf]",

@@ -23,7 +23,6 @@ from beers_deploy.bench.traditional import measure_chain
 from beers_deploy.dpu.board import load_dpu
 from beers_deploy.dpu.checker.placement import Placement, place
 from beers_deploy.dpu.reading import read_network
-from beers_deploy.gate import Request, run_gate
 from beers_deploy.library import restore
 from beers_deploy.model.io.files import whole_file
 from beers_deploy.model.io.images import MAX_DN, read_acquisition, read_pixels
@@ -37,18 +36,18 @@ from beers_deploy.model.simulator.detector import Draw
 from beers_deploy.model.simulator.procedural import procedural_scene
 from beers_deploy.model.simulator.sampling import read_scene
 from beers_deploy.model.traditional.pipeline import Chain, restore_traditional
-from beers_deploy.networks import Conditioned, warn_outside
+from beers_deploy.network import Conditioned, warn_outside
 from beers_deploy.profiles import Sensor, load_sensor
 from beers_deploy.profiles.errors import OptionError
 from beers_deploy.profiles.figures import Row, measured
 from beers_deploy.profiles.sensor_file import reference_for
 from beers_deploy.profiles.target import DEFAULT_TARGET, board_names
 from beers_deploy.quant.encodings import board_model, read_core
-from beers_deploy.quant.gate import Limits
 from beers_deploy.quant.onnx_file import load_onnx, metadata, save_onnx
 from beers_deploy.quant.tiling.walk import tiling_of
-from beers_deploy.report.page import Picture, Report, Table
+from beers_deploy.report.page import Picture, Report, Section
 from beers_deploy.restoration.options import TILE_PX
+from beers_deploy.verdict import gate
 
 BITS, SIDE_PX, GATE_PATCHES = 12, 640, 12
 CROP_PX, ZOOM, LARGEST_PX = 110, 3, 1280
@@ -97,9 +96,7 @@ def run_demo(
     say("telling the shipped network the sensor, and gating its INT8")
     write_networks(out, sensors[0], say)
     float_file, int8_file = out / "float.onnx", out / "int8.onnx"
-    gate = run_gate(
-        Request(float_file, int8_file, Limits(), None, DEFAULT_TARGET, sensor, None, GATE_PATCHES, seed)
-    ).row
+    verdict = gate(int8_file, float_file, sensor=sensors[0], patches=GATE_PATCHES, seed=seed)
     say("checking every operator against the DPU")
     placement = place(read_network(int8_file, TILE_PX), load_dpu(DEFAULT_TARGET))
     say("restoring: traditional pipeline and INT8 network")
@@ -117,8 +114,8 @@ def run_demo(
         images[REFERENCE] = reference
     say("measuring the traditional pipeline, predicting the board")
     bench = bench_tables(int8_file, degraded, sensors)
-    tables = [*bench, *([Table("Quality on this image, over 4095 DN", quality)] if quality else [])]
-    tables.append(Table("What quantisation changes", [gate], GATE_CAPTION))
+    tables = [*bench, *([Section("Quality on this image, over 4095 DN", quality)] if quality else [])]
+    tables.append(Section("What quantisation changes", verdict.rows, GATE_CAPTION))
     sentence = headline(bench[0].rows, quality, placement)
     return Report("From training to board, on one image", sentence, tables, pictures_of(images, out), NOTES)
 
@@ -132,8 +129,8 @@ def load_sensors(name: str = SENSOR) -> Sensors:
     """
     degraded = load_sensor(name)
     if degraded.nominal().bits != BITS:
-        got, remedy = f"{degraded.nominal().bits} bits", "use 'restore', with --full-scale or --method traditional"
-        raise OptionError("--sensor", expected=f"a sensor of {BITS} bits", got=got, remedy=remedy)
+        got, remedy = f"{degraded.nominal().bits} bits", "use 'restore', with a full scale or the traditional method"
+        raise OptionError("sensor", expected=f"a sensor of {BITS} bits", got=got, remedy=remedy)
     return degraded, reference_for(degraded)
 
 
@@ -178,7 +175,7 @@ def _fidelity(name: str, dn: np.ndarray, reference: np.ndarray, degraded: np.nda
     return Row("quality", name, figures)
 
 
-def bench_tables(model: Path, dn: np.ndarray, sensors: Sensors) -> list[Table]:
+def bench_tables(model: Path, dn: np.ndarray, sensors: Sensors) -> list[Section]:
     """Speed for this image, for the swath of the paper beside its rows, and for that swath on every board."""
     dpu, halo_px = load_dpu(DEFAULT_TARGET), tiling_of(load_onnx(model)).halo_px
     chain = measure_chain(dn, *sensors)
@@ -193,9 +190,9 @@ def bench_tables(model: Path, dn: np.ndarray, sensors: Sensors) -> list[Table]:
     words = f"The same INT8 file on each board's default configuration. Of these, {within}."
     title = "A swath of {} x {}, beside the paper's figures".format(*SWATH_PX)
     return [
-        Table(f"Time and power for this image, {dn.shape[1]} x {dn.shape[0]}", rows[0]),
-        Table(title, [replace(row, table="swath") for row in (*rows[1], *published_rows())], SWATH_CAPTION),
-        Table("The same swath on each board, predicted", [replace(row, table="boards") for row in boards], words),
+        Section(f"Time and power for this image, {dn.shape[1]} x {dn.shape[0]}", rows[0]),
+        Section(title, [replace(row, table="swath") for row in (*rows[1], *published_rows())], SWATH_CAPTION),
+        Section("The same swath on each board, predicted", [replace(row, table="boards") for row in boards], words),
     ]
 
 

@@ -7,7 +7,7 @@ import argparse
 from pathlib import Path
 
 from beers_deploy.model.shipped import INT8, shipped_names, shipped_weights
-from beers_deploy.networks import Conditioned, family_model
+from beers_deploy.network import Conditioned, family_model
 from beers_deploy.quant.onnx_file import save_onnx
 
 WEIGHTS = Path(__file__).parents[2] / "model" / "weights"

@@ -39,21 +39,21 @@ PATHS = {
     "characterise": Paths({"out": FILE, "json": FILE}, ("images",)),
     "simulate": Paths({"out": FOLDER}, ("scenes",), ("sensor", "reference", "scene")),
     "train": Paths({"out": FOLDER}, ("images", "pairs", "lpips", "start", "teacher"), ("sensor", "reference")),
-    "export": Paths({"out": FILE, "board": FILE, "delta": FILE}, ("checkpoint", "apply"), ("sensor",)),
+    "export": Paths({"out": FILE, "board_file": FILE, "delta": FILE}, ("network", "apply"), ("sensor",)),
     "quantize": Paths(
-        {"out": FILE, "board": FILE, "report": FOLDER, "json": FILE},
-        ("model", "images", "data"),
+        {"out": FILE, "board_file": FILE, "report": FOLDER, "json": FILE},
+        ("model", "images", "samples"),
         ("sensor", "target"),
     ),
     "gate": Paths(
         {"junit": FILE, "json": FILE},
-        ("float_model", "int8_model", "config", "baseline", "images", "data"),
+        ("float_model", "int8_model", "limits", "baseline", "images", "samples"),
         ("sensor", "target"),
     ),
     "check": Paths({"picture": FILE, "json": FILE}, ("model",), ("target",)),
     "bench": Paths({"json": FILE}, ("model", "image", "measured"), ("sensor", "target")),
-    "info": Paths({"json": FILE}, ("image", "model"), ("sensor", "target")),
-    "restore": Paths({"out": FILE, "json": FILE, "stac": FILE}, ("image", "model"), ("sensor",)),
+    "info": Paths({"json": FILE}, ("image", "network"), ("sensor", "target")),
+    "restore": Paths({"out": FILE, "json": FILE, "stac": FILE}, ("image", "network"), ("sensor",)),
     "evaluate": Paths(
         {"out": FOLDER, "json": FILE}, ("images", "pairs", "lpips"), ("sensor", "reference", "methods")
     ),
@@ -63,10 +63,10 @@ PATHS = {
     "stress": Paths({"out": FILE, "json": FILE}, ("float_model", "int8_model", "images"), ("sensor", "target")),
     "tradeoff": Paths(
         {"out": FOLDER, "json": FILE},
-        ("images", "lpips", "calibration", "labelled", "detector", "network"),
-        ("sensor", "reference", "networks", "target"),
+        ("images", "lpips", "calibration", "labelled", "detector"),
+        ("sensor", "reference", "network", "target"),
     ),
-    "compare": Paths({"json": FILE}, ("before", "after")),
+    "diff": Paths({"json": FILE}, ("before", "after")),
 }
 
 UNITS = {
@@ -94,7 +94,7 @@ UNITS = {
     "psnr_weight": "weight",
     "rough": "of patches",
     "seed": "",
-    "size": "px",
+    "side": "px",
     "steps": "steps",
     "threads": "threads, at most the cores",
     "tile": "px",
@@ -110,8 +110,8 @@ WORDS = {
     "budget": "limits such as latency<=20s",
     "cases": "names with commas",
     "classes": "pairs such as car=vehicle",
-    "config": "configuration",
     "device": "cpu, cuda",
+    "dpu": "configuration",
     "edge": "FILE:X,Y,WIDTH,HEIGHT in px",
     "fail_on": "change such as PSNR<-0.05",
     "forbid": "effect",
@@ -119,7 +119,7 @@ WORDS = {
     "methods": "names with commas",
     "name": "profile",
     "need": "limits such as psnr>=44",
-    "networks": "names with commas",
+    "network": "network",
     "optimiser": "adam, adamw",
     "preset": "data set",
     "reference": "profile",
@@ -169,11 +169,9 @@ REFUSED = {
         Refused(("lpips",), "--lpips-weight 0"),
     ],
     "export": [
-        Refused(("variant",), "--checkpoint WEIGHTS"),
-        Refused(("board", "delta", "apply"), without="--checkpoint"),
+        Refused(("board_file", "delta", "apply"), without="--network"),
     ],
-    "quantize": [Refused(("board", "report", "finetune"), "--regime free")],
-    "gate": [Refused(("variant",), "FLOAT INT8")],
+    "quantize": [Refused(("board_file", "report", "finetune"), "--regime free")],
     "bench": [
         Refused(
             (
@@ -181,7 +179,7 @@ REFUSED = {
                 "full_scale",
                 "size",
                 "halo",
-                "config",
+                "dpu",
                 "host_task",
                 "measured",
                 "no_traditional",
@@ -196,7 +194,7 @@ REFUSED = {
     ],
     "restore": [
         Refused(
-            ("model", "tile", "halo", "runtime", "threads", "scheduler", "cog", "stac", "resume"),
+            ("network", "tile", "halo", "runtime", "threads", "scheduler", "cog", "stac", "resume"),
             "--method traditional",
         ),
         Refused(("method",), without="--sensor"),
@@ -209,7 +207,6 @@ REFUSED = {
     ],
     "tradeoff": [Refused(("detector", "classes"), without="--labelled")],
     "stress": [
-        Refused(("variant",), "FLOAT"),
         Refused(("cases", "stages"), "--bit-flips"),
         Refused(("draws", "images", "target"), without="--bit-flips"),
     ],
@@ -254,7 +251,9 @@ def parameters(command: str) -> list[Parameter]:
     for shown in get_command(app).commands[command].params:  # type: ignore[attr-defined]
         if shown.name in hints:
             hint, info = get_args(hints[shown.name])
-            label = shown.opts[0] if shown.param_type_name == "option" else shown.metavar or shown.name.upper()
+            label = (
+                max(shown.opts, key=len) if shown.param_type_name == "option" else shown.metavar or shown.name.upper()
+            )
             found.append(Parameter(command, shown.name, label.strip("[]"), shown.required, _plain(hint), info))
     return found
 

@@ -78,7 +78,7 @@ def limitation_lines() -> Iterator[str]:
 
 def main() -> None:
     """Run the battery on the shipped pair and write the page."""
-    subject = open_subject(None, None, VARIANT)
+    subject = open_subject(Path(VARIANT), None)
     write_text(TARGET, document(subject, run_battery(subject)))
     sys.stdout.write(f"wrote {TARGET}\n")
 

@@ -139,7 +139,7 @@ applies where the file has the constants that the rule names, so leave out what 
 |---|---|
 | `base` | a shipped board that supplies what the file does not state, except the watts of `[power]` |
 | `description` | one sentence; required |
-| `default_configuration` | the configuration that is used where `--config` names none |
+| `default_configuration` | the configuration that is used where `--dpu` names none |
 """
 
 

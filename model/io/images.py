@@ -183,7 +183,7 @@ UNIT_MAX = 2.0
 """Floats no larger may be shares of full scale, or reflectances, which pass 1 on snow and glint. A raw image has a
 pixel above 2 DN wherever it sees anything at all."""
 
-REMEDY = "give the pixel value that is full scale as --full-scale"
+REMEDY = "give the pixel value that is full scale as `full_scale`"
 
 
 def settled_scale(
@@ -237,7 +237,7 @@ def check_scale(full_scale: float, kind: str) -> None:
     if 0 < full_scale < np.inf and (kind == "f" or whole):
         return
     expected = "a number above 0" if kind == "f" else "a whole number of 1 to 65535 for integer pixels"
-    raise OptionError("--full-scale", expected=expected, got=f"{full_scale:g}", remedy="4095 is 12 bits")
+    raise OptionError("full_scale", expected=expected, got=f"{full_scale:g}", remedy="4095 is 12 bits")
 
 
 def remedy_outside(low: float, high: float, remedy: str) -> str:

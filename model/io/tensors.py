@@ -104,7 +104,7 @@ def read_plain(path: Path) -> Weights:
     """
     found = read_weights(path)
     if found.conditioned:
-        remedy = "name the sensor: beers-deploy export --checkpoint FILE --sensor NAME"
+        remedy = "name the sensor: beers-deploy export --network FILE --sensor NAME"
         got = "one that is conditioned on its sensor"
         raise ModelError(str(path), expected="the weights of a plain network", got=got, remedy=remedy)
     return found

@@ -140,6 +140,17 @@ def acquire(
     return detect(signal, sensor, draw, role, skip)
 
 
+def acquire_three(
+    scene: PreparedScene, degraded: Instrument, reference: Instrument, draw: Draw
+) -> tuple[Tensor, Tensor, Tensor]:
+    """A pair of one scene, and the reference once more without noise and rounding: digital numbers (h, w) each."""
+
+    def by(sensor: Instrument, role: str, skip: Collection[str] = ()) -> Tensor:
+        return acquire(scene.spectrum, scene.radiance.shape[-1], sensor, scene.oversampling, draw, role, skip=skip)
+
+    return by(degraded, "degraded"), by(reference, "reference"), by(reference, "reference", NOISE)
+
+
 def acquire_padded(
     radiance: Tensor, sensor: Instrument, oversampling: int, draw: Draw, role: str, skip: Collection[str] = ()
 ) -> Tensor:

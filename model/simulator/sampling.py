@@ -121,7 +121,15 @@ def read_scene(path: Path, sensor: Instrument) -> Scene:
     Raises:
         ImageError: not an image, or pixels of another kind.
     """
-    pixels = read_pixels(path)
+    return scene_of(path.name, read_pixels(path), sensor)
+
+
+def scene_of(name: str, pixels: np.ndarray, sensor: Instrument) -> Scene:
+    """As `read_scene`, of the pixels of an image.
+
+    Raises:
+        ImageError: pixels of another kind.
+    """
     radiance: np.ndarray
     if pixels.dtype == np.uint8:
         radiance = _linear(pixels) * (sensor.max_dn / sensor.gain_dn_per_radiance)
@@ -131,12 +139,12 @@ def read_scene(path: Path, sensor: Instrument) -> Scene:
         radiance = pixels.astype(np.float32)
     else:
         raise ImageError(
-            str(path),
+            name,
             expected="8-bit RGB or mono, 16-bit mono, or float mono pixels",
             got=f"{pixels.dtype} of shape {pixels.shape}",
             remedy="convert it to one of these",
         )
-    return Scene(path.name, torch.from_numpy(np.ascontiguousarray(radiance, dtype=np.float32)))
+    return Scene(name, torch.from_numpy(np.ascontiguousarray(radiance, dtype=np.float32)))
 
 
 def _linear(pixels: np.ndarray) -> np.ndarray:

@@ -105,7 +105,7 @@ def read_checkpoint(
     found, header = read_tensors(path)
     tensors = {name: torch.from_numpy(array) for name, array in found.items()}
     if header.get("recipe") != asdict(recipe):
-        remedy = "repeat its options, or choose another --out"
+        remedy = "repeat its options, or choose another folder"
         raise ModelError(str(path), expected=f"a checkpoint of {recipe}", got="another recipe", remedy=remedy)
     try:
         _check_parts(tensors, network, recipe.steps)

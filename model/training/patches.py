@@ -302,7 +302,7 @@ class StoredPairs:
                 str(files[0]),
                 expected=f"a mono pair of one size, {self.patch_px} pixels a side or more",
                 got=" and ".join(map(_size, images)),
-                remedy="choose a smaller --patch, or simulate larger patches",
+                remedy="choose a smaller `patch`, or simulate larger patches",
             )
         top, left = (int(generator.integers(size - self.patch_px + 1)) for size in (height, width))
         window = slice(top, top + self.patch_px), slice(left, left + self.patch_px)

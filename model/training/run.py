@@ -33,7 +33,7 @@ from beers_deploy.model.training.trainer import Precision, Progress, Schedule, S
 from beers_deploy.model.training.validation import Validation, split_by_site
 from beers_deploy.model.training.workers import Worker
 from beers_deploy.model.variants import Variant, variant_named
-from beers_deploy.profiles.errors import ModelError, OptionError
+from beers_deploy.profiles.errors import MissingExtraError, ModelError, OptionError
 
 STEP = re.compile(r"[0-9]{1,18}(?=,)")
 """What a line of a log begins with."""
@@ -115,8 +115,8 @@ def train(run: Run, resume: bool, worker: Worker, say: Callable[[str], None]) ->
     if resume:
         trainer.resume(run.checkpoint)
     elif run.checkpoint.exists():
-        remedy = "add --resume or choose another"
-        raise OptionError("--out", expected="a folder without a run", got=str(run.checkpoint), remedy=remedy)
+        remedy = "add `resume` or choose another"
+        raise OptionError("out", expected="a folder without a run", got=str(run.checkpoint), remedy=remedy)
     source, validation, names = data(run, trainer)
     _train(run, trainer, source, validation)
     if worker.first:
@@ -136,7 +136,7 @@ def require_whole_places(run: Run, variants: Sequence[Variant]) -> None:
             f"a multiple of {scale} px, for a network at 1/{scale} resolution",
             f"{run.patches.patch_px} px",
         )
-        raise OptionError("--patch", expected=expected, got=got, remedy="choose another")
+        raise OptionError("patch", expected=expected, got=got, remedy="choose another")
 
 
 def start_weights(run: Run) -> Mapping[str, Tensor] | None:
@@ -161,7 +161,7 @@ def _given(run: Run, path: Path) -> Network:
     wanted = ConvBEERS if run.patches.family is None else BankedConvBEERS
     if not isinstance(network, wanted):
         kinds = {ConvBEERS: "a plain network's", BankedConvBEERS: "those that 'train --conditioned' wrote"}
-        remedy = "give others, or train with --conditioned" if wanted is ConvBEERS else "give others"
+        remedy = "give others, or give `conditioned`" if wanted is ConvBEERS else "give others"
         raise ModelError(str(path), expected=f"weights: {kinds[wanted]}", got=kinds[type(network)], remedy=remedy)
     require_finite_output(network, str(path), "give another network")
     return network
@@ -194,7 +194,7 @@ def data(run: Run, trainer: Trainer) -> tuple[Source, Validation, list[str]]:
     validation = Validation([scenes[k] for k in held for _ in range(views)], *sensors)
     train_on = [scenes[k] for k in kept] + draw_scenes(run.drawn, recipe.seed)
     if not train_on:
-        remedy = "give --images, --pairs or --drawn"
+        remedy = "give `images`, `pairs` or `drawn`"
         raise OptionError("training data", expected="images, pairs or drawn scenes", got="none", remedy=remedy)
     patches = PatchSource(train_on, run.patches, recipe.batch, recipe.seed, trainer.worker, trainer.device)
     return patches, validation, [scene.name for scene in train_on]
@@ -278,7 +278,7 @@ def tensorboard(out: Path) -> "SummaryWriter":
         from torch.utils.tensorboard import SummaryWriter
     except ImportError as error:
         remedy = "pip install 'beers-deploy[tensorboard]'"
-        raise OptionError("--tensorboard", expected="TensorBoard", got="none installed", remedy=remedy) from error
+        raise MissingExtraError("tensorboard", expected="TensorBoard", got="none installed", remedy=remedy) from error
     return SummaryWriter(str(out / "tensorboard"))
 
 

@@ -250,7 +250,7 @@ def require_loss(loss: RestorationLoss, distil: float) -> None:
     left_out = ", and none but LPIPS, which lacks its weights" if loss.weights.lpips else ""
     got, remedy = (
         f"weights of 0{left_out}",
-        "raise one of --l1-weight, --l2-weight, --fft-weight, --radiance-weight, --psnr-weight",
+        "raise one of `l1_weight`, `l2_weight`, `fft_weight`, `radiance_weight`, `psnr_weight`",
     )
     raise OptionError("loss", expected="a term of weight above 0", got=got, remedy=remedy)
 

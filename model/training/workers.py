@@ -32,8 +32,8 @@ class Worker:
         """
         device = torch.device(name)
         if device.type == "cuda" and not torch.cuda.is_available():
-            remedy = "choose --device cpu, or install a build of PyTorch for it"
-            raise MachineError("--device", expected="a CUDA device", got="none that PyTorch can see", remedy=remedy)
+            remedy = "choose the device cpu, or install a build of PyTorch for it"
+            raise MachineError("device", expected="a CUDA device", got="none that PyTorch can see", remedy=remedy)
         if name == "cuda":
             return torch.device("cuda", self.local_rank)
         return device

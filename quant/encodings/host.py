@@ -14,7 +14,7 @@ from onnx import TensorProto
 
 from beers_deploy.quant.core import INT8_MAX, INT8_MIN, IntConv, IntCore
 from beers_deploy.quant.encodings.description import KEY, describe, phases
-from beers_deploy.quant.ends import ZERO, Ends, HostWriter, write_back, write_front
+from beers_deploy.quant.ends import ZERO, HostWriter, write_back, write_front
 from beers_deploy.quant.graph import (
     CORRECTION,
     IMAGE,
@@ -29,7 +29,6 @@ from beers_deploy.quant.graph import (
     Resize,
     Shuffle,
     channels_of,
-    is_plain,
 )
 from beers_deploy.quant.graph.operations import LEAKY_SLOPE
 from beers_deploy.quant.graph.writer import window_attributes, write_shuffle
@@ -50,14 +49,7 @@ def host_model(core: IntCore, about: dict[str, str], tile_px: int | None = None)
     graph = writer.graph(
         "convbeers-int8", [image_info(IMAGE, core.ends.image_channels, tile_px)], [_result(core, tile_px)]
     )
-    return make_model(graph, about if _needs_no_words(core) else {**about, KEY: describe(core)}, microsoft=True)
-
-
-def _needs_no_words(core: IntCore) -> bool:
-    """Whether the nodes alone tell what the core is: ConvBEERS and its like."""
-    square = all(op.weight.shape[2] == op.weight.shape[3] for op in core.convolutions)
-    ends = isinstance(core.ops[0], IntConv) and isinstance(core.ops[-1], IntConv)
-    return square and ends and all(map(is_plain, core.ops)) and core.ends == Ends(gains=core.ends.gains)
+    return make_model(graph, {**about, KEY: describe(core)}, microsoft=True)
 
 
 def _result(core: IntCore, tile_px: int | None) -> onnx.ValueInfoProto:

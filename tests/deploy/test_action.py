@@ -13,7 +13,7 @@ import pytest
 from beers_deploy.export import to_onnx
 from beers_deploy.model.shipped import SENSOR
 from beers_deploy.model.variants import Variant
-from beers_deploy.networks import shipped_pair
+from beers_deploy.network import shipped_pair
 from beers_deploy.quant.onnx_file import save_onnx
 from tests.deploy.command_line import done
 from tests.deploy.workflow_steps import ACTION, BASH, KEPT, ROOT, Runner, read_yaml
@@ -33,7 +33,7 @@ pytestmark = [
 def networks(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with a sound pair, the same with one bias doubled, and in plain/ a network of one sensor alone."""
     folder = tmp_path_factory.mktemp("networks")
-    done("export", "--variant", "convbeers-xs", "--out", folder / "float.onnx")
+    done("export", "--network", "convbeers-xs", "--out", folder / "float.onnx")
     shutil.copy(shipped_pair("convbeers-xs")[1], folder / "int8.onnx")
     model = onnx.load(folder / "int8.onnx")
     name = next(node.input[8] for node in model.graph.node if node.op_type == "QLinearConv")
@@ -123,7 +123,7 @@ def test_without_an_int8_network_it_quantises_for_the_same_sensor(runner: Runner
 
 
 def test_names_are_never_run(runner: Runner) -> None:
-    given = dict.fromkeys(("float", "int8", "sensor", "config"), "$(touch ran) `touch ran` ; touch ran")
+    given = dict.fromkeys(("float", "int8", "sensor", "limits"), "$(touch ran) `touch ran` ; touch ran")
     assert runner.run_action(given)["verdict"] == "error"
     assert not (runner.folder / "ran").exists()
 

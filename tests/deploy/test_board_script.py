@@ -7,18 +7,13 @@ from types import ModuleType
 
 import pytest
 
+from beers_deploy import board_measure
 from tests.deploy.dpu.graphs import board_convbeers
-
-SCRIPT = Path(__file__).resolve().parents[2] / "docs" / "how-to" / "board" / "measure.py"
 
 
 @pytest.fixture
-def script(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
-    monkeypatch.syspath_prepend(str(SCRIPT.parent))
-    monkeypatch.delitem(sys.modules, "measure", raising=False)
-    import measure
-
-    return measure
+def script() -> ModuleType:
+    return board_measure
 
 
 def run(script: ModuleType, monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
@@ -64,7 +59,7 @@ def test_the_same_provider_gives_the_same_numbers(
 
 def test_throughput_leaves_the_first_calls_latency_out(script: ModuleType) -> None:
     assert script.throughput([5.0, 5.5, 6.0], batch=3) == pytest.approx(6)
-    with pytest.raises(ValueError, match="--frames"):
+    with pytest.raises(ValueError, match="frames"):
         script.throughput([5.0], batch=3)
 
 

@@ -139,7 +139,7 @@ def test_an_acquisition_of_another_scale_is_read_as_digital_numbers(tmp_path: Pa
     for name in ("share.tif", "eight.tif"):
         with pytest.raises(ImageError, match="rescale it"):  # where no option settles it, as for pairs
             read_acquisition(tmp_path / name)
-        with pytest.raises(ImageError, match="--full-scale"):
+        with pytest.raises(ImageError, match="full_scale"):
             read_input(tmp_path / name, 0, load_sensors()) if name == "share.tif" else read_acquisition(
                 tmp_path / name, None, None
             )
@@ -158,11 +158,11 @@ def test_a_full_scale_without_an_image_is_refused() -> None:
     [
         ["profiles", "no-such-sensor"],
         ["gate", "--sensor", "no-such-sensor"],
-        ["export", "--out", "x.onnx", "--variant", "no-such-variant"],
-        ["export", "--out", "x.onnx", "--checkpoint", "missing.safetensors"],
+        ["export", "--out", "x.onnx", "--network", "no-such-variant"],
+        ["export", "--out", "x.onnx", "--network", "missing.safetensors"],
         ["quantize", "missing.onnx", "--out", "x.onnx"],
         ["check", "missing.onnx"],
-        ["check", "--config", "C99"],
+        ["check", "--dpu", "C99"],
         ["check", "--target", "no-such-target"],
         ["evaluate", "--images", "no-such-folder"],
         ["evaluate", "--methods", "magic"],
@@ -184,8 +184,8 @@ def test_garbage_models_are_refused(tmp_path: Path) -> None:
 
 def test_rules_need_a_board_that_has_them(tmp_path: Path) -> None:
     paths = [str(tmp_path / name) for name in ("float.onnx", "int8.onnx")]
-    done("export", "--variant", "convbeers-xs", "--out", paths[0])
-    fails(["quantize", paths[0], "--target", "host-cpu", "--out", paths[1]], "--target", "--regime free")
+    done("export", "--network", "convbeers-xs", "--out", paths[0])
+    fails(["quantize", paths[0], "--target", "host-cpu", "--out", paths[1]], "--target", "the free regime")
     assert not Path(paths[1]).exists()
 
 

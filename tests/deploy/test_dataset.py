@@ -96,7 +96,7 @@ def test_a_killed_dataset_is_resumed_to_the_same_bytes(scene: Path, tmp_path: Pa
 
 def test_another_dataset_in_the_folder_is_not_overwritten(scene: Path, made: Path) -> None:
     before = bytes_of(made)
-    with pytest.raises(OptionError, match="add --resume"):
+    with pytest.raises(OptionError, match="add `resume`"):
         write_dataset(small(scene), made, 1, resume=False, tick=silent)
     with pytest.raises(OptionError, match="another dataset"):
         write_dataset(small(scene, patch_px=32), made, 1, resume=True, tick=silent)

@@ -42,7 +42,7 @@ def test_they_agree_at_a_lower_resolution_and_a_tile_is_whole_places(scale: int)
     coarse = plain(Variant(1, 8, scale))
     assert parity(coarse, to_onnx(coarse, {}), 32) < 1e-6
     assert parity(coarse, to_onnx(coarse, {}, 12 * scale), 12 * scale) < 1e-6
-    with pytest.raises(OptionError, match=f"--tile: expected a multiple of {scale} px, got 41 px"):
+    with pytest.raises(OptionError, match=f"tile: expected a multiple of {scale} px, got 41 px"):
         to_onnx(coarse, {}, 41)
 
 
@@ -89,14 +89,14 @@ def overflowing(network: ConvBEERS) -> ConvBEERS:
 def test_a_network_that_gives_nan_is_not_exported(network: ConvBEERS, tmp_path: Path) -> None:
     weights, out = tmp_path / "run.safetensors", tmp_path / "float.onnx"
     save_network(weights, overflowing(network), {})
-    said = refused("export", "--checkpoint", weights, "--out", out)
+    said = refused("export", "--network", weights, "--out", out)
     assert "expected finite pixels" in said
     assert "largest difference" not in said
     assert not out.exists()
     with pytest.raises(ModelError, match="finite pixels"):
         parity(overflowing(network), to_onnx(overflowing(network), {}), 33)
     save_network(weights, network, {})
-    done("export", "--checkpoint", weights, "--out", out)
+    done("export", "--network", weights, "--out", out)
 
 
 def test_an_export_that_computes_something_else_is_refused(network: ConvBEERS) -> None:
@@ -117,7 +117,7 @@ def test_a_relu_stands_behind_every_first_convolution(network: ConvBEERS) -> Non
 @pytest.mark.parametrize("sensor", ["pleiades-degraded", "pleiades-variable"])
 def test_conditioned_weights_become_the_sensors(conditioned: Path, sensor: str, tmp_path: Path) -> None:
     path = tmp_path / "x.onnx"
-    assert "warning" not in done("export", "--checkpoint", conditioned, "--sensor", sensor, "--out", path)
+    assert "warning" not in done("export", "--network", conditioned, "--sensor", sensor, "--out", path)
     unfolded, vector = load_network(conditioned)[0], vector_tensor(load_sensor(sensor).nominal())
     image = np.random.default_rng(1).random((1, 1, 27, 35), dtype=np.float32)
     with torch.inference_mode():
@@ -129,7 +129,7 @@ def test_conditioned_weights_become_the_sensors(conditioned: Path, sensor: str, 
 def test_another_sensor_makes_another_file_and_the_same_one_the_same_bytes(conditioned: Path, tmp_path: Path) -> None:
     files = [tmp_path / f"{number}.onnx" for number in range(3)]
     for file, sensor in zip(files, ("pleiades-degraded", "pleiades-degraded", "pleiades-variable"), strict=True):
-        done("export", "--checkpoint", conditioned, "--sensor", sensor, "--out", file)
+        done("export", "--network", conditioned, "--sensor", sensor, "--out", file)
     same, again, other = (file.read_bytes() for file in files)
     assert same == again
     assert same != other
@@ -137,7 +137,7 @@ def test_another_sensor_makes_another_file_and_the_same_one_the_same_bytes(condi
 
 def test_a_users_own_sensor_and_what_lies_outside_the_ranges_is_said(conditioned: Path, tmp_path: Path) -> None:
     mine = own_sensor(tmp_path, ("[noise]", "mtf_nyquist_along = 0.004\n[noise]"))
-    said = done("export", "--checkpoint", conditioned, "--sensor", mine, "--out", tmp_path / "x.onnx")
+    said = done("export", "--network", conditioned, "--sensor", mine, "--out", tmp_path / "x.onnx")
     warning = "warning: mtf_along 0.004 is outside 0.015 to 0.15, the network is told 0.015"
     assert warning in " ".join(said.split())
 
@@ -147,9 +147,9 @@ def test_plain_weights_take_no_sensor_and_conditioned_ones_the_default(
 ) -> None:
     plain_weights, out = tmp_path / "plain.safetensors", tmp_path / "x.onnx"
     save_network(plain_weights, network, {})
-    useless = refused("export", "--checkpoint", plain_weights, "--sensor", "pleiades-degraded", "--out", out)
+    useless = refused("export", "--network", plain_weights, "--sensor", "pleiades-degraded", "--out", out)
     assert "train --conditioned" in useless
-    assert "hubble" in refused("export", "--checkpoint", conditioned, "--sensor", "hubble", "--out", out)
+    assert "hubble" in refused("export", "--network", conditioned, "--sensor", "hubble", "--out", out)
     assert not out.exists()
-    done("export", "--checkpoint", conditioned, "--out", out)
+    done("export", "--network", conditioned, "--out", out)
     assert metadata(onnx.load(out))["sensor"] == "pleiades-degraded"

@@ -13,8 +13,8 @@ import pytest
 from onnx import numpy_helper
 
 from beers_deploy.export import float_model
-from beers_deploy.gate import baseline_mae, file_checks, junit_text, sentence
-from beers_deploy.networks import shipped_pair
+from beers_deploy.network import Network, shipped_pair
+from beers_deploy.profiles import load_target
 from beers_deploy.profiles.errors import OptionError
 from beers_deploy.profiles.figures import Row, measured
 from beers_deploy.profiles.sensor_file import BLIND
@@ -26,7 +26,8 @@ from beers_deploy.quant.gate import Limits, compare, judge, judge_saturation, re
 from beers_deploy.quant.onnx_file import image_info, load_onnx, save_onnx
 from beers_deploy.quant.session import open_session
 from beers_deploy.quant.structure import Relus, count_relus, rounded_tensors, saturated_shares
-from beers_deploy.results import Document
+from beers_deploy.results import Table
+from beers_deploy.verdict import baseline_mae, file_checks, junit_text, sentence
 from tests.deploy.command_line import done, refused
 from tests.quant.quick import change, changed, drawn, one_guess
 
@@ -51,7 +52,7 @@ def failed(reference_model: onnx.ModelProto, unseen: Patches, folder: Path, spoi
     result = compare(open_session(reference_model), open_session(model), unseen.pairs)
     limits = Limits(std_over_mae=2.5, saturated=0.001)
     checks = judge(result, limits) + judge_saturation(saturated_shares(model, unseen.degraded), limits)
-    checks += file_checks(reference_model, folder / "spoilt.onnx", model, "vck190")
+    checks += file_checks(reference_model, Network(model, "spoilt"), load_target("vck190"))
     return {check.name for check in checks if not check.passed}
 
 
@@ -227,8 +228,6 @@ def test_the_number_decides(value: float, limit: float, bound: Bound, passed: bo
 def test_one_file_alone_is_no_pair(tmp_path: Path) -> None:
     (tmp_path / "float.onnx").touch()
     assert "expected the INT8 network of float.onnx" in refused("gate", tmp_path / "float.onnx")
-    said = refused("gate", *shipped_pair("convbeers-xs"), "--variant", "convbeers-s")
-    assert "--variant: expected it without files" in said
 
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -269,7 +268,7 @@ def test_a_document_that_is_no_baseline_is_refused(tmp_path: Path) -> None:
 )
 def test_a_baseline_of_other_patches_is_refused(other: dict[str, object], tmp_path: Path) -> None:
     row = Row("gate", "INT8 against float", {"MAE": measured(5e-4, "of full scale", "here")})
-    Document("gate", ASKED, (), (row,)).write(tmp_path / "before.json")
+    Table("gate", ASKED, (), (row,)).save(tmp_path / "before.json")
     assert baseline_mae(tmp_path / "before.json", ASKED) == 5e-4
     (name,) = other
     with pytest.raises(OptionError, match=f"same patches \\({name}"):
@@ -278,7 +277,7 @@ def test_a_baseline_of_other_patches_is_refused(other: dict[str, object], tmp_pa
 
 def test_a_folder_of_images_may_lie_elsewhere(tmp_path: Path) -> None:
     row = Row("gate", "INT8 against float", {"MAE": measured(5e-4, "of full scale", "here")})
-    Document("gate", {**ASKED, "images": "/here/aerial"}, (), (row,)).write(tmp_path / "before.json")
+    Table("gate", {**ASKED, "images": "/here/aerial"}, (), (row,)).save(tmp_path / "before.json")
     assert baseline_mae(tmp_path / "before.json", {**ASKED, "images": Path("there/aerial")}) == 5e-4
 
 
@@ -342,12 +341,13 @@ def test_a_free_file_is_judged_without_the_rules_of_a_dpu(model: Path, unseen: P
     path, reference_model = tmp_path / "free.onnx", load_onnx(model)
     with one_guess():
         save_onnx(quantise_free(reference_model, unseen, {}), path)
-    checks = file_checks(reference_model, path, onnx.load(path), "host-cpu")
+    free = Network(onnx.load(path), "free", path)
+    checks = file_checks(reference_model, free, load_target("host-cpu"))
     assert [(c.name, c.passed) for c in checks] == [
         ("ReLUs lost or added", True),
         ("optimised against unoptimised", True),
     ]
-    (rules,) = {c.name for c in file_checks(reference_model, path, onnx.load(path), "vck190") if not c.passed}
+    (rules,) = {c.name for c in file_checks(reference_model, free, load_target("vck190")) if not c.passed}
     assert rules == "nodes the DPU refuses"
 
 
@@ -361,9 +361,9 @@ def test_two_networks_of_one_kind_are_refused(reference_model: onnx.ModelProto, 
 def test_samples_without_references_tell_no_loss_and_cannot_keep_a_limit_on_it(tmp_path: Path) -> None:
     samples, limits = tmp_path / "samples.npy", tmp_path / "limits.toml"
     np.save(samples, np.random.default_rng(0).uniform(0.1, 0.9, (2, 1, 40, 40)).astype(np.float32))
-    command = ["gate", *shipped_pair("convbeers-xs"), "--data", samples, "--max-mae", "0.5"]
+    command = ["gate", *shipped_pair("convbeers-xs"), "--samples", samples, "--max-mae", "0.5"]
     said = done(*command)
     assert "gate passed" in said
     assert "nan" not in said.lower()
     limits.write_text("psnr_drop_db = 0.25\n", encoding="utf-8")
-    assert "references for psnr_drop_db, got images alone" in refused(*command, "--config", limits)
+    assert "references for psnr_drop_db, got images alone" in refused(*command, "--limits", limits)

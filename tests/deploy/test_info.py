@@ -10,7 +10,7 @@ import pytest
 import tifffile
 
 from beers_deploy.info import info_row
-from beers_deploy.networks import shipped_pair
+from beers_deploy.network import shipped_pair
 from beers_deploy.profiles import load_target
 from beers_deploy.profiles.figures import Row
 from beers_deploy.restoration.options import Options
@@ -63,8 +63,8 @@ def test_a_full_scale_that_is_open_is_said_to_be(kind: str, model: Path, tmp_pat
     tifffile.imwrite(tmp_path / "in.tif", np.ones((40, 40), kind))
     text = about(tmp_path / "in.tif", Options(model)).text
     assert text["full scale"] == "open"
-    assert "--full-scale" in text["full scale from"]
-    assert about(tmp_path / "in.tif", Options(model, full_scale=200)).text["full scale from"] == "--full-scale"
+    assert "full scale" in text["full scale from"]
+    assert about(tmp_path / "in.tif", Options(model, full_scale=200)).text["full scale from"] == "asked for"
 
 
 def test_time_here_is_predicted_from_what_was_timed(model: Path, tmp_path: Path) -> None:
@@ -93,7 +93,7 @@ def test_it_reads_none_of_a_file_of_ten_gigabytes(model: Path, tmp_path: Path) -
     image = tifffile.memmap(tmp_path / "big.tif", shape=(73_000, 73_000), dtype="uint16", bigtiff=True)
     del image
     out = tmp_path / "a.json"
-    done("info", tmp_path / "big.tif", "--model", model, "--json", out)
+    done("info", tmp_path / "big.tif", "--network", model, "--json", out)
     (row,) = json.loads(out.read_text())["rows"]
     assert row["figures"]["width"]["value"] == 73_000
     assert [each["name"] for each in json.loads(out.read_text())["inputs"]] == [model.name]

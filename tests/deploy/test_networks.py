@@ -11,15 +11,15 @@ import onnx
 import pytest
 import tifffile
 
-from beers_deploy.gate import files_or_shipped
 from beers_deploy.model.io.files import sha256
 from beers_deploy.model.progress import once
 from beers_deploy.model.shipped import INT8, SENSOR, SHIPPED, VARIANT, shipped_names, shipped_weights
-from beers_deploy.networks import (
+from beers_deploy.network import (
     WEIGHTS,
     float_file,
     int8_file,
     network_file,
+    pair_of,
     shipped_pair,
     told_int8,
     weights_file,
@@ -64,7 +64,7 @@ def test_int8_is_calibrated_once_and_then_told_any_sensor(
     monkeypatch.chdir(tmp_path)
     done("quantize", conditioned, "--sensor", SENSOR, "--patches", "1", "--out", "base.onnx")
     base, sensor = load_onnx(Path("base.onnx")), own_sensor(tmp_path, ("value = 0.07", "value = 0.05"))
-    words = ["export", "--checkpoint", "base.onnx", "--out"]
+    words = ["export", "--network", "base.onnx", "--out"]
     mine = [*words, "mine.onnx", "--sensor", str(sensor), "--delta", "mine.delta"]
     done(*mine)
     done(*words, "applied.onnx", "--apply", "mine.delta")
@@ -126,7 +126,7 @@ def test_restoring_for_a_sensor_needs_no_torch_and_is_what_the_sensor_makes_of_i
     dn = np.random.default_rng(0).integers(200, 1800, (37, 41)).astype(np.uint16)
     tifffile.imwrite(tmp_path / "in.tif", dn)
     sensor = own_sensor(tmp_path, ("value = 0.07", "value = 0.05"))
-    words = ["restore", str(tmp_path / "in.tif"), "out.tif", "--model", name, "--sensor", str(sensor)]
+    words = ["restore", str(tmp_path / "in.tif"), "out.tif", "--network", name, "--sensor", str(sensor)]
     call = f"app({words!r}, standalone_mode=False)"
     code = f"import sys; from beers_deploy.cli import app; {call}; print({{'torch', 'skimage'}} & set(sys.modules))"
     ran = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=True)
@@ -140,7 +140,15 @@ def test_restoring_for_a_sensor_needs_no_torch_and_is_what_the_sensor_makes_of_i
 def test_a_network_that_is_made_already_takes_no_sensor(tmp_path: Path) -> None:
     tifffile.imwrite(tmp_path / "in.tif", np.full((20, 30), 900, np.uint16))
     mine = shipped_pair("convbeers-xs")[0]
-    words = ["restore", str(tmp_path / "in.tif"), str(tmp_path / "out.tif"), "--model", str(mine), "--sensor", SENSOR]
+    words = [
+        "restore",
+        str(tmp_path / "in.tif"),
+        str(tmp_path / "out.tif"),
+        "--network",
+        str(mine),
+        "--sensor",
+        SENSOR,
+    ]
     assert "leave --sensor out" in refused(*words)
     assert not (tmp_path / "out.tif").exists()
 
@@ -183,11 +191,11 @@ def test_commands_take_the_name(tmp_path: Path) -> None:
     tifffile.imwrite(tmp_path / "in.tif", np.random.default_rng(0).integers(200, 1800, (37, 41)).astype(np.uint16))
     for model in ("convbeers-xs-int8", str(shipped_pair("convbeers-xs", "blind")[1])):
         out = tmp_path / f"{len(model)}.tif"
-        said = done("restore", tmp_path / "in.tif", out, "--model", model)
+        said = done("restore", tmp_path / "in.tif", out, "--network", model)
         assert ("network: convbeers-xs-int8, told no sensor" in said) == (model == "convbeers-xs-int8")
     first, second = (tifffile.imread(path) for path in tmp_path.glob("*.tif") if path.name != "in.tif")
     np.testing.assert_array_equal(first, second)
-    said = refused("restore", tmp_path / "in.tif", tmp_path / "x.tif", "--model", "huge")
+    said = refused("restore", tmp_path / "in.tif", tmp_path / "x.tif", "--network", "huge")
     assert "a shipped network (convbeers, convbeers-half" in said
 
 
@@ -204,24 +212,25 @@ def test_judges_take_the_name(command: list[str]) -> None:
 
 def test_the_gate_takes_the_names() -> None:
     for int8 in ("convbeers-xs", "convbeers-xs-int8"):
-        assert files_or_shipped(Path("convbeers-xs"), Path(int8), None) == shipped_pair("convbeers-xs")
+        names = pair_of(Path("convbeers-xs"), Path(int8))
+        assert tuple(map(str, names)) == ("convbeers-xs", "convbeers-xs-int8")
 
 
 def test_export_takes_the_name(tmp_path: Path) -> None:
-    done("export", "--checkpoint", "convbeers-xs", "--out", tmp_path / "net.onnx")
+    done("export", "--network", "convbeers-xs", "--out", tmp_path / "net.onnx")
     assert metadata(load_onnx(tmp_path / "net.onnx"))["variant"] == "convbeers-xs"
 
 
 def test_export_writes_a_shipped_networks_integers_for_the_host_and_the_board(tmp_path: Path) -> None:
     host, board = str(tmp_path / "int8.onnx"), str(tmp_path / "core.onnx")
-    words = ["export", "--checkpoint", "convbeers-half-xs-int8", "--sensor", "blind", "--tile", "64", "--out", host]
-    done(*words, "--board", board)
+    words = ["export", "--network", "convbeers-half-xs-int8", "--sensor", "blind", "--tile", "64", "--out", host]
+    done(*words, "--board-file", board)
     assert metadata(load_onnx(Path(host)))["sensor"] == "blind"
     for path in (host, board):
         done("check", path)
 
 
 def test_a_tile_that_a_network_cannot_rearrange_is_refused(tmp_path: Path) -> None:
-    words = ["export", "--checkpoint", "convbeers-half-xs-int8", "--tile", "65", "--out", str(tmp_path / "x.onnx")]
+    words = ["export", "--network", "convbeers-half-xs-int8", "--tile", "65", "--out", str(tmp_path / "x.onnx")]
     assert "--tile: expected a multiple of 2 px, got 65 px" in refused(*words)
     assert not (tmp_path / "x.onnx").exists()

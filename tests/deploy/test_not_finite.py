@@ -15,7 +15,7 @@ from beers_deploy.cli import app
 from beers_deploy.export import to_onnx
 from beers_deploy.model.convbeers import ConvBEERS, save_network
 from beers_deploy.model.variants import VARIANTS
-from beers_deploy.networks import shipped_pair
+from beers_deploy.network import shipped_pair
 from beers_deploy.profiles.errors import ModelError
 from beers_deploy.quant.gate import compare
 from beers_deploy.quant.onnx_file import load_onnx, parse_onnx, save_onnx
@@ -24,20 +24,20 @@ from beers_deploy.quant.session import open_session
 VARIANT = "convbeers-xs"
 INT8 = str(shipped_pair(VARIANT)[1])
 READERS = [
-    "quantize {0} --out {1}/int8.onnx --board {1}/board.onnx --json {1}/q.json",
+    "quantize {0} --out {1}/int8.onnx --board-file {1}/board.onnx --json {1}/q.json",
     f"gate {{0}} {INT8} --json {{1}}/g.json",
     "check {0} --json {1}/c.json --picture {1}/c.svg",
     "evaluate --methods {0} --json {1}/e.json --out {1}",
     f"stress {{0}} {INT8} --json {{1}}/s.json",
     "stress --bit-flips {0} --json {1}/s.json",
-    "tradeoff --networks {0} --out {1}",
+    "tradeoff --network {0} --out {1}",
     "bench {0} --json {1}/b.json",
     "bench {0} --target host --json {1}/b.json",
-    "restore {1}/raw.tif {1}/out.tif --model {0}",
+    "restore {1}/raw.tif {1}/out.tif --network {0}",
 ]
 TRAINING = f"--variant {VARIANT} --drawn 1 --steps 2 --batch 1 --patch 24 --validate-every 0 --out {{1}}"
 OF_WEIGHTS = [
-    "export --checkpoint {0} --out {1}/float.onnx",
+    "export --network {0} --out {1}/float.onnx",
     f"train --start {{0}} {TRAINING}",
     f"train --teacher {{0}} {TRAINING}",
     "quantize {0} --out {1}/int8.onnx",
@@ -108,7 +108,7 @@ def test_no_command_takes_such_weights(tmp_path: Path, command: str) -> None:
         "quantize {0} --out {1}/int8.onnx --images {2} --patches 1",
         "quantize {0} --out {1}/int8.onnx --images {2} --patches 1 --regime free",
         "bench {0} --target host --tile 64 --json {1}/b.json",
-        "restore {1}/raw.tif {1}/out.tif --model {0}",
+        "restore {1}/raw.tif {1}/out.tif --network {0}",
     ],
 )
 def test_a_network_whose_sums_overflow_is_refused_where_it_runs(tmp_path: Path, command: str, scenes: Path) -> None:

@@ -1,6 +1,7 @@
 """The code of docs/how-to/notebook.md, as a reader would run it."""
 
 import re
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -8,10 +9,27 @@ import numpy as np
 import pytest
 import tifffile
 
-from beers_deploy.networks import shipped_pair
+import beers_deploy as bd
+from beers_deploy.network import shipped_pair
+from beers_deploy.profiles.toml import profile_path
 from beers_deploy.restoration.options import Options
 from beers_deploy.restoration.run import restore_file
 
+NET = """
+import torch
+
+
+class Net(torch.nn.Module):
+    def __init__(self):
+        super().__init__()
+        generator = torch.Generator().manual_seed(0)
+        self.head, self.tail = torch.nn.Conv2d(1, 8, 3, padding=1), torch.nn.Conv2d(8, 1, 3, padding=1)
+        for weight in self.parameters():
+            weight.data = 0.1 * torch.randn(weight.shape, generator=generator)
+
+    def forward(self, image):
+        return image + self.tail(torch.relu(self.head(image)))
+"""
 PAGE = Path(__file__).parents[2] / "docs" / "how-to" / "notebook.md"
 
 
@@ -25,6 +43,11 @@ def test_the_page_gives_what_the_command_gives(tmp_path: Path, monkeypatch: pyte
     about = {"crs": "EPSG:32631", "transform": rasterio.Affine(0.5, 0, 3e5, 0, -0.5, 4.8e6), "nodata": 0}
     with rasterio.open("raw.tif", "w", "GTiff", 260, 300, 1, dtype="uint16", **about) as file:
         file.write(pixels)
+    shutil.copy(profile_path("sensors", "pleiades-degraded"), "my-sensor.toml")
+    Path("my_net.py").write_text(NET)
+    for stranger in ("model", "quant", "profiles", "deploy"):
+        Path(f"{stranger}.py").write_text("raise RuntimeError('a module of the user')\n")
+    monkeypatch.syspath_prepend(str(tmp_path))
     names: dict[str, Any] = {}
     for code in re.findall(r"```python\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL):
         exec(code, names)  # noqa: S102 - our own page
@@ -33,5 +56,10 @@ def test_the_page_gives_what_the_command_gives(tmp_path: Path, monkeypatch: pyte
     with rasterio.open("restored.tif") as ours, rasterio.open("expected.tif") as theirs:
         np.testing.assert_array_equal(ours.read(1), expected)
         assert (ours.crs, ours.transform, ours.nodata) == (theirs.crs, theirs.transform, theirs.nodata)
+    names["test_int8_stays_close_to_float"]()
+    assert names["int8"] == bd.Network.load("int8.onnx")
+    psnrs_db = [names["pair"].psnr(names["images"][name]) for name in ("raw", "chain", "network")]
+    assert psnrs_db == sorted(psnrs_db)
+    assert list(names["table"].columns[:1]) == ["tiles"]
     np.testing.assert_array_equal(names["corner"].values, expected[:200, :200])
     np.testing.assert_array_equal(names["whole"][0], expected)

@@ -12,7 +12,7 @@ from docs.make.options import PATHS, REFUSED, UNITS, WORDS, Parameter, Refused, 
 CASES = [(name, option, case) for name, cases in REFUSED.items() for case in cases for option in case.options]
 GIVEN = {
     "add": "haze",
-    "config": "C32B3",
+    "dpu": "C32B3",
     "halo": "8",
     "reference": "pleiades-reference",
     "scheduler": "tcp://host:8786",

@@ -42,7 +42,11 @@ def test_the_free_regime_writes_a_file_of_its_own_kind(tmp_path: Path) -> None:
     done(*free, "--out", out, "--json", tmp_path / "q.json")
     assert metadata(load_onnx(out))["precision"] == "int8 free"
     valid(tmp_path / "q.json")
-    for option in (["--finetune", "1"], ["--board", str(tmp_path / "b.onnx")], ["--report", str(tmp_path / "r")]):
+    for option in (
+        ["--finetune", "1"],
+        ["--board-file", str(tmp_path / "b.onnx")],
+        ["--report", str(tmp_path / "r")],
+    ):
         assert "--regime legal" in refused(*free, "--out", tmp_path / "no.onnx", *option)
     assert not (tmp_path / "no.onnx").exists()
 

@@ -5,7 +5,7 @@ import numpy as np
 
 from beers_deploy.model.io.pictures import busiest_windows, picture_url, stretch_of, strip
 from beers_deploy.profiles.figures import Row, measured, predicted, unavailable
-from beers_deploy.report.page import Picture, Report, Table, render
+from beers_deploy.report.page import Picture, Report, Section, render
 
 
 def report() -> Report:
@@ -14,7 +14,7 @@ def report() -> Report:
         "PSNR": measured(41.5, "dB", "a pair"),
         "power": unavailable("W", "no counter on this <machine>"),
     }
-    table = Table("Times", [Row("bench", "network & more", figures)], "a caption")
+    table = Section("Times", [Row("bench", "network & more", figures)], "a caption")
     picture = Picture("a crop", picture_url(np.zeros((4, 5), np.uint8)), "what it shows")
     return Report("A title", "A headline.", [table], [picture], ["a note"])
 

@@ -6,17 +6,17 @@ from typing import Any
 import jsonschema
 import pytest
 
-from beers_deploy.compare import read_document
+from beers_deploy.differences import read_document
 from beers_deploy.profiles.figures import Figure, Row, measured, number, predicted, published, unavailable
 from beers_deploy.quant.checks import Check
 from beers_deploy.quant.gate import GateResult, Limits, gate_row, judge
-from beers_deploy.results import SCHEMA_PATH, Document
+from beers_deploy.results import SCHEMA_PATH, Table
 
 SCHEMA = json.loads(SCHEMA_PATH.read_text())
 
 
 def document(**figures: Figure) -> dict[str, object]:
-    return Document("test", {"tile": 640, "image": Path("a.tif")}, (), (Row("t", "row", figures),)).to_json()
+    return Table("test", {"tile": 640, "image": Path("a.tif")}, (), (Row("t", "row", figures),)).to_dict()
 
 
 def test_every_mode_validates() -> None:
@@ -48,7 +48,7 @@ def test_a_figure_without_what_its_mode_needs_is_invalid(wrong: Figure) -> None:
 def test_inputs_are_named_by_their_digest(tmp_path: Path) -> None:
     (tmp_path / "model.onnx").write_bytes(b"abc")
     row = Row("t", "row", {"a": measured(1, "s", "here")})
-    inputs = Document("test", {}, (tmp_path / "model.onnx",), (row,)).to_json()["inputs"]
+    inputs = Table("test", {}, (tmp_path / "model.onnx",), (row,)).to_dict()["inputs"]
     digest = "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad"
     assert inputs == [{"name": "model.onnx", "sha256": digest}]
 
@@ -72,9 +72,8 @@ def strictly(text: str) -> object:
 
 def test_what_is_written_is_the_document(tmp_path: Path) -> None:
     row = Row("t", "row", {"a": measured(1.5, "s", "here")}, {"remedy": "none"})
-    whole = Document("test", {"seed": 0, "json": None}, (), (row,))
-    whole.write(tmp_path / "made" / "a.json")
-    whole.write(None)
+    whole = Table("test", {"seed": 0, "json": None}, (), (row,))
+    assert whole.save(tmp_path / "made" / "a.json") == tmp_path / "made" / "a.json"
     read = strictly((tmp_path / "made" / "a.json").read_text())
     jsonschema.validate(read, SCHEMA)
     assert [p.name for p in (tmp_path / "made").iterdir()] == ["a.json"]
@@ -82,7 +81,7 @@ def test_what_is_written_is_the_document(tmp_path: Path) -> None:
 
 def test_a_document_without_rows_is_invalid() -> None:
     with pytest.raises(jsonschema.ValidationError):
-        jsonschema.validate(Document("test", {}, (), ()).to_json(), SCHEMA)
+        jsonschema.validate(Table("test", {}, (), ()).to_dict(), SCHEMA)
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, 0.0])
@@ -90,7 +89,7 @@ def test_a_gate_on_a_network_gone_wrong_still_writes_json(value: float, tmp_path
     """A network that gives NaN has no MAE: unavailable with a reason, in JSON that every reader takes."""
     result = GateResult(value, value, value, value, value, value, value, value, patches=1)
     checks = tuple(judge(result, Limits(mae=1.0)))
-    Document("gate", {}, (), (gate_row(result),), checks).write(tmp_path / "gate.json")
+    Table("gate", {}, (), (gate_row(result),), checks).save(tmp_path / "gate.json")
     jsonschema.validate(strictly((tmp_path / "gate.json").read_text()), SCHEMA)
     assert checks[0].passed == (value == 0)
 
@@ -117,7 +116,7 @@ CHECKS = Check("MAE", 6e-4, 7e-4, "of full scale"), Check("PSNR drop", math.nan,
 
 def judged(*checks: Check, command: str = "gate") -> dict[str, Any]:
     row = Row("t", "row", {"a": measured(1, "s", "here")})
-    return Document(command, {}, (), (row,), checks).to_json()
+    return Table(command, {}, (), (row,), checks).to_dict()
 
 
 @pytest.mark.parametrize(("checks", "verdict"), [(CHECKS[:1], "passed"), (CHECKS, "failed")])

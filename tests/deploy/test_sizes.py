@@ -27,7 +27,7 @@ IMAGE = np.random.default_rng(0).integers(200, 1800, (ROWS, COLUMNS)).astype(np.
 
 def plan_of_restore(folder: Path) -> str:
     tifffile.imwrite(folder / "raw.tif", IMAGE)
-    command = ["restore", str(folder / "raw.tif"), str(folder / "out.tif"), "--model", "convbeers-xs"]
+    command = ["restore", str(folder / "raw.tif"), str(folder / "out.tif"), "--network", "convbeers-xs"]
     return CliRunner().invoke(app, command).output
 
 

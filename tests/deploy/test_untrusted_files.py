@@ -14,7 +14,6 @@ from typer.testing import CliRunner
 
 from beers_deploy.cli import app
 from beers_deploy.dpu.board import load_dpu
-from beers_deploy.gate import PATCHES, baseline_mae
 from beers_deploy.model.convbeers import arrays, load_network
 from beers_deploy.model.dataset import _read_summary
 from beers_deploy.model.io.images import read_pixels
@@ -28,8 +27,9 @@ from beers_deploy.profiles.toml import HERE, read_json, read_toml_text
 from beers_deploy.quant.checks import Check
 from beers_deploy.quant.onnx_file import load_onnx
 from beers_deploy.restoration.output import Checkpoint, part_folder
-from beers_deploy.results import Document
+from beers_deploy.results import Table
 from beers_deploy.studies.tradeoff.measure import Measurements
+from beers_deploy.verdict import PATCHES, baseline_mae
 from tests.deploy.command_line import refused
 from tests.fuzz.networks import checkpoint_seeds, go_on
 from tests.fuzz.parsers import JOB, SHAPE
@@ -41,7 +41,7 @@ def document(path: Path, value: object, name: str = "int8") -> Path:
     """Results with one figure of any value."""
     asked = dict.fromkeys(PATCHES)
     row, check = Row("gate", name, {"MAE": measured(1.0, "", "here")}), Check("MAE", 0.5, 2.0, "of full scale")
-    made = Document("gate", asked, (), (row,), (check,)).to_json()
+    made = Table("gate", asked, (), (row,), (check,)).to_dict()
     path.write_text(json.dumps(made).replace('"value": 1.0', f'"value": {value}'), encoding="utf-8")
     return path
 
@@ -51,7 +51,7 @@ def test_figures_that_are_no_numbers_are_refused(value: str, tmp_path: Path) -> 
     path = document(tmp_path / "a.json", value)
     with pytest.raises(OptionError, match=r"a\.json"):
         baseline_mae(path, dict.fromkeys(PATCHES))
-    result = runner.invoke(app, ["compare", str(document(tmp_path / "b.json", 2.0)), str(path)])
+    result = runner.invoke(app, ["diff", str(document(tmp_path / "b.json", 2.0)), str(path)])
     assert result.exit_code == 2, result.output
     assert result.stderr.strip().count("\n") == 0
 
@@ -59,7 +59,7 @@ def test_figures_that_are_no_numbers_are_refused(value: str, tmp_path: Path) -> 
 def test_a_name_that_no_terminal_prints_is_refused(tmp_path: Path) -> None:
     path = document(tmp_path / "a.json", 1.0)
     path.write_text(path.read_text().replace("int8", "\\ud800"))
-    assert runner.invoke(app, ["compare", str(path), str(path)]).exit_code == 2
+    assert runner.invoke(app, ["diff", str(path), str(path)]).exit_code == 2
 
 
 def test_a_deep_header_is_refused(tmp_path: Path) -> None:
@@ -149,7 +149,7 @@ def test_a_journal_that_counts_rows_that_are_not_there_is_refused(journal: objec
     sound = {"job": JOB, "rows": 4, "known": 32}
     path = part_folder(out) / "journal.json"
     path.write_text(json.dumps({**sound, **journal} if isinstance(journal, dict) else journal))
-    with pytest.raises(OptionError, match="--resume"):
+    with pytest.raises(OptionError, match="resume"):
         Checkpoint(out, SHAPE, np.dtype(np.uint16), JOB, resume=True)
     path.write_text(json.dumps(sound))
     assert Checkpoint(out, SHAPE, np.dtype(np.uint16), JOB, resume=True).rows == 4
@@ -188,10 +188,10 @@ POINTER = "version https://git-lfs.github.com/spec/v1\noid sha256:4d7a2146\nsize
     [
         (["check", "{}"], "network.onnx"),
         (["gate", "{}", "{}"], "network.onnx"),
-        (["export", "--out", "out.onnx", "--checkpoint", "{}"], "weights.safetensors"),
-        (["gate", "--config", "{}"], "limits.toml"),
+        (["export", "--out", "out.onnx", "--network", "{}"], "weights.safetensors"),
+        (["gate", "--limits", "{}"], "limits.toml"),
         (["gate", "--baseline", "{}"], "gate.json"),
-        (["compare", "{}", "{}"], "gate.json"),
+        (["diff", "{}", "{}"], "gate.json"),
         (["profiles", "{}"], "sensor.toml"),
     ],
 )

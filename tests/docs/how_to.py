@@ -52,10 +52,11 @@ SHORTER = {
     r"IMAGE OUT": "raw.tif restored.tif",
     r"(beers-deploy detect)$": r"\1 --drawn 2 --methods degraded",
     r"(beers-deploy detect) (--images)": r"\1 --methods degraded \2",
-    r"(tradeoff)": r"\1 --images aerial --calibration aerial --networks narrow.safetensors",
+    r"--network all ": "",
+    r"(tradeoff)": r"\1 --images aerial --calibration aerial --network narrow.safetensors",
     r"(tradeoff .*)--out": r"\1--size 1500x1200 --out",
     r"(beers-deploy train)": r"\1 --variant convbeers-xs --steps 2 --batch 2 --patch 24 --validate-every 0",
-    r"(stress float\.onnx int8\.onnx)$": r"\1 --size 32 --cases night,snow",
+    r"(stress float\.onnx int8\.onnx)$": r"\1 --side 32 --cases night,snow",
     r"--bit-flips": "--bit-flips --draws 1",
 }
 """Patterns in a command, and what stands there instead so that a test takes seconds."""

@@ -10,6 +10,7 @@ import tifffile
 import torch
 from PIL import Image
 
+from beers_deploy.board import MEASURE
 from beers_deploy.model.convbeers import save_network
 from beers_deploy.model.shipped import SHIPPED
 from beers_deploy.model.variants import Variant
@@ -28,8 +29,8 @@ SITES, SCENE_PX = 6, 820
 FEW, FEW_PX = 2, 480
 MADE = """
 beers-deploy simulate scene.png --sensor pleiades-degraded --out made
-beers-deploy export --checkpoint narrow.safetensors --out float.onnx
-beers-deploy quantize float.onnx --patches 8 --patch 64 --out int8.onnx --board core.onnx
+beers-deploy export --network narrow.safetensors --out float.onnx
+beers-deploy quantize float.onnx --patches 8 --patch 64 --out int8.onnx --board-file core.onnx
 beers-deploy gate float.onnx int8.onnx --patches 4 --json gate-main.json
 beers-deploy evaluate --pairs made --methods float.onnx --json old.json
 python -m examples.samples ffdnet --images aerial --count 2 --out samples.npz
@@ -57,7 +58,7 @@ def prepare(folder: Path) -> None:
 def copied_files(folder: Path) -> None:
     """Those of this project, and those that the pages show."""
     shutil.copytree(ROOT / "benchmarks", folder / "benchmarks", ignore=shutil.ignore_patterns("__pycache__"))
-    shutil.copy(HOW_TO / "board" / "measure.py", folder)
+    shutil.copy(MEASURE, folder / "measure.py")
     shutil.copy(PROFILES / "sensors" / "pleiades-degraded.toml", folder / "my-sensor.toml")
     shutil.copy(SHIPPED / "convbeers-s.safetensors", folder)
     (folder / "gate.toml").write_text(shown("gate.md", r"```toml\n(# gate\.toml\n.*?)```"), encoding="utf-8")

@@ -1,4 +1,4 @@
-"""What the example networks learn from: what each is for, the same for the same seed, as `--data` reads it."""
+"""What the example networks learn from: what each is for, the same for the same seed, as `--samples` reads it."""
 
 from pathlib import Path
 

@@ -12,7 +12,7 @@ from tempfile import TemporaryDirectory
 import numpy as np
 import tifffile
 
-from beers_deploy.compare import change_rows, compare, read_document
+from beers_deploy.differences import change_rows, changes, read_document
 from beers_deploy.dpu.board import load_dpu
 from beers_deploy.dpu.checker.placement import place
 from beers_deploy.dpu.cost.model import Layers
@@ -20,7 +20,6 @@ from beers_deploy.dpu.cost.own_runs import read_own_runs
 from beers_deploy.dpu.cost.work import count_work
 from beers_deploy.dpu.graph import Network
 from beers_deploy.dpu.reading import read_network
-from beers_deploy.gate import PATCHES, baseline_mae
 from beers_deploy.model.convbeers import load_network
 from beers_deploy.model.dataset import _read_summary
 from beers_deploy.model.io.images import read_pixels
@@ -34,8 +33,9 @@ from beers_deploy.profiles.scene_call import load_scene_call
 from beers_deploy.quant.checks import Check
 from beers_deploy.quant.gate import read_limits
 from beers_deploy.restoration.output import Checkpoint, part_folder
-from beers_deploy.results import Document, by_row, cell
+from beers_deploy.results import Table, by_row, cell
 from beers_deploy.studies.tradeoff.measure import Measurements
+from beers_deploy.verdict import PATCHES, baseline_mae
 from tests.deploy.dpu.graphs import integer_convbeers
 from tests.deploy.studies.detection.folders import coco, voc, yolo
 from tests.fuzz.detection import detect, detector_seeds, label_seeds, names_seeds, read_beside, read_names
@@ -139,16 +139,16 @@ def document_seeds(_: Path) -> list[bytes]:
     figures["time"] = predicted(3.0, "s", (2.0, 4.0), "cost model")
     rows = (Row("gate", "int8", figures, {"word": "text"}), Row("gate", "other", figures))
     check = Check("MAE", 0.5, 2.0, "of full scale", detail="text")
-    return [json.dumps(Document("gate", GATED, (), rows, (check,)).to_json()).encode()]
+    return [json.dumps(Table("gate", GATED, (), rows, (check,)).to_dict()).encode()]
 
 
 def read_results(path: Path) -> None:
     """What `compare` shows."""
     document = read_document(path)
-    changes = compare(document, read_document(path)).both
-    rows = change_rows(changes)
+    both = changes(document, read_document(path)).both
+    rows = change_rows(both)
     by_row(rows, ["before", "after"])
-    for change in changes:
+    for change in both:
         cell(change.before, "")
 
 

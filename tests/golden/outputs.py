@@ -42,7 +42,7 @@ def outputs(folder: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
                 arrays[f"{name}, {precision}, {image}"] = _restored(file, path, folder)
             figures |= _figures(f"check, {name}, {precision}", folder, "check", file, "--tile", "64")
         arrays |= {f"{name}, {key}": value for key, value in _integers(Path(int8_model)).items()}
-        pair = (float_model, int8_model) if name != SHIPPED else ("--variant", name)
+        pair = (float_model, int8_model) if name != SHIPPED else (name,)
         figures |= _figures(f"gate, {name}", folder, "gate", *pair, "--patches", "2", "--max-mae", "0.1")
     figures |= _figures(f"bench, {SHIPPED}", folder, "bench", f"{SHIPPED}-int8", "--size", "3000x2000")
     return arrays, figures
@@ -69,7 +69,7 @@ def _networks(folder: Path) -> dict[str, tuple[str, str]]:
     save_onnx(example_to_onnx(OTHER, build(OTHER, torch.Generator().manual_seed(0))), folder / f"{OTHER}.onnx")
     found = {SHIPPED: (str(folder / "xs.onnx"), str(folder / "xs-int8.onnx"))}
     for name, path in ((SHIPPED, "xs.onnx"), (f"{SHIPPED}-int8", "xs-int8.onnx")):
-        _run("export", "--checkpoint", name, "--out", folder / path)
+        _run("export", "--network", name, "--out", folder / path)
     for name in (PLAIN, OTHER):
         _run("quantize", folder / f"{name}.onnx", "--out", folder / f"{name}-int8.onnx", *PATCHES)
         found[name] = (str(folder / f"{name}.onnx"), str(folder / f"{name}-int8.onnx"))
@@ -85,7 +85,7 @@ def _run(*arguments: object) -> None:
 def _restored(model: str, image: Path, folder: Path) -> np.ndarray:
     out = folder / "restored.tif"
     out.unlink(missing_ok=True)
-    _run("restore", image, out, "--model", model, "--tile", "64", "--full-scale", "4095")
+    _run("restore", image, out, "--network", model, "--tile", "64", "--full-scale", "4095")
     return tifffile.imread(out)
 
 

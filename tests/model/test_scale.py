@@ -24,13 +24,13 @@ def test_floats_beyond_any_share_are_digital_numbers(kind: str) -> None:
     assert settled(kind, 0.0, 1.0, 2.5) == MAX_DN
     assert settled(kind, 4095) == MAX_DN
     for brightest in (1e-6, 0.5, 1.0, UNIT_MAX):
-        with pytest.raises(ImageError, match=r"x\.tif: .*more than 8 bits, got floats of at most .*--full-scale"):
+        with pytest.raises(ImageError, match=r"x\.tif: .*more than 8 bits, got floats of at most .*full_scale"):
             settled(kind, 0.0, brightest)
 
 
 @pytest.mark.parametrize("kind", ["uint8", "int8"])
 def test_8_bit_pixels_leave_it_open(kind: str) -> None:
-    with pytest.raises(ImageError, match=r"got 8-bit pixels; .*--full-scale \(255 for"):
+    with pytest.raises(ImageError, match=r"got 8-bit pixels; .*`full_scale` \(255 for"):
         settled(kind, 200)
 
 
@@ -46,7 +46,7 @@ def test_what_was_asked_for_settles_it(kind: str, asked: float) -> None:
 @pytest.mark.parametrize("asked", [0, -1, float("nan"), float("inf")])
 @pytest.mark.parametrize("kind", ["uint16", "float32"])
 def test_no_image_has_such_a_full_scale(kind: str, asked: float) -> None:
-    with pytest.raises(OptionError, match="--full-scale"):
+    with pytest.raises(OptionError, match="full_scale"):
         settled(kind, 1000, asked=asked)
 
 

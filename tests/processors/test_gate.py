@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 from onnx import numpy_helper
 
-from beers_deploy.networks import shipped_pair
+from beers_deploy.network import shipped_pair
 from beers_deploy.quant.onnx_file import load_onnx, save_onnx
 from tests.deploy.command_line import done
 
@@ -17,7 +17,7 @@ def gate(scenes: Path, *pair: object, code: int = 0) -> str:
 
 @pytest.mark.parametrize("name", ["convbeers-xs", "convbeers-s"])
 def test_a_shipped_pair_passes(name: str, scenes: Path) -> None:
-    assert "gate passed" in gate(scenes, "--variant", name)
+    assert "gate passed" in gate(scenes, name)
 
 
 def test_a_broken_one_fails(scenes: Path, tmp_path: Path) -> None:

@@ -8,7 +8,7 @@ import tifffile
 
 from beers_deploy.library import restore
 from beers_deploy.model.shipped import SENSOR
-from beers_deploy.networks import shipped_pair
+from beers_deploy.network import shipped_pair
 from beers_deploy.quant.encodings import read_core
 from beers_deploy.quant.integer import merged_correction, run_core
 from beers_deploy.quant.onnx_file import load_onnx
@@ -40,7 +40,7 @@ def test_an_array_becomes_what_the_integer_reference_says(name: str) -> None:
     expected = by_reference(dn, name)
     assert (expected != dn).mean() > 0.5
     for tile_px, threads in ((640, 1), (48, 2)):
-        np.testing.assert_array_equal(restore(dn, model, tile_px=tile_px, threads=threads), expected)
+        np.testing.assert_array_equal(restore(dn, model, tile=tile_px, threads=threads), expected)
 
 
 def test_the_command_writes_the_same_pixels(tmp_path: Path) -> None:

@@ -93,7 +93,7 @@ def test_the_pages_commands_are_understood_and_use_what_was_written_before() -> 
     for name, *words in lines:
         context = group.commands[name].make_context(name, [*words])
         paths = {word for part in words for word in part.split(",") if re.search(r"\.(png|tif|toml|onnx)$", word)}
-        outputs = {str(context.params.get(key)) for key in ("out", "output", "board")} & {*words}
+        outputs = {str(context.params.get(key)) for key in ("out", "output", "board_file")} & {*words}
         assert paths - outputs <= known, (name, paths - outputs - known)
         known |= outputs
     assert [name for name, *_ in lines].count("restore") == 2

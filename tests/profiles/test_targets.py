@@ -112,7 +112,7 @@ def test_without_cost_constants_what_predicts_refuses_and_the_rest_works(tmp_pat
     text = (HERE / "targets" / "vck190.toml").read_text(encoding="utf-8")
     path = written(tmp_path, re.sub(r"\n\[cost].*?\n\n", "\n", text, flags=re.DOTALL))
     done("check", "--tile", "64", "--target", path)
-    assert "no cost constants yet" in refused("stress", "--bit-flips", "--target", path, "--size", "32")
+    assert "no cost constants yet" in refused("stress", "--bit-flips", "--target", path, "--side", "32")
 
 
 def test_a_target_without_a_dpu_is_told_the_boards() -> None:

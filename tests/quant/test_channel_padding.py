@@ -7,7 +7,7 @@ import onnx
 import onnxruntime as ort
 import pytest
 
-from beers_deploy.networks import shipped_pair
+from beers_deploy.network import shipped_pair
 from beers_deploy.quant.kernels import FEWEST_OUTPUTS, filled
 from beers_deploy.quant.onnx_file import load_onnx
 

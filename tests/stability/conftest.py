@@ -66,7 +66,7 @@ def saved(float_onnx: onnx.ModelProto, quantised: Quantised, folder: Path) -> li
 
 @pytest.fixture(scope="session")
 def subject(pair: list[Path]) -> Subject:
-    return open_subject(pair[0], pair[1], "")
+    return open_subject(pair[0], pair[1])
 
 
 @pytest.fixture(scope="session")
@@ -74,4 +74,4 @@ def coarse(tmp_path_factory: pytest.TempPathFactory) -> Subject:
     """A network at half resolution, in both precisions."""
     model = to_onnx(small_network(Variant(blocks=1, features=8, scale=2)), {"variant": "test"})
     paths = saved(model, quickly_quantised(model), tmp_path_factory.mktemp("coarse"))
-    return open_subject(paths[0], paths[1], "")
+    return open_subject(paths[0], paths[1])

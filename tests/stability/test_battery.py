@@ -47,7 +47,7 @@ def test_a_network_at_half_resolution_passes(name: str, coarse: Subject) -> None
 @pytest.mark.parametrize("variant", ["convbeers-half", "convbeers-half-xs"])
 def test_the_shipped_networks_at_half_resolution_are_calm(variant: str) -> None:
     """A checkerboard is four even planes to them: one that nothing holds answered it with black."""
-    subject = open_subject(None, None, variant)
+    subject = open_subject(Path(variant), None)
     checks = [BY_NAME[name] for name in ("checkerboard", "Siemens star", "SNR 3")]
     results = run_battery(subject, checks, ["float32", "INT8"], side_px=96)
     assert not [(o.stage, o.verdict, o.reason) for o in results if o.failed]
@@ -66,7 +66,7 @@ def test_the_shipped_network_passes(name: str, shipped: Subject) -> None:
 
 @pytest.fixture(scope="module")
 def shipped() -> Subject:
-    return open_subject(None, None, "convbeers-xs")
+    return open_subject(Path("convbeers-xs"), None)
 
 
 def one_nan(weight: np.ndarray) -> np.ndarray:
@@ -93,20 +93,20 @@ def test_a_broken_float_network_fails(
     tmp_path: Path,
 ) -> None:
     save_onnx(changed(float_onnx, name, change), tmp_path / "broken.onnx")
-    (result,) = look(open_subject(tmp_path / "broken.onnx", None, ""), [case], ("float32",))
+    (result,) = look(open_subject(tmp_path / "broken.onnx", None), [case], ("float32",))
     assert any(measure.check.startswith(check) for measure in result.failed), result.verdict
 
 
 def test_a_network_with_a_nan_among_its_weights_is_not_opened(float_onnx: onnx.ModelProto, tmp_path: Path) -> None:
     save_onnx(changed(float_onnx, "body.0.second.weight", one_nan), tmp_path / "broken.onnx")
     with pytest.raises(ModelError, match=r"1 NaN or infinite in body\.0\.second\.weight"):
-        open_subject(tmp_path / "broken.onnx", None, "")
+        open_subject(tmp_path / "broken.onnx", None)
 
 
 def test_a_broken_int8_network_fails(pair: list[Path], tmp_path: Path) -> None:
     broken = changed(onnx.load(pair[1]), "tail.bias", lambda bias: bias + 10_000_000)
     save_onnx(broken, tmp_path / "broken.onnx")
-    results = look(open_subject(pair[0], tmp_path / "broken.onnx", ""), ["deciles"], ("INT8",))
+    results = look(open_subject(pair[0], tmp_path / "broken.onnx"), ["deciles"], ("INT8",))
     assert {"mean moved"} <= {measure.check for measure in results[0].failed}
 
 
@@ -158,7 +158,7 @@ def test_cases_are_drawn_from_their_seed_and_say_what_is_wrong_with_them(case: C
 
 
 def test_the_command_writes_its_figures_and_fails_by_exit_code(pair: list[Path], tmp_path: Path) -> None:
-    few = ["--cases", "night,NaN pixels", "--stages", "float32,INT8,tiling", "--size", "24"]
+    few = ["--cases", "night,NaN pixels", "--stages", "float32,INT8,tiling", "--side", "24"]
     files = ["--json", str(tmp_path / "s.json"), "--out", str(tmp_path / "s.md")]
     done("stress", pair[0], pair[1], *few, *files)
     document = valid(tmp_path / "s.json")
@@ -178,7 +178,7 @@ def test_the_command_writes_its_figures_and_fails_by_exit_code(pair: list[Path],
     [
         (["--cases", "fog"], "some of black"),
         (["--stages", "fog"], "some of float32"),
-        (["--variant", "fog"], "shipped weights"),
+        (["fog"], "shipped weights"),
         (["nowhere.onnx"], "no such file"),
         (["FLOAT", "FLOAT"], "an INT8 network"),
         (["INT8"], "a float network"),

@@ -10,7 +10,7 @@ import pytest
 
 from beers_deploy.bench.tables import predict_file
 from beers_deploy.dpu.board import load_dpu
-from beers_deploy.networks import shipped_pair
+from beers_deploy.network import shipped_pair
 from beers_deploy.profiles.figures import Row
 from beers_deploy.quant.core import IntConv
 from beers_deploy.quant.graph import Activation
@@ -48,7 +48,7 @@ REQUEST = FlipRequest("pleiades-degraded", None, "vck190", draws=2, size_px=48, 
 @pytest.fixture(scope="module")
 def target() -> FaultTarget:
     """A trained network: what a new one makes is hardly worse with bits flipped."""
-    return make_target(open_subject(None, None, "convbeers-xs"), REQUEST)
+    return make_target(open_subject(Path("convbeers-xs"), None), REQUEST)
 
 
 @pytest.fixture(scope="module")
@@ -109,7 +109,7 @@ def test_at_half_resolution_maps_have_a_bit_for_each_channel_of_each_place(coars
 
 @pytest.mark.parametrize("variant", ["convbeers-xs", "convbeers-s", "convbeers"])
 def test_all_guards_cost_under_two_per_cent_on_the_board(variant: str) -> None:
-    core = as_stored(open_subject(None, None, variant).core)
+    core = as_stored(open_subject(Path(variant), None).core)
     relus = {op.output: 96 for op in core.ops if isinstance(op, IntConv) and op.activation is Activation.relu}
     dpu, target = load_dpu("vck190", None), FaultTarget(core, Guards(relus, 1024.0, checksums(core)), ())
     found = price_rows(target, predict_file(shipped_pair(variant)[1], dpu, TILE_PX), dpu)
@@ -159,7 +159,7 @@ def test_the_page_is_fresh() -> None:
     assert page.startswith(maker.OPENING + maker.FINDINGS)
     dpu = load_dpu("vck190", None)
     for variant in maker.VARIANTS:
-        target = make_target(open_subject(None, None, variant), maker.REQUEST)
+        target = make_target(open_subject(Path(variant), None), maker.REQUEST)
         rows = price_rows(target, predict_file(shipped_pair(variant)[1], dpu, TILE_PX), dpu)
         assert all(line in page for line in maker.price_lines({variant: rows}))
     for name, memory in MEMORIES.items():

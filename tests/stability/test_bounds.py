@@ -58,10 +58,10 @@ def test_a_core_is_read_back_from_its_file(quantised: Quantised) -> None:
 
 def test_another_spelling_has_no_core(quantised: Quantised, float_onnx: onnx.ModelProto) -> None:
     for model in (float_onnx, quantised.board):
-        with pytest.raises(ModelError, match="power-of-two"):
+        with pytest.raises(ModelError, match="a file that describes its integers"):
             read_core(model)
 
 
 def test_a_pair_in_the_wrong_order_is_refused(pair: list[object]) -> None:
     with pytest.raises(ModelError, match="float model first"):
-        open_subject(pair[1], pair[0], "")  # type: ignore[arg-type]
+        open_subject(pair[1], pair[0])  # type: ignore[arg-type]

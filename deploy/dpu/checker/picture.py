@@ -38,7 +38,7 @@ def require_picture(path: Path | None) -> None:
     """
     if path is not None and path.suffix not in (".svg", ".html"):
         remedy = "name it so; every browser opens both"
-        raise OptionError("--picture", expected="a file ending in .svg or .html", got=path.name, remedy=remedy)
+        raise OptionError("picture", expected="a file ending in .svg or .html", got=path.name, remedy=remedy)
 
 
 def write_picture(placement: Placement, title: str, path: Path) -> None:

@@ -1,12 +1,19 @@
-"""The checker's findings as rows of results and as a few lines."""
+"""`check`: where each node of a network goes, as rows of results and as a few lines."""
 
 import math
 from collections.abc import Callable
+from dataclasses import dataclass
 
-from beers_deploy.dpu.board import Dpu
-from beers_deploy.dpu.checker.placement import Cut, PlacedNode, Placement
+from beers_deploy.dpu.board import BoardLike, Dpu, dpu_of
+from beers_deploy.dpu.checker.placement import Cut, PlacedNode, Placement, place
+from beers_deploy.dpu.reading import network_of, own_tile_px
+from beers_deploy.model.shipped import SENSOR
+from beers_deploy.network import Network, NetworkLike
 from beers_deploy.profiles.figures import Figure, Row, predicted, unavailable
+from beers_deploy.profiles.target import DEFAULT_TARGET, TargetProfile
 from beers_deploy.quant.checks import Check
+from beers_deploy.quant.graph import refusal
+from beers_deploy.results import Table
 
 Remark = Callable[[Placement, Dpu, int], str | None]
 """Looks at a placed network, the DPU and the tile's side; None where there is nothing to say."""
@@ -64,6 +71,73 @@ def remarks_on(placement: Placement, dpu: Dpu, tile_px: int) -> dict[str, str]:
 
 
 SOURCE = "operator rules of the target profile"
+TILE_PX = 640
+
+
+@dataclass(frozen=True, repr=False, kw_only=True)
+class Checked(Table):
+    """Every node of a network on the host, the DPU or the CPU. It is true where the core runs whole on the DPU.
+
+    Attributes:
+        placement: the nodes, in order.
+        dpu: the board's configuration that was asked.
+        tile_px: side of the tile.
+        network: that was looked at.
+    """
+
+    placement: Placement
+    dpu: Dpu
+    tile_px: int
+    network: Network
+
+    @property
+    def failed(self) -> tuple[PlacedNode, ...]:
+        """The nodes that should run on the DPU and cannot, with the rules that they break."""
+        return self.placement.failed
+
+    @property
+    def title(self) -> str:
+        """What was asked."""
+        return f"{self.network.input.name} on {self.dpu.target.name} {self.dpu.name}, tile {self.tile_px}"
+
+    @property
+    def lines(self) -> list[str]:
+        """What a person wants to know, in a few lines."""
+        refused = refusal(self.network.model) if self.placement.note else ""
+        return summary(self.placement, self.dpu, self.tile_px, refused)
+
+
+def check(
+    network: NetworkLike, board: BoardLike = DEFAULT_TARGET, *, dpu: str | None = None, tile: int | None = None
+) -> Checked:
+    """Place every node of a network on the host, the DPU or the CPU, and say which rules are broken.
+
+    Args:
+        network: float, INT8 or a board's core, anyone's.
+        board: with a DPU.
+        dpu: configuration of the DPU that the board's file lists; its own default if None.
+        tile: side of a tile in pixels; the network's own where it has one, else 640.
+
+    Raises:
+        ModelError: no ONNX network of images.
+        ProfileError: no such board or configuration.
+        OptionError: a board without a DPU.
+    """
+    read, asked = Network.load(network, sensor=SENSOR, to_run=False), dpu_of(TargetProfile.load(board), dpu)
+    tile_px = tile or own_tile_px(read.model) or TILE_PX
+    placement = place(network_of(read.model, tile_px, read.label), asked)
+    arguments = {"target": asked.target.name, "dpu": asked.name, "tile": tile_px}
+    return Checked(
+        "check",
+        arguments,
+        (read.input,),
+        tuple(network_rows(placement, asked, tile_px)),
+        (legality(placement),),
+        placement=placement,
+        dpu=asked,
+        tile_px=tile_px,
+        network=read,
+    )
 
 
 def network_rows(placement: Placement, dpu: Dpu, tile_px: int) -> list[Row]:

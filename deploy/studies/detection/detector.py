@@ -29,7 +29,7 @@ LITERAL = 1 << 16
 ROUNDING = 1e-3
 """By how much a score may pass 0 or 1."""
 REMEDY = "export it by Ultralytics for detection, with format='onnx'"
-OPTION = "--classes"
+OPTION = "classes"
 
 Layout = Literal["raw", "final"]
 
@@ -99,7 +99,7 @@ def open_detector(path: Path, threads: int = 0, size_px: int | None = None) -> D
         ModelError: a file that is not to be trusted, or of another layout.
         OptionError: another size than the file is fixed to, or more threads than cores.
     """
-    require_cores("--threads", threads)
+    require_cores("threads", threads)
     model = load_onnx(path)
     about = {key: _literal(value) for key, value in metadata(model).items()}
     names = class_names(about.get("names"))
@@ -156,15 +156,15 @@ def _sizes(value: onnx.ValueInfoProto) -> list[int]:
 
 def _size_px(fixed: int | None, about: dict[str, Any], asked: int | None, path: Path) -> int:
     if fixed and asked not in (None, fixed):
-        expected, remedy = f"{fixed}, which {path.name} is fixed to", f"export it for {asked} px, or leave --size out"
-        raise OptionError("--size", expected=expected, got=f"{asked}", remedy=remedy)
+        expected, remedy = f"{fixed}, which {path.name} is fixed to", f"export it for {asked} px, or leave `side` out"
+        raise OptionError("side", expected=expected, got=f"{asked}", remedy=remedy)
     stated = about.get("imgsz")
     if isinstance(stated, list) and len(stated) == 2 and stated[0] == stated[1]:
         stated = stated[0]
     size = fixed or asked or stated
     if not isinstance(size, int) or size < 1:
         expected = "the side of the detector's square input in px"
-        raise OptionError("--size", expected=expected, got=f"{size}", remedy="say it")
+        raise OptionError("side", expected=expected, got=f"{size}", remedy="say it")
     return size
 
 

@@ -21,7 +21,7 @@ import numpy as np
 
 from beers_deploy.model.io.files import IMAGE_SUFFIXES
 from beers_deploy.model.io.images import image_size_px, list_images
-from beers_deploy.profiles.errors import MachineError, OptionError
+from beers_deploy.profiles.errors import BeersError, MissingExtraError, OptionError
 from beers_deploy.profiles.toml import read_json, read_whole
 from beers_deploy.restoration.index_files import NoDoctype
 from beers_deploy.studies.detection.boxes import Boxes, areas
@@ -125,11 +125,11 @@ def _labels_near(top: Path, folder: Path) -> Path:
             return path
         found = sorted(path.glob("*.json"))
         if len(found) > 1:
-            raise _faulty(path, "one file of labels", f"{len(found)}", "name it: --labels")
+            raise _faulty(path, "one file of labels", f"{len(found)}", "name it as `labels`")
         if found:
             return found[0]
     list_images(folder)  # which says so where there is no image either
-    raise _faulty(folder, LAYOUTS, "none beside the images", "give them as --labels")
+    raise _faulty(folder, LAYOUTS, "none beside the images", "give them as `labels`")
 
 
 def _holds(folder: Path, suffixes: Iterable[str], but: str = "") -> bool:
@@ -217,6 +217,8 @@ def _read_voc(image: Path, labels: Path) -> _File:
     try:
         # NoDoctype refuses a document type: with entities a file of a hundred bytes can grow to gigabytes.
         root = ET.fromstring(_read_bytes(labels), ET.XMLParser(target=NoDoctype()))  # noqa: S314
+    except BeersError:
+        raise
     except (ET.ParseError, ValueError, LookupError, RecursionError) as error:  # lookup: of an encoding
         raise _faulty(labels, "plain XML", " ".join(str(error).split())[:100]) from error
     if root.tag != "annotation":
@@ -249,6 +251,8 @@ def _read_coco(labels: Path, folder: Path) -> tuple[list[_File], list[str]]:
             for entry in content["images"]
             if (path := _inside(folder, _text(entry["file_name"]))) is not None
         ]
+    except BeersError:
+        raise
     except (OSError, LookupError, TypeError, ValueError, OverflowError) as error:
         got = f"{type(error).__name__}: {' '.join(str(error).split())[:100]}"
         remedy = "give COCO's JSON file"
@@ -327,9 +331,13 @@ def _yaml_names(path: Path) -> tuple[str, ...]:
         import yaml  # type: ignore[import-untyped]  # its stubs are one more package, for one function
     except ImportError as error:
         remedy = "pip install 'beers-deploy[detect]', or write classes.txt"
-        raise MachineError(str(path), expected="PyYAML to read it", got="no such package", remedy=remedy) from error
+        raise MissingExtraError(
+            str(path), expected="PyYAML to read it", got="no such package", remedy=remedy
+        ) from error
     try:
         content: Any = yaml.safe_load(_read_bytes(path, NAMES_BYTES))
+    except BeersError:
+        raise
     except (yaml.YAMLError, RecursionError, ValueError) as error:
         raise _faulty(path, "YAML", " ".join(str(error).split())[:100]) from error
     if not isinstance(content, dict) or "names" not in content:

@@ -8,7 +8,7 @@ from PIL import Image, ImageDraw
 
 from beers_deploy.model.io.pictures import grid, picture_url
 from beers_deploy.profiles.figures import Row, by_table
-from beers_deploy.report.page import Picture, Report, Table, write_report
+from beers_deploy.report.page import Picture, Report, Section, write_report
 from beers_deploy.report.plots import SERIES, Curve, Panel, curves_svg, data_url
 from beers_deploy.studies.detection.average_precision import RECALLS, Hits, mean_known, precisions
 from beers_deploy.studies.detection.boxes import Boxes, iou
@@ -37,7 +37,7 @@ NOTES = (
 def write_page(compared: Sequence[Comparison], notes: Sequence[str], path: Path) -> None:
     """Write the page of a study, whole or not at all; the comparisons are of one set of scenes."""
     rows: list[Row] = [*(row for found in compared for row in detection_rows(found)), *paper_rows()]
-    tables = [Table(name, each, CAPTIONS.get(name.split(",")[0], "")) for name, each in by_table(rows).items()]
+    tables = [Section(name, each, CAPTIONS.get(name.split(",")[0], "")) for name, each in by_table(rows).items()]
     truths = [each.scene.truth for each in compared[0].scenes]
     objects = sum(int((~truth.ignored).sum()) for truth in truths)
     title = f"What restoration buys a detector: {objects} objects on {len(truths)} images"

@@ -7,6 +7,7 @@ networks.
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Final
 
 import onnx
 import torch
@@ -17,7 +18,7 @@ from beers_deploy.model.shipped import INT8, shipped_names
 from beers_deploy.model.traditional.peers import PEERS
 from beers_deploy.model.traditional.pipeline import Chain, Order, restore_traditional
 from beers_deploy.model.traditional.settings import QUALITIES
-from beers_deploy.networks import conditioned, network_file, warn_outside
+from beers_deploy.network import conditioned, network_file, warn_outside
 from beers_deploy.profiles.constant import Constant
 from beers_deploy.profiles.errors import OptionError
 from beers_deploy.profiles.sensor import Instrument, Sensor
@@ -29,7 +30,9 @@ from beers_deploy.restoration.function import Restore, network_method
 Specialise = Callable[[Instrument], Restore]
 """A sensor to the restoration of images that it acquired."""
 
-DEGRADED, TRADITIONAL, DECONVOLVE_FIRST = "degraded", "traditional", "deconvolve-first"
+DEGRADED: Final = "degraded"
+TRADITIONAL: Final = "traditional"
+DECONVOLVE_FIRST: Final = "deconvolve-first"
 
 ORDERS: dict[str, Order] = {TRADITIONAL: "denoise-first", DECONVOLVE_FIRST: "deconvolve-first"}
 STANDARD = "standard"
@@ -114,7 +117,7 @@ def method_named(name: str, degraded: Sensor, reference: Sensor, log: Log = no_l
     network, _, other = name.partition("@")
     shipped = network.removesuffix(INT8) in shipped_names()
     if not shipped and Path(network).suffix not in (".onnx", ".safetensors"):
-        raise OptionError("--methods", expected=EXPECTED, got=repr(name), remedy="correct that name")
+        raise OptionError("methods", expected=EXPECTED, got=repr(name), remedy="correct that name")
     sensor = load_sensor(other) if other else degraded
     model = float_model(network_file(Path(network), sensor, log))
     known = knowledge_of(model, degraded.name)

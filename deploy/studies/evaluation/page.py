@@ -9,7 +9,7 @@ from PIL import Image
 from beers_deploy.model.io.files import whole_file
 from beers_deploy.model.io.pictures import busiest_windows, error_row, grid, picture_url, stretch_of, strip_row
 from beers_deploy.profiles.figures import Row, by_table
-from beers_deploy.report.page import Picture, Report, Table, write_report
+from beers_deploy.report.page import Picture, Report, Section, write_report
 from beers_deploy.studies.evaluation.methods import Method
 from beers_deploy.studies.evaluation.pairs import NamedPair
 from beers_deploy.studies.evaluation.run import Evaluation
@@ -65,10 +65,10 @@ def write_page(found: Evaluation, out: Path) -> Path:
 
 def evaluation_report(found: Evaluation, strips: Sequence[Picture]) -> Report:
     """The page: pictures, means, sites, and the sweep where there was one."""
-    tables = [Table("Means over all pairs", found.mean, MEAN_CAPTION)]
-    tables += [Table(name, rows, SITES_CAPTION) for name, rows in by_table(found.sites).items()]
+    tables = [Section("Means over all pairs", found.mean, MEAN_CAPTION)]
+    tables += [Section(name, rows, SITES_CAPTION) for name, rows in by_table(found.sites).items()]
     swept = by_table(found.swept).items()
-    tables += [Table(f"{name[0].upper()}{name[1:]}", rows, SWEEP_CAPTION) for name, rows in swept]
+    tables += [Section(f"{name[0].upper()}{name[1:]}", rows, SWEEP_CAPTION) for name, rows in swept]
     return Report(found.title, headline(found.mean), tables, strips, (*NOTES, *found.said))
 
 

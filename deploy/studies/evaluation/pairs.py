@@ -1,7 +1,7 @@
 """Pairs of a degraded and a reference image: simulated from scenes, or read from a folder that `simulate` wrote."""
 
 from collections import Counter
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,8 +12,7 @@ from beers_deploy.model.recipe import PairsRecipe
 from beers_deploy.model.simulator.acquire import (
     LEAST_SIDE_PX,
     MARGIN_PX,
-    NOISE,
-    acquire,
+    acquire_three,
     fitting_oversampling,
     prepare_scene,
 )
@@ -114,13 +113,8 @@ def simulate_pairs(
 
 def _simulated(scene: Scene, degraded: Instrument, reference: Instrument, ratio: int, draw: Draw) -> NamedPair:
     """Three acquisitions of one scene: the pair, and the reference once more without its noise."""
-    prepared = prepare_scene(scene.radiance, ratio)
-
-    def by(sensor: Instrument, role: str, skip: Collection[str] = ()) -> np.ndarray:
-        width = prepared.radiance.shape[-1]
-        return acquire(prepared.spectrum, width, sensor, ratio, draw, role, skip=skip).numpy()
-
-    seen, meant, clean = by(degraded, "degraded"), by(reference, "reference"), by(reference, "reference", NOISE)
+    made = acquire_three(prepare_scene(scene.radiance, ratio), degraded, reference, draw)
+    seen, meant, clean = (image.numpy() for image in made)
     return NamedPair(scene.name, seen, meant, oversampling=ratio, noise_free=clean)
 
 

@@ -103,6 +103,6 @@ def mtf_figure(found: Sequence[float | Refusal]) -> Figure:
 def flat_figure(flat: np.ndarray) -> Figure:
     """Mean over standard deviation of a flat field (h, w), about its mean: the linear SNR there."""
     mean, deviation = float(flat.mean(dtype=np.float64)), float(flat.std(dtype=np.float64, ddof=1))
-    if deviation < 1e-6 * mean:
+    if deviation <= 1e-6 * mean:
         return unavailable("ratio", "nothing is left of the noise in a flat field")
     return measured(mean / deviation, "ratio", f"one flat field of {flat.shape[1]} x {flat.shape[0]}, L / sigma")

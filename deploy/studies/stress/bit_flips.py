@@ -18,6 +18,7 @@ from beers_deploy.dpu.cost.latency import Prediction
 from beers_deploy.dpu.cost.model import Constants
 from beers_deploy.model.metrics.fidelity import psnr_db
 from beers_deploy.model.progress import steps
+from beers_deploy.profiles import load_sensor
 from beers_deploy.profiles.figures import Figure, Row, measured, predicted
 from beers_deploy.quant.calibration import HELD_OUT_SEED, Calibration
 from beers_deploy.quant.core import IntCore
@@ -98,7 +99,7 @@ def make_target(subject: Subject, request: FlipRequest) -> FaultTarget:
     """The core as the board stores it, guards that calibration patches teach, and other patches to try it on."""
     core = as_stored(subject.core)
     taught, tried = (
-        Calibration(request.sensor, request.images, count, request.size_px, seed).drawn
+        Calibration(load_sensor(request.sensor), request.images, count, request.size_px, seed).drawn
         for seed, count in ((request.seed, CALIBRATION_PATCHES), (request.seed + HELD_OUT_SEED, request.draws))
     )
     guards = learn_guards(core, (core.ends.split(image) for image in taught.degraded))

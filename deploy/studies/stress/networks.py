@@ -16,7 +16,7 @@ from torch.nn.functional import conv2d, pixel_shuffle, pixel_unshuffle
 from beers_deploy.export import float_model
 from beers_deploy.model.progress import Log, no_log
 from beers_deploy.model.shipped import SENSOR
-from beers_deploy.networks import float_file, int8_file, shipped_pair
+from beers_deploy.network import float_file, int8_file, pair_of
 from beers_deploy.profiles import load_sensor
 from beers_deploy.profiles.errors import BeersError, ModelError
 from beers_deploy.quant.bounds import saturable
@@ -124,16 +124,14 @@ class Subject:
         return self.int8
 
 
-def open_subject(
-    float_path: Path | None, int8_path: Path | None, variant: str, sensor: str = SENSOR, say: Log = no_log
-) -> Subject:
-    """The files given, or a shipped network in both precisions where neither is, told the sensor.
+def open_subject(float_path: Path | None, int8_path: Path | None, sensor: str = SENSOR, say: Log = no_log) -> Subject:
+    """The files given, or a shipped network in both precisions by its name, told the sensor.
 
     Raises:
         ModelError: no such file or variant, the two swapped, or a network that cannot be tiled.
     """
-    if float_path is None:
-        float_path, int8_path = shipped_pair(variant, sensor, say)
+    if int8_path is None and (float_path is None or not (float_path.suffix or float_path.exists())):
+        float_path, int8_path = pair_of(float_path, None)
     known = load_sensor(sensor)
     float_path = float_file(float_path, known, say)
     int8_path = int8_file(int8_path, known, say) if int8_path else None
@@ -141,7 +139,7 @@ def open_subject(
     int8 = None if int8_path is None else Network(load_onnx(int8_path))
     for path, network, wanted in ((float_path, float32, False), (int8_path, int8, True)):
         if path is not None and network is not None:
-            require_quantised(network.model, path, wanted)
+            require_quantised(network.model, str(path), wanted)
             _ = network.tiling  # refuses what cannot be tiled before anything runs
     paths = (float_path,) if int8_path is None else (float_path, int8_path)
     return Subject(float32, int8, paths)

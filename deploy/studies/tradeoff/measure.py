@@ -220,7 +220,7 @@ PATCHES, PATCH_PX = 32, 96
 """Calibration of a network that comes without INT8: fewer and smaller patches than `quantize` takes."""
 
 
-def make_int8(file: Path, folder: Path, scenes: Path | None, sensor: str, seed: int) -> Path:
+def make_int8(file: Path, folder: Path, scenes: Path | None, sensor: Sensor, seed: int) -> Path:
     """Quantise a float network on simulated patches as `quantize` does, and keep the file.
 
     Args:
@@ -236,7 +236,7 @@ def make_int8(file: Path, folder: Path, scenes: Path | None, sensor: str, seed: 
     """
     model = float_model(file)
     said = metadata(model).get("sensor", "")
-    known = load_sensor(said if said in sensor_names() else sensor)
+    known = load_sensor(said) if said in sensor_names() else sensor
     seen = [sha256(path) for path in list_images(scenes)] if scenes else []
     key = key_of(network=network_sha256(file), scenes=seen, sensor=known, seed=seed, size=[PATCHES, PATCH_PX])
     path = folder / f"{file.stem}-int8-{key[:16]}.onnx"

@@ -10,7 +10,7 @@ from markupsafe import Markup
 from beers_deploy.model.io.files import write_text
 from beers_deploy.model.traditional.peers import PEERS
 from beers_deploy.profiles.figures import Row
-from beers_deploy.report.page import Picture, Report, Table, write_report
+from beers_deploy.report.page import Picture, Report, Section, write_report
 from beers_deploy.report.plots import LIGHT, SERIES, data_url, look, new_figure, set_ticks, svg_of
 from beers_deploy.studies.tradeoff.pareto import PSNR, Measured, ends, placed
 from beers_deploy.studies.tradeoff.run import Study
@@ -60,8 +60,8 @@ def report_of(study: Study, svg: str) -> Report:
     """The page in reading order."""
     picture = Picture(f"{PSNR} against {study.cost}", data_url(svg), PLOT_CAPTION)
     tables = [
-        Table("The front, from cheap to dear", study.front_rows, FRONT_CAPTION),
-        Table(f"All {len(study.points)} points", [_shown(point) for point in study.points], POINTS_CAPTION),
+        Section("The front, from cheap to dear", study.front_rows, FRONT_CAPTION),
+        Section(f"All {len(study.points)} points", [_shown(point) for point in study.points], POINTS_CAPTION),
     ]
     line = study.recommendation.line
     return Report(
@@ -78,24 +78,30 @@ def plot_svg(study: Study) -> Markup:
     """Every point of the first board that has a cost and a PSNR; those of the front large, with their numbers."""
     from matplotlib import rc_context
 
-    front = list(study.front)
-    boards = (study.board, "this machine")
-    points = [point for point in placed(study.points, study.cost) if point.text["board"] in boards]
     with look(), rc_context({"font.size": TEXT_PX}):
         figure = new_figure(*SIZE_PX)
-        axes = figure.add_subplot(xscale="log", xlabel=_label(study, study.cost), ylabel=_label(study, PSNR))
-        for name, colour, marker, members in series(points):
-            _scatter(axes, study.cost, members, front, name=name, colour=colour, marker=marker)
-        _draw_front(axes, study, front)
-        axes.margins(0.1)
-        if points:
-            set_ticks(axes.xaxis, 6)
-            set_ticks(axes.yaxis, 8)
+        axes = figure.add_subplot()
+        draw_study(axes, study)
+        names = axes.get_legend_handles_labels()[1]
+        if names:
             figure.legend(loc="lower center", ncols=2)
-        rows = -(-len(axes.get_legend_handles_labels()[1]) // 2)
-        figure.subplots_adjust(left=0.13, right=0.97, top=0.97, bottom=0.13 + 0.045 * rows)
+        figure.subplots_adjust(left=0.13, right=0.97, top=0.97, bottom=0.13 + 0.045 * -(-len(names) // 2))
         _draw_numbers(axes, study)
         return svg_of(figure, f"{PSNR} against {study.cost}; numbers as in the table of the front")
+
+
+def draw_study(axes: "Axes", study: Study) -> None:
+    """Draw the points of the first board and their front on axes; their numbers are left to whoever sizes these."""
+    boards = (study.board, "this machine")
+    points = [point for point in placed(study.points, study.cost) if point.text["board"] in boards]
+    axes.set(xscale="log", xlabel=_label(study, study.cost), ylabel=_label(study, PSNR))
+    for name, colour, marker, members in series(points):
+        _scatter(axes, study.cost, members, list(study.front), name=name, colour=colour, marker=marker)
+    _draw_front(axes, study, study.front)
+    axes.margins(0.1)
+    if points:
+        set_ticks(axes.xaxis, 6)
+        set_ticks(axes.yaxis, 8)
 
 
 def series(points: Sequence[Measured]) -> Iterator[tuple[str, str, str, list[Measured]]]:

@@ -12,6 +12,8 @@ from itertools import pairwise
 import numpy as np
 
 from beers_deploy.model.metrics.bootstrap import site_interval
+from beers_deploy.network import Network
+from beers_deploy.profiles.errors import OptionError
 from beers_deploy.profiles.figures import Figure, Row, measured, predicted
 from beers_deploy.studies.tradeoff.measure import Scores
 from beers_deploy.studies.tradeoff.points import Point
@@ -60,6 +62,18 @@ class Measured:
         """The value of PSNR; less than any where there is none to compare."""
         value = self.value(PSNR)
         return -math.inf if value is None else value
+
+    @property
+    def network(self) -> Network:
+        """The network that restores here.
+
+        Raises:
+            OptionError: a point without one: a traditional pipeline, another library's method or a published run.
+        """
+        if self.point is None or self.point.variant.file is None:
+            remedy = "take a point of a network"
+            raise OptionError("point", expected="one with a network", got=self.name, remedy=remedy)
+        return Network.load(self.point.variant.file)
 
     @property
     def row(self) -> Row:

@@ -21,7 +21,7 @@ from beers_deploy.dpu.graph import Network
 from beers_deploy.dpu.reading import network_of
 from beers_deploy.export import float_model
 from beers_deploy.model.shipped import shipped_names
-from beers_deploy.networks import float_file, int8_file
+from beers_deploy.network import float_file, int8_file
 from beers_deploy.profiles import TargetProfile
 from beers_deploy.profiles.errors import ModelError, OptionError
 from beers_deploy.profiles.sensor import Sensor
@@ -107,7 +107,7 @@ def parse_targets(text: str) -> tuple[str, ...]:
     names = tuple(name.strip() for name in text.split(","))
     if not all(names) or len(set(names)) < len(names):
         remedy = "write vck190, or vck190,zcu102, or all"
-        raise OptionError("--target", expected="boards, each once", got=repr(text), remedy=remedy)
+        raise OptionError("target", expected="boards, each once", got=repr(text), remedy=remedy)
     return names
 
 
@@ -131,7 +131,7 @@ def network_variants(
     shown = [variant.name for variant in found]
     if len(set(shown)) < len(shown):
         twice = max(shown, key=shown.count)
-        raise OptionError("--network", expected="names that differ", got=f"two {twice!r}", remedy="rename one file")
+        raise OptionError("network", expected="names that differ", got=f"two {twice!r}", remedy="rename one file")
     return found
 
 
@@ -141,7 +141,7 @@ def _variants(
     path = Path(name)
     if name not in shipped_names() and path.suffix not in (".onnx", ".safetensors"):
         expected = f"a shipped network ({', '.join(shipped_names())}), or an ONNX or safetensors file"
-        raise OptionError("--networks", expected=expected, got=repr(name), remedy="correct that name")
+        raise OptionError("network", expected=expected, got=repr(name), remedy="correct that name")
     given = float_file(path, sensor, log)
     model, method = float_model(given), name if name in shipped_names() else path.stem
     _require_tiles(name, tiling_of(model))
@@ -163,8 +163,8 @@ def _require_tiles(name: str, tiling: Tiling) -> None:
     if tiling.fixed_px is not None or not plain or HALO_STEP_PX % tiling.lattice_px:
         fixed = ", fixed to one tile size" if tiling.fixed_px is not None else ""
         expected = f"a network of one band in tiles of any multiple of {HALO_STEP_PX} px"
-        remedy = "export it without --tile, or bench it by itself"
-        raise OptionError("--network", expected=expected, got=f"{name}, {tiling.words}{fixed}", remedy=remedy)
+        remedy = "export it with free sizes, or bench it by itself"
+        raise OptionError("network", expected=expected, got=f"{name}, {tiling.words}{fixed}", remedy=remedy)
 
 
 def network_points(variant: Variant, boards: Sequence[TargetProfile], whole: Swath) -> list[Point]:

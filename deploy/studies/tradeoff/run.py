@@ -1,28 +1,44 @@
 """One study: variants, what is measured of each, points with their figures, a front and a recommendation."""
 
+import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING, cast
 
 from beers_deploy.bench.tables import PAPER_SIZE, PAPER_TARGET, Swath, parse_size, published_rows
+from beers_deploy.dpu.board import BoardLike, boards_of
 from beers_deploy.dpu.cost.model import Constants
 from beers_deploy.model.io.files import sha256
 from beers_deploy.model.io.images import list_images
 from beers_deploy.model.metrics.backbones import find_backbone
 from beers_deploy.model.metrics.bootstrap import too_few
-from beers_deploy.model.progress import steps
+from beers_deploy.model.progress import Progress, reporting, steps
+from beers_deploy.model.shipped import SENSOR
 from beers_deploy.model.traditional.peers import PEERS
 from beers_deploy.model.traditional.settings import QUALITIES
-from beers_deploy.profiles import TargetProfile, load_sensor, load_target
-from beers_deploy.profiles.errors import MachineError
+from beers_deploy.network import Network, NetworkLike, SensorLike
+from beers_deploy.profiles import TargetProfile
+from beers_deploy.profiles.errors import MachineError, optional
 from beers_deploy.profiles.figures import Figure, Row, unavailable
 from beers_deploy.profiles.sensor import Sensor
-from beers_deploy.profiles.sensor_file import reference_for
+from beers_deploy.profiles.sensor_file import REFERENCE
+from beers_deploy.profiles.target import DEFAULT_TARGET
+from beers_deploy.results import Input, Table, input_of
 from beers_deploy.studies.evaluation.methods import Method, method_named
 from beers_deploy.studies.evaluation.pairs import pairs_of_scenes
 from beers_deploy.studies.evaluation.scores import Instruments, perceptual_distances
-from beers_deploy.studies.tradeoff.advice import MAP50, Constraint, Recommendation, chosen_cost, recommend
+from beers_deploy.studies.tradeoff.advice import (
+    MAP50,
+    Constraint,
+    Recommendation,
+    chosen_cost,
+    parse_constraints,
+    recommend,
+)
 from beers_deploy.studies.tradeoff.boards import CHAIN, board_figures
 from beers_deploy.studies.tradeoff.labelled import Labelled
 from beers_deploy.studies.tradeoff.measure import Benchmark, Measurements, Scores, key_of, make_int8, measure_host
@@ -35,6 +51,9 @@ from beers_deploy.studies.tradeoff.points import (
     network_points,
     network_variants,
 )
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 LPIPS = "LPIPS-squeeze"
 
@@ -69,14 +88,117 @@ class Study:
         return (self.recommendation.row, *self.front_rows, *(point.row for point in self.points))
 
 
+@dataclass(frozen=True, repr=False, kw_only=True)
+class Tradeoff(Table):
+    """What accuracy costs in time: the recommended point, the Pareto front and every point with its figures.
+
+    Attributes:
+        study: the same with what was measured of each point.
+    """
+
+    study: Study
+
+    @property
+    def best(self) -> Measured | None:
+        """The recommended point; None where none keeps the budget and the need."""
+        return self.study.recommendation.point
+
+    def plot(self, figure: str | None = None, ax: "Axes | None" = None) -> "Axes":
+        """PSNR of every point of the first board against its cost, the front's numbered.
+
+        Args:
+            figure: given, bars of that figure instead, as of any table.
+            ax: axes of matplotlib to draw on; new ones if None.
+        """
+        if figure is not None:
+            return super().plot(figure, ax)
+        from beers_deploy.studies.tradeoff.page import draw_study  # which imports this module
+
+        axes = ax if ax is not None else optional("matplotlib.pyplot", "plot", "report").subplots()[1]
+        draw_study(axes, self.study)
+        return cast("Axes", axes)
+
+    def report(self, folder: str | os.PathLike[str]) -> Path:
+        """Write the page and its plot into a folder; returns the page's path."""
+        from beers_deploy.studies.tradeoff.page import FILES, write_study  # which imports this module
+
+        write_study(self.study, Path(folder))
+        return Path(folder) / FILES[0]
+
+    def __str__(self) -> str:
+        return self.study.recommendation.line
+
+
+def tradeoff(
+    networks: Sequence[NetworkLike],
+    *,
+    images: str | os.PathLike[str] | None = None,
+    sensor: SensorLike = SENSOR,
+    reference: SensorLike | None = None,
+    board: BoardLike | Sequence[BoardLike] = DEFAULT_TARGET,
+    size: tuple[int, int] | str = PAPER_SIZE,
+    budget: str | None = None,
+    need: str | None = None,
+    lpips: str | os.PathLike[str] | None = None,
+    calibration: str | os.PathLike[str] | None = None,
+    seed: int = 0,
+    cache: str | os.PathLike[str] | None = None,
+    progress: Progress = None,
+) -> Tradeoff:
+    """Measure networks and traditional pipelines on the same images, predict their runs, and recommend a point.
+
+    Args:
+        networks: shipped names, files, or networks in memory; float ones are quantised on the way.
+        images: folder of held-out scenes to simulate from; drawn ones if None.
+        sensor: of the degraded images.
+        reference: the sensor that is aimed at; the shipped one if None.
+        board: one or several; the front and the recommendation are about the first.
+        size: (width, height) of the swath in pixels, or as text.
+        budget: what can be afforded, such as "latency<=20s".
+        need: what must be reached, such as "psnr>=44".
+        lpips: weights of SqueezeNet 1.1, or a folder of backbones, for LPIPS.
+        calibration: folder of scenes to quantise networks on; drawn ones if None.
+        seed: of every random draw.
+        cache: folder of measurements that a later run goes on with; None keeps none.
+        progress: a function that is told each step, False for silence, None for a bar or lines on standard error.
+
+    Raises:
+        BeersError: a network, an image, a profile or weights that cannot be used.
+    """
+    several = boards_of(board)
+    names = [each if isinstance(each, str) else str(Network.load(each).file) for each in networks]
+    width_px, height_px = parse_size(size) if isinstance(size, str) else size
+    keep = nullcontext(cache) if cache is not None else TemporaryDirectory(prefix="beers-deploy-")
+    with keep as folder, reporting(progress):
+        study = run_study(
+            names,
+            Path(folder),
+            images=None if images is None else Path(images),
+            sensor=sensor,
+            reference=reference,
+            targets=several,
+            size_px=(width_px, height_px),
+            budget=parse_constraints("budget", budget),
+            need=parse_constraints("need", need),
+            lpips=None if lpips is None else Path(lpips),
+            calibration=None if calibration is None else Path(calibration),
+            seed=seed,
+        )
+        inputs = tuple(each if isinstance(each, Input) else input_of(each) for each in study.inputs)
+    arguments: dict[str, object] = {"images": images, "sensor": Sensor.load(sensor).name, "budget": budget}
+    arguments |= {"size": f"{width_px}x{height_px}", "need": need, "calibration": calibration, "seed": seed}
+    arguments |= {"target": ",".join(each.name for each in several), "networks": ",".join(names)}
+    return Tradeoff("tradeoff", arguments, inputs, study.rows, notes=tuple(study.notes), study=study)
+
+
 def run_study(
     networks: Sequence[str],
     out: Path,
     *,
     images: Path | None = None,
-    sensor: str,
-    reference: str,
-    targets: Sequence[str],
+    sensor: SensorLike,
+    reference: SensorLike | None,
+    targets: Sequence[BoardLike],
     size_px: tuple[int, int],
     budget: Sequence[Constraint] = (),
     need: Sequence[Constraint] = (),
@@ -111,14 +233,15 @@ def run_study(
     Raises:
         BeersError: a network, an image, a profile or weights that cannot be used.
     """
-    swath, boards = Swath(*size_px), [load_target(target) for target in targets]
+    swath, boards = Swath(*size_px), [TargetProfile.load(target) for target in targets]
     for board in boards:
         Constants.of(configurations(board)[0])  # a board without them is refused before anything is measured
-    degraded, kept = load_sensor(sensor), Measurements.open(out / "measurements.json")
-    quantise = partial(make_int8, folder=out / "int8", scenes=calibration, sensor=sensor, seed=seed)
+    degraded, kept = Sensor.load(sensor), Measurements.open(out / "measurements.json")
+    quantise = partial(make_int8, folder=out / "int8", scenes=calibration, sensor=degraded, seed=seed)
+    aim = Sensor.load(reference or REFERENCE).in_units_of(degraded)
     variants = network_variants(networks, degraded, quantise, log)
     points = [point for variant in variants for point in network_points(variant, boards, swath)]
-    benchmark, said = _benchmark(images, degraded, reference_for(degraded, reference), lpips, seed)
+    benchmark, said = _benchmark(images, degraded, aim, lpips, seed)
     scenes = Labelled.open(labelled, detector, classes, benchmark) if labelled else None
     measured = _measured([*points, *_others(boards)], benchmark, scenes, kept, swath, log)
     if boards[0].name == PAPER_TARGET and size_px == parse_size(PAPER_SIZE):

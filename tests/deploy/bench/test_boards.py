@@ -104,9 +104,9 @@ def test_a_swath_of_a_network_that_is_not_tiled_is_refused(classifier: Path) -> 
 
 
 def test_one_configuration_or_runs_beside_all_boards_are_refused(network: Path, tmp_path: Path) -> None:
-    with pytest.raises(OptionError, match="--config"):
+    with pytest.raises(OptionError, match="dpu: expected"):
         bench(network, "all", config="C32B3")
-    with pytest.raises(OptionError, match="--measured"):
+    with pytest.raises(OptionError, match="measured"):
         bench(network, "all", measured=tmp_path / "runs.json")
 
 

@@ -11,7 +11,7 @@ import pytest
 from beers_deploy.bench.host import Timed, host_rows, time_networks, timed_rows
 from beers_deploy.export import float_model
 from beers_deploy.host_state import cpu_load, resident_bytes
-from beers_deploy.networks import other_precision, shipped_pair
+from beers_deploy.network import other_precision, shipped_pair
 from beers_deploy.profiles import load_target
 from beers_deploy.profiles.constant import Constant
 from beers_deploy.profiles.errors import ModelError
@@ -80,7 +80,7 @@ def test_a_file_fixed_to_another_tile_is_refused_in_one_sentence(tmp_path: Path)
     for dimension in sketch.input.type.tensor_type.shape.dim[2:]:
         dimension.dim_value = 48
     path = sketch.save(tmp_path / "f.onnx", sketch.conv("image", (1, 1, 3, 3)))
-    with pytest.raises(ModelError, match="--tile 48"):
+    with pytest.raises(ModelError, match="`tile` 48"):
         host_rows(path, HOST, 32, 1)
 
 

@@ -18,7 +18,7 @@ from beers_deploy.dpu.cost.latency import dpu_power
 from beers_deploy.dpu.graph import Operation, Window
 from beers_deploy.dpu.reading import network_of, read_network
 from beers_deploy.model.shipped import shipped_names
-from beers_deploy.networks import shipped_pair
+from beers_deploy.network import shipped_pair
 from beers_deploy.profiles import load_target
 from beers_deploy.profiles.figures import predicted
 from beers_deploy.profiles.target import DEFAULT_TARGET, board_names

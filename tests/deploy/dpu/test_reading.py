@@ -100,7 +100,7 @@ def test_a_model_fixed_to_another_tile_says_which(tmp_path: Path) -> None:
         dimension.dim_value = 48
     path = sketch.save(tmp_path / "f.onnx", sketch.conv("image", (2, 2, 3, 3)))
     assert read_network(path, 48).operations[0].out_shape == (2, 48, 48)
-    with pytest.raises(ModelError, match="--tile 48"):
+    with pytest.raises(ModelError, match="`tile` 48"):
         read_network(path, 640)
 
 
@@ -147,7 +147,7 @@ def test_a_core_at_half_resolution_that_is_fixed_to_a_tile_is_fixed_to_half_of_i
     assert [d.dim_value for d in fixed.graph.input[0].type.tensor_type.shape.dim[2:]] == [32, 32]
     assert own_tile_px(fixed) == 64
     save_onnx(fixed, tmp_path / "fixed.onnx")
-    with pytest.raises(ModelError, match="one fixed to 64 x 64; pass --tile 64"):
+    with pytest.raises(ModelError, match="one fixed to 64 x 64; give `tile` 64"):
         read_network(tmp_path / "fixed.onnx", 66)
 
 

@@ -5,7 +5,7 @@ from html.parser import HTMLParser
 import pytest
 
 from beers_deploy.profiles.figures import Row, measured, unavailable
-from beers_deploy.report.page import WIDE, Report, Table, render
+from beers_deploy.report.page import WIDE, Report, Section, render
 
 
 class Cells(HTMLParser):
@@ -33,7 +33,7 @@ class Cells(HTMLParser):
 
 def lines(rows: list[Row]) -> list[list[str]]:
     reader = Cells()
-    reader.feed(render(Report("A page", "Its headline", [Table("A table", rows)], [], [])))
+    reader.feed(render(Report("A page", "Its headline", [Section("A table", rows)], [], [])))
     return [[cell.strip() for cell in line] for line in reader.lines]
 
 
@@ -62,7 +62,7 @@ def test_words_and_what_is_missing_are_told(figures: int) -> None:
     row = Row(
         "t", "one", {**rows_of(figures, 1)[0].figures, "power": unavailable("W", "no meter")}, {"note": "so & so"}
     )
-    text = render(Report("A page", "Its headline", [Table("A table", [row], "How to read it")], [], []))
+    text = render(Report("A page", "Its headline", [Section("A table", [row], "How to read it")], [], []))
     assert "so &amp; so" in text
     assert "no meter" in text
     assert "How to read it" in text

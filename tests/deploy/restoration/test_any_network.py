@@ -96,7 +96,7 @@ def test_tiled_is_whole_at_an_odd_size(tile_px: int, path: Path, tmp_path: Path)
     expected = whole(path, pixels)
     assert len(np.unique(expected)) > 50
     np.testing.assert_array_equal(by_file(pixels, tmp_path, options), expected)
-    np.testing.assert_array_equal(restore(pixels, path, tile_px=tile_px, threads=1), expected)
+    np.testing.assert_array_equal(restore(pixels, path, tile=tile_px, threads=1), expected)
 
 
 def test_one_lattice_less_of_halo_shows_seams(path: Path, tmp_path: Path) -> None:
@@ -132,7 +132,7 @@ def test_missing_pixels_stay_and_spoil_no_others(path: Path, tmp_path: Path) -> 
 def test_a_lazy_array_gives_the_same(path: Path) -> None:
     da = pytest.importorskip("dask.array")
     pixels = noise(path)
-    lazy = restore(da.from_array(pixels, chunks=40), path, tile_px=56)
+    lazy = restore(da.from_array(pixels, chunks=40), path, tile=56)
     expected = whole(path, pixels)
     assert lazy.shape == expected.shape
     np.testing.assert_array_equal(lazy.compute(scheduler="synchronous"), expected)
@@ -175,7 +175,7 @@ def test_what_cannot_be_restored_is_refused_in_one_sentence(name: str, tmp_path:
 
 def test_halos_and_tiles_off_the_lattice_are_refused_or_rounded() -> None:
     tiling = Tiling(8, 4)
-    with pytest.raises(OptionError, match=r"--halo: expected a multiple of 4 px.*got 7 px.*8 is exact"):
+    with pytest.raises(OptionError, match=r"halo: expected a multiple of 4 px.*got 7 px.*8 is exact"):
         make_plan((1, 100, 100), 40, 7, tiling)
     with pytest.raises(OptionError, match="20 px at least, got 19 px"):
         make_plan((1, 100, 100), 19, 8, tiling)

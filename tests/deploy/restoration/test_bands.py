@@ -17,7 +17,7 @@ FIRST, SECOND = "pleiades-degraded", "blind"
 
 def restored(image: Path, sensor: str, *more: str) -> tuple[np.ndarray, str]:
     out = image.with_name("out.tif")
-    words = ["restore", str(image), str(out), "--model", "convbeers-xs", "--sensor", sensor, *more]
+    words = ["restore", str(image), str(out), "--network", "convbeers-xs", "--sensor", sensor, *more]
     said = done(*words)
     return tifffile.imread(out), said
 
@@ -63,7 +63,7 @@ def test_a_cog_names_the_sensors_in_the_order_of_the_bands(tmp_path: Path) -> No
 )
 def test_what_does_not_fit_is_refused(sensor: str, words: str, tmp_path: Path) -> None:
     image = images.write_tiff(tmp_path / "in.tif", images.digital_numbers())
-    arguments = ["restore", str(image), str(tmp_path / "out.tif"), "--model", "convbeers-xs", "--sensor", sensor]
+    arguments = ["restore", str(image), str(tmp_path / "out.tif"), "--network", "convbeers-xs", "--sensor", sensor]
     assert words in refused(*arguments)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["in.tif"]
 

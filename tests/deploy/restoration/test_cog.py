@@ -13,7 +13,7 @@ from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
 from beers_deploy.model.io.files import sha256
-from beers_deploy.networks import shipped_pair
+from beers_deploy.network import shipped_pair
 from beers_deploy.profiles.errors import MachineError
 from beers_deploy.restoration.cog import disk_bytes
 from beers_deploy.restoration.options import Compression, Options
@@ -94,7 +94,7 @@ def test_a_run_stopped_while_it_is_written_goes_on(
     shutil: Any = import_module("rasterio.shutil")
     with monkeypatch.context() as patch:
         patch.setattr(shutil, "copy", full)
-        with pytest.raises(MachineError, match=r"no space left.*--resume from row 150 of 150"):
+        with pytest.raises(MachineError, match=r"no space left.*`resume` from row 150 of 150"):
             restore_file(image, tmp_path / "out.tif", options, lambda _: None)
     assert (tmp_path / "out.tif").read_bytes() == b"the old one"
     calls: list[str] = []
@@ -117,7 +117,7 @@ def test_it_is_valid_at_any_size(height: int, width: int, model: Path, tmp_path:
 def test_without_rasterio_it_is_one_sentence(model: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     image = images.write_tiff(tmp_path / "in.tif", images.digital_numbers())
     monkeypatch.setitem(sys.modules, "rasterio", None)
-    with pytest.raises(MachineError, match=r"--cog.*pip install 'beers-deploy\[gdal\]'"):
+    with pytest.raises(MachineError, match=r"cog.*pip install 'beers-deploy\[gdal\]'"):
         restore_file(image, tmp_path / "out.tif", Options(model, cog=True), lambda _: None)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["in.tif"]
 

@@ -175,7 +175,7 @@ def test_a_trusted_index_reaches_outside_and_to_urls_and_never_runs_code(tmp_pat
         index.write_text(vrt(naming(url)))
         with open_source(index, trusted=True) as source:
             assert source.read(0, 9).sum() == 81
-        with pytest.raises(ImageError, match="--trust-index"), open_source(index):
+        with pytest.raises(ImageError, match="trust_index"), open_source(index):
             pass
         server.shutdown()
     for body in ("<PixelFunctionLanguage>Python</PixelFunctionLanguage>", naming("no.tif")):

@@ -11,7 +11,7 @@ import psutil
 import pytest
 import tifffile
 
-from beers_deploy.networks import shipped_pair
+from beers_deploy.network import shipped_pair
 from beers_deploy.profiles.errors import MachineError
 from beers_deploy.profiles.sensor_file import BLIND
 from beers_deploy.restoration import output

@@ -10,7 +10,7 @@ import tifffile
 
 from beers_deploy import library
 from beers_deploy.library import restore
-from beers_deploy.networks import shipped_pair
+from beers_deploy.network import shipped_pair
 from beers_deploy.profiles import load_sensor
 from beers_deploy.quant.onnx_file import load_onnx
 from beers_deploy.restoration import function
@@ -75,7 +75,7 @@ def exact_ways(path: Path, tile_px: int) -> dict[str, Restored]:
     network = load_onnx(path)
     return {
         "evaluate and tradeoff": method_named(str(path), SENSOR, REFERENCE).restore,
-        "the library and the demo": lambda dn: np.rint(library.restore(dn, path, tile_px=tile_px, full_scale=4095)),
+        "the library and the demo": lambda dn: np.rint(library.restore(dn, path, tile=tile_px, full_scale=4095)),
         "stress": lambda dn: np.rint(Network(network).restore(dn, tile_px=tile_px)),
         "the array": partial(by_engine, options=Options(path, tile_px)),
     }
@@ -87,7 +87,7 @@ def test_with_exact_seams_every_command_gives_the_pixels_of_restore(
     pixels, tile_px = image(), TILES_PX[precision]
     expected = by_command(pixels, tmp_path, Options(path, tile_px))
     assert (expected != pixels).mean() > 0.5
-    np.testing.assert_array_equal(restore(pixels, path, tile_px=tile_px), expected)
+    np.testing.assert_array_equal(restore(pixels, path, tile=tile_px), expected)
     for name, way in exact_ways(path, tile_px).items():
         np.testing.assert_array_equal(way(pixels.astype(np.float32)), expected, err_msg=name)
 
@@ -98,7 +98,7 @@ def test_with_a_halo_below_the_radius_they_have_the_same_seams(precision: str, p
     expected = by_command(pixels, tmp_path, options)
     assert (expected != by_command(pixels, tmp_path, Options(path, tile_px))).any()
     dn = pixels.astype(np.float32)
-    np.testing.assert_array_equal(restore(pixels, path, tile_px=tile_px, halo=halo_px), expected)
+    np.testing.assert_array_equal(restore(pixels, path, tile=tile_px, halo=halo_px), expected)
     np.testing.assert_array_equal(by_tradeoff(path, precision, halo_px)(dn), expected)
     np.testing.assert_array_equal(by_engine(dn, options), expected)
 
@@ -107,7 +107,7 @@ def test_floats_are_those_of_restore_unrounded(precision: str, path: Path, tmp_p
     dn, tile_px = np.minimum(image() + np.float32(0.37), np.float32(4095)), TILES_PX[precision]
     expected = by_command(dn, tmp_path, Options(path, tile_px))
     assert (expected % 1 > 0).mean() > 0.5
-    np.testing.assert_array_equal(restore(dn, path, tile_px=tile_px), expected)
+    np.testing.assert_array_equal(restore(dn, path, tile=tile_px), expected)
     np.testing.assert_array_equal(Network(load_onnx(path)).restore(dn, tile_px=tile_px), expected)
 
 

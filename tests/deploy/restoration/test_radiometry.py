@@ -36,9 +36,9 @@ def scale(raster: Raster, asked: float | None = None, bits: int | None = None) -
 def test_the_user_goes_before_the_file_and_the_file_before_the_sensor() -> None:
     silent = Raster(1, 9, 9, np.dtype(np.uint16))
     stated = replace(silent, bits=10)
-    assert scale(stated, 16383, 14) == FullScale(16383, "--full-scale")
+    assert scale(stated, 16383, 14) == FullScale(16383, "asked for")
     assert scale(stated, None, 14) == FullScale(1023, "10 bits, as the file states")
-    assert scale(silent, None, 14) == FullScale(16383, "14 bits, of --sensor")
+    assert scale(silent, None, 14) == FullScale(16383, "14 bits, of the sensor")
     assert scale(silent) == FullScale(4095, "assumed: 12 bits", assumed=True)
 
 
@@ -56,7 +56,7 @@ def test_8_bit_pixels_need_it_stated_and_cannot_be_of_more() -> None:
 def test_floats_of_digital_numbers_have_the_sensor_s_full_scale_and_shares_none() -> None:
     floats = Raster(1, 9, 9, np.dtype(np.float32))
     assert full_scale_of("x", floats, [900.0], bits=10).value == 1023
-    with pytest.raises(ImageError, match="--full-scale"):
+    with pytest.raises(ImageError, match="full_scale"):
         full_scale_of("x", floats, [0.9], bits=10)
 
 
@@ -65,19 +65,19 @@ def test_a_file_of_such_bits_is_restored_to_its_own_full_scale(bits: int, model:
     """Three ways to state it give the same pixels; that they reach half of it shows that none took 12 bits."""
     full = 2**bits - 1
     asked, row, _ = run(tmp_path, noise(bits), Options(model, 23, full_scale=full))
-    assert row.text["full scale from"] == "--full-scale"
+    assert row.text["full scale from"] == "asked for"
     assert asked.dtype == np.uint16
     assert full / 2 < asked.max() <= full
     profiled, row, _ = run(tmp_path, noise(bits), Options(model, 23, sensor_bits=bits))
     assert row.text["full scale"] == f"{full:g}"
-    assert row.text["full scale from"] == f"{bits} bits, of --sensor"
+    assert row.text["full scale from"] == f"{bits} bits, of the sensor"
     np.testing.assert_array_equal(profiled, asked)
     if bits == 10:
         _, row, said = run(tmp_path, noise(bits), Options(model, 23))
         assert row.text["full scale from"] == "assumed: 12 bits"
         assert not any("clipped" in sentence for sentence in said)
     else:
-        with pytest.raises(ImageError, match=r"0 to 4095.*--full-scale"):
+        with pytest.raises(ImageError, match=r"0 to 4095.*full_scale"):
             run(tmp_path, noise(bits), Options(model, 23))
 
 
@@ -120,7 +120,7 @@ def test_values_above_a_stated_full_scale_are_clipped_counted_and_told(model: Pa
     pixels[30, 30] = 1024
     clipped, row, said = run(tmp_path, pixels, Options(model, 23, full_scale=1023))
     assert row.figures["clipped pixels"].value == 4 * 37 + 1
-    assert sum("149 pixels above full scale, 1023 (--full-scale), were clipped" in each for each in said) == 1
+    assert sum("149 pixels above full scale, 1023 (asked for), were clipped" in each for each in said) == 1
     expected, row, said = run(tmp_path, np.minimum(pixels, 1023), Options(model, 23, full_scale=1023))
     np.testing.assert_array_equal(clipped, expected)
     assert row.figures["clipped pixels"].value == 0

@@ -41,7 +41,7 @@ def expected(image: Path, model: Path, tmp_path: Path) -> bytes:
 
 
 def asked(model: Path) -> list[object]:
-    return ["--model", model, "--tile", TILE_PX, "--resume"]
+    return ["--network", model, "--tile", TILE_PX, "--resume"]
 
 
 def test_killed_at_random_moments_it_is_resumed_to_the_same_bytes(
@@ -86,7 +86,7 @@ def test_finished_rows_are_not_restored_again(
     out, options = tmp_path / "out.tif", Options(model, TILE_PX)
     with stopped_after(50):
         restore_file(image, out, options, lambda _: None)
-    with pytest.raises(OptionError, match="--resume"):
+    with pytest.raises(OptionError, match="resume"):
         restore_file(image, out, replace(options, halo="3", resume=True), lambda _: None)
     seen: list[str] = []
     stop_after(50, monkeypatch, AssertionError("restored more than what was left"))
@@ -121,7 +121,7 @@ def test_a_full_disk_is_one_sentence_and_loses_no_finished_row(
     else:
         monkeypatch.setattr(os, "fsync", full)
     out.write_bytes(b"old")
-    with pytest.raises(MachineError, match=r"No space left.*--resume"):
+    with pytest.raises(MachineError, match=r"No space left.*resume"):
         restore_file(image, out, replace(options, compression=Compression.none), lambda _: None)
     monkeypatch.undo()
     assert out.read_bytes() == b"old"

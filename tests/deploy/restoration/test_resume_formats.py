@@ -27,7 +27,7 @@ def test_killed_among_its_rows_and_at_its_cog_it_is_resumed_to_the_same_bytes(
     out.write_bytes(b"old")
     killed = []
     for sign in ("journal.json", "out.tif"):  # some rows are finished; all are, and the TIFF is begun
-        running = begin(image, out, "--model", model, "--tile", TILE_PX, "--cog", "--resume")
+        running = begin(image, out, "--network", model, "--tile", TILE_PX, "--cog", "--resume")
         while running.poll() is None and not (part_folder(out) / sign).exists():
             time.sleep(0.001)
         running.kill()
@@ -36,7 +36,7 @@ def test_killed_among_its_rows_and_at_its_cog_it_is_resumed_to_the_same_bytes(
         assert running.returncode <= 0, said
         assert out.read_bytes() in (b"old", expected.read_bytes())
     assert killed[0]
-    last = begin(image, out, "--model", model, "--tile", TILE_PX, "--cog", "--resume")
+    last = begin(image, out, "--network", model, "--tile", TILE_PX, "--cog", "--resume")
     said, _ = last.communicate(timeout=120)
     assert last.returncode == 0, said
     assert out.read_bytes() == expected.read_bytes()

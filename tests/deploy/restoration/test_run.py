@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import tifffile
 
-from beers_deploy.networks import shipped_pair
+from beers_deploy.network import shipped_pair
 from beers_deploy.profiles.errors import BeersError, ImageError, MachineError, OptionError
 from beers_deploy.profiles.figures import Row
 from beers_deploy.quant.onnx_file import load_onnx
@@ -93,8 +93,8 @@ def test_full_scale_is_what_the_network_sees_as_one(model: Path, tmp_path: Path)
 def test_floats_of_about_0_to_1_are_refused_until_their_scale_is_named(model: Path, tmp_path: Path) -> None:
     shares = (noise(61, 37) / 4095).astype(np.float32)
     shares[5:9] = np.nan
-    refused(tmp_path, shares, Options(model, tile_px=23), ImageError, "floats of at most 1", "--full")
-    refused(tmp_path, shares * 1.9, Options(model, tile_px=23), ImageError, "--full-scale")
+    refused(tmp_path, shares, Options(model, tile_px=23), ImageError, "floats of at most 1", "`full")
+    refused(tmp_path, shares * 1.9, Options(model, tile_px=23), ImageError, "full_scale")
     (tmp_path / "out.tif").unlink()
     restored, _ = restore(tmp_path, shares, Options(model, tile_px=23, full_scale=1))
     assert 0 < np.nanmean(restored) < np.nanmax(restored) <= 1
@@ -113,7 +113,7 @@ def test_nodata_settles_no_scale(model: Path, tmp_path: Path) -> None:
     shares = (noise(40, 37) / 4095).astype(np.float32)
     shares[3:7] = -9999
     tifffile.imwrite(tmp_path / "in.tif", shares, extratags=[(42113, "s", 0, "-9999", True)])
-    with pytest.raises(ImageError, match="--full-scale"):
+    with pytest.raises(ImageError, match="full_scale"):
         swath.restore_file(tmp_path / "in.tif", tmp_path / "out.tif", Options(model, tile_px=23), lambda _: None)
 
 
@@ -181,7 +181,7 @@ def refused(folder: Path, pixels: np.ndarray, options: Options, error: type[Beer
 def test_values_beyond_full_scale_in_the_last_rows_leave_the_old_output(model: Path, tmp_path: Path) -> None:
     pixels = noise(90, 40)
     pixels[-1, -1] = 60000
-    refused(tmp_path, pixels, Options(model, tile_px=23), ImageError, "60000", "--full-scale")
+    refused(tmp_path, pixels, Options(model, tile_px=23), ImageError, "60000", "full_scale")
     pixels = -noise(90, 40).astype(np.float32)
     refused(tmp_path, pixels, Options(model, tile_px=23), ImageError, "-4", "add the offset")
     refused(tmp_path, np.full((20, 20), np.inf, np.float32), Options(model), ImageError, "inf", "write NaN")
@@ -194,9 +194,9 @@ def test_an_image_all_missing_is_refused(model: Path, tmp_path: Path) -> None:
 def test_options_that_cannot_be_are_refused(model: Path, tmp_path: Path) -> None:
     sound = Options(model, tile_px=23)
     for options, word in (
-        (replace(sound, tile_px=16, halo="8"), "--tile"),
-        (replace(sound, halo="wide"), "--halo"),
-        (replace(sound, full_scale=0.5), "--full-scale"),
+        (replace(sound, tile_px=16, halo="8"), "tile"),
+        (replace(sound, halo="wide"), "halo"),
+        (replace(sound, full_scale=0.5), "full_scale"),
     ):
         refused(tmp_path, noise(40, 40), options, OptionError, word)
 
@@ -209,7 +209,7 @@ def test_a_budget_that_does_not_suffice_is_refused_before_the_run(
         noise(40, 40),
         Options(model, memory_bytes=1000),
         MachineError,
-        "--memory",
+        "memory",
         "1.00 kB",
         "give it more than",
     )

@@ -17,7 +17,7 @@ import tifffile
 
 from beers_deploy import cluster
 from beers_deploy.cluster import open_cluster
-from beers_deploy.networks import shipped_pair
+from beers_deploy.network import shipped_pair
 from beers_deploy.profiles.errors import ImageError, MachineError
 from beers_deploy.quant.onnx_file import load_onnx, save_onnx
 from beers_deploy.quant.tiling.walk import tiling_of
@@ -167,7 +167,7 @@ def call(
 
 
 def test_a_call_that_kills_its_workers_is_one_sentence(scheduler: str) -> None:
-    with pytest.raises(MachineError, match=r"died over one call.*--resume"):
+    with pytest.raises(MachineError, match=r"died over one call.*resume"):
         call(scheduler, os._exit, 1)
 
 
@@ -180,7 +180,7 @@ def test_a_scheduler_that_goes_away_is_one_sentence(monkeypatch: pytest.MonkeyPa
 def test_a_scheduler_whose_workers_left_is_one_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("POLL_S", "WORKERLESS_S"):
         monkeypatch.setattr(cluster, name, 0.2)
-    with local_cluster(1) as local, pytest.raises(MachineError, match=r"none for 0.2 s.*--resume"):
+    with local_cluster(1) as local, pytest.raises(MachineError, match=r"none for 0.2 s.*resume"):
         call(local.scheduler_address, time.sleep, 60, meanwhile=lambda: local.scale(0))
 
 

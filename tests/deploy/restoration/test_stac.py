@@ -16,7 +16,7 @@ rasterio: Any = images.rasterio
 
 def restored(image: Path, item: Path, model: Path) -> dict[str, Any]:
     out = image.with_name("out.tif")
-    done("restore", image, out, "--model", model, "--cog", "--stac", item)
+    done("restore", image, out, "--network", model, "--cog", "--stac", item)
     found: dict[str, Any] = json.loads(item.read_text())
     return found
 
@@ -48,7 +48,7 @@ def test_it_goes_with_a_cog_and_needs_its_package(
     model: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     image = images.write_tiff(tmp_path / "in.tif", images.digital_numbers())
-    words = "restore", image, tmp_path / "out.tif", "--model", model, "--stac", tmp_path / "i.json"
+    words = "restore", image, tmp_path / "out.tif", "--network", model, "--stac", tmp_path / "i.json"
     monkeypatch.setitem(sys.modules, "pystac", None)
     for more, sentence in (([], "--stac: expected --cog"), (["--cog"], "beers-deploy[gdal]")):
         assert sentence in refused(*words, *more)

@@ -78,8 +78,8 @@ def test_the_output_has_the_scale_of_the_input_whatever_the_gain(tmp_path: Path)
     ("pixels", "words"),
     [
         (np.full(SHAPE, 5000, np.uint16), "5000"),
-        (np.full(SHAPE, 200, np.uint8), "--full-scale"),
-        (np.full(SHAPE, 0.5, np.float32), "--full-scale"),
+        (np.full(SHAPE, 200, np.uint8), "full_scale"),
+        (np.full(SHAPE, 0.5, np.float32), "full_scale"),
         (np.full(SHAPE, np.nan, np.float32), "NaN or nodata everywhere"),
         (np.full((*SHAPE, 3), 500, np.uint16), "one band"),
     ],
@@ -94,7 +94,7 @@ def test_what_it_cannot_restore_leaves_the_old_output(pixels: np.ndarray, words:
 
 
 def test_a_budget_that_does_not_suffice_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(MachineError, match="--memory"):
+    with pytest.raises(MachineError, match="memory"):
         of_file(tmp_path, noise(), replace(request(), memory_bytes=1000))
 
 

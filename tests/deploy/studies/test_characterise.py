@@ -162,7 +162,7 @@ WRONG: dict[str, tuple[np.ndarray, tuple[str, ...], str]] = {
     "wide": (FLAT.astype(np.uint32) * 70, ("--bits", "16"), "from 0 to 65535"),
     "nan": (np.where(FLAT > 1060, np.nan, 7).astype(np.float32), ("--bits", "12"), "finite pixels"),
     "steps": (FLAT.astype(np.uint16) * 16, ("--bits", "16"), "divide it by 16"),
-    "open bits": (FLAT.astype(np.uint16), (), "such as --bits 12"),
+    "open bits": (FLAT.astype(np.uint16), (), "--bits: expected --bits beside images"),
     "wrong bits": (FLAT.astype(np.uint16), ("--bits", "8"), "up to 255"),
     "gain": (FLAT.astype(np.uint16), ("--bits", "12", "--gain", "0"), "above 0"),
     "no noise": (np.full((200, 200), 1000, np.uint16), ("--bits", "12"), "noise"),

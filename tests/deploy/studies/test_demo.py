@@ -58,5 +58,5 @@ def test_the_reference_has_the_gain_of_the_sensor_named(tmp_path: Path) -> None:
     assert pair is not None
     assert abs(float(pair.degraded.mean() / pair.reference.mean()) - 1) < 0.01
     (tmp_path / "wide.toml").write_text(text.replace("bits = { value = 12", "bits = { value = 14"))
-    with pytest.raises(OptionError, match="--sensor: expected a sensor of 12 bits, got 14 bits"):
+    with pytest.raises(OptionError, match="sensor: expected a sensor of 12 bits, got 14 bits"):
         load_sensors(str(tmp_path / "wide.toml"))

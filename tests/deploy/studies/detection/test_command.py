@@ -77,7 +77,7 @@ def test_dior_s_tree_is_read_and_nothing_in_it_is_written_over(tmp_path: Path) -
         (["--classes", "car"], "--classes"),
         (["--classes", "lorry=vehicle"], "lorry"),
         (["--images", "none"], "none"),
-        (["--size", "128"], "--size"),
+        (["--side", "128"], "--side"),
     ],
 )
 def test_what_cannot_be_is_one_sentence(

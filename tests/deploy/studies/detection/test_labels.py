@@ -130,7 +130,7 @@ def test_labels_of_an_image_of_another_size_are_refused(tmp_path: Path) -> None:
         (lambda folder: folder, "a folder of images, got no image in it"),
         (
             lambda folder: text(text(coco(folder) / "b.json", "{}"), "{}"),
-            "one file of labels, got 2; name it: --labels",
+            "one file of labels, got 2; name it as `labels`",
         ),
     ],
 )

@@ -123,7 +123,7 @@ def test_another_oversampling_than_the_profiles_is_said(own: int, sides: tuple[i
 
 @pytest.mark.parametrize("name", ["magic", "traditional-superb", "convbeers-huge", ""])
 def test_an_unknown_method_is_refused(name: str) -> None:
-    with pytest.raises(OptionError, match=r"--methods|variant"):
+    with pytest.raises(OptionError, match=r"methods|variant"):
         method_named(name, DEGRADED, REFERENCE)
 
 

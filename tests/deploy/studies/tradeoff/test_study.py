@@ -152,7 +152,7 @@ def test_a_measurement_depends_on_its_inputs() -> None:
 
 def test_an_int8_file_is_made_once(folder: Path, tmp_path: Path) -> None:
     def made() -> Path:
-        return make_int8(folder / "narrow.safetensors", tmp_path, folder / "calibration", SENSOR, 0)
+        return make_int8(folder / "narrow.safetensors", tmp_path, folder / "calibration", load_sensor(SENSOR), 0)
 
     path = made()
     changed = path.stat().st_mtime_ns
@@ -225,7 +225,7 @@ def test_the_command_recommends_in_one_line_and_writes_its_files(
     folder: Path, study: tuple[Study, Path], budget: str, code: int
 ) -> None:
     out = study[1]
-    named = f"--networks {folder}/narrow.safetensors --images {folder}/images --calibration {folder}/calibration"
+    named = f"--network {folder}/narrow.safetensors --images {folder}/images --calibration {folder}/calibration"
     command = f"tradeoff {named} --size 1500x1200 --out {out}"
     result = CliRunner().invoke(app, [*command.split(), "--budget", budget])
     assert result.exit_code == code, result.output

@@ -4,10 +4,10 @@ from pathlib import Path
 
 import pytest
 
-from beers_deploy.compare import compare, parse_limit, read_document
+from beers_deploy.differences import changes, parse_limit, read_document
 from beers_deploy.profiles.figures import Figure, Row, measured, predicted, unavailable
 from beers_deploy.quant.checks import Check
-from beers_deploy.results import Document
+from beers_deploy.results import Table
 from tests.deploy.command_line import done, refused
 
 
@@ -18,13 +18,13 @@ def document(path: Path, psnr: float = 46.5, mae: float = 0.0006, more: tuple[Ro
         Row("bench", "network", {"latency": predicted(42, "s", (30, 60), "model")}),
     )
     checks = (Check("MAE", mae, 0.0007, "of full scale"),)
-    Document("gate", {"model": "a.onnx"}, (), (*rows, *more), checks).write(path)
+    Table("gate", {"model": "a.onnx"}, (), (*rows, *more), checks).save(path)
     return path
 
 
 def test_the_same_document_has_not_changed(tmp_path: Path) -> None:
     one = document(tmp_path / "a.json")
-    output = done("compare", one, one, "--fail-on", "PSNR<0", "--fail-on", "MAE>0%")
+    output = done("diff", one, one, "--fail-on", "PSNR<0", "--fail-on", "MAE>0%")
     assert "3 figures in both, 0 changed, 0 gone, 0 new" in output
 
 
@@ -42,7 +42,7 @@ def test_the_same_document_has_not_changed(tmp_path: Path) -> None:
 )
 def test_a_limit_knows_its_direction_and_its_unit(limit: str, code: int, tmp_path: Path) -> None:
     before, after = document(tmp_path / "a.json"), document(tmp_path / "b.json", psnr=46.4, mae=0.00066)
-    output = done("compare", before, after, "--fail-on", limit, code=code)
+    output = done("diff", before, after, "--fail-on", limit, code=code)
     assert "2 changed" in output
     assert ("FAILED gate / network" in output) == bool(code)
 
@@ -50,15 +50,15 @@ def test_a_limit_knows_its_direction_and_its_unit(limit: str, code: int, tmp_pat
 def test_figures_that_come_and_go_are_counted_and_a_watched_one_that_goes_fails(tmp_path: Path) -> None:
     extra = Row("gate", "other", {"SSIM": measured(0.99, "ratio", "pairs"), "LPIPS": unavailable("distance", "none")})
     with_more, without = document(tmp_path / "a.json", more=(extra,)), document(tmp_path / "b.json")
-    assert "2 gone, 0 new" in done("compare", with_more, without)
-    assert "0 gone, 2 new" in done("compare", without, with_more)
-    done("compare", with_more, without, "--fail-on", "SSIM<-1", code=1)
+    assert "2 gone, 0 new" in done("diff", with_more, without)
+    assert "0 gone, 2 new" in done("diff", without, with_more)
+    done("diff", with_more, without, "--fail-on", "SSIM<-1", code=1)
 
 
 def test_from_nothing_any_rise_is_endless() -> None:
     limit = parse_limit("saturated>5%")
     for value, broken in ((0.0, False), (1e-9, True)):
-        changed = compare(*({"rows": [as_row(v)]} for v in (0.0, value))).both[0]
+        changed = changes(*({"rows": [as_row(v)]} for v in (0.0, value))).both[0]
         assert limit.broken_by(changed) is broken
 
 
@@ -69,8 +69,8 @@ def as_row(value: float) -> dict[str, object]:
 
 def test_a_written_comparison_is_a_document_again(tmp_path: Path) -> None:
     before, after = document(tmp_path / "a.json"), document(tmp_path / "b.json", psnr=40)
-    done("compare", before, after, "--json", tmp_path / "c.json")
-    assert read_document(tmp_path / "c.json")["command"] == "compare"
+    done("diff", before, after, "--json", tmp_path / "c.json")
+    assert read_document(tmp_path / "c.json")["command"] == "diff"
 
 
 @pytest.mark.parametrize(
@@ -80,7 +80,7 @@ def test_a_written_comparison_is_a_document_again(tmp_path: Path) -> None:
 def test_what_is_no_document_gets_one_sentence(content: str | None, words: str, tmp_path: Path) -> None:
     if content is not None:
         (tmp_path / "x.json").write_text(content)
-    assert words in refused("compare", document(tmp_path / "a.json"), tmp_path / "x.json")
+    assert words in refused("diff", document(tmp_path / "a.json"), tmp_path / "x.json")
 
 
 def test_a_watched_figure_that_can_no_longer_be_had_fails(tmp_path: Path) -> None:
@@ -91,16 +91,16 @@ def test_a_watched_figure_that_can_no_longer_be_had_fails(tmp_path: Path) -> Non
             ("b.json", unavailable("distance", "no weights")),
         )
     )
-    done("compare", had, gone, "--fail-on", "LPIPS>1", code=1)
-    done("compare", gone, had, "--fail-on", "LPIPS>1")
+    done("diff", had, gone, "--fail-on", "LPIPS>1", code=1)
+    done("diff", gone, had, "--fail-on", "LPIPS>1")
 
 
 def test_a_limit_on_a_figure_that_is_not_there_is_refused(tmp_path: Path) -> None:
     one = document(tmp_path / "a.json")
-    assert "MAE, PSNR, latency" in refused("compare", one, one, "--fail-on", "PSMR<0")
+    assert "MAE, PSNR, latency" in refused("diff", one, one, "--fail-on", "PSMR<0")
 
 
 @pytest.mark.parametrize("text", ["PSNR", "PSNR=3", ">3", "PSNR<lots"])
 def test_what_is_no_limit_gets_one_sentence(text: str, tmp_path: Path) -> None:
     one = document(tmp_path / "a.json")
-    assert "NAME>CHANGE" in refused("compare", one, one, "--fail-on", text)
+    assert "NAME>CHANGE" in refused("diff", one, one, "--fail-on", text)

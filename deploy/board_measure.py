@@ -48,7 +48,7 @@ def main() -> int:
 def arguments() -> argparse.Namespace:
     """What the user asks for."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("model", type=Path, help="QDQ ONNX: the file of 'beers-deploy quantize --board'")
+    parser.add_argument("model", type=Path, help="QDQ ONNX: the file of 'beers-deploy quantize --board-file'")
     parser.add_argument("--out", type=Path, default=Path("board.json"), help="JSON list; a new run is added to it")
     parser.add_argument("--provider", default="VitisAIExecutionProvider", help="onnxruntime's execution provider")
     parser.add_argument(

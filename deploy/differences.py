@@ -63,7 +63,7 @@ class Limit:
 
 
 @dataclass(frozen=True)
-class Comparison:
+class Changes:
     """Figures in both documents, and the places of those in one of them only."""
 
     both: tuple[Change, ...]
@@ -76,7 +76,7 @@ class Comparison:
         return [change for change in self.both if change.before.value != change.after.value]
 
 
-def broken(found: Comparison, limits: Sequence[Limit]) -> list[str]:
+def broken(found: Changes, limits: Sequence[Limit]) -> list[str]:
     """What fails a job, a line each: changes beyond a limit, and figures with a limit that are gone.
 
     Raises:
@@ -86,7 +86,7 @@ def broken(found: Comparison, limits: Sequence[Limit]) -> list[str]:
     for limit in limits:
         if limit.name not in known:
             expected = f"a figure of the documents: {', '.join(sorted(known))}"
-            raise OptionError("--fail-on", expected=expected, got=repr(limit.name), remedy="correct the name")
+            raise OptionError("fail_on", expected=expected, got=repr(limit.name), remedy="correct the name")
     changed = [change for change in found.both if any(limit.broken_by(change) for limit in limits)]
     names = {limit.name for limit in limits}
     lines = [f"{' / '.join(change.place)}: {change.before} -> {change.after}" for change in changed]
@@ -102,7 +102,7 @@ def parse_limit(text: str) -> Limit:
     found = LIMIT.fullmatch(text.strip())
     if found is None:
         remedy = "write 'MAE>2%' or 'PSNR<-0.05'"
-        raise OptionError("--fail-on", expected="NAME>CHANGE or NAME<CHANGE", got=repr(text), remedy=remedy)
+        raise OptionError("fail_on", expected="NAME>CHANGE or NAME<CHANGE", got=repr(text), remedy=remedy)
     return Limit(found["name"], found["side"] == ">", float(found["change"]), bool(found["percent"]))
 
 
@@ -127,11 +127,11 @@ def read_document(path: Path) -> dict[str, object]:
     return document  # type: ignore[return-value]
 
 
-def compare(before: Mapping[str, object], after: Mapping[str, object]) -> Comparison:
+def changes(before: Mapping[str, object], after: Mapping[str, object]) -> Changes:
     """Match the figures of two documents."""
     old, new = figures_of(before), figures_of(after)
     both = tuple(Change(place, figure, new[place]) for place, figure in old.items() if place in new)
-    return Comparison(both, tuple(p for p in old if p not in new), tuple(p for p in new if p not in old))
+    return Changes(both, tuple(p for p in old if p not in new), tuple(p for p in new if p not in old))
 
 
 def figures_of(document: Mapping[str, object]) -> dict[Place, Figure]:

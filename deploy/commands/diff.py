@@ -1,19 +1,19 @@
-"""`beers-deploy compare`: what changed between two runs, and whether a CI job should fail for it."""
+"""`beers-deploy diff`: what changed between two runs, and whether a CI job should fail for it."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from beers_deploy.commands.shared import say
+from beers_deploy.commands.shared import save, say
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-EXAMPLE = "compare before.json after.json --fail-on 'MAE>2%' --fail-on 'PSNR<-0.05'"
+EXAMPLE = "diff before.json after.json --fail-on 'MAE>2%' --fail-on 'PSNR<-0.05'"
 
 
-def compare(
+def diff(
     before: Annotated[Path, typer.Argument(metavar="A.json", help="What a command wrote with --json.")],
     after: Annotated[Path, typer.Argument(metavar="B.json", help="What it wrote later.")],
     fail_on: Annotated[
@@ -26,15 +26,14 @@ def compare(
 
     A figure named by --fail-on that the second document lacks fails too.
     """
-    from beers_deploy.compare import broken, change_rows, parse_limit, read_document
-    from beers_deploy.compare import compare as compare_documents
+    from beers_deploy.differences import broken, change_rows, changes, parse_limit, read_document
     from beers_deploy.model.io.files import require_writable
-    from beers_deploy.results import Document, print_rows
+    from beers_deploy.results import Table, print_rows
 
     require_writable(json, inputs=(before, after))
     limits = [parse_limit(text) for text in fail_on or ()]
     documents = read_document(before), read_document(after)
-    found = compare_documents(*documents)
+    found = changes(*documents)
     rows = change_rows(found.changed)
     if rows:
         print_rows(f"{before.name} -> {after.name}", rows)
@@ -42,7 +41,7 @@ def compare(
     say(f"{len(found.both)} figures in both, {counts}")
     for note in differing(*documents):
         say(note)
-    Document("compare", {"fail_on": ", ".join(fail_on or ())}, (before, after), tuple(rows)).write(json)
+    save(Table("diff", {"fail_on": ", ".join(fail_on or ())}, (before, after), tuple(rows)), json)
     failed = broken(found, limits)
     for line in failed:
         say(f"FAILED {line}")

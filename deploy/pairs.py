@@ -1,0 +1,161 @@
+"""Simulated pairs for notebooks and scripts: what a sensor sees of a scene, and what a better one would have seen."""
+
+import json
+import os
+from collections.abc import Collection, Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from beers_deploy.model.io.files import write_text
+from beers_deploy.model.io.pictures import picture_url, stretch_of
+from beers_deploy.model.io.tiff import write_tiff
+from beers_deploy.model.metrics.fidelity import psnr_db, ssim
+from beers_deploy.model.shipped import SENSOR
+from beers_deploy.network import SensorLike
+from beers_deploy.profiles.errors import ImageError, OptionError, optional
+from beers_deploy.profiles.scene_call import calling_for, load_scene_call
+from beers_deploy.profiles.sensor import Instrument, Sensor, require_same_units
+
+if TYPE_CHECKING:
+    from beers_deploy.model.simulator.sampling import Scene
+
+LARGEST_PX = 4096
+"""The largest side that is simulated at once; `beers-deploy simulate` writes data sets of any size."""
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Pair:
+    """Two acquisitions of one scene in the same digital numbers; it unpacks into both.
+
+    Attributes:
+        degraded: what the sensor sees, (H, W) uint16.
+        reference: what the better sensor sees, (H, W) uint16.
+        clean: the reference without noise and rounding, (H, W) float32.
+        sensor: the sensor, every number settled.
+        profiles: the two sensors that were drawn from.
+    """
+
+    degraded: np.ndarray
+    reference: np.ndarray
+    clean: np.ndarray
+    sensor: Instrument
+    profiles: tuple[Sensor, Sensor]
+
+    def __iter__(self) -> Iterator[np.ndarray]:
+        return iter((self.degraded, self.reference))
+
+    def psnr(self, image: np.ndarray) -> float:
+        """Peak signal-to-noise ratio in dB of an image (H, W) beside the reference, over the sensor's full scale.
+
+        Raises:
+            ImageError: an image of another shape.
+        """
+        return psnr_db(self._alike(image), self.reference, self.sensor.max_dn)
+
+    def ssim(self, image: np.ndarray) -> float:
+        """Structural similarity of an image (H, W) and the reference, over the sensor's full scale.
+
+        Raises:
+            ImageError: an image of another shape, or smaller than the window of 11 pixels.
+        """
+        return ssim(self._alike(image), self.reference, self.sensor.max_dn)
+
+    def _alike(self, image: np.ndarray) -> np.ndarray:
+        found = np.asarray(image)
+        if found.shape != self.reference.shape:
+            remedy = "compare images of one size"
+            got = f"an image of shape {found.shape}"
+            raise ImageError("image", expected=f"one of shape {self.reference.shape}", got=got, remedy=remedy)
+        return found
+
+    def save(self, folder: str | os.PathLike[str]) -> Path:
+        """Write both images as 12-bit TIFFs that `beers-deploy evaluate --pairs` reads, and what made them."""
+        out = Path(folder)
+        for role, image in (("degraded", self.degraded), ("reference", self.reference)):
+            write_tiff(out / role / "0000-drawn.tif", image)
+        degraded, reference = map(asdict, self.profiles)
+        recipe = {"scenes": [{"name": "drawn"}], "degraded": degraded, "reference": reference}
+        write_text(out / "recipe.json", json.dumps(recipe, indent=1, sort_keys=True) + "\n")
+        return out
+
+    def __repr__(self) -> str:
+        height, width = self.degraded.shape
+        return f"Pair({width} x {height} px, {self.profiles[0].name} -> {self.profiles[1].name})"
+
+    def _repr_html_(self) -> str:
+        stretch = stretch_of(self.reference)
+        shown = (("degraded", self.degraded), ("reference", self.reference), ("clean", self.clean))
+        pictures = [
+            f'<figure style="display: inline-block; margin: 4px"><img src="{picture_url(stretch.to_bytes(image))}" '
+            f'style="max-width: 30em; width: 100%"><figcaption>{name}</figcaption></figure>'
+            for name, image in shown
+        ]
+        return "".join(pictures)
+
+
+def simulate(
+    scene: "str | os.PathLike[str] | np.ndarray | None" = None,
+    sensor: SensorLike = SENSOR,
+    *,
+    reference: SensorLike | None = None,
+    size: int = 512,
+    calls_for: str | os.PathLike[str] | None = None,
+    effects: Collection[str] = (),
+    seed: int = 0,
+) -> Pair:
+    """Simulate what a sensor sees of a scene, and what a better one would have seen.
+
+    Args:
+        scene: an image file or its pixels: 8 bits, 16-bit digital numbers, or float radiance in W/m2/sr/um; one is
+            drawn if None.
+        sensor: of the degraded image; each of its ranges is drawn from.
+        reference: the sensor that is aimed at, in the digital numbers of `sensor`; None for the shipped one.
+        size: side in pixels of the images of a drawn scene.
+        calls_for: what the scene calls for: the name of a shipped scene such as night-port, or a .toml file.
+        effects: further effects by name, at typical values.
+        seed: of every random draw.
+
+    Raises:
+        ImageError: a scene that cannot be read, or too small for the margin that the blur needs.
+        ProfileError: no such sensor or scene.
+        OptionError: no such effect, or a size that is not simulated at once.
+        MissingExtraError: torch is not installed.
+    """
+    if not 1 <= size <= LARGEST_PX:
+        remedy = "give another, or simulate a data set with beers-deploy simulate"
+        raise OptionError("size", expected=f"1 to {LARGEST_PX} pixels", got=str(size), remedy=remedy)
+    optional("torch", "simulate", "torch")
+    from beers_deploy.model.simulator.acquire import acquire_three, prepare_scene
+    from beers_deploy.model.simulator.detector import Draw, to_uint16
+
+    call = None if calls_for is None else load_scene_call(os.fspath(calls_for))
+    degraded = calling_for(Sensor.load(sensor), call, effects)
+    aim = degraded.reference if reference is None else Sensor.load(reference).in_units_of(degraded)
+    require_same_units(degraded, aim)
+    draw, ratio = Draw(seed), int(degraded.oversampling.low)
+    radiance = _scene(scene, aim.nominal(), size, ratio, seed).radiance * (call.radiance_scale.low if call else 1.0)
+    seen_by, meant_by = (
+        profile.draw(draw.generator(f"sensor-{role}"))
+        for role, profile in (("degraded", degraded), ("reference", aim))
+    )
+    seen, meant, clean = acquire_three(prepare_scene(radiance, ratio), seen_by, meant_by, draw)
+    return Pair(to_uint16(seen), to_uint16(meant), clean.numpy(), seen_by, (degraded, aim))
+
+
+def _scene(
+    scene: "str | os.PathLike[str] | np.ndarray | None", sensor: Instrument, size_px: int, ratio: int, seed: int
+) -> "Scene":
+    from beers_deploy.model.simulator.acquire import MARGIN_PX
+    from beers_deploy.model.simulator.detector import Draw
+    from beers_deploy.model.simulator.procedural import procedural_scene
+    from beers_deploy.model.simulator.sampling import read_scene, scene_of
+
+    if scene is None:
+        side_px = (size_px + 2 * MARGIN_PX) * ratio
+        return procedural_scene(side_px, side_px, Draw(seed).generator("drawn scene"))
+    if isinstance(scene, str | os.PathLike):
+        return read_scene(Path(scene), sensor)
+    return scene_of("scene", np.asarray(scene), sensor)

@@ -1,0 +1,333 @@
+"""The gate: what INT8 changes, what the file itself shows, and which limits that keeps.
+
+Looked at, in this order:
+
+1. Patches that calibration did not see, through both networks: MAE, percentile, PSNRs (`quant.gate`), and the results
+   inside the INT8 network that saturate (`quant.structure`).
+2. The MAE that an earlier gate found on the same patches, where a baseline is given.
+3. The INT8 file: the DPU's rules, its ReLUs, its encoding, the same bits with onnxruntime's optimisations as without.
+"""
+
+import math
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+from xml.etree import ElementTree as ET
+
+import onnx
+
+from beers_deploy.dpu.board import BoardLike, dpu_of
+from beers_deploy.dpu.checker.placement import place
+from beers_deploy.dpu.checker.table import legality
+from beers_deploy.dpu.reading import network_of
+from beers_deploy.model.progress import Progress, reporting
+from beers_deploy.model.shipped import SENSOR
+from beers_deploy.network import Network, NetworkLike, SensorLike
+from beers_deploy.profiles.errors import OptionError, printable
+from beers_deploy.profiles.sensor import Sensor
+from beers_deploy.profiles.target import DEFAULT_TARGET, TargetProfile
+from beers_deploy.profiles.toml import read_json, unreadable
+from beers_deploy.quant.checks import Check
+from beers_deploy.quant.gate import GateResult, Limits, judge, judge_saturation, limits_of, verdict_row
+from beers_deploy.quant.gate import compare as differences
+from beers_deploy.quant.onnx_file import fixed_tile_px, metadata, require_quantised
+from beers_deploy.quant.samples import OwnSamples, samples_of
+from beers_deploy.quant.session import open_any_size
+from beers_deploy.quant.structure import saturated_shares, structure_checks
+from beers_deploy.restoration.options import TILE_PX
+from beers_deploy.results import Table
+
+if TYPE_CHECKING:
+    from beers_deploy.quant.calibration import Patches
+
+PATCHES = ("sensor", "images", "patches", "seed", "samples")
+"""The arguments that say what INT8 and float are compared on."""
+
+
+ALL_SEEN = "calibration saw all of these samples"
+
+
+@dataclass(frozen=True, repr=False, kw_only=True)
+class Comparison(Table):
+    """What INT8 changes, and how many results inside the INT8 network saturate.
+
+    Attributes:
+        result: the differences.
+        shares: of each layer's results the share at the ends of 8 bits.
+    """
+
+    result: GateResult
+    shares: Mapping[str, float]
+
+
+@dataclass(frozen=True, repr=False, kw_only=True)
+class Verdict(Table):
+    """What a gate found: a comparison, and every check. It is true where all of them passed."""
+
+    comparison: Comparison
+
+    @property
+    def passed(self) -> bool:
+        """Whether every check did."""
+        return bool(self)
+
+    @property
+    def failed(self) -> tuple[Check, ...]:
+        """The checks that did not pass."""
+        return tuple(check for check in self.checks if not check.passed)
+
+    def raise_if_failed(self) -> None:
+        """Fail a test where a limit is broken.
+
+        Raises:
+            GateFailedError: each check that failed, with its value and its limit.
+        """
+        if not self:
+            raise GateFailedError(str(self))
+
+    def to_junit(self) -> str:
+        """The verdict as JUnit XML: a test case a check."""
+        return junit_text(f"INT8 gate of {self.comparison.arguments['int8']}", self.checks)
+
+    def to_markdown(self) -> str:
+        """The checks as a table of Markdown, such as a job's summary shows."""
+        lines = [f"| {check.name} | {check.found} | {check.allowed} | {_mark(check)} |" for check in self.checks]
+        return "\n".join(["| check | found | allowed | |", "|---|---|---|---|", *lines]) + "\n"
+
+    def __repr__(self) -> str:
+        return f"Verdict({self})"
+
+    def __str__(self) -> str:
+        mae, drop_db = self.comparison.result.mae, self.comparison.result.drop_db
+        drop = "" if math.isnan(drop_db) else f", PSNR drop {drop_db:.2f} dB"
+        return f"gate {sentence(self.checks, f'MAE {mae:.3g} of full scale{drop}')}"
+
+
+def _mark(check: Check) -> str:
+    return "passed" if check.passed else "**failed**"
+
+
+class GateFailedError(AssertionError):
+    """An INT8 network does not keep its limits; no bad input, and so no `BeersError`."""
+
+
+def compare(
+    int8: NetworkLike,
+    against: NetworkLike | None = None,
+    samples: object = None,
+    *,
+    sensor: SensorLike = SENSOR,
+    images: Path | None = None,
+    patches: int = 32,
+    seed: int = 0,
+    progress: Progress = None,
+) -> Comparison:
+    """Compare an INT8 network with its float network, on patches or samples that calibration did not see.
+
+    Args:
+        int8: the INT8 network.
+        against: the float one; where it is None, the one that `int8` was quantised from here.
+        samples: a path, arrays or whatever `quantize` takes; None for simulated patches. Of samples that include
+            those of its calibration only the others are used.
+        sensor: of the simulated patches, and what shipped networks are told.
+        images: folder of scenes for them; None for drawn ones.
+        patches: how many of 128 x 128 are simulated.
+        seed: of the patches.
+        progress: a function that is told each step, False for silence, None for a bar or lines on standard error.
+
+    Raises:
+        ModelError: a file that is not what it should be.
+        OptionError: no float network, or samples that were all calibrated on.
+        ImageError: samples that the networks do not take.
+    """
+    known = Sensor.load(sensor)
+    ours, theirs = _pair(int8, against, known)
+    with reporting(progress):
+        unseen, simulated, notes = _unseen(ours, theirs, known, samples, images, patches, seed)
+        sessions = open_any_size(theirs.model), open_any_size(ours.model)
+        result = differences(*sessions, unseen.pairs, simulated)
+        shares = saturated_shares(ours.model, unseen.degraded)
+    arguments: dict[str, object] = {"float": theirs.name, "int8": ours.name, "sensor": known.name, "images": images}
+    arguments |= {"patches": patches, "seed": seed, "samples": samples if isinstance(samples, str | Path) else None}
+    rows, inputs = (verdict_row(result, shares),), (theirs.input, ours.input)
+    return Comparison("compare", arguments, inputs, rows, notes=notes, result=result, shares=shares)
+
+
+def gate(
+    int8: NetworkLike,
+    against: NetworkLike | None = None,
+    samples: object = None,
+    *,
+    board: BoardLike = DEFAULT_TARGET,
+    limits: Limits | Mapping[str, float] | str | os.PathLike[str] | None = None,
+    baseline: str | os.PathLike[str] | None = None,
+    sensor: SensorLike = SENSOR,
+    images: Path | None = None,
+    patches: int = 32,
+    seed: int = 0,
+    progress: Progress = None,
+) -> Verdict:
+    """Judge an INT8 network beside its float one; the verdict is true where every check passed.
+
+    Args:
+        int8: as in `compare`, like all that follow but for these three.
+        against: the float network.
+        samples: what both are compared on.
+        board: whose rules the INT8 file must keep.
+        limits: names and numbers, such as {"mae": 0.001}, or a TOML file; None for the default of the MAE.
+        baseline: what an earlier gate wrote as JSON: the MAE may not grow.
+        sensor: of the simulated patches.
+        images: folder of scenes for them.
+        patches: how many.
+        seed: of the patches.
+        progress: how it is told.
+
+    Raises:
+        ModelError: a file that is not what it should be.
+        OptionError: as in `compare`, or limits or a baseline that do not fit.
+        ImageError: samples that the networks do not take.
+        ProfileError: no such board or sensor.
+    """
+    allowed, target, known = limits_of(limits), TargetProfile.load(board), Sensor.load(sensor)
+    ours, theirs = _pair(int8, against, known)
+    config = limits if isinstance(limits, str | os.PathLike) else None
+    data = samples if isinstance(samples, str | os.PathLike) else None
+    arguments: dict[str, object] = {
+        "max_mae": allowed.mae,
+        "limits": config,
+        "baseline": baseline,
+        "target": target.name,
+    }
+    arguments |= {"sensor": sensor if isinstance(sensor, str) else known.name, "images": images, "patches": patches}
+    arguments |= {"seed": seed, "samples": data}
+    before = None if baseline is None else baseline_mae(Path(baseline), arguments)
+    if allowed.psnr_drop_db is not None and samples is not None:
+        _require_references(samples_of(theirs.model, samples))
+    found = compare(ours, theirs, samples, sensor=known, images=images, patches=patches, seed=seed, progress=progress)
+    if ALL_SEEN in found.notes:
+        expected, remedy = "samples that calibration did not see", "give others, or quantise with four or more"
+        raise OptionError("samples", expected=expected, got="those of the calibration", remedy=remedy)
+    checks = judge(found.result, allowed, before) + judge_saturation(found.shares, allowed)
+    checks += file_checks(theirs.model, ours, target)
+    return Verdict("gate", arguments, found.inputs, found.rows, tuple(checks), notes=found.notes, comparison=found)
+
+
+def _pair(int8: NetworkLike, against: NetworkLike | None, sensor: Sensor) -> tuple[Network, Network]:
+    """The INT8 network and the float one, each of its precision.
+
+    Raises:
+        ModelError: one that is of the other precision.
+        OptionError: no float network.
+    """
+    ours = Network.load(int8, sensor=sensor)
+    given = ours.origin if against is None else against
+    if given is None:
+        remedy = "give it, or quantise it here"
+        raise OptionError("against", expected=f"the float network of {ours.name}", got="none", remedy=remedy)
+    theirs = Network.load(given, sensor=sensor)
+    require_quantised(theirs.model, theirs.label, wanted=False)
+    require_quantised(ours.model, ours.label, wanted=True)
+    return ours, theirs
+
+
+def _unseen(
+    int8: Network,
+    floating: Network,
+    sensor: Sensor,
+    samples: object,
+    images: Path | None,
+    patches: int,
+    seed: int,
+) -> "tuple[Patches, bool, tuple[str, ...]]":
+    """What the two are compared on, whether it is simulated, and what a reader must know of it."""
+    own = samples_of(floating.model, samples)
+    if own is None:
+        from beers_deploy.quant.calibration import unseen_patches  # it takes torch
+
+        return unseen_patches(sensor, images, patches, seed), True, ()
+    calibrated = metadata(int8.model).get("calibration_sha256")
+    if own.all.digest == calibrated:
+        return own.all, False, (ALL_SEEN,)
+    if own.drawn.digest == calibrated:
+        held_out = own.unseen
+        note = f"{len(held_out.pairs)} of {len(own.all.pairs)} samples: the others were calibrated on"
+        return held_out, False, (note,)
+    return own.all, False, ()
+
+
+def _require_references(own: OwnSamples | None) -> None:
+    if own is not None and not any(reference.size for _, reference in own.all.pairs):
+        expected, remedy = "references for psnr_drop_db", "give images and references, or no such limit"
+        raise OptionError("samples", expected=expected, got="images alone", remedy=remedy)
+
+
+def baseline_mae(path: Path, arguments: Mapping[str, Any]) -> float:
+    """The MAE in a document that an earlier `gate --json` wrote, of the same patches.
+
+    Args:
+        path: the document.
+        arguments: of this run of the gate.
+
+    Raises:
+        OptionError: no such document, or one of other patches.
+    """
+    try:
+        document: Any = read_json(path)
+        before = {name: _plain(name, dict(document["arguments"]).get(name)) for name in PATCHES}
+        mae = float(next(row["figures"]["MAE"]["value"] for row in document["rows"] if row["table"] == "gate"))
+    except (OSError, ValueError, KeyError, TypeError, StopIteration) as error:
+        got = unreadable(path) or "another document"
+        remedy = "give what 'gate --json' wrote"
+        raise OptionError(str(path), expected="a gate's results", got=got, remedy=remedy) from error
+    for name in PATCHES:
+        now = _plain(name, arguments.get(name))
+        if before[name] != now:
+            expected, got = f"a baseline of the same patches ({name} {now})", f"{name} {before[name]}"
+            raise OptionError(str(path), expected=expected, got=got, remedy="make it anew with these")
+    return mae
+
+
+def _plain(name: str, value: object) -> str:
+    """As text; of a folder of images its name, for it may lie elsewhere."""
+    return Path(str(value)).name if name == "images" else str(value)
+
+
+def file_checks(float_model: onnx.ModelProto, int8: Network, target: TargetProfile) -> list[Check]:
+    """What the INT8 file itself shows: the target's rules, then what `quant.structure` looks at."""
+    return [*_legality(int8, target), *structure_checks(float_model, int8.model)]
+
+
+def _legality(int8: Network, target: TargetProfile) -> list[Check]:
+    """The DPU's rules; a target without a DPU has none."""
+    if not target.configurations:
+        return []
+    read = network_of(int8.model, fixed_tile_px(int8.model) or TILE_PX, int8.name)
+    return [legality(place(read, dpu_of(target)))]
+
+
+def sentence(checks: Sequence[Check], passed: str) -> str:
+    """The line that ends a command: every check that failed, with its value and its limit, and no other.
+
+    Args:
+        checks: all that were made.
+        passed: what to say beside their number where none failed.
+    """
+    failed = [str(check) for check in checks if not check.passed]
+    if not failed:
+        return f"passed, all {len(checks)} checks: {passed}"
+    return f"FAILED, {len(failed)} of {len(checks)} checks: {'; '.join(failed)}"
+
+
+def junit_text(title: str, checks: Sequence[Check]) -> str:
+    """The verdict as JUnit XML: a test case a check."""
+    failures = sum(not check.passed for check in checks)
+    counts = {"tests": str(len(checks)), "failures": str(failures), "errors": "0"}
+    suite = ET.Element("testsuite", name=printable(title), attrib=counts)
+    for check in checks:
+        case = ET.SubElement(suite, "testcase", classname=printable(title), name=check.name)
+        if not check.passed:
+            text = f"found {check.found}, allowed {check.allowed}"
+            ET.SubElement(case, "failure", message=text).text = text
+    return ET.tostring(suite, encoding="unicode") + "\n"

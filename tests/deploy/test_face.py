@@ -1,0 +1,285 @@
+"""The names of `import beers_deploy`: what they take and return, and what they refuse in one sentence."""
+
+import copy
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import jsonschema
+import numpy as np
+import onnx
+import pytest
+import tifffile
+import torch
+
+import beers_deploy as bd
+from beers_deploy.model.progress import Step
+from beers_deploy.profiles.sensor import numbers_of
+from beers_deploy.profiles.sensor_file import sensor_names
+from beers_deploy.results import SCHEMA_PATH
+
+SMALL = "convbeers-xs"
+
+
+class Tiny(torch.nn.Module):
+    """Two convolutions that change an image a little."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        generator = torch.Generator().manual_seed(0)
+        self.head, self.tail = torch.nn.Conv2d(1, 4, 3, padding=1), torch.nn.Conv2d(4, 1, 3, padding=1)
+        for weight in self.parameters():
+            weight.data = 0.1 * torch.randn(weight.shape, generator=generator)
+
+    def forward(self, image: torch.Tensor) -> torch.Tensor:
+        """The shape is kept."""
+        change: torch.Tensor = self.tail(torch.relu(self.head(image)))
+        return image + change
+
+
+@pytest.fixture(scope="module")
+def samples() -> np.ndarray:
+    return np.random.default_rng(0).random((8, 1, 32, 32), np.float32)
+
+
+@pytest.fixture(scope="module")
+def tiny() -> bd.Network:
+    return bd.Network.load(Tiny())
+
+
+@pytest.fixture(scope="module")
+def int8(tiny: bd.Network, samples: np.ndarray) -> bd.Network:
+    return bd.quantize(tiny, samples, board="zcu102", progress=False)
+
+
+@pytest.fixture(scope="module")
+def pair() -> bd.Pair:
+    return bd.simulate(size=70, seed=1)
+
+
+@pytest.fixture(scope="module")
+def raw() -> np.ndarray:
+    return np.random.default_rng(2).integers(200, 3000, (61, 83)).astype(np.uint16)
+
+
+@pytest.mark.parametrize("name", sensor_names())
+def test_a_saved_sensor_is_the_same(name: str, tmp_path: Path) -> None:
+    sensor = bd.Sensor.load(name)
+    assert numbers_of(bd.Sensor.load(sensor.save(tmp_path / "s.toml"))) == numbers_of(sensor)
+
+
+def test_another_number_of_a_sensor_keeps_the_others() -> None:
+    sensor = bd.Sensor.load("pleiades-degraded")
+    sharper = sensor.replace(mtf_nyquist=(0.1, 0.2), alpha=0.002, beta=0.01)
+    assert (sharper.mtf_nyquist.low, sharper.mtf_nyquist.high) == (0.1, 0.2)
+    assert sharper.noise([0.0, 100.0]) == pytest.approx([0.1, 0.21**0.5])
+    assert sharper.snr_0 is None
+    assert sharper.gsd_m == sensor.gsd_m
+    np.testing.assert_allclose(sensor.to_radiance(sensor.to_dn(np.array([3.0, 70.0]))), [3, 70])
+
+
+def test_values_are_copied_and_compared(tiny: bd.Network) -> None:
+    tiny(np.zeros((1, 1, 8, 8), np.float32))
+    for value in (bd.Sensor.load("blind"), bd.Board.load("vck190"), tiny):
+        assert copy.deepcopy(value) == value
+        assert len(repr(value)) < 150
+
+
+def test_a_module_computes_as_in_torch(tiny: bd.Network) -> None:
+    images = np.random.default_rng(1).random((2, 1, 19, 23), np.float32)
+    with torch.inference_mode():
+        expected = Tiny()(torch.from_numpy(images)).numpy()
+    np.testing.assert_allclose(tiny(images), expected, atol=1e-6)
+    assert (tiny.precision, tiny.tiling.halo_px) == ("float32", 2)
+
+
+def test_a_network_is_whatever_holds_one(tiny: bd.Network, tmp_path: Path) -> None:
+    path = tiny.save(tmp_path / "tiny.onnx")
+    for held in (str(path), path, onnx.load(path), tiny):
+        found = bd.Network.load(held)
+        np.testing.assert_array_equal(found(np.ones((1, 1, 9, 9))), tiny(np.ones((1, 1, 9, 9))))
+
+
+def test_int8_knows_its_float_network_and_its_layers(tiny: bd.Network, int8: bd.Network) -> None:
+    assert int8.origin == tiny
+    assert int8.precision == "int8"
+    assert [row.table for row in int8.layers] == ["integer layers", "integer layers", "rounding"]
+
+
+def test_the_gate_leaves_calibrations_samples_out(int8: bd.Network, samples: np.ndarray) -> None:
+    verdict = bd.gate(int8, samples=samples, board="zcu102", limits={"mae": 0.01})
+    verdict.raise_if_failed()
+    assert verdict.notes == ("2 of 8 samples: the others were calibrated on",)
+    assert bd.compare(int8, samples=samples[3::4]).result.mae == verdict.comparison.result.mae
+    with pytest.raises(AssertionError, match=r"gate FAILED, 1 of \d checks: MAE .* allowed at most 1e-09"):
+        bd.gate(int8, samples=samples, limits={"mae": 1e-9}).raise_if_failed()
+
+
+def test_the_gate_refuses_samples_that_were_all_calibrated_on(tiny: bd.Network, samples: np.ndarray) -> None:
+    few = bd.quantize(tiny, samples[:3], progress=False)
+    with pytest.raises(ValueError, match="samples: expected samples that calibration did not see"):
+        bd.gate(few, samples=samples[:3])
+
+
+@pytest.mark.parametrize("kind", ["array", "tuple", "list", "batches", "file"])
+def test_samples_of_any_kind_are_the_same(
+    kind: str, tiny: bd.Network, int8: bd.Network, samples: np.ndarray, tmp_path: Path
+) -> None:
+    np.save(tmp_path / "samples.npy", samples)
+    forms: dict[str, Any] = {
+        "array": torch.from_numpy(samples),
+        "tuple": (samples, samples),
+        "list": list(samples),
+        "batches": [[batch] for batch in (samples[:3], torch.from_numpy(samples[3:]))],
+        "file": str(tmp_path / "samples.npy"),
+    }
+    made = bd.quantize(tiny, forms[kind], board="zcu102", progress=False)
+    np.testing.assert_array_equal(made(samples), int8(samples))
+
+
+def test_a_board_says_whether_and_how_fast(int8: bd.Network) -> None:
+    found = bd.check(int8, "zcu102")
+    assert found
+    assert not found.failed
+    speed = bd.predict(int8, ["zcu102", bd.Board.load("vck190")], size=(3000, 2000))
+    frame = speed.to_pandas()
+    assert list(frame.index) == ["zcu102 B4096, tiles of 640", "vck190 C32B3, tiles of 640"]
+    assert frame.attrs["units"]["swath"] == "s"
+    tidy = speed.to_pandas(tidy=True)
+    fps = tidy[tidy.figure == "fps"].iloc[0]
+    assert fps.low < fps.value < fps.high
+    assert fps["mode"] == "predicted"
+    one = bd.predict(int8, "zcu102")
+    assert one.layers.plot("time").get_xlabel() == "time (ms/batch)"
+
+
+def test_a_table_is_a_document_and_shows_itself(int8: bd.Network, tmp_path: Path) -> None:
+    table = bd.predict(int8, "all")
+    document = json.loads(table.save(tmp_path / "figures.json").read_text())
+    jsonschema.validate(document, json.loads(SCHEMA_PATH.read_text(encoding="utf-8")))
+    assert document["inputs"][0]["sha256"] == int8.sha256
+    assert document == {**table.to_dict(), "host": document["host"]}
+    page = table._repr_html_()
+    assert page.count("<tr>") == len(table.rows) + 1
+    assert 'title="cost model fitted on published networks' in page
+    assert len(repr(table)) < 200
+
+
+def test_a_kit_holds_what_a_board_computes(int8: bd.Network, tmp_path: Path) -> None:
+    folder = bd.Board.load("zcu102").kit(int8, tmp_path / "kit", tile=32)
+    core = bd.Network.load(folder / "core.onnx")
+    assert core(np.load(folder / "input.npy")) == pytest.approx(np.load(folder / "expected.npy"))
+    assert (folder / "measure.py").read_text(encoding="utf-8").startswith("#!/usr/bin/env python3")
+
+
+def test_a_pair_is_read_as_evaluate_reads_it(pair: bd.Pair, tmp_path: Path) -> None:
+    degraded, reference = pair
+    assert degraded.shape == reference.shape == pair.clean.shape == (70, 70)
+    saved = bd.evaluate(["traditional-fast"], pair.save(tmp_path / "pairs"), progress=False)
+    ways: dict[str, Any] = {"chain": "traditional-fast", "half": lambda dn: dn / 2, "mine": Tiny()}
+    held = bd.evaluate(ways, [pair], progress=False)
+    names = {row.name: row.figures for row in held.rows if row.table == "mean"}
+    assert set(names) >= {"degraded", "chain", "half", "mine"}
+    assert names["chain"]["PSNR"].value == next(
+        row.figures["PSNR"].value for row in saved.rows if row.name == "traditional-fast"
+    )
+    assert (names["chain"]["PSNR"].value or 0) > (names["half"]["PSNR"].value or 0)
+    assert pair._repr_html_().count("<img") == 3
+
+
+def test_tensors_and_masks_come_back_as_they_went(raw: np.ndarray) -> None:
+    expected = bd.restore(raw, SMALL)
+    tensor = bd.restore(torch.from_numpy(raw), SMALL)
+    assert torch.equal(tensor, torch.from_numpy(expected))
+    for pixels, missing in ((raw, 65535), (raw.astype(np.float32), np.nan)):
+        masked = np.ma.array(pixels, mask=raw < 400)
+        restored = bd.restore(masked, SMALL)
+        marked = np.where(masked.mask, pixels.dtype.type(missing), pixels)
+        plain = bd.restore(marked, SMALL, nodata=None if missing != missing else missing)
+        np.testing.assert_array_equal(restored.mask, masked.mask)
+        np.testing.assert_array_equal(restored.compressed(), plain[~masked.mask])
+
+
+def test_bands_are_told_by_name(raw: np.ndarray) -> None:
+    xarray = pytest.importorskip("xarray", reason="no xarray")
+    bands = np.stack([raw, raw[::-1], raw // 2])
+    expected = bd.restore(bands, SMALL)
+    last = xarray.DataArray(np.moveaxis(bands, 0, -1), dims=("y", "x", "band"), coords={"band": [1, 2, 3]})
+    restored = bd.restore(last, SMALL)
+    assert restored.dims == last.dims
+    np.testing.assert_array_equal(restored.transpose("band", "y", "x").values, expected)
+    scaled = xarray.DataArray((raw // 16).astype(np.uint8), dims=("y", "x"), attrs={"full_scale": 255})
+    assert bd.restore(scaled, SMALL).dtype == np.uint8
+
+
+def test_the_traditional_pipeline_restores_arrays_as_files(raw: np.ndarray, tmp_path: Path) -> None:
+    tifffile.imwrite(tmp_path / "raw.tif", raw)
+    steps: list[Step] = []
+    run = bd.restore(
+        tmp_path / "raw.tif",
+        method="traditional",
+        sensor="pleiades-degraded",
+        out=tmp_path / "r.tif",
+        progress=steps.append,
+    )
+    assert steps[-1].done == steps[-1].total == len(raw)
+    assert run.time_s > 0
+    array = bd.restore(raw, method="traditional", sensor="pleiades-degraded")
+    np.testing.assert_array_equal(array, tifffile.imread(run.path))
+
+
+REFUSED: dict[str, tuple[Callable[[np.ndarray], object], type[Exception], str]] = {
+    "bands last": (lambda raw: bd.restore(np.stack([raw] * 3, -1)), ValueError, "moveaxis"),
+    "no array": (lambda _: bd.restore(3), ValueError, "got int"),
+    "a path alone": (lambda _: bd.restore("raw.tif"), ValueError, "out: expected a path"),
+    "an array with out": (lambda raw: bd.restore(raw, out="a.tif"), ValueError, "expected none beside an array"),
+    "no such sensor": (lambda raw: bd.restore(raw, sensor="none"), ValueError, "expected one of"),
+    "no such network": (lambda raw: bd.restore(raw, "none"), ValueError, "a shipped network"),
+    "no network": (lambda _: bd.Network.load(3), ValueError, r"torch.nn.Module"),  # type: ignore[arg-type]
+    "no method": (lambda raw: bd.restore(raw, method="x"), ValueError, "method: exp"),  # type: ignore[arg-type]
+    "8 bits": (lambda raw: bd.restore(raw.astype(np.uint8)), ValueError, "full_scale"),
+    "shares": (lambda raw: bd.restore(raw / 4095), ValueError, "full_scale"),
+    "other channels": (
+        lambda raw: bd.quantize(Tiny(), raw[None, None, :32, :32].repeat(3, 1)),
+        ValueError,
+        "1 channel",
+    ),
+    "not 0..1": (lambda raw: bd.quantize(Tiny(), raw[None, None]), ValueError, "values in"),
+    "INT8 again": (lambda _: bd.quantize(f"{SMALL}-int8"), ValueError, "got an INT8 one"),
+    "no float network": (lambda _: bd.gate(f"{SMALL}-int8"), ValueError, "against: expected the float network"),
+    "no limit": (lambda _: bd.gate(f"{SMALL}-int8", SMALL, limits={"maee": 1}), ValueError, "named mae"),
+    "no DPU": (lambda _: bd.check(f"{SMALL}-int8", "host-cpu"), ValueError, "a target with a DPU"),
+    "no board": (lambda _: bd.predict(SMALL, "none"), ValueError, "expected one of"),
+    "no size": (lambda _: bd.simulate(size=0), ValueError, "size: expected"),
+    "other sizes": (lambda raw: bd.simulate(size=48).psnr(raw), ValueError, "one of shape"),
+    "no figure": (lambda _: bd.sensors().plot("x"), ValueError, "figure: expected one of"),
+    "no number": (lambda _: bd.Sensor.load("blind").replace(mtf=1), ValueError, "mtf_nyquist"),
+}
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_bad_input_is_one_sentence_and_the_class_that_one_expects(case: str, raw: np.ndarray) -> None:
+    call, kind, words = REFUSED[case]
+    with pytest.raises(kind, match=words) as caught:
+        call(raw)
+    assert isinstance(caught.value, bd.BeersError)
+    assert "--" not in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.slow
+def test_from_raw_images_to_a_kit(tmp_path: Path) -> None:
+    sensor = bd.Sensor.load("pleiades-degraded")
+    raws = [bd.simulate(sensor=sensor, size=1200, seed=seed).degraded for seed in (0, 1)]
+    found = bd.characterize(raws, bits=12, progress=False)
+    assert found.mtf_nyquist.low == pytest.approx(0.07, abs=0.02)
+    assert found.evidence is not None
+    low, high = found.evidence.rows[0].figures["MTF across at Nyquist"].interval or (0, 0)
+    assert low < 7 < high
+    study = bd.tradeoff([SMALL], sensor=found, board="zcu104", budget="latency<=60s", progress=False)
+    assert study.best is not None
+    assert study.plot().get_xlabel().startswith("board latency")
+    assert "recommended" in str(study)
+    assert study.report(tmp_path / "study").read_text(encoding="utf-8").startswith("<!doctype html>")
+    assert (bd.Board.load("zcu104").kit(study.best.network, tmp_path / "kit") / "core.onnx").is_file()
