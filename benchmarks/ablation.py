@@ -17,10 +17,11 @@ import numpy as np
 from beers_deploy.export import float_model
 from beers_deploy.network import float_file
 from beers_deploy.profiles import load_sensor
-from beers_deploy.quant.calibration import PATCH_PX, Calibration
+from beers_deploy.quant.calibration import Calibration
 from beers_deploy.quant.gate import compare
 from beers_deploy.quant.passes.equalise import first_guess
 from beers_deploy.quant.quantise import quantise_model
+from beers_deploy.quant.samples import PATCH_PX
 from beers_deploy.quant.session import open_any_size
 
 ALL, PAIR = "all passes", "without half-LSB pair"

@@ -43,8 +43,9 @@ from beers_deploy.model.simulator.sampling import read_scene
 from beers_deploy.model.training.losses import LossWeights, RestorationLoss
 from beers_deploy.model.training.patches import PatchRecipe, PatchSource
 from beers_deploy.profiles import load_sensor
-from beers_deploy.quant.calibration import Calibration, Patches, draw_patches
+from beers_deploy.quant.calibration import Calibration, draw_patches
 from beers_deploy.quant.quantise import quantise_model
+from beers_deploy.quant.samples import Patches
 from beers_deploy.quant.session import open_any_size
 from beers_deploy.quant.tiling.walk import tiling_of
 

@@ -35,9 +35,9 @@ def main() -> None:
 
 def ours(way: str, network: Path, images: np.ndarray, out: Path) -> None:
     """The host file of `quantize`, of these images (K, 1, H, W) in [0, 1]."""
-    from beers_deploy.quant.calibration import Patches, Remade
     from beers_deploy.quant.free import quantise_free
     from beers_deploy.quant.quantise import quantise_model
+    from beers_deploy.quant.samples import Patches, Remade
 
     def image(number: int) -> np.ndarray:
         return images[number : number + 1]

@@ -23,8 +23,8 @@ from beers_deploy.dpu.reading import network_of
 from beers_deploy.export import to_onnx
 from beers_deploy.model.convbeers import ConvBEERS, initialise
 from beers_deploy.model.variants import Variant
-from beers_deploy.quant.calibration import Patches, Remade
 from beers_deploy.quant.quantise import quantise_model
+from beers_deploy.quant.samples import Patches, Remade
 from beers_deploy.quant.tiling.walk import tiling_of
 
 SHAPES = "4x16,8x32,16x32,16x64,2x32@2,4x32@2,8x32@2,4x48@2,8x48@2,3x64@2,4x64@2,2x64@4,4x96@4,4x128@4"

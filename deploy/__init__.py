@@ -13,10 +13,21 @@ for. Inside:
 - `cli` and `commands`: a file a command, which parses options, calls one function and prints.
 """
 
+from typing import Any
+
 import lazy_loader
 
 import beers_deploy.quant  # noqa: F401  # switches telemetry off before a module here loads a runtime
+from beers_deploy.profiles.errors import missing_extra
 
 __version__ = "0.1.0"
 
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+_loaded, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+
+
+def __getattr__(name: str) -> Any:
+    """What is offered under a name, loaded now."""
+    try:
+        return _loaded(name)
+    except ModuleNotFoundError as error:
+        raise missing_extra(error, name) from error

@@ -43,7 +43,7 @@ from beers_deploy.commands import (
 )
 from beers_deploy.commands.shared import results_to
 from beers_deploy.model.progress import reporting
-from beers_deploy.profiles.errors import BeersError, OutsideRangeWarning, visible
+from beers_deploy.profiles.errors import BeersError, OutsideRangeWarning, missing_extra, visible
 
 CRASHED, INTERRUPTED = 70, 130
 """Exit codes of a fault in this program (sysexits' EX_SOFTWARE), and of Ctrl-C."""
@@ -74,21 +74,14 @@ def command(function: Callable[..., None]) -> Callable[..., None]:
         try:
             with reporting(False if quiet else None):
                 function(*given, **named)
-            return
         except (typer.Exit, typer.Abort):
             raise
-        except BeersError as error:
-            message, code = in_options(str(error), function), 2
-        except MemoryError:
-            message, code = "memory: expected enough for this input, got none left; give a smaller image or tile.", 2
-        except KeyboardInterrupt:
-            message, code = "interrupted", INTERRUPTED
-        except Exception as error:  # noqa: BLE001 - whatever it is must not look like a failed gate
-            message, code, verbose = f"a fault of this program, please report it: {error!r}", CRASHED, True
-        if verbose:
-            traceback.print_exc()
-        typer.echo(f"beers-deploy: {message}", err=True)
-        raise typer.Exit(code)
+        except (Exception, KeyboardInterrupt) as error:  # noqa: BLE001 - no fault must look like a failed gate
+            message, code = ending(error, function)
+            if verbose or code == CRASHED:
+                traceback.print_exc()
+            typer.echo(f"beers-deploy: {message}", err=True)
+            raise typer.Exit(code) from None
 
     signature, more = inspect.signature(function), {"quiet": Quiet, "verbose": Verbose}
     kind = inspect.Parameter.KEYWORD_ONLY
@@ -97,6 +90,19 @@ def command(function: Callable[..., None]) -> Callable[..., None]:
     run.__signature__ = signature.replace(parameters=own)  # type: ignore[attr-defined]
     run.__annotations__ = {**function.__annotations__, **more}
     return run
+
+
+def ending(error: BaseException, function: Callable[..., None]) -> tuple[str, int]:
+    """What a command says of an error that ends it, and its exit code."""
+    if isinstance(error, ModuleNotFoundError):
+        error = missing_extra(error, function.__name__)
+    if isinstance(error, BeersError):
+        return in_options(str(error), function), 2
+    if isinstance(error, MemoryError):
+        return "memory: expected enough for this input, got none left; give a smaller image or tile.", 2
+    if isinstance(error, KeyboardInterrupt):
+        return "interrupted", INTERRUPTED
+    return f"a fault of this program, please report it: {error!r}", CRASHED
 
 
 def in_options(message: str, function: Callable[..., None]) -> str:

@@ -34,11 +34,7 @@ class Cluster:
 
     @property
     def slots(self) -> int:
-        """Calls that run at once: the threads of all workers.
-
-        Raises:
-            MachineError: the scheduler is gone.
-        """
+        """Calls that run at once: the threads of all workers."""
         try:
             return sum(self._client.nthreads().values())
         except OSError as error:
@@ -50,11 +46,7 @@ class Cluster:
         return standing
 
     def result(self, call: "Future[T]") -> T:
-        """What a call returns, as soon as it has.
-
-        Raises:
-            MachineError: the scheduler is gone, or there was no worker for a minute.
-        """
+        """What a call returns, as soon as it has."""
         seen_s = time.monotonic()
         while True:
             try:
@@ -71,12 +63,7 @@ def _itself(value: T) -> T:
 
 @contextmanager
 def open_cluster(scheduler: str | None) -> Iterator[Cluster | None]:
-    """The workers of a scheduler by its address; None where no address is given.
-
-    Raises:
-        MachineError: Dask is not installed, no scheduler or worker answers, a worker has other versions, or workers
-            are lost while the block runs.
-    """
+    """The workers of a scheduler by its address; None where no address is given."""
     if scheduler is None:
         yield None
         return

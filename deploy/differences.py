@@ -77,11 +77,7 @@ class Changes:
 
 
 def broken(found: Changes, limits: Sequence[Limit]) -> list[str]:
-    """What fails a job, a line each: changes beyond a limit, and figures with a limit that are gone.
-
-    Raises:
-        OptionError: a limit for a figure that neither document holds.
-    """
+    """What fails a job, a line each: changes beyond a limit, and figures with a limit that are gone."""
     known = {place[2] for place in (*(change.place for change in found.both), *found.gone, *found.new)}
     for limit in limits:
         if limit.name not in known:
@@ -94,11 +90,7 @@ def broken(found: Changes, limits: Sequence[Limit]) -> list[str]:
 
 
 def parse_limit(text: str) -> Limit:
-    """Read NAME>CHANGE or NAME<CHANGE, the change in the figure's unit or in %.
-
-    Raises:
-        OptionError: another text.
-    """
+    """Read NAME>CHANGE or NAME<CHANGE, the change in the figure's unit or in %."""
     found = LIMIT.fullmatch(text.strip())
     if found is None:
         remedy = "write 'MAE>2%' or 'PSNR<-0.05'"
@@ -107,11 +99,7 @@ def parse_limit(text: str) -> Limit:
 
 
 def read_document(path: Path) -> dict[str, object]:
-    """A results document.
-
-    Raises:
-        OptionError: missing, or not one.
-    """
+    """A results document."""
     try:
         document = read_json(path)
         schema = Draft202012Validator(json.loads(SCHEMA_PATH.read_text(encoding="utf-8")))

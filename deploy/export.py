@@ -33,20 +33,13 @@ def float_for(path: Path, name: str, sensor: Sensor, tile_px: int | None = None)
         name: that it is listed under.
         sensor: whose images it is to restore.
         tile_px: as in `to_onnx`.
-
-    Raises:
-        ModelError: no such network's weights.
     """
     found = read_conditioned(path)
     return banked_to_onnx(found, sensor.nominal(), about(name, found.recipe, sensor.name), tile_px)
 
 
 def to_onnx(network: "Weights | ConvBEERS", about: dict[str, str], tile_px: int | None = None) -> onnx.ModelProto:
-    """A plain network as an ONNX model; `tile_px` fixes one square image, None leaves number and size free.
-
-    Raises:
-        OptionError: a tile that is no multiple of the network's scale.
-    """
+    """A plain network as an ONNX model; `tile_px` fixes one square image, None leaves number and size free."""
     scale = network.variant.scale
     require_tile(tile_px, scale)
     writer = GraphWriter()
@@ -69,9 +62,6 @@ def banked_to_onnx(
         sensor: whose images are restored.
         about: metadata.
         tile_px: side of a fixed square image, or None for any number and size.
-
-    Raises:
-        OptionError: a tile that is no multiple of the network's scale.
     """
     variant, bank = weights.variant, network_bank(sensor)
     scale, pixels = variant.scale, variant.pixels
@@ -120,11 +110,7 @@ def _ended(
 
 
 def require_tile(tile_px: int | None, scale: int) -> None:
-    """Refuse a side that a network at 1 / `scale` of the resolution cannot rearrange.
-
-    Raises:
-        OptionError: such a side.
-    """
+    """Refuse a side that a network at 1 / `scale` of the resolution cannot rearrange."""
     if tile_px is not None and tile_px % scale:
         remedy = "choose another, or leave it out"
         raise OptionError("tile", expected=f"a multiple of {scale} px", got=f"{tile_px} px", remedy=remedy)
@@ -140,9 +126,6 @@ def parity(network: "ConvBEERS | OfOneSensor", model: Path | onnx.ModelProto, si
     """Largest absolute difference between torch and onnxruntime on one random image, in [0, 1] of full scale.
 
     The image's side is the next multiple of the network's scale.
-
-    Raises:
-        ModelError: the network gives NaN or infinity; then nothing can be compared.
     """
     import torch  # seconds to load, and a restoration begins with what this module writes
 
@@ -159,11 +142,7 @@ def parity(network: "ConvBEERS | OfOneSensor", model: Path | onnx.ModelProto, si
 
 
 def require_parity(network: "ConvBEERS | OfOneSensor", model: Path | onnx.ModelProto, side_px: int) -> float:
-    """As `parity`, and small.
-
-    Raises:
-        ModelError: the network gives NaN or infinity, or both do not compute the same.
-    """
+    """As `parity`, and small."""
     difference = parity(network, model, side_px)
     if difference > MAX_DIFFERENCE:
         expected = f"at most {MAX_DIFFERENCE:g} of full scale from torch"
@@ -183,11 +162,7 @@ def _moved(writer: GraphWriter, operator: str, name: str, source: str, scale: in
 
 
 def float_model(path: Path) -> onnx.ModelProto:
-    """A float network as ONNX: from an .onnx file, or from the .safetensors file of a plain one.
-
-    Raises:
-        ModelError: neither of these.
-    """
+    """A float network as ONNX: from an .onnx file, or from the .safetensors file of a plain one."""
     if path.suffix != ".safetensors":
         return load_onnx(path)
     weights = read_plain(path)
@@ -204,11 +179,7 @@ def about(variant: str, recipe: dict[str, object], sensor: str | None = None) ->
 
 
 def torch_network(path: Path, sensor: Instrument | None = None) -> "ConvBEERS | OfOneSensor":
-    """The network of torch that an exported one must compute as: of weights, for a sensor where they need one.
-
-    Raises:
-        ModelError: no such weights.
-    """
+    """The network of torch that an exported one must compute as: of weights, for a sensor where they need one."""
     from beers_deploy.model.convbeers import BankedConvBEERS, OfOneSensor, network_of, vector_tensor
 
     network = network_of(read_plain(path) if sensor is None else read_conditioned(path))

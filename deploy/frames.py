@@ -21,7 +21,7 @@ def figures_of(rows: Sequence[Row]) -> list[str]:
 
 
 def _index(rows: Sequence[Row]) -> Any:
-    pandas = optional("pandas", "to_pandas", "notebook")
+    pandas = optional("pandas", "to_pandas")
     if len({row.table for row in rows}) > 1:
         return pandas.MultiIndex.from_tuples([(row.table, row.name) for row in rows], names=["table", "name"])
     return pandas.Index([row.name for row in rows], name=rows[0].table if rows else "name")
@@ -29,7 +29,7 @@ def _index(rows: Sequence[Row]) -> Any:
 
 def wide_frame(rows: Sequence[Row]) -> "pd.DataFrame":
     """One line a row, a column a figure and a column for each word beside them; units in `attrs["units"]`."""
-    pandas = optional("pandas", "to_pandas", "notebook")
+    pandas = optional("pandas", "to_pandas")
     columns: dict[str, list[object]] = {}
     for key in figures_of(rows):
         columns[key] = [row.figures[key].value if key in row.figures else None for row in rows]
@@ -43,7 +43,7 @@ def wide_frame(rows: Sequence[Row]) -> "pd.DataFrame":
 
 def tidy_frame(rows: Sequence[Row]) -> "pd.DataFrame":
     """One line a figure: its table, row and name, value, unit, mode, interval and source (or why there is none)."""
-    pandas = optional("pandas", "to_pandas", "notebook")
+    pandas = optional("pandas", "to_pandas")
     lines = [
         {
             "table": row.table,
@@ -73,7 +73,7 @@ def bars(rows: Sequence[Row], figure: str | None, ax: "Axes | None") -> "Axes":
     shown = [
         (row.name, row.figures[key]) for row in rows if key in row.figures and row.figures[key].value is not None
     ]
-    axes: Any = ax if ax is not None else optional("matplotlib.pyplot", "plot", "report").subplots()[1]
+    axes: Any = ax if ax is not None else optional("matplotlib.pyplot", "plot").subplots()[1]
     for place, (_, each) in enumerate(shown):
         axes.barh(place, each.value, color=COLOURS[each.mode])
         if each.interval:

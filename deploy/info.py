@@ -42,11 +42,6 @@ def info_row(image: Path, options: Options, target: TargetProfile, measure: bool
         options: as a restoration would be given them.
         target: the board whose time is predicted.
         measure: whether tiles are timed here.
-
-    Raises:
-        ImageError: no such image, damaged, or one that cannot be followed.
-        ModelError: a network that cannot be tiled.
-        OptionError: options that do not go together.
     """
     network = load_onnx(options.model)
     with open_source(image, options.trust_index) as source:
@@ -97,7 +92,7 @@ def _code(keys: Any) -> str:
 
 
 def _not_measured() -> Figure:
-    return unavailable("s", "no tile was timed here: ask for it to be measured")
+    return unavailable("s", "no tile was timed here: --measure times some")
 
 
 def time_here(network: onnx.ModelProto, plan: Plan, options: Options) -> Figure:

@@ -225,7 +225,7 @@ def _restore(image: Any, job: Job) -> Any:
 
 def _restore_traditionally(bands: np.ndarray, raster: Raster, job: Job) -> np.ndarray:
     """Each band by the traditional pipeline; missing pixels stay as they are."""
-    torch = optional("torch", "method", "torch")
+    torch = optional("torch", "method")
     from beers_deploy.model.traditional.pipeline import Chain, restore_traditional
 
     chain = Chain(job.sensor.nominal(), job.sensor.reference.nominal(), job.quality)
@@ -324,11 +324,7 @@ class Task:
     tiling: Tiling
 
     def restorer(self, window: np.ndarray) -> Restorer:
-        """For this process, at the full scale that was asked for or that the window's pixels tell.
-
-        Raises:
-            ImageError: they leave it open.
-        """
+        """For this process, at the full scale that was asked for or that the window's pixels tell."""
         largest = (self.raster.largest(part) for part in (window,))
         full_scale = settled_scale(NAME, self.raster.dtype, largest, self.full_scale)
         return Restorer(self.raster, open_packed(self.network), full_scale, self.tiling, NAME)
@@ -357,11 +353,7 @@ def restore_lazily(bands: Any, raster: Raster, options: Options) -> Any:
 
 
 def restore_tile(task: Task, window: np.ndarray, top: int, left: int, row: Span, column: Span) -> np.ndarray:
-    """The kept pixels (bands, h, w) of one tile, from a window (bands, ., .) whose first pixel is at (top, left).
-
-    Raises:
-        ImageError: values outside 0 to full scale, or a full scale left open.
-    """
+    """The kept pixels (bands, h, w) of one tile, from a window (bands, ., .) whose first pixel is at (top, left)."""
     restorer = task.restorer(window)
     here = Span(*(side - left for side in (column.start, column.stop, column.keep_start, column.keep_stop)))
     strip = checked_strip(task.raster, top, window, restorer.full_scale, NAME)

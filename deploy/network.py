@@ -131,11 +131,7 @@ class Network:
         return Network(made, f"{self.name}-core")
 
     def __call__(self, images: Any) -> np.ndarray:
-        """What the network makes of images (N, C, H, W) in [0, 1]: (N, C', H', W') float32.
-
-        Raises:
-            ModelError: images that it does not take.
-        """
+        """What the network makes of images (N, C, H, W) in [0, 1]: (N, C', H', W') float32."""
         return result_of(self._session, np.ascontiguousarray(images, np.float32))
 
     @cached_property
@@ -199,13 +195,8 @@ class Network:
 
 
 def exported(module: Any, example: Sequence[int]) -> onnx.ModelProto:
-    """A module of torch as ONNX, for any number and size of images.
-
-    Raises:
-        ModelError: no module, or one that torch does not export.
-        MissingExtraError: torch is not installed.
-    """
-    torch = optional("torch", "network", "torch")
+    """A module of torch as ONNX, for any number and size of images."""
+    torch = optional("torch", "network")
     if not isinstance(module, torch.nn.Module):
         expected = "a Network, a ModelProto, a torch.nn.Module, a file or a shipped name"
         remedy = "give one of these"
@@ -244,11 +235,7 @@ class Conditioned:
     weights: Path
 
     def model(self, sensor: Sensor, int8: bool) -> onnx.ModelProto:
-        """The network told a sensor, in float32 or in INT8.
-
-        Raises:
-            ModelError: INT8 of other weights than the shipped ones, which must be calibrated first.
-        """
+        """The network told a sensor, in float32 or in INT8."""
         if not int8:
             return float_for(self.weights, self.name, sensor)
         shipped = SHIPPED / f"{self.name}{INT8}.onnx"
@@ -259,11 +246,7 @@ class Conditioned:
 
 
 def conditioned(given: Path | None) -> Conditioned | None:
-    """The network to be told its sensor that is meant, None meaning the default one; None for any other file.
-
-    Raises:
-        ModelError: weights that cannot be read.
-    """
+    """The network to be told its sensor that is meant, None meaning the default one; None for any other file."""
     if given is None:
         return Conditioned(VARIANT, shipped_weights(VARIANT))
     if _is_shipped(given):
@@ -280,11 +263,7 @@ def weights_file(given: Path) -> Path:
 
 
 def weights_named(given: Path) -> Path:
-    """As `weights_file`, of a name.
-
-    Raises:
-        ModelError: no network of that name is shipped.
-    """
+    """As `weights_file`, of a name."""
     shipped_weights(given.name.removesuffix(INT8))
     return weights_file(given)
 
@@ -301,12 +280,7 @@ def in_int8(given: Path) -> Path:
 
 
 def pair_of(floating: Path | None, int8: Path | None) -> tuple[Path, Path]:
-    """A float network and its INT8: the files given, or a shipped pair by its name, the default one if None.
-
-    Raises:
-        OptionError: a file without its INT8, which have nothing to do with each other.
-        ModelError: no network of that name is shipped.
-    """
+    """A float network and its INT8: the files given, or a shipped pair by its name, the default one if None."""
     name = Path(VARIANT) if floating is None else floating
     if int8 is None and not name.suffix and not name.exists():
         shipped_weights(name.name)
@@ -323,9 +297,6 @@ def network_file(given: Path | None, sensor: Sensor, log: Log = no_log) -> Path:
         given: a file, or a shipped name where no such file lies; None is the default network in INT8.
         sensor: what a conditioned network is told: the middle of each of its ranges.
         log: is told what of the sensor lies outside the range that was trained.
-
-    Raises:
-        ModelError: weights that cannot be read, or a name that is neither a file's nor a shipped network's.
     """
     if given is not None and not (given.suffix or given.exists() or _is_shipped(given)):
         expected = f"a file, or a shipped network ({', '.join(shipped_names())}, each also with {INT8})"
@@ -335,32 +306,19 @@ def network_file(given: Path | None, sensor: Sensor, log: Log = no_log) -> Path:
 
 
 def float_file(given: Path | None, sensor: Sensor, log: Log = no_log) -> Path:
-    """As `network_file`, a conditioned network always in float32.
-
-    Raises:
-        ModelError: weights that cannot be read.
-    """
+    """As `network_file`, a conditioned network always in float32."""
     found = conditioned(given)
     return _written(found, sensor, False, log) if found else given or Path()
 
 
 def int8_file(given: Path | None, sensor: Sensor, log: Log = no_log) -> Path:
-    """As `network_file`, a conditioned network always in INT8.
-
-    Raises:
-        ModelError: weights that cannot be read, or that are not calibrated yet.
-    """
+    """As `network_file`, a conditioned network always in INT8."""
     found = conditioned(given)
     return _written(found, sensor, True, log) if found else given or Path()
 
 
 def shipped_pair(name: str = VARIANT, sensor: str = SENSOR, log: Log = no_log) -> tuple[Path, Path]:
-    """A shipped network in float32 and in INT8, told a sensor.
-
-    Raises:
-        ModelError: no network of that name is shipped.
-        ProfileError: no such sensor.
-    """
+    """A shipped network in float32 and in INT8, told a sensor."""
     known, given = load_sensor(sensor), Path(shipped_weights(name).stem)
     return float_file(given, known, log), int8_file(given, known, log)
 
@@ -418,9 +376,6 @@ def told_int8(
         sensor: of which the middle is taken.
         more: metadata to add.
         log: is told what of the sensor lies outside the range that was trained.
-
-    Raises:
-        ModelError: no such file.
     """
     warn_outside(sensor, log)
     known = sensor.nominal()
@@ -429,11 +384,7 @@ def told_int8(
 
 
 def told_by_delta(model: onnx.ModelProto, delta: Path) -> onnx.ModelProto:
-    """An INT8 network behind a bank told the sensor of a delta, a file that `export --delta` wrote.
-
-    Raises:
-        ModelError: no such network, no delta, or one of another network.
-    """
+    """An INT8 network behind a bank told the sensor of a delta, a file that `export --delta` wrote."""
     try:
         packed = delta.read_bytes()
     except OSError as error:
@@ -455,9 +406,6 @@ def family_model(
         images: folder of scenes that the family sees while it is calibrated; None draws some.
         seed: of the patches.
         shifts: the windows of the target.
-
-    Raises:
-        ModelError: other weights.
     """
     from beers_deploy.model.simulator.procedural import load_scenes  # torch, which a restoration does not need
     from beers_deploy.quant.banked.calibrate import family_images, quantise_family

@@ -127,7 +127,7 @@ def simulate(
     if not 1 <= size <= LARGEST_PX:
         remedy = "give another, or simulate a data set with beers-deploy simulate"
         raise OptionError("size", expected=f"1 to {LARGEST_PX} pixels", got=str(size), remedy=remedy)
-    optional("torch", "simulate", "torch")
+    optional("torch", "simulate")
     from beers_deploy.model.simulator.acquire import acquire_three, prepare_scene
     from beers_deploy.model.simulator.detector import Draw, to_uint16
 

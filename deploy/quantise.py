@@ -21,7 +21,7 @@ from beers_deploy.network import (
     family_model,
     told_int8,
 )
-from beers_deploy.profiles.errors import OptionError
+from beers_deploy.profiles.errors import OptionError, optional
 from beers_deploy.profiles.figures import Row
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.profiles.target import DEFAULT_TARGET, TargetProfile, board_names
@@ -31,7 +31,6 @@ from beers_deploy.quant.free import quantise_free
 from beers_deploy.quant.gate import compare, gate_row
 from beers_deploy.quant.integer import integer_rows
 from beers_deploy.quant.onnx_file import require_quantised
-from beers_deploy.quant.passes.tune import Tuning
 from beers_deploy.quant.quantise import quantise_model
 from beers_deploy.quant.samples import OwnSamples, samples_of
 from beers_deploy.quant.sensitivity import WORST, headline, layer_error_rows, sizes_row, spread_of, worst_row
@@ -40,7 +39,9 @@ from beers_deploy.report.page import Report
 from beers_deploy.report.sensitivity_page import sensitivity_page
 
 if TYPE_CHECKING:
-    from beers_deploy.quant.calibration import Calibration, Patches
+    from beers_deploy.quant.calibration import Calibration
+    from beers_deploy.quant.passes.tune import Tuning
+    from beers_deploy.quant.samples import Patches
 
 Source: TypeAlias = "Calibration | OwnSamples"
 """Where patches come from: simulated ones, or a user's own."""
@@ -114,7 +115,8 @@ def _conditioned(network: NetworkLike) -> Conditioned | None:
 
 
 def _simulated(sensor: Sensor, images: Path | None, patches: int, patch_px: int, seed: int) -> "Calibration":
-    from beers_deploy.quant.calibration import Calibration  # it takes torch
+    optional("torch", "samples")  # which simulates
+    from beers_deploy.quant.calibration import Calibration
 
     return Calibration(sensor, images, patches, patch_px, seed)
 
@@ -127,12 +129,19 @@ def _free(origin: Network, calibration: Source) -> Network:
 
 def _legal(origin: Network, calibration: Source, target: TargetProfile, finetune: int) -> Network:
     shifts = _shifts_of(target)
-    tuning = Tuning(calibration.for_tuning.pairs, finetune) if finetune else None
+    tuning = _tuning(calibration, finetune) if finetune else None
     with begun("calibrating") as step:
         about = {**calibration.about, "target": target.name}
         result = quantise_model(origin.model, calibration.drawn, about, shifts, tuning, log=step)
     layers = _layers(origin.model, result.core, result.host, calibration.drawn)
     return Network(result.host, f"{origin.name}-int8", layers=layers, quantised=result)
+
+
+def _tuning(calibration: Source, steps: int) -> "Tuning":
+    optional("torch", "finetune")
+    from beers_deploy.quant.passes.tune import Tuning
+
+    return Tuning(calibration.for_tuning.pairs, steps)
 
 
 def _banked(network: Conditioned, calibration: "Calibration", sensor: Sensor, target: TargetProfile) -> Network:

@@ -25,7 +25,7 @@ from beers_deploy.dpu.reading import network_of
 from beers_deploy.model.progress import Progress, reporting
 from beers_deploy.model.shipped import SENSOR
 from beers_deploy.network import Network, NetworkLike, SensorLike
-from beers_deploy.profiles.errors import OptionError, printable
+from beers_deploy.profiles.errors import OptionError, optional, printable
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.profiles.target import DEFAULT_TARGET, TargetProfile
 from beers_deploy.profiles.toml import read_json, unreadable
@@ -40,7 +40,7 @@ from beers_deploy.restoration.options import TILE_PX
 from beers_deploy.results import Table
 
 if TYPE_CHECKING:
-    from beers_deploy.quant.calibration import Patches
+    from beers_deploy.quant.samples import Patches
 
 PATCHES = ("sensor", "images", "patches", "seed", "samples")
 """The arguments that say what INT8 and float are compared on."""
@@ -79,11 +79,7 @@ class Verdict(Table):
         return tuple(check for check in self.checks if not check.passed)
 
     def raise_if_failed(self) -> None:
-        """Fail a test where a limit is broken.
-
-        Raises:
-            GateFailedError: each check that failed, with its value and its limit.
-        """
+        """Fail a test where a limit is broken."""
         if not self:
             raise GateFailedError(str(self))
 
@@ -215,18 +211,13 @@ def gate(
 
 
 def _pair(int8: NetworkLike, against: NetworkLike | None, sensor: Sensor) -> tuple[Network, Network]:
-    """The INT8 network and the float one, each of its precision.
-
-    Raises:
-        ModelError: one that is of the other precision.
-        OptionError: no float network.
-    """
+    """The INT8 network and the float one, each of its precision."""
+    theirs = None if against is None else Network.load(against, sensor=sensor)
     ours = Network.load(int8, sensor=sensor)
-    given = ours.origin if against is None else against
-    if given is None:
+    theirs = theirs or ours.origin
+    if theirs is None:
         remedy = "give it, or quantise it here"
         raise OptionError("against", expected=f"the float network of {ours.name}", got="none", remedy=remedy)
-    theirs = Network.load(given, sensor=sensor)
     require_quantised(theirs.model, theirs.label, wanted=False)
     require_quantised(ours.model, ours.label, wanted=True)
     return ours, theirs
@@ -244,7 +235,8 @@ def _unseen(
     """What the two are compared on, whether it is simulated, and what a reader must know of it."""
     own = samples_of(floating.model, samples)
     if own is None:
-        from beers_deploy.quant.calibration import unseen_patches  # it takes torch
+        optional("torch", "samples")  # which simulates
+        from beers_deploy.quant.calibration import unseen_patches
 
         return unseen_patches(sensor, images, patches, seed), True, ()
     calibrated = metadata(int8.model).get("calibration_sha256")
@@ -269,9 +261,6 @@ def baseline_mae(path: Path, arguments: Mapping[str, Any]) -> float:
     Args:
         path: the document.
         arguments: of this run of the gate.
-
-    Raises:
-        OptionError: no such document, or one of other patches.
     """
     try:
         document: Any = read_json(path)

@@ -201,10 +201,6 @@ def save_network(path: Path, network: Network, recipe: Mapping[str, object]) -> 
 
 
 def load_network(path: Path) -> tuple[Network, dict[str, object]]:
-    """Read a network in evaluation mode, plain or behind a bank, and its recipe.
-
-    Raises:
-        ModelError: not our weights, of another shape, or for other ranges of sensors than this version's.
-    """
+    """Read a network in evaluation mode, plain or behind a bank, and its recipe."""
     found = read_weights(path)
     return network_of(found), found.recipe

@@ -75,11 +75,7 @@ class Window:
 
 
 def plan_windows(recipe: DatasetRecipe) -> list[Window]:
-    """Every patch of a dataset, in order.
-
-    Raises:
-        ImageError: a scene that holds none.
-    """
+    """Every patch of a dataset, in order."""
     windows: list[Window] = []
     for index, path in enumerate(recipe.scenes):
         found = list(_scene_windows(recipe, index, len(windows)))
@@ -130,11 +126,7 @@ class Patch(NamedTuple):
 
 
 def make_patches(recipe: DatasetRecipe, windows: list[Window]) -> list[Patch]:
-    """Simulate some patches of one scene, with one thread.
-
-    Raises:
-        ImageError: no such scene where this runs.
-    """
+    """Simulate some patches of one scene, with one thread."""
     torch.set_num_threads(1)
     radiance = load(recipe, windows[0].scene).radiance
     return [_make_patch(recipe, window, radiance) for window in windows]
@@ -182,10 +174,6 @@ def write_dataset(
 
     Returns:
         patches, and the share of drawn SNR pairs that were impossible and drawn again.
-
-    Raises:
-        OptionError: the folder holds another dataset, or this one without `resume`.
-        ImageError: a scene that cannot be read.
     """
     _check_folder(recipe, out, resume)
     if (out / "manifest.jsonl").exists():  # nothing was left to do
@@ -259,11 +247,7 @@ def _chunks(windows: list[Window]) -> Iterator[list[Window]]:
 
 
 def _read_summary(path: Path) -> dict[str, float]:
-    """Patches, and the share of SNR pairs that were drawn again.
-
-    Raises:
-        OptionError: no manifest of ours.
-    """
+    """Patches, and the share of SNR pairs that were drawn again."""
     try:
         lines: list[Any] = [parse_json(line) for line in path.read_text(encoding="utf-8").split("\n") if line]
         rejected = sum(int(line[role]["rejected_snr_pairs"]) for line in lines for role in ("degraded", "reference"))

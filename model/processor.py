@@ -147,11 +147,7 @@ SEEDS = 2**62
 
 
 def require_cores(option: str, asked: int) -> None:
-    """Refuse more threads or processes than this machine has logical cores; 0 is the option's own default.
-
-    Raises:
-        OptionError: more, or a number below 0.
-    """
+    """Refuse more threads or processes than this machine has logical cores; 0 is the option's own default."""
     cores = os.cpu_count() or 1
     if not 0 <= asked <= cores:
         expected = f"0 to {cores}, the cores of this machine"

@@ -42,12 +42,7 @@ class PairsRecipe:
 
 
 def read_pairs_recipe(folder: Path) -> PairsRecipe | None:
-    """The recipe beside a folder's pairs; None where there is none.
-
-    Raises:
-        OptionError: a recipe that is none of ours.
-        ProfileError: a sensor in it that cannot be.
-    """
+    """The recipe beside a folder's pairs; None where there is none."""
     path = folder / "recipe.json"
     if not path.exists():
         return None
@@ -65,12 +60,7 @@ def read_pairs_recipe(folder: Path) -> PairsRecipe | None:
 def profiles_for(
     sensor: SensorLike | None, reference: SensorLike | None, recipe: PairsRecipe | None, say: Callable[[str], None]
 ) -> tuple[Sensor, Sensor]:
-    """The profiles of degraded and reference images: the recipe's where there is one, else those named.
-
-    Raises:
-        OptionError: a name that contradicts the recipe.
-        ProfileError: no such profile, or a faulty one.
-    """
+    """The profiles of degraded and reference images: the recipe's where there is one, else those named."""
     if recipe is None:
         degraded = Sensor.load(sensor or SENSOR)
         return degraded, reference_beside(degraded, reference, say)

@@ -25,11 +25,7 @@ def shipped_names() -> list[str]:
 
 
 def shipped_weights(name: str) -> Path:
-    """The shipped weights of that name.
-
-    Raises:
-        ModelError: none are shipped.
-    """
+    """The shipped weights of that name."""
     if name not in shipped_names():
         remedy = "give the file that 'beers-deploy train' wrote"
         expected = f"shipped weights ({', '.join(shipped_names())})"

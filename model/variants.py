@@ -70,11 +70,7 @@ VARIANTS = {
 
 
 def variant_named(name: str) -> Variant:
-    """The variant of that name.
-
-    Raises:
-        OptionError: no such variant.
-    """
+    """The variant of that name."""
     if name not in VARIANTS:
         raise OptionError(
             "variant", expected=f"one of {', '.join(VARIANTS)}", got=repr(name), remedy="choose one of them"

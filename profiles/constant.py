@@ -49,11 +49,7 @@ class Words:
 
 
 def read_words(where: str, raw: object, known: Collection[str]) -> Words:
-    """Read `["ReLU"]` or `{ value = ["ReLU"], status = ..., source = ... }`.
-
-    Raises:
-        ProfileError: no list, or a name that is not among the known ones.
-    """
+    """Read `["ReLU"]` or `{ value = ["ReLU"], status = ..., source = ... }`."""
     value, status, source = read_stated(where, raw)
     if not isinstance(value, list) or not all(isinstance(name, str) and name in known for name in value):
         remedy = "correct the names; an empty list stands for none"
@@ -71,11 +67,7 @@ def read_constant(where: str, raw: object) -> Constant:
 
 
 def read_stated(where: str, raw: object) -> tuple[object, Status, str]:
-    """Value, status and source of what a profile states in either way; the value, of any kind, is not checked.
-
-    Raises:
-        ProfileError: no such status, or no source.
-    """
+    """Value, status and source of what a profile states in either way; the value, of any kind, is not checked."""
     if not isinstance(raw, Mapping):
         return raw, "stated", "stated by the profile without a source"
     check_keys(where, raw, required={"value", "status", "source"})

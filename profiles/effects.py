@@ -113,11 +113,7 @@ Table = Mapping[str, Constant]
 
 
 def read_effect(where: str, name: str, raw: object) -> Table:
-    """Read one effect's table of a TOML file: every key of its dataclass and no other, each within its limits.
-
-    Raises:
-        ProfileError: a wrong or missing key, or a value that cannot be.
-    """
+    """Read one effect's table of a TOML file: every key of its dataclass and no other, each within its limits."""
     keys = [field.name for field in fields(TABLES[name])]
     if not isinstance(raw, Mapping):
         raise ProfileError(where, expected=f"a table [{name}]", got=repr(raw), remedy="write it as one")

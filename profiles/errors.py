@@ -98,19 +98,30 @@ class OutsideRangeWarning(UserWarning):
     """A sensor that lies outside the range that a network was trained for; the command line prints it as a line."""
 
 
-def optional(package: str, where: str, extra: str) -> Any:
+EXTRAS = {"matplotlib": "study", "pandas": "notebook", "scipy": "study", "skimage": "study", "torch": "torch"}
+"""The extra of beers-deploy that installs a package."""
+
+
+def optional(package: str, where: str) -> Any:
     """An optional package, imported.
 
     Args:
         package: its module.
-        where: the parameter or file that needs it.
-        extra: of beers-deploy that installs it.
+        where: the parameter or verb that needs it.
 
     Raises:
         MissingExtraError: it is not installed.
     """
     try:
         return import_module(package)
-    except ImportError as error:
-        remedy = f"pip install 'beers-deploy[{extra}]'"
-        raise MissingExtraError(where, expected=f"the package {package}", got="none", remedy=remedy) from error
+    except ModuleNotFoundError as error:
+        raise missing_extra(error, where) from error
+
+
+def missing_extra(error: ModuleNotFoundError, where: str) -> Exception:
+    """The error of an optional package that is not installed; the error itself of any other module."""
+    package = (error.name or "").split(".")[0]
+    if package not in EXTRAS:
+        return error
+    remedy = f"pip install 'beers-deploy[{EXTRAS[package]}]'"
+    return MissingExtraError(where, expected=f"the package {package}", got="none", remedy=remedy)

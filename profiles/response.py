@@ -112,11 +112,7 @@ def packed(values: NDArray[np.floating]) -> str:
 
 
 def unpacked(point: PointSpread) -> NDArray[np.float64]:
-    """The samples, (height, width).
-
-    Raises:
-        ValueError: the text holds no such samples.
-    """
+    """The samples, (height, width)."""
     count_bytes = 4 * point.height * point.width
     try:
         found = zlib.decompressobj().decompress(base64.b64decode(point.samples, validate=True), count_bytes)

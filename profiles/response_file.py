@@ -36,9 +36,6 @@ def read_response(label: str, raw: Mapping[str, Any], folder: Path) -> tuple[Res
         label: names the file in errors.
         raw: the table, its keys already checked.
         folder: where the file lies, from which the path of a point-spread function counts.
-
-    Raises:
-        ProfileError: numbers or samples that no instrument can have, or a file that cannot be read.
     """
     key = "psf" if "psf" in raw else "across"
     _, status, source = read_stated(f"{label} {key}", raw[key])
@@ -55,11 +52,7 @@ def axes_of(response: Response, status: Status, source: str) -> dict[str, Any]:
 
 
 def response_from_json(label: str, raw: object) -> Response:
-    """A response from the plain values of its fields, as `dataclasses.asdict` and JSON leave them.
-
-    Raises:
-        ProfileError: values that no response has.
-    """
+    """A response from the plain values of its fields, as `dataclasses.asdict` and JSON leave them."""
     if not isinstance(raw, Mapping):
         raise ProfileError(label, expected="a table or a point-spread function", got=repr(raw), remedy="make it anew")
     if "samples" not in raw:
@@ -73,11 +66,7 @@ def response_from_json(label: str, raw: object) -> Response:
 
 
 def _require_contrast(where: str, response: Response) -> None:
-    """Refuse a blur that leaves more contrast at Nyquist than a square detector can, or none.
-
-    Raises:
-        ProfileError: either.
-    """
+    """Refuse a blur that leaves more contrast at Nyquist than a square detector can, or none."""
     limit = float(np.sinc(NYQUIST))
     for axis, contrast in zip(("across", "along"), response.at_nyquist, strict=True):
         if not 0 < contrast <= limit:
@@ -204,11 +193,7 @@ def _unpacked_again(label: str, raw: Mapping[str, Any]) -> PointSpread:
 
 
 def _read_samples(where: str, path: Path) -> Samples:
-    """The samples of a .npy or TIFF file, (H, W).
-
-    Raises:
-        ProfileError: no such file, another kind, damage, or another shape.
-    """
+    """The samples of a .npy or TIFF file, (H, W)."""
     reader = {".npy": _open_npy, ".tif": _open_tiff, ".tiff": _open_tiff}.get(path.suffix.lower())
     reason = unreadable(path) if reader else f"one that ends in {path.suffix!r}"
     if reader is None or reason:

@@ -60,11 +60,7 @@ def typical_effects() -> dict[str, Table]:
 def calling_for(
     profile: Sensor, scene: SceneCall | None, add: Collection[str] = (), forbid: Collection[str] = ()
 ) -> Sensor:
-    """The profile with a scene's effects and `add`, without `forbid`; stated values win over typical ones.
-
-    Raises:
-        OptionError: a name that is no optional effect.
-    """
+    """The profile with a scene's effects and `add`, without `forbid`; stated values win over typical ones."""
     for name in (*add, *forbid):
         if name not in TABLES:
             known = ", ".join(TABLES)

@@ -280,11 +280,7 @@ class Sensor:
 
 
 def require_same_units(degraded: Sensor, reference: Sensor) -> None:
-    """Refuse a reference that another digitiser made: its images differ from the degraded ones by a factor.
-
-    Raises:
-        ProfileError: another gain, other bits or another offset.
-    """
+    """Refuse a reference that another digitiser made: its images differ from the degraded ones by a factor."""
     if degraded.units != reference.units:
         raise ProfileError(
             f"sensor profile {reference.name}, the reference of {degraded.name}",

@@ -34,11 +34,7 @@ REFERENCE = "pleiades-reference"
 
 
 def reference_for(degraded: Sensor, name: str = REFERENCE) -> Sensor:
-    """The profile called `name` in the digital numbers of `degraded`: what a restoration of its images is held to.
-
-    Raises:
-        ProfileError: no such profile, or a faulty one.
-    """
+    """The profile called `name` in the digital numbers of `degraded`: what a restoration of its images is held to."""
     return load_sensor(name).in_units_of(degraded)
 
 
@@ -63,11 +59,7 @@ def load_sensor(name: str) -> Sensor:
 
 
 def with_numbers(sensor: Sensor, numbers: Mapping[str, Number]) -> Sensor:
-    """A sensor with other numbers; see `Sensor.replace`.
-
-    Raises:
-        ProfileError: no such number, or one that no instrument can have.
-    """
+    """A sensor with other numbers; see `Sensor.replace`."""
     where, tables = f"sensor {sensor.name}", tables_of(sensor)
     home = {key: table for table in TABLES for key in constant_keys(table)}
     for key, value in numbers.items():
@@ -127,11 +119,7 @@ def _toml(value: object) -> str:
 
 
 def sensor_from_json(label: str, raw: Mapping[str, Any]) -> Sensor:
-    """A profile from the plain values of its fields, as `dataclasses.asdict` and JSON leave them.
-
-    Raises:
-        ProfileError: keys or numbers that no profile has.
-    """
+    """A profile from the plain values of its fields, as `dataclasses.asdict` and JSON leave them."""
     known = {key for table in TABLES for key in constant_keys(table)}
     check_keys(label, raw, required={"name", "description"}, optional={*known, "effects", "response"})
     tables = {table: {key: raw[key] for key in constant_keys(table) if raw.get(key) is not None} for table in TABLES}
@@ -153,9 +141,6 @@ def read_sensor(label: str, raw: Mapping[str, Any], folder: Path = Path()) -> Se
         label: names the file in errors.
         raw: its tables.
         folder: where it lies, from which the path of a point-spread function counts.
-
-    Raises:
-        ProfileError: wrong or missing key, or numbers that no instrument can have.
     """
     check_keys(label, raw, required={"description", *TABLES}, optional=set(EFFECT_TABLES))
     stated = {table: _read_table(label, table, raw[table]) for table in TABLES}
@@ -183,11 +168,7 @@ def read_sensor(label: str, raw: Mapping[str, Any], folder: Path = Path()) -> Se
 
 
 def _read_table(label: str, table: str, content: object) -> Mapping[str, object]:
-    """The content of a table that is filled in one of its ways, and in no other.
-
-    Raises:
-        ProfileError: two ways at once, or keys too many or missing.
-    """
+    """The content of a table that is filled in one of its ways, and in no other."""
     if not isinstance(content, Mapping):
         raise ProfileError(label, expected=f"a table [{table}]", got=repr(content), remedy="write it as one")
     where, ways = f"{label} [{table}]", TABLES[table]
@@ -321,9 +302,6 @@ def reference_beside(
     """The reference profile that a user named, or the default one, in the digital numbers of `degraded`.
 
     One that was named, and states other ones, is converted in sight: `say` is told.
-
-    Raises:
-        ProfileError: no such profile, or a faulty one.
     """
     stated = Sensor.load(named or REFERENCE)
     reference = stated.in_units_of(degraded)

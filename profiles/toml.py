@@ -25,12 +25,7 @@ LINE_DOTS = 100
 
 
 def read_toml_text(path: Path) -> dict[str, object]:
-    """A TOML file as plain values; it may say inf, nan, or a whole number of up to 2 000 digits.
-
-    Raises:
-        OSError: not readable.
-        ValueError: too large, no UTF-8, no TOML (the line is quoted), nested too deeply, or with a longer number.
-    """
+    """A TOML file as plain values; it may say inf, nan, or a whole number of up to 2 000 digits."""
     text = read_whole(path, TOML_BYTES).decode("utf-8-sig")  # some editors on Windows begin with a mark
     if any(line.count(".") > LINE_DOTS for line in text.split("\n")):
         raise ValueError(f"a line with more than {LINE_DOTS} dots")
@@ -55,22 +50,12 @@ def _line_at_fault(text: str, reason: str) -> str:
 
 
 def read_json(path: Path) -> object:
-    """Read a JSON file as plain values of Python.
-
-    Raises:
-        OSError: not readable.
-        ValueError: as of `parse_json`, or too large.
-    """
+    """Read a JSON file as plain values of Python."""
     return parse_json(read_whole(path, JSON_BYTES).decode("utf-8-sig"))
 
 
 def parse_json(text: str) -> object:
-    """Read JSON text as plain values of Python.
-
-    Raises:
-        ValueError: no JSON, nested too deeply, or holding what cannot be computed with or printed: NaN, infinity,
-            numbers that float64 cannot hold, half a surrogate pair.
-    """
+    """Read JSON text as plain values of Python."""
     try:
         found: object = json.loads(text, parse_constant=_number, parse_float=_number)
     except RecursionError:
@@ -80,12 +65,7 @@ def parse_json(text: str) -> object:
 
 
 def read_whole(path: Path, limit_bytes: int) -> bytes:
-    """Read all bytes of a regular file that has at most `limit_bytes`.
-
-    Raises:
-        OSError: not readable.
-        ValueError: too large, a pointer of Git LFS, or no file: a folder, a pipe or a device, which may have no end.
-    """
+    """Read all bytes of a regular file that has at most `limit_bytes`."""
     found = path.stat()
     if reason := unreadable(path):
         raise ValueError(reason)
@@ -156,11 +136,7 @@ def profile_path(kind: str, name: str) -> Path:
 
 
 def read_toml(kind: str, name: str) -> tuple[str, dict[str, object]]:
-    """Return (label for messages, parsed table) of profile `name`.
-
-    Raises:
-        ProfileError: no such profile, not readable, or not TOML.
-    """
+    """Return (label for messages, parsed table) of profile `name`."""
     path = profile_path(kind, name)
     known = shipped_names(kind)
     if not name.endswith(".toml") and name not in known:

@@ -1,5 +1,4 @@
 from .calibration import Calibration as Calibration
-from .calibration import Patches as Patches
 from .calibration import draw_patches as draw_patches
 from .calibration import unseen_patches as unseen_patches
 from .core import IntCore as IntCore
@@ -15,6 +14,7 @@ from .onnx_file import load_onnx as load_onnx
 from .onnx_file import save_onnx as save_onnx
 from .quantise import Quantised as Quantised
 from .quantise import quantise_model as quantise_model
+from .samples import Patches as Patches
 from .session import open_session as open_session
 from .session import run as run
 from .tiling.walk import Tiling as Tiling

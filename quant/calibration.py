@@ -1,15 +1,14 @@
-"""Calibration: what values each tensor takes, seen one tile of a patch at a time.
+"""Simulated patches for calibration, and for looking at what INT8 changes.
 
 Patches are simulated anew for each pass over them, which costs a tenth of what the network does with them. So memory
 grows neither with their number nor with their size.
 """
 
-import hashlib
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Generic, TypeVar
+from typing import TypeVar
 
 import numpy as np
 import torch
@@ -25,10 +24,7 @@ from beers_deploy.model.training.patches import PatchRecipe, turn
 from beers_deploy.profiles.errors import ImageError
 from beers_deploy.profiles.sensor import Instrument, Sensor
 from beers_deploy.profiles.sensor_file import reference_for
-from beers_deploy.quant.core import CANDIDATES, squared_errors, unclipped_frac_bits
-from beers_deploy.quant.ends import ONE_CHANNEL, Ends
-from beers_deploy.quant.graph import PLANES, PLANES_FRAC_BITS, Graph, graph_to_onnx, tensors, tied
-from beers_deploy.quant.session import halo_of, open_session, tensor_values
+from beers_deploy.quant.samples import PATCH_PX, Pair, Patches, Remade
 
 VIEW_CANDIDATES = 8
 """Drawn for each that is wanted."""
@@ -93,9 +89,6 @@ def draw_views(
     """So many views, spread over brightness, MTF and noise.
 
     A scene at a scale is drawn as often as it holds patches, as training sees it.
-
-    Raises:
-        ImageError: no scene holds a patch with its margin.
     """
     places = _places(scenes, recipe)
     room = np.array([_room_px(*place) for place in places])
@@ -156,56 +149,8 @@ def _ground(place: tuple[Scene, int], recipe: PatchRecipe, generator: np.random.
     return Ground(scene, top, left, side_px, oversampling, float(generator.uniform(*recipe.exposures)))
 
 
-PATCH_PX = 128
 DEGRADED = "degraded"
 """The role whose noise a patch carries: the same in a pair and alone."""
-
-T = TypeVar("T")
-Pair = tuple[np.ndarray, np.ndarray]
-"""(degraded, reference) of a patch; the reference of a user's own sample that has none is empty."""
-
-
-@dataclass(frozen=True)
-class Remade(Generic[T]):
-    """A sequence whose items are made each time they are asked for: none is kept."""
-
-    make: Callable[[int], T]
-    count: int
-
-    def __len__(self) -> int:
-        return self.count
-
-    def __getitem__(self, number: int) -> T:
-        if not 0 <= number < self.count:
-            raise IndexError(number)
-        return self.make(number)
-
-    def __iter__(self) -> Iterator[T]:
-        return map(self.make, range(self.count))
-
-
-@dataclass(frozen=True)
-class Patches:
-    """Simulated patches, each (1, 1, P, P) float32 in [0, 1].
-
-    Attributes:
-        views: what each shows, and the sensors that saw it.
-        pairs: (degraded, reference) of each.
-        degraded: the same degraded patches alone, for half the work.
-    """
-
-    views: list[View]
-    pairs: Remade[Pair]
-    degraded: Remade[np.ndarray]
-
-    @cached_property
-    def digest(self) -> str:
-        """SHA-256 of the bytes of all pairs."""
-        digest = hashlib.sha256()
-        for pair in self.pairs:
-            for image in pair:
-                digest.update(image.tobytes())
-        return digest.hexdigest()
 
 
 def draw_patches(
@@ -260,44 +205,6 @@ def _simulate(ground: Ground, sensors: dict[str, Instrument], draw: Draw) -> lis
     mirrors, quarters = sensors[DEGRADED].symmetry
     turned = turn(torch.stack(images)[:, None], draw.generator("turn"), quarters, mirrors)
     return [np.ascontiguousarray(image[None]) for image in turned.numpy()]
-
-
-def choose_frac_bits(graph: Graph, images: Iterable[np.ndarray], ends: Ends = ONE_CHANNEL) -> dict[str, int]:
-    """Least-squares scale of every tensor of a plane-reading graph over images (1, C, H, W) in [0, 1].
-
-    Tensors that must share a scale (`quant.graph.tied`) get that of least error in all of them together.
-
-    Two passes, so images that can be passed over twice: the largest values, then the squared errors of the scales
-    around them.
-    """
-    names, halo_px = tensors(graph), halo_of(graph)
-    session = open_session(graph_to_onnx(graph, names, ends.planes * ends.channels))
-    shared = tied(graph)
-    groups = np.array([names.index(shared[name]) if shared[name] in names else -1 for name in names])
-
-    def values() -> Iterator[list[np.ndarray]]:
-        for image in images:
-            yield from tensor_values(session, names, image, halo_px, ends)
-
-    def together(of_each: np.ndarray, join: Callable[..., np.ndarray]) -> np.ndarray:
-        return np.stack([join(of_each[groups == group], axis=0) for group in groups])
-
-    largest = np.zeros(len(names))
-    for results in values():
-        largest = np.maximum(largest, [float(np.abs(r).max()) for r in results])
-    first = [unclipped_frac_bits(m) for m in together(largest, np.max)]
-    errors = np.zeros((len(names), CANDIDATES))
-    for results in values():
-        errors += [_errors(r[0], f) for r, f in zip(results, first, strict=True)]
-    moves = np.argmin(together(errors, np.sum), axis=1)
-    best = {name: f + int(move) for name, f, move in zip(names, first, moves, strict=True)}
-    return {PLANES: PLANES_FRAC_BITS, **best}
-
-
-def _errors(tensor: np.ndarray, first: int) -> np.ndarray:
-    """The squared errors of (C, H, W), a few channels at a time: within the cache it is three times faster."""
-    parts = np.array_split(tensor, -(-len(tensor) // 4))
-    return np.asarray(np.sum([squared_errors(part, first) for part in parts], axis=0))
 
 
 @dataclass(frozen=True)

@@ -72,11 +72,7 @@ SHIFTS = Shifts()
 
 
 def target_shifts(target: TargetProfile) -> Shifts:
-    """The windows that a target's profile states.
-
-    Raises:
-        ProfileError: it states none: it has no DPU.
-    """
+    """The windows that a target's profile states."""
 
     def window(key: str) -> tuple[int, int]:
         constant = target.constant("numbers", key)
@@ -150,9 +146,6 @@ def build_core(
         frac_bits: the least-squares number of fractional bits of every activation.
         shifts: the windows of the target.
         ends: what the host does around; by default an image of one channel and a correction of it.
-
-    Raises:
-        ModelError: no scales are within reach: sizes of values that have nothing to do with each other.
     """
     legal = dict(frac_bits)
     for _ in range(ROUNDS):

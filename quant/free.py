@@ -11,7 +11,6 @@ import numpy as np
 import onnx
 
 from beers_deploy.model.progress import Log, no_log
-from beers_deploy.quant.calibration import Patches
 from beers_deploy.quant.core import INT8_MAX
 from beers_deploy.quant.encodings import MICROSOFT
 from beers_deploy.quant.ends import ONE_CHANNEL, ZERO, Ends, HostWriter, ends_of, write_back, write_front
@@ -34,6 +33,7 @@ from beers_deploy.quant.passes.equalise import Costs, channel_ranges, equalise, 
 from beers_deploy.quant.passes.fit_weights import Moments, fit, input_moments
 from beers_deploy.quant.passes.stream import half_lsb_pair, streams, two_gains
 from beers_deploy.quant.quantise import STREAM_STEP, Targets, crop_costs, search_targets
+from beers_deploy.quant.samples import Patches
 from beers_deploy.quant.session import halo_of, open_session, tensor_values
 
 BINS = 4096

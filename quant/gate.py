@@ -19,7 +19,7 @@ from beers_deploy.quant.checks import Check
 from beers_deploy.quant.session import result_of
 
 if TYPE_CHECKING:
-    from beers_deploy.quant.calibration import Pair
+    from beers_deploy.quant.samples import Pair
 
 
 @dataclass(frozen=True)
@@ -130,11 +130,7 @@ class Limits:
 
 
 def limits_of(given: "Limits | Mapping[str, float] | str | os.PathLike[str] | None") -> Limits:
-    """Limits by their names, of a TOML file such as `mae = 0.0007`, or the defaults for None.
-
-    Raises:
-        OptionError: no such limits, or not such a file.
-    """
+    """Limits by their names, of a TOML file such as `mae = 0.0007`, or the defaults for None."""
     if given is None:
         return Limits()
     if isinstance(given, Limits):
@@ -143,11 +139,7 @@ def limits_of(given: "Limits | Mapping[str, float] | str | os.PathLike[str] | No
 
 
 def read_limits(path: Path | None, mae: float | None) -> Limits:
-    """As `limits_of`; `mae` overrides.
-
-    Raises:
-        OptionError: not such a file.
-    """
+    """As `limits_of`; `mae` overrides."""
     limits = limits_of(path)
     return limits if mae is None else replace(limits, mae=mae)
 

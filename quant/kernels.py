@@ -69,11 +69,7 @@ def is_integer(model: onnx.ModelProto) -> bool:
 
 
 def made_exact(model: onnx.ModelProto) -> tuple[onnx.ModelProto, dict[str, Way]]:
-    """The model with the same results on kernels that add exactly, and the way of each operator by its name.
-
-    Raises:
-        ModelError: an operator of which nothing can be proven, for its signed weights are no constants of the file.
-    """
+    """The model with the same results on kernels that add exactly, and the way of each operator by its name."""
     work = _Rewriting(model)
     for node in [each for each in work.model.graph.node if each.op_type == "Max"]:
         work.move_relu_down(node)

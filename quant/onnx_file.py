@@ -48,11 +48,7 @@ def load_onnx(path: Path, to_run: bool = True) -> onnx.ModelProto:
 
 
 def read_onnx(content: bytes, where: str) -> onnx.ModelProto:
-    """As `load_onnx`, of the bytes of a network that holds all its weights.
-
-    Raises:
-        ModelError: as there.
-    """
+    """As `load_onnx`, of the bytes of a network that holds all its weights."""
     return _simplest(_parsed(content, where, True, None), where, True)
 
 
@@ -69,11 +65,7 @@ def _simplest(model: onnx.ModelProto, where: str, to_run: bool) -> onnx.ModelPro
 
 
 def parse_onnx(content: bytes, where: str, to_run: bool = True) -> onnx.ModelProto:
-    """As `load_onnx`, of the bytes of a file that holds all its weights; what is read stays as it is.
-
-    Raises:
-        ModelError: as there.
-    """
+    """As `load_onnx`, of the bytes of a file that holds all its weights; what is read stays as it is."""
     return _parsed(content, where, to_run, None)
 
 
@@ -186,11 +178,7 @@ def constants(model: onnx.ModelProto) -> dict[str, np.ndarray]:
 
 
 def fixed_tile_px(model: onnx.ModelProto) -> int | None:
-    """The tile side that a model is fixed to, or None when it takes any size.
-
-    Raises:
-        ModelError: not one (N, C, H, W) input, or a fixed size that is not square.
-    """
+    """The tile side that a model is fixed to, or None when it takes any size."""
     sizes = [d.dim_value for d in model.graph.input[0].type.tensor_type.shape.dim] if model.graph.input else []
     if len(model.graph.input) != 1 or len(sizes) != 4 or sizes[2] != sizes[3]:
         raise ModelError(
@@ -203,11 +191,7 @@ def fixed_tile_px(model: onnx.ModelProto) -> int | None:
 
 
 def any_size(model: onnx.ModelProto) -> onnx.ModelProto:
-    """A network of convolutions that is fixed to one tile, for images of any size; any other as it is.
-
-    Raises:
-        ModelError: other than one image in and out.
-    """
+    """A network of convolutions that is fixed to one tile, for images of any size; any other as it is."""
     if fixed_tile_px(model) is None:
         return model
     free = onnx.ModelProto()
@@ -228,11 +212,7 @@ def is_quantised(model: onnx.ModelProto) -> bool:
 
 
 def require_quantised(model: onnx.ModelProto, name: str, wanted: bool) -> None:
-    """Refuse the float network in the place of the INT8 one, and the other way round.
-
-    Raises:
-        ModelError: it is the other kind.
-    """
+    """Refuse the float network in the place of the INT8 one, and the other way round."""
     if is_quantised(model) != wanted:
         expected, got = ("an INT8 network", "a float one") if wanted else ("a float network", "an INT8 one")
         remedy = "give the float model first, the INT8 model second"

@@ -1,21 +1,30 @@
 """Static INT8 in one call: float ONNX and calibration patches in, the two encodings of the integer core out."""
 
 import os
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 import onnx
 
 from beers_deploy.model.progress import Log, no_log
-from beers_deploy.quant.calibration import Patches, Remade, choose_frac_bits
-from beers_deploy.quant.core import SHIFTS, IntCore, Shifts, build_core
+from beers_deploy.quant.core import (
+    CANDIDATES,
+    SHIFTS,
+    IntCore,
+    Shifts,
+    build_core,
+    squared_errors,
+    unclipped_frac_bits,
+)
 from beers_deploy.quant.encodings import board_model, host_model
-from beers_deploy.quant.ends import GAIN, Ends, ends_of
+from beers_deploy.quant.ends import GAIN, ONE_CHANNEL, Ends, ends_of
 from beers_deploy.quant.graph import (
     CORRECTION,
     PLANES,
+    PLANES_FRAC_BITS,
     Graph,
     channels_of,
     graph_to_onnx,
@@ -23,6 +32,7 @@ from beers_deploy.quant.graph import (
     read_planes,
     relu_count,
     tensors,
+    tied,
 )
 from beers_deploy.quant.graph.tail import Tail
 from beers_deploy.quant.onnx_file import fixed_tile_px, metadata
@@ -51,8 +61,11 @@ from beers_deploy.quant.passes.stream import (
     window_offsets,
     windowed,
 )
-from beers_deploy.quant.passes.tune import Tuning, tune
+from beers_deploy.quant.samples import Patches, Remade
 from beers_deploy.quant.session import TILE_PX, crops, halo_of, open_session, result_of, tensor_values
+
+if TYPE_CHECKING:
+    from beers_deploy.quant.passes.tune import Tuning
 
 SEARCH_CROPS = 16
 """What the equalisation is searched on, a quarter of them with the strongest edges: there int8 clips."""
@@ -147,7 +160,7 @@ def quantise_model(
     patches: Patches,
     about: dict[str, str],
     shifts: Shifts = SHIFTS,
-    tuning: Tuning | None = None,
+    tuning: "Tuning | None" = None,
     pairs: bool = True,
     log: Log = no_log,
 ) -> Quantised:
@@ -171,6 +184,8 @@ def quantise_model(
     core, final, last_sum = rounded(plan, patches.degraded, log)
     core = replace(core, ends=replace(core.ends, tail=plan.tail))
     if tuning:
+        from beers_deploy.quant.passes.tune import tune  # torch, which no other step takes
+
         # Patches that hold few roofs would train the last sum's room away.
         core = tune(core, final, plan.graph, tuning, still=last_sum, log=log)
     about = {**metadata(model), "precision": "int8 legal", "calibration_sha256": patches.digest, **about}
@@ -181,6 +196,44 @@ def quantise_model(
     return Quantised(
         host_model(core, about, tile_px), board_model(core, about, tile_px), core, relu_count(plan.graph), final
     )
+
+
+def choose_frac_bits(graph: Graph, images: Iterable[np.ndarray], ends: Ends = ONE_CHANNEL) -> dict[str, int]:
+    """Least-squares scale of every tensor of a plane-reading graph over images (1, C, H, W) in [0, 1].
+
+    Tensors that must share a scale (`quant.graph.tied`) get that of least error in all of them together.
+
+    Two passes, so images that can be passed over twice: the largest values, then the squared errors of the scales
+    around them.
+    """
+    names, halo_px = tensors(graph), halo_of(graph)
+    session = open_session(graph_to_onnx(graph, names, ends.planes * ends.channels))
+    shared = tied(graph)
+    groups = np.array([names.index(shared[name]) if shared[name] in names else -1 for name in names])
+
+    def values() -> Iterator[list[np.ndarray]]:
+        for image in images:
+            yield from tensor_values(session, names, image, halo_px, ends)
+
+    def together(of_each: np.ndarray, join: Callable[..., np.ndarray]) -> np.ndarray:
+        return np.stack([join(of_each[groups == group], axis=0) for group in groups])
+
+    largest = np.zeros(len(names))
+    for results in values():
+        largest = np.maximum(largest, [float(np.abs(r).max()) for r in results])
+    first = [unclipped_frac_bits(m) for m in together(largest, np.max)]
+    errors = np.zeros((len(names), CANDIDATES))
+    for results in values():
+        errors += [_errors(r[0], f) for r, f in zip(results, first, strict=True)]
+    moves = np.argmin(together(errors, np.sum), axis=1)
+    best = {name: f + int(move) for name, f, move in zip(names, first, moves, strict=True)}
+    return {PLANES: PLANES_FRAC_BITS, **best}
+
+
+def _errors(tensor: np.ndarray, first: int) -> np.ndarray:
+    """The squared errors of (C, H, W), a few channels at a time: within the cache it is three times faster."""
+    parts = np.array_split(tensor, -(-len(tensor) // 4))
+    return np.asarray(np.sum([squared_errors(part, first) for part in parts], axis=0))
 
 
 def rounded(plan: Plan, images: Remade[np.ndarray], log: Log = no_log) -> tuple[IntCore, Graph, frozenset[str]]:

@@ -5,13 +5,14 @@ Values are in [0, 1] of full scale: of pixels of 8 bits 255, of more 4095. A .np
 should give beside what it reads, as `image` and `reference`.
 """
 
+import hashlib
 import os
 import zipfile
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 import numpy as np
 import onnx
@@ -20,10 +21,61 @@ from beers_deploy.model.io.files import IMAGE_SUFFIXES
 from beers_deploy.model.io.images import MAX_DN, read_pixels
 from beers_deploy.profiles.errors import ImageError, ModelError, OptionError
 from beers_deploy.profiles.toml import unreadable
-from beers_deploy.quant.calibration import PATCH_PX, Pair, Patches, Remade
 from beers_deploy.quant.onnx_file import fixed_tile_px
 from beers_deploy.quant.tiling.walk import tiling_of
 from beers_deploy.quant.untrusted import times
+
+if TYPE_CHECKING:
+    from beers_deploy.quant.calibration import View
+
+PATCH_PX = 128
+T = TypeVar("T")
+Pair = tuple[np.ndarray, np.ndarray]
+"""(degraded, reference) of a patch; the reference of a user's own sample that has none is empty."""
+
+
+@dataclass(frozen=True)
+class Remade(Generic[T]):
+    """A sequence whose items are made each time they are asked for: none is kept."""
+
+    make: Callable[[int], T]
+    count: int
+
+    def __len__(self) -> int:
+        return self.count
+
+    def __getitem__(self, number: int) -> T:
+        if not 0 <= number < self.count:
+            raise IndexError(number)
+        return self.make(number)
+
+    def __iter__(self) -> Iterator[T]:
+        return map(self.make, range(self.count))
+
+
+@dataclass(frozen=True)
+class Patches:
+    """Simulated patches, each (1, 1, P, P) float32 in [0, 1].
+
+    Attributes:
+        views: what each shows, and the sensors that saw it.
+        pairs: (degraded, reference) of each.
+        degraded: the same degraded patches alone, for half the work.
+    """
+
+    views: "list[View]"
+    pairs: Remade[Pair]
+    degraded: Remade[np.ndarray]
+
+    @cached_property
+    def digest(self) -> str:
+        """SHA-256 of the bytes of all pairs."""
+        digest = hashlib.sha256()
+        for pair in self.pairs:
+            for image in pair:
+                digest.update(image.tobytes())
+        return digest.hexdigest()
+
 
 HELD_OUT_EVERY = 4
 """One sample of so many is kept from calibration, to look at what INT8 changes."""
@@ -44,9 +96,6 @@ def read_samples(given: Path | Sequence[Named], channels: int, fixed_px: int | N
         channels: that the network reads.
         fixed_px: side of the image that the network is fixed to; None cuts large samples to patches.
         multiple_px: what sides must be multiples of; the rest is cut off.
-
-    Raises:
-        ImageError: no samples, values outside [0, 1], or images of other channels or sizes.
     """
     pairs = [
         pair
@@ -68,9 +117,6 @@ def samples_in(given: object) -> list[Named]:
     Args:
         given: a batch (N, C, H, W), or one image (C, H, W), of NumPy or torch and in [0, 1]; a tuple of two; a
             simulated pair, which knows its full scale; or an iterable of any of these, such as a DataLoader.
-
-    Raises:
-        ImageError: none of these.
     """
     if hasattr(given, "degraded") and hasattr(given, "reference"):
         pair: Any = given
@@ -96,11 +142,7 @@ def samples_in(given: object) -> list[Named]:
 
 
 def _batch(array: Any) -> np.ndarray:
-    """One image or a batch of NumPy or torch as (N, C, H, W).
-
-    Raises:
-        ImageError: of another number of dimensions.
-    """
+    """One image or a batch of NumPy or torch as (N, C, H, W)."""
     found = np.asarray(array.detach() if hasattr(array, "detach") else array)
     if found.ndim not in (3, 4):
         raise ImageError(IN_MEMORY, expected="a batch of (N, C, H, W)", got=times(found.shape), remedy=REMEDY)
@@ -267,12 +309,7 @@ class OwnSamples:
 
 
 def samples_of(model: onnx.ModelProto, given: object) -> OwnSamples | None:
-    """A user's samples for a network, in a file, a folder or memory; None where none are and it takes simulated ones.
-
-    Raises:
-        OptionError: none given, for a network that simulated patches do not suit.
-        ModelError: no network of images.
-    """
+    """A user's samples for a network, None where none are given and it takes simulated ones."""
     channels, fixed_px, multiple_px = _channels(model), fixed_tile_px(model), _multiple_px(model)
     if given is not None:
         found = Path(given) if isinstance(given, str | os.PathLike) else samples_in(given)

@@ -17,7 +17,6 @@ from onnx import TensorProto, helper
 from beers_deploy.model.io.images import MAX_DN
 from beers_deploy.profiles.figures import Figure, Row, measured, unavailable
 from beers_deploy.profiles.sensor import Instrument
-from beers_deploy.quant.calibration import Patches
 from beers_deploy.quant.core import INT8_MAX, INT8_MIN, IntConv, IntCore
 from beers_deploy.quant.encodings import host_model
 from beers_deploy.quant.gate import GateResult
@@ -35,6 +34,7 @@ from beers_deploy.quant.graph import (
     ties_scales,
 )
 from beers_deploy.quant.quantise import Quantised
+from beers_deploy.quant.samples import Patches
 from beers_deploy.quant.session import few_crops, halo_of, open_session, planes_of, result_of, run, tensor_values
 
 IN_INT8 = ".in_int8"

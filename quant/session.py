@@ -77,20 +77,12 @@ def run(session: ort.InferenceSession, image: np.ndarray) -> np.ndarray:
 
 
 def result_of(session: ort.InferenceSession, image: np.ndarray) -> np.ndarray:
-    """What a network makes of (N, C, H, W) float32 in [0, 1], whatever its size.
-
-    Raises:
-        ModelError: a model that does not run on this image.
-    """
+    """What a network makes of (N, C, H, W) float32 in [0, 1], whatever its size."""
     return tensors_of(session, None, image)[0]
 
 
 def tensors_of(session: ort.InferenceSession, names: list[str] | None, image: np.ndarray) -> list[np.ndarray]:
-    """The named outputs, or all, for an image (N, 1, H, W) float32 in [0, 1].
-
-    Raises:
-        ModelError: a model that does not run on this image.
-    """
+    """The named outputs, or all, for an image (N, 1, H, W) float32 in [0, 1]."""
     try:
         return [np.asarray(value) for value in session.run(names, {session.get_inputs()[0].name: image})]
     except Exception as error:  # as above
@@ -98,11 +90,7 @@ def tensors_of(session: ort.InferenceSession, names: list[str] | None, image: np
 
 
 def require_finite(values: Iterable[np.ndarray], where: str) -> None:
-    """Refuse what a network computed of an image in [0, 1], where its weights are finite and that is not.
-
-    Raises:
-        ModelError: NaN or infinity among the values.
-    """
+    """Refuse what a network computed of an image in [0, 1], where its weights are finite and that is not."""
     if not all(np.isfinite((value.min(), value.max())).all() for value in values):
         remedy = "its sums overflow: train it again with a lower learning rate, or scale its weights"
         raise ModelError(where, expected="finite values for an image", got="NaN or infinity", remedy=remedy)
@@ -135,9 +123,6 @@ def tensor_values(
     Each tile is computed with a halo of the pixels that its values depend on, which is then cut off: together the
     tiles hold what the whole image would have given, its zero-padded borders included. Without a halo (None) the
     image is one tile.
-
-    Raises:
-        ModelError: NaN or infinity inside the network.
     """
     if halo_px is None:
         values = session.run(names, {PLANES: planes_of(image, ends)})

@@ -63,9 +63,6 @@ def saturated_shares(model: onnx.ModelProto, images: Iterable[np.ndarray]) -> di
     """The share, in [0, 1], of each 8-bit tensor's values that lie at an end, over images (N, 1, H, W) in [0, 1].
 
     Empty where no node rounds to 8 bits.
-
-    Raises:
-        ModelError: onnxruntime refuses the model, or cannot run it.
     """
     looked_at = rounded_tensors(model)
     if not looked_at:
@@ -83,11 +80,7 @@ def saturated_shares(model: onnx.ModelProto, images: Iterable[np.ndarray]) -> di
 
 
 def rounded_tensors(model: onnx.ModelProto) -> list[Rounded]:
-    """What the graph's nodes round to 8 bits, in the graph's order.
-
-    Raises:
-        ModelError: nodes that contradict it.
-    """
+    """What the graph's nodes round to 8 bits, in the graph's order."""
     with contradictions("INT8 model"):
         return [tensor for tensor in _rounded(model) if tensor.zero_point.dtype in (np.int8, np.uint8)]
 
@@ -147,11 +140,7 @@ class Relus:
 
 
 def count_relus(model: onnx.ModelProto) -> Relus:
-    """The ReLUs of a file.
-
-    Raises:
-        ModelError: nodes that contradict it.
-    """
+    """The ReLUs of a file."""
     with contradictions("model"):
         known, rounded = constants(model), {tensor.name: tensor for tensor in rounded_tensors(model)}
         convolved = {name for node in model.graph.node if "Conv" in node.op_type for name in node.output}

@@ -32,12 +32,7 @@ FIELDS |= dict.fromkeys(SHORT, (2, "int32_data"))
 
 
 def check_content(model: onnx.ModelProto, where: str) -> None:
-    """Refuse a model that does not hold what it states.
-
-    Raises:
-        ModelError: no input or output; sizes that cannot be; values elsewhere, missing, of another type or not
-            finite.
-    """
+    """Refuse a model that does not hold what it states."""
     graph = model.graph
     held = {tensor.name for tensor in graph.initializer}
     if all(value.name in held for value in graph.input) or not graph.output:
@@ -50,11 +45,7 @@ def check_content(model: onnx.ModelProto, where: str) -> None:
 
 @contextmanager
 def contradictions(where: str) -> Iterator[None]:
-    """One sentence for whatever a graph leads to whose nodes lack inputs, or have sizes that cannot be.
-
-    Raises:
-        ModelError: such a graph.
-    """
+    """One sentence for whatever a graph leads to whose nodes lack inputs, or have sizes that cannot be."""
     try:
         yield
     except BeersError:
@@ -66,11 +57,7 @@ def contradictions(where: str) -> Iterator[None]:
 
 
 def check_size(name: str, sizes: Iterable[float], where: str) -> None:
-    """Refuse a tensor that a file sizes beyond reason; 0 and -1 stand for sizes left open.
-
-    Raises:
-        ModelError: such a size.
-    """
+    """Refuse a tensor that a file sizes beyond reason; 0 and -1 stand for sizes left open."""
     sizes = list(sizes)
     rank = len(sizes) <= RANK
     if not (rank and min(sizes, default=0) >= -1 and math.prod(max(size, 1) for size in sizes) <= VALUES):
@@ -156,11 +143,7 @@ KEEPING = {
 
 
 def check_runnable(model: onnx.ModelProto, where: str) -> None:
-    """Refuse a model that no runtime of ours should open.
-
-    Raises:
-        ModelError: foreign operators, functions, loops, sparse weights, or results of absurd sizes.
-    """
+    """Refuse a model that no runtime of ours should open."""
     if model.functions or model.graph.sparse_initializer:
         raise refused(where, "plain operators and weights", "functions or sparse weights", "export it without them")
     constants = _Constants(model, where)
@@ -187,11 +170,7 @@ class _Constants:
         self._opset = max((o.version for o in model.opset_import if o.domain in STANDARD), default=1)
 
     def follow(self, node: NodeProto) -> None:
-        """Note a node that reads no image.
-
-        Raises:
-            ModelError: it could make anything of what it reads.
-        """
+        """Note a node that reads no image."""
         stored = [a.t for a in node.attribute if a.name == "value"] if node.op_type == "Constant" else []
         if stored:
             self.values[node.output[0]] = stored[0]

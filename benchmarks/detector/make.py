@@ -17,9 +17,9 @@ import torch
 from beers_deploy.model.progress import steps
 from beers_deploy.model.shipped import DETECTOR, DETECTOR_INT8
 from beers_deploy.profiles.sensor_file import REFERENCE, load_sensor
-from beers_deploy.quant.calibration import Patches, Remade
 from beers_deploy.quant.onnx_file import load_onnx, save_onnx
 from beers_deploy.quant.quantise import quantise_model
+from beers_deploy.quant.samples import Patches, Remade
 from beers_deploy.studies.detection.average_precision import find_hits, interval, score_rows, site_weights
 from beers_deploy.studies.detection.boxes import Boxes
 from beers_deploy.studies.detection.detector import open_detector

@@ -179,9 +179,6 @@ def bench_board(
         measured: runs of the user's board, by which the cost model is corrected.
         within_s: what the swath may take; None does not ask.
         host_task: what the host does with the results; None for what the file tells.
-
-    Raises:
-        BeersError: a file or an option that is not what it should be.
     """
     network = load_onnx(model)
     boards, corrected = _boards(target, config, measured)

@@ -37,11 +37,7 @@ class Timed:
 
 
 def time_networks(runs: Sequence[Timed], tile_px: int, threads: int, min_time_s: float, min_runs: int) -> None:
-    """Time each for one tile, interleaved, until all have run for `min_time_s` and `min_runs` times; fills in `runs`.
-
-    Raises:
-        ModelError: a network that gives NaN or infinity.
-    """
+    """Time each for one tile, interleaved, until all have run for `min_time_s` and `min_runs` times."""
     calls = []
     for run in runs:
         feed = tile_feed(run.model, tile_px, run.name)
@@ -61,11 +57,7 @@ def time_networks(runs: Sequence[Timed], tile_px: int, threads: int, min_time_s:
 
 
 def tile_feed(model: onnx.ModelProto, tile_px: int, where: str = "ONNX model") -> dict[str, np.ndarray]:
-    """A grey tile (1, C, tile, tile) for every input.
-
-    Raises:
-        ModelError: inputs that are no images, or fixed to another tile.
-    """
+    """A grey tile (1, C, tile, tile) for every input."""
     shapes = inputs_of(model, tile_px, where)
     return {name: np.full((1, *shape), 0.25, np.float32) for name, shape in shapes.items()}
 
@@ -111,9 +103,6 @@ def host_rows(model: Path, target: TargetProfile, tile_px: int, threads: int = 0
 
     Each runs for the target's minimum time and count, one run for warm-up left out. Its pair in the other
     precision is the shipped network of the same variant; without one it runs alone.
-
-    Raises:
-        OptionError: more threads than cores.
     """
     require_cores("threads", threads)
     given = load_onnx(model)

@@ -63,11 +63,7 @@ class Swath:
 
     @property
     def tiles(self) -> int:
-        """Whole tiles of the grid, the last row and column moved inward: 384 of the paper's swath, halo 35.
-
-        Raises:
-            OptionError: a tile with no room between its two halos.
-        """
+        """Whole tiles of the grid, the last row and column moved inward: 384 of the paper's swath, halo 35."""
         rows, columns = (plan_side(side, self.tile_px, self.halo_px) for side in (self.height_px, self.width_px))
         return len(rows) * len(columns)
 
@@ -80,9 +76,6 @@ def predict_file(model: Path, dpu: Dpu, tile_px: int | None = PAPER_TILE_PX, tas
     """What the cost model says of an ONNX file, for tiles of that side or, with None, for the size it is fixed to.
 
     The `task` of the host is what the file tells, if none is given.
-
-    Raises:
-        ModelError: not a network, or one that does not run whole on the DPU.
     """
     return predict(place(read_network(model, tile_px), dpu), dpu, task)
 
@@ -363,11 +356,7 @@ def on_chip(prediction: Prediction) -> float:
 
 
 def parse_tiles(text: str) -> list[int]:
-    """Tile sides in pixels, with commas between them.
-
-    Raises:
-        OptionError: another text, or a side below 16 or above MOST_TILE_PX.
-    """
+    """Tile sides in pixels, with commas between them."""
     parts = [part.strip() for part in text.split(",")]
     if not all(part.isdecimal() and len(part) < 6 and 16 <= int(part) <= MOST_TILE_PX for part in parts):
         remedy = "write one size, or several as 640,256,128"
@@ -378,11 +367,7 @@ def parse_tiles(text: str) -> list[int]:
 
 
 def parse_size(text: str) -> tuple[int, int]:
-    """WIDTHxHEIGHT in pixels as (width, height).
-
-    Raises:
-        OptionError: another text.
-    """
+    """WIDTHxHEIGHT in pixels as (width, height)."""
     parts = text.lower().split("x")
     if len(parts) != 2 or not all(part.isdecimal() and int(part) > 0 for part in parts):
         remedy = f"write it as {PAPER_SIZE}"

@@ -10,7 +10,7 @@ import typer
 from beers_deploy.commands.shared import refuse, save, say
 from beers_deploy.model.shipped import SENSOR
 from beers_deploy.profiles import load_sensor, load_target
-from beers_deploy.profiles.errors import OptionError
+from beers_deploy.profiles.errors import OptionError, missing_extra
 from beers_deploy.profiles.figures import Row, by_table
 from beers_deploy.profiles.sensor_file import REFERENCE
 from beers_deploy.profiles.target import DEFAULT_TARGET, MODEL_SUFFIX, board_names
@@ -142,8 +142,11 @@ def bench(
             say(note)
         rows = found.rows
         if not no_traditional and found.swath is not None:
-            rows = [*rows, _traditional_row(found.dn, found.swath)]
-            print_rows("the traditional pipeline, measured on crops here", rows[-1:])
+            try:
+                rows = [*rows, _traditional_row(found.dn, found.swath)]
+                print_rows("the traditional pipeline, measured on crops here", rows[-1:])
+            except ModuleNotFoundError as error:
+                say(f"The traditional pipeline is not measured here: {missing_extra(error, 'bench')}")
     arguments = {
         "target": target,
         "sensor": sensor,

@@ -101,10 +101,6 @@ def _export_int8(
         board: the same integers in the board's encoding, or None.
         delta: what the sensor changes, or None.
         apply: a delta that is told in place of a sensor, or None.
-
-    Raises:
-        OptionError: a delta and a sensor, or a tile that is no multiple of the network's scale.
-        ModelError: no such INT8 file, or a delta of another.
     """
     from beers_deploy.export import require_tile
     from beers_deploy.model.io.files import whole_file

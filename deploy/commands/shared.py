@@ -29,9 +29,6 @@ def refuse(context: typer.Context, names: Iterable[str], *, expected: str, got: 
         expected: what must stand beside the option, or must not.
         got: what stands there.
         remedy: what the user can do.
-
-    Raises:
-        OptionError: one was given.
     """
     options = {parameter.name: parameter.opts[0] for parameter in context.command.params}
     for name in names:

@@ -18,11 +18,7 @@ ALL = "all"
 
 
 def boards_of(board: BoardLike | Sequence[BoardLike]) -> list[TargetProfile]:
-    """One board or several; "all" stands for the shipped ones with a DPU.
-
-    Raises:
-        ProfileError: no such board.
-    """
+    """One board or several; "all" stands for the shipped ones with a DPU."""
     if board == ALL:
         return [load_target(name) for name in board_names()]
     if isinstance(board, str | os.PathLike | TargetProfile):
@@ -106,11 +102,7 @@ class Dpu:
         return lanes * self.value("array", "pl_clock_hz")
 
     def limit(self, table: str, key: str) -> Constant:
-        """A constant with both ends of its range: a rule's window, or one limit as both.
-
-        Raises:
-            ProfileError: neither the configuration nor the target states it.
-        """
+        """A constant with both ends of its range: a rule's window, or one limit as both."""
         found = self.tables.get(table, {}).get(key)
         return self.target.constant(table, key) if found is None else found
 
@@ -124,12 +116,7 @@ class Dpu:
 
 
 def load_dpu(target: str, configuration: str | None = None) -> Dpu:
-    """Read a target profile and one of its configurations.
-
-    Raises:
-        ProfileError: unknown target or configuration, or constants that no board has.
-        OptionError: a target without a DPU.
-    """
+    """Read a target profile and one of its configurations."""
     return dpu_of(load_target(target), configuration)
 
 

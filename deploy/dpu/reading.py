@@ -58,9 +58,6 @@ def read_network(path: Path, tile_px: int | None = 640) -> Network:
     """Read an ONNX file as a network for one image with sides of `tile_px`; None is the size that it is fixed to.
 
     The image is the whole network's: of a core that reads places of 2 x 2 pixels, planes have half of its sides.
-
-    Raises:
-        ModelError: not an ONNX file, or not a network of images.
     """
     return network_of(load_onnx(path, to_run=False), tile_px, str(path))
 
@@ -83,11 +80,7 @@ def _border_px(model: onnx.ModelProto) -> int:
 
 
 def _said_px(model: onnx.ModelProto, key: str, least: int) -> int:
-    """What a board's file says of its planes, in pixels; the least where it says nothing.
-
-    Raises:
-        ValueError: no such number.
-    """
+    """What a board's file says of its planes, in pixels; the least where it says nothing."""
     said_px = int(metadata(model).get(key, str(least)))
     if not least <= said_px <= PLACE_MAX_PX:
         raise ValueError(f"{key} {said_px}")
@@ -105,11 +98,7 @@ def network_of(model: onnx.ModelProto, tile_px: int | None, where: str = "ONNX m
 
 
 def inputs_of(model: onnx.ModelProto, tile_px: int | None, where: str = "ONNX model") -> dict[str, Shape]:
-    """The inputs of a file as it stands, by name: (C, H, W) in places, for a tile or as the file states them.
-
-    Raises:
-        ModelError: inputs that are no images, or fixed to another tile.
-    """
+    """The inputs of a file as it stands, by name: (C, H, W) in places, for a tile or as the file states them."""
     held = {t.name for t in model.graph.initializer} | {n.output[0] for n in model.graph.node if _constant(n)}
     places = _place_px(model), _border_px(model)
     return {i.name: _input_shape(i, tile_px, places, where) for i in model.graph.input if i.name not in held}
@@ -253,11 +242,7 @@ def _count(tensor: TensorProto) -> int:
 
 
 def _input_shape(info: onnx.ValueInfoProto, tile_px: int | None, places: tuple[int, int], where: str) -> Shape:
-    """(C, tile, tile) of an input (N, C, H, W), in places; without a tile (C, H, W) as the file states them.
-
-    Raises:
-        ModelError: not such an input, or one fixed to another tile.
-    """
+    """(C, tile, tile) of an input (N, C, H, W), in places; without a tile (C, H, W) as the file states them."""
     sizes = [d.dim_value for d in info.type.tensor_type.shape.dim]
     if len(sizes) != 4 or sizes[1] < 1:
         raise ModelError(

@@ -19,11 +19,7 @@ METADATA_TAG = 42112
 
 
 def parse_sensors(text: str) -> dict[str, str]:
-    """A profile for each band by the band's name; under no name at all where one is for all bands.
-
-    Raises:
-        OptionError: a band without a name or a profile, or named twice.
-    """
+    """A profile for each band by the band's name; under no name at all where one is for all bands."""
     if "=" not in text or Path(text).is_file():
         return {"": text}
     pairs = [part.partition("=") for part in text.split(",")]
@@ -47,11 +43,7 @@ def band_names(raster: Raster) -> tuple[str, ...]:
 
 
 def in_order(given: Mapping[str, Path], raster: Raster) -> list[Path]:
-    """The networks of the bands, in the order of the image's bands.
-
-    Raises:
-        OptionError: other names or another number of bands than the image has.
-    """
+    """The networks of the bands, in the order of the image's bands."""
     names = band_names(raster) or tuple(given)
     if len(given) != raster.bands or set(names) != set(given):
         expected = f"a sensor for each of {raster.bands} bands" + (f": {', '.join(names)}" if names else "")
@@ -61,11 +53,7 @@ def in_order(given: Mapping[str, Path], raster: Raster) -> list[Path]:
 
 
 def require_alike(networks: Sequence[onnx.ModelProto]) -> None:
-    """That networks of several bands are met alike by an image: one plan of tiles serves them all.
-
-    Raises:
-        ModelError: they differ, or take several bands each.
-    """
+    """That networks of several bands are met alike by an image: one plan of tiles serves them all."""
     tilings = [tiling_of(network) for network in networks]
     if len(networks) > 1 and (len(set(map(repr, tilings))) > 1 or tilings[0].channels_in != 1):
         remedy = "give one network for all bands"

@@ -30,11 +30,7 @@ BLOCK_PX = 512
 
 
 def require_cog() -> None:
-    """Find out before the run that rasterio is missing.
-
-    Raises:
-        MissingExtraError: it is not installed.
-    """
+    """Find out before the run that rasterio is missing."""
     try:
         import_module("rasterio")
     except ImportError as error:
@@ -68,11 +64,7 @@ def disk_bytes(shape: tuple[int, int, int], itemsize: int) -> int:
 
 
 def write_cog(plain: Path, cog: Path, compression: Compression, about: Mapping[str, str]) -> None:
-    """Write the TIFF `plain` as the Cloud-Optimised GeoTIFF `cog`, with `about` among its metadata.
-
-    Raises:
-        OSError: the disk is full or gone.
-    """
+    """Write the TIFF `plain` as the Cloud-Optimised GeoTIFF `cog`, with `about` among its metadata."""
     rasterio: Any = import_module("rasterio")
     options: dict[str, Any] = {
         "COMPRESS": CODECS[compression],

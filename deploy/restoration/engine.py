@@ -87,22 +87,13 @@ class Restorer:
         require_room(self.raster, self.full_scale)
 
     def read(self, source: Source, start: int, stop: int) -> Strip:
-        """The strip that tiles from row `start` to `stop` (excluded) need.
-
-        Raises:
-            ImageError: unreadable rows, or values outside 0 to full scale.
-        """
+        """The strip that tiles from row `start` to `stop` (excluded) need."""
         margin_px = self.raster.fill_margin_px(self.tiling.halo_px)
         start, stop = max(start - margin_px, 0), min(stop + margin_px, self.raster.height_px)
         return checked_strip(self.raster, start, source.read(start, stop), self.full_scale, self.name, self.clips)
 
     def tile(self, strip: Strip, group: int, rows: Span, columns: Span) -> Tile:
-        """The tile of one group of bands that reads `rows` and `columns`; one without a known pixel is not inferred.
-
-        Raises:
-            ImageError: the network gives NaN or infinity.
-            ModelError: it gives another shape than its file states.
-        """
+        """The tile of one group of bands that reads `rows` and `columns`; one of missing pixels is not inferred."""
         bands = slice(group * self.tiling.channels_in, (group + 1) * self.tiling.channels_in)
         unknown = self._unknown(strip, bands, rows, columns)
         if unknown is not None and unknown[1].all():
@@ -186,11 +177,7 @@ class Restorer:
 def checked_strip(
     raster: Raster, top: int, pixels: np.ndarray, full_scale: float, name: str, clips: bool = False
 ) -> Strip:
-    """Rows from `top` on, (bands, rows, width) as stored, and which of their pixels are missing.
-
-    Raises:
-        ImageError: values below 0, infinite, or, unless it `clips`, above full scale.
-    """
+    """Rows from `top` on, (bands, rows, width) as stored, and which of their pixels are missing."""
     missing = raster.missing(pixels) if raster.may_miss else None
     missing = missing if missing is not None and missing.any() else None
     known = True if missing is None else ~missing
@@ -240,9 +227,6 @@ def restore_window(dn: np.ndarray, infer: Infer, full_scale: float = MAX_DN) -> 
 
     Returns:
         Of as many axes; of other bands and sizes where the network makes others.
-
-    Raises:
-        ImageError: the network gives NaN or infinity.
     """
     bands = dn[None] if dn.ndim == 2 else dn
     image = np.ascontiguousarray(bands, dtype=np.float32)[None] / np.float32(full_scale)
@@ -280,9 +264,6 @@ def restore_rows(
     """Restore rows of tiles in order, `at_once` tiles at a time; `tick` is called once a tile.
 
     A row is begun before the one before it is finished, so that no thread waits for the last tile of a row.
-
-    Raises:
-        ImageError: unreadable rows, values outside 0 to full scale, or a network that gives NaN.
     """
     # A single reader, since a source keeps what it decoded for the rows before, for the next ones to take.
     with ThreadPoolExecutor(1) as reader, ThreadPoolExecutor(at_once) as pool:
@@ -327,11 +308,7 @@ def _places(plan: Plan) -> list[tuple[int, Span]]:
 
 
 def restore_array(source: Source, plan: Plan, restorer: Restorer, at_once: int = 1) -> np.ndarray:
-    """Restore all rows of an image, `at_once` tiles at a time: the plan's `out_shape` of the raster's `out_dtype`.
-
-    Raises:
-        ImageError: unreadable rows, values outside 0 to full scale, or a network that gives NaN.
-    """
+    """Restore all rows of an image, `at_once` tiles at a time: the plan's `out_shape` of the raster's `out_dtype`."""
     result = np.empty(plan.out_shape, restorer.raster.out_dtype)
     for row in restore_rows(source, plan, restorer, plan.rows, lambda: None, at_once):
         result[:, row.span.keep_start * plan.scale : row.span.keep_stop * plan.scale] = row.pixels
@@ -342,10 +319,6 @@ def restore_floats(dn: np.ndarray, infer: Infer, plan: Plan, max_dn: float = MAX
     """Restore (H, W) digital numbers of 0 to `max_dn` to float32, not rounded: what `restore` writes of floats.
 
     NaN is a missing pixel, and stays.
-
-    Raises:
-        ImageError: values outside 0 to `max_dn`, or a network that gives NaN.
-        ModelError: a network whose result has another size or more bands.
     """
     if plan.out_shape != (1, *dn.shape):
         got, remedy = f"one of {times(plan.out_shape)}", "restore files with it, or arrays by beers_deploy.library"
@@ -358,9 +331,5 @@ def restore_floats(dn: np.ndarray, infer: Infer, plan: Plan, max_dn: float = MAX
 
 
 def restore_dn(dn: np.ndarray, infer: Infer, plan: Plan, max_dn: float = MAX_DN) -> np.ndarray:
-    """Restore (H, W) digital numbers of 0 to `max_dn` to whole ones, float32: what `restore` writes of integers.
-
-    Raises:
-        ImageError: values outside 0 to `max_dn`, or a network that gives NaN.
-    """
+    """Restore (H, W) digital numbers of 0 to `max_dn` to whole ones, float32: what `restore` writes of integers."""
     return np.asarray(np.rint(restore_floats(dn, infer, plan, max_dn)))

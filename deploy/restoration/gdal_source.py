@@ -58,10 +58,6 @@ def open_gdal(path: Path, trusted: bool = False) -> Iterator["GdalSource"]:
     Args:
         path: of the file or the index.
         trusted: as in `index_files`.
-
-    Raises:
-        ImageError: damaged, an index that cannot be followed, or no image of numbers.
-        MissingExtraError: rasterio is not installed.
     """
     rasterio = _rasterio(path)
     files = path, *index_files(path, trusted)
@@ -84,11 +80,7 @@ def _block_px(dataset: Any) -> int:
 
 @contextmanager
 def _damage_in_a_sentence(path: Path, where: str = "") -> Iterator[None]:
-    """One sentence for whatever GDAL finds wrong.
-
-    Raises:
-        ImageError: damaged.
-    """
+    """One sentence for whatever GDAL finds wrong."""
     try:
         with warnings.catch_warnings(action="ignore"), _log_in_any_bytes():  # an image need not lie on Earth
             yield
@@ -134,11 +126,7 @@ class GdalSource:
         self._block_px = block_px
 
     def read(self, start: int, stop: int) -> np.ndarray:
-        """Rows `start` to `stop` (excluded) of every band, (bands, rows, width), as stored.
-
-        Raises:
-            ImageError: damaged.
-        """
+        """Rows `start` to `stop` (excluded) of every band, (bands, rows, width), as stored."""
         rasterio = _rasterio(self._path)
         with (
             _damage_in_a_sentence(self._path, f"rows {start} to {stop - 1}"),
@@ -155,12 +143,7 @@ class GdalSource:
 
 
 def _raster(path: Path, dataset: Any) -> Raster:
-    """What GDAL says of an image, before any pixel is read.
-
-    Raises:
-        ImageError: none or several images, bands of different kinds, too large, no numbers, or a nodata value that
-            the output could not hold.
-    """
+    """What GDAL says of an image, before any pixel is read."""
     if dataset.count == 0:
         remedy = "give the file of one of them" + (f", as {dataset.subdatasets[0]}" if dataset.subdatasets else "")
         raise ImageError(str(path), expected="one image", got="several, or none", remedy=remedy)

@@ -71,9 +71,6 @@ def index_files(path: Path, trusted: bool = False) -> tuple[Path, ...]:
     Args:
         path: of any image.
         trusted: whether tiles may lie outside the index's folder; what lies at a URL is then not looked at.
-
-    Raises:
-        ImageError: no sound index, or one that names what is missing, outside its folder, at a URL, or no image.
     """
     if not is_index(path):
         return ()
@@ -105,11 +102,7 @@ def _named(index: Path, home: Path, trusted: bool) -> Iterator[Path]:
 
 
 def _require_pixels(index: Path, text: str, file: Path) -> None:
-    """That a tile is there, and is an image or a VRT.
-
-    Raises:
-        ImageError: it is not.
-    """
+    """That a tile is there, and is an image or a VRT."""
     if not (text and file.is_file()):
         raise _refused(index, f"the tile {text or '(no name)'}", "no such file", "fetch it or make the index anew")
     with file.open("rb") as stream:

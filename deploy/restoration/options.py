@@ -70,11 +70,7 @@ class Options:
 
 
 def parse_halo(text: str, radius_px: int) -> int:
-    """The halo in pixels that a user asked for: 'exact' is the network's receptive radius.
-
-    Raises:
-        OptionError: neither 'exact' nor a number of pixels.
-    """
+    """The halo in pixels that a user asked for: 'exact' is the network's receptive radius."""
     if text == "exact":
         return radius_px
     if text.isdecimal():

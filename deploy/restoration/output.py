@@ -61,10 +61,6 @@ class Checkpoint:
             job: all that decides the pixels; a run is resumed only by one of the same job.
             resume: go on; where nothing was left, begin.
             cog_bytes: of disk that the output takes beside the rows and the plain TIFF.
-
-        Raises:
-            MachineError: no room for the rows and what is made of them.
-            OptionError: what was left belongs to another job.
         """
         self.out, self.shape, self.dtype = out, shape, dtype
         self.folder = part_folder(out)
@@ -80,11 +76,7 @@ class Checkpoint:
             (self.folder / "rows.raw").touch()
 
     def append(self, row: RestoredRow) -> None:
-        """Keep a row of tiles, which must follow those that are kept.
-
-        Raises:
-            MachineError: the disk is full or gone.
-        """
+        """Keep a row of tiles, which must follow those that are kept."""
         with self.disk():
             with (self.folder / "rows.raw").open("r+b") as stream:
                 for band in range(self.shape[0]):
@@ -110,11 +102,7 @@ class Checkpoint:
 
     @contextmanager
     def disk(self) -> Iterator[None]:
-        """One sentence for what a disk may do.
-
-        Raises:
-            MachineError: full, gone, or not ours to write to.
-        """
+        """One sentence for what a disk may do."""
         try:
             yield
         except OSError as error:
@@ -189,22 +177,14 @@ HORIZONTAL = 2
 
 
 def require_tiff_name(path: Path) -> None:
-    """Refuse a name under which no program would look for a TIFF.
-
-    Raises:
-        OptionError: it does not end as a TIFF's does.
-    """
+    """Refuse a name under which no program would look for a TIFF."""
     if path.suffix.lower() not in TIFF_SUFFIXES | BIG_TIFF_SUFFIXES:
         remedy = "name it so; other programs turn a TIFF into what you need"
         raise OptionError("OUT", expected="a TIFF's name, such as restored.tif", got=path.name, remedy=remedy)
 
 
 def require_codec(compression: Compression) -> None:
-    """Find out before the run that a compression needs a package which is not installed.
-
-    Raises:
-        MachineError: it does.
-    """
+    """Find out before the run that a compression needs a package which is not installed."""
     try:
         tifffile.imwrite(io.BytesIO(), np.zeros((16, 16), np.uint16), compression=compression.codec)
     except (ValueError, KeyError, ImportError) as error:
@@ -227,9 +207,6 @@ def write_output(
         tags: of the image.
         compression: of the TIFF; none where it is on its way to be cloud-optimised.
         to_cog: None leaves the TIFF as it is.
-
-    Raises:
-        MachineError: the disk is full or gone; the rows are still there.
     """
     fresh, bands = checkpoint.folder / PLAIN, checkpoint.shape[0]
     plain_bytes = padded_px(checkpoint.shape, TILE_PX) * checkpoint.dtype.itemsize
@@ -324,9 +301,6 @@ def only_run(out: Path, folder: Path) -> Iterator[None]:
 
     Folders above it that were made for it are gone then, too, unless something was written there. It locks nothing on
     a disk that has no locks, as some of networks.
-
-    Raises:
-        MachineError: another run holds it, or it cannot be made.
     """
     new = [parent for parent in folder.parents if not parent.exists()]
     lock = _take(out, folder)

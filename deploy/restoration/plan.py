@@ -40,9 +40,6 @@ def plan_side(size_px: int, tile_px: int, halo_px: int, lattice_px: int = 1, lea
         halo_px: a multiple of the lattice.
         lattice_px: spans begin at its multiples, and read to one.
         least_px: that a span reads, beyond the image where that has fewer.
-
-    Raises:
-        OptionError: a tile with no room between its two halos.
     """
     if tile_px < 2 * halo_px + lattice_px or halo_px < 0:
         least = f", {2 * halo_px + lattice_px} px at least" if lattice_px > 1 else ""
@@ -62,11 +59,7 @@ def _up(size_px: int, lattice_px: int) -> int:
 
 
 def even_side_px(size_px: int, tile_px: int, halo_px: int, lattice_px: int = 1) -> int:
-    """The shortest side that needs no more tiles than `tile_px` does: what a last tile overlaps is work done twice.
-
-    Raises:
-        OptionError: as `plan_side`.
-    """
+    """The shortest side that needs no more tiles than `tile_px` does."""
     count = len(plan_side(size_px, tile_px, halo_px, lattice_px))
     even_px = -(-(_up(size_px, lattice_px) + 2 * halo_px * (count - 1)) // count)
     return max(_up(even_px, lattice_px), 2 * halo_px + lattice_px)
@@ -176,12 +169,7 @@ class Plan:
 
 
 def plan_for(network: onnx.ModelProto, shape: tuple[int, int, int], options: Options) -> Plan:
-    """How an image of `shape` (bands, H, W) is cut for a network, as a user's options ask.
-
-    Raises:
-        ModelError: a network that cannot be tiled.
-        OptionError: options that do not go together.
-    """
+    """How an image of `shape` (bands, H, W) is cut for a network, as a user's options ask."""
     tiling = tiling_of(network)
     if tiling.fixed_px is not None:
         require_fixed_tile(tiling.fixed_px, options.tile_px, shape[1:])
@@ -189,11 +177,7 @@ def plan_for(network: onnx.ModelProto, shape: tuple[int, int, int], options: Opt
 
 
 def require_fixed_tile(fixed_px: int, tile_px: int, size: tuple[int, int]) -> None:
-    """A network fixed to one tile size takes only windows of that size, in an image of `size` (H, W).
-
-    Raises:
-        OptionError: another tile size, or an image smaller than the tile.
-    """
+    """A network fixed to one tile size takes only windows of that size, in an image of `size` (H, W)."""
     if fixed_px != tile_px or min(size) < fixed_px:
         raise OptionError(
             "tile",
@@ -207,11 +191,6 @@ def make_plan(shape: tuple[int, ...], tile_px: int, halo_px: int, tiling: Tiling
     """The plan of an image of `shape` (bands, H, W).
 
     Tiles are as even as can be, of at most `tile_px` a side; of just that where the network is fixed to it.
-
-    Raises:
-        ModelError: a network whose result is smaller than the image.
-        OptionError: a tile with no room between its two halos, a halo off the lattice, or bands that the network
-            does not take.
     """
     bands, height_px, width_px = shape
     _require_fit(bands, halo_px, tiling)
@@ -266,9 +245,6 @@ def check_memory(rows: int, budget_bytes: int | None, bulky: bool) -> int:
         rows: bytes that rows of the image will take.
         budget_bytes: None allows what is free.
         bulky: most of them for the sake of an image in large strips.
-
-    Raises:
-        MachineError: it does not fit.
     """
     held = psutil.Process().memory_info().rss
     allowed = budget_bytes or psutil.virtual_memory().available + held

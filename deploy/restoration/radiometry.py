@@ -35,10 +35,6 @@ def full_scale_of(
         largest: as for `model.io.images.settled_scale`, drawn for floats only.
         asked: by the user.
         bits: of the sensor, where the user names its profile.
-
-    Raises:
-        ImageError: pixels that leave it open.
-        OptionError: a full scale that such pixels, or their restored ones, cannot have.
     """
     if asked is not None:
         settled_scale(name, raster.dtype, largest, asked)
@@ -59,11 +55,7 @@ def _holds(dtype: np.dtype[Any], bits: int) -> bool:
 
 
 def require_room(raster: Raster, full_scale: float) -> None:
-    """That restored pixels up to full scale fit into the output's type.
-
-    Raises:
-        OptionError: they do not.
-    """
+    """That restored pixels up to full scale fit into the output's type."""
     kind = raster.out_dtype
     if kind.kind == "u" and full_scale > np.iinfo(kind).max:
         expected, remedy = f"at most {np.iinfo(kind).max} for {kind} pixels", "convert the image to uint16"

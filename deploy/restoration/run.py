@@ -63,13 +63,6 @@ def restore_file(image: Path, out: Path, options: Options, log: Log, beside: Seq
         options: what the user chose.
         log: is told the plan, the memory, and how to go on after a stop.
         beside: other files that the caller will write: they must be none that the image is read from.
-
-    Raises:
-        ImageError: no such image, damaged, all missing, or values outside 0 to full scale; nothing is left behind.
-        ModelError: a network that cannot be tiled or run.
-        OptionError: options that do not go together, or `resume` after a run of another kind.
-        MachineError: another run on `out`; memory, disk, a package or lost workers: finished rows stay for `resume`.
-        KeyboardInterrupt: stopped; rows already finished stay for `resume`.
     """
     require_image_file(image)
     require_writable(out, inputs=(image, options.model))
@@ -143,12 +136,7 @@ def _opened(
 
 
 def scale_of(source: Source, plan: Plan, options: Options, name: str) -> FullScale:
-    """The pixel value that is full scale; float images are read to their first bright row of tiles to know it.
-
-    Raises:
-        ImageError: pixels that leave it open.
-        OptionError: a full scale that such pixels cannot have.
-    """
+    """The pixel value that is full scale; float images are read to their first bright row of tiles to know it."""
     largest = (source.raster.largest(source.read(row.keep_start, row.keep_stop)) for row in plan.rows)
     return full_scale_of(name, source.raster, largest, options.full_scale, options.sensor_bits)
 
@@ -184,11 +172,6 @@ def _finish_rows(
         at_once: tiles in work at a time.
         budget_bytes: of memory; None allows what is free.
         log: is told the memory, and how to go on after a stop.
-
-    Raises:
-        ImageError: unreadable rows, values out of range, or no known pixel at all; the rows are thrown away.
-        MachineError: memory, disk, or workers; finished rows stay.
-        KeyboardInterrupt: stopped; finished rows stay.
     """
     rows = [row for row in plan.rows if row.keep_start * plan.scale >= checkpoint.rows]
     tiles, steady = len(rows) * plan.row_tiles, min(RUNS_UNTIL_STEADY * at_once, len(rows) * plan.row_tiles)

@@ -33,12 +33,7 @@ Precision = Literal["f32", "bf16"]
 def open_openvino(
     model: onnx.ModelProto, threads: int, precision: Precision = "f32", at_once: int = 1
 ) -> tuple[Callable[[np.ndarray], np.ndarray], str]:
-    """A callable (1, C, h, w) float32 -> (1, C', h', w') for `at_once` callers, and the runtime's name and version.
-
-    Raises:
-        MachineError: OpenVINO is not installed, or this processor does not compute in that precision.
-        ModelError: OpenVINO refuses the model.
-    """
+    """A callable (1, C, h, w) float32 -> (1, C', h', w') for `at_once` callers, and the runtime's version."""
     core = _core()
     if precision == "bf16" and "BF16" not in core.get_property("CPU", "OPTIMIZATION_CAPABILITIES"):
         remedy = "run it on a processor that has them"
@@ -141,11 +136,6 @@ def open_runtime(runtime: Runtime, model: onnx.ModelProto, threads: int, at_once
         model: the network.
         threads: in all; 0 takes every core.
         at_once: how many callers share the threads.
-
-    Raises:
-        MissingExtraError: the runtime is not installed.
-        ModelError: it refuses the model.
-        OptionError: more threads than cores.
     """
     require_cores("threads", threads)
     if runtime is Runtime.openvino:

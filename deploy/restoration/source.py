@@ -78,12 +78,7 @@ class Raster:
 
 
 def page_raster(path: str, page: tifffile.TiffPage) -> Raster:
-    """What a TIFF page says of its image, before any pixel is read.
-
-    Raises:
-        ImageError: too large to be planned, pixels that are no real numbers, or a nodata value that the output could
-            not hold.
-    """
+    """What a TIFF page says of its image, before any pixel is read."""
     planes, _, height_px, width_px, samples = page.shaped
     require_size(path, planes * samples, height_px, width_px)
     dtype = require_numbers(path, page.dtype)
@@ -101,11 +96,7 @@ def carried_tags(page: tifffile.TiffPage) -> tuple[Tag, ...]:
 
 
 def require_size(path: str, bands: int, height_px: int, width_px: int) -> None:
-    """That an image can be planned.
-
-    Raises:
-        ImageError: too large.
-    """
+    """That an image can be planned."""
     if max(height_px, width_px) > SIDE_PX or bands > BANDS:
         got = f"{bands} bands of {width_px} x {height_px} pixels"
         expected = f"at most {BANDS} bands of {SIDE_PX} pixels a side"
@@ -113,11 +104,7 @@ def require_size(path: str, bands: int, height_px: int, width_px: int) -> None:
 
 
 def require_numbers(path: str, dtype: np.dtype[Any] | None) -> np.dtype[Any]:
-    """The type of the pixels, unless they are complex or packed bits.
-
-    Raises:
-        ImageError: pixels that are neither integers nor floats.
-    """
+    """The type of the pixels, unless they are complex or packed bits."""
     if dtype is None or dtype.kind not in "uif":
         got = str(dtype or "packed bits")
         raise ImageError(path, expected="integer or float pixels", got=got, remedy="convert it to uint16")
@@ -136,11 +123,7 @@ def _nodata(path: str, page: tifffile.TiffPage, dtype: np.dtype[Any]) -> float |
 
 
 def usable_nodata(path: str, value: float | None, dtype: np.dtype[Any]) -> float | None:
-    """A nodata value; None for one that no pixel of this type can have.
-
-    Raises:
-        ImageError: the output could not hold it.
-    """
+    """A nodata value; None for one that no pixel of this type can have."""
     if value is None or dtype.kind == "f":
         return value
     limits = np.iinfo(dtype)
@@ -208,11 +191,6 @@ def open_source(path: Path, trusted: bool = False) -> Iterator[Source]:
     Args:
         path: of the file, or of the index of its tiles.
         trusted: whether an index may name files outside its folder and at URLs.
-
-    Raises:
-        ImageError: no such file, or no image of numbers.
-        MachineError: an unknown compression, a format that needs a package which is not installed, or an image read
-            whole that does not fit in memory.
     """
     require_image_file(path)
     suffix = path.suffix.lower()
@@ -230,12 +208,7 @@ def open_source(path: Path, trusted: bool = False) -> Iterator[Source]:
 
 @contextmanager
 def open_page(path: Path) -> Iterator[Source]:
-    """A TIFF of one page as a stream, of several whole.
-
-    Raises:
-        ImageError: no image of numbers.
-        MachineError: an unknown compression, or an image read whole that does not fit in memory.
-    """
+    """A TIFF of one page as a stream, of several whole."""
     with damage_in_a_sentence(path):
         file = open_tiff(path)
     with file:
@@ -288,11 +261,7 @@ class TiffSource:
         self._flat = page.compression == 1 and page.is_contiguous and page.bitspersample in (8, 16, 32, 64)
 
     def read(self, start: int, stop: int) -> np.ndarray:
-        """Rows `start` to `stop` (excluded) of every band, (bands, rows, width), as stored.
-
-        Raises:
-            ImageError: damaged.
-        """
+        """Rows `start` to `stop` (excluded) of every band, (bands, rows, width), as stored."""
         with damage_in_a_sentence(self._path, f"rows {start} to {stop - 1}"):
             return self._read_flat(start, stop) if self._flat else self._read_segments(start, stop)
 

@@ -21,11 +21,7 @@ WHEN = "datetime is the time of the restoration: the image states no time of acq
 
 
 def require_stac() -> None:
-    """Find out before the run that a package is missing.
-
-    Raises:
-        MissingExtraError: rasterio or pystac is not installed.
-    """
+    """Find out before the run that a package is missing."""
     for package in ("rasterio", "pystac"):
         try:
             import_module(package)

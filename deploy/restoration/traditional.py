@@ -70,15 +70,7 @@ class Request:
 
 
 def restore_file_traditionally(image: Path, out: Path, request: Request, beside: Sequence[Path | None] = ()) -> Row:
-    """As `deploy.restoration.run.restore_file`, of a mono image and by the traditional chain.
-
-    Raises:
-        ImageError: no such image, damaged, of several bands, all missing, of a scale left open, or values outside 0
-            to full scale; nothing is left behind.
-        OptionError: a full scale that such pixels cannot have.
-        MachineError: another run on `out`; memory or disk.
-        KeyboardInterrupt: stopped; nothing is left behind.
-    """
+    """As `deploy.restoration.run.restore_file`, of a mono image and by the traditional chain."""
     require_image_file(image)
     require_writable(out, inputs=(image,))
     require_tiff_name(out)
@@ -110,11 +102,7 @@ def _restore(image: Path, out: Path, request: Request, beside: Sequence[Path | N
 
 
 def _fill(checkpoint: Checkpoint, source: Source, chain: Chain, full_scale: float, name: str) -> None:
-    """Restore every row.
-
-    Raises:
-        ImageError: no pixel of the image is known, or one is outside 0 to full scale.
-    """
+    """Restore every row."""
     raster, to_dn, top = source.raster, chain.degraded.max_dn / full_scale, 0
     with steps("restoring rows", raster.height_px) as bar:
         for strip in restore_strips(_read(source, to_dn, full_scale, name), raster.height_px, chain):

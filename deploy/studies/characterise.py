@@ -62,11 +62,7 @@ class Box:
     height: int
 
     def cut(self, pixels: np.ndarray) -> np.ndarray:
-        """The part of its pixels (H, W).
-
-        Raises:
-            OptionError: outside the image, or too small for an edge.
-        """
+        """The part of its pixels (H, W)."""
         part = pixels[self.top : self.top + self.height, self.left : self.left + self.width]
         if part.shape != (self.height, self.width) or min(part.shape) < BOX_PX:
             height, width = pixels.shape
@@ -79,11 +75,7 @@ class Box:
 
 
 def read_box(text: str, images: Sequence[Path]) -> Box:
-    """The box that FILE:X,Y,WIDTH,HEIGHT names, FILE being one of the images.
-
-    Raises:
-        OptionError: written otherwise, or of another image.
-    """
+    """The box that FILE:X,Y,WIDTH,HEIGHT names, FILE being one of the images."""
     parts = re.fullmatch(r"(.*):(\d{1,8}),(\d{1,8}),(\d{1,8}),(\d{1,8})", text, re.ASCII)
     if parts is None:
         expected, remedy = "FILE:X,Y,WIDTH,HEIGHT in whole pixels", "write raw.tif:1200,340,60,60"
@@ -159,10 +151,6 @@ def characterise(
         bits: of a digital number; None where clipped pixels must tell.
         gain: DN per W/m2/sr/um; None assumes 400 W/m2/sr/um at full scale.
         gsd_m: ground sampling distance; None assumes one.
-
-    Raises:
-        ImageError: images that are not raw, or that do not hold what is needed; the message says what that is.
-        OptionError: an option that contradicts the pixels.
     """
     for option, value in (("gain", gain), ("gsd", gsd_m)):
         if value is not None and not 0 < value < math.inf:
@@ -239,11 +227,7 @@ def _as_file(image: Any, path: Path) -> Path:
 
 
 def read_raw(path: Path) -> np.ndarray:
-    """Digital numbers (H, W) of one band, integers of any width.
-
-    Raises:
-        ImageError: several bands, fractions, or values below 0.
-    """
+    """Digital numbers (H, W) of one band, integers of any width."""
     pixels = read_pixels(path)
     if pixels.ndim != 2:
         got, remedy = f"{pixels.shape[2]} bands", "extract one band; each has a sensor of its own"
@@ -300,11 +284,7 @@ def snr_at(noise: NoiseModel, dn: float, gain: float) -> Snr:
 
 
 def measured_noise(images: Sequence[Path], clipped_at: int) -> NoiseModel:
-    """The noise in the digital numbers of images that clip at a value.
-
-    Raises:
-        ImageError: it cannot be known.
-    """
+    """The noise in the digital numbers of images that clip at a value."""
     blocks = [cut_blocks(tile, clipped_at) for tile in _tiles(images)]
     noise = fit_noise_model(join(blocks), np.random.default_rng(SEED))
     if isinstance(noise, Refusal):

@@ -121,12 +121,7 @@ def run_demo(
 
 
 def load_sensors(name: str = SENSOR) -> Sensors:
-    """The sensor that the demo simulates, and the one it imitates.
-
-    Raises:
-        OptionError: a sensor of other than 12 bits.
-        ProfileError: no such sensor.
-    """
+    """The sensor that the demo simulates, and the one it imitates."""
     degraded = load_sensor(name)
     if degraded.nominal().bits != BITS:
         got, remedy = f"{degraded.nominal().bits} bits", "use 'restore', with a full scale or the traditional method"

@@ -66,9 +66,6 @@ def claim_outputs(
         inputs: files that are read, and folders from which files are; what does not exist is passed over. A hard
             link or a symbolic link to an input is that input.
         folders: are to be filled with images whose names are not known yet: no image that is read may lie there.
-
-    Raises:
-        OptionError: such an output.
     """
     read = [file for path in inputs if path is not None for file in _files_of(path)]
     known, wanted = {_identity(file) for file in read}, [path for path in outputs if path is not None]
@@ -113,11 +110,7 @@ def require_writable(
 
 
 def require_regular(path: Path | None) -> None:
-    """Refuse an output at which a folder, a link, a pipe or a device stands; a regular file or nothing may.
-
-    Raises:
-        MachineError: one of those stands there.
-    """
+    """Refuse an output at which a folder, a link, a pipe or a device stands; a regular file or nothing may."""
     if path is None or not os.path.lexists(path):
         return
     kind = stat.S_IFMT(path.lstat().st_mode)

@@ -55,11 +55,7 @@ def read_pixels(path: Path) -> np.ndarray:
 
 
 def require_image_file(path: Path) -> None:
-    """Refuse what is no file, or an empty one.
-
-    Raises:
-        ImageError: either.
-    """
+    """Refuse what is no file, or an empty one."""
     got = unreadable(path)
     if got is not None:
         raise ImageError(str(path), expected="an image file", got=got, remedy="check the path")
@@ -69,12 +65,7 @@ def require_image_file(path: Path) -> None:
 
 @contextmanager
 def damage_in_a_sentence(path: Path, where: str = "") -> Iterator[None]:
-    """One sentence for whatever the bytes of a damaged image lead to; `where` names the place in it.
-
-    Raises:
-        ImageError: damaged.
-        MachineError: a compression that needs a package which is not installed.
-    """
+    """One sentence for whatever the bytes of a damaged image lead to; `where` names the place in it."""
     try:
         yield
     except (BeersError, MemoryError):
@@ -90,11 +81,7 @@ def damage_in_a_sentence(path: Path, where: str = "") -> Iterator[None]:
 
 
 def image_size_px(path: Path) -> tuple[int, int]:
-    """Height and width of an image file as its header has them: no pixel is read.
-
-    Raises:
-        ImageError: missing, empty, or not an image.
-    """
+    """Height and width of an image file as its header has them: no pixel is read."""
     require_image_file(path)
     with damage_in_a_sentence(path), warnings.catch_warnings(action="ignore"):
         if path.suffix.lower() in TIFF_SUFFIXES:
@@ -228,11 +215,7 @@ def settled_scale(
 
 
 def check_scale(full_scale: float, kind: str) -> None:
-    """A full scale that pixels of this kind (numpy's letter) can have.
-
-    Raises:
-        OptionError: another.
-    """
+    """A full scale that pixels of this kind (numpy's letter) can have."""
     whole = full_scale <= 65535 and full_scale % 1 == 0
     if 0 < full_scale < np.inf and (kind == "f" or whole):
         return
@@ -263,10 +246,6 @@ def read_acquisition(
         full_scale: the pixel value that is full scale; None lets the pixels' type and values decide.
         remedy: what to do about pixels that leave it open; None names --full-scale.
         max_dn: the sensor's largest digital number.
-
-    Raises:
-        ImageError: several bands, pixels that leave the full scale open, or values that no such sensor gives.
-        OptionError: a full scale that such pixels cannot have.
     """
     pixels = read_pixels(path)
     if pixels.ndim != 2:

@@ -55,11 +55,7 @@ def write_tensors(path: Path, tensors: Arrays, header: Mapping[str, object]) -> 
 
 
 def read_tensors(path: Path) -> tuple[dict[str, np.ndarray], dict[str, object]]:
-    """Read the named arrays, of any shape, and the JSON header of a safetensors file.
-
-    Raises:
-        ModelError: missing or not safetensors.
-    """
+    """Read the named arrays, of any shape, and the JSON header of a safetensors file."""
     try:
         with safe_open(path, framework="np") as file:
             header = {key: parse_json(value) for key, value in (file.metadata() or {}).items()}
@@ -80,11 +76,7 @@ def write_weights(path: Path, weights: Weights) -> None:
 
 
 def read_weights(path: Path) -> Weights:
-    """The weights of a network, plain or told its sensor.
-
-    Raises:
-        ModelError: not our weights, of another shape, or of other ranges of sensors than this version's.
-    """
+    """The weights of a network, plain or told its sensor."""
     tensors, header = read_tensors(path)
     try:
         conditioned = _told(header)
@@ -97,11 +89,7 @@ def read_weights(path: Path) -> Weights:
 
 
 def read_plain(path: Path) -> Weights:
-    """The weights of a plain network.
-
-    Raises:
-        ModelError: not our weights, weights of another shape, or of a network that is told its sensor.
-    """
+    """The weights of a plain network."""
     found = read_weights(path)
     if found.conditioned:
         remedy = "name the sensor: beers-deploy export --network FILE --sensor NAME"
@@ -111,11 +99,7 @@ def read_plain(path: Path) -> Weights:
 
 
 def read_conditioned(path: Path) -> Weights:
-    """The weights of a network that is told its sensor.
-
-    Raises:
-        ModelError: not such weights, or of other ranges of sensors than this version's.
-    """
+    """The weights of a network that is told its sensor."""
     found = read_weights(path)
     if not found.conditioned:
         error = ValueError("a network that is told no sensor")
@@ -124,11 +108,7 @@ def read_conditioned(path: Path) -> Weights:
 
 
 def is_conditioned(path: Path) -> bool:
-    """Whether a weights file states that it holds a network that must be told its sensor.
-
-    Raises:
-        ModelError: missing or not safetensors.
-    """
+    """Whether a weights file states that it holds a network that must be told its sensor."""
     return read_tensors(path)[1].get("kind") is not None
 
 
@@ -148,11 +128,7 @@ def _recipe(header: Mapping[str, object]) -> dict[str, object]:
 
 
 def _told(header: Mapping[str, object]) -> bool:
-    """Whether the network is told its sensor.
-
-    Raises:
-        ValueError: another kind, or other ranges of sensors than this version's.
-    """
+    """Whether the network is told its sensor."""
     kind = header.get("kind")
     if kind not in (None, BANKED):
         raise ValueError(f"weights {kind}: those of another version")
@@ -170,21 +146,13 @@ def _variant(header: Mapping[str, Any]) -> Variant:
 
 
 def _check_count(tensors: Arrays, variant: Variant, count: int) -> None:
-    """The number of tensors, before a list of a network's is made: a header alone must not take memory.
-
-    Raises:
-        ValueError: another number than a network of that variant has.
-    """
+    """The number of tensors, before a list of a network's is made: a header alone must not take memory."""
     if len(tensors) != count:
         raise ValueError(f"{len(tensors)} tensors for {variant}")
 
 
 def _check_like(tensors: Arrays, shapes: Mapping[str, tuple[int, ...]]) -> None:
-    """Compare with what a network has.
-
-    Raises:
-        ValueError: a tensor that is missing, misshapen, of another type or not finite.
-    """
+    """Compare with what a network has."""
     for name, shape in shapes.items():
         if tensors[name].shape != shape:
             raise ValueError(f"{name} of shape {tensors[name].shape}, for {shape}")

@@ -99,13 +99,7 @@ MARKER, FRAMES = 0xFF, set(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 
 
 def check_page(path: Path, page: tifffile.TiffPage) -> None:
-    """Refuse a page that would take more than its pixels do.
-
-    Raises:
-        ImageError: a file cut short, a compression that is not known here, or packed bytes of more pixels than their
-            place has.
-        MachineError: a strip or tile that does not fit in memory.
-    """
+    """Refuse a page that would take more than its pixels do."""
     for name in SIZES:
         if not isinstance(getattr(page, name), int):  # a file may hold a float, or a list
             got, remedy = f"{name} of {str(getattr(page, name))[:40]}", "write it again"

@@ -172,9 +172,6 @@ def load_backbone(network: str, path: Path, *, l2_pool: bool = False) -> Backbon
         network: "squeeze", "alex" or "vgg".
         path: .safetensors or .npz.
         l2_pool: DISTS's pooling in the place of the max pooling.
-
-    Raises:
-        ModelError: missing, of a kind that is not read, or with a parameter missing, misshapen or not finite.
     """
     backbone = Backbone(network, l2_pool=l2_pool)
     wanted = backbone.state_dict()
@@ -189,11 +186,7 @@ def load_backbone(network: str, path: Path, *, l2_pool: bool = False) -> Backbon
 
 
 def read_tensors(path: Path, names: Iterable[str]) -> dict[str, Tensor]:
-    """The named tensors, of any shape, of a .safetensors or .npz file, as float32.
-
-    Raises:
-        ModelError: missing file, missing name, or of a kind that is not read.
-    """
+    """The named tensors, of any shape, of a .safetensors or .npz file, as float32."""
     if path.suffix not in SUFFIXES:
         raise _error(path, "a .safetensors or .npz file", f"'{path.suffix}', which is not read", CONVERT)
     got = unreadable(path)

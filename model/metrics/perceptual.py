@@ -45,9 +45,6 @@ class Lpips(nn.Module):
         Args:
             network: "squeeze", "alex" or "vgg".
             path: .safetensors or .npz, parameters named as in torchvision.
-
-        Raises:
-            ModelError: the file is missing, of a kind that is not read, or not that network.
         """
         backbone = load_backbone(network, path)
         names = [f"lin{layer}" for layer in range(len(backbone.spec.taps))]
@@ -60,9 +57,6 @@ class Lpips(nn.Module):
         Args:
             image: (N, 1, H, W), 0 to 1 of full scale; at least 17 px a side for squeeze, 31 for alex, 16 for vgg.
             reference: the same shape.
-
-        Raises:
-            ImageError: of another shape, or too small.
         """
         _check_pair(self.label, self.backbone, image, reference)
         with torch.autocast(image.device.type, enabled=False):
@@ -94,11 +88,7 @@ class Dists(nn.Module):
 
     @classmethod
     def load(cls, path: Path) -> Self:
-        """The metric with its published weights, over the VGG16 in a file (`find_backbone("vgg")`).
-
-        Raises:
-            ModelError: the file is missing, of a kind that is not read, or no VGG16.
-        """
+        """The metric with its published weights, over the VGG16 in a file (`find_backbone("vgg")`)."""
         backbone = load_backbone("vgg", path, l2_pool=True)
         weights = read_tensors(PUBLISHED / "dists.safetensors", ["alpha", "beta"])
         return cls(backbone, weights["alpha"], weights["beta"])
@@ -109,9 +99,6 @@ class Dists(nn.Module):
         Args:
             image: (N, 1, H, W), 0 to 1 of full scale, at least 16 px a side.
             reference: the same shape.
-
-        Raises:
-            ImageError: of another shape, or too small.
         """
         _check_pair(self.label, self.backbone, image, reference)
         with torch.autocast(image.device.type, enabled=False):

@@ -26,9 +26,6 @@ def gamma_from_mtf(mtf_nyquist: float, antialias_sigma_px: float = 0.0) -> float
     G is the anti-alias filter's own gain at Nyquist: the filter is part of the budget, so that the product has the
     MTF that its profile states. Limits: 2 G / pi gives 0 (the square detector alone); towards 0 it grows without
     bound.
-
-    Raises:
-        OptionError: outside (0, 2 G / pi], where the "blur" would have to amplify, or would erase everything.
     """
     limit = mtf_limit(antialias_sigma_px)
     if not 0 < mtf_nyquist <= limit:
@@ -65,9 +62,6 @@ def mtf(fx: ArrayLike, fy: ArrayLike, blur: Blur, antialias_sigma_px: float = 0.
 
     Returns:
         (H, W) float64; complex128 for a point-spread function.
-
-    Raises:
-        OptionError: a contrast that no blur leaves, or an anti-alias filter beside a whole response.
     """
     fx, fy = np.asarray(fx, np.float64), np.asarray(fy, np.float64)
     if isinstance(blur, Response):

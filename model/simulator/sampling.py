@@ -125,11 +125,7 @@ def read_scene(path: Path, sensor: Instrument) -> Scene:
 
 
 def scene_of(name: str, pixels: np.ndarray, sensor: Instrument) -> Scene:
-    """As `read_scene`, of the pixels of an image.
-
-    Raises:
-        ImageError: pixels of another kind.
-    """
+    """As `read_scene`, of the pixels of an image."""
     radiance: np.ndarray
     if pixels.dtype == np.uint8:
         radiance = _linear(pixels) * (sensor.max_dn / sensor.gain_dn_per_radiance)

@@ -294,9 +294,6 @@ def nl_bayes(image: Tensor, noise: Noise, quality: Quality = QUALITIES["standard
     The settings were published for 8-bit images: bring the data to a scale where sigma lies within some 5 to 40.
     Limits: sigma = 0 returns a copy; a constant image returns itself, up to rounding; a pixel too near missing ones
     to lie in any whole patch keeps its value. Any H and W from 1 on.
-
-    Raises:
-        ImageError: not one plane, or infinite values.
     """
     if image.ndim != 2 or 0 in image.shape:
         raise ImageError(
@@ -324,11 +321,7 @@ def nl_bayes_strips(strips: Iterable[Tensor], height: int, noise: Noise, quality
 
 
 def finite_or_missing(strips: Iterable[Tensor]) -> Iterator[Tensor]:
-    """Pass strips (any, W) on as they come; NaN marks missing pixels.
-
-    Raises:
-        ImageError: one holds infinite values.
-    """
+    """Pass strips (any, W) on as they come; NaN marks missing pixels."""
     for strip in strips:
         if bool(torch.isinf(strip).any()):
             remedy = "mark missing pixels as NaN"

@@ -97,11 +97,7 @@ def read_checkpoint(
     optimiser: torch.optim.Optimizer,
     recipe: TrainingRecipe,
 ) -> tuple[int, Guards]:
-    """Fill network, average (any shape each) and optimiser from a checkpoint; return its step and guards.
-
-    Raises:
-        ModelError: not a checkpoint, or one of another recipe or network.
-    """
+    """Fill network, average (any shape each) and optimiser from a checkpoint; return its step and guards."""
     found, header = read_tensors(path)
     tensors = {name: torch.from_numpy(array) for name, array in found.items()}
     if header.get("recipe") != asdict(recipe):
@@ -127,11 +123,7 @@ def read_checkpoint(
 
 
 def finish(network: Network, path: Path, recipe: dict[str, object]) -> Network:
-    """Write a network with the recipe that made it, and read it back.
-
-    Raises:
-        ModelError: a weight is not finite, or what the network makes of an image.
-    """
+    """Write a network with the recipe that made it, and read it back."""
     if not all_finite(arrays(network.state_dict())):
         remedy = "lower the learning rate"
         raise ModelError(str(path), expected="finite weights", got="NaN or infinity", remedy=remedy)
@@ -141,11 +133,7 @@ def finish(network: Network, path: Path, recipe: dict[str, object]) -> Network:
 
 
 def _check_parts(tensors: dict[str, Tensor], network: Network, steps: int) -> None:
-    """Nothing is filled in before all of it fits.
-
-    Raises:
-        ValueError: a tensor that is missing, misshapen, of another type or not finite.
-    """
+    """Nothing is filled in before all of it fits."""
     wanted = network.state_dict()
     parameters = dict(network.named_parameters())
     for name, value in wanted.items():

@@ -23,9 +23,6 @@ def grow(network: N, variant: Variant, generator: torch.Generator) -> N:
     Features are copied, and their weights shared out among the copies (Net2Net, Chen et al. 2016). Added blocks lie
     evenly between the others; their second convolution is zero, so that each hands on what it is given until it has
     learnt something. At a larger scale each feature becomes one for each pixel of a place (see `_coarser`).
-
-    Raises:
-        ModelError: fewer blocks, a finer scale, or features that are no multiple.
     """
     sources = _sources(network.variant, variant)
     large = type(network)(variant)

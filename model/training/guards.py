@@ -28,21 +28,13 @@ class Guards:
         self._sum, self._count = 0.0, 0
 
     def skipped(self, step: int) -> None:
-        """Count a step whose loss or gradient was not finite.
-
-        Raises:
-            ModelError: there have been too many.
-        """
+        """Count a step whose loss or gradient was not finite."""
         self.bad_steps += 1
         if self.bad_steps > MAX_BAD_STEPS:
             raise _error(step, "a finite loss", f"{self.bad_steps} non-finite steps")
 
     def passed(self, step: int, loss: float) -> None:
-        """Take note of a step's loss.
-
-        Raises:
-            ModelError: the loss has run away.
-        """
+        """Take note of a step's loss."""
         self._sum, self._count = self._sum + loss, self._count + 1
         if self._count < WINDOW_STEPS:
             return
@@ -72,9 +64,6 @@ def require_finite_output(network: Network, where: str, remedy: str = "lower the
         network: on the CPU; a conditioned one is told the middle of every range.
         where: what to name in the message.
         remedy: what to do about it.
-
-    Raises:
-        ModelError: it does.
     """
     side_px = network.variant.scale * TEST_PLACES
     image = torch.rand((1, 1, side_px, side_px), generator=torch.Generator().manual_seed(0))

@@ -236,11 +236,7 @@ Files = tuple[Path, Path]
 
 
 def pair_files(folder: Path) -> list[Files]:
-    """The pairs FOLDER/degraded/NAME and FOLDER/reference/NAME, by name.
-
-    Raises:
-        ImageError: a folder is missing or empty, or a name has no partner.
-    """
+    """The pairs FOLDER/degraded/NAME and FOLDER/reference/NAME, by name."""
     degraded, reference = ({p.stem: p for p in list_images(folder / role)} for role in ("degraded", "reference"))
     alone = sorted(degraded.keys() ^ reference.keys())
     if alone:

@@ -125,11 +125,7 @@ def train(run: Run, resume: bool, worker: Worker, say: Callable[[str], None]) ->
 
 
 def require_whole_places(run: Run, variants: Sequence[Variant]) -> None:
-    """Refuse patches that a network at a lower resolution, or a teacher at one, cannot rearrange.
-
-    Raises:
-        OptionError: such a side.
-    """
+    """Refuse patches that a network at a lower resolution, or a teacher at one, cannot rearrange."""
     scale = math.lcm(*(variant.scale for variant in variants))
     if run.patches.patch_px % scale:
         expected, got = (
@@ -140,11 +136,7 @@ def require_whole_places(run: Run, variants: Sequence[Variant]) -> None:
 
 
 def start_weights(run: Run) -> Mapping[str, Tensor] | None:
-    """The weights to go on from, grown to the run's variant; None draws new ones.
-
-    Raises:
-        ModelError: no such weights, or a network that cannot grow to the variant.
-    """
+    """The weights to go on from, grown to the run's variant; None draws new ones."""
     if run.start is None:
         return None
     variant, generator = variant_named(run.variant), torch.Generator().manual_seed(run.recipe.seed)
@@ -152,11 +144,7 @@ def start_weights(run: Run) -> Mapping[str, Tensor] | None:
 
 
 def _given(run: Run, path: Path) -> Network:
-    """A network from its file, of the kind that the run trains; refused where it gives NaN, as every step would.
-
-    Raises:
-        ModelError: no such weights, or of the other kind.
-    """
+    """A network from its file, of the kind that the run trains; refused where it gives NaN, as every step would."""
     network, _ = load_network(path)
     wanted = ConvBEERS if run.patches.family is None else BankedConvBEERS
     if not isinstance(network, wanted):
@@ -269,11 +257,7 @@ class Board(Protocol):
 
 
 def tensorboard(out: Path) -> "SummaryWriter":
-    """A writer of TensorBoard scalars in the run's folder.
-
-    Raises:
-        OptionError: TensorBoard is not installed.
-    """
+    """A writer of TensorBoard scalars in the run's folder."""
     try:
         from torch.utils.tensorboard import SummaryWriter
     except ImportError as error:

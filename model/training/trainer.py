@@ -88,9 +88,6 @@ class Trainer:
         teacher: a network of the same kind whose outputs the recipe's `distil` weighs.
         precision: what the body is computed in; it is the machine's, and a resumed run may take another.
         conditioned: whether the network is given the sensor of each patch.
-
-    Raises:
-        OptionError: a loss of which nothing is weighed.
     """
 
     def __init__(
@@ -120,12 +117,7 @@ class Trainer:
         self.optimiser = _optimiser(self.network, recipe)
 
     def run(self, source: Source, checkpoint: Path, schedule: Schedule) -> None:
-        """Train to the last step. Ctrl-C leaves a checkpoint of the last whole step.
-
-        Raises:
-            ModelError: the loss stayed non-finite, or diverged.
-            KeyboardInterrupt: after the checkpoint was written.
-        """
+        """Train to the last step. Ctrl-C leaves a checkpoint of the last whole step."""
         meter, saved = Meter(self), time.monotonic()
         with held_back() as interrupt:
             batches = source.batches(self.step)
@@ -203,11 +195,7 @@ class Trainer:
             write_checkpoint(path, *parts)
 
     def resume(self, path: Path) -> None:
-        """Go on from a checkpoint of the same recipe, begun on this processor or another.
-
-        Raises:
-            ModelError: not a checkpoint, or one of another recipe.
-        """
+        """Go on from a checkpoint of the same recipe, begun on this processor or another."""
         parts = self.network, self.average, self.optimiser, self.recipe
         self.step, self.guards = read_checkpoint(path, *parts)
 
@@ -240,11 +228,7 @@ class Meter:
 
 
 def require_loss(loss: RestorationLoss, distil: float) -> None:
-    """Refuse a loss that is 0 whatever the network gives: such a run learns nothing.
-
-    Raises:
-        OptionError: no term that is computed has a weight above 0.
-    """
+    """Refuse a loss that is 0 whatever the network gives: such a run learns nothing."""
     if loss.weights.total(loss.perceptual is not None) + distil > 0:
         return
     left_out = ", and none but LPIPS, which lacks its weights" if loss.weights.lpips else ""

@@ -25,11 +25,7 @@ class Worker:
         return self.rank == 0
 
     def device(self, name: str) -> torch.device:
-        """The device of that name; of several GPUs, this worker's own.
-
-        Raises:
-            MachineError: there is none here.
-        """
+        """The device of that name; of several GPUs, this worker's own."""
         device = torch.device(name)
         if device.type == "cuda" and not torch.cuda.is_available():
             remedy = "choose the device cpu, or install a build of PyTorch for it"

@@ -26,7 +26,7 @@ from beers_deploy.quant.banked.filters import (
     spread_over_a_step,
     whole_bank,
 )
-from beers_deploy.quant.calibration import PATCH_PX, Remade, draw_patches
+from beers_deploy.quant.calibration import draw_patches
 from beers_deploy.quant.core import SHIFTS, IntConv, IntCore, Shifts, quantise_bias
 from beers_deploy.quant.ends import Ends
 from beers_deploy.quant.graph import (
@@ -47,6 +47,7 @@ from beers_deploy.quant.integer.arithmetic import convolve
 from beers_deploy.quant.passes.level import Chain
 from beers_deploy.quant.passes.stream import lone_tensors, streams
 from beers_deploy.quant.quantise import Plan, rounded
+from beers_deploy.quant.samples import PATCH_PX, Remade
 
 LIKE = "pleiades-degraded"
 """The profile that gives gain and bits; what is computed is over full scale."""
@@ -200,9 +201,6 @@ def family_images(scenes: list[Scene], scale: int, seed: int, patch_px: int = PA
         scale: of the network.
         seed: of everything that is drawn.
         patch_px: side of a patch.
-
-    Raises:
-        ImageError: no scene holds a patch.
     """
     like, reference = load_sensor(LIKE), load_sensor(REFERENCE)
     families = (PATCHES, SensorFamily(like.nominal())), (QUIET_PATCHES, SensorFamily(like.nominal(), QUIET_SNR))

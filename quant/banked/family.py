@@ -67,11 +67,7 @@ class Family:
 
 
 def family_of(model: onnx.ModelProto) -> Family | None:
-    """What an INT8 file of a network behind a bank says of other sensors; None of any other file.
-
-    Raises:
-        ModelError: words that contradict the file.
-    """
+    """What an INT8 file of a network behind a bank says of other sensors; None of any other file."""
     words = metadata(model).get(FAMILY)
     if words is None:
         return None
@@ -87,11 +83,7 @@ def family_of(model: onnx.ModelProto) -> Family | None:
 
 
 def required_family(model: onnx.ModelProto) -> Family:
-    """As `family_of`, of a file that must be such a network's.
-
-    Raises:
-        ModelError: it is another, or contradicts itself.
-    """
+    """As `family_of`, of a file that must be such a network's."""
     family = family_of(model)
     if family is None:
         remedy = "make one with 'beers-deploy quantize' of weights that 'train --conditioned' wrote"
@@ -110,9 +102,6 @@ def delta_of_file(model: onnx.ModelProto) -> bytes:
     """What its sensor has changed in an INT8 file of a network behind a bank: `with_delta` changes it in another's.
 
     A line of JSON and the int8 numbers of each convolution that it names, in their order, all of it compressed.
-
-    Raises:
-        ModelError: no such file.
     """
     family = required_family(model)
     told = [op for op in family.core.convolutions if op.input == PLANES or op.name in family.biases]
@@ -128,11 +117,7 @@ def _numbers(op: IntConv) -> list[np.ndarray]:
 
 
 def with_delta(core: IntCore, delta: bytes) -> tuple[IntCore, str]:
-    """A core of the network that a delta was made for, told the delta's sensor; and the name of that.
-
-    Raises:
-        ModelError: no delta, or one of another network.
-    """
+    """A core of the network that a delta was made for, told the delta's sensor; and the name of that."""
     try:
         line, _, numbers = zlib.decompressobj().decompress(delta, LARGEST_DELTA).partition(b"\n")
         said = json.loads(line)
@@ -157,11 +142,7 @@ LARGEST_DELTA = 1 << 20
 
 
 def _patched(op: IntConv, bits: tuple[int, ...], left: np.ndarray) -> tuple[IntConv, np.ndarray]:
-    """A convolution with the first of these numbers in the place of its own, and the numbers after them.
-
-    Raises:
-        ValueError: too few.
-    """
+    """A convolution with the first of these numbers in the place of its own, and the numbers after them."""
     found = list[np.ndarray]()
     for values in _numbers(op):
         found.append(left[: values.size].reshape(values.shape))

@@ -45,9 +45,6 @@ def as_on_board(model: onnx.ModelProto) -> onnx.ModelProto:
     """A host's file whose core is described in it as the board gets it; any other model as it is.
 
     What the host spells with several operators, such as a transposed convolution, is one of the DPU's own.
-
-    Raises:
-        ModelError: a description that contradicts the file.
     """
     if KEY not in metadata(model):
         return model

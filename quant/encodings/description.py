@@ -57,11 +57,7 @@ def _plain(op: IntConv | Op) -> dict[str, Any]:
 
 
 def described_core(text: str, constants: Mapping[str, np.ndarray]) -> IntCore:
-    """The core that a description and the constants of its file make.
-
-    Raises:
-        LookupError, TypeError, ValueError: a description that contradicts itself or them.
-    """
+    """The core that a description and the constants of its file make."""
     said = json.loads(text)
     _require_small({**said, "ends": {**said["ends"], "offsets": []}})  # values, of any size
     frac_bits = {str(name): int(bits) for name, bits in said["frac_bits"].items()}
@@ -75,11 +71,7 @@ def described_core(text: str, constants: Mapping[str, np.ndarray]) -> IntCore:
 
 
 def _require_small(said: object) -> None:
-    """Numbers that size something are looked at before anything is made of them.
-
-    Raises:
-        ValueError: one beyond what a network of the DPU's has.
-    """
+    """Numbers that size something are looked at before anything is made of them."""
     for each in said.values() if isinstance(said, dict) else said if isinstance(said, list) else ():
         _require_small(each)
     if isinstance(said, int | float) and not abs(said) <= LARGEST:

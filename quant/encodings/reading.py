@@ -32,9 +32,6 @@ def encoding_faults(model: onnx.ModelProto) -> list[str] | None:
     """Where a file of the legal regime is not what its integers ask for: the host's ends, ReLUs, a reader's scale.
 
     None for files of others.
-
-    Raises:
-        ModelError: nodes that contradict it.
     """
     with contradictions("INT8 model"):
         return _encoding_faults(model)

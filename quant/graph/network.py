@@ -147,11 +147,7 @@ def _is_ours(name: str) -> bool:
 
 
 def check_network(network: Network) -> None:
-    """Refuse what cannot be quantised, before anything is computed.
-
-    Raises:
-        ModelError: a tensor read that nobody wrote, widths that do not fit, or weights that are no numbers.
-    """
+    """Refuse what cannot be quantised, before anything is computed."""
     graph = network.graph
     if not graph or graph[-1].output != CORRECTION:
         raise refused_graph("a last operation that writes the result", graph[-1].name if graph else "no operation")
@@ -199,11 +195,7 @@ def _size(op: Op, read: Pair) -> Pair:
 
 
 def channels_of(graph: Graph, given: Mapping[str, int]) -> dict[str, int]:
-    """Channels of every tensor, from those of the given ones.
-
-    Raises:
-        ModelError: an operation that reads what nobody wrote, or channels that do not fit.
-    """
+    """Channels of every tensor, from those of the given ones."""
     widths = dict(given)
     for op in graph:
         missing = [name for name in op.inputs if name not in widths]

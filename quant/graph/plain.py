@@ -12,11 +12,7 @@ from beers_deploy.quant.graph.reader import read_network
 
 
 def plain_network(model: onnx.ModelProto) -> Network:
-    """A network of that kind.
-
-    Raises:
-        ModelError: any other network.
-    """
+    """A network of that kind."""
     network = read_network(model)
     blocks = [[shuffle.block for shuffle in end] for end in (network.front, network.back)]
     same_ends = network == Network(network.graph, front=network.front, back=network.back)
@@ -29,11 +25,7 @@ def plain_network(model: onnx.ModelProto) -> Network:
 
 
 def correction_graph(model: onnx.ModelProto) -> Graph:
-    """The operations of `plain_network`, from `image` (N, S^2, H / S, W / S) to `correction` of the same shape.
-
-    Raises:
-        ModelError: any other network.
-    """
+    """The operations of `plain_network`, from `image` (N, S^2, H / S, W / S) to `correction` of the same shape."""
     return plain_network(model).graph
 
 

@@ -47,11 +47,7 @@ from beers_deploy.quant.untrusted import contradictions, times
 
 
 def read_network(model: onnx.ModelProto) -> Network:
-    """The operations of a float network that has been simplified (`quant.reading`).
-
-    Raises:
-        ModelError: an operation that the DPU does not compute, named with its node.
-    """
+    """The operations of a float network that has been simplified (`quant.reading`)."""
     with contradictions("float model"):
         body, tail = without_tail(model, {*READERS, *ACTIVATIONS})
         reader = _Reader(body)

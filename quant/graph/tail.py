@@ -41,11 +41,7 @@ class Tail:
 
     @cached_property
     def graph(self) -> GraphProto:
-        """The nodes and their constants.
-
-        Raises:
-            ValueError: no such graph, or one that holds other operators.
-        """
+        """The nodes and their constants."""
         try:
             graph: GraphProto = GraphProto.FromString(base64.b64decode(self.text, validate=True))
         except DecodeError as error:

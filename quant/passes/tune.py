@@ -15,11 +15,11 @@ import torch
 
 from beers_deploy.model.progress import Log, no_log
 from beers_deploy.profiles.errors import ImageError
-from beers_deploy.quant.calibration import Pair, Remade
 from beers_deploy.quant.core import IntCore
 from beers_deploy.quant.ends import Ends
 from beers_deploy.quant.graph import CORRECTION, PLANES, Conv, Graph, graph_to_onnx
 from beers_deploy.quant.integer.trainable import Tensor, TrainableCore
+from beers_deploy.quant.samples import Pair, Remade
 from beers_deploy.quant.session import open_session, planes_of, require_finite
 from beers_deploy.quant.untrusted import times
 
@@ -91,10 +91,6 @@ def tune(
         tuning: on what, how long, how fast.
         still: the tensors whose convolutions are not trained.
         log: is told now and then how many steps are done.
-
-    Raises:
-        ModelError: NaN or infinity in the float network.
-        ImageError: a reference of another size than the network's result.
     """
     samples = list(_samples(core.ends, full, tuning.pairs))
     held = samples[HELD_OUT_EVERY - 1 :: HELD_OUT_EVERY] or samples

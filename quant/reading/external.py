@@ -19,12 +19,7 @@ from beers_deploy.quant.untrusted import FIELDS, FILE_BYTES, check_size, refused
 
 
 def take_in(model: onnx.ModelProto, path: Path) -> None:
-    """Put the weights that a model of this file keeps beside it into the model.
-
-    Raises:
-        ModelError: they lie outside its folder, are missing, are more than 1 GiB in all, or are not as many as the
-            model states.
-    """
+    """Put the weights that a model of this file keeps beside it into the model."""
     taken = 0
     for tensor in model.graph.initializer:
         if tensor.data_location == TensorProto.EXTERNAL:
@@ -36,11 +31,7 @@ def take_in(model: onnx.ModelProto, path: Path) -> None:
 
 
 def network_sha256(path: Path) -> str:
-    """SHA-256 of a network's file, and of the files beside it that its weights are in.
-
-    Raises:
-        ModelError: weights elsewhere than beside it.
-    """
+    """SHA-256 of a network's file, and of the files beside it that its weights are in."""
     own = sha256(path)
     if path.suffix != ".onnx":
         return own

@@ -57,9 +57,6 @@ def simplest(model: onnx.ModelProto, where: str) -> onnx.ModelProto:
     Args:
         model: what `check_content` and `check_runnable` let through; not changed.
         where: its file, for the sentence.
-
-    Raises:
-        ModelError: the runtime does not read it.
     """
     with contradictions(where):
         return model if _is_plain(model) else _simplest(model, where)

@@ -72,21 +72,13 @@ class Along:
     shapes: Mapping[str, tuple[int, ...]]
 
     def require(self, sound: bool, why: str) -> None:
-        """Refuse a node that cannot be tiled.
-
-        Raises:
-            ModelError: it is not sound.
-        """
+        """Refuse a node that cannot be tiled."""
         if not sound:
             got = f"{self.node.op_type} {self.node.name}".strip() + f", {why}"
             raise refused("operators that do the same at every pixel, from near pixels alone", got)
 
     def numbers(self, index: int, otherwise: Iterable[float]) -> list[Any]:
-        """The values of a constant input, or what they are where there is none.
-
-        Raises:
-            ModelError: they are computed, or too many to say where pixels go.
-        """
+        """The values of a constant input, or what they are where there is none."""
         name = self.node.input[index] if len(self.node.input) > index else ""
         if not name:
             return list(otherwise)

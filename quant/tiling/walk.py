@@ -132,11 +132,7 @@ class _Grid:
 
 
 class _Walk:
-    """Follows the image along one side, from node to node, and back what a cell of the lattice reads.
-
-    Raises:
-        ModelError: a node that cannot be tiled, or a result of another size than a share of the image's.
-    """
+    """Follows the image along one side, from node to node, and back what a cell of the lattice reads."""
 
     def __init__(self, model: onnx.ModelProto, held: dict[str, np.ndarray], side: int) -> None:
         self._side, self._values, self._shapes = side, held, {name: value.shape for name, value in held.items()}

@@ -2,6 +2,8 @@
 
 import copy
 import json
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -283,3 +285,44 @@ def test_from_raw_images_to_a_kit(tmp_path: Path) -> None:
     assert "recommended" in str(study)
     assert study.report(tmp_path / "study").read_text(encoding="utf-8").startswith("<!doctype html>")
     assert (bd.Board.load("zcu104").kit(study.best.network, tmp_path / "kit") / "core.onnx").is_file()
+
+
+WITHOUT_EXTRAS = """
+import sys
+
+
+class Blocked:
+    def find_spec(self, name, path=None, target=None):
+        if name.split(".")[0] in ("torch", "matplotlib", "skimage", "scipy", "pandas"):
+            raise ModuleNotFoundError("blocked", name=name)
+
+
+sys.meta_path.insert(0, Blocked())
+import numpy as np
+import beers_deploy as bd
+
+samples = np.load("samples.npy")
+int8 = bd.quantize("tiny.onnx", samples, progress=False)
+assert bd.gate(int8, samples=samples, limits={"mae": 0.01}) and bd.check(int8) and bd.predict(int8)
+assert bd.restore(np.full((40, 50), 900, np.uint16), "convbeers-xs-int8").shape == (40, 50)
+for call, extra in (
+    (bd.simulate, "torch"),
+    (lambda: bd.quantize("tiny.onnx"), "torch"),
+    (lambda: bd.evaluate(["degraded"]), "torch"),
+    (lambda: bd.characterize([]), "study"),
+    (lambda: bd.sensors().plot(), "study"),
+    (lambda: bd.sensors().to_pandas(), "notebook"),
+):
+    try:
+        call()
+    except ImportError as error:
+        assert isinstance(error, bd.BeersError) and f"beers-deploy[{extra}]" in str(error), error
+    else:
+        raise AssertionError(extra)
+"""
+
+
+def test_the_core_needs_no_extra(tiny: bd.Network, samples: np.ndarray, tmp_path: Path) -> None:
+    tiny.save(tmp_path / "tiny.onnx")
+    np.save(tmp_path / "samples.npy", samples)
+    subprocess.run([sys.executable, "-c", WITHOUT_EXTRAS], cwd=tmp_path, check=True, timeout=120)

@@ -28,6 +28,7 @@ Sitting = tuple[str, ...]
 LEFT_OUT = {
     "beers-deploy demo --image raw.tif": "takes a minute: .ci/run has the demo, and a test of its own",
     "beers-deploy evaluate --images aerial/ --methods network.onnx --sweep": "takes minutes: its own test does",
+    "pip install 'beers-deploy[notebook]'": "fetches from a registry",
     "pip install 'beers-deploy[gdal]'": "fetches from a registry",
     "pip install 'beers-deploy[dask]' rioxarray": "fetches from a registry",
     "apt-get install gdal-bin python3-qgis": "changes the system",

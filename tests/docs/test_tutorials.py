@@ -13,7 +13,7 @@ pytestmark = pytest.mark.slow
 
 FOLDER = ROOT / "docs" / "tutorials"
 PAGES = sorted({path.stem for path in FOLDER.glob("*.md")} - {"index"})
-INSTALLED = "python3 -m venv .venv && .venv/bin/pip install --quiet ."
+INSTALLED = "python3 -m venv .venv && .venv/bin/pip install --quiet '.[all]'"
 
 
 def walked(name: str, folder: Path) -> Walk:

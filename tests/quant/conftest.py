@@ -7,9 +7,9 @@ import torch
 from beers_deploy.export import to_onnx
 from beers_deploy.model.convbeers import ConvBEERS
 from beers_deploy.model.variants import Variant
-from beers_deploy.quant.calibration import Patches
 from beers_deploy.quant.graph import Graph, correction_graph, read_planes
 from beers_deploy.quant.quantise import Quantised, quantise_model
+from beers_deploy.quant.samples import Patches
 from tests.model.networks import plain
 from tests.quant.quick import drawn
 

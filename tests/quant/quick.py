@@ -12,8 +12,9 @@ from onnxruntime.quantization import CalibrationDataReader
 
 from beers_deploy.model.simulator.procedural import procedural_scene
 from beers_deploy.profiles import load_sensor
-from beers_deploy.quant.calibration import Patches, Remade, draw_patches
+from beers_deploy.quant.calibration import draw_patches
 from beers_deploy.quant.quantise import Quantised, quantise_model
+from beers_deploy.quant.samples import Patches, Remade
 
 
 def image(height: int = 37, width: int = 53, seed: int = 0) -> np.ndarray:

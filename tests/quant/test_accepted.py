@@ -8,12 +8,12 @@ import onnx
 import pytest
 
 from beers_deploy.profiles.errors import ModelError
-from beers_deploy.quant.calibration import Patches
 from beers_deploy.quant.core import build_core, shift_faults
 from beers_deploy.quant.free import quantise_free
 from beers_deploy.quant.gate import compare
 from beers_deploy.quant.graph import PLANES, Add, Conv, Graph, Network, check_network, correction_graph, read_planes
 from beers_deploy.quant.quantise import quantise_model
+from beers_deploy.quant.samples import Patches
 from beers_deploy.quant.session import open_session
 from tests.quant.quick import changed, one_guess, quickly
 

@@ -13,8 +13,10 @@ from beers_deploy.model.simulator.sampling import Scene
 from beers_deploy.profiles import load_sensor
 from beers_deploy.profiles.errors import ImageError
 from beers_deploy.profiles.response import MtfTable
-from beers_deploy.quant.calibration import Patches, choose_frac_bits, draw_patches, stratified
+from beers_deploy.quant.calibration import draw_patches, stratified
 from beers_deploy.quant.graph import PLANES, Graph, graph_to_onnx, tensors
+from beers_deploy.quant.quantise import choose_frac_bits
+from beers_deploy.quant.samples import Patches
 from beers_deploy.quant.session import TILE_PX, crops, halo_of, open_session, planes_of, tensor_values
 from tests.quant.quick import image
 

@@ -7,11 +7,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
-from beers_deploy.quant.calibration import Patches
 from beers_deploy.quant.core import IntConv, IntCore
 from beers_deploy.quant.gate import compare
 from beers_deploy.quant.graph import Conv, Graph
 from beers_deploy.quant.passes.fit_weights import Moments, descend, fit_weights, input_moments
+from beers_deploy.quant.samples import Patches
 from beers_deploy.quant.session import open_session, planes_of
 from tests.quant.quick import quickly
 

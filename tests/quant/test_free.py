@@ -9,7 +9,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 from onnx import numpy_helper
 
-from beers_deploy.quant.calibration import Patches
 from beers_deploy.quant.free import BINS, Scale, best_scale, free_model, quantise_free, round_weight, tensor_scales
 from beers_deploy.quant.gate import compare
 from beers_deploy.quant.graph import (
@@ -31,6 +30,7 @@ from beers_deploy.quant.onnx_file import metadata
 from beers_deploy.quant.passes.equalise import channel_ranges, equalise, first_guess
 from beers_deploy.quant.passes.stream import OFFSETS, half_lsb_pair, streams, two_gains
 from beers_deploy.quant.quantise import Quantised
+from beers_deploy.quant.samples import Patches
 from beers_deploy.quant.session import open_session, planes_of, run
 from tests.quant.quick import changed, copied, image, one_guess
 from tests.quant.tiling.small_networks import half_resolution

@@ -4,7 +4,6 @@ import numpy as np
 import onnx
 import pytest
 
-from beers_deploy.quant.calibration import Patches
 from beers_deploy.quant.core import SHIFTS, IntConv, op_shifts
 from beers_deploy.quant.ends import FINE_MAX, GAIN, Ends
 from beers_deploy.quant.gate import compare
@@ -37,6 +36,7 @@ from beers_deploy.quant.passes.stream import (
     two_gains,
 )
 from beers_deploy.quant.quantise import Quantised, quantise_model
+from beers_deploy.quant.samples import Patches
 from beers_deploy.quant.session import open_session
 from tests.quant.quick import quickly
 

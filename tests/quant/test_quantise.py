@@ -5,12 +5,12 @@ import onnx
 import pytest
 from onnx import numpy_helper
 
-from beers_deploy.quant.calibration import Patches
 from beers_deploy.quant.core import IntConv, build_core, shift_faults
 from beers_deploy.quant.gate import compare
 from beers_deploy.quant.graph import correction_graph, read_planes
 from beers_deploy.quant.onnx_file import metadata
 from beers_deploy.quant.quantise import Quantised, quantise_model
+from beers_deploy.quant.samples import Patches
 from beers_deploy.quant.session import open_session
 from beers_deploy.quant.tiling.walk import tiling_of
 

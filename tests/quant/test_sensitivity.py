@@ -7,10 +7,10 @@ import onnx
 import pytest
 
 from beers_deploy.model.io.images import MAX_DN
-from beers_deploy.quant.calibration import Patches
 from beers_deploy.quant.core import IntConv
 from beers_deploy.quant.graph import Add
 from beers_deploy.quant.quantise import Quantised
+from beers_deploy.quant.samples import Patches
 from beers_deploy.quant.sensitivity import LayerError, Loss, layer_errors, spread_of
 from beers_deploy.quant.session import open_session, run
 from tests.quant.quick import quickly

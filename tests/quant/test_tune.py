@@ -10,7 +10,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from beers_deploy.profiles.errors import ImageError
-from beers_deploy.quant.calibration import Patches, Remade
 from beers_deploy.quant.core import IntConv, IntCore, shift_faults
 from beers_deploy.quant.ends import Ends
 from beers_deploy.quant.graph import Conv, Shuffle, correction_graph, read_planes
@@ -18,6 +17,7 @@ from beers_deploy.quant.integer import merged_correction, run_core
 from beers_deploy.quant.integer.trainable import TrainableCore
 from beers_deploy.quant.passes.tune import BORDER_PX, Sample, Tuning, tune
 from beers_deploy.quant.quantise import Quantised, quantise_model
+from beers_deploy.quant.samples import Patches, Remade
 
 
 def origins(made: Quantised) -> list[Conv]:

@@ -122,7 +122,7 @@ def test_all_guards_cost_under_two_per_cent_on_the_board(variant: str) -> None:
 
 def test_the_command(pair: list[Path], tmp_path: Path) -> None:
     files = ["--json", str(tmp_path / "f.json"), "--out", str(tmp_path / "f.md")]
-    few = ["--bit-flips", "--draws", "1", "--size", "32"]
+    few = ["--bit-flips", "--draws", "1", "--side", "32"]
     done("stress", *pair, *few, *files)
     document = json.loads((tmp_path / "f.json").read_text(encoding="utf-8"))
     assert {row["table"] for row in document["rows"]} == {"bit flips", "guards"}

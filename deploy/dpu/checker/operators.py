@@ -115,11 +115,7 @@ def all_rules() -> Iterator[Rule]:
 
 
 def require_known(dpu: Dpu) -> None:
-    """Refuse a constant that no rule names: misspelt, it would silence the rule that it is for.
-
-    Raises:
-        ProfileError: such a constant in a table that only rules read.
-    """
+    """Refuse a constant that no rule names: misspelt, it would silence the rule that it is for."""
     known: dict[str, set[str]] = {}
     for rule in all_rules():
         for table, key in _named(rule):

@@ -31,11 +31,7 @@ VIEWPORT = '<meta name="viewport" content="width=device-width"><style>body{margi
 
 
 def require_picture(path: Path | None) -> None:
-    """Refuse a file name that is neither .svg nor .html.
-
-    Raises:
-        OptionError: another ending.
-    """
+    """Refuse a file name that is neither .svg nor .html."""
     if path is not None and path.suffix not in (".svg", ".html"):
         remedy = "name it so; every browser opens both"
         raise OptionError("picture", expected="a file ending in .svg or .html", got=path.name, remedy=remedy)

@@ -92,11 +92,7 @@ class Placement:
 
 
 def place(network: Network, dpu: Dpu) -> Placement:
-    """Judge every node of a network against the rules of a DPU.
-
-    Raises:
-        ProfileError: a constant of the target that no rule knows.
-    """
+    """Judge every node of a network against the rules of a DPU."""
     require_known(dpu)
     parts = _parts(network)
     broken = [

@@ -168,10 +168,6 @@ def predict(placement: Placement, dpu: Dpu, task: Task | None = None) -> Predict
         placement: where its nodes run.
         dpu: a board's.
         task: what the host does with the results; None for what the file tells.
-
-    Raises:
-        ModelError: a node that the DPU cannot run between others that it does, or nothing for it to do.
-        ProfileError: a target without cost constants.
     """
     if placement.cutting:
         names = ", ".join(node.op.name for node in placement.cutting[:3])

@@ -76,13 +76,7 @@ class OwnRuns:
 
 
 def read_own_runs(path: Path, dpu: Dpu) -> OwnRuns:
-    """Compare the runs in a file with what is predicted of them on `dpu`'s board.
-
-    Raises:
-        OptionError: not such a file, or a run that cannot be understood.
-        ModelError: a model that does not run whole on the DPU.
-        ProfileError: a configuration that the target does not have, or a target without cost constants.
-    """
+    """Compare the runs in a file with what is predicted of them on `dpu`'s board."""
     runs = [_run(entry, path, f"{path.name}, run {index + 1}", dpu) for index, entry in enumerate(_read(path))]
     ratios: dict[bool, list[float]] = {True: [], False: []}
     for run in runs:

@@ -127,9 +127,6 @@ class Letterbox:
         height_px: of the image.
         width_px: of the image.
         size_px: side of the input.
-
-    Raises:
-        OptionError: an image so narrow that nothing of it would be left.
     """
 
     def __init__(self, height_px: int, width_px: int, size_px: int) -> None:

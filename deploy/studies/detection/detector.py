@@ -56,10 +56,6 @@ class Detector:
 
         Returns:
             Boxes in px of the image, cut at its borders.
-
-        Raises:
-            OptionError: an image too narrow for the input.
-            ModelError: it does not run, or answers no scores in 0 to 1.
         """
         height, width = rgb.shape[:2]
         box = Letterbox(height, width, self.size_px)
@@ -68,11 +64,7 @@ class Detector:
         return Boxes.of(inside.corners, inside.classes, inside.scores)
 
     def decoded(self, output: np.ndarray) -> Boxes:
-        """Boxes in px of the input, suppressed, of an answer (1, 4 + classes, anchors) raw, or (1, N, 6) final.
-
-        Raises:
-            ModelError: of another size, scores outside 0 to 1, or values that are not finite.
-        """
+        """Boxes in px of the input, suppressed, of an answer (1, 4 + classes, anchors) raw, or (1, N, 6) final."""
         axis, size = (1, 4 + len(self.names)) if self.layout == "raw" else (2, 6)
         if output.ndim != 3 or len(output) != 1 or output.shape[axis] != size:
             raise _refused("an answer of the sizes that its file states", " x ".join(map(str, output.shape)))
@@ -94,10 +86,6 @@ def open_detector(path: Path, threads: int = 0, size_px: int | None = None) -> D
         path: an ONNX file.
         threads: of onnxruntime; 0 takes a thread a core.
         size_px: side of the input; None takes the one that the file is fixed to or was trained for.
-
-    Raises:
-        ModelError: a file that is not to be trusted, or of another layout.
-        OptionError: another size than the file is fixed to, or more threads than cores.
     """
     require_cores("threads", threads)
     model = load_onnx(path)
@@ -214,11 +202,7 @@ def class_names(found: Any) -> tuple[str, ...]:
 
 
 def parse_classes(text: str) -> dict[str, str]:
-    """Read LABELLED=DETECTOR,...: which class of the detector a labelled class is.
-
-    Raises:
-        OptionError: another text, or a class given twice.
-    """
+    """Read LABELLED=DETECTOR,...: which class of the detector a labelled class is."""
     pairs = [[part.strip() for part in entry.split("=")] for entry in text.split(",") if entry.strip()]
     sound = pairs and all(len(pair) == 2 and all(map(letters, pair)) for pair in pairs)
     if not sound or len({letters(pair[0]) for pair in pairs}) < len(pairs):
@@ -237,9 +221,6 @@ def class_numbers(labelled: Sequence[str], detector: Sequence[str], given: Mappi
 
     Returns:
         (L,) int64, -1 for a class that the detector does not know; as `Boxes.renamed` takes it.
-
-    Raises:
-        OptionError: a name given that is none, two classes of a detector with the same letters, or none in common.
     """
     number = {letters(name): i for i, name in enumerate(detector)}
     if len(number) < len(detector):

@@ -88,11 +88,6 @@ def read_labelled(images: Path, labels: Path | None = None, split: str | None = 
         images: the folder of the images, or the top of a tree as VOC, DIOR or YOLO have it.
         labels: a folder of label files, one an image, or COCO's JSON; None looks where each layout keeps them.
         split: which part of a tree; None takes `test` if there is one.
-
-    Raises:
-        OptionError: no labels, labels of another layout or with faults, no such split, or not one box.
-        ImageError: no image, or one that cannot be read.
-        MachineError: a package that reads the layout is not installed.
     """
     if labels is None and (images / "Annotations").is_dir() and any(images.glob("JPEGImages*")):
         return _labelled_set([_read_voc(*pair) for pair in _voc_pairs(images, split)])
@@ -309,12 +304,7 @@ def _yolo_box(line: str, path: Path, names: Sequence[str], size_px: tuple[int, i
 
 
 def yolo_names(folders: Sequence[Path]) -> tuple[str, ...]:
-    """Names of the classes, in their order, from the first data.yaml or classes.txt in some folders.
-
-    Raises:
-        OptionError: none of them holds either, or what is there does not name classes.
-        MachineError: PyYAML, which reads data.yaml, is not installed.
-    """
+    """Names of the classes, in their order, from the first data.yaml or classes.txt in some folders."""
     for folder in folders:
         for path in (*sorted(folder.glob("*.yaml")), *sorted(folder.glob("*.yml"))):
             if found := _yaml_names(path):

@@ -165,9 +165,6 @@ def run_study(
         reference: profile of the reference images; None for the default one.
         seed: of every random draw.
         say: is told what a user should know on the way.
-
-    Raises:
-        BeersError: a name, a profile or a picture that cannot be used.
     """
     told = once(say)
     pairs = [SensorPair(each, reference_beside(each, reference, told)) for each in map(load_sensor, sensors)]
@@ -242,9 +239,6 @@ def labelled_scenes(
         images: as `read_labelled` takes it.
         labels: where they lie, if not beside the pictures.
         split: which part of a tree.
-
-    Raises:
-        BeersError: pictures or labels that cannot be used, or not one class in common.
     """
     labelled = read_labelled(images, labels, split)
     numbers = class_numbers(labelled.names, names, given)

@@ -70,11 +70,7 @@ class Method:
 
 
 def method_without_network(name: str, degraded: Instrument, reference: Instrument) -> Method | None:
-    """The input itself, or a traditional chain or a peer of it, which know both sensors; None for any other name.
-
-    Raises:
-        MachineError: a peer whose library is not installed.
-    """
+    """The input itself, or a traditional chain or a peer of it, which know both sensors; None for any other name."""
     if name == DEGRADED:
         return Method(name, lambda dn: dn, "the input itself")
     if name not in (*CHAINS, *PEERS):
@@ -104,12 +100,6 @@ def method_named(name: str, degraded: Sensor, reference: Sensor, log: Log = no_l
         degraded: the sensor of the images.
         reference: the one that is aimed at.
         log: is told what of the sensor lies outside the range that a network was trained for.
-
-    Raises:
-        OptionError: no such method.
-        ModelError: a file that is no network.
-        ProfileError: no such sensor behind an @.
-        MachineError: a peer whose library is not installed.
     """
     plain = method_without_network(name, degraded.nominal(), reference.nominal())
     if plain is not None:

@@ -84,9 +84,6 @@ def simulate_pairs(
 
     Returns:
         The pairs, and the names of scenes too small to use.
-
-    Raises:
-        ImageError: all are too small.
     """
     pairs, small = [], []
     for number, scene in enumerate(scenes):
@@ -144,9 +141,6 @@ def read_pairs(folder: Path, max_dn: int = MAX_DN, recipe: PairsRecipe | None = 
     """Read FOLDER/degraded/NAME.tif beside FOLDER/reference/NAME.tif, mono images of 0 to max_dn.
 
     With the recipe beside them, the sites are those of the scenes that it names.
-
-    Raises:
-        ImageError: a folder is missing, a name has no partner, or two images differ in size.
     """
     pairs = []
     for degraded, reference in pair_files(folder):

@@ -188,9 +188,6 @@ def run_evaluation(
         sweep: whether other blurs, noises and gains are looked at too.
         seed: of every random draw.
         say: is told where a reference profile is taken in other units than it states.
-
-    Raises:
-        BeersError: a name, a file or a folder that is not what it should be.
     """
     recipe = read_pairs_recipe(pairs) if isinstance(pairs, Path) else None
     sensors = profiles_for(sensor, reference, recipe, say)

@@ -27,9 +27,6 @@ def perceptual_distances(place: Path | None) -> dict[str, Perceptual | str]:
 
     Args:
         place: a file with SqueezeNet 1.1, or a folder with any of the backbones; None asks the environment.
-
-    Raises:
-        ModelError: a file that is missing or holds something else.
     """
     found: dict[str, Perceptual | str] = {"LPIPS-squeeze": not_found("squeeze")}
     networks = ("squeeze", "alex", "vgg") if place is None or place.is_dir() else ("squeeze",)

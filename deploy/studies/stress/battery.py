@@ -109,11 +109,7 @@ def _excess(measure: Measure) -> float:
 
 
 def chosen(names: str | None, known: Iterable[str], option: str) -> list[str]:
-    """The names in a list with commas; all where none is given.
-
-    Raises:
-        OptionError: an unknown one.
-    """
+    """The names in a list with commas; all where none is given."""
     every = list(known)
     wanted = every if names is None else [name.strip() for name in names.split(",")]
     for name in wanted:

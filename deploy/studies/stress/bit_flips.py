@@ -66,12 +66,7 @@ class FlipRequest:
 
 
 def flip_rows(subject: Subject, request: FlipRequest) -> list[Row]:
-    """The rows of the whole study: quality against flips, and what guards cost.
-
-    Raises:
-        ModelError: no INT8 file, or one whose whole numbers cannot be told.
-        BeersError: no such target, sensor or images.
-    """
+    """The rows of the whole study: quality against flips, and what guards cost."""
     _ = subject.core  # refused before anything is drawn
     dpu = load_dpu(request.target, None)
     prediction = predict_file(subject.paths[-1], dpu, TILE_PX)

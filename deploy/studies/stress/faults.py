@@ -49,11 +49,7 @@ def flip_bits(values: np.ndarray, count: int, generator: np.random.Generator, bi
 
 
 def as_stored(core: IntCore) -> IntCore:
-    """The core with its bias in int8, at the finest scale that holds it: what the board keeps in memory.
-
-    Raises:
-        ModelError: a bias that int8 does not hold, or a shift of more than six bits.
-    """
+    """The core with its bias in int8, at the finest scale that holds it: what the board keeps in memory."""
     for (op, field), shift in shifts_of(core).items():
         if not -(1 << (SHIFT_BITS - 1)) <= shift < 1 << (SHIFT_BITS - 1):
             raise _refuse(f"{field} {shift} at {op}")

@@ -71,11 +71,7 @@ class Network:
         return partial(run, self._opened[threads])
 
     def restore(self, image: np.ndarray, threads: int = 1, tile_px: int = WHOLE_PX) -> np.ndarray:
-        """As `restore` restores digital numbers (H, W) float: tiled, missing pixels kept, clipped, not rounded.
-
-        Raises:
-            ImageError: numbers outside 0 to full scale, or a network that gives NaN.
-        """
+        """As `restore` restores digital numbers (H, W) float: tiled, missing pixels kept, clipped, not rounded."""
         plan = make_plan((1, *image.shape), tile_px, self.tiling.halo_px, self.tiling)
         return restore_floats(image, self.infer(threads), plan, FULL_DN)
 
@@ -104,20 +100,12 @@ class Subject:
 
     @cached_property
     def core(self) -> IntCore:
-        """The whole numbers of the INT8 file.
-
-        Raises:
-            ModelError: no file, or one whose numbers cannot be told.
-        """
+        """The whole numbers of the INT8 file."""
         return read_core(self.quantised.model)
 
     @property
     def quantised(self) -> Network:
-        """The INT8 network.
-
-        Raises:
-            ModelError: there is none.
-        """
+        """The INT8 network."""
         if self.int8 is None:
             remedy = "give it as the second argument"
             raise ModelError("INT8 network", expected="a file", got="none", remedy=remedy)
@@ -125,11 +113,7 @@ class Subject:
 
 
 def open_subject(float_path: Path | None, int8_path: Path | None, sensor: str = SENSOR, say: Log = no_log) -> Subject:
-    """The files given, or a shipped network in both precisions by its name, told the sensor.
-
-    Raises:
-        ModelError: no such file or variant, the two swapped, or a network that cannot be tiled.
-    """
+    """The files given, or a shipped network in both precisions by its name, told the sensor."""
     if int8_path is None and (float_path is None or not (float_path.suffix or float_path.exists())):
         float_path, int8_path = pair_of(float_path, None)
     known = load_sensor(sensor)

@@ -57,11 +57,7 @@ class Constraint:
 
 
 def parse_constraints(option: str, text: str | None) -> list[Constraint]:
-    """Read constraints with commas between: `latency<=20s, psnr>=44`.
-
-    Raises:
-        OptionError: another text, an unknown name, or a unit that is not the figure's.
-    """
+    """Read constraints with commas between: `latency<=20s, psnr>=44`."""
     return [_parse(option, part.strip()) for part in text.split(",")] if text is not None else []
 
 

@@ -49,9 +49,6 @@ class Labelled:
             detector: ONNX file; the embedded one if None.
             classes: labelled classes under the detector's names, as the user writes them.
             benchmark: whose sensors acquire the scenes, and whose seed draws.
-
-        Raises:
-            BeersError: a folder, labels, classes or a detector that cannot be used.
         """
         file = detector or DETECTOR
         opened = open_detector(file)

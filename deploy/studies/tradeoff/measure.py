@@ -71,11 +71,7 @@ class Measurements:
 
     @classmethod
     def open(cls, path: Path) -> "Measurements":
-        """Those of a file, or none yet.
-
-        Raises:
-            OptionError: a file that holds something else.
-        """
+        """Those of a file, or none yet."""
         if not path.exists():
             return cls(path)
         try:
@@ -229,10 +225,6 @@ def make_int8(file: Path, folder: Path, scenes: Path | None, sensor: Sensor, see
         scenes: folder of images to calibrate on; drawn ones if None.
         sensor: of the patches, where the network names none that is known.
         seed: of every random draw.
-
-    Raises:
-        ModelError: a network that the quantiser does not take.
-        ImageError: no scene holds a patch.
     """
     model = float_model(file)
     said = metadata(model).get("sensor", "")

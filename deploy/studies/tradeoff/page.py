@@ -46,11 +46,7 @@ PLOT_CAPTION = (
 
 
 def write_study(study: Study, out: Path) -> None:
-    """Write the page and its plot into a folder.
-
-    Raises:
-        MachineError: a file cannot be written.
-    """
+    """Write the page and its plot into a folder."""
     svg = plot_svg(study)
     write_text(out / "tradeoff.svg", svg)
     write_report(report_of(study, svg), out / "tradeoff.html")

@@ -65,11 +65,7 @@ class Measured:
 
     @property
     def network(self) -> Network:
-        """The network that restores here.
-
-        Raises:
-            OptionError: a point without one: a traditional pipeline, another library's method or a published run.
-        """
+        """The network that restores here."""
         if self.point is None or self.point.variant.file is None:
             remedy = "take a point of a network"
             raise OptionError("point", expected="one with a network", got=self.name, remedy=remedy)

@@ -97,11 +97,7 @@ class Point:
 
 
 def parse_targets(text: str) -> tuple[str, ...]:
-    """The boards of `--target`: one, several with commas, or all of the shipped ones, the default first.
-
-    Raises:
-        OptionError: an empty name, or the same board twice.
-    """
+    """The boards of `--target`: one, several with commas, or all of the shipped ones, the default first."""
     if text == "all":
         return DEFAULT_TARGET, *(name for name in board_names() if name != DEFAULT_TARGET)
     names = tuple(name.strip() for name in text.split(","))
@@ -121,10 +117,6 @@ def network_variants(
         sensor: that acquires the images.
         make_int8: quantises a float network's file, and says where it wrote the result.
         log: is told which network has no INT8, and what of the sensor lies outside the range that was trained.
-
-    Raises:
-        OptionError: neither a shipped name nor a file of a network, two of one name, or one that takes other tiles.
-        ModelError: a file that is no network.
     """
     different = dict.fromkeys(each.strip() for each in names)
     found = [variant for name in different for variant in _variants(name, sensor, make_int8, log)]
@@ -205,11 +197,7 @@ def configurations(board: TargetProfile) -> list[Dpu]:
 
 
 def fastest_tile_px(variant: Variant, dpu: Dpu, whole: Swath) -> int:
-    """The tile with exact seams, no larger than the paper's, in which the swath is predicted to take least time.
-
-    Raises:
-        ModelError: the DPU does not run the network.
-    """
+    """The tile with exact seams, no larger than the paper's, in which the swath is predicted to take least time."""
     radius = radius_px(variant)
     sides = range(TILE_STEP_PX * (2 * radius // TILE_STEP_PX + 1), PAPER_TILE_PX + 1, TILE_STEP_PX)
 
@@ -221,11 +209,7 @@ def fastest_tile_px(variant: Variant, dpu: Dpu, whole: Swath) -> int:
 
 
 def predict_tile(variant: Variant, tile_px: int, dpu: Dpu) -> Prediction:
-    """What the cost model says of an INT8 network in such tiles.
-
-    Raises:
-        ModelError: the DPU does not run it whole.
-    """
+    """What the cost model says of an INT8 network in such tiles."""
     return predict(place(_graph(variant.file or Path(), tile_px), dpu), dpu)
 
 

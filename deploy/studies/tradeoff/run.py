@@ -114,7 +114,7 @@ class Tradeoff(Table):
             return super().plot(figure, ax)
         from beers_deploy.studies.tradeoff.page import draw_study  # which imports this module
 
-        axes = ax if ax is not None else optional("matplotlib.pyplot", "plot", "report").subplots()[1]
+        axes = ax if ax is not None else optional("matplotlib.pyplot", "plot").subplots()[1]
         draw_study(axes, self.study)
         return cast("Axes", axes)
 
@@ -229,9 +229,6 @@ def run_study(
         classes: labelled classes under the detector's names.
         seed: of every random draw.
         log: is told what a user should know on the way.
-
-    Raises:
-        BeersError: a network, an image, a profile or weights that cannot be used.
     """
     swath, boards = Swath(*size_px), [TargetProfile.load(target) for target in targets]
     for board in boards:

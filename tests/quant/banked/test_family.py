@@ -19,10 +19,10 @@ from beers_deploy.quant.banked.calibrate import bank_results, quantise_family
 from beers_deploy.quant.banked.family import FAMILY, Family, delta_of_file, family_of, required_family, with_delta
 from beers_deploy.quant.banked.filters import channels
 from beers_deploy.quant.bounds import layer_bounds
-from beers_deploy.quant.calibration import Remade
 from beers_deploy.quant.core import IntConv, IntCore, shift_faults
 from beers_deploy.quant.encodings import board_model, encoding_faults, host_model, read_core
 from beers_deploy.quant.integer.reference import merged_correction, run_core
+from beers_deploy.quant.samples import Remade
 from beers_deploy.quant.session import open_session, run
 from beers_deploy.quant.tiling.walk import tiling_of
 from tests.quant.banked.test_filters import textured

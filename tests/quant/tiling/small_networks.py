@@ -14,9 +14,9 @@ from onnx import TensorProto, helper, numpy_helper
 from beers_deploy.export import to_onnx
 from beers_deploy.model.convbeers import ConvBEERS, initialise
 from beers_deploy.model.variants import Variant
-from beers_deploy.quant.calibration import Patches, Remade
 from beers_deploy.quant.onnx_file import image_info, make_model
 from beers_deploy.quant.quantise import Quantised
+from beers_deploy.quant.samples import Patches, Remade
 from tests.quant.quick import quickly
 
 
