@@ -1,7 +1,7 @@
 """`beers-deploy evaluate`: several restorations on the same pairs, judged by the same instruments."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -50,36 +50,23 @@ def evaluate(
     @blind or with @ and another sensor.
     """
     from beers_deploy.model.io.files import require_writable
-    from beers_deploy.results import Table, print_rows
-    from beers_deploy.studies.evaluation.page import write_page
-    from beers_deploy.studies.evaluation.run import run_evaluation
+    from beers_deploy.results import print_rows
+    from beers_deploy.studies.evaluation.run import evaluate as compared
 
     if pairs is not None and (images is not None or sweep):
         expected = "no --images or --sweep beside it: pairs are as they are"
-        raise OptionError("--pairs", expected=expected, got="both", remedy="leave one out")
-    names = list(dict.fromkeys(["degraded", *(name.strip() for name in methods.split(","))]))
+        raise OptionError("pairs", expected=expected, got="both", remedy="leave one out")
+    names = list(dict.fromkeys(name.strip() for name in methods.split(",")))
     folders = [pairs, *(pairs / role for role in ("degraded", "reference"))] if pairs else [images]
     read = (*folders, lpips, *(Path(name) for name in (sensor, reference, *names) if name))
     require_writable(out / "report.html" if out else None, json, inputs=read, folders=(out,))
-    found = run_evaluation(
-        names,
-        images=images,
-        pairs=pairs,
-        sensor=sensor,
-        reference=reference,
-        lpips=lpips,
-        sweep=sweep,
-        seed=seed,
-        say=say,
-    )
+    about: dict[str, Any] = {"sensor": sensor, "reference": reference, "lpips": lpips}
+    found = compared(names, pairs, images=images, sweep=sweep, seed=seed, log=say, **about)
     print_rows(found.title, found.mean)
     for table, rows in by_table((*found.sites, *found.swept)).items():
         print_rows(table, rows)
     for note in found.notes:
         say(note)
     if out is not None:
-        say(f"wrote {write_page(found, out)}")
-    degraded, wanted = (profile.name for profile in found.sensors)
-    arguments: dict[str, object] = {"images": images, "pairs": pairs, "sensor": sensor or degraded}
-    arguments |= {"reference": wanted, "methods": methods, "lpips": lpips, "out": out, "sweep": sweep, "seed": seed}
-    save(Table("evaluate", arguments, tuple(found.inputs), found.rows), json)
+        say(f"wrote {found.report(out)}")
+    save(found, json)

@@ -80,15 +80,14 @@ def tradeoff(
     Measurements are kept: a second run, or one that was stopped, measures only what is missing. Exit code 1 where no
     point keeps --budget and --need; the page is written all the same.
     """
-    from beers_deploy.bench.tables import parse_size
     from beers_deploy.dpu.board import ALL
     from beers_deploy.model.io.files import require_writable
     from beers_deploy.model.shipped import shipped_names
-    from beers_deploy.results import Table, print_rows
+    from beers_deploy.results import print_rows
     from beers_deploy.studies.tradeoff.advice import parse_constraints
-    from beers_deploy.studies.tradeoff.page import FILES, write_study
+    from beers_deploy.studies.tradeoff.page import FILES
     from beers_deploy.studies.tradeoff.points import parse_targets
-    from beers_deploy.studies.tradeoff.run import run_study
+    from beers_deploy.studies.tradeoff.run import tradeoff as measured
 
     log = partial(say, err=True)
     limits = {name: parse_constraints(name, text) for name, text in (("budget", budget), ("need", need))}
@@ -101,37 +100,31 @@ def tradeoff(
     written = (out / "tradeoff.json", *(out / name for name in FILES), out / "measurements.json", json)
     require_writable(*written, inputs=read, folders=(out / "int8",))
     reference_beside(load_sensor(sensor), reference, say)
-    study = run_study(
+    study = measured(
         names,
-        out,
         images=images,
         sensor=sensor,
         reference=aim,
-        targets=boards,
-        size_px=parse_size(size),
-        budget=limits["budget"],
-        need=limits["need"],
+        board=boards,
+        size=size,
+        budget=budget,
+        need=need,
         lpips=lpips,
         calibration=calibration,
         labelled=labelled,
         detector=detector,
         classes=classes,
         seed=seed,
+        cache=out,
         log=log,
     )
-    write_study(study, out)
+    study.report(out)
     print_rows(f"front of PSNR against {study.cost}", study.front_rows)
-    say(study.recommendation.line)
-    arguments: dict[str, object] = {"images": images, "sensor": sensor, "reference": aim, "size": size}
-    arguments |= {"network": ",".join(names), "budget": budget, "need": need, "calibration": calibration}
-    arguments |= {"target": target, "seed": seed}
-    if labelled:
-        arguments |= {"labelled": labelled, "detector": detector, "classes": classes}
-    document = Table("tradeoff", arguments, tuple(study.inputs), study.rows)
+    say(str(study))
     for path in (out / "tradeoff.json", json):
-        save(document, path)
+        save(study, path)
     say(f"wrote {out / FILES[0]}")
-    if study.recommendation.point is None:
+    if study.best is None:
         raise typer.Exit(1)
 
 

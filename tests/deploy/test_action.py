@@ -152,7 +152,7 @@ def test_installing_puts_the_command_alone_on_the_path(tmp_path: Path) -> None:
     done = subprocess.run([*BASH, step["run"]], cwd=tmp_path, env=given | files, **KEPT)
     assert done.returncode == 0, done.stderr
     venv = tmp_path / "beers-deploy"
-    assert (tmp_path / "log").read_text() == f"-m venv {venv}\n-m pip install --quiet the action\n"
+    assert (tmp_path / "log").read_text() == f"-m venv {venv}\n-m pip install --quiet the action[torch]\n"
     (added,) = (tmp_path / "path").read_text().splitlines()
     assert [path.name for path in Path(added).iterdir()] == ["beers-deploy"]
     assert step["env"]["PIP_EXTRA_INDEX_URL"] == "https://download.pytorch.org/whl/cpu"

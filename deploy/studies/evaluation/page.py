@@ -69,7 +69,7 @@ def evaluation_report(found: Evaluation, strips: Sequence[Picture]) -> Report:
     tables += [Section(name, rows, SITES_CAPTION) for name, rows in by_table(found.sites).items()]
     swept = by_table(found.swept).items()
     tables += [Section(f"{name[0].upper()}{name[1:]}", rows, SWEEP_CAPTION) for name, rows in swept]
-    return Report(found.title, headline(found.mean), tables, strips, (*NOTES, *found.said))
+    return Report(found.title, headline(found.mean), tables, strips, (*NOTES, *found.notes))
 
 
 MEAN_CAPTION = (

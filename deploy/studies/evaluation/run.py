@@ -1,7 +1,7 @@
-"""An evaluation from names and folders to rows and a report: what `beers-deploy evaluate` does behind its options."""
+"""`evaluate`: restorations compared on the same pairs, from names, networks and functions to rows and a report."""
 
 import os
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import cast
@@ -11,7 +11,7 @@ import numpy as np
 from beers_deploy.model.io.images import list_images
 from beers_deploy.model.metrics.bootstrap import too_few
 from beers_deploy.model.progress import Log, Progress, no_log, once, reporting
-from beers_deploy.model.recipe import profiles_for, read_pairs_recipe
+from beers_deploy.model.recipe import PairsRecipe, profiles_for, read_pairs_recipe
 from beers_deploy.network import Network, NetworkLike, SensorLike
 from beers_deploy.pairs import Pair
 from beers_deploy.profiles.figures import Row
@@ -22,23 +22,23 @@ from beers_deploy.studies.evaluation.methods import DEGRADED, Method, knowledge_
 from beers_deploy.studies.evaluation.pairs import NamedPair, pairs_of_scenes, read_pairs
 from beers_deploy.studies.evaluation.scores import Instruments, paper_rows, perceptual_distances, score, site_rows
 from beers_deploy.studies.evaluation.sweep import sweep_tables
-from beers_deploy.studies.evaluation.targets import acquire_targets, target_figures
+from beers_deploy.studies.evaluation.targets import Targets, acquire_targets, target_figures
+
+Methods = Mapping[str, NetworkLike | Restore] | Sequence[str]
+"""Names of methods, or what restores by the name that it is listed under."""
 
 
-@dataclass(frozen=True)
-class Evaluation:
-    """What an evaluation found.
+@dataclass(frozen=True, repr=False, kw_only=True)
+class Evaluation(Table):
+    """Methods compared on the same pairs: means, sites, images, and other sensors where they were asked for.
 
     Attributes:
-        sensors: profiles of the degraded and of the reference images.
+        sensors: of the degraded and of the reference images.
         methods: as they were run.
         pairs: that they were run on.
         mean: a row a method, and the paper's.
         sites: a row a site.
-        images: a row a method and image.
-        swept: rows of the sweep, where one was asked for.
-        said: what a reader must know of the pairs.
-        inputs: the files that the figures rest on: models, weights of LPIPS, scenes or pairs.
+        swept: rows of the sweep.
     """
 
     sensors: tuple[Sensor, Sensor]
@@ -46,15 +46,7 @@ class Evaluation:
     pairs: Sequence[NamedPair]
     mean: Sequence[Row]
     sites: Sequence[Row]
-    images: Sequence[Row]
     swept: Sequence[Row]
-    said: Sequence[str]
-    inputs: Sequence[Path]
-
-    @property
-    def rows(self) -> tuple[Row, ...]:
-        """All rows: means, sites, images, the sweep."""
-        return (*self.mean, *self.sites, *self.images, *self.swept)
 
     @property
     def title(self) -> str:
@@ -62,32 +54,11 @@ class Evaluation:
         degraded, reference = self.sensors
         return f"{degraded.name} -> {reference.name}, {len(self.pairs)} image{'' if len(self.pairs) == 1 else 's'}"
 
-    @property
-    def notes(self) -> list[str]:
-        """What a reader of the tables must know."""
-        few = too_few(len({pair.site for pair in self.pairs}))
-        return [few, *self.said] if few else list(self.said)
-
-
-Methods = Mapping[str, NetworkLike | Restore] | Sequence[str]
-"""Names of methods, or what restores by the name that it is listed under."""
-
-
-@dataclass(frozen=True, repr=False, kw_only=True)
-class Evaluated(Table):
-    """Methods compared on the same pairs: means with intervals, sites, images.
-
-    Attributes:
-        found: the same with the methods and the pairs.
-    """
-
-    found: Evaluation
-
     def report(self, folder: str | os.PathLike[str]) -> Path:
         """Write report.html and pictures into a folder; returns the page's path."""
         from beers_deploy.studies.evaluation.page import write_page  # which imports this module
 
-        return write_page(self.found, Path(folder))
+        return write_page(self, Path(folder))
 
 
 def evaluate(
@@ -98,10 +69,12 @@ def evaluate(
     sensor: SensorLike | None = None,
     reference: SensorLike | None = None,
     lpips: str | os.PathLike[str] | None = None,
+    sweep: bool = False,
     seed: int = 0,
     progress: Progress = None,
-) -> Evaluated:
-    """Compare restorations on the same pairs; the degraded input is always a row.
+    log: Log = no_log,
+) -> Evaluation:
+    """Compare restorations on the same pairs and targets; the degraded input is always a row.
 
     Args:
         methods: names such as "traditional" or "convbeers-s-int8"; or a mapping of the name in the table to such a
@@ -111,39 +84,88 @@ def evaluate(
         sensor: of the degraded images; of pairs the one that made them, else the default one.
         reference: the sensor that is aimed at.
         lpips: weights of SqueezeNet 1.1, or a folder of backbones, for LPIPS.
+        sweep: whether other blurs, noises and gains are looked at too.
         seed: of every random draw.
         progress: a function that is told each step, False for silence, None for a bar or lines on standard error.
+        log: is told where a reference is taken in other units than it states.
 
     Raises:
         OptionError: no such method.
         ImageError: pairs that cannot be read, or differ in size.
         ProfileError: no such sensor.
     """
-    asked = methods if isinstance(methods, Mapping) else dict(zip(methods, methods, strict=True))
-    made = None if pairs is None or isinstance(pairs, str | os.PathLike) else list(pairs)
+    asked = {DEGRADED: DEGRADED, **(methods if isinstance(methods, Mapping) else {name: name for name in methods})}
     folder = Path(pairs) if isinstance(pairs, str | os.PathLike) else None
+    made = None if pairs is None or isinstance(pairs, str | os.PathLike) else list(pairs)
     if made and sensor is None:
         sensor, reference = made[0].profiles
+    recipe = read_pairs_recipe(folder) if folder else None
+    sensors = profiles_for(sensor, reference, recipe, log)
+    scenes, weights = (None if path is None else Path(path) for path in (images, lpips))
+    told = once(log)
     with reporting(progress):
-        found = run_evaluation(
-            {DEGRADED: DEGRADED, **asked},
-            images=None if images is None else Path(images),
-            pairs=folder if made is None else made,
-            sensor=sensor,
-            reference=reference,
-            lpips=None if lpips is None else Path(lpips),
-            seed=seed,
-            say=no_log,
-        )
-    arguments: dict[str, object] = {"images": images, "pairs": folder, "sensor": found.sensors[0].name}
-    arguments |= {"reference": found.sensors[1].name, "methods": ",".join(asked), "seed": seed}
-    return Evaluated("evaluate", arguments, tuple(found.inputs), found.rows, notes=tuple(found.notes), found=found)
+        ways = [_method(name, each, sensors, told) for name, each in asked.items()]
+        instruments = Instruments(perceptual_distances(weights), sensors[0].nominal().max_dn)
+        loaded, said = _pairs(made, folder, scenes, sensors, recipe, seed)
+        mean, rows = _scored(ways, loaded, instruments, acquire_targets(sensors[0].nominal(), seed), seed)
+        swept = sweep_tables(ways, scenes, *sensors, seed) if sweep else ()
+    few = too_few(len({pair.site for pair in loaded}))
+    arguments: dict[str, object] = {"images": images, "pairs": folder, "sensor": sensors[0].name, "lpips": lpips}
+    arguments |= {"reference": sensors[1].name, "methods": ",".join(asked), "sweep": sweep, "seed": seed}
+    sites = site_rows(rows)
+    return Evaluation(
+        "evaluate",
+        arguments,
+        tuple(_inputs(asked, weights, scenes, folder)),
+        (*mean, *sites, *rows, *swept),
+        notes=tuple([few, *said] if few else said),
+        sensors=sensors,
+        methods=ways,
+        pairs=loaded,
+        mean=mean,
+        sites=sites,
+        swept=swept,
+    )
 
 
-def _methods(given: Methods, sensors: tuple[Sensor, Sensor], log: Log) -> list[Method]:
-    if not isinstance(given, Mapping):
-        return [method_named(name, *sensors, log) for name in given]
-    return [_method(name, each, sensors, log) for name, each in given.items()]
+def _inputs(asked: Iterable[str], weights: Path | None, scenes: Path | None, pairs: Path | None) -> Iterator[Path]:
+    """The files that the figures rest on: networks, weights of LPIPS, scenes or pairs."""
+    yield from (path for path in (*map(Path, asked), *([weights] if weights else [])) if path.is_file())
+    folders = [scenes] if scenes else [pairs / role for role in ("degraded", "reference")] if pairs else []
+    yield from (path for folder in folders for path in list_images(folder))
+
+
+def _pairs(
+    made: Sequence[Pair] | None,
+    folder: Path | None,
+    scenes: Path | None,
+    sensors: tuple[Sensor, Sensor],
+    recipe: PairsRecipe | None,
+    seed: int,
+) -> tuple[list[NamedPair], list[str]]:
+    """The pairs given, those of a folder, or simulated ones; and what a reader must know of them."""
+    if made is not None:
+        return [_named(number, pair) for number, pair in enumerate(made)], []
+    if folder is not None:
+        return read_pairs(folder, sensors[0].nominal().max_dn, recipe), []
+    return pairs_of_scenes(scenes, *sensors, seed)
+
+
+def _named(number: int, pair: Pair) -> NamedPair:
+    seen, meant = (image.astype(np.float32) for image in pair)
+    return NamedPair(f"pair{number}", seen, meant, noise_free=pair.clean)
+
+
+def _scored(
+    methods: Sequence[Method], pairs: Sequence[NamedPair], instruments: Instruments, targets: Targets, seed: int
+) -> tuple[list[Row], list[Row]]:
+    """A row a method, the paper's behind; and a row a method and image."""
+    mean, rows = list[Row](), list[Row]()
+    for method in methods:
+        scored, *each = score(method, pairs, instruments, seed)
+        mean.append(replace(scored, figures={**scored.figures, **target_figures(method, targets)}))
+        rows += each
+    return [*mean, *paper_rows()], rows
 
 
 def _method(name: str, given: NetworkLike | Restore, sensors: tuple[Sensor, Sensor], log: Log) -> Method:
@@ -154,62 +176,3 @@ def _method(name: str, given: NetworkLike | Restore, sensors: tuple[Sensor, Sens
     network = Network.load(cast("NetworkLike", given), sensor=sensors[0])
     known = knowledge_of(network.model, sensors[0].name)
     return Method(name, network_method(network.model, sensors[0].nominal().max_dn), known)
-
-
-def _named(pairs: Sequence[Pair]) -> list[NamedPair]:
-    found = []
-    for number, pair in enumerate(pairs):
-        seen, meant = (image.astype(np.float32) for image in pair)
-        found.append(NamedPair(f"pair{number}", seen, meant, noise_free=pair.clean))
-    return found
-
-
-def run_evaluation(
-    names: Methods,
-    *,
-    images: Path | None = None,
-    pairs: Path | Sequence[Pair] | None = None,
-    sensor: SensorLike | None = None,
-    reference: SensorLike | None = None,
-    lpips: Path | None = None,
-    sweep: bool = False,
-    seed: int = 0,
-    say: Callable[[str], None],
-) -> Evaluation:
-    """Score every method on the same pairs and targets.
-
-    Args:
-        names: of the methods, the degraded input first.
-        images: folder of scenes to simulate pairs from; None for drawn ones.
-        pairs: folder of pairs instead, or simulated ones.
-        sensor: profile of the degraded images, by name or file; None for the pairs' own, or the default one.
-        reference: profile of the reference images, likewise.
-        lpips: weights of SqueezeNet 1.1, or a folder of backbones; None asks the environment.
-        sweep: whether other blurs, noises and gains are looked at too.
-        seed: of every random draw.
-        say: is told where a reference profile is taken in other units than it states.
-    """
-    recipe = read_pairs_recipe(pairs) if isinstance(pairs, Path) else None
-    sensors = profiles_for(sensor, reference, recipe, say)
-    degraded = sensors[0].nominal()
-    told = once(say)
-    methods = _methods(names, sensors, told)
-    instruments = Instruments(perceptual_distances(lpips), degraded.max_dn)
-    if pairs is None:
-        loaded, said = pairs_of_scenes(images, *sensors, seed)
-    elif isinstance(pairs, Path):
-        loaded, said = read_pairs(pairs, degraded.max_dn, recipe), []
-    else:
-        loaded, said = _named(pairs), []
-    named = [path for path in (*map(Path, names), *([lpips] if lpips else [])) if path.is_file()]
-    folders = [images] if images else []
-    folders += [pairs / role for role in ("degraded", "reference")] if isinstance(pairs, Path) else []
-    inputs = [*named, *(path for folder in folders for path in list_images(folder))]
-    mean, rows = [], list[Row]()
-    targets = acquire_targets(degraded, seed)
-    for method in methods:
-        scored, *each = score(method, loaded, instruments, seed)
-        mean.append(replace(scored, figures={**scored.figures, **target_figures(method, targets)}))
-        rows += each
-    swept = sweep_tables(methods, images, *sensors, seed) if sweep else ()
-    return Evaluation(sensors, methods, loaded, [*mean, *paper_rows()], site_rows(rows), rows, swept, said, inputs)

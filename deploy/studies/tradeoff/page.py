@@ -13,7 +13,7 @@ from beers_deploy.profiles.figures import Row
 from beers_deploy.report.page import Picture, Report, Section, write_report
 from beers_deploy.report.plots import LIGHT, SERIES, data_url, look, new_figure, set_ticks, svg_of
 from beers_deploy.studies.tradeoff.pareto import PSNR, Measured, ends, placed
-from beers_deploy.studies.tradeoff.run import Study
+from beers_deploy.studies.tradeoff.run import Tradeoff
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -45,14 +45,14 @@ PLOT_CAPTION = (
 )
 
 
-def write_study(study: Study, out: Path) -> None:
+def write_study(study: Tradeoff, out: Path) -> None:
     """Write the page and its plot into a folder."""
     svg = plot_svg(study)
     write_text(out / "tradeoff.svg", svg)
     write_report(report_of(study, svg), out / "tradeoff.html")
 
 
-def report_of(study: Study, svg: str) -> Report:
+def report_of(study: Tradeoff, svg: str) -> Report:
     """The page in reading order."""
     picture = Picture(f"{PSNR} against {study.cost}", data_url(svg), PLOT_CAPTION)
     tables = [
@@ -70,7 +70,7 @@ def _shown(point: Measured) -> Row:
     return Row("points", point.name, point.figures, {key: point.text.get(key, "") for key in SHOWN_WORDS})
 
 
-def plot_svg(study: Study) -> Markup:
+def plot_svg(study: Tradeoff) -> Markup:
     """Every point of the first board that has a cost and a PSNR; those of the front large, with their numbers."""
     from matplotlib import rc_context
 
@@ -86,7 +86,7 @@ def plot_svg(study: Study) -> Markup:
         return svg_of(figure, f"{PSNR} against {study.cost}; numbers as in the table of the front")
 
 
-def draw_study(axes: "Axes", study: Study) -> None:
+def draw_study(axes: "Axes", study: Tradeoff) -> None:
     """Draw the points of the first board and their front on axes; their numbers are left to whoever sizes these."""
     boards = (study.board, "this machine")
     points = [point for point in placed(study.points, study.cost) if point.text["board"] in boards]
@@ -127,7 +127,7 @@ def _scatter(
     axes.scatter([], [], s=FRONT_PX2, c=colour, marker=marker, label=name, linewidths=0)
 
 
-def _draw_front(axes: "Axes", study: Study, front: Sequence[Measured]) -> None:
+def _draw_front(axes: "Axes", study: Tradeoff, front: Sequence[Measured]) -> None:
     """The line of the front, and the intervals of its members."""
     x, y = [point.cost(study.cost) for point in front], [point.psnr_db for point in front]
     axes.step(x, y, where="post", color=LIGHT["soft"], lw=1, zorder=1)
@@ -140,7 +140,7 @@ def _draw_front(axes: "Axes", study: Study, front: Sequence[Measured]) -> None:
             axes.plot([at[0]] * 2, [before + end for end in gain.interval], color=LIGHT["soft"], lw=1.5, zorder=1)
 
 
-def _draw_numbers(axes: "Axes", study: Study) -> None:
+def _draw_numbers(axes: "Axes", study: Tradeoff) -> None:
     """The members' numbers beside their marks; one label for neighbours whose marks lie on one another."""
     groups: list[tuple[int, int, np.ndarray]] = []
     for number, point in enumerate(study.front, 1):
@@ -154,7 +154,7 @@ def _draw_numbers(axes: "Axes", study: Study) -> None:
         axes.annotate(words, (at[0], at[1]), (-4, 7), "figure pixels", "offset points", ha="right", weight="bold")
 
 
-def _label(study: Study, key: str) -> str:
+def _label(study: Tradeoff, key: str) -> str:
     figure = next((point.figures[key] for point in study.points if key in point.figures), None)
     where = f" on {study.board}" if key.startswith("board") else ""
     return f"{key}{where}, {figure.unit}" if figure else key

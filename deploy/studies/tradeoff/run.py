@@ -3,7 +3,7 @@
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import nullcontext
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -16,7 +16,7 @@ from beers_deploy.model.io.files import sha256
 from beers_deploy.model.io.images import list_images
 from beers_deploy.model.metrics.backbones import find_backbone
 from beers_deploy.model.metrics.bootstrap import too_few
-from beers_deploy.model.progress import Progress, reporting, steps
+from beers_deploy.model.progress import Log, Progress, no_log, reporting, steps
 from beers_deploy.model.shipped import SENSOR
 from beers_deploy.model.traditional.peers import PEERS
 from beers_deploy.model.traditional.settings import QUALITIES
@@ -58,9 +58,9 @@ if TYPE_CHECKING:
 LPIPS = "LPIPS-squeeze"
 
 
-@dataclass(frozen=True)
-class Study:
-    """What a study found.
+@dataclass(frozen=True, repr=False, kw_only=True)
+class Tradeoff(Table):
+    """What accuracy costs in time: the recommended point, the Pareto front, and every point with its figures.
 
     Attributes:
         board: the first one, which the front and the recommendation are about.
@@ -69,8 +69,6 @@ class Study:
         front_rows: the same by number, each with its difference from the next cheaper one.
         cost: the figure that the front is against.
         recommendation: what to take.
-        notes: what a reader must know.
-        inputs: the files that the figures rest on, besides shipped ones.
     """
 
     board: str
@@ -79,29 +77,11 @@ class Study:
     front_rows: Sequence[Row]
     cost: str
     recommendation: Recommendation
-    notes: Sequence[str]
-    inputs: Sequence[Path] = ()
-
-    @property
-    def rows(self) -> tuple[Row, ...]:
-        """For the document."""
-        return (self.recommendation.row, *self.front_rows, *(point.row for point in self.points))
-
-
-@dataclass(frozen=True, repr=False, kw_only=True)
-class Tradeoff(Table):
-    """What accuracy costs in time: the recommended point, the Pareto front and every point with its figures.
-
-    Attributes:
-        study: the same with what was measured of each point.
-    """
-
-    study: Study
 
     @property
     def best(self) -> Measured | None:
         """The recommended point; None where none keeps the budget and the need."""
-        return self.study.recommendation.point
+        return self.recommendation.point
 
     def plot(self, figure: str | None = None, ax: "Axes | None" = None) -> "Axes":
         """PSNR of every point of the first board against its cost, the front's numbered.
@@ -115,18 +95,18 @@ class Tradeoff(Table):
         from beers_deploy.studies.tradeoff.page import draw_study  # which imports this module
 
         axes = ax if ax is not None else optional("matplotlib.pyplot", "plot").subplots()[1]
-        draw_study(axes, self.study)
+        draw_study(axes, self)
         return cast("Axes", axes)
 
     def report(self, folder: str | os.PathLike[str]) -> Path:
         """Write the page and its plot into a folder; returns the page's path."""
         from beers_deploy.studies.tradeoff.page import FILES, write_study  # which imports this module
 
-        write_study(self.study, Path(folder))
+        write_study(self, Path(folder))
         return Path(folder) / FILES[0]
 
     def __str__(self) -> str:
-        return self.study.recommendation.line
+        return self.recommendation.line
 
 
 def tradeoff(
@@ -141,9 +121,13 @@ def tradeoff(
     need: str | None = None,
     lpips: str | os.PathLike[str] | None = None,
     calibration: str | os.PathLike[str] | None = None,
+    labelled: str | os.PathLike[str] | None = None,
+    detector: Path | None = None,
+    classes: str | None = None,
     seed: int = 0,
     cache: str | os.PathLike[str] | None = None,
     progress: Progress = None,
+    log: Log = no_log,
 ) -> Tradeoff:
     """Measure networks and traditional pipelines on the same images, predict their runs, and recommend a point.
 
@@ -158,114 +142,80 @@ def tradeoff(
         need: what must be reached, such as "psnr>=44".
         lpips: weights of SqueezeNet 1.1, or a folder of backbones, for LPIPS.
         calibration: folder of scenes to quantise networks on; drawn ones if None.
+        labelled: folder of labelled pictures for a detector, whose mAP50 is then a figure of each point.
+        detector: ONNX file; the embedded one if None.
+        classes: labelled classes under the detector's names, such as "car=vehicle".
         seed: of every random draw.
         cache: folder of measurements that a later run goes on with; None keeps none.
         progress: a function that is told each step, False for silence, None for a bar or lines on standard error.
+        log: is told which network has no INT8, and what of the sensor lies outside the range that was trained.
 
     Raises:
         BeersError: a network, an image, a profile or weights that cannot be used.
     """
-    several = boards_of(board)
+    boards, width_height = boards_of(board), parse_size(size) if isinstance(size, str) else size
+    for each in boards:
+        Constants.of(configurations(each)[0])  # a board without them is refused before anything is measured
+    limits = parse_constraints("budget", budget), parse_constraints("need", need)
+    scenes, weights, calibrated = (None if path is None else Path(path) for path in (images, lpips, calibration))
+    degraded = Sensor.load(sensor)
+    aim = Sensor.load(reference or REFERENCE).in_units_of(degraded)
     names = [each if isinstance(each, str) else str(Network.load(each).file) for each in networks]
-    width_px, height_px = parse_size(size) if isinstance(size, str) else size
     keep = nullcontext(cache) if cache is not None else TemporaryDirectory(prefix="beers-deploy-")
     with keep as folder, reporting(progress):
-        study = run_study(
-            names,
-            Path(folder),
-            images=None if images is None else Path(images),
-            sensor=sensor,
-            reference=reference,
-            targets=several,
-            size_px=(width_px, height_px),
-            budget=parse_constraints("budget", budget),
-            need=parse_constraints("need", need),
-            lpips=None if lpips is None else Path(lpips),
-            calibration=None if calibration is None else Path(calibration),
-            seed=seed,
-        )
-        inputs = tuple(each if isinstance(each, Input) else input_of(each) for each in study.inputs)
-    arguments: dict[str, object] = {"images": images, "sensor": Sensor.load(sensor).name, "budget": budget}
-    arguments |= {"size": f"{width_px}x{height_px}", "need": need, "calibration": calibration, "seed": seed}
-    arguments |= {"target": ",".join(each.name for each in several), "networks": ",".join(names)}
-    return Tradeoff("tradeoff", arguments, inputs, study.rows, notes=tuple(study.notes), study=study)
-
-
-def run_study(
-    networks: Sequence[str],
-    out: Path,
-    *,
-    images: Path | None = None,
-    sensor: SensorLike,
-    reference: SensorLike | None,
-    targets: Sequence[BoardLike],
-    size_px: tuple[int, int],
-    budget: Sequence[Constraint] = (),
-    need: Sequence[Constraint] = (),
-    lpips: Path | None = None,
-    calibration: Path | None = None,
-    labelled: Path | None = None,
-    detector: Path | None = None,
-    classes: str | None = None,
-    seed: int = 0,
-    log: Callable[[str], None] = lambda _: None,
-) -> Study:
-    """Measure each variant on the images, predict each point on the boards, and weigh them.
-
-    Args:
-        networks: shipped names and files.
-        out: folder of the measurements, which a later run goes on with.
-        images: folder of scenes; drawn ones if None.
-        sensor: profile of the degraded images.
-        reference: profile of the reference images.
-        targets: boards, the first of which the front and the recommendation are about.
-        size_px: width and height of the swath.
-        budget: what can be afforded.
-        need: what must be reached.
-        lpips: weights of SqueezeNet 1.1, or a folder of backbones.
-        calibration: folder of scenes to quantise the user's networks on; drawn ones if None.
-        labelled: folder of labelled images for a detector, whose mAP50 is then a figure of each point.
-        detector: ONNX file; the embedded one if None.
-        classes: labelled classes under the detector's names.
-        seed: of every random draw.
-        log: is told what a user should know on the way.
-    """
-    swath, boards = Swath(*size_px), [TargetProfile.load(target) for target in targets]
-    for board in boards:
-        Constants.of(configurations(board)[0])  # a board without them is refused before anything is measured
-    degraded, kept = Sensor.load(sensor), Measurements.open(out / "measurements.json")
-    quantise = partial(make_int8, folder=out / "int8", scenes=calibration, sensor=degraded, seed=seed)
-    aim = Sensor.load(reference or REFERENCE).in_units_of(degraded)
-    variants = network_variants(networks, degraded, quantise, log)
-    points = [point for variant in variants for point in network_points(variant, boards, swath)]
-    benchmark, said = _benchmark(images, degraded, aim, lpips, seed)
-    scenes = Labelled.open(labelled, detector, classes, benchmark) if labelled else None
-    measured = _measured([*points, *_others(boards)], benchmark, scenes, kept, swath, log)
-    if boards[0].name == PAPER_TARGET and size_px == parse_size(PAPER_SIZE):
+        kept, swath = Measurements.open(Path(folder) / "measurements.json"), Swath(*width_height)
+        quantise = partial(make_int8, folder=Path(folder) / "int8", scenes=calibrated, sensor=degraded, seed=seed)
+        variants = network_variants(names, degraded, quantise, log)
+        points = [point for variant in variants for point in network_points(variant, boards, swath)]
+        benchmark, said = _benchmark(scenes, degraded, aim, weights, seed)
+        pictures = Labelled.open(Path(labelled), detector, classes, benchmark) if labelled else None
+        measured = _measured([*points, *_others(boards)], benchmark, pictures, kept, swath, log)
+    if boards[0].name == PAPER_TARGET and width_height == parse_size(PAPER_SIZE):
         measured += _published()
-    notes = (*_notes(benchmark, boards[0].name), *(scenes.notes if scenes else ()), *said)
-    study = _weighed(measured, boards[0], Comparison(benchmark.sites, seed), budget, need, notes)
-    named = [path for path in map(Path, networks) if path.is_file()]
-    listed = [path for folder in (images, calibration) if folder for path in list_images(folder)]
-    single = [path for path in (find_backbone("squeeze", lpips), detector) if path]
-    pictures = [scene.path for scene in scenes.scenes if scene.path] if scenes else []
-    return replace(study, inputs=[*named, *listed, *single, *pictures])
+    notes = (*_notes(benchmark, boards[0].name), *(pictures.notes if pictures else ()), *said)
+    files = [path for path in map(Path, names) if path.is_file()]
+    files += [path for folder in (scenes, calibrated) if folder for path in list_images(folder)]
+    files += [path for path in (find_backbone("squeeze", weights), detector) if path]
+    files += [scene.path for scene in pictures.scenes if scene.path] if pictures else []
+    arguments: dict[str, object] = {"images": images, "sensor": degraded.name, "reference": aim.name, "need": need}
+    arguments |= {
+        "size": "x".join(map(str, width_height)),
+        "budget": budget,
+        "calibration": calibration,
+        "seed": seed,
+    }
+    arguments |= {"target": ",".join(each.name for each in boards), "network": ",".join(names), "seed": seed}
+    arguments |= {"labelled": labelled, "detector": detector, "classes": classes} if labelled else {}
+    about = arguments, tuple(map(input_of, files)), notes
+    return _weighed(measured, boards[0], Comparison(benchmark.sites, seed), limits, about)
 
 
 def _weighed(
     points: Sequence[Measured],
     board: TargetProfile,
     compare: Comparison,
-    budget: Sequence[Constraint],
-    need: Sequence[Constraint],
-    notes: Sequence[str],
-) -> Study:
+    limits: tuple[Sequence[Constraint], Sequence[Constraint]],
+    about: tuple[Mapping[str, object], tuple[Input, ...], tuple[str, ...]],
+) -> Tradeoff:
     """The front and the recommendation, of the points of one board."""
     here = [each for each in points if each.point and each.point.board in (None, board)]
-    cost = chosen_cost(here, budget)
+    cost, (arguments, inputs, notes) = chosen_cost(here, limits[0]), about
     front = pareto_front(here, cost)
-    recommended = recommend(here, budget, need, compare)
-    return Study(board.name, points, front, front_rows(front, cost, compare), cost, recommended, notes)
+    numbered, advice = front_rows(front, cost, compare), recommend(here, limits[0], limits[1], compare)
+    rows = (advice.row, *numbered, *(point.row for point in points))
+    return Tradeoff(
+        "tradeoff",
+        arguments,
+        inputs,
+        rows,
+        notes=notes,
+        board=board.name,
+        points=points,
+        front=front,
+        front_rows=numbered,
+        cost=cost,
+        recommendation=advice,
+    )
 
 
 def _benchmark(

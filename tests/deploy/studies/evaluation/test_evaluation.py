@@ -3,6 +3,7 @@
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import jsonschema
 import numpy as np
@@ -270,7 +271,8 @@ def test_one_pair_a_site_is_shown() -> None:
 def test_tables_of_a_sweep_keep_their_words_on_the_page() -> None:
     mean, *_ = score(IDENTITY, [pair()], PLAIN, 0)
     swept = Row("sweep, MTF at Nyquist", "nominal", {"degraded": measured(7, "%", "edges")})
-    report = evaluation_report(Evaluation((DEGRADED, REFERENCE), [], [], [mean], [], [], [swept], [], []), [])
+    lists: dict[str, Any] = {"methods": [], "pairs": [], "sites": [], "mean": [mean], "swept": [swept]}
+    report = evaluation_report(Evaluation("evaluate", {}, (), (), sensors=(DEGRADED, REFERENCE), **lists), [])
     assert [table.title for table in report.tables] == ["Means over all pairs", "Sweep, MTF at Nyquist"]
 
 

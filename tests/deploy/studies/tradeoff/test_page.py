@@ -12,7 +12,7 @@ from beers_deploy.report.plots import DARK, LIGHT
 from beers_deploy.studies.tradeoff.advice import recommend
 from beers_deploy.studies.tradeoff.page import SIZE_PX, plot_svg, report_of, series, write_study
 from beers_deploy.studies.tradeoff.pareto import Measured, front_rows, pareto_front
-from beers_deploy.studies.tradeoff.run import Study
+from beers_deploy.studies.tradeoff.run import Tradeoff
 from tests.deploy.browser import seen
 from tests.deploy.studies.tradeoff.made import COMPARE, family
 
@@ -20,11 +20,23 @@ SVG = "{http://www.w3.org/2000/svg}"
 COST = "board latency"
 
 
-def study(points: list[Measured] | None = None) -> Study:
+def study(points: list[Measured] | None = None) -> Tradeoff:
     found = list(family()) if points is None else points
     front = pareto_front(found, COST)
     advice = recommend(found, [], [], COMPARE)
-    return Study("vck190", found, front, front_rows(front, COST, COMPARE), COST, advice, ("No board was used.",))
+    return Tradeoff(
+        "tradeoff",
+        {},
+        (),
+        (),
+        notes=("No board was used.",),
+        board="vck190",
+        points=found,
+        front=front,
+        front_rows=front_rows(front, COST, COMPARE),
+        cost=COST,
+        recommendation=advice,
+    )
 
 
 def page() -> str:

@@ -30,7 +30,7 @@ from beers_deploy.studies.tradeoff.advice import parse_constraints
 from beers_deploy.studies.tradeoff.labelled import Labelled
 from beers_deploy.studies.tradeoff.measure import SEAM_ERROR, Benchmark, make_int8
 from beers_deploy.studies.tradeoff.pareto import TOO_FEW
-from beers_deploy.studies.tradeoff.run import Study, run_study
+from beers_deploy.studies.tradeoff.run import Tradeoff, tradeoff
 from tests.deploy.studies.tradeoff.small import small_studies
 
 pytestmark = pytest.mark.slow
@@ -60,20 +60,20 @@ def small() -> Iterator[None]:
         yield
 
 
-def studied(folder: Path, out: Path, **options: Any) -> Study:
+def studied(folder: Path, out: Path, **options: Any) -> Tradeoff:
     given = {"images": folder / "images", "calibration": folder / "calibration", "sensor": SENSOR}
-    given |= {"reference": "pleiades-reference", "targets": ("vck190",), "size_px": (1500, 1200)}
-    return run_study([str(folder / "narrow.safetensors")], out, **{**given, **options})
+    given |= {"reference": "pleiades-reference", "board": ("vck190",), "size": (1500, 1200)}
+    return tradeoff([str(folder / "narrow.safetensors")], cache=out, **{**given, **options})
 
 
 @pytest.fixture(scope="module")
-def study(folder: Path, small: None, tmp_path_factory: pytest.TempPathFactory) -> tuple[Study, Path]:  # noqa: ARG001
+def study(folder: Path, small: None, tmp_path_factory: pytest.TempPathFactory) -> tuple[Tradeoff, Path]:  # noqa: ARG001
     """An unbroken run, and where its measurements lie."""
     out = tmp_path_factory.mktemp("study")
     return studied(folder, out), out
 
 
-def test_every_figure_is_a_number_or_has_a_reason(study: tuple[Study, Path]) -> None:
+def test_every_figure_is_a_number_or_has_a_reason(study: tuple[Tradeoff, Path]) -> None:
     points = study[0].points
     assert len({point.name for point in points}) == len(points) > 12
     for point in points:
@@ -85,7 +85,7 @@ def test_every_figure_is_a_number_or_has_a_reason(study: tuple[Study, Path]) -> 
     assert {point.text["sensor"] for point in points} == {"known"}
 
 
-def test_exact_halos_give_one_picture_and_smaller_ones_show_seams(study: tuple[Study, Path]) -> None:
+def test_exact_halos_give_one_picture_and_smaller_ones_show_seams(study: tuple[Tradeoff, Path]) -> None:
     points = [point for point in study[0].points if "INT8" in point.name]
     exact = {point.value("PSNR") for point in points if point.text["halo"] == "exact"}
     (cut,) = [point for point in points if point.text["halo"] == "0"]
@@ -95,7 +95,7 @@ def test_exact_halos_give_one_picture_and_smaller_ones_show_seams(study: tuple[S
     assert all(SEAM_ERROR not in point.figures for point in points if point.text["halo"] == "exact")
 
 
-def test_the_scores_are_those_of_the_method_that_evaluate_takes(folder: Path, study: tuple[Study, Path]) -> None:
+def test_the_scores_are_those_of_the_method_that_evaluate_takes(folder: Path, study: tuple[Tradeoff, Path]) -> None:
     degraded = load_sensor(SENSOR)
     reference = reference_for(degraded)
     restore = method_named(str(folder / "narrow.safetensors"), degraded, reference).restore
@@ -106,7 +106,7 @@ def test_the_scores_are_those_of_the_method_that_evaluate_takes(folder: Path, st
     assert [image["PSNR"] for image in found.images] == expected
 
 
-def test_two_sites_give_no_interval_and_it_is_said(study: tuple[Study, Path]) -> None:
+def test_two_sites_give_no_interval_and_it_is_said(study: tuple[Tradeoff, Path]) -> None:
     found = study[0]
     assert all(point.figures["PSNR"].interval is None for point in found.points)
     assert {row.text["gain over the next cheaper"] for row in found.front_rows} <= {"cheapest", TOO_FEW}
@@ -116,7 +116,7 @@ def test_two_sites_give_no_interval_and_it_is_said(study: tuple[Study, Path]) ->
 
 
 def test_a_stopped_run_goes_on_and_says_the_same(
-    folder: Path, study: tuple[Study, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    folder: Path, study: tuple[Tradeoff, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     whole, out = study
     kept = json.loads((out / "measurements.json").read_text())
@@ -160,10 +160,8 @@ def test_an_int8_file_is_made_once(folder: Path, tmp_path: Path) -> None:
     assert path.stat().st_mtime_ns == changed
 
 
-def test_other_boards_are_rows_and_the_front_is_of_the_first(folder: Path, study: tuple[Study, Path]) -> None:
-    found = studied(
-        folder, study[1], targets=("vck190", "zcu102"), budget=parse_constraints("--budget", "latency<=9")
-    )
+def test_other_boards_are_rows_and_the_front_is_of_the_first(folder: Path, study: tuple[Tradeoff, Path]) -> None:
+    found = studied(folder, study[1], board=("vck190", "zcu102"), budget=parse_constraints("--budget", "latency<=9"))
     assert {point.text["board"] for point in found.points} >= {"vck190", "zcu102", "this machine"}
     assert {point.text["board"] for point in found.front} == {"vck190"}
     assert found.recommendation.point is not None
@@ -173,9 +171,9 @@ def test_other_boards_are_rows_and_the_front_is_of_the_first(folder: Path, study
 
 
 def test_the_papers_runs_stand_beside_its_own_swath_and_compare_with_nothing(
-    folder: Path, study: tuple[Study, Path]
+    folder: Path, study: tuple[Tradeoff, Path]
 ) -> None:
-    found = studied(folder, study[1], size_px=(13600, 9016))
+    found = studied(folder, study[1], size=(13600, 9016))
     printed = [point for point in found.points if point.point is None]
     assert sorted(point.figures["board latency"].value or 0 for point in printed) == [42, 1724]
     assert all(point.value("board latency") is None for point in printed)
@@ -183,7 +181,7 @@ def test_the_papers_runs_stand_beside_its_own_swath_and_compare_with_nothing(
 
 
 def test_labelled_pictures_add_map50_beside_exact_halos(
-    folder: Path, study: tuple[Study, Path], monkeypatch: pytest.MonkeyPatch
+    folder: Path, study: tuple[Tradeoff, Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     class Made:
         digest, notes, scenes = "d", ("labels",), ()
@@ -195,7 +193,7 @@ def test_labelled_pictures_add_map50_beside_exact_halos(
             return measured(100 * stored["value"], "%", "made up")
 
     monkeypatch.setattr(Labelled, "open", lambda *_: Made())
-    found = studied(folder, study[1], labelled=folder, need=parse_constraints("--need", "map50>=40"))
+    found = studied(folder, study[1], labelled=folder, need="map50>=40")
     values = {point.text["halo"]: point.figures["mAP50"] for point in found.points if "INT8" in point.name}
     assert values["exact"].value == 50
     assert values["0"].reason == "measured with exact halos alone"
@@ -222,7 +220,7 @@ def test_a_detector_is_shown_what_each_method_restored(folder: Path, tmp_path: P
 
 @pytest.mark.parametrize(("budget", "code"), [("latency<=20s", 0), ("latency<=0.001s", 1)])
 def test_the_command_recommends_in_one_line_and_writes_its_files(
-    folder: Path, study: tuple[Study, Path], budget: str, code: int
+    folder: Path, study: tuple[Tradeoff, Path], budget: str, code: int
 ) -> None:
     out = study[1]
     named = f"--network {folder}/narrow.safetensors --images {folder}/images --calibration {folder}/calibration"
