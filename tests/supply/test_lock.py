@@ -13,7 +13,13 @@ PIN = re.compile(r"(?P<name>[\w.-]+)==(?P<version>[\w.!]+)(?P<hashes>( --hash=sh
 
 def asked_for() -> list[str]:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())
-    return [*project["project"]["dependencies"], *project["build-system"]["requires"]]
+    extras = project["project"]["optional-dependencies"]
+    return [
+        *project["project"]["dependencies"],
+        *extras["study"],
+        *extras["torch"],
+        *project["build-system"]["requires"],
+    ]
 
 
 def faults(lock: str, wanted: list[str]) -> list[str]:

@@ -31,8 +31,8 @@ VERSIONS = [Version(text) for text in ("2.4.1", "2.5.0", "2.9.1", "2.13.0", "2.1
 
 
 def asked_for(name: str) -> SpecifierSet:
-    dependencies = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["dependencies"]
-    return next(found.specifier for found in map(Requirement, dependencies) if found.name == name)
+    extras = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["optional-dependencies"]
+    return next(found.specifier for found in map(Requirement, extras[name]) if found.name == name)
 
 
 def pages() -> list[Path]:
