@@ -212,14 +212,14 @@ def layer_error_rows(result: Quantised, patches: Patches) -> list[Row]:
     """Every layer in int8 by itself, and all of them."""
     seen = few_crops(patches.degraded, result.host)
     layers, together = layer_errors(result.graph, result.core, seen)
-    source = f"{len(seen)} simulated patches, all other layers in float"
+    source = f"{len(seen)} patches, all other layers in float"
     whole = sum(layer.network.squared for layer in layers)
     rows = []
     for layer in layers:
         figures = {"SQNR alone": _sqnr(layer.alone, source), **_network(layer.network, source)}
         figures["share of squared error"] = measured(100 * layer.network.squared / whole if whole else 0, "%", source)
         rows.append(Row("layers", layer.name, figures))
-    return [*rows, Row("layers", "all layers", _network(together, f"{len(seen)} simulated patches"))]
+    return [*rows, Row("layers", "all layers", _network(together, f"{len(seen)} patches"))]
 
 
 def _network(loss: Loss, source: str) -> dict[str, Figure]:
@@ -233,13 +233,14 @@ def _sqnr(loss: Loss, source: str) -> Figure:
 
 
 def worst_row(number: int, patches: Patches, spread: Spread) -> Row:
-    """The errors of a patch, and what it shows through which sensor."""
-    view, source = patches.views[number], "one simulated patch"
-    figures = {
-        "MAE": measured(float(spread.mae[number]), "of full scale", source),
-        "max": measured(float(spread.largest[number]), "of full scale", source),
-        "mean radiance": measured(view.ground.brightness, "W/m2/sr/um", "of the simulated ground"),
-    }
+    """The errors of a patch; of a simulated one also what it shows through which sensor."""
+    errors = {"MAE": spread.mae[number], "max": spread.largest[number]}
+    kind = "simulated patch" if patches.views else "sample"
+    figures = {key: measured(float(value), "of full scale", f"one {kind}") for key, value in errors.items()}
+    if not patches.views:
+        return Row("worst samples", f"sample {number}", figures)
+    view = patches.views[number]
+    figures["mean radiance"] = measured(view.ground.brightness, "W/m2/sr/um", "of the simulated ground")
     words = {
         "scene": view.ground.scene.name,
         "MTF at Nyquist, drawn from the profile": _mtf(view.degraded),
@@ -256,7 +257,7 @@ def _mtf(sensor: Instrument) -> str:
 
 def sizes_row(spread: Spread) -> Row:
     """How many pixels differ by more than a few DN, and by more than many."""
-    source = f"{len(spread.mae)} simulated patches"
+    source = f"{len(spread.mae)} patches"
     figures = {f"beyond {dn} DN": measured(100 * spread.share_beyond(dn), "%", source) for dn in BEYOND_DN}
     return Row("error sizes", "INT8 against float", figures)
 
@@ -266,8 +267,9 @@ def headline(gate: GateResult, layers: list[Row]) -> str:
     shares = {row.name: row.figures["share of squared error"].value or 0 for row in layers[:-1]}
     most = sorted(shares, key=lambda name: shares[name], reverse=True)[:3]
     named = ", ".join(f"{name} {shares[name]:.0f} %" for name in most)
+    drop = "" if math.isnan(gate.drop_db) else f" and costs {gate.drop_db:.2f} dB"
     return (
-        f"INT8 differs from float by {gate.mae:.2g} of full scale on average and costs {gate.drop_db:.2f} dB "
+        f"INT8 differs from float by {gate.mae:.2g} of full scale on average{drop} "
         f"(measured). {kind_of_error(gate.std_over_mae)} Most of the squared error comes from: {named}."
     )
 

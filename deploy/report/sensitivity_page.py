@@ -86,5 +86,5 @@ CAPTIONS = {
 NOTES = (
     "SQNR is 10 log10 of the signal's energy over the error's; differences are of full scale, 0.001 is 4 DN.",
     "Squared errors of layers nearly add up, as independent errors do: the shares say where an effort would pay.",
-    "All figures are of simulated patches; the INT8 network ran on onnxruntime, which rounds ties to even.",
+    "All figures are of patches that calibration did not see; onnxruntime, which ran INT8, rounds ties to even.",
 )

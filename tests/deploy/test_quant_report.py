@@ -157,3 +157,14 @@ def test_the_ratio_is_put_into_words() -> None:
     assert "mostly those of rounding." in kind_of_error(1.27)
     assert "unequal" in kind_of_error(1.5)
     assert "clipping" in kind_of_error(3.0)
+
+
+def test_a_report_on_samples_shows_the_worst_of_them(tmp_path: Path) -> None:
+    save_onnx(to_onnx(plain(Variant(1, 4)), {}), tmp_path / "f.onnx")
+    np.save(tmp_path / "s.npy", np.random.default_rng(0).random((8, 1, 40, 48), np.float32))
+    options = ["--samples", tmp_path / "s.npy", "--out", tmp_path / "i.onnx", "--report", tmp_path / "r"]
+    assert "dB" not in done("quantize", tmp_path / "f.onnx", *options).splitlines()[-1]
+    rows = json.loads((tmp_path / "r" / "report.json").read_text())["rows"]
+    assert {row["name"] for row in rows if row["table"] == "worst samples"} == {"sample 0", "sample 1"}
+    judged = done("gate", tmp_path / "f.onnx", tmp_path / "i.onnx", "--samples", tmp_path / "s.npy", "--max-mae", "1")
+    assert "note: 2 of 8 samples: the others were calibrated on" in judged
