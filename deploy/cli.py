@@ -41,7 +41,7 @@ from beers_deploy.commands import (
     tradeoff,
     train,
 )
-from beers_deploy.commands.shared import results_to
+from beers_deploy.commands.shared import results_to, running
 from beers_deploy.model.progress import reporting
 from beers_deploy.profiles.errors import BeersError, OutsideRangeWarning, missing_extra, visible
 
@@ -72,7 +72,7 @@ def command(function: Callable[..., None]) -> Callable[..., None]:
     @wraps(function)
     def run(*given: Any, quiet: bool = False, verbose: bool = False, **named: Any) -> None:
         try:
-            with reporting(False if quiet else None):
+            with reporting(False if quiet else None), running(named):
                 function(*given, **named)
         except (typer.Exit, typer.Abort):
             raise

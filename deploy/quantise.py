@@ -54,7 +54,7 @@ def quantize(
     board: BoardLike = DEFAULT_TARGET,
     sensor: SensorLike = SENSOR,
     regime: Literal["legal", "free"] = "legal",
-    images: Path | None = None,
+    images: str | os.PathLike[str] | None = None,
     patches: int = 64,
     patch_px: int = 128,
     finetune: int = 0,
@@ -95,12 +95,12 @@ def quantize(
         raise OptionError("a network behind a bank", expected=expected, got="one", remedy=remedy)
     origin = Network.load(network, sensor=known)
     require_quantised(origin.model, origin.label, wanted=False)
-    own = samples_of(origin.model, samples)
+    own, scenes = samples_of(origin.model, samples), None if images is None else Path(images)
     with reporting(progress):
         if banked:
-            simulated = _simulated(known, images, patches, patch_px, seed)
+            simulated = _simulated(known, scenes, patches, patch_px, seed)
             return replace(_banked(banked, simulated, known, target), origin=origin)
-        calibration: Source = own or _simulated(known, images, patches, patch_px, seed)
+        calibration: Source = own or _simulated(known, scenes, patches, patch_px, seed)
         made = _free(origin, calibration) if regime == "free" else _legal(origin, calibration, target, finetune)
     return replace(made, origin=origin)
 

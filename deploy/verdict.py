@@ -29,8 +29,7 @@ from beers_deploy.profiles.errors import OptionError, optional, printable
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.profiles.target import DEFAULT_TARGET, TargetProfile
 from beers_deploy.profiles.toml import read_json, unreadable
-from beers_deploy.quant.checks import Check
-from beers_deploy.quant.gate import GateResult, Limits, judge, judge_saturation, limits_of, verdict_row
+from beers_deploy.quant.gate import Check, GateResult, Limits, judge, judge_saturation, limits_of, verdict_row
 from beers_deploy.quant.gate import compare as differences
 from beers_deploy.quant.onnx_file import fixed_tile_px, metadata, require_quantised
 from beers_deploy.quant.samples import OwnSamples, samples_of
@@ -115,7 +114,7 @@ def compare(
     samples: object = None,
     *,
     sensor: SensorLike = SENSOR,
-    images: Path | None = None,
+    images: str | os.PathLike[str] | None = None,
     patches: int = 32,
     seed: int = 0,
     progress: Progress = None,
@@ -140,8 +139,9 @@ def compare(
     """
     known = Sensor.load(sensor)
     ours, theirs = _pair(int8, against, known)
+    scenes = None if images is None else Path(images)
     with reporting(progress):
-        unseen, simulated, notes = _unseen(ours, theirs, known, samples, images, patches, seed)
+        unseen, simulated, notes = _unseen(ours, theirs, known, samples, scenes, patches, seed)
         sessions = open_any_size(theirs.model), open_any_size(ours.model)
         result = differences(*sessions, unseen.pairs, simulated)
         shares = saturated_shares(ours.model, unseen.degraded)
@@ -160,7 +160,7 @@ def gate(
     limits: Limits | Mapping[str, float] | str | os.PathLike[str] | None = None,
     baseline: str | os.PathLike[str] | None = None,
     sensor: SensorLike = SENSOR,
-    images: Path | None = None,
+    images: str | os.PathLike[str] | None = None,
     patches: int = 32,
     seed: int = 0,
     progress: Progress = None,

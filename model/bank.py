@@ -14,7 +14,6 @@ A network that reads x and u and gives `y_0 + g * body` is the same for every se
 network: Dong, Roth and Schiele, NeurIPS 2020.) This is NumPy alone, so that a restoration begins without torch.
 """
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -23,7 +22,7 @@ from itertools import product
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from beers_deploy.model.family import RANGES
+from beers_deploy.model.family import RANGES, noise_over_full_scale
 from beers_deploy.model.simulator.mtf import NYQUIST, sensor_mtf
 from beers_deploy.profiles import load_sensor
 from beers_deploy.profiles.sensor import Instrument
@@ -135,13 +134,6 @@ def in_places(kernels: NDArray[np.float64], scale: int) -> NDArray[np.float64]:
         (place_y, y), (place_x, x) = divmod(row + down - middle, scale), divmod(column + right - middle, scale)
         found[:, row, column, y, x, place_y + reach, place_x + reach] = kernels[:, down, right]
     return found.reshape(len(kernels) * scale**2, scale**2, 2 * reach + 1, 2 * reach + 1)
-
-
-def noise_over_full_scale(sensor: Instrument) -> float:
-    """Standard deviation of noise at a quarter of full scale, that of rounding counted, over full scale."""
-    full_scale = sensor.max_dn / sensor.gain_dn_per_radiance
-    rounding = 1 / (12 * sensor.gain_dn_per_radiance**2)
-    return math.sqrt(sensor.noise_sigma(full_scale / 4) ** 2 + rounding) / full_scale
 
 
 def restoring_gain(

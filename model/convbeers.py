@@ -51,44 +51,40 @@ class ResidualBlock(nn.Module):
         return x + correction
 
 
-class ConvBEERS(nn.Module):
+class Layers(nn.Module):
+    """What both networks are made of; their heads read so many planes of each pixel."""
+
+    def __init__(self, variant: Variant, planes: int) -> None:
+        super().__init__()
+        self.variant = variant
+        self.head = conv3x3(planes * variant.pixels, variant.features)
+        self.body = nn.Sequential(*(ResidualBlock(variant.features) for _ in range(variant.blocks)))
+        self.body_end = conv3x3(variant.features, variant.features)
+        self.tail = conv3x3(variant.features, variant.pixels)
+
+    def corrected(self, shallow: Tensor, bfloat16: bool) -> Tensor:
+        """What the head gave, (N, F, H / S, W / S), to the correction (N, 1, H, W)."""
+        with torch.autocast(shallow.device.type, dtype=torch.bfloat16, enabled=bfloat16):
+            deep = self.body_end(self.body(shallow))
+        return pixel_shuffle(self.tail(shallow + deep.float()), self.variant.scale)
+
+
+class ConvBEERS(Layers):
     """The network: (N, 1, H, W) in [0, 1] of full scale to the same, not clipped; H and W multiples of its scale."""
 
     def __init__(self, variant: Variant) -> None:
-        super().__init__()
-        self.variant = variant
-        self.head = conv3x3(variant.pixels, variant.features)
-        self.body = nn.Sequential(*(ResidualBlock(variant.features) for _ in range(variant.blocks)))
-        self.body_end = conv3x3(variant.features, variant.features)
-        self.tail = conv3x3(variant.features, variant.pixels)
+        super().__init__(variant, planes=1)
 
     def forward(self, image: Tensor, bfloat16: bool = False) -> Tensor:
         """Image plus correction, (N, 1, H, W); `bfloat16` is for the blocks alone."""
-        shallow = self.entered(image)
-        with torch.autocast(image.device.type, dtype=torch.bfloat16, enabled=bfloat16):
-            deep = self.body_end(self.body(shallow))
-        return image + self.left(shallow + deep.float())
-
-    def entered(self, image: Tensor) -> Tensor:
-        """Image (N, 1, H, W) through the head: (N, F, H / S, W / S)."""
-        shallow: Tensor = self.head(pixel_unshuffle(image, self.variant.scale))
-        return shallow
-
-    def left(self, deep: Tensor) -> Tensor:
-        """Maps (N, F, H / S, W / S) through the tail: the correction (N, 1, H, W)."""
-        return pixel_shuffle(self.tail(deep), self.variant.scale)
+        return image + self.corrected(self.head(pixel_unshuffle(image, self.variant.scale)), bfloat16)
 
 
-class BankedConvBEERS(nn.Module):
+class BankedConvBEERS(Layers):
     """Images (N, 1, H, W) in [0, 1] of full scale and sensor vectors (N, 4) to (N, 1, H, W), not clipped."""
 
     def __init__(self, variant: Variant) -> None:
-        super().__init__()
-        self.variant = variant
-        self.head = conv3x3(BANK_PLANES * variant.pixels, variant.features)
-        self.body = nn.Sequential(*(ResidualBlock(variant.features) for _ in range(variant.blocks)))
-        self.body_end = conv3x3(variant.features, variant.features)
-        self.tail = conv3x3(variant.features, variant.pixels)
+        super().__init__(variant, BANK_PLANES)
         self.bias = nn.Linear(SENSOR_VALUES, variant.features, bias=False)
         nn.init.zeros_(self.bias.weight)
 
@@ -110,9 +106,7 @@ class BankedConvBEERS(nn.Module):
         shallow = (self.head(read) + self.bias(vectors)[:, :, None, None]).contiguous(
             memory_format=torch.channels_last
         )
-        with torch.autocast(image.device.type, dtype=torch.bfloat16, enabled=bfloat16):
-            deep = self.body_end(self.body(shallow))
-        correction = pixel_shuffle(self.tail(shallow + deep.float()), self.variant.scale)
+        correction = self.corrected(shallow, bfloat16)
         unit = image.new_tensor([bank.unit for bank in banks])[:, None, None, None]
         restored: Tensor = image + unit * (filtered[:, FILTERS:] + correction)
         return restored

@@ -182,13 +182,15 @@ def write_dataset(
         if not left_over.is_dir():
             left_over.unlink()
     windows = plan_windows(recipe)
-    chunks = [c for _, group in groupby(windows, key=lambda w: w.scene) for c in _chunks(list(group))]
+    scenes = [list(group) for _, group in groupby(windows, key=lambda w: w.scene)]
+    chunks = [scene[first : first + CHUNK] for scene in scenes for first in range(0, len(scene), CHUNK)]
     parts = {out / "parts" / f"{chunk[0].number:08d}.jsonl": chunk for chunk in chunks}
     tick(sum(len(chunk) for path, chunk in parts.items() if path.exists()))
     waiting = {path: chunk for path, chunk in parts.items() if not path.exists()}
     with ExitStack() as stack:
         if pool is None and workers > 1 and len(waiting) > 1:
-            pool = stack.enter_context(_processes(workers))
+            spawn = multiprocessing.get_context("spawn")  # a forked copy of torch's thread pools can hang
+            pool = stack.enter_context(ProcessPoolExecutor(min(workers, MOST_PROCESSES), mp_context=spawn))
         for path, patches in stack.enter_context(closing(_made(recipe, waiting, workers, pool))):
             for patch in patches:
                 for role, dn in (("degraded", patch.degraded), ("reference", patch.reference)):
@@ -200,11 +202,6 @@ def write_dataset(
         summary = _read_summary(manifest)
     shutil.rmtree(out / "parts")
     return summary
-
-
-def _processes(workers: int) -> ProcessPoolExecutor:
-    # spawn: a forked copy of torch's thread pools can hang
-    return ProcessPoolExecutor(min(workers, MOST_PROCESSES), mp_context=multiprocessing.get_context("spawn"))
 
 
 def _made(
@@ -234,16 +231,12 @@ def _check_folder(recipe: DatasetRecipe, out: Path, resume: bool) -> None:
     if not path.exists():
         write_text(path, wanted)
         return
-    same = path.is_file() and path.read_bytes() == wanted.encode()
-    got = "this dataset" if same else "another dataset"
-    if got == "another dataset" or not resume:
-        remedy = "add `resume` or choose another folder" if got == "this dataset" else "choose another folder"
-        raise OptionError("out", expected="a folder without a dataset", got=got, remedy=remedy)
-
-
-def _chunks(windows: list[Window]) -> Iterator[list[Window]]:
-    for first in range(0, len(windows), CHUNK):
-        yield windows[first : first + CHUNK]
+    expected = "a folder without a dataset"
+    if not path.is_file() or path.read_bytes() != wanted.encode():
+        raise OptionError("out", expected=expected, got="another dataset", remedy="choose another folder")
+    if not resume:
+        remedy = "add `resume` or choose another folder"
+        raise OptionError("out", expected=expected, got="this dataset", remedy=remedy)
 
 
 def _read_summary(path: Path) -> dict[str, float]:

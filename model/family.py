@@ -53,14 +53,19 @@ class SensorVector:
 
 def sensor_values(sensor: Instrument) -> dict[str, float]:
     """The four values of `RANGES`, smear and rounding noise counted."""
-    full_scale = sensor.max_dn / sensor.gain_dn_per_radiance
-    rounding = 1 / (12 * sensor.gain_dn_per_radiance**2)
     smear = sensor.effects.get("smear")
     # A network knows no smear of its own: what that leaves of the contrast along the track is counted there.
     kept = abs(float(np.sinc(0.5 * smear.length_px))) if isinstance(smear, Smear) else 1.0
-    sigmas = [math.sqrt(sensor.noise_sigma(full_scale / part) ** 2 + rounding) / full_scale for part in (16, 4)]
+    sigmas = [noise_over_full_scale(sensor, part) for part in (16, 4)]
     across, along = sensor.mtf_axes
     return dict(zip(RANGES, (across, along * kept, *sigmas), strict=True))
+
+
+def noise_over_full_scale(sensor: Instrument, part: int = 4) -> float:
+    """Standard deviation of noise at that part of full scale, that of rounding counted, over full scale."""
+    full_scale = sensor.max_dn / sensor.gain_dn_per_radiance
+    rounding = 1 / (12 * sensor.gain_dn_per_radiance**2)
+    return math.sqrt(sensor.noise_sigma(full_scale / part) ** 2 + rounding) / full_scale
 
 
 def sensor_vector(sensor: Instrument) -> SensorVector:

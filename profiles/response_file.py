@@ -179,16 +179,13 @@ def _trimmed(samples: Samples) -> Samples:
 
 
 def _unpacked_again(label: str, raw: Mapping[str, Any]) -> PointSpread:
-    sides, text = (raw["height"], raw["width"]), raw["samples"]
-    whole = all(isinstance(side, int) and 1 <= side <= KEPT_SIDE for side in sides) and isinstance(text, str)
     per_px = _samples_per_px(f"{label} samples_per_px", raw["samples_per_px"])
+    point = PointSpread(raw["height"], raw["width"], per_px, raw["samples"])
     try:
-        point = PointSpread(*sides, per_px, text)
-        sound = whole and 0 < float(unpacked(point).sum()) < math.inf
-    except (TypeError, ValueError):
-        sound = False
-    if not sound:
-        raise ProfileError(label, expected="packed samples", got="others", remedy="make it anew")
+        if not 0 < float(unpacked(point).sum()) < math.inf:
+            raise ValueError("samples whose sum is no weight")
+    except (OverflowError, TypeError, ValueError) as error:
+        raise ProfileError(label, expected="packed samples", got="others", remedy="make it anew") from error
     return point
 
 

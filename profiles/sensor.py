@@ -334,33 +334,20 @@ def snr_0_bounds(radiance_0: float, radiance_1: float, snr_1: float) -> tuple[fl
     return snr_1 * ratio, snr_1 * math.sqrt(ratio)
 
 
-@dataclass(frozen=True)
-class Way:
-    """One way in which a table of a profile states its matter: the keys that it needs, and those it may have."""
-
-    required: tuple[str, ...]
-    optional: tuple[str, ...] = ()
-
-    @property
-    def keys(self) -> tuple[str, ...]:
-        """All of them."""
-        return self.required + self.optional
-
-
-TABLES: dict[str, tuple[Way, ...]] = {
-    "grid": (Way(("gsd_m", "oversampling")),),
+TABLES: dict[str, tuple[tuple[tuple[str, ...], tuple[str, ...]], ...]] = {
+    "grid": ((("gsd_m", "oversampling"), ()),),
     "mtf": (
-        Way(("mtf_nyquist",), ("mtf_nyquist_along",)),
-        Way(("frequency", "across"), ("along",)),
-        Way(("psf", "psf_samples_per_px")),
+        (("mtf_nyquist",), ("mtf_nyquist_along",)),
+        (("frequency", "across"), ("along",)),
+        (("psf", "psf_samples_per_px"), ()),
     ),
     "noise": (
-        Way(("radiance_0", "snr_0", "radiance_1", "snr_1")),
-        Way(("alpha", "beta"), ("radiance_0", "radiance_1")),
+        (("radiance_0", "snr_0", "radiance_1", "snr_1"), ()),
+        (("alpha", "beta"), ("radiance_0", "radiance_1")),
     ),
-    "digitiser": (Way(("bits", "gain_dn_per_radiance")),),
+    "digitiser": ((("bits", "gain_dn_per_radiance"), ()),),
 }
-"""Every table that a profile has, and the ways to fill it: exactly one of them."""
+"""Every table that a profile has, and the ways to fill it: the keys that each needs, and those that it may have."""
 
 RESPONSE = ("frequency", "across", "along", "psf", "psf_samples_per_px")
 """Keys that make up the response; each other key of `TABLES` is a constant, and a field of `Sensor`."""
@@ -368,12 +355,16 @@ RESPONSE = ("frequency", "across", "along", "psf", "psf_samples_per_px")
 
 def table_keys(table: str) -> tuple[str, ...]:
     """Every key that a table may have, each once, in the order of its ways."""
-    return tuple(dict.fromkeys(key for way in TABLES[table] for key in way.keys))
+    return tuple(dict.fromkeys(key for required, optional in TABLES[table] for key in required + optional))
 
 
 def constant_keys(table: str) -> tuple[str, ...]:
     """Those of them that are constants."""
     return tuple(key for key in table_keys(table) if key not in RESPONSE)
+
+
+TABLE_OF = {key: table for table in TABLES for key in constant_keys(table)}
+"""The table of each constant."""
 
 
 def same_instrument(one: Sensor, other: Sensor) -> bool:
@@ -383,8 +374,7 @@ def same_instrument(one: Sensor, other: Sensor) -> bool:
 
 def numbers_of(profile: Sensor) -> dict[str, object]:
     """The low and high end of each constant by name: what of a profile decides what its images are like."""
-    keys = [key for table in TABLES for key in constant_keys(table)]
-    constants: dict[str, Constant | None] = {key: getattr(profile, key) for key in keys}
+    constants: dict[str, Constant | None] = {key: getattr(profile, key) for key in TABLE_OF}
     constants |= {f"{n}.{key}": value for n, table in profile.effects.items() for key, value in table.items()}
     numbers: dict[str, object] = {
         key: constant and (constant.low, constant.high) for key, constant in constants.items()

@@ -19,6 +19,7 @@ from beers_deploy.profiles.sensor import (
     MTF_NYQUIST_MAX,
     OFFSET,
     RESPONSE,
+    TABLE_OF,
     TABLES,
     Sensor,
     constant_keys,
@@ -61,12 +62,11 @@ def load_sensor(name: str) -> Sensor:
 def with_numbers(sensor: Sensor, numbers: Mapping[str, Number]) -> Sensor:
     """A sensor with other numbers; see `Sensor.replace`."""
     where, tables = f"sensor {sensor.name}", tables_of(sensor)
-    home = {key: table for table in TABLES for key in constant_keys(table)}
     for key, value in numbers.items():
-        if key not in home:
-            expected, remedy = f"one of {', '.join(home)}", "correct the name"
+        if key not in TABLE_OF:
+            expected, remedy = f"one of {', '.join(TABLE_OF)}", "correct the name"
             raise ProfileError(where, expected=expected, got=repr(key), remedy=remedy)
-        tables[home[key]][key] = list(value) if isinstance(value, tuple) else value
+        tables[TABLE_OF[key]][key] = list(value) if isinstance(value, tuple) else value
     for one, other in (({"alpha", "beta"}, {"snr_0", "snr_1"}), ({"snr_0", "snr_1"}, {"alpha", "beta"})):
         if one & set(numbers):
             tables["noise"] = {key: value for key, value in tables["noise"].items() if key not in other}
@@ -78,9 +78,11 @@ def with_numbers(sensor: Sensor, numbers: Mapping[str, Number]) -> Sensor:
 def tables_of(sensor: Sensor) -> dict[str, dict[str, object]]:
     """The tables of a sensor's file as plain values; of a response its contrasts at Nyquist alone."""
     found: dict[str, dict[str, object]] = {}
-    for table in TABLES:
-        constants = {key: getattr(sensor, key) for key in constant_keys(table)}
-        found[table] = {key: _plain(constant) for key, constant in constants.items() if constant is not None}
+    for key, table in TABLE_OF.items():
+        constant: Constant | None = getattr(sensor, key)
+        found.setdefault(table, {})
+        if constant is not None:
+            found[table][key] = _plain(constant)
     for name, effect in sensor.effects.items():
         found[name] = {key: _plain(constant) for key, constant in effect.items()}
     return found
@@ -94,16 +96,15 @@ def _plain(constant: Constant) -> dict[str, object]:
 def save_sensor(sensor: Sensor, path: Path) -> Path:
     """Write a sensor as the TOML file that `load_sensor` reads, and a point-spread function beside it as .npy."""
     tables, response = tables_of(sensor), sensor.response
-    if response is not None:
-        tables["mtf"] = {"frequency": list(response.frequency)} if isinstance(response, MtfTable) else {}
-        about = {"status": sensor.mtf_nyquist.status, "source": sensor.mtf_nyquist.source}
-        if isinstance(response, MtfTable):
-            tables["mtf"] |= {axis: {"value": list(getattr(response, axis)), **about} for axis in ("across", "along")}
-        else:
-            samples = path.with_name(f"{path.stem}-psf.npy")
-            np.save(samples, unpacked(response).astype(np.float32))
-            tables["mtf"] = {"psf": {"value": samples.name, **about}}
-            tables["mtf"] |= {"psf_samples_per_px": response.samples_per_px}
+    about = {"status": sensor.mtf_nyquist.status, "source": sensor.mtf_nyquist.source}
+    if isinstance(response, MtfTable):
+        axes = {axis: {"value": list(getattr(response, axis)), **about} for axis in ("across", "along")}
+        tables["mtf"] = {"frequency": list(response.frequency), **axes}
+    elif response is not None:
+        samples = path.with_name(f"{path.stem}-psf.npy")
+        np.save(samples, unpacked(response).astype(np.float32))
+        psf = {"value": samples.name, **about}
+        tables["mtf"] = {"psf": psf, "psf_samples_per_px": response.samples_per_px}
     lines = [f"description = {_toml(sensor.description)}"]
     for name, table in tables.items():
         lines += ["", f"[{name}]", *(f"{key} = {_toml(value)}" for key, value in table.items())]
@@ -120,8 +121,7 @@ def _toml(value: object) -> str:
 
 def sensor_from_json(label: str, raw: Mapping[str, Any]) -> Sensor:
     """A profile from the plain values of its fields, as `dataclasses.asdict` and JSON leave them."""
-    known = {key for table in TABLES for key in constant_keys(table)}
-    check_keys(label, raw, required={"name", "description"}, optional={*known, "effects", "response"})
+    check_keys(label, raw, required={"name", "description"}, optional={*TABLE_OF, "effects", "response"})
     tables = {table: {key: raw[key] for key in constant_keys(table) if raw.get(key) is not None} for table in TABLES}
     effects = raw.get("effects", {})
     if not isinstance(effects, Mapping):
@@ -173,17 +173,15 @@ def _read_table(label: str, table: str, content: object) -> Mapping[str, object]
         raise ProfileError(label, expected=f"a table [{table}]", got=repr(content), remedy="write it as one")
     where, ways = f"{label} [{table}]", TABLES[table]
     check_keys(where, content, required=set(), optional=set(table_keys(table)))
-    others = {way: {key for other in ways if other is not way for key in other.keys} for way in ways}
-    begun = [way for way in ways if any(key in content for key in set(way.keys) - others[way])]
+    # The two radiances belong to both ways of stating noise, and say of neither that it is meant.
+    telling = set(content) - {"radiance_0", "radiance_1"}
+    begun = [way for way in ways if telling & {*way[0], *way[1]}]
     if len(begun) > 1:
-        raise ProfileError(
-            where,
-            expected="one of " + ", or ".join(" and ".join(way.required) for way in ways),
-            got="keys of several: " + ", ".join(content),
-            remedy="keep one of them",
-        )
-    way = begun[0] if begun else ways[0]
-    check_keys(where, content, required=set(way.required), optional=set(way.optional))
+        expected = "one of " + ", or ".join(" and ".join(required) for required, _ in ways)
+        got = "keys of several: " + ", ".join(content)
+        raise ProfileError(where, expected=expected, got=got, remedy="keep one of them")
+    required, optional = begun[0] if begun else ways[0]
+    check_keys(where, content, required=set(required), optional=set(optional))
     return content
 
 
@@ -233,11 +231,10 @@ CHECKS: dict[str, Check] = {
 
 
 def _check_each(label: str, constants: Mapping[str, Constant]) -> None:
-    tables = {key: table for table in TABLES for key in constant_keys(table)}
     for key, constant in constants.items():
         valid, expected, remedy = CHECKS[key]
         if not (valid(constant.low) and valid(constant.high)):
-            where = f"{label} [{tables[key]}] {key}"
+            where = f"{label} [{TABLE_OF[key]}] {key}"
             raise ProfileError(where, expected=expected, got=str(constant), remedy=remedy)
 
 
@@ -288,11 +285,9 @@ def _check_snr(profile: Sensor) -> None:
     """Some pair in the ranges must be physical: the bounds grow with snr_1, so its two ends decide."""
     if profile.snr_0 is None or profile.snr_1 is None:
         return
-    ends = [
-        snr_0_bounds(profile.radiance_0.low, profile.radiance_1.low, s)
-        for s in (profile.snr_1.low, profile.snr_1.high)
-    ]
-    if profile.snr_0.high < ends[0][0] or profile.snr_0.low > ends[1][1]:
+    radiances = profile.radiance_0.low, profile.radiance_1.low
+    lowest, highest = snr_0_bounds(*radiances, profile.snr_1.low)[0], snr_0_bounds(*radiances, profile.snr_1.high)[1]
+    if profile.snr_0.high < lowest or profile.snr_0.low > highest:
         raise profile.impossible_snr()
 
 

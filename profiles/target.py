@@ -134,14 +134,16 @@ def load_target(name: str) -> TargetProfile:
         for k, v in _mapping(label, raw.get("configurations", {})).items()
     }
     default = raw.get("default_configuration")
+    activations = _whole_table(label, raw, "activations", PLACES)
+    documents = _whole_table(label, raw, "documents", DOCUMENTS)
     profile = TargetProfile(
         label.removesuffix(".toml"),
         str(raw["description"]),
         str(default) if default else None,
         configurations,
         tables,
-        _activations(f"{label} [activations]", raw.get("activations")),
-        _documents(f"{label} [documents]", raw.get("documents")),
+        {key: read_words(f"{label} [activations] {key}", value, FUSED) for key, value in activations.items()},
+        {key: str(value) for key, value in documents.items()},
     )
     if configurations:
         profile.configuration()
@@ -173,20 +175,13 @@ def _over(above: Mapping[str, object], below: Mapping[str, object], depth: int) 
     return joined
 
 
-def _activations(where: str, raw: object) -> dict[str, Words]:
-    if raw is None:
+def _whole_table(label: str, raw: Mapping[str, object], name: str, keys: frozenset[str]) -> Mapping[str, object]:
+    """A table that has all of its keys, or is not there at all."""
+    if name not in raw:
         return {}
-    table = _mapping(where, raw)
-    check_keys(where, table, set(PLACES))
-    return {key: read_words(f"{where} {key}", value, FUSED) for key, value in table.items()}
-
-
-def _documents(where: str, raw: object) -> dict[str, str]:
-    if raw is None:
-        return {}
-    table = _mapping(where, raw)
-    check_keys(where, table, set(DOCUMENTS))
-    return {key: str(value) for key, value in table.items()}
+    table = _mapping(f"{label} [{name}]", raw[name])
+    check_keys(f"{label} [{name}]", table, set(keys))
+    return table
 
 
 def _table(where: str, raw: object) -> dict[str, Constant]:

@@ -6,17 +6,31 @@ for onnxruntime, the board's for its own flow
 - `quantise` does it in one call; `free` goes without the DPU's rules;
 - `session` runs networks on onnxruntime, `kernels` in ways that add exactly on this processor;
 - `integer` is the core's arithmetic in whole numbers, `bounds` proves what holds for any input;
-- `gate`, `structure` and `checks` judge an INT8 file, `sensitivity` says which layers err;
+- `gate` and `structure` judge an INT8 file, `sensitivity` says which layers err;
 - `tiling` says how an image may be cut for a network: lattice, halo and scale; `samples` are a user's own;
 - `reading` folds what exporters leave in a float file, `untrusted` looks at files before they are used.
 
 What is offered here is loaded when it is asked for.
 """
 
+import os
+import sys
+
 import lazy_loader
 
-from beers_deploy.quant.telemetry import switch_off_telemetry
 
-switch_off_telemetry()  # here, because a runtime's first import anywhere in this package is too late
+def _switch_off_telemetry() -> None:
+    """Keep onnxruntime and OpenVINO from reporting their use.
+
+    onnxruntime's wheels (1.29 and later) keep an identifier in the home folder and send events from native code.
+    That begins as the library is loaded, so its switch must be set before. OpenVINO reports its import through a
+    package beside it; where that cannot be imported it takes a stub of its own. A choice made before is kept.
+    """
+    os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")
+    absent: dict[str, object] = sys.modules  # type: ignore[assignment]  # None is Python's mark for "do not import"
+    absent.setdefault("openvino_telemetry", None)
+
+
+_switch_off_telemetry()  # here, because a runtime's first import anywhere in this package is too late
 
 __getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

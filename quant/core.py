@@ -13,6 +13,7 @@ from beers_deploy.profiles.errors import ModelError
 from beers_deploy.profiles.target import TargetProfile
 from beers_deploy.quant.ends import Ends
 from beers_deploy.quant.graph import PLANES, Activation, Add, Conv, Graph, Mul, Op, Window, ties_scales
+from beers_deploy.quant.graph.operations import OneInput
 
 INT8_MIN, INT8_MAX = -128, 127
 CANDIDATES = 6
@@ -92,12 +93,9 @@ ROUNDS = 8
 
 
 @dataclass(frozen=True)
-class IntConv:
+class IntConv(OneInput):
     """int8 convolution: sum of products, plus bias << shift_bias, activation, shifted right by shift_cut, clipped."""
 
-    name: str
-    input: str
-    output: str
     weight: np.ndarray  # (O, I / groups, kh, kw) int8
     weight_frac_bits: int
     bias: np.ndarray  # (O,) int8
@@ -106,11 +104,6 @@ class IntConv:
     window: Window = field(default_factory=Window)
     groups: int = 1
     transposed: bool = False
-
-    @property
-    def inputs(self) -> tuple[str, ...]:
-        """The tensors it reads."""
-        return (self.input,)
 
     @property
     def float_bias(self) -> np.ndarray:

@@ -4,8 +4,11 @@ Activations uint8 with float scales, weights int8 with a scale of each output ch
 written with the host file's integer kernels. What stays is the residual stream of 8 bits.
 """
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
+from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 import onnx
@@ -23,7 +26,6 @@ from beers_deploy.quant.graph import (
     Add,
     Conv,
     Graph,
-    graph_to_onnx,
     plain_network,
     read_planes,
     tensors,
@@ -34,21 +36,13 @@ from beers_deploy.quant.passes.fit_weights import Moments, fit, input_moments
 from beers_deploy.quant.passes.stream import half_lsb_pair, streams, two_gains
 from beers_deploy.quant.quantise import STREAM_STEP, Targets, crop_costs, search_targets
 from beers_deploy.quant.samples import Patches
-from beers_deploy.quant.session import halo_of, open_session, tensor_values
+from beers_deploy.quant.session import values_of
 
 BINS = 4096
 """Sixteen and more a step of an 8-bit number."""
 
 SHARES = np.linspace(0.3, 1.0, 71)
 """Scales tried, as shares of the one that clips nothing."""
-
-
-@dataclass(frozen=True)
-class RoundedWeight:
-    """An int8 weight with one scale an output channel: (O, I, kh, kw) int8 in [-127, 127] and (O,) float32."""
-
-    values: np.ndarray
-    scales: np.ndarray
 
 
 def tensor_scales(
@@ -65,21 +59,13 @@ def tensor_scales(
         images: (1, 1, H, W) float32 in [0, 1], passed over twice; one is in memory at a time.
         ends: of the network.
     """
-    names, halo_px = list(levels), halo_of(graph)
-    session = open_session(graph_to_onnx(graph, names, ends.planes * ends.channels))
-
-    def sizes() -> Iterator[list[np.ndarray]]:
-        for image in images:
-            for results in tensor_values(session, names, image, halo_px, ends):
-                yield [np.abs(r) for r in results]
-
-    largest = np.zeros(len(names))
-    for results in sizes():
-        largest = np.maximum(largest, [float(r.max()) for r in results])
+    names = list(levels)
+    largest, counts = np.zeros(len(names)), np.zeros((len(names), BINS + 1))
+    for results in values_of(graph, names, images, ends):
+        largest = np.maximum(largest, [float(np.abs(r).max()) for r in results])
     largest[largest == 0] = 1  # a tensor that is always zero: any scale will do
-    counts = np.zeros((len(names), BINS + 1))
-    for results in sizes():
-        counts += [_counts(r, float(high)) for r, high in zip(results, largest, strict=True)]
+    for results in values_of(graph, names, images, ends):
+        counts += [_counts(np.abs(r), float(high)) for r, high in zip(results, largest, strict=True)]
     return {
         name: best_scale(count, float(high), levels[name])
         for name, count, high in zip(names, counts, largest, strict=True)
@@ -94,11 +80,14 @@ def best_scale(counts: np.ndarray, largest: float, levels: int) -> float:
     return float(tried[int(np.argmin(errors))])
 
 
-def round_weight(weight: np.ndarray, finest: np.ndarray) -> RoundedWeight:
-    """Each output channel at its own least-squares scale, but none below `finest` (O,); one of zeros at scale 1."""
+def round_weight(weight: np.ndarray, finest: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(O, I, kh, kw) int8 in [-127, 127] and the scale (O,) float32 of each output channel.
+
+    The least-squares one, but none below `finest` (O,); of a channel of zeros 1.
+    """
     rows = np.asarray(weight, np.float64).reshape(len(weight), -1)
     scales = np.maximum(_row_scales(rows), finest).astype(np.float32)
-    return RoundedWeight(_whole(rows, scales).astype(np.int8).reshape(weight.shape), scales)
+    return _whole(rows, scales).astype(np.int8).reshape(weight.shape), scales
 
 
 def _row_scales(rows: np.ndarray) -> np.ndarray:
@@ -136,20 +125,20 @@ class Scale:
 def free_model(
     graph: Graph,
     scales: Mapping[str, Scale],
-    about: dict[str, str],
+    ends: Ends = ONE_CHANNEL,
+    about: Mapping[str, str] = MappingProxyType({}),
     tile_px: int | None = None,
     moments: Mapping[str, Moments] | None = None,
-    ends: Ends = ONE_CHANNEL,
 ) -> onnx.ModelProto:
     """The network on stock onnxruntime, (N, 1, H, W) float32 in [0, 1] to the same.
 
     Args:
         graph: that reads the planes, its correction with two gains.
         scales: of every tensor, the planes included.
+        ends: of the network.
         about: metadata.
         tile_px: side of a fixed tile, or None for any size.
         moments: of what each convolution reads, for `quant.passes.fit_weights`; None rounds to nearest.
-        ends: of the network.
     """
     writer, ends = HostWriter(), replace(ends, gains=2)
     write_front(writer, ends)
@@ -163,20 +152,20 @@ def free_model(
             _conv(writer, op, scales, moments[op.name] if moments else None)
     write_back(writer, ends, [CORRECTION, *_scale(writer, scales[CORRECTION])], scales[CORRECTION].unit)
     sides = [image_info(IMAGE, 1, tile_px)], [image_info("restored", 1, tile_px)]
-    return make_model(writer.graph("convbeers-int8-free", *sides), about, microsoft=True)
+    return make_model(writer.graph("convbeers-int8-free", *sides), dict(about), microsoft=True)
 
 
 def _conv(w: HostWriter, op: Conv, scales: Mapping[str, Scale], moments: Moments | None) -> None:
-    weight = round_weight(op.weight, np.abs(op.bias) / (scales[op.input].unit * MAX_BIAS))
-    values, shifted = fit(op.weight, weight.values, weight.scales, moments) if moments else (weight.values, 0.0)
-    products = np.float32(scales[op.input].unit) * weight.scales.astype(np.float64)
+    whole, units = round_weight(op.weight, np.abs(op.bias) / (scales[op.input].unit * MAX_BIAS))
+    whole, shifted = fit(op.weight, whole, units, moments) if moments else (whole, np.zeros(1))
+    products = np.float32(scales[op.input].unit) * units.astype(np.float64)
     bias = np.rint((op.bias - shifted) / products).astype(np.int32)
     feeds = [op.input, *_scale(w, scales[op.input])]
-    feeds += [w.constant(f"{op.name}.weight", values), w.constant(f"{op.name}.weight_scale", weight.scales)]
+    feeds += [w.constant(f"{op.name}.weight", whole), w.constant(f"{op.name}.weight_scale", units)]
     feeds += [w.constant(f"{op.name}.weight_zero_point", np.zeros(len(op.weight), np.int8))]
     feeds += [*_scale(w, scales[op.output]), w.constant(f"{op.name}.bias", bias)]
     kernel, zero_point = list(op.weight.shape[2:]), scales[op.output].zero_point
-    clipped = (op.activation is Activation.relu) and zero_point != 0
+    clipped = op.activation is Activation.relu and zero_point != 0
     result = f"{op.output}.linear" if clipped else op.output
     w.node("QLinearConv", result, feeds, name=op.name, pads=list(op.window.pads), kernel_shape=kernel)
     if clipped:
@@ -208,48 +197,35 @@ def quantise_free(
     graph, ends = read_planes(network.graph), ends_of(network)
     log("scale of each tensor")
     scales = _scales(graph, patches, ends)
+
+    def written(tried: Graph, *more: Any) -> onnx.ModelProto:
+        fine = _fine(tried)
+        known = {name: scales.get(name, Scale(STREAM_STEP)) for name in (PLANES, *tensors(fine))}
+        return free_model(fine, known, ends, *more)
+
+    def costs_of(targets: Targets, tried: Graph) -> Costs:
+        return crop_costs(written(tried), targets)
+
     for stream in streams(graph):
         log("equalising the channels of the residual stream")
         ranges = channel_ranges(graph, stream, patches.degraded, ends)
-        targets = search_targets(graph, ends, patches.degraded)
-
-        def trial(tried: Graph, targets: Targets = targets) -> Costs:
-            return crop_costs(_written(tried, scales, {}, ends), targets)
-
-        factors = search(graph, stream, ranges, trial)
-        graph = equalise(graph, stream, factors)
+        trial = partial(costs_of, search_targets(graph, ends, patches.degraded))
+        graph = equalise(graph, stream, search(graph, stream, ranges, trial))
     about = {**metadata(model), "precision": "int8 free", "calibration_sha256": patches.digest, **about}
     log("rounding of the weights")
-    moments = input_moments(_fine(graph), patches.degraded, ends)
-    return _written(graph, scales, about, ends, fixed_tile_px(model), moments)
+    return written(graph, about, fixed_tile_px(model), input_moments(_fine(graph), patches.degraded, ends))
 
 
 def _scales(graph: Graph, patches: Patches, ends: Ends) -> dict[str, Scale]:
     """Least-squares scales of what is not the stream; that has any, because `equalise` scales its channels to it."""
     in_streams = {name for stream in streams(graph) for name in stream}
     convs = [op for op in graph if isinstance(op, Conv) and op.output not in in_streams]
-    levels = {op.output: UINT8_MAX if (op.activation is Activation.relu) else INT8_MAX for op in convs}
+    levels = {op.output: UINT8_MAX if op.activation is Activation.relu else INT8_MAX for op in convs}
     units = tensor_scales(graph, levels, patches.degraded, ends)
     units[CORRECTION] /= FINER
-    found = {
-        op.output: Scale(units[op.output], 0) if (op.activation is Activation.relu) else Scale(units[op.output])
-        for op in convs
-    }
+    found = {name: Scale(unit, 0 if levels[name] == UINT8_MAX else ZERO) for name, unit in units.items()}
     return {PLANES: Scale(2.0**-PLANES_FRAC_BITS), **found}
 
 
 def _fine(graph: Graph) -> Graph:
     return two_gains(half_lsb_pair(graph, STREAM_STEP))
-
-
-def _written(
-    graph: Graph,
-    scales: dict[str, Scale],
-    about: dict[str, str],
-    ends: Ends,
-    tile_px: int | None = None,
-    moments: dict[str, Moments] | None = None,
-) -> onnx.ModelProto:
-    stream, fine = Scale(STREAM_STEP), _fine(graph)
-    known = {name: scales.get(name, stream) for name in (PLANES, *tensors(fine))}
-    return free_model(fine, known, about, tile_px, moments, ends)

@@ -1,7 +1,7 @@
 """Static INT8 in one call: float ONNX and calibration patches in, the two encodings of the integer core out."""
 
 import os
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
@@ -62,7 +62,7 @@ from beers_deploy.quant.passes.stream import (
     windowed,
 )
 from beers_deploy.quant.samples import Patches, Remade
-from beers_deploy.quant.session import TILE_PX, crops, halo_of, open_session, result_of, tensor_values
+from beers_deploy.quant.session import TILE_PX, crops, halo_of, open_session, result_of, tensor_values, values_of
 
 if TYPE_CHECKING:
     from beers_deploy.quant.passes.tune import Tuning
@@ -206,24 +206,18 @@ def choose_frac_bits(graph: Graph, images: Iterable[np.ndarray], ends: Ends = ON
     Two passes, so images that can be passed over twice: the largest values, then the squared errors of the scales
     around them.
     """
-    names, halo_px = tensors(graph), halo_of(graph)
-    session = open_session(graph_to_onnx(graph, names, ends.planes * ends.channels))
-    shared = tied(graph)
+    names, shared = tensors(graph), tied(graph)
     groups = np.array([names.index(shared[name]) if shared[name] in names else -1 for name in names])
-
-    def values() -> Iterator[list[np.ndarray]]:
-        for image in images:
-            yield from tensor_values(session, names, image, halo_px, ends)
 
     def together(of_each: np.ndarray, join: Callable[..., np.ndarray]) -> np.ndarray:
         return np.stack([join(of_each[groups == group], axis=0) for group in groups])
 
     largest = np.zeros(len(names))
-    for results in values():
+    for results in values_of(graph, names, images, ends):
         largest = np.maximum(largest, [float(np.abs(r).max()) for r in results])
     first = [unclipped_frac_bits(m) for m in together(largest, np.max)]
     errors = np.zeros((len(names), CANDIDATES))
-    for results in values():
+    for results in values_of(graph, names, images, ends):
         errors += [_errors(r[0], f) for r, f in zip(results, first, strict=True)]
     moves = np.argmin(together(errors, np.sum), axis=1)
     best = {name: f + int(move) for name, f, move in zip(names, first, moves, strict=True)}
@@ -255,11 +249,9 @@ def rounded(plan: Plan, images: Remade[np.ndarray], log: Log = no_log) -> tuple[
 
 def _result_range(plan: Plan, images: Remade[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
     """The smallest and the largest value (C,) of each channel of the float network's result."""
-    session = open_session(graph_to_onnx(plan.graph, [CORRECTION], plan.ends.planes * plan.ends.channels))
     low, high = np.array(np.inf), np.array(-np.inf)
-    for image in images:
-        for (result,) in tensor_values(session, [CORRECTION], image, halo_of(plan.graph), plan.ends):
-            low, high = np.minimum(low, result[0].min((1, 2))), np.maximum(high, result[0].max((1, 2)))
+    for (result,) in values_of(plan.graph, [CORRECTION], images, plan.ends):
+        low, high = np.minimum(low, result[0].min((1, 2))), np.maximum(high, result[0].max((1, 2)))
     return low, high
 
 

@@ -15,6 +15,7 @@ from beers_deploy.model.processor import int8_adds_exactly
 from beers_deploy.profiles.errors import ModelError
 from beers_deploy.quant.ends import ONE_CHANNEL, Ends
 from beers_deploy.quant.graph import PLANES, PLANES_FRAC_BITS, Add, Concat, Conv, Graph, Mul, Op, Pointwise, same
+from beers_deploy.quant.graph.writer import graph_to_onnx
 from beers_deploy.quant.kernels import filled, is_integer, made_exact
 from beers_deploy.quant.onnx_file import any_size, fixed_tile_px, load_onnx
 from beers_deploy.quant.untrusted import contradictions, times
@@ -110,9 +111,7 @@ def crops(image: np.ndarray, halo_px: int | None = 0) -> list[np.ndarray]:
 
     Where the network has no halo, None, the image is left whole: as `tensor_values` does.
     """
-    if halo_px is None:
-        return [image]
-    return [image[..., slice(*rows), slice(*columns)] for rows, columns in _places(image)]
+    return [image[..., slice(*rows), slice(*columns)] for rows, columns in _places(image, halo_px)]
 
 
 def tensor_values(
@@ -124,18 +123,25 @@ def tensor_values(
     tiles hold what the whole image would have given, its zero-padded borders included. Without a halo (None) the
     image is one tile.
     """
-    if halo_px is None:
-        values = session.run(names, {PLANES: planes_of(image, ends)})
+    for (top, bottom), (left, right) in _places(image, halo_px):
+        around_px = halo_px or 0
+        above, before = min(top, around_px), min(left, around_px)
+        with_halo = image[..., top - above : bottom + around_px, left - before : right + around_px]
+        values = session.run(names, {PLANES: planes_of(with_halo, ends)})
+        if halo_px is not None:
+            inner = ..., slice(above, above + bottom - top), slice(before, before + right - left)
+            values = [result[inner] for result in values]
         require_finite(values, "float network")
         yield values
-        return
-    for (top, bottom), (left, right) in _places(image):
-        above, before = min(top, halo_px), min(left, halo_px)
-        with_halo = image[..., top - above : bottom + halo_px, left - before : right + halo_px]
-        inner = ..., slice(above, above + bottom - top), slice(before, before + right - left)
-        values = [result[inner] for result in session.run(names, {PLANES: planes_of(with_halo, ends)})]
-        require_finite(values, "float network")
-        yield values
+
+
+def values_of(
+    graph: Graph, names: list[str], images: Iterable[np.ndarray], ends: Ends = ONE_CHANNEL
+) -> Iterator[list[np.ndarray]]:
+    """As `tensor_values`, of a plane-reading float graph and for every tile of every image."""
+    session = open_session(graph_to_onnx(graph, names, ends.planes * ends.channels))
+    for image in images:
+        yield from tensor_values(session, names, image, halo_of(graph), ends)
 
 
 def planes_of(image: np.ndarray, ends: Ends = ONE_CHANNEL) -> np.ndarray:
@@ -157,15 +163,11 @@ def _keeps_lattice(op: Op) -> bool:
     return isinstance(op, Conv) and not op.transposed and op.window == same(op.weight)
 
 
-def _places(image: np.ndarray) -> Iterator[tuple[tuple[int, int], tuple[int, int]]]:
-    """(top, bottom) and (left, right) of every tile, all about equally large."""
-    height, width = image.shape[-2:]
-    return product(pairwise(_edges(height)), pairwise(_edges(width)))
-
-
-def _edges(size: int) -> list[int]:
-    count = -(-size // TILE_PX)
-    return [size * k // count for k in range(count + 1)]
+def _places(image: np.ndarray, halo_px: int | None) -> Iterator[tuple[tuple[int, int], tuple[int, int]]]:
+    """(top, bottom) and (left, right) of every tile, all about equally large; without a halo the one that is all."""
+    counts = [-(-size // TILE_PX) if halo_px is not None else 1 for size in image.shape[-2:]]
+    edges = [[size * k // n for k in range(n + 1)] for size, n in zip(image.shape[-2:], counts, strict=True)]
+    return product(*map(pairwise, edges))
 
 
 LAYER_PATCHES = 4

@@ -13,9 +13,9 @@ import numpy as np
 import onnx
 
 from beers_deploy.profiles.errors import ModelError
-from beers_deploy.quant.checks import Check
 from beers_deploy.quant.encodings import encoding_faults, read_core
 from beers_deploy.quant.ends import ZERO
+from beers_deploy.quant.gate import Check
 from beers_deploy.quant.graph import CORRECTION
 from beers_deploy.quant.onnx_file import any_size, constants, with_outputs
 from beers_deploy.quant.session import open_any_size, open_session, result_of, tensors_of

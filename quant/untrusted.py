@@ -1,7 +1,7 @@
 """Whether an ONNX file holds what it states, and may be run: looked at before it is used."""
 
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 
 import numpy as np
@@ -9,7 +9,6 @@ import onnx
 from onnx import AttributeProto, NodeProto, TensorProto, numpy_helper
 
 from beers_deploy.profiles.errors import BeersError, ModelError
-from beers_deploy.quant.reading.arithmetic import LIST_VALUES, computed
 
 FILE_BYTES = 1 << 30
 VALUES = 1 << 28
@@ -177,7 +176,7 @@ class _Constants:
             return
         arrays = [self._array(name) for name in node.input]
         self._check_filled(node, arrays)
-        result = computed(node, arrays, self._opset)
+        result = _computed(node, arrays, self._opset)
         if result is not None:
             self.values[node.output[0]] = numpy_helper.from_array(result, node.output[0])
         elif node.op_type not in KEEPING | {"ConstantOfShape"}:
@@ -201,6 +200,41 @@ class _Constants:
         check_size(named(node), sizes, self._where)
         self._made += math.prod(max(size, 0) for size in sizes)
         check_size("what constants fill", [self._made], self._where)
+
+
+LIST_VALUES = 4096
+"""Of one list; a runtime that computes with such ones is done in a moment."""
+
+COMPUTED = {
+    "Add", "Cast", "Concat", "ConstantOfShape", "Div", "Gather", "Identity", "Mul", "Neg", "Reshape", "Shape",
+    "Slice", "Sqrt", "Squeeze", "Sub", "Transpose", "Unsqueeze",
+}  # fmt: skip
+
+
+def _computed(node: NodeProto, values: Sequence[np.ndarray | None], opset: int) -> np.ndarray | None:
+    """What a node computes of short lists, None where that is no short list of numbers or not computed here.
+
+    Exporters leave a dozen nodes to state four sizes. They are computed by onnx's reference in Python, before a
+    runtime has the file: so the sizes that follow are looked at like those that a file states.
+
+    Args:
+        node: an operator of ONNX's own.
+        values: its inputs, None for one that is not known; the caller has bounded what ConstantOfShape makes.
+        opset: the version of the operators.
+    """
+    short = all(value is not None and value.size <= LIST_VALUES for value in values)
+    if node.op_type not in COMPUTED or not short:
+        return None
+    from onnx.reference import ReferenceEvaluator  # half a second, of files alone that compute
+
+    try:
+        with np.errstate(all="ignore"):
+            feeds = dict(zip(node.input, values, strict=True))
+            result = next(iter(ReferenceEvaluator(node, opsets={"": opset}).run(None, feeds)))
+    except Exception:  # noqa: BLE001 - whatever the reference raises of a node that is none means: not known
+        return None
+    array = np.asarray(result)
+    return array if array.dtype.kind in "biuf" and array.size <= LIST_VALUES else None
 
 
 def named(node: NodeProto) -> str:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from beers_deploy.commands.shared import refuse, save, say
+from beers_deploy.commands.shared import arguments, refuse, save, say
 from beers_deploy.model.shipped import SENSOR
 from beers_deploy.profiles import load_sensor, load_target
 from beers_deploy.profiles.errors import OptionError, missing_extra
@@ -147,20 +147,8 @@ def bench(
                 print_rows("the traditional pipeline, measured on crops here", rows[-1:])
             except ModuleNotFoundError as error:
                 say(f"The traditional pipeline is not measured here: {missing_extra(error, 'bench')}")
-    arguments = {
-        "target": target,
-        "sensor": sensor,
-        "full_scale": full_scale,
-        "size": size,
-        "tile": tile,
-        "halo": halo,
-        "dpu": dpu,
-        "host_task": host_task,
-        "measured": measured.name if measured else None,
-        "within": within,
-    }
     inputs = tuple(file for file in (path, image, measured) if file)
-    save(Table("bench", arguments, inputs, tuple(rows)), json)
+    save(Table("bench", arguments(), inputs, tuple(rows)), json)
 
 
 def _traditional_row(dn: "np.ndarray | None", swath: "Swath") -> "Row":

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from beers_deploy.commands.shared import save, say
+from beers_deploy.commands.shared import arguments, save, say
 
 EXAMPLE = "characterise raw1.tif raw2.tif --bits 12 --out my-sensor.toml"
 
@@ -42,6 +42,5 @@ def characterise(
     rows = found.rows()
     print_rows(f"sensor of {len(images)} image{'' if len(images) == 1 else 's'}", rows)
     write_text(out, profile_toml(found))
-    arguments = {"bits": bits, "gain": gain, "gsd": gsd, "edge": ", ".join(map(str, boxes)) or None}
-    save(Table("characterise", arguments, tuple(images), tuple(rows)), json)
+    save(Table("characterise", arguments(), tuple(images), tuple(rows)), json)
     say(f"wrote {out}: beers-deploy profiles {out}")

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from beers_deploy.commands.shared import save, say
+from beers_deploy.commands.shared import arguments, save, say
 from beers_deploy.model.processor import SEEDS
 from beers_deploy.model.shipped import SENSOR
 from beers_deploy.profiles.errors import OptionError
@@ -41,6 +41,5 @@ def demo(
         print_rows(table.title, table.rows)
     say(report.headline)
     say(f"report: {out / 'report.html'}")
-    arguments = {"image": image, "full_scale": full_scale, "sensor": sensor, "out": out, "seed": seed}
     rows = tuple(row for table in report.tables for row in table.rows)
-    save(Table("demo", arguments, tuple([image] if image else []), rows), json)
+    save(Table("demo", arguments(), tuple([image] if image else []), rows), json)

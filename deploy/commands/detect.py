@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from beers_deploy.commands.shared import refuse, save, say
+from beers_deploy.commands.shared import arguments, refuse, save, say
 from beers_deploy.model.processor import SEEDS
 from beers_deploy.profiles.figures import by_table
 
@@ -89,8 +89,7 @@ def detect(
     say(f"wrote {out / REPORT}")
     rows = (*(row for found in compared for row in detection_rows(found)), *paper_rows())
     pictures = [scene.path for scene in scenes if scene.path is not None]
-    arguments = {name: value for name, value in context.params.items() if name != "json"}
-    save(Table("detect", arguments, (detector or DETECTOR, *pictures), rows), json)
+    save(Table("detect", arguments(), (detector or DETECTOR, *pictures), rows), json)
 
 
 def _refuse_unused(context: typer.Context) -> None:

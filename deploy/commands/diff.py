@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from beers_deploy.commands.shared import save, say
+from beers_deploy.commands.shared import arguments, save, say
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -41,7 +41,7 @@ def diff(
     say(f"{len(found.both)} figures in both, {counts}")
     for note in differing(*documents):
         say(note)
-    save(Table("diff", {"fail_on": ", ".join(fail_on or ())}, (before, after), tuple(rows)), json)
+    save(Table("diff", arguments(), (before, after), tuple(rows)), json)
     failed = broken(found, limits)
     for line in failed:
         say(f"FAILED {line}")

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from beers_deploy.commands.shared import BOARDS, save, say
+from beers_deploy.commands.shared import BOARDS, arguments, save, say
 from beers_deploy.model.processor import SEEDS
 from beers_deploy.model.shipped import SENSOR
 from beers_deploy.profiles.target import DEFAULT_TARGET
@@ -75,7 +75,7 @@ def gate(
         say(f"note: {note}")
     for check in verdict.checks:
         say(f"{'ok    ' if check.passed else 'FAILED'} {check}")
-    save(replace(verdict, arguments={**verdict.arguments, "limits": limits}), json)
+    save(replace(verdict, arguments=arguments(max_mae=allowed.mae)), json)
     if junit is not None:
         write_text(junit, verdict.to_junit())
     say(str(verdict))

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from beers_deploy.commands.shared import save, say
+from beers_deploy.commands.shared import arguments, save, say
 from beers_deploy.profiles import load_sensor, load_target
 from beers_deploy.profiles.sensor_file import BLIND
 from beers_deploy.profiles.target import DEFAULT_TARGET
@@ -55,6 +55,5 @@ def info(
     options = Options(path, tile, full_scale=full_scale, trust_index=trust_index, sensor_bits=bits)
     row = info_row(image, options, load_target(target), measure)
     print_rows(str(image), [row])
-    arguments = {"sensor": sensor or BLIND, "tile": tile, "full_scale": full_scale, "target": target}
     # No digest of FILE: it would be read whole.
-    save(Table("info", {**arguments, "file": image.name}, (path,), (row,)), json)
+    save(Table("info", arguments(sensor=sensor or BLIND, image=image.name), (path,), (row,)), json)

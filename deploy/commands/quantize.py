@@ -6,7 +6,7 @@ from typing import Annotated, Any
 
 import typer
 
-from beers_deploy.commands.shared import BOARDS, save, say
+from beers_deploy.commands.shared import BOARDS, arguments, save, say
 from beers_deploy.model.processor import SEEDS
 from beers_deploy.model.shipped import SENSOR
 from beers_deploy.profiles.errors import OptionError
@@ -112,10 +112,7 @@ def quantize(
         write_report(written, page)
         say(f"wrote {page}: {written.headline}")
         rows = [*found, *rows]
-    arguments = {"target": target, "sensor": sensor, "images": images, "patches": patches, "patch": patch}
-    arguments |= {"samples": samples}
-    arguments |= {"regime": regime.value, "finetune": finetune, "seed": seed}
     origin = made.origin.input if made.origin else model
-    document = Table("quantize", arguments, (origin, out), tuple(rows))
+    document = Table("quantize", arguments(), (origin, out), tuple(rows))
     for path in (figures, json):
         save(document, path)

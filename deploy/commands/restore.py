@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from beers_deploy.commands.shared import refuse, save, say
+from beers_deploy.commands.shared import arguments, refuse, save, say
 from beers_deploy.profiles import load_sensor
 from beers_deploy.profiles.errors import OptionError
 from beers_deploy.profiles.sensor_file import BLIND, reference_for
@@ -137,16 +137,7 @@ def restore(
     if stac is not None:
         write_item(out, stac)
     print_rows(f"wrote {out}", [row])
-    arguments = {
-        "sensor": sensor or BLIND,
-        "tile": tile,
-        "halo": halo,
-        "full_scale": full_scale,
-        "runtime": runtime,
-        "threads": threads,
-    }
-    arguments |= {"scheduler": scheduler}
-    save(Table("restore", arguments, (*paths.values(), image), (row,)), json)
+    save(Table("restore", arguments(sensor=sensor or BLIND), (*paths.values(), image), (row,)), json)
 
 
 def _by_the_chain(
@@ -169,5 +160,4 @@ def _by_the_chain(
     request = Request(degraded, reference_for(degraded), full_scale, compression, memory_bytes, trust_index)
     row = restore_file_traditionally(image, out, request, (json,))
     print_rows(f"wrote {out}", [row])
-    arguments = {"method": "traditional", "sensor": sensor, "full_scale": full_scale}
-    save(Table("restore", arguments, (image,), (row,)), json)
+    save(Table("restore", arguments(), (image,), (row,)), json)

@@ -2,10 +2,11 @@
 
 import json
 import sys
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, redirect_stdout
 from contextvars import ContextVar
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING, TextIO
 
 import typer
@@ -52,6 +53,27 @@ def results_to(stream: TextIO) -> Iterator[None]:
             yield
     finally:
         _results.reset(token)
+
+
+_given: ContextVar[Mapping[str, object]] = ContextVar("given", default=MappingProxyType({}))
+OUTPUTS = ("context", "json", "junit")
+"""Parameters that decide no figure."""
+
+
+@contextmanager
+def running(given: Mapping[str, object]) -> Iterator[None]:
+    """Keep what the command line gave while its command runs."""
+    token = _given.set(given)
+    try:
+        yield
+    finally:
+        _given.reset(token)
+
+
+def arguments(**settled: object) -> dict[str, object]:
+    """What the command line gave, for its results; and what the command settled on where nothing was given."""
+    plain = {name: ", ".join(map(str, v)) if isinstance(v, list) else v for name, v in _given.get().items()}
+    return {name: value for name, value in {**plain, **settled}.items() if name not in OUTPUTS}
 
 
 def save(table: "Table", path: Path | None) -> None:

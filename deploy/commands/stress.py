@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from beers_deploy.commands.shared import BOARDS, refuse, save, say
+from beers_deploy.commands.shared import BOARDS, arguments, refuse, save, say
 from beers_deploy.model.processor import SEEDS
 from beers_deploy.model.shipped import SENSOR
 from beers_deploy.profiles.errors import OptionError
@@ -103,8 +103,7 @@ def stress(
     shown = [*battery_rows(results), *worst_rows(results), *limitation_rows(results), *layer_rows(subject)]
     for table, rows in by_table(shown).items():
         print_rows(title(table), rows)
-    arguments = {"sensor": sensor, "cases": cases, "stages": stages, "side": side, "seed": seed}
-    save(Table("stress", arguments, subject.paths, (*shown, *finding_rows(results))), json)
+    save(Table("stress", arguments(), subject.paths, (*shown, *finding_rows(results))), json)
     if out is not None:
         write_text(out, markdown(shown))
     for reason in dict.fromkeys(result.reason for result in results if result.reason):
@@ -134,8 +133,6 @@ def _flip_bits(
     subject: "Subject", request: "FlipRequest", wanted: tuple[Path | None, Path | None, Path | None]
 ) -> None:
     """Inject, print, and write what was asked for: tables, curves, figures."""
-    from dataclasses import asdict
-
     from beers_deploy.model.io.files import write_text
     from beers_deploy.results import Table, print_rows
     from beers_deploy.studies.stress.bit_flips import flip_curves_svg, flip_rows
@@ -145,7 +142,7 @@ def _flip_bits(
     rows = flip_rows(subject, request)
     for table, found in by_table(rows).items():
         print_rows(title(table), found)
-    save(Table("stress", {"bit_flips": True, **asdict(request)}, subject.paths, tuple(rows)), json)
+    save(Table("stress", arguments(), subject.paths, tuple(rows)), json)
     if out is not None and picture is not None:
         write_text(out, markdown(rows))
         write_text(picture, flip_curves_svg({subject.paths[-1].stem: rows}))

@@ -8,7 +8,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import torch
 
 from beers_deploy.bench.tables import (
     Swath,
@@ -21,8 +20,8 @@ from beers_deploy.bench.tables import (
 )
 from beers_deploy.bench.traditional import measure_chain
 from beers_deploy.dpu.board import load_dpu
-from beers_deploy.dpu.checker.placement import Placement, place
-from beers_deploy.dpu.reading import read_network
+from beers_deploy.dpu.checker.placement import Placement
+from beers_deploy.dpu.checker.table import check
 from beers_deploy.library import restore
 from beers_deploy.model.io.files import whole_file
 from beers_deploy.model.io.images import MAX_DN, read_acquisition, read_pixels
@@ -30,20 +29,18 @@ from beers_deploy.model.io.pictures import busiest_windows, picture_url, stretch
 from beers_deploy.model.io.tiff import write_tiff
 from beers_deploy.model.metrics.fidelity import fidelity_db, ssim
 from beers_deploy.model.progress import Log
-from beers_deploy.model.shipped import SENSOR, VARIANT, shipped_weights
+from beers_deploy.model.shipped import SENSOR, VARIANT
 from beers_deploy.model.simulator.acquire import MARGIN_PX, Pair, simulate_pair
 from beers_deploy.model.simulator.detector import Draw
 from beers_deploy.model.simulator.procedural import procedural_scene
 from beers_deploy.model.simulator.sampling import read_scene
-from beers_deploy.model.traditional.pipeline import Chain, restore_traditional
-from beers_deploy.network import Conditioned, warn_outside
+from beers_deploy.network import Network
 from beers_deploy.profiles import Sensor, load_sensor
 from beers_deploy.profiles.errors import OptionError
 from beers_deploy.profiles.figures import Row, measured
 from beers_deploy.profiles.sensor_file import reference_for
 from beers_deploy.profiles.target import DEFAULT_TARGET, board_names
-from beers_deploy.quant.encodings import board_model, read_core
-from beers_deploy.quant.onnx_file import load_onnx, metadata, save_onnx
+from beers_deploy.quant.onnx_file import load_onnx
 from beers_deploy.quant.tiling.walk import tiling_of
 from beers_deploy.report.page import Picture, Report, Section
 from beers_deploy.restoration.options import TILE_PX
@@ -94,16 +91,15 @@ def run_demo(
     sensors = load_sensors(sensor)
     degraded, pair = read_input(image, seed, sensors, full_scale)
     say("telling the shipped network the sensor, and gating its INT8")
-    write_networks(out, sensors[0], say)
+    write_networks(out, sensors[0])
     float_file, int8_file = out / "float.onnx", out / "int8.onnx"
     verdict = gate(int8_file, float_file, sensor=sensors[0], patches=GATE_PATCHES, seed=seed)
     say("checking every operator against the DPU")
-    placement = place(read_network(int8_file, TILE_PX), load_dpu(DEFAULT_TARGET))
+    placement = check(int8_file, tile=TILE_PX).placement
     say("restoring: traditional pipeline and INT8 network")
-    chain = Chain(sensors[0].nominal(), sensors[1].nominal())
     images = {
         INPUT: degraded,
-        TRADITIONAL: restore_traditional(torch.from_numpy(degraded), chain).numpy(),
+        TRADITIONAL: restore(degraded, method="traditional", sensor=sensors[0], full_scale=MAX_DN),
         INT8: np.rint(restore(degraded, int8_file, full_scale=MAX_DN)),
     }
     write_tiff(out / "restored.tif", images[INT8].astype(np.uint16))
@@ -152,13 +148,11 @@ def read_input(
     return pair.degraded.numpy(), pair
 
 
-def write_networks(out: Path, sensor: Sensor, say: Log) -> None:
+def write_networks(out: Path, sensor: Sensor) -> None:
     """Write the shipped network, told the sensor: in float32, in INT8, and the INT8 core for the board."""
-    shipped = Conditioned(VARIANT, shipped_weights(VARIANT))
-    warn_outside(sensor, say)
-    floating, int8 = (shipped.model(sensor, int8) for int8 in (False, True))
-    for name, model in (("float", floating), ("int8", int8), ("core", board_model(read_core(int8), metadata(int8)))):
-        save_onnx(model, out / f"{name}.onnx")
+    floating, int8 = (Network.load(name, sensor=sensor) for name in (VARIANT, f"{VARIANT}-int8"))
+    for name, network in (("float", floating), ("int8", int8), ("core", int8.core())):
+        network.save(out / f"{name}.onnx")
 
 
 def _fidelity(name: str, dn: np.ndarray, reference: np.ndarray, degraded: np.ndarray) -> Row:

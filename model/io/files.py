@@ -1,34 +1,23 @@
 """Whole files or none, and never over what a run reads or writes elsewhere.
 
-One rule for every output of every command: it is a regular file or a new name, no input, no other output, and nothing
-that is shipped.
-Symbolic links, pipes and devices are refused: what is renamed over them would stand in their place.
+One rule for every output of every command: it is a regular file or a new name, no input and no other output. Symbolic
+links, pipes and devices are refused: what is renamed over them would stand in their place.
 """
 
 import hashlib
 import os
-import stat
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from itertools import combinations
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
-from beers_deploy.model.shipped import SHIPPED
 from beers_deploy.profiles.errors import MachineError, OptionError
-from beers_deploy.profiles.toml import HERE as PROFILES
 
 TIFF_SUFFIXES = {".tif", ".tiff"}
 IMAGE_SUFFIXES = TIFF_SUFFIXES | {".png", ".jpg", ".jpeg"}
 READ_SUFFIXES = IMAGE_SUFFIXES | {".onnx", ".safetensors", ".pth"}
 """What a command takes from a folder that it reads; an earlier run's figures may lie there and be renewed."""
-KINDS = {
-    stat.S_IFDIR: "a folder",
-    stat.S_IFLNK: "a symbolic link",
-    stat.S_IFIFO: "a pipe",
-    stat.S_IFSOCK: "a socket",
-    stat.S_IFCHR: "a device",
-    stat.S_IFBLK: "a device",
-}
 
 
 @contextmanager
@@ -38,8 +27,8 @@ def whole_file(path: Path) -> Iterator[Path]:
     Raises:
         MachineError: no regular file stands there, the folder cannot be made or written to, or the disk is full.
     """
-    require_regular(path)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.part")
+    _require_regular(path)
+    temporary = _part_of(path)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         temporary.touch()
@@ -54,35 +43,6 @@ def whole_file(path: Path) -> Iterator[Path]:
             temporary.unlink()
 
 
-def claim_outputs(
-    *outputs: Path | None, inputs: Iterable[Path | None] = (), folders: Iterable[Path | None] = ()
-) -> None:
-    """Refuse, before any work, an output that would destroy an input, another output or what is shipped.
-
-    None asks for no output.
-
-    Args:
-        outputs: files that are to be written.
-        inputs: files that are read, and folders from which files are; what does not exist is passed over. A hard
-            link or a symbolic link to an input is that input.
-        folders: are to be filled with images whose names are not known yet: no image that is read may lie there.
-    """
-    read = [file for path in inputs if path is not None for file in _files_of(path)]
-    known, wanted = {_identity(file) for file in read}, [path for path in outputs if path is not None]
-    for path in wanted:
-        if _exists(path) and _identity(path) in known:
-            raise _taken(path, "an input of this run")
-        if _is_shipped(path):
-            raise _taken(path, "a file of this installation, which every later run reads")
-    homes = {_identity(file.parent) for file in read if file.suffix.lower() in IMAGE_SUFFIXES}
-    for folder in folders:
-        if folder is not None and _exists(folder) and _identity(folder) in homes:
-            raise _taken(folder, "the folder of an input")
-    for one, other in combinations(wanted, 2):
-        if _overlap(one, other):
-            raise _taken(other, f"a place that another output takes: {one}")
-
-
 def require_writable(
     *paths: Path | None, inputs: Iterable[Path | None] = (), folders: Iterable[Path | None] = ()
 ) -> None:
@@ -90,98 +50,83 @@ def require_writable(
 
     Args:
         paths: files that are to be written.
-        inputs: as of `claim_outputs`.
-        folders: as of `claim_outputs`.
+        inputs: files that are read, and folders from which files are; what does not exist is passed over. A hard
+            link or a symbolic link to an input is that input.
+        folders: are to be filled with images whose names are not known yet: no image that is read may lie there.
 
     Raises:
         OptionError: an output that is an input, or another output.
         MachineError: no regular file stands at a path, or its folder cannot be made or written to.
     """
-    folders = list(folders)
-    claim_outputs(*paths, inputs=inputs, folders=folders)
-    for folder in folders:
-        if folder is not None and os.path.lexists(folder) and not folder.is_dir():
-            raise MachineError(str(folder), expected="a folder", got="something else", remedy="choose another path")
-    for path in paths:
-        require_regular(path)
-    for path in paths:
-        if path is not None:
-            _probe(path)
+    outputs, filled = ([path for path in given if path is not None] for given in (paths, folders))
+    _require_apart(outputs, filled, inputs)
+    for folder in filled:
+        if os.path.lexists(folder) and not folder.is_dir():
+            raise _unwritable(folder, "something else", expected="a folder")
+    for path in outputs:
+        _require_regular(path)
+        _probe(path)
 
 
-def require_regular(path: Path | None) -> None:
+def _require_apart(outputs: list[Path], filled: list[Path], inputs: Iterable[Path | None]) -> None:
+    """Refuse an output that is an input or another output, and a folder to be filled where images are read."""
+    read = [file for path in inputs if path is not None for file in _files_of(path)]
+    known = {_identity(file) for file in read} - {None}
+    homes = {_identity(file.parent) for file in read if file.suffix.lower() in IMAGE_SUFFIXES} - {None}
+    for places, taken, by in ((outputs, known, "an input of this run"), (filled, homes, "the folder of an input")):
+        for path in places:
+            if _identity(path) in taken:
+                raise _taken(path, by)
+    for one, other in combinations(outputs, 2):
+        # Some disks know no capitals.
+        if os.path.realpath(one).casefold() == os.path.realpath(other).casefold():
+            raise _taken(other, f"a place that another output takes: {one}")
+
+
+def _require_regular(path: Path) -> None:
     """Refuse an output at which a folder, a link, a pipe or a device stands; a regular file or nothing may."""
-    if path is None or not os.path.lexists(path):
-        return
-    kind = stat.S_IFMT(path.lstat().st_mode)
-    if kind != stat.S_IFREG:
-        raise _unwritable(path, KINDS.get(kind, "no regular file"), expected="a regular file or a new name")
+    if os.path.lexists(path) and (path.is_symlink() or not path.is_file()):
+        got = "a symbolic link" if path.is_symlink() else "a folder" if path.is_dir() else "no regular file"
+        raise _unwritable(path, got, expected="a regular file or a new name")
 
 
 def _probe(path: Path) -> None:
-    """Try to write into the nearest folder that exists: a new one would outlive a command that is refused later."""
+    """Try to write below the nearest folder that exists: a new one would outlive a command that is refused later."""
     path = path.absolute()
+    folder = next(parent for parent in path.parents if os.path.lexists(parent))
     try:
-        folder = next(parent for parent in path.parents if _stands(parent))
-        for name in path.parent.relative_to(folder).parts:
-            _stands(folder / name)  # a new folder's name may be too long for this disk
-        probe = folder / f".{path.name}.{os.getpid()}.probe"
-        probe.touch()
-        probe.unlink()
+        with TemporaryDirectory(dir=folder) as probe:
+            place = probe / path.relative_to(folder)
+            place.parent.mkdir(parents=True, exist_ok=True)
+            _part_of(place).touch()
     except OSError as error:
         raise _unwritable(path, error.strerror or str(error)) from error
 
 
-def _stands(path: Path) -> bool:
-    """Whether something stands there, a link to nothing included; what cannot be asked for is an error."""
-    try:
-        path.lstat()
-    except FileNotFoundError:
-        return False
-    return True
+def _part_of(path: Path) -> Path:
+    """Where a file is written before it is whole."""
+    return path.with_name(f".{path.name}.{os.getpid()}.part")
 
 
-def _exists(path: Path) -> bool:
-    """Whether something is there, through links; what cannot be asked for, as a name that is too long, is not."""
+def _identity(path: Path) -> tuple[int, int] | None:
+    """What all names of a file have in common; None where there is none."""
     try:
-        return path.exists()
+        found = path.stat()
     except OSError:
-        return False
-
-
-def _identity(path: Path) -> tuple[int, int]:
-    found = path.stat()
+        return None
     return found.st_dev, found.st_ino
-
-
-def _is_shipped(path: Path) -> bool:
-    """Whether a shipped network or profile stands there, through links."""
-    shipped = [*SHIPPED.glob("*"), *PROFILES.rglob("*.toml")]
-    return _exists(path) and _identity(path) in {_identity(file) for file in shipped}
 
 
 def _files_of(path: Path) -> list[Path]:
     """An input as files: itself, or those of a folder that a command may read."""
-    if path.is_dir():
-        return [file for file in path.glob("*") if file.suffix.lower() in READ_SUFFIXES and _exists(file)]
-    return [path] if _exists(path) else []
-
-
-def _overlap(one: Path, other: Path) -> bool:
-    """Whether two outputs are one file, or one would have to be the other's folder; some disks know no capitals.
-
-    What is a folder already is refused as such, whatever is to be written into it.
-    """
-    a, b = (Path(os.path.realpath(path).casefold()) for path in (one, other))
-    linked = _exists(one) and _exists(other) and _identity(one) == _identity(other)
-    inside = (a in b.parents and not one.is_dir()) or (b in a.parents and not other.is_dir())
-    return linked or a == b or inside
+    if not path.is_dir():
+        return [path]
+    return [file for file in path.glob("*") if file.suffix.lower() in READ_SUFFIXES]
 
 
 def _taken(path: Path, got: str) -> OptionError:
-    return OptionError(
-        str(path), expected="a place of its own for each output", got=got, remedy="choose another path"
-    )
+    expected = "a place of its own for each output"
+    return OptionError(str(path), expected=expected, got=got, remedy="choose another path")
 
 
 def _unwritable(path: Path, got: str, expected: str = "a place to write to") -> MachineError:

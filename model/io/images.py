@@ -74,10 +74,10 @@ def damage_in_a_sentence(path: Path, where: str = "") -> Iterator[None]:
         name = f"{path}, {where}" if where else str(path)
         if isinstance(error, ValueError) and "imagecodecs" in str(error):
             remedy = "pip install 'beers-deploy[codecs]'"
-            raise MachineError(
-                name, expected="a TIFF compression known here", got=str(error), remedy=remedy
-            ) from error
-        raise _no_image(name, error) from error
+            expected = "a TIFF compression known here"
+            raise MachineError(name, expected=expected, got=str(error), remedy=remedy) from error
+        got, remedy = " ".join(str(error).split()) or type(error).__name__, "check that it is a whole image"
+        raise ImageError(name, expected="a readable TIFF, PNG or JPEG", got=got[:120], remedy=remedy) from error
 
 
 def image_size_px(path: Path) -> tuple[int, int]:
@@ -130,9 +130,9 @@ def _read_other(path: Path) -> np.ndarray:
         with (
             damage_in_a_sentence(path),
             warnings.catch_warnings(action="ignore"),  # odd EXIF is no concern of ours
-            Image.open(
-                _in_memory(path), formats=("PNG", "JPEG")
-            ) as image,  # others would run further programs, as for EPS
+            # In memory, so that a chunk's stated length takes no more of it than there is file. Other formats would
+            # run further programs, as for EPS.
+            Image.open(io.BytesIO(read_whole(path, PACKED_BYTES)), formats=("PNG", "JPEG")) as image,
         ):
             bands = 4 if image.mode == "RGBA" else len(image.getbands())
             _check_memory(path, image.width * image.height * bands)
@@ -141,27 +141,13 @@ def _read_other(path: Path) -> np.ndarray:
         Image.MAX_IMAGE_PIXELS = limit
 
 
-def _in_memory(path: Path) -> io.BytesIO:
-    """The packed file: a chunk's stated length then takes no more memory than there is file."""
-    return io.BytesIO(read_whole(path, PACKED_BYTES))
-
-
 def _check_memory(path: Path, samples: int) -> None:
     needed, free = samples * 4 * WORKING_COPIES, psutil.virtual_memory().available
     if needed > free:
         room, size = sizes(free, needed)
-        expected, got = (
-            f"an image that fits in {room} of free memory",
-            f"{samples:,} samples, which need about {size}",
-        )
+        expected = f"an image that fits in {room} of free memory"
+        got = f"{samples:,} samples, which need about {size}"
         raise MachineError(str(path), expected=expected, got=got, remedy="cut it into pieces")
-
-
-def _no_image(name: str, error: Exception) -> ImageError:
-    got = " ".join(str(error).split()) or type(error).__name__
-    return ImageError(
-        name, expected="a readable TIFF, PNG or JPEG", got=got[:120], remedy="check that it is a whole image"
-    )
 
 
 """Of 12 bits."""

@@ -81,11 +81,14 @@ def read_weights(path: Path) -> Weights:
     try:
         conditioned = _told(header)
         variant = _variant(header)
-        _check_count(tensors, variant, 4 * variant.blocks + (7 if conditioned else 6))
+        # Before a list of the network's is made: a header alone must not take memory.
+        if len(tensors) != 4 * variant.blocks + (7 if conditioned else 6):
+            raise ValueError(f"{len(tensors)} tensors for {variant}")
         _check_like(tensors, variant.banked_shapes if conditioned else variant.shapes)
     except FAULTS as error:
         raise _not_weights(path, "the weights of a ConvBEERS", error) from error
-    return Weights(tensors, variant, _recipe(header), conditioned)
+    recipe = header.get("recipe")
+    return Weights(tensors, variant, recipe if isinstance(recipe, dict) else {}, conditioned)
 
 
 def read_plain(path: Path) -> Weights:
@@ -122,11 +125,6 @@ def _not_weights(path: Path, expected: str, error: Exception) -> ModelError:
     return ModelError(str(path), expected=expected, got=got, remedy="give a file written by 'beers-deploy train'")
 
 
-def _recipe(header: Mapping[str, object]) -> dict[str, object]:
-    recipe = header.get("recipe", {})
-    return recipe if isinstance(recipe, dict) else {}
-
-
 def _told(header: Mapping[str, object]) -> bool:
     """Whether the network is told its sensor."""
     kind = header.get("kind")
@@ -143,12 +141,6 @@ def _variant(header: Mapping[str, Any]) -> Variant:
     if found.scale < 1:
         raise ValueError(f"a scale of {found.scale}")
     return found
-
-
-def _check_count(tensors: Arrays, variant: Variant, count: int) -> None:
-    """The number of tensors, before a list of a network's is made: a header alone must not take memory."""
-    if len(tensors) != count:
-        raise ValueError(f"{len(tensors)} tensors for {variant}")
 
 
 def _check_like(tensors: Arrays, shapes: Mapping[str, tuple[int, ...]]) -> None:

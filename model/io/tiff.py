@@ -1,20 +1,17 @@
-"""Open an untrusted TIFF: as plain pages, none of which leads back to an earlier one.
+"""Open a TIFF of others as plain pages, and refuse one whose pixels would take more memory than they should.
 
-Formats for microscopes name further files to be opened, and tifffile follows directories that lead in a circle for
-hours. What a page's pixels could do is the matter of `model.io.tiff`.
+Formats for microscopes name further files to be opened.
 """
 
 import logging
 import math
-import os
-import struct
 import zlib
 from collections.abc import Iterator
 from contextlib import suppress
 from importlib.util import find_spec
 from itertools import accumulate
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import numpy as np
 import psutil
@@ -31,60 +28,13 @@ PLAIN: dict[str, Any] = dict.fromkeys(
     False,
 )  # fmt: skip
 """Laboratories' own kinds of TIFF are read as plain pages: some name other files to be opened."""
-TAGS, PAGES_WITHIN = 100_000, 64
-"""Of all pages together: a thousand pages have some twenty thousand tags."""
 
 logging.getLogger("tifffile").addHandler(logging.NullHandler())  # who asks for its remarks still has them
 
 
 def open_tiff(path: Path) -> tifffile.TiffFile:
-    """A TIFF as plain pages; raises what tifffile raises.
-
-    Raises:
-        ImageError: pages in a circle, or more of them, or of their tags, than any image here has.
-    """
-    _check_directories(path)
-    file = tifffile.TiffFile(path, **PLAIN)
-    try:
-        within = sum(len(page.subifds or ()) for page in file.pages if isinstance(page, tifffile.TiffPage))
-        if within > PAGES_WITHIN:
-            raise _endless(path, f"{within} pages within pages")
-    except Exception:
-        file.close()
-        raise
-    return file
-
-
-def _check_directories(path: Path) -> None:
-    """Before tifffile follows them: it does not see every circle, and goes round for hours."""
-    seen, tags = set[int](), 0
-    with path.open("rb") as stream, suppress(struct.error, OSError, OverflowError):  # a broken end: tifffile says so
-        for place, count in _directories(stream):
-            tags += count + 1
-            if place in seen or tags > TAGS:
-                raise _endless(path, "pages in a circle" if place in seen else f"more than {TAGS} tags")
-            seen.add(place)
-
-
-def _directories(stream: BinaryIO) -> Iterator[tuple[int, int]]:
-    """Place and number of tags of one directory after another, plain or BigTIFF."""
-    head = stream.read(4)
-    order, big = ">" if head[:2] == b"MM" else "<", head[2:] in (b"+\0", b"\0+")
-    (count, tag_bytes, offset), start = (("Q", 20, "Q"), 8) if big else (("H", 12, "I"), 4)
-
-    def number(kind: str) -> int:
-        return int(struct.unpack(order + kind, stream.read(struct.calcsize(kind)))[0])
-
-    stream.seek(start)
-    while place := number(offset):
-        stream.seek(place)
-        tags = number(count)
-        yield place, tags
-        stream.seek(tag_bytes * tags, os.SEEK_CUR)
-
-
-def _endless(path: Path, got: str) -> ImageError:
-    return ImageError(str(path), expected="a TIFF of a few pages", got=got, remedy="write it again")
+    """A TIFF as plain pages; raises what tifffile raises."""
+    return tifffile.TiffFile(path, **PLAIN)
 
 
 NONE, LZW, JPEG, DEFLATE, PACKBITS, ZSTD = 1, 5, 7, (8, 32946), 32773, 50000

@@ -90,10 +90,7 @@ def _spread(excess: Tensor, length_px: float) -> Tensor:
 
 
 def add_defects(dn: Tensor, defects: Defects, max_dn: int, generator: np.random.Generator) -> Tensor:
-    """Pixels of DN (H, W) dead (0 DN) or hot (max_dn), each at its rate per million; rates 0 change nothing.
-
-    Rates of 0 change nothing.
-    """
+    """Pixels of DN (H, W) dead (0 DN) or hot (max_dn), each at its rate per million; rates 0 change nothing."""
     draw = torch.from_numpy(generator.random(tuple(dn.shape), dtype=np.float32)).to(dn.device)
     dead, hot = defects.dead_per_million / 1e6, defects.hot_per_million / 1e6
     dn = torch.where(draw < dead, torch.zeros_like(dn), dn)

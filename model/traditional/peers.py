@@ -5,6 +5,7 @@ in the place of NL-Bayes in the chain.
 """
 
 from collections.abc import Callable
+from functools import partial
 
 import torch
 from skimage import restoration
@@ -25,41 +26,28 @@ Peer = Callable[[Tensor, Chain], Tensor]
 """(H, W) digital numbers of the degraded sensor, and the two sensors, to those of the reference."""
 
 
-def wiener(dn: Tensor, chain: Chain) -> Tensor:
-    """scikit-image's Wiener filter with a Laplacian regulariser, balance 0.01: (H, W) DN to (H, W) DN."""
-
-    def deconvolve(image: Tensor, blur: Tensor) -> Tensor:
-        restored = restoration.wiener(image.numpy(), blur.numpy().astype(complex), WIENER_BALANCE, clip=False)
-        return torch.from_numpy(restored)
-
-    return _deconvolved(dn, chain, deconvolve)
+def wiener(image: Tensor, blur: Tensor) -> Tensor:
+    """scikit-image's Wiener filter with a Laplacian regulariser, balance 0.01."""
+    restored = restoration.wiener(image.numpy(), blur.numpy().astype(complex), WIENER_BALANCE, clip=False)
+    return torch.from_numpy(restored)
 
 
-def unsupervised_wiener(dn: Tensor, chain: Chain) -> Tensor:
-    """scikit-image's Wiener filter that estimates its own regularisation (seed 0): (H, W) DN to (H, W) DN."""
-
-    def deconvolve(image: Tensor, blur: Tensor) -> Tensor:
-        restored, _ = restoration.unsupervised_wiener(image.numpy(), blur.numpy().astype(complex), clip=False, rng=0)
-        return torch.from_numpy(restored)
-
-    return _deconvolved(dn, chain, deconvolve)
+def unsupervised_wiener(image: Tensor, blur: Tensor) -> Tensor:
+    """scikit-image's Wiener filter that estimates its own regularisation (seed 0)."""
+    restored, _ = restoration.unsupervised_wiener(image.numpy(), blur.numpy().astype(complex), clip=False, rng=0)
+    return torch.from_numpy(restored)
 
 
-def richardson_lucy(dn: Tensor, chain: Chain) -> Tensor:
-    """scikit-image's Richardson-Lucy deconvolution, 20 steps: (H, W) DN to (H, W) DN."""
-
-    def deconvolve(image: Tensor, blur: Tensor) -> Tensor:
-        height, width = image.shape
-        side = 2 * PAD_PX + 1
-        spread = torch.fft.irfft2(blur, s=(height, width)).roll((PAD_PX, PAD_PX), (0, 1))[:side, :side]
-        # Richardson-Lucy is defined for kernels that are nowhere negative, and this one may ring below 0.
-        spread = spread.clamp(min=0)
-        point = (spread / spread.sum()).numpy()
-        # It divides by its own blurred estimate, which goes to 0 where the image is 0.
-        light = image.clamp(min=1e-6).numpy()
-        return torch.from_numpy(restoration.richardson_lucy(light, point, RICHARDSON_LUCY_STEPS, clip=False))
-
-    return _deconvolved(dn, chain, deconvolve)
+def richardson_lucy(image: Tensor, blur: Tensor) -> Tensor:
+    """scikit-image's Richardson-Lucy deconvolution, 20 steps."""
+    side = 2 * PAD_PX + 1
+    spread = torch.fft.irfft2(blur, s=tuple(image.shape)).roll((PAD_PX, PAD_PX), (0, 1))[:side, :side]
+    # Richardson-Lucy is defined for kernels that are nowhere negative, and this one may ring below 0.
+    spread = spread.clamp(min=0)
+    point = (spread / spread.sum()).numpy()
+    # It divides by its own blurred estimate, which goes to 0 where the image is 0.
+    light = image.clamp(min=1e-6).numpy()
+    return torch.from_numpy(restoration.richardson_lucy(light, point, RICHARDSON_LUCY_STEPS, clip=False))
 
 
 def nl_means(dn: Tensor, chain: Chain) -> Tensor:
@@ -74,16 +62,11 @@ def nl_means(dn: Tensor, chain: Chain) -> Tensor:
     return to_dn(sharp, chain.reference)
 
 
-PEERS: dict[str, Peer] = {
-    "wiener": wiener,
-    "unsupervised-wiener": unsupervised_wiener,
-    "richardson-lucy": richardson_lucy,
-    "nl-means": nl_means,
-}
+def _deconvolved(deconvolve: Callable[[Tensor, Tensor], Tensor], dn: Tensor, chain: Chain) -> Tensor:
+    """Undo the degraded MTF on mirrored borders, at a scale of 1 for full scale, and blur to the reference's.
 
-
-def _deconvolved(dn: Tensor, chain: Chain, deconvolve: Callable[[Tensor, Tensor], Tensor]) -> Tensor:
-    """Undo the degraded MTF on mirrored borders, at a scale of 1 for full scale, and blur to the reference's."""
+    `deconvolve` takes an image (H, W) and the half spectrum of its blur, (H, W // 2 + 1).
+    """
     full_scale = chain.degraded.max_dn / chain.degraded.gain_dn_per_radiance
     rows, columns = (mirrored(-PAD_PX, size + PAD_PX, size) for size in dn.shape)
     height, width = len(rows), len(columns)
@@ -92,3 +75,11 @@ def _deconvolved(dn: Tensor, chain: Chain, deconvolve: Callable[[Tensor, Tensor]
     sharp = torch.fft.rfft2(deconvolve(wide, blur)) * target
     inside = torch.fft.irfft2(sharp, s=(height, width))[PAD_PX:-PAD_PX, PAD_PX:-PAD_PX]
     return to_dn((inside * full_scale).float(), chain.reference)
+
+
+PEERS: dict[str, Peer] = {
+    "wiener": partial(_deconvolved, wiener),
+    "unsupervised-wiener": partial(_deconvolved, unsupervised_wiener),
+    "richardson-lucy": partial(_deconvolved, richardson_lucy),
+    "nl-means": nl_means,
+}

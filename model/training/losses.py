@@ -61,22 +61,19 @@ class RestorationLoss:
             restored, reference = restored.float(), reference.float()
             terms = {"l1": (restored - reference).abs().mean()}
             total = weights.l1 * terms["l1"]
-            if weights.l2:
-                terms["l2"] = (restored - reference).square().mean()
-                total = total + weights.l2 * terms["l2"]
-            if weights.fft:
-                terms["fft"] = fft_l1(restored, reference)
-                total = total + weights.fft * terms["fft"]
-            if weights.radiance:
-                terms["radiance"] = radiance_l1(restored, reference)
-                total = total + weights.radiance * terms["radiance"]
-            if weights.psnr:
-                terms["psnr"] = log_mse(restored, reference)
-                total = total + weights.psnr * terms["psnr"]
+            for name, term in {"l2": mse, "fft": fft_l1, "radiance": radiance_l1, "psnr": log_mse}.items():
+                if weight := getattr(weights, name):
+                    terms[name] = term(restored, reference)
+                    total = total + weight * terms[name]
             if self.perceptual is not None:
                 terms["lpips"] = self.perceptual(restored, reference).mean()
                 total = total + weights.lpips * terms["lpips"]
         return total, {name: term.detach() for name, term in terms.items()}
+
+
+def mse(restored: Tensor, reference: Tensor) -> Tensor:
+    """Mean squared difference of images of one shape."""
+    return (restored - reference).square().mean()
 
 
 def log_mse(restored: Tensor, reference: Tensor) -> Tensor:

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from beers_deploy.model.convbeers import vector_tensor
 from beers_deploy.model.family import SensorFamily
-from beers_deploy.model.io.images import list_images, read_pixels, remedy_outside, settled_scale
+from beers_deploy.model.io.images import list_images, read_acquisition
 from beers_deploy.model.simulator.acquire import acquire
 from beers_deploy.model.simulator.detector import Draw
 from beers_deploy.model.simulator.sampling import Scene, crop_divisible, scene_spectrum
@@ -291,32 +291,16 @@ class StoredPairs:
     def _patch(self, generator: np.random.Generator) -> Tensor:
         """One patch (2, P, P) of a random pair."""
         files = self.files[int(generator.integers(len(self.files)))]
-        images = [self._digital_numbers(file) for file in files]
-        height, width = images[0].shape[:2]
-        if images[0].shape != images[1].shape or images[0].ndim != 2 or min(height, width) < self.patch_px:
+        images = [read_acquisition(file, remedy=RESCALE, max_dn=self.max_dn) for file in files]
+        height, width = images[0].shape
+        if images[0].shape != images[1].shape or min(height, width) < self.patch_px:
             raise ImageError(
                 str(files[0]),
                 expected=f"a mono pair of one size, {self.patch_px} pixels a side or more",
-                got=" and ".join(map(_size, images)),
+                got=" and ".join(f"{image.shape[1]} x {image.shape[0]} pixels" for image in images),
                 remedy="choose a smaller `patch`, or simulate larger patches",
             )
         top, left = (int(generator.integers(size - self.patch_px + 1)) for size in (height, width))
         window = slice(top, top + self.patch_px), slice(left, left + self.patch_px)
-        both = torch.stack([torch.from_numpy(image[window].astype(np.float32)) for image in images])
+        both = torch.stack([torch.from_numpy(image[window]) for image in images])
         return turn(both[None], generator, self.quarters, self.mirrors)[0]
-
-    def _digital_numbers(self, file: Path) -> np.ndarray:
-        """The pixels of an image, refused where they are not those of the sensor."""
-        pixels = read_pixels(file)
-        low, high = float(pixels.min()), float(pixels.max())
-        settled_scale(str(file), pixels.dtype, [max(-low, high)], usual=self.max_dn, remedy=RESCALE)
-        if low < 0 or high > self.max_dn:
-            expected, got = f"digital numbers of 0 to {self.max_dn}", f"values from {low:g} to {high:g}"
-            raise ImageError(str(file), expected=expected, got=got, remedy=remedy_outside(low, high, RESCALE))
-        return pixels
-
-
-def _size(image: np.ndarray) -> str:
-    """Width x height, and the bands where it is not mono."""
-    height, width, *bands = image.shape
-    return f"{width} x {height} pixels" + (f" of {bands[0]} bands" if bands else "")

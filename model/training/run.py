@@ -9,7 +9,7 @@ import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -18,10 +18,10 @@ from torch import Tensor
 from beers_deploy.model.convbeers import BankedConvBEERS, ConvBEERS, Network, load_network
 from beers_deploy.model.io.files import whole_file
 from beers_deploy.model.io.images import list_images
-from beers_deploy.model.io.pictures import Stretch, busiest_windows, grid, strip_row
+from beers_deploy.model.io.pictures import busiest_windows, grid, stretch_of, strip_row
 from beers_deploy.model.metrics.backbones import find_backbone, not_found
 from beers_deploy.model.metrics.perceptual import Lpips
-from beers_deploy.model.progress import Steps, steps
+from beers_deploy.model.progress import steps
 from beers_deploy.model.simulator.procedural import draw_scenes
 from beers_deploy.model.simulator.sampling import Scene, read_scene
 from beers_deploy.model.training.checkpoint import TrainingRecipe, finish
@@ -128,11 +128,8 @@ def require_whole_places(run: Run, variants: Sequence[Variant]) -> None:
     """Refuse patches that a network at a lower resolution, or a teacher at one, cannot rearrange."""
     scale = math.lcm(*(variant.scale for variant in variants))
     if run.patches.patch_px % scale:
-        expected, got = (
-            f"a multiple of {scale} px, for a network at 1/{scale} resolution",
-            f"{run.patches.patch_px} px",
-        )
-        raise OptionError("patch", expected=expected, got=got, remedy="choose another")
+        expected = f"a multiple of {scale} px, for a network at 1/{scale} resolution"
+        raise OptionError("patch", expected=expected, got=f"{run.patches.patch_px} px", remedy="choose another")
 
 
 def start_weights(run: Run) -> Mapping[str, Tensor] | None:
@@ -210,7 +207,8 @@ def _train(run: Run, trainer: Trainer, source: Source, validation: Validation) -
         def report(now: Progress) -> None:
             log.write(now.step, {**now.terms, "patches_per_s": now.patches_per_s})
             _scalars(board, now.step, now.terms)
-            _show(bar, now)
+            terms = ", ".join(f"{name} {value:.5f}" for name, value in now.terms.items())
+            bar.advance(now.step - bar.done, f"{terms}, {now.patches_per_s:.0f} patches/s in {now.precision}")
 
         def validate(step: int, network: Network) -> None:
             require_finite_output(network, f"training step {step}")
@@ -221,11 +219,6 @@ def _train(run: Run, trainer: Trainer, source: Source, validation: Validation) -
 
         every = run.validate_steps if validation.pairs else 0
         trainer.run(source, run.checkpoint, Schedule(validate_steps=every, report=report, validate=validate))
-
-
-def _show(bar: Steps, now: Progress) -> None:
-    terms = ", ".join(f"{name} {value:.5f}" for name, value in now.terms.items())
-    bar.advance(now.step - bar.done, f"{terms}, {now.patches_per_s:.0f} patches/s in {now.precision}")
 
 
 class Log:
@@ -248,14 +241,6 @@ class Log:
             lines.writerow([step, *(f"{value:.6g}" for value in values.values())])
 
 
-class Board(Protocol):
-    """What TensorBoard's writer offers."""
-
-    def add_scalar(self, name: str, value: float, step: int) -> None:
-        """Note one figure."""
-        ...
-
-
 def tensorboard(out: Path) -> "SummaryWriter":
     """A writer of TensorBoard scalars in the run's folder."""
     try:
@@ -266,7 +251,7 @@ def tensorboard(out: Path) -> "SummaryWriter":
     return SummaryWriter(str(out / "tensorboard"))
 
 
-def _scalars(board: Board | None, step: int, values: Mapping[str, float]) -> None:
+def _scalars(board: "SummaryWriter | None", step: int, values: Mapping[str, float]) -> None:
     if board is not None:
         for name, value in values.items():
             board.add_scalar(name, value, step)
@@ -279,13 +264,12 @@ def write_picture(validation: Validation, network: Network, path: Path) -> None:
         images = [degraded[0, 0].numpy(), restored, reference[0, 0].numpy()]
         side = min(VALIDATION_CROP_PX, *images[0].shape)
         top, left = busiest_windows(images[2], side)[0]
-        stretch = Stretch(*(float(v) for v in np.percentile(images[2], (0.5, 99.5))))
-        rows.append(strip_row((image[top : top + side, left : left + side] for image in images), stretch))
-    sides = {row[0].shape for row in rows}
-    smallest = min(sides)
-    crops = [[cell[: smallest[0], : smallest[1]] for cell in row] for row in rows]
+        crops = (image[top : top + side, left : left + side] for image in images)
+        rows.append(strip_row(crops, stretch_of(images[2])))
+    smallest = min(row[0].shape for row in rows)
+    cells = [[cell[: smallest[0], : smallest[1]] for cell in row] for row in rows]
     with whole_file(path) as temporary:
-        grid(["degraded", "restored", "reference"], crops, ZOOM).save(temporary, "PNG", optimize=True)
+        grid(["degraded", "restored", "reference"], cells, ZOOM).save(temporary, "PNG", optimize=True)
 
 
 def about(run: Run, images: Sequence[str], held_out: Sequence[str], loss: RestorationLoss) -> dict[str, object]:

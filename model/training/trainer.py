@@ -106,7 +106,8 @@ class Trainer:
         self.loss, self.device = loss or RestorationLoss(recipe.loss), self.worker.device(device)
         require_loss(self.loss, recipe.distil if teacher is not None else 0.0)
         self.step, self.guards = 0, Guards()
-        self.network = new_network(variant, torch.Generator().manual_seed(recipe.seed), conditioned)
+        self.network: Network = (BankedConvBEERS if conditioned else ConvBEERS)(variant)
+        initialise(self.network, torch.Generator().manual_seed(recipe.seed))
         if start is not None:
             self.network.load_state_dict(dict(start))
         self.network.to(self.device).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
@@ -232,18 +233,8 @@ def require_loss(loss: RestorationLoss, distil: float) -> None:
     if loss.weights.total(loss.perceptual is not None) + distil > 0:
         return
     left_out = ", and none but LPIPS, which lacks its weights" if loss.weights.lpips else ""
-    got, remedy = (
-        f"weights of 0{left_out}",
-        "raise one of `l1_weight`, `l2_weight`, `fft_weight`, `radiance_weight`, `psnr_weight`",
-    )
-    raise OptionError("loss", expected="a term of weight above 0", got=got, remedy=remedy)
-
-
-def new_network(variant: Variant, generator: torch.Generator, conditioned: bool) -> Network:
-    """A network that nothing was trained into yet."""
-    network = BankedConvBEERS(variant) if conditioned else ConvBEERS(variant)
-    initialise(network, generator)
-    return network
+    remedy = "raise one of `l1_weight`, `l2_weight`, `fft_weight`, `radiance_weight`, `psnr_weight`"
+    raise OptionError("loss", expected="a term of weight above 0", got=f"weights of 0{left_out}", remedy=remedy)
 
 
 def _optimiser(network: Network, recipe: TrainingRecipe) -> torch.optim.Optimizer:

@@ -1,17 +1,22 @@
 """A network as the short list of operations that a DPU computes: what quantisation works on.
 
-- `operations`: what there is, convolutions to pixel shuffles, and which tensors must share a scale;
+- `operations`: what there is, convolutions to pixel shuffles, which tensors must share a scale, and how 12 bits enter
+  int8;
 - `reader`: from float ONNX to a `network`, cut where the host's part ends, with `trials` of what exporters spell out;
-- `plain`: which networks are of ConvBEERS' kind;
 - `tail`: what the host computes behind the last map, kept as ONNX nodes;
-- `writer`: back to float ONNX;
-- `planes`: how 12 bits enter int8.
+- `writer`: back to float ONNX.
 """
 
 from beers_deploy.quant.graph.network import Network, channels_of, check_network, refused_graph
 from beers_deploy.quant.graph.operations import (
+    COARSE_MAX,
     CORRECTION,
+    COUNT,
     IMAGE,
+    PLANES,
+    PLANES_FRAC_BITS,
+    QUARTER,
+    STEP,
     Activation,
     Add,
     AveragePool,
@@ -26,24 +31,15 @@ from beers_deploy.quant.graph.operations import (
     Shuffle,
     Window,
     is_plain,
+    read_planes,
     relu_count,
     same,
+    split,
     tensors,
     tied,
     ties_scales,
 )
-from beers_deploy.quant.graph.plain import correction_graph, image_channels, plain_network
-from beers_deploy.quant.graph.planes import (
-    COARSE_MAX,
-    COUNT,
-    PLANES,
-    PLANES_FRAC_BITS,
-    QUARTER,
-    STEP,
-    read_planes,
-    split,
-)
-from beers_deploy.quant.graph.reader import read_network, refusal
+from beers_deploy.quant.graph.reader import correction_graph, image_channels, plain_network, read_network, refusal
 from beers_deploy.quant.graph.writer import graph_to_onnx
 
 __all__ = [

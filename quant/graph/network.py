@@ -10,6 +10,7 @@ from beers_deploy.profiles.errors import ModelError
 from beers_deploy.quant.graph.operations import (
     CORRECTION,
     IMAGE,
+    PLANES,
     Activation,
     Add,
     AveragePool,
@@ -24,7 +25,6 @@ from beers_deploy.quant.graph.operations import (
     Resize,
     Shuffle,
 )
-from beers_deploy.quant.graph.planes import PLANES
 from beers_deploy.quant.graph.tail import Tail
 
 REMEDY = "see docs/reference/any-network.md for what 'quantize' takes; 'check' names what a DPU does not run"

@@ -10,6 +10,8 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 
+from beers_deploy.model.io.images import MAX_DN
+
 IMAGE, CORRECTION = "image", "correction"
 """What a network reads, and what its last operation writes."""
 
@@ -129,10 +131,13 @@ def is_plain(op: Op) -> bool:
     return dense and kept and getattr(op, "window", None) == same(op.weight)
 
 
-class _OneInput:
+@dataclass(frozen=True)
+class OneInput:
     """Operations that read one tensor, `input`."""
 
+    name: str
     input: str
+    output: str
 
     @property
     def inputs(self) -> tuple[str, ...]:
@@ -141,16 +146,13 @@ class _OneInput:
 
 
 @dataclass(frozen=True)
-class Conv(_OneInput):
+class Conv(OneInput):
     """A convolution with zero padding and an activation; `groups` is 1, or as many as channels (depthwise).
 
     Transposed, its weights stay (O, I, kh, kw), O the channels that it writes, and `window` is ONNX's: its strides
     enlarge, its pads cut.
     """
 
-    name: str
-    input: str
-    output: str
     weight: np.ndarray  # (O, I / groups, kh, kw) float32
     bias: np.ndarray  # (O,) float32
     activation: Activation = Activation.none
@@ -188,48 +190,36 @@ class Concat:
 
 
 @dataclass(frozen=True)
-class MaxPool(_OneInput):
+class MaxPool(OneInput):
     """The largest value of each window; what is padded never is."""
 
-    name: str
-    input: str
-    output: str
     kernel: Pair
     window: Window = field(default_factory=Window)
 
 
 @dataclass(frozen=True)
-class AveragePool(_OneInput):
+class AveragePool(OneInput):
     """The mean of each window, padding counted as zeros; `kernel` None is the whole image (global pooling)."""
 
-    name: str
-    input: str
-    output: str
     kernel: Pair | None
     window: Window = field(default_factory=Window)
 
 
 @dataclass(frozen=True)
-class Resize(_OneInput):
+class Resize(OneInput):
     """Rows and columns `factor` times as many: nearest, or bilinear with half-pixel centres."""
 
-    name: str
-    input: str
-    output: str
     factor: int
     bilinear: bool = False
 
 
 @dataclass(frozen=True)
-class Shuffle(_OneInput):
+class Shuffle(OneInput):
     """Pixel shuffle: blocks of block^2 channels become block x block pixels; or, `up` False, the other way round.
 
     `columns_first` is torch's order of the channels (ONNX's CRD), without it ONNX's own (DCR, and SpaceToDepth).
     """
 
-    name: str
-    input: str
-    output: str
     block: int
     up: bool = True
     columns_first: bool = True
@@ -255,12 +245,9 @@ class Shuffle(_OneInput):
 
 
 @dataclass(frozen=True)
-class Pointwise(_OneInput):
+class Pointwise(OneInput):
     """An activation by itself: a function of each value, which the integer core keeps as a table of 256."""
 
-    name: str
-    input: str
-    output: str
     activation: Activation
 
 
@@ -301,3 +288,45 @@ def tensors(graph: Graph) -> list[str]:
 def relu_count(graph: Graph) -> int:
     """How many operations carry a ReLU: quantisers have been seen to drop them without a word."""
     return sum(getattr(op, "activation", None) is Activation.relu for op in graph)
+
+
+PLANES = "planes"
+"""How an image of 12 bits enters a network of int8: each channel a coarse plane, its remainder, and a third for finer
+weights, (N, C, H, W) to (N, 3 C, H, W), all coarse planes first. Convolutions alone read them."""
+STEP = 32
+COARSE_MAX = 127
+QUARTER = 4
+COUNT = 3
+PLANES_FRAC_BITS = 7
+"""The planes' scale is 2^-7: coarse 127 stands for about 1, the full scale."""
+
+
+def split(image: np.ndarray, count: int = COUNT) -> np.ndarray:
+    """(N, C, H, W) float32 in [0, 1] to the planes (N, count C, H, W) int8."""
+    dn = np.clip(np.rint(image * np.float32(MAX_DN)), 0, MAX_DN)
+    coarse = np.minimum(np.rint(dn / STEP), COARSE_MAX)
+    remainder = dn - STEP * coarse
+    planes = [coarse, remainder, np.rint(remainder / QUARTER)]
+    return np.concatenate(planes[:count], axis=1).astype(np.int8)
+
+
+def read_planes(graph: Graph) -> Graph:
+    """The same graph, the convolutions that read the image reading the planes (as q * 2^-7) instead."""
+    return tuple(_reads_planes(op) if isinstance(op, Conv) and op.input == IMAGE else op for op in graph)
+
+
+def _reads_planes(op: Conv) -> Conv:
+    unit = np.float32(2.0**PLANES_FRAC_BITS / MAX_DN)
+    weight = dense(op).weight
+    planes = [weight * (STEP * unit), weight * unit, np.zeros_like(weight)]
+    return replace(op, input=PLANES, weight=np.concatenate(planes, axis=1).astype(np.float32), groups=1)
+
+
+def dense(op: Conv) -> Conv:
+    """A depthwise convolution as one of a single group; any other as it is."""
+    if op.groups == 1:
+        return op
+    weight = np.zeros((len(op.weight), op.groups, *op.weight.shape[2:]), np.float32)
+    channels = np.arange(op.groups)
+    weight[channels, channels] = op.weight[:, 0]
+    return replace(op, weight=weight, groups=1)

@@ -9,6 +9,7 @@ from onnx import TensorProto, helper
 
 from beers_deploy.quant.graph.operations import (
     LEAKY_SLOPE,
+    PLANES,
     Activation,
     Add,
     AveragePool,
@@ -23,7 +24,6 @@ from beers_deploy.quant.graph.operations import (
     Shuffle,
     Window,
 )
-from beers_deploy.quant.graph.planes import PLANES
 from beers_deploy.quant.onnx_file import GraphWriter, image_info, make_model
 
 

@@ -15,9 +15,9 @@ import numpy as np
 
 from beers_deploy.quant.core import INT8_MAX
 from beers_deploy.quant.ends import ONE_CHANNEL, Ends
-from beers_deploy.quant.graph import Conv, Graph, graph_to_onnx
+from beers_deploy.quant.graph import Conv, Graph
 from beers_deploy.quant.passes.stream import STREAM_FRAC_BITS, Stream
-from beers_deploy.quant.session import halo_of, open_session, tensor_values
+from beers_deploy.quant.session import values_of
 
 QUANTILE = 0.9999
 """A channel's range: the mean over tiles of this quantile of its sizes. The maximum would be ruled by outliers."""
@@ -80,11 +80,8 @@ def channel_sizes(
     quantile: float = QUANTILE,
 ) -> Iterator[list[np.ndarray]]:
     """A quantile of each channel's sizes, (C,) of each of the named tensors, for every tile of the images."""
-    halo_px = halo_of(graph)
-    session = open_session(graph_to_onnx(graph, names, ends.planes * ends.channels))
-    for image in images:
-        for results in tensor_values(session, names, image, halo_px, ends):
-            yield [np.quantile(np.abs(r[0]).reshape(r.shape[1], -1), quantile, axis=1) for r in results]
+    for results in values_of(graph, names, images, ends):
+        yield [np.quantile(np.abs(r[0]).reshape(r.shape[1], -1), quantile, axis=1) for r in results]
 
 
 def with_room(graph: Graph, step: float, images: Iterable[np.ndarray], ends: Ends = ONE_CHANNEL) -> Graph:

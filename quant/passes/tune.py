@@ -17,10 +17,10 @@ from beers_deploy.model.progress import Log, no_log
 from beers_deploy.profiles.errors import ImageError
 from beers_deploy.quant.core import IntCore
 from beers_deploy.quant.ends import Ends
-from beers_deploy.quant.graph import CORRECTION, PLANES, Conv, Graph, graph_to_onnx
+from beers_deploy.quant.graph import CORRECTION, Conv, Graph, graph_to_onnx
 from beers_deploy.quant.integer.trainable import Tensor, TrainableCore
 from beers_deploy.quant.samples import Pair, Remade
-from beers_deploy.quant.session import open_session, planes_of, require_finite
+from beers_deploy.quant.session import open_session, tensor_values
 from beers_deploy.quant.untrusted import times
 
 HELD_OUT_EVERY = 8
@@ -110,8 +110,7 @@ def tune(
 def _samples(ends: Ends, full: Graph, pairs: Remade[Pair]) -> Iterator[Sample]:
     session = open_session(graph_to_onnx(full, [CORRECTION], ends.planes * ends.channels))
     for image, reference in pairs:
-        (floats,) = session.run([CORRECTION], {PLANES: planes_of(image, ends)})
-        require_finite([floats], "float network")
+        ((floats,),) = tensor_values(session, [CORRECTION], image, None, ends)
         planes, result = torch.from_numpy(ends.split(image).astype(np.float32)), torch.from_numpy(floats)
         if not (reference.size and ends.is_image):
             yield Sample(planes, result, None, 1.0)

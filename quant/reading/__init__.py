@@ -2,6 +2,5 @@
 
 - `folding`: what holds behind it, and what onnxruntime and onnx's converter do for it;
 - `equivalents`: the rewritings that they lack, of `nodes`; `flat`: fully connected layers as convolutions;
-- `external`: weights in a file beside the model are taken in;
-- `arithmetic`: short lists computed of constants, known before a runtime has them.
+- `external`: weights in a file beside the model are taken in.
 """

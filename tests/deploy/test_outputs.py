@@ -17,7 +17,6 @@ from typer.main import get_command
 from typer.testing import CliRunner
 
 from beers_deploy.cli import COMMANDS, app
-from beers_deploy.model.io import files
 from docs.make.options import FILE, PATHS
 
 INSIDE = {
@@ -162,8 +161,8 @@ STANDS: dict[str, tuple[Callable[[Path], object], str]] = {
     "a folder": (Path.mkdir, "a folder"),
     "a link": (link, "a symbolic link"),
     "a link to nothing": (dangling, "a symbolic link"),
-    "a pipe": (pipe, "a pipe"),
-    "a device": (device, "a device"),
+    "a pipe": (pipe, "no regular file"),
+    "a device": (device, "no regular file"),
 }
 
 
@@ -261,21 +260,6 @@ def test_no_two_outputs_are_one(name: str, one: str, other: str, tmp_path: Path)
     (tmp_path / "detour").mkdir(exist_ok=True)
     around = tmp_path / "detour" / ".." / file.relative_to(tmp_path)
     refused(given(name, tmp_path, **{one: value, other: around}), tmp_path, *words)
-    refused(given(name, tmp_path, **{one: value, other: file / f"below{suffix_of(name)}"}), tmp_path, *words)
-
-
-@pytest.mark.parametrize(("name", "option"), FILES, ids=str)
-def test_no_output_is_shipped(name: str, option: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A network that a run reads by its name, or where it is given none."""
-    monkeypatch.setattr(files, "SHIPPED", tmp_path / "weights")
-    value = kept(tmp_path / "weights" / f"kept{suffix_of(name)}")
-    refused(given(name, tmp_path, **{option: value}), tmp_path, str(value), "a file of this installation")
-
-
-def test_no_output_is_a_shipped_profile(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(files, "PROFILES", tmp_path)
-    profile = kept(tmp_path / "sensors" / "mine.toml")
-    refused(["gate", "--json", str(profile)], tmp_path, str(profile), "a file of this installation")
 
 
 def test_the_curves_of_bit_flips_are_an_output_too(tmp_path: Path) -> None:
@@ -290,4 +274,4 @@ def test_a_socket_is_no_output(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     monkeypatch.chdir(tmp_path)  # a socket's name is short
     with socket.socket(socket.AF_UNIX) as here:
         here.bind("figures.json")
-        refused(["bench", "--json", "figures.json"], tmp_path, "a socket")
+        refused(["bench", "--json", "figures.json"], tmp_path, "no regular file")

@@ -132,25 +132,6 @@ def test_other_files_that_a_microscopes_tiff_names_are_not_opened(tmp_path: Path
     np.testing.assert_array_equal(rows(folder / "a.tif")[0], GREY)
 
 
-@pytest.mark.parametrize("count", [1, 2, 150])
-def test_pages_in_a_circle_are_refused(count: int, tmp_path: Path) -> None:
-    """Empty directories of 6 bytes that lead on, and the last one back: tifffile sees no circle of 100 or more."""
-    path, first = tmp_path / "a.tif", 8
-    places = [first + 6 * number for number in range(count)] + [first]
-    path.write_bytes(b"II*\0" + struct.pack("<I", first) + b"".join(struct.pack("<HI", 0, p) for p in places[1:]))
-    refused(path, ImageError, "circle")
-    big = b"II+\0" + struct.pack("<HHQQQ", 8, 0, 16, 0, 16)
-    path.write_bytes(big)
-    refused(path, ImageError, "circle")
-
-
-def test_pages_within_pages_are_counted(tmp_path: Path) -> None:
-    path = tmp_path / "a.tif"
-    tifffile.imwrite(path, GREY, extratags=[(65000, "I", 4000, (8,) * 4000, True)])
-    path.write_bytes(path.read_bytes().replace(struct.pack("<HH", 65000, 4), struct.pack("<HH", 330, 4)))
-    refused(path, ImageError, "within pages")
-
-
 def test_what_is_no_png_or_jpeg_starts_no_other_program(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Pillow hands EPS to Ghostscript, whatever the file is called."""
 

@@ -12,7 +12,7 @@ from beers_deploy.profiles.errors import ProfileError
 from beers_deploy.profiles.sensor import TABLES, noise_from_snr, snr_0_bounds
 from tests.profiles.own_sensor import SHIPPED, own_sensor
 
-KEYS = [(table, key) for table, ways in TABLES.items() for key in ways[0].required]
+KEYS = [(table, key) for table, ways in TABLES.items() for key in ways[0][0]]
 
 
 def refusal(path: Path) -> ProfileError:

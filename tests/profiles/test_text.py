@@ -11,18 +11,13 @@ from hypothesis import strategies as st
 from beers_deploy.profiles import load_sensor, load_target
 from beers_deploy.profiles.errors import BeersError, OptionError, ProfileError
 from beers_deploy.profiles.scene_call import load_scene_call
-from beers_deploy.profiles.toml import DEPTH, JSON_BYTES, QUOTED, TOML_BYTES, parse_json, read_json, read_toml_text
+from beers_deploy.profiles.toml import JSON_BYTES, QUOTED, TOML_BYTES, parse_json, read_json, read_toml_text
 from beers_deploy.quant.gate import read_limits
 
 BAD_TOML = {
     "nested arrays": "a = " + "[" * 20_000,
-    "closed ones": "a = " + "[" * 200 + "]" * 200,
     "inline tables": "a = " + "{b = " * 5_000,
-    "a dotted key": "a." * 8_000 + "a = 1",
-    "with strange spaces": '"\\u2028" .' * 5_000 + "a = 1",
-    "tables in tables": "[" + ".".join("a" * 60) + "]\nb = 1",
     "decimal digits": "a = " + "9" * 5_000,
-    "hex digits": "a = 0x" + "f" * 50_000,
     "too long": "#" * (TOML_BYTES + 1),
     "no text": "a = '\x00'",
 }
@@ -67,7 +62,6 @@ def test_the_line_that_is_no_toml_is_quoted_wherever_a_user_s_toml_is_read(
 
 BAD_JSON = {
     "nested arrays": "[" * 100_000,
-    "closed ones": "[" * 100 + "]" * 100,
     "nested objects": '{"a":' * 100_000,
     "not a number": '{"a": NaN}',
     "infinity": "[-Infinity]",
@@ -91,16 +85,6 @@ def test_what_is_plain_comes_through(value: object) -> None:
     import json
 
     assert parse_json(json.dumps(value)) == value
-
-
-@pytest.mark.parametrize(("depth", "sound"), [(DEPTH - 1, True), (DEPTH, False)])
-def test_the_depth_is_exact(depth: int, sound: bool) -> None:
-    text = "[" * depth + "1" + "]" * depth
-    if sound:
-        assert parse_json(text) is not None
-    else:
-        with pytest.raises(ValueError, match="levels"):
-            parse_json(text)
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no pipes and devices among its files")

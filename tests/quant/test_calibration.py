@@ -146,9 +146,7 @@ def test_no_run_sees_more_than_a_piece_with_its_halo(graph: Graph) -> None:
 def test_positions_of_a_large_image_are_those_of_its_whole(graph: Graph, monkeypatch: pytest.MonkeyPatch) -> None:
     """In pieces or at once: found here by hand from whole tensors."""
     whole = image(TILE_PX + 21, 50)
-    monkeypatch.setattr(
-        "beers_deploy.quant.calibration._errors", lambda *_: np.zeros(1)
-    )  # the scale that clips nothing
+    monkeypatch.setattr("beers_deploy.quant.quantise._errors", lambda *_: np.zeros(1))  # the scale that clips nothing
     frac_bits = choose_frac_bits(graph, [whole])
     names = tensors(graph)
     values = open_session(graph_to_onnx(graph, names)).run(names, {PLANES: planes_of(whole)})

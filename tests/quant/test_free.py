@@ -164,17 +164,17 @@ def test_each_output_channel_has_the_precision_of_its_own_size(seed: int, channe
     generator = np.random.default_rng(seed)
     sizes = 10.0 ** generator.integers(-4, 3, (channels, 1, 1, 1))
     weight = generator.normal(0, 1, (channels, 3, side, side)) * sizes
-    rounded = round_weight(weight.astype(np.float32), np.zeros(channels))
-    found = rounded.values * rounded.scales.astype(np.float64)[:, None, None, None]
+    whole, scales = round_weight(weight.astype(np.float32), np.zeros(channels))
+    found = whole * scales.astype(np.float64)[:, None, None, None]
     size = np.abs(weight).max((1, 2, 3), keepdims=True)
-    assert rounded.values.dtype == np.int8
+    assert whole.dtype == np.int8
     assert (np.square(found - weight).mean((1, 2, 3), keepdims=True) <= (size / 127 / 2) ** 2 * 1.01).all()
 
 
 def test_a_channel_of_zeros_stays_zero_and_a_tiny_one_keeps_its_bias_in_reach() -> None:
-    rounded = round_weight(np.array([[[[0.0]]], [[[1e-9]]]]), finest=np.array([0.0, 1e-3]))
-    assert rounded.scales.tolist() == pytest.approx([1.0, 1e-3])
-    assert not rounded.values.any()
+    whole, scales = round_weight(np.array([[[[0.0]]], [[[1e-9]]]]), finest=np.array([0.0, 1e-3]))
+    assert scales.tolist() == pytest.approx([1.0, 1e-3])
+    assert not whole.any()
 
 
 def in_float(graph: Graph) -> np.ndarray:
@@ -214,7 +214,7 @@ def test_the_half_lsb_pair_lose_less(float_onnx: onnx.ModelProto, patches: Patch
 
     def mae(offset: float) -> float:
         fine = two_gains(half_lsb_pair(graph, offset))
-        model = free_model(fine, {name: scales.get(name, Scale(step)) for name in (PLANES, *tensors(fine))}, {})
+        model = free_model(fine, {name: scales.get(name, Scale(step)) for name in (PLANES, *tensors(fine))})
         return compare(open_session(float_onnx), open_session(model), unseen.pairs).mae
 
     assert mae(step) < 0.95 * mae(0.0)
