@@ -19,8 +19,7 @@ from beers_deploy.frames import bars, html_table, tidy_frame, wide_frame
 from beers_deploy.model.io.files import sha256, write_text
 from beers_deploy.model.processor import decided, processor_name
 from beers_deploy.profiles.errors import printable, visible
-from beers_deploy.profiles.figures import Figure, Row, by_table
-from beers_deploy.quant.gate import Check
+from beers_deploy.profiles.figures import Check, Figure, Row, by_table
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -26,10 +26,11 @@ from beers_deploy.model.progress import Progress, reporting
 from beers_deploy.model.shipped import SENSOR
 from beers_deploy.network import Network, NetworkLike, SensorLike
 from beers_deploy.profiles.errors import OptionError, optional, printable
+from beers_deploy.profiles.figures import Check
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.profiles.target import DEFAULT_TARGET, TargetProfile
 from beers_deploy.profiles.toml import read_json, unreadable
-from beers_deploy.quant.gate import Check, GateResult, Limits, judge, judge_saturation, limits_of, verdict_row
+from beers_deploy.quant.gate import GateResult, Limits, judge, judge_saturation, limits_of, verdict_row
 from beers_deploy.quant.gate import compare as differences
 from beers_deploy.quant.onnx_file import fixed_tile_px, metadata, require_quantised
 from beers_deploy.quant.samples import OwnSamples, samples_of

@@ -6,82 +6,19 @@ import sys
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import onnxruntime as ort
 
 from beers_deploy.model.metrics.fidelity import psnr_db
-from beers_deploy.profiles.errors import OptionError, printable
-from beers_deploy.profiles.figures import Figure, Row, measured, unavailable
+from beers_deploy.profiles.errors import OptionError
+from beers_deploy.profiles.figures import Check, Figure, Row, measured, unavailable
 from beers_deploy.profiles.toml import read_toml_text, unreadable
 from beers_deploy.quant.session import result_of
 
 if TYPE_CHECKING:
     from beers_deploy.quant.samples import Pair
-
-
-Bound = Literal["at most", "at least"]
-
-IN_THE_NAME = {"ratio", "node", "ReLU", "fault", "step"}
-"""Units that a check's name tells a reader already."""
-
-
-@dataclass(frozen=True)
-class Check:
-    """One thing that a gate looks at: a value and its limit. The number decides, and NaN keeps no limit.
-
-    Attributes:
-        name: what is measured, for example "MAE".
-        value: what was found, in `unit`; infinite or NaN where a network gave that.
-        limit: the largest value that passes, or the smallest where `bound` says "at least"; infinity for none.
-        unit: of both; a count has the name of what is counted, for example "node".
-        bound: the side of the limit that passes.
-        detail: where the value was found, or where the limit comes from; empty where there is nothing to add.
-    """
-
-    name: str
-    value: float
-    limit: float
-    unit: str
-    bound: Bound = "at most"
-    detail: str = ""
-
-    @property
-    def passed(self) -> bool:
-        """Whether the value keeps its limit."""
-        return self.value >= self.limit if self.bound == "at least" else self.value <= self.limit
-
-    @property
-    def found(self) -> str:
-        """The value with its unit and its detail, for a person."""
-        unit = "" if self.unit in IN_THE_NAME else f" {self.unit}"
-        # A detail may hold the name of a node of another's file: it must stay on its line of a log.
-        return f"{self.value:.4g}{unit}" + (f" ({printable(self.detail)})" if self.detail else "")
-
-    @property
-    def allowed(self) -> str:
-        """The limit, for a person."""
-        return f"{self.bound} {self.limit:.4g}"
-
-    def __str__(self) -> str:
-        return f"{self.name} {self.found}, allowed {self.allowed}"
-
-    def to_json(self) -> dict[str, object]:
-        """The check as the results schema wants it; None for what JSON has no number for."""
-        return {
-            "name": self.name,
-            "value": _finite(self.value),
-            "limit": _finite(self.limit),
-            "unit": self.unit,
-            "bound": self.bound,
-            "passed": self.passed,
-            "detail": self.detail if math.isfinite(self.value) else self.found,
-        }
-
-
-def _finite(value: float) -> float | None:
-    return float(value) if math.isfinite(value) else None
 
 
 @dataclass(frozen=True)
@@ -132,7 +69,8 @@ def compare(
     differences, errors, agreeing = [], [], []
     for degraded, reference in pairs:
         results = [result_of(s, degraded) for s in (float_session, int8_session)]
-        agreeing.append(_same_class(*results) if results[0].shape[1] > degraded.shape[1] else math.nan)
+        classes = [result.argmax(1) for result in results]
+        agreeing.append((classes[0] == classes[1]).mean() if results[0].shape[1] > degraded.shape[1] else math.nan)
         in_float, in_int8 = (_as_in_a_file(result, degraded) for result in results)
         differences.append((in_int8 - in_float).ravel())
         errors.append([_psnr_db(image, reference) for image in (degraded, in_float, in_int8)])
@@ -161,11 +99,6 @@ def _as_in_a_file(result: np.ndarray, image: np.ndarray) -> np.ndarray:
 
 def _psnr_db(image: np.ndarray, reference: np.ndarray) -> float:
     return psnr_db(image, reference, 1.0) if reference.shape == image.shape else math.nan
-
-
-def _same_class(one: np.ndarray, other: np.ndarray) -> float:
-    """The share of results (N, classes, ...) whose largest is the same class."""
-    return float((one.argmax(1) == other.argmax(1)).mean())
 
 
 @dataclass(frozen=True)

@@ -16,6 +16,7 @@ operators between 8-bit tensors (QDQ), of which onnxruntime makes integer ones, 
 
 import hashlib
 from collections import defaultdict
+from copy import deepcopy
 from dataclasses import dataclass
 from enum import StrEnum
 
@@ -109,8 +110,7 @@ class _Rewriting:
     """A copy of the model, what is known of it, and the ways chosen so far."""
 
     def __init__(self, model: onnx.ModelProto) -> None:
-        self.model = onnx.ModelProto()
-        self.model.CopyFrom(model)
+        self.model = deepcopy(model)
         self.arrays, self.ways = constants(model), dict[str, Way]()
         self.writers = {name: node for node in self.model.graph.node for name in node.output}
         self.readers: dict[str, list[onnx.NodeProto]] = defaultdict(list)
@@ -185,8 +185,7 @@ class _Rewriting:
             self.ways[node.name or node.output[0]] = Way.signed
             return [node]
         self.ways[node.name or node.output[0]] = Way.unsigned
-        lifted = onnx.NodeProto()
-        lifted.CopyFrom(source)
+        lifted = deepcopy(source)
         self._lift(lifted, 0, 2)
         node.input[1] = lifted.name = lifted.output[0] = f"{node.output[0]}.weight_from_uint8"
         return [lifted, node]
@@ -245,8 +244,7 @@ def filled(model: onnx.ModelProto) -> onnx.ModelProto:
     """The model with the same results, its integer convolutions no narrower than suits onnxruntime."""
     if any(each.domain in ("", "ai.onnx") and each.version < FIRST_OPSET for each in model.opset_import):
         return model
-    wider = onnx.ModelProto()
-    wider.CopyFrom(model)
+    wider = deepcopy(model)
     arrays = {each.name: each for each in wider.graph.initializer}
     work = _ChannelPadding(wider.graph, {name: numpy_helper.to_array(each) for name, each in arrays.items()})
     nodes = [each for node in wider.graph.node for each in work.around(node)]

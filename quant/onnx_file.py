@@ -5,6 +5,7 @@ into tiles for it is `quant.tiling`'s matter.
 """
 
 from collections.abc import Mapping, Sequence
+from copy import deepcopy
 from pathlib import Path
 
 import numpy as np
@@ -44,12 +45,12 @@ def load_onnx(path: Path, to_run: bool = True) -> onnx.ModelProto:
     except (OSError, ValueError) as error:
         got = unreadable(path) or " ".join(str(error).split())[:120]
         raise ModelError(str(path), expected="an ONNX file", got=got, remedy=REMEDY) from error
-    return _simplest(_parsed(content, str(path), to_run, path), str(path), to_run)
+    return _simplest(parse_onnx(content, str(path), to_run, path), str(path), to_run)
 
 
 def read_onnx(content: bytes, where: str) -> onnx.ModelProto:
     """As `load_onnx`, of the bytes of a network that holds all its weights."""
-    return _simplest(_parsed(content, where, True, None), where, True)
+    return _simplest(parse_onnx(content, where), where, True)
 
 
 def _simplest(model: onnx.ModelProto, where: str, to_run: bool) -> onnx.ModelProto:
@@ -64,13 +65,8 @@ def _simplest(model: onnx.ModelProto, where: str, to_run: bool) -> onnx.ModelPro
         return model
 
 
-def parse_onnx(content: bytes, where: str, to_run: bool = True) -> onnx.ModelProto:
-    """As `load_onnx`, of the bytes of a file that holds all its weights; what is read stays as it is."""
-    return _parsed(content, where, to_run, None)
-
-
-def _parsed(content: bytes, where: str, to_run: bool, path: Path | None) -> onnx.ModelProto:
-    """The model in a file's bytes, checked; with a path its weights may lie beside it."""
+def parse_onnx(content: bytes, where: str, to_run: bool = True, path: Path | None = None) -> onnx.ModelProto:
+    """As `load_onnx`, of a file's bytes, and what is read stays as it is; with a path weights may lie beside it."""
     if not content:
         raise ModelError(where, expected="an ONNX file", got="an empty file", remedy=REMEDY)
     try:
@@ -158,8 +154,7 @@ def image_info(
 
 def with_outputs(model: onnx.ModelProto, kinds: Mapping[str, int]) -> onnx.ModelProto:
     """The model with these tensors, of these ONNX types, as outputs behind its own."""
-    extended = onnx.ModelProto()
-    extended.CopyFrom(model)
+    extended = deepcopy(model)
     own = {value.name for value in extended.graph.output}
     extended.graph.output.extend(
         onnx.helper.make_tensor_value_info(name, kind, None) for name, kind in kinds.items() if name not in own
@@ -194,8 +189,7 @@ def any_size(model: onnx.ModelProto) -> onnx.ModelProto:
     """A network of convolutions that is fixed to one tile, for images of any size; any other as it is."""
     if fixed_tile_px(model) is None:
         return model
-    free = onnx.ModelProto()
-    free.CopyFrom(model)
+    free = deepcopy(model)
     for value in (*free.graph.input, *free.graph.output):
         if len(value.type.tensor_type.shape.dim) != 4:  # such as a classifier's, which has one size of image
             return model

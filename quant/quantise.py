@@ -68,9 +68,9 @@ if TYPE_CHECKING:
     from beers_deploy.quant.passes.tune import Tuning
 
 SEARCH_CROPS = 16
-"""What the equalisation is searched on, a quarter of them with the strongest edges: there int8 clips."""
+"""What the equalisation is searched on, a quarter of them with the strongest edges: there int8 clips. Small crops say
+less each, so more of them are taken."""
 MOST_CROPS = 64
-
 
 STREAM_STEP = 2.0**-STREAM_FRAC_BITS
 """The value of one unit of the streams' tensors."""
@@ -117,8 +117,11 @@ class Plan:
         room = self.ends.outputs <= MAX_CHANNELS // 2
         return self.ends.gains == 1 and not self.ends.adds_image and takes_gains(self.graph) and room
 
-    def with_windows(self, frac_bits: int, low: np.ndarray, high: np.ndarray) -> "Plan":
-        """The result in windows from low to high (C,), finer by GAIN than its own scale of so many bits."""
+    def with_windows(self, frac_bits: int, images: Iterable[np.ndarray]) -> "Plan":
+        """The result in windows over all that it is in float, finer by GAIN than its own scale of so many bits."""
+        low, high = np.array(np.inf), np.array(-np.inf)
+        for (result,) in values_of(self.graph, [CORRECTION], images, self.ends):
+            low, high = np.minimum(low, result[0].min((1, 2))), np.maximum(high, result[0].max((1, 2)))
         offsets = window_offsets(low, high, 2.0 ** -(frac_bits + FINER))
         found = tuple(tuple(float(each) for each in window) for window in offsets)
         return replace(self, ends=replace(self.ends, offsets=found))
@@ -235,7 +238,7 @@ def rounded(plan: Plan, images: Remade[np.ndarray], log: Log = no_log) -> tuple[
     log("scale of each tensor")
     frac_bits = choose_frac_bits(plan.graph, images, plan.ends)
     if plan.takes_windows:
-        plan = plan.with_windows(frac_bits[CORRECTION], *_result_range(plan, images))
+        plan = plan.with_windows(frac_bits[CORRECTION], images)
     graph = _balanced(plan, frac_bits, images, log)
     paired, last_sum = plan.paired(graph), frozenset[str]()
     if paired is not graph:
@@ -247,20 +250,17 @@ def rounded(plan: Plan, images: Remade[np.ndarray], log: Log = no_log) -> tuple[
     return fit_weights(final, plan.core(final, frac_bits), moments, plan.shifts), final, last_sum
 
 
-def _result_range(plan: Plan, images: Remade[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """The smallest and the largest value (C,) of each channel of the float network's result."""
-    low, high = np.array(np.inf), np.array(-np.inf)
-    for (result,) in values_of(plan.graph, [CORRECTION], images, plan.ends):
-        low, high = np.minimum(low, result[0].min((1, 2))), np.maximum(high, result[0].max((1, 2)))
-    return low, high
-
-
 def _balanced(plan: Plan, frac_bits: dict[str, int], images: Remade[np.ndarray], log: Log) -> Graph:
     """The plan's graph, its streams equalised and then its chain levelled."""
     graph = plan.chain.scaled(plan.graph, plan.chain.unscaled(frac_bits))
     if not (plan.streams or plan.chain.tensors):
         return graph
-    trial = _trial(plan, frac_bits, images)
+    targets = search_targets(plan.graph, plan.ends, images)
+
+    def trial(tried: Graph) -> Costs:
+        final = plan.ended(plan.paired(tried))
+        return crop_costs(host_model(plan.core(final, frac_bits), {}), targets)
+
     graph = _equalised(graph, plan, trial, images, log) if plan.streams else graph
     if plan.chain.tensors:
         log(f"equalising the channels of {len(plan.chain.tensors)} tensors")
@@ -280,17 +280,6 @@ def _equalised(graph: Graph, plan: Plan, trial: Trial, images: Remade[np.ndarray
             graph = equalise(graph, stream, 1 / first_guess(ranges[stream], LEVELLING[0], 1.0))
         graph = equalise(graph, stream, search(graph, stream, ranges[stream], trial))
     return graph
-
-
-def _trial(plan: Plan, frac_bits: dict[str, int], images: Remade[np.ndarray]) -> Trial:
-    """What a graph costs once it is rounded, on crops of the images."""
-    targets = search_targets(plan.graph, plan.ends, images)
-
-    def costs_of(tried: Graph) -> Costs:
-        final = plan.ended(plan.paired(tried))
-        return crop_costs(host_model(plan.core(final, frac_bits), {}), targets)
-
-    return costs_of
 
 
 Targets = list[tuple[np.ndarray, np.ndarray]]
@@ -315,17 +304,12 @@ def search_targets(graph: Graph, ends: Ends, images: Remade[np.ndarray]) -> Targ
 
     sizes = {(k, n): size(crop) for k, image in enumerate(images) for n, crop in enumerate(crops(image, halo_px))}
     order = sorted(sizes, key=lambda place: sizes[place], reverse=True)
-    count = _crop_count(crops(images[0], halo_px)[0])
+    height, width = map(int, crops(images[0], halo_px)[0].shape[2:])
+    count = min(max(SEARCH_CROPS * TILE_PX**2 // (height * width), SEARCH_CROPS), MOST_CROPS)
     hard = count // 4
     others = order[hard :: max((len(order) - hard) // (count - hard), 1)]
     chosen = [crops(images[k], halo_px)[n].copy() for k, n in (*order[:hard], *others[: count - hard])]
     return [(crop, restored(crop)) for crop in chosen]
-
-
-def _crop_count(crop: np.ndarray) -> int:
-    """How many crops like this one are searched on: small ones say less each."""
-    height, width = map(int, crop.shape[2:])
-    return min(max(SEARCH_CROPS * TILE_PX**2 // (height * width), SEARCH_CROPS), MOST_CROPS)
 
 
 def crop_costs(model: onnx.ModelProto, targets: Targets) -> Costs:

@@ -40,7 +40,6 @@ from beers_deploy.quant.session import few_crops, halo_of, open_session, planes_
 IN_INT8 = ".in_int8"
 """Behind the name of a tensor: as int8 weights and bias make it of float inputs, not yet rounded."""
 
-
 WORST = 4
 BEYOND_DN = (1, 2, 4, 8, 16, 32, 64)
 ROUNDING, CLIPPING = 1.4, 1.6
@@ -107,20 +106,21 @@ def layer_errors(graph: Graph, core: IntCore, crops: Iterable[np.ndarray]) -> tu
     exact, int8 = open_session(graph_to_onnx((*graph, *twins), names, width)), open_session(host_model(core, {}))
     rests = {name: open_session(_rest(graph, name, width)) for name in tensors(graph) if name != CORRECTION}
     layers, together = [LayerError(op.name, Loss(), Loss()) for op in graph], Loss()
+    scale = core.scale(CORRECTION)
     for crop in crops:
         (values,) = tensor_values(exact, names, crop, halo_px, core.ends)
         wanted = dict(zip(names, values, strict=True))
-        restored = _restored(crop, wanted[CORRECTION], core)
+        restored = core.ends.restored(crop, wanted[CORRECTION], scale)
         offset = crop if core.ends.adds_image else 0.0
         for op, layer in zip(graph, layers, strict=True):
             result, meant = _in_int8(op, core, wanted), wanted[op.output]
             if op.output == CORRECTION:  # of two gains one is coarse and the other clipped: together they count
-                result = core.ends.merge(result, core.scale(CORRECTION))
+                result = core.ends.merge(result, scale)
                 meant = core.ends.whole(meant)
                 found = core.ends.finished(crop, result)
             else:
                 feed = {PLANES: planes_of(crop, core.ends), op.output: result}
-                found = _restored(crop, rests[op.output].run(None, feed)[0], core)
+                found = core.ends.restored(crop, rests[op.output].run(None, feed)[0], scale)
             layer.alone.add(result, meant)
             layer.network.add(found, restored, offset)
         together.add(result_of(int8, crop), restored, offset)
@@ -158,10 +158,6 @@ def _rounded(values: np.ndarray, frac_bits: int) -> np.ndarray:
     """To whole multiples of 2^-n, half up, and clipped, as the DPU does."""
     scale = np.float32(2.0**frac_bits)
     return np.asarray(np.clip(np.floor(values * scale + np.float32(0.5)), INT8_MIN, INT8_MAX) / scale)
-
-
-def _restored(crop: np.ndarray, correction: np.ndarray, core: IntCore) -> np.ndarray:
-    return core.ends.restored(crop, correction, core.scale(CORRECTION))
 
 
 @dataclass(frozen=True)

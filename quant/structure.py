@@ -13,9 +13,9 @@ import numpy as np
 import onnx
 
 from beers_deploy.profiles.errors import ModelError
+from beers_deploy.profiles.figures import Check
 from beers_deploy.quant.encodings import encoding_faults, read_core
 from beers_deploy.quant.ends import ZERO
-from beers_deploy.quant.gate import Check
 from beers_deploy.quant.graph import CORRECTION
 from beers_deploy.quant.onnx_file import any_size, constants, with_outputs
 from beers_deploy.quant.session import open_any_size, open_session, result_of, tensors_of
@@ -178,13 +178,18 @@ def _begins_at_zero(node: onnx.NodeProto, rounded: dict[str, Rounded], convolved
     return bool((value.zero_point == value.lowest).all())
 
 
-def structure_checks(graph_to_onnx: onnx.ModelProto, int8: onnx.ModelProto) -> list[Check]:
+def structure_checks(float_model: onnx.ModelProto, int8: onnx.ModelProto) -> list[Check]:
     """Does the INT8 file keep its ReLUs, is it encoded as meant, and the same with onnxruntime's optimisations?"""
     image = np.random.default_rng(0).random(_odd_size(int8), dtype=np.float32)
     plain, optimised = (result_of(open_any_size(int8, optimise=o), image) for o in (False, True))
     difference = float(np.abs(plain - optimised).max())
     optimisation = Check("optimised against unoptimised", difference, 0, "of full scale")
-    return [_relus(graph_to_onnx, int8), *_encoding(int8), optimisation]
+    wanted, kept = count_relus(float_model).explicit, count_relus(int8)
+    said, faults = f"{wanted} in float, {kept} in INT8", encoding_faults(int8)
+    checks = [Check("ReLUs lost or added", kept.off_by(wanted), 0, "ReLU", detail=said)]
+    if faults is not None:  # of files that `quantize` wrote under the rules of a DPU
+        checks.append(Check("faults of the encoding", len(faults), 0, "fault", detail="".join(faults[:1])))
+    return [*checks, optimisation]
 
 
 def _odd_size(model: onnx.ModelProto) -> tuple[int, int, int, int]:
@@ -193,16 +198,3 @@ def _odd_size(model: onnx.ModelProto) -> tuple[int, int, int, int]:
     lattice_px = 1 if sizes[2] else tiling_of(model).lattice_px
     rows, columns = (fixed or -(-n // lattice_px) * lattice_px for fixed, n in zip(sizes[2:], (97, 101), strict=True))
     return 1, sizes[1] or 1, rows, columns
-
-
-def _relus(graph_to_onnx: onnx.ModelProto, int8: onnx.ModelProto) -> Check:
-    wanted, kept = count_relus(graph_to_onnx).explicit, count_relus(int8)
-    return Check("ReLUs lost or added", kept.off_by(wanted), 0, "ReLU", detail=f"{wanted} in float, {kept} in INT8")
-
-
-def _encoding(model: onnx.ModelProto) -> list[Check]:
-    """Of files that `quantize` wrote under the rules of a DPU: does each part say what the whole numbers ask for?"""
-    faults = encoding_faults(model)
-    if faults is None:
-        return []
-    return [Check("faults of the encoding", len(faults), 0, "fault", detail=faults[0] if faults else "")]

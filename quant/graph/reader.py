@@ -3,7 +3,7 @@
 A file from outside is looked at once, here; behind it nothing asks again.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -106,27 +106,17 @@ class _Node:
     """An ONNX node: what it reads and writes, and its attributes by name."""
 
     proto: onnx.NodeProto
+    op_type: str
+    name: str
+    input: list[str]
+    output: list[str]
     given: dict[str, Any]
 
     @classmethod
     def of(cls, proto: onnx.NodeProto) -> "_Node":
-        return cls(proto, {a.name: helper.get_attribute_value(a) for a in proto.attribute})
-
-    @property
-    def op_type(self) -> str:
-        return self.proto.op_type
-
-    @property
-    def name(self) -> str:
-        return self.proto.name or self.proto.output[0]
-
-    @property
-    def input(self) -> Sequence[str]:
-        return list(self.proto.input)
-
-    @property
-    def output(self) -> Sequence[str]:
-        return list(self.proto.output)
+        given = {a.name: helper.get_attribute_value(a) for a in proto.attribute}
+        name = proto.name or proto.output[0]
+        return cls(proto, proto.op_type, name, list(proto.input), list(proto.output), given)
 
 
 class _Reader:
@@ -253,11 +243,9 @@ class _Reader:
         self.ops[-1] = renamed(self.ops[-1], {node.input[0]: node.output[0]})
         self.softmax = True
 
-    def _add(self, node: _Node) -> Op:
-        return self._by_constant(node) or Add(node.name, (node.input[0], node.input[1]), node.output[0])
-
-    def _mul(self, node: _Node) -> Op:
-        return self._by_constant(node) or Mul(node.name, (node.input[0], node.input[1]), node.output[0])
+    def _add_or_mul(self, node: _Node) -> Op:
+        kind = Add if node.op_type == "Add" else Mul
+        return self._by_constant(node) or kind(node.name, (node.input[0], node.input[1]), node.output[0])
 
     def _sub(self, node: _Node) -> Op | None:
         """Of a constant; what a convolution wrote is added since the file was folded (`quant.reading`)."""
@@ -333,12 +321,9 @@ class _Reader:
             self._require(blocks, node, expected, f"{mode}, {where}, {rounding} by {factor:g}")
         return Resize(node.name, node.input[0], node.output[0], int(factor), mode == "linear")
 
-    def _depthtospace(self, node: _Node) -> Op:
-        columns_first = node.given.get("mode", b"DCR") == b"CRD"
-        return Shuffle(node.name, node.input[0], node.output[0], int(node.given["blocksize"]), True, columns_first)
-
-    def _spacetodepth(self, node: _Node) -> Op:
-        return Shuffle(node.name, node.input[0], node.output[0], int(node.given["blocksize"]), False, False)
+    def _shuffle(self, node: _Node) -> Op:
+        up, columns_first = node.op_type == "DepthToSpace", node.given.get("mode", b"DCR") == b"CRD"
+        return Shuffle(node.name, node.input[0], node.output[0], int(node.given["blocksize"]), up, columns_first)
 
     def _move(self, node: _Node) -> Op | None:
         """Reshape and Transpose as exporters spell pixel shuffles: followed to the last of them, then tried out."""
@@ -384,19 +369,19 @@ class _Reader:
 
 
 READERS: dict[str, Callable[[_Reader, _Node], Op | None]] = {
-    "Add": _Reader._add,
+    "Add": _Reader._add_or_mul,
     "AveragePool": _Reader._averagepool,
     "Concat": _Reader._concat,
     "Conv": _Reader._conv,
     "ConvTranspose": _Reader._convtranspose,
-    "DepthToSpace": _Reader._depthtospace,
+    "DepthToSpace": _Reader._shuffle,
     "Flatten": _Reader._flatten,
     "GlobalAveragePool": _Reader._globalaveragepool,
     "MaxPool": _Reader._maxpool,
-    "Mul": _Reader._mul,
+    "Mul": _Reader._add_or_mul,
     "Resize": _Reader._resize,
     "Softmax": _Reader._softmax,
-    "SpaceToDepth": _Reader._spacetodepth,
+    "SpaceToDepth": _Reader._shuffle,
     "Sub": _Reader._sub,
     **dict.fromkeys(MOVES, _Reader._move),
 }

@@ -6,6 +6,7 @@ they are, from `correction` to the result, and written behind the core again.
 
 import base64
 from collections.abc import Collection
+from copy import deepcopy
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -64,9 +65,7 @@ class Tail:
 
     def write(self, writer: GraphWriter, source: str) -> None:
         """Write its nodes behind the tensor `source`."""
-        for node in self.graph.node:
-            written = _renamed(node, {CORRECTION: source})
-            writer.nodes.append(written)
+        writer.nodes.extend(_renamed(node, {CORRECTION: source}) for node in self.graph.node)
         for tensor in self.graph.initializer:
             writer.weights.setdefault(tensor.name, tensor)
 
@@ -100,8 +99,7 @@ def without_tail(model: ModelProto, known: Collection[str]) -> tuple[ModelProto,
 
 
 def _parted(model: ModelProto, nodes: list[NodeProto], tail: list[NodeProto], source: str) -> tuple[ModelProto, Tail]:
-    body, output = ModelProto(), model.graph.output[0]
-    body.CopyFrom(model)
+    body, output = deepcopy(model), model.graph.output[0]
     del body.graph.node[:], body.graph.output[:]
     body.graph.node.extend(nodes)
     body.graph.output.append(helper.make_tensor_value_info(source, TensorProto.FLOAT, None))
@@ -118,12 +116,9 @@ def _parted(model: ModelProto, nodes: list[NodeProto], tail: list[NodeProto], so
 
 
 def _renamed(node: NodeProto, names: dict[str, str]) -> NodeProto:
-    found = NodeProto()
-    found.CopyFrom(node)
+    found = deepcopy(node)
     for field in (found.input, found.output):
-        renamed = [names.get(name, name) for name in field]
-        del field[:]
-        field.extend(renamed)
+        field[:] = [names.get(name, name) for name in field]
     if not found.name.startswith("host_tail."):
         found.name = f"host_tail.{found.name or found.output[0]}"
     return found

@@ -6,6 +6,7 @@ torch writes PixelUnshuffle as Reshape and Transpose, and PixelShuffle in old op
 import math
 from collections import Counter
 from collections.abc import Callable, Sequence
+from copy import deepcopy
 from fractions import Fraction
 from itertools import product
 
@@ -70,8 +71,7 @@ def with_shuffles(model: onnx.ModelProto) -> onnx.ModelProto:
     """
     if not any(node.op_type in MOVES for node in model.graph.node):
         return model
-    found = onnx.ModelProto()
-    found.CopyFrom(model)
+    found = deepcopy(model)
     graph = onnx.shape_inference.infer_shapes(model).graph
     known = {value.name: value.type.tensor_type.shape.dim for value in (*graph.input, *graph.value_info)}
     for chain in _chains(found.graph):

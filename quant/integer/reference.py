@@ -157,7 +157,8 @@ def _moving(core: IntCore, op: Op, read: list[np.ndarray]) -> np.ndarray:
 
 def _conv(core: IntCore, op: IntConv, image: np.ndarray, faults: Faults) -> Sums:
     product = op.weight_frac_bits + core.frac_bits[op.input]
-    bias = _moved(op.bias.astype(np.int64), faults.shift(op.name, "shift_bias", product - op.bias_frac_bits))
+    shift = faults.shift(op.name, "shift_bias", product - op.bias_frac_bits)
+    bias = op.bias.astype(np.int64) << shift if shift >= 0 else op.bias.astype(np.int64) >> -shift
     sums = convolve(image, op.weight, op.window, op.groups, op.transposed) + bias[:, None, None]
     sums, finer = activated(sums, op.activation, product)
     cut = faults.shift(op.name, "shift_cut", product - core.frac_bits[op.output])
@@ -174,11 +175,6 @@ def _add(core: IntCore, op: Add, read: list[np.ndarray], faults: Faults) -> Sums
     coarsest = min(core.frac_bits[name] for name in op.inputs)
     write = faults.shift(op.name, "shift_write", coarsest - core.frac_bits[op.output])
     return sums, finest - coarsest + write + finer, float(np.log2(bound)), finer
-
-
-def _moved(values: np.ndarray, shift: int) -> np.ndarray:
-    """Shifted left, or right where a fault makes it so."""
-    return values << shift if shift >= 0 else values >> -shift
 
 
 def _shifted(sums: np.ndarray, shift: int, half_even: bool) -> tuple[np.ndarray, float]:

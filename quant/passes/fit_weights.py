@@ -30,6 +30,11 @@ class Moments:
     total: np.ndarray  # (n,) float64, sum of x
     count: int = 0
 
+    @classmethod
+    def of_none(cls, size: int) -> "Moments":
+        """Of no windows yet."""
+        return cls(np.zeros((size, size)), np.zeros(size))
+
     def add(self, windows: np.ndarray) -> None:
         """Count further windows (K, n) float32."""
         self.products += windows.T @ windows
@@ -55,7 +60,7 @@ def input_moments(graph: Graph, images: Iterable[np.ndarray], ends: Ends = ONE_C
     The values are those of the float network.
     """
     convs = [op for op in graph if isinstance(op, Conv) and fits(op)]
-    found = {op.name: _nothing(op) for op in convs}
+    found = {op.name: Moments.of_none(op.weight[0].size) for op in convs}
     names, halo_px = tensors(graph), halo_of(graph)
     session = open_session(graph_to_onnx(graph, names, ends.planes * ends.channels))
     for image in images:
@@ -65,11 +70,6 @@ def input_moments(graph: Graph, images: Iterable[np.ndarray], ends: Ends = ONE_C
             for op in convs:
                 found[op.name].add(_windows(read[op.input], op))
     return found
-
-
-def _nothing(op: Conv) -> Moments:
-    size = int(np.prod(op.weight.shape[1:]))
-    return Moments(np.zeros((size, size)), np.zeros(size))
 
 
 def fits(op: Conv) -> bool:
@@ -83,12 +83,12 @@ def _windows(values: np.ndarray, op: Conv) -> np.ndarray:
     kernel = (op.weight.shape[2] - 1) * tall + 1, (op.weight.shape[3] - 1) * broad + 1
     every = -(-EVERY_PX // rows) * rows, -(-EVERY_PX // columns) * columns
     if min(n - k for n, k in zip(values.shape[2:], kernel, strict=True)) < 0:
-        return np.empty((0, int(np.prod(op.weight.shape[1:]))), np.float32)
+        return np.empty((0, op.weight[0].size), np.float32)
     # In step with the windows that are computed, which begin in the padding.
     first = -op.window.pads[0] % rows, -op.window.pads[1] % columns
     windows = sliding_window_view(values[0], kernel, axis=(1, 2))
     windows = windows[:, first[0] :: every[0], first[1] :: every[1], ::tall, ::broad]
-    return np.ascontiguousarray(windows.transpose(1, 2, 0, 3, 4)).reshape(-1, int(np.prod(op.weight.shape[1:])))
+    return np.ascontiguousarray(windows.transpose(1, 2, 0, 3, 4)).reshape(-1, op.weight[0].size)
 
 
 SWEEPS = 20

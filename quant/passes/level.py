@@ -116,25 +116,22 @@ def level(graph: Graph, chain: Chain, ranges: np.ndarray, start: np.ndarray, tri
     def costs_of(factors: np.ndarray) -> Costs:
         return trial(chain.scaled(graph, factors))
 
-    best = Best(start, costs_of(start)(None))
-    for shape in product(LEVELLING, HEADROOM):
-        best = _better(np.concatenate([channels.guess(*shape) for channels in known]), costs_of, best)
-    if not chain.one_by_one:
-        return best.factors
-    for channels, part in reversed(list(zip(known, chain.parts, strict=True))):
-        best = _one_tensor(channels, part, costs_of, best)
+    def guessed(best: Best, own: list[tuple[Channels, slice]]) -> Best:
+        """The best of the first guesses for these tensors, the others as they are."""
+        for shape in product(LEVELLING, HEADROOM):
+            tried = best.factors.copy()
+            for channels, part in own:
+                tried[part] = channels.guess(*shape)
+            best = _better(tried, costs_of, best)
+        return best
+
+    placed = list(zip(known, chain.parts, strict=True))
+    best = guessed(Best(start, costs_of(start)(None)), placed)
+    for channels, part in reversed(placed) if chain.one_by_one else ():
+        best = guessed(best, [(channels, part)])
         if chain.stepped:
             best = stepped(costs_of, range(part.start, part.stop), best)
     return best.factors
-
-
-def _one_tensor(channels: Channels, part: slice, costs_of: Callable[[np.ndarray], Costs], best: Best) -> Best:
-    """The best of the first guesses for one tensor, the others as they are."""
-    for shape in product(LEVELLING, HEADROOM):
-        tried = best.factors.copy()
-        tried[part] = channels.guess(*shape)
-        best = _better(tried, costs_of, best)
-    return best
 
 
 def _better(factors: np.ndarray, costs_of: Callable[[np.ndarray], Costs], best: Best) -> Best:

@@ -65,16 +65,13 @@ def half_lsb_pair(graph: Graph, step: float) -> Graph:
         graph: that ends with an add and a convolution; any other is returned as it is.
         step: the value of one unit of the tensors that the add reads and writes.
     """
-    writers = {op.output: op for op in graph if isinstance(op, Conv) and _plain(op)}
-    before, end = graph[:-2], graph[-2:]
-    add, tail = end if len(end) == 2 else (None, None)
-    shared = isinstance(add, Add) and any(add.output in stream for stream in streams(graph))
-    two = isinstance(add, Add) and add.activation is Activation.none and len(set(add.inputs)) == 2
-    sums = isinstance(add, Add) and two and set(add.inputs) <= set(writers)
-    if not (shared and sums and isinstance(tail, Conv) and tail.groups == 1):
+    *before, add, tail = graph if len(graph) > 1 else (None, None)
+    if not (isinstance(add, Add) and isinstance(tail, Conv)):
         return graph
-    assert isinstance(add, Add)  # noqa: S101
-    if tail.input != add.output:
+    writers = {op.output: op for op in graph if isinstance(op, Conv) and _plain(op)}
+    two = add.activation is Activation.none and len(set(add.inputs)) == 2 and set(add.inputs) <= set(writers)
+    shared = any(add.output in stream for stream in streams(graph))
+    if not (shared and two and tail.groups == 1 and tail.input == add.output):
         return graph
     left, right = (_twice(writers[name], step) for name in add.inputs)
     read = {name for op in before for name in op.inputs}

@@ -181,8 +181,7 @@ def _numbers(graph: Nodes, node: NodeProto) -> tuple[np.ndarray, np.ndarray]:
 def _set_numbers(graph: Nodes, node: NodeProto, weight: np.ndarray, bias: np.ndarray) -> None:
     name = node.name or node.output[0]
     inputs = [node.input[0], graph.keep(f"{name}.weight", weight), graph.keep(f"{name}.bias", bias)]
-    del node.input[:]
-    node.input.extend(inputs)
+    node.input[:] = inputs
 
 
 def _hard_swish(graph: Nodes, node: NodeProto) -> list[NodeProto] | None:

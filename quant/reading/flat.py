@@ -4,6 +4,7 @@ A DPU runs them as such, and a quantiser that knows convolutions knows them too.
 one along the channels of a map of one pixel.
 """
 
+from copy import deepcopy
 from math import prod
 
 import numpy as np
@@ -38,8 +39,7 @@ class Unflatten:
         if node.op_type == "Softmax" and size[1:] == (1, 1) and attributes_of(node).get("axis", -1) in (1, -1):
             return self._flat(helper.make_node("Softmax", [source], node.output, name=node.name, axis=1), size)
         if node.op_type in POINTWISE:
-            image = NodeProto()
-            image.CopyFrom(node)
+            image = deepcopy(node)
             image.input[0] = source
             return self._flat(image, size)
         if node.op_type == "Reshape" and graph.integers(node.input[1]) in ([1, *size], [0, *size], [-1, *size]):

@@ -23,6 +23,7 @@ come here: a runtime opens it.
 """
 
 from collections.abc import Iterator
+from copy import deepcopy
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -63,8 +64,7 @@ def simplest(model: onnx.ModelProto, where: str) -> onnx.ModelProto:
 
 
 def _simplest(model: onnx.ModelProto, where: str) -> onnx.ModelProto:
-    folded = onnx.ModelProto()
-    folded.CopyFrom(model)
+    folded = deepcopy(model)
     _widen(folded)
     held = {tensor.name for tensor in folded.graph.initializer}
     inputs = [value for value in folded.graph.input if value.name not in held]

@@ -5,8 +5,7 @@ from pathlib import Path
 import pytest
 
 from beers_deploy.differences import changes, parse_limit, read_document
-from beers_deploy.profiles.figures import Figure, Row, measured, predicted, unavailable
-from beers_deploy.quant.gate import Check
+from beers_deploy.profiles.figures import Check, Figure, Row, measured, predicted, unavailable
 from beers_deploy.results import Table
 from tests.deploy.command_line import done, refused
 

@@ -16,11 +16,11 @@ from beers_deploy.export import float_model
 from beers_deploy.network import Network, shipped_pair
 from beers_deploy.profiles import load_target
 from beers_deploy.profiles.errors import OptionError
-from beers_deploy.profiles.figures import Row, measured
+from beers_deploy.profiles.figures import Bound, Check, Row, measured
 from beers_deploy.profiles.sensor_file import BLIND
 from beers_deploy.quant.encodings import read_core
 from beers_deploy.quant.free import quantise_free
-from beers_deploy.quant.gate import Bound, Check, Limits, compare, judge, judge_saturation, read_limits
+from beers_deploy.quant.gate import Limits, compare, judge, judge_saturation, read_limits
 from beers_deploy.quant.onnx_file import image_info, load_onnx, save_onnx
 from beers_deploy.quant.samples import Patches
 from beers_deploy.quant.session import open_session

@@ -22,9 +22,8 @@ from beers_deploy.model.io.tensors import write_tensors
 from beers_deploy.model.metrics.backbones import read_tensors
 from beers_deploy.model.training.run import Log
 from beers_deploy.profiles.errors import BeersError, ModelError, OptionError, ProfileError
-from beers_deploy.profiles.figures import Row, measured
+from beers_deploy.profiles.figures import Check, Row, measured
 from beers_deploy.profiles.toml import HERE, read_json, read_toml_text
-from beers_deploy.quant.gate import Check
 from beers_deploy.quant.onnx_file import load_onnx
 from beers_deploy.restoration.output import Checkpoint, part_folder
 from beers_deploy.results import Table

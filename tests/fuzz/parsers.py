@@ -27,10 +27,10 @@ from beers_deploy.model.metrics.backbones import read_tensors
 from beers_deploy.model.recipe import read_pairs_recipe
 from beers_deploy.model.training.run import Log
 from beers_deploy.profiles import load_sensor, load_target
-from beers_deploy.profiles.figures import Row, measured, predicted, unavailable
+from beers_deploy.profiles.figures import Check, Row, measured, predicted, unavailable
 from beers_deploy.profiles.response_file import read_response
 from beers_deploy.profiles.scene_call import load_scene_call
-from beers_deploy.quant.gate import Check, read_limits
+from beers_deploy.quant.gate import read_limits
 from beers_deploy.restoration.output import Checkpoint, part_folder
 from beers_deploy.results import Table, by_row, cell
 from beers_deploy.studies.tradeoff.measure import Measurements

@@ -17,9 +17,8 @@ from beers_deploy.model.bank import (
     bank_of,
     bank_of_vector,
     in_places,
-    noise_over_full_scale,
 )
-from beers_deploy.model.family import sensor_vector
+from beers_deploy.model.family import noise_over_full_scale, sensor_vector
 from beers_deploy.model.traditional.compensate import compensation_kernel
 from beers_deploy.profiles import load_sensor
 from beers_deploy.profiles.effects import Smear
