@@ -26,7 +26,6 @@ from beers_deploy.results import SCHEMA_PATH
 from beers_deploy.studies.evaluation.methods import Method, method_named
 from beers_deploy.studies.evaluation.pairs import NamedPair, pairs_of_scenes
 from beers_deploy.studies.evaluation.scores import Instruments
-from beers_deploy.studies.tradeoff.advice import parse_constraints
 from beers_deploy.studies.tradeoff.labelled import Labelled
 from beers_deploy.studies.tradeoff.measure import SEAM_ERROR, Benchmark, make_int8
 from beers_deploy.studies.tradeoff.pareto import TOO_FEW
@@ -161,7 +160,7 @@ def test_an_int8_file_is_made_once(folder: Path, tmp_path: Path) -> None:
 
 
 def test_other_boards_are_rows_and_the_front_is_of_the_first(folder: Path, study: tuple[Tradeoff, Path]) -> None:
-    found = studied(folder, study[1], board=("vck190", "zcu102"), budget=parse_constraints("--budget", "latency<=9"))
+    found = studied(folder, study[1], board=("vck190", "zcu102"), budget="latency<=9")
     assert {point.text["board"] for point in found.points} >= {"vck190", "zcu102", "this machine"}
     assert {point.text["board"] for point in found.front} == {"vck190"}
     assert found.recommendation.point is not None
